@@ -1,0 +1,203 @@
+"""Lagrange multipliers: how strongly each cost is weighed against the return.
+
+Once per epoch a multiplier receives J_c, the mean undiscounted cost of the episodes that
+finished in the epoch, and moves λ up where J_c exceeds its limit d and down where it does not.
+Multipliers hold one λ per cost; their whole state lives in buffers, so that `state_dict`
+resumes them exactly and `.to(device)` moves them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import torch
+from tensordict import NestedKey
+from torch import Tensor, nn
+from torch.nn.functional import softplus
+
+CostLimits = Mapping[NestedKey, float] | Sequence[float] | float
+
+
+def parse_cost_limits(cost_limits: CostLimits) -> tuple[list[NestedKey], Tensor]:
+    """Split cost limits into keys and a tensor.
+
+    Args:
+        cost_limits: a mapping from cost key to limit, a sequence of limits, or one limit. The
+            limits are undiscounted costs per episode.
+
+    Returns:
+        The cost keys, and the limits as a float32 tensor [k]. Limits that come without keys
+        are named ``cost`` (one) or ``cost_0``, ``cost_1``, … (several).
+
+    Raises:
+        ValueError: if there is no limit at all, or one that is not a finite number.
+    """
+    keys: list[NestedKey]
+    if isinstance(cost_limits, Mapping):
+        keys, values = list(cost_limits.keys()), list(cost_limits.values())
+    else:
+        values = list(cost_limits) if isinstance(cost_limits, Sequence) else [cost_limits]
+        keys = ["cost"] if len(values) == 1 else [f"cost_{i}" for i in range(len(values))]
+    if not values:
+        raise ValueError(
+            "cost_limits is empty: give at least one limit, for example {'cost': 25.0}; "
+            "an unconstrained algorithm takes multiplier=None instead."
+        )
+    limits = torch.as_tensor(values, dtype=torch.float32)
+    if not limits.isfinite().all():
+        raise ValueError(f"cost_limits must be finite numbers, got {values}.")
+    return keys, limits
+
+
+def per_cost(name: str, value: float | Sequence[float] | Tensor, num_costs: int) -> Tensor:
+    """Expand a scalar, or check a sequence, to one float32 value per cost, [k].
+
+    Raises:
+        ValueError: if a sequence does not hold one value per cost.
+    """
+    tensor = torch.as_tensor(value, dtype=torch.float32)
+    if tensor.ndim and tensor.shape != (num_costs,):
+        raise ValueError(
+            f"{name} must be one number or {num_costs} numbers (one per cost), "
+            f"got shape {tuple(tensor.shape)}."
+        )
+    return tensor.expand(num_costs).clone()
+
+
+class Multiplier(nn.Module):
+    """What losses and training loops rely on: limits, `value` and `update`.
+
+    Subclasses keep their state in buffers and implement `value` and `_step`.
+
+    Args:
+        cost_limits: mapping from cost key to limit, or limits alone; see `parse_cost_limits`.
+
+    Attributes:
+        cost_keys: one key per cost, in the order of every [k] tensor.
+        limits: [k] buffer, undiscounted cost per episode.
+    """
+
+    limits: Tensor
+
+    def __init__(self, cost_limits: CostLimits) -> None:
+        super().__init__()
+        self.cost_keys, limits = parse_cost_limits(cost_limits)
+        self.register_buffer("limits", limits)
+
+    @property
+    def num_costs(self) -> int:
+        """Number of costs k."""
+        return len(self.cost_keys)
+
+    @property
+    def value(self) -> Tensor:
+        """The multipliers λ ≥ 0, [k], detached."""
+        raise NotImplementedError
+
+    @torch.no_grad()
+    def update(self, mean_costs: Tensor | Sequence[float] | float) -> None:
+        """Move λ after an epoch.
+
+        A cost whose J_c is not finite (NaN: no episode finished in the epoch) keeps its
+        multiplier and its state as they are.
+
+        Args:
+            mean_costs: J_c, [k] (or a scalar if k = 1): mean undiscounted cost of the episodes
+                that finished in this epoch.
+
+        Raises:
+            ValueError: if there is not one number per cost.
+        """
+        costs = torch.as_tensor(mean_costs, dtype=self.limits.dtype, device=self.limits.device)
+        if costs.numel() != self.num_costs:
+            raise ValueError(
+                f"update() needs one mean cost for each of {self.cost_keys}, "
+                f"got shape {tuple(costs.shape)}."
+            )
+        costs = costs.reshape(self.num_costs)
+        known = costs.isfinite()
+        for name, new in self._step(torch.where(known, costs, self.limits)).items():
+            buffer = self.get_buffer(name)
+            buffer.copy_(torch.where(known, new, buffer))
+
+    def _step(self, mean_costs: Tensor) -> dict[str, Tensor]:
+        """Return the new value of every state buffer ([..., k]) given finite J_c [k]."""
+        raise NotImplementedError
+
+    def named_values(self) -> dict[str, Tensor]:
+        """λ per cost as scalars, named by cost key (nested keys joined by ``/``)."""
+        names = ("/".join(key) if isinstance(key, tuple) else str(key) for key in self.cost_keys)
+        return dict(zip(names, self.value.unbind(), strict=True))
+
+    def extra_repr(self) -> str:
+        """Limits and multipliers by cost key."""
+        limits = dict(zip(self.cost_keys, self.limits.tolist(), strict=True))
+        return f"cost_limits={limits}"
+
+
+class LagrangeMultiplier(Multiplier):
+    """λ = softplus(ν), with ν moved by Adam on the dual loss −ν·(J_c − d).
+
+    The gradient is taken with respect to ν directly, not through the softplus, as in the
+    Lagrangian baselines of Ray, Achiam and Amodei, *Benchmarking Safe Exploration in Deep
+    Reinforcement Learning* (2019), section 5.1. Adam (Kingma and Ba 2015, algorithm 1) is
+    written out here, because its moments belong to the state that is moved and saved.
+
+    Args:
+        cost_limits: mapping from cost key to limit d, or limits alone; see `parse_cost_limits`.
+        init: initial λ > 0, for all costs or one per cost.
+        lr: Adam's step size.
+        betas: Adam's decay rates.
+        eps: Adam's ε.
+
+    Raises:
+        ValueError: if an initial λ is not positive.
+
+    Examples:
+        >>> multiplier = LagrangeMultiplier({"cost": 25.0}, init=1.0, lr=0.05)
+        >>> multiplier.update(torch.tensor([60.0]))
+        >>> multiplier.value
+        tensor([1.0319])
+    """
+
+    nu: Tensor
+    step: Tensor
+    exp_avg: Tensor
+    exp_avg_sq: Tensor
+
+    def __init__(
+        self,
+        cost_limits: CostLimits,
+        *,
+        init: float | Sequence[float],
+        lr: float,
+        betas: tuple[float, float] = (0.9, 0.999),
+        eps: float = 1e-8,
+    ) -> None:
+        super().__init__(cost_limits)
+        initial = per_cost("init", init, self.num_costs)
+        if not (initial > 0).all():
+            raise ValueError(
+                f"init must be positive, got {init}: a softplus never reaches 0; "
+                "use a small number such as 1e-3."
+            )
+        self.lr, self.betas, self.eps = lr, betas, eps
+        # softplus⁻¹(λ) = log(exp(λ) − 1), in the form that does not overflow.
+        self.register_buffer("nu", initial + torch.log(-torch.expm1(-initial)))
+        for name in ("step", "exp_avg", "exp_avg_sq"):
+            self.register_buffer(name, torch.zeros(self.num_costs))
+
+    @property
+    def value(self) -> Tensor:
+        """The multipliers λ = softplus(ν) > 0, [k], detached."""
+        return softplus(self.nu).detach()
+
+    def _step(self, mean_costs: Tensor) -> dict[str, Tensor]:
+        beta1, beta2 = self.betas
+        grad = self.limits - mean_costs
+        step = self.step + 1
+        exp_avg = torch.lerp(grad, self.exp_avg, beta1)
+        exp_avg_sq = torch.lerp(grad.square(), self.exp_avg_sq, beta2)
+        denominator = (exp_avg_sq / (1 - beta2**step)).sqrt() + self.eps
+        nu = self.nu - self.lr * exp_avg / (1 - beta1**step) / denominator
+        return {"nu": nu, "step": step, "exp_avg": exp_avg, "exp_avg_sq": exp_avg_sq}

@@ -1,0 +1,116 @@
+"""Multipliers against hand-computed numbers and against torch's own Adam."""
+
+import math
+
+import pytest
+import torch
+
+from safe_rl.objectives.multipliers import LagrangeMultiplier, parse_cost_limits
+
+NU_OF_ONE = math.log(math.e - 1)
+
+
+def lagrange(limits=None, init=1.0, lr=0.05):
+    return LagrangeMultiplier({"cost": 25.0} if limits is None else limits, init=init, lr=lr)
+
+
+@pytest.mark.parametrize("init", [1e-4, 1.0, 50.0, 200.0])
+def test_initial_value_is_init(init):
+    torch.testing.assert_close(lagrange(init=init).value, torch.tensor([init]))
+
+
+def test_first_adam_step_moves_nu_by_the_learning_rate():
+    # Bias correction makes Adam's first step lr·sign(gradient), whatever its size.
+    for cost, sign in ((60.0, 1), (26.0, 1), (3.0, -1)):
+        multiplier = lagrange()
+        multiplier.update(torch.tensor([cost]))
+        expected = math.log1p(math.exp(NU_OF_ONE + sign * 0.05))
+        assert multiplier.value.item() == pytest.approx(expected, rel=1e-6)
+
+
+def test_second_adam_step_by_hand():
+    multiplier = lagrange()
+    multiplier.update([35.0])  # gradient −10: m = −1, v = .1
+    multiplier.update([20.0])  # gradient +5: m = −.9 + .5 = −.4, v = .0999 + .025 = .1249
+    first = 0.05
+    second = 0.05 * (0.4 / (1 - 0.81)) / math.sqrt(0.1249 / (1 - 0.998001))
+    assert multiplier.nu.item() == pytest.approx(NU_OF_ONE + first + second, rel=1e-5)
+
+
+def test_matches_torch_adam_on_the_dual_loss():
+    multiplier = lagrange({"a": 25.0, ("nested", "b"): 5.0}, init=[1.0, 0.2], lr=0.03)
+    nu = multiplier.nu.clone().requires_grad_()
+    adam = torch.optim.Adam([nu], lr=0.03)
+    generator = torch.Generator().manual_seed(0)
+    for _ in range(50):
+        costs = 40 * torch.rand(2, generator=generator)
+        adam.zero_grad()
+        (-nu * (costs - torch.tensor([25.0, 5.0]))).sum().backward()
+        adam.step()
+        multiplier.update(costs)
+    torch.testing.assert_close(multiplier.nu, nu.detach())
+
+
+def test_nan_leaves_only_that_cost_unchanged():
+    multiplier, single = lagrange([25.0, 5.0]), lagrange([25.0])
+    for known, unknown in ((40.0, 9.0), (30.0, math.nan), (10.0, math.nan)):
+        multiplier.update([known, unknown])
+        single.update([known])
+    after_one = lagrange([5.0])
+    after_one.update([9.0])
+    expected = torch.cat([single.nu, after_one.nu])
+    torch.testing.assert_close(multiplier.nu, expected)
+    torch.testing.assert_close(multiplier.step, torch.tensor([3.0, 1.0]))
+
+
+def test_resume_is_exact():
+    one, other = lagrange([25.0, 5.0]), lagrange([1.0, 1.0], init=0.3)
+    for costs in ([40.0, 1.0], [33.0, 9.0]):
+        one.update(costs)
+    other.load_state_dict(one.state_dict())
+    one.update([10.0, 10.0])
+    other.update([10.0, 10.0])
+    assert torch.equal(one.value, other.value)
+    assert torch.equal(one.limits, other.limits)
+
+
+def test_moves_and_has_nothing_to_train():
+    multiplier = lagrange().to("meta")
+    assert multiplier.value.device.type == "meta"
+    assert not list(multiplier.parameters())
+    assert not multiplier.value.requires_grad
+    assert lagrange().double().value.dtype == torch.float64
+
+
+@pytest.mark.parametrize(
+    ("limits", "keys"),
+    [
+        (25.0, ["cost"]),
+        ([25.0], ["cost"]),
+        ([25.0, 3.0], ["cost_0", "cost_1"]),
+        ({"cost_hazards": 10, ("costs", "vases"): 5}, ["cost_hazards", ("costs", "vases")]),
+    ],
+)
+def test_limits_keep_their_keys(limits, keys):
+    assert parse_cost_limits(limits)[0] == keys
+
+
+def test_named_values_join_nested_keys():
+    multiplier = lagrange({"cost_hazards": 10.0, ("costs", "vases"): 5.0}, init=[2.0, 3.0])
+    named = {name: value.item() for name, value in multiplier.named_values().items()}
+    assert named == pytest.approx({"cost_hazards": 2.0, "costs/vases": 3.0})
+
+
+@pytest.mark.parametrize(
+    ("build", "message"),
+    [
+        (lambda: lagrange({}), "multiplier=None"),
+        (lambda: lagrange([math.inf]), "finite"),
+        (lambda: lagrange(init=0.0), "positive"),
+        (lambda: lagrange([1.0, 2.0], init=[1.0, 1.0, 1.0]), "2 numbers"),
+        (lambda: lagrange([1.0, 2.0]).update([1.0]), "each of"),
+    ],
+)
+def test_errors_say_what_to_change(build, message):
+    with pytest.raises(ValueError, match=message):
+        build()
