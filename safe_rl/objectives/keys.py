@@ -1,0 +1,36 @@
+"""Reading a batch by key, with errors that name what is missing and what is there."""
+
+from __future__ import annotations
+
+from difflib import get_close_matches
+
+from tensordict import NestedKey, TensorDictBase
+from tensordict.utils import unravel_key
+from torch import Tensor
+
+
+def key_name(key: NestedKey) -> str:
+    """A nested key as one string, its parts joined by ``/``."""
+    return key if isinstance(key, str) else "/".join(key)
+
+
+def require(tensordict: TensorDictBase, key: NestedKey, hint: str = "") -> Tensor:
+    """Get an entry, or raise an error that names the nearest key present.
+
+    Args:
+        tensordict: the batch to read.
+        key: entry to get.
+        hint: what writes this entry, for the error message.
+
+    Raises:
+        KeyError: if there is no such entry.
+    """
+    value = tensordict.get(key, None)
+    if value is not None:
+        return value
+    present = {key_name(found): found for found in tensordict.keys(True, True)}
+    near = get_close_matches(key_name(unravel_key(key)), present, n=1)
+    nearest = f" Nearest key: {present[near[0]]!r}." if near else ""
+    raise KeyError(
+        f"No entry {key!r} in the batch.{nearest} Keys: {sorted(present)}. {hint}".strip()
+    )

@@ -1,0 +1,48 @@
+"""Small batches, actors and critics shared by the objective tests."""
+
+import torch
+from tensordict import TensorDict
+from tensordict.nn import NormalParamExtractor, TensorDictModule, TensorDictSequential
+from torch import nn
+from torchrl.modules import IndependentNormal, ProbabilisticActor
+
+NUM_OBS, NUM_ACTIONS = 3, 2
+
+
+def make_actor(in_key="observation", loc="loc", scale="scale", action="action", width=8):
+    net = nn.Sequential(
+        nn.Linear(NUM_OBS, width),
+        nn.Tanh(),
+        nn.Linear(width, 2 * NUM_ACTIONS),
+        NormalParamExtractor(),
+    )
+    return ProbabilisticActor(
+        TensorDictSequential(TensorDictModule(net, in_keys=[in_key], out_keys=[loc, scale])),
+        in_keys={"loc": loc, "scale": scale},
+        out_keys=[action],
+        distribution_class=IndependentNormal,
+        return_log_prob=True,
+        log_prob_key="action_log_prob",
+    )
+
+
+def make_critic(out_key="state_value", outputs=1, in_key="observation"):
+    return TensorDictModule(nn.Linear(NUM_OBS, outputs), in_keys=[in_key], out_keys=[out_key])
+
+
+def make_batch(actor, batch_size, num_costs=1):
+    """A batch as a training loop hands it to a loss: sampled by `actor`, with advantages."""
+    batch = TensorDict(observation=torch.randn(*batch_size, NUM_OBS), batch_size=batch_size)
+    with torch.no_grad():
+        actor(batch)
+    batch["advantage"] = torch.randn(*batch_size, 1)
+    if num_costs:
+        batch["cost_advantage"] = 3 * torch.randn(*batch_size, num_costs)
+    return batch
+
+
+def perturb(actor, size=0.05):
+    """Move an actor away from the policy that sampled the batch."""
+    with torch.no_grad():
+        for parameter in actor.parameters():
+            parameter.add_(size * torch.randn_like(parameter))

@@ -1,0 +1,202 @@
+"""Advantages against a step-by-step loop written from the definition."""
+
+import time
+
+import pytest
+import torch
+from samples import NUM_OBS, make_critic
+from tensordict import TensorDict
+from torchrl.objectives.value import GAE
+
+from safe_rl.objectives.advantages import CostGAE, VectorGAE
+from safe_rl.objectives.normalisation import normalise_advantages
+
+N, T = 4, 37
+
+
+def make_rollout(critics, n=N, steps=T, p_end=0.12, costs=("cost",)):
+    """Rollout whose next observation is the following root one, except where it ends."""
+    done = torch.rand(n, steps, 1) < p_end
+    terminated = done & (torch.rand(n, steps, 1) < 0.5)
+    observation = torch.randn(n, steps + 1, NUM_OBS)
+    final = torch.randn(n, steps, NUM_OBS)
+    following = TensorDict(
+        observation=torch.where(done, final, observation[:, 1:]),
+        reward=torch.randn(n, steps, 1),
+        done=done,
+        terminated=terminated,
+        batch_size=[n, steps],
+    )
+    for key in costs:
+        following[key] = torch.rand(n, steps, 1)
+    rollout = TensorDict(observation=observation[:, :-1], next=following, batch_size=[n, steps])
+    with torch.no_grad():
+        for critic in critics:
+            critic(rollout)
+            critic(rollout["next"])
+    return rollout
+
+
+def loop_gae(reward, value, next_value, done, terminated, gamma, lmbda):
+    advantage = torch.zeros_like(reward)
+    for n in range(reward.shape[0]):
+        running = 0.0
+        for t in reversed(range(reward.shape[1])):
+            bootstrap = 0.0 if terminated[n, t] else next_value[n, t]
+            error = reward[n, t] + gamma * bootstrap - value[n, t]
+            running = error + (0.0 if done[n, t] else gamma * lmbda * running)
+            advantage[n, t] = running
+    return advantage
+
+
+def loop_return_to_go(reward, next_value, done, terminated, gamma):
+    returns = torch.zeros_like(reward)
+    for n in range(reward.shape[0]):
+        for t in reversed(range(reward.shape[1])):
+            if terminated[n, t]:
+                following = 0.0
+            elif done[n, t] or t == reward.shape[1] - 1:
+                following = next_value[n, t]
+            else:
+                following = returns[n, t + 1]
+            returns[n, t] = reward[n, t] + gamma * following
+    return returns
+
+
+def expected(rollout, reward, value, gamma, lmbda):
+    following = rollout["next"]
+    ends = following["done"], following["terminated"]
+    next_value = following[value]
+    advantage = loop_gae(reward, rollout[value], next_value, *ends, gamma, lmbda)
+    return advantage, loop_return_to_go(reward, next_value, *ends, gamma)
+
+
+@pytest.mark.parametrize("precomputed", [False, True])
+@pytest.mark.parametrize("lmbda", [0.0, 0.9, 0.97, 1.0])
+def test_reward_advantage_and_targets(lmbda, precomputed):
+    critic = make_critic()
+    rollout = make_rollout([critic])
+    advantage, to_go = expected(rollout, rollout["next", "reward"], "state_value", 0.95, lmbda)
+    targets = {"lambda_return": advantage + rollout["state_value"], "return_to_go": to_go}
+    for name, target in targets.items():
+        data = rollout.clone()
+        if not precomputed:
+            del data["state_value"], data["next", "state_value"]
+        network = None if precomputed else critic
+        out = VectorGAE(network, gamma=0.95, lmbda=lmbda, value_target=name)(data)
+        torch.testing.assert_close(out["advantage"], advantage, atol=1e-5, rtol=1e-5)
+        torch.testing.assert_close(out["value_target"], target, atol=1e-5, rtol=1e-5)
+        torch.testing.assert_close(out["state_value"], rollout["state_value"])
+        assert not out["advantage"].requires_grad
+
+
+@pytest.mark.parametrize("keys", [["cost"], ["cost_hazards", "cost_vases"], ["a", ("b", "c"), "d"]])
+def test_k_costs_at_once(keys):
+    critic = make_critic("cost_value", len(keys))
+    rollout = make_rollout([critic], costs=keys)
+    estimator = CostGAE(keys, critic, gamma=0.99, lmbda=0.95, value_target="return_to_go")
+    costs = torch.cat([rollout["next", *([k] if isinstance(k, str) else k)] for k in keys], -1)
+    advantage, target = expected(rollout, costs, "cost_value", 0.99, 0.95)
+    out = estimator(rollout.select("observation", "next"))
+    torch.testing.assert_close(out["cost_advantage"], advantage, atol=1e-5, rtol=1e-5)
+    torch.testing.assert_close(out["cost_value_target"], target, atol=1e-5, rtol=1e-5)
+
+
+def test_agrees_with_torchrl_gae():
+    critic = make_critic()
+    rollout = make_rollout([critic])
+    ours = VectorGAE(critic, gamma=0.99, lmbda=0.97, value_target="lambda_return")(rollout.clone())
+    theirs = GAE(gamma=0.99, lmbda=0.97, value_network=critic)(rollout.clone())
+    for key in ("advantage", "value_target"):
+        torch.testing.assert_close(ours[key], theirs[key], atol=1e-5, rtol=1e-5)
+
+
+def test_each_observation_is_valued_once():
+    critic = make_critic()
+    rollout = make_rollout([critic])
+    valued = []
+    critic.register_forward_hook(lambda _module, args, _out: valued.append(args[0].numel()))
+    VectorGAE(critic, gamma=0.9, lmbda=0.9, value_target="lambda_return")(rollout)
+    ends = rollout["next", "done"].squeeze(-1).clone()
+    ends[:, -1] = True
+    assert sum(valued) == N * T + ends.sum()
+
+
+def test_other_keys_and_a_single_trajectory():
+    critic = make_critic(("values", "state"), in_key=("agent", "observation"))
+    rollout = make_rollout([])[0]
+    rollout["agent", "observation"] = rollout.pop("observation")
+    rollout["next", "agent", "observation"] = rollout.pop(("next", "observation"))
+    rollout["next", "agent", "r"] = rollout.pop(("next", "reward"))
+    estimator = VectorGAE(critic, gamma=0.9, lmbda=0.9, value_target="lambda_return")
+    estimator.set_keys(value=("values", "state"), reward=("agent", "r"), advantage=("out", "a"))
+    with torch.no_grad():
+        value = critic(rollout.clone())["values", "state"]
+        next_value = critic(rollout["next"].clone())["values", "state"]
+    following = rollout["next"]
+    advantage = loop_gae(
+        following["agent", "r"][None],
+        value[None],
+        next_value[None],
+        following["done"][None],
+        following["terminated"][None],
+        0.9,
+        0.9,
+    )[0]
+    assert ("next", "agent", "r") in estimator.in_keys
+    out = estimator(rollout)
+    torch.testing.assert_close(out["out", "a"], advantage, atol=1e-5, rtol=1e-5)
+
+
+def test_thirty_thousand_steps_take_a_tenth_of_a_second():
+    rollout = make_rollout([], n=60, steps=500, p_end=0.001, costs=("cost_hazards", "cost_vases"))
+    shape = (60, 500)
+    for key, outputs in (("state_value", 1), ("cost_value", 2)):
+        rollout[key], rollout["next", key] = torch.randn(2, *shape, outputs)
+    settings = {"gamma": 0.99, "lmbda": 0.97, "value_target": "lambda_return"}
+    reward = VectorGAE(None, **settings)
+    cost = CostGAE(["cost_hazards", "cost_vases"], None, **settings)
+    seconds = []
+    for _ in range(3):
+        start = time.perf_counter()
+        cost(reward(rollout))
+        seconds.append(time.perf_counter() - start)
+    assert min(seconds) < 0.1
+
+
+def test_normalisation():
+    batch = TensorDict(
+        advantage=5 + 3 * torch.randn(6, 50, 1),
+        cost_advantage=torch.tensor([2.0, 40.0]) * (torch.randn(6, 50, 2) + 1),
+        batch_size=[6, 50],
+    )
+    scale = batch["cost_advantage"].flatten(0, 1).std(0)
+    normalise_advantages(batch)
+    torch.testing.assert_close(batch["advantage"].mean(), torch.tensor(0.0), atol=1e-6, rtol=0)
+    torch.testing.assert_close(batch["advantage"].std(correction=0), torch.tensor(1.0))
+    costs = batch["cost_advantage"].flatten(0, 1)
+    torch.testing.assert_close(costs.mean(0), torch.zeros(2), atol=1e-5, rtol=0)
+    torch.testing.assert_close(costs.std(0), scale)
+
+
+def test_normalisation_of_a_constant_advantage_is_zero():
+    batch = TensorDict(advantage=torch.full((5, 1), 7.0), batch_size=[5])
+    assert torch.equal(normalise_advantages(batch)["advantage"], torch.zeros(5, 1))
+
+
+def test_errors_say_what_to_change():
+    settings = {"gamma": 0.99, "lmbda": 0.97}
+    with pytest.raises(ValueError, match="lambda_return"):
+        VectorGAE(None, value_target="montecarlo", **settings)
+    cost = CostGAE(
+        ["cost_hazard"], make_critic("cost_value"), value_target="return_to_go", **settings
+    )
+    rollout = make_rollout([], costs=("cost_hazards", "cost_vases"))
+    with pytest.raises(KeyError, match=r"Nearest key: \('next', 'cost_hazards'\)"):
+        cost(rollout)
+    cost.set_keys(reward=["cost_hazards", "cost_vases"])
+    with pytest.raises(ValueError, match="one output per signal"):
+        cost(rollout)
+    reward = VectorGAE(None, value_target="lambda_return", **settings)
+    with pytest.raises(KeyError, match="state_value"):
+        reward(rollout)
