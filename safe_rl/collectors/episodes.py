@@ -1,0 +1,176 @@
+"""Episode accounting: returns, episode costs and cost rates of the collected batches."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from tensordict import NestedKey, TensorDictBase, unravel_key
+from torch import Tensor
+
+__all__ = ["EpisodeAccounting", "EpisodeStatistics"]
+
+
+@dataclass(frozen=True)
+class EpisodeStatistics:
+    """What one batch says about episodes.
+
+    Attributes:
+        returns: Undiscounted return of every episode that finished in the batch, shape [E].
+        costs: Cost key -> undiscounted cost of every finished episode, shape [E].
+        lengths: Steps of every finished episode, shape [E].
+        cost_rates: Cost key -> all cost so far divided by all steps so far, ρ_c, scalar tensors.
+
+    Examples:
+        >>> import torch
+        >>> statistics = EpisodeStatistics(
+        ...     returns=torch.tensor([1.0, 3.0]),
+        ...     costs={"cost": torch.tensor([20.0, 40.0])},
+        ...     lengths=torch.tensor([1000.0, 1000.0]),
+        ...     cost_rates={"cost": torch.tensor(0.03)},
+        ... )
+        >>> statistics.mean_costs(["cost"])
+        tensor([30.])
+    """
+
+    returns: Tensor
+    costs: dict[str, Tensor]
+    lengths: Tensor
+    cost_rates: dict[str, Tensor]
+
+    @property
+    def num_episodes(self) -> int:
+        """Number of episodes that finished in the batch, E."""
+        return self.returns.shape[0]
+
+    def mean_costs(self, cost_keys: Sequence[str]) -> Tensor:
+        """Mean episode cost J_c per key, shape [len(cost_keys)]; NaN if no episode finished."""
+        if not cost_keys:
+            return self.returns.new_empty(0)
+        return torch.stack([self.costs[key].mean() for key in cost_keys])
+
+    def scalars(self) -> dict[str, float]:
+        """Means under the names of the log; NaN where no episode finished."""
+        rows = {
+            "episodes": float(self.num_episodes),
+            "episode_return": self.returns.mean().item(),
+            "episode_length": self.lengths.mean().item(),
+        }
+        rows |= {f"episode_{key}": costs.mean().item() for key, costs in self.costs.items()}
+        rows |= {f"{key}_rate": rate.item() for key, rate in self.cost_rates.items()}
+        return rows
+
+
+def _key_name(key: NestedKey) -> str:
+    """A possibly nested key as one string, its parts joined by `/`."""
+    return key if isinstance(key, str) else "/".join(key)
+
+
+class EpisodeAccounting:
+    """Sum rewards and costs over episodes that may span any number of batches.
+
+    The sums are taken over whole batches at once, after collection, so that nothing is added to
+    the steps of the environment.
+
+    Args:
+        num_envs: Number of environments N.
+        cost_keys: Keys below ``"next"`` to account for, each [N, T, 1].
+        reward_key: Key of the reward below ``"next"``.
+        done_key: Key of the end of an episode below ``"next"``.
+        device: Device of the batches.
+
+    Raises:
+        KeyError: By :meth:`update`, if a key is not in the batch.
+        ValueError: By :meth:`update`, if the batch does not have the shape [N, T].
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> accounting = EpisodeAccounting(num_envs=1, cost_keys=["cost"])
+        >>> done = torch.tensor([[[False], [True], [False]]])
+        >>> step = {"reward": torch.ones(1, 3, 1), "cost": torch.ones(1, 3, 1), "done": done}
+        >>> batch = TensorDict({"next": step}, [1, 3])
+        >>> accounting.update(batch).costs["cost"]  # one episode, two steps long
+        tensor([2.], dtype=torch.float64)
+        >>> accounting.update(batch).costs["cost"]  # its first step was in the last batch
+        tensor([3.], dtype=torch.float64)
+    """
+
+    def __init__(
+        self,
+        num_envs: int,
+        cost_keys: Sequence[NestedKey],
+        *,
+        reward_key: NestedKey = "reward",
+        done_key: NestedKey = "done",
+        device: torch.device | str | None = None,
+    ) -> None:
+        self.cost_keys = list(cost_keys)
+        self.done_key = done_key
+        self._signal_keys = [reward_key, *self.cost_keys]
+        num_sums = 1 + len(self._signal_keys)
+        # float64 keeps sums of indicator costs exact and those of rewards independent of how the
+        # steps were cut into batches to far below what is logged
+        self._open_sums = torch.zeros(num_envs, num_sums, dtype=torch.float64, device=device)
+        self._totals = torch.zeros(num_sums, dtype=torch.float64, device=device)
+
+    def update(self, batch: TensorDictBase) -> EpisodeStatistics:
+        """Account for one batch of consecutive steps, shape [N, T], batches in order of time."""
+        num_envs = self._open_sums.shape[0]
+        if batch.ndim != 2 or batch.shape[0] != num_envs:
+            raise ValueError(
+                f"The batch has shape {list(batch.shape)}, but the accounting is for {num_envs} "
+                f"environments: it needs [{num_envs}, T], as the collector returns it."
+            )
+        signals = torch.stack([self._column(batch, key) for key in self._signal_keys], -1)
+        signals = torch.cat([torch.ones_like(signals[..., :1]), signals], -1)
+        finished = self._close_episodes(signals, self._column(batch, self.done_key).long())
+        self._totals += signals.sum((0, 1))
+        names = [_key_name(key) for key in self.cost_keys]
+        rates = self._totals[2:] / self._totals[0]
+        return EpisodeStatistics(
+            returns=finished[:, 1],
+            costs=dict(zip(names, finished[:, 2:].unbind(-1), strict=True)),
+            lengths=finished[:, 0],
+            cost_rates=dict(zip(names, rates.unbind(), strict=True)),
+        )
+
+    def _close_episodes(self, signals: Tensor, done: Tensor) -> Tensor:
+        """Sums of the finished episodes, [E, m], from signals [N, T, m] and done [N, T]."""
+        num_envs, _, num_sums = signals.shape
+        num_done = done.sum(1)
+        # index of the episode that each step belongs to, counted from the batch's first step
+        episode = done.cumsum(1) - done
+        sums = signals.new_zeros(num_envs, int(num_done.max()) + 1, num_sums)
+        sums[:, 0] = self._open_sums
+        sums.scatter_add_(1, episode.unsqueeze(-1).expand_as(signals), signals)
+        is_finished = torch.arange(sums.shape[1], device=sums.device) < num_done.unsqueeze(1)
+        last = num_done.view(-1, 1, 1).expand(-1, 1, num_sums)
+        self._open_sums = sums.gather(1, last).squeeze(1)
+        return sums[is_finished]
+
+    @staticmethod
+    def _column(batch: TensorDictBase, key: NestedKey) -> Tensor:
+        """Entry below "next" as float64, shape [N, T]."""
+        entry = batch.get(unravel_key(("next", key)), None)
+        if entry is None:
+            known = sorted(map(str, batch.get("next").keys(True, True)))
+            raise KeyError(f"The batch has no ('next', {key!r}). What it has there: {known}.")
+        return entry.squeeze(-1).double()
+
+    def state_dict(self) -> dict[str, Tensor]:
+        """Sums of the open episodes and of all steps so far."""
+        return {"open_sums": self._open_sums.clone(), "totals": self._totals.clone()}
+
+    def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
+        """Continue from :meth:`state_dict`."""
+        for name, target in (("open_sums", self._open_sums), ("totals", self._totals)):
+            if state_dict[name].shape != target.shape:
+                raise ValueError(
+                    f"The saved '{name}' has shape {list(state_dict[name].shape)}, this run needs "
+                    f"{list(target.shape)}: it has other environments or cost keys than the saved."
+                )
+        self._open_sums = state_dict["open_sums"].to(self._open_sums)
+        self._totals = state_dict["totals"].to(self._totals)

@@ -1,0 +1,124 @@
+"""Episode accounting against a plain loop over environments and steps."""
+
+import pytest
+import torch
+from tensordict import TensorDict
+
+from safe_rl.collectors import EpisodeAccounting
+
+COST_KEYS = ["cost", ("agent", "cost_speed")]
+
+
+def random_batch(generator, num_envs, num_steps, done_probability):
+    shape = (num_envs, num_steps, 1)
+    step = TensorDict(
+        reward=torch.randn(shape, generator=generator),
+        cost=torch.randint(0, 3, shape, generator=generator).float(),
+        agent={"cost_speed": torch.rand(shape, generator=generator)},
+        done=torch.rand(shape, generator=generator) < done_probability,
+        batch_size=[num_envs, num_steps],
+    )
+    return TensorDict({"next": step}, [num_envs, num_steps])
+
+
+class LoopAccounting:
+    """The definition, one step of one environment at a time."""
+
+    def __init__(self, num_envs):
+        self.open = [[0.0, 0.0, 0.0, 0] for _ in range(num_envs)]
+        self.steps, self.cost, self.speed_cost = 0, 0.0, 0.0
+
+    def update(self, batch):
+        finished = []
+        for row in range(batch.shape[0]):
+            for t in range(batch.shape[1]):
+                step = batch["next"][row, t]
+                signals = [step["reward"], step["cost"], step["agent", "cost_speed"]]
+                for i, signal in enumerate(signals):
+                    self.open[row][i] += signal.double().item()
+                self.open[row][3] += 1
+                self.steps += 1
+                self.cost += signals[1].double().item()
+                self.speed_cost += signals[2].double().item()
+                if step["done"].item():
+                    finished.append(self.open[row])
+                    self.open[row] = [0.0, 0.0, 0.0, 0]
+        return finished, (self.cost / self.steps, self.speed_cost / self.steps)
+
+
+@pytest.mark.parametrize("done_probability", [0.0, 0.02, 0.3, 1.0])
+@pytest.mark.parametrize(("num_envs", "num_steps"), [(1, 7), (3, 40), (5, 1)])
+def test_agrees_with_a_loop_over_several_batches(num_envs, num_steps, done_probability):
+    generator = torch.Generator().manual_seed(num_envs + num_steps)
+    accounting, loop = EpisodeAccounting(num_envs, COST_KEYS), LoopAccounting(num_envs)
+    for _ in range(4):
+        batch = random_batch(generator, num_envs, num_steps, done_probability)
+        statistics = accounting.update(batch)
+        finished, (cost_rate, speed_rate) = loop.update(batch)
+        assert statistics.num_episodes == len(finished)
+        expected = torch.tensor(finished, dtype=torch.float64).reshape(-1, 4)
+        columns = [
+            statistics.returns,
+            statistics.costs["cost"],
+            statistics.costs["agent/cost_speed"],
+            statistics.lengths,
+        ]
+        torch.testing.assert_close(torch.stack(columns, -1), expected)
+        assert statistics.cost_rates["cost"].item() == pytest.approx(cost_rate)
+        assert statistics.cost_rates["agent/cost_speed"].item() == pytest.approx(speed_rate)
+
+
+def test_result_does_not_depend_on_where_batches_are_cut():
+    batch = random_batch(torch.Generator().manual_seed(1), 3, 60, 0.05)
+    whole = EpisodeAccounting(3, COST_KEYS).update(batch)
+    pieces = EpisodeAccounting(3, COST_KEYS)
+    parts = [pieces.update(batch[:, start : start + 12]) for start in range(0, 60, 12)]
+    for key in whole.costs:
+        joined = torch.cat([part.costs[key] for part in parts])
+        torch.testing.assert_close(joined.sort().values, whole.costs[key].sort().values)
+        assert parts[-1].cost_rates[key].item() == pytest.approx(whole.cost_rates[key].item())
+
+
+def test_means_are_nan_and_rates_are_known_before_an_episode_finishes():
+    batch = random_batch(torch.Generator().manual_seed(0), 2, 5, 0.0)
+    statistics = EpisodeAccounting(2, COST_KEYS).update(batch)
+    assert statistics.mean_costs(["cost"]).isnan().all()
+    scalars = statistics.scalars()
+    assert scalars["episodes"] == 0
+    assert scalars["episode_return"] != scalars["episode_return"]
+    assert scalars["cost_rate"] == pytest.approx(batch["next", "cost"].mean().item())
+    assert list(scalars) == [
+        "episodes", "episode_return", "episode_length",
+        "episode_cost", "episode_agent/cost_speed", "cost_rate", "agent/cost_speed_rate",
+    ]  # fmt: skip
+
+
+def test_state_dict_continues_open_episodes():
+    generator = torch.Generator().manual_seed(3)
+    batches = [random_batch(generator, 4, 10, 0.1) for _ in range(2)]
+    first, second = EpisodeAccounting(4, COST_KEYS), EpisodeAccounting(4, COST_KEYS)
+    first.update(batches[0])
+    second.load_state_dict(first.state_dict())
+    expected, continued = first.update(batches[1]), second.update(batches[1])
+    assert torch.equal(expected.returns, continued.returns)
+    assert torch.equal(expected.cost_rates["cost"], continued.cost_rates["cost"])
+
+
+def test_saved_state_is_not_changed_by_later_batches():
+    generator = torch.Generator().manual_seed(3)
+    accounting = EpisodeAccounting(4, COST_KEYS)
+    accounting.update(random_batch(generator, 4, 10, 0.1))
+    state = accounting.state_dict()
+    before = {name: value.clone() for name, value in state.items()}
+    accounting.update(random_batch(generator, 4, 10, 0.1))
+    assert all(torch.equal(state[name], before[name]) for name in state)
+
+
+def test_errors_say_what_is_wrong():
+    batch = random_batch(torch.Generator(), 2, 5, 0.5)
+    with pytest.raises(KeyError, match="cost_hazard"):
+        EpisodeAccounting(2, ["cost_hazard"]).update(batch)
+    with pytest.raises(ValueError, match="needs \\[3, T\\]"):
+        EpisodeAccounting(3, COST_KEYS).update(batch)
+    with pytest.raises(ValueError, match="other environments or cost keys"):
+        EpisodeAccounting(2, ["cost"]).load_state_dict(EpisodeAccounting(2, COST_KEYS).state_dict())

@@ -1,0 +1,115 @@
+"""Networks: initialisation, distribution, and the fast behaviour policy."""
+
+import math
+
+import pytest
+import torch
+from tensordict import TensorDict
+from tensordict.nn import TensorDictModule
+from torch import nn
+from torchrl.envs.utils import ExplorationType, set_exploration_type
+from torchrl.modules import ProbabilisticActor, TanhNormal
+
+from safe_rl.models import BehaviourPolicy, InputScale, input_scale_vector, make_actor, make_critic
+
+
+def observations(*shape):
+    return TensorDict({"observation": torch.randn(*shape, 5)}, list(shape))
+
+
+def linear_layers(module):
+    return [layer for layer in module.modules() if isinstance(layer, nn.Linear)]
+
+
+def test_weights_are_glorot_uniform_and_biases_zero():
+    for layer in linear_layers(make_critic(200, hidden_sizes=[300, 100])):
+        bound = math.sqrt(6 / (layer.in_features + layer.out_features))
+        assert layer.weight.abs().max() <= bound
+        # a uniform variable on [-b, b] has the standard deviation b / sqrt(3)
+        if layer.weight.numel() > 1000:
+            assert layer.weight.std().item() == pytest.approx(bound / math.sqrt(3), rel=0.05)
+        assert not layer.bias.any()
+
+
+def test_actor_is_a_tanh_perceptron_with_a_diagonal_gaussian():
+    actor = make_actor(5, 2, hidden_sizes=[6, 7], initial_log_std=-0.5)
+    batch = observations(3, 4)
+    hidden = batch["observation"]
+    first, second, last = linear_layers(actor)
+    for layer in (first, second):
+        hidden = torch.tanh(hidden @ layer.weight.T + layer.bias)
+    loc = hidden @ last.weight.T + last.bias
+    reference = torch.distributions.Normal(loc, math.exp(-0.5))
+    distribution = actor.get_dist(batch)
+    action = torch.randn(3, 4, 2)
+    torch.testing.assert_close(distribution.mean, loc)
+    torch.testing.assert_close(distribution.log_prob(action), reference.log_prob(action).sum(-1))
+    torch.testing.assert_close(distribution.entropy(), reference.entropy().sum(-1))
+
+
+def test_critic_has_one_output_per_cost():
+    critic = make_critic(5, hidden_sizes=[6], num_outputs=3, out_key="cost_value")
+    assert critic(observations(2, 7))["cost_value"].shape == (2, 7, 3)
+
+
+def test_behaviour_policy_writes_what_the_actor_writes():
+    actor = make_actor(5, 2, hidden_sizes=[6], initial_log_std=-0.3)
+    sample, expected = BehaviourPolicy(actor)(observations(4)), actor(observations(4))
+    assert set(sample.keys()) == set(expected.keys())
+    assert all(sample[key].shape == expected[key].shape for key in expected.keys())  # noqa: SIM118
+    distribution = actor.get_dist(sample)
+    torch.testing.assert_close(sample["loc"], distribution.mean)
+    torch.testing.assert_close(sample["action_log_prob"], distribution.log_prob(sample["action"]))
+
+
+def test_behaviour_policy_samples_the_actors_distribution():
+    actor = make_actor(5, 2, hidden_sizes=[6], initial_log_std=-0.3)
+    batch = TensorDict({"observation": torch.ones(20_000, 5)}, [20_000])
+    with torch.no_grad():
+        sample = BehaviourPolicy(actor)(batch)
+    torch.testing.assert_close(sample["action"].mean(0), sample["loc"][0], atol=0.02, rtol=0)
+    torch.testing.assert_close(sample["action"].std(0), sample["scale"][0], atol=0.02, rtol=0)
+    correlation = torch.corrcoef(sample["action"].T)[0, 1]
+    assert abs(correlation) < 0.03
+
+
+def test_behaviour_policy_follows_the_actors_parameters_and_the_exploration_type():
+    actor = make_actor(5, 2, hidden_sizes=[6], initial_log_std=-0.5)
+    policy = BehaviourPolicy(actor)
+    batch = observations(4)
+    with torch.no_grad():
+        for parameter in actor.parameters():
+            parameter.add_(0.1)
+    with set_exploration_type(ExplorationType.DETERMINISTIC):
+        sample = policy(batch)
+    torch.testing.assert_close(sample["action"], actor.get_dist(batch).mean)
+
+
+def test_behaviour_policy_refuses_other_distributions():
+    network = TensorDictModule(nn.Linear(5, 4), in_keys=["observation"], out_keys=["loc", "scale"])
+    squashed = ProbabilisticActor(network, in_keys=["loc", "scale"], distribution_class=TanhNormal)
+    with pytest.raises(TypeError, match="TanhNormal"):
+        BehaviourPolicy(squashed)
+
+
+def test_input_scale_is_fixed_saved_and_applied():
+    scale = input_scale_vector(
+        {"gyro": 0.5, "absent": 9.0}, {"gyro": slice(3, 5), "lidar": slice(0, 3)}
+    )
+    assert scale.tolist() == [1.0, 1.0, 1.0, 0.5, 0.5]
+    scaled = make_critic(5, hidden_sizes=[6], input_scale=scale)
+    plain = make_critic(5, hidden_sizes=[6])
+    weights = (value for name, value in scaled.state_dict().items() if "scale" not in name)
+    plain.load_state_dict(dict(zip(plain.state_dict(), weights, strict=True)))
+    batch = observations(4)
+    expected = plain(TensorDict({"observation": batch["observation"] * scale}, [4]))
+    torch.testing.assert_close(scaled(batch)["state_value"], expected["state_value"])
+    assert all(parameter is not scale for parameter in scaled.parameters())
+    assert any(isinstance(module, InputScale) for module in scaled.modules())
+    assert sum("scale" in name for name in scaled.state_dict()) == 1
+
+
+def test_input_scale_without_observed_components_is_none():
+    assert input_scale_vector({"gyro": 0.5}, {"lidar": slice(0, 3)}) is None
+    with pytest.raises(ValueError, match="'gyro' is 0"):
+        input_scale_vector({"gyro": 0.0}, {"gyro": slice(0, 3)})
