@@ -1,0 +1,151 @@
+"""Losses of the reward critic and the cost critic."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from tensordict import NestedKey, TensorDict, TensorDictBase, TensorDictParams
+from tensordict.nn import TensorDictModuleBase, dispatch
+from torch import Tensor
+from torchrl.objectives import LossModule
+
+from safe_rl.objectives.keys import require
+
+
+def explained_variance(prediction: Tensor, target: Tensor) -> Tensor:
+    """1 − Var(target − prediction) / Var(target), per column.
+
+    Args:
+        prediction: [..., F].
+        target: [..., F].
+
+    Returns:
+        [F]; 1 is perfect, 0 no better than a constant. 0 for a constant target.
+    """
+    residual = (target - prediction).flatten(0, -2).var(0, correction=0)
+    total = target.flatten(0, -2).var(0, correction=0)
+    return (1 - residual / total).where(total > 0, 0.0)
+
+
+class CriticLoss(LossModule):
+    """Squared errors of a reward critic and, if there is one, of a cost critic.
+
+    Writes ``loss_critic`` and ``loss_cost_critic`` (summed over the k costs), to be added and
+    minimised, and the detached ``explained_variance`` (scalar) and
+    ``cost_explained_variance`` [k].
+
+    Args:
+        critic: writes the value key, [..., 1].
+        cost_critic: writes the cost value key, [..., k].
+        reduction: ``"mean"``, ``"sum"`` or ``"none"`` over the samples.
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from tensordict.nn import TensorDictModule
+        >>> critic = TensorDictModule(
+        ...     torch.nn.Linear(3, 1), in_keys=["observation"], out_keys=["state_value"]
+        ... )
+        >>> cost_critic = TensorDictModule(
+        ...     torch.nn.Linear(3, 2), in_keys=["observation"], out_keys=["cost_value"]
+        ... )
+        >>> batch = TensorDict(
+        ...     observation=torch.randn(8, 3),
+        ...     value_target=torch.randn(8, 1),
+        ...     cost_value_target=torch.randn(8, 2),
+        ...     batch_size=[8],
+        ... )
+        >>> losses = CriticLoss(critic, cost_critic)(batch)
+        >>> (losses["loss_critic"] + losses["loss_cost_critic"]).backward()
+    """
+
+    @dataclass
+    class _AcceptedKeys:
+        """Keys that `set_keys` accepts.
+
+        Attributes:
+            value: the critic's output, [..., 1].
+            value_target: [..., 1].
+            cost_value: the cost critic's output, [..., k].
+            cost_value_target: [..., k].
+        """
+
+        value: NestedKey = "state_value"
+        value_target: NestedKey = "value_target"
+        cost_value: NestedKey = "cost_value"
+        cost_value_target: NestedKey = "cost_value_target"
+
+    tensor_keys: _AcceptedKeys
+    default_keys = _AcceptedKeys
+
+    critic: TensorDictModuleBase
+    critic_params: TensorDictParams
+    target_critic_params: TensorDictParams
+    cost_critic: TensorDictModuleBase | None
+    cost_critic_params: TensorDictParams | None
+    target_cost_critic_params: TensorDictParams | None
+
+    def __init__(
+        self,
+        critic: TensorDictModuleBase,
+        cost_critic: TensorDictModuleBase | None = None,
+        *,
+        reduction: str = "mean",
+    ) -> None:
+        super().__init__()
+        self.reduction = reduction
+        self.convert_to_functional(critic, "critic")
+        self.out_keys = ["loss_critic", "explained_variance"]
+        self.cost_critic, self.cost_critic_params = None, None
+        if cost_critic is not None:
+            self.convert_to_functional(cost_critic, "cost_critic")
+            self.out_keys = [*self.out_keys, "loss_cost_critic", "cost_explained_variance"]
+
+    @property
+    def in_keys(self) -> list[NestedKey]:
+        """Entries of the batch that are read."""
+        keys = [*self.critic.in_keys, self.tensor_keys.value_target]
+        if self.cost_critic is not None:
+            keys += [*self.cost_critic.in_keys, self.tensor_keys.cost_value_target]
+        return list(dict.fromkeys(keys))
+
+    @dispatch
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Evaluate the losses.
+
+        Args:
+            tensordict: batch of any shape with `in_keys`; left as it is.
+
+        Returns:
+            TensorDict with `out_keys`, without batch dimension.
+
+        Raises:
+            KeyError: if an entry is missing.
+            ValueError: if a value and its target differ in shape.
+        """
+        keys = self.tensor_keys
+        loss, variance = self._regression(tensordict, "critic", keys.value, keys.value_target)
+        out = {"loss_critic": loss, "explained_variance": variance.squeeze(-1)}
+        if self.cost_critic is not None:
+            out["loss_cost_critic"], out["cost_explained_variance"] = self._regression(
+                tensordict, "cost_critic", keys.cost_value, keys.cost_value_target
+            )
+        losses = TensorDict(out)
+        self._clear_weakrefs(tensordict, losses, "critic_params", "cost_critic_params")
+        return losses
+
+    def _regression(
+        self, tensordict: TensorDictBase, name: str, value_key: NestedKey, target_key: NestedKey
+    ) -> tuple[Tensor, Tensor]:
+        """Squared error, summed over columns, and explained variance [F] of one critic."""
+        network, params = getattr(self, name), getattr(self, f"{name}_params")
+        target = require(tensordict, target_key, "VectorGAE and CostGAE write value targets.")
+        with params.to_module(network, preserve_module_state=False):
+            value = network(tensordict.select(*network.in_keys)).get(value_key)
+        if value.shape != target.shape:
+            raise ValueError(
+                f"{value_key!r} has shape {tuple(value.shape)} but {target_key!r} has "
+                f"{tuple(target.shape)}: the {name} needs one output per target."
+            )
+        error = (value - target).square().sum(-1)
+        return self._reduce_loss(error, tensordict), explained_variance(value.detach(), target)

@@ -1,0 +1,227 @@
+"""What all policy losses share: importance ratios, the Lagrangian, and diagnostics."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from tensordict import NestedKey, TensorDict, TensorDictBase, TensorDictParams
+from tensordict.nn import ProbabilisticTensorDictSequential, dispatch
+from torch import Tensor
+from torch.distributions import Distribution
+from torchrl.objectives import LossModule
+
+from safe_rl.objectives.gaussian import gaussian_kl, normal_parameters
+from safe_rl.objectives.keys import key_name, require
+from safe_rl.objectives.multipliers import Multiplier
+
+
+def lagrangian(reward_gain: Tensor, cost_gain: Tensor, multipliers: Tensor) -> Tensor:
+    """(L_r − Σᵢ λᵢ L_cᵢ) / (1 + Σᵢ λᵢ).
+
+    The division keeps the step size of an optimiser independent of λ (Stooke, Achiam and
+    Abbeel 2020, section 4.4).
+
+    Args:
+        reward_gain: per-sample reward surrogate, [..., 1].
+        cost_gain: per-sample cost surrogates, [..., k].
+        multipliers: λ, [k].
+
+    Returns:
+        Per-sample objective to maximise, [..., 1].
+    """
+    penalty = (cost_gain * multipliers).sum(-1, keepdim=True)
+    return (reward_gain - penalty) / (1 + multipliers.sum())
+
+
+def effective_sample_size(log_weight: Tensor) -> Tensor:
+    """Kish's effective sample size of importance weights, as a fraction of the samples."""
+    log_weight = log_weight.flatten()
+    log_size = 2 * log_weight.logsumexp(0) - (2 * log_weight).logsumexp(0)
+    return log_size.exp() / log_weight.numel()
+
+
+class SurrogateLoss(LossModule):
+    """Base of the policy losses: subclasses turn log-ratios into surrogates.
+
+    Reads a batch of any shape, [B] or [N, T], with normalised advantages. Writes
+    ``loss_objective`` (to minimise), ``loss_entropy`` if there is an entropy bonus, and the
+    detached scalars ``kl`` (mean over states of KL(π_k ‖ π_θ), π_k the policy whose parameters
+    the batch holds), ``entropy`` and ``ESS``.
+
+    Args:
+        actor_network: policy with `get_dist` and a Gaussian distribution.
+        entropy_coeff: factor of the entropy bonus; with 0 there is no ``loss_entropy``.
+        multiplier: weighs the costs; None if there is none to weigh.
+        reduction: how samples are reduced: ``"mean"``, ``"sum"`` or ``"none"``.
+    """
+
+    @dataclass
+    class _AcceptedKeys:
+        """Keys that `set_keys` accepts.
+
+        Attributes:
+            advantage: reward advantage, [..., 1].
+            cost_advantage: cost advantages, [..., k]; read if the loss has costs.
+            action: action taken, [..., n].
+            sample_log_prob: its log-probability under the behaviour policy, [...].
+            loc: mean of the behaviour policy, [..., n].
+            scale: standard deviation of the behaviour policy, [..., n].
+        """
+
+        advantage: NestedKey = "advantage"
+        cost_advantage: NestedKey = "cost_advantage"
+        action: NestedKey = "action"
+        sample_log_prob: NestedKey = "action_log_prob"
+        loc: NestedKey = "loc"
+        scale: NestedKey = "scale"
+
+    tensor_keys: _AcceptedKeys
+    default_keys = _AcceptedKeys
+    _schedulable_buffers = frozenset({"entropy_coeff"})
+
+    actor_network: ProbabilisticTensorDictSequential
+    actor_network_params: TensorDictParams
+    target_actor_network_params: TensorDictParams
+    entropy_coeff: Tensor
+
+    #: Entries besides ``loss_objective`` that a subclass adds.
+    extra_out_keys: tuple[str, ...] = ()
+
+    def __init__(
+        self,
+        actor_network: ProbabilisticTensorDictSequential,
+        *,
+        entropy_coeff: float,
+        multiplier: Multiplier | None = None,
+        reduction: str = "mean",
+    ) -> None:
+        super().__init__()
+        self.convert_to_functional(actor_network, "actor_network")
+        self.multiplier = multiplier
+        self.reduction = reduction
+        self.register_coeff_buffer("entropy_coeff", entropy_coeff, device=self._default_device)
+        self.has_entropy_bonus = bool(entropy_coeff)
+        entropy_keys = ["loss_entropy"] if self.has_entropy_bonus else []
+        self.out_keys = [
+            "loss_objective", *entropy_keys, *self.extra_out_keys, "kl", "entropy", "ESS",
+        ]  # fmt: skip
+
+    @property
+    def has_costs(self) -> bool:
+        """Whether cost advantages are read."""
+        return self.multiplier is not None
+
+    @property
+    def in_keys(self) -> list[NestedKey]:
+        """Entries of the batch that are read."""
+        keys = self.tensor_keys
+        costs = [keys.cost_advantage] if self.has_costs else []
+        behaviour = [keys.action, keys.sample_log_prob, keys.loc, keys.scale]
+        return [*self.actor_network.in_keys, *behaviour, keys.advantage, *costs]
+
+    @dispatch
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Evaluate the loss.
+
+        Args:
+            tensordict: batch with `in_keys`; left as it is.
+
+        Returns:
+            TensorDict with `out_keys`, without batch dimension.
+
+        Raises:
+            KeyError: if an entry is missing.
+            ValueError: if advantages do not match log-probabilities or multipliers in shape.
+        """
+        distribution = self._policy(tensordict)
+        log_weight = self._log_weight(tensordict, distribution)
+        entropy = distribution.entropy()
+        out = self._surrogates(tensordict, log_weight)
+        out["loss_objective"] = self._reduce_loss(out["loss_objective"], tensordict)
+        if self.has_entropy_bonus:
+            out["loss_entropy"] = -self.entropy_coeff * self._reduce_loss(entropy, tensordict)
+        kl = self._kl(tensordict, distribution).detach()
+        out["kl"] = self._reduce_loss(kl, tensordict, reduction="mean")
+        out["entropy"] = self._reduce_loss(entropy.detach(), tensordict, reduction="mean")
+        out["ESS"] = effective_sample_size(log_weight.detach())
+        losses = TensorDict(out)
+        self._clear_weakrefs(
+            tensordict, losses, "actor_network_params", "target_actor_network_params"
+        )
+        return losses
+
+    def _surrogates(self, tensordict: TensorDictBase, log_weight: Tensor) -> dict[str, Tensor]:
+        """Per-sample ``loss_objective`` [..., 1] and the `extra_out_keys`."""
+        raise NotImplementedError
+
+    def _policy(self, tensordict: TensorDictBase) -> Distribution:
+        # A copy: actors write their loc and scale, which in the batch are the behaviour policy's.
+        observed = tensordict.select(*self.actor_network.in_keys)
+        with self.actor_network_params.to_module(self.actor_network, preserve_module_state=False):
+            return self.actor_network.get_dist(observed)
+
+    def _log_weight(self, tensordict: TensorDictBase, distribution: Distribution) -> Tensor:
+        """log(π_θ(a|s) / π_k(a|s)), [..., 1]."""
+        keys = self.tensor_keys
+        log_prob = distribution.log_prob(require(tensordict, keys.action))
+        behaviour = require(tensordict, keys.sample_log_prob, "The collector writes it.")
+        if behaviour.shape != log_prob.shape:
+            raise ValueError(
+                f"{keys.sample_log_prob!r} has shape {tuple(behaviour.shape)}, expected "
+                f"{tuple(log_prob.shape)}: one log-probability per action, no trailing dimension."
+            )
+        return (log_prob - behaviour).unsqueeze(-1)
+
+    def _kl(self, tensordict: TensorDictBase, distribution: Distribution) -> Tensor:
+        """KL(π_k ‖ π_θ) per state, [...]."""
+        hint = "It is the behaviour policy's, stored when the action was sampled."
+        loc, scale = (
+            require(tensordict, key, hint) for key in (self.tensor_keys.loc, self.tensor_keys.scale)
+        )
+        return gaussian_kl(loc, scale, *normal_parameters(distribution))
+
+    def _advantage(self, tensordict: TensorDictBase, log_weight: Tensor) -> Tensor:
+        """Reward advantage, [..., 1]."""
+        key = self.tensor_keys.advantage
+        advantage = require(tensordict, key, "VectorGAE writes it.")
+        if advantage.shape != log_weight.shape:
+            raise ValueError(
+                f"{key!r} has shape {tuple(advantage.shape)}, expected {tuple(log_weight.shape)}."
+            )
+        return advantage
+
+    def _cost_advantage(self, tensordict: TensorDictBase, num_costs: int) -> Tensor:
+        """Cost advantages, [..., k]."""
+        key = self.tensor_keys.cost_advantage
+        advantage = require(tensordict, key, "CostGAE writes it.")
+        if advantage.shape[-1] != num_costs or advantage.ndim != tensordict.ndim + 1:
+            raise ValueError(
+                f"{key!r} has shape {tuple(advantage.shape)}, expected "
+                f"{(*tensordict.batch_size, num_costs)}: one column per cost limit."
+            )
+        return advantage
+
+    def _lagrangian(self, tensordict: TensorDictBase, reward_gain: Tensor, ratio: Tensor) -> Tensor:
+        """Objective per sample [..., 1]: the reward's alone if there is no multiplier."""
+        if self.multiplier is None:
+            return reward_gain
+        advantage = self._cost_advantage(tensordict, self.multiplier.num_costs)
+        return lagrangian(reward_gain, ratio * advantage, self.multiplier.value.detach())
+
+    def extra_repr(self) -> str:
+        """Keys that are read."""
+        return f"in_keys={[key_name(key) for key in self.in_keys]}"
+
+
+def require_multiplier(multiplier: Multiplier, plain_loss: str) -> Multiplier:
+    """Raise if a Lagrangian loss is built without a multiplier.
+
+    Raises:
+        TypeError: if `multiplier` is not a `Multiplier`.
+    """
+    if not isinstance(multiplier, Multiplier):
+        raise TypeError(
+            f"A Lagrangian loss needs a LagrangeMultiplier or a PIDMultiplier, got {multiplier!r}: "
+            f"without constraints use {plain_loss}."
+        )
+    return multiplier

@@ -1,0 +1,101 @@
+"""Critic losses against torch's own regression loss and numbers worked out by hand."""
+
+import pytest
+import torch
+from samples import NUM_OBS, make_critic
+from tensordict import TensorDict
+from torch.nn.functional import mse_loss
+
+from safe_rl.objectives.critics import CriticLoss, explained_variance
+
+
+def make_targets(batch_size, num_costs):
+    return TensorDict(
+        observation=torch.randn(*batch_size, NUM_OBS),
+        value_target=torch.randn(*batch_size, 1),
+        cost_value_target=torch.randn(*batch_size, num_costs),
+        batch_size=batch_size,
+    )
+
+
+@pytest.mark.parametrize("batch_size", [[64], [4, 16]])
+@pytest.mark.parametrize("num_costs", [1, 3])
+def test_squared_errors(batch_size, num_costs):
+    critic, cost_critic = make_critic(), make_critic("cost_value", num_costs)
+    batch = make_targets(batch_size, num_costs)
+    losses = CriticLoss(critic, cost_critic)(batch)
+    value, cost_value = (net.module(batch["observation"]) for net in (critic, cost_critic))
+    expected = mse_loss(value, batch["value_target"])
+    expected_cost = num_costs * mse_loss(cost_value, batch["cost_value_target"])
+    torch.testing.assert_close(losses["loss_critic"], expected)
+    torch.testing.assert_close(losses["loss_cost_critic"], expected_cost)
+    assert losses["explained_variance"].shape == ()
+    assert losses["cost_explained_variance"].shape == (num_costs,)
+    assert batch.get("state_value", None) is None
+
+
+def test_one_critic_alone():
+    loss = CriticLoss(make_critic())
+    losses = loss(make_targets([8], 1))
+    assert set(losses.keys()) == set(loss.out_keys) == {"loss_critic", "explained_variance"}
+    assert set(loss.in_keys) == {"observation", "value_target"}
+
+
+def test_adam_fits_linear_targets_and_explains_their_variance():
+    critic, cost_critic = make_critic(), make_critic("cost_value", 2)
+    batch = make_targets([256], 2)
+    weights = torch.randn(NUM_OBS, 3)
+    targets = batch["observation"] @ weights + 1
+    batch["value_target"], batch["cost_value_target"] = targets.split([1, 2], -1)
+    loss = CriticLoss(critic, cost_critic)
+    adam = torch.optim.Adam(loss.parameters(), lr=0.1)
+    for _ in range(300):
+        adam.zero_grad()
+        losses = loss(batch)
+        (losses["loss_critic"] + losses["loss_cost_critic"]).backward()
+        adam.step()
+    assert losses["explained_variance"] > 0.999
+    assert (losses["cost_explained_variance"] > 0.999).all()
+    torch.testing.assert_close(critic.module.weight.T, weights[:, :1], atol=1e-2, rtol=0)
+
+
+def test_explained_variance_by_hand():
+    target = torch.tensor([[0.0, 1.0, 5.0], [2.0, 3.0, 5.0]])
+    prediction = torch.tensor([[0.0, 2.0, 4.0], [2.0, 2.0, 6.0]])
+    # Residual variances 0, 1 and 1 against target variances 1, 1 and 0.
+    torch.testing.assert_close(
+        explained_variance(prediction, target), torch.tensor([1.0, 0.0, 0.0])
+    )
+
+
+def test_nested_keys_and_compile():
+    torch._dynamo.reset()
+    critic = make_critic(("v", "state"), in_key=("agent", "obs"))
+    loss = CriticLoss(critic, make_critic(("v", "cost"), 2, in_key=("agent", "obs")))
+    loss.set_keys(
+        value=("v", "state"),
+        value_target=("target", "state"),
+        cost_value=("v", "cost"),
+        cost_value_target=("target", "cost"),
+    )
+    batch = make_targets([8], 2)
+    batch["agent", "obs"] = batch.pop("observation")
+    batch["target"] = {"state": batch.pop("value_target"), "cost": batch.pop("cost_value_target")}
+    expected = loss(batch)
+    compiled = torch.compile(loss, fullgraph=True, backend="aot_eager")(batch)
+    for key in loss.out_keys:
+        torch.testing.assert_close(compiled[key], expected[key])
+
+
+def test_moves_across_devices():
+    critic, cost_critic = make_critic().to("meta"), make_critic("cost_value", 2).to("meta")
+    losses = CriticLoss(critic, cost_critic)(make_targets([8], 2).to("meta"))
+    assert all(value.device.type == "meta" for value in losses.values())
+
+
+def test_errors_say_what_to_change():
+    loss = CriticLoss(make_critic(), make_critic("cost_value", 2))
+    with pytest.raises(ValueError, match="cost_critic needs one output per target"):
+        loss(make_targets([8], 3))
+    with pytest.raises(KeyError, match="value targets"):
+        loss(make_targets([8], 2).exclude("value_target"))

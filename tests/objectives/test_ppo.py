@@ -1,0 +1,237 @@
+"""PPO losses against TorchRL's PPO, loops written from the definition, and torch's KL."""
+
+import pytest
+import torch
+from samples import make_actor, make_batch, perturb
+from torch.distributions import Independent, Normal, kl_divergence
+from torchrl.objectives import ClipPPOLoss
+
+from safe_rl.objectives.multipliers import LagrangeMultiplier
+from safe_rl.objectives.ppo import PPOLagrangianLoss, PPOLoss
+
+SETTINGS = {"clip_epsilon": 0.2, "entropy_coeff": 0.01}
+LIMITS = {"a": 25.0, "b": 5.0}
+
+
+def make_lagrangian(actor, init=(0.5, 2.0), limits=LIMITS, **settings):
+    multiplier = LagrangeMultiplier(limits, init=init, lr=0.05)
+    return PPOLagrangianLoss(actor, multiplier, **(SETTINGS | settings))
+
+
+def gradient(loss, actor):
+    return torch.autograd.grad(loss, list(actor.parameters()))
+
+
+@pytest.mark.parametrize("batch_size", [[64], [4, 16]])
+def test_plain_ppo_agrees_with_torchrl(batch_size):
+    actor = make_actor()
+    batch = make_batch(actor, batch_size, num_costs=0)
+    perturb(actor, 0.2)
+    theirs = ClipPPOLoss(actor, None, critic_coeff=None, **SETTINGS)
+    theirs.set_keys(sample_log_prob="action_log_prob")
+    expected = theirs(batch.clone())
+    losses = PPOLoss(actor, **SETTINGS)(batch)
+    for key in ("loss_objective", "loss_entropy", "entropy", "clip_fraction"):
+        torch.testing.assert_close(losses[key], expected[key])
+    if len(batch_size) == 1:
+        torch.testing.assert_close(losses["ESS"], expected["ESS"])
+    assert losses["clip_fraction"] > 0
+    ours = gradient(losses["loss_objective"], actor)
+    torch.testing.assert_close(ours, gradient(expected["loss_objective"], actor))
+
+
+@pytest.mark.parametrize("batch_size", [[64], [4, 16]])
+@pytest.mark.parametrize("num_costs", [1, 2, 3])
+def test_lagrangian_from_the_definition(batch_size, num_costs):
+    actor = make_actor()
+    batch = make_batch(actor, batch_size, num_costs)
+    perturb(actor, 0.2)
+    multipliers = [0.5, 2.0, 0.1][:num_costs]
+    loss = make_lagrangian(actor, init=multipliers, limits=[1.0] * num_costs)
+    losses = loss(batch)
+    total = 0.0
+    flat = batch.flatten()
+    with torch.no_grad():
+        log_prob = actor.get_dist(flat.clone()).log_prob(flat["action"])
+    for i in range(flat.shape[0]):
+        ratio = (log_prob[i] - flat["action_log_prob"][i]).exp().item()
+        advantage = flat["advantage"][i].item()
+        bound = (1.2 if advantage > 0 else 0.8) * advantage
+        gain = min(ratio * advantage, bound)
+        costs = flat["cost_advantage"][i].tolist()
+        penalty = sum(lam * ratio * c for lam, c in zip(multipliers, costs, strict=True))
+        total += (gain - penalty) / (1 + sum(multipliers))
+    expected = torch.tensor(-total / flat.shape[0])
+    torch.testing.assert_close(losses["loss_objective"], expected, atol=1e-5, rtol=1e-5)
+
+
+def test_gradient_against_finite_differences():
+    actor = make_actor(width=4)
+    batch = make_batch(actor, [32], 2).double()
+    actor.double()
+    perturb(actor, 0.2)
+    loss = make_lagrangian(actor).double()
+    losses = loss(batch)
+    objective = losses["loss_objective"] + losses["loss_entropy"]
+    parameters = list(actor.parameters())
+    for parameter, grad in zip(parameters, gradient(objective, actor), strict=True):
+        direction = torch.randn_like(parameter)
+        values = []
+        for step in (1e-6, -2e-6):
+            parameter.data += step * direction
+            moved = loss(batch)
+            values.append(moved["loss_objective"] + moved["loss_entropy"])
+        parameter.data += 1e-6 * direction
+        slope = (values[0] - values[1]) / 2e-6
+        torch.testing.assert_close((grad * direction).sum(), slope.detach(), rtol=1e-4, atol=1e-7)
+
+
+def test_cost_surrogates_are_not_clipped():
+    actor = make_actor()
+    batch = make_batch(actor, [64])
+    perturb(actor, 2.0)
+    batch["advantage"].zero_()
+    loss = make_lagrangian(actor, init=1.0, limits=25.0, clip_epsilon=1e-6)
+    losses = loss(batch)
+    log_prob = actor.get_dist(batch.clone()).log_prob(batch["action"])
+    ratio = (log_prob - batch["action_log_prob"]).exp().unsqueeze(-1)
+    torch.testing.assert_close(
+        losses["loss_objective"], (ratio * batch["cost_advantage"]).mean() / 2
+    )
+
+
+def test_kl_is_exact_and_carries_no_gradient():
+    actor = make_actor()
+    batch = make_batch(actor, [4, 16])
+    perturb(actor)
+    behaviour = Independent(Normal(batch["loc"], batch["scale"]), 1)
+    current = actor.get_dist(batch.clone()).base_dist
+    expected = kl_divergence(behaviour, Independent(current, 1)).mean()
+    losses = make_lagrangian(actor, init=1.0, limits=25.0)(batch)
+    torch.testing.assert_close(losses["kl"], expected.detach())
+    trained = {key for key, value in losses.items() if value.requires_grad}
+    assert trained == {"loss_objective", "loss_entropy"}
+    assert set(losses.keys()) == {
+        "loss_objective", "loss_entropy", "kl", "entropy", "ESS", "clip_fraction"
+    }  # fmt: skip
+
+
+def test_batch_is_left_as_it_is():
+    actor = make_actor()
+    batch = make_batch(actor, [16])
+    perturb(actor)
+    before = batch.clone()
+    make_lagrangian(actor, init=1.0, limits=25.0)(batch)
+    assert set(batch.keys()) == set(before.keys())
+    assert (batch == before).all()
+
+
+def test_multiplier_update_reaches_the_loss_and_is_not_trained_by_it():
+    actor = make_actor()
+    batch = make_batch(actor, [16], 2)
+    loss = make_lagrangian(actor)
+    names = [name for name, _ in loss.named_parameters()]
+    assert names
+    assert all(name.startswith("actor_network_params") for name in names)
+    before = loss(batch)["loss_objective"]
+    loss.multiplier.update([60.0, 60.0])
+    assert loss(batch)["loss_objective"] != before
+
+
+@pytest.mark.parametrize("backend", ["eager", "aot_eager"])
+def test_compiles_in_one_graph_that_is_never_recompiled(backend):
+    torch._dynamo.reset()
+    actor = make_actor()
+    batch = make_batch(actor, [64], 2)
+    perturb(actor)
+    loss = make_lagrangian(actor)
+    counter = torch._dynamo.testing.CompileCounterWithBackend(backend)
+    compiled = torch.compile(loss, fullgraph=True, backend=counter)
+    for epoch in range(4):
+        losses = compiled(batch)
+        expected = loss(batch)
+        for key in loss.out_keys:
+            torch.testing.assert_close(losses[key], expected[key])
+        compiled_gradient = gradient(losses["loss_objective"], actor)
+        torch.testing.assert_close(compiled_gradient, gradient(expected["loss_objective"], actor))
+        loss.multiplier.update([60.0 + epoch, 1.0])
+        loss.clip_epsilon, loss.entropy_coeff = 0.1 / (epoch + 1), 0.02 / (epoch + 1)
+        perturb(actor)
+        batch = make_batch(actor, [64], 2)
+    assert counter.frame_count == 1
+
+
+def test_nested_keys():
+    actor = make_actor(in_key=("agent", "obs"), loc=("pi", "loc"), scale=("pi", "scale"))
+    reference = make_actor()
+    reference.load_state_dict(actor.state_dict())
+    batch = make_batch(reference, [16], 2)
+    perturb(actor)
+    perturbed = make_lagrangian(actor)
+    reference.load_state_dict(actor.state_dict())
+    expected = make_lagrangian(reference)(batch)
+    nested = batch.select("action")
+    renamed = {
+        "observation": ("agent", "obs"),
+        "loc": ("pi", "loc"),
+        "scale": ("pi", "scale"),
+        "action_log_prob": ("pi", "log_prob"),
+        "advantage": ("adv", "reward"),
+        "cost_advantage": ("adv", "cost"),
+    }
+    for old, new in renamed.items():
+        nested[new] = batch[old]
+    perturbed.set_keys(
+        loc=("pi", "loc"),
+        scale=("pi", "scale"),
+        sample_log_prob=("pi", "log_prob"),
+        advantage=("adv", "reward"),
+        cost_advantage=("adv", "cost"),
+    )
+    assert set(perturbed.in_keys) == {"action", *renamed.values()}
+    torch.testing.assert_close(perturbed(nested)["loss_objective"], expected["loss_objective"])
+
+
+def test_called_with_keywords():
+    actor = make_actor()
+    batch = make_batch(actor, [16])
+    loss = make_lagrangian(actor, init=1.0, limits=25.0)
+    values = loss(**{key: batch[key] for key in loss.in_keys})
+    torch.testing.assert_close(values[0], loss(batch)["loss_objective"])
+    assert len(values) == len(loss.out_keys)
+
+
+def test_moves_across_devices_and_types():
+    actor = make_actor()
+    batch = make_batch(actor, [16], 2)
+    losses = make_lagrangian(actor).double()(batch.double())
+    assert losses["loss_objective"].dtype == torch.float64
+    losses = make_lagrangian(actor.to("meta")).to("meta")(batch.to("meta"))
+    assert all(value.device.type == "meta" for value in losses.values())
+
+
+def test_reductions():
+    actor = make_actor()
+    batch = make_batch(actor, [4, 16])
+    samples = PPOLoss(actor, reduction="none", **SETTINGS)(batch)["loss_objective"]
+    assert samples.shape == (4, 16, 1)
+    mean = PPOLoss(actor, **SETTINGS)(batch)["loss_objective"]
+    torch.testing.assert_close(samples.mean(), mean)
+
+
+def test_errors_say_what_to_change():
+    actor = make_actor()
+    batch = make_batch(actor, [16])
+    with pytest.raises(TypeError, match="use PPOLoss"):
+        PPOLagrangianLoss(actor, None, **SETTINGS)
+    loss = make_lagrangian(actor)
+    with pytest.raises(ValueError, match="one column per cost limit"):
+        loss(batch)
+    with pytest.raises(ValueError, match="no trailing dimension"):
+        loss(batch.clone().set("action_log_prob", batch["action_log_prob"].unsqueeze(-1)))
+    with pytest.raises(ValueError, match=r"expected \(16, 1\)"):
+        loss(batch.clone().set("advantage", torch.zeros(16)))
+    with pytest.raises(KeyError, match="Nearest key: 'advantages'"):
+        loss(batch.clone().rename_key_("advantage", "advantages"))
+    with pytest.raises(ValueError, match="not an accepted tensordict key"):
+        loss.set_keys(costs="cost_advantage")
