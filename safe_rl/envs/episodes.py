@@ -1,0 +1,201 @@
+"""What is drawn at random: the start of an episode, new goals, noise and frame skip.
+
+Every draw is addressed by its row's seed, the episode, its purpose and the step, see `rng`.
+"""
+
+from __future__ import annotations
+
+import math
+from enum import IntEnum
+
+import torch
+from torch import Tensor
+
+from safe_rl.envs import rng
+from safe_rl.envs.config import SafetyGymConfig
+from safe_rl.envs.elements import BY_KIND
+from safe_rl.envs.layout import LayoutError, PlacementPlan, resample_goal, sample_layouts
+from safe_rl.envs.scene import Scene
+from safe_rl.envs.tasks import TASKS, NextGoal
+from safe_rl.envs.world import World, circling_targets, refresh, yaw_quaternion
+
+
+class Purpose(IntEnum):
+    """What a random draw is for; part of its address."""
+
+    LAYOUT = 0
+    YAW = 1
+    BUTTON = 2
+    GOAL = 3
+    NOISE = 4
+    FRAMESKIP = 5
+
+
+def pinned_yaws(scene: Scene) -> Tensor:
+    """Yaw of the robot and of every free body, NaN where the configuration fixes none [1 + F]."""
+    config = scene.config
+    yaws = torch.full((1 + scene.num_free,), math.nan, dtype=torch.float64)
+    if config.robot_rot is not None:
+        yaws[0] = config.robot_rot
+    for kind, span in scene.slots.items():
+        given = getattr(config, f"{kind}_rots", ())[: span.stop - span.start]
+        yaws[1 + span.start : 1 + span.start + len(given)] = torch.tensor(given)
+    return yaws
+
+
+def start_episodes(world: World, plan: PlacementPlan, key: Tensor, mask: Tensor) -> None:
+    """Draw a new layout for some worlds and set them to its initial state.
+
+    Args:
+        world: the worlds; those in `mask` are brought up to date.
+        plan: what is placed where.
+        key: random key of each layout, int64 [N].
+        mask: worlds to start anew, bool [N].
+
+    Raises:
+        LayoutError: naming the object that did not fit.
+    """
+    scene = world.scene
+    rows = mask.nonzero()[:, 0]
+    key = key[rows]
+    world.layout[rows] = sample_layouts(plan, rng.fold(key, Purpose.LAYOUT))
+    drawn = 2 * math.pi * rng.uniform(key[:, None], Purpose.YAW, torch.arange(1 + scene.num_free))
+    pinned = pinned_yaws(scene)
+    yaws = torch.where(pinned.isnan(), drawn, pinned)
+    world.physics.reset(mask)
+    _pose_bodies(world, rows, yaws)
+    world.positions[rows, scene.num_free :, :2] = world.layout[rows, 1 + scene.num_free :]
+    if TASKS[scene.config.task].next_goal is NextGoal.BUTTON:
+        _choose_button(world, rows, rng.fold(key, Purpose.BUTTON))
+    world.step_count[rows] = 0
+    world.buttons_timer[rows] = 0
+    place_mocaps(world)
+    world.physics.forward(mask)
+    refresh(world)
+
+
+def _pose_bodies(world: World, rows: Tensor, yaws: Tensor) -> None:
+    """Write the robot's and the free bodies' poses into the state."""
+    scene, physics = world.scene, world.physics
+    start = world.layout[rows, 0]
+    world.start_pose[rows] = torch.cat([start, yaws[:, :1]], -1)
+    physics.qpos[rows, :2] = start
+    if scene.planar:
+        physics.qpos[rows, 2] = yaws[:, 0]
+    else:
+        physics.qpos[rows, 3:7] = yaw_quaternion(yaws[:, 0])
+    free = physics.qpos[:, scene.robot_nq :].unflatten(1, (scene.num_free, 7))
+    free[rows, :, :2] = world.layout[rows, 1 : 1 + scene.num_free]
+    free[rows, :, 3:] = yaw_quaternion(yaws[:, 1:])
+    if scene.num_targets:
+        guided = scene.slots["gremlins"]
+        quaternion = yaw_quaternion(yaws[:, 1 + guided.start : 1 + guided.stop])
+        physics.mocap_quat[rows, : scene.num_targets] = quaternion
+
+
+def gremlin_path(world: World, time: Tensor, num_substeps: int) -> Tensor:
+    """Mocap positions before each of the coming substeps [N, S, nmocap, 3]."""
+    scene, config = world.scene, world.scene.config
+    guided = scene.slots["gremlins"]
+    height = 2 * BY_KIND["gremlins"].height(config)
+    targets = circling_targets(
+        world.layout[:, 1 + guided.start : 1 + guided.stop],
+        time,
+        config.gremlins_travel,
+        height,
+        world.physics.timestep,
+        num_substeps,
+    )
+    static = world.physics.mocap_pos[:, None, scene.num_targets :].expand(-1, num_substeps, -1, -1)
+    return torch.cat([targets, static], 2)
+
+
+def place_mocaps(world: World) -> None:
+    """Write the positions of static bodies and of the gremlins' targets into the state."""
+    scene, physics = world.scene, world.physics
+    if scene.num_mocap_slots:
+        span = slice(scene.num_free, scene.num_free + scene.num_mocap_slots)
+        physics.mocap_pos[:, scene.num_targets :] = world.positions[:, span]
+    if scene.num_targets:
+        # Where they were before the last substep, which is what the state was computed with.
+        last = (physics.time - physics.timestep).clamp(min=0.0)
+        targets = gremlin_path(world, last, 1)[:, 0, : scene.num_targets]
+        physics.mocap_pos[:, : scene.num_targets] = targets
+
+
+def _choose_button(world: World, rows: Tensor, key: Tensor) -> None:
+    """Choose goal buttons uniformly; the same one may come again."""
+    number = world.scene.config.buttons_num
+    button = (rng.uniform(key) * number).to(torch.int64)
+    world.goal_button[rows] = button
+    point_goal_at_button(world, rows)
+
+
+def point_goal_at_button(world: World, rows: Tensor) -> None:
+    """Let the goal be where the goal button is."""
+    goal, buttons = world.scene.slots["goal"], world.at("buttons")
+    world.positions[rows, goal.start] = buttons[rows, world.goal_button[rows]]
+
+
+def next_goals(world: World, plan: PlacementPlan, key: Tensor, mask: Tensor) -> Tensor:
+    """Draw a new goal for some worlds.
+
+    Args:
+        world: the worlds, up to date.
+        plan: what is placed where.
+        key: random keys, int64 [N].
+        mask: worlds that get a new goal, bool [N].
+
+    Returns:
+        Worlds where no place for a goal was found, bool [N].
+
+    Raises:
+        LayoutError: for those, if `terminate_resample_failure` is False.
+    """
+    config = world.scene.config
+    rows = mask.nonzero()[:, 0]
+    world.buttons_timer[rows] = config.buttons_resampling_delay
+    stuck = torch.zeros_like(mask)
+    if TASKS[config.task].next_goal is NextGoal.BUTTON:
+        _choose_button(world, rows, rng.fold(key[rows], Purpose.BUTTON))
+        return stuck
+    position, ok = resample_goal(plan, rng.fold(key[rows], Purpose.GOAL), _current(world)[rows])
+    goal = world.scene.slots["goal"].start
+    found = rows[ok]
+    world.positions[found, goal, :2] = position[ok]
+    world.layout[found, 1 + goal] = position[ok]
+    stuck[rows[~ok]] = True
+    if stuck.any() and not config.terminate_resample_failure:
+        raise LayoutError(
+            "No place for a new goal was found. Use fewer objects or smaller keepouts, or set "
+            "'terminate_resample_failure' to end such episodes."
+        )
+    if world.scene.num_mocap_slots:
+        place_mocaps(world)
+    return stuck
+
+
+def _current(world: World) -> Tensor:
+    """Where everything is now, in the columns of a layout; gremlins keep their layout position."""
+    current = torch.cat([world.robot_pos[:, None, :2], world.positions[..., :2]], 1)
+    guided = world.scene.slots.get("gremlins", slice(0, 0))
+    columns = slice(1 + guided.start, 1 + guided.stop)
+    current[:, columns] = world.layout[:, columns]
+    return current
+
+
+def noisy(config: SafetyGymConfig, control: Tensor, key: Tensor) -> Tensor:
+    """Add the configured Gaussian noise to controls [N, nu]."""
+    if config.action_noise == 0.0:
+        return control
+    columns = torch.arange(control.shape[-1])
+    return control + config.action_noise * rng.normal(key[:, None], Purpose.NOISE, columns)
+
+
+def draw_substeps(config: SafetyGymConfig, key: Tensor) -> Tensor | int:
+    """Draw the number of substeps, Binomial(n, p): one number where it is certain, else [N]."""
+    if config.frameskip_binom_p == 1.0:
+        return config.frameskip_binom_n
+    trials = torch.arange(config.frameskip_binom_n)
+    draws = rng.uniform(key[:, None], Purpose.FRAMESKIP, trials)
+    return (draws < config.frameskip_binom_p).sum(-1)

@@ -1,0 +1,53 @@
+"""What the environment needs of a physics backend."""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+from torch import Tensor
+
+
+class Physics(Protocol):
+    """N simulations of one model, advanced together.
+
+    The tensors keep their addresses: state fields are written in place and take effect at the
+    next call, outputs are refreshed by every call for the simulations it ran. Floats are float64
+    on the CPU backend. Shapes have the sizes of the model (nq, nv, nu, nbody, nmocap).
+    """
+
+    # state
+    time: Tensor  # [N] s
+    qpos: Tensor  # [N, nq]
+    qvel: Tensor  # [N, nv]
+    qacc_warmstart: Tensor  # [N, nv]
+    ctrl: Tensor  # [N, nu]
+    mocap_pos: Tensor  # [N, nmocap, 3] m
+    mocap_quat: Tensor  # [N, nmocap, 4]
+    # outputs
+    xpos: Tensor  # [N, nbody, 3] m
+    xmat: Tensor  # [N, nbody, 3, 3]
+    sensordata: Tensor  # [N, nsensordata]
+    subtree_com: Tensor  # [N, nbody, 3] m
+
+    @property
+    def timestep(self) -> float:
+        """Length of one substep [s]."""
+
+    def reset(self, mask: Tensor) -> None:
+        """Set the simulations in `mask` (bool [N]) to the model's initial state, awake."""
+
+    def forward(self, mask: Tensor | None = None) -> None:
+        """Bring the outputs up to date with the state, for all simulations or those in `mask`."""
+
+    def step(self, num_substeps: Tensor | int, mocap_path: Tensor | None = None) -> Tensor:
+        """Advance by substeps under constant `ctrl`, then bring the outputs up to date.
+
+        Args:
+            num_substeps: one number for all, or int64 [N].
+            mocap_path: mocap positions before each substep [N, S, nmocap, 3], or None where
+                nothing moves.
+
+        Returns:
+            bool [N]: simulations that failed (non-finite or huge state); their state is finite
+            again but meaningless until reset.
+        """

@@ -1,0 +1,113 @@
+"""The CPU backend: `mujoco.batch.Batch`, a C++ thread pool over rows of state."""
+
+from __future__ import annotations
+
+import warnings
+
+import mujoco
+import numpy as np
+import torch
+from mujoco.batch import Batch
+from torch import Tensor
+
+_STATE = ("time", "qpos", "qvel", "qacc_warmstart", "ctrl", "mocap_pos", "mocap_quat")
+_OUTPUTS = ("xpos", "xmat", "sensordata", "subtree_com")
+_PATH_INPUTS = int(mujoco.mjtState.mjSTATE_CTRL) | int(mujoco.mjtState.mjSTATE_MOCAP_POS)
+_NO_SENSORS = int(mujoco.mjtDisableBit.mjDSBL_SENSOR)
+_NO_STAGE = int(mujoco.mjtStage.mjSTAGE_NONE)
+
+
+def _log_to_console_only() -> None:
+    """Keep MuJoCo from leaving a MUJOCO_LOG.TXT in the working directory."""
+    log = mujoco.MjLogConfig.get()
+    log.logto_file = False
+    log.set()
+
+
+def _share(array: np.ndarray) -> Tensor:
+    """Wrap an array without copying it; outputs are read-only, which torch warns of."""
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", message="The given NumPy array is not writable")
+        return torch.from_numpy(array)
+
+
+class BatchPhysics:
+    """`Physics` on the CPU.
+
+    Args:
+        model: the compiled model; sleeping follows its options.
+        num_envs: number of simulations, N.
+        num_threads: threads that step them, 0 for one per core.
+
+    Examples:
+        >>> from safe_rl.envs.config import SafetyGymConfig
+        >>> from safe_rl.envs.scene import build_scene
+        >>> physics = BatchPhysics(build_scene(SafetyGymConfig()).model, num_envs=2, num_threads=1)
+        >>> physics.step(num_substeps=10).tolist()
+        [False, False]
+    """
+
+    def __init__(self, model: mujoco.MjModel, num_envs: int, num_threads: int) -> None:
+        _log_to_console_only()
+        sleeps = bool(model.opt.enableflags & mujoco.mjtEnableBit.mjENBL_SLEEP)
+        self._batch = Batch(model, num_envs, num_threads, persistent=sleeps)
+        # Every field is bound before the first call: later ones would be zero until the next.
+        state = {name: _share(self._batch.bind(name)) for name in _STATE}
+        outputs = {name: _share(self._batch.bind(name)) for name in _OUTPUTS}
+        self.time, self.qpos, self.qvel = state["time"], state["qpos"], state["qvel"]
+        self.qacc_warmstart, self.ctrl = state["qacc_warmstart"], state["ctrl"]
+        self.mocap_pos, self.mocap_quat = state["mocap_pos"], state["mocap_quat"]
+        self.xpos, self.sensordata = outputs["xpos"], outputs["sensordata"]
+        self.xmat = outputs["xmat"].view(num_envs, model.nbody, 3, 3)
+        self.subtree_com = outputs["subtree_com"]
+        self._disableflags = self._batch.expand("opt.disableflags")
+        self._with_sensors = int(model.opt.disableflags)
+        self._warnings = np.zeros_like(self._batch.warning)
+
+    @property
+    def timestep(self) -> float:
+        """Length of one substep [s]."""
+        return float(self._batch.model.opt.timestep)
+
+    def reset(self, mask: Tensor) -> None:
+        """See `Physics.reset`."""
+        self._batch.reset(mask.numpy(), stage=_NO_STAGE)
+        self._warnings[:] = self._batch.warning
+
+    def forward(self, mask: Tensor | None = None) -> None:
+        """See `Physics.forward`."""
+        self._batch.forward(None if mask is None else mask.numpy())
+
+    def step(self, num_substeps: Tensor | int, mocap_path: Tensor | None = None) -> Tensor:
+        """See `Physics.step`."""
+        # Nobody reads sensors between substeps; without them the result is the same to the bit.
+        self._disableflags[:] = self._with_sensors | _NO_SENSORS
+        if isinstance(num_substeps, int):
+            self._substeps(num_substeps, mocap_path, None)
+        else:
+            for count in num_substeps.unique().tolist():
+                self._substeps(count, mocap_path, (num_substeps == count).numpy())
+        self._disableflags[:] = self._with_sensors
+        self._batch.forward()
+        failed = self._failed()
+        if failed.any():
+            self.ctrl[failed] = 0.0
+        return failed
+
+    def _substeps(self, count: int, path: Tensor | None, mask: np.ndarray | None) -> None:
+        if count == 0:
+            return
+        if path is None:
+            self._batch.rollout(count, record=(), ids=mask)
+            return
+        rows = slice(None) if mask is None else torch.from_numpy(mask)
+        moved = path[rows, :count].flatten(2)
+        control = torch.cat([self.ctrl[rows, None].expand(-1, count, -1), moved], -1)
+        self._batch.rollout(count, control.numpy(), _PATH_INPUTS, record=(), ids=mask)
+
+    def _failed(self) -> Tensor:
+        """Rows whose warning counters rose: MuJoCo resets a bad state by itself, silently."""
+        rose = (self._batch.warning[..., 1] > self._warnings[..., 1]).any(-1)
+        if rose.any():
+            self._warnings[:] = self._batch.warning
+        return torch.from_numpy(rose)

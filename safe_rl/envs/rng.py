@@ -1,0 +1,66 @@
+"""Random numbers as a pure function of integers, for batches whose rows must not share a stream.
+
+Every row of a batch has its own seed, and a draw is addressed by what it is for (episode,
+purpose, attempt, object, …) instead of by how many came before it. So row k does not depend
+on the batch size, the other rows or the thread count, and a snapshot needs no generator state.
+Library generators keep one stream per generator; one generator per row would put a Python loop
+over rows into every reset.
+"""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+
+# SplitMix64 (Steele, Lea, Flood 2014), as two's complement int64.
+_GAMMA = 0x9E3779B97F4A7C15 - (1 << 64)
+_MIX_1 = 0xBF58476D1CE4E5B9 - (1 << 64)
+_MIX_2 = 0x94D049BB133111EB - (1 << 64)
+
+
+def _shift_right(x: Tensor, bits: int) -> Tensor:
+    """Shift int64 right, filling with zeros (torch's own shift repeats the sign bit)."""
+    return (x >> bits) & ((1 << (64 - bits)) - 1)
+
+
+def _mix(x: Tensor) -> Tensor:
+    x = (x ^ _shift_right(x, 30)) * _MIX_1
+    x = (x ^ _shift_right(x, 27)) * _MIX_2
+    return x ^ _shift_right(x, 31)
+
+
+def fold(key: Tensor, *counters: Tensor | int) -> Tensor:
+    """Hash `key` with counters, one after the other, into new keys.
+
+    Args:
+        key: int64 of any shape.
+        counters: integers or int64 tensors that broadcast with `key`.
+
+    Returns:
+        int64 keys of the broadcast shape, uniform over all 64-bit values.
+
+    Examples:
+        >>> fold(torch.tensor([1, 1]), torch.tensor([0, 0])).unique().numel()
+        1
+    """
+    for counter in counters:
+        key = _mix((key ^ (torch.as_tensor(counter) * _MIX_2)) + _GAMMA)
+    return key
+
+
+def uniform(key: Tensor, *counters: Tensor | int) -> Tensor:
+    """Return float64 draws in [0, 1), one for each of the keys `fold(key, *counters)`."""
+    return _shift_right(fold(key, *counters), 11).to(torch.float64) * 2.0**-53
+
+
+def normal(key: Tensor, *counters: Tensor | int) -> Tensor:
+    """Return float64 standard normal draws (Box-Muller), one for each folded key."""
+    radius = torch.sqrt(-2.0 * torch.log1p(-uniform(key, *counters, 0)))
+    return radius * torch.cos(2.0 * math.pi * uniform(key, *counters, 1))
+
+
+def row_seeds(seed: int, num_rows: int) -> Tensor:
+    """Return one seed per row, int64 [num_rows]; row k is the same for every `num_rows`."""
+    return fold(torch.full((num_rows,), seed, dtype=torch.int64), torch.arange(num_rows))

@@ -1,0 +1,243 @@
+"""The Safety Gym environments as one batched TorchRL environment."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
+from torchrl.data import Binary, Bounded, Composite, Unbounded
+from torchrl.envs import EnvBase
+
+from safe_rl.envs import rng
+from safe_rl.envs.config import SafetyGymConfig
+from safe_rl.envs.costs import compute_costs, cost_keys
+from safe_rl.envs.episodes import (
+    Purpose,
+    draw_substeps,
+    gremlin_path,
+    next_goals,
+    noisy,
+    start_episodes,
+)
+from safe_rl.envs.layout import plan_placements
+from safe_rl.envs.observations import make_observer
+from safe_rl.envs.physics.cpu import BatchPhysics
+from safe_rl.envs.scene import build_scene
+from safe_rl.envs.snapshot import read_state, write_state
+from safe_rl.envs.suite import resolve
+from safe_rl.envs.tasks import TASKS, dense_reward
+from safe_rl.envs.world import make_world, refresh
+
+
+class SafetyGymEnv(EnvBase):
+    """N parallel worlds of one Safety Gym configuration, stepped together on a thread pool.
+
+    Reads `action` [N, nu] in [-1, 1] (clipped). Writes `observation` [N, n], and each [N, 1]:
+    `reward`, `cost` (the aggregate), one `cost_<kind>` per constrained kind, `cost_exception`,
+    `goal_met`, `done`, `terminated`, `truncated`. Time-outs are truncations. Where the physics of
+    a world fails, that world gets `reward_exception`, `cost_exception` 1 and termination.
+
+    Args:
+        env: name in the suite ("PointGoal1", "Safexp-PointGoal1-v0"), mapping of configuration
+            keys, or `SafetyGymConfig`.
+        num_envs: number of worlds, N.
+        device: where the TensorDicts live; the physics runs on the CPU.
+        seed: integer that determines every draw; None takes one from torch's generator. Row k gets
+            the same episodes whatever N and the number of threads are.
+        num_threads: threads that step the physics; 0 for one per core.
+        sleep: let resting objects sleep until touched, which is faster and changes no statistics.
+
+    Raises:
+        ConfigError: for an unknown name or key, or a value that cannot be used.
+        LayoutError: at a reset, if the objects do not fit.
+
+    Examples:
+        >>> env = SafetyGymEnv("PointGoal1", num_envs=4, seed=0)
+        >>> rollout = env.rollout(max_steps=10)
+        >>> rollout["next", "cost_hazards"].shape
+        torch.Size([4, 10, 1])
+    """
+
+    def __init__(
+        self,
+        env: str | Mapping[str, Any] | SafetyGymConfig,
+        num_envs: int = 1,
+        device: torch.device | str = "cpu",
+        seed: int | None = None,
+        num_threads: int = 0,
+        sleep: bool = True,
+    ) -> None:
+        super().__init__(device=torch.device(device), batch_size=torch.Size([num_envs]))
+        self.config = resolve(env)
+        scene = build_scene(self.config, sleep)
+        self._physics = BatchPhysics(scene.model, num_envs, num_threads)
+        self._world = make_world(scene, self._physics)
+        self._plan = plan_placements(self.config, scene.slots, len(scene.names))
+        self._observer = make_observer(scene)
+        self._task = TASKS[self.config.task]
+        limits = torch.as_tensor(scene.model.actuator_ctrlrange)
+        self._control_low, self._control_high = limits[:, 0].clone(), limits[:, 1].clone()
+        self._episode = torch.zeros(num_envs, dtype=torch.int64)
+        self._measured = self._task.measure(self._world)
+        self.cost_keys = cost_keys(self.config)
+        self._make_specs(scene.model.nu)
+        self.set_seed(int(torch.randint(2**62, ())) if seed is None else seed)
+
+    @property
+    def observation_layout(self) -> dict[str, slice]:
+        """Columns of every named component in `observation`."""
+        return dict(self._observer.columns)
+
+    def _make_specs(self, num_actions: int) -> None:
+        shape, kind = self.batch_size, {"dtype": torch.float32, "device": self.device}
+        size = max(columns.stop for columns in self._observer.columns.values())
+        scalar = (*shape, 1)
+        flag = Binary(1, shape=scalar, dtype=torch.bool, device=self.device)
+        self.observation_spec = Composite(
+            observation=Unbounded(shape=(*shape, size), **kind),
+            goal_met=flag.clone(),
+            shape=shape,
+        )
+        self.action_spec = Bounded(-1.0, 1.0, shape=(*shape, num_actions), **kind)
+        high = 1.0 if self.config.constrain_indicator else torch.finfo(torch.float32).max
+        self.reward_spec = Composite(
+            reward=Unbounded(shape=scalar, **kind),
+            **{key: Bounded(0.0, high, shape=scalar, **kind) for key in self.cost_keys},
+            shape=shape,
+        )
+        self.done_spec = Composite(
+            **{key: flag.clone() for key in ("done", "terminated", "truncated")}, shape=shape
+        )
+
+    def _set_seed(self, seed: int | None) -> None:
+        if seed is None:
+            return
+        self._row_seed = rng.row_seeds(seed, self.batch_size[0])
+        # One layout for all rows where the configuration wants a single one.
+        self._fixed_layout = rng.fold(torch.tensor(seed), Purpose.LAYOUT)
+        self._episode.zero_()
+
+    def _layout_key(self) -> Tensor:
+        if not self.config.randomize_layout:
+            return self._fixed_layout.expand(self.batch_size)
+        return rng.fold(self._row_seed, self._episode)
+
+    def _step_key(self) -> Tensor:
+        return rng.fold(self._row_seed, self._episode, self._world.step_count + 1)
+
+    def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDictBase:
+        mask = None if tensordict is None else tensordict.get("_reset", None)
+        if mask is None:
+            mask = torch.ones(self.batch_size, dtype=torch.bool)
+        mask = mask.reshape(self.batch_size).cpu()
+        self._episode[mask] += 1
+        start_episodes(self._world, self._plan, self._layout_key(), mask)
+        fresh = self._task.measure(self._world)
+        self._measured = torch.where(mask.unsqueeze(-1), fresh, self._measured)
+        return self._reset_output()
+
+    def _reset_output(self) -> TensorDict:
+        """What a reset returns, for the worlds as they are."""
+        none = torch.zeros(*self.batch_size, 1, dtype=torch.bool)
+        return self._pack({"goal_met": none, "done": none, "terminated": none, "truncated": none})
+
+    def _pack(self, outputs: dict[str, Tensor]) -> TensorDict:
+        """Add the observation; here, and here alone, things become float32 copies on the device."""
+        outputs["observation"] = self._observer.read(self._world).to(torch.float32)
+        if self.device.type != "cpu":
+            outputs = {key: value.to(self.device) for key, value in outputs.items()}
+        return TensorDict(outputs, batch_size=self.batch_size, device=self.device)
+
+    def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
+        world, config = self._world, self.config
+        key = self._step_key()
+        failed = self._advance(self._checked_action(tensordict), key)
+        now = self._task.measure(world)
+        reward = dense_reward(config, world, self._measured, now)
+        costs = compute_costs(config, world, failed)
+        world.buttons_timer.sub_(1).clamp_(min=0)
+        met, ended, stuck = self._handle_goals(now, failed, key)
+        reward = torch.where(failed, config.reward_exception, reward + config.reward_goal * met)
+        world.step_count.add_(1)
+        terminated = failed | ended
+        truncated = ((world.step_count >= config.num_steps) | stuck) & ~terminated
+        numbers = torch.stack([reward, *costs.values()]).to(torch.float32).unsqueeze(-1)
+        flags = torch.stack([met, terminated | truncated, terminated, truncated]).unsqueeze(-1)
+        outputs = dict(zip(("reward", *costs), numbers.unbind(0), strict=True))
+        names = ("goal_met", "done", "terminated", "truncated")
+        outputs |= zip(names, flags.unbind(0), strict=True)
+        return self._pack(outputs)
+
+    def _checked_action(self, tensordict: TensorDictBase) -> Tensor:
+        action = tensordict.get("action")
+        if action.shape != self.action_spec.shape or not action.dtype.is_floating_point:
+            raise ValueError(
+                f"'action' must be a floating-point tensor of shape {tuple(self.action_spec.shape)}"
+                f" (num_envs, number of actuators), got {action.dtype} {tuple(action.shape)}."
+            )
+        return action.detach().cpu().to(torch.float64)
+
+    def _advance(self, action: Tensor, key: Tensor) -> Tensor:
+        """Run the substeps of one step; returns the worlds whose physics failed [N]."""
+        config, physics = self.config, self._physics
+        control = action.clamp(self._control_low, self._control_high)
+        physics.ctrl.copy_(noisy(config, control, key))
+        path = None
+        if self._world.scene.num_targets:
+            path = gremlin_path(self._world, physics.time, config.frameskip_binom_n)
+        failed = physics.step(draw_substeps(config, key), path)
+        refresh(self._world)
+        return failed
+
+    def _handle_goals(
+        self, now: Tensor, failed: Tensor, key: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """Give worlds that met their goal a new one: met, ended by it, without a place for one."""
+        self._measured = now
+        never = torch.zeros_like(failed)
+        if self._task.met is None:
+            return never, never, never
+        met = self._task.met(self.config, self._world, now) & ~failed
+        if not self.config.continue_goal:
+            return met, met, never
+        if not met.any():
+            return met, never, never
+        stuck = next_goals(self._world, self._plan, key, met)
+        self._measured = self._task.measure(self._world)
+        return met, never, stuck
+
+    def get_state(self) -> TensorDict:
+        """Return a copy of everything that determines what happens next.
+
+        Returns:
+            TensorDict [N] with `qpos`, `qvel`, `qacc_warmstart`, `time`, `goal_pos` [N, 3],
+            `goal_button`, `buttons_timer`, `step_count`, and the layout and seeds.
+        """
+        state = read_state(self._world)
+        state["seed"], state["episode"] = self._row_seed.clone(), self._episode.clone()
+        return state
+
+    def set_state(self, state: TensorDictBase) -> TensorDict:
+        """Set the worlds to a state, for resuming, branching and tests.
+
+        Args:
+            state: TensorDict [N] as `get_state` returns it; the layout and the seeds may be left
+                out, then the present ones stay.
+
+        Returns:
+            What a reset returns, for that state.
+
+        Raises:
+            KeyError: if a key is missing.
+            ValueError: if a shape does not fit.
+        """
+        if "layout" not in state and not self._episode.any():
+            self.reset()
+        write_state(self._world, state)
+        self._row_seed = state.get("seed", self._row_seed).clone()
+        self._episode = state.get("episode", self._episode).clone()
+        self._measured = self._task.measure(self._world)
+        return self._reset_output()

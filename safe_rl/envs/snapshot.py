@@ -1,0 +1,72 @@
+"""Reading and writing the state of the worlds, for exact resume, branching and tests."""
+
+from __future__ import annotations
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+
+from safe_rl.envs.episodes import place_mocaps, point_goal_at_button
+from safe_rl.envs.tasks import TASKS, NextGoal
+from safe_rl.envs.world import World, refresh
+
+PHYSICS_KEYS = ("qpos", "qvel", "qacc_warmstart", "time")
+TASK_KEYS = ("goal_button", "buttons_timer", "step_count")
+LAYOUT_KEYS = ("layout", "start_pose")
+
+
+def read_state(world: World) -> TensorDict:
+    """Return copies of the state of N worlds, a TensorDict [N]."""
+    state = {key: getattr(world.physics, key).clone() for key in PHYSICS_KEYS}
+    state |= {key: getattr(world, key).clone() for key in (*TASK_KEYS, *LAYOUT_KEYS)}
+    goal = world.at("goal")[:, 0] if "goal" in world.scene.slots else torch.zeros_like(world.com)
+    state["goal_pos"] = goal.clone()
+    state["target_quat"] = world.physics.mocap_quat[:, : world.scene.num_targets].clone()
+    return TensorDict(state, batch_size=[len(world.step_count)])
+
+
+def write_state(world: World, state: TensorDictBase) -> None:
+    """Set N worlds to a state and bring everything derived from it up to date.
+
+    Args:
+        world: the worlds.
+        state: TensorDict [N] as `read_state` returns it; `layout`, `start_pose` and `target_quat`
+            may be missing.
+
+    Raises:
+        KeyError: if another key is missing.
+        ValueError: if a shape does not fit.
+    """
+    _check(world, state)
+    scene, physics = world.scene, world.physics
+    physics.reset(torch.ones_like(world.step_count, dtype=torch.bool))
+    for key in PHYSICS_KEYS:
+        getattr(physics, key).copy_(state[key])
+    for key in (*TASK_KEYS, *LAYOUT_KEYS):
+        if key in state:
+            getattr(world, key).copy_(state[key])
+    if "target_quat" in state:
+        physics.mocap_quat[:, : scene.num_targets] = state["target_quat"]
+    world.positions[:, scene.num_free :, :2] = world.layout[:, 1 + scene.num_free :]
+    if TASKS[scene.config.task].next_goal is NextGoal.BUTTON:
+        point_goal_at_button(world, torch.arange(len(world.step_count)))
+    elif "goal" in scene.slots:
+        goal = scene.slots["goal"].start
+        world.positions[:, goal] = state["goal_pos"]
+        world.layout[:, 1 + goal] = state["goal_pos"][:, :2]
+    place_mocaps(world)
+    physics.forward()
+    refresh(world)
+
+
+def _check(world: World, state: TensorDictBase) -> None:
+    expected = read_state(world)
+    optional = {*LAYOUT_KEYS, "target_quat"}
+    for key, value in expected.items():
+        if key in state:
+            if state[key].shape != value.shape:
+                raise ValueError(
+                    f"State '{key}' must have shape {tuple(value.shape)} in this environment, got "
+                    f"{tuple(state[key].shape)}."
+                )
+        elif key not in optional:
+            raise KeyError(f"The state lacks '{key}'; it needs {sorted(set(expected) - optional)}.")
