@@ -39,7 +39,7 @@ def pinned_yaws(scene: Scene) -> Tensor:
         yaws[0] = config.robot_rot
     for kind, span in scene.slots.items():
         given = getattr(config, f"{kind}_rots", ())[: span.stop - span.start]
-        yaws[1 + span.start : 1 + span.start + len(given)] = torch.tensor(given)
+        yaws[1 + span.start : 1 + span.start + len(given)] = yaws.new_tensor(given)
     return yaws
 
 

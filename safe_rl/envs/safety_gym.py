@@ -87,6 +87,11 @@ class SafetyGymEnv(EnvBase):
         self.set_seed(int(torch.randint(2**62, ())) if seed is None else seed)
 
     @property
+    def object_names(self) -> tuple[str, ...]:
+        """Names of the objects, in the order they have in a state's `layout` after the robot."""
+        return self._world.scene.names
+
+    @property
     def observation_layout(self) -> dict[str, slice]:
         """Columns of every named component in `observation`."""
         return dict(self._observer.columns)

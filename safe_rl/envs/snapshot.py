@@ -12,11 +12,13 @@ from safe_rl.envs.world import World, refresh
 PHYSICS_KEYS = ("qpos", "qvel", "qacc_warmstart", "time")
 TASK_KEYS = ("goal_button", "buttons_timer", "step_count")
 LAYOUT_KEYS = ("layout", "start_pose")
+# Without the last control, sensors that feel the actuators differ until the next step.
+OPTIONAL_KEYS = (*LAYOUT_KEYS, "target_quat", "ctrl")
 
 
 def read_state(world: World) -> TensorDict:
     """Return copies of the state of N worlds, a TensorDict [N]."""
-    state = {key: getattr(world.physics, key).clone() for key in PHYSICS_KEYS}
+    state = {key: getattr(world.physics, key).clone() for key in (*PHYSICS_KEYS, "ctrl")}
     state |= {key: getattr(world, key).clone() for key in (*TASK_KEYS, *LAYOUT_KEYS)}
     goal = world.at("goal")[:, 0] if "goal" in world.scene.slots else torch.zeros_like(world.com)
     state["goal_pos"] = goal.clone()
@@ -29,8 +31,8 @@ def write_state(world: World, state: TensorDictBase) -> None:
 
     Args:
         world: the worlds.
-        state: TensorDict [N] as `read_state` returns it; `layout`, `start_pose` and `target_quat`
-            may be missing.
+        state: TensorDict [N] as `read_state` returns it; `layout`, `start_pose`, `target_quat` and
+            `ctrl` may be missing.
 
     Raises:
         KeyError: if another key is missing.
@@ -38,14 +40,16 @@ def write_state(world: World, state: TensorDictBase) -> None:
     """
     _check(world, state)
     scene, physics = world.scene, world.physics
+    target_quat = state.get("target_quat", physics.mocap_quat[:, : scene.num_targets].clone())
     physics.reset(torch.ones_like(world.step_count, dtype=torch.bool))
     for key in PHYSICS_KEYS:
         getattr(physics, key).copy_(state[key])
     for key in (*TASK_KEYS, *LAYOUT_KEYS):
         if key in state:
             getattr(world, key).copy_(state[key])
-    if "target_quat" in state:
-        physics.mocap_quat[:, : scene.num_targets] = state["target_quat"]
+    if "ctrl" in state:
+        physics.ctrl.copy_(state["ctrl"])
+    physics.mocap_quat[:, : scene.num_targets] = target_quat
     world.positions[:, scene.num_free :, :2] = world.layout[:, 1 + scene.num_free :]
     if TASKS[scene.config.task].next_goal is NextGoal.BUTTON:
         point_goal_at_button(world, torch.arange(len(world.step_count)))
@@ -60,7 +64,6 @@ def write_state(world: World, state: TensorDictBase) -> None:
 
 def _check(world: World, state: TensorDictBase) -> None:
     expected = read_state(world)
-    optional = {*LAYOUT_KEYS, "target_quat"}
     for key, value in expected.items():
         if key in state:
             if state[key].shape != value.shape:
@@ -68,5 +71,6 @@ def _check(world: World, state: TensorDictBase) -> None:
                     f"State '{key}' must have shape {tuple(value.shape)} in this environment, got "
                     f"{tuple(state[key].shape)}."
                 )
-        elif key not in optional:
-            raise KeyError(f"The state lacks '{key}'; it needs {sorted(set(expected) - optional)}.")
+        elif key not in OPTIONAL_KEYS:
+            needed = sorted(set(expected.keys()) - set(OPTIONAL_KEYS))
+            raise KeyError(f"The state lacks '{key}'; it needs {needed}.")

@@ -1,0 +1,42 @@
+"""Golden transitions of the 2019 reference environments, where they are at hand."""
+
+import json
+import os
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+FOLDER = Path(
+    os.environ.get("SAFE_RL_GOLDEN", Path(__file__).resolve().parents[2] / "shared" / "golden")
+)
+NAMES = sorted(path.stem for path in FOLDER.glob("*.json"))
+
+needs_golden = pytest.mark.skipif(
+    not NAMES, reason=f"no golden transitions in {FOLDER}; set SAFE_RL_GOLDEN to their folder"
+)
+
+
+@dataclass(frozen=True)
+class Golden:
+    """One pinned configuration and the steps recorded in it; row t + 1 follows from row t."""
+
+    name: str
+    config: dict
+    components: dict[str, slice]  # columns of the observation
+    layout: dict[str, list[float]]  # (x, y) of every object at the reset
+    arrays: dict[str, np.ndarray]
+
+    def __getitem__(self, key):
+        return self.arrays[key]
+
+
+def load(name):
+    described = json.loads((FOLDER / f"{name}.json").read_text())
+    with np.load(FOLDER / f"{name}.npz") as archive:
+        arrays = {key: archive[key] for key in archive.files}
+    components = {
+        row["key"]: slice(row["start"], row["stop"]) for row in described["observation_layout"]
+    }
+    return Golden(name, described["config"], components, described["reset_layout"], arrays)
