@@ -2,8 +2,18 @@
 
 from safe_rl.envs.config import SafetyGymConfig
 from safe_rl.envs.layout import LayoutError
+from safe_rl.envs.registration import make_env, store_configs
 from safe_rl.envs.safety_gym import SafetyGymEnv
 from safe_rl.envs.suite import SUITE, resolve
 from safe_rl.envs.validation import ConfigError
 
-__all__ = ["SUITE", "ConfigError", "LayoutError", "SafetyGymConfig", "SafetyGymEnv", "resolve"]
+__all__ = [
+    "SUITE",
+    "ConfigError",
+    "LayoutError",
+    "SafetyGymConfig",
+    "SafetyGymEnv",
+    "make_env",
+    "resolve",
+    "store_configs",
+]
