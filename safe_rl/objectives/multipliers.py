@@ -15,6 +15,8 @@ from tensordict import NestedKey
 from torch import Tensor, nn
 from torch.nn.functional import softplus
 
+from safe_rl.objectives.keys import key_name
+
 CostLimits = Mapping[NestedKey, float] | Sequence[float] | float
 
 
@@ -126,7 +128,7 @@ class Multiplier(nn.Module):
 
     def named_values(self) -> dict[str, Tensor]:
         """λ per cost as scalars, named by cost key (nested keys joined by ``/``)."""
-        names = ("/".join(key) if isinstance(key, tuple) else str(key) for key in self.cost_keys)
+        names = map(key_name, self.cost_keys)
         return dict(zip(names, self.value.unbind(), strict=True))
 
     def extra_repr(self) -> str:

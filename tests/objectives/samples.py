@@ -4,6 +4,7 @@ import torch
 from tensordict import TensorDict
 from tensordict.nn import NormalParamExtractor, TensorDictModule, TensorDictSequential
 from torch import nn
+from torchrl.envs.utils import ExplorationType
 from torchrl.modules import IndependentNormal, ProbabilisticActor
 
 NUM_OBS, NUM_ACTIONS = 3, 2
@@ -21,6 +22,7 @@ def make_actor(in_key="observation", loc="loc", scale="scale", action="action", 
         in_keys={"loc": loc, "scale": scale},
         out_keys=[action],
         distribution_class=IndependentNormal,
+        default_interaction_type=ExplorationType.RANDOM,
         return_log_prob=True,
         log_prob_key="action_log_prob",
     )
