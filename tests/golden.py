@@ -25,6 +25,7 @@ class Golden:
     name: str
     config: dict
     components: dict[str, slice]  # columns of the observation
+    shapes: dict[str, tuple[int, ...]]  # of the components
     layout: dict[str, list[float]]  # (x, y) of every object at the reset
     arrays: dict[str, np.ndarray]
 
@@ -36,7 +37,12 @@ def load(name):
     described = json.loads((FOLDER / f"{name}.json").read_text())
     with np.load(FOLDER / f"{name}.npz") as archive:
         arrays = {key: archive[key] for key in archive.files}
-    components = {
-        row["key"]: slice(row["start"], row["stop"]) for row in described["observation_layout"]
-    }
-    return Golden(name, described["config"], components, described["reset_layout"], arrays)
+    rows = described["observation_layout"]
+    return Golden(
+        name=name,
+        config=described["config"],
+        components={row["key"]: slice(row["start"], row["stop"]) for row in rows},
+        shapes={row["key"]: tuple(row["shape"]) for row in rows},
+        layout=described["reset_layout"],
+        arrays=arrays,
+    )

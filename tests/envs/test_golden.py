@@ -7,10 +7,10 @@ where boxes and pillars collide. So rows agree to rounding, or nearly so in hard
 import numpy as np
 import pytest
 import torch
+from golden import NAMES, load, needs_golden
 from tensordict import TensorDict
 
 from safe_rl.envs import SafetyGymEnv
-from tests.golden import NAMES, load, needs_golden
 
 # Natural lidar has its own issue; everything else in the folder is compared.
 LEFT_OUT = {"point_circle_natural_lidar", "point_goal_natural_lidar"}

@@ -3,22 +3,15 @@
 from __future__ import annotations
 
 import functools
-import json
-import os
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 import pytest
+from golden import NAMES, Golden, load, needs_golden
 
 from . import ReferenceWorld
 
-_BESIDE_REPOSITORY = Path(__file__).resolve().parents[3] / "shared" / "golden"
-GOLDEN = Path(os.environ.get("SAFE_RL_GOLDEN", _BESIDE_REPOSITORY))
-
-pytestmark = pytest.mark.skipif(
-    not GOLDEN.is_dir(), reason=f"no golden transitions in {GOLDEN}: set SAFE_RL_GOLDEN"
-)
+pytestmark = needs_golden
 
 CASES = (
     "car_circle",
@@ -61,9 +54,7 @@ CHAOTIC_SHARE = 0.05  # of the rows may leave it: rounding errors grow in hard c
 class Replay:
     """What the reference makes of one case, row by row, beside the recording."""
 
-    golden: dict[str, np.ndarray]
-    config: dict
-    layout: list[dict]
+    golden: Golden
     results: list[dict]
     parts: list[dict[str, np.ndarray]]  # components of each observation
     flat: list[np.ndarray]
@@ -79,16 +70,14 @@ class Replay:
 
 @functools.cache
 def replay(case: str) -> Replay:
-    record = json.loads((GOLDEN / f"{case}.json").read_text())
-    golden = dict(np.load(GOLDEN / f"{case}.npz"))
-    config = record["config"]
-    world = ReferenceWorld(config)
+    golden = load(case)
+    world = ReferenceWorld(golden.config)
     results, parts, flat = [], [], []
     for t, action in enumerate(golden["action"]):
         world.set_state(
-            layout=record["reset_layout"],
+            layout=golden.layout,
             pillar_yaws=PILLAR_YAWS.get(case),
-            start_pose=(*record["reset_layout"]["robot"], config["robot_rot"]),
+            start_pose=(*golden.layout["robot"], golden.config["robot_rot"]),
             step_count=t,
             **{key: golden[key][t] for key in ("qpos", "qvel", "qacc_warmstart", "time")},
             **{key: golden[key][t] for key in ("goal_pos", "goal_button", "buttons_timer")},
@@ -101,12 +90,12 @@ def replay(case: str) -> Replay:
         results.append({**result, "buttons_timer": world.buttons_timer})
         parts.append(world.observe_parts())
         flat.append(world.observe())
-    return Replay(golden, config, record["observation_layout"], results, parts, flat, start)
+    return Replay(golden, results, parts, flat, start)
 
 
 def failed_draws(run: Replay) -> np.ndarray:
     """Rows [T] that ended since no place was found for the next goal: the caller's part."""
-    continues = run.config.get("continue_goal", True)
+    continues = run.golden.config.get("continue_goal", True)
     return run.golden["goal_met"].astype(bool) & run.golden["done"].astype(bool) & continues
 
 
@@ -139,10 +128,10 @@ def test_reward_and_events(case):
 @pytest.mark.parametrize("case", CASES)
 def test_costs(case):
     run = replay(case)
-    keys = {key for key in run.golden if key.startswith("cost")}
+    keys = {key for key in run.golden.arrays if key.startswith("cost")}
     assert keys == {key for key in run.results[0] if key.startswith("cost")} - {"cost_exception"}
     for key in keys:
-        tolerance = 0 if run.config.get("constrain_indicator", True) else 1e-6
+        tolerance = 0 if run.golden.config.get("constrain_indicator", True) else 1e-6
         np.testing.assert_allclose(
             run.got(key), run.golden[key], rtol=0, atol=tolerance, err_msg=key
         )
@@ -154,10 +143,8 @@ def test_observation(case):
     run = replay(case)
     calm, golden = run.recorded_path(), run.golden["observation"]
     np.testing.assert_allclose(run.start, golden[0], atol=1e-9)
-    assert set(run.parts[0]) == {component["key"] for component in run.layout}
-    for component in run.layout:
-        key, here = component["key"], slice(component["start"], component["stop"])
-        assert run.parts[0][key].shape == tuple(component["shape"])
+    assert {key: part.shape for key, part in run.parts[0].items()} == run.golden.shapes
+    for key, here in run.golden.components.items():
         got = np.array([part[key].ravel() for part in run.parts])
         want = golden[1:, here]
         np.testing.assert_allclose(got[calm], want[calm], atol=1e-9, err_msg=key)
@@ -165,4 +152,4 @@ def test_observation(case):
 
 
 def test_every_recorded_case_is_compared():
-    assert {path.stem for path in GOLDEN.glob("*.npz")} == set(CASES)
+    assert set(NAMES) == set(CASES)
