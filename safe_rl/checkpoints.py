@@ -1,0 +1,114 @@
+"""Checkpoints of a run: the last few and the best feasible one, written atomically.
+
+A checkpoint is one archive of :class:`torchrl.checkpoint.Checkpoint`, whose tensors are loaded
+weights-only: reading one runs no code of its.
+"""
+
+from __future__ import annotations
+
+import math
+import zipfile
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, Protocol
+
+from torchrl.checkpoint import (
+    Checkpoint,
+    CheckpointError,
+    CheckpointRotation,
+    StateDictCheckpointAdapter,
+)
+
+__all__ = ["CheckpointStore", "Stateful"]
+
+
+class Stateful(Protocol):
+    """Anything with a ``state_dict``."""
+
+    def state_dict(self) -> Mapping[str, Any]:
+        """Everything that an exact continuation needs."""
+        ...
+
+    def load_state_dict(self, state_dict: Mapping[str, Any]) -> Any:
+        """Continue from :meth:`state_dict`."""
+        ...
+
+
+class CheckpointStore:
+    """The checkpoints in a run's folder.
+
+    ``last/`` keeps the newest, ``best/`` the one with the highest return among those in which
+    every cost was within its limit. Names carry the number of environment steps.
+
+    Args:
+        directory: Folder of the checkpoints.
+        components: Parts of the run, by name.
+        keep_last: Number of newest checkpoints to keep.
+
+    Examples:
+        >>> import tempfile, torch
+        >>> network = torch.nn.Linear(2, 1)
+        >>> folder = tempfile.mkdtemp()
+        >>> store = CheckpointStore(folder, {"network": network}, keep_last=2)
+        >>> for steps in (100, 200, 300):
+        ...     path = store.save(steps)
+        >>> [path.name for path in store.last.checkpoints()]
+        ['checkpoint-000000000200.torchrl', 'checkpoint-000000000300.torchrl']
+        >>> store.save_best(300, score=1.0), store.save_best(400, score=0.5)
+        (True, False)
+        >>> CheckpointStore.load(store.last.latest(), {"network": torch.nn.Linear(2, 1)})
+    """
+
+    def __init__(
+        self, directory: Path | str, components: Mapping[str, Stateful], *, keep_last: int
+    ) -> None:
+        directory = Path(directory)
+        self._checkpoint = _checkpoint(components)
+        self.last = CheckpointRotation(directory / "last", keep_last=keep_last)
+        self.best = CheckpointRotation(directory / "best", keep_last=1)
+
+    def save(self, steps: int, metadata: Mapping[str, Any] | None = None) -> Path:
+        """Write a checkpoint and drop the oldest that is too many.
+
+        Args:
+            steps: Environment steps so far.
+            metadata: JSON-compatible facts, readable without loading.
+        """
+        return self.last.save(self._checkpoint, step=steps, metadata=metadata)
+
+    def save_best(
+        self, steps: int, score: float, metadata: Mapping[str, Any] | None = None
+    ) -> bool:
+        """Write a checkpoint if ``score`` is higher than that of the best one.
+
+        Returns:
+            Whether it was written.
+        """
+        latest = self.best.latest()
+        best = -math.inf if latest is None else Checkpoint.manifest(latest)["metadata"]["score"]
+        if not score > best:
+            return False
+        self.best.save(self._checkpoint, step=steps, metadata={**(metadata or {}), "score": score})
+        return True
+
+    @staticmethod
+    def load(path: Path, components: Mapping[str, Stateful]) -> None:
+        """Restore ``components`` from a checkpoint that has them, other parts of it aside.
+
+        Raises:
+            CheckpointError: If the file is no checkpoint, or does not fit the components.
+        """
+        try:
+            _checkpoint(components).load(path)
+        except (CheckpointError, zipfile.BadZipFile, OSError) as error:
+            raise CheckpointError(f"Cannot continue from {path}: {error}") from error
+
+
+def _checkpoint(components: Mapping[str, Stateful]) -> Checkpoint:
+    # torch's format restores in one read and refuses everything but tensors and plain containers;
+    # one archive per checkpoint instead of hundreds of files
+    adapter = StateDictCheckpointAdapter(payload_format="torch")
+    checkpoint = Checkpoint(format="archive")
+    for name, component in components.items():
+        checkpoint.register(name, component, adapter=adapter)
+    return checkpoint

@@ -1,0 +1,95 @@
+"""The three learning curves of the benchmark: return, episode cost, cost rate."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import EngFormatter
+
+__all__ = ["draw_learning_curves"]
+
+SMOOTHING_EPOCHS = 5
+"""Epochs in the moving mean, as many as final figures are averaged over."""
+
+
+def draw_learning_curves(
+    table: Mapping[str, Sequence[float]],
+    cost_limits: Mapping[str, float],
+    episode_length: int,
+    path: Path,
+    title: str = "",
+) -> None:
+    """Draw return, episode cost and cost rate over environment steps (Ray et al. 2019, Figure 7).
+
+    Limits d are dashed in the second panel, d / T_ep in the third. There is a line for every cost
+    with a limit, or for the aggregate cost if there is none. Single epochs are drawn faint, their
+    moving mean strong.
+
+    Args:
+        table: Columns of a run's table, see :func:`safe_rl.tables.read_table`.
+        cost_limits: Cost key -> d, undiscounted cost per episode.
+        episode_length: T_ep, steps of a full episode.
+        path: Picture to write, replaced in one go.
+        title: Written above the panels.
+
+    Examples:
+        >>> import tempfile
+        >>> table = {
+        ...     "steps": [1000, 2000],
+        ...     "episode_return": [0.0, 1.0],
+        ...     "episode_cost": [50.0, 30.0],
+        ...     "cost_rate": [0.05, 0.04],
+        ... }
+        >>> path = Path(tempfile.mkdtemp()) / "curves.png"
+        >>> draw_learning_curves(table, {"cost": 25.0}, 1000, path)
+        >>> path.exists()
+        True
+    """
+    figure = Figure(figsize=(12, 3.4), layout="constrained")
+    returns, costs, rates = figure.subplots(1, 3)
+    steps = np.asarray(table["steps"], dtype=float)
+    _draw(returns, steps, table["episode_return"], "C0", None)
+    for index, key in enumerate(cost_limits or ["cost"]):
+        colour = f"C{index + 1}"
+        _draw(costs, steps, table[f"episode_{key}"], colour, key)
+        rates.plot(steps, table[f"{key}_rate"], color=colour, label=key)
+        if key in cost_limits:
+            limit = cost_limits[key]
+            costs.axhline(limit, color=colour, linestyle="--", linewidth=1)
+            rates.axhline(limit / episode_length, color=colour, linestyle="--", linewidth=1)
+    for axes, name in ((returns, "Return"), (costs, "Episode cost"), (rates, "Cost rate")):
+        axes.set_title(name)
+        axes.set_xlabel("Environment steps")
+        axes.xaxis.set_major_formatter(EngFormatter(sep=""))
+        axes.grid(alpha=0.3)
+    for axes in (costs, rates):
+        axes.set_ylim(bottom=0)
+        if len(cost_limits) > 1:
+            axes.legend()
+    figure.suptitle(title)
+    # a viewer that watches the file never sees half a picture
+    unfinished = path.with_suffix(".tmp" + path.suffix)
+    figure.savefig(unfinished, dpi=120)
+    unfinished.replace(path)
+
+
+def _draw(
+    axes: Axes, steps: np.ndarray, values: Sequence[float], colour: str, label: str | None
+) -> None:
+    """Epochs in which an episode finished, and their moving mean."""
+    known = np.isfinite(values)
+    steps, heights = steps[known], np.asarray(values, dtype=float)[known]
+    axes.plot(steps, heights, color=colour, alpha=0.3, linewidth=1)
+    axes.plot(steps, _moving_mean(heights), color=colour, label=label)
+
+
+def _moving_mean(values: np.ndarray) -> np.ndarray:
+    """Mean of each value and the up to ``SMOOTHING_EPOCHS - 1`` before it."""
+    sums = np.cumsum(np.concatenate([[0.0], values]))
+    ends = np.arange(1, len(values) + 1)
+    starts = np.maximum(ends - SMOOTHING_EPOCHS, 0)
+    return (sums[ends] - sums[starts]) / (ends - starts)

@@ -1,0 +1,152 @@
+"""What a run leaves in its folder and shows on the terminal."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from hydra.utils import instantiate
+from omegaconf import DictConfig, OmegaConf
+from tqdm import tqdm
+
+from safe_rl.plotting import draw_learning_curves
+from safe_rl.tables import TableWriter, read_table
+
+__all__ = ["FINAL_EPOCHS", "RunFolder", "final_figures"]
+
+FINAL_EPOCHS = 5
+"""Epochs over which the final J_r and J_c are averaged (Ray et al. 2019, section 5.1)."""
+
+
+class RunFolder:
+    """Configuration, table, logger, learning curves and progress bar of one run.
+
+    The folder holds ``config.yaml`` (resolved), ``progress.csv`` (a row per epoch), ``curves.png``
+    and what the configured logger writes.
+
+    Args:
+        directory: The folder; made if it does not exist.
+        config: Configuration of the run.
+        cost_limits: Cost key -> d, undiscounted cost per episode.
+        episode_length: T_ep, steps of a full episode.
+
+    Examples:
+        >>> import tempfile
+        >>> config = OmegaConf.create({"frames": 200, "logger": {}, "algo": {"name": "ppo"}})
+        >>> folder = RunFolder(Path(tempfile.mkdtemp()), config, {"cost": 25.0}, 1000)
+        >>> row = {"steps": 200, "episode_return": 1.0, "episode_cost": 30.0, "cost_rate": 0.03}
+        >>> with folder.writing():
+        ...     folder.record(row | {"time_total": 2.0})
+        ...     folder.draw_curves()
+        >>> folder.summary().split(" in ")[0]
+        'J_r 1.00, J_c 30.0 (limit 25), ρ_c 0.0300, 100 steps/s'
+    """
+
+    def __init__(
+        self,
+        directory: Path,
+        config: DictConfig,
+        cost_limits: Mapping[str, float],
+        episode_length: int,
+    ) -> None:
+        directory.mkdir(parents=True, exist_ok=True)
+        self.directory = directory
+        self._config = config
+        self._cost_limits = dict(cost_limits)
+        self._episode_length = episode_length
+
+    @property
+    def table_path(self) -> Path:
+        """The CSV file."""
+        return self.directory / "progress.csv"
+
+    @property
+    def checkpoint_directory(self) -> Path:
+        """Folder of the checkpoints."""
+        return self.directory / "checkpoints"
+
+    @contextmanager
+    def writing(self, epoch: int = 0, steps: int = 0) -> Iterator[None]:
+        """Keep the files open; ``epoch`` and ``steps`` say where a continued run stands."""
+        OmegaConf.save(self._config, self.directory / "config.yaml", resolve=True)
+        self._table = TableWriter(self.table_path, keep_rows=epoch)
+        self._logger = None
+        if self._config.logger.get("_target_"):
+            self._logger = instantiate(self._config.logger, log_dir=str(self.directory))
+        self._bar = tqdm(
+            total=self._config.frames, initial=steps, unit=" steps", unit_scale=True,
+            dynamic_ncols=True, smoothing=0.1,
+        )  # fmt: skip
+        self._shown: dict[str, str] = {}
+        try:
+            yield
+        finally:
+            self._bar.close()
+            self._table.close()
+
+    def record(self, row: Mapping[str, float]) -> None:
+        """Write one epoch to table and logger and show it."""
+        self._table.write(row)
+        if self._logger is not None:
+            for name, value in row.items():
+                if not math.isnan(value):
+                    self._logger.log_scalar(name, value, step=int(row["steps"]))
+        self._bar.update(int(row["steps"]) - self._bar.n)
+        self._shown |= self._postfix(row)
+        self._bar.set_postfix(self._shown, refresh=True)
+
+    def _postfix(self, row: Mapping[str, float]) -> dict[str, str]:
+        """What the bar shows of an epoch: only what is known in it."""
+        shown = {"return": f"{row['episode_return']:.2f}"}
+        for key in self._cost_limits or ["cost"]:
+            limit = f"/{self._cost_limits[key]:g}" if key in self._cost_limits else ""
+            shown[key] = f"{row[f'episode_{key}']:.1f}{limit}"
+        if math.isnan(row["episode_return"]):
+            shown = {}
+        multipliers = [value for name, value in row.items() if name.startswith("multiplier_")]
+        if multipliers:
+            shown["λ"] = " ".join(f"{value:.3g}" for value in multipliers)
+        return shown
+
+    def draw_curves(self) -> None:
+        """Write ``curves.png`` from the table."""
+        table = read_table(self.table_path)
+        title = f"{self._config.get('env', {}).get('name', '')} {self._config.algo.name}".strip()
+        path = self.directory / "curves.png"
+        draw_learning_curves(table, self._cost_limits, self._episode_length, path, title)
+
+    def summary(self) -> str:
+        """One line on how the run ended."""
+        final = final_figures(read_table(self.table_path), list(self._cost_limits) or ["cost"])
+        parts = [f"J_r {final['episode_return']:.2f}"]
+        several = len(self._cost_limits) > 1
+        for key in self._cost_limits or ["cost"]:
+            name = f"[{key}]" if several else ""
+            limit = f" (limit {self._cost_limits[key]:g})" if key in self._cost_limits else ""
+            parts.append(f"J_c{name} {final[f'episode_{key}']:.1f}{limit}")
+            parts.append(f"ρ_c{name} {final[f'{key}_rate']:.4f}")  # noqa: RUF001
+        parts.append(f"{final['steps_per_second']:,.0f} steps/s")
+        return f"{', '.join(parts)} in {self.directory}"
+
+
+def final_figures(table: Mapping[str, list[float]], cost_keys: list[str]) -> dict[str, float]:
+    """Final J_r, J_c and ρ_c (Ray et al. 2019, section 5.1), and steps per second of the run.
+
+    J_r and J_c are means over the last ``FINAL_EPOCHS`` epochs in which an episode finished, ρ_c
+    is that of the last epoch.
+
+    Args:
+        table: Columns of the run's table.
+        cost_keys: Keys of the costs to report.
+    """
+    known = [row for row, value in enumerate(table["episode_return"]) if not math.isnan(value)]
+    final: dict[str, Any] = {}
+    for name in ("episode_return", *(f"episode_{key}" for key in cost_keys)):
+        values = [table[name][row] for row in known[-FINAL_EPOCHS:]]
+        final[name] = sum(values) / len(values) if values else math.nan
+    final |= {f"{key}_rate": table[f"{key}_rate"][-1] for key in cost_keys}
+    final["steps_per_second"] = table["steps"][-1] / table["time_total"][-1]
+    return final

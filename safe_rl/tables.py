@@ -1,0 +1,93 @@
+"""A run's table: one CSV file, one row per epoch, readable while the run writes it."""
+
+from __future__ import annotations
+
+import csv
+import math
+from collections.abc import Mapping
+from pathlib import Path
+
+__all__ = ["TableWriter", "read_table"]
+
+
+class TableWriter:
+    """Append rows of numbers to a CSV file; the first row fixes the columns.
+
+    Every row is flushed. NaN becomes an empty field. Numbers are written so that they read back
+    exactly, whole ones without a decimal point.
+
+    Args:
+        path: File to write. An existing one is replaced.
+        keep_rows: Number of rows of an existing file to keep, for a run that continues; 0 starts
+            afresh.
+
+    Raises:
+        ValueError: By :meth:`write`, if a row's columns differ from the first one's.
+
+    Examples:
+        >>> import tempfile
+        >>> path = Path(tempfile.mkdtemp()) / "progress.csv"
+        >>> with TableWriter(path) as table:
+        ...     table.write({"epoch": 1, "episode_return": math.nan})
+        ...     table.write({"epoch": 2, "episode_return": 0.5})
+        >>> read_table(path)["episode_return"]
+        [nan, 0.5]
+    """
+
+    def __init__(self, path: Path, keep_rows: int = 0) -> None:
+        kept = path.read_text().splitlines(keepends=True)[: keep_rows + 1] if keep_rows else []
+        self._columns = next(csv.reader(kept)) if kept else None
+        # replaced in one go: a run killed here still has its table
+        rewritten = path.with_suffix(".tmp")
+        rewritten.write_text("".join(kept))
+        rewritten.replace(path)
+        self._file = path.open("a", newline="")
+        self._writer = csv.writer(self._file, lineterminator="\n")
+
+    def write(self, row: Mapping[str, float]) -> None:
+        """Append a row."""
+        if self._columns is None:
+            self._columns = list(row)
+            self._writer.writerow(self._columns)
+        if list(row) != self._columns:
+            unexpected = sorted(set(row).symmetric_difference(self._columns))
+            raise ValueError(
+                f"Every row of the table must have the columns of the first, in the same order; "
+                f"these are in one of the two only: {unexpected}. Report a diagnostic in every "
+                "epoch, as NaN where it does not exist."
+            )
+        self._writer.writerow([_field(value) for value in row.values()])
+        self._file.flush()
+
+    def close(self) -> None:
+        """Close the file."""
+        self._file.close()
+
+    def __enter__(self) -> TableWriter:
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        self.close()
+
+
+def _field(value: float) -> str:
+    if math.isnan(value):
+        return ""
+    return str(int(value)) if float(value).is_integer() else repr(float(value))
+
+
+def read_table(path: Path) -> dict[str, list[float]]:
+    """Read a table by columns; empty fields are NaN.
+
+    Raises:
+        ValueError: If the file has no header.
+    """
+    with path.open(newline="") as file:
+        rows = list(csv.reader(file))
+    if not rows:
+        raise ValueError(f"{path} is empty: the run has not finished an epoch.")
+    columns = zip(*rows[1:], strict=True) if len(rows) > 1 else ([] for _ in rows[0])
+    return {
+        name: [float(field) if field else math.nan for field in column]
+        for name, column in zip(rows[0], columns, strict=True)
+    }

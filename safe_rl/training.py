@@ -1,0 +1,222 @@
+"""The training loop: collect, account, learn, record."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import torch
+from omegaconf import DictConfig
+from tensordict import TensorDictBase
+from torchrl.checkpoint import GlobalRNGState
+from torchrl.collectors import Collector
+from torchrl.envs import EnvBase
+
+from safe_rl.algorithm import Algorithm
+from safe_rl.building import build_algorithm, check_cost_limits
+from safe_rl.checkpoints import CheckpointStore, Stateful
+from safe_rl.collectors import EpisodeAccounting, make_collector
+from safe_rl.interrupts import StopRequest
+from safe_rl.models import BehaviourPolicy
+from safe_rl.run_folder import RunFolder
+
+__all__ = ["Trainer", "build_trainer", "seed_everything"]
+
+
+def seed_everything(seed: int, num_threads: int | None) -> None:
+    """Seed torch and set the number of threads it computes with; None leaves the number alone."""
+    torch.manual_seed(seed)
+    if num_threads is not None:
+        torch.set_num_threads(num_threads)
+
+
+def build_trainer(config: DictConfig, env: EnvBase, directory: Path) -> Trainer:
+    """Build everything that a run consists of.
+
+    Args:
+        config: Configuration as composed from ``conf/``.
+        env: Seeded environment with ``observation_layout``, ``cost_keys`` and
+            ``config.num_steps``; if it has ``get_state`` and ``set_state``, a checkpoint holds the
+            state of its worlds.
+        directory: Folder of the run.
+
+    Raises:
+        ValueError: If parts of the configuration do not fit together.
+    """
+    cost_limits = check_cost_limits(config.cost_limits, env.cost_keys)
+    algorithm = build_algorithm(config, env)
+    return Trainer(
+        env=env,
+        algorithm=algorithm,
+        collector=make_collector(
+            env,
+            BehaviourPolicy(algorithm.networks.actor),
+            frames_per_batch=config.frames_per_batch,
+            device=config.device,
+        ),
+        cost_limits=cost_limits,
+        folder=RunFolder(directory, config, cost_limits, env.config.num_steps),
+        config=config,
+    )
+
+
+class Trainer:
+    """One run.
+
+    Args:
+        env: Environment that the collector steps.
+        algorithm: What learns.
+        collector: Endless collector of [N, T] batches, running the algorithm's actor.
+        cost_limits: Cost key -> d, undiscounted cost per episode: what counts as feasible.
+        folder: Where the run writes.
+        config: Configuration of the run, for ``frames`` and ``checkpoint``.
+    """
+
+    def __init__(
+        self,
+        env: EnvBase,
+        algorithm: Algorithm,
+        collector: Collector,
+        *,
+        cost_limits: Mapping[str, float],
+        folder: RunFolder,
+        config: DictConfig,
+    ) -> None:
+        self.algorithm = algorithm
+        self.accounting = EpisodeAccounting(
+            env.batch_size.numel(), env.cost_keys, device=collector.storing_device
+        )
+        self.progress = Progress()
+        self.folder = folder
+        self._env = env
+        self._collector = collector
+        self._cost_limits = dict(cost_limits)
+        self._frames = config.frames
+        self._checkpoint_interval = config.checkpoint.interval
+        self._checkpoints = CheckpointStore(
+            folder.checkpoint_directory,
+            self.components(),
+            keep_last=config.checkpoint.keep_last,
+        )
+
+    def components(self) -> dict[str, Stateful]:
+        """Parts of a checkpoint, by name."""
+        parts: dict[str, Stateful] = {
+            **self.algorithm.checkpoint_components(),
+            "accounting": self.accounting,
+            "progress": self.progress,
+            "rng": GlobalRNGState(),
+        }
+        if hasattr(self._env, "get_state"):
+            parts["env"] = EnvironmentState(self._env, self._collector)
+        return parts
+
+    def restore(self, checkpoint: Path) -> None:
+        """Continue from a checkpoint of a run with the same configuration.
+
+        Raises:
+            CheckpointError: If the file is no checkpoint, or does not fit this run.
+        """
+        CheckpointStore.load(checkpoint, self.components())
+
+    def run(self) -> str:
+        """Train for ``frames`` steps, rounded up to whole batches.
+
+        Ctrl-C or SIGTERM ends the run after the epoch at hand, with a checkpoint.
+
+        Returns:
+            One line on the outcome.
+        """
+        batches = iter(self._collector)
+        saved_at = time.monotonic()
+        with self.folder.writing(self.progress.epoch, self.progress.steps), StopRequest() as stop:
+            while self.progress.steps < self._frames and not stop.received:
+                row = self.epoch(batches)
+                self.folder.record(row)
+                self._save_if_best(row)
+                if time.monotonic() - saved_at > self._checkpoint_interval:
+                    self._save()
+                    saved_at = time.monotonic()
+            self._save()
+        return self.folder.summary()
+
+    def epoch(self, batches: Iterator[TensorDictBase]) -> dict[str, float]:
+        """Collect one batch and learn from it; returns the row of the table."""
+        start = time.perf_counter()
+        batch = next(batches)
+        collected = time.perf_counter()
+        episodes = self.accounting.update(batch)
+        learned = self.algorithm.learn(batch, episodes)
+        end = time.perf_counter()
+        self.progress.add(batch.numel(), end - start)
+        return {
+            "epoch": self.progress.epoch,
+            "steps": self.progress.steps,
+            **episodes.scalars(),
+            **learned,
+            "time_collect": collected - start,
+            "time_learn": end - collected,
+            "time_total": self.progress.seconds,
+            "steps_per_second": batch.numel() / (end - start),
+        }
+
+    def _save(self) -> None:
+        self._checkpoints.save(self.progress.steps, {"epoch": self.progress.epoch})
+        self.folder.draw_curves()
+
+    def _save_if_best(self, row: Mapping[str, float]) -> None:
+        """Keep the policy with the highest return among those that kept every limit."""
+        feasible = all(row[f"episode_{key}"] <= d for key, d in self._cost_limits.items())
+        if feasible and not math.isnan(row["episode_return"]):
+            self._checkpoints.save_best(
+                self.progress.steps, row["episode_return"], {"epoch": self.progress.epoch}
+            )
+
+
+class Progress:
+    """Counters of a run: epochs, environment steps, seconds of training."""
+
+    def __init__(self) -> None:
+        self.epoch = 0
+        self.steps = 0
+        self.seconds = 0.0
+
+    def add(self, steps: int, seconds: float) -> None:
+        """Count one epoch."""
+        self.epoch += 1
+        self.steps += steps
+        self.seconds += seconds
+
+    def state_dict(self) -> dict[str, Any]:
+        """The counters."""
+        return dict(vars(self))
+
+    def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
+        """Continue from :meth:`state_dict`."""
+        vars(self).update(state_dict)
+
+
+class EnvironmentState:
+    """State of the environment's worlds and of the observation that the collector goes on from.
+
+    Args:
+        env: Environment with ``get_state`` and ``set_state``.
+        collector: The collector that steps it.
+    """
+
+    def __init__(self, env: EnvBase, collector: Collector) -> None:
+        self._env = env
+        self._collector = collector
+
+    def state_dict(self) -> dict[str, Any]:
+        """The environment's snapshot."""
+        return self._env.get_state().to_dict()
+
+    def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
+        """Put the worlds back, and the collector in front of them."""
+        snapshot = self._env.get_state().from_dict(state_dict, batch_size=self._env.batch_size)
+        # the collector has no public way to start from a given state instead of a reset
+        self._collector._carrier.update(self._env.set_state(snapshot))
