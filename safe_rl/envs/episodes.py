@@ -184,18 +184,14 @@ def _current(world: World) -> Tensor:
     return current
 
 
-def noisy(config: SafetyGymConfig, control: Tensor, key: Tensor) -> Tensor:
-    """Add the configured Gaussian noise to controls [N, nu]."""
-    if config.action_noise == 0.0:
-        return control
-    columns = torch.arange(control.shape[-1])
-    return control + config.action_noise * rng.normal(key[:, None], Purpose.NOISE, columns)
+def control_noise(config: SafetyGymConfig, key: Tensor, num_controls: int) -> Tensor:
+    """Draw the configured Gaussian noise on the controls: keys [N] -> [N, nu]."""
+    columns = torch.arange(num_controls)
+    return config.action_noise * rng.normal(key[:, None], Purpose.NOISE, columns)
 
 
-def draw_substeps(config: SafetyGymConfig, key: Tensor) -> Tensor | int:
-    """Draw the number of substeps, Binomial(n, p): one number where it is certain, else [N]."""
-    if config.frameskip_binom_p == 1.0:
-        return config.frameskip_binom_n
+def draw_substeps(config: SafetyGymConfig, key: Tensor) -> Tensor:
+    """Draw numbers of substeps, Binomial(n, p): keys [N] -> int64 [N]."""
     trials = torch.arange(config.frameskip_binom_n)
     draws = rng.uniform(key[:, None], Purpose.FRAMESKIP, trials)
     return (draws < config.frameskip_binom_p).sum(-1)

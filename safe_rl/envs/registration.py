@@ -40,8 +40,8 @@ def make_env(env: str | Mapping[str, Any] | SafetyGymConfig, **kwargs: Any) -> S
         ConfigError: for an unknown name or key, or a value that cannot be used.
 
     Examples:
-        >>> make_env({"name": "mine", "robot_base": "point", "observe_goal_lidar": True}).config.task
-        'goal'
+        >>> make_env({"name": "mine", "robot_base": "point"}, num_envs=2).batch_size
+        torch.Size([2])
     """
     if isinstance(env, Mapping):
         env = {key: value for key, value in env.items() if key != "name"}

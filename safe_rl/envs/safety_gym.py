@@ -16,10 +16,10 @@ from safe_rl.envs.config import SafetyGymConfig
 from safe_rl.envs.costs import compute_costs, cost_keys
 from safe_rl.envs.episodes import (
     Purpose,
+    control_noise,
     draw_substeps,
     gremlin_path,
     next_goals,
-    noisy,
     start_episodes,
 )
 from safe_rl.envs.layout import plan_placements
@@ -131,6 +131,7 @@ class SafetyGymEnv(EnvBase):
         return rng.fold(self._row_seed, self._episode)
 
     def _step_key(self) -> Tensor:
+        """Random key of the step that is being taken, [N]."""
         return rng.fold(self._row_seed, self._episode, self._world.step_count + 1)
 
     def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDictBase:
@@ -158,13 +159,12 @@ class SafetyGymEnv(EnvBase):
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         world, config = self._world, self.config
-        key = self._step_key()
-        failed = self._advance(self._checked_action(tensordict), key)
+        failed = self._advance(self._checked_action(tensordict))
         now = self._task.measure(world)
         reward = dense_reward(config, world, self._measured, now)
         costs = compute_costs(config, world, failed)
         world.buttons_timer.sub_(1).clamp_(min=0)
-        met, ended, stuck = self._handle_goals(now, failed, key)
+        met, ended, stuck = self._handle_goals(now, failed)
         reward = torch.where(failed, config.reward_exception, reward + config.reward_goal * met)
         world.step_count.add_(1)
         terminated = failed | ended
@@ -185,21 +185,24 @@ class SafetyGymEnv(EnvBase):
             )
         return action.detach().cpu().to(torch.float64)
 
-    def _advance(self, action: Tensor, key: Tensor) -> Tensor:
+    def _advance(self, action: Tensor) -> Tensor:
         """Run the substeps of one step; returns the worlds whose physics failed [N]."""
         config, physics = self.config, self._physics
         control = action.clamp(self._control_low, self._control_high)
-        physics.ctrl.copy_(noisy(config, control, key))
+        num_substeps: Tensor | int = config.frameskip_binom_n
+        if config.action_noise > 0.0:
+            control = control + control_noise(config, self._step_key(), control.shape[-1])
+        if config.frameskip_binom_p < 1.0:
+            num_substeps = draw_substeps(config, self._step_key())
+        physics.ctrl.copy_(control)
         path = None
         if self._world.scene.num_targets:
             path = gremlin_path(self._world, physics.time, config.frameskip_binom_n)
-        failed = physics.step(draw_substeps(config, key), path)
+        failed = physics.step(num_substeps, path)
         refresh(self._world)
         return failed
 
-    def _handle_goals(
-        self, now: Tensor, failed: Tensor, key: Tensor
-    ) -> tuple[Tensor, Tensor, Tensor]:
+    def _handle_goals(self, now: Tensor, failed: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Give worlds that met their goal a new one: met, ended by it, without a place for one."""
         self._measured = now
         never = torch.zeros_like(failed)
@@ -210,7 +213,7 @@ class SafetyGymEnv(EnvBase):
             return met, met, never
         if not met.any():
             return met, never, never
-        stuck = next_goals(self._world, self._plan, key, met)
+        stuck = next_goals(self._world, self._plan, self._step_key(), met)
         self._measured = self._task.measure(self._world)
         return met, never, stuck
 
