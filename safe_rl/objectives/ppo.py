@@ -32,7 +32,7 @@ class PPOLoss(SurrogateLoss):
     """Clipped policy loss of PPO (Schulman et al. 2017), without constraints.
 
     Differs from `torchrl.objectives.ClipPPOLoss` in that critics are not its business (see
-    `CriticLoss`) and that ``kl`` is the exact mean KL(π_k ‖ π_θ), by which early stopping can
+    `CriticLoss`) and that ``kl`` is the exact mean KL(π_θ ‖ π_k), by which early stopping can
     be decided. See `SurrogateLoss` for what it reads and writes; adds ``clip_fraction``.
 
     Args:

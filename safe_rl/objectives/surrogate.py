@@ -45,7 +45,7 @@ class SurrogateLoss(LossModule):
 
     Reads a batch of any shape, [B] or [N, T], with normalised advantages. Writes
     ``loss_objective`` (to minimise), ``loss_entropy`` if there is an entropy bonus, and the
-    detached scalars ``kl`` (mean over states of KL(π_k ‖ π_θ), π_k the policy whose parameters
+    detached scalars ``kl`` (mean over states of KL(π_θ ‖ π_k), π_k the policy whose parameters
     the batch holds), ``entropy`` and ``ESS``.
 
     Args:
@@ -173,12 +173,12 @@ class SurrogateLoss(LossModule):
         return (log_prob - behaviour).unsqueeze(-1)
 
     def _kl(self, tensordict: TensorDictBase, distribution: Distribution) -> Tensor:
-        """KL(π_k ‖ π_θ) per state, [...]."""
+        """KL(π_θ ‖ π_k) per state, [...]."""
         hint = "It is the behaviour policy's, stored when the action was sampled."
         loc, scale = (
             require(tensordict, key, hint) for key in (self.tensor_keys.loc, self.tensor_keys.scale)
         )
-        return gaussian_kl(loc, scale, *normal_parameters(distribution))
+        return gaussian_kl(*normal_parameters(distribution), loc, scale)
 
     def _advantage(self, tensordict: TensorDictBase, log_weight: Tensor) -> Tensor:
         """Reward advantage, [..., 1]."""

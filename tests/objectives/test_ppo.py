@@ -106,7 +106,7 @@ def test_kl_is_exact_and_carries_no_gradient():
     perturb(actor)
     behaviour = Independent(Normal(batch["loc"], batch["scale"]), 1)
     current = actor.get_dist(batch.clone()).base_dist
-    expected = kl_divergence(behaviour, Independent(current, 1)).mean()
+    expected = kl_divergence(Independent(current, 1), behaviour).mean()
     losses = make_lagrangian(actor, init=1.0, limits=25.0)(batch)
     torch.testing.assert_close(losses["kl"], expected.detach())
     trained = {key for key, value in losses.items() if value.requires_grad}
