@@ -27,6 +27,9 @@ PLACEMENT_ORDER = (
     *("hazards", "vases", "pillars", "gremlins"),
 )
 
+# Rays select geoms by MuJoCo's groups 0 to 5.
+NUM_RAY_GROUPS = int(mujoco.mjNGROUP)
+
 
 class Motion(Enum):
     """How an element takes part in the physics."""

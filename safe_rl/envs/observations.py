@@ -14,8 +14,8 @@ import torch
 from torch import Tensor
 
 from safe_rl.envs.config import ConfigError, SafetyGymConfig
-from safe_rl.envs.elements import ELEMENTS
-from safe_rl.envs.lidar import compass, pseudo_lidar, to_ego
+from safe_rl.envs.lidar import compass, to_ego
+from safe_rl.envs.lidar_blocks import lidar_blocks
 from safe_rl.envs.scene import Scene
 from safe_rl.envs.sensors import sensor_blocks
 from safe_rl.envs.tasks import distance
@@ -121,42 +121,9 @@ def _plain(config: SafetyGymConfig, scene: Scene) -> list[Block]:
     ]
 
 
-def _lidars(config: SafetyGymConfig, scene: Scene) -> list[Block]:
-    """All pseudo-lidars in one pass over all objects that any of them sees."""
-    kinds = [element.kind for element in ELEMENTS if element.observed(config)]
-    if not kinds:
-        return []
-    seen = [(scene.slots[kind], i) for i, kind in enumerate(kinds) if kind in scene.slots]
-    slots = torch.tensor([s for span, _ in seen for s in range(span.start, span.stop)])
-    group = torch.tensor([i for span, i in seen for _ in range(span.start, span.stop)])
-    bins = config.lidar_num_bins
-    asleep = slice(0, 0)
-    if "buttons" in kinds:
-        first = kinds.index("buttons") * bins
-        asleep = slice(first, first + bins)
-    on_floor = torch.tensor([1.0, 1.0, 0.0], dtype=torch.float64)
-
-    def read(world: World) -> Tensor:
-        objects = world.positions.index_select(1, slots) * on_floor
-        ego = to_ego(objects, world.robot_pos, world.robot_mat)
-        readings = pseudo_lidar(
-            ego[..., :2],
-            group,
-            len(kinds),
-            bins,
-            config.lidar_max_dist,
-            config.lidar_exp_gain,
-            config.lidar_alias,
-        )
-        readings[:, asleep] *= (world.buttons_timer == 0).unsqueeze(-1)
-        return readings
-
-    return [Block({f"{kind}_lidar": (bins,) for kind in kinds}, read)]
-
-
 SOURCES: tuple[Callable[[SafetyGymConfig, Scene], list[Block]], ...] = (
     sensor_blocks,
-    _lidars,
+    lidar_blocks,
     _plain,
 )
 

@@ -14,15 +14,16 @@ from pathlib import Path
 
 import mujoco
 
+from safe_rl.envs.bodies import add_bodies, add_floor, add_targets
 from safe_rl.envs.config import ConfigError, SafetyGymConfig
 from safe_rl.envs.elements import ELEMENTS, Element, Motion
+from safe_rl.envs.scenery import decorate
 
 ROBOT_FOLDER = Path(__file__).parent / "robots"
 # The robot files' stack and contact sizes would reserve hundreds of MB for every environment.
 ARENA_BYTES = 8 << 20
 # MuJoCo's default (1e-3) lets slowly sliding vases sleep, which lowers the vase-velocity cost.
 SLEEP_TOLERANCE = 1e-5
-FLOOR_HALF_SIZE = 3.5  # visible part [m]; the plane itself is infinite
 # Kinds whose contacts with the robot are counted, in the order of their sensors.
 CONTACT_KINDS = ("vases", "gremlins", "pillars", "buttons")
 
@@ -64,32 +65,36 @@ class Scene:
 
 
 @functools.lru_cache(maxsize=64)
-def build_scene(config: SafetyGymConfig, sleep: bool = False) -> Scene:
+def build_scene(config: SafetyGymConfig, sleep: bool = False, decorated: bool = False) -> Scene:
     """Compile the world of a configuration.
 
     Args:
         config: the environment.
         sleep: let resting free bodies sleep until something touches them.
+        decorated: build the world for pictures: areas are bodies too, and there are cameras, light
+            and a floor pattern. Its `qpos` and first mocap bodies are those of the plain world.
 
     Raises:
         ConfigError: if a custom robot file lacks what an environment needs.
     """
     spec, robot_bodies = _load_robot(config)
     _set_options(spec, sleep)
-    floor = _add_geom(spec, spec.worldbody, mujoco.mjtGeom.mjGEOM_PLANE, name="floor")
-    floor.size = [FLOOR_HALF_SIZE, FLOOR_HALF_SIZE, 0.1]
+    add_floor(spec)
     present = [element for element in ELEMENTS if element.count(config) > 0]
     for element in present:
         if element.motion in (Motion.FREE, Motion.GUIDED):
-            _add_bodies(spec, config, element)
+            add_bodies(spec, config, element)
     for element in present:
         if element.motion is Motion.GUIDED:
-            _add_targets(spec, config, element)
-    # Rays see geoms only, so natural lidar needs bodies for the areas as well.
-    in_physics = {Motion.STATIC} | ({Motion.VIRTUAL} if config.lidar_type == "natural" else set())
+            add_targets(spec, config, element)
+    if decorated:
+        decorate(spec, config, floor)
+    # Rays and pictures see geoms only, so natural lidar needs bodies for the areas as well.
+    needs_areas = decorated or config.lidar_type == "natural"
+    in_physics = {Motion.STATIC} | ({Motion.VIRTUAL} if needs_areas else set())
     for element in present:
         if element.motion in in_physics:
-            _add_bodies(spec, config, element)
+            add_bodies(spec, config, element)
     contact_names = _add_contact_sensors(spec, config, present)
     if config.task == "circle":
         spec.add_sensor(
@@ -124,50 +129,6 @@ def _set_options(spec: mujoco.MjSpec, sleep: bool) -> None:
     if sleep:
         spec.option.enableflags |= mujoco.mjtEnableBit.mjENBL_SLEEP
         spec.option.sleep_tolerance = SLEEP_TOLERANCE
-
-
-def _add_geom(
-    spec: mujoco.MjSpec, body: mujoco.MjsBody, geom_type: mujoco.mjtGeom, **attributes: object
-) -> mujoco.MjsGeom:
-    """Add a geom that inherits the robot file's defaults (condim, density)."""
-    return body.add_geom(spec.default, type=geom_type, **attributes)
-
-
-def _add_bodies(spec: mujoco.MjSpec, config: SafetyGymConfig, element: Element) -> None:
-    free = element.motion in (Motion.FREE, Motion.GUIDED)
-    collides = int(element.motion is not Motion.VIRTUAL)
-    rgba = [*element.rgb, 1.0 if collides else 0.25]
-    for name in element.names(config):
-        body = spec.worldbody.add_body(
-            name=name, pos=[0, 0, element.height(config)], mocap=not free
-        )
-        if free:
-            body.add_freejoint(name=name)
-        for shape in element.geoms(config):
-            geom = _add_geom(spec, body, shape.type, pos=shape.pos, rgba=rgba)
-            geom.size[: len(shape.size)] = shape.size
-            geom.group = element.group
-            geom.contype = geom.conaffinity = collides
-            if free:
-                geom.density = getattr(config, f"{element.kind}_density")
-
-
-def _add_targets(spec: mujoco.MjSpec, config: SafetyGymConfig, element: Element) -> None:
-    """Add a mocap target per object and weld the object to it, without any offset."""
-    for name in element.names(config):
-        target = spec.worldbody.add_body(
-            name=f"{name}_target", pos=[0, 0, element.height(config)], mocap=True
-        )
-        weld = spec.add_equality(
-            type=mujoco.mjtEq.mjEQ_WELD,
-            objtype=mujoco.mjtObj.mjOBJ_BODY,
-            name1=target.name,
-            name2=name,
-            solref=[0.02, 1.5],
-        )
-        # The data a new equality comes with are not a weld's: no anchor, relative pose from the
-        # initial one, torque scale 1.
-        weld.data[:10], weld.data[10:] = 0, 1
 
 
 def _contact_kinds(config: SafetyGymConfig) -> set[str]:

@@ -51,3 +51,16 @@ class Physics(Protocol):
             bool [N]: simulations that failed (non-finite or huge state); their state is finite
             again but meaningless until reset.
         """
+
+    def rays(self, origin: Tensor, directions: Tensor, group: int, exclude_body: int) -> Tensor:
+        """Cast rays into the simulations as their state is now.
+
+        Args:
+            origin: where the rays of each simulation start [N, 3] (m).
+            directions: unit vectors [N, R, 3].
+            group: the geom group that is seen, 0 to 5.
+            exclude_body: id of a body whose own geoms are not seen.
+
+        Returns:
+            Distance to the first surface [N, R] (m), -1 where there is none.
+        """

@@ -94,6 +94,15 @@ class BatchPhysics:
             self.ctrl[failed] = 0.0
         return failed
 
+    def rays(self, origin: Tensor, directions: Tensor, group: int, exclude_body: int) -> Tensor:
+        """See `Physics.rays`."""
+        seen = np.zeros(mujoco.mjNGROUP, dtype=np.uint8)
+        seen[group] = 1
+        distance, _ = self._batch.ray(
+            origin.numpy()[:, None], directions.numpy(), geomgroup=seen, bodyexclude=exclude_body
+        )
+        return torch.from_numpy(distance)
+
     def _substeps(self, count: int, path: Tensor | None, mask: np.ndarray | None) -> None:
         if count == 0:
             return
