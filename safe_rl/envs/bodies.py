@@ -16,8 +16,13 @@ def add_floor(spec: mujoco.MjSpec) -> None:
     floor.size = [FLOOR_HALF_SIZE, FLOOR_HALF_SIZE, 0.1]
 
 
-def add_bodies(spec: mujoco.MjSpec, config: SafetyGymConfig, element: Element) -> None:
-    """Add a body per object: free where it can be pushed, else one that is placed at resets."""
+def add_bodies(
+    spec: mujoco.MjSpec, config: SafetyGymConfig, element: Element, decorated: bool = False
+) -> None:
+    """Add a body per object: free where it can be pushed, else one that is placed at resets.
+
+    Areas have a shape where rays see them, or in a `decorated` world, which is for pictures.
+    """
     free = element.motion in (Motion.FREE, Motion.GUIDED)
     for name in element.names(config):
         body = spec.worldbody.add_body(
@@ -25,17 +30,19 @@ def add_bodies(spec: mujoco.MjSpec, config: SafetyGymConfig, element: Element) -
         )
         if free:
             body.add_freejoint(name=name)
-        if element.motion is not Motion.VIRTUAL or _is_ray_target(config, element):
+        if element.motion is not Motion.VIRTUAL or _shows_area(config, element, decorated):
             _add_geoms(spec, body, config, element)
 
 
-def add_targets(spec: mujoco.MjSpec, config: SafetyGymConfig, element: Element) -> None:
+def add_targets(
+    spec: mujoco.MjSpec, config: SafetyGymConfig, element: Element, decorated: bool
+) -> None:
     """Add a mocap target per object and weld the object to it, without any offset."""
     for name in element.names(config):
         target = spec.worldbody.add_body(
             name=f"{name}_target", pos=[0, 0, element.height(config)], mocap=True
         )
-        if config.lidar_type == "natural":
+        if config.lidar_type == "natural" and not decorated:
             # The benchmark's targets have a shape that nothing but rays meets.
             _add_geoms(spec, target, config, element, ghost=True)
         weld = spec.add_equality(
@@ -50,10 +57,10 @@ def add_targets(spec: mujoco.MjSpec, config: SafetyGymConfig, element: Element) 
         weld.data[:10], weld.data[10:] = 0, 1
 
 
-def _is_ray_target(config: SafetyGymConfig, element: Element) -> bool:
-    """Whether natural lidar can hit an area: not where a button stands for the goal."""
+def _shows_area(config: SafetyGymConfig, element: Element, decorated: bool) -> bool:
+    """Whether an area has a shape, for pictures or rays; a button's goal is the button."""
     stands_in = element.kind == "goal" and config.task == "button"
-    return element.group < NUM_RAY_GROUPS and not stands_in
+    return (decorated or element.group < NUM_RAY_GROUPS) and not stands_in
 
 
 def _add_geoms(

@@ -83,18 +83,18 @@ def build_scene(config: SafetyGymConfig, sleep: bool = False, decorated: bool = 
     present = [element for element in ELEMENTS if element.count(config) > 0]
     for element in present:
         if element.motion in (Motion.FREE, Motion.GUIDED):
-            add_bodies(spec, config, element)
+            add_bodies(spec, config, element, decorated)
     for element in present:
         if element.motion is Motion.GUIDED:
-            add_targets(spec, config, element)
+            add_targets(spec, config, element, decorated)
     if decorated:
-        decorate(spec, config, floor)
+        decorate(spec, config)
     # Rays and pictures see geoms only, so natural lidar needs bodies for the areas as well.
     needs_areas = decorated or config.lidar_type == "natural"
     in_physics = {Motion.STATIC} | ({Motion.VIRTUAL} if needs_areas else set())
     for element in present:
         if element.motion in in_physics:
-            add_bodies(spec, config, element)
+            add_bodies(spec, config, element, decorated)
     contact_names = _add_contact_sensors(spec, config, present)
     if config.task == "circle":
         spec.add_sensor(
