@@ -3,7 +3,7 @@
 Everything here works on TensorDict keys alone and knows no environment:
 
 - `VectorGAE`, `CostGAE`, `normalise_advantages`: advantages of the reward and of k costs;
-- `LagrangeMultiplier`: one λ per cost, moved by the mean episode costs;
+- `LagrangeMultiplier`, `PIDMultiplier`: one λ per cost, moved by the mean episode costs;
 - `PPOLoss`, `PPOLagrangianLoss`: policy losses;
 - `CriticLoss`: squared errors of the reward and the cost critic.
 """
@@ -12,6 +12,7 @@ from safe_rl.objectives.advantages import CostGAE, VectorGAE
 from safe_rl.objectives.critics import CriticLoss
 from safe_rl.objectives.multipliers import LagrangeMultiplier, Multiplier
 from safe_rl.objectives.normalisation import normalise_advantages
+from safe_rl.objectives.pid import PIDMultiplier
 from safe_rl.objectives.ppo import PPOLagrangianLoss, PPOLoss
 from safe_rl.objectives.surrogate import SurrogateLoss
 
@@ -20,6 +21,7 @@ __all__ = [
     "CriticLoss",
     "LagrangeMultiplier",
     "Multiplier",
+    "PIDMultiplier",
     "PPOLagrangianLoss",
     "PPOLoss",
     "SurrogateLoss",

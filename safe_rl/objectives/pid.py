@@ -1,0 +1,123 @@
+"""Lagrange multipliers as the output of a PID controller on the episode cost."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Literal
+
+import torch
+from torch import Tensor
+
+from safe_rl.objectives.multipliers import CostLimits, Multiplier, per_cost
+
+
+class PIDMultiplier(Multiplier):
+    """λ = (K_P Δ + I + K_D ∂)₊ (Stooke, Achiam and Abbeel 2020, algorithm 2).
+
+    With the error Δ = (J_c − d) / scale, one update is
+
+    - proportional: Δ, smoothed by an exponential moving average;
+    - integral: I ← (I + K_I Δ)₊, unsmoothed. The gain is applied before the sum, so that I is in
+      units of λ and starts at `init`; the algorithm is the same, and a gain may change on the way;
+    - derivative: ∂ = (J − J')₊, the growth of the smoothed J = J_c / scale over the last
+      `derivative_delay` updates. Costs before the first update count as 0, as in the paper.
+
+    A purely integral controller (K_P = K_D = 0) is the ordinary dual gradient ascent on λ.
+
+    Args:
+        cost_limits: mapping from cost key to limit d, or limits alone; see `parse_cost_limits`.
+        init: initial λ ≥ 0, for all costs or one per cost.
+        kp: proportional gain K_P ≥ 0.
+        ki: integral gain K_I ≥ 0.
+        kd: derivative gain K_D ≥ 0.
+        proportional_ema: weight in [0, 1) of the past in the smoothed Δ; 0 is no smoothing.
+        derivative_ema: weight in [0, 1) of the past in the smoothed J; 0 is no smoothing.
+        derivative_delay: number of updates ≥ 1 over which growth is measured.
+        scale: what errors are divided by: one number, one per cost, or ``"limit"`` for the limits
+            themselves, which makes the gains independent of the units of a cost. The paper's is 1.
+
+    Raises:
+        ValueError: if an argument is outside its range.
+
+    Examples:
+        >>> multiplier = PIDMultiplier(
+        ...     {"cost": 25.0},
+        ...     init=0.0,
+        ...     kp=0.1,
+        ...     ki=0.01,
+        ...     kd=0.0,
+        ...     proportional_ema=0.0,
+        ...     derivative_ema=0.0,
+        ...     derivative_delay=1,
+        ...     scale=1.0,
+        ... )
+        >>> multiplier.update([35.0])
+        >>> multiplier.value
+        tensor([1.1000])
+    """
+
+    scale: Tensor
+    penalty: Tensor
+    integral: Tensor
+    smoothed_error: Tensor
+    smoothed_cost: Tensor
+    past_costs: Tensor
+
+    def __init__(
+        self,
+        cost_limits: CostLimits,
+        *,
+        init: float | Sequence[float],
+        kp: float,
+        ki: float,
+        kd: float,
+        proportional_ema: float,
+        derivative_ema: float,
+        derivative_delay: int,
+        scale: float | Sequence[float] | Literal["limit"],
+    ) -> None:
+        super().__init__(cost_limits)
+        if min(kp, ki, kd) < 0:
+            raise ValueError(f"Gains must not be negative, got kp={kp}, ki={ki}, kd={kd}.")
+        if not (0 <= proportional_ema < 1 and 0 <= derivative_ema < 1):
+            raise ValueError(
+                "proportional_ema and derivative_ema are weights of the past in [0, 1), got "
+                f"{proportional_ema} and {derivative_ema}."
+            )
+        if derivative_delay < 1:
+            raise ValueError(f"derivative_delay must be at least 1, got {derivative_delay}.")
+        initial = per_cost("init", init, self.num_costs)
+        scales = self.limits if scale == "limit" else per_cost("scale", scale, self.num_costs)
+        if not (initial >= 0).all() or not (scales > 0).all():
+            raise ValueError(
+                f"init must not be negative and scale must be positive, got {initial.tolist()} "
+                f'and {scales.tolist()}: with a limit of 0, scale="limit" is no choice.'
+            )
+        self.kp, self.ki, self.kd = kp, ki, kd
+        self.proportional_ema, self.derivative_ema = proportional_ema, derivative_ema
+        self.register_buffer("scale", scales.clone())
+        self.register_buffer("penalty", initial)
+        self.register_buffer("integral", initial.clone())
+        self.register_buffer("smoothed_error", torch.zeros(self.num_costs))
+        self.register_buffer("smoothed_cost", torch.zeros(self.num_costs))
+        self.register_buffer("past_costs", torch.zeros(derivative_delay, self.num_costs))
+
+    @property
+    def value(self) -> Tensor:
+        """The multipliers λ ≥ 0, [k], detached."""
+        return self.penalty.detach()
+
+    def _step(self, mean_costs: Tensor) -> dict[str, Tensor]:
+        error = (mean_costs - self.limits) / self.scale
+        smoothed_error = torch.lerp(error, self.smoothed_error, self.proportional_ema)
+        integral = (self.integral + self.ki * error).clamp_min(0)
+        cost = torch.lerp(mean_costs / self.scale, self.smoothed_cost, self.derivative_ema)
+        growth = (cost - self.past_costs[0]).clamp_min(0)
+        penalty = self.kp * smoothed_error + integral + self.kd * growth
+        return {
+            "penalty": penalty.clamp_min(0),
+            "integral": integral,
+            "smoothed_error": smoothed_error,
+            "smoothed_cost": cost,
+            "past_costs": torch.cat([self.past_costs[1:], cost.unsqueeze(0)]),
+        }
