@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -31,6 +32,17 @@ def seed_everything(seed: int, num_threads: int | None) -> None:
     torch.manual_seed(seed)
     if num_threads is not None:
         torch.set_num_threads(num_threads)
+
+
+@contextmanager
+def torch_threads(number: int) -> Iterator[None]:
+    """Let torch compute with `number` threads inside the block."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(number)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
 
 
 def build_trainer(config: DictConfig, env: EnvBase, directory: Path) -> Trainer:
@@ -130,7 +142,7 @@ class Trainer:
         Returns:
             One line on the outcome.
         """
-        batches = iter(self._collector)
+        batches = self.batches()
         saved_at = time.monotonic()
         with self.folder.writing(self.progress.epoch, self.progress.steps), StopRequest() as stop:
             while self.progress.steps < self._frames and not stop.received:
@@ -143,10 +155,17 @@ class Trainer:
             self._save()
         return self.folder.summary()
 
+    def batches(self) -> Iterator[TensorDictBase]:
+        """Rollouts [N, T] of the present policy, without end."""
+        return iter(self._collector)
+
     def epoch(self, batches: Iterator[TensorDictBase]) -> dict[str, float]:
         """Collect one batch and learn from it; returns the row of the table."""
         start = time.perf_counter()
-        batch = next(batches)
+        # One observation per environment is too little work to share among threads, and the
+        # physics wants the cores.
+        with torch_threads(1):
+            batch = next(batches)
         collected = time.perf_counter()
         episodes = self.accounting.update(batch)
         learned = self.algorithm.learn(batch, episodes)
