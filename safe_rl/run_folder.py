@@ -94,9 +94,9 @@ class RunFolder:
             for name, value in row.items():
                 if not math.isnan(value):
                     self._logger.log_scalar(name, value, step=int(row["steps"]))
-        self._bar.update(int(row["steps"]) - self._bar.n)
         self._shown |= self._postfix(row)
-        self._bar.set_postfix(self._shown, refresh=True)
+        self._bar.set_postfix(self._shown, refresh=False)
+        self._bar.update(int(row["steps"]) - self._bar.n)
 
     def _postfix(self, row: Mapping[str, float]) -> dict[str, str]:
         """What the bar shows of an epoch: only what is known in it."""

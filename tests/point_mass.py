@@ -17,17 +17,18 @@ from torchrl.envs import EnvBase
 
 HAZARD = torch.tensor([0.6, 0.0])
 HAZARD_RADIUS = 0.3
-SPEED_LIMIT = 0.1
+NORTH = 0.3
+ARENA = 2.0
 
 
 class PointMass(EnvBase):
     """Observation: position and last displacement, shape [N, 4]; action: displacement, [N, 2].
 
-    ``cost`` is 1 where ``cost_hazards`` (inside the hazard) or ``cost_speed`` (too fast) is.
+    ``cost`` is 1 where ``cost_hazards`` (inside the hazard) or ``cost_north`` (beyond a border) is.
     """
 
     observation_layout = {"position": slice(0, 2), "velocity": slice(2, 4)}  # noqa: RUF012
-    cost_keys = ["cost", "cost_hazards", "cost_speed"]  # noqa: RUF012
+    cost_keys = ["cost", "cost_hazards", "cost_north"]  # noqa: RUF012
 
     def __init__(self, num_envs: int = 4, num_steps: int = 20, seed: int = 0) -> None:
         super().__init__(batch_size=[num_envs])
@@ -78,24 +79,24 @@ class PointMass(EnvBase):
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         before = self._position.norm(dim=-1, keepdim=True)
-        self._velocity = 0.15 * tensordict["action"].clamp(-1, 1)
-        self._position = self._position + self._velocity
+        start = self._position
+        self._position = (start + 0.15 * tensordict["action"].clamp(-1, 1)).clamp(-ARENA, ARENA)
+        self._velocity = self._position - start
         self._step_count = self._step_count + 1
         distance = self._position.norm(dim=-1, keepdim=True)
         step = self._observe()
         step["reward"] = before - distance
-        hazards, speed = self._costs(self._position, self._velocity)
-        step["cost_hazards"], step["cost_speed"] = hazards, speed
-        step["cost"] = torch.maximum(hazards, speed)
-        step["terminated"] = distance > 3.0
+        hazards, north = self._costs(self._position)
+        step["cost_hazards"], step["cost_north"] = hazards, north
+        step["cost"] = torch.maximum(hazards, north)
         step["truncated"] = self._step_count >= self.config.num_steps
-        step["done"] = step["terminated"] | step["truncated"]
+        step["done"] = step["truncated"]
         return step
 
     @staticmethod
-    def _costs(position: Tensor, velocity: Tensor) -> tuple[Tensor, Tensor]:
+    def _costs(position: Tensor) -> tuple[Tensor, Tensor]:
         inside = (position - HAZARD).norm(dim=-1, keepdim=True) < HAZARD_RADIUS
-        return inside.float(), (velocity.norm(dim=-1, keepdim=True) > SPEED_LIMIT).float()
+        return inside.float(), (position[:, 1:] > NORTH).float()
 
     def get_state(self) -> TensorDict:
         return TensorDict(

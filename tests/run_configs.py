@@ -19,16 +19,21 @@ def compose_config(*overrides: str) -> DictConfig:
         return compose("config", overrides=list(overrides))
 
 
-def point_mass_config(*overrides: str) -> DictConfig:
-    """A run on the point mass that takes a second: 8 epochs of 4 x 40 steps."""
+def point_mass_config(*overrides: str, minibatch_size: int | None = 40) -> DictConfig:
+    """A run on the point mass that takes a second: 8 epochs of 4 x 40 steps.
+
+    ``minibatch_size=None`` leaves a policy update alone that knows no minibatches.
+    """
+    minibatches = [f"policy_update.minibatch_size={minibatch_size}", "policy_update.num_passes=3"]
     return compose_config(
         "env=PointMass",
         "frames=1280",
         "num_envs=4",
         "frames_per_batch=160",
         "model.hidden_sizes=[16]",
-        "policy_update.minibatch_size=40",
+        *(minibatches if minibatch_size else []),
         "critic_update.minibatch_size=40",
+        "critic_update.num_passes=3",
         "logger=none",
         *overrides,
     )

@@ -1,0 +1,176 @@
+"""Every configuration file composes, and the paper's preset has the paper's numbers."""
+
+import itertools
+
+import pytest
+import torch
+from hydra.errors import HydraException
+from omegaconf import OmegaConf
+from point_mass import PointMass
+from run_configs import CONF, compose_config
+
+from safe_rl.building import build_algorithm, check_cost_limits
+from safe_rl.envs import SUITE, make_env, store_configs
+
+store_configs()
+
+
+def options(group: str) -> list[str]:
+    return sorted(path.stem for path in (CONF / group).glob("*.yaml"))
+
+
+ALGORITHMS = options("algo")
+COMBINATIONS = list(itertools.product(ALGORITHMS, options("preset")))
+# of the groups that only some algorithms have
+LAGRANGIAN = [name for name in ALGORITHMS if "lagrangian" in name]
+MULTIPLIERS = [name for name in options("lagrangian") if name not in options("preset")]
+
+
+@pytest.mark.parametrize(("algo", "preset"), COMBINATIONS)
+@pytest.mark.parametrize("env", ["PointGoal1", "CarButton2", "DoggoPush0"])
+def test_every_combination_composes_and_resolves(env, algo, preset):
+    config = compose_config(f"env={env}", f"algo={algo}", f"preset={preset}")
+    plain = OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
+    assert plain["env"]["name"] == env
+    assert plain["algo"]["name"] == algo
+    assert plain["preset"] == preset
+    # whole episodes of 1000 steps, shared equally
+    assert plain["frames_per_batch"] == plain["num_envs"] * plain["env"]["num_steps"]
+
+
+@pytest.mark.parametrize(("algo", "preset"), COMBINATIONS)
+def test_every_combination_builds(algo, preset):
+    config = compose_config("env=PointMass", f"algo={algo}", f"preset={preset}")
+    algorithm = build_algorithm(config, PointMass(2))
+    assert (algorithm.networks.cost_critic is None) == (algorithm.cost_advantage is None)
+    assert (algorithm.multiplier is not None) == (algo in LAGRANGIAN)
+
+
+@pytest.mark.parametrize(("algo", "preset"), itertools.product(LAGRANGIAN, options("preset")))
+@pytest.mark.parametrize("multiplier", MULTIPLIERS)
+def test_multipliers_are_interchangeable(algo, preset, multiplier):
+    names = (f"algo={algo}", f"preset={preset}", f"lagrangian={multiplier}")
+    config = compose_config("env=PointMass", *names)
+    assert config.lagrangian == OmegaConf.load(CONF / "lagrangian" / f"{multiplier}.yaml")
+    build_algorithm(config, PointMass(2))
+
+
+@pytest.mark.parametrize("env", sorted(SUITE))
+def test_every_environment_of_the_suite_is_an_option(env):
+    assert compose_config(f"env={env}").env.name == env
+
+
+def test_overrides_reach_the_environment():
+    config = compose_config("env=PointGoal1", "env.hazards_num=3")
+    assert make_env(OmegaConf.to_container(config.env), num_envs=1).config.hazards_num == 3
+    with pytest.raises(HydraException, match="hazard_num"):
+        compose_config("env=PointGoal1", "env.hazard_num=3")
+
+
+PAPER = {
+    "model.hidden_sizes": [256, 256],
+    "model.initial_log_std": -0.5,
+    "model.input_scale": {},
+    "advantage.gamma": 0.99,
+    "advantage.lmbda": 0.97,
+    "advantage.value_target": "return_to_go",
+    "cost_advantage.gamma": 0.99,
+    "cost_advantage.lmbda": 0.97,
+    "cost_advantage.value_target": "return_to_go",
+    "critic_update.optimizer._target_": "torch.optim.Adam",
+    "critic_update.optimizer.lr": 1e-3,
+    "critic_update.num_passes": 80,
+    "critic_update.minibatch_size": None,
+    "policy_update.optimizer._target_": "torch.optim.Adam",
+    "policy_update.optimizer.lr": 3e-4,
+    "policy_update.num_passes": 80,
+    "policy_update.minibatch_size": None,
+    "policy_update.max_kl": 1.2 * 0.01,
+    "loss.clip_epsilon": 0.2,
+    "loss.entropy_coeff": 0.0,
+    "lagrangian.init": 1.0,
+    "lagrangian.lr": 0.05,
+    "cost_limits": {"cost": 25.0},
+}
+
+
+@pytest.mark.parametrize(
+    ("env", "frames", "frames_per_batch"),
+    [
+        ("PointGoal1", 10_000_000, 30_000),
+        ("CarPush2", 10_000_000, 30_000),
+        ("DoggoButton1", 100_000_000, 60_000),
+    ],
+)
+def test_the_paper_preset_is_the_paper(env, frames, frames_per_batch):
+    config = compose_config("preset=paper", f"env={env}", "algo=ppo_lagrangian")
+    assert (config.frames, config.frames_per_batch) == (frames, frames_per_batch)
+    found = {key: OmegaConf.select(config, key, throw_on_missing=True) for key in PAPER}
+    assert {key: pytest.approx(value) if isinstance(value, float) else value
+            for key, value in found.items()} == PAPER  # fmt: skip
+
+
+def test_a_robot_of_ones_own_has_the_numbers_of_point():
+    config = compose_config("preset=paper", "env=PointMass", "env.robot_base=xmls/mine.xml")
+    assert (config.frames, config.num_envs, config.frames_per_batch) == (10_000_000, 30, 30_000)
+
+
+def test_cost_limits_on_the_command_line_replace_the_default():
+    assert compose_config().cost_limits == {"cost": 25.0}
+    config = compose_config("cost_limits={cost_hazards: 10, cost_vases_contact: 5}")
+    assert config.cost_limits == {"cost_hazards": 10, "cost_vases_contact": 5}
+
+
+@pytest.mark.parametrize(
+    ("overrides", "message"),
+    [
+        (["algo=ppo_lagrangien"], "ppo_lagrangian"),
+        (["env=PointGoal3"], "PointGoal2"),
+        (["preset=papers"], "paper"),
+        (["algo=ppo", "lagrangian=adam"], "lagrangian"),
+        (["fames=10"], "fames"),
+    ],
+)
+def test_unknown_names_are_errors_that_list_the_known_ones(overrides, message):
+    with pytest.raises(HydraException, match=message):
+        compose_config(*overrides)
+
+
+def test_cost_limits_must_name_costs_of_the_environment():
+    keys = ["cost", "cost_hazards", "cost_vases_contact"]
+    assert check_cost_limits({"cost_hazards": 10}, keys) == {"cost_hazards": 10.0}
+    with pytest.raises(ValueError, match="Nearest: 'cost_hazards'"):
+        check_cost_limits({"cost_hazard": 10}, keys)
+    for limit in (-1, "many", None, float("nan"), True):
+        with pytest.raises(ValueError, match="'cost' is"):
+            check_cost_limits({"cost": limit}, keys)
+    with pytest.raises(ValueError, match="Without constraints use algo=ppo"):
+        build_algorithm(compose_config("env=PointMass", "cost_limits={}"), PointMass(2))
+
+
+def test_the_compile_switch_reaches_both_updates():
+    config = compose_config("compile=true")
+    assert config.policy_update.compile
+    assert config.critic_update.compile
+
+
+def test_hyper_parameters_have_one_home():
+    """Numbers that a preset decides are not defaults of the classes that use them."""
+    config = compose_config("env=PointMass")
+    del config.policy_update.num_passes
+    with pytest.raises(Exception, match="num_passes"):
+        build_algorithm(config, PointMass(2))
+
+
+def test_networks_scale_the_components_that_are_observed():
+    config = compose_config("env=PointMass", "+model.input_scale.velocity=0.5")
+    network = build_algorithm(config, PointMass(2)).networks.actor
+    scales = [value for name, value in network.state_dict().items() if name.endswith("0.scale")]
+    torch.testing.assert_close(scales, [torch.tensor([1.0, 1.0, 0.5, 0.5])])
+
+
+def test_configuration_files_say_what_they_are():
+    files = list(CONF.rglob("*.yaml"))
+    assert files
+    for path in files:
+        assert any(line.startswith("# ") for line in path.read_text().splitlines()), path
