@@ -17,7 +17,7 @@ import mujoco
 from safe_rl.envs.bodies import add_bodies, add_floor, add_targets
 from safe_rl.envs.config import ConfigError, SafetyGymConfig
 from safe_rl.envs.elements import ELEMENTS, Element, Motion
-from safe_rl.envs.scenery import decorate
+from safe_rl.envs.rendering.scenery import decorate
 
 ROBOT_FOLDER = Path(__file__).parent / "robots"
 # The robot files' stack and contact sizes would reserve hundreds of MB for every environment.
