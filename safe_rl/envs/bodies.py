@@ -6,6 +6,7 @@ import mujoco
 
 from safe_rl.envs.config import SafetyGymConfig
 from safe_rl.envs.elements import NUM_RAY_GROUPS, Element, Motion
+from safe_rl.envs.tasks import goal_is_button
 
 FLOOR_HALF_SIZE = 3.5  # visible part [m]; the plane itself is infinite
 
@@ -59,7 +60,7 @@ def add_targets(
 
 def _shows_area(config: SafetyGymConfig, element: Element, decorated: bool) -> bool:
     """Whether an area has a shape, for pictures or rays; a button's goal is the button."""
-    stands_in = element.kind == "goal" and config.task == "button"
+    stands_in = element.kind == "goal" and goal_is_button(config.task)
     return (decorated or element.group < NUM_RAY_GROUPS) and not stands_in
 
 

@@ -7,13 +7,14 @@ Spec: paper section 4.1.3. Every function returns one number per world, [N], bef
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import torch
 from torch import Tensor
 
-from safe_rl.envs.config import SafetyGymConfig
-from safe_rl.envs.world import World
+if TYPE_CHECKING:
+    from safe_rl.envs.config import SafetyGymConfig
+    from safe_rl.envs.world import World
 
 
 def hazard_cost(robot_xy: Tensor, hazard_xy: Tensor, size: float) -> Tensor:
@@ -65,23 +66,22 @@ def wrong_button_cost(contacts: Tensor, goal_button: Tensor, timer: Tensor) -> T
 
 
 class Cost(NamedTuple):
-    """A row: the cost key, when a configuration has it, and its magnitude in a world."""
+    """A row: one cost.
+
+    Attributes:
+        key: what it is called in TensorDicts, "cost_<kind>".
+        active: whether a configuration has it.
+        magnitude: (config, world) -> [N], 0 or more.
+        touches: kinds whose contacts with the robot it reads.
+    """
 
     key: str
     active: Callable[[SafetyGymConfig], bool]
     magnitude: Callable[[SafetyGymConfig, World], Tensor]
+    touches: tuple[str, ...] = ()
 
 
-def _vase_layout(world: World) -> Tensor:
-    slots = world.scene.slots.get("vases", slice(0, 0))
-    return world.layout[:, 1 + slots.start : 1 + slots.stop]
-
-
-def _contacts(world: World, kind: str) -> Tensor:
-    return world.contacts.get(kind, world.sensordata[:, :0])
-
-
-COSTS: tuple[Cost, ...] = (
+COSTS: list[Cost] = [
     Cost(
         "cost_hazards",
         lambda c: c.constrain_hazards,
@@ -93,42 +93,49 @@ COSTS: tuple[Cost, ...] = (
     Cost(
         "cost_vases_contact",
         lambda c: c.constrain_vases,
-        lambda c, w: c.vases_contact_cost * contact_cost(_contacts(w, "vases")),
+        lambda c, w: c.vases_contact_cost * contact_cost(w.contacts_with("vases")),
+        touches=("vases",),
     ),
     Cost(
         "cost_vases_displace",
         lambda c: c.constrain_vases and c.vases_displace_cost != 0,
         lambda c, w: (
             c.vases_displace_cost
-            * displacement_cost(w.at("vases")[..., :2], _vase_layout(w), c.vases_displace_threshold)
+            * displacement_cost(
+                w.at("vases")[..., :2], w.start_of("vases"), c.vases_displace_threshold
+            )
         ),
     ),
     Cost(
         "cost_vases_velocity",
         lambda c: c.constrain_vases and c.vases_velocity_cost != 0,
         lambda c, w: (
-            c.vases_velocity_cost * velocity_cost(w.vase_velocity, c.vases_velocity_threshold)
+            c.vases_velocity_cost
+            * velocity_cost(w.velocity_of("vases"), c.vases_velocity_threshold)
         ),
     ),
     Cost(
         "cost_pillars",
         lambda c: c.constrain_pillars,
-        lambda c, w: c.pillars_cost * contact_cost(_contacts(w, "pillars")),
+        lambda c, w: c.pillars_cost * contact_cost(w.contacts_with("pillars")),
+        touches=("pillars",),
     ),
     Cost(
         "cost_buttons",
         lambda c: c.constrain_buttons,
         lambda c, w: (
             c.buttons_cost
-            * wrong_button_cost(_contacts(w, "buttons"), w.goal_button, w.buttons_timer)
+            * wrong_button_cost(w.contacts_with("buttons"), w.goal_button, w.buttons_timer)
         ),
+        touches=("buttons",),
     ),
     Cost(
         "cost_gremlins",
         lambda c: c.constrain_gremlins,
-        lambda c, w: c.gremlins_contact_cost * contact_cost(_contacts(w, "gremlins")),
+        lambda c, w: c.gremlins_contact_cost * contact_cost(w.contacts_with("gremlins")),
+        touches=("gremlins",),
     ),
-)
+]
 EXCEPTION_KEY = "cost_exception"
 
 

@@ -14,6 +14,7 @@ from typing import NamedTuple
 import mujoco
 
 from safe_rl.envs.config import SafetyGymConfig
+from safe_rl.envs.tasks import TASKS
 
 BOX, CYLINDER, SPHERE = (
     mujoco.mjtGeom.mjGEOM_BOX,
@@ -22,10 +23,10 @@ BOX, CYLINDER, SPHERE = (
 )
 
 # Where each kind stands in the order of placement; "robot" is not an element but is placed too.
-PLACEMENT_ORDER = (
+PLACEMENT_ORDER = [
     *("robot", "walls", "goal", "box", "buttons"),
     *("hazards", "vases", "pillars", "gremlins"),
-)
+]
 
 # Rays select geoms by MuJoCo's groups 0 to 5.
 NUM_RAY_GROUPS = int(mujoco.mjNGROUP)
@@ -54,31 +55,37 @@ class Element:
 
     Attributes:
         kind: prefix of its configuration keys and of its lidar ("hazards").
-        label: name of one object in layouts and errors; with an index where there may be several.
+        label: name of one object in layouts and errors. There are `<kind>_num` objects, with an
+            index; a kind that is its own label belongs to the tasks that list it, one object each.
         motion: how it takes part in the physics.
-        count: number of objects.
         height: z of the object's centre [m].
         geoms: its shapes.
         rgb: colour in pictures and lidar halos.
         group: MuJoCo geom group, which natural lidar selects by.
-        flag: configuration key that turns its lidar on.
+        flag: configuration key that turns its lidar on; "" for `observe_<kind>`.
         always_observed: whether the lidar is there (all zeros) even without any object.
     """
 
     kind: str
     label: str
     motion: Motion
-    count: Callable[[SafetyGymConfig], int]
     height: Callable[[SafetyGymConfig], float]
     geoms: Callable[[SafetyGymConfig], tuple[Geom, ...]]
     rgb: tuple[float, float, float]
     group: int
-    flag: str
+    flag: str = ""
     always_observed: bool = False
+
+    def count(self, config: SafetyGymConfig) -> int:
+        """Return the number of objects."""
+        if self.singular:
+            return int(self.kind in TASKS[config.task].elements)
+        return getattr(config, f"{self.kind}_num")
 
     def observed(self, config: SafetyGymConfig) -> bool:
         """Whether the observation has a lidar for this kind."""
-        return getattr(config, self.flag) and (self.always_observed or self.count(config) > 0)
+        flag = self.flag or f"observe_{self.kind}"
+        return getattr(config, flag) and (self.always_observed or self.count(config) > 0)
 
     def names(self, config: SafetyGymConfig) -> list[str]:
         """Names of this kind's objects."""
@@ -102,35 +109,30 @@ def _box_geoms(config: SafetyGymConfig) -> tuple[Geom, ...]:
     return (*_cube(s), *(Geom(BOX, post, corner) for corner in corners))
 
 
-ELEMENTS: tuple[Element, ...] = (
+ELEMENTS: list[Element] = [
     Element(
         kind="vases",
         label="vase",
         motion=Motion.FREE,
-        count=lambda c: c.vases_num,
         height=lambda c: c.vases_size - c.vases_sink,
         geoms=lambda c: _cube(c.vases_size),
         rgb=(0, 1, 1),
         group=4,
-        flag="observe_vases",
         always_observed=True,
     ),
     Element(
         kind="gremlins",
         label="gremlin",
         motion=Motion.GUIDED,
-        count=lambda c: c.gremlins_num,
         height=lambda c: c.gremlins_size,
         geoms=lambda c: _cube(c.gremlins_size),
         rgb=(0.5, 0, 1),
         group=5,
-        flag="observe_gremlins",
     ),
     Element(
         kind="box",
         label="box",
         motion=Motion.FREE,
-        count=lambda c: int(c.task == "push"),
         height=lambda c: c.box_size,
         geoms=_box_geoms,
         rgb=(1, 1, 0),
@@ -141,40 +143,33 @@ ELEMENTS: tuple[Element, ...] = (
         kind="walls",
         label="wall",
         motion=Motion.STATIC,
-        count=lambda c: c.walls_num,
         height=lambda c: c.walls_size,
         geoms=lambda c: _cube(c.walls_size),
         rgb=(0.5, 0.5, 0.5),
         group=2,
-        flag="observe_walls",
     ),
     Element(
         kind="pillars",
         label="pillar",
         motion=Motion.STATIC,
-        count=lambda c: c.pillars_num,
         height=lambda c: c.pillars_height,
         geoms=lambda c: (Geom(CYLINDER, (c.pillars_size, c.pillars_height)),),
         rgb=(0.5, 0.5, 1),
         group=2,
-        flag="observe_pillars",
     ),
     Element(
         kind="buttons",
         label="button",
         motion=Motion.STATIC,
-        count=lambda c: c.buttons_num,
         height=lambda c: c.buttons_size,
         geoms=lambda c: (Geom(SPHERE, (c.buttons_size,)),),
         rgb=(1, 0.5, 0),
         group=1,
-        flag="observe_buttons",
     ),
     Element(
         kind="goal",
         label="goal",
         motion=Motion.VIRTUAL,
-        count=lambda c: int(c.task in ("goal", "push", "button")),
         height=lambda c: c.goal_size / 2 + 1e-2,
         geoms=lambda c: (Geom(CYLINDER, (c.goal_size, c.goal_size / 2)),),
         rgb=(0, 1, 0),
@@ -185,25 +180,21 @@ ELEMENTS: tuple[Element, ...] = (
         kind="hazards",
         label="hazard",
         motion=Motion.VIRTUAL,
-        count=lambda c: c.hazards_num,
         height=lambda c: 2e-2,
         geoms=lambda c: (Geom(CYLINDER, (c.hazards_size, 1e-2)),),
         rgb=(0, 0, 1),
         group=3,
-        flag="observe_hazards",
         always_observed=True,
     ),
     Element(
         kind="circle",
         label="circle",
         motion=Motion.VIRTUAL,
-        count=lambda c: int(c.task == "circle"),
         height=lambda c: 2e-2,
         geoms=lambda c: (Geom(CYLINDER, (c.circle_radius, 1e-2)),),
         rgb=(0, 1, 0),
         group=6,
-        flag="observe_circle",
     ),
-)
+]
 
 BY_KIND = {element.kind: element for element in ELEMENTS}

@@ -13,10 +13,9 @@ from torch import Tensor
 
 from safe_rl.envs import rng
 from safe_rl.envs.config import SafetyGymConfig
-from safe_rl.envs.elements import BY_KIND
 from safe_rl.envs.layout import LayoutError, PlacementPlan, resample_goal, sample_layouts
 from safe_rl.envs.scene import Scene
-from safe_rl.envs.tasks import TASKS, NextGoal
+from safe_rl.envs.tasks import goal_is_button
 from safe_rl.envs.world import World, circling_targets, refresh, yaw_quaternion
 
 
@@ -65,7 +64,7 @@ def start_episodes(world: World, plan: PlacementPlan, key: Tensor, mask: Tensor)
     world.physics.reset(mask)
     _pose_bodies(world, rows, yaws)
     world.positions[rows, scene.num_free :, :2] = world.layout[rows, 1 + scene.num_free :]
-    if TASKS[scene.config.task].next_goal is NextGoal.BUTTON:
+    if goal_is_button(scene.config.task):
         _choose_button(world, rows, rng.fold(key, Purpose.BUTTON))
     world.step_count[rows] = 0
     world.buttons_timer[rows] = 0
@@ -88,21 +87,19 @@ def _pose_bodies(world: World, rows: Tensor, yaws: Tensor) -> None:
     free[rows, :, :2] = world.layout[rows, 1 : 1 + scene.num_free]
     free[rows, :, 3:] = yaw_quaternion(yaws[:, 1:])
     if scene.num_targets:
-        guided = scene.slots["gremlins"]
-        quaternion = yaw_quaternion(yaws[:, 1 + guided.start : 1 + guided.stop])
+        quaternion = yaw_quaternion(yaws[:, 1 + scene.guided.start : 1 + scene.guided.stop])
         physics.mocap_quat[rows, : scene.num_targets] = quaternion
 
 
 def gremlin_path(world: World, time: Tensor, num_substeps: int) -> Tensor:
     """Mocap positions before each of the coming substeps [N, S, nmocap, 3]."""
-    scene, config = world.scene, world.scene.config
-    guided = scene.slots["gremlins"]
-    height = 2 * BY_KIND["gremlins"].height(config)
+    scene = world.scene
+    guided = slice(1 + scene.guided.start, 1 + scene.guided.stop)
     targets = circling_targets(
-        world.layout[:, 1 + guided.start : 1 + guided.stop],
+        world.layout[:, guided],
         time,
-        config.gremlins_travel,
-        height,
+        world.target_travel,
+        world.target_height,
         world.physics.timestep,
         num_substeps,
     )
@@ -156,7 +153,7 @@ def next_goals(world: World, plan: PlacementPlan, key: Tensor, mask: Tensor) -> 
     rows = mask.nonzero()[:, 0]
     world.buttons_timer[rows] = config.buttons_resampling_delay
     stuck = torch.zeros_like(mask)
-    if TASKS[config.task].next_goal is NextGoal.BUTTON:
+    if goal_is_button(config.task):
         _choose_button(world, rows, rng.fold(key[rows], Purpose.BUTTON))
         return stuck
     position, ok = resample_goal(plan, rng.fold(key[rows], Purpose.GOAL), _current(world)[rows])
@@ -178,7 +175,7 @@ def next_goals(world: World, plan: PlacementPlan, key: Tensor, mask: Tensor) -> 
 def _current(world: World) -> Tensor:
     """Where everything is now, in the columns of a layout; gremlins keep their layout position."""
     current = torch.cat([world.robot_pos[:, None, :2], world.positions[..., :2]], 1)
-    guided = world.scene.slots.get("gremlins", slice(0, 0))
+    guided = world.scene.guided
     columns = slice(1 + guided.start, 1 + guided.stop)
     current[:, columns] = world.layout[:, columns]
     return current

@@ -6,7 +6,7 @@ lengths in metres.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 
 import torch
@@ -15,6 +15,7 @@ from torch import Tensor
 from safe_rl.envs import rng
 from safe_rl.envs.config import ConfigError, SafetyGymConfig
 from safe_rl.envs.elements import BY_KIND, PLACEMENT_ORDER
+from safe_rl.envs.tasks import goal_is_button
 
 TRIES_PER_OBJECT = 100
 TRIES_PER_LAYOUT = 10_000
@@ -51,7 +52,9 @@ class PlacementPlan:
     margin: float
 
 
-def plan_placements(config: SafetyGymConfig, slots: dict[str, slice], num_slots: int):
+def plan_placements(
+    config: SafetyGymConfig, slots: Mapping[str, slice], num_slots: int
+) -> PlacementPlan:
     """Build the plan of a configuration.
 
     Args:
@@ -66,7 +69,7 @@ def plan_placements(config: SafetyGymConfig, slots: dict[str, slice], num_slots:
     for kind in PLACEMENT_ORDER:
         if kind == "robot":
             labels, first = ["robot"], 0
-        elif kind not in slots or (kind == "goal" and config.task == "button"):
+        elif kind not in slots or (kind == "goal" and goal_is_button(config.task)):
             continue
         else:
             labels, first = BY_KIND[kind].names(config), 1 + slots[kind].start
@@ -98,7 +101,9 @@ def _rectangles(
         tolerance = PIN_TOLERANCE
         return [(x - tolerance, y - tolerance, x + tolerance, y + tolerance)]
     placements = getattr(config, f"{kind}_placements") or (config.placements_extents,)
-    shrunk = [(a + keepout, b + keepout, c - keepout, d - keepout) for a, b, c, d in placements]
+    shrunk: list[tuple[float, ...]] = [
+        (a + keepout, b + keepout, c - keepout, d - keepout) for a, b, c, d in placements
+    ]
     for (xmin, ymin, xmax, ymax), placement in zip(shrunk, placements, strict=True):
         if xmin > xmax or ymin > ymax:
             raise ConfigError(

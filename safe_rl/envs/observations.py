@@ -18,7 +18,7 @@ from safe_rl.envs.lidar import compass, to_ego
 from safe_rl.envs.lidar_blocks import lidar_blocks
 from safe_rl.envs.scene import Scene
 from safe_rl.envs.sensors import sensor_blocks
-from safe_rl.envs.tasks import distance
+from safe_rl.envs.tasks import TASKS, distance
 from safe_rl.envs.world import Block, Shapes, World
 
 
@@ -66,26 +66,26 @@ def _from_start(world: World, vector: Tensor, moved: bool) -> Tensor:
     return torch.cat([local, vector[:, 3:]], -1)
 
 
-def _has_goal(config: SafetyGymConfig) -> bool:
-    return config.task in ("goal", "push", "button")
+def _has(config: SafetyGymConfig, element: str) -> bool:
+    return element in TASKS[config.task].elements
 
 
 READINGS: tuple[Reading, ...] = (
     Reading(
         "goal_compass",
-        lambda c: c.observe_goal_comp and _has_goal(c),
+        lambda c: c.observe_goal_comp and _has(c, "goal"),
         lambda c, s: c.compass_shape,
         _compass_to("goal"),
     ),
     Reading(
         "box_compass",
-        lambda c: c.observe_box_comp and c.task == "push",
+        lambda c: c.observe_box_comp and _has(c, "box"),
         lambda c, s: c.compass_shape,
         _compass_to("box"),
     ),
     Reading(
         "goal_dist",
-        lambda c: c.observe_goal_dist and _has_goal(c),
+        lambda c: c.observe_goal_dist and _has(c, "goal"),
         lambda c, s: 1,
         _goal_closeness,
     ),
@@ -156,7 +156,8 @@ def make_observer(scene: Scene) -> Observer:
     for name, shape in unordered.items():
         starts[name], start = start, start + math.prod(shape)
     shapes = {name: unordered[name] for name in sorted(unordered)}
-    columns, first, order = {}, 0, []
+    columns: dict[str, slice] = {}
+    first, order = 0, list[int]()
     for name, shape in shapes.items():
         size = math.prod(shape)
         columns[name], first = slice(first, first + size), first + size

@@ -10,22 +10,22 @@ from __future__ import annotations
 import functools
 from collections.abc import Mapping
 from dataclasses import dataclass
-from pathlib import Path
 
 import mujoco
 
 from safe_rl.envs.bodies import add_bodies, add_floor, add_targets
-from safe_rl.envs.config import ConfigError, SafetyGymConfig
+from safe_rl.envs.config import SafetyGymConfig
+from safe_rl.envs.costs import COSTS
 from safe_rl.envs.elements import ELEMENTS, Element, Motion
+from safe_rl.envs.errors import ConfigError, nearest
 from safe_rl.envs.rendering.scenery import decorate
+from safe_rl.envs.robot import Robot, load_robot
+from safe_rl.envs.tasks import TASKS
 
-ROBOT_FOLDER = Path(__file__).parent / "robots"
 # The robot files' stack and contact sizes would reserve hundreds of MB for every environment.
 ARENA_BYTES = 8 << 20
 # MuJoCo's default (1e-3) lets slowly sliding vases sleep, which lowers the vase-velocity cost.
 SLEEP_TOLERANCE = 1e-5
-# Kinds whose contacts with the robot are counted, in the order of their sensors.
-CONTACT_KINDS = ("vases", "gremlins", "pillars", "buttons")
 
 
 @dataclass(frozen=True)
@@ -40,10 +40,14 @@ class Scene:
         heights: z of every object's centre [m], by slot.
         num_free: slots below this are free bodies, 7 `qpos` and 6 `qvel` each after the robot's.
         num_mocap_slots: that many slots from `num_free` on are mocap bodies (after the targets').
-        num_targets: mocap bodies that the gremlins are welded to; the first ones.
+        guided: slots of the bodies that are welded to a target which runs in a circle.
+        num_targets: mocap bodies that those are welded to; the first ones.
+        travel: radius of each target's circle [m], by guided slot.
         robot_body: body id of the robot's root.
+        robot_sensors: number of the robot file's own sensors, which come first.
         robot_nq, robot_nv: the robot's share of `qpos` and `qvel`, which comes first.
         planar: whether the root is (x, y, yaw) instead of a free joint.
+        oriented_body: body id of the part that `reward_orientation` looks at.
         free_bodies: body ids of the free slots.
         contacts: `sensordata` columns of each kind's contact counts with the robot.
     """
@@ -55,11 +59,15 @@ class Scene:
     heights: tuple[float, ...]
     num_free: int
     num_mocap_slots: int
+    guided: slice
     num_targets: int
+    travel: tuple[float, ...]
     robot_body: int
+    robot_sensors: int
     robot_nq: int
     robot_nv: int
     planar: bool
+    oriented_body: int
     free_bodies: slice
     contacts: Mapping[str, slice]
 
@@ -77,7 +85,8 @@ def build_scene(config: SafetyGymConfig, sleep: bool = False, decorated: bool = 
     Raises:
         ConfigError: if a custom robot file lacks what an environment needs.
     """
-    spec, robot_bodies = _load_robot(config)
+    robot = load_robot(config.robot_base)
+    spec = robot.spec
     _set_options(spec, sleep)
     add_floor(spec)
     present = [element for element in ELEMENTS if element.count(config) > 0]
@@ -96,30 +105,20 @@ def build_scene(config: SafetyGymConfig, sleep: bool = False, decorated: bool = 
         if element.motion in in_physics:
             add_bodies(spec, config, element, decorated)
     contact_names = _add_contact_sensors(spec, config, present)
-    if config.task == "circle":
-        spec.add_sensor(
-            name="robot_velocity",
-            type=mujoco.mjtSensor.mjSENS_FRAMELINVEL,
-            objtype=mujoco.mjtObj.mjOBJ_XBODY,
-            objname="robot",
-        )
-    model = spec.compile()
-    return _index(config, model, present, robot_bodies, in_physics, contact_names)
-
-
-def _load_robot(config: SafetyGymConfig) -> tuple[mujoco.MjSpec, int]:
-    base = config.robot_base
-    path = Path(base) if base.endswith(".xml") else ROBOT_FOLDER / f"{base}.xml"
+    spec.add_sensor(
+        name="robot_vel",
+        type=mujoco.mjtSensor.mjSENS_FRAMELINVEL,
+        objtype=mujoco.mjtObj.mjOBJ_XBODY,
+        objname="robot",
+    )
     try:
-        spec = mujoco.MjSpec.from_file(str(path))
-        robot_bodies = spec.copy().compile().nbody - 1
+        model = spec.compile()
     except ValueError as error:
-        raise ConfigError(f"'robot_base': MuJoCo cannot load {path}: {error}") from error
-    if spec.body("robot") is None:
-        raise ConfigError(f"'robot_base': {path} has no body named 'robot'.")
-    if not spec.actuators:
-        raise ConfigError(f"'robot_base': {path} has no actuators.")
-    return spec, robot_bodies
+        raise ConfigError(
+            f"'robot_base': {config.robot_base} does not fit into the world: {error}. Rename what "
+            "has the name of an object of the world."
+        ) from error
+    return _index(config, model, present, robot, in_physics, contact_names)
 
 
 def _set_options(spec: mujoco.MjSpec, sleep: bool) -> None:
@@ -131,9 +130,10 @@ def _set_options(spec: mujoco.MjSpec, sleep: bool) -> None:
         spec.option.sleep_tolerance = SLEEP_TOLERANCE
 
 
-def _contact_kinds(config: SafetyGymConfig) -> set[str]:
-    kinds = {kind for kind in CONTACT_KINDS if getattr(config, f"constrain_{kind}")}
-    return kinds | ({"buttons"} if config.task == "button" else set())
+def _touched_kinds(config: SafetyGymConfig) -> set[str]:
+    """Kinds whose contacts with the robot a cost or the task reads."""
+    costs = [row.touches for row in COSTS if row.active(config)]
+    return {kind for kinds in (TASKS[config.task].touches, *costs) for kind in kinds}
 
 
 def _add_contact_sensors(
@@ -141,8 +141,9 @@ def _add_contact_sensors(
 ) -> dict[str, list[str]]:
     """Add a sensor per object that counts its contact points with the robot."""
     sensors: dict[str, list[str]] = {}
+    touched = _touched_kinds(config)
     for element in present:
-        if element.kind not in _contact_kinds(config):
+        if element.kind not in touched:
             continue
         for name in element.names(config):
             spec.add_sensor(
@@ -162,7 +163,7 @@ def _index(
     config: SafetyGymConfig,
     model: mujoco.MjModel,
     present: list[Element],
-    robot_bodies: int,
+    robot: Robot,
     in_physics: set[Motion],
     contact_names: dict[str, list[str]],
 ) -> Scene:
@@ -178,7 +179,8 @@ def _index(
         return sum(element.count(config) for element in present if element.motion in motions)
 
     num_free = count(Motion.FREE, Motion.GUIDED)
-    robot_body = model.body("robot").id
+    guided = [e for e in present if e.motion is Motion.GUIDED]
+    spans = [slots[element.kind] for element in guided] or [slice(0, 0)]
     return Scene(
         config=config,
         model=model,
@@ -187,12 +189,20 @@ def _index(
         heights=tuple(heights),
         num_free=num_free,
         num_mocap_slots=count(*in_physics),
+        guided=slice(spans[0].start, spans[-1].stop),
         num_targets=count(Motion.GUIDED),
-        robot_body=robot_body,
+        travel=tuple(
+            getattr(config, f"{element.kind}_travel")
+            for element in guided
+            for _ in element.names(config)
+        ),
+        robot_body=model.body("robot").id,
+        robot_sensors=robot.num_sensors,
         robot_nq=model.nq - 7 * num_free,
         robot_nv=model.nv - 6 * num_free,
-        planar=_is_planar(config, model, robot_body),
-        free_bodies=slice(1 + robot_bodies, 1 + robot_bodies + num_free),
+        planar=robot.planar,
+        oriented_body=_oriented_body(config, model, robot),
+        free_bodies=slice(1 + robot.num_bodies, 1 + robot.num_bodies + num_free),
         contacts={
             kind: slice(first := int(model.sensor(sensors[0]).adr[0]), first + len(sensors))
             for kind, sensors in contact_names.items()
@@ -200,21 +210,13 @@ def _index(
     )
 
 
-def _is_planar(config: SafetyGymConfig, model: mujoco.MjModel, robot_body: int) -> bool:
-    """Whether the robot's root is (slide x, slide y, hinge z); else it must be a free joint."""
-    joint = mujoco.mjtJoint
-    first, number = model.body_jntadr[robot_body], model.body_jntnum[robot_body]
-    types = list(model.jnt_type[first : first + number])
-    if types[:1] == [joint.mjJNT_FREE]:
-        return False
-    axes = model.jnt_axis[first : first + 3].tolist()
-    if types[:3] == [joint.mjJNT_SLIDE, joint.mjJNT_SLIDE, joint.mjJNT_HINGE] and axes == [
-        [1, 0, 0],
-        [0, 1, 0],
-        [0, 0, 1],
-    ]:
-        return True
-    raise ConfigError(
-        f"'robot_base' {config.robot_base!r}: the body 'robot' needs a free joint, or slides "
-        "along x and y and a hinge about z in this order, so that it can be placed."
-    )
+def _oriented_body(config: SafetyGymConfig, model: mujoco.MjModel, robot: Robot) -> int:
+    """Body id of `reward_orientation_body`; the robot's root where nobody asks for it."""
+    wanted = config.reward_orientation_body if config.reward_orientation else "robot"
+    names = [model.body(i).name for i in range(1, 1 + robot.num_bodies)]
+    if wanted not in names:
+        raise ConfigError(
+            f"'reward_orientation_body': robot '{config.robot_base}' has no body '{wanted}'."
+            f"{nearest(wanted, names)} Its bodies are {', '.join(names)}."
+        )
+    return 1 + names.index(wanted)

@@ -23,18 +23,19 @@ def _joint_sensors(scene: Scene, kind: mujoco.mjtSensor, joint: mujoco.mjtJoint)
     model = scene.model
     return [
         i
-        for i in range(model.nsensor)
+        for i in range(scene.robot_sensors)
         if model.sensor_type[i] == kind and model.jnt_type[model.sensor_objid[i]] == joint
     ]
 
 
 def _named_sensors(config: SafetyGymConfig, scene: Scene) -> list[int]:
-    known = {scene.model.sensor(i).name: i for i in range(scene.model.nsensor)}
+    known = {scene.model.sensor(i).name: i for i in range(scene.robot_sensors)}
     for name in config.sensors_obs:
         if name not in known:
             raise ConfigError(
                 f"'sensors_obs': robot '{config.robot_base}' has no sensor '{name}'."
-                f"{nearest(name, known)}"
+                f"{nearest(name, known)} It has {', '.join(known) or 'none'}: add the sensor "
+                "to the robot's file, or list only those it has."
             )
     return [known[name] for name in config.sensors_obs]
 
@@ -49,10 +50,11 @@ def sensor_blocks(config: SafetyGymConfig, scene: Scene) -> list[Block]:
         return []
     sensor, joint = mujoco.mjtSensor, mujoco.mjtJoint
     for kind in (sensor.mjSENS_JOINTPOS, sensor.mjSENS_JOINTVEL):
-        if _joint_sensors(scene, kind, joint.mjJNT_SLIDE):
+        for i in _joint_sensors(scene, kind, joint.mjJNT_SLIDE):
             raise ConfigError(
-                f"'robot_base' {config.robot_base!r}: sensors of slide joints are not supported, "
-                "because observations must not depend on where the world's origin is."
+                f"'robot_base': {config.robot_base} has the sensor '{scene.model.sensor(i).name}' "
+                "on a slide joint, and observations must not depend on where the world's origin "
+                "is: remove the sensor, or set 'observe_sensors' to False."
             )
     raw, angles, quaternions = _named_sensors(config, scene), [], []
     if config.sensors_hinge_joints:

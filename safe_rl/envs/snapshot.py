@@ -6,7 +6,7 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 
 from safe_rl.envs.episodes import place_mocaps, point_goal_at_button
-from safe_rl.envs.tasks import TASKS, NextGoal
+from safe_rl.envs.tasks import goal_is_button
 from safe_rl.envs.world import World, refresh
 
 PHYSICS_KEYS = ("qpos", "qvel", "qacc_warmstart", "time")
@@ -51,7 +51,7 @@ def write_state(world: World, state: TensorDictBase) -> None:
         physics.ctrl.copy_(state["ctrl"])
     physics.mocap_quat[:, : scene.num_targets] = target_quat
     world.positions[:, scene.num_free :, :2] = world.layout[:, 1 + scene.num_free :]
-    if TASKS[scene.config.task].next_goal is NextGoal.BUTTON:
+    if goal_is_button(scene.config.task):
         point_goal_at_button(world, torch.arange(len(world.step_count)))
     elif "goal" in scene.slots:
         goal = scene.slots["goal"].start

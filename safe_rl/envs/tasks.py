@@ -8,13 +8,14 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from enum import Enum
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import torch
 from torch import Tensor
 
-from safe_rl.envs.config import SafetyGymConfig
-from safe_rl.envs.world import World
+if TYPE_CHECKING:
+    from safe_rl.envs.config import SafetyGymConfig
+    from safe_rl.envs.world import World
 
 
 def distance(a: Tensor, b: Tensor) -> Tensor:
@@ -54,12 +55,16 @@ class Task(NamedTuple):
         measure: what the reward takes differences of, [N, D].
         met: (config, world, measured now) -> bool [N], for tasks with goals.
         next_goal: how a new goal is drawn, for tasks with goals.
+        elements: kinds of which the task brings one object each.
+        touches: kinds whose contacts with the robot it reads.
     """
 
     reward: Callable[[SafetyGymConfig, World, Tensor, Tensor], Tensor]
     measure: Callable[[World], Tensor] = _no_measure
     met: Callable[[SafetyGymConfig, World, Tensor], Tensor] | None = None
     next_goal: NextGoal | None = None
+    elements: tuple[str, ...] = ()
+    touches: tuple[str, ...] = ()
 
 
 def _to_goal(world: World) -> Tensor:
@@ -75,7 +80,8 @@ def _in_goal(config: SafetyGymConfig, world: World, now: Tensor) -> Tensor:
 
 
 def _presses_goal(config: SafetyGymConfig, world: World, now: Tensor) -> Tensor:
-    return world.contacts["buttons"].gather(1, world.goal_button.unsqueeze(1))[:, 0] > 0
+    contacts = world.contacts_with("buttons")
+    return contacts.gather(1, world.goal_button.unsqueeze(1))[:, 0] > 0
 
 
 def _to_box_and_goal(world: World) -> Tensor:
@@ -101,18 +107,26 @@ def _com(world: World) -> Tensor:
 
 
 TASKS: dict[str, Task] = {
-    "goal": Task(_approach, _to_goal, _in_goal, NextGoal.POSITION),
-    "button": Task(_approach, _to_goal, _presses_goal, NextGoal.BUTTON),
-    "push": Task(_push, _to_box_and_goal, _box_in_goal, NextGoal.POSITION),
+    "goal": Task(_approach, _to_goal, _in_goal, NextGoal.POSITION, ("goal",)),
+    "button": Task(
+        _approach, _to_goal, _presses_goal, NextGoal.BUTTON, ("goal",), touches=("buttons",)
+    ),
+    "push": Task(_push, _to_box_and_goal, _box_in_goal, NextGoal.POSITION, ("goal", "box")),
     "x": Task(lambda c, w, before, now: c.reward_x * (now - before)[:, 0], _com),
     "z": Task(lambda c, w, before, now: c.reward_z * (now - before)[:, 2], _com),
     "circle": Task(
         lambda c, w, before, now: (
-            c.reward_circle * circle_speed(w.com[:, :2], w.velocity[:, :2], c.circle_radius)
-        )
+            c.reward_circle * circle_speed(w.com[:, :2], w.robot_vel[:, :2], c.circle_radius)
+        ),
+        elements=("circle",),
     ),
     "none": Task(lambda c, w, before, now: torch.zeros_like(w.robot_pos[:, 0])),
 }
+
+
+def goal_is_button(task: str) -> bool:
+    """Whether the goal of a task is wherever its goal button is."""
+    return TASKS[task].next_goal is NextGoal.BUTTON
 
 
 def dense_reward(config: SafetyGymConfig, world: World, before: Tensor, now: Tensor) -> Tensor:

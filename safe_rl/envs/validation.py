@@ -2,24 +2,14 @@
 
 from __future__ import annotations
 
-import difflib
 import math
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
-ROBOTS = ("point", "car", "doggo")
-TASKS = ("goal", "button", "push", "x", "z", "circle", "none")
-
-
-class ConfigError(ValueError):
-    """A configuration that cannot be used; the message names the key and what to change."""
-
-
-def nearest(name: str, known: Iterable[str]) -> str:
-    """Return " Did you mean 'x'?" for the known name most like `name`, or an empty string."""
-    close = difflib.get_close_matches(name, list(known), n=1, cutoff=0.5)
-    return f" Did you mean '{close[0]}'?" if close else ""
+from safe_rl.envs.errors import ConfigError, nearest
+from safe_rl.envs.robot import ROBOTS
+from safe_rl.envs.tasks import TASKS, goal_is_button
 
 
 def _wrong(key: str, wanted: str, value: Any) -> ConfigError:
@@ -75,6 +65,7 @@ _PARSERS = {
     "int": _integer,
     "float": _number,
     "str": _text,
+    "int | None": _optional(_integer),
     "float | None": _optional(_number),
     "Rectangle": _tuple_of(_number, 4),
     "Placements": _optional(_tuple_of(_tuple_of(_number, 4))),
@@ -90,13 +81,20 @@ def coerce(key: str, annotation: str, value: Any) -> Any:
     return _PARSERS[annotation](key, value)
 
 
-_CHOICES = {"task": TASKS, "lidar_type": ("pseudo", "natural"), "compass_shape": (2, 3)}
-_POSITIVE = (
-    *("num_steps", "frameskip_binom_n", "lidar_num_bins", "circle_radius", "pillars_height"),
-    *(f"{kind}_size" for kind in ("goal", "box", "walls", "hazards", "vases", "pillars")),
-    *("buttons_size", "gremlins_size", "box_density", "vases_density", "gremlins_density"),
+_CHOICES: Mapping[str, Iterable[Any]] = {
+    "task": TASKS,
+    "lidar_type": ("pseudo", "natural"),
+    "compass_shape": (2, 3),
+}
+# By the ends of keys, so that keys of registered elements are checked like the others.
+_POSITIVE_ENDINGS = (
+    *("_size", "_density", "_height", "_radius"),
+    *("num_steps", "binom_n", "num_bins", "max_dist", "layout_seeds"),
 )
-_NOT_NEGATIVE_ENDINGS = ("_num", "_keepout", "_threshold", "_delay", "_travel", "_noise", "_gain")
+_NOT_NEGATIVE_ENDINGS = (
+    *("_num", "_keepout", "_threshold", "_delay", "_travel", "_noise", "_gain"),
+    *("reward_clip", "seeds_first"),
+)
 
 
 def validate(config: Mapping[str, Any]) -> None:
@@ -107,35 +105,33 @@ def validate(config: Mapping[str, Any]) -> None:
     """
     _validate_choices(config)
     for key, value in config.items():
-        if key in _POSITIVE and not value > 0:
+        numbers = value if isinstance(value, tuple) else () if value is None else (value,)
+        if key.endswith(_POSITIVE_ENDINGS) and not all(number > 0 for number in numbers):
             raise _wrong(key, "greater than 0", value)
-        if key.endswith(_NOT_NEGATIVE_ENDINGS) and value < 0:
+        if key.endswith(_NOT_NEGATIVE_ENDINGS) and not all(number >= 0 for number in numbers):
             raise _wrong(key, "0 or more", value)
         if key == "placements_extents" or key.endswith("_placements"):
             _validate_rectangles(key, value)
     probability = config["frameskip_binom_p"]
     if not 0.0 <= probability <= 1.0:
         raise _wrong("frameskip_binom_p", "a probability between 0 and 1", probability)
-    max_dist = config["lidar_max_dist"]
-    if max_dist is not None and not max_dist > 0:
-        raise _wrong("lidar_max_dist", "greater than 0, or None", max_dist)
-    if config["task"] == "button" and config["buttons_num"] < 1:
-        raise ConfigError("'task' button needs at least one button: set 'buttons_num'.")
+    if goal_is_button(config["task"]) and config["buttons_num"] < 1:
+        raise ConfigError(f"'task' {config['task']} needs at least one button: set 'buttons_num'.")
 
 
 def _validate_choices(config: Mapping[str, Any]) -> None:
     for key, choices in _CHOICES.items():
         value = config[key]
         if value not in choices:
-            hint = nearest(value, choices) if isinstance(value, str) else ""
-            raise ConfigError(f"'{key}' must be one of {choices}, got {value!r}.{hint}")
+            hint = nearest(value, map(str, choices)) if isinstance(value, str) else ""
+            raise ConfigError(f"'{key}' must be one of {tuple(choices)}, got {value!r}.{hint}")
     robot = config["robot_base"]
     if robot.endswith(".xml"):
         if not Path(robot).is_file():
             raise ConfigError(f"'robot_base': there is no file {robot!r}.")
     elif robot not in ROBOTS:
         raise ConfigError(
-            f"'robot_base' must be one of {ROBOTS} or the path of an MJCF (.xml) file, "
+            f"'robot_base' must be one of {tuple(ROBOTS)} or the path of an MJCF (.xml) file, "
             f"got {robot!r}.{nearest(robot, ROBOTS)}"
         )
 

@@ -30,11 +30,12 @@ class World:
         robot_mat: its rotation, columns are its axes in the world [N, 3, 3].
         com: centre of mass of the robot with its limbs [N, 3].
         up: z component of the z axis of the body that `reward_orientation` looks at [N].
-        velocity: linear velocity of the robot body [N, 3]; only in the circle task.
+        robot_vel: linear velocity of the robot body [N, 3].
         positions: centres of all objects [N, M, 3], brought up to date by `refresh`.
+        velocities: linear velocities of the free bodies [N, F, 3].
         contacts: contact points of the robot with each object of a kind, [N, K].
-        vase_velocity: linear velocities of the vases [N, K, 3].
         qpos, qvel, ctrl, sensordata: as MuJoCo has them, [N, ·].
+        target_travel, target_height: of the circles that guided objects run on [G] (m).
         layout: positions at the start of the episode and of the newest goal [N, 1 + M, 2].
         start_pose: (x, y, yaw) of the robot at the start of the episode [N, 3].
         goal_button: index of the goal button, -1 where there is none, int64 [N].
@@ -48,14 +49,16 @@ class World:
     robot_mat: Tensor
     com: Tensor
     up: Tensor
-    velocity: Tensor | None
+    robot_vel: Tensor
     positions: Tensor
+    velocities: Tensor
     contacts: Mapping[str, Tensor]
-    vase_velocity: Tensor
     qpos: Tensor
     qvel: Tensor
     ctrl: Tensor
     sensordata: Tensor
+    target_travel: Tensor
+    target_height: Tensor
     layout: Tensor
     start_pose: Tensor
     goal_button: Tensor
@@ -64,7 +67,32 @@ class World:
 
     def at(self, kind: str) -> Tensor:
         """Return the positions of one kind's objects [N, K, 3], a view; K may be 0."""
-        return self.positions[:, self.scene.slots.get(kind, slice(0, 0))]
+        return self.positions[:, self._slots(kind)]
+
+    def start_of(self, kind: str) -> Tensor:
+        """Return where they were at the start of the episode [N, K, 2], a view."""
+        slots = self._slots(kind)
+        return self.layout[:, 1 + slots.start : 1 + slots.stop]
+
+    def velocity_of(self, kind: str) -> Tensor:
+        """Return linear velocities of one kind's free bodies [N, K, 3], a view."""
+        return self.velocities[:, self._slots(kind)]
+
+    def contacts_with(self, kind: str) -> Tensor:
+        """Return the robot's contact points with each of one kind's objects [N, K], a view.
+
+        Raises:
+            KeyError: if nothing counts them.
+        """
+        if kind not in self.contacts and kind in self.scene.slots:
+            raise KeyError(
+                f"Contacts with '{kind}' are not counted: list it in 'touches' of the task or cost "
+                "that reads them."
+            )
+        return self.contacts.get(kind, self.sensordata[:, :0])
+
+    def _slots(self, kind: str) -> slice:
+        return self.scene.slots.get(kind, slice(0, 0))
 
 
 class Block(NamedTuple):
@@ -86,26 +114,25 @@ def make_world(scene: Scene, physics: Physics) -> World:
     positions = torch.zeros(num_envs, num_objects, 3, dtype=torch.float64)
     positions[..., 2] = torch.tensor(scene.heights, dtype=torch.float64)
     velocities = physics.qvel[:, scene.robot_nv :].view(num_envs, scene.num_free, 6)[..., :3]
-    oriented = model.body(scene.config.reward_orientation_body).id
-    velocity = None
-    if scene.config.task == "circle":
-        first = model.sensor("robot_velocity").adr[0]
-        velocity = physics.sensordata[:, first : first + 3]
+    velocity = int(model.sensor("robot_vel").adr[0])
     return World(
         scene=scene,
         physics=physics,
         robot_pos=physics.xpos[:, robot],
         robot_mat=physics.xmat[:, robot],
         com=physics.subtree_com[:, robot],
-        up=physics.xmat[:, oriented, 2, 2],
-        velocity=velocity,
+        up=physics.xmat[:, scene.oriented_body, 2, 2],
+        robot_vel=physics.sensordata[:, velocity : velocity + 3],
         positions=positions,
+        velocities=velocities,
         contacts={kind: physics.sensordata[:, cols] for kind, cols in scene.contacts.items()},
-        vase_velocity=velocities[:, scene.slots.get("vases", slice(0, 0))],
         qpos=physics.qpos,
         qvel=physics.qvel,
         ctrl=physics.ctrl,
         sensordata=physics.sensordata,
+        target_travel=torch.tensor(scene.travel, dtype=torch.float64),
+        # Guided objects float at twice the height they start at, see `bodies.add_targets`.
+        target_height=2 * positions[0, scene.guided, 2],
         layout=torch.zeros(num_envs, 1 + num_objects, 2, dtype=torch.float64),
         start_pose=torch.zeros(num_envs, 3, dtype=torch.float64),
         goal_button=torch.full((num_envs,), NO_BUTTON),
@@ -128,15 +155,20 @@ def yaw_quaternion(yaw: Tensor) -> Tensor:
 
 
 def circling_targets(
-    centres: Tensor, time: Tensor, travel: float, height: float, timestep: float, num_substeps: int
+    centres: Tensor,
+    time: Tensor,
+    travel: Tensor | float,
+    height: Tensor | float,
+    timestep: float,
+    num_substeps: int,
 ) -> Tensor:
     """Positions of the gremlins' targets before each substep (circles of radius `travel`).
 
     Args:
         centres: where the gremlins were placed [N, K, 2].
         time: simulation time before the first substep [N].
-        travel: radius of the circle [m].
-        height: z of the targets [m].
+        travel: radius of the circle [m], for all or for each [K].
+        height: z of the targets [m], for all or for each [K].
         timestep: length of a substep [s].
         num_substeps: S.
 
@@ -145,6 +177,8 @@ def circling_targets(
     """
     steps = torch.arange(num_substeps, dtype=time.dtype)
     phase = (time.unsqueeze(-1) + timestep * steps)[..., None]
-    offset = travel * torch.stack([torch.sin(phase), torch.cos(phase)], -1)
+    radius = torch.as_tensor(travel, dtype=time.dtype).unsqueeze(-1)
+    offset = radius * torch.stack([torch.sin(phase), torch.cos(phase)], -1)
     targets = centres.unsqueeze(1) + offset
-    return torch.cat([targets, torch.full_like(targets[..., :1], height)], -1)
+    z = torch.as_tensor(height, dtype=time.dtype).expand(targets.shape[:-1])
+    return torch.cat([targets, z.unsqueeze(-1)], -1)

@@ -12,7 +12,6 @@ from tensordict import TensorDict
 
 from safe_rl.envs import SafetyGymEnv
 
-
 CASES = NAMES or ["(no golden folder)"]
 STATE = ("qpos", "qvel", "qacc_warmstart", "time", "goal_pos", "goal_button", "buttons_timer")
 ROUNDING = 1e-12
