@@ -1,5 +1,9 @@
 """Safety Gym environments: configurations, the benchmark suite and the batched environment."""
 
+# First, because it imports MuJoCo where OpenGL is missing.
+from safe_rl.envs.rendering.opengl import OpenGLError
+
+# isort: split
 from safe_rl.envs.config import SafetyGymConfig
 from safe_rl.envs.layout import LayoutError
 from safe_rl.envs.registration import make_env, store_configs
@@ -11,6 +15,7 @@ __all__ = [
     "SUITE",
     "ConfigError",
     "LayoutError",
+    "OpenGLError",
     "SafetyGymConfig",
     "SafetyGymEnv",
     "make_env",

@@ -16,6 +16,7 @@ from torch import Tensor
 from safe_rl.envs.config import ConfigError, SafetyGymConfig
 from safe_rl.envs.lidar import compass, to_ego
 from safe_rl.envs.lidar_blocks import lidar_blocks
+from safe_rl.envs.rendering.vision import vision_blocks
 from safe_rl.envs.scene import Scene
 from safe_rl.envs.sensors import sensor_blocks
 from safe_rl.envs.tasks import TASKS, distance
@@ -125,6 +126,7 @@ SOURCES: tuple[Callable[[SafetyGymConfig, Scene], list[Block]], ...] = (
     sensor_blocks,
     lidar_blocks,
     _plain,
+    vision_blocks,
 )
 
 

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
+import numpy as np
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
@@ -25,6 +26,8 @@ from safe_rl.envs.episodes import (
 from safe_rl.envs.layout import plan_placements
 from safe_rl.envs.observations import make_observer
 from safe_rl.envs.physics.cpu import BatchPhysics
+from safe_rl.envs.rendering.display import Camera
+from safe_rl.envs.rendering.renderer import WorldRenderer
 from safe_rl.envs.scene import build_scene
 from safe_rl.envs.snapshot import read_state, write_state
 from safe_rl.envs.suite import resolve
@@ -82,6 +85,8 @@ class SafetyGymEnv(EnvBase):
         self._control_low, self._control_high = limits[:, 0].clone(), limits[:, 1].clone()
         self._episode = torch.zeros(num_envs, dtype=torch.int64)
         self._measured = self._task.measure(self._world)
+        self._renderer = WorldRenderer(self._world)
+        self._has_cost = torch.zeros(num_envs, dtype=torch.bool)
         self.cost_keys = cost_keys(self.config)
         self._make_specs(scene.model.nu)
         self.set_seed(int(torch.randint(2**62, ())) if seed is None else seed)
@@ -143,6 +148,7 @@ class SafetyGymEnv(EnvBase):
         start_episodes(self._world, self._plan, self._layout_key(), mask)
         fresh = self._task.measure(self._world)
         self._measured = torch.where(mask.unsqueeze(-1), fresh, self._measured)
+        self._has_cost = self._has_cost & ~mask
         return self._reset_output()
 
     def _reset_output(self) -> TensorDict:
@@ -163,6 +169,7 @@ class SafetyGymEnv(EnvBase):
         now = self._task.measure(world)
         reward = dense_reward(config, world, self._measured, now)
         costs = compute_costs(config, world, failed)
+        self._has_cost = costs["cost"] > 0
         world.buttons_timer.sub_(1).clamp_(min=0)
         met, ended, stuck = self._handle_goals(now, failed)
         reward = torch.where(failed, config.reward_exception, reward + config.reward_goal * met)
@@ -248,4 +255,47 @@ class SafetyGymEnv(EnvBase):
         self._row_seed = state.get("seed", self._row_seed).clone()
         self._episode = state.get("episode", self._episode).clone()
         self._measured = self._task.measure(self._world)
+        self._has_cost = torch.zeros_like(self._has_cost)
         return self._reset_output()
+
+    def render(
+        self,
+        rows: int | Sequence[int] | None = None,
+        *,
+        camera: Camera = "fixedfar",
+        width: int = 480,
+        height: int = 360,
+    ) -> np.ndarray:
+        """Draw worlds as they are, with lidar halos, and a red sphere where a cost is incurred.
+
+        Args:
+            rows: which worlds; None is all of them.
+            camera: "fixednear", "fixedfar", "track" (behind the robot), "vision" (the robot's),
+                "free" (above), or a `mujoco.MjvCamera`.
+            width: of a frame [pixels].
+            height: of a frame [pixels].
+
+        Returns:
+            RGB, uint8: one frame [height, width, 3] for an integer, else [R, height, width, 3].
+
+        Raises:
+            OpenGLError: if OpenGL is missing; the message names the package to install.
+            ValueError: for an unknown camera.
+        """
+        if isinstance(rows, int):
+            return self._renderer.frames([rows], self._has_cost, camera, width, height)[0]
+        chosen = range(self.batch_size[0]) if rows is None else rows
+        return self._renderer.frames(list(chosen), self._has_cost, camera, width, height)
+
+    def show(self, row: int = 0) -> None:
+        """Show one world as it is in MuJoCo's viewer, opened by the first call.
+
+        Raises:
+            OpenGLError: if there is no screen.
+        """
+        self._renderer.show(row, self._has_cost)
+
+    def close(self, *, raise_if_closed: bool = True) -> None:
+        """Close the viewer and free what OpenGL holds."""
+        self._renderer.close()
+        super().close(raise_if_closed=raise_if_closed)

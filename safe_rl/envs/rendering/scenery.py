@@ -15,9 +15,10 @@ FIXED_CAMERAS = {"fixednear": (0.0, -2.0, 2.0), "fixedfar": (0.0, -5.0, 5.0)}
 TRACK = "track"  # behind the robot, see `rendering.track_pose`
 VISION = "vision"  # the robot's own, part of the robot file
 
-SKY_RGB = ((0.55, 0.65, 0.85), (0.15, 0.2, 0.4))  # overhead and at the horizon's far side
-FLOOR_RGB = ((0.72, 0.72, 0.72), (0.8, 0.8, 0.8))
+SKY_RGB = ((0.55, 0.62, 0.85), (0.2, 0.25, 0.45))  # overhead and underfoot
+FLOOR_RGB = ((0.74, 0.74, 0.74), (0.82, 0.82, 0.82))
 FLOOR_TILE = 0.5  # side of a square of the chequered floor [m]
+SLICES, STACKS = 24, 8  # facets of a round shape; halos have hundreds of spheres
 DISPLAY_RIM = 0.1  # how far a cropped floor reaches beyond the placements [m]
 
 
@@ -33,6 +34,8 @@ def decorate(spec: mujoco.MjSpec, config: SafetyGymConfig) -> None:
         half = max(abs(bound) for bound in config.placements_extents) + DISPLAY_RIM
         floor.size = [half, half, 0.1]
     floor.material = _floor_material(spec)
+    floor.rgba = [1, 1, 1, 1]  # instead of the robot file's default, which would colour it
+    spec.visual.quality.numslices, spec.visual.quality.numstacks = SLICES, STACKS
     _add_sky(spec)
     _add_light(spec)
     for name, position in FIXED_CAMERAS.items():
@@ -74,14 +77,17 @@ def _add_sky(spec: mujoco.MjSpec) -> None:
 
 
 def _add_light(spec: mujoco.MjSpec) -> None:
-    """Light from above, slightly from the south-west, so that upright faces differ."""
+    """Light from above and the south-west, so that upright faces differ.
+
+    It casts no shadows: they would take software OpenGL a hundred times longer than the rest.
+    """
     spec.worldbody.add_light(
         pos=[0, 0, 4],
         dir=[0.3, 0.4, -1],
         type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL,
         diffuse=[0.7, 0.7, 0.7],
         specular=[0.1, 0.1, 0.1],
-        castshadow=True,
+        castshadow=False,
     )
     spec.visual.headlight.ambient = [0.35, 0.35, 0.35]
     spec.visual.headlight.diffuse = [0.25, 0.25, 0.25]

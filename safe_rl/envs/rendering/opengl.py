@@ -1,0 +1,85 @@
+"""OpenGL, which only pictures need: it is chosen and loaded when the first one is drawn.
+
+MuJoCo loads its OpenGL backend as soon as it is imported, the one that MUJOCO_GL names, and fails
+to import where the libraries of that backend are missing. Importing this module imports MuJoCo in
+any case.
+"""
+
+from __future__ import annotations
+
+import importlib
+import os
+import sys
+
+try:
+    import mujoco
+except ImportError:
+    raise
+except Exception:  # whatever PyOpenGL raises in place of an ImportError
+    _backend = os.environ["MUJOCO_GL"]
+    os.environ["MUJOCO_GL"] = "disable"
+    import mujoco
+
+    os.environ["MUJOCO_GL"] = _backend
+from mujoco.rendering.classic import gl_context
+
+# What Debian and Ubuntu call the libraries of each backend.
+PACKAGES = {
+    "egl": "libegl1 libgl1 libgl1-mesa-dri",
+    "glfw": "libgl1 libgl1-mesa-dri",
+    "osmesa": "libosmesa6",
+}
+
+
+class OpenGLError(RuntimeError):
+    """Nothing can be drawn on this machine; the message names the package to install."""
+
+
+def has_screen() -> bool:
+    """Whether windows can be opened on this machine."""
+    if sys.platform != "linux":
+        return True
+    return bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
+
+
+def open_renderer(model: mujoco.MjModel, width: int, height: int) -> mujoco.Renderer:
+    """Open an OpenGL context that draws pictures of one size.
+
+    The backend is the one that MUJOCO_GL names, or EGL where there is neither that nor a screen.
+
+    Args:
+        model: what is drawn; its offscreen buffer is set to the size.
+        width: of the pictures [pixels].
+        height: of the pictures [pixels].
+
+    Raises:
+        OpenGLError: if OpenGL is missing or cannot be started.
+    """
+    model.vis.global_.offwidth, model.vis.global_.offheight = width, height
+    try:
+        _load_backend()
+        return mujoco.Renderer(model, height, width)
+    except Exception as error:  # every backend fails in its own way
+        raise OpenGLError(_advice(error)) from error
+
+
+def _load_backend() -> None:
+    if not os.environ.get("MUJOCO_GL") and not has_screen():
+        os.environ["MUJOCO_GL"] = "egl"
+    elif hasattr(gl_context, "GLContext"):
+        return
+    # MuJoCo chooses by MUJOCO_GL when this module is loaded, and its Renderer looks there.
+    importlib.reload(gl_context)
+
+
+def _advice(error: Exception) -> str:
+    backend = os.environ.get("MUJOCO_GL", "").lower().strip()
+    name = backend if backend in PACKAGES else "glfw"
+    message = (
+        f"Pictures need OpenGL, which cannot be started here with MUJOCO_GL={backend or 'unset'} "
+        f"({type(error).__name__}: {error}). On Debian or Ubuntu install it with "
+        f"'apt-get install {PACKAGES[name]}'"
+    )
+    if name == "glfw":
+        return f"{message}; without a screen, set MUJOCO_GL=egl."
+    return f"{message}, then start Python anew."

@@ -1,0 +1,61 @@
+"""MuJoCo's interactive viewer, showing a world that is stepped elsewhere."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+import mujoco
+
+from safe_rl.envs.rendering.display import add_markers
+from safe_rl.envs.rendering.markers import Marker
+from safe_rl.envs.rendering.opengl import PACKAGES, OpenGLError, has_screen
+
+
+class Viewer:
+    """A window onto a model's data; the mouse moves its camera.
+
+    Args:
+        model: what is shown.
+        data: where everything is; written by others, copied by `show`.
+
+    Raises:
+        OpenGLError: if there is no screen, or no OpenGL.
+    """
+
+    def __init__(self, model: mujoco.MjModel, data: mujoco.MjData) -> None:
+        if not has_screen():
+            raise OpenGLError(
+                "MuJoCo's viewer needs a screen, and there is none here (neither DISPLAY nor "
+                "WAYLAND_DISPLAY is set). Use render_mode='rgb_array', which needs none."
+            )
+        # Its import opens a connection to the screen.
+        import mujoco.viewer
+
+        try:
+            self._window = mujoco.viewer.launch_passive(
+                model, data, show_left_ui=False, show_right_ui=False
+            )
+        except Exception as error:  # GLFW raises what it likes
+            raise OpenGLError(
+                f"MuJoCo's viewer cannot be opened ({error}). It needs OpenGL: on Debian or "
+                f"Ubuntu 'apt-get install {PACKAGES['glfw']}'."
+            ) from error
+
+    @property
+    def is_open(self) -> bool:
+        """Whether nobody closed the window."""
+        return self._window.is_running()
+
+    def show(self, markers: Iterable[Marker]) -> None:
+        """Bring the window up to date with the data, and draw markers in it."""
+        if not self.is_open:
+            return
+        with self._window.lock():
+            drawn = self._window.user_scn
+            drawn.ngeom = 0
+            add_markers(drawn, markers)
+        self._window.sync()
+
+    def close(self) -> None:
+        """Close the window."""
+        self._window.close()
