@@ -1,6 +1,8 @@
 """The benchmark suite: names, configurations, and the one way from a name to an environment.
 
-27 environments, {Point, Car, Doggo} x {Goal, Button, Push} x {0, 1, 2} (paper section 4.2).
+27 environments, {Point, Car, Doggo} x {Goal, Button, Push} x {0, 1, 2} (paper section 4.2). Beside
+them stand debug environments, {Point, Car, Doggo} x {Run, Circle}, and a variant of every
+environment with the robot's camera in a nested observation, {name}Vision.
 """
 
 from __future__ import annotations
@@ -142,9 +144,29 @@ SUITE: dict[str, SafetyGymConfig] = {
     for level in range(3)
 }
 
+# Not part of the benchmark: to see whether a robot can be moved at all.
+_DEBUG: dict[str, Values] = {
+    "Run": {"task": "x", "robot_rot": 0.0},
+    "Circle": {"task": "circle", "observe_circle": True, "lidar_max_dist": 6.0},
+}
+_NO_TARGETS: Values = {"observe_goal_lidar": False, "observe_box_lidar": False, **_extents(1.0)}
+
+_DEBUG_SUITE = {
+    f"{robot}{task}": SafetyGymConfig(**{**_COMMON, **_NO_TARGETS, **values, **own})
+    for robot, own in _ROBOTS.items()
+    for task, values in _DEBUG.items()
+}
+_WITH_VISION: Values = {"observe_vision": True, "observation_flatten": False}
+
+# Everything that has a name but does not count as the benchmark.
+EXTRAS: dict[str, SafetyGymConfig] = _DEBUG_SUITE | {
+    f"{name}Vision": config.replace(**_WITH_VISION)
+    for name, config in (SUITE | _DEBUG_SUITE).items()
+}
+
 
 def resolve(env: str | Mapping[str, Any] | SafetyGymConfig) -> SafetyGymConfig:
-    """Return the configuration of a suite name, a mapping of keys, or a configuration.
+    """Return the configuration of a name, a mapping of keys, or a configuration.
 
     Args:
         env: "PointGoal1", "Safexp-PointGoal1-v0", a flat mapping, or a `SafetyGymConfig`.
@@ -166,9 +188,11 @@ def resolve(env: str | Mapping[str, Any] | SafetyGymConfig) -> SafetyGymConfig:
             f"got {type(env).__name__}."
         )
     name = env.removeprefix("Safexp-").removesuffix("-v0")
-    if name not in SUITE:
+    named = SUITE | EXTRAS
+    if name not in named:
         raise ConfigError(
-            f"Unknown environment '{env}'.{nearest(name, SUITE)} The suite has "
-            "{Point, Car, Doggo}{Goal, Button, Push}{0, 1, 2}, for example 'PointGoal1'."
+            f"Unknown environment '{env}'.{nearest(name, named)} The suite has "
+            "{Point, Car, Doggo}{Goal, Button, Push}{0, 1, 2}, for example 'PointGoal1'; beyond it "
+            "there are {Point, Car, Doggo}{Run, Circle}, and a {name}Vision of every one."
         )
-    return SUITE[name]
+    return named[name]
