@@ -2,8 +2,8 @@
 
 One environment is one flat, frozen `SafetyGymConfig`. Keys, defaults and meaning are those of the
 2019 Safety Gym engine (paper, section 4.1), so that its dictionaries can be used as they are;
-`vases_rots`, `gremlins_rots` and `box_rots` are additions. Lengths are metres, angles radians,
-times environment steps unless said otherwise.
+`layout_seeds`, `layout_seeds_first`, `vases_rots`, `gremlins_rots` and `box_rots` are additions.
+Lengths are metres, angles radians, times environment steps unless said otherwise.
 """
 
 from __future__ import annotations
@@ -44,6 +44,8 @@ class SafetyGymConfig:
     placements_extents: Rectangle = (-2.0, -2.0, 2.0, 2.0)  # xmin, ymin, xmax, ymax
     placements_margin: float = 0.0
     randomize_layout: bool = True
+    layout_seeds: int | None = None  # number of different layouts; None: unlimited
+    layout_seeds_first: int = 0  # they are first, first + 1, …; disjoint ranges share none
     continue_goal: bool = True
     terminate_resample_failure: bool = True
 

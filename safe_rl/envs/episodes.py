@@ -28,6 +28,23 @@ class Purpose(IntEnum):
     GOAL = 3
     NOISE = 4
     FRAMESKIP = 5
+    SPLIT = 6
+
+
+def pick_layouts(config: SafetyGymConfig, key: Tensor) -> Tensor:
+    """Pick layouts from the finite set that a configuration names, uniformly.
+
+    Args:
+        config: the environment, with `layout_seeds`.
+        key: random keys to pick with, int64 [N].
+
+    Returns:
+        Layout keys [N]: functions of the picked layout seeds alone, so that environments with other
+        seeds, and runs that evaluate on the same set, meet the same layouts.
+    """
+    assert config.layout_seeds is not None
+    index = (rng.uniform(key, Purpose.SPLIT) * config.layout_seeds).to(torch.int64)
+    return rng.fold(config.layout_seeds_first + index, Purpose.SPLIT)
 
 
 def pinned_yaws(scene: Scene) -> Tensor:

@@ -143,17 +143,37 @@ class Observer(NamedTuple):
     columns: dict[str, slice]
     read: Callable[[World], Tensor]
 
+    @property
+    def size(self) -> int:
+        """Number of columns of the flat observation."""
+        return sum(math.prod(shape) for shape in self.shapes.values())
+
+    def split(self, flat: Tensor) -> dict[str, Tensor]:
+        """Views of a flat observation [N, n] by component, each [N, *shape]."""
+        return {
+            name: flat[:, self.columns[name]].unflatten(1, shape)
+            for name, shape in self.shapes.items()
+        }
+
 
 def make_observer(scene: Scene) -> Observer:
     """Resolve what a configuration observes.
 
     Raises:
-        ConfigError: for sensors the robot does not have, or if nothing is observed.
+        ConfigError: for sensors the robot does not have, if two components have one name, or if
+            nothing is observed.
     """
     blocks = [block for source in SOURCES for block in source(scene.config, scene)]
-    unordered: Shapes = {name: shape for block in blocks for name, shape in block.shapes.items()}
-    if not unordered:
+    names = [name for block in blocks for name in block.shapes]
+    if not names:
         raise ConfigError("Nothing is observed: set at least one 'observe_*' key.")
+    for name in names:
+        if names.count(name) > 1:
+            raise ConfigError(
+                f"Two observations are called '{name}': rename the robot's sensor, or the "
+                "observation that was registered."
+            )
+    unordered: Shapes = {name: shape for block in blocks for name, shape in block.shapes.items()}
     starts, start = {}, 0
     for name, shape in unordered.items():
         starts[name], start = start, start + math.prod(shape)

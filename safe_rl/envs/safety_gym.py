@@ -9,7 +9,6 @@ import numpy as np
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
-from torchrl.data import Binary, Bounded, Composite, Unbounded
 from torchrl.envs import EnvBase
 
 from safe_rl.envs import rng
@@ -21,6 +20,7 @@ from safe_rl.envs.episodes import (
     draw_substeps,
     gremlin_path,
     next_goals,
+    pick_layouts,
     start_episodes,
 )
 from safe_rl.envs.layout import plan_placements
@@ -30,6 +30,7 @@ from safe_rl.envs.rendering.display import Camera
 from safe_rl.envs.rendering.renderer import WorldRenderer
 from safe_rl.envs.scene import build_scene
 from safe_rl.envs.snapshot import read_state, write_state
+from safe_rl.envs.specs import make_specs
 from safe_rl.envs.suite import resolve
 from safe_rl.envs.tasks import TASKS, dense_reward
 from safe_rl.envs.world import make_world, refresh
@@ -38,7 +39,9 @@ from safe_rl.envs.world import make_world, refresh
 class SafetyGymEnv(EnvBase):
     """N parallel worlds of one Safety Gym configuration, stepped together on a thread pool.
 
-    Reads `action` [N, nu] in [-1, 1] (clipped). Writes `observation` [N, n], and each [N, 1]:
+    Reads `action` [N, nu], clipped to the actuators' control range ([-1, 1] in the suite). Writes
+    `observation` [N, n], or nested `("observation", name)` [N, …] where the configuration sets
+    `observation_flatten` False, and each [N, 1]:
     `reward`, `cost` (the aggregate), one `cost_<kind>` per constrained kind, `cost_exception`,
     `goal_met`, `done`, `terminated`, `truncated`. Time-outs are truncations. Where the physics of
     a world fails, that world gets `reward_exception`, `cost_exception` 1 and termination.
@@ -81,14 +84,18 @@ class SafetyGymEnv(EnvBase):
         self._plan = plan_placements(self.config, scene.slots, len(scene.names))
         self._observer = make_observer(scene)
         self._task = TASKS[self.config.task]
-        limits = torch.as_tensor(scene.model.actuator_ctrlrange)
-        self._control_low, self._control_high = limits[:, 0].clone(), limits[:, 1].clone()
+        low, high = torch.from_numpy(scene.model.actuator_ctrlrange.T.copy())
+        self._control_range = (low, high)
         self._episode = torch.zeros(num_envs, dtype=torch.int64)
         self._measured = self._task.measure(self._world)
         self._renderer = WorldRenderer(self._world)
         self._has_cost = torch.zeros(num_envs, dtype=torch.bool)
         self.cost_keys = cost_keys(self.config)
-        self._make_specs(scene.model.nu)
+        specs = make_specs(
+            self.config, self._observer, self._control_range, self.cost_keys, num_envs, self.device
+        )
+        self.observation_spec, self.action_spec = specs.observation, specs.action
+        self.reward_spec, self.done_spec = specs.reward, specs.done
         self.set_seed(int(torch.randint(2**62, ())) if seed is None else seed)
 
     @property
@@ -101,27 +108,6 @@ class SafetyGymEnv(EnvBase):
         """Columns of every named component in `observation`."""
         return dict(self._observer.columns)
 
-    def _make_specs(self, num_actions: int) -> None:
-        shape, kind = self.batch_size, {"dtype": torch.float32, "device": self.device}
-        size = max(columns.stop for columns in self._observer.columns.values())
-        scalar = (*shape, 1)
-        flag = Binary(1, shape=scalar, dtype=torch.bool, device=self.device)
-        self.observation_spec = Composite(
-            observation=Unbounded(shape=(*shape, size), **kind),
-            goal_met=flag.clone(),
-            shape=shape,
-        )
-        self.action_spec = Bounded(-1.0, 1.0, shape=(*shape, num_actions), **kind)
-        high = 1.0 if self.config.constrain_indicator else torch.finfo(torch.float32).max
-        self.reward_spec = Composite(
-            reward=Unbounded(shape=scalar, **kind),
-            **{key: Bounded(0.0, high, shape=scalar, **kind) for key in self.cost_keys},
-            shape=shape,
-        )
-        self.done_spec = Composite(
-            **{key: flag.clone() for key in ("done", "terminated", "truncated")}, shape=shape
-        )
-
     def _set_seed(self, seed: int | None) -> None:
         if seed is None:
             return
@@ -131,9 +117,10 @@ class SafetyGymEnv(EnvBase):
         self._episode.zero_()
 
     def _layout_key(self) -> Tensor:
+        key = rng.fold(self._row_seed, self._episode)
         if not self.config.randomize_layout:
-            return self._fixed_layout.expand(self.batch_size)
-        return rng.fold(self._row_seed, self._episode)
+            key = self._fixed_layout.expand(self.batch_size)
+        return key if self.config.layout_seeds is None else pick_layouts(self.config, key)
 
     def _step_key(self) -> Tensor:
         """Random key of the step that is being taken, [N]."""
@@ -156,11 +143,17 @@ class SafetyGymEnv(EnvBase):
         none = torch.zeros(*self.batch_size, 1, dtype=torch.bool)
         return self._pack({"goal_met": none, "done": none, "terminated": none, "truncated": none})
 
-    def _pack(self, outputs: dict[str, Tensor]) -> TensorDict:
+    def _pack(self, outputs: dict[str, Any]) -> TensorDict:
         """Add the observation; here, and here alone, things become float32 copies on the device."""
-        outputs["observation"] = self._observer.read(self._world).to(torch.float32)
+        flat = self._observer.read(self._world).to(torch.float32)
         if self.device.type != "cpu":
             outputs = {key: value.to(self.device) for key, value in outputs.items()}
+            flat = flat.to(self.device)
+        outputs["observation"] = flat
+        if not self.config.observation_flatten:
+            outputs["observation"] = TensorDict(
+                self._observer.split(flat), batch_size=self.batch_size, device=self.device
+            )
         return TensorDict(outputs, batch_size=self.batch_size, device=self.device)
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -195,7 +188,7 @@ class SafetyGymEnv(EnvBase):
     def _advance(self, action: Tensor) -> Tensor:
         """Run the substeps of one step; returns the worlds whose physics failed [N]."""
         config, physics = self.config, self._physics
-        control = action.clamp(self._control_low, self._control_high)
+        control = action.clamp(*self._control_range)
         num_substeps: Tensor | int = config.frameskip_binom_n
         if config.action_noise > 0.0:
             control = control + control_noise(config, self._step_key(), control.shape[-1])
