@@ -1,0 +1,178 @@
+"""Specs, names and sizes of all 27 environments, ends of episodes, and partial resets."""
+
+import itertools
+
+import pytest
+import torch
+from tensordict import TensorDict
+from torchrl.envs.utils import check_env_specs
+
+from safe_rl.envs import SUITE, SafetyGymEnv, make_env
+
+# By hand from sections 4, 8 and 9 of the benchmark's description: names and sizes.
+COMMON_SENSORS = {"accelerometer": 3, "gyro": 3, "magnetometer": 3, "velocimeter": 3}
+LEGS = [joint for leg in "1234" for joint in (f"hip_{leg}_y", f"hip_{leg}_z", f"ankle_{leg}")]
+ROBOT_SENSORS = {
+    "Point": COMMON_SENSORS,
+    "Car": {**COMMON_SENSORS, "ballangvel_rear": 3, "ballquat_rear": 9},
+    "Doggo": {
+        **COMMON_SENSORS,
+        **{f"jointpos_{joint}": 2 for joint in LEGS},
+        **{f"jointvel_{joint}": 1 for joint in LEGS},
+        **{f"touch_ankle_{leg}{end}": 1 for leg in (1, 2, 3, 4) for end in "ab"},
+    },
+}
+LIDARS = {
+    "Goal0": ["goal"],
+    "Goal1": ["goal", "hazards", "vases"],
+    "Goal2": ["goal", "hazards", "vases"],
+    "Button0": ["buttons", "goal"],
+    "Button1": ["buttons", "goal", "gremlins", "hazards"],
+    "Button2": ["buttons", "goal", "gremlins", "hazards"],
+    "Push0": ["box", "goal"],
+    "Push1": ["box", "goal", "hazards", "pillars"],
+    "Push2": ["box", "goal", "hazards", "pillars"],
+}
+SIZES = {
+    **{"PointGoal0": 28, "PointGoal1": 60, "PointGoal2": 60},
+    **{"PointButton0": 44, "PointButton1": 76, "PointButton2": 76},
+    **{"PointPush0": 44, "PointPush1": 76, "PointPush2": 76},
+    **{"CarGoal0": 40, "CarGoal1": 72, "CarGoal2": 72},
+    **{"CarButton0": 56, "CarButton1": 88, "CarButton2": 88},
+    **{"CarPush0": 56, "CarPush1": 88, "CarPush2": 88},
+    **{"DoggoGoal0": 72, "DoggoGoal1": 104, "DoggoGoal2": 104},
+    **{"DoggoButton0": 88, "DoggoButton1": 120, "DoggoButton2": 120},
+    **{"DoggoPush0": 88, "DoggoPush1": 120, "DoggoPush2": 120},
+}
+ACTIONS = {"Point": 2, "Car": 2, "Doggo": 12}
+COST_KINDS = {
+    "Goal0": [],
+    "Goal1": ["hazards"],
+    "Goal2": ["hazards", "vases_contact", "vases_velocity"],
+    "Button0": [],
+    "Button1": ["buttons", "gremlins", "hazards"],
+    "Button2": ["buttons", "gremlins", "hazards"],
+    "Push0": [],
+    "Push1": ["hazards"],
+    "Push2": ["hazards", "pillars"],
+}
+NAMES = [(robot, task) for robot, task in itertools.product(ACTIONS, LIDARS)]
+
+
+def actions(env, num_steps: int, seed: int = 0) -> torch.Tensor:
+    generator = torch.Generator().manual_seed(seed)
+    return 2 * torch.rand(num_steps, *env.action_spec.shape, generator=generator) - 1
+
+
+def test_the_suite_has_its_27_names():
+    assert sorted(SUITE) == sorted(SIZES) == sorted(robot + task for robot, task in NAMES)
+
+
+@pytest.mark.parametrize(("robot", "task"), NAMES)
+def test_specs(robot, task):
+    env = SafetyGymEnv(f"Safexp-{robot}{task}-v0", num_envs=2, seed=0, num_threads=1)
+    check_env_specs(env)
+    assert env.observation_spec["observation"].shape == (2, SIZES[robot + task])
+    assert env.action_spec.shape == (2, ACTIONS[robot])
+    low, high = env.action_spec.space.low, env.action_spec.space.high
+    assert (low == -1).all()
+    assert (high == 1).all()
+    keys = ["reward", "cost", "cost_exception", *(f"cost_{kind}" for kind in COST_KINDS[task])]
+    assert sorted(env.full_reward_spec.keys()) == sorted(keys)
+    assert all(env.full_reward_spec[key].shape == (2, 1) for key in keys)
+
+
+@pytest.mark.parametrize(("robot", "task"), NAMES)
+def test_observations_are_ordered_by_name(robot, task):
+    env = SafetyGymEnv(robot + task, seed=0, num_threads=1)
+    sizes = ROBOT_SENSORS[robot] | {f"{kind}_lidar": 16 for kind in LIDARS[task]}
+    columns, first = {}, 0
+    for name in sorted(sizes):
+        columns[name], first = slice(first, first + sizes[name]), first + sizes[name]
+    assert env.observation_layout == columns
+
+
+@pytest.mark.parametrize("env_name", ["PointGoal1", "CarButton1", "DoggoPush1"])
+def test_time_outs_truncate_at_exactly_the_last_step(env_name):
+    env = SafetyGymEnv(SUITE[env_name].replace(num_steps=7), num_envs=3, seed=0, num_threads=1)
+    last = env.rollout(20)["next"]
+    assert last.shape == (3, 7)
+    for key in ("done", "truncated"):
+        assert not last[key][:, :-1].any()
+        assert last[key][:, -1].all()
+    assert not last["terminated"].any()
+
+
+def test_benchmark_episodes_have_1000_steps():
+    env = SafetyGymEnv("PointGoal0", num_envs=2, seed=0, num_threads=1)
+    last = env.rollout(1100)["next"]
+    assert last.shape == (2, 1000)
+    assert last["truncated"][:, -1].all()
+    assert not last["terminated"].any()
+
+
+def test_rows_time_out_by_their_own_count():
+    config = SUITE["PointGoal1"].replace(num_steps=5)
+    env = SafetyGymEnv(config, num_envs=2, seed=0, num_threads=1)
+    tensordict = env.reset()
+    ends = []
+    for step, action in enumerate(actions(env, 12)):
+        following, tensordict = env.step_and_maybe_reset(tensordict.set("action", action))
+        ends.append(following["next", "truncated"][:, 0].tolist())
+        if step == 1:
+            mask = torch.tensor([[True], [False]])
+            tensordict = env.reset(tensordict.set("_reset", mask))
+    # Row 0 was started anew after two steps, so it times out two steps later ever after.
+    assert [step for step, end in enumerate(ends) if end[0]] == [6, 11]
+    assert [step for step, end in enumerate(ends) if end[1]] == [4, 9]
+
+
+@pytest.mark.parametrize("env_name", ["PointGoal2", "CarPush2", "DoggoGoal1", "PointButton2"])
+def test_partial_resets_leave_other_rows_alone(env_name):
+    mask = torch.tensor([[True], [False], [True], [False]])
+    kept = ~mask[:, 0]
+    trajectories = []
+    for interrupted in (False, True):
+        env = SafetyGymEnv(env_name, num_envs=4, seed=3, num_threads=1)
+        tensordict, steps = env.reset(), []
+        for step, action in enumerate(actions(env, 20)):
+            if step == 10 and interrupted:
+                state, observation = env.get_state(), tensordict["observation"].clone()
+                tensordict = env.reset(tensordict.set("_reset", mask))
+                for key, value in env.get_state().items():
+                    assert torch.equal(value[kept], state[key][kept]), key
+                assert torch.equal(tensordict["observation"][kept], observation[kept])
+                assert not torch.equal(tensordict["observation"][~kept], observation[~kept])
+                assert env.get_state()["step_count"].tolist() == [0, 10, 0, 10]
+            following = env.step(tensordict.set("action", action))
+            steps.append(following["next"].clone())
+            tensordict = env.step_mdp(following)
+        trajectories.append(torch.stack(steps))
+    plain, interrupted = trajectories
+    for key, value in plain.items():
+        assert torch.equal(value[:, kept], interrupted[key][:, kept]), key
+    assert not torch.equal(plain["observation"], interrupted["observation"])
+
+
+def test_outputs_are_copies():
+    """TorchRL stacks the steps of a rollout at its end, so what was handed out must not change."""
+    env = SafetyGymEnv("PointGoal1", num_envs=2, seed=0, num_threads=1)
+    first = env.step(env.rand_action(env.reset()))["next"]
+    kept = first.clone()
+    for _ in range(3):
+        last = env.step(env.rand_action())["next"]
+    assert all(torch.equal(first[key], value) for key, value in kept.items())
+    assert not torch.equal(last["observation"], kept["observation"])
+
+
+def test_names_and_nodes_make_the_same_environment():
+    by_name, by_id = make_env("PointGoal1"), make_env("Safexp-PointGoal1-v0")
+    node = make_env({"name": "mine", **SUITE["PointGoal1"].to_dict()})
+    assert by_name.config == by_id.config == node.config == SUITE["PointGoal1"]
+
+
+def test_custom_configurations_need_only_what_differs():
+    env = SafetyGymEnv({"robot_base": "point", "observe_goal_comp": True}, num_envs=2, seed=0)
+    check_env_specs(env)
+    assert sorted([*COMMON_SENSORS, "goal_compass"]) == list(env.observation_layout)
+    assert isinstance(env.reset(), TensorDict)
