@@ -1,0 +1,189 @@
+"""Every trajectory follows from the seed of its row, and every future from a state."""
+
+import pytest
+import torch
+from tensordict import TensorDict
+
+from safe_rl.envs import SUITE, SafetyGymEnv
+
+# Short episodes and large goals, so that resets and new goals are among the compared steps.
+BUSY = {"num_steps": 20}
+CONFIGS = {
+    "goal": SUITE["PointGoal2"].replace(**BUSY, goal_size=0.9),
+    "button": SUITE["CarButton2"].replace(**BUSY, buttons_size=0.2),
+    "push": SUITE["DoggoPush2"].replace(**BUSY, goal_size=1.0),
+    "noise": SUITE["PointPush1"].replace(**BUSY, action_noise=0.3, frameskip_binom_p=0.7),
+}
+# Met goals are rare with random actions, but for these tasks.
+MEETS_GOALS = ("goal", "push")
+
+
+def make(name: str, num_envs: int, seed: int | None = 0, **kwargs) -> SafetyGymEnv:
+    return SafetyGymEnv(CONFIGS[name], num_envs=num_envs, seed=seed, **{"num_threads": 1, **kwargs})
+
+
+def random_actions(num_steps: int, num_envs: int, size: int) -> torch.Tensor:
+    """The same for row k, however many rows there are."""
+    rows = [
+        2 * torch.rand(num_steps, size, generator=torch.Generator().manual_seed(row)) - 1
+        for row in range(num_envs)
+    ]
+    return torch.stack(rows, 1)
+
+
+def play(env: SafetyGymEnv, start: TensorDict, num_steps: int) -> TensorDict:
+    """All outputs of a run with resets [N, T]."""
+    *shape, size = env.action_spec.shape
+    steps, tensordict = [], start
+    for action in random_actions(num_steps, *shape, size):
+        following, tensordict = env.step_and_maybe_reset(tensordict.set("action", action))
+        steps.append(following["next"].clone().set("action", action))
+    return torch.stack(steps, 1)
+
+
+def assert_same(a: TensorDict, b: TensorDict) -> None:
+    assert set(a.keys()) == set(b.keys())
+    for key, value in a.items():
+        assert torch.equal(value, b[key]), key
+
+
+@pytest.mark.parametrize("name", CONFIGS)
+def test_threads_do_not_matter(name):
+    runs = [play(env, env.reset(), 50) for env in (make(name, 6), make(name, 6, num_threads=2))]
+    assert_same(*runs)
+    assert runs[0]["truncated"].any()
+    if name in MEETS_GOALS:
+        assert runs[0]["goal_met"].any()
+
+
+@pytest.mark.parametrize("name", CONFIGS)
+def test_rows_do_not_depend_on_the_batch_size(name):
+    few, many = (play(env, env.reset(), 50) for env in (make(name, 3), make(name, 8)))
+    assert_same(few, many[:3])
+
+
+@pytest.mark.parametrize("name", CONFIGS)
+def test_seeds_and_rows_differ(name):
+    one, other = (make(name, 4, seed=seed).reset()["observation"] for seed in (0, 1))
+    starts = torch.cat([one, other])
+    assert len(starts.unique(dim=0)) == 8
+
+
+def test_seeding_starts_over():
+    env = make("goal", 3, seed=5)
+    runs = [play(env, env.reset(), 30)]
+    env.set_seed(5)
+    runs.append(play(env, env.reset(), 30))
+    assert_same(*runs)
+    env.set_seed(6)
+    assert not torch.equal(env.reset()["observation"], runs[0]["observation"][:, 0])
+
+
+def test_without_a_seed_torch_decides():
+    starts = []
+    for seed in (0, 0, 1):
+        torch.manual_seed(seed)
+        starts.append(make("goal", 2, seed=None).reset()["observation"])
+    assert torch.equal(starts[0], starts[1])
+    assert not torch.equal(starts[0], starts[2])
+
+
+def test_the_seed_alone_decides():
+    starts = []
+    for seed in (0, 1):
+        torch.manual_seed(seed)
+        starts.append(make("goal", 2, seed=3).reset()["observation"])
+    assert torch.equal(*starts)
+
+
+def test_one_layout_for_all_episodes_where_asked_for():
+    def starts(seed: int) -> list[TensorDict]:
+        config = SUITE["CarButton1"].replace(randomize_layout=False)
+        env = SafetyGymEnv(config, num_envs=3, seed=seed, num_threads=1)
+        states = []
+        for _ in range(3):
+            env.rollout(2)
+            env.reset()
+            states.append(env.get_state())
+        return states
+
+    first, *others = starts(0)
+    for state in (first, *others):
+        for key in ("layout", "qpos", "goal_button", "start_pose"):
+            assert torch.equal(state[key], first[key][:1].expand_as(state[key])), key
+    assert not torch.equal(starts(1)[0]["layout"], first["layout"])
+
+
+@pytest.mark.parametrize("name", CONFIGS)
+def test_a_state_determines_the_future(name):
+    """Branch, go on, come back, go on: through new goals and resets; also in another instance."""
+    env = make(name, 4, sleep=False)
+    play(env, env.reset(), 8)
+    state = env.get_state()
+    runs = [play(env, env.set_state(state), 45)]
+    runs.append(play(env, env.set_state(state), 45))
+    elsewhere = make(name, 4, seed=99, sleep=False, num_threads=2)
+    runs.append(play(elsewhere, elsewhere.set_state(state), 45))
+    assert_same(runs[0], runs[1])
+    assert_same(runs[0], runs[2])
+    assert runs[0]["truncated"].sum() >= 8
+    if name in MEETS_GOALS:
+        assert runs[0]["goal_met"].any()
+
+
+@pytest.mark.parametrize("name", CONFIGS)
+def test_setting_the_present_state_interrupts_nothing(name):
+    plain, interrupted = make(name, 4, sleep=False), make(name, 4, sleep=False)
+    first = play(plain, plain.reset(), 8)
+    play(interrupted, interrupted.reset(), 8)
+    state = interrupted.get_state()
+    tensordict = interrupted.set_state(state)
+    assert_same(interrupted.get_state(), state)
+    assert torch.equal(tensordict["observation"], first["observation"][:, -1])
+    run = play(plain, tensordict.clone(), 30)
+    assert_same(run, play(interrupted, tensordict, 30))
+
+
+def test_one_state_can_be_branched_into_all_rows():
+    env = make("goal", 4, sleep=False)
+    env.rollout(10)
+    state = env.get_state()
+    branches = env.set_state(state[2:3].expand(4).clone())
+    action = env.action_spec.rand()
+    action[1] = action[0]
+    following = env.step(branches.set("action", action))["next"]
+    assert torch.equal(following["observation"][0], following["observation"][1])
+    assert not torch.equal(following["observation"][0], following["observation"][2])
+
+
+def test_states_are_copies():
+    env = make("button", 3)
+    env.reset()
+    state = env.get_state()
+    kept = state.clone()
+    env.rollout(3)
+    env.set_state(state)
+    env.rollout(3)
+    assert_same(state, kept)
+
+
+def test_set_state_returns_what_a_reset_returns():
+    env = make("push", 3)
+    start = env.reset()
+    again = env.set_state(env.get_state())
+    assert_same(start, again)
+
+
+def test_layout_and_seeds_may_be_left_out_of_a_state():
+    env = make("goal", 3, sleep=False)
+    env.rollout(5)
+    state = env.get_state()
+    observation = env.set_state(state)["observation"]
+    env.rollout(5)
+    required = ("qpos", "qvel", "qacc_warmstart", "time", "goal_pos", "goal_button")
+    partial = state.select(*required, "buttons_timer", "step_count", "ctrl")
+    episode = env.get_state()["episode"]
+    lidars = [span for name, span in env.observation_layout.items() if name != "hazards_lidar"]
+    for span in lidars:
+        assert torch.equal(env.set_state(partial)["observation"][:, span], observation[:, span])
+    assert torch.equal(env.get_state()["episode"], episode)
