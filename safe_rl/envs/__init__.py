@@ -6,12 +6,13 @@ from safe_rl.envs.rendering.opengl import OpenGLError
 # isort: split
 from safe_rl.envs.config import SafetyGymConfig
 from safe_rl.envs.layout import LayoutError
-from safe_rl.envs.registration import make_env, store_configs
+from safe_rl.envs.registration import make_env, register_gymnasium, store_configs
 from safe_rl.envs.safety_gym import SafetyGymEnv
-from safe_rl.envs.suite import SUITE, resolve
+from safe_rl.envs.suite import EXTRAS, SUITE, resolve
 from safe_rl.envs.validation import ConfigError
 
 __all__ = [
+    "EXTRAS",
     "SUITE",
     "ConfigError",
     "LayoutError",
@@ -22,3 +23,5 @@ __all__ = [
     "resolve",
     "store_configs",
 ]
+
+register_gymnasium()

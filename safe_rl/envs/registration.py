@@ -1,15 +1,16 @@
-"""The suite's names in Hydra, and environments from what Hydra composes."""
+"""The suite's names in Hydra and in Gymnasium, and environments from what Hydra composes."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from typing import Any
 
+import gymnasium
 from hydra.core.config_store import ConfigStore
 
 from safe_rl.envs.config import SafetyGymConfig
 from safe_rl.envs.safety_gym import SafetyGymEnv
-from safe_rl.envs.suite import SUITE
+from safe_rl.envs.suite import EXTRAS, SUITE
 
 
 def _plain(value: Any) -> Any:
@@ -23,10 +24,27 @@ def group_node(name: str, config: SafetyGymConfig) -> dict[str, Any]:
 
 
 def store_configs() -> None:
-    """Put the suite into Hydra's group `env`, so that `env=PointGoal1 env.hazards_num=3` works."""
+    """Put all names into Hydra's group `env`, so that `env=PointGoal1 env.hazards_num=3` works."""
     store = ConfigStore.instance()
-    for name, config in SUITE.items():
+    for name, config in (SUITE | EXTRAS).items():
         store.store(group="env", name=name, node=group_node(name, config))
+
+
+def register_gymnasium() -> None:
+    """Give Gymnasium an id `Safexp-{name}-v0` for every name, and `Safexp-Custom-v0`.
+
+    The custom one has the defaults of every configuration key; all of them take a `config` with
+    keys to change. What the ids stand for is imported when an environment is made.
+    """
+    for name in (*SUITE, *EXTRAS, None):
+        env_id = f"Safexp-{name or 'Custom'}-v0"
+        if env_id not in gymnasium.registry:
+            gymnasium.register(
+                env_id,
+                entry_point="safe_rl.envs.gymnasium.single:SafetyGymnasiumEnv",
+                vector_entry_point="safe_rl.envs.gymnasium.vector:SafetyGymnasiumVectorEnv",
+                kwargs={"name": name},
+            )
 
 
 def make_env(env: str | Mapping[str, Any] | SafetyGymConfig, **kwargs: Any) -> SafetyGymEnv:

@@ -1,0 +1,6 @@
+"""The environments in Gymnasium's interfaces, and Gymnasium's environments in TorchRL's.
+
+Costs stand in `info`: `info["cost"]`, one `info["cost_<kind>"]` per constrained kind, and
+`info["goal_met"]`. `gymnasium.make` and `gymnasium.make_vec` find the environments under the ids
+that `safe_rl.envs.registration` registers.
+"""

@@ -1,0 +1,147 @@
+"""What Gymnasium's two interfaces have in common: spaces, arrays, infos, and when to show."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping
+from typing import Any
+
+import gymnasium
+import numpy as np
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torchrl.data import Composite, TensorSpec
+
+from safe_rl.envs.config import SafetyGymConfig
+from safe_rl.envs.rendering.opengl import OpenGLError, has_screen
+from safe_rl.envs.safety_gym import SafetyGymEnv
+from safe_rl.envs.scene import build_scene
+from safe_rl.envs.suite import resolve
+
+RENDER_MODES = ("human", "rgb_array")
+# Every value is finite, and no more is promised: sensors feel accelerations of any size.
+LARGEST = np.finfo(np.float32).max
+NUM_SEEDS = 2**62
+
+Observation = np.ndarray | dict[str, np.ndarray]
+Arrays = dict[str, np.ndarray]
+
+
+def configure(
+    name: str | None, config: Mapping[str, Any] | SafetyGymConfig | None
+) -> SafetyGymConfig:
+    """Return the configuration of a registered name, with some keys changed.
+
+    Args:
+        name: as `resolve` takes it; None starts from the defaults of every key.
+        config: keys to change, or a whole configuration, which takes the place of the named one.
+
+    Raises:
+        ConfigError: for an unknown name or key, or a value that cannot be used.
+    """
+    if isinstance(config, SafetyGymConfig):
+        return config
+    base = SafetyGymConfig() if name is None else resolve(name)
+    return base.replace(**(config or {}))
+
+
+def space_of(spec: TensorSpec) -> gymnasium.Space:
+    """Return the space of one world for a spec of N worlds."""
+    if isinstance(spec, Composite):
+        return gymnasium.spaces.Dict({key: space_of(part) for key, part in spec.items()})
+    low, high = (
+        bound.reshape(spec.shape)[0].cpu().numpy().clip(-LARGEST, LARGEST)
+        for bound in (spec.space.low, spec.space.high)
+    )
+    return gymnasium.spaces.Box(low, high, dtype=np.float32)
+
+
+def arrays_of(observation: torch.Tensor | TensorDictBase) -> Observation:
+    """Return an observation of N worlds as arrays, by name where it is nested."""
+    if isinstance(observation, TensorDictBase):
+        return {str(key): value.cpu().numpy() for key, value in observation.items()}
+    return observation.cpu().numpy()
+
+
+def take(observation: Observation, row: int) -> Observation:
+    """Return one world's observation."""
+    if isinstance(observation, dict):
+        return {key: value[row] for key, value in observation.items()}
+    return observation[row]
+
+
+class Worlds:
+    """A batched environment as arrays, and how it is shown.
+
+    Args:
+        config: of the environment.
+        num_envs: number of worlds, N.
+        num_threads: as `SafetyGymEnv` takes it.
+        sleep: as `SafetyGymEnv` takes it.
+        render_mode: one of `RENDER_MODES`, or None.
+
+    Raises:
+        ValueError: for another render mode.
+        OpenGLError: for the mode "human" where there is no screen.
+    """
+
+    def __init__(
+        self,
+        config: SafetyGymConfig,
+        num_envs: int,
+        num_threads: int,
+        sleep: bool,
+        render_mode: str | None,
+    ) -> None:
+        if render_mode not in (None, *RENDER_MODES):
+            raise ValueError(f"render_mode must be one of {RENDER_MODES}, got {render_mode!r}.")
+        if render_mode == "human" and not has_screen():
+            raise OpenGLError(
+                "render_mode='human' opens a window, and there is no screen here (neither DISPLAY "
+                "nor WAYLAND_DISPLAY is set). Use render_mode='rgb_array', which needs none."
+            )
+        self.env = SafetyGymEnv(config, num_envs, "cpu", 0, num_threads, sleep)
+        self.observation_space = space_of(self.env.observation_spec["observation"])
+        self.action_space = space_of(self.env.action_spec)
+        timestep = build_scene(config, sleep).model.opt.timestep
+        self.seconds_per_step = timestep * config.frameskip_binom_n
+        self._is_seeded = False
+        self._shown_at = 0.0
+
+    def metadata(self) -> dict[str, Any]:
+        """Render modes that work on this machine, and frames per second of real time."""
+        modes = [mode for mode in RENDER_MODES if mode != "human" or has_screen()]
+        return {"render_modes": modes, "render_fps": max(1, round(1 / self.seconds_per_step))}
+
+    def seed(self, seed: int | None, generator: np.random.Generator) -> None:
+        """Seed all episodes to come; without a seed, once, with one that is drawn."""
+        if seed is None:
+            if self._is_seeded:
+                return
+            seed = int(generator.integers(NUM_SEEDS))
+        self.env.set_seed(seed % NUM_SEEDS)
+        self._is_seeded = True
+
+    def reset(self, mask: np.ndarray | None = None) -> Observation:
+        """Start new episodes, everywhere or where the mask [N] says; all worlds' observation."""
+        ask = None
+        if mask is not None:
+            ask = TensorDict({"_reset": torch.from_numpy(mask).unsqueeze(-1)}, len(mask))
+        return arrays_of(self.env.reset(ask)["observation"])
+
+    def step(self, actions: np.ndarray) -> TensorDictBase:
+        """Step all worlds with actions [N, nu]."""
+        action = torch.as_tensor(actions, dtype=torch.float32, device=self.env.device)
+        return self.env.step(TensorDict({"action": action}, self.env.batch_size))["next"]
+
+    def infos(self, step: TensorDictBase) -> Arrays:
+        """Costs (float64) and `goal_met` of a step, [N] each."""
+        costs = {key: step[key].squeeze(-1).double().cpu().numpy() for key in self.env.cost_keys}
+        return costs | {"goal_met": step["goal_met"].squeeze(-1).cpu().numpy()}
+
+    def show(self) -> None:
+        """Bring the viewer up to date, no faster than real time."""
+        left = self._shown_at + self.seconds_per_step - time.monotonic()
+        time.sleep(max(0.0, left))
+        self.env.show()
+        self._shown_at = time.monotonic()
