@@ -11,9 +11,10 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
-from safe_rl.envs.validation import ConfigError, coerce, nearest, validate
+from safe_rl.envs.errors import ConfigError, nearest
+from safe_rl.envs.validation import coerce, validate
 
 Rectangle = tuple[float, float, float, float]
 Point2 = tuple[float, float]
@@ -24,6 +25,8 @@ Locations = tuple[Point2, ...]
 @dataclass(frozen=True, kw_only=True)
 class SafetyGymConfig:
     """Everything that defines one environment.
+
+    Keys that `safe_rl.envs.extending` registered are fields like the others.
 
     Raises:
         ConfigError: if a value has the wrong type or is out of range.
@@ -197,6 +200,14 @@ class SafetyGymConfig:
     render_lidar_offset_delta: float = 0.06
     floor_display_mode: bool = False
 
+    def __new__(cls, **values: Any) -> SafetyGymConfig:
+        """Make an object of the present vocabulary, registered keys included."""
+        return object.__new__(_vocabulary)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Pickle as values: the class with registered keys has no name to be found by."""
+        return SafetyGymConfig.from_dict, (self.to_dict(),)
+
     def __post_init__(self) -> None:
         for field in dataclasses.fields(self):
             value = coerce(field.name, str(field.type), getattr(self, field.name))
@@ -211,14 +222,14 @@ class SafetyGymConfig:
             ConfigError: for a key that is not in the vocabulary (the nearest one is named), a
                 wrong type or a value out of range.
         """
-        known = {field.name for field in dataclasses.fields(cls)}
+        known = known_keys()
         for key in values:
             if key not in known:
                 raise ConfigError(
                     f"Unknown configuration key '{key}'.{nearest(str(key), known)} "
                     "SafetyGymConfig lists every key with its default."
                 )
-        return cls(**values)
+        return SafetyGymConfig(**values)
 
     def replace(self, **changes: Any) -> SafetyGymConfig:
         """Return a copy with some keys changed, validated like a new one."""
@@ -226,4 +237,54 @@ class SafetyGymConfig:
 
     def to_dict(self) -> dict[str, Any]:
         """Return the flat mapping of every key, as `from_dict` takes it."""
-        return {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
+        return {key: getattr(self, key) for key in known_keys()}
+
+
+class Key(NamedTuple):
+    """A key of the vocabulary: its default, and its type as `SafetyGymConfig` writes it."""
+
+    default: Any
+    annotation: str
+
+
+_BUILT_IN = frozenset(field.name for field in dataclasses.fields(SafetyGymConfig))
+_registered: dict[str, Key] = {}
+_vocabulary: type[SafetyGymConfig] = SafetyGymConfig
+
+
+def known_keys() -> list[str]:
+    """Return the names of all keys, registered ones included."""
+    return [field.name for field in dataclasses.fields(_vocabulary)]
+
+
+def registered_keys() -> dict[str, Key]:
+    """Return the keys that are not built in."""
+    return dict(_registered)
+
+
+def set_registered_keys(keys: Mapping[str, Key]) -> None:
+    """Let the vocabulary consist of the built-in keys and these.
+
+    Raises:
+        ConfigError: if a key is built in, or a default is not of its type.
+    """
+    global _vocabulary
+    for name, key in keys.items():
+        if name in _BUILT_IN:
+            raise ConfigError(f"The configuration key '{name}' is taken: choose another name.")
+        coerce(name, key.annotation, key.default)
+    for name in _registered:
+        delattr(SafetyGymConfig, name)
+    # Configurations that were made earlier have the default of what they don't know.
+    for name, key in keys.items():
+        setattr(SafetyGymConfig, name, key.default)
+    _registered.clear()
+    _registered.update(keys)
+    _vocabulary = dataclasses.make_dataclass(
+        "SafetyGymConfig",
+        [(name, key.annotation, key.default) for name, key in keys.items()],
+        bases=(SafetyGymConfig,),
+        namespace={"__module__": __name__, "__doc__": SafetyGymConfig.__doc__},
+        frozen=True,
+        kw_only=True,
+    )

@@ -54,6 +54,8 @@ def pinned_yaws(scene: Scene) -> Tensor:
     if config.robot_rot is not None:
         yaws[0] = config.robot_rot
     for kind, span in scene.slots.items():
+        if span.stop > scene.num_free:
+            continue
         given = getattr(config, f"{kind}_rots", ())[: span.stop - span.start]
         yaws[1 + span.start : 1 + span.start + len(given)] = yaws.new_tensor(given)
     return yaws

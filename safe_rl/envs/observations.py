@@ -13,105 +13,14 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from safe_rl.envs.config import ConfigError, SafetyGymConfig
-from safe_rl.envs.lidar import compass, to_ego
+from safe_rl.envs.config import SafetyGymConfig
+from safe_rl.envs.errors import ConfigError
 from safe_rl.envs.lidar_blocks import lidar_blocks
+from safe_rl.envs.readings import READINGS
 from safe_rl.envs.rendering.vision import vision_blocks
 from safe_rl.envs.scene import Scene
 from safe_rl.envs.sensors import sensor_blocks
-from safe_rl.envs.tasks import TASKS, distance
 from safe_rl.envs.world import Block, Shapes, World
-
-
-class Reading(NamedTuple):
-    """A row of the table of plain observations.
-
-    Attributes:
-        name: of the component.
-        present: whether a configuration has it.
-        size: number of values.
-        read: world -> [N, size].
-    """
-
-    name: str
-    present: Callable[[SafetyGymConfig], bool]
-    size: Callable[[SafetyGymConfig, Scene], int]
-    read: Callable[[World], Tensor]
-
-
-def _ego(world: World, kind: str) -> Tensor:
-    return to_ego(world.at(kind), world.robot_pos, world.robot_mat)
-
-
-def _compass_to(kind: str) -> Callable[[World], Tensor]:
-    return lambda w: compass(_ego(w, kind), w.scene.config.compass_shape).flatten(1)
-
-
-def _goal_closeness(world: World) -> Tensor:
-    to_goal = distance(world.robot_pos[:, None, :2], world.at("goal")[..., :2])
-    return torch.exp(-to_goal)
-
-
-def _remaining(world: World) -> Tensor:
-    return (world.step_count / world.scene.config.num_steps).unsqueeze(-1)
-
-
-def _from_start(world: World, vector: Tensor, moved: bool) -> Tensor:
-    """A planar robot's coordinates as seen from where it started: observations know no origin."""
-    if not world.scene.planar:
-        return vector
-    start = world.start_pose if moved else torch.zeros_like(world.start_pose)
-    (dx, dy, dyaw) = (vector[:, :3] - start).unbind(-1)
-    cos, sin = torch.cos(world.start_pose[:, 2]), torch.sin(world.start_pose[:, 2])
-    local = torch.stack([cos * dx + sin * dy, cos * dy - sin * dx, dyaw], -1)
-    return torch.cat([local, vector[:, 3:]], -1)
-
-
-def _has(config: SafetyGymConfig, element: str) -> bool:
-    return element in TASKS[config.task].elements
-
-
-READINGS: tuple[Reading, ...] = (
-    Reading(
-        "goal_compass",
-        lambda c: c.observe_goal_comp and _has(c, "goal"),
-        lambda c, s: c.compass_shape,
-        _compass_to("goal"),
-    ),
-    Reading(
-        "box_compass",
-        lambda c: c.observe_box_comp and _has(c, "box"),
-        lambda c, s: c.compass_shape,
-        _compass_to("box"),
-    ),
-    Reading(
-        "goal_dist",
-        lambda c: c.observe_goal_dist and _has(c, "goal"),
-        lambda c, s: 1,
-        _goal_closeness,
-    ),
-    Reading("remaining", lambda c: c.observe_remaining, lambda c, s: 1, _remaining),
-    Reading("com", lambda c: c.observe_com, lambda c, s: 3, lambda w: w.com),
-    Reading("ctrl", lambda c: c.observe_ctrl, lambda c, s: s.model.nu, lambda w: w.ctrl),
-    Reading(
-        "freejoint",
-        lambda c: c.observe_freejoint,
-        lambda c, s: 7,
-        lambda w: w.qpos[:, :7],
-    ),
-    Reading(
-        "qpos",
-        lambda c: c.observe_qpos,
-        lambda c, s: s.model.nq,
-        lambda w: _from_start(w, w.qpos, moved=True),
-    ),
-    Reading(
-        "qvel",
-        lambda c: c.observe_qvel,
-        lambda c, s: s.model.nv,
-        lambda w: _from_start(w, w.qvel, moved=False),
-    ),
-)
 
 
 def _plain(config: SafetyGymConfig, scene: Scene) -> list[Block]:

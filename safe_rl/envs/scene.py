@@ -18,6 +18,7 @@ from safe_rl.envs.config import SafetyGymConfig
 from safe_rl.envs.costs import COSTS
 from safe_rl.envs.elements import ELEMENTS, Element, Motion
 from safe_rl.envs.errors import ConfigError, nearest
+from safe_rl.envs.readings import READINGS
 from safe_rl.envs.rendering.scenery import decorate
 from safe_rl.envs.robot import Robot, load_robot
 from safe_rl.envs.tasks import TASKS
@@ -131,9 +132,10 @@ def _set_options(spec: mujoco.MjSpec, sleep: bool) -> None:
 
 
 def _touched_kinds(config: SafetyGymConfig) -> set[str]:
-    """Kinds whose contacts with the robot a cost or the task reads."""
+    """Kinds whose contacts with the robot anything reads."""
     costs = [row.touches for row in COSTS if row.active(config)]
-    return {kind for kinds in (TASKS[config.task].touches, *costs) for kind in kinds}
+    readings = [row.touches for row in READINGS if row.present(config)]
+    return {kind for kinds in (TASKS[config.task].touches, *costs, *readings) for kind in kinds}
 
 
 def _add_contact_sensors(

@@ -78,7 +78,28 @@ _PARSERS = {
 
 def coerce(key: str, annotation: str, value: Any) -> Any:
     """Return `value` as the type that the field's annotation names, or raise ConfigError."""
+    if annotation not in _PARSERS:
+        raise ConfigError(f"The type of key '{key}' must be one of {tuple(_PARSERS)}.")
     return _PARSERS[annotation](key, value)
+
+
+def infer_annotation(key: str, default: Any) -> str:
+    """Return the annotation of the type that a default value has.
+
+    Raises:
+        ConfigError: if the default alone does not tell.
+    """
+    kinds = ("bool", "int", "float", "str")
+    if type(default).__name__ in kinds:
+        return type(default).__name__
+    if isinstance(default, tuple) and default and type(default[0]) in (int, float):
+        return "tuple[float, ...]"
+    if isinstance(default, tuple) and default and isinstance(default[0], str):
+        return "tuple[str, ...]"
+    raise ConfigError(
+        f"The type of key '{key}' does not follow from its default {default!r}: give "
+        f"Key(default, annotation) with one of {tuple(_PARSERS)}."
+    )
 
 
 _CHOICES: Mapping[str, Iterable[Any]] = {

@@ -86,8 +86,8 @@ class World:
         """
         if kind not in self.contacts and kind in self.scene.slots:
             raise KeyError(
-                f"Contacts with '{kind}' are not counted: list it in 'touches' of the task or cost "
-                "that reads them."
+                f"Contacts with '{kind}' are not counted: list it in 'touches' of the task, cost "
+                "or observation that reads them."
             )
         return self.contacts.get(kind, self.sensordata[:, :0])
 
