@@ -5,6 +5,7 @@ from safe_rl.envs.rendering.opengl import OpenGLError
 
 # isort: split
 from safe_rl.envs.config import SafetyGymConfig
+from safe_rl.envs.gymnasium.conversion import from_gymnasium
 from safe_rl.envs.layout import LayoutError
 from safe_rl.envs.registration import make_env, register_gymnasium, store_configs
 from safe_rl.envs.safety_gym import SafetyGymEnv
@@ -19,6 +20,7 @@ __all__ = [
     "OpenGLError",
     "SafetyGymConfig",
     "SafetyGymEnv",
+    "from_gymnasium",
     "make_env",
     "resolve",
     "store_configs",

@@ -1,0 +1,207 @@
+"""Gymnasium's environments in TorchRL, with their costs where the algorithms look for them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from functools import partial
+from typing import Any, NamedTuple
+
+import gymnasium
+import numpy as np
+import torch
+from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv
+from tensordict import TensorDictBase
+from torchrl.data import Composite, Unbounded
+from torchrl.envs import GymWrapper, Transform, TransformedEnv
+from torchrl.envs.gym_like import BaseInfoDictReader
+
+AGGREGATE = "cost"
+MakeEnv = Callable[[], gymnasium.Env]
+
+
+class Episode(NamedTuple):
+    """What training asks of a configuration: the largest number of steps of an episode."""
+
+    num_steps: int
+
+
+class CostReader(BaseInfoDictReader):
+    """Reads costs from `info` into the TensorDict, float32 [N, 1]; 0 where none is reported.
+
+    Args:
+        cost_keys: names in `info`.
+        num_envs: number of environments, N.
+    """
+
+    def __init__(self, cost_keys: Sequence[str], num_envs: int) -> None:
+        self._cost_keys = list(cost_keys)
+        self._shape = (num_envs, 1)
+
+    def __call__(self, info_dict: dict[str, Any], tensordict: TensorDictBase) -> TensorDictBase:
+        """Write the costs of a step."""
+        for key in self._cost_keys:
+            value = info_dict.get(key, np.zeros(self._shape))
+            tensordict[key] = torch.as_tensor(value, dtype=torch.float32).reshape(self._shape)
+        return tensordict
+
+    @property
+    def info_spec(self) -> Composite:
+        """Shapes and types of the costs."""
+        costs = {key: Unbounded(shape=self._shape) for key in self._cost_keys}
+        return Composite(costs, shape=self._shape[:1])
+
+
+class CostsAsRewards(Transform):
+    """Puts costs beside the reward instead of among the observations, and adds their sum.
+
+    Args:
+        cost_keys: costs that the environment writes; where `cost` is not one of them, it is added
+            as the sum of all.
+    """
+
+    def __init__(self, cost_keys: Sequence[str]) -> None:
+        super().__init__()
+        self._cost_keys = list(cost_keys)
+        self._sums = AGGREGATE not in self._cost_keys
+
+    def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:
+        if self._sums:
+            costs = torch.stack([next_tensordict[key] for key in self._cost_keys])
+            next_tensordict[AGGREGATE] = costs.sum(0)
+        return next_tensordict
+
+    def _reset(
+        self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
+    ) -> TensorDictBase:
+        return tensordict_reset.exclude(*self._cost_keys)
+
+    def transform_output_spec(self, output_spec: Composite) -> Composite:
+        """Move the specs accordingly."""
+        output_spec = super().transform_output_spec(output_spec)
+        observations, rewards = (
+            output_spec["full_observation_spec"],
+            output_spec["full_reward_spec"],
+        )
+        for key in self._cost_keys:
+            rewards[key] = observations[key]
+            del observations[key]
+        if self._sums:
+            rewards[AGGREGATE] = rewards[self._cost_keys[0]].clone()
+        return output_spec
+
+
+class GymnasiumEnv(TransformedEnv):
+    """N environments of Gymnasium as one of TorchRL, made by `from_gymnasium`.
+
+    Attributes:
+        cost_keys: the aggregate `cost`, then one key per kind.
+        observation_layout: one component, the whole observation.
+        config: the largest number of steps of an episode, `config.num_steps`.
+    """
+
+    def __init__(self, base_env: GymWrapper, cost_keys: Sequence[str], num_steps: int) -> None:
+        super().__init__(base_env, CostsAsRewards(cost_keys))
+        size = base_env.observation_spec["observation"].shape[-1]
+        self.cost_keys = [AGGREGATE, *(key for key in cost_keys if key != AGGREGATE)]
+        self.observation_layout = {"observation": slice(0, size)}
+        self.config = Episode(num_steps)
+
+
+def from_gymnasium(
+    env: str | MakeEnv,
+    *,
+    num_envs: int = 1,
+    cost_keys: Sequence[str] | None = None,
+    num_steps: int | None = None,
+    seed: int | None = None,
+    in_processes: bool = False,
+    **kwargs: Any,
+) -> GymnasiumEnv:
+    """Make a TorchRL environment of any Gymnasium environment that reports costs in `info`.
+
+    Observations become one float32 vector each, actions are clipped to [-1, 1] and stretched to
+    the environment's bounds, so that the algorithms can be used as they are.
+
+    Args:
+        env: Gymnasium id, or a function that makes an environment.
+        num_envs: number of environments, N.
+        cost_keys: names of the costs in `info`; None finds those called `cost` or `cost_<kind>` by
+            taking one step.
+        num_steps: the largest number of steps of an episode; None takes what the id says.
+        seed: of all environments.
+        in_processes: step each environment in a process of its own, where one step is slow.
+        kwargs: for `gymnasium.make`, with an id.
+
+    Returns:
+        An environment [N] on the CPU, with the costs in its reward spec. Without a cost called
+        `cost` it gets one, the sum of the others.
+
+    Raises:
+        ValueError: if no costs are reported, the actions are not continuous and bounded, or the
+            length of episodes is not known.
+
+    Examples:
+        >>> env = from_gymnasium("Safexp-PointGoal1-v0", num_envs=2, num_steps=1000, seed=0)
+        >>> env.rollout(3)["next", "cost_hazards"].shape
+        torch.Size([2, 3, 1])
+    """
+    make: MakeEnv = partial(gymnasium.make, env, **kwargs) if isinstance(env, str) else env
+    probe = adapt(make())
+    keys = list(cost_keys) if cost_keys is not None else _find_costs(probe)
+    num_steps = _episode_length(probe, num_steps)
+    probe.close()
+
+    def make_adapted() -> gymnasium.Env:
+        return adapt(make(), num_steps)
+
+    vectorise = AsyncVectorEnv if in_processes else SyncVectorEnv
+    worlds = vectorise([make_adapted] * num_envs, autoreset_mode=AutoresetMode.DISABLED)
+    base = GymWrapper(worlds)
+    base.set_info_dict_reader(CostReader(keys, num_envs))
+    batch = GymnasiumEnv(base, keys, num_steps)
+    batch.set_seed(int(torch.randint(2**31, ())) if seed is None else seed)
+    return batch
+
+
+def adapt(env: gymnasium.Env, num_steps: int | None = None) -> gymnasium.Env:
+    """Wrap an environment: float32 vectors as observations, actions in [-1, 1].
+
+    Args:
+        env: the environment.
+        num_steps: truncate episodes after that many steps; None leaves their length alone.
+
+    Raises:
+        ValueError: if the actions are not continuous and bounded.
+    """
+    actions = env.action_space
+    if not isinstance(actions, gymnasium.spaces.Box) or not actions.is_bounded():
+        raise ValueError(
+            f"The algorithms need continuous, bounded actions (a Box), but {env} has {actions}."
+        )
+    env = gymnasium.wrappers.FlattenObservation(env)
+    vectors = gymnasium.spaces.Box(-np.inf, np.inf, env.observation_space.shape, np.float32)
+    env = gymnasium.wrappers.TransformObservation(env, lambda x: x.astype(np.float32), vectors)
+    env = gymnasium.wrappers.RescaleAction(env, np.float32(-1.0), np.float32(1.0))
+    env = gymnasium.wrappers.TransformAction(env, lambda a: np.clip(a, -1, 1), env.action_space)
+    return env if num_steps is None else gymnasium.wrappers.TimeLimit(env, num_steps)
+
+
+def _find_costs(probe: gymnasium.Env) -> list[str]:
+    probe.reset(seed=0)
+    *_, info = probe.step(np.zeros(probe.action_space.shape, dtype=np.float32))
+    keys = [key for key in info if key == AGGREGATE or key.startswith(f"{AGGREGATE}_")]
+    if not keys:
+        raise ValueError(
+            f"{probe} reports no costs: there is no 'cost' or 'cost_<kind>' in its info, which has "
+            f"{sorted(info)}. If a cost is called otherwise, or is not reported at every step, "
+            "name it in 'cost_keys'."
+        )
+    return keys
+
+
+def _episode_length(probe: gymnasium.Env, num_steps: int | None) -> int:
+    known = None if probe.spec is None else probe.spec.max_episode_steps
+    length = num_steps or known
+    if length is None:
+        raise ValueError(f"{probe} does not say how long episodes are: give 'num_steps'.")
+    return length
