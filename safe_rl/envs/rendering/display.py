@@ -111,6 +111,12 @@ class Display:
         add_markers(renderer.scene, markers)
         return renderer.render()
 
+    def free_camera(self) -> mujoco.MjvCamera:
+        """A camera in the south that has all placements in view and can be moved."""
+        camera = mujoco.MjvCamera()
+        camera.distance = 3 * max(abs(bound) for bound in self._config.placements_extents)
+        return camera
+
     def close(self) -> None:
         """Free what OpenGL holds; a later picture opens it again."""
         for renderer in self._renderers.values():
@@ -119,9 +125,7 @@ class Display:
 
     def _camera(self, camera: Camera) -> Camera:
         if camera == FREE:
-            free = mujoco.MjvCamera()
-            free.distance = 3 * max(abs(bound) for bound in self._config.placements_extents)
-            return free
+            return self.free_camera()
         if isinstance(camera, str) and camera not in self.cameras:
             raise ValueError(
                 f"There is no camera '{camera}'.{nearest(camera, self.cameras)} "

@@ -66,7 +66,7 @@ class WorldRenderer:
         """
         self._display.pose(self._world, row)
         if self._viewer is None:
-            self._viewer = Viewer(self._display.scene.model, self._display.data)
+            self._viewer = Viewer(self._display)
         self._viewer.show(self._markers(row, self._readings(), bool(has_cost[row])))
 
     def close(self) -> None:

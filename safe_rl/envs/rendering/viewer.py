@@ -4,25 +4,22 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
-import mujoco
-
-from safe_rl.envs.rendering.display import add_markers
+from safe_rl.envs.rendering.display import Display, add_markers
 from safe_rl.envs.rendering.markers import Marker
 from safe_rl.envs.rendering.opengl import PACKAGES, OpenGLError, has_screen
 
 
 class Viewer:
-    """A window onto a model's data; the mouse moves its camera.
+    """A window onto a display; the mouse moves its camera.
 
     Args:
-        model: what is shown.
-        data: where everything is; written by others, copied by `show`.
+        display: what is shown, as it was posed last.
 
     Raises:
         OpenGLError: if there is no screen, or no OpenGL.
     """
 
-    def __init__(self, model: mujoco.MjModel, data: mujoco.MjData) -> None:
+    def __init__(self, display: Display) -> None:
         if not has_screen():
             raise OpenGLError(
                 "MuJoCo's viewer needs a screen, and there is none here (neither DISPLAY nor "
@@ -33,13 +30,19 @@ class Viewer:
 
         try:
             self._window = mujoco.viewer.launch_passive(
-                model, data, show_left_ui=False, show_right_ui=False
+                display.scene.model, display.data, show_left_ui=False, show_right_ui=False
             )
         except Exception as error:  # GLFW raises what it likes
             raise OpenGLError(
                 f"MuJoCo's viewer cannot be opened ({error}). It needs OpenGL: on Debian or "
                 f"Ubuntu 'apt-get install {PACKAGES['glfw']}'."
             ) from error
+        camera = display.free_camera()
+        with self._window.lock():
+            self._window.cam.lookat[:] = camera.lookat
+            self._window.cam.distance = camera.distance
+            self._window.cam.azimuth, self._window.cam.elevation = camera.azimuth, camera.elevation
+            self._window.opt.geomgroup[:] = 1
 
     @property
     def is_open(self) -> bool:
@@ -47,7 +50,7 @@ class Viewer:
         return self._window.is_running()
 
     def show(self, markers: Iterable[Marker]) -> None:
-        """Bring the window up to date with the data, and draw markers in it."""
+        """Bring the window up to date with the display, and draw markers in it."""
         if not self.is_open:
             return
         with self._window.lock():
