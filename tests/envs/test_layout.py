@@ -1,0 +1,219 @@
+"""Where things stand at the start: rules kept in every layout of the suite, and distributions."""
+
+import functools
+import itertools
+import math
+
+import numpy as np
+import pytest
+import torch
+from crafting import kind_of, places
+from scipy import stats
+
+from safe_rl.envs import SUITE, ConfigError, LayoutError, SafetyGymEnv
+
+# By hand from sections 1 and 9 of the benchmark's description [m].
+HALF_EXTENTS = {
+    **{"Goal0": 1.0, "Goal1": 1.5, "Goal2": 2.0},
+    **{"Button0": 1.0, "Button1": 1.5, "Button2": 1.8},
+    **{"Push0": 1.0, "Push1": 1.5, "Push2": 2.0},
+}
+KEEPOUTS = {
+    "Goal": {"robot": 0.4, "goal": 0.305, "hazard": 0.18, "vase": 0.15},
+    "Button": {"robot": 0.4, "button": 0.2, "hazard": 0.18, "gremlin": 0.4},
+    "Push": {"robot": 0.4, "goal": 0.4, "box": 0.2, "hazard": 0.4, "pillar": 0.3},
+}
+CAR_BOX_KEEPOUT = 0.125
+NUM_LAYOUTS = 800
+# No substeps: a step judges the state that it starts from.
+FROZEN = {"frameskip_binom_p": 0.0}
+POINT = {"robot_base": "point", "task": "none"}
+UNLIKELY = 1e-3  # p values below this one would be a finding
+
+
+@functools.cache
+def frozen_start(name: str):
+    """An environment with many fresh layouts, none of which has moved."""
+    config = SUITE[name].replace(**FROZEN)
+    env = SafetyGymEnv(config, num_envs=NUM_LAYOUTS, seed=0, sleep=False, num_threads=1)
+    return env, env.reset()
+
+
+def fresh_state(config: dict, num_envs: int, seed: int = 0):
+    env = SafetyGymEnv(config, num_envs=num_envs, seed=seed, sleep=False, num_threads=1)
+    env.reset()
+    return env, env.get_state()
+
+
+def fresh_places(config: dict, num_envs: int, seed: int = 0) -> dict[str, np.ndarray]:
+    return {key: xy.numpy() for key, xy in places(*fresh_state(config, num_envs, seed)).items()}
+
+
+@pytest.mark.parametrize("name", SUITE)
+def test_layouts_keep_their_distances_and_bounds(name):
+    env, _ = frozen_start(name)
+    task = name.removeprefix("Point").removeprefix("Car").removeprefix("Doggo")
+    keepouts = dict(KEEPOUTS[task[:-1]])
+    if name.startswith("CarPush"):
+        keepouts["box"] = CAR_BOX_KEEPOUT
+    found = places(env, env.get_state())
+    if task.startswith("Button"):
+        del found["goal"]  # it is where one of the buttons is
+    assert {kind_of(one) for one in found} <= set(keepouts)
+    for one, xy in found.items():
+        limit = HALF_EXTENTS[task] - keepouts[kind_of(one)]
+        assert xy.abs().max() <= limit + 1e-9, one
+        assert xy.abs().max() >= 0.97 * limit, f"{one} never comes near the edge"
+    for one, other in itertools.combinations(found, 2):
+        least = keepouts[kind_of(one)] + keepouts[kind_of(other)]
+        distance = (found[one] - found[other]).norm(dim=-1)
+        assert distance.min() >= least - 1e-9, (one, other)
+
+
+@pytest.mark.parametrize("name", SUITE)
+def test_no_episode_starts_with_a_cost_or_a_met_goal(name):
+    env, start = frozen_start(name)
+    got = env.step(start.set("action", env.action_spec.zero()))["next"]
+    for key in env.cost_keys:
+        assert not got[key].any(), key
+    assert not got["goal_met"].any()
+    assert not got["reward"].any()
+
+
+def test_a_single_object_is_uniform_in_its_rectangle():
+    config = {**POINT, "placements_extents": [-1, 0, 3, 1.5], "robot_keepout": 0.25}
+    _, state = fresh_state(config, 4000)
+    x, y, yaw = state["qpos"].numpy().T
+    assert stats.kstest(x, stats.uniform(-0.75, 3.5).cdf).pvalue > UNLIKELY
+    assert stats.kstest(y, stats.uniform(0.25, 1.0).cdf).pvalue > UNLIKELY
+    assert stats.kstest(yaw, stats.uniform(0, 2 * math.pi).cdf).pvalue > UNLIKELY
+    for one, other in itertools.combinations((x, y, yaw), 2):
+        assert stats.spearmanr(one, other).pvalue > UNLIKELY
+
+
+def test_rectangles_are_chosen_in_proportion_to_their_areas():
+    rectangles = [[-2, -2, -1, -1], [0, 0, 2, 1], [-2, 1, -1.5, 1.5]]
+    config = {**POINT, "robot_placements": rectangles, "robot_keepout": 0.1}
+    x, y = fresh_places(config, 4000)["robot"].T
+    inside = [(x > a) & (x < c) & (y > b) & (y < d) for a, b, c, d in rectangles]
+    counts = np.sum(inside, axis=1)
+    assert counts.sum() == 4000
+    areas = np.array([0.8 * 0.8, 1.8 * 0.8, 0.3 * 0.3])  # less the keepouts
+    assert stats.chisquare(counts, 4000 * areas / areas.sum()).pvalue > UNLIKELY
+
+
+def by_rejection(rng, keepouts: list[float], half: float) -> np.ndarray:
+    """One layout by the rule itself: place one after the other, 100 tries each, or start over."""
+    while True:
+        placed: list[np.ndarray] = []
+        for keepout in keepouts:
+            for _ in range(100):
+                xy = rng.uniform(keepout - half, half - keepout, 2)
+                if all(
+                    math.dist(xy, other) >= keepout + theirs
+                    for other, theirs in zip(placed, keepouts, strict=False)
+                ):
+                    placed.append(xy)
+                    break
+            else:
+                break
+        else:
+            return np.array(placed)
+
+
+def test_crowded_layouts_are_distributed_as_by_the_rule_itself():
+    config = {
+        **{"robot_base": "point", "task": "goal", "placements_extents": [-1, -1, 1, 1]},
+        **{"goal_keepout": 0.3, "hazards_num": 3, "hazards_keepout": 0.25},
+    }
+    got = fresh_places(config, 2000)
+    names = ["robot", "goal", "hazard0", "hazard1", "hazard2"]
+    rng = np.random.default_rng(0)
+    keepouts = [0.4, 0.3, 0.25, 0.25, 0.25]
+    layouts = np.array([by_rejection(rng, keepouts, 1.0) for _ in range(2000)])
+    want = dict(zip(names, layouts.transpose(1, 0, 2), strict=True))
+    for name in names:
+        for column in (0, 1):
+            pair = got[name][:, column], want[name][:, column]
+            assert stats.ks_2samp(*pair).pvalue > UNLIKELY, name
+    for one, other in itertools.combinations(names, 2):
+        pair = (np.linalg.norm(xy[one] - xy[other], axis=1) for xy in (got, want))
+        assert stats.ks_2samp(*pair).pvalue > UNLIKELY, (one, other)
+
+
+def test_each_object_gets_a_hundred_tries():
+    """Where the goal fits one time in a hundred, it finds a place in 63 % of all layouts."""
+    spot = 5.0 + 1e-3
+    robot = [[4.9 - spot, -spot, 4.9 + spot, spot], [-50 - spot, -spot, -50 + spot, spot]]
+    config = {
+        **{"robot_base": "point", "task": "goal", "robot_keepout": 5.0, "goal_keepout": 0.0},
+        **{"robot_placements": robot, "goal_placements": [[0, 0, 10, 0]]},
+    }
+    crowded = int((fresh_places(config, 3000)["robot"][:, 0] > 0).sum())
+    fits = 1 - 0.99**100
+    assert stats.binomtest(crowded, 3000, fits / (fits + 1)).pvalue > UNLIKELY
+
+
+def test_pinned_layouts():
+    config = {
+        **{"robot_base": "point", "task": "push", "robot_locations": [[-1.5, -1.5]]},
+        **{"robot_rot": 0.3, "box_locations": [[0, 1]], "box_rots": [0.4]},
+        **{"goal_locations": [[1, 1]], "vases_num": 3, "vases_rots": [0.5, 0.6, 0.7, 0.8]},
+        "vases_locations": [[-1, 0], [0, 0], [0.5, -1], [9, 9]],
+        **{"hazards_num": 2, "hazards_locations": [[1.5, -1]]},
+    }
+    env, state = fresh_state(config, 50)
+    found = places(env, state)
+    pins = {"robot": (-1.5, -1.5), "box": (0, 1), "goal": (1, 1), "hazard0": (1.5, -1)}
+    pins |= {"vase0": (-1, 0), "vase1": (0, 0), "vase2": (0.5, -1)}
+    for name, xy in pins.items():
+        offset = found.pop(name) - torch.tensor(xy, dtype=torch.float64)
+        assert offset.abs().max() <= 1e-9, name
+    assert (found.pop("hazard1").std(0) > 0.5).all()
+    assert not found
+    # Robot, then per body x, y, z and a quaternion about z: vases, box.
+    quaternion = state["qpos"][:, 3:].unflatten(1, (4, 7))[..., 3:]
+    yaw = 2 * torch.atan2(quaternion[..., 3], quaternion[..., 0])
+    want = torch.tensor([0.5, 0.6, 0.7, 0.4], dtype=torch.float64).expand(50, 4)
+    torch.testing.assert_close(yaw, want)
+    assert (state["qpos"][:, 2] == 0.3).all()
+
+
+@pytest.mark.parametrize("robot", ["car", "doggo"])
+def test_yaws_are_uniform(robot):
+    config = {"robot_base": robot, "task": "none", "vases_num": 1, "gremlins_num": 1}
+    _, state = fresh_state(config, 2000)
+    robot_quat, vase_quat = state["qpos"][:, 3:7], state["qpos"][:, -11:-7]
+    gremlin_quat = state["qpos"][:, -4:]
+    for quat in (robot_quat, vase_quat, gremlin_quat):
+        assert (quat[:, 1:3] == 0).all()
+        yaw = 2 * torch.atan2(quat[:, 3], quat[:, 0]).numpy()
+        assert (
+            stats.kstest(yaw % (2 * math.pi), stats.uniform(0, 2 * math.pi).cdf).pvalue > UNLIKELY
+        )
+
+
+def test_margin_is_added_to_the_distance():
+    config = {**POINT, "hazards_num": 1, "placements_margin": 0.7}
+    found = fresh_places(config, 1000)
+    distance = np.linalg.norm(found["robot"] - found["hazard0"], axis=1)
+    assert 1.5 <= distance.min() < 1.55
+
+
+@pytest.mark.parametrize(
+    ("config", "culprit"),
+    [
+        ({"hazards_num": 30, "placements_extents": [-1, -1, 1, 1]}, "hazard"),
+        ({"vases_num": 1, "vases_locations": [[0, 0.3]], "robot_locations": [[0, 0]]}, "vase0"),
+    ],
+)
+def test_impossible_layouts_name_the_object(config, culprit):
+    env = SafetyGymEnv({**POINT, **config}, num_envs=2, seed=0, num_threads=1)
+    with pytest.raises(LayoutError, match=f"'{culprit}.*keepout"):
+        env.reset()
+
+
+def test_placements_without_room_name_the_key():
+    config = {**POINT, "hazards_num": 1, "hazards_placements": [[0, 0, 0.7, 2]]}
+    with pytest.raises(ConfigError, match=r"hazard0.*'hazards_placements'.*'hazards_keepout'"):
+        SafetyGymEnv(config, num_threads=1)
