@@ -190,11 +190,12 @@ class SurrogateLoss(LossModule):
             )
         return advantage
 
-    def _cost_advantage(self, tensordict: TensorDictBase, num_costs: int) -> Tensor:
+    def _cost_advantage(self, tensordict: TensorDictBase) -> Tensor:
         """Cost advantages, [..., k]."""
         key = self.tensor_keys.cost_advantage
         advantage = require(tensordict, key, "CostGAE writes it.")
-        if advantage.shape[-1] != num_costs or advantage.ndim != tensordict.ndim + 1:
+        num_costs = advantage.shape[-1] if self.multiplier is None else self.multiplier.num_costs
+        if advantage.shape != (*tensordict.batch_size, num_costs):
             raise ValueError(
                 f"{key!r} has shape {tuple(advantage.shape)}, expected "
                 f"{(*tensordict.batch_size, num_costs)}: one column per cost limit."
@@ -205,8 +206,8 @@ class SurrogateLoss(LossModule):
         """Objective per sample [..., 1]: the reward's alone if there is no multiplier."""
         if self.multiplier is None:
             return reward_gain
-        advantage = self._cost_advantage(tensordict, self.multiplier.num_costs)
-        return lagrangian(reward_gain, ratio * advantage, self.multiplier.value.detach())
+        cost_gain = ratio * self._cost_advantage(tensordict)
+        return lagrangian(reward_gain, cost_gain, self.multiplier.value.detach())
 
     def extra_repr(self) -> str:
         """Keys that are read."""

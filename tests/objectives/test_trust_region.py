@@ -1,0 +1,206 @@
+"""Pieces of trust-region steps against dense linear algebra and finite differences."""
+
+import math
+
+import pytest
+import torch
+from cmdp import make_actor as make_fixed_width_actor
+from samples import NUM_ACTIONS, NUM_OBS, make_actor
+from tensordict import TensorDict
+from tensordict.nn import AddStateIndependentNormalScale, TensorDictModule
+from torch import nn
+from torch.distributions import Independent, Normal, TransformedDistribution, kl_divergence
+from torch.distributions.transforms import TanhTransform
+from torchrl.modules import IndependentNormal, ProbabilisticActor
+
+from safe_rl.objectives.gaussian import gaussian_kl, normal_parameters
+from safe_rl.objectives.trust_region import (
+    FisherProduct,
+    backtracking_search,
+    conjugate_gradient,
+    flat_gradient,
+    flatten,
+    mean_kl,
+    policy_gaussian,
+    set_parameters,
+    subsample,
+    unflatten,
+)
+
+
+def state_independent_actor():
+    net = nn.Sequential(
+        nn.Linear(NUM_OBS, 5), nn.ELU(), nn.Linear(5, NUM_ACTIONS),
+        AddStateIndependentNormalScale(NUM_ACTIONS),
+    )  # fmt: skip
+    return ProbabilisticActor(
+        TensorDictModule(net, in_keys=["observation"], out_keys=["loc", "scale"]),
+        in_keys=["loc", "scale"],
+        distribution_class=IndependentNormal,
+    )
+
+
+def one_observation_actor():
+    return make_fixed_width_actor()
+
+
+ACTORS = {
+    "state-dependent scale": (make_actor, NUM_OBS),
+    "state-independent scale": (state_independent_actor, NUM_OBS),
+    "constant scale": (one_observation_actor, 1),
+}
+
+
+def setup_actor(name, batch_size=(7,)):
+    make, observations = ACTORS[name]
+    actor = make().double()
+    for parameter in actor.parameters():
+        parameter.data.add_(0.3 * torch.randn_like(parameter))
+    batch = TensorDict(
+        observation=torch.randn(*batch_size, observations, dtype=torch.float64),
+        batch_size=batch_size,
+    )
+    return actor, batch, list(actor.parameters())
+
+
+def explicit_fisher(actor, batch, parameters):
+    """Hessian of the mean KL at the current parameters, by autograd twice over torch's own KL."""
+    with torch.no_grad():
+        old = Independent(Normal(*policy_gaussian(actor, batch)), 1)
+
+    def kl(vector):
+        names = [name for name, _ in actor.named_parameters()]
+        values = dict(zip(names, unflatten(vector, parameters), strict=True))
+        out = torch.func.functional_call(actor.module[0], rename(values), batch.clone())
+        return kl_divergence(old, Independent(Normal(out["loc"], out["scale"]), 1)).mean()
+
+    def rename(values):
+        return {name.removeprefix("module.0."): value for name, value in values.items()}
+
+    return torch.autograd.functional.hessian(kl, flatten(parameters).detach())
+
+
+@pytest.mark.parametrize("batch_size", [(7,), (3, 4)])
+@pytest.mark.parametrize("name", ACTORS)
+def test_fisher_product_against_the_explicit_matrix(name, batch_size):
+    actor, batch, parameters = setup_actor(name, batch_size)
+    fisher = explicit_fisher(actor, batch, parameters)
+    product = FisherProduct(actor, batch, parameters, damping=0.1)
+    identity = torch.eye(len(fisher), dtype=torch.float64)
+    columns = torch.stack([product(row) for row in identity], -1)
+    torch.testing.assert_close(columns, fisher + 0.1 * identity)
+
+
+def test_fisher_product_is_the_second_difference_of_the_kl():
+    actor, batch, parameters = setup_actor("state-dependent scale")
+    product = FisherProduct(actor, batch, parameters, damping=0.0)
+    start = flatten(parameters).detach()
+    with torch.no_grad():
+        reference = policy_gaussian(actor, batch)
+    direction = torch.randn_like(start)
+    curvature = direction @ product(direction)
+    size = 1e-4
+    values = []
+    for sign in (1, -1):
+        set_parameters(parameters, start + sign * size * direction)
+        values.append(mean_kl(reference, actor, batch))
+    # KL(0) = 0, so that its second difference is the sum of the two values.
+    torch.testing.assert_close(sum(values) / size**2, curvature, rtol=1e-4, atol=0)
+
+
+def test_frozen_parameters_are_left_out():
+    actor, batch, parameters = setup_actor("state-dependent scale")
+    whole = FisherProduct(actor, batch, parameters, damping=0.0)
+    part = FisherProduct(actor, batch, parameters[2:], damping=0.0)
+    first = sum(parameter.numel() for parameter in parameters[:2])
+    vector = torch.randn(sum(p.numel() for p in parameters), dtype=torch.float64)
+    vector[:first] = 0
+    torch.testing.assert_close(part(vector[first:]), whole(vector)[first:])
+
+
+def test_conjugate_gradient_against_a_direct_solve():
+    size = 20
+    root = torch.randn(size, size, dtype=torch.float64)
+    matrix = root @ root.T + torch.eye(size, dtype=torch.float64)
+    right = torch.randn(size, dtype=torch.float64)
+    solution = conjugate_gradient(matrix.__matmul__, right, iterations=60, tolerance=1e-24)
+    torch.testing.assert_close(solution, torch.linalg.solve(matrix, right))
+
+
+def test_conjugate_gradient_on_the_fisher_matrix_of_a_policy():
+    actor, batch, parameters = setup_actor("state-dependent scale")
+    fisher = explicit_fisher(actor, batch, parameters)
+    fisher += 0.1 * torch.eye(len(fisher), dtype=torch.float64)
+    right = torch.randn(len(fisher), dtype=torch.float64)
+    product = FisherProduct(actor, batch, parameters, damping=0.1)
+    solution = conjugate_gradient(product, right, iterations=100, tolerance=1e-24)
+    torch.testing.assert_close(solution, torch.linalg.solve(fisher, right))
+
+
+def test_conjugate_gradient_stops_and_never_divides_by_zero():
+    products = []
+
+    def product(vector):
+        products.append(vector)
+        return 2 * vector
+
+    assert torch.equal(conjugate_gradient(product, torch.zeros(4), 10), torch.zeros(4))
+    assert not products
+    solution = conjugate_gradient(product, torch.ones(4), 10)
+    torch.testing.assert_close(solution, torch.full((4,), 0.5))
+    assert len(products) == 1
+
+
+def test_truncated_solution_is_orthogonal_to_its_residual():
+    # The identity xᵀHx = xᵀg, by which steps are scaled without another product.
+    root = torch.randn(30, 30, dtype=torch.float64)
+    matrix = root @ root.T + torch.eye(30, dtype=torch.float64)
+    right = torch.randn(30, dtype=torch.float64)
+    x = conjugate_gradient(matrix.__matmul__, right, iterations=5)
+    assert (matrix @ x - right).norm() > 0.01
+    torch.testing.assert_close(x @ matrix @ x, x @ right)
+
+
+def test_gaussian_kl_against_torch():
+    loc_p, loc_q = torch.randn(2, 5, 3)
+    scale_p, scale_q = torch.rand(2, 5, 3) + 0.1
+    expected = kl_divergence(
+        Independent(Normal(loc_p, scale_p), 1), Independent(Normal(loc_q, scale_q), 1)
+    )
+    torch.testing.assert_close(gaussian_kl(loc_p, scale_p, loc_q, scale_q), expected)
+
+
+def test_normal_is_found_under_transforms():
+    base = Normal(torch.zeros(3), torch.ones(3))
+    wrapped = Independent(TransformedDistribution(base, TanhTransform()), 1)
+    assert normal_parameters(wrapped)[0] is base.loc
+    with pytest.raises(TypeError, match="must be Gaussian, got Categorical"):
+        normal_parameters(torch.distributions.Categorical(torch.ones(3)))
+
+
+def test_flat_gradient_counts_unused_parameters_as_zero():
+    used, unused = nn.Parameter(torch.ones(2)), nn.Parameter(torch.ones(3))
+    gradient = flat_gradient((3 * used).sum(), [used, unused])
+    assert gradient.tolist() == [3, 3, 0, 0, 0]
+
+
+@pytest.mark.parametrize(("limit", "fraction"), [(2.0, 1.0), (0.7, 0.64), (0.3, 0.0)])
+def test_backtracking_takes_the_first_acceptable_fraction(limit, fraction):
+    parameter = nn.Parameter(torch.tensor([1.0, -1.0]))
+    found = backtracking_search(
+        [parameter],
+        torch.tensor([1.0, 1.0]),
+        lambda: parameter[0].item() - 1 <= limit,
+        coeff=0.8,
+        max_tries=5,
+    )
+    assert math.isclose(found, fraction)
+    torch.testing.assert_close(parameter.data, torch.tensor([1.0, -1.0]) + found)
+
+
+def test_subsample_is_spread_over_the_batch():
+    batch = TensorDict(index=torch.arange(100), batch_size=[100])
+    assert subsample(batch, 0.1)["index"].tolist() == list(range(0, 100, 10))
+    assert subsample(batch, 1.0)["index"].tolist() == list(range(100))
+    with pytest.raises(ValueError, match="fisher_subsample"):
+        subsample(batch, 0.0)
