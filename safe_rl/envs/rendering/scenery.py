@@ -15,7 +15,7 @@ FIXED_CAMERAS = {"fixednear": (0.0, -2.0, 2.0), "fixedfar": (0.0, -5.0, 5.0)}
 TRACK = "track"  # behind the robot, see `rendering.track_pose`
 VISION = "vision"  # the robot's own, part of the robot file
 
-SKY_RGB = ((0.55, 0.62, 0.85), (0.2, 0.25, 0.45))  # overhead and underfoot
+SKY_RGB = ((0.7, 0.78, 0.92), (0.42, 0.5, 0.68))  # overhead and underfoot
 FLOOR_RGB = ((0.74, 0.74, 0.74), (0.82, 0.82, 0.82))
 FLOOR_TILE = 0.5  # side of a square of the chequered floor [m]
 SLICES, STACKS = 24, 8  # facets of a round shape; halos have hundreds of spheres
