@@ -6,6 +6,7 @@ import hydra
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
 
+import safe_rl.openmp  # noqa: F401, has to come before torch
 from safe_rl.envs import make_env, store_configs
 from safe_rl.training import build_trainer, seed_everything
 

@@ -1,9 +1,17 @@
-"""Every test starts from the same random state, whatever ran before it."""
+"""What holds for every test."""
 
 import pytest
+
+import safe_rl.openmp  # noqa: F401, has to come before torch
+
+# isort: split
 import torch
+
+# as many processes as cores run tests: a second thread in each would only be in the way
+torch.set_num_threads(1)
 
 
 @pytest.fixture(autouse=True)
 def _seed():
+    """Every test starts from the same random state, whatever ran before it."""
     torch.manual_seed(0)
