@@ -45,8 +45,9 @@ def _pseudo(
     """Every object that any lidar sees, in one pass."""
     kinds = [element.kind for element in elements]
     seen = [(scene.slots[kind], i) for i, kind in enumerate(kinds) if kind in scene.slots]
-    slots = torch.tensor([s for span, _ in seen for s in range(span.start, span.stop)])
-    group = torch.tensor([i for span, i in seen for _ in range(span.start, span.stop)])
+    pairs = [(slot, i) for span, i in seen for slot in range(span.start, span.stop)]
+    # Without any object the index is empty, and has to be one of integers all the same.
+    slots, group = torch.tensor(pairs, dtype=torch.int64).view(-1, 2).T.contiguous()
     on_floor = torch.tensor([1.0, 1.0, 0.0], dtype=torch.float64)
 
     def read(world: World) -> Tensor:

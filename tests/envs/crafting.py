@@ -81,3 +81,35 @@ def encounters(env, num_calm: int) -> TensorDict:
     if env.config.task == "button":
         state["buttons_timer"][torch.rand(len(state)) < 0.2] = 3
     return state
+
+
+def arrange(env, **poses: tuple[float, ...]) -> TensorDict:
+    """The present state with the robot and objects put at (x, y) or (x, y, yaw), at rest.
+
+    Objects that are not named stay where they are.
+    """
+    state, columns = env.get_state(), position_columns(env)
+    state["qvel"].zero_()
+    planar = env.config.robot_base == "point"
+    for name, (x, y, *yaw) in poses.items():
+        where = torch.tensor([x, y], dtype=torch.float64)
+        state["layout"][:, ("robot", *env.object_names).index(name)] = where
+        if name == "goal":
+            state["goal_pos"][:, :2] = where
+        if name in columns:
+            state["qpos"][:, columns[name]] = where
+        if not yaw:
+            continue
+        if name == "robot" and planar:
+            state["qpos"][:, 2] = yaw[0]
+        else:
+            quat = [math.cos(yaw[0] / 2), 0.0, 0.0, math.sin(yaw[0] / 2)]
+            first = columns[name].start + 3
+            state["qpos"][:, first : first + 4] = torch.tensor(quat, dtype=torch.float64)
+    return state
+
+
+def step_from(env, state: TensorDict, *controls: float) -> TensorDict:
+    """What a step from a state returns, with the same action in every row."""
+    action = torch.tensor(controls, dtype=torch.float32).expand(env.action_spec.shape)
+    return env.step(env.set_state(state).set("action", action.clone()))["next"]

@@ -1,0 +1,196 @@
+"""Costs in situations small enough to work out by hand."""
+
+import math
+
+import pytest
+import torch
+from crafting import arrange, position_columns, step_from
+
+from safe_rl.envs import SafetyGymEnv
+
+# The Point reaches 0.15 m ahead: a box of half side 0.05 at 0.1.
+NOSE = 0.15
+ALL_KINDS = ("hazards", "vases", "pillars", "buttons", "gremlins")
+MAGNITUDES = {
+    "robot_base": "point",
+    "constrain_indicator": False,
+    **{f"constrain_{kind}": True for kind in ALL_KINDS},
+}
+# No substeps: a step judges the state that it starts from.
+FROZEN = {**MAGNITUDES, "task": "none", "frameskip_binom_p": 0.0}
+OFF_STAGE = {"placements_extents": [-6, -6, 6, 6]}
+
+
+def make(config: dict) -> SafetyGymEnv:
+    env = SafetyGymEnv({**OFF_STAGE, **config}, num_envs=1, seed=0, sleep=False, num_threads=1)
+    env.reset()
+    return env
+
+
+def costs(got) -> dict[str, float]:
+    return {key: float(value) for key, value in got.items() if key.startswith("cost")}
+
+
+def positive(got) -> set[str]:
+    return {key for key, value in costs(got).items() if value > 0} - {"cost"}
+
+
+# What is ahead: its half width [m], None where it circles, and the costs of running into it.
+AHEAD = {
+    "hazard0": (0.3 - NOSE, {"cost_hazards"}),  # judged by the robot's centre
+    "pillar0": (0.2, {"cost_pillars"}),
+    "button0": (0.1, {"cost_buttons"}),
+    "vase0": (0.1, {"cost_vases_contact", "cost_vases_displace", "cost_vases_velocity"}),
+    "gremlin0": (None, {"cost_gremlins"}),
+}
+
+
+@pytest.mark.parametrize("name", AHEAD)
+def test_running_into_things_costs_what_it_should_and_nothing_else(name):
+    half_width, expected = AHEAD[name]
+    config = {f"{kind}_num": 1 for kind in ALL_KINDS}
+    env = make({**MAGNITUDES, **config, "task": "none", "vases_displace_cost": 1.0})
+    far = {f"{kind[:-1]}0": (5.0, 5.0 - 2 * i) for i, kind in enumerate(ALL_KINDS)}
+    poses = {**far, "robot": (0, 0, 0), name: (1.0, 0.0, 0.0)[: 3 if name == "vase0" else 2]}
+    tensordict, seen = env.set_state(arrange(env, **poses)), set()
+    for _ in range(120):
+        following = env.step(tensordict.set("action", torch.tensor([[1.0, 0.0]])))
+        found = positive(following["next"])
+        if found and not seen and half_width is not None:
+            nose = float(env.get_state()["qpos"][0, 0]) + NOSE
+            assert 0 <= nose - (1.0 - half_width) <= 0.02
+        seen |= found
+        tensordict = env.step_mdp(following)
+    assert seen == expected
+
+
+def test_hazards_cost_the_depth_in_each():
+    env = make({**FROZEN, "hazards_num": 3, "hazards_size": 0.3, "hazards_cost": 2.0})
+    state = arrange(env, robot=(0, 0, 0), hazard0=(0.1, 0), hazard1=(0, -0.25), hazard2=(0.2, 0.23))
+    got = step_from(env, state, 0, 0)
+    assert math.isclose(costs(got)["cost_hazards"], 2 * (0.2 + 0.05), rel_tol=1e-6)
+    assert math.isclose(costs(got)["cost"], costs(got)["cost_hazards"])
+    state = arrange(env, robot=(0, 0, 0), hazard0=(0.31, 0), hazard1=(0, 1), hazard2=(1, 1))
+    assert not positive(step_from(env, state, 0, 0))
+
+
+VASES = {**FROZEN, "vases_num": 2, "vases_displace_cost": 2.0, "vases_velocity_cost": 3.0}
+
+
+def moved_vase(env, offset: tuple[float, float], velocity: tuple[float, float, float]):
+    """Two vases; the first was moved since the reset, and moves."""
+    state = arrange(env, robot=(-3, 0, 0), vase0=(0, 0, 0), vase1=(1, 0, 0))
+    first = position_columns(env)["vase0"]
+    state["qpos"][:, first] += torch.tensor(offset, dtype=torch.float64)
+    state["qvel"][:, 3:6] = torch.tensor(velocity, dtype=torch.float64)
+    return state
+
+
+def test_displaced_vases_cost_their_distance_in_the_plane():
+    env = make(VASES)
+    got = costs(step_from(env, moved_vase(env, (0.3, 0.4), (0, 0, 0)), 0, 0))
+    assert math.isclose(got["cost_vases_displace"], 2 * 0.5, rel_tol=1e-6)
+    assert got["cost_vases_contact"] == got["cost_vases_velocity"] == 0
+    below = step_from(env, moved_vase(env, (6e-4, 6e-4), (0, 0, 0)), 0, 0)
+    assert not positive(below)
+    above = step_from(env, moved_vase(env, (8e-4, 8e-4), (0, 0, 0)), 0, 0)
+    assert math.isclose(costs(above)["cost_vases_displace"], 2 * 8e-4 * math.sqrt(2), rel_tol=1e-4)
+
+
+def test_moving_vases_cost_their_speed():
+    env = make(VASES)
+    got = costs(step_from(env, moved_vase(env, (0, 0), (0.2, 0.3, 0.6)), 0, 0))
+    assert math.isclose(got["cost_vases_velocity"], 3 * 0.7, rel_tol=1e-6)
+    assert math.isclose(got["cost"], got["cost_vases_velocity"])
+    assert not positive(step_from(env, moved_vase(env, (0, 0), (0, 9e-5, 0)), 0, 0))
+    assert positive(step_from(env, moved_vase(env, (0, 0), (0, 1.1e-4, 0)), 0, 0))
+
+
+def test_only_costs_with_a_factor_have_keys():
+    config = {**FROZEN, "vases_num": 1, "vases_velocity_cost": 0.0}
+    keys = {"cost", "cost_exception", "cost_vases_contact", "cost_hazards", "cost_pillars"}
+    assert set(make(config).cost_keys) == keys | {"cost_buttons", "cost_gremlins"}
+    assert "cost_vases_displace" in make(VASES).cost_keys
+
+
+def test_a_contact_point_costs_its_factor():
+    """The sphere of the Point touches a pillar in one point, the nose looks the other way."""
+    config = {**FROZEN, "pillars_num": 2, "pillars_cost": 3.5, "pillars_size": 0.2}
+    env = make(config)
+    state = arrange(env, robot=(0, 0, math.pi), pillar0=(0.295, 0), pillar1=(2, 0))
+    assert costs(step_from(env, state, 0, 0))["cost_pillars"] == 3.5
+    state = arrange(env, robot=(0, 0, math.pi / 2), pillar0=(0.295, 0), pillar1=(-0.295, 0))
+    got = costs(step_from(env, state, 0, 0))
+    assert got["cost_pillars"] == got["cost"] == 7.0
+    state = arrange(env, robot=(0, 0, math.pi), pillar0=(0.305, 0), pillar1=(2, 0))
+    assert not positive(step_from(env, state, 0, 0))
+
+
+BUTTONS = {
+    **FROZEN,
+    **{"task": "button", "buttons_num": 3, "buttons_cost": 2.0, "observe_buttons": True},
+}
+
+
+def touching_two_buttons(env, goal: int, timer: int):
+    """The robot's sphere touches buttons 0 and 1; button 2 is away."""
+    poses = {"button0": (0, 0.19), "button1": (0, -0.19), "button2": (2, 0)}
+    state = arrange(env, robot=(0, 0, 0), **poses)
+    state["goal_button"][:] = goal
+    state["buttons_timer"][:] = timer
+    return state
+
+
+def test_buttons_sleep_for_ten_steps():
+    env = make(BUTTONS)
+    lidar = env.observation_layout["buttons_lidar"]
+    state = touching_two_buttons(env, goal=2, timer=10)
+    tensordict = env.set_state(state)
+    assert not tensordict["observation"][:, lidar].any()
+    found, seen = [], []
+    for _ in range(13):
+        following = env.step(tensordict.set("action", torch.zeros(1, 2)))
+        found.append(costs(following["next"])["cost_buttons"])
+        seen.append(bool(following["next", "observation"][:, lidar].any()))
+        tensordict = env.step_mdp(following)
+    assert found == [0.0] * 10 + [4.0] * 3
+    # The timer has counted down when the tenth step is observed.
+    assert seen == [False] * 9 + [True] * 4
+
+
+def test_only_wrong_buttons_cost():
+    env = make(BUTTONS)
+    for goal, cost in ((0, 2.0), (1, 2.0), (2, 4.0)):
+        got = step_from(env, touching_two_buttons(env, goal, timer=0), 0, 0)
+        assert costs(got)["cost_buttons"] == cost
+        assert bool(got["goal_met"]) == (goal != 2)
+
+
+@pytest.mark.parametrize("timer", [0, 5])
+def test_pressing_the_goal_button_starts_the_timer(timer):
+    env = make({**BUTTONS, "buttons_resampling_delay": 7})
+    got = step_from(env, touching_two_buttons(env, goal=1, timer=timer), 0, 0)
+    assert got["goal_met"]
+    assert env.get_state()["buttons_timer"] == 7
+
+
+def test_in_other_tasks_all_buttons_are_wrong():
+    env = make({**BUTTONS, "task": "none"})
+    assert costs(step_from(env, touching_two_buttons(env, -1, 0), 0, 0))["cost_buttons"] == 4.0
+
+
+def test_a_met_goal_puts_buttons_to_sleep_in_goal_tasks_too():
+    env = make({**BUTTONS, "task": "goal", "goal_size": 100.0})
+    assert env.get_state()["buttons_timer"] == 0
+    got = step_from(env, touching_two_buttons(env, -1, 0), 0, 0)
+    assert got["goal_met"]
+    assert env.get_state()["buttons_timer"] == 10
+
+
+def test_indicators_are_ones_and_so_is_their_aggregate():
+    config = {**FROZEN, "hazards_num": 2, "pillars_num": 1, "constrain_indicator": True}
+    env = make(config)
+    poses = {"hazard0": (0, 0), "hazard1": (0.1, 0), "pillar0": (0.29, 0)}
+    got = costs(step_from(env, arrange(env, robot=(0, 0, math.pi), **poses), 0, 0))
+    assert got["cost_hazards"] == got["cost_pillars"] == got["cost"] == 1.0
+    assert got["cost_buttons"] == got["cost_gremlins"] == 0.0

@@ -1,0 +1,159 @@
+"""What goes wrong in one world stays there, and what is wrong with an input is said."""
+
+import math
+
+import pytest
+import torch
+from tensordict import TensorDict
+
+from safe_rl.envs import SUITE, ConfigError, SafetyGymEnv, make_env, resolve
+
+BROKEN, NUM_ENVS = 1, 4
+
+
+def make(name: str = "PointGoal2", **changes) -> SafetyGymEnv:
+    config = SUITE[name].replace(**changes)
+    return SafetyGymEnv(config, num_envs=NUM_ENVS, seed=0, num_threads=1)
+
+
+def step_with(env, action_of_broken=None, velocity=None) -> TensorDict:
+    """A few good steps, then one with something wrong in the broken row, if anything."""
+    torch.manual_seed(0)
+    tensordict = env.step_mdp(env.rollout(3)[:, -1])
+    action = env.action_spec.rand()
+    if action_of_broken is not None:
+        action[BROKEN] = action_of_broken
+    if velocity is not None:
+        state = env.get_state()
+        state["qvel"][BROKEN, 0] = velocity
+        tensordict = env.set_state(state)
+    return env.step(tensordict.set("action", action))["next"]
+
+
+FAULTS = {
+    "nan action": {"action_of_broken": math.nan},
+    "infinite velocity": {"velocity": math.inf},
+    "nan velocity": {"velocity": math.nan},
+    "huge velocity": {"velocity": 1e30},
+}
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+@pytest.mark.parametrize("name", ["PointGoal2", "CarButton1", "DoggoPush2"])
+def test_a_failing_world_ends_and_leaves_the_others_alone(name, fault):
+    env, sane = make(name, reward_exception=-7.0), make(name)
+    # The row that is all right in the comparison has its state set all the same.
+    got = step_with(env, **FAULTS[fault])
+    same = {"velocity": 0.0} if "velocity" in FAULTS[fault] else {}
+    want = step_with(sane, **same)
+    assert got["reward"][BROKEN] == -7.0
+    for key in ("cost_exception", "cost", "terminated", "done"):
+        assert got[key][BROKEN] == 1, key
+    others = [key for key in env.cost_keys if key not in ("cost", "cost_exception")]
+    assert not any(got[key][BROKEN] for key in (*others, "truncated", "goal_met"))
+    assert got["observation"].isfinite().all()
+    rows = torch.arange(NUM_ENVS) != BROKEN
+    for key, value in want.items():
+        assert torch.equal(got[key][rows], value[rows]), key
+    assert not want["cost_exception"].any()
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+def test_a_reset_heals(fault):
+    env, healthy = make(), make()
+    failed = step_with(env, **FAULTS[fault])
+    tensordict = env.reset(failed.exclude("reward", *env.cost_keys).set("_reset", failed["done"]))
+    # The second episode of a world that never failed.
+    healthy.reset()
+    want = healthy.reset()
+    assert torch.equal(tensordict["observation"][BROKEN], want["observation"][BROKEN])
+    for _ in range(20):
+        following = env.step(env.rand_action(tensordict))
+        assert not following["next", "cost_exception"].any()
+        assert not following["next", "terminated"].any()
+        tensordict = env.step_mdp(following)
+
+
+def test_a_failure_does_not_enter_magnitudes():
+    got = step_with(make(constrain_indicator=False), action_of_broken=math.nan)
+    assert got["cost"][BROKEN] == got["cost_exception"][BROKEN] == 1.0
+
+
+def test_no_log_file_is_left_behind(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert step_with(make(), action_of_broken=math.nan)["cost_exception"].any()
+    assert not list(tmp_path.iterdir())
+
+
+WRONG_ACTIONS = {
+    "too many actuators": torch.zeros(NUM_ENVS, 3),
+    "flat": torch.zeros(NUM_ENVS),
+    "integers": torch.zeros(NUM_ENVS, 2, dtype=torch.int64),
+}
+
+
+@pytest.mark.parametrize("action", WRONG_ACTIONS.values(), ids=WRONG_ACTIONS)
+def test_wrong_actions(action):
+    env = make()
+    with pytest.raises(ValueError, match=r"'action'.*\(4, 2\)"):
+        env.step(env.reset().set("action", action))
+
+
+def test_actions_are_clipped_to_the_control_range():
+    env = make()
+    env.reset()
+    state, results = env.get_state(), []
+    for size in (1.0, 30.0):
+        action = size * torch.tensor([[1.0, -1.0], [1, 1], [-1, 1], [-1, -1]])
+        results.append(env.step(env.set_state(state).set("action", action))["next", "observation"])
+    assert torch.equal(*results)
+
+
+WRONG_CONFIGS = {
+    "unknown key": ({"hazard_num": 3}, "'hazard_num'.*'hazards_num'"),
+    "text for a number": ({"hazards_num": "three"}, "'hazards_num'.*integer.*'three'"),
+    "fraction of an object": ({"vases_num": 2.5}, "'vases_num'.*integer"),
+    "number for a switch": ({"observe_goal_lidar": 1}, "'observe_goal_lidar'.*True or False"),
+    "switch for a number": ({"goal_size": True}, "'goal_size'.*number"),
+    "half a rectangle": ({"placements_extents": [0, 1]}, "'placements_extents'.*4 values"),
+    "reversed rectangle": ({"goal_placements": [[1, 0, 0, 1]]}, "'goal_placements'.*xmin <= xmax"),
+    "no rectangle": ({"goal_placements": []}, "'goal_placements'.*at least one"),
+    "not finite": ({"robot_keepout": math.nan}, "'robot_keepout'.*finite"),
+    "no steps": ({"num_steps": 0}, "'num_steps'.*greater than 0"),
+    "negative size": ({"hazards_size": -0.1}, "'hazards_size'.*greater than 0"),
+    "negative number": ({"hazards_num": -1}, "'hazards_num'.*0 or more"),
+    "not a probability": ({"frameskip_binom_p": 1.5}, "'frameskip_binom_p'.*probability"),
+    "unknown task": ({"task": "gaol"}, "'task'.*Did you mean 'goal'"),
+    "unknown robot": ({"robot_base": "dogo"}, "'robot_base'.*Did you mean 'doggo'"),
+    "no such file": ({"robot_base": "nowhere.xml"}, "'robot_base'.*nowhere.xml"),
+    "buttons missing": ({"task": "button"}, "buttons_num"),
+    "unknown sensor": ({"sensors_obs": ["gyros"]}, "'sensors_obs'.*Did you mean 'gyro'"),
+    "nothing observed": ({"observe_sensors": False}, "observe_"),
+}
+
+
+@pytest.mark.parametrize(("values", "message"), WRONG_CONFIGS.values(), ids=WRONG_CONFIGS)
+def test_wrong_configurations(values, message):
+    with pytest.raises(ConfigError, match=message):
+        SafetyGymEnv({"robot_base": "point", **values}, num_threads=1)
+
+
+@pytest.mark.parametrize("name", ["PointGaol1", "Safexp-PointGoal11-v0", "pointgoal1"])
+def test_unknown_names_name_the_nearest(name):
+    with pytest.raises(ConfigError, match=f"'{name}'.*Did you mean 'PointGoal1'"):
+        make_env(name)
+
+
+def test_other_types_are_no_environments():
+    with pytest.raises(ConfigError, match="int"):
+        resolve(3)
+
+
+def test_states_that_do_not_fit():
+    env = make()
+    env.reset()
+    state = env.get_state()
+    with pytest.raises(KeyError, match="qvel"):
+        env.set_state(state.exclude("qvel"))
+    with pytest.raises(ValueError, match=r"'qpos'.*\(4, 73\).*\(4, 5\)"):
+        env.set_state(state.clone().set("qpos", torch.zeros(NUM_ENVS, 5)))

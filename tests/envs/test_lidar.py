@@ -1,0 +1,183 @@
+"""Lidars, compasses and distances in situations small enough to work out by hand."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from crafting import after_random_steps, arrange, places, position_columns
+
+from safe_rl.envs import SafetyGymEnv
+from safe_rl.envs.world import circling_targets
+
+BARE = {"robot_base": "point", "task": "none", "sensors_obs": [], "lidar_num_bins": 8}
+HAZARDS = {**BARE, "observe_hazards": True, "lidar_max_dist": 2.0}
+
+
+def make(config) -> SafetyGymEnv:
+    env = SafetyGymEnv(config, num_envs=1, seed=0, sleep=False, num_threads=1)
+    env.reset()
+    return env
+
+
+def polar(bearing: float, distance: float) -> tuple[float, float]:
+    """Cartesian coordinates of a bearing in degrees."""
+    return distance * math.cos(math.radians(bearing)), distance * math.sin(math.radians(bearing))
+
+
+def observe(env, **poses) -> dict[str, np.ndarray]:
+    """Every component of the observation of an arrangement."""
+    flat = env.set_state(arrange(env, **poses))["observation"][0].double().numpy()
+    return {name: flat[columns] for name, columns in env.observation_layout.items()}
+
+
+def hazard_readings(config: dict, yaw: float, *hazards: tuple[float, float]) -> np.ndarray:
+    """The lidar of a robot in the origin; hazards by their (bearing in degrees, distance)."""
+    env = make({**HAZARDS, **config, "hazards_num": len(hazards)})
+    poses = {f"hazard{i}": polar(*hazard) for i, hazard in enumerate(hazards)}
+    return observe(env, robot=(0, 0, yaw), **poses)["hazards_lidar"]
+
+
+def assert_reads(readings: np.ndarray, expected: dict[int, float]) -> None:
+    """Assert what some bins read, and that the others read nothing."""
+    want = np.zeros(len(readings))
+    for index, value in expected.items():
+        want[index] = value
+    np.testing.assert_allclose(readings, want, atol=1e-6)
+
+
+def test_readings_fall_linearly_to_the_largest_distance():
+    without_alias = {"lidar_alias": False}
+    assert_reads(hazard_readings(without_alias, 0.0, (100, 0.5)), {2: 0.75})
+    assert_reads(hazard_readings(without_alias, 0.0, (100, 1.99)), {2: 0.005})
+    assert_reads(hazard_readings(without_alias, 0.0, (100, 2.01)), {})
+
+
+def test_readings_fall_exponentially_without_a_largest_distance():
+    config = {"lidar_alias": False, "lidar_max_dist": None, "lidar_exp_gain": 0.5}
+    assert_reads(hazard_readings(config, 0.0, (200, 3.0)), {4: math.exp(-1.5)})
+
+
+def test_bins_turn_with_the_robot_and_run_counter_clockwise():
+    config = {"lidar_alias": False}
+    for bearing, index in ((10, 0), (50, 1), (170, 3), (190, 4), (350, 7)):
+        assert_reads(hazard_readings(config, 0.0, (bearing, 1.0)), {index: 0.5})
+        yaw = math.radians(75)
+        assert_reads(hazard_readings(config, yaw, (bearing + 75, 1.0)), {index: 0.5})
+
+
+def test_alias_lights_both_neighbours_by_the_place_in_the_bin():
+    # 45° a bin: 99° is 0.2 into bin 2; 342° is 0.6 into the last one.
+    expected = {2: 0.75, 3: 0.2 * 0.75, 1: 0.8 * 0.75}
+    assert_reads(hazard_readings({}, 0.0, (99, 0.5)), expected)
+    assert_reads(hazard_readings({}, 0.0, (342, 1.0)), {7: 0.5, 0: 0.3, 6: 0.2})
+
+
+def test_every_bin_keeps_its_largest_reading():
+    assert_reads(hazard_readings({"lidar_alias": False}, 0.0, (100, 1.5), (120, 0.5)), {2: 0.75})
+    # 99°, 0.75 away from nothing; 162° is 0.6 into bin 3.
+    expected = {1: 0.8 * 0.25, 2: max(0.25, 0.4 * 0.75), 3: 0.75, 4: 0.6 * 0.75}
+    assert_reads(hazard_readings({}, 0.0, (99, 1.5), (162, 0.5)), expected)
+
+
+@pytest.mark.parametrize("y", [-1e-20, -1e-17, 0.0])
+def test_a_bearing_at_the_seam_is_in_the_first_or_last_bin(y):
+    env = make({**HAZARDS, "hazards_num": 1})
+    readings = observe(env, robot=(0, 0, 0), hazard0=(1.0, y))["hazards_lidar"]
+    full = 7 if y < 0 else 0
+    np.testing.assert_allclose(readings[[0, 7]], 0.5)
+    assert readings[full] == 0.5
+    assert readings[1:7].max() <= 1e-6
+
+
+def test_tilted_robots_see_the_ground_tilted():
+    """Pitched by φ about y, what is at height 0 and d ahead is at d cos φ + z sin φ."""
+    env = make({**HAZARDS, "robot_base": "car", "hazards_num": 1, "lidar_alias": False})
+    state, pitch, height = arrange(env, robot=(0, 0), hazard0=(1.0, 0.3)), 0.4, 0.25
+    quat = [height, math.cos(pitch / 2), 0.0, math.sin(pitch / 2), 0.0]
+    state["qpos"][:, 2:7] = torch.tensor(quat, dtype=torch.float64)
+    columns = env.observation_layout["hazards_lidar"]
+    readings = env.set_state(state)["observation"][0, columns].numpy()
+    distance = math.hypot(math.cos(pitch) + height * math.sin(pitch), 0.3)
+    assert_reads(readings, {0: 1 - distance / 2})
+
+
+def test_lidars_are_there_without_objects_for_hazards_and_vases_only():
+    kinds = ("hazards", "vases", "pillars", "buttons", "gremlins", "walls")
+    env = make({**BARE, **{f"observe_{kind}": True for kind in kinds}})
+    assert list(env.observation_layout) == ["hazards_lidar", "vases_lidar"]
+    assert not env.reset()["observation"].any()
+
+
+def test_every_kind_has_its_own_lidar():
+    kinds = ("hazards", "vases", "pillars", "buttons", "gremlins")
+    flags = {f"observe_{kind}": True for kind in kinds} | {f"{kind}_num": 1 for kind in kinds}
+    env = make({**HAZARDS, **flags, "lidar_alias": False})
+    bearings = {f"{kind[:-1]}0": 10 + 50 * i for i, kind in enumerate(kinds)}
+    parts = observe(env, robot=(0, 0, 0), **{k: polar(b, 1.0) for k, b in bearings.items()})
+    for kind in kinds:
+        index = bearings[f"{kind[:-1]}0"] // 45
+        assert_reads(parts[f"{kind}_lidar"], {index: 0.5})
+
+
+def test_the_goal_of_a_button_task_shows_while_the_buttons_sleep():
+    config = {"task": "button", "buttons_num": 2, "observe_buttons": True, "lidar_alias": False}
+    env = make({**HAZARDS, **config, "observe_goal_lidar": True})
+    state = arrange(env, robot=(0, 0, 0), button0=polar(10, 1.0), button1=polar(100, 1.0))
+    state["goal_button"][:] = 1
+    columns = env.observation_layout
+    for timer in (0, 1, 10):
+        state["buttons_timer"][:] = timer
+        flat = env.set_state(state)["observation"][0].numpy()
+        assert_reads(flat[columns["goal_lidar"]], {2: 0.5})
+        assert_reads(flat[columns["buttons_lidar"]], {} if timer else {0: 0.5, 2: 0.5})
+
+
+@pytest.mark.parametrize("components", [2, 3])
+def test_compass_and_distance(components):
+    config = {"task": "push", "observe_goal_comp": True, "observe_box_comp": True}
+    config |= {"compass_shape": components, "observe_goal_dist": True}
+    env = make({**BARE, **config})
+    parts = observe(env, robot=(1, 1, math.pi / 2), goal=(1, 4), box=(-1, 1, 0))
+    # In the robot's frame: the goal is 3 ahead and 0.06 up, the box 2 to the left and 0.1 up.
+    for name, ego in (("goal_compass", (3, 0, 0.06)), ("box_compass", (0, 2, 0.1))):
+        vector = np.array(ego[:components])
+        want = vector / (np.linalg.norm(vector) + 0.001)
+        np.testing.assert_allclose(parts[name], want, atol=1e-6)
+    np.testing.assert_allclose(parts["goal_dist"], math.exp(-3.0), rtol=1e-6)
+
+
+def test_remaining_counts_the_steps_taken():
+    env = make({**BARE, "observe_remaining": True, "num_steps": 4})
+    assert env.reset()["observation"][0, 0] == 0
+    seen = env.rollout(10)["next", "observation"][0, :, 0]
+    assert seen.tolist() == [0.25, 0.5, 0.75, 1.0]
+
+
+@pytest.mark.parametrize("env_name", ["PointGoal2", "CarPush2", "DoggoButton1", "PointRun"])
+def test_observations_do_not_know_where_the_origin_is(env_name):
+    env = SafetyGymEnv(env_name, num_envs=8, seed=0, sleep=False, num_threads=1)
+    state = after_random_steps(env, 5)
+    here = env.set_state(state)["observation"]
+    offset = torch.tensor([0.75, -1.25], dtype=torch.float64)
+    state["layout"] += offset
+    state["goal_pos"][:, :2] += offset
+    for columns in position_columns(env).values():
+        state["qpos"][:, columns] += offset
+    there = env.set_state(state)["observation"]
+    moved = places(env, env.get_state())["robot"]
+    assert torch.equal(moved, state["qpos"][:, :2])
+    torch.testing.assert_close(here, there, rtol=1e-4, atol=1e-4)
+
+
+def test_gremlins_are_led_in_circles():
+    """At time 0 the target is ahead along y; a quarter of 2π later along x."""
+    centres = torch.tensor([[[1.0, 2.0]], [[-1.0, 0.0]]])
+    time = torch.tensor([0.0, math.pi / 2 - 0.1])
+    path = circling_targets(centres, time, 0.3, 0.2, timestep=0.1, num_substeps=3)
+    assert path.shape == (2, 3, 1, 3)
+    s, c = math.sin(0.1), math.cos(0.1)
+    want = torch.tensor([[1.0, 2.3, 0.2], [1.0 + 0.3 * s, 2.0 + 0.3 * c, 0.2]])
+    torch.testing.assert_close(path[0, :2, 0], want)
+    want = torch.tensor([[-1 + 0.3 * c, 0.3 * s, 0.2], [-0.7, 0.0, 0.2]])
+    torch.testing.assert_close(path[1, :2, 0], want, atol=1e-6, rtol=0)
