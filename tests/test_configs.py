@@ -4,6 +4,7 @@ import itertools
 
 import pytest
 import torch
+from hydra.core.config_store import ConfigStore
 from hydra.errors import HydraException
 from omegaconf import OmegaConf
 from point_mass import PointMass
@@ -26,8 +27,15 @@ LAGRANGIAN = [name for name in ALGORITHMS if "lagrangian" in name]
 MULTIPLIERS = [name for name in options("lagrangian") if name not in options("preset")]
 
 
-@pytest.mark.parametrize(("algo", "preset"), COMBINATIONS)
-@pytest.mark.parametrize("env", ["PointGoal1", "CarButton2", "DoggoPush0"])
+@pytest.mark.parametrize(
+    ("algo", "preset", "env"),
+    [
+        (*names, env)
+        for names, env in zip(
+            COMBINATIONS, itertools.cycle(["PointGoal1", "CarButton2", "DoggoPush0"]), strict=False
+        )
+    ],
+)
 def test_every_combination_composes_and_resolves(env, algo, preset):
     config = compose_config(f"env={env}", f"algo={algo}", f"preset={preset}")
     plain = OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
@@ -46,18 +54,19 @@ def test_every_combination_builds(algo, preset):
     assert (algorithm.multiplier is not None) == (algo in LAGRANGIAN)
 
 
-@pytest.mark.parametrize(("algo", "preset"), itertools.product(LAGRANGIAN, options("preset")))
+@pytest.mark.parametrize("algo", LAGRANGIAN)
 @pytest.mark.parametrize("multiplier", MULTIPLIERS)
-def test_multipliers_are_interchangeable(algo, preset, multiplier):
-    names = (f"algo={algo}", f"preset={preset}", f"lagrangian={multiplier}")
+def test_multipliers_are_interchangeable(algo, multiplier):
+    names = (f"algo={algo}", f"lagrangian={multiplier}")
     config = compose_config("env=PointMass", *names)
     assert config.lagrangian == OmegaConf.load(CONF / "lagrangian" / f"{multiplier}.yaml")
     build_algorithm(config, PointMass(2))
 
 
-@pytest.mark.parametrize("env", sorted(SUITE))
-def test_every_environment_of_the_suite_is_an_option(env):
-    assert compose_config(f"env={env}").env.name == env
+def test_every_environment_of_the_suite_is_an_option():
+    listed = ConfigStore.instance().list("env")
+    assert {f"{name}.yaml" for name in SUITE} <= set(listed)
+    assert len(SUITE) == 27
 
 
 def test_overrides_reach_the_environment():
@@ -94,6 +103,27 @@ PAPER = {
 }
 
 
+TRUST_REGION = {
+    "policy_update.target_kl": 0.01,
+    "policy_update.damping": 0.1,
+    "policy_update.cg_iterations": 10,
+    "policy_update.backtrack_coeff": 0.8,
+    "policy_update.max_backtracks": 10,
+    "policy_update.fisher_subsample": 1.0,
+}
+PPO_ONLY = {
+    key: value
+    for key, value in PAPER.items()
+    if key.startswith("policy_update") or key == "loss.clip_epsilon"
+}
+MULTIPLIER_ONLY = {key: value for key, value in PAPER.items() if key.startswith("lagrangian")}
+
+
+def select(config, keys):
+    found = {key: OmegaConf.select(config, key, throw_on_missing=True) for key in keys}
+    return {k: pytest.approx(v) if isinstance(v, float) else v for k, v in found.items()}
+
+
 @pytest.mark.parametrize(
     ("env", "frames", "frames_per_batch"),
     [
@@ -105,9 +135,21 @@ PAPER = {
 def test_the_paper_preset_is_the_paper(env, frames, frames_per_batch):
     config = compose_config("preset=paper", f"env={env}", "algo=ppo_lagrangian")
     assert (config.frames, config.frames_per_batch) == (frames, frames_per_batch)
-    found = {key: OmegaConf.select(config, key, throw_on_missing=True) for key in PAPER}
-    assert {key: pytest.approx(value) if isinstance(value, float) else value
-            for key, value in found.items()} == PAPER  # fmt: skip
+    assert select(config, PAPER) == PAPER
+
+
+@pytest.mark.parametrize("algo", ["trpo", "trpo_lagrangian", "cpo"])
+def test_the_paper_preset_of_the_trust_region_algorithms(algo):
+    config = compose_config("preset=paper", f"algo={algo}")
+    expected = {key: value for key, value in PAPER.items() if key not in PPO_ONLY}
+    expected |= TRUST_REGION
+    if algo != "trpo_lagrangian":
+        expected = {key: value for key, value in expected.items() if key not in MULTIPLIER_ONLY}
+    if algo == "trpo":
+        expected = {k: v for k, v in expected.items() if not k.startswith("cost_advantage")}
+    if algo == "cpo":
+        expected["policy_update.rescale_violation"] = True
+    assert select(config, expected) == expected
 
 
 def test_a_robot_of_ones_own_has_the_numbers_of_point():
