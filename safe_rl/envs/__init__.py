@@ -7,7 +7,7 @@ from safe_rl.envs.rendering.opengl import OpenGLError
 from safe_rl.envs.config import SafetyGymConfig
 from safe_rl.envs.gymnasium.conversion import from_gymnasium
 from safe_rl.envs.layout import LayoutError
-from safe_rl.envs.registration import make_env, register_gymnasium, store_configs
+from safe_rl.envs.registration import make_env, register_gymnasium, store_config, store_configs
 from safe_rl.envs.safety_gym import SafetyGymEnv
 from safe_rl.envs.suite import EXTRAS, SUITE, resolve
 from safe_rl.envs.validation import ConfigError
@@ -23,6 +23,7 @@ __all__ = [
     "from_gymnasium",
     "make_env",
     "resolve",
+    "store_config",
     "store_configs",
 ]
 

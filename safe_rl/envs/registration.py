@@ -10,7 +10,7 @@ from hydra.core.config_store import ConfigStore
 
 from safe_rl.envs.config import SafetyGymConfig
 from safe_rl.envs.safety_gym import SafetyGymEnv
-from safe_rl.envs.suite import EXTRAS, SUITE
+from safe_rl.envs.suite import EXTRAS, SUITE, resolve
 
 
 def _plain(value: Any) -> Any:
@@ -23,11 +23,20 @@ def group_node(name: str, config: SafetyGymConfig) -> dict[str, Any]:
     return {"name": name, **{key: _plain(value) for key, value in config.to_dict().items()}}
 
 
+def store_config(name: str, config: Mapping[str, Any] | SafetyGymConfig) -> None:
+    """Put a configuration into Hydra's group `env` by a name, so that `env=<name>` finds it.
+
+    Raises:
+        ConfigError: for an unknown key, or a value that cannot be used.
+    """
+    node = group_node(name, resolve(config))
+    ConfigStore.instance().store(group="env", name=name, node=node)
+
+
 def store_configs() -> None:
     """Put all names into Hydra's group `env`, so that `env=PointGoal1 env.hazards_num=3` works."""
-    store = ConfigStore.instance()
     for name, config in (SUITE | EXTRAS).items():
-        store.store(group="env", name=name, node=group_node(name, config))
+        store_config(name, config)
 
 
 def register_gymnasium() -> None:

@@ -77,10 +77,18 @@ _PARSERS = {
 
 
 def coerce(key: str, annotation: str, value: Any) -> Any:
-    """Return `value` as the type that the field's annotation names, or raise ConfigError."""
+    """Return `value` as the type that the field's annotation names, within the key's range.
+
+    Raises:
+        ConfigError: if it is of another type, or out of range.
+    """
     if annotation not in _PARSERS:
         raise ConfigError(f"The type of key '{key}' must be one of {tuple(_PARSERS)}.")
-    return _PARSERS[annotation](key, value)
+    value = _PARSERS[annotation](key, value)
+    _check_range(key, value)
+    if annotation == "Placements" or key == "placements_extents":
+        _check_rectangles(key, value)
+    return value
 
 
 def infer_annotation(key: str, default: Any) -> str:
@@ -119,20 +127,12 @@ _NOT_NEGATIVE_ENDINGS = (
 
 
 def validate(config: Mapping[str, Any]) -> None:
-    """Check values of the right type: choices, ranges, and what they need of one another.
+    """Check values of the right type and range: choices, and what they need of one another.
 
     Raises:
         ConfigError: naming the first key that is wrong.
     """
     _validate_choices(config)
-    for key, value in config.items():
-        numbers = value if isinstance(value, tuple) else () if value is None else (value,)
-        if key.endswith(_POSITIVE_ENDINGS) and not all(number > 0 for number in numbers):
-            raise _wrong(key, "greater than 0", value)
-        if key.endswith(_NOT_NEGATIVE_ENDINGS) and not all(number >= 0 for number in numbers):
-            raise _wrong(key, "0 or more", value)
-        if key == "placements_extents" or key.endswith("_placements"):
-            _validate_rectangles(key, value)
     probability = config["frameskip_binom_p"]
     if not 0.0 <= probability <= 1.0:
         raise _wrong("frameskip_binom_p", "a probability between 0 and 1", probability)
@@ -157,7 +157,16 @@ def _validate_choices(config: Mapping[str, Any]) -> None:
         )
 
 
-def _validate_rectangles(key: str, value: Any) -> None:
+def _check_range(key: str, value: Any) -> None:
+    values = value if isinstance(value, tuple) else (value,)
+    numbers = [x for x in values if isinstance(x, int | float) and not isinstance(x, bool)]
+    if key.endswith(_POSITIVE_ENDINGS) and not all(x > 0 for x in numbers):
+        raise _wrong(key, "greater than 0", value)
+    if key.endswith(_NOT_NEGATIVE_ENDINGS) and not all(x >= 0 for x in numbers):
+        raise _wrong(key, "0 or more", value)
+
+
+def _check_rectangles(key: str, value: Any) -> None:
     rectangles = (value,) if key == "placements_extents" else value or ()
     if value == ():
         raise _wrong(key, "None or a list of at least one rectangle", value)
