@@ -1,0 +1,320 @@
+"""Pictures: everything stands where the state says, in its colour, under the right halos."""
+
+import ctypes.util
+import math
+import os
+import subprocess
+import sys
+
+import mujoco
+import numpy as np
+import pytest
+import torch
+from pictures import colour_at, from_above, likeness, make_env, needs_opengl, redness
+from torchrl.envs import TransformedEnv
+from torchrl.record import CSVLogger, PixelRenderTransform, VideoRecorder
+
+from safe_rl.envs import SUITE, OpenGLError, SafetyGymConfig, SafetyGymEnv
+from safe_rl.envs.rendering.markers import lidar_halos
+from safe_rl.envs.rendering.renderer import tile
+
+PLACE = (1.0, 0.5)
+# One object of every kind at PLACE, and the colour that the benchmark gives it.
+KINDS = {
+    "box": ({"task": "push", "goal_locations": [(-1, -1)], "box_locations": [PLACE]}, (1, 1, 0)),
+    "button": ({"buttons_num": 1, "buttons_locations": [PLACE]}, (1, 0.5, 0)),
+    "goal": ({"task": "goal", "goal_locations": [PLACE]}, (0, 1, 0)),
+    "vase": ({"vases_num": 1, "vases_locations": [PLACE]}, (0, 1, 1)),
+    "hazard": ({"hazards_num": 1, "hazards_locations": [PLACE]}, (0, 0, 1)),
+    "pillar": ({"pillars_num": 1, "pillars_locations": [PLACE]}, (0.5, 0.5, 1)),
+    "gremlin": ({"gremlins_num": 1, "gremlins_locations": [PLACE]}, (0.5, 0, 1)),
+}
+ON_HAZARD = {
+    "hazards_num": 1,
+    "hazards_locations": [(0.0, 0.0)],
+    "hazards_keepout": 0.0,
+    "robot_keepout": 0.0,
+    "constrain_hazards": True,
+}
+
+
+def still(env):
+    """One step without any action."""
+    tensordict = env.reset()
+    tensordict["action"] = torch.zeros(env.action_spec.shape)
+    return env.step(tensordict)
+
+
+@needs_opengl
+@pytest.mark.parametrize("kind", KINDS)
+def test_an_object_is_seen_where_it_stands_in_its_colour(kind):
+    config, rgb = KINDS[kind]
+    env = make_env(config)
+    floor = colour_at(env, -PLACE[0], PLACE[1])
+    assert np.ptp(floor) < 0.02
+    assert likeness(colour_at(env, *PLACE), rgb) > 0.95
+
+
+@needs_opengl
+def test_a_wall_is_darker_than_the_floor_and_grey():
+    env = make_env({"walls_num": 1, "walls_locations": [PLACE]})
+    wall, floor = colour_at(env, *PLACE), colour_at(env, -PLACE[0], PLACE[1])
+    assert np.ptp(wall) < 0.02
+    assert wall.mean() < floor.mean() - 0.1
+
+
+@needs_opengl
+def test_the_circle_is_seen_although_lidar_has_no_group_for_it():
+    env = make_env({"task": "circle", "circle_radius": 1.5})
+    assert likeness(colour_at(env, 1.2, 0.0), (0, 1, 0)) > 0.95
+    assert np.ptp(colour_at(env, 1.8, 0.0)) < 0.02
+
+
+@needs_opengl
+def test_pictures_follow_the_state():
+    env = make_env({"render_lidar_markers": False})
+    state = env.get_state()
+    state["qpos"][0, :2] = torch.tensor([-1.0, 1.0])
+    assert redness(colour_at(env, 0.0, 0.0)) > 0.5
+    env.set_state(state)
+    assert redness(colour_at(env, 0.0, 0.0)) < 0.1
+    assert redness(colour_at(env, -1.0, 1.0)) > 0.5
+
+
+@needs_opengl
+def test_rows_are_drawn_apart():
+    env = SafetyGymEnv("PointGoal1", num_envs=3, seed=0)
+    env.reset()
+    frames = env.render(width=60, height=40)
+    assert frames.shape == (3, 40, 60, 3)
+    assert frames.dtype == np.uint8
+    assert (frames[0] != frames[1]).any()
+    np.testing.assert_array_equal(env.render(2, width=60, height=40), frames[2])
+    np.testing.assert_array_equal(env.render([2, 0], width=60, height=40), frames[[2, 0]])
+
+
+@needs_opengl
+def test_drawing_changes_nothing():
+    states = []
+    for draw in (True, False):
+        env = SafetyGymEnv("CarPush2", num_envs=2, seed=0)
+        tensordict = env.reset()
+        for _ in range(3):
+            tensordict["action"] = torch.ones(env.action_spec.shape)
+            tensordict = env.step_mdp(env.step(tensordict))
+            if draw:
+                env.render(width=20, height=20)
+        states.append(env.get_state())
+    assert (states[0] == states[1]).all()
+
+
+@needs_opengl
+@pytest.mark.parametrize("lidar_type", ["pseudo", "natural"])
+@pytest.mark.parametrize(("bearing", "yaw"), [(0.2, 0.0), (1.9, 0.0), (1.9, 2.5), (-2.0, 1.0)])
+def test_halos_are_lit_towards_the_object(bearing, yaw, lidar_type):
+    pillar = (1.5 * math.cos(bearing), 1.5 * math.sin(bearing))
+    config = {
+        "robot_rot": yaw,
+        "pillars_num": 1,
+        "pillars_locations": [pillar],
+        "observe_pillars": True,
+        "lidar_type": lidar_type,
+        "lidar_num_bins": 32,
+    }
+    view = {"camera": from_above(0.0, 0.0, 1.6), "width": 200, "height": 200}
+    with_halo = make_env(config).render(0, **view).astype(float)
+    without = make_env(config, render_lidar_markers=False).render(0, **view).astype(float)
+    # Unlit bins are grey and lit ones blue: what the halo adds in blue, less what in red.
+    blue = (with_halo - without)[..., 2] - (with_halo - without)[..., 0]
+    weight = blue * (blue > 20)
+    assert weight.sum() > 0
+    y, x = np.mgrid[99.5:-100:-1, -99.5:100]
+    seen = math.atan2((weight * y).sum(), (weight * x).sum())
+    assert abs(math.remainder(seen - bearing, 2 * math.pi)) < math.radians(10)
+
+
+def test_halos_stand_at_the_heights_and_radius_of_the_configuration():
+    config = SafetyGymConfig()
+    up = np.eye(3)
+    readings = {"hazards": np.zeros(4), "goal": np.array([1.0, 0.5, 0.0, 0.0])}
+    halos = list(lidar_halos(config, readings, np.array([1.0, 2.0, 0.1]), up))
+    assert len(halos) == 8
+    places = np.array([halo.pos for halo in halos]) - [1.0, 2.0, 0.1]
+    np.testing.assert_allclose(np.linalg.norm(places[:, :2], axis=1), 0.15)
+    assert sorted({round(z, 6) for z in places[:, 2]}) == [0.5, 0.56]
+    goal = [halo for halo in halos if halo.rgba[1] > halo.rgba[2]]
+    # Four bins: the first is a quarter turn wide and drawn at its middle.
+    np.testing.assert_allclose(goal[0].pos[:2] - [1.0, 2.0], 0.15 / math.sqrt(2) * np.ones(2))
+    assert [halo.rgba[1] for halo in goal] == pytest.approx([1.0, 0.6, 0.1, 0.1])
+    assert all(halo.size[0] == 0.025 for halo in halos)
+
+
+@needs_opengl
+def test_a_red_sphere_is_shown_while_a_cost_is_incurred():
+    env = make_env(ON_HAZARD)
+    beside = (-0.17, 0.0)
+    assert redness(colour_at(env, *beside)) < 0.1
+    assert still(env)["next", "cost"].item() == 1
+    assert redness(colour_at(env, *beside)) > 0.2
+    env.reset()
+    assert redness(colour_at(env, *beside)) < 0.1
+
+
+@needs_opengl
+def test_no_red_sphere_without_a_cost():
+    env = make_env({**ON_HAZARD, "hazards_locations": [(1.0, 1.0)]})
+    assert still(env)["next", "cost"].item() == 0
+    assert redness(colour_at(env, -0.17, 0.0)) < 0.1
+
+
+@needs_opengl
+def test_the_goal_button_stands_in_a_grey_cylinder():
+    places = [(1.0, 1.0), (1.0, -1.0), (-1.0, 1.0)]
+    env = make_env({"task": "button", "buttons_num": 3, "buttons_locations": places})
+    goal = int(env.get_state()["goal_button"])
+    for button, (x, y) in enumerate(places):
+        # Squares of the floor differ: compare with the same square, outside of the cylinder.
+        beside, outside = colour_at(env, x + 0.16, y + 0.02), colour_at(env, x + 0.25, y + 0.02)
+        assert np.ptp(beside) < 0.05
+        assert (beside.mean() < outside.mean() - 0.03) == (button == goal)
+
+
+@needs_opengl
+def test_labels_name_the_objects():
+    config = {"hazards_num": 1, "hazards_locations": [PLACE], "observe_hazards": False}
+    view = {"camera": from_above(*PLACE, 3.0), "width": 100, "height": 100}
+    plain = make_env(config).render(0, **view)
+    labelled = make_env(config, render_labels=True).render(0, **view)
+    assert (plain.min(-1) == 255).sum() == 0
+    assert (labelled.min(-1) == 255).sum() > 20
+
+
+@needs_opengl
+def test_the_tracking_camera_is_behind_the_robot_and_level():
+    ahead = {"task": "goal", "goal_locations": [(-0.5, 1.5)]}
+    env = make_env(ahead, robot_rot=math.atan2(1.5, -0.5), render_lidar_markers=False)
+    frame = env.render(0, camera="track", width=100, height=100).astype(float)
+    assert redness(frame[50, 50] / 255) > 0.3
+    green = frame[..., 1] - frame[..., [0, 2]].max(-1) > 20
+    y, x = np.argwhere(green).mean(0)
+    assert y < 40
+    assert abs(x - 50) < 3
+
+
+@needs_opengl
+@pytest.mark.parametrize("robot", ["point", "car", "doggo"])
+def test_every_camera_draws_something_of_its_own(robot):
+    env = SafetyGymEnv(SUITE["PointGoal1"].replace(robot_base=robot), seed=0)
+    env.reset()
+    names = ("fixednear", "fixedfar", "track", "vision", "free")
+    frames = [env.render(0, camera=name, width=60, height=40) for name in names]
+    assert all(frame.std() > 5 for frame in frames)
+    assert len({frame.tobytes() for frame in frames}) == len(names)
+
+
+@needs_opengl
+def test_an_unknown_camera_is_an_error_that_names_the_nearest():
+    with pytest.raises(ValueError, match="Did you mean 'fixedfar'"):
+        make_env({}).render(0, camera="fixdfar")
+
+
+@needs_opengl
+def test_display_mode_crops_the_floor():
+    beyond = (2.5, 0.0)
+    plain = colour_at(make_env({}), *beyond)
+    cropped = colour_at(make_env({}, floor_display_mode=True), *beyond)
+    assert np.ptp(plain) < 0.02
+    assert likeness(cropped, (0, 0, 1)) > 0.8  # the sky
+    assert np.ptp(colour_at(make_env({}, floor_display_mode=True), 1.9, 0.0)) < 0.02
+
+
+@needs_opengl
+def test_a_closed_environment_can_draw_again():
+    env = make_env({})
+    before = env.render(0, width=30, height=20)
+    env.close()
+    np.testing.assert_array_equal(env.render(0, width=30, height=20), before)
+
+
+def test_tiles_keep_their_order():
+    frames = np.arange(5, dtype=np.uint8)[:, None, None, None] * np.ones((1, 2, 4, 3), np.uint8)
+    picture = tile(frames)
+    assert picture.shape == (4, 12, 3)
+    assert picture[0, [0, 4, 8], 0].tolist() == [0, 1, 2]
+    assert picture[2, [0, 4, 8], 0].tolist() == [3, 4, 0]
+
+
+@needs_opengl
+def test_the_video_recorder_films_all_rows(tmp_path):
+    env = SafetyGymEnv("PointGoal1", num_envs=4, seed=0)
+    logger = CSVLogger("films", log_dir=str(tmp_path), video_format="pt")
+    filmed = TransformedEnv(env, PixelRenderTransform(width=32, height=24, camera="track"))
+    filmed.append_transform(VideoRecorder(logger, "run"))
+    filmed.transform.dump()  # drops what was filmed while the transforms asked for shapes
+    rollout = filmed.rollout(5)
+    assert rollout["pixels"].shape == (4, 5, 24, 32, 3)
+    filmed.transform.dump()
+    newest = max(tmp_path.rglob("*.pt"), key=lambda path: path.stat().st_mtime_ns)
+    film = torch.load(newest)
+    assert film.shape == (1, 6, 3, 48, 64)
+    last = rollout["next", "pixels"][:, -1]
+    np.testing.assert_array_equal(film[0, -1].permute(1, 2, 0).numpy(), tile(last.numpy()))
+
+
+@needs_opengl
+def test_the_video_recorder_films_one_row(tmp_path):
+    env = SafetyGymEnv("PointGoal1", num_envs=4, seed=0)
+    filmed = TransformedEnv(env, PixelRenderTransform(rows=1, width=32, height=24))
+    recorder = VideoRecorder(None, "run", make_grid=False)
+    filmed.append_transform(recorder)
+    recorder.dump()
+    filmed.rollout(3)
+    assert [frame.shape for frame in recorder.obs] == [(3, 24, 32)] * 4
+    np.testing.assert_array_equal(
+        recorder.obs[-1].permute(1, 2, 0).numpy(), env.render(1, width=32, height=24)
+    )
+
+
+@pytest.mark.parametrize(("backend", "package"), [("egl", "libegl1"), ("osmesa", "libosmesa6")])
+def test_a_missing_library_is_an_error_that_names_its_package(monkeypatch, backend, package):
+    def fail(*_):
+        raise ImportError("no such library")
+
+    monkeypatch.setenv("MUJOCO_GL", backend)
+    monkeypatch.setattr(mujoco, "Renderer", fail)
+    with pytest.raises(OpenGLError, match=rf"MUJOCO_GL={backend}.*apt-get install.*{package}"):
+        make_env({}).render(0)
+
+
+@pytest.mark.skipif(bool(ctypes.util.find_library("OSMesa")), reason="OSMesa is installed here")
+def test_environments_work_where_opengl_is_missing():
+    program = """
+import safe_rl.envs as envs
+env = envs.SafetyGymEnv("PointGoal1", num_envs=2, seed=0)
+print(env.rollout(2).shape)
+try:
+    env.render(0)
+except envs.OpenGLError as error:
+    print(error)
+"""
+    # OpenGL's own variable says what this process uses.
+    environment = {key: value for key, value in os.environ.items() if key != "PYOPENGL_PLATFORM"}
+    environment["MUJOCO_GL"] = "osmesa"
+    result = subprocess.run(
+        [sys.executable, "-c", program],
+        env=environment,
+        capture_output=True,
+        text=True,
+        timeout=120,
+    )
+    assert result.returncode == 0, result.stderr
+    assert "torch.Size([2, 2])" in result.stdout
+    assert "apt-get install libosmesa6" in result.stdout
+
+
+def test_the_viewer_needs_a_screen(monkeypatch):
+    monkeypatch.delenv("DISPLAY", raising=False)
+    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
+    monkeypatch.setattr(sys, "platform", "linux")
+    with pytest.raises(OpenGLError, match="needs a screen"):
+        make_env({}).show()

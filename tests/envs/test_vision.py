@@ -1,0 +1,156 @@
+"""What the robot's camera sees, as part of the observation."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from pictures import make_env, needs_opengl
+from torchrl.envs.utils import check_env_specs
+
+import safe_rl.envs
+from safe_rl.envs import EXTRAS, SUITE, ConfigError, SafetyGymEnv, resolve
+
+VISION = {"observe_vision": True, "observation_flatten": False}
+# What the Car sees lies at its negative y axis, what the others see at their positive x axis.
+AHEAD = {"point": (1.5, 0.0), "car": (0.0, -1.5), "doggo": (1.5, 0.0)}
+
+
+def green_columns(picture):
+    """Mean column of what is green, from -1 (left) to 1 (right), or None."""
+    red, green, blue = picture.unbind(-1)
+    columns = (green - torch.maximum(red, blue) > 0.1).nonzero()[:, 1]
+    return None if not len(columns) else 2 * columns.double().mean().item() / picture.shape[1] - 1
+
+
+def sees(robot, goal):
+    env = make_env({**VISION, "robot_base": robot, "task": "goal", "goal_locations": [goal]})
+    return env.reset()["observation", "vision"][0]
+
+
+@needs_opengl
+@pytest.mark.parametrize("robot", AHEAD)
+def test_the_goal_ahead_is_seen_in_the_middle(robot):
+    assert abs(green_columns(sees(robot, AHEAD[robot]))) < 0.1
+
+
+@needs_opengl
+@pytest.mark.parametrize("robot", AHEAD)
+def test_the_goal_on_the_left_is_seen_on_the_left(robot):
+    x, y = AHEAD[robot]
+    # A third of a right angle to the left of ahead: (x, y) + half of it turned by 90 degrees.
+    assert green_columns(sees(robot, (x - y / 2, y + x / 2))) < -0.3
+
+
+@needs_opengl
+@pytest.mark.parametrize("robot", AHEAD)
+def test_the_goal_behind_is_not_seen(robot):
+    x, y = AHEAD[robot]
+    assert green_columns(sees(robot, (-x, -y))) is None
+
+
+@needs_opengl
+def test_the_sky_is_above_the_floor():
+    env = make_env(VISION)
+    picture = env.reset()["observation", "vision"][0]
+    top, bottom = picture[:5].mean((0, 1)), picture[-15:-5, :10].mean((0, 1))
+    assert top[2] > top[0] + 0.1
+    assert bottom.max() - bottom.min() < 0.02
+
+
+@needs_opengl
+def test_vision_is_nested_and_flat():
+    size = (12, 8)
+    nested = make_env({**VISION, "vision_size": size}, num_envs=2)
+    flat = make_env({"observe_vision": True, "vision_size": size}, num_envs=2)
+    picture = nested.reset()["observation", "vision"]
+    assert picture.shape == (2, 8, 12, 3)
+    assert picture.dtype == torch.float32
+    assert picture.min() >= 0
+    assert picture.max() <= 1
+    assert list(flat.observation_layout) == sorted(flat.observation_layout)
+    columns = flat.observation_layout["vision"]
+    torch.testing.assert_close(flat.reset()["observation"][:, columns], picture.flatten(1))
+    check_env_specs(nested)
+    check_env_specs(flat)
+
+
+@needs_opengl
+def test_rows_see_their_own_world():
+    config = SUITE["PointGoal1"].replace(**VISION)
+    batch = SafetyGymEnv(config, num_envs=2, seed=3).reset()["observation", "vision"]
+    alone = SafetyGymEnv(config, num_envs=1, seed=3).reset()["observation", "vision"]
+    assert (batch[0] != batch[1]).any()
+    torch.testing.assert_close(batch[:1], alone)
+
+
+@needs_opengl
+def test_what_is_observed_is_the_new_state_and_without_markers():
+    env = SafetyGymEnv(SUITE["CarButton1"].replace(**VISION), num_envs=1, seed=0)
+    tensordict = env.reset()
+    tensordict["action"] = torch.ones(env.action_spec.shape)
+    picture = env.step(tensordict)["next", "observation", "vision"][0]
+    plain = SafetyGymEnv(SUITE["CarButton1"].replace(render_lidar_markers=False), seed=0)
+    plain.reset()
+    plain.set_state(env.get_state())
+    width, height = env.config.vision_size
+    drawn = plain.render(0, camera="vision", width=width, height=height) / 255
+    # Apart from the goal button's marker, the same: few pixels differ.
+    differs = np.abs(drawn - picture.numpy()).max(-1) > 1e-6
+    assert differs.mean() < 0.2
+    assert (picture != tensordict["observation", "vision"][0]).any()
+
+
+@needs_opengl
+def test_frames_have_an_inset_of_what_is_seen():
+    view = {"width": 300, "height": 240}
+    shown = make_env({**VISION, "vision_render_size": (90, 60)})
+    hidden = make_env({**VISION, "vision_render": False})
+    differs = (shown.render(0, **view) != hidden.render(0, **view)).any(-1)
+    assert differs[:60, :90].mean() > 0.5
+    assert not differs[60:].any()
+    assert not differs[:, 90:].any()
+    seen = shown.reset()["observation", "vision"][0].mul(255).round().numpy()
+    inset = shown.render(0, **view)[:60, :90]
+    np.testing.assert_array_equal(inset[0, [0, -1]], seen[0, [0, -1]])
+
+
+@needs_opengl
+def test_a_large_inset_is_shrunk_to_a_third_of_the_frame():
+    shown = make_env({**VISION, "vision_render_size": (300, 200)})
+    hidden = make_env({**VISION, "vision_render": False})
+    frames = [env.render(0, width=120, height=90) for env in (shown, hidden)]
+    differs = (frames[0] != frames[1]).any(-1)
+    assert not differs[31:].any()
+    assert not differs[:, 41:].any()
+
+
+def test_a_robot_without_a_camera_is_an_error(tmp_path):
+    folder = Path(safe_rl.envs.__file__).parent / "robots"
+    text = (folder / "point.xml").read_text().splitlines()
+    blind = tmp_path / "blind.xml"
+    blind.write_text("\n".join(line for line in text if "<camera" not in line))
+    with pytest.raises(ConfigError, match=r"observe_vision.*no camera named 'vision'"):
+        SafetyGymEnv({"robot_base": str(blind), "observe_vision": True})
+
+
+def test_every_environment_has_a_variant_with_vision():
+    debug = [name for name in EXTRAS if not name.endswith("Vision")]
+    assert sorted(debug) == sorted(
+        f"{robot}{task}" for robot in ("Point", "Car", "Doggo") for task in ("Run", "Circle")
+    )
+    assert len(SUITE) == 27
+    for name in (*SUITE, *debug):
+        config = resolve(f"Safexp-{name}Vision-v0")
+        assert config == resolve(name).replace(observe_vision=True, observation_flatten=False)
+
+
+def test_debug_environments():
+    run, circle = resolve("Safexp-CarRun-v0"), resolve("Safexp-DoggoCircle-v0")
+    assert (run.task, run.robot_rot, run.robot_base) == ("x", 0.0, "car")
+    assert (circle.task, circle.lidar_max_dist, circle.robot_base) == ("circle", 6.0, "doggo")
+    assert run.placements_extents == circle.placements_extents == (-1, -1, 1, 1)
+    layout = SafetyGymEnv(run, seed=0).observation_layout
+    assert not [name for name in layout if "lidar" in name]
+    layout = SafetyGymEnv(circle, seed=0).observation_layout
+    assert [name for name in layout if "lidar" in name] == ["circle_lidar"]
