@@ -1,0 +1,157 @@
+"""The house has floors: imports point one way only, and every new module is given its place."""
+
+import ast
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+
+# Which part may import which other ones. Environments, losses, collectors and networks know nothing
+# of each other: what they share are TensorDict keys.
+PARTS = {
+    "envs": (),
+    "objectives": (),
+    "collectors": (),
+    "models": (),
+    "updates": (),
+    "checkpoints": (),
+    "interrupts": (),
+    "openmp": (),
+    "plotting": (),
+    "tables": (),
+    "run_folder": ("plotting", "tables"),
+    "algorithm": ("collectors", "objectives", "updates"),
+    "building": ("algorithm", "models", "objectives"),
+    "training": (
+        *("algorithm", "building", "checkpoints", "collectors", "interrupts"),
+        *("models", "run_folder"),
+    ),
+    "train": ("envs", "openmp", "training"),
+}
+
+# Inside a package a module may import those of the floors below its own.
+FLOORS = {
+    "envs": (
+        ("errors", "rng", "lidar", "physics", "physics.base", "rendering.opengl"),
+        ("tasks", "costs", "robot", "physics.cpu"),
+        ("readings", "validation"),
+        ("config",),
+        ("elements", "suite", "rendering.scenery"),
+        ("bodies", "layout", "rendering.markers"),
+        ("scene",),
+        ("world",),
+        ("episodes", "sensors", "lidar_blocks", "extending", "rendering.display"),
+        ("snapshot", "rendering.viewer", "rendering.vision"),
+        ("observations", "rendering.renderer", "rendering"),
+        ("specs",),
+        ("safety_gym",),
+        ("registration", "gymnasium.conversion", "gymnasium.worlds"),
+        ("gymnasium.single", "gymnasium.vector"),
+        ("gymnasium", ""),
+    ),
+    "objectives": (
+        ("keys", "gaussian", "cpo_dual"),
+        ("advantages", "critics", "multipliers", "normalisation", "trust_region"),
+        ("pid", "surrogate"),
+        ("ppo", "trpo"),
+        ("cpo",),
+        ("",),
+    ),
+    "collectors": (("episodes", "factory"), ("",)),
+}
+
+# Libraries that only one part knows.
+LIBRARIES = {"mujoco": "envs", "gymnasium": "envs", "matplotlib": "plotting"}
+
+
+@dataclass(frozen=True)
+class Import:
+    """One import statement's module, as seen from the module that it stands in."""
+
+    importer: str
+    imported: str
+    only_types: bool  # under `if TYPE_CHECKING`
+
+    def __str__(self) -> str:
+        return f"{self.importer} imports {self.imported}"
+
+
+def module_name(path: Path) -> str:
+    parts = path.relative_to(ROOT).with_suffix("").parts
+    return ".".join(parts).removesuffix(".__init__")
+
+
+PATHS = {module_name(path): path for path in (*ROOT.glob("safe_rl/**/*.py"), ROOT / "train.py")}
+
+
+def imports_of(module: str) -> list[Import]:
+    """Every import of a module, also those inside functions."""
+    tree = ast.parse(PATHS[module].read_text())
+    guarded = {
+        id(node)
+        for block in ast.walk(tree)
+        if isinstance(block, ast.If) and "TYPE_CHECKING" in ast.unparse(block.test)
+        for statement in block.body
+        for node in ast.walk(statement)
+    }
+    found = []
+    for node in ast.walk(tree):
+        names: list[str] = []
+        if isinstance(node, ast.Import):
+            names = [alias.name for alias in node.names]
+        elif isinstance(node, ast.ImportFrom):
+            assert node.level == 0, f"{module}: relative imports hide where they point"
+            # `from package import module` imports the module.
+            full = [f"{node.module}.{alias.name}" for alias in node.names]
+            names = [name if name in PATHS else str(node.module) for name in full]
+        found += [Import(module, name, id(node) in guarded) for name in dict.fromkeys(names)]
+    return found
+
+
+def part_of(module: str) -> str:
+    """The package or top-level module of safe_rl that a module is in, or `train`."""
+    return [*module.split("."), ""][module.startswith("safe_rl")]
+
+
+def floor_of(module: str) -> int:
+    part = part_of(module)
+    inside = module.removeprefix(f"safe_rl.{part}").removeprefix(".")
+    floors = [number for number, modules in enumerate(FLOORS[part]) if inside in modules]
+    assert floors, f"give {module} a floor in FLOORS"
+    return floors[0]
+
+
+INSIDE = [module for module in PATHS if part_of(module)]
+
+
+@pytest.mark.parametrize("module", INSIDE)
+def test_imports_point_one_way(module):
+    part = part_of(module)
+    assert part in PARTS, f"give {part} a row in PARTS"
+    floor = floor_of(module) if part in FLOORS else 0
+    for found in imports_of(module):
+        if found.imported not in PATHS:
+            library = found.imported.split(".")[0]
+            assert LIBRARIES.get(library, part) == part, str(found)
+        elif part_of(found.imported) != part:
+            assert part_of(found.imported) in PARTS[part], str(found)
+        elif not found.only_types:
+            assert floor_of(found.imported) < floor, str(found)
+
+
+def test_the_package_itself_imports_nothing():
+    """So that importing one part never pulls in another."""
+    assert not imports_of("safe_rl")
+
+
+def test_tables_have_no_circles_and_no_ruins():
+    for part, allowed in PARTS.items():
+        above = list(PARTS)[: list(PARTS).index(part)]
+        assert set(allowed) <= set(above), f"{part} must stand below what it imports"
+        assert any(part_of(module) == part for module in PATHS), f"{part} is no more"
+    for part, floors in FLOORS.items():
+        modules = [f"safe_rl.{part}.{name}".rstrip(".") for floor in floors for name in floor]
+        assert len(set(modules)) == len(modules)
+        assert set(modules) <= set(PATHS), "modules that are no more"
