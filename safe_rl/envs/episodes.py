@@ -133,10 +133,15 @@ def place_mocaps(world: World) -> None:
         span = slice(scene.num_free, scene.num_free + scene.num_mocap_slots)
         physics.mocap_pos[:, scene.num_targets :] = world.positions[:, span]
     if scene.num_targets:
-        # Where they were before the last substep, which is what the state was computed with.
+        # Where they were before the last substep, which is what the state was computed with; at
+        # the start they stand where their objects do.
         last = (physics.time - physics.timestep).clamp(min=0.0)
         targets = gremlin_path(world, last, 1)[:, 0, : scene.num_targets]
-        physics.mocap_pos[:, : scene.num_targets] = targets
+        centres = world.layout[:, 1 + scene.guided.start : 1 + scene.guided.stop]
+        height = (0.5 * world.target_height).expand(len(centres), -1)
+        started = (physics.time > 0.0).view(-1, 1, 1)
+        at_start = torch.cat([centres, height.unsqueeze(-1)], -1)
+        physics.mocap_pos[:, : scene.num_targets] = torch.where(started, targets, at_start)
 
 
 def _choose_button(world: World, rows: Tensor, key: Tensor) -> None:
