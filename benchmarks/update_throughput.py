@@ -4,7 +4,7 @@
 
 Networks are tanh perceptrons (256, 256); observations, actions and advantages are random, which
 changes nothing about the work. The line search of a trust-region step takes as many tries as the
-data asks for; their number is printed.
+data asks for; their number is printed. On a busy machine, compare the processor time of one thread.
 """
 
 from __future__ import annotations
@@ -56,15 +56,17 @@ def make_batch(actor, samples: int, observation_size: int) -> TensorDict:
     return batch
 
 
-def measure(update: Callable[[], dict], repeats: int) -> tuple[float, dict]:
-    """Median seconds of an update, the first one (which may compile) left out."""
-    update()
-    seconds, metrics = [], {}
+def measure(update: Callable[[], dict], repeats: int) -> tuple[float, float, dict]:
+    """Median wall-clock and processor seconds of an update, warm-up (and compilation) left out."""
+    for _ in range(2):
+        update()
+    wall, processor, metrics = [], [], {}
     for _ in range(repeats):
-        start = time.perf_counter()
+        start, used = time.perf_counter(), time.process_time()
         metrics = update()
-        seconds.append(time.perf_counter() - start)
-    return statistics.median(seconds), metrics
+        wall.append(time.perf_counter() - start)
+        processor.append(time.process_time() - used)
+    return statistics.median(wall), statistics.median(processor), metrics
 
 
 def one_pass(actor, batch, observation_size: int, minibatch_size: int):
@@ -128,9 +130,9 @@ def main() -> None:
     print(f"{args.samples} samples, observation size {args.observation_size}, {HIDDEN}, "
           f"{args.threads} threads; median of {args.repeats}")  # fmt: skip
     for name, update in updates.items():
-        seconds, metrics = measure(from_the_start(update), args.repeats)
+        wall, processor, metrics = measure(from_the_start(update), args.repeats)
         tries = f", {metrics['backtracks']} backtracks" if "backtracks" in metrics else ""
-        print(f"{name:40s} {seconds:6.2f} s{tries}")
+        print(f"{name:40s} {wall:6.2f} s, {processor:6.2f} s of processor time{tries}")
 
 
 if __name__ == "__main__":
