@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import gymnasium
 import numpy as np
 import torch
-from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv
+from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from tensordict import TensorDictBase
 from torchrl.data import Composite, Unbounded
 from torchrl.envs import GymWrapper, Transform, TransformedEnv
@@ -114,7 +114,6 @@ def from_gymnasium(
     cost_keys: Sequence[str] | None = None,
     num_steps: int | None = None,
     seed: int | None = None,
-    in_processes: bool = False,
     **kwargs: Any,
 ) -> GymnasiumEnv:
     """Make a TorchRL environment of any Gymnasium environment that reports costs in `info`.
@@ -124,12 +123,11 @@ def from_gymnasium(
 
     Args:
         env: Gymnasium id, or a function that makes an environment.
-        num_envs: number of environments, N.
+        num_envs: number of environments, N, stepped one after the other.
         cost_keys: names of the costs in `info`; None finds those called `cost` or `cost_<kind>` by
             taking one step.
         num_steps: the largest number of steps of an episode; None takes what the id says.
         seed: of all environments.
-        in_processes: step each environment in a process of its own, where one step is slow.
         kwargs: for `gymnasium.make`, with an id.
 
     Returns:
@@ -154,8 +152,7 @@ def from_gymnasium(
     def make_adapted() -> gymnasium.Env:
         return adapt(make(), num_steps)
 
-    vectorise = AsyncVectorEnv if in_processes else SyncVectorEnv
-    worlds = vectorise([make_adapted] * num_envs, autoreset_mode=AutoresetMode.DISABLED)
+    worlds = SyncVectorEnv([make_adapted] * num_envs, autoreset_mode=AutoresetMode.DISABLED)
     base = GymWrapper(worlds)
     base.set_info_dict_reader(CostReader(keys, num_envs))
     batch = GymnasiumEnv(base, keys, num_steps)

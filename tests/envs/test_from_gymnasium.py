@@ -1,0 +1,168 @@
+"""Environments that are not ours, with costs in `info`, in TorchRL and under our algorithms."""
+
+import gymnasium
+import numpy as np
+import pytest
+import torch
+from run_configs import compose_config
+from torchrl.envs import RewardSum, TransformedEnv
+from torchrl.envs.utils import check_env_specs
+
+from safe_rl.envs import SafetyGymEnv, from_gymnasium, store_configs
+from safe_rl.tables import read_table
+from safe_rl.training import build_trainer, seed_everything
+
+store_configs()
+
+
+class Costly(gymnasium.Wrapper):
+    """The pendulum with costs for being fast and for being upright."""
+
+    def step(self, action):
+        observation, reward, terminated, truncated, info = self.env.step(action)
+        info["cost_speed"] = float(abs(observation[2]) > 1.0)
+        info["cost_upright"] = max(0.0, float(observation[0]))
+        info["torque"] = float(action[0])
+        return observation, reward, terminated, truncated, info
+
+
+def make_pendulum(**kwargs):
+    return Costly(gymnasium.make("Pendulum-v1", **kwargs))
+
+
+class Counter(gymnasium.Env):
+    """Terminates after as many steps as its seed says; observes what it was and how far it is."""
+
+    observation_space = gymnasium.spaces.Dict(
+        count=gymnasium.spaces.Discrete(5), length=gymnasium.spaces.Box(0, 9, (1,), np.float64)
+    )
+    action_space = gymnasium.spaces.Box(0.0, 10.0, (1,), np.float32)
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.length = self.length if seed is None else seed
+        self.count = 0
+        return self.observe(), {}
+
+    def observe(self):
+        return {"count": self.count, "length": np.array([float(self.length)])}
+
+    def step(self, action):
+        self.count += 1
+        info = {"cost": float(action[0]), "cost_late": float(self.count > 1)}
+        return self.observe(), 1.0, self.count >= self.length, False, info
+
+
+def test_costs_stand_beside_the_reward_and_are_those_of_the_environment():
+    env = from_gymnasium(make_pendulum, num_envs=3, seed=0)
+    assert env.cost_keys == ["cost", "cost_speed", "cost_upright"]
+    assert sorted(env.reward_keys) == [*env.cost_keys, "reward"]
+    step = env.rollout(20)["next"]
+    x, _, speed = step["observation"].split(1, -1)
+    torch.testing.assert_close(step["cost_speed"], (speed.abs() > 1).float())
+    torch.testing.assert_close(step["cost_upright"], x.clamp(min=0))
+    torch.testing.assert_close(step["cost"], step["cost_speed"] + step["cost_upright"])
+    assert 0 < step["cost_speed"].sum() < 60
+
+
+def test_torchrls_checker():
+    check_env_specs(from_gymnasium(make_pendulum, num_envs=2, seed=0))
+
+
+def test_rows_are_reset_apart():
+    env = from_gymnasium(Counter, num_envs=3, num_steps=4, seed=2)
+    rollout = env.rollout(9, break_when_any_done=False)
+    # Episodes of 2, 3 and 4 steps, the last of which ends by its own and by the limit.
+    ends = [[1, 3, 5, 7], [2, 5, 8], [3, 7]]
+    done = rollout["next", "done"].squeeze(-1)
+    assert [row.nonzero().flatten().tolist() for row in done] == ends
+    torch.testing.assert_close(rollout["next", "terminated"], rollout["next", "done"])
+    assert rollout["next", "truncated"].squeeze(-1).sum(1).tolist() == [0, 0, 2]
+    counts = rollout["next", "observation"][..., :5].argmax(-1)
+    assert counts[1].tolist() == [1, 2, 3] * 3
+    assert (rollout["next", "cost_late"].squeeze(-1) == (counts > 1)).all()
+
+
+def test_any_observation_becomes_a_vector_and_actions_are_stretched():
+    env = from_gymnasium(Counter, num_steps=9, seed=4)
+    assert env.cost_keys == ["cost", "cost_late"]
+    tensordict = env.reset()
+    assert tensordict["observation"].tolist() == [[1, 0, 0, 0, 0, 4]]
+    assert tensordict["observation"].dtype == torch.float32
+    for action, cost in ((-1.0, 0.0), (0.5, 7.5), (3.0, 10.0)):
+        tensordict["action"] = torch.tensor([[action]])
+        tensordict = env.step(tensordict)
+        assert tensordict["next", "cost"].item() == pytest.approx(cost)
+        tensordict = env.step_mdp(tensordict)
+
+
+def test_ids_are_made_with_their_arguments_and_chosen_costs():
+    env = from_gymnasium(
+        "Safexp-PointGoal1-v0",
+        num_envs=2,
+        num_steps=7,
+        cost_keys=["cost_hazards"],
+        seed=3,
+        config={"lidar_num_bins": 8},
+    )
+    assert env.cost_keys == ["cost", "cost_hazards"]
+    assert env.observation_layout == {"observation": slice(0, 12 + 3 * 8)}
+    assert env.config.num_steps == 7
+    assert env.rollout(20).shape == (2, 7)
+
+
+def test_our_own_environment_comes_back_as_it_was():
+    there_and_back = from_gymnasium("Safexp-CarGoal2-v0", num_steps=1000, seed=4)
+    ours = SafetyGymEnv("CarGoal2", seed=4)
+    ours.reset()  # seeding through Gymnasium is a reset, so the next one starts another episode
+    torch.manual_seed(0)
+    expected = ours.rollout(50)
+    torch.manual_seed(0)
+    rollout = there_and_back.rollout(50)
+    for key in ("observation", "reward", *ours.cost_keys, "done"):
+        torch.testing.assert_close(rollout["next", key], expected["next", key], rtol=0, atol=0)
+
+
+def test_episode_sums():
+    env = from_gymnasium(make_pendulum, num_envs=2, seed=0)
+    summed = TransformedEnv(env, RewardSum(in_keys=["reward", "cost"]))
+    step = summed.rollout(10)["next"]
+    torch.testing.assert_close(step["episode_cost"][:, -1], step["cost"].sum(1))
+
+
+def test_a_seed_determines_everything():
+    starts = [from_gymnasium(make_pendulum, num_envs=2, seed=s).reset() for s in (1, 1, 2)]
+    assert (starts[0] == starts[1]).all()
+    assert (starts[0]["observation"] != starts[2]["observation"]).any()
+    assert (starts[0]["observation"][0] != starts[0]["observation"][1]).any()
+
+
+def test_our_algorithms_train_on_it(tmp_path):
+    config = compose_config(
+        "algo=ppo_lagrangian",
+        "cost_limits={cost_speed: 50.0, cost: 60.0}",
+        "frames=1600",
+        "num_envs=4",
+        "frames_per_batch=800",
+        "model.hidden_sizes=[16]",
+        "policy_update.minibatch_size=200",
+        "critic_update.minibatch_size=200",
+        "logger=none",
+    )
+    seed_everything(0, None)
+    env = from_gymnasium(make_pendulum, num_envs=4, seed=0)
+    build_trainer(config, env, tmp_path).run()
+    table = read_table(tmp_path / "progress.csv")
+    assert table["episodes"] == [4, 4]
+    assert table["episode_length"] == [200, 200]
+    assert all(cost > 0 for cost in table["episode_cost_speed"])
+    assert table["multiplier_cost_speed"][0] != table["multiplier_cost_speed"][1]
+
+
+def test_errors_say_what_to_change():
+    with pytest.raises(ValueError, match=r"reports no costs.*name it in 'cost_keys'"):
+        from_gymnasium("Pendulum-v1")
+    with pytest.raises(ValueError, match=r"continuous, bounded actions.*Discrete"):
+        from_gymnasium("CartPole-v1")
+    with pytest.raises(ValueError, match="give 'num_steps'"):
+        from_gymnasium(Counter)
