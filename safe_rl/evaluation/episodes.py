@@ -1,0 +1,96 @@
+"""Whole episodes of a fixed policy."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+from torchrl.envs import EnvBase
+from torchrl.envs.utils import ExplorationType, set_exploration_type
+from tqdm import tqdm
+
+from safe_rl.models import BehaviourPolicy
+
+__all__ = ["Episodes", "collect_episodes", "exploration"]
+
+
+@dataclass(frozen=True)
+class Episodes:
+    """What happened in E whole episodes.
+
+    Attributes:
+        returns: Undiscounted returns, shape [E].
+        lengths: Steps, shape [E].
+        costs: Cost key -> undiscounted costs, shape [E].
+    """
+
+    returns: Tensor
+    lengths: Tensor
+    costs: dict[str, Tensor]
+
+
+def exploration(deterministic: bool) -> set_exploration_type:
+    """Within it, policies act with their mean or sample."""
+    kind = ExplorationType.DETERMINISTIC if deterministic else ExplorationType.RANDOM
+    return set_exploration_type(kind)
+
+
+@torch.no_grad()
+def collect_episodes(
+    env: EnvBase,
+    policy: BehaviourPolicy,
+    num_episodes: int,
+    cost_keys: Sequence[str],
+    *,
+    deterministic: bool,
+    progress: bool = False,
+) -> Episodes:
+    """Run a policy for exactly ``num_episodes`` episodes.
+
+    How many episodes each world contributes is fixed before the first step. Taking whichever
+    episodes end first would favour short ones.
+
+    Args:
+        env: Batched environment, batch_size [N].
+        policy: What acts.
+        num_episodes: E; worlds whose share is done go on unobserved until the last one is.
+        cost_keys: Keys of the costs to sum, below "next".
+        deterministic: Whether the policy acts with its mean.
+        progress: Whether to show a bar.
+
+    Examples:
+        >>> from safe_rl.envs import make_env
+        >>> from safe_rl.models import make_actor
+        >>> env = make_env({"robot_base": "point", "num_steps": 5}, num_envs=2, seed=0)
+        >>> size = env.observation_spec["observation"].shape[-1]
+        >>> policy = BehaviourPolicy(make_actor(size, 2, hidden_sizes=[8], initial_log_std=-0.5))
+        >>> collect_episodes(env, policy, 3, env.cost_keys, deterministic=True).lengths
+        tensor([5., 5., 5.], dtype=torch.float64)
+    """
+    num_envs = env.batch_size.numel()
+    quota = num_episodes // num_envs + (torch.arange(num_envs) < num_episodes % num_envs).long()
+    finished = torch.zeros(num_envs, dtype=torch.long)
+    # float64: sums of indicator costs are exact
+    sums = torch.zeros(num_envs, 2 + len(cost_keys), dtype=torch.float64)
+    rows: list[tuple[Tensor, Tensor]] = []  # world numbers [e], sums of their episodes [e, m]
+    state = env.reset()
+    with exploration(deterministic), tqdm(total=num_episodes, disable=not progress) as bar:
+        while (finished < quota).any():
+            step, state = env.step_and_maybe_reset(policy(state))
+            after = step["next"]
+            signals = [torch.ones_like(after["reward"]), after["reward"]]
+            signals += [after[key] for key in cost_keys]
+            sums += torch.cat(signals, -1).to(sums)
+            done = after["done"].squeeze(-1).cpu()
+            if done.any():
+                counts = done & (finished < quota)
+                rows.append((counts.nonzero().squeeze(-1), sums[counts]))
+                finished += counts
+                sums[done] = 0.0
+                bar.update(int(counts.sum()))
+    # by world, so that the table does not depend on which episode happened to end first
+    order = torch.cat([worlds for worlds, _ in rows]).argsort(stable=True)
+    lengths, returns, *costs = torch.cat([ended for _, ended in rows])[order].unbind(-1)
+    return Episodes(returns, lengths, dict(zip(cost_keys, costs, strict=True)))

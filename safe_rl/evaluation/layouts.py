@@ -1,0 +1,54 @@
+"""Whether an evaluation shows a policy layouts that it was trained on."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+__all__ = ["default_seed", "shared_layouts"]
+
+# Far from any seed that a person counts up from a run's own.
+_OFFSET = 1_000_000_007
+
+
+def default_seed(env: Mapping[str, Any], training_seed: int) -> int:
+    """Seed of an evaluation: another than training's, so that neither layouts nor noise repeat.
+
+    Where the layout is fixed it is drawn from the seed, and belongs to what was learned; then it
+    is training's.
+    """
+    return training_seed + (_OFFSET if env["randomize_layout"] else 0)
+
+
+def shared_layouts(
+    trained: Mapping[str, Any], evaluated: Mapping[str, Any], *, same_seed: bool
+) -> float:
+    """Share of the evaluation's layouts that training could have met, in [0, 1].
+
+    Args:
+        trained: Environment of the training: `randomize_layout`, `layout_seeds` and
+            `layout_seeds_first` count here.
+        evaluated: That of the evaluation.
+        same_seed: Whether both draw from the same seed.
+
+    Examples:
+        >>> finite = {"randomize_layout": True, "layout_seeds": 10, "layout_seeds_first": 0}
+        >>> shared_layouts(finite, {**finite, "layout_seeds_first": 8}, same_seed=False)
+        0.2
+        >>> shared_layouts(finite, {**finite, "layout_seeds": None}, same_seed=False)
+        0.0
+    """
+    sizes = [
+        env.get("layout_seeds") if env["randomize_layout"] else None for env in (trained, evaluated)
+    ]
+    if sizes[0] is None or sizes[1] is None:
+        alike = (
+            sizes[0] is sizes[1] and trained["randomize_layout"] == evaluated["randomize_layout"]
+        )
+        return float(alike and same_seed)
+    ranges = [
+        range(env["layout_seeds_first"], env["layout_seeds_first"] + size)
+        for env, size in zip((trained, evaluated), sizes, strict=True)
+    ]
+    common = min(r.stop for r in ranges) - max(r.start for r in ranges)
+    return max(0, common) / len(ranges[1])

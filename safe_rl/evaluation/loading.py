@@ -1,0 +1,102 @@
+"""From a run's folder to its environment and its trained policy."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import torch
+from omegaconf import DictConfig, OmegaConf
+from torchrl.checkpoint import CheckpointError, CheckpointRotation
+from torchrl.envs import EnvBase
+
+from safe_rl.building import build_networks
+from safe_rl.checkpoints import CheckpointStore
+from safe_rl.models import BehaviourPolicy
+
+__all__ = ["checkpoint_steps", "find_checkpoint", "load_config", "load_policy", "override_env"]
+
+
+def load_config(directory: Path) -> DictConfig:
+    """Read the resolved configuration of a run.
+
+    Raises:
+        FileNotFoundError: If the folder is not that of a run; runs below it are named.
+    """
+    path = directory / "config.yaml"
+    if not path.is_file():
+        below = sorted({table.parent for table in directory.glob("**/progress.csv")})
+        hint = f" Runs below it: {', '.join(map(str, below[:5]))}." if below else ""
+        raise FileNotFoundError(f"{directory} is not the folder of a run: no config.yaml.{hint}")
+    config = OmegaConf.load(path)
+    if not isinstance(config, DictConfig) or not {"env", "model"} <= set(config):
+        raise ValueError(f"{path} is not the configuration of a run: it needs 'env' and 'model'.")
+    return config
+
+
+def override_env(config: DictConfig, overrides: Mapping[str, Any]) -> dict[str, Any]:
+    """The run's environment with some keys changed; their names are checked where it is made."""
+    return {**OmegaConf.to_container(config.env, resolve=True), **overrides}  # type: ignore[dict-item]
+
+
+def find_checkpoint(directory: Path, which: str) -> Path:
+    """Return the path of a run's checkpoint.
+
+    Args:
+        directory: Folder of the run.
+        which: "last", "best", or a path.
+
+    Raises:
+        FileNotFoundError: If there is none; the message says why and what there is.
+    """
+    kinds = ("last", "best")
+    if which not in kinds:
+        path = Path(which)
+        if not path.exists():
+            raise FileNotFoundError(
+                f"There is no checkpoint '{which}': checkpoint is last, best or the path of a file."
+            )
+        return path
+    found = {
+        kind: CheckpointRotation(directory / "checkpoints" / kind, keep_last=1).latest()
+        for kind in kinds
+    }
+    path = found.pop(which)
+    if path is None:
+        reason = {"last": "it has not saved one yet", "best": "no epoch kept every cost limit"}
+        others = [f"checkpoint={kind}" for kind, other in found.items() if other is not None]
+        hint = f" Use {others[0]}." if others else ""
+        raise FileNotFoundError(f"{directory} has no {which} checkpoint: {reason[which]}.{hint}")
+    return path
+
+
+def checkpoint_steps(checkpoint: Path) -> int | None:
+    """Environment steps that a checkpoint's name carries, if it does."""
+    number = checkpoint.stem.rpartition("-")[2]
+    return int(number) if number.isdigit() else None
+
+
+def load_policy(
+    config: DictConfig, env: EnvBase, checkpoint: Path, device: torch.device
+) -> BehaviourPolicy:
+    """Build the run's actor and give it the weights of a checkpoint.
+
+    Only weights are read: neither the checkpoint nor the configuration can make code run.
+
+    Raises:
+        CheckpointError: If the file is no checkpoint, or its actor does not fit the environment.
+    """
+    actor = build_networks(config.model, env, 0, device).actor
+    try:
+        CheckpointStore.load(checkpoint, {"actor": actor})
+    except CheckpointError as error:
+        if "size mismatch" not in str(error):
+            raise
+        size = env.observation_spec["observation"].shape[-1]
+        raise CheckpointError(
+            f"The policy in {checkpoint} was trained on other observations or actions than this "
+            f"environment's ({size} numbers, {env.action_spec.shape[-1]} actions): undo the env.… "
+            "override that changes them."
+        ) from error
+    return BehaviourPolicy(actor).eval()

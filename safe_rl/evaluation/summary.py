@@ -1,0 +1,106 @@
+"""From episodes to estimates, and how these are written."""
+
+from __future__ import annotations
+
+import csv
+import json
+import math
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from safe_rl.evaluation.episodes import Episodes
+from safe_rl.intervals import Estimate, cvar, mean, share_over
+from safe_rl.protocol import Scores, normalised_return, normalised_violation
+
+__all__ = ["format_estimates", "summarise", "write_episodes", "write_summary"]
+
+
+def summarise(
+    episodes: Episodes,
+    cost_limits: Mapping[str, float],
+    reference: Scores | None,
+    cvar_alpha: float,
+) -> dict[str, Estimate]:
+    """Estimate everything that is reported of an evaluation.
+
+    Args:
+        episodes: What happened.
+        cost_limits: Cost key -> d, undiscounted cost per episode.
+        reference: Characteristic metrics of the environment, for normalised scores; or None.
+        cvar_alpha: Share of the costliest episodes that the CVaR is the mean of.
+
+    Returns:
+        Estimates by name: ``episode_return``, ``episode_length``, ``episode_<key>`` for every cost
+        key; for those with a limit (the aggregate cost where none has) ``cvar_<key>`` and
+        ``over_limit_<key>``; ``normalised_return`` and ``normalised_violation``.
+
+    Examples:
+        >>> import torch
+        >>> two = torch.tensor([1.0, 3.0])
+        >>> episodes = Episodes(two, two, {"cost": torch.tensor([10.0, 30.0])})
+        >>> summary = summarise(episodes, {"cost": 25.0}, None, cvar_alpha=0.5)
+        >>> [summary[name].value for name in ("episode_cost", "cvar_cost", "over_limit_cost")]
+        [20.0, 30.0, 0.5]
+    """
+    estimates = {
+        "episode_return": mean(episodes.returns),
+        "episode_length": mean(episodes.lengths),
+    }
+    estimates |= {f"episode_{key}": mean(costs) for key, costs in episodes.costs.items()}
+    for key in cost_limits or ["cost"]:
+        estimates[f"cvar_{key}"] = cvar(episodes.costs[key], cvar_alpha)
+        if key in cost_limits:
+            over = share_over(episodes.costs[key], cost_limits[key])
+            estimates[f"over_limit_{key}"] = over
+    if reference is not None:
+        estimates["normalised_return"] = Estimate(
+            *map(float, normalised_return(estimates["episode_return"], reference))
+        )
+    if reference is not None and "cost" in cost_limits:
+        # monotone in J_c, so the interval's ends are those of J_c
+        violation = normalised_violation(estimates["episode_cost"], cost_limits["cost"], reference)
+        estimates["normalised_violation"] = Estimate(*map(float, violation))
+    return estimates
+
+
+def format_estimates(
+    estimates: Mapping[str, Estimate], cost_limits: Mapping[str, float]
+) -> list[str]:
+    """Lines of a table for the terminal."""
+    width = max(map(len, estimates))
+    lines = [f"{'':{width}} {'estimate':>10}   95 % interval"]
+    for name, estimate in estimates.items():
+        key = name.removeprefix("episode_")
+        limit = f"   limit {cost_limits[key]:g}" if key in cost_limits else ""
+        interval = f"[{_number(estimate.low)}, {_number(estimate.high)}]"
+        lines.append(f"{name:{width}} {_number(estimate.value):>10}   {interval}{limit}")
+    return lines
+
+
+def _number(value: float) -> str:
+    return "—" if math.isnan(value) else f"{value:.4g}"
+
+
+def write_summary(path: Path, facts: Mapping[str, Any], estimates: Mapping[str, Estimate]) -> None:
+    """Write facts and estimates as JSON; what is not a number becomes null."""
+    content = {
+        **facts,
+        "estimates": {
+            name: {
+                part: None if math.isnan(value) else value
+                for part, value in estimate._asdict().items()
+            }
+            for name, estimate in estimates.items()
+        },
+    }
+    path.write_text(json.dumps(content, indent=2, ensure_ascii=False, allow_nan=False) + "\n")
+
+
+def write_episodes(path: Path, episodes: Episodes) -> None:
+    """Write one row per episode as CSV."""
+    columns = {"return": episodes.returns, "length": episodes.lengths, **episodes.costs}
+    with path.open("w", newline="") as file:
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow(columns)
+        writer.writerows(zip(*(column.tolist() for column in columns.values()), strict=True))
