@@ -62,7 +62,8 @@ def square_distances(angles: np.ndarray, centre: tuple[float, float], half: floa
     """Distance from the origin to an upright square along rays: the slab method."""
     ways = np.stack([np.cos(angles), np.sin(angles)])
     middle = np.array(centre)[:, None]
-    bounds = np.stack([(middle - half) / ways, (middle + half) / ways])
+    with np.errstate(divide="ignore"):  # rays along a face never leave its slab
+        bounds = np.stack([(middle - half) / ways, (middle + half) / ways])
     near, far = bounds.min(0).max(0), bounds.max(0).min(0)
     return np.where((near <= far) & (near > 0), near, np.inf)
 

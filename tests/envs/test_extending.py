@@ -1,0 +1,248 @@
+"""Rows from outside the package are placed, simulated, observed and charged like built-in ones."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from crafting import arrange, step_from
+from registrations import cube, disc, inside, register_mines, undone
+from torchrl.envs.utils import check_env_specs
+
+from safe_rl.envs import SUITE, ConfigError, SafetyGymEnv
+from safe_rl.envs.extending import (
+    Cost,
+    Motion,
+    NextGoal,
+    Reading,
+    Task,
+    contact_cost,
+    register_cost,
+    register_element,
+    register_observation,
+    register_robot,
+    register_task,
+)
+from safe_rl.envs.robot import ROBOTS
+
+POINT = {"robot_base": "point", "task": "none", "sensors_obs": ["gyro"]}
+MINES = {"mines_num": 2, "observe_mines": True, "constrain_mines": True}
+
+
+@pytest.fixture(autouse=True)
+def _undone():
+    with undone():
+        yield
+
+
+def make(config: dict, num_envs: int = 1) -> SafetyGymEnv:
+    env = SafetyGymEnv({**POINT, **config}, num_envs=num_envs, seed=0, sleep=False, num_threads=1)
+    env.reset()
+    return env
+
+
+def component(env, observation: torch.Tensor, name: str) -> np.ndarray:
+    return observation[0, env.observation_layout[name]].double().numpy()
+
+
+def test_areas_are_placed_seen_and_cost():
+    register_mines()
+    env = make({**MINES, "constrain_indicator": False, "lidar_alias": False, "lidar_num_bins": 4})
+    assert env.object_names == ("mine0", "mine1")
+    assert env.cost_keys == ["cost", "cost_mines", "cost_exception"]
+    state = arrange(env, robot=(0, 0, 0), mine0=(0.1, 0.1), mine1=(0, -2))
+    reading = component(env, env.set_state(state)["observation"], "mines_lidar")
+    np.testing.assert_allclose(reading, [math.exp(-math.sqrt(0.02)), 0, 0, math.exp(-2)], rtol=1e-6)
+    result = step_from(env, state, 0.0, 0.0)
+    assert float(result["cost_mines"]) == float(result["cost"]) == 2.5
+    assert not step_from(env, arrange(env, mine0=(0.5, 0)), 0.0, 0.0)["cost"].any()
+    check_env_specs(env)
+
+
+def test_layouts_keep_clear_of_registered_objects():
+    register_mines()
+    config = {**MINES, "mines_num": 6, "mines_placements": [[0, -2, 2, 2]], "hazards_num": 3}
+    env = make({**config, "task": "goal"}, num_envs=200)
+    layout = env.get_state()["layout"]
+    names = ["robot", *env.object_names]
+    keepout = {"robot": 0.4, "goal": 0.4, "hazard": 0.4, "mine": 0.3}
+    keepouts = torch.tensor([keepout[name.rstrip("0123456789")] for name in names])
+    distance = torch.cdist(layout, layout) + 1e3 * torch.eye(len(names))
+    assert (distance >= keepouts + keepouts.unsqueeze(1) - 1e-9).all()
+    mines = layout[:, [i for i, name in enumerate(names) if name.startswith("mine")]]
+    assert 0.3 <= float(mines[..., 0].min()) < 0.4
+    assert 1.6 < float(mines[..., 0].max()) <= 1.7
+    pinned = make({**config, "mines_locations": [[1.0, 1.5]]}, num_envs=5).get_state()["layout"]
+    expected = torch.tensor([1.0, 1.5], dtype=torch.float64).expand(5, 2)
+    torch.testing.assert_close(pinned[:, names.index("mine0") - 1], expected, atol=1e-8, rtol=0)
+
+
+def test_static_bodies_stop_the_robot_and_contacts_can_cost():
+    register_element(cube("bollards", "bollard", Motion.STATIC))
+    cost = Cost(
+        "cost_bollards",
+        active=lambda c: c.constrain_bollards,
+        magnitude=lambda c, w: contact_cost(w.contacts_with("bollards")),
+        touches=("bollards",),
+    )
+    register_cost(cost, keys={"constrain_bollards": False})
+    env = make({"bollards_num": 1, "constrain_bollards": True})
+    tensordict = env.set_state(arrange(env, robot=(0, 0, 0), bollard0=(0.6, 0)))
+    costs = []
+    for _ in range(150):
+        tensordict["action"] = torch.tensor([[1.0, 0.0]])
+        tensordict = env.step(tensordict)
+        costs.append(float(tensordict["next", "cost_bollards"]))
+        tensordict = env.step_mdp(tensordict)
+    # The robot's arrow reaches 0.15 m ahead, the bollard 0.1 m back.
+    assert float(env.get_state()["qpos"][0, 0]) == pytest.approx(0.6 - 0.1 - 0.15, abs=5e-3)
+    assert costs[0] == 0.0
+    assert costs[-1] == 1.0
+
+
+def test_contacts_that_nothing_counts_are_an_error_that_says_so():
+    cost = Cost("cost_walls", lambda c: True, lambda c, w: contact_cost(w.contacts_with("walls")))
+    register_cost(cost)
+    with pytest.raises(KeyError, match=r"'walls'.*'touches'"):
+        make({"walls_num": 1}).rollout(1)
+
+
+def test_free_bodies_are_pushed_and_have_a_density():
+    register_element(cube("crates", "crate", Motion.FREE), keys={"crates_density": 0.5})
+    env = make({"crates_num": 1, "crates_rots": [0.3], "vases_num": 1, "task": "push"})
+    assert env.object_names == ("vase0", "box", "crate0", "goal")
+    state = env.get_state()
+    assert state["qpos"].shape == (1, 3 + 3 * 7)
+    quat = torch.tensor([[math.cos(0.15), 0, 0, math.sin(0.15)]], dtype=torch.float64)
+    torch.testing.assert_close(state["qpos"][:, -4:], quat)
+    model = env._world.scene.model
+    assert model.body("crate0").mass[0] == pytest.approx(0.5 * 0.2**3)
+    assert model.body("vase0").mass[0] == pytest.approx(0.001 * 0.2**3)
+
+
+def test_guided_bodies_run_circles_of_their_own():
+    register_element(cube("drones", "drone", Motion.GUIDED, group=5), keys={"drones_travel": 0.6})
+    env = make({"drones_num": 1, "gremlins_num": 1, "robot_locations": [[9, 9]]})
+    assert env.object_names == ("gremlin0", "drone0")
+    tensordict, radii = env.reset(), []
+    for _ in range(400):
+        tensordict["action"] = torch.zeros(1, 2)
+        tensordict = env.step_mdp(env.step(tensordict))
+        state = env.get_state()
+        offset = state["qpos"][0, 3:].view(2, 7)[:, :2] - state["layout"][0, 1:]
+        radii.append(offset.norm(dim=-1))
+    # Dragged by a stiff damped spring, they run close to their targets' circles.
+    torch.testing.assert_close(
+        torch.stack(radii)[200:].mean(0), torch.tensor([0.3, 0.6]).double(), rtol=0.02, atol=0
+    )
+    heights = env.get_state()["qpos"][0, 3:].view(2, 7)[:, 2]
+    torch.testing.assert_close(heights, torch.tensor([0.2, 0.2]).double(), atol=5e-3, rtol=0)
+
+
+def follow(config, world, before, now) -> torch.Tensor:
+    return config.reward_follow * (before - now)[:, 0]
+
+
+FOLLOW = Task(
+    reward=follow,
+    measure=lambda w: (w.at("beacon")[:, :, :2] - w.robot_pos[:, None, :2]).norm(dim=-1),
+    elements=("beacon",),
+)
+
+
+def test_tasks_bring_objects_and_keys():
+    register_element(disc("beacon", "beacon"), keys={"beacon_size": 0.2})
+    register_task("follow", FOLLOW, keys={"reward_follow": 3.0})
+    assert make({}).object_names == ()
+    env = make({"task": "follow", "observe_beacon": True})
+    assert env.object_names == ("beacon",)
+    assert "beacon_lidar" in env.observation_layout
+    state = arrange(env, robot=(0, 0, 0), beacon=(2, 0))
+    state["qvel"][:, 0] = 0.5
+    result, after = step_from(env, state, 0.0, 0.0), env.get_state()
+    assert float(after["qpos"][0, 0]) > 5e-3
+    assert float(result["reward"]) == pytest.approx(3.0 * float(after["qpos"][0, 0]), rel=1e-5)
+    with pytest.raises(ConfigError, match=r"'folow'.*'follow'"):
+        make({"task": "folow"})
+
+
+def test_tasks_with_goals_of_their_own():
+    register_task(
+        "visit",
+        Task(
+            reward=lambda c, w, before, now: torch.zeros_like(now[:, 0]),
+            measure=lambda w: (w.at("goal")[..., :2] - w.robot_pos[:, None, :2]).norm(dim=-1),
+            met=lambda c, w, now: now[:, 0] < c.visit_radius,
+            next_goal=NextGoal.POSITION,
+            elements=("goal",),
+        ),
+        keys={"visit_radius": 1.5},
+    )
+    env = make({"task": "visit", "observe_goal_dist": True})
+    result = step_from(env, arrange(env, robot=(0, 0, 0), goal=(1.4, 0)), 0.0, 0.0)
+    assert bool(result["goal_met"])
+    assert float(result["reward"]) == 1.0
+    assert not torch.allclose(env.get_state()["goal_pos"][0, :2], torch.tensor([1.4, 0]).double())
+    assert not step_from(env, arrange(env, robot=(0, 0, 0), goal=(1.6, 0)), 0.0, 0.0)["goal_met"]
+
+
+def test_observations_are_sorted_in_and_may_feel_contacts():
+    touch = Reading(
+        "feel",
+        present=lambda c: c.observe_feel,
+        size=lambda c, scene: c.pillars_num,
+        read=lambda w: w.contacts_with("pillars"),
+        touches=("pillars",),
+    )
+    register_observation(touch, keys={"observe_feel": False})
+    assert "feel" not in make({}).observation_layout
+    env = make({"observe_feel": True, "pillars_num": 2, "observe_pillars": True})
+    assert list(env.observation_layout) == ["feel", "gyro", "pillars_lidar"]
+    state = arrange(env, robot=(0, 0, math.pi), pillar0=(3, 3), pillar1=(0.299, 0))
+    np.testing.assert_array_equal(
+        component(env, env.set_state(state)["observation"], "feel"), [0, 1]
+    )
+    check_env_specs(env)
+
+
+def test_robots_by_name(tmp_path):
+    source, slow = ROBOTS["point"].read_text(), 'gear=".3 0 0 0 0 0" site'
+    assert slow in source
+    path = tmp_path / "mine.xml"
+    path.write_text(source.replace(slow, slow.replace(".3", ".6")))
+    register_robot("mine", path)
+    ways = []
+    for robot in ("point", "mine"):
+        env = make({"robot_base": robot, "robot_locations": [[0, 0]], "robot_rot": 0.0})
+        env.step(env.reset().set("action", torch.tensor([[1.0, 0.0]])))
+        ways.append(float(env.get_state()["qpos"][0, 0]))
+    assert ways[1] == pytest.approx(2 * ways[0], rel=0.05)
+    with pytest.raises(ConfigError, match=r"built-in robot"):
+        register_robot("car", path)
+
+
+def test_the_suite_stays_what_it_was():
+    def rollout():
+        env = SafetyGymEnv("CarButton1", num_envs=3, seed=1, num_threads=1)
+        torch.manual_seed(0)
+        return env.rollout(5)
+
+    before = rollout()
+    register_mines()
+    register_element(cube("drones", "drone", Motion.GUIDED))
+    register_element(cube("crates", "crate", Motion.FREE))
+    after = rollout()
+    assert SUITE["CarButton1"].drones_num == 0
+    assert set(before.keys(True, True)) == set(after.keys(True, True))
+    assert all(torch.equal(before[key], after[key]) for key in before.keys(True, True))
+
+
+def test_registering_again_replaces_the_row():
+    register_mines()
+    make(MINES)
+    register_element(disc("mines", "bomb"), keys={"mines_size": 0.4})
+    register_cost(Cost("cost_mines", lambda c: c.constrain_mines, lambda c, w: 7.0 * inside(c, w)))
+    env = make({**MINES, "constrain_indicator": False, "hazards_num": 1})
+    assert env.object_names == ("hazard0", "bomb0", "bomb1")
+    result = step_from(env, arrange(env, robot=(0, 0), bomb0=(0.3, 0), bomb1=(5, 5)), 0.0, 0.0)
+    assert float(result["cost_mines"]) == 7.0 * 2.5

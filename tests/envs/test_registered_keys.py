@@ -1,0 +1,145 @@
+"""Keys registered from outside the package: validation, pickling, Hydra, and refused rows."""
+
+import pickle
+
+import pytest
+import torch
+from hydra import compose, initialize_config_dir
+from hydra.errors import ConfigCompositionException
+from omegaconf import OmegaConf
+from registrations import disc, register_mines, undone
+from run_configs import CONF
+
+from safe_rl.envs import ConfigError, SafetyGymConfig, SafetyGymEnv, make_env, store_config
+from safe_rl.envs.extending import (
+    Cost,
+    Key,
+    Reading,
+    Task,
+    register_cost,
+    register_element,
+    register_observation,
+    register_task,
+)
+
+POINT = {"robot_base": "point", "task": "none", "sensors_obs": ["gyro"]}
+
+
+@pytest.fixture(autouse=True)
+def _undone():
+    with undone():
+        yield
+
+
+def follow(config, world, before, now) -> torch.Tensor:
+    return (before - now)[:, 0]
+
+
+FOLLOW = Task(reward=follow, elements=("beacon",))
+
+
+def test_registered_keys_are_keys_like_the_others():
+    before = SafetyGymConfig(robot_base="point")
+    register_mines()
+    config = SafetyGymConfig(**POINT, mines_num=2)
+    assert (config.mines_size, config.mines_keepout, config.mines_cost) == (0.2, 0.3, 2.5)
+    with pytest.raises(ConfigError, match=r"'mine_num'.*'mines_num'"):
+        SafetyGymConfig.from_dict({"mine_num": 2})
+    with pytest.raises(ConfigError, match=r"'mines_num'.*integer"):
+        config.replace(mines_num=1.5)
+    with pytest.raises(ConfigError, match=r"'mines_size'.*greater than 0"):
+        config.replace(mines_size=0.0)
+    with pytest.raises(AttributeError):
+        config.mines_num = 3
+    assert pickle.loads(pickle.dumps(config)) == config
+    assert hash(pickle.loads(pickle.dumps(config))) == hash(config)
+    assert config.replace(mines_num=0) != config
+    # What was made before has the defaults of what it does not know.
+    assert before.mines_num == 0
+    assert before.to_dict() == SafetyGymConfig(robot_base="point").to_dict()
+    assert before.replace(mines_num=1).mines_num == 1
+
+
+def compose_env(*overrides: str):
+    with initialize_config_dir(str(CONF), version_base="1.3"):
+        return compose("config", overrides=list(overrides)).env
+
+
+def test_hydra_knows_registered_keys_and_configurations():
+    register_mines()
+    store_config("PointMines", {**POINT, "mines_num": 2})
+    node = compose_env("env=PointMines", "env.mines_num=4")
+    assert (node.name, node.mines_num, node.mines_cost) == ("PointMines", 4, 2.5)
+    env = make_env(OmegaConf.to_container(node, resolve=True), num_envs=2)
+    assert len(env.object_names) == 4
+    with pytest.raises(ConfigCompositionException, match=r"mine_num"):
+        compose_env("env=PointMines", "env.mine_num=4")
+
+
+WRONG = {
+    "a built-in element": (lambda: register_element(disc("vases", "jug")), "'vases'.*built-in"),
+    "a label in use": (lambda: register_element(disc("jugs", "vase")), "'vase'.*label"),
+    "a built-in task": (lambda: register_task("goal", FOLLOW), "'goal'.*built-in"),
+    "an unknown element": (lambda: register_task("follow", FOLLOW), "'beacon'.*Register"),
+    "a goal that is missing": (
+        lambda: register_task("visit", Task(follow, met=lambda c, w, now: now[:, 0] < 1)),
+        "'visit'.*'goal'",
+    ),
+    "the aggregate cost": (lambda: register_cost(Cost("cost", bool, follow)), "'cost'.*built-in"),
+    "a cost by another name": (lambda: register_cost(Cost("mines", bool, follow)), "'cost_'"),
+    "contacts with nothing known": (
+        lambda: register_cost(Cost("cost_mines", bool, follow, touches=("pilars",))),
+        "'pilars'.*'pillars'",
+    ),
+    "a built-in observation": (
+        lambda: register_observation(Reading("com", bool, len, len)),
+        "'com'.*built-in",
+    ),
+    "a built-in key": (
+        lambda: register_element(disc("mines", "mine"), keys={"num_steps": 3}),
+        "'num_steps'.*taken",
+    ),
+    "a default of the wrong type": (
+        lambda: register_element(disc("mines", "mine"), keys={"mines_num": "many"}),
+        "'mines_num'.*integer",
+    ),
+    "a default out of range": (
+        lambda: register_element(disc("mines", "mine"), keys={"mines_size": -1.0}),
+        "'mines_size'.*greater than 0",
+    ),
+    "a default without a type": (
+        lambda: register_element(disc("mines", "mine"), keys={"mines_fuse": None}),
+        "'mines_fuse'.*Key",
+    ),
+    "an unknown type": (
+        lambda: register_element(disc("mines", "mine"), keys={"mines_fuse": Key(None, "Fuse")}),
+        "'mines_fuse'",
+    ),
+}
+
+
+@pytest.mark.parametrize(("register", "message"), WRONG.values(), ids=WRONG)
+def test_wrong_rows_are_refused_and_leave_nothing_behind(register, message):
+    known = SafetyGymConfig().to_dict()
+    with pytest.raises(ConfigError, match=message):
+        register()
+    assert SafetyGymConfig().to_dict() == known
+    assert SafetyGymEnv(POINT).object_names == ()
+
+
+def test_names_that_meet_an_observation_are_refused():
+    register_observation(Reading("gyro", lambda c: True, lambda c, s: 1, lambda w: w.up[:, None]))
+    with pytest.raises(ConfigError, match=r"Two observations.*'gyro'"):
+        SafetyGymEnv(POINT)
+
+
+def test_keys_of_any_type():
+    fuse, colours = Key(None, "float | None"), Key((), "tuple[str, ...]")
+    keys = {"mines_fuse": fuse, "mines_colours": colours, "mines_times": (1.0, 2), "mines_on": True}
+    register_element(disc("mines", "mine"), keys=keys)
+    config = SafetyGymConfig(mines_colours=["red"])
+    assert (config.mines_fuse, config.mines_colours) == (None, ("red",))
+    assert (config.mines_times, config.mines_on) == ((1.0, 2.0), True)
+    assert config.replace(mines_fuse=2).mines_fuse == 2.0
+    with pytest.raises(ConfigError, match=r"'mines_on'"):
+        config.replace(mines_on=1)
