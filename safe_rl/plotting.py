@@ -58,9 +58,9 @@ def draw_learning_curves(
         _draw(costs, steps, table[f"episode_{key}"], colour, key)
         rates.plot(steps, table[f"{key}_rate"], color=colour, label=key)
         if key in cost_limits:
-            limit = cost_limits[key]
-            costs.axhline(limit, color=colour, linestyle="--", linewidth=1)
-            rates.axhline(limit / episode_length, color=colour, linestyle="--", linewidth=1)
+            _draw_limit(costs, cost_limits[key], colour, f"limit {cost_limits[key]:g}")
+            per_step = cost_limits[key] / episode_length
+            _draw_limit(rates, per_step, colour, f"limit / steps = {per_step:g}")
     for axes, name in ((returns, "Return"), (costs, "Episode cost"), (rates, "Cost rate")):
         axes.set_title(name)
         axes.set_xlabel("Environment steps")
@@ -68,13 +68,16 @@ def draw_learning_curves(
         axes.grid(alpha=0.3)
     for axes in (costs, rates):
         axes.set_ylim(bottom=0)
-        if len(cost_limits) > 1:
-            axes.legend()
+        axes.legend(fontsize="small")
     figure.suptitle(title)
     # a viewer that watches the file never sees half a picture
     unfinished = path.with_suffix(".tmp" + path.suffix)
     figure.savefig(unfinished, dpi=120)
     unfinished.replace(path)
+
+
+def _draw_limit(axes: Axes, height: float, colour: str, label: str) -> None:
+    axes.axhline(height, color=colour, linestyle="--", linewidth=1, label=label)
 
 
 def _draw(

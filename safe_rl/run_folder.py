@@ -70,7 +70,16 @@ class RunFolder:
 
     @contextmanager
     def writing(self, epoch: int = 0, steps: int = 0) -> Iterator[None]:
-        """Keep the files open; ``epoch`` and ``steps`` say where a continued run stands."""
+        """Keep the files open; ``epoch`` and ``steps`` say where a continued run stands.
+
+        Raises:
+            FileExistsError: If a new run would overwrite one that is there.
+        """
+        if epoch == 0 and self.table_path.exists():
+            raise FileExistsError(
+                f"{self.directory} already holds a run. Move it away, or give this one another "
+                "folder with hydra.run.dir=..."
+            )
         OmegaConf.save(self._config, self.directory / "config.yaml", resolve=True)
         self._table = TableWriter(self.table_path, keep_rows=epoch)
         self._logger = None

@@ -68,7 +68,9 @@ def test_several_costs_have_a_line_a_limit_and_a_name_each(drawn):
     _, costs, rates = drawn({"cost": 25.0, "cost_hazards": 10.0})
     assert sorted(line[0] for line in heights(costs, "--")) == [10.0, 25.0]
     assert sorted(line[0] for line in heights(rates, "--")) == [0.01, 0.025]
-    assert [text.get_text() for text in costs.get_legend().get_texts()] == ["cost", "cost_hazards"]
+    assert [text.get_text() for text in costs.get_legend().get_texts()] == [
+        "cost", "limit 25", "cost_hazards", "limit 10",
+    ]  # fmt: skip
     colours = {line.get_color() for line in costs.lines if line.get_linestyle() == "--"}
     assert len(colours) == 2
 

@@ -83,6 +83,15 @@ def test_a_continued_table_goes_on_after_its_epoch(tmp_path):
     assert lines[3].startswith("3,3000,7,7")
 
 
+def test_a_new_run_does_not_overwrite_another(tmp_path):
+    config = compose_config("env=PointMass", "logger=none")
+    with RunFolder(tmp_path, config, {}, 1000).writing():
+        pass
+    again = RunFolder(tmp_path, config, {}, 1000).writing()
+    with pytest.raises(FileExistsError, match="already holds a run"):
+        again.__enter__()
+
+
 def test_writing_ends_cleanly_when_training_fails(tmp_path):
     config = compose_config("env=PointMass", "logger=none")
     folder = RunFolder(tmp_path, config, {}, 1000)
