@@ -8,6 +8,7 @@ lidar sees them. Nothing in the package changes: every row stands in this file.
 """
 
 import sys
+import time
 from pathlib import Path
 
 import torch
@@ -74,7 +75,7 @@ POINT_MINES = {
     "constrain_indicator": False,  # the cost is how deep the robot is in a mine, not whether
     "observe_speed": True,
 }
-RUN = ["env=PointMines", "cost_limits={cost_mines: 5}", "frames=500_000", "num_threads=2"]
+RUN = ["env=PointMines", "cost_limits={cost_mines: 10}", "frames=500_000"]
 
 
 def register() -> None:
@@ -85,7 +86,7 @@ def register() -> None:
     store_config("PointMines", POINT_MINES)
 
 
-def main(overrides: list[str], directory: Path = Path("runs/PointMines")) -> str:
+def main(overrides: list[str], directory: Path) -> str:
     """Train PPO-Lagrangian; returns a line on the outcome."""
     register()
     with initialize_config_dir(str(CONF), version_base="1.3"):
@@ -95,10 +96,10 @@ def main(overrides: list[str], directory: Path = Path("runs/PointMines")) -> str
         OmegaConf.to_container(config.env, resolve=True),
         num_envs=config.num_envs,
         seed=config.seed,
-        num_threads=config.num_threads,
+        num_threads=config.num_threads or 0,
     )
     return build_trainer(config, env, directory).run()
 
 
 if __name__ == "__main__":
-    print(main(sys.argv[1:]))
+    print(main(sys.argv[1:], Path("runs/PointMines") / time.strftime("%Y-%m-%d_%H-%M-%S")))

@@ -1,0 +1,96 @@
+"""Noise on the controls and on the number of substeps."""
+
+import numpy as np
+import pytest
+import torch
+from reference import ReferenceWorld
+from scipy.stats import binom, chisquare, kstest, pearsonr
+
+from safe_rl.envs import SafetyGymEnv
+
+POINT = {"robot_base": "point", "task": "none", "observe_sensors": False, "observe_ctrl": True}
+NUM_ENVS = 2000
+
+
+def make(num_envs: int = NUM_ENVS, seed: int = 0, **keys) -> SafetyGymEnv:
+    env = SafetyGymEnv({**POINT, **keys}, num_envs, seed=seed, sleep=False, num_threads=1)
+    env.reset()
+    return env
+
+
+def controls(env, action: tuple[float, float]) -> np.ndarray:
+    """The controls that a step applies [N, 2]."""
+    request = env.reset().set("action", torch.tensor(action).expand(env.batch_size[0], 2))
+    return env.step(request)["next", "observation"].double().numpy()
+
+
+def test_noise_is_added_to_the_clipped_control():
+    got = controls(make(action_noise=0.3), (0.2, 5.0))
+    for column, mean in ((0, 0.2), (1, 1.0)):
+        assert kstest(got[:, column], "norm", (mean, 0.3)).pvalue > 1e-3
+    assert abs(pearsonr(got[:, 0], got[:, 1]).statistic) < 0.1
+
+
+def test_noise_is_new_in_every_step_and_belongs_to_the_seed():
+    env = make(num_envs=50, action_noise=0.1)
+    tensordict, steps = env.reset(), []
+    for _ in range(2):
+        tensordict = env.step_mdp(env.step(tensordict.set("action", torch.zeros(50, 2))))
+        steps.append(tensordict["observation"])
+    assert not (steps[0] == steps[1]).any()
+    again = make(num_envs=50, action_noise=0.1)
+    assert np.array_equal(controls(again, (0.0, 0.0)), steps[0].double().numpy())
+    other = make(num_envs=50, action_noise=0.1, seed=1)
+    assert not np.array_equal(controls(other, (0.0, 0.0)), steps[0].double().numpy())
+
+
+def test_without_noise_controls_are_the_action():
+    assert np.unique(controls(make(num_envs=5), (0.25, -0.5)), axis=0).tolist() == [[0.25, -0.5]]
+
+
+def substeps(env) -> np.ndarray:
+    """Substeps of a step, by the time that passed; a substep of the Point takes 2 ms."""
+    env.step(env.reset().set("action", torch.zeros(env.batch_size[0], 2)))
+    return np.rint(env.get_state()["time"].numpy() / 0.002).astype(int)
+
+
+@pytest.mark.parametrize(("trials", "probability"), [(10, 0.7), (4, 0.5)])
+def test_substeps_are_binomial(trials, probability):
+    got = substeps(make(frameskip_binom_n=trials, frameskip_binom_p=probability))
+    counts = np.bincount(got, minlength=trials + 1)
+    expected = NUM_ENVS * binom.pmf(np.arange(trials + 1), trials, probability)
+    common = expected >= 5
+    observed = [*counts[common], counts[~common].sum()]
+    wanted = [*expected[common], expected[~common].sum()]
+    if wanted[-1] == 0:
+        observed, wanted = observed[:-1], wanted[:-1]
+    assert chisquare(observed, wanted).pvalue > 1e-3
+
+
+@pytest.mark.parametrize(("trials", "probability", "number"), [(3, 1.0, 3), (10, 0.0, 0)])
+def test_certain_numbers_of_substeps(trials, probability, number):
+    got = substeps(make(num_envs=20, frameskip_binom_n=trials, frameskip_binom_p=probability))
+    assert set(got) == {number}
+
+
+def test_worlds_with_fewer_substeps_and_gremlins_do_what_a_plain_world_does():
+    config = {**POINT, "gremlins_num": 2, "frameskip_binom_n": 6, "frameskip_binom_p": 0.5}
+    env = make(num_envs=12, **config)
+    env.rollout(3)
+    before = env.get_state()
+    action = env.action_spec.rand()
+    env.step(env.set_state(before).set("action", action))
+    after, world = env.get_state(), ReferenceWorld(config)
+    numbers = ((after["time"] - before["time"]) / 0.002).round().int().tolist()
+    assert len(set(numbers)) > 2
+    for row, number in enumerate(numbers):
+        quat = before["target_quat"][row]
+        world.set_state(
+            **{key: before[key][row].numpy() for key in ("qpos", "qvel", "qacc_warmstart", "time")},
+            layout=dict(
+                zip(("robot", *env.object_names), before["layout"][row].numpy(), strict=True)
+            ),
+            gremlin_yaws=(2 * torch.atan2(quat[:, 3], quat[:, 0])).tolist(),
+        )
+        result = world.step(action[row].numpy(), substeps=number)
+        np.testing.assert_allclose(after["qpos"][row], result["qpos"], atol=1e-9)
