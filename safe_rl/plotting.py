@@ -58,9 +58,18 @@ def draw_learning_curves(
         _draw(costs, steps, table[f"episode_{key}"], colour, key)
         rates.plot(steps, table[f"{key}_rate"], color=colour, label=key)
         if key in cost_limits:
-            _draw_limit(costs, cost_limits[key], colour, f"limit {cost_limits[key]:g}")
-            per_step = cost_limits[key] / episode_length
+            limit, per_step = cost_limits[key], cost_limits[key] / episode_length
+            _draw_limit(costs, limit, colour, f"limit {limit:g}")
             _draw_limit(rates, per_step, colour, f"limit / steps = {per_step:g}")
+    _label(returns, costs, rates)
+    figure.suptitle(title)
+    # a viewer that watches the file never sees half a picture
+    unfinished = path.with_suffix(".tmp" + path.suffix)
+    figure.savefig(unfinished, dpi=120)
+    unfinished.replace(path)
+
+
+def _label(returns: Axes, costs: Axes, rates: Axes) -> None:
     for axes, name in ((returns, "Return"), (costs, "Episode cost"), (rates, "Cost rate")):
         axes.set_title(name)
         axes.set_xlabel("Environment steps")
@@ -69,11 +78,6 @@ def draw_learning_curves(
     for axes in (costs, rates):
         axes.set_ylim(bottom=0)
         axes.legend(fontsize="small")
-    figure.suptitle(title)
-    # a viewer that watches the file never sees half a picture
-    unfinished = path.with_suffix(".tmp" + path.suffix)
-    figure.savefig(unfinished, dpi=120)
-    unfinished.replace(path)
 
 
 def _draw_limit(axes: Axes, height: float, colour: str, label: str) -> None:
