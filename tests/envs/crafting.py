@@ -74,7 +74,7 @@ def encounters(env, num_calm: int) -> TensorDict:
     kinds: dict[str, list[str]] = {}
     for name in env.object_names:
         kinds.setdefault(kind_of(name), []).append(name)
-    for row in range(num_calm, len(state)):
+    for row in range(num_calm, len(state) if kinds else 0):
         number, turn = divmod(row - num_calm, len(kinds))
         names = list(kinds.values())[turn]
         meet(env, state, row, names[number % len(names)])

@@ -133,7 +133,8 @@ def test_time_out_truncates_and_never_terminates():
     assert not result["terminated"]
 
 
-def test_physics_failure_ends_the_episode():
+def test_physics_failure_ends_the_episode(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)  # MuJoCo logs failures to a file where it is
     world = ReferenceWorld({**POINT, "reward_exception": -7.0})
     world.set_state([0, 0, 0], [np.nan, 0, 0], layout={})
     result = world.step([0, 0])
