@@ -1,4 +1,4 @@
-"""One step of the benchmark's environments beside the same step of a plain world that shares no code.
+"""One step of every named environment beside a plain world that shares no code with it.
 
 Most rows run into something. Contacts between boxes are chaotic: two correct worlds may part there.
 So a row that does not agree to rounding has to be shown to be chaotic: the reference itself, set to
