@@ -87,10 +87,32 @@ def build_scene(config: SafetyGymConfig, sleep: bool = False, decorated: bool = 
         ConfigError: if a custom robot file lacks what an environment needs.
     """
     robot = load_robot(config.robot_base)
-    spec = robot.spec
-    _set_options(spec, sleep)
-    add_floor(spec)
+    _set_options(robot.spec, sleep)
     present = [element for element in ELEMENTS if element.count(config) > 0]
+    # Rays and pictures see geoms only, so natural lidar needs bodies for the areas as well.
+    needs_areas = decorated or config.lidar_type == "natural"
+    in_physics = {Motion.STATIC} | ({Motion.VIRTUAL} if needs_areas else set())
+    try:
+        _add_objects(robot.spec, config, present, in_physics, decorated)
+        contact_names = _add_sensors(robot.spec, config, present)
+        model = robot.spec.compile()
+    except ValueError as error:
+        raise ConfigError(
+            f"'robot_base': {config.robot_base} does not fit into the world: {error}. Rename what "
+            "has the name of something in the world."
+        ) from error
+    return _index(config, model, present, robot, in_physics, contact_names)
+
+
+def _add_objects(
+    spec: mujoco.MjSpec,
+    config: SafetyGymConfig,
+    present: list[Element],
+    in_physics: set[Motion],
+    decorated: bool,
+) -> None:
+    """Add floor and elements, free bodies first."""
+    add_floor(spec)
     for element in present:
         if element.motion in (Motion.FREE, Motion.GUIDED):
             add_bodies(spec, config, element, decorated)
@@ -99,27 +121,9 @@ def build_scene(config: SafetyGymConfig, sleep: bool = False, decorated: bool = 
             add_targets(spec, config, element, decorated)
     if decorated:
         decorate(spec, config)
-    # Rays and pictures see geoms only, so natural lidar needs bodies for the areas as well.
-    needs_areas = decorated or config.lidar_type == "natural"
-    in_physics = {Motion.STATIC} | ({Motion.VIRTUAL} if needs_areas else set())
     for element in present:
         if element.motion in in_physics:
             add_bodies(spec, config, element, decorated)
-    contact_names = _add_contact_sensors(spec, config, present)
-    spec.add_sensor(
-        name="robot_vel",
-        type=mujoco.mjtSensor.mjSENS_FRAMELINVEL,
-        objtype=mujoco.mjtObj.mjOBJ_XBODY,
-        objname="robot",
-    )
-    try:
-        model = spec.compile()
-    except ValueError as error:
-        raise ConfigError(
-            f"'robot_base': {config.robot_base} does not fit into the world: {error}. Rename what "
-            "has the name of an object of the world."
-        ) from error
-    return _index(config, model, present, robot, in_physics, contact_names)
 
 
 def _set_options(spec: mujoco.MjSpec, sleep: bool) -> None:
@@ -138,10 +142,16 @@ def _touched_kinds(config: SafetyGymConfig) -> set[str]:
     return {kind for kinds in (TASKS[config.task].touches, *costs, *readings) for kind in kinds}
 
 
-def _add_contact_sensors(
+def _add_sensors(
     spec: mujoco.MjSpec, config: SafetyGymConfig, present: list[Element]
 ) -> dict[str, list[str]]:
-    """Add a sensor per object that counts its contact points with the robot."""
+    """Add the robot's velocity, and a sensor per object that counts its contacts with the robot."""
+    spec.add_sensor(
+        name="robot_vel",
+        type=mujoco.mjtSensor.mjSENS_FRAMELINVEL,
+        objtype=mujoco.mjtObj.mjOBJ_XBODY,
+        objname="robot",
+    )
     sensors: dict[str, list[str]] = {}
     touched = _touched_kinds(config)
     for element in present:

@@ -1,0 +1,235 @@
+"""Robots by the path of an MJCF file: what works, and what an unusable file is told."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from torchrl.envs.utils import check_env_specs
+
+from safe_rl.envs import ConfigError, SafetyGymEnv
+
+# A planar disc with an arm on a hinge; the turning motor has no control range of its own.
+DISC = """
+<mujoco>
+  <option timestep="0.004"/>
+  <default><geom condim="6" density="10"/></default>
+  <worldbody>
+    <body name="robot" pos="0 0 0.1">
+      <joint name="x" type="slide" axis="1 0 0" damping="0.1"/>
+      <joint name="y" type="slide" axis="0 1 0" damping="0.1"/>
+      <joint name="yaw" type="hinge" axis="0 0 1" damping="0.01"/>
+      <geom type="cylinder" size="0.1 0.05"/>
+      <site name="robot"/>
+      <body name="arm" pos="0.1 0 0">
+        <joint name="elbow" type="hinge" axis="0 1 0" range="-90 0" stiffness="0.01"/>
+        <geom type="capsule" fromto="0 0 0 0.1 0 0" size="0.02"/>
+      </body>
+    </body>
+  </worldbody>
+  <actuator>
+    <motor name="drive" site="robot" gear="1 0 0 0 0 0" ctrlrange="-0.5 2"/>
+    <motor name="turn" joint="yaw" gear="0.1"/>
+    <motor name="lift" joint="elbow" gear="0.02" ctrlrange="-1 1"/>
+  </actuator>
+  <sensor>
+    <velocimeter name="speed" site="robot"/>
+    <gyro name="gyro" site="robot"/>
+    <jointpos name="elbow_pos" joint="elbow"/>
+    <jointvel name="elbow_vel" joint="elbow"/>
+  </sensor>
+</mujoco>
+"""
+# The same, free in space; its file brings a pose, a texture and more memory than it needs.
+BALL = """
+<mujoco>
+  <size memory="200M"/>
+  <worldbody>
+    <body name="robot" pos="0.3 0.2 0.12">
+      <freejoint/>
+      <geom type="sphere" size="0.12"/>
+      <site name="imu"/>
+    </body>
+  </worldbody>
+  <actuator><general site="imu" gear="0 0 0 0 0 0.01"/></actuator>
+  <sensor><gyro name="gyro" site="imu"/></sensor>
+  <keyframe><key name="start" qpos="1 2 3 1 0 0 0"/></keyframe>
+</mujoco>
+"""
+EVERYTHING = {
+    **{f"{kind}_num": 1 for kind in ("hazards", "vases", "pillars", "buttons", "gremlins")},
+    **{f"constrain_{kind}": True for kind in ("hazards", "vases", "pillars", "gremlins")},
+    "observe_goal_lidar": True,
+    "placements_extents": [-2.5, -2.5, 2.5, 2.5],
+}
+
+
+@pytest.fixture
+def make(tmp_path):
+    def build(xml: str, num_envs: int = 2, **keys) -> SafetyGymEnv:
+        path = tmp_path / "robot.xml"
+        path.write_text(xml)
+        config = {"robot_base": str(path), "sensors_obs": ["gyro"], **keys}
+        return SafetyGymEnv(config, num_envs, seed=0, num_threads=1)
+
+    return build
+
+
+@pytest.mark.parametrize("xml", [DISC, BALL], ids=["planar", "free"])
+@pytest.mark.parametrize("task", ["goal", "push", "button", "circle"])
+def test_own_robots_work_in_every_task(make, xml, task):
+    env = make(xml, task=task, **EVERYTHING)
+    check_env_specs(env)
+    rollout = env.rollout(30)
+    assert not rollout["next", "cost_exception"].any()
+    assert rollout["next", "observation"].isfinite().all()
+
+
+@pytest.mark.parametrize(("xml", "yaw"), [(DISC, 2), (BALL, None)], ids=["planar", "free"])
+def test_they_are_placed_by_their_root(make, xml, yaw):
+    env = make(xml, robot_locations=[[1.5, -0.5]], robot_rot=0.9, vases_num=1)
+    env.reset()
+    qpos = env.get_state()["qpos"][0]
+    np.testing.assert_allclose(qpos[:2], [1.5, -0.5], atol=1e-8)
+    turned = qpos[yaw] if yaw else 2 * math.atan2(qpos[6], qpos[3])
+    assert float(turned) == pytest.approx(0.9)
+    if not yaw:
+        assert float(qpos[2]) == pytest.approx(0.12)
+    position = env._world.robot_pos[0]
+    np.testing.assert_allclose(position[:2], [1.5, -0.5], atol=1e-8)
+
+
+def test_actions_have_the_range_of_the_actuators(make):
+    env = make(DISC, observe_ctrl=True, task="none")
+    low, high = env.action_spec.space.low[0], env.action_spec.space.high[0]
+    assert low.tolist() == [-0.5, -1.0, -1.0]
+    assert high.tolist() == [2.0, 1.0, 1.0]
+    columns = env.observation_layout["ctrl"]
+    for request, applied in (([9.0, 9.0, 0.5], [2.0, 1.0, 0.5]), ([-9.0, -9, 0], [-0.5, -1, 0])):
+        action = torch.tensor(request).expand(2, 3)
+        result = env.step(env.reset().set("action", action))["next", "observation"]
+        assert result[0, columns].tolist() == applied
+
+
+def test_they_turn_and_drive(make):
+    env = make(DISC, task="none", observe_qpos=True)
+    env.reset()
+    # The motor has a force of the control in newtons: v' = F/m without other forces.
+    tensordict = env.step(env.reset().set("action", torch.tensor([[1.0, 0.0, 0.0]] * 2)))
+    way = tensordict["next", "observation"][0, env.observation_layout["qpos"].start]
+    assert float(way) == pytest.approx(0.5 * 0.04**2 * (1.0 / _mass(env)), rel=0.2)
+    env.step(env.reset().set("action", torch.tensor([[0.0, 1.0, 0.0]] * 2)))
+    assert float(env.get_state()["qvel"][0, 2]) > 1e-2
+
+
+def _mass(env) -> float:
+    return float(env._world.scene.model.body_subtreemass[1])
+
+
+def test_their_sensors_are_found_by_type_and_name(make):
+    env = make(DISC, sensors_obs=["speed"], observe_goal_lidar=True)
+    sizes = {name: span.stop - span.start for name, span in env.observation_layout.items()}
+    assert sizes == {"elbow_pos": 2, "elbow_vel": 1, "goal_lidar": 10, "speed": 3}
+    without = make(DISC, sensors_obs=["speed"], sensors_hinge_joints=False)
+    assert list(without.observation_layout) == ["speed"]
+    assert list(make(BALL).observation_layout) == ["gyro"]
+
+
+def test_memory_stays_small(make):
+    assert make(BALL)._world.scene.model.narena < 20e6
+
+
+def without(xml: str, *parts: str) -> str:
+    for part in parts:
+        assert part in xml
+        xml = xml.replace(part, "")
+    return xml
+
+
+def changed(xml: str, old: str, new: str) -> str:
+    assert old in xml
+    return xml.replace(old, new)
+
+
+JOINTS = (
+    '<joint name="x" type="slide" axis="1 0 0" damping="0.1"/>',
+    '<joint name="y" type="slide" axis="0 1 0" damping="0.1"/>',
+    '<joint name="yaw" type="hinge" axis="0 0 1" damping="0.01"/>',
+)
+ACTUATORS = DISC[DISC.index("<actuator>") : DISC.index("<sensor>")]
+SLIDE = '<jointpos name="east" joint="x"/></sensor>'
+WRONG = {
+    "no XML": ("<mujoco><worldbody>", "cannot load"),
+    "a mistake in it": (changed(DISC, "capsule", "sausage"), "cannot load.*sausage"),
+    "no robot": (changed(BALL, '"robot"', '"robto"'), "no body named 'robot'.*'robto'"),
+    "no name at all": (changed(BALL, 'name="robot" pos', "pos"), "no body named 'robot'"),
+    "robot inside another": (
+        changed(changed(BALL, "<worldbody>", '<worldbody><body name="cart">'),
+                "</worldbody>", "</body></worldbody>").replace("<freejoint/>", ""),
+        "'robot' inside 'cart'",
+    ),
+    "a turned root": (changed(BALL, 'pos="0.3 0.2 0.12"', 'euler="90 0 0"'), "turns its body"),
+    "no actuators": (without(DISC, ACTUATORS), "no actuators"),
+    "no root joint": (without(DISC, *JOINTS[:2]), "free joint, or slides"),
+    "another order": (
+        changed(changed(DISC, 'axis="1 0 0" damping', 'axis="0 0 0.5" damping'),
+                'axis="0 1 0" damping', 'axis="1 0 0" damping'),
+        "free joint, or slides",
+    ),
+    "a root off the origin": (changed(DISC, 'pos="0 0 0.1"', 'pos="1 0 0.1"'), "origin.*must be 0"),
+    "another body before": (
+        changed(BALL, "<worldbody>", '<worldbody><body><freejoint/><geom size="1"/></body>'),
+        "put that body first",
+    ),
+    "mocap bodies": (
+        changed(BALL, "<worldbody>", '<worldbody><body mocap="true"/>'),
+        "mocap bodies",
+    ),
+    "an observed slide": (changed(DISC, "</sensor>", SLIDE), "'east' on a slide joint"),
+    "a name of the world": (changed(DISC, 'name="arm"', 'name="vase0"'), "does not fit.*vase0"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(("xml", "message"), WRONG.values(), ids=WRONG)
+def test_files_that_lack_something_are_told_what(make, xml, message):
+    with pytest.raises(ConfigError, match="'robot_base'.*" + message):
+        make(xml, vases_num=1)
+
+
+def test_missing_sensors_are_named_with_the_nearest(make):
+    with pytest.raises(ConfigError, match=r"'sensors_obs'.*'sped'.*'speed'.*elbow_pos"):
+        make(DISC, sensors_obs=["sped"])
+    with pytest.raises(ConfigError, match=r"no sensor 'accelerometer'.*It has gyro"):
+        make(BALL, sensors_obs=["accelerometer"])
+
+
+def test_the_sensors_of_the_world_are_not_the_robots(make):
+    with pytest.raises(ConfigError, match="no sensor 'contact_vase0'"):
+        make(DISC, sensors_obs=["contact_vase0"], vases_num=1, constrain_vases=True)
+
+
+def test_unobserved_sensors_of_slides_do_no_harm(make):
+    xml = changed(DISC, "</sensor>", SLIDE)
+    env = make(xml, observe_sensors=False, observe_goal_lidar=True)
+    assert list(env.observation_layout) == ["goal_lidar"]
+
+
+def test_the_body_that_is_kept_upright_is_one_of_the_robots(make):
+    keys = {"reward_orientation": True, "task": "none"}
+    env = make(DISC, **keys, reward_orientation_body="arm", reward_orientation_scale=1.0)
+    env.reset()
+    state = env.get_state()
+    state["qpos"][:, 3] = -1.0  # the elbow
+    result = env.step(env.set_state(state).set("action", torch.zeros(2, 3)))
+    elbow = env.get_state()["qpos"][0, 3]
+    assert float(result["next", "reward"][0]) == pytest.approx(math.cos(elbow), abs=1e-6)
+    with pytest.raises(ConfigError, match=r"'reward_orientation_body'.*'arms'.*'arm'"):
+        make(DISC, **keys, reward_orientation_body="arms")
+    with pytest.raises(ConfigError, match=r"'reward_orientation_body'.*'vase0'"):
+        make(DISC, **keys, reward_orientation_body="vase0", vases_num=1)
+
+
+def test_relative_paths(make, tmp_path, monkeypatch):
+    make(BALL)
+    monkeypatch.chdir(tmp_path)
+    assert SafetyGymEnv({"robot_base": "robot.xml", "sensors_obs": ["gyro"]}).reset() is not None
