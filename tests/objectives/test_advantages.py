@@ -157,10 +157,11 @@ def test_thirty_thousand_steps_take_a_tenth_of_a_second():
     reward = VectorGAE(None, **settings)
     cost = CostGAE(["cost_hazards", "cost_vases"], None, **settings)
     seconds = []
-    for _ in range(3):
-        start = time.perf_counter()
+    for _ in range(5):
+        # Processor time, so that a busy machine does not fail the test.
+        start = time.process_time()
         cost(reward(rollout))
-        seconds.append(time.perf_counter() - start)
+        seconds.append(time.process_time() - start)
     assert min(seconds) < 0.1
 
 
