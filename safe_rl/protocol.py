@@ -6,7 +6,7 @@ by which training runs are compared.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Hashable, Iterator, Mapping
 from typing import NamedTuple
 
 import numpy as np
@@ -216,13 +216,13 @@ class Agent(NamedTuple):
         episode_return: J_r, or J̄_r of a slate.
         cost_rate: ρ_c, or ρ̄_c.
         is_satisfying: Whether every constraint is satisfied.
-        steps: Environment steps of training.
+        steps: Environment steps of training: a number, or one per environment of a slate.
     """
 
     episode_return: float
     cost_rate: float
     is_satisfying: bool
-    steps: float
+    steps: Hashable
 
 
 def dominates(first: Agent, second: Agent) -> bool:

@@ -1,0 +1,75 @@
+"""Learning curves of several seeds as one: mean and interval over environment steps."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from safe_rl.extras import import_extra
+from safe_rl.intervals import bootstrap
+from safe_rl.reporting.runs import Run
+from safe_rl.run_folder import FINAL_EPOCHS
+
+__all__ = ["Curve", "mean_curve"]
+
+NUM_POINTS = 200
+"""Of a curve at most; a panel is not much wider in pixels."""
+
+
+@dataclass(frozen=True)
+class Curve:
+    """A quantity over training.
+
+    Attributes:
+        steps: Environment steps, shape [points].
+        mean: Mean over seeds, shape [points].
+        low: Lower end of its 95 % interval, shape [points]; NaN with a single seed.
+        high: Upper end.
+    """
+
+    steps: np.ndarray
+    mean: np.ndarray
+    low: np.ndarray
+    high: np.ndarray
+
+
+def mean_curve(runs: Sequence[Run], column: str, *, smooth: bool) -> Curve | None:
+    """Average a column of the runs' tables over seeds.
+
+    The curve ends where the first of the runs does. Between epochs, and over those in which no
+    episode finished, values are interpolated.
+
+    Args:
+        runs: One per seed.
+        column: Column of their tables.
+        smooth: Whether to take the moving mean over ``FINAL_EPOCHS`` epochs first.
+
+    Returns:
+        The curve, or None if a run has no value.
+    """
+    series = [_series(run, column) for run in runs]
+    if not all(len(steps) for steps, _ in series):
+        return None
+    start = max(steps[0] for steps, _ in series)
+    stop = min(steps[-1] for steps, _ in series)
+    longest = max(len(steps) for steps, _ in series)
+    grid = np.linspace(start, stop, min(longest, NUM_POINTS)) if stop > start else np.array([stop])
+    values = np.stack(
+        [np.interp(grid, steps, _smoothed(y) if smooth else y) for steps, y in series], -1
+    )
+    low, high = bootstrap([values], np.mean)
+    return Curve(grid, values.mean(-1), low, high)
+
+
+def _series(run: Run, column: str) -> tuple[np.ndarray, np.ndarray]:
+    """Steps and values where there is a value."""
+    steps, values = np.array(run.table["steps"]), np.array(run.table.get(column, []))
+    known = np.isfinite(values)
+    return (steps[known], values[known]) if len(values) else (values, values)
+
+
+def _smoothed(values: np.ndarray) -> np.ndarray:
+    filters = import_extra("scipy.ndimage", "report")
+    return filters.uniform_filter1d(values, FINAL_EPOCHS, mode="nearest")

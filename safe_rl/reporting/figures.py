@@ -1,0 +1,166 @@
+"""Figures 7 to 9 of the paper, one per robot, and interquartile means with their intervals."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from itertools import chain, cycle
+from pathlib import Path
+from typing import Any
+
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import EngFormatter, MaxNLocator
+
+from safe_rl.protocol import ALGORITHMS
+from safe_rl.reporting.curves import mean_curve
+from safe_rl.reporting.experiments import Experiment
+from safe_rl.reporting.results import cost_keys_of
+from safe_rl.reporting.slate_tables import SYMBOLS
+from safe_rl.reporting.slates import Aggregate
+
+__all__ = ["algorithm_colours", "draw_aggregates", "draw_learning_curves", "save"]
+
+# Okabe and Ito's palette, which people with colour-blindness can read.
+_OWN_COLOURS = {
+    "ppo": "#e69f00",
+    "ppo_lagrangian": "#0072b2",
+    "trpo": "#d55e00",
+    "trpo_lagrangian": "#009e73",
+    "cpo": "#cc79a7",
+}
+_FURTHER_COLOURS = ("#56b4e9", "#555555", "#8c564b", "#9467bd", "#bcbd22", "#17becf", "#7f7f7f")
+_LIMIT: dict[str, Any] = {"color": "#c00000", "linestyle": "--", "linewidth": 1.1}
+_DPI = 130
+ROW_HEIGHT, WIDTH = 2.5, 12.0
+"""Of a row of panels, and of a figure, in inches."""
+
+
+def algorithm_colours(experiments: Iterable[Experiment]) -> dict[str, str]:
+    """Name of an algorithm -> its colour, the same in every figure."""
+    names = {e.algorithm: e.runs[0].algorithm for e in experiments}
+    further = cycle(_FURTHER_COLOURS)
+    colours: dict[str, str] = {}
+    for name, algorithm in sorted(names.items(), key=lambda pair: _rank(pair[1])):
+        own = _OWN_COLOURS.get(algorithm)
+        colours[name] = own if own and own not in colours.values() else next(further)
+    return colours
+
+
+def _rank(algorithm: str) -> int:
+    return list(ALGORITHMS).index(algorithm) if algorithm in ALGORITHMS else len(ALGORITHMS)
+
+
+def draw_learning_curves(experiments: Sequence[Experiment], colours: Mapping[str, str]) -> Figure:
+    """Draw return, episode cost and cost rate over steps, a row per environment.
+
+    Lines are means over seeds and bands their 95 % intervals; return and episode cost are smoothed
+    over five epochs. Limits d are dashed, and so is d / T_ep beside the cost rate. Runs that have
+    not come to their end are drawn one by one, thin.
+
+    Args:
+        experiments: Any environments and algorithms.
+        colours: Name of an algorithm -> its colour.
+    """
+    rows = [
+        (environment, key)
+        for environment in dict.fromkeys(e.environment for e in experiments)
+        for key in _drawn_keys([e for e in experiments if e.environment == environment])
+    ]
+    figure = Figure(figsize=(WIDTH, ROW_HEIGHT * len(rows) + 0.6), layout="constrained")
+    panels = figure.subplots(len(rows), 3, squeeze=False)
+    for (environment, key), axes in zip(rows, panels, strict=True):
+        shown = [e for e in experiments if e.environment == environment]
+        for experiment in shown:
+            _draw_experiment(experiment, key, axes, colours[experiment.algorithm])
+        name = environment.replace(" (", "\n(")
+        _decorate(axes, name if key == "cost" else f"{name}\n{key}", shown, key)
+    for axis, title in zip(panels[0], ("Return", "Episode cost", "Cost rate"), strict=True):
+        axis.set_title(title, fontweight="bold")
+    for axis in panels[-1]:
+        axis.set_xlabel("environment steps")
+    _add_legend(figure, panels[:, 0])
+    return figure
+
+
+def _drawn_keys(experiments: Sequence[Experiment]) -> list[str]:
+    """Cost keys with a limit, or the aggregate cost where none has one."""
+    limited = {key for experiment in experiments for key in experiment.limits}
+    return [key for key in cost_keys_of(experiments) if key in limited] or ["cost"]
+
+
+def _draw_experiment(experiment: Experiment, key: str, axes: Sequence[Axes], colour: str) -> None:
+    columns = (("episode_return", True), (f"episode_{key}", True), (f"{key}_rate", False))
+    unfinished = [run for run in experiment.runs if not run.is_finished]
+    for axis, (column, smooth) in zip(axes, columns, strict=True):
+        curve = (
+            mean_curve(experiment.finished, column, smooth=smooth) if experiment.finished else None
+        )
+        if curve is not None:
+            axis.plot(curve.steps, curve.mean, color=colour, label=experiment.algorithm)
+            axis.fill_between(
+                curve.steps, curve.low, curve.high, color=colour, alpha=0.2, linewidth=0
+            )
+        for run in unfinished:
+            line = mean_curve([run], column, smooth=smooth)
+            if line is not None:
+                label = f"{experiment.algorithm} (unfinished)"
+                axis.plot(line.steps, line.mean, ":", color=colour, linewidth=1.2, label=label)
+
+
+def _decorate(axes: Sequence[Axes], name: str, experiments: Sequence[Experiment], key: str) -> None:
+    returns, costs, rates = axes
+    returns.set_ylabel(name, fontweight="bold")
+    for limit, length in {
+        (e.limits[key], e.runs[0].episode_length) for e in experiments if key in e.limits
+    }:
+        costs.axhline(limit, **_LIMIT)
+        rates.axhline(limit / length, **_LIMIT)
+    for axis in axes:
+        axis.xaxis.set_major_formatter(EngFormatter(sep=""))
+        axis.xaxis.set_major_locator(MaxNLocator(6))
+        axis.grid(alpha=0.25)
+        axis.spines[["top", "right"]].set_visible(False)
+        axis.set_xlim(left=0)
+    for axis in (costs, rates):
+        axis.set_ylim(bottom=0)
+
+
+def _add_legend(figure: Figure, axes: Iterable[Axes]) -> None:
+    """One legend for all panels, below the figure."""
+    pairs = chain.from_iterable(
+        zip(*axis.get_legend_handles_labels(), strict=True) for axis in axes
+    )
+    handles = {label: handle for handle, label in pairs}
+    figure.legend(
+        handles.values(), handles.keys(), loc="outside lower center", ncols=min(5, len(handles)),
+        frameon=False,
+    )  # fmt: skip
+
+
+def draw_aggregates(aggregates: Sequence[Aggregate], colours: Mapping[str, str]) -> Figure:
+    """Draw interquartile means and their intervals, a panel per normalised score."""
+    figure = Figure(figsize=(WIDTH, 0.9 + 0.32 * len(aggregates)), layout="constrained")
+    panels = figure.subplots(1, 3, sharey=True)
+    heights = range(len(aggregates))
+    for axis, (name, symbol) in zip(panels, SYMBOLS.items(), strict=True):
+        for height, aggregate in zip(heights, aggregates, strict=True):
+            estimate, colour = aggregate.middle[name], colours[aggregate.algorithm]
+            axis.barh(
+                height, estimate.high - estimate.low, left=estimate.low, height=0.55, color=colour,
+                alpha=0.45,
+            )  # fmt: skip
+            axis.plot([estimate.value] * 2, [height - 0.33, height + 0.33], color="black")
+        axis.set_title(symbol)
+        axis.set_yticks(list(heights), [aggregate.algorithm for aggregate in aggregates])
+        axis.tick_params(axis="y", length=0)
+        axis.grid(alpha=0.25, axis="x")
+        axis.spines[["top", "right", "left"]].set_visible(False)
+        axis.set_xlim(left=min(0.0, axis.get_xlim()[0]))
+    panels[0].invert_yaxis()
+    return figure
+
+
+def save(figure: Figure, path: Path) -> Path:
+    """Write a figure as PNG."""
+    figure.savefig(path, dpi=_DPI)
+    return path

@@ -1,0 +1,159 @@
+"""Final scores of experiments, and which are better than which (paper section 5.1)."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from typing import Any
+
+import numpy as np
+
+from safe_rl.protocol import REFERENCE, REIMPLEMENTATIONS, Agent, compare
+from safe_rl.reporting.experiments import Experiment
+from safe_rl.reporting.tables import MISSING, Column, Table, number, plain
+
+__all__ = ["cost_keys_of", "dominance_table", "final_record", "final_table"]
+
+Records = list[dict[str, Any]]
+
+
+def cost_keys_of(experiments: Iterable[Experiment]) -> list[str]:
+    """The aggregate cost, and every cost key that one of the experiments limits."""
+    limited = [key for experiment in experiments for key in experiment.limits]
+    return list(dict.fromkeys(["cost", *limited]))
+
+
+def final_record(experiment: Experiment, cost_keys: Sequence[str]) -> dict[str, Any]:
+    """Final J_r, J_c and ρ_c of an experiment: mean and standard deviation over its seeds."""
+    runs = experiment.finished
+    finals = [run.final([key for key in cost_keys if f"{key}_rate" in run.table]) for run in runs]
+    record: dict[str, Any] = {
+        "environment": experiment.environment,
+        "algorithm": experiment.algorithm,
+        "seeds": len(runs),
+        "steps": max(run.steps for run in runs),
+        "hours": float(np.mean([run.hours for run in runs])),
+    }
+    for name in finals[0]:
+        values = np.array([final[name] for final in finals])
+        record[name] = float(values.mean())
+        record[f"{name}_std"] = float(values.std(ddof=1)) if len(values) > 1 else float("nan")
+    limits = experiment.limits
+    record |= {f"limit_{key}": limit for key, limit in limits.items()}
+    record["satisfies"] = all(record[f"episode_{key}"] <= d for key, d in limits.items())
+    return record | _published(experiment)
+
+
+def _published(experiment: Experiment) -> dict[str, Any]:
+    """Values printed elsewhere for the same environment and algorithm."""
+    if experiment.benchmark is None or not experiment.has_published_limit:
+        return {}
+    algorithm = experiment.runs[0].algorithm
+    fields: dict[str, Any] = {}
+    reference = REFERENCE.get(experiment.benchmark)
+    if algorithm == "ppo" and reference is not None:
+        fields |= {f"paper_{name}": value for name, value in reference._asdict().items()}
+    later = REIMPLEMENTATIONS.get(experiment.benchmark, {}).get(algorithm)
+    if later is not None:
+        fields |= {"later_return": later[0], "later_cost": later[1]}
+    return fields
+
+
+def final_table(environment: str, records: Records, cost_keys: Sequence[str]) -> Table:
+    """Final scores on one environment, with what others have published beside them."""
+    best = _best(records)
+
+    def is_over(key: str) -> Any:
+        return lambda r: "bad" if r[f"episode_{key}"] > r.get(f"limit_{key}", np.inf) else ""
+
+    columns = [
+        Column("algorithm", plain("algorithm"), is_number=False),
+        Column("seeds", plain("seeds")),
+        Column("steps", lambda r: f"{r['steps']:,}"),
+        Column(
+            "$J_r$",
+            number("episode_return", 2, "episode_return_std"),
+            _mark_if(best["episode_return"]),
+        ),
+    ]
+    for key in cost_keys:
+        suffix = "" if len(cost_keys) == 1 else f" [{key}]"
+        cost, rate = f"episode_{key}", f"{key}_rate"
+        columns += [
+            Column(f"$J_c${suffix}", number(cost, 1, f"{cost}_std"), is_over(key)),
+            Column(f"$d${suffix}", _limit(key)),
+            Column(
+                rf"$\rho_c${suffix}",
+                number(rate, 4, f"{rate}_std"),
+                _mark_if(best.get(rate)),
+            ),
+        ]
+    if any("paper_episode_return" in record for record in records):
+        columns.append(Column(r"paper: $J_r$ / $J_c$ / $\rho_c$", _paper))
+    if any("later_return" in record for record in records):
+        columns.append(Column("later work: $J_r$ / $J_c$", _later))
+    stem = "".join(c if c.isalnum() else "_" for c in environment).strip("_")
+    return Table(f"final_{stem}", environment, columns, records)
+
+
+def _limit(key: str) -> Any:
+    return lambda record: f"{record[f'limit_{key}']:g}" if f"limit_{key}" in record else MISSING
+
+
+def _mark_if(best: Any) -> Any:
+    return lambda record: "best" if record is best else ""
+
+
+def _best(records: Records) -> dict[str, Any]:
+    """Highest return and lowest cost rate among those that satisfy their constraints."""
+    able = [record for record in records if record["satisfies"] and "cost_rate" in record]
+    return {
+        "episode_return": max(able, key=lambda r: r["episode_return"], default=None),
+        "cost_rate": min(able, key=lambda r: r["cost_rate"], default=None),
+    }
+
+
+def _paper(record: Any) -> str:
+    if "paper_episode_return" not in record:
+        return MISSING
+    values = (record[f"paper_{name}"] for name in ("episode_return", "episode_cost", "cost_rate"))
+    return " / ".join(f"{value:g}" for value in values)
+
+
+def _later(record: Any) -> str:
+    if "later_return" not in record:
+        return MISSING
+    return f"{record['later_return']:g} / {record['later_cost']:g}"
+
+
+def dominance_table(records: Records) -> Table:
+    """Which algorithm is better than which on each environment."""
+    relations: Records = []
+    for environment in dict.fromkeys(record["environment"] for record in records):
+        agents = {
+            record["algorithm"]: Agent(
+                record["episode_return"],
+                record["cost_rate"],
+                record["satisfies"],
+                record["steps"],
+            )
+            for record in records
+            if record["environment"] == environment
+        }
+        for better, worse, reason in compare(agents):
+            relations.append(
+                {"environment": environment, "better": better, "worse": worse, "reason": reason}
+            )
+    reasons = {"satisfies": "keeps its limits, the other does not", "dominates": "≻ dominates"}
+    return Table(
+        "dominance",
+        "Which is better",
+        [
+            Column("environment", plain("environment"), is_number=False),
+            Column("better", plain("better"), is_number=False),
+            Column("worse", plain("worse"), is_number=False),
+            Column("why", lambda r: reasons[r["reason"]], is_number=False),
+        ],
+        relations,
+        "By means over seeds (section 5.1 of the paper). Not ranked: algorithms that were trained "
+        "for different numbers of steps, or are each better in one respect.",
+    )
