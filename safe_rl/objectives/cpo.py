@@ -86,7 +86,7 @@ class CPOStep(TRPOStep):
 
     With g the gradient of the loss, bᵢ those of the cost surrogates and cᵢ the constraint
     violations, the step solves the CPO problem by its dual (see `cpo_dual`). The line search
-    takes the first fraction with KL(π_k ‖ π_θ) ≤ δ and L_c(new) − L_c(old) ≤ max(−c, 0), and,
+    takes the first fraction with KL(π_θ ‖ π_k) ≤ δ and L_c(new) − L_c(old) ≤ max(−c, 0), and,
     unless the step is a recovery (cases 0 and 1), a loss that is not worse.
 
     Args:

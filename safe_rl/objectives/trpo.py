@@ -143,7 +143,7 @@ class TRPOStep:
 
     The step is √(2δ / xᵀHx)·x with H x = −g solved by conjugate gradients, H the Fisher matrix of
     the policy plus damping. A backtracking line search takes its first fraction with
-    KL(π_k ‖ π_θ) ≤ δ that does not worsen the loss. If there is none, the policy stays.
+    KL(π_θ ‖ π_k) ≤ δ that does not worsen the loss. If there is none, the policy stays.
 
     The loss may be any callable from a batch to a TensorDict with scalars ``loss_…``, for example
     a surrogate of your own; their sum is minimised.
@@ -226,7 +226,7 @@ class TRPOStep:
             episode_length: T̄, scalar; read by constrained steps only.
 
         Returns:
-            The losses' entries after the step, ``kl`` (mean KL(π_k ‖ π_θ)), ``step_fraction``
+            The losses' entries after the step, ``kl`` (mean KL(π_θ ‖ π_k)), ``step_fraction``
             (accepted by the line search; 0: none), ``backtracks`` (tries before that one) and
             what the step itself reports.
         """

@@ -55,8 +55,8 @@ def policy_gaussian(
 def mean_kl(
     reference: Gaussian, actor_network: ProbabilisticTensorDictSequential, batch: TensorDictBase
 ) -> Tensor:
-    """Mean over states of KL(reference ‖ π_θ), scalar."""
-    return gaussian_kl(*reference, *policy_gaussian(actor_network, batch)).mean()
+    """Mean over states of KL(π_θ ‖ reference), scalar."""
+    return gaussian_kl(*policy_gaussian(actor_network, batch), *reference).mean()
 
 
 def subsample(batch: TensorDictBase, fraction: float) -> TensorDictBase:
@@ -73,7 +73,7 @@ def subsample(batch: TensorDictBase, fraction: float) -> TensorDictBase:
 class FisherProduct:
     """Product of a vector with the Fisher matrix of a Gaussian policy, plus damping.
 
-    The Fisher matrix is the Hessian of the mean KL(π_k ‖ π_θ) at θ_k: Jᵀ M J with J the Jacobian
+    The Fisher matrix is the Hessian of the mean KL(π_θ ‖ π_k) at θ_k: Jᵀ M J with J the Jacobian
     of mean and standard deviation with respect to θ, and M their own, diagonal, Fisher matrix,
     1/σ² for a mean and 2/σ² for a standard deviation σ. J v comes from differentiating the
     vector-Jacobian product uᵀJ, which is linear in u, with respect to u. Both graphs are built

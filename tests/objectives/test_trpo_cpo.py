@@ -47,7 +47,7 @@ def cpo_step(actor, **settings):
 def kl_and_surrogates(actor, batch):
     with torch.no_grad():
         loc, scale = policy_gaussian(actor, batch)
-        kl = gaussian_kl(batch["loc"], batch["scale"], loc, scale).mean()
+        kl = gaussian_kl(loc, scale, batch["loc"], batch["scale"]).mean()
         reward = -TRPOLoss(actor, entropy_coeff=0.0)(batch)["loss_objective"]
         costs = None
         if "cost_advantage" in batch.keys():  # noqa: SIM118 (a TensorDict iterates over its rows)

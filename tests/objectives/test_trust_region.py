@@ -72,7 +72,7 @@ def explicit_fisher(actor, batch, parameters):
         names = [name for name, _ in actor.named_parameters()]
         values = dict(zip(names, unflatten(vector, parameters), strict=True))
         out = torch.func.functional_call(actor.module[0], rename(values), batch.clone())
-        return kl_divergence(old, Independent(Normal(out["loc"], out["scale"]), 1)).mean()
+        return kl_divergence(Independent(Normal(out["loc"], out["scale"]), 1), old).mean()
 
     def rename(values):
         return {name.removeprefix("module.0."): value for name, value in values.items()}
