@@ -8,7 +8,7 @@ from typing import Any
 
 import torch
 from omegaconf import DictConfig, OmegaConf
-from torchrl.checkpoint import CheckpointError, CheckpointRotation
+from torchrl.checkpoint import CheckpointError
 from torchrl.envs import EnvBase
 
 from safe_rl.building import build_networks
@@ -58,8 +58,9 @@ def find_checkpoint(directory: Path, which: str) -> Path:
                 f"There is no checkpoint '{which}': checkpoint is last, best or the path of a file."
             )
         return path
+    # the newest by name, readable or not: an older one is not silently put in its place
     found = {
-        kind: CheckpointRotation(directory / "checkpoints" / kind, keep_last=1).latest()
+        kind: max((directory / "checkpoints" / kind).glob("checkpoint-*"), default=None)
         for kind in kinds
     }
     path = found.pop(which)

@@ -1,0 +1,252 @@
+"""The evaluate command on a tiny trained run: what it runs, writes and refuses."""
+
+import csv
+import json
+import pickle
+import shutil
+import zipfile
+from pathlib import Path
+
+import numpy as np
+import pytest
+from omegaconf import OmegaConf
+from run_configs import compose_config
+
+from safe_rl.envs import OpenGLError, make_env, store_configs
+from safe_rl.evaluate import evaluate, main
+from safe_rl.evaluation.options import EvaluationOptions
+from safe_rl.evaluation.video import HEIGHT, STEPS_PER_FRAME, WIDTH
+from safe_rl.protocol import REFERENCE
+from safe_rl.training import build_trainer, seed_everything
+
+NUM_STEPS = 40
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory):
+    """A run of two epochs on PointGoal1 with short episodes."""
+    store_configs()
+    config = compose_config(
+        "env=PointGoal1",
+        f"env.num_steps={NUM_STEPS}",
+        "frames=320",
+        "num_envs=4",
+        "frames_per_batch=160",
+        "model.hidden_sizes=[16]",
+        "policy_update.minibatch_size=80",
+        "critic_update.minibatch_size=80",
+        "logger=none",
+    )
+    seed_everything(config.seed, num_threads=1)
+    node = OmegaConf.to_container(config.env, resolve=True)
+    env = make_env(node, num_envs=4, seed=config.seed, num_threads=1)
+    directory = tmp_path_factory.mktemp("runs") / "run"
+    build_trainer(config, env, directory).run()
+    return directory
+
+
+@pytest.fixture
+def run(trained, tmp_path):
+    """A copy to write into."""
+    return Path(shutil.copytree(trained, tmp_path / "run"))
+
+
+def options(**changes):
+    return EvaluationOptions(**{"episodes": 7, "num_envs": 3, "num_threads": 1, **changes})
+
+
+def read_columns(path):
+    with path.open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    return {name: np.array([float(row[name]) for row in rows]) for name in rows[0]}
+
+
+def test_the_summary_is_that_of_the_episodes(run):
+    result = evaluate(run, options(cvar_alpha=0.5))
+    assert [path.name for path in result.files] == ["evaluation.json", "evaluation.csv"]
+    episodes = read_columns(run / "evaluation.csv")
+    assert set(episodes) == {"return", "length", "cost", "cost_hazards", "cost_exception"}
+    np.testing.assert_array_equal(episodes["length"], NUM_STEPS)
+    assert len(episodes["cost"]) == 7
+    assert episodes["return"].std() > 0
+    written = json.loads((run / "evaluation.json").read_text())
+    values = {name: estimate["value"] for name, estimate in written["estimates"].items()}
+    for key in ("return", "length", "cost", "cost_hazards", "cost_exception"):
+        assert values[f"episode_{key}"] == pytest.approx(episodes[key].mean())
+    worst = np.sort(episodes["cost"])[::-1]
+    assert values["cvar_cost"] == pytest.approx((worst[:3].sum() + 0.5 * worst[3]) / 3.5)
+    assert values["over_limit_cost"] == pytest.approx((episodes["cost"] > 25).mean())
+    # another episode length than the benchmark's: nothing to normalise by
+    assert "normalised_return" not in values
+    assert written["steps"] == 320
+    assert written["layouts_trained_on"] == 0.0
+    assert written["seed"] != 0
+
+
+def test_scores_are_normalised_where_the_environment_is_the_benchmarks(run):
+    limits = {"cost_limits": {"cost": 0.0}}
+    config = OmegaConf.merge(OmegaConf.load(run / "config.yaml"), limits)
+    OmegaConf.save(config, run / "config.yaml")
+    found = evaluate(run, options(episodes=6, num_envs=6, env={"num_steps": 1000})).estimates
+    reference = REFERENCE["PointGoal1"]
+    assert found["normalised_return"].value == pytest.approx(
+        found["episode_return"].value / reference.episode_return
+    )
+    cost = found["episode_cost"].value
+    assert cost > 0.0
+    assert found["normalised_violation"].value == pytest.approx(cost / reference.episode_cost)
+
+
+def test_the_seed_decides_and_the_mean_action_is_not_sampled(run):
+    def returns(**changes):
+        evaluate(run, options(**changes))
+        return read_columns(run / "evaluation.csv")["return"].tolist()
+
+    sampled = returns(seed=5)
+    assert returns(seed=5) == sampled
+    assert returns(seed=6) != sampled
+    assert returns(seed=5, deterministic=True) != sampled
+
+
+def test_layouts_can_be_those_of_training_or_others(run):
+    trained_on = {"env": {"layout_seeds": 10, "layout_seeds_first": 0}}
+    config = OmegaConf.merge(OmegaConf.load(run / "config.yaml"), trained_on)
+    OmegaConf.save(config, run / "config.yaml")
+
+    def known(**env):
+        return evaluate(run, options(episodes=1, env=env)).facts["layouts_trained_on"]
+
+    assert known() == 1.0
+    assert known(layout_seeds_first=1000) == 0.0
+    assert known(layout_seeds=None) == 0.0
+
+
+def test_evaluations_of_a_name_stand_side_by_side(run):
+    evaluate(run, options(episodes=1))
+    evaluate(run, options(episodes=2, name="other"))
+    numbers = [
+        json.loads((run / f"{name}.json").read_text())["episodes"]
+        for name in ("evaluation", "evaluation_other")
+    ]
+    assert numbers == [1, 2]
+
+
+def test_the_best_checkpoint_is_taken_on_demand(run):
+    best = next((run / "checkpoints" / "best").iterdir())
+    for named in ("best", str(best)):
+        facts = evaluate(run, options(episodes=1, checkpoint=named)).facts
+        assert facts["checkpoint_file"] == str(best)
+        assert facts["steps"] == int(best.stem.removeprefix("checkpoint-"))
+
+
+def test_the_command_prints_a_table(run, capsys):
+    assert main([str(run), "episodes=3", "num_envs=3", "num_threads=1"]) == 0
+    shown = capsys.readouterr().out
+    assert shown.startswith("ppo_lagrangian on PointGoal1 at 320 steps: 3 episodes")
+    assert "95 % interval" in shown
+    line = next(line for line in shown.splitlines() if line.startswith("episode_cost "))
+    assert line.endswith("limit 25")
+    assert f"wrote {run}/evaluation.json" in shown
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["epsiodes=3"], "Did you mean 'episodes'?"),
+        (["env.hazard_num=3"], "hazards_num"),
+        (["episodes=0"], "episodes=0"),
+        (["checkpoint=there.torchrl"], "checkpoint is last, best or the path"),
+        (["env.lidar_num_bins=8"], "trained on other observations"),
+        (["cvar_alpha=2"], "cvar_alpha"),
+        (["camera=nowhere", "video=true", "episodes=1"], "nowhere"),
+    ],
+)
+def test_what_cannot_be_done_ends_in_one_line(run, arguments, message, capsys):
+    if "video=true" in arguments:
+        skip_without_opengl()
+    assert main([str(run), *arguments]) == 1
+    error = capsys.readouterr().err.splitlines()[-1]
+    assert error.startswith("error: ")
+    assert message in error
+
+
+def test_a_folder_above_runs_names_them(run, capsys):
+    assert main([str(run.parent)]) == 1
+    assert f"Runs below it: {run}" in capsys.readouterr().err
+
+
+def test_without_a_best_checkpoint_the_last_is_offered(run, capsys):
+    shutil.rmtree(run / "checkpoints" / "best")
+    assert main([str(run), "checkpoint=best"]) == 1
+    error = capsys.readouterr().err
+    assert "no epoch kept every cost limit. Use checkpoint=last" in error
+
+
+def last_checkpoint(run):
+    return next((run / "checkpoints" / "last").iterdir())
+
+
+def test_a_truncated_checkpoint_is_named(run, capsys):
+    path = last_checkpoint(run)
+    path.write_bytes(path.read_bytes()[:2000])
+    assert main([str(run)]) == 1
+    assert path.name in capsys.readouterr().err
+    assert not (run / "evaluation.json").exists()
+
+
+class Trap:
+    """Unpickling it makes a file."""
+
+    def __init__(self, path):
+        self.path = str(path)
+
+    def __reduce__(self):
+        return open, (self.path, "w")
+
+
+@pytest.mark.parametrize("bare", [True, False])
+def test_a_checkpoint_runs_no_code(run, bare, tmp_path, capsys):
+    sprung = tmp_path / "sprung"
+    path = last_checkpoint(run)
+    if bare:
+        path.write_bytes(pickle.dumps(Trap(sprung)))
+    else:
+        with zipfile.ZipFile(path) as archive:
+            members = {name: archive.read(name) for name in archive.namelist()}
+        with zipfile.ZipFile(path, "w") as archive:
+            for name, content in members.items():
+                trapped = not name.endswith(".json")
+                archive.writestr(name, pickle.dumps(Trap(sprung)) if trapped else content)
+    assert main([str(run)]) == 1
+    assert path.name in capsys.readouterr().err
+    assert not sprung.exists()
+
+
+def skip_without_opengl():
+    env = make_env("PointGoal0", seed=0, num_threads=1)
+    env.reset()
+    try:
+        env.render(rows=0, width=16, height=16)
+    except OpenGLError as error:
+        pytest.skip(f"no pictures here: {error}")
+
+
+def test_the_video_shows_an_episode(run):
+    imageio = pytest.importorskip("imageio.v2", reason="needs the extra 'video'")
+    pytest.importorskip("imageio_ffmpeg", reason="needs the extra 'video'")
+    skip_without_opengl()
+    result = evaluate(run, options(episodes=1, video=True))
+    assert result.files[-1] == run / "evaluation.mp4"
+    with imageio.get_reader(run / "evaluation.mp4") as reader:
+        facts = reader.get_meta_data()
+        frames = np.stack([frame for frame in reader])  # noqa: C416, a list() would ask for its length
+    assert facts["codec"] == "h264"
+    assert facts["pix_fmt"].startswith("yuv420p")
+    assert len(frames) == NUM_STEPS // STEPS_PER_FRAME
+    assert frames.shape[2] == WIDTH
+    # below the picture stands a white line with black text
+    caption = frames[:, HEIGHT + 2 :]
+    assert np.median(caption) > 240
+    assert caption.min() < 80
+    assert np.abs(frames[0, :HEIGHT].astype(float) - frames[-1, :HEIGHT]).max() > 50
+    assert not list(run.glob("*.tmp*"))

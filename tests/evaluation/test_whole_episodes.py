@@ -1,0 +1,101 @@
+"""Which episodes are counted, on an environment whose lengths are known; layouts by counting."""
+
+import itertools
+
+import pytest
+import torch
+from tensordict import TensorDict
+from torchrl.data import Bounded, Categorical, Composite, Unbounded
+from torchrl.envs import EnvBase
+
+from safe_rl.evaluation.episodes import collect_episodes
+from safe_rl.evaluation.layouts import default_seed, shared_layouts
+from safe_rl.models import BehaviourPolicy, make_actor
+
+# steps of every world's episodes, in turn
+LENGTHS = [[30, 1], [2, 3], [1, 1]]
+
+
+class KnownLengths(EnvBase):
+    """The reward of a step is 1, its cost 0.5."""
+
+    def __init__(self):
+        num = len(LENGTHS)
+        super().__init__(batch_size=[num])
+        self.observation_spec = Composite(observation=Unbounded((num, 1)), shape=[num])
+        self.action_spec = Bounded(-1, 1, (num, 1))
+        keys = {key: Unbounded((num, 1)) for key in ("reward", "cost")}
+        self.full_reward_spec = Composite(**keys, shape=[num])
+        flags = ("done", "terminated", "truncated")
+        self.full_done_spec = Composite(
+            **{key: Categorical(2, dtype=torch.bool, shape=(num, 1)) for key in flags}, shape=[num]
+        )
+        self._lengths = torch.tensor(LENGTHS)
+        self._episode = torch.full((num,), -1)
+        self._step_count = torch.zeros(num, dtype=torch.long)
+
+    def _set_seed(self, seed):
+        pass
+
+    def _reset(self, tensordict=None, **kwargs):
+        mask = None if tensordict is None else tensordict.get("_reset", None)
+        mask = torch.ones(3, dtype=torch.bool) if mask is None else mask.reshape(3)
+        self._episode = self._episode + mask
+        self._step_count = torch.where(mask, 0, self._step_count)
+        return self._output(torch.zeros(3, 1, dtype=torch.bool))
+
+    def _output(self, done):
+        return TensorDict(
+            observation=torch.zeros(3, 1), done=done, terminated=done.clone(),
+            truncated=torch.zeros_like(done), batch_size=[3],
+        )  # fmt: skip
+
+    def _step(self, tensordict):
+        self._step_count = self._step_count + 1
+        length = self._lengths[torch.arange(3), self._episode % 2]
+        out = self._output((self._step_count >= length).unsqueeze(-1))
+        out["reward"], out["cost"] = torch.ones(3, 1), torch.full((3, 1), 0.5)
+        return out
+
+
+@pytest.mark.parametrize(
+    ("number", "expected"),
+    [
+        (3, [30, 2, 1]),
+        (5, [30, 1, 2, 3, 1]),  # the first two worlds have one more
+        (6, [30, 1, 2, 3, 1, 1]),
+    ],
+)
+def test_every_world_contributes_its_first_episodes(number, expected):
+    policy = BehaviourPolicy(make_actor(1, 1, hidden_sizes=[4], initial_log_std=0.0))
+    episodes = collect_episodes(KnownLengths(), policy, number, ["cost"], deterministic=False)
+    assert episodes.lengths.tolist() == expected
+    assert episodes.returns.tolist() == expected
+    assert episodes.costs["cost"].tolist() == [0.5 * length for length in expected]
+
+
+def layouts(env):
+    return set(range(env["layout_seeds_first"], env["layout_seeds_first"] + env["layout_seeds"]))
+
+
+@pytest.mark.parametrize(
+    ("trained", "evaluated"), list(itertools.product([(0, 5), (3, 4), (9, 1)], repeat=2))
+)
+def test_shared_layouts_are_those_in_both_ranges(trained, evaluated):
+    envs = [
+        {"randomize_layout": True, "layout_seeds_first": first, "layout_seeds": number}
+        for first, number in (trained, evaluated)
+    ]
+    common = len(layouts(envs[0]) & layouts(envs[1])) / len(layouts(envs[1]))
+    assert shared_layouts(*envs, same_seed=False) == common
+
+
+def test_a_fixed_layout_is_trainings_only_with_its_seed():
+    fixed = {"randomize_layout": False, "layout_seeds": None, "layout_seeds_first": 0}
+    unlimited = {**fixed, "randomize_layout": True}
+    assert default_seed(fixed, 4) == 4
+    assert default_seed(unlimited, 4) != 4
+    assert shared_layouts(fixed, fixed, same_seed=True) == 1.0
+    assert shared_layouts(fixed, fixed, same_seed=False) == 0.0
+    assert shared_layouts(unlimited, unlimited, same_seed=False) == 0.0
+    assert shared_layouts(unlimited, fixed, same_seed=True) == 0.0
