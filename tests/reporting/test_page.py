@@ -1,0 +1,212 @@
+"""The report as files, and the page as a browser shows it."""
+
+import base64
+import json
+import re
+import shutil
+import subprocess
+
+import numpy as np
+import pytest
+from matplotlib.image import imread
+from synthetic import NODES, write_run
+
+from safe_rl.report import main
+from safe_rl.reporting.experiments import group_runs
+from safe_rl.reporting.figures import algorithm_colours, draw_learning_curves
+from safe_rl.reporting.runs import find_runs
+
+CHROMIUM = next(
+    filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None
+)
+ROWS = {"returns": (1.0, 2.0, 3.0), "rates": (0.06, 0.05, 0.04)}
+# one frame of H.264 is not needed: the page embeds whatever bytes there are
+VIDEO = b"not really a film"
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """Two algorithms and seeds on PointGoal1, one run elsewhere that is not finished."""
+    root = tmp_path_factory.mktemp("experiments")
+    for algo, costs in (("ppo", (60.0, 50.0, 55.0)), ("ppo_lagrangian", (30.0, 20.0, 20.0))):
+        for seed in (0, 10):
+            directory = write_run(
+                root, "PointGoal1", algo, seed, **ROWS, costs=np.array(costs) + seed / 10
+            )
+    (directory / "evaluation.mp4").write_bytes(VIDEO)
+    (directory / "evaluation.json").write_text(json.dumps(EVALUATION))
+    write_run(root, "Mine", "cpo", 0, frames=10**6, overrides=["env=Mine", "+note=<b>&"])
+    (write_run(root, folder="unbegun") / "progress.csv").unlink()
+    return root
+
+
+def _estimate(value):
+    return {"value": value, "low": value - 1, "high": value + 1}
+
+
+EVALUATION = {
+    "checkpoint": "last", "steps": 3000, "episodes": 100, "deterministic": True, "env": {"x": 1},
+    "layouts_trained_on": 0.0, "cost_limits": {"cost": 25.0}, "cvar_alpha": 0.1,
+    "estimates": {
+        "episode_return": _estimate(12.0), "episode_cost": _estimate(21.0),
+        "cvar_cost": _estimate(70.0), "over_limit_cost": _estimate(0.25),
+    },
+}  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def report(folder):
+    assert main([str(folder), "seeds=2", "title=A <title>"]) == 0
+    return folder / "report"
+
+
+def test_everything_is_written(report):
+    assert {path.name for path in report.iterdir()} == {
+        "report.html", "report.md", "curves_point.png", "curves_robot.png", "final_PointGoal1.csv",
+        "slate_shared.csv", "slate_shared_iqm.csv", "slate_shared.png",
+        "missing.csv", "dominance.csv", "evaluations.csv", "runs.csv",
+    }  # fmt: skip
+    for picture in report.glob("*.png"):
+        assert imread(picture).std() > 0
+
+
+def test_the_markdown_has_the_tables(report):
+    text = (report / "report.md").read_text()
+    assert "| PPO | 2 | 3,000 | 2.00 ± 0.00 | 55.5 ± 0.7 | 25 | 0.0400 ± 0.0000 |" in text
+    assert "![Learning curves, Point](curves_point.png)" in text
+    assert "- SG1 lacks runs: 16 of PPO, 16 of PPO-Lagrangian" in text
+    assert "| PointGoal1 | PPO-Lagrangian | PPO | keeps its limits, the other does not |" in text
+    assert "sampled actions" not in text
+    assert "mean actions, x=1, 0% known layouts | 12.00 [11.00, 13.00] | 21.0 [20.0, 22.0]" in text
+
+
+def test_the_page_holds_everything_itself(report):
+    html = (report / "report.html").read_text()
+    links = re.findall(r'(?:src|href)="([^"]*)"', html)
+    assert all(link.startswith(("data:", "#")) for link in links)
+    anchors = [link[1:] for link in links if link.startswith("#")]
+    assert anchors
+    assert all(f'id="{anchor}"' in html for anchor in anchors)
+    assert base64.b64encode(VIDEO).decode() in html
+    assert base64.b64encode((report / "curves_point.png").read_bytes()).decode() in html
+    # what people wrote is text, not markup
+    assert "A &lt;title&gt;" in html
+    assert "python train.py env=Mine &#39;+note=&lt;b&gt;&amp;&#39;" in html
+    assert "it has not begun" in html
+
+
+def test_slates_that_all_share_are_averaged(tmp_path, capsys):
+    for env in ("PointGoal1", "CarGoal1"):
+        for algo in ("ppo", "cpo"):
+            write_run(tmp_path, env, algo)
+    write_run(tmp_path, "DoggoGoal1", "cpo")
+    assert main([str(tmp_path), "seeds=1", f"out={tmp_path / 'there'}"]) == 0
+    html = (tmp_path / "there" / "report.html").read_text()
+    assert "What all algorithms were trained on" in html
+    assert "PointGoal1, CarGoal1</p>" in html
+    assert (tmp_path / "there" / "slate_shared.png").exists()
+    assert "SG6 lacks runs: 4 of PPO, 3 of CPO" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [(["sedes=1"], "'seeds'"), (["seeds=0"], "at least one run"), (["seeds=two"], "'seeds'")],
+)
+def test_what_cannot_be_done_ends_in_one_line(tmp_path, arguments, message, capsys):
+    write_run(tmp_path)
+    assert main([str(tmp_path), *arguments]) == 1
+    error = capsys.readouterr().err
+    assert error.startswith("error: ")
+    assert message in error
+
+
+def test_panels_have_means_intervals_and_limits(tmp_path):
+    for seed, shift in ((0, 0.0), (10, 6.0)):
+        costs = [30.0 + shift] * 3
+        write_run(tmp_path, "PointGoal1", "ppo", seed, **ROWS, costs=costs)
+    write_run(tmp_path, "PointGoal2", "cpo", 0, **ROWS, costs=(1, 1, 1), limits={"cost": 10.0},
+              env_changes={"num_steps": 500}, frames=10**6)  # fmt: skip
+    experiments, _ = group_runs(find_runs(tmp_path)[0], NODES)
+    figure = draw_learning_curves(experiments, algorithm_colours(experiments))
+    panels = np.array(figure.axes).reshape(2, 3)
+    assert [axes.get_title() for axes in panels[0]] == ["Return", "Episode cost", "Cost rate"]
+    assert panels[0, 0].get_ylabel() == "PointGoal1"
+    cost_line, limit = panels[0, 1].lines
+    np.testing.assert_allclose(cost_line.get_ydata(), 33.0)
+    assert (limit.get_linestyle(), list(limit.get_ydata())) == ("--", [25.0, 25.0])
+    band = panels[0, 1].collections[0].get_paths()[0].get_extents()
+    assert (band.ymin, band.ymax) == pytest.approx((30.0, 36.0))
+    assert list(panels[0, 2].lines[-1].get_ydata()) == [0.025, 0.025]
+    # the limit of another task, over shorter episodes; and a run that is not finished is dotted
+    assert list(panels[1, 2].lines[-1].get_ydata()) == [0.02, 0.02]
+    assert panels[1, 0].lines[0].get_linestyle() == ":"
+    names = [text.get_text() for text in figure.legends[0].get_texts()]
+    assert names == ["PPO", "CPO (unfinished)"]
+
+
+def test_every_limited_cost_has_a_row(tmp_path):
+    directory = write_run(tmp_path, limits={"cost": 25.0, "cost_hazards": 5.0})
+    path = directory / "progress.csv"
+    head, row = path.read_text().splitlines()
+    path.write_text(f"{head},episode_cost_hazards,cost_hazards_rate\n{row},4,0.004\n")
+    experiments, _ = group_runs(find_runs(tmp_path)[0], NODES)
+    figure = draw_learning_curves(experiments, algorithm_colours(experiments))
+    panels = np.array(figure.axes).reshape(2, 3)
+    assert [axes.get_ylabel() for axes in panels[:, 0]] == [
+        "PointGoal1", "PointGoal1\ncost_hazards",
+    ]  # fmt: skip
+    assert [list(line.get_ydata()) for line in panels[1, 1].lines] == [[4.0], [5.0, 5.0]]
+
+
+def test_colours_stay_with_the_algorithms(tmp_path):
+    for algo in ("ppo", "cpo", "mine", "yours"):
+        write_run(tmp_path, algo=algo)
+    write_run(tmp_path, algo="cpo", frames=500, folder="variant")
+    everything, _ = group_runs(find_runs(tmp_path)[0], NODES)
+    colours = algorithm_colours(everything)
+    assert len(set(colours.values())) == 5
+    alone = algorithm_colours([e for e in everything if e.algorithm == "PPO"])
+    assert alone["PPO"] == colours["PPO"]
+
+
+# appended to the page: what the browser makes of it, as JSON in an element
+PROBE = """
+<script>
+  const images = [...document.images].map(image => image.naturalWidth);
+  const tables = [...document.querySelectorAll("table")].map(
+    table => [table.offsetWidth, table.parentElement.clientWidth]);
+  const facts = {images, tables, page: document.documentElement.scrollWidth,
+                 window: window.innerWidth, heading: document.querySelector("h1").textContent};
+  const probe = document.createElement("pre");
+  probe.id = "probe";
+  probe.textContent = btoa(unescape(encodeURIComponent(JSON.stringify(facts))));
+  document.body.append(probe);
+</script>
+"""
+
+
+@pytest.mark.skipif(CHROMIUM is None, reason="Chromium is not installed")
+def test_a_browser_shows_the_page(report, tmp_path):
+    page = tmp_path / "page.html"
+    page.write_text((report / "report.html").read_text() + PROBE)
+    result = subprocess.run(
+        [
+            *(CHROMIUM, "--headless", "--no-sandbox", "--disable-gpu", "--no-first-run"),
+            *("--disable-background-networking", "--disable-component-update", "--disable-sync"),
+            *("--disable-quic", f"--user-data-dir={tmp_path / 'profile'}"),
+            *("--window-size=1280,900", "--virtual-time-budget=5000"),
+            *("--dump-dom", page.as_uri()),
+        ],
+        capture_output=True,
+        text=True,
+        timeout=120,
+    )
+    found = re.search(r'<pre id="probe">([^<]*)</pre>', result.stdout)
+    assert found, result.stderr
+    facts = json.loads(base64.b64decode(found.group(1)))
+    assert facts["heading"] == "A <title>"
+    assert len(facts["images"]) == 3
+    assert all(width > 1000 for width in facts["images"])
+    # nothing sticks out of the window, nor, at this width, a table out of its box
+    assert facts["page"] <= facts["window"]
+    assert all(table <= box for table, box in facts["tables"])

@@ -1,0 +1,137 @@
+"""Which folders count as runs, how they are grouped, and what they are called."""
+
+import os
+
+import pytest
+from synthetic import NODES, write_run
+
+from safe_rl.reporting.experiments import distinguishing_keys, group_runs
+from safe_rl.reporting.runs import find_runs
+
+
+def names(experiments):
+    return [(e.environment, e.algorithm, [run.seed for run in e.runs]) for e in experiments]
+
+
+def grouped(root):
+    return group_runs(find_runs(root)[0], NODES)
+
+
+def test_seeds_of_one_configuration_are_one_experiment(tmp_path):
+    for seed in (20, 0, 10):
+        write_run(tmp_path, "PointGoal1", "cpo", seed, device="cpu", num_threads=seed + 1)
+    write_run(tmp_path, "PointGoal1", "ppo", 0)
+    write_run(tmp_path, "CarPush1", "ppo", 0)
+    experiments, skipped = grouped(tmp_path)
+    # in the order of the benchmark and of the paper's tables
+    assert names(experiments) == [
+        ("PointGoal1", "PPO", [0]),
+        ("PointGoal1", "CPO", [0, 10, 20]),
+        ("CarPush1", "PPO", [0]),
+    ]
+    assert not skipped
+    assert [e.benchmark for e in experiments] == ["PointGoal1", "PointGoal1", "CarPush1"]
+
+
+def test_a_run_knows_its_command_and_its_end(tmp_path):
+    said = ["env=PointGoal1", "cost_limits={cost: 10}", "seed=0"]
+    write_run(tmp_path, returns=(1.0, 2.0), costs=(1, 1), rates=(0, 0), overrides=said)
+    write_run(tmp_path, seed=1, frames=9000)
+    (tmp_path / "PointGoal1/ppo/seed1/.hydra/overrides.yaml").unlink()
+    first, second = find_runs(tmp_path)[0]
+    assert first.command == "python train.py env=PointGoal1 'cost_limits={cost: 10}' seed=0"
+    assert (first.steps, first.is_finished, first.hours) == (2000, True, 0.002)
+    assert second.command is None
+    assert not second.is_finished
+    assert find_runs(tmp_path, unfinished=True)[0][1].is_finished
+
+
+def test_what_is_no_run_is_named_with_its_reason(tmp_path):
+    good = write_run(tmp_path)
+    foreign, unbegun, empty, torn, garbled = (
+        write_run(tmp_path, seed=seed, folder=f"f{seed}") for seed in range(1, 6)
+    )
+    (foreign / "config.yaml").write_text("some: thing")
+    (unbegun / "progress.csv").unlink()
+    (empty / "progress.csv").write_text("epoch,steps\n")
+    (torn / "progress.csv").write_text("epoch,steps\n1,1000\n2")
+    (garbled / "config.yaml").write_text("{")
+    runs, skipped = find_runs(tmp_path)
+    assert [run.directory for run in runs] == [good]
+    reasons = {path.name: reason for path, reason in skipped.items()}
+    assert reasons["f1"] == "config.yaml is not that of a run"
+    assert reasons["f2"] == "it has not begun: no progress.csv"
+    assert reasons["f3"] == "it has not finished an epoch"
+    assert reasons["f4"].startswith("progress.csv cannot be read")
+    assert reasons["f5"].startswith("config.yaml cannot be read")
+
+
+def test_without_any_run_there_is_an_error_with_the_reasons(tmp_path):
+    with pytest.raises(FileNotFoundError, match="a run is a folder with config"):
+        find_runs(tmp_path)
+    (write_run(tmp_path) / "progress.csv").unlink()
+    with pytest.raises(FileNotFoundError, match="seed0: it has not begun"):
+        find_runs(tmp_path)
+    with pytest.raises(FileNotFoundError, match="There is no folder"):
+        find_runs(tmp_path / "elsewhere")
+
+
+def test_of_the_same_run_twice_the_one_that_came_further_is_kept(tmp_path):
+    rows = {"returns": (1.0, 2.0), "costs": (1, 1), "rates": (0, 0)}
+    longer = write_run(tmp_path, **rows, frames=2000, folder="longer")
+    shorter = write_run(tmp_path, frames=2000, folder="shorter")
+    newer = write_run(tmp_path, seed=1, frames=2000, folder="newer")
+    older = write_run(tmp_path, seed=1, frames=2000, folder="older")
+    os.utime(older / "progress.csv", (1.0, 1.0))
+    (experiment,), skipped = grouped(tmp_path)
+    assert [run.directory for run in experiment.runs] == [longer, newer]
+    assert skipped == {
+        shorter: f"{longer} is the same run with the same seed",
+        older: f"{newer} is the same run with the same seed",
+    }
+
+
+def test_variants_are_told_apart_by_what_differs(tmp_path):
+    write_run(tmp_path, algo="ppo_lagrangian", limits={"cost": 25.0}, folder="a")
+    write_run(tmp_path, algo="ppo_lagrangian", limits={"cost": 10.0}, folder="b")
+    write_run(tmp_path, algo="mine", model={"hidden_sizes": [64]}, folder="c")
+    write_run(tmp_path, algo="mine", model={"hidden_sizes": [8, 8]}, folder="d")
+    multiplier = {"_target_": "safe_rl.objectives.PIDMultiplier", "ki": 0.1}
+    write_run(tmp_path, algo="cpo", lagrangian=multiplier, folder="e")
+    write_run(tmp_path, algo="cpo", lagrangian={"_target_": "some.LagrangeMultiplier"}, folder="f")
+    assert [name for _, name, _ in names(grouped(tmp_path)[0])] == [
+        "PPO-Lagrangian (cost ≤ 10)",
+        "PPO-Lagrangian (cost ≤ 25)",
+        "CPO (lagrangian=LagrangeMultiplier)",
+        "CPO (lagrangian=PIDMultiplier)",
+        "mine (model.hidden_sizes=[64])",
+        "mine (model.hidden_sizes=[8,8])",
+    ]
+
+
+def test_the_preset_stands_for_what_follows_from_it():
+    point = [
+        {"preset": "default", "frames": 3, "model.width": 64},
+        {"preset": "paper", "frames": 10, "model.width": 256},
+    ]
+    # what differs between environments alone tells nothing apart
+    doggo = [{"preset": "paper", "frames": 100, "model.width": 256}]
+    assert distinguishing_keys([point, doggo]) == ["preset"]
+    assert distinguishing_keys([doggo, point[:1]]) == []
+    point.append({"preset": "paper", "frames": 20, "model.width": 256})
+    assert distinguishing_keys([point, doggo]) == ["preset", "frames"]
+
+
+def test_a_changed_environment_is_another_one(tmp_path):
+    write_run(tmp_path, folder="a")
+    write_run(tmp_path, folder="b", env_changes={"hazards_num": 12, "layout_seeds": 5})
+    write_run(tmp_path, folder="c", env="Mine", env_changes={"hazards_num": 1})
+    write_run(tmp_path, folder="d", env="Mine", env_changes={"hazards_num": 2})
+    experiments, _ = grouped(tmp_path)
+    assert [(e.environment, e.benchmark) for e in experiments] == [
+        ("PointGoal1", "PointGoal1"),
+        ("Mine", None),
+        ("Mine (hazards_num=2)", None),
+        ("PointGoal1 (layout_seeds=5, hazards_num=12)", None),
+    ]
+    assert [e.reference is None for e in experiments] == [False, True, True, True]

@@ -1,0 +1,234 @@
+"""Final scores, slates and rankings of runs whose numbers are chosen."""
+
+import csv
+
+import numpy as np
+import pytest
+from synthetic import NODES, write_run
+
+from safe_rl.protocol import REFERENCE, SLATES
+from safe_rl.reporting.curves import mean_curve
+from safe_rl.reporting.experiments import group_runs
+from safe_rl.reporting.results import dominance_table, final_record, final_table
+from safe_rl.reporting.runs import find_runs
+from safe_rl.reporting.slate_tables import gap_table, middle_table, slate_table
+from safe_rl.reporting.slates import aggregate, find_gap
+from safe_rl.reporting.tables import Column, Table, number, plain
+
+
+def experiments_in(root):
+    return group_runs(find_runs(root)[0], NODES)[0]
+
+
+def test_final_scores_are_means_and_deviations_over_seeds(tmp_path):
+    # seven epochs, of which the last five count for return and cost and the last for the rate
+    early = (900.0, 900.0)
+    for seed, shift in ((0, -1.0), (10, 0.0), (20, 4.0)):
+        returns = (*early, *(10.0 + shift + k for k in (-2, -1, 0, 1, 2)))
+        costs = (*early, *[20.0 + shift] * 5)
+        rates = (*[9.0] * 6, 0.02 + shift / 1000)
+        write_run(tmp_path, "CarGoal1", "ppo", seed, returns=returns, costs=costs, rates=rates)
+    (experiment,) = experiments_in(tmp_path)
+    record = final_record(experiment, ["cost"])
+    # shifts -1, 0, 4: mean 1, variance (4 + 1 + 9) / 2
+    assert record["episode_return"] == pytest.approx(11.0)
+    assert record["episode_return_std"] == pytest.approx(7**0.5)
+    assert record["episode_cost"] == pytest.approx(21.0)
+    assert record["cost_rate"] == pytest.approx(0.021)
+    assert record["cost_rate_std"] == pytest.approx(7**0.5 / 1000)
+    assert (record["seeds"], record["steps"], record["satisfies"]) == (3, 7000, True)
+    (row,) = final_table("CarGoal1", [record], ["cost"]).rows()
+    assert [cell.text for cell in row] == [
+        "PPO", "3", "7,000", "11.00 ± 2.65", "21.0 ± 2.6", "25", "0.0210 ± 0.0026",
+        "25.49 / 54.218 / 0.054", "33.4 / 58.1",
+    ]  # fmt: skip
+
+
+def test_published_values_stand_only_beside_what_they_are_values_of(tmp_path):
+    write_run(tmp_path, algo="ppo_lagrangian", limits={"cost": 10.0}, folder="other limit")
+    write_run(tmp_path, algo="ppo", env_changes={"hazards_num": 3}, folder="other environment")
+    write_run(tmp_path, algo="trpo")
+    found = {e.algorithm: final_record(e, ["cost"]) for e in experiments_in(tmp_path)}
+    assert "later_return" not in found["PPO-Lagrangian"]
+    assert "later_return" not in found["PPO"]
+    assert "paper_episode_return" not in found["PPO"]
+    assert found["TRPO"]["later_cost"] == 45.9
+    assert "paper_episode_return" not in found["TRPO"]
+
+
+def marks(table, title):
+    place = [column.title for column in table.columns].index(title)
+    return [row[place].mark for row in table.rows()]
+
+
+def ranked(tmp_path):
+    """Four agents: B is dominated by A, D has the highest return and violates the limit."""
+    for algo, values in {
+        "ppo": (20.0, 60.0, 0.06),
+        "ppo_lagrangian": (10.0, 25.0, 0.02),
+        "trpo_lagrangian": (10.0, 20.0, 0.03),
+        "cpo": (12.0, 24.0, 0.04),
+    }.items():
+        returns, costs, rates = ([value] for value in values)
+        write_run(tmp_path, algo=algo, returns=returns, costs=costs, rates=rates)
+    return [final_record(e, ["cost"]) for e in experiments_in(tmp_path)]
+
+
+def test_the_best_is_sought_among_those_that_keep_their_limits(tmp_path):
+    table = final_table("PointGoal1", ranked(tmp_path), ["cost"])
+    assert marks(table, "$J_c$") == ["bad", "", "", ""]
+    assert marks(table, "$J_r$") == ["", "", "", "best"]
+    assert marks(table, r"$\rho_c$") == ["", "best", "", ""]
+
+
+def test_the_ranking_follows_the_two_rules(tmp_path):
+    records = dominance_table(ranked(tmp_path)).records
+    assert {(r["better"], r["worse"], r["reason"]) for r in records} == {
+        ("PPO-Lagrangian", "TRPO-Lagrangian", "dominates"),
+        ("PPO-Lagrangian", "PPO", "satisfies"),
+        ("TRPO-Lagrangian", "PPO", "satisfies"),
+        ("CPO", "PPO", "satisfies"),
+    }
+
+
+def write_slate(root, algo, multiples, *, leave_out=()):
+    """Final scores that are multiples of the reference: one multiple per environment and seed."""
+    for index, env in enumerate(SLATES["SG6"]):
+        reference = REFERENCE[env]
+        for seed, spread in ((0, -0.1), (10, 0.0), (20, 0.1)):
+            if (env, seed) in leave_out:
+                continue
+            factor = multiples[index] + spread
+            write_run(
+                root, env, algo, seed,
+                returns=[factor * reference.episode_return],
+                costs=[25 + factor * (reference.episode_cost - 25)],
+                rates=[factor * reference.cost_rate],
+            )  # fmt: skip
+
+
+MULTIPLES = (0.2, 0.4, 0.6, 0.8, 1.0, 3.0)
+
+
+def test_a_complete_slate_is_averaged_over_environments_and_seeds(tmp_path):
+    write_slate(tmp_path, "cpo", MULTIPLES)
+    experiments = experiments_in(tmp_path)
+    assert find_gap("SG6", "CPO", experiments, 3) is None
+    result = aggregate(experiments)
+    assert result.mean == pytest.approx((1.0, 1.0, 1.0))
+    assert result.num_runs == 18
+    # 18 values; four are left out at each end: 0.1 0.2 0.3 0.3 | 0.4 ... 0.9 | 1.1 2.9 3.0 3.1
+    kept = [0.4, 0.5, 0.5, 0.6, 0.7, 0.7, 0.8, 0.9, 0.9, 1.0]
+    middle = result.middle["episode_return"]
+    assert middle.value == pytest.approx(np.mean(kept))
+    # the seeds of an environment are within 0.1 of each other, and environments stay apart
+    assert middle.value - 0.1 <= middle.low < middle.value < middle.high <= middle.value + 0.1
+    table = slate_table("SG6", [result])
+    ours = dict(zip((c.title for c in table.columns), table.rows()[0], strict=True))
+    assert ours[r"$\bar J_r$"].text == "1.000"
+    assert ours[r"paper $\bar J_r$"].text == "1.021"
+    assert ours[r"paper $\bar M_c$"].text == "0.573"
+    assert ours["steps"].text == "1,000"
+    assert "worse than any that does not: CPO" in table.note
+    (row,) = middle_table("SG6", [result]).rows()
+    assert row[1].text.startswith("0.700 [0.")
+
+
+def test_unequal_numbers_of_seeds_weigh_environments_equally(tmp_path):
+    half, double = ((0.5, REFERENCE["PointGoal1"]), (2.0, REFERENCE["CarGoal1"]))
+    for env, seeds, (factor, reference) in (
+        ("PointGoal1", (0,), half),
+        ("CarGoal1", (0, 1, 2), double),
+    ):
+        for seed in seeds:
+            write_run(tmp_path, env, "ppo", seed, returns=[factor * reference.episode_return])
+    assert aggregate(experiments_in(tmp_path)).mean.episode_return == pytest.approx(1.25)
+
+
+def test_an_incomplete_slate_says_which_runs_it_lacks(tmp_path):
+    missing = (("CarGoal1", 10), ("DoggoGoal1", 0), ("DoggoGoal1", 10), ("DoggoGoal1", 20))
+    write_slate(tmp_path, "cpo", MULTIPLES, leave_out=missing)
+    # a seed of one's own counts, and runs that are not finished do not
+    write_run(tmp_path, "PointPush1", "cpo", 7)
+    write_run(tmp_path, "DoggoGoal1", "cpo", 20, frames=10**8)
+    experiments = experiments_in(tmp_path)
+    gap = find_gap("SG6", "CPO", experiments, 3)
+    assert gap.seeds == {"CarGoal1": (10,), "DoggoGoal1": (0, 10, 20)}
+    assert gap.commands() == [
+        "python train.py -m env=CarGoal1 algo=cpo seed=10",
+        "python train.py -m env=DoggoGoal1 algo=cpo seed=0,10,20",
+    ]
+    # beyond the published seeds come further ones, and PointPush1 has four already
+    more = find_gap("SG6", "CPO", experiments, 4).seeds
+    assert more["PointGoal1"] == (30,)
+    assert more["DoggoGoal1"] == (0, 10, 20, 30)
+    assert "PointPush1" not in more
+    (row,) = gap_table([gap]).rows()
+    assert [cell.text for cell in row[:3]] == ["SG6", "CPO", "4"]
+    assert row[3].text == "CarGoal1 (seeds 10), DoggoGoal1 (seeds 0, 10, 20)"
+
+
+def test_the_missing_runs_of_a_variant_are_those_of_the_variant(tmp_path):
+    said = ["env=PointGoal1", "env.num_steps=1000", "algo=cpo", "preset=paper", "+seed=0"]
+    write_run(tmp_path, algo="cpo", overrides=said)
+    gap = find_gap("SGDoggo", "CPO", experiments_in(tmp_path), 1)
+    (command,) = gap.commands()
+    assert command.startswith("python train.py -m env=DoggoGoal1,DoggoGoal2,")
+    assert command.endswith(" algo=cpo preset=paper seed=0")
+
+
+def test_a_slate_takes_environments_as_they_are_and_a_limit_of_the_cost(tmp_path):
+    write_run(tmp_path, "PointGoal1", "cpo", 0, env_changes={"hazards_num": 3})
+    write_run(tmp_path, "PointGoal2", "cpo", 0, limits={"cost_hazards": 25.0})
+    write_run(tmp_path, "PointPush1", "cpo", 0)
+    lacking = find_gap("SGPoint", "CPO", experiments_in(tmp_path), 1).seeds
+    assert {"PointGoal1", "PointGoal2"} <= set(lacking)
+    assert "PointPush1" not in lacking
+
+
+def test_curves_are_means_over_seeds_on_common_steps(tmp_path):
+    slow = {"returns": [0.0, 2.0, 4.0], "costs": [1, 1, 1], "rates": [0.1, 0.2, 0.3]}
+    fast = {"returns": [10.0, 12.0], "costs": [1, 1], "rates": [0.3, 0.6]}
+    write_run(tmp_path, seed=0, **slow, frames=0)
+    write_run(tmp_path, seed=1, **fast, frames=0)
+    runs, _ = find_runs(tmp_path)
+    curve = mean_curve(runs, "cost_rate", smooth=False)
+    # until the shorter one ends, with as many points as the longer one has epochs
+    np.testing.assert_allclose(curve.steps, [1000, 1500, 2000])
+    np.testing.assert_allclose(curve.mean, [0.2, 0.3, 0.4])
+    # two seeds: the same is drawn twice in half of all resamples
+    np.testing.assert_allclose(curve.low, [0.1, 0.15, 0.2])
+    np.testing.assert_allclose(curve.high, [0.3, 0.45, 0.6])
+    alone = mean_curve(runs[:1], "episode_return", smooth=True)
+    np.testing.assert_allclose(alone.mean[1], 2.0)
+    assert np.isnan(alone.low).all()
+    assert mean_curve(runs, "no_such_column", smooth=False) is None
+
+
+def test_epochs_without_an_episode_are_bridged(tmp_path):
+    nan = float("nan")
+    values = {"returns": [1.0, nan, 3.0], "costs": [1, nan, 1], "rates": [0.1, 0.1, 0.1]}
+    directory = write_run(tmp_path, **values)
+    text = (directory / "progress.csv").read_text().replace("nan", "")
+    (directory / "progress.csv").write_text(text)
+    curve = mean_curve(find_runs(tmp_path)[0], "episode_return", smooth=False)
+    np.testing.assert_allclose(curve.mean, [1.0, 3.0])
+    np.testing.assert_allclose(curve.steps, [1000, 3000])
+
+
+def test_tables_write_all_fields_and_show_the_chosen(tmp_path):
+    records = [{"name": "a", "x": 1.25, "x_std": 0.5}, {"name": "b", "x": float("nan"), "more": 7}]
+    columns = [
+        Column("name", plain("name"), is_number=False),
+        Column("x", number("x", 1, "x_std"), lambda r: "best" if r["name"] == "a" else ""),
+    ]
+    table = Table("scores", "Scores", columns, records)
+    lines = ["| name | x |", "|---|---:|", "| a | **1.2 ± 0.5** |", "| b | — |"]
+    assert table.markdown().splitlines() == lines
+    table.write_csv(tmp_path)
+    with (tmp_path / "scores.csv").open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert rows == [
+        {"name": "a", "x": "1.25", "x_std": "0.5", "more": ""},
+        {"name": "b", "x": "", "x_std": "", "more": "7"},
+    ]
