@@ -186,11 +186,15 @@ def _algorithm_names(runs: Sequence[Run], environments: Mapping[Path, str]) -> d
 
 
 def _learning_settings(run: Run) -> Settings:
-    return {
+    settings = {
         key: value
         for key, value in flatten(run.config).items()
         if key.partition(".")[0] not in {"env", *_MANNER} and not key.endswith(".compile")
     }
+    if settings.get("init_from"):
+        # every seed starts from a run of its own; what these have in common is the folder above
+        settings["init_from"] = str(Path(str(settings["init_from"])).parent)
+    return settings
 
 
 def _in_brackets(settings: Mapping[str, Hashable]) -> str:
