@@ -23,15 +23,20 @@ def _boolean(key: str, value: Any) -> bool:
 
 
 def _integer(key: str, value: Any) -> int:
-    if isinstance(value, bool) or not isinstance(value, int | float) or value != int(value):
+    is_whole = isinstance(value, int) or (isinstance(value, float) and value.is_integer())
+    if isinstance(value, bool) or not is_whole:
         raise _wrong(key, "an integer", value)
     return int(value)
 
 
 def _number(key: str, value: Any) -> float:
-    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+    try:
+        number = math.nan if isinstance(value, bool | str) else float(value)
+    except (TypeError, ValueError, OverflowError):
+        number = math.nan
+    if not math.isfinite(number):
         raise _wrong(key, "a finite number", value)
-    return float(value)
+    return number
 
 
 def _text(key: str, value: Any) -> str:
@@ -115,6 +120,7 @@ _CHOICES: Mapping[str, Iterable[Any]] = {
     "lidar_type": ("pseudo", "natural"),
     "compass_shape": (2, 3),
 }
+LARGEST_SEED = 2**62  # of layouts, which are hashed as 64-bit integers
 # By the ends of keys, so that keys of registered elements are checked like the others.
 _POSITIVE_ENDINGS = (
     *("_size", "_density", "_height", "_radius"),
@@ -136,6 +142,8 @@ def validate(config: Mapping[str, Any]) -> None:
     probability = config["frameskip_binom_p"]
     if not 0.0 <= probability <= 1.0:
         raise _wrong("frameskip_binom_p", "a probability between 0 and 1", probability)
+    if config["layout_seeds_first"] + (config["layout_seeds"] or 0) > LARGEST_SEED:
+        raise _wrong("layout_seeds_first", f"at most {LARGEST_SEED}", config["layout_seeds_first"])
     if goal_is_button(config["task"]) and config["buttons_num"] < 1:
         raise ConfigError(f"'task' {config['task']} needs at least one button: set 'buttons_num'.")
 

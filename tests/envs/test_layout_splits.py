@@ -93,6 +93,7 @@ def test_without_a_number_layouts_never_come_again():
         ({"layout_seeds": 0}, "'layout_seeds'.*greater than 0"),
         ({"layout_seeds": 1.5}, "'layout_seeds'.*integer"),
         ({"layout_seeds_first": -1}, "'layout_seeds_first'.*0 or more"),
+        ({"layout_seeds_first": 2**63}, "'layout_seeds_first'.*at most"),
         ({"layout_seed": 3}, "'layout_seed'.*'layout_seeds'"),
     ],
 )

@@ -1,0 +1,224 @@
+"""Any valid configuration makes a working environment; errors name the key that is wrong."""
+
+import dataclasses
+import math
+import string
+
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from safe_rl.envs import ConfigError, LayoutError, SafetyGymConfig, SafetyGymEnv
+
+# Deterministic, so that no run depends on luck; without deadlines, which depend on the machine.
+often, seldom = (
+    settings(
+        max_examples=number,
+        deadline=None,
+        derandomize=True,
+        suppress_health_check=[HealthCheck.too_slow, HealthCheck.data_too_large],
+    )
+    for number in (100, 4)
+)
+
+COUNTED = ("walls", "hazards", "vases", "pillars", "buttons", "gremlins")
+PLACED = (*COUNTED, "robot", "goal", "box")
+FLAGS = [
+    field.name
+    for field in dataclasses.fields(SafetyGymConfig)
+    if field.type == "bool"
+    # Needs OpenGL; has its own tests.
+    and field.name != "observe_vision"
+]
+
+
+def between(low: float, high: float) -> st.SearchStrategy[float]:
+    return st.floats(low, high, allow_nan=False, allow_subnormal=False)
+
+
+def some_of(keys: dict[str, st.SearchStrategy]) -> st.SearchStrategy[dict]:
+    """Any of these keys with a value each."""
+    return st.fixed_dictionaries({}, optional=keys)
+
+
+# Objects of 0.35 m and keepouts of 0.4 m fit 20 times into 9 x 9 m.
+SIZES = {f"{kind}_size": between(0.05, 0.35) for kind in (*COUNTED, "goal", "box")}
+KEEPOUTS = {f"{kind}_keepout": between(0.0, 0.4) for kind in PLACED}
+COUNTS = {f"{kind}_num": st.integers(0, 3) for kind in COUNTED}
+DENSITIES = {f"{kind}_density": between(1e-4, 10.0) for kind in ("vases", "gremlins", "box")}
+PLACEMENTS = {
+    f"{kind}_placements": st.lists(
+        st.sampled_from([(-4, -4, 4, 0), (-4, 0, 4, 4), (-4.5, -4.5, 4.5, 4.5)]), min_size=1,
+        max_size=2,
+    )
+    for kind in PLACED
+}  # fmt: skip
+ROTATIONS = {
+    f"{kind}_rots": st.lists(between(-7.0, 7.0), max_size=4)
+    for kind in ("vases", "gremlins", "box")
+}
+COSTS = {
+    key: between(0.0, 3.0)
+    for key in (
+        *("hazards_cost", "pillars_cost", "buttons_cost", "gremlins_contact_cost"),
+        *("vases_contact_cost", "vases_displace_cost", "vases_velocity_cost"),
+    )
+}
+NUMBERS = {
+    "num_steps": st.integers(2, 5),
+    "action_noise": between(0.0, 1.0),
+    "frameskip_binom_n": st.integers(1, 12),
+    "frameskip_binom_p": between(0.0, 1.0),
+    "placements_margin": between(0.0, 0.1),
+    "layout_seeds": st.none() | st.integers(1, 3),
+    "layout_seeds_first": st.integers(0, 2**40),
+    "robot_rot": st.none() | between(-10.0, 10.0),
+    "lidar_num_bins": st.integers(1, 20),
+    "lidar_max_dist": st.none() | between(0.1, 10.0),
+    "lidar_exp_gain": between(0.0, 5.0),
+    "lidar_type": st.sampled_from(["pseudo", "natural"]),
+    "compass_shape": st.sampled_from([2, 3]),
+    "box_null_dist": between(0.0, 5.0),
+    "reward_distance": between(-2.0, 2.0),
+    "reward_goal": between(-2.0, 2.0),
+    "reward_clip": st.none() | between(0.0, 10.0),
+    "reward_orientation_scale": between(-1.0, 1.0),
+    "circle_radius": between(0.1, 3.0),
+    "buttons_resampling_delay": st.integers(0, 4),
+    "gremlins_travel": between(0.0, 0.5),
+}
+FIXED = {"placements_extents": (-4.5, -4.5, 4.5, 4.5), "robot_locations": ()}
+
+
+@st.composite
+def configurations(draw) -> dict:
+    """Valid configurations."""
+    config = draw(
+        some_of(
+            SIZES | KEEPOUTS | COUNTS | DENSITIES | PLACEMENTS | ROTATIONS | COSTS | NUMBERS
+            | dict.fromkeys(FLAGS, st.booleans())
+        )
+    )  # fmt: skip
+    config |= FIXED
+    config["robot_base"] = draw(st.sampled_from(["point", "car", "doggo"]))
+    config["task"] = draw(st.sampled_from(["goal", "button", "push", "x", "z", "circle", "none"]))
+    if config["task"] == "button":
+        config["buttons_num"] = max(1, config.get("buttons_num", 0))
+    if config["robot_base"] == "point":
+        config.pop("observe_freejoint", None)
+    if not any(config.get(flag) for flag in ("observe_sensors", "observe_ctrl")):
+        config["observe_remaining"] = True
+    return config
+
+
+@often
+@given(configurations(), st.booleans(), st.integers(0, 2**31))
+def test_valid_configurations_work(config, sleep, seed):
+    env = SafetyGymEnv(config, num_envs=2, seed=seed, sleep=sleep, num_threads=1)
+    tensordict = env.reset()
+    assert env.observation_spec.is_in(tensordict.select(*env.observation_spec.keys()))
+    for _ in range(3):
+        result = env.step(env.rand_action(tensordict))["next"]
+        for spec in (env.observation_spec, env.full_reward_spec, env.full_done_spec):
+            assert spec.is_in(result.select(*spec.keys())), spec
+        numbers = result.select("observation", "reward", *env.cost_keys)
+        assert all(value.isfinite().all() for value in numbers.values(True, True))
+        readings = result["observation"]
+        for name in env.observation_layout:
+            if name.endswith("_lidar"):
+                flat = env.config.observation_flatten
+                reading = readings[:, env.observation_layout[name]] if flat else readings[name]
+                assert float(reading.min()) >= 0.0
+                assert float(reading.max()) <= 1.0
+        tensordict = env.step_mdp(env.step_and_maybe_reset(env.rand_action(tensordict))[0])
+    assert env.config.to_dict().keys() >= config.keys()
+
+
+NOT_NUMBERS = st.sampled_from(["1", None, [1.0], {}, math.nan, math.inf, True, 1j])
+WRONG = {
+    "bool": st.sampled_from([0, 1, "yes", None, 0.5]),
+    "int": NOT_NUMBERS | st.just(0.5),
+    "float": NOT_NUMBERS | st.just(10**400),
+    "str": st.sampled_from([1, None, ["goal"], True]),
+    "int | None": NOT_NUMBERS.filter(lambda value: value is not None),
+    "float | None": NOT_NUMBERS.filter(lambda value: value is not None),
+    "Rectangle": st.sampled_from([None, (), (1, 2, 3), "0 0 1 1", (1, 0, 0, 1), (0, 0, 1, "1")]),
+    "Placements": st.sampled_from([(), ((0, 0, 1),), ((1, 0, 0, 1),), (0, 0, 1, 1), "all"]),
+    "Locations": st.sampled_from([None, ((1,),), (1, 2), ((1, 2, 3),), ((math.nan, 0),)]),
+    "tuple[str, ...]": st.sampled_from([None, "gyro", (1,), 3]),
+    "tuple[float, ...]": st.sampled_from([None, ("a",), 1.0, ((1.0,),), "12"]),
+    "tuple[int, int]": st.sampled_from([None, (1,), (1.5, 2), 3, (0, 4), (60, -40)]),
+}
+FIELDS = {field.name: str(field.type) for field in dataclasses.fields(SafetyGymConfig)}
+
+
+@settings(often, max_examples=300)
+@given(st.data())
+def test_wrong_values_name_their_key(data):
+    key = data.draw(st.sampled_from(sorted(FIELDS)))
+    value = data.draw(WRONG[FIELDS[key]])
+    with pytest.raises(ConfigError, match=rf"'{key}'"):
+        SafetyGymConfig.from_dict({key: value})
+
+
+POSITIVE = [key for key in FIELDS if key.endswith(("_size", "_density")) and FIELDS[key] == "float"]
+NOT_NEGATIVE = [key for key in FIELDS if key.endswith(("_num", "_keepout", "_threshold", "_delay"))]
+
+
+@often
+@given(
+    (
+        st.sampled_from(POSITIVE)
+        | st.sampled_from(["num_steps", "lidar_num_bins", "circle_radius"])
+    ).flatmap(lambda key: st.tuples(st.just(key), st.integers(-(10**6), 0)))
+    | st.tuples(st.sampled_from(NOT_NEGATIVE), st.integers(-(10**6), -1))
+)
+def test_values_out_of_range_name_their_key(pair):
+    key, value = pair
+    with pytest.raises(ConfigError, match=rf"'{key}'.*{value}"):
+        SafetyGymConfig.from_dict({key: value})
+
+
+@settings(often, max_examples=200)
+@given(st.data())
+def test_misspelt_keys_name_the_nearest(data):
+    key = data.draw(st.sampled_from(sorted(FIELDS)))
+    place = data.draw(st.integers(0, len(key) - 1))
+    letter = data.draw(st.sampled_from(string.ascii_lowercase))
+    misspelt = key[:place] + letter + key[place + data.draw(st.integers(0, 1)) :]
+    if misspelt in FIELDS:
+        return
+    with pytest.raises(ConfigError, match=rf"'{misspelt}'\. Did you mean '\w+'"):
+        SafetyGymConfig.from_dict({misspelt: 1})
+
+
+@often
+@given(st.sampled_from(PLACED), between(0.11, 3.0))
+def test_placements_smaller_than_the_keepout_name_their_key(kind, keepout):
+    counted = {f"{kind}_num": 1} if kind in COUNTED else {}
+    config = {**counted, f"{kind}_keepout": keepout, f"{kind}_placements": [(0, 0, 0.2, 0.2)]}
+    if kind == "box":
+        config["task"] = "push"
+    with pytest.raises(ConfigError, match=rf"'{kind}_placements'.*'{kind}_keepout'"):
+        SafetyGymEnv(config)
+
+
+@seldom
+@given(st.sampled_from(COUNTED), st.integers(8, 12))
+def test_too_many_objects_are_named(kind, number):
+    config = {"robot_base": "point", "task": "none", f"{kind}_num": number}
+    config |= {f"{kind}_keepout": 0.5, f"{kind}_size": 0.1, "robot_locations": [(9, 9)]}
+    env = SafetyGymEnv({**config, "placements_extents": (-1, -1, 1, 1)}, seed=0)
+    with pytest.raises(LayoutError, match=rf"'{kind.removesuffix('s')}\d+'"):
+        env.reset()
+
+
+def test_the_strategies_reach_everything():
+    """Every kind of key that a configuration has is drawn by something above."""
+    drawn = SIZES | KEEPOUTS | COUNTS | DENSITIES | PLACEMENTS | ROTATIONS | COSTS | NUMBERS
+    drawn |= dict.fromkeys((*FLAGS, *FIXED, "robot_base", "task"), st.none())
+    rest = {key for key in FIELDS if key not in drawn}
+    assert not {key for key in rest if key.startswith(("observe_", "constrain_", "lidar_"))} - {
+        "observe_vision"
+    }
+    assert set(WRONG) == set(FIELDS.values())
