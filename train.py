@@ -1,5 +1,6 @@
 """Train an algorithm on an environment: ``python train.py env=PointGoal1 algo=ppo_lagrangian``."""
 
+import sys
 from pathlib import Path
 
 import hydra
@@ -7,7 +8,9 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
 
 import safe_rl.openmp  # noqa: F401, has to come before torch
+from safe_rl.command_line import CommandLineError, expand_arguments
 from safe_rl.envs import make_env, store_configs
+from safe_rl.resuming import is_finished, may_continue
 from safe_rl.training import build_trainer, seed_everything
 
 store_configs()
@@ -16,6 +19,11 @@ store_configs()
 @hydra.main(version_base="1.3", config_path="conf", config_name="config")
 def main(config: DictConfig) -> None:
     """Compose, build, train."""
+    directory = Path(HydraConfig.get().runtime.output_dir)
+    continues = may_continue(HydraConfig.get(), config)
+    if continues and is_finished(directory, config.frames):
+        print(f"{directory} has its {config.frames:,} frames already: raise 'frames' to train on.")
+        return
     seed_everything(config.seed, config.num_threads)
     env = make_env(
         OmegaConf.to_container(config.env, resolve=True),
@@ -24,9 +32,19 @@ def main(config: DictConfig) -> None:
         seed=config.seed,
         num_threads=config.num_threads or 0,
     )
-    trainer = build_trainer(config, env, Path(HydraConfig.get().runtime.output_dir))
+    trainer = build_trainer(config, env, directory)
+    if continues and trainer.folder.holds_run:
+        trainer.resume()
+        print(f"Going on after {trainer.progress.steps:,} of {config.frames:,} frames.")
     print(trainer.run())
+    if trainer.interrupted_by is not None:
+        print(f"Interrupted. Continue with: python train.py resume={directory}")
+        raise SystemExit(128 + trainer.interrupted_by)
 
 
 if __name__ == "__main__":
+    try:
+        sys.argv[1:] = expand_arguments(sys.argv[1:])
+    except CommandLineError as error:
+        raise SystemExit(str(error)) from None
     main()

@@ -7,6 +7,8 @@ weights-only: reading one runs no code of its.
 from __future__ import annotations
 
 import math
+import shutil
+import warnings
 import zipfile
 from collections.abc import Mapping
 from pathlib import Path
@@ -63,6 +65,7 @@ class CheckpointStore:
         self, directory: Path | str, components: Mapping[str, Stateful], *, keep_last: int
     ) -> None:
         directory = Path(directory)
+        self._components = dict(components)
         self._checkpoint = _checkpoint(components)
         self.last = CheckpointRotation(directory / "last", keep_last=keep_last)
         self.best = CheckpointRotation(directory / "best", keep_last=1)
@@ -90,6 +93,48 @@ class CheckpointStore:
             return False
         self.best.save(self._checkpoint, step=steps, metadata={**(metadata or {}), "score": score})
         return True
+
+    def resume(self) -> Path | None:
+        """Restore the newest checkpoint, or with a warning the next older one if it is damaged.
+
+        The best one goes if it is newer than the restored: what it was the best of is forgotten.
+        So do the beginnings of checkpoints during whose writing the run was killed.
+
+        Returns:
+            The checkpoint, or None if there is none.
+
+        Raises:
+            CheckpointError: If no checkpoint can be used; the message is about the newest.
+        """
+        failures: list[CheckpointError] = []
+        restored = None
+        for path in sorted(self.last.directory.glob("checkpoint-*.torchrl"), reverse=True):
+            try:
+                self.load(path, self._components)
+            except CheckpointError as error:
+                failures.append(error)
+                continue
+            restored = path
+            break
+        if restored is None and failures:
+            raise failures[0]
+        if restored is not None and failures:
+            warnings.warn(
+                f"{failures[0]} Going on from the older {restored.name} instead.", stacklevel=2
+            )
+        for best in self.best.checkpoints():
+            if restored is None or best.name > restored.name:
+                best.unlink()
+        for rotation in (self.last, self.best):
+            for begun in rotation.directory.glob(".checkpoint-*.stage-*"):
+                shutil.rmtree(begun) if begun.is_dir() else begun.unlink()
+        return restored
+
+    @staticmethod
+    def newest_step(directory: Path | str) -> int:
+        """Environment steps of the newest checkpoint in a folder, 0 if there is none."""
+        newest = CheckpointRotation(Path(directory) / "last", keep_last=1).latest()
+        return 0 if newest is None else int(newest.stem.rpartition("-")[2])
 
     @staticmethod
     def load(path: Path, components: Mapping[str, Stateful]) -> None:

@@ -10,7 +10,7 @@ __all__ = ["StopRequest"]
 
 
 class StopRequest:
-    """Turns the first SIGINT (Ctrl-C) or SIGTERM into a flag; the second acts as it always did.
+    """Remembers the first SIGINT (Ctrl-C) or SIGTERM; the second acts as it always did.
 
     Signals can only be caught in the main thread; elsewhere this does nothing.
 
@@ -18,14 +18,14 @@ class StopRequest:
         >>> import signal
         >>> with StopRequest() as stop:
         ...     signal.raise_signal(signal.SIGTERM)
-        ...     stop.received
+        ...     stop.received is signal.SIGTERM
         True
     """
 
     _SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
     def __init__(self) -> None:
-        self.received = False
+        self.received: signal.Signals | None = None
         self._previous: dict[int, signal._HANDLER] = {}
 
     def __enter__(self) -> StopRequest:
@@ -37,7 +37,7 @@ class StopRequest:
         self._restore()
 
     def _stop(self, number: int, frame: FrameType | None) -> None:
-        self.received = True
+        self.received = signal.Signals(number)
         self._restore()
 
     def _restore(self) -> None:

@@ -64,27 +64,39 @@ class RunFolder:
         return self.directory / "progress.csv"
 
     @property
+    def holds_run(self) -> bool:
+        """Whether a run has been begun here."""
+        return self.table_path.exists()
+
+    @property
     def checkpoint_directory(self) -> Path:
         """Folder of the checkpoints."""
         return self.directory / "checkpoints"
 
     @contextmanager
-    def writing(self, epoch: int = 0, steps: int = 0) -> Iterator[None]:
-        """Keep the files open; ``epoch`` and ``steps`` say where a continued run stands.
+    def writing(self, epoch: int | None = None, steps: int = 0) -> Iterator[None]:
+        """Keep the files open.
+
+        Args:
+            epoch: Epochs that a continued run has behind it; None for a new run.
+            steps: Environment steps that it has behind it.
 
         Raises:
             FileExistsError: If a new run would overwrite one that is there.
+            ValueError: If the table lacks epochs of the run that is to be continued.
         """
-        if epoch == 0 and self.table_path.exists():
+        if epoch is None and self.holds_run:
             raise FileExistsError(
-                f"{self.directory} already holds a run. Move it away, or give this one another "
-                "folder with hydra.run.dir=..."
+                f"{self.directory} already holds a run. Continue it with 'python train.py "
+                f"resume={self.directory}', or give this one another folder with hydra.run.dir=..."
             )
-        OmegaConf.save(self._config, self.directory / "config.yaml", resolve=True)
-        self._table = TableWriter(self.table_path, keep_rows=epoch)
+        self._table = TableWriter(self.table_path, keep_rows=epoch or 0)
+        self._save_config()
         self._logger = None
         if self._config.logger.get("_target_"):
             self._logger = instantiate(self._config.logger, log_dir=str(self.directory))
+            if epoch is not None and hasattr(self._logger, "continue_from"):
+                self._logger.continue_from(steps)
         self._bar = tqdm(
             total=self._config.frames, initial=steps, unit=" steps", unit_scale=True,
             dynamic_ncols=True, smoothing=0.1,
@@ -95,6 +107,12 @@ class RunFolder:
         finally:
             self._bar.close()
             self._table.close()
+
+    def _save_config(self) -> None:
+        # replaced in one go: a run killed here can still be continued
+        path = self.directory / "config.tmp"
+        OmegaConf.save(self._config, path, resolve=True)
+        path.replace(self.directory / "config.yaml")
 
     def record(self, row: Mapping[str, float]) -> None:
         """Write one epoch to table and logger and show it."""

@@ -22,7 +22,8 @@ class TableWriter:
             afresh.
 
     Raises:
-        ValueError: By :meth:`write`, if a row's columns differ from the first one's.
+        ValueError: If there are fewer rows than are to be kept; by :meth:`write`, if a row's
+            columns differ from the first one's.
 
     Examples:
         >>> import tempfile
@@ -35,7 +36,7 @@ class TableWriter:
     """
 
     def __init__(self, path: Path, keep_rows: int = 0) -> None:
-        kept = path.read_text().splitlines(keepends=True)[: keep_rows + 1] if keep_rows else []
+        kept = _first_rows(path, keep_rows) if keep_rows else []
         self._columns = next(csv.reader(kept)) if kept else None
         # replaced in one go: a run killed here still has its table
         rewritten = path.with_suffix(".tmp")
@@ -68,6 +69,18 @@ class TableWriter:
 
     def __exit__(self, *exception: object) -> None:
         self.close()
+
+
+def _first_rows(path: Path, number: int) -> list[str]:
+    """Lines of a table: the header and as many rows."""
+    lines = path.read_text().splitlines(keepends=True) if path.exists() else []
+    complete = [line for line in lines if line.endswith("\n")]
+    if len(complete) < number + 1:
+        raise ValueError(
+            f"{path} holds {max(0, len(complete) - 1)} complete rows, but the run that is to be "
+            f"continued has finished {number} epochs: the table has been changed or cut off."
+        )
+    return complete[: number + 1]
 
 
 def _field(value: float) -> str:

@@ -7,7 +7,7 @@ import time
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from signal import Signals
 
 import torch
 from omegaconf import DictConfig
@@ -23,6 +23,7 @@ from safe_rl.collectors import EpisodeAccounting, make_collector
 from safe_rl.interrupts import StopRequest
 from safe_rl.models import BehaviourPolicy
 from safe_rl.run_folder import RunFolder
+from safe_rl.run_state import Progress, WorldSnapshot
 
 __all__ = ["Trainer", "build_trainer", "seed_everything"]
 
@@ -103,8 +104,10 @@ class Trainer:
         )
         self.progress = Progress()
         self.folder = folder
-        self._env = env
+        self.interrupted_by: Signals | None = None
         self._collector = collector
+        self._worlds = WorldSnapshot(env, collector) if hasattr(env, "get_state") else None
+        self._is_continued = False
         self._cost_limits = dict(cost_limits)
         self._frames = config.frames
         self._checkpoint_interval = config.checkpoint.interval
@@ -122,8 +125,8 @@ class Trainer:
             "progress": self.progress,
             "rng": GlobalRNGState(),
         }
-        if hasattr(self._env, "get_state"):
-            parts["env"] = EnvironmentState(self._env, self._collector)
+        if self._worlds is not None:
+            parts["env"] = self._worlds
         return parts
 
     def restore(self, checkpoint: Path) -> None:
@@ -133,18 +136,30 @@ class Trainer:
             CheckpointError: If the file is no checkpoint, or does not fit this run.
         """
         CheckpointStore.load(checkpoint, self.components())
+        self._is_continued = True
+
+    def resume(self) -> None:
+        """Continue the run in the folder from its newest checkpoint; if it has none, start over.
+
+        Raises:
+            CheckpointError: If no checkpoint can be read, or they do not fit this run.
+        """
+        self._checkpoints.resume()
+        self._is_continued = True
 
     def run(self) -> str:
         """Train for ``frames`` steps, rounded up to whole batches.
 
-        Ctrl-C or SIGTERM ends the run after the epoch at hand, with a checkpoint.
+        Ctrl-C or SIGTERM ends the run after the epoch at hand, with a checkpoint;
+        ``interrupted_by`` then holds the signal.
 
         Returns:
             One line on the outcome.
         """
         batches = self.batches()
         saved_at = time.monotonic()
-        with self.folder.writing(self.progress.epoch, self.progress.steps), StopRequest() as stop:
+        behind = self.progress.epoch if self._is_continued else None
+        with self.folder.writing(behind, self.progress.steps), StopRequest() as stop:
             while self.progress.steps < self._frames and not stop.received:
                 row = self.epoch(batches)
                 self.folder.record(row)
@@ -153,6 +168,7 @@ class Trainer:
                     self._save()
                     saved_at = time.monotonic()
             self._save()
+            self.interrupted_by = stop.received
         return self.folder.summary()
 
     def batches(self) -> Iterator[TensorDictBase]:
@@ -166,6 +182,8 @@ class Trainer:
         # physics wants the cores.
         with torch_threads(1):
             batch = next(batches)
+            if self._worlds is not None:
+                self._worlds.take()
         collected = time.perf_counter()
         episodes = self.accounting.update(batch)
         learned = self.algorithm.learn(batch, episodes)
@@ -193,49 +211,3 @@ class Trainer:
             self._checkpoints.save_best(
                 self.progress.steps, row["episode_return"], {"epoch": self.progress.epoch}
             )
-
-
-class Progress:
-    """Counters of a run: epochs, environment steps, seconds of training."""
-
-    def __init__(self) -> None:
-        self.epoch = 0
-        self.steps = 0
-        self.seconds = 0.0
-
-    def add(self, steps: int, seconds: float) -> None:
-        """Count one epoch."""
-        self.epoch += 1
-        self.steps += steps
-        self.seconds += seconds
-
-    def state_dict(self) -> dict[str, Any]:
-        """The counters."""
-        return dict(vars(self))
-
-    def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
-        """Continue from :meth:`state_dict`."""
-        vars(self).update(state_dict)
-
-
-class EnvironmentState:
-    """State of the environment's worlds and of the observation that the collector goes on from.
-
-    Args:
-        env: Environment with ``get_state`` and ``set_state``.
-        collector: The collector that steps it.
-    """
-
-    def __init__(self, env: EnvBase, collector: Collector) -> None:
-        self._env = env
-        self._collector = collector
-
-    def state_dict(self) -> dict[str, Any]:
-        """The environment's snapshot."""
-        return self._env.get_state().to_dict()
-
-    def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
-        """Put the worlds back, and the collector in front of them."""
-        snapshot = self._env.get_state().from_dict(state_dict, batch_size=self._env.batch_size)
-        # the collector has no public way to start from a given state instead of a reset
-        self._collector._carrier.update(self._env.set_state(snapshot))

@@ -37,3 +37,11 @@ def point_mass_config(*overrides: str, minibatch_size: int | None = 40) -> DictC
         "logger=none",
         *overrides,
     )
+
+
+def without_times(path: Path) -> list[list[str]]:
+    """Rows of a run's table without its columns of times."""
+    lines = [line.split(",") for line in path.read_text().splitlines()]
+    times = {i for i, name in enumerate(lines[0]) if "time" in name or name == "steps_per_second"}
+    assert len(times) == 4
+    return [[field for i, field in enumerate(line) if i not in times] for line in lines]

@@ -1,0 +1,77 @@
+"""Parts of a run's state that belong to no network: counters, and the worlds between epochs."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from tensordict import TensorDictBase
+from torchrl.collectors import Collector
+from torchrl.envs import EnvBase
+
+__all__ = ["Progress", "WorldSnapshot"]
+
+
+class Progress:
+    """Counters of a run: epochs, environment steps, seconds of training.
+
+    Examples:
+        >>> progress = Progress()
+        >>> progress.add(steps=1000, seconds=2.0)
+        >>> progress.state_dict()
+        {'epoch': 1, 'steps': 1000, 'seconds': 2.0}
+    """
+
+    def __init__(self) -> None:
+        self.epoch = 0
+        self.steps = 0
+        self.seconds = 0.0
+
+    def add(self, steps: int, seconds: float) -> None:
+        """Count one epoch."""
+        self.epoch += 1
+        self.steps += steps
+        self.seconds += seconds
+
+    def state_dict(self) -> dict[str, Any]:
+        """The counters."""
+        return dict(vars(self))
+
+    def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
+        """Continue from :meth:`state_dict`."""
+        vars(self).update(state_dict)
+
+
+class WorldSnapshot:
+    """The worlds as the next epoch finds them, and the observation that the collector goes on from.
+
+    Every epoch starts from a snapshot, whether a checkpoint is written or not. Writing a state
+    into a simulation forgets what no snapshot holds (it wakes sleeping bodies); were it done on
+    resuming alone, a run that was interrupted would differ from one that was not.
+
+    Args:
+        env: Environment with ``get_state`` and ``set_state``.
+        collector: The in-process collector that steps it.
+    """
+
+    def __init__(self, env: EnvBase, collector: Collector) -> None:
+        self._env = env
+        self._collector = collector
+        self._snapshot: TensorDictBase = env.get_state()
+
+    def take(self) -> None:
+        """Take a snapshot and go on from it."""
+        self._go_on_from(self._env.get_state())
+
+    def state_dict(self) -> dict[str, Any]:
+        """The snapshot taken last."""
+        return self._snapshot.to_dict()
+
+    def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
+        """Put the worlds back, and the collector in front of them."""
+        self._go_on_from(self._snapshot.from_dict(state_dict, batch_size=self._env.batch_size))
+
+    def _go_on_from(self, snapshot: TensorDictBase) -> None:
+        self._snapshot = snapshot
+        # the collector has no public way to start from a given state instead of a reset
+        self._collector._carrier.update(self._env.set_state(snapshot))
