@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -17,7 +17,12 @@ from safe_rl.objectives.multipliers import Multiplier
 from safe_rl.objectives.normalisation import normalise_advantages
 from safe_rl.updates import MinibatchUpdate, PolicyUpdate
 
-__all__ = ["Algorithm", "Networks"]
+__all__ = ["Algorithm", "Networks", "mean_cost"]
+
+
+def mean_cost(episode_costs: Tensor) -> Tensor:
+    """J_c, the mean over episodes: [E, k] -> [k]."""
+    return episode_costs.mean(0)
 
 
 @dataclass
@@ -43,6 +48,9 @@ class Algorithm:
         networks: What is trained.
         cost_keys: Keys of the k constrained costs; empty for an unconstrained algorithm.
         cost_limits: d of every constraint, undiscounted cost per episode, shape [k].
+        cost_measure: What of the episode costs, [E, k], is held against the limits, [k]:
+            `mean_cost`, or another statistic, such as a quantile. Its gradient is up to
+            `cost_advantage`.
         advantage: Estimator of the reward advantage, with the critic.
         cost_advantage: Estimator of the cost advantages, with the cost critic, or None.
         multiplier: Weighs the costs against the return, or None.
@@ -53,6 +61,7 @@ class Algorithm:
     networks: Networks
     cost_keys: Sequence[str]
     cost_limits: Tensor
+    cost_measure: Callable[[Tensor], Tensor]
     advantage: VectorGAE
     cost_advantage: CostGAE | None
     multiplier: Multiplier | None
@@ -61,7 +70,7 @@ class Algorithm:
 
     def __post_init__(self) -> None:
         """Start without any knowledge of the episode costs."""
-        self._mean_costs = torch.full_like(self.cost_limits, torch.nan)
+        self._costs = torch.full_like(self.cost_limits, torch.nan)
         self._mean_length = torch.full((), torch.nan, device=self.cost_limits.device)
 
     def learn(self, batch: TensorDictBase, episodes: EpisodeStatistics) -> dict[str, float]:
@@ -79,39 +88,39 @@ class Algorithm:
             self.cost_advantage(batch)
         normalise_advantages(batch)
 
-        if self.multiplier is not None:
-            self.multiplier.update(episodes.mean_costs(self.cost_keys))
         violation, length = self._constraint_state(batch, episodes)
+        if self.multiplier is not None and episodes.num_episodes:
+            self.multiplier.update(self._costs)
         policy = self.policy_update(batch, violation, length)
         critic = self.critic_update(batch)
-        return self._scalars(policy, critic)
+        return self._scalars(violation, policy, critic)
 
     def _constraint_state(
         self, batch: TensorDictBase, episodes: EpisodeStatistics
     ) -> tuple[Tensor, Tensor]:
-        """J_c − d, shape [k], and the mean episode length T̄.
+        """J_c − d, shape [k], and the mean episode length T̄; J_c as `cost_measure` has it.
 
         Both are those of the last batch in which an episode finished. Before there is one, the
         length is that of the batch and the cost what the batch's cost rate would sum to in it.
         """
         device = self.cost_limits.device
         if episodes.num_episodes:
-            self._mean_costs = episodes.mean_costs(self.cost_keys).to(self.cost_limits)
+            costs = self.cost_measure(episodes.episode_costs(self.cost_keys))
+            self._costs = costs.to(self.cost_limits)
             self._mean_length = episodes.lengths.mean().to(device, torch.float32)
         if self._mean_length.isfinite():
-            return self._mean_costs - self.cost_limits, self._mean_length
+            return self._costs - self.cost_limits, self._mean_length
         length = torch.tensor(float(batch.shape[-1]), device=device)
         rates = [episodes.cost_rates[key].to(device) for key in self.cost_keys]
-        costs = torch.stack(rates) * length if rates else self._mean_costs
+        costs = torch.stack(rates) * length if rates else self._costs
         return costs.float() - self.cost_limits, length
 
     def _scalars(
-        self, policy: Mapping[str, Tensor], critic: Mapping[str, Tensor]
+        self, violation: Tensor, policy: Mapping[str, Tensor], critic: Mapping[str, Tensor]
     ) -> dict[str, float]:
-        row: dict[str, float] = {}
+        row = self._columns("violation", violation)
         if self.multiplier is not None:
-            for key, value in zip(self.cost_keys, self.multiplier.value.tolist(), strict=True):
-                row[f"multiplier_{key}"] = value
+            row |= self._columns("multiplier", self.multiplier.value)
         for part, metrics in (("policy", policy), ("critic", critic)):
             for name, value in metrics.items():
                 row |= self._columns(f"{part}_{name}", torch.as_tensor(value))
@@ -140,10 +149,10 @@ class Algorithm:
         return {name: part for name, part in parts.items() if part is not None}
 
     def state_dict(self) -> dict[str, Tensor]:
-        """The episode cost and length of the last batch in which an episode finished."""
-        return {"mean_costs": self._mean_costs, "mean_length": self._mean_length}
+        """The costs and the length of the last batch in which an episode finished."""
+        return {"costs": self._costs, "mean_length": self._mean_length}
 
     def load_state_dict(self, state_dict: Mapping[str, Tensor]) -> None:
         """Continue from :meth:`state_dict`."""
-        self._mean_costs = state_dict["mean_costs"].to(self._mean_costs)
+        self._costs = state_dict["costs"].to(self._costs)
         self._mean_length = state_dict["mean_length"].to(self._mean_length)

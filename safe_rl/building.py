@@ -16,7 +16,7 @@ from omegaconf import DictConfig, OmegaConf
 from torchrl.envs import EnvBase
 from torchrl.objectives import LossModule
 
-from safe_rl.algorithm import Algorithm, Networks
+from safe_rl.algorithm import Algorithm, Networks, mean_cost
 from safe_rl.models import input_scale_vector, make_actor, make_critic
 from safe_rl.objectives import CriticLoss
 from safe_rl.objectives.multipliers import Multiplier
@@ -58,6 +58,7 @@ def build_algorithm(config: DictConfig, env: EnvBase) -> Algorithm:
         networks=networks,
         cost_keys=list(constraints),
         cost_limits=torch.tensor(list(constraints.values()), dtype=torch.float32, device=device),
+        cost_measure=instantiate(config.get("cost_measure")) or mean_cost,
         advantage=_build(config.advantage, value_network=networks.critic),
         cost_advantage=cost_advantage,
         multiplier=multiplier,

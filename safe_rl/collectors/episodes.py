@@ -45,11 +45,15 @@ class EpisodeStatistics:
         """Number of episodes that finished in the batch, E."""
         return self.returns.shape[0]
 
+    def episode_costs(self, cost_keys: Sequence[str]) -> Tensor:
+        """Undiscounted costs of every finished episode, shape [E, len(cost_keys)]."""
+        if not cost_keys:
+            return self.returns.new_empty(self.num_episodes, 0)
+        return torch.stack([self.costs[key] for key in cost_keys], -1)
+
     def mean_costs(self, cost_keys: Sequence[str]) -> Tensor:
         """Mean episode cost J_c per key, shape [len(cost_keys)]; NaN if no episode finished."""
-        if not cost_keys:
-            return self.returns.new_empty(0)
-        return torch.stack([self.costs[key].mean() for key in cost_keys])
+        return self.episode_costs(cost_keys).mean(0)
 
     def scalars(self) -> dict[str, float]:
         """Means under the names of the log; NaN where no episode finished."""
