@@ -154,6 +154,19 @@ def test_partial_resets_leave_other_rows_alone(env_name):
     assert not torch.equal(plain["observation"], interrupted["observation"])
 
 
+def test_a_reset_leaves_nothing_of_the_episode_before():
+    env = SafetyGymEnv("CarButton2", num_envs=3, seed=0, num_threads=1)
+    env.rollout(5)
+    state = env.get_state()
+    state["buttons_timer"][:] = 7
+    env.set_state(state)
+    env.reset()
+    fresh = env.get_state()
+    for key in ("buttons_timer", "step_count", "time", "qvel", "ctrl"):
+        assert state[key].any(), key
+        assert not fresh[key].any(), key
+
+
 def test_outputs_are_copies():
     """TorchRL stacks the steps of a rollout at its end, so what was handed out must not change."""
     env = SafetyGymEnv("PointGoal1", num_envs=2, seed=0, num_threads=1)
