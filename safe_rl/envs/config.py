@@ -22,7 +22,7 @@ Placements = tuple[Rectangle, ...] | None
 Locations = tuple[Point2, ...]
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class SafetyGymConfig:
     """Everything that defines one environment.
 
@@ -208,6 +208,14 @@ class SafetyGymConfig:
         """Pickle as values: the class with registered keys has no name to be found by."""
         return SafetyGymConfig.from_dict, (self.to_dict(),)
 
+    def __eq__(self, other: object) -> bool:
+        """Compare values: an object made before a key was registered has its default."""
+        return isinstance(other, SafetyGymConfig) and self.to_dict() == other.to_dict()
+
+    def __hash__(self) -> int:
+        """Hash what never changes, the built-in keys."""
+        return hash(tuple(getattr(self, key) for key in _BUILT_IN))
+
     def __post_init__(self) -> None:
         for field in dataclasses.fields(self):
             value = coerce(field.name, str(field.type), getattr(self, field.name))
@@ -287,4 +295,5 @@ def set_registered_keys(keys: Mapping[str, Key]) -> None:
         namespace={"__module__": __name__, "__doc__": SafetyGymConfig.__doc__},
         frozen=True,
         kw_only=True,
+        eq=False,
     )

@@ -56,7 +56,9 @@ def test_registered_keys_are_keys_like_the_others():
     assert config.replace(mines_num=0) != config
     # What was made before has the defaults of what it does not know.
     assert before.mines_num == 0
-    assert before.to_dict() == SafetyGymConfig(robot_base="point").to_dict()
+    assert before == SafetyGymConfig(robot_base="point")
+    assert hash(before) == hash(SafetyGymConfig(robot_base="point"))
+    assert before != SafetyGymConfig(robot_base="point", mines_num=1)
     assert before.replace(mines_num=1).mines_num == 1
 
 
