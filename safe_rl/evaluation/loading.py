@@ -52,12 +52,11 @@ def find_checkpoint(directory: Path, which: str) -> Path:
     """
     kinds = ("last", "best")
     if which not in kinds:
-        path = Path(which)
-        if not path.exists():
+        if not Path(which).exists():
             raise FileNotFoundError(
                 f"There is no checkpoint '{which}': checkpoint is last, best or the path of a file."
             )
-        return path
+        return Path(which)
     # the newest by name, readable or not: an older one is not silently put in its place
     found = {
         kind: max((directory / "checkpoints" / kind).glob("checkpoint-*"), default=None)

@@ -155,7 +155,9 @@ def draw_aggregates(aggregates: Sequence[Aggregate], colours: Mapping[str, str])
         axis.tick_params(axis="y", length=0)
         axis.grid(alpha=0.25, axis="x")
         axis.spines[["top", "right", "left"]].set_visible(False)
-        axis.set_xlim(left=min(0.0, axis.get_xlim()[0]))
+        axis.xaxis.set_major_locator(MaxNLocator(5))
+        left, right = axis.get_xlim()
+        axis.set_xlim(min(0.0, left), max(0.0, right))
     panels[0].invert_yaxis()
     return figure
 

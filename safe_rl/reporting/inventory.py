@@ -10,7 +10,7 @@ from safe_rl.reporting.experiments import Experiment
 from safe_rl.reporting.runs import Run
 from safe_rl.reporting.tables import MISSING, Column, Table, number, plain, with_interval
 
-__all__ = ["evaluation_table", "run_table", "videos"]
+__all__ = ["duration", "evaluation_table", "run_table", "videos"]
 
 
 def run_table(experiments: Sequence[Experiment]) -> Table:
@@ -36,7 +36,7 @@ def run_table(experiments: Sequence[Experiment]) -> Table:
         Column("seed", plain("seed")),
         Column("steps", lambda r: f"{r['steps']:,}"),
         Column("", plain("state"), is_number=False),
-        Column("hours", number("hours", 2)),
+        Column("time", lambda r: duration(r["hours"])),
         Column("steps/s", lambda r: f"{r['steps_per_second']:,.0f}"),
         Column("$J_r$", number("episode_return", 2)),
         Column("$J_c$", number("episode_cost", 1)),
@@ -44,6 +44,16 @@ def run_table(experiments: Sequence[Experiment]) -> Table:
         Column("command", plain("command"), is_number=False),
     ]
     return Table("runs", "Runs", columns, records)
+
+
+def duration(hours: float) -> str:
+    """A time as people say it.
+
+    Examples:
+        >>> duration(0.21), duration(2.5)
+        ('13 min', '2.5 h')
+    """
+    return f"{60 * hours:.0f} min" if hours < 1 else f"{hours:,.1f} h"
 
 
 def evaluation_table(experiments: Sequence[Experiment]) -> Table:

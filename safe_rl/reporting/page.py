@@ -12,7 +12,7 @@ from typing import Any
 
 from safe_rl.extras import import_extra
 from safe_rl.reporting.figures import save
-from safe_rl.reporting.inventory import evaluation_table, run_table, videos
+from safe_rl.reporting.inventory import duration, evaluation_table, run_table, videos
 from safe_rl.reporting.report import Report
 from safe_rl.reporting.slate_tables import gap_table
 from safe_rl.reporting.tables import Table
@@ -107,7 +107,7 @@ def _facts(report: Report) -> dict[str, str]:
         "environments": str(len({e.environment for e in report.experiments})),
         "algorithms": str(len({e.algorithm for e in report.experiments})),
         "environment steps": f"{sum(run.steps for run in runs):,}",
-        "hours of training": f"{sum(run.hours for run in runs):,.1f}",
+        "training": duration(sum(run.hours for run in runs)),
     }
 
 

@@ -209,14 +209,16 @@ def test_a_checkpoint_runs_no_code(run, bare, tmp_path, capsys):
     sprung = tmp_path / "sprung"
     path = last_checkpoint(run)
     if bare:
-        path.write_bytes(pickle.dumps(Trap(sprung)))
+        path.write_bytes(pickle.dumps(Trap(sprung), protocol=2))
     else:
         with zipfile.ZipFile(path) as archive:
             members = {name: archive.read(name) for name in archive.namelist()}
         with zipfile.ZipFile(path, "w") as archive:
             for name, content in members.items():
                 trapped = not name.endswith(".json")
-                archive.writestr(name, pickle.dumps(Trap(sprung)) if trapped else content)
+                archive.writestr(
+                    name, pickle.dumps(Trap(sprung), protocol=2) if trapped else content
+                )
     assert main([str(run)]) == 1
     assert path.name in capsys.readouterr().err
     assert not sprung.exists()

@@ -14,6 +14,7 @@ from synthetic import NODES, write_run
 from safe_rl.report import main
 from safe_rl.reporting.experiments import group_runs
 from safe_rl.reporting.figures import algorithm_colours, draw_learning_curves
+from safe_rl.reporting.inventory import duration
 from safe_rl.reporting.runs import find_runs
 
 CHROMIUM = next(
@@ -78,6 +79,10 @@ def test_the_markdown_has_the_tables(report):
     assert "| PointGoal1 | PPO-Lagrangian | PPO | keeps its limits, the other does not |" in text
     assert "sampled actions" not in text
     assert "mean actions, x=1, 0% known layouts | 12.00 [11.00, 13.00] | 21.0 [20.0, 22.0]" in text
+
+
+def test_times_are_in_minutes_or_hours():
+    assert [duration(hours) for hours in (0.0, 0.21, 2.5)] == ["0 min", "13 min", "2.5 h"]
 
 
 def test_the_page_holds_everything_itself(report):
