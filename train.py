@@ -12,6 +12,7 @@ from safe_rl.command_line import CommandLineError, expand_arguments
 from safe_rl.envs import make_env, store_configs
 from safe_rl.resuming import is_finished, may_continue
 from safe_rl.training import build_trainer, seed_everything
+from safe_rl.transfer import initialise_networks
 
 store_configs()
 
@@ -33,9 +34,11 @@ def main(config: DictConfig) -> None:
         num_threads=config.num_threads or 0,
     )
     trainer = build_trainer(config, env, directory)
-    if continues and trainer.folder.holds_run:
-        trainer.resume()
+    if continues and trainer.resume():
         print(f"Going on after {trainer.progress.steps:,} of {config.frames:,} frames.")
+    elif config.init_from is not None:
+        algorithm = trainer.algorithm
+        initialise_networks(algorithm.networks, Path(config.init_from), algorithm.cost_keys)
     print(trainer.run())
     if trainer.interrupted_by is not None:
         print(f"Interrupted. Continue with: python train.py resume={directory}")

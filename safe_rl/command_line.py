@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from difflib import get_close_matches
+from importlib.util import find_spec
 from pathlib import Path
 
 from omegaconf import DictConfig, OmegaConf
@@ -17,6 +18,7 @@ __all__ = ["CommandLineError", "expand_arguments"]
 
 # they would have no effect on a run whose networks, optimisers and random numbers are restored
 _FIXED = ("preset", "seed", "init_from")
+_JOBLIB = "hydra_plugins.hydra_joblib_launcher"
 
 
 class CommandLineError(ValueError):
@@ -28,6 +30,7 @@ def expand_arguments(arguments: Sequence[str]) -> list[str]:
 
     ``resume=RUN_DIR`` becomes what makes Hydra read the run's own configuration and write into its
     folder; ``slate=SG6`` becomes the slate's environments (Ray, Achiam, Amodei 2019, section 5.1).
+    A sweep gets the launcher that runs its jobs in processes of their own, if that is installed.
 
     Args:
         arguments: Arguments of ``train.py``.
@@ -47,7 +50,15 @@ def expand_arguments(arguments: Sequence[str]) -> list[str]:
         if given:
             others = [argument for argument in expanded if argument != given[0]]
             expanded = expand(given[0].partition("=")[2], others)
-    return expanded
+    return _with_launcher(expanded)
+
+
+def _with_launcher(arguments: list[str]) -> list[str]:
+    """Sweeps run on joblib where it is installed, unless told otherwise."""
+    is_told = any(argument.startswith("hydra/launcher=") for argument in arguments)
+    if not _is_sweep(arguments) or is_told or not _is_installed(_JOBLIB):
+        return arguments
+    return [*arguments, "hydra/launcher=joblib"]
 
 
 def _expand_resume(value: str, others: list[str]) -> list[str]:
@@ -97,6 +108,13 @@ def _expand_slate(value: str, others: list[str]) -> list[str]:
     flags = [argument for argument in others if argument.startswith("-")]
     overrides = [argument for argument in others if not argument.startswith("-")]
     return [*flags, f"env={','.join(environments)}", *overrides]
+
+
+def _is_installed(module: str) -> bool:
+    try:
+        return find_spec(module) is not None
+    except ModuleNotFoundError:
+        return False
 
 
 def _is_sweep(arguments: list[str]) -> bool:

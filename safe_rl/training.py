@@ -138,14 +138,17 @@ class Trainer:
         CheckpointStore.load(checkpoint, self.components())
         self._is_continued = True
 
-    def resume(self) -> None:
+    def resume(self) -> bool:
         """Continue the run in the folder from its newest checkpoint; if it has none, start over.
+
+        Returns:
+            Whether there was one.
 
         Raises:
             CheckpointError: If no checkpoint can be read, or they do not fit this run.
         """
-        self._checkpoints.resume()
         self._is_continued = True
+        return self._checkpoints.resume() is not None
 
     def run(self) -> str:
         """Train for ``frames`` steps, rounded up to whole batches.

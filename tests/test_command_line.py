@@ -19,8 +19,17 @@ def run(tmp_path):
 
 
 def test_arguments_without_shorthands_stay():
-    arguments = ["-m", "env=PointGoal1,CarGoal1", "+seed=0", "hydra.sweep.dir=resume"]
+    arguments = ["env=PointGoal1", "+seed=0", "hydra.run.dir=resume"]
     assert expand_arguments(arguments) == arguments
+
+
+def test_sweeps_run_on_joblib_where_it_is_installed(monkeypatch):
+    arguments = ["-m", "env=PointGoal1,CarGoal1"]
+    for is_there, launcher in ((True, ["hydra/launcher=joblib"]), (False, [])):
+        monkeypatch.setattr("safe_rl.command_line._is_installed", lambda _, known=is_there: known)
+        assert expand_arguments(arguments) == [*arguments, *launcher]
+        told = [*arguments, "hydra/launcher=ray"]
+        assert expand_arguments(told) == told
 
 
 def test_resuming_reads_the_configuration_of_the_run(run):
@@ -52,11 +61,8 @@ def test_only_a_run_can_be_resumed(run):
 
 @pytest.mark.parametrize("shorthand", ["slate=SG6", "+slate=SG6"])
 def test_a_slate_is_its_environments(shorthand):
-    assert expand_arguments(["algo=ppo,cpo", shorthand, "-m"]) == [
-        "-m",
-        f"env={','.join(SLATES['SG6'])}",
-        "algo=ppo,cpo",
-    ]
+    expanded = expand_arguments(["algo=ppo,cpo", shorthand, "-m", "hydra/launcher=basic"])
+    assert expanded[:3] == ["-m", f"env={','.join(SLATES['SG6'])}", "algo=ppo,cpo"]
 
 
 def test_slates_that_cannot_be_written_out():

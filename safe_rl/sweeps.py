@@ -1,0 +1,137 @@
+"""Sweeps of many runs: threads per job, and a report on what became of every job."""
+
+from __future__ import annotations
+
+import atexit
+import json
+import math
+import os
+import traceback
+from collections.abc import Sequence
+from datetime import datetime
+from pathlib import Path
+from typing import Any
+
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.core.utils import JobReturn, JobStatus
+from hydra.experimental.callback import Callback
+from omegaconf import DictConfig
+
+__all__ = ["SweepReport", "count_jobs", "threads_per_job"]
+
+FAILURE_FILE = "failure.txt"
+
+
+def count_jobs(overrides: Sequence[str]) -> int:
+    """Number of jobs that overrides make.
+
+    Examples:
+        >>> count_jobs(["env=PointGoal1,CarGoal1", "seed=0,10,20", "algo=cpo"])
+        6
+    """
+    parsed = OverridesParser.create().parse_overrides(list(overrides))
+    return math.prod(
+        len(list(override.sweep_string_iterator()))
+        for override in parsed
+        if override.is_sweep_override()
+    )
+
+
+def threads_per_job(num_jobs: int, num_workers: int, num_cores: int) -> int:
+    """Threads with which jobs do not get in each other's way.
+
+    Args:
+        num_jobs: Jobs of the sweep.
+        num_workers: Jobs at a time; negative counts from the number of cores, -1 being all, as
+            joblib has it.
+        num_cores: Cores of the machine.
+
+    Examples:
+        >>> threads_per_job(num_jobs=6, num_workers=-1, num_cores=64)
+        10
+    """
+    workers = num_workers if num_workers > 0 else num_cores + 1 + num_workers
+    return max(1, num_cores // max(1, min(workers, num_jobs)))
+
+
+class SweepReport(Callback):
+    """Keeps a failing job from ending the sweep, and names it at the end.
+
+    Every job leaves lines in a journal below the sweep's folder; a failing one also its traceback
+    in its own. In single runs this does nothing.
+    """
+
+    def __init__(self) -> None:
+        self._journal: Path | None = None
+        self._num_jobs = 0
+
+    def on_multirun_start(self, config: DictConfig, **kwargs: Any) -> None:
+        """Share the cores out among the jobs and begin the journal."""
+        self._num_jobs = count_jobs(config.hydra.overrides.task)
+        self._journal = _journal_path(Path(config.hydra.sweep.dir))
+        num_workers = config.hydra.launcher.get("n_jobs")
+        if num_workers is not None:
+            num_cores = len(os.sched_getaffinity(0))
+            threads = threads_per_job(self._num_jobs, num_workers, num_cores)
+            os.environ["SAFE_RL_NUM_THREADS"] = str(threads)
+            # bars of several jobs would overwrite each other
+            os.environ.setdefault("TQDM_DISABLE", "1")
+        # if the launcher itself fails, Hydra does not come to the end of the sweep
+        atexit.register(self._print_summary)
+
+    def on_job_start(self, config: DictConfig, **kwargs: Any) -> None:
+        """Note that a job has begun."""
+        self._note(config, "begun")
+
+    def on_job_end(self, config: DictConfig, job_return: JobReturn, **kwargs: Any) -> None:
+        """Note how a job has ended, and take its error out of the way of the others."""
+        if self._journal is None:
+            return
+        failure = Path(config.hydra.runtime.output_dir) / FAILURE_FILE
+        failure.unlink(missing_ok=True)
+        if job_return.status is not JobStatus.FAILED:
+            self._note(config, "done")
+            return
+        error = job_return._return_value
+        failure.write_text("".join(traceback.format_exception(error)))
+        summary = str(error).strip().partition("\n")[0]
+        self._note(config, "failed", f"{type(error).__name__}: {summary}")
+        job_return.return_value, job_return.status = None, JobStatus.COMPLETED
+
+    def on_multirun_end(self, config: DictConfig, **kwargs: Any) -> None:
+        """Say what became of the jobs; exit with status 1 if one failed."""
+        atexit.unregister(self._print_summary)
+        if self._print_summary():
+            raise SystemExit(1)
+
+    def _note(self, config: DictConfig, event: str, error: str = "") -> None:
+        if self._journal is None:
+            return
+        directory = config.hydra.runtime.output_dir
+        line = json.dumps({"job": config.hydra.job.num, "event": event, "error": error,
+                           "directory": directory})  # fmt: skip
+        # appended in one piece, also by several processes
+        with self._journal.open("a") as file:
+            file.write(f"{line}\n")
+
+    def _print_summary(self) -> bool:
+        """Print what became of the jobs; returns whether one has not come to its end."""
+        assert self._journal is not None
+        lines = self._journal.read_text().splitlines() if self._journal.exists() else []
+        last = {note["job"]: note for note in map(json.loads, lines)}
+        done = [note for note in last.values() if note["event"] == "done"]
+        print(f"Sweep: {len(done)} of {self._num_jobs} runs are finished.")
+        for note in last.values():
+            if note["event"] == "failed":
+                print(f"  failed: {note['directory']}: {note['error']} (see {FAILURE_FILE} there)")
+            if note["event"] == "begun":
+                print(f"  interrupted: {note['directory']}")
+        if len(done) < self._num_jobs:
+            print("Start it again as it was: finished runs are skipped, the others go on.")
+        return len(done) < self._num_jobs
+
+
+def _journal_path(sweep_directory: Path) -> Path:
+    folder = sweep_directory / "sweeps"
+    folder.mkdir(parents=True, exist_ok=True)
+    return (folder / f"{datetime.now():%Y-%m-%d_%H-%M-%S}_{os.getpid()}.jsonl").absolute()
