@@ -26,7 +26,12 @@ _PORTION = 2_000_000
 
 
 class Estimate(NamedTuple):
-    """An estimate and the interval in which the estimated quantity lies with confidence 95 %."""
+    """An estimate and the interval in which the estimated quantity lies with confidence 95 %.
+
+    Examples:
+        >>> print(Estimate(12.3456, 11.0, 14.0))
+        12.35 [11, 14]
+    """
 
     value: float
     low: float

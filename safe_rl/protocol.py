@@ -203,8 +203,8 @@ def normalised_cost_rate(cost_rate: ArrayLike, reference: Scores) -> np.ndarray:
     """ρ̄_c = ρ_c / ρ_c^E, of any shape.
 
     Examples:
-        >>> float(normalised_cost_rate(0.01, Scores(20.0, 50.0, 0.05)))
-        0.2
+        >>> float(normalised_cost_rate(0.025, Scores(20.0, 50.0, 0.05)))
+        0.5
     """
     return np.asarray(cost_rate, dtype=float) / reference.cost_rate
 

@@ -56,6 +56,11 @@ class Gap:
         algorithm: Name of the algorithm, as experiments have it.
         overrides: What makes ``train.py`` run it.
         seeds: Environment -> seeds still to run.
+
+    Examples:
+        >>> gap = Gap("SG6", "CPO", ("algo=cpo",), {"CarGoal1": (0, 10)})
+        >>> gap.num_runs, gap.commands()
+        (2, ['python train.py -m env=CarGoal1 algo=cpo seed=0,10'])
     """
 
     slate: str
