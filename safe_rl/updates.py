@@ -15,6 +15,8 @@ from torch import Tensor, nn
 from torch.optim import Optimizer
 from torchrl.objectives import LossModule
 
+from safe_rl.learning_rate import KLAdaptiveRate
+
 __all__ = ["MinibatchUpdate", "PolicyUpdate"]
 
 
@@ -62,10 +64,13 @@ class MinibatchUpdate:
         minibatch_size: Samples per gradient step; None takes the whole batch.
         max_kl: Mean KL divergence that ends the update, or None.
         max_grad_norm: Norm to which the gradient is clipped, or None.
+        adapt_rate: Sets the learning rate of the next call by the steps and the KL of this one, or
+            None for a constant rate; needs ``max_kl``.
         compile: Whether to compile the loss and its gradient with :func:`torch.compile`.
 
     Raises:
-        ValueError: If ``num_passes`` or ``minibatch_size`` is below 1.
+        ValueError: If ``num_passes`` or ``minibatch_size`` is below 1, or ``adapt_rate`` comes
+            without ``max_kl``.
         KeyError: By the call, if ``max_kl`` is set and the loss does not report ``kl``.
         FloatingPointError: By the call, if a loss is not finite.
 
@@ -97,6 +102,7 @@ class MinibatchUpdate:
         minibatch_size: int | None,
         max_kl: float | None = None,
         max_grad_norm: float | None = None,
+        adapt_rate: KLAdaptiveRate | None = None,
         compile: bool = False,
     ) -> None:
         if num_passes < 1 or (minibatch_size is not None and minibatch_size < 1):
@@ -104,11 +110,14 @@ class MinibatchUpdate:
                 f"num_passes={num_passes} and minibatch_size={minibatch_size} must be at least 1; "
                 "minibatch_size=null takes the whole batch."
             )
+        if adapt_rate is not None and max_kl is None:
+            raise ValueError("adapt_rate follows the KL divergence: it needs a max_kl.")
         self.loss = loss
         self.num_passes = num_passes
         self.minibatch_size = minibatch_size
         self.max_kl = max_kl
         self.max_grad_norm = max_grad_norm
+        self.adapt_rate = adapt_rate
         self._parameters = [parameter for parameter in loss.parameters() if parameter.requires_grad]
         self.optimizer = optimizer(self._parameters)
         self._evaluate = torch.compile(self._total_loss) if compile else self._total_loss
@@ -128,24 +137,39 @@ class MinibatchUpdate:
 
         Returns:
             The mean over the steps of everything that the loss reports, save ``kl``, which is the
-            last one measured; and ``num_steps``, the gradient steps taken.
+            last one measured; ``num_steps``, the gradient steps taken; and ``lr``, the next
+            learning rate, if it is adapted.
         """
         del cost_violation, episode_length
         history: list[TensorDictBase] = []
         num_steps = 0
-        for minibatch in self._minibatches(batch.select(*self.loss.in_keys).reshape(-1)):
+        samples = batch.select(*self.loss.in_keys).reshape(-1)
+        for minibatch in self._minibatches(samples):
             total, losses = self._evaluate(minibatch)
             history.append(losses.detach())
             if self.max_kl is not None and losses["kl"] > self.max_kl:
                 break
             self._step(total)
             num_steps += 1
-        return self._diagnostics(history, num_steps)
+        diagnostics = self._diagnostics(history, num_steps)
+        if self.adapt_rate is not None and self.max_kl is not None:
+            planned = self.num_passes * self._num_minibatches(samples.shape[0])
+            shares = {
+                "share_of_steps": num_steps / planned,
+                "share_of_kl": float(diagnostics["kl"]) / self.max_kl,
+            }
+            for group in self.optimizer.param_groups:
+                group["lr"] = self.adapt_rate(group["lr"], **shares)
+            diagnostics["lr"] = torch.tensor(self.optimizer.param_groups[0]["lr"])
+        return diagnostics
+
+    def _num_minibatches(self, num_samples: int) -> int:
+        size = num_samples if self.minibatch_size is None else self.minibatch_size
+        return max(1, round(num_samples / size))
 
     def _minibatches(self, samples: TensorDictBase) -> Iterator[TensorDictBase]:
         num_samples = samples.shape[0]
-        size = num_samples if self.minibatch_size is None else self.minibatch_size
-        num_minibatches = max(1, round(num_samples / size))
+        num_minibatches = self._num_minibatches(num_samples)
         size = num_samples // num_minibatches
         for _ in range(self.num_passes):
             if num_minibatches == 1:

@@ -9,6 +9,7 @@ from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 from torch import nn
 
+from safe_rl.learning_rate import KLAdaptiveRate
 from safe_rl.models import BehaviourPolicy, make_actor
 from safe_rl.objectives import CriticLoss, PPOLoss
 from safe_rl.updates import MinibatchUpdate
@@ -176,3 +177,28 @@ def test_errors_say_what_is_wrong():
     update = MinibatchUpdate(loss, optimizer=adam, num_passes=1, minibatch_size=None)
     with pytest.raises(FloatingPointError, match="'loss_objective' is nan"):
         update(TensorDict({"x": torch.tensor([float("nan")])}, [1]))
+
+
+def test_the_rate_follows_the_kl_divergence():
+    adapt = KLAdaptiveRate(factor=2.0, lowest=1e-4, highest=4e-3, few_steps=0.5, low_kl=0.5)
+    assert adapt(1e-3, share_of_steps=0.4, share_of_kl=2.0) == pytest.approx(5e-4)
+    assert adapt(1e-3, share_of_steps=1.0, share_of_kl=0.4) == pytest.approx(2e-3)
+    assert adapt(1e-3, share_of_steps=1.0, share_of_kl=0.9) == pytest.approx(1e-3)
+    assert adapt(1e-3, share_of_steps=0.8, share_of_kl=1.1) == pytest.approx(1e-3)
+    assert adapt(1e-4, share_of_steps=0.0, share_of_kl=9.0) == pytest.approx(1e-4)
+    assert adapt(4e-3, share_of_steps=1.0, share_of_kl=0.0) == pytest.approx(4e-3)
+    with pytest.raises(ValueError, match="factor"):
+        KLAdaptiveRate(factor=0.5, lowest=1e-4, highest=1e-3, few_steps=0.5, low_kl=0.5)
+
+
+def test_an_update_that_ends_early_lowers_the_next_rate():
+    adapt = KLAdaptiveRate(factor=2.0, lowest=1e-5, highest=1.0, few_steps=0.7, low_kl=0.7)
+    common = {"optimizer": adam, "minibatch_size": 5, "num_passes": 3, "adapt_rate": adapt}
+    # The recording loss reports a KL of 0, 0.004, 0.008, …: 12 steps are planned.
+    ended = MinibatchUpdate(RecordingLoss(), max_kl=0.01, **common)
+    assert ended(samples(4, 5))["num_steps"] == 3
+    assert ended.optimizer.param_groups[0]["lr"] == pytest.approx(5e-3)
+    short = MinibatchUpdate(RecordingLoss(), max_kl=1.0, **common)
+    assert short(samples(4, 5))["lr"] == pytest.approx(2e-2)
+    with pytest.raises(ValueError, match="max_kl"):
+        MinibatchUpdate(RecordingLoss(), **common)
