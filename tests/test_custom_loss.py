@@ -188,11 +188,11 @@ def test_the_loss_is_pessimistic_on_both_sides():
     assert loss(data)["clip_fraction"] > 0
 
 
-def train(directory, *overrides):
+def train(directory, *overrides, limits="{cost_hazards: 1, cost_north: 0.5}"):
     """A run of a second on the point mass, with the example's folder of configurations."""
     config = point_mass_config(
         f"hydra.searchpath=[file://{EXAMPLES / 'conf'}]",
-        "cost_limits={cost_hazards: 1, cost_north: 0.5}",
+        f"cost_limits={limits}",
         *overrides,
         minibatch_size=None if "algo=cpo" in overrides else 40,
     )
@@ -211,6 +211,14 @@ def test_it_trains_with_several_costs(tmp_path):
         # eight episodes an epoch: the mean of the worst two, whose costs are whole numbers
         assert all((2 * worst) % 1 == 0 for worst in cvar)
         assert len(set(table[f"multiplier_{key}"])) > 1
+
+
+def test_a_policy_is_best_only_if_its_worst_episodes_keep_the_limit(tmp_path):
+    limit = 8
+    _, table = train(tmp_path, "algo=cvar_ppo", limits=f"{{cost_hazards: {limit}}}")
+    assert min(table["episode_cost_hazards"]) < limit
+    assert min(table["violation_cost_hazards"]) > 0
+    assert not (tmp_path / "checkpoints" / "best").exists()
 
 
 def test_measure_and_estimator_go_with_cpo(tmp_path):
