@@ -1,0 +1,55 @@
+"""Letting resting objects sleep makes steps cheap; it must not change what is measured.
+
+Contacts are chaotic, so two runs from one seed soon have nothing in common, and their means differ
+by chance. Here worlds without sleep go along with a run with sleep, set to its state again and
+again: what differs within such a window is the work of sleeping.
+"""
+
+import numpy as np
+import pytest
+import torch
+from scipy import stats
+from tensordict import TensorDict
+
+from safe_rl.envs import SUITE, SafetyGymEnv
+
+NUM_ENVS, NUM_WINDOWS, WINDOW = 100, 12, 25
+TELLING, NEGLIGIBLE = 0.05, 0.005  # of what is measured
+
+
+def forward_driving() -> torch.Tensor:
+    """Full speed ahead in random curves, which runs into things: actions [windows, T, N, 2]."""
+    turn = 2 * torch.rand(NUM_WINDOWS, 1, NUM_ENVS) - 1
+    actions = torch.stack([torch.ones_like(turn), turn], -1)
+    return actions.expand(NUM_WINDOWS, WINDOW, NUM_ENVS, 2).clone()
+
+
+def drive(env: SafetyGymEnv, tensordict: TensorDict, actions: torch.Tensor):
+    """Take steps; returns where they end and the sums of reward and costs [N]."""
+    keys, steps = ("reward", *env.cost_keys), []
+    for action in actions:
+        following = env.step(tensordict.set("action", action))
+        steps.append(following["next"].select(*keys))
+        tensordict = env.step_mdp(following)
+    run = torch.stack(steps)
+    return tensordict, {key: run[key].double().sum(0)[:, 0].numpy() for key in keys}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["PointGoal2", "PointPush2", "CarGoal2"])
+def test_sleeping_biases_neither_returns_nor_costs(name):
+    env = SafetyGymEnv(SUITE[name], num_envs=NUM_ENVS, seed=0)
+    sleepless = SafetyGymEnv(SUITE[name], num_envs=NUM_ENVS, seed=0, sleep=False)
+    tensordict, asleep, awake = env.reset(), [], []
+    for actions in forward_driving():
+        awake.append(drive(sleepless, sleepless.set_state(env.get_state()), actions)[1])
+        tensordict, sums = drive(env, tensordict, actions)
+        asleep.append(sums)
+    for key in asleep[0]:
+        got, want = (np.stack([sums[key] for sums in windows]) for windows in (asleep, awake))
+        difference = (got - want).mean(0)  # one number per world, so that they are independent
+        bias, error = abs(difference.mean()), stats.sem(difference)
+        size = np.abs(want).mean()
+        assert bias <= max(3 * error, NEGLIGIBLE * size), (key, bias, error, size)
+        if key != "cost_exception":
+            assert 3 * error <= TELLING * size, f"{key}: too few events to tell"
