@@ -1,6 +1,7 @@
 """Train an algorithm on an environment: ``python train.py env=PointGoal1 algo=ppo_lagrangian``."""
 
 import sys
+from functools import partial
 from pathlib import Path
 
 import hydra
@@ -11,7 +12,7 @@ import safe_rl.openmp  # noqa: F401, has to come before torch
 from safe_rl.command_line import CommandLineError, expand_arguments
 from safe_rl.envs import make_env, store_configs
 from safe_rl.resuming import is_finished, may_continue
-from safe_rl.training import build_trainer, seed_everything
+from safe_rl.training import build_trainer, physics_threads, seed_everything
 from safe_rl.transfer import initialise_networks
 
 store_configs()
@@ -26,14 +27,14 @@ def main(config: DictConfig) -> None:
         print(f"{directory} has its {config.frames:,} frames already: raise 'frames' to train on.")
         return
     seed_everything(config.seed, config.num_threads)
-    env = make_env(
+    make = partial(
+        make_env,
         OmegaConf.to_container(config.env, resolve=True),
-        num_envs=config.num_envs,
         device=config.device,
         seed=config.seed,
-        num_threads=config.num_threads or 0,
+        num_threads=physics_threads(config),
     )
-    trainer = build_trainer(config, env, directory)
+    trainer = build_trainer(config, make(num_envs=config.num_envs), directory, make)
     if continues and trainer.resume():
         print(f"Going on after {trainer.progress.steps:,} of {config.frames:,} frames.")
     elif config.init_from is not None:

@@ -1,21 +1,37 @@
-"""Loggers that know how to go on with a run that was interrupted."""
+"""Loggers that know how to go on with a run that was interrupted.
+
+Each is TorchRL's, writes below or remembers its run in the folder ``log_dir``, and is chosen by
+``logger=`` from ``conf/logger``.
+"""
 
 from __future__ import annotations
 
-from tensorboard.compat.proto.event_pb2 import Event, SessionLog
-from torchrl.record.loggers.tensorboard import TensorboardLogger as TorchRLTensorboardLogger
+from pathlib import Path
+from typing import Any
 
-__all__ = ["TensorboardLogger"]
+from tensorboard.compat.proto.event_pb2 import Event, SessionLog
+from torchrl.record.loggers.mlflow import MLFlowLogger
+from torchrl.record.loggers.tensorboard import TensorboardLogger as TorchRLTensorboardLogger
+from torchrl.record.loggers.wandb import WandbLogger as TorchRLWandbLogger
+
+from safe_rl.extras import import_extra
+
+__all__ = ["MLflowLogger", "TensorboardLogger", "WandbLogger"]
 
 
 class TensorboardLogger(TorchRLTensorboardLogger):
-    """TorchRL's TensorBoard logger, for runs that may be continued.
+    """Event files for TensorBoard.
+
+    Args:
+        exp_name: Folder of the event files, below ``log_dir``.
+        log_dir: Folder of the run.
 
     Examples:
         >>> import tempfile
         >>> logger = TensorboardLogger(exp_name="tensorboard", log_dir=tempfile.mkdtemp())
         >>> logger.continue_from(1000)
         >>> logger.log_scalar("episode_return", 1.0, step=2000)
+        >>> logger.close()
     """
 
     def continue_from(self, step: int) -> None:
@@ -23,3 +39,65 @@ class TensorboardLogger(TorchRLTensorboardLogger):
         writer = self.experiment._get_file_writer()
         event = Event(step=step + 1, session_log=SessionLog(status=SessionLog.START))
         writer.add_event(event, step=step + 1)
+
+    def close(self) -> None:
+        """Write what is still held back."""
+        self.experiment.close()
+
+
+class MLflowLogger(MLFlowLogger):
+    """A run of an MLflow experiment; a run that is continued goes on in the same one.
+
+    Metrics that are logged again after an interruption have the same values as before.
+
+    Args:
+        exp_name: Name of the experiment.
+        tracking_uri: Database or server, such as ``sqlite:///runs/mlflow.db``.
+        log_dir: Folder of the run, where the id of the MLflow run is kept.
+
+    Raises:
+        ModuleNotFoundError: If MLflow is not installed.
+    """
+
+    def __init__(self, exp_name: str, tracking_uri: str, log_dir: str) -> None:
+        self._mlflow = import_extra("mlflow", extra="mlflow")
+        self._directory = Path(log_dir)
+        super().__init__(exp_name=exp_name, tracking_uri=tracking_uri)
+
+    def _create_experiment(self) -> Any:
+        path = self._directory / "mlflow_run_id.txt"
+        self.id = self._mlflow.set_experiment(self.exp_name).experiment_id
+        run = self._mlflow.start_run(
+            run_id=path.read_text() if path.exists() else None,
+            experiment_id=self.id,
+            run_name=str(self._directory),
+        )
+        path.write_text(run.info.run_id)
+        return run
+
+    def close(self) -> None:
+        """End the MLflow run, so that another one can begin in this process."""
+        self._mlflow.end_run()
+
+
+class WandbLogger(TorchRLWandbLogger):
+    """A run of Weights & Biases; a run that is continued goes on in the same one.
+
+    Args:
+        log_dir: Folder of the run, where the id of the run is kept.
+        kwargs: Arguments of TorchRL's logger and of ``wandb.init``.
+
+    Raises:
+        ModuleNotFoundError: If wandb is not installed.
+    """
+
+    def __init__(self, log_dir: str, **kwargs: Any) -> None:
+        wandb = import_extra("wandb", extra="wandb")
+        path = Path(log_dir) / "wandb_run_id.txt"
+        run_id = path.read_text() if path.exists() else wandb.util.generate_id()
+        path.write_text(run_id)
+        super().__init__(log_dir=log_dir, id=run_id, **kwargs)
+
+    def close(self) -> None:
+        """End the run, so that another one can begin in this process."""
+        self.experiment.finish()

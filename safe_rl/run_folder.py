@@ -107,6 +107,9 @@ class RunFolder:
         finally:
             self._bar.close()
             self._table.close()
+            close = getattr(self._logger, "close", None)
+            if close is not None:
+                close()
 
     def _save_config(self) -> None:
         # replaced in one go: a run killed here can still be continued

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 import time
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -10,6 +11,7 @@ from pathlib import Path
 from signal import Signals
 
 import torch
+from hydra.utils import instantiate
 from omegaconf import DictConfig
 from tensordict import TensorDictBase
 from torchrl.checkpoint import GlobalRNGState
@@ -19,13 +21,14 @@ from torchrl.envs import EnvBase
 from safe_rl.algorithm import Algorithm
 from safe_rl.building import build_algorithm, check_cost_limits
 from safe_rl.checkpoints import CheckpointStore, Stateful
-from safe_rl.collectors import EpisodeAccounting, make_collector
+from safe_rl.collectors import EpisodeAccounting, WorkerCollector, make_collector
+from safe_rl.collectors.workers import MakeEnv
 from safe_rl.interrupts import StopRequest
 from safe_rl.models import BehaviourPolicy
 from safe_rl.run_folder import RunFolder
 from safe_rl.run_state import Progress, WorldSnapshot
 
-__all__ = ["Trainer", "build_trainer", "seed_everything"]
+__all__ = ["Trainer", "build_trainer", "physics_threads", "seed_everything"]
 
 
 def seed_everything(seed: int, num_threads: int | None) -> None:
@@ -46,7 +49,17 @@ def torch_threads(number: int) -> Iterator[None]:
         torch.set_num_threads(before)
 
 
-def build_trainer(config: DictConfig, env: EnvBase, directory: Path) -> Trainer:
+def physics_threads(config: DictConfig) -> int:
+    """Threads that step each environment; 0 is one per core. Workers share them."""
+    num_collectors = config.collector.num_collectors
+    if num_collectors == 1:
+        return config.num_threads or 0
+    return max(1, (config.num_threads or os.cpu_count() or 1) // num_collectors)
+
+
+def build_trainer(
+    config: DictConfig, env: EnvBase, directory: Path, make_env: MakeEnv | None = None
+) -> Trainer:
     """Build everything that a run consists of.
 
     Args:
@@ -55,6 +68,8 @@ def build_trainer(config: DictConfig, env: EnvBase, directory: Path) -> Trainer:
             ``config.num_steps``; if it has ``get_state`` and ``set_state``, a checkpoint holds the
             state of its worlds.
         directory: Folder of the run.
+        make_env: Makes an environment like ``env`` with another ``num_envs``, for collectors with
+            workers.
 
     Raises:
         ValueError: If parts of the configuration do not fit together.
@@ -64,16 +79,21 @@ def build_trainer(config: DictConfig, env: EnvBase, directory: Path) -> Trainer:
     return Trainer(
         env=env,
         algorithm=algorithm,
-        collector=make_collector(
-            env,
-            BehaviourPolicy(algorithm.networks.actor),
-            frames_per_batch=config.frames_per_batch,
-            device=config.device,
-        ),
+        collector=_build_collector(config, env, make_env, algorithm),
         cost_limits=cost_limits,
         folder=RunFolder(directory, config, cost_limits, env.config.num_steps),
         config=config,
     )
+
+
+def _build_collector(
+    config: DictConfig, env: EnvBase, make_env: MakeEnv | None, algorithm: Algorithm
+) -> Collector | WorkerCollector:
+    policy = BehaviourPolicy(algorithm.networks.actor)
+    numbers = {"frames_per_batch": config.frames_per_batch, "device": config.device}
+    if config.collector.get("_target_") is None:
+        return make_collector(env, policy, **numbers)
+    return instantiate(config.collector, _partial_=True)(env, make_env, policy, **numbers)
 
 
 class Trainer:
@@ -92,7 +112,7 @@ class Trainer:
         self,
         env: EnvBase,
         algorithm: Algorithm,
-        collector: Collector,
+        collector: Collector | WorkerCollector,
         *,
         cost_limits: Mapping[str, float],
         folder: RunFolder,
@@ -106,7 +126,10 @@ class Trainer:
         self.folder = folder
         self.interrupted_by: Signals | None = None
         self._collector = collector
-        self._worlds = WorldSnapshot(env, collector) if hasattr(env, "get_state") else None
+        # the worlds of workers are out of reach
+        self._worlds = None
+        if isinstance(collector, Collector) and hasattr(env, "get_state"):
+            self._worlds = WorldSnapshot(env, collector)
         self._is_continued = False
         self._cost_limits = dict(cost_limits)
         self._frames = config.frames
@@ -137,6 +160,7 @@ class Trainer:
         """
         CheckpointStore.load(checkpoint, self.components())
         self._is_continued = True
+        self._begin_episodes()
 
     def resume(self) -> bool:
         """Continue the run in the folder from its newest checkpoint; if it has none, start over.
@@ -148,7 +172,14 @@ class Trainer:
             CheckpointError: If no checkpoint can be read, or they do not fit this run.
         """
         self._is_continued = True
-        return self._checkpoints.resume() is not None
+        restored = self._checkpoints.resume()
+        self._begin_episodes()
+        return restored is not None
+
+    def _begin_episodes(self) -> None:
+        """Without their state, the worlds cannot go on with the episodes that were open."""
+        if self._worlds is None:
+            self.accounting.forget_open_episodes()
 
     def run(self) -> str:
         """Train for ``frames`` steps, rounded up to whole batches.
@@ -172,6 +203,8 @@ class Trainer:
                     saved_at = time.monotonic()
             self._save()
             self.interrupted_by = stop.received
+        if isinstance(self._collector, WorkerCollector):
+            self._collector.shutdown()
         return self.folder.summary()
 
     def batches(self) -> Iterator[TensorDictBase]:

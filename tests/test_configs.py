@@ -126,7 +126,7 @@ SIZES = {
     "DoggoButton1": (100_000_000, 60, 60_000),
 }
 # what is no part of the algorithm, and the tables that other keys read
-ASIDE = {"env", "algo", "preset", "logger", "seed", "device", "num_threads", "compile"}
+ASIDE = {"collector", "env", "algo", "preset", "logger", "seed", "device", "num_threads", "compile"}
 ASIDE |= {"checkpoint", "default_cost_limits", "paper"}
 
 

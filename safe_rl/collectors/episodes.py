@@ -164,6 +164,10 @@ class EpisodeAccounting:
             raise KeyError(f"The batch has no ('next', {key!r}). What it has there: {known}.")
         return entry.squeeze(-1).double()
 
+    def forget_open_episodes(self) -> None:
+        """Drop the sums of episodes that will never be finished: the environment starts anew."""
+        self._open_sums.zero_()
+
     def state_dict(self) -> dict[str, Tensor]:
         """Sums of the open episodes and of all steps so far."""
         return {"open_sums": self._open_sums.clone(), "totals": self._totals.clone()}

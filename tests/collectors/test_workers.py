@@ -1,0 +1,69 @@
+"""Collection by several processes: rows, weights, noise, and workers that die."""
+
+import os
+import signal
+import time
+from functools import partial
+
+import pytest
+import torch
+
+from safe_rl.collectors import make_process_collector
+from safe_rl.collectors.workers import share_rows
+from safe_rl.envs import SafetyGymEnv
+from safe_rl.models import BehaviourPolicy, make_actor
+
+CONFIG = {"robot_base": "point", "task": "goal", "num_steps": 30, "observe_goal_lidar": True}
+MAKE = partial(SafetyGymEnv, CONFIG, seed=3, num_threads=1)
+
+
+def test_workers_step_the_rows_that_one_process_would():
+    whole = MAKE(num_envs=6)
+    shares = [make() for make in share_rows(whole, MAKE, num_collectors=3)]
+    expected = whole.reset()["observation"]
+    rows = torch.cat([share.reset()["observation"] for share in shares])
+    assert torch.equal(rows, expected)
+    assert len({tuple(row.tolist()) for row in rows}) == 6
+
+
+@pytest.mark.parametrize(("num_collectors", "frames"), [(4, 60), (2, 63), (0, 60)])
+def test_numbers_that_cannot_be_shared(num_collectors, frames):
+    with pytest.raises(ValueError, match="num_envs must be a multiple"):
+        make_process_collector(
+            MAKE(num_envs=6), MAKE, None,
+            frames_per_batch=frames, num_collectors=num_collectors, device="cpu",
+        )  # fmt: skip
+
+
+def test_batches_follow_the_weights_until_a_worker_dies():
+    env = MAKE(num_envs=4)
+    size = env.observation_spec["observation"].shape[-1]
+    actor = make_actor(size, 2, hidden_sizes=[8], initial_log_std=-0.5)
+    collector = make_process_collector(
+        env, MAKE, BehaviourPolicy(actor), frames_per_batch=80, num_collectors=2, device="cpu"
+    )
+    batches = iter(collector)
+    previous = None
+    for _ in range(3):
+        batch = next(batches)
+        assert batch.shape == (4, 20)
+        expected = actor.get_dist(batch).base_dist.loc
+        assert torch.allclose(batch["loc"], expected, atol=1e-6)
+        noise = (batch["action"] - batch["loc"])[:, 0, 0]
+        assert len(set(noise.tolist())) == 4
+        if previous is not None:
+            # rows go on where they were, unless their episode of 30 steps has ended
+            kept = ~previous["next", "done"][:, -1, 0]
+            assert torch.equal(
+                batch["observation"][kept, 0], previous["next", "observation"][kept, -1]
+            )
+        previous = batch.clone()
+        with torch.no_grad():
+            for parameter in actor.parameters():
+                parameter.add_(0.1)
+    os.kill(collector._workers.procs[1].pid, signal.SIGKILL)
+    start = time.monotonic()
+    with pytest.raises(RuntimeError, match=r"worker .* died \(exit code -9.*resume="):
+        next(batches)
+    assert time.monotonic() - start < 30
+    collector.shutdown()
