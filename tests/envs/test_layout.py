@@ -1,6 +1,5 @@
 """Where things stand at the start: rules kept in every layout of the suite, and distributions."""
 
-import functools
 import itertools
 import math
 
@@ -31,12 +30,12 @@ POINT = {"robot_base": "point", "task": "none"}
 UNLIKELY = 1e-3  # p values below this one would be a finding
 
 
-@functools.cache
-def frozen_start(name: str):
-    """An environment with many fresh layouts, none of which has moved."""
-    config = SUITE[name].replace(**FROZEN)
+@pytest.fixture(params=SUITE, scope="module")
+def start(request):
+    """Name, environment and first TensorDict of many fresh layouts, none of which has moved."""
+    config = SUITE[request.param].replace(**FROZEN)
     env = SafetyGymEnv(config, num_envs=NUM_LAYOUTS, seed=0, sleep=False, num_threads=1)
-    return env, env.reset()
+    return request.param, env, env.reset()
 
 
 def fresh_state(config: dict, num_envs: int, seed: int = 0):
@@ -49,9 +48,8 @@ def fresh_places(config: dict, num_envs: int, seed: int = 0) -> dict[str, np.nda
     return {key: xy.numpy() for key, xy in places(*fresh_state(config, num_envs, seed)).items()}
 
 
-@pytest.mark.parametrize("name", SUITE)
-def test_layouts_keep_their_distances_and_bounds(name):
-    env, _ = frozen_start(name)
+def test_layouts_keep_their_distances_and_bounds(start):
+    name, env, _ = start
     task = name.removeprefix("Point").removeprefix("Car").removeprefix("Doggo")
     keepouts = dict(KEEPOUTS[task[:-1]])
     if name.startswith("CarPush"):
@@ -70,10 +68,9 @@ def test_layouts_keep_their_distances_and_bounds(name):
         assert distance.min() >= least - 1e-9, (one, other)
 
 
-@pytest.mark.parametrize("name", SUITE)
-def test_no_episode_starts_with_a_cost_or_a_met_goal(name):
-    env, start = frozen_start(name)
-    got = env.step(start.set("action", env.action_spec.zero()))["next"]
+def test_no_episode_starts_with_a_cost_or_a_met_goal(start):
+    _, env, tensordict = start
+    got = env.step(tensordict.set("action", env.action_spec.zero()))["next"]
     for key in env.cost_keys:
         assert not got[key].any(), key
     assert not got["goal_met"].any()
