@@ -7,6 +7,7 @@ have in a single process, so that a run meets the same kind of episodes however 
 from __future__ import annotations
 
 import signal
+import sys
 from collections.abc import Callable, Iterator
 from functools import partial
 from multiprocessing import parent_process
@@ -101,7 +102,7 @@ class WorkerCollector:
 
     def shutdown(self) -> None:
         """End the workers, if there are any."""
-        if self._workers is not None and not self._workers.closed:
+        if self._workers is not None and not getattr(self._workers, "closed", False):
             self._workers.shutdown()
 
 
@@ -179,7 +180,7 @@ def make_ray_collector(
             share_rows(env, make_env, num_collectors),
             policy,
             frames_per_batch=frames_per_batch,
-            total_frames=-1,
+            total_frames=sys.maxsize,
             sync=True,
             ray_init_config=ray_init,
             remote_configs=resources,

@@ -8,7 +8,7 @@ from functools import partial
 import pytest
 import torch
 
-from safe_rl.collectors import make_process_collector
+from safe_rl.collectors import make_process_collector, make_ray_collector
 from safe_rl.collectors.workers import share_rows
 from safe_rl.envs import SafetyGymEnv
 from safe_rl.models import BehaviourPolicy, make_actor
@@ -67,3 +67,29 @@ def test_batches_follow_the_weights_until_a_worker_dies():
         next(batches)
     assert time.monotonic() - start < 30
     collector.shutdown()
+
+
+@pytest.mark.slow
+def test_actors_of_ray_follow_the_weights():
+    ray = pytest.importorskip("ray")
+    env = MAKE(num_envs=4)
+    size = env.observation_spec["observation"].shape[-1]
+    actor = make_actor(size, 2, hidden_sizes=[8], initial_log_std=-0.5)
+    collector = make_ray_collector(
+        env, MAKE, BehaviourPolicy(actor), frames_per_batch=80, num_collectors=2, device="cpu",
+        ray_init={"num_cpus": 2, "include_dashboard": False},
+        resources={"num_cpus": 1, "num_gpus": 0},
+    )  # fmt: skip
+    try:
+        batches = iter(collector)
+        for _ in range(3):
+            batch = next(batches)
+            assert batch.shape == (4, 20)
+            assert torch.allclose(batch["loc"], actor.get_dist(batch).base_dist.loc, atol=1e-6)
+            assert len(set((batch["action"] - batch["loc"])[:, 0, 0].tolist())) == 4
+            with torch.no_grad():
+                for parameter in actor.parameters():
+                    parameter.add_(0.1)
+    finally:
+        collector.shutdown()
+        ray.shutdown()
