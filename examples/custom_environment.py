@@ -3,7 +3,7 @@
 Mines lie between the robot and its goal. Their cost rises towards the centre, and the robot's
 lidar sees them. Nothing in the package changes: every row stands in this file.
 
-    python examples/custom_environment.py                        # a minute on two cores
+    python examples/custom_environment.py                        # about a minute on two cores
     python examples/custom_environment.py frames=2_000_000 seed=1 env.mines_num=8
 """
 
@@ -75,7 +75,7 @@ POINT_MINES = {
     "constrain_indicator": False,  # the cost is how deep the robot is in a mine, not whether
     "observe_speed": True,
 }
-RUN = ["env=PointMines", "cost_limits={cost_mines: 10}", "frames=500_000"]
+RUN = ["env=PointMines", "cost_limits={cost_mines: 10}", "frames=400_000"]
 
 
 def register() -> None:
