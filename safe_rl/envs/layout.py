@@ -105,7 +105,8 @@ def _rectangles(
         (a + keepout, b + keepout, c - keepout, d - keepout) for a, b, c, d in placements
     ]
     for (xmin, ymin, xmax, ymax), placement in zip(shrunk, placements, strict=True):
-        if xmin > xmax or ymin > ymax:
+        # A rectangle of twice the keepout is a point, which rounding may turn inside out.
+        if max(xmin - xmax, ymin - ymax) > PIN_TOLERANCE:
             raise ConfigError(
                 f"There is no room for '{label}': its placement {placement} is smaller than twice "
                 f"its keepout ({keepout}). Enlarge '{kind}_placements' or 'placements_extents', or "
@@ -120,7 +121,7 @@ def _stack(rectangles: list[list[tuple[float, ...]]]) -> tuple[Tensor, Tensor]:
     padded = torch.tensor(
         [group + [group[-1]] * (most - len(group)) for group in rectangles], dtype=torch.float64
     )
-    area = (padded[..., 2] - padded[..., 0]) * (padded[..., 3] - padded[..., 1])
+    area = (padded[..., 2:] - padded[..., :2]).clamp(min=0.0).prod(-1)
     for row, group in enumerate(rectangles):
         area[row, len(group) :] = 0.0
         if area[row].sum() == 0.0:

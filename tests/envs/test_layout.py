@@ -210,6 +210,15 @@ def test_impossible_layouts_name_the_object(config, culprit):
         env.reset()
 
 
+def test_a_rectangle_of_twice_the_keepout_is_a_point():
+    """Rounding turns one in five of them inside out."""
+    rng = np.random.default_rng(0)
+    for x, y in rng.uniform(-2, 2, (30, 2)).round(2).tolist():
+        rectangle = [x - 0.4, y - 0.4, x + 0.4, y + 0.4]
+        found = fresh_places({**POINT, "robot_placements": [rectangle]}, 2)["robot"]
+        np.testing.assert_allclose(found, [[x, y], [x, y]], atol=1e-9)
+
+
 def test_placements_without_room_name_the_key():
     config = {**POINT, "hazards_num": 1, "hazards_placements": [[0, 0, 0.7, 2]]}
     with pytest.raises(ConfigError, match=r"hazard0.*'hazards_placements'.*'hazards_keepout'"):
