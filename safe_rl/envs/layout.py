@@ -212,9 +212,9 @@ def sample_layouts(plan: PlacementPlan, key: Tensor) -> Tensor:
         attempts = rng.fold(key[pending, None], torch.arange(start, stop))
         positions, misfit = _try_layouts(plan, attempts.flatten())
         misfits += torch.bincount(misfit[misfit >= 0], minlength=len(misfits))
-        good = (misfit < 0).view(len(pending), -1)
+        good = (misfit < 0).view(len(pending), stop - start)
         found, first = good.any(-1), good.to(torch.uint8).argmax(-1)
-        chosen = positions.view(len(pending), stop - start, -1, 2)[found, first[found]]
+        chosen = positions.view(*good.shape, len(plan.names), 2)[found, first[found]]
         layouts[pending[found].unsqueeze(1), torch.tensor(plan.columns)] = chosen
         pending = pending[~found]
         if not len(pending):
