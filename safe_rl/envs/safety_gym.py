@@ -33,6 +33,7 @@ from safe_rl.envs.snapshot import read_state, write_state
 from safe_rl.envs.specs import make_specs
 from safe_rl.envs.suite import resolve
 from safe_rl.envs.tasks import TASKS, dense_reward
+from safe_rl.envs.validation import require_integer
 from safe_rl.envs.world import make_world, refresh
 
 
@@ -76,6 +77,8 @@ class SafetyGymEnv(EnvBase):
         num_threads: int = 0,
         sleep: bool = True,
     ) -> None:
+        require_integer("num_envs", num_envs, lowest=1)
+        require_integer("num_threads", num_threads, lowest=0)
         super().__init__(device=torch.device(device), batch_size=torch.Size([num_envs]))
         self.config = resolve(env)
         scene = build_scene(self.config, sleep)
@@ -111,6 +114,7 @@ class SafetyGymEnv(EnvBase):
     def _set_seed(self, seed: int | None) -> None:
         if seed is None:
             return
+        require_integer("seed", seed, lowest=-(2**63))
         self._row_seed = rng.row_seeds(seed, self.batch_size[0])
         # One layout for all rows where the configuration wants a single one.
         self._fixed_layout = rng.fold(torch.tensor(seed), Purpose.LAYOUT)

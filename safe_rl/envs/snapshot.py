@@ -36,7 +36,7 @@ def write_state(world: World, state: TensorDictBase) -> None:
 
     Raises:
         KeyError: if another key is missing.
-        ValueError: if a shape does not fit.
+        ValueError: if a shape does not fit, or there is no such goal button.
     """
     _check(world, state)
     scene, physics = world.scene, world.physics
@@ -74,3 +74,6 @@ def _check(world: World, state: TensorDictBase) -> None:
         elif key not in OPTIONAL_KEYS:
             needed = sorted(set(expected.keys()) - set(OPTIONAL_KEYS))
             raise KeyError(f"The state lacks '{key}'; it needs {needed}.")
+    button, number = state["goal_button"], world.scene.config.buttons_num
+    if goal_is_button(world.scene.config.task) and not ((button >= 0) & (button < number)).all():
+        raise ValueError(f"State 'goal_button' must be between 0 and {number - 1}: {button}.")

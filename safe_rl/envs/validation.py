@@ -181,3 +181,13 @@ def _check_rectangles(key: str, value: Any) -> None:
     for xmin, ymin, xmax, ymax in rectangles:
         if xmin > xmax or ymin > ymax:
             raise _wrong(key, "(xmin, ymin, xmax, ymax) with xmin <= xmax, ymin <= ymax", value)
+
+
+def require_integer(name: str, value: Any, lowest: int, highest: int = 2**63 - 1) -> None:
+    """Check an argument that counts or seeds.
+
+    Raises:
+        ConfigError: if it is no integer between the bounds.
+    """
+    if isinstance(value, bool) or not isinstance(value, int) or not lowest <= value <= highest:
+        raise ConfigError(f"'{name}' must be an integer of at least {lowest}, got {value!r}.")

@@ -157,3 +157,22 @@ def test_states_that_do_not_fit():
         env.set_state(state.exclude("qvel"))
     with pytest.raises(ValueError, match=r"'qpos'.*\(4, 73\).*\(4, 5\)"):
         env.set_state(state.clone().set("qpos", torch.zeros(NUM_ENVS, 5)))
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [{"num_envs": 0}, {"num_envs": 2.5}, {"num_threads": -1}, {"seed": "one"}, {"seed": 2**63}],
+)
+def test_wrong_counts_and_seeds_are_named(arguments):
+    (name,) = arguments
+    with pytest.raises(ConfigError, match=f"'{name}' must be an integer"):
+        SafetyGymEnv("PointGoal0", **arguments)
+
+
+def test_a_goal_button_that_does_not_exist_is_refused():
+    env = SafetyGymEnv("PointButton0", num_envs=2, seed=0)
+    env.reset()
+    state = env.get_state()
+    state["goal_button"] = torch.tensor([0, 4])
+    with pytest.raises(ValueError, match="between 0 and 3"):
+        env.set_state(state)
