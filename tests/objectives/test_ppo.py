@@ -2,6 +2,7 @@
 
 import pytest
 import torch
+import torch._dynamo.testing
 from samples import make_actor, make_batch, perturb
 from torch.distributions import Independent, Normal, kl_divergence
 from torchrl.objectives import ClipPPOLoss
