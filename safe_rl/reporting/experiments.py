@@ -9,9 +9,9 @@ from pathlib import Path
 from typing import Any
 
 from safe_rl.protocol import ALGORITHMS, COST_LIMIT, REFERENCE, Scores
-from safe_rl.reporting.runs import Run, without_repetitions
+from safe_rl.reporting.runs import Run, split_source, without_repetitions
 
-__all__ = ["Experiment", "distinguishing_keys", "flatten", "group_runs"]
+__all__ = ["Experiment", "distinguishing_keys", "environment_names", "flatten", "group_runs"]
 
 Settings = dict[str, Hashable]
 
@@ -121,7 +121,7 @@ def group_runs(
         Experiments in the order of the benchmark and of the paper's tables, and folder -> why a
         run was left out.
     """
-    environments = _environment_names(runs, suite)
+    environments = environment_names(runs, suite)
     algorithms = _algorithm_names(runs, environments)
     cells: dict[tuple[str, str], list[Run]] = defaultdict(list)
     for run in runs:
@@ -148,16 +148,20 @@ def _order(experiment: Experiment) -> tuple[Hashable, ...]:
     )
 
 
-def _environment_names(
+def environment_names(
     runs: Sequence[Run], suite: Mapping[str, Mapping[str, Any]]
 ) -> dict[Path, str]:
-    """Folder -> name of the environment, with the keys that differ from the suite's."""
+    """Folder -> name of the environment, with the keys that differ from the suite's.
+
+    Args:
+        runs: Of an environment that is not in the suite, the first one's settings are the measure.
+        suite: Name -> every key of a benchmark environment.
+    """
     names: dict[Path, str] = {}
     standards = {name: flatten(node) for name, node in suite.items()}
     for run in runs:
         settings = flatten(run.config["env"])
         name = str(settings.pop("name", "environment"))
-        # without a benchmark of that name, the first run's environment is the measure
         standard = standards.setdefault(name, settings)
         changed = {
             key: value
@@ -191,10 +195,20 @@ def _learning_settings(run: Run) -> Settings:
         for key, value in flatten(run.config).items()
         if key.partition(".")[0] not in {"env", *_MANNER} and not key.endswith(".compile")
     }
-    if settings.get("init_from"):
-        # every seed starts from a run of its own; what these have in common is the folder above
-        settings["init_from"] = str(Path(str(settings["init_from"])).parent)
+    if run.init_from is not None:
+        settings["init_from"] = _common_source(run.init_from)
     return settings
+
+
+def _common_source(source: Path) -> str:
+    """What ``init_from`` is alike in over seeds, each of which starts from a run of its own."""
+    folder, steps = split_source(source)
+    if steps is None:
+        return str(folder.parent)
+    checkpoint = source.relative_to(folder)
+    # the best one comes after other steps in every seed
+    is_best = checkpoint.parent.name == "best"
+    return str(folder.parent / "*" / (checkpoint.parent if is_best else checkpoint))
 
 
 def _in_brackets(settings: Mapping[str, Hashable]) -> str:

@@ -18,7 +18,19 @@ from safe_rl.reporting.results import cost_keys_of
 from safe_rl.reporting.slate_tables import SYMBOLS
 from safe_rl.reporting.slates import Aggregate
 
-__all__ = ["algorithm_colours", "draw_aggregates", "draw_learning_curves", "save"]
+__all__ = [
+    "LIMIT_STYLE",
+    "ROW_HEIGHT",
+    "WIDTH",
+    "add_legend",
+    "algorithm_colours",
+    "draw_aggregates",
+    "draw_experiment",
+    "draw_learning_curves",
+    "drawn_keys",
+    "save",
+    "set_axes",
+]
 
 # Okabe and Ito's palette, which people with colour-blindness can read.
 _OWN_COLOURS = {
@@ -29,8 +41,9 @@ _OWN_COLOURS = {
     "cpo": "#cc79a7",
 }
 _FURTHER_COLOURS = ("#56b4e9", "#555555", "#8c564b", "#9467bd", "#bcbd22", "#17becf", "#7f7f7f")
-_LIMIT: dict[str, Any] = {"color": "#c00000", "linestyle": "--", "linewidth": 1.1}
 _DPI = 130
+LIMIT_STYLE: dict[str, Any] = {"color": "#c00000", "linestyle": "--", "linewidth": 1.1}
+"""How limits are drawn."""
 ROW_HEIGHT, WIDTH = 2.5, 12.0
 """Of a row of panels, and of a figure, in inches."""
 
@@ -64,31 +77,42 @@ def draw_learning_curves(experiments: Sequence[Experiment], colours: Mapping[str
     rows = [
         (environment, key)
         for environment in dict.fromkeys(e.environment for e in experiments)
-        for key in _drawn_keys([e for e in experiments if e.environment == environment])
+        for key in drawn_keys([e for e in experiments if e.environment == environment])
     ]
     figure = Figure(figsize=(WIDTH, ROW_HEIGHT * len(rows) + 0.6), layout="constrained")
     panels = figure.subplots(len(rows), 3, squeeze=False)
     for (environment, key), axes in zip(rows, panels, strict=True):
         shown = [e for e in experiments if e.environment == environment]
         for experiment in shown:
-            _draw_experiment(experiment, key, axes, colours[experiment.algorithm])
+            draw_experiment(experiment, key, axes, colours[experiment.algorithm])
         name = environment.replace(" (", "\n(")
         _decorate(axes, name if key == "cost" else f"{name}\n{key}", shown, key)
     for axis, title in zip(panels[0], ("Return", "Episode cost", "Cost rate"), strict=True):
         axis.set_title(title, fontweight="bold")
     for axis in panels[-1]:
         axis.set_xlabel("environment steps")
-    _add_legend(figure, panels[:, 0])
+    add_legend(figure, panels[:, 0])
     return figure
 
 
-def _drawn_keys(experiments: Sequence[Experiment]) -> list[str]:
+def drawn_keys(experiments: Sequence[Experiment]) -> list[str]:
     """Cost keys with a limit, or the aggregate cost where none has one."""
     limited = {key for experiment in experiments for key in experiment.limits}
     return [key for key in cost_keys_of(experiments) if key in limited] or ["cost"]
 
 
-def _draw_experiment(experiment: Experiment, key: str, axes: Sequence[Axes], colour: str) -> None:
+def draw_experiment(
+    experiment: Experiment, key: str, axes: Sequence[Axes], colour: str, offset: int = 0
+) -> None:
+    """Draw return, episode cost and cost rate of an experiment.
+
+    Args:
+        experiment: The finished runs become a mean and its interval, others a line each.
+        key: Cost key.
+        axes: A panel for each of the three.
+        colour: Of everything.
+        offset: Environment steps to its beginning.
+    """
     columns = (("episode_return", True), (f"episode_{key}", True), (f"{key}_rate", False))
     unfinished = [run for run in experiment.runs if not run.is_finished]
     for axis, (column, smooth) in zip(axes, columns, strict=True):
@@ -96,15 +120,15 @@ def _draw_experiment(experiment: Experiment, key: str, axes: Sequence[Axes], col
             mean_curve(experiment.finished, column, smooth=smooth) if experiment.finished else None
         )
         if curve is not None:
-            axis.plot(curve.steps, curve.mean, color=colour, label=experiment.algorithm)
-            axis.fill_between(
-                curve.steps, curve.low, curve.high, color=colour, alpha=0.2, linewidth=0
-            )
+            steps = curve.steps + offset
+            axis.plot(steps, curve.mean, color=colour, label=experiment.algorithm)
+            axis.fill_between(steps, curve.low, curve.high, color=colour, alpha=0.2, linewidth=0)
         for run in unfinished:
             line = mean_curve([run], column, smooth=smooth)
             if line is not None:
                 label = f"{experiment.algorithm} (unfinished)"
-                axis.plot(line.steps, line.mean, ":", color=colour, linewidth=1.2, label=label)
+                steps = line.steps + offset
+                axis.plot(steps, line.mean, ":", color=colour, linewidth=1.2, label=label)
 
 
 def _decorate(axes: Sequence[Axes], name: str, experiments: Sequence[Experiment], key: str) -> None:
@@ -113,19 +137,24 @@ def _decorate(axes: Sequence[Axes], name: str, experiments: Sequence[Experiment]
     for limit, length in {
         (e.limits[key], e.runs[0].episode_length) for e in experiments if key in e.limits
     }:
-        costs.axhline(limit, **_LIMIT)
-        rates.axhline(limit / length, **_LIMIT)
+        costs.axhline(limit, **LIMIT_STYLE)
+        rates.axhline(limit / length, **LIMIT_STYLE)
+    set_axes(axes)
+
+
+def set_axes(axes: Sequence[Axes]) -> None:
+    """Scales, ticks and grid of a row of panels: return, episode cost and cost rate."""
     for axis in axes:
         axis.xaxis.set_major_formatter(EngFormatter(sep=""))
         axis.xaxis.set_major_locator(MaxNLocator(6))
         axis.grid(alpha=0.25)
         axis.spines[["top", "right"]].set_visible(False)
         axis.set_xlim(left=0)
-    for axis in (costs, rates):
+    for axis in axes[1:]:
         axis.set_ylim(bottom=0)
 
 
-def _add_legend(figure: Figure, axes: Iterable[Axes]) -> None:
+def add_legend(figure: Figure, axes: Iterable[Axes]) -> None:
     """One legend for all panels, below the figure."""
     pairs = chain.from_iterable(
         zip(*axis.get_legend_handles_labels(), strict=True) for axis in axes

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 import shlex
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
@@ -17,7 +18,7 @@ from yaml import YAMLError
 from safe_rl.run_folder import final_figures
 from safe_rl.tables import read_table
 
-__all__ = ["Run", "find_runs", "without_repetitions"]
+__all__ = ["Run", "find_runs", "read_run", "split_source", "without_repetitions"]
 
 
 @dataclass(frozen=True)
@@ -72,6 +73,12 @@ class Run:
         return self.table["time_total"][-1] / 3600
 
     @property
+    def init_from(self) -> Path | None:
+        """The run or checkpoint whose networks it started from, as its command line named it."""
+        source = self.config.get("init_from")
+        return None if source is None else Path(str(source))
+
+    @property
     def overrides(self) -> list[str] | None:
         """What its command line said, if Hydra has recorded it."""
         path = self.directory / ".hydra" / "overrides.yaml"
@@ -123,7 +130,7 @@ def find_runs(root: Path, *, unfinished: bool = False) -> tuple[list[Run], dict[
     for path in sorted(root.rglob("config.yaml")):
         if path.parent.name == ".hydra":
             continue
-        outcome = _read_run(path.parent, unfinished)
+        outcome = read_run(path.parent, unfinished=unfinished)
         if isinstance(outcome, Run):
             runs.append(outcome)
         else:
@@ -137,8 +144,13 @@ def find_runs(root: Path, *, unfinished: bool = False) -> tuple[list[Run], dict[
     return runs, skipped
 
 
-def _read_run(directory: Path, unfinished: bool) -> Run | str:
-    """A run, or why it cannot be read."""
+def read_run(directory: Path, *, unfinished: bool = False) -> Run | str:
+    """A run, or why it cannot be read.
+
+    Args:
+        directory: Its folder, which holds a ``config.yaml``.
+        unfinished: Whether it counts as finished before its configured end.
+    """
     try:
         config = OmegaConf.to_container(OmegaConf.load(directory / "config.yaml"), resolve=True)
     except (YAMLError, OmegaConfBaseException, UnicodeDecodeError) as error:
@@ -155,6 +167,20 @@ def _read_run(directory: Path, unfinished: bool) -> Run | str:
     if not table.get("steps"):
         return "it has not finished an epoch"
     return Run(directory, config, table, 0 if unfinished else config["frames"])  # type: ignore[arg-type]
+
+
+def split_source(source: Path) -> tuple[Path, int | None]:
+    """Folder of the run that ``init_from`` names, and steps of the checkpoint if it names one.
+
+    Examples:
+        >>> folder, steps = split_source(Path("a/checkpoints/best/checkpoint-000000003000.torchrl"))
+        >>> folder.name, steps
+        ('a', 3000)
+    """
+    match = re.fullmatch(r"checkpoint-(\d+)\.torchrl", source.name)
+    if match is None or len(source.parents) < 3:
+        return source, None
+    return source.parents[2], int(match.group(1))
 
 
 def without_repetitions(runs: list[Run]) -> tuple[list[Run], dict[Path, str]]:
