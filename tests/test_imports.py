@@ -42,7 +42,7 @@ PARTS = {
     "intervals": ("extras",),
     "evaluation": ("building", "checkpoints", "extras", "intervals", "models", "protocol"),
     "evaluate": ("envs", "evaluation", "intervals", "openmp", "options", "protocol"),
-    "reporting": ("extras", "intervals", "protocol", "run_folder", "tables"),
+    "reporting": ("checkpoints", "extras", "intervals", "protocol", "run_folder", "tables"),
     "report": ("envs", "openmp", "options", "protocol", "reporting"),
 }
 
@@ -83,9 +83,10 @@ FLOORS = {
     "reporting": (
         ("runs", "tables"),
         ("experiments", "curves"),
-        ("results", "slates", "inventory"),
+        ("results", "slates", "inventory", "transfers"),
         ("slate_tables",),
         ("figures",),
+        ("transfer_figures",),
         ("report",),
         ("page",),
         ("",),

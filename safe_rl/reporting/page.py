@@ -28,6 +28,7 @@ class Media:
 
     caption: str
     path: Path
+    notes: Sequence[str] = ()
 
     @property
     def data(self) -> str:
@@ -76,6 +77,10 @@ def _context(report: Report, out: Path, title: str) -> dict[str, Any]:
         Media(robot.capitalize(), save(figure, out / f"curves_{robot}.png"))
         for robot, figure in report.curves.items()
     ]
+    transfers = [
+        Media(transfer.title, save(figure, out / f"transfer_{number}.png"), transfer.notes)
+        for number, (transfer, figure) in enumerate(report.transfers, start=1)
+    ]
     aggregates = {
         slate.name: Media(slate.name, save(slate.figure, out / f"slate_{slate.name}.png"))
         for slate in report.slates
@@ -86,6 +91,7 @@ def _context(report: Report, out: Path, title: str) -> dict[str, Any]:
         "facts": _facts(report),
         "finals": report.finals,
         "curves": curves,
+        "transfers": transfers,
         "slates": report.slates,
         "aggregates": aggregates,
         "gaps": gap_table(report.gaps),

@@ -24,6 +24,8 @@ from safe_rl.reporting.slates import (
     find_gap,
 )
 from safe_rl.reporting.tables import Table
+from safe_rl.reporting.transfer_figures import draw_transfer
+from safe_rl.reporting.transfers import Transfer, find_transfers
 
 __all__ = ["Report", "Slate", "build_report"]
 
@@ -55,6 +57,7 @@ class Report:
         experiments: Runs, grouped.
         finals: Final scores, a table per environment.
         curves: Robot -> its learning curves.
+        transfers: Experiments that continue others, with both phases as a picture.
         slates: Sets of environments that are complete for an algorithm or more.
         gaps: What is missing for the others.
         dominance: Which algorithm is better than which.
@@ -64,6 +67,7 @@ class Report:
     experiments: Sequence[Experiment]
     finals: Sequence[Table]
     curves: Mapping[str, Figure]
+    transfers: Sequence[tuple[Transfer, Figure]]
     slates: Sequence[Slate]
     gaps: Sequence[Gap]
     dominance: Table
@@ -114,6 +118,10 @@ def build_report(
         experiments=experiments,
         finals=finals,
         curves={robot: draw_learning_curves(group, colours) for robot, group in robots.items()},
+        transfers=[
+            (transfer, draw_transfer(transfer, colours))
+            for transfer in find_transfers(experiments, runs, suite)
+        ],
         slates=slates,
         gaps=missing,
         dominance=dominance_table(records),

@@ -119,6 +119,21 @@ def test_seeds_that_start_from_seeds_are_one_experiment(tmp_path):
     ]
 
 
+def test_seeds_that_start_from_checkpoints_of_seeds_are_one_experiment(tmp_path):
+    for seed in (0, 10):
+        for kind, steps in (("best", 1000 + seed), ("last", 3000), ("last", 4000)):
+            checkpoint = f"checkpoints/{kind}/checkpoint-{steps:012d}.torchrl"
+            source = f"first/seed{seed}/{checkpoint}"
+            folder = f"{kind}{steps}_{seed}"
+            write_run(tmp_path, "PointGoal2", "cpo", seed, init_from=source, folder=folder)
+    last = "init_from=first/*/checkpoints/last/checkpoint"
+    assert names(grouped(tmp_path)[0]) == [
+        ("PointGoal2", "CPO (init_from=first/*/checkpoints/best)", [0, 10]),
+        ("PointGoal2", f"CPO ({last}-000000003000.torchrl)", [0, 10]),
+        ("PointGoal2", f"CPO ({last}-000000004000.torchrl)", [0, 10]),
+    ]
+
+
 def test_the_preset_stands_for_what_follows_from_it():
     point = [
         {"preset": "default", "frames": 3, "model.width": 64},
