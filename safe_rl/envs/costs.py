@@ -155,12 +155,11 @@ def compute_costs(config: SafetyGymConfig, world: World, failed: Tensor) -> dict
     Returns:
         The keys of `cost_keys(config)`, each [N].
     """
-    costs = {row.key: row.magnitude(config, world) for row in COSTS if row.active(config)}
+    magnitudes = [row.magnitude(config, world) for row in COSTS if row.active(config)]
     if failed.any():
-        costs = {key: torch.where(failed, 0.0, cost) for key, cost in costs.items()}
-    costs[EXCEPTION_KEY] = failed.to(world.positions.dtype)
-    total = torch.stack(list(costs.values())).sum(0)
-    costs = {"cost": total, **costs}
+        magnitudes = [torch.where(failed, 0.0, magnitude) for magnitude in magnitudes]
+    kinds = torch.stack([*magnitudes, failed.to(world.positions.dtype)])
+    costs = torch.cat([kinds.sum(0, keepdim=True), kinds])
     if config.constrain_indicator:
-        costs = {key: (cost > 0).to(cost.dtype) for key, cost in costs.items()}
-    return costs
+        costs = (costs > 0).to(costs.dtype)
+    return dict(zip(cost_keys(config), costs.unbind(0), strict=True))
