@@ -9,8 +9,8 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
 
 import safe_rl.openmp  # noqa: F401, has to come before torch
-from safe_rl.command_line import CommandLineError, expand_arguments
-from safe_rl.envs import make_env, store_configs
+from safe_rl.command_line import CommandLineError, check_env_keys, expand_arguments
+from safe_rl.envs import SafetyGymConfig, make_env, store_configs
 from safe_rl.resuming import is_finished, may_continue
 from safe_rl.training import build_trainer, physics_threads, seed_everything
 from safe_rl.transfer import initialise_networks
@@ -48,6 +48,7 @@ def main(config: DictConfig) -> None:
 
 if __name__ == "__main__":
     try:
+        check_env_keys(sys.argv[1:], {"name", *SafetyGymConfig().to_dict()})
         sys.argv[1:] = expand_arguments(sys.argv[1:])
     except CommandLineError as error:
         raise SystemExit(str(error)) from None

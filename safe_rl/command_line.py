@@ -5,7 +5,7 @@ They are written out before Hydra sees the command line.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from difflib import get_close_matches
 from importlib.util import find_spec
 from pathlib import Path
@@ -14,7 +14,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from safe_rl.protocol import SLATES
 
-__all__ = ["CommandLineError", "expand_arguments"]
+__all__ = ["CommandLineError", "check_env_keys", "expand_arguments"]
 
 # they would have no effect on a run whose networks, optimisers and random numbers are restored
 _FIXED = ("preset", "seed", "init_from")
@@ -51,6 +51,28 @@ def expand_arguments(arguments: Sequence[str]) -> list[str]:
             others = [argument for argument in expanded if argument != given[0]]
             expanded = expand(given[0].partition("=")[2], others)
     return _with_launcher(expanded)
+
+
+def check_env_keys(arguments: Sequence[str], known: Collection[str]) -> None:
+    """Check the keys of overrides such as ``env.hazards_num=3``; Hydra would name no other key.
+
+    Args:
+        arguments: Arguments of ``train.py``.
+        known: Configuration keys of an environment.
+
+    Raises:
+        CommandLineError: For a key that is not among them; the nearest one is named.
+
+    Examples:
+        >>> check_env_keys(["env.hazards_num=3"], ["hazards_num"])
+    """
+    for argument in arguments:
+        key = argument.lstrip("+~").partition("=")[0]
+        if key.startswith("env.") and key[4:] not in known:
+            nearest = get_close_matches(key[4:], known, n=1, cutoff=0)[0]
+            raise CommandLineError(
+                f"'{argument}': an environment has no key '{key[4:]}'. Nearest: 'env.{nearest}'."
+            )
 
 
 def _with_launcher(arguments: list[str]) -> list[str]:

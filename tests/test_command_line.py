@@ -4,7 +4,7 @@ import pytest
 from hydra import compose, initialize_config_dir
 from run_configs import point_mass_config
 
-from safe_rl.command_line import CommandLineError, expand_arguments
+from safe_rl.command_line import CommandLineError, check_env_keys, expand_arguments
 from safe_rl.protocol import SLATES
 from safe_rl.run_folder import RunFolder
 
@@ -72,3 +72,10 @@ def test_slates_that_cannot_be_written_out():
         expand_arguments(["slate=SG6"])
     with pytest.raises(CommandLineError, match="use one of them"):
         expand_arguments(["-m", "slate=SG6", "env=PointGoal1"])
+
+
+def test_a_wrong_key_of_the_environment_names_the_nearest():
+    known = ["hazards_num", "hazards_size", "num_steps"]
+    check_env_keys(["-m", "env=PointGoal1", "env.hazards_num=3,4", "+env.num_steps=5"], known)
+    with pytest.raises(CommandLineError, match=r"Nearest: 'env\.hazards_num'"):
+        check_env_keys(["seed=0", "env.hazard_num=3"], known)
