@@ -25,9 +25,8 @@ def hazard_cost(robot_xy: Tensor, hazard_xy: Tensor, size: float) -> Tensor:
         hazard_xy: [N, K, 2].
         size: radius of a hazard [m].
     """
-    offset = hazard_xy - robot_xy.unsqueeze(-2)
-    distance = torch.sqrt(offset[..., 0] ** 2 + offset[..., 1] ** 2)
-    return (size - distance).clamp_(min=0.0).sum(-1)
+    distance = torch.hypot(*(hazard_xy - robot_xy.unsqueeze(-2)).unbind(-1))
+    return torch.rsub(distance, size).relu_().sum(-1)
 
 
 def contact_cost(contacts: Tensor) -> Tensor:
@@ -43,7 +42,7 @@ def displacement_cost(xy: Tensor, start_xy: Tensor, threshold: float) -> Tensor:
         start_xy: positions at the reset [N, K, 2].
         threshold: displacements up to this one are free [m].
     """
-    moved = torch.linalg.vector_norm(xy - start_xy, dim=-1)
+    moved = torch.hypot(*(xy - start_xy).unbind(-1))
     return torch.where(moved > threshold, moved, 0.0).sum(-1)
 
 
@@ -86,8 +85,7 @@ COSTS: list[Cost] = [
         "cost_hazards",
         lambda c: c.constrain_hazards,
         lambda c, w: (
-            c.hazards_cost
-            * hazard_cost(w.robot_pos[:, :2], w.at("hazards")[..., :2], c.hazards_size)
+            c.hazards_cost * hazard_cost(w.robot_xy, w.at("hazards")[..., :2], c.hazards_size)
         ),
     ),
     Cost(
@@ -144,7 +142,7 @@ def cost_keys(config: SafetyGymConfig) -> list[str]:
     return ["cost", *(row.key for row in COSTS if row.active(config)), EXCEPTION_KEY]
 
 
-def compute_costs(config: SafetyGymConfig, world: World, failed: Tensor) -> dict[str, Tensor]:
+def compute_costs(config: SafetyGymConfig, world: World, failed: Tensor) -> Tensor:
     """Compute every cost of the worlds as they are.
 
     Args:
@@ -153,13 +151,10 @@ def compute_costs(config: SafetyGymConfig, world: World, failed: Tensor) -> dict
         failed: worlds whose physics failed, bool [N]; their only cost is `cost_exception`.
 
     Returns:
-        The keys of `cost_keys(config)`, each [N].
+        One row for each of `cost_keys(config)`, [1 + number of kinds + 1, N].
     """
     magnitudes = [row.magnitude(config, world) for row in COSTS if row.active(config)]
     if failed.any():
         magnitudes = [torch.where(failed, 0.0, magnitude) for magnitude in magnitudes]
-    kinds = torch.stack([*magnitudes, failed.to(world.positions.dtype)])
-    costs = torch.cat([kinds.sum(0, keepdim=True), kinds])
-    if config.constrain_indicator:
-        costs = (costs > 0).to(costs.dtype)
-    return dict(zip(cost_keys(config), costs.unbind(0), strict=True))
+    costs = torch.stack([sum(magnitudes, start=failed), *magnitudes, failed])
+    return costs.gt_(0.0) if config.constrain_indicator else costs

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from functools import cached_property
 
 import torch
 from torch import Tensor
@@ -50,6 +51,14 @@ class PlacementPlan:
     thresholds: Tensor
     keepouts: Tensor
     margin: float
+
+    @cached_property
+    def beside_goal(self) -> tuple[int, Tensor, Tensor]:
+        """The goal's place in the order, the others' columns [P - 1], and clearances [P - 1]."""
+        item = self.names.index("goal")
+        others = [i for i in range(len(self.names)) if i != item]
+        columns = torch.tensor([self.columns[i] for i in others])
+        return item, columns, self.keepouts[others] + self.keepouts[item] + self.margin
 
 
 def plan_placements(
@@ -132,10 +141,14 @@ def _stack(rectangles: list[list[tuple[float, ...]]]) -> tuple[Tensor, Tensor]:
 def _draw(plan: PlacementPlan, item: int, key: Tensor) -> Tensor:
     """One candidate position of an object per key: [...] -> [..., 2]."""
     rectangles, thresholds = plan.rectangles[item], plan.thresholds[item]
-    last = rectangles.shape[0] - 1
-    which = torch.searchsorted(thresholds, rng.uniform(key, 0), right=True).clamp(max=last)
-    low, high = rectangles[which, :2], rectangles[which, 2:]
-    return low + (high - low) * torch.stack([rng.uniform(key, 1), rng.uniform(key, 2)], -1)
+    uniform = rng.uniform(key.unsqueeze(-1), torch.arange(3))
+    if len(rectangles) == 1:
+        chosen = rectangles[0]
+    else:
+        which = torch.searchsorted(thresholds, uniform[..., 0].contiguous(), right=True)
+        chosen = rectangles[which.clamp(max=len(rectangles) - 1)]
+    low, high = chosen[..., :2], chosen[..., 2:]
+    return low + (high - low) * uniform[..., 1:]
 
 
 def _fits(candidates: Tensor, others: Tensor, clearance: Tensor) -> Tensor:
@@ -180,9 +193,9 @@ def _try_layouts(plan: PlacementPlan, key: Tensor) -> tuple[Tensor, Tensor]:
     return positions, misfit
 
 
-def _rounds(total: int, rows: int) -> Iterator[tuple[int, int]]:
+def _rounds(total: int, rows: int, first: int = 1) -> Iterator[tuple[int, int]]:
     """Ranges of attempts that grow, so that a few stubborn rows don't take thousands of rounds."""
-    start, size = 0, 1
+    start, size = 0, first
     while start < total:
         stop = min(start + size, total)
         yield start, stop
@@ -237,12 +250,10 @@ def resample_goal(plan: PlacementPlan, key: Tensor, layouts: Tensor) -> tuple[Te
     Returns:
         The new positions [B, 2], and whether one was found within 10,000 draws [B].
     """
-    item = plan.names.index("goal")
-    others = [i for i in range(len(plan.names)) if i != item]
-    placed = layouts[:, [plan.columns[i] for i in others]]
-    clearance = plan.keepouts[others] + plan.keepouts[item] + plan.margin
+    item, columns, clearance = plan.beside_goal
+    placed = layouts.index_select(1, columns)
     position, pending = layouts.new_zeros(len(key), 2), torch.arange(len(key))
-    for start, stop in _rounds(TRIES_PER_GOAL, len(key)):
+    for start, stop in _rounds(TRIES_PER_GOAL, len(key), first=4 * _BLOCK):
         candidates = _draw(plan, item, rng.fold(key[pending, None], torch.arange(start, stop)))
         fits = _fits(candidates, placed[pending], clearance)
         found, first = fits.any(-1), fits.to(torch.uint8).argmax(-1)

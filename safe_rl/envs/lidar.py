@@ -3,9 +3,15 @@
 from __future__ import annotations
 
 import math
+from functools import reduce
 
 import torch
 from torch import Tensor
+
+
+def _num_laps(num_bins: int) -> int:
+    """Turns of the circle that readings are written to, so that no index of a bin has to wrap."""
+    return 2 if num_bins > 2 else 4
 
 
 def to_ego(position: Tensor, robot_pos: Tensor, robot_mat: Tensor) -> Tensor:
@@ -22,9 +28,44 @@ def to_ego(position: Tensor, robot_pos: Tensor, robot_mat: Tensor) -> Tensor:
     return (position - robot_pos.unsqueeze(-2)) @ robot_mat
 
 
+def floor_to_ego(xy: Tensor, robot_pos: Tensor, robot_mat: Tensor) -> Tensor:
+    """Rotate points on the floor into the robot's frame and leave out z: `to_ego` in fewer passes.
+
+    Args:
+        xy: [N, M, 2].
+        robot_pos: [N, 3].
+        robot_mat: columns are the robot's axes in the world [N, 3, 3].
+
+    Returns:
+        [N, M, 2], in memory all x before all y, as the passes that follow want it.
+    """
+    robot_xy, robot_z = robot_pos.split([2, 1], -1)
+    x, y = (xy - robot_xy.unsqueeze(1)).unbind(-1)
+    axes = robot_mat[..., :2].permute(1, 2, 0).contiguous()
+    along_x, along_y, along_z = axes.unsqueeze(-1).unbind(0)
+    ego = torch.addcmul(x * along_x, y, along_y)
+    return ego.addcmul_(robot_z, along_z, value=-1).movedim(0, -1)
+
+
+def lidar_cells(group: Tensor, num_bins: int, alias: bool) -> Tensor:
+    """Cells that objects straight ahead light up: their own, and with `alias` its neighbours'.
+
+    Args:
+        group: which lidar sees each object, int64 [M].
+        num_bins: bins over the full circle.
+        alias: as in `pseudo_lidar`.
+
+    Returns:
+        int64 [1 or 3, M]; lidars follow each other, each of several turns of the circle.
+    """
+    neighbours = torch.tensor([0, 1, -1] if alias else [0])
+    laps = _num_laps(num_bins)
+    return (laps * group + laps // 2) * num_bins + neighbours.unsqueeze(-1)
+
+
 def pseudo_lidar(
     ego_xy: Tensor,
-    group: Tensor,
+    cells: Tensor,
     num_groups: int,
     num_bins: int,
     max_dist: float | None,
@@ -35,7 +76,7 @@ def pseudo_lidar(
 
     Args:
         ego_xy: objects in the robot's frame [N, M, 2] (m).
-        group: which lidar sees each object, int64 [M] below `num_groups`.
+        cells: of the objects, from `lidar_cells`.
         num_groups: number of lidars, G.
         num_bins: bins over the full circle, counter-clockwise from the robot's x axis.
         max_dist: readings fall linearly to 0 at this distance [m]; None: they fall as exp(-gain d).
@@ -46,22 +87,22 @@ def pseudo_lidar(
         Readings in [0, 1], [N, G * num_bins].
     """
     x, y = ego_xy.unbind(-1)
-    distance = torch.sqrt(x * x + y * y)
+    distance = torch.hypot(x, y)
     if max_dist is None:
         reading = torch.exp(-exp_gain * distance)
     else:
-        reading = (1.0 - distance / max_dist).clamp_(min=0.0)
-    turn = torch.remainder(torch.atan2(y, x), 2 * math.pi) * (num_bins / (2 * math.pi))
-    # A bearing just below the x axis may round up to a full turn.
-    bins = turn.floor().clamp_(max=num_bins - 1)
-    index, first = bins.to(torch.int64), group * num_bins
-    cells, values = [index + first], [reading]
+        reading = torch.rsub(distance / max_dist, 1.0).relu_()
+    turn = torch.atan2(y, x).mul_(num_bins / (2 * math.pi))
+    bins = turn.floor()
+    values = [reading]
     if alias:
-        part = turn - bins
-        cells += [(index + 1) % num_bins + first, (index - 1) % num_bins + first]
-        values += [part * reading, (1.0 - part) * reading]
-    empty = reading.new_zeros(len(reading), num_groups * num_bins)
-    return empty.scatter_reduce_(1, torch.cat(cells, 1), torch.cat(values, 1), "amax")
+        ahead = (turn - bins) * reading
+        values += [ahead, reading - ahead]
+    index = (bins.to(torch.int64).unsqueeze(1) + cells).flatten(1)
+    laps = _num_laps(num_bins)
+    turns = reading.new_zeros(len(reading), num_groups * laps * num_bins)
+    turns.scatter_reduce_(1, index, torch.cat(values, 1), "amax")
+    return reduce(torch.maximum, turns.unflatten(1, (-1, laps, num_bins)).unbind(2)).flatten(1)
 
 
 def compass(ego: Tensor, num_components: int) -> Tensor:

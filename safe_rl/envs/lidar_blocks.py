@@ -14,7 +14,7 @@ from torch import Tensor
 
 from safe_rl.envs.config import SafetyGymConfig
 from safe_rl.envs.elements import ELEMENTS, NUM_RAY_GROUPS, Element
-from safe_rl.envs.lidar import pseudo_lidar, to_ego
+from safe_rl.envs.lidar import floor_to_ego, lidar_cells, pseudo_lidar
 from safe_rl.envs.scene import Scene
 from safe_rl.envs.world import Block, World
 
@@ -26,17 +26,21 @@ def lidar_blocks(config: SafetyGymConfig, scene: Scene) -> list[Block]:
         return []
     read = _LIDARS[config.lidar_type](config, scene, elements)
     bins, kinds = config.lidar_num_bins, [element.kind for element in elements]
-    asleep = slice(0, 0)
     if "buttons" in kinds:
         first = kinds.index("buttons") * bins
-        asleep = slice(first, first + bins)
+        read = _while_awake(read, slice(first, first + bins))
+    return [Block({f"{kind}_lidar": (bins,) for kind in kinds}, read)]
+
+
+def _while_awake(read: Callable[[World], Tensor], columns: slice) -> Callable[[World], Tensor]:
+    """Buttons are not seen while they wait for the next goal."""
 
     def read_awake(world: World) -> Tensor:
         readings = read(world)
-        readings[:, asleep] *= (world.buttons_timer == 0).unsqueeze(-1)
+        readings[:, columns] *= (world.buttons_timer == 0).unsqueeze(-1)
         return readings
 
-    return [Block({f"{kind}_lidar": (bins,) for kind in kinds}, read_awake)]
+    return read_awake
 
 
 def _pseudo(
@@ -44,18 +48,23 @@ def _pseudo(
 ) -> Callable[[World], Tensor]:
     """Every object that any lidar sees, in one pass."""
     kinds = [element.kind for element in elements]
-    seen = [(scene.slots[kind], i) for i, kind in enumerate(kinds) if kind in scene.slots]
-    pairs = [(slot, i) for span, i in seen for slot in range(span.start, span.stop)]
-    # Without any object the index is empty, and has to be one of integers all the same.
-    slots, group = torch.tensor(pairs, dtype=torch.int64).view(-1, 2).T.contiguous()
-    on_floor = torch.tensor([1.0, 1.0, 0.0], dtype=torch.float64)
+    seen = sorted(
+        (slot, kinds.index(kind))
+        for kind, span in scene.slots.items()
+        for slot in range(span.start, span.stop)
+        if kind in kinds
+    )
+    slots, group = torch.tensor(seen, dtype=torch.int64).view(-1, 2).T.contiguous()
+    cells = lidar_cells(group, config.lidar_num_bins, config.lidar_alias)
+    all_seen = len(slots) == len(scene.names)
 
     def read(world: World) -> Tensor:
-        objects = world.positions.index_select(1, slots) * on_floor
-        ego = to_ego(objects, world.robot_pos, world.robot_mat)
+        xy = world.positions[..., :2]
         return pseudo_lidar(
-            ego[..., :2],
-            group,
+            floor_to_ego(
+                xy if all_seen else xy.index_select(1, slots), world.robot_pos, world.robot_mat
+            ),
+            cells,
             len(kinds),
             config.lidar_num_bins,
             config.lidar_max_dist,

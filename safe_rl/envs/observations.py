@@ -45,7 +45,7 @@ class Observer(NamedTuple):
     Attributes:
         shapes: shape of every component, in the order of the flat observation.
         columns: columns of every component in the flat observation.
-        read: world -> flat observation [N, n], float64.
+        read: world -> flat observation [N, n], float32.
     """
 
     shapes: Shapes
@@ -97,6 +97,6 @@ def make_observer(scene: Scene) -> Observer:
 
     def read(world: World) -> Tensor:
         values = torch.cat([block.read(world) for block in blocks], -1)
-        return values.index_select(1, permutation)
+        return values.to(torch.float32).index_select(1, permutation)
 
     return Observer(shapes, columns, read)

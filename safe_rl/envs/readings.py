@@ -45,7 +45,7 @@ def _compass_to(kind: str) -> Callable[[World], Tensor]:
 
 
 def _goal_closeness(world: World) -> Tensor:
-    to_goal = distance(world.robot_pos[:, None, :2], world.at("goal")[..., :2])
+    to_goal = distance(world.robot_xy.unsqueeze(1), world.at("goal")[..., :2])
     return torch.exp(-to_goal)
 
 

@@ -22,13 +22,21 @@ _MIX_2 = 0x94D049BB133111EB - (1 << 64)
 
 def _shift_right(x: Tensor, bits: int) -> Tensor:
     """Shift int64 right, filling with zeros (torch's own shift repeats the sign bit)."""
-    return (x >> bits) & ((1 << (64 - bits)) - 1)
+    return (x >> bits).bitwise_and_((1 << (64 - bits)) - 1)
 
 
-def _mix(x: Tensor) -> Tensor:
-    x = (x ^ _shift_right(x, 30)) * _MIX_1
-    x = (x ^ _shift_right(x, 27)) * _MIX_2
-    return x ^ _shift_right(x, 31)
+def _spread(counter: Tensor | int) -> Tensor | int:
+    """Counters times an odd constant, so that neighbours differ in many bits; integers stay so."""
+    if isinstance(counter, Tensor):
+        return counter * _MIX_2
+    return (counter * _MIX_2 + (1 << 63)) % (1 << 64) - (1 << 63)
+
+
+def _mix_(x: Tensor) -> Tensor:
+    """Mix in place."""
+    x.bitwise_xor_(_shift_right(x, 30)).mul_(_MIX_1)
+    x.bitwise_xor_(_shift_right(x, 27)).mul_(_MIX_2)
+    return x.bitwise_xor_(_shift_right(x, 31))
 
 
 def fold(key: Tensor, *counters: Tensor | int) -> Tensor:
@@ -46,13 +54,13 @@ def fold(key: Tensor, *counters: Tensor | int) -> Tensor:
         1
     """
     for counter in counters:
-        key = _mix((key ^ (torch.as_tensor(counter) * _MIX_2)) + _GAMMA)
+        key = _mix_((key ^ _spread(counter)).add_(_GAMMA))
     return key
 
 
 def uniform(key: Tensor, *counters: Tensor | int) -> Tensor:
     """Return float64 draws in [0, 1), one for each of the keys `fold(key, *counters)`."""
-    return _shift_right(fold(key, *counters), 11).to(torch.float64) * 2.0**-53
+    return _shift_right(fold(key, *counters), 11).to(torch.float64).mul_(2.0**-53)
 
 
 def normal(key: Tensor, *counters: Tensor | int) -> Tensor:

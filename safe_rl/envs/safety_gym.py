@@ -137,9 +137,8 @@ class SafetyGymEnv(EnvBase):
         mask = mask.reshape(self.batch_size).cpu()
         self._episode[mask] += 1
         start_episodes(self._world, self._plan, self._layout_key(), mask)
-        fresh = self._task.measure(self._world)
-        self._measured = torch.where(mask.unsqueeze(-1), fresh, self._measured)
-        self._has_cost = self._has_cost & ~mask
+        self._measured[mask] = self._task.measure(self._world)[mask]
+        self._has_cost &= ~mask
         return self._reset_output()
 
     def _reset_output(self) -> TensorDict:
@@ -149,7 +148,7 @@ class SafetyGymEnv(EnvBase):
 
     def _pack(self, outputs: dict[str, Any]) -> TensorDict:
         """Add the observation; here, and here alone, things become float32 copies on the device."""
-        flat = self._observer.read(self._world).to(torch.float32)
+        flat = self._observer.read(self._world)
         if self.device.type != "cpu":
             outputs = {key: value.to(self.device) for key, value in outputs.items()}
             flat = flat.to(self.device)
@@ -158,7 +157,8 @@ class SafetyGymEnv(EnvBase):
             outputs["observation"] = TensorDict(
                 self._observer.split(flat), batch_size=self.batch_size, device=self.device
             )
-        return TensorDict(outputs, batch_size=self.batch_size, device=self.device)
+        # As TorchRL's own environments do: every shape and device is right by construction.
+        return TensorDict._new_unsafe(outputs, batch_size=self.batch_size, device=self.device)
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         world, config = self._world, self.config
@@ -166,32 +166,32 @@ class SafetyGymEnv(EnvBase):
         now = self._task.measure(world)
         reward = dense_reward(config, world, self._measured, now)
         costs = compute_costs(config, world, failed)
-        self._has_cost = costs["cost"] > 0
+        torch.gt(costs[0], 0.0, out=self._has_cost)
         world.buttons_timer.sub_(1).clamp_(min=0)
-        met, ended, stuck = self._handle_goals(now, failed)
-        reward = torch.where(failed, config.reward_exception, reward + config.reward_goal * met)
+        met, stuck = self._handle_goals(now, failed)
+        reward = reward.add(met, alpha=config.reward_goal)
+        reward.masked_fill_(failed, config.reward_exception)
         world.step_count.add_(1)
-        terminated = failed | ended
-        truncated = ((world.step_count >= config.num_steps) | stuck) & ~terminated
-        numbers = torch.stack([reward, *costs.values()]).to(torch.float32).unsqueeze(-1)
+        time_out = world.step_count >= config.num_steps
+        terminated = failed if config.continue_goal else failed | met
+        truncated = (time_out if stuck is None else time_out | stuck) & ~terminated
+        numbers = torch.cat([reward.unsqueeze(0), costs]).to(torch.float32).unsqueeze(-1)
         flags = torch.stack([met, terminated | truncated, terminated, truncated]).unsqueeze(-1)
-        outputs = dict(zip(("reward", *costs), numbers.unbind(0), strict=True))
-        names = ("goal_met", "done", "terminated", "truncated")
-        outputs |= zip(names, flags.unbind(0), strict=True)
-        return self._pack(outputs)
+        names = ("reward", *self.cost_keys, "goal_met", "done", "terminated", "truncated")
+        return self._pack(dict(zip(names, (*numbers, *flags), strict=True)))
 
     def _step_proc_data(self, next_tensordict_out: TensorDictBase) -> TensorDictBase:
         """Skip TorchRL's checks of every step: shapes and end flags are right by construction."""
         return next_tensordict_out
 
     def _checked_action(self, tensordict: TensorDictBase) -> Tensor:
-        action = tensordict.get("action")
-        if action.shape != self.action_spec.shape or not action.dtype.is_floating_point:
+        action, needed = tensordict.get("action"), self._physics.ctrl.shape
+        if action.shape != needed or not action.dtype.is_floating_point:
             raise ValueError(
-                f"'action' must be a floating-point tensor of shape {tuple(self.action_spec.shape)}"
-                f" (num_envs, number of actuators), got {action.dtype} {tuple(action.shape)}."
+                f"'action' must be a floating-point tensor of shape {tuple(needed)} (num_envs, "
+                f"number of actuators), got {action.dtype} {tuple(action.shape)}."
             )
-        return action.detach().cpu().to(torch.float64)
+        return action.detach().cpu()
 
     def _advance(self, action: Tensor) -> Tensor:
         """Run the substeps of one step; returns the worlds whose physics failed [N]."""
@@ -210,20 +210,17 @@ class SafetyGymEnv(EnvBase):
         refresh(self._world)
         return failed
 
-    def _handle_goals(self, now: Tensor, failed: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Give worlds that met their goal a new one: met, ended by it, without a place for one."""
-        self._measured = now
-        never = torch.zeros_like(failed)
+    def _handle_goals(self, now: Tensor, failed: Tensor) -> tuple[Tensor, Tensor | None]:
+        """Give worlds that met their goal a new one: which met it, which have no place for one."""
+        self._measured.copy_(now)
         if self._task.met is None:
-            return never, never, never
+            return torch.zeros_like(failed), None
         met = self._task.met(self.config, self._world, now) & ~failed
-        if not self.config.continue_goal:
-            return met, met, never
-        if not met.any():
-            return met, never, never
+        if not (self.config.continue_goal and met.any()):
+            return met, None
         stuck = next_goals(self._world, self._plan, self._step_key(), met)
-        self._measured = self._task.measure(self._world)
-        return met, never, stuck
+        self._measured.copy_(self._task.measure(self._world))
+        return met, stuck
 
     def get_state(self) -> TensorDict:
         """Return a copy of everything that determines what happens next.
@@ -255,8 +252,8 @@ class SafetyGymEnv(EnvBase):
         write_state(self._world, state)
         self._row_seed = state.get("seed", self._row_seed).clone()
         self._episode = state.get("episode", self._episode).clone()
-        self._measured = self._task.measure(self._world)
-        self._has_cost = torch.zeros_like(self._has_cost)
+        self._measured.copy_(self._task.measure(self._world))
+        self._has_cost.zero_()
         return self._reset_output()
 
     def render(

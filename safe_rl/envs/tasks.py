@@ -68,7 +68,7 @@ class Task(NamedTuple):
 
 
 def _to_goal(world: World) -> Tensor:
-    return distance(world.robot_pos[:, None, :2], world.at("goal")[..., :2])
+    return distance(world.robot_xy.unsqueeze(1), world.at("goal")[..., :2])
 
 
 def _approach(config: SafetyGymConfig, world: World, before: Tensor, now: Tensor) -> Tensor:

@@ -26,12 +26,13 @@ class World:
     """N worlds of one scene; M objects by slot, K of one kind. Metres, seconds, float64.
 
     Attributes:
-        robot_pos: position of the robot body [N, 3].
+        robot_pos, robot_xy: position of the robot body [N, 3], and where it is on the floor [N, 2].
         robot_mat: its rotation, columns are its axes in the world [N, 3, 3].
         com: centre of mass of the robot with its limbs [N, 3].
         up: z component of the z axis of the body that `reward_orientation` looks at [N].
         robot_vel: linear velocity of the robot body [N, 3].
         positions: centres of all objects [N, M, 3], brought up to date by `refresh`.
+        objects: the same by kind, [N, K, 3].
         velocities: linear velocities of the free bodies [N, F, 3].
         contacts: contact points of the robot with each object of a kind, [N, K].
         qpos, qvel, ctrl, sensordata: as MuJoCo has them, [N, ·].
@@ -46,11 +47,13 @@ class World:
     scene: Scene
     physics: Physics
     robot_pos: Tensor
+    robot_xy: Tensor
     robot_mat: Tensor
     com: Tensor
     up: Tensor
     robot_vel: Tensor
     positions: Tensor
+    objects: Mapping[str, Tensor]
     velocities: Tensor
     contacts: Mapping[str, Tensor]
     qpos: Tensor
@@ -67,7 +70,7 @@ class World:
 
     def at(self, kind: str) -> Tensor:
         """Return the positions of one kind's objects [N, K, 3], a view; K may be 0."""
-        return self.positions[:, self._slots(kind)]
+        return self.objects[kind] if kind in self.objects else self.positions[:, :0]
 
     def start_of(self, kind: str) -> Tensor:
         """Return where they were at the start of the episode [N, K, 2], a view."""
@@ -111,7 +114,8 @@ def make_world(scene: Scene, physics: Physics) -> World:
     """Bind the views of a scene to the tensors of a physics backend."""
     num_envs, num_objects = physics.qpos.shape[0], len(scene.names)
     robot, model = scene.robot_body, scene.model
-    positions = torch.zeros(num_envs, num_objects, 3, dtype=torch.float64)
+    # In memory all x, then all y, then all z: passes over one coordinate are over one piece.
+    positions = torch.zeros(3, num_envs, num_objects, dtype=torch.float64).movedim(0, -1)
     positions[..., 2] = torch.tensor(scene.heights, dtype=torch.float64)
     velocities = physics.qvel[:, scene.robot_nv :].view(num_envs, scene.num_free, 6)[..., :3]
     velocity = int(model.sensor("robot_vel").adr[0])
@@ -119,11 +123,13 @@ def make_world(scene: Scene, physics: Physics) -> World:
         scene=scene,
         physics=physics,
         robot_pos=physics.xpos[:, robot],
+        robot_xy=physics.xpos[:, robot, :2],
         robot_mat=physics.xmat[:, robot],
         com=physics.subtree_com[:, robot],
         up=physics.xmat[:, scene.oriented_body, 2, 2],
         robot_vel=physics.sensordata[:, velocity : velocity + 3],
         positions=positions,
+        objects={kind: positions[:, span] for kind, span in scene.slots.items()},
         velocities=velocities,
         contacts={kind: physics.sensordata[:, cols] for kind, cols in scene.contacts.items()},
         qpos=physics.qpos,

@@ -89,10 +89,7 @@ class BatchPhysics:
                 self._substeps(count, mocap_path, (num_substeps == count).numpy())
         self._disableflags[:] = self._with_sensors
         self._batch.forward()
-        failed = self._failed()
-        if failed.any():
-            self.ctrl[failed] = 0.0
-        return failed
+        return self._failed()
 
     def rays(self, origin: Tensor, directions: Tensor, group: int, exclude_body: int) -> Tensor:
         """See `Physics.rays`."""
@@ -116,7 +113,10 @@ class BatchPhysics:
 
     def _failed(self) -> Tensor:
         """Rows whose warning counters rose: MuJoCo resets a bad state by itself, silently."""
-        rose = (self._batch.warning[..., 1] > self._warnings[..., 1]).any(-1)
-        if rose.any():
-            self._warnings[:] = self._batch.warning
-        return torch.from_numpy(rose)
+        counts = self._batch.warning
+        if np.array_equal(counts, self._warnings):
+            return torch.zeros(len(counts), dtype=torch.bool)
+        failed = torch.from_numpy((counts[..., 1] > self._warnings[..., 1]).any(-1))
+        self._warnings[:] = counts
+        self.ctrl[failed] = 0.0
+        return failed
