@@ -1,8 +1,10 @@
-"""Environment steps per second, beside the bare physics of the same model.
+"""Environment steps per second, beside the bare physics of the same worlds.
 
 The bare loop is what no environment on this backend can beat: the same compiled model with the
-same options, controls and the gremlins' targets in, the substeps, one forward at the end. Both are
-timed in turns in one process; the figures are medians.
+same options, controls and the gremlins' targets in, the substeps, one forward at the end. It starts
+where the environment's episodes start and gets the same controls, so that both compute the same
+trajectories. They are timed in turns in one process; the figures are medians over the turns, and
+one reset of all worlds is spread over the steps of an episode.
 
     python benchmarks/env_throughput.py --envs PointGoal1 DoggoGoal2 --num-envs 64 --threads 0
 """
@@ -25,9 +27,8 @@ from safe_rl.envs.scene import build_scene
 COLUMNS = ("env", "num_envs", "threads", "env steps/s", "bare steps/s", "ratio", "reset ms", "MB")
 
 
-def time_env(env, tensordict, steps):
-    """Seconds for `steps` vector steps with random actions, resets included."""
-    actions = env.action_spec.rand((steps,))
+def time_env(env, tensordict, actions):
+    """Seconds for as many vector steps as there are actions."""
     start = time.perf_counter()
     for action in actions:
         tensordict["action"] = action
@@ -35,42 +36,52 @@ def time_env(env, tensordict, steps):
     return time.perf_counter() - start, tensordict
 
 
-def time_bare(physics, env, paths, steps):
-    """Seconds for as many steps of the physics alone."""
-    actions = env.action_spec.rand((steps,))
-    start = time.perf_counter()
+def time_bare(physics, env, actions):
+    """Seconds for the same steps of the physics alone; where the targets go is known before."""
+    seconds, path = 0.0, None
     for action in actions:
+        if env._world.scene.num_targets:
+            path = gremlin_path(env._world, physics.time, env.config.frameskip_binom_n)
+        start = time.perf_counter()
         physics.ctrl.copy_(action)
-        physics.step(env.config.frameskip_binom_n, paths)
-    return time.perf_counter() - start
+        physics.step(env.config.frameskip_binom_n, path)
+        seconds += time.perf_counter() - start
+    return seconds
 
 
 def bare_physics(env, num_envs, threads):
-    """The same worlds, in the environment's present state, without the environment."""
+    """The same worlds at the start of their episodes, without the environment."""
     world = env._world
     physics = BatchPhysics(world.scene.model, num_envs, threads)
     for name in ("qpos", "qvel", "qacc_warmstart", "time", "mocap_pos", "mocap_quat"):
         getattr(physics, name).copy_(getattr(world.physics, name))
-    path = None
-    if world.scene.num_targets:
-        path = gremlin_path(world, physics.time, env.config.frameskip_binom_n)
-    return physics, path
+    return physics
+
+
+def time_reset(env):
+    """Seconds for a reset of all worlds."""
+    start = time.perf_counter()
+    tensordict = env.reset()
+    return time.perf_counter() - start, tensordict
 
 
 def measure(name, num_envs, threads, steps, repeats):
     """One row of the table."""
     torch.set_num_threads(1)  # the physics has the cores; tensors this small gain nothing
     env = SafetyGymEnv(name, num_envs=num_envs, seed=0, num_threads=threads)
-    tensordict = env.reset()
-    start = time.perf_counter()
-    tensordict = env.reset()
-    reset = time.perf_counter() - start
-    physics, path = bare_physics(env, num_envs, threads)
+    if steps * (repeats + 1) >= env.config.num_steps:
+        raise SystemExit(f"All turns have to fit into one episode of {env.config.num_steps} steps.")
+    reset = statistics.median(time_reset(env)[0] for _ in range(5))
+    _, tensordict = time_reset(env)
+    physics = bare_physics(env, num_envs, threads)
     env_seconds, bare_seconds = [], []
     for _ in range(repeats + 1):
-        seconds, tensordict = time_env(env, tensordict, steps)
-        env_seconds.append(seconds)
-        bare_seconds.append(time_bare(physics, env, path, steps))
+        actions = env.action_spec.rand((steps,))
+        seconds, tensordict = time_env(env, tensordict, actions)
+        env_seconds.append(seconds + steps * reset / env.config.num_steps)
+        bare_seconds.append(time_bare(physics, env, actions))
+    if not torch.equal(physics.qpos, env._physics.qpos):
+        print(f"{name}: the two went different ways.", file=sys.stderr)
     env_rate, bare_rate = (
         num_envs * steps / statistics.median(seconds[1:]) for seconds in (env_seconds, bare_seconds)
     )
@@ -84,7 +95,7 @@ def measure(name, num_envs, threads, steps, repeats):
 def measure_apart(*arguments):
     """Measure in a process of its own, so that peak memory is that of one environment."""
     command = [sys.executable, __file__, "--row", *map(str, arguments)]
-    return json.loads(subprocess.run(command, check=True, capture_output=True, text=True).stdout)
+    return json.loads(subprocess.run(command, check=True, stdout=subprocess.PIPE, text=True).stdout)
 
 
 def main():
@@ -92,8 +103,8 @@ def main():
     parser.add_argument("--envs", nargs="+", default=["PointGoal1", "DoggoGoal2"], help="or: all")
     parser.add_argument("--num-envs", nargs="+", type=int, default=[64])
     parser.add_argument("--threads", nargs="+", type=int, default=[0], help="0: one per core")
-    parser.add_argument("--steps", type=int, default=200, help="vector steps per repeat")
-    parser.add_argument("--repeats", type=int, default=5)
+    parser.add_argument("--steps", type=int, default=20, help="vector steps per turn")
+    parser.add_argument("--repeats", type=int, default=20, help="turns")
     parser.add_argument("--row", nargs=5, help=argparse.SUPPRESS)
     options = parser.parse_args()
     if options.row:

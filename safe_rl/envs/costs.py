@@ -43,13 +43,13 @@ def displacement_cost(xy: Tensor, start_xy: Tensor, threshold: float) -> Tensor:
         threshold: displacements up to this one are free [m].
     """
     moved = torch.hypot(*(xy - start_xy).unbind(-1))
-    return torch.where(moved > threshold, moved, 0.0).sum(-1)
+    return (moved * (moved > threshold)).sum(-1)
 
 
 def velocity_cost(velocity: Tensor, threshold: float) -> Tensor:
     """Speed [m/s] of objects, where it reaches the threshold, summed: [N, K, 3] -> [N]."""
     speed = torch.linalg.vector_norm(velocity, dim=-1)
-    return torch.where(speed >= threshold, speed, 0.0).sum(-1)
+    return (speed * (speed >= threshold)).sum(-1)
 
 
 def wrong_button_cost(contacts: Tensor, goal_button: Tensor, timer: Tensor) -> Tensor:

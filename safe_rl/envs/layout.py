@@ -153,9 +153,9 @@ def _draw(plan: PlacementPlan, item: int, key: Tensor) -> Tensor:
 
 def _fits(candidates: Tensor, others: Tensor, clearance: Tensor) -> Tensor:
     """Whether candidates [B, C, 2] keep their clearance [K] from others [B, K, 2]: [B, C]."""
-    offset = candidates.unsqueeze(2) - others.unsqueeze(1)
-    distance = torch.sqrt(offset[..., 0] ** 2 + offset[..., 1] ** 2)
-    return (distance >= clearance).all(-1)
+    (x, y), (other_x, other_y) = candidates.unbind(-1), others.unsqueeze(1).unbind(-1)
+    dx, dy = x.unsqueeze(-1) - other_x, y.unsqueeze(-1) - other_y
+    return (torch.addcmul(dx.square_(), dy, dy) >= clearance.square()).all(-1)
 
 
 def _place(plan: PlacementPlan, item: int, key: Tensor, placed: Tensor) -> tuple[Tensor, Tensor]:

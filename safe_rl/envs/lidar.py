@@ -47,20 +47,18 @@ def floor_to_ego(xy: Tensor, robot_pos: Tensor, robot_mat: Tensor) -> Tensor:
     return ego.addcmul_(robot_z, along_z, value=-1).movedim(0, -1)
 
 
-def lidar_cells(group: Tensor, num_bins: int, alias: bool) -> Tensor:
-    """Cells that objects straight ahead light up: their own, and with `alias` its neighbours'.
+def lidar_cells(group: Tensor, num_bins: int) -> Tensor:
+    """First cell of every object's lidar: where an object straight ahead is written.
 
     Args:
         group: which lidar sees each object, int64 [M].
         num_bins: bins over the full circle.
-        alias: as in `pseudo_lidar`.
 
     Returns:
-        int64 [1 or 3, M]; lidars follow each other, each of several turns of the circle.
+        int64 [M]; lidars follow each other, each of several turns of the circle.
     """
-    neighbours = torch.tensor([0, 1, -1] if alias else [0])
     laps = _num_laps(num_bins)
-    return (laps * group + laps // 2) * num_bins + neighbours.unsqueeze(-1)
+    return (laps * group + laps // 2) * num_bins
 
 
 def pseudo_lidar(
@@ -94,14 +92,14 @@ def pseudo_lidar(
         reading = torch.rsub(distance / max_dist, 1.0).relu_()
     turn = torch.atan2(y, x).mul_(num_bins / (2 * math.pi))
     bins = turn.floor()
-    values = [reading]
+    index = bins.to(torch.int64).add_(cells)
     if alias:
-        ahead = (turn - bins) * reading
-        values += [ahead, reading - ahead]
-    index = (bins.to(torch.int64).unsqueeze(1) + cells).flatten(1)
+        ahead = turn.sub_(bins).mul_(reading)
+        index = torch.cat([index, index + 1, index - 1], 1)
+        reading = torch.cat([reading, ahead, reading - ahead], 1)
     laps = _num_laps(num_bins)
     turns = reading.new_zeros(len(reading), num_groups * laps * num_bins)
-    turns.scatter_reduce_(1, index, torch.cat(values, 1), "amax")
+    turns.scatter_reduce_(1, index, reading, "amax")
     return reduce(torch.maximum, turns.unflatten(1, (-1, laps, num_bins)).unbind(2)).flatten(1)
 
 

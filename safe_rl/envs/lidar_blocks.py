@@ -55,7 +55,7 @@ def _pseudo(
         if kind in kinds
     )
     slots, group = torch.tensor(seen, dtype=torch.int64).view(-1, 2).T.contiguous()
-    cells = lidar_cells(group, config.lidar_num_bins, config.lidar_alias)
+    cells = lidar_cells(group, config.lidar_num_bins)
     all_seen = len(slots) == len(scene.names)
 
     def read(world: World) -> Tensor:
