@@ -7,9 +7,12 @@ trajectories. They are timed in turns in one process; the figures are medians ov
 one reset of all worlds is spread over the steps of an episode.
 
     python benchmarks/env_throughput.py --envs PointGoal1 DoggoGoal2 --num-envs 64 --threads 0
+    python benchmarks/env_throughput.py --envs PointGoal1 --change hazards_num=0 hazards_num=16
 """
 
 import argparse
+import dataclasses
+import itertools
 import json
 import resource
 import statistics
@@ -18,13 +21,21 @@ import sys
 import time
 
 import torch
+from omegaconf import OmegaConf
 
-from safe_rl.envs import SUITE, SafetyGymEnv
+from safe_rl.envs import SUITE, SafetyGymConfig, SafetyGymEnv
 from safe_rl.envs.episodes import gremlin_path
 from safe_rl.envs.physics.cpu import BatchPhysics
 from safe_rl.envs.scene import build_scene
+from safe_rl.envs.suite import resolve
 
 COLUMNS = ("env", "num_envs", "threads", "env steps/s", "bare steps/s", "ratio", "reset ms", "MB")
+
+
+def configuration(name, change):
+    """An environment of the suite with some keys changed: "hazards_num=0,vases_num=5"."""
+    changes = OmegaConf.to_container(OmegaConf.from_dotlist(change.split(",") if change else []))
+    return SafetyGymConfig.from_dict(dataclasses.asdict(resolve(name)) | changes)
 
 
 def time_env(env, tensordict, actions):
@@ -65,20 +76,23 @@ def time_reset(env):
     return time.perf_counter() - start, tensordict
 
 
-def measure(name, num_envs, threads, steps, repeats):
+def measure(name, change, num_envs, threads, steps, repeats):
     """One row of the table."""
     torch.set_num_threads(1)  # the physics has the cores; tensors this small gain nothing
-    env = SafetyGymEnv(name, num_envs=num_envs, seed=0, num_threads=threads)
-    if steps * (repeats + 1) >= env.config.num_steps:
-        raise SystemExit(f"All turns have to fit into one episode of {env.config.num_steps} steps.")
-    reset = statistics.median(time_reset(env)[0] for _ in range(5))
+    config = configuration(name, change)
+    env = SafetyGymEnv(config, num_envs=num_envs, seed=0, num_threads=threads)
+    if steps * (repeats + 1) >= config.num_steps:
+        raise SystemExit(f"All turns have to fit into one episode of {config.num_steps} steps.")
     _, tensordict = time_reset(env)
-    physics = bare_physics(env, num_envs, threads)
+    time_env(env, tensordict, env.action_spec.rand((steps,)))
+    reset = statistics.median(time_reset(env)[0] for _ in range(5))
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+    tensordict, physics = env.reset(), bare_physics(env, num_envs, threads)
     env_seconds, bare_seconds = [], []
     for _ in range(repeats + 1):
         actions = env.action_spec.rand((steps,))
         seconds, tensordict = time_env(env, tensordict, actions)
-        env_seconds.append(seconds + steps * reset / env.config.num_steps)
+        env_seconds.append(seconds + steps * reset / config.num_steps)
         bare_seconds.append(time_bare(physics, env, actions))
     if not torch.equal(physics.qpos, env._physics.qpos):
         print(f"{name}: the two went different ways.", file=sys.stderr)
@@ -86,8 +100,7 @@ def measure(name, num_envs, threads, steps, repeats):
         num_envs * steps / statistics.median(seconds[1:]) for seconds in (env_seconds, bare_seconds)
     )
     ratios = [bare / env for env, bare in zip(env_seconds[1:], bare_seconds[1:], strict=True)]
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
-    values = (name, num_envs, threads, round(env_rate), round(bare_rate))
+    values = (f"{name} {change}".strip(), num_envs, threads, round(env_rate), round(bare_rate))
     rounded = (round(statistics.median(ratios), 3), round(1e3 * reset, 1), round(peak))
     return dict(zip(COLUMNS, (*values, *rounded), strict=True))
 
@@ -101,25 +114,24 @@ def measure_apart(*arguments):
 def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--envs", nargs="+", default=["PointGoal1", "DoggoGoal2"], help="or: all")
+    parser.add_argument("--change", nargs="+", default=[""], help="hazards_num=0,vases_num=5")
     parser.add_argument("--num-envs", nargs="+", type=int, default=[64])
     parser.add_argument("--threads", nargs="+", type=int, default=[0], help="0: one per core")
     parser.add_argument("--steps", type=int, default=20, help="vector steps per turn")
     parser.add_argument("--repeats", type=int, default=20, help="turns")
-    parser.add_argument("--row", nargs=5, help=argparse.SUPPRESS)
+    parser.add_argument("--row", nargs=6, help=argparse.SUPPRESS)
     options = parser.parse_args()
     if options.row:
-        name, *numbers = options.row
-        print(json.dumps(measure(name, *map(int, numbers))))
+        name, change, *numbers = options.row
+        print(json.dumps(measure(name, change, *map(int, numbers))))
         return
     names = list(SUITE) if options.envs == ["all"] else options.envs
-    for name in names:
-        build_scene(SUITE[name])  # an unknown name fails here, before anything is timed
+    for name, change in itertools.product(names, options.change):
+        build_scene(configuration(name, change))  # what is unknown fails before anything is timed
     print("| " + " | ".join(COLUMNS) + " |\n" + "|---" * len(COLUMNS) + "|")
-    for name in names:
-        for num_envs in options.num_envs:
-            for threads in options.threads:
-                row = measure_apart(name, num_envs, threads, options.steps, options.repeats)
-                print("| " + " | ".join(str(row[column]) for column in COLUMNS) + " |", flush=True)
+    for case in itertools.product(names, options.change, options.num_envs, options.threads):
+        row = measure_apart(*case, options.steps, options.repeats)
+        print("| " + " | ".join(str(row[column]) for column in COLUMNS) + " |", flush=True)
 
 
 if __name__ == "__main__":

@@ -1,0 +1,86 @@
+"""Seconds until training takes its first step, and until its first epoch is over.
+
+Every figure is from a process of its own, median of several: the imports of torch and TorchRL,
+what `import safe_rl.envs` takes beyond them, `train.py` until the first step, and until the end of
+a run of one epoch. With compile=true, the cache of the compiler is empty.
+
+    python benchmarks/startup.py env=PointGoal1 algo=ppo_lagrangian
+"""
+
+import argparse
+import os
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[1]
+IMPORTS = """
+import time
+start = time.perf_counter()
+import torch, tensordict, torchrl.collectors, torchrl.envs
+theirs = time.perf_counter()
+import safe_rl.envs
+print(theirs - start, time.perf_counter() - theirs)
+"""
+FIRST_STEP = """
+import runpy, sys, time
+from safe_rl.envs import SafetyGymEnv
+step = SafetyGymEnv._step
+def first_step(env, tensordict):
+    print("first step at", time.time())
+    SafetyGymEnv._step = step
+    return step(env, tensordict)
+SafetyGymEnv._step = first_step
+runpy.run_path("train.py", run_name="__main__")
+"""
+
+
+def run(code, *arguments, **variables):
+    """What a script prints, run in a new interpreter in the root of the repository."""
+    result = subprocess.run(
+        [sys.executable, "-c", code, *arguments],
+        cwd=ROOT,
+        env=os.environ | variables | {"PYTHONPATH": str(ROOT)},
+        check=True,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.DEVNULL,
+        text=True,
+    )
+    return result.stdout
+
+
+def time_training(overrides):
+    """Seconds from the start of the process to the first step, and to the end of the run."""
+    with tempfile.TemporaryDirectory() as directory:
+        folder, cache = f"hydra.run.dir={directory}/run", f"{directory}/cache"
+        start = time.time()
+        printed = run(FIRST_STEP, *overrides, folder, TORCHINDUCTOR_CACHE_DIR=cache)
+        end = time.time()
+    line = next(line for line in printed.splitlines() if line.startswith("first step at"))
+    return float(line.split()[-1]) - start, end - start
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("overrides", nargs="*", help="as train.py takes them")
+    parser.add_argument("--repeats", type=int, default=5)
+    options = parser.parse_args()
+    overrides = [*options.overrides, "frames=20_000", "logger=none"]
+    imports = [tuple(map(float, run(IMPORTS).split())) for _ in range(options.repeats)]
+    training = [time_training(overrides) for _ in range(options.repeats)]
+    rows = {
+        "import torch, tensordict, torchrl": statistics.median(theirs for theirs, _ in imports),
+        "import safe_rl.envs, beyond that": statistics.median(ours for _, ours in imports),
+        "train.py to the first step": statistics.median(first for first, _ in training),
+        "train.py with one epoch of 20,000 steps": statistics.median(end for _, end in training),
+    }
+    print("| | seconds |\n|---|---|")
+    for name, seconds in rows.items():
+        print(f"| {name} | {seconds:.2f} |")
+
+
+if __name__ == "__main__":
+    main()
