@@ -8,6 +8,7 @@ import torch
 from crafting import after_random_steps, arrange, places, position_columns
 
 from safe_rl.envs import SafetyGymEnv
+from safe_rl.envs.lidar import floor_to_ego, lidar_cells, pseudo_lidar, to_ego
 from safe_rl.envs.world import circling_targets
 
 BARE = {"robot_base": "point", "task": "none", "sensors_obs": [], "lidar_num_bins": 8}
@@ -181,3 +182,34 @@ def test_gremlins_are_led_in_circles():
     torch.testing.assert_close(path[0, :2, 0], want)
     want = torch.tensor([[-1 + 0.3 * c, 0.3 * s, 0.2], [-0.7, 0.0, 0.2]])
     torch.testing.assert_close(path[1, :2, 0], want, atol=1e-6, rtol=0)
+
+
+def one_by_one(x: float, y: float, num_bins: int) -> np.ndarray:
+    """What one object 1 m from zero lights up in a lidar with aliasing, by the paper's words."""
+    turn = (math.atan2(y, x) % (2 * math.pi)) / (2 * math.pi) * num_bins
+    own = min(int(turn), num_bins - 1)
+    reading, part = math.exp(-math.hypot(x, y)), turn - own
+    seen = np.zeros(num_bins)
+    for index, share in ((own, 1.0), (own + 1, part), (own - 1, 1.0 - part)):
+        seen[index % num_bins] = max(seen[index % num_bins], share * reading)
+    return seen
+
+
+@pytest.mark.parametrize("num_bins", [1, 2, 3, 4, 7, 16])
+def test_any_number_of_bins_closes_to_a_circle(num_bins):
+    edges = [(1.0, 0.0), (1.0, -0.0), (1.0, -1e-17), (-1.0, 0.0), (-1.0, -1e-17), (0.0, -2.0)]
+    xy = torch.cat([torch.tensor(edges).double(), torch.randn(60, 2, dtype=torch.float64)])
+    group = torch.arange(len(xy)) % 2
+    cells = lidar_cells(group, num_bins)
+    seen = pseudo_lidar(xy.unsqueeze(0), cells, 2, num_bins, None, 1.0, alias=True)
+    alone = [one_by_one(*place, num_bins) for place in xy.tolist()]
+    want = [np.max([a for a, g in zip(alone, group, strict=True) if g == k], 0) for k in (0, 1)]
+    np.testing.assert_allclose(seen[0].unflatten(0, (2, -1)), want, atol=1e-12)
+
+
+def test_points_on_the_floor_turn_like_all_others():
+    robot_mat = torch.linalg.qr(torch.randn(5, 3, 3, dtype=torch.float64)).Q
+    robot_pos, xy = torch.randn(5, 3).double(), torch.randn(5, 4, 2).double()
+    there = torch.cat([xy, torch.zeros(5, 4, 1, dtype=torch.float64)], -1)
+    want = to_ego(there, robot_pos, robot_mat)[..., :2]
+    torch.testing.assert_close(floor_to_ego(xy, robot_pos, robot_mat), want)
