@@ -33,8 +33,8 @@ COLUMNS = ("env", "num_envs", "threads", "env steps/s", "bare steps/s", "ratio",
 
 
 def configuration(name, change):
-    """An environment of the suite with some keys changed: "hazards_num=0,vases_num=5"."""
-    changes = OmegaConf.to_container(OmegaConf.from_dotlist(change.split(",") if change else []))
+    """An environment of the suite with some keys changed: "hazards_num=0 vases_num=5"."""
+    changes = OmegaConf.to_container(OmegaConf.from_dotlist(change.split()))
     return SafetyGymConfig.from_dict(dataclasses.asdict(resolve(name)) | changes)
 
 
@@ -114,7 +114,9 @@ def measure_apart(*arguments):
 def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--envs", nargs="+", default=["PointGoal1", "DoggoGoal2"], help="or: all")
-    parser.add_argument("--change", nargs="+", default=[""], help="hazards_num=0,vases_num=5")
+    parser.add_argument(
+        "--change", nargs="+", default=[""], help="keys, in quotes: 'vases_num=5 hazards_num=0'"
+    )
     parser.add_argument("--num-envs", nargs="+", type=int, default=[64])
     parser.add_argument("--threads", nargs="+", type=int, default=[0], help="0: one per core")
     parser.add_argument("--steps", type=int, default=20, help="vector steps per turn")
