@@ -43,13 +43,13 @@ def displacement_cost(xy: Tensor, start_xy: Tensor, threshold: float) -> Tensor:
         threshold: displacements up to this one are free [m].
     """
     moved = torch.hypot(*(xy - start_xy).unbind(-1))
-    return (moved * (moved > threshold)).sum(-1)
+    return torch.where(moved > threshold, moved, 0.0).sum(-1)
 
 
 def velocity_cost(velocity: Tensor, threshold: float) -> Tensor:
     """Speed [m/s] of objects, where it reaches the threshold, summed: [N, K, 3] -> [N]."""
     speed = torch.linalg.vector_norm(velocity, dim=-1)
-    return (speed * (speed >= threshold)).sum(-1)
+    return torch.where(speed >= threshold, speed, 0.0).sum(-1)
 
 
 def wrong_button_cost(contacts: Tensor, goal_button: Tensor, timer: Tensor) -> Tensor:
@@ -156,5 +156,6 @@ def compute_costs(config: SafetyGymConfig, world: World, failed: Tensor) -> Tens
     magnitudes = [row.magnitude(config, world) for row in COSTS if row.active(config)]
     if failed.any():
         magnitudes = [torch.where(failed, 0.0, magnitude) for magnitude in magnitudes]
-    costs = torch.stack([sum(magnitudes, start=failed), *magnitudes, failed])
+    exceptions = failed.to(torch.float64)  # the sum has this type, whatever a registered cost has
+    costs = torch.stack([sum(magnitudes, start=exceptions), *magnitudes, exceptions])
     return costs.gt_(0.0) if config.constrain_indicator else costs

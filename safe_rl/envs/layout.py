@@ -22,8 +22,9 @@ TRIES_PER_OBJECT = 100
 TRIES_PER_LAYOUT = 10_000
 TRIES_PER_GOAL = 10_000
 PIN_TOLERANCE = 1e-9  # half width of the square that a pinned location stands for
-_BLOCK = 10  # candidates that are tested at once
-_MAX_ROWS = 4096  # layouts that are tried at once, a bound on memory
+_BLOCK = 10  # candidates for an object that are tested at once
+_GOAL_BLOCK = 40  # and for a new goal: mostly enough, and a second round takes as long again
+_MAX_ROWS = 4096  # layouts, or candidates for new goals, at once: a bound on memory
 
 
 class LayoutError(RuntimeError):
@@ -195,11 +196,12 @@ def _try_layouts(plan: PlacementPlan, key: Tensor) -> tuple[Tensor, Tensor]:
 
 def _rounds(total: int, rows: int, first: int = 1) -> Iterator[tuple[int, int]]:
     """Ranges of attempts that grow, so that a few stubborn rows don't take thousands of rounds."""
-    start, size = 0, first
+    start, most = 0, max(1, _MAX_ROWS // max(1, rows))
+    size = min(first, most)
     while start < total:
         stop = min(start + size, total)
         yield start, stop
-        start, size = stop, max(1, min(4 * size, _MAX_ROWS // max(1, rows)))
+        start, size = stop, min(4 * size, most)
 
 
 def sample_layouts(plan: PlacementPlan, key: Tensor) -> Tensor:
@@ -253,7 +255,7 @@ def resample_goal(plan: PlacementPlan, key: Tensor, layouts: Tensor) -> tuple[Te
     item, columns, clearance = plan.beside_goal
     placed = layouts.index_select(1, columns)
     position, pending = layouts.new_zeros(len(key), 2), torch.arange(len(key))
-    for start, stop in _rounds(TRIES_PER_GOAL, len(key), first=4 * _BLOCK):
+    for start, stop in _rounds(TRIES_PER_GOAL, len(key), first=_GOAL_BLOCK):
         candidates = _draw(plan, item, rng.fold(key[pending, None], torch.arange(start, stop)))
         fits = _fits(candidates, placed[pending], clearance)
         found, first = fits.any(-1), fits.to(torch.uint8).argmax(-1)

@@ -90,7 +90,8 @@ def pseudo_lidar(
         reading = torch.exp(-exp_gain * distance)
     else:
         reading = torch.rsub(distance / max_dist, 1.0).relu_()
-    turn = torch.atan2(y, x).mul_(num_bins / (2 * math.pi))
+    # In two steps: then straight behind, either way round, is half of the bins to the last digit.
+    turn = torch.atan2(y, x).div_(2 * math.pi).mul_(num_bins)
     bins = turn.floor()
     index = bins.to(torch.int64).add_(cells)
     if alias:

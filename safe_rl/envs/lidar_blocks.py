@@ -60,10 +60,10 @@ def _pseudo(
 
     def read(world: World) -> Tensor:
         xy = world.positions[..., :2]
+        if not all_seen:
+            xy = xy.index_select(1, slots)
         return pseudo_lidar(
-            floor_to_ego(
-                xy if all_seen else xy.index_select(1, slots), world.robot_pos, world.robot_mat
-            ),
+            floor_to_ego(xy, world.robot_pos, world.robot_mat),
             cells,
             len(kinds),
             config.lidar_num_bins,

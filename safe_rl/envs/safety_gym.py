@@ -90,7 +90,7 @@ class SafetyGymEnv(EnvBase):
         low, high = torch.from_numpy(scene.model.actuator_ctrlrange.T.copy())
         self._control_range = (low, high)
         self._episode = torch.zeros(num_envs, dtype=torch.int64)
-        self._measured = self._task.measure(self._world)
+        self._measured = self._task.measure(self._world).detach().clone()
         self._renderer = WorldRenderer(self._world)
         self._has_cost = torch.zeros(num_envs, dtype=torch.bool)
         self.cost_keys = cost_keys(self.config)
@@ -130,6 +130,7 @@ class SafetyGymEnv(EnvBase):
         """Random key of the step that is being taken, [N]."""
         return rng.fold(self._row_seed, self._episode, self._world.step_count + 1)
 
+    @torch.no_grad()
     def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDictBase:
         mask = None if tensordict is None else tensordict.get("_reset", None)
         if mask is None:
@@ -143,11 +144,12 @@ class SafetyGymEnv(EnvBase):
 
     def _reset_output(self) -> TensorDict:
         """What a reset returns, for the worlds as they are."""
-        none = torch.zeros(*self.batch_size, 1, dtype=torch.bool)
-        return self._pack({"goal_met": none, "done": none, "terminated": none, "truncated": none})
+        names = ("goal_met", "done", "terminated", "truncated")
+        none = torch.zeros(len(names), *self.batch_size, 1, dtype=torch.bool)
+        return self._pack(dict(zip(names, none, strict=True)))
 
     def _pack(self, outputs: dict[str, Any]) -> TensorDict:
-        """Add the observation; here, and here alone, things become float32 copies on the device."""
+        """Add the observation and move everything to the device."""
         flat = self._observer.read(self._world)
         if self.device.type != "cpu":
             outputs = {key: value.to(self.device) for key, value in outputs.items()}
@@ -160,7 +162,7 @@ class SafetyGymEnv(EnvBase):
         # As TorchRL's own environments do: every shape and device is right by construction.
         return TensorDict._new_unsafe(outputs, batch_size=self.batch_size, device=self.device)
 
-    @torch.no_grad()  # nothing here has a gradient; not looking for one saves a percent
+    @torch.no_grad()
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         world, config = self._world, self.config
         failed = self._advance(self._checked_action(tensordict))
@@ -170,7 +172,7 @@ class SafetyGymEnv(EnvBase):
         torch.gt(costs[0], 0.0, out=self._has_cost)
         world.buttons_timer.sub_(1).clamp_(min=0)
         met, stuck = self._handle_goals(now, failed)
-        reward = reward.add(met, alpha=config.reward_goal)
+        reward = reward + config.reward_goal * met
         reward.masked_fill_(failed, config.reward_exception)
         world.step_count.add_(1)
         time_out = world.step_count >= config.num_steps
@@ -234,6 +236,7 @@ class SafetyGymEnv(EnvBase):
         state["seed"], state["episode"] = self._row_seed.clone(), self._episode.clone()
         return state
 
+    @torch.no_grad()
     def set_state(self, state: TensorDictBase) -> TensorDict:
         """Set the worlds to a state, for resuming, branching and tests.
 

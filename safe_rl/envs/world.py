@@ -31,7 +31,8 @@ class World:
         com: centre of mass of the robot with its limbs [N, 3].
         up: z component of the z axis of the body that `reward_orientation` looks at [N].
         robot_vel: linear velocity of the robot body [N, 3].
-        positions: centres of all objects [N, M, 3], brought up to date by `refresh`.
+        positions: centres of all objects [N, M, 3], brought up to date by `refresh`; not
+            contiguous, so `flatten` them instead of asking for a `view`.
         objects: the same by kind, [N, K, 3].
         velocities: linear velocities of the free bodies [N, F, 3].
         contacts: contact points of the robot with each object of a kind, [N, K].

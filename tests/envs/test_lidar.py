@@ -121,6 +121,23 @@ def test_every_kind_has_its_own_lidar():
         assert_reads(parts[f"{kind}_lidar"], {index: 0.5})
 
 
+@pytest.mark.parametrize("unseen", ["vases", "pillars"])
+def test_kinds_that_are_not_observed_light_up_nothing(unseen):
+    env = make({**HAZARDS, "hazards_num": 1, f"{unseen}_num": 3, "lidar_alias": False})
+    others = {f"{unseen[:-1]}{i}": polar(100 + 90 * i, 0.8) for i in range(3)}
+    parts = observe(env, robot=(0, 0, 0), hazard0=polar(10, 1.0), **others)
+    assert list(parts) == ["hazards_lidar"]
+    assert_reads(parts["hazards_lidar"], {0: 0.5})
+
+
+@pytest.mark.parametrize("num_bins", [*range(1, 30), 56, 122, 220])
+def test_straight_behind_is_half_way_round(num_bins):
+    xy = torch.tensor([[[-1.0, 0.0]], [[-1.0, -0.0]]], dtype=torch.float64)
+    cells = lidar_cells(torch.tensor([0]), num_bins)
+    seen = pseudo_lidar(xy, cells, 1, num_bins, 2.0, 0.0, alias=False)
+    assert seen.argmax(1).tolist() == [num_bins // 2] * 2
+
+
 def test_the_goal_of_a_button_task_shows_while_the_buttons_sleep():
     config = {"task": "button", "buttons_num": 2, "observe_buttons": True, "lidar_alias": False}
     env = make({**HAZARDS, **config, "observe_goal_lidar": True})

@@ -199,3 +199,19 @@ def test_custom_configurations_need_only_what_differs():
     check_env_specs(env)
     assert sorted([*COMMON_SENSORS, "goal_compass"]) == list(env.observation_layout)
     assert isinstance(env.reset(), TensorDict)
+
+
+def test_nothing_that_is_returned_shares_memory():
+    env = SafetyGymEnv("PointButton1", num_envs=3, seed=0, num_threads=1)
+    first = env.reset()
+    second = env.step(first.clone().set("action", env.action_spec.rand()))["next"]
+    third = env.set_state(env.get_state())
+    tensors = [value for result in (first, second, third) for value in result.values()]
+    wanted = [value.clone() for value in tensors]
+    env.rollout(3)
+    assert all(map(torch.equal, tensors, wanted))
+    for one, other in itertools.combinations(tensors, 2):
+        before = other.clone()
+        one.fill_(one.new_tensor(7).logical_not_() if one.dtype is torch.bool else 7)
+        one.logical_not_()
+        assert torch.equal(other, before)

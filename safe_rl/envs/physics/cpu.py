@@ -116,7 +116,8 @@ class BatchPhysics:
         counts = self._batch.warning
         if np.array_equal(counts, self._warnings):
             return torch.zeros(len(counts), dtype=torch.bool)
-        failed = torch.from_numpy((counts[..., 1] > self._warnings[..., 1]).any(-1))
+        failed = (counts[..., 1] > self._warnings[..., 1]).any(-1)
+        counts[failed] = 0  # so that they rise again if these fail again
         self._warnings[:] = counts
         self.ctrl[failed] = 0.0
-        return failed
+        return torch.from_numpy(failed)
