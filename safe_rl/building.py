@@ -20,6 +20,7 @@ from safe_rl.algorithm import Algorithm, Networks, mean_cost
 from safe_rl.models import input_scale_vector, make_actor, make_critic
 from safe_rl.objectives import CriticLoss
 from safe_rl.objectives.multipliers import Multiplier
+from safe_rl.settings import SettingError
 
 __all__ = ["build_algorithm", "build_networks", "check_cost_limits"]
 
@@ -105,10 +106,11 @@ def check_cost_limits(cost_limits: Mapping[str, float], cost_keys: list[str]) ->
     limits: dict[str, float] = {}
     for key, limit in cost_limits.items():
         if key not in cost_keys:
-            nearest = get_close_matches(key, cost_keys, n=1, cutoff=0)
+            close = get_close_matches(key, cost_keys, n=1, cutoff=0.8)
+            nearest = f" Nearest: '{close[0]}'." if close else ""
             raise ValueError(
-                f"cost_limits names '{key}', but this environment has no such cost. Nearest: "
-                f"'{nearest[0]}'; all of them: {', '.join(cost_keys)}."
+                f"cost_limits names '{key}', but this environment has no such cost.{nearest} It "
+                f"has {', '.join(cost_keys)}; env.constrain_<kind>=true adds those of another kind."
             )
         if isinstance(limit, bool) or not isinstance(limit, int | float) or not limit >= 0:
             raise ValueError(
@@ -130,4 +132,7 @@ def _build_policy_loss(
 def _build(node: DictConfig, **objects: Any) -> Any:
     """Instantiate ``node`` with live objects, which Hydra would copy if it got them itself."""
     OmegaConf.resolve(node)
-    return instantiate(node, _partial_=True)(**objects)
+    try:
+        return instantiate(node, _partial_=True)(**objects)
+    except (TypeError, ValueError) as error:
+        raise SettingError(f"{node._get_full_key(None)}: {error}") from error

@@ -146,7 +146,7 @@ class CheckpointStore:
         try:
             _checkpoint(components).load(path)
         except (CheckpointError, zipfile.BadZipFile, OSError) as error:
-            raise CheckpointError(f"Cannot continue from {path}: {error}") from error
+            raise CheckpointError(f"Cannot use the checkpoint {path}: {error}") from error
 
 
 def _checkpoint(components: Mapping[str, Stateful]) -> Checkpoint:

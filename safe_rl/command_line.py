@@ -5,24 +5,23 @@ They are written out before Hydra sees the command line.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Sequence
 from difflib import get_close_matches
 from importlib.util import find_spec
 from pathlib import Path
 
+import yaml
 from omegaconf import DictConfig, OmegaConf
 
+from safe_rl.overrides import CommandLineError
 from safe_rl.protocol import SLATES
 
-__all__ = ["CommandLineError", "check_env_keys", "expand_arguments"]
+__all__ = ["expand_arguments"]
 
-# they would have no effect on a run whose networks, optimisers and random numbers are restored
-_FIXED = ("preset", "seed", "init_from")
+# they would have no effect on a run whose networks, optimisers, worlds and random numbers are
+# restored, or would not fit them
+_FIXED = ("preset", "seed", "init_from", "model", "num_envs", "frames_per_batch")
 _JOBLIB = "hydra_plugins.hydra_joblib_launcher"
-
-
-class CommandLineError(ValueError):
-    """A command line that cannot be used; the message says what to write instead."""
 
 
 def expand_arguments(arguments: Sequence[str]) -> list[str]:
@@ -53,28 +52,6 @@ def expand_arguments(arguments: Sequence[str]) -> list[str]:
     return _with_launcher(expanded)
 
 
-def check_env_keys(arguments: Sequence[str], known: Collection[str]) -> None:
-    """Check the keys of overrides such as ``env.hazards_num=3``; Hydra would name no other key.
-
-    Args:
-        arguments: Arguments of ``train.py``.
-        known: Configuration keys of an environment.
-
-    Raises:
-        CommandLineError: For a key that is not among them; the nearest one is named.
-
-    Examples:
-        >>> check_env_keys(["env.hazards_num=3"], ["hazards_num"])
-    """
-    for argument in arguments:
-        key = argument.lstrip("+~").partition("=")[0]
-        if key.startswith("env.") and key[4:] not in known:
-            nearest = get_close_matches(key[4:], known, n=1, cutoff=0)[0]
-            raise CommandLineError(
-                f"'{argument}': an environment has no key '{key[4:]}'. Nearest: 'env.{nearest}'."
-            )
-
-
 def _with_launcher(arguments: list[str]) -> list[str]:
     """Sweeps run on joblib where it is installed, unless told otherwise."""
     is_told = any(argument.startswith("hydra/launcher=") for argument in arguments)
@@ -94,11 +71,14 @@ def _expand_resume(value: str, others: list[str]) -> list[str]:
         below = sorted({table.parent for table in directory.glob("**/progress.csv")})
         hint = f" Runs below it: {', '.join(map(str, below[:5]))}." if below else ""
         raise CommandLineError(f"{value} is not the folder of a run: no config.yaml.{hint}")
-    config = OmegaConf.load(directory / "config.yaml")
+    try:
+        config = OmegaConf.load(directory / "config.yaml")
+    except yaml.YAMLError as error:
+        raise CommandLineError(f"{directory / 'config.yaml'} cannot be read: {error}") from None
     assert isinstance(config, DictConfig)
     for argument in others:
         key = argument.lstrip("+~").partition("=")[0]
-        if key in _FIXED or isinstance(config.get(key), DictConfig):
+        if key.partition(".")[0] in _FIXED or isinstance(config.get(key), DictConfig):
             raise CommandLineError(
                 f"'{argument}' cannot change in a run that is continued. Single numbers can "
                 "(frames=…, policy_update.max_kl=…). For a new run from trained networks use "

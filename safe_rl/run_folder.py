@@ -133,13 +133,18 @@ class RunFolder:
         shown = {"return": f"{row['episode_return']:.2f}"}
         for key in self._cost_limits or ["cost"]:
             limit = f"/{self._cost_limits[key]:g}" if key in self._cost_limits else ""
-            shown[key] = f"{row[f'episode_{key}']:.1f}{limit}"
+            shown[key] = f"{self._measured(row, key):.1f}{limit}"
         if math.isnan(row["episode_return"]):
             shown = {}
         multipliers = [value for name, value in row.items() if name.startswith("multiplier_")]
         if multipliers:
             shown["λ"] = " ".join(f"{value:.3g}" for value in multipliers)
         return shown
+
+    def _measured(self, row: Mapping[str, float], key: str) -> float:
+        """What is held against a limit: the mean episode cost, or the algorithm's own measure."""
+        violation = row.get(f"violation_{key}")
+        return row[f"episode_{key}"] if violation is None else self._cost_limits[key] + violation
 
     def draw_curves(self) -> None:
         """Write ``curves.png`` from the table."""
@@ -150,13 +155,16 @@ class RunFolder:
 
     def summary(self) -> str:
         """One line on how the run ended."""
-        final = final_figures(read_table(self.table_path), list(self._cost_limits) or ["cost"])
+        keys = list(self._cost_limits) or ["cost"]
+        final = final_figures(read_table(self.table_path), keys)
         parts = [f"J_r {final['episode_return']:.2f}"]
         several = len(self._cost_limits) > 1
         for key in self._cost_limits or ["cost"]:
             name = f"[{key}]" if several else ""
             limit = f" (limit {self._cost_limits[key]:g})" if key in self._cost_limits else ""
-            parts.append(f"J_c{name} {final[f'episode_{key}']:.1f}{limit}")
+            mean, measured = final[f"episode_{key}"], self._measured(final, key)
+            own = "" if math.isclose(mean, measured, abs_tol=0.05) else f", measured {measured:.1f}"
+            parts.append(f"J_c{name} {mean:.1f}{own}{limit}")
             parts.append(f"ρ_c{name} {final[f'{key}_rate']:.4f}")  # noqa: RUF001
         parts.append(f"{final['steps_per_second']:,.0f} steps/s")
         return f"{', '.join(parts)} in {self.directory}"
@@ -165,8 +173,8 @@ class RunFolder:
 def final_figures(table: Mapping[str, list[float]], cost_keys: list[str]) -> dict[str, float]:
     """Final J_r, J_c and ρ_c (Ray et al. 2019, section 5.1), and steps per second of the run.
 
-    J_r and J_c are means over the last ``FINAL_EPOCHS`` epochs in which an episode finished, ρ_c
-    is that of the last epoch.
+    J_r, J_c and violations of limits are means over the last ``FINAL_EPOCHS`` epochs in which an
+    episode finished, ρ_c is that of the last epoch.
 
     Args:
         table: Columns of the run's table.
@@ -174,7 +182,8 @@ def final_figures(table: Mapping[str, list[float]], cost_keys: list[str]) -> dic
     """
     known = [row for row, value in enumerate(table["episode_return"]) if not math.isnan(value)]
     final: dict[str, Any] = {}
-    for name in ("episode_return", *(f"episode_{key}" for key in cost_keys)):
+    names = [f"{kind}_{key}" for key in cost_keys for kind in ("episode", "violation")]
+    for name in ("episode_return", *(name for name in names if name in table)):
         values = [table[name][row] for row in known[-FINAL_EPOCHS:]]
         final[name] = sum(values) / len(values) if values else math.nan
     final |= {f"{key}_rate": table[f"{key}_rate"][-1] for key in cost_keys}

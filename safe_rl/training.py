@@ -185,7 +185,7 @@ class Trainer:
         """Train for ``frames`` steps, rounded up to whole batches.
 
         Ctrl-C or SIGTERM ends the run after the epoch at hand, with a checkpoint;
-        ``interrupted_by`` then holds the signal.
+        ``interrupted_by`` then holds the signal, unless that epoch was the last one.
 
         Returns:
             One line on the outcome.
@@ -202,7 +202,8 @@ class Trainer:
                     self._save()
                     saved_at = time.monotonic()
             self._save()
-            self.interrupted_by = stop.received
+            if self.progress.steps < self._frames:
+                self.interrupted_by = stop.received
         if isinstance(self._collector, WorkerCollector):
             self._collector.shutdown()
         return self.folder.summary()

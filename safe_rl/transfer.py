@@ -34,6 +34,8 @@ def initialise_networks(networks: Networks, source: Path, cost_keys: list[str]) 
         CheckpointError: If there is no checkpoint, or its networks have other sizes; nothing has
             been changed then.
     """
+    if not source.exists():
+        raise CheckpointError(f"init_from={source}: there is no such folder or file.")
     checkpoint = _newest(source) if source.is_dir() else source
     taken: dict[str, nn.Module] = {"actor": networks.actor, "critic": networks.critic}
     if networks.cost_critic is not None and _constrained_costs(checkpoint) == cost_keys:

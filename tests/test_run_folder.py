@@ -70,6 +70,16 @@ def test_the_folder_has_configuration_table_and_tensorboard(tmp_path, capsys):
     assert "nan" not in bar
 
 
+def test_a_measure_of_ones_own_is_what_is_held_against_the_limit(tmp_path, capsys):
+    config = compose_config("env=PointMass", "logger=none")
+    folder = RunFolder(tmp_path, config, {"cost": 25.0}, 1000)
+    with folder.writing():
+        folder.record(row(1, 1.0, 20.0) | {"violation_cost": 62.0})
+        folder.record(row(2, 1.0, 30.0) | {"violation_cost": 64.0})
+    assert "J_c 25.0, measured 88.0 (limit 25)" in folder.summary()
+    assert "cost=89.0/25" in capsys.readouterr().err
+
+
 def test_a_continued_table_goes_on_after_its_epoch(tmp_path):
     config = compose_config("env=PointMass", "logger=none")
     folder = RunFolder(tmp_path, config, {"cost": 25.0}, 1000)

@@ -229,6 +229,20 @@ def test_a_signal_ends_the_run_after_the_epoch_with_a_checkpoint(tmp_path):
     ]
 
 
+def test_a_signal_in_the_last_epoch_interrupts_nothing(tmp_path):
+    trainer = make_trainer(tmp_path, "frames=160")
+    record = trainer.folder.record
+
+    def record_and_signal(row):
+        record(row)
+        signal.raise_signal(signal.SIGTERM)
+
+    trainer.folder.record = record_and_signal
+    trainer.run()
+    assert trainer.progress.steps == 160
+    assert trainer.interrupted_by is None
+
+
 def test_a_second_interrupt_acts_at_once():
     with StopRequest() as stop:
         signal.raise_signal(signal.SIGINT)

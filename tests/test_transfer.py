@@ -1,5 +1,7 @@
 """Starting from trained networks: what is taken over, and what does not fit."""
 
+from pathlib import Path
+
 import pytest
 import torch
 from omegaconf import OmegaConf
@@ -90,6 +92,12 @@ def test_other_sizes_are_named_and_nothing_changes(trained, override, message):
 def test_a_folder_without_a_checkpoint(trained, tmp_path):
     with pytest.raises(CheckpointError, match=r"init_from=.*no checkpoint"):
         initialise_networks(trained.algorithm.networks, tmp_path, ["cost"])
+
+
+@pytest.mark.parametrize("path", ["nowhere", "some/where/else/nowhere.torchrl"])
+def test_a_source_that_does_not_exist_is_named(trained, path):
+    with pytest.raises(CheckpointError, match=f"init_from={path}: there is no such folder"):
+        initialise_networks(trained.algorithm.networks, Path(path), ["cost"])
 
 
 def test_the_configuration_records_where_a_run_came_from(tmp_path):

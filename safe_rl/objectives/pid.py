@@ -88,10 +88,12 @@ class PIDMultiplier(Multiplier):
             raise ValueError(f"derivative_delay must be at least 1, got {derivative_delay}.")
         initial = per_cost("init", init, self.num_costs)
         scales = self.limits if scale == "limit" else per_cost("scale", scale, self.num_costs)
-        if not (initial >= 0).all() or not (scales > 0).all():
+        if not (initial >= 0).all():
+            raise ValueError(f"init must not be negative, got {initial.tolist()}.")
+        if not (scales > 0).all():
             raise ValueError(
-                f"init must not be negative and scale must be positive, got {initial.tolist()} "
-                f'and {scales.tolist()}: with a limit of 0, scale="limit" is no choice.'
+                f"scale must be positive, got {scales.tolist()}: a limit of 0 cannot be the unit "
+                "of its violations. Set scale to a cost, for example scale=1."
             )
         self.kp, self.ki, self.kd = kp, ki, kd
         self.proportional_ema, self.derivative_ema = proportional_ema, derivative_ema
