@@ -13,7 +13,7 @@ from omegaconf import DictConfig, OmegaConf
 
 import safe_rl.openmp  # noqa: F401, has to come before torch
 from safe_rl.command_line import expand_arguments
-from safe_rl.envs import SafetyGymConfig, make_env, store_configs
+from safe_rl.envs import LayoutError, SafetyGymConfig, make_env, store_configs
 from safe_rl.overrides import CommandLineError, check_overrides
 from safe_rl.resuming import is_finished, may_continue
 from safe_rl.settings import check_settings, errors_in_a_line
@@ -59,7 +59,8 @@ def main(config: DictConfig) -> None:
     directory = Path(HydraConfig.get().runtime.output_dir)
     is_job = HydraConfig.get().mode is RunMode.MULTIRUN  # whose sweep keeps account of failures
     continues = may_continue(HydraConfig.get(), config)
-    with nullcontext() if is_job else errors_in_a_line(directory, is_new=not continues):
+    errors = nullcontext() if is_job else errors_in_a_line(directory, not continues, LayoutError)
+    with errors:
         trainer = prepare(config, directory, continues)
     if trainer is None:
         return

@@ -72,19 +72,20 @@ def check_settings(config: DictConfig) -> None:
 
 
 @contextmanager
-def errors_in_a_line(directory: Path, is_new: bool) -> Iterator[None]:
+def errors_in_a_line(directory: Path, is_new: bool, *also: type[Exception]) -> Iterator[None]:
     """End with what is wrong instead of the way to it, which ``HYDRA_FULL_ERROR=1`` shows.
 
     Args:
         directory: Folder of the run.
         is_new: Whether it may go if nothing but Hydra's notes is in it.
+        also: Errors about settings besides `ValueError`, `CheckpointError` and Hydra's.
 
     Raises:
         SystemExit: For errors about settings and files; all others pass.
     """
     try:
         yield
-    except (ValueError, CheckpointError, InstantiationException) as error:
+    except (ValueError, CheckpointError, InstantiationException, *also) as error:
         if os.environ.get("HYDRA_FULL_ERROR") == "1":
             raise
         if is_new and all(path.name == ".hydra" for path in directory.iterdir()):

@@ -77,6 +77,9 @@ def test_a_measure_of_ones_own_is_what_is_held_against_the_limit(tmp_path, capsy
         folder.record(row(1, 1.0, 20.0) | {"violation_cost": 62.0})
         folder.record(row(2, 1.0, 30.0) | {"violation_cost": 64.0})
     assert "J_c 25.0, measured 88.0 (limit 25)" in folder.summary()
+    with folder.writing(0):
+        folder.record(row(1, NAN, NAN) | {"violation_cost": NAN})
+    assert "J_c nan (limit 25)" in folder.summary()
     assert "cost=89.0/25" in capsys.readouterr().err
 
 

@@ -63,6 +63,7 @@ def test_other_errors_and_full_ones_pass(tmp_path, monkeypatch):
         ("lagrangian.kp=abc", "lagrangian: '<' not supported"),
         ("init_from=nowhere", "init_from=nowhere: there is no such folder or file."),
         ("env.hazards_num=abc", "'hazards_num'"),
+        ("env.hazards_num=200", "No layout found in 10000 attempts: most often 'hazard"),
     ],
 )
 def test_train_py_ends_in_a_line_and_leaves_nothing(tmp_path, override, words):
