@@ -51,7 +51,12 @@ class Experiment:
     @property
     def has_published_limit(self) -> bool:
         """Whether it has the limit, and only that, with which results were published."""
-        return self.limits == {"cost": COST_LIMIT}
+        return self.limits == {"cost": COST_LIMIT} and not self.limits_of_other_measures
+
+    @property
+    def limits_of_other_measures(self) -> list[str]:
+        """Cost keys whose limit is on something else than the mean cost of an episode."""
+        return [k for k in self.limits if any(run.limits_another_measure(k) for run in self.runs)]
 
     @property
     def finished(self) -> tuple[Run, ...]:

@@ -11,11 +11,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 from yaml import YAMLError
 
-from safe_rl.run_folder import final_figures
+from safe_rl.run_folder import FINAL_EPOCHS, final_figures
 from safe_rl.tables import read_table
 
 __all__ = ["Run", "find_runs", "read_run", "split_source", "without_repetitions"]
@@ -99,6 +100,30 @@ class Run:
     def final(self, cost_keys: list[str]) -> dict[str, float]:
         """Final J_r, J_c and ρ_c by column name (section 5.1)."""
         return final_figures(self.table, cost_keys)
+
+    def excess(self, key: str) -> float:
+        """What the limit of a cost judges, minus d: a mean over the last five epochs.
+
+        That is J_c − d unless the run's table has a column ``violation_<key>``: an algorithm that
+        limits another measure than the mean cost says there what it holds against d.
+        """
+        finished = np.isfinite(self.table["episode_return"])
+        column = np.array(self.table.get(f"violation_{key}", np.full(finished.shape, math.nan)))
+        last = column[finished][-FINAL_EPOCHS:]
+        known = last[np.isfinite(last)]
+        if known.size:
+            return float(known.mean())
+        return self.final([key])[f"episode_{key}"] - self.limits[key]
+
+    def limits_another_measure(self, key: str) -> bool:
+        """Whether the limit of a cost is on something else than the mean cost of an episode."""
+        columns = (self.table.get(f"{name}_{key}") for name in ("violation", "episode"))
+        violation, cost = (np.array([] if column is None else column) for column in columns)
+        if not (violation.size and cost.size):
+            return False
+        # columns may come from single precision
+        difference = np.abs(violation - (cost - self.limits[key]))
+        return bool(np.any(difference > 1e-4 * (1 + np.abs(cost) + abs(self.limits[key]))))
 
     def evaluations(self) -> Iterator[dict[str, Any]]:
         """What :mod:`safe_rl.evaluate` has written into its folder."""

@@ -110,9 +110,11 @@ def normalised_scores(experiment: Experiment) -> dict[str, np.ndarray]:
         )
     finals = [run.final(["cost"]) for run in experiment.finished]
     values = {name: np.array([final[name] for final in finals]) for name in finals[0]}
+    # J_c, or what the run compares with the limit in its place
+    judged = limit + np.array([run.excess("cost") for run in experiment.finished])
     return {
         "episode_return": normalised_return(values["episode_return"], reference),
-        "violation": normalised_violation(values["episode_cost"], limit, reference),
+        "violation": normalised_violation(judged, limit, reference),
         "cost_rate": normalised_cost_rate(values["cost_rate"], reference),
     }
 

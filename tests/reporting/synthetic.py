@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+from itertools import cycle
 from pathlib import Path
 
 import yaml
@@ -30,9 +31,13 @@ def write_run(
     limits: dict | None = None,
     overrides: list[str] | None = None,
     folder: str | None = None,
+    columns: dict | None = None,
     **settings,
 ) -> Path:
-    """One row of the table per entry of `returns`, 1000 steps and 3.6 s apart."""
+    """One row of the table per entry of `returns`, 1000 steps and 3.6 s apart.
+
+    `columns` are further ones, by name.
+    """
     directory = root / env / algo / (folder or f"seed{seed}")
     (directory / ".hydra").mkdir(parents=True)
     config = {
@@ -51,7 +56,11 @@ def write_run(
     (directory / ".hydra" / "config.yaml").write_text("not: this one")
     with (directory / "progress.csv").open("w", newline="") as file:
         writer = csv.writer(file)
-        writer.writerow(COLUMNS)
-        for epoch, row in enumerate(zip(returns, costs, rates, strict=True), start=1):
-            writer.writerow([epoch, 1000 * epoch, 1, *row, 3.6 * epoch])
+        more = columns or {}
+        writer.writerow([*COLUMNS, *more])
+        rows = zip(
+            zip(returns, costs, rates, strict=True), zip(*more.values()) if more else cycle([()])
+        )
+        for epoch, (row, further) in enumerate(rows, start=1):
+            writer.writerow([epoch, 1000 * epoch, 1, *row, 3.6 * epoch, *further])
     return directory

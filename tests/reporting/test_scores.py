@@ -91,6 +91,34 @@ def test_the_ranking_follows_the_two_rules(tmp_path):
     }
 
 
+def test_a_limit_on_another_measure_is_judged_by_that_measure(tmp_path):
+    epochs = {"returns": [1.0] * 7, "rates": [0.01] * 7}
+    # the mean cost keeps d = 25 and the measure does not; the first two epochs are not the last five
+    over = {"violation_cost": [-900, -900, "", 9, 11, "", 10]}
+    below = {"violation_cost": [900, 900, -4, -6, "", "", ""]}
+    plain = {"violation_cost": [-15.0] * 7}
+    write_run(tmp_path, algo="mine", **epochs, costs=[10.0] * 7, columns=over)
+    write_run(tmp_path, algo="yours", **epochs, costs=[40.0] * 7, columns=below)
+    write_run(tmp_path, algo="cpo", **epochs, costs=[10.0] * 7, columns=plain)
+    experiments = experiments_in(tmp_path)
+    records = {e.algorithm: final_record(e, ["cost"]) for e in experiments}
+    found = {name: (r["excess_cost"], r["satisfies"]) for name, r in records.items()}
+    assert found == {"mine": (10.0, False), "yours": (-5.0, True), "CPO": (-15.0, True)}
+    table = final_table("PointGoal1", list(records.values()), ["cost"])
+    assert marks(table, "$J_c$") == ["", "bad", ""]
+    assert "mine: the limit of cost is on another measure than the mean $J_c$" in table.note
+    assert "was 10.0 over $d$" in table.note
+    assert "yours: the limit" in table.note
+    assert "CPO" not in table.note
+    better = {(r["better"], r["worse"]) for r in dominance_table(list(records.values())).records}
+    assert {("yours", "mine"), ("CPO", "mine")} <= better
+    # slates ask the same, and nothing published stands beside another limit than the published
+    by_name = {e.algorithm: aggregate([e]) for e in experiments}
+    assert by_name["yours"].mean.violation == 0.0
+    assert by_name["mine"].mean.violation == pytest.approx(10 / (REFERENCE["PointGoal1"][1] - 25))
+    assert [e.has_published_limit for e in experiments] == [True, False, False]
+
+
 def write_slate(root, algo, multiples, *, leave_out=()):
     """Final scores that are multiples of the reference: one multiple per environment and seed."""
     for index, env in enumerate(SLATES["SG6"]):
