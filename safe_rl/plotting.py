@@ -10,7 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter
 
-__all__ = ["draw_learning_curves"]
+__all__ = ["draw_learning_curves", "moving_mean", "point_marker"]
 
 SMOOTHING_EPOCHS = 5
 """Epochs in the moving mean, as many as final figures are averaged over."""
@@ -49,14 +49,17 @@ def draw_learning_curves(
         >>> path.exists()
         True
     """
-    figure = Figure(figsize=(12, 3.4), layout="constrained")
+    # legends stand below the panels, where they cover nothing
+    num_lines = max(1, len(cost_limits))
+    figure = Figure(figsize=(12, 3.6 + 0.2 * num_lines), layout="constrained")
     returns, costs, rates = figure.subplots(1, 3)
     steps = np.asarray(table["steps"], dtype=float)
     _draw(returns, steps, table["episode_return"], "C0", None)
     for index, key in enumerate(cost_limits or ["cost"]):
         colour = f"C{index + 1}"
         _draw(costs, steps, table[f"episode_{key}"], colour, key)
-        rates.plot(steps, table[f"{key}_rate"], color=colour, label=key)
+        rate = table[f"{key}_rate"]
+        rates.plot(steps, rate, color=colour, label=key, marker=point_marker(steps))
         if key in cost_limits:
             limit, per_step = cost_limits[key], cost_limits[key] / episode_length
             _draw_limit(costs, limit, colour, f"limit {limit:g}")
@@ -77,7 +80,10 @@ def _label(returns: Axes, costs: Axes, rates: Axes) -> None:
         axes.grid(alpha=0.3)
     for axes in (costs, rates):
         axes.set_ylim(bottom=0)
-        axes.legend(fontsize="small")
+        axes.legend(
+            fontsize="small", frameon=False, ncols=2,
+            loc="upper center", bbox_to_anchor=(0.5, -0.18),
+        )  # fmt: skip
 
 
 def _draw_limit(axes: Axes, height: float, colour: str, label: str) -> None:
@@ -90,12 +96,30 @@ def _draw(
     """Epochs in which an episode finished, and their moving mean."""
     known = np.isfinite(values)
     steps, heights = steps[known], np.asarray(values, dtype=float)[known]
+    marker = point_marker(steps)
     axes.plot(steps, heights, color=colour, alpha=0.3, linewidth=1)
-    axes.plot(steps, _moving_mean(heights), color=colour, label=label)
+    axes.plot(steps, moving_mean(heights), color=colour, label=label, marker=marker)
 
 
-def _moving_mean(values: np.ndarray) -> np.ndarray:
-    """Mean of each value and the up to ``SMOOTHING_EPOCHS - 1`` before it."""
+def point_marker(values: np.ndarray) -> str:
+    """Marker of a line through values, shape [n]: a single point would not be seen without.
+
+    Examples:
+        >>> point_marker(np.zeros(1)), point_marker(np.zeros(2))
+        ('o', '')
+    """
+    return "o" if len(values) == 1 else ""
+
+
+def moving_mean(values: np.ndarray) -> np.ndarray:
+    """Mean of each value, shape [n], and the up to ``SMOOTHING_EPOCHS - 1`` before it.
+
+    The last one is the final figure of a run.
+
+    Examples:
+        >>> moving_mean(np.array([1.0, 3.0, 5.0, 7.0, 9.0, 11.0])).tolist()
+        [1.0, 2.0, 3.0, 4.0, 5.0, 7.0]
+    """
     sums = np.cumsum(np.concatenate([[0.0], values]))
     ends = np.arange(1, len(values) + 1)
     starts = np.maximum(ends - SMOOTHING_EPOCHS, 0)

@@ -47,7 +47,9 @@ PARTS = {
     "intervals": ("extras",),
     "evaluation": ("building", "checkpoints", "extras", "intervals", "models", "protocol"),
     "evaluate": ("envs", "evaluation", "intervals", "openmp", "options", "protocol"),
-    "reporting": ("checkpoints", "extras", "intervals", "protocol", "run_folder", "tables"),
+    "reporting": (
+        *("checkpoints", "extras", "intervals", "plotting", "protocol", "run_folder", "tables"),
+    ),
     "report": ("envs", "openmp", "options", "protocol", "reporting"),
 }
 

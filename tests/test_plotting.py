@@ -31,9 +31,9 @@ def drawn(monkeypatch, tmp_path):
 
     monkeypatch.setattr(Figure, "savefig", remember)
 
-    def draw(cost_limits):
+    def draw(cost_limits, table=TABLE):
         path = tmp_path / "curves.png"
-        draw_learning_curves(TABLE, cost_limits, 1000, path, "title")
+        draw_learning_curves(table, cost_limits, 1000, path, "title")
         assert imread(path).std() > 0
         assert [entry.name for entry in tmp_path.iterdir()] == ["curves.png"]
         return figures[-1].axes
@@ -73,6 +73,22 @@ def test_several_costs_have_a_line_a_limit_and_a_name_each(drawn):
     ]  # fmt: skip
     colours = {line.get_color() for line in costs.lines if line.get_linestyle() == "--"}
     assert len(colours) == 2
+
+
+def test_a_single_epoch_is_drawn_as_a_point(drawn):
+    panels = drawn({"cost": 25.0}, {name: values[:1] for name, values in TABLE.items()})
+    markers = [{line.get_marker() for line in axes.lines} for axes in panels]
+    assert all("o" in found for found in markers)
+    lines = [line for axes in drawn({"cost": 25.0}) for line in axes.lines]
+    assert not any(line.get_marker() == "o" for line in lines)
+
+
+@pytest.mark.parametrize("limits", [{"cost": 25.0}, {"cost": 25.0, "cost_hazards": 10.0}])
+def test_the_legend_covers_no_line(drawn, limits):
+    for axes in drawn(limits)[1:]:
+        legend = axes.get_legend().get_window_extent()
+        labels = axes.xaxis.get_tightbbox()
+        assert 0 <= legend.y0 < legend.y1 <= labels.y0
 
 
 def test_without_limits_the_aggregate_cost_is_drawn(drawn):

@@ -7,10 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from safe_rl.extras import import_extra
 from safe_rl.intervals import bootstrap
+from safe_rl.plotting import moving_mean
 from safe_rl.reporting.runs import Run
-from safe_rl.run_folder import FINAL_EPOCHS
 
 __all__ = ["Curve", "mean_curve"]
 
@@ -44,7 +43,8 @@ def mean_curve(runs: Sequence[Run], column: str, *, smooth: bool) -> Curve | Non
     Args:
         runs: One per seed.
         column: Column of their tables.
-        smooth: Whether to take the moving mean over ``FINAL_EPOCHS`` epochs first.
+        smooth: Whether to take :func:`safe_rl.plotting.moving_mean` first, which ends at the
+            run's final figure.
 
     Returns:
         The curve, or None if a run has no value.
@@ -57,7 +57,7 @@ def mean_curve(runs: Sequence[Run], column: str, *, smooth: bool) -> Curve | Non
     longest = max(len(steps) for steps, _ in series)
     grid = np.linspace(start, stop, min(longest, NUM_POINTS)) if stop > start else np.array([stop])
     values = np.stack(
-        [np.interp(grid, steps, _smoothed(y) if smooth else y) for steps, y in series], -1
+        [np.interp(grid, steps, moving_mean(y) if smooth else y) for steps, y in series], -1
     )
     low, high = bootstrap([values], np.mean)
     return Curve(grid, values.mean(-1), low, high)
@@ -68,8 +68,3 @@ def _series(run: Run, column: str) -> tuple[np.ndarray, np.ndarray]:
     steps, values = np.array(run.table["steps"]), np.array(run.table.get(column, []))
     known = np.isfinite(values)
     return (steps[known], values[known]) if len(values) else (values, values)
-
-
-def _smoothed(values: np.ndarray) -> np.ndarray:
-    filters = import_extra("scipy.ndimage", "report")
-    return filters.uniform_filter1d(values, FINAL_EPOCHS, mode="nearest")

@@ -12,7 +12,12 @@ from matplotlib.figure import Figure
 
 from safe_rl.protocol import REFERENCE, SLATES
 from safe_rl.reporting.experiments import Experiment, group_runs
-from safe_rl.reporting.figures import algorithm_colours, draw_aggregates, draw_learning_curves
+from safe_rl.reporting.figures import (
+    Style,
+    algorithm_styles,
+    draw_aggregates,
+    draw_learning_curves,
+)
 from safe_rl.reporting.results import cost_keys_of, dominance_table, final_record, final_table
 from safe_rl.reporting.runs import Run, find_runs
 from safe_rl.reporting.slate_tables import middle_table, slate_table
@@ -108,18 +113,18 @@ def build_report(
     """
     runs, unreadable = find_runs(root, unfinished=unfinished)
     experiments, repeated = group_runs(runs, suite)
-    colours = algorithm_colours(experiments)
+    styles = algorithm_styles(experiments)
     finals, records = _finals(experiments)
-    slates, missing = _slates(experiments, colours, seeds_needed)
+    slates, missing = _slates(experiments, styles, seeds_needed)
     robots: dict[str, list[Experiment]] = defaultdict(list)
     for experiment in experiments:
         robots[_robot(experiment)].append(experiment)
     return Report(
         experiments=experiments,
         finals=finals,
-        curves={robot: draw_learning_curves(group, colours) for robot, group in robots.items()},
+        curves={robot: draw_learning_curves(group, styles) for robot, group in robots.items()},
         transfers=[
-            (transfer, draw_transfer(transfer, colours))
+            (transfer, draw_transfer(transfer, styles))
             for transfer in find_transfers(experiments, runs, suite)
         ],
         slates=slates,
@@ -148,7 +153,7 @@ def _finals(experiments: Sequence[Experiment]) -> tuple[list[Table], list[dict[s
 
 
 def _slates(
-    experiments: Sequence[Experiment], colours: Mapping[str, str], seeds_needed: int
+    experiments: Sequence[Experiment], styles: Mapping[str, Style], seeds_needed: int
 ) -> tuple[list[Slate], list[Gap]]:
     """The slates that are complete for an algorithm or more, and what the others lack."""
     usable = [e for e in experiments if can_be_normalised(e)]
@@ -163,7 +168,7 @@ def _slates(
             else:
                 missing.append(gap)
         if complete:
-            slates.append(_slate(name, environments, complete, colours))
+            slates.append(_slate(name, environments, complete, styles))
     shared = tuple(
         name
         for name in REFERENCE
@@ -171,7 +176,7 @@ def _slates(
     )
     if shared and shared not in [slate.environments for slate in slates]:
         everyone = [_aggregate(usable, algorithm, shared) for algorithm in algorithms]
-        slates.append(_slate("shared", shared, everyone, colours))
+        slates.append(_slate("shared", shared, everyone, styles))
     return slates, missing
 
 
@@ -187,12 +192,12 @@ def _slate(
     name: str,
     environments: tuple[str, ...],
     aggregates: Sequence[Aggregate],
-    colours: Mapping[str, str],
+    styles: Mapping[str, Style],
 ) -> Slate:
     return Slate(
         name,
         environments,
         slate_table(name, aggregates),
         middle_table(name, aggregates),
-        draw_aggregates(aggregates, colours),
+        draw_aggregates(aggregates, styles),
     )

@@ -13,8 +13,9 @@ from safe_rl.reporting.figures import (
     LIMIT_STYLE,
     ROW_HEIGHT,
     WIDTH,
+    Style,
     add_legend,
-    algorithm_colours,
+    algorithm_styles,
     draw_experiment,
     drawn_keys,
     set_axes,
@@ -40,7 +41,7 @@ class _Phase(NamedTuple):
         return names.replace(" (", "\n(")
 
 
-def draw_transfer(transfer: Transfer, colours: Mapping[str, str]) -> Figure:
+def draw_transfer(transfer: Transfer, styles: Mapping[str, Style]) -> Figure:
     """Draw return, episode cost and cost rate over the steps of both phases, a row per cost.
 
     The second phase follows the first, and a vertical line separates them. Each has its
@@ -49,18 +50,18 @@ def draw_transfer(transfer: Transfer, colours: Mapping[str, str]) -> Figure:
 
     Args:
         transfer: The two phases; the second is drawn alone if the first was not found.
-        colours: Name of an algorithm -> its colour.
+        styles: Name of an algorithm -> how it is drawn.
     """
     phases = list(_phases(transfer))
     everyone = [e for phase in phases for e in phase.experiments]
     keys = drawn_keys(everyone)
-    colours = {**algorithm_colours(transfer.first), **colours}
-    figure = Figure(figsize=(WIDTH, ROW_HEIGHT * len(keys) + 1.0), layout="constrained")
+    styles = {**algorithm_styles(transfer.first), **styles}
+    figure = Figure(figsize=(WIDTH, ROW_HEIGHT * len(keys) + 0.7), layout="constrained")
     panels = figure.subplots(len(keys), 3, squeeze=False)
     for key, axes in zip(keys, panels, strict=True):
         for phase in phases:
             for experiment in phase.experiments:
-                draw_experiment(experiment, key, axes, colours[experiment.algorithm], phase.start)
+                draw_experiment(experiment, key, axes, styles[experiment.algorithm], phase.start)
             _draw_limits(phase, key, axes)
         set_axes(axes)
         axes[0].set_ylabel("" if key == "cost" else key, fontweight="bold")

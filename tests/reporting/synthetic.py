@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-from itertools import cycle
 from pathlib import Path
 
 import yaml
@@ -58,9 +57,7 @@ def write_run(
         writer = csv.writer(file)
         more = columns or {}
         writer.writerow([*COLUMNS, *more])
-        rows = zip(
-            zip(returns, costs, rates, strict=True), zip(*more.values()) if more else cycle([()])
-        )
-        for epoch, (row, further) in enumerate(rows, start=1):
+        for epoch, row in enumerate(zip(returns, costs, rates, strict=True), start=1):
+            further = [values[epoch - 1] for values in more.values()]
             writer.writerow([epoch, 1000 * epoch, 1, *row, 3.6 * epoch, *further])
     return directory

@@ -8,12 +8,13 @@ import subprocess
 
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
 from matplotlib.image import imread
 from synthetic import NODES, write_run
 
 from safe_rl.report import main
 from safe_rl.reporting.experiments import group_runs
-from safe_rl.reporting.figures import algorithm_colours, draw_learning_curves
+from safe_rl.reporting.figures import add_legend, algorithm_styles, draw_learning_curves, save
 from safe_rl.reporting.inventory import duration
 from safe_rl.reporting.runs import find_runs
 
@@ -132,7 +133,7 @@ def test_panels_have_means_intervals_and_limits(tmp_path):
     write_run(tmp_path, "PointGoal2", "cpo", 0, **ROWS, costs=(1, 1, 1), limits={"cost": 10.0},
               env_changes={"num_steps": 500}, frames=10**6)  # fmt: skip
     experiments, _ = group_runs(find_runs(tmp_path)[0], NODES)
-    figure = draw_learning_curves(experiments, algorithm_colours(experiments))
+    figure = draw_learning_curves(experiments, algorithm_styles(experiments))
     panels = np.array(figure.axes).reshape(2, 3)
     assert [axes.get_title() for axes in panels[0]] == ["Return", "Episode cost", "Cost rate"]
     assert panels[0, 0].get_ylabel() == "PointGoal1"
@@ -155,7 +156,7 @@ def test_every_limited_cost_has_a_row(tmp_path):
     head, row = path.read_text().splitlines()
     path.write_text(f"{head},episode_cost_hazards,cost_hazards_rate\n{row},4,0.004\n")
     experiments, _ = group_runs(find_runs(tmp_path)[0], NODES)
-    figure = draw_learning_curves(experiments, algorithm_colours(experiments))
+    figure = draw_learning_curves(experiments, algorithm_styles(experiments))
     panels = np.array(figure.axes).reshape(2, 3)
     assert [axes.get_ylabel() for axes in panels[:, 0]] == [
         "PointGoal1", "PointGoal1\ncost_hazards",
@@ -168,10 +169,59 @@ def test_colours_stay_with_the_algorithms(tmp_path):
         write_run(tmp_path, algo=algo)
     write_run(tmp_path, algo="cpo", frames=500, folder="variant")
     everything, _ = group_runs(find_runs(tmp_path)[0], NODES)
-    colours = algorithm_colours(everything)
+    colours = algorithm_styles(everything)
     assert len(set(colours.values())) == 5
-    alone = algorithm_colours([e for e in everything if e.algorithm == "PPO"])
+    alone = algorithm_styles([e for e in everything if e.algorithm == "PPO"])
     assert alone["PPO"] == colours["PPO"]
+
+
+def test_experiments_of_one_algorithm_are_told_apart(tmp_path):
+    for width in range(15):
+        model = {"model": {"width": width}, "frames": 3000}
+        write_run(tmp_path, algo="cpo", **model, **ROWS, costs=(1, 1, 1), folder=f"w{width}")
+        write_run(tmp_path, algo="cpo", **model, seed=1, folder=f"unfinished{width}")
+    experiments, _ = group_runs(find_runs(tmp_path)[0], NODES)
+    styles = algorithm_styles(experiments)
+    assert len(set(styles.values())) == 15
+    figure = draw_learning_curves(experiments, styles)
+    looks = [(line.get_color(), str(line._unscaled_dash_pattern)) for line in figure.axes[0].lines]
+    assert len(set(looks)) == 30
+
+
+@pytest.mark.parametrize(
+    "names",
+    [
+        ["a", "b", "c"],
+        [f"model.input_scale=a,model.hidden_sizes={n},num_envs={n}" for n in range(12)],
+        [" ".join(f"model.hidden_sizes_{n}=64" for n in range(20))],
+    ],
+)
+def test_the_legend_is_as_wide_as_the_figure_at_most(names, tmp_path):
+    figure = Figure(figsize=(12, 3), layout="constrained")
+    panels = figure.subplots(1, 3)
+    for name in names:
+        panels[0].plot([0, 1], [0, 1], label=name)
+    add_legend(figure, panels)
+    save(figure, tmp_path / "legend.png")
+    (legend,) = figure.legends
+    box = legend.get_window_extent()
+    assert 0 <= box.x0 < box.x1 <= figure.bbox.width
+    assert 0 <= box.y0 < box.y1
+    assert legend._ncols == (3 if len(names) == 3 else 1 if len(names) == 1 else legend._ncols)
+    # the figure has grown, so that the panels are as high as with a short legend
+    assert panels[0].get_window_extent().height > 180
+
+
+def test_a_single_epoch_is_drawn_as_a_point(tmp_path):
+    write_run(tmp_path)
+    write_run(tmp_path, algo="cpo", frames=10**6)
+    write_run(tmp_path, algo="trpo", **ROWS, costs=(1, 1, 1))
+    experiments, _ = group_runs(find_runs(tmp_path)[0], NODES)
+    figure = draw_learning_curves(experiments, algorithm_styles(experiments))
+    for axis in figure.axes:
+        drawn = {line.get_label(): line.get_marker() for line in axis.lines}
+        drawn = {name: marker for name, marker in drawn.items() if not name.startswith("_")}
+        assert drawn == {"PPO": "o", "TRPO": "", "CPO (unfinished)": "o"}
 
 
 # appended to the page: what the browser makes of it, as JSON in an element

@@ -93,7 +93,7 @@ def test_the_ranking_follows_the_two_rules(tmp_path):
 
 def test_a_limit_on_another_measure_is_judged_by_that_measure(tmp_path):
     epochs = {"returns": [1.0] * 7, "rates": [0.01] * 7}
-    # the mean cost keeps d = 25 and the measure does not; the first two epochs are not the last five
+    # mean costs that keep d = 25 and a measure that does not, and the other way round
     over = {"violation_cost": [-900, -900, "", 9, 11, "", 10]}
     below = {"violation_cost": [900, 900, -4, -6, "", "", ""]}
     plain = {"violation_cost": [-15.0] * 7}
@@ -228,9 +228,18 @@ def test_curves_are_means_over_seeds_on_common_steps(tmp_path):
     np.testing.assert_allclose(curve.low, [0.1, 0.15, 0.2])
     np.testing.assert_allclose(curve.high, [0.3, 0.45, 0.6])
     alone = mean_curve(runs[:1], "episode_return", smooth=True)
-    np.testing.assert_allclose(alone.mean[1], 2.0)
+    np.testing.assert_allclose(alone.mean, [0.0, 1.0, 2.0])
     assert np.isnan(alone.low).all()
     assert mean_curve(runs, "no_such_column", smooth=False) is None
+
+
+def test_a_curve_ends_at_the_final_score(tmp_path):
+    returns = [1.0, 2.0, 4.0, 8.0, 16.0, 32.0, 65.0]
+    write_run(tmp_path, returns=returns, costs=returns, rates=returns)
+    (experiment,) = experiments_in(tmp_path)
+    curve = mean_curve(experiment.runs, "episode_cost", smooth=True)
+    assert curve.mean[-1] == pytest.approx(25.0)
+    assert curve.mean[-1] == pytest.approx(final_record(experiment, ["cost"])["episode_cost"])
 
 
 def test_epochs_without_an_episode_are_bridged(tmp_path):

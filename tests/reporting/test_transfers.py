@@ -12,7 +12,7 @@ from synthetic import NODES, write_run
 from safe_rl.checkpoints import CheckpointStore
 from safe_rl.report import main
 from safe_rl.reporting.experiments import group_runs
-from safe_rl.reporting.figures import algorithm_colours
+from safe_rl.reporting.figures import algorithm_styles
 from safe_rl.reporting.runs import find_runs
 from safe_rl.reporting.transfer_figures import draw_transfer
 from safe_rl.reporting.transfers import find_transfers
@@ -35,7 +35,7 @@ def write_second(root, source, seed=0, **settings):
 def transfers_in(root):
     runs, _ = find_runs(root)
     experiments, _ = group_runs(runs, NODES)
-    return find_transfers(experiments, runs, NODES), algorithm_colours(experiments)
+    return find_transfers(experiments, runs, NODES), algorithm_styles(experiments)
 
 
 def only_transfer_in(root):
