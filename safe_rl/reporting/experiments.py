@@ -11,15 +11,22 @@ from typing import Any
 from safe_rl.protocol import ALGORITHMS, COST_LIMIT, REFERENCE, Scores
 from safe_rl.reporting.runs import Run, split_source, without_repetitions
 
-__all__ = ["Experiment", "distinguishing_keys", "environment_names", "flatten", "group_runs"]
+__all__ = [
+    "MANNER",
+    "Experiment",
+    "distinguishing_keys",
+    "environment_names",
+    "flatten",
+    "group_runs",
+]
 
 Settings = dict[str, Hashable]
 
-# What changes how a run is carried out, not what it measures.
-_MANNER = {
+MANNER = {
     "seed", "device", "num_threads", "compile", "checkpoint", "logger", "default_cost_limits",
     "hydra", "resume", "collector", "num_collectors",
 }  # fmt: skip
+"""Settings of how a run is carried out, not of what it measures."""
 
 
 @dataclass(frozen=True)
@@ -59,6 +66,11 @@ class Experiment:
         return [k for k in self.limits if any(run.limits_another_measure(k) for run in self.runs)]
 
     @property
+    def is_continued(self) -> bool:
+        """Whether a run of it started from another run's networks."""
+        return any(run.init_from is not None for run in self.runs)
+
+    @property
     def finished(self) -> tuple[Run, ...]:
         """Runs that have come to their configured end."""
         return tuple(run for run in self.runs if run.is_finished)
@@ -85,9 +97,10 @@ def _hashable(value: Any) -> Hashable:
 
 
 def distinguishing_keys(cells: Iterable[Sequence[Settings]]) -> list[str]:
-    """Few keys by which the different settings within every cell can be told apart.
+    """Keys that differ within a cell, but for those that follow from another one.
 
-    Keys of the top level come first, so that ``preset`` stands for all that follows from it.
+    What follows from ``preset``, or from the ``_target_`` of the group that a key belongs to, is
+    not named: it is told by these.
 
     Args:
         cells: Groups of settings that have to be told apart within the group, not across groups.
@@ -102,15 +115,18 @@ def distinguishing_keys(cells: Iterable[Sequence[Settings]]) -> list[str]:
         {key for cell in cells for settings in cell for key in settings},
         key=lambda key: (key != "preset", key.count("."), key),
     )
-    chosen: list[str] = []
-    for key in keys:
-        if any(_num_kinds(cell, [*chosen, key]) > _num_kinds(cell, chosen) for cell in cells):
-            chosen.append(key)
-    return chosen
+    return [key for key in keys if any(not _follows(key, cell) for cell in cells)]
 
 
-def _num_kinds(cell: Sequence[Settings], keys: Sequence[str]) -> int:
-    return len({tuple(settings.get(key) for key in keys) for settings in cell})
+def _follows(key: str, cell: Sequence[Settings]) -> bool:
+    """Whether a key's value is settled by those of the keys that stand for it."""
+    names = key.split(".")
+    groups = [".".join([*names[:depth], "_target_"]) for depth in range(1, len(names))]
+    above = [other for other in ("preset", *groups) if other != key]
+    values: dict[tuple[Hashable, ...], set[Hashable]] = defaultdict(set)
+    for settings in cell:
+        values[tuple(settings.get(other) for other in above)].add(settings.get(key))
+    return all(len(found) == 1 for found in values.values())
 
 
 def group_runs(
@@ -186,11 +202,17 @@ def _algorithm_names(runs: Sequence[Run], environments: Mapping[Path, str]) -> d
         cells: dict[str, list[Settings]] = defaultdict(list)
         for run in members:
             cells[environments[run.directory]].append(settings[run.directory])
-        keys = distinguishing_keys(cells.values())
+        # an experiment may train longer on one environment than on another
+        anywhere = [
+            {key: value for key, value in settings[run.directory].items() if key != "frames"}
+            for run in members
+        ]
+        keys = distinguishing_keys([*cells.values(), anywhere])
         title = ALGORITHMS.get(algorithm, algorithm)
         for run in members:
             own = {key: settings[run.directory].get(key) for key in keys}
-            names[run.directory] = title + _in_brackets(own)
+            known = {key: value for key, value in own.items() if value is not None}
+            names[run.directory] = title + _in_brackets(known)
     return names
 
 
@@ -198,11 +220,22 @@ def _learning_settings(run: Run) -> Settings:
     settings = {
         key: value
         for key, value in flatten(run.config).items()
-        if key.partition(".")[0] not in {"env", *_MANNER} and not key.endswith(".compile")
+        if key.partition(".")[0] not in {"env", *MANNER} and not key.endswith(".compile")
     }
     if run.init_from is not None:
         settings["init_from"] = _common_source(run.init_from)
-    return settings
+    return _without_presets_for_robots(settings, run)
+
+
+def _without_presets_for_robots(settings: Settings, run: Run) -> Settings:
+    """Leave out what is as the preset has it for the robot: it holds that in ``paper.<key>``."""
+    robot = Path(str(run.config["env"].get("robot_base"))).stem
+
+    def of_robot(key: str) -> Hashable:
+        places = (f"paper.{key}.{name}" for name in (robot, "point"))
+        return next((settings[place] for place in places if place in settings), None)
+
+    return {key: value for key, value in settings.items() if value != of_robot(key)}
 
 
 def _common_source(source: Path) -> str:

@@ -92,15 +92,19 @@ def find_transfers(
     }
     found = [origin.run for origin in origins.values() if origin is not None]
     environments = environment_names([*runs, *found], suite)
+    names = {run.directory: e.algorithm for e in experiments for run in e.runs}
     return [
-        _transfer(experiment, origins, environments)
+        _transfer(experiment, origins, environments, names)
         for experiment in experiments
         if any(run.directory in origins for run in experiment.runs)
     ]
 
 
 def _transfer(
-    second: Experiment, origins: Mapping[Path, _Origin | None], environments: Mapping[Path, str]
+    second: Experiment,
+    origins: Mapping[Path, _Origin | None],
+    environments: Mapping[Path, str],
+    algorithms: Mapping[Path, str],
 ) -> Transfer:
     found: dict[Path, _Origin] = {}
     changes: set[int] = set()
@@ -117,7 +121,7 @@ def _transfer(
     phases: dict[tuple[str, str, Hashable], list[Run]] = defaultdict(list)
     for directory, origin in found.items():
         algorithm = origin.run.algorithm
-        name = second.algorithm if algorithm == second.runs[0].algorithm else _title(algorithm)
+        name = algorithms.get(directory, ALGORITHMS.get(algorithm, algorithm))
         limits = tuple(sorted(origin.run.limits.items()))
         phases[environments[directory], name, limits].append(_until(*origin))
     first = tuple(
@@ -125,10 +129,6 @@ def _transfer(
         for (environment, algorithm, _), members in phases.items()
     )
     return Transfer(first, second, tuple(sorted(changes)), tuple(missing))
-
-
-def _title(algorithm: str) -> str:
-    return ALGORITHMS.get(algorithm, algorithm)
 
 
 def _origin(run: Run, known: Mapping[Path, Run]) -> _Origin | None:

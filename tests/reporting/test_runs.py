@@ -114,7 +114,7 @@ def test_seeds_that_start_from_seeds_are_one_experiment(tmp_path):
         write_run(tmp_path, "PointGoal2", "cpo", seed, init_from=f"runs/PointGoal1/cpo/seed{seed}")
         write_run(tmp_path, "PointGoal2", "cpo", seed, init_from=None, folder=f"afresh{seed}")
     assert names(grouped(tmp_path)[0]) == [
-        ("PointGoal2", "CPO (init_from=null)", [0, 10]),
+        ("PointGoal2", "CPO", [0, 10]),
         ("PointGoal2", "CPO (init_from=runs/PointGoal1/cpo)", [0, 10]),
     ]
 
@@ -132,6 +132,39 @@ def test_seeds_that_start_from_checkpoints_of_seeds_are_one_experiment(tmp_path)
         ("PointGoal2", f"CPO ({last}-000000003000.torchrl)", [0, 10]),
         ("PointGoal2", f"CPO ({last}-000000004000.torchrl)", [0, 10]),
     ]
+
+
+def test_what_differs_between_environments_is_named_in_full(tmp_path):
+    lagrangian = {"_target_": "a.PIDMultiplier", "ki": 0.1}
+    write_run(tmp_path, "PointGoal1", num_envs=20, frames_per_batch=20, lagrangian=lagrangian)
+    write_run(
+        tmp_path, "CarGoal1", num_envs=4, frames_per_batch=40, limits={"cost_hazards": 10.0},
+        lagrangian={"_target_": "a.LagrangeMultiplier", "lr": 1.0}, frames=1,
+    )  # fmt: skip
+    other = {"num_envs": 4, "frames_per_batch": 40, "lagrangian": {**lagrangian, "ki": 0.2}}
+    write_run(tmp_path, "DoggoGoal1", **other, tail=0.1, init_from="runs/x/seed0")
+    found = {environment: name for environment, name, _ in names(grouped(tmp_path)[0])}
+    pid = "lagrangian=PIDMultiplier"
+    assert found == {
+        "PointGoal1": "PPO (frames_per_batch=20, num_envs=20, "
+                      f"cost ≤ 25, {pid}, lagrangian.ki=0.1)",
+        "CarGoal1": "PPO (frames_per_batch=40, num_envs=4, cost_hazards ≤ 10, "
+                    "lagrangian=LagrangeMultiplier)",
+        "DoggoGoal1": "PPO (frames_per_batch=40, init_from=runs/x, num_envs=4, tail=0.1, "
+                      f"cost ≤ 25, {pid}, lagrangian.ki=0.2)",
+    }  # fmt: skip
+
+
+def test_what_a_preset_holds_for_every_robot_tells_nothing_apart(tmp_path):
+    paper = {"preset": "paper", "paper": {"num_envs": {"point": 30, "doggo": 60}}}
+    write_run(tmp_path, "PointGoal1", "cpo", num_envs=30, **paper)
+    write_run(tmp_path, "CarGoal1", "cpo", num_envs=30, **paper)
+    write_run(tmp_path, "DoggoGoal1", "cpo", num_envs=60, frames=10**8, **paper)
+    assert {name for _, name, _ in names(grouped(tmp_path)[0])} == {"CPO"}
+    write_run(tmp_path, "DoggoGoal2", "cpo", num_envs=30, **paper)
+    found = {environment: name for environment, name, _ in names(grouped(tmp_path)[0])}
+    assert found["DoggoGoal2"] == "CPO (num_envs=30)"
+    assert {name for env, name in found.items() if env != "DoggoGoal2"} == {"CPO"}
 
 
 def test_the_preset_stands_for_what_follows_from_it():

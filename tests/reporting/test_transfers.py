@@ -70,7 +70,9 @@ def test_the_second_phase_follows_the_first(tmp_path):
             env_changes={"num_steps": 500},
         )  # fmt: skip
     transfer, figure = only_transfer_in(tmp_path)
-    assert transfer.title == "PointGoal1 → PointGoal2 (num_steps=500), CPO"
+    name = f"CPO (init_from={tmp_path}/PointGoal1/cpo, cost ≤ 10)"
+    title = f"PointGoal1 → PointGoal2 (num_steps=500), {name}"
+    assert transfer.title == title
     assert not transfer.notes
     returns, costs, rates = figure.axes
     before, after = solid_lines(costs)
@@ -215,6 +217,6 @@ def test_the_page_has_a_section(tmp_path):
     assert "was not found (runs/<gone>): drawn alone." in text
     assert "Cost rates are not joined" in html
     assert "Cost rates are not joined" in text
-    assert "![Transfer, PointGoal1 → PointGoal2, CPO (preset=default)](transfer_" in text
+    assert "![Transfer, PointGoal1 → PointGoal2, CPO (preset=default, init_from=" in text
     for number in (1, 2):
         assert imread(tmp_path / f"report/transfer_{number}.png").std() > 0
