@@ -80,6 +80,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(f"left out {path}: {reason}", file=sys.stderr)
     for slate, runs in result.lacking().items():
         print(f"{slate} lacks runs: {runs}")
+    if result.hardly_begun():
+        print(result.hardly_begun())
     print(f"wrote {page}")
     return 0
 

@@ -96,6 +96,7 @@ def _context(report: Report, out: Path, title: str) -> dict[str, Any]:
         "aggregates": aggregates,
         "gaps": gap_table(report.gaps),
         "lacking": report.lacking(),
+        "hardly_begun": report.hardly_begun(),
         "dominance": report.dominance,
         "evaluations": evaluation_table(report.experiments),
         "videos": [Media(caption, path) for caption, path in videos(report.experiments)],

@@ -84,13 +84,22 @@ class Report:
         return [run for experiment in self.experiments for run in experiment.runs]
 
     def lacking(self) -> dict[str, str]:
-        """Slate -> how many runs of which algorithms it lacks, in words."""
+        """Slate -> how many runs it lacks of the algorithms that have begun it, in words."""
+        begun = [gap for gap in self.gaps if gap.is_begun]
         return {
-            slate: ", ".join(
-                f"{g.num_runs} of {g.algorithm}" for g in self.gaps if g.slate == slate
-            )
-            for slate in dict.fromkeys(gap.slate for gap in self.gaps)
+            slate: ", ".join(f"{g.num_runs} of {g.algorithm}" for g in begun if g.slate == slate)
+            for slate in dict.fromkeys(gap.slate for gap in begun)
         }
+
+    def hardly_begun(self) -> str:
+        """A line on what :meth:`lacking` leaves out, or nothing."""
+        slates = dict.fromkeys(gap.slate for gap in self.gaps if not gap.is_begun)
+        if not slates:
+            return ""
+        return (
+            "Not listed: algorithms with runs on less than a third of the environments of "
+            f"{', '.join(slates)}."
+        )
 
 
 def build_report(
@@ -157,7 +166,11 @@ def _slates(
 ) -> tuple[list[Slate], list[Gap]]:
     """The slates that are complete for an algorithm or more, and what the others lack."""
     usable = [e for e in experiments if can_be_normalised(e)]
-    algorithms = list(dict.fromkeys(e.algorithm for e in experiments if e.benchmark in REFERENCE))
+    algorithms = list(
+        dict.fromkeys(
+            e.algorithm for e in experiments if e.benchmark in REFERENCE and not e.is_continued
+        )
+    )
     slates, missing = [], []
     for name, environments in SLATES.items():
         complete = []

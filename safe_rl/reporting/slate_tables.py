@@ -118,6 +118,7 @@ def gap_table(gaps: Sequence[Gap]) -> Table:
                 f"{name} (seeds {', '.join(map(str, seeds))})" for name, seeds in gap.seeds.items()
             ),
             "commands": "\n".join(gap.commands()),
+            "is_begun": gap.is_begun,
         }
         for gap in gaps
     ]

@@ -17,12 +17,16 @@ from safe_rl.protocol import (
     normalised_return,
     normalised_violation,
 )
-from safe_rl.reporting.experiments import Experiment
+from safe_rl.reporting.experiments import MANNER, Experiment
 from safe_rl.reporting.runs import Run
 
 __all__ = ["Aggregate", "Gap", "aggregate", "can_be_normalised", "find_gap", "normalised_scores"]
 
-_NOT_OF_THE_ALGORITHM = {"env", "algo", "seed", "hydra", "slate"}
+# What a command leaves out: others say it, or it does not change results. Other defaults of the
+# limits do, and so may the way in which environments are stepped.
+_NOT_OF_THE_ALGORITHM = {"env", "algo", "slate", "init_from"} | (
+    MANNER - {"default_cost_limits", "collector", "num_collectors"}
+)
 
 
 @dataclass(frozen=True)
@@ -56,6 +60,7 @@ class Gap:
         algorithm: Name of the algorithm, as experiments have it.
         overrides: What makes ``train.py`` run it.
         seeds: Environment -> seeds still to run.
+        environments_begun: Environments that have a run, finished or not.
 
     Examples:
         >>> gap = Gap("SG6", "CPO", ("algo=cpo",), {"CarGoal1": (0, 10)})
@@ -67,6 +72,12 @@ class Gap:
     algorithm: str
     overrides: tuple[str, ...]
     seeds: Mapping[str, tuple[int, ...]]
+    environments_begun: int = 0
+
+    @property
+    def is_begun(self) -> bool:
+        """Whether a third of the slate's environments have a run."""
+        return 3 * self.environments_begun >= len(SLATES[self.slate])
 
     @property
     def num_runs(self) -> int:
@@ -91,9 +102,16 @@ class Gap:
 
 
 def can_be_normalised(experiment: Experiment) -> bool:
-    """Whether there is something to normalise, and something to normalise it by."""
+    """Whether there is something to normalise, and something to normalise it by.
+
+    Runs that started from other runs' networks had more training than their steps say, and do not
+    count.
+    """
     has_limit = "cost" in experiment.limits
-    return experiment.reference is not None and has_limit and bool(experiment.finished)
+    is_afresh = not experiment.is_continued
+    return (
+        experiment.reference is not None and has_limit and is_afresh and bool(experiment.finished)
+    )
 
 
 def normalised_scores(experiment: Experiment) -> dict[str, np.ndarray]:
@@ -146,7 +164,11 @@ def find_gap(
         experiments: All experiments.
         seeds_needed: Finished runs that a slate takes per environment.
     """
-    own = {e.benchmark: e for e in experiments if e.algorithm == algorithm and e.benchmark}
+    own = {
+        e.benchmark: e
+        for e in experiments
+        if e.algorithm == algorithm and e.benchmark and not e.is_continued
+    }
     lacking: dict[str, tuple[int, ...]] = {}
     for environment in SLATES[slate]:
         experiment = own.get(environment)
@@ -159,7 +181,8 @@ def find_gap(
     if not lacking:
         return None
     example = next(e.runs[0] for e in experiments if e.algorithm == algorithm)
-    return Gap(slate, algorithm, _overrides(example), lacking)
+    begun = len(own.keys() & set(SLATES[slate]))
+    return Gap(slate, algorithm, _overrides(example), lacking, begun)
 
 
 def _seeds_left(done: set[int], seeds_needed: int) -> tuple[int, ...]:
@@ -171,9 +194,10 @@ def _seeds_left(done: set[int], seeds_needed: int) -> tuple[int, ...]:
 
 def _overrides(run: Run) -> tuple[str, ...]:
     """What a run's command line says beside environment and seed."""
-    kept = [
-        override
-        for override in run.overrides or ()
-        if override.lstrip("+~").partition("=")[0].partition(".")[0] not in _NOT_OF_THE_ALGORITHM
-    ]
+    kept = []
+    for override in run.overrides or ():
+        key = override.lstrip("+~").partition("=")[0]
+        group = key.partition(".")[0].partition("@")[0]
+        if group not in _NOT_OF_THE_ALGORITHM and not key.endswith(".compile"):
+            kept.append(override)
     return (f"algo={run.algorithm}", *kept)

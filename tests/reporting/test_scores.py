@@ -9,10 +9,11 @@ from synthetic import NODES, write_run
 from safe_rl.protocol import REFERENCE, SLATES
 from safe_rl.reporting.curves import mean_curve
 from safe_rl.reporting.experiments import group_runs
+from safe_rl.reporting.report import build_report
 from safe_rl.reporting.results import dominance_table, final_record, final_table
 from safe_rl.reporting.runs import find_runs
 from safe_rl.reporting.slate_tables import gap_table, middle_table, slate_table
-from safe_rl.reporting.slates import aggregate, find_gap
+from safe_rl.reporting.slates import aggregate, can_be_normalised, find_gap
 from safe_rl.reporting.tables import Column, Table, number, plain
 
 
@@ -197,7 +198,11 @@ def test_an_incomplete_slate_says_which_runs_it_lacks(tmp_path):
 
 
 def test_the_missing_runs_of_a_variant_are_those_of_the_variant(tmp_path):
-    said = ["env=PointGoal1", "env.num_steps=1000", "algo=cpo", "preset=paper", "+seed=0"]
+    said = [
+        *("env=PointGoal1", "env.num_steps=1000", "algo=cpo", "preset=paper", "+seed=0"),
+        *("init_from=runs/a", "checkpoint.interval=5", "num_threads=1", "device=cuda"),
+        *("logger=none", "compile=true", "policy_update.compile=true", "++hydra.run.dir=x"),
+    ]
     write_run(tmp_path, algo="cpo", overrides=said)
     gap = find_gap("SGDoggo", "CPO", experiments_in(tmp_path), 1)
     (command,) = gap.commands()
@@ -209,9 +214,25 @@ def test_a_slate_takes_environments_as_they_are_and_a_limit_of_the_cost(tmp_path
     write_run(tmp_path, "PointGoal1", "cpo", 0, env_changes={"hazards_num": 3})
     write_run(tmp_path, "PointGoal2", "cpo", 0, limits={"cost_hazards": 25.0})
     write_run(tmp_path, "PointPush1", "cpo", 0)
-    lacking = find_gap("SGPoint", "CPO", experiments_in(tmp_path), 1).seeds
-    assert {"PointGoal1", "PointGoal2"} <= set(lacking)
-    assert "PointPush1" not in lacking
+    write_run(tmp_path, "PointPush2", "cpo", 0, init_from="runs/PointPush1/cpo/seed0")
+    experiments = experiments_in(tmp_path)
+    gap = find_gap("SGPoint", "CPO (cost ≤ 25)", experiments, 1)
+    assert {"PointGoal1", "PointGoal2", "PointPush2"} <= set(gap.seeds)
+    assert "PointPush1" not in gap.seeds
+    # one of six environments has a run of it
+    assert (gap.environments_begun, gap.is_begun) == (1, False)
+    write_run(tmp_path, "PointButton1", "cpo", 0, frames=10**6)
+    assert find_gap("SGPoint", "CPO (cost ≤ 25)", experiments_in(tmp_path), 1).is_begun
+
+
+def test_runs_that_continue_others_count_towards_no_slate(tmp_path):
+    for env in SLATES["SG6"]:
+        write_run(tmp_path, env, "cpo", init_from="runs/PointGoal1/cpo/seed0")
+    experiments = experiments_in(tmp_path)
+    assert not any(map(can_be_normalised, experiments))
+    assert len(find_gap("SG6", experiments[0].algorithm, experiments, 1).seeds) == 6
+    result = build_report(tmp_path, NODES, seeds_needed=1, unfinished=False)
+    assert (result.slates, result.gaps) == ([], [])
 
 
 def test_curves_are_means_over_seeds_on_common_steps(tmp_path):
