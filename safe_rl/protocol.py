@@ -17,8 +17,10 @@ __all__ = [
     "COST_LIMIT",
     "EPISODE_LENGTH",
     "PUBLISHED",
+    "PUBLISHED_STEPS",
     "REFERENCE",
     "REIMPLEMENTATIONS",
+    "REIMPLEMENTATION_STEPS",
     "SEEDS",
     "SLATES",
     "Agent",
@@ -93,6 +95,9 @@ REFERENCE = {
     "DoggoPush2": Scores(1.193, 88.774, 0.097),
 }
 """Characteristic metrics of every constrained environment: the final ones of unconstrained PPO."""
+
+PUBLISHED_STEPS = {name: 10**8 if name.startswith("Doggo") else 10**7 for name in REFERENCE}
+"""Environment steps after which the paper's values were measured (section 5.2)."""
 
 SLATES: dict[str, tuple[str, ...]] = {
     "SG1": tuple(name for name in REFERENCE if name.endswith("1")),
@@ -176,6 +181,10 @@ REIMPLEMENTATIONS: dict[str, dict[str, tuple[float, float]]] = {
 Means over five seeds, on environments that are close to the 2019 ones and not identical with them.
 The paper prints no absolute values but those of PPO, which are :data:`REFERENCE`.
 """
+
+
+REIMPLEMENTATION_STEPS = 10**7
+"""Environment steps after which these were measured."""
 
 
 def normalised_return(episode_return: ArrayLike, reference: Scores) -> np.ndarray:

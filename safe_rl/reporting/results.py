@@ -7,9 +7,24 @@ from typing import Any
 
 import numpy as np
 
-from safe_rl.protocol import REFERENCE, REIMPLEMENTATIONS, Agent, compare
+from safe_rl.protocol import (
+    PUBLISHED_STEPS,
+    REFERENCE,
+    REIMPLEMENTATION_STEPS,
+    REIMPLEMENTATIONS,
+    Agent,
+    compare,
+)
 from safe_rl.reporting.experiments import Experiment
-from safe_rl.reporting.tables import MISSING, Column, Table, number, plain
+from safe_rl.reporting.tables import (
+    MISSING,
+    Column,
+    Table,
+    mark_best,
+    number,
+    plain,
+    power_of_ten,
+)
 
 __all__ = ["cost_keys_of", "dominance_table", "final_record", "final_table"]
 
@@ -67,7 +82,6 @@ def _published(experiment: Experiment) -> dict[str, Any]:
 
 def final_table(environment: str, records: Records, cost_keys: Sequence[str]) -> Table:
     """Final scores on one environment, with what others have published beside them."""
-    best = _best(records)
 
     def is_over(key: str) -> Any:
         return lambda r: "bad" if r.get(f"excess_{key}", 0.0) > 0 else ""
@@ -79,7 +93,7 @@ def final_table(environment: str, records: Records, cost_keys: Sequence[str]) ->
         Column(
             "$J_r$",
             number("episode_return", 2, "episode_return_std"),
-            _mark_if(best["episode_return"]),
+            _best(records, "episode_return", max),
         ),
     ]
     for key in cost_keys:
@@ -91,13 +105,15 @@ def final_table(environment: str, records: Records, cost_keys: Sequence[str]) ->
             Column(
                 rf"$\rho_c${suffix}",
                 number(rate, 4, f"{rate}_std"),
-                _mark_if(best.get(rate)),
+                _best(records, rate, min) if key == "cost" else lambda record: "",
             ),
         ]
     if any("paper_episode_return" in record for record in records):
-        columns.append(Column(r"paper: $J_r$ / $J_c$ / $\rho_c$", _paper))
+        paper = f"paper, {power_of_ten(PUBLISHED_STEPS[environment])} steps"
+        columns.append(Column(rf"{paper}: $J_r$ / $J_c$ / $\rho_c$", _paper))
     if any("later_return" in record for record in records):
-        columns.append(Column("later work: $J_r$ / $J_c$", _later))
+        later = f"later work, {power_of_ten(REIMPLEMENTATION_STEPS)} steps"
+        columns.append(Column(f"{later}: $J_r$ / $J_c$", _later))
     stem = "".join(c if c.isalnum() else "_" for c in environment).strip("_")
     notes = [_measure_note(record, key) for record in records for key in _other_measures(record)]
     return Table(f"final_{stem}", environment, columns, records, " ".join(notes))
@@ -121,17 +137,12 @@ def _limit(key: str) -> Any:
     return lambda record: f"{record[f'limit_{key}']:g}" if f"limit_{key}" in record else MISSING
 
 
-def _mark_if(best: Any) -> Any:
-    return lambda record: "best" if record is best else ""
-
-
-def _best(records: Records) -> dict[str, Any]:
-    """Highest return and lowest cost rate among those that satisfy their constraints."""
-    able = [record for record in records if record["satisfies"] and "cost_rate" in record]
-    return {
-        "episode_return": max(able, key=lambda r: r["episode_return"], default=None),
-        "cost_rate": min(able, key=lambda r: r["cost_rate"], default=None),
-    }
+def _best(records: Records, name: str, best: Any) -> Any:
+    """Mark of the best among those that satisfy their constraints."""
+    return mark_best(
+        records, name, best,
+        is_able=lambda r: r["satisfies"], steps=lambda r: r["steps"],
+    )  # fmt: skip
 
 
 def _paper(record: Any) -> str:
@@ -176,6 +187,8 @@ def dominance_table(records: Records) -> Table:
             Column("why", lambda r: reasons[r["reason"]], is_number=False),
         ],
         relations,
-        "By means over seeds (section 5.1 of the paper). Not ranked: algorithms that were trained "
-        "for different numbers of steps, or are each better in one respect.",
+        "By means over seeds (section 5.1 of the paper). What keeps its limits is better than what "
+        "does not, after however many steps. Not ranked: two that both violate theirs, and two "
+        "that both keep theirs, but after different numbers of steps or each better in one "
+        "respect.",
     )

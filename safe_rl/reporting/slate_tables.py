@@ -5,9 +5,25 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from safe_rl.protocol import NOISE_OF_ZERO, PUBLISHED, Agent, Normalised, compare
+from safe_rl.protocol import (
+    NOISE_OF_ZERO,
+    PUBLISHED,
+    PUBLISHED_STEPS,
+    SLATES,
+    Agent,
+    Normalised,
+    compare,
+)
 from safe_rl.reporting.slates import Aggregate, Gap
-from safe_rl.reporting.tables import Column, Table, number, plain, with_interval
+from safe_rl.reporting.tables import (
+    Column,
+    Table,
+    mark_best,
+    number,
+    plain,
+    power_of_ten,
+    with_interval,
+)
 
 __all__ = ["SYMBOLS", "gap_table", "middle_table", "slate_table"]
 
@@ -22,22 +38,36 @@ _Record = Mapping[str, Any]
 def slate_table(slate: str, aggregates: Sequence[Aggregate]) -> Table:
     """One of the paper's Tables 1 and 2, the published values beside ours."""
     records = [_record(slate, aggregate) for aggregate in aggregates]
-    able = [record for record in records if record["violation"] <= NOISE_OF_ZERO]
-    best = {
-        "episode_return": max(able, key=lambda r: r["episode_return"], default=None),
-        "cost_rate": min(able, key=lambda r: r["cost_rate"], default=None),
-    }
+    steps = {aggregate.algorithm: aggregate.steps for aggregate in aggregates}
+    marks = {
+        name: mark_best(
+            records, name, best,
+            is_able=lambda r: r["violation"] <= NOISE_OF_ZERO,
+            steps=lambda r: steps[r["algorithm"]],
+        )
+        for name, best in (("episode_return", max), ("cost_rate", min))
+    }  # fmt: skip
+    marks["violation"] = lambda r: "bad" if r["violation"] > NOISE_OF_ZERO else ""
     columns = [
         Column("algorithm", plain("algorithm"), is_number=False),
         Column("runs", plain("runs")),
         Column("steps", _steps),
     ]
     for name, symbol in SYMBOLS.items():
-        columns.append(Column(symbol, number(name, 3), _mark(name, best.get(name))))
+        columns.append(Column(symbol, number(name, 3), marks[name]))
     if slate in PUBLISHED:
         for name, symbol in SYMBOLS.items():
             columns.append(Column(f"paper {symbol}", number(f"paper_{name}", 3)))
-    return Table(f"slate_{slate}", slate, columns, records, _relations(aggregates))
+    notes = [_relations(aggregates), _published_steps(slate) if slate in PUBLISHED else ""]
+    return Table(f"slate_{slate}", slate, columns, records, " ".join(filter(None, notes)))
+
+
+def _published_steps(slate: str) -> str:
+    """After how many steps the published values were measured."""
+    steps = {PUBLISHED_STEPS[environment] for environment in SLATES[slate]}
+    texts = [power_of_ten(number) for number in sorted(steps)]
+    doggo = " (Doggo)" if len(texts) > 1 else ""
+    return f"The paper's values are those after {' and '.join(texts)}{doggo} steps."
 
 
 def middle_table(slate: str, aggregates: Sequence[Aggregate]) -> Table:
@@ -55,12 +85,6 @@ def middle_table(slate: str, aggregates: Sequence[Aggregate]) -> Table:
     columns = [Column("algorithm", plain("algorithm"), is_number=False)]
     columns += [Column(f"IQM {s}", with_interval(name, 3)) for name, s in SYMBOLS.items()]
     return Table(f"slate_{slate}_iqm", f"{slate}, interquartile means", columns, records)
-
-
-def _mark(name: str, best: Any) -> Any:
-    if name == "violation":
-        return lambda record: "bad" if record["violation"] > NOISE_OF_ZERO else ""
-    return lambda record: "best" if record is best else ""
 
 
 def _record(slate: str, aggregate: Aggregate) -> dict[str, Any]:

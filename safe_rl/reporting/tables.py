@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import csv
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-__all__ = ["MISSING", "Cell", "Column", "Table", "number", "plain", "with_interval"]
+__all__ = [
+    *("MISSING", "Cell", "Column", "Table", "mark_best", "number", "plain", "power_of_ten"),
+    "with_interval",
+]
 
 MISSING = "—"
 """Shown where there is no value."""
@@ -142,6 +145,52 @@ def with_interval(name: str, decimals: int) -> Callable[[Record], str]:
         return value(record) + (f" [{', '.join(ends)}]" if MISSING not in ends else "")
 
     return text
+
+
+def mark_best(
+    records: Sequence[Record],
+    name: str,
+    best: Callable[..., float],
+    *,
+    is_able: Callable[[Record], bool],
+    steps: Callable[[Record], Hashable],
+) -> Callable[[Record], str]:
+    """Mark of a column: "best" for the best value, and all equal to it, after equally many steps.
+
+    What nothing else has had as many steps as is not compared, and not marked.
+
+    Args:
+        records: Rows of the table.
+        name: Field of the value.
+        best: ``max`` or ``min``.
+        is_able: Which of them can be the best.
+        steps: Environment steps of training of a record.
+
+    Examples:
+        >>> rows = [{"x": x, "steps": steps} for x, steps in ((1, 5), (2, 5), (2, 5), (9, 6))]
+        >>> mark = mark_best(rows, "x", max, is_able=lambda r: True, steps=lambda r: r["steps"])
+        >>> [mark(row) for row in rows]
+        ['', 'best', 'best', '']
+    """
+
+    def mark(record: Record) -> str:
+        rivals = [other for other in records if steps(other) == steps(record)]
+        if len(rivals) < 2 or name not in record or not is_able(record):
+            return ""
+        winner = best(other[name] for other in rivals if name in other and is_able(other))
+        return "best" if math.isclose(record[name], winner, rel_tol=1e-9) else ""
+
+    return mark
+
+
+def power_of_ten(value: int) -> str:
+    """A power of ten as people write it.
+
+    Examples:
+        >>> power_of_ten(10_000_000)
+        '10⁷'
+    """
+    return f"10{str(round(math.log10(value))).translate(str.maketrans('0123456789', '⁰¹²³⁴⁵⁶⁷⁸⁹'))}"
 
 
 def plain(name: str) -> Callable[[Record], str]:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from synthetic import NODES, write_run
 
-from safe_rl.protocol import REFERENCE, SLATES
+from safe_rl.protocol import PUBLISHED_STEPS, REFERENCE, SLATES
 from safe_rl.reporting.curves import mean_curve
 from safe_rl.reporting.experiments import group_runs
 from safe_rl.reporting.report import build_report
@@ -80,6 +80,45 @@ def test_the_best_is_sought_among_those_that_keep_their_limits(tmp_path):
     assert marks(table, "$J_c$") == ["bad", "", "", ""]
     assert marks(table, "$J_r$") == ["", "", "", "best"]
     assert marks(table, r"$\rho_c$") == ["", "best", "", ""]
+
+
+def test_the_best_is_sought_among_runs_of_equal_steps_and_may_be_several(tmp_path):
+    for algo, value, epochs in (("a", 9.0, 1), ("b", 5.0, 2), ("c", 5.0, 2), ("d", 4.0, 2)):
+        write_run(tmp_path, algo=algo, returns=[value] * epochs, costs=[1.0] * epochs,
+                  rates=[1 / value] * epochs)  # fmt: skip
+    experiments = experiments_in(tmp_path)
+    table = final_table("PointGoal1", [final_record(e, ["cost"]) for e in experiments], ["cost"])
+    # the first one has the highest return, after fewer steps than any other
+    assert marks(table, "$J_r$") == ["", "best", "best", ""]
+    assert marks(table, r"$\rho_c$") == ["", "best", "best", ""]
+    slate = slate_table("SG6", [aggregate([e]) for e in experiments])
+    assert marks(slate, r"$\bar J_r$") == ["", "best", "best", ""]
+    assert marks(slate, r"$\bar \rho_c$") == ["", "best", "best", ""]
+
+
+def test_what_keeps_its_limits_is_better_after_any_number_of_steps(tmp_path):
+    write_run(tmp_path, algo="a", costs=[1.0])
+    write_run(tmp_path, algo="b", returns=[1, 1], costs=[90, 90], rates=[1, 1])
+    write_run(tmp_path, algo="c", returns=[0, 0], costs=[2, 2], rates=[1, 1])
+    table = dominance_table([final_record(e, ["cost"]) for e in experiments_in(tmp_path)])
+    ranks = {(r["better"], r["worse"], r["reason"]) for r in table.records}
+    assert ranks == {("a", "b", "satisfies"), ("c", "b", "satisfies")}
+    assert "does not, after however many steps" in table.note
+
+
+@pytest.mark.parametrize(
+    ("slate", "text"), [("SGPoint", "after 10⁷ steps"), ("SG6", "after 10⁷ and 10⁸ (Doggo) steps")]
+)
+def test_published_values_say_after_how_many_steps(tmp_path, slate, text):
+    write_run(tmp_path)
+    (experiment,) = experiments_in(tmp_path)
+    assert text in slate_table(slate, [aggregate([experiment])]).note
+    table = final_table("PointGoal1", [final_record(experiment, ["cost"])], ["cost"])
+    titles = [column.title for column in table.columns[-2:]]
+    assert titles == [
+        r"paper, 10⁷ steps: $J_r$ / $J_c$ / $\rho_c$", "later work, 10⁷ steps: $J_r$ / $J_c$",
+    ]  # fmt: skip
+    assert PUBLISHED_STEPS["DoggoPush2"] == 10**8
 
 
 def test_the_ranking_follows_the_two_rules(tmp_path):
