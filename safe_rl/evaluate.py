@@ -26,7 +26,7 @@ from safe_rl.evaluation.loading import (
     load_policy,
     override_env,
 )
-from safe_rl.evaluation.options import EvaluationOptions
+from safe_rl.evaluation.options import EvaluationOptions, check_options
 from safe_rl.evaluation.summary import format_estimates, summarise, write_episodes, write_summary
 from safe_rl.evaluation.video import record_episode, write_video
 from safe_rl.intervals import LEVEL, Estimate
@@ -65,12 +65,9 @@ def evaluate(directory: Path, options: EvaluationOptions, *, progress: bool = Fa
         FileNotFoundError: If the folder is not a run's, or has no such checkpoint.
         CheckpointError: If the checkpoint is damaged, or does not fit the environment.
         ConfigError: If the environment does not accept an override.
-        ValueError: If there are no episodes to run.
+        ValueError: If an option is out of its range.
     """
-    if options.episodes < 1 or options.num_envs < 1:
-        raise ValueError(
-            f"episodes={options.episodes} and num_envs={options.num_envs}: at least 1."
-        )
+    check_options(options)
     config = load_config(directory)
     checkpoint = find_checkpoint(directory, options.checkpoint)
     node = override_env(config, options.env)

@@ -15,7 +15,10 @@ from numpy.typing import ArrayLike
 
 from safe_rl.extras import import_extra
 
-__all__ = ["LEVEL", "Estimate", "bootstrap", "cvar", "interquartile_mean", "mean", "share_over"]
+__all__ = [
+    *("LEVEL", "Estimate", "bootstrap", "check_share", "cvar", "interquartile_mean", "mean"),
+    "share_over",
+]
 
 LEVEL = 0.95
 """Confidence level of all intervals."""
@@ -142,8 +145,7 @@ def cvar(values: ArrayLike, alpha: float) -> Estimate:
         >>> cvar([1.0, 2.0, 3.0, 4.0], alpha=0.5).value
         3.5
     """
-    if not 0.0 < alpha <= 1.0:
-        raise ValueError(f"cvar_alpha={alpha} must be a share of episodes, in (0, 1].")
+    check_share(alpha)
     values = np.asarray(values, dtype=float)
     size = alpha * len(values)
 
@@ -154,6 +156,16 @@ def cvar(values: ArrayLike, alpha: float) -> Estimate:
 
     low, high = bootstrap([values], tail_mean)
     return Estimate(float(tail_mean(values)), float(low), float(high))
+
+
+def check_share(alpha: float) -> None:
+    """Refuse what is no share of episodes that a CVaR can be the mean of.
+
+    Raises:
+        ValueError: If ``alpha`` is not in (0, 1].
+    """
+    if not 0.0 < alpha <= 1.0:
+        raise ValueError(f"cvar_alpha={alpha} must be a share of episodes, in (0, 1].")
 
 
 def share_over(values: ArrayLike, limit: float) -> Estimate:

@@ -5,7 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Any
 
-__all__ = ["EvaluationOptions"]
+from safe_rl.intervals import check_share
+
+__all__ = ["EvaluationOptions", "check_options"]
 
 
 def _option(default: Any, help: str) -> Any:
@@ -40,3 +42,16 @@ class EvaluationOptions:
         default_factory=dict,
         metadata={"help": "keys of the environment, as in training: env.hazards_num=12"},
     )
+
+
+def check_options(options: EvaluationOptions) -> None:
+    """Refuse what cannot be done before anything is.
+
+    Raises:
+        ValueError: If an option is out of its range; the message names it.
+    """
+    for name in ("episodes", "num_envs"):
+        value = getattr(options, name)
+        if value < 1:
+            raise ValueError(f"{name}={value}: at least 1.")
+    check_share(options.cvar_alpha)

@@ -3,12 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from math import inf
 from pathlib import Path
 from typing import Any
 
 from safe_rl.reporting.experiments import Experiment
 from safe_rl.reporting.runs import Run
-from safe_rl.reporting.tables import MISSING, Column, Table, number, plain, with_interval
+from safe_rl.reporting.tables import (
+    MISSING,
+    Column,
+    Table,
+    limit_text,
+    number,
+    plain,
+    with_interval,
+)
 
 __all__ = ["duration", "evaluation_table", "run_table", "videos"]
 
@@ -64,6 +73,9 @@ def evaluation_table(experiments: Sequence[Experiment]) -> Table:
         for run in experiment.runs
         for evaluation in run.evaluations()
     ]
+    names = dict.fromkeys(name for record in records for name in record)
+    limited = [name.removeprefix("limit_") for name in names if name.startswith("limit_")]
+    keys = list(dict.fromkeys(["cost", *limited]))
     columns = [
         Column("environment", plain("environment"), is_number=False),
         Column("algorithm", plain("algorithm"), is_number=False),
@@ -72,13 +84,12 @@ def evaluation_table(experiments: Sequence[Experiment]) -> Table:
         Column("episodes", plain("episodes")),
         Column("what", plain("manner"), is_number=False),
         Column("$J_r$", with_interval("episode_return", 2)),
-        Column("$J_c$", with_interval("episode_cost", 1), _over_limit),
-        Column("over limit", _share("over_limit_cost")),
-        Column("CVaR of the cost", _cvar),
     ]
+    for key in keys:
+        columns += _cost_columns(key, "" if len(keys) == 1 else f" [{key}]")
     note = (
         "Whole episodes of the trained policy, with 95 % intervals over episodes. Over limit: the "
-        "share of episodes that cost more than d. CVaR: mean cost of the costliest episodes, of "
+        "share of episodes that cost more than $d$. CVaR: mean cost of the costliest episodes, of "
         "how many is said before it."
     )
     return Table("evaluations", "Evaluations", columns, records, note)
@@ -98,19 +109,35 @@ def _evaluation_record(
         "steps": evaluation["steps"],
         "episodes": evaluation["episodes"],
         "manner": ", ".join(manner),
-        "limit": evaluation["cost_limits"].get("cost"),
         "cvar_alpha": evaluation["cvar_alpha"],
+        "other_measures": " ".join(experiment.limits_of_other_measures),
     }
+    record |= {f"limit_{key}": limit for key, limit in evaluation["cost_limits"].items()}
     for name, estimate in evaluation["estimates"].items():
         for part, value in estimate.items():
             record[name if part == "value" else f"{name}_{part}"] = value
     return record
 
 
-def _cvar(record: Any) -> str:
-    if "cvar_cost" not in record:
-        return MISSING
-    return f"{record['cvar_alpha']:.0%}: {with_interval('cvar_cost', 1)(record)}"
+def _cost_columns(key: str, suffix: str) -> list[Column]:
+    """J_c, d, share of episodes over it and CVaR of one cost."""
+
+    def is_over(record: Any) -> str:
+        # of another measure than the mean these episodes do not say whether it keeps the limit
+        if key in record["other_measures"].split():
+            return ""
+        return "bad" if record.get(f"episode_{key}", 0.0) > record.get(f"limit_{key}", inf) else ""
+
+    def cvar(record: Any) -> str:
+        shown = with_interval(f"cvar_{key}", 1)(record)
+        return shown if shown == MISSING else f"{record['cvar_alpha']:.0%}: {shown}"
+
+    return [
+        Column(f"$J_c${suffix}", with_interval(f"episode_{key}", 1), is_over),
+        Column(f"$d${suffix}", limit_text(key)),
+        Column(f"over limit{suffix}", _share(f"over_limit_{key}")),
+        Column(f"CVaR of the cost{suffix}", cvar),
+    ]
 
 
 def _share(name: str) -> Any:
@@ -119,11 +146,6 @@ def _share(name: str) -> Any:
         return MISSING if value is None else f"{value:.0%}"
 
     return text
-
-
-def _over_limit(record: Any) -> str:
-    limit = record["limit"]
-    return "bad" if limit is not None and record["episode_cost"] > limit else ""
 
 
 def videos(experiments: Sequence[Experiment]) -> Iterator[tuple[str, Path]]:

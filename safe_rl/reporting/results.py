@@ -20,6 +20,7 @@ from safe_rl.reporting.tables import (
     MISSING,
     Column,
     Table,
+    limit_text,
     mark_best,
     number,
     plain,
@@ -101,7 +102,7 @@ def final_table(environment: str, records: Records, cost_keys: Sequence[str]) ->
         cost, rate = f"episode_{key}", f"{key}_rate"
         columns += [
             Column(f"$J_c${suffix}", number(cost, 1, f"{cost}_std"), is_over(key)),
-            Column(f"$d${suffix}", _limit(key)),
+            Column(f"$d${suffix}", limit_text(key)),
             Column(
                 rf"$\rho_c${suffix}",
                 number(rate, 4, f"{rate}_std"),
@@ -131,10 +132,6 @@ def _measure_note(record: Any, key: str) -> str:
         f"{record['algorithm']}: the limit of {key} is on another measure than the mean $J_c$; "
         f"over the last five epochs that measure was {verdict}, and this is what is judged."
     )
-
-
-def _limit(key: str) -> Any:
-    return lambda record: f"{record[f'limit_{key}']:g}" if f"limit_{key}" in record else MISSING
 
 
 def _best(records: Records, name: str, best: Any) -> Any:

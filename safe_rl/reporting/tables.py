@@ -10,8 +10,8 @@ from pathlib import Path
 from typing import Any
 
 __all__ = [
-    *("MISSING", "Cell", "Column", "Table", "mark_best", "number", "plain", "power_of_ten"),
-    "with_interval",
+    *("MISSING", "Cell", "Column", "Table", "limit_text", "mark_best", "number", "plain"),
+    *("power_of_ten", "with_interval"),
 ]
 
 MISSING = "—"
@@ -191,6 +191,11 @@ def power_of_ten(value: int) -> str:
         '10⁷'
     """
     return f"10{str(round(math.log10(value))).translate(str.maketrans('0123456789', '⁰¹²³⁴⁵⁶⁷⁸⁹'))}"
+
+
+def limit_text(key: str) -> Callable[[Record], str]:
+    """Text of the limit of a cost, the field ``limit_<key>``."""
+    return lambda record: f"{record[f'limit_{key}']:g}" if f"limit_{key}" in record else MISSING
 
 
 def plain(name: str) -> Callable[[Record], str]:

@@ -170,6 +170,20 @@ def test_what_cannot_be_done_ends_in_one_line(run, arguments, message, capsys):
     assert message in error
 
 
+@pytest.mark.parametrize(
+    ("argument", "others"), [("episodes=0", "num_envs"), ("num_envs=0", "episodes"),
+                             ("cvar_alpha=3.0", "episodes="), ("cvar_alpha=nan", "episodes=")]
+)  # fmt: skip
+def test_options_out_of_range_are_refused_before_anything_runs(
+    argument, others, run, capsys, monkeypatch
+):
+    monkeypatch.setattr("safe_rl.evaluate.load_config", None)
+    assert main([str(run), argument]) == 1
+    error = capsys.readouterr().err
+    assert error.startswith(f"error: {argument}")
+    assert others not in error
+
+
 def test_a_folder_above_runs_names_them(run, capsys):
     assert main([str(run.parent)]) == 1
     assert f"Runs below it: {run}" in capsys.readouterr().err

@@ -15,7 +15,7 @@ from synthetic import NODES, write_run
 from safe_rl.report import main
 from safe_rl.reporting.experiments import group_runs
 from safe_rl.reporting.figures import add_legend, algorithm_styles, draw_learning_curves, save
-from safe_rl.reporting.inventory import duration
+from safe_rl.reporting.inventory import duration, evaluation_table
 from safe_rl.reporting.runs import find_runs
 
 CHROMIUM = next(
@@ -82,6 +82,40 @@ def test_the_markdown_has_the_tables(report):
     assert "| PointGoal1 | PPO-Lagrangian | PPO | keeps its limits, the other does not |" in text
     assert "sampled actions" not in text
     assert "mean actions, x=1, 0% known layouts | 12.00 [11.00, 13.00] | 21.0 [20.0, 22.0]" in text
+
+
+def test_an_evaluation_shows_every_limit(tmp_path):
+    limits = {"cost_hazards": 5.0, "cost_vases": 30.0}
+    columns = {"episode_cost_hazards": [4.0], "cost_hazards_rate": [0.1], "violation_cost": [-9.0]}
+    directory = write_run(tmp_path, "PointGoal1", "ppo", limits=limits, columns=columns)
+    estimates = {"episode_return": _estimate(12.0), "episode_cost": _estimate(40.0)}
+    for key, cost in (("cost_hazards", 21.0), ("cost_vases", 22.0)):
+        estimates |= {
+            f"episode_{key}": _estimate(cost), f"cvar_{key}": _estimate(cost + 10),
+            f"over_limit_{key}": _estimate(0.25),
+        }  # fmt: skip
+    evaluation = {**EVALUATION, "cost_limits": limits, "estimates": estimates}
+    (directory / "evaluation.json").write_text(json.dumps(evaluation))
+    table = evaluation_table(group_runs(find_runs(tmp_path)[0], NODES)[0])
+    cells = dict(zip((c.title for c in table.columns), table.rows()[0], strict=True))
+    assert (cells["$J_c$ [cost]"].text, cells["$d$ [cost]"].text) == ("40.0 [39.0, 41.0]", "—")
+    for key, cost, limit, mark in (
+        ("cost_hazards", 21, "5", "bad"),
+        ("cost_vases", 22, "30", ""),
+    ):
+        assert cells[f"$J_c$ [{key}]"].text == f"{cost}.0 [{cost - 1}.0, {cost + 1}.0]"
+        assert cells[f"$J_c$ [{key}]"].mark == mark
+        assert cells[f"$d$ [{key}]"].text == limit
+        assert cells[f"over limit [{key}]"].text == "25%"
+        assert cells[f"CVaR of the cost [{key}]"].text.startswith(f"10%: {cost + 10}.0 [")
+
+
+def test_an_evaluation_is_not_judged_by_the_mean_if_training_was_not(tmp_path):
+    directory = write_run(tmp_path, columns={"violation_cost": [3.0]})
+    estimates = {**EVALUATION["estimates"], "episode_cost": _estimate(90.0)}
+    (directory / "evaluation.json").write_text(json.dumps({**EVALUATION, "estimates": estimates}))
+    table = evaluation_table(group_runs(find_runs(tmp_path)[0], NODES)[0])
+    assert "bad" not in [cell.mark for cell in table.rows()[0]]
 
 
 def test_times_are_in_minutes_or_hours():
