@@ -163,7 +163,7 @@ def _plot(
 ) -> None:
     axis.plot(
         steps, heights, color=colour, linestyle=line, linewidth=width, label=label,
-        marker=point_marker(steps), markersize=5,
+        marker=point_marker(steps), markersize=5, clip_on=not point_marker(steps),
     )  # fmt: skip
 
 

@@ -168,6 +168,17 @@ def test_seeds_that_start_from_one_run_are_one_sample_of_it(tmp_path):
     assert len(transfer.second.runs) == 2
 
 
+def test_a_second_phase_of_one_epoch_is_a_whole_point(tmp_path):
+    second = {"returns": (1.0,), "costs": (50.0,), "rates": (0.09,)}
+    write_second(tmp_path, write_first(tmp_path), **second)
+    _, figure = only_transfer_in(tmp_path)
+    for axis in figure.axes:
+        before, after = solid_lines(axis)
+        assert (before.get_marker(), after.get_marker()) == ("", "o")
+        # it lies on the edge of the panel
+        assert not after.get_clip_on()
+
+
 def test_best_checkpoints_of_different_ages(tmp_path):
     for seed, steps in ((0, 1000), (10, 3000)):
         first = write_first(tmp_path, seed)
