@@ -12,12 +12,12 @@ from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
 from tqdm import tqdm
 
-from safe_rl.plotting import draw_learning_curves
+from safe_rl.plotting import SMOOTHING_EPOCHS, draw_learning_curves
 from safe_rl.tables import TableWriter, read_table
 
 __all__ = ["FINAL_EPOCHS", "RunFolder", "final_figures"]
 
-FINAL_EPOCHS = 5
+FINAL_EPOCHS = SMOOTHING_EPOCHS  # so that curves end at the final figures
 """Epochs over which the final J_r and J_c are averaged (Ray et al. 2019, section 5.1)."""
 
 
@@ -149,7 +149,9 @@ class RunFolder:
     def draw_curves(self) -> None:
         """Write ``curves.png`` from the table."""
         table = read_table(self.table_path)
-        title = f"{self._config.get('env', {}).get('name', '')} {self._config.algo.name}".strip()
+        config = self._config
+        seed = f"seed {config.seed}" if "seed" in config else ""
+        title = f"{config.get('env', {}).get('name', '')} {config.algo.name} {seed}".strip()
         path = self.directory / "curves.png"
         draw_learning_curves(table, self._cost_limits, self._episode_length, path, title)
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from functools import cache, partial
 
 import torch
 from torch import Tensor
@@ -55,7 +56,8 @@ def _pseudo(
         if kind in kinds
     )
     slots, group = torch.tensor(seen, dtype=torch.int64).view(-1, 2).T.contiguous()
-    cells = lidar_cells(group, config.lidar_num_bins)
+    # The same at every step, but how many robots there are is known at the first.
+    cells = cache(partial(lidar_cells, group, len(kinds), config.lidar_num_bins))
     all_seen = len(slots) == len(scene.names)
 
     def read(world: World) -> Tensor:
@@ -64,7 +66,7 @@ def _pseudo(
             xy = xy.index_select(1, slots)
         return pseudo_lidar(
             floor_to_ego(xy, world.robot_pos, world.robot_mat),
-            cells,
+            cells(len(xy)),
             len(kinds),
             config.lidar_num_bins,
             config.lidar_max_dist,

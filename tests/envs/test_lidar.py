@@ -133,7 +133,7 @@ def test_kinds_that_are_not_observed_light_up_nothing(unseen):
 @pytest.mark.parametrize("num_bins", [*range(1, 30), 56, 122, 220])
 def test_straight_behind_is_half_way_round(num_bins):
     xy = torch.tensor([[[-1.0, 0.0]], [[-1.0, -0.0]]], dtype=torch.float64)
-    cells = lidar_cells(torch.tensor([0]), num_bins)
+    cells = lidar_cells(torch.tensor([0]), 1, num_bins, 2)
     seen = pseudo_lidar(xy, cells, 1, num_bins, 2.0, 0.0, alias=False)
     assert seen.argmax(1).tolist() == [num_bins // 2] * 2
 
@@ -217,11 +217,13 @@ def test_any_number_of_bins_closes_to_a_circle(num_bins):
     edges = [(1.0, 0.0), (1.0, -0.0), (1.0, -1e-17), (-1.0, 0.0), (-1.0, -1e-17), (0.0, -2.0)]
     xy = torch.cat([torch.tensor(edges).double(), torch.randn(60, 2, dtype=torch.float64)])
     group = torch.arange(len(xy)) % 2
-    cells = lidar_cells(group, num_bins)
-    seen = pseudo_lidar(xy.unsqueeze(0), cells, 2, num_bins, None, 1.0, alias=True)
+    cells = lidar_cells(group, 2, num_bins, 3)
+    seen = pseudo_lidar(
+        torch.stack([xy.flip(1), xy, -xy]), cells, 2, num_bins, None, 1.0, alias=True
+    )
     alone = [one_by_one(*place, num_bins) for place in xy.tolist()]
     want = [np.max([a for a, g in zip(alone, group, strict=True) if g == k], 0) for k in (0, 1)]
-    np.testing.assert_allclose(seen[0].unflatten(0, (2, -1)), want, atol=1e-12)
+    np.testing.assert_allclose(seen[1].unflatten(0, (2, -1)), want, atol=1e-12)
 
 
 def test_points_on_the_floor_turn_like_all_others():
