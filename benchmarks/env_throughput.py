@@ -108,7 +108,10 @@ def measure(name, change, num_envs, threads, steps, repeats):
 def measure_apart(*arguments):
     """Measure in a process of its own, so that peak memory is that of one environment."""
     command = [sys.executable, __file__, "--row", *map(str, arguments)]
-    return json.loads(subprocess.run(command, check=True, stdout=subprocess.PIPE, text=True).stdout)
+    result = subprocess.run(command, stdout=subprocess.PIPE, text=True)
+    if result.returncode:
+        raise SystemExit(result.returncode)  # it has said why
+    return json.loads(result.stdout)
 
 
 def main():

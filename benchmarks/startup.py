@@ -45,10 +45,11 @@ def run(code, *arguments, **variables):
         [sys.executable, "-c", code, *arguments],
         cwd=ROOT,
         env=os.environ | variables | {"PYTHONPATH": str(ROOT)},
-        check=True,
-        stdout=subprocess.PIPE,
+        capture_output=True,
         text=True,
     )
+    if result.returncode:
+        raise SystemExit(result.stderr)
     return result.stdout
 
 

@@ -14,7 +14,7 @@ from omegaconf import OmegaConf
 __all__ = ["CommandLineError", "check_overrides"]
 
 # with folders of one's own, names are not only those of `conf/`
-_OTHER_FOLDERS = ("--config-dir", "-cd", "--config-path", "-cp", "--config-name", "-cn", "hydra.")
+_OTHER_FOLDERS = ("--config-dir", "-cd", "--config-path", "-cp", "hydra.searchpath")
 
 
 class CommandLineError(ValueError):

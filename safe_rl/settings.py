@@ -67,7 +67,11 @@ def check_settings(config: DictConfig) -> None:
         value = OmegaConf.select(config, row.key)
         if not row.holds(value):
             raise SettingError(f"{row.key}={value}: it must be {row.meaning}.")
-    if torch.device(config.device).type == "cuda" and not torch.cuda.is_available():
+    try:
+        kind = torch.device(config.device).type
+    except RuntimeError as error:
+        raise SettingError(f"device={config.device}: {error}") from None
+    if kind == "cuda" and not torch.cuda.is_available():
         raise SettingError(f"device={config.device}: this torch finds no CUDA device.")
 
 

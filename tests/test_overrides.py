@@ -48,7 +48,7 @@ def test_right_names_pass(arguments):
 @pytest.mark.parametrize("argument", WRONG)
 def test_wrong_names_name_the_nearest(argument):
     with pytest.raises(CommandLineError, match=WRONG[argument]):
-        check_overrides(["seed=0", argument], CONF, ENV_KEYS)
+        check_overrides(["seed=0", "hydra.run.dir=x", argument], CONF, ENV_KEYS)
 
 
 @pytest.mark.parametrize("algo", ["ppo", "trpo", "cpo", "ppo_lagrangian,cpo"])

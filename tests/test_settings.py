@@ -21,6 +21,7 @@ WRONG = {
     "checkpoint.keep_last=0": r"checkpoint\.keep_last=0",
     "num_threads=0": "num_threads=0",
     "model.hidden_sizes=64": r"model\.hidden_sizes=64: it must be a list of widths",
+    "device=gpu": "device=gpu: Expected one of cpu, cuda",
     "cost_limits=25": r"cost_limits=25: it must be limits by cost",
 }
 

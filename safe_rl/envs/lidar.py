@@ -76,6 +76,8 @@ def pseudo_lidar(
 ) -> Tensor:
     """Closeness of the nearest object in every direction, for several kinds of object at once.
 
+    On the CPU, where the worlds are.
+
     Args:
         ego_xy: objects in the robot's frame [N, M, 2] (m).
         cells: of the objects, from `lidar_cells` [N, M].

@@ -36,6 +36,8 @@ from safe_rl.envs.tasks import TASKS, dense_reward
 from safe_rl.envs.validation import require_integer
 from safe_rl.envs.world import make_world, refresh
 
+_FLAGS = ("goal_met", "done", "terminated", "truncated")
+
 
 class SafetyGymEnv(EnvBase):
     """N parallel worlds of one Safety Gym configuration, stepped together on a thread pool.
@@ -144,9 +146,8 @@ class SafetyGymEnv(EnvBase):
 
     def _reset_output(self) -> TensorDict:
         """What a reset returns, for the worlds as they are."""
-        names = ("goal_met", "done", "terminated", "truncated")
-        none = torch.zeros(len(names), *self.batch_size, 1, dtype=torch.bool)
-        return self._pack(dict(zip(names, none, strict=True)))
+        none = torch.zeros(len(_FLAGS), *self.batch_size, 1, dtype=torch.bool)
+        return self._pack(dict(zip(_FLAGS, none, strict=True)))
 
     def _pack(self, outputs: dict[str, Any]) -> TensorDict:
         """Add the observation and move everything to the device."""
@@ -180,7 +181,7 @@ class SafetyGymEnv(EnvBase):
         truncated = (time_out if stuck is None else time_out | stuck) & ~terminated
         numbers = torch.cat([reward.unsqueeze(0), costs]).to(torch.float32).unsqueeze(-1)
         flags = torch.stack([met, terminated | truncated, terminated, truncated]).unsqueeze(-1)
-        names = ("reward", *self.cost_keys, "goal_met", "done", "terminated", "truncated")
+        names = ("reward", *self.cost_keys, *_FLAGS)
         return self._pack(dict(zip(names, (*numbers, *flags), strict=True)))
 
     def _step_proc_data(self, next_tensordict_out: TensorDictBase) -> TensorDictBase:
