@@ -17,7 +17,7 @@ from omegaconf import OmegaConf
 
 import safe_rl.openmp  # noqa: F401, has to come before torch
 from safe_rl.envs import make_env, store_configs
-from safe_rl.training import build_trainer, seed_everything
+from safe_rl.training.trainer import build_trainer, seed_everything
 
 CONF = Path(__file__).resolve().parents[1] / "conf"
 

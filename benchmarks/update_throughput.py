@@ -18,17 +18,16 @@ from collections.abc import Callable
 import torch
 from tensordict import TensorDict
 
+from safe_rl.algorithms import CPOStep, TRPOStep
+from safe_rl.algorithms.minibatch import MinibatchUpdate
 from safe_rl.models import make_actor, make_critic
 from safe_rl.objectives import (
     CPOLoss,
-    CPOStep,
     CriticLoss,
     LagrangeMultiplier,
     PPOLagrangianLoss,
     TRPOLagrangianLoss,
-    TRPOStep,
 )
-from safe_rl.updates import MinibatchUpdate
 
 TRUST_REGION = {
     "target_kl": 0.01,

@@ -27,7 +27,7 @@ from safe_rl.envs.extending import (
     register_element,
     register_observation,
 )
-from safe_rl.training import build_trainer, seed_everything
+from safe_rl.training.trainer import build_trainer, seed_everything
 
 CONF = Path(__file__).resolve().parents[1] / "conf"
 

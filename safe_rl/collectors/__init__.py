@@ -1,6 +1,6 @@
 """Data collection with cost accounting."""
 
-from safe_rl.collectors.episodes import EpisodeAccounting, EpisodeStatistics
+from safe_rl.collectors.accounting import EpisodeAccounting, EpisodeStatistics
 from safe_rl.collectors.factory import make_collector
 from safe_rl.collectors.workers import (
     WorkerCollector,

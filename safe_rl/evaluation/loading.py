@@ -11,9 +11,9 @@ from omegaconf import DictConfig, OmegaConf
 from torchrl.checkpoint import CheckpointError
 from torchrl.envs import EnvBase
 
-from safe_rl.building import build_networks
-from safe_rl.checkpoints import CheckpointStore
+from safe_rl.algorithms.building import build_networks
 from safe_rl.models import BehaviourPolicy
+from safe_rl.runs.checkpoints import CheckpointStore
 
 __all__ = ["checkpoint_steps", "find_checkpoint", "load_config", "load_policy", "override_env"]
 

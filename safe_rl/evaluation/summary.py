@@ -10,8 +10,8 @@ from pathlib import Path
 from typing import Any
 
 from safe_rl.evaluation.episodes import Episodes
-from safe_rl.intervals import Estimate, cvar, mean, share_over
-from safe_rl.protocol import Scores, normalised_return, normalised_violation
+from safe_rl.scores.intervals import Estimate, cvar, mean, share_over
+from safe_rl.scores.protocol import Scores, normalised_return, normalised_violation
 
 __all__ = ["format_estimates", "summarise", "write_episodes", "write_summary"]
 

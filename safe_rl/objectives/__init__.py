@@ -5,24 +5,23 @@ Everything here works on TensorDict keys alone and knows no environment:
 - `VectorGAE`, `CostGAE`, `normalise_advantages`: advantages of the reward and of k costs;
 - `LagrangeMultiplier`, `PIDMultiplier`: one λ per cost, moved by the mean episode costs;
 - `PPOLoss`, `PPOLagrangianLoss`: policy losses for an optimiser;
-- `TRPOLoss`, `TRPOLagrangianLoss`, `CPOLoss`: policy losses for `TRPOStep` and `CPOStep`, whose
-  pieces are in `safe_rl.objectives.trust_region` and `safe_rl.objectives.cpo_dual`;
+- `TRPOLoss`, `TRPOLagrangianLoss`, `CPOLoss`: policy losses for the steps of `safe_rl.algorithms`,
+  whose mathematics is in `safe_rl.objectives.trust_region` and `safe_rl.objectives.cpo_dual`;
 - `CriticLoss`: squared errors of the reward and the cost critic.
 """
 
 from safe_rl.objectives.advantages import CostGAE, VectorGAE
-from safe_rl.objectives.cpo import CPOLoss, CPOStep
+from safe_rl.objectives.cpo import CPOLoss
 from safe_rl.objectives.critics import CriticLoss
 from safe_rl.objectives.multipliers import LagrangeMultiplier, Multiplier
 from safe_rl.objectives.normalisation import normalise_advantages
 from safe_rl.objectives.pid import PIDMultiplier
 from safe_rl.objectives.ppo import PPOLagrangianLoss, PPOLoss
 from safe_rl.objectives.surrogate import SurrogateLoss
-from safe_rl.objectives.trpo import TRPOLagrangianLoss, TRPOLoss, TRPOStep
+from safe_rl.objectives.trpo import TRPOLagrangianLoss, TRPOLoss
 
 __all__ = [
     "CPOLoss",
-    "CPOStep",
     "CostGAE",
     "CriticLoss",
     "LagrangeMultiplier",
@@ -33,7 +32,6 @@ __all__ = [
     "SurrogateLoss",
     "TRPOLagrangianLoss",
     "TRPOLoss",
-    "TRPOStep",
     "VectorGAE",
     "normalise_advantages",
 ]

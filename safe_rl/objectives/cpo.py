@@ -1,29 +1,21 @@
-"""Constrained policy optimisation (Achiam, Held, Tamar and Abbeel 2017)."""
+"""Surrogates of constrained policy optimisation (Achiam, Held, Tamar and Abbeel 2017)."""
 
 from __future__ import annotations
-
-from collections.abc import Callable
 
 import torch
 from tensordict import TensorDictBase
 from tensordict.nn import ProbabilisticTensorDictSequential
 from torch import Tensor
 
-from safe_rl.objectives.cpo_dual import DualSolution, solve_dual
 from safe_rl.objectives.surrogate import SurrogateLoss
-from safe_rl.objectives.trpo import Proposal, TRPOStep, total_loss
-from safe_rl.objectives.trust_region import FisherProduct, flat_gradient
-
-#: Squared norm of a cost gradient below which a satisfied constraint is left out (case 4).
-_NO_GRADIENT = 1e-8
 
 
 class CPOLoss(SurrogateLoss):
     """Surrogates of CPO: ``loss_objective`` = −E[ρ A] and ``cost_surrogate`` = E[ρ A_c], [k].
 
-    Both carry gradients. The cost surrogates are constraints, not losses: `CPOStep` keeps them
-    within their limits; with an optimiser of your own, combine them as you see fit. See
-    `SurrogateLoss` for what it reads and writes.
+    Both carry gradients. The cost surrogates are constraints, not losses: a
+    `safe_rl.algorithms.CPOStep` keeps them within their limits; with an optimiser of your own,
+    combine them as you see fit. See `SurrogateLoss` for what it reads and writes.
 
     Args:
         actor_network: policy with `get_dist` and a Gaussian distribution.
@@ -56,163 +48,4 @@ class CPOLoss(SurrogateLoss):
         return {
             "loss_objective": -ratio * self._advantage(tensordict, log_weight),
             "cost_surrogate": torch.stack([self._reduce_loss(cost, tensordict) for cost in costs]),
-        }
-
-
-def constraint_value(
-    cost_violation: Tensor, episode_length: Tensor, rescale_violation: bool
-) -> Tensor:
-    """c, the constraint violation in the units of the cost surrogate's gradient, [k].
-
-    A cost surrogate is an average per step, so the violation of an episode's cost has to be
-    divided by the episode's length. Without the division c is some thousand times too large, and
-    the boundary of the feasible set almost never crosses the trust region.
-
-    Args:
-        cost_violation: J_c − d, [k]. NaN (no episode has finished) counts as 0: the policy is
-            taken to be at the limit, and not allowed to raise the cost.
-        episode_length: T̄, scalar.
-        rescale_violation: whether to divide.
-
-    Returns:
-        c, [k].
-    """
-    divisor = episode_length if rescale_violation else torch.ones_like(episode_length)
-    return (cost_violation / divisor).nan_to_num(nan=0.0)
-
-
-class CPOStep(TRPOStep):
-    """Step on a loss within a trust region and k linearised cost constraints.
-
-    With g the gradient of the loss, bᵢ those of the cost surrogates and cᵢ the constraint
-    violations, the step solves the CPO problem by its dual (see `cpo_dual`). The line search
-    takes the first fraction with KL(π_θ ‖ π_k) ≤ δ and L_c(new) − L_c(old) ≤ max(−c, 0), and,
-    unless the step is a recovery (cases 0 and 1), a loss that is not worse.
-
-    Args:
-        loss: a `CPOLoss`, or a callable of your own that returns a TensorDict with scalars
-            ``loss_…`` and the differentiable ``cost_surrogate``, [k].
-        rescale_violation: whether to divide the violations by the episode length; see
-            `constraint_value`.
-        target_kl: radius δ of the trust region, mean KL over the states of the batch.
-        damping: multiple of the identity added to the Fisher matrix.
-        cg_iterations: iterations of the conjugate gradient method, for g and for every bᵢ.
-        backtrack_coeff: factor between one try of the line search and the next.
-        max_backtracks: tries of the line search.
-        fisher_subsample: fraction of the batch that the Fisher matrix is averaged over.
-        actor_network: policy to step; by default ``loss.actor_network``.
-
-    Examples:
-        >>> from tensordict import TensorDict
-        >>> from tensordict.nn import AddStateIndependentNormalScale, TensorDictModule
-        >>> from torchrl.modules import IndependentNormal, ProbabilisticActor
-        >>> net = torch.nn.Sequential(torch.nn.Linear(3, 2), AddStateIndependentNormalScale(2))
-        >>> actor = ProbabilisticActor(
-        ...     TensorDictModule(net, in_keys=["observation"], out_keys=["loc", "scale"]),
-        ...     in_keys=["loc", "scale"],
-        ...     distribution_class=IndependentNormal,
-        ...     return_log_prob=True,
-        ... )
-        >>> with torch.no_grad():
-        ...     batch = actor(TensorDict(observation=torch.randn(8, 3), batch_size=[8]))
-        >>> batch["advantage"], batch["cost_advantage"] = torch.randn(8, 1), torch.randn(8, 1)
-        >>> step = CPOStep(
-        ...     CPOLoss(actor, entropy_coeff=0.0),
-        ...     rescale_violation=True,
-        ...     target_kl=0.01,
-        ...     damping=0.1,
-        ...     cg_iterations=10,
-        ...     backtrack_coeff=0.8,
-        ...     max_backtracks=10,
-        ... )
-        >>> step(batch, cost_violation=torch.tensor([-25.0]), episode_length=torch.tensor(50.0))[
-        ...     "case"
-        ... ]
-        tensor(3)
-    """
-
-    def __init__(
-        self,
-        loss: Callable[[TensorDictBase], TensorDictBase],
-        *,
-        rescale_violation: bool,
-        target_kl: float,
-        damping: float,
-        cg_iterations: int,
-        backtrack_coeff: float,
-        max_backtracks: int,
-        fisher_subsample: float = 1.0,
-        actor_network: ProbabilisticTensorDictSequential | None = None,
-    ) -> None:
-        super().__init__(
-            loss,
-            target_kl=target_kl,
-            damping=damping,
-            cg_iterations=cg_iterations,
-            backtrack_coeff=backtrack_coeff,
-            max_backtracks=max_backtracks,
-            fisher_subsample=fisher_subsample,
-            actor_network=actor_network,
-        )
-        self.rescale_violation = rescale_violation
-
-    def _propose(
-        self,
-        losses: TensorDictBase,
-        fisher: FisherProduct,
-        cost_violation: Tensor | None,
-        episode_length: Tensor | None,
-    ) -> Proposal:
-        loss, surrogates = total_loss(losses), losses["cost_surrogate"]
-        c = self._constraint(surrogates, cost_violation, episode_length)
-        g = flat_gradient(loss, self.parameters, retain_graph=True)
-        b = torch.stack(
-            [flat_gradient(cost, self.parameters, retain_graph=True) for cost in surrogates]
-        )
-        # Left out by a zero gradient: the dual takes such constraints for case 4.
-        b = b * ~((b.square().sum(-1, keepdim=True) <= _NO_GRADIENT) & (c[:, None] < 0))
-        v = self._solve(fisher, g)
-        w = torch.stack([self._solve(fisher, row) for row in b])
-        q, r, s = g @ v, w @ g, b @ w.T
-        dual = solve_dual(q, r, s, c, self.target_kl)
-        step = -(dual.reward_coefficient * v + dual.cost_coefficient @ w)
-        before, cost_before = loss.detach(), surrogates.detach()
-        allowance = (-c).clamp_min(0)
-
-        def is_acceptable(after: TensorDictBase) -> bool:
-            not_worse = total_loss(after) <= before
-            within = (after["cost_surrogate"] - cost_before <= allowance).all()
-            return bool((not_worse | (dual.case < 2)) & within)
-
-        return Proposal(step, is_acceptable, self._diagnostics(q, r, s.diagonal(), c, dual))
-
-    def _constraint(
-        self, surrogates: Tensor, cost_violation: Tensor | None, episode_length: Tensor | None
-    ) -> Tensor:
-        if cost_violation is None or episode_length is None:
-            raise ValueError("A CPO step needs cost_violation [k] and episode_length.")
-        violation = torch.as_tensor(cost_violation).to(surrogates)
-        if violation.shape != surrogates.shape:
-            raise ValueError(
-                f"cost_violation has shape {tuple(violation.shape)} but there are "
-                f"{surrogates.numel()} cost surrogate(s): give one violation per surrogate."
-            )
-        length = torch.as_tensor(episode_length).to(surrogates)
-        return constraint_value(violation, length, self.rescale_violation)
-
-    def _diagnostics(
-        self, q: Tensor, r: Tensor, s: Tensor, c: Tensor, dual: DualSolution
-    ) -> dict[str, Tensor]:
-        """Scalars, and vectors [k] with one entry per constraint; A and B are 0 where s is."""
-        has_gradient = s > 0
-        return {
-            "q": q,
-            "r": r,
-            "s": s,
-            "c": c,
-            "A": torch.where(has_gradient, q - r.square() / s, 0.0),
-            "B": torch.where(has_gradient, 2 * self.target_kl - c.square() / s, 0.0),
-            "lambda": dual.lam,
-            "nu": dual.nu,
-            "case": dual.case,
         }

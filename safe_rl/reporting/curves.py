@@ -7,9 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from safe_rl.intervals import bootstrap
-from safe_rl.plotting import moving_mean
 from safe_rl.reporting.runs import Run
+from safe_rl.runs.curves import moving_mean
+from safe_rl.scores.intervals import bootstrap
 
 __all__ = ["Curve", "mean_curve"]
 
@@ -43,7 +43,7 @@ def mean_curve(runs: Sequence[Run], column: str, *, smooth: bool) -> Curve | Non
     Args:
         runs: One per seed.
         column: Column of their tables.
-        smooth: Whether to take :func:`safe_rl.plotting.moving_mean` first, which ends at the
+        smooth: Whether to take :func:`safe_rl.runs.curves.moving_mean` first, which ends at the
             run's final figure.
 
     Returns:

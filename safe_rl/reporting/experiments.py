@@ -8,8 +8,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from safe_rl.protocol import ALGORITHMS, COST_LIMIT, REFERENCE, Scores
 from safe_rl.reporting.runs import Run, split_source, without_repetitions
+from safe_rl.scores.protocol import ALGORITHMS, COST_LIMIT, REFERENCE, Scores
 
 __all__ = [
     "MANNER",

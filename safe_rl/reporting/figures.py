@@ -13,13 +13,13 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter, MaxNLocator
 
-from safe_rl.plotting import point_marker
-from safe_rl.protocol import ALGORITHMS
 from safe_rl.reporting.curves import mean_curve
 from safe_rl.reporting.experiments import Experiment
 from safe_rl.reporting.results import cost_keys_of
 from safe_rl.reporting.slate_tables import SYMBOLS
 from safe_rl.reporting.slates import Aggregate
+from safe_rl.runs.curves import point_marker
+from safe_rl.scores.protocol import ALGORITHMS
 
 __all__ = [
     "LIMIT_STYLE",

@@ -10,7 +10,6 @@ from typing import Any
 
 from matplotlib.figure import Figure
 
-from safe_rl.protocol import REFERENCE, SLATES
 from safe_rl.reporting.experiments import Experiment, group_runs
 from safe_rl.reporting.figures import (
     Style,
@@ -31,6 +30,7 @@ from safe_rl.reporting.slates import (
 from safe_rl.reporting.tables import Table
 from safe_rl.reporting.transfer_figures import draw_transfer
 from safe_rl.reporting.transfers import Transfer, find_transfers
+from safe_rl.scores.protocol import REFERENCE, SLATES
 
 __all__ = ["Report", "Slate", "build_report"]
 

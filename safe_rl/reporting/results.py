@@ -7,14 +7,6 @@ from typing import Any
 
 import numpy as np
 
-from safe_rl.protocol import (
-    PUBLISHED_STEPS,
-    REFERENCE,
-    REIMPLEMENTATION_STEPS,
-    REIMPLEMENTATIONS,
-    Agent,
-    compare,
-)
 from safe_rl.reporting.experiments import Experiment
 from safe_rl.reporting.tables import (
     MISSING,
@@ -25,6 +17,14 @@ from safe_rl.reporting.tables import (
     number,
     plain,
     power_of_ten,
+)
+from safe_rl.scores.protocol import (
+    PUBLISHED_STEPS,
+    REFERENCE,
+    REIMPLEMENTATION_STEPS,
+    REIMPLEMENTATIONS,
+    Agent,
+    compare,
 )
 
 __all__ = ["cost_keys_of", "dominance_table", "final_record", "final_table"]

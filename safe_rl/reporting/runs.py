@@ -16,8 +16,8 @@ from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 from yaml import YAMLError
 
-from safe_rl.run_folder import FINAL_EPOCHS, final_figures
-from safe_rl.tables import read_table
+from safe_rl.runs.folder import FINAL_EPOCHS, final_figures
+from safe_rl.runs.table import read_table
 
 __all__ = ["Run", "find_runs", "read_run", "split_source", "without_repetitions"]
 

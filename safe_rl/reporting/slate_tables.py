@@ -5,15 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from safe_rl.protocol import (
-    NOISE_OF_ZERO,
-    PUBLISHED,
-    PUBLISHED_STEPS,
-    SLATES,
-    Agent,
-    Normalised,
-    compare,
-)
 from safe_rl.reporting.slates import Aggregate, Gap
 from safe_rl.reporting.tables import (
     Column,
@@ -23,6 +14,15 @@ from safe_rl.reporting.tables import (
     plain,
     power_of_ten,
     with_interval,
+)
+from safe_rl.scores.protocol import (
+    NOISE_OF_ZERO,
+    PUBLISHED,
+    PUBLISHED_STEPS,
+    SLATES,
+    Agent,
+    Normalised,
+    compare,
 )
 
 __all__ = ["SYMBOLS", "gap_table", "middle_table", "slate_table"]

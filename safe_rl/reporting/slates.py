@@ -8,8 +8,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from safe_rl.intervals import Estimate, interquartile_mean
-from safe_rl.protocol import (
+from safe_rl.reporting.experiments import MANNER, Experiment
+from safe_rl.reporting.runs import Run
+from safe_rl.scores.intervals import Estimate, interquartile_mean
+from safe_rl.scores.protocol import (
     SEEDS,
     SLATES,
     Normalised,
@@ -17,8 +19,6 @@ from safe_rl.protocol import (
     normalised_return,
     normalised_violation,
 )
-from safe_rl.reporting.experiments import MANNER, Experiment
-from safe_rl.reporting.runs import Run
 
 __all__ = ["Aggregate", "Gap", "aggregate", "can_be_normalised", "find_gap", "normalised_scores"]
 
@@ -159,7 +159,7 @@ def find_gap(
     """Return what a slate lacks of an algorithm, or None if it is complete.
 
     Args:
-        slate: A name in :data:`safe_rl.protocol.SLATES`.
+        slate: A name in :data:`safe_rl.scores.protocol.SLATES`.
         algorithm: Name of the algorithm, as experiments have it.
         experiments: All experiments.
         seeds_needed: Finished runs that a slate takes per environment.

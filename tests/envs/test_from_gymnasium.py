@@ -9,8 +9,8 @@ from torchrl.envs import RewardSum, TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
 from safe_rl.envs import SafetyGymEnv, from_gymnasium, store_configs
-from safe_rl.tables import read_table
-from safe_rl.training import build_trainer, seed_everything
+from safe_rl.runs.table import read_table
+from safe_rl.training.trainer import build_trainer, seed_everything
 
 store_configs()
 

@@ -12,12 +12,12 @@ import pytest
 from omegaconf import OmegaConf
 from run_configs import compose_config
 
+from safe_rl.cli.evaluate import evaluate, main
 from safe_rl.envs import OpenGLError, make_env, store_configs
-from safe_rl.evaluate import evaluate, main
-from safe_rl.evaluation.options import EvaluationOptions
+from safe_rl.evaluation.settings import EvaluationOptions
 from safe_rl.evaluation.video import HEIGHT, STEPS_PER_FRAME, WIDTH
-from safe_rl.protocol import REFERENCE
-from safe_rl.training import build_trainer, seed_everything
+from safe_rl.scores.protocol import REFERENCE
+from safe_rl.training.trainer import build_trainer, seed_everything
 
 NUM_STEPS = 40
 
@@ -177,7 +177,7 @@ def test_what_cannot_be_done_ends_in_one_line(run, arguments, message, capsys):
 def test_options_out_of_range_are_refused_before_anything_runs(
     argument, others, run, capsys, monkeypatch
 ):
-    monkeypatch.setattr("safe_rl.evaluate.load_config", None)
+    monkeypatch.setattr("safe_rl.cli.evaluate.load_config", None)
     assert main([str(run), argument]) == 1
     error = capsys.readouterr().err
     assert error.startswith(f"error: {argument}")

@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from matplotlib.image import imread
 from synthetic import NODES, write_run
 
-from safe_rl.report import main
+from safe_rl.cli.report import main
 from safe_rl.reporting.experiments import group_runs
 from safe_rl.reporting.figures import add_legend, algorithm_styles, draw_learning_curves, save
 from safe_rl.reporting.inventory import duration, evaluation_table

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from synthetic import NODES, write_run
 
-from safe_rl.protocol import PUBLISHED_STEPS, REFERENCE, SLATES
 from safe_rl.reporting.curves import mean_curve
 from safe_rl.reporting.experiments import group_runs
 from safe_rl.reporting.report import build_report
@@ -15,6 +14,7 @@ from safe_rl.reporting.runs import find_runs
 from safe_rl.reporting.slate_tables import gap_table, middle_table, slate_table
 from safe_rl.reporting.slates import aggregate, can_be_normalised, find_gap
 from safe_rl.reporting.tables import Column, Table, number, plain
+from safe_rl.scores.protocol import PUBLISHED_STEPS, REFERENCE, SLATES
 
 
 def experiments_in(root):

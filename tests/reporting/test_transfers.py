@@ -9,13 +9,13 @@ import torch
 from matplotlib.image import imread
 from synthetic import NODES, write_run
 
-from safe_rl.checkpoints import CheckpointStore
-from safe_rl.report import main
+from safe_rl.cli.report import main
 from safe_rl.reporting.experiments import group_runs
 from safe_rl.reporting.figures import algorithm_styles
 from safe_rl.reporting.runs import find_runs
 from safe_rl.reporting.transfer_figures import draw_transfer
 from safe_rl.reporting.transfers import find_transfers
+from safe_rl.runs.checkpoints import CheckpointStore
 
 FIRST = {"returns": (4.0, 4.0, 4.0), "rates": (0.06, 0.05, 0.04)}
 SECOND = {"returns": (1.0, 1.0), "costs": (50.0, 50.0), "rates": (0.09, 0.07)}

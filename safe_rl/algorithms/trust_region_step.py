@@ -1,0 +1,214 @@
+"""Steps within a trust region (Schulman et al. 2015)."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from typing import Any, NamedTuple
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.nn import ProbabilisticTensorDictSequential
+from torch import Tensor
+
+from safe_rl.objectives.trust_region import (
+    FisherProduct,
+    backtracking_search,
+    conjugate_gradient,
+    flat_gradient,
+    mean_kl,
+    policy_gaussian,
+    subsample,
+)
+
+__all__ = ["Proposal", "TRPOStep", "total_loss"]
+
+
+class Proposal(NamedTuple):
+    """A full step, and the conditions under which a line search may take it.
+
+    Attributes:
+        step: change of the parameters, [P].
+        is_acceptable: judges the losses after a step; the trust region is checked besides.
+        diagnostics: what is worth logging about the step.
+    """
+
+    step: Tensor
+    is_acceptable: Callable[[TensorDictBase], bool]
+    diagnostics: dict[str, Tensor]
+
+
+def total_loss(losses: TensorDictBase) -> Tensor:
+    """Sum of all entries that are named ``loss_…``: what TorchRL means to be minimised.
+
+    Raises:
+        FloatingPointError: if it is not finite.
+    """
+    total = torch.stack([v for k, v in losses.items() if k.startswith("loss_")]).sum()
+    if not total.isfinite():
+        raise FloatingPointError(
+            f"The policy loss is {total.item()}: look for non-finite rewards, costs or "
+            "observations, or lower the target KL."
+        )
+    return total
+
+
+class TRPOStep:
+    """Natural-gradient step on a loss, within a trust region (Schulman et al. 2015, appendix C).
+
+    The step is √(2δ / xᵀHx)·x with H x = −g solved by conjugate gradients, H the Fisher matrix of
+    the policy plus damping. A backtracking line search takes its first fraction with
+    KL(π_θ ‖ π_k) ≤ δ that does not worsen the loss. If there is none, the policy stays.
+
+    The loss may be any callable from a batch to a TensorDict with scalars ``loss_…``, for example
+    a surrogate of your own; their sum is minimised.
+
+    Args:
+        loss: the loss; a `TRPOLoss`, a `TRPOLagrangianLoss` or your own.
+        target_kl: radius δ of the trust region, mean KL over the states of the batch.
+        damping: multiple of the identity added to the Fisher matrix.
+        cg_iterations: iterations of the conjugate gradient method.
+        backtrack_coeff: factor between one try of the line search and the next.
+        max_backtracks: tries of the line search.
+        fisher_subsample: fraction of the batch that the Fisher matrix is averaged over.
+        actor_network: policy to step; by default ``loss.actor_network``.
+
+    Examples:
+        >>> from tensordict import TensorDict
+        >>> from tensordict.nn import AddStateIndependentNormalScale, TensorDictModule
+        >>> from torchrl.modules import IndependentNormal, ProbabilisticActor
+        >>> from safe_rl.objectives import TRPOLoss
+        >>> net = torch.nn.Sequential(torch.nn.Linear(3, 2), AddStateIndependentNormalScale(2))
+        >>> actor = ProbabilisticActor(
+        ...     TensorDictModule(net, in_keys=["observation"], out_keys=["loc", "scale"]),
+        ...     in_keys=["loc", "scale"],
+        ...     distribution_class=IndependentNormal,
+        ...     return_log_prob=True,
+        ... )
+        >>> with torch.no_grad():
+        ...     batch = actor(TensorDict(observation=torch.randn(8, 3), batch_size=[8]))
+        >>> batch["advantage"] = torch.randn(8, 1)
+        >>> step = TRPOStep(
+        ...     TRPOLoss(actor, entropy_coeff=0.01),
+        ...     target_kl=0.01,
+        ...     damping=0.1,
+        ...     cg_iterations=10,
+        ...     backtrack_coeff=0.8,
+        ...     max_backtracks=10,
+        ... )
+        >>> bool(step(batch)["kl"] <= 0.01)
+        True
+    """
+
+    def __init__(
+        self,
+        loss: Callable[[TensorDictBase], TensorDictBase],
+        *,
+        target_kl: float,
+        damping: float,
+        cg_iterations: int,
+        backtrack_coeff: float,
+        max_backtracks: int,
+        fisher_subsample: float = 1.0,
+        actor_network: ProbabilisticTensorDictSequential | None = None,
+    ) -> None:
+        self.loss = loss
+        self.actor_network = actor_network or getattr(loss, "actor_network", None)
+        if self.actor_network is None:
+            raise ValueError(
+                "The loss has no attribute `actor_network`: pass the policy as actor_network."
+            )
+        if not (target_kl > 0 and 0 < backtrack_coeff < 1 and 0 < fisher_subsample <= 1):
+            raise ValueError(
+                "target_kl must be positive, backtrack_coeff in (0, 1) and fisher_subsample in "
+                f"(0, 1]; got {target_kl}, {backtrack_coeff} and {fisher_subsample}."
+            )
+        self.target_kl, self.damping, self.cg_iterations = target_kl, damping, cg_iterations
+        self.backtrack_coeff, self.max_backtracks = backtrack_coeff, max_backtracks
+        self.fisher_subsample = fisher_subsample
+        self.parameters = [p for p in self.actor_network.parameters() if p.requires_grad]
+
+    def __call__(
+        self,
+        batch: TensorDictBase,
+        cost_violation: Tensor | None = None,
+        episode_length: Tensor | None = None,
+    ) -> dict[str, Tensor]:
+        """Take one step.
+
+        Args:
+            batch: on-policy data with what the loss reads, of any shape.
+            cost_violation: J_c − d, [k]; read by constrained steps only.
+            episode_length: T̄, scalar; read by constrained steps only.
+
+        Returns:
+            The losses' entries after the step, ``kl`` (mean KL(π_θ ‖ π_k)), ``step_fraction``
+            (accepted by the line search; 0: none), ``backtracks`` (tries before that one) and
+            what the step itself reports.
+        """
+        batch = batch.reshape(-1)
+        with torch.no_grad():
+            reference = policy_gaussian(self.actor_network, batch)
+        losses = self.loss(batch)
+        sample = subsample(batch, self.fisher_subsample)
+        fisher = FisherProduct(self.actor_network, sample, self.parameters, self.damping)
+        proposal = self._propose(losses, fisher, cost_violation, episode_length)
+        del fisher
+        metrics = self._search(batch, reference, proposal)
+        return metrics | proposal.diagnostics
+
+    def _propose(
+        self,
+        losses: TensorDictBase,
+        fisher: FisherProduct,
+        cost_violation: Tensor | None,
+        episode_length: Tensor | None,
+    ) -> Proposal:
+        loss = total_loss(losses)
+        gradient = flat_gradient(loss, self.parameters)
+        direction = self._solve(fisher, gradient)
+        # Conjugate gradients leave a residual orthogonal to the solution x, so that xᵀHx = xᵀg.
+        squared = (gradient @ direction).clamp_min(0)
+        length = torch.where(squared > 0, (2 * self.target_kl / squared).sqrt(), 0.0)
+        before = loss.detach()
+        return Proposal(-length * direction, lambda after: bool(total_loss(after) <= before), {})
+
+    def _solve(self, fisher: FisherProduct, vector: Tensor) -> Tensor:
+        return conjugate_gradient(fisher, vector, self.cg_iterations)
+
+    @torch.no_grad()
+    def _search(
+        self, batch: TensorDictBase, reference: tuple[Tensor, Tensor], proposal: Proposal
+    ) -> dict[str, Tensor]:
+        tried: dict[str, Any] = {}
+
+        def accept() -> bool:
+            tried["kl"] = mean_kl(reference, self.actor_network, batch)
+            if not tried["kl"] <= self.target_kl:
+                return False
+            tried["losses"] = self.loss(batch)
+            return proposal.is_acceptable(tried["losses"])
+
+        fraction = backtracking_search(
+            self.parameters,
+            proposal.step,
+            accept,
+            coeff=self.backtrack_coeff,
+            max_tries=self.max_backtracks,
+        )
+        if not fraction:
+            tried = {"kl": torch.zeros_like(tried["kl"]), "losses": self.loss(batch)}
+        tries = self.max_backtracks if not fraction else math.log(fraction, self.backtrack_coeff)
+        return {
+            **tried["losses"].to_dict(),
+            "kl": tried["kl"],
+            "step_fraction": torch.tensor(fraction),
+            "backtracks": torch.tensor(round(tries)),
+        }
+
+    def state_dict(self) -> dict[str, Any]:
+        """Empty: a step has no state beyond the policy."""
+        return {}
+
+    def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
+        """Nothing to load."""

@@ -1,0 +1,1 @@
+"""What a person types: commands, shorthands, checks of names and values."""

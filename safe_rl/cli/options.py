@@ -1,0 +1,82 @@
+"""Options of the command-line tools: ``key=value``, checked against a schema by OmegaConf.
+
+The schema is a dataclass; its fields' metadata holds the help texts.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import MISSING, fields
+from difflib import get_close_matches
+from typing import TYPE_CHECKING, TypeVar
+
+from omegaconf import OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+
+__all__ = ["OptionError", "parse_options", "usage"]
+
+if TYPE_CHECKING:
+    from _typeshed import DataclassInstance
+
+Schema = TypeVar("Schema", bound="DataclassInstance")
+
+
+class OptionError(ValueError):
+    """An option of the command line that cannot be used; the message says what to write instead."""
+
+
+def parse_options(arguments: Sequence[str], schema: type[Schema]) -> Schema:
+    """Read options.
+
+    Args:
+        arguments: Texts of the form ``key=value``; values are YAML, nested keys have dots.
+        schema: Dataclass with a default for every field.
+
+    Raises:
+        OptionError: For an option that is unknown (the nearest is named), without a value, or of
+            another type than the schema's.
+
+    Examples:
+        >>> from dataclasses import dataclass
+        >>> @dataclass
+        ... class Options:
+        ...     episodes: int = 100
+        ...     video: bool = False
+        >>> parse_options(["episodes=7", "video=true"], Options)
+        Options(episodes=7, video=True)
+        >>> parse_options(["episode=7"], Options)
+        Traceback (most recent call last):
+        ...
+        safe_rl.cli.options.OptionError: Unknown option 'episode'. Did you mean 'episodes'? Options are: episodes, video.
+    """  # noqa: E501
+    known = [field.name for field in fields(schema)]
+    for argument in arguments:
+        key, equals, _ = argument.partition("=")
+        if not equals:
+            raise OptionError(
+                f"'{argument}' is not an option: options are written key=value, for example "
+                f"{known[0]}=…"
+            )
+        name = key.partition(".")[0]
+        if name not in known:
+            nearest = get_close_matches(name, known, n=1, cutoff=0.0)[0]
+            raise OptionError(
+                f"Unknown option '{name}'. Did you mean '{nearest}'? Options are: "
+                f"{', '.join(known)}."
+            )
+    try:
+        given = OmegaConf.from_dotlist(list(arguments))
+        merged = OmegaConf.merge(OmegaConf.structured(schema), given)
+        return OmegaConf.to_object(merged)  # type: ignore[return-value]
+    except OmegaConfBaseException as error:
+        raise OptionError(f"{str(error).splitlines()[0]} (option '{error.full_key}')") from error
+
+
+def usage(command: str, schema: type[DataclassInstance]) -> str:
+    """How a command is called: its options, their defaults and what they mean."""
+    lines = [f"usage: {command} [option=value ...]", ""]
+    for field in fields(schema):
+        default = "null" if field.default is None else str(field.default).lower()
+        shown = f"{field.name}.…" if field.default is MISSING else f"{field.name}={default}"
+        lines.append(f"  {shown:<24} {field.metadata['help']}")
+    return "\n".join(lines)

@@ -1,0 +1,86 @@
+"""Report a folder of runs: ``python -m safe_rl.report RUNS_DIR [seeds=3 title=...]``."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import safe_rl.openmp  # noqa: F401, has to come before torch
+
+# isort: split
+from safe_rl.cli.options import OptionError, parse_options, usage
+from safe_rl.envs.registration import group_node
+from safe_rl.envs.suite import SUITE
+from safe_rl.reporting import Report, build_report, write_report
+from safe_rl.scores.protocol import SEEDS
+
+__all__ = ["ReportOptions", "main", "report"]
+
+COMMAND = "python -m safe_rl.report"
+
+
+@dataclass
+class ReportOptions:
+    """Options of ``python -m safe_rl.report``; the help texts say what they mean.
+
+    Examples:
+        >>> ReportOptions(seeds=5).unfinished
+        False
+    """
+
+    out: str | None = field(
+        default=None, metadata={"help": "folder of the report; null: RUNS_DIR/report"}
+    )
+    seeds: int = field(
+        default=len(SEEDS), metadata={"help": "runs that a slate takes per environment"}
+    )
+    unfinished: bool = field(
+        default=False, metadata={"help": "count runs that have not come to their end"}
+    )
+    title: str | None = field(default=None, metadata={"help": "heading; null: the folder's name"})
+
+
+def report(root: Path, options: ReportOptions) -> tuple[Report, Path]:
+    """Report the runs below a folder.
+
+    Args:
+        root: The folder.
+        options: What to report, and where to.
+
+    Returns:
+        What there is to say, and the page that says it.
+
+    Raises:
+        FileNotFoundError: If there is no run.
+        ValueError: If a slate is to take less than one run per environment.
+    """
+    if options.seeds < 1:
+        raise ValueError(f"seeds={options.seeds}: a slate takes at least one run per environment.")
+    suite = {name: group_node(name, config) for name, config in SUITE.items()}
+    result = build_report(root, suite, seeds_needed=options.seeds, unfinished=options.unfinished)
+    out = root / "report" if options.out is None else Path(options.out)
+    return result, write_report(result, out, options.title or root.resolve().name)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """The command; returns its exit status."""
+    arguments = sys.argv[1:] if arguments is None else list(arguments)
+    if not arguments or arguments[0] in ("-h", "--help"):
+        print(usage(f"{COMMAND} RUNS_DIR", ReportOptions))
+        return 0 if arguments else 2
+    try:
+        options = parse_options(arguments[1:], ReportOptions)
+        result, page = report(Path(arguments[0]), options)
+    except (OptionError, FileNotFoundError, ModuleNotFoundError, ValueError) as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 1
+    for path, reason in result.skipped.items():
+        print(f"left out {path}: {reason}", file=sys.stderr)
+    for slate, runs in result.lacking().items():
+        print(f"{slate} lacks runs: {runs}")
+    if result.hardly_begun():
+        print(result.hardly_begun())
+    print(f"wrote {page}")
+    return 0

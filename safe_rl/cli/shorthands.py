@@ -1,0 +1,129 @@
+"""Shorthands of ``train.py`` that Hydra does not know: ``resume=`` and ``slate=``.
+
+They are written out before Hydra sees the command line.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from difflib import get_close_matches
+from importlib.util import find_spec
+from pathlib import Path
+
+import yaml
+from omegaconf import DictConfig, OmegaConf
+
+from safe_rl.cli.overrides import CommandLineError
+from safe_rl.scores.protocol import SLATES
+
+__all__ = ["expand_arguments"]
+
+# they would have no effect on a run whose networks, optimisers, worlds and random numbers are
+# restored, or would not fit them
+_FIXED = ("preset", "seed", "init_from", "model", "num_envs", "frames_per_batch")
+_JOBLIB = "hydra_plugins.hydra_joblib_launcher"
+
+
+def expand_arguments(arguments: Sequence[str]) -> list[str]:
+    """Write the shorthands out.
+
+    ``resume=RUN_DIR`` becomes what makes Hydra read the run's own configuration and write into its
+    folder; ``slate=SG6`` becomes the slate's environments (Ray, Achiam, Amodei 2019, section 5.1).
+    A sweep gets the launcher that runs its jobs in processes of their own, if that is installed.
+
+    Args:
+        arguments: Arguments of ``train.py``.
+
+    Raises:
+        CommandLineError: If a shorthand cannot be written out.
+
+    Examples:
+        >>> expand_arguments(["-m", "slate=SGDoggo", "seed=0"])[1]
+        'env=DoggoGoal1,DoggoGoal2,DoggoButton1,DoggoButton2,DoggoPush1,DoggoPush2'
+    """
+    expanded = list(arguments)
+    for name, expand in _SHORTHANDS.items():
+        given = [a for a in expanded if a.lstrip("+").startswith(f"{name}=")]
+        if len(given) > 1:
+            raise CommandLineError(f"'{name}' is given more than once: {', '.join(given)}.")
+        if given:
+            others = [argument for argument in expanded if argument != given[0]]
+            expanded = expand(given[0].partition("=")[2], others)
+    return _with_launcher(expanded)
+
+
+def _with_launcher(arguments: list[str]) -> list[str]:
+    """Sweeps run on joblib where it is installed, unless told otherwise."""
+    is_told = any(argument.startswith("hydra/launcher=") for argument in arguments)
+    if not _is_sweep(arguments) or is_told or not _is_installed(_JOBLIB):
+        return arguments
+    return [*arguments, "hydra/launcher=joblib"]
+
+
+def _expand_resume(value: str, others: list[str]) -> list[str]:
+    directory = Path(value).expanduser().absolute()
+    if _is_sweep(others):
+        raise CommandLineError(
+            "resume= continues one run. To continue a sweep, start it again as it was: finished "
+            "runs are skipped, interrupted ones go on."
+        )
+    if not (directory / "config.yaml").is_file():
+        below = sorted({table.parent for table in directory.glob("**/progress.csv")})
+        hint = f" Runs below it: {', '.join(map(str, below[:5]))}." if below else ""
+        raise CommandLineError(f"{value} is not the folder of a run: no config.yaml.{hint}")
+    try:
+        config = OmegaConf.load(directory / "config.yaml")
+    except yaml.YAMLError as error:
+        raise CommandLineError(f"{directory / 'config.yaml'} cannot be read: {error}") from None
+    assert isinstance(config, DictConfig)
+    for argument in others:
+        key = argument.lstrip("+~").partition("=")[0]
+        if key.partition(".")[0] in _FIXED or isinstance(config.get(key), DictConfig):
+            raise CommandLineError(
+                f"'{argument}' cannot change in a run that is continued. Single numbers can "
+                "(frames=…, policy_update.max_kl=…). For a new run from trained networks use "
+                f"init_from={value}."
+            )
+    folder = str(directory).replace("'", "\\'")
+    return [
+        *("--config-path", str(directory), "--config-name", "config"),
+        f"hydra.run.dir='{folder}'",
+        "hydra.output_subdir=null",
+        "hydra/job_logging=stdout",
+        *others,
+    ]
+
+
+def _expand_slate(value: str, others: list[str]) -> list[str]:
+    if value not in SLATES:
+        nearest = get_close_matches(value, SLATES, n=1, cutoff=0)[0]
+        raise CommandLineError(
+            f"Unknown slate '{value}'. Did you mean '{nearest}'? Slates are: {', '.join(SLATES)}."
+        )
+    if any(argument.startswith("env=") for argument in others):
+        raise CommandLineError("slate= and env= both name environments: use one of them.")
+    environments = SLATES[value]
+    if len(environments) > 1 and not _is_sweep(others):
+        raise CommandLineError(
+            f"{value} is {len(environments)} environments: add -m to train on every one of them."
+        )
+    flags = [argument for argument in others if argument.startswith("-")]
+    overrides = [argument for argument in others if not argument.startswith("-")]
+    return [*flags, f"env={','.join(environments)}", *overrides]
+
+
+def _is_installed(module: str) -> bool:
+    try:
+        return find_spec(module) is not None
+    except ModuleNotFoundError:
+        return False
+
+
+def _is_sweep(arguments: list[str]) -> bool:
+    return any(argument in ("-m", "--multirun") for argument in arguments)
+
+
+_SHORTHANDS: dict[str, Callable[[str, list[str]], list[str]]] = {
+    "resume": _expand_resume,
+    "slate": _expand_slate,
+}

@@ -1,0 +1,82 @@
+"""The command ``train.py``: compose a configuration, build a run, train."""
+
+import math
+import sys
+from contextlib import nullcontext
+from functools import partial
+from pathlib import Path
+from typing import Any, cast
+
+import hydra
+from hydra.core.hydra_config import HydraConfig
+from hydra.types import RunMode
+from omegaconf import DictConfig, OmegaConf
+
+import safe_rl.openmp  # noqa: F401, has to come before torch
+from safe_rl.cli.overrides import CommandLineError, check_overrides
+from safe_rl.cli.settings import check_settings, errors_in_a_line
+from safe_rl.cli.shorthands import expand_arguments
+from safe_rl.envs import LayoutError, SafetyGymConfig, make_env, store_configs
+from safe_rl.runs.resuming import is_finished, may_continue
+from safe_rl.training.trainer import Trainer, build_trainer, physics_threads, seed_everything
+from safe_rl.training.transfer import initialise_networks
+
+CONF = Path(__file__).parents[2] / "conf"
+store_configs()
+
+
+def prepare(config: DictConfig, directory: Path, continues: bool) -> Trainer | None:
+    """Build a run, or go on with the one in the folder; None if that is finished."""
+    check_settings(config)
+    if continues and is_finished(directory, config.frames):
+        print(f"{directory} has its {config.frames:,} frames already: raise 'frames' to train on.")
+        return None
+    if config.frames % config.frames_per_batch:
+        whole = math.ceil(config.frames / config.frames_per_batch) * config.frames_per_batch
+        print(f"Training for {whole:,} frames: whole batches of {config.frames_per_batch:,}.")
+    seed_everything(config.seed, config.num_threads)
+    make = partial(
+        make_env,
+        cast(dict[str, Any], OmegaConf.to_container(config.env, resolve=True)),
+        device=config.device,
+        seed=config.seed,
+        num_threads=physics_threads(config),
+    )
+    trainer = build_trainer(config, make(num_envs=config.num_envs), directory, make)
+    if continues and trainer.resume():
+        print(f"Going on after {trainer.progress.steps:,} of {config.frames:,} frames.")
+        return trainer
+    if continues and trainer.folder.holds_run:
+        print("No checkpoint was written yet: starting over, with a new progress.csv.")
+    if config.init_from is not None:
+        algorithm = trainer.algorithm
+        initialise_networks(algorithm.networks, Path(config.init_from), list(algorithm.cost_keys))
+    return trainer
+
+
+@hydra.main(version_base="1.3", config_path=str(CONF), config_name="config")
+def train(config: DictConfig) -> None:
+    """Compose, build, train."""
+    directory = Path(HydraConfig.get().runtime.output_dir)
+    is_job = HydraConfig.get().mode is RunMode.MULTIRUN  # whose sweep keeps account of failures
+    continues = may_continue(HydraConfig.get(), config)
+    errors = nullcontext() if is_job else errors_in_a_line(directory, not continues, LayoutError)
+    with errors:
+        trainer = prepare(config, directory, continues)
+    if trainer is None:
+        return
+    print(trainer.run())
+    if trainer.interrupted_by is not None:
+        print(f"Interrupted. Continue with: python train.py resume={directory}")
+        raise SystemExit(128 + trainer.interrupted_by)
+
+
+def main() -> None:
+    """The command: expand shorthands, check names, and hand over to Hydra."""
+    try:
+        arguments = expand_arguments(sys.argv[1:])
+        check_overrides(arguments, CONF, {"name", *SafetyGymConfig().to_dict()})
+        sys.argv[1:] = arguments
+    except CommandLineError as error:
+        raise SystemExit(str(error)) from None
+    train()

@@ -1,0 +1,66 @@
+"""The policy that a collector steps: an actor without distribution objects."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModuleBase
+from torchrl.envs.utils import ExplorationType, exploration_type
+from torchrl.modules import IndependentNormal
+
+__all__ = ["BehaviourPolicy"]
+
+
+class BehaviourPolicy(TensorDictModuleBase):
+    """Sample a Gaussian actor in one module, without distribution objects.
+
+    It shares the actor's parameters and writes what the actor writes: ``loc``, ``scale``, the
+    action and its log-probability. While an environment is stepped with small batches, most of the
+    actor's time goes into building distributions and nesting modules, which this class leaves out.
+    Under ``set_exploration_type(ExplorationType.DETERMINISTIC)`` the action is ``loc``.
+
+    Args:
+        actor: Policy made by :func:`make_actor`, or any ``ProbabilisticTensorDictSequential``
+            whose first module maps one key to ``loc`` and ``scale`` and whose distribution is a
+            diagonal Gaussian.
+
+    Raises:
+        TypeError: If the actor's distribution is not ``IndependentNormal``.
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> policy = BehaviourPolicy(make_actor(3, 2, hidden_sizes=[8], initial_log_std=-0.5))
+        >>> policy(TensorDict({"observation": torch.zeros(5, 3)}, [5]))["scale"][0]
+        tensor([0.6065, 0.6065], grad_fn=<SelectBackward0>)
+    """
+
+    def __init__(self, actor: ProbabilisticTensorDictSequential) -> None:
+        super().__init__()
+        parameters, sampler = actor.module[0], actor.module[-1]
+        if len(actor.module) != 2 or sampler.distribution_class is not IndependentNormal:
+            raise TypeError(
+                "BehaviourPolicy samples a network followed by an IndependentNormal, got "
+                f"{len(actor.module)} modules and {sampler.distribution_class.__name__}. Hand the "
+                "actor itself to the collector instead."
+            )
+        self.network = parameters.module
+        self.in_keys = list(parameters.in_keys)
+        self.out_keys = [*parameters.out_keys, *sampler.out_keys]
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Write the distribution's parameters, the action and its log-probability."""
+        loc, scale = self.network(tensordict.get(self.in_keys[0]))
+        if exploration_type() is ExplorationType.DETERMINISTIC:
+            noise = torch.zeros_like(loc)
+        else:
+            noise = torch.randn_like(loc)
+        # log N(loc + scale * noise; loc, scale) in terms of the noise alone
+        log_prob = -0.5 * noise.square().sum(-1) - scale.log().sum(-1)
+        log_prob = log_prob - 0.5 * math.log(2 * math.pi) * loc.shape[-1]
+        outputs = (loc, scale, torch.addcmul(loc, scale, noise), log_prob)
+        for key, value in zip(self.out_keys, outputs, strict=True):
+            tensordict.set(key, value)
+        return tensordict

@@ -1,0 +1,126 @@
+"""The three learning curves of the benchmark: return, episode cost, cost rate."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import EngFormatter
+
+__all__ = ["draw_learning_curves", "moving_mean", "point_marker"]
+
+SMOOTHING_EPOCHS = 5
+"""Epochs in the moving mean, as many as final figures are averaged over."""
+
+
+def draw_learning_curves(
+    table: Mapping[str, Sequence[float]],
+    cost_limits: Mapping[str, float],
+    episode_length: int,
+    path: Path,
+    title: str = "",
+) -> None:
+    """Draw return, episode cost and cost rate over environment steps (Ray et al. 2019, Figure 7).
+
+    Limits d are dashed in the second panel, d / T_ep in the third. There is a line for every cost
+    with a limit, or for the aggregate cost if there is none. Single epochs are drawn faint, their
+    moving mean strong.
+
+    Args:
+        table: Columns of a run's table, see :func:`safe_rl.runs.table.read_table`.
+        cost_limits: Cost key -> d, undiscounted cost per episode.
+        episode_length: T_ep, steps of a full episode.
+        path: Picture to write, replaced in one go.
+        title: Written above the panels.
+
+    Examples:
+        >>> import tempfile
+        >>> table = {
+        ...     "steps": [1000, 2000],
+        ...     "episode_return": [0.0, 1.0],
+        ...     "episode_cost": [50.0, 30.0],
+        ...     "cost_rate": [0.05, 0.04],
+        ... }
+        >>> path = Path(tempfile.mkdtemp()) / "curves.png"
+        >>> draw_learning_curves(table, {"cost": 25.0}, 1000, path)
+        >>> path.exists()
+        True
+    """
+    # legends stand below the panels, where they cover nothing
+    num_lines = max(1, len(cost_limits))
+    figure = Figure(figsize=(12, 3.6 + 0.2 * num_lines), layout="constrained")
+    returns, costs, rates = figure.subplots(1, 3)
+    steps = np.asarray(table["steps"], dtype=float)
+    _draw(returns, steps, table["episode_return"], "C0", None)
+    for index, key in enumerate(cost_limits or ["cost"]):
+        colour = f"C{index + 1}"
+        _draw(costs, steps, table[f"episode_{key}"], colour, key)
+        rate = table[f"{key}_rate"]
+        rates.plot(steps, rate, color=colour, label=key, marker=point_marker(steps))
+        if key in cost_limits:
+            limit, per_step = cost_limits[key], cost_limits[key] / episode_length
+            _draw_limit(costs, limit, colour, f"limit {limit:g}")
+            _draw_limit(rates, per_step, colour, f"limit / steps = {per_step:g}")
+    _label(returns, costs, rates)
+    figure.suptitle(title)
+    # a viewer that watches the file never sees half a picture
+    unfinished = path.with_suffix(".tmp" + path.suffix)
+    figure.savefig(unfinished, dpi=120)
+    unfinished.replace(path)
+
+
+def _label(returns: Axes, costs: Axes, rates: Axes) -> None:
+    for axes, name in ((returns, "Return"), (costs, "Episode cost"), (rates, "Cost rate")):
+        axes.set_title(name)
+        axes.set_xlabel("Environment steps")
+        axes.xaxis.set_major_formatter(EngFormatter(sep=""))
+        axes.grid(alpha=0.3)
+    for axes in (costs, rates):
+        axes.set_ylim(bottom=0)
+        axes.legend(
+            fontsize="small", frameon=False, ncols=2,
+            loc="upper center", bbox_to_anchor=(0.5, -0.18),
+        )  # fmt: skip
+
+
+def _draw_limit(axes: Axes, height: float, colour: str, label: str) -> None:
+    axes.axhline(height, color=colour, linestyle="--", linewidth=1, label=label)
+
+
+def _draw(
+    axes: Axes, steps: np.ndarray, values: Sequence[float], colour: str, label: str | None
+) -> None:
+    """Epochs in which an episode finished, and their moving mean."""
+    known = np.isfinite(values)
+    steps, heights = steps[known], np.asarray(values, dtype=float)[known]
+    marker = point_marker(steps)
+    axes.plot(steps, heights, color=colour, alpha=0.3, linewidth=1)
+    axes.plot(steps, moving_mean(heights), color=colour, label=label, marker=marker)
+
+
+def point_marker(values: np.ndarray) -> str:
+    """Marker of a line through values, shape [n]: a single point would not be seen without.
+
+    Examples:
+        >>> point_marker(np.zeros(1)), point_marker(np.zeros(2))
+        ('o', '')
+    """
+    return "o" if len(values) == 1 else ""
+
+
+def moving_mean(values: np.ndarray) -> np.ndarray:
+    """Mean of each value, shape [n], and the up to ``SMOOTHING_EPOCHS - 1`` before it.
+
+    The last one is the final figure of a run.
+
+    Examples:
+        >>> moving_mean(np.array([1.0, 3.0, 5.0, 7.0, 9.0, 11.0])).tolist()
+        [1.0, 2.0, 3.0, 4.0, 5.0, 7.0]
+    """
+    sums = np.cumsum(np.concatenate([[0.0], values]))
+    ends = np.arange(1, len(values) + 1)
+    starts = np.maximum(ends - SMOOTHING_EPOCHS, 0)
+    return (sums[ends] - sums[starts]) / (ends - starts)

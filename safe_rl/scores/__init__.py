@@ -1,0 +1,1 @@
+"""The protocol: reference scores, slates, normalisation, intervals."""

@@ -1,0 +1,1 @@
+"""The loop: collect, account, learn, record."""

@@ -1,0 +1,254 @@
+"""The training loop: collect, account, learn, record."""
+
+from __future__ import annotations
+
+import math
+import os
+import time
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from signal import Signals
+
+import torch
+from hydra.utils import instantiate
+from omegaconf import DictConfig
+from tensordict import TensorDictBase
+from torchrl.checkpoint import GlobalRNGState
+from torchrl.collectors import Collector
+from torchrl.envs import EnvBase
+
+from safe_rl.algorithms.building import build_algorithm, check_cost_limits
+from safe_rl.algorithms.on_policy import Algorithm
+from safe_rl.collectors import EpisodeAccounting, WorkerCollector, make_collector
+from safe_rl.collectors.workers import MakeEnv
+from safe_rl.models import BehaviourPolicy
+from safe_rl.runs.checkpoints import CheckpointStore, Stateful
+from safe_rl.runs.folder import RunFolder
+from safe_rl.training.interrupts import StopRequest
+from safe_rl.training.state import Progress, WorldSnapshot
+
+__all__ = ["Trainer", "build_trainer", "physics_threads", "seed_everything"]
+
+
+def seed_everything(seed: int, num_threads: int | None) -> None:
+    """Seed torch and set the number of threads it computes with; None leaves the number alone."""
+    torch.manual_seed(seed)
+    if num_threads is not None:
+        torch.set_num_threads(num_threads)
+
+
+@contextmanager
+def torch_threads(number: int) -> Iterator[None]:
+    """Let torch compute with `number` threads inside the block."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(number)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
+
+
+def physics_threads(config: DictConfig) -> int:
+    """Threads that step each environment; 0 is one per core. Workers share them."""
+    num_collectors = config.collector.num_collectors
+    if num_collectors == 1:
+        return config.num_threads or 0
+    return max(1, (config.num_threads or os.cpu_count() or 1) // num_collectors)
+
+
+def build_trainer(
+    config: DictConfig, env: EnvBase, directory: Path, make_env: MakeEnv | None = None
+) -> Trainer:
+    """Build everything that a run consists of.
+
+    Args:
+        config: Configuration as composed from ``conf/``.
+        env: Seeded environment with ``observation_layout``, ``cost_keys`` and
+            ``config.num_steps``; if it has ``get_state`` and ``set_state``, a checkpoint holds the
+            state of its worlds.
+        directory: Folder of the run.
+        make_env: Makes an environment like ``env`` with another ``num_envs``, for collectors with
+            workers.
+
+    Raises:
+        ValueError: If parts of the configuration do not fit together.
+    """
+    cost_limits = check_cost_limits(config.cost_limits, env.cost_keys)
+    algorithm = build_algorithm(config, env)
+    return Trainer(
+        env=env,
+        algorithm=algorithm,
+        collector=_build_collector(config, env, make_env, algorithm),
+        cost_limits=cost_limits,
+        folder=RunFolder(directory, config, cost_limits, env.config.num_steps),
+        config=config,
+    )
+
+
+def _build_collector(
+    config: DictConfig, env: EnvBase, make_env: MakeEnv | None, algorithm: Algorithm
+) -> Collector | WorkerCollector:
+    policy = BehaviourPolicy(algorithm.networks.actor)
+    numbers = {"frames_per_batch": config.frames_per_batch, "device": config.device}
+    if config.collector.get("_target_") is None:
+        return make_collector(env, policy, **numbers)
+    return instantiate(config.collector, _partial_=True)(env, make_env, policy, **numbers)
+
+
+class Trainer:
+    """One run.
+
+    Args:
+        env: Environment that the collector steps.
+        algorithm: What learns.
+        collector: Endless collector of [N, T] batches, running the algorithm's actor.
+        cost_limits: Cost key -> d, undiscounted cost per episode: what counts as feasible.
+        folder: Where the run writes.
+        config: Configuration of the run, for ``frames`` and ``checkpoint``.
+    """
+
+    def __init__(
+        self,
+        env: EnvBase,
+        algorithm: Algorithm,
+        collector: Collector | WorkerCollector,
+        *,
+        cost_limits: Mapping[str, float],
+        folder: RunFolder,
+        config: DictConfig,
+    ) -> None:
+        self.algorithm = algorithm
+        self.accounting = EpisodeAccounting(
+            env.batch_size.numel(), env.cost_keys, device=collector.storing_device
+        )
+        self.progress = Progress()
+        self.folder = folder
+        self.interrupted_by: Signals | None = None
+        self._collector = collector
+        # the worlds of workers are out of reach
+        self._worlds = None
+        if isinstance(collector, Collector) and hasattr(env, "get_state"):
+            self._worlds = WorldSnapshot(env, collector)
+        self._is_continued = False
+        self._cost_limits = dict(cost_limits)
+        self._frames = config.frames
+        self._checkpoint_interval = config.checkpoint.interval
+        self._checkpoints = CheckpointStore(
+            folder.checkpoint_directory,
+            self.components(),
+            keep_last=config.checkpoint.keep_last,
+        )
+
+    def components(self) -> dict[str, Stateful]:
+        """Parts of a checkpoint, by name."""
+        parts: dict[str, Stateful] = {
+            **self.algorithm.checkpoint_components(),
+            "accounting": self.accounting,
+            "progress": self.progress,
+            "rng": GlobalRNGState(),
+        }
+        if self._worlds is not None:
+            parts["env"] = self._worlds
+        return parts
+
+    def restore(self, checkpoint: Path) -> None:
+        """Continue from a checkpoint of a run with the same configuration.
+
+        Raises:
+            CheckpointError: If the file is no checkpoint, or does not fit this run.
+        """
+        CheckpointStore.load(checkpoint, self.components())
+        self._is_continued = True
+        self._begin_episodes()
+
+    def resume(self) -> bool:
+        """Continue the run in the folder from its newest checkpoint; if it has none, start over.
+
+        Returns:
+            Whether there was one.
+
+        Raises:
+            CheckpointError: If no checkpoint can be read, or they do not fit this run.
+        """
+        self._is_continued = True
+        restored = self._checkpoints.resume()
+        self._begin_episodes()
+        return restored is not None
+
+    def _begin_episodes(self) -> None:
+        """Without their state, the worlds cannot go on with the episodes that were open."""
+        if self._worlds is None:
+            self.accounting.forget_open_episodes()
+
+    def run(self) -> str:
+        """Train for ``frames`` steps, rounded up to whole batches.
+
+        Ctrl-C or SIGTERM ends the run after the epoch at hand, with a checkpoint;
+        ``interrupted_by`` then holds the signal, unless that epoch was the last one.
+
+        Returns:
+            One line on the outcome.
+        """
+        batches = self.batches()
+        saved_at = time.monotonic()
+        behind = self.progress.epoch if self._is_continued else None
+        with self.folder.writing(behind, self.progress.steps), StopRequest() as stop:
+            while self.progress.steps < self._frames and not stop.received:
+                row = self.epoch(batches)
+                self.folder.record(row)
+                self._save_if_best(row)
+                if time.monotonic() - saved_at > self._checkpoint_interval:
+                    self._save()
+                    saved_at = time.monotonic()
+            self._save()
+            if self.progress.steps < self._frames:
+                self.interrupted_by = stop.received
+        if isinstance(self._collector, WorkerCollector):
+            self._collector.shutdown()
+        return self.folder.summary()
+
+    def batches(self) -> Iterator[TensorDictBase]:
+        """Rollouts [N, T] of the present policy, without end."""
+        return iter(self._collector)
+
+    def epoch(self, batches: Iterator[TensorDictBase]) -> dict[str, float]:
+        """Collect one batch and learn from it; returns the row of the table."""
+        start = time.perf_counter()
+        # One observation per environment is too little work to share among threads, and the
+        # physics wants the cores.
+        with torch_threads(1):
+            batch = next(batches)
+            if self._worlds is not None:
+                self._worlds.take()
+        collected = time.perf_counter()
+        episodes = self.accounting.update(batch)
+        learned = self.algorithm.learn(batch, episodes)
+        end = time.perf_counter()
+        self.progress.add(batch.numel(), end - start)
+        return {
+            "epoch": self.progress.epoch,
+            "steps": self.progress.steps,
+            **episodes.scalars(),
+            **learned,
+            "time_collect": collected - start,
+            "time_learn": end - collected,
+            "time_total": self.progress.seconds,
+            "steps_per_second": batch.numel() / (end - start),
+        }
+
+    def _save(self) -> None:
+        self._checkpoints.save(self.progress.steps, {"epoch": self.progress.epoch})
+        self.folder.draw_curves()
+
+    def _save_if_best(self, row: Mapping[str, float]) -> None:
+        """Keep the policy with the highest return among those that kept every limit."""
+        # a constrained algorithm says itself what it holds against the limits
+        feasible = all(
+            row.get(f"violation_{key}", row[f"episode_{key}"] - d) <= 0
+            for key, d in self._cost_limits.items()
+        )
+        if feasible and not math.isnan(row["episode_return"]):
+            self._checkpoints.save_best(
+                self.progress.steps, row["episode_return"], {"epoch": self.progress.epoch}
+            )

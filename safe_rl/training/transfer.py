@@ -1,0 +1,110 @@
+"""Starting a run from the networks of another one (Ray, Achiam, Amodei 2019, section 6)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from omegaconf import DictConfig, OmegaConf
+from torch import Tensor, nn
+from torchrl.checkpoint import CheckpointError, CheckpointRotation
+
+from safe_rl.algorithms.on_policy import Networks
+from safe_rl.runs.checkpoints import CheckpointStore
+
+__all__ = ["initialise_networks"]
+
+
+def initialise_networks(networks: Networks, source: Path, cost_keys: list[str]) -> list[str]:
+    """Give networks the weights that a run has learned.
+
+    Actor and critics are taken over; optimisers, multipliers and counters start anew. The cost
+    critic is taken over if the run had one for the same costs.
+
+    Args:
+        networks: The new run's, changed in place.
+        source: Folder of the run, of which the newest checkpoint is read, or a checkpoint.
+        cost_keys: Keys of the new run's constrained costs.
+
+    Returns:
+        Names of the networks that were taken over.
+
+    Raises:
+        CheckpointError: If there is no checkpoint, or its networks have other sizes; nothing has
+            been changed then.
+    """
+    if not source.exists():
+        raise CheckpointError(f"init_from={source}: there is no such folder or file.")
+    checkpoint = _newest(source) if source.is_dir() else source
+    taken: dict[str, nn.Module] = {"actor": networks.actor, "critic": networks.critic}
+    if networks.cost_critic is not None and _constrained_costs(checkpoint) == cost_keys:
+        taken["cost_critic"] = networks.cost_critic
+    weights = {name: _Weights() for name in taken}
+    CheckpointStore.load(checkpoint, weights)
+    for name, network in taken.items():
+        _check_sizes(name, network.state_dict(), weights[name].values, checkpoint)
+    for name, network in taken.items():
+        network.load_state_dict(weights[name].values)
+    return list(taken)
+
+
+class _Weights:
+    """Receives a network's part of a checkpoint without a network."""
+
+    def __init__(self) -> None:
+        self.values: dict[str, Tensor] = {}
+
+    def state_dict(self) -> dict[str, Tensor]:
+        return self.values
+
+    def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
+        self.values = dict(state_dict)
+
+
+def _newest(directory: Path) -> Path:
+    newest = CheckpointRotation(directory / "checkpoints" / "last", keep_last=1).latest()
+    if newest is None:
+        raise CheckpointError(
+            f"init_from={directory}: there is no checkpoint that can be read. Give the folder of a "
+            "run, or a file in its folder 'checkpoints'."
+        )
+    return newest
+
+
+def _constrained_costs(checkpoint: Path) -> list[str]:
+    """Costs that the cost critic of a checkpoint's run is for; none if that is not known."""
+    path = checkpoint.parents[2] / "config.yaml"
+    config = OmegaConf.load(path) if path.is_file() else None
+    if not isinstance(config, DictConfig) or config.get("cost_advantage") is None:
+        return []
+    return list(config.get("cost_limits", {}))
+
+
+def _check_sizes(
+    name: str, own: Mapping[str, Any], given: Mapping[str, Any], checkpoint: Path
+) -> None:
+    sizes = [_layer_sizes(weights) for weights in (own, given)]
+    if sizes[0] != sizes[1]:
+        raise CheckpointError(
+            f"The {name} of {checkpoint} has layers of {_arrows(sizes[1])} numbers, this run's has "
+            f"{_arrows(sizes[0])}: the first is the observation, the last the output. Observations "
+            "and actions must be those of the other run; for the others set model.hidden_sizes."
+        )
+    if set(own) != set(given):
+        raise CheckpointError(
+            f"The {name} of {checkpoint} scales its inputs and this run's does not, or the other "
+            "way round: set model.input_scale as in the other run's config.yaml."
+        )
+
+
+def _layer_sizes(weights: Mapping[str, Any]) -> list[int]:
+    """Numbers that go into a perceptron and come out of each of its layers."""
+    matrices = [
+        value for value in weights.values() if isinstance(value, Tensor) and value.ndim == 2
+    ]
+    return [matrices[0].shape[1], *(matrix.shape[0] for matrix in matrices)] if matrices else []
+
+
+def _arrows(sizes: list[int]) -> str:
+    return " → ".join(map(str, sizes))

@@ -1,0 +1,135 @@
+"""Every algorithm on a problem whose optimal constrained policy is known in closed form."""
+
+from itertools import count
+
+import pytest
+import torch
+from cmdp import ONE, STEPS, TARGET, TWO, make_actor, train
+
+from safe_rl.algorithms import CPOStep, TRPOStep
+from safe_rl.objectives import (
+    CPOLoss,
+    LagrangeMultiplier,
+    PIDMultiplier,
+    PPOLagrangianLoss,
+    PPOLoss,
+    TRPOLagrangianLoss,
+    TRPOLoss,
+)
+
+TARGET_KL = 0.1
+TRUST_REGION = {
+    "target_kl": 0.03, "damping": 0.1, "cg_iterations": 10, "backtrack_coeff": 0.8,
+    "max_backtracks": 10,
+}  # fmt: skip
+PPO = {"clip_epsilon": 0.2, "entropy_coeff": 0.0}
+
+
+def ppo_update(loss, actor):
+    """Adam passes over the batch until the policy has moved far enough."""
+    adam = torch.optim.Adam(actor.parameters(), lr=0.01)
+
+    def update(batch):
+        for _ in range(10):
+            losses = loss(batch)
+            if losses["kl"] > 1.2 * TARGET_KL:
+                break
+            adam.zero_grad()
+            losses["loss_objective"].backward()
+            adam.step()
+
+    return update
+
+
+def multiplier_first(multiplier, update):
+    def update_both(batch, mean_costs):
+        multiplier.update(mean_costs)
+        update(batch)
+
+    return update_both
+
+
+def dual_ascent(multiplier, update):
+    """`multiplier_first` with dual step sizes that fall as 1/t, so that λ settles."""
+    first_lr, epochs = multiplier.lr, count(1)
+
+    def update_both(batch, mean_costs):
+        multiplier.lr = first_lr / (1 + next(epochs) / 50)
+        multiplier_first(multiplier, update)(batch, mean_costs)
+
+    return update_both
+
+
+def ppo(actor, cmdp):
+    update = ppo_update(PPOLoss(actor, **PPO), actor)
+    return lambda batch, _mean_costs: update(batch)
+
+
+def ppo_lagrangian(actor, cmdp):
+    multiplier = LagrangeMultiplier(cmdp.cost_limits, init=1.0, lr=0.08)
+    return dual_ascent(multiplier, ppo_update(PPOLagrangianLoss(actor, multiplier, **PPO), actor))
+
+
+def pid_multiplier(cmdp):
+    return PIDMultiplier(
+        cmdp.cost_limits, init=1.0, kp=0.5, ki=0.05, kd=0.2,
+        proportional_ema=0.5, derivative_ema=0.5, derivative_delay=2, scale="limit",
+    )  # fmt: skip
+
+
+def ppo_pid(actor, cmdp):
+    multiplier = pid_multiplier(cmdp)
+    update = ppo_update(PPOLagrangianLoss(actor, multiplier, **PPO), actor)
+    return multiplier_first(multiplier, update)
+
+
+def trpo(actor, cmdp):
+    step = TRPOStep(TRPOLoss(actor, entropy_coeff=0.0), **TRUST_REGION)
+    return lambda batch, _mean_costs: step(batch)
+
+
+def trpo_lagrangian(actor, cmdp):
+    multiplier = LagrangeMultiplier(cmdp.cost_limits, init=1.0, lr=0.08)
+    loss = TRPOLagrangianLoss(actor, multiplier, entropy_coeff=0.0)
+    return dual_ascent(multiplier, TRPOStep(loss, **TRUST_REGION))
+
+
+def trpo_pid(actor, cmdp):
+    multiplier = pid_multiplier(cmdp)
+    loss = TRPOLagrangianLoss(actor, multiplier, entropy_coeff=0.0)
+    return multiplier_first(multiplier, TRPOStep(loss, **TRUST_REGION))
+
+
+def cpo(actor, cmdp):
+    step = CPOStep(CPOLoss(actor, entropy_coeff=0.0), rescale_violation=True, **TRUST_REGION)
+    return lambda batch, mean_costs: step(batch, mean_costs - cmdp.limits, torch.tensor(STEPS))
+
+
+UNCONSTRAINED = [ppo, trpo]
+# Epochs: a multiplier moved by gradient steps overshoots before it settles, a controller does not.
+CONSTRAINED = [
+    (ppo_lagrangian, 250),
+    (ppo_pid, 120),
+    (trpo_lagrangian, 200),
+    (trpo_pid, 120),
+    (cpo, 100),
+]
+
+
+@pytest.mark.parametrize("cmdp", [ONE, TWO], ids=["one", "two"])
+@pytest.mark.parametrize("algorithm", UNCONSTRAINED)
+def test_unconstrained_algorithms_reach_the_target_and_violate(algorithm, cmdp):
+    actor = make_actor()
+    mean = train(cmdp, actor, algorithm(actor, cmdp), epochs=60)[-20:].mean(0)
+    torch.testing.assert_close(mean, TARGET, atol=0.05, rtol=0)
+    assert (cmdp.expected_costs(mean) > 1.5 * cmdp.limits).all()
+
+
+@pytest.mark.parametrize("cmdp", [ONE, TWO], ids=["one", "two"])
+@pytest.mark.parametrize(("algorithm", "epochs"), CONSTRAINED)
+def test_constrained_algorithms_reach_the_boundary_at_the_optimum(algorithm, epochs, cmdp):
+    actor = make_actor()
+    mean = train(cmdp, actor, algorithm(actor, cmdp), epochs)[-50:].mean(0)
+    # Within 8 % of the limits and 0.05 of the optimal mean, averaged over the last 50 epochs.
+    torch.testing.assert_close(cmdp.expected_costs(mean), cmdp.limits, atol=0, rtol=0.08)
+    torch.testing.assert_close(mean, cmdp.optimum, atol=0.05, rtol=0)

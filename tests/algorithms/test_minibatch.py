@@ -1,0 +1,204 @@
+"""Minibatch updates against plain loops and closed forms."""
+
+import copy
+import functools
+
+import pytest
+import torch
+from tensordict import TensorDict
+from tensordict.nn import TensorDictModule
+from torch import nn
+
+from safe_rl.algorithms.learning_rate import KLAdaptiveRate
+from safe_rl.algorithms.minibatch import MinibatchUpdate
+from safe_rl.models import BehaviourPolicy, make_actor
+from safe_rl.objectives import CriticLoss, PPOLoss
+
+adam = functools.partial(torch.optim.Adam, lr=1e-2)
+
+
+class RecordingLoss(nn.Module):
+    """Loss (w - x)² that remembers the samples it saw; its KL grows with every call."""
+
+    in_keys = ["x"]  # noqa: RUF012
+
+    def __init__(self):
+        super().__init__()
+        self.w = nn.Parameter(torch.zeros(()))
+        self.seen = []
+
+    def forward(self, batch):
+        self.seen.append(batch["x"].clone())
+        kl = torch.tensor(0.004 * (len(self.seen) - 1))
+        return TensorDict(loss_objective=(self.w - batch["x"]).square().mean(), kl=kl)
+
+
+def samples(*shape):
+    count = torch.Size(shape).numel()
+    return TensorDict({"x": torch.arange(float(count)).reshape(shape)}, list(shape))
+
+
+@pytest.mark.parametrize(("minibatch_size", "expected"), [(5, 4), (7, 3), (20, 1), (50, 1)])
+def test_a_pass_takes_equal_parts_of_the_batch_without_repetition(minibatch_size, expected):
+    loss = RecordingLoss()
+    update = MinibatchUpdate(loss, optimizer=adam, num_passes=3, minibatch_size=minibatch_size)
+    diagnostics = update(samples(4, 5))
+    assert diagnostics["num_steps"] == 3 * expected == len(loss.seen)
+    assert len({len(part) for part in loss.seen}) == 1
+    for start in range(0, len(loss.seen), expected):
+        taken = torch.cat(loss.seen[start : start + expected])
+        assert len(taken.unique()) == len(taken) > 20 - expected
+    if expected > 1:
+        assert not torch.equal(loss.seen[0], loss.seen[expected])
+
+
+def test_the_whole_batch_as_minibatch_is_plain_gradient_descent():
+    loss, reference = RecordingLoss(), RecordingLoss()
+    MinibatchUpdate(loss, optimizer=adam, num_passes=7, minibatch_size=None)(samples(4, 5))
+    optimizer = adam(reference.parameters())
+    for _ in range(7):
+        optimizer.zero_grad()
+        reference(samples(20))["loss_objective"].backward()
+        optimizer.step()
+    assert torch.equal(loss.w, reference.w)
+
+
+def test_the_update_stops_before_the_first_step_beyond_the_kl_limit():
+    loss, reference = RecordingLoss(), RecordingLoss()
+    update = MinibatchUpdate(loss, optimizer=adam, num_passes=80, minibatch_size=None, max_kl=0.012)
+    diagnostics = update(samples(20))
+    # the KLs are 0, .004, .008, .012, .016: the fifth exceeds the limit, after four steps
+    MinibatchUpdate(reference, optimizer=adam, num_passes=4, minibatch_size=None)(samples(20))
+    assert diagnostics["num_steps"] == 4
+    assert diagnostics["kl"].item() == pytest.approx(0.016)
+    assert torch.equal(loss.w, reference.w)
+
+
+def test_the_stop_ends_all_passes():
+    loss = RecordingLoss()
+    update = MinibatchUpdate(loss, optimizer=adam, num_passes=9, minibatch_size=5, max_kl=0.012)
+    assert update(samples(20))["num_steps"] == 4
+    assert len(loss.seen) == 5
+
+
+def test_critics_converge_to_least_squares():
+    inputs, noise = torch.randn(200, 3), torch.randn(200, 2)
+    targets = inputs @ torch.randn(3, 2) + 0.3 * noise
+    design = torch.cat([inputs, torch.ones(200, 1)], -1)
+    expected = torch.linalg.lstsq(design, targets).solution
+    critics = [
+        TensorDictModule(nn.Linear(3, 1), in_keys=["observation"], out_keys=[key])
+        for key in ("state_value", "cost_value")
+    ]
+    update = MinibatchUpdate(
+        CriticLoss(*critics), optimizer=adam, num_passes=2000, minibatch_size=None
+    )
+    batch = TensorDict(
+        observation=inputs,
+        value_target=targets[:, :1],
+        cost_value_target=targets[:, 1:],
+        batch_size=[200],
+    )
+    update(batch)
+    for column, critic in enumerate(critics):
+        found = torch.cat([critic.module.weight[0], critic.module.bias])
+        torch.testing.assert_close(found, expected[:, column], atol=1e-4, rtol=0)
+
+
+def ppo_batch(actor):
+    batch = TensorDict({"observation": torch.randn(8, 16, 5)}, [8, 16])
+    with torch.no_grad():
+        batch = BehaviourPolicy(actor)(batch)
+    return batch.set("advantage", batch["action"][..., :1] - batch["loc"][..., :1])
+
+
+def test_the_policy_that_collects_is_the_one_that_is_updated():
+    actor = make_actor(5, 2, hidden_sizes=[16], initial_log_std=-0.5)
+    batch, policy = ppo_batch(actor), BehaviourPolicy(actor)
+    loss = PPOLoss(actor, clip_epsilon=0.2, entropy_coeff=0.0)
+    MinibatchUpdate(loss, optimizer=adam, num_passes=3, minibatch_size=32)(batch)
+    loc = policy(batch.select("observation"))["loc"]
+    # the first action's advantage grows with the action itself, the second one's does not count
+    assert (loc - batch["loc"])[..., 0].mean() > 0.05
+    torch.testing.assert_close(actor.get_dist(batch.select("observation")).mean, loc)
+
+
+def test_compiled_and_plain_updates_agree():
+    results = []
+    for compile in (False, True):
+        torch.manual_seed(1)
+        actor = make_actor(5, 2, hidden_sizes=[16], initial_log_std=-0.5)
+        batch = ppo_batch(actor)
+        loss = PPOLoss(actor, clip_epsilon=0.2, entropy_coeff=0.0)
+        update = MinibatchUpdate(
+            loss, optimizer=adam, num_passes=3, minibatch_size=32, compile=compile
+        )
+        results.append((update(batch), actor.get_dist(batch).mean))
+    torch.testing.assert_close(*(mean for _, mean in results), atol=1e-4, rtol=1e-3)
+    torch.testing.assert_close(*(diagnostics for diagnostics, _ in results), atol=1e-4, rtol=1e-2)
+
+
+def test_state_dict_continues_the_optimiser():
+    batch, losses = samples(20), [RecordingLoss() for _ in range(2)]
+    updates = [
+        MinibatchUpdate(loss, optimizer=adam, num_passes=2, minibatch_size=None) for loss in losses
+    ]
+    updates[0](batch)
+    losses[1].load_state_dict(losses[0].state_dict())
+    updates[1].load_state_dict(copy.deepcopy(updates[0].state_dict()))
+    for update in updates:
+        update(batch)
+    assert torch.equal(losses[0].w, losses[1].w)
+    # Adam without its moments would have taken another step
+    fresh = MinibatchUpdate(losses[1], optimizer=adam, num_passes=1, minibatch_size=None)
+    fresh(batch)
+    updates[0](batch)
+    assert not torch.equal(losses[0].w, losses[1].w)
+
+
+def test_gradients_are_clipped():
+    def distance(max_grad_norm):
+        loss = RecordingLoss()
+        sgd = functools.partial(torch.optim.SGD, lr=1.0)
+        MinibatchUpdate(
+            loss, optimizer=sgd, num_passes=1, minibatch_size=None, max_grad_norm=max_grad_norm
+        )(samples(20))
+        return loss.w.item()
+
+    # d/dw mean((w - x)²) at w = 0 is -2 mean(x) = -19
+    assert distance(None) == pytest.approx(19.0)
+    assert distance(0.5) == pytest.approx(0.5, abs=1e-5)
+
+
+def test_errors_say_what_is_wrong():
+    loss = RecordingLoss()
+    with pytest.raises(ValueError, match="minibatch_size=0"):
+        MinibatchUpdate(loss, optimizer=adam, num_passes=1, minibatch_size=0)
+    update = MinibatchUpdate(loss, optimizer=adam, num_passes=1, minibatch_size=None)
+    with pytest.raises(FloatingPointError, match="'loss_objective' is nan"):
+        update(TensorDict({"x": torch.tensor([float("nan")])}, [1]))
+
+
+def test_the_rate_follows_the_kl_divergence():
+    adapt = KLAdaptiveRate(factor=2.0, lowest=1e-4, highest=4e-3, few_steps=0.5, low_kl=0.5)
+    assert adapt(1e-3, share_of_steps=0.4, share_of_kl=2.0) == pytest.approx(5e-4)
+    assert adapt(1e-3, share_of_steps=1.0, share_of_kl=0.4) == pytest.approx(2e-3)
+    assert adapt(1e-3, share_of_steps=1.0, share_of_kl=0.9) == pytest.approx(1e-3)
+    assert adapt(1e-3, share_of_steps=0.8, share_of_kl=1.1) == pytest.approx(1e-3)
+    assert adapt(1e-4, share_of_steps=0.0, share_of_kl=9.0) == pytest.approx(1e-4)
+    assert adapt(4e-3, share_of_steps=1.0, share_of_kl=0.0) == pytest.approx(4e-3)
+    with pytest.raises(ValueError, match="factor"):
+        KLAdaptiveRate(factor=0.5, lowest=1e-4, highest=1e-3, few_steps=0.5, low_kl=0.5)
+
+
+def test_an_update_that_ends_early_lowers_the_next_rate():
+    adapt = KLAdaptiveRate(factor=2.0, lowest=1e-5, highest=1.0, few_steps=0.7, low_kl=0.7)
+    common = {"optimizer": adam, "minibatch_size": 5, "num_passes": 3, "adapt_rate": adapt}
+    # The recording loss reports a KL of 0, 0.004, 0.008, …: 12 steps are planned.
+    ended = MinibatchUpdate(RecordingLoss(), max_kl=0.01, **common)
+    assert ended(samples(4, 5))["num_steps"] == 3
+    assert ended.optimizer.param_groups[0]["lr"] == pytest.approx(5e-3)
+    short = MinibatchUpdate(RecordingLoss(), max_kl=1.0, **common)
+    assert short(samples(4, 5))["lr"] == pytest.approx(2e-2)
+    with pytest.raises(ValueError, match="max_kl"):
+        MinibatchUpdate(RecordingLoss(), **common)

@@ -1,0 +1,289 @@
+"""TRPO and CPO: losses against finite differences, steps against their own optimality."""
+
+import pytest
+import torch
+from samples import make_actor, make_batch, perturb
+from tensordict import TensorDict
+
+from safe_rl.algorithms import CPOStep, TRPOStep
+from safe_rl.algorithms.cpo_step import constraint_value
+from safe_rl.objectives import (
+    CPOLoss,
+    LagrangeMultiplier,
+    PIDMultiplier,
+    TRPOLagrangianLoss,
+    TRPOLoss,
+)
+from safe_rl.objectives.gaussian import gaussian_kl
+from safe_rl.objectives.normalisation import normalise_advantages
+from safe_rl.objectives.trust_region import FisherProduct, flatten, policy_gaussian
+
+DELTA = 0.01
+SETTINGS = {
+    "target_kl": DELTA, "damping": 0.1, "cg_iterations": 50, "backtrack_coeff": 0.8,
+    "max_backtracks": 10,
+}  # fmt: skip
+LENGTH = torch.tensor(100.0)
+
+
+def make_case(num_costs=1, batch_size=(400,)):
+    actor = make_actor()
+    batch = make_batch(actor, batch_size, num_costs)
+    # Advantages that follow the actions, as sampled ones do, so that steps change surrogates.
+    push = batch["action"] - batch["loc"]
+    batch["advantage"] = push[..., :1] + 0.1 * batch["advantage"]
+    if num_costs:
+        batch["cost_advantage"] = 2 * push[..., :1] + push[..., 1:] + 0.1 * batch["cost_advantage"]
+    return actor, normalise_advantages(batch)
+
+
+def cpo_step(actor, **settings):
+    return CPOStep(
+        CPOLoss(actor, entropy_coeff=0.0), rescale_violation=True, **(SETTINGS | settings)
+    )
+
+
+def kl_and_surrogates(actor, batch):
+    with torch.no_grad():
+        loc, scale = policy_gaussian(actor, batch)
+        kl = gaussian_kl(loc, scale, batch["loc"], batch["scale"]).mean()
+        reward = -TRPOLoss(actor, entropy_coeff=0.0)(batch)["loss_objective"]
+        costs = None
+        if "cost_advantage" in batch.keys():  # noqa: SIM118 (a TensorDict iterates over its rows)
+            costs = CPOLoss(actor, entropy_coeff=0.0)(batch)["cost_surrogate"]
+    return kl, reward, costs
+
+
+def dense_fisher(actor, batch):
+    parameters = list(actor.parameters())
+    product = FisherProduct(actor, batch, parameters, SETTINGS["damping"])
+    return torch.stack([product(row) for row in torch.eye(flatten(parameters).numel())])
+
+
+def all_losses(actor):
+    multiplier = LagrangeMultiplier([25.0, 5.0], init=[0.5, 2.0], lr=0.05)
+    return [
+        TRPOLoss(actor, entropy_coeff=0.01),
+        TRPOLagrangianLoss(actor, multiplier, entropy_coeff=0.01),
+        CPOLoss(actor, entropy_coeff=0.01),
+    ]
+
+
+@pytest.mark.parametrize("index", range(3))
+@pytest.mark.parametrize("batch_size", [(32,), (4, 8)])
+def test_surrogate_gradients_against_finite_differences(index, batch_size):
+    actor = make_actor(width=4)
+    batch = make_batch(actor, batch_size, 2).double()
+    actor.double()
+    perturb(actor, 0.1)
+    loss = all_losses(actor)[index].double()
+    parameters = list(actor.parameters())
+    direction = [torch.randn_like(parameter) for parameter in parameters]
+
+    def outputs():
+        losses = loss(batch)
+        values = [losses["loss_objective"] + losses["loss_entropy"]]
+        return values + list(losses.get("cost_surrogate", torch.empty(0)))
+
+    slopes = []
+    for value in outputs():
+        gradient = torch.autograd.grad(value, parameters, retain_graph=True)
+        slopes.append(sum((g * d).sum() for g, d in zip(gradient, direction, strict=True)))
+    moved = []
+    for size in (1e-6, -2e-6):
+        for parameter, d in zip(parameters, direction, strict=True):
+            parameter.data += size * d
+        moved.append(outputs())
+    for slope, up, down in zip(slopes, *moved, strict=True):
+        torch.testing.assert_close(slope, (up - down) / 2e-6, rtol=1e-4, atol=1e-7)
+
+
+def test_trpo_loss_is_the_definition():
+    actor, batch = make_case(2)
+    perturb(actor, 0.1)
+    log_prob = actor.get_dist(batch.clone()).log_prob(batch["action"])
+    ratio = (log_prob - batch["action_log_prob"]).exp().unsqueeze(-1)
+    reward = (ratio * batch["advantage"]).mean()
+    costs = (ratio * batch["cost_advantage"]).mean(0)
+    losses = [loss(batch) for loss in all_losses(actor)]
+    torch.testing.assert_close(losses[0]["loss_objective"], -reward)
+    expected = -(reward - 0.5 * costs[0] - 2 * costs[1]) / 3.5
+    torch.testing.assert_close(losses[1]["loss_objective"], expected)
+    torch.testing.assert_close(losses[2]["loss_objective"], -reward)
+    torch.testing.assert_close(losses[2]["cost_surrogate"], costs)
+
+
+@pytest.mark.parametrize("index", range(3))
+def test_losses_compile_take_nested_keys_and_move(index):
+    torch._dynamo.reset()
+    actor = make_actor(in_key=("agent", "obs"))
+    batch = make_batch(make_actor(), [16], 2)
+    batch["agent", "obs"] = batch.pop("observation")
+    batch["adv", "cost"] = batch.pop("cost_advantage")
+    loss = all_losses(actor)[index]
+    loss.set_keys(cost_advantage=("adv", "cost"))
+    expected = loss(batch)
+    compiled = torch.compile(loss, fullgraph=True, backend="aot_eager")(batch)
+    for key in loss.out_keys:
+        torch.testing.assert_close(compiled[key], expected[key])
+    double = all_losses(actor.double())[index].double()
+    double.set_keys(cost_advantage=("adv", "cost"))
+    assert double(batch.double())["loss_objective"].dtype == torch.float64
+    meta = all_losses(actor.to("meta"))[index].to("meta")
+    meta.set_keys(cost_advantage=("adv", "cost"))
+    assert all(value.device.type == "meta" for value in meta(batch.to("meta")).values())
+
+
+@pytest.mark.parametrize("batch_size", [(400,), (20, 20)])
+def test_trpo_step_fills_the_trust_region_along_the_natural_gradient(batch_size):
+    actor, batch = make_case(0, batch_size)
+    parameters = list(actor.parameters())
+    start = flatten(parameters).detach()
+    matrix = dense_fisher(actor, batch)
+    loss = TRPOLoss(actor, entropy_coeff=0.0)
+    gradient = flatten(torch.autograd.grad(loss(batch)["loss_objective"], parameters))
+    metrics = TRPOStep(loss, **SETTINGS)(batch)
+    step = (flatten(parameters).detach() - start) / metrics["step_fraction"]
+    length = 0.5 * step @ matrix @ step
+    torch.testing.assert_close(length, torch.tensor(DELTA), rtol=1e-3, atol=0)
+    assert torch.cosine_similarity(matrix @ step, -gradient, dim=0) > 0.999
+    kl, reward, _ = kl_and_surrogates(actor, batch)
+    torch.testing.assert_close(metrics["kl"], kl, rtol=1e-3, atol=1e-6)
+    assert 0.3 * DELTA < kl <= DELTA
+    assert reward > 0
+    assert metrics["step_fraction"] == pytest.approx(0.8 ** metrics["backtracks"].item())
+
+
+def test_rejected_step_leaves_the_policy_exactly_as_it_was():
+    actor, batch = make_case(0)
+    before = flatten(actor.parameters()).detach().clone()
+
+    def worse_everywhere(batch):
+        value = sum(parameter.sum() for parameter in actor.parameters())
+        moved = (flatten(actor.parameters()).detach() - before).norm()
+        return TensorDict(loss_objective=value - value.detach() + moved)
+
+    metrics = TRPOStep(worse_everywhere, actor_network=actor, **SETTINGS)(batch)
+    assert metrics["step_fraction"] == 0
+    assert metrics["backtracks"] == 10
+    assert metrics["kl"] == 0
+    assert torch.equal(flatten(actor.parameters()), before)
+
+
+def test_a_surrogate_of_ones_own():
+    actor, batch = make_case(0)
+
+    def towards_zero(batch):
+        return TensorDict(loss_mean=actor.get_dist(batch.clone()).mean.square().mean())
+
+    start = towards_zero(batch)["loss_mean"]
+    step = TRPOStep(towards_zero, actor_network=actor, **SETTINGS)
+    for _ in range(100):
+        step(batch)
+    assert towards_zero(batch)["loss_mean"] < 0.1 * start
+    with pytest.raises(ValueError, match="actor_network"):
+        TRPOStep(towards_zero, **SETTINGS)
+
+
+@pytest.mark.parametrize(("violation", "case"), [(-1e4, 3), (-5.0, 2), (5.0, 1), (1e4, 0)])
+def test_cpo_cases_move_the_cost_as_they_should(violation, case):
+    actor, batch = make_case(1)
+    _, _, before = kl_and_surrogates(actor, batch)
+    metrics = cpo_step(actor)(batch, torch.tensor([violation]), LENGTH)
+    kl, reward, after = kl_and_surrogates(actor, batch)
+    assert metrics["case"] == case
+    assert metrics["step_fraction"] > 0
+    assert kl <= DELTA * 1.001
+    assert (after - before).item() <= max(-violation / LENGTH.item(), 0) + 1e-6
+    if case > 1:
+        assert reward > 0
+    if case < 2:
+        assert after < before
+
+
+def test_cpo_diagnostics_are_the_definitions():
+    actor, batch = make_case(2)
+    parameters = list(actor.parameters())
+    matrix = dense_fisher(actor, batch).double()
+    losses = CPOLoss(actor, entropy_coeff=0.0)(batch)
+    vectors = [
+        flatten(torch.autograd.grad(value, parameters, retain_graph=True)).double()
+        for value in (losses["loss_objective"], *losses["cost_surrogate"])
+    ]
+    g, b = vectors[0], torch.stack(vectors[1:])
+    violation = torch.tensor([-5.0, 3.0])
+    metrics = cpo_step(actor)(batch, violation, LENGTH)
+    q, r = g @ torch.linalg.solve(matrix, g), b @ torch.linalg.solve(matrix, g)
+    s = (b * torch.linalg.solve(matrix, b.T).T).sum(-1)
+    c = violation.double() / 100
+    expected = {
+        "q": q, "r": r, "s": s, "c": c, "A": q - r**2 / s, "B": 2 * DELTA - c**2 / s
+    }  # fmt: skip
+    for name, value in expected.items():
+        torch.testing.assert_close(metrics[name].double(), value, rtol=2e-3, atol=1e-4)
+    assert metrics["case"] == 1
+    assert metrics["nu"].shape == (2,)
+
+
+def test_cpo_without_cost_gradient_is_trpo():
+    actor, batch = make_case(1)
+    batch["cost_advantage"].zero_()
+    twin = make_actor()
+    twin.load_state_dict(actor.state_dict())
+    metrics = cpo_step(actor)(batch, torch.tensor([-25.0]), LENGTH)
+    TRPOStep(TRPOLoss(twin, entropy_coeff=0.0), **SETTINGS)(batch)
+    assert metrics["case"] == 4
+    torch.testing.assert_close(flatten(actor.parameters()), flatten(twin.parameters()))
+    before = flatten(actor.parameters()).detach().clone()
+    metrics = cpo_step(actor)(batch, torch.tensor([25.0]), LENGTH)
+    assert metrics["case"] == 0
+    assert torch.equal(flatten(actor.parameters()), before)
+    assert all(torch.as_tensor(value).isfinite().all() for value in metrics.values())
+
+
+def test_division_by_the_episode_length_is_a_switch():
+    violation = torch.tensor([5.0, torch.nan])
+    assert constraint_value(violation, LENGTH, True).tolist() == pytest.approx([0.05, 0.0])
+    assert constraint_value(violation, LENGTH, False).tolist() == [5.0, 0.0]
+
+
+def test_subsampled_fisher_steps_stay_in_the_trust_region():
+    actor, batch = make_case(1, (100, 40))
+    step = cpo_step(actor, fisher_subsample=0.1)
+    _, reward, before = kl_and_surrogates(actor, batch)
+    metrics = step(batch, torch.tensor([-2.0]), LENGTH)
+    kl, better, after = kl_and_surrogates(actor, batch)
+    assert metrics["step_fraction"] > 0
+    assert 0.3 * DELTA < kl <= DELTA * 1.001
+    assert better > reward
+    assert after - before <= 0.02 + 1e-6
+
+
+def test_pid_multiplier_in_a_lagrangian_loss():
+    actor, batch = make_case(1)
+    multiplier = PIDMultiplier(
+        25.0, init=0.0, kp=0.1, ki=0.0, kd=0.0, proportional_ema=0.0, derivative_ema=0.0,
+        derivative_delay=1, scale=1.0,
+    )  # fmt: skip
+    loss = TRPOLagrangianLoss(actor, multiplier, entropy_coeff=0.0)
+    free = loss(batch)["loss_objective"]
+    torch.testing.assert_close(free, TRPOLoss(actor, entropy_coeff=0.0)(batch)["loss_objective"])
+    multiplier.update(1e6)
+    costs_only = CPOLoss(actor, entropy_coeff=0.0)(batch)["cost_surrogate"][0]
+    torch.testing.assert_close(loss(batch)["loss_objective"], costs_only, atol=1e-4, rtol=1e-4)
+
+
+def test_errors_say_what_to_change():
+    actor, batch = make_case(1)
+    step = cpo_step(actor)
+    with pytest.raises(ValueError, match="needs cost_violation"):
+        step(batch)
+    with pytest.raises(ValueError, match="one violation per surrogate"):
+        step(batch, torch.zeros(2), LENGTH)
+    with pytest.raises(ValueError, match="fisher_subsample in"):
+        cpo_step(actor, fisher_subsample=2.0)
+    with pytest.raises(TypeError, match="use TRPOLoss"):
+        TRPOLagrangianLoss(actor, None, entropy_coeff=0.0)
+    batch["advantage"][0] = torch.nan
+    with pytest.raises(FloatingPointError, match="non-finite rewards"):
+        step(batch, torch.zeros(1), LENGTH)

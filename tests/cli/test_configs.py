@@ -1,0 +1,207 @@
+"""Every configuration file composes, and the paper's preset has the paper's numbers."""
+
+import itertools
+
+import pytest
+import torch
+from hydra.core.config_store import ConfigStore
+from hydra.errors import HydraException
+from omegaconf import OmegaConf
+from point_mass import PointMass
+from run_configs import CONF, compose_config
+
+from safe_rl.algorithms.building import build_algorithm, check_cost_limits
+from safe_rl.envs import SUITE, make_env, store_configs
+
+store_configs()
+
+
+def options(group: str) -> list[str]:
+    return sorted(path.stem for path in (CONF / group).glob("*.yaml"))
+
+
+ALGORITHMS = options("algo")
+COMBINATIONS = list(itertools.product(ALGORITHMS, options("preset")))
+# of the groups that only some algorithms have
+LAGRANGIAN = [name for name in ALGORITHMS if "lagrangian" in name]
+MULTIPLIERS = [name for name in options("lagrangian") if name not in options("preset")]
+
+
+@pytest.mark.parametrize(
+    ("algo", "preset", "env"),
+    [
+        (*names, env)
+        for names, env in zip(
+            COMBINATIONS, itertools.cycle(["PointGoal1", "CarButton2", "DoggoPush0"]), strict=False
+        )
+    ],
+)
+def test_every_combination_composes_and_resolves(env, algo, preset):
+    config = compose_config(f"env={env}", f"algo={algo}", f"preset={preset}")
+    plain = OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
+    assert plain["env"]["name"] == env
+    assert plain["algo"]["name"] == algo
+    assert plain["preset"] == preset
+    # whole episodes of 1000 steps, shared equally
+    assert plain["frames_per_batch"] == plain["num_envs"] * plain["env"]["num_steps"]
+
+
+@pytest.mark.parametrize(("algo", "preset"), COMBINATIONS)
+def test_every_combination_builds(algo, preset):
+    config = compose_config("env=PointMass", f"algo={algo}", f"preset={preset}")
+    algorithm = build_algorithm(config, PointMass(2))
+    assert (algorithm.networks.cost_critic is None) == (algorithm.cost_advantage is None)
+    assert (algorithm.multiplier is not None) == (algo in LAGRANGIAN)
+
+
+@pytest.mark.parametrize("algo", LAGRANGIAN)
+@pytest.mark.parametrize("multiplier", MULTIPLIERS)
+def test_multipliers_are_interchangeable(algo, multiplier):
+    names = (f"algo={algo}", f"lagrangian={multiplier}")
+    config = compose_config("env=PointMass", *names)
+    assert config.lagrangian == OmegaConf.load(CONF / "lagrangian" / f"{multiplier}.yaml")
+    build_algorithm(config, PointMass(2))
+
+
+def test_every_environment_of_the_suite_is_an_option():
+    listed = ConfigStore.instance().list("env")
+    assert {f"{name}.yaml" for name in SUITE} <= set(listed)
+    assert len(SUITE) == 27
+
+
+def test_overrides_reach_the_environment():
+    config = compose_config("env=PointGoal1", "env.hazards_num=3")
+    assert make_env(OmegaConf.to_container(config.env), num_envs=1).config.hazards_num == 3
+    with pytest.raises(HydraException, match="hazard_num"):
+        compose_config("env=PointGoal1", "env.hazard_num=3")
+
+
+# The whole of what decides how a run learns with preset=paper, from the paper's section 5.2 and the
+# code published with it. A number that is in the configuration and not here fails the tests.
+ADAM = {"_target_": "torch.optim.Adam", "_partial_": True, "fused": True}
+DISCOUNT = {"gamma": 0.99, "lmbda": 0.97, "value_target": "return_to_go"}
+FULL_BATCH = {
+    "_target_": "safe_rl.algorithms.MinibatchUpdate", "num_passes": 80, "minibatch_size": None,
+    "compile": False,
+}  # fmt: skip
+SHARED = {
+    "model": {"hidden_sizes": [256, 256], "initial_log_std": -0.5, "input_scale": {}},
+    "advantage": {"_target_": "safe_rl.objectives.VectorGAE", **DISCOUNT},
+    "critic_update": {**FULL_BATCH, "optimizer": {**ADAM, "lr": 1e-3}},
+    "cost_limits": {"cost": 25.0},
+}
+COSTS = {"cost_advantage": {"_target_": "safe_rl.objectives.CostGAE", **DISCOUNT}}
+MULTIPLIER = {
+    "lagrangian": {"_target_": "safe_rl.objectives.LagrangeMultiplier", "init": 1.0, "lr": 0.05}
+}
+PPO = {"policy_update": {**FULL_BATCH, "optimizer": {**ADAM, "lr": 3e-4}, "max_kl": 1.2 * 0.01}}
+TRUST_REGION = {
+    "target_kl": 0.01, "damping": 0.1, "cg_iterations": 10, "backtrack_coeff": 0.8,
+    "max_backtracks": 10, "fisher_subsample": 1.0,
+}  # fmt: skip
+TRPO = {"policy_update": {"_target_": "safe_rl.algorithms.TRPOStep", **TRUST_REGION}}
+CPO = {
+    "policy_update": {
+        "_target_": "safe_rl.algorithms.CPOStep", **TRUST_REGION, "rescale_violation": True
+    }
+}  # fmt: skip
+PAPER = {
+    "ppo": SHARED | PPO,
+    "ppo_lagrangian": SHARED | PPO | COSTS | MULTIPLIER,
+    "trpo": SHARED | TRPO,
+    "trpo_lagrangian": SHARED | TRPO | COSTS | MULTIPLIER,
+    "cpo": SHARED | CPO | COSTS,
+}
+LOSSES = {
+    "ppo": {"_target_": "safe_rl.objectives.PPOLoss", "clip_epsilon": 0.2},
+    "ppo_lagrangian": {"_target_": "safe_rl.objectives.PPOLagrangianLoss", "clip_epsilon": 0.2},
+    "trpo": {"_target_": "safe_rl.objectives.TRPOLoss"},
+    "trpo_lagrangian": {"_target_": "safe_rl.objectives.TRPOLagrangianLoss"},
+    "cpo": {"_target_": "safe_rl.objectives.CPOLoss"},
+}
+# per environment: steps in all, environments, steps per epoch
+SIZES = {
+    "PointGoal1": (10_000_000, 30, 30_000),
+    "CarPush2": (10_000_000, 30, 30_000),
+    "DoggoButton1": (100_000_000, 60, 60_000),
+}
+# what is no part of the algorithm, and the tables that other keys read
+ASIDE = {"collector", "env", "algo", "preset", "logger", "seed", "device", "num_threads", "compile"}
+ASIDE |= {"checkpoint", "default_cost_limits", "paper"}
+
+
+@pytest.mark.parametrize("env", SIZES)
+@pytest.mark.parametrize("algo", ALGORITHMS)
+def test_the_paper_preset_is_the_paper(env, algo):
+    config = compose_config("preset=paper", f"env={env}", f"algo={algo}")
+    plain = OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
+    # a switch that is off, such as one to start from another run, is null
+    found = {k: v for k, v in plain.items() if k not in ASIDE and v is not None}
+    sizes = dict(zip(("frames", "num_envs", "frames_per_batch"), SIZES[env], strict=True))
+    assert found == PAPER[algo] | sizes | {"loss": {**LOSSES[algo], "entropy_coeff": 0.0}}
+
+
+def test_a_robot_of_ones_own_has_the_numbers_of_point():
+    config = compose_config("preset=paper", "env=PointMass", "env.robot_base=xmls/mine.xml")
+    assert (config.frames, config.num_envs, config.frames_per_batch) == (10_000_000, 30, 30_000)
+
+
+def test_cost_limits_on_the_command_line_replace_the_default():
+    assert compose_config().cost_limits == {"cost": 25.0}
+    config = compose_config("cost_limits={cost_hazards: 10, cost_vases_contact: 5}")
+    assert config.cost_limits == {"cost_hazards": 10, "cost_vases_contact": 5}
+
+
+@pytest.mark.parametrize(
+    ("overrides", "message"),
+    [
+        (["algo=ppo_lagrangien"], "ppo_lagrangian"),
+        (["env=PointGoal3"], "PointGoal2"),
+        (["preset=papers"], "paper"),
+        (["algo=ppo", "lagrangian=adam"], "lagrangian"),
+        (["fames=10"], "fames"),
+    ],
+)
+def test_unknown_names_are_errors_that_list_the_known_ones(overrides, message):
+    with pytest.raises(HydraException, match=message):
+        compose_config(*overrides)
+
+
+def test_cost_limits_must_name_costs_of_the_environment():
+    keys = ["cost", "cost_hazards", "cost_vases_contact"]
+    assert check_cost_limits({"cost_hazards": 10}, keys) == {"cost_hazards": 10.0}
+    with pytest.raises(ValueError, match="Nearest: 'cost_hazards'"):
+        check_cost_limits({"cost_hazard": 10}, keys)
+    for limit in (-1, "many", None, float("nan"), True):
+        with pytest.raises(ValueError, match="'cost' is"):
+            check_cost_limits({"cost": limit}, keys)
+    with pytest.raises(ValueError, match="Without constraints use algo=ppo"):
+        build_algorithm(compose_config("env=PointMass", "cost_limits={}"), PointMass(2))
+
+
+def test_the_compile_switch_reaches_both_updates():
+    config = compose_config("compile=true")
+    assert config.policy_update.compile
+    assert config.critic_update.compile
+
+
+def test_hyper_parameters_have_one_home():
+    """Numbers that a preset decides are not defaults of the classes that use them."""
+    config = compose_config("env=PointMass")
+    del config.policy_update.num_passes
+    with pytest.raises(Exception, match="num_passes"):
+        build_algorithm(config, PointMass(2))
+
+
+def test_networks_scale_the_components_that_are_observed():
+    config = compose_config("env=PointMass", "+model.input_scale.velocity=0.5")
+    network = build_algorithm(config, PointMass(2)).networks.actor
+    scales = [value for name, value in network.state_dict().items() if name.endswith("0.scale")]
+    torch.testing.assert_close(scales, [torch.tensor([1.0, 1.0, 0.5, 0.5])])
+
+
+def test_configuration_files_say_what_they_are():
+    files = list(CONF.rglob("*.yaml"))
+    assert files
+    for path in files:
+        assert any(line.startswith("# ") for line in path.read_text().splitlines()), path

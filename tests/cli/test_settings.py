@@ -1,0 +1,77 @@
+"""Values that a run cannot have are named before it begins, in one line."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from run_configs import point_mass_config
+
+from safe_rl.cli.settings import SettingError, check_settings, errors_in_a_line
+
+ROOT = Path(__file__).parents[2]
+WRONG = {
+    "frames=abc": "frames=abc: it must be a number of steps",
+    "frames=0": "frames=0",
+    "frames=1.5": r"frames=1\.5",
+    "num_envs=0": "num_envs=0",
+    "seed=-1": "seed=-1: it must be a whole number",
+    "seed=true": "seed=True",
+    "checkpoint.interval=abc": r"checkpoint\.interval=abc: it must be a number of seconds",
+    "checkpoint.keep_last=0": r"checkpoint\.keep_last=0",
+    "num_threads=0": "num_threads=0",
+    "model.hidden_sizes=64": r"model\.hidden_sizes=64: it must be a list of widths",
+    "device=gpu": "device=gpu: Expected one of cpu, cuda",
+    "cost_limits=25": r"cost_limits=25: it must be limits by cost",
+}
+
+
+@pytest.mark.parametrize("override", WRONG)
+def test_wrong_values_are_named(override):
+    with pytest.raises(SettingError, match=WRONG[override]):
+        check_settings(point_mass_config(override))
+
+
+@pytest.mark.parametrize("override", ["frames=3e5", "num_threads=null", "checkpoint.interval=0"])
+def test_right_values_pass(override):
+    check_settings(point_mass_config(override))
+
+
+def test_only_folders_of_runs_that_did_not_begin_are_removed(tmp_path, monkeypatch):
+    monkeypatch.delenv("HYDRA_FULL_ERROR", raising=False)
+    for name, is_new, stays in (("a", True, False), ("b", False, True), ("c", True, True)):
+        (tmp_path / name / ".hydra").mkdir(parents=True)
+        if name == "c":
+            (tmp_path / name / "progress.csv").write_text("steps")
+        stops = pytest.raises(SystemExit, match="what is wrong")
+        with stops, errors_in_a_line(tmp_path / name, is_new):
+            raise SettingError("what is wrong")
+        assert (tmp_path / name).exists() == stays
+
+
+def test_other_errors_and_full_ones_pass(tmp_path, monkeypatch):
+    with pytest.raises(RuntimeError), errors_in_a_line(tmp_path, is_new=False):
+        raise RuntimeError
+    monkeypatch.setenv("HYDRA_FULL_ERROR", "1")
+    with pytest.raises(SettingError), errors_in_a_line(tmp_path, is_new=False):
+        raise SettingError
+
+
+@pytest.mark.parametrize(
+    ("override", "words"),
+    [
+        ("frames=abc", "frames=abc: it must be a number of steps, at least 1."),
+        ("lagrangian.kp=abc", "lagrangian: '<' not supported"),
+        ("init_from=nowhere", "init_from=nowhere: there is no such folder or file."),
+        ("env.hazards_num=abc", "'hazards_num'"),
+        ("env.hazards_num=200", "No layout found in 10000 attempts: most often 'hazard"),
+    ],
+)
+def test_train_py_ends_in_a_line_and_leaves_nothing(tmp_path, override, words):
+    command = [sys.executable, "train.py", override, f"hydra.run.dir={tmp_path / 'run'}"]
+    result = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
+    assert result.returncode == 1
+    assert words in result.stderr
+    assert "Traceback" not in result.stderr
+    assert len(result.stderr.strip().splitlines()) == 1
+    assert not (tmp_path / "run").exists()

@@ -1,0 +1,88 @@
+"""What the shorthands of train.py are written out to, and what is refused."""
+
+import re
+
+import pytest
+from hydra import compose, initialize_config_dir
+from run_configs import point_mass_config
+
+from safe_rl.cli.overrides import CommandLineError
+from safe_rl.cli.shorthands import expand_arguments
+from safe_rl.runs.folder import RunFolder
+from safe_rl.scores.protocol import SLATES
+
+
+@pytest.fixture
+def run(tmp_path):
+    """Folder of a run whose name Hydra's grammar would trip over."""
+    directory = tmp_path / "it's frames=10,num_envs=4"
+    with RunFolder(directory, point_mass_config(), {"cost": 25.0}, 20).writing():
+        pass
+    return directory
+
+
+def test_arguments_without_shorthands_stay():
+    arguments = ["env=PointGoal1", "+seed=0", "hydra.run.dir=resume"]
+    assert expand_arguments(arguments) == arguments
+
+
+def test_sweeps_run_on_joblib_where_it_is_installed(monkeypatch):
+    arguments = ["-m", "env=PointGoal1,CarGoal1"]
+    for is_there, launcher in ((True, ["hydra/launcher=joblib"]), (False, [])):
+        monkeypatch.setattr("safe_rl.cli.shorthands._is_installed", lambda _, known=is_there: known)
+        assert expand_arguments(arguments) == [*arguments, *launcher]
+        told = [*arguments, "hydra/launcher=ray"]
+        assert expand_arguments(told) == told
+
+
+def test_resuming_reads_the_configuration_of_the_run(run):
+    expanded = expand_arguments([f"resume={run}", "frames=99", "policy_update.max_kl=0.5"])
+    assert expanded[:4] == ["--config-path", str(run), "--config-name", "config"]
+    with initialize_config_dir(str(run), version_base="1.3"):
+        config = compose("config", overrides=expanded[4:], return_hydra_config=True)
+    assert config.hydra.run.dir == str(run)
+    assert config.hydra.output_subdir is None
+    assert config.frames == 99
+    assert config.policy_update.max_kl == 0.5
+    assert config.algo == point_mass_config().algo
+
+
+@pytest.mark.parametrize(
+    "override",
+    ["algo=ppo", "env=CarGoal1", "seed=3", "preset=paper", "num_envs=8", "model.hidden_sizes=[8]"],
+)
+def test_what_cannot_change_in_a_continued_run(run, override):
+    with pytest.raises(
+        CommandLineError, match=rf"'{re.escape(override)}' cannot change.*init_from="
+    ):
+        expand_arguments([override, f"resume={run}"])
+
+
+def test_only_a_run_can_be_resumed(run):
+    with pytest.raises(CommandLineError, match=r"no config.yaml. Runs below it: .*it's frames"):
+        expand_arguments([f"resume={run.parent}"])
+    with pytest.raises(CommandLineError, match="start it again as it was"):
+        expand_arguments(["-m", f"resume={run}"])
+    with pytest.raises(CommandLineError, match="more than once"):
+        expand_arguments([f"resume={run}", f"resume={run}"])
+
+
+@pytest.mark.parametrize("shorthand", ["slate=SG6", "+slate=SG6"])
+def test_a_slate_is_its_environments(shorthand):
+    expanded = expand_arguments(["algo=ppo,cpo", shorthand, "-m", "hydra/launcher=basic"])
+    assert expanded[:3] == ["-m", f"env={','.join(SLATES['SG6'])}", "algo=ppo,cpo"]
+
+
+def test_slates_that_cannot_be_written_out():
+    with pytest.raises(CommandLineError, match="Did you mean 'SGPoint'"):
+        expand_arguments(["-m", "slate=Point"])
+    with pytest.raises(CommandLineError, match="6 environments: add -m"):
+        expand_arguments(["slate=SG6"])
+    with pytest.raises(CommandLineError, match="use one of them"):
+        expand_arguments(["-m", "slate=SG6", "env=PointGoal1"])
+
+
+def test_a_broken_configuration_is_named(run):
+    (run / "config.yaml").write_text("algo: [")
+    with pytest.raises(CommandLineError, match=r"config\.yaml cannot be read"):
+        expand_arguments([f"resume={run}"])

@@ -1,0 +1,134 @@
+"""Sweeps: how many jobs and threads, failing jobs, and a whole sweep started again."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from hydra.core.utils import JobReturn, JobStatus
+from omegaconf import OmegaConf
+
+from safe_rl.cli.sweeps import SweepReport, count_jobs, threads_per_job
+
+ROOT = Path(__file__).parents[2]
+
+
+@pytest.mark.parametrize(
+    ("overrides", "number"),
+    [
+        (["env=PointGoal1", "seed=0"], 1),
+        (["env=PointGoal1,CarGoal1", "seed=0,10,20", "algo=ppo"], 6),
+        (["cost_limits={cost: 25, cost_hazards: 3}", "seed=range(5)"], 5),
+        (["frames=choice(10,20)", "model.hidden_sizes=[64,64],[32]"], 4),
+    ],
+)
+def test_jobs_are_counted_as_hydra_makes_them(overrides, number):
+    assert count_jobs(overrides) == number
+
+
+@pytest.mark.parametrize(
+    ("jobs", "workers", "cores", "threads"),
+    [(8, -1, 4, 1), (2, -1, 8, 4), (8, 2, 8, 4), (8, -2, 8, 1), (1, 16, 2, 2), (9, 16, 2, 1)],
+)
+def test_jobs_at_a_time_share_the_cores(jobs, workers, cores, threads):
+    assert threads_per_job(jobs, workers, cores) == threads
+    workers = workers if workers > 0 else cores + 1 + workers
+    assert threads == 1 or threads * min(jobs, workers) <= cores
+
+
+def sweep_config(directory, job=0):
+    return OmegaConf.create(
+        {
+            "hydra": {
+                "overrides": {"task": ["seed=0,1,2"]},
+                "sweep": {"dir": str(directory)},
+                "launcher": {},
+                "runtime": {"output_dir": str(directory / f"seed{job}")},
+                "job": {"num": job},
+            }
+        }
+    )
+
+
+def end_job(report, config, error=None):
+    Path(config.hydra.runtime.output_dir).mkdir(exist_ok=True)
+    outcome = JobReturn(status=JobStatus.FAILED if error else JobStatus.COMPLETED)
+    outcome.return_value = error
+    report.on_job_start(config=config)
+    report.on_job_end(config=config, job_return=outcome)
+    return outcome
+
+
+def test_a_failing_job_is_named_and_stops_nobody(tmp_path, capsys):
+    report = SweepReport()
+    report.on_multirun_start(sweep_config(tmp_path))
+    end_job(report, sweep_config(tmp_path, 0))
+    failed = end_job(report, sweep_config(tmp_path, 1), ValueError("no such cost\nmore"))
+    assert failed.return_value is None
+    report.on_job_start(config=sweep_config(tmp_path, 2))
+    with pytest.raises(SystemExit, match="1"):
+        report.on_multirun_end(sweep_config(tmp_path))
+    assert capsys.readouterr().out.splitlines() == [
+        "Sweep: 1 of 3 runs are finished.",
+        f"  failed: {tmp_path}/seed1: ValueError: no such cost (see failure.txt there)",
+        f"  interrupted: {tmp_path}/seed2",
+        "Start it again as it was: finished runs are skipped, the others go on.",
+    ]
+    assert "ValueError: no such cost\nmore" in (tmp_path / "seed1" / "failure.txt").read_text()
+
+
+def test_a_sweep_without_failures_ends_well_and_clears_old_failures(tmp_path, capsys):
+    (tmp_path / "seed0").mkdir()
+    (tmp_path / "seed0" / "failure.txt").write_text("of last time")
+    report = SweepReport()
+    report.on_multirun_start(sweep_config(tmp_path))
+    for job in range(3):
+        end_job(report, sweep_config(tmp_path, job))
+    report.on_multirun_end(sweep_config(tmp_path))
+    assert capsys.readouterr().out == "Sweep: 3 of 3 runs are finished.\n"
+    assert not (tmp_path / "seed0" / "failure.txt").exists()
+
+
+def test_single_runs_are_left_alone(tmp_path):
+    failed = end_job(SweepReport(), sweep_config(tmp_path), ValueError("wrong"))
+    with pytest.raises(ValueError, match="wrong"):
+        failed.return_value  # noqa: B018, raises what the job raised
+    assert [path.name for path in tmp_path.iterdir()] == ["seed0"]
+
+
+TINY = [
+    *("env.num_steps=40", "num_envs=2", "frames_per_batch=80", "frames=240", "logger=none"),
+    *("model.hidden_sizes=[8]", "critic_update.num_passes=1", "policy_update.num_passes=1"),
+]
+
+
+def sweep(directory, *overrides):
+    return subprocess.run(
+        [sys.executable, "train.py", "-m", *TINY, f"hydra.sweep.dir={directory}", *overrides],
+        cwd=ROOT, capture_output=True, text=True, timeout=600,
+    )  # fmt: skip
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("launcher", ["joblib", "basic"])
+def test_a_sweep_end_to_end(tmp_path, launcher):
+    if launcher == "joblib":
+        pytest.importorskip("hydra_plugins.hydra_joblib_launcher")
+    # the constrained algorithm cannot work without a limit, the other one does not need any
+    jobs = ["env=PointGoal1", "algo=ppo,ppo_lagrangian", "seed=0,10", f"hydra/launcher={launcher}"]
+    first = sweep(tmp_path, *jobs, "default_cost_limits=null", "cost_limits={}")
+    assert first.returncode == 1, first.stderr
+    assert "Sweep: 2 of 4 runs are finished." in first.stdout
+    assert first.stdout.count("needs at least one entry in cost_limits") == 2
+    tables = sorted(tmp_path.glob("PointGoal1/ppo/*/seed*/progress.csv"))
+    assert [table.parent.name for table in tables] == ["seed0", "seed10"]
+    assert not list(tmp_path.glob("PointGoal1/ppo_lagrangian/*/*/progress.csv"))
+    before = [table.stat().st_mtime_ns for table in tables]
+    again = sweep(tmp_path, *jobs, "default_cost_limits=null", "cost_limits={}")
+    assert again.stdout.count("has its 240 frames already") == 2
+    assert [table.stat().st_mtime_ns for table in tables] == before
+    journals = sorted((tmp_path / "sweeps").iterdir())
+    assert len(journals) == 2
+    notes = [json.loads(line) for line in journals[0].read_text().splitlines()]
+    assert sorted(note["event"] for note in notes) == ["begun"] * 4 + ["done"] * 2 + ["failed"] * 2

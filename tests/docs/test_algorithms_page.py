@@ -1,0 +1,78 @@
+"""The page on the algorithms says what is so: its snippets run, its tables are the program's."""
+
+import re
+
+import pytest
+from omegaconf import OmegaConf
+from point_mass import PointMass
+from run_configs import CONF, compose_config, point_mass_config
+
+from safe_rl.runs.table import read_table
+from safe_rl.training.trainer import build_trainer
+
+PAGE = (CONF.parent / "docs" / "algorithms.md").read_text()
+COSTS, LIMITED = PointMass.cost_keys, ["cost_hazards", "cost_north"]
+TABLES = {
+    "ppo": ["ppo"],
+    "ppo_lagrangian": ["constrained", "lagrangian", "ppo"],
+    "trpo": ["trpo"],
+    "trpo_lagrangian": ["constrained", "lagrangian", "trpo"],
+    "cpo": ["constrained", "trpo", "cpo"],
+}
+
+
+def rows(name):
+    """Cells of the table below its mark, without the heading."""
+    table = re.search(rf"<!-- table: {name} -->\n(.*?)\n\n", PAGE, re.DOTALL)[1]
+    return [re.split(r" ?\| ?", line)[1:-1] for line in table.splitlines()[2:]]
+
+
+def columns(name, costs):
+    """Names of the columns that a table explains, one per cost where it says so."""
+    names = [found for first, *_ in rows(name) for found in re.findall(r"`([^`]+)`", first)]
+    found = [entry.replace("<cost>", cost) for entry in names for cost in costs]
+    return set(found)
+
+
+def test_snippets_run_one_after_the_other():
+    snippets = re.findall(r"```python\n(.*?)```", PAGE, re.DOTALL)
+    assert len(snippets) == 5
+    exec("\n".join(snippets), {})
+
+
+@pytest.mark.parametrize("algo", TABLES)
+def test_the_columns_are_those_of_a_run(algo, tmp_path):
+    config = point_mass_config(
+        f"algo={algo}",
+        "frames=160",
+        "cost_limits={cost_hazards: 1, cost_north: 1}",
+        minibatch_size=40 if "ppo" in algo else None,
+    )
+    build_trainer(config, PointMass(config.num_envs), tmp_path).run()
+    documented = columns("columns of all", COSTS)
+    for table in TABLES[algo]:
+        documented |= columns(f"columns of {table}", LIMITED)
+    assert set(read_table(tmp_path / "progress.csv")) == documented
+
+
+@pytest.mark.parametrize("preset", ["default", "paper"])
+@pytest.mark.parametrize(
+    ("name", "algo"),
+    [
+        ("presets", "cpo"),
+        ("presets of ppo_lagrangian", "ppo_lagrangian"),
+        ("presets of cpo", "cpo"),
+    ],
+)
+def test_the_numbers_of_the_presets(name, algo, preset):
+    config = compose_config(f"preset={preset}", f"algo={algo}", "env=PointMass")
+    for key, default, paper, _ in rows(name):
+        value = OmegaConf.create(f"value: {default if preset == 'default' else paper}").value
+        assert OmegaConf.select(config, key.strip("`")) == value, key
+
+
+def test_costs_are_estimated_as_rewards_are():
+    for preset in ("default", "paper"):
+        config = compose_config(f"preset={preset}", "algo=cpo", "env=PointMass")
+        same = ("gamma", "lmbda", "value_target")
+        assert all(config.cost_advantage[key] == config.advantage[key] for key in same)

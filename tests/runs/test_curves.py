@@ -1,0 +1,97 @@
+"""The learning curves: what is drawn, not how it looks."""
+
+import math
+
+import numpy as np
+import pytest
+from matplotlib.figure import Figure
+from matplotlib.image import imread
+
+from safe_rl.runs.curves import draw_learning_curves
+
+TABLE = {
+    "steps": [100, 200, 300, 400, 500, 600, 700],
+    "episode_return": [1.0, math.nan, 3.0, 4.0, 5.0, 6.0, 13.0],
+    "episode_cost": [60.0, math.nan, 50.0, 40.0, 30.0, 20.0, 10.0],
+    "episode_cost_hazards": [6.0, math.nan, 5.0, 4.0, 3.0, 2.0, 1.0],
+    "cost_rate": [0.06, 0.06, 0.05, 0.04, 0.03, 0.03, 0.02],
+    "cost_hazards_rate": [0.006, 0.006, 0.005, 0.004, 0.003, 0.003, 0.002],
+}
+
+
+@pytest.fixture
+def drawn(monkeypatch, tmp_path):
+    """Draw, and return the panels that were saved."""
+    figures = []
+    save = Figure.savefig
+
+    def remember(figure, *args, **kwargs):
+        figures.append(figure)
+        return save(figure, *args, **kwargs)
+
+    monkeypatch.setattr(Figure, "savefig", remember)
+
+    def draw(cost_limits, table=TABLE):
+        path = tmp_path / "curves.png"
+        draw_learning_curves(table, cost_limits, 1000, path, "title")
+        assert imread(path).std() > 0
+        assert [entry.name for entry in tmp_path.iterdir()] == ["curves.png"]
+        return figures[-1].axes
+
+    return draw
+
+
+def heights(axes, style):
+    return [line.get_ydata() for line in axes.lines if line.get_linestyle() == style]
+
+
+def test_three_panels_with_dashed_limits(drawn):
+    returns, costs, rates = drawn({"cost": 25.0})
+    assert [panel.get_title() for panel in (returns, costs, rates)] == [
+        "Return", "Episode cost", "Cost rate",
+    ]  # fmt: skip
+    assert heights(returns, "--") == []
+    assert heights(costs, "--") == [[25.0, 25.0]]
+    assert heights(rates, "--") == [[0.025, 0.025]]
+    np.testing.assert_allclose(heights(rates, "-")[0], TABLE["cost_rate"])
+
+
+def test_single_epochs_and_their_moving_mean_over_five(drawn):
+    returns, _, _ = drawn({"cost": 25.0})
+    single, mean = returns.lines
+    np.testing.assert_allclose(single.get_ydata(), [1, 3, 4, 5, 6, 13])
+    np.testing.assert_allclose(single.get_xdata(), [100, 300, 400, 500, 600, 700])
+    np.testing.assert_allclose(mean.get_ydata(), [1, 2, 8 / 3, 13 / 4, 19 / 5, 31 / 5])
+
+
+def test_several_costs_have_a_line_a_limit_and_a_name_each(drawn):
+    _, costs, rates = drawn({"cost": 25.0, "cost_hazards": 10.0})
+    assert sorted(line[0] for line in heights(costs, "--")) == [10.0, 25.0]
+    assert sorted(line[0] for line in heights(rates, "--")) == [0.01, 0.025]
+    assert [text.get_text() for text in costs.get_legend().get_texts()] == [
+        "cost", "limit 25", "cost_hazards", "limit 10",
+    ]  # fmt: skip
+    colours = {line.get_color() for line in costs.lines if line.get_linestyle() == "--"}
+    assert len(colours) == 2
+
+
+def test_a_single_epoch_is_drawn_as_a_point(drawn):
+    panels = drawn({"cost": 25.0}, {name: values[:1] for name, values in TABLE.items()})
+    markers = [{line.get_marker() for line in axes.lines} for axes in panels]
+    assert all("o" in found for found in markers)
+    lines = [line for axes in drawn({"cost": 25.0}) for line in axes.lines]
+    assert not any(line.get_marker() == "o" for line in lines)
+
+
+@pytest.mark.parametrize("limits", [{"cost": 25.0}, {"cost": 25.0, "cost_hazards": 10.0}])
+def test_the_legend_covers_no_line(drawn, limits):
+    for axes in drawn(limits)[1:]:
+        legend = axes.get_legend().get_window_extent()
+        labels = axes.xaxis.get_tightbbox()
+        assert 0 <= legend.y0 < legend.y1 <= labels.y0
+
+
+def test_without_limits_the_aggregate_cost_is_drawn(drawn):
+    _, costs, rates = drawn({})
+    assert heights(costs, "--") == heights(rates, "--") == []
+    np.testing.assert_allclose(heights(rates, "-")[0], TABLE["cost_rate"])

@@ -1,0 +1,119 @@
+"""Final figures by hand, and what reaches TensorBoard."""
+
+import math
+
+import pytest
+from omegaconf import OmegaConf
+from run_configs import compose_config
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+from safe_rl.runs.folder import RunFolder, final_figures
+
+NAN = math.nan
+
+
+def row(epoch, episode_return, cost, north_cost=0.0):
+    return {
+        "epoch": epoch,
+        "steps": 1000 * epoch,
+        "episode_return": episode_return,
+        "episode_cost": cost,
+        "episode_cost_north": north_cost,
+        "cost_rate": 0.001 * epoch,
+        "cost_north_rate": 0.002,
+        "multiplier_cost": 0.5,
+        "time_total": 2.0 * epoch,
+    }
+
+
+def test_final_figures_are_means_of_the_last_five_epochs_with_episodes():
+    table = {
+        "episode_return": [100.0, 1.0, 2.0, NAN, 3.0, 4.0, 5.0],
+        "episode_cost": [900.0, 10.0, 20.0, NAN, 30.0, 40.0, 50.0],
+        "cost_rate": [9.0, 8.0, 7.0, 6.0, 5.0, 4.0, 0.03],
+        "steps": [10.0, 20.0, 30.0, 40.0, 50.0, 60.0, 70.0],
+        "time_total": [1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 35.0],
+    }
+    final = final_figures(table, ["cost"])
+    assert final == {
+        "episode_return": 3.0, "episode_cost": 30.0, "cost_rate": 0.03, "steps_per_second": 2.0,
+    }  # fmt: skip
+
+
+def test_final_figures_without_any_episode_are_nan():
+    table = {"episode_return": [NAN], "steps": [10.0], "time_total": [1.0]}
+    assert math.isnan(final_figures(table, [])["episode_return"])
+
+
+def test_the_folder_has_configuration_table_and_tensorboard(tmp_path, capsys):
+    config = compose_config("env=PointMass", "cost_limits={cost: 25, cost_north: 5}", "frames=2000")
+    folder = RunFolder(tmp_path / "run", config, {"cost": 25.0, "cost_north": 5.0}, 1000)
+    with folder.writing():
+        folder.record(row(1, NAN, NAN, NAN))
+        folder.record(row(2, 1.5, 30.0, 4.0))
+    folder.draw_curves()
+    saved = OmegaConf.load(tmp_path / "run" / "config.yaml")
+    assert saved == OmegaConf.create(OmegaConf.to_container(config, resolve=True))
+    events = EventAccumulator(str(tmp_path / "run" / "tensorboard")).Reload()
+    costs = [(event.step, event.value) for event in events.Scalars("episode_cost")]
+    assert costs == [(2000, 30.0)]
+    assert {event.step for event in events.Scalars("multiplier_cost")} == {1000, 2000}
+    assert folder.summary() == (
+        "J_r 1.50, J_c[cost] 30.0 (limit 25), ρ_c[cost] 0.0020, "  # noqa: RUF001
+        "J_c[cost_north] 4.0 (limit 5), ρ_c[cost_north] 0.0020, "  # noqa: RUF001
+        f"500 steps/s in {tmp_path / 'run'}"
+    )
+    bar = capsys.readouterr().err
+    assert "return=1.50, cost=30.0/25, cost_north=4.0/5" in bar
+    assert "λ=0.5" in bar
+    assert "2.00k/2.00k" in bar
+    assert "nan" not in bar
+
+
+def test_a_measure_of_ones_own_is_what_is_held_against_the_limit(tmp_path, capsys):
+    config = compose_config("env=PointMass", "logger=none")
+    folder = RunFolder(tmp_path, config, {"cost": 25.0}, 1000)
+    with folder.writing():
+        folder.record(row(1, 1.0, 20.0) | {"violation_cost": 62.0})
+        folder.record(row(2, 1.0, 30.0) | {"violation_cost": 64.0})
+    assert "J_c 25.0, measured 88.0 (limit 25)" in folder.summary()
+    with folder.writing(0):
+        folder.record(row(1, NAN, NAN) | {"violation_cost": NAN})
+    assert "J_c nan (limit 25)" in folder.summary()
+    assert "cost=89.0/25" in capsys.readouterr().err
+
+
+def test_a_continued_table_goes_on_after_its_epoch(tmp_path):
+    config = compose_config("env=PointMass", "logger=none")
+    folder = RunFolder(tmp_path, config, {"cost": 25.0}, 1000)
+    with folder.writing():
+        for epoch in (1, 2, 3):
+            folder.record(row(epoch, 0.0, 0.0))
+    with folder.writing(epoch=2, steps=2000):
+        folder.record(row(3, 7.0, 7.0))
+    lines = folder.table_path.read_text().splitlines()
+    assert [line.split(",")[0] for line in lines] == ["epoch", "1", "2", "3"]
+    assert lines[3].startswith("3,3000,7,7")
+
+
+def test_a_new_run_does_not_overwrite_another(tmp_path):
+    config = compose_config("env=PointMass", "logger=none")
+    with RunFolder(tmp_path, config, {}, 1000).writing():
+        pass
+    again = RunFolder(tmp_path, config, {}, 1000).writing()
+    with pytest.raises(FileExistsError, match="already holds a run"):
+        again.__enter__()
+
+
+def test_writing_ends_cleanly_when_training_fails(tmp_path):
+    config = compose_config("env=PointMass", "logger=none")
+    folder = RunFolder(tmp_path, config, {}, 1000)
+
+    def fail():
+        with folder.writing():
+            folder.record(row(1, 0.0, 0.0))
+            raise FloatingPointError
+
+    with pytest.raises(FloatingPointError):
+        fail()
+    assert len(folder.table_path.read_text().splitlines()) == 2

@@ -1,0 +1,47 @@
+"""Loggers of others: what they hold of a run, and of one that was continued."""
+
+import sys
+
+import pytest
+from point_mass import PointMass
+from run_configs import point_mass_config
+
+from safe_rl.runs.loggers import WandbLogger
+from safe_rl.runs.table import read_table
+from safe_rl.training.trainer import build_trainer, seed_everything
+
+
+def train(directory, *overrides):
+    config = point_mass_config(*overrides)
+    seed_everything(config.seed, 1)
+    trainer = build_trainer(config, PointMass(config.num_envs, 20), directory)
+    if trainer.folder.holds_run:
+        trainer.resume()
+    trainer.run()
+
+
+def test_mlflow_holds_the_table_and_goes_on_in_the_same_run(tmp_path):
+    mlflow = pytest.importorskip("mlflow")
+    pytest.importorskip("sqlalchemy", reason="only the whole of MLflow has its own database")
+    uri = f"sqlite:///{tmp_path}/mlflow.db"
+    overrides = ["logger=mlflow", f"logger.tracking_uri={uri}"]
+    train(tmp_path / "run", *overrides, "frames=640")
+    train(tmp_path / "run", *overrides, "frames=960")
+    train(tmp_path / "other", *overrides, "frames=160", "seed=1")
+    client = mlflow.MlflowClient(uri)
+    experiment = client.get_experiment_by_name("PointMass")
+    runs = {run.info.run_name: run for run in client.search_runs([experiment.experiment_id])}
+    assert set(runs) == {str(tmp_path / "run"), str(tmp_path / "other")}
+    run = runs[str(tmp_path / "run")]
+    table = read_table(tmp_path / "run" / "progress.csv")
+    history = client.get_metric_history(run.info.run_id, "policy_kl")
+    assert {metric.step: metric.value for metric in history} == dict(
+        zip(table["steps"], table["policy_kl"], strict=True)
+    )
+    assert run.info.status == "FINISHED"
+
+
+def test_what_is_not_installed_is_named(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "wandb", None)
+    with pytest.raises(ModuleNotFoundError, match=r"pip install 'safe-rl\[wandb\]'"):
+        WandbLogger(log_dir=str(tmp_path))

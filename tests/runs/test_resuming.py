@@ -1,0 +1,212 @@
+"""Runs that are killed and continued; what continues, what does not, and what it says."""
+
+import multiprocessing
+import os
+import random
+import signal
+import time
+from types import SimpleNamespace
+
+import pytest
+from hydra.types import RunMode
+from omegaconf import OmegaConf
+from point_mass import PointMass
+from run_configs import compose_config, point_mass_config, without_times
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+from torchrl.checkpoint import CheckpointError
+
+from safe_rl.runs.checkpoints import CheckpointStore
+from safe_rl.envs import SafetyGymEnv, store_configs
+from safe_rl.runs.resuming import check_same_run, is_finished, may_continue
+from safe_rl.runs.table import read_table
+from safe_rl.training.trainer import build_trainer, seed_everything
+
+store_configs()
+
+# episodes of 45 steps are open at the end of epochs of 30
+SMALL = [
+    *("num_envs=4", "frames_per_batch=120", "model.hidden_sizes=[16]", "logger=none"),
+    *("policy_update.minibatch_size=40", "policy_update.num_passes=2"),
+    *("critic_update.minibatch_size=40", "critic_update.num_passes=2"),
+]
+SAFETY_GYM = ["env.num_steps=45", "frames=1800"]
+
+
+def make_trainer(directory, *overrides, **options):
+    config = compose_config(*SMALL, *SAFETY_GYM, *overrides)
+    seed_everything(config.seed, 1)
+    env = SafetyGymEnv(
+        {key: value for key, value in OmegaConf.to_container(config.env).items() if key != "name"},
+        num_envs=config.num_envs, seed=config.seed, num_threads=1, **options,
+    )  # fmt: skip
+    return build_trainer(config, env, directory)
+
+
+def train(directory, *overrides, **options):
+    """What the command line does: start, or continue what is there."""
+    trainer = make_trainer(directory, *overrides, **options)
+    if trainer.folder.holds_run:
+        trainer.resume()
+    trainer.run()
+
+
+def in_a_process(directory, *overrides, **options):
+    """Start a process of its own that trains; only such a one can be killed."""
+    process = multiprocessing.get_context("fork").Process(
+        target=train, args=(directory, *overrides), kwargs=options, daemon=True
+    )
+    process.start()
+    return process
+
+
+def kill_after_rows(process, directory, number):
+    """Kill a run at a random moment after it has written a number of rows."""
+    table = directory / "progress.csv"
+    deadline = time.monotonic() + 60
+    while not (table.exists() and table.read_text().count("\n") > number):
+        assert process.is_alive(), "the run ended before it could be killed"
+        assert time.monotonic() < deadline
+        time.sleep(0.002)
+    time.sleep(random.Random(number).uniform(0, 0.1))
+    os.kill(process.pid, signal.SIGKILL)
+    process.join()
+    assert process.exitcode == -signal.SIGKILL
+
+
+@pytest.mark.parametrize(
+    ("name", "sleep"),
+    [("PointGoal1", True), ("CarPush2", True), ("PointButton1", False)],
+)
+def test_a_run_killed_several_times_leaves_the_table_of_one_that_was_not(tmp_path, name, sleep):
+    whole, killed = tmp_path / "whole", tmp_path / "killed"
+    overrides = [f"env={name}", "algo=ppo_lagrangian"]
+    train(whole, *overrides, sleep=sleep)
+    # one checkpoint per epoch, then one in several: what lies after it is done again
+    for rows, interval in ((2, 0.0), (6, 0.2), (9, 0.4)):
+        process = in_a_process(killed, *overrides, f"checkpoint.interval={interval}", sleep=sleep)
+        kill_after_rows(process, killed, rows)
+    process = in_a_process(killed, *overrides, sleep=sleep)
+    process.join()
+    assert process.exitcode == 0
+    table, expected = (without_times(folder / "progress.csv") for folder in (killed, whole))
+    assert len(expected) == 1 + 15
+    assert table == expected
+    best, expected = (list((f / "checkpoints/best").iterdir()) for f in (killed, whole))
+    assert [path.name for path in best] == [path.name for path in expected]
+    assert not list(killed.rglob("*.stage-*"))
+
+
+def test_checkpoints_change_nothing(tmp_path):
+    often, never = tmp_path / "often", tmp_path / "never"
+    train(often, "env=PointGoal1", "frames=480", "checkpoint.interval=0")
+    train(never, "env=PointGoal1", "frames=480", "checkpoint.interval=1000")
+    assert without_times(often / "progress.csv") == without_times(never / "progress.csv")
+
+
+def point_mass_trainer(directory, *overrides):
+    config = point_mass_config(*overrides)
+    seed_everything(config.seed, 1)
+    return build_trainer(config, PointMass(config.num_envs, 27, config.seed), directory)
+
+
+def test_a_run_without_a_checkpoint_starts_over(tmp_path):
+    whole = point_mass_trainer(tmp_path / "whole")
+    whole.run()
+    begun = point_mass_trainer(tmp_path / "begun")
+    with begun.folder.writing():
+        begun.folder.record(begun.epoch(begun.batches()))
+    again = point_mass_trainer(tmp_path / "begun")
+    assert again.folder.holds_run
+    again.resume()
+    again.run()
+    tables = [without_times(tmp_path / name / "progress.csv") for name in ("begun", "whole")]
+    assert tables[0] == tables[1]
+
+
+def test_a_longer_run_goes_on_from_the_end(tmp_path):
+    point_mass_trainer(tmp_path, "frames=640").run()
+    assert is_finished(tmp_path, 640)
+    assert not is_finished(tmp_path, 641)
+    longer = point_mass_trainer(tmp_path, "frames=960")
+    longer.resume()
+    assert longer.progress.steps == 640
+    longer.run()
+    assert read_table(tmp_path / "progress.csv")["steps"] == [160.0 * i for i in range(1, 7)]
+    assert OmegaConf.load(tmp_path / "config.yaml").frames == 960
+
+
+def test_a_damaged_checkpoint_gives_way_to_the_older_one(tmp_path):
+    point_mass_trainer(tmp_path / "whole").run()
+    point_mass_trainer(tmp_path / "run", "frames=640", "checkpoint.interval=0").run()
+    older, newest = sorted((tmp_path / "run/checkpoints/last").iterdir())
+    newest.write_bytes(newest.read_bytes()[:-100])
+    trainer = point_mass_trainer(tmp_path / "run")
+    with pytest.warns(UserWarning, match=f"{newest.name}.*older {older.name}"):
+        trainer.resume()
+    assert trainer.progress.steps == 480
+    trainer.run()
+    tables = [without_times(tmp_path / name / "progress.csv") for name in ("run", "whole")]
+    assert tables[0] == tables[1]
+
+
+def test_a_foreign_checkpoint_is_refused_and_touches_nothing(tmp_path):
+    point_mass_trainer(tmp_path / "wide", "model.hidden_sizes=[32]").run()
+    before = {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
+    trainer = point_mass_trainer(tmp_path / "wide")
+    with pytest.raises(CheckpointError, match="size mismatch"):
+        trainer.resume()
+    assert {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()} == before
+
+
+def test_a_table_that_lacks_epochs_is_refused(tmp_path):
+    point_mass_trainer(tmp_path, "frames=640").run()
+    table = tmp_path / "progress.csv"
+    table.write_text("".join(table.read_text().splitlines(keepends=True)[:3]))
+    trainer = point_mass_trainer(tmp_path)
+    trainer.resume()
+    with pytest.raises(ValueError, match=r"holds 2 complete rows, but .* 4 epochs"):
+        trainer.run()
+
+
+def test_tensorboard_forgets_what_is_done_again(tmp_path):
+    overrides = ["logger=tensorboard", "frames=640", "checkpoint.interval=1000"]
+    trainer = point_mass_trainer(tmp_path, *overrides)
+    trainer.run()
+    # as if it had been killed in the sixth epoch, after a checkpoint in the fourth
+    with trainer.folder.writing(trainer.progress.epoch, trainer.progress.steps):
+        for epoch in (5, 6):
+            lost = dict.fromkeys(read_table(tmp_path / "progress.csv"), -1.0)
+            trainer.folder.record(lost | {"epoch": epoch, "steps": 160 * epoch})
+    resumed = point_mass_trainer(tmp_path, "logger=tensorboard")
+    resumed.resume()
+    resumed.run()
+    table = read_table(tmp_path / "progress.csv")
+    events = EventAccumulator(str(tmp_path / "tensorboard")).Reload().Scalars("policy_kl")
+    assert [event.step for event in events] == table["steps"]
+    assert [event.value for event in events] == pytest.approx(table["policy_kl"])
+
+
+def hydra_conf(mode, output_dir, *sources):
+    sources = [SimpleNamespace(path=str(path), provider="main") for path in sources]
+    runtime = SimpleNamespace(output_dir=str(output_dir), config_sources=sources)
+    return SimpleNamespace(mode=mode, runtime=runtime)
+
+
+def test_a_single_run_continues_only_from_its_own_configuration(tmp_path):
+    config = point_mass_config()
+    own = hydra_conf(RunMode.RUN, tmp_path, tmp_path)
+    assert may_continue(own, config)
+    assert not may_continue(hydra_conf(RunMode.RUN, tmp_path, tmp_path / "conf"), config)
+
+
+def test_jobs_of_a_sweep_continue_with_the_same_settings_only(tmp_path):
+    sweep = hydra_conf(RunMode.MULTIRUN, tmp_path)
+    assert may_continue(sweep, point_mass_config())
+    point_mass_trainer(tmp_path).run()
+    assert may_continue(sweep, point_mass_config("frames=9000", "num_threads=2"))
+    with pytest.raises(ValueError, match=r"seed: 0 -> 1.*hydra.sweep.dir"):
+        check_same_run(tmp_path, point_mass_config("seed=1"))
+
+
+def test_no_checkpoint_no_steps(tmp_path):
+    assert CheckpointStore.newest_step(tmp_path) == 0

@@ -1,0 +1,54 @@
+"""The run's table, read back with pandas-like rigour from plain text."""
+
+import csv
+import math
+
+import pytest
+
+from safe_rl.runs.table import TableWriter, read_table
+
+
+def test_rows_are_on_disk_at_once_and_read_back_exactly(tmp_path):
+    path = tmp_path / "progress.csv"
+    with TableWriter(path) as table:
+        table.write({"epoch": 1, "return": 0.1 + 0.2, "cost": math.nan})
+        with path.open() as file:
+            assert list(csv.DictReader(file)) == [
+                {"epoch": "1", "return": "0.30000000000000004", "cost": ""}
+            ]
+        table.write({"epoch": 2, "return": -1e-12, "cost": 25.0})
+    columns = read_table(path)
+    assert columns["epoch"] == [1.0, 2.0]
+    assert columns["return"] == [0.1 + 0.2, -1e-12]
+    assert math.isnan(columns["cost"][0])
+    assert columns["cost"][1] == 25.0
+
+
+def test_columns_may_not_change(tmp_path):
+    with TableWriter(tmp_path / "progress.csv") as table:
+        table.write({"epoch": 1, "kl": 0.01})
+        with pytest.raises(ValueError, match=r"\['extra'\]"):
+            table.write({"epoch": 2, "kl": 0.01, "extra": 0.0})
+        with pytest.raises(ValueError, match="same order"):
+            table.write({"kl": 0.01, "epoch": 2})
+
+
+def test_a_continued_table_keeps_the_rows_it_is_told_to(tmp_path):
+    path = tmp_path / "progress.csv"
+    with TableWriter(path) as table:
+        for epoch in range(1, 6):
+            table.write({"epoch": epoch})
+    with TableWriter(path, keep_rows=3) as table:
+        table.write({"epoch": 40})
+        with pytest.raises(ValueError, match="other"):
+            table.write({"other": 1})
+    assert read_table(path)["epoch"] == [1, 2, 3, 40]
+    TableWriter(path).close()
+    with pytest.raises(ValueError, match="has not finished an epoch"):
+        read_table(path)
+
+
+def test_a_header_without_rows_gives_empty_columns(tmp_path):
+    path = tmp_path / "progress.csv"
+    path.write_text("epoch,steps\n")
+    assert read_table(path) == {"epoch": [], "steps": []}

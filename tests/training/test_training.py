@@ -1,0 +1,273 @@
+"""Whole runs on the point mass: learning, determinism, exact continuation, plugging in."""
+
+import itertools
+import math
+import signal
+import threading
+
+import pytest
+import torch
+from point_mass import PointMass
+from run_configs import point_mass_config, without_times
+from torchrl.checkpoint import Checkpoint
+
+from safe_rl.objectives import PPOLagrangianLoss
+from safe_rl.runs.table import read_table
+from safe_rl.training.interrupts import StopRequest
+from safe_rl.training.trainer import build_trainer, seed_everything
+
+
+def make_trainer(directory, *overrides, num_steps=20):
+    config = point_mass_config(*overrides)
+    seed_everything(config.seed, None)
+    return build_trainer(config, PointMass(config.num_envs, num_steps, config.seed), directory)
+
+
+def train(directory, *overrides, **options):
+    """Run to the end; returns the trainer and its table."""
+    trainer = make_trainer(directory, *overrides, **options)
+    trainer.run()
+    return trainer, read_table(directory / "progress.csv")
+
+
+LEARNING = [
+    "frames=60_000",
+    "num_envs=16",
+    "frames_per_batch=1600",
+    "policy_update.minibatch_size=400",
+    "policy_update.num_passes=10",
+    "policy_update.optimizer.lr=3e-3",
+    "critic_update.minibatch_size=400",
+    "critic_update.num_passes=10",
+    "critic_update.optimizer.lr=1e-2",
+]
+
+
+def test_ppo_learns_and_pays_the_cost(tmp_path):
+    _, table = train(tmp_path, *LEARNING, "algo=ppo", "cost_limits={cost_hazards: 1.0}")
+    assert table["episode_return"][-1] > table["episode_return"][0] + 0.5
+    assert table["episode_cost_hazards"][-1] > 3.0
+    assert not any("multiplier" in name or "cost_critic" in name for name in table)
+
+
+def test_ppo_lagrangian_keeps_the_limits(tmp_path):
+    limits = {"cost_hazards": 1.0, "cost_north": 1.0}
+    _, table = train(
+        tmp_path,
+        *LEARNING,
+        "algo=ppo_lagrangian",
+        "cost_limits={cost_hazards: 1.0, cost_north: 1.0}",
+        "lagrangian=adam",
+        "lagrangian.init=0.3",
+        "lagrangian.lr=0.05",
+    )
+    assert table["episode_cost_hazards"][0] > 3.0
+    for key, limit in limits.items():
+        cost = sum(table[f"episode_{key}"][-5:]) / 5
+        assert cost < 1.25 * limit
+    assert table["episode_return"][-1] > 0.8
+    assert len({*table["multiplier_cost_hazards"]} & {*table["multiplier_cost_north"]}) <= 1
+
+
+def test_the_same_seed_gives_the_same_table_but_for_times(tmp_path):
+    first, second = tmp_path / "first", tmp_path / "second"
+    train(first)
+    train(second)
+    assert without_times(first / "progress.csv") == without_times(second / "progress.csv")
+    train(tmp_path / "other", "seed=1")
+    assert without_times(first / "progress.csv") != without_times(tmp_path / "other/progress.csv")
+
+
+def test_a_restored_run_continues_as_if_it_had_never_stopped(tmp_path):
+    whole, halves = tmp_path / "whole", tmp_path / "halves"
+    # episodes of 27 steps are open at the end of every batch of 40
+    options = {"num_steps": 27}
+    train(whole, **options)
+    train(halves, "frames=640", **options)
+    torch.rand(7)
+    resumed = make_trainer(halves, **options)
+    (checkpoint,) = (halves / "checkpoints" / "last").iterdir()
+    resumed.restore(checkpoint)
+    resumed.run()
+    table, expected = (without_times(folder / "progress.csv") for folder in (halves, whole))
+    assert len(expected) == 9
+    assert table == expected
+
+
+def test_the_folder_of_a_run(tmp_path):
+    trainer = make_trainer(tmp_path, "checkpoint.interval=0", "cost_limits={cost: 1000}")
+    line = trainer.run()
+    names = {path.relative_to(tmp_path).as_posix() for path in tmp_path.rglob("*")}
+    assert {"config.yaml", "progress.csv", "curves.png"} <= names
+    assert {name for name in names if name.startswith("checkpoints/last/")} == {
+        "checkpoints/last/checkpoint-000000001120.torchrl",
+        "checkpoints/last/checkpoint-000000001280.torchrl",
+    }
+    table = read_table(tmp_path / "progress.csv")
+    best = max(range(8), key=lambda epoch: table["episode_return"][epoch])
+    (path,) = (tmp_path / "checkpoints" / "best").iterdir()
+    assert Checkpoint.manifest(path)["metadata"] == {
+        "epoch": best + 1,
+        "score": table["episode_return"][best],
+    }
+    assert line.startswith("J_r ")
+    assert line.endswith(str(tmp_path))
+
+
+def test_nothing_is_best_while_a_limit_is_broken(tmp_path):
+    train(tmp_path, "algo=ppo", "cost_limits={cost: 1000, cost_hazards: 0}")
+    assert not (tmp_path / "checkpoints" / "best").exists()
+
+
+def test_epochs_without_a_finished_episode(tmp_path):
+    _, table = train(tmp_path, num_steps=100)
+    # 40 steps per environment and epoch, episodes of 100 steps
+    known = [not math.isnan(value) for value in table["episode_cost"]]
+    assert known == [False, False, True, False, True, False, False, True]
+    assert table["episodes"] == [0, 0, 4, 0, 4, 0, 0, 4]
+    multiplier = table["multiplier_cost"]
+    moved = [new != old for old, new in itertools.pairwise(multiplier)]
+    assert moved == known[1:]
+    assert not any(math.isnan(value) for value in table["cost_rate"])
+
+
+class ReportingUpdate:
+    """A policy update of one's own: changes nothing, reports what it was given."""
+
+    def __init__(self, loss):
+        self.loss = loss
+
+    def __call__(self, batch, cost_violation, episode_length):
+        return {"violation": cost_violation, "length": episode_length}
+
+    def state_dict(self):
+        return {}
+
+    def load_state_dict(self, state_dict):
+        pass
+
+
+class PenalisedLoss(PPOLagrangianLoss):
+    """A loss of one's own, with a hyper-parameter of its own."""
+
+    def __init__(self, *args, penalty, **kwargs):
+        super().__init__(*args, **kwargs)
+        self.penalty = penalty
+
+
+OWN_ALGORITHM = """
+# @package _global_
+defaults:
+  - ppo_lagrangian
+  - _self_
+algo: {name: mine}
+loss: {_target_: test_training.PenalisedLoss, penalty: 3.0}
+"""
+
+OWN_UPDATE = """
+# @package _global_
+defaults:
+  - /cost_advantage: ${preset}
+algo: {name: mine}
+loss: {_target_: safe_rl.objectives.PPOLoss, clip_epsilon: 0.2, entropy_coeff: 0.0}
+policy_update: {_target_: test_training.ReportingUpdate}
+"""
+
+
+def own_algorithm(folder, text):
+    """Overrides that find ``algo=mine`` in a folder outside the repository."""
+    (folder / "algo").mkdir()
+    (folder / "algo" / "mine.yaml").write_text(text)
+    return [f"hydra.searchpath=[file://{folder}]", "algo=mine"]
+
+
+def test_a_loss_from_outside_the_package(tmp_path):
+    own = own_algorithm(tmp_path, OWN_ALGORITHM)
+    trainer, table = train(tmp_path / "run", *own, "cost_limits={cost: 1}")
+    loss = trainer.algorithm.policy_update.loss
+    assert loss.penalty == 3.0
+    assert loss.multiplier is trainer.algorithm.multiplier
+    assert len(set(table["multiplier_cost"])) == 8
+
+
+def test_a_policy_update_from_outside_the_package(tmp_path):
+    limits = "cost_limits={cost: 25, cost_north: 5}"
+    directory, own = tmp_path / "run", own_algorithm(tmp_path, OWN_UPDATE)
+    config = point_mass_config(*own, limits, minibatch_size=None)
+    trainer = build_trainer(config, PointMass(config.num_envs, 100), directory)
+    trainer.run()
+    table = read_table(directory / "progress.csv")
+    assert table["policy_length"] == [40, 40, 100, 100, 100, 100, 100, 100]
+    for key, limit in (("cost", 25), ("cost_north", 5)):
+        # until an episode has finished, the rate so far over the 40 steps of a batch
+        first = [40 * rate - limit for rate in table[f"{key}_rate"][:2]]
+        later = [table[f"episode_{key}"][i] - limit for i in (2, 2, 4, 4, 4, 7)]
+        assert table[f"policy_violation_{key}"] == pytest.approx([*first, *later], abs=1e-4)
+
+
+def test_frames_are_rounded_up_to_whole_batches(tmp_path):
+    _, table = train(tmp_path, "frames=200")
+    assert table["steps"] == [160, 320]
+
+
+def test_a_signal_ends_the_run_after_the_epoch_with_a_checkpoint(tmp_path):
+    trainer = make_trainer(tmp_path, "frames=100_000_000")
+    record = trainer.folder.record
+
+    def record_and_signal(row):
+        record(row)
+        if row["epoch"] == 3:
+            signal.raise_signal(signal.SIGTERM)
+
+    trainer.folder.record = record_and_signal
+    handler = signal.getsignal(signal.SIGTERM)
+    trainer.run()
+    assert signal.getsignal(signal.SIGTERM) is handler
+    assert read_table(tmp_path / "progress.csv")["epoch"] == [1, 2, 3]
+    assert [path.name for path in (tmp_path / "checkpoints" / "last").iterdir()] == [
+        "checkpoint-000000000480.torchrl"
+    ]
+
+
+def test_a_signal_in_the_last_epoch_interrupts_nothing(tmp_path):
+    trainer = make_trainer(tmp_path, "frames=160")
+    record = trainer.folder.record
+
+    def record_and_signal(row):
+        record(row)
+        signal.raise_signal(signal.SIGTERM)
+
+    trainer.folder.record = record_and_signal
+    trainer.run()
+    assert trainer.progress.steps == 160
+    assert trainer.interrupted_by is None
+
+
+def test_a_second_interrupt_acts_at_once():
+    with StopRequest() as stop:
+        signal.raise_signal(signal.SIGINT)
+        assert stop.received
+        with pytest.raises(KeyboardInterrupt):
+            signal.raise_signal(signal.SIGINT)
+
+
+def test_signals_are_left_alone_outside_the_main_thread():
+    received = []
+
+    def request():
+        with StopRequest() as stop:
+            received.append(stop.received)
+
+    thread = threading.Thread(target=request)
+    thread.start()
+    thread.join()
+    assert received == [None]
+
+
+def test_diverged_training_says_so(tmp_path):
+    trainer = make_trainer(tmp_path)
+    with torch.no_grad():
+        for parameter in trainer.algorithm.networks.critic.parameters():
+            parameter.fill_(torch.nan)
+    with pytest.raises(FloatingPointError, match="training has diverged"):
+        trainer.run()

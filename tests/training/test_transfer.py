@@ -1,0 +1,105 @@
+"""Starting from trained networks: what is taken over, and what does not fit."""
+
+from pathlib import Path
+
+import pytest
+import torch
+from omegaconf import OmegaConf
+from point_mass import PointMass
+from run_configs import point_mass_config
+from torchrl.checkpoint import CheckpointError
+
+from safe_rl.training.trainer import build_trainer, seed_everything
+from safe_rl.training.transfer import initialise_networks
+
+
+def make_trainer(directory, *overrides, minibatch_size=40):
+    config = point_mass_config(*overrides, minibatch_size=minibatch_size)
+    seed_everything(config.seed, 1)
+    return build_trainer(config, PointMass(config.num_envs, 20, config.seed), directory)
+
+
+@pytest.fixture
+def trained(tmp_path):
+    trainer = make_trainer(tmp_path / "first", "frames=320")
+    trainer.run()
+    return trainer
+
+
+def same(first, second):
+    pairs = zip(first.state_dict().values(), second.state_dict().values(), strict=True)
+    return all(torch.equal(a, b) for a, b in pairs)
+
+
+def take_over(trained, *overrides):
+    fresh = make_trainer(trained.folder.directory.parent / "second", "seed=1", *overrides)
+    networks, algorithm = fresh.algorithm.networks, fresh.algorithm
+    assert not same(networks.actor, trained.algorithm.networks.actor)
+    taken = initialise_networks(networks, trained.folder.directory, list(algorithm.cost_keys))
+    return fresh, taken
+
+
+def test_all_networks_are_taken_over_and_nothing_else(trained):
+    fresh, taken = take_over(trained)
+    assert taken == ["actor", "critic", "cost_critic"]
+    for name in taken:
+        theirs = getattr(trained.algorithm.networks, name)
+        assert same(getattr(fresh.algorithm.networks, name), theirs)
+    assert fresh.progress.steps == 0
+    assert not fresh.algorithm.policy_update.optimizer.state
+    first = fresh.epoch(fresh.batches())
+    assert first["epoch"] == 1
+
+
+def test_the_policy_that_collects_has_the_weights(trained):
+    fresh, _ = take_over(trained)
+    batch = next(fresh.batches())
+    expected = trained.algorithm.networks.actor.get_dist(batch)
+    assert torch.allclose(batch["loc"], expected.base_dist.loc, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    "overrides",
+    [["algo=ppo"], ["cost_limits={cost_hazards: 1}"], ["cost_limits={cost: 1, cost_north: 2}"]],
+)
+def test_the_cost_critic_stays_new_where_the_costs_are_others(trained, overrides):
+    assert take_over(trained, *overrides)[1] == ["actor", "critic"]
+
+
+def test_a_checkpoint_can_be_named(trained):
+    path = next((trained.folder.checkpoint_directory / "last").iterdir())
+    fresh = make_trainer(trained.folder.directory.parent / "second", "seed=1")
+    initialise_networks(fresh.algorithm.networks, path, ["cost"])
+    assert same(fresh.algorithm.networks.actor, trained.algorithm.networks.actor)
+
+
+@pytest.mark.parametrize(
+    ("override", "message"),
+    [
+        ("model.hidden_sizes=[8, 8]", r"4 → 16 → 2 numbers, this run's has 4 → 8 → 8 → 2"),
+        ("+model.input_scale.position=0.5", "set model.input_scale"),
+    ],
+)
+def test_other_sizes_are_named_and_nothing_changes(trained, override, message):
+    fresh = make_trainer(trained.folder.directory.parent / "second", "seed=1", override)
+    before = {k: v.clone() for k, v in fresh.algorithm.networks.actor.state_dict().items()}
+    with pytest.raises(CheckpointError, match=message):
+        initialise_networks(fresh.algorithm.networks, trained.folder.directory, ["cost"])
+    after = fresh.algorithm.networks.actor.state_dict()
+    assert all(torch.equal(after[key], value) for key, value in before.items())
+
+
+def test_a_folder_without_a_checkpoint(trained, tmp_path):
+    with pytest.raises(CheckpointError, match=r"init_from=.*no checkpoint"):
+        initialise_networks(trained.algorithm.networks, tmp_path, ["cost"])
+
+
+@pytest.mark.parametrize("path", ["nowhere", "some/where/else/nowhere.torchrl"])
+def test_a_source_that_does_not_exist_is_named(trained, path):
+    with pytest.raises(CheckpointError, match=f"init_from={path}: there is no such folder"):
+        initialise_networks(trained.algorithm.networks, Path(path), ["cost"])
+
+
+def test_the_configuration_records_where_a_run_came_from(tmp_path):
+    make_trainer(tmp_path, "init_from=runs/first", "frames=160").run()
+    assert OmegaConf.load(tmp_path / "config.yaml").init_from == "runs/first"
