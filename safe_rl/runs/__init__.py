@@ -1,0 +1,1 @@
+"""What is on disk: folder, table, checkpoints, loggers, curves."""
