@@ -13,6 +13,7 @@ ROOT = Path(__file__).parents[1]
 PARTS = {
     "openmp": (),
     "extras": (),
+    "targets": (),
     "envs": (),
     "objectives": (),
     "collectors": (),

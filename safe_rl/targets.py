@@ -1,0 +1,206 @@
+"""From a configuration's ``_target_`` to an object: the only place that does it.
+
+A configuration may come from somebody else, with a run that is resumed or evaluated. It therefore
+reaches only what a run is built of: this package's parts, torch's optimisers, and modules that the
+user has named by ``import=``. It stands on the top floor because every room below the command line
+builds something.
+"""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Callable, Iterator, Mapping
+from difflib import get_close_matches
+from importlib import import_module
+from importlib.util import find_spec
+from typing import Any
+
+from hydra.errors import InstantiationException
+from hydra.utils import instantiate
+from omegaconf import DictConfig, ListConfig, OmegaConf
+
+__all__ = ["TargetError", "allow", "build", "locate"]
+
+# Rooms whose public classes and functions are parts of a run. Others hold commands, which write
+# files and import modules.
+_ROOMS = tuple(
+    f"safe_rl.{room}"
+    for room in ("algorithms", "collectors", "envs", "models", "objectives", "runs.loggers")
+)
+_OPTIMISERS = "torch.optim"
+_users_modules: set[str] = set()
+
+# What configurations of earlier runs call the parts that have moved since.
+_RENAMED = {
+    "safe_rl.updates.MinibatchUpdate": "safe_rl.algorithms.MinibatchUpdate",
+    "safe_rl.learning_rate.KLAdaptiveRate": "safe_rl.algorithms.KLAdaptiveRate",
+    "safe_rl.objectives.TRPOStep": "safe_rl.algorithms.TRPOStep",
+    "safe_rl.objectives.CPOStep": "safe_rl.algorithms.CPOStep",
+    "safe_rl.loggers.MLflowLogger": "safe_rl.runs.loggers.MLflowLogger",
+    "safe_rl.loggers.TensorboardLogger": "safe_rl.runs.loggers.TensorboardLogger",
+    "safe_rl.loggers.WandbLogger": "safe_rl.runs.loggers.WandbLogger",
+}
+
+
+class TargetError(ValueError):
+    """A node that cannot be built; the message names its key and what to change."""
+
+
+def allow(module: str) -> None:
+    """Let configurations name what a module, or package, of the user's defines.
+
+    Examples:
+        >>> allow("fractions")
+        >>> build({"_target_": "fractions.Fraction", "numerator": 3}, denominator=4)
+        Fraction(3, 4)
+    """
+    _users_modules.add(module)
+
+
+def build(node: DictConfig | Mapping[str, Any] | None, /, **objects: Any) -> Any:
+    """Build what a node's ``_target_`` names, as :func:`hydra.utils.instantiate` does.
+
+    Args:
+        node: The node. Nodes in it that have a ``_target_`` too are built before; one with
+            ``_partial_: true`` becomes a function that takes the other arguments later.
+        objects: Live objects for the outermost target, which gets them as they are, not copied.
+
+    Returns:
+        The object, or None for a node that is null, or whose ``_target_`` is.
+
+    Raises:
+        TargetError: If a target may not be built or does not exist, or if it refuses its arguments.
+
+    Examples:
+        >>> node = {"_target_": "safe_rl.objectives.LagrangeMultiplier", "init": 1.0, "lr": 0.05}
+        >>> build(node, cost_limits={"cost": 25.0}).value
+        tensor([1.])
+    """
+    key = node._get_full_key(None) if isinstance(node, DictConfig) else ""
+    plain = OmegaConf.to_container(node, resolve=True) if isinstance(node, DictConfig) else node
+    if plain is None:
+        return None
+    if not isinstance(plain, Mapping):
+        raise TargetError(f"What is built is a node with a _target_, not {plain!r}.")
+    if "_target_" not in plain:
+        raise TargetError(f"{_join(key, '_target_')} is missing: it names the class to build.")
+    if plain["_target_"] is None:
+        return None
+    checked = _checked(plain, key)
+    try:
+        part = instantiate(checked, _partial_=True)
+        return part if plain.get("_partial_") and not objects else part(**objects)
+    except InstantiationException as error:
+        raise TargetError(_in_words(error, key)) from error
+    except (TypeError, ValueError) as error:
+        raise TargetError(f"{key}: {error}" if key else str(error)) from error
+
+
+def locate(target: Any, key: str = "") -> Callable[..., Any]:
+    """Return the class or function of a dotted name, if a configuration may name it.
+
+    Args:
+        target: The name.
+        key: Key that holds it, for the message.
+
+    Raises:
+        TargetError: If it may not be named, or does not exist.
+
+    Examples:
+        >>> locate("safe_rl.updates.MinibatchUpdate").__name__  # as runs of before call it
+        'MinibatchUpdate'
+        >>> locate("torch.load", key="loss._target_")
+        Traceback (most recent call last):
+        ...
+        safe_rl.targets.TargetError: loss._target_=torch.load: configurations reach only parts of safe_rl, torch.optim and modules of yours. If you trust 'torch', add import=torch to the command.
+    """  # noqa: E501
+    shown = f"{key}={target}" if key else f"{target}"
+    name = _RENAMED.get(str(target), str(target))
+    root = next((root for root in _roots() if _is_inside(name, root) and name != root), None)
+    if root is None:
+        module = name.rpartition(".")[0] or name
+        raise TargetError(
+            f"{shown}: configurations reach only parts of safe_rl, {_OPTIMISERS} and modules of "
+            f"yours. If you trust '{module}', add import={module} to the command."
+        )
+    found = _walk(root, name, shown)
+    home = getattr(found, "__module__", None) or ""
+    if not (inspect.isclass(found) or inspect.isroutine(found)):
+        raise TargetError(f"{shown} is neither a class nor a function.")
+    if not any(_is_inside(home, root) for root in _roots()):
+        raise TargetError(
+            f"{shown}: '{root}' only borrows it from '{home}', which is out of reach of "
+            f"configurations. If you trust '{home}', add import={home} to the command and write "
+            f"_target_={home}.{found.__qualname__}."
+        )
+    if _is_inside(home, _OPTIMISERS) and not _is_optimiser(found):
+        raise TargetError(f"{shown} is neither an optimiser nor a scheduler of {_OPTIMISERS}.")
+    return found
+
+
+def _checked(node: Any, key: str) -> Any:
+    """Copy plain containers with the present names of their targets, each of which is allowed."""
+    if isinstance(node, list | tuple | ListConfig):
+        return [_checked(item, f"{key}[{index}]") for index, item in enumerate(node)]
+    if not isinstance(node, Mapping):
+        return node
+    copied = {name: _checked(value, _join(key, str(name))) for name, value in node.items()}
+    if "_target_" in copied:
+        locate(copied["_target_"], _join(key, "_target_"))
+        copied["_target_"] = _RENAMED.get(copied["_target_"], copied["_target_"])
+    return copied
+
+
+def _walk(root: str, name: str, shown: str) -> Any:
+    """Follow a dotted name from an allowed module; other modules on the way are no way."""
+    found: Any = import_module(root)
+    for part in name.removeprefix(f"{root}.").split("."):
+        below = f"{found.__name__}.{part}" if inspect.ismodule(found) else ""
+        if part.startswith("_"):
+            raise TargetError(f"{shown}: '{part}' is private.")
+        if hasattr(found, part):
+            following = getattr(found, part)
+        elif hasattr(found, "__path__") and find_spec(below):
+            following = import_module(below)
+        else:
+            close = get_close_matches(part, _public(found), n=1, cutoff=0.5)
+            hint = f" Nearest: '{close[0]}'." if close else ""
+            raise TargetError(f"{shown}: '{found.__name__}' has no '{part}'.{hint}")
+        if inspect.ismodule(following) and following.__name__ != below:
+            raise TargetError(
+                f"{shown}: '{part}' is the module '{following.__name__}', which is no part of "
+                f"'{root}'. If you trust it, add import={following.__name__} to the command."
+            )
+        found = following
+    return found
+
+
+def _public(found: Any) -> Iterator[str]:
+    return (name for name in dir(found) if not name.startswith("_"))
+
+
+def _roots() -> tuple[str, ...]:
+    return (*_ROOMS, _OPTIMISERS, *sorted(_users_modules))
+
+
+def _is_inside(name: str, module: str) -> bool:
+    return name == module or name.startswith(f"{module}.")
+
+
+def _is_optimiser(found: Any) -> bool:
+    from torch.optim import Optimizer  # here, because commands that build nothing need no torch
+    from torch.optim.lr_scheduler import LRScheduler
+
+    return inspect.isclass(found) and issubclass(found, Optimizer | LRScheduler)
+
+
+def _join(key: str, name: str) -> str:
+    return f"{key}.{name}" if key else name
+
+
+def _in_words(error: InstantiationException, key: str) -> str:
+    """A component's own words, and the full key of its node."""
+    cause = error.__cause__
+    inner = str(error).partition("full_key: ")[2]
+    words = str(cause) if isinstance(cause, ValueError) else f"{type(cause).__name__}: {cause}"
+    return f"{_join(key, inner) if inner else key}: {words if cause is not None else error}"
