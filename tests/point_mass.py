@@ -7,8 +7,6 @@ as truncation, partial resets, and snapshots from which it continues exactly.
 
 from __future__ import annotations
 
-from types import SimpleNamespace
-
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
@@ -32,7 +30,7 @@ class PointMass(EnvBase):
 
     def __init__(self, num_envs: int = 4, num_steps: int = 20, seed: int = 0) -> None:
         super().__init__(batch_size=[num_envs])
-        self.config = SimpleNamespace(num_steps=num_steps)
+        self.max_episode_steps = num_steps
         scalar = {"shape": (num_envs, 1)}
         self.observation_spec = Composite(observation=Unbounded((num_envs, 4)), shape=[num_envs])
         self.action_spec = Bounded(-1, 1, (num_envs, 2))
@@ -89,7 +87,7 @@ class PointMass(EnvBase):
         hazards, north = self._costs(self._position)
         step["cost_hazards"], step["cost_north"] = hazards, north
         step["cost"] = torch.maximum(hazards, north)
-        step["truncated"] = self._step_count >= self.config.num_steps
+        step["truncated"] = self._step_count >= self.max_episode_steps
         step["done"] = step["truncated"]
         return step
 

@@ -1,8 +1,21 @@
 """What moves parameters: recipes, updates, trust-region steps, and building them."""
 
+from safe_rl.algorithms.constraints import Constraints
+from safe_rl.algorithms.contract import Algorithm, PolicyUpdate, Recipe
 from safe_rl.algorithms.cpo_step import CPOStep
 from safe_rl.algorithms.learning_rate import KLAdaptiveRate
-from safe_rl.algorithms.minibatch import MinibatchUpdate, PolicyUpdate
+from safe_rl.algorithms.minibatch import MinibatchUpdate
+from safe_rl.algorithms.on_policy import OnPolicy
 from safe_rl.algorithms.trust_region_step import TRPOStep
 
-__all__ = ["CPOStep", "KLAdaptiveRate", "MinibatchUpdate", "PolicyUpdate", "TRPOStep"]
+__all__ = [
+    "Algorithm",
+    "CPOStep",
+    "Constraints",
+    "KLAdaptiveRate",
+    "MinibatchUpdate",
+    "OnPolicy",
+    "PolicyUpdate",
+    "Recipe",
+    "TRPOStep",
+]

@@ -1,13 +1,14 @@
 """Gradient updates: passes of minibatch steps over one batch.
 
 Policies (PPO) and critics are trained by the same object. Policy updates of another kind, such as
-trust-region steps, take its place if they follow :class:`PolicyUpdate`.
+trust-region steps, take its place if they follow
+:class:`~safe_rl.algorithms.contract.PolicyUpdate`.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from typing import Any, Protocol
+from typing import Any
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -17,31 +18,7 @@ from torchrl.objectives import LossModule
 
 from safe_rl.algorithms.learning_rate import KLAdaptiveRate
 
-__all__ = ["MinibatchUpdate", "PolicyUpdate"]
-
-
-class PolicyUpdate(Protocol):
-    """What the training loop asks of a policy update."""
-
-    def __call__(
-        self, batch: TensorDictBase, cost_violation: Tensor, episode_length: Tensor
-    ) -> Mapping[str, Tensor]:
-        """Improve the policy on ``batch`` and return diagnostics.
-
-        Args:
-            batch: On-policy data with advantages, any batch shape.
-            cost_violation: J_c − d of every constraint, shape [k].
-            episode_length: Mean episode length T̄ in steps, a scalar.
-        """
-        ...
-
-    def state_dict(self) -> dict[str, Any]:
-        """State beyond the network's parameters, for an exact continuation."""
-        ...
-
-    def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
-        """Continue from :meth:`state_dict`."""
-        ...
+__all__ = ["MinibatchUpdate"]
 
 
 class MinibatchUpdate:

@@ -1,77 +1,115 @@
-"""One epoch of constrained policy optimisation, put together from interchangeable parts."""
+"""The on-policy recipe: advantages, constraints, policy update, value fitting, once per batch."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import torch
+from omegaconf import DictConfig
 from tensordict import TensorDictBase
-from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModule
-from torch import Tensor
+from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModule, TensorDictModuleBase
+from torch import nn
+from torchrl.envs import EnvBase
 
-from safe_rl.algorithms.minibatch import MinibatchUpdate, PolicyUpdate
+from safe_rl.algorithms.constraints import Constraints, check_cost_limits, mean_cost
+from safe_rl.algorithms.contract import PolicyUpdate, Stateful
+from safe_rl.algorithms.minibatch import MinibatchUpdate
+from safe_rl.algorithms.parts import build_part
 from safe_rl.collectors import EpisodeStatistics
+from safe_rl.models import input_scale_vector, make_actor, make_behaviour, make_critic
+from safe_rl.objectives import CriticLoss
 from safe_rl.objectives.advantages import CostGAE, VectorGAE
-from safe_rl.objectives.multipliers import Multiplier
 from safe_rl.objectives.normalisation import normalise_advantages
 
-__all__ = ["Algorithm", "Networks", "mean_cost"]
-
-
-def mean_cost(episode_costs: Tensor) -> Tensor:
-    """J_c, the mean over episodes: [E, k] -> [k]."""
-    return episode_costs.mean(0)
+__all__ = ["OnPolicy"]
 
 
 @dataclass
-class Networks:
-    """What is trained.
+class OnPolicy:
+    """PPO, TRPO, CPO and their like: an algorithm, and the recipe that builds it.
 
     Attributes:
         actor: Policy with ``get_dist``.
         critic: Writes ``state_value``, [..., 1].
         cost_critic: Writes ``cost_value``, [..., k]; None if the algorithm has no constraints.
+        constraints: Costs, limits and multiplier.
+        advantage: Estimator of the reward advantage, with the critic.
+        cost_advantage: Estimator of the cost advantages, with the cost critic, or None.
+        policy_update: Improves the actor.
+        critic_update: Fits the critics.
     """
 
     actor: ProbabilisticTensorDictSequential
     critic: TensorDictModule
     cost_critic: TensorDictModule | None
-
-
-@dataclass
-class Algorithm:
-    """Advantages, multiplier, policy update, value fitting: in this order, once per epoch.
-
-    Attributes:
-        networks: What is trained.
-        cost_keys: Keys of the k constrained costs; empty for an unconstrained algorithm.
-        cost_limits: d of every constraint, undiscounted cost per episode, shape [k].
-        cost_measure: What of the episode costs, [E, k], is held against the limits, [k]:
-            `mean_cost`, or another statistic, such as a quantile. Its gradient is up to
-            `cost_advantage`.
-        advantage: Estimator of the reward advantage, with the critic.
-        cost_advantage: Estimator of the cost advantages, with the cost critic, or None.
-        multiplier: Weighs the costs against the return, or None.
-        policy_update: Improves the actor.
-        critic_update: Fits the critics.
-    """
-
-    networks: Networks
-    cost_keys: Sequence[str]
-    cost_limits: Tensor
-    cost_measure: Callable[[Tensor], Tensor]
+    constraints: Constraints
     advantage: VectorGAE
     cost_advantage: CostGAE | None
-    multiplier: Multiplier | None
     policy_update: PolicyUpdate
     critic_update: MinibatchUpdate
 
-    def __post_init__(self) -> None:
-        """Start without any knowledge of the episode costs."""
-        self._costs = torch.full_like(self.cost_limits, torch.nan)
-        self._mean_length = torch.full((), torch.nan, device=self.cost_limits.device)
+    @classmethod
+    def build(cls, config: DictConfig, env: EnvBase) -> OnPolicy:
+        """Build networks, estimators, losses and updates.
+
+        Args:
+            config: Configuration as composed from ``conf/``.
+            env: Environment that keeps the contract of `safe_rl.envs`.
+
+        Raises:
+            ValueError: If a cost limit names a cost that the environment does not have, or a
+                constrained algorithm gets no limit.
+        """
+        limits = _constrained_limits(config, env)
+        device = torch.device(config.device)
+        networks = _build_networks(config.model, env, len(limits), device)
+        constraints = _build_constraints(config, limits, device)
+        parts = {
+            "actor_network": networks["actor"],
+            "constraints": constraints,
+            "multiplier": constraints.multiplier,
+            "cost_keys": constraints.keys,
+        }
+        critic, cost_critic = networks["critic"], networks.get("cost_critic")
+        cost_advantage = None
+        if limits:
+            cost_advantage = build_part(config.cost_advantage, value_network=cost_critic, **parts)
+        loss = build_part(config.loss, critic_network=critic, **parts)
+        del parts["actor_network"]  # an update asks its loss for it
+        return cls(
+            **{"cost_critic": None, **networks},
+            constraints=constraints,
+            advantage=build_part(config.advantage, value_network=critic, **parts),
+            cost_advantage=cost_advantage,
+            policy_update=build_part(config.policy_update, loss=loss, **parts),
+            critic_update=build_part(config.critic_update, loss=CriticLoss(critic, cost_critic)),
+        )
+
+    @classmethod
+    def build_policy(
+        cls, config: DictConfig, env: EnvBase, device: torch.device
+    ) -> tuple[TensorDictModuleBase, Mapping[str, nn.Module]]:
+        """Build what acts, and the networks that it consists of."""
+        actor = _build_networks(config.model, env, 0, device)["actor"]
+        return make_behaviour(actor), {"actor": actor}
+
+    @property
+    def cost_keys(self) -> Sequence[str]:
+        """Keys of the constrained costs."""
+        return self.constraints.keys
+
+    @property
+    def policy(self) -> TensorDictModuleBase:
+        """What explores."""
+        return make_behaviour(self.actor)
+
+    @property
+    def networks(self) -> dict[str, nn.Module]:
+        """What is trained, by name."""
+        named = {"actor": self.actor, "critic": self.critic, "cost_critic": self.cost_critic}
+        return {name: network for name, network in named.items() if network is not None}
 
     def learn(self, batch: TensorDictBase, episodes: EpisodeStatistics) -> dict[str, float]:
         """Train on one batch.
@@ -87,72 +125,71 @@ class Algorithm:
         if self.cost_advantage is not None:
             self.cost_advantage(batch)
         normalise_advantages(batch)
-
-        violation, length = self._constraint_state(batch, episodes)
-        if self.multiplier is not None and episodes.num_episodes:
-            self.multiplier.update(self._costs)
-        policy = self.policy_update(batch, violation, length)
-        critic = self.critic_update(batch)
-        return self._scalars(violation, policy, critic)
-
-    def _constraint_state(
-        self, batch: TensorDictBase, episodes: EpisodeStatistics
-    ) -> tuple[Tensor, Tensor]:
-        """J_c − d, shape [k], and the mean episode length T̄; J_c as `cost_measure` has it.
-
-        Both are those of the last batch in which an episode finished. Before there is one, the
-        length is that of the batch and the cost what the batch's cost rate would sum to in it.
-        """
-        device = self.cost_limits.device
-        if episodes.num_episodes:
-            costs = self.cost_measure(episodes.episode_costs(self.cost_keys))
-            self._costs = costs.to(self.cost_limits)
-            self._mean_length = episodes.lengths.mean().to(device, torch.float32)
-        if self._mean_length.isfinite():
-            return self._costs - self.cost_limits, self._mean_length
-        length = torch.tensor(float(batch.shape[-1]), device=device)
-        rates = [episodes.cost_rates[key].to(device) for key in self.cost_keys]
-        costs = torch.stack(rates) * length if rates else self._costs
-        return costs.float() - self.cost_limits, length
-
-    def _scalars(
-        self, violation: Tensor, policy: Mapping[str, Tensor], critic: Mapping[str, Tensor]
-    ) -> dict[str, float]:
-        row = self._columns("violation", violation)
-        if self.multiplier is not None:
-            row |= self._columns("multiplier", self.multiplier.value)
-        for part, metrics in (("policy", policy), ("critic", critic)):
-            for name, value in metrics.items():
-                row |= self._columns(f"{part}_{name}", torch.as_tensor(value))
+        constraints = self.constraints
+        constraints.observe(episodes, batch.shape[-1])
+        metrics = {
+            "policy": self.policy_update(batch, constraints.violation, constraints.episode_length),
+            "critic": self.critic_update(batch),
+        }
+        row = constraints.columns()
+        for part, values in metrics.items():
+            for name, value in values.items():
+                row |= constraints.column(f"{part}_{name}", torch.as_tensor(value))
         return row
 
-    def _columns(self, name: str, value: Tensor) -> dict[str, float]:
-        """One column for a scalar, one per constraint for a vector [k]."""
-        if value.ndim == 0:
-            return {name: value.item()}
-        return {
-            f"{name}_{key}": entry
-            for key, entry in zip(self.cost_keys, value.tolist(), strict=True)
-        }
-
-    def checkpoint_components(self) -> dict[str, Any]:
+    def checkpoint_components(self) -> dict[str, Stateful]:
         """Parts with a ``state_dict``, by name: together they are all that learning depends on."""
-        parts = {
-            "actor": self.networks.actor,
-            "critic": self.networks.critic,
-            "cost_critic": self.networks.cost_critic,
-            "multiplier": self.multiplier,
+        parts: dict[str, Stateful | None] = {
+            **self.networks,
+            "multiplier": self.constraints.multiplier,
             "policy_update": self.policy_update,
             "critic_update": self.critic_update,
-            "algorithm": self,
+            "algorithm": self.constraints,
         }
         return {name: part for name, part in parts.items() if part is not None}
 
-    def state_dict(self) -> dict[str, Tensor]:
-        """The costs and the length of the last batch in which an episode finished."""
-        return {"costs": self._costs, "mean_length": self._mean_length}
 
-    def load_state_dict(self, state_dict: Mapping[str, Tensor]) -> None:
-        """Continue from :meth:`state_dict`."""
-        self._costs = state_dict["costs"].to(self._costs)
-        self._mean_length = state_dict["mean_length"].to(self._mean_length)
+def _constrained_limits(config: DictConfig, env: EnvBase) -> dict[str, float]:
+    """Limits of a constrained algorithm; without an estimator of cost advantages it has none."""
+    limits = check_cost_limits(config.cost_limits, env.cost_keys)
+    if config.get("cost_advantage") is None:
+        return {}
+    if not limits:
+        raise ValueError(
+            f"algo={config.algo.name} needs at least one entry in cost_limits, for example "
+            "cost_limits='{cost: 25}'. Without constraints use algo=ppo."
+        )
+    return limits
+
+
+def _build_constraints(
+    config: DictConfig, limits: dict[str, float], device: torch.device
+) -> Constraints:
+    multiplier = measure = None
+    if config.get("lagrangian") is not None:
+        multiplier = build_part(config.lagrangian, cost_limits=limits).to(device)
+    if config.get("cost_measure") is not None:
+        measure = build_part(config.cost_measure)
+    return Constraints(limits, measure=measure or mean_cost, multiplier=multiplier, device=device)
+
+
+def _build_networks(
+    model: DictConfig, env: EnvBase, num_costs: int, device: torch.device
+) -> dict[str, Any]:
+    """The actor, the reward critic and, for ``num_costs`` > 0, the cost critic."""
+    size = env.observation_spec["observation"].shape[-1]
+    common: dict[str, Any] = {
+        "hidden_sizes": list(model.hidden_sizes),
+        "input_scale": input_scale_vector(model.input_scale, env.observation_layout),
+        "device": device,
+    }
+    actions = env.action_spec.shape[-1]
+    networks: dict[str, Any] = {
+        "actor": make_actor(size, actions, initial_log_std=model.initial_log_std, **common),
+        "critic": make_critic(size, **common),
+    }
+    if num_costs:
+        networks["cost_critic"] = make_critic(
+            size, num_outputs=num_costs, out_key="cost_value", **common
+        )
+    return networks

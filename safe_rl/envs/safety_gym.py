@@ -109,6 +109,11 @@ class SafetyGymEnv(EnvBase):
         return self._world.scene.names
 
     @property
+    def max_episode_steps(self) -> int:
+        """Steps after which an episode is truncated."""
+        return self.config.num_steps
+
+    @property
     def observation_layout(self) -> dict[str, slice]:
         """Columns of every named component in `observation`."""
         return dict(self._observer.columns)

@@ -6,12 +6,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
+from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 from tqdm import tqdm
-
-from safe_rl.models import BehaviourPolicy
 
 __all__ = ["Episodes", "collect_episodes", "exploration"]
 
@@ -40,7 +39,7 @@ def exploration(deterministic: bool) -> set_exploration_type:
 @torch.no_grad()
 def collect_episodes(
     env: EnvBase,
-    policy: BehaviourPolicy,
+    policy: TensorDictModuleBase,
     num_episodes: int,
     cost_keys: Sequence[str],
     *,
@@ -62,7 +61,7 @@ def collect_episodes(
 
     Examples:
         >>> from safe_rl.envs import make_env
-        >>> from safe_rl.models import make_actor
+        >>> from safe_rl.models import BehaviourPolicy, make_actor
         >>> env = make_env({"robot_base": "point", "num_steps": 5}, num_envs=2, seed=0)
         >>> size = env.observation_spec["observation"].shape[-1]
         >>> policy = BehaviourPolicy(make_actor(size, 2, hidden_sizes=[8], initial_log_std=-0.5))

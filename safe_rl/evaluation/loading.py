@@ -8,11 +8,11 @@ from typing import Any
 
 import torch
 from omegaconf import DictConfig, OmegaConf
+from tensordict.nn import TensorDictModuleBase
 from torchrl.checkpoint import CheckpointError
 from torchrl.envs import EnvBase
 
-from safe_rl.algorithms.building import build_networks
-from safe_rl.models import BehaviourPolicy
+from safe_rl.algorithms.parts import find_recipe
 from safe_rl.runs.checkpoints import CheckpointStore
 
 __all__ = ["checkpoint_steps", "find_checkpoint", "load_config", "load_policy", "override_env"]
@@ -79,17 +79,17 @@ def checkpoint_steps(checkpoint: Path) -> int | None:
 
 def load_policy(
     config: DictConfig, env: EnvBase, checkpoint: Path, device: torch.device
-) -> BehaviourPolicy:
-    """Build the run's actor and give it the weights of a checkpoint.
+) -> TensorDictModuleBase:
+    """Build the run's policy and give it the weights of a checkpoint.
 
     Only weights are read: neither the checkpoint nor the configuration can make code run.
 
     Raises:
-        CheckpointError: If the file is no checkpoint, or its actor does not fit the environment.
+        CheckpointError: If the file is no checkpoint, or its policy does not fit the environment.
     """
-    actor = build_networks(config.model, env, 0, device).actor
+    policy, networks = find_recipe(config).build_policy(config, env, device)
     try:
-        CheckpointStore.load(checkpoint, {"actor": actor})
+        CheckpointStore.load(checkpoint, networks)
     except CheckpointError as error:
         if "size mismatch" not in str(error):
             raise
@@ -99,4 +99,4 @@ def load_policy(
             f"environment's ({size} numbers, {env.action_spec.shape[-1]} actions): undo the env.… "
             "override that changes them."
         ) from error
-    return BehaviourPolicy(actor).eval()
+    return policy.eval()

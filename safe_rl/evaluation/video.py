@@ -8,11 +8,11 @@ from pathlib import Path
 import numpy as np
 import torch
 from PIL import Image, ImageDraw, ImageFont
+from tensordict.nn import TensorDictModuleBase
 from torchrl.envs import EnvBase
 
 from safe_rl.evaluation.episodes import exploration
 from safe_rl.extras import import_extra
-from safe_rl.models import BehaviourPolicy
 
 __all__ = ["record_episode", "write_video"]
 
@@ -26,7 +26,7 @@ _CAPTION_HEIGHT = 20
 
 @torch.no_grad()
 def record_episode(
-    env: EnvBase, policy: BehaviourPolicy, *, deterministic: bool, camera: str = "free"
+    env: EnvBase, policy: TensorDictModuleBase, *, deterministic: bool, camera: str = "free"
 ) -> Iterator[np.ndarray]:
     """Run one episode and yield its frames, uint8 [height, width, 3].
 

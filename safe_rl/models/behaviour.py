@@ -10,7 +10,15 @@ from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModuleBas
 from torchrl.envs.utils import ExplorationType, exploration_type
 from torchrl.modules import IndependentNormal
 
-__all__ = ["BehaviourPolicy"]
+__all__ = ["BehaviourPolicy", "make_behaviour"]
+
+
+def make_behaviour(actor: ProbabilisticTensorDictSequential) -> TensorDictModuleBase:
+    """The fastest module that samples an actor: a `BehaviourPolicy` if it is a plain Gaussian."""
+    try:
+        return BehaviourPolicy(actor)
+    except TypeError:
+        return actor
 
 
 class BehaviourPolicy(TensorDictModuleBase):

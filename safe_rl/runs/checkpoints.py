@@ -12,7 +12,7 @@ import warnings
 import zipfile
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 from torchrl.checkpoint import (
     Checkpoint,
@@ -21,19 +21,9 @@ from torchrl.checkpoint import (
     StateDictCheckpointAdapter,
 )
 
-__all__ = ["CheckpointStore", "Stateful"]
+from safe_rl.algorithms.contract import Stateful
 
-
-class Stateful(Protocol):
-    """Anything with a ``state_dict``."""
-
-    def state_dict(self) -> Mapping[str, Any]:
-        """Everything that an exact continuation needs."""
-        ...
-
-    def load_state_dict(self, state_dict: Mapping[str, Any]) -> Any:
-        """Continue from :meth:`state_dict`."""
-        ...
+__all__ = ["CheckpointStore"]
 
 
 class CheckpointStore:

@@ -8,12 +8,12 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
 from tqdm import tqdm
 
 from safe_rl.runs.curves import SMOOTHING_EPOCHS, draw_learning_curves
 from safe_rl.runs.table import TableWriter, read_table
+from safe_rl.targets import build
 
 __all__ = ["FINAL_EPOCHS", "RunFolder", "final_figures"]
 
@@ -92,11 +92,11 @@ class RunFolder:
             )
         self._table = TableWriter(self.table_path, keep_rows=epoch or 0)
         self._save_config()
-        self._logger = None
-        if self._config.logger.get("_target_"):
-            self._logger = instantiate(self._config.logger, log_dir=str(self.directory))
-            if epoch is not None and hasattr(self._logger, "continue_from"):
-                self._logger.continue_from(steps)
+        logger = self._config.logger
+        self._logger = build(logger, log_dir=str(self.directory)) if logger else None
+        continue_from = getattr(self._logger, "continue_from", None)
+        if epoch is not None and continue_from is not None:
+            continue_from(steps)
         self._bar = tqdm(
             total=self._config.frames, initial=steps, unit=" steps", unit_scale=True,
             dynamic_ncols=True, smoothing=0.1,

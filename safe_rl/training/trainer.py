@@ -11,20 +11,20 @@ from pathlib import Path
 from signal import Signals
 
 import torch
-from hydra.utils import instantiate
 from omegaconf import DictConfig
 from tensordict import TensorDictBase
 from torchrl.checkpoint import GlobalRNGState
 from torchrl.collectors import Collector
 from torchrl.envs import EnvBase
 
-from safe_rl.algorithms.building import build_algorithm, check_cost_limits
-from safe_rl.algorithms.on_policy import Algorithm
+from safe_rl.algorithms.constraints import check_cost_limits
+from safe_rl.algorithms.contract import Algorithm, Stateful
+from safe_rl.algorithms.parts import find_recipe
 from safe_rl.collectors import EpisodeAccounting, WorkerCollector, make_collector
 from safe_rl.collectors.workers import MakeEnv
-from safe_rl.models import BehaviourPolicy
-from safe_rl.runs.checkpoints import CheckpointStore, Stateful
+from safe_rl.runs.checkpoints import CheckpointStore
 from safe_rl.runs.folder import RunFolder
+from safe_rl.targets import build
 from safe_rl.training.interrupts import StopRequest
 from safe_rl.training.state import Progress, WorldSnapshot
 
@@ -64,9 +64,8 @@ def build_trainer(
 
     Args:
         config: Configuration as composed from ``conf/``.
-        env: Seeded environment with ``observation_layout``, ``cost_keys`` and
-            ``config.num_steps``; if it has ``get_state`` and ``set_state``, a checkpoint holds the
-            state of its worlds.
+        env: Seeded environment that keeps the contract of `safe_rl.envs`; if it has ``get_state``
+            and ``set_state``, a checkpoint holds the state of its worlds.
         directory: Folder of the run.
         make_env: Makes an environment like ``env`` with another ``num_envs``, for collectors with
             workers.
@@ -75,13 +74,13 @@ def build_trainer(
         ValueError: If parts of the configuration do not fit together.
     """
     cost_limits = check_cost_limits(config.cost_limits, env.cost_keys)
-    algorithm = build_algorithm(config, env)
+    algorithm = find_recipe(config).build(config, env)
     return Trainer(
         env=env,
         algorithm=algorithm,
         collector=_build_collector(config, env, make_env, algorithm),
         cost_limits=cost_limits,
-        folder=RunFolder(directory, config, cost_limits, env.config.num_steps),
+        folder=RunFolder(directory, config, cost_limits, env.max_episode_steps),
         config=config,
     )
 
@@ -89,11 +88,11 @@ def build_trainer(
 def _build_collector(
     config: DictConfig, env: EnvBase, make_env: MakeEnv | None, algorithm: Algorithm
 ) -> Collector | WorkerCollector:
-    policy = BehaviourPolicy(algorithm.networks.actor)
+    policy = algorithm.policy
     numbers = {"frames_per_batch": config.frames_per_batch, "device": config.device}
     if config.collector.get("_target_") is None:
         return make_collector(env, policy, **numbers)
-    return instantiate(config.collector, _partial_=True)(env, make_env, policy, **numbers)
+    return build(config.collector, env=env, make_env=make_env, policy=policy, **numbers)
 
 
 class Trainer:
@@ -102,7 +101,7 @@ class Trainer:
     Args:
         env: Environment that the collector steps.
         algorithm: What learns.
-        collector: Endless collector of [N, T] batches, running the algorithm's actor.
+        collector: Endless collector of [N, T] batches, running the algorithm's policy.
         cost_limits: Cost key -> d, undiscounted cost per episode: what counts as feasible.
         folder: Where the run writes.
         config: Configuration of the run, for ``frames`` and ``checkpoint``.
@@ -126,6 +125,7 @@ class Trainer:
         self.folder = folder
         self.interrupted_by: Signals | None = None
         self._collector = collector
+        self._env = env
         # the worlds of workers are out of reach
         self._worlds = None
         if isinstance(collector, Collector) and hasattr(env, "get_state"):
@@ -190,6 +190,22 @@ class Trainer:
         Returns:
             One line on the outcome.
         """
+        try:
+            self._train()
+        except BaseException:
+            self.close()
+            raise
+        if isinstance(self._collector, WorkerCollector):
+            self._collector.shutdown()
+        return self.folder.summary()
+
+    def close(self) -> None:
+        """End what collects: workers, if there are any, and the environment."""
+        self._collector.shutdown()
+        if not self._env.is_closed:
+            self._env.close()
+
+    def _train(self) -> None:
         batches = self.batches()
         saved_at = time.monotonic()
         behind = self.progress.epoch if self._is_continued else None
@@ -204,9 +220,6 @@ class Trainer:
             self._save()
             if self.progress.steps < self._frames:
                 self.interrupted_by = stop.received
-        if isinstance(self._collector, WorkerCollector):
-            self._collector.shutdown()
-        return self.folder.summary()
 
     def batches(self) -> Iterator[TensorDictBase]:
         """Rollouts [N, T] of the present policy, without end."""

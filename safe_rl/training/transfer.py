@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -10,20 +10,21 @@ from omegaconf import DictConfig, OmegaConf
 from torch import Tensor, nn
 from torchrl.checkpoint import CheckpointError, CheckpointRotation
 
-from safe_rl.algorithms.on_policy import Networks
 from safe_rl.runs.checkpoints import CheckpointStore
 
 __all__ = ["initialise_networks"]
 
 
-def initialise_networks(networks: Networks, source: Path, cost_keys: list[str]) -> list[str]:
+def initialise_networks(
+    networks: Mapping[str, nn.Module], source: Path, cost_keys: Sequence[str]
+) -> list[str]:
     """Give networks the weights that a run has learned.
 
-    Actor and critics are taken over; optimisers, multipliers and counters start anew. The cost
-    critic is taken over if the run had one for the same costs.
+    Optimisers, multipliers and counters start anew. Networks whose names begin with ``cost_`` are
+    taken over if the run constrained the same costs.
 
     Args:
-        networks: The new run's, changed in place.
+        networks: The new run's by name, changed in place.
         source: Folder of the run, of which the newest checkpoint is read, or a checkpoint.
         cost_keys: Keys of the new run's constrained costs.
 
@@ -37,9 +38,12 @@ def initialise_networks(networks: Networks, source: Path, cost_keys: list[str]) 
     if not source.exists():
         raise CheckpointError(f"init_from={source}: there is no such folder or file.")
     checkpoint = _newest(source) if source.is_dir() else source
-    taken: dict[str, nn.Module] = {"actor": networks.actor, "critic": networks.critic}
-    if networks.cost_critic is not None and _constrained_costs(checkpoint) == cost_keys:
-        taken["cost_critic"] = networks.cost_critic
+    same_costs = _constrained_costs(checkpoint) == list(cost_keys)
+    taken = {
+        name: network
+        for name, network in networks.items()
+        if same_costs or not name.startswith("cost_")
+    }
     weights = {name: _Weights() for name in taken}
     CheckpointStore.load(checkpoint, weights)
     for name, network in taken.items():

@@ -18,6 +18,7 @@ from torchrl.modules import IndependentNormal, ProbabilisticActor
 
 from safe_rl.objectives import LagrangeMultiplier
 from safe_rl.runs.table import read_table
+from safe_rl.targets import allow
 from safe_rl.training.trainer import build_trainer
 
 ROOT = CONF.parent
@@ -25,6 +26,8 @@ EXAMPLES = ROOT / "examples"
 sys.path.append(str(EXAMPLES))
 
 import custom_loss  # noqa: E402
+
+allow("custom_loss")
 
 DISCOUNT = {"gamma": 0.9, "lmbda": 0.8, "value_target": "lambda_return"}
 

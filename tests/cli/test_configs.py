@@ -10,7 +10,8 @@ from omegaconf import OmegaConf
 from point_mass import PointMass
 from run_configs import CONF, compose_config
 
-from safe_rl.algorithms.building import build_algorithm, check_cost_limits
+from safe_rl.algorithms import OnPolicy
+from safe_rl.algorithms.constraints import check_cost_limits
 from safe_rl.envs import SUITE, make_env, store_configs
 
 store_configs()
@@ -49,9 +50,9 @@ def test_every_combination_composes_and_resolves(env, algo, preset):
 @pytest.mark.parametrize(("algo", "preset"), COMBINATIONS)
 def test_every_combination_builds(algo, preset):
     config = compose_config("env=PointMass", f"algo={algo}", f"preset={preset}")
-    algorithm = build_algorithm(config, PointMass(2))
-    assert (algorithm.networks.cost_critic is None) == (algorithm.cost_advantage is None)
-    assert (algorithm.multiplier is not None) == (algo in LAGRANGIAN)
+    algorithm = OnPolicy.build(config, PointMass(2))
+    assert (algorithm.cost_critic is None) == (algorithm.cost_advantage is None)
+    assert (algorithm.constraints.multiplier is not None) == (algo in LAGRANGIAN)
 
 
 @pytest.mark.parametrize("algo", LAGRANGIAN)
@@ -60,7 +61,7 @@ def test_multipliers_are_interchangeable(algo, multiplier):
     names = (f"algo={algo}", f"lagrangian={multiplier}")
     config = compose_config("env=PointMass", *names)
     assert config.lagrangian == OmegaConf.load(CONF / "lagrangian" / f"{multiplier}.yaml")
-    build_algorithm(config, PointMass(2))
+    OnPolicy.build(config, PointMass(2))
 
 
 def test_every_environment_of_the_suite_is_an_option():
@@ -176,7 +177,7 @@ def test_cost_limits_must_name_costs_of_the_environment():
         with pytest.raises(ValueError, match="'cost' is"):
             check_cost_limits({"cost": limit}, keys)
     with pytest.raises(ValueError, match="Without constraints use algo=ppo"):
-        build_algorithm(compose_config("env=PointMass", "cost_limits={}"), PointMass(2))
+        OnPolicy.build(compose_config("env=PointMass", "cost_limits={}"), PointMass(2))
 
 
 def test_the_compile_switch_reaches_both_updates():
@@ -190,12 +191,12 @@ def test_hyper_parameters_have_one_home():
     config = compose_config("env=PointMass")
     del config.policy_update.num_passes
     with pytest.raises(Exception, match="num_passes"):
-        build_algorithm(config, PointMass(2))
+        OnPolicy.build(config, PointMass(2))
 
 
 def test_networks_scale_the_components_that_are_observed():
     config = compose_config("env=PointMass", "+model.input_scale.velocity=0.5")
-    network = build_algorithm(config, PointMass(2)).networks.actor
+    network = OnPolicy.build(config, PointMass(2)).actor
     scales = [value for name, value in network.state_dict().items() if name.endswith("0.scale")]
     torch.testing.assert_close(scales, [torch.tensor([1.0, 1.0, 0.5, 0.5])])
 

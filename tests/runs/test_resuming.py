@@ -15,8 +15,8 @@ from run_configs import compose_config, point_mass_config, without_times
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from torchrl.checkpoint import CheckpointError
 
-from safe_rl.runs.checkpoints import CheckpointStore
 from safe_rl.envs import SafetyGymEnv, store_configs
+from safe_rl.runs.checkpoints import CheckpointStore
 from safe_rl.runs.resuming import check_same_run, is_finished, may_continue
 from safe_rl.runs.table import read_table
 from safe_rl.training.trainer import build_trainer, seed_everything

@@ -34,7 +34,7 @@ def same(first, second):
 def take_over(trained, *overrides):
     fresh = make_trainer(trained.folder.directory.parent / "second", "seed=1", *overrides)
     networks, algorithm = fresh.algorithm.networks, fresh.algorithm
-    assert not same(networks.actor, trained.algorithm.networks.actor)
+    assert not same(networks["actor"], trained.algorithm.actor)
     taken = initialise_networks(networks, trained.folder.directory, list(algorithm.cost_keys))
     return fresh, taken
 
@@ -43,8 +43,8 @@ def test_all_networks_are_taken_over_and_nothing_else(trained):
     fresh, taken = take_over(trained)
     assert taken == ["actor", "critic", "cost_critic"]
     for name in taken:
-        theirs = getattr(trained.algorithm.networks, name)
-        assert same(getattr(fresh.algorithm.networks, name), theirs)
+        theirs = trained.algorithm.networks[name]
+        assert same(fresh.algorithm.networks[name], theirs)
     assert fresh.progress.steps == 0
     assert not fresh.algorithm.policy_update.optimizer.state
     first = fresh.epoch(fresh.batches())
@@ -54,7 +54,7 @@ def test_all_networks_are_taken_over_and_nothing_else(trained):
 def test_the_policy_that_collects_has_the_weights(trained):
     fresh, _ = take_over(trained)
     batch = next(fresh.batches())
-    expected = trained.algorithm.networks.actor.get_dist(batch)
+    expected = trained.algorithm.actor.get_dist(batch)
     assert torch.allclose(batch["loc"], expected.base_dist.loc, atol=1e-6)
 
 
@@ -70,7 +70,7 @@ def test_a_checkpoint_can_be_named(trained):
     path = next((trained.folder.checkpoint_directory / "last").iterdir())
     fresh = make_trainer(trained.folder.directory.parent / "second", "seed=1")
     initialise_networks(fresh.algorithm.networks, path, ["cost"])
-    assert same(fresh.algorithm.networks.actor, trained.algorithm.networks.actor)
+    assert same(fresh.algorithm.networks["actor"], trained.algorithm.actor)
 
 
 @pytest.mark.parametrize(
@@ -82,10 +82,10 @@ def test_a_checkpoint_can_be_named(trained):
 )
 def test_other_sizes_are_named_and_nothing_changes(trained, override, message):
     fresh = make_trainer(trained.folder.directory.parent / "second", "seed=1", override)
-    before = {k: v.clone() for k, v in fresh.algorithm.networks.actor.state_dict().items()}
+    before = {k: v.clone() for k, v in fresh.algorithm.actor.state_dict().items()}
     with pytest.raises(CheckpointError, match=message):
         initialise_networks(fresh.algorithm.networks, trained.folder.directory, ["cost"])
-    after = fresh.algorithm.networks.actor.state_dict()
+    after = fresh.algorithm.actor.state_dict()
     assert all(torch.equal(after[key], value) for key, value in before.items())
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any
 
 import gymnasium
 import numpy as np
@@ -17,12 +17,6 @@ from torchrl.envs.gym_like import BaseInfoDictReader
 
 AGGREGATE = "cost"
 MakeEnv = Callable[[], gymnasium.Env]
-
-
-class Episode(NamedTuple):
-    """What training asks of a configuration: the largest number of steps of an episode."""
-
-    num_steps: int
 
 
 class CostReader(BaseInfoDictReader):
@@ -96,7 +90,7 @@ class GymnasiumEnv(TransformedEnv):
     Attributes:
         cost_keys: the aggregate `cost`, then one key per kind.
         observation_layout: one component, the whole observation.
-        config: the largest number of steps of an episode, `config.num_steps`.
+        max_episode_steps: the largest number of steps of an episode.
     """
 
     def __init__(self, base_env: GymWrapper, cost_keys: Sequence[str], num_steps: int) -> None:
@@ -104,7 +98,7 @@ class GymnasiumEnv(TransformedEnv):
         size = base_env.observation_spec["observation"].shape[-1]
         self.cost_keys = [AGGREGATE, *(key for key in cost_keys if key != AGGREGATE)]
         self.observation_layout = {"observation": slice(0, size)}
-        self.config = Episode(num_steps)
+        self.max_episode_steps = num_steps
 
 
 def from_gymnasium(

@@ -1,0 +1,143 @@
+"""The constraints of a run: which costs, how much of them, and how far the policy is from that."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from difflib import get_close_matches
+
+import torch
+from torch import Tensor
+
+from safe_rl.collectors import EpisodeStatistics
+from safe_rl.objectives.multipliers import Multiplier
+
+__all__ = ["Constraints", "check_cost_limits", "mean_cost"]
+
+
+def mean_cost(episode_costs: Tensor) -> Tensor:
+    """J_c, the mean over episodes: [E, k] -> [k]."""
+    return episode_costs.mean(0)
+
+
+class Constraints:
+    """Keys, limits, what of the episode costs is limited, and the multiplier that weighs them.
+
+    Every recipe has one, and shows it every batch. Losses and updates that need the violation
+    take the object itself and read ``violation`` and ``episode_length`` at every call.
+
+    Args:
+        limits: Cost key -> d, undiscounted cost allowed per episode; empty without constraints.
+        measure: What of the episode costs, [E, k], is held against the limits, [k]: `mean_cost`, or
+            another statistic, such as a quantile. Its gradient is up to the cost advantages.
+        multiplier: Weighs the costs against the return, or None.
+        device: Of all tensors.
+
+    Attributes:
+        keys: Keys of the k costs.
+        limits: d, [k].
+        violation: J_c − d, [k], as of the last batch; J_c as `measure` has it.
+        episode_length: T̄, mean number of steps of an episode, scalar.
+
+    Examples:
+        >>> constraints = Constraints({"cost": 25.0})
+        >>> episodes = EpisodeStatistics(
+        ...     returns=torch.ones(2),
+        ...     costs={"cost": torch.tensor([20.0, 40.0])},
+        ...     lengths=torch.tensor([1000.0, 1000.0]),
+        ...     cost_rates={"cost": torch.tensor(0.03)},
+        ... )
+        >>> constraints.observe(episodes, batch_steps=1000)
+        >>> constraints.violation, constraints.episode_length
+        (tensor([5.]), tensor(1000.))
+    """
+
+    def __init__(
+        self,
+        limits: Mapping[str, float],
+        *,
+        measure: Callable[[Tensor], Tensor] = mean_cost,
+        multiplier: Multiplier | None = None,
+        device: torch.device | str | None = None,
+    ) -> None:
+        self.keys = list(limits)
+        self.limits = torch.tensor(list(limits.values()), dtype=torch.float32, device=device)
+        self.multiplier = multiplier
+        self._measure = measure
+        self.violation = torch.full_like(self.limits, torch.nan)
+        self.episode_length = torch.full((), torch.nan, device=device)
+        self._costs = torch.full_like(self.limits, torch.nan)
+        self._mean_length = torch.full((), torch.nan, device=device)
+
+    def observe(self, episodes: EpisodeStatistics, batch_steps: int) -> None:
+        """Take in what a batch says about episodes, and move the multiplier.
+
+        Costs and length are those of the last batch in which an episode finished. Before there is
+        one, the length is that of the batch and the cost what the cost rate would sum to in it.
+
+        Args:
+            episodes: Statistics of the batch.
+            batch_steps: T, steps of every environment in the batch.
+        """
+        if episodes.num_episodes:
+            costs = self._measure(episodes.episode_costs(self.keys))
+            self._costs = costs.to(self._costs)
+            self._mean_length = episodes.lengths.mean().to(self._mean_length)
+        if self._mean_length.isfinite():
+            costs, length = self._costs, self._mean_length
+        else:
+            length = torch.full_like(self._mean_length, float(batch_steps))
+            rates = [episodes.cost_rates[key].to(self._costs.device) for key in self.keys]
+            costs = (torch.stack(rates) * length).float() if rates else self._costs
+        # in place: compiled losses read the same tensors every time
+        self.violation.copy_(costs - self.limits)
+        self.episode_length.copy_(length)
+        if self.multiplier is not None and episodes.num_episodes:
+            self.multiplier.update(self._costs)
+
+    def columns(self) -> dict[str, float]:
+        """Violations and multipliers, by column of the table."""
+        row = self.column("violation", self.violation)
+        if self.multiplier is not None:
+            row |= self.column("multiplier", self.multiplier.value)
+        return row
+
+    def column(self, name: str, value: Tensor) -> dict[str, float]:
+        """One column for a scalar, one per constraint for a vector [k]."""
+        if value.ndim == 0:
+            return {name: value.item()}
+        return {f"{name}_{key}": v for key, v in zip(self.keys, value.tolist(), strict=True)}
+
+    def state_dict(self) -> dict[str, Tensor]:
+        """The costs and the length of the last batch in which an episode finished."""
+        return {"costs": self._costs, "mean_length": self._mean_length}
+
+    def load_state_dict(self, state_dict: Mapping[str, Tensor]) -> None:
+        """Continue from :meth:`state_dict`."""
+        self._costs = state_dict["costs"].to(self._costs)
+        self._mean_length = state_dict["mean_length"].to(self._mean_length)
+
+
+def check_cost_limits(
+    cost_limits: Mapping[str, float], cost_keys: Sequence[str]
+) -> dict[str, float]:
+    """Return the limits as a plain dictionary, once every key is known to the environment.
+
+    Raises:
+        ValueError: If a key is unknown, or a limit is negative or not a number.
+    """
+    limits: dict[str, float] = {}
+    for key, limit in cost_limits.items():
+        if key not in cost_keys:
+            close = get_close_matches(key, cost_keys, n=1, cutoff=0.8)
+            nearest = f" Nearest: '{close[0]}'." if close else ""
+            raise ValueError(
+                f"cost_limits names '{key}', but this environment has no such cost.{nearest} It "
+                f"has {', '.join(cost_keys)}; env.constrain_<kind>=true adds those of another kind."
+            )
+        if isinstance(limit, bool) or not isinstance(limit, int | float) or not limit >= 0:
+            raise ValueError(
+                f"The limit of '{key}' is {limit!r}: it must be a number of at least 0, the "
+                "undiscounted cost allowed per episode."
+            )
+        limits[key] = float(limit)
+    return limits

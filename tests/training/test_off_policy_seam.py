@@ -1,0 +1,147 @@
+"""An algorithm of another kind runs in the same loop: replay buffer, random policy, Q updates.
+
+It knows nothing of advantages, state values or multipliers, and the loop nothing of it: training,
+checkpoints, resuming, transfer and evaluation are those of every run.
+"""
+
+import pytest
+import torch
+from point_mass import PointMass
+from run_configs import point_mass_config, without_times
+from tensordict.nn import TensorDictModule, TensorDictModuleBase
+from torch import nn
+from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
+from torchrl.modules import RandomPolicy
+
+from safe_rl.evaluation.episodes import collect_episodes
+from safe_rl.evaluation.loading import find_checkpoint, load_config, load_policy
+from safe_rl.runs.table import read_table
+from safe_rl.targets import allow
+from safe_rl.training.trainer import build_trainer, seed_everything
+from safe_rl.training.transfer import initialise_networks
+
+
+class QNetwork(nn.Module):
+    def __init__(self, num_obs, num_actions):
+        super().__init__()
+        self.layers = nn.Sequential(nn.Linear(num_obs + num_actions, 8), nn.Tanh(), nn.Linear(8, 1))
+
+    def forward(self, observation, action):
+        return self.layers(torch.cat([observation, action], -1))
+
+
+class RandomExploration(TensorDictModuleBase):
+    """Acts at random, and has a network that evaluation has to find in the checkpoint."""
+
+    def __init__(self, env):
+        super().__init__()
+        self.bias = nn.Parameter(torch.zeros(env.action_spec.shape[-1]))
+        self._random = RandomPolicy(env.action_spec)
+        self.in_keys, self.out_keys = ["observation"], ["action"]
+
+    def forward(self, tensordict):
+        self._random(tensordict)
+        tensordict["action"] = tensordict["action"] + self.bias.detach()
+        return tensordict
+
+
+class OneStepQ:
+    """Fits Q(s, a) to the reward of one step, from a replay buffer."""
+
+    cost_keys = ()
+
+    def __init__(self, env):
+        self.policy = RandomExploration(env)
+        self._q = QNetwork(env.observation_spec["observation"].shape[-1], 2)
+        self.networks = {"explorer": self.policy, "q": self._q}
+        module = TensorDictModule(self._q, in_keys=["observation", "action"], out_keys=["q"])
+        self._predict = module
+        self._optimizer = torch.optim.Adam(self._q.parameters(), lr=1e-2)
+        self._buffer = TensorDictReplayBuffer(storage=LazyTensorStorage(2000), batch_size=64)
+
+    @classmethod
+    def build(cls, config, env):
+        return cls(env)
+
+    @classmethod
+    def build_policy(cls, config, env, device):
+        policy = RandomExploration(env)
+        return policy, {"explorer": policy}
+
+    def learn(self, batch, episodes):
+        self._buffer.extend(batch.reshape(-1))
+        sample = self._buffer.sample()
+        error = self._predict(sample)["q"] - sample["next", "reward"]
+        loss = error.square().mean()
+        self._optimizer.zero_grad()
+        loss.backward()
+        self._optimizer.step()
+        with torch.no_grad():
+            self.policy.bias += 0.01
+        return {"q_loss": loss.item()}
+
+    def checkpoint_components(self):
+        return {**self.networks, "optimizer": self._optimizer, "buffer": self._buffer}
+
+
+@pytest.fixture
+def make_trainer(tmp_path):
+    allow(__name__)
+    (tmp_path / "algo").mkdir()
+    (tmp_path / "algo" / "one_step_q.yaml").write_text(
+        "# @package _global_\nalgo: {name: one_step_q, _target_: test_off_policy_seam.OneStepQ}\n"
+    )
+
+    def make(name, *overrides):
+        config = point_mass_config(
+            f"hydra.searchpath=[file://{tmp_path}]",
+            *("algo=one_step_q", "cost_limits={}"),
+            *overrides,
+            minibatch_size=None,
+        )
+        seed_everything(config.seed, None)
+        return build_trainer(config, PointMass(4, 20, config.seed), tmp_path / name)
+
+    return make
+
+
+def test_it_trains_and_writes_a_run(make_trainer, tmp_path):
+    trainer = make_trainer("run", "checkpoint.interval=0")
+    line = trainer.run()
+    table = read_table(tmp_path / "run" / "progress.csv")
+    assert table["steps"] == [160 * epoch for epoch in range(1, 9)]
+    assert table["q_loss"][-1] < table["q_loss"][0]
+    assert "J_c" in line
+
+
+def test_it_goes_on_with_its_buffer_as_if_it_had_never_stopped(make_trainer, tmp_path):
+    make_trainer("whole").run()
+    make_trainer("halves", "frames=640").run()
+    torch.rand(7)
+    resumed = make_trainer("halves")
+    assert resumed.resume()
+    resumed.run()
+    table, expected = (without_times(tmp_path / n / "progress.csv") for n in ("halves", "whole"))
+    assert len(expected) == 9
+    assert table == expected
+
+
+def test_another_run_starts_from_its_networks(make_trainer, tmp_path):
+    first = make_trainer("first")
+    first.run()
+    second = make_trainer("second", "seed=1")
+    taken = initialise_networks(second.algorithm.networks, tmp_path / "first", [])
+    assert taken == ["explorer", "q"]
+    assert torch.equal(second.algorithm.policy.bias, first.algorithm.policy.bias)
+
+
+def test_evaluation_finds_its_policy(make_trainer, tmp_path):
+    trainer = make_trainer("run")
+    trainer.run()
+    config = load_config(tmp_path / "run")
+    env = PointMass(2, 20)
+    checkpoint = find_checkpoint(tmp_path / "run", "last")
+    policy = load_policy(config, env, checkpoint, torch.device("cpu"))
+    assert policy.bias.tolist() == pytest.approx([0.08, 0.08])
+    episodes = collect_episodes(env, policy, 3, env.cost_keys, deterministic=False)
+    assert episodes.lengths.tolist() == [20, 20, 20]
