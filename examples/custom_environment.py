@@ -16,7 +16,7 @@ from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 
 from safe_rl.envs import make_env, store_config
-from safe_rl.envs.extending import (
+from safe_rl.envs.safety_gym.extending import (
     CYLINDER,
     Cost,
     Element,

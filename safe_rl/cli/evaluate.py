@@ -17,7 +17,7 @@ from torchrl.checkpoint import CheckpointError
 
 from safe_rl.cli.options import OptionError, parse_options, usage
 from safe_rl.envs import ConfigError, OpenGLError, SafetyGymEnv, make_env
-from safe_rl.envs.suite import SUITE
+from safe_rl.envs.safety_gym.suite import SUITE
 from safe_rl.evaluation.episodes import collect_episodes
 from safe_rl.evaluation.layouts import default_seed, shared_layouts
 from safe_rl.evaluation.loading import (

@@ -11,8 +11,8 @@ import safe_rl.openmp  # noqa: F401, has to come before torch
 
 # isort: split
 from safe_rl.cli.options import OptionError, parse_options, usage
-from safe_rl.envs.registration import group_node
-from safe_rl.envs.suite import SUITE
+from safe_rl.envs.safety_gym.registration import group_node
+from safe_rl.envs.safety_gym.suite import SUITE
 from safe_rl.reporting import Report, build_report, write_report
 from safe_rl.scores.protocol import SEEDS
 

@@ -5,10 +5,7 @@ from contextlib import contextmanager
 
 import torch
 
-from safe_rl.envs.config import registered_keys, set_registered_keys
-from safe_rl.envs.costs import COSTS
-from safe_rl.envs.elements import BY_KIND, ELEMENTS, PLACEMENT_ORDER
-from safe_rl.envs.extending import (
+from safe_rl.envs.safety_gym.extending import (
     BOX,
     CYLINDER,
     Cost,
@@ -18,10 +15,13 @@ from safe_rl.envs.extending import (
     register_cost,
     register_element,
 )
-from safe_rl.envs.readings import READINGS
-from safe_rl.envs.robot import ROBOTS
-from safe_rl.envs.scene import build_scene
-from safe_rl.envs.tasks import TASKS
+from safe_rl.envs.safety_gym.records.config import registered_keys, set_registered_keys
+from safe_rl.envs.safety_gym.rules.costs import COSTS
+from safe_rl.envs.safety_gym.rules.elements import BY_KIND, ELEMENTS, PLACEMENT_ORDER
+from safe_rl.envs.safety_gym.rules.readings import READINGS
+from safe_rl.envs.safety_gym.rules.robots import ROBOTS
+from safe_rl.envs.safety_gym.rules.tasks import TASKS
+from safe_rl.envs.safety_gym.world.building import build_scene
 
 LISTS = (COSTS, ELEMENTS, PLACEMENT_ORDER, READINGS)
 MAPPINGS = (BY_KIND, ROBOTS, TASKS)

@@ -10,7 +10,7 @@ from registrations import cube, disc, inside, register_mines, undone
 from torchrl.envs.utils import check_env_specs
 
 from safe_rl.envs import SUITE, ConfigError, SafetyGymEnv
-from safe_rl.envs.extending import (
+from safe_rl.envs.safety_gym.extending import (
     Cost,
     Motion,
     NextGoal,
@@ -23,7 +23,7 @@ from safe_rl.envs.extending import (
     register_robot,
     register_task,
 )
-from safe_rl.envs.robot import ROBOTS
+from safe_rl.envs.safety_gym.rules.robots import ROBOTS
 
 POINT = {"robot_base": "point", "task": "none", "sensors_obs": ["gyro"]}
 MINES = {"mines_num": 2, "observe_mines": True, "constrain_mines": True}

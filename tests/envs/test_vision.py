@@ -126,7 +126,7 @@ def test_a_large_inset_is_shrunk_to_a_third_of_the_frame():
 
 
 def test_a_robot_without_a_camera_is_an_error(tmp_path):
-    folder = Path(safe_rl.envs.__file__).parent / "robots"
+    folder = Path(safe_rl.envs.__file__).parent / "safety_gym" / "robots"
     text = (folder / "point.xml").read_text().splitlines()
     blind = tmp_path / "blind.xml"
     blind.write_text("\n".join(line for line in text if "<camera" not in line))

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import yaml
 
-from safe_rl.envs.registration import group_node
-from safe_rl.envs.suite import SUITE
+from safe_rl.envs.safety_gym.registration import group_node
+from safe_rl.envs.safety_gym.suite import SUITE
 
 COLUMNS = [
     *("epoch", "steps", "episodes", "episode_return", "episode_cost", "cost_rate", "time_total"),

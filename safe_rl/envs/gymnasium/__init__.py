@@ -2,5 +2,5 @@
 
 Costs stand in `info`: `info["cost"]`, one `info["cost_<kind>"]` per constrained kind, and
 `info["goal_met"]`. `gymnasium.make` and `gymnasium.make_vec` find the environments under the ids
-that `safe_rl.envs.registration` registers.
+that `safe_rl.envs.safety_gym.registration` registers.
 """

@@ -8,7 +8,6 @@ from typing import Any
 import gymnasium
 import numpy as np
 
-from safe_rl.envs.config import SafetyGymConfig
 from safe_rl.envs.gymnasium.worlds import (
     RENDER_MODES,
     Observation,
@@ -17,8 +16,9 @@ from safe_rl.envs.gymnasium.worlds import (
     configure,
     take,
 )
-from safe_rl.envs.rendering.display import Camera
-from safe_rl.envs.safety_gym import SafetyGymEnv
+from safe_rl.envs.safety_gym.env import SafetyGymEnv
+from safe_rl.envs.safety_gym.records.config import SafetyGymConfig
+from safe_rl.envs.safety_gym.rendering.display import Camera
 
 
 class SafetyGymnasiumEnv(gymnasium.Env[Any, np.ndarray]):

@@ -9,7 +9,6 @@ import numpy as np
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
-from safe_rl.envs.config import SafetyGymConfig
 from safe_rl.envs.gymnasium.worlds import (
     RENDER_MODES,
     Arrays,
@@ -19,8 +18,9 @@ from safe_rl.envs.gymnasium.worlds import (
     configure,
     take,
 )
-from safe_rl.envs.rendering.display import Camera
-from safe_rl.envs.safety_gym import SafetyGymEnv
+from safe_rl.envs.safety_gym.env import SafetyGymEnv
+from safe_rl.envs.safety_gym.records.config import SafetyGymConfig
+from safe_rl.envs.safety_gym.rendering.display import Camera
 
 
 class SafetyGymnasiumVectorEnv(VectorEnv[Any, np.ndarray, np.ndarray]):

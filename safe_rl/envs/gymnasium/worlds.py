@@ -12,11 +12,11 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from torchrl.data import Composite, TensorSpec
 
-from safe_rl.envs.config import SafetyGymConfig
-from safe_rl.envs.rendering.opengl import OpenGLError, has_screen
-from safe_rl.envs.safety_gym import SafetyGymEnv
-from safe_rl.envs.scene import build_scene
-from safe_rl.envs.suite import resolve
+from safe_rl.envs.opengl import OpenGLError, has_screen
+from safe_rl.envs.safety_gym.env import SafetyGymEnv
+from safe_rl.envs.safety_gym.records.config import SafetyGymConfig
+from safe_rl.envs.safety_gym.suite import resolve
+from safe_rl.envs.safety_gym.world.building import build_scene
 
 RENDER_MODES = ("human", "rgb_array")
 # Every value is finite, and no more is promised: sensors feel accelerations of any size.

@@ -40,8 +40,8 @@ class BatchPhysics:
         num_threads: threads that step them, 0 for one per core.
 
     Examples:
-        >>> from safe_rl.envs.config import SafetyGymConfig
-        >>> from safe_rl.envs.scene import build_scene
+        >>> from safe_rl.envs.safety_gym.records.config import SafetyGymConfig
+        >>> from safe_rl.envs.safety_gym.world.building import build_scene
         >>> physics = BatchPhysics(build_scene(SafetyGymConfig()).model, num_envs=2, num_threads=1)
         >>> physics.step(num_substeps=10).tolist()
         [False, False]

@@ -1,0 +1,1 @@
+"""The Safety Gym family: configurations, the benchmark suite and the batched environment."""

@@ -1,0 +1,310 @@
+"""The Safety Gym environments as one batched TorchRL environment."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
+from torchrl.envs import EnvBase
+
+from safe_rl.envs import rng
+from safe_rl.envs.errors import require_integer
+from safe_rl.envs.physics.cpu import BatchPhysics
+from safe_rl.envs.safety_gym.observing.lidar_blocks import lidar_blocks
+from safe_rl.envs.safety_gym.observing.observations import make_observer
+from safe_rl.envs.safety_gym.records.config import SafetyGymConfig
+from safe_rl.envs.safety_gym.rendering.display import Camera
+from safe_rl.envs.safety_gym.rendering.renderer import WorldRenderer
+from safe_rl.envs.safety_gym.rules.costs import compute_costs, cost_keys
+from safe_rl.envs.safety_gym.rules.tasks import TASKS, dense_reward
+from safe_rl.envs.safety_gym.specs import make_specs
+from safe_rl.envs.safety_gym.suite import resolve
+from safe_rl.envs.safety_gym.world.building import build_scene
+from safe_rl.envs.safety_gym.world.draws import (
+    Purpose,
+    control_noise,
+    draw_substeps,
+    gremlin_path,
+    next_goals,
+    pick_layouts,
+    start_episodes,
+)
+from safe_rl.envs.safety_gym.world.layout import plan_placements
+from safe_rl.envs.safety_gym.world.snapshot import read_state, write_state
+from safe_rl.envs.safety_gym.world.views import make_world, refresh
+
+_FLAGS = ("goal_met", "done", "terminated", "truncated")
+
+
+class SafetyGymEnv(EnvBase):
+    """N parallel worlds of one Safety Gym configuration, stepped together on a thread pool.
+
+    Reads `action` [N, nu], clipped to the actuators' control range ([-1, 1] in the suite). Writes
+    `observation` [N, n], or nested `("observation", name)` [N, …] where the configuration sets
+    `observation_flatten` False, and each [N, 1]:
+    `reward`, `cost` (the aggregate), one `cost_<kind>` per constrained kind, `cost_exception`,
+    `goal_met`, `done`, `terminated`, `truncated`. Time-outs are truncations. Where the physics of
+    a world fails, that world gets `reward_exception`, `cost_exception` 1 and termination.
+
+    Args:
+        env: name in the suite ("PointGoal1", "Safexp-PointGoal1-v0"), mapping of configuration
+            keys, or `SafetyGymConfig`.
+        num_envs: number of worlds, N.
+        device: where the TensorDicts live; the physics runs on the CPU.
+        seed: integer that determines every draw; None takes one from torch's generator. Row k gets
+            the same episodes whatever N and the number of threads are.
+        num_threads: threads that step the physics; 0 for one per core.
+        sleep: let resting objects sleep until touched, which is faster and changes no statistics.
+
+    Raises:
+        ConfigError: for an unknown name or key, or a value that cannot be used.
+        LayoutError: at a reset, if the objects do not fit.
+
+    Examples:
+        >>> env = SafetyGymEnv("PointGoal1", num_envs=4, seed=0)
+        >>> rollout = env.rollout(max_steps=10)
+        >>> rollout["next", "cost_hazards"].shape
+        torch.Size([4, 10, 1])
+    """
+
+    def __init__(
+        self,
+        env: str | Mapping[str, Any] | SafetyGymConfig,
+        num_envs: int = 1,
+        device: torch.device | str = "cpu",
+        seed: int | None = None,
+        num_threads: int = 0,
+        sleep: bool = True,
+    ) -> None:
+        require_integer("num_envs", num_envs, lowest=1)
+        require_integer("num_threads", num_threads, lowest=0)
+        super().__init__(device=torch.device(device), batch_size=torch.Size([num_envs]))
+        self.config = resolve(env)
+        scene = build_scene(self.config, sleep)
+        self._physics = BatchPhysics(scene.model, num_envs, num_threads)
+        self._world = make_world(scene, self._physics)
+        self._plan = plan_placements(self.config, scene.slots, len(scene.names))
+        self._observer = make_observer(scene)
+        self._task = TASKS[self.config.task]
+        low, high = torch.from_numpy(scene.model.actuator_ctrlrange.T.copy())
+        self._control_range = (low, high)
+        self._episode = torch.zeros(num_envs, dtype=torch.int64)
+        self._measured = self._task.measure(self._world).detach().clone()
+        self._renderer = WorldRenderer(self._world, lidar_blocks(self.config, scene))
+        self._has_cost = torch.zeros(num_envs, dtype=torch.bool)
+        self.cost_keys = cost_keys(self.config)
+        specs = make_specs(
+            self.config, self._observer, self._control_range, self.cost_keys, num_envs, self.device
+        )
+        self.observation_spec, self.action_spec = specs.observation, specs.action
+        self.reward_spec, self.done_spec = specs.reward, specs.done
+        self.set_seed(int(torch.randint(2**62, ())) if seed is None else seed)
+
+    @property
+    def object_names(self) -> tuple[str, ...]:
+        """Names of the objects, in the order they have in a state's `layout` after the robot."""
+        return self._world.scene.names
+
+    @property
+    def max_episode_steps(self) -> int:
+        """Steps after which an episode is truncated."""
+        return self.config.num_steps
+
+    @property
+    def observation_layout(self) -> dict[str, slice]:
+        """Columns of every named component in `observation`."""
+        return dict(self._observer.columns)
+
+    def _set_seed(self, seed: int | None) -> None:
+        if seed is None:
+            return
+        require_integer("seed", seed, lowest=-(2**63))
+        self._row_seed = rng.row_seeds(seed, self.batch_size[0])
+        # One layout for all rows where the configuration wants a single one.
+        self._fixed_layout = rng.fold(torch.tensor(seed), Purpose.LAYOUT)
+        self._episode.zero_()
+
+    def _layout_key(self) -> Tensor:
+        key = rng.fold(self._row_seed, self._episode)
+        if not self.config.randomize_layout:
+            key = self._fixed_layout.expand(self.batch_size)
+        return key if self.config.layout_seeds is None else pick_layouts(self.config, key)
+
+    def _step_key(self) -> Tensor:
+        """Random key of the step that is being taken, [N]."""
+        return rng.fold(self._row_seed, self._episode, self._world.step_count + 1)
+
+    @torch.no_grad()
+    def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDictBase:
+        mask = None if tensordict is None else tensordict.get("_reset", None)
+        if mask is None:
+            mask = torch.ones(self.batch_size, dtype=torch.bool)
+        mask = mask.reshape(self.batch_size).cpu()
+        self._episode[mask] += 1
+        start_episodes(self._world, self._plan, self._layout_key(), mask)
+        self._measured[mask] = self._task.measure(self._world)[mask]
+        self._has_cost &= ~mask
+        return self._reset_output()
+
+    def _reset_output(self) -> TensorDict:
+        """What a reset returns, for the worlds as they are."""
+        none = torch.zeros(len(_FLAGS), *self.batch_size, 1, dtype=torch.bool)
+        return self._pack(dict(zip(_FLAGS, none, strict=True)))
+
+    def _pack(self, outputs: dict[str, Any]) -> TensorDict:
+        """Add the observation and move everything to the device."""
+        flat = self._observer.read(self._world)
+        if self.device.type != "cpu":
+            outputs = {key: value.to(self.device) for key, value in outputs.items()}
+            flat = flat.to(self.device)
+        outputs["observation"] = flat
+        if not self.config.observation_flatten:
+            outputs["observation"] = TensorDict(
+                self._observer.split(flat), batch_size=self.batch_size, device=self.device
+            )
+        # As TorchRL's own environments do: every shape and device is right by construction.
+        return TensorDict._new_unsafe(outputs, batch_size=self.batch_size, device=self.device)
+
+    @torch.no_grad()
+    def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
+        world, config = self._world, self.config
+        failed = self._advance(self._checked_action(tensordict))
+        now = self._task.measure(world)
+        reward = dense_reward(config, world, self._measured, now)
+        costs = compute_costs(config, world, failed)
+        torch.gt(costs[0], 0.0, out=self._has_cost)
+        world.buttons_timer.sub_(1).clamp_(min=0)
+        met, stuck = self._handle_goals(now, failed)
+        reward = reward + config.reward_goal * met
+        reward.masked_fill_(failed, config.reward_exception)
+        world.step_count.add_(1)
+        time_out = world.step_count >= config.num_steps
+        terminated = failed if config.continue_goal else failed | met
+        truncated = (time_out if stuck is None else time_out | stuck) & ~terminated
+        numbers = torch.cat([reward.unsqueeze(0), costs]).to(torch.float32).unsqueeze(-1)
+        flags = torch.stack([met, terminated | truncated, terminated, truncated]).unsqueeze(-1)
+        names = ("reward", *self.cost_keys, *_FLAGS)
+        return self._pack(dict(zip(names, (*numbers, *flags), strict=True)))
+
+    def _step_proc_data(self, next_tensordict_out: TensorDictBase) -> TensorDictBase:
+        """Skip TorchRL's checks of every step: shapes and end flags are right by construction."""
+        return next_tensordict_out
+
+    def _checked_action(self, tensordict: TensorDictBase) -> Tensor:
+        action, needed = tensordict.get("action"), self._physics.ctrl.shape
+        if action.shape != needed or not action.dtype.is_floating_point:
+            raise ValueError(
+                f"'action' must be a floating-point tensor of shape {tuple(needed)} (num_envs, "
+                f"number of actuators), got {action.dtype} {tuple(action.shape)}."
+            )
+        return action.detach().cpu()
+
+    def _advance(self, action: Tensor) -> Tensor:
+        """Run the substeps of one step; returns the worlds whose physics failed [N]."""
+        config, physics = self.config, self._physics
+        control = action.clamp(*self._control_range)
+        num_substeps: Tensor | int = config.frameskip_binom_n
+        if config.action_noise > 0.0:
+            control = control + control_noise(config, self._step_key(), control.shape[-1])
+        if config.frameskip_binom_p < 1.0:
+            num_substeps = draw_substeps(config, self._step_key())
+        physics.ctrl.copy_(control)
+        path = None
+        if self._world.scene.num_targets:
+            path = gremlin_path(self._world, physics.time, config.frameskip_binom_n)
+        failed = physics.step(num_substeps, path)
+        refresh(self._world)
+        return failed
+
+    def _handle_goals(self, now: Tensor, failed: Tensor) -> tuple[Tensor, Tensor | None]:
+        """Give worlds that met their goal a new one: which met it, which have no place for one."""
+        self._measured.copy_(now)
+        if self._task.met is None:
+            return torch.zeros_like(failed), None
+        met = self._task.met(self.config, self._world, now) & ~failed
+        if not (self.config.continue_goal and met.any()):
+            return met, None
+        stuck = next_goals(self._world, self._plan, self._step_key(), met)
+        self._measured.copy_(self._task.measure(self._world))
+        return met, stuck
+
+    def get_state(self) -> TensorDict:
+        """Return a copy of everything that determines what happens next.
+
+        Returns:
+            TensorDict [N] with `qpos`, `qvel`, `qacc_warmstart`, `time`, `goal_pos` [N, 3],
+            `goal_button`, `buttons_timer`, `step_count`, and the layout and seeds.
+        """
+        state = read_state(self._world)
+        state["seed"], state["episode"] = self._row_seed.clone(), self._episode.clone()
+        return state
+
+    @torch.no_grad()
+    def set_state(self, state: TensorDictBase) -> TensorDict:
+        """Set the worlds to a state, for resuming, branching and tests.
+
+        Args:
+            state: TensorDict [N] as `get_state` returns it; the layout and the seeds may be left
+                out, then the present ones stay.
+
+        Returns:
+            What a reset returns, for that state.
+
+        Raises:
+            KeyError: if a key is missing.
+            ValueError: if a shape does not fit.
+        """
+        if "layout" not in state and not self._episode.any():
+            self.reset()
+        write_state(self._world, state)
+        self._row_seed = state.get("seed", self._row_seed).clone()
+        self._episode = state.get("episode", self._episode).clone()
+        self._measured.copy_(self._task.measure(self._world))
+        self._has_cost.zero_()
+        return self._reset_output()
+
+    def render(
+        self,
+        rows: int | Sequence[int] | None = None,
+        *,
+        camera: Camera = "fixedfar",
+        width: int = 480,
+        height: int = 360,
+    ) -> np.ndarray:
+        """Draw worlds as they are, with lidar halos, and a red sphere where a cost is incurred.
+
+        Args:
+            rows: which worlds; None is all of them.
+            camera: "fixednear", "fixedfar", "track" (behind the robot), "vision" (the robot's),
+                "free" (above), or a `mujoco.MjvCamera`.
+            width: of a frame [pixels].
+            height: of a frame [pixels].
+
+        Returns:
+            RGB, uint8: one frame [height, width, 3] for an integer, else [R, height, width, 3].
+
+        Raises:
+            OpenGLError: if OpenGL is missing; the message names the package to install.
+            ValueError: for an unknown camera.
+        """
+        if isinstance(rows, int):
+            return self._renderer.frames([rows], self._has_cost, camera, width, height)[0]
+        chosen = range(self.batch_size[0]) if rows is None else rows
+        return self._renderer.frames(list(chosen), self._has_cost, camera, width, height)
+
+    def show(self, row: int = 0) -> None:
+        """Show one world as it is in MuJoCo's viewer, opened by the first call.
+
+        Raises:
+            OpenGLError: if there is no screen.
+        """
+        self._renderer.show(row, self._has_cost)
+
+    def close(self, *, raise_if_closed: bool = True) -> None:
+        """Close the viewer and free what OpenGL holds."""
+        self._renderer.close()
+        super().close(raise_if_closed=raise_if_closed)

@@ -1,0 +1,89 @@
+"""Geometry of points and bodies: distances, frames, directions, circles.
+
+Lengths in metres, angles in radians.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+
+def distance(a: Tensor, b: Tensor) -> Tensor:
+    """Euclidean distance over the last dimension."""
+    return torch.linalg.vector_norm(a - b, dim=-1)
+
+
+def to_ego(position: Tensor, robot_pos: Tensor, robot_mat: Tensor) -> Tensor:
+    """Rotate positions in the world into the robot's frame.
+
+    Args:
+        position: [N, M, 3].
+        robot_pos: [N, 3].
+        robot_mat: columns are the robot's axes in the world [N, 3, 3].
+
+    Returns:
+        [N, M, 3].
+    """
+    return (position - robot_pos.unsqueeze(-2)) @ robot_mat
+
+
+def floor_to_ego(xy: Tensor, robot_pos: Tensor, robot_mat: Tensor) -> Tensor:
+    """Rotate points on the floor into the robot's frame and leave out z: `to_ego` in fewer passes.
+
+    Args:
+        xy: [N, M, 2].
+        robot_pos: [N, 3].
+        robot_mat: columns are the robot's axes in the world [N, 3, 3].
+
+    Returns:
+        [N, M, 2], in memory all x before all y, as the passes that follow want it.
+    """
+    robot_xy, robot_z = robot_pos.split([2, 1], -1)
+    x, y = (xy - robot_xy.unsqueeze(1)).unbind(-1)
+    axes = robot_mat[..., :2].permute(1, 2, 0).contiguous()
+    along_x, along_y, along_z = axes.unsqueeze(-1).unbind(0)
+    ego = torch.addcmul(x * along_x, y, along_y)
+    return ego.addcmul_(robot_z, along_z, value=-1).movedim(0, -1)
+
+
+def compass(ego: Tensor, num_components: int) -> Tensor:
+    """Direction to objects in the robot's frame: [N, K, 3] -> [N, K, 2 or 3], nearly unit."""
+    vector = ego[..., :num_components]
+    return vector / (torch.linalg.vector_norm(vector, dim=-1, keepdim=True) + 1e-3)
+
+
+def yaw_quaternion(yaw: Tensor) -> Tensor:
+    """Rotations about z by yaw [...] as quaternions (w, x, y, z) [..., 4]."""
+    zero = torch.zeros_like(yaw)
+    return torch.stack([torch.cos(yaw / 2), zero, zero, torch.sin(yaw / 2)], -1)
+
+
+def circling_targets(
+    centres: Tensor,
+    time: Tensor,
+    travel: Tensor | float,
+    height: Tensor | float,
+    timestep: float,
+    num_substeps: int,
+) -> Tensor:
+    """Positions of the gremlins' targets before each substep (circles of radius `travel`).
+
+    Args:
+        centres: where the gremlins were placed [N, K, 2].
+        time: simulation time before the first substep [N].
+        travel: radius of the circle [m], for all or for each [K].
+        height: z of the targets [m], for all or for each [K].
+        timestep: length of a substep [s].
+        num_substeps: S.
+
+    Returns:
+        [N, S, K, 3]; at time 0 a target stands at +travel along y.
+    """
+    steps = torch.arange(num_substeps, dtype=time.dtype)
+    phase = (time.unsqueeze(-1) + timestep * steps)[..., None]
+    radius = torch.as_tensor(travel, dtype=time.dtype).unsqueeze(-1)
+    offset = radius * torch.stack([torch.sin(phase), torch.cos(phase)], -1)
+    targets = centres.unsqueeze(1) + offset
+    z = torch.as_tensor(height, dtype=time.dtype).expand(targets.shape[:-1])
+    return torch.cat([targets, z.unsqueeze(-1)], -1)

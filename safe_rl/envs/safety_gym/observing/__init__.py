@@ -1,0 +1,1 @@
+"""What a robot observes: its sensors, lidars, readings and camera, as one vector."""

@@ -1,0 +1,102 @@
+"""What a robot observes: a table of sources, from which sizes, order and values all come.
+
+A source yields a block: named components that are computed together. The observation is all
+components in alphabetical order of their names (paper section 4.1.4).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from safe_rl.envs.errors import ConfigError
+from safe_rl.envs.safety_gym.observing.lidar_blocks import lidar_blocks
+from safe_rl.envs.safety_gym.observing.sensors import sensor_blocks
+from safe_rl.envs.safety_gym.observing.vision import vision_blocks
+from safe_rl.envs.safety_gym.records.config import SafetyGymConfig
+from safe_rl.envs.safety_gym.records.scene import Scene
+from safe_rl.envs.safety_gym.records.world import Block, Shapes, World
+from safe_rl.envs.safety_gym.rules.readings import READINGS
+
+
+def _plain(config: SafetyGymConfig, scene: Scene) -> list[Block]:
+    return [
+        Block({row.name: (row.size(config, scene),)}, row.read)
+        for row in READINGS
+        if row.present(config)
+    ]
+
+
+SOURCES: tuple[Callable[[SafetyGymConfig, Scene], list[Block]], ...] = (
+    sensor_blocks,
+    lidar_blocks,
+    _plain,
+    vision_blocks,
+)
+
+
+class Observer(NamedTuple):
+    """How to observe the worlds of one scene.
+
+    Attributes:
+        shapes: shape of every component, in the order of the flat observation.
+        columns: columns of every component in the flat observation.
+        read: world -> flat observation [N, n], float32.
+    """
+
+    shapes: Shapes
+    columns: dict[str, slice]
+    read: Callable[[World], Tensor]
+
+    @property
+    def size(self) -> int:
+        """Number of columns of the flat observation."""
+        return sum(math.prod(shape) for shape in self.shapes.values())
+
+    def split(self, flat: Tensor) -> dict[str, Tensor]:
+        """Views of a flat observation [N, n] by component, each [N, *shape]."""
+        return {
+            name: flat[:, self.columns[name]].unflatten(1, shape)
+            for name, shape in self.shapes.items()
+        }
+
+
+def make_observer(scene: Scene) -> Observer:
+    """Resolve what a configuration observes.
+
+    Raises:
+        ConfigError: for sensors the robot does not have, if two components have one name, or if
+            nothing is observed.
+    """
+    blocks = [block for source in SOURCES for block in source(scene.config, scene)]
+    names = [name for block in blocks for name in block.shapes]
+    if not names:
+        raise ConfigError("Nothing is observed: set at least one 'observe_*' key.")
+    for name in names:
+        if names.count(name) > 1:
+            raise ConfigError(
+                f"Two observations are called '{name}': rename the robot's sensor, or the "
+                "observation that was registered."
+            )
+    unordered: Shapes = {name: shape for block in blocks for name, shape in block.shapes.items()}
+    starts, start = {}, 0
+    for name, shape in unordered.items():
+        starts[name], start = start, start + math.prod(shape)
+    shapes = {name: unordered[name] for name in sorted(unordered)}
+    columns: dict[str, slice] = {}
+    first, order = 0, list[int]()
+    for name, shape in shapes.items():
+        size = math.prod(shape)
+        columns[name], first = slice(first, first + size), first + size
+        order += range(starts[name], starts[name] + size)
+    permutation = torch.tensor(order)
+
+    def read(world: World) -> Tensor:
+        values = torch.cat([block.read(world) for block in blocks], -1)
+        return values.to(torch.float32).index_select(1, permutation)
+
+    return Observer(shapes, columns, read)

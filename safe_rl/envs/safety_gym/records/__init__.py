@@ -1,0 +1,1 @@
+"""What stands in an environment, without any rule: configuration, compiled scene, world views."""

@@ -1,0 +1,160 @@
+"""Safety costs: one batched function per cost key, and the table that names them.
+
+Spec: paper section 4.1.3. Every function returns one number per world, [N], before
+`constrain_indicator` turns positive ones into 1.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from safe_rl.envs.safety_gym.records.config import SafetyGymConfig
+from safe_rl.envs.safety_gym.records.world import World
+
+
+def hazard_cost(robot_xy: Tensor, hazard_xy: Tensor, size: float) -> Tensor:
+    """Depth [m] to which the robot is inside hazards, summed over them.
+
+    Args:
+        robot_xy: [N, 2].
+        hazard_xy: [N, K, 2].
+        size: radius of a hazard [m].
+    """
+    distance = torch.hypot(*(hazard_xy - robot_xy.unsqueeze(-2)).unbind(-1))
+    return torch.rsub(distance, size).relu_().sum(-1)
+
+
+def contact_cost(contacts: Tensor) -> Tensor:
+    """Contact points of the robot [N, K], summed over the objects."""
+    return contacts.sum(-1)
+
+
+def displacement_cost(xy: Tensor, start_xy: Tensor, threshold: float) -> Tensor:
+    """Distance [m] objects were moved since the reset, where above the threshold, summed.
+
+    Args:
+        xy: current positions [N, K, 2].
+        start_xy: positions at the reset [N, K, 2].
+        threshold: displacements up to this one are free [m].
+    """
+    moved = torch.hypot(*(xy - start_xy).unbind(-1))
+    return torch.where(moved > threshold, moved, 0.0).sum(-1)
+
+
+def velocity_cost(velocity: Tensor, threshold: float) -> Tensor:
+    """Speed [m/s] of objects, where it reaches the threshold, summed: [N, K, 3] -> [N]."""
+    speed = torch.linalg.vector_norm(velocity, dim=-1)
+    return torch.where(speed >= threshold, speed, 0.0).sum(-1)
+
+
+def wrong_button_cost(contacts: Tensor, goal_button: Tensor, timer: Tensor) -> Tensor:
+    """Contact points with buttons that are not the goal, while the buttons are awake.
+
+    Args:
+        contacts: [N, K].
+        goal_button: index of the goal button or -1, int64 [N].
+        timer: steps until the buttons wake up, int64 [N].
+    """
+    wrong = torch.arange(contacts.shape[-1]) != goal_button.unsqueeze(-1)
+    return (contacts * wrong).sum(-1) * (timer == 0)
+
+
+class Cost(NamedTuple):
+    """A row: one cost.
+
+    Attributes:
+        key: what it is called in TensorDicts, "cost_<kind>".
+        active: whether a configuration has it.
+        magnitude: (config, world) -> [N], 0 or more.
+        touches: kinds whose contacts with the robot it reads.
+    """
+
+    key: str
+    active: Callable[[SafetyGymConfig], bool]
+    magnitude: Callable[[SafetyGymConfig, World], Tensor]
+    touches: tuple[str, ...] = ()
+
+
+COSTS: list[Cost] = [
+    Cost(
+        "cost_hazards",
+        lambda c: c.constrain_hazards,
+        lambda c, w: (
+            c.hazards_cost * hazard_cost(w.robot_xy, w.at("hazards")[..., :2], c.hazards_size)
+        ),
+    ),
+    Cost(
+        "cost_vases_contact",
+        lambda c: c.constrain_vases,
+        lambda c, w: c.vases_contact_cost * contact_cost(w.contacts_with("vases")),
+        touches=("vases",),
+    ),
+    Cost(
+        "cost_vases_displace",
+        lambda c: c.constrain_vases and c.vases_displace_cost != 0,
+        lambda c, w: (
+            c.vases_displace_cost
+            * displacement_cost(
+                w.at("vases")[..., :2], w.start_of("vases"), c.vases_displace_threshold
+            )
+        ),
+    ),
+    Cost(
+        "cost_vases_velocity",
+        lambda c: c.constrain_vases and c.vases_velocity_cost != 0,
+        lambda c, w: (
+            c.vases_velocity_cost
+            * velocity_cost(w.velocity_of("vases"), c.vases_velocity_threshold)
+        ),
+    ),
+    Cost(
+        "cost_pillars",
+        lambda c: c.constrain_pillars,
+        lambda c, w: c.pillars_cost * contact_cost(w.contacts_with("pillars")),
+        touches=("pillars",),
+    ),
+    Cost(
+        "cost_buttons",
+        lambda c: c.constrain_buttons,
+        lambda c, w: (
+            c.buttons_cost
+            * wrong_button_cost(w.contacts_with("buttons"), w.goal_button, w.buttons_timer)
+        ),
+        touches=("buttons",),
+    ),
+    Cost(
+        "cost_gremlins",
+        lambda c: c.constrain_gremlins,
+        lambda c, w: c.gremlins_contact_cost * contact_cost(w.contacts_with("gremlins")),
+        touches=("gremlins",),
+    ),
+]
+EXCEPTION_KEY = "cost_exception"
+
+
+def cost_keys(config: SafetyGymConfig) -> list[str]:
+    """Return the keys an environment writes: the aggregate `cost`, then one per kind."""
+    return ["cost", *(row.key for row in COSTS if row.active(config)), EXCEPTION_KEY]
+
+
+def compute_costs(config: SafetyGymConfig, world: World, failed: Tensor) -> Tensor:
+    """Compute every cost of the worlds as they are.
+
+    Args:
+        config: the environment.
+        world: the worlds, up to date.
+        failed: worlds whose physics failed, bool [N]; their only cost is `cost_exception`.
+
+    Returns:
+        One row for each of `cost_keys(config)`, [1 + number of kinds + 1, N].
+    """
+    magnitudes = [row.magnitude(config, world) for row in COSTS if row.active(config)]
+    if failed.any():
+        magnitudes = [torch.where(failed, 0.0, magnitude) for magnitude in magnitudes]
+    exceptions = failed.to(torch.float64)  # the sum has this type, whatever a registered cost has
+    costs = torch.stack([sum(magnitudes, start=exceptions), *magnitudes, exceptions])
+    return costs.gt_(0.0) if config.constrain_indicator else costs

@@ -1,0 +1,200 @@
+"""The kinds of object a world is built from: one row each, read by every other module.
+
+Sizes, heights and colours are those of the 2019 benchmark. The order of the rows is the order of
+objects in every `[N, M, …]` tensor: free bodies first, as in `qpos`, then static, then virtual.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from enum import Enum
+from typing import NamedTuple
+
+import mujoco
+
+from safe_rl.envs.safety_gym.records.config import SafetyGymConfig
+from safe_rl.envs.safety_gym.rules.tasks import TASKS
+
+BOX, CYLINDER, SPHERE = (
+    mujoco.mjtGeom.mjGEOM_BOX,
+    mujoco.mjtGeom.mjGEOM_CYLINDER,
+    mujoco.mjtGeom.mjGEOM_SPHERE,
+)
+
+# Where each kind stands in the order of placement; "robot" is not an element but is placed too.
+PLACEMENT_ORDER = [
+    *("robot", "walls", "goal", "box", "buttons"),
+    *("hazards", "vases", "pillars", "gremlins"),
+]
+
+# Rays select geoms by MuJoCo's groups 0 to 5.
+NUM_RAY_GROUPS = int(mujoco.mjNGROUP)
+
+
+class Motion(Enum):
+    """How an element takes part in the physics."""
+
+    FREE = "free"  # a free body that can be pushed
+    GUIDED = "guided"  # a free body welded to a target that runs in a circle
+    STATIC = "static"  # collides and never moves within an episode
+    VIRTUAL = "virtual"  # an area without physics
+
+
+class Geom(NamedTuple):
+    """One shape of an element: MuJoCo type, size [m] as MJCF has it, position in the body [m]."""
+
+    type: mujoco.mjtGeom
+    size: tuple[float, ...]
+    pos: tuple[float, float, float] = (0.0, 0.0, 0.0)
+
+
+@dataclass(frozen=True)
+class Element:
+    """One kind of object.
+
+    Attributes:
+        kind: prefix of its configuration keys and of its lidar ("hazards").
+        label: name of one object in layouts and errors. There are `<kind>_num` objects, with an
+            index; a kind that is its own label belongs to the tasks that list it, one object each.
+        motion: how it takes part in the physics.
+        height: z of the object's centre [m].
+        geoms: its shapes.
+        rgb: colour in pictures and lidar halos.
+        group: MuJoCo geom group, which natural lidar selects by.
+        flag: configuration key that turns its lidar on; "" for `observe_<kind>`.
+        always_observed: whether the lidar is there (all zeros) even without any object.
+    """
+
+    kind: str
+    label: str
+    motion: Motion
+    height: Callable[[SafetyGymConfig], float]
+    geoms: Callable[[SafetyGymConfig], tuple[Geom, ...]]
+    rgb: tuple[float, float, float]
+    group: int
+    flag: str = ""
+    always_observed: bool = False
+
+    def count(self, config: SafetyGymConfig) -> int:
+        """Return the number of objects."""
+        if self.singular:
+            return int(self.kind in TASKS[config.task].elements)
+        return getattr(config, f"{self.kind}_num")
+
+    def observed(self, config: SafetyGymConfig) -> bool:
+        """Whether the observation has a lidar for this kind."""
+        flag = self.flag or f"observe_{self.kind}"
+        return getattr(config, flag) and (self.always_observed or self.count(config) > 0)
+
+    def names(self, config: SafetyGymConfig) -> list[str]:
+        """Names of this kind's objects."""
+        count = self.count(config)
+        return [self.label] if self.singular else [f"{self.label}{i}" for i in range(count)]
+
+    @property
+    def singular(self) -> bool:
+        """Whether there is at most one, which has a name without an index."""
+        return self.label == self.kind
+
+
+def _cube(half: float) -> tuple[Geom, ...]:
+    return (Geom(BOX, (half, half, half)),)
+
+
+def _box_geoms(config: SafetyGymConfig) -> tuple[Geom, ...]:
+    s = config.box_size
+    post = (s / 2, s / 2, s)
+    corners = ((s, s, 0.0), (-s, s, 0.0), (s, -s, 0.0), (-s, -s, 0.0))
+    return (*_cube(s), *(Geom(BOX, post, corner) for corner in corners))
+
+
+ELEMENTS: list[Element] = [
+    Element(
+        kind="vases",
+        label="vase",
+        motion=Motion.FREE,
+        height=lambda c: c.vases_size - c.vases_sink,
+        geoms=lambda c: _cube(c.vases_size),
+        rgb=(0, 1, 1),
+        group=4,
+        always_observed=True,
+    ),
+    Element(
+        kind="gremlins",
+        label="gremlin",
+        motion=Motion.GUIDED,
+        height=lambda c: c.gremlins_size,
+        geoms=lambda c: _cube(c.gremlins_size),
+        rgb=(0.5, 0, 1),
+        group=5,
+    ),
+    Element(
+        kind="box",
+        label="box",
+        motion=Motion.FREE,
+        height=lambda c: c.box_size,
+        geoms=_box_geoms,
+        rgb=(1, 1, 0),
+        group=1,
+        flag="observe_box_lidar",
+    ),
+    Element(
+        kind="walls",
+        label="wall",
+        motion=Motion.STATIC,
+        height=lambda c: c.walls_size,
+        geoms=lambda c: _cube(c.walls_size),
+        rgb=(0.5, 0.5, 0.5),
+        group=2,
+    ),
+    Element(
+        kind="pillars",
+        label="pillar",
+        motion=Motion.STATIC,
+        height=lambda c: c.pillars_height,
+        geoms=lambda c: (Geom(CYLINDER, (c.pillars_size, c.pillars_height)),),
+        rgb=(0.5, 0.5, 1),
+        group=2,
+    ),
+    Element(
+        kind="buttons",
+        label="button",
+        motion=Motion.STATIC,
+        height=lambda c: c.buttons_size,
+        geoms=lambda c: (Geom(SPHERE, (c.buttons_size,)),),
+        rgb=(1, 0.5, 0),
+        group=1,
+    ),
+    Element(
+        kind="goal",
+        label="goal",
+        motion=Motion.VIRTUAL,
+        height=lambda c: c.goal_size / 2 + 1e-2,
+        geoms=lambda c: (Geom(CYLINDER, (c.goal_size, c.goal_size / 2)),),
+        rgb=(0, 1, 0),
+        group=0,
+        flag="observe_goal_lidar",
+    ),
+    Element(
+        kind="hazards",
+        label="hazard",
+        motion=Motion.VIRTUAL,
+        height=lambda c: 2e-2,
+        geoms=lambda c: (Geom(CYLINDER, (c.hazards_size, 1e-2)),),
+        rgb=(0, 0, 1),
+        group=3,
+        always_observed=True,
+    ),
+    Element(
+        kind="circle",
+        label="circle",
+        motion=Motion.VIRTUAL,
+        height=lambda c: 2e-2,
+        geoms=lambda c: (Geom(CYLINDER, (c.circle_radius, 1e-2)),),
+        rgb=(0, 1, 0),
+        group=6,
+    ),
+]
+
+BY_KIND = {element.kind: element for element in ELEMENTS}

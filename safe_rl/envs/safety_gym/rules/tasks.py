@@ -1,0 +1,141 @@
+"""Tasks: what is measured, what is rewarded, when a goal is met (paper section 4.1.2).
+
+Dense rewards are differences of measurements between two steps; the environment keeps the earlier
+one and measures again when a new goal is drawn, so that changing goals costs nothing.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from enum import Enum
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from safe_rl.envs.safety_gym.geometry import distance
+from safe_rl.envs.safety_gym.records.config import SafetyGymConfig
+from safe_rl.envs.safety_gym.records.world import World
+
+
+def circle_speed(com_xy: Tensor, velocity_xy: Tensor, radius: float) -> Tensor:
+    """Angular motion about the origin, discounted by the distance to the circle.
+
+    Args:
+        com_xy: robot's centre of mass [N, 2].
+        velocity_xy: robot's velocity [N, 2].
+        radius: of the circle [m].
+    """
+    (x, y), (u, v) = com_xy.unbind(-1), velocity_xy.unbind(-1)
+    r = torch.sqrt(x**2 + y**2)
+    return ((-u * y + v * x) / r) / (1 + torch.abs(r - radius))
+
+
+class NextGoal(Enum):
+    """What a new goal is."""
+
+    POSITION = "position"
+    BUTTON = "button"
+
+
+def _no_measure(world: World) -> Tensor:
+    return world.robot_pos.new_zeros(len(world.robot_pos), 0)
+
+
+class Task(NamedTuple):
+    """A row: one task.
+
+    Attributes:
+        reward: (config, world, measured one step before [N, D], measured now [N, D]) -> [N].
+        measure: what the reward takes differences of, [N, D].
+        met: (config, world, measured now) -> bool [N], for tasks with goals.
+        next_goal: how a new goal is drawn, for tasks with goals.
+        elements: kinds of which the task brings one object each.
+        touches: kinds whose contacts with the robot it reads.
+    """
+
+    reward: Callable[[SafetyGymConfig, World, Tensor, Tensor], Tensor]
+    measure: Callable[[World], Tensor] = _no_measure
+    met: Callable[[SafetyGymConfig, World, Tensor], Tensor] | None = None
+    next_goal: NextGoal | None = None
+    elements: tuple[str, ...] = ()
+    touches: tuple[str, ...] = ()
+
+
+def _to_goal(world: World) -> Tensor:
+    return distance(world.robot_xy.unsqueeze(1), world.at("goal")[..., :2])
+
+
+def _approach(config: SafetyGymConfig, world: World, before: Tensor, now: Tensor) -> Tensor:
+    return config.reward_distance * (before - now)[:, 0]
+
+
+def _in_goal(config: SafetyGymConfig, world: World, now: Tensor) -> Tensor:
+    return now[:, 0] <= config.goal_size
+
+
+def _presses_goal(config: SafetyGymConfig, world: World, now: Tensor) -> Tensor:
+    contacts = world.contacts_with("buttons")
+    return contacts.gather(1, world.goal_button.unsqueeze(1))[:, 0] > 0
+
+
+def _to_box_and_goal(world: World) -> Tensor:
+    box = world.at("box")
+    return torch.cat(
+        [distance(world.robot_pos[:, None], box), distance(box, world.at("goal"))], dim=-1
+    )
+
+
+def _push(config: SafetyGymConfig, world: World, before: Tensor, now: Tensor) -> Tensor:
+    gained = before - now
+    far = before[:, 0] > config.box_null_dist * config.box_size
+    to_box = torch.where(far, config.reward_box_dist * gained[:, 0], 0.0)
+    return to_box + config.reward_box_goal * gained[:, 1]
+
+
+def _box_in_goal(config: SafetyGymConfig, world: World, now: Tensor) -> Tensor:
+    return now[:, 1] <= config.goal_size
+
+
+def _com(world: World) -> Tensor:
+    return world.com.clone()
+
+
+TASKS: dict[str, Task] = {
+    "goal": Task(_approach, _to_goal, _in_goal, NextGoal.POSITION, ("goal",)),
+    "button": Task(
+        _approach, _to_goal, _presses_goal, NextGoal.BUTTON, ("goal",), touches=("buttons",)
+    ),
+    "push": Task(_push, _to_box_and_goal, _box_in_goal, NextGoal.POSITION, ("goal", "box")),
+    "x": Task(lambda c, w, before, now: c.reward_x * (now - before)[:, 0], _com),
+    "z": Task(lambda c, w, before, now: c.reward_z * (now - before)[:, 2], _com),
+    "circle": Task(
+        lambda c, w, before, now: (
+            c.reward_circle * circle_speed(w.com[:, :2], w.robot_vel[:, :2], c.circle_radius)
+        ),
+        elements=("circle",),
+    ),
+    "none": Task(lambda c, w, before, now: torch.zeros_like(w.robot_pos[:, 0])),
+}
+
+
+def goal_is_button(task: str) -> bool:
+    """Whether the goal of a task is wherever its goal button is."""
+    return TASKS[task].next_goal is NextGoal.BUTTON
+
+
+def dense_reward(config: SafetyGymConfig, world: World, before: Tensor, now: Tensor) -> Tensor:
+    """Reward of a step without the bonus for a goal, clipped to ±`reward_clip`: [N].
+
+    Args:
+        config: the environment.
+        world: the worlds after the step.
+        before: the task's measurements before the step [N, D].
+        now: and after it [N, D].
+    """
+    reward = TASKS[config.task].reward(config, world, before, now)
+    if config.reward_orientation:
+        reward = reward + config.reward_orientation_scale * world.up
+    if config.reward_clip is not None:
+        reward = reward.clamp(-config.reward_clip, config.reward_clip)
+    return reward

@@ -1,0 +1,75 @@
+"""Specs of the environment: shapes, types and bounds of everything it reads and writes."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+from torchrl.data import Binary, Bounded, Composite, TensorSpec, Unbounded
+
+from safe_rl.envs.safety_gym.observing.observations import Observer
+from safe_rl.envs.safety_gym.records.config import SafetyGymConfig
+
+
+class Specs(NamedTuple):
+    """What `EnvBase` asks for, for N worlds."""
+
+    observation: Composite
+    action: TensorSpec
+    reward: Composite
+    done: Composite
+
+
+def make_specs(
+    config: SafetyGymConfig,
+    observer: Observer,
+    control_range: tuple[Tensor, Tensor],
+    cost_keys: Sequence[str],
+    num_envs: int,
+    device: torch.device | None,
+) -> Specs:
+    """Describe an environment.
+
+    Args:
+        config: the environment.
+        observer: what it observes.
+        control_range: lowest and highest control of every actuator, [nu] each.
+        cost_keys: costs, which stand beside the reward.
+        num_envs: N.
+        device: where the TensorDicts live.
+    """
+    batch, scalar = (num_envs,), (num_envs, 1)
+    kind: dict[str, Any] = {"dtype": torch.float32, "device": device}
+    flag = Binary(1, shape=scalar, dtype=torch.bool, device=device)
+    highest = 1.0 if config.constrain_indicator else torch.finfo(torch.float32).max
+    low, high = (bound.to(torch.float32).expand(num_envs, -1) for bound in control_range)
+    return Specs(
+        observation=Composite(
+            observation=_observation(config, observer, num_envs, kind),
+            goal_met=flag.clone(),
+            shape=batch,
+        ),
+        action=Bounded(low, high, **kind),
+        reward=Composite(
+            reward=Unbounded(shape=scalar, **kind),
+            **{key: Bounded(0.0, highest, shape=scalar, **kind) for key in cost_keys},
+            shape=batch,
+        ),
+        done=Composite(
+            **{key: flag.clone() for key in ("done", "terminated", "truncated")}, shape=batch
+        ),
+    )
+
+
+def _observation(
+    config: SafetyGymConfig, observer: Observer, num_envs: int, kind: dict[str, Any]
+) -> TensorSpec:
+    """One flat vector, or every component in its own shape."""
+    if config.observation_flatten:
+        return Unbounded(shape=(num_envs, observer.size), **kind)
+    components = {
+        name: Unbounded(shape=(num_envs, *shape), **kind) for name, shape in observer.shapes.items()
+    }
+    return Composite(components, shape=(num_envs,))

@@ -1,0 +1,1 @@
+"""Building worlds, starting episodes in them, and taking and setting their state."""

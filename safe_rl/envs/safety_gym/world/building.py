@@ -1,0 +1,189 @@
+"""From a configuration to one compiled model, and the integer maps into its arrays.
+
+The model is compiled once per configuration. Everything that differs between episodes is state:
+free bodies stand in `qpos`, static ones are mocap bodies. Body order: robot, vases, gremlins, box,
+the gremlins' targets, static bodies.
+"""
+
+from __future__ import annotations
+
+import functools
+
+import mujoco
+
+from safe_rl.envs.errors import ConfigError, nearest
+from safe_rl.envs.safety_gym.records.config import SafetyGymConfig
+from safe_rl.envs.safety_gym.records.scene import Scene
+from safe_rl.envs.safety_gym.rules.costs import COSTS
+from safe_rl.envs.safety_gym.rules.elements import ELEMENTS, Element, Motion
+from safe_rl.envs.safety_gym.rules.readings import READINGS
+from safe_rl.envs.safety_gym.rules.robots import Robot, load_robot
+from safe_rl.envs.safety_gym.rules.tasks import TASKS
+from safe_rl.envs.safety_gym.world.bodies import add_bodies, add_floor, add_targets
+from safe_rl.envs.safety_gym.world.scenery import decorate
+
+# The robot files' stack and contact sizes would reserve hundreds of MB for every environment.
+ARENA_BYTES = 8 << 20
+# MuJoCo's default (1e-3) lets slowly sliding vases sleep, which lowers the vase-velocity cost.
+SLEEP_TOLERANCE = 1e-5
+
+
+@functools.lru_cache(maxsize=64)
+def build_scene(config: SafetyGymConfig, sleep: bool = False, decorated: bool = False) -> Scene:
+    """Compile the world of a configuration.
+
+    Args:
+        config: the environment.
+        sleep: let resting free bodies sleep until something touches them.
+        decorated: build the world for pictures: areas are bodies too, and there are cameras, light
+            and a floor pattern. Its `qpos` and first mocap bodies are those of the plain world.
+
+    Raises:
+        ConfigError: if a custom robot file lacks what an environment needs.
+    """
+    robot = load_robot(config.robot_base)
+    _set_options(robot.spec, sleep)
+    present = [element for element in ELEMENTS if element.count(config) > 0]
+    # Rays and pictures see geoms only, so natural lidar needs bodies for the areas as well.
+    needs_areas = decorated or config.lidar_type == "natural"
+    in_physics = {Motion.STATIC} | ({Motion.VIRTUAL} if needs_areas else set())
+    try:
+        _add_objects(robot.spec, config, present, in_physics, decorated)
+        contact_names = _add_sensors(robot.spec, config, present)
+        model = robot.spec.compile()
+    except ValueError as error:
+        raise ConfigError(
+            f"'robot_base': {config.robot_base} does not fit into the world: {error}. Rename what "
+            "has the name of something in the world."
+        ) from error
+    return _index(config, model, present, robot, in_physics, contact_names)
+
+
+def _add_objects(
+    spec: mujoco.MjSpec,
+    config: SafetyGymConfig,
+    present: list[Element],
+    in_physics: set[Motion],
+    decorated: bool,
+) -> None:
+    """Add floor and elements, free bodies first."""
+    add_floor(spec)
+    for element in present:
+        if element.motion in (Motion.FREE, Motion.GUIDED):
+            add_bodies(spec, config, element, decorated)
+    for element in present:
+        if element.motion is Motion.GUIDED:
+            add_targets(spec, config, element, decorated)
+    if decorated:
+        decorate(spec, config)
+    for element in present:
+        if element.motion in in_physics:
+            add_bodies(spec, config, element, decorated)
+
+
+def _set_options(spec: mujoco.MjSpec, sleep: bool) -> None:
+    spec.memory = ARENA_BYTES
+    # MuJoCo 4.0.0 gives wrong normals for cylinders with it; MuJoCo 2 had no such thing.
+    spec.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_MULTICCD
+    if sleep:
+        spec.option.enableflags |= mujoco.mjtEnableBit.mjENBL_SLEEP
+        spec.option.sleep_tolerance = SLEEP_TOLERANCE
+
+
+def _touched_kinds(config: SafetyGymConfig) -> set[str]:
+    """Kinds whose contacts with the robot anything reads."""
+    costs = [row.touches for row in COSTS if row.active(config)]
+    readings = [row.touches for row in READINGS if row.present(config)]
+    return {kind for kinds in (TASKS[config.task].touches, *costs, *readings) for kind in kinds}
+
+
+def _add_sensors(
+    spec: mujoco.MjSpec, config: SafetyGymConfig, present: list[Element]
+) -> dict[str, list[str]]:
+    """Add the robot's velocity, and a sensor per object that counts its contacts with the robot."""
+    spec.add_sensor(
+        name="robot_vel",
+        type=mujoco.mjtSensor.mjSENS_FRAMELINVEL,
+        objtype=mujoco.mjtObj.mjOBJ_XBODY,
+        objname="robot",
+    )
+    sensors: dict[str, list[str]] = {}
+    touched = _touched_kinds(config)
+    for element in present:
+        if element.kind not in touched:
+            continue
+        for name in element.names(config):
+            spec.add_sensor(
+                name=f"contact_{name}",
+                type=mujoco.mjtSensor.mjSENS_CONTACT,
+                objtype=mujoco.mjtObj.mjOBJ_XBODY,  # the robot with its limbs
+                objname="robot",
+                reftype=mujoco.mjtObj.mjOBJ_BODY,
+                refname=name,
+                intprm=[1 << int(mujoco.mjtConDataField.mjCONDATA_FOUND), 0, 1],
+            )
+            sensors.setdefault(element.kind, []).append(f"contact_{name}")
+    return sensors
+
+
+def _index(
+    config: SafetyGymConfig,
+    model: mujoco.MjModel,
+    present: list[Element],
+    robot: Robot,
+    in_physics: set[Motion],
+    contact_names: dict[str, list[str]],
+) -> Scene:
+    """Resolve every name to integers."""
+    names: list[str] = []
+    slots, heights = {}, []
+    for element in present:
+        slots[element.kind] = slice(len(names), len(names) + element.count(config))
+        names += element.names(config)
+        heights += [element.height(config)] * element.count(config)
+
+    def count(*motions: Motion) -> int:
+        return sum(element.count(config) for element in present if element.motion in motions)
+
+    num_free = count(Motion.FREE, Motion.GUIDED)
+    guided = [e for e in present if e.motion is Motion.GUIDED]
+    spans = [slots[element.kind] for element in guided] or [slice(0, 0)]
+    return Scene(
+        config=config,
+        model=model,
+        names=tuple(names),
+        slots=slots,
+        heights=tuple(heights),
+        num_free=num_free,
+        num_mocap_slots=count(*in_physics),
+        guided=slice(spans[0].start, spans[-1].stop),
+        num_targets=count(Motion.GUIDED),
+        travel=tuple(
+            getattr(config, f"{element.kind}_travel")
+            for element in guided
+            for _ in element.names(config)
+        ),
+        robot_body=model.body("robot").id,
+        robot_sensors=robot.num_sensors,
+        robot_nq=model.nq - 7 * num_free,
+        robot_nv=model.nv - 6 * num_free,
+        planar=robot.planar,
+        oriented_body=_oriented_body(config, model, robot),
+        free_bodies=slice(1 + robot.num_bodies, 1 + robot.num_bodies + num_free),
+        contacts={
+            kind: slice(first := int(model.sensor(sensors[0]).adr[0]), first + len(sensors))
+            for kind, sensors in contact_names.items()
+        },
+    )
+
+
+def _oriented_body(config: SafetyGymConfig, model: mujoco.MjModel, robot: Robot) -> int:
+    """Body id of `reward_orientation_body`; the robot's root where nobody asks for it."""
+    wanted = config.reward_orientation_body if config.reward_orientation else "robot"
+    names = [model.body(i).name for i in range(1, 1 + robot.num_bodies)]
+    if wanted not in names:
+        raise ConfigError(
+            f"'reward_orientation_body': robot '{config.robot_base}' has no body '{wanted}'."
+            f"{nearest(wanted, names)} Its bodies are {', '.join(names)}."
+        )
+    return 1 + names.index(wanted)

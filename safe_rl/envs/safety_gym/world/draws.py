@@ -1,0 +1,225 @@
+"""What is drawn at random: the start of an episode, new goals, noise and frame skip.
+
+Every draw is addressed by its row's seed, the episode, its purpose and the step, see `rng`.
+"""
+
+from __future__ import annotations
+
+import math
+from enum import IntEnum
+
+import torch
+from torch import Tensor
+
+from safe_rl.envs import rng
+from safe_rl.envs.safety_gym.geometry import circling_targets, yaw_quaternion
+from safe_rl.envs.safety_gym.records.config import SafetyGymConfig
+from safe_rl.envs.safety_gym.records.scene import Scene
+from safe_rl.envs.safety_gym.records.world import World
+from safe_rl.envs.safety_gym.rules.tasks import goal_is_button
+from safe_rl.envs.safety_gym.world.layout import (
+    LayoutError,
+    PlacementPlan,
+    resample_goal,
+    sample_layouts,
+)
+from safe_rl.envs.safety_gym.world.views import refresh
+
+
+class Purpose(IntEnum):
+    """What a random draw is for; part of its address."""
+
+    LAYOUT = 0
+    YAW = 1
+    BUTTON = 2
+    GOAL = 3
+    NOISE = 4
+    FRAMESKIP = 5
+    SPLIT = 6
+
+
+def pick_layouts(config: SafetyGymConfig, key: Tensor) -> Tensor:
+    """Pick layouts from the finite set that a configuration names, uniformly.
+
+    Args:
+        config: the environment, with `layout_seeds`.
+        key: random keys to pick with, int64 [N].
+
+    Returns:
+        Layout keys [N]: functions of the picked layout seeds alone, so that environments with other
+        seeds, and runs that evaluate on the same set, meet the same layouts.
+    """
+    assert config.layout_seeds is not None
+    index = (rng.uniform(key, Purpose.SPLIT) * config.layout_seeds).to(torch.int64)
+    return rng.fold(config.layout_seeds_first + index, Purpose.SPLIT)
+
+
+def pinned_yaws(scene: Scene) -> Tensor:
+    """Yaw of the robot and of every free body, NaN where the configuration fixes none [1 + F]."""
+    config = scene.config
+    yaws = torch.full((1 + scene.num_free,), math.nan, dtype=torch.float64)
+    if config.robot_rot is not None:
+        yaws[0] = config.robot_rot
+    for kind, span in scene.slots.items():
+        if span.stop > scene.num_free:
+            continue
+        given = getattr(config, f"{kind}_rots", ())[: span.stop - span.start]
+        yaws[1 + span.start : 1 + span.start + len(given)] = yaws.new_tensor(given)
+    return yaws
+
+
+def start_episodes(world: World, plan: PlacementPlan, key: Tensor, mask: Tensor) -> None:
+    """Draw a new layout for some worlds and set them to its initial state.
+
+    Args:
+        world: the worlds; those in `mask` are brought up to date.
+        plan: what is placed where.
+        key: random key of each layout, int64 [N].
+        mask: worlds to start anew, bool [N].
+
+    Raises:
+        LayoutError: naming the object that did not fit.
+    """
+    scene = world.scene
+    rows = mask.nonzero()[:, 0]
+    key = key[rows]
+    world.layout[rows] = sample_layouts(plan, rng.fold(key, Purpose.LAYOUT))
+    drawn = 2 * math.pi * rng.uniform(key[:, None], Purpose.YAW, torch.arange(1 + scene.num_free))
+    pinned = pinned_yaws(scene)
+    yaws = torch.where(pinned.isnan(), drawn, pinned)
+    world.physics.reset(mask)
+    _pose_bodies(world, rows, yaws)
+    world.positions[rows, scene.num_free :, :2] = world.layout[rows, 1 + scene.num_free :]
+    if goal_is_button(scene.config.task):
+        _choose_button(world, rows, rng.fold(key, Purpose.BUTTON))
+    world.step_count[rows] = 0
+    world.buttons_timer[rows] = 0
+    place_mocaps(world)
+    world.physics.forward(mask)
+    refresh(world)
+
+
+def _pose_bodies(world: World, rows: Tensor, yaws: Tensor) -> None:
+    """Write the robot's and the free bodies' poses into the state."""
+    scene, physics = world.scene, world.physics
+    start = world.layout[rows, 0]
+    world.start_pose[rows] = torch.cat([start, yaws[:, :1]], -1)
+    physics.qpos[rows, :2] = start
+    if scene.planar:
+        physics.qpos[rows, 2] = yaws[:, 0]
+    else:
+        physics.qpos[rows, 3:7] = yaw_quaternion(yaws[:, 0])
+    free = physics.qpos[:, scene.robot_nq :].unflatten(1, (scene.num_free, 7))
+    free[rows, :, :2] = world.layout[rows, 1 : 1 + scene.num_free]
+    free[rows, :, 3:] = yaw_quaternion(yaws[:, 1:])
+    if scene.num_targets:
+        quaternion = yaw_quaternion(yaws[:, 1 + scene.guided.start : 1 + scene.guided.stop])
+        physics.mocap_quat[rows, : scene.num_targets] = quaternion
+
+
+def gremlin_path(world: World, time: Tensor, num_substeps: int) -> Tensor:
+    """Mocap positions before each of the coming substeps [N, S, nmocap, 3]."""
+    scene = world.scene
+    guided = slice(1 + scene.guided.start, 1 + scene.guided.stop)
+    targets = circling_targets(
+        world.layout[:, guided],
+        time,
+        world.target_travel,
+        world.target_height,
+        world.physics.timestep,
+        num_substeps,
+    )
+    static = world.physics.mocap_pos[:, None, scene.num_targets :].expand(-1, num_substeps, -1, -1)
+    return torch.cat([targets, static], 2)
+
+
+def place_mocaps(world: World) -> None:
+    """Write the positions of static bodies and of the gremlins' targets into the state."""
+    scene, physics = world.scene, world.physics
+    if scene.num_mocap_slots:
+        span = slice(scene.num_free, scene.num_free + scene.num_mocap_slots)
+        physics.mocap_pos[:, scene.num_targets :] = world.positions[:, span]
+    if scene.num_targets:
+        # Where they were before the last substep, which is what the state was computed with; at
+        # the start they stand where their objects do.
+        last = (physics.time - physics.timestep).clamp(min=0.0)
+        targets = gremlin_path(world, last, 1)[:, 0, : scene.num_targets]
+        centres = world.layout[:, 1 + scene.guided.start : 1 + scene.guided.stop]
+        height = (0.5 * world.target_height).expand(len(centres), -1)
+        started = (physics.time > 0.0).view(-1, 1, 1)
+        at_start = torch.cat([centres, height.unsqueeze(-1)], -1)
+        physics.mocap_pos[:, : scene.num_targets] = torch.where(started, targets, at_start)
+
+
+def _choose_button(world: World, rows: Tensor, key: Tensor) -> None:
+    """Choose goal buttons uniformly; the same one may come again."""
+    number = world.scene.config.buttons_num
+    button = (rng.uniform(key) * number).to(torch.int64)
+    world.goal_button[rows] = button
+    point_goal_at_button(world, rows)
+
+
+def point_goal_at_button(world: World, rows: Tensor) -> None:
+    """Let the goal be where the goal button is."""
+    goal, buttons = world.scene.slots["goal"], world.at("buttons")
+    world.positions[rows, goal.start] = buttons[rows, world.goal_button[rows]]
+
+
+def next_goals(world: World, plan: PlacementPlan, key: Tensor, mask: Tensor) -> Tensor:
+    """Draw a new goal for some worlds.
+
+    Args:
+        world: the worlds, up to date.
+        plan: what is placed where.
+        key: random keys, int64 [N].
+        mask: worlds that get a new goal, bool [N].
+
+    Returns:
+        Worlds where no place for a goal was found, bool [N].
+
+    Raises:
+        LayoutError: for those, if `terminate_resample_failure` is False.
+    """
+    config = world.scene.config
+    rows = mask.nonzero()[:, 0]
+    world.buttons_timer[rows] = config.buttons_resampling_delay
+    stuck = torch.zeros_like(mask)
+    if goal_is_button(config.task):
+        _choose_button(world, rows, rng.fold(key[rows], Purpose.BUTTON))
+        return stuck
+    position, ok = resample_goal(plan, rng.fold(key[rows], Purpose.GOAL), _current(world)[rows])
+    goal = world.scene.slots["goal"].start
+    found = rows[ok]
+    world.positions[found, goal, :2] = position[ok]
+    world.layout[found, 1 + goal] = position[ok]
+    stuck[rows[~ok]] = True
+    if stuck.any() and not config.terminate_resample_failure:
+        raise LayoutError(
+            "No place for a new goal was found. Use fewer objects or smaller keepouts, or set "
+            "'terminate_resample_failure' to end such episodes."
+        )
+    if world.scene.num_mocap_slots:
+        place_mocaps(world)
+    return stuck
+
+
+def _current(world: World) -> Tensor:
+    """Where everything is now, in the columns of a layout; gremlins keep their layout position."""
+    current = torch.cat([world.robot_pos[:, None, :2], world.positions[..., :2]], 1)
+    guided = world.scene.guided
+    columns = slice(1 + guided.start, 1 + guided.stop)
+    current[:, columns] = world.layout[:, columns]
+    return current
+
+
+def control_noise(config: SafetyGymConfig, key: Tensor, num_controls: int) -> Tensor:
+    """Draw the configured Gaussian noise on the controls: keys [N] -> [N, nu]."""
+    columns = torch.arange(num_controls)
+    return config.action_noise * rng.normal(key[:, None], Purpose.NOISE, columns)
+
+
+def draw_substeps(config: SafetyGymConfig, key: Tensor) -> Tensor:
+    """Draw numbers of substeps, Binomial(n, p): keys [N] -> int64 [N]."""
+    trials = torch.arange(config.frameskip_binom_n)
+    draws = rng.uniform(key[:, None], Purpose.FRAMESKIP, trials)
+    return (draws < config.frameskip_binom_p).sum(-1)

@@ -1,0 +1,269 @@
+"""Batched rejection sampling of where things stand at the start of an episode, and of new goals.
+
+Many layouts are drawn at once: one object after the other, for all rows together. Distances and
+lengths in metres.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from functools import cached_property
+
+import torch
+from torch import Tensor
+
+from safe_rl.envs import rng
+from safe_rl.envs.errors import ConfigError
+from safe_rl.envs.safety_gym.records.config import SafetyGymConfig
+from safe_rl.envs.safety_gym.rules.elements import BY_KIND, PLACEMENT_ORDER
+from safe_rl.envs.safety_gym.rules.tasks import goal_is_button
+
+TRIES_PER_OBJECT = 100
+TRIES_PER_LAYOUT = 10_000
+TRIES_PER_GOAL = 10_000
+PIN_TOLERANCE = 1e-9  # half width of the square that a pinned location stands for
+_BLOCK = 10  # candidates for an object that are tested at once
+_GOAL_BLOCK = 40  # and for a new goal: mostly enough, and a second round takes as long again
+_MAX_ROWS = 4096  # layouts, or candidates for new goals, at once: a bound on memory
+
+
+class LayoutError(RuntimeError):
+    """No layout was found; the message names the object that did not fit."""
+
+
+@dataclass(frozen=True)
+class PlacementPlan:
+    """What is placed, in which order, and where each object may stand.
+
+    Attributes:
+        names: the P objects in order of placement.
+        columns: column of each in a layout [.., 1 + M, 2]: 0 the robot, 1 + slot an object.
+        num_columns: 1 + M.
+        rectangles: where the centres may be, [P, R, 4] (xmin, ymin, xmax, ymax).
+        thresholds: cumulative probability of each object's rectangles, [P, R].
+        keepouts: [P].
+        margin: added to the sum of two keepouts.
+    """
+
+    names: tuple[str, ...]
+    columns: tuple[int, ...]
+    num_columns: int
+    rectangles: Tensor
+    thresholds: Tensor
+    keepouts: Tensor
+    margin: float
+
+    @cached_property
+    def beside_goal(self) -> tuple[int, Tensor, Tensor]:
+        """The goal's place in the order, the others' columns [P - 1], and clearances [P - 1]."""
+        item = self.names.index("goal")
+        others = [i for i in range(len(self.names)) if i != item]
+        columns = torch.tensor([self.columns[i] for i in others])
+        return item, columns, self.keepouts[others] + self.keepouts[item] + self.margin
+
+
+def plan_placements(
+    config: SafetyGymConfig, slots: Mapping[str, slice], num_slots: int
+) -> PlacementPlan:
+    """Build the plan of a configuration.
+
+    Args:
+        config: the environment.
+        slots: slots of each kind that has objects.
+        num_slots: M.
+
+    Raises:
+        ConfigError: if a placement leaves no room for its object's keepout.
+    """
+    names, columns, keepouts, rectangles = [], [], [], []
+    for kind in PLACEMENT_ORDER:
+        if kind == "robot":
+            labels, first = ["robot"], 0
+        elif kind not in slots or (kind == "goal" and goal_is_button(config.task)):
+            continue
+        else:
+            labels, first = BY_KIND[kind].names(config), 1 + slots[kind].start
+        for index, label in enumerate(labels):
+            names.append(label)
+            columns.append(first + index)
+            keepouts.append(getattr(config, f"{kind}_keepout"))
+            rectangles.append(_rectangles(config, kind, label, index))
+    stacked, thresholds = _stack(rectangles)
+    return PlacementPlan(
+        names=tuple(names),
+        columns=tuple(columns),
+        num_columns=1 + num_slots,
+        rectangles=stacked,
+        thresholds=thresholds,
+        keepouts=torch.tensor(keepouts, dtype=torch.float64),
+        margin=config.placements_margin,
+    )
+
+
+def _rectangles(
+    config: SafetyGymConfig, kind: str, label: str, index: int
+) -> list[tuple[float, ...]]:
+    """Rectangles for the centre of one object: its placements, less its keepout."""
+    locations = getattr(config, f"{kind}_locations")
+    keepout = getattr(config, f"{kind}_keepout")
+    if index < len(locations):
+        x, y = locations[index]
+        tolerance = PIN_TOLERANCE
+        return [(x - tolerance, y - tolerance, x + tolerance, y + tolerance)]
+    placements = getattr(config, f"{kind}_placements") or (config.placements_extents,)
+    shrunk: list[tuple[float, ...]] = [
+        (a + keepout, b + keepout, c - keepout, d - keepout) for a, b, c, d in placements
+    ]
+    for (xmin, ymin, xmax, ymax), placement in zip(shrunk, placements, strict=True):
+        # A rectangle of twice the keepout is a point, which rounding may turn inside out.
+        if max(xmin - xmax, ymin - ymax) > PIN_TOLERANCE:
+            raise ConfigError(
+                f"There is no room for '{label}': its placement {placement} is smaller than twice "
+                f"its keepout ({keepout}). Enlarge '{kind}_placements' or 'placements_extents', or "
+                f"reduce '{kind}_keepout'."
+            )
+    return shrunk
+
+
+def _stack(rectangles: list[list[tuple[float, ...]]]) -> tuple[Tensor, Tensor]:
+    """Pad to one tensor; cumulative probabilities are in proportion to the areas."""
+    most = max(len(group) for group in rectangles)
+    padded = torch.tensor(
+        [group + [group[-1]] * (most - len(group)) for group in rectangles], dtype=torch.float64
+    )
+    area = (padded[..., 2:] - padded[..., :2]).clamp(min=0.0).prod(-1)
+    for row, group in enumerate(rectangles):
+        area[row, len(group) :] = 0.0
+        if area[row].sum() == 0.0:
+            area[row, : len(group)] = 1.0
+    return padded, area.cumsum(-1) / area.sum(-1, keepdim=True)
+
+
+def _draw(plan: PlacementPlan, item: int, key: Tensor) -> Tensor:
+    """One candidate position of an object per key: [...] -> [..., 2]."""
+    rectangles, thresholds = plan.rectangles[item], plan.thresholds[item]
+    uniform = rng.uniform(key.unsqueeze(-1), torch.arange(3))
+    if len(rectangles) == 1:
+        chosen = rectangles[0]
+    else:
+        which = torch.searchsorted(thresholds, uniform[..., 0].contiguous(), right=True)
+        chosen = rectangles[which.clamp(max=len(rectangles) - 1)]
+    low, high = chosen[..., :2], chosen[..., 2:]
+    return low + (high - low) * uniform[..., 1:]
+
+
+def _fits(candidates: Tensor, others: Tensor, clearance: Tensor) -> Tensor:
+    """Whether candidates [B, C, 2] keep their clearance [K] from others [B, K, 2]: [B, C]."""
+    (x, y), (other_x, other_y) = candidates.unbind(-1), others.unsqueeze(1).unbind(-1)
+    dx, dy = x.unsqueeze(-1) - other_x, y.unsqueeze(-1) - other_y
+    return (torch.addcmul(dx.square_(), dy, dy) >= clearance.square()).all(-1)
+
+
+def _place(plan: PlacementPlan, item: int, key: Tensor, placed: Tensor) -> tuple[Tensor, Tensor]:
+    """Place one object beside those placed before: keys [B], placed [B, K, 2] -> [B, 2], ok [B]."""
+    clearance = plan.keepouts[:item] + plan.keepouts[item] + plan.margin
+    position = placed.new_zeros(len(key), 2)
+    pending = torch.arange(len(key))
+    for start in range(0, TRIES_PER_OBJECT, _BLOCK):
+        tries = rng.fold(key[pending, None], torch.arange(start, start + _BLOCK))
+        candidates = _draw(plan, item, tries)
+        fits = _fits(candidates, placed[pending], clearance)
+        found, first = fits.any(-1), fits.to(torch.uint8).argmax(-1)
+        rows = pending[found]
+        position[rows] = candidates[found, first[found]]
+        pending = pending[~found]
+        if not len(pending):
+            break
+    ok = torch.ones(len(key), dtype=torch.bool)
+    ok[pending] = False
+    return position, ok
+
+
+def _try_layouts(plan: PlacementPlan, key: Tensor) -> tuple[Tensor, Tensor]:
+    """Try one layout per key [B]: positions [B, P, 2], and the object that did not fit or -1."""
+    positions = torch.zeros(len(key), len(plan.names), 2, dtype=torch.float64)
+    misfit = torch.full((len(key),), -1)
+    alive = torch.arange(len(key))
+    for item in range(len(plan.names)):
+        placed = positions[alive, :item]
+        positions[alive, item], ok = _place(plan, item, rng.fold(key[alive], item), placed)
+        misfit[alive[~ok]] = item
+        alive = alive[ok]
+        if not len(alive):
+            break
+    return positions, misfit
+
+
+def _rounds(total: int, rows: int, first: int = 1) -> Iterator[tuple[int, int]]:
+    """Ranges of attempts that grow, so that a few stubborn rows don't take thousands of rounds."""
+    start, most = 0, max(1, _MAX_ROWS // max(1, rows))
+    size = min(first, most)
+    while start < total:
+        stop = min(start + size, total)
+        yield start, stop
+        start, size = stop, min(4 * size, most)
+
+
+def sample_layouts(plan: PlacementPlan, key: Tensor) -> Tensor:
+    """Draw a layout for every key.
+
+    Every object in its turn gets 100 tries; then the layout is thrown away and drawn again, 10,000
+    times at most.
+
+    Args:
+        plan: what to place.
+        key: random keys, int64 [B]; equal keys give equal layouts.
+
+    Returns:
+        Positions [B, 1 + M, 2]: the robot, then the objects by slot; zero for what is not placed.
+
+    Raises:
+        LayoutError: naming the object that did not fit.
+    """
+    layouts = torch.zeros(len(key), plan.num_columns, 2, dtype=torch.float64)
+    misfits = torch.zeros(len(plan.names), dtype=torch.int64)
+    pending = torch.arange(len(key))
+    for start, stop in _rounds(TRIES_PER_LAYOUT, len(key)):
+        attempts = rng.fold(key[pending, None], torch.arange(start, stop))
+        positions, misfit = _try_layouts(plan, attempts.flatten())
+        misfits += torch.bincount(misfit[misfit >= 0], minlength=len(misfits))
+        good = (misfit < 0).view(len(pending), stop - start)
+        found, first = good.any(-1), good.to(torch.uint8).argmax(-1)
+        chosen = positions.view(*good.shape, len(plan.names), 2)[found, first[found]]
+        layouts[pending[found].unsqueeze(1), torch.tensor(plan.columns)] = chosen
+        pending = pending[~found]
+        if not len(pending):
+            return layouts
+    worst = int(misfits.argmax())
+    raise LayoutError(
+        f"No layout found in {TRIES_PER_LAYOUT} attempts: most often '{plan.names[worst]}' did not "
+        "fit. Use fewer objects, smaller keepouts, or larger placements."
+    )
+
+
+def resample_goal(plan: PlacementPlan, key: Tensor, layouts: Tensor) -> tuple[Tensor, Tensor]:
+    """Draw a new goal position beside everything else where it is now.
+
+    Args:
+        plan: the plan, with a goal in it.
+        key: random keys, int64 [B].
+        layouts: current positions [B, 1 + M, 2].
+
+    Returns:
+        The new positions [B, 2], and whether one was found within 10,000 draws [B].
+    """
+    item, columns, clearance = plan.beside_goal
+    placed = layouts.index_select(1, columns)
+    position, pending = layouts.new_zeros(len(key), 2), torch.arange(len(key))
+    for start, stop in _rounds(TRIES_PER_GOAL, len(key), first=_GOAL_BLOCK):
+        candidates = _draw(plan, item, rng.fold(key[pending, None], torch.arange(start, stop)))
+        fits = _fits(candidates, placed[pending], clearance)
+        found, first = fits.any(-1), fits.to(torch.uint8).argmax(-1)
+        position[pending[found]] = candidates[found, first[found]]
+        pending = pending[~found]
+        if not len(pending):
+            break
+    ok = torch.ones(len(key), dtype=torch.bool)
+    ok[pending] = False
+    return position, ok
