@@ -76,7 +76,12 @@ FLOORS = {
         ("on_policy",),
         ("",),
     ),
-    "runs": (("checkpoints", "curves", "loggers", "table"), ("folder", "resuming"), ("",)),
+    "runs": (
+        ("archive", "curves", "loggers", "table"),
+        ("checkpoints", "folder"),
+        ("resuming",),
+        ("",),
+    ),
     "training": (("interrupts", "state", "transfer"), ("trainer",), ("",)),
     "scores": (("intervals", "protocol"), ("",)),
     "cli": (

@@ -138,6 +138,11 @@ class Trainer:
             folder.checkpoint_directory,
             self.components(),
             keep_last=config.checkpoint.keep_last,
+            run={
+                "environment": config.env.name,
+                "algorithm": config.algo.name,
+                "seed": config.seed,
+            },
         )
 
     def components(self) -> dict[str, Stateful]:

@@ -8,9 +8,10 @@ from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
 from torch import Tensor, nn
-from torchrl.checkpoint import CheckpointError, CheckpointRotation
+from torchrl.checkpoint import CheckpointError
 
-from safe_rl.runs.checkpoints import CheckpointStore
+from safe_rl.runs.archive import read_states
+from safe_rl.runs.checkpoints import checkpoints_in
 
 __all__ = ["initialise_networks"]
 
@@ -44,36 +45,22 @@ def initialise_networks(
         for name, network in networks.items()
         if same_costs or not name.startswith("cost_")
     }
-    weights = {name: _Weights() for name in taken}
-    CheckpointStore.load(checkpoint, weights)
+    weights = read_states(checkpoint, taken)
     for name, network in taken.items():
-        _check_sizes(name, network.state_dict(), weights[name].values, checkpoint)
+        _check_sizes(name, network.state_dict(), weights[name], checkpoint)
     for name, network in taken.items():
-        network.load_state_dict(weights[name].values)
+        network.load_state_dict(weights[name])
     return list(taken)
 
 
-class _Weights:
-    """Receives a network's part of a checkpoint without a network."""
-
-    def __init__(self) -> None:
-        self.values: dict[str, Tensor] = {}
-
-    def state_dict(self) -> dict[str, Tensor]:
-        return self.values
-
-    def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
-        self.values = dict(state_dict)
-
-
 def _newest(directory: Path) -> Path:
-    newest = CheckpointRotation(directory / "checkpoints" / "last", keep_last=1).latest()
-    if newest is None:
+    found = checkpoints_in(directory / "checkpoints" / "last")
+    if not found:
         raise CheckpointError(
-            f"init_from={directory}: there is no checkpoint that can be read. Give the folder of a "
-            "run, or a file in its folder 'checkpoints'."
+            f"init_from={directory}: there is no checkpoint. Give the folder of a run, or a file "
+            "in its folder 'checkpoints'."
         )
-    return newest
+    return found[-1]
 
 
 def _constrained_costs(checkpoint: Path) -> list[str]:

@@ -1,13 +1,18 @@
 """Checkpoints: rotation, the best one, and files that are not what they should be."""
 
+import errno
+import json
 import zipfile
 
 import pytest
+import tensordict
 import torch
+from tensordict import NonTensorData, TensorDict
 from torch import nn
 from torchrl.checkpoint import Checkpoint, CheckpointError, StateDictCheckpointAdapter
 
-from safe_rl.runs.checkpoints import CheckpointStore
+from safe_rl.runs.archive import read_facts, writer
+from safe_rl.runs.checkpoints import CheckpointStore, checkpoint_steps, checkpoints_in
 
 
 class Counter:
@@ -33,12 +38,13 @@ def test_the_newest_are_kept_and_restored(tmp_path):
     for steps in (10, 20, 30):
         components["counter"].value = steps
         store.save(steps, {"epoch": steps // 10})
-    assert [path.name[-10:] for path in store.last.checkpoints()] == ["20.torchrl", "30.torchrl"]
+    *older, newest = checkpoints_in(store.last)
+    assert [path.name[-10:] for path in (*older, newest)] == ["20.torchrl", "30.torchrl"]
     restored = parts(7)
-    CheckpointStore.load(store.last.latest(), restored)
+    CheckpointStore.load(newest, restored)
     assert restored["counter"].value == 30
     assert torch.equal(restored["network"].weight, components["network"].weight)
-    assert Checkpoint.manifest(store.last.latest())["metadata"] == {"epoch": 3}
+    assert read_facts(newest) == {"epoch": 3}
 
 
 def test_the_best_one_is_replaced_only_by_a_better_one(tmp_path):
@@ -49,9 +55,9 @@ def test_the_best_one_is_replaced_only_by_a_better_one(tmp_path):
         components["counter"].value = steps
         written.append(store.save_best(steps, score))
     assert written == [True, False, True, False, False]
-    assert len(store.best.checkpoints()) == 1
+    (best,) = checkpoints_in(store.best)
     restored = parts(0)
-    CheckpointStore.load(store.best.latest(), restored)
+    CheckpointStore.load(best, restored)
     assert restored["counter"].value == 3
 
 
@@ -92,19 +98,199 @@ def test_a_checkpoint_of_another_run_is_refused(tmp_path):
 
 
 class Harmful:
+    """Opens a file when it is unpickled."""
+
+    def __init__(self, trace):
+        self.trace = str(trace)
+
     def __reduce__(self):
-        return open, ("harm.txt", "w")
+        return open, (self.trace, "w")
 
 
-def test_loading_runs_no_code_of_the_checkpoint(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    component = Counter(Harmful())
-    checkpoint = Checkpoint(format="archive")
-    checkpoint.register(
-        "counter", component, adapter=StateDictCheckpointAdapter(payload_format="torch")
-    )
-    path = checkpoint.save(tmp_path / "harmful.torchrl")
+def write_checkpoint(path, component, adapter, container="archive"):
+    """A checkpoint with one part, written by TorchRL as it may be by somebody else."""
+    checkpoint = Checkpoint(format=container)
+    checkpoint.register("counter", component, adapter=adapter)
+    return checkpoint.save(path)
+
+
+def refuse(path, match, trace):
+    target = Counter(7)
+    with pytest.raises(CheckpointError, match=match):
+        CheckpointStore.load(path, {"counter": target})
+    assert target.value == 7
+    assert not trace.exists()
+
+
+def test_loading_runs_no_code_of_the_weights_file(tmp_path):
+    trace = tmp_path / "trace.txt"
+    adapter = StateDictCheckpointAdapter(payload_format="torch")
+    path = write_checkpoint(tmp_path / "a.torchrl", Counter(Harmful(trace)), adapter)
     assert zipfile.is_zipfile(path)
-    with pytest.raises(CheckpointError, match="counter"):
-        CheckpointStore.load(path, {"counter": Counter()})
-    assert not (tmp_path / "harm.txt").exists()
+    refuse(path, "counter", trace)
+
+
+@pytest.mark.parametrize("payload", ["directory", "archive", "consolidated"])
+@pytest.mark.parametrize("container", ["archive", "directory"])
+def test_other_payloads_are_refused_before_they_are_read(tmp_path, payload, container):
+    trace = tmp_path / "trace.txt"
+    adapter = StateDictCheckpointAdapter(payload_format=payload)
+    written = tmp_path / "written"
+    write_checkpoint(written, Counter(torch.ones(2)), adapter, "directory")
+    state = written / "components" / "0000-counter" / "state"
+    if payload == "directory":
+        # what a TensorDict cannot keep as tensors it keeps, and loads, as a pickle
+        harmful = TensorDict(tensor_00000000=torch.ones(2), a=NonTensorData(Harmful(trace)))
+        tensordict.save(harmful, state)
+    path = written if container == "directory" else zipped(written, tmp_path / "a.torchrl")
+    refuse(path, "only state.pt" if container == "archive" else "one file", trace)
+    if payload == "directory":
+        # what was refused is harmful indeed
+        stock = StateDictCheckpointAdapter()
+        options = {"map_location": None, "tensor_load_kwargs": {}, "args": (), "kwargs": {}}
+        with pytest.warns(FutureWarning, match="pickled"):
+            stock.load(Counter(), state.parent, **options)
+        assert trace.exists()
+
+
+def zipped(folder, path):
+    """A checkpoint in a folder as an archive, with every file of the folder in its inventory."""
+    manifest = json.loads((folder / "manifest.json").read_text())
+    part = folder / "components" / "0000-counter"
+    files = [file.relative_to(part).as_posix() for file in part.rglob("*") if file.is_file()]
+    manifest["components"]["counter"]["files"] = files
+    return rewritten(path, manifest, {f"components/0000-counter/{f}": part / f for f in files})
+
+
+def rewritten(path, manifest, members):
+    with zipfile.ZipFile(path, "w") as archive:
+        archive.writestr("manifest.json", json.dumps(manifest))
+        for name, source in members.items():
+            archive.writestr(name, source.read_bytes())
+    return path
+
+
+def test_a_pickle_beside_the_weights_is_refused(tmp_path):
+    folder = tmp_path / "written"
+    adapter = StateDictCheckpointAdapter(payload_format="torch")
+    write_checkpoint(folder, Counter(1), adapter, "directory")
+    (folder / "components" / "0000-counter" / "state.json").write_text("{}")
+    refuse(zipped(folder, tmp_path / "a.torchrl"), "only state.pt", tmp_path / "trace.txt")
+
+
+@pytest.mark.parametrize(
+    "record",
+    [
+        {"path": "../outside"},
+        {"path": "/tmp"},
+        {"files": ["../../state.pt"]},
+        {"files": ["state.pt", "../../../trace.txt"]},
+        {"files": []},
+        {"files": "state.pt"},
+        {"adapter": "torchrl.dump_load"},
+    ],
+)
+def test_a_manifest_cannot_point_elsewhere(tmp_path, record):
+    whole = CheckpointStore(tmp_path, {"counter": Counter(1)}, keep_last=1).save(10)
+    manifest = Checkpoint.manifest(whole)
+    manifest["components"]["counter"].update(record)
+    state = tmp_path / "state.pt"
+    torch.save({"value": 3}, state)
+    path = rewritten(
+        tmp_path / "a.torchrl",
+        manifest,
+        dict.fromkeys(["components/0000-counter/state.pt", "trace.txt", "../trace.txt"], state),
+    )
+    refuse(path, "Cannot use the checkpoint .*a.torchrl", tmp_path / "trace.txt")
+
+
+def test_a_link_in_place_of_the_weights_is_refused(tmp_path):
+    part = tmp_path / "part"
+    part.mkdir()
+    torch.save({"value": 3}, tmp_path / "elsewhere.pt")
+    (part / "state.pt").symlink_to(tmp_path / "elsewhere.pt")
+    counter = Counter(7)
+    with pytest.raises(CheckpointError, match=r"state\.pt is no file"):
+        writer({"counter": counter})._components["counter"].adapter.load(counter, part)
+    assert counter.value == 7
+
+
+@pytest.mark.parametrize("manifest", ["[]", "null", "{", "", '{"format": 3}', "[" * 100_000])
+def test_a_manifest_that_is_none_is_refused_and_stops_no_run(tmp_path, manifest):
+    store = CheckpointStore(tmp_path, {"counter": Counter(1)}, keep_last=2)
+    store.save_best(10, 1.0)
+    store.save(10)
+    for folder in (store.last, store.best):
+        with zipfile.ZipFile(folder / "checkpoint-000000000020.torchrl", "w") as archive:
+            archive.writestr("manifest.json", manifest)
+    refuse(store.last / "checkpoint-000000000020.torchrl", "Cannot use", tmp_path / "trace.txt")
+    assert CheckpointStore.newest_step(tmp_path) == 10
+    with pytest.warns(UserWarning, match="Going on from the older"):
+        assert store.resume().name == "checkpoint-000000000010.torchrl"
+    store.save(20)
+    assert not store.save_best(20, 0.5)
+    assert CheckpointStore.newest_step(tmp_path) == 20
+
+
+def test_a_checkpoint_of_another_seed_is_not_resumed_from(tmp_path):
+    counter = Counter(1)
+    path = CheckpointStore(tmp_path, {"counter": counter}, keep_last=1, run={"seed": 3}).save(10)
+    other = CheckpointStore(tmp_path, {"counter": counter}, keep_last=1, run={"seed": 0})
+    with pytest.raises(CheckpointError, match=r"its seed is 3, this run's is 0\..*init_from="):
+        other.resume()
+    # its networks may be read all the same, and so may checkpoints that say nothing of it
+    CheckpointStore.load(path, {"counter": counter})
+    CheckpointStore(tmp_path, {"counter": counter}, keep_last=1).save(20)
+    assert other.resume().name.endswith("20.torchrl")
+
+
+def test_what_a_killed_run_has_begun_is_cleared_and_what_it_put_aside_restored(tmp_path):
+    store = CheckpointStore(tmp_path, {"counter": Counter(1)}, keep_last=3)
+    for steps in (10, 20):
+        store.save(steps)
+    store.save_best(10, 0.0)
+    name = "checkpoint-000000000020.torchrl"
+    (store.last / name).rename(store.last / f".{name}.backup-0a")
+    for folder in (store.last, store.best):
+        (folder / ".checkpoint-000000000030.torchrl.archive-0a").write_text("begun")
+        (folder / ".checkpoint-000000000030.torchrl.stage-0a").mkdir()
+        (folder / ".checkpoint-000000000010.torchrl.backup-0a").write_text("replaced")
+    assert store.resume().name == name
+    left = [path.name[-10:] for path in sorted(store.last.iterdir())]
+    assert left == ["10.torchrl", "20.torchrl"]
+    assert len(list(store.best.iterdir())) == 1
+
+
+def test_the_parts_stay_as_they_were_if_one_of_them_is_missing(tmp_path):
+    path = CheckpointStore(tmp_path, parts(1), keep_last=1).save(10)
+    target = parts(7)
+    with pytest.raises(CheckpointError, match="multiplier"):
+        CheckpointStore.load(path, {**target, "multiplier": Counter()})
+    assert target["counter"].value == 7
+
+
+def test_a_full_disk_leaves_the_checkpoints_that_were_there(tmp_path, monkeypatch):
+    counter = Counter(1)
+    store = CheckpointStore(tmp_path, {"counter": counter}, keep_last=1)
+    store.save(10)
+
+    def full(*args, **kwargs):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(zipfile.ZipFile, "write", full)
+        counter.value = 2
+        with pytest.raises(OSError, match="No space"):
+            store.save(20)
+    assert [path.name for path in store.last.iterdir()] == ["checkpoint-000000000010.torchrl"]
+    store.resume()
+    assert counter.value == 1
+
+
+def test_the_number_of_checkpoints_is_kept(tmp_path):
+    store = CheckpointStore(tmp_path, {"counter": Counter(1)}, keep_last=3)
+    for steps in range(1, 7):
+        store.save(steps)
+        assert [checkpoint_steps(p) for p in checkpoints_in(store.last)] == list(
+            range(max(1, steps - 2), steps + 1)
+        )

@@ -110,6 +110,7 @@ def test_the_folder_of_a_run(tmp_path):
     assert Checkpoint.manifest(path)["metadata"] == {
         "epoch": best + 1,
         "score": table["episode_return"][best],
+        "run": {"environment": "PointMass", "algorithm": "ppo_lagrangian", "seed": 0},
     }
     assert line.startswith("J_r ")
     assert line.endswith(str(tmp_path))

@@ -1,0 +1,121 @@
+"""One checkpoint file: what is written into it, and what is believed of one from elsewhere.
+
+A file is an archive of :class:`torchrl.checkpoint.Checkpoint` that holds, for every part of a run,
+tensors, numbers and plain containers. Reading runs no code of the file's: TorchRL would also take
+other payloads, and unpickles some of them, so that all but the one that is written here are
+refused.
+"""
+
+from __future__ import annotations
+
+import stat
+from collections.abc import Collection, Mapping
+from pathlib import Path
+from typing import Any
+
+import torch
+from torchrl.checkpoint import Checkpoint, CheckpointError, StateDictCheckpointAdapter
+
+from safe_rl.algorithms.contract import Stateful
+
+__all__ = ["read_facts", "read_states", "restore", "writer"]
+
+
+class _WeightsOnly(StateDictCheckpointAdapter):
+    """A part's payload: exactly one file, written by `torch.save` and read weights-only."""
+
+    def __init__(self) -> None:
+        # restores in one read; one archive per checkpoint instead of hundreds of files
+        super().__init__(payload_format="torch")
+
+    def load(self, component: Any, path: Path, **options: Any) -> Any:
+        # the adapter falls back on formats that unpickle where its own file is missing
+        found = sorted(path.iterdir())
+        if [file.name for file in found] != [self.state_torch]:
+            raise CheckpointError(
+                f"it holds {[file.name for file in found]}, where only {self.state_torch} may be: "
+                "this package has not written it, and it is not read."
+            )
+        if not stat.S_ISREG(found[0].lstat().st_mode):
+            raise CheckpointError(f"its {self.state_torch} is no file.")
+        options["tensor_load_kwargs"] = {"weights_only": True}
+        return super().load(component, path, **options)
+
+
+class _Received:
+    """Takes a part's state out of a file, without the part."""
+
+    state: Any = None
+
+    def state_dict(self) -> Mapping[str, Any]:
+        return {}
+
+    def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
+        self.state = state_dict
+
+
+def writer(components: Mapping[str, Stateful]) -> Checkpoint:
+    """What writes the present state of parts, by name, into a file in one go."""
+    checkpoint = Checkpoint(format="archive")
+    adapter = _WeightsOnly()
+    for name, component in components.items():
+        checkpoint.register(name, component, adapter=adapter)
+    return checkpoint
+
+
+def read_facts(path: Path) -> dict[str, Any]:
+    """The facts that a checkpoint was written with, without reading its tensors.
+
+    Raises:
+        CheckpointError: If the file is no checkpoint.
+    """
+    try:
+        _check_kind(path)
+        facts = Checkpoint.manifest(path)["metadata"]
+        if not isinstance(facts, dict):
+            raise CheckpointError("its facts are no mapping.")
+        return facts
+    except Exception as error:  # a file of unknown origin can be wrong in any way
+        raise _cannot_use(path, error) from error
+
+
+def read_states(path: Path, names: Collection[str]) -> dict[str, Any]:
+    """States of some parts by name: tensors, numbers and plain containers.
+
+    Raises:
+        CheckpointError: If the file is no checkpoint, is damaged, or lacks a part.
+    """
+    received = {name: _Received() for name in names}
+    # where there is no such device any more, tensors are read into main memory
+    device = None if torch.cuda.is_available() else "cpu"
+    try:
+        _check_kind(path)
+        writer(received).load(path, map_location=device)
+    except Exception as error:
+        raise _cannot_use(path, error) from error
+    return {name: part.state for name, part in received.items()}
+
+
+def restore(path: Path, components: Mapping[str, Stateful]) -> None:
+    """Give parts the states of a checkpoint, all of which are read before the first is changed.
+
+    Raises:
+        CheckpointError: If the file is no checkpoint, or does not fit the parts.
+    """
+    states = read_states(path, components)
+    for name in sorted(components):
+        try:
+            components[name].load_state_dict(states[name])
+        except Exception as error:
+            raise _cannot_use(path, error, f"its {name!r} does not fit: ") from error
+
+
+def _check_kind(path: Path) -> None:
+    if path.is_dir():
+        raise CheckpointError("it is a folder, and a checkpoint is one file.")
+
+
+def _cannot_use(path: Path, error: Exception, part: str = "") -> CheckpointError:
+    says_it = isinstance(error, OSError | RuntimeError | ValueError)
+    words = str(error) if says_it else f"{type(error).__name__}: {error}"
+    return CheckpointError(f"Cannot use the checkpoint {path}: {part}{words}")
