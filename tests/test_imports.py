@@ -83,7 +83,7 @@ FLOORS = {
         ("",),
     ),
     "training": (("interrupts", "state", "transfer"), ("trainer",), ("",)),
-    "scores": (("intervals", "protocol"), ("",)),
+    "scores": (("dominance", "intervals", "published"), ("normalised", "slates"), ("",)),
     "cli": (
         ("options", "overrides", "settings", "sweeps"),
         ("shorthands",),

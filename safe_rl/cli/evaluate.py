@@ -31,7 +31,7 @@ from safe_rl.evaluation.settings import EvaluationOptions, check_options
 from safe_rl.evaluation.summary import format_estimates, summarise, write_episodes, write_summary
 from safe_rl.evaluation.video import record_episode, write_video
 from safe_rl.scores.intervals import LEVEL, Estimate
-from safe_rl.scores.protocol import REFERENCE, Scores
+from safe_rl.scores.published import REFERENCE, Scores
 
 __all__ = ["Evaluation", "evaluate", "main"]
 

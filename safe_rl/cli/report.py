@@ -14,7 +14,7 @@ from safe_rl.cli.options import OptionError, parse_options, usage
 from safe_rl.envs.safety_gym.registration import group_node
 from safe_rl.envs.safety_gym.suite import SUITE
 from safe_rl.reporting import Report, build_report, write_report
-from safe_rl.scores.protocol import SEEDS
+from safe_rl.scores.published import SEEDS
 
 __all__ = ["ReportOptions", "main", "report"]
 

@@ -14,7 +14,7 @@ import yaml
 from omegaconf import DictConfig, OmegaConf
 
 from safe_rl.cli.overrides import CommandLineError
-from safe_rl.scores.protocol import SLATES
+from safe_rl.scores.slates import SLATES
 
 __all__ = ["expand_arguments"]
 

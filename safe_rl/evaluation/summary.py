@@ -11,7 +11,8 @@ from typing import Any
 
 from safe_rl.evaluation.episodes import Episodes
 from safe_rl.scores.intervals import Estimate, cvar, mean, share_over
-from safe_rl.scores.protocol import Scores, normalised_return, normalised_violation
+from safe_rl.scores.normalised import normalised_return, normalised_violation
+from safe_rl.scores.published import Scores
 
 __all__ = ["format_estimates", "summarise", "write_episodes", "write_summary"]
 

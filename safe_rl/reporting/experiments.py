@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from safe_rl.reporting.runs import Run, split_source, without_repetitions
-from safe_rl.scores.protocol import ALGORITHMS, COST_LIMIT, REFERENCE, Scores
+from safe_rl.scores.published import ALGORITHMS, COST_LIMIT, REFERENCE, Scores
 
 __all__ = [
     "MANNER",

@@ -19,7 +19,7 @@ from safe_rl.reporting.results import cost_keys_of
 from safe_rl.reporting.slate_tables import SYMBOLS
 from safe_rl.reporting.slates import Aggregate
 from safe_rl.runs.curves import point_marker
-from safe_rl.scores.protocol import ALGORITHMS
+from safe_rl.scores.published import ALGORITHMS
 
 __all__ = [
     "LIMIT_STYLE",

@@ -30,7 +30,8 @@ from safe_rl.reporting.slates import (
 from safe_rl.reporting.tables import Table
 from safe_rl.reporting.transfer_figures import draw_transfer
 from safe_rl.reporting.transfers import Transfer, find_transfers
-from safe_rl.scores.protocol import REFERENCE, SLATES
+from safe_rl.scores.published import REFERENCE
+from safe_rl.scores.slates import SLATES
 
 __all__ = ["Report", "Slate", "build_report"]
 

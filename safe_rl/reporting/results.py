@@ -18,13 +18,12 @@ from safe_rl.reporting.tables import (
     plain,
     power_of_ten,
 )
-from safe_rl.scores.protocol import (
+from safe_rl.scores.dominance import Agent, compare
+from safe_rl.scores.published import (
     PUBLISHED_STEPS,
     REFERENCE,
     REIMPLEMENTATION_STEPS,
     REIMPLEMENTATIONS,
-    Agent,
-    compare,
 )
 
 __all__ = ["cost_keys_of", "dominance_table", "final_record", "final_table"]

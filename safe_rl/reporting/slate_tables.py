@@ -15,15 +15,9 @@ from safe_rl.reporting.tables import (
     power_of_ten,
     with_interval,
 )
-from safe_rl.scores.protocol import (
-    NOISE_OF_ZERO,
-    PUBLISHED,
-    PUBLISHED_STEPS,
-    SLATES,
-    Agent,
-    Normalised,
-    compare,
-)
+from safe_rl.scores.dominance import NOISE_OF_ZERO, Agent, compare
+from safe_rl.scores.published import PUBLISHED, PUBLISHED_STEPS, Normalised
+from safe_rl.scores.slates import SLATES
 
 __all__ = ["SYMBOLS", "gap_table", "middle_table", "slate_table"]
 

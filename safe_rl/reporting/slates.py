@@ -11,14 +11,9 @@ import numpy as np
 from safe_rl.reporting.experiments import MANNER, Experiment
 from safe_rl.reporting.runs import Run
 from safe_rl.scores.intervals import Estimate, interquartile_mean
-from safe_rl.scores.protocol import (
-    SEEDS,
-    SLATES,
-    Normalised,
-    normalised_cost_rate,
-    normalised_return,
-    normalised_violation,
-)
+from safe_rl.scores.normalised import normalised_cost_rate, normalised_return, normalised_violation
+from safe_rl.scores.published import SEEDS, Normalised
+from safe_rl.scores.slates import SLATES
 
 __all__ = ["Aggregate", "Gap", "aggregate", "can_be_normalised", "find_gap", "normalised_scores"]
 
@@ -159,7 +154,7 @@ def find_gap(
     """Return what a slate lacks of an algorithm, or None if it is complete.
 
     Args:
-        slate: A name in :data:`safe_rl.scores.protocol.SLATES`.
+        slate: A name in :data:`safe_rl.scores.slates.SLATES`.
         algorithm: Name of the algorithm, as experiments have it.
         experiments: All experiments.
         seeds_needed: Finished runs that a slate takes per environment.

@@ -13,7 +13,7 @@ from omegaconf import OmegaConf
 from safe_rl.reporting.experiments import Experiment, environment_names
 from safe_rl.reporting.runs import Run, read_run, split_source
 from safe_rl.runs.checkpoints import CheckpointStore
-from safe_rl.scores.protocol import ALGORITHMS
+from safe_rl.scores.published import ALGORITHMS
 
 __all__ = ["Transfer", "find_transfers"]
 

@@ -1,1 +1,1 @@
-"""The protocol: reference scores, slates, normalisation, intervals."""
+"""The protocol: published scores, slates, normalisation, dominance, intervals."""

@@ -9,7 +9,7 @@ from run_configs import point_mass_config
 from safe_rl.cli.overrides import CommandLineError
 from safe_rl.cli.shorthands import expand_arguments
 from safe_rl.runs.folder import RunFolder
-from safe_rl.scores.protocol import SLATES
+from safe_rl.scores.slates import SLATES
 
 
 @pytest.fixture

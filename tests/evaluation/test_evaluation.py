@@ -16,7 +16,7 @@ from safe_rl.cli.evaluate import evaluate, main
 from safe_rl.envs import OpenGLError, make_env, store_configs
 from safe_rl.evaluation.settings import EvaluationOptions
 from safe_rl.evaluation.video import HEIGHT, STEPS_PER_FRAME, WIDTH
-from safe_rl.scores.protocol import REFERENCE
+from safe_rl.scores.published import REFERENCE
 from safe_rl.training.trainer import build_trainer, seed_everything
 
 NUM_STEPS = 40

@@ -14,7 +14,8 @@ from safe_rl.reporting.runs import find_runs
 from safe_rl.reporting.slate_tables import gap_table, middle_table, slate_table
 from safe_rl.reporting.slates import aggregate, can_be_normalised, find_gap
 from safe_rl.reporting.tables import Column, Table, number, plain
-from safe_rl.scores.protocol import PUBLISHED_STEPS, REFERENCE, SLATES
+from safe_rl.scores.published import PUBLISHED_STEPS, REFERENCE
+from safe_rl.scores.slates import SLATES
 
 
 def experiments_in(root):
