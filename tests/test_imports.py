@@ -77,15 +77,19 @@ FLOORS = {
         ("",),
     ),
     "runs": (
-        ("archive", "curves", "loggers", "table"),
+        ("archive", "curves", "files", "loggers", "table"),
         ("checkpoints", "folder"),
         ("resuming",),
         ("",),
     ),
     "training": (("interrupts", "state", "transfer"), ("trainer",), ("",)),
-    "scores": (("dominance", "intervals", "published"), ("normalised", "slates"), ("",)),
+    "scores": (
+        ("dominance", "intervals", "published"),
+        ("benchmark", "normalised", "slates"),
+        ("",),
+    ),
     "cli": (
-        ("options", "overrides", "settings", "sweeps"),
+        ("benchmark", "options", "overrides", "settings", "sweeps"),
         ("shorthands",),
         ("evaluate", "report", "train"),
         ("",),
@@ -93,6 +97,7 @@ FLOORS = {
     "evaluation": (
         ("episodes", "layouts", "loading", "settings"),
         ("summary", "video"),
+        ("measuring",),
         ("",),
     ),
     "reporting": (

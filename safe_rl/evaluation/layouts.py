@@ -9,6 +9,8 @@ __all__ = ["default_seed", "shared_layouts"]
 
 # Far from any seed that a person counts up from a run's own.
 _OFFSET = 1_000_000_007
+# where a configuration does not say, or its environments have no layouts: every episode is new
+_UNLIMITED = {"randomize_layout": True, "layout_seeds": None, "layout_seeds_first": 0}
 
 
 def default_seed(env: Mapping[str, Any], training_seed: int) -> int:
@@ -17,7 +19,7 @@ def default_seed(env: Mapping[str, Any], training_seed: int) -> int:
     Where the layout is fixed it is drawn from the seed, and belongs to what was learned; then it
     is training's.
     """
-    return training_seed + (_OFFSET if env["randomize_layout"] else 0)
+    return training_seed + (_OFFSET if (_UNLIMITED | {**env})["randomize_layout"] else 0)
 
 
 def shared_layouts(
@@ -38,17 +40,14 @@ def shared_layouts(
         >>> shared_layouts(finite, {**finite, "layout_seeds": None}, same_seed=False)
         0.0
     """
-    sizes = [
-        env.get("layout_seeds") if env["randomize_layout"] else None for env in (trained, evaluated)
-    ]
-    if sizes[0] is None or sizes[1] is None:
-        alike = (
-            sizes[0] is sizes[1] and trained["randomize_layout"] == evaluated["randomize_layout"]
-        )
-        return float(alike and same_seed)
+    envs = [_UNLIMITED | {**env} for env in (trained, evaluated)]
+    sizes = [env["layout_seeds"] if env["randomize_layout"] else None for env in envs]
+    if None in sizes:
+        randomised = {env["randomize_layout"] for env in envs}
+        return float(sizes[0] is sizes[1] and len(randomised) == 1 and same_seed)
     ranges = [
         range(env["layout_seeds_first"], env["layout_seeds_first"] + size)
-        for env, size in zip((trained, evaluated), sizes, strict=True)
+        for env, size in zip(envs, sizes, strict=True)
     ]
     common = min(r.stop for r in ranges) - max(r.start for r in ranges)
     return max(0, common) / len(ranges[1])

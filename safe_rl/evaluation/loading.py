@@ -14,6 +14,7 @@ from torchrl.envs import EnvBase
 
 from safe_rl.algorithms.parts import find_recipe
 from safe_rl.runs.checkpoints import CheckpointStore
+from safe_rl.runs.files import read_config
 
 __all__ = ["checkpoint_steps", "find_checkpoint", "load_config", "load_policy", "override_env"]
 
@@ -23,21 +24,24 @@ def load_config(directory: Path) -> DictConfig:
 
     Raises:
         FileNotFoundError: If the folder is not that of a run; runs below it are named.
+        ValueError: If the configuration is not that of a run, or not resolved.
     """
     path = directory / "config.yaml"
     if not path.is_file():
         below = sorted({table.parent for table in directory.glob("**/progress.csv")})
         hint = f" Runs below it: {', '.join(map(str, below[:5]))}." if below else ""
         raise FileNotFoundError(f"{directory} is not the folder of a run: no config.yaml.{hint}")
-    config = OmegaConf.load(path)
-    if not isinstance(config, DictConfig) or not {"env", "model"} <= set(config):
-        raise ValueError(f"{path} is not the configuration of a run: it needs 'env' and 'model'.")
-    return config
+    config = read_config(path)
+    missing = {"env", "algo", "seed", "cost_limits"} - set(config)
+    if missing or not isinstance(config["env"], dict):
+        lacking = ", ".join(sorted(missing)) or "the keys of 'env'"
+        raise ValueError(f"{path} is not the configuration of a run: it lacks {lacking}.")
+    return OmegaConf.create(config)
 
 
 def override_env(config: DictConfig, overrides: Mapping[str, Any]) -> dict[str, Any]:
     """The run's environment with some keys changed; their names are checked where it is made."""
-    return {**OmegaConf.to_container(config.env, resolve=True), **overrides}  # type: ignore[dict-item]
+    return {**OmegaConf.to_container(config.env), **overrides}  # type: ignore[dict-item]
 
 
 def find_checkpoint(directory: Path, which: str) -> Path:

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from safe_rl.evaluation.episodes import Episodes
+from safe_rl.runs.files import replacing
 from safe_rl.scores.intervals import Estimate, cvar, mean, share_over
 from safe_rl.scores.normalised import normalised_return, normalised_violation
 from safe_rl.scores.published import Scores
@@ -33,7 +34,7 @@ def summarise(
 
     Returns:
         Estimates by name: ``episode_return``, ``episode_length``, ``episode_<key>`` for every cost
-        key; for those with a limit (the aggregate cost where none has) ``cvar_<key>`` and
+        key; for those with a limit (the first cost where none has) ``cvar_<key>`` and
         ``over_limit_<key>``; ``normalised_return`` and ``normalised_violation``.
 
     Examples:
@@ -49,7 +50,7 @@ def summarise(
         "episode_length": mean(episodes.lengths),
     }
     estimates |= {f"episode_{key}": mean(costs) for key, costs in episodes.costs.items()}
-    for key in cost_limits or ["cost"]:
+    for key in cost_limits or list(episodes.costs)[:1]:
         estimates[f"cvar_{key}"] = cvar(episodes.costs[key], cvar_alpha)
         if key in cost_limits:
             over = share_over(episodes.costs[key], cost_limits[key])
@@ -84,24 +85,26 @@ def _number(value: float) -> str:
 
 
 def write_summary(path: Path, facts: Mapping[str, Any], estimates: Mapping[str, Estimate]) -> None:
-    """Write facts and estimates as JSON; what is not a number becomes null."""
+    """Write facts and estimates as JSON, in one go; what is not a number becomes null."""
     content = {
         **facts,
         "estimates": {
             name: {
-                part: None if math.isnan(value) else value
+                part: value if math.isfinite(value) else None
                 for part, value in estimate._asdict().items()
             }
             for name, estimate in estimates.items()
         },
     }
-    path.write_text(json.dumps(content, indent=2, ensure_ascii=False, allow_nan=False) + "\n")
+    text = json.dumps(content, indent=2, ensure_ascii=False, allow_nan=False) + "\n"
+    with replacing(path) as unfinished:
+        unfinished.write_text(text, encoding="utf-8")
 
 
 def write_episodes(path: Path, episodes: Episodes) -> None:
-    """Write one row per episode as CSV."""
+    """Write one row per episode as CSV, in one go."""
     columns = {"return": episodes.returns, "length": episodes.lengths, **episodes.costs}
-    with path.open("w", newline="") as file:
+    with replacing(path) as unfinished, unfinished.open("w", newline="") as file:
         writer = csv.writer(file, lineterminator="\n")
         writer.writerow(columns)
         writer.writerows(zip(*(column.tolist() for column in columns.values()), strict=True))

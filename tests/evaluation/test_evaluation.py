@@ -1,6 +1,7 @@
 """The evaluate command on a tiny trained run: what it runs, writes and refuses."""
 
 import csv
+import functools
 import json
 import pickle
 import shutil
@@ -9,10 +10,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import yaml
 from omegaconf import OmegaConf
 from run_configs import compose_config
 
-from safe_rl.cli.evaluate import evaluate, main
+from safe_rl.cli.benchmark import suite
+from safe_rl.cli.evaluate import evaluate_run as evaluate
+from safe_rl.cli.evaluate import main
 from safe_rl.envs import OpenGLError, make_env, store_configs
 from safe_rl.evaluation.settings import EvaluationOptions
 from safe_rl.evaluation.video import HEIGHT, STEPS_PER_FRAME, WIDTH
@@ -121,6 +125,56 @@ def test_layouts_can_be_those_of_training_or_others(run):
     assert known(layout_seeds=None) == 0.0
 
 
+def change_config(run, **changes):
+    config = yaml.safe_load((run / "config.yaml").read_text())
+    (run / "config.yaml").write_text(yaml.safe_dump({**config, **changes}))
+
+
+def test_an_environment_of_another_kind_has_no_published_scores(run, monkeypatch):
+    """What fulfils the contract of environments and calls itself PointGoal1."""
+    change_config(run, env={"_target_": "mine.build", "name": "PointGoal1", "cost_keys": ["cost"]})
+    make = functools.partial(make_env, "PointGoal1")
+    monkeypatch.setattr("safe_rl.cli.evaluate.make_env", lambda node, **kwargs: make(**kwargs))
+    found = evaluate(run, options(episodes=2)).estimates
+    assert found["episode_length"].value == 1000
+    assert "normalised_return" not in found
+
+
+def test_a_configuration_may_hold_the_changed_keys_only(run):
+    full, defaults = yaml.safe_load((run / "config.yaml").read_text())["env"], suite().defaults
+    changed = {key: value for key, value in full.items() if value != defaults[key]}
+    assert "randomize_layout" not in changed
+    change_config(run, env={**changed, "name": "mine"})
+    result = evaluate(run, options(episodes=2))
+    assert (result.facts["environment"], result.facts["layouts_trained_on"]) == ("mine", 0.0)
+
+
+def test_a_foreign_configuration_learns_nothing_of_this_machine(run, capsys, monkeypatch):
+    monkeypatch.setenv("SECRET", "hush")
+    change_config(run, env={"name": "${oc.env:SECRET}", "robot_base": "point"})
+    assert main([str(run), "episodes=1"]) == 1
+    shown = capsys.readouterr()
+    assert "hush" not in shown.out + shown.err
+    assert "without interpolations" in shown.err
+
+
+def test_what_is_interrupted_leaves_the_evaluation_of_before(run, monkeypatch):
+    evaluate(run, options(episodes=1))
+    before = {path.name: path.read_bytes() for path in run.glob("evaluation*")}
+    written = Path.write_text
+
+    def fail(path, text, *args, **kwargs):
+        written(path, text[: len(text) // 2], *args, **kwargs)
+        raise OSError("no space left")
+
+    with monkeypatch.context() as patched:
+        patched.setattr(Path, "write_text", fail)
+        with pytest.raises(OSError, match="no space"):
+            evaluate(run, options(episodes=2))
+    assert {path.name: path.read_bytes() for path in run.glob("evaluation*")} == before
+    assert not list(run.glob(".*unfinished*"))
+
+
 def test_evaluations_of_a_name_stand_side_by_side(run):
     evaluate(run, options(episodes=1))
     evaluate(run, options(episodes=2, name="other"))
@@ -158,12 +212,14 @@ def test_the_command_prints_a_table(run, capsys):
         (["checkpoint=there.torchrl"], "checkpoint is last, best or the path"),
         (["env.lidar_num_bins=8"], "trained on other observations"),
         (["cvar_alpha=2"], "cvar_alpha"),
-        (["camera=nowhere", "video=true", "episodes=1"], "nowhere"),
+        (["camera=nowhere", "video=true"], "nowhere"),
     ],
 )
-def test_what_cannot_be_done_ends_in_one_line(run, arguments, message, capsys):
+def test_what_cannot_be_done_ends_in_one_line(run, arguments, message, capsys, monkeypatch):
     if "video=true" in arguments:
         skip_without_opengl()
+        # before any episode
+        monkeypatch.setattr("safe_rl.evaluation.measuring.collect_episodes", None)
     assert main([str(run), *arguments]) == 1
     error = capsys.readouterr().err.splitlines()[-1]
     assert error.startswith("error: ")
@@ -177,7 +233,7 @@ def test_what_cannot_be_done_ends_in_one_line(run, arguments, message, capsys):
 def test_options_out_of_range_are_refused_before_anything_runs(
     argument, others, run, capsys, monkeypatch
 ):
-    monkeypatch.setattr("safe_rl.cli.evaluate.load_config", None)
+    monkeypatch.setattr("safe_rl.evaluation.measuring.load_config", None)
     assert main([str(run), argument]) == 1
     error = capsys.readouterr().err
     assert error.startswith(f"error: {argument}")
@@ -265,4 +321,4 @@ def test_the_video_shows_an_episode(run):
     assert np.median(caption) > 240
     assert caption.min() < 80
     assert np.abs(frames[0, :HEIGHT].astype(float) - frames[-1, :HEIGHT]).max() > 50
-    assert not list(run.glob("*.tmp*"))
+    assert not list(run.glob(".*unfinished*"))

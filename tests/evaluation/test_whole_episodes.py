@@ -2,6 +2,7 @@
 
 import itertools
 
+import numpy as np
 import pytest
 import torch
 from tensordict import TensorDict
@@ -10,6 +11,7 @@ from torchrl.envs import EnvBase
 
 from safe_rl.evaluation.episodes import collect_episodes
 from safe_rl.evaluation.layouts import default_seed, shared_layouts
+from safe_rl.evaluation.video import check_camera, record_episode
 from safe_rl.models import BehaviourPolicy, make_actor
 
 # steps of every world's episodes, in turn
@@ -19,8 +21,8 @@ LENGTHS = [[30, 1], [2, 3], [1, 1]]
 class KnownLengths(EnvBase):
     """The reward of a step is 1, its cost 0.5."""
 
-    def __init__(self):
-        num = len(LENGTHS)
+    def __init__(self, lengths=LENGTHS):
+        num = self.num = len(lengths)
         super().__init__(batch_size=[num])
         self.observation_spec = Composite(observation=Unbounded((num, 1)), shape=[num])
         self.action_spec = Bounded(-1, 1, (num, 1))
@@ -30,7 +32,7 @@ class KnownLengths(EnvBase):
         self.full_done_spec = Composite(
             **{key: Categorical(2, dtype=torch.bool, shape=(num, 1)) for key in flags}, shape=[num]
         )
-        self._lengths = torch.tensor(LENGTHS)
+        self._lengths = torch.tensor(lengths)
         self._episode = torch.full((num,), -1)
         self._step_count = torch.zeros(num, dtype=torch.long)
 
@@ -39,22 +41,22 @@ class KnownLengths(EnvBase):
 
     def _reset(self, tensordict=None, **kwargs):
         mask = None if tensordict is None else tensordict.get("_reset", None)
-        mask = torch.ones(3, dtype=torch.bool) if mask is None else mask.reshape(3)
+        mask = torch.ones(self.num, dtype=torch.bool) if mask is None else mask.reshape(self.num)
         self._episode = self._episode + mask
         self._step_count = torch.where(mask, 0, self._step_count)
-        return self._output(torch.zeros(3, 1, dtype=torch.bool))
+        return self._output(torch.zeros(self.num, 1, dtype=torch.bool))
 
     def _output(self, done):
         return TensorDict(
-            observation=torch.zeros(3, 1), done=done, terminated=done.clone(),
-            truncated=torch.zeros_like(done), batch_size=[3],
+            observation=torch.zeros(self.num, 1), done=done, terminated=done.clone(),
+            truncated=torch.zeros_like(done), batch_size=[self.num],
         )  # fmt: skip
 
     def _step(self, tensordict):
         self._step_count = self._step_count + 1
-        length = self._lengths[torch.arange(3), self._episode % 2]
+        length = self._lengths[torch.arange(self.num), self._episode % 2]
         out = self._output((self._step_count >= length).unsqueeze(-1))
-        out["reward"], out["cost"] = torch.ones(3, 1), torch.full((3, 1), 0.5)
+        out["reward"], out["cost"] = torch.ones(self.num, 1), torch.full((self.num, 1), 0.5)
         return out
 
 
@@ -74,6 +76,36 @@ def test_every_world_contributes_its_first_episodes(number, expected):
     assert episodes.costs["cost"].tolist() == [0.5 * length for length in expected]
 
 
+class Drawn(KnownLengths):
+    """One world whose pictures are of one kind and size: the number of the step in grey."""
+
+    def __init__(self):
+        super().__init__([[6, 6]])
+
+    def render(self):
+        return np.full((50, 70, 3), 10 * int(self._step_count), np.uint8)
+
+
+def test_a_film_takes_the_pictures_that_an_environment_has():
+    env, policy = Drawn(), BehaviourPolicy(make_actor(1, 1, hidden_sizes=[4], initial_log_std=0.0))
+    check_camera(env, "free")
+    frames = list(record_episode(env, policy, ["cost"], deterministic=True))
+    # every other step of six; what the encoder cannot halve twice is cut off
+    assert [frame[0, 0, 0] for frame in frames] == [0, 20, 40]
+    assert {frame.shape for frame in frames} == {(48 + 20, 68, 3)}
+    without_costs = list(record_episode(env, policy, [], deterministic=True))
+    assert len(without_costs) == 3
+
+
+def test_what_prevents_a_film_is_said_before_any_episode():
+    with pytest.raises(ValueError, match="camera=track: this environment has no cameras"):
+        check_camera(Drawn(), "track")
+    without_pictures = KnownLengths([[1, 1]])
+    without_pictures.render = None
+    with pytest.raises(ValueError, match="draws no pictures"):
+        check_camera(without_pictures, "free")
+
+
 def layouts(env):
     return set(range(env["layout_seeds_first"], env["layout_seeds_first"] + env["layout_seeds"]))
 
@@ -88,6 +120,12 @@ def test_shared_layouts_are_those_in_both_ranges(trained, evaluated):
     ]
     common = len(layouts(envs[0]) & layouts(envs[1])) / len(layouts(envs[1]))
     assert shared_layouts(*envs, same_seed=False) == common
+
+
+def test_what_says_nothing_of_layouts_shows_new_ones():
+    assert default_seed({}, 4) != 4
+    assert shared_layouts({}, {}, same_seed=False) == 0.0
+    assert shared_layouts({"layout_seeds": 5}, {"layout_seeds": 10}, same_seed=False) == 0.5
 
 
 def test_a_fixed_layout_is_trainings_only_with_its_seed():

@@ -1,0 +1,133 @@
+"""A trained policy measured: from a run's folder to estimates, and their files in it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from omegaconf import DictConfig, OmegaConf
+from torchrl.envs import EnvBase
+
+from safe_rl.evaluation.episodes import collect_episodes
+from safe_rl.evaluation.layouts import default_seed, shared_layouts
+from safe_rl.evaluation.loading import (
+    checkpoint_steps,
+    find_checkpoint,
+    load_config,
+    load_policy,
+    override_env,
+)
+from safe_rl.evaluation.settings import EvaluationOptions, check_options
+from safe_rl.evaluation.summary import summarise, write_episodes, write_summary
+from safe_rl.evaluation.video import check_camera, record_episode, write_video
+from safe_rl.scores.benchmark import Suite
+from safe_rl.scores.intervals import LEVEL, Estimate
+
+__all__ = ["Evaluation", "evaluate"]
+
+# which layouts are shown does not make it another environment
+_LAYOUTS = ("layout_seeds", "layout_seeds_first")
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """What an evaluation found.
+
+    Attributes:
+        facts: What was evaluated, and how: JSON-compatible.
+        estimates: Name -> estimate, see :func:`safe_rl.evaluation.summary.summarise`.
+        files: What was written.
+    """
+
+    facts: dict[str, Any]
+    estimates: dict[str, Estimate]
+    files: tuple[Path, ...]
+
+
+def evaluate(
+    directory: Path,
+    options: EvaluationOptions,
+    *,
+    make_env: Callable[..., EnvBase],
+    suite: Suite,
+    progress: bool = False,
+) -> Evaluation:
+    """Run a trained policy for whole episodes and write what they say into the run's folder.
+
+    Args:
+        directory: Folder of a run.
+        options: What to evaluate.
+        make_env: ``make_env(node, num_envs=, device=, seed=, num_threads=)`` makes environments
+            from a run's ``env``, see :func:`safe_rl.envs.make_env`.
+        suite: Environments with published scores.
+        progress: Whether to show a bar.
+
+    Raises:
+        FileNotFoundError: If the folder is not a run's, or has no such checkpoint.
+        CheckpointError: If the checkpoint is damaged, or does not fit the environment.
+        ConfigError: If the environment does not accept an override.
+        ValueError: If an option is out of its range, or there is no such camera.
+    """
+    check_options(options)
+    config = load_config(directory)
+    checkpoint = find_checkpoint(directory, options.checkpoint)
+    node = override_env(config, options.env)
+    seed = default_seed(node, config.seed) if options.seed is None else options.seed
+
+    def make(num_envs: int) -> EnvBase:
+        threads = options.num_threads
+        return make_env(
+            node, num_envs=num_envs, device=options.device, seed=seed, num_threads=threads
+        )
+
+    if options.video:
+        check_camera(make(1), options.camera)
+    env = make(min(options.num_envs, options.episodes))
+    policy = load_policy(config, env, checkpoint, torch.device(options.device))
+    manner = {"deterministic": options.deterministic}
+    torch.manual_seed(seed)
+    episodes = collect_episodes(
+        env, policy, options.episodes, env.cost_keys, **manner, progress=progress
+    )
+    limits = {key: float(d) for key, d in config.cost_limits.items() if key in env.cost_keys}
+    reference = suite.reference(node, but_for=_LAYOUTS)
+    estimates = summarise(episodes, limits, reference, options.cvar_alpha)
+    facts = _facts(directory, config, checkpoint, options, node, seed) | {"cost_limits": limits}
+    stem = "_".join(filter(None, ("evaluation", options.name)))
+    files = [directory / f"{stem}.{suffix}" for suffix in ("json", "csv", "mp4")]
+    write_summary(files[0], facts, estimates)
+    write_episodes(files[1], episodes)
+    if not options.video:
+        return Evaluation(facts, estimates, tuple(files[:2]))
+    torch.manual_seed(seed)
+    # the first world draws the same episodes whatever the number of worlds
+    frames = record_episode(make(1), policy, env.cost_keys, **manner, camera=options.camera)
+    write_video(files[2], frames)
+    return Evaluation(facts, estimates, tuple(files))
+
+
+def _facts(
+    directory: Path,
+    config: DictConfig,
+    checkpoint: Path,
+    options: EvaluationOptions,
+    node: Mapping[str, Any],
+    seed: int,
+) -> dict[str, Any]:
+    trained = OmegaConf.to_container(config.env)
+    assert isinstance(trained, dict)
+    shared = shared_layouts(trained, node, same_seed=seed == config.seed)  # type: ignore[arg-type]
+    return {
+        "run": str(directory),
+        "environment": node.get("name", ""),
+        "algorithm": config.algo.name,
+        "checkpoint_file": str(checkpoint),
+        "steps": checkpoint_steps(checkpoint),
+        "layouts_trained_on": shared,
+        "interval_level": LEVEL,
+        **asdict(options),
+        "seed": seed,
+    }

@@ -1,0 +1,82 @@
+"""Files of a run: read without trusting them, written in one go."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import yaml
+from omegaconf import OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+
+__all__ = ["read_config", "replacing"]
+
+# of a configuration; that of a run has about six thousand
+_MOST_LETTERS = 1_000_000
+
+
+def read_config(path: Path) -> dict[str, Any]:
+    r"""Read a YAML file as plain dictionaries, lists and values, and nothing more.
+
+    Nothing in it is followed: a run's configuration has been resolved before it was saved, and
+    ``${oc.env:…}`` in somebody's file would put a secret of this machine into what is made of it.
+
+    Raises:
+        ValueError: If it is no mapping with texts for keys, or has interpolations or aliases.
+        OSError: If it cannot be read.
+
+    Examples:
+        >>> import tempfile
+        >>> path = Path(tempfile.mkdtemp()) / "config.yaml"
+        >>> _ = path.write_text("seed: 3\nmodel: {hidden_sizes: [64, 64]}")
+        >>> read_config(path)
+        {'seed': 3, 'model': {'hidden_sizes': [64, 64]}}
+    """
+    try:
+        text = path.read_text(encoding="utf-8")
+        if len(text) > _MOST_LETTERS:
+            raise ValueError(f"{path.name} is longer than any configuration of a run")
+        # aliases of aliases would grow without end
+        if any(isinstance(token, yaml.AliasToken) for token in yaml.scan(text)):
+            raise ValueError(f"{path.name} has YAML aliases, which no run writes")
+        config = OmegaConf.to_container(OmegaConf.create(text), resolve=False)
+    except (yaml.YAMLError, OmegaConfBaseException, UnicodeDecodeError, RecursionError) as error:
+        reason = (str(error) or type(error).__name__).splitlines()[0]
+        raise ValueError(f"{path.name} cannot be read ({reason})") from error
+    if not isinstance(config, dict) or not _all_plain(config):
+        raise ValueError(
+            f"{path.name} is not that of a run: it takes a mapping without interpolations, ${{…}}"
+        )
+    return config  # type: ignore[return-value]
+
+
+def _all_plain(value: Any) -> bool:
+    if isinstance(value, dict):
+        return all(isinstance(key, str) and _all_plain(v) for key, v in value.items())
+    if isinstance(value, list):
+        return all(map(_all_plain, value))
+    return not (isinstance(value, str) and "${" in value)
+
+
+@contextmanager
+def replacing(path: Path) -> Iterator[Path]:
+    """Give the name of a file to write, which takes the place of ``path`` when it is complete.
+
+    Who reads ``path`` meanwhile, or after an interruption, finds the old content or the new one.
+
+    Examples:
+        >>> import tempfile
+        >>> path = Path(tempfile.mkdtemp()) / "numbers.csv"
+        >>> with replacing(path) as unfinished:
+        ...     _ = unfinished.write_text("1,2")
+        >>> path.read_text()
+        '1,2'
+    """
+    unfinished = path.with_name(f".{path.stem}.unfinished{path.suffix}")
+    try:
+        yield unfinished
+        unfinished.replace(path)
+    finally:
+        unfinished.unlink(missing_ok=True)

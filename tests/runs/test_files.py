@@ -1,0 +1,62 @@
+"""Configurations of strangers, and files that are written in one go."""
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from omegaconf import OmegaConf
+
+from safe_rl.runs.files import read_config, replacing
+
+VALUES = st.recursive(
+    st.none() | st.booleans() | st.integers() | st.floats(allow_nan=False) | st.text("ab -:#'1"),
+    lambda inner: st.lists(inner) | st.dictionaries(st.text("abc", min_size=1), inner),
+)
+
+
+@settings(deadline=None, max_examples=40)
+@given(config=st.dictionaries(st.text("abc", min_size=1), VALUES))
+def test_what_a_run_saves_is_read_back(config, tmp_path_factory):
+    path = tmp_path_factory.mktemp("run") / "config.yaml"
+    OmegaConf.save(OmegaConf.create(config), path)
+    assert read_config(path) == config
+
+
+BOMB = "a: &a [x, x]\n" + "".join(
+    f"{n}: &{n} [*{m}, *{m}]\n" for m, n in zip("abc", "bcd", strict=True)
+)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("a: ${oc.env:HOME}", "interpolations"),
+        ("a: {b: [1, 'x${a}']}", "interpolations"),
+        ("- a", "mapping"),
+        ("1: a", "mapping"),
+        ("{", "cannot be read"),
+        ("a: !!python/object/apply:os.system [true]", "cannot be read"),
+        ("a: ${", "cannot be read"),
+        (BOMB, "aliases"),
+        ("[" * 5000, "cannot be read"),
+        ("a: " + "x" * 1_000_001, "longer"),
+        (b"\xff\xfe\x00", "cannot be read"),
+    ],
+)
+def test_what_is_no_resolved_configuration_is_refused(text, message, tmp_path):
+    path = tmp_path / "config.yaml"
+    path.write_bytes(text if isinstance(text, bytes) else text.encode())
+    with pytest.raises(ValueError, match=message):
+        read_config(path)
+
+
+def test_a_file_is_replaced_when_it_is_complete(tmp_path):
+    path = tmp_path / "table.csv"
+    path.write_text("before")
+    with replacing(path) as unfinished:
+        unfinished.write_text("aft")
+        assert path.read_text() == "before"
+    assert path.read_text() == "aft"
+    with pytest.raises(UnicodeEncodeError), replacing(path) as unfinished:
+        unfinished.write_text("half \udc80")
+    assert [file.name for file in tmp_path.iterdir()] == ["table.csv"]
+    assert path.read_text() == "aft"
