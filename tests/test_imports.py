@@ -84,8 +84,8 @@ FLOORS = {
     ),
     "training": (("interrupts", "state", "transfer"), ("trainer",), ("",)),
     "scores": (
-        ("dominance", "intervals", "published"),
-        ("benchmark", "normalised", "slates"),
+        ("dominance", "intervals", "learning", "published"),
+        ("benchmark", "comparisons", "normalised", "slates"),
         ("",),
     ),
     "cli": (

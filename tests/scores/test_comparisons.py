@@ -1,0 +1,93 @@
+"""Comparisons of samples against SciPy, enumeration and definitions written out."""
+
+import itertools
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.stats import mannwhitneyu
+
+from safe_rl.scores.comparisons import (
+    pareto_front,
+    performance_profile,
+    probability_of_improvement,
+)
+from safe_rl.scores.learning import (
+    first_good_epoch,
+    longest_streak,
+    regret,
+    share_of_epochs_over,
+)
+
+
+def test_probability_of_improvement_is_the_statistic_of_mann_and_whitney():
+    generator = np.random.default_rng(0)
+    # rounded, so that there are ties
+    first = [generator.normal(size=n).round(1) for n in (5, 7)]
+    second = [generator.normal(size=n).round(1) for n in (6, 4)]
+    expected = np.mean(
+        [
+            mannwhitneyu(x, y).statistic / (len(x) * len(y))
+            for x, y in zip(first, second, strict=True)
+        ]
+    )
+    found = probability_of_improvement(first, second)
+    assert found.value == pytest.approx(expected)
+    assert found.low < found.value < found.high
+    assert probability_of_improvement(second, first).value == pytest.approx(1 - expected)
+
+
+def test_the_interval_of_the_probability_is_that_of_all_resamples():
+    first, second = [0.0, 2.0], [1.0, 1.0]
+    resamples = itertools.product(itertools.product(first, repeat=2), [second])
+    outcomes = {np.mean([x > y for x in a for y in b]) for a, b in resamples}
+    found = probability_of_improvement([first], [second])
+    assert (found.low, found.high) == (min(outcomes), max(outcomes)) == (0.0, 1.0)
+
+
+def test_a_profile_is_the_share_of_runs_above():
+    strata = [np.random.default_rng(1).normal(size=n) for n in (3, 8)]
+    thresholds = np.linspace(-2, 2, 9)
+    everything = np.concatenate(strata)
+    value, low, high = performance_profile(strata, thresholds)
+    for threshold, *found in zip(thresholds, value, low, high, strict=True):
+        share = sum(run > threshold for run in everything) / len(everything)
+        assert found[0] == pytest.approx(share)
+        assert found[1] <= share <= found[2]
+    assert (np.diff(value) <= 0).all()
+
+
+@given(st.lists(st.tuples(st.integers(0, 5), st.integers(0, 5)), min_size=1, max_size=9))
+def test_the_front_is_what_nobody_beats(points):
+    returns, costs = zip(*points, strict=True)
+    front = pareto_front(returns, costs).tolist()
+
+    def beats(a, b):
+        return a[0] >= b[0] and a[1] <= b[1] and a != b
+
+    unbeaten = {p for p in points if not any(beats(other, p) for other in points)}
+    assert {points[i] for i in front} == unbeaten
+    assert len(front) == len(unbeaten)
+    assert [costs[i] for i in front] == sorted(costs[i] for i in front)
+
+
+EPOCHS = st.lists(st.integers(0, 4).map(float), min_size=1, max_size=12)
+
+
+@given(costs=EPOCHS, limit=st.integers(0, 4))
+def test_figures_of_the_course_by_counting(costs, limit):
+    over = [cost > limit for cost in costs]
+    groups = [len(list(group)) for is_over, group in itertools.groupby(over) if is_over]
+    assert longest_streak(costs, limit) == max(groups, default=0)
+    assert share_of_epochs_over(costs, limit) == pytest.approx(sum(over) / len(over))
+    excess = sum(cost - limit for cost in costs if cost > limit)
+    assert regret(costs, limit) == pytest.approx(excess / len(costs))
+
+
+@given(costs=EPOCHS, seed=st.integers(0, 99), limit=st.integers(0, 4))
+def test_the_first_good_epoch_is_good_and_none_before_it(costs, seed, limit):
+    returns = np.random.default_rng(seed).integers(0, 5, len(costs))
+    found = first_good_epoch(returns, costs, 2.0, limit)
+    good = [r >= 2 and c <= limit for r, c in zip(returns, costs, strict=True)]
+    assert found == (good.index(True) if any(good) else None)
