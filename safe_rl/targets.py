@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Callable, Iterator, Mapping
-from difflib import get_close_matches
 from importlib import import_module
 from importlib.util import find_spec
 from typing import Any
@@ -18,6 +17,8 @@ from typing import Any
 from hydra.errors import InstantiationException
 from hydra.utils import instantiate
 from omegaconf import DictConfig, ListConfig, OmegaConf
+
+from safe_rl.naming import did_you_mean
 
 __all__ = ["TargetError", "allow", "build", "locate"]
 
@@ -163,8 +164,7 @@ def _walk(root: str, name: str, shown: str) -> Any:
         elif hasattr(found, "__path__") and find_spec(below):
             following = import_module(below)
         else:
-            close = get_close_matches(part, _public(found), n=1, cutoff=0.5)
-            hint = f" Nearest: '{close[0]}'." if close else ""
+            hint = did_you_mean(part, _public(found))
             raise TargetError(f"{shown}: '{found.__name__}' has no '{part}'.{hint}")
         if inspect.ismodule(following) and following.__name__ != below:
             raise TargetError(

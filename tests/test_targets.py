@@ -174,7 +174,7 @@ def test_modules_named_by_the_user_are_reached_but_not_what_they_borrow(users):
     for name in ("os.system", "system", "pickle.loads", "NUMBER", "Loss.__init__"):
         with pytest.raises(TargetError):
             locate(f"users_module.{name}")
-    with pytest.raises(TargetError, match=r"'users_module' has no 'Lose'\. Nearest: 'Loss'"):
+    with pytest.raises(TargetError, match=r"'users_module' has no 'Lose'\. Did you mean 'Loss'"):
         locate("users_module.Lose")
 
 

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from difflib import get_close_matches
 
 import torch
 from torch import Tensor
 
 from safe_rl.collectors import EpisodeStatistics
+from safe_rl.naming import did_you_mean
 from safe_rl.objectives.multipliers import Multiplier
 
 __all__ = ["Constraints", "check_cost_limits", "mean_cost"]
@@ -128,11 +128,10 @@ def check_cost_limits(
     limits: dict[str, float] = {}
     for key, limit in cost_limits.items():
         if key not in cost_keys:
-            close = get_close_matches(key, cost_keys, n=1, cutoff=0.8)
-            nearest = f" Nearest: '{close[0]}'." if close else ""
             raise ValueError(
-                f"cost_limits names '{key}', but this environment has no such cost.{nearest} It "
-                f"has {', '.join(cost_keys)}; env.constrain_<kind>=true adds those of another kind."
+                f"cost_limits names '{key}', but this environment has no such cost."
+                f"{did_you_mean(key, cost_keys)} It has {', '.join(cost_keys)}; "
+                "env.constrain_<kind>=true adds those of another kind."
             )
         if isinstance(limit, bool) or not isinstance(limit, int | float) or not limit >= 0:
             raise ValueError(

@@ -7,11 +7,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import MISSING, fields
-from difflib import get_close_matches
 from typing import TYPE_CHECKING, TypeVar
 
 from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
+
+from safe_rl.naming import did_you_mean
 
 __all__ = ["OptionError", "parse_options", "usage"]
 
@@ -59,9 +60,8 @@ def parse_options(arguments: Sequence[str], schema: type[Schema]) -> Schema:
             )
         name = key.partition(".")[0]
         if name not in known:
-            nearest = get_close_matches(name, known, n=1, cutoff=0.0)[0]
             raise OptionError(
-                f"Unknown option '{name}'. Did you mean '{nearest}'? Options are: "
+                f"Unknown option '{name}'.{did_you_mean(name, known)} Options are: "
                 f"{', '.join(known)}."
             )
     try:

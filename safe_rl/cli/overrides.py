@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import re
 from collections.abc import Collection, Iterator, Mapping, Sequence
-from difflib import get_close_matches
 from pathlib import Path
 from typing import Any
 
 from hydra.core.config_store import ConfigStore
 from omegaconf import OmegaConf
+
+from safe_rl.naming import nearest
 
 __all__ = ["CommandLineError", "check_overrides"]
 
@@ -63,8 +64,8 @@ def check_overrides(arguments: Sequence[str], conf: Path, env_keys: Collection[s
 def _refuse(
     argument: str, problem: str, name: str, known: Collection[str], prefix: str = ""
 ) -> None:
-    close = get_close_matches(name, known, n=1, cutoff=0.5)
-    hint = f" Nearest: '{prefix}{close[0]}'." if close else ""
+    close = nearest(name, known)
+    hint = f" Did you mean '{prefix}{close}'?" if close else ""
     raise CommandLineError(f"'{argument}': {problem} '{name}'.{hint}")
 
 

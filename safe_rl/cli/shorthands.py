@@ -6,7 +6,6 @@ They are written out before Hydra sees the command line.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from difflib import get_close_matches
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -14,6 +13,7 @@ import yaml
 from omegaconf import DictConfig, OmegaConf
 
 from safe_rl.cli.overrides import CommandLineError
+from safe_rl.naming import did_you_mean
 from safe_rl.scores.slates import SLATES
 
 __all__ = ["expand_arguments"]
@@ -96,9 +96,9 @@ def _expand_resume(value: str, others: list[str]) -> list[str]:
 
 def _expand_slate(value: str, others: list[str]) -> list[str]:
     if value not in SLATES:
-        nearest = get_close_matches(value, SLATES, n=1, cutoff=0)[0]
         raise CommandLineError(
-            f"Unknown slate '{value}'. Did you mean '{nearest}'? Slates are: {', '.join(SLATES)}."
+            f"Unknown slate '{value}'.{did_you_mean(value, SLATES)} Slates are: "
+            f"{', '.join(SLATES)}."
         )
     if any(argument.startswith("env=") for argument in others):
         raise CommandLineError("slate= and env= both name environments: use one of them.")

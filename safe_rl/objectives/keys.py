@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from difflib import get_close_matches
-
 from tensordict import NestedKey, TensorDictBase
 from tensordict.utils import unravel_key
 from torch import Tensor
+
+from safe_rl.naming import nearest
 
 
 def key_name(key: NestedKey) -> str:
@@ -29,8 +29,6 @@ def require(tensordict: TensorDictBase, key: NestedKey, hint: str = "") -> Tenso
     if value is not None:
         return value
     present = {key_name(found): found for found in tensordict.keys(True, True)}
-    near = get_close_matches(key_name(unravel_key(key)), present, n=1)
-    nearest = f" Nearest key: {present[near[0]]!r}." if near else ""
-    raise KeyError(
-        f"No entry {key!r} in the batch.{nearest} Keys: {sorted(present)}. {hint}".strip()
-    )
+    near = nearest(key_name(unravel_key(key)), present)
+    meant = "" if near is None else f" Did you mean {present[near]!r}?"
+    raise KeyError(f"No entry {key!r} in the batch.{meant} Keys: {sorted(present)}. {hint}".strip())

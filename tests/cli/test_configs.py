@@ -171,7 +171,7 @@ def test_unknown_names_are_errors_that_list_the_known_ones(overrides, message):
 def test_cost_limits_must_name_costs_of_the_environment():
     keys = ["cost", "cost_hazards", "cost_vases_contact"]
     assert check_cost_limits({"cost_hazards": 10}, keys) == {"cost_hazards": 10.0}
-    with pytest.raises(ValueError, match="Nearest: 'cost_hazards'"):
+    with pytest.raises(ValueError, match="Did you mean 'cost_hazards'"):
         check_cost_limits({"cost_hazard": 10}, keys)
     for limit in (-1, "many", None, float("nan"), True):
         with pytest.raises(ValueError, match="'cost' is"):

@@ -23,14 +23,14 @@ RIGHT = [
     ["--config-dir=mine", "algo=mine", "mine.tail=0.1"],
 ]
 WRONG = {
-    "env.hazard_num=3": r"no key 'hazard_num'\. Nearest: 'env\.hazards_num'",
-    "frmaes=3": "no key 'frmaes'. Nearest: 'frames'",
-    "presett=paper": "Nearest: 'preset'",
-    "policy_update.target_kll=1": "Nearest: 'target_kl'",
-    "env=PointGaol1": "no env 'PointGaol1'. Nearest: 'PointGoal1'",
-    "env=CarGoal1,CarGaol2": "no env 'CarGaol2'. Nearest: 'CarGoal2'",
-    "algo=cop": "no algo 'cop'. Nearest: 'cpo'",
-    "preset=papers": "Nearest: 'paper'",
+    "env.hazard_num=3": r"no key 'hazard_num'\. Did you mean 'env\.hazards_num'",
+    "frmaes=3": "no key 'frmaes'. Did you mean 'frames'",
+    "presett=paper": "Did you mean 'preset'",
+    "policy_update.target_kll=1": "Did you mean 'target_kl'",
+    "env=PointGaol1": "no env 'PointGaol1'. Did you mean 'PointGoal1'",
+    "env=CarGoal1,CarGaol2": "no env 'CarGaol2'. Did you mean 'CarGoal2'",
+    "algo=cop": "no algo 'cop'. Did you mean 'cpo'",
+    "preset=papers": "Did you mean 'paper'",
     "cost_limits.cost=10": r"cost_limits='\{cost: 10\}'",
 }
 

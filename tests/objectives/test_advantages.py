@@ -193,7 +193,7 @@ def test_errors_say_what_to_change():
         ["cost_hazard"], make_critic("cost_value"), value_target="return_to_go", **settings
     )
     rollout = make_rollout([], costs=("cost_hazards", "cost_vases"))
-    with pytest.raises(KeyError, match=r"Nearest key: \('next', 'cost_hazards'\)"):
+    with pytest.raises(KeyError, match=r"Did you mean \('next', 'cost_hazards'\)"):
         cost(rollout)
     cost.set_keys(reward=["cost_hazards", "cost_vases"])
     with pytest.raises(ValueError, match="one output per signal"):

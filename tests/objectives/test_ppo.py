@@ -232,7 +232,7 @@ def test_errors_say_what_to_change():
         loss(batch.clone().set("action_log_prob", batch["action_log_prob"].unsqueeze(-1)))
     with pytest.raises(ValueError, match=r"expected \(16, 1\)"):
         loss(batch.clone().set("advantage", torch.zeros(16)))
-    with pytest.raises(KeyError, match="Nearest key: 'advantages'"):
+    with pytest.raises(KeyError, match="Did you mean 'advantages'"):
         loss(batch.clone().rename_key_("advantage", "advantages"))
     with pytest.raises(ValueError, match="not an accepted tensordict key"):
         loss.set_keys(costs="cost_advantage")

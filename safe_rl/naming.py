@@ -1,0 +1,35 @@
+"""The known name that is most like a wrong one: what errors about names end with."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from difflib import get_close_matches
+
+__all__ = ["did_you_mean", "nearest"]
+
+_LIKENESS = 0.5
+"""Ratio of difflib's below which two names have nothing to do with each other."""
+
+
+def nearest(name: str, known: Iterable[str]) -> str | None:
+    """Return the known name most like `name`, or None if none is like it.
+
+    Examples:
+        >>> nearest("hazard_num", ["hazards_num", "vases_num"])
+        'hazards_num'
+        >>> nearest("zzz", ["hazards_num"]) is None
+        True
+    """
+    close = get_close_matches(name, list(known), n=1, cutoff=_LIKENESS)
+    return close[0] if close else None
+
+
+def did_you_mean(name: str, known: Iterable[str]) -> str:
+    """Return a sentence to append to an error, with its space, or nothing if no name is like it.
+
+    Examples:
+        >>> did_you_mean("cop", ["cpo", "ppo"])
+        " Did you mean 'cpo'?"
+    """
+    close = nearest(name, known)
+    return "" if close is None else f" Did you mean '{close}'?"

@@ -1,0 +1,28 @@
+"""One function says which name was meant, and nothing else in the package looks for one."""
+
+from pathlib import Path
+
+import pytest
+
+from safe_rl.naming import did_you_mean, nearest
+
+PACKAGE = Path(__file__).parents[1] / "safe_rl"
+
+
+@pytest.mark.parametrize(
+    ("name", "known", "meant"),
+    [
+        ("hazard_num", ["vases_num", "hazards_num"], "hazards_num"),
+        ("cop", ["ppo", "cpo"], "cpo"),
+        ("zzz", ["hazards_num"], None),
+        ("anything", [], None),
+    ],
+)
+def test_the_name_that_was_meant(name, known, meant):
+    assert nearest(name, known) == meant
+    assert did_you_mean(name, known) == (f" Did you mean '{meant}'?" if meant else "")
+
+
+def test_nothing_else_looks_for_names():
+    copies = [path for path in PACKAGE.rglob("*.py") if "difflib" in path.read_text()]
+    assert copies == [PACKAGE / "naming.py"]
