@@ -1,0 +1,191 @@
+"""Upper confidence bounds of what a policy costs, and which of several policies keeps its limits.
+
+A mean below its limit on the episodes that a policy was chosen by says little: the luckiest of many
+was chosen. Here policies are ranked on one half of the episodes and tested on the other, at a level
+that is shared out among the tests.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from statistics import NormalDist
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy import stats
+
+__all__ = ["Claim", "Verdict", "first_certified", "mean_bound", "rank", "share_bound"]
+
+
+def mean_bound(values: ArrayLike, level: float) -> np.ndarray:
+    """Upper confidence bound of the mean of a distribution that may have a heavy right tail.
+
+    x̄ + (t + γ (1 + 2 t²) / (6 √n)) s / √n, with Student's quantile t and the skewness γ where it is
+    positive (Chen, "Testing the mean of skewed distributions", 1995): episode costs are skewed, and
+    Student's bound alone falls below their mean too often. A sample underestimates the skewness of
+    a heavy tail; γ is twice the sample's, with which lognormal costs (σ = 0.9) keep the level too.
+
+    Args:
+        values: Independent values, shape [..., n].
+        level: Confidence, in (0.5, 1).
+
+    Returns:
+        The bound, shape [...]; infinite for fewer than two values.
+
+    Examples:
+        >>> float(mean_bound([20.0, 22.0, 24.0, 26.0], level=0.95).round(2))
+        26.04
+    """
+    values = np.asarray(values, dtype=float)
+    number = values.shape[-1]
+    if number < 2:
+        return np.full(values.shape[:-1], np.inf)
+    mean, spread = values.mean(-1), values.std(-1, ddof=1)
+    cubes = ((values - mean[..., np.newaxis]) ** 3).mean(-1)
+    sample = np.divide(cubes, spread**3, out=np.zeros_like(mean), where=spread > 0)
+    quantile = stats.t.ppf(level, number - 1)
+    correction = 2 * sample.clip(0) * (1 + 2 * quantile**2) / (6 * np.sqrt(number))
+    return mean + (quantile + correction) * spread / np.sqrt(number)
+
+
+def share_bound(values: ArrayLike, limit: float, level: float) -> float:
+    """Upper confidence bound of P(value > limit), exact (Clopper and Pearson 1934).
+
+    Examples:
+        >>> round(share_bound([1.0] * 59, limit=2.0, level=0.95), 3)  # none of 59: below 5 %
+        0.05
+    """
+    values = np.asarray(values, dtype=float)
+    over, number = int((values > limit).sum()), len(values)
+    if over == number:
+        return 1.0
+    return float(stats.beta.ppf(level, over + 1, number - over))
+
+
+@dataclass(frozen=True)
+class Claim:
+    """What is to be certified of a policy's episode costs.
+
+    Attributes:
+        limits: Cost key -> d, of the mean cost per episode.
+        most_over: Largest share of episodes that may cost more than d; 1 asks for nothing.
+        level: Confidence of the whole statement.
+
+    Examples:
+        >>> Claim({"cost": 25.0}).shortfalls({"cost": [20.0, 21.0, 22.0, 20.0]}, tests=1)
+        {}
+    """
+
+    limits: Mapping[str, float]
+    most_over: float = 1.0
+    level: float = 0.95
+
+    def bounds(self, costs: Mapping[str, ArrayLike], tests: int) -> dict[str, tuple[float, float]]:
+        """Every upper confidence bound beside what it has to keep, by name.
+
+        Args:
+            costs: Cost key -> episode costs, [E].
+            tests: Policies tested at most; together with the bounds of a policy they share the
+                error (Bonferroni).
+        """
+        asks_for_shares = self.most_over < 1
+        number = tests * len(self.limits) * (2 if asks_for_shares else 1)
+        level = 1 - (1 - self.level) / max(1, number)
+        bounds = {
+            f"mean_{k}": (float(mean_bound(costs[k], level)), d) for k, d in self.limits.items()
+        }
+        if asks_for_shares:
+            bounds |= {
+                f"over_limit_{key}": (share_bound(costs[key], limit, level), self.most_over)
+                for key, limit in self.limits.items()
+            }
+        return bounds
+
+    def shortfalls(self, costs: Mapping[str, ArrayLike], tests: int) -> dict[str, float]:
+        """By how much bounds exceed what they have to keep; empty if the claim is certified."""
+        bounds = self.bounds(costs, tests)
+        return {name: bound - most for name, (bound, most) in bounds.items() if bound > most}
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """What became of the candidates.
+
+    Attributes:
+        certified: Number of the policy that is certified, or None.
+        tested: Numbers of the policies that were tested, in this order.
+        bounds: Of the policy tested last: name -> (bound, what it has to keep).
+        shortfalls: Of the policy that fell short least, if none is certified.
+    """
+
+    certified: int | None
+    tested: list[int]
+    bounds: dict[str, tuple[float, float]] = field(default_factory=dict)
+    shortfalls: dict[str, float] = field(default_factory=dict)
+
+
+def rank(
+    returns: Sequence[ArrayLike], costs: Sequence[Mapping[str, ArrayLike]], claim: Claim
+) -> list[int]:
+    """Order candidates for the tests: those likely to pass by return, then the others by cost.
+
+    Likely is a policy whose mean costs on these episodes are within the limits by a standard error
+    of two, one for the ranking's episodes and one for as many of the test.
+
+    Args:
+        returns: Episode returns of every candidate.
+        costs: Cost key -> episode costs, of every candidate.
+        claim: What is to be certified.
+    """
+
+    def key(candidate: int) -> tuple[bool, float]:
+        excess = max(_expected_excess(costs[candidate], claim), default=0.0)
+        return (excess > 0, excess if excess > 0 else -float(np.mean(returns[candidate])))
+
+    return sorted(range(len(returns)), key=key)
+
+
+def _expected_excess(costs: Mapping[str, ArrayLike], claim: Claim) -> list[float]:
+    """Mean cost plus two standard errors, over the limit in units of it, for every limit."""
+    excesses = []
+    for name, limit in claim.limits.items():
+        values = np.asarray(costs[name], dtype=float)
+        error = values.std(ddof=1) / np.sqrt(len(values)) if len(values) > 1 else 0.0
+        quantile = NormalDist().inv_cdf(claim.level)
+        excesses.append((values.mean() + quantile * error - limit) / max(limit, 1.0))
+    return excesses
+
+
+def first_certified(
+    order: Sequence[int],
+    collect: Callable[[int], Mapping[str, ArrayLike]],
+    claim: Claim,
+    tests: int,
+) -> Verdict:
+    """Test candidates in order on fresh episodes until one is certified.
+
+    Args:
+        order: Numbers of the candidates, from :func:`rank`.
+        collect: Episode costs of a candidate that had no part in the order.
+        claim: What is to be certified.
+        tests: Candidates tested at most: the fewer, the sharper each test.
+
+    Examples:
+        >>> costs = [[26.0, 30.0, 31.0], [15.0, 16.0, 14.0]]
+        >>> collect = lambda number: {"cost": costs[number]}
+        >>> first_certified([0, 1], collect, Claim({"cost": 25.0}), tests=2).certified
+        1
+    """
+    nearest: tuple[float, dict[str, float]] = (float("inf"), {})
+    tested: list[int] = []
+    bounds: dict[str, tuple[float, float]] = {}
+    for candidate in order[:tests]:
+        costs = collect(candidate)
+        tested.append(candidate)
+        bounds = claim.bounds(costs, tests)
+        missing = claim.shortfalls(costs, tests)
+        if not missing:
+            return Verdict(candidate, tested, bounds)
+        nearest = min(nearest, (max(missing.values()), missing), key=lambda pair: pair[0])
+    return Verdict(None, tested, bounds, nearest[1])

@@ -1,0 +1,96 @@
+"""Certificates: how often they are wrong, on distributions whose means are known."""
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from safe_rl.scores.certificate import Claim, first_certified, mean_bound, rank, share_bound
+
+LEVEL = 0.95
+# as episode costs are: counts, many zeros, tails of several times the limit
+DISTRIBUTIONS = {
+    "poisson": stats.poisson(25),
+    "geometric": stats.geom(1 / 25),
+    "gamma": stats.gamma(0.6, scale=25 / 0.6),
+    "lognormal": stats.lognorm(0.9, scale=25 / np.exp(0.9**2 / 2)),
+    "normal": stats.norm(25, 8),
+}
+
+
+@pytest.mark.parametrize("name", DISTRIBUTIONS)
+@pytest.mark.parametrize("number", [100, 250])
+def test_bounds_of_means_are_below_them_in_one_case_of_twenty(name, number):
+    draws = DISTRIBUTIONS[name].rvs((2000, number), random_state=1)
+    wrong = np.mean(mean_bound(draws, LEVEL) < DISTRIBUTIONS[name].mean())
+    # three standard errors of the 2000 draws above 5 %
+    assert wrong < 0.05 + 3 * np.sqrt(0.05 * 0.95 / 2000)
+
+
+def test_the_correction_is_for_skewed_costs_only():
+    symmetric = np.array([10.0, 20.0, 30.0, 40.0])
+    student = symmetric.mean() + stats.t.ppf(LEVEL, 3) * symmetric.std(ddof=1) / 2
+    assert mean_bound(symmetric, LEVEL) == pytest.approx(student)
+    skewed = np.array([0.0, 0.0, 0.0, 100.0])
+    student = skewed.mean() + stats.t.ppf(LEVEL, 3) * skewed.std(ddof=1) / 2
+    assert mean_bound(skewed, LEVEL) > student
+
+
+def test_students_bound_alone_would_be_wrong_too_often():
+    """What the correction is for: without it, this test's counterpart above fails."""
+    gamma = DISTRIBUTIONS["gamma"]
+    draws = gamma.rvs((2000, 100), random_state=1)
+    errors = draws.std(1, ddof=1) / 10
+    wrong = np.mean(draws.mean(1) + stats.t.ppf(LEVEL, 99) * errors < gamma.mean())
+    assert wrong > 0.05 + 2 * np.sqrt(0.05 * 0.95 / 2000)
+
+
+def test_bounds_of_shares_are_those_of_the_exact_test():
+    values = np.r_[np.full(37, 30.0), np.full(163, 10.0)]
+    exact = stats.binomtest(37, 200).proportion_ci(0.9, method="exact").high
+    assert share_bound(values, 25.0, LEVEL) == pytest.approx(exact)
+    assert share_bound(np.full(5, 30.0), 25.0, LEVEL) == 1.0
+
+
+def certify(rng, means, claim, number=250, tests=3):
+    """The whole procedure on policies with geometric costs; returns the one that is certified."""
+    draw = lambda mean: rng.geometric(1 / mean, number).astype(float)  # noqa: E731
+    first = [{"cost": draw(mean)} for mean in means]
+    returns = [np.full(number, mean) for mean in means]  # who costs more gets more
+    order = rank(returns, first, claim)
+    return first_certified(order, lambda k: {"cost": draw(means[k])}, claim, tests)
+
+
+def test_of_many_policies_above_the_limit_hardly_ever_one_is_certified():
+    rng, claim = np.random.default_rng(0), Claim({"cost": 25.0}, level=LEVEL)
+    wrong = np.mean([certify(rng, [25.5] * 8, claim).certified is not None for _ in range(600)])
+    assert wrong < 0.05
+
+
+def test_the_best_policy_that_keeps_the_limit_is_named():
+    rng, claim = np.random.default_rng(0), Claim({"cost": 25.0}, level=LEVEL)
+    found = [certify(rng, [10.0, 16.0, 24.8, 40.0], claim).certified for _ in range(100)]
+    assert found.count(1) > 90
+    assert 3 not in found
+
+
+def test_none_is_named_where_none_keeps_the_limit_and_by_how_much():
+    rng, claim = np.random.default_rng(0), Claim({"cost": 25.0}, level=LEVEL)
+    verdict = certify(rng, [40.0, 32.0, 60.0], claim)
+    assert verdict.certified is None
+    assert verdict.tested[0] == 1
+    assert 5 < verdict.shortfalls["mean_cost"] < 15
+
+
+def test_shares_of_episodes_can_be_asked_for():
+    costs = {"cost": np.r_[np.zeros(150), np.full(100, 30.0)]}  # mean 12, two fifths over 25
+    assert not Claim({"cost": 25.0}).shortfalls(costs, tests=1)
+    assert list(Claim({"cost": 25.0}, most_over=0.3).shortfalls(costs, tests=1)) == [
+        "over_limit_cost"
+    ]
+    assert not Claim({"cost": 25.0}, most_over=0.5).shortfalls(costs, tests=1)
+
+
+def test_every_limit_has_to_be_kept():
+    costs = {"cost": np.full(50, 10.0), "cost_hazards": np.full(50, 6.0)}
+    claim = Claim({"cost": 25.0, "cost_hazards": 5.0})
+    assert claim.shortfalls(costs, tests=1) == {"mean_cost_hazards": pytest.approx(1.0)}
