@@ -20,7 +20,7 @@ from omegaconf import DictConfig, ListConfig, OmegaConf
 
 from safe_rl.naming import did_you_mean
 
-__all__ = ["TargetError", "allow", "build", "locate"]
+__all__ = ["TargetError", "allow", "build", "locate", "present_name"]
 
 # Rooms whose public classes and functions are parts of a run. Others hold commands, which write
 # files and import modules.
@@ -56,6 +56,16 @@ def allow(module: str) -> None:
         Fraction(3, 4)
     """
     _users_modules.add(module)
+
+
+def present_name(target: str) -> str:
+    """What a target is called now, of which an earlier run may know another name.
+
+    Examples:
+        >>> present_name("safe_rl.objectives.CPOStep")
+        'safe_rl.algorithms.CPOStep'
+    """
+    return _RENAMED.get(target, target)
 
 
 def build(node: DictConfig | Mapping[str, Any] | None, /, **objects: Any) -> Any:
@@ -116,7 +126,7 @@ def locate(target: Any, key: str = "") -> Callable[..., Any]:
         safe_rl.targets.TargetError: loss._target_=torch.load: configurations reach only parts of safe_rl, torch.optim and modules of yours. If you trust 'torch', add import=torch to the command.
     """  # noqa: E501
     shown = f"{key}={target}" if key else f"{target}"
-    name = _RENAMED.get(str(target), str(target))
+    name = present_name(str(target))
     root = next((root for root in _roots() if _is_inside(name, root) and name != root), None)
     if root is None:
         module = name.rpartition(".")[0] or name
@@ -148,7 +158,7 @@ def _checked(node: Any, key: str) -> Any:
     copied = {name: _checked(value, _join(key, str(name))) for name, value in node.items()}
     if "_target_" in copied:
         locate(copied["_target_"], _join(key, "_target_"))
-        copied["_target_"] = _RENAMED.get(copied["_target_"], copied["_target_"])
+        copied["_target_"] = present_name(copied["_target_"])
     return copied
 
 

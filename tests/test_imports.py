@@ -80,9 +80,9 @@ FLOORS = {
         ("",),
     ),
     "runs": (
-        ("archive", "curves", "files", "loggers", "table"),
-        ("checkpoints", "folder"),
-        ("resuming",),
+        ("archive", "files", "folder", "outcome"),
+        ("checkpoints", "curves", "identity", "lock", "loggers", "table"),
+        ("record", "resuming"),
         ("",),
     ),
     "training": (("interrupts", "state", "transfer"), ("trainer",), ("",)),

@@ -17,9 +17,9 @@ from hydra.core.utils import JobReturn, JobStatus
 from hydra.experimental.callback import Callback
 from omegaconf import DictConfig
 
-__all__ = ["SweepReport", "count_jobs", "threads_per_job"]
+from safe_rl.runs.folder import RunFolder
 
-FAILURE_FILE = "failure.txt"
+__all__ = ["SweepReport", "count_jobs", "threads_per_job"]
 
 
 def count_jobs(overrides: Sequence[str]) -> int:
@@ -87,7 +87,7 @@ class SweepReport(Callback):
         """Note how a job has ended, and take its error out of the way of the others."""
         if self._journal is None:
             return
-        failure = Path(config.hydra.runtime.output_dir) / FAILURE_FILE
+        failure = RunFolder(Path(config.hydra.runtime.output_dir)).failure
         failure.unlink(missing_ok=True)
         if job_return.status is not JobStatus.FAILED:
             self._note(config, "done")
@@ -123,7 +123,8 @@ class SweepReport(Callback):
         print(f"Sweep: {len(done)} of {self._num_jobs} runs are finished.")
         for note in last.values():
             if note["event"] == "failed":
-                print(f"  failed: {note['directory']}: {note['error']} (see {FAILURE_FILE} there)")
+                file = RunFolder(Path(note["directory"])).failure.name
+                print(f"  failed: {note['directory']}: {note['error']} (see {file} there)")
             if note["event"] == "begun":
                 print(f"  interrupted: {note['directory']}")
         if len(done) < self._num_jobs:

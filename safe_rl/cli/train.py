@@ -46,7 +46,7 @@ def prepare(config: DictConfig, directory: Path, continues: bool) -> Trainer | N
     if continues and trainer.resume():
         print(f"Going on after {trainer.progress.steps:,} of {config.frames:,} frames.")
         return trainer
-    if continues and trainer.folder.holds_run:
+    if continues and trainer.folder.files.num_rows:
         print("No checkpoint was written yet: starting over, with a new progress.csv.")
     if config.init_from is not None:
         algorithm = trainer.algorithm

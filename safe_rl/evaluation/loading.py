@@ -15,8 +15,9 @@ from torchrl.envs import EnvBase
 from safe_rl.algorithms.parts import find_recipe
 from safe_rl.runs.checkpoints import CheckpointStore
 from safe_rl.runs.files import read_config
+from safe_rl.runs.folder import KINDS, RunFolder
 
-__all__ = ["checkpoint_steps", "find_checkpoint", "load_config", "load_policy", "override_env"]
+__all__ = ["find_checkpoint", "load_config", "load_policy", "override_env"]
 
 
 def load_config(directory: Path) -> DictConfig:
@@ -26,16 +27,13 @@ def load_config(directory: Path) -> DictConfig:
         FileNotFoundError: If the folder is not that of a run; runs below it are named.
         ValueError: If the configuration is not that of a run, or not resolved.
     """
-    path = directory / "config.yaml"
-    if not path.is_file():
-        below = sorted({table.parent for table in directory.glob("**/progress.csv")})
-        hint = f" Runs below it: {', '.join(map(str, below[:5]))}." if below else ""
-        raise FileNotFoundError(f"{directory} is not the folder of a run: no config.yaml.{hint}")
-    config = read_config(path)
+    run = RunFolder(directory)
+    run.check_is_run()
+    config = read_config(run.config)
     missing = {"env", "algo", "seed", "cost_limits"} - set(config)
     if missing or not isinstance(config["env"], dict):
         lacking = ", ".join(sorted(missing)) or "the keys of 'env'"
-        raise ValueError(f"{path} is not the configuration of a run: it lacks {lacking}.")
+        raise ValueError(f"{run.config} is not the configuration of a run: it lacks {lacking}.")
     return OmegaConf.create(config)
 
 
@@ -54,18 +52,14 @@ def find_checkpoint(directory: Path, which: str) -> Path:
     Raises:
         FileNotFoundError: If there is none; the message says why and what there is.
     """
-    kinds = ("last", "best")
-    if which not in kinds:
+    if which not in KINDS:
         if not Path(which).exists():
             raise FileNotFoundError(
                 f"There is no checkpoint '{which}': checkpoint is last, best or the path of a file."
             )
         return Path(which)
-    # the newest by name, readable or not: an older one is not silently put in its place
-    found = {
-        kind: max((directory / "checkpoints" / kind).glob("checkpoint-*"), default=None)
-        for kind in kinds
-    }
+    # readable or not: an older one is not silently put in its place
+    found = {kind: RunFolder(directory).newest_checkpoint(kind) for kind in KINDS}
     path = found.pop(which)
     if path is None:
         reason = {"last": "it has not saved one yet", "best": "no epoch kept every cost limit"}
@@ -73,12 +67,6 @@ def find_checkpoint(directory: Path, which: str) -> Path:
         hint = f" Use {others[0]}." if others else ""
         raise FileNotFoundError(f"{directory} has no {which} checkpoint: {reason[which]}.{hint}")
     return path
-
-
-def checkpoint_steps(checkpoint: Path) -> int | None:
-    """Environment steps that a checkpoint's name carries, if it does."""
-    number = checkpoint.stem.rpartition("-")[2]
-    return int(number) if number.isdigit() else None
 
 
 def load_policy(

@@ -13,16 +13,11 @@ from torchrl.envs import EnvBase
 
 from safe_rl.evaluation.episodes import collect_episodes
 from safe_rl.evaluation.layouts import default_seed, shared_layouts
-from safe_rl.evaluation.loading import (
-    checkpoint_steps,
-    find_checkpoint,
-    load_config,
-    load_policy,
-    override_env,
-)
+from safe_rl.evaluation.loading import find_checkpoint, load_config, load_policy, override_env
 from safe_rl.evaluation.settings import EvaluationOptions, check_options
 from safe_rl.evaluation.summary import summarise, write_episodes, write_summary
 from safe_rl.evaluation.video import check_camera, record_episode, write_video
+from safe_rl.runs.folder import RunFolder, checkpoint_steps
 from safe_rl.scores.benchmark import Suite
 from safe_rl.scores.intervals import LEVEL, Estimate
 
@@ -96,8 +91,8 @@ def evaluate(
     reference = suite.reference(node, but_for=_LAYOUTS)
     estimates = summarise(episodes, limits, reference, options.cvar_alpha)
     facts = _facts(directory, config, checkpoint, options, node, seed) | {"cost_limits": limits}
-    stem = "_".join(filter(None, ("evaluation", options.name)))
-    files = [directory / f"{stem}.{suffix}" for suffix in ("json", "csv", "mp4")]
+    run = RunFolder(directory)
+    files = [run.evaluation(options.name, suffix) for suffix in ("json", "csv", "mp4")]
     write_summary(files[0], facts, estimates)
     write_episodes(files[1], episodes)
     if not options.video:

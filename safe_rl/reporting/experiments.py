@@ -8,7 +8,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from safe_rl.reporting.runs import Run, split_source, without_repetitions
+from safe_rl.reporting.runs import Run, without_repetitions
+from safe_rl.runs.folder import common_source
 from safe_rl.scores.published import ALGORITHMS, COST_LIMIT, REFERENCE, Scores
 
 __all__ = [
@@ -223,7 +224,7 @@ def _learning_settings(run: Run) -> Settings:
         if key.partition(".")[0] not in {"env", *MANNER} and not key.endswith(".compile")
     }
     if run.init_from is not None:
-        settings["init_from"] = _common_source(run.init_from)
+        settings["init_from"] = common_source(str(run.init_from))
     return _without_presets_for_robots(settings, run)
 
 
@@ -236,17 +237,6 @@ def _without_presets_for_robots(settings: Settings, run: Run) -> Settings:
         return next((settings[place] for place in places if place in settings), None)
 
     return {key: value for key, value in settings.items() if value != of_robot(key)}
-
-
-def _common_source(source: Path) -> str:
-    """What ``init_from`` is alike in over seeds, each of which starts from a run of its own."""
-    folder, steps = split_source(source)
-    if steps is None:
-        return str(folder.parent)
-    checkpoint = source.relative_to(folder)
-    # the best one comes after other steps in every seed
-    is_best = checkpoint.parent.name == "best"
-    return str(folder.parent / "*" / (checkpoint.parent if is_best else checkpoint))
 
 
 def _in_brackets(settings: Mapping[str, Hashable]) -> str:

@@ -4,22 +4,21 @@ from __future__ import annotations
 
 import json
 import math
-import re
 import shlex
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 from yaml import YAMLError
 
-from safe_rl.runs.folder import FINAL_EPOCHS, final_figures
+from safe_rl.runs.folder import RunFolder, runs_below
+from safe_rl.runs.outcome import final_figures, judges_another_measure, violation
 from safe_rl.runs.table import read_table
 
-__all__ = ["Run", "find_runs", "read_run", "split_source", "without_repetitions"]
+__all__ = ["Run", "find_runs", "read_run", "without_repetitions"]
 
 
 @dataclass(frozen=True)
@@ -82,7 +81,7 @@ class Run:
     @property
     def overrides(self) -> list[str] | None:
         """What its command line said, if Hydra has recorded it."""
-        path = self.directory / ".hydra" / "overrides.yaml"
+        path = RunFolder(self.directory).overrides
         return [str(override) for override in OmegaConf.load(path)] if path.is_file() else None
 
     @property
@@ -102,32 +101,16 @@ class Run:
         return final_figures(self.table, cost_keys)
 
     def excess(self, key: str) -> float:
-        """What the limit of a cost judges, minus d: a mean over the last five epochs.
-
-        That is J_c − d unless the run's table has a column ``violation_<key>``: an algorithm that
-        limits another measure than the mean cost says there what it holds against d.
-        """
-        finished = np.isfinite(self.table["episode_return"])
-        column = np.array(self.table.get(f"violation_{key}", np.full(finished.shape, math.nan)))
-        last = column[finished][-FINAL_EPOCHS:]
-        known = last[np.isfinite(last)]
-        if known.size:
-            return float(known.mean())
-        return self.final([key])[f"episode_{key}"] - self.limits[key]
+        """What the limit of a cost judges, minus d: a mean over the last five epochs."""
+        return violation(self.final([key]), key, self.limits[key])
 
     def limits_another_measure(self, key: str) -> bool:
         """Whether the limit of a cost is on something else than the mean cost of an episode."""
-        columns = (self.table.get(f"{name}_{key}") for name in ("violation", "episode"))
-        violation, cost = (np.array([] if column is None else column) for column in columns)
-        if not (violation.size and cost.size):
-            return False
-        # columns may come from single precision
-        difference = np.abs(violation - (cost - self.limits[key]))
-        return bool(np.any(difference > 1e-4 * (1 + np.abs(cost) + abs(self.limits[key]))))
+        return judges_another_measure(self.table, key, self.limits[key])
 
     def evaluations(self) -> Iterator[dict[str, Any]]:
         """What :mod:`safe_rl.evaluate` has written into its folder."""
-        for path in sorted(self.directory.glob("evaluation*.json")):
+        for path in RunFolder(self.directory).evaluations():
             content = json.loads(path.read_text())
             if "estimates" in content:
                 yield content
@@ -152,14 +135,12 @@ def find_runs(root: Path, *, unfinished: bool = False) -> tuple[list[Run], dict[
         )
     runs: list[Run] = []
     skipped: dict[Path, str] = {}
-    for path in sorted(root.rglob("config.yaml")):
-        if path.parent.name == ".hydra":
-            continue
-        outcome = read_run(path.parent, unfinished=unfinished)
+    for folder in runs_below(root):
+        outcome = read_run(folder.directory, unfinished=unfinished)
         if isinstance(outcome, Run):
             runs.append(outcome)
         else:
-            skipped[path.parent] = outcome
+            skipped[folder.directory] = outcome
     if not runs:
         reasons = "".join(f"\n  {path}: {reason}" for path, reason in skipped.items())
         raise FileNotFoundError(
@@ -176,36 +157,23 @@ def read_run(directory: Path, *, unfinished: bool = False) -> Run | str:
         directory: Its folder, which holds a ``config.yaml``.
         unfinished: Whether it counts as finished before its configured end.
     """
+    folder = RunFolder(directory)
     try:
-        config = OmegaConf.to_container(OmegaConf.load(directory / "config.yaml"), resolve=True)
+        config = OmegaConf.to_container(OmegaConf.load(folder.config), resolve=True)
     except (YAMLError, OmegaConfBaseException, UnicodeDecodeError) as error:
         return f"config.yaml cannot be read ({str(error).splitlines()[0]})"
     needed = {"env", "algo", "seed", "cost_limits", "frames"}
     if not isinstance(config, dict) or not needed <= set(config):
         return "config.yaml is not that of a run"
-    if not (directory / "progress.csv").is_file():
+    if not folder.has_begun:
         return "it has not begun: no progress.csv"
     try:
-        table = read_table(directory / "progress.csv")
+        table = read_table(folder.table)
     except ValueError as error:
         return f"progress.csv cannot be read ({error})"
     if not table.get("steps"):
         return "it has not finished an epoch"
     return Run(directory, config, table, 0 if unfinished else config["frames"])  # type: ignore[arg-type]
-
-
-def split_source(source: Path) -> tuple[Path, int | None]:
-    """Folder of the run that ``init_from`` names, and steps of the checkpoint if it names one.
-
-    Examples:
-        >>> folder, steps = split_source(Path("a/checkpoints/best/checkpoint-000000003000.torchrl"))
-        >>> folder.name, steps
-        ('a', 3000)
-    """
-    match = re.fullmatch(r"checkpoint-(\d+)\.torchrl", source.name)
-    if match is None or len(source.parents) < 3:
-        return source, None
-    return source.parents[2], int(match.group(1))
 
 
 def without_repetitions(runs: list[Run]) -> tuple[list[Run], dict[Path, str]]:
@@ -232,5 +200,5 @@ def without_repetitions(runs: list[Run]) -> tuple[list[Run], dict[Path, str]]:
 
 
 def _modified(run: Run) -> float:
-    path = run.directory / "progress.csv"
+    path = RunFolder(run.directory).table
     return path.stat().st_mtime if path.exists() else math.nan

@@ -11,8 +11,9 @@ from typing import Any, NamedTuple
 from omegaconf import OmegaConf
 
 from safe_rl.reporting.experiments import Experiment, environment_names
-from safe_rl.reporting.runs import Run, read_run, split_source
+from safe_rl.reporting.runs import Run, read_run
 from safe_rl.runs.checkpoints import CheckpointStore
+from safe_rl.runs.folder import RunFolder, run_of
 from safe_rl.scores.published import ALGORITHMS
 
 __all__ = ["Transfer", "find_transfers"]
@@ -138,12 +139,12 @@ def _origin(run: Run, known: Mapping[Path, Run]) -> _Origin | None:
     that is where its table ends.
     """
     for source in _places(run):
-        folder, steps = split_source(source)
+        folder, steps = run_of(source)
         outcome = known.get(folder)
-        if outcome is None and (folder / "config.yaml").is_file():
+        if outcome is None and RunFolder(folder).is_run:
             outcome = _read(folder)
         if outcome is not None and folder != run.directory.resolve():
-            newest = CheckpointStore.newest_step(folder / "checkpoints")
+            newest = CheckpointStore.newest_step(RunFolder(folder).checkpoints)
             origin = _Origin(outcome, steps or newest or outcome.steps)
             # a table that begins after the checkpoint is another run's
             return origin if outcome.table["steps"][0] <= origin.steps else None
@@ -162,7 +163,7 @@ def _places(run: Run) -> Iterator[Path]:
     upwards, then from the current one.
     """
     assert run.init_from is not None
-    record = run.directory / ".hydra" / "hydra.yaml"
+    record = RunFolder(run.directory).surroundings
     if record.is_file():
         directory = OmegaConf.select(OmegaConf.load(record), "hydra.runtime.cwd")
         if directory is not None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import re
 import shutil
 import warnings
 from collections.abc import Mapping
@@ -14,28 +13,9 @@ from torchrl.checkpoint import CheckpointError
 
 from safe_rl.algorithms.contract import Stateful
 from safe_rl.runs.archive import read_facts, restore, writer
+from safe_rl.runs.folder import checkpoint_name, checkpoint_steps, checkpoints_in
 
-__all__ = ["CheckpointStore", "checkpoint_steps", "checkpoints_in"]
-
-_NAME = re.compile(r"checkpoint-(\d+)\.torchrl")
-
-
-def checkpoint_steps(path: Path) -> int | None:
-    """Environment steps that a checkpoint's name carries, if it is one's name.
-
-    Examples:
-        >>> checkpoint_steps(Path("last/checkpoint-000000000300.torchrl"))
-        300
-    """
-    match = _NAME.fullmatch(path.name)
-    return None if match is None else int(match.group(1))
-
-
-def checkpoints_in(directory: Path) -> list[Path]:
-    """Checkpoints in a folder by ascending steps, readable or not; none if there is no folder."""
-    found = directory.iterdir() if directory.is_dir() else ()
-    steps = {path: checkpoint_steps(path) for path in found}
-    return sorted((path for path in steps if steps[path] is not None), key=lambda p: steps[p] or 0)
+__all__ = ["CheckpointStore"]
 
 
 class CheckpointStore:
@@ -77,8 +57,15 @@ class CheckpointStore:
         self.best = Path(directory) / "best"
         self._components = dict(components)
         self._writer = writer(components)
+        # there until the first checkpoint is: who finds neither knows that something is missing
+        self._none_yet = self.last / "none-yet"
         self._keep_last = keep_last
         self._run = dict(run or {})
+
+    def begin(self) -> None:
+        """Note that a run begins, which has no checkpoint yet."""
+        self.last.mkdir(parents=True, exist_ok=True)
+        self._none_yet.touch()
 
     def save(self, steps: int, facts: Mapping[str, Any] | None = None) -> Path:
         """Write a checkpoint and drop the oldest that is too many.
@@ -87,7 +74,9 @@ class CheckpointStore:
             steps: Environment steps so far.
             facts: JSON-compatible facts, readable without loading.
         """
-        return self._save(self.last, steps, facts, self._keep_last)
+        path = self._save(self.last, steps, facts, self._keep_last)
+        self._none_yet.unlink(missing_ok=True)
+        return path
 
     def save_best(self, steps: int, score: float, facts: Mapping[str, Any] | None = None) -> bool:
         """Write a checkpoint if ``score`` is higher than that of the best one.
@@ -111,7 +100,7 @@ class CheckpointStore:
     def _save(
         self, directory: Path, steps: int, facts: Mapping[str, Any] | None, keep: int
     ) -> Path:
-        path = directory / f"checkpoint-{steps:012d}.torchrl"
+        path = directory / checkpoint_name(steps)
         facts = {**(facts or {}), **({"run": self._run} if self._run else {})}
         self._writer.save(path, metadata=facts)
         others = [other for other in checkpoints_in(directory) if other != path]
@@ -119,17 +108,21 @@ class CheckpointStore:
             old.unlink()
         return path
 
-    def resume(self) -> Path | None:
+    def resume(self, epochs: int = 0) -> Path | None:
         """Restore the newest checkpoint, or with a warning the next older one if it is damaged.
 
         The best one goes if it is newer than the restored: what it was the best of is forgotten.
         So do the beginnings of checkpoints during whose writing the run was killed.
 
+        Args:
+            epochs: Rows of the run's table.
+
         Returns:
-            The checkpoint, or None if there is none.
+            The checkpoint, or None if the run was stopped before it had written one.
 
         Raises:
-            CheckpointError: If no checkpoint can be used; the message is about the newest.
+            CheckpointError: If no checkpoint can be used, with a message about the newest; or if
+                the run has finished epochs and its checkpoints are gone.
         """
         _clear_beginnings(self.last)
         failures: list[CheckpointError] = []
@@ -144,6 +137,12 @@ class CheckpointStore:
             break
         if restored is None and failures:
             raise failures[0]
+        if restored is None and epochs and not self._none_yet.exists():
+            raise CheckpointError(
+                f"The checkpoints of {self.last} are gone, and the run has finished {epochs} "
+                "epochs, which starting over would delete. Put the checkpoints back to go on, or "
+                "move the run's folder away to start over."
+            )
         if restored is not None and failures:
             warnings.warn(
                 f"{failures[0]} Going on from the older {restored.name} instead.", stacklevel=2

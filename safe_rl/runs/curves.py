@@ -10,10 +10,13 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter
 
+from safe_rl.runs.files import replacing
+from safe_rl.runs.outcome import FINAL_EPOCHS, judges_another_measure
+
 __all__ = ["draw_learning_curves", "moving_mean", "point_marker"]
 
-SMOOTHING_EPOCHS = 5
-"""Epochs in the moving mean, as many as final figures are averaged over."""
+SMOOTHING_EPOCHS = FINAL_EPOCHS  # so that curves end at the final figures
+"""Epochs in the moving mean."""
 
 
 def draw_learning_curves(
@@ -60,6 +63,9 @@ def draw_learning_curves(
         _draw(costs, steps, table[f"episode_{key}"], colour, key)
         rate = table[f"{key}_rate"]
         rates.plot(steps, rate, color=colour, label=key, marker=point_marker(steps))
+        if key in cost_limits and judges_another_measure(table, key, cost_limits[key]):
+            judged = np.asarray(table[f"violation_{key}"], dtype=float) + cost_limits[key]
+            _draw(costs, steps, judged, f"C{len(cost_limits) + index + 1}", f"{key} as limited")
         if key in cost_limits:
             limit, per_step = cost_limits[key], cost_limits[key] / episode_length
             _draw_limit(costs, limit, colour, f"limit {limit:g}")
@@ -67,9 +73,8 @@ def draw_learning_curves(
     _label(returns, costs, rates)
     figure.suptitle(title)
     # a viewer that watches the file never sees half a picture
-    unfinished = path.with_suffix(".tmp" + path.suffix)
-    figure.savefig(unfinished, dpi=120)
-    unfinished.replace(path)
+    with replacing(path) as unfinished:
+        figure.savefig(unfinished, dpi=120)
 
 
 def _label(returns: Axes, costs: Axes, rates: Axes) -> None:
@@ -91,7 +96,11 @@ def _draw_limit(axes: Axes, height: float, colour: str, label: str) -> None:
 
 
 def _draw(
-    axes: Axes, steps: np.ndarray, values: Sequence[float], colour: str, label: str | None
+    axes: Axes,
+    steps: np.ndarray,
+    values: Sequence[float] | np.ndarray,
+    colour: str,
+    label: str | None,
 ) -> None:
     """Epochs in which an episode finished, and their moving mean."""
     known = np.isfinite(values)

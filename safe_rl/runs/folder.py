@@ -1,194 +1,213 @@
-"""What a run leaves in its folder and shows on the terminal."""
+"""The folder of a run: what lies in it, and where. Nothing else spells these names."""
 
 from __future__ import annotations
 
-import math
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+import re
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
-from omegaconf import DictConfig, OmegaConf
-from tqdm import tqdm
+__all__ = [
+    "KINDS",
+    "RunFolder",
+    "checkpoint_name",
+    "checkpoint_steps",
+    "checkpoints_in",
+    "common_source",
+    "run_of",
+    "runs_below",
+]
 
-from safe_rl.runs.curves import SMOOTHING_EPOCHS, draw_learning_curves
-from safe_rl.runs.table import TableWriter, read_table
-from safe_rl.targets import build
-
-__all__ = ["FINAL_EPOCHS", "RunFolder", "final_figures"]
-
-FINAL_EPOCHS = SMOOTHING_EPOCHS  # so that curves end at the final figures
-"""Epochs over which the final J_r and J_c are averaged (Ray et al. 2019, section 5.1)."""
+_CHECKPOINT = re.compile(r"checkpoint-(\d+)\.torchrl")
+KINDS = ("last", "best")
+"""Folders of checkpoints: the newest few, and the best that kept every limit."""
 
 
+@dataclass(frozen=True)
 class RunFolder:
-    """Configuration, table, logger, learning curves and progress bar of one run.
+    """Where the files of one run are.
 
-    The folder holds ``config.yaml`` (resolved), ``progress.csv`` (a row per epoch), ``curves.png``
-    and what the configured logger writes.
-
-    Args:
-        directory: The folder; made if it does not exist.
-        config: Configuration of the run.
-        cost_limits: Cost key -> d, undiscounted cost per episode.
-        episode_length: T_ep, steps of a full episode.
+    Attributes:
+        directory: The folder, which need not exist.
 
     Examples:
-        >>> import tempfile
-        >>> config = OmegaConf.create({"frames": 200, "logger": {}, "algo": {"name": "ppo"}})
-        >>> folder = RunFolder(Path(tempfile.mkdtemp()), config, {"cost": 25.0}, 1000)
-        >>> row = {"steps": 200, "episode_return": 1.0, "episode_cost": 30.0, "cost_rate": 0.03}
-        >>> with folder.writing():
-        ...     folder.record(row | {"time_total": 2.0})
-        ...     folder.draw_curves()
-        >>> folder.summary().split(" in ")[0]
-        'J_r 1.00, J_c 30.0 (limit 25), ρ_c 0.0300, 100 steps/s'
+        >>> folder = RunFolder(Path("runs/mine"))
+        >>> folder.table.as_posix(), folder.evaluation("many", "json").name
+        ('runs/mine/progress.csv', 'evaluation_many.json')
+        >>> folder.checkpoint("best", 3000).as_posix()
+        'runs/mine/checkpoints/best/checkpoint-000000003000.torchrl'
     """
 
-    def __init__(
-        self,
-        directory: Path,
-        config: DictConfig,
-        cost_limits: Mapping[str, float],
-        episode_length: int,
-    ) -> None:
-        directory.mkdir(parents=True, exist_ok=True)
-        self.directory = directory
-        self._config = config
-        self._cost_limits = dict(cost_limits)
-        self._episode_length = episode_length
+    directory: Path
 
     @property
-    def table_path(self) -> Path:
-        """The CSV file."""
+    def config(self) -> Path:
+        """The resolved configuration."""
+        return self.directory / "config.yaml"
+
+    @property
+    def table(self) -> Path:
+        """A row per epoch."""
         return self.directory / "progress.csv"
 
     @property
-    def holds_run(self) -> bool:
-        """Whether a run has been begun here."""
-        return self.table_path.exists()
+    def curves(self) -> Path:
+        """The picture of its learning curves."""
+        return self.directory / "curves.png"
 
     @property
-    def checkpoint_directory(self) -> Path:
+    def failure(self) -> Path:
+        """What a job of a sweep has failed of."""
+        return self.directory / "failure.txt"
+
+    @property
+    def lock(self) -> Path:
+        """What keeps a second process from writing here."""
+        return self.directory / ".lock"
+
+    @property
+    def writer(self) -> Path:
+        """Who holds the lock."""
+        return self.directory / ".writer.json"
+
+    @property
+    def notes(self) -> Path:
+        """Folder of Hydra's notes."""
+        return self.directory / ".hydra"
+
+    @property
+    def overrides(self) -> Path:
+        """What the command line said."""
+        return self.notes / "overrides.yaml"
+
+    @property
+    def surroundings(self) -> Path:
+        """Hydra's own configuration, with the folder that the run was started in."""
+        return self.notes / "hydra.yaml"
+
+    @property
+    def checkpoints(self) -> Path:
         """Folder of the checkpoints."""
         return self.directory / "checkpoints"
 
-    @contextmanager
-    def writing(self, epoch: int | None = None, steps: int = 0) -> Iterator[None]:
-        """Keep the files open.
+    def checkpoint(self, kind: str, steps: int) -> Path:
+        """The checkpoint of a kind (``last`` or ``best``) after so many environment steps."""
+        return self.checkpoints / kind / checkpoint_name(steps)
 
-        Args:
-            epoch: Epochs that a continued run has behind it; None for a new run.
-            steps: Environment steps that it has behind it.
+    def newest_checkpoint(self, kind: str = "last") -> Path | None:
+        """The checkpoint after most steps, readable or not, if there is one of that kind."""
+        found = checkpoints_in(self.checkpoints / kind)
+        return found[-1] if found else None
+
+    def evaluation(self, name: str, suffix: str) -> Path:
+        """A file of an evaluation: ``json`` for estimates, ``csv`` for episodes, ``mp4``."""
+        return self.directory / f"{'_'.join(filter(None, ('evaluation', name)))}.{suffix}"
+
+    def evaluations(self) -> list[Path]:
+        """The estimates of all evaluations."""
+        return sorted(self.directory.glob("evaluation*.json"))
+
+    def logger_id(self, logger: str) -> Path:
+        """Where the id of this run is kept that a logger's service has given it."""
+        return self.directory / f"{logger}_run_id.txt"
+
+    @property
+    def is_run(self) -> bool:
+        """Whether a run has been set up here."""
+        return self.config.is_file()
+
+    @property
+    def has_begun(self) -> bool:
+        """Whether a run has a table here."""
+        return self.table.exists()
+
+    @property
+    def is_untouched(self) -> bool:
+        """Whether nothing has been written here but what shows who would."""
+        lock = (self.lock.name, self.writer.name)
+        return all(path.name in lock for path in self.directory.iterdir())
+
+    @property
+    def num_rows(self) -> int:
+        """Finished epochs in the table."""
+        try:
+            lines = self.table.read_bytes().count(b"\n")
+        except FileNotFoundError:
+            return 0
+        return max(0, lines - 1)
+
+    def check_is_run(self) -> None:
+        """Refuse a folder that is not a run's.
 
         Raises:
-            FileExistsError: If a new run would overwrite one that is there.
-            ValueError: If the table lacks epochs of the run that is to be continued.
+            FileNotFoundError: Naming runs that are below it.
         """
-        if epoch is None and self.holds_run:
-            raise FileExistsError(
-                f"{self.directory} already holds a run. Continue it with 'python train.py "
-                f"resume={self.directory}', or give this one another folder with hydra.run.dir=..."
-            )
-        self._table = TableWriter(self.table_path, keep_rows=epoch or 0)
-        self._save_config()
-        logger = self._config.logger
-        self._logger = build(logger, log_dir=str(self.directory)) if logger else None
-        continue_from = getattr(self._logger, "continue_from", None)
-        if epoch is not None and continue_from is not None:
-            continue_from(steps)
-        self._bar = tqdm(
-            total=self._config.frames, initial=steps, unit=" steps", unit_scale=True,
-            dynamic_ncols=True, smoothing=0.1,
-        )  # fmt: skip
-        self._shown: dict[str, str] = {}
-        try:
-            yield
-        finally:
-            self._bar.close()
-            self._table.close()
-            close = getattr(self._logger, "close", None)
-            if close is not None:
-                close()
-
-    def _save_config(self) -> None:
-        # replaced in one go: a run killed here can still be continued
-        path = self.directory / "config.tmp"
-        OmegaConf.save(self._config, path, resolve=True)
-        path.replace(self.directory / "config.yaml")
-
-    def record(self, row: Mapping[str, float]) -> None:
-        """Write one epoch to table and logger and show it."""
-        self._table.write(row)
-        if self._logger is not None:
-            for name, value in row.items():
-                if not math.isnan(value):
-                    self._logger.log_scalar(name, value, step=int(row["steps"]))
-        self._shown |= self._postfix(row)
-        self._bar.set_postfix(self._shown, refresh=False)
-        self._bar.update(int(row["steps"]) - self._bar.n)
-
-    def _postfix(self, row: Mapping[str, float]) -> dict[str, str]:
-        """What the bar shows of an epoch: only what is known in it."""
-        shown = {"return": f"{row['episode_return']:.2f}"}
-        for key in self._cost_limits or ["cost"]:
-            limit = f"/{self._cost_limits[key]:g}" if key in self._cost_limits else ""
-            shown[key] = f"{self._measured(row, key):.1f}{limit}"
-        if math.isnan(row["episode_return"]):
-            shown = {}
-        multipliers = [value for name, value in row.items() if name.startswith("multiplier_")]
-        if multipliers:
-            shown["λ"] = " ".join(f"{value:.3g}" for value in multipliers)
-        return shown
-
-    def _measured(self, row: Mapping[str, float], key: str) -> float:
-        """What is held against a limit: the mean episode cost, or the algorithm's own measure."""
-        violation = row.get(f"violation_{key}")
-        return row[f"episode_{key}"] if violation is None else self._cost_limits[key] + violation
-
-    def draw_curves(self) -> None:
-        """Write ``curves.png`` from the table."""
-        table = read_table(self.table_path)
-        config = self._config
-        seed = f"seed {config.seed}" if "seed" in config else ""
-        title = f"{config.get('env', {}).get('name', '')} {config.algo.name} {seed}".strip()
-        path = self.directory / "curves.png"
-        draw_learning_curves(table, self._cost_limits, self._episode_length, path, title)
-
-    def summary(self) -> str:
-        """One line on how the run ended."""
-        keys = list(self._cost_limits) or ["cost"]
-        final = final_figures(read_table(self.table_path), keys)
-        parts = [f"J_r {final['episode_return']:.2f}"]
-        several = len(self._cost_limits) > 1
-        for key in self._cost_limits or ["cost"]:
-            name = f"[{key}]" if several else ""
-            limit = f" (limit {self._cost_limits[key]:g})" if key in self._cost_limits else ""
-            mean, measured = final[f"episode_{key}"], self._measured(final, key)
-            differs = abs(measured - mean) > 0.05  # false without any episode
-            own = f", measured {measured:.1f}" if differs else ""
-            parts.append(f"J_c{name} {mean:.1f}{own}{limit}")
-            parts.append(f"ρ_c{name} {final[f'{key}_rate']:.4f}")  # noqa: RUF001
-        parts.append(f"{final['steps_per_second']:,.0f} steps/s")
-        return f"{', '.join(parts)} in {self.directory}"
+        if self.is_run:
+            return
+        below = [str(run.directory) for run in runs_below(self.directory)[:5]]
+        hint = f" Runs below it: {', '.join(below)}." if below else ""
+        raise FileNotFoundError(
+            f"{self.directory} is not the folder of a run: no {self.config.name}.{hint}"
+        )
 
 
-def final_figures(table: Mapping[str, list[float]], cost_keys: list[str]) -> dict[str, float]:
-    """Final J_r, J_c and ρ_c (Ray et al. 2019, section 5.1), and steps per second of the run.
+def runs_below(root: Path) -> list[RunFolder]:
+    """Folders of runs below a folder, itself included, in the order of their paths."""
+    found = root.rglob(RunFolder(root).config.name)
+    notes = RunFolder(root).notes.name
+    return [RunFolder(path.parent) for path in sorted(found) if path.parent.name != notes]
 
-    J_r, J_c and violations of limits are means over the last ``FINAL_EPOCHS`` epochs in which an
-    episode finished, ρ_c is that of the last epoch.
 
-    Args:
-        table: Columns of the run's table.
-        cost_keys: Keys of the costs to report.
+def checkpoint_name(steps: int) -> str:
+    """Name of a checkpoint after so many environment steps."""
+    return f"checkpoint-{steps:012d}.torchrl"
+
+
+def checkpoint_steps(path: Path) -> int | None:
+    """Environment steps that a checkpoint's name carries, if it is one's name.
+
+    Examples:
+        >>> checkpoint_steps(Path("last/checkpoint-000000000300.torchrl"))
+        300
     """
-    known = [row for row, value in enumerate(table["episode_return"]) if not math.isnan(value)]
-    final: dict[str, Any] = {}
-    names = [f"{kind}_{key}" for key in cost_keys for kind in ("episode", "violation")]
-    for name in ("episode_return", *(name for name in names if name in table)):
-        values = [table[name][row] for row in known[-FINAL_EPOCHS:]]
-        final[name] = sum(values) / len(values) if values else math.nan
-    final |= {f"{key}_rate": table[f"{key}_rate"][-1] for key in cost_keys}
-    final["steps_per_second"] = table["steps"][-1] / table["time_total"][-1]
-    return final
+    match = _CHECKPOINT.fullmatch(path.name)
+    return None if match is None else int(match.group(1))
+
+
+def checkpoints_in(directory: Path) -> list[Path]:
+    """Checkpoints in a folder by ascending steps, readable or not; none if there is no folder."""
+    found = directory.iterdir() if directory.is_dir() else ()
+    steps = {path: checkpoint_steps(path) for path in found}
+    return sorted((path for path in steps if steps[path] is not None), key=lambda p: steps[p] or 0)
+
+
+def run_of(source: Path) -> tuple[Path, int | None]:
+    """Folder of the run that ``init_from`` names, and steps of the checkpoint if it names one.
+
+    Examples:
+        >>> folder, steps = run_of(Path("a/checkpoints/best/checkpoint-000000003000.torchrl"))
+        >>> folder.name, steps
+        ('a', 3000)
+    """
+    steps = checkpoint_steps(source)
+    if steps is None or len(source.parents) < 3:
+        return source, None
+    return source.parents[2], steps
+
+
+def common_source(source: str) -> str:
+    """What ``init_from`` is alike in over seeds, each of which starts from a run of its own.
+
+    Examples:
+        >>> common_source("runs/small/seed3")
+        'runs/small'
+        >>> common_source("runs/small/seed3/checkpoints/best/checkpoint-000000003000.torchrl")
+        'runs/small/*/checkpoints/best'
+    """
+    path = Path(source)
+    folder, steps = run_of(path)
+    if steps is None:
+        return str(folder.parent)
+    checkpoint = path.relative_to(folder)
+    # the best one comes after other steps in every seed
+    is_best = checkpoint.parent.name == "best"
+    return str(folder.parent / "*" / (checkpoint.parent if is_best else checkpoint))

@@ -15,6 +15,8 @@ from torchrl.record.loggers.tensorboard import TensorboardLogger as TorchRLTenso
 from torchrl.record.loggers.wandb import WandbLogger as TorchRLWandbLogger
 
 from safe_rl.extras import import_extra
+from safe_rl.runs.files import replacing
+from safe_rl.runs.folder import RunFolder
 
 __all__ = ["MLflowLogger", "TensorboardLogger", "WandbLogger"]
 
@@ -65,14 +67,15 @@ class MLflowLogger(MLFlowLogger):
         super().__init__(exp_name=exp_name, tracking_uri=tracking_uri)
 
     def _create_experiment(self) -> Any:
-        path = self._directory / "mlflow_run_id.txt"
+        path = RunFolder(self._directory).logger_id("mlflow")
         self.id = self._mlflow.set_experiment(self.exp_name).experiment_id
         run = self._mlflow.start_run(
             run_id=path.read_text() if path.exists() else None,
             experiment_id=self.id,
             run_name=str(self._directory),
         )
-        path.write_text(run.info.run_id)
+        with replacing(path) as unfinished:
+            unfinished.write_text(run.info.run_id)
         return run
 
     def close(self) -> None:
@@ -93,9 +96,10 @@ class WandbLogger(TorchRLWandbLogger):
 
     def __init__(self, log_dir: str, **kwargs: Any) -> None:
         wandb = import_extra("wandb", extra="wandb")
-        path = Path(log_dir) / "wandb_run_id.txt"
+        path = RunFolder(Path(log_dir)).logger_id("wandb")
         run_id = path.read_text() if path.exists() else wandb.util.generate_id()
-        path.write_text(run_id)
+        with replacing(path) as unfinished:
+            unfinished.write_text(run_id)
         super().__init__(log_dir=log_dir, id=run_id, **kwargs)
 
     def close(self) -> None:

@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Any
 
 from hydra.conf import HydraConf
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 
 from safe_rl.runs.checkpoints import CheckpointStore
+from safe_rl.runs.files import read_config
+from safe_rl.runs.folder import RunFolder
+from safe_rl.runs.identity import differences
 
 __all__ = ["check_same_run", "is_finished", "may_continue"]
-
-_MAY_CHANGE = ("frames", "num_threads", "device", "compile", "checkpoint", "logger")
 
 
 def may_continue(hydra: HydraConf, config: DictConfig) -> bool:
@@ -36,7 +35,7 @@ def may_continue(hydra: HydraConf, config: DictConfig) -> bool:
 
 def is_finished(directory: Path, frames: int) -> bool:
     """Whether the run in a folder has come to its end."""
-    return CheckpointStore.newest_step(directory / "checkpoints") >= frames
+    return CheckpointStore.newest_step(RunFolder(directory).checkpoints) >= frames
 
 
 def check_same_run(directory: Path, config: DictConfig) -> None:
@@ -45,29 +44,15 @@ def check_same_run(directory: Path, config: DictConfig) -> None:
     Raises:
         ValueError: Naming every key that differs.
     """
-    path = directory / "config.yaml"
-    if not path.is_file():
+    run = RunFolder(directory)
+    if not run.is_run:
         return
-    saved, given = (_settings(node) for node in (OmegaConf.load(path), config))
-    keys = [key for key in sorted({*saved, *given}) if saved.get(key) != given.get(key)]
-    if keys:
-        changes = ", ".join(f"{key}: {saved.get(key)} -> {given.get(key)}" for key in keys)
+    given = OmegaConf.to_container(config, resolve=True)
+    assert isinstance(given, dict)
+    found = differences(read_config(run.config), given)  # type: ignore[arg-type]
+    if found:
+        changes = ", ".join(f"{key}: {before} -> {now}" for key, (before, now) in found.items())
         raise ValueError(
             f"{directory} holds a run with other settings ({changes}). Move it away, or give the "
             "sweep another folder with hydra.sweep.dir=..."
         )
-
-
-def _settings(config: Any) -> dict[str, Any]:
-    """Every value by its dotted key, without those that may change."""
-    plain = OmegaConf.to_container(config, resolve=True)
-    assert isinstance(plain, dict)
-    return dict(_flatten({key: plain[key] for key in plain if key not in _MAY_CHANGE}))
-
-
-def _flatten(node: Mapping[Any, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
-    for key, value in node.items():
-        if isinstance(value, Mapping) and value:
-            yield from _flatten(value, f"{prefix}{key}.")
-        else:
-            yield f"{prefix}{key}", value

@@ -7,6 +7,8 @@ import math
 from collections.abc import Mapping
 from pathlib import Path
 
+from safe_rl.runs.files import replacing
+
 __all__ = ["TableWriter", "read_table"]
 
 
@@ -39,9 +41,8 @@ class TableWriter:
         kept = _first_rows(path, keep_rows) if keep_rows else []
         self._columns = next(csv.reader(kept)) if kept else None
         # replaced in one go: a run killed here still has its table
-        rewritten = path.with_suffix(".tmp")
-        rewritten.write_text("".join(kept))
-        rewritten.replace(path)
+        with replacing(path) as rewritten:
+            rewritten.write_text("".join(kept))
         self._file = path.open("a", newline="")
         self._writer = csv.writer(self._file, lineterminator="\n")
 

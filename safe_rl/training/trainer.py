@@ -23,7 +23,9 @@ from safe_rl.algorithms.parts import find_recipe
 from safe_rl.collectors import EpisodeAccounting, WorkerCollector, make_collector
 from safe_rl.collectors.workers import MakeEnv
 from safe_rl.runs.checkpoints import CheckpointStore
-from safe_rl.runs.folder import RunFolder
+from safe_rl.runs.lock import held
+from safe_rl.runs.outcome import violation
+from safe_rl.runs.record import RunRecord
 from safe_rl.targets import build
 from safe_rl.training.interrupts import StopRequest
 from safe_rl.training.state import Progress, WorldSnapshot
@@ -80,7 +82,7 @@ def build_trainer(
         algorithm=algorithm,
         collector=_build_collector(config, env, make_env, algorithm),
         cost_limits=cost_limits,
-        folder=RunFolder(directory, config, cost_limits, env.max_episode_steps),
+        folder=RunRecord(directory, config, cost_limits, env.max_episode_steps),
         config=config,
     )
 
@@ -114,7 +116,7 @@ class Trainer:
         collector: Collector | WorkerCollector,
         *,
         cost_limits: Mapping[str, float],
-        folder: RunFolder,
+        folder: RunRecord,
         config: DictConfig,
     ) -> None:
         self.algorithm = algorithm
@@ -135,7 +137,7 @@ class Trainer:
         self._frames = config.frames
         self._checkpoint_interval = config.checkpoint.interval
         self._checkpoints = CheckpointStore(
-            folder.checkpoint_directory,
+            folder.files.checkpoints,
             self.components(),
             keep_last=config.checkpoint.keep_last,
             run={
@@ -177,7 +179,8 @@ class Trainer:
             CheckpointError: If no checkpoint can be read, or they do not fit this run.
         """
         self._is_continued = True
-        restored = self._checkpoints.resume()
+        with held(self.folder.files):
+            restored = self._checkpoints.resume(self.folder.files.num_rows)
         self._begin_episodes()
         return restored is not None
 
@@ -215,6 +218,8 @@ class Trainer:
         saved_at = time.monotonic()
         behind = self.progress.epoch if self._is_continued else None
         with self.folder.writing(behind, self.progress.steps), StopRequest() as stop:
+            if not self.progress.epoch:
+                self._checkpoints.begin()
             while self.progress.steps < self._frames and not stop.received:
                 row = self.epoch(batches)
                 self.folder.record(row)
@@ -262,10 +267,7 @@ class Trainer:
     def _save_if_best(self, row: Mapping[str, float]) -> None:
         """Keep the policy with the highest return among those that kept every limit."""
         # a constrained algorithm says itself what it holds against the limits
-        feasible = all(
-            row.get(f"violation_{key}", row[f"episode_{key}"] - d) <= 0
-            for key, d in self._cost_limits.items()
-        )
+        feasible = all(violation(row, key, limit) <= 0 for key, limit in self._cost_limits.items())
         if feasible and not math.isnan(row["episode_return"]):
             self._checkpoints.save_best(
                 self.progress.steps, row["episode_return"], {"epoch": self.progress.epoch}

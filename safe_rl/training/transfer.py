@@ -6,12 +6,12 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from omegaconf import DictConfig, OmegaConf
 from torch import Tensor, nn
 from torchrl.checkpoint import CheckpointError
 
 from safe_rl.runs.archive import read_states
-from safe_rl.runs.checkpoints import checkpoints_in
+from safe_rl.runs.files import read_config
+from safe_rl.runs.folder import RunFolder, run_of
 
 __all__ = ["initialise_networks"]
 
@@ -54,22 +54,20 @@ def initialise_networks(
 
 
 def _newest(directory: Path) -> Path:
-    found = checkpoints_in(directory / "checkpoints" / "last")
-    if not found:
+    newest = RunFolder(directory).newest_checkpoint()
+    if newest is None:
         raise CheckpointError(
             f"init_from={directory}: there is no checkpoint. Give the folder of a run, or a file "
             "in its folder 'checkpoints'."
         )
-    return found[-1]
+    return newest
 
 
 def _constrained_costs(checkpoint: Path) -> list[str]:
     """Costs that the cost critic of a checkpoint's run is for; none if that is not known."""
-    path = checkpoint.parents[2] / "config.yaml"
-    config = OmegaConf.load(path) if path.is_file() else None
-    if not isinstance(config, DictConfig) or config.get("cost_advantage") is None:
-        return []
-    return list(config.get("cost_limits", {}))
+    run = RunFolder(run_of(checkpoint)[0])
+    config = read_config(run.config) if run.is_run else {}
+    return list(config.get("cost_limits", {})) if config.get("cost_advantage") else []
 
 
 def _check_sizes(

@@ -8,7 +8,7 @@ from run_configs import point_mass_config
 
 from safe_rl.cli.overrides import CommandLineError
 from safe_rl.cli.shorthands import expand_arguments
-from safe_rl.runs.folder import RunFolder
+from safe_rl.runs.record import RunRecord
 from safe_rl.scores.slates import SLATES
 
 
@@ -16,7 +16,7 @@ from safe_rl.scores.slates import SLATES
 def run(tmp_path):
     """Folder of a run whose name Hydra's grammar would trip over."""
     directory = tmp_path / "it's frames=10,num_envs=4"
-    with RunFolder(directory, point_mass_config(), {"cost": 25.0}, 20).writing():
+    with RunRecord(directory, point_mass_config(), {"cost": 25.0}, 20).writing():
         pass
     return directory
 

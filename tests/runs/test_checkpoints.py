@@ -12,7 +12,8 @@ from torch import nn
 from torchrl.checkpoint import Checkpoint, CheckpointError, StateDictCheckpointAdapter
 
 from safe_rl.runs.archive import read_facts, writer
-from safe_rl.runs.checkpoints import CheckpointStore, checkpoint_steps, checkpoints_in
+from safe_rl.runs.checkpoints import CheckpointStore
+from safe_rl.runs.folder import checkpoint_steps, checkpoints_in
 
 
 class Counter:

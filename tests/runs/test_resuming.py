@@ -45,7 +45,7 @@ def make_trainer(directory, *overrides, **options):
 def train(directory, *overrides, **options):
     """What the command line does: start, or continue what is there."""
     trainer = make_trainer(directory, *overrides, **options)
-    if trainer.folder.holds_run:
+    if trainer.folder.files.has_begun:
         trainer.resume()
     trainer.run()
 
@@ -114,9 +114,10 @@ def test_a_run_without_a_checkpoint_starts_over(tmp_path):
     whole.run()
     begun = point_mass_trainer(tmp_path / "begun")
     with begun.folder.writing():
+        begun._checkpoints.begin()
         begun.folder.record(begun.epoch(begun.batches()))
     again = point_mass_trainer(tmp_path / "begun")
-    assert again.folder.holds_run
+    assert again.folder.files.has_begun
     again.resume()
     again.run()
     tables = [without_times(tmp_path / name / "progress.csv") for name in ("begun", "whole")]

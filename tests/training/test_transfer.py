@@ -67,7 +67,7 @@ def test_the_cost_critic_stays_new_where_the_costs_are_others(trained, overrides
 
 
 def test_a_checkpoint_can_be_named(trained):
-    path = next((trained.folder.checkpoint_directory / "last").iterdir())
+    path = trained.folder.files.newest_checkpoint()
     fresh = make_trainer(trained.folder.directory.parent / "second", "seed=1")
     initialise_networks(fresh.algorithm.networks, path, ["cost"])
     assert same(fresh.algorithm.networks["actor"], trained.algorithm.actor)

@@ -7,7 +7,8 @@ from omegaconf import OmegaConf
 from run_configs import compose_config
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-from safe_rl.runs.folder import RunFolder, final_figures
+from safe_rl.runs.outcome import final_figures
+from safe_rl.runs.record import RunRecord
 
 NAN = math.nan
 
@@ -47,7 +48,7 @@ def test_final_figures_without_any_episode_are_nan():
 
 def test_the_folder_has_configuration_table_and_tensorboard(tmp_path, capsys):
     config = compose_config("env=PointMass", "cost_limits={cost: 25, cost_north: 5}", "frames=2000")
-    folder = RunFolder(tmp_path / "run", config, {"cost": 25.0, "cost_north": 5.0}, 1000)
+    folder = RunRecord(tmp_path / "run", config, {"cost": 25.0, "cost_north": 5.0}, 1000)
     with folder.writing():
         folder.record(row(1, NAN, NAN, NAN))
         folder.record(row(2, 1.5, 30.0, 4.0))
@@ -72,7 +73,7 @@ def test_the_folder_has_configuration_table_and_tensorboard(tmp_path, capsys):
 
 def test_a_measure_of_ones_own_is_what_is_held_against_the_limit(tmp_path, capsys):
     config = compose_config("env=PointMass", "logger=none")
-    folder = RunFolder(tmp_path, config, {"cost": 25.0}, 1000)
+    folder = RunRecord(tmp_path, config, {"cost": 25.0}, 1000)
     with folder.writing():
         folder.record(row(1, 1.0, 20.0) | {"violation_cost": 62.0})
         folder.record(row(2, 1.0, 30.0) | {"violation_cost": 64.0})
@@ -85,29 +86,29 @@ def test_a_measure_of_ones_own_is_what_is_held_against_the_limit(tmp_path, capsy
 
 def test_a_continued_table_goes_on_after_its_epoch(tmp_path):
     config = compose_config("env=PointMass", "logger=none")
-    folder = RunFolder(tmp_path, config, {"cost": 25.0}, 1000)
+    folder = RunRecord(tmp_path, config, {"cost": 25.0}, 1000)
     with folder.writing():
         for epoch in (1, 2, 3):
             folder.record(row(epoch, 0.0, 0.0))
     with folder.writing(epoch=2, steps=2000):
         folder.record(row(3, 7.0, 7.0))
-    lines = folder.table_path.read_text().splitlines()
+    lines = folder.files.table.read_text().splitlines()
     assert [line.split(",")[0] for line in lines] == ["epoch", "1", "2", "3"]
     assert lines[3].startswith("3,3000,7,7")
 
 
 def test_a_new_run_does_not_overwrite_another(tmp_path):
     config = compose_config("env=PointMass", "logger=none")
-    with RunFolder(tmp_path, config, {}, 1000).writing():
+    with RunRecord(tmp_path, config, {}, 1000).writing():
         pass
-    again = RunFolder(tmp_path, config, {}, 1000).writing()
+    again = RunRecord(tmp_path, config, {}, 1000).writing()
     with pytest.raises(FileExistsError, match="already holds a run"):
         again.__enter__()
 
 
 def test_writing_ends_cleanly_when_training_fails(tmp_path):
     config = compose_config("env=PointMass", "logger=none")
-    folder = RunFolder(tmp_path, config, {}, 1000)
+    folder = RunRecord(tmp_path, config, {}, 1000)
 
     def fail():
         with folder.writing():
@@ -116,4 +117,4 @@ def test_writing_ends_cleanly_when_training_fails(tmp_path):
 
     with pytest.raises(FloatingPointError):
         fail()
-    assert len(folder.table_path.read_text().splitlines()) == 2
+    assert len(folder.files.table.read_text().splitlines()) == 2

@@ -1,0 +1,161 @@
+"""What a configuration's keys are for: which name the experiment, and which may change on resume.
+
+One table, that everything reads that tells runs apart or holds one against another: ``resume=``,
+sweeps and the folders of their jobs, the report.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Hashable, Iterator, Mapping
+from enum import Enum
+from typing import Any
+
+from safe_rl.runs.folder import common_source
+from safe_rl.targets import present_name
+
+__all__ = ["ROLES", "Role", "differences", "experiment_of", "flatten", "role_of"]
+
+
+class Role(Enum):
+    """What a key is for.
+
+    Attributes:
+        names_experiment: Whether runs that differ in it are different experiments.
+        may_change: Whether ``resume=`` may change it.
+        may_differ: Whether a job of a sweep goes on with a run that has another value.
+    """
+
+    EXPERIMENT = ("names the experiment: what is restored with a run depends on it", 1, 0, 0)
+    LEARNING = ("names the experiment: a number that a person may turn in between", 1, 1, 0)
+    LENGTH = ("names the experiment: its runs may be made longer", 1, 1, 1)
+    SEED = ("tells the runs of an experiment apart", 0, 0, 0)
+    MANNER = ("how a run is carried out: names nothing, and stays", 0, 0, 0)
+    MACHINE = ("belongs to the machine", 0, 1, 1)
+
+    def __init__(
+        self, meaning: str, names_experiment: int, may_change: int, may_differ: int
+    ) -> None:
+        self.meaning = meaning
+        self.names_experiment = bool(names_experiment)
+        self.may_change = bool(may_change)
+        self.may_differ = bool(may_differ)
+
+
+ROLES: dict[str, Role] = {
+    "seed": Role.SEED,
+    "frames": Role.LENGTH,
+    "advantage": Role.LEARNING,
+    "cost_advantage": Role.LEARNING,
+    "critic_update": Role.LEARNING,
+    "policy_update": Role.LEARNING,
+    "lagrangian": Role.LEARNING,
+    "loss": Role.LEARNING,
+    # what a checkpoint brings along: another value would have no effect, or not fit
+    "critic_update.optimizer": Role.EXPERIMENT,
+    "policy_update.optimizer": Role.EXPERIMENT,
+    "lagrangian.init": Role.EXPERIMENT,
+    "lagrangian.scale": Role.EXPERIMENT,
+    "lagrangian.derivative_delay": Role.EXPERIMENT,
+    "*._target_": Role.EXPERIMENT,
+    "collector": Role.MANNER,
+    "default_cost_limits": Role.MANNER,
+    "checkpoint": Role.MACHINE,
+    "compile": Role.MACHINE,
+    "*.compile": Role.MACHINE,
+    "device": Role.MACHINE,
+    "logger": Role.MACHINE,
+    "num_threads": Role.MACHINE,
+    "hydra": Role.MACHINE,
+    "hydra.output_subdir": Role.MANNER,
+    "hydra.run": Role.MANNER,
+    "hydra.sweep": Role.MANNER,
+}
+"""Key, all below it, or ``*.`` and the last name of any key -> role; all others are EXPERIMENT."""
+
+# keys that the configurations of earlier runs lack, and what they meant without
+_ABSENT = {"algo._target_": "safe_rl.algorithms.OnPolicy"}
+
+
+def role_of(key: str) -> Role:
+    """The role of a dotted key: that of the nearest row above it.
+
+    Examples:
+        >>> role_of("policy_update.max_kl").name, role_of("policy_update.optimizer.lr").name
+        ('LEARNING', 'EXPERIMENT')
+        >>> role_of("critic_update.compile").name, role_of("env.hazards_num").name
+        ('MACHINE', 'EXPERIMENT')
+    """
+    names = key.split(".")
+    above = [".".join(names[:depth]) for depth in range(len(names), 0, -1)]
+    role = next((ROLES[row] for row in above if row in ROLES), Role.EXPERIMENT)
+    # a group that names nothing does not do so by its target either
+    return ROLES.get(f"*.{names[-1]}", role) if role.names_experiment and names[1:] else role
+
+
+def experiment_of(config: Mapping[str, Any]) -> dict[str, Hashable]:
+    """Dotted key -> value of all that names a run's experiment.
+
+    Runs of which this is equal differ in nothing but the seed, and in where and how they were
+    carried out. Targets have their present names; ``init_from`` is what the sources of all seeds
+    have in common, see :func:`safe_rl.runs.folder.common_source`.
+
+    Args:
+        config: Configuration of a run, resolved.
+
+    Examples:
+        >>> experiment_of({"env": {"name": "PointGoal1"}, "seed": 3, "num_threads": 2})
+        {'env.name': 'PointGoal1'}
+    """
+    return {
+        key: common_source(str(value)) if key == "init_from" and value is not None else value
+        for key, value in _comparable(config).items()
+        if role_of(key).names_experiment
+    }
+
+
+def differences(saved: Mapping[str, Any], given: Mapping[str, Any]) -> dict[str, tuple[Any, Any]]:
+    """Dotted key -> the two values where configurations differ and a sweep's job may not.
+
+    Examples:
+        >>> differences({"seed": 0, "frames": 10}, {"seed": 1, "frames": 20})
+        {'seed': (0, 1)}
+    """
+    both = [_comparable(config) for config in (saved, given)]
+    return {
+        key: (both[0].get(key), both[1].get(key))
+        for key in sorted({*both[0], *both[1]})
+        if both[0].get(key) != both[1].get(key) and not role_of(key).may_differ
+    }
+
+
+def _comparable(config: Mapping[str, Any]) -> dict[str, Hashable]:
+    flat = flatten(config)
+    absent = {key: target for key, target in _ABSENT.items() if key.partition(".")[0] in config}
+    return absent | {
+        key: present_name(value) if key.endswith("_target_") and isinstance(value, str) else value
+        for key, value in flat.items()
+    }
+
+
+def flatten(settings: Mapping[str, Any]) -> dict[str, Hashable]:
+    """Nested settings as one mapping with dotted keys; lists become tuples.
+
+    Examples:
+        >>> flatten({"model": {"hidden_sizes": [64, 64], "input_scale": {}}, "seed": 1})
+        {'model.hidden_sizes': (64, 64), 'seed': 1}
+    """
+    return dict(_leaves(settings, ""))
+
+
+def _leaves(node: Mapping[str, Any], prefix: str) -> Iterator[tuple[str, Hashable]]:
+    for key, value in node.items():
+        if isinstance(value, Mapping):
+            yield from _leaves(value, f"{prefix}{key}.")
+        else:
+            yield f"{prefix}{key}", _hashable(value)
+
+
+def _hashable(value: Any) -> Hashable:
+    if isinstance(value, Mapping):
+        return tuple((key, _hashable(item)) for key, item in value.items())
+    return tuple(map(_hashable, value)) if isinstance(value, list | tuple) else value

@@ -1,0 +1,85 @@
+"""What a run comes to: its final figures, and what a limit judges.
+
+The best checkpoint, the terminal, the curves and the report all ask here.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+
+__all__ = ["FINAL_EPOCHS", "final_figures", "judges_another_measure", "violation"]
+
+FINAL_EPOCHS = 5
+"""Epochs over which the final J_r and J_c are averaged (Ray et al. 2019, section 5.1)."""
+
+
+def violation(row: Mapping[str, float], key: str, limit: float) -> float:
+    """What is held against a limit, minus the limit: above 0 it is broken.
+
+    That is J_c − d unless there is a column ``violation_<key>``, in which an algorithm that limits
+    another measure than the mean cost of an episode says what it holds against d.
+
+    Args:
+        row: Of a run's table, or its final figures, by column.
+        key: Key of the cost.
+        limit: d, undiscounted cost per episode.
+
+    Returns:
+        The violation; NaN where no episode has finished.
+
+    Examples:
+        >>> violation({"episode_cost": 30.0}, "cost", 25.0)
+        5.0
+        >>> violation({"episode_cost": 30.0, "violation_cost": 62.0}, "cost", 25.0)
+        62.0
+    """
+    own = row.get(f"violation_{key}", math.nan)
+    return row[f"episode_{key}"] - limit if math.isnan(own) else own
+
+
+def judges_another_measure(table: Mapping[str, Sequence[float]], key: str, limit: float) -> bool:
+    """Whether the limit of a cost is on something else than the mean cost of an episode.
+
+    Args:
+        table: Columns of a run's table.
+        key: Key of the cost.
+        limit: d, undiscounted cost per episode.
+
+    Examples:
+        >>> table = {"episode_cost": [30.0, 20.0], "violation_cost": [5.0, -5.0]}
+        >>> judges_another_measure(table, "cost", 25.0)
+        False
+        >>> judges_another_measure(table | {"violation_cost": [5.0, 40.0]}, "cost", 25.0)
+        True
+    """
+    costs = table.get(f"episode_{key}", ())
+    # columns may come from single precision
+    return any(
+        abs(own - (cost - limit)) > 1e-4 * (1 + abs(cost) + abs(limit))
+        for own, cost in zip(table.get(f"violation_{key}", ()), costs, strict=False)
+    )
+
+
+def final_figures(
+    table: Mapping[str, Sequence[float]], cost_keys: Sequence[str]
+) -> dict[str, float]:
+    """Final J_r, J_c and ρ_c (Ray et al. 2019, section 5.1), and steps per second of the run.
+
+    J_r, J_c and violations of limits are means over the last ``FINAL_EPOCHS`` epochs in which an
+    episode finished, ρ_c is that of the last epoch.
+
+    Args:
+        table: Columns of the run's table.
+        cost_keys: Keys of the costs to report.
+    """
+    known = [row for row, value in enumerate(table["episode_return"]) if not math.isnan(value)]
+    costs = [f"{kind}_{key}" for key in cost_keys for kind in ("episode", "violation")]
+    final = {}
+    for name in ("episode_return", *(name for name in costs if name in table)):
+        values = [table[name][row] for row in known[-FINAL_EPOCHS:]]
+        values = [value for value in values if not math.isnan(value)]
+        final[name] = sum(values) / len(values) if values else math.nan
+    final |= {f"{key}_rate": table[f"{key}_rate"][-1] for key in cost_keys}
+    final["steps_per_second"] = table["steps"][-1] / table["time_total"][-1]
+    return final

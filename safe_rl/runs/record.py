@@ -1,0 +1,170 @@
+"""What a run writes into its folder and shows on the terminal."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+
+from omegaconf import DictConfig, OmegaConf
+from tqdm import tqdm
+
+from safe_rl.runs.curves import draw_learning_curves
+from safe_rl.runs.files import replacing
+from safe_rl.runs.folder import RunFolder
+from safe_rl.runs.lock import held
+from safe_rl.runs.outcome import final_figures, violation
+from safe_rl.runs.table import TableWriter, read_table
+from safe_rl.targets import build
+
+__all__ = ["RunRecord"]
+
+
+class RunRecord:
+    """Configuration, table, logger, learning curves and progress bar of one run.
+
+    The folder holds ``config.yaml`` (resolved), ``progress.csv`` (a row per epoch), ``curves.png``
+    and what the configured logger writes.
+
+    Args:
+        directory: The folder; made if it does not exist.
+        config: Configuration of the run.
+        cost_limits: Cost key -> d, undiscounted cost per episode.
+        episode_length: T_ep, steps of a full episode.
+
+    Examples:
+        >>> import tempfile
+        >>> config = OmegaConf.create({"frames": 200, "logger": {}, "algo": {"name": "ppo"}})
+        >>> record = RunRecord(Path(tempfile.mkdtemp()), config, {"cost": 25.0}, 1000)
+        >>> row = {"steps": 200, "episode_return": 1.0, "episode_cost": 30.0, "cost_rate": 0.03}
+        >>> with record.writing():
+        ...     record.record(row | {"time_total": 2.0})
+        ...     record.draw_curves()
+        >>> record.summary().split(" in ")[0]
+        'J_r 1.00, J_c 30.0 (limit 25), ρ_c 0.0300, 100 steps/s'
+    """
+
+    def __init__(
+        self,
+        directory: Path,
+        config: DictConfig,
+        cost_limits: Mapping[str, float],
+        episode_length: int,
+    ) -> None:
+        self.directory = directory
+        self.files = RunFolder(directory)
+        self._config = config
+        self._cost_limits = dict(cost_limits)
+        self._episode_length = episode_length
+
+    @contextmanager
+    def writing(self, epoch: int | None = None, steps: int = 0) -> Iterator[None]:
+        """Keep the files open, and everybody else from writing them.
+
+        Args:
+            epoch: Epochs that a continued run has behind it; None for a new run.
+            steps: Environment steps that it has behind it.
+
+        Raises:
+            FileExistsError: If a new run would overwrite one that is there.
+            RunInUseError: If another process writes there.
+            ValueError: If the table lacks epochs of the run that is to be continued, or has some
+                that no checkpoint of it has.
+        """
+        self.directory.mkdir(parents=True, exist_ok=True)
+        with held(self.files):
+            self._check_begin(epoch)
+            self._table = TableWriter(self.files.table, keep_rows=epoch or 0)
+            # that of a continued run is replaced when it has proved to be one that trains
+            self._is_config_saved = False
+            if epoch is None or not self.files.is_run:
+                self._save_config()
+            self._logger = build(self._config.logger, log_dir=str(self.directory))
+            if epoch is not None and hasattr(self._logger, "continue_from"):
+                self._logger.continue_from(steps)
+            self._bar = tqdm(
+                total=self._config.frames, initial=steps, unit=" steps", unit_scale=True,
+                dynamic_ncols=True, smoothing=0.1,
+            )  # fmt: skip
+            self._shown: dict[str, str] = {}
+            try:
+                yield
+                self._save_config()
+            finally:
+                self._bar.close()
+                self._table.close()
+                close = getattr(self._logger, "close", None)
+                if close is not None:
+                    close()
+
+    def _check_begin(self, epoch: int | None) -> None:
+        if epoch is None and self.files.has_begun:
+            raise FileExistsError(
+                f"{self.directory} already holds a run. Continue it with 'python train.py "
+                f"resume={self.directory}', or give this one another folder with hydra.run.dir=..."
+            )
+
+    def _save_config(self) -> None:
+        if not self._is_config_saved:
+            # replaced in one go: a run killed here can still be continued
+            with replacing(self.files.config) as unfinished:
+                OmegaConf.save(self._config, unfinished, resolve=True)
+            self._is_config_saved = True
+
+    def record(self, row: Mapping[str, float]) -> None:
+        """Write one epoch to table and logger and show it."""
+        self._save_config()
+        self._table.write(row)
+        if self._logger is not None:
+            for name, value in row.items():
+                if not math.isnan(value):
+                    self._logger.log_scalar(name, value, step=int(row["steps"]))
+        self._shown |= self._postfix(row)
+        self._bar.set_postfix(self._shown, refresh=False)
+        self._bar.update(int(row["steps"]) - self._bar.n)
+
+    def _postfix(self, row: Mapping[str, float]) -> dict[str, str]:
+        """What the bar shows of an epoch: only what is known in it."""
+        shown = {"return": f"{row['episode_return']:.2f}"}
+        for key in self._cost_limits or ["cost"]:
+            limit = f"/{self._cost_limits[key]:g}" if key in self._cost_limits else ""
+            shown[key] = f"{self._measured(row, key):.1f}{limit}"
+        if math.isnan(row["episode_return"]):
+            shown = {}
+        multipliers = [value for name, value in row.items() if name.startswith("multiplier_")]
+        if multipliers:
+            shown["λ"] = " ".join(f"{value:.3g}" for value in multipliers)
+        return shown
+
+    def _measured(self, row: Mapping[str, float], key: str) -> float:
+        """What is held against the limit; the mean episode cost where there is none."""
+        limit = self._cost_limits.get(key)
+        return row[f"episode_{key}"] if limit is None else limit + violation(row, key, limit)
+
+    def draw_curves(self) -> None:
+        """Write ``curves.png`` from the table."""
+        table = read_table(self.files.table)
+        config = self._config
+        seed = f"seed {config.seed}" if "seed" in config else ""
+        title = f"{config.get('env', {}).get('name', '')} {config.algo.name} {seed}".strip()
+        draw_learning_curves(
+            table, self._cost_limits, self._episode_length, self.files.curves, title
+        )
+
+    def summary(self) -> str:
+        """One line on how the run ended."""
+        keys = list(self._cost_limits) or ["cost"]
+        final = final_figures(read_table(self.files.table), keys)
+        parts = [f"J_r {final['episode_return']:.2f}"]
+        several = len(self._cost_limits) > 1
+        for key in keys:
+            name = f"[{key}]" if several else ""
+            limit = f" (limit {self._cost_limits[key]:g})" if key in self._cost_limits else ""
+            mean, measured = final[f"episode_{key}"], self._measured(final, key)
+            differs = abs(measured - mean) > 0.05  # false without any episode
+            own = f", measured {measured:.1f}" if differs else ""
+            parts.append(f"J_c{name} {mean:.1f}{own}{limit}")
+            parts.append(f"ρ_c{name} {final[f'{key}_rate']:.4f}")  # noqa: RUF001
+        parts.append(f"{final['steps_per_second']:,.0f} steps/s")
+        return f"{', '.join(parts)} in {self.directory}"

@@ -1,0 +1,106 @@
+"""One table of what keys are for: against the configurations that there are."""
+
+import itertools
+
+import pytest
+from omegaconf import OmegaConf
+from run_configs import CONF, compose_config
+
+from safe_rl.runs.identity import ROLES, Role, differences, experiment_of, role_of
+
+ALGORITHMS = sorted(path.stem for path in CONF.glob("algo/*.yaml"))
+LOGGERS = sorted(path.stem for path in CONF.glob("logger/*.yaml"))
+
+
+def nodes(config, prefix=""):
+    """Every key of a configuration, also those of groups."""
+    for key, value in config.items():
+        yield f"{prefix}{key}"
+        if isinstance(value, dict):
+            yield from nodes(value, f"{prefix}{key}.")
+
+
+@pytest.fixture(scope="module")
+def all_keys():
+    pairs = [(algorithm, "none") for algorithm in ALGORITHMS]
+    pairs += [(ALGORITHMS[0], logger) for logger in LOGGERS]
+    found = set()
+    for (algo, logger), preset in itertools.product(pairs, ("default", "paper")):
+        config = compose_config("env=PointMass", f"algo={algo}", f"logger={logger}", f"preset={preset}")  # fmt: skip  # noqa: E501
+        found |= set(nodes(OmegaConf.to_container(config)))
+    return found
+
+
+def test_every_row_is_about_a_key_that_exists(all_keys):
+    multipliers = [OmegaConf.load(path) for path in CONF.glob("lagrangian/*.yaml")]
+    keys = all_keys | {f"lagrangian.{key}" for node in multipliers for key in node}
+    for row in ROLES:
+        if row.startswith("*."):
+            assert any(key.endswith(row[1:]) for key in keys)
+        else:
+            assert row in keys or row.startswith("hydra")
+
+
+def test_folders_of_a_sweep_name_all_but_the_machine_and_what_is_in_the_path(all_keys):
+    hydra = OmegaConf.load(CONF / "config.yaml").hydra
+    machine = {key for key in all_keys if role_of(key) is Role.MACHINE}
+    excluded = hydra.job.config.override_dirname.exclude_keys
+    assert set(excluded) == {"env", "algo", "seed"} | machine
+    assert len(set(excluded)) == len(excluded)
+
+
+@pytest.mark.parametrize(
+    ("key", "role"),
+    [
+        ("policy_update.max_kl", Role.LEARNING),
+        ("policy_update.adapt_rate.factor", Role.LEARNING),
+        ("policy_update._target_", Role.EXPERIMENT),
+        ("policy_update.optimizer.lr", Role.EXPERIMENT),
+        ("policy_update.compile", Role.MACHINE),
+        ("logger._target_", Role.MACHINE),
+        ("collector._target_", Role.MANNER),
+        ("hydra.verbose", Role.MACHINE),
+        ("hydra.run.dir", Role.MANNER),
+        ("env.hazards_num", Role.EXPERIMENT),
+        ("mine", Role.EXPERIMENT),
+    ],
+)
+def test_a_key_has_the_role_of_the_nearest_row(key, role):
+    assert role_of(key) is role
+
+
+def as_saved(*overrides):
+    return OmegaConf.to_container(compose_config("env=PointMass", *overrides), resolve=True)
+
+
+@pytest.mark.parametrize(
+    "override",
+    ["seed=3", "num_threads=2", "device=meta", "compile=true", "logger=none", "collector=process"],
+)
+def test_seeds_and_machines_make_no_other_experiment(override):
+    assert experiment_of(as_saved(override)) == experiment_of(as_saved())
+
+
+@pytest.mark.parametrize(
+    "override", ["frames=7", "policy_update.max_kl=0.1", "cost_limits={cost: 3}", "env.name=Other"]
+)
+def test_everything_else_does(override):
+    assert experiment_of(as_saved(override)) != experiment_of(as_saved())
+
+
+def test_runs_from_the_networks_of_several_seeds_are_one_experiment():
+    sources = [f"init_from=runs/small/seed{seed}" for seed in (0, 10)]
+    first, second = (experiment_of(as_saved(source)) for source in sources)
+    assert first == second != experiment_of(as_saved("init_from=runs/large/seed0"))
+
+
+def test_a_sweep_goes_on_with_a_run_that_knows_parts_by_their_old_names():
+    now = as_saved()
+    before = as_saved()
+    before["policy_update"]["_target_"] = "safe_rl.updates.MinibatchUpdate"
+    before["algo"].pop("_target_", None)
+    assert experiment_of(before) == experiment_of(now)
+    assert not differences(before, now)
+    assert differences(now, as_saved("frames=5", "num_threads=7", "lagrangian.kp=0.5")) == {
+        "lagrangian.kp": (now["lagrangian"]["kp"], 0.5)
+    }
