@@ -14,8 +14,8 @@ take the place of the package's own; the files in `conf/` beside this one name t
   steps carry the tail's cost, and the clip ends what each of them can promise, as it does for the
   reward (Zhang et al. 2022, equation 12).
 
-    PYTHONPATH=examples python train.py --config-dir examples/conf algo=cvar_ppo \
-        env=PointGoal1 frames=60_000
+    python train.py import=examples/custom_loss.py --config-dir examples/conf \
+        algo=cvar_ppo env=PointGoal1 frames=60_000
 
 Three epochs, to see it run; without `frames` it learns. The column `violation_cost` is CVaR − d.
 The first two parts go with other algorithms as they are: `algo=cpo +risk=cvar`.

@@ -26,7 +26,8 @@ PARTS = {
     "evaluation": ("algorithms", "extras", "models", "runs", "scores"),
     "reporting": ("extras", "runs", "scores"),
     "cli": (
-        *("envs", "evaluation", "naming", "openmp", "reporting", "runs", "scores", "training"),
+        *("envs", "evaluation", "naming", "openmp", "reporting", "runs", "scores", "targets"),
+        "training",
     ),
     "evaluate": ("cli",),
     "report": ("cli",),
@@ -92,8 +93,9 @@ FLOORS = {
         ("",),
     ),
     "cli": (
-        ("benchmark", "options", "overrides", "settings", "sweeps"),
-        ("shorthands",),
+        ("benchmark", "options", "overrides", "settings"),
+        ("user_code",),
+        ("shorthands", "sweeps"),
         ("evaluate", "report", "train"),
         ("",),
     ),

@@ -13,8 +13,10 @@ from torchrl.checkpoint import CheckpointError
 
 from safe_rl.cli.benchmark import suite
 from safe_rl.cli.options import OptionError, parse_options, usage
+from safe_rl.cli.user_code import check_imports, import_modules, split_imports
 from safe_rl.envs import ConfigError, OpenGLError, make_env
 from safe_rl.evaluation import Evaluation, EvaluationOptions, evaluate
+from safe_rl.evaluation.loading import load_config
 from safe_rl.evaluation.summary import format_estimates
 
 __all__ = ["evaluate_run", "main"]
@@ -36,8 +38,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(usage(f"{COMMAND} RUN_DIR", EvaluationOptions))
         return 0 if arguments else 2
     try:
-        options = parse_options(arguments[1:], EvaluationOptions)
-        result = evaluate_run(Path(arguments[0]), options, progress=True)
+        modules, arguments = split_imports(arguments)
+        directory, options = Path(arguments[0]), parse_options(arguments[1:], EvaluationOptions)
+        check_imports(load_config(directory), modules, directory)
+        import_modules(modules or ())
+        result = evaluate_run(directory, options, progress=True)
     except (
         *(OptionError, ConfigError, CheckpointError, OpenGLError),
         *(FileNotFoundError, ModuleNotFoundError, ValueError),

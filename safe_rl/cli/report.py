@@ -11,6 +11,7 @@ import safe_rl.openmp  # noqa: F401, has to come before torch
 
 # isort: split
 from safe_rl.cli.options import OptionError, parse_options, usage
+from safe_rl.cli.user_code import import_modules, split_imports
 from safe_rl.envs.safety_gym.registration import group_node
 from safe_rl.envs.safety_gym.suite import SUITE
 from safe_rl.reporting import Report, build_report, write_report
@@ -71,6 +72,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(usage(f"{COMMAND} RUNS_DIR", ReportOptions))
         return 0 if arguments else 2
     try:
+        modules, arguments = split_imports(arguments)
+        import_modules(modules or ())
         options = parse_options(arguments[1:], ReportOptions)
         result, page = report(Path(arguments[0]), options)
     except (OptionError, FileNotFoundError, ModuleNotFoundError, ValueError) as error:

@@ -13,6 +13,7 @@ import yaml
 from omegaconf import DictConfig, OmegaConf
 
 from safe_rl.cli.overrides import CommandLineError
+from safe_rl.cli.user_code import check_imports, split_imports
 from safe_rl.naming import did_you_mean
 from safe_rl.scores.slates import SLATES
 
@@ -76,6 +77,8 @@ def _expand_resume(value: str, others: list[str]) -> list[str]:
     except yaml.YAMLError as error:
         raise CommandLineError(f"{directory / 'config.yaml'} cannot be read: {error}") from None
     assert isinstance(config, DictConfig)
+    _refuse_hydras_own(config, directory / "config.yaml")
+    check_imports(config, split_imports(others)[0], Path(value))
     for argument in others:
         key = argument.lstrip("+~").partition("=")[0]
         if key.partition(".")[0] in _FIXED or isinstance(config.get(key), DictConfig):
@@ -92,6 +95,16 @@ def _expand_resume(value: str, others: list[str]) -> list[str]:
         "hydra/job_logging=stdout",
         *others,
     ]
+
+
+def _refuse_hydras_own(config: DictConfig, path: Path) -> None:
+    """Runs write settings only; what else Hydra reads in a file can name code to run."""
+    keys = [key for key in ("hydra", "defaults") if key in config]
+    if keys or "@package" in path.read_text():
+        raise CommandLineError(
+            f"{path} holds '{(keys or ['@package'])[0]}', which runs never write and which could "
+            "make code run: delete it there to resume."
+        )
 
 
 def _expand_slate(value: str, others: list[str]) -> list[str]:

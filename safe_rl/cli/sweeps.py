@@ -17,6 +17,7 @@ from hydra.core.utils import JobReturn, JobStatus
 from hydra.experimental.callback import Callback
 from omegaconf import DictConfig
 
+from safe_rl.cli.user_code import import_modules, imported
 from safe_rl.runs.folder import RunFolder
 
 __all__ = ["SweepReport", "count_jobs", "threads_per_job"]
@@ -64,10 +65,12 @@ class SweepReport(Callback):
     def __init__(self) -> None:
         self._journal: Path | None = None
         self._num_jobs = 0
+        self._modules: list[str] = []  # jobs run in processes that get this object
 
     def on_multirun_start(self, config: DictConfig, **kwargs: Any) -> None:
         """Share the cores out among the jobs and begin the journal."""
         self._num_jobs = count_jobs(config.hydra.overrides.task)
+        self._modules = imported()
         self._journal = _journal_path(Path(config.hydra.sweep.dir))
         num_workers = config.hydra.launcher.get("n_jobs")
         if num_workers is not None:
@@ -80,8 +83,9 @@ class SweepReport(Callback):
         atexit.register(self._print_summary)
 
     def on_job_start(self, config: DictConfig, **kwargs: Any) -> None:
-        """Note that a job has begun."""
+        """Note that a job has begun, and import the user's modules where it runs."""
         self._note(config, "begun")
+        import_modules(self._modules)
 
     def on_job_end(self, config: DictConfig, job_return: JobReturn, **kwargs: Any) -> None:
         """Note how a job has ended, and take its error out of the way of the others."""

@@ -16,6 +16,13 @@ import safe_rl.openmp  # noqa: F401, has to come before torch
 from safe_rl.cli.overrides import CommandLineError, check_overrides
 from safe_rl.cli.settings import check_settings, errors_in_a_line
 from safe_rl.cli.shorthands import expand_arguments
+from safe_rl.cli.user_code import (
+    import_modules,
+    imported,
+    make_after_imports,
+    note_imports,
+    split_imports,
+)
 from safe_rl.envs import LayoutError, SafetyGymConfig, make_env, store_configs
 from safe_rl.runs.resuming import is_finished, may_continue
 from safe_rl.training.trainer import Trainer, build_trainer, physics_threads, seed_everything
@@ -42,7 +49,8 @@ def prepare(config: DictConfig, directory: Path, continues: bool) -> Trainer | N
         seed=config.seed,
         num_threads=physics_threads(config),
     )
-    trainer = build_trainer(config, make(num_envs=config.num_envs), directory, make)
+    in_workers = partial(make_after_imports, imported(), make)
+    trainer = build_trainer(config, make(num_envs=config.num_envs), directory, in_workers)
     if continues and trainer.resume():
         print(f"Going on after {trainer.progress.steps:,} of {config.frames:,} frames.")
         return trainer
@@ -74,7 +82,12 @@ def train(config: DictConfig) -> None:
 def main() -> None:
     """The command: expand shorthands, check names, and hand over to Hydra."""
     try:
-        arguments = expand_arguments(sys.argv[1:])
+        modules, arguments = split_imports(sys.argv[1:])
+        if modules is not None:
+            import_modules(modules)
+            store_configs()  # again, with the keys that the modules have registered
+            arguments = note_imports(modules, arguments)
+        arguments = expand_arguments(arguments)
         check_overrides(arguments, CONF, {"name", *SafetyGymConfig().to_dict()})
         sys.argv[1:] = arguments
     except CommandLineError as error:

@@ -25,7 +25,7 @@ Settings = dict[str, Hashable]
 
 MANNER = {
     "seed", "device", "num_threads", "compile", "checkpoint", "logger", "default_cost_limits",
-    "hydra", "resume", "collector", "num_collectors",
+    "hydra", "resume", "collector", "num_collectors", "import",
 }  # fmt: skip
 """Settings of how a run is carried out, not of what it measures."""
 

@@ -20,7 +20,7 @@ __all__ = ["Aggregate", "Gap", "aggregate", "can_be_normalised", "find_gap", "no
 # What a command leaves out: others say it, or it does not change results. Other defaults of the
 # limits do, and so may the way in which environments are stepped.
 _NOT_OF_THE_ALGORITHM = {"env", "algo", "slate", "init_from"} | (
-    MANNER - {"default_cost_limits", "collector", "num_collectors"}
+    MANNER - {"default_cost_limits", "collector", "num_collectors", "import"}
 )
 
 

@@ -63,6 +63,7 @@ ROLES: dict[str, Role] = {
     "compile": Role.MACHINE,
     "*.compile": Role.MACHINE,
     "device": Role.MACHINE,
+    "import": Role.MACHINE,
     "logger": Role.MACHINE,
     "num_threads": Role.MACHINE,
     "hydra": Role.MACHINE,

@@ -141,7 +141,10 @@ def rank(
 
     def key(candidate: int) -> tuple[bool, float]:
         excess = max(_expected_excess(costs[candidate], claim), default=0.0)
-        return (excess > 0, excess if excess > 0 else -float(np.mean(returns[candidate])))
+        return (
+            excess > 0,
+            excess if excess > 0 else -float(np.asarray(returns[candidate], dtype=float).mean()),
+        )
 
     return sorted(range(len(returns)), key=key)
 

@@ -1,6 +1,5 @@
 """The example of a loss of one's own: CVaR against its definition, and whole runs."""
 
-import os
 import re
 import shlex
 import subprocess
@@ -16,6 +15,7 @@ from tensordict.nn import AddStateIndependentNormalScale, TensorDictModule
 from torch import nn
 from torchrl.modules import IndependentNormal, ProbabilisticActor
 
+from safe_rl.cli.user_code import import_modules
 from safe_rl.objectives import LagrangeMultiplier
 from safe_rl.runs.table import read_table
 from safe_rl.targets import allow
@@ -23,7 +23,7 @@ from safe_rl.training.trainer import build_trainer
 
 ROOT = CONF.parent
 EXAMPLES = ROOT / "examples"
-sys.path.append(str(EXAMPLES))
+import_modules([str(EXAMPLES / "custom_loss.py")])
 
 import custom_loss  # noqa: E402
 
@@ -241,8 +241,8 @@ def test_without_a_measure_of_ones_own_means_are_limited(tmp_path):
 
 
 def test_the_command_of_the_example(tmp_path):
-    command = re.search(r"PYTHONPATH=(\S+) (.*?)\n\n", custom_loss.__doc__, re.DOTALL)
-    path, words = command[1], shlex.split(command[2])
+    command = re.search(r"python train.py .*?\n\n", custom_loss.__doc__, re.DOTALL)
+    words = shlex.split(command[0])
     assert words[0] == "python"
     short = [
         *("frames=80", "env.num_steps=20", "num_envs=2", "frames_per_batch=40", "logger=none"),
@@ -252,7 +252,6 @@ def test_the_command_of_the_example(tmp_path):
     result = subprocess.run(
         [sys.executable, *words[1:], *short],
         cwd=ROOT,
-        env=os.environ | {"PYTHONPATH": path},
         capture_output=True,
         text=True,
         timeout=300,

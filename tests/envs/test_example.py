@@ -1,7 +1,8 @@
-"""The example of an environment of one's own does what it says, shortened."""
+"""The example of an environment of one's own does what it says, by the ordinary commands."""
 
-import csv
 import importlib.util
+import subprocess
+import sys
 
 import pytest
 import torch
@@ -9,8 +10,12 @@ from registrations import undone
 from run_configs import CONF
 
 from safe_rl.envs import SafetyGymEnv
+from safe_rl.runs.table import read_table
 
-PATH = CONF.parent / "examples" / "custom_environment.py"
+ROOT = CONF.parent
+PATH = ROOT / "examples" / "custom_environment.py"
+IMPORT = f"import={PATH.relative_to(ROOT)}"
+MINES = ("env=PointMines", "cost_limits={cost_mines: 10}", "env.mines_num=8")
 SHORT = (
     *("env.num_steps=20", "num_envs=2", "frames_per_batch=40", "frames=80", "logger=none"),
     *("model.hidden_sizes=[8]", "policy_update.minibatch_size=20"),
@@ -27,12 +32,50 @@ def example():
         yield module
 
 
-def test_it_trains_on_its_own_cost(example, tmp_path):
-    assert "J_r" in example.main(list(SHORT), tmp_path)
-    with (tmp_path / "progress.csv").open() as file:
-        rows = list(csv.DictReader(file))
-    assert [row["steps"] for row in rows] == ["40", "80"]
-    assert {"episode_cost_mines", "multiplier_cost_mines"} <= rows[0].keys()
+def run(*words):
+    """Run a command of the checkout; returns its status, and what it printed."""
+    result = subprocess.run(
+        [sys.executable, *words],
+        cwd=ROOT, capture_output=True, text=True, timeout=300, check=False,
+    )  # fmt: skip
+    return result.returncode, result.stdout + result.stderr
+
+
+def test_it_is_trained_resumed_and_evaluated_by_the_ordinary_commands(tmp_path):
+    # with workers, which have to import it too
+    status, printed = run("train.py", IMPORT, *MINES, *SHORT, "collector=process",
+                          f"hydra.run.dir={tmp_path}")  # fmt: skip
+    assert status == 0, printed
+    assert "violation_cost_mines" in read_table(tmp_path / "progress.csv")
+    status, printed = run("train.py", f"resume={tmp_path}", "frames=160")
+    assert status == 1
+    assert f"add {IMPORT}" not in printed
+    assert printed.count("\n") == 1
+    assert f"was trained with {IMPORT}: add that to the command" in printed
+    status, printed = run("train.py", f"resume={tmp_path}", IMPORT, "frames=160")
+    assert status == 0, printed
+    assert read_table(tmp_path / "progress.csv")["steps"] == [40, 80, 120, 160]
+    evaluate = ("-m", "safe_rl.evaluate", str(tmp_path), "episodes=2")
+    status, printed = run(*evaluate)
+    assert status == 1
+    assert f"was trained with {IMPORT}: add that to the command" in printed
+    status, printed = run(*evaluate, IMPORT, "env.mines_size=0.3")
+    assert status == 0, printed
+    assert "cost_mines" in (tmp_path / "evaluation.json").read_text()
+
+
+def test_it_is_swept_and_reported(tmp_path):
+    status, printed = run("train.py", "-m", IMPORT, *MINES, *SHORT, "seed=0,1",
+                          "hydra.launcher.n_jobs=2", f"hydra.sweep.dir={tmp_path}")  # fmt: skip
+    assert status == 0, printed
+    assert "2 of 2 runs are finished" in printed
+    folders = sorted(path.parent for path in tmp_path.rglob("progress.csv"))
+    assert [folder.name for folder in folders] == ["seed0", "seed1"]
+    assert "import" not in str(folders[0].relative_to(tmp_path))
+    status, printed = run("-m", "safe_rl.report", str(tmp_path), IMPORT)
+    assert status == 0, printed
+    data = (tmp_path / "report" / "report.md").read_text()
+    assert "import=[" in data, "the command that does it again"
 
 
 def test_danger_rises_towards_the_centre(example):
@@ -44,7 +87,6 @@ def test_danger_rises_towards_the_centre(example):
 
 
 def test_robots_meet_its_mines(example):
-    example.register()
     env = SafetyGymEnv(example.POINT_MINES, num_envs=50, seed=0, num_threads=1)
     assert {"mines_lidar", "speed"} <= env.observation_layout.keys()
     rollout = env.rollout(200)

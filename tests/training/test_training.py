@@ -17,6 +17,8 @@ from safe_rl.targets import allow
 from safe_rl.training.interrupts import StopRequest
 from safe_rl.training.trainer import build_trainer, seed_everything
 
+allow("test_training")
+
 
 def make_trainer(directory, *overrides, num_steps=20):
     config = point_mass_config(*overrides)

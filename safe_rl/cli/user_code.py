@@ -1,0 +1,149 @@
+"""``import=my_module``: a user's own code, on the command line and in workers.
+
+A module may register environments, objects, costs and observations, and hold what a ``_target_``
+names. A run notes the modules in its configuration under ``import``, but only the command line
+makes them run: opening somebody's run executes nothing of theirs.
+"""
+
+from __future__ import annotations
+
+import sys
+import traceback
+from collections.abc import Callable, Mapping, Sequence
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from safe_rl import targets
+from safe_rl.cli.overrides import CommandLineError
+
+__all__ = [
+    "KEY",
+    "check_imports",
+    "import_modules",
+    "imported",
+    "make_after_imports",
+    "note_imports",
+    "split_imports",
+]
+
+KEY = "import"
+_KEYS = tuple(f"{prefix}{KEY}=" for prefix in ("", "+", "++"))
+_imported: list[str] = []
+
+
+def split_imports(arguments: Sequence[str]) -> tuple[list[str] | None, list[str]]:
+    """Take ``import=`` out of a command line.
+
+    Args:
+        arguments: Arguments of a command; ``import=`` may be repeated, or hold a list.
+
+    Returns:
+        The modules, None if ``import=`` is not given; and the other arguments.
+
+    Examples:
+        >>> split_imports(["import=mine", "seed=1", "import=[examples/other.py]"])
+        (['mine', 'examples/other.py'], ['seed=1'])
+    """
+    given = [argument for argument in arguments if argument.startswith(_KEYS)]
+    others = [argument for argument in arguments if argument not in given]
+    modules: list[str] = []
+    for argument in given:
+        text = argument.partition("=")[2]
+        value = yaml.safe_load(text) if text.startswith("[") else text
+        modules += map(str, value) if isinstance(value, list) else [value]
+    return (list(dict.fromkeys(modules)) if given else None), others
+
+
+def note_imports(modules: Sequence[str], arguments: Sequence[str]) -> list[str]:
+    """Add the override by which a run notes its modules.
+
+    Examples:
+        >>> note_imports(["mine", "examples/other.py"], ["-m", "seed=1,2"])
+        ['-m', "++import=['mine','examples/other.py']", 'seed=1,2']
+    """
+    quoted = ("'" + module.replace("'", "\\'") + "'" for module in modules)
+    is_override = ["=" in argument and not argument.startswith("-") for argument in arguments]
+    # beside the others: Hydra takes overrides on one side of a flag only
+    place = is_override.index(True) if any(is_override) else len(arguments)
+    return [*arguments[:place], f"++{KEY}=[{','.join(quoted)}]", *arguments[place:]]
+
+
+def import_modules(modules: Sequence[str]) -> None:
+    """Import modules and let configurations name what they define.
+
+    Args:
+        modules: Dotted names, looked for in the current directory too, or paths of files.
+
+    Raises:
+        CommandLineError: If one does not exist, cannot be imported, or is hidden by another.
+    """
+    for module in modules:
+        name, path = module, Path(*module.split(".")).with_suffix(".py")
+        if module.endswith(".py"):
+            path = Path(module).expanduser()
+            name = path.stem
+            if not path.is_file():
+                raise CommandLineError(f"{KEY}={module}: there is no such file.")
+        # the folder, not the file: other processes find by its name what they are sent
+        folder = str(Path.cwd() if name == module else path.resolve().parent)
+        if folder not in sys.path:
+            sys.path.append(folder)
+        found = _import(name, module)
+        if path.is_file() and Path(found).resolve() != path.resolve():
+            raise CommandLineError(
+                f"{KEY}={module}: Python has another module of that name, {found}. Rename yours."
+            )
+        targets.allow(name)
+        where = module if name == module else str(path.resolve())
+        if where not in _imported:
+            _imported.append(where)
+
+
+def imported() -> list[str]:
+    """What has been imported in this process, for others to import."""
+    return list(_imported)
+
+
+def _import(name: str, given: str) -> str:
+    """Import a module; returns its file, or "" if it has none."""
+    try:
+        return import_module(name).__file__ or ""
+    except Exception as error:
+        if isinstance(error, ModuleNotFoundError) and error.name == name.partition(".")[0]:
+            raise CommandLineError(
+                f"{KEY}={given}: there is no module '{error.name}' here or among the installed "
+                f"ones. A file is named by its path: {KEY}=folder/{error.name}.py."
+            ) from None
+        *_, last = traceback.extract_tb(error.__traceback__)
+        raise CommandLineError(
+            f"{KEY}={given}: {type(error).__name__}: {error} ({last.filename}, line {last.lineno})."
+        ) from error
+
+
+def make_after_imports(modules: Sequence[str], make: Callable[..., Any], **options: Any) -> Any:
+    """Make something where the user's modules may not have been imported: in a worker."""
+    import_modules(modules)
+    return make(**options)
+
+
+def check_imports(config: Mapping[Any, Any], given: Sequence[str] | None, run: Path) -> None:
+    """Refuse to open a run that has used modules of its user's, unless ``import=`` is given.
+
+    Args:
+        config: Configuration of the run.
+        given: Modules of the command line; None if there is no ``import=``.
+        run: Folder of the run, for the message.
+
+    Raises:
+        CommandLineError: If it has; the message says what to type.
+    """
+    noted = config.get(KEY) or []
+    if given is None and noted:
+        words = " ".join(f"{KEY}={module}" for module in noted)
+        raise CommandLineError(
+            f"{run} was trained with {words}: add that to the command if you trust this code, or "
+            f"'{KEY}=[]' to go without."
+        )

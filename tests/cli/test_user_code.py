@@ -1,0 +1,154 @@
+"""A user's own modules: found, imported when asked for, and never because a run's files say so."""
+
+import sys
+
+import pytest
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from omegaconf import OmegaConf
+from point_mass import PointMass
+from run_configs import point_mass_config
+
+from safe_rl import targets
+from safe_rl.cli import user_code
+from safe_rl.cli.overrides import CommandLineError
+from safe_rl.cli.shorthands import expand_arguments
+from safe_rl.cli.user_code import check_imports, import_modules, note_imports, split_imports
+from safe_rl.runs.folder import RunFolder
+from safe_rl.training.trainer import build_trainer
+
+MODULE = """
+import pathlib
+pathlib.Path(__file__).with_suffix(".trace").touch()
+class Loss: ...
+"""
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    """A folder that is the current one, whose modules are forgotten afterwards."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", list(sys.path))
+    monkeypatch.setattr(user_code, "_imported", [])
+    monkeypatch.setattr(targets, "_users_modules", set())
+    before = set(sys.modules)
+    yield tmp_path
+    for name in set(sys.modules) - before:
+        del sys.modules[name]
+
+
+@pytest.mark.parametrize(
+    "modules", [["mine"], ["a", "b/c.py"], ["it's/a folder/x.py", "a,b=c/d.py"], []]
+)
+def test_a_noted_list_is_read_again(modules):
+    noted = note_imports(modules, ["seed=1"])
+    assert noted[1] == "seed=1"
+    override = OverridesParser.create().parse_overrides([noted[0]])[0]
+    assert override.value() == modules
+    if not any("'" in module for module in modules):
+        assert split_imports(noted) == (modules, ["seed=1"])
+
+
+def test_overrides_stay_together():
+    arguments = ["--config-dir", "conf", "algo=mine", "seed=1"]
+    assert note_imports(["m"], arguments)[:3] == ["--config-dir", "conf", "++import=['m']"]
+    assert note_imports(["m"], ["-m"]) == ["-m", "++import=['m']"]
+    assert split_imports(["seed=1"]) == (None, ["seed=1"])
+
+
+def test_modules_are_found_by_name_and_by_file(folder):
+    (folder / "users_first.py").write_text(MODULE)
+    (folder / "below").mkdir()
+    (folder / "below" / "users_second.py").write_text(MODULE)
+    import_modules(["users_first", "below/users_second.py"])
+    for name in ("users_first", "users_second"):
+        assert targets.locate(f"{name}.Loss") is sys.modules[name].Loss
+    # as other processes find them, whatever their current folder
+    assert user_code.imported() == ["users_first", str(folder / "below" / "users_second.py")]
+
+
+@pytest.mark.parametrize(
+    ("module", "message"),
+    [
+        ("users_nowhere", "import=users_nowhere: there is no module 'users_nowhere'"),
+        ("users_nowhere.py", "import=users_nowhere.py: there is no such file"),
+        ("users_broken", r"ZeroDivisionError: .*users_broken.py, line 2\)"),
+        ("users_needy", "ModuleNotFoundError: No module named 'users_nowhere'.*line 1"),
+        ("json.py", "another module of that name"),
+        ("json", "another module of that name"),
+    ],
+)
+def test_errors_are_one_line(folder, module, message):
+    (folder / "users_broken.py").write_text("x = 1\n1 / 0\n")
+    (folder / "users_needy.py").write_text("import users_nowhere\n")
+    (folder / "json.py").write_text("")
+    with pytest.raises(CommandLineError, match=message) as error:
+        import_modules([module])
+    assert "\n" not in str(error.value)
+
+
+def begun_run(directory, **changes):
+    """Folder of a run of somebody else's, with a configuration of theirs."""
+    with RunFolder(directory, point_mass_config(), {"cost": 25.0}, 20).writing():
+        pass
+    path = directory / "config.yaml"
+    OmegaConf.save(OmegaConf.merge(OmegaConf.load(path), changes), path)
+    return path
+
+
+def test_opening_a_run_imports_nothing(folder):
+    (folder / "users_own.py").write_text(MODULE)
+    loss = {"_target_": "users_own.Loss"}
+    path = begun_run(folder / "run", **{"import": ["users_own"], "loss": loss})
+    with pytest.raises(CommandLineError, match=r"trained with import=users_own: add that"):
+        expand_arguments([f"resume={folder / 'run'}"])
+    config = OmegaConf.load(path)
+    with pytest.raises(targets.TargetError, match=r"^loss\._target_=users_own\.Loss.*import=users"):
+        build_trainer(config, PointMass(config.num_envs, 20), folder / "run")
+    assert not (folder / "users_own.trace").exists()
+    for given in ([], ["users_own"], ["moved_since.py"]):
+        check_imports(config, given, folder)
+        assert expand_arguments([f"resume={folder / 'run'}", *note_imports(given, [])])
+
+
+def exec_node(trace):
+    return {"_target_": "builtins.exec", "_args_": [f"open({str(trace)!r}, 'w')"]}
+
+
+@pytest.mark.parametrize(
+    "key",
+    ["loss", "loss.clip_epsilon", "advantage.gamma", "policy_update.optimizer.lr", "cost_measure",
+     "cost_advantage.lmbda", "lagrangian.init", "critic_update.optimizer", "collector"],
+)  # fmt: skip
+def test_no_key_of_a_run_leaves_a_trace(folder, key):
+    path = begun_run(folder / "run")
+    config = OmegaConf.load(path)
+    OmegaConf.update(config, key, exec_node(folder / "trace"), force_add=True)
+    with pytest.raises(ValueError, match=rf"^{key}\._target_=builtins.exec.*import=builtins"):
+        build_trainer(config, PointMass(config.num_envs, 20), folder / "run")
+    assert not (folder / "trace").exists()
+
+
+def test_a_logger_leaves_no_trace(folder):
+    config = OmegaConf.load(begun_run(folder / "run", logger=exec_node(folder / "trace")))
+    with (
+        pytest.raises(ValueError, match=r"^logger\._target_=builtins.exec"),
+        RunFolder(folder / "run", config, {"cost": 25.0}, 20).writing(epoch=0),
+    ):
+        pass
+    assert not (folder / "trace").exists()
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        'hydra: {callbacks: {x: {_target_: builtins.exec, _args_: [\'open("trace", "w")\']}}}',
+        "hydra: {searchpath: [pkg://users_own]}",
+        "defaults: [override hydra/launcher: joblib]",
+        "# @package hydra.callbacks.x",
+    ],
+)
+def test_what_hydra_itself_would_run_is_refused(folder, text):
+    path = begun_run(folder / "run")
+    path.write_text(f"{text}\n{path.read_text()}")
+    with pytest.raises(CommandLineError, match="which runs never write"):
+        expand_arguments([f"resume={folder / 'run'}"])
