@@ -3,9 +3,32 @@
 from __future__ import annotations
 
 import importlib
+from importlib.util import find_spec
 from typing import Any
 
-__all__ = ["import_extra"]
+__all__ = ["import_extra", "require_extra"]
+
+
+def require_extra(module: str, extra: str) -> None:
+    """Check that a package which comes with one of the extras is there, without importing it.
+
+    Args:
+        module: Name of the module, or of one in the package.
+        extra: The extra that installs it.
+
+    Raises:
+        ModuleNotFoundError: If it is not installed; the message says how to install it.
+
+    Examples:
+        >>> require_extra("json", extra="report")
+    """
+    package = module.partition(".")[0]
+    if find_spec(package) is None:
+        raise ModuleNotFoundError(
+            f"This needs the package '{package}', which comes with the extra '{extra}': "
+            f"pip install 'safe-rl[{extra}]'",
+            name=package,
+        )
 
 
 def import_extra(module: str, extra: str) -> Any:
@@ -22,14 +45,5 @@ def import_extra(module: str, extra: str) -> Any:
         >>> import_extra("json", extra="report").dumps([1])
         '[1]'
     """
-    try:
-        return importlib.import_module(module)
-    except ModuleNotFoundError as error:
-        package = module.partition(".")[0]
-        if error.name is None or error.name.partition(".")[0] != package:
-            raise
-        raise ModuleNotFoundError(
-            f"This needs the package '{package}', which comes with the extra '{extra}': "
-            f"pip install 'safe-rl[{extra}]'",
-            name=error.name,
-        ) from error
+    require_extra(module, extra)
+    return importlib.import_module(module)

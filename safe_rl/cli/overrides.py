@@ -1,120 +1,157 @@
-"""Overrides of ``train.py`` that Hydra would refuse without naming the right one."""
+"""Names in overrides of ``train.py``: which ones nothing reads, and what was meant.
+
+Hydra answers a key that does not exist with advice to add it, after which it has no effect.
+"""
 
 from __future__ import annotations
 
 import re
-from collections.abc import Collection, Iterator, Mapping, Sequence
-from pathlib import Path
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
 
-from hydra.core.config_store import ConfigStore
-from omegaconf import OmegaConf
+from hydra.core.config_loader import ConfigLoader
+from hydra.core.object_type import ObjectType
+from hydra.core.override_parser.types import Override
+from omegaconf import DictConfig, OmegaConf
 
-from safe_rl.naming import nearest
+from safe_rl.cli.keys import KEYS
+from safe_rl.cli.settings import optional_keys, plain
+from safe_rl.naming import did_you_mean, nearest
 
-__all__ = ["CommandLineError", "check_overrides"]
-
-# with folders of one's own, names are not only those of `conf/`
-_OTHER_FOLDERS = ("--config-dir", "-cd", "--config-path", "-cp", "hydra.searchpath")
+__all__ = ["CommandLineError", "check_added", "check_choices", "check_limits", "explain"]
 
 
 class CommandLineError(ValueError):
     """A command line that cannot be used; the message says what to write instead."""
 
 
-def check_overrides(arguments: Sequence[str], conf: Path, env_keys: Collection[str]) -> None:
-    """Check the names in overrides such as ``env=CarGoal1``, ``env.hazards_num=3``, ``frames=9``.
-
-    Overrides that add or remove (``+``, ``~``), and command lines that name folders of
-    configurations besides `conf/`, are left to Hydra.
+def check_choices(overrides: Sequence[Override], loader: ConfigLoader) -> None:
+    """Check what is chosen of groups, such as ``env=CarGoal1`` or ``algo=ppo,cpo``.
 
     Args:
-        arguments: Arguments of ``train.py``.
-        conf: Folder of the configurations.
-        env_keys: Configuration keys of an environment.
+        overrides: Overrides of a command line.
+        loader: Knows the files in all folders, and the environments that are registered.
 
     Raises:
-        CommandLineError: For a name that does not exist; the nearest one is named.
+        CommandLineError: For a choice that does not exist; the nearest one is named.
 
     Examples:
-        >>> check_overrides(["env.hazards_num=3"], Path("conf"), ["hazards_num"])
+        >>> from hydra.core.override_parser.overrides_parser import OverridesParser
+        >>> check_choices(OverridesParser.create().parse_overrides(["frames=9"]), loader=None)
     """
-    overrides = [a.partition("=") for a in arguments if "=" in a and not a.startswith(("+", "~"))]
-    for key, _, value in overrides:
-        if key.startswith("env.") and key[4:] not in env_keys:
-            _refuse(f"{key}={value}", "an environment has no key", key[4:], env_keys, "env.")
-    if any(argument.startswith(_OTHER_FOLDERS) for argument in arguments):
-        return
-    choices, names = _choices(conf), _names(conf)
-    for key, _, value in overrides:
-        if key.startswith(("env.", "hydra")):
+    for override in overrides:
+        group = override.key_or_group
+        is_named = override.is_discrete_sweep() or isinstance(override.value(), str)
+        known = loader.get_group_options(group, ObjectType.CONFIG) if is_named else []
+        if not known or override.is_delete():
             continue
-        if key.startswith("cost_limits."):
+        chosen = override.sweep_string_iterator() if override.is_sweep_override() else None
+        for name in chosen or [str(override.value())]:
+            if name not in known:
+                raise CommandLineError(
+                    f"'{override.input_line}': there is no {group} '{name}'."
+                    f"{did_you_mean(name, known)}"
+                )
+
+
+def check_limits(overrides: Sequence[Override]) -> None:
+    """Refuse single limits, which would be merged into the default ones.
+
+    Raises:
+        CommandLineError: If there is one.
+    """
+    for override in overrides:
+        section, _, cost = override.key_or_group.partition(".")
+        if section == "cost_limits" and cost:
             raise CommandLineError(
-                f"'{key}={value}': limits are given all at once, as "
-                f"cost_limits='{{{key.partition('.')[2]}: {value}}}'."
+                f"'{override.input_line}': limits are given all at once, as "
+                f"cost_limits='{{{cost}: {override.get_value_element_as_str()}}}'."
             )
-        _check_choices(key, value, choices)
-        for name in re.split(r"[./@]", key):
-            if name not in names:
-                _refuse(f"{key}={value}", "there is no key", name, names)
-    _check_multiplier(overrides, conf)
 
 
-def _refuse(
-    argument: str, problem: str, name: str, known: Collection[str], prefix: str = ""
-) -> None:
-    close = nearest(name, known)
-    hint = f" Did you mean '{prefix}{close}'?" if close else ""
-    raise CommandLineError(f"'{argument}': {problem} '{name}'.{hint}")
+def check_added(overrides: Sequence[Override], config: DictConfig) -> None:
+    """Refuse keys that are added at the top, where no table knows them, and that nothing reads.
+
+    What sections and parts do not take is refused with their values.
+
+    Args:
+        overrides: Overrides of a command line.
+        config: What they make.
+
+    Raises:
+        CommandLineError: For the first one; right ones are named.
+    """
+    text = OmegaConf.to_yaml(config)
+    for override in overrides:
+        head = override.key_or_group.partition(".")[0]
+        is_added = override.is_add() or override.is_force_add()
+        is_known = any(path.partition(".")[0] == head for path in KEYS)
+        if not is_added or is_known or head not in config or "/" in override.key_or_group:
+            continue
+        # ${head}, ${head.key}, ${resolver:head.key}
+        if not re.search(rf"\$\{{(?:[^${{}}]*[:,])?{re.escape(head)}[.,}}]", text):
+            others = {key: node for key, node in plain(config).items() if key != head}
+            raise CommandLineError(_unread(override.input_line, override.key_or_group, others))
 
 
-def _choices(conf: Path) -> dict[str, set[str]]:
-    """What can be chosen of every group: files, and environments that are registered."""
-    groups: dict[str, set[str]] = {"env": set()}
-    for path in conf.glob("*/*.yaml"):
-        groups.setdefault(path.parent.name, set()).add(path.stem)
-    stored = ConfigStore.instance().list("env")
-    groups["env"] |= {name.removesuffix(".yaml") for name in stored}
-    return groups
+def explain(
+    error: Exception, overrides: Sequence[str], compose: Callable[[str], DictConfig]
+) -> str:
+    """Say what is wrong with overrides that Hydra could not compose, in one line.
+
+    Args:
+        error: What Hydra says.
+        overrides: The overrides.
+        compose: Composes what they choose, without the one that it gets and all that set keys.
+    """
+    words = " ".join(str(error.__cause__ or error if not str(error) else error).split())
+    key = _quoted(r"Could not override '([^']+)'", words)
+    if key is None:
+        there = _quoted(r"An item is already at '([^']+)'", words)
+        return words if there is None else f"'{there}' is there already: write it without +."
+    given = next(text for text in overrides if text.lstrip("+").startswith(f"{key}="))
+    values = plain(compose(given))
+    section = key.partition(".")[0]
+    if section not in values and any(path.partition(".")[0] == section for path in KEYS):
+        return f"'{given}': algo={values['algo']['name']} has no '{section}'."
+    return _unread(given, key, values)
 
 
-def _check_choices(key: str, value: str, choices: Mapping[str, set[str]]) -> None:
-    for name in value.split(",") if key in choices and re.fullmatch(r"[\w,]+", value) else ():
-        if name not in choices[key]:
-            _refuse(f"{key}={value}", f"there is no {key}", name, choices[key])
+def _quoted(pattern: str, words: str) -> str | None:
+    found = re.search(pattern, words)
+    return None if found is None else found[1]
 
 
-def _names(conf: Path) -> set[str]:
-    """Every key and group in a folder of configurations, whatever it is in."""
-    names = {"env", *(path.name for path in conf.glob("**/") if path != conf)}
-    for path in conf.glob("**/*.yaml"):
-        names |= set(_keys(OmegaConf.to_container(OmegaConf.load(path))))
-    return names
+def _unread(given: str | None, key: str, values: Mapping[str, Any]) -> str:
+    """That nothing reads a key, and the full paths of those that were meant."""
+    written = {path: path for path in _paths(values)}
+    written |= {path: f"+{path}" for path in optional_keys(values)}
+    meant = [f"'{written[path]}'" for path in _meant(key, list(written))]
+    hint = f" Did you mean {' or '.join(meant)}?" if meant else ""
+    return f"'{given}': nothing reads '{key}'.{hint}"
 
 
-def _keys(node: Any) -> Iterator[str]:
-    if isinstance(node, Mapping):
-        for key, value in node.items():
-            yield str(key)
-            yield from _keys(value)
+def _meant(key: str, paths: Sequence[str]) -> list[str]:
+    """Paths that end like the key, or else the nearest one, or those whose end is nearest."""
+    name = key.rpartition(".")[2]
+    by_end = [path for path in paths if path.rpartition(".")[2] == name]
+    if by_end:
+        return by_end
+    whole = nearest(key, paths)
+    end = nearest(name, [path.rpartition(".")[2] for path in paths])
+    if whole is not None or end is None:
+        return [] if whole is None else [whole]
+    return [path for path in paths if path.rpartition(".")[2] == end]
 
 
-def _check_multiplier(overrides: Sequence[tuple[str, str, str]], conf: Path) -> None:
-    """``lagrangian=`` chooses between multipliers, which not every algorithm has."""
-    given = {key: value for key, _, value in overrides}
-    if "lagrangian" not in given or "algo" not in given:
-        return
-    with_one = {
-        path.stem
-        for path in conf.glob("algo/*.yaml")
-        if any(
-            "/lagrangian" in entry for entry in OmegaConf.select(OmegaConf.load(path), "defaults")
-        )
-    }
-    for name in given["algo"].split(","):
-        if name not in with_one:
-            raise CommandLineError(
-                f"algo={name} has no multiplier: lagrangian= goes with "
-                f"{' and '.join(sorted(with_one))}."
-            )
+def _paths(values: Mapping[str, Any], prefix: str = "") -> Iterator[str]:
+    """Full paths of everything that can be overridden."""
+    for key, value in values.items():
+        path = f"{prefix}{key}"
+        if isinstance(value, Mapping) and path not in _WHOLE:
+            yield from _paths(value, f"{path}.")
+        elif not str(key).startswith("_"):
+            yield path
+
+
+_WHOLE = ("cost_limits", "default_cost_limits", "model.input_scale", "paper")

@@ -1,107 +1,286 @@
-"""Checks of a run's settings that nothing else would make before it has begun."""
+"""Checks of a run's configuration, before anything is built or written."""
 
 from __future__ import annotations
 
-import math
+import inspect
 import os
 import shutil
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import contextmanager
+from itertools import chain
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import torch
 from hydra.errors import InstantiationException
 from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
 from torchrl.checkpoint import CheckpointError
 
-__all__ = ["SettingError", "check_settings", "errors_in_a_line"]
+from safe_rl.cli.keys import EXTRAS, KEYS, PARTS, Key
+from safe_rl.envs import resolve
+from safe_rl.extras import require_extra
+from safe_rl.naming import did_you_mean
+from safe_rl.targets import locate
+
+__all__ = [
+    *("SETTING_ERRORS", "SettingError", "check_settings", "errors_in_a_line"),
+    *("optional_keys", "plain"),
+]
+
+_MISSING = object()
+_SECTIONS = ("algo", "checkpoint", "collector", "logger", "model")
+_DEVICES = ("cpu", "cuda")
 
 
 class SettingError(ValueError):
     """A value that a run cannot have; the message names the key."""
 
 
-class _Row(NamedTuple):
-    key: str
-    holds: Callable[[Any], bool]
-    meaning: str
+class _Entry(NamedTuple):
+    """A key of a configuration that has a row."""
+
+    path: str
+    row: Key
+    value: Any
 
 
-def _is_count(lowest: int) -> Callable[[Any], bool]:
-    return lambda value: _is_number(value) and value >= lowest and float(value).is_integer()
+class _Part(NamedTuple):
+    """A node that something is built from."""
 
-
-def _is_number(value: Any) -> bool:
-    is_real = isinstance(value, int | float) and not isinstance(value, bool)
-    return is_real and math.isfinite(value)
-
-
-_ROWS = (
-    _Row("frames", _is_count(1), "a number of steps, at least 1"),
-    _Row("frames_per_batch", _is_count(1), "a number of steps, at least 1"),
-    _Row("num_envs", _is_count(1), "a number of environments, at least 1"),
-    _Row("seed", _is_count(0), "a whole number, at least 0"),
-    _Row("checkpoint.interval", lambda v: _is_number(v) and v >= 0, "a number of seconds"),
-    _Row("checkpoint.keep_last", _is_count(1), "a number of checkpoints, at least 1"),
-    _Row("num_threads", lambda v: v is None or _is_count(1)(v), "a number of threads, or null"),
-    _Row(
-        "model.hidden_sizes",
-        lambda v: OmegaConf.is_list(v) and all(map(_is_count(1), v)),
-        "a list of widths, such as [64, 64]",
-    ),
-    _Row("cost_limits", OmegaConf.is_dict, "limits by cost: cost_limits='{cost: 25}'"),
-)
+    path: str
+    node: Mapping[str, Any]
+    found: Callable[..., Any]
 
 
 def check_settings(config: DictConfig) -> None:
-    """Check the types and ranges of what every run has.
+    """Check every key of a configuration by the tables of :mod:`safe_rl.cli.keys`.
+
+    Parts of one's own are checked by what they inherit from the package's, and for names that they
+    do not take. Whole numbers that are written as 3e5 become integers.
 
     Args:
         config: Configuration as composed from ``conf/``.
 
     Raises:
-        SettingError: For the first value that cannot be.
+        SettingError: For the first key that does not exist or holds what it cannot.
+        TargetError: For a part that cannot be built.
+        ConfigError: For one of the environment's.
     """
-    for row in _ROWS:
-        value = OmegaConf.select(config, row.key)
-        if not row.holds(value):
-            raise SettingError(f"{row.key}={value}: it must be {row.meaning}.")
+    values = plain(config)
+    for entry in chain(_entries_of_keys(values), _entries_of_parts(values)):
+        _check(entry)
+        if entry.row.values.whole:
+            OmegaConf.update(config, entry.path, _whole(entry.value), merge=False)
+    for part in _parts(values):
+        _check_extra(part)
+    for path, known in _unread_keys(values):
+        raise SettingError(f"{path}: nothing reads this key.{did_you_mean(path, known)}")
+    _check_device(values["device"])
+    _check_collector(values["collector"])
+    _check_env(values["env"])
+
+
+def plain(config: DictConfig) -> dict[str, Any]:
+    """A configuration as dictionaries and lists, without Hydra's own node.
+
+    Raises:
+        SettingError: If a value refers to one that is not there.
+    """
     try:
-        kind = torch.device(config.device).type
-    except RuntimeError as error:
-        raise SettingError(f"device={config.device}: {error}") from None
-    if kind == "cuda" and not torch.cuda.is_available():
-        raise SettingError(f"device={config.device}: this torch finds no CUDA device.")
+        nodes = OmegaConf.masked_copy(config, [str(key) for key in config if key != "hydra"])
+        values = OmegaConf.to_container(nodes, resolve=True)
+    except OmegaConfBaseException as error:
+        raise SettingError(f"{error.full_key}: {str(error).partition(chr(10))[0]}") from None
+    assert isinstance(values, dict)
+    return {str(key): value for key, value in values.items()}
+
+
+def optional_keys(values: Mapping[str, Any]) -> Iterator[str]:
+    """Full paths of what a configuration does not hold and its parts would read."""
+    for path, node, found in _parts(values):
+        yield from (f"{path}.{name}" for name in _rows(found) if name not in node)
+
+
+def _unread_keys(values: Mapping[str, Any]) -> Iterator[tuple[str, list[str]]]:
+    """Keys in sections and parts of a configuration that nothing reads, and those that are read.
+
+    Keys of environments and those outside of all sections are not among them.
+    """
+    for section in _SECTIONS:
+        node = values.get(section)
+        if isinstance(node, Mapping) and node.get("_target_") is None:
+            known = [path for path in KEYS if path.startswith(f"{section}.")]
+            yield from _others(section, node, known)
+    for path, node, found in _parts(values):
+        names = _names(found)
+        if names is not None:
+            yield from _others(path, node, [f"{path}.{name}" for name in names])
+
+
+def _others(
+    path: str, node: Mapping[str, Any], known: list[str]
+) -> Iterator[tuple[str, list[str]]]:
+    paths = [f"{path}.{name}" for name in node if not str(name).startswith("_")]
+    yield from ((path, known) for path in paths if path not in known)
+
+
+def _entries_of_keys(values: Mapping[str, Any]) -> Iterator[_Entry]:
+    for path, row in KEYS.items():
+        node: Any = values
+        for name in path.split("."):
+            node = node.get(name, _MISSING) if isinstance(node, Mapping) else node
+        is_part = path.startswith("collector.") and values["collector"].get("_target_")
+        if node is not _MISSING and not is_part:
+            yield _Entry(path, row, node)
+        elif node is _MISSING and not row.may_lack:
+            raise SettingError(f"{path} is missing: {row.meaning}.")
+
+
+def _entries_of_parts(values: Mapping[str, Any]) -> Iterator[_Entry]:
+    for path, node, found in _parts(values):
+        rows = _rows(found)
+        for name in node:
+            if name in rows:
+                yield _Entry(f"{path}.{name}", rows[name], node[name])
+
+
+def _parts(values: Mapping[str, Any], prefix: str = "") -> Iterator[_Part]:
+    """What a configuration builds outside the environment, each part before those within it."""
+    for name, node in values.items():
+        if isinstance(node, Mapping) and (prefix or name not in ("env", "algo")):
+            path = f"{prefix}{name}"
+            target = node.get("_target_")
+            if target is not None:
+                yield _Part(path, node, locate(target, f"{path}._target_"))
+            yield from _parts(node, f"{path}.")
+
+
+def _rows(found: Callable[..., Any]) -> Mapping[str, Key]:
+    """Rows of a part, or of the package's part that it inherits from."""
+    if found.__module__.startswith("torch.optim"):
+        return PARTS["torch.optim"]
+    bases = getattr(found, "__mro__", (found,))
+    names = [base.__name__ for base in bases if base.__module__.startswith("safe_rl.")]
+    return next((PARTS[name] for name in names if name in PARTS), {})
+
+
+def _names(found: Callable[..., Any]) -> list[str] | None:
+    """Arguments that a part takes; None if it takes any, or cannot be known."""
+    try:
+        parameters = inspect.signature(found).parameters.values()
+    except (TypeError, ValueError):
+        return None
+    if any(parameter.kind is parameter.VAR_KEYWORD for parameter in parameters):
+        return None
+    return sorted(parameter.name for parameter in parameters)
+
+
+def _check(entry: _Entry) -> None:
+    path, row, value = entry
+    if not row.values.hold(value):
+        raise SettingError(
+            f"{path}={_shown(value)}: it must be {row.values.words} ({row.meaning})."
+        )
+    needed, present = row.bytes_each * (value if row.bytes_each else 0), _memory()
+    if needed > present:
+        raise SettingError(
+            f"{path}={_shown(value)}: this takes {needed / 1e9:,.0f} GB of memory at least, and "
+            f"the machine has {present / 1e9:,.0f}, room for {present // row.bytes_each:,}."
+        )
+
+
+def _memory() -> int:
+    """Bytes of this machine."""
+    return os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+
+
+def _shown(value: Any) -> str:
+    """A value as it is written on a command line, cut if it is long."""
+    written = {None: "null", True: "true", False: "false"}
+    is_word = value is None or isinstance(value, bool)
+    shown = written[value] if is_word else str(value)
+    return shown if len(shown) <= 80 else f"{shown[:80]}…"
+
+
+def _whole(value: Any) -> Any:
+    if isinstance(value, list):
+        return [_whole(item) for item in value]
+    return int(value) if isinstance(value, float) else value
+
+
+def _check_device(device: str) -> None:
+    try:
+        kind, index = torch.device(device).type, torch.device(device).index or 0
+    except RuntimeError:
+        kind, index = "", 0
+    if kind not in _DEVICES:
+        raise SettingError(f"device={_shown(device)}: it must be cpu, cuda or cuda:<number>.")
+    if kind == "cuda" and index >= torch.cuda.device_count():
+        raise SettingError(
+            f"device={device}: this torch finds {torch.cuda.device_count()} CUDA devices."
+        )
+
+
+def _check_collector(node: Mapping[str, Any]) -> None:
+    number = node["num_collectors"]
+    if node.get("_target_") is None and number != 1:
+        raise SettingError(
+            f"collector.num_collectors={number}: collector=local is one process; for more use "
+            "collector=process or collector=ray."
+        )
+
+
+def _check_extra(part: _Part) -> None:
+    extra = EXTRAS.get(part.found.__name__)
+    if extra is not None and part.found.__module__.startswith("safe_rl."):
+        try:
+            require_extra(*extra)
+        except ModuleNotFoundError as error:
+            raise SettingError(f"{part.path}: {error}") from None
+
+
+def _check_env(node: Mapping[str, Any]) -> None:
+    """Environments of other families check their keys where they are made."""
+    if "safety_gym" in (node.get("_target_") or "safety_gym"):
+        resolve({key: value for key, value in node.items() if key not in ("name", "_target_")})
 
 
 @contextmanager
-def errors_in_a_line(directory: Path, is_new: bool, *also: type[Exception]) -> Iterator[None]:
+def errors_in_a_line(directory: Path, is_new: bool, *errors: type[Exception]) -> Iterator[None]:
     """End with what is wrong instead of the way to it, which ``HYDRA_FULL_ERROR=1`` shows.
 
     Args:
         directory: Folder of the run.
         is_new: Whether it may go if nothing but Hydra's notes is in it.
-        also: Errors about settings besides `ValueError`, `CheckpointError` and Hydra's.
+        errors: Errors that are about settings and files; all others pass.
 
     Raises:
-        SystemExit: For errors about settings and files; all others pass.
+        SystemExit: For these errors.
     """
     try:
         yield
-    except (ValueError, CheckpointError, InstantiationException, *also) as error:
+    except errors as error:
         if os.environ.get("HYDRA_FULL_ERROR") == "1":
             raise
-        if is_new and all(path.name == ".hydra" for path in directory.iterdir()):
+        if is_new and directory.is_dir() and all(p.name == ".hydra" for p in directory.iterdir()):
             shutil.rmtree(directory)
         raise SystemExit(_in_words(error)) from None
 
 
+SETTING_ERRORS: Collection[type[Exception]] = (
+    *(ValueError, CheckpointError, InstantiationException, OmegaConfBaseException, OSError),
+    ModuleNotFoundError,
+)
+"""What goes wrong for the sake of settings and files while a run is built."""
+
+
 def _in_words(error: Exception) -> str:
-    """A component's own words, and the key of the component."""
+    """A component's own words, and the key of the component, in one line."""
     cause = error.__cause__
+    words = str(error)
     if isinstance(error, InstantiationException) and cause is not None:
         key = str(error).rpartition("full_key: ")[2]
         words = str(cause) if isinstance(cause, ValueError) else f"{type(cause).__name__}: {cause}"
-        return f"{key}: {words}"
-    return str(error)
+        words = f"{key}: {words}"
+    return " ".join(words.split())

@@ -1,8 +1,10 @@
 """The command ``train.py``: compose a configuration, build a run, train."""
 
 import math
+import os
 import sys
-from contextlib import nullcontext
+from collections.abc import Sequence
+from contextlib import AbstractContextManager, nullcontext
 from functools import partial
 from pathlib import Path
 from typing import Any, cast
@@ -13,8 +15,9 @@ from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 
 import safe_rl.openmp  # noqa: F401, has to come before torch
-from safe_rl.cli.overrides import CommandLineError, check_overrides
-from safe_rl.cli.settings import check_settings, errors_in_a_line
+from safe_rl.cli.composing import check_command
+from safe_rl.cli.overrides import CommandLineError
+from safe_rl.cli.settings import SETTING_ERRORS, SettingError, check_settings, errors_in_a_line
 from safe_rl.cli.shorthands import expand_arguments
 from safe_rl.cli.user_code import (
     import_modules,
@@ -23,8 +26,9 @@ from safe_rl.cli.user_code import (
     note_imports,
     split_imports,
 )
-from safe_rl.envs import LayoutError, SafetyGymConfig, make_env, store_configs
+from safe_rl.envs import ConfigError, LayoutError, make_env, store_configs
 from safe_rl.runs.resuming import is_finished, may_continue
+from safe_rl.targets import TargetError
 from safe_rl.training.trainer import Trainer, build_trainer, physics_threads, seed_everything
 from safe_rl.training.transfer import initialise_networks
 
@@ -68,28 +72,37 @@ def train(config: DictConfig) -> None:
     directory = Path(HydraConfig.get().runtime.output_dir)
     is_job = HydraConfig.get().mode is RunMode.MULTIRUN  # whose sweep keeps account of failures
     continues = may_continue(HydraConfig.get(), config)
-    errors = nullcontext() if is_job else errors_in_a_line(directory, not continues, LayoutError)
-    with errors:
+
+    def in_a_line(*errors: type[Exception]) -> AbstractContextManager[None]:
+        return nullcontext() if is_job else errors_in_a_line(directory, not continues, *errors)
+
+    with in_a_line(*SETTING_ERRORS, LayoutError):
         trainer = prepare(config, directory, continues)
     if trainer is None:
         return
-    print(trainer.run())
+    with in_a_line(OSError):
+        print(trainer.run())
     if trainer.interrupted_by is not None:
         print(f"Interrupted. Continue with: python train.py resume={directory}")
         raise SystemExit(128 + trainer.interrupted_by)
 
 
-def main() -> None:
-    """The command: expand shorthands, check names, and hand over to Hydra."""
+def main(arguments: Sequence[str] | None = None) -> int:
+    """The command: expand shorthands, check what is asked for, and hand over to Hydra."""
     try:
-        modules, arguments = split_imports(sys.argv[1:])
+        given = sys.argv[1:] if arguments is None else list(arguments)
+        modules, given = split_imports(given)
         if modules is not None:
             import_modules(modules)
             store_configs()  # again, with the keys that the modules have registered
-            arguments = note_imports(modules, arguments)
-        arguments = expand_arguments(arguments)
-        check_overrides(arguments, CONF, {"name", *SafetyGymConfig().to_dict()})
-        sys.argv[1:] = arguments
-    except CommandLineError as error:
-        raise SystemExit(str(error)) from None
+            given = note_imports(modules, given)
+        expanded = expand_arguments(given)
+        check_command(expanded, CONF)
+    except (CommandLineError, SettingError, TargetError, ConfigError) as error:
+        if os.environ.get("HYDRA_FULL_ERROR") == "1":
+            raise
+        print(error, file=sys.stderr)
+        return 1
+    sys.argv[1:] = expanded
     train()
+    return 0

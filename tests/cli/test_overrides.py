@@ -1,74 +1,143 @@
-"""Wrong names on the command line are refused before Hydra sees them, right ones are not."""
+"""Names on the command line: what nothing reads is refused with what was meant, before a run."""
+
+import os
 
 import pytest
 from omegaconf import OmegaConf
-from run_configs import CONF, compose_config
+from run_configs import CONF
 
-from safe_rl.cli.overrides import CommandLineError, check_overrides
-from safe_rl.envs import store_configs
+from safe_rl.cli.composing import check_command
+from safe_rl.cli.overrides import CommandLineError
+from safe_rl.cli.settings import SettingError
 
-ENV_KEYS = ["hazards_num", "hazards_size", "num_steps"]
+pytestmark = pytest.mark.usefixtures("few_environments")
+
+MINE = """
+# @package _global_
+mine: {tail: 0.25, weight: 1.0}
+lagrangian:
+  init: ${mine.tail}
+"""
 RIGHT = [
-    ["-m", "env=PointGoal1,CarPush2", "env.hazards_num=3,4", "+env.num_steps=5"],
-    ["algo=cpo,ppo", "preset=paper", "frames=30_000", "policy_update.target_kl=0.02"],
+    ["-m", "env=PointGoal1,CarGoal2", "env.hazards_num=3,4", "seed=range(3)", "+note=a,b"],
     ["algo=trpo_lagrangian", "lagrangian=adam", "lagrangian.lr=0.1", "cost_limits={cost: 3}"],
-    [
-        "lagrangian=pid",
-        "collector=process",
-        "logger=none",
-        "hydra.run.dir=x",
-        "checkpoint.interval=5",
-    ],
-    ["+frmaes=3", "~logger", "hydra/launcher=basic", "policy_update/ppo@policy_update=paper"],
-    ["--config-dir=mine", "algo=mine", "mine.tail=0.1"],
+    ["collector=process", "logger=none", "hydra.run.dir=x", "checkpoint.interval=5", "frames=3e5"],
+    ["hydra/launcher=basic", "+policy_update.max_grad_norm=0.5", "+model.input_scale.position=2"],
+    ["algo=cpo", "preset=paper", "policy_update.target_kl=0.02", "++seed=3"],
+    ["policy_update/ppo@policy_update=paper"],
 ]
 WRONG = {
-    "env.hazard_num=3": r"no key 'hazard_num'\. Did you mean 'env\.hazards_num'",
-    "frmaes=3": "no key 'frmaes'. Did you mean 'frames'",
+    "env.hazard_num=3": r"nothing reads 'env.hazard_num'\. Did you mean 'env.hazards_num'\?",
+    "hazards_num=3": r"Did you mean 'env.hazards_num'\?",
+    "frmaes=3": "nothing reads 'frmaes'. Did you mean 'frames'",
     "presett=paper": "Did you mean 'preset'",
-    "policy_update.target_kll=1": "Did you mean 'target_kl'",
+    "lr=1e-4": "Did you mean 'policy_update.optimizer.lr' or 'critic_update.optimizer.lr'",
+    "+lr=1e-4": "Did you mean 'policy_update.optimizer.lr' or 'critic_update.optimizer.lr'",
+    "++deep.lr=1e-4": "nothing reads 'deep.lr'. Did you mean 'policy_update.optimizer.lr'",
+    "policy_update.lr=1e-4": "Did you mean 'policy_update.optimizer.lr'",
+    "max_grad_norm=1": r"Did you mean '\+policy_update.max_grad_norm'",
+    "policy_update.max_kll=1": "Did you mean 'policy_update.max_kl'",
+    "+policy_update.max_kll=1": "policy_update.max_kll: nothing reads.*'policy_update.max_kl'",
+    "+checkpoint.kept=1": "checkpoint.kept: nothing reads.*'checkpoint.keep_last'",
+    "+lagrangian.kpp=1": "Did you mean 'lagrangian.kp'",
+    "+logger.path=x": "logger.path: nothing reads",
+    "~logger": "logger is missing: .*logger=none for nothing",
+    "~frames": "frames is missing",
+    "+seed=1": "'seed' is there already: write it without +",
     "env=PointGaol1": "no env 'PointGaol1'. Did you mean 'PointGoal1'",
-    "env=CarGoal1,CarGaol2": "no env 'CarGaol2'. Did you mean 'CarGoal2'",
+    "env=CarGoal2,CarGaol2": "no env 'CarGaol2'. Did you mean 'CarGoal2'",
     "algo=cop": "no algo 'cop'. Did you mean 'cpo'",
     "preset=papers": "Did you mean 'paper'",
     "cost_limits.cost=10": r"cost_limits='\{cost: 10\}'",
+    "frames=[1": r"frames=\[1",
+    "seed=0,1": "--multirun",
+    "frames=${nowhere}": "frames: .*nowhere",
 }
 
 
-@pytest.fixture(autouse=True)
-def _environments():
-    store_configs()
+@pytest.fixture
+def own_conf(tmp_path):
+    """A folder of one's own with an algorithm and an environment."""
+    for group in ("algo", "env"):
+        (tmp_path / group).mkdir()
+    (tmp_path / "algo" / "mine.yaml").write_text(
+        "# @package _global_\ndefaults: [ppo_lagrangian, _self_]\n" + MINE
+    )
+    (tmp_path / "env" / "Nearby.yaml").write_text("defaults: [PointGoal1]\nhazards_num: 3\n")
+    return tmp_path
 
 
-@pytest.mark.parametrize("arguments", RIGHT)
+@pytest.mark.parametrize("arguments", RIGHT, ids=" ".join)
 def test_right_names_pass(arguments):
-    check_overrides(arguments, CONF, ENV_KEYS)
+    check_command(arguments, CONF)
 
 
 @pytest.mark.parametrize("argument", WRONG)
-def test_wrong_names_name_the_nearest(argument):
-    with pytest.raises(CommandLineError, match=WRONG[argument]):
-        check_overrides(["seed=0", "hydra.run.dir=x", argument], CONF, ENV_KEYS)
+def test_wrong_names_name_the_right_ones(argument):
+    flags = ["-m"] if argument == "env=CarGoal2,CarGaol2" else []
+    with pytest.raises((CommandLineError, SettingError), match=WRONG[argument]) as caught:
+        check_command([*flags, "logger=none", argument], CONF)
+    assert len(str(caught.value).splitlines()) == 1
 
 
-@pytest.mark.parametrize("algo", ["ppo", "trpo", "cpo", "ppo_lagrangian,cpo"])
-def test_multipliers_go_with_algorithms_that_have_them(algo):
-    with pytest.raises(CommandLineError, match=r"no multiplier.*ppo_lagrangian and trpo_lagr"):
-        check_overrides([f"algo={algo}", "lagrangian=pid"], CONF, ENV_KEYS)
+@pytest.mark.parametrize(
+    "override", ["lagrangian=pid", "lagrangian.kp=1", "cost_advantage.gamma=0"]
+)
+def test_multipliers_go_with_algorithms_that_have_them(override):
+    part = override.partition("=")[0].partition(".")[0]
+    with pytest.raises(CommandLineError, match=f"algo=ppo has no '{part}'"):
+        check_command(["algo=ppo", override], CONF)
 
 
-@pytest.mark.parametrize("path", [*(CONF / "algo").glob("*.yaml")], ids=lambda path: path.stem)
-def test_every_key_of_every_algorithm_passes(path):
-    config = OmegaConf.to_container(compose_config(f"algo={path.stem}"))
-    groups = {group.name for group in CONF.glob("*/")}
-    keys = [key for key in dotted(config) if key not in {"env", "cost_limits", *groups}]
-    assert len(keys) > 40
-    check_overrides([f"{key}=1" for key in keys], CONF, ENV_KEYS)
+@pytest.mark.parametrize("flag", ["--config-dir=", "hydra.searchpath=[file://"])
+def test_folders_of_ones_own_are_searched_too(own_conf, flag):
+    folder = f"{flag}{own_conf}{']' if '[' in flag else ''}"
+    check_command([folder, "algo=mine", "env=Nearby", "mine.tail=0.1", "+mine.more=1"], CONF)
+    for wrong, meant in {
+        "algo=mime": "Did you mean 'mine'",
+        "env=Nearbye": "Did you mean 'Nearby'",
+        "mine.tial=1": "Did you mean 'mine.tail'",
+        "frmaes=3": "Did you mean 'frames'",
+        "+frmaes=3": "Did you mean 'frames'",
+        "mine.tail=abc": "lagrangian.init=abc",
+    }.items():
+        choice = [] if wrong.startswith("algo") else ["algo=mine"]
+        with pytest.raises((CommandLineError, SettingError), match=meant):
+            check_command([folder, *choice, wrong], CONF)
 
 
-def dotted(node, prefix=""):
-    """Every key of a configuration but those of the environment and the limits."""
-    for key, value in node.items():
-        yield f"{prefix}{key}"
-        if isinstance(value, dict) and key not in ("env", "cost_limits"):
-            yield from dotted(value, f"{prefix}{key}.")
+def test_a_folder_that_is_not_there():
+    with pytest.raises(CommandLineError, match="no such folder"):
+        check_command(["--config-dir", "nowhere"], CONF)
+
+
+def test_every_value_of_a_sweep_is_checked():
+    for wrong in ("lagrangian.kp=0.1,nan", "+lr=1,2"):
+        with pytest.raises((CommandLineError, SettingError), match=r"kp=nan|nothing reads 'lr'"):
+            check_command(["-m", "seed=0,1", wrong], CONF)
+
+
+@pytest.mark.parametrize("flags", [["-sc", "install=bash"], ["--help"], ["--hydra-help"]])
+def test_questions_to_hydra_pass_untouched(flags):
+    check_command([*flags, "no_such=key"], CONF)
+
+
+def test_configurations_are_shown_with_wrong_values_but_not_with_wrong_names():
+    check_command(["--cfg", "job", "seed=abc"], CONF)
+    check_command(["--info", "defaults"], CONF)
+    with pytest.raises(CommandLineError, match="Did you mean 'frames'"):
+        check_command(["--cfg", "job", "frmaes=3"], CONF)
+
+
+@pytest.mark.parametrize("place", ["a_file/run", "x" * 300])
+def test_folders_that_cannot_be_written(tmp_path, place):
+    (tmp_path / "a_file").write_text("")
+    with pytest.raises(CommandLineError, match=r"hydra\.run\.dir=.*nothing can be written there"):
+        check_command([f"hydra.run.dir={tmp_path / place}"], CONF)
+    assert os.listdir(tmp_path) == ["a_file"]
+
+
+def test_every_key_of_the_files_can_be_overridden_by_its_own_value():
+    config = OmegaConf.load(CONF / "policy_update" / "ppo" / "default.yaml")
+    keys = {"optimizer.lr": config.optimizer.lr, "adapt_rate.factor": config.adapt_rate.factor}
+    check_command([f"policy_update.{key}={value}" for key, value in keys.items()], CONF)

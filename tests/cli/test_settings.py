@@ -11,18 +11,18 @@ from safe_rl.cli.settings import SettingError, check_settings, errors_in_a_line
 
 ROOT = Path(__file__).parents[2]
 WRONG = {
-    "frames=abc": "frames=abc: it must be a number of steps",
+    "frames=abc": "frames=abc: it must be a whole number from 1 to .* \\(steps to train for\\)",
     "frames=0": "frames=0",
     "frames=1.5": r"frames=1\.5",
     "num_envs=0": "num_envs=0",
-    "seed=-1": "seed=-1: it must be a whole number",
-    "seed=true": "seed=True",
-    "checkpoint.interval=abc": r"checkpoint\.interval=abc: it must be a number of seconds",
+    "seed=-1": "seed=-1: it must be a whole number from 0",
+    "seed=true": "seed=true",
+    "checkpoint.interval=abc": r"checkpoint\.interval=abc: it must be a number from 0.*seconds",
     "checkpoint.keep_last=0": r"checkpoint\.keep_last=0",
     "num_threads=0": "num_threads=0",
-    "model.hidden_sizes=64": r"model\.hidden_sizes=64: it must be a list of widths",
-    "device=gpu": "device=gpu: Expected one of cpu, cuda",
-    "cost_limits=25": r"cost_limits=25: it must be limits by cost",
+    "model.hidden_sizes=64": r"model\.hidden_sizes=64: it must be a list",
+    "device=gpu": "device=gpu: it must be cpu, cuda or",
+    "cost_limits=25": r"cost_limits=25: it must be a mapping",
 }
 
 
@@ -44,24 +44,24 @@ def test_only_folders_of_runs_that_did_not_begin_are_removed(tmp_path, monkeypat
         if name == "c":
             (tmp_path / name / "progress.csv").write_text("steps")
         stops = pytest.raises(SystemExit, match="what is wrong")
-        with stops, errors_in_a_line(tmp_path / name, is_new):
+        with stops, errors_in_a_line(tmp_path / name, is_new, SettingError):
             raise SettingError("what is wrong")
         assert (tmp_path / name).exists() == stays
 
 
 def test_other_errors_and_full_ones_pass(tmp_path, monkeypatch):
-    with pytest.raises(RuntimeError), errors_in_a_line(tmp_path, is_new=False):
+    with pytest.raises(RuntimeError), errors_in_a_line(tmp_path, False, SettingError):
         raise RuntimeError
     monkeypatch.setenv("HYDRA_FULL_ERROR", "1")
-    with pytest.raises(SettingError), errors_in_a_line(tmp_path, is_new=False):
+    with pytest.raises(SettingError), errors_in_a_line(tmp_path, False, SettingError):
         raise SettingError
 
 
 @pytest.mark.parametrize(
     ("override", "words"),
     [
-        ("frames=abc", "frames=abc: it must be a number of steps, at least 1."),
-        ("lagrangian.kp=abc", "lagrangian: '<' not supported"),
+        ("frames=abc", "frames=abc: it must be a whole number from 1 to"),
+        ("lagrangian.kp=abc", "lagrangian.kp=abc: it must be a number from 0"),
         ("init_from=nowhere", "init_from=nowhere: there is no such folder or file."),
         ("env.hazards_num=abc", "'hazards_num'"),
         ("env.hazards_num=200", "No layout found in 10000 attempts: most often 'hazard"),

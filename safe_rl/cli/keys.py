@@ -1,0 +1,211 @@
+"""Every key of a run's configuration: what it may hold, and what it means.
+
+Keys that belong to a part are listed by the part's class, whatever node of the configuration it
+stands in. Defaults are in ``conf/``; keys of environments are the environments' own business.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+from safe_rl.cli.values import (
+    Values,
+    anything,
+    boolean,
+    choice,
+    component,
+    count,
+    list_of,
+    mapping_of,
+    number,
+    one_or_per_cost,
+    optional,
+    text,
+)
+
+__all__ = ["EXTRAS", "KEYS", "PARTS", "Key"]
+
+
+class Key(NamedTuple):
+    """A row of the tables.
+
+    Attributes:
+        values: What the key may hold.
+        meaning: What it is, in a few words.
+        bytes_each: Memory that every unit of a count takes at least; 0 if it takes none.
+        may_lack: Whether a configuration without the key is whole.
+
+    Examples:
+        >>> KEYS["checkpoint.keep_last"].meaning
+        'checkpoints that are kept besides the best'
+    """
+
+    values: Values
+    meaning: str
+    bytes_each: int = 0
+    may_lack: bool = False
+
+
+_SHARE = number(0, 1)
+_POSITIVE = number(0, above=True)
+_NOT_NEGATIVE = number(0)
+_LIMITS = mapping_of(number(0))
+_SECTION = mapping_of(anything)
+
+KEYS = {
+    "frames": Key(count(), "steps to train for"),
+    # a world of the smallest robot, and a step with one number of observation
+    "num_envs": Key(count(), "environments that are stepped together", bytes_each=20_000),
+    "frames_per_batch": Key(count(), "steps of all environments in one batch", bytes_each=50),
+    # evaluations add to a seed, and environments count in 64 bits
+    "seed": Key(count(0, 2**62), "seed of the run"),
+    "init_from": Key(optional(text), "folder or checkpoint of the run to start from"),
+    "cost_limits": Key(_LIMITS, "cost per episode allowed by cost, '{cost: 25}'"),
+    "default_cost_limits": Key(optional(_LIMITS), "cost_limits unless given", may_lack=True),
+    "device": Key(text, "where networks are trained: cpu or cuda"),
+    # torch starts all of them at once, and crashes where the system gives it no more
+    "num_threads": Key(optional(count(1, 1024)), "threads of physics and torch; null: all cores"),
+    "compile": Key(boolean, "whether to compile the losses"),
+    "preset": Key(text, "set of numbers"),
+    "note": Key(anything, "free words about the run, for its config.yaml", may_lack=True),
+    "import": Key(anything, "modules of one's own", may_lack=True),
+    "paper": Key(anything, "numbers that preset=paper chooses from", may_lack=True),
+    "env": Key(_SECTION, "the environment: env=PointGoal1"),
+    "algo": Key(_SECTION, "the algorithm: algo=cpo"),
+    "model": Key(_SECTION, "the networks"),
+    "checkpoint": Key(_SECTION, "when checkpoints are written"),
+    "collector": Key(_SECTION, "where environments are stepped: collector=local"),
+    "logger": Key(_SECTION, "what is logged besides the table: logger=none for nothing"),
+    "env.name": Key(text, "name of the environment"),
+    "algo.name": Key(text, "name of the algorithm"),
+    "checkpoint.interval": Key(number(0), "seconds between checkpoints"),
+    "checkpoint.keep_last": Key(count(1, 10_000), "checkpoints that are kept besides the best"),
+    "collector.num_collectors": Key(count(1, 1024), "processes that step environments"),
+    "model.hidden_sizes": Key(list_of(count(1, 16_384), 32), "widths of layers, such as [64, 64]"),
+    "model.initial_log_std": Key(number(-20, 10), "log of the policy's first standard deviation"),
+    "model.input_scale": Key(mapping_of(_POSITIVE), "factors by observation component"),
+    "advantage": Key(component, "estimator of the reward's advantages", may_lack=True),
+    "cost_advantage": Key(optional(component), "estimator of the costs' advantages", may_lack=True),
+    "cost_measure": Key(
+        optional(component), "what of the episodes' costs is limited", may_lack=True
+    ),
+    "lagrangian": Key(optional(component), "the multiplier", may_lack=True),
+    "loss": Key(component, "the policy's loss", may_lack=True),
+    "policy_update": Key(component, "what moves the policy", may_lack=True),
+    "critic_update": Key(component, "what moves the critics", may_lack=True),
+}
+"""By full path. Of sections (``model`` and the like) these are all keys there are."""
+
+_OPTIMIZER = {
+    "lr": Key(number(0, 1000, above=True), "learning rate"),
+    "betas": Key(list_of(number(0, 1, below=True), 3), "decay rates of the moments"),
+    "eps": Key(_NOT_NEGATIVE, "what denominators are kept above"),
+    "weight_decay": Key(_NOT_NEGATIVE, "decay of the weights"),
+    "momentum": Key(number(0, 1, below=True), "weight of past gradients"),
+    "fused": Key(optional(boolean), "whether to step in one kernel"),
+    "foreach": Key(optional(boolean), "whether to step all tensors together"),
+    "amsgrad": Key(boolean, "whether to keep the maximum of second moments"),
+    "nesterov": Key(boolean, "whether to look ahead"),
+}
+_ESTIMATOR = {
+    "gamma": Key(_SHARE, "discount per step"),
+    "lmbda": Key(_SHARE, "decay of the TD errors"),
+    "value_target": Key(choice("lambda_return", "return_to_go"), "what critics learn"),
+}
+_TRUST_REGION = {
+    "target_kl": Key(_POSITIVE, "radius δ of the trust region, a mean KL divergence"),
+    "damping": Key(_NOT_NEGATIVE, "multiple of the identity added to the Fisher matrix"),
+    "cg_iterations": Key(count(1, 10_000), "iterations of conjugate gradients"),
+    "backtrack_coeff": Key(
+        number(0, 1, above=True, below=True), "factor from one try of the line search to the next"
+    ),
+    "max_backtracks": Key(count(1, 10_000), "tries of the line search"),
+    "fisher_subsample": Key(number(0, 1, above=True), "share of the batch for the Fisher matrix"),
+}
+_LOSS = {
+    "entropy_coeff": Key(_NOT_NEGATIVE, "factor of the entropy bonus"),
+    "reduction": Key(choice("mean", "sum"), "how samples are reduced"),
+}
+_CLIPPED_LOSS = {
+    **_LOSS,
+    "clip_epsilon": Key(number(0, 1000, above=True), "half-width of the ratios that earn"),
+}
+_WORKERS = {"num_collectors": KEYS["collector.num_collectors"]}
+
+PARTS = {
+    "MinibatchUpdate": {
+        "optimizer": Key(component, "the optimiser"),
+        "num_passes": Key(count(1, 10**9), "passes over the batch"),
+        "minibatch_size": Key(optional(count()), "samples per step; null: the whole batch"),
+        "max_kl": Key(optional(_POSITIVE), "mean KL divergence that ends the update"),
+        "max_grad_norm": Key(optional(_POSITIVE), "norm to which the gradient is clipped"),
+        "adapt_rate": Key(optional(component), "what adapts the learning rate"),
+        "compile": Key(boolean, "whether to compile the loss"),
+    },
+    "KLAdaptiveRate": {
+        "factor": Key(number(1, above=True), "by which the rate is divided or multiplied"),
+        "lowest": Key(number(0, 1000, above=True), "lower bound of the rate"),
+        "highest": Key(number(0, 1000, above=True), "upper bound of the rate"),
+        "few_steps": Key(_SHARE, "share of the steps below which an update ended early"),
+        "low_kl": Key(_SHARE, "share of the KL limit below which an update fell short"),
+    },
+    "TRPOStep": _TRUST_REGION,
+    "CPOStep": {
+        **_TRUST_REGION,
+        "rescale_violation": Key(boolean, "whether violations are divided by the episode length"),
+    },
+    "PPOLoss": _CLIPPED_LOSS,
+    "PPOLagrangianLoss": _CLIPPED_LOSS,
+    "TRPOLoss": _LOSS,
+    "TRPOLagrangianLoss": _LOSS,
+    "CPOLoss": {"entropy_coeff": _LOSS["entropy_coeff"]},
+    "VectorGAE": _ESTIMATOR,
+    "CostGAE": _ESTIMATOR,
+    "LagrangeMultiplier": {
+        "init": Key(one_or_per_cost(number(0, 1e6, above=True)), "first λ"),
+        "lr": Key(_POSITIVE, "step size of Adam"),
+        "betas": _OPTIMIZER["betas"],
+        "eps": _OPTIMIZER["eps"],
+    },
+    "PIDMultiplier": {
+        "init": Key(one_or_per_cost(number(0, 1e6)), "first λ"),
+        "kp": Key(_NOT_NEGATIVE, "proportional gain"),
+        "ki": Key(_NOT_NEGATIVE, "integral gain"),
+        "kd": Key(_NOT_NEGATIVE, "derivative gain"),
+        "proportional_ema": Key(number(0, 1, below=True), "weight of the past in the error"),
+        "derivative_ema": Key(number(0, 1, below=True), "weight of the past in the cost"),
+        "derivative_delay": Key(count(1, 100_000), "updates over which growth is measured"),
+        "scale": Key(
+            Values(
+                lambda v: v == "limit" or one_or_per_cost(_POSITIVE).hold(v),
+                f"limit, or {one_or_per_cost(_POSITIVE).words}",
+            ),
+            "unit of the errors",
+        ),
+    },
+    "make_process_collector": _WORKERS,
+    "make_ray_collector": {
+        **_WORKERS,
+        "ray_init": Key(mapping_of(anything), "arguments of ray.init"),
+        "resources": Key(mapping_of(anything), "resources of every actor"),
+    },
+    "TensorboardLogger": {"exp_name": Key(text, "folder of the event files")},
+    "MLflowLogger": {
+        "exp_name": Key(text, "name of the experiment"),
+        "tracking_uri": Key(text, "database or server"),
+    },
+    "WandbLogger": {
+        "exp_name": Key(text, "name of the run"),
+        "project": Key(text, "name of the project"),
+        "offline": Key(boolean, "whether to keep everything in the folder of the run"),
+    },
+    "torch.optim": _OPTIMIZER,
+}
+"""Of the package's parts by class, and of torch's optimisers together."""
+
+EXTRAS = {
+    "make_ray_collector": ("ray", "ray"),
+    "WandbLogger": ("wandb", "wandb"),
+    "MLflowLogger": ("mlflow", "mlflow"),
+}
+"""Parts that need a package besides: its name, and the extra that installs it."""
