@@ -21,13 +21,17 @@ def make_behaviour(actor: ProbabilisticTensorDictSequential) -> TensorDictModule
         return actor
 
 
+_WITHOUT_NOISE = (ExplorationType.DETERMINISTIC, ExplorationType.MODE, ExplorationType.MEAN)
+
+
 class BehaviourPolicy(TensorDictModuleBase):
     """Sample a Gaussian actor in one module, without distribution objects.
 
     It shares the actor's parameters and writes what the actor writes: ``loc``, ``scale``, the
     action and its log-probability. While an environment is stepped with small batches, most of the
     actor's time goes into building distributions and nesting modules, which this class leaves out.
-    Under ``set_exploration_type(ExplorationType.DETERMINISTIC)`` the action is ``loc``.
+    Under ``set_exploration_type`` with ``DETERMINISTIC``, ``MODE`` or ``MEAN`` the action is
+    ``loc``, which is all of these of a Gaussian.
 
     Args:
         actor: Policy made by :func:`make_actor`, or any ``ProbabilisticTensorDictSequential``
@@ -61,7 +65,7 @@ class BehaviourPolicy(TensorDictModuleBase):
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write the distribution's parameters, the action and its log-probability."""
         loc, scale = self.network(tensordict.get(self.in_keys[0]))
-        if exploration_type() is ExplorationType.DETERMINISTIC:
+        if exploration_type() in _WITHOUT_NOISE:
             noise = torch.zeros_like(loc)
         else:
             noise = torch.randn_like(loc)

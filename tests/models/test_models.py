@@ -80,9 +80,13 @@ def test_behaviour_policy_follows_the_actors_parameters_and_the_exploration_type
     with torch.no_grad():
         for parameter in actor.parameters():
             parameter.add_(0.1)
-    with set_exploration_type(ExplorationType.DETERMINISTIC):
-        sample = policy(batch)
-    torch.testing.assert_close(sample["action"], actor.get_dist(batch).mean)
+    for kind in (ExplorationType.DETERMINISTIC, ExplorationType.MODE, ExplorationType.MEAN):
+        with set_exploration_type(kind):
+            sample, expected = policy(batch.clone()), actor(batch.clone())
+        assert torch.equal(sample["action"], expected["action"])
+        assert torch.equal(sample["action"], actor.get_dist(batch).mean)
+    with set_exploration_type(ExplorationType.RANDOM):
+        assert not torch.equal(policy(batch)["action"], sample["action"])
 
 
 def test_behaviour_policy_refuses_other_distributions():
