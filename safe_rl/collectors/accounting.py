@@ -80,14 +80,16 @@ class EpisodeAccounting:
 
     Args:
         num_envs: Number of environments N.
-        cost_keys: Keys below ``"next"`` to account for, each [N, T, 1].
+        cost_keys: Keys below ``"next"`` to account for, each [N, T, 1] or, of one environment
+            without a batch dimension, [T, 1].
         reward_key: Key of the reward below ``"next"``.
         done_key: Key of the end of an episode below ``"next"``.
         device: Device of the batches.
 
     Raises:
         KeyError: By :meth:`update`, if a key is not in the batch.
-        ValueError: By :meth:`update`, if the batch does not have the shape [N, T].
+        ValueError: By :meth:`update`, if the batch does not have the shape [N, T], or [T] with
+            N = 1.
 
     Examples:
         >>> import torch
@@ -121,8 +123,13 @@ class EpisodeAccounting:
         self._totals = torch.zeros(num_sums, dtype=torch.float64, device=device)
 
     def update(self, batch: TensorDictBase) -> EpisodeStatistics:
-        """Account for one batch of consecutive steps, shape [N, T], batches in order of time."""
+        """Account for one batch of consecutive steps, [N, T], batches in order of time.
+
+        A batch [T] is that of a single environment.
+        """
         num_envs = self._open_sums.shape[0]
+        if batch.ndim == num_envs == 1:
+            batch = batch.unsqueeze(0)
         if batch.ndim != 2 or batch.shape[0] != num_envs:
             raise ValueError(
                 f"The batch has shape {list(batch.shape)}, but the accounting is for {num_envs} "

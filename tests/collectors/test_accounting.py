@@ -46,6 +46,15 @@ class LoopAccounting:
         return finished, (self.cost / self.steps, self.speed_cost / self.steps)
 
 
+def test_a_single_environment_needs_no_batch_dimension():
+    generator = torch.Generator().manual_seed(0)
+    batch = random_batch(generator, 1, 40, 0.2)
+    rows = [EpisodeAccounting(1, COST_KEYS).update(data).scalars() for data in (batch, batch[0])]
+    assert rows[0] == rows[1]
+    with pytest.raises(ValueError, match="2 environments"):
+        EpisodeAccounting(2, COST_KEYS).update(batch[0])
+
+
 @pytest.mark.parametrize("done_probability", [0.0, 0.02, 0.3, 1.0])
 @pytest.mark.parametrize(("num_envs", "num_steps"), [(1, 7), (3, 40), (5, 1)])
 def test_agrees_with_a_loop_over_several_batches(num_envs, num_steps, done_probability):
