@@ -66,9 +66,9 @@ FLOORS = {
         ("",),
     ),
     "objectives": (
-        ("keys", "gaussian", "cpo_dual"),
+        ("keys", "distributions", "samples", "gae", "cpo_dual"),
         ("advantages", "critics", "multipliers", "normalisation", "trust_region"),
-        ("pid", "surrogate"),
+        ("pid", "surrogate", "fisher"),
         ("cpo", "ppo", "trpo"),
         ("",),
     ),

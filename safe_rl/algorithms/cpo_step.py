@@ -11,7 +11,8 @@ from torch import Tensor
 
 from safe_rl.algorithms.trust_region_step import Proposal, TRPOStep, total_loss
 from safe_rl.objectives.cpo_dual import DualSolution, solve_dual
-from safe_rl.objectives.trust_region import FisherProduct, flat_gradient
+from safe_rl.objectives.fisher import FisherProduct
+from safe_rl.objectives.trust_region import best_in_span, flat_gradient, solve_with_image
 
 __all__ = ["CPOStep", "constraint_value"]
 
@@ -48,6 +49,10 @@ class CPOStep(TRPOStep):
     violations, the step solves the CPO problem by its dual (see `cpo_dual`). The line search
     takes the first fraction with KL(π_θ ‖ π_k) ≤ δ and L_c(new) − L_c(old) ≤ max(−c, 0), and,
     unless the step is a recovery (cases 0 and 1), a loss that is not worse.
+
+    The violations are those that the caller hands to every call, of whatever estimate it has of
+    J_c: the mean over finished episodes, or, where a batch is shorter than its episodes, the cost
+    rate of the batch times T̄. Nothing of an earlier call is kept, so that none can be stale.
 
     Args:
         loss: a `CPOLoss`, or a callable of your own that returns a TensorDict with scalars
@@ -132,8 +137,7 @@ class CPOStep(TRPOStep):
         )
         # Left out by a zero gradient: the dual takes such constraints for case 4.
         b = b * ~((b.square().sum(-1, keepdim=True) <= _NO_GRADIENT) & (c[:, None] < 0))
-        v = self._solve(fisher, g)
-        w = torch.stack([self._solve(fisher, row) for row in b])
+        v, w = self._solve_all(fisher, g, b)
         q, r, s = g @ v, w @ g, b @ w.T
         dual = solve_dual(q, r, s, c, self.target_kl)
         step = -(dual.reward_coefficient * v + dual.cost_coefficient @ w)
@@ -146,6 +150,19 @@ class CPOStep(TRPOStep):
             return bool((not_worse | (dual.case < 2)) & within)
 
         return Proposal(step, is_acceptable, self._diagnostics(q, r, s.diagonal(), c, dual))
+
+    def _solve_all(self, fisher: FisherProduct, g: Tensor, b: Tensor) -> tuple[Tensor, Tensor]:
+        """H⁻¹g, [P], and H⁻¹bᵢ, [k, P], such that q, r and S are those of one and the same metric.
+
+        A few conjugate gradients leave residuals of tens of percents, and gᵀw, bᵀv and wᵀHv then
+        are three different numbers, while the dual knows but one r. In the span of the solutions
+        they are one: there the step keeps the linearised constraints and the radius exactly.
+        """
+        right = torch.cat([g[None], b])
+        pairs = [solve_with_image(fisher, row, self.cg_iterations) for row in right]
+        solutions, images = (torch.stack(rows) for rows in zip(*pairs, strict=True))
+        solved = best_in_span(solutions, images, right)
+        return solved[0], solved[1:]
 
     def _constraint(
         self, surrogates: Tensor, cost_violation: Tensor | None, episode_length: Tensor | None

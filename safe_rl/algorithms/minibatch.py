@@ -7,6 +7,7 @@ trust-region steps, take its place if they follow
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from typing import Any
 
@@ -15,8 +16,10 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor, nn
 from torch.optim import Optimizer
 from torchrl.objectives import LossModule
+from torchrl.objectives.common import AUTO_LOSS_MASK_KEYS
 
 from safe_rl.algorithms.learning_rate import KLAdaptiveRate
+from safe_rl.objectives.samples import flat_samples, require_finite
 
 __all__ = ["MinibatchUpdate"]
 
@@ -32,6 +35,8 @@ class MinibatchUpdate:
     that of the minibatch at hand at the parameters before its step, so the check costs nothing and
     the step that would follow is not taken; with the full batch as minibatch this is the rule of
     Ray, Achiam, Amodei (2019). With minibatches of thousands of states its error is a few percent.
+    A batch that is beyond ``max_kl`` before the first step, because a policy too different from
+    the present one collected it, teaches nothing; a warning says so.
 
     Args:
         loss: Loss module whose ``in_keys`` name what it needs of the batch.
@@ -49,7 +54,8 @@ class MinibatchUpdate:
         ValueError: If ``num_passes`` or ``minibatch_size`` is below 1, or ``adapt_rate`` comes
             without ``max_kl``.
         KeyError: By the call, if ``max_kl`` is set and the loss does not report ``kl``.
-        FloatingPointError: By the call, if a loss is not finite.
+        FloatingPointError: By the call, if an entry of the batch is not finite, before any step;
+            or if a loss is not, before the step that would follow it.
 
     Examples:
         >>> import functools
@@ -108,28 +114,40 @@ class MinibatchUpdate:
         """Take the gradient steps on ``batch``, of any shape.
 
         Args:
-            batch: Data with the entries that the loss reads.
+            batch: Data with the entries that the loss reads; padding is left out.
             cost_violation: Not used: the multiplier within the loss stands for it.
             episode_length: Not used.
 
         Returns:
             The mean over the steps of everything that the loss reports, save ``kl``, which is the
-            last one measured; ``num_steps``, the gradient steps taken; and ``lr``, the next
+            last one measured: after the last step if the limit ended the update, before it if the
+            passes were over; ``num_steps``, the gradient steps taken; and ``lr``, the next
             learning rate, if it is adapted.
         """
         del cost_violation, episode_length
         history: list[TensorDictBase] = []
         num_steps = 0
-        samples = batch.select(*self.loss.in_keys).reshape(-1)
+        require_finite(batch, self.loss.in_keys)
+        mask_keys = [key for key in AUTO_LOSS_MASK_KEYS if batch.get(key, None) is not None]
+        samples = flat_samples(batch.select(*self.loss.in_keys, *mask_keys))
         for minibatch in self._minibatches(samples):
             total, losses = self._evaluate(minibatch)
             history.append(losses.detach())
             if self.max_kl is not None and losses["kl"] > self.max_kl:
                 break
+            if not total.isfinite():
+                raise self._divergence(losses)
             self._step(total)
             num_steps += 1
         diagnostics = self._diagnostics(history, num_steps)
-        if self.adapt_rate is not None and self.max_kl is not None:
+        if not num_steps:
+            warnings.warn(
+                f"No gradient step was taken: the KL divergence from the policy that collected the "
+                f"batch is {float(diagnostics['kl']):.3g} before the first one, beyond "
+                f"max_kl={self.max_kl}. Collect with the present policy, or raise max_kl.",
+                stacklevel=2,
+            )
+        elif self.adapt_rate is not None and self.max_kl is not None:
             planned = self.num_passes * self._num_minibatches(samples.shape[0])
             shares = {
                 "share_of_steps": num_steps / planned,
@@ -137,6 +155,7 @@ class MinibatchUpdate:
             }
             for group in self.optimizer.param_groups:
                 group["lr"] = self.adapt_rate(group["lr"], **shares)
+        if self.adapt_rate is not None:
             diagnostics["lr"] = torch.tensor(self.optimizer.param_groups[0]["lr"])
         return diagnostics
 
@@ -172,15 +191,23 @@ class MinibatchUpdate:
     def _diagnostics(history: list[TensorDictBase], num_steps: int) -> dict[str, Tensor]:
         steps = TensorDict.stack(history)
         means: dict[str, Tensor] = steps.float().mean(0).to_dict()
-        for name, value in means.items():
-            if name.startswith("loss_") and not value.isfinite():
-                raise FloatingPointError(
-                    f"'{name}' is {value.item()}: training has diverged. Look for non-finite "
-                    "rewards or observations, or lower the learning rate."
-                )
         if "kl" in means:
             means["kl"] = steps["kl"][-1]
         return means | {"num_steps": torch.tensor(num_steps)}
+
+    @staticmethod
+    def _divergence(losses: TensorDictBase) -> FloatingPointError:
+        wrong = {
+            name: value.item()
+            for name, value in losses.items()
+            if name.startswith("loss_") and not value.isfinite()
+        }
+        named = " and ".join(f"{name!r} is {value}" for name, value in wrong.items())
+        return FloatingPointError(
+            f"{named or 'The sum of the losses is not finite'}: training has diverged. The step "
+            "that would follow is not taken. Lower the learning rate, or look for a policy that "
+            "has collapsed."
+        )
 
     def state_dict(self) -> dict[str, Any]:
         """State of the optimiser; the parameters belong to the network."""

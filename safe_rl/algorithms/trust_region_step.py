@@ -11,13 +11,15 @@ from tensordict import TensorDictBase
 from tensordict.nn import ProbabilisticTensorDictSequential
 from torch import Tensor
 
+from safe_rl.objectives.distributions import ReferencePolicy
+from safe_rl.objectives.fisher import FisherProduct
+from safe_rl.objectives.samples import flat_samples, require_finite
 from safe_rl.objectives.trust_region import (
-    FisherProduct,
     backtracking_search,
     conjugate_gradient,
     flat_gradient,
     mean_kl,
-    policy_gaussian,
+    policy_in,
     subsample,
 )
 
@@ -137,23 +139,34 @@ class TRPOStep:
         """Take one step.
 
         Args:
-            batch: on-policy data with what the loss reads, of any shape.
+            batch: on-policy data with what the loss reads, of any shape; padding is left out.
             cost_violation: J_c − d, [k]; read by constrained steps only.
             episode_length: T̄, scalar; read by constrained steps only.
 
         Returns:
             The losses' entries after the step, ``kl`` (mean KL(π_θ ‖ π_k)), ``step_fraction``
-            (accepted by the line search; 0: none), ``backtracks`` (tries before that one) and
-            what the step itself reports.
+            (accepted by the line search; 0: none, or nothing to step along), ``backtracks``
+            (tries before that one) and what the step itself reports.
+
+        Raises:
+            FloatingPointError: if an entry of the batch, the loss or the step is not finite; the
+                policy is as it was then.
         """
-        batch = batch.reshape(-1)
+        require_finite(batch, getattr(self.loss, "in_keys", ()))
+        batch = flat_samples(batch)
         with torch.no_grad():
-            reference = policy_gaussian(self.actor_network, batch)
+            reference = ReferencePolicy(policy_in(self.actor_network, batch))
         losses = self.loss(batch)
         sample = subsample(batch, self.fisher_subsample)
         fisher = FisherProduct(self.actor_network, sample, self.parameters, self.damping)
         proposal = self._propose(losses, fisher, cost_violation, episode_length)
         del fisher
+        if not proposal.step.isfinite().all():
+            raise FloatingPointError(
+                "The step of the policy is not finite, although the batch is; no parameter has "
+                "been changed. Look for a policy that has collapsed (policy_entropy, and the "
+                "spread of the advantages), or raise the damping."
+            )
         metrics = self._search(batch, reference, proposal)
         return metrics | proposal.diagnostics
 
@@ -178,7 +191,7 @@ class TRPOStep:
 
     @torch.no_grad()
     def _search(
-        self, batch: TensorDictBase, reference: tuple[Tensor, Tensor], proposal: Proposal
+        self, batch: TensorDictBase, reference: ReferencePolicy, proposal: Proposal
     ) -> dict[str, Tensor]:
         tried: dict[str, Any] = {}
 
@@ -189,16 +202,17 @@ class TRPOStep:
             tried["losses"] = self.loss(batch)
             return proposal.is_acceptable(tried["losses"])
 
+        max_tries = self.max_backtracks if proposal.step.any() else 0
         fraction = backtracking_search(
             self.parameters,
             proposal.step,
             accept,
             coeff=self.backtrack_coeff,
-            max_tries=self.max_backtracks,
+            max_tries=max_tries,
         )
         if not fraction:
-            tried = {"kl": torch.zeros_like(tried["kl"]), "losses": self.loss(batch)}
-        tries = self.max_backtracks if not fraction else math.log(fraction, self.backtrack_coeff)
+            tried = {"kl": proposal.step.new_zeros(()), "losses": self.loss(batch)}
+        tries = max_tries if not fraction else math.log(fraction, self.backtrack_coeff)
         return {
             **tried["losses"].to_dict(),
             "kl": tried["kl"],

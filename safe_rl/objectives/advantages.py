@@ -3,6 +3,7 @@
 Rollouts are [..., T] TensorDicts, time last (collectors give [N, T]); a trajectory ends where
 ``("next", "done")`` is set and at the last step of the batch. Where it ends without
 ``("next", "terminated")`` (time-out, or end of the batch) its last observation is bootstrapped.
+Padded trajectories (``split_trajs=True``) end where their mask does.
 """
 
 from __future__ import annotations
@@ -11,76 +12,20 @@ from collections.abc import Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass
 from functools import partial
-from typing import Literal, get_args
+from typing import Any, Literal, get_args
 
 import torch
-from tensordict import NestedKey, TensorDictBase
-from tensordict.nn import TensorDictModuleBase
+from tensordict import NestedKey, TensorDict, TensorDictBase
+from tensordict.nn import TensorDictModuleBase, dispatch
 from tensordict.utils import unravel_key
 from torch import Tensor
 from torchrl.objectives.value import ValueEstimatorBase
-from torchrl.objectives.value.functional import vec_generalized_advantage_estimate
 
+from safe_rl.objectives.gae import gae, one_pass_values, trajectory_ends
 from safe_rl.objectives.keys import require
+from safe_rl.objectives.samples import require_finite, sample_mask
 
 ValueTarget = Literal["lambda_return", "return_to_go"]
-
-
-def one_pass_values(
-    tensordict: TensorDictBase, value_network: TensorDictModuleBase, key: NestedKey, done: Tensor
-) -> tuple[Tensor, Tensor]:
-    """Value every observation of a rollout once.
-
-    Inside a trajectory the next observation of step t is the root observation of step t + 1,
-    so that only the observations at which trajectories end are valued in addition.
-
-    Args:
-        tensordict: rollout [..., T] with the network's in_keys, also under ``"next"``.
-        value_network: writes `key`, [..., T, F].
-        key: the network's value key.
-        done: [..., T, 1] bool.
-
-    Returns:
-        Values of the root observations and of the next observations, both [..., T, F].
-    """
-    ends = done.squeeze(-1).clone()
-    ends[..., -1] = True
-    value = value_network(tensordict.select(*value_network.in_keys)).get(key)
-    last = tensordict.get("next").select(*value_network.in_keys)[ends]
-    next_value = value.roll(-1, dims=-2)
-    next_value[ends] = value_network(last).get(key)
-    return value, next_value
-
-
-def gae(
-    reward: Tensor,
-    value: Tensor,
-    next_value: Tensor,
-    done: Tensor,
-    terminated: Tensor,
-    *,
-    gamma: float,
-    lmbda: float,
-) -> Tensor:
-    """Generalised advantage estimate (Schulman et al. 2016, equation 16).
-
-    Args:
-        reward: [..., T, F], F reward-like signals.
-        value: [..., T, F], values of the observations.
-        next_value: [..., T, F], values of the next observations.
-        done: [..., T, 1] bool, trajectory ends.
-        terminated: [..., T, 1] bool, ends without bootstrap.
-        gamma: discount per step.
-        lmbda: decay of the TD errors.
-
-    Returns:
-        Advantages, [..., T, F].
-    """
-    if gamma * lmbda == 0:
-        # TorchRL's filter drops even the first TD error when the decay is 0.
-        return reward + gamma * next_value * ~terminated - value
-    flags = done.expand_as(reward), terminated.expand_as(reward)
-    return vec_generalized_advantage_estimate(gamma, lmbda, value, next_value, reward, *flags)[0]
 
 
 class VectorGAE(ValueEstimatorBase):
@@ -171,6 +116,7 @@ class VectorGAE(ValueEstimatorBase):
         following = [*observed, *self.reward_keys, *ends]
         return [*observed, *(unravel_key(("next", key)) for key in following)]
 
+    @dispatch
     @torch.no_grad()
     def forward(
         self,
@@ -179,10 +125,10 @@ class VectorGAE(ValueEstimatorBase):
         params: TensorDictBase | None = None,
         target_params: TensorDictBase | None = None,
     ) -> TensorDictBase:
-        """Write advantages and value targets into a rollout.
+        """Write advantages and value targets into a rollout; 0 where it is padded.
 
         Args:
-            tensordict: rollout [..., T] with `in_keys`.
+            tensordict: rollout [..., T] with `in_keys`, or these entries as keyword arguments.
             params: parameters to run the value network with instead of its own.
             target_params: must be None; a single pass knows a single set of parameters.
 
@@ -192,33 +138,80 @@ class VectorGAE(ValueEstimatorBase):
         Raises:
             KeyError: if an entry is missing.
             ValueError: if values and signals do not match in shape, or `target_params` is given.
+            FloatingPointError: if a signal, an observation or a value is not finite.
         """
         if target_params is not None:
             raise ValueError("target_params needs two passes: use torchrl.objectives.value.GAE.")
         keys = self.tensor_keys
+        value, advantage, target = self._estimate(tensordict, params, None)
+        tensordict.set(keys.value, value)
+        tensordict.set(keys.advantage, advantage)
+        return tensordict.set(keys.value_target, target)
+
+    @torch.no_grad()
+    def value_estimate(
+        self,
+        tensordict: TensorDictBase,
+        target_params: TensorDictBase | None = None,
+        next_value: Tensor | None = None,
+        **kwargs: Any,
+    ) -> Tensor:
+        """The value targets alone, [..., T, F]; the rollout stays as it is.
+
+        Args:
+            tensordict: rollout [..., T] with `in_keys`.
+            target_params: must be None, as in `forward`.
+            next_value: values of the next observations, [..., T, F], instead of the network's.
+            kwargs: of other estimators; none is read.
+        """
+        if target_params is not None:
+            raise ValueError("target_params needs two passes: use torchrl.objectives.value.GAE.")
+        return self._estimate(tensordict, None, next_value)[-1]
+
+    def _estimate(
+        self,
+        tensordict: TensorDictBase,
+        params: TensorDictBase | None,
+        next_value: Tensor | None,
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """Value, advantage and value target, [..., T, F] each."""
+        keys = self.tensor_keys
+        observed = [] if self.value_network is None else list(self.value_network.in_keys)
+        require_finite(tensordict, [*observed, *(("next", key) for key in self.reward_keys)])
         signals = [require(tensordict, ("next", key)) for key in self.reward_keys]
         reward = torch.cat(signals, -1)
         done, terminated = (
             require(tensordict, ("next", key)) for key in (keys.done, keys.terminated)
         )
-        value, next_value = self._values(tensordict, done, params)
+        mask = sample_mask(tensordict)
+        ends = trajectory_ends(done, mask)
+        value, following = self._values(tensordict, ends, params)
+        next_value = following if next_value is None else next_value
         if value.shape != reward.shape:
             raise ValueError(
                 f"{keys.value!r} has shape {tuple(value.shape)} but the signals "
                 f"{self.reward_keys} have {tuple(reward.shape)}: the value network needs one "
                 "output per signal."
             )
+        if mask is not None:
+            done = ends.unsqueeze(-1)
+            padded = ~mask.unsqueeze(-1)
+            reward, value, next_value = (
+                signal.masked_fill(padded, 0.0) for signal in (reward, value, next_value)
+            )
+        values = TensorDict({keys.value: value, ("next", keys.value): next_value})
+        require_finite(values.auto_batch_size_(done.ndim - 1), values.keys(True, True))
         estimate = partial(gae, reward, value, next_value, done, terminated, gamma=self.gamma)
         advantage = estimate(lmbda=self.lmbda)
         # With λ = 1 the TD errors telescope: advantage + value is the bootstrapped return.
         to_go = self.value_target == "return_to_go"
         target = value + (estimate(lmbda=1.0) if to_go else advantage)
-        tensordict.set(keys.value, value)
-        tensordict.set(keys.advantage, advantage)
-        return tensordict.set(keys.value_target, target)
+        if mask is not None:
+            advantage, target = (x.masked_fill(padded, 0.0) for x in (advantage, target))
+        return value, advantage, target
 
     def _values(
-        self, tensordict: TensorDictBase, done: Tensor, params: TensorDictBase | None
+        self, tensordict: TensorDictBase, ends: Tensor, params: TensorDictBase | None
     ) -> tuple[Tensor, Tensor]:
         key, network = self.tensor_keys.value, self.value_network
         if network is None:
@@ -226,7 +219,7 @@ class VectorGAE(ValueEstimatorBase):
             following = require(tensordict, ("next", key), hint)
             return require(tensordict, key, hint), following
         with nullcontext() if params is None else params.to_module(network):
-            return one_pass_values(tensordict, network, key, done)
+            return one_pass_values(tensordict, network, key, ends)
 
 
 class CostGAE(VectorGAE):

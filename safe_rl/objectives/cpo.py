@@ -18,8 +18,9 @@ class CPOLoss(SurrogateLoss):
     combine them as you see fit. See `SurrogateLoss` for what it reads and writes.
 
     Args:
-        actor_network: policy with `get_dist` and a Gaussian distribution.
+        actor_network: policy with `get_dist`; see `SurrogateLoss`.
         entropy_coeff: factor of the entropy bonus.
+        reduction: ``"mean"``, ``"sum"`` or ``"none"`` over the samples; a `CPOStep` needs the mean.
 
     Examples:
         >>> from tensordict.nn import AddStateIndependentNormalScale, TensorDictModule
@@ -31,16 +32,20 @@ class CPOLoss(SurrogateLoss):
         ...     distribution_class=IndependentNormal,
         ... )
         >>> CPOLoss(actor, entropy_coeff=0.0).out_keys
-        ['loss_objective', 'cost_surrogate', 'kl', 'entropy', 'ESS']
+        ['loss_objective', 'loss_entropy', 'cost_surrogate', 'kl', 'entropy', 'ESS']
     """
 
     extra_out_keys = ("cost_surrogate",)
     has_costs = True
 
     def __init__(
-        self, actor_network: ProbabilisticTensorDictSequential, *, entropy_coeff: float
+        self,
+        actor_network: ProbabilisticTensorDictSequential,
+        *,
+        entropy_coeff: float,
+        reduction: str = "mean",
     ) -> None:
-        super().__init__(actor_network, entropy_coeff=entropy_coeff)
+        super().__init__(actor_network, entropy_coeff=entropy_coeff, reduction=reduction)
 
     def _surrogates(self, tensordict: TensorDictBase, log_weight: Tensor) -> dict[str, Tensor]:
         ratio = log_weight.exp()

@@ -10,6 +10,7 @@ from torch import Tensor
 from torchrl.objectives import LossModule
 
 from safe_rl.objectives.keys import require
+from safe_rl.objectives.samples import sample_mask
 
 
 def explained_variance(prediction: Tensor, target: Tensor) -> Tensor:
@@ -148,4 +149,8 @@ class CriticLoss(LossModule):
                 f"{tuple(target.shape)}: the {name} needs one output per target."
             )
         error = (value - target).square().sum(-1)
-        return self._reduce_loss(error, tensordict), explained_variance(value.detach(), target)
+        mask = sample_mask(tensordict)
+        found, wanted = value.detach(), target
+        if mask is not None:
+            found, wanted = found[mask], wanted[mask]
+        return self._reduce_loss(error, tensordict), explained_variance(found, wanted)

@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
+import torch
 from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
 
 from safe_rl.objectives.keys import require
+from safe_rl.objectives.samples import sample_mask
 
 
 def standardise(advantage: Tensor, eps: float = 1e-8) -> Tensor:
@@ -19,6 +23,17 @@ def centre(advantage: Tensor) -> Tensor:
     return advantage - advantage.flatten(0, -2).mean(0)
 
 
+def _of_samples(
+    change: Callable[[Tensor], Tensor], advantage: Tensor, mask: Tensor | None
+) -> Tensor:
+    """Apply a change to the samples alone; padding becomes 0."""
+    if mask is None:
+        return change(advantage)
+    changed = torch.zeros_like(advantage)
+    changed[mask] = change(advantage[mask])
+    return changed
+
+
 def normalise_advantages(
     tensordict: TensorDictBase,
     *,
@@ -28,7 +43,8 @@ def normalise_advantages(
     """Standardise the reward advantage and centre the cost advantages, in place.
 
     Cost advantages are never rescaled: their size against the standardised reward advantage is
-    what a multiplier acts on, and in CPO it carries the units of the constraint.
+    what a multiplier acts on, and in CPO it carries the units of the constraint. Padding, by the
+    mask of TorchRL's collectors, counts for nothing.
 
     Args:
         tensordict: batch of any shape with `advantage` [..., 1] and, if there are costs,
@@ -50,8 +66,9 @@ def normalise_advantages(
         >>> normalise_advantages(batch)["cost_advantage"].squeeze(-1)
         tensor([-2.,  2.])
     """
-    tensordict.set(advantage, standardise(require(tensordict, advantage)))
+    mask = sample_mask(tensordict)
+    tensordict.set(advantage, _of_samples(standardise, require(tensordict, advantage), mask))
     costs = tensordict.get(cost_advantage, None)
     if costs is not None:
-        tensordict.set(cost_advantage, centre(costs))
+        tensordict.set(cost_advantage, _of_samples(centre, costs, mask))
     return tensordict

@@ -36,7 +36,7 @@ class PPOLoss(SurrogateLoss):
     be decided. See `SurrogateLoss` for what it reads and writes; adds ``clip_fraction``.
 
     Args:
-        actor_network: policy with `get_dist` and a Gaussian distribution.
+        actor_network: policy with `get_dist`; see `SurrogateLoss`.
         clip_epsilon: half-width ε of the interval within which a ratio earns.
         entropy_coeff: factor of the entropy bonus.
         reduction: ``"mean"``, ``"sum"`` or ``"none"``.
@@ -87,7 +87,9 @@ class PPOLoss(SurrogateLoss):
         clipped = (ratio.detach() - 1).abs() > self.clip_epsilon
         return {
             "loss_objective": -self._lagrangian(tensordict, gain, ratio),
-            "clip_fraction": clipped.to(ratio.dtype).mean(),
+            "clip_fraction": self._reduce_loss(
+                clipped.to(ratio.dtype), tensordict, reduction="mean"
+            ),
         }
 
 
@@ -100,7 +102,7 @@ class PPOLagrangianLoss(PPOLoss):
     ``multiplier.update(mean_costs)`` once per epoch.
 
     Args:
-        actor_network: policy with `get_dist` and a Gaussian distribution.
+        actor_network: policy with `get_dist`; see `SurrogateLoss`.
         multiplier: one λ per column of ``cost_advantage``.
         clip_epsilon: half-width ε of the interval within which a ratio earns.
         entropy_coeff: factor of the entropy bonus.
@@ -123,7 +125,7 @@ class PPOLagrangianLoss(PPOLoss):
         >>> multiplier = LagrangeMultiplier({"cost": 25.0}, init=1.0, lr=0.05)
         >>> loss = PPOLagrangianLoss(actor, multiplier, clip_epsilon=0.2, entropy_coeff=0.0)
         >>> loss.out_keys
-        ['loss_objective', 'clip_fraction', 'kl', 'entropy', 'ESS']
+        ['loss_objective', 'loss_entropy', 'clip_fraction', 'kl', 'entropy', 'ESS']
     """
 
     def __init__(

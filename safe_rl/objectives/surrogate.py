@@ -4,15 +4,17 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase, TensorDictParams
 from tensordict.nn import ProbabilisticTensorDictSequential, dispatch
 from torch import Tensor
 from torch.distributions import Distribution
 from torchrl.objectives import LossModule
 
-from safe_rl.objectives.gaussian import gaussian_kl, normal_parameters
+from safe_rl.objectives.distributions import entropy, kl, sampler_of
 from safe_rl.objectives.keys import key_name, require
 from safe_rl.objectives.multipliers import Multiplier
+from safe_rl.objectives.samples import sample_mask
 
 
 def lagrangian(reward_gain: Tensor, cost_gain: Tensor, multipliers: Tensor) -> Tensor:
@@ -33,24 +35,34 @@ def lagrangian(reward_gain: Tensor, cost_gain: Tensor, multipliers: Tensor) -> T
     return (reward_gain - penalty) / (1 + multipliers.sum())
 
 
-def effective_sample_size(log_weight: Tensor) -> Tensor:
-    """Kish's effective sample size of importance weights, as a fraction of the samples."""
+def effective_sample_size(log_weight: Tensor, mask: Tensor | None = None) -> Tensor:
+    """Kish's effective sample size of importance weights, as a fraction of the samples.
+
+    Args:
+        log_weight: logarithms of the weights, any shape.
+        mask: which of them count, bool of the same number of elements; None: all.
+    """
     log_weight = log_weight.flatten()
+    if mask is not None:
+        log_weight = torch.where(mask.flatten(), log_weight, -torch.inf)
     log_size = 2 * log_weight.logsumexp(0) - (2 * log_weight).logsumexp(0)
-    return log_size.exp() / log_weight.numel()
+    return log_size.exp() / (log_weight.numel() if mask is None else mask.sum())
 
 
 class SurrogateLoss(LossModule):
     """Base of the policy losses: subclasses turn log-ratios into surrogates.
 
-    Reads a batch of any shape, [B] or [N, T], with normalised advantages. Writes
-    ``loss_objective`` (to minimise), ``loss_entropy`` if there is an entropy bonus, and the
-    detached scalars ``kl`` (mean over states of KL(π_θ ‖ π_k), π_k the policy whose parameters
-    the batch holds), ``entropy`` and ``ESS``.
+    Reads a batch of any shape, [B] or [N, T], with normalised advantages; padding, as TorchRL's
+    losses know it by its mask, counts for nothing. Writes ``loss_objective`` and ``loss_entropy``
+    (to minimise), and the detached scalars ``kl`` (mean over states of KL(π_θ ‖ π_k), π_k the
+    policy whose parameters the batch holds), ``entropy`` and ``ESS``. Policies may have any
+    distribution; its divergence and entropy are closed forms where there are any, and are
+    estimated from samples elsewhere (see `safe_rl.objectives.distributions`).
 
     Args:
-        actor_network: policy with `get_dist` and a Gaussian distribution.
-        entropy_coeff: factor of the entropy bonus; with 0 there is no ``loss_entropy``.
+        actor_network: policy with `get_dist`, such as a `torchrl.modules.ProbabilisticActor`.
+        entropy_coeff: factor of the entropy bonus; a buffer, so that it can be scheduled, also up
+            from 0.
         multiplier: weighs the costs; None if there is none to weigh.
         reduction: how samples are reduced: ``"mean"``, ``"sum"`` or ``"none"``.
     """
@@ -64,7 +76,8 @@ class SurrogateLoss(LossModule):
             cost_advantage: cost advantages, [..., k]; read if the loss has costs.
             action: action taken, [..., n].
             sample_log_prob: its log-probability under the behaviour policy, [...].
-            loc: mean of the behaviour policy, [..., n].
+            loc: mean of the behaviour policy, [..., n]. This and any other parameter of its
+                distribution are expected where the actor writes them.
             scale: standard deviation of the behaviour policy, [..., n].
         """
 
@@ -100,10 +113,12 @@ class SurrogateLoss(LossModule):
         self.multiplier = multiplier
         self.reduction = reduction
         self.register_coeff_buffer("entropy_coeff", entropy_coeff, device=self._default_device)
-        self.has_entropy_bonus = bool(entropy_coeff)
-        entropy_keys = ["loss_entropy"] if self.has_entropy_bonus else []
+        sampler = sampler_of(actor_network)
+        names = [name if isinstance(name, str) else name[-1] for name in sampler.dist_keys]
+        self._parameter_keys = dict(zip(names, sampler.in_keys, strict=True))
+        self.set_keys(**{k: v for k, v in self._parameter_keys.items() if k in ("loc", "scale")})
         self.out_keys = [
-            "loss_objective", *entropy_keys, *self.extra_out_keys, "kl", "entropy", "ESS",
+            "loss_objective", "loss_entropy", *self.extra_out_keys, "kl", "entropy", "ESS",
         ]  # fmt: skip
 
     @property
@@ -112,11 +127,20 @@ class SurrogateLoss(LossModule):
         return self.multiplier is not None
 
     @property
+    def behaviour_keys(self) -> dict[NestedKey, NestedKey]:
+        """Where the batch holds the behaviour policy's parameters, by where the actor writes them.
+
+        A mean and a standard deviation can be elsewhere: ``set_keys(loc=…, scale=…)``.
+        """
+        moved = {"loc": self.tensor_keys.loc, "scale": self.tensor_keys.scale}
+        return {key: moved.get(name, key) for name, key in self._parameter_keys.items()}
+
+    @property
     def in_keys(self) -> list[NestedKey]:
         """Entries of the batch that are read."""
         keys = self.tensor_keys
         costs = [keys.cost_advantage] if self.has_costs else []
-        behaviour = [keys.action, keys.sample_log_prob, keys.loc, keys.scale]
+        behaviour = [keys.action, keys.sample_log_prob, *self.behaviour_keys.values()]
         return [*self.actor_network.in_keys, *behaviour, keys.advantage, *costs]
 
     @dispatch
@@ -135,15 +159,14 @@ class SurrogateLoss(LossModule):
         """
         distribution = self._policy(tensordict)
         log_weight = self._log_weight(tensordict, distribution)
-        entropy = distribution.entropy()
+        bonus = entropy(distribution)
         out = self._surrogates(tensordict, log_weight)
         out["loss_objective"] = self._reduce_loss(out["loss_objective"], tensordict)
-        if self.has_entropy_bonus:
-            out["loss_entropy"] = -self.entropy_coeff * self._reduce_loss(entropy, tensordict)
-        kl = self._kl(tensordict, distribution).detach()
-        out["kl"] = self._reduce_loss(kl, tensordict, reduction="mean")
-        out["entropy"] = self._reduce_loss(entropy.detach(), tensordict, reduction="mean")
-        out["ESS"] = effective_sample_size(log_weight.detach())
+        out["loss_entropy"] = -self.entropy_coeff * self._reduce_loss(bonus, tensordict)
+        divergence = self._kl(tensordict, distribution, log_weight).detach()
+        out["kl"] = self._reduce_loss(divergence, tensordict, reduction="mean")
+        out["entropy"] = self._reduce_loss(bonus.detach(), tensordict, reduction="mean")
+        out["ESS"] = effective_sample_size(log_weight.detach(), sample_mask(tensordict))
         losses = TensorDict(out)
         self._clear_weakrefs(
             tensordict, losses, "actor_network_params", "target_actor_network_params"
@@ -172,13 +195,15 @@ class SurrogateLoss(LossModule):
             )
         return (log_prob - behaviour).unsqueeze(-1)
 
-    def _kl(self, tensordict: TensorDictBase, distribution: Distribution) -> Tensor:
+    def _kl(
+        self, tensordict: TensorDictBase, distribution: Distribution, log_weight: Tensor
+    ) -> Tensor:
         """KL(π_θ ‖ π_k) per state, [...]."""
         hint = "It is the behaviour policy's, stored when the action was sampled."
-        loc, scale = (
-            require(tensordict, key, hint) for key in (self.tensor_keys.loc, self.tensor_keys.scale)
-        )
-        return gaussian_kl(*normal_parameters(distribution), loc, scale)
+        keys = self.behaviour_keys.items()
+        stored = TensorDict({key: require(tensordict, found, hint) for key, found in keys})
+        behaviour = self.actor_network.build_dist_from_params(stored)
+        return kl(distribution, behaviour, log_weight.squeeze(-1))
 
     def _advantage(self, tensordict: TensorDictBase, log_weight: Tensor) -> Tensor:
         """Reward advantage, [..., 1]."""

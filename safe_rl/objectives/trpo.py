@@ -18,7 +18,7 @@ class TRPOLoss(SurrogateLoss):
     importance-weighted policy gradient.
 
     Args:
-        actor_network: policy with `get_dist` and a Gaussian distribution.
+        actor_network: policy with `get_dist`; see `SurrogateLoss`.
         entropy_coeff: factor of the entropy bonus.
         reduction: ``"mean"``, ``"sum"`` or ``"none"``.
 
@@ -32,7 +32,7 @@ class TRPOLoss(SurrogateLoss):
         ...     distribution_class=IndependentNormal,
         ... )
         >>> TRPOLoss(actor, entropy_coeff=0.0).out_keys
-        ['loss_objective', 'kl', 'entropy', 'ESS']
+        ['loss_objective', 'loss_entropy', 'kl', 'entropy', 'ESS']
     """
 
     def __init__(
@@ -57,7 +57,7 @@ class TRPOLagrangianLoss(TRPOLoss):
     """`TRPOLoss` on the Lagrangian (L_r − Σᵢ λᵢ L_cᵢ) / (1 + Σᵢ λᵢ), for k constraints.
 
     Args:
-        actor_network: policy with `get_dist` and a Gaussian distribution.
+        actor_network: policy with `get_dist`; see `SurrogateLoss`.
         multiplier: one λ per column of ``cost_advantage``, read at every call.
         entropy_coeff: factor of the entropy bonus.
         reduction: ``"mean"``, ``"sum"`` or ``"none"``.

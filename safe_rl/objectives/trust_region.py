@@ -1,17 +1,20 @@
-"""Pieces of a trust-region step: flat parameters, Fisher products, conjugate gradients, search."""
+"""Pieces of a trust-region step: flat parameters, divergence, conjugate gradients, line search."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable, Sequence
 
 import torch
 from tensordict import TensorDictBase
 from tensordict.nn import ProbabilisticTensorDictSequential
 from torch import Tensor, nn
+from torch.distributions import Distribution
 
-from safe_rl.objectives.gaussian import gaussian_kl, normal_parameters
+from safe_rl.objectives.distributions import ReferencePolicy
 
-Gaussian = tuple[Tensor, Tensor]
+#: Squared sine of the angle below which two approximate solutions count as parallel.
+_SAME_DIRECTION = 1e-5
 
 
 def flatten(tensors: Iterable[Tensor]) -> Tensor:
@@ -43,110 +46,37 @@ def flat_gradient(
     )
 
 
-def policy_gaussian(
+def policy_in(
     actor_network: ProbabilisticTensorDictSequential, batch: TensorDictBase
-) -> Gaussian:
-    """Mean and standard deviation of the policy in the states of a batch, both [..., n]."""
-    observed = batch.select(*actor_network.in_keys)
-    return normal_parameters(actor_network.get_dist(observed))
+) -> Distribution:
+    """Distribution of the policy in the states of a batch."""
+    return actor_network.get_dist(batch.select(*actor_network.in_keys))
 
 
 @torch.no_grad()
 def mean_kl(
-    reference: Gaussian, actor_network: ProbabilisticTensorDictSequential, batch: TensorDictBase
+    reference: ReferencePolicy,
+    actor_network: ProbabilisticTensorDictSequential,
+    batch: TensorDictBase,
 ) -> Tensor:
     """Mean over states of KL(π_θ ‖ reference), scalar."""
-    return gaussian_kl(*policy_gaussian(actor_network, batch), *reference).mean()
+    return reference.kl(policy_in(actor_network, batch)).mean()
 
 
 def subsample(batch: TensorDictBase, fraction: float) -> TensorDictBase:
-    """Every ⌊1/fraction⌉-th sample of a flat batch [B]: spread over all episodes, no randomness.
+    """A fraction of a flat batch [B], at equal distances: over all episodes, no randomness.
 
     Raises:
         ValueError: if `fraction` is not in (0, 1].
     """
     if not 0 < fraction <= 1:
         raise ValueError(f"fisher_subsample must be in (0, 1], got {fraction}.")
-    return batch[:: round(1 / fraction)]
-
-
-class FisherProduct:
-    """Product of a vector with the Fisher matrix of a Gaussian policy, plus damping.
-
-    The Fisher matrix is the Hessian of the mean KL(π_θ ‖ π_k) at θ_k: Jᵀ M J with J the Jacobian
-    of mean and standard deviation with respect to θ, and M their own, diagonal, Fisher matrix,
-    1/σ² for a mean and 2/σ² for a standard deviation σ. J v comes from differentiating the
-    vector-Jacobian product uᵀJ, which is linear in u, with respect to u. Both graphs are built
-    once, so that a product costs two backward passes.
-
-    Args:
-        actor_network: policy with `get_dist` and a Gaussian distribution; any network that can
-            be differentiated twice.
-        batch: states to average over, any batch shape.
-        parameters: θ, the parameters of the actor to differentiate by.
-        damping: multiple of the identity that is added.
-
-    Examples:
-        >>> from tensordict import TensorDict
-        >>> from tensordict.nn import AddStateIndependentNormalScale, TensorDictModule
-        >>> from torchrl.modules import IndependentNormal, ProbabilisticActor
-        >>> net = nn.Sequential(nn.Linear(3, 2), AddStateIndependentNormalScale(2))
-        >>> actor = ProbabilisticActor(
-        ...     TensorDictModule(net, in_keys=["observation"], out_keys=["loc", "scale"]),
-        ...     in_keys=["loc", "scale"],
-        ...     distribution_class=IndependentNormal,
-        ... )
-        >>> batch = TensorDict(observation=torch.randn(8, 3), batch_size=[8])
-        >>> fisher = FisherProduct(actor, batch, list(actor.parameters()), damping=0.1)
-        >>> fisher(torch.ones(10)).shape
-        torch.Size([10])
-    """
-
-    def __init__(
-        self,
-        actor_network: ProbabilisticTensorDictSequential,
-        batch: TensorDictBase,
-        parameters: Sequence[nn.Parameter],
-        damping: float,
-    ) -> None:
-        self.parameters, self.damping = list(parameters), damping
-        loc, scale = policy_gaussian(actor_network, batch)
-        precision = scale.detach().square().reciprocal() / (scale.numel() / scale.shape[-1])
-        # A mean or a standard deviation that is constant has no part in the Fisher matrix.
-        trained = [
-            (output, metric)
-            for output, metric in ((loc, precision), (scale, 2 * precision))
-            if output.requires_grad
-        ]
-        self._outputs = [output for output, _ in trained]
-        self._metrics = [metric for _, metric in trained]
-        self._dummies = [torch.zeros_like(output, requires_grad=True) for output in self._outputs]
-        self._vjp = torch.autograd.grad(
-            self._outputs,
-            self.parameters,
-            self._dummies,
-            create_graph=True,
-            materialize_grads=True,
-            allow_unused=True,
-        )
-
-    def __call__(self, vector: Tensor) -> Tensor:
-        """Multiply a vector [P]."""
-        tangents = unflatten(vector, self.parameters)
-        used = [(vjp, v) for vjp, v in zip(self._vjp, tangents, strict=True) if vjp.requires_grad]
-        jvp = torch.autograd.grad(
-            [vjp for vjp, _ in used], self._dummies, [v for _, v in used], retain_graph=True
-        )
-        weighted = [metric * change for metric, change in zip(self._metrics, jvp, strict=True)]
-        product = torch.autograd.grad(
-            self._outputs,
-            self.parameters,
-            weighted,
-            retain_graph=True,
-            materialize_grads=True,
-            allow_unused=True,
-        )
-        return flatten(product) + self.damping * vector
+    if fraction == 1:
+        return batch
+    # The small number undoes the rounding of 3 / 0.1 = 29.999….
+    count = math.ceil(batch.shape[0] * fraction - 1e-9)
+    index = (torch.arange(count, dtype=torch.float64) / fraction + 1e-9).long()
+    return batch[index.to(batch.device)]
 
 
 def conjugate_gradient(
@@ -167,6 +97,13 @@ def conjugate_gradient(
         >>> conjugate_gradient(lambda x: 2 * x, torch.tensor([2.0, 4.0]), iterations=10)
         tensor([1., 2.])
     """
+    return solve_with_image(product, right, iterations, tolerance)[0]
+
+
+def solve_with_image(
+    product: Callable[[Tensor], Tensor], right: Tensor, iterations: int, tolerance: float = 1e-10
+) -> tuple[Tensor, Tensor]:
+    """`conjugate_gradient`, and A x of its possibly unconverged solution x at no further cost."""
     solution = torch.zeros_like(right)
     residual, direction = right.clone(), right.clone()
     squared = first = residual @ residual
@@ -179,7 +116,33 @@ def conjugate_gradient(
         residual = residual - length * image
         previous, squared = squared, residual @ residual
         direction = residual + (squared / previous) * direction
-    return solution
+    return solution, right - residual
+
+
+def best_in_span(solutions: Tensor, images: Tensor, right: Tensor) -> Tensor:
+    """Solve A x = right for several right-hand sides within the span of approximate solutions.
+
+    The Galerkin solutions, of all combinations of the approximate ones the best in the norm of A.
+    Unlike those of conjugate gradients stopped early, they agree with each other: for any two,
+    xᵢᵀ A xⱼ = rightᵢᵀ xⱼ = rightⱼᵀ xᵢ.
+
+    Args:
+        solutions: approximate solutions xᵢ, [m, P]; any of them may depend on others or be 0.
+        images: A xᵢ, [m, P].
+        right: right-hand sides, [m, P].
+
+    Returns:
+        Solutions, [m, P].
+    """
+    gram = solutions.double() @ images.double().T
+    lengths = gram.diagonal().clamp_min(0).sqrt()
+    inverse_lengths = torch.where(lengths > 0, 1 / lengths, 0.0)
+    scale = inverse_lengths[:, None] * inverse_lengths
+    cosines = 0.5 * (gram + gram.T) * scale
+    # Directions that differ by no more than single precision's rounding are one direction.
+    inverse = torch.linalg.pinv(cosines, rtol=_SAME_DIRECTION, hermitian=True) * scale
+    combinations = (right.double() @ solutions.double().T) @ inverse
+    return combinations.to(solutions) @ solutions
 
 
 def backtracking_search(

@@ -170,12 +170,73 @@ def test_gradients_are_clipped():
     assert distance(0.5) == pytest.approx(0.5, abs=1e-5)
 
 
+def test_a_batch_beyond_the_limit_before_the_first_step_is_reported():
+    """Stored data of another policy: the step is refused, the rate has nothing to learn from it."""
+    actor = make_actor(5, 2, hidden_sizes=[16], initial_log_std=-0.5)
+    batch = ppo_batch(actor)
+    before = [parameter.detach().add_(0.3).clone() for parameter in actor.parameters()]
+    adapt = KLAdaptiveRate(factor=2.0, lowest=1e-5, highest=1.0, few_steps=0.7, low_kl=0.7)
+    loss = PPOLoss(actor, clip_epsilon=0.2, entropy_coeff=0.0)
+    update = MinibatchUpdate(
+        loss, optimizer=adam, num_passes=3, minibatch_size=32, max_kl=0.01, adapt_rate=adapt
+    )
+    with pytest.warns(UserWarning, match=r"beyond max_kl=0\.01"):
+        diagnostics = update(batch)
+    assert diagnostics["num_steps"] == 0
+    assert diagnostics["kl"] > 0.01
+    assert diagnostics["lr"].item() == pytest.approx(1e-2)
+    assert all(map(torch.equal, actor.parameters(), before))
+
+
+class Overflowing(RecordingLoss):
+    """Finite at first, infinite from the third call on."""
+
+    def forward(self, batch):
+        losses = super().forward(batch)
+        if len(self.seen) > 2:
+            losses["loss_objective"] = losses["loss_objective"] * torch.inf
+        return losses
+
+
+def test_the_step_after_a_loss_that_is_no_number_is_not_taken():
+    loss, reference = Overflowing(), RecordingLoss()
+    update = MinibatchUpdate(loss, optimizer=adam, num_passes=9, minibatch_size=None)
+    with pytest.raises(FloatingPointError, match="'loss_objective' is inf"):
+        update(samples(20))
+    MinibatchUpdate(reference, optimizer=adam, num_passes=2, minibatch_size=None)(samples(20))
+    assert torch.equal(loss.w, reference.w)
+
+
+@pytest.mark.parametrize("entry", ["observation", "action", "advantage", "loc"])
+def test_an_entry_that_is_no_number_is_named_before_any_step(entry):
+    actor = make_actor(5, 2, hidden_sizes=[16], initial_log_std=-0.5)
+    batch = ppo_batch(actor)
+    batch[entry][3, -1, 0] = torch.nan
+    before = [parameter.detach().clone() for parameter in actor.parameters()]
+    loss = PPOLoss(actor, clip_epsilon=0.2, entropy_coeff=0.0)
+    update = MinibatchUpdate(loss, optimizer=adam, num_passes=1, minibatch_size=16)
+    with pytest.raises(FloatingPointError, match=f"'{entry}' is not finite in 1 of 128"):
+        update(batch)
+    assert all(map(torch.equal, actor.parameters(), before))
+
+
+def test_padding_is_no_sample():
+    loss, mask = RecordingLoss(), torch.rand(4, 5) < 0.5
+    batch = samples(4, 5)
+    batch["collector", "mask"] = mask
+    batch["x"][~mask] = torch.nan
+    update = MinibatchUpdate(loss, optimizer=adam, num_passes=2, minibatch_size=None)
+    update(batch)
+    for part in loss.seen:
+        assert torch.equal(part, samples(4, 5)["x"][mask])
+
+
 def test_errors_say_what_is_wrong():
     loss = RecordingLoss()
     with pytest.raises(ValueError, match="minibatch_size=0"):
         MinibatchUpdate(loss, optimizer=adam, num_passes=1, minibatch_size=0)
     update = MinibatchUpdate(loss, optimizer=adam, num_passes=1, minibatch_size=None)
-    with pytest.raises(FloatingPointError, match="'loss_objective' is nan"):
+    with pytest.raises(FloatingPointError, match="'x' is not finite in 1 of 1"):
         update(TensorDict({"x": torch.tensor([float("nan")])}, [1]))
 
 

@@ -14,9 +14,10 @@ from safe_rl.objectives import (
     TRPOLagrangianLoss,
     TRPOLoss,
 )
-from safe_rl.objectives.gaussian import gaussian_kl
+from safe_rl.objectives.distributions import gaussian_kl
+from safe_rl.objectives.fisher import FisherProduct
 from safe_rl.objectives.normalisation import normalise_advantages
-from safe_rl.objectives.trust_region import FisherProduct, flatten, policy_gaussian
+from safe_rl.objectives.trust_region import flatten, policy_in
 
 DELTA = 0.01
 SETTINGS = {
@@ -45,8 +46,8 @@ def cpo_step(actor, **settings):
 
 def kl_and_surrogates(actor, batch):
     with torch.no_grad():
-        loc, scale = policy_gaussian(actor, batch)
-        kl = gaussian_kl(loc, scale, batch["loc"], batch["scale"]).mean()
+        policy = policy_in(actor, batch).base_dist
+        kl = gaussian_kl(policy.loc, policy.scale, batch["loc"], batch["scale"]).mean()
         reward = -TRPOLoss(actor, entropy_coeff=0.0)(batch)["loss_objective"]
         costs = None
         if "cost_advantage" in batch.keys():  # noqa: SIM118 (a TensorDict iterates over its rows)
@@ -154,6 +155,15 @@ def test_trpo_step_fills_the_trust_region_along_the_natural_gradient(batch_size)
     assert metrics["step_fraction"] == pytest.approx(0.8 ** metrics["backtracks"].item())
 
 
+def test_without_a_gradient_there_is_no_step():
+    actor, batch = make_case(0)
+    batch["advantage"].zero_()
+    before = flatten(actor.parameters()).detach().clone()
+    metrics = TRPOStep(TRPOLoss(actor, entropy_coeff=0.0), **SETTINGS)(batch)
+    assert metrics["step_fraction"] == metrics["backtracks"] == metrics["kl"] == 0
+    assert torch.equal(flatten(actor.parameters()), before)
+
+
 def test_rejected_step_leaves_the_policy_exactly_as_it_was():
     actor, batch = make_case(0)
     before = flatten(actor.parameters()).detach().clone()
@@ -225,6 +235,42 @@ def test_cpo_diagnostics_are_the_definitions():
     assert metrics["nu"].shape == (2,)
 
 
+@pytest.mark.parametrize("violation", [-1.0, 0.5, 3.0])
+def test_unconverged_cpo_steps_meet_the_linear_constraints_and_the_radius(violation):
+    """With ten iterations, against gradients and the dense Fisher matrix, not converged ones."""
+    actor, batch = make_case(2, (2000,))
+    parameters = list(actor.parameters())
+    start = flatten(parameters).detach().clone()
+    matrix = dense_fisher(actor, batch).double()
+    losses = CPOLoss(actor, entropy_coeff=0.0)(batch)
+    b = torch.stack(
+        [
+            flatten(torch.autograd.grad(cost, parameters, retain_graph=True))
+            for cost in losses["cost_surrogate"]
+        ]
+    ).double()
+    g = flatten(torch.autograd.grad(losses["loss_objective"], parameters)).double()
+    step = cpo_step(actor, cg_iterations=3)
+    violations = torch.tensor([violation, -1.0])
+    losses = step.loss(batch)
+    fisher = FisherProduct(actor, batch, parameters, SETTINGS["damping"])
+    proposal = step._propose(losses, fisher, violations, LENGTH)
+    x = proposal.step.double()
+    assert torch.equal(flatten(parameters), start)
+    solution = torch.linalg.solve(matrix, g)
+    residual = matrix @ step._solve(fisher, g.float()).double() - g
+    assert residual.norm() > 0.02 * g.norm()
+    case = proposal.diagnostics["case"]
+    assert case in (1, 2)
+    # the radius is spent, and no constraint exceeded, both to rounding
+    assert (0.5 * x @ matrix @ x).item() == pytest.approx(DELTA, rel=1e-3)
+    excess = (violations.double() / 100 + b @ x) / (
+        2 * DELTA * (b @ matrix.inverse() @ b.T).diagonal()
+    ).sqrt()
+    assert excess.max().item() == pytest.approx(0.0, abs=1e-3)
+    assert (g @ x).item() >= -((2 * DELTA * g @ solution).sqrt().item()) * 1.001
+
+
 def test_cpo_without_cost_gradient_is_trpo():
     actor, batch = make_case(1)
     batch["cost_advantage"].zero_()
@@ -284,6 +330,17 @@ def test_errors_say_what_to_change():
         cpo_step(actor, fisher_subsample=2.0)
     with pytest.raises(TypeError, match="use TRPOLoss"):
         TRPOLagrangianLoss(actor, None, entropy_coeff=0.0)
-    batch["advantage"][0] = torch.nan
-    with pytest.raises(FloatingPointError, match="non-finite rewards"):
-        step(batch, torch.zeros(1), LENGTH)
+
+
+@pytest.mark.parametrize("entry", ["advantage", "cost_advantage", "observation", "action"])
+@pytest.mark.parametrize("value", [torch.nan, torch.inf])
+def test_numbers_that_are_none_change_nothing(entry, value):
+    actor, batch = make_case(1)
+    batch[entry].view(-1)[0] = value
+    before = flatten(actor.parameters()).detach().clone()
+    for step in (cpo_step(actor), TRPOStep(CPOLoss(actor, entropy_coeff=0.0), **SETTINGS)):
+        read = entry in step.loss.in_keys
+        with pytest.raises(FloatingPointError, match=f"'{entry}' is not finite in 1 of 400"):
+            step(batch, torch.zeros(1), LENGTH)
+        assert read
+        assert torch.equal(flatten(actor.parameters()), before)

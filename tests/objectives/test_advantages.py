@@ -201,3 +201,57 @@ def test_errors_say_what_to_change():
     reward = VectorGAE(None, value_target="lambda_return", **settings)
     with pytest.raises(KeyError, match="state_value"):
         reward(rollout)
+
+
+def test_value_estimate_gives_the_targets_and_leaves_the_rollout():
+    critic = make_critic()
+    rollout = make_rollout([])
+    estimator = VectorGAE(critic, gamma=0.95, lmbda=0.9, value_target="lambda_return")
+    before = set(rollout.keys(True, True))
+    found = estimator.value_estimate(rollout)
+    assert set(rollout.keys(True, True)) == before
+    theirs = GAE(gamma=0.95, lmbda=0.9, value_network=critic)(rollout.clone())
+    torch.testing.assert_close(found, theirs["value_target"], atol=1e-5, rtol=1e-5)
+    zero = torch.zeros_like(rollout["next", "reward"])
+    greedy = VectorGAE(critic, gamma=0.95, lmbda=0.0, value_target="lambda_return")
+    torch.testing.assert_close(
+        greedy.value_estimate(rollout, next_value=zero), rollout["next", "reward"]
+    )
+
+
+def test_called_with_keywords():
+    critic = make_critic("cost_value", 2)
+    rollout = make_rollout([], costs=("a", "b"))
+    settings = {"gamma": 0.95, "lmbda": 0.9, "value_target": "lambda_return"}
+    estimator = CostGAE(["a", "b"], critic, **settings)
+    following = rollout["next"]
+    advantage, target = estimator(
+        observation=rollout["observation"],
+        next_observation=following["observation"],
+        next_a=following["a"],
+        next_b=following["b"],
+        next_done=following["done"],
+        next_terminated=following["terminated"],
+    )
+    expected = estimator(rollout)
+    torch.testing.assert_close(advantage, expected["cost_advantage"])
+    torch.testing.assert_close(target, expected["cost_value_target"])
+
+
+@pytest.mark.parametrize(
+    "key", ["observation", ("next", "cost_hazards"), ("next", "reward"), ("next", "observation")]
+)
+def test_a_number_that_is_none_is_named_where_it_entered(key):
+    critic, cost_critic = make_critic(), make_critic("cost_value")
+    rollout = make_rollout([], costs=("cost_hazards",))
+    rollout[key][2, -1, 0] = torch.nan
+    settings = {"gamma": 0.95, "lmbda": 0.9, "value_target": "lambda_return"}
+    estimators = {
+        "reward": VectorGAE(critic, **settings),
+        "cost": CostGAE(["cost_hazards"], cost_critic, **settings),
+    }
+    name = "cost" if "cost_hazards" in key else "reward"
+    wrong = ("next", "state_value") if key == ("next", "observation") else key
+    with pytest.raises(FloatingPointError) as error:
+        estimators[name](rollout)
+    assert str(error.value).startswith(f"{wrong!r} is not finite in 1 of {N * T} samples")

@@ -9,20 +9,21 @@ from samples import NUM_ACTIONS, NUM_OBS, make_actor
 from tensordict import TensorDict
 from tensordict.nn import AddStateIndependentNormalScale, TensorDictModule
 from torch import nn
-from torch.distributions import Independent, Normal, TransformedDistribution, kl_divergence
-from torch.distributions.transforms import TanhTransform
+from torch.distributions import Independent, Normal, kl_divergence
 from torchrl.modules import IndependentNormal, ProbabilisticActor
 
-from safe_rl.objectives.gaussian import gaussian_kl, normal_parameters
+from safe_rl.objectives.distributions import ReferencePolicy, gaussian_kl
+from safe_rl.objectives.fisher import FisherProduct
 from safe_rl.objectives.trust_region import (
-    FisherProduct,
     backtracking_search,
+    best_in_span,
     conjugate_gradient,
     flat_gradient,
     flatten,
     mean_kl,
-    policy_gaussian,
+    policy_in,
     set_parameters,
+    solve_with_image,
     subsample,
     unflatten,
 )
@@ -66,7 +67,7 @@ def setup_actor(name, batch_size=(7,)):
 def explicit_fisher(actor, batch, parameters):
     """Hessian of the mean KL at the current parameters, by autograd twice over torch's own KL."""
     with torch.no_grad():
-        old = Independent(Normal(*policy_gaussian(actor, batch)), 1)
+        old = policy_in(actor, batch)
 
     def kl(vector):
         names = [name for name, _ in actor.named_parameters()]
@@ -96,7 +97,7 @@ def test_fisher_product_is_the_second_difference_of_the_kl():
     product = FisherProduct(actor, batch, parameters, damping=0.0)
     start = flatten(parameters).detach()
     with torch.no_grad():
-        reference = policy_gaussian(actor, batch)
+        reference = ReferencePolicy(policy_in(actor, batch))
     direction = torch.randn_like(start)
     curvature = direction @ product(direction)
     size = 1e-4
@@ -161,6 +162,38 @@ def test_truncated_solution_is_orthogonal_to_its_residual():
     torch.testing.assert_close(x @ matrix @ x, x @ right)
 
 
+def ill_conditioned_system(size=60, rows=3):
+    """A system that five conjugate gradients leave far from solved."""
+    root = torch.randn(size, size, dtype=torch.float64)
+    basis = torch.linalg.qr(root).Q
+    matrix = basis @ torch.diag(torch.logspace(-1, 2, size, dtype=torch.float64)) @ basis.T
+    return matrix, torch.randn(rows, size, dtype=torch.float64)
+
+
+def test_solutions_in_the_span_agree_with_each_other_and_are_better():
+    matrix, right = ill_conditioned_system()
+    pairs = [solve_with_image(matrix.__matmul__, row, 5) for row in right]
+    rough, images = (torch.stack(rows) for rows in zip(*pairs, strict=True))
+    torch.testing.assert_close(images, rough @ matrix)
+    assert (images - right).norm() > 0.2 * right.norm()
+    products = rough @ right.T
+    assert (products - products.T).abs().max() > 0.01 * products.diagonal().max()
+    found = best_in_span(rough, images, right)
+    products = found @ right.T
+    torch.testing.assert_close(products, products.T)
+    torch.testing.assert_close(products, found @ matrix @ found.T)
+    error, rough_error = (x - torch.linalg.solve(matrix, right.T).T for x in (found, rough))
+    assert ((error @ matrix * error).sum(-1) <= (rough_error @ matrix * rough_error).sum(-1)).all()
+
+
+def test_parallel_and_vanishing_right_hand_sides_are_no_trouble():
+    matrix, right = ill_conditioned_system()
+    right = torch.stack([right[0], -3 * right[0], 0 * right[0]]).float()
+    pairs = [solve_with_image(matrix.float().__matmul__, row, 5) for row in right]
+    rough, images = (torch.stack(rows) for rows in zip(*pairs, strict=True))
+    torch.testing.assert_close(best_in_span(rough, images, right), rough, rtol=1e-4, atol=1e-5)
+
+
 def test_gaussian_kl_against_torch():
     loc_p, loc_q = torch.randn(2, 5, 3)
     scale_p, scale_q = torch.rand(2, 5, 3) + 0.1
@@ -168,14 +201,6 @@ def test_gaussian_kl_against_torch():
         Independent(Normal(loc_p, scale_p), 1), Independent(Normal(loc_q, scale_q), 1)
     )
     torch.testing.assert_close(gaussian_kl(loc_p, scale_p, loc_q, scale_q), expected)
-
-
-def test_normal_is_found_under_transforms():
-    base = Normal(torch.zeros(3), torch.ones(3))
-    wrapped = Independent(TransformedDistribution(base, TanhTransform()), 1)
-    assert normal_parameters(wrapped)[0] is base.loc
-    with pytest.raises(TypeError, match="must be Gaussian, got Categorical"):
-        normal_parameters(torch.distributions.Categorical(torch.ones(3)))
 
 
 def test_flat_gradient_counts_unused_parameters_as_zero():
@@ -202,5 +227,12 @@ def test_subsample_is_spread_over_the_batch():
     batch = TensorDict(index=torch.arange(100), batch_size=[100])
     assert subsample(batch, 0.1)["index"].tolist() == list(range(0, 100, 10))
     assert subsample(batch, 1.0)["index"].tolist() == list(range(100))
+    for fraction in (0.01, 0.3, 0.6, 0.7, 0.9, 0.99):
+        index = subsample(batch, fraction)["index"]
+        assert len(index) == round(100 * fraction)
+        gaps = index.diff()
+        assert not len(gaps) or int(gaps.max() - gaps.min()) <= 1
+    assert subsample(batch[:5], 0.1)["index"].tolist() == [0]
+    assert subsample(batch[:95], 0.1)["index"].tolist() == list(range(0, 95, 10))
     with pytest.raises(ValueError, match="fisher_subsample"):
         subsample(batch, 0.0)

@@ -1,0 +1,121 @@
+"""What losses and trust regions ask of a policy's distribution, whatever its kind.
+
+Closed forms where there are any: of Normals (also under a transform, such as a tanh-Normal's, which
+changes neither KL divergence nor Fisher information), of everything registered with
+`torch.distributions.kl_divergence`. From samples otherwise.
+"""
+
+from __future__ import annotations
+
+import torch
+from tensordict.nn import ProbabilisticTensorDictModule, ProbabilisticTensorDictSequential
+from torch import Tensor
+from torch.distributions import Distribution, Normal, kl_divergence
+from torchrl.modules.distributions import has_analytic_entropy, has_analytic_kl
+from torchrl.modules.distributions.utils import sample_and_log_prob
+
+
+def gaussian_kl(loc_p: Tensor, scale_p: Tensor, loc_q: Tensor, scale_q: Tensor) -> Tensor:
+    """KL(p ‖ q) of diagonal Gaussians, summed over the last dimension.
+
+    Args:
+        loc_p: mean of p, [..., n].
+        scale_p: standard deviation of p, [..., n].
+        loc_q: mean of q, [..., n].
+        scale_q: standard deviation of q, [..., n].
+
+    Returns:
+        Divergence in nats, [...].
+    """
+    ratio = (scale_p / scale_q).square()
+    shift = ((loc_p - loc_q) / scale_q).square()
+    return 0.5 * (ratio + shift - 1 - ratio.log()).sum(-1)
+
+
+def root(distribution: Distribution) -> Distribution:
+    """The distribution underneath independent and transformed ones."""
+    while hasattr(distribution, "base_dist"):
+        distribution = distribution.base_dist
+    return distribution
+
+
+def has_closed_kl(distribution: Distribution) -> bool:
+    """Whether the divergence between two distributions of this kind needs no samples."""
+    return isinstance(root(distribution), Normal) or has_analytic_kl(distribution, distribution)
+
+
+def kl(p: Distribution, q: Distribution, log_weight: Tensor) -> Tensor:
+    """KL(p ‖ q) of two distributions of the same kind, one number per state.
+
+    Without a closed form it is estimated from an action a that q sampled in each state, as
+    ρ log ρ − ρ + 1 with ρ = p(a)/q(a): without bias, never negative, and 0 with a zero gradient
+    where p = q (Schulman, *Approximating KL divergence*, 2020).
+
+    Args:
+        p: distribution in the states [...].
+        q: distribution in the same states.
+        log_weight: log ρ of the sampled actions, [...].
+
+    Returns:
+        Divergence in nats, [...].
+    """
+    roots = root(p), root(q)
+    if isinstance(roots[0], Normal) and isinstance(roots[1], Normal):
+        return gaussian_kl(roots[0].loc, roots[0].scale, roots[1].loc, roots[1].scale)
+    if has_analytic_kl(p, q):
+        return kl_divergence(p, q)
+    ratio = log_weight.exp()
+    return ratio * log_weight - ratio + 1
+
+
+def entropy(distribution: Distribution) -> Tensor:
+    """Differentiable entropy per state, [...]: in closed form, or −log π(a) of one sampled action.
+
+    The gradient of a sampled entropy goes through the sample where the distribution allows it, and
+    is the score function's elsewhere; both are without bias.
+    """
+    if has_analytic_entropy(distribution):
+        return distribution.entropy()
+    _, log_prob = sample_and_log_prob(distribution, reparameterize=distribution.has_rsample)
+    if distribution.has_rsample:
+        return -log_prob
+    fixed = log_prob.detach()
+    return -fixed * (1 + log_prob - fixed)
+
+
+def sampler_of(actor: ProbabilisticTensorDictSequential) -> ProbabilisticTensorDictModule:
+    """The module of an actor that builds its distribution from parameters.
+
+    Raises:
+        TypeError: if there is none.
+    """
+    samplers = [m for m in actor.modules() if isinstance(m, ProbabilisticTensorDictModule)]
+    if not samplers:
+        raise TypeError(
+            f"The actor, {type(actor).__name__}, has no ProbabilisticTensorDictModule that builds "
+            "its distribution: make it with torchrl.modules.ProbabilisticActor."
+        )
+    return samplers[-1]
+
+
+class ReferencePolicy:
+    """A policy as it is now, in the states of a batch, to measure later ones against.
+
+    Args:
+        distribution: of the policy, without gradients.
+    """
+
+    def __init__(self, distribution: Distribution) -> None:
+        self.distribution = distribution
+        self._sample: tuple[Tensor, Tensor] | None = None
+        if not has_closed_kl(distribution):
+            with torch.no_grad():
+                self._sample = sample_and_log_prob(distribution)
+
+    def kl(self, policy: Distribution) -> Tensor:
+        """KL(policy ‖ reference) per state, [...]; always from the same samples, if from any."""
+        log_weight = torch.empty(0)
+        if self._sample is not None:
+            action, log_prob = self._sample
+            log_weight = policy.log_prob(action) - log_prob
+        return kl(policy, self.distribution, log_weight)

@@ -1,0 +1,157 @@
+"""Products with the Fisher matrix of a policy of any distribution."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.nn import ProbabilisticTensorDictSequential
+from torch import Tensor, nn
+from torch.distributions import Categorical, Distribution, Normal
+
+from safe_rl.objectives.distributions import ReferencePolicy, root, sampler_of
+from safe_rl.objectives.trust_region import flatten, policy_in, unflatten
+
+#: What a policy's network puts out, and the product with the Fisher matrix of these outputs.
+Geometry = tuple[list[Tensor], Callable[[Sequence[Tensor]], list[Tensor]]]
+
+
+def _num_states(distribution: Distribution) -> int:
+    return max(1, distribution.batch_shape.numel())
+
+
+def _normal_geometry(normal: Normal, num_states: int) -> Geometry:
+    """1/σ² for a mean and 2/σ² for a standard deviation σ."""
+    precision = normal.scale.detach().square().reciprocal() / num_states
+    # A mean or a standard deviation that is constant has no part in the Fisher matrix.
+    trained = [
+        (output, metric)
+        for output, metric in ((normal.loc, precision), (normal.scale, 2 * precision))
+        if output.requires_grad
+    ]
+    metrics = [metric for _, metric in trained]
+
+    def multiply(changes: Sequence[Tensor]) -> list[Tensor]:
+        return [metric * change for metric, change in zip(metrics, changes, strict=True)]
+
+    return [output for output, _ in trained], multiply
+
+
+def _categorical_geometry(categorical: Categorical, num_states: int) -> Geometry:
+    """diag(p) − ppᵀ of the probabilities p, for log-probabilities."""
+    probs = categorical.probs.detach()
+
+    def multiply(changes: Sequence[Tensor]) -> list[Tensor]:
+        centred = changes[0] - (probs * changes[0]).sum(-1, keepdim=True)
+        return [probs * centred / num_states]
+
+    return [categorical.logits], multiply
+
+
+def _geometry_by_differentiation(
+    actor: ProbabilisticTensorDictSequential, batch: TensorDictBase
+) -> Geometry:
+    """Hessian of the mean KL(π ‖ π_k) with respect to the distribution's parameters, at π_k.
+
+    The gradient of the divergence is 0 there, so that JᵀMJ with this M is its whole Hessian with
+    respect to θ. The network itself is not in this graph.
+    """
+    sampler = sampler_of(actor)
+    parameters = actor.get_dist_params(batch.select(*actor.in_keys)).select(*sampler.in_keys)
+    keys = [key for key in sampler.in_keys if parameters.get(key).requires_grad]
+    outputs = [parameters.get(key) for key in keys]
+    moved = parameters.detach()
+    leaves = [output.detach().requires_grad_() for output in outputs]
+    for key, leaf in zip(keys, leaves, strict=True):
+        moved.set(key, leaf)
+    reference = ReferencePolicy(sampler.get_dist(parameters.detach()))
+    divergence = reference.kl(sampler.get_dist(moved)).mean()
+    slopes = torch.autograd.grad(divergence, leaves, create_graph=True)
+
+    def multiply(changes: Sequence[Tensor]) -> list[Tensor]:
+        product = torch.autograd.grad(
+            slopes, leaves, changes, retain_graph=True, materialize_grads=True, allow_unused=True
+        )
+        return list(product)
+
+    return outputs, multiply
+
+
+def policy_geometry(actor: ProbabilisticTensorDictSequential, batch: TensorDictBase) -> Geometry:
+    """Outputs of a policy's network in the states of a batch, and their mean Fisher matrix."""
+    distribution = policy_in(actor, batch)
+    base = root(distribution)
+    if isinstance(base, Normal):
+        return _normal_geometry(base, base.scale.numel() // base.scale.shape[-1])
+    if isinstance(base, Categorical):
+        return _categorical_geometry(base, _num_states(distribution))
+    return _geometry_by_differentiation(actor, batch)
+
+
+class FisherProduct:
+    """Product of a vector with the Fisher matrix of a policy, plus damping.
+
+    The Fisher matrix is the Hessian of the mean KL(π_θ ‖ π_k) at θ_k: Jᵀ M J with J the Jacobian
+    of the network's outputs with respect to θ, and M the outputs' own Fisher matrix: in closed form
+    for Gaussian and categorical policies, by differentiating the divergence twice for others.
+    J v comes from differentiating the vector-Jacobian product uᵀJ, which is linear in u, with
+    respect to u. Both graphs are built once, so that a product costs two backward passes.
+
+    Args:
+        actor_network: policy with `get_dist`; any network that can be differentiated twice.
+        batch: states to average over, any batch shape.
+        parameters: θ, the parameters of the actor to differentiate by.
+        damping: multiple of the identity that is added.
+
+    Examples:
+        >>> from tensordict import TensorDict
+        >>> from tensordict.nn import AddStateIndependentNormalScale, TensorDictModule
+        >>> from torchrl.modules import IndependentNormal, ProbabilisticActor
+        >>> net = nn.Sequential(nn.Linear(3, 2), AddStateIndependentNormalScale(2))
+        >>> actor = ProbabilisticActor(
+        ...     TensorDictModule(net, in_keys=["observation"], out_keys=["loc", "scale"]),
+        ...     in_keys=["loc", "scale"],
+        ...     distribution_class=IndependentNormal,
+        ... )
+        >>> batch = TensorDict(observation=torch.randn(8, 3), batch_size=[8])
+        >>> fisher = FisherProduct(actor, batch, list(actor.parameters()), damping=0.1)
+        >>> fisher(torch.ones(10)).shape
+        torch.Size([10])
+    """
+
+    def __init__(
+        self,
+        actor_network: ProbabilisticTensorDictSequential,
+        batch: TensorDictBase,
+        parameters: Sequence[nn.Parameter],
+        damping: float,
+    ) -> None:
+        self.parameters, self.damping = list(parameters), damping
+        self._outputs, self._metric = policy_geometry(actor_network, batch)
+        self._dummies = [torch.zeros_like(output, requires_grad=True) for output in self._outputs]
+        self._vjp = torch.autograd.grad(
+            self._outputs,
+            self.parameters,
+            self._dummies,
+            create_graph=True,
+            materialize_grads=True,
+            allow_unused=True,
+        )
+
+    def __call__(self, vector: Tensor) -> Tensor:
+        """Multiply a vector [P]."""
+        tangents = unflatten(vector, self.parameters)
+        used = [(vjp, v) for vjp, v in zip(self._vjp, tangents, strict=True) if vjp.requires_grad]
+        jvp = torch.autograd.grad(
+            [vjp for vjp, _ in used], self._dummies, [v for _, v in used], retain_graph=True
+        )
+        product = torch.autograd.grad(
+            self._outputs,
+            self.parameters,
+            self._metric(jvp),
+            retain_graph=True,
+            materialize_grads=True,
+            allow_unused=True,
+        )
+        return flatten(product) + self.damping * vector

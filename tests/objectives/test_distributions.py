@@ -1,0 +1,283 @@
+"""Policies of any distribution: KL, entropy and Fisher products against torch and differences."""
+
+import functools
+
+import pytest
+import torch
+from samples import NUM_OBS, perturb
+from tensordict import TensorDict
+from tensordict.nn import NormalParamExtractor, TensorDictModule
+from torch import nn
+from torch.distributions import Beta, Categorical, Distribution, Independent, kl_divergence
+from torchrl.envs.utils import ExplorationType
+from torchrl.modules import IndependentNormal, OneHotCategorical, ProbabilisticActor, TanhNormal
+from torchrl.modules import TruncatedNormal as TorchRLTruncatedNormal
+from torchrl.objectives import ClipPPOLoss
+
+from safe_rl.algorithms import CPOStep, MinibatchUpdate, TRPOStep
+from safe_rl.objectives import CPOLoss, LagrangeMultiplier, PPOLagrangianLoss, PPOLoss, TRPOLoss
+from safe_rl.objectives.distributions import ReferencePolicy, entropy, kl
+from safe_rl.objectives.fisher import FisherProduct
+from safe_rl.objectives.trust_region import flatten, mean_kl, policy_in, set_parameters
+
+SETTINGS = {"target_kl": 0.01, "damping": 0.1, "cg_iterations": 10, "backtrack_coeff": 0.8,
+            "max_backtracks": 15}  # fmt: skip
+
+
+class IndependentBeta(Independent):
+    """Beta in every dimension of the action."""
+
+    def __init__(self, alpha, beta):
+        super().__init__(Beta(alpha, beta), 1)
+
+    @property
+    def deterministic_sample(self):
+        return self.mean
+
+
+class MultiCategorical(Independent):
+    """As many choices in every component of the action."""
+
+    def __init__(self, logits):
+        super().__init__(Categorical(logits=logits), 1)
+
+
+class Anonymous(Distribution):
+    """A normal distribution that tells neither its entropy nor what it is made of."""
+
+    arg_constraints = {}  # noqa: RUF012
+    has_rsample = True
+
+    def __init__(self, loc, scale):
+        self.hidden = IndependentNormal(loc, scale)
+        super().__init__(self.hidden.batch_shape, self.hidden.event_shape, validate_args=False)
+
+    def rsample(self, sample_shape=()):
+        return self.hidden.rsample(sample_shape)
+
+    def log_prob(self, value):
+        return self.hidden.log_prob(value)
+
+
+class Unreparametrised(Anonymous):
+    has_rsample = False
+
+    def sample(self, sample_shape=()):
+        return self.hidden.sample(sample_shape)
+
+
+class Positive(nn.Module):
+    """Two parameters above 1 per dimension."""
+
+    def forward(self, x):
+        return tuple((1 + nn.functional.softplus(x)).chunk(2, -1))
+
+
+class Grid(nn.Module):
+    """Two choices among three."""
+
+    def forward(self, x):
+        return x.unflatten(-1, (2, 3))
+
+
+KINDS = {
+    "normal": (4, NormalParamExtractor(), ["loc", "scale"], IndependentNormal),
+    "tanh_normal": (4, NormalParamExtractor(), ["loc", "scale"], TanhNormal),
+    "bounded_tanh_normal": (
+        4, NormalParamExtractor(), ["loc", "scale"],
+        functools.partial(TanhNormal, low=-2.0, high=3.0),
+    ),
+    "truncated_normal": (4, NormalParamExtractor(), ["loc", "scale"], TorchRLTruncatedNormal),
+    "beta": (4, Positive(), ["alpha", "beta"], IndependentBeta),
+    "categorical": (5, nn.Identity(), ["logits"], Categorical),
+    "one_hot": (5, nn.Identity(), ["logits"], OneHotCategorical),
+    "multi_discrete": (6, Grid(), ["logits"], MultiCategorical),
+    "anonymous": (4, NormalParamExtractor(), ["loc", "scale"], Anonymous),
+    "unreparametrised": (4, NormalParamExtractor(), ["loc", "scale"], Unreparametrised),
+}  # fmt: skip
+SAMPLED_KL = {"truncated_normal", "anonymous", "unreparametrised"}
+
+
+def make_actor(kind):
+    outputs, head, keys, distribution = KINDS[kind]
+    net = nn.Sequential(nn.Linear(NUM_OBS, 6), nn.Tanh(), nn.Linear(6, outputs), head)
+    return ProbabilisticActor(
+        TensorDictModule(net, in_keys=["observation"], out_keys=keys),
+        in_keys=keys,
+        distribution_class=distribution,
+        default_interaction_type=ExplorationType.RANDOM,
+        return_log_prob=True,
+    )
+
+
+def make_case(kind, samples=64, costs=1):
+    actor = make_actor(kind)
+    batch = TensorDict(observation=torch.randn(samples, NUM_OBS), batch_size=[samples])
+    with torch.no_grad():
+        actor(batch)
+    batch["advantage"] = torch.randn(samples, 1)
+    batch["cost_advantage"] = torch.randn(samples, costs)
+    return actor, batch
+
+
+def behaviour(actor, batch):
+    """The distribution that collected a batch, from the entries that the actor wrote into it."""
+    return actor.build_dist_from_params(batch)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_ppo_surrogate_agrees_with_torchrl(kind):
+    actor, batch = make_case(kind)
+    perturb(actor, 0.1)
+    theirs = ClipPPOLoss(actor, None, critic_coeff=None, clip_epsilon=0.2, entropy_coeff=0.0)
+    expected = theirs(batch.clone())
+    losses = PPOLoss(actor, clip_epsilon=0.2, entropy_coeff=0.0)(batch)
+    for key in ("loss_objective", "clip_fraction", "ESS"):
+        torch.testing.assert_close(losses[key], expected[key])
+    assert losses["loss_entropy"] == 0
+
+
+@pytest.mark.parametrize("kind", sorted(set(KINDS) - SAMPLED_KL))
+def test_kl_in_closed_form(kind):
+    actor, batch = make_case(kind)
+    perturb(actor, 0.1)
+    losses = PPOLoss(actor, clip_epsilon=0.2, entropy_coeff=0.0)(batch)
+    present, past = policy_in(actor, batch), behaviour(actor, batch)
+    if "tanh" in kind:  # torch knows the divergence of what is underneath
+        present, past = present.base_dist, past.base_dist
+    expected = kl_divergence(present, past).mean()
+    torch.testing.assert_close(losses["kl"], expected.detach())
+    assert losses["kl"] > 0
+
+
+@pytest.mark.parametrize("kind", [*sorted(SAMPLED_KL), "normal", "beta"])
+def test_sampled_kl_is_the_divergence_on_average(kind):
+    """Against the mean of log p − log q over samples of p, both with a hundred thousand samples."""
+    actor = make_actor(kind)
+    batch = TensorDict(observation=torch.ones(100_000, NUM_OBS), batch_size=[100_000])
+    with torch.no_grad():
+        past = policy_in(actor, batch)
+        action = past.sample()
+        perturb(actor, 0.1)
+        present = policy_in(actor, batch)
+        log_weight = present.log_prob(action) - past.log_prob(action)
+        ratio = log_weight.exp()
+        found = (ratio * log_weight - ratio + 1).mean()
+        own = present.sample()
+        expected = (present.log_prob(own) - past.log_prob(own)).mean()
+        if kind in SAMPLED_KL:
+            torch.testing.assert_close(kl(present, past, log_weight).mean(), found)
+    assert found.item() == pytest.approx(expected.item(), rel=0.1, abs=1e-3)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_entropy_bonus_is_the_entropy_and_its_slope(kind):
+    """Against the mean of −log p over other samples; slopes by differences of that with p fixed."""
+    actor = make_actor(kind)
+    batch = TensorDict(observation=torch.ones(200_000, NUM_OBS), batch_size=[200_000])
+    found = entropy(policy_in(actor, batch)).mean()
+    with torch.no_grad():
+        own = policy_in(actor, batch)
+        expected = -own.log_prob(own.sample()).mean()
+    assert found.item() == pytest.approx(expected.item(), abs=0.02)
+    bias = [module for module in actor.modules() if isinstance(module, nn.Linear)][-1].bias
+    (slope,) = torch.autograd.grad(found, bias)
+    numbers = []
+    for index in range(len(bias)):
+        values = []
+        for size in (0.1, -0.1):
+            with torch.no_grad():
+                bias[index] += size
+                torch.manual_seed(0)
+                moved = policy_in(actor, batch)
+                values.append(-moved.log_prob(moved.sample()).mean())
+                bias[index] -= size
+        numbers.append((values[0] - values[1]) / 0.2)
+    torch.testing.assert_close(slope, torch.stack(numbers), atol=0.03, rtol=0.05)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_fisher_product_is_the_second_difference_of_the_kl(kind):
+    actor, batch = make_case(kind, samples=8)
+    actor.double()
+    batch = batch.select("observation").double()
+    parameters = list(actor.parameters())
+    torch.manual_seed(3)
+    product = FisherProduct(actor, batch, parameters, damping=0.0)
+    torch.manual_seed(3)  # where samples decide, the same ones
+    with torch.no_grad():
+        reference = ReferencePolicy(policy_in(actor, batch))
+    start = flatten(parameters).detach()
+    direction = torch.randn(len(start), dtype=torch.float64)
+    curvature = direction @ product(direction)
+    size, values = 1e-4, []
+    for sign in (1, -1):
+        set_parameters(parameters, start + sign * size * direction)
+        values.append(mean_kl(reference, actor, batch))
+    torch.testing.assert_close(sum(values) / size**2, curvature, rtol=1e-3, atol=1e-9)
+    assert curvature > 0
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_every_update_takes_every_policy(kind):
+    actor, batch = make_case(kind, samples=200)
+    multiplier = LagrangeMultiplier([1.0], init=1.0, lr=0.1)
+    ppo = PPOLagrangianLoss(actor, multiplier, clip_epsilon=0.2, entropy_coeff=0.01)
+    adam = functools.partial(torch.optim.Adam, lr=1e-2)
+    update = MinibatchUpdate(ppo, optimizer=adam, num_passes=10, minibatch_size=None)
+    before = ppo(batch)["loss_objective"].item()
+    assert update(batch)["num_steps"] == 10
+    assert ppo(batch)["loss_objective"] < before
+    for step, violation in (
+        (TRPOStep(TRPOLoss(actor, entropy_coeff=0.0), **SETTINGS), None),
+        (CPOStep(CPOLoss(actor, entropy_coeff=0.0), rescale_violation=True, **SETTINGS), -5.0),
+    ):
+        with torch.no_grad():  # another batch, of the policy as it is
+            batch = actor(batch.select("observation", "advantage", "cost_advantage"))
+        start = step.loss(batch)["loss_objective"].item()
+        given = () if violation is None else (torch.tensor([violation]), torch.tensor(50.0))
+        metrics = step(batch, *given)
+        assert metrics["step_fraction"] > 0
+        assert 0 < metrics["kl"] <= SETTINGS["target_kl"]
+        assert step.loss(batch)["loss_objective"] < start
+
+
+def test_parameters_are_read_where_the_actor_writes_them():
+    net = nn.Sequential(nn.Linear(NUM_OBS, 5))
+    keys = [("pi", "logits")]
+    actor = ProbabilisticActor(
+        TensorDictModule(net, in_keys=["observation"], out_keys=keys),
+        in_keys={"logits": ("pi", "logits")},
+        distribution_class=Categorical,
+        return_log_prob=True,
+    )
+    loss = PPOLoss(actor, clip_epsilon=0.2, entropy_coeff=0.0)
+    assert ("pi", "logits") in loss.in_keys
+    assert "loc" not in loss.in_keys
+    batch = TensorDict(observation=torch.randn(8, NUM_OBS), batch_size=[8])
+    with torch.no_grad():
+        actor(batch)
+    batch["advantage"] = torch.randn(8, 1)
+    assert loss(batch)["kl"] == 0
+    del batch["pi", "logits"]
+    with pytest.raises(KeyError, match="behaviour policy's"):
+        loss(batch)
+
+
+def test_the_entropy_bonus_can_be_scheduled_up_from_zero():
+    actor, batch = make_case("normal")
+    loss = PPOLoss(actor, clip_epsilon=0.2, entropy_coeff=0.0)
+    assert loss(batch)["loss_entropy"] == 0
+    loss.entropy_coeff = 0.5
+    expected = -0.5 * policy_in(actor, batch).entropy().mean()
+    torch.testing.assert_close(loss(batch)["loss_entropy"], expected)
+    assert set(loss(batch).keys()) == set(loss.out_keys)
+
+
+def test_an_actor_without_a_sampler_is_refused():
+    with pytest.raises(TypeError, match="ProbabilisticActor"):
+        PPOLoss(
+            TensorDictModule(nn.Linear(3, 2), in_keys=["observation"], out_keys=["action"]),
+            clip_epsilon=0.2,
+            entropy_coeff=0.0,
+        )
