@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Protocol
 
 from torch import Tensor
@@ -28,6 +29,8 @@ class Physics(Protocol):
     xmat: Tensor  # [N, nbody, 3, 3]
     sensordata: Tensor  # [N, nsensordata]
     subtree_com: Tensor  # [N, nbody, 3] m
+    # all outputs that were asked for, by their names in MjData
+    outputs: Mapping[str, Tensor]
 
     @property
     def timestep(self) -> float:
@@ -36,21 +39,31 @@ class Physics(Protocol):
     def reset(self, mask: Tensor) -> None:
         """Set the simulations in `mask` (bool [N]) to the model's initial state, awake."""
 
-    def forward(self, mask: Tensor | None = None) -> None:
-        """Bring the outputs up to date with the state, for all simulations or those in `mask`."""
+    def forward(self, mask: Tensor | None = None, sensors: bool = True) -> None:
+        """Bring the outputs up to date with the state, for all simulations or those in `mask`.
 
-    def step(self, num_substeps: Tensor | int, mocap_path: Tensor | None = None) -> Tensor:
+        Without `sensors`, the readings and what is computed for them alone stay as they are.
+        """
+
+    def step(
+        self, num_substeps: Tensor | int, mocap_path: Tensor | None = None, refresh: bool = True
+    ) -> Tensor:
         """Advance by substeps under constant `ctrl`, then bring the outputs up to date.
 
         Args:
             num_substeps: one number for all, or int64 [N].
             mocap_path: mocap positions before each substep [N, S, nmocap, 3], or None where
                 nothing moves.
+            refresh: False leaves the outputs as `mj_step` does: of the state that the last
+                substep evaluated last, which with the Runge-Kutta integrator is its fourth stage.
 
         Returns:
             bool [N]: simulations that failed (non-finite or huge state); their state is finite
             again but meaningless until reset.
         """
+
+    def failed(self) -> Tensor:
+        """Return the simulations that failed since the last call of this or `step`, bool [N]."""
 
     def rays(self, origin: Tensor, directions: Tensor, group: int, exclude_body: int) -> Tensor:
         """Cast rays into the simulations as their state is now.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from collections.abc import Mapping, Sequence
 
 import mujoco
 import numpy as np
@@ -38,6 +39,7 @@ class BatchPhysics:
         model: the compiled model; sleeping follows its options.
         num_envs: number of simulations, N.
         num_threads: threads that step them, 0 for one per core.
+        outputs: names of the fields of `MjData` that are read; every call copies them out.
 
     Examples:
         >>> from safe_rl.envs.safety_gym.records.config import SafetyGymConfig
@@ -47,19 +49,32 @@ class BatchPhysics:
         [False, False]
     """
 
-    def __init__(self, model: mujoco.MjModel, num_envs: int, num_threads: int) -> None:
+    xpos: Tensor
+    xmat: Tensor
+    sensordata: Tensor
+    subtree_com: Tensor
+
+    def __init__(
+        self,
+        model: mujoco.MjModel,
+        num_envs: int,
+        num_threads: int,
+        outputs: Sequence[str] = _OUTPUTS,
+    ) -> None:
         _log_to_console_only()
         sleeps = bool(model.opt.enableflags & mujoco.mjtEnableBit.mjENBL_SLEEP)
         self._batch = Batch(model, num_envs, num_threads, persistent=sleeps)
         # Every field is bound before the first call: later ones would be zero until the next.
         state = {name: _share(self._batch.bind(name)) for name in _STATE}
-        outputs = {name: _share(self._batch.bind(name)) for name in _OUTPUTS}
+        read = {name: _share(self._batch.bind(name)) for name in outputs}
+        if "xmat" in read:
+            read["xmat"] = read["xmat"].view(num_envs, model.nbody, 3, 3)
+        self.outputs: Mapping[str, Tensor] = read
         self.time, self.qpos, self.qvel = state["time"], state["qpos"], state["qvel"]
         self.qacc_warmstart, self.ctrl = state["qacc_warmstart"], state["ctrl"]
         self.mocap_pos, self.mocap_quat = state["mocap_pos"], state["mocap_quat"]
-        self.xpos, self.sensordata = outputs["xpos"], outputs["sensordata"]
-        self.xmat = outputs["xmat"].view(num_envs, model.nbody, 3, 3)
-        self.subtree_com = outputs["subtree_com"]
+        for name in set(_OUTPUTS).intersection(outputs):
+            setattr(self, name, self.outputs[name])
         self._disableflags = self._batch.expand("opt.disableflags")
         self._with_sensors = int(model.opt.disableflags)
         self._warnings = np.zeros_like(self._batch.warning)
@@ -74,11 +89,15 @@ class BatchPhysics:
         self._batch.reset(mask.numpy(), stage=_NO_STAGE)
         self._warnings[:] = self._batch.warning
 
-    def forward(self, mask: Tensor | None = None) -> None:
+    def forward(self, mask: Tensor | None = None, sensors: bool = True) -> None:
         """See `Physics.forward`."""
+        self._disableflags[:] = self._with_sensors | (0 if sensors else _NO_SENSORS)
         self._batch.forward(None if mask is None else mask.numpy())
+        self._disableflags[:] = self._with_sensors
 
-    def step(self, num_substeps: Tensor | int, mocap_path: Tensor | None = None) -> Tensor:
+    def step(
+        self, num_substeps: Tensor | int, mocap_path: Tensor | None = None, refresh: bool = True
+    ) -> Tensor:
         """See `Physics.step`."""
         # Nobody reads sensors between substeps; without them the result is the same to the bit.
         self._disableflags[:] = self._with_sensors | _NO_SENSORS
@@ -88,8 +107,21 @@ class BatchPhysics:
             for count in num_substeps.unique().tolist():
                 self._substeps(count, mocap_path, (num_substeps == count).numpy())
         self._disableflags[:] = self._with_sensors
-        self._batch.forward()
-        return self._failed()
+        if refresh:
+            self._batch.forward()
+        return self.failed()
+
+    def failed(self) -> Tensor:
+        """See `Physics.failed`."""
+        # Their warning counters rose: MuJoCo resets a bad state by itself, silently.
+        counts = self._batch.warning
+        if np.array_equal(counts, self._warnings):
+            return torch.zeros(len(counts), dtype=torch.bool)
+        failed = (counts[..., 1] > self._warnings[..., 1]).any(-1)
+        counts[failed] = 0  # so that they rise again if these fail again
+        self._warnings[:] = counts
+        self.ctrl[failed] = 0.0
+        return torch.from_numpy(failed)
 
     def rays(self, origin: Tensor, directions: Tensor, group: int, exclude_body: int) -> Tensor:
         """See `Physics.rays`."""
@@ -110,14 +142,3 @@ class BatchPhysics:
         moved = path[rows, :count].flatten(2)
         control = torch.cat([self.ctrl[rows, None].expand(-1, count, -1), moved], -1)
         self._batch.rollout(count, control.numpy(), _PATH_INPUTS, record=(), ids=mask)
-
-    def _failed(self) -> Tensor:
-        """Rows whose warning counters rose: MuJoCo resets a bad state by itself, silently."""
-        counts = self._batch.warning
-        if np.array_equal(counts, self._warnings):
-            return torch.zeros(len(counts), dtype=torch.bool)
-        failed = (counts[..., 1] > self._warnings[..., 1]).any(-1)
-        counts[failed] = 0  # so that they rise again if these fail again
-        self._warnings[:] = counts
-        self.ctrl[failed] = 0.0
-        return torch.from_numpy(failed)

@@ -1,0 +1,281 @@
+"""Velocity-limited locomotion as one batched TorchRL environment."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
+from torchrl.envs import EnvBase
+
+from safe_rl.envs import rng
+from safe_rl.envs.errors import require_integer
+from safe_rl.envs.physics.cpu import BatchPhysics
+from safe_rl.envs.physics.runge_kutta import runge_kutta_substep
+from safe_rl.envs.velocity.config import VelocityConfig
+from safe_rl.envs.velocity.health import HEALTH
+from safe_rl.envs.velocity.measuring import PLACES, limited_speed
+from safe_rl.envs.velocity.model import FORCES, load_model, needed_outputs, needs_forces
+from safe_rl.envs.velocity.observing import Observer
+from safe_rl.envs.velocity.rendering import Camera, RobotRenderer
+from safe_rl.envs.velocity.rewarding import locomotion_reward
+from safe_rl.envs.velocity.robots import ROBOTS
+from safe_rl.envs.velocity.snapshot import check_state
+from safe_rl.envs.velocity.specs import make_velocity_specs
+from safe_rl.envs.velocity.starting import draw_start
+from safe_rl.envs.velocity.suite import resolve_velocity
+
+_FLAGS = ("done", "terminated", "truncated")
+_PHYSICS_KEYS = ("qpos", "qvel", "qacc_warmstart", "time")
+
+
+class VelocityEnv(EnvBase):
+    """N parallel robots of one configuration that are to run, but not too fast.
+
+    Dynamics, observation, reward and termination are those of Gymnasium's environment of version 5
+    (Towers et al. 2024) with the robot's own MJCF file; a step costs 1 where the velocity exceeds
+    the threshold, as in Safety-Gymnasium 1.0 (Ji et al. 2023).
+
+    Reads `action` [N, nu], clipped to the actuators' control range. Writes `observation` [N, n],
+    and each [N, 1]: `reward`, `cost`, `cost_velocity` (the same), `done`, `terminated` (the robot
+    fell), `truncated` (time is up). A robot whose physics fails gets reward and cost 0 and
+    terminates.
+
+    Args:
+        env: name ("SafeHopperVelocity"), mapping with `robot` and configuration keys, or
+            `VelocityConfig`.
+        num_envs: number of robots, N.
+        device: where the TensorDicts live; the physics runs on the CPU.
+        seed: integer that determines every draw; None takes one from torch's generator. Row k gets
+            the same episodes whatever N and the number of threads are.
+        num_threads: threads that step the physics; 0 for one per core.
+
+    Raises:
+        ConfigError: for an unknown name or key, or a value that cannot be used.
+
+    Examples:
+        >>> env = VelocityEnv("SafeHopperVelocity", num_envs=4, seed=0)
+        >>> rollout = env.rollout(max_steps=5)
+        >>> rollout["next", "cost_velocity"].shape
+        torch.Size([4, 5, 1])
+    """
+
+    def __init__(
+        self,
+        env: str | Mapping[str, Any] | VelocityConfig,
+        num_envs: int = 1,
+        device: torch.device | str = "cpu",
+        seed: int | None = None,
+        num_threads: int = 0,
+    ) -> None:
+        require_integer("num_envs", num_envs, lowest=1)
+        require_integer("num_threads", num_threads, lowest=0)
+        super().__init__(device=torch.device(device), batch_size=torch.Size([num_envs]))
+        self.config = resolve_velocity(env)
+        self.cost_keys = ["cost", "cost_velocity"]
+        self._robot, self._model = ROBOTS[self.config.robot], load_model(self.config)
+        outputs = needed_outputs(self.config)
+        self._physics = BatchPhysics(self._model, num_envs, num_threads, outputs)
+        self._has_forces = needs_forces(self.config)
+        self._no_forces = torch.zeros(num_envs, 0, 6, dtype=torch.float64)
+        self._duration = self._physics.timestep * self.config.frame_skip
+        self._observer = Observer(self.config, self._model)
+        self._place = PLACES[self._robot.place].reading(self._model, self._physics)
+        low, high = torch.from_numpy(self._model.actuator_ctrlrange.T.copy())
+        self._control_range = (low, high)
+        self._last_place = self._place()
+        self._observation = torch.zeros(num_envs, self._observer.size)
+        self._step_count = torch.zeros(num_envs, dtype=torch.int64)
+        self._episode = torch.zeros(num_envs, dtype=torch.int64)
+        self._has_cost = torch.zeros(num_envs, dtype=torch.bool)
+        self._renderer = RobotRenderer(self.config)
+        specs = make_velocity_specs(
+            self._observer.size, self._control_range, self.cost_keys, num_envs, self.device
+        )
+        self.observation_spec, self.action_spec = specs.observation, specs.action
+        self.reward_spec, self.done_spec = specs.reward, specs.done
+        self.set_seed(int(torch.randint(2**62, ())) if seed is None else seed)
+
+    @property
+    def max_episode_steps(self) -> int:
+        """Steps after which an episode is truncated."""
+        return self.config.num_steps
+
+    @property
+    def observation_layout(self) -> dict[str, slice]:
+        """Columns of every named component in `observation`."""
+        return dict(self._observer.columns)
+
+    def _set_seed(self, seed: int | None) -> None:
+        if seed is None:
+            return
+        require_integer("seed", seed, lowest=-(2**63))
+        self._row_seed = rng.row_seeds(seed, self.batch_size[0])
+        self._episode.zero_()
+
+    @torch.no_grad()
+    def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDictBase:
+        mask = None if tensordict is None else tensordict.get("_reset", None)
+        if mask is None:
+            mask = torch.ones(self.batch_size, dtype=torch.bool)
+        mask = mask.reshape(self.batch_size).cpu()
+        self._episode[mask] += 1
+        physics, key = self._physics, rng.fold(self._row_seed, self._episode)[mask]
+        physics.reset(mask)
+        physics.qpos[mask], physics.qvel[mask] = draw_start(self.config, self._model, key)
+        self._start(mask)
+        self._step_count[mask] = 0
+        self._has_cost &= ~mask
+        return self._reset_output()
+
+    def _start(self, mask: Tensor) -> None:
+        """Bring what is derived from the state up to date where no step was taken, bool [N]."""
+        self._physics.forward(mask)
+        self._last_place[mask] = self._place()[mask]
+        self._observer.write_start(self._physics, self._observation, mask)
+
+    def _reset_output(self) -> TensorDict:
+        """What a reset returns, for the robots as they are."""
+        none = torch.zeros(len(_FLAGS), *self.batch_size, 1, dtype=torch.bool)
+        return self._pack(dict(zip(_FLAGS, none, strict=True)))
+
+    def _pack(self, outputs: dict[str, Any]) -> TensorDict:
+        """Add a copy of the observation and move everything to the device."""
+        outputs["observation"] = self._observation.clone()
+        if self.device.type != "cpu":
+            outputs = {key: value.to(self.device) for key, value in outputs.items()}
+        # As TorchRL's own environments do: every shape and device is right by construction.
+        return TensorDict._new_unsafe(outputs, batch_size=self.batch_size, device=self.device)
+
+    @torch.no_grad()
+    def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
+        action = self._checked_action(tensordict).to(torch.float64)
+        reward, terminated = self._move(action.clamp(*self._control_range))
+        self._observer.write(self._physics, self._observation)
+        self._step_count += 1
+        truncated = (self._step_count >= self.config.num_steps) & ~terminated
+        cost = self._has_cost.to(torch.float64)
+        numbers = torch.stack([reward, cost, cost]).to(torch.float32).unsqueeze(-1)
+        flags = torch.stack([terminated | truncated, terminated, truncated]).unsqueeze(-1)
+        names = ("reward", *self.cost_keys, *_FLAGS)
+        return self._pack(dict(zip(names, (*numbers, *flags), strict=True)))
+
+    def _move(self, control: Tensor) -> tuple[Tensor, Tensor]:
+        """Take one step; returns reward and termination, float64 and bool [N]."""
+        config, physics = self.config, self._physics
+        physics.ctrl.copy_(control)
+        failed = self._advance()
+        place = self._place()
+        velocity = (place - self._last_place) / self._duration
+        self._last_place.copy_(place)
+        healthy = self._healthy()
+        forces = physics.outputs[FORCES] if self._has_forces else self._no_forces
+        reward = locomotion_reward(config, velocity[:, 0], control, healthy, forces)
+        self._has_cost = (limited_speed(velocity) > config.velocity_threshold) & ~failed
+        terminated = failed | ~healthy if config.terminate_when_unhealthy else failed
+        return reward.masked_fill_(failed, 0.0), terminated
+
+    def _step_proc_data(self, next_tensordict_out: TensorDictBase) -> TensorDictBase:
+        """Skip TorchRL's checks of every step: shapes and end flags are right by construction."""
+        return next_tensordict_out
+
+    def _checked_action(self, tensordict: TensorDictBase) -> Tensor:
+        action, needed = tensordict.get("action"), self._physics.ctrl.shape
+        if action.shape != needed or not action.dtype.is_floating_point:
+            raise ValueError(
+                f"'action' must be a floating-point tensor of shape {tuple(needed)} (num_envs, "
+                f"number of actuators), got {action.dtype} {tuple(action.shape)}."
+            )
+        return action.detach().cpu()
+
+    def _advance(self) -> Tensor:
+        """Run the substeps of one step; returns the robots whose physics failed [N]."""
+        if not self._has_forces:
+            return self._physics.step(self.config.frame_skip, refresh=False)
+        failed = self._physics.step(self.config.frame_skip - 1, refresh=False)
+        return failed | runge_kutta_substep(self._physics)
+
+    def _healthy(self) -> Tensor:
+        """Which robots stand as they should, bool [N]."""
+        if self._robot.health is None:
+            return torch.ones(self.batch_size, dtype=torch.bool)
+        return HEALTH[self._robot.health](self.config, self._physics.qpos, self._physics.qvel)
+
+    def get_state(self) -> TensorDict:
+        """Return a copy of everything that determines what happens next.
+
+        Returns:
+            TensorDict [N] with `qpos`, `qvel`, `qacc_warmstart`, `time`, `step_count`; `place` and
+            `observation`, which belong to the last substep; and the seeds.
+        """
+        state = {key: getattr(self._physics, key).clone() for key in _PHYSICS_KEYS}
+        state |= {"step_count": self._step_count.clone(), "place": self._last_place.clone()}
+        state["observation"] = self._observation.clone()
+        state["seed"], state["episode"] = self._row_seed.clone(), self._episode.clone()
+        return TensorDict(state, batch_size=self.batch_size)
+
+    @torch.no_grad()
+    def set_state(self, state: TensorDictBase) -> TensorDict:
+        """Set the robots to a state, for resuming, branching and tests.
+
+        Args:
+            state: TensorDict [N] as `get_state` returns it. Without `place` and `observation` both
+                are computed anew, as at the start of an episode; without seeds the present stay.
+
+        Returns:
+            What a reset returns, for that state.
+
+        Raises:
+            KeyError: if a key is missing.
+            ValueError: if a shape does not fit.
+        """
+        check_state(self.get_state(), state)
+        everyone = torch.ones(self.batch_size, dtype=torch.bool)
+        self._physics.reset(everyone)
+        for key in _PHYSICS_KEYS:
+            getattr(self._physics, key).copy_(state[key])
+        self._step_count.copy_(state["step_count"])
+        self._start(everyone)
+        self._last_place.copy_(state.get("place", self._last_place))
+        self._observation.copy_(state.get("observation", self._observation))
+        self._row_seed = state.get("seed", self._row_seed).clone()
+        self._episode = state.get("episode", self._episode).clone()
+        self._has_cost.zero_()
+        return self._reset_output()
+
+    def render(
+        self,
+        rows: int | Sequence[int] | None = None,
+        *,
+        camera: Camera = "track",
+        width: int = 480,
+        height: int = 360,
+    ) -> np.ndarray:
+        """Draw robots as they are, and a red sphere where a cost is incurred.
+
+        Args:
+            rows: which robots; None is all of them.
+            camera: "track" (the model's own), "free" (beside the robot), or a `mujoco.MjvCamera`.
+            width: of a frame [pixels].
+            height: of a frame [pixels].
+
+        Returns:
+            RGB, uint8: one frame [height, width, 3] for an integer, else [R, height, width, 3].
+
+        Raises:
+            OpenGLError: if OpenGL is missing; the message names the package to install.
+            ValueError: for an unknown camera.
+        """
+        everyone = list(range(self.batch_size[0]))
+        chosen = [rows] if isinstance(rows, int) else everyone if rows is None else list(rows)
+        cost = self._has_cost.numpy()
+        frames = self._renderer.frames(self._physics, chosen, cost, camera, width, height)
+        return frames[0] if isinstance(rows, int) else frames
+
+    def close(self, *, raise_if_closed: bool = True) -> None:
+        """Free what OpenGL holds."""
+        self._renderer.close()
+        super().close(raise_if_closed=raise_if_closed)

@@ -1,0 +1,82 @@
+"""Configurations of the velocity family: what is accepted, and what people are told otherwise."""
+
+import inspect
+import math
+
+import gymnasium
+import pytest
+from omegaconf import OmegaConf
+
+from safe_rl.envs.errors import ConfigError
+from safe_rl.envs.velocity import (
+    VELOCITY_SUITE,
+    VelocityConfig,
+    VelocityEnv,
+    resolve_velocity,
+    velocity_node,
+)
+from safe_rl.envs.velocity.robots import ROBOTS
+
+OURS = {"robot", "velocity_threshold", "num_steps"}
+THEIRS = {"xml_file", "default_camera_config", "main_body", "kwargs", "self"}
+
+
+@pytest.mark.parametrize("name", VELOCITY_SUITE)
+def test_keys_and_defaults_are_gymnasiums(name):
+    config = VELOCITY_SUITE[name]
+    made = gymnasium.make(ROBOTS[config.robot].gymnasium_id).unwrapped
+    parameters = inspect.signature(type(made).__init__).parameters
+    defaults = {key: row.default for key, row in parameters.items() if key not in THEIRS}
+    ours = {key: value for key, value in config.to_dict().items() if key not in OURS}
+    assert ours == defaults
+
+
+@pytest.mark.parametrize("name", VELOCITY_SUITE)
+def test_nodes_survive_yaml(name):
+    node = velocity_node(name, VELOCITY_SUITE[name])
+    read = OmegaConf.to_container(OmegaConf.create(OmegaConf.to_yaml(OmegaConf.create(node))))
+    assert read.pop("name") == name
+    assert resolve_velocity(read) == VELOCITY_SUITE[name]
+
+
+@pytest.mark.parametrize("name", ["SafeHopperVelocity", "SafetyHopperVelocity-v1"])
+def test_names(name):
+    assert resolve_velocity(name) is VELOCITY_SUITE["SafeHopperVelocity"]
+
+
+def test_another_robot_brings_its_own_keys():
+    config = VELOCITY_SUITE["SafeHopperVelocity"].replace(robot="ant", frame_skip=2)
+    assert config == VelocityConfig.from_dict({"robot": "ant", "frame_skip": 2})
+    assert config.healthy_angle_range is None
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ("SafeHoperVelocity", "Did you mean 'SafeHopperVelocity'"),
+        (7, "got int"),
+        ({"frame_skip": 2}, "lacks 'robot'"),
+        ({"robot": "hoper"}, "Did you mean 'hopper'"),
+        ({"robot": "hopper", "velocity_treshold": 1.0}, "Did you mean 'velocity_threshold'"),
+        ({"robot": "swimmer", "healthy_reward": 1.0}, "'swimmer' has no configuration key"),
+        ({"robot": "hopper", "frame_skip": 0}, "'frame_skip' must be an integer of at least 1"),
+        ({"robot": "hopper", "num_steps": 2.5}, "'num_steps' must be an integer"),
+        ({"robot": "hopper", "velocity_threshold": "fast"}, "must be a number, got 'fast'"),
+        ({"robot": "hopper", "velocity_threshold": -1.0}, "must be 0 or more"),
+        ({"robot": "hopper", "healthy_reward": math.inf}, "must be finite"),
+        ({"robot": "hopper", "healthy_reward": None}, "must be a number"),
+        ({"robot": "hopper", "healthy_z_range": [1.0]}, "a list of two numbers"),
+        ({"robot": "hopper", "healthy_z_range": [2.0, 1.0]}, "lowest <= highest"),
+        ({"robot": "hopper", "terminate_when_unhealthy": 1}, "must be True or False"),
+    ],
+)
+def test_mistakes_are_named(given, message):
+    with pytest.raises(ConfigError, match=message):
+        resolve_velocity(given)
+
+
+def test_counts_are_checked():
+    with pytest.raises(ConfigError, match="'num_envs'"):
+        VelocityEnv("SafeHopperVelocity", num_envs=0)
+    with pytest.raises(ConfigError, match="'seed'"):
+        VelocityEnv("SafeHopperVelocity", seed=1.5)
