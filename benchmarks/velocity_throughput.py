@@ -1,12 +1,13 @@
 """Environment steps per second of the velocity family, beside bare physics and Gymnasium.
 
 The bare loop is what no environment on this backend can beat: the same model without sensors, the
-same controls in, the substeps, nothing read. Before every step it is set to the environment's own
-state, untimed, so that both compute the same trajectories, resets of the environment or not; the
-script fails if they do not. Gymnasium's `SyncVectorEnv` steps as many of its own environments in
-turns of its own. All are timed in one process, step by step in turns; rates are of the medians.
+same controls in, the substeps, nothing read. Before every step it is set to the state that the
+environment had then, untimed, so that both compute the same trajectories, resets of the environment
+or not; the script fails if they do not. Gymnasium's `SyncVectorEnv` steps as many of its own
+environments. All take turns in one process; figures are medians over turns of the median step.
 
     python benchmarks/velocity_throughput.py --envs SafeHopperVelocity --num-envs 64 256
+    python benchmarks/velocity_throughput.py --threads 1 --cpu-time  # on a machine that is shared
 """
 
 import argparse
@@ -28,74 +29,74 @@ COLUMNS = (
 STATE = ("qpos", "qvel", "qacc_warmstart", "time")
 
 
+clock = time.perf_counter
+
+
 def timed(function):
     """Seconds a call took, and its result."""
-    start = time.perf_counter()
+    start = clock()
     result = function()
-    return time.perf_counter() - start, result
+    return clock() - start, result
 
 
-def bare_seconds(physics, env, action):
-    """Seconds of the physics alone for the step that the environment takes next."""
-    for name in STATE:
-        getattr(physics, name).copy_(getattr(env._physics, name))
-
-    def step():
-        physics.ctrl.copy_(action)
-        physics.step(env.config.frame_skip, refresh=False)
-
-    return timed(step)[0]
-
-
-def check_same(name, physics, env, done):
-    """Compare the states after a step, but of robots that were reset."""
-    if not torch.allclose(physics.qpos[~done], env._physics.qpos[~done], rtol=1e-9, atol=1e-9):
-        raise SystemExit(f"{name}: the two went different ways, there is nothing to compare.")
-
-
-def gymnasium_seconds(config, num_envs, actions):
-    """Seconds of each vector step of Gymnasium's own environments."""
-    gymnasium_id = ROBOTS[config.robot].gymnasium_id
-    vector = gymnasium.make_vec(gymnasium_id, num_envs=num_envs, vectorization_mode="sync")
-    vector.reset(seed=0)
-    yield
+def env_turn(env, tensordict, actions):
+    """Seconds of the environment's steps, the states before and after each, and who goes on."""
+    seconds, states = [], [read(env._physics)]
     for action in actions:
-        yield timed(lambda action=action: vector.step(action.numpy()))[0]
+        tensordict["action"] = action
+        spent, (after, tensordict) = timed(lambda td=tensordict: env.step_and_maybe_reset(td))
+        seconds.append(spent)
+        states.append((*read(env._physics), ~after["next", "done"][:, 0]))
+    return seconds, states, tensordict
 
 
-def measure(name, num_envs, threads, steps):
+def read(physics):
+    """Copies of the state."""
+    return tuple(getattr(physics, name).clone() for name in STATE)
+
+
+def bare_turn(name, physics, frame_skip, actions, states):
+    """Seconds of the same steps of the physics alone, each from the environment's state."""
+
+    def step(action):
+        physics.ctrl.copy_(action)
+        physics.step(frame_skip, refresh=False)
+
+    seconds = []
+    for action, before, after in zip(actions, states, states[1:], strict=False):
+        for field, value in zip(STATE, before, strict=False):
+            getattr(physics, field).copy_(value)
+        seconds.append(timed(lambda action=action: step(action))[0])
+        qpos, going = after[0], after[-1]
+        if not torch.allclose(physics.qpos[going], qpos[going], rtol=1e-9, atol=1e-9):
+            raise SystemExit(f"{name}: the two went different ways, there is nothing to compare.")
+    return seconds
+
+
+def measure(name, num_envs, threads, steps, repeats):
     """One row of the table."""
     torch.set_num_threads(1)  # the physics has the cores; tensors this small gain nothing
     env = VelocityEnv(name, num_envs=num_envs, seed=0, num_threads=threads)
     plain = VelocityEnv(
-        {"robot": env.config.robot, **_without_contacts(env.config)}, num_envs, num_threads=threads
+        {"robot": env.config.robot, **_without_contacts(env.config)}, num_threads=threads
     )
     physics = BatchPhysics(plain._model, num_envs, threads, outputs=())
-    actions = env.action_spec.rand((steps,))
-    others = gymnasium_seconds(env.config, num_envs, actions)
-    next(others)
-    tensordict, seconds = env.reset(), {"env": [], "bare": [], "gymnasium": []}
-    for action in actions:
-        seconds["bare"].append(bare_seconds(physics, env, action))
-        tensordict["action"] = action
-        spent, (after, tensordict) = timed(lambda td=tensordict: env.step_and_maybe_reset(td))
-        seconds["env"].append(spent)
-        check_same(name, physics, env, after["next", "done"][:, 0])
-        seconds["gymnasium"].append(next(others))
-    warm = {key: values[steps // 5 :] for key, values in seconds.items()}
-    rates = {key: num_envs / statistics.median(values) for key, values in warm.items()}
-    ratio = statistics.median(b / e for b, e in zip(warm["bare"], warm["env"], strict=True))
-    factor = statistics.median(g / e for g, e in zip(warm["gymnasium"], warm["env"], strict=True))
-    return dict(
-        zip(
-            COLUMNS,
-            (
-                *(name, num_envs, threads, round(rates["env"]), round(rates["bare"])),
-                *(round(ratio, 3), round(rates["gymnasium"]), round(factor, 1)),
-            ),
-            strict=True,
-        )
-    )
+    gymnasium_id = ROBOTS[env.config.robot].gymnasium_id
+    vector = gymnasium.make_vec(gymnasium_id, num_envs=num_envs, vectorization_mode="sync")
+    vector.reset(seed=0)
+    tensordict, turns = env.reset(), []
+    for _ in range(repeats + 1):
+        actions = env.action_spec.rand((steps,))
+        mine, states, tensordict = env_turn(env, tensordict, actions)
+        bare = bare_turn(name, physics, env.config.frame_skip, actions, states)
+        theirs = [timed(lambda a=action: vector.step(a.numpy()))[0] for action in actions[:3]]
+        turns.append([statistics.median(seconds) for seconds in (mine, bare, theirs)])
+    mine, bare, theirs = zip(*turns[1:], strict=True)
+    rates = [round(num_envs / statistics.median(seconds)) for seconds in (mine, bare, theirs)]
+    ratio = statistics.median(b / m for b, m in zip(bare, mine, strict=True))
+    factor = statistics.median(t / m for t, m in zip(theirs, mine, strict=True))
+    values = (name, num_envs, threads, *rates[:2], round(ratio, 3), rates[2], round(factor, 1))
+    return dict(zip(COLUMNS, values, strict=True))
 
 
 def _without_contacts(config):
@@ -110,11 +111,20 @@ def main():
     parser.add_argument("--envs", nargs="+", default=list(VELOCITY_SUITE))
     parser.add_argument("--num-envs", nargs="+", type=int, default=[256])
     parser.add_argument("--threads", nargs="+", type=int, default=[0], help="0: one per core")
-    parser.add_argument("--steps", type=int, default=100, help="vector steps of each")
+    parser.add_argument("--steps", type=int, default=10, help="vector steps per turn")
+    parser.add_argument("--repeats", type=int, default=10, help="turns")
+    parser.add_argument(
+        "--cpu-time", action="store_true", help="of the process, instead of the wall's; one thread"
+    )
     options = parser.parse_args()
+    if options.cpu_time:
+        global clock
+        clock = time.process_time
+        if options.threads != [1]:
+            raise SystemExit("CPU time is that of all threads together: add --threads 1.")
     print("| " + " | ".join(COLUMNS) + " |\n" + "|---" * len(COLUMNS) + "|")
     for case in itertools.product(options.envs, options.num_envs, options.threads):
-        row = measure(*case, options.steps)
+        row = measure(*case, options.steps, options.repeats)
         print("| " + " | ".join(str(row[column]) for column in COLUMNS) + " |", flush=True)
 
 

@@ -13,8 +13,6 @@ Wanner, Geometric Numerical Integration, section IV.8).
 
 from __future__ import annotations
 
-import math
-
 import torch
 from torch import Tensor
 
@@ -22,7 +20,17 @@ from safe_rl.envs.physics.base import Physics
 
 _STAGES = (0.5, 0.5, 1.0)  # how far into the substep the second, third and fourth stage look
 _HUGE = 1e10  # MuJoCo's mjMAXVAL: larger numbers are a simulation that failed
-_SMALL_ANGLE = 1e-3  # rad; below it the factor in `_pull_back` is constant to rounding
+_SMALL_ANGLE = 1e-7  # rad; smaller ones are as good as this, and nothing is divided by 0
+# The product of quaternions p q is (p @ _LEFT) q.
+_LEFT = torch.tensor(
+    [
+        [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]],
+        [[0, -1, 0, 0], [1, 0, 0, 0], [0, 0, 0, -1], [0, 0, 1, 0]],
+        [[0, 0, -1, 0], [0, 0, 0, 1], [1, 0, 0, 0], [0, -1, 0, 0]],
+        [[0, 0, 0, -1], [0, 0, -1, 0], [0, 1, 0, 0], [1, 0, 0, 0]],
+    ],
+    dtype=torch.float64,
+)
 
 
 def runge_kutta_substep(physics: Physics) -> Tensor:
@@ -36,71 +44,69 @@ def runge_kutta_substep(physics: Physics) -> Tensor:
         bool [N]: simulations that failed; they are in the model's initial state.
     """
     step, free = physics.timestep, physics.qpos.shape[-1] == physics.qvel.shape[-1] + 1
-    qpos, qvel, time = _unit(physics.qpos, free), physics.qvel.clone(), physics.time.clone()
+    qpos, qvel, time = physics.qpos.clone(), physics.qvel.clone(), physics.time.clone()
+    root = _Root(qpos[:, 3:7]) if free else None
     physics.forward(sensors=False)
     travels, accelerations = [qvel], [physics.outputs["qacc"].clone()]
     for part in _STAGES:
-        tangent = part * step * travels[-1]
-        physics.qpos.copy_(_move(qpos, tangent, free))
-        physics.qvel.copy_(qvel + part * step * accelerations[-1])
-        physics.time.copy_(time + part * step)
+        _move(physics.qpos, qpos, travels[-1], part * step, root)
+        torch.add(qvel, accelerations[-1], alpha=part * step, out=physics.qvel)
+        torch.add(time, part * step, out=physics.time)
         physics.forward(sensors=part == 1.0)
         accelerations.append(physics.outputs["qacc"].clone())
-        travels.append(_pull_back(physics.qvel, tangent, free))
+        travels.append(physics.qvel.clone())
+        if root is not None:
+            root.pull_back_(travels[-1][:, 3:6])
     physics.qacc_warmstart.copy_(accelerations[-1])
-    physics.qpos.copy_(_move(qpos, step * _average(travels), free))
-    physics.qvel.copy_(qvel + step * _average(accelerations))
+    _move(physics.qpos, qpos, _average(travels), step, root)
+    torch.add(qvel, _average(accelerations), alpha=step, out=physics.qvel)
     return _reset_failed(physics)
 
 
 def _average(stages: list[Tensor]) -> Tensor:
     first, second, third, fourth = stages
-    return (first + fourth + 2.0 * (second + third)) / 6.0
+    return (second + third).mul_(2.0).add_(first).add_(fourth).div_(6.0)
 
 
-def _unit(qpos: Tensor, free: bool) -> Tensor:
-    """Copy positions [N, nq], with a root quaternion of length 1."""
-    qpos = qpos.clone()
-    if free:
-        qpos[:, 3:7] /= torch.linalg.vector_norm(qpos[:, 3:7], dim=-1, keepdim=True)
-    return qpos
+def _move(moved: Tensor, qpos: Tensor, travel: Tensor, duration: float, root: _Root | None) -> None:
+    """Write positions [N, nq] that have travelled [N, nv], as `mj_integratePos` does."""
+    if root is None:
+        torch.add(qpos, travel, alpha=duration, out=moved)
+        return
+    torch.add(qpos[:, :3], travel[:, :3], alpha=duration, out=moved[:, :3])
+    torch.add(qpos[:, 7:], travel[:, 6:], alpha=duration, out=moved[:, 7:])
+    moved[:, 3:7] = root.turn(travel[:, 3:6], duration)
 
 
-def _move(qpos: Tensor, tangent: Tensor, free: bool) -> Tensor:
-    """Move positions [N, nq] along a tangent vector [N, nv], as `mj_integratePos` does."""
-    if not free:
-        return qpos + tangent
-    turned = _multiply(qpos[:, 3:7], _exponential(tangent[:, 3:6]))
-    return torch.cat([qpos[:, :3] + tangent[:, :3], turned, qpos[:, 7:] + tangent[:, 6:]], -1)
+class _Root:
+    """Rotations of free roots from where they were at the start of the substep.
 
+    Args:
+        quaternion: where that was [N, 4].
+    """
 
-def _exponential(rotation: Tensor) -> Tensor:
-    """Unit quaternions of rotation vectors [N, 3] -> [N, 4]."""
-    angle = torch.linalg.vector_norm(rotation, dim=-1, keepdim=True)
-    vector = torch.sinc(angle / (2.0 * math.pi)) * (0.5 * rotation)
-    return torch.cat([torch.cos(0.5 * angle), vector], -1)
+    def __init__(self, quaternion: Tensor) -> None:
+        unit = quaternion / torch.linalg.vector_norm(quaternion, dim=-1, keepdim=True)
+        # Matrices that multiply from the left; every entry is one of the four numbers.
+        self._product = (unit @ _LEFT.flatten(1)).view(-1, 4, 4)
 
+    def turn(self, angular: Tensor, duration: float) -> Tensor:
+        """Turn at a velocity in the root's own axes [N, 3] (rad/s): quaternions [N, 4]."""
+        self._rotation = angular * duration
+        angle = torch.linalg.vector_norm(self._rotation, dim=-1, keepdim=True)
+        self._angle = angle.clamp_(min=_SMALL_ANGLE)
+        half = 0.5 * self._angle
+        self._cosine, self._sine = torch.cos(half), torch.sin(half)
+        turned = torch.cat([self._cosine, self._rotation * (self._sine / self._angle)], -1)
+        return (self._product * turned[:, None]).sum(-1)
 
-def _multiply(left: Tensor, right: Tensor) -> Tensor:
-    """Products of quaternions [N, 4]."""
-    left_scalar, left_vector = left[:, :1], left[:, 1:]
-    right_scalar, right_vector = right[:, :1], right[:, 1:]
-    scalar = left_scalar * right_scalar - (left_vector * right_vector).sum(-1, keepdim=True)
-    turned = torch.linalg.cross(left_vector, right_vector)
-    return torch.cat([scalar, turned + left_scalar * right_vector + right_scalar * left_vector], -1)
-
-
-def _pull_back(qvel: Tensor, tangent: Tensor, free: bool) -> Tensor:
-    """Velocities at the end of a tangent, in the coordinates of its start (inverse of dexp)."""
-    moved = qvel.clone()
-    if free:
-        rotation = tangent[:, 3:6]
-        once = torch.linalg.cross(rotation, qvel[:, 3:6])
-        angle = torch.linalg.vector_norm(rotation, dim=-1, keepdim=True).clamp(min=_SMALL_ANGLE)
-        half = 0.5 * angle
-        factor = (1.0 - half / torch.tan(half)) / angle.square()
-        moved[:, 3:6] += 0.5 * once + factor * torch.linalg.cross(rotation, once)
-    return moved
+    def pull_back_(self, angular: Tensor) -> None:
+        """Map velocities after the last turn to coordinates at the start (inverse of dexp)."""
+        once = torch.linalg.cross(self._rotation, angular)
+        cotangent = (0.5 * self._angle) * (self._cosine / self._sine)
+        factor = (1.0 - cotangent) / self._angle.square()
+        angular.add_(once, alpha=0.5)
+        angular.addcmul_(factor, torch.linalg.cross(self._rotation, once))
 
 
 def _reset_failed(physics: Physics) -> Tensor:

@@ -122,20 +122,22 @@ class VelocityEnv(EnvBase):
         if mask is None:
             mask = torch.ones(self.batch_size, dtype=torch.bool)
         mask = mask.reshape(self.batch_size).cpu()
-        self._episode[mask] += 1
-        physics, key = self._physics, rng.fold(self._row_seed, self._episode)[mask]
+        physics, rows = self._physics, mask.nonzero()[:, 0]
+        episode = self._episode[rows] + 1
+        self._episode[rows] = episode
+        key = rng.fold(self._row_seed[rows], episode)
         physics.reset(mask)
-        physics.qpos[mask], physics.qvel[mask] = draw_start(self.config, self._model, key)
-        self._start(mask)
-        self._step_count[mask] = 0
+        physics.qpos[rows], physics.qvel[rows] = draw_start(self.config, self._model, key)
+        physics.forward(mask)
+        self._start(rows)
+        self._step_count[rows] = 0
         self._has_cost &= ~mask
         return self._reset_output()
 
-    def _start(self, mask: Tensor) -> None:
-        """Bring what is derived from the state up to date where no step was taken, bool [N]."""
-        self._physics.forward(mask)
-        self._last_place[mask] = self._place()[mask]
-        self._observer.write_start(self._physics, self._observation, mask)
+    def _start(self, rows: Tensor) -> None:
+        """Write what is derived from states that no step has led to, of robots int64 [R]."""
+        self._last_place[rows] = self._place()[rows]
+        self._observer.write_start(self._physics, self._observation, rows)
 
     def _reset_output(self) -> TensorDict:
         """What a reset returns, for the robots as they are."""
@@ -238,7 +240,8 @@ class VelocityEnv(EnvBase):
         for key in _PHYSICS_KEYS:
             getattr(self._physics, key).copy_(state[key])
         self._step_count.copy_(state["step_count"])
-        self._start(everyone)
+        self._physics.forward()
+        self._start(everyone.nonzero()[:, 0])
         self._last_place.copy_(state.get("place", self._last_place))
         self._observation.copy_(state.get("observation", self._observation))
         self._row_seed = state.get("seed", self._row_seed).clone()

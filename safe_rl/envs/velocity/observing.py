@@ -48,12 +48,11 @@ class Observer:
         for part in self._parts:
             observation[:, self.columns[part.name]] = part.read(physics)
 
-    def write_start(self, physics: Physics, observation: Tensor, mask: Tensor) -> None:
-        """Write what robots in `mask` (bool [N]) observe where no step was taken: no contacts.
+    def write_start(self, physics: Physics, observation: Tensor, rows: Tensor) -> None:
+        """Write what some robots (int64 [R]) observe where no step was taken: no contact forces.
 
         Gymnasium computes contact forces after steps only.
         """
-        rows = mask.nonzero()[:, 0]
         for part in self._parts:
             columns = self.columns[part.name]
             start = 0.0 if part.name == FORCES else part.read(physics)[rows].to(observation.dtype)

@@ -1,8 +1,9 @@
-"""How episodes start: noise around the model's initial state, addressed by row and episode."""
+"""How episodes start: noise around the model's initial state.
+
+Every draw is addressed by its row's seed, the episode and the column of the state, see `rng`.
+"""
 
 from __future__ import annotations
-
-from enum import IntEnum
 
 import mujoco
 import torch
@@ -11,13 +12,6 @@ from torch import Tensor
 from safe_rl.envs import rng
 from safe_rl.envs.velocity.config import VelocityConfig
 from safe_rl.envs.velocity.robots import ROBOTS
-
-
-class Purpose(IntEnum):
-    """What a random draw is for; part of its address, see `rng`."""
-
-    POSITION = 0
-    VELOCITY = 1
 
 
 def draw_start(config: VelocityConfig, model: mujoco.MjModel, key: Tensor) -> tuple[Tensor, Tensor]:
@@ -34,16 +28,17 @@ def draw_start(config: VelocityConfig, model: mujoco.MjModel, key: Tensor) -> tu
     Returns:
         Positions [R, nq] and velocities [R, nv], float64.
     """
-    scale, keys = config.reset_noise_scale, key[:, None]
-    initial = torch.from_numpy(model.qpos0.copy())
-    positions = scale * _symmetric(keys, Purpose.POSITION, model.nq)
+    columns = torch.arange(model.nq + model.nv)
     if ROBOTS[config.robot].normal_velocities:
-        velocities = rng.normal(keys, Purpose.VELOCITY, torch.arange(model.nv))
+        positions = _symmetric(key[:, None], columns[: model.nq])
+        velocities = rng.normal(key[:, None], columns[model.nq :])
     else:
-        velocities = _symmetric(keys, Purpose.VELOCITY, model.nv)
-    return initial + positions, scale * velocities
+        draws = _symmetric(key[:, None], columns)
+        positions, velocities = draws.split([model.nq, model.nv], -1)
+    initial, scale = torch.from_numpy(model.qpos0.copy()), config.reset_noise_scale
+    return initial + scale * positions, scale * velocities
 
 
-def _symmetric(keys: Tensor, purpose: Purpose, size: int) -> Tensor:
-    """Uniform in [-1, 1): [R, 1] -> [R, size]."""
-    return rng.uniform(keys, purpose, torch.arange(size)).mul_(2.0).sub_(1.0)
+def _symmetric(keys: Tensor, columns: Tensor) -> Tensor:
+    """Uniform in [-1, 1): [R, 1], [C] -> [R, C]."""
+    return rng.uniform(keys, columns).mul_(2.0).sub_(1.0)
