@@ -68,6 +68,7 @@ FLOORS = {
         ("velocity.model",),
         ("velocity.observing", "velocity.rendering"),
         ("velocity.env",),
+        ("velocity.registration",),
         ("velocity",),
         ("gymnasium", "gymnasium.conversion", "gymnasium.worlds"),
         ("gymnasium.single", "gymnasium.vector"),

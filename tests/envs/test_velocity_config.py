@@ -5,6 +5,7 @@ import math
 
 import gymnasium
 import pytest
+from hydra import compose, initialize
 from omegaconf import OmegaConf
 
 from safe_rl.envs.errors import ConfigError
@@ -12,7 +13,9 @@ from safe_rl.envs.velocity import (
     VELOCITY_SUITE,
     VelocityConfig,
     VelocityEnv,
+    make_velocity_env,
     resolve_velocity,
+    store_velocity_configs,
     velocity_node,
 )
 from safe_rl.envs.velocity.robots import ROBOTS
@@ -35,8 +38,18 @@ def test_keys_and_defaults_are_gymnasiums(name):
 def test_nodes_survive_yaml(name):
     node = velocity_node(name, VELOCITY_SUITE[name])
     read = OmegaConf.to_container(OmegaConf.create(OmegaConf.to_yaml(OmegaConf.create(node))))
-    assert read.pop("name") == name
-    assert resolve_velocity(read) == VELOCITY_SUITE[name]
+    assert read["name"] == name
+    assert make_velocity_env(read, seed=0).config == VELOCITY_SUITE[name]
+
+
+def test_names_are_in_hydras_group():
+    store_velocity_configs()
+    overrides = ["+env=SafeAntVelocity", "env.healthy_z_range=[0.1,inf]"]
+    with initialize(version_base="1.3", config_path=None):
+        node = OmegaConf.to_container(compose(overrides=overrides).env)
+    made = make_velocity_env(node, num_envs=3, seed=0)
+    assert made.config == VELOCITY_SUITE["SafeAntVelocity"].replace(healthy_z_range=(0.1, math.inf))
+    assert made.batch_size == (3,)
 
 
 @pytest.mark.parametrize("name", ["SafeHopperVelocity", "SafetyHopperVelocity-v1"])

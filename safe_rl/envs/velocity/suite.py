@@ -47,15 +47,3 @@ def resolve_velocity(env: str | Mapping[str, Any] | VelocityConfig) -> VelocityC
             f"{', '.join(VELOCITY_SUITE)}."
         )
     return VELOCITY_SUITE[name]
-
-
-def velocity_node(name: str, config: VelocityConfig) -> dict[str, Any]:
-    """Return a configuration as a node of Hydra's group `env`: `name`, and keys as YAML has them.
-
-    Examples:
-        >>> velocity_node("mine", VELOCITY_SUITE["SafeHopperVelocity"])["healthy_angle_range"]
-        [-0.2, 0.2]
-    """
-    values = config.to_dict().items()
-    plain = {key: list(value) if isinstance(value, tuple) else value for key, value in values}
-    return {"name": name, **plain}
