@@ -12,6 +12,7 @@ import safe_rl.openmp  # noqa: F401, has to come before torch
 from torchrl.checkpoint import CheckpointError
 
 from safe_rl.cli.benchmark import suite
+from safe_rl.cli.certificates import certify_run
 from safe_rl.cli.options import OptionError, parse_options, usage
 from safe_rl.cli.user_code import check_imports, import_modules, split_imports
 from safe_rl.envs import ConfigError, OpenGLError, make_env
@@ -42,6 +43,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
         directory, options = Path(arguments[0]), parse_options(arguments[1:], EvaluationOptions)
         check_imports(load_config(directory), modules, directory)
         import_modules(modules or ())
+        if options.certify:
+            certificate = certify_run(directory, num_threads=options.num_threads)
+            print(certificate or "Nothing to certify: the run has no limits, or no checkpoints.")
+            return 0 if certificate is not None and certificate.checkpoint is not None else 1
         result = evaluate_run(directory, options, progress=True)
     except (
         *(OptionError, ConfigError, CheckpointError, OpenGLError),

@@ -80,6 +80,15 @@ KEYS = {
     "algo.name": Key(text, "name of the algorithm"),
     "checkpoint.interval": Key(number(0), "seconds between checkpoints"),
     "checkpoint.keep_last": Key(count(1, 10_000), "checkpoints that are kept besides the best"),
+    "checkpoint.keep_best": Key(count(1, 10_000), "best checkpoints kept", may_lack=True),
+    "certificate": Key(_SECTION, "what is certified at a run's end", may_lack=True),
+    "certificate.ranking": Key(count(2, 10**6), "episodes that order candidates", may_lack=True),
+    "certificate.episodes": Key(count(0, 10**6), "episodes of a test; 0: none", may_lack=True),
+    "certificate.tests": Key(count(1, 1000), "candidates tested at most", may_lack=True),
+    "certificate.level": Key(
+        number(0.5, 1, above=True, below=True), "confidence of a certificate", may_lack=True
+    ),
+    "certificate.most_over": Key(_SHARE, "share of episodes over a limit", may_lack=True),
     "collector.num_collectors": Key(count(1, 1024), "processes that step environments"),
     "model.hidden_sizes": Key(list_of(count(1, 16_384), 32), "widths of layers, such as [64, 64]"),
     "model.initial_log_std": Key(number(-20, 10), "log of the policy's first standard deviation"),

@@ -15,7 +15,9 @@ from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 
 import safe_rl.openmp  # noqa: F401, has to come before torch
+from safe_rl.cli.certificates import certify_run, is_worth_a_certificate
 from safe_rl.cli.composing import check_command
+from safe_rl.cli.conf import CONF
 from safe_rl.cli.overrides import CommandLineError
 from safe_rl.cli.settings import SETTING_ERRORS, SettingError, check_settings, errors_in_a_line
 from safe_rl.cli.shorthands import expand_arguments
@@ -32,7 +34,6 @@ from safe_rl.targets import TargetError
 from safe_rl.training.trainer import Trainer, build_trainer, physics_threads, seed_everything
 from safe_rl.training.transfer import initialise_networks
 
-CONF = Path(__file__).parents[2] / "conf"
 store_configs()
 
 
@@ -85,6 +86,8 @@ def train(config: DictConfig) -> None:
     if trainer.interrupted_by is not None:
         print(f"Interrupted. Continue with: python train.py resume={directory}")
         raise SystemExit(128 + trainer.interrupted_by)
+    if trainer.algorithm.cost_keys and is_worth_a_certificate(config, trainer.episode_length):
+        print(certify_run(directory, num_threads=config.num_threads or 0))
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

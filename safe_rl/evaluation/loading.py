@@ -47,7 +47,7 @@ def find_checkpoint(directory: Path, which: str) -> Path:
 
     Args:
         directory: Folder of the run.
-        which: "last", "best", or a path.
+        which: "last", "best", "certified", or a path.
 
     Raises:
         FileNotFoundError: If there is none; the message says why and what there is.
@@ -55,14 +55,19 @@ def find_checkpoint(directory: Path, which: str) -> Path:
     if which not in KINDS:
         if not Path(which).exists():
             raise FileNotFoundError(
-                f"There is no checkpoint '{which}': checkpoint is last, best or the path of a file."
+                f"There is no checkpoint '{which}': checkpoint is last, best, certified or the path "
+                "of a file."
             )
         return Path(which)
     # readable or not: an older one is not silently put in its place
     found = {kind: RunFolder(directory).newest_checkpoint(kind) for kind in KINDS}
     path = found.pop(which)
     if path is None:
-        reason = {"last": "it has not saved one yet", "best": "no epoch kept every cost limit"}
+        reason = {
+            "last": "it has not saved one yet",
+            "best": "no epoch kept every cost limit",
+            "certified": "none of its policies has been certified",
+        }
         others = [f"checkpoint={kind}" for kind, other in found.items() if other is not None]
         hint = f" Use {others[0]}." if others else ""
         raise FileNotFoundError(f"{directory} has no {which} checkpoint: {reason[which]}.{hint}")

@@ -25,7 +25,7 @@ class EvaluationOptions:
 
     episodes: int = _option(100, "whole episodes to run")
     checkpoint: str = _option(
-        "last", "last, best (highest return that kept every limit), or a path"
+        "last", "last, best (highest return that kept every limit), certified, or a path"
     )
     deterministic: bool = _option(False, "act with the policy's mean instead of sampling from it")
     seed: int | None = _option(
@@ -37,6 +37,9 @@ class EvaluationOptions:
     cvar_alpha: float = _option(0.1, "share of the costliest episodes in the CVaR")
     video: bool = _option(False, "write an MP4 of the first episode (extra 'video')")
     camera: str = _option("free", "of the video: free, fixednear, fixedfar, track or vision")
+    certify: bool = _option(
+        False, "find the best checkpoint that surely keeps the limits, instead of evaluating one"
+    )
     name: str = _option("", "told apart by it, several evaluations of a run can stand side by side")
     env: dict[str, Any] = field(
         default_factory=dict,

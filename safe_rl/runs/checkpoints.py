@@ -28,6 +28,7 @@ class CheckpointStore:
         directory: Folder of the checkpoints.
         components: Parts of the run, by name.
         keep_last: Number of newest checkpoints to keep.
+        keep_best: Number of best checkpoints to keep; each was the best when it was written.
         run: JSON-compatible facts of the run that every checkpoint holds: one with others is not
             resumed from.
 
@@ -51,6 +52,7 @@ class CheckpointStore:
         components: Mapping[str, Stateful],
         *,
         keep_last: int,
+        keep_best: int = 1,
         run: Mapping[str, Any] | None = None,
     ) -> None:
         self.last = Path(directory) / "last"
@@ -59,7 +61,7 @@ class CheckpointStore:
         self._writer = writer(components)
         # there until the first checkpoint is: who finds neither knows that something is missing
         self._none_yet = self.last / "none-yet"
-        self._keep_last = keep_last
+        self._keep_last, self._keep_best = keep_last, keep_best
         self._run = dict(run or {})
 
     def begin(self) -> None:
@@ -86,7 +88,7 @@ class CheckpointStore:
         """
         if not score > self._best_score():
             return False
-        self._save(self.best, steps, {**(facts or {}), "score": score}, keep=1)
+        self._save(self.best, steps, {**(facts or {}), "score": score}, self._keep_best)
         return True
 
     def _best_score(self) -> float:

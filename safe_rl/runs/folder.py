@@ -18,8 +18,8 @@ __all__ = [
 ]
 
 _CHECKPOINT = re.compile(r"checkpoint-(\d+)\.torchrl")
-KINDS = ("last", "best")
-"""Folders of checkpoints: the newest few, and the best that kept every limit."""
+KINDS = ("last", "best", "certified")
+"""Folders of checkpoints: the newest few, the best that kept every limit, the certified one."""
 
 
 @dataclass(frozen=True)
@@ -90,13 +90,18 @@ class RunFolder:
         return self.directory / "checkpoints"
 
     def checkpoint(self, kind: str, steps: int) -> Path:
-        """The checkpoint of a kind (``last`` or ``best``) after so many environment steps."""
+        """The checkpoint of a kind after so many environment steps."""
         return self.checkpoints / kind / checkpoint_name(steps)
 
     def newest_checkpoint(self, kind: str = "last") -> Path | None:
         """The checkpoint after most steps, readable or not, if there is one of that kind."""
         found = checkpoints_in(self.checkpoints / kind)
         return found[-1] if found else None
+
+    @property
+    def certificate(self) -> Path:
+        """Which checkpoint surely keeps the limits."""
+        return self.directory / "certificate.json"
 
     def evaluation(self, name: str, suffix: str) -> Path:
         """A file of an evaluation: ``json`` for estimates, ``csv`` for episodes, ``mp4``."""

@@ -59,6 +59,7 @@ ROLES: dict[str, Role] = {
     "*._target_": Role.EXPERIMENT,
     "collector": Role.MANNER,
     "default_cost_limits": Role.MANNER,
+    "certificate": Role.MACHINE,  # what is found out about a run, not what it is
     "checkpoint": Role.MACHINE,
     "compile": Role.MACHINE,
     "*.compile": Role.MACHINE,

@@ -125,6 +125,7 @@ class Trainer:
         )
         self.progress = Progress()
         self.folder = folder
+        self.episode_length = env.max_episode_steps
         self.interrupted_by: Signals | None = None
         self._collector = collector
         self._env = env
@@ -140,6 +141,7 @@ class Trainer:
             folder.files.checkpoints,
             self.components(),
             keep_last=config.checkpoint.keep_last,
+            keep_best=config.checkpoint.get("keep_best", 1),
             run={
                 "environment": config.env.name,
                 "algorithm": config.algo.name,

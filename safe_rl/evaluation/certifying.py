@@ -1,0 +1,195 @@
+"""The certificate of a run: which of its checkpoints keeps the limits, and how surely."""
+
+from __future__ import annotations
+
+import json
+import math
+import shutil
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from omegaconf import DictConfig
+from torchrl.envs import EnvBase
+
+from safe_rl.evaluation.episodes import Episodes, collect_episodes
+from safe_rl.evaluation.layouts import default_seed
+from safe_rl.evaluation.loading import load_config, load_policy, override_env
+from safe_rl.runs.files import replacing
+from safe_rl.runs.folder import RunFolder, checkpoint_steps, checkpoints_in
+from safe_rl.scores.certificate import Claim, Verdict, first_certified, rank
+
+__all__ = ["Certificate", "CertificateOptions", "certify"]
+
+# worlds that are stepped together at most: more of them only take memory
+_MOST_WORLDS = 100
+
+
+@dataclass(frozen=True, kw_only=True)
+class CertificateOptions:
+    """What is certified and by how many episodes: the section ``certificate`` of a configuration.
+
+    Attributes:
+        ranking: Episodes of every candidate by which candidates are put in order.
+        episodes: Fresh episodes of every candidate that is tested.
+        tests: Candidates tested at most.
+        level: Confidence of the statement, in (0.5, 1).
+        most_over: Largest share of episodes that may cost more than a limit; 1 asks for nothing.
+    """
+
+    ranking: int
+    episodes: int
+    tests: int
+    level: float
+    most_over: float
+
+
+@dataclass(frozen=True)
+class Certificate:
+    """What was found.
+
+    Attributes:
+        checkpoint: The policy that is certified, or None.
+        episode_return: Its mean return in the test.
+        verdict: Bounds, tests and shortfalls.
+        options: What was asked for.
+    """
+
+    checkpoint: Path | None
+    episode_return: float
+    verdict: Verdict
+    options: CertificateOptions
+
+    def __str__(self) -> str:
+        """One line for the terminal."""
+        level = f"at {self.options.level:.0%}"
+        if self.checkpoint is None:
+            missing = ", ".join(f"{n} by {v:.3g}" for n, v in self.verdict.shortfalls.items())
+            return f"Not certified {level}: no checkpoint's bound is within its limit ({missing})."
+        bounds = ", ".join(f"{n} ≤ {b:.3g}" for n, (b, _) in self.verdict.bounds.items())
+        steps = checkpoint_steps(self.checkpoint)
+        return f"Certified {level}: {bounds}, return {self.episode_return:.2f}, at {steps:,} steps."
+
+
+def certify(
+    directory: Path,
+    options: CertificateOptions,
+    *,
+    make_env: Callable[..., EnvBase],
+    num_threads: int = 0,
+    progress: bool = False,
+) -> Certificate | None:
+    """Find the best checkpoint of a run of which it can be said that it keeps its limits.
+
+    All checkpoints are ranked by episodes of their own; the first of them are tested on fresh ones.
+    The result is written to ``certificate.json``, the policy kept as ``checkpoint=certified``.
+
+    Args:
+        directory: Folder of the run.
+        options: What to certify, and by how many episodes.
+        make_env: ``make_env(node, num_envs=, device=, seed=, num_threads=)``.
+        num_threads: Threads that step environments; 0 is one per core.
+        progress: Whether to show a bar.
+
+    Returns:
+        The certificate; None if the run has no limits or no checkpoints.
+    """
+    config = load_config(directory)
+    folder = RunFolder(directory)
+    candidates = _candidates(folder)
+    limits = {key: float(limit) for key, limit in config.cost_limits.items()}
+    if not limits or not candidates:
+        return None
+    claim = Claim(limits, options.most_over, options.level)
+    runner = _Runner(config, make_env, num_threads, progress)
+    first = [runner.run(path, options.ranking, purpose=0) for path in candidates]
+    order = rank([e.returns.numpy() for e in first], [_costs(e) for e in first], claim)
+    returns: dict[int, float] = {}
+
+    def collect(number: int) -> dict[str, np.ndarray]:
+        episodes = runner.run(candidates[number], options.episodes, purpose=1)
+        returns[number] = episodes.returns.mean().item()
+        return _costs(episodes)
+
+    verdict = first_certified(order, collect, claim, options.tests)
+    kept = None if verdict.certified is None else candidates[verdict.certified]
+    episode_return = math.nan if verdict.certified is None else returns[verdict.certified]
+    certificate = Certificate(_keep(folder, kept), episode_return, verdict, options)
+    _write(folder, certificate, [checkpoint_steps(path) for path in candidates])
+    return certificate
+
+
+def _costs(episodes: Episodes) -> dict[str, np.ndarray]:
+    return {key: costs.numpy() for key, costs in episodes.costs.items()}
+
+
+def _candidates(folder: RunFolder) -> list[Path]:
+    """Checkpoints of all kinds by ascending steps, one for every number of steps."""
+    found = {
+        checkpoint_steps(path): path
+        for kind in ("best", "last")
+        for path in checkpoints_in(folder.checkpoints / kind)
+    }
+    return [found[steps] for steps in sorted(found, key=lambda steps: steps or 0)]
+
+
+class _Runner:
+    """Runs policies on episodes that neither training nor another purpose has seen."""
+
+    def __init__(
+        self, config: DictConfig, make_env: Callable[..., EnvBase], threads: int, progress: bool
+    ) -> None:
+        self._config, self._make_env = config, make_env
+        self._threads, self._progress = threads, progress
+
+    def run(self, checkpoint: Path, number: int, purpose: int) -> Episodes:
+        node = override_env(self._config, {})
+        # of all candidates the same layouts: what differs between them is not luck
+        seed = default_seed(node, self._config.seed) + 1 + purpose
+        env = self._make_env(
+            node,
+            num_envs=min(number, _MOST_WORLDS),
+            device="cpu",
+            seed=seed,
+            num_threads=self._threads,
+        )
+        policy = load_policy(self._config, env, checkpoint, torch.device("cpu"))
+        torch.manual_seed(seed)
+        keys = list(self._config.cost_limits)
+        try:
+            return collect_episodes(
+                env, policy, number, keys, deterministic=False, progress=self._progress
+            )
+        finally:
+            env.close()
+
+
+def _keep(folder: RunFolder, checkpoint: Path | None) -> Path | None:
+    """Copy the certified checkpoint to where no other takes its place."""
+    directory = folder.checkpoints / "certified"
+    shutil.rmtree(directory, ignore_errors=True)
+    if checkpoint is None:
+        return None
+    directory.mkdir(parents=True)
+    return Path(shutil.copy2(checkpoint, directory))
+
+
+def _write(folder: RunFolder, certificate: Certificate, candidates: list[int | None]) -> None:
+    verdict = certificate.verdict
+    content: Mapping[str, Any] = {
+        "certified": certificate.checkpoint is not None,
+        "checkpoint": None if certificate.checkpoint is None else certificate.checkpoint.name,
+        "episode_return": None if verdict.certified is None else certificate.episode_return,
+        "bounds": {
+            name: {"bound": bound, "most": most} for name, (bound, most) in verdict.bounds.items()
+        },
+        "shortfalls": verdict.shortfalls,
+        "candidates": candidates,
+        "tested": [candidates[number] for number in verdict.tested],
+        **asdict(certificate.options),
+    }
+    with replacing(folder.certificate) as path:
+        path.write_text(json.dumps(content, indent=2) + "\n")

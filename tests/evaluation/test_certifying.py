@@ -1,0 +1,76 @@
+"""The certificate of a run on the point mass, whose costs are known to be kept or broken."""
+
+import json
+
+import pytest
+import torch
+from point_mass import PointMass
+from run_configs import point_mass_config
+
+from safe_rl.evaluation import CertificateOptions, certify
+from safe_rl.evaluation.loading import find_checkpoint
+from safe_rl.training.trainer import build_trainer, seed_everything
+
+OPTIONS = CertificateOptions(ranking=6, episodes=12, tests=2, level=0.95, most_over=1.0)
+
+
+def make_env(node, *, num_envs, device, seed, num_threads):
+    return PointMass(num_envs, 20, seed % 1000)
+
+
+@pytest.fixture
+def train(tmp_path):
+    def train(limits, *overrides):
+        config = point_mass_config(f"cost_limits={limits}", "checkpoint.interval=0", *overrides)
+        seed_everything(config.seed, None)
+        env = PointMass(config.num_envs, 20, config.seed)
+        build_trainer(config, env, tmp_path / "run").run()
+        return tmp_path / "run"
+
+    return train
+
+
+def test_a_policy_that_keeps_its_limit_is_certified_and_kept(train):
+    directory = train("{cost: 1000}")
+    certificate = certify(directory, OPTIONS, make_env=make_env)
+    written = json.loads((directory / "certificate.json").read_text())
+    assert written["certified"]
+    assert written["bounds"]["mean_cost"]["bound"] < written["bounds"]["mean_cost"]["most"] == 1000
+    # the last two epochs, and the best three: several files may be of the same epoch
+    assert len(written["candidates"]) == len(set(written["candidates"])) >= 2
+    assert find_checkpoint(directory, "certified") == certificate.checkpoint
+    assert certificate.checkpoint.read_bytes()
+    assert str(certificate).startswith("Certified at 95%: mean_cost ≤ ")
+
+
+def test_none_is_certified_where_limits_are_broken_and_it_says_by_how_much(train):
+    directory = train("{cost_hazards: 0.01}")
+    certificate = certify(directory, OPTIONS, make_env=make_env)
+    assert certificate.checkpoint is None
+    assert certificate.verdict.shortfalls["mean_cost_hazards"] > 0.1
+    assert len(certificate.verdict.tested) == 2
+    assert "mean_cost_hazards by" in str(certificate)
+    with pytest.raises(FileNotFoundError, match="none of its policies has been certified"):
+        find_checkpoint(directory, "certified")
+
+
+def test_a_certificate_is_taken_back_with_its_policy(train):
+    directory = train("{cost: 1000}")
+    certify(directory, OPTIONS, make_env=make_env)
+    strict = CertificateOptions(ranking=6, episodes=12, tests=2, level=0.95, most_over=0.0)
+    assert certify(directory, strict, make_env=make_env).checkpoint is None
+    assert not json.loads((directory / "certificate.json").read_text())["certified"]
+    with pytest.raises(FileNotFoundError):
+        find_checkpoint(directory, "certified")
+
+
+def test_the_same_run_gets_the_same_certificate(train):
+    directory = train("{cost: 1000}")
+    first = certify(directory, OPTIONS, make_env=make_env)
+    torch.rand(3)
+    assert certify(directory, OPTIONS, make_env=make_env) == first
+
+
+def test_without_limits_there_is_nothing_to_certify(train):
+    directory = train("{}", "algo=ppo")
+    assert certify(directory, OPTIONS, make_env=make_env) is None
