@@ -13,11 +13,12 @@ ROOT = Path(__file__).parents[1]
 PARTS = {
     "openmp": (),
     "extras": (),
+    "processes": (),
     "naming": (),
     "targets": ("naming",),
     "envs": ("naming",),
     "objectives": ("naming",),
-    "collectors": (),
+    "collectors": ("processes",),
     "models": (),
     "algorithms": ("collectors", "models", "naming", "objectives", "targets"),
     "runs": ("algorithms", "extras", "targets"),
@@ -26,7 +27,8 @@ PARTS = {
     "evaluation": ("algorithms", "extras", "models", "runs", "scores"),
     "reporting": ("extras", "runs", "scores"),
     "cli": (
-        *("envs", "evaluation", "extras", "naming", "openmp", "reporting", "runs", "scores"),
+        *("envs", "evaluation", "extras", "naming", "openmp", "processes", "reporting", "runs"),
+        "scores",
         *("targets", "training"),
     ),
     "evaluate": ("cli",),
@@ -102,7 +104,7 @@ FLOORS = {
         ("",),
     ),
     "cli": (
-        ("benchmark", "conf", "options", "values"),
+        ("benchmark", "conf", "options", "run_folders", "values"),
         ("keys",),
         ("settings",),
         ("overrides",),

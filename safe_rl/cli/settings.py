@@ -21,6 +21,7 @@ from safe_rl.cli.keys import EXTRAS, KEYS, PARTS, Key
 from safe_rl.envs import resolve
 from safe_rl.extras import require_extra
 from safe_rl.naming import did_you_mean
+from safe_rl.runs.folder import RunFolder
 from safe_rl.targets import locate
 
 __all__ = [
@@ -252,7 +253,7 @@ def errors_in_a_line(directory: Path, is_new: bool, *errors: type[Exception]) ->
 
     Args:
         directory: Folder of the run.
-        is_new: Whether it may go if nothing but Hydra's notes is in it.
+        is_new: Whether it may go if nothing is in it.
         errors: Errors that are about settings and files; all others pass.
 
     Raises:
@@ -263,7 +264,7 @@ def errors_in_a_line(directory: Path, is_new: bool, *errors: type[Exception]) ->
     except errors as error:
         if os.environ.get("HYDRA_FULL_ERROR") == "1":
             raise
-        if is_new and directory.is_dir() and all(p.name == ".hydra" for p in directory.iterdir()):
+        if is_new and directory.is_dir() and RunFolder(directory).is_untouched:
             shutil.rmtree(directory)
         raise SystemExit(_in_words(error)) from None
 

@@ -9,19 +9,20 @@ from collections.abc import Callable, Sequence
 from importlib.util import find_spec
 from pathlib import Path
 
-import yaml
 from omegaconf import DictConfig, OmegaConf
 
 from safe_rl.cli.overrides import CommandLineError
 from safe_rl.cli.user_code import check_imports, split_imports
 from safe_rl.naming import did_you_mean
+from safe_rl.runs.files import read_config
+from safe_rl.runs.folder import RunFolder
+from safe_rl.runs.identity import role_of
 from safe_rl.scores.slates import SLATES
 
 __all__ = ["expand_arguments"]
 
-# they would have no effect on a run whose networks, optimisers, worlds and random numbers are
-# restored, or would not fit them
-_FIXED = ("preset", "seed", "init_from", "model", "num_envs", "frames_per_batch")
+# of Hydra, that would make it read another configuration than the run's
+_OTHER_CONFIGURATIONS = ("--config-path", "-cp", "--config-name", "-cn")
 _JOBLIB = "hydra_plugins.hydra_joblib_launcher"
 
 
@@ -68,20 +69,19 @@ def _expand_resume(value: str, others: list[str]) -> list[str]:
             "resume= continues one run. To continue a sweep, start it again as it was: finished "
             "runs are skipped, interrupted ones go on."
         )
-    if not (directory / "config.yaml").is_file():
-        below = sorted({table.parent for table in directory.glob("**/progress.csv")})
-        hint = f" Runs below it: {', '.join(map(str, below[:5]))}." if below else ""
-        raise CommandLineError(f"{value} is not the folder of a run: no config.yaml.{hint}")
+    run = RunFolder(directory)
     try:
-        config = OmegaConf.load(directory / "config.yaml")
-    except yaml.YAMLError as error:
-        raise CommandLineError(f"{directory / 'config.yaml'} cannot be read: {error}") from None
-    assert isinstance(config, DictConfig)
-    _refuse_hydras_own(config, directory / "config.yaml")
+        run.check_is_run()
+        config = OmegaConf.create(read_config(run.config))
+    except (OSError, ValueError) as error:
+        raise CommandLineError(f"resume={value}: {error}") from None
+    _refuse_hydras_own(config, run.config)
     check_imports(config, split_imports(others)[0], Path(value))
     for argument in others:
         key = argument.lstrip("+~").partition("=")[0]
-        if key.partition(".")[0] in _FIXED or isinstance(config.get(key), DictConfig):
+        is_flag = key.startswith("-")
+        stays = not (is_flag or role_of(key.replace("/", ".")).may_change)
+        if stays or key in _OTHER_CONFIGURATIONS or isinstance(config.get(key), DictConfig):
             raise CommandLineError(
                 f"'{argument}' cannot change in a run that is continued. Single numbers can "
                 "(frames=…, policy_update.max_kl=…). For a new run from trained networks use "

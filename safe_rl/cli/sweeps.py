@@ -18,9 +18,15 @@ from hydra.experimental.callback import Callback
 from omegaconf import DictConfig
 
 from safe_rl.cli.user_code import import_modules, imported
+from safe_rl.processes import end_with_parent
+from safe_rl.runs.files import replacing
 from safe_rl.runs.folder import RunFolder
+from safe_rl.runs.lock import RunInUseError
 
 __all__ = ["SweepReport", "count_jobs", "threads_per_job"]
+
+_GRACE = 30.0
+"""Seconds in which a job whose sweep was killed may end its epoch and write a checkpoint."""
 
 
 def count_jobs(overrides: Sequence[str]) -> int:
@@ -65,6 +71,7 @@ class SweepReport(Callback):
     def __init__(self) -> None:
         self._journal: Path | None = None
         self._num_jobs = 0
+        self._process = os.getpid()
         self._modules: list[str] = []  # jobs run in processes that get this object
 
     def on_multirun_start(self, config: DictConfig, **kwargs: Any) -> None:
@@ -86,18 +93,24 @@ class SweepReport(Callback):
         """Note that a job has begun, and import the user's modules where it runs."""
         self._note(config, "begun")
         import_modules(self._modules)
+        if os.getppid() == self._process:
+            # else it would train on, or wait for ever, when the sweep was killed
+            end_with_parent(_GRACE)
 
     def on_job_end(self, config: DictConfig, job_return: JobReturn, **kwargs: Any) -> None:
         """Note how a job has ended, and take its error out of the way of the others."""
         if self._journal is None:
             return
         failure = RunFolder(Path(config.hydra.runtime.output_dir)).failure
-        failure.unlink(missing_ok=True)
-        if job_return.status is not JobStatus.FAILED:
+        error = job_return._return_value if job_return.status is JobStatus.FAILED else None
+        if not isinstance(error, RunInUseError):  # the folder is somebody else's
+            failure.unlink(missing_ok=True)
+            if error is not None:
+                with replacing(failure) as unfinished:
+                    unfinished.write_text("".join(traceback.format_exception(error)))
+        if error is None:
             self._note(config, "done")
             return
-        error = job_return._return_value
-        failure.write_text("".join(traceback.format_exception(error)))
         summary = str(error).strip().partition("\n")[0]
         self._note(config, "failed", f"{type(error).__name__}: {summary}")
         job_return.return_value, job_return.status = None, JobStatus.COMPLETED
@@ -127,8 +140,9 @@ class SweepReport(Callback):
         print(f"Sweep: {len(done)} of {self._num_jobs} runs are finished.")
         for note in last.values():
             if note["event"] == "failed":
-                file = RunFolder(Path(note["directory"])).failure.name
-                print(f"  failed: {note['directory']}: {note['error']} (see {file} there)")
+                file = RunFolder(Path(note["directory"])).failure
+                hint = f" (see {file.name} there)" if file.exists() else ""
+                print(f"  failed: {note['directory']}: {note['error']}{hint}")
             if note["event"] == "begun":
                 print(f"  interrupted: {note['directory']}")
         if len(done) < self._num_jobs:

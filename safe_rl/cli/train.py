@@ -4,7 +4,7 @@ import math
 import os
 import sys
 from collections.abc import Sequence
-from contextlib import AbstractContextManager, nullcontext
+from contextlib import AbstractContextManager, ExitStack, nullcontext
 from functools import partial
 from pathlib import Path
 from typing import Any, cast
@@ -19,6 +19,7 @@ from safe_rl.cli.certificates import certify_run, is_worth_a_certificate
 from safe_rl.cli.composing import check_command
 from safe_rl.cli.conf import CONF
 from safe_rl.cli.overrides import CommandLineError
+from safe_rl.cli.run_folders import write_notes
 from safe_rl.cli.settings import SETTING_ERRORS, SettingError, check_settings, errors_in_a_line
 from safe_rl.cli.shorthands import expand_arguments
 from safe_rl.cli.user_code import (
@@ -29,6 +30,8 @@ from safe_rl.cli.user_code import (
     split_imports,
 )
 from safe_rl.envs import ConfigError, LayoutError, make_env, store_configs
+from safe_rl.runs.folder import RunFolder
+from safe_rl.runs.lock import held
 from safe_rl.runs.resuming import is_finished, may_continue
 from safe_rl.targets import TargetError
 from safe_rl.training.trainer import Trainer, build_trainer, physics_threads, seed_everything
@@ -39,6 +42,8 @@ store_configs()
 
 def prepare(config: DictConfig, directory: Path, continues: bool) -> Trainer | None:
     """Build a run, or go on with the one in the folder; None if that is finished."""
+    if not continues:
+        RunFolder(directory).check_is_free()
     check_settings(config)
     if continues and is_finished(directory, config.frames):
         print(f"{directory} has its {config.frames:,} frames already: raise 'frames' to train on.")
@@ -70,21 +75,26 @@ def prepare(config: DictConfig, directory: Path, continues: bool) -> Trainer | N
 @hydra.main(version_base="1.3", config_path=str(CONF), config_name="config")
 def train(config: DictConfig) -> None:
     """Compose, build, train."""
-    directory = Path(HydraConfig.get().runtime.output_dir)
+    folder = RunFolder(Path(HydraConfig.get().runtime.output_dir))
     is_job = HydraConfig.get().mode is RunMode.MULTIRUN  # whose sweep keeps account of failures
     continues = may_continue(HydraConfig.get(), config)
 
     def in_a_line(*errors: type[Exception]) -> AbstractContextManager[None]:
-        return nullcontext() if is_job else errors_in_a_line(directory, not continues, *errors)
+        within = errors_in_a_line(folder.directory, not continues, *errors)
+        return nullcontext() if is_job else within
 
-    with in_a_line(*SETTING_ERRORS, LayoutError):
-        trainer = prepare(config, directory, continues)
-    if trainer is None:
-        return
-    with in_a_line(OSError):
-        print(trainer.run())
+    with ExitStack() as stack:
+        with in_a_line(*SETTING_ERRORS, LayoutError, FileExistsError):
+            stack.enter_context(held(folder))
+            trainer = prepare(config, folder.directory, continues)
+        if trainer is None:
+            return
+        with in_a_line(OSError):
+            if not continues or (is_job and not folder.notes.exists()):
+                write_notes(folder, config)
+            print(trainer.run())
     if trainer.interrupted_by is not None:
-        print(f"Interrupted. Continue with: python train.py resume={directory}")
+        print(f"Interrupted. Continue with: python train.py resume={folder.directory}")
         raise SystemExit(128 + trainer.interrupted_by)
     if trainer.algorithm.cost_keys and is_worth_a_certificate(config, trainer.episode_length):
         print(certify_run(directory, num_threads=config.num_threads or 0))

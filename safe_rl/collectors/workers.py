@@ -8,9 +8,10 @@ from __future__ import annotations
 
 import signal
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from functools import partial
 from multiprocessing import parent_process
+from multiprocessing.queues import Queue
 from threading import Thread
 from typing import Any, Protocol
 
@@ -20,6 +21,8 @@ from tensordict.nn import TensorDictModuleBase
 from torchrl.collectors import MultiSyncCollector
 from torchrl.collectors.distributed import RayCollector
 from torchrl.envs import EnvBase
+
+from safe_rl.processes import end_with_parent, is_stopped
 
 __all__ = ["MakeEnv", "WorkerCollector", "make_process_collector", "make_ray_collector"]
 
@@ -32,78 +35,127 @@ class MakeEnv(Protocol):
         ...
 
 
+Known = Callable[[Any], None]
+"""Takes note of a collector of TorchRL's."""
+
+_MOST_LOOKS = 5
+"""Seconds for which a worker may be missing: a job that is put to sleep as a whole wakes so."""
+
+
 class WorkerCollector:
     """Batches [N, T] of the present policy, collected by workers that wait for one another.
 
     The workers get the policy's weights before every batch but the first, with which they start.
 
     Args:
-        start: Starts TorchRL's collector, whose batches are [W, n, T] or [N, T].
+        start: Starts TorchRL's collector, whose batches are [W, n, T] or [N, T]; as soon as that
+            has processes it is given to the function that ``start`` gets.
         num_envs: Rows of all workers together, N.
         device: Device of the batches.
     """
 
-    def __init__(self, start: Callable[[], Any], num_envs: int, device: torch.device) -> None:
+    def __init__(self, start: Callable[[Known], Any], num_envs: int, device: torch.device) -> None:
         self.storing_device = device
         self._start = start
         self._workers: Any = None
         self._num_envs = num_envs
+        self._looks = 0
 
     def __iter__(self) -> Iterator[TensorDictBase]:
         """Start the workers and collect without end.
 
         Raises:
-            RuntimeError: If a worker has died.
+            RuntimeError: If a worker has died or stands still.
         """
-        self._workers = self._start()
+        self._supervised(lambda: self._start(self._known))
         batches = iter(self._workers)
         while True:
-            try:
-                batch = next(batches)
-            except RuntimeError:
-                # TorchRL notices that a worker has died while it waits for its batch
-                self._check_workers()
-                raise
+            batch = self._supervised(lambda: next(batches))
             yield batch.reshape(self._num_envs, -1).to(self.storing_device)
-            self._send_weights()
+            self._supervised(self._workers.update_policy_weights_)
 
-    def _send_weights(self) -> None:
-        """Send the weights, which for ever waits for a worker that has died, and notice that."""
-        failures: list[Exception] = []
+    def _known(self, workers: Any) -> None:
+        """Take note of TorchRL's collector, which is told while it still starts its processes."""
+        self._workers = workers
 
-        def send() -> None:
+    def _supervised(self, wait: Callable[[], Any]) -> Any:
+        """The result of a call that for ever waits for a worker that has died."""
+        outcome: list[Any] = []
+        failures: list[BaseException] = []
+
+        def run() -> None:
             try:
-                self._workers.update_policy_weights_()
-            except Exception as error:
+                outcome.append(wait())
+            except BaseException as error:  # also StopIteration
                 failures.append(error)
 
-        sender = Thread(target=send, daemon=True)
-        sender.start()
-        while sender.is_alive():
-            sender.join(timeout=1.0)
+        thread = Thread(target=run, daemon=True)
+        thread.start()
+        while thread.is_alive():
+            thread.join(timeout=1.0)
             self._check_workers()
         if failures:
+            self._check_workers()
+            end_processes(self._workers)
             raise failures[0]
+        return outcome[0]
 
     def _check_workers(self) -> None:
-        """Raise if a process has ended; the others are ended then."""
+        """Raise if a process was killed, or is missing for some time; all are ended then."""
         processes = [p for p in getattr(self._workers, "procs", []) if not p._closed]
-        dead = [process for process in processes if not process.is_alive()]
-        if not dead:
+        ended = [p.exitcode for p in processes if p.exitcode is not None]
+        stopped = [p.pid for p in processes if p.pid is not None and is_stopped(p.pid)]
+        self._looks = self._looks + 1 if ended or stopped else 0
+        # one that has failed by itself reports that, if it is given the time
+        if not set(ended) - {0, 1} and self._looks <= _MOST_LOOKS:
             return
-        codes = ", ".join(str(process.exitcode) for process in dead)
-        for process in processes:
-            process.kill()
-        self._workers.closed = True
+        codes = ", ".join(map(str, ended))
+        reason = (
+            f"has died (exit code {codes}; -9 is mostly a lack of memory: use fewer environments)"
+            if ended
+            else f"stands still (process {stopped[0]} was stopped by a signal)"
+        )
+        end_processes(self._workers)
         raise RuntimeError(
-            f"A worker of the collector has died (exit code {codes}; -9 is mostly a lack of "
-            "memory: use fewer environments). The last checkpoint is whole: continue with resume=."
+            f"A worker of the collector {reason}. The last checkpoint is whole: continue with "
+            "resume=."
         )
 
     def shutdown(self) -> None:
         """End the workers, if there are any."""
         if self._workers is not None and not getattr(self._workers, "closed", False):
             self._workers.shutdown()
+
+
+class _ProcessCollector(MultiSyncCollector):
+    """TorchRL's, known while it starts: its processes are what it may for ever wait for."""
+
+    def __init__(self, known: Known, *args: Any, **options: Any) -> None:
+        known(self)
+        super().__init__(*args, **options)
+
+
+def end_processes(collector: Any) -> None:
+    """Kill the processes of a collector, and let go of all that this one would wait for."""
+    processes = [p for p in getattr(collector, "procs", []) if not p._closed]
+    for process in processes:
+        process.kill()
+    for process in processes:
+        process.join(timeout=5.0)
+    # weights on their way to a process that is no more: at exit, Python would wait for them
+    schemes = getattr(collector, "_weight_sync_schemes", None) or {}
+    for holder in (collector, *schemes.values()):
+        for queue in _queues(vars(holder).values()):
+            queue.cancel_join_thread()
+    collector.closed = True
+
+
+def _queues(values: Iterable[Any]) -> Iterator[Queue]:
+    for value in values:
+        if isinstance(value, Queue):
+            yield value
+        elif isinstance(value, dict):
+            yield from _queues(value.values())
 
 
 def make_process_collector(
@@ -130,8 +182,9 @@ def make_process_collector(
     """
     check_shares(env, num_collectors, frames_per_batch)
 
-    def start() -> MultiSyncCollector:
-        return MultiSyncCollector(
+    def start(known: Known) -> None:
+        _ProcessCollector(
+            known,
             share_rows(env, make_env, num_collectors),
             policy,
             frames_per_batch=frames_per_batch,
@@ -175,16 +228,18 @@ def make_ray_collector(
     """
     check_shares(env, num_collectors, frames_per_batch)
 
-    def start() -> RayCollector:
-        return RayCollector(
-            share_rows(env, make_env, num_collectors),
-            policy,
-            frames_per_batch=frames_per_batch,
-            total_frames=sys.maxsize,
-            sync=True,
-            ray_init_config=ray_init,
-            remote_configs=resources,
-            num_collectors=num_collectors,
+    def start(known: Known) -> None:
+        known(
+            RayCollector(
+                share_rows(env, make_env, num_collectors),
+                policy,
+                frames_per_batch=frames_per_batch,
+                total_frames=sys.maxsize,
+                sync=True,
+                ray_init_config=ray_init,
+                remote_configs=resources,
+                num_collectors=num_collectors,
+            )
         )
 
     return WorkerCollector(start, env.batch_size.numel(), torch.device(device))
@@ -229,6 +284,7 @@ def _make_share(
     if parent_process() is not None:
         # Ctrl-C reaches every process; it is the first one's to end the run, with a checkpoint
         signal.signal(signal.SIGINT, signal.SIG_IGN)
+        end_with_parent()
     env = make_env(num_envs=num_envs)
     if state is not None:
         env.set_state(state)

@@ -85,6 +85,11 @@ class RunFolder:
         return self.notes / "hydra.yaml"
 
     @property
+    def composed(self) -> Path:
+        """The configuration before it was resolved."""
+        return self.notes / "config.yaml"
+
+    @property
     def checkpoints(self) -> Path:
         """Folder of the checkpoints."""
         return self.directory / "checkpoints"
@@ -139,6 +144,18 @@ class RunFolder:
         except FileNotFoundError:
             return 0
         return max(0, lines - 1)
+
+    def check_is_free(self) -> None:
+        """Refuse a folder in which a run has begun.
+
+        Raises:
+            FileExistsError: Saying how to go on with that run.
+        """
+        if self.has_begun:
+            raise FileExistsError(
+                f"{self.directory} already holds a run. Continue it with 'python train.py "
+                f"resume={self.directory}', or give this one another folder with hydra.run.dir=..."
+            )
 
     def check_is_run(self) -> None:
         """Refuse a folder that is not a run's.

@@ -69,12 +69,12 @@ class RunRecord:
         Raises:
             FileExistsError: If a new run would overwrite one that is there.
             RunInUseError: If another process writes there.
-            ValueError: If the table lacks epochs of the run that is to be continued, or has some
-                that no checkpoint of it has.
+            ValueError: If the table lacks epochs of the run that is to be continued.
         """
         self.directory.mkdir(parents=True, exist_ok=True)
         with held(self.files):
-            self._check_begin(epoch)
+            if epoch is None:
+                self.files.check_is_free()
             self._table = TableWriter(self.files.table, keep_rows=epoch or 0)
             # that of a continued run is replaced when it has proved to be one that trains
             self._is_config_saved = False
@@ -97,13 +97,6 @@ class RunRecord:
                 close = getattr(self._logger, "close", None)
                 if close is not None:
                     close()
-
-    def _check_begin(self, epoch: int | None) -> None:
-        if epoch is None and self.files.has_begun:
-            raise FileExistsError(
-                f"{self.directory} already holds a run. Continue it with 'python train.py "
-                f"resume={self.directory}', or give this one another folder with hydra.run.dir=..."
-            )
 
     def _save_config(self) -> None:
         if not self._is_config_saved:

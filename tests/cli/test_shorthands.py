@@ -86,3 +86,41 @@ def test_a_broken_configuration_is_named(run):
     (run / "config.yaml").write_text("algo: [")
     with pytest.raises(CommandLineError, match=r"config\.yaml cannot be read"):
         expand_arguments([f"resume={run}"])
+
+
+@pytest.mark.parametrize(
+    "override",
+    [
+        "env.hazards_num=3",
+        "+env.hazards_num=3",
+        "cost_limits.cost=3",
+        "cost_limits={cost: 3}",
+        "init_from=elsewhere",
+        "policy_update.optimizer.lr=1",
+        "policy_update._target_=os.system",
+        "lagrangian.init=3",
+        "logger=none",
+        "collector=process",
+        "hydra.run.dir=elsewhere",
+        "hydra.sweep.dir=elsewhere",
+        "--config-name",
+        "-cp",
+        "+mine=3",
+        "~model",
+    ],
+)
+def test_what_is_not_marked_as_changing_stays(run, override):
+    with pytest.raises(CommandLineError, match=rf"'{re.escape(override)}' cannot change"):
+        expand_arguments([f"resume={run}", override])
+
+
+@pytest.mark.parametrize(
+    "override",
+    [
+        *("frames=9", "device=cuda", "num_threads=3", "checkpoint.interval=3", "compile=true"),
+        *("logger.exp_name=mine", "loss.entropy_coeff=0.1", "lagrangian.kp=0.5"),
+        *("critic_update.num_passes=3", "hydra.verbose=true", "--cfg"),
+    ],
+)
+def test_what_is_marked_may_change(run, override):
+    assert expand_arguments([f"resume={run}", override])[-1] == override

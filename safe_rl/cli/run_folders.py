@@ -1,0 +1,60 @@
+"""New runs get folders of their own, and note there how they were begun."""
+
+from __future__ import annotations
+
+from itertools import count
+from pathlib import Path
+from typing import Any
+
+from hydra.core.hydra_config import HydraConfig
+from hydra.experimental.callback import Callback
+from omegaconf import DictConfig, OmegaConf, open_dict, read_write
+
+from safe_rl.runs.files import replacing
+from safe_rl.runs.folder import RunFolder
+
+__all__ = ["NewFolder", "write_notes"]
+
+
+class NewFolder(Callback):
+    """Makes the folder of a single run before anything is written, so that it is nobody else's.
+
+    Where the name is taken, by a run that began in the same second say, it gets a number. A folder
+    that the command line names is left as it is.
+    """
+
+    def on_run_start(self, config: DictConfig, **kwargs: Any) -> None:
+        """Make the folder and tell Hydra."""
+        if any(o.lstrip("+").startswith("hydra.run.dir=") for o in config.hydra.overrides.hydra):
+            return
+        wanted = Path(config.hydra.run.dir)
+        made = next(path for path in _names(wanted) if _make(path))
+        with read_write(config), open_dict(config):
+            config.hydra.run.dir = str(made)
+
+
+def _names(path: Path) -> Any:
+    yield path
+    yield from (path.with_name(f"{path.name}_{number}") for number in count(2))
+
+
+def _make(path: Path) -> bool:
+    """Make a folder; False if it is there."""
+    try:
+        path.mkdir(parents=True)
+    except FileExistsError:
+        return False
+    return True
+
+
+def write_notes(folder: RunFolder, config: DictConfig) -> None:
+    """Write what Hydra would have written before it was known whether the run may begin here."""
+    surroundings = HydraConfig.instance().cfg
+    assert surroundings is not None
+    folder.notes.mkdir(exist_ok=True)
+    overrides = surroundings.hydra.overrides.task
+    notes = ((folder.composed, config), (folder.surroundings, surroundings),
+             (folder.overrides, overrides))  # fmt: skip
+    for path, content in notes:
+        with replacing(path) as unfinished:
+            OmegaConf.save(content, unfinished)

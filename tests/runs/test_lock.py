@@ -1,0 +1,155 @@
+"""One writer per run: between processes, after they were killed, and where locks do not reach."""
+
+import errno
+import json
+import multiprocessing
+import os
+import signal
+import time
+
+import pytest
+from filelock import FileLock
+
+from safe_rl.runs import lock
+from safe_rl.runs.folder import RunFolder
+from safe_rl.runs.lock import RunInUseError, held
+
+FORK = multiprocessing.get_context("fork")
+
+
+@pytest.fixture
+def folder(tmp_path):
+    return RunFolder(tmp_path)
+
+
+def hold(folder, ready):
+    with held(folder):
+        ready.set()
+        time.sleep(60)
+
+
+@pytest.fixture
+def holder(folder):
+    """A process that holds the folder."""
+    ready = FORK.Event()
+    process = FORK.Process(target=hold, args=(folder, ready), daemon=True)
+    process.start()
+    assert ready.wait(30)
+    yield process
+    process.kill()
+    process.join()
+
+
+def test_the_second_is_told_who_the_first_is(folder, holder):
+    with pytest.raises(RunInUseError, match=rf"process {holder.pid} on .*, since 20\d\d-"):
+        held(folder).__enter__()
+
+
+def test_the_lock_dies_with_its_process(folder, holder):
+    os.kill(holder.pid, signal.SIGKILL)
+    holder.join()
+    assert json.loads(folder.writer.read_text())["pid"] == holder.pid
+    start = time.monotonic()
+    with held(folder):
+        assert json.loads(folder.writer.read_text())["pid"] == os.getpid()
+    assert time.monotonic() - start < 2
+    assert not folder.writer.exists()
+
+
+def test_the_same_process_goes_on_and_the_outermost_lets_go(folder):
+    with held(folder):
+        with held(folder):
+            pass
+        assert folder.writer.exists()
+    with held(folder):
+        pass
+
+
+def outcome_of(folder, outcome):
+    try:
+        with held(folder):
+            outcome.put("held")
+    except RunInUseError:
+        outcome.put("in use")
+
+
+def test_a_forked_process_does_not_hold_what_its_parent_holds(folder):
+    outcome = FORK.Queue()
+    with held(folder):
+        process = FORK.Process(target=outcome_of, args=(folder, outcome))
+        process.start()
+        assert outcome.get(timeout=30) == "in use"
+        process.join()
+
+
+def test_a_forked_process_that_outlives_the_holder_holds_nothing(folder):
+    """The kernel's lock would go on in it: workers of a run that was killed."""
+
+    def hold_and_fork(ready, child):
+        with held(folder):
+            grandchild = FORK.Process(target=time.sleep, args=(60,))
+            grandchild.start()
+            child.value = grandchild.pid
+            ready.set()
+            time.sleep(60)
+
+    ready, child = FORK.Event(), FORK.Value("i")
+    process = FORK.Process(target=hold_and_fork, args=(ready, child))
+    process.start()
+    assert ready.wait(30)
+    try:
+        process.kill()
+        process.join()
+        with held(folder):
+            pass
+    finally:
+        os.kill(child.value, signal.SIGKILL)
+
+
+@pytest.fixture
+def quick(monkeypatch):
+    monkeypatch.setattr(lock, "BEAT", 0.1)
+
+
+def write_as_elsewhere(folder):
+    writer = {"host": "elsewhere", "pid": 1, "since": "2026-01-01 00:00:00"}
+    folder.writer.write_text(json.dumps(writer))
+
+
+def test_a_writer_on_another_machine_that_shows_itself_is_left_alone(folder, quick):
+    """As on a network file system whose locks stay on each machine."""
+    write_as_elsewhere(folder)
+    with lock._beating(folder.writer), pytest.raises(RunInUseError, match="process 1 on elsewhere"):
+        held(folder).__enter__()
+    # and its place is taken when it does so no more
+    with held(folder):
+        assert json.loads(folder.writer.read_text())["pid"] == os.getpid()
+
+
+@pytest.mark.parametrize("code", [errno.ENOLCK, errno.EOPNOTSUPP])
+def test_without_locks_the_writer_is_still_seen(folder, quick, monkeypatch, code):
+    def refuse(self):
+        raise OSError(code, os.strerror(code))
+
+    monkeypatch.setattr(FileLock, "acquire", refuse)
+    with pytest.warns(UserWarning, match="has no locks"), held(folder):
+        written = folder.writer.read_text()
+    folder.writer.write_text(written)
+    with (
+        lock._beating(folder.writer),
+        pytest.warns(UserWarning, match="has no locks"),
+        pytest.raises(RunInUseError),
+    ):
+        held(folder).__enter__()
+
+
+@pytest.mark.parametrize("content", ["", "{", "[]", "null"])
+def test_a_damaged_note_of_the_writer_stops_nobody(folder, content):
+    folder.writer.write_text(content)
+    with held(folder):
+        pass
+
+
+def test_other_errors_are_not_hidden(tmp_path):
+    with pytest.raises(OSError, match="No such file"):
+        held(RunFolder(tmp_path / "missing")).__enter__()
