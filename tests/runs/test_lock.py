@@ -148,8 +148,3 @@ def test_a_damaged_note_of_the_writer_stops_nobody(folder, content):
     folder.writer.write_text(content)
     with held(folder):
         pass
-
-
-def test_other_errors_are_not_hidden(tmp_path):
-    with pytest.raises(OSError, match="No such file"):
-        held(RunFolder(tmp_path / "missing")).__enter__()
