@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from itertools import count
 from pathlib import Path
 from typing import Any
 
 from hydra.core.hydra_config import HydraConfig
 from hydra.experimental.callback import Callback
-from omegaconf import DictConfig, OmegaConf, open_dict, read_write
+from omegaconf import DictConfig, OmegaConf, read_write
 
 from safe_rl.runs.files import replacing
 from safe_rl.runs.folder import RunFolder
@@ -29,11 +30,11 @@ class NewFolder(Callback):
             return
         wanted = Path(config.hydra.run.dir)
         made = next(path for path in _names(wanted) if _make(path))
-        with read_write(config), open_dict(config):
+        with read_write(config.hydra.run):
             config.hydra.run.dir = str(made)
 
 
-def _names(path: Path) -> Any:
+def _names(path: Path) -> Iterator[Path]:
     yield path
     yield from (path.with_name(f"{path.name}_{number}") for number in count(2))
 

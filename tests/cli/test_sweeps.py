@@ -1,8 +1,10 @@
 """Sweeps: how many jobs and threads, failing jobs, and a whole sweep started again."""
 
+import contextlib
 import json
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import pytest
@@ -10,6 +12,8 @@ from hydra.core.utils import JobReturn, JobStatus
 from omegaconf import OmegaConf
 
 from safe_rl.cli.sweeps import SweepReport, count_jobs, threads_per_job
+from safe_rl.runs.archive import read_facts
+from safe_rl.runs.folder import runs_below
 
 ROOT = Path(__file__).parents[2]
 
@@ -132,3 +136,55 @@ def test_a_sweep_end_to_end(tmp_path, launcher):
     assert len(journals) == 2
     notes = [json.loads(line) for line in journals[0].read_text().splitlines()]
     assert sorted(note["event"] for note in notes) == ["begun"] * 4 + ["done"] * 2 + ["failed"] * 2
+
+
+def writers(directory):
+    """Folder -> process that writes it, of the runs below a folder."""
+    found = {}
+    for run in runs_below(directory):
+        with contextlib.suppress(OSError, ValueError):
+            found[run.directory] = json.loads(run.writer.read_text())["pid"]
+    return found
+
+
+def wait_until(condition, seconds):
+    deadline = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < deadline
+        time.sleep(0.2)
+
+
+def is_running(pid):
+    try:
+        return "State:\tZ" not in Path(f"/proc/{pid}/status").read_text()
+    except OSError:
+        return False
+
+
+@pytest.mark.slow
+def test_jobs_have_their_folders_for_themselves_and_end_with_the_sweep(tmp_path):
+    pytest.importorskip("hydra_plugins.hydra_joblib_launcher")
+    command = [
+        *(sys.executable, "train.py", "-m", *TINY, f"hydra.sweep.dir={tmp_path}", "seed=0,1"),
+        *("hydra/launcher=joblib", "hydra.launcher.n_jobs=2", "frames=100_000_000"),
+    ]
+    first = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.DEVNULL)
+    try:
+        wait_until(lambda: [r.num_rows > 1 for r in runs_below(tmp_path)] == [True, True], 300)
+        processes = writers(tmp_path)
+        again = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=300)
+        assert again.returncode == 1
+        for directory, pid in processes.items():
+            assert f"{directory}: RunInUseError: {directory} is being written by process {pid}" in (
+                again.stdout
+            )
+        assert writers(tmp_path) == processes
+        assert not list(tmp_path.rglob("failure.txt"))
+    finally:
+        first.kill()
+        first.wait()
+    wait_until(lambda: not any(map(is_running, processes.values())), 60)
+    # they had the time to write what they had come to
+    for run in runs_below(tmp_path):
+        epoch = read_facts(run.newest_checkpoint())["epoch"]
+        assert epoch == run.num_rows

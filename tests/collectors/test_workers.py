@@ -1,7 +1,10 @@
 """Collection by several processes: rows, weights, noise, and workers that die."""
 
 import os
+import re
 import signal
+import subprocess
+import sys
 import time
 from functools import partial
 
@@ -67,6 +70,72 @@ def test_batches_follow_the_weights_until_a_worker_dies():
         next(batches)
     assert time.monotonic() - start < 30
     collector.shutdown()
+
+
+class Troubled:
+    """Makes environments, but in a worker something happens to it."""
+
+    def __init__(self, trouble):
+        self.trouble = trouble
+        self.home = os.getpid()
+
+    def __call__(self, *, num_envs):
+        if os.getpid() != self.home:
+            self.trouble()
+        return MAKE(num_envs=num_envs)
+
+
+def end():
+    os._exit(9)
+
+
+def stop():
+    os.kill(os.getpid(), signal.SIGSTOP)
+
+
+def fail():
+    raise MemoryError("too many worlds")
+
+
+def collect_in_trouble(trouble):
+    """Run by a process of its own, which has to end as well."""
+    make = Troubled(trouble)
+    env = make(num_envs=4)
+    actor = make_actor(env.observation_spec["observation"].shape[-1], 2, hidden_sizes=[8], initial_log_std=-0.5)  # fmt: skip  # noqa: E501
+    collector = make_process_collector(
+        env, make, BehaviourPolicy(actor), frames_per_batch=80, num_collectors=2, device="cpu"
+    )
+    next(iter(collector))
+
+
+SCRIPT = """
+import sys
+sys.path[:0] = {path!r}
+import safe_rl.openmp
+import test_workers
+if __name__ == "__main__":
+    test_workers.collect_in_trouble(test_workers.{trouble})
+"""
+
+
+@pytest.mark.parametrize(
+    ("trouble", "reason"),
+    [
+        (end, r"has died \(exit code 9"),
+        (stop, "stands still .* stopped by a signal"),
+        (fail, "too many worlds"),
+    ],
+)
+def test_a_worker_in_trouble_while_it_starts_ends_the_run_with_the_reason(
+    tmp_path, trouble, reason
+):
+    script = tmp_path / "script.py"
+    script.write_text(SCRIPT.format(path=[os.path.dirname(__file__)], trouble=trouble.__name__))
+    ended = subprocess.run(
+        [sys.executable, str(script)], capture_output=True, text=True, timeout=300
+    )
+    assert ended.returncode == 1
+    assert re.search(reason, ended.stderr)
 
 
 @pytest.mark.slow

@@ -1,8 +1,10 @@
 """Runs that are killed and continued; what continues, what does not, and what it says."""
 
+import errno
 import multiprocessing
 import os
 import random
+import shutil
 import signal
 import time
 from types import SimpleNamespace
@@ -13,10 +15,12 @@ from omegaconf import OmegaConf
 from point_mass import PointMass
 from run_configs import compose_config, point_mass_config, without_times
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
-from torchrl.checkpoint import CheckpointError
+from torchrl.checkpoint import Checkpoint, CheckpointError
 
 from safe_rl.envs import SafetyGymEnv, store_configs
 from safe_rl.runs.checkpoints import CheckpointStore
+from safe_rl.runs.folder import RunFolder
+from safe_rl.runs.lock import RunInUseError
 from safe_rl.runs.resuming import check_same_run, is_finished, may_continue
 from safe_rl.runs.table import read_table
 from safe_rl.training.trainer import build_trainer, seed_everything
@@ -122,6 +126,75 @@ def test_a_run_without_a_checkpoint_starts_over(tmp_path):
     again.run()
     tables = [without_times(tmp_path / name / "progress.csv") for name in ("begun", "whole")]
     assert tables[0] == tables[1]
+
+
+@pytest.mark.parametrize("missing", ["checkpoints", "checkpoints/last"])
+def test_a_run_whose_checkpoints_are_gone_is_left_as_it_is(tmp_path, missing):
+    point_mass_trainer(tmp_path, "frames=640", "algo=ppo", "cost_limits={cost: 1000}").run()
+    assert (tmp_path / "checkpoints" / "best").exists()
+    shutil.rmtree(tmp_path / missing)
+    before = {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
+    trainer = point_mass_trainer(tmp_path, "frames=960", "algo=ppo", "cost_limits={cost: 1000}")
+    with pytest.raises(CheckpointError, match=r"are gone.*4 epochs.*Put the checkpoints back"):
+        trainer.resume()
+    assert {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()} == before
+
+
+def test_a_run_continued_with_what_cannot_train_keeps_its_configuration(tmp_path):
+    point_mass_trainer(tmp_path, "frames=640").run()
+    before = (tmp_path / "config.yaml").read_text()
+    broken = point_mass_trainer(tmp_path, "frames=960", "policy_update.max_kl=abc")
+    broken.resume()
+    with pytest.raises(TypeError):
+        broken.run()
+    assert (tmp_path / "config.yaml").read_text() == before
+    whole = point_mass_trainer(tmp_path, "frames=960")
+    whole.resume()
+    whole.run()
+    assert len(read_table(tmp_path / "progress.csv")["steps"]) == 6
+
+
+def test_a_full_disk_ends_the_run_and_leaves_one_that_goes_on(tmp_path, monkeypatch):
+    point_mass_trainer(tmp_path / "whole").run()
+    trainer = point_mass_trainer(tmp_path / "run", "checkpoint.interval=0")
+    save = Checkpoint.save
+    saved = []
+
+    def fill(checkpoint, path, **options):
+        saved.append(path)
+        if len(saved) == 4:
+            path.with_name(f".{path.name}.archive-0").write_text("half")
+            raise OSError(errno.ENOSPC, "No space left on device")
+        return save(checkpoint, path, **options)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Checkpoint, "save", fill)
+        with pytest.raises(OSError, match="No space"):
+            trainer.run()
+    resumed = point_mass_trainer(tmp_path / "run")
+    assert resumed.resume()
+    resumed.run()
+    tables = [without_times(tmp_path / name / "progress.csv") for name in ("run", "whole")]
+    assert tables[0] == tables[1]
+    assert not list((tmp_path / "run").rglob("*.archive-*"))
+
+
+def test_a_second_process_does_not_touch_a_run_that_is_being_written(tmp_path):
+    process = in_a_process(tmp_path, "env=PointGoal1", "frames=100_000_000")
+    deadline = time.monotonic() + 60
+    while RunFolder(tmp_path).num_rows < 2:
+        assert time.monotonic() < deadline
+        time.sleep(0.05)
+    with pytest.raises(RunInUseError, match=f"process {process.pid}"):
+        make_trainer(tmp_path, "env=PointGoal1").resume()
+    with pytest.raises(RunInUseError, match=f"process {process.pid}"):
+        make_trainer(tmp_path, "env=PointGoal1").run()
+    assert process.is_alive()
+    process.kill()
+    process.join()
+    train(tmp_path, "env=PointGoal1", "frames=1200")
+    steps = read_table(tmp_path / "progress.csv")["steps"]
+    assert steps == [120.0 * (i + 1) for i in range(len(steps))]
 
 
 def test_a_longer_run_goes_on_from_the_end(tmp_path):

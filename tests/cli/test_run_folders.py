@@ -1,0 +1,78 @@
+"""Folders of new runs, as the command line makes them."""
+
+import multiprocessing
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from omegaconf import OmegaConf
+
+from safe_rl.cli.run_folders import NewFolder
+
+ROOT = Path(__file__).parents[2]
+
+
+def hydra_config(directory, *overrides):
+    config = OmegaConf.create(
+        {"hydra": {"run": {"dir": str(directory)}, "overrides": {"hydra": list(overrides)}}}
+    )
+    OmegaConf.set_struct(config, True)
+    OmegaConf.set_readonly(config, True)
+    return config
+
+
+def claim(directory):
+    config = hydra_config(directory)
+    NewFolder().on_run_start(config)
+    return config.hydra.run.dir
+
+
+def test_runs_that_begin_in_the_same_second_get_folders_of_their_own(tmp_path):
+    wanted = tmp_path / "PointGoal1" / "ppo" / "2026-01-31_12-00-00_seed0"
+    with multiprocessing.get_context("fork").Pool(4) as pool:
+        made = pool.map(claim, [wanted] * 12)
+    assert sorted(made) == sorted(str(path) for path in wanted.parent.iterdir())
+    assert str(wanted) in made
+    assert len(set(made)) == 12
+
+
+@pytest.mark.parametrize("override", ["hydra.run.dir", "+hydra.run.dir"])
+def test_a_folder_that_was_named_stays(tmp_path, override):
+    config = hydra_config(tmp_path, f"{override}={tmp_path}")
+    NewFolder().on_run_start(config)
+    assert config.hydra.run.dir == str(tmp_path)
+    assert not list(tmp_path.iterdir())
+
+
+TINY = [
+    *("env.num_steps=40", "num_envs=2", "frames_per_batch=80", "logger=none", "num_threads=1"),
+    *("model.hidden_sizes=[8]", "critic_update.num_passes=1", "policy_update.num_passes=1"),
+]
+
+
+def train(*arguments):
+    return subprocess.run(
+        [sys.executable, "train.py", *arguments],
+        cwd=ROOT, capture_output=True, text=True, timeout=600,
+    )  # fmt: skip
+
+
+@pytest.mark.slow
+def test_a_refused_run_changes_nothing_of_the_one_that_is_there(tmp_path):
+    where = f"hydra.run.dir={tmp_path / 'run'}"
+    assert train(*TINY, where, "frames=160").returncode == 0
+    before = {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
+    assert tmp_path / "run" / ".hydra" / "overrides.yaml" in before
+    refused = train(*TINY, where, "frames=240", "seed=3")
+    assert refused.returncode == 1
+    assert "already holds a run. Continue it with 'python train.py resume=" in refused.stderr
+    broken = train(f"resume={tmp_path / 'run'}", "frames=240", "policy_update.max_kl=abc")
+    assert broken.returncode == 1
+    elsewhere = train(f"resume={tmp_path / 'run'}", f"hydra.run.dir={tmp_path / 'other'}")
+    assert "cannot change" in elsewhere.stderr
+    after = {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
+    assert after == before
+    # one that could not begin leaves no folder
+    assert train(*TINY, f"hydra.run.dir={tmp_path / 'new'}", "frames=-1").returncode == 1
+    assert [path.name for path in tmp_path.iterdir()] == ["run"]
