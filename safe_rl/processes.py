@@ -21,7 +21,7 @@ def end_with_parent(grace: float = 0.0) -> None:
     """End this process when its parent has ended, however that was ended.
 
     Args:
-        grace: Seconds between SIGTERM, which lets a run write its checkpoint, and the end.
+        grace: Seconds for the run at hand, which gets SIGTERM, to write its checkpoint.
     """
     parent = os.getppid()
 
@@ -29,9 +29,10 @@ def end_with_parent(grace: float = 0.0) -> None:
         # an orphan gets another parent
         while os.getppid() == parent:
             time.sleep(_LOOK)
-        if grace:
+        # a second one would end at once the run that is ending already
+        if grace and callable(signal.getsignal(signal.SIGTERM)):
             os.kill(os.getpid(), signal.SIGTERM)
-            time.sleep(grace)
+        time.sleep(grace)
         os._exit(1)
 
     Thread(target=watch, name="end with parent", daemon=True).start()

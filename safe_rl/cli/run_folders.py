@@ -50,8 +50,7 @@ def _make(path: Path) -> bool:
 
 def write_notes(folder: RunFolder, config: DictConfig) -> None:
     """Write what Hydra would have written before it was known whether the run may begin here."""
-    surroundings = HydraConfig.instance().cfg
-    assert surroundings is not None
+    surroundings: Any = HydraConfig.instance().cfg
     folder.notes.mkdir(exist_ok=True)
     overrides = surroundings.hydra.overrides.task
     notes = ((folder.composed, config), (folder.surroundings, surroundings),
