@@ -15,6 +15,7 @@ from safe_rl.cli.values import (
     choice,
     component,
     count,
+    folder_name,
     list_of,
     mapping_of,
     number,
@@ -23,7 +24,7 @@ from safe_rl.cli.values import (
     text,
 )
 
-__all__ = ["EXTRAS", "KEYS", "PARTS", "Key"]
+__all__ = ["EXTRAS", "FLAGS", "KEYS", "PARTS", "Key"]
 
 
 class Key(NamedTuple):
@@ -76,8 +77,8 @@ KEYS = {
     "checkpoint": Key(_SECTION, "when checkpoints are written"),
     "collector": Key(_SECTION, "where environments are stepped: collector=local"),
     "logger": Key(_SECTION, "what is logged besides the table: logger=none for nothing"),
-    "env.name": Key(text, "name of the environment"),
-    "algo.name": Key(text, "name of the algorithm"),
+    "env.name": Key(folder_name, "name of the environment"),
+    "algo.name": Key(folder_name, "name of the algorithm"),
     "checkpoint.interval": Key(number(0), "seconds between checkpoints"),
     "checkpoint.keep_last": Key(count(1, 10_000), "checkpoints that are kept besides the best"),
     "checkpoint.keep_best": Key(count(1, 10_000), "best checkpoints kept", may_lack=True),
@@ -211,6 +212,12 @@ PARTS = {
     "torch.optim": _OPTIMIZER,
 }
 """Of the package's parts by class, and of torch's optimisers together."""
+
+FLAGS = {
+    "_target_": Key(optional(text), "what is built"),
+    "_partial_": Key(boolean, "whether other arguments follow"),
+}
+"""Keys of any part that are Hydra's."""
 
 EXTRAS = {
     "make_ray_collector": ("ray", "ray"),

@@ -17,7 +17,7 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 from torchrl.checkpoint import CheckpointError
 
-from safe_rl.cli.keys import EXTRAS, KEYS, PARTS, Key
+from safe_rl.cli.keys import EXTRAS, FLAGS, KEYS, PARTS, Key
 from safe_rl.envs import resolve
 from safe_rl.extras import require_extra
 from safe_rl.naming import did_you_mean
@@ -140,7 +140,7 @@ def _entries_of_keys(values: Mapping[str, Any]) -> Iterator[_Entry]:
 
 def _entries_of_parts(values: Mapping[str, Any]) -> Iterator[_Entry]:
     for path, node, found in _parts(values):
-        rows = _rows(found)
+        rows = {**FLAGS, **_rows(found)}
         for name in node:
             if name in rows:
                 yield _Entry(f"{path}.{name}", rows[name], node[name])
@@ -153,6 +153,7 @@ def _parts(values: Mapping[str, Any], prefix: str = "") -> Iterator[_Part]:
             path = f"{prefix}{name}"
             target = node.get("_target_")
             if target is not None:
+                _check(_Entry(f"{path}._target_", FLAGS["_target_"], target))
                 yield _Part(path, node, locate(target, f"{path}._target_"))
             yield from _parts(node, f"{path}.")
 
@@ -169,7 +170,9 @@ def _rows(found: Callable[..., Any]) -> Mapping[str, Key]:
 def _names(found: Callable[..., Any]) -> list[str] | None:
     """Arguments that a part takes; None if it takes any, or cannot be known."""
     try:
-        parameters = inspect.signature(found).parameters.values()
+        # the classes of some libraries' metaclasses show only what those take
+        takes = found.__init__ if inspect.isclass(found) else found
+        parameters = inspect.signature(takes).parameters.values()
     except (TypeError, ValueError):
         return None
     if any(parameter.kind is parameter.VAR_KEYWORD for parameter in parameters):
@@ -200,7 +203,7 @@ def _shown(value: Any) -> str:
     """A value as it is written on a command line, cut if it is long."""
     written = {None: "null", True: "true", False: "false"}
     is_word = value is None or isinstance(value, bool)
-    shown = written[value] if is_word else str(value)
+    shown = written[value] if is_word else " ".join(str(value).split())
     return shown if len(shown) <= 80 else f"{shown[:80]}…"
 
 

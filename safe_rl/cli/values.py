@@ -7,8 +7,18 @@ from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
 __all__ = [
-    *("Values", "anything", "boolean", "choice", "component", "count", "list_of", "mapping_of"),
-    *("number", "one_or_per_cost", "optional", "text"),
+    *(
+        "Values",
+        "anything",
+        "boolean",
+        "choice",
+        "component",
+        "count",
+        "folder_name",
+        "list_of",
+        "mapping_of",
+    ),
+    *("mapping_of", "number", "one_or_per_cost", "optional", "text"),
 ]
 
 
@@ -106,6 +116,7 @@ def one_or_per_cost(values: Values) -> Values:
 boolean = Values(lambda value: isinstance(value, bool), "true or false")
 text = Values(_is_text, "a text that is not empty")
 anything = Values(lambda value: True, "anything")
+folder_name = Values(lambda v: _is_text(v) and "/" not in v, f"{text.words} and has no /")
 component = Values(
     lambda value: isinstance(value, Mapping) and _is_text(value.get("_target_")),
     "a part with a _target_, as the files in conf/ have it",

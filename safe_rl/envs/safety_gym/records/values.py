@@ -128,6 +128,17 @@ _NOT_NEGATIVE_ENDINGS = (
     *("_num", "_keepout", "_threshold", "_delay", "_travel", "_noise", "_gain"),
     *("reward_clip", "seeds_first"),
 )
+# What memory and time allow: a lidar of more bins, or a picture of more pixels, fills a machine.
+_LARGEST = {
+    "_num": 1000,
+    "num_bins": 10_000,
+    "binom_n": 10_000,
+    "vision_size": 4096,
+    "vision_render_size": 4096,
+    "layout_seeds": LARGEST_SEED,
+    "layout_seeds_first": LARGEST_SEED,
+}
+_LARGEST_OF_ALL = 10**9  # whose square float32 still holds
 
 
 def check_choice(key: str, value: Any, choices: Collection[Any]) -> None:
@@ -142,16 +153,23 @@ def check_choice(key: str, value: Any, choices: Collection[Any]) -> None:
 
 
 def _check_range(key: str, value: Any) -> None:
-    values = value if isinstance(value, tuple) else (value,)
-    numbers = [x for x in values if isinstance(x, int | float) and not isinstance(x, bool)]
+    numbers = _numbers(value)
     if key.endswith(_POSITIVE_ENDINGS) and not all(x > 0 for x in numbers):
         raise _wrong(key, "greater than 0", value)
     if key.endswith(_NOT_NEGATIVE_ENDINGS) and not all(x >= 0 for x in numbers):
         raise _wrong(key, "0 or more", value)
+    largest = next((_LARGEST[end] for end in _LARGEST if key.endswith(end)), _LARGEST_OF_ALL)
+    if not all(abs(x) <= largest for x in numbers):
+        raise _wrong(key, f"at most {largest:,}", value)
     if key == "frameskip_binom_p" and not 0.0 <= value <= 1.0:
         raise _wrong(key, "a probability between 0 and 1", value)
-    if key.startswith("layout_seeds") and not all(x <= LARGEST_SEED for x in numbers):
-        raise _wrong(key, f"at most {LARGEST_SEED}", value)
+
+
+def _numbers(value: Any) -> list[float]:
+    """The numbers in a value, also in lists of lists."""
+    if isinstance(value, tuple):
+        return [number for item in value for number in _numbers(item)]
+    return [value] if isinstance(value, int | float) and not isinstance(value, bool) else []
 
 
 def _check_rectangles(key: str, value: Any) -> None:

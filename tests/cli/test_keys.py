@@ -1,0 +1,239 @@
+"""Every key of a configuration has a row, and no value whatever ends in a traceback."""
+
+import inspect
+import math
+from collections.abc import Iterator
+from typing import Any
+
+import pytest
+from hydra import compose, initialize_config_dir
+from omegaconf import OmegaConf
+from point_mass import PointMass
+from run_configs import CONF
+
+import safe_rl.algorithms
+import safe_rl.collectors
+import safe_rl.objectives
+import safe_rl.runs.loggers
+from safe_rl.algorithms import OnPolicy
+from safe_rl.cli.keys import KEYS, PARTS
+from safe_rl.cli.settings import SettingError, check_settings, plain
+from safe_rl.cli.values import anything
+from safe_rl.envs import ConfigError, SafetyGymConfig, resolve
+from safe_rl.targets import TargetError
+
+ALGORITHMS = sorted(path.stem for path in (CONF / "algo").glob("*.yaml"))
+HOMES = (safe_rl.algorithms, safe_rl.collectors, safe_rl.objectives, safe_rl.runs.loggers)
+# what recipes, collectors and run folders hand to a part themselves
+LIVE = {
+    *("self", "loss", "actor_network", "multiplier", "value_network", "cost_keys", "cost_limits"),
+    *("env", "make_env", "policy", "frames_per_batch", "device", "log_dir", "kwargs"),
+}
+FREE = {path for path, row in KEYS.items() if row.values is anything}
+WRONG: list[Any] = [
+    *("abc", "", " ", "nan", "a\nb", None, True, False, math.nan, math.inf, -math.inf),
+    *(-1, 0, 0.5, 1.5, 2, 1e-300, 1e9, 1e300, -1e300, 10**30, -(10**30)),
+    *([], {}, [math.nan], [1], ["a"], [[]], {"a": math.nan}, {"a": 1}, {"_target_": "os.system"}),
+]
+NOT_FINITE = [value for value in WRONG if isinstance(value, float) and not math.isfinite(value)]
+
+
+@pytest.fixture(scope="module")
+def configs(few_environments) -> dict[tuple[str, str], Any]:
+    """Configurations of all algorithms with both presets, for the point mass."""
+    configs = {}
+    with initialize_config_dir(str(CONF), version_base="1.3"):
+        for algo in ALGORITHMS:
+            for preset, logger in (("default", "tensorboard"), ("paper", "none")):
+                choices = [f"algo={algo}", f"preset={preset}", f"logger={logger}", "env=PointMass"]
+                configs[algo, preset] = compose("config", [*choices, "model.hidden_sizes=[4]"])
+    return configs
+
+
+def leaves(node: Any, path: str = "") -> Iterator[str]:
+    """Full paths of a configuration's values, and of what holds them."""
+    for key, value in node.items():
+        if path or key != "env":
+            yield f"{path}{key}"
+            if isinstance(value, dict):
+                yield from leaves(value, f"{path}{key}.")
+
+
+@pytest.mark.parametrize("part", sorted(set(PARTS) - {"torch.optim"}))
+def test_rows_are_the_arguments_of_the_part(part):
+    found = next(getattr(home, part) for home in HOMES if hasattr(home, part))
+    takes = found.__init__ if inspect.isclass(found) else found
+    arguments = set(inspect.signature(takes).parameters) - LIVE
+    if part == "WandbLogger":
+        arguments |= {"exp_name", "project", "offline"}
+    assert set(PARTS[part]) == arguments
+
+
+def test_every_key_of_every_file_has_a_row(configs):
+    targets = set()
+    for config in configs.values():
+        for path in leaves(plain(config)):
+            if path.endswith("_target_") or path.split(".")[0] in ("algo", "paper"):
+                continue
+            node, _, name = path.rpartition(".")
+            target = OmegaConf.select(config, f"{node}._target_") if node else None
+            known = PARTS.get(str(target).rpartition(".")[2], {})
+            is_optimiser = str(target).startswith("torch.optim.")
+            is_within = node in ("cost_limits", "default_cost_limits", "model.input_scale")
+            assert (
+                path in KEYS or name in known or is_within or (is_optimiser and name[0] == "_")
+            ) or name in PARTS["torch.optim"], path
+            targets.add(target)
+    assert len(targets) > 8
+
+
+def outcome(config: Any, path: str, value: Any) -> str:
+    """What a value of a key leads to: the words of a refusal, or nothing."""
+    changed = config.copy()
+    OmegaConf.update(changed, path, value, merge=False, force_add=True)
+    try:
+        check_settings(changed)
+    except (SettingError, ConfigError, TargetError) as error:
+        return str(error)
+    try:
+        OnPolicy.build(changed, PointMass(2))
+    except ValueError as error:  # what parts have to say about two keys together
+        return " ".join(str(error).split())
+    return ""
+
+
+def keys_of(configs) -> Iterator[tuple[Any, str]]:
+    """Every key of every part once, with a configuration that has it."""
+    seen = set()
+    for config in configs.values():
+        values = plain(config)
+        for path in leaves(values):
+            part = OmegaConf.select(config, f"{path.rpartition('.')[0]}._target_")
+            if (path, part) not in seen and not path.startswith(("paper.", "algo._")):
+                seen.add((path, part))
+                yield config, path
+
+
+def test_no_value_ends_in_a_traceback(configs):
+    accepted: dict[str, list[Any]] = {}
+    for config, path in keys_of(configs):
+        for value in WRONG:
+            words = outcome(config, path, value)
+            assert len(words.splitlines()) <= 1, words
+            if not words:
+                accepted.setdefault(path, []).append(value)
+    assert len(accepted) > 50
+    for path in set(accepted) - FREE:
+        assert not [v for v in accepted[path] if v in NOT_FINITE or v != v], path
+    # the sieve is neither closed nor open
+    assert 0.5 in accepted["advantage.gamma"]
+    assert 1.5 not in accepted["advantage.gamma"]
+    assert accepted["compile"] == [True, False]
+
+
+@pytest.mark.parametrize(
+    ("path", "value", "words"),
+    [
+        ("advantage.gamma", 2, "advantage.gamma=2: it must be a number from 0 to 1 (discount"),
+        ("advantage.lmbda", 1.5, "advantage.lmbda=1.5: it must be a number from 0 to 1"),
+        (
+            "policy_update.num_passes",
+            1.5,
+            "policy_update.num_passes=1.5: it must be a whole number",
+        ),
+        ("policy_update.max_kl", -1, "policy_update.max_kl=-1: it must be a number above 0"),
+        ("policy_update.adapt_rate", 3, "policy_update.adapt_rate=3: it must be a part"),
+        ("policy_update.optimizer.lr", "abc", "policy_update.optimizer.lr=abc: it must be"),
+        ("policy_update.adapt_rate.factor", 1, "adapt_rate.factor=1: it must be a number above 1"),
+        ("loss.clip_epsilon", math.nan, "loss.clip_epsilon=nan: it must be"),
+        ("lagrangian.scale", "foo", "lagrangian.scale=foo: it must be limit, or a number"),
+        ("lagrangian.kp", -1, "lagrangian.kp=-1: it must be a number from 0"),
+        ("model.initial_log_std", None, "model.initial_log_std=null: it must be"),
+        ("model.input_scale", 3, "model.input_scale=3: it must be a mapping"),
+        ("model.hidden_sizes", [10**9], "model.hidden_sizes=[1000000000]: it must be a list"),
+        ("init_from", 3, "init_from=3: it must be a text"),
+        ("collector.num_collectors", 0, "collector.num_collectors=0: it must be"),
+        ("collector.num_collectors", 4, "use collector=process or collector=ray"),
+        (
+            "num_threads",
+            1_000_000,
+            "num_threads=1000000: it must be a whole number from 1 to",
+        ),
+        ("num_envs", 10**9, "num_envs=1000000000: this takes 20,000 GB of memory at least"),
+        ("frames_per_batch", 1e12, "frames_per_batch=1000000000000.0: this takes 50,000 GB"),
+        ("seed", 1e30, "seed=1e+30: it must be a whole number from 0 to"),
+        ("compile", "maybe", "compile=maybe: it must be true or false"),
+        ("device", "mps", "device=mps: it must be cpu, cuda or cuda:<number>"),
+        ("device", "meta", "device=meta: it must be"),
+        ("device", "cuda:99", "device=cuda:99: this torch finds"),
+        ("env.name", "", "env.name=: it must be a text"),
+        ("env.name", "a/b", "env.name=a/b: it must be"),
+        ("cost_limits", {"cost": math.inf}, "cost_limits={'cost': inf}: it must be a mapping"),
+        ("loss._target_", "torch.load", "loss._target_=torch.load: configurations reach only"),
+        ("lagrangian.kpp", 1, "lagrangian.kpp: nothing reads this key. Did you mean 'lagr"),
+    ],
+)
+def test_refusals_name_the_key_and_what_it_may_hold(configs, path, value, words):
+    assert words in outcome(configs["ppo_lagrangian", "default"], path, value)
+
+
+@pytest.mark.parametrize(
+    ("path", "node", "extra"),
+    [
+        ("logger", {"_target_": "safe_rl.runs.loggers.WandbLogger", "exp_name": "x"}, "wandb"),
+        ("logger", {"_target_": "safe_rl.runs.loggers.MLflowLogger", "exp_name": "x"}, "mlflow"),
+        ("collector", {"_target_": "safe_rl.collectors.make_ray_collector",
+                       "num_collectors": 2, "ray_init": {}, "resources": {}}, "ray"),
+    ],
+)  # fmt: skip
+def test_missing_extras_are_named(configs, monkeypatch, path, node, extra):
+    monkeypatch.setattr("safe_rl.extras.find_spec", lambda name: None)
+    words = outcome(configs["ppo", "default"], path, node)
+    assert words.startswith(f"{path}: This needs the package '{extra}'")
+    assert words.endswith(f"[{extra}]'")
+
+
+def test_whole_numbers_may_be_written_with_exponents(configs):
+    config = configs["ppo", "default"].copy()
+    config.frames, config.policy_update.num_passes = 3e5, 1e1
+    config.model.hidden_sizes = [8.0]
+    check_settings(config)
+    values = [config.frames, config.policy_update.num_passes, config.model.hidden_sizes[0]]
+    assert [repr(value) for value in values] == ["300000", "10", "8"]
+
+
+class OwnMultiplier(safe_rl.objectives.PIDMultiplier):
+    """A part of one's own, with an argument more."""
+
+    def __init__(self, cost_limits, *, patience, **kwargs):
+        super().__init__(cost_limits, **kwargs)
+
+
+class OwnLoss(safe_rl.objectives.PPOLoss):
+    """A part of one's own that takes what it inherits."""
+
+
+def test_parts_of_ones_own_are_checked_by_what_they_inherit(configs, monkeypatch):
+    monkeypatch.setattr("safe_rl.targets._users_modules", {__name__})
+    config = configs["ppo_lagrangian", "default"].copy()
+    config.lagrangian._target_ = f"{__name__}.OwnMultiplier"
+    config.loss._target_ = f"{__name__}.OwnLoss"
+    OmegaConf.update(config, "lagrangian.patience", "anything", force_add=True)
+    check_settings(config)
+    for path, value in {"lagrangian.kp": math.nan, "loss.clip_epsilon": -1}.items():
+        assert f"{path}={value}: it must be" in outcome(config, path, value)
+    assert "loss.epsilon: nothing reads" in outcome(config, "loss.epsilon", 1)
+
+
+@pytest.mark.parametrize("key", sorted(SafetyGymConfig().to_dict()))
+def test_environments_refuse_in_a_line(key):
+    for value in WRONG:
+        try:
+            resolve({"robot_base": "point", key: value})
+        except ConfigError as error:
+            words = str(error)
+            assert key in words
+        else:
+            assert value not in NOT_FINITE
+            assert value == value
+            assert not isinstance(value, int | float) or abs(value) <= 1e9
