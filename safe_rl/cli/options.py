@@ -9,7 +9,8 @@ from collections.abc import Sequence
 from dataclasses import MISSING, fields
 from typing import TYPE_CHECKING, TypeVar
 
-from omegaconf import OmegaConf
+import yaml
+from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from safe_rl.naming import did_you_mean
@@ -66,10 +67,23 @@ def parse_options(arguments: Sequence[str], schema: type[Schema]) -> Schema:
             )
     try:
         given = OmegaConf.from_dotlist(list(arguments))
+        _check_switches(given, schema)
         merged = OmegaConf.merge(OmegaConf.structured(schema), given)
         return OmegaConf.to_object(merged)  # type: ignore[return-value]
     except OmegaConfBaseException as error:
         raise OptionError(f"{str(error).splitlines()[0]} (option '{error.full_key}')") from error
+    except yaml.YAMLError as error:
+        words = " ".join(str(error).split())
+        raise OptionError(f"{' '.join(arguments)}: a value cannot be read: {words}") from error
+
+
+def _check_switches(given: DictConfig, schema: type[DataclassInstance]) -> None:
+    """OmegaConf takes every number for a boolean."""
+    for field in fields(schema):
+        value = given.get(field.name)
+        is_number = isinstance(value, int | float) and not isinstance(value, bool)
+        if isinstance(field.default, bool) and is_number:
+            raise OptionError(f"{field.name}={value}: it must be true or false.")
 
 
 def usage(command: str, schema: type[DataclassInstance]) -> str:

@@ -11,7 +11,6 @@ from itertools import chain
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import torch
 from hydra.errors import InstantiationException
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
@@ -19,6 +18,7 @@ from torchrl.checkpoint import CheckpointError
 
 from safe_rl.cli.keys import EXTRAS, FLAGS, KEYS, PARTS, Key
 from safe_rl.envs import resolve
+from safe_rl.evaluation.settings import check_device
 from safe_rl.extras import require_extra
 from safe_rl.naming import did_you_mean
 from safe_rl.runs.folder import RunFolder
@@ -31,7 +31,6 @@ __all__ = [
 
 _MISSING = object()
 _SECTIONS = ("algo", "checkpoint", "collector", "logger", "model")
-_DEVICES = ("cpu", "cuda")
 
 
 class SettingError(ValueError):
@@ -77,7 +76,10 @@ def check_settings(config: DictConfig) -> None:
         _check_extra(part)
     for path, known in _unread_keys(values):
         raise SettingError(f"{path}: nothing reads this key.{did_you_mean(path, known)}")
-    _check_device(values["device"])
+    try:
+        check_device(values["device"])
+    except ValueError as error:
+        raise SettingError(str(error)) from None
     _check_collector(values["collector"])
     _check_env(values["env"])
 
@@ -211,19 +213,6 @@ def _whole(value: Any) -> Any:
     if isinstance(value, list):
         return [_whole(item) for item in value]
     return int(value) if isinstance(value, float) else value
-
-
-def _check_device(device: str) -> None:
-    try:
-        kind, index = torch.device(device).type, torch.device(device).index or 0
-    except RuntimeError:
-        kind, index = "", 0
-    if kind not in _DEVICES:
-        raise SettingError(f"device={_shown(device)}: it must be cpu, cuda or cuda:<number>.")
-    if kind == "cuda" and index >= torch.cuda.device_count():
-        raise SettingError(
-            f"device={device}: this torch finds {torch.cuda.device_count()} CUDA devices."
-        )
 
 
 def _check_collector(node: Mapping[str, Any]) -> None:

@@ -5,9 +5,19 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Any
 
+import torch
+
 from safe_rl.scores.intervals import check_share
 
-__all__ = ["EvaluationOptions", "check_options"]
+__all__ = ["EvaluationOptions", "check_device", "check_options"]
+
+# Threads beyond it are not to be had, and worlds fill the memory.
+_RANGES = {
+    "episodes": (1, 10**8),
+    "num_envs": (1, 100_000),
+    "num_threads": (0, 1024),
+    "seed": (0, 2**62),
+}
 
 
 def _option(default: Any, help: str) -> Any:
@@ -53,8 +63,32 @@ def check_options(options: EvaluationOptions) -> None:
     Raises:
         ValueError: If an option is out of its range; the message names it.
     """
-    for name in ("episodes", "num_envs"):
+    for name, (lowest, highest) in _RANGES.items():
         value = getattr(options, name)
-        if value < 1:
-            raise ValueError(f"{name}={value}: at least 1.")
+        if value is not None and not lowest <= value <= highest:
+            raise ValueError(f"{name}={value}: at least {lowest} and at most {highest:,}.")
     check_share(options.cvar_alpha)
+    if "/" in options.name or not options.name.isprintable():
+        raise ValueError(f"name={options.name}: it is part of the files' names, without /.")
+    if not options.video and options.camera != EvaluationOptions.camera:
+        raise ValueError(f"camera={options.camera}: it is the video's: add video=true.")
+    check_device(options.device)
+
+
+def check_device(device: str) -> None:
+    """Refuse devices that networks cannot be on, here or anywhere.
+
+    Raises:
+        ValueError: If there is none of the name.
+
+    Examples:
+        >>> check_device("cpu")
+    """
+    try:
+        kind, index = torch.device(device).type, torch.device(device).index or 0
+    except RuntimeError:
+        kind, index = "", 0
+    if kind not in ("cpu", "cuda"):
+        raise ValueError(f"device={device}: it must be cpu, cuda or cuda:<number>.")
+    if kind == "cuda" and index >= torch.cuda.device_count():
+        raise ValueError(f"device={device}: torch finds {torch.cuda.device_count()} CUDA devices.")

@@ -165,7 +165,7 @@ def test_no_value_ends_in_a_traceback(configs):
         ("compile", "maybe", "compile=maybe: it must be true or false"),
         ("device", "mps", "device=mps: it must be cpu, cuda or cuda:<number>"),
         ("device", "meta", "device=meta: it must be"),
-        ("device", "cuda:99", "device=cuda:99: this torch finds"),
+        ("device", "cuda:99", "device=cuda:99: torch finds"),
         ("env.name", "", "env.name=: it must be a text"),
         ("env.name", "a/b", "env.name=a/b: it must be"),
         ("cost_limits", {"cost": math.inf}, "cost_limits={'cost': inf}: it must be a mapping"),

@@ -5,6 +5,7 @@ from dataclasses import fields
 
 import pytest
 
+from safe_rl.cli.evaluate import evaluate_run
 from safe_rl.cli.options import OptionError, parse_options, usage
 from safe_rl.evaluation.settings import EvaluationOptions
 from safe_rl.extras import import_extra
@@ -28,12 +29,34 @@ def test_values_are_read_with_their_types():
         ("epsiodes=3", "Unknown option 'epsiodes'. Did you mean 'episodes'?"),
         ("episodes", "'episodes' is not an option: options are written key=value"),
         ("episodes=many", "'many'.*option 'episodes'"),
-        ("video=7.5", "option 'video'"),
+        ("video=7.5", "video=7.5: it must be true or false"),
+        ("deterministic=2", "deterministic=2: it must be true or false"),
+        ("episodes=nan", "'nan'.*option 'episodes'"),
+        ("episodes=[1", "a value cannot be read"),
     ],
 )
 def test_errors_say_what_to_write(argument, message):
     with pytest.raises(OptionError, match=message):
         parse_options([argument], EvaluationOptions)
+
+
+@pytest.mark.parametrize(
+    ("argument", "message"),
+    [
+        ("episodes=0", "episodes=0: at least 1"),
+        ("num_envs=1000000000", "num_envs=1000000000: .* at most 100,000"),
+        ("num_threads=1000000", "num_threads=1000000: .* at most 1,024"),
+        ("seed=-1", "seed=-1: at least 0"),
+        ("name=a/b", "name=a/b: .*without /"),
+        ("camera=track", r"camera=track: it is the video's: add video=true\."),
+        ("device=meta", "device=meta: it must be cpu, cuda or"),
+        ("cvar_alpha=nan", "nan"),
+    ],
+)
+def test_options_are_checked_before_anything_is_done(tmp_path, argument, message):
+    options = parse_options([argument], EvaluationOptions)
+    with pytest.raises(ValueError, match=message):
+        evaluate_run(tmp_path / "no run at all", options)
 
 
 def test_the_help_has_every_option_and_its_default():
