@@ -80,7 +80,7 @@ FLOORS = {
         ("keys", "distributions", "samples", "gae", "cpo_dual"),
         ("advantages", "critics", "multipliers", "normalisation", "trust_region"),
         ("pid", "surrogate", "fisher"),
-        ("cpo", "ppo", "trpo"),
+        ("actor_critic", "cpo", "ppo", "trpo"),
         ("",),
     ),
     "collectors": (("accounting", "factory", "workers"), ("",)),
@@ -88,7 +88,7 @@ FLOORS = {
     "algorithms": (
         ("contract", "constraints", "learning_rate", "trust_region_step"),
         ("cpo_step", "minibatch", "parts"),
-        ("on_policy",),
+        ("on_policy", "torchrl_trainers"),
         ("",),
     ),
     "runs": (

@@ -7,9 +7,11 @@ Everything here works on TensorDict keys alone and knows no environment:
 - `PPOLoss`, `PPOLagrangianLoss`: policy losses for an optimiser;
 - `TRPOLoss`, `TRPOLagrangianLoss`, `CPOLoss`: policy losses for the steps of `safe_rl.algorithms`,
   whose mathematics is in `safe_rl.objectives.trust_region` and `safe_rl.objectives.cpo_dual`;
-- `CriticLoss`: squared errors of the reward and the cost critic.
+- `CriticLoss`: squared errors of the reward and the cost critic;
+- `ActorCriticLoss`, `JointAdvantages`: all losses and estimators as one, for TorchRL's trainers.
 """
 
+from safe_rl.objectives.actor_critic import ActorCriticLoss, JointAdvantages
 from safe_rl.objectives.advantages import CostGAE, VectorGAE
 from safe_rl.objectives.cpo import CPOLoss
 from safe_rl.objectives.critics import CriticLoss
@@ -21,9 +23,11 @@ from safe_rl.objectives.surrogate import SurrogateLoss
 from safe_rl.objectives.trpo import TRPOLagrangianLoss, TRPOLoss
 
 __all__ = [
+    "ActorCriticLoss",
     "CPOLoss",
     "CostGAE",
     "CriticLoss",
+    "JointAdvantages",
     "LagrangeMultiplier",
     "Multiplier",
     "PIDMultiplier",

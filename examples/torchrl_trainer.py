@@ -1,0 +1,152 @@
+"""Train with TorchRL's own trainers: its `PPOTrainer`, and a `Trainer` that takes CPO steps.
+
+    python examples/torchrl_trainer.py --algo ppo_lagrangian --env PointGoal1 --frames 300_000
+    python examples/torchrl_trainer.py --algo cpo
+
+Loss, advantages, constraints and steps are this package's; loop, buffer, logging hooks and
+checkpoints are TorchRL's. `train.py` does all of it, and more, from configurations.
+"""
+
+from __future__ import annotations
+
+import argparse
+import functools
+import warnings
+from collections.abc import Mapping
+
+import torch
+from torchrl.data import LazyTensorStorage, ReplayBuffer, SamplerWithoutReplacement
+from torchrl.envs import EnvBase
+from torchrl.trainers import Trainer
+from torchrl.trainers.algorithms import PPOTrainer
+from torchrl.trainers.trainers import ValueEstimatorHook
+
+from safe_rl.algorithms import Constraints, CPOStep, MinibatchUpdate
+from safe_rl.algorithms.torchrl_trainers import ConstraintHook, UpdateStepper
+from safe_rl.collectors import EpisodeAccounting, make_collector
+from safe_rl.envs import SafetyGymEnv
+from safe_rl.models import make_actor, make_critic
+from safe_rl.objectives import (
+    ActorCriticLoss,
+    CostGAE,
+    CPOLoss,
+    CriticLoss,
+    JointAdvantages,
+    LagrangeMultiplier,
+    PPOLagrangianLoss,
+    VectorGAE,
+)
+
+DISCOUNT = {"gamma": 0.99, "lmbda": 0.97, "value_target": "lambda_return"}
+
+
+class Parts:
+    """What both trainers share, for an environment and limits by cost key."""
+
+    def __init__(self, env: EnvBase, limits: Mapping[str, float], frames_per_batch: int) -> None:
+        size, keys = env.observation_spec["observation"].shape[-1], list(limits)
+        layers = {"hidden_sizes": [64, 64], "device": env.device}
+        self.actor = make_actor(size, env.action_spec.shape[-1], initial_log_std=-0.5, **layers)
+        critic = make_critic(size, **layers)
+        cost_critic = make_critic(size, num_outputs=len(keys), out_key="cost_value", **layers)
+        self.critic_loss = CriticLoss(critic, cost_critic)
+        self.advantages = JointAdvantages(
+            VectorGAE(critic, **DISCOUNT), CostGAE(keys, cost_critic, **DISCOUNT)
+        )
+        self.accounting = EpisodeAccounting(env.batch_size.numel(), keys, device=env.device)
+        self.collector = make_collector(env, self.actor, frames_per_batch=frames_per_batch)
+
+
+def ppo_lagrangian_trainer(
+    env: EnvBase, limits: Mapping[str, float], frames: int, frames_per_batch: int
+) -> PPOTrainer:
+    """TorchRL's PPO trainer on the Lagrangian."""
+    parts = Parts(env, limits, frames_per_batch)
+    multiplier = LagrangeMultiplier(limits, init=1.0, lr=0.05)
+    policy_loss = PPOLagrangianLoss(parts.actor, multiplier, clip_epsilon=0.2, entropy_coeff=0.0)
+    loss = ActorCriticLoss(policy_loss, parts.critic_loss, critic_coeff=1.0)
+    buffer = ReplayBuffer(
+        storage=LazyTensorStorage(frames_per_batch),
+        sampler=SamplerWithoutReplacement(),
+        batch_size=frames_per_batch // 5,
+    )
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # TorchRL calls its trainers experimental
+        trainer = PPOTrainer(
+            collector=parts.collector,
+            total_frames=frames,
+            frame_skip=1,
+            optim_steps_per_batch=None,  # passes of the whole buffer
+            loss_module=loss,
+            optimizer=torch.optim.Adam(loss.parameters(), lr=3e-4),
+            replay_buffer=buffer,
+            num_epochs=4,
+            gae=parts.advantages,
+            progress_bar=False,
+        )
+    ConstraintHook(Constraints(limits, multiplier=multiplier), parts.accounting).register(trainer)
+    return trainer
+
+
+def cpo_trainer(
+    env: EnvBase, limits: Mapping[str, float], frames: int, frames_per_batch: int
+) -> Trainer:
+    """TorchRL's trainer with a CPO step in place of its optimiser."""
+    parts = Parts(env, limits, frames_per_batch)
+    constraints = Constraints(limits)
+    policy_loss = CPOLoss(parts.actor, entropy_coeff=0.0)
+    step = CPOStep(
+        policy_loss,
+        rescale_violation=True,
+        target_kl=0.01,
+        damping=0.1,
+        cg_iterations=10,
+        backtrack_coeff=0.8,
+        max_backtracks=10,
+    )
+    critic_update = MinibatchUpdate(
+        parts.critic_loss,
+        optimizer=functools.partial(torch.optim.Adam, lr=1e-3),
+        num_passes=10,
+        minibatch_size=frames_per_batch // 5,
+    )
+    trainer = Trainer(
+        collector=parts.collector,
+        total_frames=frames,
+        frame_skip=1,
+        optim_steps_per_batch=1,
+        loss_module=ActorCriticLoss(policy_loss, parts.critic_loss, critic_coeff=1.0),
+        optimization_stepper=UpdateStepper(step, critic_update, constraints),
+        progress_bar=False,
+    )
+    ConstraintHook(constraints, parts.accounting).register(trainer)
+    ValueEstimatorHook(parts.advantages).register(trainer)
+    return trainer
+
+
+TRAINERS = {"ppo_lagrangian": ppo_lagrangian_trainer, "cpo": cpo_trainer}
+
+
+def main(arguments: list[str] | None = None) -> Trainer:
+    """Train, print a line per batch in which episodes ended, and return the trainer."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--algo", choices=TRAINERS, default="ppo_lagrangian")
+    parser.add_argument("--env", default="PointGoal1")
+    parser.add_argument("--limit", type=float, default=25.0)
+    parser.add_argument("--frames", type=int, default=200_000)
+    parser.add_argument("--frames-per-batch", type=int, default=20_000)
+    parser.add_argument("--num-envs", type=int, default=20)
+    parser.add_argument("--seed", type=int, default=0)
+    args = parser.parse_args(arguments)
+    torch.manual_seed(args.seed)
+    env = SafetyGymEnv(args.env, num_envs=args.num_envs, seed=args.seed)
+    trainer = TRAINERS[args.algo](env, {"cost": args.limit}, args.frames, args.frames_per_batch)
+    trainer.train()
+    history = trainer._log_dict
+    for row in zip(history["episode_return"], history["episode_cost"], strict=True):
+        print("J_r {:.2f}, J_c {:.1f}".format(*row))
+    return trainer
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,154 @@
+"""Constraints and updates as parts of TorchRL's own `Trainer`.
+
+`examples/torchrl_trainer.py` puts them together, with its `PPOTrainer` and with a `CPOStep`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torchrl.trainers import Trainer
+from torchrl.trainers.trainers import OptimizationStepper, TrainerHookBase
+
+from safe_rl.algorithms.constraints import Constraints
+from safe_rl.algorithms.contract import PolicyUpdate
+from safe_rl.algorithms.minibatch import MinibatchUpdate
+from safe_rl.collectors import EpisodeAccounting
+
+__all__ = ["ConstraintHook", "UpdateStepper"]
+
+
+class ConstraintHook(TrainerHookBase):
+    """Shows every collected batch to the constraints, which move their multiplier.
+
+    Registered with a trainer it runs before anything is learnt from a batch, and logs returns,
+    costs, violations and multipliers.
+
+    Args:
+        constraints: what is limited; its multiplier, if any, is the one that the loss reads.
+        accounting: sums costs and rewards of the collector's batches over episodes.
+
+    Examples:
+        >>> accounting = EpisodeAccounting(num_envs=1, cost_keys=["cost"])
+        >>> hook = ConstraintHook(Constraints({"cost": 1.0}), accounting)
+        >>> done = torch.tensor([[[False], [True]]])
+        >>> step = {"reward": torch.ones(1, 2, 1), "cost": torch.ones(1, 2, 1), "done": done}
+        >>> _ = hook(TensorDict({"next": step}, [1, 2]))
+        >>> hook.constraints.violation
+        tensor([1.])
+    """
+
+    def __init__(self, constraints: Constraints, accounting: EpisodeAccounting) -> None:
+        self.constraints, self.accounting = constraints, accounting
+        self._row: dict[str, float] = {}
+
+    def __call__(self, batch: TensorDictBase) -> TensorDictBase:
+        """Account for a batch [N, T] or [T]; it stays as it is."""
+        episodes = self.accounting.update(batch)
+        self.constraints.observe(episodes, batch.shape[-1])
+        self._row = episodes.scalars() | self.constraints.columns()
+        return batch
+
+    def log(self, batch: TensorDictBase) -> dict[str, float]:
+        """What is worth logging about the last batch."""
+        del batch
+        return self._row
+
+    def state_dict(self) -> dict[str, Any]:
+        """Open episodes, last known costs and multiplier."""
+        return {name: part.state_dict() for name, part in self._parts().items()}
+
+    def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
+        """Continue from :meth:`state_dict`."""
+        for name, part in self._parts().items():
+            part.load_state_dict(state_dict[name])
+
+    def _parts(self) -> dict[str, Any]:
+        parts = {
+            "accounting": self.accounting,
+            "constraints": self.constraints,
+            "multiplier": self.constraints.multiplier,
+        }
+        return {name: part for name, part in parts.items() if part is not None}
+
+    def register(self, trainer: Trainer, name: str = "constraints") -> None:
+        """Add the hook to a trainer, for every batch, its log and its checkpoints."""
+        trainer.register_op("batch_process", self)
+        trainer.register_op("pre_steps_log", self.log)
+        trainer.register_module(name, self)
+
+
+class UpdateStepper(OptimizationStepper):
+    """A trust-region step, or another of our updates, as a trainer's optimisation step.
+
+    It takes the batch as the trainer hands it over: without a replay buffer the whole collected
+    batch, to which a trust-region step belongs, with ``optim_steps_per_batch=1``.
+
+    Args:
+        policy_update: a `TRPOStep`, a `CPOStep` or a `MinibatchUpdate`.
+        critic_update: fits the critics afterwards, or None.
+        constraints: what a constrained step has to keep, filled by a `ConstraintHook`; or None.
+
+    Examples:
+        >>> from safe_rl.algorithms import TRPOStep
+        >>> from safe_rl.models import make_actor
+        >>> from safe_rl.objectives import TRPOLoss
+        >>> actor = make_actor(3, 2, hidden_sizes=[8], initial_log_std=-0.5)
+        >>> with torch.no_grad():
+        ...     batch = actor(TensorDict(observation=torch.randn(8, 3), batch_size=[8]))
+        >>> batch["advantage"] = torch.randn(8, 1)
+        >>> update = TRPOStep(
+        ...     TRPOLoss(actor, entropy_coeff=0.0),
+        ...     target_kl=0.01,
+        ...     damping=0.1,
+        ...     cg_iterations=10,
+        ...     backtrack_coeff=0.8,
+        ...     max_backtracks=10,
+        ... )
+        >>> bool(UpdateStepper(update).step(None, batch)["kl"] <= 0.01)
+        True
+    """
+
+    def __init__(
+        self,
+        policy_update: PolicyUpdate,
+        critic_update: MinibatchUpdate | None = None,
+        constraints: Constraints | None = None,
+    ) -> None:
+        self.policy_update, self.critic_update = policy_update, critic_update
+        self.constraints = Constraints({}) if constraints is None else constraints
+
+    def step(self, trainer: Trainer | None, sub_batch: TensorDictBase) -> TensorDictBase:
+        """Improve policy and critics on a batch.
+
+        Args:
+            trainer: not asked for anything.
+            sub_batch: data with advantages and value targets, any shape.
+
+        Returns:
+            What the updates report, as scalars: one per constraint of what there is per constraint.
+        """
+        del trainer
+        known = self.constraints
+        rows = [self.policy_update(sub_batch, known.violation, known.episode_length)]
+        if self.critic_update is not None:
+            rows.append({f"critic_{k}": v for k, v in self.critic_update(sub_batch).items()})
+        scalars: dict[str, float] = {}
+        for row in rows:
+            for name, value in row.items():
+                scalars |= known.column(name, torch.as_tensor(value))
+        return TensorDict({name: torch.tensor(value) for name, value in scalars.items()})
+
+    def state_dict(self) -> dict[str, Any]:
+        """State of both updates."""
+        updates = {"policy_update": self.policy_update, "critic_update": self.critic_update}
+        return {name: part.state_dict() for name, part in updates.items() if part is not None}
+
+    def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
+        """Continue from :meth:`state_dict`."""
+        self.policy_update.load_state_dict(state_dict["policy_update"])
+        if self.critic_update is not None:
+            self.critic_update.load_state_dict(state_dict["critic_update"])

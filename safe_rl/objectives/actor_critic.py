@@ -1,0 +1,168 @@
+"""Policy and critics as TorchRL's trainers want them: one loss, one advantage estimator."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from tensordict import NestedKey, TensorDict, TensorDictBase
+from tensordict.nn import TensorDictModuleBase, dispatch
+from torchrl.objectives import LossModule
+
+from safe_rl.naming import did_you_mean
+from safe_rl.objectives.advantages import CostGAE, VectorGAE
+from safe_rl.objectives.critics import CriticLoss
+from safe_rl.objectives.normalisation import normalise_advantages
+from safe_rl.objectives.surrogate import SurrogateLoss
+
+#: Keys that TorchRL's trainers hand to every loss, and that the estimators read, not the losses.
+_OF_ESTIMATORS = {"reward", "done", "terminated"}
+
+
+class ActorCriticLoss(LossModule):
+    """A policy loss and the loss of the critics as one `LossModule`.
+
+    For `torchrl.trainers.algorithms.PPOTrainer` and others that train policy and critics with one
+    optimiser: they find `actor_network` and `critic_network` here, and their `set_keys`.
+
+    Args:
+        policy_loss: a `PPOLoss`, a `PPOLagrangianLoss` or another `SurrogateLoss`.
+        critic_loss: of the reward critic and, for constraints, the cost critic.
+        critic_coeff: factor of the critics' losses.
+
+    Examples:
+        >>> import torch
+        >>> from safe_rl.objectives import PPOLoss
+        >>> from tensordict.nn import AddStateIndependentNormalScale, TensorDictModule
+        >>> from torchrl.modules import IndependentNormal, ProbabilisticActor
+        >>> net = torch.nn.Sequential(torch.nn.Linear(3, 2), AddStateIndependentNormalScale(2))
+        >>> actor = ProbabilisticActor(
+        ...     TensorDictModule(net, in_keys=["observation"], out_keys=["loc", "scale"]),
+        ...     in_keys=["loc", "scale"],
+        ...     distribution_class=IndependentNormal,
+        ... )
+        >>> critic = TensorDictModule(
+        ...     torch.nn.Linear(3, 1), in_keys=["observation"], out_keys=["state_value"]
+        ... )
+        >>> policy_loss = PPOLoss(actor, clip_epsilon=0.2, entropy_coeff=0.0)
+        >>> loss = ActorCriticLoss(policy_loss, CriticLoss(critic), critic_coeff=1.0)
+        >>> [key for key in loss.out_keys if key.startswith("loss_")]
+        ['loss_objective', 'loss_entropy', 'loss_critic']
+    """
+
+    def __init__(
+        self, policy_loss: SurrogateLoss, critic_loss: CriticLoss, *, critic_coeff: float
+    ) -> None:
+        super().__init__()
+        self.policy_loss, self.critic_loss = policy_loss, critic_loss
+        self.critic_coeff = critic_coeff
+        self.out_keys = [*policy_loss.out_keys, *critic_loss.out_keys]
+
+    @property
+    def actor_network(self) -> TensorDictModuleBase:
+        """The policy."""
+        return self.policy_loss.actor_network
+
+    @property
+    def critic_network(self) -> TensorDictModuleBase:
+        """The reward critic."""
+        return self.critic_loss.critic
+
+    @property
+    def in_keys(self) -> list[NestedKey]:
+        """Entries of the batch that are read."""
+        return list(dict.fromkeys([*self.policy_loss.in_keys, *self.critic_loss.in_keys]))
+
+    def set_keys(self, **kwargs: NestedKey) -> None:
+        """Name entries of the batch; each part takes the names that it knows.
+
+        ``reward``, ``done`` and ``terminated``, which trainers name to every loss, are read by
+        the advantage estimators alone.
+
+        Raises:
+            ValueError: if neither part knows a name.
+        """
+        parts: tuple[LossModule, LossModule] = (self.policy_loss, self.critic_loss)
+        accepted = [set(part._AcceptedKeys.__dataclass_fields__) for part in parts]
+        known = set.union(_OF_ESTIMATORS, *accepted)
+        for name in kwargs:
+            if name not in known:
+                raise ValueError(
+                    f"set_keys() does not know {name!r}.{did_you_mean(name, known)} It knows "
+                    f"{sorted(known)}."
+                )
+        for part, names in zip(parts, accepted, strict=True):
+            part.set_keys(**{name: key for name, key in kwargs.items() if name in names})
+
+    @dispatch
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Evaluate both losses.
+
+        Args:
+            tensordict: batch of any shape with `in_keys`; left as it is.
+
+        Returns:
+            TensorDict with `out_keys`, without batch dimension.
+        """
+        critic = self.critic_loss(tensordict).items()
+        weighed = {
+            name: self.critic_coeff * value if name.startswith("loss_") else value
+            for name, value in critic
+        }
+        return TensorDict({**self.policy_loss(tensordict), **weighed})
+
+
+class JointAdvantages(TensorDictModuleBase):
+    """Advantages of the reward and of the costs, normalised: one call per batch.
+
+    Stands where TorchRL's trainers expect a `GAE`.
+
+    Args:
+        reward: estimator of the reward advantage.
+        cost: estimator of the cost advantages, or None.
+
+    Examples:
+        >>> settings = {"gamma": 0.99, "lmbda": 0.97, "value_target": "lambda_return"}
+        >>> estimator = JointAdvantages(
+        ...     VectorGAE(None, **settings), CostGAE(["cost"], None, **settings)
+        ... )
+        >>> estimator.out_keys
+        ['advantage', 'value_target', 'cost_advantage', 'cost_value_target']
+    """
+
+    def __init__(self, reward: VectorGAE, cost: CostGAE | None = None) -> None:
+        super().__init__()
+        self.reward, self.cost = reward, cost
+
+    @property
+    def _estimators(self) -> list[VectorGAE]:
+        return [part for part in (self.reward, self.cost) if part is not None]
+
+    @property
+    def in_keys(self) -> list[NestedKey]:
+        """Entries of the rollout that are read."""
+        return list(dict.fromkeys(key for part in self._estimators for key in part.in_keys))
+
+    @property
+    def out_keys(self) -> list[NestedKey]:
+        """Entries that are written."""
+        return [key for part in self._estimators for key in part.out_keys]
+
+    def set_keys(self, **kwargs: Any) -> None:
+        """Name entries of the rollout: of the reward's estimator, and where episodes end of both.
+
+        Args:
+            kwargs: as for `VectorGAE`; ``done`` and ``terminated`` go to both estimators.
+        """
+        self.reward.set_keys(**kwargs)
+        if self.cost is not None:
+            ends = {name: kwargs[name] for name in ("done", "terminated") if name in kwargs}
+            self.cost.set_keys(**ends)
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Write advantages and value targets into a rollout [..., T], and return it."""
+        self.reward(tensordict)
+        keys = {"advantage": self.reward.tensor_keys.advantage}
+        if self.cost is not None:
+            self.cost(tensordict)
+            keys["cost_advantage"] = self.cost.tensor_keys.advantage
+        return normalise_advantages(tensordict, **keys)

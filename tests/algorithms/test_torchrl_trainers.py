@@ -1,0 +1,188 @@
+"""TorchRL's trainers with our parts: the example trains, and the parts do what they say."""
+
+import importlib.util
+import warnings
+from pathlib import Path
+
+import pytest
+import torch
+from point_mass import PointMass
+from samples import make_actor, make_batch, make_critic, perturb
+from tensordict import TensorDict
+from torchrl.data import LazyTensorStorage, ReplayBuffer, SamplerWithoutReplacement
+from torchrl.trainers.algorithms import PPOTrainer
+
+from safe_rl import models
+from safe_rl.algorithms import Constraints
+from safe_rl.algorithms.torchrl_trainers import ConstraintHook
+from safe_rl.collectors import EpisodeAccounting, make_collector
+from safe_rl.objectives import (
+    ActorCriticLoss,
+    CostGAE,
+    CriticLoss,
+    JointAdvantages,
+    LagrangeMultiplier,
+    PPOLagrangianLoss,
+    PPOLoss,
+    VectorGAE,
+)
+
+ROOT = Path(__file__).resolve().parents[2]
+LIMITS = {"cost_hazards": 1.0, "cost_north": 0.5}
+SETTINGS = {"gamma": 0.99, "lmbda": 0.97, "value_target": "lambda_return"}
+
+
+@pytest.fixture(scope="module")
+def example():
+    path = ROOT / "examples" / "torchrl_trainer.py"
+    spec = importlib.util.spec_from_file_location("torchrl_trainer", path)
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def weights(module):
+    return [parameter.detach().clone() for parameter in module.parameters()]
+
+
+def test_ppo_lagrangian_in_torchrls_ppo_trainer(example):
+    env = PointMass(num_envs=4, num_steps=20)
+    trainer = example.ppo_lagrangian_trainer(env, LIMITS, frames=480, frames_per_batch=160)
+    loss, before = trainer.loss_module, weights(trainer.loss_module)
+    trainer.train()
+    assert all(not torch.equal(a, b) for a, b in zip(before, weights(loss), strict=True))
+    history = trainer._log_dict
+    assert [len(history[key]) for key in ("episode_return", "optim_steps")] == [3, 3]
+    # 3 batches, 4 passes, 5 minibatches
+    assert history["optim_steps"][-1] >= 60
+    twin = LagrangeMultiplier(LIMITS, init=1.0, lr=0.05)
+    for index in range(3):
+        twin.update([history[f"episode_{key}"][index] for key in LIMITS])
+        for key, value in twin.named_values().items():
+            assert history[f"multiplier_{key}"][index] == pytest.approx(value.item(), rel=1e-5)
+            violation = history[f"episode_{key}"][index] - LIMITS[key]
+            assert history[f"violation_{key}"][index] == pytest.approx(violation, abs=1e-5)
+    torch.testing.assert_close(loss.policy_loss.multiplier.value, twin.value)
+
+
+def test_cpo_steps_in_torchrls_trainer(example):
+    env = PointMass(num_envs=4, num_steps=20)
+    trainer = example.cpo_trainer(env, LIMITS, frames=480, frames_per_batch=160)
+    actor, critics = trainer.loss_module.actor_network, trainer.loss_module.critic_loss
+    before = weights(actor), weights(critics)
+    trainer.train()
+    history = trainer._log_dict
+    assert len(history["kl"]) == 3
+    assert all(0 <= kl <= 0.01 for kl in history["kl"])
+    assert any(fraction > 0 for fraction in history["step_fraction"])
+    for key in LIMITS:
+        # the violation of the very batch, per step, is what the step went by
+        violations = torch.tensor(history[f"violation_{key}"])
+        torch.testing.assert_close(torch.tensor(history[f"c_{key}"]), violations / 20)
+    for old, module in zip(before, (actor, critics), strict=True):
+        assert any(not torch.equal(a, b) for a, b in zip(old, weights(module), strict=True))
+    # what collects is what was trained
+    collecting = dict(trainer.collector.policy.named_parameters())
+    trained = [p for name, p in collecting.items() if "module" in name]
+    assert all(map(torch.equal, trained, weights(actor)))
+
+
+def test_the_trainers_own_gae_and_an_unconstrained_loss():
+    env = PointMass(num_envs=2, num_steps=20)
+    actor = models.make_actor(4, 2, hidden_sizes=[8], initial_log_std=-0.5)
+    critic = models.make_critic(4, hidden_sizes=[8])
+    policy_loss = PPOLoss(actor, clip_epsilon=0.2, entropy_coeff=0.01)
+    loss = ActorCriticLoss(policy_loss, CriticLoss(critic), critic_coeff=0.5)
+    before = weights(loss)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        trainer = PPOTrainer(
+            collector=make_collector(env, actor, frames_per_batch=80),
+            total_frames=160,
+            frame_skip=1,
+            optim_steps_per_batch=None,
+            loss_module=loss,
+            optimizer=torch.optim.Adam(loss.parameters(), lr=1e-3),
+            replay_buffer=ReplayBuffer(
+                storage=LazyTensorStorage(80), sampler=SamplerWithoutReplacement(), batch_size=40
+            ),
+            progress_bar=False,
+        )
+    trainer.train()
+    assert all(not torch.equal(a, b) for a, b in zip(before, weights(loss), strict=True))
+
+
+def make_pair(critic_coeff=0.5):
+    actor = make_actor()
+    batch = make_batch(actor, [16], 2)
+    batch["value_target"], batch["cost_value_target"] = torch.randn(16, 1), torch.randn(16, 2)
+    perturb(actor)
+    multiplier = LagrangeMultiplier([1.0, 1.0], init=[0.5, 2.0], lr=0.05)
+    policy = PPOLagrangianLoss(actor, multiplier, clip_epsilon=0.2, entropy_coeff=0.01)
+    critics = CriticLoss(make_critic(), make_critic("cost_value", 2))
+    return ActorCriticLoss(policy, critics, critic_coeff=critic_coeff), policy, critics, batch
+
+
+def test_the_composite_loss_is_its_parts():
+    loss, policy, critics, batch = make_pair(critic_coeff=0.5)
+    losses, expected, fitted = loss(batch), policy(batch), critics(batch)
+    assert set(losses.keys()) == set(loss.out_keys)
+    for key, value in expected.items():
+        assert torch.equal(losses[key], value)
+    for key, value in fitted.items():
+        weight = 0.5 if key.startswith("loss_") else 1.0
+        torch.testing.assert_close(losses[key], weight * value)
+    assert len(list(loss.parameters())) == len([*policy.parameters(), *critics.parameters()])
+    assert {p.data_ptr() for p in loss.actor_network.parameters()} == {
+        p.data_ptr() for p in policy.parameters()
+    }
+    values = loss(**{key: batch[key] for key in loss.in_keys})
+    torch.testing.assert_close(values[0], losses["loss_objective"])
+
+
+def test_keys_reach_the_part_that_reads_them():
+    loss, policy, critics, _ = make_pair()
+    loss.set_keys(reward="r", done="d", terminated="t", action="a", value_target="v")
+    assert policy.tensor_keys.action == "a"
+    assert critics.tensor_keys.value_target == "v"
+    assert {"a", "v"} <= set(loss.in_keys)
+    with pytest.raises(ValueError, match="Did you mean 'advantage'"):
+        loss.set_keys(advantages="a")
+    cost = CostGAE(["cost"], None, **SETTINGS)
+    estimator = JointAdvantages(VectorGAE(None, **SETTINGS), cost)
+    estimator.set_keys(reward="r", done="d", terminated="t")
+    assert ("next", "r") in estimator.in_keys
+    assert cost.reward_keys == ["cost"]
+    assert (cost.tensor_keys.done, cost.tensor_keys.terminated) == ("d", "t")
+
+
+def costly_batch(cost, done=True):
+    step = {"reward": torch.ones(1, 4, 1), "cost": torch.full((1, 4, 1), cost)}
+    step["done"] = torch.tensor([[[False], [False], [False], [done]]])
+    return TensorDict({"next": step}, [1, 4])
+
+
+def test_the_hook_continues_from_its_state():
+    def make():
+        multiplier = LagrangeMultiplier({"cost": 1.0}, init=1.0, lr=0.1)
+        accounting = EpisodeAccounting(num_envs=1, cost_keys=["cost"])
+        return ConstraintHook(Constraints({"cost": 1.0}, multiplier=multiplier), accounting)
+
+    whole, first, second = make(), make(), make()
+    batches = [costly_batch(1.0), costly_batch(2.0, done=False), costly_batch(0.5)]
+    rows = [whole.log(whole(batch)) for batch in batches]
+    for batch in batches[:2]:
+        first(batch)
+    second.load_state_dict(first.state_dict())
+    assert second.log(second(batches[2])) == rows[2]
+    assert rows[2]["episode_cost"] == 10
+    assert rows[2]["violation_cost"] == 9
+
+
+def test_the_command_of_the_example(example, capsys, monkeypatch):
+    monkeypatch.setattr(
+        example, "SafetyGymEnv", lambda name, num_envs, seed: PointMass(num_envs, 20, seed)
+    )
+    trainer = example.main(["--frames=160", "--frames-per-batch=80", "--num-envs=4"])
+    assert trainer.collected_frames == 160
+    assert capsys.readouterr().out.count("J_r") == 2
