@@ -10,11 +10,11 @@ from pathlib import Path
 import safe_rl.openmp  # noqa: F401, has to come before torch
 
 # isort: split
+from safe_rl.cli.benchmark import suite
 from safe_rl.cli.options import OptionError, parse_options, usage
 from safe_rl.cli.user_code import import_modules, split_imports
-from safe_rl.envs.safety_gym.registration import group_node
-from safe_rl.envs.safety_gym.suite import SUITE
 from safe_rl.reporting import Report, build_report, write_report
+from safe_rl.reporting.recorded import clean
 from safe_rl.scores.published import SEEDS
 
 __all__ = ["ReportOptions", "main", "report"]
@@ -59,8 +59,7 @@ def report(root: Path, options: ReportOptions) -> tuple[Report, Path]:
     """
     if options.seeds < 1:
         raise ValueError(f"seeds={options.seeds}: a slate takes at least one run per environment.")
-    suite = {name: group_node(name, config) for name, config in SUITE.items()}
-    result = build_report(root, suite, seeds_needed=options.seeds, unfinished=options.unfinished)
+    result = build_report(root, suite(), seeds_needed=options.seeds, unfinished=options.unfinished)
     out = root / "report" if options.out is None else Path(options.out)
     return result, write_report(result, out, options.title or root.resolve().name)
 
@@ -80,10 +79,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(f"error: {error}", file=sys.stderr)
         return 1
     for path, reason in result.skipped.items():
-        print(f"left out {path}: {reason}", file=sys.stderr)
-    for slate, runs in result.lacking().items():
-        print(f"{slate} lacks runs: {runs}")
-    if result.hardly_begun():
-        print(result.hardly_begun())
+        print(f"left out {clean(path)}: {reason}", file=sys.stderr)
+    for gap in result.lacking.records:
+        print(f"{gap['slate']} lacks {gap['runs']} runs of {gap['algorithm']}")
     print(f"wrote {page}")
     return 0

@@ -1,4 +1,4 @@
-"""Experiments: runs that differ in nothing but the seed, and names to tell them apart by."""
+"""Experiments: runs that differ in nothing but the seed."""
 
 from __future__ import annotations
 
@@ -6,28 +6,14 @@ from collections import defaultdict
 from collections.abc import Hashable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
-from safe_rl.reporting.runs import Run, without_repetitions
-from safe_rl.runs.folder import common_source
+from safe_rl.reporting.naming import algorithm_names, environment_names
+from safe_rl.reporting.origins import Origin
+from safe_rl.reporting.recorded import Run
+from safe_rl.scores.benchmark import Suite
 from safe_rl.scores.published import ALGORITHMS, COST_LIMIT, REFERENCE, Scores
 
-__all__ = [
-    "MANNER",
-    "Experiment",
-    "distinguishing_keys",
-    "environment_names",
-    "flatten",
-    "group_runs",
-]
-
-Settings = dict[str, Hashable]
-
-MANNER = {
-    "seed", "device", "num_threads", "compile", "checkpoint", "logger", "default_cost_limits",
-    "hydra", "resume", "collector", "num_collectors", "import",
-}  # fmt: skip
-"""Settings of how a run is carried out, not of what it measures."""
+__all__ = ["Experiment", "cost_keys_of", "group_runs"]
 
 
 @dataclass(frozen=True)
@@ -49,7 +35,7 @@ class Experiment:
     @property
     def reference(self) -> Scores | None:
         """Characteristic metrics to normalise by, if the environment has them."""
-        return None if self.benchmark is None else REFERENCE.get(self.benchmark)
+        return REFERENCE.get(self.benchmark or "")
 
     @property
     def limits(self) -> dict[str, float]:
@@ -77,83 +63,39 @@ class Experiment:
         return tuple(run for run in self.runs if run.is_finished)
 
 
-def flatten(settings: Mapping[str, Any], prefix: str = "") -> Settings:
-    """Nested settings as one mapping with dotted keys; lists become tuples.
-
-    Examples:
-        >>> flatten({"model": {"hidden_sizes": [64, 64]}, "seed": 1})
-        {'model.hidden_sizes': (64, 64), 'seed': 1}
-    """
-    flat: Settings = {}
-    for key, value in settings.items():
-        if isinstance(value, Mapping):
-            flat |= flatten(value, f"{prefix}{key}.")
-        else:
-            flat[f"{prefix}{key}"] = _hashable(value)
-    return flat
-
-
-def _hashable(value: Any) -> Hashable:
-    return tuple(map(_hashable, value)) if isinstance(value, list | tuple) else value
-
-
-def distinguishing_keys(cells: Iterable[Sequence[Settings]]) -> list[str]:
-    """Keys that differ within a cell, but for those that follow from another one.
-
-    What follows from ``preset``, or from the ``_target_`` of the group that a key belongs to, is
-    not named: it is told by these.
-
-    Args:
-        cells: Groups of settings that have to be told apart within the group, not across groups.
-
-    Examples:
-        >>> small, large = {"preset": "a", "model.width": 1}, {"preset": "b", "model.width": 2}
-        >>> distinguishing_keys([[small, large, small]])
-        ['preset']
-    """
-    cells = [list(cell) for cell in cells]
-    keys = sorted(
-        {key for cell in cells for settings in cell for key in settings},
-        key=lambda key: (key != "preset", key.count("."), key),
-    )
-    return [key for key in keys if any(not _follows(key, cell) for cell in cells)]
-
-
-def _follows(key: str, cell: Sequence[Settings]) -> bool:
-    """Whether a key's value is settled by those of the keys that stand for it."""
-    names = key.split(".")
-    groups = [".".join([*names[:depth], "_target_"]) for depth in range(1, len(names))]
-    above = [other for other in ("preset", *groups) if other != key]
-    values: dict[tuple[Hashable, ...], set[Hashable]] = defaultdict(set)
-    for settings in cell:
-        values[tuple(settings.get(other) for other in above)].add(settings.get(key))
-    return all(len(found) == 1 for found in values.values())
+def cost_keys_of(experiments: Iterable[Experiment]) -> list[str]:
+    """The aggregate cost if there is one, and every cost key that an experiment limits."""
+    experiments = list(experiments)
+    has_cost = any("cost_rate" in run.table for e in experiments for run in e.runs)
+    limited = [key for experiment in experiments for key in experiment.limits]
+    return list(dict.fromkeys([*(["cost"] if has_cost else []), *limited]))
 
 
 def group_runs(
-    runs: Sequence[Run], suite: Mapping[str, Mapping[str, Any]]
+    runs: Sequence[Run], suite: Suite, origins: Mapping[Path, Origin], root: Path
 ) -> tuple[list[Experiment], dict[Path, str]]:
     """Group runs into experiments.
 
     Args:
         runs: Runs of any environments and algorithms.
-        suite: Name -> every key of a benchmark environment.
+        suite: The benchmark.
+        origins: Folder of a run -> what it started from.
+        root: Folder of all runs.
 
     Returns:
         Experiments in the order of the benchmark and of the paper's tables, and folder -> why a
         run was left out.
     """
     environments = environment_names(runs, suite)
-    algorithms = _algorithm_names(runs, environments)
+    algorithms = algorithm_names(runs, environments, origins, root)
     cells: dict[tuple[str, str], list[Run]] = defaultdict(list)
     for run in runs:
         cells[environments[run.directory], algorithms[run.directory]].append(run)
     skipped: dict[Path, str] = {}
     experiments = []
     for (environment, algorithm), members in cells.items():
-        kept, left_out = without_repetitions(members)
-        skipped |= left_out
-        benchmark = environment if environment in suite else None
+        kept = _without_repetitions(members, skipped)
+        benchmark = suite.name_of(kept[0].config["env"])
         experiments.append(Experiment(environment, algorithm, benchmark, tuple(kept)))
     return sorted(experiments, key=_order), skipped
 
@@ -163,97 +105,22 @@ def _order(experiment: Experiment) -> tuple[Hashable, ...]:
     benchmarks, names = list(REFERENCE), list(ALGORITHMS)
     name = experiment.runs[0].algorithm
     return (
-        benchmarks.index(experiment.environment) if experiment.benchmark in benchmarks else 99,
+        benchmarks.index(experiment.benchmark) if experiment.benchmark in benchmarks else 99,
         experiment.environment,
         names.index(name) if name in names else 99,
         experiment.algorithm,
     )
 
 
-def environment_names(
-    runs: Sequence[Run], suite: Mapping[str, Mapping[str, Any]]
-) -> dict[Path, str]:
-    """Folder -> name of the environment, with the keys that differ from the suite's.
+def _without_repetitions(runs: Sequence[Run], skipped: dict[Path, str]) -> list[Run]:
+    """Runs by ascending seed, the same seed once: twice it would be one sample, not two.
 
-    Args:
-        runs: Of an environment that is not in the suite, the first one's settings are the measure.
-        suite: Name -> every key of a benchmark environment.
+    The one that has come further is kept, among equals the newer; the others are noted.
     """
-    names: dict[Path, str] = {}
-    standards = {name: flatten(node) for name, node in suite.items()}
-    for run in runs:
-        settings = flatten(run.config["env"])
-        name = str(settings.pop("name", "environment"))
-        standard = standards.setdefault(name, settings)
-        changed = {
-            key: value
-            for key, value in settings.items()
-            if key not in standard or value != standard[key]
-        }
-        names[run.directory] = name + _in_brackets(changed)
-    return names
-
-
-def _algorithm_names(runs: Sequence[Run], environments: Mapping[Path, str]) -> dict[Path, str]:
-    """Folder -> name of the algorithm, with the settings that tell it from its namesakes."""
-    settings = {run.directory: _learning_settings(run) for run in runs}
-    names = {}
-    for algorithm in {run.algorithm for run in runs}:
-        members = [run for run in runs if run.algorithm == algorithm]
-        cells: dict[str, list[Settings]] = defaultdict(list)
-        for run in members:
-            cells[environments[run.directory]].append(settings[run.directory])
-        # an experiment may train longer on one environment than on another
-        anywhere = [
-            {key: value for key, value in settings[run.directory].items() if key != "frames"}
-            for run in members
-        ]
-        keys = distinguishing_keys([*cells.values(), anywhere])
-        title = ALGORITHMS.get(algorithm, algorithm)
-        for run in members:
-            own = {key: settings[run.directory].get(key) for key in keys}
-            known = {key: value for key, value in own.items() if value is not None}
-            names[run.directory] = title + _in_brackets(known)
-    return names
-
-
-def _learning_settings(run: Run) -> Settings:
-    settings = {
-        key: value
-        for key, value in flatten(run.config).items()
-        if key.partition(".")[0] not in {"env", *MANNER} and not key.endswith(".compile")
-    }
-    if run.init_from is not None:
-        settings["init_from"] = common_source(str(run.init_from))
-    return _without_presets_for_robots(settings, run)
-
-
-def _without_presets_for_robots(settings: Settings, run: Run) -> Settings:
-    """Leave out what is as the preset has it for the robot: it holds that in ``paper.<key>``."""
-    robot = Path(str(run.config["env"].get("robot_base"))).stem
-
-    def of_robot(key: str) -> Hashable:
-        places = (f"paper.{key}.{name}" for name in (robot, "point"))
-        return next((settings[place] for place in places if place in settings), None)
-
-    return {key: value for key, value in settings.items() if value != of_robot(key)}
-
-
-def _in_brackets(settings: Mapping[str, Hashable]) -> str:
-    """Settings as on the command line, ``" (frames=1000)"``, or nothing."""
-    texts = []
-    for key, value in settings.items():
-        if key.endswith("._target_"):
-            key, value = key.removesuffix("._target_"), str(value).rpartition(".")[2]
-        is_limit = key.startswith("cost_limits.")
-        relation = " ≤ " if is_limit else "="
-        texts.append(f"{key.removeprefix('cost_limits.')}{relation}{_text(value)}")
-    return f" ({', '.join(texts)})" if texts else ""
-
-
-def _text(value: Hashable) -> str:
-    if isinstance(value, bool) or value is None:
-        return {True: "true", False: "false", None: "null"}[value]
-    if isinstance(value, tuple):
-        return f"[{','.join(map(_text, value))}]"
-    return f"{value:g}" if isinstance(value, float) else str(value)
+    kept: dict[int, Run] = {}
+    for run in sorted(runs, key=lambda run: (run.steps, run.modified)):
+        if run.seed in kept:
+            reason = f"{run.directory} is the same run with the same seed"
+            skipped[kept[run.seed].directory] = reason
+        kept[run.seed] = run
+    return [kept[seed] for seed in sorted(kept)]

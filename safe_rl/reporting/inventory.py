@@ -2,24 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from functools import partial
 from math import inf
 from pathlib import Path
 from typing import Any
 
+from safe_rl.reporting.columns import Column, Record, Table, interval
 from safe_rl.reporting.experiments import Experiment
-from safe_rl.reporting.runs import Run
-from safe_rl.reporting.tables import (
-    MISSING,
-    Column,
-    Table,
-    limit_text,
-    number,
-    plain,
-    with_interval,
-)
+from safe_rl.reporting.recorded import Run, clean
 
 __all__ = ["duration", "evaluation_table", "run_table", "videos"]
+
+_WHERE = tuple(Column(name, ("{}", name)) for name in ("environment", "algorithm"))
+_SEED = Column("seed", ("{:d}", "seed"))
 
 
 def run_table(experiments: Sequence[Experiment]) -> Table:
@@ -32,25 +28,25 @@ def run_table(experiments: Sequence[Experiment]) -> Table:
             "steps": run.steps,
             "state": "finished" if run.is_finished else f"{run.steps / run.frames:.0%}",
             "hours": run.hours,
+            "time": duration(run.hours),
             **run.final(["cost"]),
-            "folder": str(run.directory),
+            "folder": clean(run.directory),
             "command": run.command or "not recorded",
         }
         for experiment in experiments
         for run in experiment.runs
     ]
     columns = [
-        Column("environment", plain("environment"), is_number=False),
-        Column("algorithm", plain("algorithm"), is_number=False),
-        Column("seed", plain("seed")),
-        Column("steps", lambda r: f"{r['steps']:,}"),
-        Column("", plain("state"), is_number=False),
-        Column("time", lambda r: duration(r["hours"])),
-        Column("steps/s", lambda r: f"{r['steps_per_second']:,.0f}"),
-        Column("$J_r$", number("episode_return", 2)),
-        Column("$J_c$", number("episode_cost", 1)),
-        Column(r"$\rho_c$", number("cost_rate", 4)),
-        Column("command", plain("command"), is_number=False),
+        *_WHERE,
+        _SEED,
+        Column("steps", ("{:,}", "steps")),
+        Column("state", ("{}", "state")),
+        Column("time", ("{:}", "time")),
+        Column("steps/s", ("{:,.0f}", "steps_per_second")),
+        Column("$J_r$", ("{:.2f}", "episode_return")),
+        Column("$J_c$", ("{:.1f}", "episode_cost")),
+        Column(r"$\rho_c$", ("{:.4f}", "cost_rate")),
+        Column("command", ("{}", "command")),
     ]
     return Table("runs", "Runs", columns, records)
 
@@ -71,32 +67,37 @@ def evaluation_table(experiments: Sequence[Experiment]) -> Table:
         _evaluation_record(experiment, run, evaluation)
         for experiment in experiments
         for run in experiment.runs
-        for evaluation in run.evaluations()
+        for evaluation in run.evaluations
     ]
     names = dict.fromkeys(name for record in records for name in record)
     limited = [name.removeprefix("limit_") for name in names if name.startswith("limit_")]
-    keys = list(dict.fromkeys(["cost", *limited]))
+    keys = list(dict.fromkeys([*(["cost"] if "episode_cost" in names else []), *limited]))
     columns = [
-        Column("environment", plain("environment"), is_number=False),
-        Column("algorithm", plain("algorithm"), is_number=False),
-        Column("seed", plain("seed")),
-        Column("checkpoint", plain("checkpoint"), is_number=False),
-        Column("episodes", plain("episodes")),
-        Column("what", plain("manner"), is_number=False),
-        Column("$J_r$", with_interval("episode_return", 2)),
+        *_WHERE,
+        _SEED,
+        Column("checkpoint", ("{}", "checkpoint")),
+        Column("episodes", ("{:d}", "episodes")),
+        Column("what", ("{}", "manner")),
+        Column("$J_r$", *interval("episode_return", 2)),
     ]
     for key in keys:
-        columns += _cost_columns(key, "" if len(keys) == 1 else f" [{key}]")
-    note = (
-        "Whole episodes of the trained policy, with 95 % intervals over episodes. Over limit: the "
-        "share of episodes that cost more than $d$. CVaR: mean cost of the costliest episodes, of "
-        "how many is said before it."
-    )
-    return Table("evaluations", "Evaluations", columns, records, note)
+        suffix = "" if len(keys) == 1 else f" [{clean(key, 40)}]"
+        tail = interval(f"cvar_{key}", 1)
+        columns += [
+            Column(f"$J_c${suffix}", *interval(f"episode_{key}", 1), mark=partial(_is_over, key)),
+            Column(f"$d${suffix}", ("{:g}", f"limit_{key}")),
+            Column(f"P($C$ > $d$){suffix}", ("{:.0%}", f"over_limit_{key}")),
+            Column(
+                f"CVaR of the cost{suffix}",
+                ("{:.0%}: {:.1f}", "cvar_alpha", f"cvar_{key}"),
+                tail[1],
+            ),
+        ]
+    return Table("evaluations", "Evaluations", columns, records)
 
 
 def _evaluation_record(
-    experiment: Experiment, run: Run, evaluation: dict[str, Any]
+    experiment: Experiment, run: Run, evaluation: Mapping[str, Any]
 ) -> dict[str, Any]:
     manner = ["mean actions" if evaluation["deterministic"] else "sampled actions"]
     manner += [f"{key}={value}" for key, value in evaluation["env"].items()]
@@ -105,12 +106,9 @@ def _evaluation_record(
         "environment": experiment.environment,
         "algorithm": experiment.algorithm,
         "seed": run.seed,
-        "checkpoint": evaluation["checkpoint"],
-        "steps": evaluation["steps"],
-        "episodes": evaluation["episodes"],
-        "manner": ", ".join(manner),
-        "cvar_alpha": evaluation["cvar_alpha"],
-        "other_measures": " ".join(experiment.limits_of_other_measures),
+        **{key: evaluation[key] for key in ("checkpoint", "steps", "episodes", "cvar_alpha")},
+        "manner": clean(", ".join(manner)),
+        "other_measures": experiment.limits_of_other_measures,
     }
     record |= {f"limit_{key}": limit for key, limit in evaluation["cost_limits"].items()}
     for name, estimate in evaluation["estimates"].items():
@@ -119,33 +117,11 @@ def _evaluation_record(
     return record
 
 
-def _cost_columns(key: str, suffix: str) -> list[Column]:
-    """J_c, d, share of episodes over it and CVaR of one cost."""
-
-    def is_over(record: Any) -> str:
-        # of another measure than the mean these episodes do not say whether it keeps the limit
-        if key in record["other_measures"].split():
-            return ""
-        return "bad" if record.get(f"episode_{key}", 0.0) > record.get(f"limit_{key}", inf) else ""
-
-    def cvar(record: Any) -> str:
-        shown = with_interval(f"cvar_{key}", 1)(record)
-        return shown if shown == MISSING else f"{record['cvar_alpha']:.0%}: {shown}"
-
-    return [
-        Column(f"$J_c${suffix}", with_interval(f"episode_{key}", 1), is_over),
-        Column(f"$d${suffix}", limit_text(key)),
-        Column(f"over limit{suffix}", _share(f"over_limit_{key}")),
-        Column(f"CVaR of the cost{suffix}", cvar),
-    ]
-
-
-def _share(name: str) -> Any:
-    def text(record: Any) -> str:
-        value = record.get(name)
-        return MISSING if value is None else f"{value:.0%}"
-
-    return text
+def _is_over(key: str, record: Record) -> str:
+    # of another measure than the mean these episodes do not say whether it keeps the limit
+    if key in record["other_measures"]:
+        return ""
+    return "bad" if record.get(f"episode_{key}", 0.0) > record.get(f"limit_{key}", inf) else ""
 
 
 def videos(experiments: Sequence[Experiment]) -> Iterator[tuple[str, Path]]:

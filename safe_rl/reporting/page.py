@@ -5,36 +5,23 @@ from __future__ import annotations
 import base64
 import datetime
 import re
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 from safe_rl.extras import import_extra
-from safe_rl.reporting.figures import save
-from safe_rl.reporting.inventory import duration, evaluation_table, run_table, videos
-from safe_rl.reporting.report import Report
-from safe_rl.reporting.slate_tables import gap_table
-from safe_rl.reporting.tables import Table
+from safe_rl.reporting.columns import SYMBOL, Table, escaped
+from safe_rl.reporting.contents import Block, Drawing, Film, Report
+from safe_rl.reporting.inventory import duration
+from safe_rl.reporting.pictures import save
+from safe_rl.reporting.recorded import clean
+from safe_rl.runs.files import replacing
 
 __all__ = ["write_report"]
 
 _MIME_TYPES = {".png": "image/png", ".mp4": "video/mp4"}
-
-
-@dataclass(frozen=True)
-class Media:
-    """A picture or a video of the page."""
-
-    caption: str
-    path: Path
-    notes: Sequence[str] = ()
-
-    @property
-    def data(self) -> str:
-        """The file as the text of a link, so that the page needs no other file."""
-        content = base64.b64encode(self.path.read_bytes()).decode()
-        return f"data:{_MIME_TYPES[self.path.suffix]};base64,{content}"
+# of a film, above which it is named instead of embedded [bytes]
+_LARGEST = 50_000_000
 
 
 def write_report(report: Report, out: Path, title: str) -> Path:
@@ -54,9 +41,13 @@ def write_report(report: Report, out: Path, title: str) -> Path:
     """
     jinja2 = import_extra("jinja2", "report")
     out.mkdir(parents=True, exist_ok=True)
-    context = _context(report, out, title)
-    for table in _tables(context):
-        table.write_csv(out)
+    place = _places(out)
+    context = {
+        "title": clean(title),
+        "date": datetime.datetime.now().astimezone().strftime("%d %B %Y, %H:%M"),
+        "facts": _facts(report),
+        "sections": [(s, [_written(b, place) for b in s.blocks]) for s in report.sections],
+    }
     environment = jinja2.Environment(
         loader=jinja2.FileSystemLoader(Path(__file__).parent),
         autoescape=jinja2.select_autoescape(["html.jinja"]),
@@ -64,45 +55,50 @@ def write_report(report: Report, out: Path, title: str) -> Path:
         lstrip_blocks=True,
         undefined=jinja2.StrictUndefined,
     )
-    environment.filters["symbols"] = _symbols
+    environment.filters |= {"symbols": _symbols, "words": _words, "md": _markdown}
     for name in ("report.md", "report.html"):
         text = environment.get_template(f"{name}.jinja").render(context)
-        (out / name).write_text(text, encoding="utf-8")
+        with replacing(out / name) as unfinished:
+            unfinished.write_text(text, encoding="utf-8")
     return out / "report.html"
 
 
-def _context(report: Report, out: Path, title: str) -> dict[str, Any]:
-    """What the templates see."""
-    curves = [
-        Media(robot.capitalize(), save(figure, out / f"curves_{robot}.png"))
-        for robot, figure in report.curves.items()
-    ]
-    transfers = [
-        Media(transfer.title, save(figure, out / f"transfer_{number}.png"), transfer.notes)
-        for number, (transfer, figure) in enumerate(report.transfers, start=1)
-    ]
-    aggregates = {
-        slate.name: Media(slate.name, save(slate.figure, out / f"slate_{slate.name}.png"))
-        for slate in report.slates
-    }
-    return {
-        "title": title,
-        "date": datetime.datetime.now().astimezone().strftime("%d %B %Y, %H:%M"),
-        "facts": _facts(report),
-        "finals": report.finals,
-        "curves": curves,
-        "transfers": transfers,
-        "slates": report.slates,
-        "aggregates": aggregates,
-        "gaps": gap_table(report.gaps),
-        "lacking": report.lacking(),
-        "hardly_begun": report.hardly_begun(),
-        "dominance": report.dominance,
-        "evaluations": evaluation_table(report.experiments),
-        "videos": [Media(caption, path) for caption, path in videos(report.experiments)],
-        "runs": run_table(report.experiments),
-        "skipped": report.skipped,
-    }
+def _places(out: Path) -> Callable[[str], Path]:
+    """Names of files that no other has, also where case is not told apart."""
+    taken: set[str] = set()
+
+    def place(name: str) -> Path:
+        stem, suffix = re.sub(r"\W+", "_", name.rpartition(".")[0])[:100], Path(name).suffix
+        numbered = (f"{stem}{number or ''}{suffix}" for number in range(len(taken) + 1))
+        free = next(name for name in numbered if name.lower() not in taken)
+        taken.add(free.lower())
+        return out / free
+
+    return place
+
+
+def _written(block: Block, place: Callable[[str], Path]) -> dict[str, Any]:
+    """A block as the templates see it; tables and pictures are written on the way."""
+    if isinstance(block, Table):
+        block.write_csv(place(f"{block.name}.csv"))
+        return {"kind": "table", "title": block.title, "table": block}
+    if isinstance(block, Drawing):
+        path = save(block.figure, place(f"{block.name}.png"))
+        return {
+            "kind": "picture", "title": block.title, "file": path.name, "data": _embedded(path),
+            "says": block.shows,
+        }  # fmt: skip
+    if isinstance(block, Film):
+        data = _embedded(block.path)
+        return {"kind": "film", "title": block.title, "file": clean(block.path), "data": data}
+    return {"kind": "text", "title": "", "text": block}
+
+
+def _embedded(path: Path) -> str:
+    """A file as the text of a link, so that the page needs no other; "" if it is too big."""
+    if path.stat().st_size > _LARGEST:
+        return ""
+    return f"data:{_MIME_TYPES[path.suffix]};base64,{base64.b64encode(path.read_bytes()).decode()}"
 
 
 def _facts(report: Report) -> dict[str, str]:
@@ -112,16 +108,11 @@ def _facts(report: Report) -> dict[str, str]:
     return {
         "runs": str(len(runs)) if finished == len(runs) else f"{finished} of {len(runs)} finished",
         "environments": str(len({e.environment for e in report.experiments})),
-        "algorithms": str(len({e.algorithm for e in report.experiments})),
+        "algorithms": str(len({run.algorithm for run in runs})),
+        "experiments": str(len(report.experiments)),
         "environment steps": f"{sum(run.steps for run in runs):,}",
         "training": duration(sum(run.hours for run in runs)),
     }
-
-
-def _tables(context: Mapping[str, Any]) -> Sequence[Table]:
-    single = [context[name] for name in ("gaps", "dominance", "evaluations", "runs")]
-    slates = [table for slate in context["slates"] for table in (slate.table, slate.middle)]
-    return [*context["finals"], *slates, *single]
 
 
 def _symbols(text: str) -> Any:
@@ -134,5 +125,16 @@ def _symbols(text: str) -> Any:
         letter = f'<i class="bar">{letter}</i>' if bar else f"<i>{letter}</i>"
         return letter + (f"<sub>{index}</sub>" if index else "")
 
-    pattern = r"\$(\\bar )?(\\rho|\w)(?:_(\w))?\$"
-    return markupsafe.Markup(re.sub(pattern, html, str(markupsafe.escape(text))))
+    return markupsafe.Markup(SYMBOL.sub(html, str(markupsafe.escape(text))))
+
+
+def _words(text: str) -> str:
+    """Symbols as plain letters, for where a page takes no markup: ``J_r``."""
+    return SYMBOL.sub(
+        lambda match: match.group().strip("$").replace(r"\bar ", "").replace(r"\rho", "ρ"),  # noqa: RUF001
+        text,
+    )
+
+
+def _markdown(text: str) -> str:
+    return escaped(clean(text, most=10_000))

@@ -11,17 +11,37 @@ import yaml
 from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-__all__ = ["read_config", "replacing"]
+__all__ = ["read_config", "read_yaml", "replacing"]
 
 # of a configuration; that of a run has about six thousand
 _MOST_LETTERS = 1_000_000
 
 
-def read_config(path: Path) -> dict[str, Any]:
-    r"""Read a YAML file as plain dictionaries, lists and values, and nothing more.
+def read_yaml(path: Path) -> Any:
+    """Read a YAML file as plain dictionaries, lists and values; nothing in it is followed.
 
-    Nothing in it is followed: a run's configuration has been resolved before it was saved, and
-    ``${oc.env:…}`` in somebody's file would put a secret of this machine into what is made of it.
+    Raises:
+        ValueError: If it is none, or has aliases, which could grow without end.
+        OSError: If it cannot be read.
+    """
+    try:
+        text = path.read_text(encoding="utf-8")
+        if len(text) > _MOST_LETTERS:
+            raise ValueError(f"{path.name} is longer than any configuration of a run")
+        if any(isinstance(token, yaml.AliasToken) for token in yaml.scan(text)):
+            raise ValueError(f"{path.name} has YAML aliases, which no run writes")
+        # which reads numbers as runs write them, such as 1e-4
+        return OmegaConf.to_container(OmegaConf.create(text), resolve=False)
+    except (yaml.YAMLError, OmegaConfBaseException, UnicodeDecodeError, RecursionError) as error:
+        reason = (str(error) or type(error).__name__).splitlines()[0]
+        raise ValueError(f"{path.name} cannot be read ({reason})") from error
+
+
+def read_config(path: Path) -> dict[str, Any]:
+    r"""Read a run's configuration, which has been resolved before it was saved.
+
+    An interpolation in it is somebody's, and ``${oc.env:…}`` would put a secret of this machine
+    into what is made of it: it is refused.
 
     Raises:
         ValueError: If it is no mapping with texts for keys, or has interpolations or aliases.
@@ -34,22 +54,12 @@ def read_config(path: Path) -> dict[str, Any]:
         >>> read_config(path)
         {'seed': 3, 'model': {'hidden_sizes': [64, 64]}}
     """
-    try:
-        text = path.read_text(encoding="utf-8")
-        if len(text) > _MOST_LETTERS:
-            raise ValueError(f"{path.name} is longer than any configuration of a run")
-        # aliases of aliases would grow without end
-        if any(isinstance(token, yaml.AliasToken) for token in yaml.scan(text)):
-            raise ValueError(f"{path.name} has YAML aliases, which no run writes")
-        config = OmegaConf.to_container(OmegaConf.create(text), resolve=False)
-    except (yaml.YAMLError, OmegaConfBaseException, UnicodeDecodeError, RecursionError) as error:
-        reason = (str(error) or type(error).__name__).splitlines()[0]
-        raise ValueError(f"{path.name} cannot be read ({reason})") from error
+    config = read_yaml(path)
     if not isinstance(config, dict) or not _all_plain(config):
         raise ValueError(
             f"{path.name} is not that of a run: it takes a mapping without interpolations, ${{…}}"
         )
-    return config  # type: ignore[return-value]
+    return config
 
 
 def _all_plain(value: Any) -> bool:

@@ -55,7 +55,8 @@ def compare(agents: Mapping[str, Agent]) -> Iterator[tuple[str, str, str]]:
     """Every pair of which one is better, by the rules of section 5.1: (better, worse, reason).
 
     An agent that fails its constraints is worse than all that satisfy theirs; among those that do
-    satisfy them, better means to dominate.
+    satisfy them, better means to dominate. Agents that were trained for different times are not
+    compared: the paper has none.
 
     Examples:
         >>> safe, rash = Agent(1.0, 0.02, True, 1e6), Agent(20.0, 0.06, False, 1e6)
@@ -64,6 +65,8 @@ def compare(agents: Mapping[str, Agent]) -> Iterator[tuple[str, str, str]]:
     """
     for name, agent in agents.items():
         for other_name, other in agents.items():
+            if agent.steps != other.steps:
+                continue
             if agent.is_satisfying and not other.is_satisfying:
                 yield name, other_name, "satisfies"
             elif dominates(agent, other):

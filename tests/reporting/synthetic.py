@@ -7,13 +7,26 @@ from pathlib import Path
 
 import yaml
 
-from safe_rl.envs.safety_gym.registration import group_node
-from safe_rl.envs.safety_gym.suite import SUITE
+from safe_rl.cli.benchmark import suite
+from safe_rl.reporting.experiments import group_runs
+from safe_rl.reporting.origins import find_origins
+from safe_rl.reporting.recorded import find_runs
 
 COLUMNS = [
     *("epoch", "steps", "episodes", "episode_return", "episode_cost", "cost_rate", "time_total"),
 ]
-NODES = {name: group_node(name, config) for name, config in SUITE.items()}
+SUITE = suite()
+
+
+def grouped(root: Path):
+    """Experiments below a folder, and what was left out for being a repetition."""
+    runs, _ = find_runs(root)
+    return group_runs(runs, SUITE, find_origins(runs), root)
+
+
+def experiments_in(root: Path):
+    """Experiments below a folder."""
+    return grouped(root)[0]
 
 
 def write_run(
@@ -35,12 +48,12 @@ def write_run(
 ) -> Path:
     """One row of the table per entry of `returns`, 1000 steps and 3.6 s apart.
 
-    `columns` are further ones, by name.
+    `columns` are further ones, by name; those of limited costs are there.
     """
     directory = root / env / algo / (folder or f"seed{seed}")
     (directory / ".hydra").mkdir(parents=True)
     config = {
-        "env": {**NODES.get(env, {"name": env}), **(env_changes or {})},
+        "env": {**SUITE.environments.get(env, {"name": env}), **(env_changes or {})},
         "algo": {"name": algo},
         "seed": seed,
         "frames": 1000 * len(returns) if frames is None else frames,
@@ -55,7 +68,10 @@ def write_run(
     (directory / ".hydra" / "config.yaml").write_text("not: this one")
     with (directory / "progress.csv").open("w", newline="") as file:
         writer = csv.writer(file)
-        more = columns or {}
+        limited = {key: (costs, rates) for key in config["cost_limits"] if key != "cost"}
+        more = {f"episode_{key}": values for key, (values, _) in limited.items()}
+        more |= {f"{key}_rate": values for key, (_, values) in limited.items()}
+        more |= columns or {}
         writer.writerow([*COLUMNS, *more])
         for epoch, row in enumerate(zip(returns, costs, rates, strict=True), start=1):
             further = [values[epoch - 1] for values in more.values()]

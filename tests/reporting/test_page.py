@@ -5,18 +5,24 @@ import json
 import re
 import shutil
 import subprocess
+from html.parser import HTMLParser
 
 import numpy as np
 import pytest
 from matplotlib.figure import Figure
 from matplotlib.image import imread
-from synthetic import NODES, write_run
+from synthetic import experiments_in, write_run
 
 from safe_rl.cli.report import main
-from safe_rl.reporting.experiments import group_runs
-from safe_rl.reporting.figures import add_legend, algorithm_styles, draw_learning_curves, save
 from safe_rl.reporting.inventory import duration, evaluation_table
-from safe_rl.reporting.runs import find_runs
+from safe_rl.reporting.pictures import (
+    add_legend,
+    algorithm_styles,
+    draw_fronts,
+    draw_learning_curves,
+    save,
+)
+from safe_rl.reporting.scoring import final_table
 
 CHROMIUM = next(
     filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None
@@ -62,26 +68,107 @@ def report(folder):
     return folder / "report"
 
 
+class Page(HTMLParser):
+    """What a page says: headings, cells by table, attributes of elements, text without markup."""
+
+    def __init__(self, path):
+        super().__init__()
+        self.elements, self.rows, self.words, self.headings = [], [], [], []
+        self._open = []
+        self.feed(path.read_text())
+
+    def handle_starttag(self, tag, attributes):
+        self.elements.append((tag, dict(attributes)))
+        self._open.append(tag)
+        if tag == "tr":
+            self.rows.append([])
+        if tag in ("td", "th"):
+            self.rows[-1].append("")
+
+    def handle_endtag(self, tag):
+        while self._open and self._open.pop() != tag:
+            pass
+
+    def handle_data(self, data):
+        if "style" in self._open or not data.strip():
+            return
+        self.words.append(" ".join(data.split()))
+        if {"td", "th"} & set(self._open):
+            self.rows[-1][-1] += data.strip()
+        if self._open[-1] in ("h1", "h2", "h3"):
+            self.headings.append(data.strip())
+
+    def of(self, *tags):
+        return [attributes for tag, attributes in self.elements if tag in tags]
+
+
 def test_everything_is_written(report):
-    assert {path.name for path in report.iterdir()} == {
-        "report.html", "report.md", "curves_point.png", "curves_robot.png", "final_PointGoal1.csv",
-        "slate_shared.csv", "slate_shared_iqm.csv", "slate_shared.png",
-        "missing.csv", "dominance.csv", "evaluations.csv", "runs.csv",
+    names = {path.name for path in report.iterdir()}
+    assert {"report.html", "report.md", "runs.csv", "dominance.csv", "evaluations.csv"} <= names
+    # a table and a figure of every kind that these runs give reason for, and no other
+    kinds = {re.match("[a-z]+", name)[0] for name in names}
+    assert kinds == {
+        "report", "runs", "dominance", "evaluations", "final", "learning", "curves", "fronts",
+        "slate", "profiles", "left",
     }  # fmt: skip
     for picture in report.glob("*.png"):
         assert imread(picture).std() > 0
 
 
-def test_the_markdown_has_the_tables(report):
-    text = (report / "report.md").read_text()
-    assert "| PPO | 2 | 3,000 | 2.00 ± 0.00 | 55.5 ± 0.7 | 25 | 0.0400 ± 0.0000 |" in text
-    assert "![Learning curves, Point](curves_point.png)" in text
-    # one of six environments at most
-    assert "lacks runs" not in text
-    assert "less than a third of the environments of SG1, SG2, SG6, SG18, SGPoint" in text
-    assert "| PointGoal1 | PPO-Lagrangian | PPO | keeps its limits, the other does not |" in text
-    assert "sampled actions" not in text
-    assert "mean actions, x=1, 0% known layouts | 12.00 [11.00, 13.00] | 21.0 [20.0, 22.0]" in text
+def test_page_and_markdown_say_the_same(report):
+    page, text = Page(report / "report.html"), (report / "report.md").read_text()
+    for heading in page.headings[1:]:
+        assert heading in text
+    # a row of the table of final scores, and one of an evaluation
+    (row,) = (r for r in page.rows if r[:2] == ["PPO", "2"] and len(r) == 9)
+    assert row[2:7] == ["3,000", "2.00 ± 0.00", "55.5 ± 0.7▲", "25", "0.0400 ± 0.0000"]
+    assert "| PPO | 2 | 3,000 | 2.00 ± 0.00 | 55.5 ± 0.7 ▲ | 25 | 0.0400 ± 0.0000 |" in text
+    (row,) = (r for r in page.rows if "mean actions, x=1, 0% known layouts" in r)
+    assert row[-5:] == [
+        "12.00 [11.00, 13.00]",
+        "21.0 [20.0, 22.0]",
+        "25",
+        "25%",
+        "10%: 70.0 [69.0, 71.0]",
+    ]
+    assert [
+        "PointGoal1",
+        "PPO-Lagrangian",
+        "PPO",
+        "keeps its limits, the other does not",
+    ] in page.rows
+
+
+def test_the_counts_are_those_of_the_runs(report):
+    words = Page(report / "report.html").words
+    facts = {words[words.index(name) + 1] for name in ("environments", "algorithms", "experiments")}
+    shown = [words[words.index(n) + 1] for n in ("environments", "algorithms", "experiments")]
+    assert facts
+    assert shown == ["2", "3", "3"]
+    assert words[words.index("runs") + 1] == "4 of 5 finished"
+
+
+def test_the_page_is_for_everybody(report):
+    page = Page(report / "report.html")
+    assert all(th.get("scope") in ("col", "row") for th in page.of("th"))
+    texts = [image["alt"] for image in page.of("img")]
+    assert all("PointGoal1" in text or "shared" in text or "Mine" in text for text in texts)
+    assert len(set(texts)) == len(texts)
+    # what is over its limit is told by a sign with a name, not by colour alone
+    marked = [e for e in page.of("b") if e.get("class") == "flag"]
+    assert marked
+    assert all(mark["aria-label"] == "over the limit" for mark in marked)
+    # on a narrow screen every number stands beside the head of its column
+    assert all(cell["data-label"] for cell in page.of("td"))
+    css = (report / "report.html").read_text().partition("</style>")[0]
+    for query in ("prefers-color-scheme: dark", "@media print", "max-width: 640px"):
+        assert query in css
+
+
+def test_the_page_explains_its_words(report):
+    words = " ".join(Page(report / "report.html").words)
+    assert "A slate is a set of environments" in words
+    assert "Regret: cost per episode above the limit" in words
 
 
 def test_an_evaluation_shows_every_limit(tmp_path):
@@ -96,7 +183,7 @@ def test_an_evaluation_shows_every_limit(tmp_path):
         }  # fmt: skip
     evaluation = {**EVALUATION, "cost_limits": limits, "estimates": estimates}
     (directory / "evaluation.json").write_text(json.dumps(evaluation))
-    table = evaluation_table(group_runs(find_runs(tmp_path)[0], NODES)[0])
+    table = evaluation_table(experiments_in(tmp_path))
     cells = dict(zip((c.title for c in table.columns), table.rows()[0], strict=True))
     assert (cells["$J_c$ [cost]"].text, cells["$d$ [cost]"].text) == ("40.0 [39.0, 41.0]", "—")
     for key, cost, limit, mark in (
@@ -106,7 +193,7 @@ def test_an_evaluation_shows_every_limit(tmp_path):
         assert cells[f"$J_c$ [{key}]"].text == f"{cost}.0 [{cost - 1}.0, {cost + 1}.0]"
         assert cells[f"$J_c$ [{key}]"].mark == mark
         assert cells[f"$d$ [{key}]"].text == limit
-        assert cells[f"over limit [{key}]"].text == "25%"
+        assert cells[f"P($C$ > $d$) [{key}]"].text == "25%"
         assert cells[f"CVaR of the cost [{key}]"].text.startswith(f"10%: {cost + 10}.0 [")
 
 
@@ -114,7 +201,7 @@ def test_an_evaluation_is_not_judged_by_the_mean_if_training_was_not(tmp_path):
     directory = write_run(tmp_path, columns={"violation_cost": [3.0]})
     estimates = {**EVALUATION["estimates"], "episode_cost": _estimate(90.0)}
     (directory / "evaluation.json").write_text(json.dumps({**EVALUATION, "estimates": estimates}))
-    table = evaluation_table(group_runs(find_runs(tmp_path)[0], NODES)[0])
+    table = evaluation_table(experiments_in(tmp_path))
     assert "bad" not in [cell.mark for cell in table.rows()[0]]
 
 
@@ -143,15 +230,16 @@ def test_slates_that_all_share_are_averaged(tmp_path, capsys):
             write_run(tmp_path, env, algo)
     write_run(tmp_path, "DoggoGoal1", "cpo")
     assert main([str(tmp_path), "seeds=1", f"out={tmp_path / 'there'}"]) == 0
-    html = (tmp_path / "there" / "report.html").read_text()
-    assert "What all algorithms were trained on" in html
-    assert "PointGoal1, CarGoal1</p>" in html
+    page = Page(tmp_path / "there" / "report.html")
+    assert "What all algorithms were trained on" in page.headings
+    assert any("On PointGoal1, CarGoal1." in word for word in page.words)
     assert (tmp_path / "there" / "slate_shared.png").exists()
     shown = capsys.readouterr().out
-    assert "SG6 lacks runs: 4 of PPO, 3 of CPO" in shown
-    assert "less than a third of the environments of SG1, SG2, SG18" in shown
-    assert "<b>SG6, CPO</b>" in html
-    assert "<b>SG2, CPO</b>" not in html
+    assert "SG6 lacks 4 runs of PPO" in shown
+    assert "SG6 lacks 3 runs of CPO" in shown
+    assert "SG2" not in shown
+    (row,) = (row for row in page.rows if row[:3] == ["SG6", "CPO", "3"])
+    assert "python train.py -m env=" in row[3]
 
 
 @pytest.mark.parametrize(
@@ -172,7 +260,7 @@ def test_panels_have_means_intervals_and_limits(tmp_path):
         write_run(tmp_path, "PointGoal1", "ppo", seed, **ROWS, costs=costs)
     write_run(tmp_path, "PointGoal2", "cpo", 0, **ROWS, costs=(1, 1, 1), limits={"cost": 10.0},
               env_changes={"num_steps": 500}, frames=10**6)  # fmt: skip
-    experiments, _ = group_runs(find_runs(tmp_path)[0], NODES)
+    experiments = experiments_in(tmp_path)
     figure = draw_learning_curves(experiments, algorithm_styles(experiments))
     panels = np.array(figure.axes).reshape(2, 3)
     assert [axes.get_title() for axes in panels[0]] == ["Return", "Episode cost", "Cost rate"]
@@ -195,7 +283,7 @@ def test_every_limited_cost_has_a_row(tmp_path):
     path = directory / "progress.csv"
     head, row = path.read_text().splitlines()
     path.write_text(f"{head},episode_cost_hazards,cost_hazards_rate\n{row},4,0.004\n")
-    experiments, _ = group_runs(find_runs(tmp_path)[0], NODES)
+    experiments = experiments_in(tmp_path)
     figure = draw_learning_curves(experiments, algorithm_styles(experiments))
     panels = np.array(figure.axes).reshape(2, 3)
     assert [axes.get_ylabel() for axes in panels[:, 0]] == [
@@ -208,7 +296,7 @@ def test_colours_stay_with_the_algorithms(tmp_path):
     for algo in ("ppo", "cpo", "mine", "yours"):
         write_run(tmp_path, algo=algo)
     write_run(tmp_path, algo="cpo", frames=500, folder="variant")
-    everything, _ = group_runs(find_runs(tmp_path)[0], NODES)
+    everything = experiments_in(tmp_path)
     colours = algorithm_styles(everything)
     assert len(set(colours.values())) == 5
     alone = algorithm_styles([e for e in everything if e.algorithm == "PPO"])
@@ -220,7 +308,7 @@ def test_experiments_of_one_algorithm_are_told_apart(tmp_path):
         model = {"model": {"width": width}, "frames": 3000}
         write_run(tmp_path, algo="cpo", **model, **ROWS, costs=(1, 1, 1), folder=f"w{width}")
         write_run(tmp_path, algo="cpo", **model, seed=1, folder=f"unfinished{width}")
-    experiments, _ = group_runs(find_runs(tmp_path)[0], NODES)
+    experiments = experiments_in(tmp_path)
     styles = algorithm_styles(experiments)
     assert len(set(styles.values())) == 15
     figure = draw_learning_curves(experiments, styles)
@@ -251,11 +339,27 @@ def test_the_legend_is_as_wide_as_the_figure_at_most(names, tmp_path):
     assert panels[0].get_window_extent().height > 180
 
 
+def test_the_front_joins_what_no_other_one_beats(tmp_path):
+    for algo, value, cost in (("ppo", 20.0, 60.0), ("cpo", 10.0, 20.0), ("trpo", 5.0, 40.0)):
+        write_run(tmp_path, algo=algo, returns=[value], costs=[cost])
+    write_run(tmp_path, algo="cpo", returns=[3.0], costs=[8.0], limits={"cost": 9.0}, folder="9")
+    experiments = experiments_in(tmp_path)
+    (axis,) = draw_fronts(final_table(experiments).records, algorithm_styles(experiments)).axes
+    front = next(line for line in axis.lines if line.get_color() == "0.6")
+    assert list(zip(*front.get_data(), strict=True)) == [(8.0, 3.0), (20.0, 10.0), (60.0, 20.0)]
+    limits = sorted(line.get_xdata()[0] for line in axis.lines if line.get_linestyle() == "--")
+    assert limits == [9.0, 25.0]
+    # experiments of another limit have another sign
+    points = [c[0] for c in axis.containers]
+    assert len({(p.get_xdata()[0], p.get_marker()) for p in points}) == 4
+    assert len({p.get_marker() for p in points}) == 2
+
+
 def test_a_single_epoch_is_drawn_as_a_point(tmp_path):
     write_run(tmp_path)
     write_run(tmp_path, algo="cpo", frames=10**6)
     write_run(tmp_path, algo="trpo", **ROWS, costs=(1, 1, 1))
-    experiments, _ = group_runs(find_runs(tmp_path)[0], NODES)
+    experiments = experiments_in(tmp_path)
     figure = draw_learning_curves(experiments, algorithm_styles(experiments))
     for axis in figure.axes:
         drawn = {line.get_label(): line.get_marker() for line in axis.lines}
@@ -280,7 +384,8 @@ PROBE = """
 
 
 @pytest.mark.skipif(CHROMIUM is None, reason="Chromium is not installed")
-def test_a_browser_shows_the_page(report, tmp_path):
+@pytest.mark.parametrize("width", [1280, 500])
+def test_a_browser_shows_the_page(report, tmp_path, width):
     page = tmp_path / "page.html"
     page.write_text((report / "report.html").read_text() + PROBE)
     result = subprocess.run(
@@ -288,7 +393,7 @@ def test_a_browser_shows_the_page(report, tmp_path):
             *(CHROMIUM, "--headless", "--no-sandbox", "--disable-gpu", "--no-first-run"),
             *("--disable-background-networking", "--disable-component-update", "--disable-sync"),
             *("--disable-quic", f"--user-data-dir={tmp_path / 'profile'}"),
-            *("--window-size=1280,900", "--virtual-time-budget=5000"),
+            *(f"--window-size={width},900", "--virtual-time-budget=5000"),
             *("--dump-dom", page.as_uri()),
         ],
         capture_output=True,
@@ -299,8 +404,9 @@ def test_a_browser_shows_the_page(report, tmp_path):
     assert found, result.stderr
     facts = json.loads(base64.b64decode(found.group(1)))
     assert facts["heading"] == "A <title>"
-    assert len(facts["images"]) == 3
-    assert all(width > 1000 for width in facts["images"])
-    # nothing sticks out of the window, nor, at this width, a table out of its box
+    assert len(facts["images"]) == 5
+    assert all(pixels > 1000 for pixels in facts["images"])
+    assert facts["window"] == width
+    # nothing sticks out of the window, nor a table out of its box
     assert facts["page"] <= facts["window"]
     assert all(table <= box for table, box in facts["tables"])

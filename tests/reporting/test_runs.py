@@ -3,18 +3,14 @@
 import os
 
 import pytest
-from synthetic import NODES, write_run
+from synthetic import grouped, write_run
 
-from safe_rl.reporting.experiments import distinguishing_keys, group_runs
-from safe_rl.reporting.runs import find_runs
+from safe_rl.reporting.naming import distinguishing_keys
+from safe_rl.reporting.recorded import find_runs
 
 
 def names(experiments):
     return [(e.environment, e.algorithm, [run.seed for run in e.runs]) for e in experiments]
-
-
-def grouped(root):
-    return group_runs(find_runs(root)[0], NODES)
 
 
 def test_seeds_of_one_configuration_are_one_experiment(tmp_path):
@@ -59,7 +55,7 @@ def test_what_is_no_run_is_named_with_its_reason(tmp_path):
     runs, skipped = find_runs(tmp_path)
     assert [run.directory for run in runs] == [good]
     reasons = {path.name: reason for path, reason in skipped.items()}
-    assert reasons["f1"] == "config.yaml is not that of a run"
+    assert reasons["f1"] == "config.yaml is not that of a run: its 'env' is not a mapping"
     assert reasons["f2"] == "it has not begun: no progress.csv"
     assert reasons["f3"] == "it has not finished an epoch"
     assert reasons["f4"].startswith("progress.csv cannot be read")

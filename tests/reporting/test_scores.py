@@ -4,22 +4,34 @@ import csv
 
 import numpy as np
 import pytest
-from synthetic import NODES, write_run
+from synthetic import SUITE, experiments_in, write_run
 
-from safe_rl.reporting.curves import mean_curve
-from safe_rl.reporting.experiments import group_runs
-from safe_rl.reporting.report import build_report
-from safe_rl.reporting.results import dominance_table, final_record, final_table
-from safe_rl.reporting.runs import find_runs
-from safe_rl.reporting.slate_tables import gap_table, middle_table, slate_table
-from safe_rl.reporting.slates import aggregate, can_be_normalised, find_gap
-from safe_rl.reporting.tables import Column, Table, number, plain
+from safe_rl.reporting.averages import average
+from safe_rl.reporting.columns import Column, Table, spread
+from safe_rl.reporting.contents import build_report
+from safe_rl.reporting.recorded import find_runs
+from safe_rl.reporting.scoring import (
+    dominance_table,
+    final_record,
+    final_table,
+    learning_table,
+)
+from safe_rl.reporting.slate_scores import (
+    aggregate,
+    can_be_normalised,
+    improvement_table,
+    lacking_table,
+    middle_table,
+    missing_seeds,
+    slate_table,
+)
 from safe_rl.scores.published import PUBLISHED_STEPS, REFERENCE
 from safe_rl.scores.slates import SLATES
 
 
-def experiments_in(root):
-    return group_runs(find_runs(root)[0], NODES)[0]
+def table_of(root):
+    """Final scores of the only environment."""
+    return final_table(experiments_in(root))
 
 
 def test_final_scores_are_means_and_deviations_over_seeds(tmp_path):
@@ -39,7 +51,7 @@ def test_final_scores_are_means_and_deviations_over_seeds(tmp_path):
     assert record["cost_rate"] == pytest.approx(0.021)
     assert record["cost_rate_std"] == pytest.approx(7**0.5 / 1000)
     assert (record["seeds"], record["steps"], record["satisfies"]) == (3, 7000, True)
-    (row,) = final_table("CarGoal1", [record], ["cost"]).rows()
+    (row,) = final_table([experiment]).rows()
     assert [cell.text for cell in row] == [
         "PPO", "3", "7,000", "11.00 ± 2.65", "21.0 ± 2.6", "25", "0.0210 ± 0.0026",
         "25.49 / 54.218 / 0.054", "33.4 / 58.1",
@@ -73,11 +85,11 @@ def ranked(tmp_path):
     }.items():
         returns, costs, rates = ([value] for value in values)
         write_run(tmp_path, algo=algo, returns=returns, costs=costs, rates=rates)
-    return [final_record(e, ["cost"]) for e in experiments_in(tmp_path)]
+    return table_of(tmp_path)
 
 
 def test_the_best_is_sought_among_those_that_keep_their_limits(tmp_path):
-    table = final_table("PointGoal1", ranked(tmp_path), ["cost"])
+    table = ranked(tmp_path)
     assert marks(table, "$J_c$") == ["bad", "", "", ""]
     assert marks(table, "$J_r$") == ["", "", "", "best"]
     assert marks(table, r"$\rho_c$") == ["", "best", "", ""]
@@ -88,23 +100,22 @@ def test_the_best_is_sought_among_runs_of_equal_steps_and_may_be_several(tmp_pat
         write_run(tmp_path, algo=algo, returns=[value] * epochs, costs=[1.0] * epochs,
                   rates=[1 / value] * epochs)  # fmt: skip
     experiments = experiments_in(tmp_path)
-    table = final_table("PointGoal1", [final_record(e, ["cost"]) for e in experiments], ["cost"])
+    table = final_table(experiments)
     # the first one has the highest return, after fewer steps than any other
     assert marks(table, "$J_r$") == ["", "best", "best", ""]
     assert marks(table, r"$\rho_c$") == ["", "best", "best", ""]
-    slate = slate_table("SG6", [aggregate([e]) for e in experiments])
+    slate = slate_table("SG6", SLATES["SG6"], [aggregate([e]) for e in experiments])
     assert marks(slate, r"$\bar J_r$") == ["", "best", "best", ""]
     assert marks(slate, r"$\bar \rho_c$") == ["", "best", "best", ""]
 
 
-def test_what_keeps_its_limits_is_better_after_any_number_of_steps(tmp_path):
+def test_only_what_was_trained_for_equally_many_steps_is_ranked(tmp_path):
     write_run(tmp_path, algo="a", costs=[1.0])
     write_run(tmp_path, algo="b", returns=[1, 1], costs=[90, 90], rates=[1, 1])
     write_run(tmp_path, algo="c", returns=[0, 0], costs=[2, 2], rates=[1, 1])
-    table = dominance_table([final_record(e, ["cost"]) for e in experiments_in(tmp_path)])
-    ranks = {(r["better"], r["worse"], r["reason"]) for r in table.records}
-    assert ranks == {("a", "b", "satisfies"), ("c", "b", "satisfies")}
-    assert "does not, after however many steps" in table.note
+    table = dominance_table(table_of(tmp_path).records)
+    ranks = [(r["better"], r["worse"], r["reason"]) for r in table.records]
+    assert ranks == [("c", "b", "satisfies")]
 
 
 @pytest.mark.parametrize(
@@ -113,8 +124,8 @@ def test_what_keeps_its_limits_is_better_after_any_number_of_steps(tmp_path):
 def test_published_values_say_after_how_many_steps(tmp_path, slate, text):
     write_run(tmp_path)
     (experiment,) = experiments_in(tmp_path)
-    assert text in slate_table(slate, [aggregate([experiment])]).note
-    table = final_table("PointGoal1", [final_record(experiment, ["cost"])], ["cost"])
+    assert text in slate_table(slate, SLATES[slate], [aggregate([experiment])]).note
+    table = final_table([experiment])
     titles = [column.title for column in table.columns[-2:]]
     assert titles == [
         r"paper, 10⁷ steps: $J_r$ / $J_c$ / $\rho_c$", "later work, 10⁷ steps: $J_r$ / $J_c$",
@@ -123,7 +134,7 @@ def test_published_values_say_after_how_many_steps(tmp_path, slate, text):
 
 
 def test_the_ranking_follows_the_two_rules(tmp_path):
-    records = dominance_table(ranked(tmp_path)).records
+    records = dominance_table(ranked(tmp_path).records).records
     assert {(r["better"], r["worse"], r["reason"]) for r in records} == {
         ("PPO-Lagrangian", "TRPO-Lagrangian", "dominates"),
         ("PPO-Lagrangian", "PPO", "satisfies"),
@@ -145,13 +156,13 @@ def test_a_limit_on_another_measure_is_judged_by_that_measure(tmp_path):
     records = {e.algorithm: final_record(e, ["cost"]) for e in experiments}
     found = {name: (r["excess_cost"], r["satisfies"]) for name, r in records.items()}
     assert found == {"mine": (10.0, False), "yours": (-5.0, True), "CPO": (-15.0, True)}
-    table = final_table("PointGoal1", list(records.values()), ["cost"])
+    table = final_table(experiments)
     assert marks(table, "$J_c$") == ["", "bad", ""]
     assert "mine: the limit of cost is on another measure than the mean $J_c$" in table.note
     assert "was 10.0 over $d$" in table.note
     assert "yours: the limit" in table.note
     assert "CPO" not in table.note
-    better = {(r["better"], r["worse"]) for r in dominance_table(list(records.values())).records}
+    better = {(r["better"], r["worse"]) for r in dominance_table(table.records).records}
     assert {("yours", "mine"), ("CPO", "mine")} <= better
     # slates ask the same, and nothing published stands beside another limit than the published
     by_name = {e.algorithm: aggregate([e]) for e in experiments}
@@ -164,10 +175,10 @@ def write_slate(root, algo, multiples, *, leave_out=()):
     """Final scores that are multiples of the reference: one multiple per environment and seed."""
     for index, env in enumerate(SLATES["SG6"]):
         reference = REFERENCE[env]
-        for seed, spread in ((0, -0.1), (10, 0.0), (20, 0.1)):
+        for seed, shift in ((0, -0.1), (10, 0.0), (20, 0.1)):
             if (env, seed) in leave_out:
                 continue
-            factor = multiples[index] + spread
+            factor = multiples[index] + shift
             write_run(
                 root, env, algo, seed,
                 returns=[factor * reference.episode_return],
@@ -182,23 +193,23 @@ MULTIPLES = (0.2, 0.4, 0.6, 0.8, 1.0, 3.0)
 def test_a_complete_slate_is_averaged_over_environments_and_seeds(tmp_path):
     write_slate(tmp_path, "cpo", MULTIPLES)
     experiments = experiments_in(tmp_path)
-    assert find_gap("SG6", "CPO", experiments, 3) is None
+    assert missing_seeds("SG6", "CPO", experiments, 3) == {}
     result = aggregate(experiments)
     assert result.mean == pytest.approx((1.0, 1.0, 1.0))
     assert result.num_runs == 18
     # 18 values; four are left out at each end: 0.1 0.2 0.3 0.3 | 0.4 ... 0.9 | 1.1 2.9 3.0 3.1
     kept = [0.4, 0.5, 0.5, 0.6, 0.7, 0.7, 0.8, 0.9, 0.9, 1.0]
-    middle = result.middle["episode_return"]
+    middle = result.middle("episode_return")
     assert middle.value == pytest.approx(np.mean(kept))
     # the seeds of an environment are within 0.1 of each other, and environments stay apart
     assert middle.value - 0.1 <= middle.low < middle.value < middle.high <= middle.value + 0.1
-    table = slate_table("SG6", [result])
+    table = slate_table("SG6", SLATES["SG6"], [result])
     ours = dict(zip((c.title for c in table.columns), table.rows()[0], strict=True))
     assert ours[r"$\bar J_r$"].text == "1.000"
     assert ours[r"paper $\bar J_r$"].text == "1.021"
     assert ours[r"paper $\bar M_c$"].text == "0.573"
     assert ours["steps"].text == "1,000"
-    assert "worse than any that does not: CPO" in table.note
+    assert "worse than any that does not after equally many steps: CPO" in table.note
     (row,) = middle_table("SG6", [result]).rows()
     assert row[1].text.startswith("0.700 [0.")
 
@@ -221,20 +232,17 @@ def test_an_incomplete_slate_says_which_runs_it_lacks(tmp_path):
     write_run(tmp_path, "PointPush1", "cpo", 7)
     write_run(tmp_path, "DoggoGoal1", "cpo", 20, frames=10**8)
     experiments = experiments_in(tmp_path)
-    gap = find_gap("SG6", "CPO", experiments, 3)
-    assert gap.seeds == {"CarGoal1": (10,), "DoggoGoal1": (0, 10, 20)}
-    assert gap.commands() == [
+    (record,) = [r for r in lacking_table(experiments, 3).records if r["slate"] == "SG6"]
+    assert (record["algorithm"], record["runs"]) == ("CPO", 4)
+    assert record["commands"].splitlines() == [
         "python train.py -m env=CarGoal1 algo=cpo seed=10",
         "python train.py -m env=DoggoGoal1 algo=cpo seed=0,10,20",
     ]
     # beyond the published seeds come further ones, and PointPush1 has four already
-    more = find_gap("SG6", "CPO", experiments, 4).seeds
+    more = missing_seeds("SG6", "CPO", experiments, 4)
     assert more["PointGoal1"] == (30,)
     assert more["DoggoGoal1"] == (0, 10, 20, 30)
     assert "PointPush1" not in more
-    (row,) = gap_table([gap]).rows()
-    assert [cell.text for cell in row[:3]] == ["SG6", "CPO", "4"]
-    assert row[3].text == "CarGoal1 (seeds 10), DoggoGoal1 (seeds 0, 10, 20)"
 
 
 def test_the_missing_runs_of_a_variant_are_those_of_the_variant(tmp_path):
@@ -243,11 +251,14 @@ def test_the_missing_runs_of_a_variant_are_those_of_the_variant(tmp_path):
         *("init_from=runs/a", "checkpoint.interval=5", "num_threads=1", "device=cuda"),
         *("logger=none", "compile=true", "policy_update.compile=true", "++hydra.run.dir=x"),
     ]
-    write_run(tmp_path, algo="cpo", overrides=said)
-    gap = find_gap("SGDoggo", "CPO", experiments_in(tmp_path), 1)
-    (command,) = gap.commands()
-    assert command.startswith("python train.py -m env=DoggoGoal1,DoggoGoal2,")
-    assert command.endswith(" algo=cpo preset=paper seed=0")
+    for env in ("DoggoPush1", "DoggoPush2"):
+        write_run(tmp_path, env, algo="cpo", overrides=said)
+    (record,) = lacking_table(experiments_in(tmp_path), 1).records
+    assert record["slate"] == "SGDoggo"
+    assert record["commands"] == (
+        "python train.py -m env=DoggoGoal1,DoggoGoal2,DoggoButton1,DoggoButton2 algo=cpo "
+        "preset=paper seed=0"
+    )
 
 
 def test_a_slate_takes_environments_as_they_are_and_a_limit_of_the_cost(tmp_path):
@@ -256,13 +267,14 @@ def test_a_slate_takes_environments_as_they_are_and_a_limit_of_the_cost(tmp_path
     write_run(tmp_path, "PointPush1", "cpo", 0)
     write_run(tmp_path, "PointPush2", "cpo", 0, init_from="runs/PointPush1/cpo/seed0")
     experiments = experiments_in(tmp_path)
-    gap = find_gap("SGPoint", "CPO (cost ≤ 25)", experiments, 1)
-    assert {"PointGoal1", "PointGoal2", "PointPush2"} <= set(gap.seeds)
-    assert "PointPush1" not in gap.seeds
-    # one of six environments has a run of it
-    assert (gap.environments_begun, gap.is_begun) == (1, False)
+    missing = missing_seeds("SGPoint", "CPO (cost ≤ 25)", experiments, 1)
+    assert {"PointGoal1", "PointGoal2", "PointPush2"} <= set(missing)
+    assert "PointPush1" not in missing
+    # one of six environments has a run of it, which is not worth a word; then two of them
+    assert not lacking_table(experiments, 1).records
     write_run(tmp_path, "PointButton1", "cpo", 0, frames=10**6)
-    assert find_gap("SGPoint", "CPO (cost ≤ 25)", experiments_in(tmp_path), 1).is_begun
+    records = lacking_table(experiments_in(tmp_path), 1).records
+    assert {r["slate"]: r["runs"] for r in records} == {"SG6": 5, "SGPoint": 5}
 
 
 def test_runs_that_continue_others_count_towards_no_slate(tmp_path):
@@ -270,9 +282,9 @@ def test_runs_that_continue_others_count_towards_no_slate(tmp_path):
         write_run(tmp_path, env, "cpo", init_from="runs/PointGoal1/cpo/seed0")
     experiments = experiments_in(tmp_path)
     assert not any(map(can_be_normalised, experiments))
-    assert len(find_gap("SG6", experiments[0].algorithm, experiments, 1).seeds) == 6
-    result = build_report(tmp_path, NODES, seeds_needed=1, unfinished=False)
-    assert (result.slates, result.gaps) == ([], [])
+    assert len(missing_seeds("SG6", experiments[0].algorithm, experiments, 1)) == 6
+    result = build_report(tmp_path, SUITE, seeds_needed=1, unfinished=False)
+    assert "normalised" not in [section.name for section in result.sections]
 
 
 def test_curves_are_means_over_seeds_on_common_steps(tmp_path):
@@ -281,24 +293,24 @@ def test_curves_are_means_over_seeds_on_common_steps(tmp_path):
     write_run(tmp_path, seed=0, **slow, frames=0)
     write_run(tmp_path, seed=1, **fast, frames=0)
     runs, _ = find_runs(tmp_path)
-    curve = mean_curve(runs, "cost_rate", smooth=False)
+    curve = average(runs, "cost_rate", smooth=False)
     # until the shorter one ends, with as many points as the longer one has epochs
     np.testing.assert_allclose(curve.steps, [1000, 1500, 2000])
     np.testing.assert_allclose(curve.mean, [0.2, 0.3, 0.4])
     # two seeds: the same is drawn twice in half of all resamples
     np.testing.assert_allclose(curve.low, [0.1, 0.15, 0.2])
     np.testing.assert_allclose(curve.high, [0.3, 0.45, 0.6])
-    alone = mean_curve(runs[:1], "episode_return", smooth=True)
+    alone = average(runs[:1], "episode_return", smooth=True)
     np.testing.assert_allclose(alone.mean, [0.0, 1.0, 2.0])
     assert np.isnan(alone.low).all()
-    assert mean_curve(runs, "no_such_column", smooth=False) is None
+    assert average(runs, "no_such_column", smooth=False) is None
 
 
 def test_a_curve_ends_at_the_final_score(tmp_path):
     returns = [1.0, 2.0, 4.0, 8.0, 16.0, 32.0, 65.0]
     write_run(tmp_path, returns=returns, costs=returns, rates=returns)
     (experiment,) = experiments_in(tmp_path)
-    curve = mean_curve(experiment.runs, "episode_cost", smooth=True)
+    curve = average(experiment.runs, "episode_cost", smooth=True)
     assert curve.mean[-1] == pytest.approx(25.0)
     assert curve.mean[-1] == pytest.approx(final_record(experiment, ["cost"])["episode_cost"])
 
@@ -309,24 +321,67 @@ def test_epochs_without_an_episode_are_bridged(tmp_path):
     directory = write_run(tmp_path, **values)
     text = (directory / "progress.csv").read_text().replace("nan", "")
     (directory / "progress.csv").write_text(text)
-    curve = mean_curve(find_runs(tmp_path)[0], "episode_return", smooth=False)
+    curve = average(find_runs(tmp_path)[0], "episode_return", smooth=False)
     np.testing.assert_allclose(curve.mean, [1.0, 3.0])
     np.testing.assert_allclose(curve.steps, [1000, 3000])
 
 
 def test_tables_write_all_fields_and_show_the_chosen(tmp_path):
-    records = [{"name": "a", "x": 1.25, "x_std": 0.5}, {"name": "b", "x": float("nan"), "more": 7}]
+    records = [
+        {"name": "a|b", "x": 1.25, "x_std": 0.5}, {"name": "=b", "x": float("nan"), "more": 7},
+        {"name": "c", "x": 3.0},
+    ]  # fmt: skip
+    looks = {"a|b": "best", "c": "bad"}
     columns = [
-        Column("name", plain("name"), is_number=False),
-        Column("x", number("x", 1, "x_std"), lambda r: "best" if r["name"] == "a" else ""),
+        Column("name", ("{}", "name")),
+        Column("x", *spread("x", 1), mark=lambda r: looks.get(r["name"], "")),
     ]
     table = Table("scores", "Scores", columns, records)
-    lines = ["| name | x |", "|---|---:|", "| a | **1.2 ± 0.5** |", "| b | — |"]
-    assert table.markdown().splitlines() == lines
-    table.write_csv(tmp_path)
+    assert table.markdown().splitlines() == [
+        "| name | x |", "|---|---:|", r"| a\|b | **1.2 ± 0.5** |", "| =b | — |", "| c | 3.0 ▲ |",
+    ]  # fmt: skip
+    table.write_csv(tmp_path / "scores.csv")
     with (tmp_path / "scores.csv").open(newline="") as file:
         rows = list(csv.DictReader(file))
     assert rows == [
-        {"name": "a", "x": "1.25", "x_std": "0.5", "more": ""},
-        {"name": "b", "x": "", "x_std": "", "more": "7"},
+        {"name": "a|b", "x": "1.25", "x_std": "0.5", "more": ""},
+        # no formula for a spreadsheet
+        {"name": "'=b", "x": "", "x_std": "", "more": "7"},
+        {"name": "c", "x": "3.0", "x_std": "", "more": ""},
     ]
+
+
+def test_what_learning_cost_is_counted_over_all_of_training(tmp_path):
+    reference = REFERENCE["PointGoal1"].episode_return
+    costs = [45.0, 35.0, 5.0, 5.0, 5.0, 5.0, 30.0]
+    for seed, level in ((0, 0.8), (10, 0.2)):
+        write_run(tmp_path, algo="cpo", seed=seed, returns=[level * reference] * 7, costs=costs,
+                  rates=[0.01] * 7)  # fmt: skip
+    table = learning_table(experiments_in(tmp_path))
+    (record,) = table.records
+    assert record["regret_cost"] == pytest.approx((20 + 10 + 5) / 7)
+    assert record["share_over_cost"] == pytest.approx(3 / 7)
+    assert record["streak_cost"] == 2
+    # the mean over five epochs is within 25 for the first time in the third; one seed returns
+    # less than half of the reference for ever
+    assert np.mean(costs[:2]) > 25 > np.mean(costs[:4])
+    assert record["good_steps"] == (3000 if np.mean(costs[:3]) <= 25 else 4000)
+    assert record["good_hours"] == pytest.approx(record["good_steps"] / 1000 * 3.6 / 3600)
+    assert (record["seeds"], record["seeds_good"]) == (2, 1)
+    assert f"{reference / 2:.4g}" in table.note
+
+
+def test_without_a_limit_learning_costs_nothing_to_speak_of(tmp_path):
+    write_run(tmp_path, limits={})
+    assert learning_table(experiments_in(tmp_path)) is None
+
+
+def test_improvement_is_a_probability_per_score(tmp_path):
+    for algo, value, cost in (("ppo", 2.0, 60.0), ("cpo", 1.0, 20.0)):
+        for seed in (0, 10):
+            write_run(tmp_path, algo=algo, seed=seed, returns=[value], costs=[cost])
+    table = improvement_table("x", [aggregate([e]) for e in experiments_in(tmp_path)])
+    found = {r["algorithm"]: (r["episode_return"], r["violation"]) for r in table.records}
+    assert found == {"PPO": (1.0, 0.0), "CPO": (0.0, 1.0)}
+    # the cost rates are equal
+    assert {r["cost_rate"] for r in table.records} == {0.5}

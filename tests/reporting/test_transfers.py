@@ -7,14 +7,14 @@ import numpy as np
 import pytest
 import torch
 from matplotlib.image import imread
-from synthetic import NODES, write_run
+from synthetic import SUITE, write_run
 
 from safe_rl.cli.report import main
 from safe_rl.reporting.experiments import group_runs
-from safe_rl.reporting.figures import algorithm_styles
-from safe_rl.reporting.runs import find_runs
-from safe_rl.reporting.transfer_figures import draw_transfer
-from safe_rl.reporting.transfers import find_transfers
+from safe_rl.reporting.origins import find_origins
+from safe_rl.reporting.pictures import algorithm_styles
+from safe_rl.reporting.recorded import find_runs
+from safe_rl.reporting.transfers import draw_transfer, find_transfers
 from safe_rl.runs.checkpoints import CheckpointStore
 
 FIRST = {"returns": (4.0, 4.0, 4.0), "rates": (0.06, 0.05, 0.04)}
@@ -34,8 +34,9 @@ def write_second(root, source, seed=0, **settings):
 
 def transfers_in(root):
     runs, _ = find_runs(root)
-    experiments, _ = group_runs(runs, NODES)
-    return find_transfers(experiments, runs, NODES), algorithm_styles(experiments)
+    origins = find_origins(runs)
+    experiments, _ = group_runs(runs, SUITE, origins, root)
+    return find_transfers(experiments, origins), algorithm_styles(experiments)
 
 
 def only_transfer_in(root):
@@ -70,7 +71,7 @@ def test_the_second_phase_follows_the_first(tmp_path):
             env_changes={"num_steps": 500},
         )  # fmt: skip
     transfer, figure = only_transfer_in(tmp_path)
-    name = f"CPO (init_from={tmp_path}/PointGoal1/cpo, cost ≤ 10)"
+    name = "CPO (init_from=PointGoal1/cpo, cost ≤ 10)"
     title = f"PointGoal1 → PointGoal2 (num_steps=500), {name}"
     assert transfer.title == title
     assert not transfer.notes
@@ -119,8 +120,7 @@ def test_without_a_name_the_newest_checkpoint_was_taken(tmp_path):
 
 
 @pytest.mark.parametrize("is_recorded", [True, False])
-def test_a_relative_path_counts_from_where_the_run_was_started(tmp_path, is_recorded, monkeypatch):
-    monkeypatch.chdir(tmp_path)
+def test_a_relative_path_counts_from_where_the_run_was_started(tmp_path, is_recorded):
     here, elsewhere = tmp_path / "here", tmp_path / "elsewhere"
     # of the same path from both folders
     write_first(here / "runs", rates=(1.0, 1.0, 1.0))
@@ -129,10 +129,19 @@ def test_a_relative_path_counts_from_where_the_run_was_started(tmp_path, is_reco
     if is_recorded:
         record = {"hydra": {"runtime": {"cwd": str(elsewhere)}}}
         (second / ".hydra" / "hydra.yaml").write_text(json.dumps(record))
-    # the report has both, or reads the other one at its path
-    for root in (tmp_path, here):
-        (phase,) = only_transfer_in(root)[0].first
-        assert phase.runs[0].table["cost_rate"] == [2.0 if is_recorded else 1.0] * 3
+    (phase,) = only_transfer_in(tmp_path)[0].first
+    assert phase.runs[0].table["cost_rate"] == [2.0 if is_recorded else 1.0] * 3
+    # a report reads what is in its folder, and nothing else
+    assert bool(only_transfer_in(here)[0].first) is not is_recorded
+
+
+def test_runs_that_were_moved_together_still_find_each_other(tmp_path):
+    first = write_first(tmp_path / "before" / "runs")
+    second = write_second(tmp_path / "before" / "runs", first.relative_to(tmp_path / "before"))
+    record = {"hydra": {"runtime": {"cwd": str(tmp_path / "before")}}}
+    (second / ".hydra" / "hydra.yaml").write_text(json.dumps(record))
+    (tmp_path / "before").rename(tmp_path / "after")
+    assert only_transfer_in(tmp_path / "after")[0].title.startswith("PointGoal1 → PointGoal2")
 
 
 def test_a_first_run_that_is_gone(tmp_path):
@@ -142,7 +151,7 @@ def test_a_first_run_that_is_gone(tmp_path):
     transfer, figure = only_transfer_in(tmp_path)
     assert transfer.title == "? → PointGoal2, CPO"
     (note,) = transfer.notes
-    assert note == f"The run it started from was not found ({gone}): drawn alone."
+    assert note == f"The run it started from is not in this folder ({gone}): drawn alone."
     assert labels(figure.axes[0]) == ["PointGoal2"]
     assert changes(figure.axes[0]) == []
     (line,) = solid_lines(figure.axes[0])
@@ -224,10 +233,10 @@ def test_the_page_has_a_section(tmp_path):
     text = (tmp_path / "report/report.md").read_text()
     assert '<a href="#transfer">' in html
     assert 'id="transfer"' in html
-    assert "was not found (runs/&lt;gone&gt;): drawn alone." in html
-    assert "was not found (runs/<gone>): drawn alone." in text
+    assert "is not in this folder (runs/&lt;gone&gt;): drawn alone." in html
+    assert r"is not in this folder (runs/\<gone\>): drawn alone." in text
     assert "Cost rates are not joined" in html
     assert "Cost rates are not joined" in text
-    assert "![Transfer, PointGoal1 → PointGoal2, CPO (preset=default, init_from=" in text
+    assert r"PointGoal1 → PointGoal2, CPO (preset=default, init\_from=PointGoal1/cpo)](" in text
     for number in (1, 2):
         assert imread(tmp_path / f"report/transfer_{number}.png").std() > 0

@@ -1,4 +1,4 @@
-"""Figures 7 to 9 of the paper, one per robot, and interquartile means with their intervals."""
+"""Pictures of experiments: the paper's Figures 7 to 9, and returns against costs."""
 
 from __future__ import annotations
 
@@ -8,32 +8,25 @@ from pathlib import Path
 from textwrap import fill
 from typing import Any, NamedTuple
 
+import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter, MaxNLocator
 
-from safe_rl.reporting.curves import mean_curve
-from safe_rl.reporting.experiments import Experiment
-from safe_rl.reporting.results import cost_keys_of
-from safe_rl.reporting.slate_tables import SYMBOLS
-from safe_rl.reporting.slates import Aggregate
+from safe_rl.reporting.averages import average
+from safe_rl.reporting.columns import Record
+from safe_rl.reporting.experiments import Experiment, cost_keys_of
+from safe_rl.reporting.recorded import clean
 from safe_rl.runs.curves import point_marker
+from safe_rl.runs.files import replacing
+from safe_rl.scores.comparisons import pareto_front
 from safe_rl.scores.published import ALGORITHMS
 
 __all__ = [
-    "LIMIT_STYLE",
-    "ROW_HEIGHT",
-    "WIDTH",
-    "Style",
-    "add_legend",
-    "algorithm_styles",
-    "draw_aggregates",
-    "draw_experiment",
-    "draw_learning_curves",
-    "drawn_keys",
-    "save",
-    "set_axes",
+    *("LIMIT_STYLE", "ROW_HEIGHT", "WIDTH", "Style", "add_legend", "algorithm_styles"),
+    *("draw_experiment", "draw_fronts", "draw_learning_curves", "drawn_keys", "limits_of"),
+    *("literal", "save", "set_axes"),
 ]
 
 # Okabe and Ito's palette, which people with colour-blindness can read.
@@ -50,6 +43,7 @@ _LINES: tuple[tuple[Any, Any], ...] = (
     ("-", ":"), ("-.", (0, (1, 4))), ((0, (8, 2)), (0, (3, 3))),
     ((0, (8, 2, 1, 2, 1, 2)), (0, (1, 1, 1, 6))),
 )  # fmt: skip
+_MARKERS = "osD^vP"
 _DPI = 130
 LIMIT_STYLE: dict[str, Any] = {"color": "#c00000", "linestyle": "--", "linewidth": 1.1}
 """How limits are drawn."""
@@ -67,6 +61,11 @@ class Style(NamedTuple):
     unfinished: Any
 
 
+def literal(text: str) -> str:
+    """A name as Matplotlib draws it letter by letter: no mathematics, and shown in legends."""
+    return text.replace("$", r"\$").replace("_", "\N{ZERO WIDTH SPACE}_", text[:1] == "_")
+
+
 def algorithm_styles(experiments: Iterable[Experiment]) -> dict[str, Style]:
     """Name of an algorithm -> its style, the same in every figure and no other algorithm's."""
     names = {e.algorithm: e.runs[0].algorithm for e in experiments}
@@ -77,15 +76,14 @@ def algorithm_styles(experiments: Iterable[Experiment]) -> dict[str, Style]:
         for colours, several in ((_FURTHER_COLOURS, [first]), (everything, others))
         for lines, colour in product(several, colours)
     )
+    order = list(ALGORITHMS)
     styles: dict[str, Style] = {}
-    for name, algorithm in sorted(names.items(), key=lambda pair: _rank(pair[1])):
+    for name, algorithm in sorted(
+        names.items(), key=lambda pair: order.index(pair[1]) if pair[1] in order else len(order)
+    ):
         own = Style(_OWN_COLOURS.get(algorithm, ""), *first)
         styles[name] = own if own.colour and own not in styles.values() else next(further)
     return styles
-
-
-def _rank(algorithm: str) -> int:
-    return list(ALGORITHMS).index(algorithm) if algorithm in ALGORITHMS else len(ALGORITHMS)
 
 
 def draw_learning_curves(experiments: Sequence[Experiment], styles: Mapping[str, Style]) -> Figure:
@@ -110,14 +108,35 @@ def draw_learning_curves(experiments: Sequence[Experiment], styles: Mapping[str,
         shown = [e for e in experiments if e.environment == environment]
         for experiment in shown:
             draw_experiment(experiment, key, axes, styles[experiment.algorithm])
-        name = environment.replace(" (", "\n(")
-        _decorate(axes, name if key == "cost" else f"{name}\n{key}", shown, key)
+        name = literal(fill(environment.replace(" (", "\n("), 30, replace_whitespace=False))
+        axes[0].set_ylabel(
+            name if key == "cost" else f"{name}\n{literal(clean(key, 40))}", fontweight="bold"
+        )
+        for limit, length in {
+            (e.limits[key], e.runs[0].episode_length) for e in shown if key in e.limits
+        }:
+            axes[1].axhline(limit, **LIMIT_STYLE)
+            if length is not None:
+                axes[2].axhline(limit / length, **LIMIT_STYLE)
+        set_axes(axes)
     for axis, title in zip(panels[0], ("Return", "Episode cost", "Cost rate"), strict=True):
         axis.set_title(title, fontweight="bold")
     for axis in panels[-1]:
         axis.set_xlabel("environment steps")
     add_legend(figure, panels[:, 0])
     return figure
+
+
+def limits_of(
+    experiments: Iterable[Experiment], key: str, axes: Sequence[Axes]
+) -> list[tuple[Axes, float]]:
+    """Panels of episode cost and cost rate, and the heights of limits in them: d and d / T_ep."""
+    limited = [e for e in experiments if key in e.limits]
+    pairs = {(e.limits[key], e.runs[0].episode_length) for e in limited}
+    return [
+        *((axes[1], limit) for limit, _ in pairs),
+        *((axes[2], limit / length) for limit, length in pairs if length is not None),
+    ]
 
 
 def drawn_keys(experiments: Sequence[Experiment]) -> list[str]:
@@ -138,44 +157,25 @@ def draw_experiment(
         style: Of everything.
         offset: Environment steps to its beginning.
     """
+    name = literal(experiment.algorithm)
+    unfinished = [[run] for run in experiment.runs if not run.is_finished]
+    looks: list[tuple[Any, ...]] = [(experiment.finished, name, style.line, 1.5)]
+    looks += [(runs, f"{name} (unfinished)", style.unfinished, 1.2) for runs in unfinished]
     columns = (("episode_return", True), (f"episode_{key}", True), (f"{key}_rate", False))
-    unfinished = [run for run in experiment.runs if not run.is_finished]
     for axis, (column, smooth) in zip(axes, columns, strict=True):
-        curve = (
-            mean_curve(experiment.finished, column, smooth=smooth) if experiment.finished else None
-        )
-        if curve is not None:
-            steps = curve.steps + offset
-            _plot(axis, steps, curve.mean, style.colour, style.line, experiment.algorithm)
-            axis.fill_between(
-                steps, curve.low, curve.high, color=style.colour, alpha=0.2, linewidth=0
-            )
-        for run in unfinished:
-            line = mean_curve([run], column, smooth=smooth)
-            if line is not None:
-                label = f"{experiment.algorithm} (unfinished)"
-                steps = line.steps + offset
-                _plot(axis, steps, line.mean, style.colour, style.unfinished, label, width=1.2)
-
-
-def _plot(
-    axis: Axes, steps: Any, heights: Any, colour: str, line: Any, label: str, width: float = 1.5
-) -> None:
-    axis.plot(
-        steps, heights, color=colour, linestyle=line, linewidth=width, label=label,
-        marker=point_marker(steps), markersize=5, clip_on=not point_marker(steps),
-    )  # fmt: skip
-
-
-def _decorate(axes: Sequence[Axes], name: str, experiments: Sequence[Experiment], key: str) -> None:
-    returns, costs, rates = axes
-    returns.set_ylabel(name, fontweight="bold")
-    for limit, length in {
-        (e.limits[key], e.runs[0].episode_length) for e in experiments if key in e.limits
-    }:
-        costs.axhline(limit, **LIMIT_STYLE)
-        rates.axhline(limit / length, **LIMIT_STYLE)
-    set_axes(axes)
+        for runs, label, line, width in looks:
+            curve = average(runs, column, smooth=smooth)
+            if curve is None:
+                continue
+            steps, marker = curve.steps + offset, point_marker(curve.steps)
+            axis.plot(
+                steps, curve.mean, color=style.colour, linestyle=line, linewidth=width,
+                label=label, marker=marker, markersize=5, clip_on=not marker,
+            )  # fmt: skip
+            if len(runs) > 1:
+                axis.fill_between(
+                    steps, curve.low, curve.high, color=style.colour, alpha=0.2, linewidth=0
+                )
 
 
 def set_axes(axes: Sequence[Axes]) -> None:
@@ -183,14 +183,18 @@ def set_axes(axes: Sequence[Axes]) -> None:
     for axis in axes:
         axis.xaxis.set_major_formatter(EngFormatter(sep=""))
         axis.xaxis.set_major_locator(MaxNLocator(6))
-        axis.grid(alpha=0.25)
-        axis.spines[["top", "right"]].set_visible(False)
+        _clear(axis)
         axis.set_xlim(left=0)
     for axis in axes[1:]:
         # with zero among the data, the margin above them is a share of their height
         axis.update_datalim([(0.0, 0.0)], updatex=False)
         axis.autoscale_view(scalex=False)
         axis.set_ylim(bottom=0)
+
+
+def _clear(axis: Axes) -> None:
+    axis.grid(alpha=0.25)
+    axis.spines[["top", "right"]].set_visible(False)
 
 
 def add_legend(figure: Figure, axes: Iterable[Axes]) -> None:
@@ -218,32 +222,49 @@ def add_legend(figure: Figure, axes: Iterable[Axes]) -> None:
     figure.set_figheight(figure.get_figheight() + size.height / figure.dpi)
 
 
-def draw_aggregates(aggregates: Sequence[Aggregate], styles: Mapping[str, Style]) -> Figure:
-    """Draw interquartile means and their intervals, a panel per normalised score."""
-    figure = Figure(figsize=(WIDTH, 0.9 + 0.32 * len(aggregates)), layout="constrained")
-    panels = figure.subplots(1, 3, sharey=True)
-    heights = range(len(aggregates))
-    for axis, (name, symbol) in zip(panels, SYMBOLS.items(), strict=True):
-        for height, aggregate in zip(heights, aggregates, strict=True):
-            estimate, colour = aggregate.middle[name], styles[aggregate.algorithm].colour
-            axis.barh(
-                height, estimate.high - estimate.low, left=estimate.low, height=0.55, color=colour,
-                alpha=0.45,
+def draw_fronts(records: Sequence[Record], styles: Mapping[str, Style]) -> Figure:
+    """Draw final returns against final costs, a panel per environment.
+
+    A point is an experiment, with the standard deviations over its seeds; its limit, a vertical
+    line, tells experiments of one algorithm apart. The grey line joins those that no other one
+    beats in both.
+
+    Args:
+        records: Final scores, see :func:`safe_rl.reporting.scoring.final_record`.
+        styles: Name of an algorithm -> how it is drawn.
+    """
+    environments = list(dict.fromkeys(record["environment"] for record in records))
+    columns = min(3, len(environments))
+    rows = -(-len(environments) // columns)
+    figure = Figure(figsize=(WIDTH, 3.4 * rows + 0.3), layout="constrained")
+    panels = figure.subplots(rows, columns, squeeze=False).ravel()
+    for axis, environment in zip(panels, environments, strict=False):
+        own = [r for r in records if r["environment"] == environment]
+        points = np.array([(r["episode_cost"], r["episode_return"]) for r in own])
+        front = points[pareto_front(points[:, 1], points[:, 0])]
+        axis.plot(*front.T, color="0.6", linewidth=1, zorder=1, drawstyle="steps-post")
+        limits = sorted({r["limit_cost"] for r in own if "limit_cost" in r})
+        for record, (cost, value) in zip(own, points, strict=True):
+            limit = record.get("limit_cost")
+            marker = "x" if limit is None else _MARKERS[limits.index(limit) % len(_MARKERS)]
+            axis.errorbar(
+                cost, value, xerr=record["episode_cost_std"], yerr=record["episode_return_std"],
+                color=styles[record["algorithm"]].colour, marker=marker, markersize=7,
+                linestyle="", elinewidth=1, label=literal(record["algorithm"]),
             )  # fmt: skip
-            axis.plot([estimate.value] * 2, [height - 0.33, height + 0.33], color="black")
-        axis.set_title(symbol)
-        axis.set_yticks(list(heights), [aggregate.algorithm for aggregate in aggregates])
-        axis.tick_params(axis="y", length=0)
-        axis.grid(alpha=0.25, axis="x")
-        axis.spines[["top", "right", "left"]].set_visible(False)
-        axis.xaxis.set_major_locator(MaxNLocator(5))
-        left, right = axis.get_xlim()
-        axis.set_xlim(min(0.0, left), max(0.0, right))
-    panels[0].invert_yaxis()
+        for limit in limits:
+            axis.axvline(limit, **LIMIT_STYLE)
+        axis.set_title(literal(fill(environment, 44)), fontsize=10, fontweight="bold")
+        axis.set(xlabel="final episode cost", ylabel="final return")
+        _clear(axis)
+    for axis in panels[len(environments) :]:
+        axis.set_axis_off()
+    add_legend(figure, panels)
     return figure
 
 
 def save(figure: Figure, path: Path) -> Path:
     """Write a figure as PNG."""
-    figure.savefig(path, dpi=_DPI)
+    with replacing(path) as unfinished:
+        figure.savefig(unfinished, dpi=_DPI)
     return path

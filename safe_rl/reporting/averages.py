@@ -1,24 +1,23 @@
-"""Learning curves of several seeds as one: mean and interval over environment steps."""
+"""Several seeds as one curve: mean and interval over environment steps."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
-from safe_rl.reporting.runs import Run
+from safe_rl.reporting.recorded import Run
 from safe_rl.runs.curves import moving_mean
 from safe_rl.scores.intervals import bootstrap
 
-__all__ = ["Curve", "mean_curve"]
+__all__ = ["Average", "average"]
 
 NUM_POINTS = 200
 """Of a curve at most; a panel is not much wider in pixels."""
 
 
-@dataclass(frozen=True)
-class Curve:
+class Average(NamedTuple):
     """A quantity over training.
 
     Attributes:
@@ -34,7 +33,7 @@ class Curve:
     high: np.ndarray
 
 
-def mean_curve(runs: Sequence[Run], column: str, *, smooth: bool) -> Curve | None:
+def average(runs: Sequence[Run], column: str, *, smooth: bool) -> Average | None:
     """Average a column of the runs' tables over seeds.
 
     The curve ends where the first of the runs does. Between epochs, and over those in which no
@@ -47,10 +46,10 @@ def mean_curve(runs: Sequence[Run], column: str, *, smooth: bool) -> Curve | Non
             run's final figure.
 
     Returns:
-        The curve, or None if a run has no value.
+        The curve, or None if there is no run, or one has no value.
     """
     series = [_series(run, column) for run in runs]
-    if not all(len(steps) for steps, _ in series):
+    if not series or not all(len(steps) for steps, _ in series):
         return None
     start = max(steps[0] for steps, _ in series)
     stop = min(steps[-1] for steps, _ in series)
@@ -59,12 +58,12 @@ def mean_curve(runs: Sequence[Run], column: str, *, smooth: bool) -> Curve | Non
     values = np.stack(
         [np.interp(grid, steps, moving_mean(y) if smooth else y) for steps, y in series], -1
     )
-    low, high = bootstrap([values], np.mean)
-    return Curve(grid, values.mean(-1), low, high)
+    return Average(grid, values.mean(-1), *bootstrap([values], np.mean))
 
 
 def _series(run: Run, column: str) -> tuple[np.ndarray, np.ndarray]:
     """Steps and values where there is a value."""
-    steps, values = np.array(run.table["steps"]), np.array(run.table.get(column, []))
+    steps = np.array(run.table["steps"])
+    values = np.array(run.table.get(column, np.full(steps.shape, np.nan)))
     known = np.isfinite(values)
-    return (steps[known], values[known]) if len(values) else (values, values)
+    return steps[known], values[known]

@@ -1,0 +1,214 @@
+"""Tables that are written as CSV, Markdown and HTML from one description."""
+
+from __future__ import annotations
+
+import csv
+import math
+import re
+from collections.abc import Callable, Hashable, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import chain, zip_longest
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from safe_rl.runs.files import replacing
+
+__all__ = [
+    *("MISSING", "SYMBOL", "Cell", "Column", "Record", "Table", "escaped", "interval", "mark_best"),
+    *("power_of_ten", "spread"),
+]
+
+MISSING = "—"
+"""Shown where there is no value."""
+SYMBOL = re.compile(r"\$(\\bar )?(\\rho|\w)(?:_(\w))?\$")
+r"""A symbol in a title or a sentence, such as ``$\bar J_r$``."""
+
+Record = Mapping[str, Any]
+
+
+class Cell(NamedTuple):
+    """What a reader sees of one entry.
+
+    Attributes:
+        title: Head of its column.
+        text: The entry.
+        mark: "best", "bad", or nothing.
+        is_number: Whether it is set flush right.
+    """
+
+    title: str
+    text: str
+    mark: str
+    is_number: bool
+
+
+class Column:
+    """A column: its head, and how the entry of a record is written.
+
+    Args:
+        title: Its head.
+        parts: A template each, and the fields that fill it, as in
+            ``("{:.1f}", "x"), (" ± {:.1f}", "x_std")``; a part is left out where one of its fields
+            is missing or NaN, the entry where the first part is.
+        mark: Record -> "best" (bold), "bad" (over a limit), or nothing.
+
+    Examples:
+        >>> column = Column("x", *spread("x", 1))
+        >>> column.text({"x": 1.25, "x_std": 0.5}), column.text({"x": 1.25}), column.text({})
+        ('1.2 ± 0.5', '1.2', '—')
+    """
+
+    def __init__(
+        self, title: str, *parts: tuple[str, ...], mark: Callable[[Record], str] | None = None
+    ) -> None:
+        self.title = title
+        self.parts = parts
+        self.mark = mark or (lambda record: "")
+        self.is_number = ":" in parts[0][0]
+
+    def text(self, record: Record) -> str:
+        """The entry of a record."""
+        texts = [
+            template.format(*(record[field] for field in fields))
+            if all(_is_there(record.get(field)) for field in fields)
+            else ""
+            for template, *fields in self.parts
+        ]
+        return "".join(texts) if texts[0] else MISSING
+
+
+def _is_there(value: Any) -> bool:
+    return value is not None and not (isinstance(value, float) and math.isnan(value))
+
+
+def spread(name: str, decimals: int) -> tuple[tuple[str, ...], ...]:
+    """Parts of a column: a number, and ± its standard deviation, the field ``<name>_std``."""
+    return (f"{{:.{decimals}f}}", name), (f" ± {{:.{decimals}f}}", f"{name}_std")
+
+
+def interval(name: str, decimals: int) -> tuple[tuple[str, ...], ...]:
+    """Parts of a column: an estimate, and the ends of its interval in brackets."""
+    ends = f" [{{:.{decimals}f}}, {{:.{decimals}f}}]"
+    return (f"{{:.{decimals}f}}", name), (ends, f"{name}_low", f"{name}_high")
+
+
+@dataclass(frozen=True)
+class Table:
+    """Records, and how they are shown.
+
+    Attributes:
+        name: Stem of the file.
+        title: Its heading.
+        columns: What is shown.
+        records: A row each; the CSV file holds all their fields, as numbers.
+        note: Said below it.
+
+    Examples:
+        >>> table = Table("t", "A table", [Column("x", ("{:.2f}", "x"))], [{"x": 1.23456}])
+        >>> print(table.markdown())
+        | x |
+        |---:|
+        | 1.23 |
+    """
+
+    name: str
+    title: str
+    columns: Sequence[Column]
+    records: Sequence[Record]
+    note: str = ""
+
+    def rows(self) -> list[list[Cell]]:
+        """What a reader sees."""
+        return [
+            [Cell(c.title, c.text(record), c.mark(record), c.is_number) for c in self.columns]
+            for record in self.records
+        ]
+
+    def markdown(self) -> str:
+        """The table in GitHub's Markdown; what is over its limit has a triangle."""
+        looks = {"best": "**{}**", "bad": "{} ▲", "": "{}"}
+        head = [escaped(column.title) for column in self.columns]
+        rule = ["---:" if column.is_number else "---" for column in self.columns]
+        rows = [
+            [looks[cell.mark].format(escaped(cell.text)) for cell in row] for row in self.rows()
+        ]
+        lines = [f"| {' | '.join(row)} |" for row in (head, *rows)]
+        return "\n".join([lines[0], f"|{'|'.join(rule)}|", *lines[1:]])
+
+    def write_csv(self, path: Path) -> None:
+        """Write the records; what is not a number becomes an empty field."""
+        names = dict.fromkeys(name for record in self.records for name in record)
+        with (
+            replacing(path) as unfinished,
+            unfinished.open("w", newline="", encoding="utf-8") as file,
+        ):
+            writer = csv.DictWriter(file, list(names), restval="", lineterminator="\n")
+            writer.writeheader()
+            writer.writerows([{k: _field(v) for k, v in r.items()} for r in self.records])
+
+
+def _field(value: Any) -> Any:
+    if not _is_there(value):
+        return ""
+    # a spreadsheet would take it for a formula
+    return f"'{value}" if isinstance(value, str) and value[:1] in {*"=+-@"} else value
+
+
+def escaped(text: str) -> str:
+    r"""Text as Markdown shows it, symbols aside.
+
+    Examples:
+        >>> print(escaped("<b> a|b $x_y$"))
+        \<b\> a\|b $x_y$
+    """
+    symbols = [match.group() for match in SYMBOL.finditer(text)]
+    ends = [0, *chain.from_iterable(match.span() for match in SYMBOL.finditer(text)), len(text)]
+    pieces = [text[start:stop] for start, stop in zip(ends[::2], ends[1::2], strict=True)]
+    plain = [re.sub(r"([\\`*_{}\[\]<>|#$~&])", r"\\\1", piece) for piece in pieces]
+    return "".join(chain.from_iterable(zip_longest(plain, symbols, fillvalue="")))
+
+
+def mark_best(
+    records: Sequence[Record],
+    name: str,
+    best: Callable[..., float],
+    *,
+    is_able: Callable[[Record], bool],
+    steps: Callable[[Record], Hashable],
+) -> Callable[[Record], str]:
+    """Mark of a column: "best" for the best value, and all equal to it, after equally many steps.
+
+    What nothing else has had as many steps as is not compared, and not marked.
+
+    Args:
+        records: Rows of the table.
+        name: Field of the value.
+        best: ``max`` or ``min``.
+        is_able: Which of them can be the best.
+        steps: Environment steps of training of a record.
+
+    Examples:
+        >>> rows = [{"x": x, "steps": steps} for x, steps in ((1, 5), (2, 5), (2, 5), (9, 6))]
+        >>> mark = mark_best(rows, "x", max, is_able=lambda r: True, steps=lambda r: r["steps"])
+        >>> [mark(row) for row in rows]
+        ['', 'best', 'best', '']
+    """
+
+    def mark(record: Record) -> str:
+        rivals = [other for other in records if steps(other) == steps(record)]
+        if len(rivals) < 2 or name not in record or not is_able(record):
+            return ""
+        winner = best(other[name] for other in rivals if name in other and is_able(other))
+        return "best" if math.isclose(record[name], winner, rel_tol=1e-9) else ""
+
+    return mark
+
+
+def power_of_ten(value: int) -> str:
+    """A power of ten as people write it.
+
+    Examples:
+        >>> power_of_ten(10_000_000)
+        '10⁷'
+    """
+    return f"10{str(round(math.log10(value))).translate(str.maketrans('0123456789', '⁰¹²³⁴⁵⁶⁷⁸⁹'))}"

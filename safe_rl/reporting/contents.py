@@ -1,0 +1,242 @@
+"""Everything a report says, in the order in which it says it."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from importlib.resources import files
+from math import isfinite, nan
+from pathlib import Path
+from typing import NamedTuple
+
+import yaml
+from matplotlib.figure import Figure
+
+from safe_rl.reporting.columns import Column, Record, Table
+from safe_rl.reporting.experiments import Experiment, group_runs
+from safe_rl.reporting.inventory import evaluation_table, run_table, videos
+from safe_rl.reporting.origins import Origin, find_origins
+from safe_rl.reporting.pictures import (
+    Style,
+    algorithm_styles,
+    draw_fronts,
+    draw_learning_curves,
+)
+from safe_rl.reporting.recorded import Run, clean, find_runs
+from safe_rl.reporting.scoring import dominance_table, final_table, learning_table
+from safe_rl.reporting.slate_pictures import draw_middles, draw_profiles
+from safe_rl.reporting.slate_scores import (
+    aggregate,
+    can_be_normalised,
+    improvement_table,
+    lacking_table,
+    middle_table,
+    missing_seeds,
+    slate_table,
+)
+from safe_rl.reporting.transfers import draw_transfer, find_transfers
+from safe_rl.scores.benchmark import Suite
+from safe_rl.scores.published import REFERENCE
+from safe_rl.scores.slates import SLATES
+
+__all__ = ["Block", "Drawing", "Film", "Report", "Section", "build_report"]
+
+# rows of a picture of learning curves, in environments
+_MOST_ROWS = 20
+_TEXTS = yaml.safe_load(files(__package__).joinpath("texts.yaml").read_text(encoding="utf-8"))
+
+
+class Drawing(NamedTuple):
+    """A picture: stem of its file, heading, and what it shows, for those who cannot see it."""
+
+    name: str
+    title: str
+    figure: Figure
+    shows: str
+
+
+class Film(NamedTuple):
+    """A video, and its caption."""
+
+    title: str
+    path: Path
+
+
+Block = Table | Drawing | Film | str
+
+
+class Section(NamedTuple):
+    """A part of the report: its key in ``texts.yaml``, its heading, what is in it."""
+
+    name: str
+    title: str
+    blocks: Sequence[Block]
+
+    @property
+    def text(self) -> str:
+        """What a reader has to know."""
+        return _TEXTS.get(self.name, "")
+
+
+@dataclass(frozen=True)
+class Report:
+    """What there is to say about a folder of runs.
+
+    Attributes:
+        experiments: Runs, grouped.
+        sections: What is said of them; none is empty.
+        lacking: Which runs slates still lack.
+        skipped: Folder or file -> why it was left out.
+    """
+
+    experiments: Sequence[Experiment]
+    sections: Sequence[Section]
+    lacking: Table
+    skipped: Mapping[Path, str]
+
+    @property
+    def runs(self) -> list[Run]:
+        """All runs in it."""
+        return [run for experiment in self.experiments for run in experiment.runs]
+
+    @property
+    def tables(self) -> dict[str, Table]:
+        """All tables by name."""
+        blocks = (block for section in self.sections for block in section.blocks)
+        return {block.name: block for block in blocks if isinstance(block, Table)}
+
+
+def build_report(root: Path, suite: Suite, *, seeds_needed: int, unfinished: bool) -> Report:
+    """Find the runs below a folder and put everything together.
+
+    Args:
+        root: The folder.
+        suite: The benchmark.
+        seeds_needed: Finished runs that a slate takes per environment.
+        unfinished: Whether unfinished runs count as finished ones.
+
+    Raises:
+        FileNotFoundError: If there is no run.
+    """
+    runs, skipped = find_runs(root, unfinished=unfinished)
+    origins = find_origins(runs)
+    experiments, repeated = group_runs(runs, suite, origins, root)
+    skipped |= repeated
+    styles = algorithm_styles(experiments)
+    groups = _by_environment(e for e in experiments if e.finished)
+    finals = [final_table(group) for group in groups]
+    records = [record for table in finals for record in table.records]
+    lacking = lacking_table(experiments, seeds_needed)
+    sections = [
+        Section("final", "Final scores", finals or ["No run is finished."]),
+        Section("learning", "What learning cost", list(filter(None, map(learning_table, groups)))),
+        Section("curves", "Learning curves", _curves(experiments, styles)),
+        Section("fronts", "Return against cost", _fronts(records, styles)),
+        Section("transfer", "Transfer", _transfers(experiments, origins, styles)),
+        Section(
+            "normalised",
+            "Normalised scores",
+            [*_slates(experiments, styles, seeds_needed), *_if_any(lacking)],
+        ),
+        Section("dominance", "Which is better", _if_any(dominance_table(records))),
+        Section("evaluations", "Evaluations", _if_any(evaluation_table(experiments))),
+        Section("videos", "Videos", [Film(clean(c), path) for c, path in videos(experiments)]),
+        Section("runs", "Runs", [run_table(experiments), *_if_any(_left_out(skipped))]),
+    ]
+    return Report(experiments, [s for s in sections if s.blocks], lacking, skipped)
+
+
+def _if_any(table: Table) -> list[Table]:
+    return [table] if table.records else []
+
+
+def _left_out(skipped: Mapping[Path, str]) -> Table:
+    records = [{"what": clean(path), "why": clean(why, 500)} for path, why in skipped.items()]
+    columns = [Column(name, ("{}", name)) for name in ("what", "why")]
+    return Table("left_out", "Left out", columns, records)
+
+
+def _by_environment(experiments: Iterable[Experiment]) -> list[list[Experiment]]:
+    groups: dict[str, list[Experiment]] = defaultdict(list)
+    for experiment in experiments:
+        groups[experiment.environment].append(experiment)
+    return list(groups.values())
+
+
+def _fronts(records: Sequence[Record], styles: Mapping[str, Style]) -> list[Drawing]:
+    """Environments on which at least two experiments have both a return and a cost."""
+    known = [r for r in records if isfinite(r["episode_return"] + r.get("episode_cost", nan))]
+    names = [record["environment"] for record in known]
+    shown = [record for record in known if names.count(record["environment"]) > 1]
+    says = f"Final return against final cost: {', '.join(dict.fromkeys(names))}"
+    return [Drawing("fronts", "", draw_fronts(shown, styles), says)] if shown else []
+
+
+def _curves(experiments: Sequence[Experiment], styles: Mapping[str, Style]) -> list[Drawing]:
+    """A picture per robot, where environments have one; several if it would get too long."""
+    robots: dict[str, list[list[Experiment]]] = defaultdict(list)
+    for group in _by_environment(experiments):
+        robot = Path(str(group[0].runs[0].config["env"].get("robot_base", "other"))).stem
+        robots[clean(robot, 40)].append(group)
+    drawings = []
+    for robot, groups in robots.items():
+        for start in range(0, len(groups), _MOST_ROWS):
+            shown = groups[start : start + _MOST_ROWS]
+            names = ", ".join(group[0].environment for group in shown)
+            says = f"Return, episode cost and cost rate over environment steps: {names}"
+            figure = draw_learning_curves([e for group in shown for e in group], styles)
+            drawings.append(Drawing(f"curves_{robot}", "", figure, says))
+    return drawings
+
+
+def _transfers(
+    experiments: Sequence[Experiment],
+    origins: Mapping[Path, Origin],
+    styles: Mapping[str, Style],
+) -> list[Block]:
+    blocks: list[Block] = []
+    for number, transfer in enumerate(find_transfers(experiments, origins), start=1):
+        says = f"Return, episode cost and cost rate of both phases, {transfer.title}"
+        figure = draw_transfer(transfer, styles)
+        blocks += [Drawing(f"transfer_{number}", transfer.title, figure, says), *transfer.notes]
+    return blocks
+
+
+def _slates(
+    experiments: Sequence[Experiment], styles: Mapping[str, Style], seeds_needed: int
+) -> list[Block]:
+    """The slates that are complete for an algorithm or more, and what all have in common."""
+    begun = [e for e in experiments if e.benchmark in REFERENCE and not e.is_continued]
+    algorithms = list(dict.fromkeys(e.algorithm for e in begun))
+    usable = [e for e in experiments if can_be_normalised(e)]
+    shared = tuple(
+        name
+        for name in REFERENCE
+        if algorithms and {e.algorithm for e in usable if e.benchmark == name} == set(algorithms)
+    )
+    complete = {
+        (name, slate): [
+            a for a in algorithms if not missing_seeds(name, a, experiments, seeds_needed)
+        ]
+        for name, slate in SLATES.items()
+    }
+    if shared not in [slate for (_, slate), members in complete.items() if members]:
+        complete["shared", shared] = algorithms if shared else []
+    blocks: list[Block] = []
+    for (name, slate), members in complete.items():
+        aggregates = [
+            aggregate([e for e in usable if e.algorithm == a and e.benchmark in slate])
+            for a in members
+        ]
+        if aggregates:
+            middle = middle_table(name, aggregates)
+            iqm, profiles = draw_middles(middle.records, styles), draw_profiles(aggregates, styles)
+            blocks += [
+                slate_table(name, slate, aggregates),
+                Drawing(f"slate_{name}", "", iqm, f"Interquartile means, {name}"),
+                middle,
+                Drawing(f"profiles_{name}", "", profiles, f"Performance profiles, {name}"),
+                *_if_any(improvement_table(name, aggregates)),
+            ]
+    return blocks

@@ -1,0 +1,305 @@
+"""Runs as their folders record them, whoever wrote these: configuration, table, command, films.
+
+Whatever is odd in a folder becomes a sentence on why it, or a file of it, is left out. Nothing is
+read that a link in the folder names outside of it, and nothing that a file says is followed.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import shlex
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from safe_rl.runs.files import read_config, read_yaml
+from safe_rl.runs.folder import RunFolder, runs_below
+from safe_rl.runs.outcome import final_figures, judges_another_measure, violation
+from safe_rl.runs.table import read_table
+
+__all__ = ["Run", "clean", "find_runs"]
+
+_LONGEST = 200
+# a number that has left all bounds says as little as NaN, and fits no picture
+_EXPLODED = 1e30
+
+
+def clean(text: Any, most: int = _LONGEST) -> str:
+    r"""Text as a page can show it: one line, printable, of bounded length.
+
+    Examples:
+        >>> clean("a\nb\x07"), clean("x" * 10, most=4)
+        ('a b�', 'xxx…')
+    """
+    shown = "".join(c if c.isprintable() else " " if c.isspace() else "�" for c in str(text))
+    return shown if len(shown) <= most else f"{shown[: most - 1]}…"
+
+
+@dataclass(frozen=True)
+class Run:
+    """One training run.
+
+    Attributes:
+        directory: Its folder.
+        config: Its configuration.
+        table: Columns of its table; a row per epoch, NaN where there is no number.
+        frames: Environment steps after which it counts as finished.
+        command: The command line that does it again, if Hydra has recorded it.
+        overrides: What its command line said.
+        cwd: Where it was started, if Hydra has recorded it.
+        evaluations: What ``safe_rl.evaluate`` has written into its folder.
+        videos: Videos in its folder.
+        modified: When its table was last written [s since 1970].
+    """
+
+    directory: Path
+    config: Mapping[str, Any]
+    table: Mapping[str, list[float]]
+    frames: int
+    overrides: tuple[str, ...] | None = None
+    command: str | None = None
+    cwd: Path | None = None
+    evaluations: tuple[Mapping[str, Any], ...] = ()
+    videos: tuple[Path, ...] = ()
+    modified: float = 0.0
+
+    @property
+    def seed(self) -> int:
+        """Seed of networks, layouts and actions."""
+        return self.config["seed"]
+
+    @property
+    def algorithm(self) -> str:
+        """Name of the file in ``conf/algo``."""
+        return self.config["algo"]["name"]
+
+    @property
+    def limits(self) -> dict[str, float]:
+        """Cost key -> d, undiscounted cost per episode."""
+        return {key: float(d) for key, d in (self.config["cost_limits"] or {}).items()}
+
+    @property
+    def episode_length(self) -> int | None:
+        """T_ep in steps, if the configuration says it."""
+        found = (self.config["env"].get(key) for key in ("num_steps", "max_episode_steps"))
+        return next((n for n in found if isinstance(n, int) and n > 0), None)
+
+    @property
+    def steps(self) -> int:
+        """Environment steps so far."""
+        return int(self.table["steps"][-1])
+
+    @property
+    def is_finished(self) -> bool:
+        """Whether it has come to its end."""
+        return self.steps >= self.frames
+
+    @property
+    def hours(self) -> float:
+        """Time of training so far [h]."""
+        return self.table["time_total"][-1] / 3600
+
+    @property
+    def init_from(self) -> Path | None:
+        """The run or checkpoint whose networks it started from, as its command line named it."""
+        source = self.config.get("init_from")
+        return None if source is None else Path(source)
+
+    def column(self, name: str) -> np.ndarray:
+        """A column in the epochs in which an episode finished, shape [epochs]; NaN without one."""
+        known = np.isfinite(self.table["episode_return"])
+        return np.array(self.table.get(name, np.full(known.shape, math.nan)), dtype=float)[known]
+
+    def final(self, cost_keys: Sequence[str]) -> dict[str, float]:
+        """Final J_r, J_c and ρ_c by column name (section 5.1), of the costs that it has."""
+        own = [key for key in cost_keys if f"{key}_rate" in self.table]
+        return final_figures(self.table, own)
+
+    def excess(self, key: str) -> float:
+        """What the limit of a cost judges, minus d: a mean over the last five epochs."""
+        return violation(self.final([key]), key, self.limits[key])
+
+    def limits_another_measure(self, key: str) -> bool:
+        """Whether the limit of a cost is on something else than the mean cost of an episode."""
+        return judges_another_measure(self.table, key, self.limits[key])
+
+
+def find_runs(root: Path, *, unfinished: bool = False) -> tuple[list[Run], dict[Path, str]]:
+    """Find every run below a folder.
+
+    Args:
+        root: The folder.
+        unfinished: Whether runs count as finished that have not come to their configured end.
+
+    Returns:
+        Runs that have finished an epoch, and folder or file -> why it was left out.
+
+    Raises:
+        FileNotFoundError: If there is no such folder, or no run in it.
+    """
+    if not root.is_dir():
+        raise FileNotFoundError(
+            f"There is no folder '{root}': give the folder that holds the runs."
+        )
+    runs: list[Run] = []
+    skipped: dict[Path, str] = {}
+    for folder in runs_below(root):
+        try:
+            runs.append(_read_run(folder, root.resolve(), unfinished, skipped))
+        except Exception as error:  # whatever is wrong with it, the others are reported
+            skipped[folder.directory] = clean(error) or type(error).__name__
+    if not runs:
+        reasons = "".join(f"\n  {clean(path)}: {reason}" for path, reason in skipped.items())
+        raise FileNotFoundError(
+            f"There is no run to report below '{root}': a run is a folder with config.yaml and "
+            f"progress.csv, as train.py writes it.{reasons}"
+        )
+    return runs, skipped
+
+
+def _read_run(folder: RunFolder, root: Path, unfinished: bool, skipped: dict[Path, str]) -> Run:
+    config = read_config(_own(folder.config, root))
+    for key, is_right, wanted in _NEEDED:
+        if not is_right(config.get(key)):
+            raise ValueError(f"config.yaml is not that of a run: its '{key}' is not {wanted}")
+    if not folder.table.is_file():
+        raise ValueError("it has not begun: no progress.csv")
+    table = _read_numbers(_own(folder.table, root), config["cost_limits"] or {})
+
+    def read(paths: Iterable[Path], reader: Callable[[Path], Any]) -> list[Any]:
+        """What files of the run hold; those that cannot be read are noted."""
+        contents = []
+        for path in paths:
+            try:
+                contents.append(reader(_own(path, root)))
+            except Exception as error:
+                skipped[path] = clean(error) or type(error).__name__
+        return contents
+
+    notes = (folder.surroundings, folder.overrides, folder.notes / "config.yaml")
+    hydra, said, begun_with = (
+        next(iter(read((path for path in (note,) if os.path.lexists(path)), read_yaml)), None)
+        for note in notes
+    )
+    overrides = tuple(map(clean, said)) if isinstance(said, list) else None
+    cwd = _select(hydra, "hydra", "runtime", "cwd")
+    return Run(
+        folder.directory,
+        config,
+        table,
+        0 if unfinished else config["frames"],
+        overrides,
+        None if overrides is None else _command(overrides, hydra, begun_with, config),
+        Path(cwd) if isinstance(cwd, str) else None,
+        tuple(filter(None, read(folder.evaluations(), _read_evaluation))),
+        tuple(read(sorted(folder.directory.rglob("*.mp4")), lambda path: path)),
+        folder.table.stat().st_mtime,
+    )
+
+
+def _own(path: Path, root: Path) -> Path:
+    if not path.resolve().is_relative_to(root):
+        raise ValueError(f"{path.name} is a link to outside of the folder")
+    if not path.is_file():
+        raise ValueError(f"{path.name} is no file")
+    return path
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+
+
+def _is_named(value: Any) -> bool:
+    return isinstance(value, dict) and isinstance(value.get("name"), str) and bool(value["name"])
+
+
+def _are_limits(value: Any) -> bool:
+    return value is None or (isinstance(value, dict) and all(map(_is_number, value.values())))
+
+
+_NEEDED: tuple[tuple[str, Callable[[Any], bool], str], ...] = (
+    ("env", lambda v: isinstance(v, dict), "a mapping"),
+    ("algo", _is_named, "a mapping with a name"),
+    ("seed", lambda v: isinstance(v, int) and not isinstance(v, bool), "a whole number"),
+    ("frames", lambda v: _is_number(v) and v >= 0, "a number of steps"),
+    ("cost_limits", _are_limits, "a mapping of costs to numbers"),
+    ("init_from", lambda v: v is None or isinstance(v, str), "a path"),
+)
+
+
+def _read_numbers(path: Path, limits: Mapping[str, Any]) -> dict[str, list[float]]:
+    try:
+        table = read_table(path)
+    except ValueError as error:
+        raise ValueError(f"progress.csv cannot be read ({error})") from error
+    if not table.get("steps"):
+        raise ValueError("it has not finished an epoch")
+    needed = ["episode_return", "time_total"]
+    needed += [name for key in limits for name in (f"episode_{key}", f"{key}_rate")]
+    missing = [name for name in needed if name not in table]
+    if missing:
+        raise ValueError(f"progress.csv has no column {missing[0]}")
+    bounded = {
+        name: [value if abs(value) < _EXPLODED else math.nan for value in values]
+        for name, values in table.items()
+    }
+    steps, seconds = bounded["steps"], bounded["time_total"][-1]
+    if not (steps[0] > 0 and all(np.diff(steps) > 0) and seconds > 0):
+        raise ValueError("progress.csv cannot be read (its steps or times do not grow)")
+    return bounded
+
+
+def _read_evaluation(path: Path) -> dict[str, Any] | None:
+    """An evaluation with the types that its table needs, or None if it is something else."""
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+        if "estimates" not in content:
+            return None
+        return {
+            "checkpoint": clean(content["checkpoint"]),
+            "steps": content["steps"],
+            "episodes": int(content["episodes"]),
+            "deterministic": bool(content["deterministic"]),
+            "env": {clean(key): clean(value) for key, value in content["env"].items()},
+            "layouts_trained_on": float(content["layouts_trained_on"]),
+            "cvar_alpha": float(content["cvar_alpha"]),
+            "cost_limits": {str(k): float(d) for k, d in content["cost_limits"].items()},
+            "estimates": {
+                name: {
+                    p: math.nan if e[p] is None else float(e[p]) for p in ("value", "low", "high")
+                }
+                for name, e in content["estimates"].items()
+            },
+        }
+    except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
+        raise ValueError(f"it is no evaluation ({type(error).__name__}: {error})") from error
+
+
+def _number(value: float | None) -> float:
+    return math.nan if value is None else float(value)
+
+
+def _command(
+    overrides: Sequence[str], hydra: Any, begun_with: Any, config: Mapping[str, Any]
+) -> str:
+    """The command line, with what it did not say in its overrides."""
+    words = ["python", "train.py"]
+    for source in _select(hydra, "hydra", "runtime", "config_sources") or ():
+        if _select(source, "provider") == "command-line":
+            words.append(f"--config-dir={clean(_select(source, 'path'))}")
+    frames = config["frames"]
+    # a run that was continued for longer
+    if _select(begun_with, "frames") not in (None, frames):
+        overrides = [o for o in overrides if not o.startswith("frames=")] + [f"frames={frames}"]
+    return shlex.join([*words, *overrides])
+
+
+def _select(node: Any, *keys: str) -> Any:
+    for key in keys:
+        node = node.get(key) if isinstance(node, dict) else None
+    return node

@@ -1,0 +1,242 @@
+"""Final scores of experiments, what learning them has cost, and which are better than which."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import partial
+from statistics import mean
+from typing import Any
+
+import numpy as np
+
+from safe_rl.reporting.columns import Column, Record, Table, mark_best, power_of_ten, spread
+from safe_rl.reporting.experiments import Experiment, cost_keys_of
+from safe_rl.reporting.recorded import Run, clean
+from safe_rl.runs.curves import moving_mean
+from safe_rl.scores.dominance import Agent, compare
+from safe_rl.scores.learning import (
+    first_good_epoch,
+    longest_streak,
+    regret,
+    share_of_epochs_over,
+)
+from safe_rl.scores.published import (
+    PUBLISHED_STEPS,
+    REFERENCE,
+    REIMPLEMENTATION_STEPS,
+    REIMPLEMENTATIONS,
+)
+
+__all__ = ["dominance_table", "final_record", "final_table", "learning_table", "stem"]
+
+Records = list[dict[str, Any]]
+IDENTITY = (Column("algorithm", ("{}", "algorithm")), Column("seeds", ("{:d}", "seeds")))
+
+
+def final_record(experiment: Experiment, cost_keys: Sequence[str]) -> dict[str, Any]:
+    """Final J_r, J_c and ρ_c of an experiment: mean and standard deviation over its seeds."""
+    runs = experiment.finished
+    record: dict[str, Any] = {
+        "environment": experiment.environment,
+        "algorithm": experiment.algorithm,
+        "seeds": len(runs),
+        "steps": max(run.steps for run in runs),
+        "hours": float(np.mean([run.hours for run in runs])),
+    }
+    record |= _over_seeds([run.final(cost_keys) for run in runs])
+    limits = experiment.limits
+    record |= {f"limit_{key}": limit for key, limit in limits.items()}
+    excesses = {k: float(np.mean([run.excess(k) for run in runs])) for k in limits}
+    record |= {f"excess_{key}": excess for key, excess in excesses.items()}
+    record["satisfies"] = all(excess <= 0 for excess in excesses.values())
+    return record | _published(experiment)
+
+
+def _over_seeds(values: Sequence[Mapping[str, float | None]]) -> dict[str, float]:
+    """Mean and standard deviation of figures over the seeds that have them."""
+    record = {}
+    for name in values[0]:
+        known = np.array([one[name] for one in values if one.get(name) is not None], dtype=float)
+        if known.size:
+            record[name] = float(known.mean())
+            record[f"{name}_std"] = float(known.std(ddof=1)) if known.size > 1 else float("nan")
+    return record
+
+
+def _published(experiment: Experiment) -> dict[str, Any]:
+    """Values printed elsewhere for the same environment and algorithm."""
+    if experiment.benchmark is None or not experiment.has_published_limit:
+        return {}
+    algorithm = experiment.runs[0].algorithm
+    fields: dict[str, Any] = {}
+    reference = REFERENCE.get(experiment.benchmark)
+    if algorithm == "ppo" and reference is not None:
+        fields |= {f"paper_{name}": value for name, value in reference._asdict().items()}
+    later = REIMPLEMENTATIONS.get(experiment.benchmark, {}).get(algorithm)
+    if later is not None:
+        fields |= {"later_return": later[0], "later_cost": later[1]}
+    return fields
+
+
+def final_table(experiments: Sequence[Experiment]) -> Table:
+    """Final scores on one environment, with what others have published beside them."""
+    environment = experiments[0].environment
+    cost_keys = cost_keys_of(experiments)
+    records = [final_record(experiment, cost_keys) for experiment in experiments]
+    columns = [
+        *IDENTITY,
+        Column("steps", ("{:,}", "steps")),
+        _marked("$J_r$", "episode_return", 2, records, max),
+    ]
+    for key in cost_keys:
+        suffix = "" if len(cost_keys) == 1 else f" [{clean(key, 40)}]"
+        ranked = records if key == "cost" else []
+        columns += [
+            Column(f"$J_c${suffix}", *spread(f"episode_{key}", 1), mark=partial(_is_over, key)),
+            Column(f"$d${suffix}", ("{:g}", f"limit_{key}")),
+            _marked(rf"$\rho_c${suffix}", f"{key}_rate", 4, ranked, min),
+        ]
+    if any("paper_episode_return" in record for record in records):
+        steps = power_of_ten(PUBLISHED_STEPS[experiments[0].benchmark or ""])
+        names = ("paper_episode_return", "paper_episode_cost", "paper_cost_rate")
+        title = rf"paper, {steps} steps: $J_r$ / $J_c$ / $\rho_c$"
+        columns.append(Column(title, ("{:g} / {:g} / {:g}", *names)))
+    if any("later_return" in record for record in records):
+        title = f"later work, {power_of_ten(REIMPLEMENTATION_STEPS)} steps: $J_r$ / $J_c$"
+        columns.append(Column(title, ("{:g} / {:g}", "later_return", "later_cost")))
+    notes = [
+        _measure_note(record, key)
+        for record, experiment in zip(records, experiments, strict=True)
+        for key in experiment.limits_of_other_measures
+    ]
+    return Table(stem("final", environment), environment, columns, records, " ".join(notes))
+
+
+def stem(kind: str, environment: str) -> str:
+    """Name of an environment's file."""
+    return f"{kind}_{re.sub(r'[^A-Za-z0-9]+', '_', environment).strip('_')[:80]}"
+
+
+def _is_over(key: str, record: Record) -> str:
+    return "bad" if record.get(f"excess_{key}", 0.0) > 0 else ""
+
+
+def _marked(
+    title: str, name: str, decimals: int, records: Sequence[Record], best: Callable[..., float]
+) -> Column:
+    """A column with a mark at the best among those that satisfy their constraints."""
+    mark = mark_best(
+        records, name, best, is_able=lambda r: r["satisfies"], steps=lambda r: r["steps"]
+    )
+    return Column(title, *spread(name, decimals), mark=mark)
+
+
+def _measure_note(record: Record, key: str) -> str:
+    """Says that a limit is on something else than the mean that the table shows."""
+    excess = record[f"excess_{key}"]
+    verdict = f"{abs(excess):.1f} {'over' if excess > 0 else 'below'} $d$"
+    return (
+        f"{record['algorithm']}: the limit of {clean(key, 40)} is on another measure than the mean "
+        f"$J_c$; over the last five epochs that measure was {verdict}, and this is what is judged."
+    )
+
+
+def learning_table(experiments: Sequence[Experiment]) -> Table | None:
+    """What learning has cost on one environment, and when it came to something.
+
+    Returns:
+        The table, or None if nothing on it has a limit.
+    """
+    experiments = [e for e in experiments if e.limits]
+    if not experiments:
+        return None
+    environment, keys = experiments[0].environment, cost_keys_of(experiments)
+    keys = [key for key in keys if any(key in e.limits for e in experiments)]
+    finals = [[run.final([])["episode_return"] for run in e.finished] for e in experiments]
+    reference = experiments[0].reference
+    whose = "the final return of the best here" if reference is None else "the published PPO's"
+    least = 0.5 * (max(map(mean, finals)) if reference is None else reference.episode_return)
+    records = []
+    for experiment in experiments:
+        figures = [_learning_figures(run, least) for run in experiment.finished]
+        reached = sum(one["good_steps"] is not None for one in figures)
+        records.append(
+            {
+                "environment": environment,
+                "algorithm": experiment.algorithm,
+                "seeds": len(figures),
+                "seeds_good": reached,
+                **_over_seeds(figures),
+            }
+        )
+    columns = [*IDENTITY]
+    for key in keys:
+        suffix = "" if len(keys) == 1 else f" [{clean(key, 40)}]"
+        columns += [
+            Column(f"regret{suffix}", *spread(f"regret_{key}", 1)),
+            Column(f"epochs over{suffix}", ("{:.0%}", f"share_over_{key}")),
+            Column(f"longest streak{suffix}", ("{:.0f}", f"streak_{key}")),
+        ]
+    columns += [
+        Column("good after", ("{:,.0f} steps", "good_steps")),
+        Column("and", ("{:.2f} h", "good_hours")),
+        Column("in", ("{:d} of {:d} seeds", "seeds_good", "seeds")),
+    ]
+    note = (
+        f"Good: $J_r$ at least {least:.4g}, half of {whose}, and every $J_c$ within its limit, "
+        "over five epochs; mean over the seeds that came to it."
+    )
+    return Table(stem("learning", environment), environment, columns, records, note)
+
+
+def _learning_figures(run: Run, least_return: float) -> dict[str, float | None]:
+    returns = run.column("episode_return")
+    figures: dict[str, float | None] = {"good_steps": None, "good_hours": None}
+    if not returns.size:
+        return figures
+    worst = np.full(returns.shape, -np.inf)
+    for key, limit in run.limits.items():
+        violation = run.column(f"violation_{key}")
+        costs = run.column(f"episode_{key}")
+        judged = np.where(np.isfinite(violation), limit + violation, costs)
+        judged = judged if run.limits_another_measure(key) else costs
+        figures[f"regret_{key}"] = regret(judged, limit)
+        figures[f"share_over_{key}"] = share_of_epochs_over(judged, limit)
+        figures[f"streak_{key}"] = longest_streak(judged, limit)
+        worst = np.maximum(worst, moving_mean(judged) - limit)
+    epoch = first_good_epoch(moving_mean(returns), worst, least_return, 0.0)
+    if epoch is not None:
+        figures["good_steps"] = float(run.column("steps")[epoch])
+        figures["good_hours"] = float(run.column("time_total")[epoch]) / 3600
+    return figures
+
+
+def dominance_table(records: Iterable[Record]) -> Table:
+    """Which algorithm is better than which on each environment."""
+    records, relations = list(records), []
+    for environment in dict.fromkeys(record["environment"] for record in records):
+        agents = {
+            r["algorithm"]: Agent(
+                r["episode_return"], r.get("cost_rate", 0.0), r["satisfies"], r["steps"]
+            )
+            for r in records
+            if r["environment"] == environment
+        }
+        for better, worse, reason in compare(agents):
+            relations.append(
+                {
+                    "environment": environment, "better": better, "worse": worse,
+                    "reason": reason, "why": _REASONS[reason],
+                }
+            )  # fmt: skip
+    names = ("environment", "better", "worse", "why")
+    return Table(
+        "dominance",
+        "Which is better",
+        [Column(name, ("{}", name)) for name in names],
+        relations,
+    )
+
+
+_REASONS = {"satisfies": "keeps its limits, the other does not", "dominates": "≻ dominates"}

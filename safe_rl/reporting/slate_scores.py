@@ -1,0 +1,292 @@
+"""Normalised scores over slates of environments (paper section 5.1), and what slates lack."""
+
+from __future__ import annotations
+
+import shlex
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import permutations
+from typing import Any
+
+import numpy as np
+
+from safe_rl.reporting.columns import Column, Table, interval, mark_best, power_of_ten
+from safe_rl.reporting.experiments import Experiment
+from safe_rl.runs.identity import Role, role_of
+from safe_rl.scores.comparisons import probability_of_improvement
+from safe_rl.scores.dominance import NOISE_OF_ZERO, Agent, compare
+from safe_rl.scores.intervals import Estimate, interquartile_mean
+from safe_rl.scores.normalised import (
+    normalised_cost_rate,
+    normalised_return,
+    normalised_violation,
+)
+from safe_rl.scores.published import PUBLISHED, PUBLISHED_STEPS, SEEDS, Normalised
+from safe_rl.scores.slates import SLATES
+
+__all__ = [
+    *("SYMBOLS", "Aggregate", "aggregate", "can_be_normalised", "improvement_table"),
+    *("lacking_table", "middle_table", "missing_seeds", "normalised_scores", "slate_table"),
+]
+
+SYMBOLS = dict(
+    zip(Normalised._fields, (r"$\bar J_r$", r"$\bar M_c$", r"$\bar \rho_c$"), strict=True)
+)
+"""Score -> its symbol."""
+
+# groups that a command for missing runs chooses itself
+_CHOSEN = {"env", "algo", "slate", "init_from", "hydra"}
+
+
+@dataclass(frozen=True)
+class Aggregate:
+    """An algorithm's normalised scores over a set of environments.
+
+    Attributes:
+        algorithm: Its name, as experiments have it.
+        published: Its name in ``conf/algo``, or "" if its limits are not the published ones.
+        strata: Score -> its values per environment, one of each run.
+        steps: Environment steps of training, per environment.
+    """
+
+    algorithm: str
+    published: str
+    strata: Mapping[str, list[np.ndarray]]
+    steps: tuple[int, ...]
+
+    @property
+    def mean(self) -> Normalised:
+        """Averages over environments of averages over seeds."""
+        return Normalised(
+            *(float(np.mean([runs.mean() for runs in self.strata[n]])) for n in Normalised._fields)
+        )
+
+    @property
+    def num_runs(self) -> int:
+        """Runs that went into it."""
+        return sum(map(len, self.strata["episode_return"]))
+
+    def middle(self, score: str) -> Estimate:
+        """Interquartile mean over all runs; its interval resamples every environment's seeds."""
+        return interquartile_mean(self.strata[score])
+
+
+def can_be_normalised(experiment: Experiment) -> bool:
+    """Whether there is something to normalise, and something to normalise it by.
+
+    Runs that started from other runs' networks had more training than their steps say, and do not
+    count.
+    """
+    return (
+        experiment.reference is not None
+        and "cost" in experiment.limits
+        and not experiment.is_continued
+        and bool(experiment.finished)
+    )
+
+
+def normalised_scores(experiment: Experiment) -> dict[str, np.ndarray]:
+    """Normalised final scores of every finished run, each of shape [seeds].
+
+    Raises:
+        ValueError: If the environment has no reference scores, or its cost no limit.
+    """
+    reference, limit = experiment.reference, experiment.limits.get("cost")
+    if reference is None or limit is None:
+        raise ValueError(
+            f"{experiment.environment} with limits {experiment.limits} cannot be normalised: it "
+            "takes an environment of the benchmark and a limit of 'cost'."
+        )
+    finals = [run.final(["cost"]) for run in experiment.finished]
+    values = {name: np.array([final[name] for final in finals]) for name in finals[0]}
+    # J_c, or what the run compares with the limit in its place
+    judged = limit + np.array([run.excess("cost") for run in experiment.finished])
+    return {
+        "episode_return": normalised_return(values["episode_return"], reference),
+        "violation": normalised_violation(judged, limit, reference),
+        "cost_rate": normalised_cost_rate(values["cost_rate"], reference),
+    }
+
+
+def aggregate(experiments: Sequence[Experiment]) -> Aggregate:
+    """Put one algorithm's experiments together, one per environment."""
+    scores = [normalised_scores(experiment) for experiment in experiments]
+    first = experiments[0]
+    return Aggregate(
+        first.algorithm,
+        first.runs[0].algorithm if all(e.has_published_limit for e in experiments) else "",
+        {name: [score[name] for score in scores] for name in Normalised._fields},
+        tuple(max(run.steps for run in e.finished) for e in experiments),
+    )
+
+
+def slate_table(slate: str, environments: Sequence[str], aggregates: Sequence[Aggregate]) -> Table:
+    """One of the paper's Tables 1 and 2, the published values beside ours."""
+    records = [_record(slate, aggregate) for aggregate in aggregates]
+    steps = {aggregate.algorithm: aggregate.steps for aggregate in aggregates}
+
+    def best(name: str, of: Any) -> Any:
+        return mark_best(
+            records, name, of,
+            is_able=lambda r: r["violation"] <= NOISE_OF_ZERO,
+            steps=lambda r: steps[r["algorithm"]],
+        )  # fmt: skip
+
+    marks = {"episode_return": best("episode_return", max), "cost_rate": best("cost_rate", min)}
+    marks["violation"] = lambda r: "bad" if r["violation"] > NOISE_OF_ZERO else ""
+    columns = [
+        Column("algorithm", ("{}", "algorithm")),
+        Column("runs", ("{:d}", "runs")),
+        Column("steps", ("{:,}", "fewest_steps"), (" to {:,}", "most_steps")),
+        *(Column(s, ("{:.3f}", name), mark=marks[name]) for name, s in SYMBOLS.items()),
+    ]
+    if slate in PUBLISHED:
+        columns += [Column(f"paper {s}", ("{:.3f}", f"paper_{n}")) for n, s in SYMBOLS.items()]
+    notes = [f"On {', '.join(environments)}.", _relations(aggregates)]
+    notes += [_published_steps(slate)] if slate in PUBLISHED else []
+    title = {"shared": "What all algorithms were trained on"}.get(slate, slate)
+    return Table(f"slate_{slate}", title, columns, records, " ".join(filter(None, notes)))
+
+
+def _record(slate: str, aggregate: Aggregate) -> dict[str, Any]:
+    fewest, most = min(aggregate.steps), max(aggregate.steps)
+    record: dict[str, Any] = {
+        "slate": slate,
+        "algorithm": aggregate.algorithm,
+        "runs": aggregate.num_runs,
+        "fewest_steps": fewest,
+        "most_steps": None if most == fewest else most,
+        **aggregate.mean._asdict(),
+    }
+    published = PUBLISHED.get(slate, {}).get(aggregate.published)
+    if published is not None:
+        record |= {f"paper_{name}": value for name, value in published._asdict().items()}
+    return record
+
+
+def _published_steps(slate: str) -> str:
+    """After how many steps the published values were measured."""
+    steps = sorted({PUBLISHED_STEPS[environment] for environment in SLATES[slate]})
+    doggo = " (Doggo)" if len(steps) > 1 else ""
+    return (
+        f"The paper's values are those after {' and '.join(map(power_of_ten, steps))}{doggo} steps."
+    )
+
+
+def _relations(aggregates: Sequence[Aggregate]) -> str:
+    """Who fails, and who dominates whom, in words."""
+    agents = {
+        a.algorithm: Agent(
+            a.mean.episode_return, a.mean.cost_rate, a.mean.violation <= NOISE_OF_ZERO, a.steps
+        )
+        for a in aggregates
+    }
+    failing = [name for name, agent in agents.items() if not agent.is_satisfying]
+    pairs = [f"{a} ≻ {b}" for a, b, reason in compare(agents) if reason == "dominates"]
+    parts = []
+    if failing:
+        parts.append(
+            f"Violate the constraint ({SYMBOLS['violation']} above {NOISE_OF_ZERO:g}), and so are "
+            "worse than any that does not after equally many steps: " + ", ".join(failing) + "."
+        )
+    if len(agents) - len(failing) > 1:
+        parts.append(f"{'; '.join(pairs)}." if pairs else "None of the others dominates another.")
+    return " ".join(parts)
+
+
+def middle_table(slate: str, aggregates: Sequence[Aggregate]) -> Table:
+    """Interquartile means over all runs with their intervals."""
+    records = []
+    for one in aggregates:
+        record: dict[str, Any] = {"slate": slate, "algorithm": one.algorithm, "runs": one.num_runs}
+        for name in SYMBOLS:
+            value, low, high = one.middle(name)
+            record |= {name: value, f"{name}_low": low, f"{name}_high": high}
+        records.append(record)
+    columns = [Column("algorithm", ("{}", "algorithm"))]
+    columns += [Column(f"IQM {s}", *interval(name, 3)) for name, s in SYMBOLS.items()]
+    return Table(f"slate_{slate}_iqm", f"{slate}, interquartile means", columns, records)
+
+
+def improvement_table(slate: str, aggregates: Sequence[Aggregate]) -> Table:
+    """How likely a run of one algorithm is better than one of another, in each score."""
+    records = []
+    for first, second in permutations(aggregates, 2):
+        record: dict[str, Any] = {
+            "slate": slate, "algorithm": first.algorithm, "other": second.algorithm,
+        }  # fmt: skip
+        for name in SYMBOLS:
+            pair = (first, second) if name == "episode_return" else (second, first)
+            value, low, high = probability_of_improvement(*(one.strata[name] for one in pair))
+            record |= {name: value, f"{name}_low": low, f"{name}_high": high}
+        records.append(record)
+    columns = [Column(name, ("{}", name)) for name in ("algorithm", "other")]
+    titles = zip(SYMBOLS, ("higher", "lower", "lower"), strict=True)
+    columns += [Column(f"{how} {SYMBOLS[name]}", *interval(name, 2)) for name, how in titles]
+    title = f"{slate}, probability of improvement"
+    return Table(f"slate_{slate}_improvement", title, columns, records)
+
+
+def missing_seeds(
+    slate: str, algorithm: str, experiments: Sequence[Experiment], needed: int
+) -> dict[str, tuple[int, ...]]:
+    """Environment of a slate -> seeds that an algorithm still lacks on it.
+
+    The published seeds come first, then further multiples of ten.
+    """
+    done = {
+        e.benchmark: {run.seed for run in e.finished}
+        for e in experiments
+        if e.algorithm == algorithm and can_be_normalised(e)
+    }
+    missing = {}
+    for environment in SLATES[slate]:
+        own = done.get(environment, set())
+        further = range(max(SEEDS) + 10, max(SEEDS) + 10 * (needed + len(own) + 1), 10)
+        left = [seed for seed in (*SEEDS, *further) if seed not in own]
+        if len(own) < needed:
+            missing[environment] = tuple(left[: needed - len(own)])
+    return missing
+
+
+def lacking_table(experiments: Sequence[Experiment], needed: int) -> Table:
+    """What slates lack of algorithms with runs on a third of their environments, and commands."""
+    records = []
+    afresh = [e for e in experiments if not e.is_continued]
+    for slate, environments in SLATES.items():
+        begun = [e for e in afresh if e.benchmark in environments]
+        for algorithm in dict.fromkeys(e.algorithm for e in begun):
+            own = [e for e in begun if e.algorithm == algorithm]
+            missing = missing_seeds(slate, algorithm, experiments, needed)
+            if missing and 3 * len({e.benchmark for e in own}) >= len(environments):
+                records.append(
+                    {
+                        "slate": slate,
+                        "algorithm": algorithm,
+                        "runs": sum(map(len, missing.values())),
+                        "commands": "\n".join(_commands(own[0], missing)),
+                    }
+                )
+    columns = [Column(name, ("{}", name)) for name in ("slate", "algorithm")]
+    columns += [Column("runs", ("{:d}", "runs")), Column("commands", ("{}", "commands"))]
+    note = "Slates of which an algorithm has runs on less than a third are not listed."
+    return Table("missing", "What slates still lack", columns, records, note)
+
+
+def _commands(example: Experiment, missing: Mapping[str, tuple[int, ...]]) -> Iterator[str]:
+    """Command lines for missing runs: a sweep for every set of seeds."""
+    run = example.runs[0]
+    kept = [override for override in run.overrides or () if _is_of_the_algorithm(override)]
+    for seeds in dict.fromkeys(missing.values()):
+        environments = ",".join(name for name, own in missing.items() if own == seeds)
+        words = ["python", "train.py", "-m", f"env={environments}", f"algo={run.algorithm}", *kept]
+        yield shlex.join([*words, f"seed={','.join(map(str, seeds))}"])
+
+
+def _is_of_the_algorithm(override: str) -> bool:
+    """Whether it may change results: the way in which environments are stepped may, too."""
+    key = override.lstrip("+~").partition("=")[0]
+    group = key.partition(".")[0].partition("@")[0]
+    if group == "import":
+        return True
+    return group not in _CHOSEN and role_of(key) not in (Role.SEED, Role.MACHINE)

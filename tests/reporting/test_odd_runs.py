@@ -1,0 +1,221 @@
+"""One odd run never stops the report, and learns and shows nothing of this machine."""
+
+import json
+import os
+import re
+
+import pytest
+import yaml
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from synthetic import SUITE, write_run
+
+from safe_rl.cli.report import main
+from safe_rl.reporting import build_report
+
+SECRET = "hush-hush"
+EPOCHS = {"returns": (1.0, 2.0), "costs": (30.0, 20.0), "rates": (0.03, 0.02)}
+EVALUATION = {
+    "checkpoint": "last", "steps": 3000, "episodes": 100, "deterministic": True, "env": {},
+    "layouts_trained_on": 0.0, "cost_limits": {"cost": 25.0}, "cvar_alpha": 0.1,
+    "estimates": {"episode_return": {"value": 1.0, "low": 0.0, "high": 2.0}},
+}  # fmt: skip
+
+
+def change(run, **changes):
+    config = yaml.safe_load((run / "config.yaml").read_text())
+    (run / "config.yaml").write_text(yaml.safe_dump({**config, **changes}))
+
+
+def change_env(run, **changes):
+    change(run, env={**SUITE.environments["PointGoal1"], **changes})
+
+
+def evaluate(run, text):
+    (run / "evaluation.json").write_text(text)
+
+
+def table(run, text):
+    (run / "progress.csv").write_text(text)
+
+
+def instead(run, name):
+    """The name of a file that is there no more."""
+    (run / name).unlink(missing_ok=True)
+    return run / name
+
+
+def link(run, name, target):
+    """A link to a file beside the folder of all runs."""
+    instead(run, name).symlink_to(run.parents[3] / target)
+
+
+HEAD = "epoch,steps,episodes,episode_return,episode_cost,cost_rate,time_total"
+# what is wrong with a run that is left out
+UNREADABLE = {
+    "seed": lambda run: change(run, seed="abc"),
+    "seed is a list": lambda run: change(run, seed=[1]),
+    "no seed": lambda run: change(run, seed=None),
+    "unknown cost": lambda run: change(run, cost_limits={"cost_of_living": 3.0}),
+    "limit": lambda run: change(run, cost_limits={"cost": "low"}),
+    "limits": lambda run: change(run, cost_limits=[25.0]),
+    "infinite limit": lambda run: change(run, cost_limits={"cost": float("inf")}),
+    "algo": lambda run: change(run, algo="cpo"),
+    "algo's name": lambda run: change(run, algo={"name": ["cpo"]}),
+    "env": lambda run: change(run, env="PointGoal1"),
+    "frames": lambda run: change(run, frames="many"),
+    "init_from": lambda run: change(run, init_from={"a": 1}),
+    "secret": lambda run: change(run, algo={"name": "${oc.env:SECRET}"}),
+    "secret env": lambda run: change_env(run, task="${oc.env:SECRET}"),
+    "code": lambda run: (run / "config.yaml").write_text(
+        "algo: !!python/object/apply:os.system ['touch trace']"
+    ),
+    "binary": lambda run: (run / "config.yaml").write_bytes(b"\xff\xfe\x00"),
+    "half a configuration": lambda run: (run / "config.yaml").write_text("env: {name: Poi"),
+    "empty configuration": lambda run: (run / "config.yaml").write_text(""),
+    "binary table": lambda run: (run / "progress.csv").write_bytes(b"\x00\xff" * 99),
+    "empty table": lambda run: table(run, ""),
+    "head alone": lambda run: table(run, HEAD),
+    "half a row": lambda run: table(run, HEAD + "\n1,1000"),
+    "words": lambda run: table(run, HEAD + "\n1,1000,1,good,bad,ugly,1"),
+    "no time": lambda run: table(run, HEAD + "\n1,1000,1,1,1,1,0"),
+    "steps back": lambda run: table(run, HEAD + "\n1,1000,1,1,1,1,1\n2,900,1,1,1,1,2"),
+    "no steps": lambda run: table(run, HEAD + "\n1,,1,1,1,1,1"),
+    "infinite steps": lambda run: table(run, HEAD + "\n1,inf,1,1,1,1,1"),
+    "table is a folder": lambda run: instead(run, "progress.csv").mkdir(),
+    "table is a pipe": lambda run: os.mkfifo(instead(run, "progress.csv")),
+    "table elsewhere": lambda run: link(run, "progress.csv", "outside.csv"),
+    "configuration elsewhere": lambda run: link(run, "config.yaml", "outside.yaml"),
+}  # fmt: skip
+# what is wrong with a file of a run that is kept
+UNREADABLE_FILES = {
+    "half an evaluation": lambda run: evaluate(run, '{"estimates": {"episode_ret'),
+    "evaluation is a list": lambda run: evaluate(run, '["estimates"]'),
+    "no numbers": lambda run: evaluate(run, json.dumps(EVALUATION).replace("1.0", '"a"')),
+    "estimates": lambda run: evaluate(run, json.dumps({**EVALUATION, "estimates": [1]})),
+    "missing facts": lambda run: evaluate(run, '{"estimates": {}}'),
+    "deep": lambda run: evaluate(run, "[" * 100_000),
+    "evaluation is a folder": lambda run: (run / "evaluation.json").mkdir(),
+    "evaluation elsewhere": lambda run: link(run, "evaluation.json", "outside.json"),
+    "dangling video": lambda run: link(run, "evaluation.mp4", "gone.mp4"),
+    "video elsewhere": lambda run: link(run, "evaluation.mp4", "outside.mp4"),
+    "video is a folder": lambda run: (run / "evaluation.mp4").mkdir(),
+    "overrides": lambda run: (run / ".hydra/overrides.yaml").write_text("{"),
+    "overrides elsewhere": lambda run: link(run, ".hydra/overrides.yaml", "outside.yaml"),
+    "hydra": lambda run: (run / ".hydra/hydra.yaml").write_text("hydra: [[["),
+}  # fmt: skip
+# what looks odd, and is shown
+UNUSUAL = {
+    "mathematics": lambda run: change(run, algo={"name": r"a $\foo$ b"}),
+    "half mathematics": lambda run: change_env(run, name=r"$\frac{"),
+    "underscore": lambda run: change(run, algo={"name": "_hidden"}),
+    "markup": lambda run: change(run, algo={"name": "<script>alert(1)</script>|`*_["}),
+    "braces": lambda run: change_env(run, name="{0.__class__} {{7*7}} {% raise %}"),
+    "long": lambda run: change(run, algo={"name": "x" * 100_000}),
+    "long environment": lambda run: change_env(run, name="y z" * 30_000),
+    "long key": lambda run: change_env(run, **{"k" * 50_000: 1}),
+    "many keys": lambda run: change(run, model={f"layer{n}": n for n in range(2000)}),
+    "path": lambda run: change_env(run, name="../../../etc/passwd", robot_base="../../robot"),
+    "robot": lambda run: change_env(run, robot_base=["point"]),
+    "name is a list": lambda run: change_env(run, name=["PointGoal1"]),
+    "no name": lambda run: change(run, env={}),
+    "lines": lambda run: change(run, algo={"name": "a\nb\r\tc\x1b[31m\u202e"}),
+    "formula": lambda run: change(run, algo={"name": "=cmd()"}),
+    "steps": lambda run: change_env(run, num_steps="many"),
+    "init_from": lambda run: change(run, init_from="/etc"),
+    "init_from itself": lambda run: change(run, init_from=str(run)),
+    "init_from nothing": lambda run: change(run, init_from=""),
+    "no limits": lambda run: change(run, cost_limits=None),
+    "huge": lambda run: table(
+        run, HEAD + "\n1,1000,1,1e308,1e308,-1e308,1\n2,2000,1,1e308,1e308,1,2"
+    ),
+    "infinite": lambda run: table(run, HEAD + "\n1,1000,1,inf,inf,-inf,1\n2,2000,1,nan,1,1,2"),
+    "nothing finished": lambda run: table(run, HEAD + "\n1,1000,0,,,,1\n2,2000,0,,,,2"),
+    "NaN": lambda run: evaluate(run, json.dumps(EVALUATION).replace("2.0", "NaN")),
+}
+
+
+@pytest.fixture(autouse=True)
+def outside(tmp_path, monkeypatch):
+    """Files beside the folder of runs that hold a secret, and the same in the environment."""
+    monkeypatch.setenv("SECRET", SECRET)
+    (tmp_path / "outside.yaml").write_text(f"- note={SECRET}")
+    (tmp_path / "outside.csv").write_text(f"{HEAD},{SECRET}\n1,1000,1,1,1,1,1,1\n")
+    (tmp_path / "outside.json").write_text(json.dumps({**EVALUATION, "checkpoint": SECRET}))
+    (tmp_path / "outside.mp4").write_bytes(SECRET.encode())
+
+
+def report(tmp_path, damages):
+    """A report of a good run and one for every damage: runs by folder, what was left out, files."""
+    root = tmp_path / "runs"
+    write_run(root, folder="good", **EPOCHS)
+    for number, damage in enumerate(damages):
+        damage(write_run(root, seed=number + 1, folder=f"odd{number}", **EPOCHS))
+    assert main([str(root), "seeds=1"]) == 0
+    found = build_report(root, SUITE, seeds_needed=1, unfinished=False)
+    texts = [path.read_bytes() for path in (root / "report").iterdir()]
+    assert not any(SECRET.encode() in text for text in texts)
+    html = (root / "report/report.html").read_text()
+    assert all(
+        link.startswith(("data:", "#")) for link in re.findall(r'(?:src|href)="([^"]*)"', html)
+    )
+    assert "<script" not in html
+    return {run.directory.name: run for run in found.runs}, found.skipped
+
+
+def test_runs_that_cannot_be_read_are_left_out_with_their_reasons(tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    runs, skipped = report(tmp_path, UNREADABLE.values())
+    assert set(runs) == {"good"}
+    folders = {place.name: reason for place, reason in skipped.items()}
+    for number, name in enumerate(UNREADABLE):
+        assert folders.pop(f"odd{number}"), name
+    assert not folders
+    shown = capsys.readouterr().err
+    assert all(f"{place}: {reason}" in shown for place, reason in skipped.items())
+    assert not (tmp_path / "trace").exists()
+
+
+def test_files_that_cannot_be_read_are_left_out_and_their_runs_kept(tmp_path):
+    runs, skipped = report(tmp_path, UNREADABLE_FILES.values())
+    assert len(runs) == 1 + len(UNREADABLE_FILES)
+    assert not any(run.videos or run.evaluations for run in runs.values())
+    own = {part for place in skipped for part in place.parts if part.startswith("odd")}
+    assert own == {f"odd{number}" for number in range(len(UNREADABLE_FILES))}
+    assert len(skipped) == len(UNREADABLE_FILES)
+
+
+def test_what_looks_odd_is_shown(tmp_path):
+    runs, skipped = report(tmp_path, UNUSUAL.values())
+    assert len(runs) == 1 + len(UNUSUAL)
+    assert not skipped
+    markdown = (tmp_path / "runs/report/report.md").read_text()
+    assert "\\<script\\>alert" in markdown
+    # every line of a table has as many cells as its head, whatever names hold
+    for block in re.split(r"\n\n", markdown):
+        rows = [line for line in block.splitlines() if line.startswith("| ")]
+        assert len({len(re.split(r"(?<!\\)\|", row)) for row in rows}) <= 1
+
+
+WRITTEN = ("config.yaml", "progress.csv", "evaluation.json", ".hydra/overrides.yaml")
+
+
+@settings(
+    max_examples=8, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
+)
+@given(data=st.data())
+def test_whatever_happens_to_bytes_of_a_run_the_others_are_reported(tmp_path_factory, data):
+    root = tmp_path_factory.mktemp("runs")
+    write_run(root, folder="good", **EPOCHS)
+    run = write_run(root, seed=1, folder="odd", **EPOCHS)
+    evaluate(run, json.dumps(EVALUATION))
+    for name in data.draw(st.lists(st.sampled_from(WRITTEN), min_size=1, max_size=3)):
+        content = bytearray((run / name).read_bytes())
+        place = data.draw(st.integers(0, len(content)))
+        kept = data.draw(st.sampled_from((place, place + 1, len(content))))
+        noise = data.draw(
+            st.binary(max_size=4) | st.sampled_from([b"\n", b",", b": ", b"-", b"9" * 400])
+        )
+        (run / name).write_bytes(bytes(content[:place]) + noise + bytes(content[kept:]))
+    found = build_report(root, SUITE, seeds_needed=1, unfinished=False)
+    assert "good" in {known.directory.name for known in found.runs}
