@@ -16,7 +16,7 @@ PARTS = {
     "processes": (),
     "naming": (),
     "targets": ("naming",),
-    "envs": ("naming",),
+    "envs": ("naming", "targets"),
     "objectives": ("naming",),
     "collectors": ("processes",),
     "models": (),
@@ -39,7 +39,7 @@ PARTS = {
 # Inside a package a module may import those of the floors below its own.
 FLOORS = {
     "envs": (
-        ("errors", "opengl", "rng", "physics", "physics.base"),
+        ("contract", "errors", "opengl", "rng", "physics", "physics.base"),
         ("physics.cpu",),
         # Safety Gym: records, then rules, then worlds, and what is seen of them.
         ("safety_gym.records", "safety_gym.records.values", "safety_gym.geometry"),
@@ -62,7 +62,7 @@ FLOORS = {
         ("safety_gym.observing.observations",),
         ("safety_gym.specs",),
         ("safety_gym.env",),
-        ("safety_gym", "safety_gym.registration", "extending"),
+        ("safety_gym", "safety_gym.nodes", "extending"),
         # The velocity family: rows, configurations, then functions over tensors, the environment.
         ("physics.runge_kutta", "velocity.robots", "velocity.snapshot", "velocity.specs"),
         ("velocity.config", "velocity.measuring"),
@@ -70,10 +70,14 @@ FLOORS = {
         ("velocity.model",),
         ("velocity.observing", "velocity.rendering"),
         ("velocity.env",),
-        ("velocity.registration",),
+        ("velocity.nodes",),
         ("velocity",),
-        ("gymnasium", "gymnasium.conversion", "gymnasium.worlds"),
-        ("gymnasium.single", "gymnasium.vector"),
+        ("gymnasium.processes", "gymnasium.worlds"),
+        ("gymnasium.conversion", "gymnasium.single", "gymnasium.vector"),
+        ("gymnasium.family",),
+        ("gymnasium",),
+        ("families",),
+        ("registration",),
         ("",),
     ),
     "objectives": (

@@ -25,7 +25,7 @@ def certify_run(
     options |= load_config(directory).get("certificate") or {}
     return certify(
         directory,
-        CertificateOptions(**options),  # type: ignore[arg-type]
+        CertificateOptions(**options),
         make_env=make_env,
         num_threads=num_threads,
         progress=progress,

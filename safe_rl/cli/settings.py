@@ -17,7 +17,7 @@ from omegaconf.errors import OmegaConfBaseException
 from torchrl.checkpoint import CheckpointError
 
 from safe_rl.cli.keys import EXTRAS, FLAGS, KEYS, PARTS, Key
-from safe_rl.envs import resolve
+from safe_rl.envs import complete_env
 from safe_rl.evaluation.settings import check_device
 from safe_rl.extras import require_extra
 from safe_rl.naming import did_you_mean
@@ -81,7 +81,7 @@ def check_settings(config: DictConfig) -> None:
     except ValueError as error:
         raise SettingError(str(error)) from None
     _check_collector(values["collector"])
-    _check_env(values["env"])
+    complete_env(values["env"])
 
 
 def plain(config: DictConfig) -> dict[str, Any]:
@@ -231,12 +231,6 @@ def _check_extra(part: _Part) -> None:
             require_extra(*extra)
         except ModuleNotFoundError as error:
             raise SettingError(f"{part.path}: {error}") from None
-
-
-def _check_env(node: Mapping[str, Any]) -> None:
-    """Environments of other families check their keys where they are made."""
-    if "safety_gym" in (node.get("_target_") or "safety_gym"):
-        resolve({key: value for key, value in node.items() if key not in ("name", "_target_")})
 
 
 @contextmanager

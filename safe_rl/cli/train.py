@@ -12,7 +12,7 @@ from typing import Any, cast
 import hydra
 from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig, OmegaConf, open_dict
 
 import safe_rl.openmp  # noqa: F401, has to come before torch
 from safe_rl.cli.certificates import certify_run, is_worth_a_certificate
@@ -29,7 +29,7 @@ from safe_rl.cli.user_code import (
     note_imports,
     split_imports,
 )
-from safe_rl.envs import ConfigError, LayoutError, make_env, store_configs
+from safe_rl.envs import ConfigError, LayoutError, complete_env, make_env, store_configs
 from safe_rl.runs.folder import RunFolder
 from safe_rl.runs.lock import held
 from safe_rl.runs.resuming import is_finished, may_continue
@@ -63,6 +63,8 @@ def prepare(config: DictConfig, directory: Path, continues: bool) -> Trainer | N
     trainer = build_trainer(config, make(num_envs=config.num_envs), directory, in_workers)
     if continues and trainer.resume():
         print(f"Going on after {trainer.progress.steps:,} of {config.frames:,} frames.")
+        if trainer.begins_anew:
+            print("The state of its environments is not stored: they begin new episodes.")
         return trainer
     if continues and trainer.folder.files.num_rows:
         print("No checkpoint was written yet: starting over, with a new progress.csv.")
@@ -72,11 +74,21 @@ def prepare(config: DictConfig, directory: Path, continues: bool) -> Trainer | N
     return trainer
 
 
+def complete(config: DictConfig) -> None:
+    """Fill the environment's keys up, so that the run's folder tells all of them."""
+    with open_dict(config):
+        config.env = complete_env(
+            cast(dict[str, Any], OmegaConf.to_container(config.env, resolve=True))
+        )
+
+
 @hydra.main(version_base="1.3", config_path=str(CONF), config_name="config")
 def train(config: DictConfig) -> None:
     """Compose, build, train."""
     folder = RunFolder(Path(HydraConfig.get().runtime.output_dir))
     is_job = HydraConfig.get().mode is RunMode.MULTIRUN  # whose sweep keeps account of failures
+    with nullcontext() if is_job else errors_in_a_line(folder.directory, True, *SETTING_ERRORS):
+        complete(config)
     continues = may_continue(HydraConfig.get(), config)
 
     def in_a_line(*errors: type[Exception]) -> AbstractContextManager[None]:
@@ -97,7 +109,7 @@ def train(config: DictConfig) -> None:
         print(f"Interrupted. Continue with: python train.py resume={folder.directory}")
         raise SystemExit(128 + trainer.interrupted_by)
     if trainer.algorithm.cost_keys and is_worth_a_certificate(config, trainer.episode_length):
-        print(certify_run(directory, num_threads=config.num_threads or 0))
+        print(certify_run(folder.directory, num_threads=config.num_threads or 0))
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -107,7 +119,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
         modules, given = split_imports(given)
         if modules is not None:
             import_modules(modules)
-            store_configs()  # again, with the keys that the modules have registered
             given = note_imports(modules, given)
         expanded = expand_arguments(given)
         check_command(expanded, CONF)

@@ -260,7 +260,7 @@ def share_rows(env: EnvBase, make_env: MakeEnv, num_collectors: int) -> list[Cal
     """Functions that make every worker's environment, with its share of the rows of ``env``.
 
     An environment with ``get_state`` and ``set_state`` has its rows continued by the workers, from
-    their next reset; any other one is made anew, seeded by ``make_env``.
+    their next reset; any other one is made anew, and seeded apart from the other workers'.
     """
     states: list[TensorDictBase | None]
     if not hasattr(env, "get_state"):
@@ -288,4 +288,6 @@ def _make_share(
     env = make_env(num_envs=num_envs)
     if state is not None:
         env.set_state(state)
+    else:
+        env.set_seed(seed % 2**31)
     return env

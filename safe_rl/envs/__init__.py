@@ -1,19 +1,24 @@
-"""Safety Gym environments: configurations, the benchmark suite and the batched environment."""
+"""Environments of every family, the contract they fulfil, and their names.
+
+Safety Gym's configurations, the benchmark suite and the batched environment stand in `safety_gym`.
+"""
 
 # First, because it imports MuJoCo where OpenGL is missing.
 from safe_rl.envs.opengl import OpenGLError
 
 # isort: split
+from safe_rl.envs.contract import (
+    ConstrainedEnv,
+    ContractError,
+    SnapshotEnv,
+    check_constrained_env,
+)
 from safe_rl.envs.errors import ConfigError
+from safe_rl.envs.families import complete_env, env_names, env_node, make_env
 from safe_rl.envs.gymnasium.conversion import from_gymnasium
+from safe_rl.envs.registration import register_gymnasium, store_config, store_configs
 from safe_rl.envs.safety_gym.env import SafetyGymEnv
 from safe_rl.envs.safety_gym.records.config import SafetyGymConfig
-from safe_rl.envs.safety_gym.registration import (
-    make_env,
-    register_gymnasium,
-    store_config,
-    store_configs,
-)
 from safe_rl.envs.safety_gym.suite import EXTRAS, SUITE, resolve
 from safe_rl.envs.safety_gym.world.layout import LayoutError
 
@@ -21,10 +26,17 @@ __all__ = [
     "EXTRAS",
     "SUITE",
     "ConfigError",
+    "ConstrainedEnv",
+    "ContractError",
     "LayoutError",
     "OpenGLError",
     "SafetyGymConfig",
     "SafetyGymEnv",
+    "SnapshotEnv",
+    "check_constrained_env",
+    "complete_env",
+    "env_names",
+    "env_node",
     "from_gymnasium",
     "make_env",
     "resolve",

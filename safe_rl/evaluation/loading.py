@@ -55,8 +55,8 @@ def find_checkpoint(directory: Path, which: str) -> Path:
     if which not in KINDS:
         if not Path(which).exists():
             raise FileNotFoundError(
-                f"There is no checkpoint '{which}': checkpoint is last, best, certified or the path "
-                "of a file."
+                f"There is no checkpoint '{which}': checkpoint is last, best, certified or the "
+                "path of a file."
             )
         return Path(which)
     # readable or not: an older one is not silently put in its place

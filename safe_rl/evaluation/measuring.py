@@ -72,14 +72,16 @@ def evaluate(
     node = override_env(config, options.env)
     seed = default_seed(node, config.seed) if options.seed is None else options.seed
 
-    def make(num_envs: int) -> EnvBase:
+    def make(num_envs: int, **keys: Any) -> EnvBase:
         threads = options.num_threads
         return make_env(
-            node, num_envs=num_envs, device=options.device, seed=seed, num_threads=threads
+            node | keys, num_envs=num_envs, device=options.device, seed=seed, num_threads=threads
         )
 
+    # environments that draw nothing unless they are told have a key for it
+    drawing = {key: "rgb_array" for key in ("render_mode",) if key in node}
     if options.video:
-        check_camera(make(1), options.camera)
+        check_camera(make(1, **drawing), options.camera)
     env = make(min(options.num_envs, options.episodes))
     policy = load_policy(config, env, checkpoint, torch.device(options.device))
     manner = {"deterministic": options.deterministic}
@@ -99,7 +101,9 @@ def evaluate(
         return Evaluation(facts, estimates, tuple(files[:2]))
     torch.manual_seed(seed)
     # the first world draws the same episodes whatever the number of worlds
-    frames = record_episode(make(1), policy, env.cost_keys, **manner, camera=options.camera)
+    frames = record_episode(
+        make(1, **drawing), policy, env.cost_keys, **manner, camera=options.camera
+    )
     write_video(files[2], frames)
     return Evaluation(facts, estimates, tuple(files))
 

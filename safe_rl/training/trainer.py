@@ -186,10 +186,20 @@ class Trainer:
         self._begin_episodes()
         return restored is not None
 
+    @property
+    def begins_anew(self) -> bool:
+        """Whether a run that is continued begins new episodes, for want of the worlds' state."""
+        return self._worlds is None
+
     def _begin_episodes(self) -> None:
         """Without their state, the worlds cannot go on with the episodes that were open."""
-        if self._worlds is None:
-            self.accounting.forget_open_episodes()
+        if self._worlds is not None:
+            return
+        self.accounting.forget_open_episodes()
+        if isinstance(self._collector, Collector):
+            # otherwise it would meet the episodes again that the run began with
+            self._env.set_seed(int(torch.randint(2**31, ())))
+            self._collector.reset()
 
     def run(self) -> str:
         """Train for ``frames`` steps, rounded up to whole batches.

@@ -1,6 +1,7 @@
 """Every configuration file composes, and the paper's preset has the paper's numbers."""
 
 import itertools
+import sys
 
 import pytest
 import torch
@@ -12,7 +13,8 @@ from run_configs import CONF, compose_config
 
 from safe_rl.algorithms import OnPolicy
 from safe_rl.algorithms.constraints import check_cost_limits
-from safe_rl.envs import SUITE, make_env, store_configs
+from safe_rl.cli import train
+from safe_rl.envs import EXTRAS, SUITE, env_names, env_node, make_env, registration, store_configs
 
 store_configs()
 
@@ -64,10 +66,32 @@ def test_multipliers_are_interchangeable(algo, multiplier):
     OnPolicy.build(config, PointMass(2))
 
 
-def test_every_environment_of_the_suite_is_an_option():
-    listed = ConfigStore.instance().list("env")
-    assert {f"{name}.yaml" for name in SUITE} <= set(listed)
+def test_every_environment_is_an_option_and_a_node_with_all_keys():
+    assert {*SUITE, *EXTRAS} <= set(env_names())
     assert len(SUITE) == 27
+    for name in ("PointGoal1", "DoggoPush2Vision", "CarRun"):
+        config = compose_config(f"env={name}")
+        assert config.env == env_node(name)
+
+
+def test_hydra_makes_no_node_that_nobody_asked_for(monkeypatch, capsys):
+    """It copies what it stores about a hundred times to print its help."""
+    made = []
+
+    def counting(name):
+        made.append(name)
+        return env_node(name)
+
+    monkeypatch.setattr(registration, "env_node", counting)
+    monkeypatch.setattr(sys, "argv", ["train.py", "--help"])
+    with pytest.raises(SystemExit):
+        train.main()
+    help_text = capsys.readouterr().out
+    assert all(name in help_text for name in (*SUITE, *EXTRAS, "gymnasium"))
+    assert set(made) == {"PointGoal1"}
+    assert len(made) < 5
+    stored = ConfigStore.instance().repo["env"]
+    assert not {f"{name}.yaml" for name in (*SUITE, *EXTRAS)} & set(stored)
 
 
 def test_overrides_reach_the_environment():

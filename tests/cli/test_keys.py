@@ -39,7 +39,7 @@ NOT_FINITE = [value for value in WRONG if isinstance(value, float) and not math.
 
 
 @pytest.fixture(scope="module")
-def configs(few_environments) -> dict[tuple[str, str], Any]:
+def configs() -> dict[tuple[str, str], Any]:
     """Configurations of all algorithms with both presets, for the point mass."""
     configs = {}
     with initialize_config_dir(str(CONF), version_base="1.3"):

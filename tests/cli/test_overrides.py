@@ -10,8 +10,6 @@ from safe_rl.cli.composing import check_command
 from safe_rl.cli.overrides import CommandLineError
 from safe_rl.cli.settings import SettingError
 
-pytestmark = pytest.mark.usefixtures("few_environments")
-
 MINE = """
 # @package _global_
 mine: {tail: 0.25, weight: 1.0}

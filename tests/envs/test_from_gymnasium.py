@@ -107,7 +107,7 @@ def test_ids_are_made_with_their_arguments_and_chosen_costs():
     )
     assert env.cost_keys == ["cost", "cost_hazards"]
     assert env.observation_layout == {"observation": slice(0, 12 + 3 * 8)}
-    assert env.config.num_steps == 7
+    assert env.max_episode_steps == 7
     assert env.rollout(20).shape == (2, 7)
 
 

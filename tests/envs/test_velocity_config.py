@@ -8,14 +8,13 @@ import pytest
 from hydra import compose, initialize
 from omegaconf import OmegaConf
 
+from safe_rl.envs import complete_env, make_env, store_configs
 from safe_rl.envs.errors import ConfigError
 from safe_rl.envs.velocity import (
     VELOCITY_SUITE,
     VelocityConfig,
     VelocityEnv,
-    make_velocity_env,
     resolve_velocity,
-    store_velocity_configs,
     velocity_node,
 )
 from safe_rl.envs.velocity.robots import ROBOTS
@@ -39,15 +38,16 @@ def test_nodes_survive_yaml(name):
     node = velocity_node(name, VELOCITY_SUITE[name])
     read = OmegaConf.to_container(OmegaConf.create(OmegaConf.to_yaml(OmegaConf.create(node))))
     assert read["name"] == name
-    assert make_velocity_env(read, seed=0).config == VELOCITY_SUITE[name]
+    assert make_env(read, seed=0).config == VELOCITY_SUITE[name]
+    assert complete_env({"_target_": node["_target_"], "robot": node["robot"]})["num_steps"] == 1000
 
 
 def test_names_are_in_hydras_group():
-    store_velocity_configs()
+    store_configs()
     overrides = ["+env=SafeAntVelocity", "env.healthy_z_range=[0.1,inf]"]
     with initialize(version_base="1.3", config_path=None):
         node = OmegaConf.to_container(compose(overrides=overrides).env)
-    made = make_velocity_env(node, num_envs=3, seed=0)
+    made = make_env(node, num_envs=3, seed=0)
     assert made.config == VELOCITY_SUITE["SafeAntVelocity"].replace(healthy_z_range=(0.1, math.inf))
     assert made.batch_size == (3,)
 

@@ -2,5 +2,9 @@
 
 Costs stand in `info`: `info["cost"]`, one `info["cost_<kind>"]` per constrained kind, and
 `info["goal_met"]`. `gymnasium.make` and `gymnasium.make_vec` find the environments under the ids
-that `safe_rl.envs.safety_gym.registration` registers.
+that `safe_rl.envs.registration` registers.
 """
+
+from safe_rl.envs.gymnasium.family import make_gymnasium
+
+__all__ = ["make_gymnasium"]

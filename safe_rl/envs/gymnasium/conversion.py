@@ -4,16 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from functools import partial
+from multiprocessing import current_process
 from typing import Any
 
 import gymnasium
 import numpy as np
 import torch
-from gymnasium.vector import AutoresetMode, SyncVectorEnv
+from gymnasium.vector import AutoresetMode, SyncVectorEnv, VectorEnv
 from tensordict import TensorDictBase
 from torchrl.data import Composite, Unbounded
 from torchrl.envs import GymWrapper, Transform, TransformedEnv
 from torchrl.envs.gym_like import BaseInfoDictReader
+
+from safe_rl.envs.gymnasium.processes import ProcessVectorEnv
 
 AGGREGATE = "cost"
 MakeEnv = Callable[[], gymnasium.Env]
@@ -100,6 +103,40 @@ class GymnasiumEnv(TransformedEnv):
         self.observation_layout = {"observation": slice(0, size)}
         self.max_episode_steps = num_steps
 
+    def render(
+        self,
+        rows: int | Sequence[int] | None = None,
+        *,
+        camera: str = "free",
+        width: int = 480,
+        height: int = 360,
+    ) -> np.ndarray:
+        """Draw environments as they draw themselves, within a picture of the asked size.
+
+        Args:
+            rows: which of them; None is all.
+            camera: "free"; others are arguments of the environment's own.
+            width: of a frame [pixels].
+            height: of a frame [pixels].
+
+        Returns:
+            RGB, uint8: one frame [height, width, 3] for an integer, else [R, height, width, 3].
+
+        Raises:
+            ValueError: for another camera, or if the environments were made without pictures.
+        """
+        if camera != "free":
+            raise ValueError(
+                f"There is no camera '{camera}': an environment of Gymnasium has its own, which "
+                "its arguments may change (env.kwargs)."
+            )
+        frames = self.base_env._env.render()
+        if frames is None or frames[0] is None:
+            raise ValueError("It was made without pictures: env.render_mode=rgb_array.")
+        chosen = range(len(frames)) if rows is None else [rows] if isinstance(rows, int) else rows
+        drawn = np.stack([_fit(np.asarray(frames[row]), width, height) for row in chosen])
+        return drawn[0] if isinstance(rows, int) else drawn
+
 
 def from_gymnasium(
     env: str | MakeEnv,
@@ -108,6 +145,9 @@ def from_gymnasium(
     cost_keys: Sequence[str] | None = None,
     num_steps: int | None = None,
     seed: int | None = None,
+    workers: int = 0,
+    device: torch.device | str = "cpu",
+    flatten: bool = True,
     **kwargs: Any,
 ) -> GymnasiumEnv:
     """Make a TorchRL environment of any Gymnasium environment that reports costs in `info`.
@@ -117,20 +157,25 @@ def from_gymnasium(
 
     Args:
         env: Gymnasium id, or a function that makes an environment.
-        num_envs: number of environments, N, stepped one after the other.
+        num_envs: number of environments, N.
         cost_keys: names of the costs in `info`; None finds those called `cost` or `cost_<kind>` by
             taking one step.
         num_steps: the largest number of steps of an episode; None takes what the id says.
-        seed: of all environments.
+        seed: of all environments; row k has this one plus k.
+        workers: processes that step them; 0 steps them here, one after the other, as is done in a
+            process that is itself a worker.
+        device: where the TensorDicts live.
+        flatten: make one vector of observations that are no arrays; False refuses them.
         kwargs: for `gymnasium.make`, with an id.
 
     Returns:
-        An environment [N] on the CPU, with the costs in its reward spec. Without a cost called
-        `cost` it gets one, the sum of the others.
+        An environment [N], with the costs in its reward spec. Without a cost called `cost` it gets
+        one, the sum of the others.
 
     Raises:
-        ValueError: if no costs are reported, the actions are not continuous and bounded, or the
-            length of episodes is not known.
+        ValueError: if no costs are reported, the actions are not continuous and bounded, the
+            observations are no arrays and not to be flattened, or the length of episodes is not
+            known.
 
     Examples:
         >>> env = from_gymnasium("Safexp-PointGoal1-v0", num_envs=2, num_steps=1000, seed=0)
@@ -138,20 +183,41 @@ def from_gymnasium(
         torch.Size([2, 3, 1])
     """
     make: MakeEnv = partial(gymnasium.make, env, **kwargs) if isinstance(env, str) else env
-    probe = adapt(make())
-    keys = list(cost_keys) if cost_keys is not None else _find_costs(probe)
-    num_steps = _episode_length(probe, num_steps)
-    probe.close()
-
-    def make_adapted() -> gymnasium.Env:
-        return adapt(make(), num_steps)
-
-    worlds = SyncVectorEnv([make_adapted] * num_envs, autoreset_mode=AutoresetMode.DISABLED)
-    base = GymWrapper(worlds)
+    keys, length = describe(make, cost_keys, num_steps, flatten)
+    make_adapted = partial(_make_adapted, make, length)
+    worlds: VectorEnv
+    if workers and not current_process().daemon:
+        worlds = ProcessVectorEnv(make_adapted, num_envs, min(workers, num_envs), keys)
+    else:
+        worlds = SyncVectorEnv([make_adapted] * num_envs, autoreset_mode=AutoresetMode.DISABLED)
+    base = GymWrapper(worlds, device=torch.device(device))
     base.set_info_dict_reader(CostReader(keys, num_envs))
-    batch = GymnasiumEnv(base, keys, num_steps)
+    batch = GymnasiumEnv(base, keys, length)
     batch.set_seed(int(torch.randint(2**31, ())) if seed is None else seed)
     return batch
+
+
+def describe(
+    make: MakeEnv, cost_keys: Sequence[str] | None, num_steps: int | None, flatten: bool
+) -> tuple[list[str], int]:
+    """Return the names of the costs and the length of episodes, found out where they are None.
+
+    Raises:
+        ValueError: if the environment does not tell, or cannot be used.
+    """
+    probe = make()
+    try:
+        if not (flatten or isinstance(probe.observation_space, gymnasium.spaces.Box)):
+            raise ValueError(
+                f"Policies take observations that are arrays (a Box), but {probe} has "
+                f"{probe.observation_space}. flatten=true makes one vector of it: kinds (Discrete) "
+                "become one-hot, components of a dictionary follow one another."
+            )
+        adapted = adapt(probe)
+        keys = list(cost_keys) if cost_keys is not None else _find_costs(adapted)
+        return keys, _episode_length(adapted, num_steps)
+    finally:
+        probe.close()
 
 
 def adapt(env: gymnasium.Env, num_steps: int | None = None) -> gymnasium.Env:
@@ -171,10 +237,33 @@ def adapt(env: gymnasium.Env, num_steps: int | None = None) -> gymnasium.Env:
         )
     env = gymnasium.wrappers.FlattenObservation(env)
     vectors = gymnasium.spaces.Box(-np.inf, np.inf, env.observation_space.shape, np.float32)
-    env = gymnasium.wrappers.TransformObservation(env, lambda x: x.astype(np.float32), vectors)
+    env = gymnasium.wrappers.TransformObservation(env, _single_precision, vectors)
     env = gymnasium.wrappers.RescaleAction(env, np.float32(-1.0), np.float32(1.0))
-    env = gymnasium.wrappers.TransformAction(env, lambda a: np.clip(a, -1, 1), env.action_space)
+    env = gymnasium.wrappers.TransformAction(env, _within_bounds, env.action_space)
     return env if num_steps is None else gymnasium.wrappers.TimeLimit(env, num_steps)
+
+
+def _make_adapted(make: MakeEnv, num_steps: int) -> gymnasium.Env:
+    return adapt(make(), num_steps)
+
+
+def _single_precision(observation: np.ndarray) -> np.ndarray:
+    return observation.astype(np.float32)
+
+
+def _within_bounds(action: np.ndarray) -> np.ndarray:
+    return np.clip(action, -1, 1)
+
+
+def _fit(picture: np.ndarray, width: int, height: int) -> np.ndarray:
+    """Resize to the largest picture that keeps its form, in the corner of [height, width, 3]."""
+    scale = min(width / picture.shape[1], height / picture.shape[0])
+    lines, columns = (
+        (np.arange(max(1, int(scale * size))) / scale).astype(int) for size in picture.shape[:2]
+    )
+    canvas = np.zeros((height, width, 3), dtype=np.uint8)
+    canvas[: len(lines), : len(columns)] = picture[lines[:, None], columns]
+    return canvas
 
 
 def _find_costs(probe: gymnasium.Env) -> list[str]:

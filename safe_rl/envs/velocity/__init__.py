@@ -2,19 +2,13 @@
 
 from safe_rl.envs.velocity.config import VelocityConfig
 from safe_rl.envs.velocity.env import VelocityEnv
-from safe_rl.envs.velocity.registration import (
-    make_velocity_env,
-    store_velocity_configs,
-    velocity_node,
-)
+from safe_rl.envs.velocity.nodes import velocity_node
 from safe_rl.envs.velocity.suite import VELOCITY_SUITE, resolve_velocity
 
 __all__ = [
     "VELOCITY_SUITE",
     "VelocityConfig",
     "VelocityEnv",
-    "make_velocity_env",
     "resolve_velocity",
-    "store_velocity_configs",
     "velocity_node",
 ]

@@ -1,0 +1,116 @@
+"""Names of environments in Hydra and in Gymnasium."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import gymnasium
+from hydra.core.config_search_path import ConfigSearchPath
+from hydra.core.config_store import ConfigStore
+from hydra.core.object_type import ObjectType
+from hydra.core.plugins import Plugins
+from hydra.plugins.config_source import ConfigLoadError, ConfigResult, ConfigSource
+from hydra.plugins.search_path_plugin import SearchPathPlugin
+from omegaconf import OmegaConf
+
+from safe_rl.envs.families import env_names, env_node
+from safe_rl.envs.safety_gym.nodes import group_node
+from safe_rl.envs.safety_gym.records.config import SafetyGymConfig
+from safe_rl.envs.safety_gym.suite import EXTRAS, SUITE, resolve
+
+GROUP = "env"
+SCHEME = "safe-rl-environments"
+
+
+class EnvironmentsSource(ConfigSource):
+    """Where Hydra finds the group `env`: names are listed, nodes made when they are asked for.
+
+    Hydra's own store would hold every node, and copies all it holds about a hundred times.
+    """
+
+    @staticmethod
+    def scheme() -> str:
+        """Of the source's address in Hydra's search path."""
+        return SCHEME
+
+    def available(self) -> bool:
+        """It always is."""
+        return True
+
+    def load_config(self, config_path: str) -> ConfigResult:
+        """Return the node of `env/<name>`."""
+        group, _, name = config_path.removesuffix(".yaml").rpartition("/")
+        if group != GROUP or name not in env_names():
+            raise ConfigLoadError(f"There is no {config_path} among the environments.")
+        return ConfigResult(
+            provider=self.provider,
+            path=self.full_path(),
+            config=OmegaConf.create(env_node(name)),
+            header={"package": None},
+        )
+
+    def is_group(self, config_path: str) -> bool:
+        """Whether it is the group `env`, or the folder that it is in."""
+        return config_path.strip("/") in ("", GROUP)
+
+    def is_config(self, config_path: str) -> bool:
+        """Whether it is one of the group."""
+        group, _, name = config_path.removesuffix(".yaml").rpartition("/")
+        return group == GROUP and name in env_names()
+
+    def list(self, config_path: str, results_filter: ObjectType | None) -> list[str]:
+        """Return the names in the group, or the group."""
+        here = config_path.strip("/")
+        found = {"": (ObjectType.GROUP, [GROUP]), GROUP: (ObjectType.CONFIG, sorted(env_names()))}
+        kind, names = found.get(here, (None, []))
+        return names if results_filter in (None, kind) else []
+
+
+class EnvironmentsSearchPath(SearchPathPlugin):
+    """Puts the source behind folders of files, which so can hold an environment of a known name."""
+
+    def manipulate_search_path(self, search_path: ConfigSearchPath) -> None:
+        """Add the source."""
+        search_path.append(provider="safe_rl", path=f"{SCHEME}://")
+
+
+def store_config(name: str, config: Mapping[str, Any] | SafetyGymConfig) -> None:
+    """Put a configuration into Hydra's group `env` by a name, so that `env=<name>` finds it.
+
+    Args:
+        name: of the environment.
+        config: a configuration of Safety Gym, whole or what differs from the defaults, or a node
+            with the `_target_` of another family.
+
+    Raises:
+        ConfigError: for an unknown key, or a value that cannot be used.
+    """
+    if isinstance(config, Mapping) and config.get("_target_") is not None:
+        node = {"name": name, **config}
+    else:
+        node = group_node(name, resolve(config))
+    ConfigStore.instance().store(group=GROUP, name=name, node=node)
+
+
+def store_configs() -> None:
+    """Let Hydra find all names in its group `env`: `env=PointGoal1 env.hazards_num=3` works."""
+    for plugin in (EnvironmentsSource, EnvironmentsSearchPath):
+        Plugins.instance().register(plugin)
+
+
+def register_gymnasium() -> None:
+    """Give Gymnasium an id `Safexp-{name}-v0` for every name, and `Safexp-Custom-v0`.
+
+    The custom one has the defaults of every configuration key; all of them take a `config` with
+    keys to change. What the ids stand for is imported when an environment is made.
+    """
+    for name in (*SUITE, *EXTRAS, None):
+        env_id = f"Safexp-{name or 'Custom'}-v0"
+        if env_id not in gymnasium.registry:
+            gymnasium.register(
+                env_id,
+                entry_point="safe_rl.envs.gymnasium.single:SafetyGymnasiumEnv",
+                vector_entry_point="safe_rl.envs.gymnasium.vector:SafetyGymnasiumVectorEnv",
+                kwargs={"name": name},
+            )

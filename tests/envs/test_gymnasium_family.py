@@ -1,0 +1,195 @@
+"""Somebody else's environment, registered with Gymnasium, through the ordinary commands."""
+
+import json
+import os
+import signal
+import sys
+from functools import partial
+from pathlib import Path
+
+import gymnasium
+import gymnasium_envs  # noqa: F401, registers Walk-v0
+import pytest
+import torch
+import yaml
+
+from safe_rl.cli import evaluate, report, train
+from safe_rl.collectors.workers import share_rows
+from safe_rl.envs import ConfigError, complete_env, make_env
+from safe_rl.runs.table import read_table
+
+NODE = {
+    "_target_": "safe_rl.envs.gymnasium.make_gymnasium",
+    "id": "Walk-v0",
+    "cost_keys": ["fast", "far"],
+}
+SMALL = (
+    *("env=gymnasium", "env.id=Walk-v0", "env.cost_keys=[fast,far]", "num_envs=4"),
+    *("frames_per_batch=200", "logger=none", "model.hidden_sizes=[8]", "num_threads=1"),
+    *("policy_update.minibatch_size=50", "critic_update.minibatch_size=50"),
+    "cost_limits={fast: 3}",
+)
+
+
+def run_train(*arguments: str) -> None:
+    """What `python train.py …` does, in this process."""
+    before = sys.argv
+    try:
+        assert train.main(arguments) == 0
+    finally:
+        sys.argv = before
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory) -> Path:
+    folder = tmp_path_factory.mktemp("runs") / "walk"
+    run_train(*SMALL, "frames=600", "env.kwargs={border: 2.5}", f"hydra.run.dir={folder}")
+    return folder
+
+
+def test_its_folder_tells_everything(run):
+    env = yaml.safe_load((run / "config.yaml").read_text())["env"]
+    assert env["name"] == "Walk-v0"
+    assert env["num_steps"] == 25  # as it was registered
+    assert env["kwargs"] == {"border": 2.5}
+    table = read_table(run / "progress.csv")
+    assert table["steps"] == [200, 400, 600]
+    # many episodes end before their time-out
+    assert all(length < 25 for length in table["episode_length"])
+    assert all(cost > 0 for cost in table["episode_fast"])
+
+
+def test_it_resumes(run, tmp_path, capsys):
+    folder = tmp_path / "copied"
+    os.system(f"cp -r {run} {folder}")
+    run_train(f"resume={folder}", "frames=1000")
+    assert read_table(folder / "progress.csv")["steps"] == [200, 400, 600, 800, 1000]
+    assert "The state of its environments is not stored" in capsys.readouterr().out
+
+
+def test_it_is_evaluated_on_video(run, capsys):
+    pytest.importorskip("imageio_ffmpeg")
+    assert evaluate.main([str(run), "episodes=6", "num_envs=3", "video=true"]) == 0
+    facts = json.loads((run / "evaluation.json").read_text())
+    assert facts["environment"] == "Walk-v0"
+    assert facts["layouts_trained_on"] == 0.0
+    assert (run / "evaluation.mp4").stat().st_size > 1000
+    assert evaluate.main([str(run), "env.borders=3"]) == 1
+    assert "no key 'borders'" in capsys.readouterr().err
+
+
+def test_it_is_reported_and_starts_others(run, tmp_path):
+    folder = tmp_path / "runs" / "further"
+    run_train(*SMALL, "frames=200", f"init_from={run}", f"hydra.run.dir={folder}")
+    assert report.main([str(folder.parent)]) == 0
+    assert "Walk-v0" in (folder.parent / "report" / "report.md").read_text()
+
+
+def test_it_is_swept(tmp_path, capsys):
+    sweep = ("-m", "seed=0,1", f"hydra.sweep.dir={tmp_path}", "hydra/launcher=basic")
+    run_train(*sweep, *SMALL, "frames=200")
+    run_train(*sweep, *SMALL, "frames=200")
+    assert capsys.readouterr().out.count("has its 200 frames already") == 2
+    tables = sorted(tmp_path.glob("Walk-v0/**/progress.csv"))
+    assert [read_table(path)["steps"] for path in tables] == [[200]] * 2
+    returns = [read_table(path)["episode_return"] for path in tables]
+    assert returns[0] != returns[1]
+
+
+def test_processes_step_what_one_process_would():
+    inline, shared = (
+        make_env({**NODE, "workers": workers, "kwargs": {"border": 1.5}}, num_envs=5, seed=3)
+        for workers in (0, 2)
+    )
+    rollouts = []
+    for env in (inline, shared):
+        torch.manual_seed(0)
+        rollouts.append(env.rollout(40, break_when_any_done=False))
+        env.close()
+    assert rollouts[0]["next", "terminated"].sum() > 5
+    for key in ("observation", "reward", "cost", "fast", "far", "done", "terminated"):
+        torch.testing.assert_close(
+            rollouts[1]["next", key], rollouts[0]["next", key], rtol=0, atol=0
+        )
+    step = rollouts[0]["next"]
+    torch.testing.assert_close(step["cost"], step["fast"] + step["far"])
+
+
+def test_what_fails_in_a_process_is_told():
+    with pytest.raises(RuntimeError, match="the line is broken"):
+        make_env({**NODE, "workers": 1, "kwargs": {"broken": True}}, seed=0).rollout(2)
+    env = make_env({**NODE, "workers": 2}, num_envs=2, seed=0)
+    process = env.base_env._env._workers[1][0]
+    os.kill(process.pid, signal.SIGKILL)
+    process.join()
+    with pytest.raises(RuntimeError, match=r"died \(exit code -9\)"):
+        env.rollout(2)
+
+
+def starts(seed: int, num_envs: int = 4) -> list[float]:
+    return make_env(NODE, num_envs=num_envs, seed=seed).reset()["observation"][:, 0].tolist()
+
+
+def test_seeds_determine_rows_and_share_none():
+    assert starts(0) == starts(0)
+    assert len({*starts(0), *starts(1), *starts(2)}) == 12
+
+
+def test_workers_without_a_state_to_go_on_from_have_rows_of_their_own():
+    make = partial(make_env, NODE, seed=0)
+    shares = [make() for make in share_rows(make(num_envs=4), make, num_collectors=2)]
+    rows = [share.reset()["observation"][:, 0].tolist() for share in shares]
+    assert len({*rows[0], *rows[1]}) == 4
+
+
+@pytest.mark.parametrize(
+    ("keys", "message"),
+    [
+        ({"id": None}, r"env\.id="),
+        ({"id": "Walk-v1"}, "Walk-v1.*Did you mean 'Walk-v0'"),
+        ({"id": "Wolk-v0"}, "Did you mean 'Walk-v0'.*import=my_module"),
+        ({"id": "os.path:Walk-v0"}, "import=os.path env.id=Walk-v0"),
+        ({"border": 3}, "no key 'border'.*env.kwargs"),
+        ({"worker": 3}, "no key 'worker'. Did you mean 'workers'"),
+        ({"workers": -1}, "'workers' must be an integer of at least 0"),
+        ({"num_steps": 0}, "'num_steps' must be an integer of at least 1"),
+        ({"cost_keys": None}, "Walk-v0.*reports no costs.*'cost_keys'"),
+        ({"kwargs": {"nested": True}}, "observations that are arrays.*flatten=true"),
+        ({"kwargs": {"speed": 3}}, "Walk-v0.*speed"),
+    ],
+)
+def test_what_cannot_be_made_is_said(keys, message):
+    with pytest.raises(ConfigError, match=message):
+        make_env({**NODE, **keys})
+
+
+def test_nested_observations_become_a_vector_on_request():
+    env = make_env({**NODE, "kwargs": {"nested": True}, "flatten": True}, num_envs=2)
+    assert env.reset()["observation"].shape == (2, 4)
+
+
+def test_pictures_are_fitted_in():
+    node = complete_env(NODE)
+    with pytest.raises(ValueError, match="render_mode=rgb_array"):
+        make_env(node, seed=0).render(rows=0)
+    env = make_env({**node, "render_mode": "rgb_array"}, num_envs=2, seed=0)
+    place = env.reset()["observation"][1, 0].item()
+    picture = env.render(rows=1, width=120, height=90)
+    assert picture.shape == (90, 120, 3)
+    columns = picture[:40].max(axis=(0, 2)).nonzero()[0]
+    assert columns.tolist() == [2 * int(30 + 9 * place), 2 * int(30 + 9 * place) + 1]
+    assert not picture[40:].any()
+    assert env.render(width=60, height=20).shape == (2, 20, 60, 3)
+    with pytest.raises(ValueError, match="no camera 'track'"):
+        env.render(camera="track")
+
+
+def test_registered_arguments_and_limits_are_kept():
+    gymnasium.register(
+        "ShortWalk-v0", "gymnasium_envs:Walk", max_episode_steps=3, kwargs={"border": 99.0}
+    )
+    env = make_env({**NODE, "id": "ShortWalk-v0"}, num_envs=2, seed=0)
+    rollout = env.rollout(10)
+    assert rollout.shape == (2, 3)
+    assert rollout["next", "truncated"][:, -1].all()
+    assert make_env({**NODE, "num_steps": 2}, seed=0).rollout(10).shape == (1, 2)
