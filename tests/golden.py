@@ -1,21 +1,13 @@
-"""Golden transitions of the 2019 reference environments, where they are at hand."""
+"""Golden transitions of the 2019 reference environments, see golden/README.md."""
 
 import json
-import os
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import pytest
 
-FOLDER = Path(
-    os.environ.get("SAFE_RL_GOLDEN", Path(__file__).resolve().parents[2] / "shared" / "golden")
-)
+FOLDER = Path(__file__).parent / "golden"
 NAMES = sorted(path.stem for path in FOLDER.glob("*.json"))
-
-needs_golden = pytest.mark.skipif(
-    not NAMES, reason=f"no golden transitions in {FOLDER}; set SAFE_RL_GOLDEN to their folder"
-)
 
 
 @dataclass(frozen=True)

@@ -7,27 +7,24 @@ where boxes and pillars collide. So rows agree to rounding, or nearly so in hard
 import numpy as np
 import pytest
 import torch
-from golden import NAMES, load, needs_golden
+from golden import NAMES, load
 from tensordict import TensorDict
 
 from safe_rl.envs import SafetyGymEnv
 
-CASES = NAMES or ["(no golden folder)"]
 STATE = ("qpos", "qvel", "qacc_warmstart", "time", "goal_pos", "goal_button", "buttons_timer")
 ROUNDING = 1e-12
 HARD_CONTACT = 5e-4
-# Least share of rows that agree to rounding where it is not nine in ten: boxes against pillars.
-TO_ROUNDING = {
-    "car_push": 0.2,
-    "doggo_goal_pillars_raw": 0.7,
-    "point_everything": 0.5,
-    "point_push": 0.3,
-    "point_walls_push": 0.5,
+# Largest share of rows that may leave the recorded path, in cases where any does: boxes and vases
+# against pillars. Measured: 0.28, 0.18, 0.09, 0.48. Other processors round otherwise.
+CHAOTIC = {
+    "car_push": 0.35,
+    "doggo_goal_pillars_raw": 0.25,
+    "point_everything": 0.15,
+    "point_push": 0.6,
 }
 # What feels contact forces follows the solver, which stops at a finite accuracy.
 FORCE_SENSORS = ("accelerometer", "touch_")
-
-pytestmark = needs_golden
 
 
 def states(golden, env, rows):
@@ -42,7 +39,7 @@ def states(golden, env, rows):
     return TensorDict(state, batch_size=[num_rows])
 
 
-@pytest.fixture(params=CASES, scope="module")
+@pytest.fixture(params=NAMES, scope="module")
 def golden(request):
     return load(request.param)
 
@@ -70,9 +67,11 @@ def position_error(golden, state):
     return np.abs(state["qpos"].numpy() - golden["qpos"][1:]).max(1)
 
 
-def test_next_positions(golden, stepped):
+def test_next_positions(golden, stepped, record_property):
     error = position_error(golden, stepped[1])
-    assert (error <= ROUNDING).mean() >= TO_ROUNDING.get(golden.name, 0.9)
+    chaotic = float((error > ROUNDING).mean())
+    record_property("share of chaotic rows", f"{golden.name} {chaotic:.2f}")
+    assert chaotic <= CHAOTIC.get(golden.name, 0.0)
     assert error.max() <= HARD_CONTACT
 
 

@@ -7,11 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 import pytest
-from golden import NAMES, Golden, load, needs_golden
+from golden import NAMES, Golden, load
 
 from . import ReferenceWorld
-
-pytestmark = needs_golden
 
 CASES = (
     "car_circle",
