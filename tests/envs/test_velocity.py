@@ -102,6 +102,25 @@ def test_seeds_rows_and_episodes_differ(name):
     assert len(torch.cat(starts).unique(dim=0)) == 16
 
 
+def test_starts_depend_on_seed_row_and_episode_alone():
+    """Whoever started an episode before, and however often."""
+    seen = []
+    for lonely in (range(0), range(3), range(1, 4)):
+        env = make("SafeAntVelocity", 4, seed=3)
+        tensordict = env.reset()
+        for row in lonely:
+            mask = torch.zeros(4, 1, dtype=torch.bool)
+            mask[row] = True
+            tensordict = env.reset(tensordict.set("_reset", mask))
+        while not (env.get_state()["episode"] >= 3).all():
+            behind = (env.get_state()["episode"] < 3)[:, None]
+            tensordict = env.reset(tensordict.set("_reset", behind))
+        seen.append(env.get_state().select("qpos", "qvel", "episode"))
+    assert all((state["episode"] == 3).all() for state in seen)
+    assert_same(seen[0], seen[1])
+    assert_same(seen[0], seen[2])
+
+
 def test_seeding_starts_over():
     env = make("SafeHopperVelocity", 3, seed=5)
     runs = [play(env, env.reset(), 30)]

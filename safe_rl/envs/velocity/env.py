@@ -25,7 +25,7 @@ from safe_rl.envs.velocity.rewarding import locomotion_reward
 from safe_rl.envs.velocity.robots import ROBOTS
 from safe_rl.envs.velocity.snapshot import check_state
 from safe_rl.envs.velocity.specs import make_velocity_specs
-from safe_rl.envs.velocity.starting import draw_start
+from safe_rl.envs.velocity.starting import Starts
 from safe_rl.envs.velocity.suite import resolve_velocity
 
 _FLAGS = ("done", "terminated", "truncated")
@@ -91,6 +91,7 @@ class VelocityEnv(EnvBase):
         self._step_count = torch.zeros(num_envs, dtype=torch.int64)
         self._episode = torch.zeros(num_envs, dtype=torch.int64)
         self._has_cost = torch.zeros(num_envs, dtype=torch.bool)
+        self._starts = Starts(self.config, self._model, num_envs)
         self._renderer = RobotRenderer(self.config)
         specs = make_velocity_specs(
             self._observer.size, self._control_range, self.cost_keys, num_envs, self.device
@@ -123,11 +124,10 @@ class VelocityEnv(EnvBase):
             mask = torch.ones(self.batch_size, dtype=torch.bool)
         mask = mask.reshape(self.batch_size).cpu()
         physics, rows = self._physics, mask.nonzero()[:, 0]
-        episode = self._episode[rows] + 1
-        self._episode[rows] = episode
-        key = rng.fold(self._row_seed[rows], episode)
+        self._episode += mask
         physics.reset(mask)
-        physics.qpos[rows], physics.qvel[rows] = draw_start(self.config, self._model, key)
+        start = self._starts.take(self._row_seed, self._episode, rows)
+        physics.qpos[rows], physics.qvel[rows] = start
         physics.forward(mask)
         self._start(rows)
         self._step_count[rows] = 0

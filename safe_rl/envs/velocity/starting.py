@@ -14,6 +14,41 @@ from safe_rl.envs.velocity.config import VelocityConfig
 from safe_rl.envs.velocity.robots import ROBOTS
 
 
+class Starts:
+    """Starts of episodes, drawn for all rows at once and ahead of need.
+
+    Few rows at a time start an episode, and a draw for few costs as much as one for many. What is
+    handed out depends on the row's seed and episode alone.
+
+    Args:
+        config: the environment.
+        model: its compiled model.
+        num_envs: number of rows, N.
+    """
+
+    def __init__(self, config: VelocityConfig, model: mujoco.MjModel, num_envs: int) -> None:
+        self._config, self._model = config, model
+        self._seeds = self._episodes = torch.full((num_envs,), -1)
+        self._qpos = torch.zeros(num_envs, model.nq, dtype=torch.float64)
+        self._qvel = torch.zeros(num_envs, model.nv, dtype=torch.float64)
+
+    def take(self, seeds: Tensor, episodes: Tensor, rows: Tensor) -> tuple[Tensor, Tensor]:
+        """Return positions [R, nq] and velocities [R, nv] of episodes that start.
+
+        Args:
+            seeds: of all rows, int64 [N].
+            episodes: that all rows are in, or start, int64 [N].
+            rows: which of them start, int64 [R].
+        """
+        known = torch.equal(self._episodes[rows], episodes[rows])
+        if not (known and torch.equal(self._seeds, seeds)):
+            self._seeds, self._episodes = seeds.clone(), episodes + 1
+            self._episodes[rows] = episodes[rows]
+            key = rng.fold(self._seeds, self._episodes)
+            self._qpos, self._qvel = draw_start(self._config, self._model, key)
+        return self._qpos[rows], self._qvel[rows]
+
+
 def draw_start(config: VelocityConfig, model: mujoco.MjModel, key: Tensor) -> tuple[Tensor, Tensor]:
     """Draw initial positions and velocities, distributed as Gymnasium's.
 
