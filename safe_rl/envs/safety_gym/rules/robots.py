@@ -15,7 +15,7 @@ import mujoco
 from safe_rl.envs.errors import ConfigError, nearest
 
 _FOLDER = Path(__file__).parents[1] / "robots"
-ROBOTS: dict[str, Path] = {name: _FOLDER / f"{name}.xml" for name in ("point", "car", "doggo")}
+ROBOTS: dict[str, Path] = {path.stem: path for path in sorted(_FOLDER.glob("*.xml"))}
 
 CONTROL_RANGE = (-1.0, 1.0)  # of actuators whose file gives none
 _PLANAR_JOINTS = (
