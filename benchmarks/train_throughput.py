@@ -15,7 +15,6 @@ from pathlib import Path
 from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 
-import safe_rl.openmp  # noqa: F401, has to come before torch
 from safe_rl.envs import make_env, store_configs
 from safe_rl.training.trainer import build_trainer, seed_everything
 

@@ -1,4 +1,4 @@
-"""How torch's idle threads wait: import this before torch.
+"""How torch's idle threads wait: set before torch is loaded, which is when OpenMP reads it.
 
 By default they spin for milliseconds after every operation and take the cores from the physics
 and from whatever else runs: two training runs on two cores then go ten times slower than one, not
@@ -6,5 +6,18 @@ twice. Sleeping at once costs a few microseconds per operation. A setting of the
 """
 
 import os
+import sys
+import warnings
 
-os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+# GOMP_SPINCOUNT says the same more finely
+_SETTINGS = ("OMP_WAIT_POLICY", "GOMP_SPINCOUNT")
+
+if not any(setting in os.environ for setting in _SETTINGS):
+    # for processes that are started from here, in any case
+    os.environ["OMP_WAIT_POLICY"] = "PASSIVE"
+    if "torch" in sys.modules:
+        warnings.warn(
+            "torch was imported before safe_rl, so that its idle threads spin and slow down "
+            "everything on these cores: import safe_rl first, or set OMP_WAIT_POLICY=PASSIVE.",
+            stacklevel=3,
+        )

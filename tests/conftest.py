@@ -2,7 +2,7 @@
 
 import pytest
 
-import safe_rl.openmp  # noqa: F401, has to come before torch
+import safe_rl  # noqa: F401, has to come before torch
 
 # isort: split
 import torch

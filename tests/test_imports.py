@@ -1,6 +1,9 @@
 """The house has floors: imports point one way only, and every new module is given its place."""
 
 import ast
+import os
+import subprocess
+import sys
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -33,6 +36,7 @@ PARTS = {
     ),
     "evaluate": ("cli",),
     "report": ("cli",),
+    "__main__": ("cli", "naming"),
     "train": ("cli",),
 }
 
@@ -116,6 +120,7 @@ FLOORS = {
         ("composing", "shorthands", "sweeps"),
         ("certificates",),
         ("evaluate", "report", "train"),
+        ("notebook",),
         ("",),
     ),
     "evaluation": (
@@ -212,9 +217,58 @@ def test_imports_point_one_way(module):
             assert floor_of(found.imported) < floor, str(found)
 
 
-def test_the_package_itself_imports_nothing():
-    """So that importing one part never pulls in another."""
-    assert not imports_of("safe_rl")
+def test_the_package_itself_imports_what_comes_before_torch_and_no_part():
+    """So that importing one part never pulls in another: the way in is found when asked for."""
+    tree = ast.parse(PATHS["safe_rl"].read_text())
+    at_once = [node for node in tree.body if isinstance(node, ast.Import | ast.ImportFrom)]
+    assert [ast.unparse(node) for node in at_once] == [
+        "from typing import TYPE_CHECKING, Any",
+        "import safe_rl.openmp",
+    ]
+    later = {found.imported for found in imports_of("safe_rl")} - {"typing", "safe_rl.openmp"}
+    assert later == {"safe_rl.cli.notebook"}
+
+
+def in_a_process(code, **environment):
+    """Run code in a process of its own; returns what it says."""
+    clean = {name: value for name, value in os.environ.items() if name != "OMP_WAIT_POLICY"}
+    result = subprocess.run(
+        [sys.executable, "-c", code],
+        env=clean | environment, capture_output=True, text=True, timeout=120, check=True,
+    )  # fmt: skip
+    return result.stdout + result.stderr
+
+
+def test_the_package_is_imported_in_no_time_and_without_torch():
+    said = in_a_process(
+        "import sys, time; start = time.process_time(); import safe_rl\n"
+        "print(time.process_time() - start, 'torch' in sys.modules)"
+    )
+    seconds, has_torch = said.split()
+    assert float(seconds) < 0.05
+    assert has_torch == "False"
+
+
+OPENMP_SAYS = {"OMP_DISPLAY_ENV": "verbose"}  # libgomp prints its settings when it is loaded
+
+
+def test_idle_threads_sleep_if_the_package_comes_first():
+    said = in_a_process("import safe_rl, torch; torch.ones(9) + 1", **OPENMP_SAYS)
+    assert "GOMP_SPINCOUNT = '0'" in said
+    assert "import safe_rl first" not in said
+
+
+def test_torch_first_is_said_to_be_too_late():
+    said = in_a_process("import torch\nimport safe_rl", **OPENMP_SAYS)
+    assert "GOMP_SPINCOUNT = '0'" not in said
+    assert "UserWarning: torch was imported before safe_rl" in said
+    assert said.count("import safe_rl first") == 1
+
+
+@pytest.mark.parametrize("setting", [{"OMP_WAIT_POLICY": "ACTIVE"}, {"GOMP_SPINCOUNT": "10"}])
+def test_a_setting_of_the_users_is_kept_without_a_word(setting):
+    code = "import torch, safe_rl, os; print(os.environ.get('OMP_WAIT_POLICY'))"
+    assert in_a_process(code, **setting).strip() == setting.get("OMP_WAIT_POLICY", "None")
 
 
 def test_tables_have_no_circles_and_no_ruins():

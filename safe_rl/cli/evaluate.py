@@ -6,9 +6,6 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-import safe_rl.openmp  # noqa: F401, has to come before torch
-
-# isort: split
 from torchrl.checkpoint import CheckpointError
 
 from safe_rl.cli.benchmark import suite

@@ -7,9 +7,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
-import safe_rl.openmp  # noqa: F401, has to come before torch
-
-# isort: split
 from safe_rl.cli.benchmark import suite
 from safe_rl.cli.options import OptionError, parse_options, usage
 from safe_rl.cli.user_code import import_modules, split_imports

@@ -14,7 +14,6 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf, open_dict
 
-import safe_rl.openmp  # noqa: F401, has to come before torch
 from safe_rl.cli.certificates import certify_run, is_worth_a_certificate
 from safe_rl.cli.composing import check_command
 from safe_rl.cli.conf import CONF

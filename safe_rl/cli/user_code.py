@@ -7,6 +7,7 @@ makes them run: opening somebody's run executes nothing of theirs.
 
 from __future__ import annotations
 
+import re
 import sys
 import traceback
 from collections.abc import Callable, Mapping, Sequence
@@ -26,6 +27,7 @@ __all__ = [
     "imported",
     "make_after_imports",
     "note_imports",
+    "quote",
     "split_imports",
 ]
 
@@ -64,11 +66,21 @@ def note_imports(modules: Sequence[str], arguments: Sequence[str]) -> list[str]:
         >>> note_imports(["mine", "examples/other.py"], ["-m", "seed=1,2"])
         ['-m', "++import=['mine','examples/other.py']", 'seed=1,2']
     """
-    quoted = ("'" + module.replace("'", "\\'") + "'" for module in modules)
     is_override = ["=" in argument and not argument.startswith("-") for argument in arguments]
     # beside the others: Hydra takes overrides on one side of a flag only
     place = is_override.index(True) if any(is_override) else len(arguments)
-    return [*arguments[:place], f"++{KEY}=[{','.join(quoted)}]", *arguments[place:]]
+    return [*arguments[:place], f"++{KEY}=[{','.join(map(quote, modules))}]", *arguments[place:]]
+
+
+def quote(text: str) -> str:
+    r"""A text as Hydra's grammar has it, whatever is in it.
+
+    Examples:
+        >>> print(quote(r"it's a\b"))
+        'it\'s a\b'
+    """
+    # backslashes are doubled before a quote only
+    return "'" + re.sub(r"(\\*)('|$)", lambda m: m[1] * 2 + ("\\'" if m[2] else ""), text) + "'"
 
 
 def import_modules(modules: Sequence[str]) -> None:

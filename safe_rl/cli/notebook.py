@@ -1,0 +1,236 @@
+"""The way in from Python: ``safe_rl.train`` and ``safe_rl.load``, for notebooks and scripts.
+
+They do what the commands do, from the same configurations; Hydra stays inside.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import torch
+from hydra import compose, initialize_config_dir
+from hydra.core.global_hydra import GlobalHydra
+from omegaconf import DictConfig, OmegaConf, open_dict
+from tensordict.nn import TensorDictModuleBase
+from torchrl.envs import EnvBase
+
+from safe_rl.cli.certificates import certify_run, is_worth_a_certificate
+from safe_rl.cli.composing import check_command
+from safe_rl.cli.conf import CONF
+from safe_rl.cli.evaluate import evaluate_run
+from safe_rl.cli.train import complete, prepare
+from safe_rl.cli.user_code import check_imports, import_modules, note_imports, quote
+from safe_rl.envs import make_env, store_configs
+from safe_rl.evaluation import Evaluation, EvaluationOptions
+from safe_rl.evaluation.layouts import default_seed
+from safe_rl.evaluation.loading import find_checkpoint, load_config, load_policy, override_env
+from safe_rl.runs.folder import RunFolder
+from safe_rl.runs.lock import held
+from safe_rl.runs.outcome import final_figures
+from safe_rl.runs.table import read_table
+
+__all__ = ["Run", "load", "train"]
+
+
+@dataclass(frozen=True)
+class Run:
+    """A run in its folder: figures, environment and trained policy.
+
+    Attributes:
+        directory: Its folder.
+        checkpoint: Which checkpoint ``policy`` has: "last", "best", "certified", or a path.
+
+    Examples:
+        >>> run = getfixture("tiny_run")  # what `safe_rl.train` returns
+        >>> sorted(run.final)[:4]
+        ['cost_rate', 'episode_cost', 'episode_return', 'steps_per_second']
+        >>> run.env.rollout(5, run.policy).shape
+        torch.Size([1, 5])
+    """
+
+    directory: Path
+    checkpoint: str = "last"
+
+    @cached_property
+    def config(self) -> DictConfig:
+        """Its whole configuration."""
+        return load_config(self.directory)
+
+    @cached_property
+    def table(self) -> dict[str, list[float]]:
+        """Its figures by epoch: the columns of ``progress.csv``, as `pandas.DataFrame` takes them.
+
+        Costs of an epoch in which no episode ended are NaN.
+        """
+        return read_table(RunFolder(self.directory).table)
+
+    @property
+    def final(self) -> dict[str, float]:
+        """Final J_r (``episode_return``), J_c (``episode_<cost>``) and ρ_c (``<cost>_rate``).
+
+        As :func:`safe_rl.runs.outcome.final_figures` takes them from the table.
+        """
+        return final_figures(self.table, list(self.config.cost_limits) or ["cost"])
+
+    @cached_property
+    def env(self) -> EnvBase:
+        """One world of its environment, with layouts that training has not met."""
+        return self.make_env()
+
+    @cached_property
+    def policy(self) -> TensorDictModuleBase:
+        """Its trained policy; :func:`torchrl.envs.set_exploration_type` chooses mean or sample."""
+        path = find_checkpoint(self.directory, self.checkpoint)
+        return load_policy(self.config, self.env, path, torch.device("cpu"))
+
+    def make_env(self, num_envs: int = 1, seed: int | None = None, **keys: Any) -> EnvBase:
+        """Make its environment.
+
+        Args:
+            num_envs: Number of worlds, N.
+            seed: Of layouts and noise; None: as for evaluation, one that training never used.
+            keys: Keys of the environment to change, such as ``hazards_num=12``.
+
+        Raises:
+            ConfigError: If the environment does not accept a key.
+        """
+        node = override_env(self.config, keys)
+        if seed is None:
+            seed = default_seed(node, self.config.seed)
+        return make_env(node, num_envs=num_envs, seed=seed)
+
+    def evaluate(self, **options: Any) -> Evaluation:
+        """Run the policy for whole episodes; writes into the folder what the command writes.
+
+        Args:
+            options: Those of :class:`safe_rl.evaluation.EvaluationOptions`, such as
+                ``episodes=100``.
+        """
+        return evaluate_run(
+            self.directory, EvaluationOptions(**{"checkpoint": self.checkpoint, **options})
+        )
+
+
+def train(
+    env: str = "PointGoal1",
+    *,
+    algo: str = "ppo_lagrangian",
+    directory: str | Path | None = None,
+    imports: Sequence[str] = (),
+    config_dir: str | Path | None = None,
+    **settings: Any,
+) -> Run:
+    """Train, as ``python train.py env=… algo=…`` does.
+
+    Seeds torch, and sets the number of its threads if ``num_threads`` is given.
+
+    Args:
+        env: Name of an environment.
+        algo: Name of an algorithm.
+        directory: Folder of the run; None: ``runs/<env>/<algo>/<date>_seed<seed>``.
+        imports: Modules of yours to import before, as the command's ``import=``.
+        config_dir: Folder with YAMLs of yours, as the command's ``--config-dir``.
+        settings: Any key of ``conf/``: ``frames=100_000``, ``preset="paper"``,
+            ``cost_limits={"cost_hazards": 10}``. Keys below another one are dictionaries,
+            ``policy_update={"max_kl": 0.02}``, or written with dots, ``**{"env.hazards_num": 12}``.
+
+    Raises:
+        ValueError: If a setting cannot be; the message names it.
+        FileExistsError: If the folder holds a run.
+
+    Examples:
+        >>> small = {"num_envs": 2, "frames_per_batch": 40, "env.num_steps": 20, "logger": "none"}
+        >>> folder = getfixture("tmp_path") / "first"
+        >>> run = train("PointGoal1", algo="cpo", frames=80, directory=folder, **small)
+        >>> run.table["steps"]
+        [40.0, 80.0]
+    """
+    import_modules(imports)
+    store_configs()
+    overrides = [f"env={env}", f"algo={algo}", *_overrides(settings)]
+    if imports:
+        overrides = note_imports(imports, overrides)
+    if config_dir is not None:
+        overrides.append(f"hydra.searchpath=[file://{Path(config_dir).resolve()}]")
+    config = _compose(overrides)
+    folder = Path(config.hydra.run.dir if directory is None else directory)
+    with open_dict(config):
+        del config["hydra"]
+    complete(config)
+    with held(RunFolder(folder)):
+        trainer = prepare(config, folder, continues=False)
+        assert trainer is not None
+        trainer.run()
+    if trainer.algorithm.cost_keys and is_worth_a_certificate(config, trainer.episode_length):
+        certify_run(folder)
+    return Run(folder)
+
+
+def load(directory: str | Path, checkpoint: str = "last", imports: Sequence[str] = ()) -> Run:
+    """Open a run: its figures, environment and policy.
+
+    Args:
+        directory: Folder of the run.
+        checkpoint: "last", "best" (highest return that kept every limit), "certified" (surely keeps
+            them), or a path.
+        imports: Modules that its environment or policy needs; none is imported unless named here.
+
+    Raises:
+        FileNotFoundError: If the folder is not that of a run, or has no such checkpoint.
+        ValueError: If the run has used modules that ``imports`` lacks.
+
+    Examples:
+        >>> run = load(getfixture("tiny_run").directory)
+        >>> run.policy(run.env.reset())["action"].shape
+        torch.Size([1, 2])
+    """
+    run = Run(Path(directory), checkpoint)
+    check_imports(run.config, imports or None, run.directory)
+    import_modules(imports)
+    find_checkpoint(run.directory, checkpoint)
+    return run
+
+
+def _overrides(settings: Mapping[str, Any], prefix: str = "") -> Iterator[str]:
+    """Settings in Hydra's grammar, which is nearly JSON's."""
+    for name, value in settings.items():
+        key = f"{prefix}{name}"
+        if isinstance(value, Mapping) and key != "cost_limits":  # which are given all at once
+            yield from _overrides(value, f"{key}.")
+        else:
+            yield f"{key}={_literal(value)}"
+
+
+def _literal(value: Any) -> str:
+    if isinstance(value, Mapping):
+        return "{" + ",".join(f"{key}:{_literal(item)}" for key, item in value.items()) + "}"
+    if isinstance(value, list | tuple):
+        return "[" + ",".join(map(_literal, value)) + "]"
+    if isinstance(value, str | Path):
+        return quote(str(value))
+    return json.dumps(value)
+
+
+def _compose(overrides: list[str]) -> DictConfig:
+    check_command(overrides, CONF)
+    with _fresh_hydra(), initialize_config_dir(str(CONF), version_base="1.3"):
+        config = compose("config", overrides=overrides, return_hydra_config=True)
+        OmegaConf.resolve(config.hydra.run)
+        return config
+
+
+@contextmanager
+def _fresh_hydra() -> Iterator[None]:
+    """Whoever has initialised Hydra finds it as it was."""
+    before = GlobalHydra.instance().hydra
+    GlobalHydra.instance().clear()
+    try:
+        yield
+    finally:
+        GlobalHydra.instance().hydra = before

@@ -1,0 +1,113 @@
+"""The way in from Python does what the commands do, whatever state Hydra is in."""
+
+import math
+import subprocess
+import sys
+
+import pytest
+import torch
+from hydra import compose, initialize_config_dir
+from hydra.core.global_hydra import GlobalHydra
+from run_configs import CONF, without_times
+
+import safe_rl
+from safe_rl.envs import ConfigError
+from safe_rl.runs.table import read_table
+
+SMALL = {
+    **{"num_envs": 2, "frames_per_batch": 40, "env.num_steps": 20, "logger": "none"},
+    **{"model": {"hidden_sizes": [8]}, "critic_update": {"minibatch_size": 20}, "num_threads": 1},
+}
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    return safe_rl.train(
+        "CarGoal1", algo="cpo", frames=120, directory=tmp_path_factory.mktemp("run"),
+        cost_limits={"cost_hazards": 3, "cost": 5.5}, seed=4, **SMALL,
+    )  # fmt: skip
+
+
+def test_a_run_is_its_figures_environment_and_policy(run):
+    assert str(run.table) == str(read_table(run.directory / "progress.csv"))
+    assert run.config.cost_limits == {"cost_hazards": 3, "cost": 5.5}
+    final = run.final
+    assert final["cost_hazards_rate"] == run.table["cost_hazards_rate"][-1]
+    returns = [value for value in run.table["episode_return"] if not math.isnan(value)]
+    assert final["episode_return"] == pytest.approx(sum(returns) / len(returns))
+    rollout = run.env.rollout(20, run.policy)
+    assert rollout.shape == (1, 20)
+    assert rollout["next", "cost_hazards"].shape == (1, 20, 1)
+    assert run.make_env(3, hazards_num=2).batch_size == (3,)
+    with pytest.raises(ConfigError, match="hazards_num"):
+        run.make_env(hazard_num=2)
+    assert run.evaluate(episodes=2, num_threads=1).facts["episodes"] == 2
+
+
+def test_a_run_is_opened_again(run):
+    again = safe_rl.load(str(run.directory))
+    assert str(again.table) == str(run.table)
+    state, actions = run.env.reset(), []
+    for policy in (run.policy, again.policy):
+        torch.manual_seed(1)
+        with torch.no_grad():
+            actions.append(policy(state.clone())["action"])
+    assert torch.equal(*actions)
+    with pytest.raises(FileNotFoundError, match="no checkpoint 'newest'"):
+        safe_rl.load(run.directory, checkpoint="newest")
+    with pytest.raises(FileNotFoundError, match="not the folder of a run"):
+        safe_rl.load(run.directory / "nowhere")
+
+
+def test_it_is_the_run_of_the_command(run, tmp_path):
+    words = ["env=CarGoal1", "algo=cpo", "frames=120", "seed=4", "num_envs=2", "num_threads=1"]
+    words += ["frames_per_batch=40", "env.num_steps=20", "logger=none", "model.hidden_sizes=[8]"]
+    words += ["critic_update.minibatch_size=20", "cost_limits={cost_hazards: 3, cost: 5.5}"]
+    subprocess.run(
+        [sys.executable, "train.py", *words, f"hydra.run.dir={tmp_path}"],
+        cwd=CONF.parent, capture_output=True, timeout=300, check=True,
+    )  # fmt: skip
+    files = (folder / "progress.csv" for folder in (run.directory, tmp_path))
+    first, second = map(without_times, files)
+    assert first == second
+    assert (tmp_path / "config.yaml").read_text() == (run.directory / "config.yaml").read_text()
+
+
+def test_hydra_is_left_as_it_was(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    with initialize_config_dir(str(CONF), version_base="1.3"):
+        before = GlobalHydra.instance().hydra
+        for seed in (0, 1):
+            run = safe_rl.train(algo="ppo", frames=40, seed=seed, preset="default", **SMALL)
+            assert run.directory.match(f"runs/PointGoal1/ppo/*_seed{seed}")
+        assert GlobalHydra.instance().hydra is before
+        assert compose("config", overrides=["seed=7"]).seed == 7
+    assert not GlobalHydra.instance().is_initialized()
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"fames": 3}, "fames"),
+        ({"env": "PointGaol1"}, "PointGoal1"),
+        ({"algo": "cop"}, "cpo"),
+        ({"frames": -1}, "frames=-1"),
+        ({"cost_limits": {"cost_hazard": 1}}, "cost_hazards"),
+        ({"policy_update": {"max_kll": 1}}, "max_kll"),
+        ({"env.hazard_num": 1}, "hazards_num"),
+        ({"imports": ["users_nowhere"]}, "import=users_nowhere"),
+    ],
+)
+def test_errors_name_the_setting(settings, message, tmp_path):
+    with pytest.raises(ValueError, match=message):
+        safe_rl.train(directory=tmp_path / "run", **settings)
+    assert not (tmp_path / "run").exists()
+
+
+def test_strange_texts_arrive_as_they_are(tmp_path):
+    from safe_rl.cli.notebook import _compose, _overrides
+
+    texts = ["it's", "a,b=c", "x: [y]", "back\\slash", "${seed}"[1:]]
+    config = _compose(list(_overrides({"init_from": texts[0], "model.hidden_sizes": texts[1:]})))
+    assert config.init_from == texts[0]
+    assert list(config.model.hidden_sizes) == texts[1:]
