@@ -25,8 +25,8 @@ def require_extra(module: str, extra: str) -> None:
     package = module.partition(".")[0]
     if find_spec(package) is None:
         raise ModuleNotFoundError(
-            f"This needs the package '{package}', which comes with the extra '{extra}': "
-            f"pip install 'safe-rl[{extra}]'",
+            f"This needs the package '{package}', which comes with the extra '{extra}': in the "
+            f"folder of safe_rl, pip install -e '.[{extra}]'",
             name=package,
         )
 

@@ -68,7 +68,7 @@ def test_the_help_has_every_option_and_its_default():
 
 
 def test_a_missing_package_names_its_extra():
-    with pytest.raises(ModuleNotFoundError, match=r"'no_such_package'.*safe-rl\[video\]"):
+    with pytest.raises(ModuleNotFoundError, match=r"'no_such_package'.*\.\[video\]"):
         import_extra("no_such_package.part", "video")
 
 

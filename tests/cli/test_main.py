@@ -1,0 +1,28 @@
+"""One command for all: names, help and exit status."""
+
+import subprocess
+import sys
+
+import pytest
+
+from safe_rl.__main__ import COMMANDS, main
+
+
+@pytest.mark.parametrize("arguments", [["-h"], ["--help"], []])
+def test_help_names_the_commands(arguments, capsys):
+    assert main(arguments) == (0 if arguments else 2)
+    printed = capsys.readouterr().out
+    assert all(name in printed for name in COMMANDS)
+
+
+def test_an_unknown_command_is_refused_with_the_nearest(capsys):
+    assert main(["trian", "env=PointGoal1"]) == 2
+    assert "'train'" in capsys.readouterr().err
+
+
+def test_a_command_gets_the_rest(tmp_path):
+    words = [sys.executable, "-m", "safe_rl", "report", str(tmp_path), "seed=3"]
+    result = subprocess.run(words, capture_output=True, text=True, timeout=120, check=False)
+    assert result.returncode == 1
+    assert "Unknown option 'seed'" in result.stderr
+    assert "seeds" in result.stderr
