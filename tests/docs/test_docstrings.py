@@ -1,0 +1,31 @@
+"""Every example in the package's docstrings does what it says."""
+
+import doctest
+import pkgutil
+from importlib import import_module
+
+import pytest
+
+import safe_rl
+
+MODULES = [
+    "safe_rl",
+    *(found.name for found in pkgutil.walk_packages(safe_rl.__path__, "safe_rl.")),
+]
+
+
+@pytest.fixture(scope="session")
+def tiny_run(tmp_path_factory):
+    """A finished run of two epochs, as examples want one."""
+    small = {"num_envs": 2, "frames_per_batch": 40, "frames": 80, "env.num_steps": 20}
+    return safe_rl.train(directory=tmp_path_factory.mktemp("tiny"), logger="none", **small)
+
+
+@pytest.mark.parametrize("module", [name for name in MODULES if not name.endswith("__main__")])
+def test_examples(module, request, capsys):
+    found = doctest.DocTestFinder().find(import_module(module))
+    runner = doctest.DocTestRunner(optionflags=doctest.ELLIPSIS)
+    for example in found:
+        example.globs["getfixture"] = request.getfixturevalue
+        runner.run(example)
+    assert not runner.failures, capsys.readouterr().out
