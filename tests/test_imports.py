@@ -31,8 +31,7 @@ PARTS = {
     "reporting": ("extras", "runs", "scores"),
     "cli": (
         *("envs", "evaluation", "extras", "naming", "openmp", "processes", "reporting", "runs"),
-        "scores",
-        *("targets", "training"),
+        *("scores", "targets", "training"),
     ),
     "evaluate": ("cli",),
     "report": ("cli",),

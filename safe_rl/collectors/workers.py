@@ -142,11 +142,14 @@ def end_processes(collector: Any) -> None:
         process.kill()
     for process in processes:
         process.join(timeout=5.0)
-    # weights on their way to a process that is no more: at exit, Python would wait for them
-    schemes = getattr(collector, "_weight_sync_schemes", None) or {}
-    for holder in (collector, *schemes.values()):
+    # weights on their way to a process that is no more: Python would wait for them at exit, and for
+    # a thread that the schemes begin when they are deleted then
+    schemes = (getattr(collector, "_weight_sync_schemes", None) or {}).values()
+    for holder in (collector, *schemes):
         for queue in _queues(vars(holder).values()):
             queue.cancel_join_thread()
+    for scheme in schemes:
+        scheme.shutdown()
     collector.closed = True
 
 

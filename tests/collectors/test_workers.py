@@ -132,7 +132,7 @@ def test_a_worker_in_trouble_while_it_starts_ends_the_run_with_the_reason(
     script = tmp_path / "script.py"
     script.write_text(SCRIPT.format(path=[os.path.dirname(__file__)], trouble=trouble.__name__))
     ended = subprocess.run(
-        [sys.executable, str(script)], capture_output=True, text=True, timeout=300
+        [sys.executable, str(script)], capture_output=True, text=True, timeout=900
     )
     assert ended.returncode == 1
     assert re.search(reason, ended.stderr)
