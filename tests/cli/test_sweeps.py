@@ -172,7 +172,7 @@ def test_jobs_have_their_folders_for_themselves_and_end_with_the_sweep(tmp_path)
     try:
         wait_until(lambda: [r.num_rows > 1 for r in runs_below(tmp_path)] == [True, True], 300)
         processes = writers(tmp_path)
-        again = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=300)
+        again = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=900)
         assert again.returncode == 1
         for directory, pid in processes.items():
             assert f"{directory}: RunInUseError: {directory} is being written by process {pid}" in (
