@@ -181,7 +181,7 @@ def _read_run(folder: RunFolder, root: Path, unfinished: bool, skipped: dict[Pat
                 skipped[path] = clean(error) or type(error).__name__
         return contents
 
-    notes = (folder.surroundings, folder.overrides, folder.notes / "config.yaml")
+    notes = (folder.surroundings, folder.overrides, folder.composed)
     hydra, said, begun_with = (
         next(iter(read((path for path in (note,) if os.path.lexists(path)), read_yaml)), None)
         for note in notes
