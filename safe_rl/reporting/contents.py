@@ -100,12 +100,6 @@ class Report:
         """All runs in it."""
         return [run for experiment in self.experiments for run in experiment.runs]
 
-    @property
-    def tables(self) -> dict[str, Table]:
-        """All tables by name."""
-        blocks = (block for section in self.sections for block in section.blocks)
-        return {block.name: block for block in blocks if isinstance(block, Table)}
-
 
 def build_report(root: Path, suite: Suite, *, seeds_needed: int, unfinished: bool) -> Report:
     """Find the runs below a folder and put everything together.

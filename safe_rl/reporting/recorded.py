@@ -294,7 +294,7 @@ def _command(
             words.append(f"--config-dir={clean(_select(source, 'path'))}")
     frames = config["frames"]
     # a run that was continued for longer
-    if _select(begun_with, "frames") not in (None, frames):
+    if isinstance(before := _select(begun_with, "frames"), int) and before != frames:
         overrides = [o for o in overrides if not o.startswith("frames=")] + [f"frames={frames}"]
     return shlex.join([*words, *overrides])
 

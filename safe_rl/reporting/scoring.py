@@ -66,7 +66,7 @@ def _over_seeds(values: Sequence[Mapping[str, float | None]]) -> dict[str, float
 
 def _published(experiment: Experiment) -> dict[str, Any]:
     """Values printed elsewhere for the same environment and algorithm."""
-    if experiment.benchmark is None or not experiment.has_published_limit:
+    if not (experiment.benchmark and experiment.has_published_limit) or experiment.is_continued:
         return {}
     algorithm = experiment.runs[0].algorithm
     fields: dict[str, Any] = {}

@@ -1,5 +1,6 @@
 """Which folders count as runs, how they are grouped, and what they are called."""
 
+import json
 import os
 
 import pytest
@@ -40,6 +41,25 @@ def test_a_run_knows_its_command_and_its_end(tmp_path):
     assert second.command is None
     assert not second.is_finished
     assert find_runs(tmp_path, unfinished=True)[0][1].is_finished
+
+
+def test_a_command_has_what_the_overrides_do_not_say(tmp_path):
+    run = write_run(tmp_path, overrides=["env=PointGoal1", "frames=500", "seed=0"])
+    sources = [
+        {"path": "/home/me/conf", "provider": "main"},
+        {"path": "/home/me/my conf", "provider": "command-line"},
+    ]
+    record = {"hydra": {"runtime": {"config_sources": sources}, "run": {"dir": "${oc.env:HOME}"}}}
+    (run / ".hydra/hydra.yaml").write_text(json.dumps(record))
+    (run / ".hydra/config.yaml").write_text("frames: 500")
+    # it was continued to 1000
+    (found,), _ = find_runs(tmp_path)
+    assert found.command == (
+        "python train.py '--config-dir=/home/me/my conf' env=PointGoal1 seed=0 frames=1000"
+    )
+    (run / ".hydra/config.yaml").write_text("frames: ${paper.frames.point}")
+    (run / ".hydra/hydra.yaml").unlink()
+    assert find_runs(tmp_path)[0][0].command == "python train.py env=PointGoal1 frames=500 seed=0"
 
 
 def test_what_is_no_run_is_named_with_its_reason(tmp_path):

@@ -5,7 +5,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from omegaconf import OmegaConf
 
-from safe_rl.runs.files import read_config, replacing
+from safe_rl.runs.files import read_config, read_yaml, replacing
 
 VALUES = st.recursive(
     st.none() | st.booleans() | st.integers() | st.floats(allow_nan=False) | st.text("ab -:#'1"),
@@ -47,6 +47,13 @@ def test_what_is_no_resolved_configuration_is_refused(text, message, tmp_path):
     path.write_bytes(text if isinstance(text, bytes) else text.encode())
     with pytest.raises(ValueError, match=message):
         read_config(path)
+
+
+def test_what_is_not_resolved_can_be_read_and_stays_so(tmp_path, monkeypatch):
+    monkeypatch.setenv("SECRET", "hush")
+    path = tmp_path / "hydra.yaml"
+    path.write_text("a: [1e-4, '${oc.env:SECRET}', '???']")
+    assert read_yaml(path) == {"a": [1e-4, "${oc.env:SECRET}", "???"]}
 
 
 def test_a_file_is_replaced_when_it_is_complete(tmp_path):
