@@ -57,21 +57,11 @@ def test_other_errors_and_full_ones_pass(tmp_path, monkeypatch):
         raise SettingError
 
 
-@pytest.mark.parametrize(
-    ("override", "words"),
-    [
-        ("frames=abc", "frames=abc: it must be a whole number from 1 to"),
-        ("lagrangian.kp=abc", "lagrangian.kp=abc: it must be a number from 0"),
-        ("init_from=nowhere", "init_from=nowhere: there is no such folder or file."),
-        ("env.hazards_num=abc", "'hazards_num'"),
-        ("env.hazards_num=200", "No layout found in 10000 attempts: most often 'hazard"),
-    ],
-)
-def test_train_py_ends_in_a_line_and_leaves_nothing(tmp_path, override, words):
-    command = [sys.executable, "train.py", override, f"hydra.run.dir={tmp_path / 'run'}"]
+@pytest.mark.slow
+def test_train_py_ends_in_a_line_where_no_world_can_be_made(tmp_path):
+    command = [sys.executable, "train.py", "env.hazards_num=200", f"hydra.run.dir={tmp_path}/run"]
     result = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
     assert result.returncode == 1
-    assert words in result.stderr
-    assert "Traceback" not in result.stderr
+    assert "No layout found in 10000 attempts: most often 'hazard" in result.stderr
     assert len(result.stderr.strip().splitlines()) == 1
     assert not (tmp_path / "run").exists()

@@ -1,0 +1,76 @@
+"""The command train.py as a whole: what Hydra is asked passes, what is wrong leaves nothing."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from safe_rl.cli import train
+
+ROOT = Path(__file__).parents[2]
+pytestmark = pytest.mark.usefixtures("few_environments")
+
+
+@pytest.fixture
+def command(tmp_path, monkeypatch, capsys):
+    """Runs train.py in an empty folder; returns its status and what it printed."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.delenv("HYDRA_FULL_ERROR", raising=False)
+
+    def run(*arguments):
+        monkeypatch.setattr(sys, "argv", ["train.py", *arguments])
+        try:
+            status = train.main()
+        except SystemExit as end:
+            status = end.code
+        return status, *capsys.readouterr()
+
+    return run
+
+
+def test_tab_completion_can_be_installed(command):
+    status, out, _ = command("-sc", "install=bash")
+    assert not status
+    assert "complete -o nospace -o default -F hydra_bash_completion" in out
+
+
+def test_configurations_are_shown(command):
+    status, out, _ = command("--cfg", "job", "frames=7")
+    assert not status
+    assert "frames: 7\n" in out
+    assert list(Path.cwd().iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("overrides", "words"),
+    [
+        (["lr=1e-4"], "'lr=1e-4': nothing reads 'lr'. Did you mean 'policy_update.optimizer.lr'"),
+        (["loss.clip_epsilon=nan"], "loss.clip_epsilon=nan: it must be a number above 0"),
+        (["env.hazards_num=abc"], "'hazards_num' must be an integer, got 'abc'"),
+        (["loss._target_=os.system"], "loss._target_=os.system: configurations reach only parts"),
+        (["-m", "seed=0,abc"], "seed=abc: it must be a whole number"),
+        (["hydra.run.dir=/proc/runs"], "hydra.run.dir=/proc/runs: nothing can be written there"),
+        (["init_from=nowhere"], "init_from=nowhere: there is no such folder or file."),
+    ],
+)
+def test_what_is_wrong_is_said_in_a_line_and_leaves_nothing(command, overrides, words):
+    status, _, err = command(*overrides)
+    said = err or status
+    assert status
+    assert words in said
+    assert len(said.strip().splitlines()) == 1
+    assert [path for path in Path.cwd().rglob("*") if path.is_file()] == []
+
+
+def test_the_whole_error_is_there_for_those_who_ask(command, monkeypatch):
+    monkeypatch.setenv("HYDRA_FULL_ERROR", "1")
+    with pytest.raises(ValueError, match="nothing reads 'lr'"):
+        command("lr=1e-4")
+
+
+@pytest.mark.parametrize("room", ["safe_rl.training", "safe_rl.cli"])
+def test_rooms_are_no_commands(room):
+    result = subprocess.run([sys.executable, "-m", room], cwd=ROOT, capture_output=True, text=True)
+    assert result.returncode
+    assert "cannot be directly executed" in result.stderr
