@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from contextlib import closing
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -81,15 +82,17 @@ def evaluate(
     # environments that draw nothing unless they are told have a key for it
     drawing = {key: "rgb_array" for key in ("render_mode",) if key in node}
     if options.video:
-        check_camera(make(1, **drawing), options.camera)
-    env = make(min(options.num_envs, options.episodes))
-    policy = load_policy(config, env, checkpoint, torch.device(options.device))
+        with closing(make(1, **drawing)) as single:
+            check_camera(single, options.camera)
     manner = {"deterministic": options.deterministic}
-    torch.manual_seed(seed)
-    episodes = collect_episodes(
-        env, policy, options.episodes, env.cost_keys, **manner, progress=progress
-    )
-    limits = {key: float(d) for key, d in config.cost_limits.items() if key in env.cost_keys}
+    with closing(make(min(options.num_envs, options.episodes))) as env:
+        cost_keys = env.cost_keys
+        policy = load_policy(config, env, checkpoint, torch.device(options.device))
+        torch.manual_seed(seed)
+        episodes = collect_episodes(
+            env, policy, options.episodes, cost_keys, **manner, progress=progress
+        )
+    limits = {key: float(d) for key, d in config.cost_limits.items() if key in cost_keys}
     reference = suite.reference(node, but_for=_LAYOUTS)
     estimates = summarise(episodes, limits, reference, options.cvar_alpha)
     facts = _facts(directory, config, checkpoint, options, node, seed) | {"cost_limits": limits}
@@ -101,10 +104,9 @@ def evaluate(
         return Evaluation(facts, estimates, tuple(files[:2]))
     torch.manual_seed(seed)
     # the first world draws the same episodes whatever the number of worlds
-    frames = record_episode(
-        make(1, **drawing), policy, env.cost_keys, **manner, camera=options.camera
-    )
-    write_video(files[2], frames)
+    with closing(make(1, **drawing)) as single:
+        frames = record_episode(single, policy, cost_keys, **manner, camera=options.camera)
+        write_video(files[2], frames)
     return Evaluation(facts, estimates, tuple(files))
 
 

@@ -175,6 +175,21 @@ def test_what_is_interrupted_leaves_the_evaluation_of_before(run, monkeypatch):
     assert not list(run.glob(".*unfinished*"))
 
 
+def test_environments_are_closed_whatever_happens(run, monkeypatch):
+    made = []
+
+    def make(node, **kwargs):
+        made.append(make_env(node, **kwargs))
+        return made[-1]
+
+    monkeypatch.setattr("safe_rl.cli.evaluate.make_env", make)
+    evaluate(run, options(episodes=1))
+    monkeypatch.setattr("safe_rl.evaluation.measuring.collect_episodes", None)
+    with pytest.raises(TypeError):
+        evaluate(run, options(episodes=1))
+    assert [env.is_closed for env in made] == [True, True]
+
+
 def test_evaluations_of_a_name_stand_side_by_side(run):
     evaluate(run, options(episodes=1))
     evaluate(run, options(episodes=2, name="other"))
@@ -209,7 +224,7 @@ def test_the_command_prints_a_table(run, capsys):
         (["epsiodes=3"], "Did you mean 'episodes'?"),
         (["env.hazard_num=3"], "hazards_num"),
         (["episodes=0"], "episodes=0"),
-        (["checkpoint=there.torchrl"], "checkpoint is last, best or the path"),
+        (["checkpoint=there.torchrl"], "checkpoint is last, best, certified or the path"),
         (["env.lidar_num_bins=8"], "trained on other observations"),
         (["cvar_alpha=2"], "cvar_alpha"),
         (["camera=nowhere", "video=true"], "nowhere"),
