@@ -168,7 +168,7 @@ PARTS = {
     "PPOLagrangianLoss": _CLIPPED_LOSS,
     "TRPOLoss": _LOSS,
     "TRPOLagrangianLoss": _LOSS,
-    "CPOLoss": {"entropy_coeff": _LOSS["entropy_coeff"]},
+    "CPOLoss": _LOSS,
     "VectorGAE": _ESTIMATOR,
     "CostGAE": _ESTIMATOR,
     "LagrangeMultiplier": {

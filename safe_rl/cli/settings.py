@@ -30,7 +30,7 @@ __all__ = [
 ]
 
 _MISSING = object()
-_SECTIONS = ("algo", "checkpoint", "collector", "logger", "model")
+_SECTIONS = ("algo", "certificate", "checkpoint", "collector", "logger", "model")
 
 
 class SettingError(ValueError):
