@@ -91,8 +91,9 @@ def plain(config: DictConfig) -> dict[str, Any]:
         SettingError: If a value refers to one that is not there.
     """
     try:
-        nodes = OmegaConf.masked_copy(config, [str(key) for key in config if key != "hydra"])
-        values = OmegaConf.to_container(nodes, resolve=True)
+        if "hydra" in config:
+            config = OmegaConf.masked_copy(config, [str(key) for key in config if key != "hydra"])
+        values = OmegaConf.to_container(config, resolve=True)
     except OmegaConfBaseException as error:
         raise SettingError(f"{error.full_key}: {str(error).partition(chr(10))[0]}") from None
     assert isinstance(values, dict)

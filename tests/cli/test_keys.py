@@ -31,9 +31,8 @@ LIVE = {
 }
 FREE = {path for path, row in KEYS.items() if row.values is anything}
 WRONG: list[Any] = [
-    *("abc", "", " ", "nan", "a\nb", None, True, False, math.nan, math.inf, -math.inf),
-    *(-1, 0, 0.5, 1.5, 2, 1e-300, 1e9, 1e300, -1e300, 10**30, -(10**30)),
-    *([], {}, [math.nan], [1], ["a"], [[]], {"a": math.nan}, {"a": 1}, {"_target_": "os.system"}),
+    *("abc", "", "a\nb", None, True, math.nan, math.inf, -math.inf, -1, 0, 0.5, 1.5),
+    *(1e9, 1e300, 10**30, [], {}, [math.nan], ["a"], {"a": math.nan}, {"_target_": "os.system"}),
 ]
 NOT_FINITE = [value for value in WRONG if isinstance(value, float) and not math.isfinite(value)]
 
@@ -128,7 +127,7 @@ def test_no_value_ends_in_a_traceback(configs):
     # the sieve is neither closed nor open
     assert 0.5 in accepted["advantage.gamma"]
     assert 1.5 not in accepted["advantage.gamma"]
-    assert accepted["compile"] == [True, False]
+    assert accepted["compile"] == [True]
 
 
 @pytest.mark.parametrize(
