@@ -218,11 +218,12 @@ def _literal(value: Any) -> str:
 
 
 def _compose(overrides: list[str]) -> DictConfig:
-    check_command(overrides, CONF)
-    with _fresh_hydra(), initialize_config_dir(str(CONF), version_base="1.3"):
-        config = compose("config", overrides=overrides, return_hydra_config=True)
-        OmegaConf.resolve(config.hydra.run)
-        return config
+    with _fresh_hydra():
+        check_command(overrides, CONF)
+        with initialize_config_dir(str(CONF), version_base="1.3"):
+            config = compose("config", overrides=overrides, return_hydra_config=True)
+            OmegaConf.resolve(config.hydra.run)
+            return config
 
 
 @contextmanager

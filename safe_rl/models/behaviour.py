@@ -44,6 +44,7 @@ class BehaviourPolicy(TensorDictModuleBase):
     Examples:
         >>> import torch
         >>> from tensordict import TensorDict
+        >>> from safe_rl.models import make_actor
         >>> policy = BehaviourPolicy(make_actor(3, 2, hidden_sizes=[8], initial_log_std=-0.5))
         >>> policy(TensorDict({"observation": torch.zeros(5, 3)}, [5]))["scale"][0]
         tensor([0.6065, 0.6065], grad_fn=<SelectBackward0>)

@@ -23,6 +23,7 @@ class TRPOLoss(SurrogateLoss):
         reduction: ``"mean"``, ``"sum"`` or ``"none"``.
 
     Examples:
+        >>> import torch
         >>> from tensordict.nn import AddStateIndependentNormalScale, TensorDictModule
         >>> from torchrl.modules import IndependentNormal, ProbabilisticActor
         >>> net = torch.nn.Sequential(torch.nn.Linear(3, 2), AddStateIndependentNormalScale(2))
@@ -67,6 +68,7 @@ class TRPOLagrangianLoss(TRPOLoss):
 
     Examples:
         >>> from safe_rl.objectives.multipliers import LagrangeMultiplier
+        >>> import torch
         >>> from tensordict.nn import AddStateIndependentNormalScale, TensorDictModule
         >>> from torchrl.modules import IndependentNormal, ProbabilisticActor
         >>> net = torch.nn.Sequential(torch.nn.Linear(3, 2), AddStateIndependentNormalScale(2))
