@@ -93,4 +93,5 @@ def usage(command: str, schema: type[DataclassInstance]) -> str:
         default = "null" if field.default is None else str(field.default).lower()
         shown = f"{field.name}.…" if field.default is MISSING else f"{field.name}={default}"
         lines.append(f"  {shown:<24} {field.metadata['help']}")
+    lines.append(f"  {'import=…':<24} a module or file of yours to import before; may be repeated")
     return "\n".join(lines)

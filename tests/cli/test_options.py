@@ -65,6 +65,7 @@ def test_the_help_has_every_option_and_its_default():
         assert re.search(rf"^  {field.name}(=|\.)", text, re.MULTILINE), field.name
     assert "episodes=100 " in text
     assert "seed=null " in text
+    assert "  import=… " in text
 
 
 def test_a_missing_package_names_its_extra():
