@@ -35,7 +35,7 @@ class RunRecord:
 
     Examples:
         >>> import tempfile
-        >>> config = OmegaConf.create({"frames": 200, "logger": {}, "algo": {"name": "ppo"}})
+        >>> config = OmegaConf.create({"frames": 200, "logger": None, "algo": {"name": "ppo"}})
         >>> record = RunRecord(Path(tempfile.mkdtemp()), config, {"cost": 25.0}, 1000)
         >>> row = {"steps": 200, "episode_return": 1.0, "episode_cost": 30.0, "cost_rate": 0.03}
         >>> with record.writing():
