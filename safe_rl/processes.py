@@ -15,6 +15,7 @@ __all__ = ["end_with_parent", "is_stopped"]
 
 _LOOK = 1.0
 """Seconds between looks at the parent."""
+_watching: set[int] = set()  # processes that do, of this one and those it was forked from
 
 
 def end_with_parent(grace: float = 0.0) -> None:
@@ -23,6 +24,9 @@ def end_with_parent(grace: float = 0.0) -> None:
     Args:
         grace: Seconds for the run at hand, which gets SIGTERM, to write its checkpoint.
     """
+    if os.getpid() in _watching:
+        return
+    _watching.add(os.getpid())
     parent = os.getppid()
 
     def watch() -> None:

@@ -164,13 +164,14 @@ def is_running(pid):
 @pytest.mark.slow
 def test_jobs_have_their_folders_for_themselves_and_end_with_the_sweep(tmp_path):
     pytest.importorskip("hydra_plugins.hydra_joblib_launcher")
+    endless = [override for override in TINY if not override.startswith("frames=")]
     command = [
-        *(sys.executable, "train.py", "-m", *TINY, f"hydra.sweep.dir={tmp_path}", "seed=0,1"),
+        *(sys.executable, "train.py", "-m", *endless, f"hydra.sweep.dir={tmp_path}", "seed=0,1"),
         *("hydra/launcher=joblib", "hydra.launcher.n_jobs=2", "frames=100_000_000"),
     ]
     first = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.DEVNULL)
     try:
-        wait_until(lambda: [r.num_rows > 1 for r in runs_below(tmp_path)] == [True, True], 300)
+        wait_until(lambda: [r.num_rows > 1 for r in runs_below(tmp_path)] == [True, True], 900)
         processes = writers(tmp_path)
         again = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=900)
         assert again.returncode == 1
@@ -183,7 +184,7 @@ def test_jobs_have_their_folders_for_themselves_and_end_with_the_sweep(tmp_path)
     finally:
         first.kill()
         first.wait()
-    wait_until(lambda: not any(map(is_running, processes.values())), 60)
+    wait_until(lambda: not any(map(is_running, processes.values())), 120)
     # they had the time to write what they had come to
     for run in runs_below(tmp_path):
         epoch = read_facts(run.newest_checkpoint())["epoch"]

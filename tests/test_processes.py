@@ -1,0 +1,62 @@
+"""Processes that end with their parent, however that was ended."""
+
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from safe_rl.processes import is_stopped
+
+ROOT = Path(__file__).parents[1]
+
+# a parent that starts a child, which says when it watches and when it gets SIGTERM
+PARENT = """
+import subprocess, sys, time
+child = subprocess.Popen([sys.executable, "-c", {child!r}])
+time.sleep(120)
+"""
+CHILD = """
+import os, signal, sys, time
+from safe_rl.processes import end_with_parent
+signal.signal(signal.SIGTERM, lambda *_: print("told", flush=True))
+end_with_parent({grace})
+end_with_parent({grace})
+print(os.getpid(), flush=True)
+time.sleep(120)
+"""
+
+
+@pytest.mark.parametrize("ending", [signal.SIGKILL, signal.SIGTERM])
+@pytest.mark.parametrize(("grace", "last_words"), [(0.0, []), (1.0, ["told"])])
+def test_a_child_ends_soon_after_its_parent(ending, grace, last_words):
+    source = PARENT.format(child=CHILD.format(grace=grace))
+    parent = subprocess.Popen(
+        [sys.executable, "-c", source], cwd=ROOT, stdout=subprocess.PIPE, text=True
+    )
+    assert parent.stdout.readline().strip().isdigit()
+    parent.send_signal(ending)
+    parent.wait()
+    start = time.monotonic()
+    # the pipe ends when the last process that writes into it has
+    assert parent.stdout.read().split() == last_words
+    assert time.monotonic() - start < 30
+
+
+def test_a_stopped_process_is_told_from_a_running_one():
+    process = subprocess.Popen([sys.executable, "-c", "import time; time.sleep(60)"])
+    try:
+        assert not is_stopped(process.pid)
+        process.send_signal(signal.SIGSTOP)
+        deadline = time.monotonic() + 10
+        while not is_stopped(process.pid):
+            assert time.monotonic() < deadline
+        process.send_signal(signal.SIGCONT)
+        while is_stopped(process.pid):
+            assert time.monotonic() < deadline
+    finally:
+        process.kill()
+        process.wait()
+    assert not is_stopped(process.pid)
