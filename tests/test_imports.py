@@ -46,6 +46,7 @@ FLOORS = {
         ("physics.cpu",),
         # Safety Gym: records, then rules, then worlds, and what is seen of them.
         ("safety_gym.records", "safety_gym.records.values", "safety_gym.geometry"),
+        ("safety_gym.records.vocabulary",),
         ("safety_gym.records.config",),
         ("safety_gym.records.scene",),
         ("safety_gym.records.world",),

@@ -18,7 +18,7 @@ from safe_rl.envs.families import complete_env, env_names, env_node, make_env
 from safe_rl.envs.gymnasium.conversion import from_gymnasium
 from safe_rl.envs.registration import register_gymnasium, store_config, store_configs
 from safe_rl.envs.safety_gym.env import SafetyGymEnv
-from safe_rl.envs.safety_gym.records.config import SafetyGymConfig
+from safe_rl.envs.safety_gym.records.config import SafetyGymConfig, key_table
 from safe_rl.envs.safety_gym.suite import EXTRAS, SUITE, resolve
 from safe_rl.envs.safety_gym.world.layout import LayoutError
 
@@ -38,6 +38,7 @@ __all__ = [
     "env_names",
     "env_node",
     "from_gymnasium",
+    "key_table",
     "make_env",
     "resolve",
     "store_config",

@@ -242,7 +242,7 @@ def _add_keys(given: Mapping[str, Any] | None, standard: Mapping[str, Key] | Non
         if isinstance(value, Key):
             keys[name] = value
         elif name in keys:
-            keys[name] = Key(value, keys[name].annotation)
+            keys[name] = keys[name]._replace(default=value)
         else:
             keys[name] = Key(value, infer_annotation(name, value))
     set_registered_keys({**registered_keys(), **keys})

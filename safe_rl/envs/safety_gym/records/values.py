@@ -1,12 +1,63 @@
-"""Values of configuration keys, each by itself: types, ranges, choices."""
+"""Values of configuration keys, each by itself: how a key is declared, types and ranges."""
 
 from __future__ import annotations
 
+import dataclasses
 import math
-from collections.abc import Collection, Iterable, Mapping
-from typing import Any
+from collections.abc import Callable, Collection, Iterable, Mapping
+from typing import Any, NamedTuple
 
 from safe_rl.envs.errors import ConfigError, nearest
+
+Rectangle = tuple[float, float, float, float]
+Point2 = tuple[float, float]
+Placements = tuple[Rectangle, ...] | None
+Locations = tuple[Point2, ...]
+
+
+LARGEST = 10**9  # of all numbers: float32 still holds its square
+LARGEST_SEED = 2**62  # of layouts, which are hashed as 64-bit integers
+
+
+class Range(NamedTuple):
+    """Which values of its type a key may have.
+
+    Attributes:
+        wanted: in words, to stand behind "must be"; "" if only the size is bounded.
+        holds: whether a number, or each one of several, is among them; None always is.
+        largest: bound of the absolute value.
+        choices: all of them, if they are few.
+    """
+
+    wanted: str
+    holds: Callable[[Any], bool]
+    largest: int = LARGEST
+    choices: tuple[Any, ...] = ()
+
+    def up_to(self, largest: int) -> Range:
+        """Return the same with another bound: what memory and time allow."""
+        return self._replace(largest=largest)
+
+    def __str__(self) -> str:
+        bound = "" if self.largest == LARGEST else f"at most {self.largest:,}"
+        return ", ".join(filter(None, (self.wanted, bound)))
+
+
+ANY = Range("", lambda x: True)
+POSITIVE = Range("greater than 0", lambda x: x > 0)
+NOT_NEGATIVE = Range("0 or more", lambda x: x >= 0)
+OBJECTS = NOT_NEGATIVE.up_to(1000)
+PROBABILITY = Range("a probability between 0 and 1", lambda x: 0.0 <= x <= 1.0)
+
+
+def one_of(*choices: Any) -> Range:
+    """Range of a few values."""
+    return Range(f"one of {choices}", lambda x: x in choices, choices=choices)
+
+
+def key(default: Any, meaning: str, range: Range = ANY) -> Any:
+    """Declare a key: the field of a dataclass, whose annotation is the key's type."""
+    return dataclasses.field(default=default, metadata={"meaning": meaning, "range": range})
 
 
 def _wrong(key: str, wanted: str, value: Any) -> ConfigError:
@@ -78,7 +129,7 @@ _PARSERS = {
 }
 
 
-def coerce(key: str, annotation: str, value: Any) -> Any:
+def coerce(key: str, annotation: str, value: Any, range: Range = ANY) -> Any:
     """Return `value` as the type that the field's annotation names, within the key's range.
 
     Raises:
@@ -87,12 +138,23 @@ def coerce(key: str, annotation: str, value: Any) -> Any:
     if annotation not in _PARSERS:
         raise ConfigError(f"The type of key '{key}' must be one of {tuple(_PARSERS)}.")
     value = _PARSERS[annotation](key, value)
-    if key in _CHOICES:
-        check_choice(key, value, _CHOICES[key])
-    _check_range(key, value)
-    if annotation == "Placements" or key == "placements_extents":
-        _check_rectangles(key, value)
+    if range.choices:
+        check_choice(key, value, range.choices)
+    numbers = _numbers(value)
+    if not all(range.holds(number) for number in numbers):
+        raise _wrong(key, range.wanted, value)
+    if not all(abs(number) <= range.largest for number in numbers):
+        raise _wrong(key, f"at most {range.largest:,}", value)
+    if annotation in ("Placements", "Rectangle"):
+        _check_rectangles(key, value if annotation == "Placements" else (value,), value)
     return value
+
+
+def _numbers(value: Any) -> list[float]:
+    """The numbers in a value, also in lists of lists."""
+    if isinstance(value, tuple):
+        return [number for item in value for number in _numbers(item)]
+    return [value] if isinstance(value, int | float) and not isinstance(value, bool) else []
 
 
 def infer_annotation(key: str, default: Any) -> str:
@@ -114,31 +176,17 @@ def infer_annotation(key: str, default: Any) -> str:
     )
 
 
-_CHOICES: Mapping[str, tuple[Any, ...]] = {
-    "lidar_type": ("pseudo", "natural"),
-    "compass_shape": (2, 3),
+# Of keys that are registered without a range, by how they end.
+_RANGES = {
+    ("_size", "_density", "_height", "_radius", "max_dist"): POSITIVE,
+    ("_keepout", "_threshold", "_delay", "_travel", "_noise", "_gain"): NOT_NEGATIVE,
+    ("_num",): OBJECTS,
 }
-LARGEST_SEED = 2**62  # of layouts, which are hashed as 64-bit integers
-# By the ends of keys, so that keys of registered elements are checked like the others.
-_POSITIVE_ENDINGS = (
-    *("_size", "_density", "_height", "_radius"),
-    *("num_steps", "binom_n", "num_bins", "max_dist", "layout_seeds"),
-)
-_NOT_NEGATIVE_ENDINGS = (
-    *("_num", "_keepout", "_threshold", "_delay", "_travel", "_noise", "_gain"),
-    *("reward_clip", "seeds_first"),
-)
-# What memory and time allow: a lidar of more bins, or a picture of more pixels, fills a machine.
-_LARGEST = {
-    "_num": 1000,
-    "num_bins": 10_000,
-    "binom_n": 10_000,
-    "vision_size": 4096,
-    "vision_render_size": 4096,
-    "layout_seeds": LARGEST_SEED,
-    "layout_seeds_first": LARGEST_SEED,
-}
-_LARGEST_OF_ALL = 10**9  # whose square float32 still holds
+
+
+def infer_range(key: str) -> Range:
+    """Return the range that a key of this name has among the built-in ones."""
+    return next((range for ends, range in _RANGES.items() if key.endswith(ends)), ANY)
 
 
 def check_choice(key: str, value: Any, choices: Collection[Any]) -> None:
@@ -152,30 +200,9 @@ def check_choice(key: str, value: Any, choices: Collection[Any]) -> None:
         raise ConfigError(f"'{key}' must be one of {tuple(choices)}, got {value!r}.{hint}")
 
 
-def _check_range(key: str, value: Any) -> None:
-    numbers = _numbers(value)
-    if key.endswith(_POSITIVE_ENDINGS) and not all(x > 0 for x in numbers):
-        raise _wrong(key, "greater than 0", value)
-    if key.endswith(_NOT_NEGATIVE_ENDINGS) and not all(x >= 0 for x in numbers):
-        raise _wrong(key, "0 or more", value)
-    largest = next((_LARGEST[end] for end in _LARGEST if key.endswith(end)), _LARGEST_OF_ALL)
-    if not all(abs(x) <= largest for x in numbers):
-        raise _wrong(key, f"at most {largest:,}", value)
-    if key == "frameskip_binom_p" and not 0.0 <= value <= 1.0:
-        raise _wrong(key, "a probability between 0 and 1", value)
-
-
-def _numbers(value: Any) -> list[float]:
-    """The numbers in a value, also in lists of lists."""
-    if isinstance(value, tuple):
-        return [number for item in value for number in _numbers(item)]
-    return [value] if isinstance(value, int | float) and not isinstance(value, bool) else []
-
-
-def _check_rectangles(key: str, value: Any) -> None:
-    rectangles = (value,) if key == "placements_extents" else value or ()
-    if value == ():
+def _check_rectangles(key: str, rectangles: Placements, value: Any) -> None:
+    if rectangles == ():
         raise _wrong(key, "None or a list of at least one rectangle", value)
-    for xmin, ymin, xmax, ymax in rectangles:
+    for xmin, ymin, xmax, ymax in rectangles or ():
         if xmin > xmax or ymin > ymax:
             raise _wrong(key, "(xmin, ymin, xmax, ymax) with xmin <= xmax, ymin <= ymax", value)
