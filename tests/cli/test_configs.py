@@ -152,7 +152,7 @@ SIZES = {
 }
 # what is no part of the algorithm, and the tables that other keys read
 ASIDE = {"collector", "env", "algo", "preset", "logger", "seed", "device", "num_threads", "compile"}
-ASIDE |= {"checkpoint", "default_cost_limits", "import", "paper"}
+ASIDE |= {"certificate", "checkpoint", "default_cost_limits", "import", "paper"}
 
 
 @pytest.mark.parametrize("env", SIZES)

@@ -9,7 +9,6 @@ import pytest
 from safe_rl.cli import train
 
 ROOT = Path(__file__).parents[2]
-pytestmark = pytest.mark.usefixtures("few_environments")
 
 
 @pytest.fixture

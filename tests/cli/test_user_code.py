@@ -13,7 +13,7 @@ from safe_rl.cli import user_code
 from safe_rl.cli.overrides import CommandLineError
 from safe_rl.cli.shorthands import expand_arguments
 from safe_rl.cli.user_code import check_imports, import_modules, note_imports, split_imports
-from safe_rl.runs.folder import RunFolder
+from safe_rl.runs.record import RunRecord
 from safe_rl.training.trainer import build_trainer
 
 MODULE = """
@@ -88,7 +88,7 @@ def test_errors_are_one_line(folder, module, message):
 
 def begun_run(directory, **changes):
     """Folder of a run of somebody else's, with a configuration of theirs."""
-    with RunFolder(directory, point_mass_config(), {"cost": 25.0}, 20).writing():
+    with RunRecord(directory, point_mass_config(), {"cost": 25.0}, 20).writing():
         pass
     path = directory / "config.yaml"
     OmegaConf.save(OmegaConf.merge(OmegaConf.load(path), changes), path)
@@ -132,7 +132,7 @@ def test_a_logger_leaves_no_trace(folder):
     config = OmegaConf.load(begun_run(folder / "run", logger=exec_node(folder / "trace")))
     with (
         pytest.raises(ValueError, match=r"^logger\._target_=builtins.exec"),
-        RunFolder(folder / "run", config, {"cost": 25.0}, 20).writing(epoch=0),
+        RunRecord(folder / "run", config, {"cost": 25.0}, 20).writing(epoch=0),
     ):
         pass
     assert not (folder / "trace").exists()

@@ -5,6 +5,7 @@ import pkgutil
 from importlib import import_module
 
 import pytest
+from registrations import undone
 
 import safe_rl
 
@@ -25,7 +26,8 @@ def tiny_run(tmp_path_factory):
 def test_examples(module, request, capsys):
     found = doctest.DocTestFinder().find(import_module(module))
     runner = doctest.DocTestRunner(optionflags=doctest.ELLIPSIS)
-    for example in found:
-        example.globs["getfixture"] = request.getfixturevalue
-        runner.run(example)
+    with undone():
+        for example in found:
+            example.globs["getfixture"] = request.getfixturevalue
+            runner.run(example)
     assert not runner.failures, capsys.readouterr().out

@@ -201,7 +201,7 @@ def test_evaluations_of_a_name_stand_side_by_side(run):
 
 
 def test_the_best_checkpoint_is_taken_on_demand(run):
-    best = next((run / "checkpoints" / "best").iterdir())
+    best = max((run / "checkpoints" / "best").iterdir())
     for named in ("best", str(best)):
         facts = evaluate(run, options(episodes=1, checkpoint=named)).facts
         assert facts["checkpoint_file"] == str(best)

@@ -95,7 +95,7 @@ def test_a_run_killed_several_times_leaves_the_table_of_one_that_was_not(tmp_pat
     table, expected = (without_times(folder / "progress.csv") for folder in (killed, whole))
     assert len(expected) == 1 + 15
     assert table == expected
-    best, expected = (list((f / "checkpoints/best").iterdir()) for f in (killed, whole))
+    best, expected = (sorted((f / "checkpoints/best").iterdir()) for f in (killed, whole))
     assert [path.name for path in best] == [path.name for path in expected]
     assert not list(killed.rglob("*.stage-*"))
 

@@ -108,7 +108,7 @@ def test_the_folder_of_a_run(tmp_path):
     }
     table = read_table(tmp_path / "progress.csv")
     best = max(range(8), key=lambda epoch: table["episode_return"][epoch])
-    (path,) = (tmp_path / "checkpoints" / "best").iterdir()
+    path = max((tmp_path / "checkpoints" / "best").iterdir())
     assert Checkpoint.manifest(path)["metadata"] == {
         "epoch": best + 1,
         "score": table["episode_return"][best],
