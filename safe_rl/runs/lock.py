@@ -64,9 +64,11 @@ def held(folder: RunFolder) -> Iterator[None]:
         _held[place] = os.getpid()
         with replacing(folder.writer) as unfinished:
             unfinished.write_text(json.dumps(_present_writer()))
-        with _beating(folder.writer):
-            yield
-        folder.writer.unlink(missing_ok=True)
+        try:
+            with _beating(folder.writer):
+                yield
+        finally:
+            folder.writer.unlink(missing_ok=True)
     finally:
         _held.pop(place, None)
         if lock is not None:

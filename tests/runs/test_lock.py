@@ -65,6 +65,12 @@ def test_the_same_process_goes_on_and_the_outermost_lets_go(folder):
         pass
 
 
+def test_one_that_fails_lets_go_as_well(folder):
+    with pytest.raises(FloatingPointError), held(folder):
+        raise FloatingPointError
+    assert not folder.writer.exists()
+
+
 def outcome_of(folder, outcome):
     try:
         with held(folder):
