@@ -6,6 +6,7 @@ They do what the commands do, from the same configurations; Hydra stays inside.
 from __future__ import annotations
 
 import json
+import shutil
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -163,10 +164,16 @@ def train(
     with open_dict(config):
         del config["hydra"]
     complete(config)
-    with held(RunFolder(folder)):
-        trainer = prepare(config, folder, continues=False)
-        assert trainer is not None
-        trainer.run()
+    is_new, has_begun = not folder.exists(), False
+    try:
+        with held(RunFolder(folder)):
+            trainer = prepare(config, folder, continues=False)
+            assert trainer is not None
+            has_begun = True
+            trainer.run()
+    finally:
+        if is_new and not has_begun:
+            shutil.rmtree(folder, ignore_errors=True)
     if trainer.algorithm.cost_keys and is_worth_a_certificate(config, trainer.episode_length):
         certify_run(folder)
     return Run(folder)

@@ -8,9 +8,11 @@ import pytest
 import torch
 from hydra import compose, initialize_config_dir
 from hydra.core.global_hydra import GlobalHydra
+from hydra.core.override_parser.overrides_parser import OverridesParser
 from run_configs import CONF, without_times
 
 import safe_rl
+from safe_rl.cli.notebook import _overrides
 from safe_rl.envs import ConfigError
 from safe_rl.runs.table import read_table
 
@@ -104,10 +106,9 @@ def test_errors_name_the_setting(settings, message, tmp_path):
     assert not (tmp_path / "run").exists()
 
 
-def test_strange_texts_arrive_as_they_are(tmp_path):
-    from safe_rl.cli.notebook import _compose, _overrides
-
-    texts = ["it's", "a,b=c", "x: [y]", "back\\slash", "${seed}"[1:]]
-    config = _compose(list(_overrides({"init_from": texts[0], "model.hidden_sizes": texts[1:]})))
-    assert config.init_from == texts[0]
-    assert list(config.model.hidden_sizes) == texts[1:]
+@pytest.mark.parametrize("text", ["it's", "a,b=c", "x: [y]", "back\\slash\\", "\\'", "", "3"])
+def test_strange_texts_arrive_as_they_are(text):
+    (override,) = _overrides({"a": {"b": [text, {"c": text}]}})
+    parsed = OverridesParser.create().parse_override(override)
+    assert parsed.key_or_group == "a.b"
+    assert parsed.value() == [text, {"c": text}]
