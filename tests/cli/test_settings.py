@@ -40,7 +40,7 @@ def test_right_values_pass(override):
 def test_only_folders_of_runs_that_did_not_begin_are_removed(tmp_path, monkeypatch):
     monkeypatch.delenv("HYDRA_FULL_ERROR", raising=False)
     for name, is_new, stays in (("a", True, False), ("b", False, True), ("c", True, True)):
-        (tmp_path / name / ".hydra").mkdir(parents=True)
+        (tmp_path / name).mkdir()
         if name == "c":
             (tmp_path / name / "progress.csv").write_text("steps")
         stops = pytest.raises(SystemExit, match="what is wrong")

@@ -75,7 +75,7 @@ def test_it_is_swept_and_reported(tmp_path):
     status, printed = run("-m", "safe_rl.report", str(tmp_path), IMPORT)
     assert status == 0, printed
     data = (tmp_path / "report" / "report.md").read_text()
-    assert "import=[" in data, "the command that does it again"
+    assert r"import=\[" in data, "the command that does it again"
 
 
 def test_danger_rises_towards_the_centre(example):
