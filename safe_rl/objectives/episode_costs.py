@@ -1,0 +1,157 @@
+"""What an episode costs: J_c, from batches that are shorter than episodes as well as longer ones.
+
+The cost rate of a batch times the mean length of an episode, J_c = (Σ c / steps) · T̄, uses every
+step that was taken. By the renewal-reward theorem it tends to E[C] even where the length and the
+cost of an episode depend on each other, if rows are at independent points of their episodes (see
+`stagger` of the accounting); while all rows are in the same part of an episode, it is the rate of
+that part. For a batch of whole episodes it *is* their mean cost.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+#: Pieces into which a batch of few rows is cut, so that a spread can be told.
+_FEWEST_PIECES = 8
+
+
+class CostEstimate(NamedTuple):
+    """An estimate of J_c.
+
+    Attributes:
+        mean: undiscounted cost per episode, [k].
+        error: its standard error, [k].
+    """
+
+    mean: Tensor
+    error: Tensor
+
+
+def rate_estimate(costs: Tensor, length: Tensor) -> CostEstimate:
+    """J_c as cost per step times steps per episode, with the standard error among rows.
+
+    Args:
+        costs: costs of N rows of T consecutive steps, [N, T, k].
+        length: mean episode length T̄ in steps, scalar.
+
+    Returns:
+        The estimate. Few rows are cut into pieces, whose costs are then taken as independent.
+
+    Examples:
+        >>> costs = torch.tensor([[0.0, 1.0], [1.0, 1.0]]).unsqueeze(-1)
+        >>> rate_estimate(costs, torch.tensor(8.0)).mean
+        tensor([6.])
+    """
+    rows, steps, num_costs = costs.shape
+    cuts = min(steps, -(-_FEWEST_PIECES // rows))
+    pieces = costs[:, : steps // cuts * cuts].reshape(rows * cuts, -1, num_costs)
+    rates = pieces.mean(1)
+    error = rates.std(0) / rates.shape[0] ** 0.5 if rates.shape[0] > 1 else rates.new_zeros(())
+    return CostEstimate(costs.mean((0, 1)) * length, (error * length).expand(num_costs))
+
+
+def shrink(past: CostEstimate, present: CostEstimate, drift: Tensor) -> CostEstimate:
+    """Weigh two estimates by their precision: one step of a Kalman filter on a random walk.
+
+    Args:
+        past: estimate for the policies so far; NaN if there is none.
+        present: estimate of this batch alone.
+        drift: standard deviation of the change of J_c from one policy to the next, [k].
+
+    Returns:
+        The estimate for the present policy, with an error below both.
+
+    Examples:
+        >>> one, two = torch.ones(1), torch.tensor([2.0])
+        >>> shrink(CostEstimate(one, one), CostEstimate(two, one), drift=torch.zeros(1))
+        CostEstimate(mean=tensor([1.5000]), error=tensor([0.7071]))
+    """
+    variance = past.error.square() + drift.square()
+    noise = present.error.square()
+    # without any noise the batch is the truth
+    weight = torch.where(variance + noise > 0, variance / (variance + noise), 1.0)
+    mean = torch.lerp(past.mean, present.mean, weight)
+    error = ((1 - weight) * variance).sqrt()
+    known = past.mean.isfinite()
+    return CostEstimate(
+        torch.where(known, mean, present.mean), torch.where(known, error, present.error)
+    )
+
+
+class EpisodeCosts:
+    """Estimator of J_c, of the mean episode length T̄ and of the size of one cost, over a run.
+
+    Args:
+        num_costs: k.
+        max_length: steps after which an episode is over: T̄ until an episode has finished.
+        drift: share by which J_c changes from one policy to the next, about; it weighs the past
+            against the batch. None uses the batch alone.
+        length_memory: weight in [0, 1) of the past in T̄.
+
+    Examples:
+        >>> estimator = EpisodeCosts(1, max_length=1000, drift=None, length_memory=0.9)
+        >>> costs = torch.zeros(4, 200, 1)
+        >>> costs[:, ::50] = 1.0
+        >>> estimator.update(costs, torch.empty(0)).mean
+        tensor([20.])
+    """
+
+    def __init__(
+        self, num_costs: int, *, max_length: float, drift: float | None, length_memory: float
+    ) -> None:
+        self.drift, self.length_memory = drift, length_memory
+        self._state = {
+            "length": torch.tensor(float(max_length)),
+            "length_weight": torch.zeros(()),
+            "mean": torch.full((num_costs,), torch.nan),
+            "error": torch.full((num_costs,), torch.nan),
+            "sums": torch.zeros(2, num_costs, dtype=torch.float64),
+        }
+
+    @property
+    def length(self) -> Tensor:
+        """Mean episode length T̄ in steps, scalar."""
+        return self._state["length"]
+
+    @property
+    def unit(self) -> Tensor:
+        """Σ c² / Σ c over all steps so far, [k]: 1 for indicators, and 1 before any cost."""
+        first, second = self._state["sums"]
+        return torch.where(first > 0, second / first, 1.0).float()
+
+    @property
+    def estimate(self) -> CostEstimate:
+        """The last estimate; NaN before the first batch."""
+        return CostEstimate(self._state["mean"], self._state["error"])
+
+    def update(self, costs: Tensor, lengths: Tensor) -> CostEstimate:
+        """Take in a batch: its costs [N, T, k], and the steps of every finished episode, [E]."""
+        costs = costs.to(self._state["sums"])
+        self._state["sums"] += torch.stack([costs.sum((0, 1)), costs.square().sum((0, 1))])
+        if lengths.numel():
+            self._add_lengths(lengths)
+        batch = CostEstimate(*(part.float() for part in rate_estimate(costs, self.length)))
+        self.batch = batch
+        if self.drift is not None:
+            batch = shrink(self.estimate, batch, self.drift * self.estimate.mean)
+        self._state["mean"], self._state["error"] = batch
+        return batch
+
+    def _add_lengths(self, lengths: Tensor) -> None:
+        kept = self._state["length_weight"] * self.length_memory
+        total = kept + lengths.numel()
+        self._state["length"] = (kept * self.length + lengths.sum().to(self.length)) / total
+        self._state["length_weight"] = total
+
+    def state_dict(self) -> dict[str, Tensor]:
+        """Everything the next estimate depends on."""
+        return {name: value.clone() for name, value in self._state.items()}
+
+    def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
+        """Continue from :meth:`state_dict`."""
+        for name, value in self._state.items():
+            self._state[name] = state_dict[name].to(value)

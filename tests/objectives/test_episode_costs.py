@@ -1,0 +1,101 @@
+"""J_c from batches: against episodes whose costs are known by construction."""
+
+import pytest
+import torch
+
+from safe_rl.objectives.episode_costs import CostEstimate, EpisodeCosts, rate_estimate, shrink
+
+
+def renewals(rows: int, steps: int, generator: torch.Generator):
+    """Rows of episodes of 10 steps at cost 2 or 40 steps at cost 20, drawn with equal chance.
+
+    Length and cost depend on each other: E[C] = 11, while the mean of C / length is .35 and
+    rate times 25 steps is 11 by the renewal theorem alone. Rows begin in the middle of episodes.
+    """
+    costs, lengths = torch.zeros(rows, steps, 1), []
+    for row in range(rows):
+        step = -int(torch.randint(40, (), generator=generator))
+        while step < steps:
+            length, rate = ((10, 0.2), (40, 0.5))[int(torch.randint(2, (), generator=generator))]
+            costs[row, max(step, 0) : max(step + length, 0)] = rate
+            step += length
+            if 0 <= step <= steps:
+                lengths.append(float(length))
+    return costs, torch.tensor(lengths)
+
+
+def test_rate_times_length_is_the_mean_cost_though_length_and_cost_are_correlated():
+    generator = torch.Generator().manual_seed(0)
+    estimator = EpisodeCosts(1, max_length=40, drift=None, length_memory=0.99)
+    estimates = []
+    for _ in range(60):
+        costs, lengths = renewals(20, 200, generator)
+        estimates.append(estimator.update(costs, lengths).mean)
+    assert torch.stack(estimates[20:]).mean() == pytest.approx(11, rel=0.03)
+
+
+def test_a_batch_of_whole_episodes_gives_their_mean_cost_whatever_their_lengths():
+    costs = torch.rand(3, 12, 2)
+    estimator = EpisodeCosts(2, max_length=100, drift=None, length_memory=0.0)
+    lengths = torch.tensor([4.0, 8.0, 12.0, 6.0, 6.0])
+    estimate = estimator.update(costs, lengths)
+    torch.testing.assert_close(estimate.mean, costs.sum((0, 1)) / 5)
+    assert estimator.length == pytest.approx(7.2)
+
+
+def test_before_an_episode_has_finished_its_length_is_the_limit_of_steps():
+    estimator = EpisodeCosts(1, max_length=1000, drift=None, length_memory=0.9)
+    estimate = estimator.update(torch.full((5, 20, 1), 0.03), torch.empty(0))
+    torch.testing.assert_close(estimate.mean, torch.tensor([30.0]))
+
+
+@pytest.mark.parametrize("rows", [1, 2, 50])
+def test_the_standard_error_is_that_of_the_mean_over_many_batches(rows):
+    torch.manual_seed(rows)
+    batches = (torch.rand(4000, rows, 40, 1) < 0.1).float()
+    estimates = [rate_estimate(batch, torch.tensor(100.0)) for batch in batches]
+    means = torch.stack([estimate.mean for estimate in estimates])
+    errors = torch.stack([estimate.error for estimate in estimates])
+    assert errors.square().mean().sqrt() == pytest.approx(means.std().item(), rel=0.1)
+
+
+def test_shrinkage_predicts_a_wandering_cost_better_than_the_batch_and_than_the_past():
+    generator = torch.Generator().manual_seed(1)
+    truth = torch.tensor([50.0])
+    estimate = CostEstimate(*torch.full((2, 1), torch.nan))
+    squared = {"shrunk": 0.0, "batch": 0.0, "mean of all": 0.0}
+    seen = []
+    for _ in range(4000):
+        truth = truth + 3 * torch.randn(1, generator=generator)
+        noisy = truth + 6 * torch.randn(1, generator=generator)
+        seen.append(noisy)
+        estimate = shrink(estimate, CostEstimate(noisy, torch.tensor([6.0])), torch.tensor([3.0]))
+        squared["shrunk"] += (estimate.mean - truth).square().item()
+        squared["batch"] += (noisy - truth).square().item()
+        squared["mean of all"] += (sum(seen) / len(seen) - truth).square().item()
+    assert squared["shrunk"] < 0.6 * min(squared["batch"], squared["mean of all"])
+    assert estimate.error.square().item() == pytest.approx(squared["shrunk"] / 4000, rel=0.15)
+
+
+def test_the_unit_of_a_cost_is_1_for_indicators_and_grows_with_the_cost():
+    costs = (torch.rand(4, 50, 1) < 0.2).float() * torch.tensor([1.0, 7.0])
+    estimator = EpisodeCosts(2, max_length=50, drift=0.1, length_memory=0.9)
+    assert estimator.unit.tolist() == [1.0, 1.0]
+    estimator.update(costs, torch.empty(0))
+    assert estimator.unit.tolist() == [1.0, 7.0]
+
+
+def test_a_saved_state_goes_on_as_if_it_had_never_stopped():
+    def batches():
+        generator = torch.Generator().manual_seed(3)
+        return [renewals(8, 50, generator) for _ in range(6)]
+
+    whole, second = (EpisodeCosts(1, max_length=40, drift=0.1, length_memory=0.9) for _ in "ab")
+    *before, last = batches()
+    for batch in before:
+        whole.update(*batch)
+    second.load_state_dict(whole.state_dict())
+    ours, theirs = whole.update(*last), second.update(*last)
+    assert all(torch.equal(one, other) for one, other in zip(ours, theirs, strict=True))
+    assert torch.equal(whole.length, second.length)
+    assert torch.equal(whole.unit, second.unit)
