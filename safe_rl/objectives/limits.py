@@ -1,0 +1,259 @@
+"""How far each cost is from where it should be by now: what multipliers and CPO steps act upon.
+
+Between the costs of a batch and the violation that an update sees lie four decisions, all here:
+
+- **how J_c is estimated** from a batch (`safe_rl.objectives.episode_costs`);
+- **a descent**: costs are free until the policy has found its goal, then the limit comes down from
+  what the policy costs by then. Pressure before there is a goal keeps it from being found; a
+  policy that has learned to ignore costs takes longest to unlearn it;
+- **a margin**: z standard errors of a batch's J_c below the limit, so that what one batch shows
+  is above the limit with a chance of about Φ(−z);
+- **trust**: the surrogate of a step promises a change of J_c, of which only a share comes true. The
+  share is measured, and violations are divided by it, for steps that go by promises (CPO). What is
+  left of a violation from one update to the next is asked for in addition, as an integral.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from safe_rl.objectives.episode_costs import CostEstimate, EpisodeCosts
+
+
+class LimitState(NamedTuple):
+    """What an update needs to know about k limits.
+
+    Attributes:
+        cost: estimate of J_c, undiscounted cost per episode, [k].
+        target: what J_c is to be at most by now: limit, descent and margin together, [k].
+        length: mean episode length T̄ in steps, scalar.
+        unit: size of one cost, [k]; see `EpisodeCosts.unit`.
+        scale: unit of violations, [k]: the limit, or a small share of the steps if that is more.
+        trust: share of a promised change of J_c that comes true, [k].
+        owed: what is to be promised beyond the violation, [k].
+    """
+
+    cost: Tensor
+    target: Tensor
+    length: Tensor
+    unit: Tensor
+    scale: Tensor
+    trust: Tensor
+    owed: Tensor
+
+    @property
+    def violation(self) -> Tensor:
+        """J_c − target, [k]."""
+        return self.cost - self.target
+
+    @property
+    def demand(self) -> Tensor:
+        """The change of J_c that a step has to promise, [k]: negative is how much it may add."""
+        change = self.violation + self.owed
+        return torch.where(change > 0, change / self.trust, change)
+
+    def to(self, device: torch.device) -> LimitState:
+        """The same on another device."""
+        return LimitState(*(entry.to(device) for entry in self))
+
+
+def descend(start: Tensor, goal: Tensor, share: float) -> Tensor:
+    """Go a share of the way from `start` down to `goal`; never up, and never below `goal`.
+
+    Examples:
+        >>> descend(torch.tensor([65.0, 5.0]), torch.tensor([25.0, 25.0]), share=0.75)
+        tensor([35., 25.])
+    """
+    return goal + (start - goal).clamp_min(0) * (1 - min(max(share, 0.0), 1.0))
+
+
+class PromisedChange:
+    """Share of the promised changes of J_c that came true: a regression through the origin.
+
+    The realised change of one update is mostly noise; over updates, Σ promised · realised /
+    Σ promised² is not. Early on it is 1, held there by the weight of one promise of size `prior`.
+
+    Args:
+        num_costs: k.
+        memory: weight in [0, 1) of the past.
+        lowest: lower bound of the share; 1 takes every promise at its word.
+
+    Examples:
+        >>> kept = PromisedChange(1, memory=0.9, lowest=0.1)
+        >>> for cost in (100.0, 95.0, 90.0, 85.0):  # each time, 10 were promised
+        ...     kept.observe(torch.tensor([cost]), prior=torch.tensor([1.0]))
+        ...     kept.promise(torch.tensor([-10.0]))
+        >>> kept.share
+        tensor([0.5013])
+    """
+
+    def __init__(self, num_costs: int, *, memory: float, lowest: float) -> None:
+        self.memory, self.lowest = memory, lowest
+        self._state = {
+            "promised": torch.full((num_costs,), torch.nan),
+            "cost": torch.full((num_costs,), torch.nan),
+            "products": torch.zeros(2, num_costs),
+        }
+
+    @property
+    def share(self) -> Tensor:
+        """The share, [k], in [lowest, 1]."""
+        realised, promised = self._state["products"]
+        share = torch.where(promised > 0, realised / promised, 1.0)
+        return share.clamp(self.lowest, 1.0)
+
+    def observe(self, cost: Tensor, prior: Tensor) -> None:
+        """Compare the new J_c with the last one and what was promised since; all [k]."""
+        if not self._state["products"].any():
+            self._state["products"] = prior.square().expand(2, -1).clone()
+        promised = self._state["promised"]
+        products = promised * torch.stack([cost - self._state["cost"], promised])
+        known = products.isfinite().all(0)
+        updated = self.memory * self._state["products"] + products
+        self._state["products"] = torch.where(known, updated, self._state["products"])
+        self._state["cost"] = cost.clone()
+        self._state["promised"] = torch.full_like(promised, torch.nan)
+
+    def promise(self, change: Tensor) -> None:
+        """Note the change of J_c that an update's surrogate predicts, [k]."""
+        self._state["promised"] = change.detach().to(self._state["promised"])
+
+    def state_dict(self) -> dict[str, Tensor]:
+        """Everything the share depends on."""
+        return {name: value.clone() for name, value in self._state.items()}
+
+    def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
+        """Continue from :meth:`state_dict`."""
+        for name, value in self._state.items():
+            self._state[name] = state_dict[name].to(value)
+
+
+class LimitTracker:
+    """Turns the costs of every batch into violations of where J_c should be by now.
+
+    Args:
+        cost_limits: d, undiscounted cost per episode, [k].
+        max_length: steps after which an episode is over.
+        margin: z: the aim is z standard errors of a batch's J_c below the limit.
+        largest_margin: bound of the margin, as a share of d.
+        free_steps: environment steps for which costs are free.
+        descent_steps: environment steps in which the limit then comes down.
+        smallest_scale: lower bound of the unit of violations, in costs per step: that of a limit
+            near 0.
+        drift: share by which J_c changes per update, about; see `EpisodeCosts`.
+        memory: weight in [0, 1) of the past in T̄, in the standard error and in the trust.
+        lowest_trust: lower bound of the share of a promise that is believed; 1 believes all.
+        integral: share of every violation that is asked for again in all updates to come (the
+            learned margin of the code of Ray, Achiam and Amodei 2019); 0 for multipliers, which
+            integrate themselves.
+        largest_integral: bound of what is asked for in this way, in units of violations.
+
+    Examples:
+        >>> tracker = LimitTracker(
+        ...     torch.tensor([25.0]), max_length=1000, margin=0.0, largest_margin=0.2,
+        ...     free_steps=0, descent_steps=800, smallest_scale=0.01, drift=0.2, memory=0.9,
+        ...     lowest_trust=1.0, integral=0.0, largest_integral=0.5,
+        ... )
+        >>> costs = torch.full((4, 100, 1), 0.065)
+        >>> state = tracker.update(costs, lengths=torch.empty(0))
+        >>> state.cost, state.target  # half of the descent is over
+        (tensor([65.]), tensor([45.]))
+    """
+
+    def __init__(
+        self,
+        cost_limits: Tensor,
+        *,
+        max_length: float,
+        margin: float,
+        largest_margin: float,
+        free_steps: int,
+        descent_steps: int,
+        smallest_scale: float,
+        drift: float | None,
+        memory: float,
+        lowest_trust: float,
+        integral: float,
+        largest_integral: float,
+    ) -> None:
+        self.limits = cost_limits.detach().cpu().float()
+        num_costs = len(self.limits)
+        self.margin, self.largest_margin = margin, largest_margin
+        self.free_steps, self.descent_steps = free_steps, descent_steps
+        self.smallest_scale, self.memory = smallest_scale, memory
+        self.costs = EpisodeCosts(
+            num_costs, max_length=max_length, drift=drift, length_memory=memory
+        )
+        self.promises = PromisedChange(num_costs, memory=memory, lowest=lowest_trust)
+        self.integral, self.largest_integral = integral, largest_integral
+        self._steps = 0
+        self._owed = torch.zeros(num_costs)
+        self._reached = torch.full((num_costs,), torch.inf)
+        self._noise = torch.full((num_costs,), torch.nan)
+
+    @torch.no_grad()
+    def update(self, costs: Tensor, lengths: Tensor) -> LimitState:
+        """Take in a batch.
+
+        Args:
+            costs: costs of its steps, [N, T, k].
+            lengths: steps of every episode that finished in it, [E].
+        """
+        costs, lengths = costs.detach().cpu(), lengths.detach().cpu()
+        estimate = self.costs.update(costs, lengths)
+        batch = self.costs.batch
+        smallest = self.smallest_scale * self.costs.length * self.costs.unit
+        scale = torch.maximum(self.limits, smallest)
+        self.promises.observe(batch.mean, prior=0.5 * scale)
+        noise = torch.lerp(batch.error, self._noise, self.memory)
+        self._noise = torch.where(noise.isfinite(), noise, batch.error)
+        target = self._target(estimate, scale, costs.shape[0] * costs.shape[1])
+        error = (estimate.mean - target).clamp(-scale, scale)
+        owed = (self._owed + self.integral * error).clamp_min(0)
+        self._owed = torch.minimum(owed, self.largest_integral * scale)
+        return LimitState(
+            cost=estimate.mean,
+            target=target,
+            length=self.costs.length,
+            unit=self.costs.unit,
+            scale=scale,
+            trust=self.promises.share,
+            owed=self._owed,
+        )
+
+    def _target(self, estimate: CostEstimate, scale: Tensor, num_steps: int) -> Tensor:
+        """What J_c is to be at most after an update, which came with `num_steps` steps, [k]."""
+        self._steps += num_steps
+        if self._steps <= self.free_steps:
+            return estimate.mean + scale
+        margin = torch.minimum(self.margin * self._noise, self.largest_margin * self.limits)
+        left = self.free_steps + self.descent_steps - self._steps + num_steps
+        share = num_steps / left if left > num_steps else 1.0
+        # from the present cost, where that has come down faster than the limit
+        self._reached = torch.minimum(self._reached, estimate.mean)
+        self._reached = descend(self._reached, self.limits - margin, share)
+        return self._reached
+
+    def state_dict(self) -> dict[str, Any]:
+        """Everything the next state depends on."""
+        return {
+            "costs": self.costs.state_dict(),
+            "promises": self.promises.state_dict(),
+            "steps": self._steps,
+            "reached": self._reached.clone(),
+            "noise": self._noise.clone(),
+            "owed": self._owed.clone(),
+        }
+
+    def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
+        """Continue from :meth:`state_dict`."""
+        self.costs.load_state_dict(state_dict["costs"])
+        self.promises.load_state_dict(state_dict["promises"])
+        self._steps = int(state_dict["steps"])
+        self._reached = state_dict["reached"].to(self._reached)
+        self._noise = state_dict["noise"].to(self._noise)
+        self._owed = state_dict["owed"].to(self._owed)

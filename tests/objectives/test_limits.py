@@ -1,0 +1,133 @@
+"""From costs to violations: the descent, the margin, trust in promises, exact continuation."""
+
+import pytest
+import torch
+
+from safe_rl.objectives.limits import LimitTracker, PromisedChange, descend
+
+SETTINGS = {
+    "max_length": 1000,
+    "margin": 0.5,
+    "largest_margin": 0.2,
+    "free_steps": 4_000,
+    "descent_steps": 10_000,
+    "smallest_scale": 0.01,
+    "drift": 0.2,
+    "memory": 0.9,
+    "lowest_trust": 0.1,
+    "integral": 0.0,
+    "largest_integral": 0.5,
+}
+
+
+def tracker(*limits: float, **settings) -> LimitTracker:
+    return LimitTracker(torch.tensor(limits or (25.0,)), **SETTINGS | settings)
+
+
+def batches(number: int, rate: float, seed: int = 0, unit: float = 1.0) -> list[torch.Tensor]:
+    """Indicator costs of 20 rows of 100 steps, times `unit`."""
+    generator = torch.Generator().manual_seed(seed)
+    return [
+        unit * (torch.rand(20, 100, 1, generator=generator) < rate).float() for _ in range(number)
+    ]
+
+
+NO_EPISODES = torch.empty(0)
+
+
+def test_costs_are_free_then_the_limit_comes_down_from_what_the_policy_costs():
+    limits = tracker(margin=0.0, drift=None)
+    costs = torch.full((20, 100, 1), 0.1)
+    states = [limits.update(costs, NO_EPISODES) for _ in range(10)]
+    assert [bool(state.violation < 0) for state in states] == [True] * 2 + [False] * 8
+    targets = torch.cat([state.target for state in states[2:]])
+    torch.testing.assert_close(targets[:5], torch.tensor([85.0, 70, 55, 40, 25]))
+    assert (targets[5:] == 25).all()
+
+
+def test_the_descent_goes_on_from_the_cost_where_that_came_down_faster():
+    limits = tracker(margin=0.0, free_steps=0, drift=None)
+    limits.update(torch.full((20, 100, 1), 0.1), NO_EPISODES)
+    state = limits.update(torch.full((20, 100, 1), 0.045), NO_EPISODES)
+    assert state.target == pytest.approx(45 - 20 / 4)
+    # and never up again
+    later = limits.update(torch.full((20, 100, 1), 0.2), NO_EPISODES)
+    assert later.target < state.target
+
+
+def test_descend_stays_at_the_goal_once_it_is_there():
+    goal = torch.tensor([25.0])
+    assert descend(torch.tensor([10.0]), goal, 0.3) == goal
+    assert descend(torch.tensor([60.0]), goal, 5.0) == goal
+
+
+def test_the_margin_makes_a_batch_exceed_the_limit_as_often_as_z_says():
+    z, d = 1.0, 50.0
+    limits = tracker(d, margin=z, free_steps=0, descent_steps=0, memory=0.99, largest_margin=1.0)
+    for costs in batches(500, rate=d / 1000):
+        target = limits.update(costs, NO_EPISODES).target
+    # a policy that is exactly at its target
+    shown = torch.stack([costs.mean() * 1000 for costs in batches(2000, target.item() / 1000, 1)])
+    chance = 1 - torch.distributions.Normal(0.0, 1.0).cdf(torch.tensor(z))
+    assert (shown > d).float().mean() == pytest.approx(chance.item(), abs=0.03)
+
+
+def test_a_limit_of_0_has_a_unit_and_no_margin():
+    limits = tracker(0.0, free_steps=0, descent_steps=0)
+    for costs in batches(3, 0.03):
+        state = limits.update(costs, NO_EPISODES)
+    assert state.target == 0
+    assert state.scale == 10
+    assert state.violation > 20
+
+
+def test_a_cost_and_a_limit_ten_times_as_large_give_the_same_picture():
+    small, large = tracker(25.0), tracker(250.0)
+    for costs, scaled in zip(batches(12, 0.06), batches(12, 0.06, unit=10.0), strict=True):
+        one, ten = small.update(costs, NO_EPISODES), large.update(scaled, NO_EPISODES)
+        torch.testing.assert_close(one.violation / one.scale, ten.violation / ten.scale)
+        torch.testing.assert_close(10 * one.target, ten.target)
+        torch.testing.assert_close(10 * one.unit, ten.unit)
+
+
+@pytest.mark.parametrize("kept", [0.2, 0.7])
+def test_trust_finds_the_share_of_promises_that_come_true(kept):
+    generator = torch.Generator().manual_seed(0)
+    promises = PromisedChange(1, memory=0.98, lowest=0.05)
+    cost, shares = torch.tensor([400.0]), []
+    for step in range(400):
+        promised = -20 * torch.rand(1, generator=generator) * (1 if step % 20 else -15)
+        promises.observe(cost + 5 * torch.randn(1, generator=generator), torch.tensor([10.0]))
+        promises.promise(promised)
+        shares.append(promises.share)
+        cost = cost + kept * promised
+    assert torch.stack(shares[100:]).mean() == pytest.approx(kept, abs=0.05)
+
+
+def test_a_violation_that_stays_is_asked_for_more_and_more_up_to_a_bound():
+    limits = tracker(free_steps=0, descent_steps=0, margin=0.0, drift=None, integral=0.1)
+    states = [limits.update(torch.full((20, 100, 1), 0.03), NO_EPISODES) for _ in range(40)]
+    demands = torch.cat([state.demand for state in states])
+    torch.testing.assert_close(demands[:3], torch.tensor([5.5, 6.0, 6.5]))
+    assert demands[-1] == 5 + 12.5
+    # a cost below the limit takes it back
+    states = [limits.update(torch.full((20, 100, 1), 0.01), NO_EPISODES) for _ in range(10)]
+    assert states[-1].demand == -15
+
+
+def test_without_promises_every_promise_is_believed():
+    promises = PromisedChange(2, memory=0.9, lowest=0.1)
+    for _ in range(5):
+        promises.observe(torch.rand(2), torch.ones(2))
+    assert promises.share.tolist() == [1.0, 1.0]
+
+
+def test_a_saved_state_goes_on_as_if_it_had_never_stopped():
+    whole, second = tracker(), tracker()
+    *before, last = batches(6, 0.06)
+    for costs in before:
+        whole.update(costs, torch.tensor([90.0]))
+        whole.promises.promise(torch.tensor([-3.0]))
+    second.load_state_dict(whole.state_dict())
+    states = [each.update(last, NO_EPISODES) for each in (whole, second)]
+    assert all(torch.equal(ours, theirs) for ours, theirs in zip(*states, strict=True))
