@@ -3,7 +3,9 @@
 Everything here works on TensorDict keys alone and knows no environment:
 
 - `VectorGAE`, `CostGAE`, `normalise_advantages`: advantages of the reward and of k costs;
-- `LagrangeMultiplier`, `PIDMultiplier`: one λ per cost, moved by the mean episode costs;
+- `LagrangeMultiplier`, `PIDMultiplier`, `PIMultiplier`: one λ per cost, moved by the mean episode
+  costs;
+- `LimitTracker`: from the costs of a batch to how far J_c is from where it should be by now;
 - `PPOLoss`, `PPOLagrangianLoss`: policy losses for an optimiser;
 - `TRPOLoss`, `TRPOLagrangianLoss`, `CPOLoss`: policy losses for the steps of `safe_rl.algorithms`,
   whose mathematics is in `safe_rl.objectives.trust_region` and `safe_rl.objectives.cpo_dual`;
@@ -13,8 +15,10 @@ Everything here works on TensorDict keys alone and knows no environment:
 
 from safe_rl.objectives.actor_critic import ActorCriticLoss, JointAdvantages
 from safe_rl.objectives.advantages import CostGAE, VectorGAE
+from safe_rl.objectives.controllers import PIMultiplier
 from safe_rl.objectives.cpo import CPOLoss
 from safe_rl.objectives.critics import CriticLoss
+from safe_rl.objectives.limits import LimitTracker
 from safe_rl.objectives.multipliers import LagrangeMultiplier, Multiplier
 from safe_rl.objectives.normalisation import normalise_advantages
 from safe_rl.objectives.pid import PIDMultiplier
@@ -29,8 +33,10 @@ __all__ = [
     "CriticLoss",
     "JointAdvantages",
     "LagrangeMultiplier",
+    "LimitTracker",
     "Multiplier",
     "PIDMultiplier",
+    "PIMultiplier",
     "PPOLagrangianLoss",
     "PPOLoss",
     "SurrogateLoss",

@@ -122,6 +122,9 @@ class Multiplier(nn.Module):
             buffer = self.get_buffer(name)
             buffer.copy_(torch.where(known, new, buffer))
 
+    def set_scale(self, scale: Tensor) -> None:
+        """Take note of the units of violations, [k] > 0; most multipliers have their own."""
+
     def _step(self, mean_costs: Tensor) -> dict[str, Tensor]:
         """Return the new value of every state buffer ([..., k]) given finite J_c [k]."""
         raise NotImplementedError
