@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+from typing import Literal, get_args
+
 import torch
 from tensordict import TensorDictBase
 from tensordict.nn import ProbabilisticTensorDictSequential
 from torch import Tensor
 
 from safe_rl.objectives.multipliers import Multiplier
-from safe_rl.objectives.surrogate import SurrogateLoss, require_multiplier
+from safe_rl.objectives.surrogate import SurrogateLoss, lagrangian, require_multiplier
+
+#: How PPO bounds the gain of lowering costs; see `PPOLagrangianLoss`.
+CostClipping = Literal["none", "pessimistic", "joint"]
 
 
 def clipped_gain(log_weight: Tensor, advantage: Tensor, clip_epsilon: Tensor) -> Tensor:
@@ -81,24 +86,34 @@ class PPOLoss(SurrogateLoss):
         self.register_coeff_buffer("clip_epsilon", clip_epsilon, device=self._default_device)
 
     def _surrogates(self, tensordict: TensorDictBase, log_weight: Tensor) -> dict[str, Tensor]:
-        advantage = self._advantage(tensordict, log_weight)
-        gain = clipped_gain(log_weight, advantage, self.clip_epsilon)
-        ratio = log_weight.exp()
-        clipped = (ratio.detach() - 1).abs() > self.clip_epsilon
+        clipped = (log_weight.detach().exp() - 1).abs() > self.clip_epsilon
         return {
-            "loss_objective": -self._lagrangian(tensordict, gain, ratio),
+            "loss_objective": -self._objective(tensordict, log_weight),
             "clip_fraction": self._reduce_loss(
-                clipped.to(ratio.dtype), tensordict, reduction="mean"
+                clipped.to(log_weight.dtype), tensordict, reduction="mean"
             ),
         }
+
+    def _objective(self, tensordict: TensorDictBase, log_weight: Tensor) -> Tensor:
+        """What is maximised, per sample, [..., 1]."""
+        advantage = self._advantage(tensordict, log_weight)
+        gain = clipped_gain(log_weight, advantage, self.clip_epsilon)
+        return self._lagrangian(tensordict, gain, log_weight.exp())
 
 
 class PPOLagrangianLoss(PPOLoss):
     """PPO on the Lagrangian (Ray, Achiam and Amodei 2019, section 5.1), for k constraints.
 
-    The objective is (L_r − Σᵢ λᵢ L_cᵢ) / (1 + Σᵢ λᵢ). Only the reward surrogate L_r is clipped:
-    clipping a cost surrogate would stop its gradient where the policy most needs it. The
-    multipliers are read at every call and never trained by this loss: call
+    The objective is (L_r − Σᵢ λᵢ L_cᵢ) / (1 + Σᵢ λᵢ). What of it is clipped is a choice:
+
+    - ``"none"``: only the reward surrogate L_r, the costs stay E[ρA_c], as in the article. Nothing
+      bounds what a few samples promise, and at high λ updates end at their KL limit after a few
+      steps;
+    - ``"pessimistic"``: each cost to its own pessimistic side, E[max(ρA_c, clip(ρ)A_c)] (Zhang et
+      al. 2022, equation 12);
+    - ``"joint"``: the objective as a whole, PPO on the advantage (A − Σᵢ λᵢ A_cᵢ) / (1 + Σᵢ λᵢ).
+
+    The multipliers are read at every call and never trained by this loss: call
     ``multiplier.update(mean_costs)`` once per epoch.
 
     Args:
@@ -106,10 +121,12 @@ class PPOLagrangianLoss(PPOLoss):
         multiplier: one λ per column of ``cost_advantage``.
         clip_epsilon: half-width ε of the interval within which a ratio earns.
         entropy_coeff: factor of the entropy bonus.
+        cost_clipping: ``"none"``, ``"pessimistic"`` or ``"joint"``.
         reduction: ``"mean"``, ``"sum"`` or ``"none"``.
 
     Raises:
         TypeError: if there is no multiplier.
+        ValueError: if `cost_clipping` is none of the three.
 
     Examples:
         >>> import torch
@@ -135,6 +152,7 @@ class PPOLagrangianLoss(PPOLoss):
         *,
         clip_epsilon: float,
         entropy_coeff: float,
+        cost_clipping: CostClipping = "none",
         reduction: str = "mean",
     ) -> None:
         super().__init__(
@@ -144,3 +162,24 @@ class PPOLagrangianLoss(PPOLoss):
             reduction=reduction,
             multiplier=require_multiplier(multiplier, "PPOLoss"),
         )
+        if cost_clipping not in get_args(CostClipping):
+            raise ValueError(
+                f"cost_clipping must be one of {get_args(CostClipping)}, got {cost_clipping!r}."
+            )
+        self.cost_clipping = cost_clipping
+
+    def _cost_gain(self, tensordict: TensorDictBase, ratio: Tensor) -> Tensor:
+        if self.cost_clipping == "none":
+            return super()._cost_gain(tensordict, ratio)
+        cost_advantage = self._cost_advantage(tensordict)
+        return -clipped_gain(ratio.log(), -cost_advantage, self.clip_epsilon)
+
+    def _objective(self, tensordict: TensorDictBase, log_weight: Tensor) -> Tensor:
+        if self.cost_clipping != "joint":
+            return super()._objective(tensordict, log_weight)
+        advantage = lagrangian(
+            self._advantage(tensordict, log_weight),
+            self._cost_advantage(tensordict),
+            self.multiplier.value,
+        )
+        return clipped_gain(log_weight, advantage, self.clip_epsilon)

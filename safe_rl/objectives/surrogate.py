@@ -231,8 +231,12 @@ class SurrogateLoss(LossModule):
         """Objective per sample [..., 1]: the reward's alone if there is no multiplier."""
         if self.multiplier is None:
             return reward_gain
-        cost_gain = ratio * self._cost_advantage(tensordict)
+        cost_gain = self._cost_gain(tensordict, ratio)
         return lagrangian(reward_gain, cost_gain, self.multiplier.value.detach())
+
+    def _cost_gain(self, tensordict: TensorDictBase, ratio: Tensor) -> Tensor:
+        """Cost surrogates per sample, [..., k]."""
+        return ratio * self._cost_advantage(tensordict)
 
     def extra_repr(self) -> str:
         """Keys that are read."""
