@@ -138,6 +138,7 @@ class EpisodeAccounting:
         signals = torch.stack([self._column(batch, key) for key in self._signal_keys], -1)
         signals = torch.cat([torch.ones_like(signals[..., :1]), signals], -1)
         finished = self._close_episodes(signals, self._column(batch, self.done_key).long())
+        finished = finished[finished[:, 0].isfinite()]
         self._totals += signals.sum((0, 1))
         names = [_key_name(key) for key in self.cost_keys]
         rates = self._totals[2:] / self._totals[0]
@@ -174,6 +175,10 @@ class EpisodeAccounting:
     def forget_open_episodes(self) -> None:
         """Drop the sums of episodes that will never be finished: the environment starts anew."""
         self._open_sums.zero_()
+
+    def ignore_open_episodes(self) -> None:
+        """Leave the open episodes, which are cut short, out of all statistics of episodes."""
+        self._open_sums.fill_(torch.nan)
 
     def state_dict(self) -> dict[str, Tensor]:
         """Sums of the open episodes and of all steps so far."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+import torch
 from tensordict import TensorDictBase
 from torchrl.collectors import Collector
 from torchrl.envs import EnvBase
@@ -62,6 +63,21 @@ class WorldSnapshot:
     def take(self) -> None:
         """Take a snapshot and go on from it."""
         self._go_on_from(self._env.get_state())
+
+    def stagger(self, max_steps: int) -> bool:
+        """Put row i of N at step i · max_steps / N of its first episode, which ends the earlier.
+
+        Returns:
+            Whether that could be done: the environment's state holds its ``step_count``.
+        """
+        state = self._env.get_state()
+        steps = state.get("step_count", None)
+        if steps is None:
+            return False
+        offsets = torch.arange(steps.shape[0]) * max_steps // steps.shape[0]
+        state["step_count"] = steps + offsets.reshape(-1, *[1] * (steps.ndim - 1)).to(steps)
+        self._go_on_from(state)
+        return True
 
     def state_dict(self) -> dict[str, Any]:
         """The snapshot taken last."""

@@ -134,6 +134,9 @@ class Trainer:
         if isinstance(collector, Collector) and hasattr(env, "get_state"):
             self._worlds = WorldSnapshot(env, collector)
         self._is_continued = False
+        is_staggered = config.get("staggered_starts") and self._worlds is not None
+        if is_staggered and self._worlds.stagger(env.max_episode_steps):
+            self.accounting.ignore_open_episodes()
         self._cost_limits = dict(cost_limits)
         self._frames = config.frames
         self._checkpoint_interval = config.checkpoint.interval
