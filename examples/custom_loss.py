@@ -15,11 +15,11 @@ take the place of the package's own; the files in `conf/` beside this one name t
   reward (Zhang et al. 2022, equation 12).
 
     python train.py import=examples/custom_loss.py --config-dir examples/conf \
-        algo=cvar_ppo env=PointGoal1 frames=60_000
+        algo=cvar_ppo env=PointGoal1 num_envs=20 frames=60_000
 
 Three epochs, to see it run; without `frames` it learns. The column `violation_cost` is CVaR − d.
-The first two parts go with other algorithms as they are: `algo=cpo +risk=cvar`.
-Batches should hold whole episodes, as both presets' do: one that a batch cuts counts in parts.
+The first two parts go with other algorithms as they are: `algo=cpo +risk=cvar num_envs=20`.
+Batches have to hold whole episodes, hence `num_envs=20`: one that a batch cuts counts in parts.
 """
 
 from collections.abc import Sequence

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 
 import torch
+from tensordict import TensorDictBase
 from torch import Tensor
 
 from safe_rl.collectors import EpisodeStatistics
@@ -39,6 +40,7 @@ class Constraints:
         episode_length: T̄, mean number of steps of an episode, scalar.
 
     Examples:
+        >>> from tensordict import TensorDict
         >>> constraints = Constraints({"cost": 25.0})
         >>> episodes = EpisodeStatistics(
         ...     returns=torch.ones(2),
@@ -46,7 +48,7 @@ class Constraints:
         ...     lengths=torch.tensor([1000.0, 1000.0]),
         ...     cost_rates={"cost": torch.tensor(0.03)},
         ... )
-        >>> constraints.observe(episodes, batch_steps=1000)
+        >>> constraints.observe(episodes, TensorDict(batch_size=[2, 1000]))
         >>> constraints.violation, constraints.episode_length
         (tensor([5.]), tensor(1000.))
     """
@@ -68,7 +70,7 @@ class Constraints:
         self._costs = torch.full_like(self.limits, torch.nan)
         self._mean_length = torch.full((), torch.nan, device=device)
 
-    def observe(self, episodes: EpisodeStatistics, batch_steps: int) -> None:
+    def observe(self, episodes: EpisodeStatistics, batch: TensorDictBase) -> None:
         """Take in what a batch says about episodes, and move the multiplier.
 
         Costs and length are those of the last batch in which an episode finished. Before there is
@@ -76,7 +78,7 @@ class Constraints:
 
         Args:
             episodes: Statistics of the batch.
-            batch_steps: T, steps of every environment in the batch.
+            batch: The batch itself, [N, T].
         """
         if episodes.num_episodes:
             costs = self._measure(episodes.episode_costs(self.keys))
@@ -85,7 +87,7 @@ class Constraints:
         if self._mean_length.isfinite():
             costs, length = self._costs, self._mean_length
         else:
-            length = torch.full_like(self._mean_length, float(batch_steps))
+            length = torch.full_like(self._mean_length, float(batch.shape[-1]))
             rates = [episodes.cost_rates[key].to(self._costs.device) for key in self.keys]
             costs = (torch.stack(rates) * length).float() if rates else self._costs
         # in place: compiled losses read the same tensors every time
@@ -93,6 +95,9 @@ class Constraints:
         self.episode_length.copy_(length)
         if self.multiplier is not None and episodes.num_episodes:
             self.multiplier.update(self._costs)
+
+    def expect(self, metrics: Mapping[str, Tensor]) -> None:
+        """Take in what a policy update reports, before the next batch shows what came of it."""
 
     def columns(self) -> dict[str, float]:
         """Violations and multipliers, by column of the table."""

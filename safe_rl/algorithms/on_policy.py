@@ -17,6 +17,7 @@ from safe_rl.algorithms.constraints import Constraints, check_cost_limits, mean_
 from safe_rl.algorithms.contract import PolicyUpdate, Stateful
 from safe_rl.algorithms.minibatch import MinibatchUpdate
 from safe_rl.algorithms.parts import build_part
+from safe_rl.algorithms.tracked_constraints import TrackedConstraints
 from safe_rl.collectors import EpisodeStatistics
 from safe_rl.models import input_scale_vector, make_actor, make_behaviour, make_critic
 from safe_rl.objectives import CriticLoss
@@ -65,7 +66,7 @@ class OnPolicy:
         limits = _constrained_limits(config, env)
         device = torch.device(config.device)
         networks = _build_networks(config.model, env, len(limits), device)
-        constraints = _build_constraints(config, limits, device)
+        constraints = _build_constraints(config, limits, env.max_episode_steps, device)
         parts = {
             "actor_network": networks["actor"],
             "constraints": constraints,
@@ -126,11 +127,12 @@ class OnPolicy:
             self.cost_advantage(batch)
         normalise_advantages(batch)
         constraints = self.constraints
-        constraints.observe(episodes, batch.shape[-1])
+        constraints.observe(episodes, batch)
         metrics = {
             "policy": self.policy_update(batch, constraints.violation, constraints.episode_length),
             "critic": self.critic_update(batch),
         }
+        constraints.expect(metrics["policy"])
         row = constraints.columns()
         for part, values in metrics.items():
             for name, value in values.items():
@@ -163,11 +165,17 @@ def _constrained_limits(config: DictConfig, env: EnvBase) -> dict[str, float]:
 
 
 def _build_constraints(
-    config: DictConfig, limits: dict[str, float], device: torch.device
+    config: DictConfig, limits: dict[str, float], max_length: int, device: torch.device
 ) -> Constraints:
     multiplier = measure = None
     if config.get("lagrangian") is not None:
         multiplier = build_part(config.lagrangian, cost_limits=limits).to(device)
+    node = config.get("limits")
+    # a measure of one's own is taken of whole episodes
+    if limits and node and node.get("_target_") and config.get("cost_measure") is None:
+        values = torch.tensor(list(limits.values()))
+        tracker = build_part(node, cost_limits=values, max_length=max_length)
+        return TrackedConstraints(limits, tracker=tracker, multiplier=multiplier, device=device)
     if config.get("cost_measure") is not None:
         measure = build_part(config.cost_measure)
     return Constraints(limits, measure=measure or mean_cost, multiplier=multiplier, device=device)

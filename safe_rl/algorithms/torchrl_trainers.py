@@ -48,7 +48,7 @@ class ConstraintHook(TrainerHookBase):
     def __call__(self, batch: TensorDictBase) -> TensorDictBase:
         """Account for a batch [N, T] or [T]; it stays as it is."""
         episodes = self.accounting.update(batch)
-        self.constraints.observe(episodes, batch.shape[-1])
+        self.constraints.observe(episodes, batch)
         self._row = episodes.scalars() | self.constraints.columns()
         return batch
 

@@ -45,8 +45,10 @@ def test_every_combination_composes_and_resolves(env, algo, preset):
     assert plain["env"]["name"] == env
     assert plain["algo"]["name"] == algo
     assert plain["preset"] == preset
-    # whole episodes of 1000 steps, shared equally
-    assert plain["frames_per_batch"] == plain["num_envs"] * plain["env"]["num_steps"]
+    # episodes of 1000 steps: whole ones, or rows that begin at different points of theirs
+    steps = plain["frames_per_batch"] / plain["num_envs"]
+    assert steps == plain["env"]["num_steps"] or plain["staggered_starts"]
+    assert plain["frames_per_batch"] % plain["num_envs"] == 0
 
 
 @pytest.mark.parametrize(("algo", "preset"), COMBINATIONS)
@@ -115,7 +117,10 @@ SHARED = {
     "critic_update": {**FULL_BATCH, "optimizer": {**ADAM, "lr": 1e-3}},
     "cost_limits": {"cost": 25.0},
 }
-COSTS = {"cost_advantage": {"_target_": "safe_rl.objectives.CostGAE", **DISCOUNT}}
+COSTS = {
+    "cost_advantage": {"_target_": "safe_rl.objectives.CostGAE", **DISCOUNT},
+    "limits": {"_target_": None},
+}
 MULTIPLIER = {
     "lagrangian": {"_target_": "safe_rl.objectives.LagrangeMultiplier", "init": 1.0, "lr": 0.05}
 }
@@ -139,7 +144,11 @@ PAPER = {
 }
 LOSSES = {
     "ppo": {"_target_": "safe_rl.objectives.PPOLoss", "clip_epsilon": 0.2},
-    "ppo_lagrangian": {"_target_": "safe_rl.objectives.PPOLagrangianLoss", "clip_epsilon": 0.2},
+    "ppo_lagrangian": {
+        "_target_": "safe_rl.objectives.PPOLagrangianLoss",
+        "clip_epsilon": 0.2,
+        "cost_clipping": "none",
+    },
     "trpo": {"_target_": "safe_rl.objectives.TRPOLoss"},
     "trpo_lagrangian": {"_target_": "safe_rl.objectives.TRPOLagrangianLoss"},
     "cpo": {"_target_": "safe_rl.objectives.CPOLoss"},

@@ -62,6 +62,7 @@ def test_the_columns_are_those_of_a_run(algo, tmp_path):
         ("presets", "cpo"),
         ("presets of ppo_lagrangian", "ppo_lagrangian"),
         ("presets of cpo", "cpo"),
+        ("presets of limits", "trpo_lagrangian"),
     ],
 )
 def test_the_numbers_of_the_presets(name, algo, preset):

@@ -60,6 +60,8 @@ def test_ppo_lagrangian_keeps_the_limits(tmp_path):
         *LEARNING,
         "algo=ppo_lagrangian",
         "cost_limits={cost_hazards: 1.0, cost_north: 1.0}",
+        "limits=paper",
+        "loss.cost_clipping=none",
         "lagrangian=adam",
         "lagrangian.init=0.3",
         "lagrangian.lr=0.05",
@@ -276,3 +278,23 @@ def test_diverged_training_says_so(tmp_path):
             parameter.fill_(torch.nan)
     with pytest.raises(FloatingPointError, match="training has diverged"):
         trainer.run()
+
+
+def test_staggered_starts_let_episodes_end_in_every_batch(tmp_path):
+    # four rows of episodes of 40 steps, ten steps a batch
+    sizes = ["frames=640", "frames_per_batch=40", "num_envs=4", "algo=ppo"]
+    _, table = train(tmp_path / "staggered", *sizes, num_steps=40)
+    # those that were cut short count nowhere
+    assert table["episodes"] == [0.0] * 4 + [1.0] * 12
+    assert set(table["episode_length"][4:]) == {40.0}
+    _, table = train(tmp_path / "together", *sizes, "staggered_starts=null", num_steps=40)
+    assert table["episodes"] == [0.0, 0.0, 0.0, 4.0] * 4
+
+
+def test_multipliers_move_with_batches_in_which_no_episode_ends(tmp_path):
+    short = ["frames=400", "frames_per_batch=40", "limits.free_steps=0", "limits.descent_steps=80"]
+    _, table = train(tmp_path, *short, "algo=ppo_lagrangian", "cost_limits={cost: 1}", num_steps=80)
+    assert table["episodes"][:4] == [0.0] * 4
+    assert len(set(table["multiplier_cost"][2:])) == 8
+    # limited by the costs of all steps: the rate times the steps of an episode
+    assert table["estimate_cost"][0] == pytest.approx(80 * table["cost_rate"][0])

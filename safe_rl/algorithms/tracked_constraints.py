@@ -1,0 +1,83 @@
+"""Constraints that go by every step of a batch, and approach their limits before they hold them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+
+from safe_rl.algorithms.constraints import Constraints
+from safe_rl.collectors import EpisodeStatistics
+from safe_rl.objectives.limits import LimitTracker
+from safe_rl.objectives.multipliers import Multiplier
+
+__all__ = ["TrackedConstraints"]
+
+
+class TrackedConstraints(Constraints):
+    """`Constraints` whose violations come from a `LimitTracker`.
+
+    ``violation`` is what a step has to promise of J_c to come down by: J_c less its target, over
+    the share of promises that come true. Multipliers get J_c less its target, in its units.
+
+    Args:
+        limits: Cost key -> d, undiscounted cost allowed per episode.
+        tracker: Estimates J_c and what it should be by now.
+        multiplier: Weighs the costs against the return, or None.
+        device: Of all tensors.
+    """
+
+    def __init__(
+        self,
+        limits: Mapping[str, float],
+        *,
+        tracker: LimitTracker,
+        multiplier: Multiplier | None = None,
+        device: torch.device | str | None = None,
+    ) -> None:
+        super().__init__(limits, multiplier=multiplier, device=device)
+        self.tracker = tracker
+        self._row: dict[str, float] = {}
+
+    def observe(self, episodes: EpisodeStatistics, batch: TensorDictBase) -> None:
+        """Take in a batch [N, T] and move the multiplier.
+
+        Cost advantages that are in the batch for a multiplier to weigh are divided by the size of
+        one cost.
+        """
+        costs = torch.cat([batch["next", key] for key in self.keys], -1)
+        state = self.tracker.update(costs, episodes.lengths).to(self.limits.device)
+        self.violation.copy_(state.demand)
+        self.episode_length.copy_(state.length)
+        self._row = self.column("estimate", state.cost) | self.column("target", state.target)
+        if self.multiplier is None:
+            self._row |= self.column("trust", state.trust)
+            return
+        self.multiplier.set_scale(state.scale)
+        self.multiplier.update(self.limits + state.violation)
+        advantage = batch.get("cost_advantage", None)
+        if advantage is not None:
+            batch["cost_advantage"] = advantage / state.unit
+
+    def expect(self, metrics: Mapping[str, Tensor]) -> None:
+        """Note the change of J_c that an update's surrogates promise, if it reports them."""
+        if "cost_surrogate" in metrics:
+            self.tracker.promises.promise(metrics["cost_surrogate"] * self.episode_length)
+
+    def columns(self) -> dict[str, float]:
+        """Estimates, targets, and multipliers or the trust in promises, by column of the table."""
+        row = dict(self._row)
+        if self.multiplier is not None:
+            row |= self.column("multiplier", self.multiplier.value)
+        return row
+
+    def state_dict(self) -> dict[str, Any]:
+        """State of the tracker."""
+        return self.tracker.state_dict()
+
+    def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
+        """Continue from :meth:`state_dict`."""
+        self.tracker.load_state_dict(state_dict)
