@@ -2,7 +2,7 @@
 
 Violations are measured in units of the limit and bounded, so that a cost of six times the limit
 does not charge the integral six times as fast as a cost of 0 empties it. Together with cost
-advantages in units of one cost, a run does not depend on the scale of rewards or costs.
+advantages in units of one cost, λ does not depend on the scale of rewards or costs.
 
 Why these two terms. To the multiplier a policy is an integrator: per update, J_c moves by about
 β (λ* − λ) limits, λ* being the multiplier that keeps J_c where it is, β ≈ ¼ or less, and no faster

@@ -175,7 +175,7 @@ class PPOLagrangianLoss(PPOLoss):
         return -clipped_gain(ratio.log(), -cost_advantage, self.clip_epsilon)
 
     def _objective(self, tensordict: TensorDictBase, log_weight: Tensor) -> Tensor:
-        if self.cost_clipping != "joint":
+        if self.cost_clipping != "joint" or self.multiplier is None:
             return super()._objective(tensordict, log_weight)
         advantage = lagrangian(
             self._advantage(tensordict, log_weight),

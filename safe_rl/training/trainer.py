@@ -134,8 +134,8 @@ class Trainer:
         if isinstance(collector, Collector) and hasattr(env, "get_state"):
             self._worlds = WorldSnapshot(env, collector)
         self._is_continued = False
-        is_staggered = config.get("staggered_starts") and self._worlds is not None
-        if is_staggered and self._worlds.stagger(env.max_episode_steps):
+        wanted = config.get("staggered_starts")
+        if wanted and self._worlds is not None and self._worlds.stagger(env.max_episode_steps):
             self.accounting.ignore_open_episodes()
         self._cost_limits = dict(cost_limits)
         self._frames = config.frames

@@ -101,6 +101,33 @@ def test_cost_surrogates_are_not_clipped():
     )
 
 
+@pytest.mark.parametrize("clipping", ["pessimistic", "joint"])
+def test_clipped_costs_from_the_definition(clipping):
+    actor = make_actor()
+    batch = make_batch(actor, [64], 2)
+    perturb(actor, 0.5)
+    with torch.no_grad():
+        loss = make_lagrangian(actor, cost_clipping=clipping)(batch)["loss_objective"]
+        log_prob = actor.get_dist(batch.clone()).log_prob(batch["action"])
+    total = 0.0
+    for i, ratio in enumerate((log_prob - batch["action_log_prob"]).exp().tolist()):
+        near = min(max(ratio, 0.8), 1.2)
+        gain = batch["advantage"][i].item()
+        costs = batch["cost_advantage"][i].tolist()
+        if clipping == "joint":
+            net = (gain - 0.5 * costs[0] - 2.0 * costs[1]) / 3.5
+            total += min(ratio * net, near * net)
+        else:
+            worst = [max(ratio * cost, near * cost) for cost in costs]
+            total += (min(ratio * gain, near * gain) - 0.5 * worst[0] - 2.0 * worst[1]) / 3.5
+    assert loss.item() == pytest.approx(-total / 64, rel=1e-5)
+
+
+def test_an_unknown_clipping_is_refused():
+    with pytest.raises(ValueError, match="cost_clipping must be one of"):
+        make_lagrangian(make_actor(), cost_clipping="both")
+
+
 def test_kl_is_exact_and_carries_no_gradient():
     actor = make_actor()
     batch = make_batch(actor, [4, 16])
