@@ -142,6 +142,9 @@ class LimitTracker:
         largest_margin: bound of the margin, as a share of d.
         free_steps: environment steps for which costs are free.
         descent_steps: environment steps in which the limit then comes down.
+        frames: environment steps of the whole run.
+        latest_end: share of the run by which the descent is over: in a run too short for that, both
+            numbers of steps are shortened in proportion.
         smallest_scale: lower bound of the unit of violations, in costs per step: that of a limit
             near 0.
         drift: share by which J_c changes per update, about; see `EpisodeCosts`.
@@ -155,8 +158,9 @@ class LimitTracker:
     Examples:
         >>> tracker = LimitTracker(
         ...     torch.tensor([25.0]), max_length=1000, margin=0.0, largest_margin=0.2,
-        ...     free_steps=0, descent_steps=800, smallest_scale=0.01, drift=0.2, memory=0.9,
-        ...     lowest_trust=1.0, integral=0.0, largest_integral=0.5,
+        ...     free_steps=0, descent_steps=800, frames=10_000, latest_end=0.7,
+        ...     smallest_scale=0.01, drift=0.2, memory=0.9, lowest_trust=1.0, integral=0.0,
+        ...     largest_integral=0.5,
         ... )
         >>> costs = torch.full((4, 100, 1), 0.065)
         >>> state = tracker.update(costs, lengths=torch.empty(0))
@@ -173,6 +177,8 @@ class LimitTracker:
         largest_margin: float,
         free_steps: int,
         descent_steps: int,
+        frames: int,
+        latest_end: float,
         smallest_scale: float,
         drift: float | None,
         memory: float,
@@ -183,7 +189,9 @@ class LimitTracker:
         self.limits = cost_limits.detach().cpu().float()
         num_costs = len(self.limits)
         self.margin, self.largest_margin = margin, largest_margin
-        self.free_steps, self.descent_steps = free_steps, descent_steps
+        shrinkage = min(1.0, latest_end * frames / max(free_steps + descent_steps, 1))
+        self.free_steps = round(free_steps * shrinkage)
+        self.descent_steps = round(descent_steps * shrinkage)
         self.smallest_scale, self.memory = smallest_scale, memory
         self.costs = EpisodeCosts(
             num_costs, max_length=max_length, drift=drift, length_memory=memory

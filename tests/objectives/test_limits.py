@@ -11,6 +11,8 @@ SETTINGS = {
     "largest_margin": 0.2,
     "free_steps": 4_000,
     "descent_steps": 10_000,
+    "frames": 1_000_000,
+    "latest_end": 0.7,
     "smallest_scale": 0.01,
     "drift": 0.2,
     "memory": 0.9,
@@ -43,6 +45,15 @@ def test_costs_are_free_then_the_limit_comes_down_from_what_the_policy_costs():
     targets = torch.cat([state.target for state in states[2:]])
     torch.testing.assert_close(targets[:5], torch.tensor([85.0, 70, 55, 40, 25]))
     assert (targets[5:] == 25).all()
+
+
+def test_in_a_short_run_the_descent_is_over_in_time():
+    limits = tracker(margin=0.0, drift=None, frames=10_000)
+    assert (limits.free_steps, limits.descent_steps) == (2_000, 5_000)
+    costs = torch.full((20, 25, 1), 0.1)
+    states = [limits.update(costs, NO_EPISODES) for _ in range(20)]
+    assert [bool(state.violation < 0) for state in states] == [True] * 4 + [False] * 16
+    assert [bool(state.target == 25) for state in states] == [False] * 13 + [True] * 7
 
 
 def test_the_descent_goes_on_from_the_cost_where_that_came_down_faster():
