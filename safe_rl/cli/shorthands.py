@@ -76,6 +76,7 @@ def _expand_resume(value: str, others: list[str]) -> list[str]:
     except (OSError, ValueError) as error:
         raise CommandLineError(f"resume={value}: {error}") from None
     _refuse_hydras_own(config, run.config)
+    _refuse_foreign_cluster(config, others, run.config)
     check_imports(config, split_imports(others)[0], Path(value))
     for argument in others:
         key = argument.lstrip("+~").partition("=")[0]
@@ -104,6 +105,23 @@ def _refuse_hydras_own(config: DictConfig, path: Path) -> None:
         raise CommandLineError(
             f"{path} holds '{(keys or ['@package'])[0]}', which runs never write and which could "
             "make code run: delete it there to resume."
+        )
+
+
+def _refuse_foreign_cluster(config: DictConfig, others: list[str], path: Path) -> None:
+    """What Ray is started with can make code run: only the command line says it, not a file."""
+    stored = dict(OmegaConf.select(config, "collector.ray_init") or {})
+    if stored.pop("address", None) is not None and not any(
+        argument.startswith("collector.ray_init.address=") for argument in others
+    ):
+        raise CommandLineError(
+            f"{path} names a Ray cluster, which is not taken from a file: say again "
+            "collector.ray_init.address=… (null for Ray on this machine)."
+        )
+    if stored:
+        raise CommandLineError(
+            f"{path} starts Ray with {', '.join(stored)}, which could make code run: delete that "
+            "there to resume."
         )
 
 

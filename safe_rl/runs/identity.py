@@ -49,6 +49,8 @@ ROLES: dict[str, Role] = {
     "critic_update": Role.LEARNING,
     "policy_update": Role.LEARNING,
     "lagrangian": Role.LEARNING,
+    "limits": Role.LEARNING,
+    "limits.frames": Role.LENGTH,
     "loss": Role.LEARNING,
     # what a checkpoint brings along: another value would have no effect, or not fit
     "critic_update.optimizer": Role.EXPERIMENT,
@@ -58,6 +60,7 @@ ROLES: dict[str, Role] = {
     "lagrangian.derivative_delay": Role.EXPERIMENT,
     "*._target_": Role.EXPERIMENT,
     "collector": Role.MANNER,
+    "collector.ray_init": Role.MACHINE,
     "default_cost_limits": Role.MANNER,
     "certificate": Role.MACHINE,  # what is found out about a run, not what it is
     "checkpoint": Role.MACHINE,

@@ -124,3 +124,17 @@ def test_what_is_not_marked_as_changing_stays(run, override):
 )
 def test_what_is_marked_may_change(run, override):
     assert expand_arguments([f"resume={run}", override])[-1] == override
+
+
+def test_what_ray_is_started_with_is_not_taken_from_a_file(run):
+    path = run / "config.yaml"
+    local = path.read_text().replace("collector:\n", "collector:\n  ray_init: {address: null}\n")
+    path.write_text(local)
+    assert expand_arguments([f"resume={run}"])
+    path.write_text(local.replace("null}", "far}"))
+    with pytest.raises(CommandLineError, match=r"say again collector\.ray_init\.address="):
+        expand_arguments([f"resume={run}"])
+    assert expand_arguments([f"resume={run}", "collector.ray_init.address=far"])
+    path.write_text(local.replace("null}", "null, runtime_env: {pip: [theirs]}}"))
+    with pytest.raises(CommandLineError, match="starts Ray with runtime_env"):
+        expand_arguments([f"resume={run}"])

@@ -22,9 +22,10 @@ def nodes(config, prefix=""):
 
 @pytest.fixture(scope="module")
 def all_keys():
+    ray = compose_config("env=PointMass", "collector=ray")
     pairs = [(algorithm, "none") for algorithm in ALGORITHMS]
     pairs += [(ALGORITHMS[0], logger) for logger in LOGGERS]
-    found = set()
+    found = set(nodes(OmegaConf.to_container(ray)))
     for (algo, logger), preset in itertools.product(pairs, ("default", "paper")):
         config = compose_config("env=PointMass", f"algo={algo}", f"logger={logger}", f"preset={preset}")  # fmt: skip  # noqa: E501
         found |= set(nodes(OmegaConf.to_container(config)))
