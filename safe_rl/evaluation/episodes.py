@@ -75,7 +75,10 @@ def collect_episodes(
     sums = torch.zeros(num_envs, 2 + len(cost_keys), dtype=torch.float64)
     rows: list[tuple[Tensor, Tensor]] = []  # world numbers [e], sums of their episodes [e, m]
     state = env.reset()
-    with exploration(deterministic), tqdm(total=num_episodes, disable=None if progress else True) as bar:
+    with (
+        exploration(deterministic),
+        tqdm(total=num_episodes, disable=None if progress else True) as bar,
+    ):
         while (finished < quota).any():
             step, state = env.step_and_maybe_reset(policy(state))
             after = step["next"]
