@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 
-__all__ = ["FINAL_EPOCHS", "final_figures", "judges_another_measure", "violation"]
+__all__ = ["FINAL_EPOCHS", "final_figures", "judges_another_measure", "keeps", "violation"]
 
 FINAL_EPOCHS = 5
 """Epochs over which the final J_r and J_c are averaged (Ray et al. 2019, section 5.1)."""
@@ -36,6 +36,28 @@ def violation(row: Mapping[str, float], key: str, limit: float) -> float:
     """
     own = row.get(f"violation_{key}", math.nan)
     return row[f"episode_{key}"] - limit if math.isnan(own) else own
+
+
+def keeps(row: Mapping[str, float], key: str, limit: float) -> bool:
+    """Whether an epoch keeps a limit, by its episodes and by what the algorithm estimates.
+
+    The few episodes of one epoch keep a limit by luck, too. An algorithm that tracks J_c has columns
+    ``estimate_<key>`` and ``target_<key>``; then its estimate has to be at its target as well.
+
+    Args:
+        row: Of a run's table, by column.
+        key: Key of the cost.
+        limit: d, undiscounted cost per episode.
+
+    Examples:
+        >>> keeps({"episode_cost": 20.0}, "cost", 25.0)
+        True
+        >>> keeps({"episode_cost": 20.0, "estimate_cost": 24.0, "target_cost": 22.0}, "cost", 25.0)
+        False
+    """
+    estimate = row.get(f"estimate_{key}", -math.inf)
+    target = min(limit, row.get(f"target_{key}", limit))
+    return violation(row, key, limit) <= 0 and estimate <= target
 
 
 def judges_another_measure(table: Mapping[str, Sequence[float]], key: str, limit: float) -> bool:

@@ -24,7 +24,7 @@ from safe_rl.collectors import EpisodeAccounting, WorkerCollector, make_collecto
 from safe_rl.collectors.workers import MakeEnv
 from safe_rl.runs.checkpoints import CheckpointStore
 from safe_rl.runs.lock import held
-from safe_rl.runs.outcome import violation
+from safe_rl.runs.outcome import keeps
 from safe_rl.runs.record import RunRecord
 from safe_rl.targets import build
 from safe_rl.training.interrupts import StopRequest
@@ -282,7 +282,7 @@ class Trainer:
     def _save_if_best(self, row: Mapping[str, float]) -> None:
         """Keep the policy with the highest return among those that kept every limit."""
         # a constrained algorithm says itself what it holds against the limits
-        feasible = all(violation(row, key, limit) <= 0 for key, limit in self._cost_limits.items())
+        feasible = all(keeps(row, key, limit) for key, limit in self._cost_limits.items())
         if feasible and not math.isnan(row["episode_return"]):
             self._checkpoints.save_best(
                 self.progress.steps, row["episode_return"], {"epoch": self.progress.epoch}
