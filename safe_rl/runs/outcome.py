@@ -41,8 +41,8 @@ def violation(row: Mapping[str, float], key: str, limit: float) -> float:
 def keeps(row: Mapping[str, float], key: str, limit: float) -> bool:
     """Whether an epoch keeps a limit, by its episodes and by what the algorithm estimates.
 
-    The few episodes of one epoch keep a limit by luck, too. An algorithm that tracks J_c has columns
-    ``estimate_<key>`` and ``target_<key>``; then its estimate has to be at its target as well.
+    The few episodes of one epoch keep a limit by luck, too. An algorithm that tracks J_c has the
+    columns ``estimate_<key>`` and ``target_<key>``; then its estimate has to be at its target.
 
     Args:
         row: Of a run's table, by column.
