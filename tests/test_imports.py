@@ -80,6 +80,11 @@ FLOORS = {
         ("gymnasium.conversion", "gymnasium.single", "gymnasium.vector"),
         ("gymnasium.family",),
         ("gymnasium",),
+        # What changes any of them from outside.
+        ("transforms.base",),
+        ("transforms.action_filter", "transforms.early_termination", "transforms.saute"),
+        ("transforms.environment",),
+        ("transforms",),
         ("families",),
         ("registration",),
         ("",),

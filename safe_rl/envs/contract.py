@@ -30,6 +30,8 @@ class ConstrainedEnv(Protocol):
         observation_layout: columns of every named component of a flat `observation`; a nested one
             may say what its columns were if it were flat.
 
+    If `reward` is not what returns are made of, `return_key` names what is, below "next".
+
     Examples:
         >>> from safe_rl.envs import SafetyGymEnv
         >>> env: ConstrainedEnv = SafetyGymEnv("PointGoal1", num_envs=2, seed=0)

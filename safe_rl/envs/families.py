@@ -17,6 +17,7 @@ from safe_rl.envs.safety_gym.env import SafetyGymEnv
 from safe_rl.envs.safety_gym.nodes import complete_safety_gym, safety_gym_node
 from safe_rl.envs.safety_gym.records.config import SafetyGymConfig
 from safe_rl.envs.safety_gym.suite import EXTRAS, SUITE
+from safe_rl.envs.transforms.environment import transform_env
 from safe_rl.envs.velocity.nodes import VELOCITY_TARGET, complete_velocity, velocity_node
 from safe_rl.envs.velocity.suite import VELOCITY_SUITE
 from safe_rl.targets import locate
@@ -87,6 +88,8 @@ def make_env(
     device: torch.device | str = "cpu",
     seed: int | None = None,
     num_threads: int = 0,
+    transforms: Mapping[str, Any] | None = None,
+    evaluating: bool = False,
 ) -> ConstrainedEnv:
     """Make a batch of environments of any family.
 
@@ -97,6 +100,8 @@ def make_env(
         device: where the TensorDicts live.
         seed: determines every draw; None takes one from torch's generator.
         num_threads: threads that may step them; 0 for one per core.
+        transforms: name -> transform, or its node, as `transform_env` takes them.
+        evaluating: whether the transforms undo what only serves learning.
 
     Raises:
         ConfigError: for an unknown name or key, or a value that cannot be used.
@@ -114,6 +119,8 @@ def make_env(
     if isinstance(env, Mapping):
         env = {key: value for key, value in env.items() if key not in ("_target_", "name")}
     made = build(env, num_envs=num_envs, device=device, seed=seed, num_threads=num_threads)
-    if target is not None:
+    if transforms:
+        made = transform_env(made, transforms, evaluating=evaluating)
+    if target is not None or transforms:
         check_constrained_env(made)
     return made

@@ -1,0 +1,17 @@
+"""What changes a constrained problem from outside: TorchRL's transforms, for any algorithm."""
+
+from safe_rl.envs.transforms.action_filter import ActionFilter
+from safe_rl.envs.transforms.base import ConstraintTransform
+from safe_rl.envs.transforms.early_termination import EarlyTermination
+from safe_rl.envs.transforms.environment import TransformedConstrainedEnv, transform_env
+from safe_rl.envs.transforms.saute import Saute, Simmer
+
+__all__ = [
+    "ActionFilter",
+    "ConstraintTransform",
+    "EarlyTermination",
+    "Saute",
+    "Simmer",
+    "TransformedConstrainedEnv",
+    "transform_env",
+]

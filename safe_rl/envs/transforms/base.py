@@ -1,0 +1,115 @@
+"""What the transforms of constrained problems have in common."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Collection, Mapping
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+from torchrl.data import Composite, TensorSpec, Unbounded
+from torchrl.envs.transforms import Transform
+
+from safe_rl.naming import did_you_mean
+
+
+class ConstraintTransform(Transform):
+    """A transform that the environment's contract and a run's snapshots know of.
+
+    What it remembers of every row's episode stands in one dictionary of tensors [..., m]: `start`
+    says what that is when an episode begins, `_step` of a subclass moves it.
+
+    Attributes:
+        evaluating: whether the problem is the one to be solved, not the one to learn on.
+        added_costs: names of costs that it writes beside the environment's.
+        return_key: where it leaves the reward that returns are made of, if it changes the reward.
+
+    Examples:
+        >>> from torchrl.envs import PendulumEnv, TransformedEnv
+        >>> TransformedEnv(PendulumEnv(), ConstraintTransform()).rollout(3).shape
+        torch.Size([3])
+    """
+
+    evaluating = False
+    added_costs: tuple[str, ...] = ()
+    return_key: str | None = None
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._rows: dict[str, Tensor] = {}
+
+    def start(self, done: Tensor) -> dict[str, Tensor]:
+        """Return what is remembered of episodes that begin, for all rows of `done` [..., 1]."""
+        return {}
+
+    def rows(self) -> dict[str, Tensor]:
+        """Return a copy of what is remembered, [..., m] each."""
+        return {name: value.clone() for name, value in self._rows.items()}
+
+    def put_rows(self, rows: Mapping[str, Tensor]) -> None:
+        """Go on from what `rows` returned."""
+        self._rows = {name: value.clone() for name, value in rows.items()}
+
+    def continue_from(self, steps: int) -> None:
+        """Take note that every row has made that many steps in a part of the run before."""
+
+    def check(self, cost_keys: Collection[str]) -> None:
+        """Raise ValueError if it needs a cost that is not among these."""
+
+    def extend_layout(self, layout: Mapping[str, slice]) -> dict[str, slice]:
+        """Add what it observes to the columns of the observation."""
+        return dict(layout)
+
+    def _reset(
+        self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
+    ) -> TensorDictBase:
+        done = tensordict_reset.get("done")
+        first = self.start(done)
+        begins = tensordict.get("_reset", None)
+        if begins is not None and self._rows:
+            mask = begins.reshape(done.shape)
+            first = {n: torch.where(mask, value, self._rows[n]) for n, value in first.items()}
+        self._rows = first
+        return self._call(tensordict_reset)
+
+
+def check_budgets(budgets: Mapping[str, float], *, above_zero: bool) -> dict[str, float]:
+    """Return budgets as a plain dictionary.
+
+    Args:
+        budgets: cost key -> cost per episode.
+        above_zero: whether 0 is too little.
+
+    Raises:
+        ValueError: if there is none, or one is no number of the range.
+    """
+    checked = {key: float(budget) for key, budget in budgets.items()}
+    if not checked:
+        raise ValueError("budgets is empty: name a cost and how much of it an episode may cost.")
+    for key, budget in checked.items():
+        if not (math.isfinite(budget) and (budget > 0 if above_zero else budget >= 0)):
+            least = "above 0" if above_zero else "of at least 0"
+            raise ValueError(f"budgets: {key}={budget:g} must be a number {least}.")
+    return checked
+
+
+def check_known(budgets: Collection[str], cost_keys: Collection[str]) -> None:
+    """Raise ValueError for a budget of a cost that there is not."""
+    for key in budgets:
+        if key not in cost_keys:
+            raise ValueError(
+                f"budgets names '{key}', but there is no such cost.{did_you_mean(key, cost_keys)} "
+                f"There are {', '.join(cost_keys)}."
+            )
+
+
+def costs_of(step: TensorDictBase, keys: Collection[str]) -> Tensor:
+    """Return costs of a step side by side as float64, [..., k]."""
+    return torch.cat([step.get(key) for key in keys], -1).double()
+
+
+def reward_like(spec: Composite) -> TensorSpec:
+    """Return the spec of any number for each reward."""
+    reward = spec["reward"]
+    return Unbounded(shape=reward.shape, dtype=reward.dtype, device=reward.device)

@@ -1,0 +1,138 @@
+"""An environment with transforms that keeps the contract of an environment without."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from tensordict import TensorDict, TensorDictBase
+from torchrl.envs import EnvBase, TransformedEnv
+from torchrl.envs.transforms import Compose, Transform
+
+from safe_rl.envs.transforms.base import ConstraintTransform
+from safe_rl.targets import TargetError, build
+
+_STATE = "transforms"
+
+
+class TransformedConstrainedEnv(TransformedEnv):
+    """N environments and what changes them from outside, made by `transform_env`.
+
+    Args:
+        base_env: keeps the contract `ConstrainedEnv`.
+        transforms: name -> transform, any of TorchRL's; the first is the innermost.
+
+    Attributes:
+        cost_keys: the environment's, then those of the transforms.
+        return_key: the entry below "next" that returns are made of, `reward` unless that is
+            changed.
+
+    Raises:
+        ValueError: if the transforms do not fit the environment, or one another.
+    """
+
+    def __init__(self, base_env: EnvBase, transforms: Mapping[str, Transform]) -> None:
+        super().__init__(base_env, Compose(*transforms.values()))
+        self._names = list(transforms)
+        self.cost_keys = list(base_env.cost_keys)
+        self.return_key = getattr(base_env, "return_key", "reward")
+        layout = dict(base_env.observation_layout)
+        for name, transform in self._ours().items():
+            try:
+                transform.check(self.cost_keys)
+                layout = transform.extend_layout(layout)
+            except ValueError as error:
+                raise ValueError(f"transforms.{name}: {error}") from error
+            self.cost_keys += transform.added_costs
+            self.return_key = transform.return_key or self.return_key
+        self.observation_layout = layout
+
+    def _ours(self) -> dict[str, ConstraintTransform]:
+        return {n: t for n, t in self._named().items() if isinstance(t, ConstraintTransform)}
+
+    def _named(self) -> dict[str, Transform]:
+        return dict(zip(self._names, self.transform.transforms, strict=True))
+
+    @property
+    def max_episode_steps(self) -> int:
+        """The largest number of steps of an episode."""
+        return self.base_env.max_episode_steps
+
+    def continue_from(self, steps: int) -> None:
+        """Go on with schedules after so many steps of every row; the next reset heeds it."""
+        for transform in self._ours().values():
+            transform.continue_from(steps)
+
+
+class TransformedSnapshotEnv(TransformedConstrainedEnv):
+    """One whose worlds can be stored and put back, with what the transforms remember of them."""
+
+    def get_state(self) -> TensorDictBase:
+        """Return a copy of everything that determines what happens next, a TensorDict [N]."""
+        state = self.base_env.get_state()
+        for name, transform in self._ours().items():
+            if rows := transform.rows():
+                state.set((_STATE, name), TensorDict(rows, batch_size=self.batch_size))
+        return state
+
+    def set_state(self, state: TensorDictBase) -> TensorDictBase:
+        """Put the worlds into a state; what it does not say of transforms begins anew.
+
+        Returns:
+            What a reset returns, for that state.
+        """
+        reset = self.base_env.set_state(state.exclude(_STATE))
+        for name, transform in self._named().items():
+            rows = state.get((_STATE, name), None)
+            if rows is not None and isinstance(transform, ConstraintTransform):
+                transform.put_rows(dict(rows.items()))
+                reset = transform._call(reset)
+            else:
+                reset = transform._reset(reset.empty(), reset)
+        return reset
+
+
+def transform_env(
+    env: EnvBase, transforms: Mapping[str, Transform | Mapping[str, Any]], *, evaluating: bool
+) -> TransformedConstrainedEnv:
+    """Change a constrained problem from outside.
+
+    Args:
+        env: keeps the contract `ConstrainedEnv`.
+        transforms: name -> transform, or node of a configuration with its `_target_`; the first is
+            the innermost: it sees the environment's costs, and the actions last.
+        evaluating: whether the problem is the one to be solved, not the one to learn on: rewards
+            are the environment's, and episodes as long.
+
+    Raises:
+        ValueError: if a transform refuses its keys, or does not fit the environment.
+
+    Examples:
+        >>> from safe_rl.envs import make_env
+        >>> from safe_rl.envs.transforms import ActionFilter
+        >>> env = make_env("PointGoal1", num_envs=2, seed=0)
+        >>> slow = ActionFilter(lambda step: 0.5 * step["action"])
+        >>> transform_env(env, {"slow": slow}, evaluating=False).cost_keys[-1]
+        'cost_interventions'
+    """
+    made = {name: _transform(name, given) for name, given in transforms.items()}
+    for transform in made.values():
+        if isinstance(transform, ConstraintTransform):
+            transform.evaluating = evaluating
+    stores = callable(getattr(env, "get_state", None))
+    return (TransformedSnapshotEnv if stores else TransformedConstrainedEnv)(env, made)
+
+
+def _transform(name: str, given: Transform | Mapping[str, Any]) -> Transform:
+    if isinstance(given, Transform):
+        return given
+    try:
+        transform = build(given)
+    except TargetError as error:
+        raise TargetError(f"transforms.{name}: {error}") from error
+    if not isinstance(transform, Transform):
+        raise TargetError(
+            f"transforms.{name}: {given['_target_']} makes a {type(transform).__name__}, which is "
+            "no Transform of TorchRL."
+        )
+    return transform

@@ -1,0 +1,215 @@
+"""The budget as a part of the state: Sauté RL, and Simmer, which lets the budget grow."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+from torchrl.data import Composite, TensorSpec, Unbounded
+
+from safe_rl.envs.transforms.base import (
+    ConstraintTransform,
+    check_budgets,
+    check_known,
+    costs_of,
+    reward_like,
+)
+
+BUDGET = "budget"
+_ROUNDING = 1e-9  # of shares of a budget that are taken one by one
+
+
+class Saute(ConstraintTransform):
+    """What is left of the budget is observed; once it is spent, every step earns the same.
+
+    Of a budget d of each of k costs, the share z is left: z_0 = 1 and
+
+        z_{t+1} = (z_t - c_t / d) / γ_s
+
+    (Sootla et al. 2022, "Sauté RL: Almost Surely Safe Reinforcement Learning Using State
+    Augmentation", section 3), so that z_T >= 0 says that the discounted cost of the episode is
+    within d. `observation` gets k more columns, the component `budget`; in a dictionary it is an
+    entry. Where a share is 0 or less, `reward` becomes `unsafe_reward`. The environment's own
+    reward is kept in `task_reward`: returns are made of that. In evaluation `reward` stays as it
+    is.
+
+    Args:
+        budgets: cost key -> undiscounted cost per episode, d.
+        discount: γ_s, in (0, 1].
+        unsafe_reward: reward of every step when a budget is spent.
+        rescale_budgets: whether d, which is undiscounted, becomes d (1 - γ_s^T) / ((1 - γ_s) T), to
+            which a cost that is spread evenly over T = `max_episode_steps` steps sums with the
+            discount, as in the published code.
+
+    Raises:
+        ValueError: for a budget that is not positive, or a discount out of range.
+
+    Examples:
+        >>> from torchrl.envs import TransformedEnv
+        >>> from safe_rl.envs import SafetyGymEnv
+        >>> env = SafetyGymEnv("PointGoal1", num_envs=2, seed=0)
+        >>> saute = Saute({"cost": 25.0}, discount=0.5, unsafe_reward=-1.0, rescale_budgets=False)
+        >>> TransformedEnv(env, saute).rollout(2)["observation"][0, :, -1]
+        tensor([1., 2.])
+    """
+
+    return_key = "task_reward"
+
+    def __init__(
+        self,
+        budgets: Mapping[str, float],
+        *,
+        discount: float,
+        unsafe_reward: float,
+        rescale_budgets: bool,
+    ) -> None:
+        super().__init__()
+        if not 0 < discount <= 1:
+            raise ValueError(f"discount={discount:g} must be above 0 and at most 1.")
+        self._budgets = check_budgets(budgets, above_zero=True)
+        self._discount = discount
+        self._unsafe_reward = unsafe_reward
+        self._rescales = rescale_budgets
+
+    def check(self, cost_keys: Collection[str]) -> None:
+        """Raise ValueError if a budget's cost is not among these."""
+        check_known(self._budgets, cost_keys)
+
+    def start(self, done: Tensor) -> dict[str, Tensor]:
+        """Return the whole budget."""
+        shape = (*done.shape[:-1], len(self._budgets))
+        return {BUDGET: torch.ones(shape, dtype=torch.float64, device=done.device)}
+
+    def extend_layout(self, layout: Mapping[str, slice]) -> dict[str, slice]:
+        """Add the component `budget`.
+
+        Raises:
+            ValueError: if there is one.
+        """
+        if BUDGET in layout:
+            raise ValueError(
+                f"The observation has a component '{BUDGET}' already: use one of saute and simmer."
+            )
+        last = max((columns.stop for columns in layout.values()), default=0)
+        return {**layout, BUDGET: slice(last, last + len(self._budgets))}
+
+    def _allowed(self, like: Tensor) -> Tensor:
+        """Budgets in which costs are measured, [k]."""
+        budgets = like.new_tensor(list(self._budgets.values()))
+        if not self._rescales or self._discount == 1:
+            return budgets
+        steps = getattr(self.container, "max_episode_steps", None)
+        if steps is None:
+            raise ValueError(
+                "rescale_budgets needs the largest number of steps of an episode, which this "
+                "environment does not say in 'max_episode_steps'."
+            )
+        return budgets * (1 - self._discount**steps) / ((1 - self._discount) * steps)
+
+    def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
+        costs = costs_of(next_tensordict, self._budgets)
+        left = (self._rows[BUDGET] - costs / self._allowed(costs)) / self._discount
+        self._rows = {**self._rows, BUDGET: left}
+        reward = next_tensordict.get("reward")
+        next_tensordict.set(self.return_key, next_tensordict.get(self.return_key, reward))
+        if not self.evaluating:
+            spent = (left <= _ROUNDING).any(-1, keepdim=True)
+            next_tensordict.set("reward", reward.masked_fill(spent, self._unsafe_reward))
+        return self._call(next_tensordict)
+
+    def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:
+        budget = self._rows[BUDGET]
+        observation = next_tensordict.get("observation")
+        if isinstance(observation, Tensor):
+            columns = torch.cat([observation, budget.to(observation.dtype)], -1)
+            return next_tensordict.set("observation", columns)
+        return next_tensordict.set(("observation", BUDGET), budget.float())
+
+    def transform_observation_spec(self, observation_spec: TensorSpec) -> TensorSpec:
+        """Add the columns."""
+        observed = observation_spec["observation"]
+        if isinstance(observed, Composite):
+            shape = (*observation_spec.shape, len(self._budgets))
+            observed[BUDGET] = Unbounded(shape=shape, device=observed.device)
+            return observation_spec
+        shape = (*observed.shape[:-1], observed.shape[-1] + len(self._budgets))
+        observation_spec["observation"] = Unbounded(
+            shape=shape, dtype=observed.dtype, device=observed.device
+        )
+        return observation_spec
+
+    def transform_reward_spec(self, reward_spec: TensorSpec) -> TensorSpec:
+        """Add the environment's own reward."""
+        for key in (self.return_key, "reward"):
+            reward_spec[key] = reward_like(reward_spec)
+        return reward_spec
+
+
+class Simmer(Saute):
+    """Sauté RL with budgets that grow during training, from a share of d to all of it.
+
+    An episode begins with z_0 = d_n / d, where d_n is the budget after n steps of its environment;
+    the share that is left stays one of the whole d, so that what was learned with a small budget
+    holds for a larger one (Sootla et al. 2022, "Enhancing Safe Exploration Using Safety State
+    Augmentation"). d_n grows in a straight line; the paper's schedules react to what is learned.
+    Episodes of an evaluation begin with the whole budget.
+
+    Args:
+        budgets: as `Saute` takes them: d.
+        first: share of d with which training begins, in (0, 1].
+        steps: steps of each environment after which the budget is the whole d.
+        discount: as `Saute` takes it.
+        unsafe_reward: as `Saute` takes it.
+        rescale_budgets: as `Saute` takes it.
+
+    Raises:
+        ValueError: for a value out of range.
+
+    Examples:
+        >>> from torchrl.envs import TransformedEnv
+        >>> from safe_rl.envs import SafetyGymEnv
+        >>> env = SafetyGymEnv({"robot_base": "point", "num_steps": 5}, seed=0)
+        >>> saute = {"discount": 1.0, "unsafe_reward": -1.0, "rescale_budgets": True}
+        >>> env = TransformedEnv(env, Simmer({"cost": 25.0}, first=0.2, steps=10, **saute))
+        >>> env.rollout(12, break_when_any_done=False)["observation"][0, ::5, -1]
+        tensor([0.2000, 0.6000, 1.0000])
+    """
+
+    def __init__(
+        self,
+        budgets: Mapping[str, float],
+        *,
+        first: float,
+        steps: int,
+        discount: float,
+        unsafe_reward: float,
+        rescale_budgets: bool,
+    ) -> None:
+        super().__init__(
+            budgets, discount=discount, unsafe_reward=unsafe_reward, rescale_budgets=rescale_budgets
+        )
+        if not 0 < first <= 1:
+            raise ValueError(f"first={first:g} must be above 0 and at most 1.")
+        if steps < 1:
+            raise ValueError(f"steps={steps} must be at least 1.")
+        self._first, self._steps = first, steps
+        self._steps_before = 0
+
+    def continue_from(self, steps: int) -> None:
+        """Go on with the schedule after so many steps of every row."""
+        self._steps_before = steps
+        self._rows.pop("age", None)
+
+    def start(self, done: Tensor) -> dict[str, Tensor]:
+        """Return the budget of this part of training, and how far that is."""
+        before = torch.full_like(done, self._steps_before, dtype=torch.int64)
+        age = self._rows.get("age", before)
+        share = self._first + (1 - self._first) * (age / self._steps).clamp(max=1).double()
+        whole = super().start(done)[BUDGET]
+        return {BUDGET: whole if self.evaluating else whole * share, "age": age}
+
+    def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
+        self._rows = {**self._rows, "age": self._rows["age"] + 1}
+        return super()._step(tensordict, next_tensordict)
