@@ -99,23 +99,40 @@ def test_rectangles_are_chosen_in_proportion_to_their_areas():
     assert stats.chisquare(counts, 4000 * areas / areas.sum()).pvalue > UNLIKELY
 
 
-def by_rejection(rng, keepouts: list[float], half: float) -> np.ndarray:
-    """One layout by the rule itself: place one after the other, 100 tries each, or start over."""
-    while True:
-        placed: list[np.ndarray] = []
-        for keepout in keepouts:
-            for _ in range(100):
-                xy = rng.uniform(keepout - half, half - keepout, 2)
-                if all(
-                    math.dist(xy, other) >= keepout + theirs
-                    for other, theirs in zip(placed, keepouts, strict=False)
-                ):
-                    placed.append(xy)
-                    break
-            else:
-                break
-        else:
-            return np.array(placed)
+def fits(xy: np.ndarray, placed: list[np.ndarray], clearances: list[float]) -> bool:
+    pairs = zip(placed, clearances, strict=True)
+    return all(math.dist(xy, other) >= clearance for other, clearance in pairs)
+
+
+def by_rejection(rng, keepouts: list[float], half: float) -> np.ndarray | None:
+    """One layout by the rule itself: place one after the other, 100 tries each."""
+    placed: list[np.ndarray] = []
+    for keepout in keepouts:
+        clearances = [keepout + theirs for theirs in keepouts[: len(placed)]]
+        tries = (rng.uniform(keepout - half, half - keepout, 2) for _ in range(100))
+        found = next((xy for xy in tries if fits(xy, placed, clearances)), None)
+        if found is None:
+            return None
+        placed.append(found)
+    return np.array(placed)
+
+
+def by_the_rule(rng, keepouts: dict[str, float], half: float, number: int) -> dict:
+    """Many layouts, started over where something did not fit, and their first goals drawn anew."""
+    layouts: list[np.ndarray] = []
+    names, sizes = list(keepouts), list(keepouts.values())
+    goal, mine = names.index("goal"), keepouts["goal"]
+    while len(layouts) < number:
+        layout = by_rejection(rng, sizes, half)
+        if layout is None:
+            continue
+        others = np.delete(layout, goal, axis=0)
+        clearances = [mine + theirs for theirs in np.delete(sizes, goal)]
+        while not fits(xy := rng.uniform(mine - half, half - mine, 2), others, clearances):
+            pass
+        layout[goal] = xy
+        layouts.append(layout)
+    return dict(zip(names, np.array(layouts).transpose(1, 0, 2), strict=True))
 
 
 def test_crowded_layouts_are_distributed_as_by_the_rule_itself():
@@ -124,18 +141,56 @@ def test_crowded_layouts_are_distributed_as_by_the_rule_itself():
         **{"goal_keepout": 0.3, "hazards_num": 3, "hazards_keepout": 0.25},
     }
     got = fresh_places(config, 2000)
-    names = ["robot", "goal", "hazard0", "hazard1", "hazard2"]
-    rng = np.random.default_rng(0)
-    keepouts = [0.4, 0.3, 0.25, 0.25, 0.25]
-    layouts = np.array([by_rejection(rng, keepouts, 1.0) for _ in range(2000)])
-    want = dict(zip(names, layouts.transpose(1, 0, 2), strict=True))
-    for name in names:
+    keepouts = {"robot": 0.4, "goal": 0.3, **{f"hazard{i}": 0.25 for i in range(3)}}
+    want = by_the_rule(np.random.default_rng(0), keepouts, 1.0, 2000)
+    for name in keepouts:
         for column in (0, 1):
             pair = got[name][:, column], want[name][:, column]
             assert stats.ks_2samp(*pair).pvalue > UNLIKELY, name
-    for one, other in itertools.combinations(names, 2):
+    for one, other in itertools.combinations(keepouts, 2):
         pair = (np.linalg.norm(xy[one] - xy[other], axis=1) for xy in (got, want))
         assert stats.ks_2samp(*pair).pvalue > UNLIKELY, (one, other)
+
+
+FIRST_GOALS = {
+    "PointPush1": {"box": 0.2, "hazard": 0.4, "hazard1": 0.4, "pillar": 0.3},
+    "PointPush2": {
+        **{"box": 0.2, **{f"hazard{i}": 0.4 for i in range(4)}},
+        **{f"pillar{i}": 0.3 for i in range(4)},
+    },
+}
+
+
+@pytest.mark.parametrize("name", FIRST_GOALS)
+def test_first_goals_are_drawn_beside_everything_that_stands(name):
+    """Objects keep clear of the goal that the layout had, which is then drawn anew."""
+    half = HALF_EXTENTS[name.removeprefix("Point")]
+    keepouts = {"robot": 0.4, "goal": 0.4, **FIRST_GOALS[name]}
+    want = by_the_rule(np.random.default_rng(1), keepouts, half, 3000)
+    got = fresh_places(SUITE[name], 3000)
+    for measure in (
+        lambda found: np.abs(found["goal"]).max(axis=1),
+        lambda found: np.linalg.norm(found["goal"] - found["robot"], axis=1),
+        lambda found: np.linalg.norm(found["goal"] - found["box"], axis=1),
+    ):
+        assert stats.ks_2samp(measure(got), measure(want)).pvalue > UNLIKELY
+    if name == "PointPush2":
+        # What was measured of the original environment, ± its standard error.
+        measured = np.abs(got["goal"]).max(axis=1).mean()
+        assert measured == pytest.approx(1.165, abs=3 * 0.008 * math.sqrt(2))
+
+
+def test_first_goals_follow_from_the_seed_of_their_row():
+    few, many = (fresh_places(SUITE["PointGoal2"], number, seed=3)["goal"] for number in (3, 50))
+    assert np.array_equal(few, many[:3])
+    assert len(np.unique(many, axis=0)) == 50
+
+
+def test_a_goal_without_a_second_place_keeps_its_first():
+    """Nothing but one point, which the pinned goal is drawn at again, up to its tolerance."""
+    pins = {"robot_locations": [[0, 0]], "goal_locations": [[0.8, 0]], "goal_keepout": 0.4}
+    got = fresh_places({"robot_base": "point", "task": "goal", **pins}, 20)["goal"]
+    np.testing.assert_allclose(got, [[0.8, 0.0]] * 20, atol=1e-9)
 
 
 def test_each_object_gets_a_hundred_tries():

@@ -54,6 +54,11 @@ class PlacementPlan:
     keepouts: Tensor
     margin: float
 
+    @property
+    def goal_column(self) -> int:
+        """The goal's column in a layout."""
+        return self.columns[self.names.index("goal")]
+
     @cached_property
     def beside_goal(self) -> tuple[int, Tensor, Tensor]:
         """The goal's place in the order, the others' columns [P - 1], and clearances [P - 1]."""
