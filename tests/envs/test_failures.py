@@ -2,6 +2,7 @@
 
 import math
 
+import gymnasium
 import pytest
 import torch
 from tensordict import TensorDict
@@ -187,3 +188,61 @@ def test_a_goal_button_that_does_not_exist_is_refused():
     state["goal_button"] = torch.tensor([0, 4])
     with pytest.raises(ValueError, match="between 0 and 3"):
         env.set_state(state)
+
+
+WRONG_STATES = {
+    "seeds of more rows": ("seed", torch.zeros(5, dtype=torch.int64), r"'seed'.*\(4,\).*\(5,\)"),
+    "a single seed": ("seed", torch.zeros(4, 1, dtype=torch.int64), r"'seed'.*\(4,\).*\(4, 1\)"),
+    "seeds that are fractions": ("seed", torch.zeros(4), "'seed' must be torch.int64"),
+    "episodes of fewer rows": ("episode", torch.ones(2, dtype=torch.int64), r"'episode'.*\(4,\)"),
+}
+
+
+@pytest.mark.parametrize("name", ["PointGoal2", "SafeHopperVelocity"])
+@pytest.mark.parametrize(("key", "value", "message"), WRONG_STATES.values(), ids=WRONG_STATES)
+def test_states_with_wrong_seeds_are_refused_and_leave_all_as_it_was(name, key, value, message):
+    env = make_env(name, num_envs=NUM_ENVS, seed=0, num_threads=1)
+    env.reset()
+    before = env.get_state()
+    wrong = {k: v for k, v in before.items() if k != key} | {key: value}
+    with pytest.raises(ValueError, match=message):
+        env.set_state(TensorDict(wrong))
+    assert all(torch.equal(env.get_state()[k], v) for k, v in before.items())
+
+
+@pytest.mark.parametrize("key", ["layout", "goal_pos", "start_pose"])
+def test_nan_in_a_layout_is_named(key):
+    env = make()
+    env.reset()
+    state = env.get_state()
+    state[key][BROKEN] = math.nan
+    with pytest.raises(ValueError, match=f"'{key}'.*not finite"):
+        env.set_state(state)
+
+
+@pytest.mark.parametrize("name", ["PointGoal1", "PointButton1", "SafeHopperVelocity"])
+def test_a_step_before_the_first_reset_says_so(name):
+    env = make_env(name, num_envs=3, seed=0, num_threads=1)
+    ask = TensorDict({"action": env.action_spec.zero()}, [3])
+    with pytest.raises(RuntimeError, match=r"No episode has begun: call reset\(\)"):
+        env.step(ask.clone())
+    env.reset(TensorDict({"_reset": torch.tensor([[True], [False], [True]])}, [3]))
+    with pytest.raises(RuntimeError, match=r"of rows \[1\]"):
+        env.step(ask.clone())
+    env.reset()
+    state = env.get_state()
+    env.step(ask.clone())
+    other = make_env(name, num_envs=3, seed=0, num_threads=1)
+    other.set_state(state)
+    other.step(ask)
+
+
+@pytest.mark.parametrize("name", ["PointGoal1", "PointButton1"])
+def test_a_step_before_the_first_reset_says_so_in_gymnasium(name):
+    one, bare = (gymnasium.make(f"Safexp-{name}-v0") for _ in range(2))
+    many = gymnasium.make_vec(f"Safexp-{name}-v0", num_envs=2)
+    for env in (one, bare.unwrapped, many):
+        with pytest.raises((RuntimeError, gymnasium.error.ResetNeeded), match="reset"):
+            env.step(env.action_space.sample())
+        env.reset(seed=0)
+        env.step(env.action_space.sample())

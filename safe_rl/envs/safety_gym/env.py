@@ -34,8 +34,9 @@ from safe_rl.envs.safety_gym.world.draws import (
     start_episodes,
 )
 from safe_rl.envs.safety_gym.world.layout import plan_placements
-from safe_rl.envs.safety_gym.world.snapshot import read_state, write_state
+from safe_rl.envs.safety_gym.world.snapshot import check_worlds, read_state, write_state
 from safe_rl.envs.safety_gym.world.views import make_world, refresh
+from safe_rl.envs.states import require_episodes
 
 _FLAGS = ("goal_met", "done", "terminated", "truncated")
 
@@ -96,6 +97,7 @@ class SafetyGymEnv(EnvBase):
         self._measured = self._task.measure(self._world).detach().clone()
         self._renderer = WorldRenderer(self._world, lidar_blocks(self.config, scene))
         self._has_cost = torch.zeros(num_envs, dtype=torch.bool)
+        self._begun = torch.zeros(num_envs, dtype=torch.bool)
         self.cost_keys = cost_keys(self.config)
         specs = make_specs(
             self.config, self._observer, self._control_range, self.cost_keys, num_envs, self.device
@@ -148,6 +150,7 @@ class SafetyGymEnv(EnvBase):
         start_episodes(self._world, self._plan, self._layout_key(), mask)
         self._measured[mask] = self._task.measure(self._world)[mask]
         self._has_cost &= ~mask
+        self._begun |= mask
         return self._reset_output()
 
     def _reset_output(self) -> TensorDict:
@@ -172,7 +175,9 @@ class SafetyGymEnv(EnvBase):
     @torch.no_grad()
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         world, config = self._world, self.config
-        failed = self._advance(self._checked_action(tensordict))
+        action = self._checked_action(tensordict)
+        require_episodes(self._begun)
+        failed = self._advance(action)
         now = self._task.measure(world)
         reward = dense_reward(config, world, self._measured, now)
         costs = compute_costs(config, world, failed)
@@ -256,8 +261,10 @@ class SafetyGymEnv(EnvBase):
 
         Raises:
             KeyError: if a key is missing.
-            ValueError: if a shape does not fit.
+            ValueError: if a shape or a type does not fit, the layout is not finite, or there is no
+                such goal button.
         """
+        check_worlds(self._world, self.get_state(), state)
         if "layout" not in state and not self._episode.any():
             self.reset()
         write_state(self._world, state)
@@ -265,6 +272,7 @@ class SafetyGymEnv(EnvBase):
         self._episode = state.get("episode", self._episode).clone()
         self._measured.copy_(self._task.measure(self._world))
         self._has_cost.zero_()
+        self._begun.fill_(True)
         return self._reset_output()
 
     def render(

@@ -15,6 +15,7 @@ from safe_rl.envs import rng
 from safe_rl.envs.errors import require_integer
 from safe_rl.envs.physics.cpu import BatchPhysics
 from safe_rl.envs.physics.runge_kutta import runge_kutta_substep
+from safe_rl.envs.states import check_state, require_episodes
 from safe_rl.envs.velocity.config import VelocityConfig
 from safe_rl.envs.velocity.health import HEALTH
 from safe_rl.envs.velocity.measuring import PLACES, limited_speed
@@ -23,13 +24,13 @@ from safe_rl.envs.velocity.observing import Observer
 from safe_rl.envs.velocity.rendering import Camera, RobotRenderer
 from safe_rl.envs.velocity.rewarding import locomotion_reward
 from safe_rl.envs.velocity.robots import ROBOTS
-from safe_rl.envs.velocity.snapshot import check_state
 from safe_rl.envs.velocity.specs import make_velocity_specs
 from safe_rl.envs.velocity.starting import Starts
 from safe_rl.envs.velocity.suite import resolve_velocity
 
 _FLAGS = ("done", "terminated", "truncated")
 _PHYSICS_KEYS = ("qpos", "qvel", "qacc_warmstart", "time")
+_OPTIONAL_KEYS = ("place", "observation", "seed", "episode")
 
 
 class VelocityEnv(EnvBase):
@@ -91,6 +92,7 @@ class VelocityEnv(EnvBase):
         self._step_count = torch.zeros(num_envs, dtype=torch.int64)
         self._episode = torch.zeros(num_envs, dtype=torch.int64)
         self._has_cost = torch.zeros(num_envs, dtype=torch.bool)
+        self._begun = torch.zeros(num_envs, dtype=torch.bool)
         self._starts = Starts(self.config, self._model, num_envs)
         self._renderer = RobotRenderer(self.config)
         specs = make_velocity_specs(
@@ -132,6 +134,7 @@ class VelocityEnv(EnvBase):
         self._start(rows)
         self._step_count[rows] = 0
         self._has_cost &= ~mask
+        self._begun |= mask
         return self._reset_output()
 
     def _start(self, rows: Tensor) -> None:
@@ -155,6 +158,7 @@ class VelocityEnv(EnvBase):
     @torch.no_grad()
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         action = self._checked_action(tensordict).to(torch.float64)
+        require_episodes(self._begun)
         reward, terminated = self._move(action.clamp(*self._control_range))
         self._observer.write(self._physics, self._observation)
         self._step_count += 1
@@ -232,9 +236,9 @@ class VelocityEnv(EnvBase):
 
         Raises:
             KeyError: if a key is missing.
-            ValueError: if a shape does not fit.
+            ValueError: if a shape or a type does not fit.
         """
-        check_state(self.get_state(), state)
+        check_state(self.get_state(), state, _OPTIONAL_KEYS)
         everyone = torch.ones(self.batch_size, dtype=torch.bool)
         self._physics.reset(everyone)
         for key in _PHYSICS_KEYS:
@@ -247,6 +251,7 @@ class VelocityEnv(EnvBase):
         self._row_seed = state.get("seed", self._row_seed).clone()
         self._episode = state.get("episode", self._episode).clone()
         self._has_cost.zero_()
+        self._begun.fill_(True)
         return self._reset_output()
 
     def render(

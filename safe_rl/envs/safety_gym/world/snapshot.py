@@ -9,12 +9,15 @@ from safe_rl.envs.safety_gym.records.world import World
 from safe_rl.envs.safety_gym.rules.tasks import goal_is_button
 from safe_rl.envs.safety_gym.world.draws import place_mocaps, point_goal_at_button
 from safe_rl.envs.safety_gym.world.views import refresh
+from safe_rl.envs.states import check_state
 
 PHYSICS_KEYS = ("qpos", "qvel", "qacc_warmstart", "time")
 TASK_KEYS = ("goal_button", "buttons_timer", "step_count")
 LAYOUT_KEYS = ("layout", "start_pose")
 # Without the last control, sensors that feel the actuators differ until the next step.
-OPTIONAL_KEYS = (*LAYOUT_KEYS, "target_quat", "ctrl")
+OPTIONAL_KEYS = (*LAYOUT_KEYS, "target_quat", "ctrl", "seed", "episode")
+# What is not part of the physics, whose failures are noticed by themselves.
+FINITE_KEYS = (*LAYOUT_KEYS, "goal_pos", "target_quat")
 
 
 def read_state(world: World) -> TensorDict:
@@ -32,14 +35,9 @@ def write_state(world: World, state: TensorDictBase) -> None:
 
     Args:
         world: the worlds.
-        state: TensorDict [N] as `read_state` returns it; `layout`, `start_pose`, `target_quat` and
-            `ctrl` may be missing.
-
-    Raises:
-        KeyError: if another key is missing.
-        ValueError: if a shape does not fit, or there is no such goal button.
+        state: TensorDict [N] as `read_state` returns it, which `check_worlds` has passed; `layout`,
+            `start_pose`, `target_quat` and `ctrl` may be missing.
     """
-    _check(world, state)
     scene, physics = world.scene, world.physics
     target_quat = state.get("target_quat", physics.mocap_quat[:, : scene.num_targets].clone())
     physics.reset(torch.ones_like(world.step_count, dtype=torch.bool))
@@ -63,18 +61,19 @@ def write_state(world: World, state: TensorDictBase) -> None:
     refresh(world)
 
 
-def _check(world: World, state: TensorDictBase) -> None:
-    expected = read_state(world)
-    for key, value in expected.items():
-        if key in state:
-            if state[key].shape != value.shape:
-                raise ValueError(
-                    f"State '{key}' must have shape {tuple(value.shape)} in this environment, got "
-                    f"{tuple(state[key].shape)}."
-                )
-        elif key not in OPTIONAL_KEYS:
-            needed = sorted(set(expected.keys()) - set(OPTIONAL_KEYS))
-            raise KeyError(f"The state lacks '{key}'; it needs {needed}.")
+def check_worlds(world: World, expected: TensorDictBase, state: TensorDictBase) -> None:
+    """Check a state before it is set.
+
+    Args:
+        world: the worlds that it is for.
+        expected: their present state, with seeds.
+        state: what is about to be set.
+
+    Raises:
+        KeyError: if a key is missing.
+        ValueError: if it does not fit, or there is no such goal button.
+    """
+    check_state(expected, state, OPTIONAL_KEYS, FINITE_KEYS)
     button, number = state["goal_button"], world.scene.config.buttons_num
     if goal_is_button(world.scene.config.task) and not ((button >= 0) & (button < number)).all():
         raise ValueError(f"State 'goal_button' must be between 0 and {number - 1}: {button}.")
