@@ -98,6 +98,7 @@ class SafetyGymEnv(EnvBase):
         self._renderer = WorldRenderer(self._world, lidar_blocks(self.config, scene))
         self._has_cost = torch.zeros(num_envs, dtype=torch.bool)
         self._begun = torch.zeros(num_envs, dtype=torch.bool)
+        self._physics_settings = (num_threads, sleep)
         self.cost_keys = cost_keys(self.config)
         specs = make_specs(
             self.config, self._observer, self._control_range, self.cost_keys, num_envs, self.device
@@ -252,6 +253,8 @@ class SafetyGymEnv(EnvBase):
     def set_state(self, state: TensorDictBase) -> TensorDict:
         """Set the worlds to a state, for resuming, branching and tests.
 
+        What sleeps wakes up; with `sleep` False what follows is the same to the last digit.
+
         Args:
             state: TensorDict [N] as `get_state` returns it; the layout and the seeds may be left
                 out, then the present ones stay.
@@ -274,6 +277,19 @@ class SafetyGymEnv(EnvBase):
         self._has_cost.zero_()
         self._begun.fill_(True)
         return self._reset_output()
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Tell `copy` and `pickle` to build anew and set the state, as far as `set_state` does."""
+        settings = (self.config, self.batch_size[0], self.device, 0, *self._physics_settings)
+        return type(self), settings, (self.get_state(), self._fixed_layout, self._has_cost.clone())
+
+    def __setstate__(self, kept: tuple[TensorDict, Tensor, Tensor]) -> None:
+        state, self._fixed_layout, has_cost = kept
+        if not state["episode"].any():  # no world has begun: there are seeds, and nothing else
+            self._row_seed = state["seed"].clone()
+            return
+        self.set_state(state)
+        self._has_cost.copy_(has_cost)
 
     def render(
         self,

@@ -95,6 +95,7 @@ class VelocityEnv(EnvBase):
         self._begun = torch.zeros(num_envs, dtype=torch.bool)
         self._starts = Starts(self.config, self._model, num_envs)
         self._renderer = RobotRenderer(self.config)
+        self._num_threads = num_threads
         specs = make_velocity_specs(
             self._observer.size, self._control_range, self.cost_keys, num_envs, self.device
         )
@@ -253,6 +254,16 @@ class VelocityEnv(EnvBase):
         self._has_cost.zero_()
         self._begun.fill_(True)
         return self._reset_output()
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Tell `copy` and `pickle` to build anew and set the state."""
+        settings = (self.config, self.batch_size[0], self.device, 0, self._num_threads)
+        return type(self), settings, (self.get_state(), self._has_cost.clone())
+
+    def __setstate__(self, kept: tuple[TensorDict, Tensor]) -> None:
+        state, has_cost = kept
+        self.set_state(state)
+        self._has_cost.copy_(has_cost)
 
     def render(
         self,

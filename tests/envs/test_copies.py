@@ -1,0 +1,113 @@
+"""Copies of an environment go on as it does, and on their own."""
+
+import copy
+import pickle
+
+import gymnasium
+import numpy as np
+import pytest
+import torch
+from torchrl.envs import Compose, RewardSum, StepCounter, TransformedEnv
+
+from safe_rl.envs import SUITE, SafetyGymEnv
+from safe_rl.envs.velocity import VELOCITY_SUITE, VelocityEnv
+
+# Short episodes, so that resets are among the compared steps.
+BUSY = {"num_steps": 15}
+SAFETY_GYM = {
+    "PointGoal2": {"goal_size": 0.9},
+    "CarButton2": {"buttons_size": 0.2},
+    "DoggoPush1": {"action_noise": 0.3, "frameskip_binom_p": 0.7},
+    "PointPush1": {"randomize_layout": False},
+    "CarGoal1": {"observation_flatten": False, "layout_seeds": 3},
+}
+COPY = {"deepcopy": copy.deepcopy, "pickle": lambda env: pickle.loads(pickle.dumps(env))}
+
+
+def safety_gym(name, **changes):
+    config = SUITE[name].replace(**BUSY, **SAFETY_GYM[name])
+    return SafetyGymEnv(config, **{"num_envs": 3, "seed": 5, "num_threads": 1, **changes})
+
+
+def velocity(name):
+    return VelocityEnv(VELOCITY_SUITE[name].replace(**BUSY), num_envs=3, seed=5, num_threads=1)
+
+
+MAKERS = {name: lambda name=name: safety_gym(name, sleep=False) for name in SAFETY_GYM}
+MAKERS |= {name: lambda name=name: velocity(name) for name in VELOCITY_SUITE}
+
+
+def play(env, tensordict, num_steps, seed=0):
+    """All outputs of a run with resets [N, T], and where it ends."""
+    generator, steps = torch.Generator().manual_seed(seed), []
+    for _ in range(num_steps):
+        action = 2 * torch.rand(env.action_spec.shape, generator=generator) - 1
+        following, tensordict = env.step_and_maybe_reset(tensordict.set("action", action))
+        steps.append(following["next"].clone())
+    return torch.stack(steps, 1), tensordict
+
+
+def assert_same(a, b):
+    assert set(a.keys(True, True)) == set(b.keys(True, True))
+    for key, value in a.items(True, True):
+        assert torch.equal(value, b[key]), key
+
+
+@pytest.mark.parametrize("how", COPY)
+@pytest.mark.parametrize("name", MAKERS)
+def test_a_copy_goes_on_as_the_original_does(name, how):
+    env = MAKERS[name]()
+    _, here = play(env, env.reset(), 10)
+    other = COPY[how](env)
+    assert type(other) is type(env)
+    assert (other.config, other.batch_size, other.device) == (
+        *(env.config, env.batch_size, env.device),
+    )
+    # The original goes first: what it does must not reach the copy.
+    expected, _ = play(env, here.clone(), 40)
+    got, _ = play(other, here.clone(), 40)
+    assert_same(expected, got)
+    assert expected["truncated"].any()
+
+
+def test_what_slept_wakes_up_in_a_copy():
+    env = safety_gym("PointGoal2")
+    _, here = play(env, env.reset(), 10)
+    other = copy.deepcopy(env)
+    (expected, _), (got, _) = play(env, here.clone(), 5), play(other, here.clone(), 5)
+    torch.testing.assert_close(got["observation"], expected["observation"], rtol=0, atol=1e-5)
+
+
+@pytest.mark.parametrize("name", ["PointPush1", "CarButton2", "SafeHopperVelocity"])
+def test_copies_before_the_first_reset_begin_the_same_episodes(name):
+    env = MAKERS[name]()
+    other = copy.deepcopy(env)
+    assert_same(env.reset(), other.reset())
+    assert_same(env.reset(), other.reset())
+
+
+def test_a_copy_under_transforms_goes_on_too():
+    env = TransformedEnv(MAKERS["PointGoal2"](), Compose(StepCounter(), RewardSum()))
+    _, here = play(env, env.reset(), 10)
+    for make_copy in COPY.values():
+        other = make_copy(env)
+        (expected, _), (got, _) = play(copy.deepcopy(env), here, 20), play(other, here, 20)
+        assert_same(expected, got)
+        assert expected["step_count"].max() == BUSY["num_steps"]
+
+
+@pytest.mark.parametrize("how", COPY)
+def test_copies_in_gymnasium(how):
+    make = {"id": "Safexp-PointGoal2-v0", "config": {"num_steps": 15}, "sleep": False}
+    for env in (gymnasium.make(**make), gymnasium.make_vec(**make, num_envs=2)):
+        env.reset(seed=1)
+        actions = np.random.default_rng(0).uniform(-1, 1, (30, *env.action_space.shape))
+        actions = actions.astype(np.float32)
+        for action in actions[:7]:
+            env.step(action)
+        other = COPY[how](env)
+        for action in actions[7:14]:
+            # each of them in turn
+            expected, got = env.step(action), other.step(action)
+            np.testing.assert_array_equal(expected[0], got[0])
+            np.testing.assert_array_equal(expected[1], got[1])
