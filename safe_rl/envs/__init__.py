@@ -10,6 +10,7 @@ from safe_rl.envs.opengl import OpenGLError
 from safe_rl.envs.contract import (
     ConstrainedEnv,
     ContractError,
+    PositionedEnv,
     SnapshotEnv,
     check_constrained_env,
 )
@@ -30,6 +31,7 @@ __all__ = [
     "ContractError",
     "LayoutError",
     "OpenGLError",
+    "PositionedEnv",
     "SafetyGymConfig",
     "SafetyGymEnv",
     "SnapshotEnv",

@@ -104,6 +104,15 @@ class SnapshotEnv(Protocol):
         ...
 
 
+@runtime_checkable
+class PositionedEnv(Protocol):
+    """An environment that tells where things are; nothing in training asks for it."""
+
+    def get_positions(self) -> TensorDictBase:
+        """Return copies of positions by kind, a TensorDict [N] of [N, K, 3] (m)."""
+        ...
+
+
 class ContractError(TypeError):
     """An environment that nothing else can work with; the message lists what it lacks."""
 

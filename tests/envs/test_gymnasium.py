@@ -209,7 +209,7 @@ def run(envs, mode, num_steps):
 @pytest.mark.parametrize("mode", MODES)
 def test_a_batch_of_one_is_gymnasiums_vector_of_one(mode, flatten):
     config = {**SHORT, "observation_flatten": flatten}
-    make = {"id": "Safexp-CarGoal2-v0", "config": config}
+    make = {"id": "Safexp-CarGoal2-v0", "config": config, "positions": flatten}
     ours = gymnasium.make_vec(**make, num_envs=1, autoreset_mode=mode)
     theirs = SyncVectorEnv([lambda: gymnasium.make(**make)], autoreset_mode=mode)
     assert ours.metadata["autoreset_mode"] is mode

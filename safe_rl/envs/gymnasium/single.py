@@ -32,6 +32,8 @@ class SafetyGymnasiumEnv(gymnasium.Env[Any, np.ndarray]):
         width: of a frame [pixels].
         height: of a frame [pixels].
         sleep: as `SafetyGymEnv` takes it.
+        positions: put `info["positions"]` into every info: float64 [K, 3] by kind (m), as
+            `SafetyGymEnv.get_positions` has them.
 
     Raises:
         ConfigError: for a configuration that cannot be used.
@@ -58,8 +60,9 @@ class SafetyGymnasiumEnv(gymnasium.Env[Any, np.ndarray]):
         width: int = 480,
         height: int = 360,
         sleep: bool = True,
+        positions: bool = False,
     ) -> None:
-        self._worlds = Worlds(configure(name, config), 1, 1, sleep, render_mode)
+        self._worlds = Worlds(configure(name, config), 1, 1, sleep, render_mode, positions)
         self._view: dict[str, Any] = {"camera": camera, "width": width, "height": height}
         self.render_mode = render_mode
         self.metadata = self._worlds.metadata()
@@ -79,11 +82,9 @@ class SafetyGymnasiumEnv(gymnasium.Env[Any, np.ndarray]):
         self._worlds.seed(seed, self.np_random)
         observation = take(self._worlds.reset(), 0)
         self._show()
-        return observation, {}
+        return observation, self._positions()
 
-    def step(
-        self, action: np.ndarray
-    ) -> tuple[Observation, float, bool, bool, dict[str, float | bool]]:
+    def step(self, action: np.ndarray) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
         """Take one action [nu]."""
         step = self._worlds.step(np.asarray(action)[None])
         infos = {key: values[0].item() for key, values in self._worlds.infos(step).items()}
@@ -93,7 +94,7 @@ class SafetyGymnasiumEnv(gymnasium.Env[Any, np.ndarray]):
             step["reward"].item(),
             step["terminated"].item(),
             step["truncated"].item(),
-            infos,
+            infos | self._positions(),
         )
 
     def render(self) -> np.ndarray | None:
@@ -106,6 +107,9 @@ class SafetyGymnasiumEnv(gymnasium.Env[Any, np.ndarray]):
     def close(self) -> None:
         """Close the viewer and free what OpenGL holds."""
         self.safety_gym.close()
+
+    def _positions(self) -> dict[str, Any]:
+        return {key: take(values, 0) for key, values in self._worlds.positions().items()}
 
     def _show(self) -> None:
         if self.render_mode == "human":

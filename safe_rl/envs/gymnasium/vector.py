@@ -11,7 +11,6 @@ from gymnasium.vector.utils import batch_space
 
 from safe_rl.envs.gymnasium.worlds import (
     RENDER_MODES,
-    Arrays,
     Observation,
     Worlds,
     arrays_of,
@@ -42,6 +41,8 @@ class SafetyGymnasiumVectorEnv(VectorEnv[Any, np.ndarray, np.ndarray]):
         height: of a frame [pixels].
         num_threads: threads that step the physics; 0 for one per core.
         sleep: as `SafetyGymEnv` takes it.
+        positions: put `infos["positions"]` into all infos: float64 [N, K, 3] by kind (m), as
+            `SafetyGymEnv.get_positions` has them.
 
     Raises:
         ConfigError: for a configuration that cannot be used.
@@ -75,8 +76,11 @@ class SafetyGymnasiumVectorEnv(VectorEnv[Any, np.ndarray, np.ndarray]):
         height: int = 360,
         num_threads: int = 0,
         sleep: bool = True,
+        positions: bool = False,
     ) -> None:
-        self._worlds = Worlds(configure(name, config), num_envs, num_threads, sleep, render_mode)
+        self._worlds = Worlds(
+            configure(name, config), num_envs, num_threads, sleep, render_mode, positions
+        )
         self._view: dict[str, Any] = {"camera": camera, "width": width, "height": height}
         self.num_envs, self.render_mode = num_envs, render_mode
         self.autoreset_mode = AutoresetMode(autoreset_mode)
@@ -94,7 +98,7 @@ class SafetyGymnasiumVectorEnv(VectorEnv[Any, np.ndarray, np.ndarray]):
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[Observation, Arrays]:
+    ) -> tuple[Observation, dict[str, Any]]:
         """Start new episodes.
 
         Args:
@@ -112,7 +116,8 @@ class SafetyGymnasiumVectorEnv(VectorEnv[Any, np.ndarray, np.ndarray]):
         observation = self._worlds.reset(mask)
         self._ended = self._ended & ~mask if mask is not None else np.zeros_like(self._ended)
         self._show()
-        return observation, {}
+        new = np.ones(self.num_envs, dtype=bool) if mask is None else mask
+        return observation, with_masks(self._worlds.positions(), new)
 
     def step(
         self, actions: np.ndarray
@@ -131,7 +136,7 @@ class SafetyGymnasiumVectorEnv(VectorEnv[Any, np.ndarray, np.ndarray]):
         begins = self._begins(terminated | truncated)
         reported = with_masks(infos, ~begins)
         if self.autoreset_mode is AutoresetMode.SAME_STEP:
-            reported |= final_infos(observation, infos, begins)
+            reported |= final_infos(observation, infos | self._worlds.positions(), begins)
         else:
             # The step of a world that had already ended counts for nothing.
             reward, terminated, truncated = (
@@ -141,6 +146,8 @@ class SafetyGymnasiumVectorEnv(VectorEnv[Any, np.ndarray, np.ndarray]):
             self._ended = terminated | truncated
         if begins.any():
             observation = choose(begins, self._worlds.reset(begins), observation)
+        # Those of a world that begins are of its new episode.
+        reported |= with_masks(self._worlds.positions(), np.ones_like(begins))
         self._show()
         return observation, reward, terminated, truncated, reported
 
@@ -175,13 +182,20 @@ class SafetyGymnasiumVectorEnv(VectorEnv[Any, np.ndarray, np.ndarray]):
             self._worlds.show()
 
 
-def with_masks(infos: Arrays, mask: np.ndarray) -> Arrays:
-    """Add to every array [N] the mask `_<key>` of the worlds that it speaks of; 0 elsewhere."""
-    masked = {key: np.where(mask, values, np.zeros_like(values)) for key, values in infos.items()}
+def with_masks(infos: Mapping[str, Any], mask: np.ndarray) -> dict[str, Any]:
+    """Add to every array [N, …] the mask `_<key>` of the worlds that it speaks of; 0 elsewhere."""
+    masked = {
+        key: with_masks(values, mask)
+        if isinstance(values, dict)
+        else _choose(mask, values, np.zeros_like(values))
+        for key, values in infos.items()
+    }
     return masked | {f"_{key}": mask.copy() for key in infos}
 
 
-def final_infos(observation: Observation, infos: Arrays, ends: np.ndarray) -> dict[str, Any]:
+def final_infos(
+    observation: Observation, infos: Mapping[str, Any], ends: np.ndarray
+) -> dict[str, Any]:
     """Describe what ended, as Gymnasium does for episodes that are followed within the step."""
     if not ends.any():
         return {}

@@ -79,6 +79,7 @@ class Worlds:
         num_threads: as `SafetyGymEnv` takes it.
         sleep: as `SafetyGymEnv` takes it.
         render_mode: one of `RENDER_MODES`, or None.
+        with_positions: whether there are `positions` among the infos.
 
     Raises:
         ValueError: for another render mode.
@@ -92,6 +93,7 @@ class Worlds:
         num_threads: int,
         sleep: bool,
         render_mode: str | None,
+        with_positions: bool,
     ) -> None:
         if render_mode not in (None, *RENDER_MODES):
             raise ValueError(f"render_mode must be one of {RENDER_MODES}, got {render_mode!r}.")
@@ -105,6 +107,7 @@ class Worlds:
         self.action_space = space_of(self.env.action_spec)
         timestep = build_scene(config, sleep).model.opt.timestep
         self.seconds_per_step = timestep * config.frameskip_binom_n
+        self._with_positions = with_positions
         self._is_seeded = False
         self._shown_at = 0.0
 
@@ -138,6 +141,12 @@ class Worlds:
         """Costs (float64) and `goal_met` of a step, [N] each."""
         costs = {key: step[key].squeeze(-1).double().cpu().numpy() for key in self.env.cost_keys}
         return costs | {"goal_met": step["goal_met"].squeeze(-1).cpu().numpy()}
+
+    def positions(self) -> dict[str, Any]:
+        """Where everything is now, by kind [N, K, 3] (m), under `positions`; or nothing."""
+        if not self._with_positions:
+            return {}
+        return {"positions": arrays_of(self.env.get_positions())}
 
     def show(self) -> None:
         """Bring the viewer up to date, no faster than real time."""
