@@ -13,7 +13,6 @@ from statistics import NormalDist
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy import stats
 
 __all__ = ["Claim", "Verdict", "first_certified", "mean_bound", "rank", "share_bound"]
 
@@ -37,6 +36,8 @@ def mean_bound(values: ArrayLike, level: float) -> np.ndarray:
         >>> float(mean_bound([20.0, 22.0, 24.0, 26.0], level=0.95).round(2))
         26.04
     """
+    from scipy import stats  # here: it takes half a second, and not every command needs it
+
     values = np.asarray(values, dtype=float)
     number = values.shape[-1]
     if number < 2:
@@ -56,6 +57,8 @@ def share_bound(values: ArrayLike, limit: float, level: float) -> float:
         >>> round(share_bound([1.0] * 59, limit=2.0, level=0.95), 3)  # none of 59: below 5 %
         0.05
     """
+    from scipy import stats
+
     values = np.asarray(values, dtype=float)
     over, number = int((values > limit).sum()), len(values)
     if over == number:
