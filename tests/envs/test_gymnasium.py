@@ -297,3 +297,28 @@ def test_statistics_of_a_batch():
         rewards += reward
     np.testing.assert_allclose(infos["episode"]["r"], rewards)
     assert infos["episode"]["l"].tolist() == [3, 3, 3]
+
+
+@pytest.mark.parametrize("keys", [{}, {"randomize_layout": False}])
+def test_every_world_may_have_a_seed_of_its_own(keys):
+    make = {"id": "Safexp-PointGoal2-v0", "config": {**SHORT, **keys}}
+    seeds = [3, 11, 3]
+    envs, batch = gymnasium.make_vec(**make, num_envs=3), envs_of(make, 3)
+    first, _ = envs.reset(seed=seeds)
+    np.testing.assert_array_equal(first, batch.reset(seed=seeds)[0])
+    np.testing.assert_array_equal(first[0], first[2])
+    assert (first[0] != first[1]).any()
+    actions = np.zeros((3, 2), np.float32)
+    for _ in range(6):  # into the next episodes
+        np.testing.assert_array_equal(envs.step(actions)[0], batch.step(actions)[0])
+    again, _ = envs.reset(seed=[None, 11, None])
+    np.testing.assert_array_equal(again[1], first[1])
+    if not keys:
+        assert (again[0] != first[0]).any()
+    with pytest.raises(ValueError, match="3 worlds need as many seeds, got 2"):
+        envs.reset(seed=[1, 2])
+
+
+def envs_of(make, num_envs):
+    """Single worlds, as Gymnasium itself puts them together."""
+    return SyncVectorEnv([lambda: gymnasium.make(**make)] * num_envs)

@@ -12,6 +12,7 @@ from gymnasium.vector.utils import batch_space
 from safe_rl.envs.gymnasium.worlds import (
     RENDER_MODES,
     Observation,
+    Seeds,
     Worlds,
     arrays_of,
     configure,
@@ -97,18 +98,20 @@ class SafetyGymnasiumVectorEnv(VectorEnv[Any, np.ndarray, np.ndarray]):
         return self._worlds.env
 
     def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+        self, *, seed: Seeds = None, options: dict[str, Any] | None = None
     ) -> tuple[Observation, dict[str, Any]]:
         """Start new episodes.
 
         Args:
-            seed: determines the episodes of all worlds.
+            seed: determines the episodes of all worlds; or one for every world [N], which then has
+                those of `SafetyGymnasiumEnv` with that seed, and None goes on as it was seeded.
             options: `reset_mask`, bool [N], restricts the reset to some worlds.
 
         Raises:
-            ValueError: for a mask of another shape or type, or a seed for a part of the worlds.
+            ValueError: for a mask of another shape or type, or a seed for a part of the worlds,
+                or seeds of another number.
         """
-        super().reset(seed=seed)
+        super().reset(seed=seed if isinstance(seed, int) else None)
         mask = (options or {}).get("reset_mask")
         if mask is not None:
             self._check_mask(mask, seed)
@@ -168,7 +171,7 @@ class SafetyGymnasiumVectorEnv(VectorEnv[Any, np.ndarray, np.ndarray]):
             return ends
         return self._ended.copy()
 
-    def _check_mask(self, mask: np.ndarray, seed: int | None) -> None:
+    def _check_mask(self, mask: np.ndarray, seed: Seeds) -> None:
         if getattr(mask, "shape", None) != (self.num_envs,) or mask.dtype != bool or not mask.any():
             raise ValueError(
                 f"options['reset_mask'] must be a boolean array of shape ({self.num_envs},) with "

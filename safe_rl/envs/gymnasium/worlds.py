@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import gymnasium
@@ -24,6 +24,7 @@ LARGEST = np.finfo(np.float32).max
 NUM_SEEDS = 2**62
 
 Observation = np.ndarray | dict[str, np.ndarray]
+Seeds = int | Sequence[int | None] | None
 Arrays = dict[str, np.ndarray]
 
 
@@ -116,13 +117,20 @@ class Worlds:
         modes = [mode for mode in RENDER_MODES if mode != "human" or has_screen()]
         return {"render_modes": modes, "render_fps": max(1, round(1 / self.seconds_per_step))}
 
-    def seed(self, seed: int | None, generator: np.random.Generator) -> None:
-        """Seed all episodes to come; without a seed, once, with one that is drawn."""
-        if seed is None:
-            if self._is_seeded:
-                return
-            seed = int(generator.integers(NUM_SEEDS))
-        self.env.set_seed(seed % NUM_SEEDS)
+    def seed(self, seed: Seeds, generator: np.random.Generator) -> None:
+        """Seed all episodes to come; without a seed, once, with one that is drawn.
+
+        Raises:
+            ValueError: for a sequence with another length than the number of worlds.
+        """
+        rows = seed if isinstance(seed, Sequence) else None
+        if rows is not None or seed is None:
+            if not self._is_seeded:
+                self.env.set_seed(int(generator.integers(NUM_SEEDS)))
+            if rows is not None:
+                self.env.set_row_seeds([None if s is None else s % NUM_SEEDS for s in rows])
+        else:
+            self.env.set_seed(seed % NUM_SEEDS)
         self._is_seeded = True
 
     def reset(self, mask: np.ndarray | None = None) -> Observation:

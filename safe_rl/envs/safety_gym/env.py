@@ -131,6 +131,24 @@ class SafetyGymEnv(EnvBase):
         self._fixed_layout = rng.fold(torch.tensor(seed), Purpose.LAYOUT)
         self._episode.zero_()
 
+    def set_row_seeds(self, seeds: Sequence[int | None]) -> None:
+        """Seed every world on its own, [N]: with the episodes of row 0 of its seed.
+
+        None leaves a world as it was seeded.
+
+        Raises:
+            ValueError: if there are not as many seeds as worlds.
+        """
+        if len(seeds) != self.batch_size[0]:
+            raise ValueError(f"{self.batch_size[0]} worlds need as many seeds, got {len(seeds)}.")
+        self._fixed_layout = self._fixed_layout.expand(self.batch_size).clone()
+        for row, seed in enumerate(seeds):
+            if seed is not None:
+                require_integer("seed", seed, lowest=-(2**63))
+                self._row_seed[row] = rng.row_seeds(seed, 1)[0]
+                self._fixed_layout[row] = rng.fold(torch.tensor(seed), Purpose.LAYOUT)
+                self._episode[row] = 0
+
     def _layout_key(self) -> Tensor:
         key = rng.fold(self._row_seed, self._episode)
         if not self.config.randomize_layout:
