@@ -17,7 +17,7 @@ from omegaconf import OmegaConf
 from safe_rl.envs.families import env_names, env_node
 from safe_rl.envs.safety_gym.nodes import group_node
 from safe_rl.envs.safety_gym.records.config import SafetyGymConfig
-from safe_rl.envs.safety_gym.suite import EXTRAS, SUITE, resolve
+from safe_rl.envs.safety_gym.suite import EXTRAS, SUITE, TESTING, resolve
 
 GROUP = "env"
 SCHEME = "safe-rl-environments"
@@ -102,11 +102,14 @@ def store_configs() -> None:
 def register_gymnasium() -> None:
     """Give Gymnasium an id `Safexp-{name}-v0` for every name, and `Safexp-Custom-v0`.
 
+    The original's environments for tests are `Testing-{name}-v0`, as there.
+
     The custom one has the defaults of every configuration key; all of them take a `config` with
     keys to change. What the ids stand for is imported when an environment is made.
     """
-    for name in (*SUITE, *EXTRAS, None):
-        env_id = f"Safexp-{name or 'Custom'}-v0"
+    prefixes = dict.fromkeys((*SUITE, *EXTRAS, None), "Safexp") | dict.fromkeys(TESTING, "Testing")
+    for name, prefix in prefixes.items():
+        env_id = f"{prefix}-{name or 'Custom'}-v0"
         if env_id not in gymnasium.registry:
             gymnasium.register(
                 env_id,

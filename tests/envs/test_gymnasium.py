@@ -322,3 +322,46 @@ def test_every_world_may_have_a_seed_of_its_own(keys):
 def envs_of(make, num_envs):
     """Single worlds, as Gymnasium itself puts them together."""
     return SyncVectorEnv([lambda: gymnasium.make(**make)] * num_envs)
+
+
+def test_specs_say_how_long_episodes_are_and_time_is_up_once():
+    make = {"id": "Safexp-PointGoal1-v0", "config": {"num_steps": 1200}}
+    env = gymnasium.make(**make)
+    assert env.spec.max_episode_steps == 1200
+    assert gymnasium.make("Safexp-PointGoal1-v0").spec.max_episode_steps == 1000
+    env.reset(seed=0)
+    ends = [any(env.step(np.zeros(2, np.float32))[2:4]) for _ in range(1200)]
+    assert ends == [False] * 1199 + [True]
+    for wrapped in (env, gymnasium.wrappers.TransformReward(env, abs)):
+        assert wrapped.spec.max_episode_steps == 1200
+    assert gymnasium.make(env.spec).spec.max_episode_steps == 1200
+    envs = gymnasium.make_vec(**make, num_envs=2)
+    assert envs.spec.max_episode_steps == 1200
+    assert gymnasium.make_vec(envs.spec).unwrapped.safety_gym.max_episode_steps == 1200
+    short = gymnasium.make_vec(**make, num_envs=2, max_episode_steps=3)
+    short.reset(seed=0)
+    ends = [short.step(np.zeros((2, 2), np.float32))[3].all() for _ in range(3)]
+    assert ends == [False, False, True]
+
+
+def test_the_originals_environments_for_tests():
+    """Numbers of the original: components of the observation, hazards, and a straight way."""
+    ids = {env_id for env_id in gymnasium.registry if env_id.startswith("Testing-")}
+    grids = [f"{robot}Grid{way}" for robot in ("Point", "Car", "Doggo") for way in "0124"]
+    grids += [f"{robot}GridWall" for robot in ("Point", "Car", "Doggo")]
+    assert ids == {f"Testing-{name}-v0" for name in grids}
+    # accelerometer, velocimeter, gyro, magnetometer; goal and hazards lidar; remaining
+    env = gymnasium.make("Testing-PointGridWall-v0", positions=True, sleep=False)
+    assert env.observation_space.shape == (4 * 3 + 2 * 10 + 1,)
+    _, info = env.reset(seed=0)
+    hazards = info["positions"]["hazards"][:, :2]
+    assert len({tuple(place) for place in hazards.round(3).tolist()}) == 42
+    np.testing.assert_allclose(info["positions"]["goal"], [[0, 10, 0.26]], atol=1e-6)
+    assert (abs(info["positions"]["robot"][0, :2]) <= 1).all()
+    for robot in ("Car", "Doggo"):
+        env = gymnasium.make(f"Testing-{robot}Grid1-v0", config={"goal_locations": [(0, 0)],
+            "goal_size": 9.0, "goal_keepout": 0.0, "robot_keepout": 0.0})  # fmt: skip
+        env.reset(seed=0)
+        *_, terminated, _, info = env.step(np.zeros(env.action_space.shape, np.float32))
+        assert terminated
+        assert info["goal_met"]

@@ -7,6 +7,7 @@ from typing import Any
 
 import gymnasium
 import numpy as np
+from gymnasium.envs.registration import EnvSpec
 
 from safe_rl.envs.gymnasium.worlds import (
     RENDER_MODES,
@@ -15,6 +16,7 @@ from safe_rl.envs.gymnasium.worlds import (
     arrays_of,
     configure,
     take,
+    with_length,
 )
 from safe_rl.envs.safety_gym.env import SafetyGymEnv
 from safe_rl.envs.safety_gym.records.config import SafetyGymConfig
@@ -50,6 +52,8 @@ class SafetyGymnasiumEnv(gymnasium.Env[Any, np.ndarray]):
 
     metadata: dict[str, Any] = {"render_modes": list(RENDER_MODES), "render_fps": 50}  # noqa: RUF012
 
+    _spec: EnvSpec | None = None
+
     def __init__(
         self,
         name: str | None = None,
@@ -68,6 +72,15 @@ class SafetyGymnasiumEnv(gymnasium.Env[Any, np.ndarray]):
         self.metadata = self._worlds.metadata()
         self.observation_space = self._worlds.observation_space
         self.action_space = self._worlds.action_space
+
+    @property
+    def spec(self) -> EnvSpec | None:
+        """What it was made from; `max_episode_steps` is the configuration's `num_steps`."""
+        return with_length(self._spec, self.safety_gym.max_episode_steps)
+
+    @spec.setter
+    def spec(self, spec: EnvSpec | None) -> None:
+        self._spec = spec
 
     @property
     def safety_gym(self) -> SafetyGymEnv:

@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
+from gymnasium.envs.registration import EnvSpec
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
@@ -17,6 +18,7 @@ from safe_rl.envs.gymnasium.worlds import (
     arrays_of,
     configure,
     take,
+    with_length,
 )
 from safe_rl.envs.safety_gym.env import SafetyGymEnv
 from safe_rl.envs.safety_gym.records.config import SafetyGymConfig
@@ -44,6 +46,7 @@ class SafetyGymnasiumVectorEnv(VectorEnv[Any, np.ndarray, np.ndarray]):
         sleep: as `SafetyGymEnv` takes it.
         positions: put `infos["positions"]` into all infos: float64 [N, K, 3] by kind (m), as
             `SafetyGymEnv.get_positions` has them.
+        max_episode_steps: takes the place of `num_steps`; `gymnasium.make_vec` passes it on.
 
     Raises:
         ConfigError: for a configuration that cannot be used.
@@ -64,6 +67,8 @@ class SafetyGymnasiumVectorEnv(VectorEnv[Any, np.ndarray, np.ndarray]):
         "autoreset_mode": AutoresetMode.NEXT_STEP,
     }
 
+    _spec: EnvSpec | None = None
+
     def __init__(
         self,
         num_envs: int = 1,
@@ -78,10 +83,12 @@ class SafetyGymnasiumVectorEnv(VectorEnv[Any, np.ndarray, np.ndarray]):
         num_threads: int = 0,
         sleep: bool = True,
         positions: bool = False,
+        max_episode_steps: int | None = None,
     ) -> None:
-        self._worlds = Worlds(
-            configure(name, config), num_envs, num_threads, sleep, render_mode, positions
-        )
+        config = configure(name, config)
+        if max_episode_steps is not None:
+            config = config.replace(num_steps=max_episode_steps)
+        self._worlds = Worlds(config, num_envs, num_threads, sleep, render_mode, positions)
         self._view: dict[str, Any] = {"camera": camera, "width": width, "height": height}
         self.num_envs, self.render_mode = num_envs, render_mode
         self.autoreset_mode = AutoresetMode(autoreset_mode)
@@ -91,6 +98,15 @@ class SafetyGymnasiumVectorEnv(VectorEnv[Any, np.ndarray, np.ndarray]):
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
         self._ended = np.zeros(num_envs, dtype=bool)
+
+    @property
+    def spec(self) -> EnvSpec | None:
+        """What it was made from; `max_episode_steps` is the configuration's `num_steps`."""
+        return with_length(self._spec, self.safety_gym.max_episode_steps)
+
+    @spec.setter
+    def spec(self, spec: EnvSpec | None) -> None:
+        self._spec = spec
 
     @property
     def safety_gym(self) -> SafetyGymEnv:

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import gymnasium
 import numpy as np
 import torch
+from gymnasium.envs.registration import EnvSpec
 from tensordict import TensorDict, TensorDictBase
 from torchrl.data import Composite, TensorSpec
 
@@ -55,6 +57,15 @@ def space_of(spec: TensorSpec) -> gymnasium.Space:
         for bound in (spec.space.low, spec.space.high)
     )
     return gymnasium.spaces.Box(low, high, dtype=np.float32)
+
+
+def with_length(spec: EnvSpec | None, num_steps: int) -> EnvSpec | None:
+    """Return a spec that says how long episodes are, for wrappers and tools that ask it.
+
+    The registered one does not: Gymnasium would add a time-out of its own to the environment's,
+    and it would stand where a configuration has another `num_steps`.
+    """
+    return None if spec is None else replace(spec, max_episode_steps=num_steps)
 
 
 def arrays_of(observation: torch.Tensor | TensorDictBase) -> Observation:
@@ -123,14 +134,12 @@ class Worlds:
         Raises:
             ValueError: for a sequence with another length than the number of worlds.
         """
-        rows = seed if isinstance(seed, Sequence) else None
-        if rows is not None or seed is None:
-            if not self._is_seeded:
-                self.env.set_seed(int(generator.integers(NUM_SEEDS)))
-            if rows is not None:
-                self.env.set_row_seeds([None if s is None else s % NUM_SEEDS for s in rows])
-        else:
-            self.env.set_seed(seed % NUM_SEEDS)
+        if isinstance(seed, int | np.integer):
+            self.env.set_seed(int(seed) % NUM_SEEDS)
+        elif not self._is_seeded:
+            self.env.set_seed(int(generator.integers(NUM_SEEDS)))
+        if isinstance(seed, Sequence):
+            self.env.set_row_seeds([None if s is None else s % NUM_SEEDS for s in seed])
         self._is_seeded = True
 
     def reset(self, mask: np.ndarray | None = None) -> Observation:
