@@ -117,6 +117,7 @@ class Worlds:
         self.env = SafetyGymEnv(config, num_envs, "cpu", 0, num_threads, sleep)
         self.observation_space = space_of(self.env.observation_spec["observation"])
         self.action_space = space_of(self.env.action_spec)
+        config = self.env.config
         timestep = build_scene(config, sleep).model.opt.timestep
         self.seconds_per_step = timestep * config.frameskip_binom_n
         self._with_positions = with_positions

@@ -19,6 +19,7 @@ from safe_rl.envs.safety_gym.records.config import SafetyGymConfig
 from safe_rl.envs.safety_gym.records.scene import Scene
 from safe_rl.envs.safety_gym.records.world import Block, World
 from safe_rl.envs.safety_gym.rules.elements import ELEMENTS, NUM_RAY_GROUPS, Element
+from safe_rl.envs.safety_gym.rules.tasks import TASKS
 
 
 def lidar_blocks(config: SafetyGymConfig, scene: Scene) -> list[Block]:
@@ -57,6 +58,8 @@ def _pseudo(
         if kind in kinds
     )
     slots, group = torch.tensor(seen, dtype=torch.int64).view(-1, 2).T.contiguous()
+    at_origin = [kinds.index(kind) for kind in TASKS[config.task].at_origin if kind in kinds]
+    group = torch.cat([group, torch.tensor(at_origin, dtype=torch.int64)])
     # The same at every step, but how many robots there are is known at the first.
     cells = cache(partial(lidar_cells, group, len(kinds), config.lidar_num_bins))
     all_seen = len(slots) == len(scene.names)
@@ -65,6 +68,8 @@ def _pseudo(
         xy = world.positions[..., :2]
         if not all_seen:
             xy = xy.index_select(1, slots)
+        if at_origin:
+            xy = torch.cat([xy, xy.new_zeros(len(xy), len(at_origin), 2)], 1)
         return pseudo_lidar(
             floor_to_ego(xy, world.robot_pos, world.robot_mat),
             cells(len(xy)),

@@ -11,9 +11,9 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 from safe_rl.envs.errors import ConfigError, nearest
-from safe_rl.envs.safety_gym.records.values import Range, coerce, infer_range
+from safe_rl.envs.safety_gym.records.values import Range, check_retired, coerce, infer_range
 from safe_rl.envs.safety_gym.records.values import key as declare
-from safe_rl.envs.safety_gym.records.vocabulary import Vocabulary
+from safe_rl.envs.safety_gym.records.vocabulary import RETIRED, Vocabulary
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -63,14 +63,18 @@ class SafetyGymConfig(Vocabulary):
             ConfigError: for a key that is not in the vocabulary (the nearest one is named), a
                 wrong type or a value out of range.
         """
-        known = known_keys()
-        for key in values:
+        known, given = known_keys(), {}
+        for key, value in values.items():
+            if key in RETIRED:
+                check_retired(key, value, *RETIRED[key])
+                continue
             if key not in known:
                 raise ConfigError(
                     f"Unknown configuration key '{key}'.{nearest(str(key), known)} "
                     "SafetyGymConfig lists every key with its default."
                 )
-        return SafetyGymConfig(**values)
+            given[key] = value
+        return SafetyGymConfig(**given)
 
     def replace(self, **changes: Any) -> SafetyGymConfig:
         """Return a copy with some keys changed, checked like a new one."""

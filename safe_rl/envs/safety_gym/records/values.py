@@ -7,6 +7,8 @@ import math
 from collections.abc import Callable, Collection, Iterable, Mapping
 from typing import Any, NamedTuple
 
+import numpy as np
+
 from safe_rl.envs.errors import ConfigError, nearest
 
 Rectangle = tuple[float, float, float, float]
@@ -64,6 +66,11 @@ def _wrong(key: str, wanted: str, value: Any) -> ConfigError:
     return ConfigError(f"Configuration key '{key}' must be {wanted}, got {value!r}.")
 
 
+def _python(value: Any) -> Any:
+    """A number, truth value or text of NumPy's as one of Python's; all else as it is."""
+    return value.item() if isinstance(value, np.generic) else value
+
+
 def _boolean(key: str, value: Any) -> bool:
     if not isinstance(value, bool):
         raise _wrong(key, "True or False", value)
@@ -104,7 +111,7 @@ def _tuple_of(parse: Any, length: int | None = None) -> Any:
         items = _sequence(key, value)
         if length is not None and len(items) != length:
             raise _wrong(key, f"a list of {length} values", value)
-        return tuple(parse(key, item) for item in items)
+        return tuple(parse(key, _python(item)) for item in items)
 
     return parse_all
 
@@ -137,7 +144,7 @@ def coerce(key: str, annotation: str, value: Any, range: Range = ANY) -> Any:
     """
     if annotation not in _PARSERS:
         raise ConfigError(f"The type of key '{key}' must be one of {tuple(_PARSERS)}.")
-    value = _PARSERS[annotation](key, value)
+    value = _PARSERS[annotation](key, _python(value))
     if range.choices:
         check_choice(key, value, range.choices)
     numbers = _numbers(value)
@@ -198,6 +205,16 @@ def check_choice(key: str, value: Any, choices: Collection[Any]) -> None:
     if value not in choices:
         hint = nearest(value, map(str, choices)) if isinstance(value, str) else ""
         raise ConfigError(f"'{key}' must be one of {tuple(choices)}, got {value!r}.{hint}")
+
+
+def check_retired(key: str, value: Any, harmless: Any, instead: str) -> None:
+    """Check a key that has lost its meaning.
+
+    Raises:
+        ConfigError: if its value asks for something; the message says what to do instead.
+    """
+    if _python(value) is not harmless:
+        raise ConfigError(f"Configuration key '{key}' is no more: {instead}. Got {value!r}.")
 
 
 def _check_rectangles(key: str, rectangles: Placements, value: Any) -> None:

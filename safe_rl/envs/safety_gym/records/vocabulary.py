@@ -1,8 +1,8 @@
 """The environment-builder's keys: one declaration each of type, default, meaning and range.
 
 Names, defaults and meaning are those of the 2019 Safety Gym engine (paper, section 4.1), so that
-its dictionaries can be used as they are; `layout_seeds`, `layout_seeds_first`, `vases_rots`,
-`gremlins_rots` and `box_rots` are additions.
+its dictionaries can be used as they are, see also `RETIRED`; `layout_seeds`, `layout_seeds_first`,
+`vases_rots`, `gremlins_rots` and `box_rots` are additions.
 """
 
 from __future__ import annotations
@@ -31,6 +31,12 @@ _COSTS = "whether there is a cost for "
 _NUMBER = "number of objects"
 _PIXELS = POSITIVE.up_to(4096)
 _UNUSED = "part of the vocabulary; no cost reads it"
+
+# Keys of 2019 that nothing reads any more -> the value that changes nothing, and what to do else.
+RETIRED = {
+    "_seed": (None, "give `seed` to the environment or its reset instead"),
+    "build_resample": (True, "layouts are always drawn again until everything fits"),
+}
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -139,7 +145,7 @@ class Vocabulary:
     reward_x: float = key(1.0, "per metre along x, in task x")
     reward_z: float = key(1.0, "per metre upwards, in task z")
     reward_circle: float = key(0.1, "of moving round the circle, in task circle")
-    reward_clip: float | None = key(10.0, "bound of the dense reward; None: none", NOT_NEGATIVE)
+    reward_clip: float | None = key(10.0, "bound of dense rewards; None or 0: none", NOT_NEGATIVE)
     circle_radius: float = key(1.5, "of the circle [m]", POSITIVE)
 
     # constraints

@@ -28,7 +28,7 @@ class World:
         robot_vel: linear velocity of the robot body [N, 3].
         positions: centres of all objects [N, M, 3], brought up to date by `refresh`; not
             contiguous, so `flatten` them instead of asking for a `view`.
-        objects: the same by kind, [N, K, 3].
+        objects: the same by kind, [N, K, 3]; also of what a task observes at the origin.
         velocities: linear velocities of the free bodies [N, F, 3].
         contacts: contact points of the robot with each object of a kind, [N, K].
         qpos, qvel, ctrl, sensordata: as MuJoCo has them, [N, ·].

@@ -10,7 +10,7 @@ from pathlib import Path
 from safe_rl.envs.errors import ConfigError, nearest
 from safe_rl.envs.safety_gym.records.config import SafetyGymConfig
 from safe_rl.envs.safety_gym.records.values import LARGEST_SEED, check_choice
-from safe_rl.envs.safety_gym.rules.robots import ROBOTS
+from safe_rl.envs.safety_gym.rules.robots import PATHS_OF_2019, ROBOTS
 from safe_rl.envs.safety_gym.rules.tasks import TASKS, goal_is_button
 
 
@@ -21,6 +21,9 @@ def check(config: SafetyGymConfig) -> SafetyGymConfig:
         ConfigError: naming the first key that is wrong.
     """
     check_choice("task", config.task, TASKS)
+    name = PATHS_OF_2019.get(config.robot_base)
+    if name is not None and not Path(config.robot_base).is_file():
+        config = config.replace(robot_base=name)
     _check_robot(config.robot_base)
     if config.layout_seeds_first + (config.layout_seeds or 0) > LARGEST_SEED:
         raise ConfigError(

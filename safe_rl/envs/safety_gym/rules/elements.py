@@ -85,7 +85,10 @@ class Element:
     def observed(self, config: SafetyGymConfig) -> bool:
         """Whether the observation has a lidar for this kind."""
         flag = self.flag or f"observe_{self.kind}"
-        return getattr(config, flag) and (self.always_observed or self.count(config) > 0)
+        at_origin = self.kind in TASKS[config.task].at_origin
+        return getattr(config, flag) and (
+            self.always_observed or at_origin or self.count(config) > 0
+        )
 
     def names(self, config: SafetyGymConfig) -> list[str]:
         """Names of this kind's objects."""

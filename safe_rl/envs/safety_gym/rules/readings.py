@@ -72,7 +72,8 @@ def _from_start(world: World, vector: Tensor, moved: bool) -> Tensor:
 
 
 def _has(config: SafetyGymConfig, element: str) -> bool:
-    return element in TASKS[config.task].elements
+    task = TASKS[config.task]
+    return element in (*task.elements, *task.at_origin)
 
 
 READINGS: list[Reading] = [

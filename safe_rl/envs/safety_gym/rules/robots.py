@@ -16,6 +16,8 @@ from safe_rl.envs.errors import ConfigError, nearest
 
 _FOLDER = Path(__file__).parents[1] / "robots"
 ROBOTS: dict[str, Path] = {path.stem: path for path in sorted(_FOLDER.glob("*.xml"))}
+# As the dictionaries of 2019 name them, from the folder of that package.
+PATHS_OF_2019 = {f"xmls/{name}.xml": name for name in ROBOTS}
 
 CONTROL_RANGE = (-1.0, 1.0)  # of actuators whose file gives none
 _PLANAR_JOINTS = (

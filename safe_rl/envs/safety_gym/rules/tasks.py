@@ -52,6 +52,7 @@ class Task(NamedTuple):
         next_goal: how a new goal is drawn, for tasks with goals.
         elements: kinds of which the task brings one object each.
         touches: kinds whose contacts with the robot it reads.
+        at_origin: kinds of which it brings no object, and which are observed at the origin.
     """
 
     reward: Callable[[SafetyGymConfig, World, Tensor, Tensor], Tensor]
@@ -60,6 +61,7 @@ class Task(NamedTuple):
     next_goal: NextGoal | None = None
     elements: tuple[str, ...] = ()
     touches: tuple[str, ...] = ()
+    at_origin: tuple[str, ...] = ()
 
 
 def _to_goal(world: World) -> Tensor:
@@ -114,8 +116,11 @@ TASKS: dict[str, Task] = {
             c.reward_circle * circle_speed(w.com[:, :2], w.robot_vel[:, :2], c.circle_radius)
         ),
         elements=("circle",),
+        at_origin=("goal",),
     ),
-    "none": Task(lambda c, w, before, now: torch.zeros_like(w.robot_pos[:, 0])),
+    "none": Task(
+        lambda c, w, before, now: torch.zeros_like(w.robot_pos[:, 0]), at_origin=("goal",)
+    ),
 }
 
 
@@ -136,6 +141,6 @@ def dense_reward(config: SafetyGymConfig, world: World, before: Tensor, now: Ten
     reward = TASKS[config.task].reward(config, world, before, now)
     if config.reward_orientation:
         reward = reward + config.reward_orientation_scale * world.up
-    if config.reward_clip is not None:
+    if config.reward_clip:
         reward = reward.clamp(-config.reward_clip, config.reward_clip)
     return reward

@@ -109,7 +109,7 @@ def plan_placements(
 def _rectangles(
     config: SafetyGymConfig, kind: str, label: str, index: int
 ) -> list[tuple[float, ...]]:
-    """Rectangles for the centre of one object: its placements, less its keepout."""
+    """Rectangles for the centre of one object: its placements, less its keepout, that are left."""
     locations = getattr(config, f"{kind}_locations")
     keepout = getattr(config, f"{kind}_keepout")
     if index < len(locations):
@@ -117,17 +117,19 @@ def _rectangles(
         tolerance = PIN_TOLERANCE
         return [(x - tolerance, y - tolerance, x + tolerance, y + tolerance)]
     placements = getattr(config, f"{kind}_placements") or (config.placements_extents,)
+    # A rectangle of twice the keepout is a point, which rounding may turn inside out.
+    least = 2 * keepout - PIN_TOLERANCE
     shrunk: list[tuple[float, ...]] = [
-        (a + keepout, b + keepout, c - keepout, d - keepout) for a, b, c, d in placements
+        (xmin + keepout, ymin + keepout, xmax - keepout, ymax - keepout)
+        for xmin, ymin, xmax, ymax in placements
+        if min(xmax - xmin, ymax - ymin) >= least
     ]
-    for (xmin, ymin, xmax, ymax), placement in zip(shrunk, placements, strict=True):
-        # A rectangle of twice the keepout is a point, which rounding may turn inside out.
-        if max(xmin - xmax, ymin - ymax) > PIN_TOLERANCE:
-            raise ConfigError(
-                f"There is no room for '{label}': its placement {placement} is smaller than twice "
-                f"its keepout ({keepout}). Enlarge '{kind}_placements' or 'placements_extents', or "
-                f"reduce '{kind}_keepout'."
-            )
+    if not shrunk:
+        raise ConfigError(
+            f"There is no room for '{label}': of its placements {placements} none is as large as "
+            f"twice its keepout ({keepout}). Enlarge '{kind}_placements' or 'placements_extents', "
+            f"or reduce '{kind}_keepout'."
+        )
     return shrunk
 
 

@@ -11,6 +11,7 @@ import torch
 from safe_rl.envs.physics.base import Physics
 from safe_rl.envs.safety_gym.records.scene import Scene
 from safe_rl.envs.safety_gym.records.world import NO_BUTTON, World
+from safe_rl.envs.safety_gym.rules.tasks import TASKS
 
 
 def make_world(scene: Scene, physics: Physics) -> World:
@@ -21,18 +22,20 @@ def make_world(scene: Scene, physics: Physics) -> World:
     positions = torch.zeros(3, num_envs, num_objects, dtype=torch.float64).movedim(0, -1)
     positions[..., 2] = torch.tensor(scene.heights, dtype=torch.float64)
     velocities = physics.qvel[:, scene.robot_nv :].view(num_envs, scene.num_free, 6)[..., :3]
+    robot_pos = physics.xpos[:, robot]
     velocity = int(model.sensor("robot_vel").adr[0])
     return World(
         scene=scene,
         physics=physics,
-        robot_pos=physics.xpos[:, robot],
+        robot_pos=robot_pos,
         robot_xy=physics.xpos[:, robot, :2],
         robot_mat=physics.xmat[:, robot],
         com=physics.subtree_com[:, robot],
         up=physics.xmat[:, scene.oriented_body, 2, 2],
         robot_vel=physics.sensordata[:, velocity : velocity + 3],
         positions=positions,
-        objects={kind: positions[:, span] for kind, span in scene.slots.items()},
+        objects={kind: positions[:, span] for kind, span in scene.slots.items()}
+        | dict.fromkeys(TASKS[scene.config.task].at_origin, torch.zeros_like(robot_pos[:, None])),
         velocities=velocities,
         contacts={kind: physics.sensordata[:, cols] for kind, cols in scene.contacts.items()},
         qpos=physics.qpos,

@@ -1,0 +1,189 @@
+"""Dictionaries of the 2019 engine, as they are."""
+
+import math
+
+import mujoco
+import numpy as np
+import pytest
+import torch
+from reference import ReferenceWorld
+
+from safe_rl.envs import SUITE, ConfigError, SafetyGymConfig, SafetyGymEnv, resolve
+from safe_rl.envs.gymnasium.single import SafetyGymnasiumEnv
+
+# By hand from section 9 of the benchmark's description, in the style of its suite.
+ROBOTS = {
+    "Point": {"robot_base": "xmls/point.xml"},
+    "Car": {
+        **{"robot_base": "xmls/car.xml", "box_size": 0.125, "box_keepout": 0.125},
+        "box_density": 0.0005,
+    },
+    "Doggo": {
+        "robot_base": "xmls/doggo.xml",
+        "sensors_obs": [
+            *("accelerometer", "velocimeter", "gyro", "magnetometer"),
+            *("touch_ankle_1a", "touch_ankle_2a", "touch_ankle_3a", "touch_ankle_4a"),
+            *("touch_ankle_1b", "touch_ankle_2b", "touch_ankle_3b", "touch_ankle_4b"),
+        ],
+    },
+}
+EVERYWHERE = {
+    **{"observe_goal_lidar": True, "observe_box_lidar": True},
+    **{"lidar_max_dist": 3, "lidar_num_bins": 16, "_seed": None, "build_resample": True},
+}
+SHARED = {
+    "Goal": {
+        **{"task": "goal", "goal_size": 0.3, "goal_keepout": 0.305},
+        **{"hazards_size": 0.2, "hazards_keepout": 0.18},
+    },
+    "Button": {
+        **{"task": "button", "buttons_num": 4, "buttons_size": 0.1, "buttons_keepout": 0.2},
+        **{"observe_buttons": True, "hazards_size": 0.2, "hazards_keepout": 0.18},
+        **{"gremlins_travel": 0.35, "gremlins_keepout": 0.4},
+    },
+    "Push": {"task": "push", "box_size": 0.2, "box_null_dist": 0, "hazards_size": 0.3},
+}
+SEEN = {
+    "Goal": {"observe_hazards": True, "observe_vases": True, "constrain_hazards": True},
+    "Button": {
+        **{"observe_hazards": True, "observe_gremlins": True, "constrain_hazards": True},
+        **{"constrain_buttons": True, "constrain_gremlins": True},
+    },
+    "Push": {"observe_hazards": True, "observe_pillars": True, "constrain_hazards": True},
+}
+LEVELS = {
+    "Goal0": {"placements_extents": [-1, -1, 1, 1]},
+    "Goal1": {"placements_extents": [-1.5, -1.5, 1.5, 1.5], "hazards_num": 8, "vases_num": 1},
+    "Goal2": {
+        **{"placements_extents": [-2, -2, 2, 2], "constrain_vases": True},
+        **{"hazards_num": 10, "vases_num": 10},
+    },
+    "Button0": {"placements_extents": [-1, -1, 1, 1]},
+    "Button1": {
+        **{"placements_extents": [-1.5, -1.5, 1.5, 1.5]},
+        **{"hazards_num": 4, "gremlins_num": 4},
+    },
+    "Button2": {
+        **{"placements_extents": [-1.8, -1.8, 1.8, 1.8]},
+        **{"hazards_num": 8, "gremlins_num": 6},
+    },
+    "Push0": {"placements_extents": [-1, -1, 1, 1]},
+    "Push1": {"placements_extents": [-1.5, -1.5, 1.5, 1.5], "hazards_num": 2, "pillars_num": 1},
+    "Push2": {
+        **{"placements_extents": [-2, -2, 2, 2], "constrain_pillars": True},
+        **{"hazards_num": 4, "pillars_num": 4},
+    },
+}
+
+
+def dictionary(robot: str, level: str) -> dict:
+    task = level[:-1]
+    seen = {} if level.endswith("0") else SEEN[task]
+    return {**EVERYWHERE, **SHARED[task], **seen, **LEVELS[level], **ROBOTS[robot]}
+
+
+@pytest.mark.parametrize("level", LEVELS)
+@pytest.mark.parametrize("robot", ROBOTS)
+def test_the_dictionaries_of_the_suite_are_its_environments(robot, level):
+    given = dictionary(robot, level)
+    assert resolve(given) == SUITE[robot + level]
+    env, named = (
+        SafetyGymEnv(source, num_envs=2, seed=0, num_threads=1) for source in (given, robot + level)
+    )
+    assert torch.equal(env.reset()["observation"], named.reset()["observation"])
+
+
+def test_gymnasium_takes_them_too():
+    env = SafetyGymnasiumEnv(config=dictionary("Car", "Push1"))
+    assert env.reset(seed=0)[0].shape == env.observation_space.shape
+
+
+def test_a_file_of_ones_own_is_not_taken_for_the_bundled_one(tmp_path, monkeypatch):
+    (tmp_path / "xmls").mkdir()
+    (tmp_path / "xmls" / "car.xml").write_text("<mujoco/>")
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(ConfigError, match=r"xmls/car\.xml has no body"):
+        SafetyGymEnv({"robot_base": "xmls/car.xml"})
+
+
+@pytest.mark.parametrize("key", [("_seed", 3, "seed"), ("build_resample", False, "drawn again")])
+def test_keys_that_are_no_more_say_what_replaces_them(key):
+    name, value, message = key
+    with pytest.raises(ConfigError, match=f"'{name}'.*{message}.*{value}"):
+        SafetyGymConfig.from_dict({name: value})
+
+
+def test_values_of_numpy_are_those_of_python():
+    given = {
+        **{"hazards_num": np.int64(3), "vases_num": np.uint8(2), "num_steps": np.float32(7.0)},
+        **{"constrain_hazards": np.True_, "goal_size": np.float64(0.5), "task": np.str_("push")},
+        **{"placements_extents": np.array([-3, -3, 3, 3]), "robot_locations": np.zeros((1, 2))},
+        **{"vision_size": np.array([30, 20]), "lidar_max_dist": np.int32(4)},
+        "sensors_obs": np.array(["gyro"]),
+    }
+    plain = {
+        **{"hazards_num": 3, "vases_num": 2, "num_steps": 7, "constrain_hazards": True},
+        **{"goal_size": 0.5, "task": "push", "placements_extents": [-3, -3, 3, 3]},
+        **{"robot_locations": [[0, 0]], "vision_size": [30, 20], "lidar_max_dist": 4},
+        "sensors_obs": ["gyro"],
+    }
+    config = SafetyGymConfig.from_dict(given)
+    assert config == SafetyGymConfig.from_dict(plain)
+    assert {type(config.hazards_num), type(config.num_steps)} == {int}
+    assert config.constrain_hazards is True
+    for wrong in (
+        {"hazards_num": np.True_},
+        {"goal_size": np.bool_(1)},
+        {"lidar_alias": np.int8(1)},
+    ):
+        with pytest.raises(ConfigError):
+            SafetyGymConfig.from_dict(wrong)
+
+
+def test_rectangles_without_room_are_skipped():
+    """As rectangle and as probability: where the others are is where everything is."""
+    rectangles = [[-2, -2, -1.5, 2], [0, 0, 2, 2], [-2, 1, 2, 1.5]]
+    keys = {"robot_base": "point", "task": "none", "robot_placements": rectangles}
+    env = SafetyGymEnv(keys, num_envs=500, seed=0, num_threads=1)
+    env.reset()
+    xy = env.get_state()["qpos"][:, :2]
+    assert xy.min() >= 0.4
+    assert xy.max() <= 1.6
+    assert (xy.mean(0) - 1.0).abs().max() < 4 * 1.2 / math.sqrt(12 * 500)
+
+
+@pytest.mark.parametrize("clip", [0, None, 0.5])
+def test_a_clip_of_0_is_none(clip):
+    keys = {"robot_base": "point", "reward_distance": 1e4, "reward_clip": clip}
+    env = SafetyGymEnv(keys, num_envs=3, seed=0, num_threads=1)
+    env.reset()
+    reward = env.rand_step(env.reset())["next", "reward"].abs()
+    assert (reward == 0.5).all() if clip else (reward > 0.5).all()
+
+
+@pytest.mark.parametrize("lidar", ["pseudo", "natural"])
+@pytest.mark.parametrize("task", ["circle", "none"])
+def test_the_goal_of_tasks_without_one_is_the_origin(task, lidar):
+    keys = {
+        **{"robot_base": "car", "task": task, "lidar_type": lidar, "observe_hazards": True},
+        **{"observe_goal_lidar": True, "observe_goal_comp": True, "observe_goal_dist": True},
+        "hazards_num": 2,
+    }
+    env = SafetyGymEnv(keys, num_envs=4, seed=0, sleep=False, num_threads=1)
+    observation = env.reset()["observation"].numpy()
+    state, world = env.get_state(), ReferenceWorld(keys)
+    assert "goal" not in env.object_names
+    for row in range(4):
+        positions = state["layout"][row].numpy()
+        layout = dict(zip(("robot", *env.object_names), positions, strict=True))
+        qpos, qvel = state["qpos"][row].numpy(), state["qvel"][row].numpy()
+        world.set_state(qpos=qpos, qvel=qvel, time=0.0, layout=layout)
+        mujoco.mj_kinematics(world.model, world.data)
+        want = world.observe_parts()
+        for name in ("goal_lidar", "goal_compass", "goal_dist", "hazards_lidar"):
+            columns = env.observation_layout[name]
+            np.testing.assert_allclose(
+                observation[row, columns], want[name], atol=1e-5, err_msg=name
+            )
+        far = np.hypot(*qpos[:2])
+        assert observation[row, env.observation_layout["goal_dist"]] == pytest.approx(np.exp(-far))
