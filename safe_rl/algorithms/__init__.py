@@ -3,6 +3,7 @@
 from safe_rl.algorithms.constraints import Constraints
 from safe_rl.algorithms.contract import Algorithm, PolicyUpdate, Recipe
 from safe_rl.algorithms.cpo_step import CPOStep
+from safe_rl.algorithms.crpo_step import CRPOStep
 from safe_rl.algorithms.learning_rate import KLAdaptiveRate
 from safe_rl.algorithms.minibatch import MinibatchUpdate
 from safe_rl.algorithms.on_policy import OnPolicy
@@ -11,6 +12,7 @@ from safe_rl.algorithms.trust_region_step import TRPOStep
 __all__ = [
     "Algorithm",
     "CPOStep",
+    "CRPOStep",
     "Constraints",
     "KLAdaptiveRate",
     "MinibatchUpdate",

@@ -13,33 +13,12 @@ from safe_rl.algorithms.trust_region_step import Proposal, TRPOStep, total_loss
 from safe_rl.objectives.cpo_dual import DualSolution, solve_dual
 from safe_rl.objectives.fisher import FisherProduct
 from safe_rl.objectives.trust_region import best_in_span, flat_gradient, solve_with_image
+from safe_rl.objectives.violation import constraint_value
 
-__all__ = ["CPOStep", "constraint_value"]
+__all__ = ["CPOStep"]
 
 #: Squared norm of a cost gradient below which a satisfied constraint is left out (case 4).
 _NO_GRADIENT = 1e-8
-
-
-def constraint_value(
-    cost_violation: Tensor, episode_length: Tensor, rescale_violation: bool
-) -> Tensor:
-    """c, the constraint violation in the units of the cost surrogate's gradient, [k].
-
-    A cost surrogate is an average per step, so the violation of an episode's cost has to be
-    divided by the episode's length. Without the division c is some thousand times too large, and
-    the boundary of the feasible set almost never crosses the trust region.
-
-    Args:
-        cost_violation: J_c − d, [k]. NaN (no episode has finished) counts as 0: the policy is
-            taken to be at the limit, and not allowed to raise the cost.
-        episode_length: T̄, scalar.
-        rescale_violation: whether to divide.
-
-    Returns:
-        c, [k].
-    """
-    divisor = episode_length if rescale_violation else torch.ones_like(episode_length)
-    return (cost_violation / divisor).nan_to_num(nan=0.0)
 
 
 class CPOStep(TRPOStep):

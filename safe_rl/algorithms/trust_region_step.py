@@ -177,14 +177,23 @@ class TRPOStep:
         cost_violation: Tensor | None,
         episode_length: Tensor | None,
     ) -> Proposal:
-        loss = total_loss(losses)
+        return self._natural_step(losses, fisher, total_loss)
+
+    def _natural_step(
+        self,
+        losses: TensorDictBase,
+        fisher: FisherProduct,
+        objective: Callable[[TensorDictBase], Tensor],
+    ) -> Proposal:
+        """The longest step along the natural gradient of an objective of the losses."""
+        loss = objective(losses)
         gradient = flat_gradient(loss, self.parameters)
         direction = self._solve(fisher, gradient)
         # Conjugate gradients leave a residual orthogonal to the solution x, so that xᵀHx = xᵀg.
         squared = (gradient @ direction).clamp_min(0)
         length = torch.where(squared > 0, (2 * self.target_kl / squared).sqrt(), 0.0)
         before = loss.detach()
-        return Proposal(-length * direction, lambda after: bool(total_loss(after) <= before), {})
+        return Proposal(-length * direction, lambda after: bool(objective(after) <= before), {})
 
     def _solve(self, fisher: FisherProduct, vector: Tensor) -> Tensor:
         return conjugate_gradient(fisher, vector, self.cg_iterations)

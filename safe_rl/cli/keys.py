@@ -50,6 +50,7 @@ class Key(NamedTuple):
 _SHARE = number(0, 1)
 _POSITIVE = number(0, above=True)
 _NOT_NEGATIVE = number(0)
+_STRENGTH = number(1e-9, 1e9)  # what is divided by, and divides
 _LIMITS = mapping_of(number(0))
 _SECTION = mapping_of(anything)
 
@@ -164,11 +165,31 @@ PARTS = {
         **_TRUST_REGION,
         "rescale_violation": Key(boolean, "whether violations are divided by the episode length"),
     },
+    "CRPOStep": {
+        **_TRUST_REGION,
+        "tolerance": Key(_NOT_NEGATIVE, "η, violation of an episode's cost that is let pass"),
+    },
     "PPOLoss": _CLIPPED_LOSS,
     "PPOLagrangianLoss": _CLIPPED_LOSS,
     "TRPOLoss": _LOSS,
     "TRPOLagrangianLoss": _LOSS,
     "CPOLoss": _LOSS,
+    "RCPOLoss": _CLIPPED_LOSS,
+    "P3OLoss": {
+        **_CLIPPED_LOSS,
+        "kappa": Key(_NOT_NEGATIVE, "penalty factor κ"),
+        "gamma": Key(optional(_SHARE), "discount that weighs the violation; null: 1/T̄ does"),
+    },
+    "IPOLoss": {
+        **_CLIPPED_LOSS,
+        "kappa": Key(_STRENGTH, "strength κ of the barrier"),
+        "max_weight": Key(_STRENGTH, "weight of costs at the limit and beyond"),
+    },
+    "FOCOPSLoss": {
+        **_LOSS,
+        "temperature": Key(_STRENGTH, "β, the trust region's multiplier"),
+        "max_state_kl": Key(_POSITIVE, "KL divergence beyond which a state teaches nothing"),
+    },
     "VectorGAE": _ESTIMATOR,
     "CostGAE": _ESTIMATOR,
     "LagrangeMultiplier": {
@@ -176,6 +197,11 @@ PARTS = {
         "lr": Key(_POSITIVE, "step size of Adam"),
         "betas": _OPTIMIZER["betas"],
         "eps": _OPTIMIZER["eps"],
+    },
+    "ProjectedMultiplier": {
+        "init": Key(one_or_per_cost(number(0, 1e6)), "first λ"),
+        "lr": Key(_POSITIVE, "change of λ per unit of violation"),
+        "highest": Key(optional(_POSITIVE), "upper bound of λ; null: none"),
     },
     "PIDMultiplier": {
         "init": Key(one_or_per_cost(number(0, 1e6)), "first λ"),

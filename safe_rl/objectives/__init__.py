@@ -3,10 +3,11 @@
 Everything here works on TensorDict keys alone and knows no environment:
 
 - `VectorGAE`, `CostGAE`, `normalise_advantages`: advantages of the reward and of k costs;
-- `LagrangeMultiplier`, `PIDMultiplier`, `PIMultiplier`: one λ per cost, moved by the mean episode
-  costs;
+- `LagrangeMultiplier`, `PIDMultiplier`, `PIMultiplier`, `ProjectedMultiplier`: one λ per cost, moved
+  by the mean episode costs;
 - `LimitTracker`: from the costs of a batch to how far J_c is from where it should be by now;
-- `PPOLoss`, `PPOLagrangianLoss`: policy losses for an optimiser;
+- `PPOLoss`, `PPOLagrangianLoss`, `RCPOLoss`, `P3OLoss`, `IPOLoss`, `FOCOPSLoss`: policy losses for
+  an optimiser;
 - `TRPOLoss`, `TRPOLagrangianLoss`, `CPOLoss`: policy losses for the steps of `safe_rl.algorithms`,
   whose mathematics is in `safe_rl.objectives.trust_region` and `safe_rl.objectives.cpo_dual`;
 - `CriticLoss`: squared errors of the reward and the cost critic;
@@ -18,11 +19,16 @@ from safe_rl.objectives.advantages import CostGAE, VectorGAE
 from safe_rl.objectives.controllers import PIMultiplier
 from safe_rl.objectives.cpo import CPOLoss
 from safe_rl.objectives.critics import CriticLoss
+from safe_rl.objectives.focops import FOCOPSLoss
+from safe_rl.objectives.ipo import IPOLoss
 from safe_rl.objectives.limits import LimitTracker
 from safe_rl.objectives.multipliers import LagrangeMultiplier, Multiplier
 from safe_rl.objectives.normalisation import normalise_advantages
+from safe_rl.objectives.p3o import P3OLoss
 from safe_rl.objectives.pid import PIDMultiplier
 from safe_rl.objectives.ppo import PPOLagrangianLoss, PPOLoss
+from safe_rl.objectives.projected import ProjectedMultiplier
+from safe_rl.objectives.rcpo import RCPOLoss
 from safe_rl.objectives.surrogate import SurrogateLoss
 from safe_rl.objectives.trpo import TRPOLagrangianLoss, TRPOLoss
 
@@ -31,14 +37,19 @@ __all__ = [
     "CPOLoss",
     "CostGAE",
     "CriticLoss",
+    "FOCOPSLoss",
+    "IPOLoss",
     "JointAdvantages",
     "LagrangeMultiplier",
     "LimitTracker",
     "Multiplier",
+    "P3OLoss",
     "PIDMultiplier",
     "PIMultiplier",
     "PPOLagrangianLoss",
     "PPOLoss",
+    "ProjectedMultiplier",
+    "RCPOLoss",
     "SurrogateLoss",
     "TRPOLagrangianLoss",
     "TRPOLoss",

@@ -160,11 +160,11 @@ class SurrogateLoss(LossModule):
         distribution = self._policy(tensordict)
         log_weight = self._log_weight(tensordict, distribution)
         bonus = entropy(distribution)
-        out = self._surrogates(tensordict, log_weight)
+        divergence = self._kl(tensordict, distribution, log_weight)
+        out = self._evaluate(tensordict, log_weight, divergence.unsqueeze(-1))
         out["loss_objective"] = self._reduce_loss(out["loss_objective"], tensordict)
         out["loss_entropy"] = -self.entropy_coeff * self._reduce_loss(bonus, tensordict)
-        divergence = self._kl(tensordict, distribution, log_weight).detach()
-        out["kl"] = self._reduce_loss(divergence, tensordict, reduction="mean")
+        out["kl"] = self._reduce_loss(divergence.detach(), tensordict, reduction="mean")
         out["entropy"] = self._reduce_loss(bonus.detach(), tensordict, reduction="mean")
         out["ESS"] = effective_sample_size(log_weight.detach(), sample_mask(tensordict))
         losses = TensorDict(out)
@@ -173,9 +173,21 @@ class SurrogateLoss(LossModule):
         )
         return losses
 
+    def _evaluate(
+        self, tensordict: TensorDictBase, log_weight: Tensor, divergence: Tensor
+    ) -> dict[str, Tensor]:
+        """`_surrogates`; what a loss overrides that needs the divergence itself, [..., 1]."""
+        del divergence
+        return self._surrogates(tensordict, log_weight)
+
     def _surrogates(self, tensordict: TensorDictBase, log_weight: Tensor) -> dict[str, Tensor]:
         """Per-sample ``loss_objective`` [..., 1] and the `extra_out_keys`."""
         raise NotImplementedError
+
+    def _cost_surrogates(self, tensordict: TensorDictBase, gain: Tensor) -> Tensor:
+        """Means over the samples of cost gains [..., k], whatever the reduction: [k]."""
+        means = [self._reduce_loss(cost, tensordict, reduction="mean") for cost in gain.unbind(-1)]
+        return torch.stack(means)
 
     def _policy(self, tensordict: TensorDictBase) -> Distribution:
         # A copy: actors write their loc and scale, which in the batch are the behaviour policy's.
@@ -237,6 +249,13 @@ class SurrogateLoss(LossModule):
     def _cost_gain(self, tensordict: TensorDictBase, ratio: Tensor) -> Tensor:
         """Cost surrogates per sample, [..., k]."""
         return ratio * self._cost_advantage(tensordict)
+
+    def _penalised_advantage(self, tensordict: TensorDictBase, log_weight: Tensor) -> Tensor:
+        """A − Σᵢ λᵢ A_cᵢ, the advantage of the reward less the weighed costs, [..., 1]."""
+        assert self.multiplier is not None
+        advantage = SurrogateLoss._advantage(self, tensordict, log_weight)
+        weighed = self._cost_advantage(tensordict) * self.multiplier.value
+        return advantage - weighed.sum(-1, keepdim=True)
 
     def extra_repr(self) -> str:
         """Keys that are read."""

@@ -6,13 +6,18 @@ import pytest
 import torch
 from cmdp import ONE, STEPS, TARGET, TWO, make_actor, train
 
-from safe_rl.algorithms import CPOStep, TRPOStep
+from safe_rl.algorithms import Constraints, CPOStep, CRPOStep, TRPOStep
 from safe_rl.objectives import (
     CPOLoss,
+    FOCOPSLoss,
+    IPOLoss,
     LagrangeMultiplier,
+    P3OLoss,
     PIDMultiplier,
     PPOLagrangianLoss,
     PPOLoss,
+    ProjectedMultiplier,
+    RCPOLoss,
     TRPOLagrangianLoss,
     TRPOLoss,
 )
@@ -35,7 +40,7 @@ def ppo_update(loss, actor):
             if losses["kl"] > 1.2 * TARGET_KL:
                 break
             adam.zero_grad()
-            losses["loss_objective"].backward()
+            sum(loss for key, loss in losses.items() if key.startswith("loss_")).backward()
             adam.step()
 
     return update
@@ -105,6 +110,47 @@ def cpo(actor, cmdp):
     return lambda batch, mean_costs: step(batch, mean_costs - cmdp.limits, torch.tensor(STEPS))
 
 
+def observed_first(constraints, cmdp, update):
+    def observe_and_update(batch, mean_costs):
+        constraints.violation.copy_(mean_costs - cmdp.limits)
+        constraints.episode_length.fill_(STEPS)
+        update(batch)
+
+    return observe_and_update
+
+
+def p3o(actor, cmdp):
+    constraints = Constraints(cmdp.cost_limits)
+    loss = P3OLoss(actor, constraints, kappa=20.0, gamma=1 - 1 / STEPS, **PPO)
+    return observed_first(constraints, cmdp, ppo_update(loss, actor))
+
+
+def ipo(actor, cmdp):
+    constraints = Constraints(cmdp.cost_limits)
+    loss = IPOLoss(actor, constraints, kappa=0.01, max_weight=10.0, **PPO)
+    return observed_first(constraints, cmdp, ppo_update(loss, actor))
+
+
+def projected_multiplier(cmdp):
+    return ProjectedMultiplier(cmdp.cost_limits, init=0.0, lr=0.1, highest=None)
+
+
+def focops(actor, cmdp):
+    multiplier = projected_multiplier(cmdp)
+    loss = FOCOPSLoss(actor, multiplier, temperature=1.5, max_state_kl=TARGET_KL, entropy_coeff=0.0)
+    return dual_ascent(multiplier, ppo_update(loss, actor))
+
+
+def rcpo(actor, cmdp):
+    multiplier = projected_multiplier(cmdp)
+    return dual_ascent(multiplier, ppo_update(RCPOLoss(actor, multiplier, **PPO), actor))
+
+
+def crpo(actor, cmdp):
+    step = CRPOStep(CPOLoss(actor, entropy_coeff=0.0), tolerance=0.0, **TRUST_REGION)
+    return lambda batch, mean_costs: step(batch, mean_costs - cmdp.limits, torch.tensor(STEPS))
+
+
 UNCONSTRAINED = [ppo, trpo]
 # Epochs: a multiplier moved by gradient steps overshoots before it settles, a controller does not.
 CONSTRAINED = [
@@ -113,6 +159,11 @@ CONSTRAINED = [
     (trpo_lagrangian, 200),
     (trpo_pid, 120),
     (cpo, 100),
+    (p3o, 120),
+    (ipo, 120),
+    (focops, 250),
+    (rcpo, 250),
+    (crpo, 150),
 ]
 
 

@@ -6,7 +6,6 @@ from samples import make_actor, make_batch, perturb
 from tensordict import TensorDict
 
 from safe_rl.algorithms import CPOStep, TRPOStep
-from safe_rl.algorithms.cpo_step import constraint_value
 from safe_rl.objectives import (
     CPOLoss,
     LagrangeMultiplier,
@@ -18,6 +17,7 @@ from safe_rl.objectives.distributions import gaussian_kl
 from safe_rl.objectives.fisher import FisherProduct
 from safe_rl.objectives.normalisation import normalise_advantages
 from safe_rl.objectives.trust_region import flatten, policy_in
+from safe_rl.objectives.violation import constraint_value
 
 DELTA = 0.01
 SETTINGS = {

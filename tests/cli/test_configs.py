@@ -26,7 +26,9 @@ def options(group: str) -> list[str]:
 ALGORITHMS = options("algo")
 COMBINATIONS = list(itertools.product(ALGORITHMS, options("preset")))
 # of the groups that only some algorithms have
-LAGRANGIAN = [name for name in ALGORITHMS if "lagrangian" in name]
+LAGRANGIAN = [
+    name for name in ALGORITHMS if "- /lagrangian:" in (CONF / "algo" / f"{name}.yaml").read_text()
+]
 MULTIPLIERS = [name for name in options("lagrangian") if name not in options("preset")]
 
 
@@ -135,13 +137,26 @@ CPO = {
         "_target_": "safe_rl.algorithms.CPOStep", **TRUST_REGION, "rescale_violation": True
     }
 }  # fmt: skip
+CRPO = {
+    "policy_update": {
+        "_target_": "safe_rl.algorithms.CRPOStep", **TRUST_REGION, "tolerance": 2.0
+    }
+}  # fmt: skip
+# of the methods' own articles, within the setting that all share
+PROJECTED = {"_target_": "safe_rl.objectives.ProjectedMultiplier", "init": 0.0}
 PAPER = {
     "ppo": SHARED | PPO,
     "ppo_lagrangian": SHARED | PPO | COSTS | MULTIPLIER,
     "trpo": SHARED | TRPO,
     "trpo_lagrangian": SHARED | TRPO | COSTS | MULTIPLIER,
     "cpo": SHARED | CPO | COSTS,
-}
+    "p3o": SHARED | PPO | COSTS,
+    "ipo": SHARED | PPO | COSTS,
+    "focops": SHARED | {"policy_update": PPO["policy_update"] | {"max_kl": 0.02}} | COSTS
+    | {"lagrangian": {**PROJECTED, "lr": 0.01, "highest": 2.0}},
+    "rcpo": SHARED | PPO | COSTS | {"lagrangian": {**PROJECTED, "lr": 0.001, "highest": None}},
+    "crpo": SHARED | CRPO | COSTS,
+}  # fmt: skip
 LOSSES = {
     "ppo": {"_target_": "safe_rl.objectives.PPOLoss", "clip_epsilon": 0.2},
     "ppo_lagrangian": {
@@ -152,7 +167,19 @@ LOSSES = {
     "trpo": {"_target_": "safe_rl.objectives.TRPOLoss"},
     "trpo_lagrangian": {"_target_": "safe_rl.objectives.TRPOLagrangianLoss"},
     "cpo": {"_target_": "safe_rl.objectives.CPOLoss"},
-}
+    "p3o": {
+        "_target_": "safe_rl.objectives.P3OLoss", "kappa": 20.0, "gamma": 0.99, "clip_epsilon": 0.2
+    },
+    "ipo": {
+        "_target_": "safe_rl.objectives.IPOLoss", "kappa": 0.01, "max_weight": 10.0,
+        "clip_epsilon": 0.2,
+    },
+    "focops": {
+        "_target_": "safe_rl.objectives.FOCOPSLoss", "temperature": 1.5, "max_state_kl": 0.02
+    },
+    "rcpo": {"_target_": "safe_rl.objectives.RCPOLoss", "clip_epsilon": 0.2},
+    "crpo": {"_target_": "safe_rl.objectives.CPOLoss"},
+}  # fmt: skip
 # per environment: steps in all, environments, steps per epoch
 SIZES = {
     "PointGoal1": (10_000_000, 30, 30_000),

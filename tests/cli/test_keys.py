@@ -27,6 +27,7 @@ HOMES = (safe_rl.algorithms, safe_rl.collectors, safe_rl.objectives, safe_rl.run
 # what recipes, collectors and run folders hand to a part themselves
 LIVE = {
     *("self", "loss", "actor_network", "multiplier", "value_network", "cost_keys", "cost_limits"),
+    "constraints",
     *("env", "make_env", "policy", "frames_per_batch", "device", "log_dir", "kwargs"),
 }
 FREE = {path for path, row in KEYS.items() if row.values is anything}

@@ -18,6 +18,11 @@ TABLES = {
     "trpo": ["trpo"],
     "trpo_lagrangian": ["constrained", "lagrangian", "trpo"],
     "cpo": ["constrained", "trpo", "cpo"],
+    "p3o": ["constrained", "ppo", "surrogates", "penalty"],
+    "ipo": ["constrained", "ppo", "surrogates", "barrier"],
+    "focops": ["constrained", "lagrangian", "adam", "focops"],
+    "rcpo": ["constrained", "lagrangian", "ppo"],
+    "crpo": ["constrained", "trpo", "surrogates", "crpo"],
 }
 
 
@@ -36,7 +41,7 @@ def columns(name, costs):
 
 def test_snippets_run_one_after_the_other():
     snippets = re.findall(r"```python\n(.*?)```", PAGE, re.DOTALL)
-    assert len(snippets) == 5
+    assert len(snippets) == 7
     exec("\n".join(snippets), {})
 
 
@@ -44,9 +49,9 @@ def test_snippets_run_one_after_the_other():
 def test_the_columns_are_those_of_a_run(algo, tmp_path):
     config = point_mass_config(
         f"algo={algo}",
-        "frames=160",
+        "frames=480",
         "cost_limits={cost_hazards: 1, cost_north: 1}",
-        minibatch_size=40 if "ppo" in algo else None,
+        minibatch_size=None if "trpo" in TABLES[algo] else 40,
     )
     build_trainer(config, PointMass(config.num_envs), tmp_path).run()
     documented = columns("columns of all", COSTS)

@@ -1,0 +1,102 @@
+"""Step of constraint-rectified policy optimisation (Xu, Liang and Lan 2021)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.nn import ProbabilisticTensorDictSequential
+from torch import Tensor
+
+from safe_rl.algorithms.trust_region_step import Proposal, TRPOStep
+from safe_rl.objectives.fisher import FisherProduct
+
+__all__ = ["CRPOStep"]
+
+
+class CRPOStep(TRPOStep):
+    """A step for the reward while all costs are within d + η, else one against a cost.
+
+    Algorithm 1 of Xu, Liang and Lan 2021, with their second policy update, the trust region: if
+    J_cᵢ ≤ dᵢ + η for all i, a `TRPOStep` on the loss, otherwise one on E[ρA_cᵢ] of the cost that
+    is exceeded most, in its own units. (The article takes any of the exceeded ones.) There is
+    no multiplier, and nothing to tune but η.
+
+    Adds ``reduces`` to the diagnostics, [k]: 1 for the cost that the step was against.
+
+    Args:
+        loss: a `CPOLoss`, or a callable of your own that returns a TensorDict with scalars
+            ``loss_…`` and the differentiable ``cost_surrogate``, [k].
+        tolerance: η ≥ 0, undiscounted cost per episode.
+        target_kl: radius δ of the trust region, mean KL over the states of the batch.
+        damping: multiple of the identity added to the Fisher matrix.
+        cg_iterations: iterations of the conjugate gradient method.
+        backtrack_coeff: factor between one try of the line search and the next.
+        max_backtracks: tries of the line search.
+        fisher_subsample: fraction of the batch that the Fisher matrix is averaged over.
+        actor_network: policy to step; by default ``loss.actor_network``.
+
+    Examples:
+        >>> from tensordict import TensorDict
+        >>> from safe_rl.models import make_actor
+        >>> from safe_rl.objectives import CPOLoss
+        >>> actor = make_actor(3, 2, hidden_sizes=[16], initial_log_std=-0.5)
+        >>> with torch.no_grad():
+        ...     batch = actor(TensorDict(observation=torch.randn(8, 3), batch_size=[8]))
+        >>> batch["advantage"], batch["cost_advantage"] = torch.randn(8, 1), torch.randn(8, 2)
+        >>> search = {"cg_iterations": 10, "backtrack_coeff": 0.8, "max_backtracks": 10}
+        >>> loss = CPOLoss(actor, entropy_coeff=0.0)
+        >>> step = CRPOStep(loss, tolerance=2.0, target_kl=0.01, damping=0.1, **search)
+        >>> step(batch, cost_violation=torch.tensor([1.0, 5.0]))["reduces"]
+        tensor([0., 1.])
+    """
+
+    def __init__(
+        self,
+        loss: Callable[[TensorDictBase], TensorDictBase],
+        *,
+        tolerance: float,
+        target_kl: float,
+        damping: float,
+        cg_iterations: int,
+        backtrack_coeff: float,
+        max_backtracks: int,
+        fisher_subsample: float = 1.0,
+        actor_network: ProbabilisticTensorDictSequential | None = None,
+    ) -> None:
+        super().__init__(
+            loss,
+            target_kl=target_kl,
+            damping=damping,
+            cg_iterations=cg_iterations,
+            backtrack_coeff=backtrack_coeff,
+            max_backtracks=max_backtracks,
+            fisher_subsample=fisher_subsample,
+            actor_network=actor_network,
+        )
+        self.tolerance = tolerance
+
+    def _propose(
+        self,
+        losses: TensorDictBase,
+        fisher: FisherProduct,
+        cost_violation: Tensor | None,
+        episode_length: Tensor | None,
+    ) -> Proposal:
+        surrogates = losses["cost_surrogate"]
+        if cost_violation is None or cost_violation.shape != surrogates.shape:
+            raise ValueError(
+                "A CRPO step needs cost_violation, one per cost surrogate: "
+                f"[{surrogates.numel()}] of them."
+            )
+        # NaN (no episode has finished yet) counts as at the limit
+        excess = cost_violation.to(surrogates).nan_to_num(nan=0.0) - self.tolerance
+        worst = int(excess.argmax())
+        reduces = torch.zeros_like(surrogates).detach()
+        if excess[worst] > 0:
+            reduces[worst] = 1.0
+            proposal = self._natural_step(losses, fisher, lambda of: of["cost_surrogate"][worst])
+        else:
+            proposal = super()._propose(losses, fisher, cost_violation, episode_length)
+        return proposal._replace(diagnostics={**proposal.diagnostics, "reduces": reduces})

@@ -1,0 +1,106 @@
+"""Interior-point policy optimisation (Liu, Ding and Liu 2020)."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.nn import ProbabilisticTensorDictSequential
+from torch import Tensor
+
+from safe_rl.objectives.ppo import PPOLoss
+from safe_rl.objectives.violation import Violations, constraint_value, violation_of
+
+
+def log_barrier(slack: Tensor, kappa: float, max_weight: float) -> Tensor:
+    """−κ log(slack), continued by its tangent where its slope is beyond ``max_weight``.
+
+    The tangent begins at slack = κ / max_weight, so that value and slope are continuous, and goes
+    on where the logarithm has no value.
+
+    Args:
+        slack: how far inside the limits, any shape.
+        kappa: strength κ > 0 of the barrier.
+        max_weight: largest slope > 0.
+
+    Returns:
+        The barrier, of the shape of `slack`.
+
+    Examples:
+        >>> log_barrier(torch.tensor([1.0, 0.0]), kappa=0.1, max_weight=1.0)
+        tensor([-0.0000, 0.3303])
+    """
+    turn = kappa / max_weight
+    inside = -kappa * slack.clamp_min(turn).log()
+    outside = -kappa * math.log(turn) - max_weight * (slack - turn)
+    return torch.where(slack > turn, inside, outside)
+
+
+class IPOLoss(PPOLoss):
+    """PPO with a logarithmic barrier before every limit, for k constraints.
+
+    Minimises (Liu, Ding and Liu 2020, algorithm 1, with κ = 1/t)
+
+        E[−min(ρA, clip(ρ)A)] − κ Σᵢ log(−cᵢ − E[ρA_cᵢ]),  cᵢ = (J_cᵢ − dᵢ) / T̄.
+
+    The argument is the distance to the limit that the surrogate predicts, as an average per step;
+    in any other unit the barrier differs by a constant. Near the limit and beyond it, where the
+    article has no value, the barrier goes on with the slope `max_weight`: a violated cost is
+    weighed by a constant, as by a multiplier of this size.
+
+    Reads and writes what `PPOLoss` does, reads ``cost_advantage`` [..., k], and adds
+    ``loss_barrier`` and the detached ``cost_surrogate`` [k], E[ρA_c].
+
+    Args:
+        actor_network: policy with `get_dist`; see `SurrogateLoss`.
+        constraints: where J_c − d and T̄ stand at every call.
+        kappa: strength κ = 1/t of the barrier.
+        max_weight: largest weight of a cost, in units of the standardised reward advantage.
+        clip_epsilon: half-width ε of the interval within which a ratio earns.
+        entropy_coeff: factor of the entropy bonus.
+        reduction: ``"mean"``, ``"sum"`` or ``"none"``; costs are always averaged.
+
+    Examples:
+        >>> from safe_rl.algorithms import Constraints
+        >>> from safe_rl.models import make_actor
+        >>> actor = make_actor(3, 2, hidden_sizes=[16], initial_log_std=-0.5)
+        >>> settings = {"clip_epsilon": 0.2, "entropy_coeff": 0.0}
+        >>> constraints = Constraints({"cost": 25.0})
+        >>> loss = IPOLoss(actor, constraints, kappa=0.01, max_weight=10.0, **settings)
+        >>> "loss_barrier" in loss.out_keys
+        True
+    """
+
+    extra_out_keys = ("loss_barrier", "clip_fraction", "cost_surrogate")
+    has_costs = True
+
+    def __init__(
+        self,
+        actor_network: ProbabilisticTensorDictSequential,
+        constraints: Violations,
+        *,
+        kappa: float,
+        max_weight: float,
+        clip_epsilon: float,
+        entropy_coeff: float,
+        reduction: str = "mean",
+    ) -> None:
+        super().__init__(
+            actor_network,
+            clip_epsilon=clip_epsilon,
+            entropy_coeff=entropy_coeff,
+            reduction=reduction,
+        )
+        self.constraints, self.kappa, self.max_weight = constraints, kappa, max_weight
+
+    def _surrogates(self, tensordict: TensorDictBase, log_weight: Tensor) -> dict[str, Tensor]:
+        gain = log_weight.exp() * self._cost_advantage(tensordict)
+        surrogates = self._cost_surrogates(tensordict, gain)
+        violation = violation_of(self.constraints, surrogates)
+        slack = -constraint_value(violation, self.constraints.episode_length, True) - surrogates
+        return {
+            **super()._surrogates(tensordict, log_weight),
+            "loss_barrier": log_barrier(slack, self.kappa, self.max_weight).sum(),
+            "cost_surrogate": surrogates.detach(),
+        }

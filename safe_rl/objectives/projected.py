@@ -1,0 +1,62 @@
+"""Lagrange multipliers moved by projected gradient ascent."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from safe_rl.objectives.multipliers import CostLimits, Multiplier, per_cost
+
+
+class ProjectedMultiplier(Multiplier):
+    """λ ← clip(λ + α (J_c − d), 0, λ_max), the plain dual ascent.
+
+    Of FOCOPS (Zhang, Vuong and Ross 2020, algorithm 1), CUP (Yang et al. 2022, algorithm 1) and,
+    slow and without λ_max, RCPO (Tessler et al. 2019, algorithm 1).
+
+    Args:
+        cost_limits: mapping from cost key to limit d, or limits alone; see `parse_cost_limits`.
+        init: initial λ in [0, `highest`], for all costs or one per cost.
+        lr: α, λ per unit of an episode's cost.
+        highest: λ_max, or None for no bound.
+
+    Raises:
+        ValueError: if an initial λ is outside the bounds.
+
+    Examples:
+        >>> multiplier = ProjectedMultiplier({"cost": 25.0}, init=0.0, lr=0.01, highest=2.0)
+        >>> multiplier.update([60.0])
+        >>> multiplier.value
+        tensor([0.3500])
+        >>> multiplier.update([1000.0])
+        >>> multiplier.value
+        tensor([2.])
+    """
+
+    penalty: Tensor
+
+    def __init__(
+        self,
+        cost_limits: CostLimits,
+        *,
+        init: float | Sequence[float],
+        lr: float,
+        highest: float | None,
+    ) -> None:
+        super().__init__(cost_limits)
+        self.lr, self.highest = lr, highest
+        initial = per_cost("init", init, self.num_costs)
+        if not torch.equal(initial.clamp(0, highest), initial):
+            raise ValueError(f"init must be between 0 and highest={highest}, got {init}.")
+        self.register_buffer("penalty", initial)
+
+    @property
+    def value(self) -> Tensor:
+        """The multipliers λ ≥ 0, [k], detached."""
+        return self.penalty.detach()
+
+    def _step(self, mean_costs: Tensor) -> dict[str, Tensor]:
+        moved = self.penalty + self.lr * (mean_costs - self.limits)
+        return {"penalty": moved.clamp(0, self.highest)}

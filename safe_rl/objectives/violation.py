@@ -1,0 +1,62 @@
+"""How far a policy is from its limits, as losses and steps read it."""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+import torch
+from torch import Tensor
+
+__all__ = ["Violations", "constraint_value", "violation_of"]
+
+
+class Violations(Protocol):
+    """What a loss reads at every call; a `safe_rl.algorithms.Constraints` is one.
+
+    Attributes:
+        violation: J_c − d of every constraint, undiscounted cost per episode, [k].
+        episode_length: T̄, mean number of steps of an episode, scalar.
+    """
+
+    violation: Tensor
+    episode_length: Tensor
+
+
+def violation_of(violations: Violations, surrogates: Tensor) -> Tensor:
+    """J_c − d in the type and on the device of the cost surrogates, [k].
+
+    Before a batch has been observed it is NaN, which counts as 0: the policy is taken to be at
+    its limits.
+
+    Raises:
+        ValueError: if there is not one violation per surrogate.
+    """
+    violation = violations.violation
+    if violation.shape != surrogates.shape:
+        raise ValueError(
+            f"There are {surrogates.numel()} cost surrogates but violations of shape "
+            f"{tuple(violation.shape)}: cost_advantage needs one column per cost limit."
+        )
+    return violation.to(surrogates).nan_to_num(nan=0.0)
+
+
+def constraint_value(
+    cost_violation: Tensor, episode_length: Tensor, rescale_violation: bool
+) -> Tensor:
+    """c, the constraint violation in the units of the cost surrogate's gradient, [k].
+
+    A cost surrogate is an average per step, so the violation of an episode's cost has to be
+    divided by the episode's length. Without the division c is some thousand times too large, and
+    the boundary of the feasible set almost never crosses the trust region.
+
+    Args:
+        cost_violation: J_c − d, [k]. NaN (no episode has finished) counts as 0: the policy is
+            taken to be at the limit, and not allowed to raise the cost.
+        episode_length: T̄, scalar.
+        rescale_violation: whether to divide.
+
+    Returns:
+        c, [k].
+    """
+    divisor = episode_length if rescale_violation else torch.ones_like(episode_length)
+    return (cost_violation / divisor).nan_to_num(nan=0.0)

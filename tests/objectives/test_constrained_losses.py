@@ -1,0 +1,290 @@
+"""Losses of first-order methods, against what their own articles say of their optimum."""
+
+import pytest
+import torch
+from samples import make_actor, make_batch, perturb
+from scipy.optimize import linprog
+from tensordict import TensorDict
+from tensordict.nn import TensorDictModule
+from torch import nn
+from torch.distributions import Categorical
+from torchrl.modules import ProbabilisticActor
+
+from safe_rl.algorithms import Constraints
+from safe_rl.objectives import (
+    CostGAE,
+    FOCOPSLoss,
+    IPOLoss,
+    P3OLoss,
+    PPOLoss,
+    ProjectedMultiplier,
+    RCPOLoss,
+    VectorGAE,
+)
+from safe_rl.objectives.ipo import log_barrier
+
+CLIP = {"clip_epsilon": 0.2, "entropy_coeff": 0.01}
+FREE = {"clip_epsilon": 1e6, "entropy_coeff": 0.0}
+
+
+def held(*violation, episode_length=100.0):
+    constraints = Constraints({f"cost_{i}": 25.0 for i in range(len(violation))})
+    constraints.violation.copy_(torch.tensor(violation))
+    constraints.episode_length.fill_(episode_length)
+    return constraints
+
+
+def projected(*values):
+    limits = [25.0] * len(values)
+    return ProjectedMultiplier(limits, init=list(values), lr=0.01, highest=None)
+
+
+LOSSES = {
+    "p3o": lambda actor: P3OLoss(actor, held(60.0, -90.0), kappa=3.0, gamma=0.99, **CLIP),
+    "ipo": lambda actor: IPOLoss(actor, held(-200.0, 30.0), kappa=0.1, max_weight=2.0, **CLIP),
+    "focops": lambda actor: FOCOPSLoss(
+        actor, projected(0.5, 2.0), temperature=1.5, max_state_kl=0.05, entropy_coeff=0.01
+    ),
+    "rcpo": lambda actor: RCPOLoss(actor, projected(0.5, 2.0), **CLIP),
+}
+
+
+def total(losses):
+    return sum(value for key, value in losses.items() if key.startswith("loss_"))
+
+
+@pytest.mark.parametrize("name", LOSSES)
+@pytest.mark.parametrize("batch_size", [[32], [4, 8]])
+def test_gradients_against_finite_differences(name, batch_size):
+    actor = make_actor(width=4)
+    batch = make_batch(actor, batch_size, 2).double()
+    actor.double()
+    perturb(actor, 0.1)
+    loss = LOSSES[name](actor).double()
+    for parameter in list(actor.parameters()):
+        direction = torch.randn_like(parameter)
+        slope = (torch.autograd.grad(total(loss(batch)), parameter)[0] * direction).sum()
+        values = []
+        for size in (1e-6, -2e-6):
+            parameter.data += size * direction
+            values.append(total(loss(batch)))
+        parameter.data += 1e-6 * direction
+        expected = ((values[0] - values[1]) / 2e-6).detach()
+        torch.testing.assert_close(slope, expected, rtol=1e-4, atol=1e-7)
+
+
+@pytest.mark.parametrize("name", LOSSES)
+def test_they_compile_take_masks_and_report_what_they_name(name):
+    torch._dynamo.reset()
+    actor = make_actor()
+    batch = make_batch(actor, [16], 2)
+    perturb(actor, 0.1)
+    loss = LOSSES[name](actor)
+    expected = loss(batch)
+    assert set(expected.keys()) == set(loss.out_keys)
+    padded = TensorDict.cat([batch, torch.full_like(batch, 7.0)])
+    padded["collector", "mask"] = torch.arange(32) < 16
+    compiled = torch.compile(loss, fullgraph=True, backend="aot_eager")(batch)
+    found = loss(padded)
+    for key in loss.out_keys:
+        torch.testing.assert_close(found[key], expected[key], msg=key)
+        torch.testing.assert_close(compiled[key], expected[key], msg=key)
+
+
+class Logits(nn.Module):
+    """The same logits in every state."""
+
+    def __init__(self, count):
+        super().__init__()
+        self.logits = nn.Parameter(torch.zeros(count))
+
+    def forward(self, observation):
+        return self.logits.expand(*observation.shape[:-1], -1)
+
+
+def one_state(advantage, *cost_advantages):
+    """A policy of a few actions, uniform at first, and a batch with every action once.
+
+    Means over the batch are expectations under the first policy, without a sampling error.
+    """
+    count = len(advantage)
+    actor = ProbabilisticActor(
+        TensorDictModule(Logits(count), ["observation"], ["logits"]),
+        in_keys=["logits"],
+        distribution_class=Categorical,
+        return_log_prob=True,
+    )
+    uniform = torch.full((count,), 1 / count).log()
+    batch = TensorDict(
+        observation=torch.zeros(count, 1),
+        action=torch.arange(count),
+        action_log_prob=uniform,
+        logits=uniform.expand(count, count),
+        advantage=torch.tensor(advantage).unsqueeze(-1),
+        cost_advantage=torch.tensor(cost_advantages).T,
+        batch_size=[count],
+    )
+    return actor, next(actor.parameters()), batch
+
+
+def best_on_a_grid(loss, logits, batch, points=50):
+    """The policy of three actions of which the loss is lowest, by trying all."""
+    best, best_value = None, torch.inf
+    for i in range(1, points):
+        for j in range(1, points - i):
+            probs = torch.tensor([i, j, points - i - j]) / points
+            with torch.no_grad():
+                logits.copy_(probs.log())
+                value = total(loss(batch)).item()
+            if value < best_value:
+                best, best_value = probs, value
+    return best
+
+
+GAIN, COST = [1.0, 0.2, -1.2], [0.8, -0.1, -0.7]
+
+
+def best_within(bound):
+    """max π·A subject to π·A_c ≤ bound, by linear programming."""
+    found = linprog([-a for a in GAIN], [COST], [bound], [[1, 1, 1]], [1], bounds=(0, 1))
+    return torch.tensor(found.x, dtype=torch.float32), -found.fun
+
+
+@pytest.mark.parametrize(("gamma", "violation"), [(0.99, -20.0), (0.98, 2.5), (None, -20.0)])
+def test_p3o_has_the_optimum_of_the_constrained_problem(gamma, violation):
+    actor, logits, batch = one_state(GAIN, COST)
+    loss = P3OLoss(actor, held(violation), kappa=20.0, gamma=gamma, **FREE)
+    per_step = 1 / 100 if gamma is None else 1 - gamma
+    expected, _ = best_within(-per_step * violation)
+    found = best_on_a_grid(loss, logits, batch)
+    torch.testing.assert_close(found, expected, atol=0.03, rtol=0)
+
+
+def test_p3o_with_too_small_a_penalty_violates():
+    actor, logits, batch = one_state(GAIN, COST)
+    loss = P3OLoss(actor, held(2.5), kappa=0.1, gamma=0.99, **FREE)
+    found = best_on_a_grid(loss, logits, batch)
+    assert found @ torch.tensor(COST) > 0.5
+
+
+def test_p3o_clips_costs_to_their_pessimistic_side():
+    actor, logits, batch = one_state(GAIN, COST)
+    with torch.no_grad():
+        logits.copy_(torch.tensor([0.5, -0.2, -1.0]))
+    ratio = logits.detach().softmax(0) * 3
+    expected = 0.0
+    for r, cost in zip(ratio.tolist(), COST, strict=True):
+        expected += max(r * cost, min(max(r, 0.8), 1.2) * cost) / 3
+    losses = P3OLoss(actor, held(2.5), kappa=20.0, gamma=0.99, **CLIP)(batch)
+    assert losses["cost_surrogate"].item() == pytest.approx(expected, abs=1e-6)
+    assert losses["loss_penalty"].item() == pytest.approx(20 * max(expected + 0.025, 0), abs=1e-5)
+
+
+@pytest.mark.parametrize("kappa", [0.05, 0.2])
+def test_ipo_stays_inside_by_no_more_than_the_gap_of_a_barrier(kappa):
+    """Of one barrier of strength κ the value is at most κ below the optimum."""
+    actor, logits, batch = one_state(GAIN, COST)
+    loss = IPOLoss(actor, held(-20.0), kappa=kappa, max_weight=1e3, **FREE)
+    _, optimum = best_within(0.2)
+    found = best_on_a_grid(loss, logits, batch)
+    gap = optimum - (found @ torch.tensor(GAIN)).item()
+    assert 0.2 * kappa < gap <= kappa + 0.03
+    assert found @ torch.tensor(COST) < 0.2
+
+
+def test_the_barrier_goes_on_smoothly_beyond_its_domain():
+    slack = torch.tensor([5.0, 0.1, 0.05, 0.04999, 0.0, -3.0], requires_grad=True)
+    barrier = log_barrier(slack, kappa=0.1, max_weight=2.0)
+    (slope,) = torch.autograd.grad(barrier.sum(), slack)
+    torch.testing.assert_close(barrier[:2], -0.1 * slack[:2].log())
+    torch.testing.assert_close(slope, torch.tensor([-0.02, -1.0, -2.0, -2.0, -2.0, -2.0]))
+    assert (barrier[2] - barrier[3]).abs() < 1e-4
+
+
+def test_focops_has_the_optimum_of_the_trust_region():
+    """π_k exp((A − ν A_c)/β) / Z, theorem 1 of its article."""
+    advantage, costs = [1.0, 0.2, -1.2, 0.7], [0.8, -0.1, -0.7, 0.3]
+    actor, logits, batch = one_state(advantage, costs)
+    loss = FOCOPSLoss(actor, projected(0.6), temperature=1.5, max_state_kl=1e6, entropy_coeff=0.0)
+    optimizer = torch.optim.LBFGS([logits], max_iter=200, line_search_fn="strong_wolfe")
+
+    def closure():
+        optimizer.zero_grad()
+        value = total(loss(batch))
+        value.backward()
+        return value
+
+    optimizer.step(closure)
+    expected = (torch.tensor(advantage) - 0.6 * torch.tensor(costs)).div(1.5).softmax(0)
+    torch.testing.assert_close(logits.detach().softmax(0), expected, atol=1e-4, rtol=0)
+
+
+def test_focops_learns_nothing_from_states_that_have_gone_too_far():
+    actor, logits, batch = one_state(GAIN, COST)
+    loss = FOCOPSLoss(actor, projected(0.6), temperature=1.5, max_state_kl=0.02, entropy_coeff=0.0)
+    near = loss(batch)
+    assert near["trusted_fraction"] == 1
+    with torch.no_grad():
+        logits.copy_(torch.tensor([1.0, 0.0, -1.0]))
+    far = loss(batch)
+    assert far["kl"] > 0.02
+    assert far["trusted_fraction"] == far["loss_objective"] == 0
+    assert not torch.autograd.grad(far["loss_objective"], logits)[0].any()
+
+
+def test_rcpo_is_ppo_on_the_penalised_reward():
+    """Estimated from r − λ c itself, with its value function."""
+    actor = make_actor()
+    batch = make_batch(actor, [4, 16], 0)
+    done = torch.zeros(4, 16, 1, dtype=torch.bool)
+    done[:, -1] = True
+    shape = {"reward": 1, "cost_a": 1, "cost_b": 1, "state_value": 1, "cost_value": 2}
+    batch["next"] = TensorDict(
+        {key: torch.randn(4, 16, size) for key, size in shape.items()}, batch_size=[4, 16]
+    ).update({"done": done, "terminated": done & False})
+    for key in ("state_value", "cost_value"):
+        batch[key] = torch.randn(4, 16, shape[key])
+    settings = {"gamma": 0.97, "lmbda": 0.9, "value_target": "lambda_return"}
+    weights = torch.tensor([0.5, 2.0])
+    penalised = batch.clone()
+    for data in (penalised, penalised["next"]):
+        data["state_value"] -= (data["cost_value"] @ weights).unsqueeze(-1)
+    costs = torch.cat([batch["next", key] for key in ("cost_a", "cost_b")], -1)
+    penalised["next", "reward"] -= (costs @ weights).unsqueeze(-1)
+    for data in (batch, penalised):
+        VectorGAE(None, **settings)(data)
+    CostGAE(["cost_a", "cost_b"], None, **settings)(batch)
+    perturb(actor, 0.2)
+    found = RCPOLoss(actor, projected(*weights.tolist()), **CLIP)(batch)
+    expected = PPOLoss(actor, **CLIP)(penalised)
+    assert expected["clip_fraction"] > 0
+    for key in expected.keys():  # noqa: SIM118
+        torch.testing.assert_close(found[key], expected[key])
+
+
+def test_projected_multipliers_move_by_the_violation_and_stop_at_their_bounds():
+    multiplier = ProjectedMultiplier([25.0, 5.0], init=[0.0, 1.9], lr=0.01, highest=2.0)
+    multiplier.update([20.0, 10.0])
+    assert multiplier.value.tolist() == pytest.approx([0.0, 1.95])
+    multiplier.update([60.0, 60.0])
+    assert multiplier.value.tolist() == pytest.approx([0.35, 2.0])
+    multiplier.update([torch.nan, 0.0])
+    assert multiplier.value.tolist() == pytest.approx([0.35, 1.95])
+    twin = ProjectedMultiplier([25.0, 5.0], init=0.0, lr=0.01, highest=2.0)
+    twin.load_state_dict(multiplier.state_dict())
+    assert torch.equal(twin.value, multiplier.value)
+    with pytest.raises(ValueError, match="between 0 and highest=2"):
+        ProjectedMultiplier(25.0, init=3.0, lr=0.01, highest=2.0)
+
+
+@pytest.mark.parametrize("name", ["p3o", "ipo"])
+def test_a_violation_is_needed_for_every_cost(name):
+    actor = make_actor()
+    with pytest.raises(ValueError, match="one column per cost limit"):
+        LOSSES[name](actor)(make_batch(actor, [8], 1))
+
+
+def test_before_any_batch_the_policy_counts_as_at_its_limit():
+    actor, _, batch = one_state(GAIN, COST)
+    losses = P3OLoss(actor, Constraints({"cost": 25.0}), kappa=20.0, gamma=0.99, **FREE)(batch)
+    assert losses["loss_penalty"].abs() < 1e-5
