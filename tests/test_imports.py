@@ -102,6 +102,7 @@ FLOORS = {
     "algorithms": (
         ("contract", "constraints", "learning_rate", "trust_region_step"),
         ("cpo_step", "crpo_step", "minibatch", "parts"),
+        ("pcpo_step",),
         ("on_policy", "torchrl_trainers"),
         ("",),
     ),

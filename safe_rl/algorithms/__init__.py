@@ -7,6 +7,7 @@ from safe_rl.algorithms.crpo_step import CRPOStep
 from safe_rl.algorithms.learning_rate import KLAdaptiveRate
 from safe_rl.algorithms.minibatch import MinibatchUpdate
 from safe_rl.algorithms.on_policy import OnPolicy
+from safe_rl.algorithms.pcpo_step import PCPOStep
 from safe_rl.algorithms.trust_region_step import TRPOStep
 
 __all__ = [
@@ -17,6 +18,7 @@ __all__ = [
     "KLAdaptiveRate",
     "MinibatchUpdate",
     "OnPolicy",
+    "PCPOStep",
     "PolicyUpdate",
     "Recipe",
     "TRPOStep",

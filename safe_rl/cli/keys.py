@@ -165,6 +165,11 @@ PARTS = {
         **_TRUST_REGION,
         "rescale_violation": Key(boolean, "whether violations are divided by the episode length"),
     },
+    "PCPOStep": {
+        **_TRUST_REGION,
+        "projection": Key(choice("kl", "l2"), "distance that the projection keeps small"),
+        "rescale_violation": Key(boolean, "whether violations are divided by the episode length"),
+    },
     "CRPOStep": {
         **_TRUST_REGION,
         "tolerance": Key(_NOT_NEGATIVE, "η, violation of an episode's cost that is let pass"),

@@ -6,7 +6,7 @@ import pytest
 import torch
 from cmdp import ONE, STEPS, TARGET, TWO, make_actor, train
 
-from safe_rl.algorithms import Constraints, CPOStep, CRPOStep, TRPOStep
+from safe_rl.algorithms import Constraints, CPOStep, CRPOStep, PCPOStep, TRPOStep
 from safe_rl.objectives import (
     CPOLoss,
     FOCOPSLoss,
@@ -151,6 +151,16 @@ def crpo(actor, cmdp):
     return lambda batch, mean_costs: step(batch, mean_costs - cmdp.limits, torch.tensor(STEPS))
 
 
+def pcpo(actor, cmdp):
+    step = PCPOStep(
+        CPOLoss(actor, entropy_coeff=0.0),
+        projection="kl",
+        rescale_violation=True,
+        **TRUST_REGION,
+    )
+    return lambda batch, mean_costs: step(batch, mean_costs - cmdp.limits, torch.tensor(STEPS))
+
+
 UNCONSTRAINED = [ppo, trpo]
 # Epochs: a multiplier moved by gradient steps overshoots before it settles, a controller does not.
 CONSTRAINED = [
@@ -164,6 +174,7 @@ CONSTRAINED = [
     (focops, 250),
     (rcpo, 250),
     (crpo, 150),
+    (pcpo, 120),
 ]
 
 

@@ -142,6 +142,10 @@ CRPO = {
         "_target_": "safe_rl.algorithms.CRPOStep", **TRUST_REGION, "tolerance": 2.0
     }
 }  # fmt: skip
+PCPO = {
+    "policy_update": CPO["policy_update"]
+    | {"_target_": "safe_rl.algorithms.PCPOStep", "projection": "kl"}
+}
 # of the methods' own articles, within the setting that all share
 PROJECTED = {"_target_": "safe_rl.objectives.ProjectedMultiplier", "init": 0.0}
 PAPER = {
@@ -156,6 +160,7 @@ PAPER = {
     | {"lagrangian": {**PROJECTED, "lr": 0.01, "highest": 2.0}},
     "rcpo": SHARED | PPO | COSTS | {"lagrangian": {**PROJECTED, "lr": 0.001, "highest": None}},
     "crpo": SHARED | CRPO | COSTS,
+    "pcpo": SHARED | PCPO | COSTS,
 }  # fmt: skip
 LOSSES = {
     "ppo": {"_target_": "safe_rl.objectives.PPOLoss", "clip_epsilon": 0.2},
@@ -179,6 +184,7 @@ LOSSES = {
     },
     "rcpo": {"_target_": "safe_rl.objectives.RCPOLoss", "clip_epsilon": 0.2},
     "crpo": {"_target_": "safe_rl.objectives.CPOLoss"},
+    "pcpo": {"_target_": "safe_rl.objectives.CPOLoss"},
 }  # fmt: skip
 # per environment: steps in all, environments, steps per epoch
 SIZES = {

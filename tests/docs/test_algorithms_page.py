@@ -22,6 +22,7 @@ TABLES = {
     "ipo": ["constrained", "ppo", "surrogates", "barrier"],
     "focops": ["constrained", "lagrangian", "adam", "focops"],
     "rcpo": ["constrained", "lagrangian", "ppo"],
+    "pcpo": ["constrained", "trpo", "surrogates", "pcpo"],
     "crpo": ["constrained", "trpo", "surrogates", "crpo"],
 }
 

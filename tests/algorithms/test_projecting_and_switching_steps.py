@@ -1,0 +1,132 @@
+"""PCPO's projection against a solver, and the steps of PCPO and CRPO against their definitions."""
+
+import numpy as np
+import pytest
+import torch
+from samples import make_actor, make_batch
+from scipy.optimize import minimize
+
+from safe_rl.algorithms import CRPOStep, PCPOStep
+from safe_rl.algorithms.pcpo_step import nearest_feasible
+from safe_rl.objectives import CPOLoss
+from safe_rl.objectives.fisher import FisherProduct
+from safe_rl.objectives.trust_region import flatten
+
+DELTA = 0.01
+SETTINGS = {
+    "target_kl": DELTA, "damping": 0.1, "cg_iterations": 60, "backtrack_coeff": 0.8,
+    "max_backtracks": 10,
+}  # fmt: skip
+LENGTH = torch.tensor(100.0)
+
+
+def make_case():
+    actor = make_actor(width=4)
+    batch = make_batch(actor, (400,), 2)
+    push = batch["action"] - batch["loc"]
+    batch["advantage"] = push[..., :1] + 0.1 * batch["advantage"]
+    batch["cost_advantage"] = 2 * push + push[..., :1] + 0.1 * batch["cost_advantage"]
+    return actor, batch
+
+
+@pytest.mark.parametrize("num_costs", [1, 2, 3])
+def test_the_nearest_feasible_point_is_that_of_a_solver(num_costs):
+    generator = np.random.default_rng(num_costs)
+    for _ in range(10):
+        root = generator.normal(size=(5, 5))
+        metric = root @ root.T + 0.5 * np.eye(5)
+        b, c = generator.normal(size=(num_costs, 5)), generator.normal(size=num_costs)
+        start = generator.normal(size=5)
+        solved = minimize(
+            lambda x, start=start, metric=metric: (x - start) @ metric @ (x - start),
+            start,
+            constraints={"type": "ineq", "fun": lambda x, b=b, c=c: -(b @ x + c)},
+            options={"ftol": 1e-12, "maxiter": 500},
+        )
+        back = np.linalg.solve(metric, b.T).T
+        nu = nearest_feasible(torch.tensor(b @ start + c), torch.tensor(b @ back.T)).numpy()
+        np.testing.assert_allclose(start - nu @ back, solved.x, atol=1e-4)
+
+
+def test_constraints_without_a_gradient_are_left_out():
+    nu = nearest_feasible(torch.tensor([1.0, 3.0]), torch.tensor([[2.0, 0.0], [0.0, 0.0]]))
+    assert nu.tolist() == pytest.approx([0.5, 0.0])
+
+
+@pytest.mark.parametrize("projection", ["kl", "l2"])
+@pytest.mark.parametrize("violation", [-1e4, -1.0, 0.5])
+def test_pcpo_is_the_equation_of_its_article(projection, violation):
+    actor, batch = make_case()
+    batch["cost_advantage"] = batch["cost_advantage"][:, :1]
+    parameters = list(actor.parameters())
+    fisher = FisherProduct(actor, batch, parameters, SETTINGS["damping"])
+    size = flatten(parameters).numel()
+    matrix = torch.stack([fisher(row) for row in torch.eye(size)]).double()
+    step = PCPOStep(
+        CPOLoss(actor, entropy_coeff=0.0), projection=projection, rescale_violation=True, **SETTINGS
+    )
+    losses = step.loss(batch)
+    g, b = (
+        flatten(torch.autograd.grad(value, parameters, retain_graph=True)).double()
+        for value in (losses["loss_objective"], losses["cost_surrogate"][0])
+    )
+    proposal = step._propose(losses, fisher, torch.tensor([violation]), LENGTH)
+    h_g = torch.linalg.solve(matrix, g)
+    first = -(2 * DELTA / (g @ h_g)).sqrt() * h_g
+    back = torch.linalg.solve(matrix, b) if projection == "kl" else b
+    expected = first - max(0.0, ((b @ first + violation / 100) / (b @ back)).item()) * back
+    radius = (2 * DELTA / (expected @ matrix @ expected)).sqrt().clamp_max(1.0)
+    torch.testing.assert_close(
+        proposal.step.double(), radius * expected, atol=2e-3 * expected.abs().max(), rtol=1e-2
+    )
+
+
+@pytest.mark.parametrize("projection", ["kl", "l2"])
+@pytest.mark.parametrize("violation", [-1e4, -1.0, 0.5, 1e4])
+def test_pcpo_keeps_the_trust_region_and_lowers_costs_outside(projection, violation):
+    actor, batch = make_case()
+    loss = CPOLoss(actor, entropy_coeff=0.0)
+    step = PCPOStep(loss, projection=projection, rescale_violation=True, **SETTINGS)
+    before = loss(batch)
+    metrics = step(batch, torch.tensor([violation, -1e4]), LENGTH)
+    after = loss(batch)
+    assert metrics["step_fraction"] > 0
+    assert after["kl"] <= DELTA * 1.001
+    change = after["cost_surrogate"][0] - before["cost_surrogate"][0]
+    assert change <= max(-violation / 100, 0.0) + 1e-6
+    if violation > 0:
+        assert change < 0
+
+
+def crpo(actor, tolerance=2.0):
+    return CRPOStep(CPOLoss(actor, entropy_coeff=0.0), tolerance=tolerance, **SETTINGS)
+
+
+@pytest.mark.parametrize(
+    ("violation", "reduces"),
+    [([1.9, -5.0], None), ([2.1, -5.0], 0), ([3.0, 9.0], 1), ([torch.nan, torch.nan], None)],
+)
+def test_crpo_switches_at_the_limit_and_its_tolerance(violation, reduces):
+    actor, batch = make_case()
+    step = crpo(actor)
+    before = step.loss(batch)
+    metrics = step(batch, torch.tensor(violation), LENGTH)
+    after = step.loss(batch)
+    assert metrics["step_fraction"] > 0
+    assert 0.3 * DELTA < after["kl"] <= DELTA * 1.001
+    if reduces is None:
+        assert not metrics["reduces"].any()
+        assert after["loss_objective"] < before["loss_objective"]
+    else:
+        assert metrics["reduces"].tolist() == [float(i == reduces) for i in range(2)]
+        assert after["cost_surrogate"][reduces] < before["cost_surrogate"][reduces]
+
+
+def test_errors_say_what_to_change():
+    actor, batch = make_case()
+    with pytest.raises(ValueError, match="one per cost surrogate"):
+        crpo(actor)(batch, torch.zeros(1), LENGTH)
+    with pytest.raises(ValueError, match="projection must be one of"):
+        PCPOStep(
+            CPOLoss(actor, entropy_coeff=0.0), projection="tv", rescale_violation=True, **SETTINGS
+        )
