@@ -3,8 +3,8 @@
 Everything here works on TensorDict keys alone and knows no environment:
 
 - `VectorGAE`, `CostGAE`, `normalise_advantages`: advantages of the reward and of k costs;
-- `LagrangeMultiplier`, `PIDMultiplier`, `PIMultiplier`, `ProjectedMultiplier`: one λ per cost, moved
-  by the mean episode costs;
+- `LagrangeMultiplier`, `PIDMultiplier`, `PIMultiplier`, `ProjectedMultiplier`: one λ per cost,
+  moved by the mean episode costs;
 - `LimitTracker`: from the costs of a batch to how far J_c is from where it should be by now;
 - `PPOLoss`, `PPOLagrangianLoss`, `RCPOLoss`, `P3OLoss`, `IPOLoss`, `FOCOPSLoss`: policy losses for
   an optimiser;

@@ -66,7 +66,7 @@ class PPOLoss(SurrogateLoss):
         tensor(0.)
     """
 
-    extra_out_keys = ("clip_fraction",)
+    extra_out_keys: tuple[str, ...] = ("clip_fraction",)
     _schedulable_buffers = frozenset({"clip_epsilon"})
 
     clip_epsilon: Tensor
