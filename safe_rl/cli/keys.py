@@ -77,6 +77,9 @@ KEYS = {
     "model": Key(_SECTION, "the networks"),
     "checkpoint": Key(_SECTION, "when checkpoints are written"),
     "collector": Key(_SECTION, "where environments are stepped: collector=local"),
+    "transforms": Key(
+        mapping_of(component), "what changes the problem: transforms=[saute]", may_lack=True
+    ),
     "logger": Key(_SECTION, "what is logged besides the table: logger=none for nothing"),
     "env.name": Key(folder_name, "name of the environment"),
     "algo.name": Key(folder_name, "name of the algorithm"),
@@ -140,6 +143,12 @@ _LOSS = {
 _CLIPPED_LOSS = {
     **_LOSS,
     "clip_epsilon": Key(number(0, 1000, above=True), "half-width of the ratios that earn"),
+}
+_SAUTE = {
+    "budgets": Key(mapping_of(number(0, above=True)), "cost per episode allowed by cost"),
+    "discount": Key(number(0, 1, above=True), "discount of the costs that a budget is for"),
+    "unsafe_reward": Key(number(), "reward of a step once a budget is spent"),
+    "rescale_budgets": Key(boolean, "whether budgets are undiscounted"),
 }
 _WORKERS = {"num_collectors": KEYS["collector.num_collectors"]}
 
@@ -229,6 +238,17 @@ PARTS = {
         **_WORKERS,
         "ray_init": Key(mapping_of(anything), "arguments of ray.init"),
         "resources": Key(mapping_of(anything), "resources of every actor"),
+    },
+    "Saute": _SAUTE,
+    "Simmer": {
+        **_SAUTE,
+        "first": Key(number(0, 1, above=True), "share of the budgets to begin with"),
+        "steps": Key(count(), "steps of each environment until budgets are whole"),
+    },
+    "EarlyTermination": {"budgets": Key(_LIMITS, "cost per episode that ends it if exceeded")},
+    "ActionFilter": {
+        "filter": Key(component, "the function that replaces actions"),
+        "cost_key": Key(text, "name of the cost of interventions"),
     },
     "TensorboardLogger": {"exp_name": Key(text, "folder of the event files")},
     "MLflowLogger": {

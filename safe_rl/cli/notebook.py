@@ -30,7 +30,13 @@ from safe_rl.cli.user_code import check_imports, import_modules, note_imports, q
 from safe_rl.envs import make_env, store_configs
 from safe_rl.evaluation import Evaluation, EvaluationOptions
 from safe_rl.evaluation.layouts import default_seed
-from safe_rl.evaluation.loading import find_checkpoint, load_config, load_policy, override_env
+from safe_rl.evaluation.loading import (
+    evaluated,
+    find_checkpoint,
+    load_config,
+    load_policy,
+    override_env,
+)
 from safe_rl.runs.folder import RunFolder
 from safe_rl.runs.lock import held
 from safe_rl.runs.outcome import final_figures
@@ -104,7 +110,7 @@ class Run:
         node = override_env(self.config, keys)
         if seed is None:
             seed = default_seed(node, self.config.seed)
-        return make_env(node, num_envs=num_envs, seed=seed)
+        return evaluated(make_env, self.config)(node, num_envs=num_envs, seed=seed)
 
     def evaluate(self, **options: Any) -> Evaluation:
         """Run the policy for whole episodes; writes into the folder what the command writes.

@@ -6,7 +6,7 @@ Hydra answers a key that does not exist with advice to add it, after which it ha
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
 from hydra.core.config_loader import ConfigLoader
@@ -41,17 +41,24 @@ def check_choices(overrides: Sequence[Override], loader: ConfigLoader) -> None:
     """
     for override in overrides:
         group = override.key_or_group
-        is_named = override.is_discrete_sweep() or isinstance(override.value(), str)
+        is_named = override.is_discrete_sweep() or isinstance(override.value(), str | list)
         known = loader.get_group_options(group, ObjectType.CONFIG) if is_named else []
         if not known or override.is_delete():
             continue
         chosen = override.sweep_string_iterator() if override.is_sweep_override() else None
-        for name in chosen or [str(override.value())]:
+        # of some groups several are chosen: transforms=[saute,action_filter]
+        for name in _names(chosen or [override.get_value_element_as_str()]):
             if name not in known:
                 raise CommandLineError(
                     f"'{override.input_line}': there is no {group} '{name}'."
                     f"{did_you_mean(name, known)}"
                 )
+
+
+def _names(choices: Iterable[str]) -> Iterator[str]:
+    """Single names of choices that are names or lists of them."""
+    for choice in choices:
+        yield from filter(None, re.split(r"[\[\],\s'\"]+", choice))
 
 
 def check_limits(overrides: Sequence[Override]) -> None:

@@ -29,6 +29,7 @@ from safe_rl.cli.user_code import (
     split_imports,
 )
 from safe_rl.envs import ConfigError, LayoutError, complete_env, make_env, store_configs
+from safe_rl.evaluation.loading import transforms_of
 from safe_rl.runs.folder import RunFolder
 from safe_rl.runs.lock import held
 from safe_rl.runs.resuming import is_finished, may_continue
@@ -57,6 +58,7 @@ def prepare(config: DictConfig, directory: Path, continues: bool) -> Trainer | N
         device=config.device,
         seed=config.seed,
         num_threads=physics_threads(config),
+        transforms=transforms_of(config),
     )
     in_workers = partial(make_after_imports, imported(), make)
     trainer = build_trainer(config, make(num_envs=config.num_envs), directory, in_workers)

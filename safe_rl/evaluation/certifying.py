@@ -17,7 +17,7 @@ from torchrl.envs import EnvBase
 
 from safe_rl.evaluation.episodes import Episodes, collect_episodes
 from safe_rl.evaluation.layouts import default_seed
-from safe_rl.evaluation.loading import load_config, load_policy, override_env
+from safe_rl.evaluation.loading import evaluated, load_config, load_policy, override_env
 from safe_rl.runs.files import replacing
 from safe_rl.runs.folder import RunFolder, checkpoint_steps, checkpoints_in
 from safe_rl.scores.certificate import Claim, Verdict, first_certified, rank
@@ -142,7 +142,7 @@ class _Runner:
     def __init__(
         self, config: DictConfig, make_env: Callable[..., EnvBase], threads: int, progress: bool
     ) -> None:
-        self._config, self._make_env = config, make_env
+        self._config, self._make_env = config, evaluated(make_env, config)
         self._threads, self._progress = threads, progress
 
     def run(self, checkpoint: Path, number: int, purpose: int) -> Episodes:

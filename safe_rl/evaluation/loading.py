@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +18,10 @@ from safe_rl.runs.checkpoints import CheckpointStore
 from safe_rl.runs.files import read_config
 from safe_rl.runs.folder import KINDS, RunFolder
 
-__all__ = ["find_checkpoint", "load_config", "load_policy", "override_env"]
+__all__ = [
+    *("evaluated", "find_checkpoint", "load_config", "load_policy", "override_env"),
+    "transforms_of",
+]
 
 
 def load_config(directory: Path) -> DictConfig:
@@ -40,6 +44,17 @@ def load_config(directory: Path) -> DictConfig:
 def override_env(config: DictConfig, overrides: Mapping[str, Any]) -> dict[str, Any]:
     """The run's environment with some keys changed; their names are checked where it is made."""
     return {**OmegaConf.to_container(config.env), **overrides}  # type: ignore[dict-item]
+
+
+def transforms_of(config: DictConfig) -> dict[str, Any]:
+    """Nodes of what changes the run's problem from outside, by name; earlier runs have none."""
+    return OmegaConf.to_container(config.get("transforms") or OmegaConf.create(), resolve=True)  # type: ignore[return-value]
+
+
+def evaluated(make_env: Callable[..., EnvBase], config: DictConfig) -> Callable[..., EnvBase]:
+    """What makes the run's environments for evaluation, with its transforms if it has any."""
+    transforms = transforms_of(config)
+    return partial(make_env, transforms=transforms, evaluating=True) if transforms else make_env
 
 
 def find_checkpoint(directory: Path, which: str) -> Path:

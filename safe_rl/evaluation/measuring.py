@@ -14,7 +14,13 @@ from torchrl.envs import EnvBase
 
 from safe_rl.evaluation.episodes import collect_episodes
 from safe_rl.evaluation.layouts import default_seed, shared_layouts
-from safe_rl.evaluation.loading import find_checkpoint, load_config, load_policy, override_env
+from safe_rl.evaluation.loading import (
+    evaluated,
+    find_checkpoint,
+    load_config,
+    load_policy,
+    override_env,
+)
 from safe_rl.evaluation.settings import EvaluationOptions, check_options
 from safe_rl.evaluation.summary import summarise, write_episodes, write_summary
 from safe_rl.evaluation.video import check_camera, record_episode, write_video
@@ -75,7 +81,7 @@ def evaluate(
 
     def make(num_envs: int, **keys: Any) -> EnvBase:
         threads = options.num_threads
-        return make_env(
+        return evaluated(make_env, config)(
             node | keys, num_envs=num_envs, device=options.device, seed=seed, num_threads=threads
         )
 

@@ -121,7 +121,10 @@ class Trainer:
     ) -> None:
         self.algorithm = algorithm
         self.accounting = EpisodeAccounting(
-            env.batch_size.numel(), env.cost_keys, device=collector.storing_device
+            env.batch_size.numel(),
+            env.cost_keys,
+            reward_key=getattr(env, "return_key", "reward"),
+            device=collector.storing_device,
         )
         self.progress = Progress()
         self.folder = folder
@@ -199,6 +202,8 @@ class Trainer:
         if self._worlds is not None:
             return
         self.accounting.forget_open_episodes()
+        if hasattr(self._env, "continue_from"):
+            self._env.continue_from(self.progress.steps // self._env.batch_size.numel())
         if isinstance(self._collector, Collector):
             # otherwise it would meet the episodes again that the run began with
             self._env.set_seed(int(torch.randint(2**31, ())))

@@ -13,6 +13,7 @@ from run_configs import CONF
 
 import safe_rl.algorithms
 import safe_rl.collectors
+import safe_rl.envs.transforms
 import safe_rl.objectives
 import safe_rl.runs.loggers
 from safe_rl.algorithms import OnPolicy
@@ -23,7 +24,10 @@ from safe_rl.envs import ConfigError, SafetyGymConfig, resolve
 from safe_rl.targets import TargetError
 
 ALGORITHMS = sorted(path.stem for path in (CONF / "algo").glob("*.yaml"))
-HOMES = (safe_rl.algorithms, safe_rl.collectors, safe_rl.objectives, safe_rl.runs.loggers)
+HOMES = (
+    *(safe_rl.algorithms, safe_rl.collectors, safe_rl.envs.transforms, safe_rl.objectives),
+    safe_rl.runs.loggers,
+)
 # what recipes, collectors and run folders hand to a part themselves
 LIVE = {
     *("self", "loss", "actor_network", "multiplier", "value_network", "cost_keys", "cost_limits"),

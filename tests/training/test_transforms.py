@@ -1,0 +1,140 @@
+"""Runs on a problem that transforms change: what they log, learn from, resume and evaluate."""
+
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+from point_mass import PointMass
+from run_configs import point_mass_config, without_times
+
+from safe_rl.cli import evaluate, train
+from safe_rl.cli.evaluate import EvaluationOptions, evaluate_run
+from safe_rl.envs.transforms import transform_env
+from safe_rl.evaluation.loading import transforms_of
+from safe_rl.runs.identity import experiment_of
+from safe_rl.runs.table import read_table
+from safe_rl.training.trainer import build_trainer, seed_everything
+
+SAUTE = ["algo=ppo", "transforms=[saute]", "cost_limits={cost: 0.5}"]
+
+
+def make_trainer(directory, *overrides):
+    config = point_mass_config(*overrides)
+    seed_everything(config.seed, None)
+    env = transform_env(
+        PointMass(config.num_envs, seed=config.seed), transforms_of(config), evaluating=False
+    )
+    return build_trainer(config, env, directory)
+
+
+def test_an_interrupted_run_goes_on_exactly(tmp_path):
+    # 50 steps a batch: episodes of 20 are open at every checkpoint
+    options = ["algo=ppo", "cost_limits={cost: 2}", "frames_per_batch=200"]
+    options += ["transforms=[simmer,early_termination]", "transforms.simmer.steps=150"]
+    whole, halves = tmp_path / "whole", tmp_path / "halves"
+    make_trainer(whole, *options, "frames=1200").run()
+    make_trainer(halves, *options, "frames=600").run()
+    resumed = make_trainer(halves, *options, "frames=1200")
+    assert resumed.resume()
+    resumed.run()
+    assert without_times(halves / "progress.csv") == without_times(whole / "progress.csv")
+
+
+def test_returns_are_those_of_the_own_reward(tmp_path, monkeypatch):
+    monkeypatch.setattr("point_mass.HAZARD_RADIUS", 0.7)
+    trainer = make_trainer(tmp_path, *SAUTE)
+    batch = next(trainer.batches())
+    shaped, own = batch["next", "reward"], batch["next", "task_reward"]
+    assert not torch.equal(shaped, own)
+    episodes = trainer.accounting.update(batch)
+    # whole episodes of 20 steps
+    expected = own.double().reshape(4, -1, 20).sum(-1).flatten()
+    torch.testing.assert_close(episodes.returns, expected)
+
+
+def test_transforms_name_the_experiment():
+    plain, changed = ({"transforms": node} for node in ({}, {"saute": {"discount": 0.999}}))
+    assert experiment_of(plain) == experiment_of({})
+    assert experiment_of(changed) != experiment_of(plain)
+
+
+RUN = [
+    *("env=PointGoal1", "env.num_steps=20", "num_envs=4", "frames_per_batch=80", "frames=240"),
+    *("model.hidden_sizes=[8]", "logger=none", "num_threads=1", "certificate.episodes=0"),
+    "hydra.run.dir=run",
+]
+FILTER = "transforms.action_filter.filter._target_=test_transforms_filters.slow"
+
+
+@pytest.fixture
+def command(tmp_path, monkeypatch, capsys):
+    """Runs train.py in a folder of its own; returns its status and what it printed."""
+    monkeypatch.chdir(tmp_path)
+    source = "def slow(step, speed=0.3):\n    return step['action'].clamp(-speed, speed)\n"
+    Path("test_transforms_filters.py").write_text(source)
+    monkeypatch.setitem(sys.modules, "test_transforms_filters", None)
+    monkeypatch.delitem(sys.modules, "test_transforms_filters")
+    monkeypatch.syspath_prepend(str(tmp_path))
+
+    def run(*arguments):
+        monkeypatch.setattr(sys, "argv", ["train.py", *arguments])
+        try:
+            status = train.main()
+        except SystemExit as end:
+            status = end.code
+        return status, *capsys.readouterr()
+
+    return run
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ["algo=ppo", "transforms=[saute]", "transforms.saute.unsafe_reward=-2"],
+        ["algo=trpo", "transforms=[simmer]", "transforms.simmer.steps=30"],
+        ["algo=ppo", "transforms=[simmer]", "collector=process", "collector.num_collectors=2"],
+        ["algo=ppo", "transforms=[saute,early_termination]", "cost_limits={cost: 0.5}"],
+        [
+            *("algo=ppo_lagrangian", "transforms=[action_filter]", FILTER),
+            *("import=test_transforms_filters.py", "cost_limits={cost_interventions: 3}"),
+        ],
+    ],
+    ids=["saute", "simmer", "processes", "early_termination", "action_filter"],
+)
+def test_the_command_line_runs_them(command, arguments):
+    status, _, said = command(*RUN, *arguments)
+    assert not status, said
+    table = read_table(Path("run/progress.csv"))
+    assert table["steps"] == [80, 160, 240]
+    imports = [text for text in arguments if text.startswith("import=")]
+    assert not evaluate.main(["run", "episodes=4", "num_envs=2", *imports])
+    if imports:
+        assert table["episode_cost_interventions"][0] > 0
+        assert "violation_cost_interventions" in table
+    assert not command("resume=run", "frames=320", *imports)[0]
+    assert read_table(Path("run/progress.csv"))["steps"][-1] == 320
+
+
+def test_an_evaluation_returns_the_reward_of_the_environment(command):
+    # hazards everywhere: no budget lasts
+    unsafe = ["transforms.saute.unsafe_reward=-1000", "transforms.saute.budgets={cost: 0.001}"]
+    unsafe += ["env.hazards_size=2.0", "env.hazards_keepout=0.0"]
+    status, _, said = command(*RUN, "algo=ppo", "transforms=[saute]", *unsafe)
+    assert not status, said
+    result = evaluate_run(Path("run"), EvaluationOptions(episodes=4, num_envs=2, num_threads=1))
+    assert result.estimates["episode_cost"].value > 0
+    assert abs(read_table(Path("run/progress.csv"))["episode_return"][-1]) < 100
+    assert abs(result.estimates["episode_return"].value) < 100
+
+
+def test_names_that_are_not_there_are_refused(command):
+    status, _, said = command("transforms=[saut]")
+    assert status
+    assert "there is no transforms 'saut'. Did you mean 'saute'?" in said
+    status, _, said = command("transforms=[saute]", "transforms.saute.discont=0.9")
+    assert status
+    assert "transforms.saute.discount" in said
+    status, _, said = command("transforms=[saute]", "transforms.saute.discount=2")
+    assert status
+    assert "transforms.saute.discount=2: it must be a number above 0" in said
