@@ -30,6 +30,7 @@ class ActionFilter(ConstraintTransform):
         ValueError: at a step, if the function returns something else.
 
     Examples:
+        >>> import torch
         >>> from torchrl.envs import TransformedEnv
         >>> from safe_rl.envs import SafetyGymEnv
         >>> env = SafetyGymEnv("PointGoal1", num_envs=2, seed=0)
