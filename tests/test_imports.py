@@ -42,7 +42,7 @@ PARTS = {
 # Inside a package a module may import those of the floors below its own.
 FLOORS = {
     "envs": (
-        ("contract", "errors", "opengl", "rng", "physics", "physics.base"),
+        ("contract", "errors", "opengl", "rng", "states", "physics", "physics.base"),
         ("physics.cpu",),
         # Safety Gym: records, then rules, then worlds, and what is seen of them.
         ("safety_gym.records", "safety_gym.records.values", "safety_gym.geometry"),
@@ -68,7 +68,7 @@ FLOORS = {
         ("safety_gym.env",),
         ("safety_gym", "safety_gym.nodes", "extending"),
         # The velocity family: rows, configurations, then functions over tensors, the environment.
-        ("physics.runge_kutta", "velocity.robots", "velocity.snapshot", "velocity.specs"),
+        ("physics.runge_kutta", "velocity.robots", "velocity.specs"),
         ("velocity.config", "velocity.measuring"),
         ("velocity.health", "velocity.rewarding", "velocity.starting", "velocity.suite"),
         ("velocity.model",),
@@ -90,9 +90,9 @@ FLOORS = {
         ("",),
     ),
     "objectives": (
-        ("keys", "distributions", "samples", "gae", "cpo_dual", "violation"),
-        ("advantages", "critics", "multipliers", "normalisation", "trust_region"),
-        ("pid", "projected", "surrogate", "fisher"),
+        ("keys", "distributions", "samples", "gae", "cpo_dual", "episode_costs", "violation"),
+        ("advantages", "critics", "limits", "multipliers", "normalisation", "trust_region"),
+        ("controllers", "pid", "projected", "surrogate", "fisher"),
         ("actor_critic", "cpo", "focops", "ppo", "trpo"),
         ("ipo", "p3o", "rcpo"),
         ("",),
@@ -101,7 +101,7 @@ FLOORS = {
     "models": (("scaling",), ("networks",), ("behaviour",), ("",)),
     "algorithms": (
         ("contract", "constraints", "learning_rate", "trust_region_step"),
-        ("cpo_step", "crpo_step", "minibatch", "parts"),
+        ("cpo_step", "crpo_step", "minibatch", "parts", "tracked_constraints"),
         ("pcpo_step",),
         ("on_policy", "torchrl_trainers"),
         ("",),
