@@ -35,6 +35,8 @@ def test_every_name_is_registered():
 def test_gymnasiums_checker_has_nothing_to_say(env_id):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
+        # Sensors feel accelerations of any size: their bounds are infinite.
+        warnings.filterwarnings("ignore", message=".*A Box observation space .* is -?infinity")
         env = gymnasium.make(env_id).unwrapped
         check_env(env, skip_render_check=bool(MISSING_OPENGL))
 
@@ -365,3 +367,25 @@ def test_the_originals_environments_for_tests():
         *_, terminated, _, info = env.step(np.zeros(env.action_space.shape, np.float32))
         assert terminated
         assert info["goal_met"]
+
+
+@pytest.mark.parametrize("flatten", [True, False])
+def test_bounds_are_true(flatten):
+    config = {
+        **{"observation_flatten": flatten, "observe_goal_comp": True, "observe_goal_dist": True},
+        **{"observe_remaining": True, "compass_shape": 3},
+    }
+    envs = gymnasium.make_vec("Safexp-CarGoal2-v0", num_envs=20, config=config)
+    bounds = {"goal_compass": (-1, 1), "goal_dist": (0, 1)}
+    bounds |= {f"{kind}_lidar": (0, 1) for kind in ("goal", "hazards", "vases")}
+    env, space = envs.safety_gym, envs.single_observation_space
+    observation, _ = envs.reset(seed=0)
+    for name, columns in env.observation_layout.items():
+        box = space if flatten else space[name]
+        rows = columns if flatten else slice(None)
+        low, high = bounds.get(name, (-np.inf, np.inf))
+        assert (box.low[rows] == low).all(), name
+        assert (box.high[rows] == high).all(), name
+    for _ in range(50):
+        assert observation in envs.observation_space
+        observation, *_ = envs.step(envs.action_space.sample())

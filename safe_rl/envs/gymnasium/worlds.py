@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from gymnasium.envs.registration import EnvSpec
 from tensordict import TensorDict, TensorDictBase
-from torchrl.data import Composite, TensorSpec
+from torchrl.data import Composite
 
 from safe_rl.envs.opengl import OpenGLError, has_screen
 from safe_rl.envs.safety_gym.env import SafetyGymEnv
@@ -21,8 +21,6 @@ from safe_rl.envs.safety_gym.suite import resolve
 from safe_rl.envs.safety_gym.world.building import build_scene
 
 RENDER_MODES = ("human", "rgb_array")
-# Every value is finite, and no more is promised: sensors feel accelerations of any size.
-LARGEST = np.finfo(np.float32).max
 NUM_SEEDS = 2**62
 
 Observation = np.ndarray | dict[str, np.ndarray]
@@ -48,14 +46,25 @@ def configure(
     return base.replace(**(config or {}))
 
 
-def space_of(spec: TensorSpec) -> gymnasium.Space:
-    """Return the space of one world for a spec of N worlds."""
+def action_space(env: SafetyGymEnv) -> gymnasium.spaces.Box:
+    """Return the actions of one world."""
+    low, high = env.action_spec.space.low, env.action_spec.space.high
+    return gymnasium.spaces.Box(low[0].cpu().numpy(), high[0].cpu().numpy(), dtype=np.float32)
+
+
+def observation_space(env: SafetyGymEnv) -> gymnasium.Space:
+    """Return what one world observes: flat, or by name where it is nested."""
+    spec, bounds = env.observation_spec["observation"], env.observation_bounds
     if isinstance(spec, Composite):
-        return gymnasium.spaces.Dict({key: space_of(part) for key, part in spec.items()})
-    low, high = (
-        bound.reshape(spec.shape)[0].cpu().numpy().clip(-LARGEST, LARGEST)
-        for bound in (spec.space.low, spec.space.high)
-    )
+        return gymnasium.spaces.Dict(
+            {
+                name: gymnasium.spaces.Box(*bounds[name], part.shape[1:], np.float32)
+                for name, part in spec.items()
+            }
+        )
+    low, high = np.empty((2, spec.shape[-1]), np.float32)
+    for name, columns in env.observation_layout.items():
+        low[columns], high[columns] = bounds[name]
     return gymnasium.spaces.Box(low, high, dtype=np.float32)
 
 
@@ -115,8 +124,8 @@ class Worlds:
                 "nor WAYLAND_DISPLAY is set). Use render_mode='rgb_array', which needs none."
             )
         self.env = SafetyGymEnv(config, num_envs, "cpu", 0, num_threads, sleep)
-        self.observation_space = space_of(self.env.observation_spec["observation"])
-        self.action_space = space_of(self.env.action_spec)
+        self.observation_space = observation_space(self.env)
+        self.action_space = action_space(self.env)
         config = self.env.config
         timestep = build_scene(config, sleep).model.opt.timestep
         self.seconds_per_step = timestep * config.frameskip_binom_n

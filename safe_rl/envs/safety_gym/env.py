@@ -122,6 +122,11 @@ class SafetyGymEnv(EnvBase):
         """Columns of every named component in `observation`."""
         return dict(self._observer.columns)
 
+    @property
+    def observation_bounds(self) -> dict[str, tuple[float, float]]:
+        """Lowest and highest value of every named component in `observation`."""
+        return dict(self._observer.bounds)
+
     def _set_seed(self, seed: int | None) -> None:
         if seed is None:
             return

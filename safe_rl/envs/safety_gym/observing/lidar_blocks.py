@@ -32,7 +32,7 @@ def lidar_blocks(config: SafetyGymConfig, scene: Scene) -> list[Block]:
     if "buttons" in kinds:
         first = kinds.index("buttons") * bins
         read = _while_awake(read, slice(first, first + bins))
-    return [Block({f"{kind}_lidar": (bins,) for kind in kinds}, read)]
+    return [Block({f"{kind}_lidar": (bins,) for kind in kinds}, read, (0.0, 1.0))]
 
 
 def _while_awake(read: Callable[[World], Tensor], columns: slice) -> Callable[[World], Tensor]:

@@ -19,13 +19,13 @@ from safe_rl.envs.safety_gym.observing.sensors import sensor_blocks
 from safe_rl.envs.safety_gym.observing.vision import vision_blocks
 from safe_rl.envs.safety_gym.records.config import SafetyGymConfig
 from safe_rl.envs.safety_gym.records.scene import Scene
-from safe_rl.envs.safety_gym.records.world import Block, Shapes, World
+from safe_rl.envs.safety_gym.records.world import Block, Bounds, Shapes, World
 from safe_rl.envs.safety_gym.rules.readings import READINGS
 
 
 def _plain(config: SafetyGymConfig, scene: Scene) -> list[Block]:
     return [
-        Block({row.name: (row.size(config, scene),)}, row.read)
+        Block({row.name: (row.size(config, scene),)}, row.read, row.bounds)
         for row in READINGS
         if row.present(config)
     ]
@@ -46,11 +46,13 @@ class Observer(NamedTuple):
         shapes: shape of every component, in the order of the flat observation.
         columns: columns of every component in the flat observation.
         read: world -> flat observation [N, n], float32.
+        bounds: lowest and highest value of every component.
     """
 
     shapes: Shapes
     columns: dict[str, slice]
     read: Callable[[World], Tensor]
+    bounds: dict[str, Bounds]
 
     @property
     def size(self) -> int:
@@ -99,4 +101,5 @@ def make_observer(scene: Scene) -> Observer:
         values = torch.cat([block.read(world) for block in blocks], -1)
         return values.to(torch.float32).index_select(1, permutation)
 
-    return Observer(shapes, columns, read)
+    bounds = {name: block.bounds for block in blocks for name in block.shapes}
+    return Observer(shapes, columns, read, bounds)

@@ -37,4 +37,4 @@ def vision_blocks(config: SafetyGymConfig, scene: Scene) -> list[Block]:
             picture.copy_(torch.from_numpy(display.frame(VISION, width, height)))
         return pixels.flatten(1).to(torch.float64) / 255
 
-    return [Block({"vision": (height, width, 3)}, read)]
+    return [Block({"vision": (height, width, 3)}, read, (0.0, 1.0))]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -14,6 +15,8 @@ from safe_rl.envs.safety_gym.records.scene import Scene
 NO_BUTTON = -1
 
 Shapes = dict[str, tuple[int, ...]]
+Bounds = tuple[float, float]
+UNBOUNDED: Bounds = (-math.inf, math.inf)
 
 
 @dataclass(frozen=True)
@@ -100,7 +103,9 @@ class Block(NamedTuple):
     Attributes:
         shapes: shape of each component, in the order of the columns of `read`.
         read: world -> [N, total size].
+        bounds: lowest and highest value of all of them.
     """
 
     shapes: Shapes
     read: Callable[[World], Tensor]
+    bounds: Bounds = UNBOUNDED

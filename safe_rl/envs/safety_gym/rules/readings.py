@@ -12,7 +12,7 @@ from safe_rl.envs.errors import ConfigError
 from safe_rl.envs.safety_gym.geometry import compass, distance, to_ego
 from safe_rl.envs.safety_gym.records.config import SafetyGymConfig
 from safe_rl.envs.safety_gym.records.scene import Scene
-from safe_rl.envs.safety_gym.records.world import World
+from safe_rl.envs.safety_gym.records.world import UNBOUNDED, Bounds, World
 from safe_rl.envs.safety_gym.rules.tasks import TASKS
 
 
@@ -25,6 +25,7 @@ class Reading(NamedTuple):
         size: number of values.
         read: world -> [N, size].
         touches: kinds whose contacts with the robot it reads.
+        bounds: lowest and highest value.
     """
 
     name: str
@@ -32,6 +33,7 @@ class Reading(NamedTuple):
     size: Callable[[SafetyGymConfig, Scene], int]
     read: Callable[[World], Tensor]
     touches: tuple[str, ...] = ()
+    bounds: Bounds = UNBOUNDED
 
 
 def _ego(world: World, kind: str) -> Tensor:
@@ -82,18 +84,21 @@ READINGS: list[Reading] = [
         lambda c: c.observe_goal_comp and _has(c, "goal"),
         lambda c, s: c.compass_shape,
         _compass_to("goal"),
+        bounds=(-1.0, 1.0),
     ),
     Reading(
         "box_compass",
         lambda c: c.observe_box_comp and _has(c, "box"),
         lambda c, s: c.compass_shape,
         _compass_to("box"),
+        bounds=(-1.0, 1.0),
     ),
     Reading(
         "goal_dist",
         lambda c: c.observe_goal_dist and _has(c, "goal"),
         lambda c, s: 1,
         _goal_closeness,
+        bounds=(0.0, 1.0),
     ),
     Reading("remaining", lambda c: c.observe_remaining, lambda c, s: 1, _remaining),
     Reading("com", lambda c: c.observe_com, lambda c, s: 3, lambda w: w.com),
