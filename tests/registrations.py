@@ -21,7 +21,7 @@ from safe_rl.envs.safety_gym.rules.elements import BY_KIND, ELEMENTS, PLACEMENT_
 from safe_rl.envs.safety_gym.rules.readings import READINGS
 from safe_rl.envs.safety_gym.rules.robots import ROBOTS
 from safe_rl.envs.safety_gym.rules.tasks import TASKS
-from safe_rl.envs.safety_gym.world.building import build_scene
+from safe_rl.envs.safety_gym.world.building import forget_scenes
 
 LISTS = (COSTS, ELEMENTS, PLACEMENT_ORDER, READINGS)
 MAPPINGS = (BY_KIND, ROBOTS, TASKS)
@@ -41,7 +41,7 @@ def undone() -> Iterator[None]:
             table.clear()
             table.update(rows)
         set_registered_keys(keys)
-        build_scene.cache_clear()
+        forget_scenes()
 
 
 def cube(kind: str, label: str, motion: Motion, group: int = 2) -> Element:

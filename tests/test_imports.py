@@ -49,7 +49,7 @@ FLOORS = {
         ("safety_gym.records.vocabulary",),
         ("safety_gym.records.config",),
         ("safety_gym.records.scene",),
-        ("safety_gym.records.world",),
+        ("safety_gym.records.world", "safety_gym.rules.robot_files"),
         ("safety_gym.rules", "safety_gym.rules.robots", "safety_gym.rules.tasks"),
         ("safety_gym.rules.checks", "safety_gym.rules.costs", "safety_gym.rules.elements"),
         ("safety_gym.rules.readings",),

@@ -36,7 +36,7 @@ from safe_rl.envs.safety_gym.rules.elements import (
 from safe_rl.envs.safety_gym.rules.readings import READINGS, Reading
 from safe_rl.envs.safety_gym.rules.robots import ROBOTS, load_robot
 from safe_rl.envs.safety_gym.rules.tasks import TASKS, NextGoal, Task
-from safe_rl.envs.safety_gym.world.building import build_scene
+from safe_rl.envs.safety_gym.world.building import forget_scenes
 
 __all__ = [
     "BOX",
@@ -112,7 +112,7 @@ def register_element(element: Element, keys: Mapping[str, Any] | None = None) ->
     BY_KIND[element.kind] = element
     if element.kind not in PLACEMENT_ORDER:
         PLACEMENT_ORDER.append(element.kind)
-    build_scene.cache_clear()
+    forget_scenes()
 
 
 def register_task(name: str, task: Task, keys: Mapping[str, Any] | None = None) -> None:
@@ -136,7 +136,7 @@ def register_task(name: str, task: Task, keys: Mapping[str, Any] | None = None) 
         raise ConfigError(f"Task '{name}' meets goals: add 'goal' to its elements.")
     _add_keys(keys)
     TASKS[name] = task
-    build_scene.cache_clear()
+    forget_scenes()
 
 
 def register_cost(cost: Cost, keys: Mapping[str, Any] | None = None) -> None:
@@ -163,7 +163,7 @@ def register_cost(cost: Cost, keys: Mapping[str, Any] | None = None) -> None:
     _refuse_unknown_kinds(cost.touches)
     _add_keys(keys)
     COSTS[:] = [*(row for row in COSTS if row.key != cost.key), cost]
-    build_scene.cache_clear()
+    forget_scenes()
 
 
 def register_observation(reading: Reading, keys: Mapping[str, Any] | None = None) -> None:
@@ -189,7 +189,7 @@ def register_observation(reading: Reading, keys: Mapping[str, Any] | None = None
     _refuse_unknown_kinds(reading.touches)
     _add_keys(keys)
     READINGS[:] = [*(row for row in READINGS if row.name != reading.name), reading]
-    build_scene.cache_clear()
+    forget_scenes()
 
 
 def register_robot(name: str, path: str | Path) -> None:
@@ -201,7 +201,7 @@ def register_robot(name: str, path: str | Path) -> None:
     _refuse_taken("robot", name)
     load_robot(str(path))
     ROBOTS[name] = Path(path)
-    build_scene.cache_clear()
+    forget_scenes()
 
 
 def _refuse_taken(what: str, name: str) -> None:

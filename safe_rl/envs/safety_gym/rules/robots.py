@@ -7,12 +7,15 @@ defaults hold for the whole world. An actuator without a `ctrlrange` gets [-1, 1
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from pathlib import Path
 
 import mujoco
+import numpy as np
 
 from safe_rl.envs.errors import ConfigError, nearest
+from safe_rl.envs.safety_gym.rules.robot_files import robot_files
 
 _FOLDER = Path(__file__).parents[1] / "robots"
 ROBOTS: dict[str, Path] = {path.stem: path for path in sorted(_FOLDER.glob("*.xml"))}
@@ -25,6 +28,7 @@ _PLANAR_JOINTS = (
     mujoco.mjtJoint.mjJNT_SLIDE,
     mujoco.mjtJoint.mjJNT_HINGE,
 )
+_OF_THE_ROBOT = ("body_", "geom_", "jnt_", "dof_", "site_", "actuator_", "qpos")
 _PLANAR_AXES = [[1, 0, 0], [0, 1, 0], [0, 0, 1]]
 
 
@@ -45,6 +49,11 @@ class Robot:
     planar: bool
 
 
+def robot_path(base: str) -> Path:
+    """Return the file of a name in `ROBOTS`, or of a path."""
+    return ROBOTS.get(base, Path(base))
+
+
 def load_robot(base: str) -> Robot:
     """Load a robot and check that it can be placed, moved and stepped.
 
@@ -58,14 +67,16 @@ def load_robot(base: str) -> Robot:
         >>> load_robot("car").planar
         False
     """
-    path = ROBOTS.get(base, Path(base))
+    path = robot_path(base)
+    robot_files(path)
     try:
         spec = mujoco.MjSpec.from_file(str(path))
         for key in list(spec.keys):
             spec.delete(key)  # a pose of the robot alone is no pose of the world
         model = spec.copy().compile()
-    except ValueError as error:
+    except (ValueError, RuntimeError, MemoryError) as error:
         raise ConfigError(f"'robot_base': MuJoCo cannot load {path}: {error}") from error
+    _check_numbers(model, path)
     _check_body(model, path)
     for actuator, limited in zip(spec.actuators, model.actuator_ctrllimited, strict=True):
         if not limited:
@@ -75,6 +86,28 @@ def load_robot(base: str) -> Robot:
 
 def _lacks(path: Path, what: str) -> ConfigError:
     return ConfigError(f"'robot_base': {path} {what}")
+
+
+def _check_numbers(model: mujoco.MjModel, path: Path) -> None:
+    """Refuse numbers that no simulation gets along with, and that MuJoCo takes."""
+    if not 0.0 < model.opt.timestep < np.inf:
+        raise _lacks(path, f"has the timestep {model.opt.timestep}: it must be greater than 0.")
+    for name in (name for name in dir(model) if name.startswith(_OF_THE_ROBOT)):
+        values = getattr(model, name)
+        if isinstance(values, np.ndarray) and values.dtype.kind == "f" and np.isnan(values).any():
+            raise _lacks(path, f"has NaN in '{name}': give every mass, size and gain a number.")
+    if not (np.isfinite(model.body_mass).all() and np.isfinite(model.body_inertia).all()):
+        raise _lacks(path, "has a body of infinite mass or inertia.")
+    for (low, high), limited in zip(
+        model.actuator_ctrlrange.tolist(), model.actuator_ctrllimited, strict=True
+    ):
+        # MuJoCo takes a reversed range for none.
+        if not math.isfinite(high - low) or low > high or (limited and low == high):
+            raise _lacks(
+                path,
+                f"has the control range [{low}, {high}]: every 'ctrlrange' must be finite, the "
+                "lower bound first.",
+            )
 
 
 def _check_body(model: mujoco.MjModel, path: Path) -> None:

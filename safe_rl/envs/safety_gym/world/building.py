@@ -17,7 +17,8 @@ from safe_rl.envs.safety_gym.records.scene import Scene
 from safe_rl.envs.safety_gym.rules.costs import COSTS
 from safe_rl.envs.safety_gym.rules.elements import ELEMENTS, Element, Motion
 from safe_rl.envs.safety_gym.rules.readings import READINGS
-from safe_rl.envs.safety_gym.rules.robots import Robot, load_robot
+from safe_rl.envs.safety_gym.rules.robot_files import fingerprint
+from safe_rl.envs.safety_gym.rules.robots import Robot, load_robot, robot_path
 from safe_rl.envs.safety_gym.rules.tasks import TASKS
 from safe_rl.envs.safety_gym.world.bodies import add_bodies, add_floor, add_targets
 from safe_rl.envs.safety_gym.world.scenery import decorate
@@ -28,7 +29,6 @@ ARENA_BYTES = 8 << 20
 SLEEP_TOLERANCE = 1e-5
 
 
-@functools.lru_cache(maxsize=64)
 def build_scene(config: SafetyGymConfig, sleep: bool = False, decorated: bool = False) -> Scene:
     """Compile the world of a configuration.
 
@@ -41,6 +41,14 @@ def build_scene(config: SafetyGymConfig, sleep: bool = False, decorated: bool = 
     Raises:
         ConfigError: if a custom robot file lacks what an environment needs.
     """
+    # A robot file that has changed makes another world.
+    content = fingerprint(robot_path(config.robot_base))
+    return _compile(config, content, sleep, decorated)
+
+
+@functools.lru_cache(maxsize=64)
+def _compile(config: SafetyGymConfig, content: str, sleep: bool, decorated: bool) -> Scene:
+    """Build a scene for the present content of its robot's files."""
     robot = load_robot(config.robot_base)
     _set_options(robot.spec, sleep)
     present = [element for element in ELEMENTS if element.count(config) > 0]
@@ -57,6 +65,10 @@ def build_scene(config: SafetyGymConfig, sleep: bool = False, decorated: bool = 
             "has the name of something in the world."
         ) from error
     return _index(config, model, present, robot, in_physics, contact_names)
+
+
+# After what worlds are built from was registered anew.
+forget_scenes = _compile.cache_clear
 
 
 def _add_objects(
