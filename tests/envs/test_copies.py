@@ -82,8 +82,19 @@ def test_what_slept_wakes_up_in_a_copy():
 def test_copies_before_the_first_reset_begin_the_same_episodes(name):
     env = MAKERS[name]()
     other = copy.deepcopy(env)
+    with pytest.raises(RuntimeError, match="No episode has begun"):
+        other.step(other.rand_action())
     assert_same(env.reset(), other.reset())
     assert_same(env.reset(), other.reset())
+
+
+def test_new_seeds_are_for_the_next_episodes_of_a_copy_too():
+    env = MAKERS["PointGoal2"]()
+    _, here = play(env, env.reset(), 5)
+    env.set_seed(8)
+    other = copy.deepcopy(env)
+    (expected, _), (got, _) = play(env, here.clone(), 20), play(other, here.clone(), 20)
+    assert_same(expected, got)
 
 
 def test_a_copy_under_transforms_goes_on_too():

@@ -322,15 +322,17 @@ class SafetyGymEnv(EnvBase):
     def __reduce__(self) -> tuple[Any, ...]:
         """Tell `copy` and `pickle` to build anew and set the state, as far as `set_state` does."""
         settings = (self.config, self.batch_size[0], self.device, 0, *self._physics_settings)
-        return type(self), settings, (self.get_state(), self._fixed_layout, self._has_cost.clone())
+        flags = (self._has_cost.clone(), self._begun.clone())
+        return type(self), settings, (self.get_state(), self._fixed_layout, flags)
 
-    def __setstate__(self, kept: tuple[TensorDict, Tensor, Tensor]) -> None:
-        state, self._fixed_layout, has_cost = kept
-        if not state["episode"].any():  # no world has begun: there are seeds, and nothing else
+    def __setstate__(self, kept: tuple[TensorDict, Tensor, tuple[Tensor, Tensor]]) -> None:
+        state, self._fixed_layout, (has_cost, begun) = kept
+        if not begun.any():  # there are seeds, and nothing else
             self._row_seed = state["seed"].clone()
             return
         self.set_state(state)
         self._has_cost.copy_(has_cost)
+        self._begun.copy_(begun)
 
     def render(
         self,

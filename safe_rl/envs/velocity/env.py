@@ -258,12 +258,13 @@ class VelocityEnv(EnvBase):
     def __reduce__(self) -> tuple[Any, ...]:
         """Tell `copy` and `pickle` to build anew and set the state."""
         settings = (self.config, self.batch_size[0], self.device, 0, self._num_threads)
-        return type(self), settings, (self.get_state(), self._has_cost.clone())
+        return type(self), settings, (self.get_state(), self._has_cost.clone(), self._begun.clone())
 
-    def __setstate__(self, kept: tuple[TensorDict, Tensor]) -> None:
-        state, has_cost = kept
+    def __setstate__(self, kept: tuple[TensorDict, Tensor, Tensor]) -> None:
+        state, has_cost, begun = kept
         self.set_state(state)
         self._has_cost.copy_(has_cost)
+        self._begun.copy_(begun)
 
     def render(
         self,
