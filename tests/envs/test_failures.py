@@ -1,6 +1,7 @@
 """What goes wrong in one world stays there, and what is wrong with an input is said."""
 
 import math
+import multiprocessing
 
 import gymnasium
 import pytest
@@ -246,3 +247,25 @@ def test_a_step_before_the_first_reset_says_so_in_gymnasium(name):
             env.step(env.action_space.sample())
         env.reset(seed=0)
         env.step(env.action_space.sample())
+
+
+def _step_forked(env: SafetyGymEnv, answers) -> None:
+    try:
+        env.reset()
+        answers.put("it works")
+    except RuntimeError as error:
+        answers.put(str(error))
+
+
+@pytest.mark.filterwarnings("ignore:.*multi-threaded.*fork")
+def test_a_fork_with_threads_is_an_error_instead_of_a_hang():
+    context = multiprocessing.get_context("fork")
+    env, answers = SafetyGymEnv("PointGoal0", num_envs=4, num_threads=2), context.Queue()
+    env.reset()
+    child = context.Process(target=_step_forked, args=(env, answers), daemon=True)
+    child.start()
+    try:
+        assert "num_threads=1" in answers.get(timeout=30)
+    finally:
+        child.kill()
+        child.join()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import warnings
 from collections.abc import Mapping, Sequence
 
@@ -41,6 +42,9 @@ class BatchPhysics:
         num_threads: threads that step them, 0 for one per core.
         outputs: names of the fields of `MjData` that are read; every call copies them out.
 
+    Threads do not survive a fork: simulations with several of them are made in the process that
+    steps them, or that process is spawned.
+
     Examples:
         >>> from safe_rl.envs.safety_gym.records.config import SafetyGymConfig
         >>> from safe_rl.envs.safety_gym.world.building import build_scene
@@ -63,6 +67,8 @@ class BatchPhysics:
     ) -> None:
         _log_to_console_only()
         sleeps = bool(model.opt.enableflags & mujoco.mjtEnableBit.mjENBL_SLEEP)
+        has_threads = (num_threads or os.cpu_count() or 1) > 1
+        self._process = os.getpid() if has_threads else None
         self._batch = Batch(model, num_envs, num_threads, persistent=sleeps)
         # Every field is bound before the first call: later ones would be zero until the next.
         state = {name: _share(self._batch.bind(name)) for name in _STATE}
@@ -86,11 +92,13 @@ class BatchPhysics:
 
     def reset(self, mask: Tensor) -> None:
         """See `Physics.reset`."""
+        self._check_process()
         self._batch.reset(mask.numpy(), stage=_NO_STAGE)
         self._warnings[:] = self._batch.warning
 
     def forward(self, mask: Tensor | None = None, sensors: bool = True) -> None:
         """See `Physics.forward`."""
+        self._check_process()
         self._disableflags[:] = self._with_sensors | (0 if sensors else _NO_SENSORS)
         self._batch.forward(None if mask is None else mask.numpy())
         self._disableflags[:] = self._with_sensors
@@ -99,6 +107,7 @@ class BatchPhysics:
         self, num_substeps: Tensor | int, mocap_path: Tensor | None = None, refresh: bool = True
     ) -> Tensor:
         """See `Physics.step`."""
+        self._check_process()
         # Nobody reads sensors between substeps; without them the result is the same to the bit.
         self._disableflags[:] = self._with_sensors | _NO_SENSORS
         if isinstance(num_substeps, int):
@@ -131,6 +140,15 @@ class BatchPhysics:
             origin.numpy()[:, None], directions.numpy(), geomgroup=seen, bodyexclude=exclude_body
         )
         return torch.from_numpy(distance)
+
+    def _check_process(self) -> None:
+        """Raise in a forked process, which has no threads and would wait for them for ever."""
+        if self._process is not None and self._process != os.getpid():
+            raise RuntimeError(
+                "This environment was made before its process was forked, which its threads do "
+                "not survive. Make it in the process that steps it, start processes with the "
+                "method 'spawn', or give it num_threads=1."
+            )
 
     def _substeps(self, count: int, path: Tensor | None, mask: np.ndarray | None) -> None:
         if count == 0:
