@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from difflib import get_close_matches
+from difflib import SequenceMatcher, get_close_matches
 
 __all__ = ["did_you_mean", "nearest"]
 
@@ -20,8 +20,14 @@ def nearest(name: str, known: Iterable[str]) -> str | None:
         >>> nearest("zzz", ["hazards_num"]) is None
         True
     """
-    close = get_close_matches(name, list(known), n=1, cutoff=_LIKENESS)
-    return close[0] if close else None
+    close = get_close_matches(name, list(known), n=3, cutoff=_LIKENESS)
+    # of equally close ones, the one of the most similar length
+    return max(close, key=lambda found: _likeness(name, found), default=None)
+
+
+def _likeness(name: str, found: str) -> tuple[float, int]:
+    ratio = SequenceMatcher(None, found, name).ratio()
+    return round(ratio, 6), -abs(len(found) - len(name))
 
 
 def did_you_mean(name: str, known: Iterable[str]) -> str:

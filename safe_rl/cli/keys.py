@@ -104,6 +104,10 @@ KEYS = {
         optional(component), "what of the episodes' costs is limited", may_lack=True
     ),
     "lagrangian": Key(optional(component), "the multiplier", may_lack=True),
+    "limits": Key(optional(component), "from the costs of a batch to violations", may_lack=True),
+    "staggered_starts": Key(
+        optional(boolean), "whether first episodes begin at different points", may_lack=True
+    ),
     "loss": Key(component, "the policy's loss", may_lack=True),
     "policy_update": Key(component, "what moves the policy", may_lack=True),
     "critic_update": Key(component, "what moves the critics", may_lack=True),
@@ -184,7 +188,10 @@ PARTS = {
         "tolerance": Key(_NOT_NEGATIVE, "η, violation of an episode's cost that is let pass"),
     },
     "PPOLoss": _CLIPPED_LOSS,
-    "PPOLagrangianLoss": _CLIPPED_LOSS,
+    "PPOLagrangianLoss": {
+        **_CLIPPED_LOSS,
+        "cost_clipping": Key(choice("none", "pessimistic", "joint"), "how cost surrogates are cut"),
+    },
     "TRPOLoss": _LOSS,
     "TRPOLagrangianLoss": _LOSS,
     "CPOLoss": _LOSS,
@@ -216,6 +223,27 @@ PARTS = {
         "init": Key(one_or_per_cost(number(0, 1e6)), "first λ"),
         "lr": Key(_POSITIVE, "change of λ per unit of violation"),
         "highest": Key(optional(_POSITIVE), "upper bound of λ; null: none"),
+    },
+    "PIMultiplier": {
+        "init": Key(one_or_per_cost(number(0, 1e6)), "first λ"),
+        "kp": Key(_NOT_NEGATIVE, "proportional gain"),
+        "ki": Key(_NOT_NEGATIVE, "integral gain"),
+        "saturation": Key(_POSITIVE, "bound of the error, in units of the limit"),
+        "highest": Key(_POSITIVE, "upper bound of λ"),
+    },
+    "LimitTracker": {
+        "margin": Key(_NOT_NEGATIVE, "standard errors of a batch's J_c below the limit"),
+        "largest_margin": Key(_SHARE, "bound of the margin, as a share of the limit"),
+        "free_steps": Key(count(0), "steps for which costs are free"),
+        "descent_steps": Key(count(0), "steps in which the limit then comes down"),
+        "frames": Key(count(), "steps of the whole run"),
+        "latest_end": Key(number(0, 1, above=True), "share of a run by which the descent is over"),
+        "smallest_scale": Key(_POSITIVE, "unit of violations of limits near 0, costs per step"),
+        "drift": Key(optional(_POSITIVE), "share by which J_c changes per update"),
+        "memory": Key(number(0, 1, below=True), "weight of the past"),
+        "lowest_trust": Key(number(0, 1, above=True), "share of a promise believed at least"),
+        "integral": Key(_NOT_NEGATIVE, "share of a violation that is asked for again"),
+        "largest_integral": Key(_NOT_NEGATIVE, "bound of that, in units of violations"),
     },
     "PIDMultiplier": {
         "init": Key(one_or_per_cost(number(0, 1e6)), "first λ"),

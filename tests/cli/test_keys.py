@@ -150,7 +150,7 @@ def test_no_value_ends_in_a_traceback(configs):
         ("policy_update.optimizer.lr", "abc", "policy_update.optimizer.lr=abc: it must be"),
         ("policy_update.adapt_rate.factor", 1, "adapt_rate.factor=1: it must be a number above 1"),
         ("loss.clip_epsilon", math.nan, "loss.clip_epsilon=nan: it must be"),
-        ("lagrangian.scale", "foo", "lagrangian.scale=foo: it must be limit, or a number"),
+        ("lagrangian.highest", "foo", "lagrangian.highest=foo: it must be a number above 0"),
         ("lagrangian.kp", -1, "lagrangian.kp=-1: it must be a number from 0"),
         ("model.initial_log_std", None, "model.initial_log_std=null: it must be"),
         ("model.input_scale", 3, "model.input_scale=3: it must be a mapping"),

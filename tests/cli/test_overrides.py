@@ -40,7 +40,7 @@ WRONG = {
     "+lagrangian.kpp=1": "Did you mean 'lagrangian.kp'",
     "+logger.path=x": "logger.path: nothing reads",
     "~logger": "logger is missing: .*logger=none for nothing",
-    "~frames": "frames is missing",
+    "~frames": "'frames' not found",
     "+seed=1": "'seed' is there already: write it without +",
     "env=PointGaol1": "no env 'PointGaol1'. Did you mean 'PointGoal1'",
     "env=CarGoal2,CarGaol2": "no env 'CarGaol2'. Did you mean 'CarGoal2'",

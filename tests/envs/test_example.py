@@ -46,7 +46,7 @@ def test_it_is_trained_resumed_and_evaluated_by_the_ordinary_commands(tmp_path):
     status, printed = run("train.py", IMPORT, *MINES, *SHORT, "collector=process",
                           f"hydra.run.dir={tmp_path}")  # fmt: skip
     assert status == 0, printed
-    assert "violation_cost_mines" in read_table(tmp_path / "progress.csv")
+    assert "estimate_cost_mines" in read_table(tmp_path / "progress.csv")
     status, printed = run("train.py", f"resume={tmp_path}", "frames=160")
     assert status == 1
     assert f"add {IMPORT}" not in printed
