@@ -104,7 +104,7 @@ KEYS = {
         optional(component), "what of the episodes' costs is limited", may_lack=True
     ),
     "lagrangian": Key(optional(component), "the multiplier", may_lack=True),
-    "limits": Key(optional(component), "from the costs of a batch to violations", may_lack=True),
+    "limits": Key(optional(_SECTION), "from the costs of a batch to violations", may_lack=True),
     "staggered_starts": Key(
         optional(boolean), "whether first episodes begin at different points", may_lack=True
     ),

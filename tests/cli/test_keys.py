@@ -31,7 +31,7 @@ HOMES = (
 # what recipes, collectors and run folders hand to a part themselves
 LIVE = {
     *("self", "loss", "actor_network", "multiplier", "value_network", "cost_keys", "cost_limits"),
-    "constraints",
+    *("constraints", "max_length"),
     *("env", "make_env", "policy", "frames_per_batch", "device", "log_dir", "kwargs"),
 }
 FREE = {path for path, row in KEYS.items() if row.values is anything}
@@ -206,14 +206,14 @@ def test_whole_numbers_may_be_written_with_exponents(configs):
     assert [repr(value) for value in values] == ["300000", "10", "8"]
 
 
-class OwnMultiplier(safe_rl.objectives.PIDMultiplier):
+class OwnMultiplier(safe_rl.objectives.PIMultiplier):
     """A part of one's own, with an argument more."""
 
     def __init__(self, cost_limits, *, patience, **kwargs):
         super().__init__(cost_limits, **kwargs)
 
 
-class OwnLoss(safe_rl.objectives.PPOLoss):
+class OwnLoss(safe_rl.objectives.PPOLagrangianLoss):
     """A part of one's own that takes what it inherits."""
 
 

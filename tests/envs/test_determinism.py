@@ -9,7 +9,7 @@ from safe_rl.envs import SUITE, SafetyGymEnv
 # Short episodes and large goals, so that resets and new goals are among the compared steps.
 BUSY = {"num_steps": 20}
 CONFIGS = {
-    "goal": SUITE["PointGoal2"].replace(**BUSY, goal_size=0.9),
+    "goal": SUITE["PointGoal2"].replace(**BUSY, goal_size=1.8),
     "button": SUITE["CarButton2"].replace(**BUSY, buttons_size=0.2),
     "push": SUITE["DoggoPush2"].replace(**BUSY, goal_size=1.0),
     "noise": SUITE["PointPush1"].replace(**BUSY, action_noise=0.3, frameskip_binom_p=0.7),
