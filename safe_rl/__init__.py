@@ -5,9 +5,10 @@ environments, `safe_rl.objectives` the constrained losses and solvers, `safe_rl.
 learns with them, `safe_rl.collectors` data collection with cost accounting.
 """
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import safe_rl.openmp  # noqa: F401, whatever is imported first, this comes before torch
+from safe_rl.lazy import import_later
 
 if TYPE_CHECKING:
     from safe_rl.cli.notebook import Run, load, train
@@ -16,10 +17,4 @@ __all__ = ["Run", "load", "train"]
 __version__ = "0.1.0"
 
 
-def __getattr__(name: str) -> Any:
-    """Import what trains and loads when it is asked for: parts are used without it."""
-    if name not in __all__:
-        raise AttributeError(f"module 'safe_rl' has no attribute '{name}'")
-    from safe_rl.cli import notebook
-
-    return getattr(notebook, name)
+__getattr__ = import_later(__name__, dict.fromkeys(__all__, "safe_rl.cli.notebook"))

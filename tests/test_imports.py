@@ -18,8 +18,9 @@ PARTS = {
     "extras": (),
     "processes": (),
     "naming": (),
+    "lazy": (),
     "targets": ("naming",),
-    "envs": ("naming", "targets"),
+    "envs": ("lazy", "naming", "targets"),
     "objectives": ("naming",),
     "collectors": ("processes",),
     "models": (),
@@ -27,7 +28,7 @@ PARTS = {
     "runs": ("algorithms", "extras", "targets"),
     "training": ("algorithms", "collectors", "runs", "targets"),
     "scores": ("extras",),
-    "evaluation": ("algorithms", "extras", "models", "runs", "scores"),
+    "evaluation": ("algorithms", "extras", "lazy", "models", "runs", "scores"),
     "reporting": ("extras", "runs", "scores"),
     "cli": (
         *("envs", "evaluation", "extras", "naming", "openmp", "processes", "reporting", "runs"),
@@ -78,8 +79,10 @@ FLOORS = {
         ("velocity",),
         ("gymnasium.processes", "gymnasium.worlds"),
         ("gymnasium.conversion", "gymnasium.single", "gymnasium.vector"),
+        ("gymnasium.nodes",),
         ("gymnasium.family",),
         ("gymnasium",),
+        ("names",),
         # What changes any of them from outside.
         ("transforms.base",),
         ("transforms.action_filter", "transforms.early_termination", "transforms.saute"),
@@ -121,11 +124,12 @@ FLOORS = {
     "cli": (
         ("benchmark", "conf", "options", "run_folders", "values"),
         ("keys",),
-        ("settings",),
+        ("failures", "settings"),
         ("overrides",),
         ("user_code",),
         ("composing", "shorthands", "sweeps"),
         ("certificates",),
+        ("running",),
         ("evaluate", "report", "train"),
         ("notebook",),
         ("",),
@@ -229,10 +233,12 @@ def test_the_package_itself_imports_what_comes_before_torch_and_no_part():
     tree = ast.parse(PATHS["safe_rl"].read_text())
     at_once = [node for node in tree.body if isinstance(node, ast.Import | ast.ImportFrom)]
     assert [ast.unparse(node) for node in at_once] == [
-        "from typing import TYPE_CHECKING, Any",
+        "from typing import TYPE_CHECKING",
         "import safe_rl.openmp",
+        "from safe_rl.lazy import import_later",
     ]
-    later = {found.imported for found in imports_of("safe_rl")} - {"typing", "safe_rl.openmp"}
+    at_hand = {"typing", "safe_rl.openmp", "safe_rl.lazy"}
+    later = {found.imported for found in imports_of("safe_rl")} - at_hand
     assert later == {"safe_rl.cli.notebook"}
 
 
@@ -287,3 +293,15 @@ def test_tables_have_no_circles_and_no_ruins():
         modules = [f"safe_rl.{part}.{name}".rstrip(".") for floor in floors for name in floor]
         assert len(set(modules)) == len(modules)
         assert set(modules) <= set(PATHS), "modules that are no more"
+
+
+@pytest.mark.parametrize("flags", [("--help",), ("--cfg", "job")])
+def test_help_and_configurations_are_shown_without_importing_what_trains(flags):
+    """Which takes longer than all the rest of it."""
+    said = in_a_process(
+        f"import sys; from safe_rl.cli.train import main; sys.argv[1:] = {flags}\n"
+        "try: main()\n"
+        "finally: print('slow:', {'torchrl', 'tensordict', 'matplotlib'} & sys.modules.keys())"
+    )
+    assert "PointGoal1" in said
+    assert said.splitlines()[-1] == "slow: set()"

@@ -25,7 +25,7 @@ from safe_rl.cli.certificates import certify_run, is_worth_a_certificate
 from safe_rl.cli.composing import check_command
 from safe_rl.cli.conf import CONF
 from safe_rl.cli.evaluate import evaluate_run
-from safe_rl.cli.train import complete, prepare
+from safe_rl.cli.running import complete, prepare
 from safe_rl.cli.user_code import check_imports, import_modules, note_imports, quote
 from safe_rl.envs import make_env, store_configs
 from safe_rl.evaluation import Evaluation, EvaluationOptions

@@ -4,30 +4,21 @@ from __future__ import annotations
 
 import inspect
 import os
-import shutil
-from collections.abc import Callable, Collection, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator, Mapping
 from itertools import chain
-from pathlib import Path
 from typing import Any, NamedTuple
 
-from hydra.errors import InstantiationException
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
-from torchrl.checkpoint import CheckpointError
 
 from safe_rl.cli.keys import EXTRAS, FLAGS, KEYS, PARTS, Key
 from safe_rl.envs import complete_env
 from safe_rl.evaluation.settings import check_device
 from safe_rl.extras import require_extra
 from safe_rl.naming import did_you_mean
-from safe_rl.runs.folder import RunFolder
 from safe_rl.targets import locate
 
-__all__ = [
-    *("SETTING_ERRORS", "SettingError", "check_settings", "errors_in_a_line"),
-    *("optional_keys", "plain"),
-]
+__all__ = ["SettingError", "check_settings", "optional_keys", "plain"]
 
 _MISSING = object()
 _SECTIONS = ("algo", "certificate", "checkpoint", "collector", "logger", "model")
@@ -232,43 +223,3 @@ def _check_extra(part: _Part) -> None:
             require_extra(*extra)
         except ModuleNotFoundError as error:
             raise SettingError(f"{part.path}: {error}") from None
-
-
-@contextmanager
-def errors_in_a_line(directory: Path, is_new: bool, *errors: type[Exception]) -> Iterator[None]:
-    """End with what is wrong instead of the way to it, which ``HYDRA_FULL_ERROR=1`` shows.
-
-    Args:
-        directory: Folder of the run.
-        is_new: Whether it may go if nothing is in it.
-        errors: Errors that are about settings and files; all others pass.
-
-    Raises:
-        SystemExit: For these errors.
-    """
-    try:
-        yield
-    except errors as error:
-        if os.environ.get("HYDRA_FULL_ERROR") == "1":
-            raise
-        if is_new and directory.is_dir() and RunFolder(directory).is_untouched:
-            shutil.rmtree(directory)
-        raise SystemExit(_in_words(error)) from None
-
-
-SETTING_ERRORS: Collection[type[Exception]] = (
-    *(ValueError, CheckpointError, InstantiationException, OmegaConfBaseException, OSError),
-    ModuleNotFoundError,
-)
-"""What goes wrong for the sake of settings and files while a run is built."""
-
-
-def _in_words(error: Exception) -> str:
-    """A component's own words, and the key of the component, in one line."""
-    cause = error.__cause__
-    words = str(error)
-    if isinstance(error, InstantiationException) and cause is not None:
-        key = str(error).rpartition("full_key: ")[2]
-        words = str(cause) if isinstance(cause, ValueError) else f"{type(cause).__name__}: {cause}"
-        words = f"{key}: {words}"
-    return " ".join(words.split())

@@ -1,27 +1,36 @@
 """Environments of every family, the contract they fulfil, and their names.
 
 Safety Gym's configurations, the benchmark suite and the batched environment stand in `safety_gym`.
+Names and keys are there at once; what builds environments is imported when it is asked for.
 """
+
+from typing import TYPE_CHECKING
 
 # First, because it imports MuJoCo where OpenGL is missing.
 from safe_rl.envs.opengl import OpenGLError
 
 # isort: split
-from safe_rl.envs.contract import (
-    ConstrainedEnv,
-    ContractError,
-    PositionedEnv,
-    SnapshotEnv,
-    check_constrained_env,
-)
 from safe_rl.envs.errors import ConfigError
-from safe_rl.envs.families import complete_env, env_names, env_node, make_env
-from safe_rl.envs.gymnasium.conversion import from_gymnasium
+from safe_rl.envs.names import complete_env, env_names, env_node
 from safe_rl.envs.registration import register_gymnasium, store_config, store_configs
-from safe_rl.envs.safety_gym.env import SafetyGymEnv
 from safe_rl.envs.safety_gym.records.config import SafetyGymConfig, key_table
 from safe_rl.envs.safety_gym.suite import EXTRAS, SUITE, resolve
-from safe_rl.envs.safety_gym.world.layout import LayoutError
+from safe_rl.lazy import import_later
+
+if TYPE_CHECKING:
+    from safe_rl.envs.contract import (
+        ConstrainedEnv,
+        ContractError,
+        PositionedEnv,
+        SnapshotEnv,
+        check_constrained_env,
+    )
+    from safe_rl.envs.families import make_env
+    from safe_rl.envs.gymnasium.conversion import from_gymnasium
+    from safe_rl.envs.safety_gym.env import SafetyGymEnv
+    from safe_rl.envs.safety_gym.world.layout import LayoutError
+
+_CONTRACT = ("ConstrainedEnv", "ContractError", "PositionedEnv", "SnapshotEnv")
 
 __all__ = [
     "EXTRAS",
@@ -46,5 +55,16 @@ __all__ = [
     "store_config",
     "store_configs",
 ]
+
+__getattr__ = import_later(
+    __name__,
+    {
+        **dict.fromkeys((*_CONTRACT, "check_constrained_env"), "safe_rl.envs.contract"),
+        "LayoutError": "safe_rl.envs.safety_gym.world.layout",
+        "SafetyGymEnv": "safe_rl.envs.safety_gym.env",
+        "from_gymnasium": "safe_rl.envs.gymnasium.conversion",
+        "make_env": "safe_rl.envs.families",
+    },
+)
 
 register_gymnasium()

@@ -14,7 +14,7 @@ from hydra.plugins.config_source import ConfigLoadError, ConfigResult, ConfigSou
 from hydra.plugins.search_path_plugin import SearchPathPlugin
 from omegaconf import OmegaConf
 
-from safe_rl.envs.families import env_names, env_node
+from safe_rl.envs.names import env_names, env_node
 from safe_rl.envs.safety_gym.nodes import group_node
 from safe_rl.envs.safety_gym.records.config import SafetyGymConfig
 from safe_rl.envs.safety_gym.suite import EXTRAS, SUITE, TESTING, resolve

@@ -1,10 +1,15 @@
 """What a trained policy does: whole episodes, estimates with intervals, a video."""
 
-from safe_rl.evaluation.certifying import Certificate, CertificateOptions, certify
-from safe_rl.evaluation.episodes import Episodes, collect_episodes
-from safe_rl.evaluation.measuring import Evaluation, evaluate
+from typing import TYPE_CHECKING
+
 from safe_rl.evaluation.settings import EvaluationOptions
-from safe_rl.evaluation.summary import summarise
+from safe_rl.lazy import import_later
+
+if TYPE_CHECKING:
+    from safe_rl.evaluation.certifying import Certificate, CertificateOptions, certify
+    from safe_rl.evaluation.episodes import Episodes, collect_episodes
+    from safe_rl.evaluation.measuring import Evaluation, evaluate
+    from safe_rl.evaluation.summary import summarise
 
 __all__ = [
     "Certificate",
@@ -17,3 +22,17 @@ __all__ = [
     "evaluate",
     "summarise",
 ]
+
+__getattr__ = import_later(
+    __name__,
+    {
+        "Certificate": "safe_rl.evaluation.certifying",
+        "CertificateOptions": "safe_rl.evaluation.certifying",
+        "Episodes": "safe_rl.evaluation.episodes",
+        "Evaluation": "safe_rl.evaluation.measuring",
+        "certify": "safe_rl.evaluation.certifying",
+        "collect_episodes": "safe_rl.evaluation.episodes",
+        "evaluate": "safe_rl.evaluation.measuring",
+        "summarise": "safe_rl.evaluation.summary",
+    },
+)

@@ -7,7 +7,8 @@ from pathlib import Path
 import pytest
 from run_configs import point_mass_config
 
-from safe_rl.cli.settings import SettingError, check_settings, errors_in_a_line
+from safe_rl.cli.failures import errors_in_a_line
+from safe_rl.cli.settings import SettingError, check_settings
 
 ROOT = Path(__file__).parents[2]
 WRONG = {

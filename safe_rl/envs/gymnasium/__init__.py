@@ -5,6 +5,13 @@ Costs stand in `info`: `info["cost"]`, one `info["cost_<kind>"]` per constrained
 that `safe_rl.envs.registration` registers.
 """
 
-from safe_rl.envs.gymnasium.family import make_gymnasium
+from typing import TYPE_CHECKING
+
+from safe_rl.lazy import import_later
+
+if TYPE_CHECKING:
+    from safe_rl.envs.gymnasium.family import make_gymnasium
 
 __all__ = ["make_gymnasium"]
+
+__getattr__ = import_later(__name__, {"make_gymnasium": "safe_rl.envs.gymnasium.family"})

@@ -1,24 +1,17 @@
-"""Any environment of Gymnasium as a family: `env=gymnasium env.id=…`, see conf/env/gymnasium.yaml.
-
-A configuration may come from somebody else, so an id that has Gymnasium import a module
-("module:Name-v0") is refused: a module of one's own is named by `import=`.
-"""
+"""Any environment of Gymnasium as a family: `env=gymnasium env.id=…`."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from functools import partial
 from typing import Any
 
 import gymnasium
 import numpy as np
 import torch
 
-from safe_rl.envs.errors import ConfigError, nearest, require_integer
-from safe_rl.envs.gymnasium.conversion import GymnasiumEnv, describe, from_gymnasium
-
-GYMNASIUM_TARGET = "safe_rl.envs.gymnasium.make_gymnasium"
-KEYS = ("id", "cost_keys", "num_steps", "kwargs", "workers", "flatten", "render_mode")
+from safe_rl.envs.errors import ConfigError
+from safe_rl.envs.gymnasium.conversion import GymnasiumEnv, from_gymnasium
+from safe_rl.envs.gymnasium.nodes import complete_gymnasium, maker
 
 
 def make_gymnasium(
@@ -32,7 +25,7 @@ def make_gymnasium(
     """Make environments of a registered id.
 
     Args:
-        config: `id` and any of the other `KEYS`.
+        config: `id` and any other of `safe_rl.envs.gymnasium.nodes.KEYS`.
         num_envs: number of environments, N.
         device: where the TensorDicts live.
         seed: determines every row; rows of different seeds have nothing in common.
@@ -47,7 +40,7 @@ def make_gymnasium(
         ['cost', 'cost_hazards', 'cost_exception']
     """
     config = complete_gymnasium(config)
-    make = _maker(config)
+    make = maker(config)
     try:
         return from_gymnasium(
             make,
@@ -61,59 +54,6 @@ def make_gymnasium(
         )
     except (gymnasium.error.Error, TypeError, ValueError) as error:
         raise ConfigError(f"env.id={config['id']}: {error}") from error
-
-
-def complete_gymnasium(node: Mapping[str, Any]) -> dict[str, Any]:
-    """Fill a node up: costs and length of episodes are found by making and stepping one.
-
-    Raises:
-        ConfigError: for an unknown key or id, or an environment that the algorithms cannot use.
-    """
-    for key in node:
-        if key not in (*KEYS, "name", "_target_"):
-            raise ConfigError(
-                f"A Gymnasium environment has no key '{key}'.{nearest(str(key), KEYS)} Arguments "
-                "for gymnasium.make stand in 'kwargs', as env.kwargs='{render_fps: 30}'."
-            )
-    if not isinstance(node.get("id"), str):
-        raise ConfigError("Which environment? Name a registered one: env.id=…")
-    defaults: dict[str, Any] = {"name": node["id"], "cost_keys": None, "num_steps": None}
-    defaults |= {"kwargs": None, "workers": 0, "flatten": False, "render_mode": None}
-    full = {**defaults, **node}
-    require_integer("workers", full["workers"], lowest=0)
-    if full["num_steps"] is not None:
-        require_integer("num_steps", full["num_steps"], lowest=1)
-    if None in (full["cost_keys"], full["num_steps"]):
-        try:
-            costs, steps = describe(
-                _maker(full), full["cost_keys"], full["num_steps"], full["flatten"]
-            )
-        except (gymnasium.error.Error, TypeError, ValueError) as error:
-            raise ConfigError(f"env.id={full['id']}: {error}") from error
-        full |= {"cost_keys": costs, "num_steps": steps}
-    return full
-
-
-def _maker(config: Mapping[str, Any]) -> Any:
-    """Function that makes one environment; what is registered goes with it to other processes."""
-    env_id = config["id"]
-    module, _, name = env_id.rpartition(":")
-    if module:
-        raise ConfigError(
-            f"env.id={env_id}: configurations import nothing. If you trust '{module}', use "
-            f"import={module} env.id={name}"
-        )
-    try:
-        spec = gymnasium.spec(env_id)
-    except gymnasium.error.Error as error:
-        raise ConfigError(
-            f"env.id={env_id}: {error} {nearest(env_id, gymnasium.registry)} A module that "
-            "registers an environment is imported by import=my_module."
-        ) from error
-    kwargs = dict(config["kwargs"] or {})
-    if config["render_mode"] is not None:
-        kwargs["render_mode"] = config["render_mode"]
-    return partial(gymnasium.make, spec, **kwargs)
 
 
 def _spread(seed: int) -> int:

@@ -1,0 +1,104 @@
+"""A composed configuration becomes a run: build it, or go on with it, train, certify."""
+
+from __future__ import annotations
+
+import math
+from contextlib import AbstractContextManager, ExitStack, nullcontext
+from functools import partial
+from pathlib import Path
+from typing import Any, cast
+
+from hydra.core.hydra_config import HydraConfig
+from hydra.types import RunMode
+from omegaconf import DictConfig, OmegaConf, open_dict
+
+from safe_rl.cli.certificates import certify_run, is_worth_a_certificate
+from safe_rl.cli.failures import SETTING_ERRORS, errors_in_a_line
+from safe_rl.cli.run_folders import write_notes
+from safe_rl.cli.settings import check_settings
+from safe_rl.cli.user_code import imported, make_after_imports
+from safe_rl.envs import LayoutError, complete_env, make_env
+from safe_rl.evaluation.loading import transforms_of
+from safe_rl.runs.folder import RunFolder
+from safe_rl.runs.lock import held
+from safe_rl.runs.resuming import is_finished, may_continue
+from safe_rl.training.trainer import Trainer, build_trainer, physics_threads, seed_everything
+from safe_rl.training.transfer import initialise_networks
+
+__all__ = ["complete", "prepare", "run"]
+
+
+def prepare(config: DictConfig, directory: Path, continues: bool) -> Trainer | None:
+    """Build a run, or go on with the one in the folder; None if that is finished."""
+    if not continues:
+        RunFolder(directory).check_is_free()
+    check_settings(config)
+    if continues and is_finished(directory, config.frames):
+        print(f"{directory} has its {config.frames:,} frames already: raise 'frames' to train on.")
+        return None
+    if config.frames % config.frames_per_batch:
+        whole = math.ceil(config.frames / config.frames_per_batch) * config.frames_per_batch
+        print(f"Training for {whole:,} frames: whole batches of {config.frames_per_batch:,}.")
+    seed_everything(config.seed, config.num_threads)
+    make = partial(
+        make_env,
+        cast(dict[str, Any], OmegaConf.to_container(config.env, resolve=True)),
+        device=config.device,
+        seed=config.seed,
+        num_threads=physics_threads(config),
+        transforms=transforms_of(config),
+    )
+    in_workers = partial(make_after_imports, imported(), make)
+    trainer = build_trainer(config, make(num_envs=config.num_envs), directory, in_workers)
+    if continues and trainer.resume():
+        print(f"Going on after {trainer.progress.steps:,} of {config.frames:,} frames.")
+        if trainer.begins_anew:
+            print("The state of its environments is not stored: they begin new episodes.")
+        return trainer
+    if continues and trainer.folder.files.num_rows:
+        print("No checkpoint was written yet: starting over, with a new progress.csv.")
+    if config.init_from is not None:
+        algorithm = trainer.algorithm
+        initialise_networks(algorithm.networks, Path(config.init_from), list(algorithm.cost_keys))
+    return trainer
+
+
+def complete(config: DictConfig) -> None:
+    """Fill the environment's keys up, so that the run's folder tells all of them."""
+    with open_dict(config):
+        config.env = complete_env(
+            cast(dict[str, Any], OmegaConf.to_container(config.env, resolve=True))
+        )
+
+
+def run(config: DictConfig) -> None:
+    """Train, or go on training, in the folder that Hydra has chosen.
+
+    Raises:
+        SystemExit: with one line for what is wrong with settings or files, or when interrupted.
+    """
+    folder = RunFolder(Path(HydraConfig.get().runtime.output_dir))
+    is_job = HydraConfig.get().mode is RunMode.MULTIRUN  # whose sweep keeps account of failures
+    with nullcontext() if is_job else errors_in_a_line(folder.directory, True, *SETTING_ERRORS):
+        complete(config)
+    continues = may_continue(HydraConfig.get(), config)
+
+    def in_a_line(*errors: type[Exception]) -> AbstractContextManager[None]:
+        within = errors_in_a_line(folder.directory, not continues, *errors)
+        return nullcontext() if is_job else within
+
+    with ExitStack() as stack:
+        with in_a_line(*SETTING_ERRORS, LayoutError, FileExistsError):
+            stack.enter_context(held(folder))
+            trainer = prepare(config, folder.directory, continues)
+        if trainer is None:
+            return
+        with in_a_line(OSError):
+            if not continues or (is_job and not folder.notes.exists()):
+                write_notes(folder, config)
+            print(trainer.run())
+    if trainer.interrupted_by is not None:
+        print(f"Interrupted. Continue with: python train.py resume={folder.directory}")
+        raise SystemExit(128 + trainer.interrupted_by)
+    if trainer.algorithm.cost_keys and is_worth_a_certificate(config, trainer.episode_length):
+        print(certify_run(folder.directory, num_threads=config.num_threads or 0))

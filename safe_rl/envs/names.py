@@ -1,0 +1,73 @@
+"""Names of environments of every family, and the nodes of the configuration they stand for.
+
+Nothing here builds an environment, so that names and keys are known without importing what does.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Mapping
+from typing import Any, NamedTuple
+
+from safe_rl.envs.gymnasium.nodes import GYMNASIUM_TARGET, complete_gymnasium
+from safe_rl.envs.safety_gym.nodes import complete_safety_gym, safety_gym_node
+from safe_rl.envs.safety_gym.suite import EXTRAS, SUITE
+from safe_rl.envs.velocity.nodes import VELOCITY_TARGET, complete_velocity, velocity_node
+from safe_rl.envs.velocity.suite import VELOCITY_SUITE
+
+
+class Named(NamedTuple):
+    """Names of a family, and the node that each of them stands for."""
+
+    names: Callable[[], Collection[str]]
+    node: Callable[[str], dict[str, Any]]
+
+
+NAMED = [
+    Named(lambda: [*SUITE, *EXTRAS], safety_gym_node),
+    Named(lambda: list(VELOCITY_SUITE), velocity_node),
+]
+
+# What fills a family's nodes up; others are taken as they are.
+_COMPLETE: dict[str | None, Callable[[Mapping[str, Any]], dict[str, Any]]] = {
+    None: complete_safety_gym,
+    VELOCITY_TARGET: complete_velocity,
+    GYMNASIUM_TARGET: complete_gymnasium,
+}
+
+
+def env_names() -> list[str]:
+    """Names that stand for an environment of any family."""
+    return [name for family in NAMED for name in family.names()]
+
+
+def env_node(name: str) -> dict[str, Any]:
+    """Return the node of the group `env` that a name stands for, with every key.
+
+    Raises:
+        KeyError: if there is no such name.
+
+    Examples:
+        >>> env_node("CarPush2")["pillars_num"]
+        4
+    """
+    for family in NAMED:
+        if name in family.names():
+            return family.node(name)
+    raise KeyError(name)
+
+
+def complete_env(node: Mapping[str, Any]) -> dict[str, Any]:
+    """Fill up a node that holds only what differs from its family's defaults.
+
+    Args:
+        node: as `make_env` takes it; what it holds stays as it is.
+
+    Raises:
+        ConfigError: for an unknown key or a value that cannot be used.
+
+    Examples:
+        >>> complete_env({"name": "mine", "robot_base": "point"})["randomize_layout"]
+        True
+    """
+    complete = _COMPLETE.get(node.get("_target_"))
+    return dict(node) if complete is None else complete(node)
