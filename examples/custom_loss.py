@@ -1,80 +1,73 @@
-"""A constrained loss of your own: PPO that limits its worst episodes instead of the mean one.
+"""A constrained loss and a risk measure of your own.
 
-The limit d applies to the conditional value at risk of the episode cost C: the mean cost of the
-worst fraction α of the episodes, CVaR = ν + E[(C − ν)₊] / α with ν, the value at risk, the cost
-that a fraction α of the episodes exceeds (Rockafellar and Uryasev 2000, theorem 1). Three parts
-take the place of the package's own; the files in `conf/` beside this one name them:
+- `QuadraticPenaltyLoss` is PPO's loss plus a penalty on how far the surrogate of J_c would be above
+  its limit, squared. The live objects that its constructor names (`constraints`) are handed to it.
+- `UpperSemideviation` limits E[C] + w E[(C − E[C])₊], the mean cost of an episode and w times what
+  costly episodes are above it (Ruszczyński and Shapiro 2006). It says what each step is charged
+  for; advantages, critics and limits follow from that.
 
-- `conditional_value_at_risk` is what the multiplier compares with d, in place of the mean cost;
-- `TailCostGAE` estimates its gradient. It charges a step only for cost beyond ν, divided by α.
-  Over an episode this sums to (C − ν)₊ / α, so that the advantages of this cost are those of CVaR;
-  how ν moves with the policy is of second order, as ν minimises the expression above (Chow,
-  Ghavamzadeh, Janson and Pavone 2017, sections 3 and 5);
-- `CVaRPPOLoss` is the Lagrangian (L_r − λ L_c) / (1 + λ) with L_c = E[max(ρA, clip(ρ)A)]: few
-  steps carry the tail's cost, and the clip ends what each of them can promise, as it does for the
-  reward (Zhang et al. 2022, equation 12).
+The files in `conf/` beside this one name them:
 
     python train.py import=examples/custom_loss.py --config-dir examples/conf \
-        algo=cvar_ppo env=PointGoal1 num_envs=20 frames=60_000
+        algo=quadratic risk=semideviation env=PointGoal1 frames=60_000
 
-Three epochs, to see it run; without `frames` it learns. The column `violation_cost` is CVaR − d.
-The first two parts go with other algorithms as they are: `algo=cpo +risk=cvar num_envs=20`.
-Batches have to hold whole episodes, hence `num_envs=20`: one that a batch cuts counts in parts.
+Three epochs, to see it run; without `frames` it learns. Each of the two goes with the package's own
+as well: `algo=cpo risk=semideviation`, `algo=quadratic risk=cvar`. The column `violation_cost` is
+what is limited less d.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping
+from typing import Any
 
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from safe_rl.objectives import CostGAE, PPOLagrangianLoss
-from safe_rl.objectives.ppo import clipped_gain
-from safe_rl.objectives.surrogate import lagrangian
+from safe_rl.objectives import PPOLoss
+from safe_rl.objectives.risk import Charges, cost_so_far
+from safe_rl.objectives.violation import violation_of
 
 
-def value_at_risk(costs: Tensor, tail: float) -> Tensor:
-    """The cost that at most a fraction `tail` of the episodes exceeds: [E, k] -> [k]."""
-    ranked = costs.sort(0, descending=True).values
-    return ranked[min(int(tail * len(ranked)), len(ranked) - 1)]
+class QuadraticPenaltyLoss(PPOLoss):
+    """PPO's loss + strength · Σᵢ (E[ρAᵢ] + (J_cᵢ − dᵢ) / T̄)₊²."""
+
+    extra_out_keys = ("loss_penalty", "clip_fraction")
+    has_costs = True
+
+    def __init__(self, actor_network, constraints, *, strength: float, **settings) -> None:
+        super().__init__(actor_network, **settings)
+        self.constraints, self.strength = constraints, strength
+
+    def _surrogates(self, tensordict: TensorDictBase, log_weight: Tensor) -> dict[str, Tensor]:
+        gain = log_weight.exp() * self._cost_advantage(tensordict)
+        surrogates = self._cost_surrogates(tensordict, gain)  # [k]
+        violation = violation_of(self.constraints, surrogates)
+        excess = surrogates + violation / self.constraints.episode_length
+        penalty = self.strength * excess.relu().square().sum()
+        return super()._surrogates(tensordict, log_weight) | {"loss_penalty": penalty}
 
 
-def conditional_value_at_risk(costs: Tensor, tail: float) -> Tensor:
-    """The mean cost of the worst fraction `tail` of the episodes: [E, k] -> [k]."""
-    threshold = value_at_risk(costs, tail)
-    return threshold + (costs - threshold).clamp_min(0).mean(0) / tail
+class UpperSemideviation:
+    """Charges whose mean over episodes is E[C] + w E[(C − m)₊], m the running mean of C."""
 
+    def __init__(self, cost_limits: Tensor, *, weight: float, memory: float) -> None:
+        self.limits, self.weight, self.memory = cost_limits, weight, memory
+        self._mean = torch.full_like(cost_limits, torch.inf)  # no episode is above it yet
 
-def cost_so_far(cost: Tensor, ends: Tensor) -> Tensor:
-    """Cost of the episode up to and with each step, from cost [N, T, k] ≥ 0 and ends [N, T, 1]."""
-    total = cost.cumsum(1)
-    before = torch.where(ends, total, 0).roll(1, 1)
-    before[:, 0] = 0
-    return total - before.cummax(1).values
+    def __call__(self, costs: Tensor, ends: Tensor, before: Tensor, finished: Tensor) -> Charges:
+        """Charge the steps of a batch: see `safe_rl.objectives.RiskMeasure`."""
+        if len(finished):
+            mean = finished.float().mean(0)
+            known = self._mean.isfinite()
+            self._mean = torch.where(known, torch.lerp(mean, self._mean, self.memory), mean)
+        beyond = (cost_so_far(costs, ends, before) - self._mean).clamp_min(0)
+        charged = costs + self.weight * torch.minimum(costs, beyond)
+        return Charges(charged, offset=torch.zeros_like(self.limits), limit=self.limits)
 
+    def state_dict(self) -> dict[str, Any]:
+        """Everything the next charges depend on."""
+        return {"mean": self._mean}
 
-class TailCostGAE(CostGAE):
-    """`CostGAE` of the cost that a step adds to its episode beyond the value at risk."""
-
-    def __init__(self, cost_keys: Sequence[str], value_network, *, tail: float, **settings):
-        super().__init__(["tail_cost"], value_network, **settings)
-        self.cost_keys, self.tail = list(cost_keys), tail
-
-    def forward(self, rollout: TensorDictBase) -> TensorDictBase:
-        """Write ``("next", "tail_cost")``, [N, T, k], then what `CostGAE` writes."""
-        cost = torch.cat([rollout["next", key] for key in self.cost_keys], -1)
-        ends = rollout["next", "done"].clone()
-        ends[:, -1] = True
-        spent = cost_so_far(cost, ends)
-        beyond = (spent - value_at_risk(spent[ends.squeeze(-1)], self.tail)).clamp_min(0)
-        rollout["next", "tail_cost"] = torch.minimum(cost, beyond) / self.tail
-        return super().forward(rollout)
-
-
-class CVaRPPOLoss(PPOLagrangianLoss):
-    """`PPOLagrangianLoss` whose cost surrogate is clipped too, to its pessimistic side."""
-
-    def _lagrangian(self, tensordict: TensorDictBase, reward_gain: Tensor, ratio: Tensor) -> Tensor:
-        tail_advantage = self._cost_advantage(tensordict)
-        cost_gain = -clipped_gain(ratio.log(), -tail_advantage, self.clip_epsilon)
-        return lagrangian(reward_gain, cost_gain, self.multiplier.value)
+    def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
+        """Continue from :meth:`state_dict`."""
+        self._mean = state_dict["mean"]

@@ -93,7 +93,8 @@ FLOORS = {
         ("",),
     ),
     "objectives": (
-        ("keys", "distributions", "samples", "gae", "cpo_dual", "episode_costs", "violation"),
+        ("keys", "distributions", "samples", "gae", "cpo_dual", "risk", "violation"),
+        ("episode_costs",),
         ("advantages", "critics", "limits", "multipliers", "normalisation", "trust_region"),
         ("controllers", "pid", "projected", "surrogate", "fisher"),
         ("actor_critic", "cpo", "focops", "ppo", "trpo"),

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 
 import torch
 from tensordict import TensorDictBase
@@ -12,31 +12,24 @@ from safe_rl.collectors import EpisodeStatistics
 from safe_rl.naming import did_you_mean
 from safe_rl.objectives.multipliers import Multiplier
 
-__all__ = ["Constraints", "check_cost_limits", "mean_cost"]
-
-
-def mean_cost(episode_costs: Tensor) -> Tensor:
-    """J_c, the mean over episodes: [E, k] -> [k]."""
-    return episode_costs.mean(0)
+__all__ = ["Constraints", "check_cost_limits"]
 
 
 class Constraints:
-    """Keys, limits, what of the episode costs is limited, and the multiplier that weighs them.
+    """Keys, limits, how far J_c is from them, and the multiplier that weighs the costs.
 
     Every recipe has one, and shows it every batch. Losses and updates that need the violation
     take the object itself and read ``violation`` and ``episode_length`` at every call.
 
     Args:
         limits: Cost key -> d, undiscounted cost allowed per episode; empty without constraints.
-        measure: What of the episode costs, [E, k], is held against the limits, [k]: `mean_cost`, or
-            another statistic, such as a quantile. Its gradient is up to the cost advantages.
         multiplier: Weighs the costs against the return, or None.
         device: Of all tensors.
 
     Attributes:
         keys: Keys of the k costs.
         limits: d, [k].
-        violation: J_c − d, [k], as of the last batch; J_c as `measure` has it.
+        violation: J_c − d, [k], as of the last batch.
         episode_length: T̄, mean number of steps of an episode, scalar.
 
     Examples:
@@ -57,18 +50,19 @@ class Constraints:
         self,
         limits: Mapping[str, float],
         *,
-        measure: Callable[[Tensor], Tensor] = mean_cost,
         multiplier: Multiplier | None = None,
         device: torch.device | str | None = None,
     ) -> None:
         self.keys = list(limits)
         self.limits = torch.tensor(list(limits.values()), dtype=torch.float32, device=device)
         self.multiplier = multiplier
-        self._measure = measure
         self.violation = torch.full_like(self.limits, torch.nan)
         self.episode_length = torch.full((), torch.nan, device=device)
         self._costs = torch.full_like(self.limits, torch.nan)
         self._mean_length = torch.full((), torch.nan, device=device)
+
+    def charge(self, episodes: EpisodeStatistics, batch: TensorDictBase) -> None:
+        """Write into a batch what stands for its costs, before advantages are estimated."""
 
     def observe(self, episodes: EpisodeStatistics, batch: TensorDictBase) -> None:
         """Take in what a batch says about episodes, and move the multiplier.
@@ -81,8 +75,7 @@ class Constraints:
             batch: The batch itself, [N, T].
         """
         if episodes.num_episodes:
-            costs = self._measure(episodes.episode_costs(self.keys))
-            self._costs = costs.to(self._costs)
+            self._costs = episodes.mean_costs(self.keys).to(self._costs)
             self._mean_length = episodes.lengths.mean().to(self._mean_length)
         if self._mean_length.isfinite():
             costs, length = self._costs, self._mean_length

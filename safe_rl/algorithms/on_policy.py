@@ -13,11 +13,11 @@ from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModule, T
 from torch import nn
 from torchrl.envs import EnvBase
 
-from safe_rl.algorithms.constraints import Constraints, check_cost_limits, mean_cost
+from safe_rl.algorithms.constraints import Constraints, check_cost_limits
 from safe_rl.algorithms.contract import PolicyUpdate, Stateful
 from safe_rl.algorithms.minibatch import MinibatchUpdate
 from safe_rl.algorithms.parts import build_part
-from safe_rl.algorithms.tracked_constraints import TrackedConstraints
+from safe_rl.algorithms.tracked_constraints import CHARGES, TrackedConstraints
 from safe_rl.collectors import EpisodeStatistics
 from safe_rl.models import input_scale_vector, make_actor, make_behaviour, make_critic
 from safe_rl.objectives import CriticLoss
@@ -77,6 +77,8 @@ class OnPolicy:
         cost_advantage = None
         if limits:
             cost_advantage = build_part(config.cost_advantage, value_network=cost_critic, **parts)
+            if getattr(constraints, "risk", None) is not None:
+                cost_advantage.set_keys(reward=[CHARGES])
         loss = build_part(config.loss, critic_network=critic, **parts)
         del parts["actor_network"]  # an update asks its loss for it
         return cls(
@@ -122,6 +124,7 @@ class OnPolicy:
         Returns:
             Everything that is worth a column of the log, by column name.
         """
+        self.constraints.charge(episodes, batch)
         self.advantage(batch)
         if self.cost_advantage is not None:
             self.cost_advantage(batch)
@@ -167,18 +170,27 @@ def _constrained_limits(config: DictConfig, env: EnvBase) -> dict[str, float]:
 def _build_constraints(
     config: DictConfig, limits: dict[str, float], max_length: int, device: torch.device
 ) -> Constraints:
-    multiplier = measure = None
+    multiplier = risk = None
     if config.get("lagrangian") is not None:
         multiplier = build_part(config.lagrangian, cost_limits=limits).to(device)
-    node = config.get("limits")
-    # a measure of one's own is taken of whole episodes
-    if limits and node and node.get("_target_") and config.get("cost_measure") is None:
-        values = torch.tensor(list(limits.values()))
-        tracker = build_part(node, cost_limits=values, max_length=max_length)
-        return TrackedConstraints(limits, tracker=tracker, multiplier=multiplier, device=device)
-    if config.get("cost_measure") is not None:
-        measure = build_part(config.cost_measure)
-    return Constraints(limits, measure=measure or mean_cost, multiplier=multiplier, device=device)
+    values = torch.tensor(list(limits.values()))
+    if limits and _names_a_part(config.get("risk")):
+        risk = build_part(config.risk, cost_limits=values)
+    if limits and _names_a_part(config.get("limits")):
+        tracker = build_part(config.limits, cost_limits=values, max_length=max_length)
+        return TrackedConstraints(
+            limits, tracker=tracker, multiplier=multiplier, risk=risk, device=device
+        )
+    if risk is not None:
+        raise ValueError(
+            "risk: only the mean cost is limited by the episodes of a batch alone (limits=paper); "
+            "other measures need limits=default."
+        )
+    return Constraints(limits, multiplier=multiplier, device=device)
+
+
+def _names_a_part(node: DictConfig | None) -> bool:
+    return node is not None and node.get("_target_") is not None
 
 
 def _build_networks(

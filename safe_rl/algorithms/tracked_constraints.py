@@ -13,8 +13,12 @@ from safe_rl.algorithms.constraints import Constraints
 from safe_rl.collectors import EpisodeStatistics
 from safe_rl.objectives.limits import LimitTracker
 from safe_rl.objectives.multipliers import Multiplier
+from safe_rl.objectives.risk import Charges, RiskMeasure
 
-__all__ = ["TrackedConstraints"]
+__all__ = ["CHARGES", "TrackedConstraints"]
+
+CHARGES = "charged_costs"
+"""Below ``"next"``, [N, T, k]: what a risk measure has put in the place of the costs."""
 
 
 class TrackedConstraints(Constraints):
@@ -27,6 +31,7 @@ class TrackedConstraints(Constraints):
         limits: Cost key -> d, undiscounted cost allowed per episode.
         tracker: Estimates J_c and what it should be by now.
         multiplier: Weighs the costs against the return, or None.
+        risk: What is limited instead of the mean cost of an episode, or None.
         device: Of all tensors.
     """
 
@@ -36,11 +41,27 @@ class TrackedConstraints(Constraints):
         *,
         tracker: LimitTracker,
         multiplier: Multiplier | None = None,
+        risk: RiskMeasure | None = None,
         device: torch.device | str | None = None,
     ) -> None:
         super().__init__(limits, multiplier=multiplier, device=device)
-        self.tracker = tracker
+        self.tracker, self.risk = tracker, risk
+        self._charges: Charges | None = None
         self._row: dict[str, float] = {}
+
+    def charge(self, episodes: EpisodeStatistics, batch: TensorDictBase) -> None:
+        """Let the risk measure put its charges below ``"next"``, for advantages and violations."""
+        if self.risk is None:
+            return
+        costs = self._costs_of(batch).cpu()
+        ends = batch["next", "done"].squeeze(-1).cpu()
+        before = torch.stack([episodes.open_costs[key] for key in self.keys], -1)
+        finished = episodes.episode_costs(self.keys).cpu()
+        self._charges = self.risk(costs, ends, before.nan_to_num(0.0).to(costs), finished)
+        batch["next", CHARGES] = self._charges.costs.to(batch.device or self.limits.device)
+
+    def _costs_of(self, batch: TensorDictBase) -> Tensor:
+        return torch.cat([batch["next", key] for key in self.keys], -1)
 
     def observe(self, episodes: EpisodeStatistics, batch: TensorDictBase) -> None:
         """Take in a batch [N, T] and move the multiplier.
@@ -48,11 +69,14 @@ class TrackedConstraints(Constraints):
         Cost advantages that are in the batch for a multiplier to weigh are divided by the size of
         one cost.
         """
-        costs = torch.cat([batch["next", key] for key in self.keys], -1)
-        state = self.tracker.update(costs, episodes.lengths).to(self.limits.device)
+        state = self.tracker.update(self._costs_of(batch), episodes.lengths, self._charges)
+        state = state.to(self.limits.device)
         self.violation.copy_(state.demand)
         self.episode_length.copy_(state.length)
         self._row = self.column("estimate", state.cost) | self.column("target", state.target)
+        if self._charges is not None:
+            limit = self._charges.limit.to(state.cost)
+            self._row |= self.column("violation", state.cost - limit)
         if self.multiplier is None:
             self._row |= self.column("trust", state.trust)
             return
@@ -75,9 +99,12 @@ class TrackedConstraints(Constraints):
         return row
 
     def state_dict(self) -> dict[str, Any]:
-        """State of the tracker."""
-        return self.tracker.state_dict()
+        """State of the tracker, and of the risk measure."""
+        states = self.tracker.state_dict()
+        return states if self.risk is None else {**states, "risk": self.risk.state_dict()}
 
     def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
         """Continue from :meth:`state_dict`."""
         self.tracker.load_state_dict(state_dict)
+        if self.risk is not None:
+            self.risk.load_state_dict(state_dict["risk"])

@@ -100,10 +100,8 @@ KEYS = {
     "model.input_scale": Key(mapping_of(_POSITIVE), "factors by observation component"),
     "advantage": Key(component, "estimator of the reward's advantages", may_lack=True),
     "cost_advantage": Key(optional(component), "estimator of the costs' advantages", may_lack=True),
-    "cost_measure": Key(
-        optional(component), "what of the episodes' costs is limited", may_lack=True
-    ),
     "lagrangian": Key(optional(component), "the multiplier", may_lack=True),
+    "risk": Key(optional(_SECTION), "what is limited: risk=mean, cvar or chance", may_lack=True),
     "limits": Key(optional(_SECTION), "from the costs of a batch to violations", may_lack=True),
     "staggered_starts": Key(
         optional(boolean), "whether first episodes begin at different points", may_lack=True
@@ -245,6 +243,13 @@ PARTS = {
         "integral": Key(_NOT_NEGATIVE, "share of a violation that is asked for again"),
         "largest_integral": Key(_NOT_NEGATIVE, "bound of that, in units of violations"),
     },
+    "CVaR": {
+        "tail": Key(number(0, 1, above=True), "share of the episodes, the worst"),
+        "window": Key(count(1, 10**6), "episodes from which the value at risk is taken"),
+        "ramp_start": Key(count(0), "steps in which the mean is limited"),
+        "ramp_steps": Key(count(0), "steps in which the tail then takes its place"),
+    },
+    "Chance": {"most_over": Key(number(0, 1, below=True), "share of episodes over the limit")},
     "PIDMultiplier": {
         "init": Key(one_or_per_cost(number(0, 1e6)), "first λ"),
         "kp": Key(_NOT_NEGATIVE, "proportional gain"),

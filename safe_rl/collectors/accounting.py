@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import torch
@@ -22,6 +22,8 @@ class EpisodeStatistics:
         costs: Cost key -> undiscounted cost of every finished episode, shape [E].
         lengths: Steps of every finished episode, shape [E].
         cost_rates: Cost key -> all cost so far divided by all steps so far, ρ_c, scalar tensors.
+        open_costs: Cost key -> what the open episode of every row had cost before the batch, shape
+            [N]; NaN where it is left out of the statistics.
 
     Examples:
         >>> import torch
@@ -39,6 +41,7 @@ class EpisodeStatistics:
     costs: dict[str, Tensor]
     lengths: Tensor
     cost_rates: dict[str, Tensor]
+    open_costs: dict[str, Tensor] = field(default_factory=dict)
 
     @property
     def num_episodes(self) -> int:
@@ -137,6 +140,7 @@ class EpisodeAccounting:
             )
         signals = torch.stack([self._column(batch, key) for key in self._signal_keys], -1)
         signals = torch.cat([torch.ones_like(signals[..., :1]), signals], -1)
+        before = self._open_sums[:, 2:]
         finished = self._close_episodes(signals, self._column(batch, self.done_key).long())
         finished = finished[finished[:, 0].isfinite()]
         self._totals += signals.sum((0, 1))
@@ -147,6 +151,7 @@ class EpisodeAccounting:
             costs=dict(zip(names, finished[:, 2:].unbind(-1), strict=True)),
             lengths=finished[:, 0],
             cost_rates=dict(zip(names, rates.unbind(), strict=True)),
+            open_costs=dict(zip(names, before.unbind(-1), strict=True)),
         )
 
     def _close_episodes(self, signals: Tensor, done: Tensor) -> Tensor:

@@ -6,6 +6,7 @@ Everything here works on TensorDict keys alone and knows no environment:
 - `LagrangeMultiplier`, `PIDMultiplier`, `PIMultiplier`, `ProjectedMultiplier`: one λ per cost,
   moved by the mean episode costs;
 - `LimitTracker`: from the costs of a batch to how far J_c is from where it should be by now;
+- `CVaR`, `Chance`: limits on the worst episodes, or on how many cost too much;
 - `PPOLoss`, `PPOLagrangianLoss`, `RCPOLoss`, `P3OLoss`, `IPOLoss`, `FOCOPSLoss`: policy losses for
   an optimiser;
 - `TRPOLoss`, `TRPOLagrangianLoss`, `CPOLoss`: policy losses for the steps of `safe_rl.algorithms`,
@@ -29,12 +30,15 @@ from safe_rl.objectives.pid import PIDMultiplier
 from safe_rl.objectives.ppo import PPOLagrangianLoss, PPOLoss
 from safe_rl.objectives.projected import ProjectedMultiplier
 from safe_rl.objectives.rcpo import RCPOLoss
+from safe_rl.objectives.risk import Chance, CVaR, RiskMeasure
 from safe_rl.objectives.surrogate import SurrogateLoss
 from safe_rl.objectives.trpo import TRPOLagrangianLoss, TRPOLoss
 
 __all__ = [
     "ActorCriticLoss",
     "CPOLoss",
+    "CVaR",
+    "Chance",
     "CostGAE",
     "CriticLoss",
     "FOCOPSLoss",
@@ -50,6 +54,7 @@ __all__ = [
     "PPOLoss",
     "ProjectedMultiplier",
     "RCPOLoss",
+    "RiskMeasure",
     "SurrogateLoss",
     "TRPOLagrangianLoss",
     "TRPOLoss",

@@ -15,6 +15,8 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
+from safe_rl.objectives.risk import Charges
+
 #: Pieces into which a batch of few rows is cut, so that a spread can be told.
 _FEWEST_PIECES = 8
 
@@ -128,13 +130,24 @@ class EpisodeCosts:
         """The last estimate; NaN before the first batch."""
         return CostEstimate(self._state["mean"], self._state["error"])
 
-    def update(self, costs: Tensor, lengths: Tensor) -> CostEstimate:
-        """Take in a batch: its costs [N, T, k], and the steps of every finished episode, [E]."""
+    def update(
+        self, costs: Tensor, lengths: Tensor, charges: Charges | None = None
+    ) -> CostEstimate:
+        """Take in a batch.
+
+        Args:
+            costs: costs of its steps, [N, T, k].
+            lengths: steps of every episode that finished in it, [E].
+            charges: what is to be estimated in place of the mean cost; `unit` stays that of costs.
+        """
         costs = costs.to(self._state["sums"])
         self._state["sums"] += torch.stack([costs.sum((0, 1)), costs.square().sum((0, 1))])
         if lengths.numel():
             self._add_lengths(lengths)
-        batch = CostEstimate(*(part.float() for part in rate_estimate(costs, self.length)))
+        charged = costs if charges is None else charges.costs.to(costs)
+        batch = CostEstimate(*(part.float() for part in rate_estimate(charged, self.length)))
+        if charges is not None:
+            batch = batch._replace(mean=batch.mean + charges.offset)
         self.batch = batch
         if self.drift is not None:
             batch = shrink(self.estimate, batch, self.drift * self.estimate.mean)

@@ -22,6 +22,7 @@ import torch
 from torch import Tensor
 
 from safe_rl.objectives.episode_costs import CostEstimate, EpisodeCosts
+from safe_rl.objectives.risk import Charges
 
 
 class LimitState(NamedTuple):
@@ -204,15 +205,18 @@ class LimitTracker:
         self._noise = torch.full((num_costs,), torch.nan)
 
     @torch.no_grad()
-    def update(self, costs: Tensor, lengths: Tensor) -> LimitState:
+    def update(self, costs: Tensor, lengths: Tensor, charges: Charges | None = None) -> LimitState:
         """Take in a batch.
 
         Args:
             costs: costs of its steps, [N, T, k].
             lengths: steps of every episode that finished in it, [E].
+            charges: what stands for the costs, if the limits are not on their mean.
         """
         costs, lengths = costs.detach().cpu(), lengths.detach().cpu()
-        estimate = self.costs.update(costs, lengths)
+        estimate = self.costs.update(costs, lengths, charges)
+        if charges is not None:
+            self.limits = charges.limit
         batch = self.costs.batch
         smallest = self.smallest_scale * self.costs.length * self.costs.unit
         scale = torch.maximum(self.limits, smallest)

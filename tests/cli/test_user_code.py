@@ -116,7 +116,7 @@ def exec_node(trace):
 
 @pytest.mark.parametrize(
     "key",
-    ["loss", "loss.clip_epsilon", "advantage.gamma", "policy_update.optimizer.lr", "cost_measure",
+    ["loss", "loss.clip_epsilon", "advantage.gamma", "policy_update.optimizer.lr", "risk",
      "cost_advantage.lmbda", "lagrangian.init", "critic_update.optimizer", "collector"],
 )  # fmt: skip
 def test_no_key_of_a_run_leaves_a_trace(folder, key):
