@@ -234,6 +234,7 @@ PARTS = {
         "largest_margin": Key(_SHARE, "bound of the margin, as a share of the limit"),
         "free_steps": Key(count(0), "steps for which costs are free"),
         "descent_steps": Key(count(0), "steps in which the limit then comes down"),
+        "recovery": Key(_SHARE, "share of a limit to come down to, once above it"),
         "frames": Key(count(), "steps of the whole run"),
         "latest_end": Key(number(0, 1, above=True), "share of a run by which the descent is over"),
         "smallest_scale": Key(_POSITIVE, "unit of violations of limits near 0, costs per step"),

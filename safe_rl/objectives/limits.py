@@ -143,6 +143,8 @@ class LimitTracker:
         largest_margin: bound of the margin, as a share of d.
         free_steps: environment steps for which costs are free.
         descent_steps: environment steps in which the limit then comes down.
+        recovery: hysteresis: once J_c is above d, the aim is this share of d until J_c is there, as
+            in the published C-TRPO and CPO with hysteresis; 1 for none.
         frames: environment steps of the whole run.
         latest_end: share of the run by which the descent is over: in a run too short for that, both
             numbers of steps are shortened in proportion.
@@ -186,6 +188,7 @@ class LimitTracker:
         lowest_trust: float,
         integral: float,
         largest_integral: float,
+        recovery: float = 1.0,  # configurations of earlier runs lack it
     ) -> None:
         self.limits = cost_limits.detach().cpu().float()
         num_costs = len(self.limits)
@@ -193,7 +196,7 @@ class LimitTracker:
         shrinkage = min(1.0, latest_end * frames / max(free_steps + descent_steps, 1))
         self.free_steps = round(free_steps * shrinkage)
         self.descent_steps = round(descent_steps * shrinkage)
-        self.smallest_scale, self.memory = smallest_scale, memory
+        self.smallest_scale, self.memory, self.recovery = smallest_scale, memory, recovery
         self.costs = EpisodeCosts(
             num_costs, max_length=max_length, drift=drift, length_memory=memory
         )
@@ -202,6 +205,7 @@ class LimitTracker:
         self._steps = 0
         self._owed = torch.zeros(num_costs)
         self._reached = torch.full((num_costs,), torch.inf)
+        self._recovers = torch.zeros(num_costs, dtype=torch.bool)
         self._noise = torch.full((num_costs,), torch.nan)
 
     @torch.no_grad()
@@ -248,7 +252,13 @@ class LimitTracker:
         # from the present cost, where that has come down faster than the limit
         self._reached = torch.minimum(self._reached, estimate.mean)
         self._reached = descend(self._reached, self.limits - margin, share)
-        return self._reached
+        if left > num_steps:
+            return self._reached
+        safe = self.recovery * self.limits
+        self._recovers = torch.where(
+            self._recovers, estimate.mean > safe, estimate.mean > self.limits
+        )
+        return torch.where(self._recovers, torch.minimum(self._reached, safe), self._reached)
 
     def state_dict(self) -> dict[str, Any]:
         """Everything the next state depends on."""
@@ -259,6 +269,7 @@ class LimitTracker:
             "reached": self._reached.clone(),
             "noise": self._noise.clone(),
             "owed": self._owed.clone(),
+            "recovers": self._recovers.clone(),
         }
 
     def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
@@ -269,3 +280,4 @@ class LimitTracker:
         self._reached = state_dict["reached"].to(self._reached)
         self._noise = state_dict["noise"].to(self._noise)
         self._owed = state_dict["owed"].to(self._owed)
+        self._recovers = state_dict.get("recovers", self._recovers).to(self._recovers)

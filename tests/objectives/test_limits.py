@@ -126,6 +126,18 @@ def test_a_violation_that_stays_is_asked_for_more_and_more_up_to_a_bound():
     assert states[-1].demand == -15
 
 
+def test_with_hysteresis_a_violation_is_made_up_for_by_more_than_itself():
+    limits = tracker(
+        25.0, 25.0, margin=0.0, free_steps=0, descent_steps=0, drift=None, recovery=0.8
+    )
+    targets = []
+    for cost in (22.0, 26.0, 24.0, 21.0, 19.0, 24.0):
+        costs = torch.stack([torch.full((20, 100), cost / 1000), torch.zeros(20, 100)], -1)
+        targets.append(limits.update(costs, NO_EPISODES).target.tolist())
+    assert [first for first, _ in targets] == [25, 20, 20, 20, 25, 25]
+    assert [second for _, second in targets] == [25] * 6
+
+
 def test_without_promises_every_promise_is_believed():
     promises = PromisedChange(2, memory=0.9, lowest=0.1)
     for _ in range(5):
