@@ -53,6 +53,7 @@ FLOORS = {
         ("safety_gym.records.world", "safety_gym.rules.robot_files"),
         ("safety_gym.rules", "safety_gym.rules.robots", "safety_gym.rules.tasks"),
         ("safety_gym.rules.checks", "safety_gym.rules.costs", "safety_gym.rules.elements"),
+        ("safety_gym.rules.robot_copies",),
         ("safety_gym.rules.readings",),
         ("safety_gym.suite", "safety_gym.world", "safety_gym.world.scenery"),
         ("safety_gym.world.bodies", "safety_gym.world.layout", "safety_gym.world.views"),
@@ -123,7 +124,7 @@ FLOORS = {
         ("",),
     ),
     "cli": (
-        ("benchmark", "conf", "options", "run_folders", "values"),
+        ("benchmark", "conf", "options", "robots", "run_folders", "values"),
         ("keys",),
         ("failures", "settings"),
         ("overrides",),

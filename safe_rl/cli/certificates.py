@@ -7,7 +7,7 @@ from pathlib import Path
 from omegaconf import DictConfig, OmegaConf
 
 from safe_rl.cli.conf import CONF
-from safe_rl.envs import make_env
+from safe_rl.cli.robots import maker_of
 from safe_rl.evaluation import Certificate, CertificateOptions, certify
 from safe_rl.evaluation.loading import load_config
 
@@ -26,7 +26,7 @@ def certify_run(
     return certify(
         directory,
         CertificateOptions(**options),
-        make_env=make_env,
+        make_env=maker_of(directory),
         num_threads=num_threads,
         progress=progress,
     )

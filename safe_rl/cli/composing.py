@@ -33,6 +33,7 @@ from safe_rl.cli.overrides import (
     explain,
 )
 from safe_rl.cli.settings import check_settings
+from safe_rl.runs.folder import RunFolder
 
 __all__ = ["check_command"]
 
@@ -143,8 +144,9 @@ def _check_run(config: DictConfig, folder_key: str) -> None:
         with read_write(config.hydra.runtime), open_dict(config.hydra.runtime):
             config.hydra.runtime.output_dir = ""
         HydraConfig.instance().set_config(config)
-        check_settings(config)
-        _check_writable(Path(str(OmegaConf.select(config, folder_key))), folder_key)
+        folder = Path(str(OmegaConf.select(config, folder_key)))
+        check_settings(config, RunFolder(folder))
+        _check_writable(folder, folder_key)
     except OmegaConfBaseException as error:
         raise CommandLineError(" ".join(str(error).split())) from None
     finally:

@@ -11,8 +11,9 @@ from torchrl.checkpoint import CheckpointError
 from safe_rl.cli.benchmark import suite
 from safe_rl.cli.certificates import certify_run
 from safe_rl.cli.options import OptionError, parse_options, usage
+from safe_rl.cli.robots import maker_of
 from safe_rl.cli.user_code import check_imports, import_modules, split_imports
-from safe_rl.envs import ConfigError, OpenGLError, make_env
+from safe_rl.envs import ConfigError, OpenGLError
 from safe_rl.evaluation import Evaluation, EvaluationOptions, evaluate
 from safe_rl.evaluation.loading import load_config
 from safe_rl.evaluation.summary import format_estimates
@@ -26,7 +27,9 @@ def evaluate_run(
     directory: Path, options: EvaluationOptions, *, progress: bool = False
 ) -> Evaluation:
     """:func:`safe_rl.evaluation.evaluate` with this package's environments and benchmark."""
-    return evaluate(directory, options, make_env=make_env, suite=suite(), progress=progress)
+    return evaluate(
+        directory, options, make_env=maker_of(directory), suite=suite(), progress=progress
+    )
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -25,9 +25,10 @@ from safe_rl.cli.certificates import certify_run, is_worth_a_certificate
 from safe_rl.cli.composing import check_command
 from safe_rl.cli.conf import CONF
 from safe_rl.cli.evaluate import evaluate_run
+from safe_rl.cli.robots import maker_of
 from safe_rl.cli.running import complete, prepare
 from safe_rl.cli.user_code import check_imports, import_modules, note_imports, quote
-from safe_rl.envs import make_env, store_configs
+from safe_rl.envs import store_configs
 from safe_rl.evaluation import Evaluation, EvaluationOptions
 from safe_rl.evaluation.layouts import default_seed
 from safe_rl.evaluation.loading import (
@@ -110,7 +111,7 @@ class Run:
         node = override_env(self.config, keys)
         if seed is None:
             seed = default_seed(node, self.config.seed)
-        return evaluated(make_env, self.config)(node, num_envs=num_envs, seed=seed)
+        return evaluated(maker_of(self.directory), self.config)(node, num_envs=num_envs, seed=seed)
 
     def evaluate(self, **options: Any) -> Evaluation:
         """Run the policy for whole episodes; writes into the folder what the command writes.
@@ -169,7 +170,7 @@ def train(
     folder = Path(config.hydra.run.dir if directory is None else directory)
     with open_dict(config):
         del config["hydra"]
-    complete(config)
+    complete(config, RunFolder(folder))
     is_new, has_begun = not folder.exists(), False
     try:
         with held(RunFolder(folder)):

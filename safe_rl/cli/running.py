@@ -14,6 +14,7 @@ from omegaconf import DictConfig, OmegaConf, open_dict
 
 from safe_rl.cli.certificates import certify_run, is_worth_a_certificate
 from safe_rl.cli.failures import SETTING_ERRORS, errors_in_a_line
+from safe_rl.cli.robots import keep_robot, robot_of
 from safe_rl.cli.run_folders import write_notes
 from safe_rl.cli.settings import check_settings
 from safe_rl.cli.user_code import imported, make_after_imports
@@ -30,9 +31,10 @@ __all__ = ["complete", "prepare", "run"]
 
 def prepare(config: DictConfig, directory: Path, continues: bool) -> Trainer | None:
     """Build a run, or go on with the one in the folder; None if that is finished."""
+    folder = RunFolder(directory)
     if not continues:
-        RunFolder(directory).check_is_free()
-    check_settings(config)
+        folder.check_is_free()
+    check_settings(config, folder if continues else None)
     if continues and is_finished(directory, config.frames):
         print(f"{directory} has its {config.frames:,} frames already: raise 'frames' to train on.")
         return None
@@ -40,9 +42,13 @@ def prepare(config: DictConfig, directory: Path, continues: bool) -> Trainer | N
         whole = math.ceil(config.frames / config.frames_per_batch) * config.frames_per_batch
         print(f"Training for {whole:,} frames: whole batches of {config.frames_per_batch:,}.")
     seed_everything(config.seed, config.num_threads)
+    given = cast(dict[str, Any], OmegaConf.to_container(config.env, resolve=True))
+    env, notice = robot_of(folder, given) if continues else (given, None)
+    if notice:
+        print(notice)
     make = partial(
         make_env,
-        cast(dict[str, Any], OmegaConf.to_container(config.env, resolve=True)),
+        env,
         device=config.device,
         seed=config.seed,
         num_threads=physics_threads(config),
@@ -60,15 +66,16 @@ def prepare(config: DictConfig, directory: Path, continues: bool) -> Trainer | N
     if config.init_from is not None:
         algorithm = trainer.algorithm
         initialise_networks(algorithm.networks, Path(config.init_from), list(algorithm.cost_keys))
+    if not (continues and folder.robot_note.exists()):
+        keep_robot(folder, given)
     return trainer
 
 
-def complete(config: DictConfig) -> None:
+def complete(config: DictConfig, folder: RunFolder) -> None:
     """Fill the environment's keys up, so that the run's folder tells all of them."""
+    given = cast(dict[str, Any], OmegaConf.to_container(config.env, resolve=True))
     with open_dict(config):
-        config.env = complete_env(
-            cast(dict[str, Any], OmegaConf.to_container(config.env, resolve=True))
-        )
+        config.env = complete_env(robot_of(folder, given)[0]) | given
 
 
 def run(config: DictConfig) -> None:
@@ -80,7 +87,7 @@ def run(config: DictConfig) -> None:
     folder = RunFolder(Path(HydraConfig.get().runtime.output_dir))
     is_job = HydraConfig.get().mode is RunMode.MULTIRUN  # whose sweep keeps account of failures
     with nullcontext() if is_job else errors_in_a_line(folder.directory, True, *SETTING_ERRORS):
-        complete(config)
+        complete(config, folder)
     continues = may_continue(HydraConfig.get(), config)
 
     def in_a_line(*errors: type[Exception]) -> AbstractContextManager[None]:

@@ -12,10 +12,12 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from safe_rl.cli.keys import EXTRAS, FLAGS, KEYS, PARTS, Key
+from safe_rl.cli.robots import robot_of
 from safe_rl.envs import complete_env
 from safe_rl.evaluation.settings import check_device
 from safe_rl.extras import require_extra
 from safe_rl.naming import did_you_mean
+from safe_rl.runs.folder import RunFolder
 from safe_rl.targets import locate
 
 __all__ = ["SettingError", "check_settings", "optional_keys", "plain"]
@@ -44,7 +46,7 @@ class _Part(NamedTuple):
     found: Callable[..., Any]
 
 
-def check_settings(config: DictConfig) -> None:
+def check_settings(config: DictConfig, folder: RunFolder | None = None) -> None:
     """Check every key of a configuration by the tables of :mod:`safe_rl.cli.keys`.
 
     Parts of one's own are checked by what they inherit from the package's, and for names that they
@@ -52,6 +54,7 @@ def check_settings(config: DictConfig) -> None:
 
     Args:
         config: Configuration as composed from ``conf/``.
+        folder: That of a run that is continued, if it is; its robot is checked.
 
     Raises:
         SettingError: For the first key that does not exist or holds what it cannot.
@@ -72,7 +75,7 @@ def check_settings(config: DictConfig) -> None:
     except ValueError as error:
         raise SettingError(str(error)) from None
     _check_collector(values["collector"])
-    complete_env(values["env"])
+    complete_env(values["env"] if folder is None else robot_of(folder, values["env"])[0])
 
 
 def plain(config: DictConfig) -> dict[str, Any]:

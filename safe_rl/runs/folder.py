@@ -70,6 +70,16 @@ class RunFolder:
         return self.directory / ".writer.json"
 
     @property
+    def robot(self) -> Path:
+        """Folder with copies of the robot's files, where the robot is one of the user's own."""
+        return self.directory / "robot"
+
+    @property
+    def robot_note(self) -> Path:
+        """Which robot that is, and its SHA-256."""
+        return self.directory / "robot.json"
+
+    @property
     def notes(self) -> Path:
         """Folder of Hydra's notes."""
         return self.directory / ".hydra"

@@ -40,7 +40,7 @@ def robot_files(path: Path) -> list[Path]:
         ConfigError: if one cannot be read, or asks for too much.
     """
     found: dict[Path, int] = {}
-    if _weigh(path, path.parent, found) > MOST_ELEMENTS:
+    if _weigh(path, [path.parent], found) > MOST_ELEMENTS:
         raise _refused(path, f"describes more than {MOST_ELEMENTS:,} elements: 'count' is too high")
     return list(found)
 
@@ -49,8 +49,11 @@ def _refused(path: Path, what: str) -> ConfigError:
     return ConfigError(f"'robot_base': {path} {what}.")
 
 
-def _weigh(path: Path, home: Path, found: dict[Path, int]) -> float:
-    """Number of elements of a file with its copies; notes the files that it names."""
+def _weigh(path: Path, folders: list[Path], found: dict[Path, int]) -> float:
+    """Number of elements of a file with its copies; notes the files that it names.
+
+    The first folder is that of the robot's own file, from which all paths go.
+    """
     if path in found:
         return 0
     found[path] = 1
@@ -59,8 +62,9 @@ def _weigh(path: Path, home: Path, found: dict[Path, int]) -> float:
     except (ElementTree.ParseError, OSError, ValueError, RecursionError) as error:
         message = f"'robot_base': MuJoCo cannot load {path}: {error}"
         raise ConfigError(message) from error
-    folders = [home, *_asset_folders(root, home)]
-    return _weight(root, path, home, folders, found)
+    # what is included finds its files where those that include it do
+    folders = list(dict.fromkeys([*folders, *_asset_folders(root, folders[0])]))
+    return _weight(root, path, folders, found)
 
 
 def _asset_folders(root: ElementTree.Element, home: Path) -> Iterator[Path]:
@@ -71,20 +75,16 @@ def _asset_folders(root: ElementTree.Element, home: Path) -> Iterator[Path]:
 
 
 def _weight(
-    element: ElementTree.Element,
-    path: Path,
-    home: Path,
-    folders: list[Path],
-    found: dict[Path, int],
+    element: ElementTree.Element, path: Path, folders: list[Path], found: dict[Path, int]
 ) -> float:
     """Number of elements that one stands for, itself and copies included."""
     for pair in _CELLS:
         if math.prod(_number(element.get(key, "1")) for key in pair) > MOST_CELLS:
             raise _refused(path, f"has a '{element.tag}' with too large {' and '.join(pair)}")
-    inside = 1 + sum(_weight(child, path, home, folders, found) for child in element)
+    inside = 1 + sum(_weight(child, path, folders, found) for child in element)
     for file in [folder / element.get("file", "") for folder in folders if element.get("file")]:
         if file.is_file() and file.suffix == ".xml":
-            inside += _weigh(file, home, found)
+            inside += _weigh(file, folders, found)
         elif file.is_file():
             found.setdefault(file, 1)
     return inside * max(1.0, math.prod(map(_number, element.get("count", "1").split())))

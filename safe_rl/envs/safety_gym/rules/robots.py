@@ -17,8 +17,8 @@ import numpy as np
 from safe_rl.envs.errors import ConfigError, nearest
 from safe_rl.envs.safety_gym.rules.robot_files import robot_files
 
-_FOLDER = Path(__file__).parents[1] / "robots"
-ROBOTS: dict[str, Path] = {path.stem: path for path in sorted(_FOLDER.glob("*.xml"))}
+BUNDLED = Path(__file__).parents[1] / "robots"
+ROBOTS: dict[str, Path] = {path.stem: path for path in sorted(BUNDLED.glob("*.xml"))}
 # As the dictionaries of 2019 name them, from the folder of that package.
 PATHS_OF_2019 = {f"xmls/{name}.xml": name for name in ROBOTS}
 

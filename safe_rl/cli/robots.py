@@ -1,0 +1,115 @@
+"""Robots of one's own: a run keeps a copy, and goes on with the robot that it began with.
+
+The configuration goes on naming the user's file, by which runs are told apart; where that is gone
+or has changed, the run's copy takes its place.
+"""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+from safe_rl import envs
+from safe_rl.envs import ConfigError
+from safe_rl.envs.safety_gym.rules.robot_copies import copy_robot, is_robot, own_robot
+from safe_rl.envs.safety_gym.rules.robot_files import fingerprint
+from safe_rl.runs.files import replacing
+from safe_rl.runs.folder import RunFolder
+
+__all__ = ["keep_robot", "maker_of", "robot_of"]
+
+
+def keep_robot(folder: RunFolder, env: Mapping[str, Any]) -> None:
+    """Note which robot a run begins with, and copy its files; bundled robots need none.
+
+    Where they cannot be copied the hash is kept, and the reason is printed.
+
+    Args:
+        folder: The run's.
+        env: Node of its environment.
+
+    Raises:
+        OSError: If nothing can be written.
+    """
+    robot = _own_robot(env)
+    if robot is None:
+        return
+    shutil.rmtree(folder.robot, ignore_errors=True)
+    note = {"robot_base": env["robot_base"], "sha256": fingerprint(robot), "file": None}
+    try:
+        copy = copy_robot(robot, folder.robot)
+        note["file"] = str(copy.relative_to(folder.robot))
+    except ConfigError as error:
+        shutil.rmtree(folder.robot, ignore_errors=True)
+        print(f"{error} The run keeps no copy of its robot: it needs that file as it is now.")
+    except OSError:
+        shutil.rmtree(folder.robot, ignore_errors=True)
+        raise
+    with replacing(folder.robot_note) as unfinished:
+        unfinished.write_text(json.dumps(note, indent=1) + "\n")
+
+
+def robot_of(folder: RunFolder, env: Mapping[str, Any]) -> tuple[dict[str, Any], str | None]:
+    """Find the robot that a run began with.
+
+    Args:
+        folder: The run's, which may not have begun.
+        env: Node of an environment; one with another robot than the run's stays as it is.
+
+    Returns:
+        The node with a file of that robot, and what to say where it is the run's copy.
+
+    Raises:
+        ConfigError: If there is no file of it any more.
+    """
+    note = _read_note(folder)
+    if not note or note.get("robot_base") != env.get("robot_base"):
+        return dict(env), None
+    original, content = _own_robot(env), str(note.get("sha256"))
+    if original is not None and original.is_file():
+        if fingerprint(original) == content:
+            return dict(env), None
+        reason = f"{original} has changed since the run began"
+    else:
+        reason = f"there is no file {str(env['robot_base'])!r}"
+    copy = folder.robot / str(note.get("file"))
+    if not (note.get("file") and copy.is_file()):
+        raise ConfigError(f"'robot_base': {reason}, and {folder.directory} has no copy of it.")
+    if not is_robot(copy, folder.robot, content):
+        raise ConfigError(f"'robot_base': {reason}, and so has the run's own copy, {copy}.")
+    return {**env, "robot_base": str(copy)}, f"'robot_base': {reason}: using the run's copy, {copy}"
+
+
+def maker_of(directory: Path) -> Callable[..., envs.ConstrainedEnv]:
+    """:func:`safe_rl.envs.make_env` for environments of a run, with the robot that it began with.
+
+    Where that is the run's copy, this is printed, once.
+    """
+    said: set[str | None] = {None}
+
+    def make(env: Mapping[str, Any], **options: Any) -> envs.ConstrainedEnv:
+        node, notice = robot_of(RunFolder(directory), env)
+        if notice not in said:
+            said.add(notice)
+            print(notice)
+        return envs.make_env(node, **options)
+
+    return make
+
+
+def _own_robot(env: Mapping[str, Any]) -> Path | None:
+    """A robot file of the user's; environments of other families have none."""
+    return own_robot(env) if env.get("_target_") is None and "robot_base" in env else None
+
+
+def _read_note(folder: RunFolder) -> dict[str, Any]:
+    try:
+        note = json.loads(folder.robot_note.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        return {}
+    except (OSError, ValueError) as error:
+        raise ConfigError(f"'robot_base': {folder.robot_note} cannot be read: {error}") from None
+    return note if isinstance(note, dict) else {}

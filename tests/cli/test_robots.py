@@ -1,0 +1,139 @@
+"""Runs with a robot of one's own find it again, wherever its files are and whatever is in them."""
+
+import json
+import struct
+import sys
+
+import pytest
+import yaml
+from run_configs import without_times
+
+import safe_rl
+from safe_rl.cli import evaluate, train
+
+SMALL = (
+    *("num_envs=2", "frames_per_batch=40", "logger=none", "model.hidden_sizes=[8]", "seed=3"),
+    *("policy_update.minibatch_size=20", "critic_update.minibatch_size=20", "num_threads=1"),
+    *("env=PointGoal1", "env.sensors_obs=[gyro]", "env.num_steps=20"),
+)
+ROBOT = """
+<mujoco>
+  <compiler meshdir="{meshes}"/>
+  <worldbody>
+    <body name="robot" pos="0 0 0.12">
+      <freejoint/>
+      <geom type="sphere" size="0.12" density="{density}"/>
+      <site name="imu"/>
+      <include file="parts/hat.xml"/>
+    </body>
+  </worldbody>
+  <asset><mesh name="hat" file="hat.stl"/></asset>
+  <actuator><general site="imu" gear="1 0 0 0 0 0.01"/></actuator>
+  <sensor><gyro name="gyro" site="imu"/></sensor>
+</mujoco>
+"""
+HAT = '<mujoco><geom type="mesh" mesh="hat" pos="0 0 0.2" contype="0" conaffinity="0"/></mujoco>'
+CORNERS = ((0, 0, 0), (0.1, 0, 0), (0, 0.1, 0), (0, 0, 0.1))
+
+
+def stl() -> bytes:
+    """A tetrahedron."""
+    faces = ((0, 2, 1), (0, 1, 3), (0, 3, 2), (1, 2, 3))
+    rows = [struct.pack("<12fH", 0, 0, 0, *sum((CORNERS[i] for i in f), ()), 0) for f in faces]
+    return bytes(80) + struct.pack("<I", len(rows)) + b"".join(rows)
+
+
+def write_robot(folder, meshes="../meshes", density=1):
+    for name in ("robot/parts", "meshes"):
+        (folder / name).mkdir(parents=True, exist_ok=True)
+    path = folder / "robot" / "ball.xml"
+    path.write_text(ROBOT.format(meshes=meshes, density=density))
+    (folder / "robot" / "parts" / "hat.xml").write_text(HAT)
+    (folder / "meshes" / "hat.stl").write_bytes(stl())
+    return path
+
+
+@pytest.fixture
+def run(tmp_path, monkeypatch):
+    """A run on a robot file that the command line names from the folder it is in."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.delenv("HYDRA_FULL_ERROR", raising=False)
+    monkeypatch.setattr(sys, "argv", ["train.py"])
+
+    def begin(name="run", frames=40, base="robot/ball.xml", **robot):
+        write_robot(tmp_path, **robot)
+        folder = tmp_path / name
+        arguments = (f"hydra.run.dir={folder}", f"frames={frames}")
+        assert train.main([f"env.robot_base={base}", *SMALL, *arguments]) == 0
+        return folder
+
+    return begin
+
+
+def test_a_changed_robot_changes_neither_the_run_nor_its_evaluation(run, tmp_path, capsys):
+    whole, folder = run("whole", frames=80), run()
+    assert evaluate.main([str(folder), "episodes=2", "num_threads=1", "name=before"]) == 0
+    assert "the run's copy" not in capsys.readouterr().out
+    write_robot(tmp_path, density=30)
+    assert evaluate.main([str(folder), "episodes=2", "num_threads=1", "name=after"]) == 0
+    said = capsys.readouterr().out
+    notice = "robot/ball.xml has changed since the run began: using the run's copy, "
+    assert said.count(f"{notice}{folder}/robot/robot/ball.xml") == 1
+    rows = [(folder / f"evaluation_{name}.csv").read_text() for name in ("before", "after")]
+    assert rows[0] == rows[1]
+    assert train.main([f"resume={folder}", "frames=80"]) == 0
+    assert notice in capsys.readouterr().out
+    assert without_times(folder / "progress.csv") == without_times(whole / "progress.csv")
+    # the name of the robot, by which runs are told apart, stays
+    assert yaml.safe_load((folder / "config.yaml").read_text())["env"]["robot_base"] == (
+        "robot/ball.xml"
+    )
+
+
+def test_a_run_is_carried_elsewhere(run, tmp_path, monkeypatch, capsys):
+    folder = run()
+    elsewhere = tmp_path / "elsewhere"
+    elsewhere.mkdir()
+    folder = folder.rename(elsewhere / "run")
+    monkeypatch.chdir(elsewhere)
+    notice = "there is no file 'robot/ball.xml': using the run's copy"
+    assert train.main(["resume=run", "frames=80"]) == 0
+    assert notice in capsys.readouterr().out
+    assert safe_rl.load("run").env.rollout(3).shape == (1, 3)
+    assert notice in capsys.readouterr().out
+    assert evaluate.main(["run", "episodes=2", "num_threads=1", "env.robot_base=point"]) == 1
+    assert "trained on other observations or actions" in capsys.readouterr().err
+
+
+def test_another_robot_than_the_runs_is_never_taken(run, tmp_path, capsys):
+    folder = run()
+    with (folder / "robot" / "meshes" / "hat.stl").open("ab") as file:
+        file.write(b"more")
+    assert evaluate.main([str(folder), "episodes=2", "num_threads=1"]) == 0  # by the original
+    write_robot(tmp_path, density=30)
+    for words in ("and so has the run's own copy", "has no copy of it"):
+        assert evaluate.main([str(folder), "episodes=2", "num_threads=1"]) == 1
+        assert words in capsys.readouterr().err
+        assert train.main([f"resume={folder}", "frames=80"]) == 1
+        assert words in capsys.readouterr().err
+        note = json.loads((folder / "robot.json").read_text()) | {"file": None}
+        (folder / "robot.json").write_text(json.dumps(note))
+    note["file"] = "../../robot/ball.xml"
+    (folder / "robot.json").write_text(json.dumps(note))
+    assert evaluate.main([str(folder), "episodes=2", "num_threads=1"]) == 1
+
+
+def test_what_cannot_be_copied_is_said(run, tmp_path, capsys):
+    folder = run(meshes=tmp_path / "meshes")
+    said = capsys.readouterr().out
+    assert "names files by absolute paths. The run keeps no copy of its robot" in said
+    assert not (folder / "robot").exists()
+    assert evaluate.main([str(folder), "episodes=2", "num_threads=1"]) == 0
+    write_robot(tmp_path, meshes=tmp_path / "meshes", density=30)
+    assert evaluate.main([str(folder), "episodes=2", "num_threads=1"]) == 1
+    assert "has changed since the run began, and" in capsys.readouterr().err
+
+
+def test_bundled_robots_need_no_copy(run):
+    folder = run(base="point")
+    assert not {"robot", "robot.json"} & {path.name for path in folder.iterdir()}
