@@ -1,0 +1,89 @@
+"""Seconds of training and testing until the first policy that is good and surely safe.
+
+After an epoch whose estimates keep every limit and whose last three returns reach the target, the
+policy is tested on fresh episodes: it passes if its mean return reaches the target and the upper
+confidence bound of every J_c is within its limit. All tests of a run share one level (Bonferroni),
+so that passing means something however often it was tried. Seconds are those of training and of
+the tests, from the first step; starting Python and compiling come on top.
+
+    python benchmarks/time_to_safe.py env=PointGoal1 algo=ppo_lagrangian --seeds 0 1 2 3 4
+"""
+
+import argparse
+import statistics
+import tempfile
+import time
+from pathlib import Path
+
+from omegaconf import OmegaConf
+from train_throughput import compose_config, new_env
+
+from safe_rl.evaluation import collect_episodes
+from safe_rl.runs.outcome import keeps
+from safe_rl.scores.certificate import Claim
+from safe_rl.training.trainer import build_trainer, seed_everything
+
+
+def is_promising(rows, limits, target):
+    """Whether a test is worth its time after these rows of the table."""
+    recent = [row["episode_return"] for row in rows[-3:]]
+    is_safe = all(keeps(rows[-1], key, limit) for key, limit in limits.items())
+    return is_safe and len(recent) == 3 and sum(recent) / 3 >= target
+
+
+def passes(config, policy, claim, options, number):
+    """Test a policy; returns its mean return, whether it passes, and the bounds."""
+    worlds = {"num_envs": min(100, options.episodes), "seed": config.seed + 10**6 + number}
+    test = new_env(OmegaConf.merge(config, worlds))
+    episodes = collect_episodes(
+        test, policy, options.episodes, list(claim.limits), deterministic=False
+    )
+    test.close()
+    costs = {key: values.numpy() for key, values in episodes.costs.items()}
+    mean = episodes.returns.mean().item()
+    bounds = {name: bound for name, (bound, _) in claim.bounds(costs, options.tests).items()}
+    return mean, mean >= options.target and not claim.shortfalls(costs, options.tests), bounds
+
+
+def time_to_safe(config, options, directory):
+    """Train until a policy passes, the tests are used up, or the run is over."""
+    seed_everything(config.seed, config.num_threads)
+    trainer = build_trainer(config, new_env(config), directory)
+    claim = Claim({key: float(limit) for key, limit in config.cost_limits.items()})
+    batches, rows, tests = trainer.batches(), [], 0
+    start = time.perf_counter()
+    while trainer.progress.steps < config.frames and tests < options.tests:
+        rows.append(trainer.epoch(batches))
+        if is_promising(rows, claim.limits, options.target):
+            tests += 1
+            policy = trainer.algorithm.policy
+            mean, is_safe, bounds = passes(config, policy, claim, options, tests)
+            if is_safe:
+                seconds = time.perf_counter() - start
+                trainer.close()
+                return trainer.progress.steps, seconds, f"return {mean:.1f}, {bounds}", tests
+    trainer.close()
+    return trainer.progress.steps, float("inf"), "none passed", tests
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("overrides", nargs="*", help="as train.py takes them")
+    parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2, 3, 4])
+    parser.add_argument("--target", type=float, default=15.0, help="mean return")
+    parser.add_argument("--episodes", type=int, default=400, help="of a test")
+    parser.add_argument("--tests", type=int, default=5, help="at most, of a run")
+    options = parser.parse_args()
+    found = []
+    print("| seed | steps | seconds | tests | policy |\n|---|---|---|---|---|")
+    for seed in options.seeds:
+        config = compose_config([*options.overrides, f"seed={seed}"])
+        with tempfile.TemporaryDirectory() as directory:
+            steps, seconds, outcome, tests = time_to_safe(config, options, Path(directory))
+        found.append(seconds)
+        print(f"| {seed} | {steps:,} | {seconds:.0f} | {tests} | {outcome} |", flush=True)
+    print(f"median: {statistics.median(found):.0f} s")
+
+
+if __name__ == "__main__":
+    main()
