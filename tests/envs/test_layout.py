@@ -2,6 +2,7 @@
 
 import itertools
 import math
+import time
 
 import numpy as np
 import pytest
@@ -278,3 +279,35 @@ def test_placements_without_room_name_the_key():
     config = {**POINT, "hazards_num": 1, "hazards_placements": [[0, 0, 0.7, 2]]}
     with pytest.raises(ConfigError, match=r"hazard0.*'hazards_placements'.*'hazards_keepout'"):
         SafetyGymEnv(config, num_threads=1)
+
+
+HOPELESS = {
+    "placements_margin": (1e9, "'goal' did not fit.*'placements_margin'"),
+    "hazards_num": (60, r"'hazard\d+' did not fit.*'hazards_num' is 60.*'hazards_keepout'"),
+    "walls_num": (1000, "'goal' did not fit.*'walls_num' is 1000"),
+    "hazards_locations": ([[0.0, 0.0]] * 8, "'hazard1' did not fit.*'hazards_locations'"),
+}
+
+
+@pytest.mark.parametrize(
+    "key", [pytest.param(k, marks=pytest.mark.slow if k == "walls_num" else ()) for k in HOPELESS]
+)
+def test_what_never_fits_is_said_within_seconds(key):
+    value, words = HOPELESS[key]
+    env = SafetyGymEnv(SUITE["PointGoal1"].replace(**{key: value}), num_envs=100, seed=0)
+    begun = time.process_time()
+    with pytest.raises(LayoutError, match=words) as caught:
+        env.reset()
+    assert time.process_time() - begun < 12
+    assert len(str(caught.value).splitlines()) == 1
+
+
+@pytest.mark.parametrize("key", ["hazards_num", "walls_num", "vases_num", "gremlins_num"])
+def test_more_objects_than_physics_holds_are_refused(key):
+    with pytest.raises(ConfigError, match=rf"'{key}' must be at most 1?[,\d]+, got 100000"):
+        SUITE["PointGoal1"].replace(**{key: 100_000})
+
+
+def test_a_negative_margin_lets_keepouts_overlap_and_asks_for_no_distance():
+    keys = {**POINT, "task": "goal", "hazards_num": 8, "placements_margin": -50.0}
+    assert fresh_places(keys, num_envs=4).keys() >= {"goal", "hazard0", "hazard7"}

@@ -49,6 +49,7 @@ ANY = Range("", lambda x: True)
 POSITIVE = Range("greater than 0", lambda x: x > 0)
 NOT_NEGATIVE = Range("0 or more", lambda x: x >= 0)
 OBJECTS = NOT_NEGATIVE.up_to(1000)
+FREE_OBJECTS = NOT_NEGATIVE.up_to(200)  # whose contacts still fit into the physics' memory
 PROBABILITY = Range("a probability between 0 and 1", lambda x: 0.0 <= x <= 1.0)
 
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from safe_rl.envs.safety_gym.records.values import (
+    FREE_OBJECTS,
     LARGEST_SEED,
     NOT_NEGATIVE,
     OBJECTS,
@@ -172,7 +173,7 @@ class Vocabulary:
     hazards_cost: float = key(1.0, "per metre that the robot is inside")
 
     # vases
-    vases_num: int = key(0, _NUMBER, OBJECTS)
+    vases_num: int = key(0, _NUMBER, FREE_OBJECTS)
     vases_placements: Placements = key(None, _AREAS)
     vases_locations: Locations = key((), _PINNED)
     vases_rots: tuple[float, ...] = key((), _YAWS)
@@ -207,7 +208,7 @@ class Vocabulary:
     )
 
     # gremlins
-    gremlins_num: int = key(0, _NUMBER, OBJECTS)
+    gremlins_num: int = key(0, _NUMBER, FREE_OBJECTS)
     gremlins_placements: Placements = key(None, _AREAS)
     gremlins_locations: Locations = key((), _PINNED)
     gremlins_rots: tuple[float, ...] = key((), _YAWS)

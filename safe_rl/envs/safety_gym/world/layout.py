@@ -6,6 +6,7 @@ lengths in metres.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property
@@ -26,6 +27,10 @@ PIN_TOLERANCE = 1e-9  # half width of the square that a pinned location stands f
 _BLOCK = 10  # candidates for an object that are tested at once
 _GOAL_BLOCK = 40  # and for a new goal: mostly enough, and a second round takes as long again
 _MAX_ROWS = 4096  # layouts, or candidates for new goals, at once: a bound on memory
+# Layouts of a batch that may fail before the first one is found; the lower number where each of
+# them takes long, by the pairs of objects that were compared.
+_HOPELESS_LAYOUTS = (100, 10_000)
+_HOPELESS_PAIRS = 1 << 26
 
 
 class LayoutError(RuntimeError):
@@ -38,6 +43,7 @@ class PlacementPlan:
 
     Attributes:
         names: the P objects in order of placement.
+        kinds: the kind of each.
         columns: column of each in a layout [.., 1 + M, 2]: 0 the robot, 1 + slot an object.
         num_columns: 1 + M.
         rectangles: where the centres may be, [P, R, 4] (xmin, ymin, xmax, ymax).
@@ -47,6 +53,7 @@ class PlacementPlan:
     """
 
     names: tuple[str, ...]
+    kinds: tuple[str, ...]
     columns: tuple[int, ...]
     num_columns: int
     rectangles: Tensor
@@ -65,7 +72,11 @@ class PlacementPlan:
         item = self.names.index("goal")
         others = [i for i in range(len(self.names)) if i != item]
         columns = torch.tensor([self.columns[i] for i in others])
-        return item, columns, self.keepouts[others] + self.keepouts[item] + self.margin
+        return item, columns, self.clearance(item, others)
+
+    def clearance(self, item: int, others: slice | list[int]) -> Tensor:
+        """Distances that an object keeps from others at least, [K]."""
+        return (self.keepouts[others] + self.keepouts[item] + self.margin).clamp(min=0.0)
 
 
 def plan_placements(
@@ -81,7 +92,7 @@ def plan_placements(
     Raises:
         ConfigError: if a placement leaves no room for its object's keepout.
     """
-    names, columns, keepouts, rectangles = [], [], [], []
+    names, kinds, columns, keepouts, rectangles = [], [], [], [], []
     for kind in PLACEMENT_ORDER:
         if kind == "robot":
             labels, first = ["robot"], 0
@@ -91,12 +102,14 @@ def plan_placements(
             labels, first = BY_KIND[kind].names(config), 1 + slots[kind].start
         for index, label in enumerate(labels):
             names.append(label)
+            kinds.append(kind)
             columns.append(first + index)
             keepouts.append(getattr(config, f"{kind}_keepout"))
             rectangles.append(_rectangles(config, kind, label, index))
     stacked, thresholds = _stack(rectangles)
     return PlacementPlan(
         names=tuple(names),
+        kinds=tuple(kinds),
         columns=tuple(columns),
         num_columns=1 + num_slots,
         rectangles=stacked,
@@ -169,7 +182,7 @@ def _fits(candidates: Tensor, others: Tensor, clearance: Tensor) -> Tensor:
 
 def _place(plan: PlacementPlan, item: int, key: Tensor, placed: Tensor) -> tuple[Tensor, Tensor]:
     """Place one object beside those placed before: keys [B], placed [B, K, 2] -> [B, 2], ok [B]."""
-    clearance = plan.keepouts[:item] + plan.keepouts[item] + plan.margin
+    clearance = plan.clearance(item, slice(item))
     position = placed.new_zeros(len(key), 2)
     pending = torch.arange(len(key))
     for start in range(0, TRIES_PER_OBJECT, _BLOCK):
@@ -216,7 +229,7 @@ def sample_layouts(plan: PlacementPlan, key: Tensor) -> Tensor:
     """Draw a layout for every key.
 
     Every object in its turn gets 100 tries; then the layout is thrown away and drawn again, 10,000
-    times at most.
+    times at most, and less often where no row's layout is found.
 
     Args:
         plan: what to place.
@@ -226,7 +239,7 @@ def sample_layouts(plan: PlacementPlan, key: Tensor) -> Tensor:
         Positions [B, 1 + M, 2]: the robot, then the objects by slot; zero for what is not placed.
 
     Raises:
-        LayoutError: naming the object that did not fit.
+        LayoutError: naming the object that did not fit, and the keys that it depends on.
     """
     layouts = torch.zeros(len(key), plan.num_columns, 2, dtype=torch.float64)
     misfits = torch.zeros(len(plan.names), dtype=torch.int64)
@@ -242,10 +255,26 @@ def sample_layouts(plan: PlacementPlan, key: Tensor) -> Tensor:
         pending = pending[~found]
         if not len(pending):
             return layouts
-    worst = int(misfits.argmax())
-    raise LayoutError(
-        f"No layout found in {TRIES_PER_LAYOUT} attempts: most often '{plan.names[worst]}' did not "
-        "fit. Use fewer objects, smaller keepouts, or larger placements."
+        if len(pending) == len(key) and _is_hopeless(misfits):
+            break
+    raise _no_layout(plan, misfits)
+
+
+def _is_hopeless(misfits: Tensor) -> bool:
+    """Whether enough layouts have failed, by the number of those that failed at each object."""
+    failed = int(misfits.sum())
+    pairs = int((misfits * torch.arange(1, 1 + len(misfits)).square()).sum())
+    return failed >= _HOPELESS_LAYOUTS[pairs < _HOPELESS_PAIRS]
+
+
+def _no_layout(plan: PlacementPlan, misfits: Tensor) -> LayoutError:
+    item = int(misfits.argmax())
+    kind, (most, number) = plan.kinds[item], Counter(plan.kinds).most_common(1)[0]
+    fewer = f"fewer objects ('{most}_num' is {number}), " if number > 1 else ""
+    return LayoutError(
+        f"No layout found in {misfits.sum():,} attempts: most often '{plan.names[item]}' did not "
+        f"fit. Use {fewer}a smaller '{kind}_keepout' or 'placements_margin', or larger "
+        f"'{kind}_placements' or 'placements_extents', and '{kind}_locations' further apart."
     )
 
 
