@@ -1,6 +1,7 @@
 """Specs, names and sizes of all 27 environments, ends of episodes, and partial resets."""
 
 import itertools
+import math
 
 import pytest
 import torch
@@ -215,3 +216,25 @@ def test_nothing_that_is_returned_shares_memory():
         one.fill_(one.new_tensor(7).logical_not_() if one.dtype is torch.bool else 7)
         one.logical_not_()
         assert torch.equal(other, before)
+
+
+def test_lidars_and_compasses_are_bounded_as_in_gymnasium():
+    keys = {"robot_base": "point", "observe_goal_comp": True, "observe_goal_lidar": True}
+    flat = SafetyGymEnv(keys, num_envs=2, seed=0)
+    check_env_specs(flat)
+    space = flat.observation_spec["observation"].space
+    bounds = {"goal_compass": (-1, 1), "goal_lidar": (0, 1)}
+    for name, columns in flat.observation_layout.items():
+        low, high = bounds.get(name, (-math.inf, math.inf))
+        assert (space.low[:, columns] == low).all(), name
+        assert (space.high[:, columns] == high).all(), name
+    nested = SafetyGymEnv({**keys, "observation_flatten": False}, num_envs=2, seed=0)
+    check_env_specs(nested)
+    drawn = nested.observation_spec["observation"].rand()
+    assert set(bounds) < set(drawn.keys())
+    for name, value in drawn.items():
+        assert value.isfinite().all()
+        low, high = bounds.get(name, (-math.inf, math.inf))
+        assert ((low <= value) & (value <= high)).all()
+    unbounded = SafetyGymEnv({"robot_base": "point"}, num_envs=2, seed=0)
+    assert unbounded.observation_spec["observation"].rand().isfinite().all()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
@@ -66,10 +67,24 @@ def make_specs(
 def _observation(
     config: SafetyGymConfig, observer: Observer, num_envs: int, kind: dict[str, Any]
 ) -> TensorSpec:
-    """One flat vector, or every component in its own shape."""
+    """One flat vector, or every component in its own shape, each within its bounds."""
+    columns = torch.tensor([observer.bounds[name] for name in observer.columns]).T
+    widths = torch.tensor([math.prod(shape) for shape in observer.shapes.values()])
     if config.observation_flatten:
-        return Unbounded(shape=(num_envs, observer.size), **kind)
+        return _within(columns.repeat_interleave(widths, dim=1), (num_envs, observer.size), kind)
     components = {
-        name: Unbounded(shape=(num_envs, *shape), **kind) for name, shape in observer.shapes.items()
+        name: _within(columns[:, i : i + 1].flatten(), (num_envs, *shape), kind)
+        for i, (name, shape) in enumerate(observer.shapes.items())
     }
     return Composite(components, shape=(num_envs,))
+
+
+def _within(bounds: Tensor, shape: tuple[int, ...], kind: dict[str, Any]) -> TensorSpec:
+    """Numbers within (low, high), which may be infinite here and there, as in TorchRL's wrappers.
+
+    Where all are, numbers can be drawn of the spec.
+    """
+    if bounds.isinf().all():
+        return Unbounded(shape=shape, **kind)
+    low, high = (bound.expand(shape).clone() for bound in bounds)
+    return Bounded(low, high, shape=shape, **kind)
