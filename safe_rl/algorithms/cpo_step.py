@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Unpack
 
 import torch
 from tensordict import TensorDictBase
-from tensordict.nn import ProbabilisticTensorDictSequential
 from torch import Tensor
 
-from safe_rl.algorithms.trust_region_step import Proposal, TRPOStep, total_loss
+from safe_rl.algorithms.trust_region_step import Proposal, TRPOStep, TrustRegion, total_loss
 from safe_rl.objectives.cpo_dual import DualSolution, solve_dual
 from safe_rl.objectives.fisher import FisherProduct
 from safe_rl.objectives.trust_region import best_in_span, flat_gradient, solve_with_image
-from safe_rl.objectives.violation import constraint_value
+from safe_rl.objectives.violation import constraint_value, matched_violation
 
 __all__ = ["CPOStep"]
 
@@ -38,13 +38,7 @@ class CPOStep(TRPOStep):
             ``loss_…`` and the differentiable ``cost_surrogate``, [k].
         rescale_violation: whether to divide the violations by the episode length; see
             `constraint_value`.
-        target_kl: radius δ of the trust region, mean KL over the states of the batch.
-        damping: multiple of the identity added to the Fisher matrix.
-        cg_iterations: iterations of the conjugate gradient method, for g and for every bᵢ.
-        backtrack_coeff: factor between one try of the line search and the next.
-        max_backtracks: tries of the line search.
-        fisher_subsample: fraction of the batch that the Fisher matrix is averaged over.
-        actor_network: policy to step; by default ``loss.actor_network``.
+        settings: those of every step, see `TrustRegion`.
 
     Examples:
         >>> from tensordict import TensorDict
@@ -81,24 +75,9 @@ class CPOStep(TRPOStep):
         loss: Callable[[TensorDictBase], TensorDictBase],
         *,
         rescale_violation: bool,
-        target_kl: float,
-        damping: float,
-        cg_iterations: int,
-        backtrack_coeff: float,
-        max_backtracks: int,
-        fisher_subsample: float = 1.0,
-        actor_network: ProbabilisticTensorDictSequential | None = None,
+        **settings: Unpack[TrustRegion],
     ) -> None:
-        super().__init__(
-            loss,
-            target_kl=target_kl,
-            damping=damping,
-            cg_iterations=cg_iterations,
-            backtrack_coeff=backtrack_coeff,
-            max_backtracks=max_backtracks,
-            fisher_subsample=fisher_subsample,
-            actor_network=actor_network,
-        )
+        super().__init__(loss, **settings)
         self.rescale_violation = rescale_violation
 
     def _propose(
@@ -108,27 +87,33 @@ class CPOStep(TRPOStep):
         cost_violation: Tensor | None,
         episode_length: Tensor | None,
     ) -> Proposal:
-        loss, surrogates = total_loss(losses), losses["cost_surrogate"]
+        surrogates = losses["cost_surrogate"]
         c = self._constraint(surrogates, cost_violation, episode_length)
-        g = flat_gradient(loss, self.parameters, retain_graph=True)
-        b = torch.stack(
-            [flat_gradient(cost, self.parameters, retain_graph=True) for cost in surrogates]
-        )
+        g = flat_gradient(total_loss(losses), self.parameters, retain_graph=True)
+        b = self._gradients(surrogates)
         # Left out by a zero gradient: the dual takes such constraints for case 4.
         b = b * ~((b.square().sum(-1, keepdim=True) <= _NO_GRADIENT) & (c[:, None] < 0))
         v, w = self._solve_all(fisher, g, b)
         q, r, s = g @ v, w @ g, b @ w.T
         dual = solve_dual(q, r, s, c, self.target_kl)
         step = -(dual.reward_coefficient * v + dual.cost_coefficient @ w)
-        before, cost_before = loss.detach(), surrogates.detach()
+        accepts = self._acceptance(losses, c, may_be_worse=dual.case < 2)
+        return Proposal(step, accepts, self._diagnostics(q, r, s.diagonal(), c, dual))
+
+    @staticmethod
+    def _acceptance(
+        losses: TensorDictBase, c: Tensor, may_be_worse: Tensor
+    ) -> Callable[[TensorDictBase, Tensor], bool]:
+        """Lets costs grow by max(−c, 0), and the loss get no worse unless it may."""
+        before, cost_before = total_loss(losses).detach(), losses["cost_surrogate"].detach()
         allowance = (-c).clamp_min(0)
 
-        def is_acceptable(after: TensorDictBase) -> bool:
+        def is_acceptable(after: TensorDictBase, kl: Tensor) -> bool:
             not_worse = total_loss(after) <= before
             within = (after["cost_surrogate"] - cost_before <= allowance).all()
-            return bool((not_worse | (dual.case < 2)) & within)
+            return bool((not_worse | may_be_worse) & within)
 
-        return Proposal(step, is_acceptable, self._diagnostics(q, r, s.diagonal(), c, dual))
+        return is_acceptable
 
     def _solve_all(self, fisher: FisherProduct, g: Tensor, b: Tensor) -> tuple[Tensor, Tensor]:
         """H⁻¹g, [P], and H⁻¹bᵢ, [k, P], such that q, r and S are those of one and the same metric.
@@ -146,14 +131,9 @@ class CPOStep(TRPOStep):
     def _constraint(
         self, surrogates: Tensor, cost_violation: Tensor | None, episode_length: Tensor | None
     ) -> Tensor:
-        if cost_violation is None or episode_length is None:
-            raise ValueError("A CPO step needs cost_violation [k] and episode_length.")
-        violation = torch.as_tensor(cost_violation).to(surrogates)
-        if violation.shape != surrogates.shape:
-            raise ValueError(
-                f"cost_violation has shape {tuple(violation.shape)} but there are "
-                f"{surrogates.numel()} cost surrogate(s): give one violation per surrogate."
-            )
+        violation = matched_violation(cost_violation, surrogates)
+        if episode_length is None:
+            raise ValueError("A step with linearised constraints needs the mean episode_length.")
         length = torch.as_tensor(episode_length).to(surrogates)
         return constraint_value(violation, length, self.rescale_violation)
 

@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Unpack
 
 import torch
 from tensordict import TensorDictBase
-from tensordict.nn import ProbabilisticTensorDictSequential
 from torch import Tensor
 
-from safe_rl.algorithms.trust_region_step import Proposal, TRPOStep
+from safe_rl.algorithms.trust_region_step import Proposal, TRPOStep, TrustRegion
 from safe_rl.objectives.fisher import FisherProduct
+from safe_rl.objectives.violation import matched_violation
 
 __all__ = ["CRPOStep"]
 
@@ -29,13 +30,7 @@ class CRPOStep(TRPOStep):
         loss: a `CPOLoss`, or a callable of your own that returns a TensorDict with scalars
             ``loss_…`` and the differentiable ``cost_surrogate``, [k].
         tolerance: η ≥ 0, undiscounted cost per episode.
-        target_kl: radius δ of the trust region, mean KL over the states of the batch.
-        damping: multiple of the identity added to the Fisher matrix.
-        cg_iterations: iterations of the conjugate gradient method.
-        backtrack_coeff: factor between one try of the line search and the next.
-        max_backtracks: tries of the line search.
-        fisher_subsample: fraction of the batch that the Fisher matrix is averaged over.
-        actor_network: policy to step; by default ``loss.actor_network``.
+        settings: those of every step, see `TrustRegion`.
 
     Examples:
         >>> from tensordict import TensorDict
@@ -57,24 +52,9 @@ class CRPOStep(TRPOStep):
         loss: Callable[[TensorDictBase], TensorDictBase],
         *,
         tolerance: float,
-        target_kl: float,
-        damping: float,
-        cg_iterations: int,
-        backtrack_coeff: float,
-        max_backtracks: int,
-        fisher_subsample: float = 1.0,
-        actor_network: ProbabilisticTensorDictSequential | None = None,
+        **settings: Unpack[TrustRegion],
     ) -> None:
-        super().__init__(
-            loss,
-            target_kl=target_kl,
-            damping=damping,
-            cg_iterations=cg_iterations,
-            backtrack_coeff=backtrack_coeff,
-            max_backtracks=max_backtracks,
-            fisher_subsample=fisher_subsample,
-            actor_network=actor_network,
-        )
+        super().__init__(loss, **settings)
         self.tolerance = tolerance
 
     def _propose(
@@ -85,13 +65,7 @@ class CRPOStep(TRPOStep):
         episode_length: Tensor | None,
     ) -> Proposal:
         surrogates = losses["cost_surrogate"]
-        if cost_violation is None or cost_violation.shape != surrogates.shape:
-            raise ValueError(
-                "A CRPO step needs cost_violation, one per cost surrogate: "
-                f"[{surrogates.numel()}] of them."
-            )
-        # NaN (no episode has finished yet) counts as at the limit
-        excess = cost_violation.to(surrogates).nan_to_num(nan=0.0) - self.tolerance
+        excess = matched_violation(cost_violation, surrogates) - self.tolerance
         worst = int(excess.argmax())
         reduces = torch.zeros_like(surrogates).detach()
         if excess[worst] > 0:

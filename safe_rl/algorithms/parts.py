@@ -6,16 +6,14 @@ your own: each gets those live objects that its constructor names.
 
 from __future__ import annotations
 
-import inspect
-from collections.abc import Callable
 from typing import Any, cast
 
 from omegaconf import DictConfig
 
 from safe_rl.algorithms.contract import Recipe
-from safe_rl.targets import TargetError, build, locate
+from safe_rl.targets import TargetError, accepted_names, build, locate
 
-__all__ = ["accepted_names", "build_part", "find_recipe"]
+__all__ = ["build_part", "find_recipe"]
 
 _DEFAULT_RECIPE = "safe_rl.algorithms.OnPolicy"
 
@@ -46,28 +44,3 @@ def build_part(node: DictConfig, **objects: Any) -> Any:
         return build(node)
     names = accepted_names(locate(node.get("_target_"), f"{node._get_full_key(None)}._target_"))
     return build(node, **{k: v for k, v in objects.items() if v is not None and k in names})
-
-
-def accepted_names(target: Callable[..., Any]) -> set[str]:
-    """Names of the arguments that a function or a class takes.
-
-    A constructor with ``**kwargs`` hands them on to its base, whose names count too.
-
-    Examples:
-        >>> class Base:
-        ...     def __init__(self, actor_network, *, multiplier=None): ...
-        >>> class Own(Base):
-        ...     def __init__(self, *args, penalty, **kwargs): ...
-        >>> sorted(accepted_names(Own))
-        ['actor_network', 'multiplier', 'penalty']
-    """
-    functions = [target]
-    if inspect.isclass(target):
-        functions = [vars(base)["__init__"] for base in target.__mro__ if "__init__" in vars(base)]
-    names: set[str] = set()
-    for function in functions:
-        parameters = inspect.signature(function).parameters.values()
-        names |= {p.name for p in parameters if p.kind in (p.POSITIONAL_OR_KEYWORD, p.KEYWORD_ONLY)}
-        if all(p.kind is not p.VAR_KEYWORD for p in parameters):
-            break
-    return names - {"self"}

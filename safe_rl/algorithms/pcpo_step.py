@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Literal, get_args
+from typing import Literal, Unpack, get_args
 
 import torch
 from scipy.optimize import nnls
 from tensordict import TensorDictBase
-from tensordict.nn import ProbabilisticTensorDictSequential
 from torch import Tensor
 
 from safe_rl.algorithms.cpo_step import CPOStep
-from safe_rl.algorithms.trust_region_step import Proposal, total_loss
+from safe_rl.algorithms.trust_region_step import Proposal, TrustRegion, total_loss
 from safe_rl.objectives.fisher import FisherProduct
 from safe_rl.objectives.trust_region import flat_gradient
 
@@ -68,13 +67,7 @@ class PCPOStep(CPOStep):
         loss: as of a `CPOStep`.
         projection: ``"kl"`` or ``"l2"``, the distance that the projection keeps small.
         rescale_violation: whether to divide the violations by the episode length.
-        target_kl: radius δ of the trust region, mean KL over the states of the batch.
-        damping: multiple of the identity added to the Fisher matrix.
-        cg_iterations: iterations of the conjugate gradient method, for g and for every bᵢ.
-        backtrack_coeff: factor between one try of the line search and the next.
-        max_backtracks: tries of the line search.
-        fisher_subsample: fraction of the batch that the Fisher matrix is averaged over.
-        actor_network: policy to step; by default ``loss.actor_network``.
+        settings: those of every step, see `TrustRegion`.
 
     Raises:
         ValueError: if `projection` is neither of the two.
@@ -101,25 +94,9 @@ class PCPOStep(CPOStep):
         *,
         projection: Projection,
         rescale_violation: bool,
-        target_kl: float,
-        damping: float,
-        cg_iterations: int,
-        backtrack_coeff: float,
-        max_backtracks: int,
-        fisher_subsample: float = 1.0,
-        actor_network: ProbabilisticTensorDictSequential | None = None,
+        **settings: Unpack[TrustRegion],
     ) -> None:
-        super().__init__(
-            loss,
-            rescale_violation=rescale_violation,
-            target_kl=target_kl,
-            damping=damping,
-            cg_iterations=cg_iterations,
-            backtrack_coeff=backtrack_coeff,
-            max_backtracks=max_backtracks,
-            fisher_subsample=fisher_subsample,
-            actor_network=actor_network,
-        )
+        super().__init__(loss, rescale_violation=rescale_violation, **settings)
         if projection not in get_args(Projection):
             raise ValueError(f"projection must be one of {get_args(Projection)}: {projection!r}.")
         self.projection = projection
@@ -131,12 +108,10 @@ class PCPOStep(CPOStep):
         cost_violation: Tensor | None,
         episode_length: Tensor | None,
     ) -> Proposal:
-        loss, surrogates = total_loss(losses), losses["cost_surrogate"]
+        surrogates = losses["cost_surrogate"]
         c = self._constraint(surrogates, cost_violation, episode_length)
-        g = flat_gradient(loss, self.parameters, retain_graph=True)
-        b = torch.stack(
-            [flat_gradient(cost, self.parameters, retain_graph=True) for cost in surrogates]
-        )
+        g = flat_gradient(total_loss(losses), self.parameters, retain_graph=True)
+        b = self._gradients(surrogates)
         v, w = self._solve_all(fisher, g, b)
         q = g @ v
         for_reward = torch.where(q > 0, (2 * self.target_kl / q).sqrt(), 0.0) * -v
@@ -145,11 +120,5 @@ class PCPOStep(CPOStep):
         step = for_reward - nu @ back
         length = step @ fisher(step)
         shortened = (2 * self.target_kl / length.clamp_min(1e-30)).sqrt().clamp_max(1.0)
-        before, cost_before = loss.detach(), surrogates.detach()
-
-        def is_acceptable(after: TensorDictBase) -> bool:
-            not_worse = total_loss(after) <= before
-            within = (after["cost_surrogate"] - cost_before <= (-c).clamp_min(0)).all()
-            return bool((not_worse | nu.any()) & within)
-
-        return Proposal(shortened * step, is_acceptable, {"c": c, "nu": nu, "shortened": shortened})
+        accepts = self._acceptance(losses, c, may_be_worse=nu.any())
+        return Proposal(shortened * step, accepts, {"c": c, "nu": nu, "shortened": shortened})

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
-from typing import Any, NamedTuple
+from collections.abc import Callable, Iterable, Mapping
+from typing import Any, NamedTuple, NotRequired, TypedDict
 
 import torch
 from tensordict import TensorDictBase
@@ -23,7 +23,29 @@ from safe_rl.objectives.trust_region import (
     subsample,
 )
 
-__all__ = ["Proposal", "TRPOStep", "total_loss"]
+__all__ = ["Proposal", "TRPOStep", "TrustRegion", "total_loss"]
+
+
+class TrustRegion(TypedDict):
+    """Keyword arguments of every trust-region step.
+
+    Attributes:
+        target_kl: radius δ of the trust region, mean KL over the states of the batch.
+        damping: multiple of the identity added to the Fisher matrix.
+        cg_iterations: iterations of the conjugate gradient method, for every system solved.
+        backtrack_coeff: factor between one try of the line search and the next.
+        max_backtracks: tries of the line search.
+        fisher_subsample: fraction of the batch that the Fisher matrix is averaged over.
+        actor_network: policy to step; by default ``loss.actor_network``.
+    """
+
+    target_kl: float
+    damping: float
+    cg_iterations: int
+    backtrack_coeff: float
+    max_backtracks: int
+    fisher_subsample: NotRequired[float]
+    actor_network: NotRequired[ProbabilisticTensorDictSequential | None]
 
 
 class Proposal(NamedTuple):
@@ -31,12 +53,13 @@ class Proposal(NamedTuple):
 
     Attributes:
         step: change of the parameters, [P].
-        is_acceptable: judges the losses after a step; the trust region is checked besides.
+        is_acceptable: judges the losses and the KL divergence after a step that is no further than
+            δ.
         diagnostics: what is worth logging about the step.
     """
 
     step: Tensor
-    is_acceptable: Callable[[TensorDictBase], bool]
+    is_acceptable: Callable[[TensorDictBase, Tensor], bool]
     diagnostics: dict[str, Tensor]
 
 
@@ -67,13 +90,7 @@ class TRPOStep:
 
     Args:
         loss: the loss; a `TRPOLoss`, a `TRPOLagrangianLoss` or your own.
-        target_kl: radius δ of the trust region, mean KL over the states of the batch.
-        damping: multiple of the identity added to the Fisher matrix.
-        cg_iterations: iterations of the conjugate gradient method.
-        backtrack_coeff: factor between one try of the line search and the next.
-        max_backtracks: tries of the line search.
-        fisher_subsample: fraction of the batch that the Fisher matrix is averaged over.
-        actor_network: policy to step; by default ``loss.actor_network``.
+        target_kl: this and all others: see `TrustRegion`.
 
     Examples:
         >>> from tensordict import TensorDict
@@ -182,21 +199,23 @@ class TRPOStep:
     def _natural_step(
         self,
         losses: TensorDictBase,
-        fisher: FisherProduct,
+        metric: Callable[[Tensor], Tensor],
         objective: Callable[[TensorDictBase], Tensor],
     ) -> Proposal:
-        """The longest step along the natural gradient of an objective of the losses."""
+        """The longest step along the natural gradient of an objective, in a metric of vectors."""
         loss = objective(losses)
         gradient = flat_gradient(loss, self.parameters)
-        direction = self._solve(fisher, gradient)
+        direction = conjugate_gradient(metric, gradient, self.cg_iterations)
         # Conjugate gradients leave a residual orthogonal to the solution x, so that xᵀHx = xᵀg.
         squared = (gradient @ direction).clamp_min(0)
         length = torch.where(squared > 0, (2 * self.target_kl / squared).sqrt(), 0.0)
         before = loss.detach()
-        return Proposal(-length * direction, lambda after: bool(objective(after) <= before), {})
+        return Proposal(-length * direction, lambda after, kl: bool(objective(after) <= before), {})
 
-    def _solve(self, fisher: FisherProduct, vector: Tensor) -> Tensor:
-        return conjugate_gradient(fisher, vector, self.cg_iterations)
+    def _gradients(self, surrogates: Iterable[Tensor]) -> Tensor:
+        """Gradients of k scalars, of whose graph more is to be differentiated, [k, P]."""
+        rows = [flat_gradient(row, self.parameters, retain_graph=True) for row in surrogates]
+        return torch.stack(rows)
 
     @torch.no_grad()
     def _search(
@@ -209,7 +228,7 @@ class TRPOStep:
             if not tried["kl"] <= self.target_kl:
                 return False
             tried["losses"] = self.loss(batch)
-            return proposal.is_acceptable(tried["losses"])
+            return proposal.is_acceptable(tried["losses"], tried["kl"])
 
         max_tries = self.max_backtracks if proposal.step.any() else 0
         fraction = backtracking_search(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import inspect
 import os
 from collections.abc import Callable, Iterator, Mapping
 from itertools import chain
@@ -18,7 +17,7 @@ from safe_rl.evaluation.settings import check_device
 from safe_rl.extras import require_extra
 from safe_rl.naming import did_you_mean
 from safe_rl.runs.folder import RunFolder
-from safe_rl.targets import locate
+from safe_rl.targets import accepted_names, constructors, locate, takes_any
 
 __all__ = ["SettingError", "check_settings", "optional_keys", "plain"]
 
@@ -167,14 +166,13 @@ def _rows(found: Callable[..., Any]) -> Mapping[str, Key]:
 def _names(found: Callable[..., Any]) -> list[str] | None:
     """Arguments that a part takes; None if it takes any, or cannot be known."""
     try:
-        # the classes of some libraries' metaclasses show only what those take
-        takes = found.__init__ if inspect.isclass(found) else found
-        parameters = inspect.signature(takes).parameters.values()
-    except (TypeError, ValueError):
+        known = constructors(found)
+        ours = all(function.__module__.startswith("safe_rl.") for function in known)
+        # the package's constructors hand on all that they do not name, others may use it
+        last = known[-1] if ours else known[0]
+        return None if takes_any(last) else sorted(accepted_names(found))
+    except (AttributeError, TypeError, ValueError):
         return None
-    if any(parameter.kind is parameter.VAR_KEYWORD for parameter in parameters):
-        return None
-    return sorted(parameter.name for parameter in parameters)
 
 
 def _check(entry: _Entry) -> None:

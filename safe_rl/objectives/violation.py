@@ -7,7 +7,7 @@ from typing import Protocol
 import torch
 from torch import Tensor
 
-__all__ = ["Violations", "constraint_value", "violation_of"]
+__all__ = ["Violations", "constraint_value", "matched_violation", "violation_of"]
 
 
 class Violations(Protocol):
@@ -22,22 +22,37 @@ class Violations(Protocol):
     episode_length: Tensor
 
 
-def violation_of(violations: Violations, surrogates: Tensor) -> Tensor:
+def matched_violation(violation: Tensor | None, surrogates: Tensor) -> Tensor:
     """J_c − d in the type and on the device of the cost surrogates, [k].
 
     Before a batch has been observed it is NaN, which counts as 0: the policy is taken to be at
     its limits.
 
+    Args:
+        violation: J_c − d of every constraint, [k].
+        surrogates: cost surrogates, [k].
+
     Raises:
         ValueError: if there is not one violation per surrogate.
+
+    Examples:
+        >>> matched_violation(torch.tensor([-5.0, torch.nan]), surrogates=torch.zeros(2))
+        tensor([-5.,  0.])
     """
-    violation = violations.violation
-    if violation.shape != surrogates.shape:
+    found = None if violation is None else torch.as_tensor(violation)
+    if found is None or found.shape != surrogates.shape:
+        shape = "missing" if found is None else f"of shape {tuple(found.shape)}"
         raise ValueError(
-            f"There are {surrogates.numel()} cost surrogates but violations of shape "
-            f"{tuple(violation.shape)}: cost_advantage needs one column per cost limit."
+            f"There are {surrogates.numel()} cost surrogate(s), and violations are {shape}: a "
+            "constrained step needs cost_violation, one per cost surrogate, and cost_advantage "
+            "needs one column per cost limit."
         )
-    return violation.to(surrogates).nan_to_num(nan=0.0)
+    return found.to(surrogates).nan_to_num(nan=0.0)
+
+
+def violation_of(violations: Violations, surrogates: Tensor) -> Tensor:
+    """`matched_violation` of what a loss reads at every call, [k]."""
+    return matched_violation(violations.violation, surrogates)
 
 
 def constraint_value(
