@@ -23,6 +23,8 @@ class Constraints:
 
     Args:
         limits: Cost key -> d, undiscounted cost allowed per episode; empty without constraints.
+        max_length: Steps after which an episode is over: its length until one has finished; None
+            takes the length of the batch.
         multiplier: Weighs the costs against the return, or None.
         device: Of all tensors.
 
@@ -50,12 +52,14 @@ class Constraints:
         self,
         limits: Mapping[str, float],
         *,
+        max_length: int | None = None,
         multiplier: Multiplier | None = None,
         device: torch.device | str | None = None,
     ) -> None:
         self.keys = list(limits)
         self.limits = torch.tensor(list(limits.values()), dtype=torch.float32, device=device)
         self.multiplier = multiplier
+        self._max_length = max_length
         self.violation = torch.full_like(self.limits, torch.nan)
         self.episode_length = torch.full((), torch.nan, device=device)
         self._costs = torch.full_like(self.limits, torch.nan)
@@ -67,8 +71,9 @@ class Constraints:
     def observe(self, episodes: EpisodeStatistics, batch: TensorDictBase) -> None:
         """Take in what a batch says about episodes, and move the multiplier.
 
-        Costs and length are those of the last batch in which an episode finished. Before there is
-        one, the length is that of the batch and the cost what the cost rate would sum to in it.
+        The length is that of the episodes of the last batch in which one finished. The cost is
+        theirs too, if batches are as long; shorter ones are judged by the cost rate of their own
+        steps times that length, unless the measure is another than the mean.
 
         Args:
             episodes: Statistics of the batch.
@@ -77,17 +82,19 @@ class Constraints:
         if episodes.num_episodes:
             self._costs = episodes.mean_costs(self.keys).to(self._costs)
             self._mean_length = episodes.lengths.mean().to(self._mean_length)
-        if self._mean_length.isfinite():
-            costs, length = self._costs, self._mean_length
-        else:
-            length = torch.full_like(self._mean_length, float(batch.shape[-1]))
-            rates = [episodes.cost_rates[key].to(self._costs.device) for key in self.keys]
-            costs = (torch.stack(rates) * length).float() if rates else self._costs
+        costs, length = self._costs, self._mean_length
+        has_finished = bool(length.isfinite())
+        if not has_finished:
+            length = torch.full_like(length, float(self._max_length or batch.shape[-1]))
+        goes_by_rate = batch.shape[-1] < float(length)
+        if self.keys and (goes_by_rate or not has_finished):
+            rates = [batch["next", key].to(costs).mean() for key in self.keys]
+            costs = torch.stack(rates) * length
         # in place: compiled losses read the same tensors every time
         self.violation.copy_(costs - self.limits)
         self.episode_length.copy_(length)
-        if self.multiplier is not None and episodes.num_episodes:
-            self.multiplier.update(self._costs)
+        if self.multiplier is not None and (goes_by_rate or episodes.num_episodes):
+            self.multiplier.update(costs)
 
     def expect(self, metrics: Mapping[str, Tensor]) -> None:
         """Take in what a policy update reports, before the next batch shows what came of it."""

@@ -186,7 +186,7 @@ def _build_constraints(
             "risk: only the mean cost is limited by the episodes of a batch alone (limits=paper); "
             "other measures need limits=default."
         )
-    return Constraints(limits, multiplier=multiplier, device=device)
+    return Constraints(limits, max_length=max_length, multiplier=multiplier, device=device)
 
 
 def _names_a_part(node: DictConfig | None) -> bool:

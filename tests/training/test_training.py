@@ -133,8 +133,8 @@ def test_epochs_without_a_finished_episode(tmp_path):
     assert known == [False, False, True, False, True, False, False, True]
     assert table["episodes"] == [0, 0, 4, 0, 4, 0, 0, 4]
     multiplier = table["multiplier_cost"]
-    moved = [new != old for old, new in itertools.pairwise(multiplier)]
-    assert moved == known[1:]
+    # by the rate of the present steps, without waiting for the end of episodes
+    assert multiplier[0] != multiplier[1] != multiplier[2]
     assert not any(math.isnan(value) for value in table["cost_rate"])
 
 
@@ -205,12 +205,25 @@ def test_a_policy_update_from_outside_the_package(tmp_path):
     trainer = build_trainer(config, PointMass(config.num_envs, 100), directory)
     trainer.run()
     table = read_table(directory / "progress.csv")
-    assert table["policy_length"] == [40, 40, 100, 100, 100, 100, 100, 100]
+    assert table["policy_length"] == [100] * 8
     for key, limit in (("cost", 25), ("cost_north", 5)):
-        # until an episode has finished, the rate so far over the 40 steps of a batch
-        first = [40 * rate - limit for rate in table[f"{key}_rate"][:2]]
-        later = [table[f"episode_{key}"][i] - limit for i in (2, 2, 4, 4, 4, 7)]
-        assert table[f"policy_violation_{key}"] == pytest.approx([*first, *later], abs=1e-4)
+        # what an episode of 100 steps costs at the rate of the 160 steps of each batch
+        so_far = zip(table[f"{key}_rate"], table["steps"], strict=True)
+        sums = [0.0, *(rate * steps for rate, steps in so_far)]
+        rates = [(new - old) / 160 for old, new in itertools.pairwise(sums)]
+        expected = [100 * rate - limit for rate in rates]
+        assert table[f"policy_violation_{key}"] == pytest.approx(expected, abs=1e-3)
+
+
+def test_batches_of_whole_episodes_are_judged_by_those(tmp_path):
+    limits = "cost_limits={cost: 5}"
+    own = own_algorithm(tmp_path, OWN_UPDATE)
+    config = point_mass_config(*own, limits, "staggered_starts=null", minibatch_size=None)
+    trainer = build_trainer(config, PointMass(config.num_envs, 40), tmp_path / "run")
+    trainer.run()
+    table = read_table(tmp_path / "run" / "progress.csv")
+    expected = [cost - 5 for cost in table["episode_cost"]]
+    assert table["policy_violation_cost"] == pytest.approx(expected, rel=1e-6)
 
 
 def test_frames_are_rounded_up_to_whole_batches(tmp_path):
