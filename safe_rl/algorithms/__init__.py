@@ -5,9 +5,12 @@ from safe_rl.algorithms.contract import Algorithm, PolicyUpdate, Recipe
 from safe_rl.algorithms.cpo_step import CPOStep
 from safe_rl.algorithms.crpo_step import CRPOStep
 from safe_rl.algorithms.learning_rate import KLAdaptiveRate
+from safe_rl.algorithms.memory import Memory
 from safe_rl.algorithms.minibatch import MinibatchUpdate
+from safe_rl.algorithms.off_policy import OffPolicy
 from safe_rl.algorithms.on_policy import OnPolicy
 from safe_rl.algorithms.pcpo_step import PCPOStep
+from safe_rl.algorithms.replay_update import ReplayUpdate
 from safe_rl.algorithms.trust_region_step import TRPOStep
 
 __all__ = [
@@ -16,10 +19,13 @@ __all__ = [
     "CRPOStep",
     "Constraints",
     "KLAdaptiveRate",
+    "Memory",
     "MinibatchUpdate",
+    "OffPolicy",
     "OnPolicy",
     "PCPOStep",
     "PolicyUpdate",
     "Recipe",
+    "ReplayUpdate",
     "TRPOStep",
 ]

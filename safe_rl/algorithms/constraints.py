@@ -33,6 +33,7 @@ class Constraints:
         limits: d, [k].
         violation: J_c − d, [k], as of the last batch.
         episode_length: T̄, mean number of steps of an episode, scalar.
+        unit: Size of one cost, by which losses divide the costs that they weigh, [k].
 
     Examples:
         >>> from tensordict import TensorDict
@@ -62,6 +63,7 @@ class Constraints:
         self._max_length = max_length
         self.violation = torch.full_like(self.limits, torch.nan)
         self.episode_length = torch.full((), torch.nan, device=device)
+        self.unit = torch.ones_like(self.limits)
         self._costs = torch.full_like(self.limits, torch.nan)
         self._mean_length = torch.full((), torch.nan, device=device)
 
@@ -73,7 +75,7 @@ class Constraints:
 
         The length is that of the episodes of the last batch in which one finished. The cost is
         theirs too, if batches are as long; shorter ones are judged by the cost rate of their own
-        steps times that length, unless the measure is another than the mean.
+        steps times that length.
 
         Args:
             episodes: Statistics of the batch.

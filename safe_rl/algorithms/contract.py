@@ -37,6 +37,9 @@ class Algorithm(Protocol):
         policy: What explores, for the collector: it shares the networks' parameters.
         networks: What is trained, by name. Another run can start from them; those whose names
             begin with ``cost_`` are then taken over only if both runs constrain the same costs.
+
+    If checkpoints do not hold all that learning depends on, ``lost_on_resume`` is a sentence on
+    what a run that is resumed has lost.
     """
 
     @property

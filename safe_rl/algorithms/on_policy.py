@@ -13,11 +13,12 @@ from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModule, T
 from torch import nn
 from torchrl.envs import EnvBase
 
-from safe_rl.algorithms.constraints import Constraints, check_cost_limits
+from safe_rl.algorithms.building import build_constraints, constrained_limits
+from safe_rl.algorithms.constraints import Constraints
 from safe_rl.algorithms.contract import PolicyUpdate, Stateful
 from safe_rl.algorithms.minibatch import MinibatchUpdate
 from safe_rl.algorithms.parts import build_part
-from safe_rl.algorithms.tracked_constraints import CHARGES, TrackedConstraints
+from safe_rl.algorithms.tracked_constraints import CHARGES
 from safe_rl.collectors import EpisodeStatistics
 from safe_rl.models import input_scale_vector, make_actor, make_behaviour, make_critic
 from safe_rl.objectives import CriticLoss
@@ -63,10 +64,13 @@ class OnPolicy:
             ValueError: If a cost limit names a cost that the environment does not have, or a
                 constrained algorithm gets no limit.
         """
-        limits = _constrained_limits(config, env)
+        # without an estimator of cost advantages an algorithm has no constraints
+        limits = constrained_limits(
+            config, env, is_constrained=config.get("cost_advantage") is not None, otherwise="ppo"
+        )
         device = torch.device(config.device)
         networks = _build_networks(config.model, env, len(limits), device)
-        constraints = _build_constraints(config, limits, env.max_episode_steps, device)
+        constraints = build_constraints(config, limits, env.max_episode_steps, device)
         parts = {
             "actor_network": networks["actor"],
             "constraints": constraints,
@@ -152,45 +156,6 @@ class OnPolicy:
             "algorithm": self.constraints,
         }
         return {name: part for name, part in parts.items() if part is not None}
-
-
-def _constrained_limits(config: DictConfig, env: EnvBase) -> dict[str, float]:
-    """Limits of a constrained algorithm; without an estimator of cost advantages it has none."""
-    limits = check_cost_limits(config.cost_limits, env.cost_keys)
-    if config.get("cost_advantage") is None:
-        return {}
-    if not limits:
-        raise ValueError(
-            f"algo={config.algo.name} needs at least one entry in cost_limits, for example "
-            "cost_limits='{cost: 25}'. Without constraints use algo=ppo."
-        )
-    return limits
-
-
-def _build_constraints(
-    config: DictConfig, limits: dict[str, float], max_length: int, device: torch.device
-) -> Constraints:
-    multiplier = risk = None
-    if config.get("lagrangian") is not None:
-        multiplier = build_part(config.lagrangian, cost_limits=limits).to(device)
-    values = torch.tensor(list(limits.values()))
-    if limits and _names_a_part(config.get("risk")):
-        risk = build_part(config.risk, cost_limits=values)
-    if limits and _names_a_part(config.get("limits")):
-        tracker = build_part(config.limits, cost_limits=values, max_length=max_length)
-        return TrackedConstraints(
-            limits, tracker=tracker, multiplier=multiplier, risk=risk, device=device
-        )
-    if risk is not None:
-        raise ValueError(
-            "risk: only the mean cost is limited by the episodes of a batch alone (limits=paper); "
-            "other measures need limits=default."
-        )
-    return Constraints(limits, max_length=max_length, multiplier=multiplier, device=device)
-
-
-def _names_a_part(node: DictConfig | None) -> bool:
-    return node is not None and node.get("_target_") is not None
 
 
 def _build_networks(

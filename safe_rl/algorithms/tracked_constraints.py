@@ -73,6 +73,7 @@ class TrackedConstraints(Constraints):
         state = state.to(self.limits.device)
         self.violation.copy_(state.demand)
         self.episode_length.copy_(state.length)
+        self.unit.copy_(state.unit)
         self._row = self.column("estimate", state.cost) | self.column("target", state.target)
         if self._charges is not None:
             limit = self._charges.limit.to(state.cost)

@@ -106,6 +106,17 @@ KEYS = {
     "staggered_starts": Key(
         optional(boolean), "whether first episodes begin at different points", may_lack=True
     ),
+    "replay": Key(anything, "numbers that preset=default takes instead of its own", may_lack=True),
+    "memory": Key(component, "what is learned from, off policy", may_lack=True),
+    "actor": Key(component, "the policy's network, off policy", may_lack=True),
+    "critics": Key(_SECTION, "sizes of the ensembles of Q functions", may_lack=True),
+    "critics.rewards": Key(count(1, 1000), "Q functions of the reward", may_lack=True),
+    "critics.costs": Key(count(1, 1000), "Q functions of the costs", may_lack=True),
+    "exploration": Key(_SECTION, "how a memory is filled", may_lack=True),
+    "exploration.random_steps": Key(count(0), "steps taken at random first", may_lack=True),
+    "exploration.noise": Key(
+        _NOT_NEGATIVE, "standard deviation of a deterministic actor's noise", may_lack=True
+    ),
     "loss": Key(component, "the policy's loss", may_lack=True),
     "policy_update": Key(component, "what moves the policy", may_lack=True),
     "critic_update": Key(component, "what moves the critics", may_lack=True),
@@ -145,6 +156,27 @@ _LOSS = {
 _CLIPPED_LOSS = {
     **_LOSS,
     "clip_epsilon": Key(number(0, 1000, above=True), "half-width of the ratios that earn"),
+}
+_Q_FUNCTIONS = {
+    "gamma": Key(_SHARE, "discount per step"),
+    "loss_function": Key(choice("l2", "smooth_l1", "l1"), "of the TD errors"),
+}
+_SAC = {
+    **_Q_FUNCTIONS,
+    "alpha_init": Key(_STRENGTH, "first weight of the entropy"),
+    "target_entropy": Key(
+        Values(lambda v: v == "auto" or number().hold(v), f"auto, or {number().words}"),
+        "entropy to which its weight is adapted; auto: minus the number of actions",
+    ),
+    "fixed_alpha": Key(boolean, "whether the weight of the entropy stays as it is"),
+}
+_TD3 = {
+    **_Q_FUNCTIONS,
+    "policy_noise": Key(_NOT_NEGATIVE, "deviation of the noise on the target policy's actions"),
+    "noise_clip": Key(_NOT_NEGATIVE, "bound of that noise"),
+}
+_COST_CRITICS = {
+    "pessimism": Key(number(), "standard deviations among cost critics on top of their mean"),
 }
 _SAUTE = {
     "budgets": Key(mapping_of(number(0, above=True)), "cost per episode allowed by cost"),
@@ -190,6 +222,29 @@ PARTS = {
         **_CLIPPED_LOSS,
         "cost_clipping": Key(choice("none", "pessimistic", "joint"), "how cost surrogates are cut"),
     },
+    "SACLoss": _SAC,
+    "SACLagrangianLoss": {**_SAC, **_COST_CRITICS},
+    "TD3Loss": _TD3,
+    "TD3LagrangianLoss": {**_TD3, **_COST_CRITICS},
+    "Memory": {
+        "capacity": Key(count(), "transitions that are kept", bytes_each=50),
+        "batch_size": Key(count(), "transitions in a minibatch"),
+        "n_steps": Key(count(1, 1000), "steps that a transition spans"),
+        "storage": Key(choice("tensor", "memmap"), "where transitions are kept"),
+        "prioritised": Key(optional(mapping_of(_SHARE)), "{alpha: …, beta: …}; null: uniform"),
+        "keep": Key(boolean, "whether checkpoints hold the transitions"),
+    },
+    "ReplayUpdate": {
+        "optimizer": Key(component, "the optimiser"),
+        "updates_per_step": Key(_POSITIVE, "gradient steps per step of an environment"),
+        "tau": Key(number(0, 0.5, above=True), "share of the way that target networks go"),
+        "policy_delay": Key(count(1, 10_000), "steps of the critics per step of the policy"),
+        "rates": Key(optional(mapping_of(_POSITIVE)), "learning rates by name of parameters"),
+        "max_grad_norm": Key(optional(_POSITIVE), "norm to which the gradient is clipped"),
+        "compile": Key(boolean, "whether to compile the loss"),
+    },
+    "make_squashed_actor": {},
+    "make_bounded_actor": {},
     "TRPOLoss": _LOSS,
     "TRPOLagrangianLoss": _LOSS,
     "CPOLoss": _LOSS,

@@ -60,6 +60,8 @@ def prepare(config: DictConfig, directory: Path, continues: bool) -> Trainer | N
         print(f"Going on after {trainer.progress.steps:,} of {config.frames:,} frames.")
         if trainer.begins_anew:
             print("The state of its environments is not stored: they begin new episodes.")
+        if lost := getattr(trainer.algorithm, "lost_on_resume", ""):
+            print(lost)
         return trainer
     if continues and trainer.folder.files.num_rows:
         print("No checkpoint was written yet: starting over, with a new progress.csv.")

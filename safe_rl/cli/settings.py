@@ -22,7 +22,18 @@ from safe_rl.targets import accepted_names, constructors, locate, takes_any
 __all__ = ["SettingError", "check_settings", "optional_keys", "plain"]
 
 _MISSING = object()
-_SECTIONS = ("algo", "certificate", "checkpoint", "collector", "logger", "model")
+_SECTIONS = (
+    *(
+        "algo",
+        "certificate",
+        "checkpoint",
+        "collector",
+        "critics",
+        "exploration",
+        "logger",
+        "model",
+    ),
+)
 
 
 class SettingError(ValueError):

@@ -1,14 +1,26 @@
-"""Networks: actors, critics, and the fast policy that explores."""
+"""Networks: actors, critics, and the fast policies that explore."""
 
 from safe_rl.models.behaviour import BehaviourPolicy, make_behaviour
+from safe_rl.models.exploring import ExploringPolicy
 from safe_rl.models.networks import make_actor, make_critic
+from safe_rl.models.q_networks import (
+    EnsembleMLP,
+    QEnsemble,
+    make_bounded_actor,
+    make_squashed_actor,
+)
 from safe_rl.models.scaling import InputScale, input_scale_vector
 
 __all__ = [
     "BehaviourPolicy",
+    "EnsembleMLP",
+    "ExploringPolicy",
     "InputScale",
+    "QEnsemble",
     "input_scale_vector",
     "make_actor",
     "make_behaviour",
+    "make_bounded_actor",
     "make_critic",
+    "make_squashed_actor",
 ]

@@ -11,6 +11,8 @@ Everything here works on TensorDict keys alone and knows no environment:
   an optimiser;
 - `TRPOLoss`, `TRPOLagrangianLoss`, `CPOLoss`: policy losses for the steps of `safe_rl.algorithms`,
   whose mathematics is in `safe_rl.objectives.trust_region` and `safe_rl.objectives.cpo_dual`;
+- `SACLoss`, `SACLagrangianLoss`, `TD3Loss`, `TD3LagrangianLoss`: losses on steps from a replay
+  buffer;
 - `CriticLoss`: squared errors of the reward and the cost critic;
 - `ActorCriticLoss`, `JointAdvantages`: all losses and estimators as one, for TorchRL's trainers.
 """
@@ -31,7 +33,9 @@ from safe_rl.objectives.ppo import PPOLagrangianLoss, PPOLoss
 from safe_rl.objectives.projected import ProjectedMultiplier
 from safe_rl.objectives.rcpo import RCPOLoss
 from safe_rl.objectives.risk import Chance, CVaR, RiskMeasure
+from safe_rl.objectives.sac import SACLagrangianLoss, SACLoss
 from safe_rl.objectives.surrogate import SurrogateLoss
+from safe_rl.objectives.td3 import TD3LagrangianLoss, TD3Loss
 from safe_rl.objectives.trpo import TRPOLagrangianLoss, TRPOLoss
 
 __all__ = [
@@ -55,7 +59,11 @@ __all__ = [
     "ProjectedMultiplier",
     "RCPOLoss",
     "RiskMeasure",
+    "SACLagrangianLoss",
+    "SACLoss",
     "SurrogateLoss",
+    "TD3LagrangianLoss",
+    "TD3Loss",
     "TRPOLagrangianLoss",
     "TRPOLoss",
     "VectorGAE",

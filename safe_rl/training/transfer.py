@@ -67,7 +67,8 @@ def _constrained_costs(checkpoint: Path) -> list[str]:
     """Costs that the cost critic of a checkpoint's run is for; none if that is not known."""
     run = RunFolder(run_of(checkpoint)[0])
     config = read_config(run.config) if run.is_run else {}
-    return list(config.get("cost_limits", {})) if config.get("cost_advantage") else []
+    is_constrained = config.get("cost_advantage") or config.get("limits") is not None
+    return list(config.get("cost_limits", {})) if is_constrained else []
 
 
 def _check_sizes(

@@ -11,8 +11,9 @@ from omegaconf import OmegaConf
 from point_mass import PointMass
 from run_configs import CONF, compose_config
 
-from safe_rl.algorithms import OnPolicy
+from safe_rl.algorithms import OffPolicy, OnPolicy
 from safe_rl.algorithms.constraints import check_cost_limits
+from safe_rl.algorithms.parts import find_recipe
 from safe_rl.cli import train
 from safe_rl.envs import EXTRAS, SUITE, env_names, env_node, make_env, registration, store_configs
 
@@ -56,8 +57,8 @@ def test_every_combination_composes_and_resolves(env, algo, preset):
 @pytest.mark.parametrize(("algo", "preset"), COMBINATIONS)
 def test_every_combination_builds(algo, preset):
     config = compose_config("env=PointMass", f"algo={algo}", f"preset={preset}")
-    algorithm = OnPolicy.build(config, PointMass(2))
-    assert (algorithm.cost_critic is None) == (algorithm.cost_advantage is None)
+    algorithm = find_recipe(config).build(config, PointMass(2))
+    assert ("cost_critic" in algorithm.networks) == bool(algorithm.cost_keys)
     assert (algorithm.constraints.multiplier is not None) == (algo in LAGRANGIAN)
 
 
@@ -67,7 +68,7 @@ def test_multipliers_are_interchangeable(algo, multiplier):
     names = (f"algo={algo}", f"lagrangian={multiplier}")
     config = compose_config("env=PointMass", *names)
     assert config.lagrangian == OmegaConf.load(CONF / "lagrangian" / f"{multiplier}.yaml")
-    OnPolicy.build(config, PointMass(2))
+    find_recipe(config).build(config, PointMass(2))
 
 
 def test_every_environment_is_an_option_and_a_node_with_all_keys():
@@ -198,7 +199,7 @@ ASIDE |= {"certificate", "checkpoint", "default_cost_limits", "import", "paper",
 
 
 @pytest.mark.parametrize("env", SIZES)
-@pytest.mark.parametrize("algo", ALGORITHMS)
+@pytest.mark.parametrize("algo", PAPER)
 def test_the_paper_preset_is_the_paper(env, algo):
     config = compose_config("preset=paper", f"env={env}", f"algo={algo}")
     plain = OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
@@ -206,6 +207,15 @@ def test_the_paper_preset_is_the_paper(env, algo):
     found = {k: v for k, v in plain.items() if k not in ASIDE and v is not None}
     sizes = dict(zip(("frames", "num_envs", "frames_per_batch"), SIZES[env], strict=True))
     assert found == PAPER[algo] | sizes | {"loss": {**LOSSES[algo], "entropy_coeff": 0.0}}
+
+
+def test_the_paper_has_no_algorithm_that_learns_from_memory():
+    others = set(ALGORITHMS) - set(PAPER)
+    assert all(find_recipe(compose_config(f"algo={name}")) is OffPolicy for name in others)
+    # of what all share they have their own numbers unless it is the paper's setting
+    assert compose_config("algo=sac").frames_per_batch == 5_000
+    assert compose_config("algo=sac", "preset=paper").frames_per_batch == 30_000
+    assert compose_config("algo=ppo").frames_per_batch == 20_000
 
 
 def test_a_robot_of_ones_own_has_the_numbers_of_point():

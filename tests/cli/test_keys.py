@@ -13,9 +13,10 @@ from run_configs import CONF
 import safe_rl.algorithms
 import safe_rl.collectors
 import safe_rl.envs.transforms
+import safe_rl.models
 import safe_rl.objectives
 import safe_rl.runs.loggers
-from safe_rl.algorithms import OnPolicy
+from safe_rl.algorithms.parts import find_recipe
 from safe_rl.cli.keys import KEYS, PARTS
 from safe_rl.cli.settings import SettingError, check_settings, plain
 from safe_rl.cli.values import anything
@@ -25,12 +26,14 @@ from safe_rl.targets import TargetError, accepted_names
 ALGORITHMS = sorted(path.stem for path in (CONF / "algo").glob("*.yaml"))
 HOMES = (
     *(safe_rl.algorithms, safe_rl.collectors, safe_rl.envs.transforms, safe_rl.objectives),
-    safe_rl.runs.loggers,
+    *(safe_rl.models, safe_rl.runs.loggers),
 )
 # what recipes, collectors and run folders hand to a part themselves
 LIVE = {
     *("self", "loss", "actor_network", "multiplier", "value_network", "cost_keys", "cost_limits"),
-    *("constraints", "max_length"),
+    *("constraints", "max_length", "qvalue_network", "cost_qvalue_network", "action_spec"),
+    *("in_keys", "reward_keys", "observation_size", "low", "high", "hidden_sizes", "input_scale"),
+    *("in_key", "action_key"),
     *("env", "make_env", "policy", "frames_per_batch", "device", "log_dir", "kwargs"),
 }
 FREE = {path for path, row in KEYS.items() if row.values is anything}
@@ -75,7 +78,7 @@ def test_every_key_of_every_file_has_a_row(configs):
     targets = set()
     for config in configs.values():
         for path in leaves(plain(config)):
-            if path.endswith("_target_") or path.split(".")[0] in ("algo", "paper"):
+            if path.endswith("_target_") or path.split(".")[0] in ("algo", "paper", "replay"):
                 continue
             node, _, name = path.rpartition(".")
             target = OmegaConf.select(config, f"{node}._target_") if node else None
@@ -98,7 +101,7 @@ def outcome(config: Any, path: str, value: Any) -> str:
     except (SettingError, ConfigError, TargetError) as error:
         return str(error)
     try:
-        OnPolicy.build(changed, PointMass(2))
+        find_recipe(changed).build(changed, PointMass(2))
     except ValueError as error:  # what parts have to say about two keys together
         return " ".join(str(error).split())
     return ""
@@ -111,7 +114,7 @@ def keys_of(configs) -> Iterator[tuple[Any, str]]:
         values = plain(config)
         for path in leaves(values):
             part = OmegaConf.select(config, f"{path.rpartition('.')[0]}._target_")
-            if (path, part) not in seen and not path.startswith(("paper.", "algo._")):
+            if (path, part) not in seen and not path.startswith(("paper.", "replay.", "algo._")):
                 seen.add((path, part))
                 yield config, path
 

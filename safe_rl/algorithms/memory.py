@@ -1,0 +1,177 @@
+"""What an algorithm learns from: a replay buffer that is filled with batches [N, T] of a run."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
+
+import torch
+from tensordict import NestedKey, TensorDict, TensorDictBase
+from torchrl.data import (
+    LazyMemmapStorage,
+    LazyTensorStorage,
+    RandomSampler,
+    TensorDictReplayBuffer,
+)
+from torchrl.data.replay_buffers.samplers import PrioritizedSampler, Sampler
+from torchrl.envs import MultiStepTransform
+
+from safe_rl.algorithms.contract import Stateful
+
+__all__ = ["Memory"]
+
+_STORAGES = {"tensor": LazyTensorStorage, "memmap": LazyMemmapStorage}
+_MOST_AT_ONCE = 16_384
+"""Steps that are gathered at a time, to be cut into minibatches."""
+
+
+class Memory:
+    """A `TensorDictReplayBuffer` of single transitions, or of such that span n steps.
+
+    A transition over n steps holds the discounted sum of n rewards, and of n costs, and the n-th
+    observation after its own. Where the episode ends before, it ends there; ``terminated`` is that
+    of its last step. Time-outs are truncations, after which values go on.
+
+    Args:
+        capacity: Transitions that are kept; the oldest go first.
+        batch_size: Transitions in a minibatch.
+        in_keys: Entries of a step that are kept; what rewards and costs are is said by
+            ``reward_keys``.
+        reward_keys: Entries below ``next`` that are summed over n steps.
+        gamma: Discount per step of these sums.
+        n_steps: n.
+        storage: ``"tensor"`` keeps transitions in main memory, ``"memmap"`` in temporary files.
+        prioritised: Exponents ``alpha`` and ``beta`` of prioritised replay (Schaul et al. 2016,
+            sections 3.3 and 3.4), or None for uniform draws.
+        keep: Whether checkpoints hold the transitions, so that a run goes on exactly.
+        device: Device of the minibatches.
+
+    Raises:
+        ValueError: If there is no such storage, if priorities were to be kept, or if TorchRL was
+            installed without the compiled extension that they need.
+
+    Examples:
+        >>> memory = Memory(
+        ...     capacity=100, batch_size=4, in_keys=["observation", ("next", "reward")],
+        ...     reward_keys=["reward"], gamma=0.99, n_steps=1, storage="tensor", keep=True,
+        ... )
+        >>> step = {"reward": torch.ones(2, 5, 1), "done": torch.zeros(2, 5, 1, dtype=torch.bool)}
+        >>> batch = TensorDict(observation=torch.zeros(2, 5, 3), next=step, batch_size=[2, 5])
+        >>> memory.extend(batch)
+        >>> len(memory), [len(minibatch) for minibatch in memory.minibatches(3)]
+        (10, [4, 4, 4])
+    """
+
+    def __init__(
+        self,
+        *,
+        capacity: int,
+        batch_size: int,
+        in_keys: Sequence[NestedKey],
+        reward_keys: Sequence[NestedKey],
+        gamma: float,
+        n_steps: int,
+        storage: str,
+        prioritised: Mapping[str, float] | None = None,
+        keep: bool,
+        device: torch.device | str | None = None,
+    ) -> None:
+        if storage not in _STORAGES:
+            raise ValueError(f"storage={storage}: it must be one of {', '.join(_STORAGES)}.")
+        self.batch_size, self.keeps, self._capacity = batch_size, keep, capacity
+        self._in_keys, self._device = list(in_keys), torch.device(device or "cpu")
+        if prioritised is not None and keep:
+            raise ValueError("Priorities cannot be kept: set keep=false, or prioritised=null.")
+        self._is_prioritised = prioritised is not None
+        self._buffer = TensorDictReplayBuffer(
+            storage=_STORAGES[storage](
+                capacity, device=self._device if storage == "tensor" else torch.device("cpu")
+            ),
+            sampler=_sampler(capacity, prioritised),
+            priority_key="td_error",
+        )
+        self._multi_step: MultiStepTransform | None = None
+        if n_steps > 1:
+            # by default it leaves `terminated` that of the first step, and values would go on
+            # after an end that lies within the n steps
+            self._multi_step = MultiStepTransform(
+                n_steps, gamma, reward_keys=list(reward_keys), done_keys=[]
+            )
+            self._in_keys.append("steps_to_next_obs")
+
+    def __len__(self) -> int:
+        """Transitions that are there."""
+        return len(self._buffer)
+
+    def extend(self, batch: TensorDictBase) -> None:
+        """Take in the steps [N, T] that follow those of the last call."""
+        steps: TensorDictBase | None = batch
+        if self._multi_step is not None:
+            wanted = {("next", "done"), *self._in_keys} - {"steps_to_next_obs"}
+            steps = self._multi_step.inv(batch.select(*wanted))
+        if steps is None:  # fewer than n steps so far
+            return
+        self._buffer.extend(steps.select(*self._in_keys).reshape(-1))
+
+    def minibatches(self, number: int) -> Iterator[TensorDictBase]:
+        """Draw a number of minibatches.
+
+        Uniform draws for several of them are gathered together: that costs a tenth of the time.
+        """
+        at_once = 1 if self._is_prioritised else max(1, _MOST_AT_ONCE // self.batch_size)
+        for first in range(0, number, at_once):
+            count = min(at_once, number - first)
+            drawn = self._buffer.sample(count * self.batch_size).to(self._device)
+            yield from drawn.split(self.batch_size)
+
+    def learned(self, minibatch: TensorDictBase) -> None:
+        """Set the priorities of a minibatch by the TD errors that a loss has written into it."""
+        if self._is_prioritised:
+            self._buffer.update_tensordict_priority(minibatch)
+
+    def components(self) -> dict[str, Stateful]:
+        """What a checkpoint holds of it: itself, if it is to be kept."""
+        return {"memory": self} if self.keeps else {}
+
+    def state_dict(self) -> dict[str, Any]:
+        """The transitions, where the next one goes, and what the next n-step sums need."""
+        size = len(self)
+        state: dict[str, Any] = {"size": size, "writer": self._buffer.writer.state_dict()}
+        if size:
+            steps = self._buffer[:].exclude("index").flatten_keys("/")
+            # a file gets the whole of what a part of is saved
+            steps = steps if size == self._capacity else steps.clone()
+            state["steps"] = {key: v.as_subclass(torch.Tensor) for key, v in steps.items()}
+        tail = None if self._multi_step is None else self._multi_step._buffer
+        if tail is not None:
+            state["tail"] = tail.flatten_keys("/").to_dict()
+            state["tail_shape"] = list(tail.batch_size)
+        return state
+
+    def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
+        """Continue from :meth:`state_dict`."""
+        size = state_dict["size"]
+        self._buffer.empty()
+        if size:
+            steps = TensorDict(state_dict["steps"], batch_size=[size]).unflatten_keys("/")
+            self._buffer.extend(steps)
+        self._buffer.writer.load_state_dict(state_dict["writer"])
+        if self._multi_step is not None:
+            # the transform has no public way to its last steps
+            self._multi_step._buffer = None
+            if "tail" in state_dict:
+                tail = TensorDict(state_dict["tail"], batch_size=state_dict["tail_shape"])
+                self._multi_step._buffer = tail.unflatten_keys("/")
+
+
+def _sampler(capacity: int, prioritised: Mapping[str, float] | None) -> Sampler:
+    if prioritised is None:
+        return RandomSampler()
+    try:
+        return PrioritizedSampler(capacity, **prioritised)
+    except (RuntimeError, TypeError) as error:
+        raise ValueError(
+            f"prioritised={dict(prioritised)} needs an alpha and a beta, and TorchRL's compiled "
+            f"extension ({error}): set memory.prioritised=null, or install a torchrl that was "
+            "built for this torch."
+        ) from error

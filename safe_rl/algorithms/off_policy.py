@@ -1,0 +1,220 @@
+"""The off-policy recipe: what is collected goes into a memory, minibatches of which are learned."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import torch
+from omegaconf import DictConfig
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from torch import nn
+from torchrl.data import TensorSpec
+from torchrl.envs import EnvBase
+
+from safe_rl.algorithms.building import build_constraints, constrained_limits
+from safe_rl.algorithms.constraints import Constraints
+from safe_rl.algorithms.contract import Stateful
+from safe_rl.algorithms.memory import Memory
+from safe_rl.algorithms.parts import build_part
+from safe_rl.algorithms.replay_update import ReplayUpdate
+from safe_rl.collectors import EpisodeStatistics
+from safe_rl.models import ExploringPolicy, QEnsemble, input_scale_vector
+
+__all__ = ["OffPolicy"]
+
+
+@dataclass
+class OffPolicy:
+    """SAC, TD3 and their like: an algorithm, and the recipe that builds it.
+
+    Attributes:
+        policy: What explores, with the actor's parameters.
+        networks: Actor, critic and, with constraints, cost critic.
+        constraints: Costs, limits and multiplier. Multipliers go by the undiscounted costs of
+            episodes, not by what the discounted critics say.
+        memory: The transitions.
+        policy_update: Trains all networks on minibatches.
+        random_steps: Steps of environments that are taken at random in the beginning. Learning
+            begins when the memory holds as many.
+    """
+
+    policy: ExploringPolicy
+    networks: Mapping[str, nn.Module]
+    constraints: Constraints
+    memory: Memory
+    policy_update: ReplayUpdate
+    random_steps: int
+    _counts: dict[str, int] = field(default_factory=lambda: {"steps": 0})
+
+    def __post_init__(self) -> None:
+        self._count_steps(0)
+
+    @classmethod
+    def build(cls, config: DictConfig, env: EnvBase) -> OffPolicy:
+        """Build networks, memory, losses and updates.
+
+        Args:
+            config: Configuration as composed from ``conf/``.
+            env: Environment that keeps the contract of `safe_rl.envs`, with bounded actions.
+
+        Raises:
+            ValueError: If a cost limit names a cost that the environment does not have, a
+                constrained algorithm gets no limit, actions have no bounds, or a risk measure is
+                named.
+        """
+        limits = constrained_limits(
+            config, env, is_constrained=config.get("limits") is not None, otherwise="sac"
+        )
+        device = torch.device(config.device)
+        networks = _build_networks(config, env, len(limits), device)
+        constraints = build_constraints(config, limits, env.max_episode_steps, device)
+        if getattr(constraints, "risk", None) is not None:
+            raise ValueError(
+                f"risk: algo={config.algo.name} limits mean costs only, for what a risk measure "
+                "charges for a step depends on the episode: use an on-policy algorithm, or risk=mean."
+            )
+        loss = build_part(
+            config.loss,
+            actor_network=networks["actor"],
+            qvalue_network=networks["critic"],
+            cost_qvalue_network=networks.get("cost_critic"),
+            action_spec=_action_spec(env).to(device),
+            multiplier=constraints.multiplier,
+            cost_keys=constraints.keys,
+        )
+        memory = build_part(
+            config.memory,
+            in_keys=loss.in_keys,
+            reward_keys=["reward", *constraints.keys],
+            gamma=config.loss.gamma,
+            device=device,
+        )
+        exploration = config.exploration
+        return cls(
+            policy=_exploring(networks["actor"], env, exploration.noise),
+            networks=networks,
+            constraints=constraints,
+            memory=memory,
+            policy_update=build_part(config.policy_update, loss=loss),
+            random_steps=exploration.random_steps,
+        )
+
+    @classmethod
+    def build_policy(
+        cls, config: DictConfig, env: EnvBase, device: torch.device
+    ) -> tuple[TensorDictModuleBase, Mapping[str, nn.Module]]:
+        """Build what acts; the noise that explores with a deterministic actor is no part of it."""
+        actor = _build_networks(config, env, 0, device)["actor"]
+        return _exploring(actor, env, 0.0), {"actor": actor}
+
+    @property
+    def cost_keys(self) -> Sequence[str]:
+        """Keys of the constrained costs."""
+        return self.constraints.keys
+
+    @property
+    def lost_on_resume(self) -> str:
+        """What a checkpoint does not hold, in a sentence; nothing if it holds all."""
+        if self.memory.keeps:
+            return ""
+        return (
+            "The transitions in its memory are not stored, by memory.keep=false: learning goes on "
+            f"when it holds {self.random_steps:,} new ones, and differs from a run that was not "
+            "interrupted."
+        )
+
+    def learn(self, batch: TensorDictBase, episodes: EpisodeStatistics) -> dict[str, float]:
+        """Take in a batch [N, T], and learn as much as it allows from all that is remembered.
+
+        Args:
+            batch: Steps of the present policy, in order of time.
+            episodes: Its episodes.
+
+        Returns:
+            Everything that is worth a column of the log, by column name.
+        """
+        constraints = self.constraints
+        if constraints.keys:
+            constraints.observe(episodes, batch)
+            self.policy_update.loss.cost_unit.copy_(constraints.unit)
+        self.memory.extend(batch)
+        self._count_steps(batch.numel())
+        may_learn = len(self.memory) >= max(self.random_steps, self.memory.batch_size)
+        number = self.policy_update.due(batch.numel()) if may_learn else 0
+        row = constraints.columns()
+        for name, value in self.policy_update(self.memory, number).items():
+            row |= constraints.column(f"policy_{name}", value)
+        return row
+
+    def _count_steps(self, steps: int) -> None:
+        self._counts["steps"] += steps
+        self.policy.is_random.fill_(self._counts["steps"] < self.random_steps)
+
+    def state_dict(self) -> dict[str, Any]:
+        """Steps so far, and the constraints'."""
+        return {"counts": dict(self._counts), "constraints": self.constraints.state_dict()}
+
+    def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
+        """Continue from :meth:`state_dict`."""
+        self._counts.update(state_dict["counts"])
+        self._count_steps(0)
+        self.constraints.load_state_dict(state_dict["constraints"])
+
+    def checkpoint_components(self) -> dict[str, Stateful]:
+        """Parts with a ``state_dict``, by name; the memory only if it is to be kept."""
+        parts: dict[str, Stateful | None] = {
+            **self.networks,
+            "multiplier": self.constraints.multiplier,
+            "policy_update": self.policy_update,
+            "algorithm": self,
+            **self.memory.components(),
+        }
+        return {name: part for name, part in parts.items() if part is not None}
+
+
+def _action_spec(env: EnvBase) -> TensorSpec:
+    """Of one environment's action, [A]; it has bounds."""
+    spec = env.action_spec_unbatched
+    if not hasattr(spec, "low") or not (spec.low.isfinite() & spec.high.isfinite()).all():
+        raise ValueError(
+            "This algorithm's actions lie within bounds, and those of this environment have none: "
+            f"its action_spec is {type(spec).__name__}. Use algo=ppo_lagrangian, or bound them."
+        )
+    return spec
+
+
+def _exploring(actor: TensorDictModuleBase, env: EnvBase, noise: float) -> ExploringPolicy:
+    spec = _action_spec(env)
+    return ExploringPolicy(actor, spec.low, spec.high, noise=noise)
+
+
+def _build_networks(
+    config: DictConfig, env: EnvBase, num_costs: int, device: torch.device
+) -> dict[str, Any]:
+    """The actor, the reward critic and, for ``num_costs`` > 0, the cost critic."""
+    size = env.observation_spec["observation"].shape[-1]
+    model, spec = config.model, _action_spec(env)
+    common: dict[str, Any] = {
+        "hidden_sizes": list(model.hidden_sizes),
+        "input_scale": input_scale_vector(model.input_scale, env.observation_layout),
+        "device": device,
+    }
+    networks: dict[str, Any] = {
+        "actor": build_part(
+            config.actor, observation_size=size, low=spec.low, high=spec.high, **common
+        ),
+        "critic": QEnsemble(size, len(spec.low), num_networks=config.critics.rewards, **common),
+    }
+    if num_costs:
+        networks["cost_critic"] = QEnsemble(
+            size,
+            len(spec.low),
+            num_networks=config.critics.costs,
+            num_outputs=num_costs,
+            out_key="cost_state_action_value",
+            **common,
+        )
+    return networks

@@ -1,0 +1,158 @@
+"""Gradient updates on minibatches from a memory, with target networks that follow."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from itertools import chain
+from typing import Any
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor, nn
+from torch.optim import Optimizer
+from torchrl.objectives import LossModule, SoftUpdate
+
+from safe_rl.algorithms.memory import Memory
+
+__all__ = ["ReplayUpdate"]
+
+
+class ReplayUpdate:
+    """Minimise the sum of all ``loss_*`` on minibatches, and let target networks follow.
+
+    Args:
+        loss: Loss module with target parameters. For a ``policy_delay`` above 1 it has
+            ``critic_losses`` and ``actor_losses``, which together are what it returns.
+        optimizer: Function of the parameters that builds the optimiser, for example
+            ``functools.partial(torch.optim.Adam, lr=3e-4, fused=True)``.
+        updates_per_step: Gradient steps per step of an environment, the update-to-data ratio.
+        tau: Share τ of the way that target networks go to the networks after every step.
+        policy_delay: Steps of the critics per step of the policy, and of the targets.
+        rates: Learning rates of parameters whose names begin with a key, such as ``log_alpha``;
+            others have the optimiser's.
+        max_grad_norm: Norm to which the gradient is clipped, or None.
+        compile: Whether to compile the losses with :func:`torch.compile`.
+
+    Raises:
+        ValueError: If a key of ``rates`` is the beginning of no parameter's name.
+        FloatingPointError: By the call, if a loss is not finite, before the step that would follow.
+
+    Examples:
+        >>> import functools
+        >>> from safe_rl.models import QEnsemble, make_squashed_actor
+        >>> from safe_rl.objectives import SACLoss
+        >>> actor = make_squashed_actor(3, -torch.ones(2), torch.ones(2), hidden_sizes=[8])
+        >>> q = QEnsemble(3, 2, hidden_sizes=[8], num_networks=2)
+        >>> update = ReplayUpdate(
+        ...     SACLoss(actor, q, gamma=0.99, alpha_init=0.1, target_entropy=-2.0),
+        ...     optimizer=functools.partial(torch.optim.Adam, lr=1e-3),
+        ...     updates_per_step=1.0,
+        ...     tau=0.005,
+        ... )
+        >>> update.due(10), update.due(10)
+        (10, 10)
+    """
+
+    def __init__(
+        self,
+        loss: LossModule,
+        *,
+        optimizer: Callable[[Iterable[Any]], Optimizer],
+        updates_per_step: float,
+        tau: float,
+        policy_delay: int = 1,
+        rates: Mapping[str, float] | None = None,
+        max_grad_norm: float | None = None,
+        compile: bool = False,
+    ) -> None:
+        self.loss, self.policy_delay = loss, policy_delay
+        self.updates_per_step, self.max_grad_norm = updates_per_step, max_grad_norm
+        self.optimizer = optimizer(_groups(loss, rates or {}))
+        self._targets = SoftUpdate(loss, tau=tau)
+        self._evaluate: Callable[..., tuple[Tensor, TensorDictBase]]
+        self._evaluate = torch.compile(self._losses) if compile else self._losses
+        self._counts = {"updates": 0, "owed": 0.0}
+
+    def due(self, steps: int) -> int:
+        """Gradient steps that have become due with as many steps of environments."""
+        owed = self._counts["owed"] + steps * self.updates_per_step
+        self._counts["owed"] = owed - int(owed)
+        return int(owed)
+
+    def __call__(self, memory: Memory, number: int) -> dict[str, Tensor]:
+        """Take a number of gradient steps.
+
+        Returns:
+            The mean over the steps of everything that the loss reports and that is one number, NaN
+            if there was no step; and ``num_updates``.
+        """
+        sums = {name: torch.zeros(2) for name in self.loss.out_keys}
+        for minibatch in memory.minibatches(number):
+            with_actor = self._counts["updates"] % self.policy_delay == 0
+            total, losses = self._evaluate(minibatch, with_actor)
+            if not total.isfinite():
+                raise _divergence(losses)
+            self._step(total, with_actor)
+            memory.learned(minibatch)
+            for name, value in losses.items():
+                sums[name] += torch.stack([value.detach().mean(), value.new_ones(())]).cpu()
+        means = {name: total / count for name, (total, count) in sums.items()}
+        return means | {"num_updates": torch.tensor(float(number))}
+
+    def _losses(self, minibatch: TensorDictBase, with_actor: bool) -> tuple[Tensor, TensorDictBase]:
+        losses = self.loss(minibatch) if with_actor else self.loss.critic_losses(minibatch)
+        total = torch.stack([v for k, v in losses.items() if k.startswith("loss_")]).sum()
+        return total, losses
+
+    def _step(self, total: Tensor, with_actor: bool) -> None:
+        self.optimizer.zero_grad(set_to_none=True)
+        total.backward()
+        if self.max_grad_norm is not None:
+            nn.utils.clip_grad_norm_(self.loss.parameters(), self.max_grad_norm)
+        self.optimizer.step()
+        if with_actor:
+            self._targets.step()
+        self._counts["updates"] += 1
+
+    def _tensors(self) -> Iterator[tuple[str, Tensor]]:
+        return chain(self.loss.named_parameters(), self.loss.named_buffers())
+
+    def state_dict(self) -> dict[str, Any]:
+        """Optimiser, target networks and whatever else the loss holds."""
+        return {
+            "optimizer": self.optimizer.state_dict(),
+            "loss": {name: tensor.detach().clone() for name, tensor in self._tensors()},
+            "counts": dict(self._counts),
+        }
+
+    @torch.no_grad()
+    def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
+        """Continue from :meth:`state_dict`."""
+        self.optimizer.load_state_dict(state_dict["optimizer"])
+        for name, tensor in self._tensors():
+            tensor.copy_(state_dict["loss"][name])
+        self._counts.update(state_dict["counts"])
+
+
+def _groups(loss: LossModule, rates: Mapping[str, float]) -> list[dict[str, Any]]:
+    """Groups of parameters for an optimiser: one per rate, and the others."""
+    groups: dict[str, list[Tensor]] = {"": [], **{prefix: [] for prefix in rates}}
+    for name, parameter in loss.named_parameters():
+        if parameter.requires_grad:
+            groups[next((p for p in rates if name.startswith(p)), "")].append(parameter)
+    empty = [prefix for prefix in rates if not groups[prefix]]
+    if empty:
+        known = sorted({name.partition(".")[0] for name, _ in loss.named_parameters()})
+        raise ValueError(f"rates names '{empty[0]}', but the loss has only {', '.join(known)}.")
+    return [
+        {"params": group} | ({"lr": rates[prefix]} if prefix else {})
+        for prefix, group in groups.items()
+    ]
+
+
+def _divergence(losses: TensorDictBase) -> FloatingPointError:
+    wrong = [f"{k!r} is {v.item()}" for k, v in losses.items() if not v.isfinite().all()]
+    return FloatingPointError(
+        f"{' and '.join(wrong) or 'The sum of the losses is not finite'}: training has diverged. "
+        "The step that would follow is not taken. Lower the learning rate."
+    )

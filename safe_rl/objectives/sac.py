@@ -1,0 +1,228 @@
+"""Losses of the soft actor-critic (Haarnoja et al. 2018), without and with cost limits."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from tensordict import NestedKey, TensorDict, TensorDictBase
+from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModuleBase, dispatch
+from torch import Tensor
+from torchrl import objectives
+from torchrl.data import TensorSpec
+from torchrl.envs.utils import ExplorationType, set_exploration_type
+from torchrl.modules.distributions.utils import rsample_and_log_prob
+from torchrl.objectives import ValueEstimators
+
+from safe_rl.objectives.multipliers import Multiplier
+from safe_rl.objectives.q_functions import CostCritics, functional, is_ensemble, scalars
+
+__all__ = ["SACLagrangianLoss", "SACLoss"]
+
+
+class SACLoss(objectives.SACLoss):
+    """TorchRL's loss with an ensemble of Q functions that needs no vmap, in two halves.
+
+    `critic_losses` and `actor_losses` together are what a call returns, so that an update may take
+    the halves at different rates.
+
+    Args:
+        actor_network: policy with ``get_dist``.
+        qvalue_network: a `safe_rl.models.QEnsemble`, or what TorchRL takes, of which two are made.
+        gamma: discount per step.
+        alpha_init: first temperature α, the weight of the entropy.
+        target_entropy: of the policy, to which α is adapted; ``"auto"`` is minus the number of
+            actions.
+        fixed_alpha: whether α stays as it is.
+        loss_function: of the TD errors: ``"l2"``, ``"smooth_l1"`` or ``"l1"``.
+        action_spec: of one action [A]; needed for ``target_entropy="auto"``.
+
+    Examples:
+        >>> from safe_rl.models import QEnsemble, make_squashed_actor
+        >>> actor = make_squashed_actor(3, -torch.ones(2), torch.ones(2), hidden_sizes=[8])
+        >>> q = QEnsemble(3, 2, hidden_sizes=[8], num_networks=2)
+        >>> loss = SACLoss(actor, q, gamma=0.99, alpha_init=0.1, target_entropy=-2.0)
+        >>> steps = TensorDict(
+        ...     observation=torch.randn(4, 3),
+        ...     action=torch.rand(4, 2),
+        ...     next={
+        ...         "observation": torch.randn(4, 3),
+        ...         "reward": torch.randn(4, 1),
+        ...         "done": torch.zeros(4, 1, dtype=torch.bool),
+        ...         "terminated": torch.zeros(4, 1, dtype=torch.bool),
+        ...     },
+        ...     batch_size=[4],
+        ... )
+        >>> [key for key in loss(steps).keys() if key.startswith("loss_")]
+        ['loss_qvalue', 'loss_actor', 'loss_alpha']
+    """
+
+    def __init__(
+        self,
+        actor_network: ProbabilisticTensorDictSequential,
+        qvalue_network: TensorDictModuleBase,
+        *,
+        gamma: float,
+        alpha_init: float,
+        target_entropy: float | str = "auto",
+        fixed_alpha: bool = False,
+        loss_function: str = "l2",
+        action_spec: TensorSpec | None = None,
+    ) -> None:
+        super().__init__(
+            actor_network,
+            qvalue_network,
+            # an ensemble has its networks already
+            num_qvalue_nets=0 if is_ensemble(qvalue_network) else 2,
+            loss_function=loss_function,
+            alpha_init=alpha_init,
+            target_entropy=target_entropy,
+            fixed_alpha=fixed_alpha,
+            action_spec=action_spec,
+        )
+        self.gamma = gamma
+        self.make_value_estimator(ValueEstimators.TD0, gamma=gamma)
+        self.out_keys = ["loss_qvalue", "loss_actor", "loss_alpha", "alpha", "entropy"]
+
+    def _make_vmap(self) -> None:
+        if is_ensemble(self.qvalue_network):
+            self._vmap_qnetworkN0 = functional(self.qvalue_network)
+        else:
+            super()._make_vmap()
+
+    @dispatch
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Evaluate all losses on steps [...]; the TD error is written as their priority.
+
+        Returns:
+            TensorDict with `out_keys`, without batch dimension.
+        """
+        return self.critic_losses(tensordict).update(self.actor_losses(tensordict))
+
+    def critic_losses(self, tensordict: TensorDictBase) -> TensorDict:
+        """Losses of the Q functions."""
+        loss, metadata = self.qvalue_v2_loss(tensordict)
+        tensordict.set(self.tensor_keys.priority, metadata["td_error"])
+        return scalars(loss_qvalue=loss)
+
+    def actor_losses(self, tensordict: TensorDictBase) -> TensorDict:
+        """Losses of the policy and of the temperature, and what both come from."""
+        loss, metadata = self.actor_loss(tensordict)
+        log_prob = metadata.pop("log_prob")
+        weights = self._maybe_get_priority_weight(tensordict)
+        alpha = self._reduce_loss(self.alpha_loss(log_prob), tensordict=tensordict, weights=weights)
+        return scalars(
+            loss_actor=loss,
+            loss_alpha=alpha,
+            alpha=self._alpha,
+            entropy=-log_prob.mean(),
+            **metadata,
+        )
+
+
+class SACLagrangianLoss(SACLoss, CostCritics):
+    """SAC on the Lagrangian: min_π E[α log π − min Q_r + Σ_i w_i Q_i] / (1 + Σ_i w_i), w = λ / u.
+
+    Ha et al., *Learning to Walk in the Real World with Minimal Human Effort* (2020); there as here
+    costs have critics of their own. λ is moved by whoever knows the costs of episodes, which
+    discounted critics do not.
+
+    Args:
+        actor_network: policy with ``get_dist``.
+        qvalue_network: Q functions of the reward, see `SACLoss`.
+        cost_qvalue_network: a `safe_rl.models.QEnsemble` with one output per cost.
+        multiplier: λ; read at every call.
+        cost_keys: costs below ``next``, [..., 1] each.
+        gamma: discount per step, of reward and costs.
+        alpha_init: see `SACLoss`.
+        target_entropy: see `SACLoss`.
+        fixed_alpha: see `SACLoss`.
+        loss_function: see `SACLoss`.
+        pessimism: κ, standard deviations among the cost critics that are added to their mean.
+        action_spec: see `SACLoss`.
+
+    Raises:
+        ValueError: if the cost critic is no ensemble, or keys and multipliers differ in number.
+
+    Examples:
+        >>> from safe_rl.models import QEnsemble, make_squashed_actor
+        >>> from safe_rl.objectives import LagrangeMultiplier
+        >>> actor = make_squashed_actor(3, -torch.ones(2), torch.ones(2), hidden_sizes=[8])
+        >>> loss = SACLagrangianLoss(
+        ...     actor,
+        ...     QEnsemble(3, 2, hidden_sizes=[8], num_networks=2),
+        ...     QEnsemble(3, 2, hidden_sizes=[8], num_networks=1, out_key="cost_value"),
+        ...     multiplier=LagrangeMultiplier({"cost": 25.0}, init=1.0, lr=0.05),
+        ...     cost_keys=["cost"],
+        ...     gamma=0.99,
+        ...     alpha_init=0.1,
+        ...     target_entropy=-2.0,
+        ... )
+        >>> ("next", "cost") in loss.in_keys, "loss_cost_qvalue" in loss.out_keys
+        (True, True)
+    """
+
+    _in_keys: list[NestedKey]
+
+    def __init__(
+        self,
+        actor_network: ProbabilisticTensorDictSequential,
+        qvalue_network: TensorDictModuleBase,
+        cost_qvalue_network: TensorDictModuleBase,
+        *,
+        multiplier: Multiplier,
+        cost_keys: Sequence[NestedKey],
+        gamma: float,
+        alpha_init: float,
+        target_entropy: float | str = "auto",
+        fixed_alpha: bool = False,
+        loss_function: str = "l2",
+        pessimism: float = 0.0,
+        action_spec: TensorSpec | None = None,
+    ) -> None:
+        self.cost_keys = list(cost_keys)
+        SACLoss.__init__(
+            self,
+            actor_network,
+            qvalue_network,
+            gamma=gamma,
+            alpha_init=alpha_init,
+            target_entropy=target_entropy,
+            fixed_alpha=fixed_alpha,
+            loss_function=loss_function,
+            action_spec=action_spec,
+        )
+        self._add_cost_critics(cost_qvalue_network, multiplier, cost_keys, pessimism)
+        self.out_keys = [*self.out_keys, "loss_cost_qvalue", "cost_qvalue"]
+
+    def _set_in_keys(self) -> None:
+        super()._set_in_keys()
+        self._in_keys = [*self._in_keys, *(("next", key) for key in self.cost_keys)]
+
+    def critic_losses(self, tensordict: TensorDictBase) -> TensorDict:
+        """Losses of the Q functions of reward and costs."""
+        losses = super().critic_losses(tensordict)
+        with torch.no_grad():
+            next_action, _ = self._act(tensordict.get("next"))
+        return losses.set("loss_cost_qvalue", self.cost_qvalue_loss(tensordict, next_action))
+
+    def _act(self, steps: TensorDictBase) -> tuple[Tensor, Tensor]:
+        """Actions of the present policy, through which gradients pass, and log π."""
+        params = self.actor_network_params
+        with (
+            set_exploration_type(ExplorationType.RANDOM),
+            params.to_module(self.actor_network, preserve_module_state=False),
+        ):
+            return rsample_and_log_prob(self.actor_network.get_dist(steps))
+
+    def actor_loss(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
+        """Loss of the policy; TorchRL's does not tell the actions whose costs are needed."""
+        action, log_prob = self._act(tensordict)
+        inputs = tensordict.select(*self.qvalue_network.in_keys, strict=False)
+        inputs.set(self.tensor_keys.action, action)
+        values = self._vmap_qnetworkN0(inputs, self._cached_detached_qvalue_params)
+        lowest = values.get(self.tensor_keys.state_action_value).min(0).values.squeeze(-1)
+        objective, costs = self.penalised(self._alpha * log_prob - lowest, tensordict, action)
+        weights = self._maybe_get_priority_weight(tensordict)
+        loss = self._reduce_loss(objective, tensordict=tensordict, weights=weights)
+        return loss, {"log_prob": log_prob.detach(), "cost_qvalue": costs}

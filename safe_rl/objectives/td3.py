@@ -1,0 +1,199 @@
+"""Losses of TD3 (Fujimoto et al. 2018), without and with cost limits."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from tensordict import NestedKey, TensorDict, TensorDictBase
+from tensordict.nn import TensorDictModuleBase, dispatch
+from torch import Tensor
+from torchrl import objectives
+from torchrl.data import TensorSpec
+from torchrl.objectives import ValueEstimators
+
+from safe_rl.objectives.multipliers import Multiplier
+from safe_rl.objectives.q_functions import CostCritics, functional, is_ensemble, scalars
+
+__all__ = ["TD3LagrangianLoss", "TD3Loss"]
+
+
+class TD3Loss(objectives.TD3Loss):
+    """TorchRL's loss with an ensemble of Q functions that needs no vmap, in two halves.
+
+    Args:
+        actor_network: deterministic policy.
+        qvalue_network: a `safe_rl.models.QEnsemble`, or what TorchRL takes, of which two are made.
+        action_spec: of one action [A], bounded.
+        gamma: discount per step.
+        policy_noise: standard deviation of the noise on the target policy's actions.
+        noise_clip: bound of that noise.
+        loss_function: of the TD errors: ``"l2"``, ``"smooth_l1"`` or ``"l1"``.
+
+    Examples:
+        >>> from safe_rl.models import QEnsemble, make_bounded_actor
+        >>> from torchrl.data import Bounded
+        >>> actor = make_bounded_actor(3, -torch.ones(2), torch.ones(2), hidden_sizes=[8])
+        >>> q = QEnsemble(3, 2, hidden_sizes=[8], num_networks=2)
+        >>> settings = {"gamma": 0.99, "policy_noise": 0.2, "noise_clip": 0.5}
+        >>> TD3Loss(actor, q, action_spec=Bounded(-1, 1, [2]), **settings).out_keys
+        ['loss_qvalue', 'loss_actor', 'qvalue']
+    """
+
+    def __init__(
+        self,
+        actor_network: TensorDictModuleBase,
+        qvalue_network: TensorDictModuleBase,
+        *,
+        action_spec: TensorSpec,
+        gamma: float,
+        policy_noise: float,
+        noise_clip: float,
+        loss_function: str = "l2",
+    ) -> None:
+        joint = is_ensemble(qvalue_network)
+        super().__init__(
+            actor_network,
+            qvalue_network,
+            action_spec=action_spec,
+            num_qvalue_nets=0 if joint else 2,
+            policy_noise=policy_noise,
+            noise_clip=noise_clip,
+            loss_function=loss_function,
+        )
+        # copies of the steps that go into the Q functions: an ensemble needs none
+        self.num_qvalue_nets = 1 if joint else 2
+        self.gamma = gamma
+        self.make_value_estimator(ValueEstimators.TD0, gamma=gamma)
+        self.out_keys = ["loss_qvalue", "loss_actor", "qvalue"]
+
+    def _make_vmap(self) -> None:
+        super()._make_vmap()
+        if is_ensemble(self.qvalue_network):
+            values = functional(self.qvalue_network)
+            self._vmap_qvalue_network00 = lambda steps, params: values(steps[0], params)
+
+    @dispatch
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Evaluate both losses on steps [...]; the TD error is written as their priority.
+
+        Returns:
+            TensorDict with `out_keys`, without batch dimension.
+        """
+        return self.critic_losses(tensordict).update(self.actor_losses(tensordict))
+
+    def critic_losses(self, tensordict: TensorDictBase) -> TensorDict:
+        """Losses of the Q functions."""
+        loss, metadata = self.value_loss(tensordict)
+        tensordict.set(self.tensor_keys.priority, metadata["td_error"].detach().max(0).values)
+        return scalars(loss_qvalue=loss)
+
+    def actor_losses(self, tensordict: TensorDictBase) -> TensorDict:
+        """Loss of the policy, and the mean value of its actions."""
+        loss, metadata = self.actor_loss(tensordict)
+        values = metadata.pop("state_action_value_actor")
+        return scalars(loss_actor=loss, qvalue=values.mean(), **metadata)
+
+
+class TD3LagrangianLoss(TD3Loss, CostCritics):
+    """TD3 on the Lagrangian: max_π E[Q_1 − Σ_i λ_i Q_i / u_i] / (1 + Σ_i λ_i / u_i).
+
+    Args:
+        actor_network: see `TD3Loss`.
+        qvalue_network: Q functions of the reward, see `TD3Loss`.
+        cost_qvalue_network: a `safe_rl.models.QEnsemble` with one output per cost.
+        multiplier: λ; read at every call.
+        cost_keys: costs below ``next``, [..., 1] each.
+        action_spec: see `TD3Loss`.
+        gamma: discount per step, of reward and costs.
+        policy_noise: see `TD3Loss`.
+        noise_clip: see `TD3Loss`.
+        loss_function: see `TD3Loss`.
+        pessimism: κ, standard deviations among the cost critics that are added to their mean.
+
+    Raises:
+        ValueError: if the cost critic is no ensemble, or keys and multipliers differ in number.
+
+    Examples:
+        >>> from safe_rl.models import QEnsemble, make_bounded_actor
+        >>> from safe_rl.objectives import LagrangeMultiplier
+        >>> from torchrl.data import Bounded
+        >>> loss = TD3LagrangianLoss(
+        ...     make_bounded_actor(3, -torch.ones(2), torch.ones(2), hidden_sizes=[8]),
+        ...     QEnsemble(3, 2, hidden_sizes=[8], num_networks=2),
+        ...     QEnsemble(3, 2, hidden_sizes=[8], num_networks=1, out_key="cost_value"),
+        ...     multiplier=LagrangeMultiplier({"cost": 25.0}, init=1.0, lr=0.05),
+        ...     cost_keys=["cost"],
+        ...     action_spec=Bounded(-1, 1, [2]),
+        ...     gamma=0.99,
+        ...     policy_noise=0.2,
+        ...     noise_clip=0.5,
+        ... )
+        >>> loss.out_keys[-2:]
+        ['loss_cost_qvalue', 'cost_qvalue']
+    """
+
+    _in_keys: list[NestedKey]
+
+    def __init__(
+        self,
+        actor_network: TensorDictModuleBase,
+        qvalue_network: TensorDictModuleBase,
+        cost_qvalue_network: TensorDictModuleBase,
+        *,
+        multiplier: Multiplier,
+        cost_keys: Sequence[NestedKey],
+        action_spec: TensorSpec,
+        gamma: float,
+        policy_noise: float,
+        noise_clip: float,
+        loss_function: str = "l2",
+        pessimism: float = 0.0,
+    ) -> None:
+        self.cost_keys = list(cost_keys)
+        TD3Loss.__init__(
+            self,
+            actor_network,
+            qvalue_network,
+            action_spec=action_spec,
+            gamma=gamma,
+            policy_noise=policy_noise,
+            noise_clip=noise_clip,
+            loss_function=loss_function,
+        )
+        self._add_cost_critics(cost_qvalue_network, multiplier, cost_keys, pessimism)
+        self.out_keys = [*self.out_keys, "loss_cost_qvalue", "cost_qvalue"]
+
+    def _set_in_keys(self) -> None:
+        super()._set_in_keys()
+        self._in_keys = [*self._in_keys, *(("next", key) for key in self.cost_keys)]
+
+    def critic_losses(self, tensordict: TensorDictBase) -> TensorDict:
+        """Losses of the Q functions of reward and costs."""
+        losses = super().critic_losses(tensordict)
+        with torch.no_grad():
+            action = self._act(tensordict.get("next"), self.target_actor_network_params)
+            noise = (torch.randn_like(action) * self.policy_noise).clamp(
+                -self.noise_clip, self.noise_clip
+            )
+            action = (action + noise).clamp(self.min_action, self.max_action)
+        return losses.set("loss_cost_qvalue", self.cost_qvalue_loss(tensordict, action))
+
+    def _act(self, steps: TensorDictBase, params: TensorDictBase) -> Tensor:
+        inputs = steps.select(*self.actor_network.in_keys, strict=False)
+        with params.to_module(self.actor_network, preserve_module_state=False):
+            return self.actor_network(inputs).get(self.tensor_keys.action)
+
+    def actor_loss(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
+        """Loss of the policy; TorchRL's does not tell the actions whose costs are needed."""
+        action = self._act(tensordict, self.actor_network_params)
+        inputs = tensordict.select(*self.qvalue_network.in_keys, strict=False)
+        inputs = inputs.set(self.tensor_keys.action, action)
+        inputs = inputs.expand(self.num_qvalue_nets, *tensordict.batch_size)
+        params = self._cached_detach_qvalue_network_params
+        values = self._vmap_qvalue_network00(inputs, params)
+        values = values.get(self.tensor_keys.state_action_value).squeeze(-1)
+        objective, costs = self.penalised(-values[0], tensordict, action)
+        weights = self._maybe_get_priority_weight(tensordict)
+        loss = self._reduce_loss(objective, tensordict=tensordict, weights=weights)
+        return loss, {"state_action_value_actor": values.detach(), "cost_qvalue": costs}

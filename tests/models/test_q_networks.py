@@ -1,0 +1,108 @@
+"""Ensembles in batched products against single perceptrons; actors and explorers within bounds."""
+
+import pytest
+import torch
+from tensordict import TensorDict
+from torch.func import functional_call
+from torchrl.envs.utils import ExplorationType, set_exploration_type
+from torchrl.modules import MLP
+
+from safe_rl.models import (
+    EnsembleMLP,
+    ExploringPolicy,
+    QEnsemble,
+    make_actor,
+    make_bounded_actor,
+    make_squashed_actor,
+)
+
+LOW, HIGH = torch.tensor([-1.0, -3.0]), torch.tensor([1.0, 5.0])
+
+
+def observations(*shape):
+    return TensorDict(observation=torch.randn(*shape, 5), batch_size=shape)
+
+
+def test_an_ensemble_is_as_many_perceptrons():
+    ensemble = EnsembleMLP(3, [5, 16, 8, 2])
+    inputs = torch.randn(4, 7, 5)
+    values = ensemble(inputs)
+    assert values.shape == (3, 4, 7, 2)
+    single = MLP(5, 2, num_cells=[16, 8], activation_class=torch.nn.ReLU)
+    for number in range(3):
+        weights = {}
+        for layer, (weight, bias) in enumerate(zip(ensemble.weights, ensemble.biases, strict=True)):
+            weights[f"{2 * layer}.weight"] = weight[number].T
+            weights[f"{2 * layer}.bias"] = bias[number, 0]
+        torch.testing.assert_close(values[number], functional_call(single, weights, inputs))
+
+
+def test_its_weights_begin_like_those_of_torch():
+    weight = EnsembleMLP(20, [300, 400]).weights[0]
+    reference = torch.nn.Linear(300, 400).weight
+    assert weight.std().item() == pytest.approx(reference.std().item(), rel=0.02)
+    assert weight.abs().max() <= reference.abs().max() * 1.001
+    assert not torch.equal(weight[0], weight[1])
+
+
+def test_q_functions_see_scaled_observations_and_the_action():
+    scale = torch.tensor([1.0, 0.1, 1.0, 1.0, 1.0])
+    q = QEnsemble(5, 2, hidden_sizes=[8], num_networks=2, num_outputs=3, input_scale=scale)
+    steps = observations(4).set("action", torch.rand(4, 2))
+    values = q(steps)
+    assert values.batch_size == (2, 4)
+    expected = q.network(torch.cat([steps["observation"] * scale, steps["action"]], -1))
+    assert torch.equal(values["state_action_value"], expected)
+    assert "state_action_value" not in steps.keys()  # noqa: SIM118
+
+
+@pytest.mark.parametrize("make", [make_squashed_actor, make_bounded_actor])
+def test_without_noise_an_explorer_acts_like_its_actor(make):
+    actor = make(5, LOW, HIGH, hidden_sizes=[8])
+    explorer, batch = ExploringPolicy(actor, LOW, HIGH, noise=0.5), observations(64)
+    with set_exploration_type(ExplorationType.DETERMINISTIC):
+        expected, found = actor(batch.clone())["action"], explorer(batch.clone())["action"]
+    torch.testing.assert_close(found, expected)
+    assert ((found > LOW) & (found < HIGH)).all()
+
+
+def test_it_samples_the_distribution_of_a_squashed_actor():
+    actor = make_squashed_actor(5, LOW, HIGH, hidden_sizes=[8])
+    batch = observations(1).expand(20_000).clone()
+    with torch.no_grad():
+        found = ExploringPolicy(actor, LOW, HIGH)(batch.clone())["action"]
+        expected = actor.get_dist(batch).sample()
+    quantiles = torch.linspace(0.05, 0.95, 7)
+    spread = HIGH - LOW
+    for column in range(2):
+        ours, theirs = (a[:, column].quantile(quantiles) for a in (found, expected))
+        torch.testing.assert_close(ours, theirs, atol=0.02 * spread[column].item(), rtol=0)
+
+
+def test_it_adds_noise_to_a_deterministic_actor_within_bounds():
+    actor = make_bounded_actor(5, LOW, HIGH, hidden_sizes=[8])
+    batch = observations(1).expand(20_000).clone()
+    with torch.no_grad():
+        own = actor(batch.clone())["action"][0]
+        found = ExploringPolicy(actor, LOW, HIGH, noise=0.1)(batch)["action"]
+    torch.testing.assert_close(found.std(0), torch.tensor([0.1, 0.4]), rtol=0.05, atol=0)
+    torch.testing.assert_close(found.mean(0), own, rtol=0, atol=0.02)
+    with torch.no_grad():
+        wild = ExploringPolicy(actor, LOW, HIGH, noise=10.0)(batch)["action"]
+    assert ((wild >= LOW) & (wild <= HIGH)).all()
+
+
+def test_it_begins_at_random_but_is_never_evaluated_so():
+    actor = make_squashed_actor(5, LOW, HIGH, hidden_sizes=[8])
+    explorer, batch = ExploringPolicy(actor, LOW, HIGH), observations(20_000)
+    explorer.is_random.fill_(True)
+    found = explorer(batch)["action"]
+    torch.testing.assert_close(found.mean(0), (LOW + HIGH) / 2, atol=0.05, rtol=0)
+    torch.testing.assert_close(found.var(0), (HIGH - LOW).square() / 12, rtol=0.05, atol=0)
+    with set_exploration_type(ExplorationType.DETERMINISTIC):
+        torch.testing.assert_close(explorer(batch)["action"], actor(batch)["action"])
+
+
+def test_actors_of_another_kind_are_refused():
+    with pytest.raises(TypeError, match="TanhNormal, got 2 modules and IndependentNormal"):
+        ExploringPolicy(make_actor(5, 2, hidden_sizes=[8], initial_log_std=0.0), LOW, HIGH)

@@ -1,0 +1,198 @@
+"""Losses on Q functions against TorchRL's own, against formulas written out, and finite limits."""
+
+import pytest
+import torch
+from tensordict import TensorDict
+from torch import nn
+from torchrl import objectives
+from torchrl.data import Bounded
+from torchrl.modules import MLP, ValueOperator
+from torchrl.objectives import ValueEstimators
+
+from safe_rl.models import QEnsemble, make_bounded_actor, make_squashed_actor
+from safe_rl.objectives import (
+    LagrangeMultiplier,
+    SACLagrangianLoss,
+    SACLoss,
+    TD3LagrangianLoss,
+    TD3Loss,
+)
+
+BOUNDS = -torch.ones(2), torch.ones(2)
+SPEC = Bounded(-1, 1, [2])
+COSTS = ["cost", "cost_other"]
+SAC = {"gamma": 0.9, "alpha_init": 0.2, "action_spec": SPEC}
+TD3 = {"gamma": 0.9, "policy_noise": 0.2, "noise_clip": 0.5, "action_spec": SPEC}
+
+
+def make_steps(size=6, terminated=False):
+    flags = torch.full((size, 1), terminated)
+    following = {
+        "observation": torch.randn(size, 3), "reward": torch.randn(size, 1),
+        "done": flags, "terminated": flags,
+        **{key: torch.rand(size, 1) for key in COSTS},
+    }  # fmt: skip
+    return TensorDict(
+        observation=torch.randn(size, 3), action=torch.rand(size, 2), next=following,
+        batch_size=[size],
+    )  # fmt: skip
+
+
+def make_q(networks=2, **keys):
+    return QEnsemble(3, 2, hidden_sizes=[8], num_networks=networks, **keys)
+
+
+def make_loss(kind, multiplier=None, networks=2, **keys):
+    make_own, settings, plain, constrained = {
+        "sac": (make_squashed_actor, SAC, SACLoss, SACLagrangianLoss),
+        "td3": (make_bounded_actor, TD3, TD3Loss, TD3LagrangianLoss),
+    }[kind]
+    actor = make_own(3, *BOUNDS, hidden_sizes=[8])
+    if multiplier is None:
+        return plain(actor, make_q(), **settings, **keys)
+    cost_q = make_q(networks, num_outputs=2, out_key="cost_value")
+    return constrained(
+        actor, make_q(), cost_q, multiplier=multiplier, cost_keys=COSTS, **settings, **keys
+    )
+
+
+def lagrange(*values):
+    return LagrangeMultiplier(dict(zip(COSTS, (25.0, 10.0), strict=True)), init=values, lr=0.05)
+
+
+def as_stock(loss, kind):
+    """TorchRL's own loss, with vmap, on the same weights."""
+    actor = loss.actor_network
+    module = nn.Module()
+    module.mlp = MLP(5, 1, num_cells=[8], activation_class=nn.ReLU)
+    module.forward = lambda observation, action: module.mlp(torch.cat([observation, action], -1))
+    critics = ValueOperator(module, in_keys=["observation", "action"])
+    shared = {"loss_function": "l2", "action_spec": SPEC}
+    if kind == "sac":
+        stock = objectives.SACLoss(actor, critics, alpha_init=0.2, **shared)
+    else:
+        stock = objectives.TD3Loss(actor, critics, policy_noise=0.2, noise_clip=0.5, **shared)
+    stock.make_value_estimator(ValueEstimators.TD0, gamma=0.9)
+    for ours, theirs in (
+        (loss.qvalue_network_params, stock.qvalue_network_params),
+        (loss.target_qvalue_network_params, stock.target_qvalue_network_params),
+    ):
+        for layer in range(2):
+            place = ("module", "mlp", str(2 * layer))
+            weight = ours["network", "weights", str(layer)].data.transpose(1, 2)
+            theirs[(*place, "weight")].data.copy_(weight)
+            theirs[(*place, "bias")].data.copy_(ours["network", "biases", str(layer)].data[:, 0])
+    return stock
+
+
+@pytest.mark.parametrize("kind", ["sac", "td3"])
+def test_an_ensemble_gives_what_torchrl_gives(kind):
+    loss, steps = make_loss(kind), make_steps()
+    stock = as_stock(loss, kind)
+    gradients = []
+    for module in (loss, stock):
+        found = {}
+        for half in ("critic", "actor"):
+            torch.manual_seed(1)
+            if module is loss:
+                entries = getattr(loss, f"{half}_losses")(steps.clone())
+            elif kind == "td3" and half == "critic":
+                entries = {"loss_qvalue": stock.value_loss(steps.clone())[0]}
+            elif half == "critic":
+                entries = {"loss_qvalue": stock.qvalue_v2_loss(steps.clone())[0]}
+            else:
+                entries = {"loss_actor": stock.actor_loss(steps.clone())[0]}
+            found |= {k: v for k, v in entries.items() if k in ("loss_qvalue", "loss_actor")}
+        parameters = list(module.actor_network_params.values(True, True))
+        parameters = [p for p in parameters if p.requires_grad]
+        found["gradient"] = torch.cat(
+            [g.flatten() for g in torch.autograd.grad(found["loss_actor"], parameters)]
+        )
+        gradients.append(found)
+    for name, value in gradients[0].items():
+        torch.testing.assert_close(value, gradients[1][name])
+
+
+@pytest.mark.parametrize("kind", ["sac", "td3"])
+def test_without_weight_on_costs_the_policy_learns_as_without_them(kind):
+    loss, steps = make_loss(kind, lagrange(1e-30, 1e-30)), make_steps()
+    torch.manual_seed(1)
+    constrained = loss.actor_losses(steps)["loss_actor"]
+    torch.manual_seed(1)
+    base = {"sac": objectives.SACLoss, "td3": objectives.TD3Loss}[kind]
+    torch.testing.assert_close(constrained, base.actor_loss(loss, steps)[0])
+
+
+@pytest.mark.parametrize("kind", ["sac", "td3"])
+def test_costs_are_weighed_by_their_multipliers_in_units_of_one_cost(kind):
+    loss, steps = make_loss(kind, lagrange(2.0, 3.0), pessimism=0.5), make_steps()
+    loss.cost_unit.copy_(torch.tensor([1.0, 0.5]))
+    torch.manual_seed(1)
+    found = loss.actor_losses(steps)
+    base = {"sac": objectives.SACLoss, "td3": objectives.TD3Loss}[kind]
+    torch.manual_seed(1)
+    reward = base.actor_loss(loss, steps)[0]
+    torch.manual_seed(1)
+    if kind == "sac":
+        action = loss.actor_network.get_dist(steps).rsample()
+    else:
+        action = loss.actor_network(steps.clone())["action"]
+    values = loss.cost_qvalue_network(steps.clone().set("action", action))["cost_value"]
+    spread = (values - values.mean(0)).square().mean(0).sqrt()
+    penalty = ((values.mean(0) + 0.5 * spread) * torch.tensor([2.0, 6.0])).sum(-1).mean()
+    torch.testing.assert_close(found["loss_actor"], (reward + penalty) / 9)
+    torch.testing.assert_close(found["cost_qvalue"], values.mean((0, 1)))
+
+
+@pytest.mark.parametrize("kind", ["sac", "td3"])
+def test_costs_are_learned_with_targets_of_their_own_networks(kind):
+    loss, steps = make_loss(kind, lagrange(1.0, 1.0)), make_steps()
+    action = torch.rand(6, 2)
+    found = loss.cost_qvalue_loss(steps, action)
+    network = loss.cost_qvalue_network
+    following = network(steps["next"].clone().set("action", action))["cost_value"]
+    costs = torch.cat([steps["next", key] for key in COSTS], -1)
+    error = network(steps)["cost_value"] - (costs + 0.9 * following)
+    torch.testing.assert_close(found, error.square().sum((0, 2)).mean())
+
+
+@pytest.mark.parametrize("kind", ["sac", "td3"])
+def test_nothing_follows_an_end_but_something_a_time_out(kind):
+    """Moving the target networks moves the losses of all steps but terminated ones."""
+    for terminated in (True, False):
+        loss, steps = make_loss(kind, lagrange(1.0, 1.0)), make_steps(terminated=terminated)
+        steps["next", "done"] = torch.ones(6, 1, dtype=torch.bool)
+        losses = []
+        for _ in range(2):
+            torch.manual_seed(1)
+            losses.append(loss.critic_losses(steps.clone()))
+            for params in (
+                loss.target_qvalue_network_params,
+                loss.target_cost_qvalue_network_params,
+            ):
+                for value in params.values(True, True):
+                    value.data.add_(0.3)
+        for name in ("loss_qvalue", "loss_cost_qvalue"):
+            assert torch.equal(losses[0][name], losses[1][name]) is terminated
+
+
+def test_a_transition_over_steps_is_discounted_by_as_many():
+    loss, steps = make_loss("sac", lagrange(1.0, 1.0)), make_steps()
+    steps["steps_to_next_obs"] = torch.tensor([1, 2, 3, 1, 2, 3])
+    found = loss.cost_qvalue_loss(steps, steps["action"])
+    network = loss.cost_qvalue_network
+    following = network(steps["next"].clone().set("action", steps["action"]))["cost_value"]
+    costs = torch.cat([steps["next", key] for key in COSTS], -1)
+    discounts = torch.tensor([0.9, 0.81, 0.729] * 2).unsqueeze(-1)
+    error = network(steps)["cost_value"] - (costs + discounts * following)
+    torch.testing.assert_close(found, error.square().sum((0, 2)).mean())
+
+
+def test_what_does_not_fit_is_refused():
+    critic = ValueOperator(nn.Linear(3, 1), in_keys=["observation"])
+    actor = make_squashed_actor(3, *BOUNDS, hidden_sizes=[8])
+    keys = {"multiplier": lagrange(1.0, 1.0), **SAC}
+    with pytest.raises(ValueError, match="QEnsemble with one output per cost, not a ValueOp"):
+        SACLagrangianLoss(actor, make_q(), critic, cost_keys=COSTS, **keys)
+    with pytest.raises(ValueError, match="1 cost_keys but 2 multipliers"):
+        SACLagrangianLoss(actor, make_q(), make_q(num_outputs=2), cost_keys=["cost"], **keys)

@@ -1,0 +1,193 @@
+"""Runs that learn from memory: they learn, resume, start from one another and are evaluated."""
+
+import pytest
+import torch
+from point_mass import PointMass
+from run_configs import compose_config, without_times
+from torchrl.data import Unbounded
+from torchrl.envs.utils import ExplorationType, set_exploration_type
+
+from safe_rl.algorithms import OffPolicy
+from safe_rl.evaluation.episodes import collect_episodes
+from safe_rl.evaluation.loading import find_checkpoint, load_config, load_policy
+from safe_rl.runs.table import read_table
+from safe_rl.training.trainer import build_trainer, seed_everything
+from safe_rl.training.transfer import initialise_networks
+
+NAMES = ["sac", "sac_lagrangian", "td3", "td3_lagrangian"]
+
+
+def off_policy_config(*overrides):
+    """8 epochs of 4 x 40 steps, 8 gradient steps each after a random one."""
+    return compose_config(
+        *("env=PointMass", "frames=1280", "num_envs=4", "frames_per_batch=160", "logger=none"),
+        *("model.hidden_sizes=[16]", "memory.batch_size=32", "exploration.random_steps=160"),
+        *("policy_update.updates_per_step=0.05", "memory.keep=true"),
+        *overrides,
+    )
+
+
+@pytest.fixture
+def make_trainer(tmp_path):
+    def make(name, *overrides):
+        config = off_policy_config(*overrides)
+        seed_everything(config.seed, None)
+        env = PointMass(config.num_envs, 20, config.seed)
+        return build_trainer(config, env, tmp_path / name)
+
+    return make
+
+
+@pytest.mark.parametrize("algo", NAMES)
+def test_it_writes_a_run(algo, make_trainer, tmp_path):
+    line = make_trainer("run", f"algo={algo}", "frames=480", "exploration.random_steps=320").run()
+    table = read_table(tmp_path / "run" / "progress.csv")
+    assert table["policy_num_updates"] == [0, 8, 8]
+    assert table["policy_loss_qvalue"][0] != table["policy_loss_qvalue"][0]
+    assert all(value == value for value in table["policy_loss_qvalue"][1:])
+    assert ("multiplier_cost" in table) == algo.endswith("lagrangian")
+    assert "J_c" in line
+
+
+@pytest.mark.parametrize(
+    "overrides",
+    [
+        ["algo=sac_lagrangian"],
+        ["algo=td3_lagrangian", "memory.n_steps=3", "lagrangian=adam"],
+        [
+            "algo=sac_lagrangian",
+            "memory.storage=memmap",
+            "memory.capacity=300",
+            "limits/replay@limits=paper",
+        ],
+        ["algo=sac_lagrangian", "cost_limits={cost_hazards: 1, cost_north: 2}", "lagrangian=pid"],
+    ],
+)
+def test_it_goes_on_with_its_memory_as_if_it_had_never_stopped(overrides, make_trainer, tmp_path):
+    make_trainer("whole", *overrides).run()
+    half = [] if "limits/replay@limits=paper" in overrides else ["limits.frames=1280"]
+    make_trainer("halves", "frames=640", *half, *overrides).run()
+    torch.rand(7)
+    resumed = make_trainer("halves", *overrides)
+    assert resumed.resume()
+    assert resumed.algorithm.lost_on_resume == ""
+    resumed.run()
+    table, expected = (without_times(tmp_path / n / "progress.csv") for n in ("halves", "whole"))
+    assert len(expected) == 9
+    assert table == expected
+
+
+def test_without_its_memory_it_says_so_and_fills_it_anew(make_trainer, tmp_path):
+    forgetful = ["algo=sac_lagrangian", "memory.keep=false"]
+    make_trainer("run", *forgetful, "frames=640", "exploration.random_steps=200").run()
+    resumed = make_trainer("run", *forgetful, "exploration.random_steps=200")
+    assert resumed.resume()
+    assert "memory.keep=false" in resumed.algorithm.lost_on_resume
+    assert "200" in resumed.algorithm.lost_on_resume
+    # it acts as it has learned at once, but learns when there is enough to learn from
+    assert not resumed.algorithm.policy.is_random
+    resumed.run()
+    table = read_table(tmp_path / "run" / "progress.csv")
+    assert table["policy_num_updates"] == [0, 8, 8, 8, 0, 8, 8, 8]
+
+
+def test_the_update_to_data_ratio_holds_for_fractions(make_trainer, tmp_path):
+    make_trainer("run", "algo=sac", "policy_update.updates_per_step=0.019").run()
+    table = read_table(tmp_path / "run" / "progress.csv")
+    # 3.04 of an epoch: the first one's are due as well, the memory being full enough
+    assert sum(table["policy_num_updates"]) == int(8 * 160 * 0.019)
+    assert set(table["policy_num_updates"]) == {3, 4} or set(table["policy_num_updates"]) == {3}
+
+
+def test_a_delayed_policy_moves_every_other_step(make_trainer):
+    trainer = make_trainer("run", "algo=td3", "policy_update.policy_delay=10000")
+    batches = trainer.batches()
+    before = [p.detach().clone() for p in trainer.algorithm.networks["actor"].parameters()]
+    trainer.epoch(batches)
+    first = [p.detach().clone() for p in trainer.algorithm.networks["actor"].parameters()]
+    q = [p.detach().clone() for p in trainer.algorithm.networks["critic"].parameters()]
+    trainer.epoch(batches)
+    later = trainer.algorithm.networks["actor"].parameters()
+    assert any(not torch.equal(a, b) for a, b in zip(before, first, strict=True))
+    assert all(torch.equal(a, b) for a, b in zip(first, later, strict=True))
+    moved = trainer.algorithm.networks["critic"].parameters()
+    assert all(not torch.equal(a, b) for a, b in zip(q, moved, strict=True))
+
+
+def test_multipliers_go_by_the_costs_of_episodes(make_trainer, tmp_path):
+    """Not by what the critics say, which are trained on discounted costs."""
+    keys = [
+        "algo=sac_lagrangian",
+        "lagrangian=projected",
+        "limits/replay@limits=paper",
+        "cost_limits={cost: 2}",
+    ]
+    make_trainer("run", *keys).run()
+    table = read_table(tmp_path / "run" / "progress.csv")
+    penalty = 0.0
+    for cost, found in zip(table["episode_cost"], table["multiplier_cost"], strict=True):
+        penalty = min(max(penalty + 0.01 * (cost - 2.0), 0.0), 2.0)
+        assert found == pytest.approx(penalty, abs=1e-5)
+
+
+def test_another_run_starts_from_its_networks(make_trainer, tmp_path):
+    first = make_trainer("first", "algo=sac_lagrangian", "frames=320")
+    first.run()
+    second = make_trainer("second", "algo=sac_lagrangian", "seed=1")
+    networks = second.algorithm.networks
+    taken = initialise_networks(networks, tmp_path / "first", ["cost"])
+    assert taken == ["actor", "critic", "cost_critic"]
+    assert initialise_networks(networks, tmp_path / "first", ["cost_north"]) == taken[:2]
+    ours, theirs = (t.algorithm.networks["cost_critic"].parameters() for t in (first, second))
+    assert all(torch.equal(a, b) for a, b in zip(ours, theirs, strict=True))
+
+
+@pytest.mark.parametrize("algo", ["sac", "td3"])
+def test_evaluation_finds_its_policy_without_what_explores(algo, make_trainer, tmp_path):
+    trainer = make_trainer("run", f"algo={algo}", "frames=320")
+    trainer.run()
+    env = PointMass(2, 20)
+    checkpoint = find_checkpoint(tmp_path / "run", "last")
+    policy = load_policy(load_config(tmp_path / "run"), env, checkpoint, torch.device("cpu"))
+    state = env.reset()
+    with set_exploration_type(ExplorationType.DETERMINISTIC):
+        expected = trainer.algorithm.policy(state.clone())["action"]
+        assert torch.equal(policy(state.clone())["action"], expected)
+    samples = torch.stack([policy(state.clone())["action"] for _ in range(2)])
+    assert torch.equal(*samples) is (algo == "td3")
+    episodes = collect_episodes(env, policy, 3, env.cost_keys, deterministic=False)
+    assert episodes.lengths.tolist() == [20, 20, 20]
+
+
+def test_actions_without_bounds_are_refused():
+    class Free(PointMass):
+        def __init__(self):
+            super().__init__(2)
+            self.action_spec = Unbounded((2, 2))
+
+    with pytest.raises(ValueError, match=r"actions lie within bounds.*Unbounded"):
+        OffPolicy.build(off_policy_config("algo=sac"), Free())
+
+
+def test_a_constrained_one_needs_a_limit():
+    with pytest.raises(ValueError, match="Without constraints use algo=sac"):
+        OffPolicy.build(off_policy_config("algo=sac_lagrangian", "cost_limits={}"), PointMass(2))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("algo", ["sac_lagrangian", "td3_lagrangian"])
+def test_it_learns_to_go_around_a_hazard(algo, tmp_path):
+    """The origin is 1.2 away and the hazard on the straight way, of which five steps lie in it."""
+    config = off_policy_config(
+        *(f"algo={algo}", "frames=24_000", "frames_per_batch=400", "cost_limits={cost: 1}"),
+        *("policy_update.updates_per_step=0.2", "limits.free_steps=6000"),
+        *("limits.descent_steps=6000", "exploration.random_steps=800", "memory.keep=false"),
+        *("model.hidden_sizes=[64, 64]", "memory.batch_size=128"),
+    )
+    seed_everything(0, None)
+    trainer = build_trainer(config, PointMass(4, 20), tmp_path)
+    trainer.run()
+    env = PointMass(8, 20, seed=7)
+    episodes = collect_episodes(env, trainer.algorithm.policy, 40, ["cost"], deterministic=True)
+    assert episodes.returns.mean() > 0.9
+    assert episodes.costs["cost"].mean() < 1.5
