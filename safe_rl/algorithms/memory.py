@@ -38,7 +38,7 @@ class Memory:
         in_keys: Entries of a step that are kept; what rewards and costs are is said by
             ``reward_keys``.
         reward_keys: Entries below ``next`` that are summed over n steps.
-        gamma: Discount per step of these sums.
+        reward_gamma: Discount per step of these sums.
         n_steps: n.
         storage: ``"tensor"`` keeps transitions in main memory, ``"memmap"`` in temporary files.
         prioritised: Exponents ``alpha`` and ``beta`` of prioritised replay (Schaul et al. 2016,
@@ -53,7 +53,7 @@ class Memory:
     Examples:
         >>> memory = Memory(
         ...     capacity=100, batch_size=4, in_keys=["observation", ("next", "reward")],
-        ...     reward_keys=["reward"], gamma=0.99, n_steps=1, storage="tensor", keep=True,
+        ...     reward_keys=["reward"], reward_gamma=0.99, n_steps=1, storage="tensor", keep=True,
         ... )
         >>> step = {"reward": torch.ones(2, 5, 1), "done": torch.zeros(2, 5, 1, dtype=torch.bool)}
         >>> batch = TensorDict(observation=torch.zeros(2, 5, 3), next=step, batch_size=[2, 5])
@@ -69,7 +69,7 @@ class Memory:
         batch_size: int,
         in_keys: Sequence[NestedKey],
         reward_keys: Sequence[NestedKey],
-        gamma: float,
+        reward_gamma: float,
         n_steps: int,
         storage: str,
         prioritised: Mapping[str, float] | None = None,
@@ -95,7 +95,7 @@ class Memory:
             # by default it leaves `terminated` that of the first step, and values would go on
             # after an end that lies within the n steps
             self._multi_step = MultiStepTransform(
-                n_steps, gamma, reward_keys=list(reward_keys), done_keys=[]
+                n_steps, reward_gamma, reward_keys=list(reward_keys), done_keys=[]
             )
             self._in_keys.append("steps_to_next_obs")
 

@@ -89,7 +89,7 @@ class OffPolicy:
             config.memory,
             in_keys=loss.in_keys,
             reward_keys=["reward", *constraints.keys],
-            gamma=config.loss.gamma,
+            reward_gamma=config.loss.gamma,
             device=device,
         )
         exploration = config.exploration

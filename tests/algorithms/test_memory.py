@@ -16,7 +16,7 @@ IN_KEYS = [
 def make_memory(**keys):
     settings = {
         "capacity": 1000, "batch_size": 64, "in_keys": IN_KEYS, "reward_keys": ["reward", "cost"],
-        "gamma": 0.5, "n_steps": 1, "storage": "tensor", "keep": True,
+        "reward_gamma": 0.5, "n_steps": 1, "storage": "tensor", "keep": True,
     }  # fmt: skip
     return Memory(**{**settings, **keys})
 
