@@ -98,7 +98,7 @@ FLOORS = {
         ("episode_costs",),
         ("advantages", "critics", "limits", "multipliers", "normalisation", "trust_region"),
         ("controllers", "pid", "projected", "q_functions", "surrogate", "fisher"),
-        ("actor_critic", "cpo", "focops", "ppo", "sac", "td3", "trpo"),
+        ("actor_critic", "cpo", "cup", "focops", "ppo", "sac", "td3", "trpo"),
         ("ipo", "p3o", "rcpo"),
         ("",),
     ),
@@ -106,7 +106,10 @@ FLOORS = {
     "models": (("scaling",), ("networks", "q_networks"), ("behaviour", "exploring"), ("",)),
     "algorithms": (
         ("contract", "constraints", "learning_rate", "trust_region_step"),
-        ("cpo_step", "crpo_step", "memory", "minibatch", "parts", "tracked_constraints"),
+        (
+            *("c_trpo_step", "cpo_step", "crpo_step", "in_turn", "memory", "minibatch", "parts"),
+            "tracked_constraints",
+        ),
         ("building", "pcpo_step", "replay_update"),
         ("off_policy", "on_policy", "torchrl_trainers"),
         ("",),

@@ -1,9 +1,11 @@
 """What moves parameters: recipes, updates, trust-region steps, and building them."""
 
+from safe_rl.algorithms.c_trpo_step import CTRPOStep
 from safe_rl.algorithms.constraints import Constraints
 from safe_rl.algorithms.contract import Algorithm, PolicyUpdate, Recipe
 from safe_rl.algorithms.cpo_step import CPOStep
 from safe_rl.algorithms.crpo_step import CRPOStep
+from safe_rl.algorithms.in_turn import UpdatesInTurn
 from safe_rl.algorithms.learning_rate import KLAdaptiveRate
 from safe_rl.algorithms.memory import Memory
 from safe_rl.algorithms.minibatch import MinibatchUpdate
@@ -17,6 +19,7 @@ __all__ = [
     "Algorithm",
     "CPOStep",
     "CRPOStep",
+    "CTRPOStep",
     "Constraints",
     "KLAdaptiveRate",
     "Memory",
@@ -28,4 +31,5 @@ __all__ = [
     "Recipe",
     "ReplayUpdate",
     "TRPOStep",
+    "UpdatesInTurn",
 ]

@@ -12,7 +12,7 @@ from torch import Tensor
 from safe_rl.algorithms.trust_region_step import Proposal, TRPOStep, TrustRegion, total_loss
 from safe_rl.objectives.cpo_dual import DualSolution, solve_dual
 from safe_rl.objectives.fisher import FisherProduct
-from safe_rl.objectives.trust_region import best_in_span, flat_gradient, solve_with_image
+from safe_rl.objectives.trust_region import flat_gradient
 from safe_rl.objectives.violation import constraint_value, matched_violation
 
 __all__ = ["CPOStep"]
@@ -114,19 +114,6 @@ class CPOStep(TRPOStep):
             return bool((not_worse | may_be_worse) & within)
 
         return is_acceptable
-
-    def _solve_all(self, fisher: FisherProduct, g: Tensor, b: Tensor) -> tuple[Tensor, Tensor]:
-        """H⁻¹g, [P], and H⁻¹bᵢ, [k, P], such that q, r and S are those of one and the same metric.
-
-        A few conjugate gradients leave residuals of tens of percents, and gᵀw, bᵀv and wᵀHv then
-        are three different numbers, while the dual knows but one r. In the span of the solutions
-        they are one: there the step keeps the linearised constraints and the radius exactly.
-        """
-        right = torch.cat([g[None], b])
-        pairs = [solve_with_image(fisher, row, self.cg_iterations) for row in right]
-        solutions, images = (torch.stack(rows) for rows in zip(*pairs, strict=True))
-        solved = best_in_span(solutions, images, right)
-        return solved[0], solved[1:]
 
     def _constraint(
         self, surrogates: Tensor, cost_violation: Tensor | None, episode_length: Tensor | None

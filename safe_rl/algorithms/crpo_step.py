@@ -19,7 +19,7 @@ __all__ = ["CRPOStep"]
 class CRPOStep(TRPOStep):
     """A step for the reward while all costs are within d + η, else one against a cost.
 
-    Algorithm 1 of Xu, Liang and Lan 2021, with their second policy update, the trust region: if
+    The algorithm of Xu, Liang and Lan 2021, with a trust region for the policy update: if
     J_cᵢ ≤ dᵢ + η for all i, a `TRPOStep` on the loss, otherwise one on E[ρA_cᵢ] of the cost that
     is exceeded most, in its own units. (The article takes any of the exceeded ones.) There is
     no multiplier, and nothing to tune but η.

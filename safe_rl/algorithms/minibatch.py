@@ -35,6 +35,9 @@ class MinibatchUpdate:
     that of the minibatch at hand at the parameters before its step, so the check costs nothing and
     the step that would follow is not taken; with the full batch as minibatch this is the rule of
     Ray, Achiam, Amodei (2019). With minibatches of thousands of states its error is a few percent.
+    A loss that measures from the policy as it is when the update begins has a method ``anchor``,
+    which is called with the batch before the first step.
+
     A batch that is beyond ``max_kl`` before the first step, because a policy too different from
     the present one collected it, teaches nothing; a warning says so.
 
@@ -127,6 +130,9 @@ class MinibatchUpdate:
         del cost_violation, episode_length
         history: list[TensorDictBase] = []
         num_steps = 0
+        anchor = getattr(self.loss, "anchor", None)
+        if anchor is not None:
+            anchor(batch)
         require_finite(batch, self.loss.in_keys)
         mask_keys = [key for key in AUTO_LOSS_MASK_KEYS if batch.get(key, None) is not None]
         samples = flat_samples(batch.select(*self.loss.in_keys, *mask_keys))

@@ -74,7 +74,8 @@ class OffPolicy:
         if getattr(constraints, "risk", None) is not None:
             raise ValueError(
                 f"risk: algo={config.algo.name} limits mean costs only, for what a risk measure "
-                "charges for a step depends on the episode: use an on-policy algorithm, or risk=mean."
+                "charges for a step depends on the episode. Use an on-policy algorithm, or "
+                "risk=mean."
             )
         loss = build_part(
             config.loss,

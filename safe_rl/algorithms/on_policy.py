@@ -16,6 +16,7 @@ from torchrl.envs import EnvBase
 from safe_rl.algorithms.building import build_constraints, constrained_limits
 from safe_rl.algorithms.constraints import Constraints
 from safe_rl.algorithms.contract import PolicyUpdate, Stateful
+from safe_rl.algorithms.in_turn import UpdatesInTurn
 from safe_rl.algorithms.minibatch import MinibatchUpdate
 from safe_rl.algorithms.parts import build_part
 from safe_rl.algorithms.tracked_constraints import CHARGES
@@ -76,6 +77,7 @@ class OnPolicy:
             "constraints": constraints,
             "multiplier": constraints.multiplier,
             "cost_keys": constraints.keys,
+            "cost_limits": limits,
         }
         critic, cost_critic = networks["critic"], networks.get("cost_critic")
         cost_advantage = None
@@ -83,14 +85,14 @@ class OnPolicy:
             cost_advantage = build_part(config.cost_advantage, value_network=cost_critic, **parts)
             if getattr(constraints, "risk", None) is not None:
                 cost_advantage.set_keys(reward=[CHARGES])
-        loss = build_part(config.loss, critic_network=critic, **parts)
-        del parts["actor_network"]  # an update asks its loss for it
+        policy_update = _build_update(config, critic_network=critic, **parts)
+        del parts["actor_network"]
         return cls(
             **{"cost_critic": None, **networks},
             constraints=constraints,
             advantage=build_part(config.advantage, value_network=critic, **parts),
             cost_advantage=cost_advantage,
-            policy_update=build_part(config.policy_update, loss=loss, **parts),
+            policy_update=policy_update,
             critic_update=build_part(config.critic_update, loss=CriticLoss(critic, cost_critic)),
         )
 
@@ -156,6 +158,21 @@ class OnPolicy:
             "algorithm": self.constraints,
         }
         return {name: part for name, part in parts.items() if part is not None}
+
+
+def _build_update(config: DictConfig, **parts: Any) -> PolicyUpdate:
+    """What moves the policy: ``policy_update`` on ``loss``, and the pairs of ``then`` after it."""
+    loss = build_part(config.loss, **parts)
+    others = {name: part for name, part in parts.items() if name != "actor_network"}
+    update = build_part(config.policy_update, loss=loss, **others)  # asks its loss for the actor
+    then = config.get("then") or {}
+    for name, pair in then.items():
+        if set(pair) != {"loss", "policy_update"}:
+            raise ValueError(
+                f"then.{name} holds {sorted(pair)}: it needs a loss and a policy_update."
+            )
+    built = {str(name): _build_update(pair, **parts) for name, pair in then.items()}
+    return UpdatesInTurn(update, built) if built else update
 
 
 def _build_networks(

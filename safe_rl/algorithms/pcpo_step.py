@@ -51,7 +51,7 @@ def nearest_feasible(excess: Tensor, gram: Tensor) -> Tensor:
 class PCPOStep(CPOStep):
     """TRPO's step, then the nearest point that keeps the linearised constraints.
 
-    With x₀ = −√(2δ/gᵀH⁻¹g) H⁻¹g and e = b x₀ + c (Yang et al. 2020, algorithm 1; one constraint)
+    With x₀ = −√(2δ/gᵀH⁻¹g) H⁻¹g and e = b x₀ + c (Yang et al. 2020; for one constraint)
 
         x = x₀ − max(0, e / bᵀL⁻¹b) L⁻¹b,  L = H (``"kl"``) or the identity (``"l2"``),
 

@@ -16,10 +16,13 @@ from safe_rl.objectives.fisher import FisherProduct
 from safe_rl.objectives.samples import flat_samples, require_finite
 from safe_rl.objectives.trust_region import (
     backtracking_search,
+    best_in_span,
     conjugate_gradient,
     flat_gradient,
+    flatten,
     mean_kl,
     policy_in,
+    solve_with_image,
     subsample,
 )
 
@@ -199,13 +202,13 @@ class TRPOStep:
     def _natural_step(
         self,
         losses: TensorDictBase,
-        metric: Callable[[Tensor], Tensor],
+        fisher: FisherProduct,
         objective: Callable[[TensorDictBase], Tensor],
     ) -> Proposal:
-        """The longest step along the natural gradient of an objective, in a metric of vectors."""
+        """The longest step along the natural gradient of an objective of the losses."""
         loss = objective(losses)
         gradient = flat_gradient(loss, self.parameters)
-        direction = conjugate_gradient(metric, gradient, self.cg_iterations)
+        direction = conjugate_gradient(fisher, gradient, self.cg_iterations)
         # Conjugate gradients leave a residual orthogonal to the solution x, so that xᵀHx = xᵀg.
         squared = (gradient @ direction).clamp_min(0)
         length = torch.where(squared > 0, (2 * self.target_kl / squared).sqrt(), 0.0)
@@ -215,7 +218,20 @@ class TRPOStep:
     def _gradients(self, surrogates: Iterable[Tensor]) -> Tensor:
         """Gradients of k scalars, of whose graph more is to be differentiated, [k, P]."""
         rows = [flat_gradient(row, self.parameters, retain_graph=True) for row in surrogates]
-        return torch.stack(rows)
+        return torch.stack(rows) if rows else flatten(self.parameters).detach()[None, :][:0]
+
+    def _solve_all(self, fisher: FisherProduct, g: Tensor, b: Tensor) -> tuple[Tensor, Tensor]:
+        """H⁻¹g, [P], and H⁻¹bᵢ, [k, P], such that q, r and S are those of one and the same metric.
+
+        A few conjugate gradients leave residuals of tens of percents, and gᵀw, bᵀv and wᵀHv then
+        are three different numbers, while a dual knows but one r. In the span of the solutions
+        they are one: there a step keeps linearised constraints and the radius exactly.
+        """
+        right = torch.cat([g[None], b])
+        pairs = [solve_with_image(fisher, row, self.cg_iterations) for row in right]
+        solutions, images = (torch.stack(rows) for rows in zip(*pairs, strict=True))
+        solved = best_in_span(solutions, images, right)
+        return solved[0], solved[1:]
 
     @torch.no_grad()
     def _search(

@@ -119,6 +119,9 @@ KEYS = {
     ),
     "loss": Key(component, "the policy's loss", may_lack=True),
     "policy_update": Key(component, "what moves the policy", may_lack=True),
+    "then": Key(
+        mapping_of(mapping_of(component)), "losses and updates after policy_update", may_lack=True
+    ),
     "critic_update": Key(component, "what moves the critics", may_lack=True),
 }
 """By full path. Of sections (``model`` and the like) these are all keys there are."""
@@ -217,6 +220,14 @@ PARTS = {
         **_TRUST_REGION,
         "tolerance": Key(_NOT_NEGATIVE, "η, violation of an episode's cost that is let pass"),
     },
+    "CTRPOStep": {
+        **_TRUST_REGION,
+        "beta": Key(_NOT_NEGATIVE, "β, weight of the barrier, per unit of an episode's cost"),
+        "gamma": Key(
+            optional(number(0, 1, below=True)), "discount that makes sums of averages; null: T̄ does"
+        ),
+        "hysteresis": Key(number(0, 1, above=True), "share of a limit at which a recovery ends"),
+    },
     "PPOLoss": _CLIPPED_LOSS,
     "PPOLagrangianLoss": {
         **_CLIPPED_LOSS,
@@ -263,6 +274,11 @@ PARTS = {
         **_LOSS,
         "temperature": Key(_STRENGTH, "β, the trust region's multiplier"),
         "max_state_kl": Key(_POSITIVE, "KL divergence beyond which a state teaches nothing"),
+    },
+    "CUPLoss": {
+        **_LOSS,
+        "gamma": Key(number(0, 1, below=True), "discount of the cost advantages"),
+        "lmbda": Key(_SHARE, "decay of their TD errors"),
     },
     "VectorGAE": _ESTIMATOR,
     "CostGAE": _ESTIMATOR,

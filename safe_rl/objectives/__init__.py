@@ -7,8 +7,8 @@ Everything here works on TensorDict keys alone and knows no environment:
   moved by the mean episode costs;
 - `LimitTracker`: from the costs of a batch to how far J_c is from where it should be by now;
 - `CVaR`, `Chance`: limits on the worst episodes, or on how many cost too much;
-- `PPOLoss`, `PPOLagrangianLoss`, `RCPOLoss`, `P3OLoss`, `IPOLoss`, `FOCOPSLoss`: policy losses for
-  an optimiser;
+- `PPOLoss`, `PPOLagrangianLoss`, `RCPOLoss`, `P3OLoss`, `IPOLoss`, `FOCOPSLoss`, `CUPLoss`:
+  policy losses for an optimiser;
 - `TRPOLoss`, `TRPOLagrangianLoss`, `CPOLoss`: policy losses for the steps of `safe_rl.algorithms`,
   whose mathematics is in `safe_rl.objectives.trust_region` and `safe_rl.objectives.cpo_dual`;
 - `SACLoss`, `SACLagrangianLoss`, `TD3Loss`, `TD3LagrangianLoss`: losses on steps from a replay
@@ -22,6 +22,7 @@ from safe_rl.objectives.advantages import CostGAE, VectorGAE
 from safe_rl.objectives.controllers import PIMultiplier
 from safe_rl.objectives.cpo import CPOLoss
 from safe_rl.objectives.critics import CriticLoss
+from safe_rl.objectives.cup import CUPLoss
 from safe_rl.objectives.focops import FOCOPSLoss
 from safe_rl.objectives.ipo import IPOLoss
 from safe_rl.objectives.limits import LimitTracker
@@ -41,6 +42,7 @@ from safe_rl.objectives.trpo import TRPOLagrangianLoss, TRPOLoss
 __all__ = [
     "ActorCriticLoss",
     "CPOLoss",
+    "CUPLoss",
     "CVaR",
     "Chance",
     "CostGAE",

@@ -13,12 +13,12 @@ from safe_rl.objectives.surrogate import SurrogateLoss, require_multiplier
 class FOCOPSLoss(SurrogateLoss):
     """Distance to the optimal policy of the trust region, projected on the networks'.
 
-    Minimises (Zhang, Vuong and Ross 2020, corollary 1 and algorithm 1)
+    Minimises (Zhang, Vuong and Ross 2020, the gradient of its projection)
 
         E[1{KL(s) ≤ δ} (KL(s) − (1/β) ρ (A − Σᵢ νᵢ A_cᵢ))],  KL(s) = KL(π_θ ‖ π_k) in state s.
 
     Its minimum over all policies is π_k exp((A − Σᵢ νᵢ A_cᵢ)/β) / Z, the optimum within the
-    trust region of which β and ν are the multipliers (theorem 1). States that have gone further
+    trust region of which β and ν are the multipliers. States that have gone further
     than δ teach nothing. Adds ``trusted_fraction``, the share of the others.
 
     Args:

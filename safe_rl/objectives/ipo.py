@@ -40,7 +40,7 @@ def log_barrier(slack: Tensor, kappa: float, max_weight: float) -> Tensor:
 class IPOLoss(PPOLoss):
     """PPO with a logarithmic barrier before every limit, for k constraints.
 
-    Minimises (Liu, Ding and Liu 2020, algorithm 1, with κ = 1/t)
+    Minimises (Liu, Ding and Liu 2020, their logarithmic barrier, with κ = 1/t)
 
         E[−min(ρA, clip(ρ)A)] − κ Σᵢ log(−cᵢ − E[ρA_cᵢ]),  cᵢ = (J_cᵢ − dᵢ) / T̄.
 

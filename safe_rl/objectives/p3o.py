@@ -13,7 +13,7 @@ from safe_rl.objectives.violation import Violations, violation_of
 class P3OLoss(PPOLoss):
     """PPO with an exact penalty on the clipped cost surrogates, for k constraints.
 
-    Minimises (Zhang et al. 2022, equation 12)
+    Minimises (Zhang et al. 2022, their clipped surrogates with an exact penalty)
 
         E[−min(ρA, clip(ρ)A)] + κ Σᵢ relu(E[max(ρA_cᵢ, clip(ρ)A_cᵢ)] + (1 − γ)(J_cᵢ − dᵢ)).
 

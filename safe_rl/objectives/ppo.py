@@ -110,7 +110,7 @@ class PPOLagrangianLoss(PPOLoss):
       bounds what a few samples promise, and at high λ updates end at their KL limit after a few
       steps;
     - ``"pessimistic"``: each cost to its own pessimistic side, E[max(ρA_c, clip(ρ)A_c)] (Zhang et
-      al. 2022, equation 12);
+      al. 2022, clipped costs);
     - ``"joint"``: the objective as a whole, PPO on the advantage (A − Σᵢ λᵢ A_cᵢ) / (1 + Σᵢ λᵢ).
 
     The multipliers are read at every call and never trained by this loss: call

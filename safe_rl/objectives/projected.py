@@ -13,7 +13,7 @@ from safe_rl.objectives.multipliers import CostLimits, Multiplier, per_cost
 class ProjectedMultiplier(Multiplier):
     """λ ← clip(λ + α (J_c − d), 0, λ_max), the plain dual ascent.
 
-    Of FOCOPS (Zhang, Vuong and Ross 2020, algorithm 1), CUP (Yang et al. 2022, algorithm 1) and,
+    Of FOCOPS (Zhang, Vuong and Ross 2020), CUP (Yang et al. 2022) and,
     slow and without λ_max, RCPO (Tessler et al. 2019, algorithm 1).
 
     Args:

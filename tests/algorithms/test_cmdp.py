@@ -6,9 +6,10 @@ import pytest
 import torch
 from cmdp import ONE, STEPS, TARGET, TWO, make_actor, train
 
-from safe_rl.algorithms import Constraints, CPOStep, CRPOStep, PCPOStep, TRPOStep
+from safe_rl.algorithms import Constraints, CPOStep, CRPOStep, CTRPOStep, PCPOStep, TRPOStep
 from safe_rl.objectives import (
     CPOLoss,
+    CUPLoss,
     FOCOPSLoss,
     IPOLoss,
     LagrangeMultiplier,
@@ -161,6 +162,26 @@ def pcpo(actor, cmdp):
     return lambda batch, mean_costs: step(batch, mean_costs - cmdp.limits, torch.tensor(STEPS))
 
 
+def c_trpo(actor, cmdp):
+    barrier = {"beta": 0.1, "gamma": 1 - 1 / STEPS, "hysteresis": 1.0}
+    loss = CPOLoss(actor, entropy_coeff=0.0)
+    region = {**TRUST_REGION, "target_kl": 0.01}  # the size of a recovery is one step
+    step = CTRPOStep(loss, cmdp.cost_limits, **barrier, **region)
+    return lambda batch, mean_costs: step(batch, mean_costs - cmdp.limits)
+
+
+def cup(actor, cmdp):
+    multiplier = projected_multiplier(cmdp)
+    loss = CUPLoss(actor, multiplier, gamma=0.9, lmbda=0.3, entropy_coeff=0.0)
+    improve, project = ppo_update(PPOLoss(actor, **PPO), actor), ppo_update(loss, actor)
+
+    def update(batch):
+        improve(batch)
+        project(loss.anchor(batch))
+
+    return dual_ascent(multiplier, update)
+
+
 UNCONSTRAINED = [ppo, trpo]
 # Epochs: a multiplier moved by gradient steps overshoots before it settles, a controller does not.
 CONSTRAINED = [
@@ -175,6 +196,8 @@ CONSTRAINED = [
     (rcpo, 250),
     (crpo, 150),
     (pcpo, 120),
+    (c_trpo, 200),
+    (cup, 250),
 ]
 
 

@@ -147,8 +147,17 @@ PCPO = {
     "policy_update": CPO["policy_update"]
     | {"_target_": "safe_rl.algorithms.PCPOStep", "projection": "kl"}
 }
+C_TRPO = {
+    "policy_update": TRPO["policy_update"]
+    | {"_target_": "safe_rl.algorithms.CTRPOStep", "beta": 1.0, "gamma": 0.99, "hysteresis": 0.8}
+}
 # of the methods' own articles, within the setting that all share
 PROJECTED = {"_target_": "safe_rl.objectives.ProjectedMultiplier", "init": 0.0}
+CUP_UPDATE = PPO["policy_update"] | {"max_kl": 0.02}
+CUP_LOSS = {"_target_": "safe_rl.objectives.CUPLoss", "gamma": 0.99, "lmbda": 0.97}
+PROJECTION = {
+    "loss": {**CUP_LOSS, "entropy_coeff": 0.0}, "policy_update": {**CUP_UPDATE, "adapt_rate": None}
+}  # fmt: skip
 PAPER = {
     "ppo": SHARED | PPO,
     "ppo_lagrangian": SHARED | PPO | COSTS | MULTIPLIER,
@@ -162,6 +171,9 @@ PAPER = {
     "rcpo": SHARED | PPO | COSTS | {"lagrangian": {**PROJECTED, "lr": 0.001, "highest": None}},
     "crpo": SHARED | CRPO | COSTS,
     "pcpo": SHARED | PCPO | COSTS,
+    "cup": SHARED | {"policy_update": CUP_UPDATE, "then": {"projection": PROJECTION}} | COSTS
+    | {"lagrangian": {**PROJECTED, "lr": 0.01, "highest": 2.0}},
+    "c_trpo": SHARED | C_TRPO | COSTS,
 }  # fmt: skip
 LOSSES = {
     "ppo": {"_target_": "safe_rl.objectives.PPOLoss", "clip_epsilon": 0.2},
@@ -186,6 +198,8 @@ LOSSES = {
     "rcpo": {"_target_": "safe_rl.objectives.RCPOLoss", "clip_epsilon": 0.2},
     "crpo": {"_target_": "safe_rl.objectives.CPOLoss"},
     "pcpo": {"_target_": "safe_rl.objectives.CPOLoss"},
+    "cup": {"_target_": "safe_rl.objectives.PPOLoss", "clip_epsilon": 0.2},
+    "c_trpo": {"_target_": "safe_rl.objectives.CPOLoss"},
 }  # fmt: skip
 # per environment: steps in all, environments, steps per epoch
 SIZES = {

@@ -84,7 +84,12 @@ def test_every_key_of_every_file_has_a_row(configs):
             target = OmegaConf.select(config, f"{node}._target_") if node else None
             known = PARTS.get(str(target).rpartition(".")[2], {})
             is_optimiser = str(target).startswith("torch.optim.")
-            is_within = node in ("cost_limits", "default_cost_limits", "model.input_scale")
+            is_pair = path.startswith("then.") and path.count(".") < 3
+            is_within = is_pair or node in (
+                "cost_limits",
+                "default_cost_limits",
+                "model.input_scale",
+            )
             assert (
                 path in KEYS or name in known or is_within or (is_optimiser and name[0] == "_")
             ) or name in PARTS["torch.optim"], path

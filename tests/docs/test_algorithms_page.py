@@ -24,6 +24,8 @@ TABLES = {
     "rcpo": ["constrained", "lagrangian", "ppo"],
     "pcpo": ["constrained", "trpo", "surrogates", "pcpo"],
     "crpo": ["constrained", "trpo", "surrogates", "crpo"],
+    "c_trpo": ["constrained", "trpo", "surrogates", "c_trpo"],
+    "cup": ["constrained", "lagrangian", "ppo", "surrogates", "cup"],
 }
 
 

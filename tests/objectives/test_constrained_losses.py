@@ -2,13 +2,10 @@
 
 import pytest
 import torch
+from one_state import best_on_a_grid, minimise, one_state, total
 from samples import make_actor, make_batch, perturb
 from scipy.optimize import linprog
 from tensordict import TensorDict
-from tensordict.nn import TensorDictModule
-from torch import nn
-from torch.distributions import Categorical
-from torchrl.modules import ProbabilisticActor
 
 from safe_rl.algorithms import Constraints
 from safe_rl.objectives import (
@@ -49,10 +46,6 @@ LOSSES = {
 }
 
 
-def total(losses):
-    return sum(value for key, value in losses.items() if key.startswith("loss_"))
-
-
 @pytest.mark.parametrize("name", LOSSES)
 @pytest.mark.parametrize("batch_size", [[32], [4, 8]])
 def test_gradients_against_finite_differences(name, batch_size):
@@ -89,56 +82,6 @@ def test_they_compile_take_masks_and_report_what_they_name(name):
     for key in loss.out_keys:
         torch.testing.assert_close(found[key], expected[key], msg=key)
         torch.testing.assert_close(compiled[key], expected[key], msg=key)
-
-
-class Logits(nn.Module):
-    """The same logits in every state."""
-
-    def __init__(self, count):
-        super().__init__()
-        self.logits = nn.Parameter(torch.zeros(count))
-
-    def forward(self, observation):
-        return self.logits.expand(*observation.shape[:-1], -1)
-
-
-def one_state(advantage, *cost_advantages):
-    """A policy of a few actions, uniform at first, and a batch with every action once.
-
-    Means over the batch are expectations under the first policy, without a sampling error.
-    """
-    count = len(advantage)
-    actor = ProbabilisticActor(
-        TensorDictModule(Logits(count), ["observation"], ["logits"]),
-        in_keys=["logits"],
-        distribution_class=Categorical,
-        return_log_prob=True,
-    )
-    uniform = torch.full((count,), 1 / count).log()
-    batch = TensorDict(
-        observation=torch.zeros(count, 1),
-        action=torch.arange(count),
-        action_log_prob=uniform,
-        logits=uniform.expand(count, count),
-        advantage=torch.tensor(advantage).unsqueeze(-1),
-        cost_advantage=torch.tensor(cost_advantages).T,
-        batch_size=[count],
-    )
-    return actor, next(actor.parameters()), batch
-
-
-def best_on_a_grid(loss, logits, batch, points=50):
-    """The policy of three actions of which the loss is lowest, by trying all."""
-    best, best_value = None, torch.inf
-    for i in range(1, points):
-        for j in range(1, points - i):
-            probs = torch.tensor([i, j, points - i - j]) / points
-            with torch.no_grad():
-                logits.copy_(probs.log())
-                value = total(loss(batch)).item()
-            if value < best_value:
-                best, best_value = probs, value
-    return best
 
 
 GAIN, COST = [1.0, 0.2, -1.2], [0.8, -0.1, -0.7]
@@ -206,15 +149,7 @@ def test_focops_has_the_optimum_of_the_trust_region():
     advantage, costs = [1.0, 0.2, -1.2, 0.7], [0.8, -0.1, -0.7, 0.3]
     actor, logits, batch = one_state(advantage, costs)
     loss = FOCOPSLoss(actor, projected(0.6), temperature=1.5, max_state_kl=1e6, entropy_coeff=0.0)
-    optimizer = torch.optim.LBFGS([logits], max_iter=200, line_search_fn="strong_wolfe")
-
-    def closure():
-        optimizer.zero_grad()
-        value = total(loss(batch))
-        value.backward()
-        return value
-
-    optimizer.step(closure)
+    minimise(loss, logits, batch)
     expected = (torch.tensor(advantage) - 0.6 * torch.tensor(costs)).div(1.5).softmax(0)
     torch.testing.assert_close(logits.detach().softmax(0), expected, atol=1e-4, rtol=0)
 

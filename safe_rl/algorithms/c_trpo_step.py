@@ -1,0 +1,163 @@
+"""Step of constrained trust region policy optimisation (Milosevic, Müller and Scherf 2025)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any, Unpack
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+
+from safe_rl.algorithms.trust_region_step import Proposal, TRPOStep, TrustRegion, total_loss
+from safe_rl.objectives.fisher import FisherProduct
+from safe_rl.objectives.multipliers import CostLimits, parse_cost_limits
+from safe_rl.objectives.trust_region import flat_gradient
+from safe_rl.objectives.violation import matched_violation
+
+__all__ = ["CTRPOStep", "barrier_divergence"]
+
+
+def barrier_divergence(change: Tensor, slack: Tensor) -> Tensor:
+    """Bregman divergence of x log x from one distance to a limit to another.
+
+    D(s − a, s) = a + (s − a) log((s − a)/s): 0 with a slope of 0 at a = 0, of curvature 1/s there,
+    and infinite beyond the limit.
+
+    Args:
+        change: a, by how much a cost grows, any shape.
+        slack: s > 0, how far it was below its limit, of the same shape.
+
+    Returns:
+        The divergence, of this shape.
+
+    Examples:
+        >>> barrier_divergence(torch.tensor([0.0, 5.0, 15.0]), torch.tensor([10.0, 10.0, 10.0]))
+        tensor([0.0000, 1.5343,    inf])
+    """
+    a, s = change.double(), slack.double()
+    left = (s - a).clamp_min(0)
+    inside = a + torch.xlogy(left, left / s)
+    return torch.where(a > s, torch.inf, inside).to(change)
+
+
+class CTRPOStep(TRPOStep):
+    """A step within a trust region that does not reach beyond the limits.
+
+    The region is that of the divergence (Milosevic et al. 2025)
+
+        D_C(π_θ ‖ π_k) = KL(π_θ ‖ π_k) + β Σᵢ D_φ(dᵢ − J_cᵢ(θ), dᵢ − J_cᵢ(θ_k)) ≤ δ
+
+    with `barrier_divergence` as D_φ and J_c(θ) − J_c(θ_k) = h E[(ρ − 1) A_c], where h = 1/(1 − γ)
+    makes a sum of an average per step. Its Hessian at θ_k is H + β h² Σᵢ bᵢbᵢᵀ / (dᵢ − J_cᵢ): where
+    a limit is near, the natural gradient turns along it. The line search takes the first fraction
+    with D_C ≤ δ that does not worsen the loss.
+
+    A policy beyond a limit recovers: `TRPOStep`'s step against E[ρ A_c] until J_c is below the
+    share `hysteresis` of d. The barriers of the costs that are within their limits stay; of several
+    to recover, the one exceeded most comes first.
+
+    Adds ``recovers`` to the diagnostics, [k]: 1 for the costs that are being recovered.
+
+    Args:
+        loss: a `CPOLoss`, or a callable of your own that returns a TensorDict with scalars
+            ``loss_…`` and the differentiable ``cost_surrogate``, [k].
+        cost_limits: d, as of a multiplier; see `parse_cost_limits`.
+        beta: β, per unit of an episode's cost, for every cost.
+        gamma: γ in the factor h = 1/(1 − γ); None takes T̄ in its place, that of undiscounted sums.
+        hysteresis: share of d in (0, 1] below which a recovery ends; 1 ends it at the limit.
+        settings: those of every step, see `TrustRegion`.
+
+    Raises:
+        ValueError: if `hysteresis` or `gamma` is outside its range.
+
+    Examples:
+        >>> from tensordict import TensorDict
+        >>> from safe_rl.models import make_actor
+        >>> from safe_rl.objectives import CPOLoss
+        >>> actor = make_actor(3, 2, hidden_sizes=[16], initial_log_std=-0.5)
+        >>> with torch.no_grad():
+        ...     batch = actor(TensorDict(observation=torch.randn(8, 3), batch_size=[8]))
+        >>> batch["advantage"], batch["cost_advantage"] = torch.randn(8, 1), torch.randn(8, 1)
+        >>> region = {"target_kl": 0.01, "damping": 0.1, "cg_iterations": 10}
+        >>> search = {"backtrack_coeff": 0.8, "max_backtracks": 10}
+        >>> barrier = {"beta": 1.0, "gamma": 0.99, "hysteresis": 0.8}
+        >>> loss = CPOLoss(actor, entropy_coeff=0.0)
+        >>> step = CTRPOStep(loss, {"cost": 25.0}, **barrier, **region, **search)
+        >>> [step(batch, torch.tensor([violation]))["recovers"].item() for violation in (1, -1, -6)]
+        [1.0, 1.0, 0.0]
+    """
+
+    def __init__(
+        self,
+        loss: Callable[[TensorDictBase], TensorDictBase],
+        cost_limits: CostLimits,
+        *,
+        beta: float,
+        gamma: float | None,
+        hysteresis: float,
+        **settings: Unpack[TrustRegion],
+    ) -> None:
+        super().__init__(loss, **settings)
+        if not 0 < hysteresis <= 1 or (gamma is not None and not 0 <= gamma < 1):
+            raise ValueError(
+                f"hysteresis must be in (0, 1] and gamma in [0, 1) or null, got {hysteresis} and "
+                f"{gamma}."
+            )
+        limits = parse_cost_limits(cost_limits)[1]
+        self.beta, self.gamma = beta, gamma
+        self.recovered = -(1 - hysteresis) * limits
+        self.recovering = torch.zeros_like(limits, dtype=torch.bool)
+
+    def _propose(
+        self,
+        losses: TensorDictBase,
+        fisher: FisherProduct,
+        cost_violation: Tensor | None,
+        episode_length: Tensor | None,
+    ) -> Proposal:
+        surrogates = losses["cost_surrogate"]
+        violation = matched_violation(cost_violation, surrogates)
+        above = violation - self.recovered.to(violation)
+        was_recovering = self.recovering.to(violation.device) & (above >= 0)
+        self.recovering = (violation >= 0) | was_recovering
+        inside, horizon = ~self.recovering, self._horizon(episode_length)
+        slack, start = -violation[inside], horizon * surrogates[inside].detach()
+        worst = int(above.masked_fill(inside, -torch.inf).argmax())
+        objective = total_loss if inside.all() else lambda of: of["cost_surrogate"][worst]
+        loss = objective(losses)
+        g = flat_gradient(loss, self.parameters, retain_graph=True)
+        b = self._gradients(surrogates[inside])
+        v, w = self._solve_all(fisher, g, b)
+        # Woodbury's identity for the inverse of H + Σ κᵢbᵢbᵢᵀ, whatever the size of κ
+        root = (self.beta * horizon**2 / slack).sqrt()
+        gram = torch.eye(len(root), dtype=root.dtype, device=root.device)
+        gram = gram + root[:, None] * (b @ w.T) * root
+        direction = v - (root * torch.linalg.solve(gram, root * (b @ v))) @ w
+        squared = (g @ direction).clamp_min(0)
+        length = torch.where(squared > 0, (2 * self.target_kl / squared).sqrt(), 0.0)
+        before = loss.detach()
+
+        def is_acceptable(after: TensorDictBase, kl: Tensor) -> bool:
+            change = horizon * after["cost_surrogate"][inside] - start
+            divergence = kl + self.beta * barrier_divergence(change, slack).sum()
+            return bool((divergence <= self.target_kl) & (objective(after) <= before))
+
+        recovers = self.recovering.to(surrogates.dtype)
+        return Proposal(-length * direction, is_acceptable, {"recovers": recovers})
+
+    def _horizon(self, episode_length: Tensor | None) -> Tensor | float:
+        """h, what makes a sum over an episode of an average per step."""
+        if self.gamma is not None:
+            return 1 / (1 - self.gamma)
+        if episode_length is None:
+            raise ValueError("With gamma=null a C-TRPO step needs the mean episode_length.")
+        return episode_length
+
+    def state_dict(self) -> dict[str, Any]:
+        """Which costs are being recovered."""
+        return {"recovering": self.recovering.clone()}
+
+    def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
+        """Continue from :meth:`state_dict`."""
+        self.recovering = state_dict["recovering"].clone()

@@ -1,0 +1,119 @@
+"""Constrained update projection (Yang, Ji, Dai, Zhang, Zhou, Li, Yang and Pan 2022)."""
+
+from __future__ import annotations
+
+import torch
+from tensordict import NestedKey, TensorDictBase
+from tensordict.nn import ProbabilisticTensorDictSequential
+from torch import Tensor
+from torch.distributions import Distribution
+
+from safe_rl.objectives.distributions import has_closed_kl
+from safe_rl.objectives.multipliers import Multiplier
+from safe_rl.objectives.surrogate import SurrogateLoss, require_multiplier
+
+#: Where a batch holds the policy that a projection starts from.
+ANCHOR = "anchor"
+
+
+class CUPLoss(SurrogateLoss):
+    """The second of CUP's two steps: from an improved policy back to where the costs are low.
+
+    The first step improves the policy for the reward, by PPO's loss, to π½. Then this loss is
+    minimised from there (Yang et al. 2022, their projection step),
+
+        E[KL(π_θ ‖ π½) + (1 − γλ_GAE)/(1 − γ) Σᵢ νᵢ ρ A_cᵢ],  ρ = π_θ/π_k,
+
+    with advantages of π_k, which collected the batch. The factor belongs to the article's bound for
+    generalised advantage estimates. `anchor` fixes π½; a `safe_rl.algorithms.MinibatchUpdate`
+    calls it before its first step.
+
+    See `SurrogateLoss` for what it reads and writes; here ``kl`` is KL(π_θ ‖ π½). Adds the
+    detached ``cost_surrogate`` [k], E[ρA_c].
+
+    Args:
+        actor_network: policy with `get_dist`, of a distribution whose KL has a closed form.
+        multiplier: one ν per column of ``cost_advantage``; a `ProjectedMultiplier` in the article.
+        gamma: γ, the discount of the cost advantages.
+        lmbda: λ_GAE, the decay of their TD errors.
+        entropy_coeff: factor of the entropy bonus.
+        reduction: ``"mean"``, ``"sum"`` or ``"none"``.
+
+    Raises:
+        TypeError: if there is no multiplier; by the call, if a KL has no closed form.
+        KeyError: by the call, if the batch has no anchor.
+
+    Examples:
+        >>> from tensordict import TensorDict
+        >>> from safe_rl.models import make_actor
+        >>> from safe_rl.objectives import ProjectedMultiplier
+        >>> actor = make_actor(3, 2, hidden_sizes=[16], initial_log_std=-0.5)
+        >>> multiplier = ProjectedMultiplier({"cost": 25.0}, init=0.5, lr=0.01, highest=2.0)
+        >>> loss = CUPLoss(actor, multiplier, gamma=0.99, lmbda=0.97, entropy_coeff=0.0)
+        >>> with torch.no_grad():
+        ...     batch = actor(TensorDict(observation=torch.randn(8, 3), batch_size=[8]))
+        >>> batch["advantage"], batch["cost_advantage"] = torch.randn(8, 1), torch.ones(8, 1)
+        >>> losses = loss(loss.anchor(batch))  # of a policy that has not moved
+        >>> round(losses["loss_objective"].item(), 4)  # 0.5 (1 - 0.99 · 0.97) / (1 - 0.99)
+        1.985
+    """
+
+    extra_out_keys = ("cost_surrogate",)
+
+    def __init__(
+        self,
+        actor_network: ProbabilisticTensorDictSequential,
+        multiplier: Multiplier,
+        *,
+        gamma: float,
+        lmbda: float,
+        entropy_coeff: float,
+        reduction: str = "mean",
+    ) -> None:
+        super().__init__(
+            actor_network,
+            entropy_coeff=entropy_coeff,
+            reduction=reduction,
+            multiplier=require_multiplier(multiplier, "PPOLoss"),
+        )
+        if not gamma < 1:
+            raise ValueError(
+                f"gamma={gamma}: it must be below 1, the projection divides by 1 - gamma."
+            )
+        self.cost_factor = (1 - gamma * lmbda) / (1 - gamma)
+
+    @property
+    def behaviour_keys(self) -> dict[NestedKey, NestedKey]:
+        """Where the batch holds π½, from which ``kl`` is measured."""
+        return {key: (ANCHOR, str(name)) for name, key in self._parameter_keys.items()}
+
+    @torch.no_grad()
+    def anchor(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Write the present policy's parameters into a batch, as π½, and return the batch."""
+        observed = tensordict.select(*self.actor_network.in_keys)
+        with self.actor_network_params.to_module(self.actor_network, preserve_module_state=False):
+            parameters = self.actor_network.get_dist_params(observed)
+        for name, key in self._parameter_keys.items():
+            tensordict[ANCHOR, str(name)] = parameters.get(key).clone()
+        return tensordict
+
+    def _kl(
+        self, tensordict: TensorDictBase, distribution: Distribution, log_weight: Tensor
+    ) -> Tensor:
+        if not has_closed_kl(distribution):
+            raise TypeError(
+                f"CUP projects in KL divergence, and that of {type(distribution).__name__} has no "
+                "closed form: use a policy with Gaussian or categorical actions, or another algo."
+            )
+        return super()._kl(tensordict, distribution, log_weight)
+
+    def _evaluate(
+        self, tensordict: TensorDictBase, log_weight: Tensor, divergence: Tensor
+    ) -> dict[str, Tensor]:
+        assert self.multiplier is not None
+        gain = self._cost_gain(tensordict, log_weight.exp())
+        penalty = (gain * self.multiplier.value).sum(-1, keepdim=True)
+        return {
+            "loss_objective": divergence + self.cost_factor * penalty,
+            "cost_surrogate": self._cost_surrogates(tensordict, gain.detach()),
+        }

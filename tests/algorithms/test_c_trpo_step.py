@@ -1,0 +1,149 @@
+"""C-TRPO's step against the divergence that defines it, and its recoveries."""
+
+import math
+
+import pytest
+import torch
+from samples import make_actor, make_batch
+
+from safe_rl.algorithms import CTRPOStep
+from safe_rl.algorithms.c_trpo_step import barrier_divergence
+from safe_rl.objectives import CPOLoss
+from safe_rl.objectives.distributions import gaussian_kl
+from safe_rl.objectives.fisher import FisherProduct
+from safe_rl.objectives.trust_region import flatten, policy_in
+
+DELTA, HORIZON, BETA = 0.01, 100.0, 0.5
+SETTINGS = {
+    "target_kl": DELTA, "damping": 0.1, "cg_iterations": 60, "backtrack_coeff": 0.8,
+    "max_backtracks": 20,
+}  # fmt: skip
+
+
+def make_case(num_costs=2):
+    """Rewards and costs that push the same way, so that limits are in the way."""
+    actor = make_actor(width=4)
+    batch = make_batch(actor, (400,), num_costs)
+    push = batch["action"] - batch["loc"]
+    batch["advantage"] = push[..., :1] + 0.1 * batch["advantage"]
+    batch["cost_advantage"] = push[..., :1] + 0.1 * batch["cost_advantage"]
+    return actor, batch
+
+
+def c_trpo(actor, num_costs=2, **changed):
+    loss = CPOLoss(actor, entropy_coeff=0.0)
+    settings = {"beta": BETA, "gamma": 0.99, "hysteresis": 0.8, **SETTINGS, **changed}
+    return CTRPOStep(loss, [25.0] * num_costs, **settings)
+
+
+def bregman(new, old):
+    """D_φ(new, old) of φ(x) = x log x, by its definition."""
+    phi = {x: x * math.log(x) if x else 0.0 for x in (new, old)}
+    return phi[new] - phi[old] - (math.log(old) + 1) * (new - old)
+
+
+@pytest.mark.parametrize("slack", [0.1, 25.0])
+def test_the_divergence_is_that_of_its_definition(slack):
+    for share in (-3.0, -0.5, 1e-3, 0.3, 1.0):
+        change = share * slack
+        found = barrier_divergence(torch.tensor(change), torch.tensor(slack)).item()
+        assert found == pytest.approx(bregman(slack - change, slack), rel=2e-3, abs=1e-9)
+    assert barrier_divergence(torch.tensor(1.01 * slack), torch.tensor(slack)) == torch.inf
+
+
+def test_the_step_is_the_natural_one_of_the_divergence():
+    """Its Hessian by differentiating twice what it is the Hessian of."""
+    actor, batch = make_case()
+    violation = torch.tensor([-4.0, -0.3])
+    parameters = list(actor.parameters())
+    step = c_trpo(actor)
+    losses = step.loss(batch)
+    surrogates = losses["cost_surrogate"]
+    policy, loc, scale = policy_in(actor, batch), batch["loc"], batch["scale"]
+    base = policy.base_dist
+    change = HORIZON * (surrogates - surrogates.detach())
+    barrier = change + (-violation - change) * ((-violation - change) / -violation).log()
+    divergence = gaussian_kl(base.loc, base.scale, loc, scale).mean() + BETA * barrier.sum()
+    slope = flatten(torch.autograd.grad(divergence, parameters, create_graph=True))
+    assert slope.abs().max() < 1e-5
+    rows = [flatten(torch.autograd.grad(s, parameters, retain_graph=True)) for s in slope]
+    matrix = torch.stack(rows).double() + 0.1 * torch.eye(len(rows))
+    objective = losses["loss_objective"]
+    g = flatten(torch.autograd.grad(objective, parameters, retain_graph=True)).double()
+    h_g = torch.linalg.solve(matrix, g)
+    expected = -(2 * DELTA / (g @ h_g)).sqrt() * h_g
+    fisher = FisherProduct(actor, batch, parameters, damping=0.1)
+    proposal = step._propose(losses, fisher, violation, None)
+    torch.testing.assert_close(
+        proposal.step.double(), expected, atol=5e-3 * expected.abs().max().item(), rtol=2e-2
+    )
+
+
+@pytest.mark.parametrize("violation", [-1e6, -25.0, -1.0, -0.01])
+def test_a_step_stays_in_its_region_and_within_the_limits(violation):
+    actor, batch = make_case(1)
+    step = c_trpo(actor, 1)
+    before = step.loss(batch)
+    metrics = step(batch, torch.tensor([violation]))
+    after = step.loss(batch)
+    change = HORIZON * (after["cost_surrogate"] - before["cost_surrogate"]).detach()
+    barrier = barrier_divergence(change, torch.tensor([-violation])).sum()
+    assert metrics["step_fraction"] > 0
+    divergence = after["kl"] + BETA * barrier
+    assert divergence <= 1.001 * DELTA
+    assert divergence > 0.2 * DELTA or violation == -0.01  # where the limit's curvature counts
+    assert after["loss_objective"] < before["loss_objective"]
+    assert change < -violation
+    if violation == -1e6:
+        assert change > 1.0  # what the limit is there to prevent
+    if violation == -0.01:
+        assert change < 0.02
+
+
+def test_recoveries_begin_at_a_limit_and_end_below_it():
+    actor, batch = make_case(1)
+    step = c_trpo(actor, 1)
+    seen = []
+    for violation in (-1.0, 0.5, -1.0, -4.9, -5.1, -1.0, torch.nan):
+        before = step.loss(batch)["cost_surrogate"]
+        recovers = bool(step(batch, torch.tensor([violation]))["recovers"])
+        seen.append(recovers)
+        assert not recovers or step.loss(batch)["cost_surrogate"] < before
+        twin = c_trpo(actor, 1)
+        twin.load_state_dict(step.state_dict())
+        assert torch.equal(twin.recovering, step.recovering)
+        step = twin
+    assert seen == [False, True, True, True, False, False, True]
+
+
+def test_of_several_costs_the_worst_is_recovered_within_the_limits_of_the_others():
+    actor, batch = make_case(3)
+    batch["cost_advantage"] = batch["cost_advantage"] * torch.tensor([1.0, 1.0, -1.0])
+    step = c_trpo(actor, 3)
+    before = step.loss(batch)["cost_surrogate"].detach()
+    metrics = step(batch, torch.tensor([3.0, 9.0, -0.2]))
+    change = HORIZON * (step.loss(batch)["cost_surrogate"].detach() - before)
+    assert metrics["recovers"].tolist() == [1.0, 1.0, 0.0]
+    assert change[1] < 0
+    assert change[2] < 0.2
+
+
+def test_undiscounted_sums_take_the_length_of_an_episode():
+    actor, batch = make_case(1)
+    state = {name: value.clone() for name, value in actor.state_dict().items()}
+    changed = []
+    for gamma, length in ((0.99, None), (None, torch.tensor(100.0))):
+        actor.load_state_dict(state)
+        c_trpo(actor, 1, gamma=gamma)(batch, torch.tensor([-1.0]), length)
+        changed.append(flatten(actor.parameters()).detach())
+    torch.testing.assert_close(*changed)
+
+
+def test_errors_say_what_to_change():
+    actor, batch = make_case(1)
+    with pytest.raises(ValueError, match="hysteresis must be in"):
+        c_trpo(actor, hysteresis=0.0)
+    with pytest.raises(ValueError, match="needs the mean episode_length"):
+        c_trpo(actor, 1, gamma=None)(batch, torch.tensor([-1.0]))
+    with pytest.raises(ValueError, match="one per cost surrogate"):
+        c_trpo(actor, 1)(batch, torch.zeros(2))

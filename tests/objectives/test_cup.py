@@ -1,0 +1,142 @@
+"""CUP's projection, against its definition and the optimum that it has in closed form."""
+
+import pytest
+import torch
+from one_state import minimise, one_state, total
+from samples import make_actor, make_batch, perturb
+from tensordict import TensorDict
+from tensordict.nn import NormalParamExtractor, TensorDictModule
+from torch.distributions import kl_divergence
+from torchrl.modules import ProbabilisticActor, TruncatedNormal
+
+from safe_rl.algorithms import MinibatchUpdate, UpdatesInTurn
+from safe_rl.objectives import CUPLoss, PPOLoss, ProjectedMultiplier
+
+FACTOR = (1 - 0.99 * 0.97) / (1 - 0.99)
+
+
+def cup_loss(actor, *values, **changed):
+    limits = [25.0] * len(values)
+    multiplier = ProjectedMultiplier(limits, init=list(values), lr=0.01, highest=None)
+    settings = {"gamma": 0.99, "lmbda": 0.97, "entropy_coeff": 0.01, **changed}
+    return CUPLoss(actor, multiplier, **settings)
+
+
+def moved_case(batch_size=(32,)):
+    """A batch of π_k, anchored at π½, and a policy that has gone on from there."""
+    actor = make_actor(width=4)
+    batch = make_batch(actor, list(batch_size), 2)
+    perturb(actor, 0.1)
+    loss = cup_loss(actor, 0.5, 2.0)
+    loss.anchor(batch)
+    half = actor.get_dist(batch.select("observation"))
+    perturb(actor, 0.1)
+    return actor, batch, loss, half
+
+
+def test_gradients_against_finite_differences():
+    actor, batch, loss, _ = moved_case()
+    loss, batch = loss.double(), batch.double()
+    for parameter in list(actor.parameters()):
+        direction = torch.randn_like(parameter)
+        slope = (torch.autograd.grad(total(loss(batch)), parameter)[0] * direction).sum()
+        values = []
+        for size in (1e-6, -2e-6):
+            parameter.data += size * direction
+            values.append(total(loss(batch)))
+        parameter.data += 1e-6 * direction
+        expected = ((values[0] - values[1]) / 2e-6).detach()
+        torch.testing.assert_close(slope, expected, rtol=1e-4, atol=1e-7)
+
+
+def test_it_is_the_equation():
+    actor, batch, loss, half = moved_case((4, 8))
+    policy = actor.get_dist(batch.select("observation"))
+    ratio = (policy.log_prob(batch["action"]) - batch["action_log_prob"]).exp()
+    divergence = kl_divergence(policy.base_dist, half.base_dist).sum(-1)
+    costs = (ratio[..., None] * batch["cost_advantage"]).mean((0, 1))
+    found = loss(batch)
+    expected = divergence.mean() + FACTOR * (costs @ torch.tensor([0.5, 2.0]))
+    torch.testing.assert_close(found["loss_objective"], expected)
+    torch.testing.assert_close(found["kl"], divergence.mean().detach())
+    torch.testing.assert_close(found["cost_surrogate"], costs.detach())
+    padded = TensorDict.cat([batch.reshape(-1), torch.full_like(batch.reshape(-1), 7.0)])
+    padded["collector", "mask"] = torch.arange(64) < 32
+    torch.testing.assert_close(loss(padded)["loss_objective"], expected)
+
+
+def test_the_projection_has_the_optimum_of_its_equation():
+    """π½ exp(−ν c A_c) / Z, by calculus of variations."""
+    costs = [0.8, -0.1, -0.7, 0.3]
+    actor, logits, batch = one_state([1.0, 0.2, -1.2, 0.7], costs)
+    loss = cup_loss(actor, 0.15, entropy_coeff=0.0)
+    half = torch.tensor([0.5, 0.1, -0.4, 0.2])
+    with torch.no_grad():
+        logits.copy_(half)
+    loss.anchor(batch)
+    minimise(loss, logits, batch)
+    expected = (half - 0.15 * FACTOR * torch.tensor(costs)).softmax(0)
+    torch.testing.assert_close(logits.detach().softmax(0), expected, atol=1e-4, rtol=0)
+
+
+def test_without_a_weight_the_projection_stays_where_the_first_step_has_led():
+    actor = make_actor()
+    batch = make_batch(actor, [64], 1)
+    settings = {"optimizer": torch.optim.SGD, "num_passes": 3, "minibatch_size": 16}
+    first = MinibatchUpdate(PPOLoss(actor, clip_epsilon=0.2, entropy_coeff=0.0), **settings)
+    seen = {}
+    for weight in (0.0, 1.0):
+        loss = cup_loss(actor, weight, entropy_coeff=0.0)
+        update = UpdatesInTurn(first, {"projection": MinibatchUpdate(loss, **settings)})
+        seen[weight] = update(batch)
+    assert seen[0.0]["kl"] > 0
+    assert seen[0.0]["projection_kl"] < 1e-6 < seen[1.0]["projection_kl"]
+    assert seen[1.0]["cost_surrogate"] < seen[0.0]["cost_surrogate"]
+    assert {"num_steps", "projection_num_steps"} < set(seen[0.0])
+
+
+def test_updates_in_turn_resume_by_name():
+    actor = make_actor()
+    batch = make_batch(actor, [16], 1)
+    settings = {"optimizer": torch.optim.Adam, "num_passes": 1, "minibatch_size": None}
+
+    def both():
+        loss = PPOLoss(actor, clip_epsilon=0.2, entropy_coeff=0.0)
+        second = MinibatchUpdate(cup_loss(actor, 1.0), **settings)
+        return UpdatesInTurn(MinibatchUpdate(loss, **settings), {"projection": second})
+
+    update, twin = both(), both()
+    update(batch)
+    twin.load_state_dict(update.state_dict())
+    for name in ("first", "projection"):
+        state = twin.state_dict()[name]["optimizer"]["state"]
+        expected = update.state_dict()[name]["optimizer"]["state"]
+        assert state
+        assert torch.equal(state[0]["exp_avg"], expected[0]["exp_avg"])
+
+
+def truncated_case():
+    """A policy whose divergence is known from samples only."""
+    net = torch.nn.Sequential(torch.nn.Linear(3, 4), NormalParamExtractor())
+    actor = ProbabilisticActor(
+        TensorDictModule(net, ["observation"], ["loc", "scale"]),
+        in_keys=["loc", "scale"],
+        distribution_class=TruncatedNormal,
+        return_log_prob=True,
+    )
+    return actor, make_batch(actor, [8], 1)
+
+
+def test_errors_say_what_to_change():
+    actor = make_actor()
+    batch = make_batch(actor, [8], 1)
+    with pytest.raises(KeyError, match="anchor"):
+        cup_loss(actor, 1.0)(batch)
+    with pytest.raises(ValueError, match="below 1"):
+        cup_loss(actor, 1.0, gamma=1.0)
+    with pytest.raises(TypeError, match="needs a LagrangeMultiplier"):
+        CUPLoss(actor, None, gamma=0.99, lmbda=0.97, entropy_coeff=0.0)
+    actor, sampled = truncated_case()
+    loss = cup_loss(actor, 1.0)
+    with pytest.raises(TypeError, match="KL divergence"):
+        loss(loss.anchor(sampled))
