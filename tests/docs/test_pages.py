@@ -1,0 +1,135 @@
+"""Every page: its snippets run, and its commands are what the program takes.
+
+In the order in which they stand on the page: a block below `<!-- file: name -->` is that file,
+blocks of Python run, and of commands everything is checked that is checked before a run begins. A
+command with an ellipsis is for the reader to fill in.
+"""
+
+import re
+import shlex
+import sys
+from pathlib import Path
+from typing import NamedTuple
+
+import pytest
+from registrations import undone
+
+import safe_rl
+from safe_rl import targets
+from safe_rl.cli import user_code
+from safe_rl.cli.composing import check_command
+from safe_rl.cli.conf import CONF
+from safe_rl.cli.evaluate import EvaluationOptions
+from safe_rl.cli.options import parse_options
+from safe_rl.cli.report import ReportOptions
+from safe_rl.cli.shorthands import expand_arguments
+from safe_rl.cli.user_code import import_modules, note_imports, split_imports
+from safe_rl.evaluation.settings import check_options
+
+ROOT = Path(__file__).resolve().parents[2]
+PAGES = ["README.md", *(str(p.relative_to(ROOT)) for p in sorted((ROOT / "docs").rglob("*.md")))]
+# snippets that have tests of their own, with more to say
+TESTED_ELSEWHERE = ("README.md", "docs/environments.md", "docs/algorithms")
+BLOCK = re.compile(
+    r"^(?:<!-- file: (?P<file>\S+) -->\n)?```(?P<language>\w*)\n(?P<text>.*?)^```", re.M | re.S
+)
+
+
+class Block(NamedTuple):
+    """What is fenced: the name of a file or None, a language or "", and the text."""
+
+    file: str | None
+    language: str
+    text: str
+
+
+def blocks(page: str) -> list[Block]:
+    return [Block(*match.groups()) for match in BLOCK.finditer((ROOT / page).read_text())]
+
+
+def commands(text: str) -> list[list[str]]:
+    """Words of our commands in a block, without comments and the words before them."""
+    lines = text.replace("\\\n", " ").splitlines()
+    found = (re.search(r"python (train\.py|-m safe_rl\.\w+)( .*)?$", line) for line in lines)
+    written = [match.group().removeprefix("python ") for match in found if match]
+    return [shlex.split(line, comments=True) for line in written if "…" not in line]
+
+
+@pytest.fixture(scope="session")
+def run_folder(tmp_path_factory):
+    """A finished run, for commands that take one."""
+    small = {"num_envs": 2, "frames_per_batch": 40, "frames": 80, "env.num_steps": 20}
+    folder = tmp_path_factory.mktemp("run")
+    return safe_rl.train(directory=folder, logger="none", num_threads=1, **small).directory
+
+
+@pytest.fixture
+def workplace(tmp_path, monkeypatch):
+    """The folder that a page's reader is in: a checkout, as far as pages name what is in it."""
+    (tmp_path / "examples").symlink_to(ROOT / "examples")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", [str(tmp_path), *sys.path])
+    monkeypatch.setattr(user_code, "_imported", [])
+    monkeypatch.setattr(targets, "_users_modules", set())
+    with undone():
+        yield tmp_path
+    for name, module in list(sys.modules.items()):
+        if str(getattr(module, "__file__", None)).startswith((str(tmp_path), str(ROOT / "exa"))):
+            del sys.modules[name]
+
+
+def check(words: list[str], run: Path) -> None:
+    """Check a command as the program does, up to where it begins to work."""
+    place = re.compile(r"^((?:resume|init_from)=)?(?:runs/[\w/.-]+|RUN_DIR)$")
+    program, *arguments = [place.sub(lambda m: f"{m[1] or ''}{run}", word) for word in words]
+    if program == "-m":
+        module, _, *options = arguments
+        schema = {"safe_rl.evaluate": EvaluationOptions, "safe_rl.report": ReportOptions}[module]
+        _, options = split_imports([o for o in options if o != "--help"])
+        parsed = parse_options(options, schema)
+        if isinstance(parsed, EvaluationOptions):
+            check_options(parsed)
+        return
+    modules, given = split_imports(arguments)
+    if modules is not None:
+        import_modules(modules)
+        given = note_imports(modules, given)
+    # Hydra does not say of which extra a launcher is
+    given = [word for word in given if not word.startswith(("hydra/launcher=", "hydra.launcher."))]
+    check_command(expand_arguments(given), CONF)
+
+
+@pytest.mark.parametrize("page", PAGES)
+def test_snippets_run_and_commands_are_taken(page, workplace, run_folder):
+    names = {"__name__": "page"}
+    for block in blocks(page):
+        if block.file:
+            (workplace / block.file).parent.mkdir(parents=True, exist_ok=True)
+            (workplace / block.file).write_text(block.text)
+        elif block.language == "python" and not page.startswith(TESTED_ELSEWHERE):
+            exec(compile(block.text, page, "exec"), names)
+        elif block.language in ("", "sh", "bash"):
+            for words in commands(block.text):
+                try:
+                    check(words, run_folder)
+                except Exception as error:
+                    if "comes with the extra" in str(error):
+                        continue  # which not everybody has
+                    raise AssertionError(f"{page}: {shlex.join(words)}: {error}") from error
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    ["train.py env=PointGaol1", "train.py alog=cpo", "-m safe_rl.evaluate RUN_DIR episode=3"],
+)
+def test_a_wrong_command_is_found(wrong, workplace, run_folder):
+    with pytest.raises(ValueError, match=r"Did you mean|nothing reads|no option|Unknown"):
+        check(wrong.split(), run_folder)
+
+
+def test_there_are_commands_and_snippets():
+    """The pattern finds them: pages that teach have both."""
+    found = {page: blocks(page) for page in PAGES}
+    for page in ("docs/start.md", "docs/guides/environment.md", "docs/guides/gymnasium.md"):
+        assert any(block.language == "python" for block in found[page]), page
+        assert sum(len(commands(block.text)) for block in found[page] if not block.file), page

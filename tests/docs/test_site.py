@@ -1,0 +1,76 @@
+"""What the site makes: tables of the environments, links out of `docs/`, its navigation."""
+
+import re
+from pathlib import Path
+
+import catalogue
+import links
+import pytest
+import yaml
+
+from safe_rl.envs import SUITE, key_table
+from safe_rl.envs.safety_gym.rules.costs import COSTS
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+def cells(page):
+    return {
+        re.split(r" ?\| ?", line)[1].strip("`"): line for line in page.splitlines() if "|" in line
+    }
+
+
+def test_every_key_has_its_row_below_a_heading():
+    page = catalogue.keys()
+    assert {row.name for row in key_table()} <= set(cells(page))
+    assert "| number | greater than 0 | `0.3` | radius [m] |" in cells(page)["hazards_size"]
+    assert page.index("## Hazards") < page.index("`hazards_size`") < page.index("## Vases")
+
+
+def test_every_environment_and_cost_has_its_row():
+    rows = cells(catalogue.benchmark())
+    assert set(SUITE) <= set(rows)
+    assert "| 60 | 2 | `cost_hazards` |" in rows["PointGoal1"]
+    assert {row.key for row in COSTS} == set(catalogue.COST_MEANINGS) - {"cost", "cost_exception"}
+    assert {row.key for row in COSTS} <= set(cells(catalogue.costs()))
+
+
+def test_every_component_of_the_observation_is_explained():
+    rows = cells(catalogue.observations())
+    assert "| 3 | any | m/s² |" in rows["accelerometer"]
+    assert "[0, 1]" in rows["…_lidar"]
+    with pytest.raises(KeyError, match="smell"):
+        catalogue.component_of("smell")
+
+
+def test_pages_ask_for_every_table():
+    pages = "".join(page.read_text() for page in (ROOT / "docs" / "environments").glob("*.md"))
+    assert set(re.findall(r"<!-- made: (\w+) -->", pages)) == set(catalogue.TABLES)
+    assert catalogue.fill("a\n<!-- made: lidars -->\nb").count("`observe_hazards`") == 1
+
+
+def test_links_to_files_outside_lead_to_their_pages(tmp_path):
+    (tmp_path / "conf").mkdir()
+    (tmp_path / "conf" / "a.yaml").write_text("x: 1\n")
+    text = "[a](../../conf/a.yaml) [all](../../conf#top) [gone](../../conf/b.yaml) [p](other.md)"
+    pages = links.linked_files({"guides/x.md": text}, tmp_path)
+    assert set(pages) == {"files/conf/a.yaml.md", "files/conf.md"}
+    assert "x: 1" in pages["files/conf/a.yaml.md"]
+    led = links.rewrite(text, "guides/x.md", tmp_path)
+    assert led == (
+        "[a](../files/conf/a.yaml.md) [all](../files/conf.md#top) "
+        "[gone](../../conf/b.yaml) [p](other.md)"
+    )
+
+
+def test_every_page_is_in_the_navigation_once():
+    class Loader(yaml.SafeLoader):
+        """What names objects of Python is none of ours."""
+
+    Loader.add_multi_constructor("!!python", lambda *_: None)
+    Loader.add_multi_constructor("tag:yaml.org,2002:python", lambda *_: None)
+    config = yaml.load((ROOT / "mkdocs.yml").read_text(), Loader)
+    named = re.findall(r"[\w/]+\.md", str(config["nav"]))
+    assert len(named) == len(set(named))
+    there = {p.relative_to(ROOT / "docs").as_posix() for p in (ROOT / "docs").rglob("*.md")}
+    assert {page for page in there if not page.startswith("algorithms/")} <= set(named)
