@@ -110,10 +110,10 @@ KEYS = {
     "memory": Key(component, "what is learned from, off policy", may_lack=True),
     "actor": Key(component, "the policy's network, off policy", may_lack=True),
     "critics": Key(_SECTION, "sizes of the ensembles of Q functions", may_lack=True),
-    "critics.rewards": Key(count(1, 1000), "Q functions of the reward", may_lack=True),
-    "critics.costs": Key(count(1, 1000), "Q functions of the costs", may_lack=True),
+    "critics.rewards": Key(count(1, 1000), "Q functions of the reward"),
+    "critics.costs": Key(count(1, 1000), "Q functions of the costs"),
     "exploration": Key(_SECTION, "how a memory is filled", may_lack=True),
-    "exploration.random_steps": Key(count(0), "steps taken at random first", may_lack=True),
+    "exploration.random_steps": Key(count(0), "steps taken at random first"),
     "exploration.noise": Key(
         _NOT_NEGATIVE, "standard deviation of a deterministic actor's noise", may_lack=True
     ),

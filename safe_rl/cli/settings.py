@@ -141,8 +141,14 @@ def _entries_of_keys(values: Mapping[str, Any]) -> Iterator[_Entry]:
         is_part = path.startswith("collector.") and values["collector"].get("_target_")
         if node is not _MISSING and not is_part:
             yield _Entry(path, row, node)
-        elif node is _MISSING and not row.may_lack:
+        elif node is _MISSING and not row.may_lack and not _lacks_section(values, path):
             raise SettingError(f"{path} is missing: {row.meaning}.")
+
+
+def _lacks_section(values: Mapping[str, Any], path: str) -> bool:
+    """Whether a key's section is not there, and need not be."""
+    section = path.partition(".")[0]
+    return section != path and section not in values and KEYS[section].may_lack
 
 
 def _entries_of_parts(values: Mapping[str, Any]) -> Iterator[_Entry]:
