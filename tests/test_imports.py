@@ -120,7 +120,7 @@ FLOORS = {
         ("record", "resuming"),
         ("",),
     ),
-    "training": (("interrupts", "state", "transfer"), ("trainer",), ("",)),
+    "training": (("evaluating", "interrupts", "state", "transfer"), ("trainer",), ("",)),
     "scores": (
         ("certificate", "dominance", "intervals", "learning", "published"),
         ("benchmark", "comparisons", "normalised", "slates"),
@@ -141,7 +141,7 @@ FLOORS = {
     ),
     "evaluation": (
         ("episodes", "layouts", "loading", "settings"),
-        ("certifying", "summary", "video"),
+        ("certifying", "during", "summary", "video"),
         ("measuring",),
         ("",),
     ),

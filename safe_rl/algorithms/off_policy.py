@@ -74,8 +74,7 @@ class OffPolicy:
         if getattr(constraints, "risk", None) is not None:
             raise ValueError(
                 f"risk: algo={config.algo.name} limits mean costs only, for what a risk measure "
-                "charges for a step depends on the episode. Use an on-policy algorithm, or "
-                "risk=mean."
+                "charges for a step depends on the episode: use risk=mean, or learn on policy."
             )
         loss = build_part(
             config.loss,

@@ -117,6 +117,9 @@ KEYS = {
     "exploration.noise": Key(
         _NOT_NEGATIVE, "standard deviation of a deterministic actor's noise", may_lack=True
     ),
+    "evaluation": Key(optional(_SECTION), "evaluation while training", may_lack=True),
+    "evaluation.interval": Key(count(), "steps between evaluations", may_lack=True),
+    "evaluation.episodes": Key(count(1, 10**6), "episodes of an evaluation", may_lack=True),
     "loss": Key(component, "the policy's loss", may_lack=True),
     "policy_update": Key(component, "what moves the policy", may_lack=True),
     "then": Key(

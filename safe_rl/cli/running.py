@@ -19,6 +19,8 @@ from safe_rl.cli.run_folders import write_notes
 from safe_rl.cli.settings import check_settings
 from safe_rl.cli.user_code import imported, make_after_imports
 from safe_rl.envs import LayoutError, complete_env, make_env
+from safe_rl.evaluation.during import PeriodicEvaluation
+from safe_rl.evaluation.layouts import default_seed
 from safe_rl.evaluation.loading import transforms_of
 from safe_rl.runs.folder import RunFolder
 from safe_rl.runs.lock import held
@@ -55,7 +57,17 @@ def prepare(config: DictConfig, directory: Path, continues: bool) -> Trainer | N
         transforms=transforms_of(config),
     )
     in_workers = partial(make_after_imports, imported(), make)
-    trainer = build_trainer(config, make(num_envs=config.num_envs), directory, in_workers)
+    training = make(num_envs=config.num_envs)
+    evaluation = None
+    if config.get("evaluation") is not None:
+        evaluation = partial(
+            PeriodicEvaluation,
+            partial(make, evaluating=True),
+            cost_keys=training.cost_keys,
+            seed=default_seed(env, config.seed),
+            **config.evaluation,
+        )
+    trainer = build_trainer(config, training, directory, in_workers, evaluation)
     if continues and trainer.resume():
         print(f"Going on after {trainer.progress.steps:,} of {config.frames:,} frames.")
         if trainer.begins_anew:

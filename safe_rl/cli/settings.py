@@ -29,6 +29,7 @@ _SECTIONS = (
         "checkpoint",
         "collector",
         "critics",
+        "evaluation",
         "exploration",
         "logger",
         "model",

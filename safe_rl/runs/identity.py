@@ -62,6 +62,7 @@ ROLES: dict[str, Role] = {
     "collector": Role.MANNER,
     "collector.ray_init": Role.MACHINE,
     "default_cost_limits": Role.MANNER,
+    "evaluation": Role.MANNER,
     "certificate": Role.MACHINE,  # what is found out about a run, not what it is
     "checkpoint": Role.MACHINE,
     "compile": Role.MACHINE,

@@ -27,6 +27,7 @@ from safe_rl.runs.lock import held
 from safe_rl.runs.outcome import keeps
 from safe_rl.runs.record import RunRecord
 from safe_rl.targets import build
+from safe_rl.training.evaluating import Evaluation, MakeEvaluation
 from safe_rl.training.interrupts import StopRequest
 from safe_rl.training.state import Progress, WorldSnapshot
 
@@ -60,7 +61,11 @@ def physics_threads(config: DictConfig) -> int:
 
 
 def build_trainer(
-    config: DictConfig, env: EnvBase, directory: Path, make_env: MakeEnv | None = None
+    config: DictConfig,
+    env: EnvBase,
+    directory: Path,
+    make_env: MakeEnv | None = None,
+    make_evaluation: MakeEvaluation | None = None,
 ) -> Trainer:
     """Build everything that a run consists of.
 
@@ -71,6 +76,7 @@ def build_trainer(
         directory: Folder of the run.
         make_env: Makes an environment like ``env`` with another ``num_envs``, for collectors with
             workers.
+        make_evaluation: Makes, of the policy, what evaluates it in between.
 
     Raises:
         ValueError: If parts of the configuration do not fit together.
@@ -84,6 +90,7 @@ def build_trainer(
         cost_limits=cost_limits,
         folder=RunRecord(directory, config, cost_limits, env.max_episode_steps),
         config=config,
+        evaluation=None if make_evaluation is None else make_evaluation(algorithm.policy),
     )
 
 
@@ -107,6 +114,7 @@ class Trainer:
         cost_limits: Cost key -> d, undiscounted cost per episode: what counts as feasible.
         folder: Where the run writes.
         config: Configuration of the run, for ``frames`` and ``checkpoint``.
+        evaluation: Evaluates the policy after every epoch in which that is due, or None.
     """
 
     def __init__(
@@ -118,6 +126,7 @@ class Trainer:
         cost_limits: Mapping[str, float],
         folder: RunRecord,
         config: DictConfig,
+        evaluation: Evaluation | None = None,
     ) -> None:
         self.algorithm = algorithm
         self.accounting = EpisodeAccounting(
@@ -132,6 +141,7 @@ class Trainer:
         self.interrupted_by: Signals | None = None
         self._collector = collector
         self._env = env
+        self._evaluation = evaluation
         # the worlds of workers are out of reach
         self._worlds = None
         if isinstance(collector, Collector) and hasattr(env, "get_state"):
@@ -268,12 +278,18 @@ class Trainer:
         episodes = self.accounting.update(batch)
         learned = self.algorithm.learn(batch, episodes)
         end = time.perf_counter()
+        before = self.progress.steps
         self.progress.add(batch.numel(), end - start)
+        evaluated: dict[str, float] = {}
+        if self._evaluation is not None:
+            with torch_threads(1):
+                evaluated = self._evaluation(before, self.progress.steps)
         return {
             "epoch": self.progress.epoch,
             "steps": self.progress.steps,
             **episodes.scalars(),
             **learned,
+            **evaluated,
             "time_collect": collected - start,
             "time_learn": end - collected,
             "time_total": self.progress.seconds,

@@ -119,6 +119,7 @@ SHARED = {
     "advantage": {"_target_": "safe_rl.objectives.VectorGAE", **DISCOUNT},
     "critic_update": {**FULL_BATCH, "optimizer": {**ADAM, "lr": 1e-3}},
     "cost_limits": {"cost": 25.0},
+    "risk": {"_target_": None},
 }
 COSTS = {
     "cost_advantage": {"_target_": "safe_rl.objectives.CostGAE", **DISCOUNT},

@@ -1,5 +1,8 @@
 """Runs that learn from memory: they learn, resume, start from one another and are evaluated."""
 
+import math
+from functools import partial
+
 import pytest
 import torch
 from point_mass import PointMass
@@ -8,6 +11,7 @@ from torchrl.data import Unbounded
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from safe_rl.algorithms import OffPolicy
+from safe_rl.evaluation.during import PeriodicEvaluation
 from safe_rl.evaluation.episodes import collect_episodes
 from safe_rl.evaluation.loading import find_checkpoint, load_config, load_policy
 from safe_rl.runs.table import read_table
@@ -157,6 +161,35 @@ def test_evaluation_finds_its_policy_without_what_explores(algo, make_trainer, t
     assert torch.equal(*samples) is (algo == "td3")
     episodes = collect_episodes(env, policy, 3, env.cost_keys, deterministic=False)
     assert episodes.lengths.tolist() == [20, 20, 20]
+
+
+def test_it_is_evaluated_in_between_without_noise_and_without_consequences(tmp_path):
+    def train(name, interval=None):
+        config = off_policy_config("algo=sac", "frames=800")
+        seed_everything(0, None)
+        evaluation = None
+        if interval:
+            evaluation = partial(
+                PeriodicEvaluation, partial(PointMass, num_steps=20),
+                cost_keys=["cost"], interval=interval, episodes=6, seed=5,
+            )  # fmt: skip
+        env = PointMass(4, 20)
+        trainer = build_trainer(config, env, tmp_path / name, make_evaluation=evaluation)
+        trainer.run()
+        return trainer, read_table(tmp_path / name / "progress.csv")
+
+    trainer, evaluated = train("evaluated", interval=400)
+    _, plain = train("plain")
+    columns = {"evaluation_return", "evaluation_cost"}
+    assert set(evaluated) - set(plain) == columns
+    assert evaluated["policy_loss_actor"][1:] == plain["policy_loss_actor"][1:]
+    assert evaluated["episode_return"] == plain["episode_return"]
+    known = [not math.isnan(value) for value in evaluated["evaluation_return"]]
+    assert known == [False, False, True, False, True]
+    policy, env = trainer.algorithm.policy, PointMass(6, 20, seed=805)
+    expected = collect_episodes(env, policy, 6, ["cost"], deterministic=True)
+    assert evaluated["evaluation_return"][-1] == pytest.approx(expected.returns.mean().item())
+    assert evaluated["evaluation_cost"][-1] == expected.costs["cost"].mean().item()
 
 
 def test_actions_without_bounds_are_refused():
