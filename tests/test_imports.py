@@ -116,7 +116,7 @@ FLOORS = {
     ),
     "runs": (
         ("archive", "files", "folder", "outcome"),
-        ("checkpoints", "curves", "identity", "lock", "loggers", "table"),
+        ("checkpoints", "curves", "identity", "keeping", "lock", "loggers", "table"),
         ("record", "resuming"),
         ("",),
     ),

@@ -14,6 +14,7 @@ from pathlib import Path, PurePosixPath
 # page of the site -> Markdown elsewhere in the repository that is shown as it stands
 PAGES = {
     "benchmarks.md": "benchmarks/README.md",
+    "campaigns.md": "results/README.md",
     "changelog.md": "CHANGELOG.md",
     "contributing.md": "CONTRIBUTING.md",
 }

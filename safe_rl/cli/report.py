@@ -12,6 +12,7 @@ from safe_rl.cli.options import OptionError, parse_options, usage
 from safe_rl.cli.user_code import import_modules, split_imports
 from safe_rl.reporting import Report, build_report, write_report
 from safe_rl.reporting.recorded import clean
+from safe_rl.runs.keeping import keep_runs
 from safe_rl.scores.published import SEEDS
 
 __all__ = ["ReportOptions", "main", "report"]
@@ -36,6 +37,10 @@ class ReportOptions:
     )
     unfinished: bool = field(
         default=False, metadata={"help": "count runs that have not come to their end"}
+    )
+    archive: str | None = field(
+        default=None,
+        metadata={"help": "folder to keep the runs in for others, tables compressed; null: none"},
     )
     title: str | None = field(default=None, metadata={"help": "heading; null: the folder's name"})
 
@@ -71,8 +76,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
         modules, arguments = split_imports(arguments)
         import_modules(modules or ())
         options = parse_options(arguments[1:], ReportOptions)
-        result, page = report(Path(arguments[0]), options)
-    except (OptionError, FileNotFoundError, ModuleNotFoundError, ValueError) as error:
+        root = Path(arguments[0])
+        result, page = report(root, options)
+        if options.archive is not None:
+            keep_runs((run.directory for run in result.runs), root, Path(options.archive))
+            print(f"kept {len(result.runs)} runs in {options.archive}")
+    except (OptionError, OSError, ModuleNotFoundError, ValueError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 1
     for path, reason in result.skipped.items():

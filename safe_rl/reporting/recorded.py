@@ -167,9 +167,10 @@ def _read_run(folder: RunFolder, root: Path, unfinished: bool, skipped: dict[Pat
     for key, is_right, wanted in _NEEDED:
         if not is_right(config.get(key)):
             raise ValueError(f"config.yaml is not that of a run: its '{key}' is not {wanted}")
-    if not folder.table.is_file():
+    recorded = folder.recorded_table
+    if not recorded.is_file():
         raise ValueError("it has not begun: no progress.csv")
-    table = _read_numbers(_own(folder.table, root), config["cost_limits"] or {})
+    table = _read_numbers(_own(recorded, root), config["cost_limits"] or {})
 
     def read(paths: Iterable[Path], reader: Callable[[Path], Any]) -> list[Any]:
         """What files of the run hold; those that cannot be read are noted."""
@@ -198,7 +199,7 @@ def _read_run(folder: RunFolder, root: Path, unfinished: bool, skipped: dict[Pat
         Path(cwd) if isinstance(cwd, str) else None,
         tuple(filter(None, read(folder.evaluations(), _read_evaluation))),
         tuple(read(sorted(folder.directory.rglob("*.mp4")), lambda path: path)),
-        folder.table.stat().st_mtime,
+        recorded.stat().st_mtime,
     )
 
 

@@ -50,6 +50,17 @@ class RunFolder:
         return self.directory / "progress.csv"
 
     @property
+    def packed_table(self) -> Path:
+        """The table of a run that is kept without what it takes to go on, compressed."""
+        return self.directory / "progress.csv.gz"
+
+    @property
+    def recorded_table(self) -> Path:
+        """The table as it is there: plain, or else compressed."""
+        is_packed = self.packed_table.is_file() and not self.table.is_file()
+        return self.packed_table if is_packed else self.table
+
+    @property
     def curves(self) -> Path:
         """The picture of its learning curves."""
         return self.directory / "curves.png"

@@ -3,13 +3,19 @@
 from __future__ import annotations
 
 import csv
+import gzip
+import io
 import math
+import zlib
 from collections.abc import Mapping
 from pathlib import Path
 
 from safe_rl.runs.files import replacing
 
 __all__ = ["TableWriter", "read_table"]
+
+# of a table that is unpacked; ten thousand epochs with a hundred columns have about 20 million
+_MOST_BYTES = 100_000_000
 
 
 class TableWriter:
@@ -91,13 +97,12 @@ def _field(value: float) -> str:
 
 
 def read_table(path: Path) -> dict[str, list[float]]:
-    """Read a table by columns; empty fields are NaN.
+    """Read a table by columns, also a compressed one (``.gz``); empty fields are NaN.
 
     Raises:
-        ValueError: If the file has no header.
+        ValueError: If the file has no header, or holds more than any table of a run.
     """
-    with path.open(newline="") as file:
-        rows = list(csv.reader(file))
+    rows = list(csv.reader(io.StringIO(_text(path), newline="")))
     if not rows:
         raise ValueError(f"{path} is empty: the run has not finished an epoch.")
     columns = zip(*rows[1:], strict=True) if len(rows) > 1 else ([] for _ in rows[0])
@@ -105,3 +110,16 @@ def read_table(path: Path) -> dict[str, list[float]]:
         name: [float(field) if field else math.nan for field in column]
         for name, column in zip(rows[0], columns, strict=True)
     }
+
+
+def _text(path: Path) -> str:
+    if path.suffix != ".gz":
+        return path.read_text()
+    try:
+        with gzip.open(path, "rb") as file:
+            content = file.read(_MOST_BYTES + 1)  # a small file can unpack to any size
+    except (EOFError, zlib.error, gzip.BadGzipFile) as error:
+        raise ValueError(f"{path} is damaged: {error}") from error
+    if len(content) > _MOST_BYTES:
+        raise ValueError(f"{path} unpacks to more than {_MOST_BYTES:,} bytes.")
+    return content.decode()

@@ -1,0 +1,44 @@
+"""The results in the repository: complete, readable, and what is said of them is what they hold."""
+
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from safe_rl.reporting.recorded import find_runs
+from safe_rl.runs.table import read_table
+
+RESULTS = Path(__file__).parents[2] / "results"
+PAGE = (RESULTS / "README.md").read_text()
+ROWS = re.findall(r"^\| `(\S+/seed\d+)` \| (.*) \|$", PAGE, re.MULTILINE)
+
+
+def test_every_run_can_be_reported_and_every_campaign_is_listed():
+    runs, skipped = find_runs(RESULTS)
+    assert not skipped
+    assert all(run.is_finished and run.command for run in runs)
+    campaigns = {run.directory.relative_to(RESULTS).parts[0] for run in runs}
+    assert campaigns == set(re.findall(r"^\| `(\w+)` \|", PAGE, re.MULTILINE))
+    # what a repository can carry, and nothing that a report does not read
+    files = [path for path in RESULTS.rglob("*") if path.is_file()]
+    assert sum(path.stat().st_size for path in files) < 10_000_000
+    assert not [path for path in files if path.suffix in (".torchrl", ".csv", ".png")]
+
+
+@pytest.mark.parametrize(("run", "row"), ROWS)
+def test_the_figures_are_those_of_the_tables(run, row):
+    columns = read_table(next(RESULTS.glob(f"*/{run}")) / "progress.csv.gz")
+    steps, returns, costs = (
+        np.array(columns[name]) for name in ("steps", "episode_return", "episode_cost")
+    )
+    *halves, above = row.split(" | ")
+    assert len(halves) == steps[-1] / 500_000
+    for number, said in enumerate(halves):
+        known = (steps > number * 500_000) & (steps <= (number + 1) * 500_000)
+        assert f"{np.nanmean(returns[known]):.1f} / {np.nanmean(costs[known]):.0f}" == said
+    assert f"{np.mean(costs[steps > 1_000_000] > 25):.0%}".replace("%", " %") == above
+
+
+def test_there_are_rows():
+    assert len(ROWS) >= 2
