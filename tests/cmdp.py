@@ -96,11 +96,11 @@ def rollout(cmdp, actor):
     return data, costs.sum(1).mean(0)
 
 
-def train(cmdp, actor, update, epochs):
+def train(cmdp, actor, update, epochs, rollout=rollout, mean=policy_mean):
     """Run epochs of rollout, advantages, policy update and critic fit.
 
     `update(batch, mean_costs)` changes the actor. Returns the means of the policy after every
-    epoch, [epochs, 2].
+    epoch, [epochs, 2], or what another function says of it.
     """
     num_costs = len(cmdp.limits)
     critic = TensorDictModule(nn.Linear(1, 1), ["observation"], ["state_value"])
@@ -115,7 +115,7 @@ def train(cmdp, actor, update, epochs):
         for estimator in estimators:
             estimator(data)
         update(normalise_advantages(data), mean_costs)
-        means.append(policy_mean(actor))
+        means.append(mean(actor))
         for _ in range(10):
             losses = critic_loss(data)
             adam.zero_grad()

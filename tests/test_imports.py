@@ -78,7 +78,7 @@ FLOORS = {
         ("velocity.env",),
         ("velocity.nodes",),
         ("velocity",),
-        ("gymnasium.processes", "gymnasium.worlds"),
+        ("gymnasium.outside", "gymnasium.processes", "gymnasium.worlds"),
         ("gymnasium.conversion", "gymnasium.single", "gymnasium.vector"),
         ("gymnasium.nodes",),
         ("gymnasium.family",),
@@ -86,7 +86,8 @@ FLOORS = {
         ("names",),
         # What changes any of them from outside.
         ("transforms.base",),
-        ("transforms.action_filter", "transforms.early_termination", "transforms.saute"),
+        ("transforms.action_filter", "transforms.early_termination"),
+        ("transforms.policy_memory", "transforms.saute"),
         ("transforms.environment",),
         ("transforms",),
         ("families",),
@@ -103,7 +104,14 @@ FLOORS = {
         ("",),
     ),
     "collectors": (("accounting", "factory", "workers"), ("",)),
-    "models": (("scaling",), ("networks", "q_networks"), ("behaviour", "exploring"), ("",)),
+    "models": (
+        ("distributions", "memory", "normalising", "scaling"),
+        ("heads",),
+        ("networks", "q_networks"),
+        ("behaviour", "encoders", "exploring"),
+        ("building",),
+        ("",),
+    ),
     "algorithms": (
         ("contract", "constraints", "learning_rate", "trust_region_step"),
         (

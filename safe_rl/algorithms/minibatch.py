@@ -19,7 +19,7 @@ from torchrl.objectives import LossModule
 from torchrl.objectives.common import AUTO_LOSS_MASK_KEYS
 
 from safe_rl.algorithms.learning_rate import KLAdaptiveRate
-from safe_rl.objectives.samples import flat_samples, require_finite
+from safe_rl.objectives.samples import learning_samples, require_finite
 
 __all__ = ["MinibatchUpdate"]
 
@@ -29,7 +29,8 @@ class MinibatchUpdate:
 
     Every pass shuffles the batch once and cuts it into contiguous minibatches of equal size: as
     many as fit ``minibatch_size`` best. Samples that are left over (fewer than there are
-    minibatches) wait for the next pass's shuffle.
+    minibatches) wait for the next pass's shuffle. Of a policy with a memory, whole sequences are
+    shuffled instead of samples.
 
     If the loss reports ``kl``, ``max_kl`` stops the update as soon as it is exceeded. The KL is
     that of the minibatch at hand at the parameters before its step, so the check costs nothing and
@@ -135,7 +136,8 @@ class MinibatchUpdate:
             anchor(batch)
         require_finite(batch, self.loss.in_keys)
         mask_keys = [key for key in AUTO_LOSS_MASK_KEYS if batch.get(key, None) is not None]
-        samples = flat_samples(batch.select(*self.loss.in_keys, *mask_keys))
+        selected = batch.select(*self.loss.in_keys, *mask_keys)
+        samples = learning_samples(selected, self.loss.in_keys)
         for minibatch in self._minibatches(samples):
             total, losses = self._evaluate(minibatch)
             history.append(losses.detach())
@@ -154,7 +156,7 @@ class MinibatchUpdate:
                 stacklevel=2,
             )
         elif self.adapt_rate is not None and self.max_kl is not None:
-            planned = self.num_passes * self._num_minibatches(samples.shape[0])
+            planned = self.num_passes * self._num_minibatches(samples)
             shares = {
                 "share_of_steps": num_steps / planned,
                 "share_of_kl": float(diagnostics["kl"]) / self.max_kl,
@@ -165,19 +167,21 @@ class MinibatchUpdate:
             diagnostics["lr"] = torch.tensor(self.optimizer.param_groups[0]["lr"])
         return diagnostics
 
-    def _num_minibatches(self, num_samples: int) -> int:
-        size = num_samples if self.minibatch_size is None else self.minibatch_size
-        return max(1, round(num_samples / size))
+    def _num_minibatches(self, samples: TensorDictBase) -> int:
+        number = samples.numel()
+        size = number if self.minibatch_size is None else self.minibatch_size
+        # of sequences, which stay whole, there may be fewer
+        return max(1, min(round(number / size), samples.shape[0]))
 
     def _minibatches(self, samples: TensorDictBase) -> Iterator[TensorDictBase]:
-        num_samples = samples.shape[0]
-        num_minibatches = self._num_minibatches(num_samples)
-        size = num_samples // num_minibatches
+        rows = samples.shape[0]
+        num_minibatches = self._num_minibatches(samples)
+        size = rows // num_minibatches
         for _ in range(self.num_passes):
             if num_minibatches == 1:
                 yield samples
                 continue
-            shuffled = samples[torch.randperm(num_samples, device=samples.device)]
+            shuffled = samples[torch.randperm(rows, device=samples.device)]
             for start in range(0, size * num_minibatches, size):
                 yield shuffled[start : start + size]
 

@@ -25,6 +25,8 @@ from safe_rl.models import ExploringPolicy, QEnsemble, input_scale_vector
 
 __all__ = ["OffPolicy"]
 
+_ON_POLICY_ONLY = ("encoders", "memory", "normalise")
+
 
 @dataclass
 class OffPolicy:
@@ -178,7 +180,8 @@ class OffPolicy:
 def _action_spec(env: EnvBase) -> TensorSpec:
     """Of one environment's action, [A]; it has bounds."""
     spec = env.action_spec_unbatched
-    if not hasattr(spec, "low") or not (spec.low.isfinite() & spec.high.isfinite()).all():
+    is_continuous = hasattr(spec, "low") and spec.dtype.is_floating_point
+    if not is_continuous or not (spec.low.isfinite() & spec.high.isfinite()).all():
         raise ValueError(
             "This algorithm's actions lie within bounds, and those of this environment have none: "
             f"its action_spec is {type(spec).__name__}. Use algo=ppo_lagrangian, or bound them."
@@ -195,8 +198,13 @@ def _build_networks(
     config: DictConfig, env: EnvBase, num_costs: int, device: torch.device
 ) -> dict[str, Any]:
     """The actor, the reward critic and, for ``num_costs`` > 0, the cost critic."""
-    size = env.observation_spec["observation"].shape[-1]
     model, spec = config.model, _action_spec(env)
+    if others := [key for key in _ON_POLICY_ONLY if model.get(key)]:
+        raise ValueError(
+            f"algo={config.algo.name} learns with perceptrons on a vector as it is; model."
+            f"{others[0]} is for on-policy algorithms. Use model=mlp without it."
+        )
+    size = env.observation_spec["observation"].shape[-1]
     common: dict[str, Any] = {
         "hidden_sizes": list(model.hidden_sizes),
         "input_scale": input_scale_vector(model.input_scale, env.observation_layout),

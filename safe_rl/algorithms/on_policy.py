@@ -21,7 +21,7 @@ from safe_rl.algorithms.minibatch import MinibatchUpdate
 from safe_rl.algorithms.parts import build_part
 from safe_rl.algorithms.tracked_constraints import CHARGES
 from safe_rl.collectors import EpisodeStatistics
-from safe_rl.models import input_scale_vector, make_actor, make_behaviour, make_critic
+from safe_rl.models import build_networks, make_behaviour, take_in
 from safe_rl.objectives import CriticLoss
 from safe_rl.objectives.advantages import CostGAE, VectorGAE
 from safe_rl.objectives.normalisation import normalise_advantages
@@ -70,7 +70,7 @@ class OnPolicy:
             config, env, is_constrained=config.get("cost_advantage") is not None, otherwise="ppo"
         )
         device = torch.device(config.device)
-        networks = _build_networks(config.model, env, len(limits), device)
+        networks = _build_networks(config, env, len(limits), device)
         constraints = build_constraints(config, limits, env.max_episode_steps, device)
         parts = {
             "actor_network": networks["actor"],
@@ -101,7 +101,7 @@ class OnPolicy:
         cls, config: DictConfig, env: EnvBase, device: torch.device
     ) -> tuple[TensorDictModuleBase, Mapping[str, nn.Module]]:
         """Build what acts, and the networks that it consists of."""
-        actor = _build_networks(config.model, env, 0, device)["actor"]
+        actor = _build_networks(config, env, 0, device)["actor"]
         return make_behaviour(actor), {"actor": actor}
 
     @property
@@ -142,6 +142,7 @@ class OnPolicy:
             "critic": self.critic_update(batch),
         }
         constraints.expect(metrics["policy"])
+        take_in(self.networks.values(), batch)
         row = constraints.columns()
         for part, values in metrics.items():
             for name, value in values.items():
@@ -176,22 +177,13 @@ def _build_update(config: DictConfig, **parts: Any) -> PolicyUpdate:
 
 
 def _build_networks(
-    model: DictConfig, env: EnvBase, num_costs: int, device: torch.device
+    config: DictConfig, env: EnvBase, num_costs: int, device: torch.device
 ) -> dict[str, Any]:
-    """The actor, the reward critic and, for ``num_costs`` > 0, the cost critic."""
-    size = env.observation_spec["observation"].shape[-1]
-    common: dict[str, Any] = {
-        "hidden_sizes": list(model.hidden_sizes),
-        "input_scale": input_scale_vector(model.input_scale, env.observation_layout),
-        "device": device,
-    }
-    actions = env.action_spec.shape[-1]
-    networks: dict[str, Any] = {
-        "actor": make_actor(size, actions, initial_log_std=model.initial_log_std, **common),
-        "critic": make_critic(size, **common),
-    }
-    if num_costs:
-        networks["cost_critic"] = make_critic(
-            size, num_outputs=num_costs, out_key="cost_value", **common
-        )
-    return networks
+    return build_networks(
+        config.model,
+        env.observation_spec,
+        env.action_spec,
+        env.observation_layout,
+        num_costs=num_costs,
+        device=device,
+    )

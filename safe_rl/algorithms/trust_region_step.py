@@ -13,7 +13,7 @@ from torch import Tensor
 
 from safe_rl.objectives.distributions import ReferencePolicy
 from safe_rl.objectives.fisher import FisherProduct
-from safe_rl.objectives.samples import flat_samples, require_finite
+from safe_rl.objectives.samples import learning_samples, require_finite
 from safe_rl.objectives.trust_region import (
     backtracking_search,
     best_in_span,
@@ -173,7 +173,7 @@ class TRPOStep:
                 policy is as it was then.
         """
         require_finite(batch, getattr(self.loss, "in_keys", ()))
-        batch = flat_samples(batch)
+        batch = learning_samples(batch, self.actor_network.in_keys)
         with torch.no_grad():
             reference = ReferencePolicy(policy_in(self.actor_network, batch))
         losses = self.loss(batch)

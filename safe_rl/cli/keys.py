@@ -53,6 +53,9 @@ _NOT_NEGATIVE = number(0)
 _STRENGTH = number(1e-9, 1e9)  # what is divided by, and divides
 _LIMITS = mapping_of(number(0))
 _SECTION = mapping_of(anything)
+_WIDTH = count(1, 16_384)
+_WIDTHS = list_of(_WIDTH, 32)
+_HEADS = choice("auto", "gaussian", "tanh", "beta", "categorical", "one_hot")
 
 KEYS = {
     "frames": Key(count(), "steps to train for"),
@@ -95,9 +98,20 @@ KEYS = {
     ),
     "certificate.most_over": Key(_SHARE, "share of episodes over a limit", may_lack=True),
     "collector.num_collectors": Key(count(1, 1024), "processes that step environments"),
-    "model.hidden_sizes": Key(list_of(count(1, 16_384), 32), "widths of layers, such as [64, 64]"),
+    "model.hidden_sizes": Key(_WIDTHS, "widths of layers, such as [64, 64]"),
     "model.initial_log_std": Key(number(-20, 10), "log of the policy's first standard deviation"),
     "model.input_scale": Key(mapping_of(_POSITIVE), "factors by observation component"),
+    "model.head": Key(_HEADS, "distribution of the actions", may_lack=True),
+    "model.normalise": Key(
+        optional(_POSITIVE), "where normalised observations are cut; null: not", may_lack=True
+    ),
+    "model.encoders": Key(optional(_SECTION), "what encodes every entry observed", may_lack=True),
+    "model.encoders.vector": Key(optional(_WIDTHS), "layers for a vector", may_lack=True),
+    "model.encoders.channels": Key(optional(_WIDTHS), "layers for a picture", may_lack=True),
+    "model.encoders.kernels": Key(optional(_WIDTHS), "their sizes [pixels]", may_lack=True),
+    "model.encoders.strides": Key(optional(_WIDTHS), "their strides [pixels]", may_lack=True),
+    "model.memory": Key(optional(_SECTION), "what the policy remembers", may_lack=True),
+    "model.memory.size": Key(optional(_WIDTH), "numbers that are remembered", may_lack=True),
     "advantage": Key(component, "estimator of the reward's advantages", may_lack=True),
     "cost_advantage": Key(optional(component), "estimator of the costs' advantages", may_lack=True),
     "lagrangian": Key(optional(component), "the multiplier", may_lack=True),
@@ -358,6 +372,7 @@ PARTS = {
         "filter": Key(component, "the function that replaces actions"),
         "cost_key": Key(text, "name of the cost of interventions"),
     },
+    "PolicyMemory": {"size": Key(_WIDTH, "numbers that are remembered")},
     "TensorboardLogger": {"exp_name": Key(text, "folder of the event files")},
     "MLflowLogger": {
         "exp_name": Key(text, "name of the experiment"),

@@ -138,7 +138,9 @@ def _entries_of_keys(values: Mapping[str, Any]) -> Iterator[_Entry]:
     for path, row in KEYS.items():
         node: Any = values
         for name in path.split("."):
-            node = node.get(name, _MISSING) if isinstance(node, Mapping) else node
+            # there is nothing below what is null
+            below = _MISSING if node is None else node
+            node = node.get(name, _MISSING) if isinstance(node, Mapping) else below
         is_part = path.startswith("collector.") and values["collector"].get("_target_")
         if node is not _MISSING and not is_part:
             yield _Entry(path, row, node)

@@ -11,18 +11,21 @@ from typing import Any, Protocol, runtime_checkable
 
 import torch
 from tensordict import TensorDictBase
-from torchrl.data import Bounded, Composite, TensorSpec
+from torchrl.data import Bounded, Categorical, Composite, OneHot, TensorSpec
 from torchrl.envs import EnvBase
 
 COST = "cost"
+#: Continuous or integers within bounds, choices as integers, choices as one-hot vectors.
+ACTIONS = (Bounded, Categorical, OneHot)
 
 
 @runtime_checkable
 class ConstrainedEnv(Protocol):
     """N environments that are stepped together: an `EnvBase` of batch size [N], and more.
 
-    It reads `action` [N, A], bounded. It writes `observation`, `reward` [N, 1], every one of
-    `cost_keys` [N, 1], `done`, `terminated` and `truncated`. Costs stand in the reward spec.
+    It reads `action`: [N, A] bounded, or choices, [N] or [N, A] integers or [N, C] one-hot. It
+    writes `observation`, `reward` [N, 1], every one of `cost_keys` [N, 1], `done`, `terminated` and
+    `truncated`. Costs stand in the reward spec.
 
     Attributes:
         cost_keys: names of the costs; the aggregate `cost` is one of them.
@@ -68,7 +71,7 @@ class ConstrainedEnv(Protocol):
 
     @property
     def action_spec(self) -> TensorSpec:
-        """Bounds of the actions [N, A]."""
+        """Bounds, or numbers of choices, of the actions."""
         ...
 
     def reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDictBase:
@@ -152,8 +155,9 @@ def _shape_problems(env: EnvBase) -> Iterator[str]:
         )
     if "observation" not in env.observation_spec.keys():  # noqa: SIM118, a spec is no mapping
         yield f"it must observe 'observation', got {sorted(map(str, env.observation_spec.keys()))}."
-    if not (isinstance(env.action_spec, Bounded) and env.action_spec.dtype.is_floating_point):
-        yield f"its actions must be continuous and bounded, got {type(env.action_spec).__name__}."
+    if not isinstance(env.action_spec, ACTIONS):
+        kind = type(env.action_spec).__name__
+        yield f"its actions must be continuous and bounded, or choices, got {kind}."
     steps = getattr(env, "max_episode_steps", None)
     if isinstance(steps, bool) or not isinstance(steps, int) or steps < 1:
         yield f"'max_episode_steps' must be the largest number of steps of an episode, got {steps}."

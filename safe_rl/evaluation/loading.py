@@ -105,10 +105,11 @@ def load_policy(
     except CheckpointError as error:
         if "size mismatch" not in str(error):
             raise
-        size = env.observation_spec["observation"].shape[-1]
+        first = env.reset()[0]
+        sizes = [first["observation"].numel(), env.action_spec.zero()[0].numel()]
         raise CheckpointError(
             f"The policy in {checkpoint} was trained on other observations or actions than this "
-            f"environment's ({size} numbers, {env.action_spec.shape[-1]} actions): undo the env.… "
+            f"environment's ({sizes[0]} numbers, {sizes[1]} actions): undo the env.… "
             "override that changes them."
         ) from error
     return policy.eval()

@@ -35,7 +35,7 @@ class BehaviourPolicy(TensorDictModuleBase):
 
     Args:
         actor: Policy made by :func:`make_actor`, or any ``ProbabilisticTensorDictSequential``
-            whose first module maps one key to ``loc`` and ``scale`` and whose distribution is a
+            whose first module maps its keys to ``loc`` and ``scale`` and whose distribution is a
             diagonal Gaussian.
 
     Raises:
@@ -56,7 +56,7 @@ class BehaviourPolicy(TensorDictModuleBase):
         if len(actor.module) != 2 or sampler.distribution_class is not IndependentNormal:
             raise TypeError(
                 "BehaviourPolicy samples a network followed by an IndependentNormal, got "
-                f"{len(actor.module)} modules and {sampler.distribution_class.__name__}. Hand the "
+                f"{len(actor.module)} modules and {sampler.distribution_class}. Hand the "
                 "actor itself to the collector instead."
             )
         self.network = parameters.module
@@ -65,7 +65,7 @@ class BehaviourPolicy(TensorDictModuleBase):
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write the distribution's parameters, the action and its log-probability."""
-        loc, scale = self.network(tensordict.get(self.in_keys[0]))
+        loc, scale = self.network(*(tensordict.get(key) for key in self.in_keys))
         if exploration_type() in _WITHOUT_NOISE:
             noise = torch.zeros_like(loc)
         else:

@@ -1,35 +1,50 @@
-"""A Gaussian actor, and the reward and cost critics.
+"""Actors, and the reward and cost critics.
 
-All of them are separate multilayer perceptrons on a flat observation that share no weights
-(Ray, Achiam, Amodei 2019, section 5.1).
+All of them are separate networks that share no weights (Ray, Achiam, Amodei 2019, section 5.1).
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import torch
 from tensordict import NestedKey
 from tensordict.nn import (
-    AddStateIndependentNormalScale,
     ProbabilisticTensorDictModule,
     ProbabilisticTensorDictSequential,
     TensorDictModule,
+    TensorDictModuleBase,
 )
 from torch import Tensor, nn
 from torchrl.envs.utils import ExplorationType
-from torchrl.modules import MLP, IndependentNormal
+from torchrl.modules import MLP
 
+from safe_rl.models.heads import Head, gaussian_head
 from safe_rl.models.scaling import InputScale
 
-__all__ = ["make_actor", "make_critic"]
-
-# The scale of a policy is exp(log std) and must follow it over the whole range in use: the floor
-# only keeps a collapsed policy from dividing by zero.
-_SCALE_FLOOR = 1e-6
+__all__ = ["Chain", "assemble_actor", "make_actor", "make_critic", "perceptron"]
 
 
-def _mlp(
+class Chain(nn.Sequential):
+    """Modules one after the other, of which the first may take several inputs.
+
+    Examples:
+        >>> import torch
+        >>> Chain(nn.Bilinear(2, 3, 4), nn.Tanh())(torch.ones(5, 2), torch.ones(5, 3)).shape
+        torch.Size([5, 4])
+    """
+
+    def forward(self, *inputs: Tensor) -> Any:
+        """Run them."""
+        first, *others = self
+        outputs = first(*inputs)
+        for module in others:
+            outputs = module(outputs)
+        return outputs
+
+
+def perceptron(
     in_features: int,
     out_features: int,
     hidden_sizes: Sequence[int],
@@ -88,18 +103,44 @@ def make_actor(
         >>> sample["action"].shape, sample["action_log_prob"].shape
         (torch.Size([5, 2]), torch.Size([5]))
     """
-    parameters = nn.Sequential(
-        _mlp(observation_size, action_size, hidden_sizes, input_scale, device),
-        AddStateIndependentNormalScale(
-            action_size, init_value=initial_log_std, scale_lb=_SCALE_FLOOR, device=device
-        ),
+    head = gaussian_head(action_size, initial_log_std, device)
+    body = perceptron(observation_size, head.num_outputs, hidden_sizes, input_scale, device)
+    return assemble_actor(
+        body, head, in_keys=[in_key], action_key=action_key, log_prob_key=log_prob_key
     )
+
+
+def assemble_actor(
+    body: nn.Module,
+    head: Head,
+    *,
+    in_keys: Sequence[NestedKey] = ("observation",),
+    action_key: NestedKey = "action",
+    log_prob_key: NestedKey = "action_log_prob",
+    before: Sequence[TensorDictModuleBase] = (),
+) -> ProbabilisticTensorDictSequential:
+    """Put a head on a network.
+
+    Args:
+        body: Network from what stands under ``in_keys`` to the head's outputs.
+        head: What makes a distribution of them.
+        in_keys: Keys of the observation.
+        action_key: Key of the action.
+        log_prob_key: Key of the action's log-probability, shape [...].
+        before: Modules that write what stands under ``in_keys``.
+
+    Returns:
+        A module with ``get_dist`` that writes the distribution's parameters, the action and its
+        log-probability.
+    """
+    parameters = Chain(body, head.parameters)
     return ProbabilisticTensorDictSequential(
-        TensorDictModule(parameters, in_keys=[in_key], out_keys=["loc", "scale"]),
+        *before,
+        TensorDictModule(parameters, in_keys=list(in_keys), out_keys=list(head.keys)),
         ProbabilisticTensorDictModule(
-            in_keys=["loc", "scale"],
+            in_keys=list(head.keys),
             out_keys=[action_key],
-            distribution_class=IndependentNormal,
+            distribution_class=head.distribution,
             return_log_prob=True,
             log_prob_key=log_prob_key,
             default_interaction_type=ExplorationType.RANDOM,
@@ -135,5 +176,5 @@ def make_critic(
         >>> critic(TensorDict({"observation": torch.zeros(5, 3)}, [5]))["cost_value"].shape
         torch.Size([5, 2])
     """
-    network = _mlp(observation_size, num_outputs, hidden_sizes, input_scale, device)
+    network = perceptron(observation_size, num_outputs, hidden_sizes, input_scale, device)
     return TensorDictModule(network, in_keys=[in_key], out_keys=[out_key])

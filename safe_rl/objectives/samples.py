@@ -9,6 +9,8 @@ from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
 from torchrl.objectives.common import AUTO_LOSS_MASK_KEYS
 
+FIRST = "is_init"
+
 
 def sample_mask(tensordict: TensorDictBase) -> Tensor | None:
     """Which entries of a batch are samples, as a bool tensor of its shape; None: all of them.
@@ -26,6 +28,25 @@ def flat_samples(batch: TensorDictBase) -> TensorDictBase:
     mask = sample_mask(batch)
     flat = batch.reshape(-1)
     return flat if mask is None else flat[mask.reshape(-1)]
+
+
+def learning_samples(batch: TensorDictBase, in_keys: Iterable[NestedKey]) -> TensorDictBase:
+    """What a policy with these inputs learns from: samples [B], or sequences [N, T].
+
+    Sequences stay whole and in order. A policy with a memory reads `is_init`, which says where
+    episodes begin.
+
+    Raises:
+        ValueError: if sequences are padded.
+    """
+    if FIRST not in in_keys:
+        return flat_samples(batch)
+    if sample_mask(batch) is not None or batch.ndim != 2:
+        raise ValueError(
+            "A policy with a memory learns from whole sequences [N, T] as collectors make them, "
+            "without padding: leave split_trajs at False."
+        )
+    return batch
 
 
 def require_finite(tensordict: TensorDictBase, keys: Iterable[NestedKey]) -> None:

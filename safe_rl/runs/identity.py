@@ -80,6 +80,14 @@ ROLES: dict[str, Role] = {
 
 # keys that the configurations of earlier runs lack, and what they meant without
 _ABSENT = {"algo._target_": "safe_rl.algorithms.OnPolicy"}
+# likewise; they say nothing where they have these values
+_SILENT: dict[str, Hashable] = {
+    "env.outside": None,
+    "model.head": "auto",
+    "model.normalise": None,
+    "model.encoders": None,
+    "model.memory": None,
+}
 
 
 def role_of(key: str) -> Role:
@@ -135,7 +143,11 @@ def differences(saved: Mapping[str, Any], given: Mapping[str, Any]) -> dict[str,
 
 
 def _comparable(config: Mapping[str, Any]) -> dict[str, Hashable]:
-    flat = flatten(config)
+    flat = {
+        key: value
+        for key, value in flatten(config).items()
+        if key not in _SILENT or value != _SILENT[key]
+    }
     absent = {key: target for key, target in _ABSENT.items() if key.partition(".")[0] in config}
     return absent | {
         key: present_name(value) if key.endswith("_target_") and isinstance(value, str) else value

@@ -5,6 +5,7 @@ from itertools import count
 import pytest
 import torch
 from cmdp import ONE, STEPS, TARGET, TWO, make_actor, train
+from tabular import ONE_OF_THREE, TWO_COMPONENTS
 
 from safe_rl.algorithms import Constraints, CPOStep, CRPOStep, CTRPOStep, PCPOStep, TRPOStep
 from safe_rl.objectives import (
@@ -218,3 +219,23 @@ def test_constrained_algorithms_reach_the_boundary_at_the_optimum(algorithm, epo
     # Within 8 % of the limits and 0.05 of the optimal mean, averaged over the last 50 epochs.
     torch.testing.assert_close(cmdp.expected_costs(mean), cmdp.limits, atol=0, rtol=0.08)
     torch.testing.assert_close(mean, cmdp.optimum, atol=0.05, rtol=0)
+
+
+# Gradient steps of a multiplier circle round the optimum of a linear programme for ever, so that
+# there are none of them here.
+CHOICES = [
+    (ONE_OF_THREE, trpo_pid),
+    *(
+        (problem, algorithm)
+        for problem in (ONE_OF_THREE, TWO_COMPONENTS)
+        for algorithm in (cpo, p3o)
+    ),
+]
+
+
+@pytest.mark.parametrize(("problem", "algorithm"), CHOICES)
+def test_policies_of_choices_reach_the_boundary_at_the_optimum(problem, algorithm):
+    actor = problem.make_actor()
+    update = algorithm(actor, problem)
+    found = train(problem, actor, update, 100, problem.rollout, problem.probabilities)
+    torch.testing.assert_close(found[-40:].mean(0), torch.cat(problem.optimum), atol=0.06, rtol=0)

@@ -115,7 +115,15 @@ FULL_BATCH = {
     "compile": False,
 }  # fmt: skip
 SHARED = {
-    "model": {"hidden_sizes": [256, 256], "initial_log_std": -0.5, "input_scale": {}},
+    "model": {
+        "hidden_sizes": [256, 256],
+        "initial_log_std": -0.5,
+        "input_scale": {},
+        "head": "auto",
+        "normalise": None,
+        "encoders": None,
+        "memory": None,
+    },
     "advantage": {"_target_": "safe_rl.objectives.VectorGAE", **DISCOUNT},
     "critic_update": {**FULL_BATCH, "optimizer": {**ADAM, "lr": 1e-3}},
     "cost_limits": {"cost": 25.0},

@@ -72,7 +72,7 @@ def with_costs(keys):
         (lambda: without("cost_keys"), "'cost_keys' must be a list of names with 'cost'"),
         (lambda: without("observation_layout"), "'observation_layout' must map names"),
         (lambda: without("set_state"), "it has 'get_state', so it needs 'set_state'"),
-        (with_unbounded_actions, "continuous and bounded, got Unbounded"),
+        (with_unbounded_actions, "continuous and bounded, or choices, got Unbounded"),
         (
             lambda: with_costs(["cost", "cost_south"]),
             r"reward spec must have 'cost_south', got \['cost', 'cost_hazards', 'cost_north'",

@@ -30,6 +30,11 @@ def make_pendulum(**kwargs):
     return Costly(gymnasium.make("Pendulum-v1", **kwargs))
 
 
+class Switches(gymnasium.Env):
+    observation_space = gymnasium.spaces.Box(0, 1, (1,), np.float32)
+    action_space = gymnasium.spaces.MultiBinary(3)
+
+
 class Counter(gymnasium.Env):
     """Terminates after as many steps as its seed says; observes what it was and how far it is."""
 
@@ -162,7 +167,7 @@ def test_our_algorithms_train_on_it(tmp_path):
 def test_errors_say_what_to_change():
     with pytest.raises(ValueError, match=r"reports no costs.*name it in 'cost_keys'"):
         from_gymnasium("Pendulum-v1")
-    with pytest.raises(ValueError, match=r"continuous, bounded actions.*Discrete"):
-        from_gymnasium("CartPole-v1")
+    with pytest.raises(ValueError, match=r"or choices \(Discrete, MultiDiscrete\).*MultiBinary"):
+        from_gymnasium(Switches)
     with pytest.raises(ValueError, match="give 'num_steps'"):
         from_gymnasium(Counter)

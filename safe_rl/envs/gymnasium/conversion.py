@@ -152,8 +152,9 @@ def from_gymnasium(
 ) -> GymnasiumEnv:
     """Make a TorchRL environment of any Gymnasium environment that reports costs in `info`.
 
-    Observations become one float32 vector each, actions are clipped to [-1, 1] and stretched to
-    the environment's bounds, so that the algorithms can be used as they are.
+    Observations become one float32 vector each, continuous actions are clipped to [-1, 1] and
+    stretched to the environment's bounds, so that the algorithms can be used as they are. Choices
+    (Discrete, MultiDiscrete) are integers.
 
     Args:
         env: Gymnasium id, or a function that makes an environment.
@@ -173,9 +174,9 @@ def from_gymnasium(
         one, the sum of the others.
 
     Raises:
-        ValueError: if no costs are reported, the actions are not continuous and bounded, the
-            observations are no arrays and not to be flattened, or the length of episodes is not
-            known.
+        ValueError: if no costs are reported, the actions are neither continuous and bounded nor
+            choices, the observations are no arrays and not to be flattened, or the length of
+            episodes is not known.
 
     Examples:
         >>> env = from_gymnasium("Safexp-PointGoal1-v0", num_envs=2, num_steps=1000, seed=0)
@@ -190,7 +191,7 @@ def from_gymnasium(
         worlds = ProcessVectorEnv(make_adapted, num_envs, min(workers, num_envs), keys)
     else:
         worlds = SyncVectorEnv([make_adapted] * num_envs, autoreset_mode=AutoresetMode.DISABLED)
-    base = GymWrapper(worlds, device=torch.device(device))
+    base = GymWrapper(worlds, device=torch.device(device), categorical_action_encoding=True)
     base.set_info_dict_reader(CostReader(keys, num_envs))
     batch = GymnasiumEnv(base, keys, length)
     batch.set_seed(int(torch.randint(2**31, ())) if seed is None else seed)
@@ -221,26 +222,40 @@ def describe(
 
 
 def adapt(env: gymnasium.Env, num_steps: int | None = None) -> gymnasium.Env:
-    """Wrap an environment: float32 vectors as observations, actions in [-1, 1].
+    """Wrap an environment: float32 vectors as observations, actions in [-1, 1] or choices from 0.
 
     Args:
         env: the environment.
         num_steps: truncate episodes after that many steps; None leaves their length alone.
 
     Raises:
-        ValueError: if the actions are not continuous and bounded.
+        ValueError: if the actions are neither continuous and bounded nor choices.
     """
-    actions = env.action_space
-    if not isinstance(actions, gymnasium.spaces.Box) or not actions.is_bounded():
-        raise ValueError(
-            f"The algorithms need continuous, bounded actions (a Box), but {env} has {actions}."
-        )
     env = gymnasium.wrappers.FlattenObservation(env)
     vectors = gymnasium.spaces.Box(-np.inf, np.inf, env.observation_space.shape, np.float32)
     env = gymnasium.wrappers.TransformObservation(env, _single_precision, vectors)
-    env = gymnasium.wrappers.RescaleAction(env, np.float32(-1.0), np.float32(1.0))
-    env = gymnasium.wrappers.TransformAction(env, _within_bounds, env.action_space)
+    env = _with_plain_actions(env)
     return env if num_steps is None else gymnasium.wrappers.TimeLimit(env, num_steps)
+
+
+def _with_plain_actions(env: gymnasium.Env) -> gymnasium.Env:
+    actions = env.action_space
+    if isinstance(actions, gymnasium.spaces.Box) and actions.is_bounded():
+        env = gymnasium.wrappers.RescaleAction(env, np.float32(-1.0), np.float32(1.0))
+        return gymnasium.wrappers.TransformAction(env, _within_bounds, env.action_space)
+    start = getattr(actions, "start", None)
+    if isinstance(actions, gymnasium.spaces.Discrete):
+        plain: gymnasium.Space = gymnasium.spaces.Discrete(int(actions.n))
+    elif isinstance(actions, gymnasium.spaces.MultiDiscrete) and actions.nvec.ndim == 1:
+        plain = gymnasium.spaces.MultiDiscrete(actions.nvec)
+    else:
+        raise ValueError(
+            "The algorithms need actions that are continuous and bounded (a Box) or choices "
+            f"(Discrete, MultiDiscrete), but {env.unwrapped} has {actions}."
+        )
+    if not np.any(start):
+        return env
+    return gymnasium.wrappers.TransformAction(env, partial(np.add, start), plain)
 
 
 def _make_adapted(make: MakeEnv, num_steps: int) -> gymnasium.Env:
@@ -268,13 +283,13 @@ def _fit(picture: np.ndarray, width: int, height: int) -> np.ndarray:
 
 def _find_costs(probe: gymnasium.Env) -> list[str]:
     probe.reset(seed=0)
-    *_, info = probe.step(np.zeros(probe.action_space.shape, dtype=np.float32))
+    *_, info = probe.step(np.zeros(probe.action_space.shape, dtype=probe.action_space.dtype))
     keys = [key for key in info if key == AGGREGATE or key.startswith(f"{AGGREGATE}_")]
     if not keys:
         raise ValueError(
             f"{probe} reports no costs: there is no 'cost' or 'cost_<kind>' in its info, which has "
             f"{sorted(info)}. If a cost is called otherwise, or is not reported at every step, "
-            "name it in 'cost_keys'."
+            "name it in 'cost_keys'; 'outside' makes a cost of leaving a range."
         )
     return keys
 

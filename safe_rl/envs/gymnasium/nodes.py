@@ -13,9 +13,10 @@ from typing import Any
 import gymnasium
 
 from safe_rl.envs.errors import ConfigError, nearest, require_integer
+from safe_rl.envs.gymnasium.outside import CostsOutside, Ranges, check_outside
 
 GYMNASIUM_TARGET = "safe_rl.envs.gymnasium.make_gymnasium"
-KEYS = ("id", "cost_keys", "num_steps", "kwargs", "workers", "flatten", "render_mode")
+KEYS = ("id", "cost_keys", "outside", "num_steps", "kwargs", "workers", "flatten", "render_mode")
 
 
 def complete_gymnasium(node: Mapping[str, Any]) -> dict[str, Any]:
@@ -33,9 +34,12 @@ def complete_gymnasium(node: Mapping[str, Any]) -> dict[str, Any]:
     if not isinstance(node.get("id"), str):
         raise ConfigError("Which environment? Name a registered one: env.id=…")
     defaults: dict[str, Any] = {"name": node["id"], "cost_keys": None, "num_steps": None}
-    defaults |= {"kwargs": None, "workers": 0, "flatten": False, "render_mode": None}
+    defaults |= {"outside": None, "kwargs": None, "workers": 0, "flatten": False}
+    defaults |= {"render_mode": None}
     full = {**defaults, **node}
     require_integer("workers", full["workers"], lowest=0)
+    if full["outside"] is not None:
+        check_outside(full["outside"])
     if full["num_steps"] is not None:
         require_integer("num_steps", full["num_steps"], lowest=1)
     if None in (full["cost_keys"], full["num_steps"]):
@@ -77,4 +81,9 @@ def maker(config: Mapping[str, Any]) -> Callable[[], gymnasium.Env]:
     kwargs = dict(config["kwargs"] or {})
     if config["render_mode"] is not None:
         kwargs["render_mode"] = config["render_mode"]
-    return partial(gymnasium.make, spec, **kwargs)
+    make = partial(gymnasium.make, spec, **kwargs)
+    return partial(_with_costs, make, config["outside"]) if config["outside"] else make
+
+
+def _with_costs(make: Callable[[], gymnasium.Env], outside: Ranges) -> gymnasium.Env:
+    return CostsOutside(make(), outside)

@@ -4,12 +4,14 @@ from safe_rl.envs.transforms.action_filter import ActionFilter
 from safe_rl.envs.transforms.base import ConstraintTransform
 from safe_rl.envs.transforms.early_termination import EarlyTermination
 from safe_rl.envs.transforms.environment import TransformedConstrainedEnv, transform_env
+from safe_rl.envs.transforms.policy_memory import PolicyMemory
 from safe_rl.envs.transforms.saute import Saute, Simmer
 
 __all__ = [
     "ActionFilter",
     "ConstraintTransform",
     "EarlyTermination",
+    "PolicyMemory",
     "Saute",
     "Simmer",
     "TransformedConstrainedEnv",

@@ -61,7 +61,8 @@ class ActionFilter(ConstraintTransform):
             raise ValueError(
                 f"The action filter must return actions of shape {tuple(action.shape)}, got {got}."
             )
-        self._intervened = (replaced != action).any(-1, keepdim=True)
+        differs = (replaced != action).reshape(*tensordict.batch_size, -1)
+        self._intervened = differs.any(-1, keepdim=True)
         return tensordict.set("action", replaced)
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:

@@ -1,0 +1,138 @@
+"""From a configuration's ``model`` and an environment's specs to networks."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import torch
+from tensordict.nn import (
+    ProbabilisticTensorDictSequential,
+    TensorDictModule,
+    TensorDictModuleBase,
+)
+from torch import nn
+from torchrl.data import Composite, TensorSpec
+
+from safe_rl.models.encoders import Body, Observed, observed_entries
+from safe_rl.models.heads import AUTO, Head, make_head
+from safe_rl.models.memory import FEATURES, MEMORY, GatedMemory
+from safe_rl.models.networks import Chain, assemble_actor, perceptron
+from safe_rl.models.normalising import RunningScale
+from safe_rl.models.scaling import input_scale_vector
+
+__all__ = ["build_networks"]
+
+_AS_IT_IS: Mapping[str, Any] = {"vector": []}
+
+
+def build_networks(
+    model: Mapping[str, Any],
+    observation_spec: Composite,
+    action_spec: TensorSpec,
+    layout: Mapping[str, slice],
+    *,
+    num_costs: int,
+    device: torch.device,
+) -> dict[str, Any]:
+    """Build an actor, a reward critic and, for ``num_costs`` > 0, a cost critic.
+
+    They share no weights. Where the actor has a memory, what it remembers is an input of the
+    critics, which need none of their own then.
+
+    Args:
+        model: Node ``model`` of a configuration as composed from ``conf/``; of earlier runs, with
+            fewer keys.
+        observation_spec: Of N environments.
+        action_spec: Of N environments.
+        layout: Component -> columns of the flat observation.
+        num_costs: Outputs of the cost critic.
+        device: Of all parameters.
+
+    Returns:
+        ``actor``, ``critic`` and ``cost_critic`` if there is one.
+
+    Raises:
+        ValueError: If the configuration does not fit the environment.
+    """
+    observed = Observed(
+        observed_entries(observation_spec),
+        layout,
+        model["input_scale"],
+        clip=model.get("normalise"),
+        encoders=model.get("encoders"),
+    )
+    widths = list(model["hidden_sizes"])
+    remembered = model["memory"]["size"] if model.get("memory") else 0
+    if remembered and MEMORY not in observation_spec.keys():  # noqa: SIM118, a spec is no mapping
+        raise ValueError(
+            "A policy with a memory needs the transform that keeps it between steps: choose "
+            "model=gru instead of setting model.memory alone."
+        )
+    head = make_head(
+        model.get("head") or AUTO,
+        action_spec,
+        initial_log_std=model["initial_log_std"],
+        device=device,
+    )
+    if remembered:
+        actor = _recurrent_actor(observed, head, widths, remembered, device)
+    else:
+        body = _body(observed, head.num_outputs, widths, 0, device)
+        actor = assemble_actor(body, head, in_keys=observed.keys)
+    critic_keys = [*observed.keys, MEMORY] if remembered else observed.keys
+
+    def critic(num_outputs: int, out_key: str) -> TensorDictModule:
+        body = _body(observed, num_outputs, widths, remembered, device)
+        return TensorDictModule(body, in_keys=critic_keys, out_keys=[out_key])
+
+    networks: dict[str, Any] = {"actor": actor, "critic": critic(1, "state_value")}
+    if num_costs:
+        networks["cost_critic"] = critic(num_costs, "cost_value")
+    return networks
+
+
+def _recurrent_actor(
+    observed: Observed,
+    head: Head,
+    widths: Sequence[int],
+    remembered: int,
+    device: torch.device,
+) -> ProbabilisticTensorDictSequential:
+    """Hidden layers, the memory, and a linear layer to the head."""
+    if not widths:
+        raise ValueError("model.hidden_sizes=[]: a memory needs at least one layer before it.")
+    encoder = Chain(_body(observed, widths[-1], widths[:-1], 0, device), nn.Tanh())
+    before: list[TensorDictModuleBase] = [
+        TensorDictModule(encoder, in_keys=observed.keys, out_keys=[FEATURES]),
+        GatedMemory(widths[-1], remembered, device=device),
+    ]
+    body = perceptron(remembered, head.num_outputs, [], None, device)
+    return assemble_actor(body, head, in_keys=[FEATURES], before=before)
+
+
+def _body(
+    observed: Observed,
+    num_outputs: int,
+    widths: Sequence[int],
+    remembered: int,
+    device: torch.device,
+) -> nn.Module:
+    """From what is observed, and remembered, to outputs: a perceptron where that will do."""
+    first = observed.entries[0]
+    is_vector = len(observed.entries) == 1 and len(first.shape) == 1
+    if observed.encoders is None and not is_vector:
+        shapes = ", ".join(f"{entry.name} {list(entry.shape)}" for entry in observed.entries)
+        raise ValueError(
+            f"This environment observes {shapes}, and model=mlp takes one vector: use model=dict, "
+            "which has an encoder for each, or make the environment flatten them."
+        )
+    if observed.encoders is not None or remembered:
+        plain = observed._replace(encoders=observed.encoders or _AS_IT_IS)
+        return Body(plain, num_outputs, widths, extra=remembered, device=device)
+    size = first.shape[0]
+    if observed.clip is None:
+        scale = input_scale_vector(observed.input_scale, observed.layout)
+        return perceptron(size, num_outputs, widths, scale, device)
+    running = RunningScale(size, key=first.key, clip=observed.clip, device=device)
+    return nn.Sequential(running, *perceptron(size, num_outputs, widths, None, device))

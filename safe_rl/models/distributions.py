@@ -1,0 +1,108 @@
+"""Distributions of actions that neither torch nor TorchRL have."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+from torch.distributions import Beta, Categorical, Independent
+
+__all__ = ["BoundedBeta", "Choices", "OneChoice"]
+
+# Beta densities are infinite or zero at the ends of (0, 1), which single precision rounds to.
+_EDGE = 1e-6
+
+
+class Choices(Independent):
+    """A choice in each of A components of an action, independent of one another.
+
+    Args:
+        logits: [..., A, C]; components with fewer than C choices have very low ones at their end.
+
+    Examples:
+        >>> import torch
+        >>> Choices(torch.zeros(5, 2, 3)).log_prob(torch.zeros(5, 2)).exp()[0]
+        tensor(0.1111)
+    """
+
+    def __init__(self, logits: Tensor) -> None:
+        super().__init__(Categorical(logits=logits), 1)
+
+    @property
+    def deterministic_sample(self) -> Tensor:
+        """The likeliest choices, [..., A]."""
+        return self.base_dist.mode
+
+
+class OneChoice(Categorical):
+    """A choice among C, as an integer.
+
+    Args:
+        logits: [..., C].
+
+    Examples:
+        >>> import torch
+        >>> OneChoice(torch.tensor([0.0, 2.0])).deterministic_sample
+        tensor(1)
+    """
+
+    def __init__(self, logits: Tensor) -> None:
+        super().__init__(logits=logits)
+
+    @property
+    def deterministic_sample(self) -> Tensor:
+        """The likeliest choice, [...]."""
+        return self.mode
+
+
+class BoundedBeta(Independent):
+    """A Beta distribution in each component of an action between bounds (Chou et al. 2017).
+
+    Its divergence is that of the Beta distributions, which stretching does not change.
+
+    Args:
+        alpha: first concentrations, [..., A].
+        beta: second ones, [..., A].
+        low: lower bounds, [A].
+        high: upper bounds, [A].
+
+    Examples:
+        >>> import torch
+        >>> two = torch.full((4, 1), 2.0)
+        >>> BoundedBeta(two, two, low=torch.tensor([0.0]), high=torch.tensor([6.0])).mean[0]
+        tensor([3.])
+    """
+
+    def __init__(self, alpha: Tensor, beta: Tensor, *, low: Tensor, high: Tensor) -> None:
+        super().__init__(Beta(alpha, beta), 1)
+        self._low, self._width = low, high - low
+
+    def rsample(self, sample_shape: torch.Size = torch.Size()) -> Tensor:  # noqa: B008
+        """Draw actions, differentiably."""
+        return self._stretched(super().rsample(sample_shape))
+
+    def sample(self, sample_shape: torch.Size = torch.Size()) -> Tensor:  # noqa: B008
+        """Draw actions."""
+        with torch.no_grad():
+            return self.rsample(sample_shape)
+
+    def log_prob(self, value: Tensor) -> Tensor:
+        """Density of actions [..., A], in the action's units."""
+        unit = ((value - self._low) / self._width).clamp(_EDGE, 1 - _EDGE)
+        return super().log_prob(unit) - self._width.log().sum(-1)
+
+    def entropy(self) -> Tensor:
+        """In closed form, [...]."""
+        return super().entropy() + self._width.log().sum(-1)
+
+    @property
+    def mean(self) -> Tensor:
+        """Mean action, [..., A]."""
+        return self._stretched(self.base_dist.mean)
+
+    @property
+    def deterministic_sample(self) -> Tensor:
+        """The mean: the mode is at a bound as soon as a concentration is 1."""
+        return self.mean
+
+    def _stretched(self, unit: Tensor) -> Tensor:
+        return self._low + self._width * unit.clamp(_EDGE, 1 - _EDGE)

@@ -1,0 +1,183 @@
+"""Encoders: from an observation, a vector, a picture or several of both, to outputs."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+import torch
+from tensordict import NestedKey
+from torch import Tensor, nn
+from torchrl.data import Composite, TensorSpec
+from torchrl.modules import ConvNet
+
+from safe_rl.models.networks import perceptron
+from safe_rl.models.normalising import RunningScale
+from safe_rl.models.scaling import InputScale, input_scale_vector
+
+__all__ = ["Body", "Entry", "Observed", "observed_entries"]
+
+
+class Entry(NamedTuple):
+    """A tensor that is observed.
+
+    Attributes:
+        key: Where it stands.
+        name: Of the component; of a flat observation, "observation".
+        shape: Of one environment's: [n], or [height, width, colours] or colours first.
+        is_bytes: Whether its numbers are 0 to 255.
+    """
+
+    key: NestedKey
+    name: str
+    shape: tuple[int, ...]
+    is_bytes: bool
+
+
+def observed_entries(observation_spec: Composite) -> list[Entry]:
+    """Everything below ``observation``, in alphabetical order of the names.
+
+    Raises:
+        ValueError: If one is neither a vector nor a picture.
+    """
+    observed = observation_spec["observation"]
+    if not isinstance(observed, Composite):
+        return [_entry("observation", "observation", observed)]
+    names = sorted(map(str, observed.keys()))
+    return [_entry(("observation", name), name, observed[name]) for name in names]
+
+
+def _entry(key: NestedKey, name: str, spec: TensorSpec) -> Entry:
+    shape = tuple(spec.shape[1:])
+    if len(shape) not in (1, 3):
+        raise ValueError(
+            f"The observation '{name}' of an environment has the shape {list(shape)}: networks "
+            "take vectors [n] and pictures [height, width, colours]."
+        )
+    return Entry(key, name, shape, not spec.dtype.is_floating_point)
+
+
+class Observed(NamedTuple):
+    """What networks are told about observations.
+
+    Attributes:
+        entries: What is observed.
+        layout: Component -> columns, of a flat observation.
+        input_scale: Component -> factor.
+        clip: Where columns that are normalised by their running moments are cut; None: they are
+            not.
+        encoders: Of every entry before all are put together; None: there is one vector, which
+            needs none.
+    """
+
+    entries: Sequence[Entry]
+    layout: Mapping[str, slice]
+    input_scale: Mapping[str, float]
+    clip: float | None
+    encoders: Mapping[str, Any] | None
+
+    @property
+    def keys(self) -> list[NestedKey]:
+        """Where the entries stand."""
+        return [entry.key for entry in self.entries]
+
+
+class Body(nn.Module):
+    """Encode every entry, put the codes side by side, and run a perceptron on them.
+
+    Args:
+        observed: What is observed, and how it is encoded.
+        out_features: Outputs of the perceptron.
+        hidden_sizes: Widths of its hidden layers.
+        extra: Numbers that come after the entries and go to the perceptron as they are.
+        device: Of the parameters.
+
+    Examples:
+        >>> import torch
+        >>> entry = Entry(("observation", "gyro"), "gyro", (3,), False)
+        >>> observed = Observed([entry], {}, {}, clip=None, encoders={"vector": [8]})
+        >>> Body(observed, 2, [16])(torch.zeros(5, 3)).shape
+        torch.Size([5, 2])
+    """
+
+    def __init__(
+        self,
+        observed: Observed,
+        out_features: int,
+        hidden_sizes: Sequence[int],
+        *,
+        extra: int = 0,
+        device: torch.device | None = None,
+    ) -> None:
+        super().__init__()
+        assert observed.encoders is not None
+        encoders, sizes = [], []
+        for entry in observed.entries:
+            make = _vector if len(entry.shape) == 1 else _picture
+            encoder = make(entry, observed, device)
+            encoders.append(encoder)
+            sizes.append(encoder(_blank(entry, device)).shape[-1])
+        self.encoders = nn.ModuleList(encoders)
+        self.perceptron = perceptron(sum(sizes) + extra, out_features, hidden_sizes, None, device)
+
+    def forward(self, *inputs: Tensor) -> Tensor:
+        """Entries [..., n] or [..., height, width, colours] -> [..., out_features]."""
+        codes = [encode(x) for encode, x in zip(self.encoders, inputs, strict=False)]
+        return self.perceptron(torch.cat([*codes, *inputs[len(codes) :]], -1))
+
+
+class Pixels(nn.Module):
+    """Pictures with colours last or first, in bytes or [0, 1], as convolutions want them."""
+
+    def __init__(self, colours_last: bool, is_bytes: bool) -> None:
+        super().__init__()
+        self._colours_last, self._factor = colours_last, 1 / 255 if is_bytes else 1.0
+
+    def forward(self, picture: Tensor) -> Tensor:
+        """[..., height, width, colours] -> [..., colours, height, width], float."""
+        picture = picture.movedim(-1, -3) if self._colours_last else picture
+        return picture.float() * self._factor
+
+
+def _vector(entry: Entry, observed: Observed, device: torch.device | None) -> nn.Module:
+    size, widths = entry.shape[0], list(observed.encoders["vector"])  # type: ignore[index]
+    layout = observed.layout if entry.name == "observation" else {entry.name: slice(0, size)}
+    scale = input_scale_vector(observed.input_scale, layout)
+    layers: list[nn.Module] = []
+    if observed.clip is not None:  # then the units make no difference
+        layers.append(RunningScale(size, key=entry.key, clip=observed.clip, device=device))
+    elif scale is not None:
+        layers.append(InputScale(scale.to(device)))
+    for before, width in zip([size, *widths], widths, strict=False):
+        layers += [*perceptron(before, width, [], None, device), nn.Tanh()]
+    return nn.Sequential(*layers)
+
+
+def _picture(entry: Entry, observed: Observed, device: torch.device | None) -> nn.Module:
+    settings = observed.encoders
+    assert settings is not None
+    # three colours, or a depth or grey; where both ends are that short, the last one counts
+    colours_last = entry.shape[-1] <= 4
+    colours = entry.shape[-1] if colours_last else entry.shape[0]
+    convolutions = ConvNet(
+        in_features=colours,
+        num_cells=list(settings["channels"]),
+        kernel_sizes=list(settings["kernels"]),
+        strides=list(settings["strides"]),
+        activation_class=nn.ReLU,
+        device=device,
+    )
+    network = nn.Sequential(Pixels(colours_last, entry.is_bytes), convolutions)
+    try:
+        network(_blank(entry, device))
+    except RuntimeError as error:
+        raise ValueError(
+            f"The picture '{entry.name}' of shape {list(entry.shape)} is too small for "
+            f"model.encoders.kernels={list(settings['kernels'])} with the strides "
+            f"{list(settings['strides'])}: choose smaller ones."
+        ) from error
+    return network
+
+
+def _blank(entry: Entry, device: torch.device | None) -> Tensor:
+    return torch.zeros(1, *entry.shape, device=device)

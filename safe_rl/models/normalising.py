@@ -1,0 +1,81 @@
+"""Observations normalised by what has been observed so far, as a part of the networks."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+import torch
+from tensordict import NestedKey, TensorDictBase
+from torch import Tensor, nn
+
+__all__ = ["RunningScale", "take_in"]
+
+
+class RunningScale(nn.Module):
+    """Subtract a running mean and divide by a running standard deviation, cut at ±``clip``.
+
+    The moments are buffers in double precision: a checkpoint holds them with the weights, and a run
+    that is resumed goes on to the last digit. They move only by :meth:`update`, which training
+    calls once per batch, after it has learned from it: the policy that a batch is collected by is
+    the one that its probabilities are compared to. Before the first batch nothing is changed.
+
+    Args:
+        size: Number of columns, n.
+        key: Entry of a batch that the input comes from.
+        clip: Where normalised columns are cut.
+        device: Of the moments.
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> scale = RunningScale(1, key="observation", clip=10.0)
+        >>> scale.update(TensorDict(observation=torch.tensor([[1.0], [5.0]]), batch_size=[2]))
+        >>> scale(torch.tensor([5.0]))
+        tensor([1.])
+    """
+
+    count: Tensor
+    mean: Tensor
+    squares: Tensor
+
+    def __init__(
+        self, size: int, *, key: NestedKey, clip: float, device: torch.device | None = None
+    ) -> None:
+        super().__init__()
+        self.key, self.clip = key, clip
+        nothing = torch.zeros(size, dtype=torch.float64, device=device)
+        self.register_buffer("count", nothing.new_zeros(()))
+        self.register_buffer("mean", nothing)
+        # sum of squared distances from the mean
+        self.register_buffer("squares", nothing.clone())
+
+    def forward(self, inputs: Tensor) -> Tensor:
+        """Normalise ``inputs``, shape [..., n]."""
+        variance = self.squares / self.count.clamp_min(1)
+        # a column that never changes is left in its unit
+        width = torch.where(variance > _CONSTANT, variance.sqrt(), 1.0)
+        normalised = (inputs - self.mean.to(inputs)) / width.to(inputs)
+        return normalised.clamp(-self.clip, self.clip)
+
+    @torch.no_grad()
+    def update(self, batch: TensorDictBase) -> None:
+        """Take in the samples of a batch (Chan, Golub, LeVeque 1979, equation 2.1)."""
+        values = batch.get(self.key).to(self.mean).reshape(-1, self.mean.shape[0])
+        number, mean = values.shape[0], values.mean(0)
+        total, shift = self.count + number, mean - self.mean
+        # in place: compiled losses read the same tensors every time
+        self.squares += (values - mean).square().sum(0)
+        self.squares += shift.square() * (self.count * number / total)
+        self.mean += shift * (number / total)
+        self.count.copy_(total)
+
+
+_CONSTANT = 1e-12
+
+
+def take_in(networks: Iterable[nn.Module], batch: TensorDictBase) -> None:
+    """Show a batch to all running scales of some networks, each of which has its own."""
+    for network in networks:
+        for module in network.modules():
+            if isinstance(module, RunningScale):
+                module.update(batch)

@@ -1,0 +1,152 @@
+"""Heads: distributions for every kind of action, against torch's own and against numbers."""
+
+import pytest
+import torch
+from tensordict import TensorDict
+from torch import nn
+from torch.distributions import Beta, Categorical, kl_divergence
+from torchrl.data import Binary, Bounded, MultiCategorical, MultiOneHot, OneHot
+from torchrl.data import Categorical as CategoricalSpec
+from torchrl.envs.utils import ExplorationType, set_exploration_type
+
+from safe_rl.cli.keys import KEYS
+from safe_rl.models.heads import HEADS, make_head
+from safe_rl.models.networks import assemble_actor, perceptron
+from safe_rl.objectives.distributions import entropy, has_closed_kl, kl
+from safe_rl.objectives.fisher import FisherProduct
+from safe_rl.objectives.trust_region import policy_in
+
+BOUNDS = torch.tensor([[-1.0, 0.0], [2.0, 5.0]])
+SPECS = {
+    "gaussian": Bounded(*BOUNDS.unsqueeze(1).expand(2, 7, 2)),
+    "categorical": CategoricalSpec(4, shape=(7,)),
+    "components": MultiCategorical([3, 2], shape=(7, 2)),
+    "alike": CategoricalSpec(3, shape=(7, 2)),
+    "gymnasium": Bounded(torch.zeros(7, 2), torch.tensor([2, 1]).expand(7, 2), dtype=torch.int64),
+    "one_hot": OneHot(4, shape=(7, 4), dtype=torch.int64),
+}
+KINDS = [(spec, "auto") for spec in SPECS] + [("gaussian", "tanh"), ("gaussian", "beta")]
+
+
+def make_actor(spec, kind):
+    head = make_head(kind, SPECS[spec], initial_log_std=-0.5)
+    actor = assemble_actor(perceptron(3, head.num_outputs, [8], None, None), head)
+    with torch.no_grad():
+        for parameter in actor.parameters():
+            parameter.add_(0.3 * torch.randn_like(parameter))
+    return actor
+
+
+def observations(number=7):
+    return TensorDict(observation=torch.randn(number, 3), batch_size=[number])
+
+
+@pytest.mark.parametrize(("spec", "kind"), KINDS)
+def test_actions_are_those_of_the_environment(spec, kind):
+    actor, batch = make_actor(spec, kind), observations()
+    with torch.no_grad():
+        sample = actor(batch)
+        with set_exploration_type(ExplorationType.DETERMINISTIC):
+            best = actor(batch.clone())
+    for action in (sample["action"], best["action"]):
+        assert action.shape == SPECS[spec].shape
+        if kind != "auto" or spec != "gaussian":  # the environment clips a Gaussian's
+            assert SPECS[spec].is_in(action)
+    assert sample["action_log_prob"].shape == (7,)
+    found = actor.get_dist(batch).log_prob(sample["action"])
+    torch.testing.assert_close(found, sample["action_log_prob"], rtol=1e-3, atol=1e-3)
+
+
+@pytest.mark.parametrize(("spec", "kind"), KINDS)
+def test_divergences_are_closed_and_agree_with_samples(spec, kind):
+    actor, batch = make_actor(spec, kind), observations()
+    p = actor.get_dist(batch)
+    with torch.no_grad():
+        for parameter in actor.parameters():
+            parameter.add_(0.2 * torch.randn_like(parameter))
+        q = actor.get_dist(batch)
+        assert has_closed_kl(p)
+        samples = p.sample((20_000,))
+        estimate = p.log_prob(samples) - q.log_prob(samples)
+        error = estimate.std(0) / 20_000**0.5
+        assert ((kl(p, q, torch.empty(0)) - estimate.mean(0)).abs() < 5 * error + 1e-4).all()
+        if kind != "tanh":  # whose entropy is one of samples
+            estimate = -p.log_prob(samples)
+            error = estimate.std(0) / 20_000**0.5
+            assert ((entropy(p) - estimate.mean(0)).abs() < 5 * error + 1e-4).all()
+
+
+@pytest.mark.parametrize(("spec", "kind"), KINDS)
+def test_fisher_products_are_those_of_the_divergence(spec, kind):
+    actor, batch = make_actor(spec, kind), observations()
+    parameters = list(actor.parameters())
+    with torch.no_grad():
+        fixed = actor.get_dist(batch)
+    divergence = kl(policy_in(actor, batch), fixed, torch.empty(0)).mean()
+    slopes = torch.autograd.grad(divergence, parameters, create_graph=True)
+    vectors = [torch.randn_like(parameter) for parameter in parameters]
+    expected = torch.autograd.grad(slopes, parameters, vectors)
+    fisher = FisherProduct(actor, batch, parameters, damping=0.0)
+    found = fisher(torch.cat([vector.flatten() for vector in vectors]))
+    expected = torch.cat([product.flatten() for product in expected])
+    assert found.isfinite().all()
+    torch.testing.assert_close(found, expected, rtol=1e-3, atol=1e-5)
+
+
+def test_choices_that_there_are_not_are_never_taken():
+    distribution = make_actor("components", "auto").get_dist(observations())
+    assert distribution.sample((1000,))[..., 1].max() == 1
+    logits = distribution.base_dist.logits
+    expected = sum(
+        Categorical(logits=logits[:, i, :choices]).entropy() for i, choices in enumerate((3, 2))
+    )
+    torch.testing.assert_close(distribution.entropy(), expected)
+    gradients = torch.autograd.grad(distribution.entropy().sum(), logits)[0]
+    assert gradients.isfinite().all()
+
+
+def test_betas_are_torchs_between_bounds():
+    actor = make_actor("gaussian", "beta")
+    batch = observations()
+    parameters = actor.get_dist_params(batch)
+    reference = Beta(parameters["alpha"], parameters["beta"])
+    assert (torch.stack([parameters["alpha"], parameters["beta"]]) > 1).all()
+    distribution, width = actor.get_dist(batch), BOUNDS[1] - BOUNDS[0]
+    unit = torch.rand(7, 2)
+    found = distribution.log_prob(BOUNDS[0] + width * unit)
+    expected = (reference.log_prob(unit) - width.log()).sum(-1)
+    torch.testing.assert_close(found, expected, rtol=1e-4, atol=1e-4)
+    torch.testing.assert_close(distribution.mean, BOUNDS[0] + width * reference.mean)
+    same = kl_divergence(distribution, distribution)
+    torch.testing.assert_close(same, torch.zeros(7), atol=1e-5, rtol=0)
+    # what single precision rounds to the bounds has a density all the same
+    edges = distribution.log_prob(torch.stack([BOUNDS[0], BOUNDS[1]]).unsqueeze(1).expand(2, 7, 2))
+    assert edges.isfinite().all()
+
+
+def test_gradients_reach_every_output_of_a_tanh_policy():
+    actor, batch = make_actor("gaussian", "tanh"), observations()
+    entropy(actor.get_dist(batch)).sum().backward()
+    assert all(p.grad is not None and p.grad.isfinite().all() for p in actor.parameters())
+
+
+@pytest.mark.parametrize(
+    ("kind", "spec", "message"),
+    [
+        ("beta", SPECS["categorical"], "model.head=beta is not for.*auto or categorical"),
+        ("categorical", SPECS["gaussian"], "auto or gaussian or tanh or beta"),
+        ("auto", Binary(3, shape=(7, 3)), "No policy can act in Binary"),
+        ("auto", MultiOneHot([2, 3], shape=(7, 5)), "No policy can act in MultiOneHot"),
+    ],
+)
+def test_heads_for_other_actions_are_refused(kind, spec, message):
+    with pytest.raises(ValueError, match=message):
+        make_head(kind, spec, initial_log_std=-0.5)
+
+
+def test_the_command_line_knows_every_head():
+    held = [name for name in ("auto", *HEADS) if KEYS["model.head"].values.hold(name)]
+    assert held == ["auto", *HEADS]
+    assert isinstance(
+        make_head("auto", SPECS["one_hot"], initial_log_std=0).parameters, nn.Identity
+    )

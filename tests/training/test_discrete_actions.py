@@ -1,0 +1,117 @@
+"""Environments whose actions are choices, from the command line."""
+
+import json
+import sys
+
+import gymnasium_envs  # noqa: F401, registers Cliff-v0 and Boxes-v0
+import pytest
+import torch
+import yaml
+
+from safe_rl.cli import evaluate, train
+from safe_rl.envs import ConfigError, make_env
+from safe_rl.runs.table import read_table
+
+SMALL = (
+    *("env=gymnasium", "logger=none", "num_threads=1", "certificate.episodes=0", "num_envs=4"),
+    *("model.hidden_sizes=[8]", "frames_per_batch=200", "critic_update.minibatch_size=50"),
+)
+CART_POLE = ("env.id=CartPole-v1", "env.outside={cost_position: [0, -0.05, 0.05]}")
+MINIBATCHES = "policy_update.minibatch_size=50"
+
+
+def run_train(*arguments):
+    """What `python train.py …` does, in this process."""
+    before = sys.argv
+    try:
+        assert train.main(arguments) == 0
+    finally:
+        sys.argv = before
+
+
+@pytest.mark.parametrize(
+    "algo", [("algo=ppo_lagrangian", MINIBATCHES), ("algo=cpo",), ("algo=trpo_lagrangian",)]
+)
+def test_a_cart_learns_to_stay_within_a_range(algo, tmp_path):
+    run_train(*SMALL, *CART_POLE, *algo, "frames=600", f"hydra.run.dir={tmp_path}")
+    env = yaml.safe_load((tmp_path / "config.yaml").read_text())["env"]
+    assert env["cost_keys"] == ["cost_position"]
+    table = read_table(tmp_path / "progress.csv")
+    assert all(
+        0 < cost <= length
+        for cost, length in zip(
+            table["episode_cost_position"], table["episode_length"], strict=True
+        )
+    )
+    assert all(kl > 0 for kl in table["policy_kl"])
+    # a policy that begins with even odds has the entropy log 2
+    assert table["policy_entropy"][0] == pytest.approx(torch.tensor(2.0).log().item(), abs=0.05)
+    run_train(f"resume={tmp_path}", "frames=800")
+    assert read_table(tmp_path / "progress.csv")["steps"] == [200, 400, 600, 800]
+    options = ["episodes=4", "num_envs=2", "deterministic=true"]
+    assert evaluate.main([str(tmp_path), *options]) == 0
+    assert json.loads((tmp_path / "evaluation.json").read_text())["environment"] == "CartPole-v1"
+
+
+def test_the_cost_is_that_of_the_position_alone():
+    node = {"_target_": "safe_rl.envs.gymnasium.make_gymnasium", "id": "CartPole-v1"}
+    ranges = {"cost_position": [0, -0.04, 0.03], "cost_angle": [2, -0.1, float("inf")]}
+    rollout = make_env({**node, "outside": ranges}, num_envs=3, seed=0).rollout(
+        200, break_when_any_done=False
+    )
+    assert rollout["action"].dtype == torch.int64
+    step = rollout["next"]
+    for key, (column, low, high) in ranges.items():
+        place = step["observation"][..., [column]]
+        expected = ((place < low) | (place > high)).float()
+        assert 0 < expected.mean() < 1
+        torch.testing.assert_close(step[key], expected)
+    torch.testing.assert_close(step["cost"], step["cost_position"] + step["cost_angle"])
+
+
+@pytest.mark.parametrize(
+    ("outside", "message"),
+    [
+        ([1], "'outside' must be as"),
+        ({"cost_x": [0, 1.0]}, "got cost_x:"),
+        ({"cost_x": [0.5, 0.0, 1.0]}, "got cost_x:"),
+        ({"cost_x": [0, 1.0, 0.0]}, "has the range 1.0 to 0.0"),
+        ({"far": [0, 0.0, 1.0]}, "called cost or cost_<kind>, not 'far'"),
+        ({"cost_x": [4, 0.0, 1.0]}, "column 4, but the observation has 4"),
+    ],
+)
+def test_ranges_that_cannot_be_are_refused(outside, message):
+    node = {"_target_": "safe_rl.envs.gymnasium.make_gymnasium", "id": "CartPole-v1"}
+    with pytest.raises(ConfigError, match=message):
+        make_env({**node, "outside": outside})
+
+
+def test_several_choices_at_once_are_trained_in_processes_too(tmp_path):
+    """The environment itself refuses actions that it does not have."""
+    limits = ("cost_limits={cost: 6}", "env.id=Boxes-v0", MINIBATCHES)
+    run_train(*SMALL, *limits, "env.workers=2", "frames=400", f"hydra.run.dir={tmp_path}")
+    table = read_table(tmp_path / "progress.csv")
+    assert table["steps"] == [200, 400]
+    # what every step earns is at most 3, and costs at most 1.5; neither is ever all or nothing
+    assert all(0 < value < 30 for value in table["episode_return"])
+    assert all(0 < cost < 15 for cost in table["episode_cost"])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("algo", ["ppo", "ppo_lagrangian", "cpo"])
+def test_a_cliff_is_walked_along_or_kept_away_from(algo, tmp_path):
+    """Optimal: a return of 4 at a cost of 5 without a limit, 2.67 at a cost of 3 with it."""
+    cliff = ("env.id=Cliff-v0", "env.flatten=true", "num_envs=20", "frames_per_batch=2000")
+    run_train(
+        *SMALL, *cliff, f"algo={algo}", "cost_limits={cost: 3}", "frames=80_000",
+        *(() if algo == "cpo" else ("policy_update.minibatch_size=500",)),
+        "critic_update.minibatch_size=500", f"hydra.run.dir={tmp_path}",
+    )  # fmt: skip
+    table = read_table(tmp_path / "progress.csv")
+    cost, value = (sum(table[key][-10:]) / 10 for key in ("episode_cost", "episode_return"))
+    if algo == "ppo":
+        assert value > 3.5
+        assert cost > 4.5
+    else:
+        assert value > 1.8
+        assert cost < 3.3

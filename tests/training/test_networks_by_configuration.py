@@ -1,0 +1,93 @@
+"""Networks by configuration, from the command line: trained, resumed exactly, evaluated."""
+
+import json
+import sys
+
+import gymnasium_envs  # noqa: F401, registers Recall-v0
+import pytest
+import torch
+from point_mass import PointMass  # noqa: F401
+from run_configs import compose_config, without_times
+
+from safe_rl.cli import evaluate, train
+from safe_rl.envs import make_env
+from safe_rl.runs.table import read_table
+from safe_rl.training.trainer import build_trainer, seed_everything
+
+SMALL = (
+    *("logger=none", "num_threads=1", "certificate.episodes=0", "num_envs=4", "env.num_steps=25"),
+    *("model.hidden_sizes=[8]", "frames_per_batch=160", "critic_update.minibatch_size=40"),
+    "critic_update.num_passes=2",
+)
+PPO = ("policy_update.minibatch_size=80", "policy_update.num_passes=2")
+DICTIONARY = ("model=dict", "model.encoders.vector=[4]", "env.observation_flatten=false")
+CHOICES = {
+    "dictionary": (*DICTIONARY, *PPO),
+    "tanh": ("model.head=tanh", *PPO),
+    "beta": ("model.head=beta", *PPO),
+    "normalised": ("model.normalise=10", *PPO),
+    "memory": ("model=gru", "model.memory.size=4", "model.normalise=10", *PPO),
+    "memory_cpo": ("model=gru", "model.memory.size=4", "algo=cpo"),
+}
+
+
+def run_train(*arguments):
+    """What `python train.py …` does, in this process."""
+    before = sys.argv
+    try:
+        assert train.main(arguments) == 0
+    finally:
+        sys.argv = before
+
+
+@pytest.mark.parametrize("kind", CHOICES)
+def test_runs_resume_to_the_last_digit(kind, tmp_path):
+    """Batches of 40 steps per row cut episodes of 25 at different points."""
+    whole, parts = tmp_path / "whole", tmp_path / "parts"
+    run_train(*SMALL, *CHOICES[kind], "frames=640", f"hydra.run.dir={whole}")
+    run_train(*SMALL, *CHOICES[kind], "frames=320", f"hydra.run.dir={parts}")
+    run_train(f"resume={parts}", "frames=640")
+    assert without_times(whole / "progress.csv") == without_times(parts / "progress.csv")
+    assert evaluate.main([str(parts), "episodes=4", "num_envs=2", "deterministic=true"]) == 0
+    assert json.loads((parts / "evaluation.json").read_text())["episodes"] == 4
+
+
+def test_workers_normalise_as_the_first_process_does(tmp_path):
+    """What they are sent before every batch is also what they divide by."""
+    config = compose_config(
+        *SMALL, *PPO, "env=PointGoal1", "model.normalise=10", "frames=480", "collector=process"
+    )
+    seed_everything(0, 1)
+
+    def make(num_envs):
+        return make_env(
+            {"name": "PointGoal1", "robot_base": "point", "num_steps": 25},
+            num_envs=num_envs,
+            seed=0,
+        )
+
+    trainer = build_trainer(config, make(num_envs=4), tmp_path, make)
+    try:
+        batches = trainer.batches()
+        for _ in range(2):
+            trainer.epoch(batches)
+        batch = next(batches)
+        actor = trainer.algorithm.actor
+        with torch.no_grad():
+            torch.testing.assert_close(actor(batch.select("observation"))["loc"], batch["loc"])
+    finally:
+        trainer.close()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("model", "lowest", "highest"), [("mlp", 3.5, 5.0), ("gru", 7.0, 8.0)])
+def test_a_memory_recalls_what_was_shown_once(model, lowest, highest, tmp_path):
+    """Eight steps, of which the side was shown before the first; half of the others is luck."""
+    run_train(
+        *("env=gymnasium", "env.id=Recall-v0", "algo=ppo", f"model={model}", "num_envs=20"),
+        *("frames_per_batch=1600", "frames=64_000", "model.hidden_sizes=[16]", "logger=none"),
+        *("policy_update.minibatch_size=320", "critic_update.minibatch_size=320"),
+        *("policy_update.max_kl=0.05", "num_threads=1", f"hydra.run.dir={tmp_path}"),
+    )
+    table = read_table(tmp_path / "progress.csv")
+    assert lowest < sum(table["episode_return"][-5:]) / 5 <= highest
