@@ -78,11 +78,8 @@ class PPOLoss(SurrogateLoss):
         clip_epsilon: float,
         entropy_coeff: float,
         reduction: str = "mean",
-        multiplier: Multiplier | None = None,
     ) -> None:
-        super().__init__(
-            actor_network, entropy_coeff=entropy_coeff, multiplier=multiplier, reduction=reduction
-        )
+        super().__init__(actor_network, entropy_coeff=entropy_coeff, reduction=reduction)
         self.register_coeff_buffer("clip_epsilon", clip_epsilon, device=self._default_device)
 
     def _surrogates(self, tensordict: TensorDictBase, log_weight: Tensor) -> dict[str, Tensor]:
@@ -160,8 +157,8 @@ class PPOLagrangianLoss(PPOLoss):
             clip_epsilon=clip_epsilon,
             entropy_coeff=entropy_coeff,
             reduction=reduction,
-            multiplier=require_multiplier(multiplier, "PPOLoss"),
         )
+        self.multiplier = require_multiplier(multiplier, "PPOLoss")
         if cost_clipping not in get_args(CostClipping):
             raise ValueError(
                 f"cost_clipping must be one of {get_args(CostClipping)}, got {cost_clipping!r}."

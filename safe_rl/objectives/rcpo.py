@@ -53,8 +53,8 @@ class RCPOLoss(PPOLoss):
             clip_epsilon=clip_epsilon,
             entropy_coeff=entropy_coeff,
             reduction=reduction,
-            multiplier=require_multiplier(multiplier, "PPOLoss"),
         )
+        self.multiplier = require_multiplier(multiplier, "PPOLoss")
 
     def _advantage(self, tensordict: TensorDictBase, log_weight: Tensor) -> Tensor:
         return self._penalised_advantage(tensordict, log_weight)

@@ -42,11 +42,8 @@ class TRPOLoss(SurrogateLoss):
         *,
         entropy_coeff: float,
         reduction: str = "mean",
-        multiplier: Multiplier | None = None,
     ) -> None:
-        super().__init__(
-            actor_network, entropy_coeff=entropy_coeff, multiplier=multiplier, reduction=reduction
-        )
+        super().__init__(actor_network, entropy_coeff=entropy_coeff, reduction=reduction)
 
     def _surrogates(self, tensordict: TensorDictBase, log_weight: Tensor) -> dict[str, Tensor]:
         ratio = log_weight.exp()
@@ -94,5 +91,5 @@ class TRPOLagrangianLoss(TRPOLoss):
             actor_network,
             entropy_coeff=entropy_coeff,
             reduction=reduction,
-            multiplier=require_multiplier(multiplier, "TRPOLoss"),
         )
+        self.multiplier = require_multiplier(multiplier, "TRPOLoss")

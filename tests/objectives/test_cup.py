@@ -3,13 +3,15 @@
 import pytest
 import torch
 from one_state import minimise, one_state, total
+from point_mass import PointMass
+from run_configs import point_mass_config
 from samples import make_actor, make_batch, perturb
 from tensordict import TensorDict
 from tensordict.nn import NormalParamExtractor, TensorDictModule
 from torch.distributions import kl_divergence
 from torchrl.modules import ProbabilisticActor, TruncatedNormal
 
-from safe_rl.algorithms import MinibatchUpdate, UpdatesInTurn
+from safe_rl.algorithms import MinibatchUpdate, OnPolicy, UpdatesInTurn
 from safe_rl.objectives import CUPLoss, PPOLoss, ProjectedMultiplier
 
 FACTOR = (1 - 0.99 * 0.97) / (1 - 0.99)
@@ -93,6 +95,20 @@ def test_without_a_weight_the_projection_stays_where_the_first_step_has_led():
     assert seen[0.0]["projection_kl"] < 1e-6 < seen[1.0]["projection_kl"]
     assert seen[1.0]["cost_surrogate"] < seen[0.0]["cost_surrogate"]
     assert {"num_steps", "projection_num_steps"} < set(seen[0.0])
+
+
+def test_the_first_step_of_a_run_knows_no_costs():
+    """Also where a multiplier is at hand."""
+    overrides = ("algo=cup", "cost_limits={cost_north: 1}")
+    algorithm = OnPolicy.build(point_mass_config(*overrides), PointMass(2))
+    first, projection = (
+        update.loss
+        for update in (algorithm.policy_update.first, algorithm.policy_update.then["projection"])
+    )
+    assert algorithm.constraints.multiplier is projection.multiplier
+    assert first.multiplier is None
+    assert "cost_advantage" not in first.in_keys
+    assert first.actor_network is projection.actor_network is algorithm.actor
 
 
 def test_updates_in_turn_resume_by_name():
