@@ -135,8 +135,8 @@ class TRPOStep:
         actor_network: ProbabilisticTensorDictSequential | None = None,
     ) -> None:
         self.loss = loss
-        self.actor_network = actor_network or getattr(loss, "actor_network", None)
-        if self.actor_network is None:
+        actor = actor_network or getattr(loss, "actor_network", None)
+        if actor is None:
             raise ValueError(
                 "The loss has no attribute `actor_network`: pass the policy as actor_network."
             )
@@ -148,6 +148,7 @@ class TRPOStep:
         self.target_kl, self.damping, self.cg_iterations = target_kl, damping, cg_iterations
         self.backtrack_coeff, self.max_backtracks = backtrack_coeff, max_backtracks
         self.fisher_subsample = fisher_subsample
+        self.actor_network = actor
         self.parameters = [p for p in self.actor_network.parameters() if p.requires_grad]
 
     def __call__(

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import TypeAlias
+
 import torch
 from torch import Tensor
 from torch.distributions import Beta, Categorical, Independent
@@ -10,6 +12,7 @@ __all__ = ["BoundedBeta", "Choices", "OneChoice"]
 
 # Beta densities are infinite or zero at the ends of (0, 1), which single precision rounds to.
 _EDGE = 1e-6
+Shape: TypeAlias = torch.Size | list[int] | tuple[int, ...]
 
 
 class Choices(Independent):
@@ -76,11 +79,11 @@ class BoundedBeta(Independent):
         super().__init__(Beta(alpha, beta), 1)
         self._low, self._width = low, high - low
 
-    def rsample(self, sample_shape: torch.Size = torch.Size()) -> Tensor:  # noqa: B008
+    def rsample(self, sample_shape: Shape = torch.Size()) -> Tensor:  # noqa: B008
         """Draw actions, differentiably."""
         return self._stretched(super().rsample(sample_shape))
 
-    def sample(self, sample_shape: torch.Size = torch.Size()) -> Tensor:  # noqa: B008
+    def sample(self, sample_shape: Shape = torch.Size()) -> Tensor:  # noqa: B008
         """Draw actions."""
         with torch.no_grad():
             return self.rsample(sample_shape)
