@@ -1,0 +1,276 @@
+"""Makes the pages of the algorithms, and their comparison, from what the program itself says.
+
+``python docs/generate_algorithms.py`` writes docs/algorithms/<name>.md and comparison.md: settings
+from conf/, their meanings from the table of keys, what is logged from docs/algorithms/index.md,
+figures from results/algorithms/, the rest from docs/algorithms/pages.yaml.
+``python docs/generate_algorithms.py collect RUNS COMMIT`` takes finished runs of a commit, RUNS/
+<environment>/<algorithm>/seed<n>, into results/algorithms/ before.
+"""
+
+from __future__ import annotations
+
+import re
+import sys
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import yaml
+from algorithm_results import collect, comparison, measured
+from hydra import compose, initialize_config_dir
+from omegaconf import DictConfig, OmegaConf
+
+from safe_rl.cli.keys import PARTS
+from safe_rl.targets import accepted_names, locate
+
+ROOT = Path(__file__).resolve().parents[1]
+PAGES = ROOT / "docs" / "algorithms"
+TEXTS: dict[str, dict[str, Any]] = yaml.safe_load((PAGES / "pages.yaml").read_text())
+GENERATED = "<!-- made by docs/generate_algorithms.py: change pages.yaml, conf/ or results/ -->"
+# nodes of a configuration that are an algorithm's own, and what the live arguments are called here
+NODES = ("loss", "policy_update", "lagrangian", "then.projection.loss")
+NODES += ("then.projection.policy_update",)
+LIVE = ("actor_network", "multiplier", "constraints", "cost_limits")
+SHOWN = {"actor_network": "actor", "cost_limits": "limits"}
+
+TEMPLATE = """{mark}
+# {title}
+
+`algo={name}` · {source}
+
+**Problem.** {problem}
+
+$$
+{equation}
+$$
+
+{how}
+
+The notation is that of [the overview](index.md), as are batches, advantages and critics.
+
+## Settings
+
+{keys}
+
+Shared by all algorithms: [presets](index.md#presets){limits}.
+
+## What is logged
+
+Besides the columns that [all algorithms](index.md#what-is-logged) have:
+
+{columns}
+
+## In a loop of your own
+
+The {parts} to any TorchRL policy and to any batch that has advantages, which `VectorGAE` and
+`CostGAE` write, or whatever you have.
+
+```python
+{snippet}
+```
+
+## Measured
+
+{measured}
+
+## Deviations from the article and from published code
+
+{deviations}
+
+## Known weaknesses
+
+{weaknesses}
+"""
+
+
+def pages() -> dict[str, str]:
+    """All pages by file name."""
+    written = {f"{name}.md": _page(name) for name in TEXTS}
+    return {**written, "comparison.md": f"{GENERATED}\n{comparison(TEXTS)}"}
+
+
+def _page(name: str) -> str:
+    texts = TEXTS[name]
+    config, paper = (_compose(name, preset) for preset in ("default", "paper"))
+    constrained = "constrained" in texts["columns"]
+    problem = r"$\max_\pi J_r(\pi)$"
+    if constrained:
+        problem += (
+            r" subject to $J_{c_i}(\pi) \le d_i$, $i = 1 \dots k$, undiscounted costs per episode"
+        )
+    is_step = "lr" not in OmegaConf.to_yaml(config.policy_update)
+    return TEMPLATE.format(
+        mark=GENERATED,
+        name=name,
+        problem=f"{problem}.",
+        keys=_keys(config, paper),
+        limits=", [holding the limit](index.md#holding-the-limit)" if constrained else "",
+        columns=_columns(texts["columns"]),
+        parts="loss and the step apply" if is_step else "loss applies",
+        snippet=_snippet(config, is_step, constrained),
+        measured=measured(name),
+        **{key: str(texts[key]).strip() for key in texts if key != "columns"},
+    )
+
+
+def _compose(algo: str, preset: str) -> DictConfig:
+    with initialize_config_dir(str(ROOT / "conf"), version_base="1.3"):
+        return compose("config", [f"algo={algo}", f"preset={preset}", "env=gymnasium"])
+
+
+def _parts(config: DictConfig) -> Iterator[tuple[str, str, dict[str, Any]]]:
+    """Path, class and arguments of every part that is the algorithm's own."""
+    for path in NODES:
+        node = OmegaConf.select(config, path)
+        if node is not None:
+            plain = OmegaConf.to_container(node, resolve=True)
+            target = plain.pop("_target_")
+            yield path, target, plain
+
+
+def _keys(config: DictConfig, paper: DictConfig) -> str:
+    rows = ["| key | `preset=default` | `preset=paper` | meaning |", "|---|---|---|---|"]
+    for path, target, arguments in _parts(config):
+        name = target.rpartition(".")[2]
+        other = OmegaConf.select(paper, f"{path}._target_")
+        same = other == target
+        rows.append(
+            f"| `{path}._target_` | `{name}` | `{str(other).rpartition('.')[2]}` | the class |"
+        )
+        known = PARTS.get(name, {})
+        for key, value in arguments.items():
+            theirs = OmegaConf.select(paper, f"{path}.{key}") if same else None
+            if key == "optimizer":
+                key, value, theirs = "optimizer.lr", value["lr"], theirs.lr if theirs else None
+            meaning = known[key].meaning if key in known else "learning rate of Adam"
+            if isinstance(value, dict):
+                value = value.get("_target_", "").rpartition(".")[2]
+                theirs = theirs and theirs.get("_target_", "").rpartition(".")[2]
+            cells = (_cell(value), _cell(theirs) if same else "—")
+            rows.append(f"| `{path}.{key}` | {cells[0]} | {cells[1]} | {meaning} |")
+    return "\n".join(rows)
+
+
+def _cell(value: Any) -> str:
+    written = {None: "null", True: "true", False: "false"}
+    return f"`{written[value] if value is None or isinstance(value, bool) else value}`"
+
+
+def _columns(names: list[str]) -> str:
+    index = (PAGES / "index.md").read_text()
+    tables = [
+        re.search(rf"<!-- table: columns of {name} -->\n(.*?)\n\n", index, re.DOTALL)[1]  # type: ignore[index]
+        for name in names
+    ]
+    rows = [row for table in tables for row in table.splitlines()[2:]]
+    text = "\n".join(["| column | meaning |", "|---|---|", *rows])
+    return text.replace("(#", "(index.md#").replace("(../../", "(../../")
+
+
+def _call(target: str, arguments: Mapping[str, Any], first: tuple[str, ...] = ()) -> str:
+    names = accepted_names(locate(target))
+    live = [SHOWN.get(name, name) for name in LIVE if name in names and not first]
+    if first and "cost_limits" in names and "limits" not in first:
+        first = (*first, "limits")
+    settings = [f"{key}={value!r}" for key, value in arguments.items()]
+    inside = [*first, *live, *settings]
+    line = f"{target.rpartition('.')[2]}({', '.join(inside)})"
+    if len(line) < 88:
+        return line
+    cut = "\n".join(f"    {entry}," for entry in inside)
+    return f"{target.rpartition('.')[2]}(\n{cut}\n)"
+
+
+def _snippet(config: DictConfig, is_step: bool, constrained: bool) -> str:
+    parts = {path: (target, arguments) for path, target, arguments in _parts(config)}
+    targets = [parts["loss"][0]]
+    lines = ['limits = {"cost": 25.0}'] if constrained else []
+    names = accepted_names(locate(parts["loss"][0]))
+    lines.append(
+        "actor = make_actor(3, 2, hidden_sizes=[64, 64], initial_log_std=-0.5)  # or yours"
+    )
+    known, violated = "", "mean_costs - torch.tensor(list(limits.values()))"
+    if "lagrangian" in parts:
+        target, arguments = parts["lagrangian"]
+        targets.append(target)
+        lines.append(f"multiplier = {_call(target, arguments, ('limits',))}")
+        known = "    multiplier.update(mean_costs)\n"
+    elif "constraints" in names:
+        targets.append("safe_rl.algorithms.Constraints")
+        lines.append("constraints = Constraints(limits)")
+        known = (
+            "    constraints.violation.copy_(mean_costs - constraints.limits)\n"
+            "    constraints.episode_length.fill_(1000.0)\n"
+        )
+    losses = [("loss", "optimizer")]
+    lines.append(f"loss = {_call(*parts['loss'])}")
+    if "then.projection.loss" in parts:
+        targets.append(parts["then.projection.loss"][0])
+        lines.append(f"projection = {_call(*parts['then.projection.loss'])}")
+        losses.append(("projection", "back"))
+    if is_step:
+        target, arguments = parts["policy_update"]
+        targets.append(target)
+        lines.append(f"step = {_call(target, arguments, ('loss',))}")
+        given = (
+            f", {violated}, torch.tensor(1000.0)"
+            if constrained and "lagrangian" not in parts
+            else ""
+        )
+        body = f"{known}    return step(batch{given})"
+    else:
+        lr = parts["policy_update"][1]["optimizer"]["lr"]
+        lines += [f"{adam} = torch.optim.Adam({of}.parameters(), lr={lr})" for of, adam in losses]
+        body = known + "\n".join(_passes(of, adam) for of, adam in losses) + "\n    return losses"
+    imports = _imports(targets)
+    costs = ', batch["cost_advantage"]' if constrained else ""
+    values = ", torch.randn(1000, 1)" if constrained else ""
+    arguments_of_learn = "batch, mean_costs" if constrained else "batch"
+    given_to_learn = "batch, mean_costs=torch.tensor([30.0])" if constrained else "batch"
+    setting = "\n".join(lines)
+    return f"""import torch
+from tensordict import TensorDict
+
+{imports}
+
+{setting}
+
+
+def learn({arguments_of_learn}):
+{body}
+
+
+with torch.no_grad():  # a collector's batch
+    batch = actor(TensorDict(observation=torch.randn(1000, 3), batch_size=[1000]))
+batch["advantage"]{costs} = torch.randn(1000, 1){values}
+assert learn({given_to_learn})["kl"] < 0.1"""
+
+
+def _passes(loss: str, optimizer: str) -> str:
+    anchored = (
+        f"    {loss}.anchor(batch)  # from where the first step has led\n"
+        if optimizer == "back"
+        else ""
+    )
+    return f"""{anchored}    for minibatch in batch.split(250):
+        losses = {loss}(minibatch)
+        {optimizer}.zero_grad()
+        sum(value for key, value in losses.items() if key.startswith("loss_")).backward()
+        {optimizer}.step()"""
+
+
+def _imports(targets: list[str]) -> str:
+    rooms: dict[str, set[str]] = {"safe_rl.models": {"make_actor"}}
+    for target in targets:
+        room, _, name = target.rpartition(".")
+        rooms.setdefault(room, set()).add(name)
+    return "\n".join(
+        f"from {room} import {', '.join(sorted(rooms[room]))}" for room in sorted(rooms)
+    )
+
+
+if __name__ == "__main__":
+    if sys.argv[1:2] == ["collect"]:
+        collect(Path(sys.argv[2]), sys.argv[3])
+    for file, text in pages().items():
+        (PAGES / file).write_text(text)

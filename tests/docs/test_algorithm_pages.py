@@ -1,0 +1,33 @@
+"""The pages of the algorithms are what their sources make of them, and their loops run."""
+
+import re
+import sys
+from pathlib import Path
+
+import pytest
+
+DOCS = Path(__file__).resolve().parents[2] / "docs"
+sys.path.insert(0, str(DOCS))
+
+import generate_algorithms  # noqa: E402
+
+PAGES = generate_algorithms.pages()
+
+
+@pytest.mark.parametrize("name", PAGES)
+def test_pages_are_up_to_date(name):
+    advice = "run python docs/generate_algorithms.py"
+    assert (DOCS / "algorithms" / name).read_text() == PAGES[name], advice
+
+
+@pytest.mark.parametrize("name", [name for name in PAGES if name != "comparison.md"])
+def test_the_loop_of_ones_own_runs(name):
+    snippets = re.findall(r"```python\n(.*?)```", PAGES[name], re.DOTALL)
+    assert len(snippets) == 1
+    exec(snippets[0], {})
+
+
+@pytest.mark.parametrize("name", PAGES)
+def test_links_lead_somewhere(name):
+    for target in re.findall(r"\]\(([^)#<]+)[)#]", PAGES[name]):
+        assert target.startswith("http") or (DOCS / "algorithms" / target).exists(), target
