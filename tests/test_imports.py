@@ -56,6 +56,7 @@ FLOORS = {
         ("safety_gym.rules.robot_copies",),
         ("safety_gym.rules.readings",),
         ("safety_gym.suite", "safety_gym.world", "safety_gym.world.scenery"),
+        ("safety_gym.world.placements",),
         ("safety_gym.world.bodies", "safety_gym.world.layout", "safety_gym.world.views"),
         ("safety_gym.world.building", "safety_gym.world.draws"),
         ("safety_gym.extending", "safety_gym.world.snapshot"),
@@ -137,6 +138,7 @@ FLOORS = {
     "cli": (
         ("benchmark", "conf", "options", "robots", "run_folders", "values"),
         ("keys",),
+        ("part_keys",),
         ("failures", "settings"),
         ("overrides",),
         ("user_code",),

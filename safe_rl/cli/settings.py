@@ -10,7 +10,8 @@ from typing import Any, NamedTuple
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from safe_rl.cli.keys import EXTRAS, FLAGS, KEYS, PARTS, Key
+from safe_rl.cli.keys import KEYS, Key
+from safe_rl.cli.part_keys import EXTRAS, FLAGS, PARTS
 from safe_rl.cli.robots import robot_of
 from safe_rl.envs import complete_env
 from safe_rl.evaluation.settings import check_device
@@ -58,7 +59,7 @@ class _Part(NamedTuple):
 
 
 def check_settings(config: DictConfig, folder: RunFolder | None = None) -> None:
-    """Check every key of a configuration by the tables of :mod:`safe_rl.cli.keys`.
+    """Check every key of a configuration by the tables `KEYS` and `PARTS`.
 
     Parts of one's own are checked by what they inherit from the package's, and for names that they
     do not take. Whole numbers that are written as 3e5 become integers.

@@ -17,7 +17,8 @@ import safe_rl.models
 import safe_rl.objectives
 import safe_rl.runs.loggers
 from safe_rl.algorithms.parts import find_recipe
-from safe_rl.cli.keys import KEYS, PARTS
+from safe_rl.cli.keys import KEYS
+from safe_rl.cli.part_keys import PARTS
 from safe_rl.cli.settings import SettingError, check_settings, plain
 from safe_rl.cli.values import anything
 from safe_rl.envs import ConfigError, SafetyGymConfig, resolve

@@ -33,7 +33,7 @@ from safe_rl.envs.safety_gym.world.draws import (
     pick_layouts,
     start_episodes,
 )
-from safe_rl.envs.safety_gym.world.layout import plan_placements
+from safe_rl.envs.safety_gym.world.placements import plan_placements
 from safe_rl.envs.safety_gym.world.snapshot import check_worlds, read_state, write_state
 from safe_rl.envs.safety_gym.world.views import make_world, refresh
 from safe_rl.envs.states import require_episodes

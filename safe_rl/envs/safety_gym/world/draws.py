@@ -17,12 +17,8 @@ from safe_rl.envs.safety_gym.records.config import SafetyGymConfig
 from safe_rl.envs.safety_gym.records.scene import Scene
 from safe_rl.envs.safety_gym.records.world import World
 from safe_rl.envs.safety_gym.rules.tasks import goal_is_button
-from safe_rl.envs.safety_gym.world.layout import (
-    LayoutError,
-    PlacementPlan,
-    resample_goal,
-    sample_layouts,
-)
+from safe_rl.envs.safety_gym.world.layout import LayoutError, resample_goal, sample_layouts
+from safe_rl.envs.safety_gym.world.placements import PlacementPlan
 from safe_rl.envs.safety_gym.world.views import refresh
 
 

@@ -1,0 +1,288 @@
+"""The keys of the parts that a run is built from, by class: what each may hold, and what it means.
+
+They hold whatever node of the configuration a part stands in.
+"""
+
+from __future__ import annotations
+
+from safe_rl.cli.keys import KEYS, Key
+from safe_rl.cli.values import (
+    Values,
+    anything,
+    boolean,
+    choice,
+    component,
+    count,
+    list_of,
+    mapping_of,
+    number,
+    one_or_per_cost,
+    optional,
+    text,
+)
+
+__all__ = ["EXTRAS", "FLAGS", "PARTS"]
+
+_SHARE = number(0, 1)
+_POSITIVE = number(0, above=True)
+_NOT_NEGATIVE = number(0)
+_STRENGTH = number(1e-9, 1e9)  # what is divided by, and divides
+
+_OPTIMIZER = {
+    "lr": Key(number(0, 1000, above=True), "learning rate"),
+    "betas": Key(list_of(number(0, 1, below=True), 3), "decay rates of the moments"),
+    "eps": Key(_NOT_NEGATIVE, "what denominators are kept above"),
+    "weight_decay": Key(_NOT_NEGATIVE, "decay of the weights"),
+    "momentum": Key(number(0, 1, below=True), "weight of past gradients"),
+    "fused": Key(optional(boolean), "whether to step in one kernel"),
+    "foreach": Key(optional(boolean), "whether to step all tensors together"),
+    "amsgrad": Key(boolean, "whether to keep the maximum of second moments"),
+    "nesterov": Key(boolean, "whether to look ahead"),
+}
+_ESTIMATOR = {
+    "gamma": Key(_SHARE, "discount per step"),
+    "lmbda": Key(_SHARE, "decay of the TD errors"),
+    "value_target": Key(choice("lambda_return", "return_to_go"), "what critics learn"),
+}
+_TRUST_REGION = {
+    "target_kl": Key(_POSITIVE, "radius δ of the trust region, a mean KL divergence"),
+    "damping": Key(_NOT_NEGATIVE, "multiple of the identity added to the Fisher matrix"),
+    "cg_iterations": Key(count(1, 10_000), "iterations of conjugate gradients"),
+    "backtrack_coeff": Key(
+        number(0, 1, above=True, below=True), "factor from one try of the line search to the next"
+    ),
+    "max_backtracks": Key(count(1, 10_000), "tries of the line search"),
+    "fisher_subsample": Key(number(0, 1, above=True), "share of the batch for the Fisher matrix"),
+}
+_LOSS = {
+    "entropy_coeff": Key(_NOT_NEGATIVE, "factor of the entropy bonus"),
+    "reduction": Key(choice("mean", "sum"), "how samples are reduced"),
+}
+_CLIPPED_LOSS = {
+    **_LOSS,
+    "clip_epsilon": Key(number(0, 1000, above=True), "half-width of the ratios that earn"),
+}
+_Q_FUNCTIONS = {
+    "gamma": Key(_SHARE, "discount per step"),
+    "loss_function": Key(choice("l2", "smooth_l1", "l1"), "of the TD errors"),
+}
+_SAC = {
+    **_Q_FUNCTIONS,
+    "alpha_init": Key(_STRENGTH, "first weight of the entropy"),
+    "target_entropy": Key(
+        Values(lambda v: v == "auto" or number().hold(v), f"auto, or {number().words}"),
+        "entropy to which its weight is adapted; auto: minus the number of actions",
+    ),
+    "fixed_alpha": Key(boolean, "whether the weight of the entropy stays as it is"),
+}
+_TD3 = {
+    **_Q_FUNCTIONS,
+    "policy_noise": Key(_NOT_NEGATIVE, "deviation of the noise on the target policy's actions"),
+    "noise_clip": Key(_NOT_NEGATIVE, "bound of that noise"),
+}
+_COST_CRITICS = {
+    "pessimism": Key(number(), "standard deviations among cost critics on top of their mean"),
+}
+_SAUTE = {
+    "budgets": Key(mapping_of(_POSITIVE), "cost per episode allowed by cost"),
+    "discount": Key(number(0, 1, above=True), "discount of the costs that a budget is for"),
+    "unsafe_reward": Key(number(), "reward of a step once a budget is spent"),
+    "rescale_budgets": Key(boolean, "whether budgets are undiscounted"),
+}
+_WORKERS = {"num_collectors": KEYS["collector.num_collectors"]}
+
+PARTS = {
+    "MinibatchUpdate": {
+        "optimizer": Key(component, "the optimiser"),
+        "num_passes": Key(count(1, 10**9), "passes over the batch"),
+        "minibatch_size": Key(optional(count()), "samples per step; null: the whole batch"),
+        "max_kl": Key(optional(_POSITIVE), "mean KL divergence that ends the update"),
+        "max_grad_norm": Key(optional(_POSITIVE), "norm to which the gradient is clipped"),
+        "adapt_rate": Key(optional(component), "what adapts the learning rate"),
+        "compile": Key(boolean, "whether to compile the loss"),
+    },
+    "KLAdaptiveRate": {
+        "factor": Key(number(1, above=True), "by which the rate is divided or multiplied"),
+        "lowest": Key(number(0, 1000, above=True), "lower bound of the rate"),
+        "highest": Key(number(0, 1000, above=True), "upper bound of the rate"),
+        "few_steps": Key(_SHARE, "share of the steps below which an update ended early"),
+        "low_kl": Key(_SHARE, "share of the KL limit below which an update fell short"),
+    },
+    "TRPOStep": _TRUST_REGION,
+    "CPOStep": {
+        **_TRUST_REGION,
+        "rescale_violation": Key(boolean, "whether violations are divided by the episode length"),
+    },
+    "PCPOStep": {
+        **_TRUST_REGION,
+        "projection": Key(choice("kl", "l2"), "distance that the projection keeps small"),
+        "rescale_violation": Key(boolean, "whether violations are divided by the episode length"),
+    },
+    "CRPOStep": {
+        **_TRUST_REGION,
+        "tolerance": Key(_NOT_NEGATIVE, "η, violation of an episode's cost that is let pass"),
+    },
+    "CTRPOStep": {
+        **_TRUST_REGION,
+        "beta": Key(_NOT_NEGATIVE, "β, weight of the barrier, per unit of an episode's cost"),
+        "gamma": Key(
+            optional(number(0, 1, below=True)), "discount that makes sums of averages; null: T̄ does"
+        ),
+        "hysteresis": Key(number(0, 1, above=True), "share of a limit at which a recovery ends"),
+    },
+    "PPOLoss": _CLIPPED_LOSS,
+    "PPOLagrangianLoss": {
+        **_CLIPPED_LOSS,
+        "cost_clipping": Key(choice("none", "pessimistic", "joint"), "how cost surrogates are cut"),
+    },
+    "SACLoss": _SAC,
+    "SACLagrangianLoss": {**_SAC, **_COST_CRITICS},
+    "TD3Loss": _TD3,
+    "TD3LagrangianLoss": {**_TD3, **_COST_CRITICS},
+    "Memory": {
+        "capacity": Key(count(), "transitions that are kept", bytes_each=50),
+        "batch_size": Key(count(), "transitions in a minibatch"),
+        "n_steps": Key(count(1, 1000), "steps that a transition spans"),
+        "storage": Key(choice("tensor", "memmap"), "where transitions are kept"),
+        "prioritised": Key(optional(mapping_of(_SHARE)), "{alpha: …, beta: …}; null: uniform"),
+        "keep": Key(boolean, "whether checkpoints hold the transitions"),
+    },
+    "ReplayUpdate": {
+        "optimizer": Key(component, "the optimiser"),
+        "updates_per_step": Key(_POSITIVE, "gradient steps per step of an environment"),
+        "tau": Key(number(0, 0.5, above=True), "share of the way that target networks go"),
+        "policy_delay": Key(count(1, 10_000), "steps of the critics per step of the policy"),
+        "rates": Key(optional(mapping_of(_POSITIVE)), "learning rates by name of parameters"),
+        "max_grad_norm": Key(optional(_POSITIVE), "norm to which the gradient is clipped"),
+        "compile": Key(boolean, "whether to compile the loss"),
+    },
+    "make_squashed_actor": {},
+    "make_bounded_actor": {},
+    "TRPOLoss": _LOSS,
+    "TRPOLagrangianLoss": _LOSS,
+    "CPOLoss": _LOSS,
+    "RCPOLoss": _CLIPPED_LOSS,
+    "P3OLoss": {
+        **_CLIPPED_LOSS,
+        "kappa": Key(_NOT_NEGATIVE, "penalty factor κ"),
+        "gamma": Key(optional(_SHARE), "discount that weighs the violation; null: 1/T̄ does"),
+    },
+    "IPOLoss": {
+        **_CLIPPED_LOSS,
+        "kappa": Key(_STRENGTH, "strength κ of the barrier"),
+        "max_weight": Key(_STRENGTH, "weight of costs at the limit and beyond"),
+    },
+    "FOCOPSLoss": {
+        **_LOSS,
+        "temperature": Key(_STRENGTH, "β, the trust region's multiplier"),
+        "max_state_kl": Key(_POSITIVE, "KL divergence beyond which a state teaches nothing"),
+    },
+    "CUPLoss": {
+        **_LOSS,
+        "gamma": Key(number(0, 1, below=True), "discount of the cost advantages"),
+        "lmbda": Key(_SHARE, "decay of their TD errors"),
+    },
+    "VectorGAE": _ESTIMATOR,
+    "CostGAE": _ESTIMATOR,
+    "LagrangeMultiplier": {
+        "init": Key(one_or_per_cost(number(0, 1e6, above=True)), "first λ"),
+        "lr": Key(_POSITIVE, "step size of Adam"),
+        "betas": _OPTIMIZER["betas"],
+        "eps": _OPTIMIZER["eps"],
+    },
+    "ProjectedMultiplier": {
+        "init": Key(one_or_per_cost(number(0, 1e6)), "first λ"),
+        "lr": Key(_POSITIVE, "change of λ per unit of violation"),
+        "highest": Key(optional(_POSITIVE), "upper bound of λ; null: none"),
+    },
+    "PIMultiplier": {
+        "init": Key(one_or_per_cost(number(0, 1e6)), "first λ"),
+        "kp": Key(_NOT_NEGATIVE, "proportional gain"),
+        "ki": Key(_NOT_NEGATIVE, "integral gain"),
+        "saturation": Key(_POSITIVE, "bound of the error, in units of the limit"),
+        "highest": Key(_POSITIVE, "upper bound of λ"),
+    },
+    "LimitTracker": {
+        "margin": Key(_NOT_NEGATIVE, "standard errors of a batch's J_c below the limit"),
+        "largest_margin": Key(_SHARE, "bound of the margin, as a share of the limit"),
+        "free_steps": Key(count(0), "steps for which costs are free"),
+        "descent_steps": Key(count(0), "steps in which the limit then comes down"),
+        "recovery": Key(_SHARE, "share of a limit to come down to, once above it"),
+        "frames": Key(count(), "steps of the whole run"),
+        "latest_end": Key(number(0, 1, above=True), "share of a run by which the descent is over"),
+        "smallest_scale": Key(_POSITIVE, "unit of violations of limits near 0, costs per step"),
+        "drift": Key(optional(_POSITIVE), "share by which J_c changes per update"),
+        "memory": Key(number(0, 1, below=True), "weight of the past"),
+        "lowest_trust": Key(number(0, 1, above=True), "share of a promise believed at least"),
+        "integral": Key(_NOT_NEGATIVE, "share of a violation that is asked for again"),
+        "largest_integral": Key(_NOT_NEGATIVE, "bound of that, in units of violations"),
+    },
+    "CVaR": {
+        "tail": Key(number(0, 1, above=True), "share of the episodes, the worst"),
+        "window": Key(count(1, 10**6), "episodes from which the value at risk is taken"),
+        "ramp_start": Key(count(0), "steps in which the mean is limited"),
+        "ramp_steps": Key(count(0), "steps in which the tail then takes its place"),
+    },
+    "Chance": {"most_over": Key(number(0, 1, below=True), "share of episodes over the limit")},
+    "PIDMultiplier": {
+        "init": Key(one_or_per_cost(number(0, 1e6)), "first λ"),
+        "kp": Key(_NOT_NEGATIVE, "proportional gain"),
+        "ki": Key(_NOT_NEGATIVE, "integral gain"),
+        "kd": Key(_NOT_NEGATIVE, "derivative gain"),
+        "proportional_ema": Key(number(0, 1, below=True), "weight of the past in the error"),
+        "derivative_ema": Key(number(0, 1, below=True), "weight of the past in the cost"),
+        "derivative_delay": Key(count(1, 100_000), "updates over which growth is measured"),
+        "scale": Key(
+            Values(
+                lambda v: v == "limit" or one_or_per_cost(_POSITIVE).hold(v),
+                f"limit, or {one_or_per_cost(_POSITIVE).words}",
+            ),
+            "unit of the errors",
+        ),
+    },
+    "make_process_collector": _WORKERS,
+    "make_ray_collector": {
+        **_WORKERS,
+        "ray_init": Key(mapping_of(anything), "arguments of ray.init"),
+        "resources": Key(mapping_of(anything), "resources of every actor"),
+    },
+    "Saute": _SAUTE,
+    "Simmer": {
+        **_SAUTE,
+        "first": Key(number(0, 1, above=True), "share of the budgets to begin with"),
+        "steps": Key(count(), "steps of each environment until budgets are whole"),
+    },
+    "EarlyTermination": {
+        "budgets": Key(mapping_of(_NOT_NEGATIVE), "cost per episode that ends it if exceeded")
+    },
+    "ActionFilter": {
+        "filter": Key(component, "the function that replaces actions"),
+        "cost_key": Key(text, "name of the cost of interventions"),
+    },
+    "PolicyMemory": {"size": Key(count(1, 16_384), "numbers that are remembered")},
+    "TensorboardLogger": {"exp_name": Key(text, "folder of the event files")},
+    "MLflowLogger": {
+        "exp_name": Key(text, "name of the experiment"),
+        "tracking_uri": Key(text, "database or server"),
+    },
+    "WandbLogger": {
+        "exp_name": Key(text, "name of the run"),
+        "project": Key(text, "name of the project"),
+        "offline": Key(boolean, "whether to keep everything in the folder of the run"),
+    },
+    "torch.optim": _OPTIMIZER,
+}
+"""Of the package's parts by class, and of torch's optimisers together."""
+
+FLAGS = {
+    "_target_": Key(optional(text), "what is built"),
+    "_partial_": Key(boolean, "whether other arguments follow"),
+}
+"""Keys of any part that are Hydra's."""
+
+EXTRAS = {
+    "make_ray_collector": ("ray", "ray"),
+    "WandbLogger": ("wandb", "wandb"),
+    "MLflowLogger": ("mlflow", "mlflow"),
+}
+"""Parts that need a package besides: its name, and the extra that installs it."""
