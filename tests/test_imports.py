@@ -156,7 +156,9 @@ FLOORS = {
         ("",),
     ),
     "reporting": (
-        ("columns", "recorded"),
+        ("cleaning", "columns"),
+        ("measured",),
+        ("recorded",),
         ("averages", "origins"),
         ("naming",),
         ("experiments",),

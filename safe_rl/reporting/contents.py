@@ -15,7 +15,7 @@ from matplotlib.figure import Figure
 
 from safe_rl.reporting.columns import Column, Record, Table
 from safe_rl.reporting.experiments import Experiment, group_runs
-from safe_rl.reporting.inventory import evaluation_table, run_table, videos
+from safe_rl.reporting.inventory import certificate_table, evaluation_table, run_table, videos
 from safe_rl.reporting.origins import Origin, find_origins
 from safe_rl.reporting.pictures import (
     Style,
@@ -134,6 +134,7 @@ def build_report(root: Path, suite: Suite, *, seeds_needed: int, unfinished: boo
             [*_slates(experiments, styles, seeds_needed), *_if_any(lacking)],
         ),
         Section("dominance", "Which is better", _if_any(dominance_table(records))),
+        Section("certificates", "Certificates", _if_any(certificate_table(experiments))),
         Section("evaluations", "Evaluations", _if_any(evaluation_table(experiments))),
         Section("videos", "Videos", [Film(clean(c), path) for c, path in videos(experiments)]),
         Section("runs", "Runs", [run_table(experiments), *_if_any(_left_out(skipped))]),

@@ -12,7 +12,7 @@ from safe_rl.reporting.columns import Column, Record, Table, interval
 from safe_rl.reporting.experiments import Experiment
 from safe_rl.reporting.recorded import Run, clean
 
-__all__ = ["duration", "evaluation_table", "run_table", "videos"]
+__all__ = ["certificate_table", "duration", "evaluation_table", "run_table", "videos"]
 
 _WHERE = tuple(Column(name, ("{}", name)) for name in ("environment", "algorithm"))
 _SEED = Column("seed", ("{:d}", "seed"))
@@ -94,6 +94,51 @@ def evaluation_table(experiments: Sequence[Experiment]) -> Table:
             ),
         ]
     return Table("evaluations", "Evaluations", columns, records)
+
+
+def certificate_table(experiments: Sequence[Experiment]) -> Table:
+    """Which runs have a checkpoint that surely keeps the limits."""
+    records = [
+        _certificate_record(experiment, run, run.certificate)
+        for experiment in experiments
+        for run in experiment.runs
+        if run.certificate is not None
+    ]
+    found = dict.fromkeys(name for record in records for name in record)
+    names = [name.removeprefix("bound_") for name in found if name.startswith("bound_")]
+    columns = [
+        *_WHERE,
+        _SEED,
+        Column("certified", ("{}", "certified"), (" at {:.0%}", "level"), mark=_is_missing),
+        Column("at", ("{:,} steps", "checkpoint")),
+        Column("$J_r$", ("{:.2f}", "certified_return")),
+    ]
+    for name in names:
+        columns += [
+            Column(f"{name} ≤", ("{:.3g}", f"bound_{name}")),
+            Column(f"wanted: {name} ≤", ("{:g}", f"most_{name}")),
+        ]
+    columns.append(Column("episodes", ("{:d}", "episodes")))
+    return Table("certificates", "Certificates", columns, records)
+
+
+def _certificate_record(
+    experiment: Experiment, run: Run, certificate: Mapping[str, Any]
+) -> dict[str, Any]:
+    bounds = certificate["bounds"].items()
+    return {
+        "environment": experiment.environment,
+        "algorithm": experiment.algorithm,
+        "seed": run.seed,
+        "certified": "no" if certificate["checkpoint"] is None else "yes",
+        **{name: value for name, value in certificate.items() if name != "bounds"},
+        **{f"bound_{name}": bound for name, (bound, _) in bounds},
+        **{f"most_{name}": most for name, (_, most) in bounds},
+    }
+
+
+def _is_missing(record: Record) -> str:
+    return "bad" if record["certified"] == "no" else ""
 
 
 def _evaluation_record(

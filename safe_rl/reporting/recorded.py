@@ -6,7 +6,6 @@ read that a link in the folder names outside of it, and nothing that a file says
 
 from __future__ import annotations
 
-import json
 import math
 import os
 import shlex
@@ -17,6 +16,8 @@ from typing import Any
 
 import numpy as np
 
+from safe_rl.reporting.cleaning import clean
+from safe_rl.reporting.measured import read_certificate, read_evaluation
 from safe_rl.runs.files import read_config, read_yaml
 from safe_rl.runs.folder import RunFolder, runs_below
 from safe_rl.runs.outcome import final_figures, judges_another_measure, violation
@@ -24,20 +25,8 @@ from safe_rl.runs.table import read_table
 
 __all__ = ["Run", "clean", "find_runs"]
 
-_LONGEST = 200
 # a number that has left all bounds says as little as NaN, and fits no picture
 _EXPLODED = 1e30
-
-
-def clean(text: Any, most: int = _LONGEST) -> str:
-    r"""Text as a page can show it: one line, printable, of bounded length.
-
-    Examples:
-        >>> clean("a\nb\x07"), clean("x" * 10, most=4)
-        ('a b�', 'xxx…')
-    """
-    shown = "".join(c if c.isprintable() else " " if c.isspace() else "�" for c in str(text))
-    return shown if len(shown) <= most else f"{shown[: most - 1]}…"
 
 
 @dataclass(frozen=True)
@@ -53,6 +42,7 @@ class Run:
         overrides: What its command line said.
         cwd: Where it was started, if Hydra has recorded it.
         evaluations: What ``safe_rl.evaluate`` has written into its folder.
+        certificate: Which of its checkpoints surely keeps the limits, or by how much none does.
         videos: Videos in its folder.
         modified: When its table was last written [s since 1970].
     """
@@ -65,6 +55,7 @@ class Run:
     command: str | None = None
     cwd: Path | None = None
     evaluations: tuple[Mapping[str, Any], ...] = ()
+    certificate: Mapping[str, Any] | None = None
     videos: tuple[Path, ...] = ()
     modified: float = 0.0
 
@@ -182,11 +173,11 @@ def _read_run(folder: RunFolder, root: Path, unfinished: bool, skipped: dict[Pat
                 skipped[path] = clean(error) or type(error).__name__
         return contents
 
+    def there(path: Path) -> list[Path]:
+        return [path] if os.path.lexists(path) else []
+
     notes = (folder.surroundings, folder.overrides, folder.composed)
-    hydra, said, begun_with = (
-        next(iter(read((path for path in (note,) if os.path.lexists(path)), read_yaml)), None)
-        for note in notes
-    )
+    hydra, said, begun_with = (next(iter(read(there(n), read_yaml)), None) for n in notes)
     overrides = tuple(map(clean, said)) if isinstance(said, list) else None
     cwd = _select(hydra, "hydra", "runtime", "cwd")
     return Run(
@@ -197,7 +188,8 @@ def _read_run(folder: RunFolder, root: Path, unfinished: bool, skipped: dict[Pat
         overrides,
         None if overrides is None else _command(overrides, hydra, begun_with, config),
         Path(cwd) if isinstance(cwd, str) else None,
-        tuple(filter(None, read(folder.evaluations(), _read_evaluation))),
+        tuple(filter(None, read(folder.evaluations(), read_evaluation))),
+        next(iter(read(there(folder.certificate), read_certificate)), None),
         tuple(read(sorted(folder.directory.rglob("*.mp4")), lambda path: path)),
         recorded.stat().st_mtime,
     )
@@ -253,36 +245,6 @@ def _read_numbers(path: Path, limits: Mapping[str, Any]) -> dict[str, list[float
     if not (steps[0] > 0 and all(np.diff(steps) > 0) and seconds > 0):
         raise ValueError("progress.csv cannot be read (its steps or times do not grow)")
     return bounded
-
-
-def _read_evaluation(path: Path) -> dict[str, Any] | None:
-    """An evaluation with the types that its table needs, or None if it is something else."""
-    try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-        if "estimates" not in content:
-            return None
-        return {
-            "checkpoint": clean(content["checkpoint"]),
-            "steps": content["steps"],
-            "episodes": int(content["episodes"]),
-            "deterministic": bool(content["deterministic"]),
-            "env": {clean(key): clean(value) for key, value in content["env"].items()},
-            "layouts_trained_on": float(content["layouts_trained_on"]),
-            "cvar_alpha": float(content["cvar_alpha"]),
-            "cost_limits": {str(k): float(d) for k, d in content["cost_limits"].items()},
-            "estimates": {
-                name: {
-                    p: math.nan if e[p] is None else float(e[p]) for p in ("value", "low", "high")
-                }
-                for name, e in content["estimates"].items()
-            },
-        }
-    except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
-        raise ValueError(f"it is no evaluation ({type(error).__name__}: {error})") from error
-
-
-def _number(value: float | None) -> float:
-    return math.nan if value is None else float(value)
 
 
 def _command(

@@ -1,4 +1,4 @@
-"""The three learning curves of the benchmark: return, episode cost, cost rate."""
+"""The learning curves of a run: return, episode cost, cost rate, and λ where there is one."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def draw_learning_curves(
 
     Limits d are dashed in the second panel, d / T_ep in the third. There is a line for every cost
     with a limit, or for the aggregate cost if there is none. Single epochs are drawn faint, their
-    moving mean strong.
+    moving mean strong. Where the table has multipliers, a fourth panel shows them.
 
     Args:
         table: Columns of a run's table, see :func:`safe_rl.runs.table.read_table`.
@@ -52,12 +52,11 @@ def draw_learning_curves(
         >>> path.exists()
         True
     """
-    # legends stand below the panels, where they cover nothing
-    num_lines = max(1, len(cost_limits))
-    figure = Figure(figsize=(12, 3.6 + 0.2 * num_lines), layout="constrained")
-    returns, costs, rates = figure.subplots(1, 3)
+    multipliers = {key: f"multiplier_{key}" for key in cost_limits if f"multiplier_{key}" in table}
+    figure = Figure(figsize=(16 if multipliers else 12, 3.7), layout="constrained")
+    returns, costs, rates, *more = figure.subplots(1, 4 if multipliers else 3)
     steps = np.asarray(table["steps"], dtype=float)
-    _draw(returns, steps, table["episode_return"], "C0", None)
+    _draw(returns, steps, table["episode_return"], "C0", "return")
     for index, key in enumerate(cost_limits or ["cost"]):
         colour = f"C{index + 1}"
         _draw(costs, steps, table[f"episode_{key}"], colour, key)
@@ -70,25 +69,31 @@ def draw_learning_curves(
             limit, per_step = cost_limits[key], cost_limits[key] / episode_length
             _draw_limit(costs, limit, colour, f"limit {limit:g}")
             _draw_limit(rates, per_step, colour, f"limit / steps = {per_step:g}")
-    _label(returns, costs, rates)
+        if key in multipliers:
+            heights = np.asarray(table[multipliers[key]], dtype=float)
+            marker = point_marker(steps)
+            more[0].plot(steps, heights, color=colour, label=f"λ of {key}", marker=marker)
+    names = ("Return", "Episode cost", "Cost rate", "Multiplier")
+    for axes, name in zip((returns, costs, rates, *more), names, strict=False):
+        _label(axes, name, from_zero=axes is not returns)
+    # legends stand below the panels, where they cover nothing
+    lines = max(len(axes.get_legend_handles_labels()[0]) for axes in figure.axes)
+    figure.set_figheight(figure.get_figheight() + 0.2 * lines)
     figure.suptitle(title)
     # a viewer that watches the file never sees half a picture
     with replacing(path) as unfinished:
         figure.savefig(unfinished, dpi=120)
 
 
-def _label(returns: Axes, costs: Axes, rates: Axes) -> None:
-    for axes, name in ((returns, "Return"), (costs, "Episode cost"), (rates, "Cost rate")):
-        axes.set_title(name)
-        axes.set_xlabel("Environment steps")
-        axes.xaxis.set_major_formatter(EngFormatter(sep=""))
-        axes.grid(alpha=0.3)
-    for axes in (costs, rates):
+def _label(axes: Axes, name: str, *, from_zero: bool) -> None:
+    axes.set_title(name)
+    axes.set_xlabel("Environment steps")
+    axes.xaxis.set_major_formatter(EngFormatter(sep=""))
+    axes.grid(alpha=0.3)
+    if from_zero:
         axes.set_ylim(bottom=0)
-        axes.legend(
-            fontsize="small", frameon=False, ncols=2,
-            loc="upper center", bbox_to_anchor=(0.5, -0.18),
-        )  # fmt: skip
+    # one below the other: side by side, names of costs run into the next panel's
+    axes.legend(fontsize="small", frameon=False, loc="upper center", bbox_to_anchor=(0.5, -0.18))
 
 
 def _draw_limit(axes: Axes, height: float, colour: str, label: str) -> None:
@@ -100,14 +105,15 @@ def _draw(
     steps: np.ndarray,
     values: Sequence[float] | np.ndarray,
     colour: str,
-    label: str | None,
+    label: str,
 ) -> None:
-    """Epochs in which an episode finished, and their moving mean."""
+    """Epochs in which an episode finished, faint, and their moving mean."""
     known = np.isfinite(values)
     steps, heights = steps[known], np.asarray(values, dtype=float)[known]
     marker = point_marker(steps)
-    axes.plot(steps, heights, color=colour, alpha=0.3, linewidth=1)
-    axes.plot(steps, moving_mean(heights), color=colour, label=label, marker=marker)
+    mean = f"{label}, mean of {SMOOTHING_EPOCHS} epochs"
+    axes.plot(steps, heights, color=colour, alpha=0.3, linewidth=1, label=f"{label}, of an epoch")
+    axes.plot(steps, moving_mean(heights), color=colour, label=mean, marker=marker)
 
 
 def point_marker(values: np.ndarray) -> str:

@@ -1,6 +1,7 @@
 """The learning curves: what is drawn, not how it looks."""
 
 import math
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -69,10 +70,21 @@ def test_several_costs_have_a_line_a_limit_and_a_name_each(drawn):
     assert sorted(line[0] for line in heights(costs, "--")) == [10.0, 25.0]
     assert sorted(line[0] for line in heights(rates, "--")) == [0.01, 0.025]
     assert [text.get_text() for text in costs.get_legend().get_texts()] == [
-        "cost", "limit 25", "cost_hazards", "limit 10",
+        "cost, of an epoch", "cost, mean of 5 epochs", "limit 25",
+        "cost_hazards, of an epoch", "cost_hazards, mean of 5 epochs", "limit 10",
     ]  # fmt: skip
     colours = {line.get_color() for line in costs.lines if line.get_linestyle() == "--"}
     assert len(colours) == 2
+
+
+def test_a_fourth_panel_has_the_multipliers_there_are(drawn):
+    multipliers = {"multiplier_cost": [0.0, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6]}
+    *_, panel = drawn({"cost": 25.0, "cost_hazards": 10.0}, TABLE | multipliers)
+    assert panel.get_title() == "Multiplier"
+    (line,) = panel.lines
+    assert line.get_label() == "λ of cost"
+    np.testing.assert_allclose(line.get_ydata(), multipliers["multiplier_cost"])
+    assert len(drawn({"cost": 25.0})) == 3
 
 
 def test_a_single_epoch_is_drawn_as_a_point(drawn):
@@ -89,6 +101,12 @@ def test_the_legend_covers_no_line(drawn, limits):
         legend = axes.get_legend().get_window_extent()
         labels = axes.xaxis.get_tightbbox()
         assert 0 <= legend.y0 < legend.y1 <= labels.y0
+
+
+def test_legends_of_neighbours_do_not_touch(drawn):
+    limits = {"cost": 25.0, "cost_hazards": 10.0}
+    extents = [axes.get_legend().get_window_extent() for axes in drawn(limits)]
+    assert all(left.x1 < right.x0 for left, right in pairwise(extents))
 
 
 def test_without_limits_the_aggregate_cost_is_drawn(drawn):

@@ -1,0 +1,72 @@
+"""What evaluations and certificates say, with the types that their tables need."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+from safe_rl.reporting.cleaning import clean
+from safe_rl.runs.folder import checkpoint_steps
+
+__all__ = ["read_certificate", "read_evaluation"]
+
+
+def read_evaluation(path: Path) -> dict[str, Any] | None:
+    """Read an evaluation; None if the file is something else.
+
+    Raises:
+        ValueError: If it is none.
+        OSError: If it cannot be read.
+    """
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+        if "estimates" not in content:
+            return None
+        return {
+            "checkpoint": clean(content["checkpoint"]),
+            "steps": content["steps"],
+            "episodes": int(content["episodes"]),
+            "deterministic": bool(content["deterministic"]),
+            "env": {clean(key): clean(value) for key, value in content["env"].items()},
+            "layouts_trained_on": float(content["layouts_trained_on"]),
+            "cvar_alpha": float(content["cvar_alpha"]),
+            "cost_limits": {str(k): float(d) for k, d in content["cost_limits"].items()},
+            "estimates": {
+                name: {
+                    p: math.nan if e[p] is None else float(e[p]) for p in ("value", "low", "high")
+                }
+                for name, e in content["estimates"].items()
+            },
+        }
+    except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
+        raise ValueError(f"it is no evaluation ({type(error).__name__}: {error})") from error
+
+
+def read_certificate(path: Path) -> dict[str, Any]:
+    """Read a certificate; a run without a certified checkpoint has None for it.
+
+    Raises:
+        ValueError: If it is none.
+        OSError: If it cannot be read.
+    """
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+        checkpoint = content["checkpoint"]
+        return {
+            "checkpoint": None if checkpoint is None else checkpoint_steps(Path(str(checkpoint))),
+            "certified_return": _number(content["episode_return"]),
+            "bounds": {
+                clean(name): (_number(bound["bound"]), _number(bound["most"]))
+                for name, bound in content["bounds"].items()
+            },
+            "episodes": int(content["episodes"]),
+            "level": float(content["level"]),
+        }
+    except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
+        raise ValueError(f"it is no certificate ({type(error).__name__}: {error})") from error
+
+
+def _number(value: float | None) -> float:
+    return math.nan if value is None else float(value)

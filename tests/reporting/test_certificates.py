@@ -1,0 +1,59 @@
+"""Certificates of runs in the report: who has one, and the bounds that speak for and against."""
+
+import csv
+import json
+
+import pytest
+from synthetic import write_run
+
+from safe_rl.cli.report import main
+
+EPOCHS = {"returns": (1.0, 2.0), "costs": (30.0, 20.0), "rates": (0.03, 0.025)}
+
+
+def certificate(**changes):
+    return {
+        "certified": True,
+        "checkpoint": "checkpoint-000000002000.torchrl",
+        "episode_return": 1.5,
+        "bounds": {"mean_cost": {"bound": 19.7252, "most": 25.0}},
+        "episodes": 400,
+        "level": 0.95,
+        **changes,
+    }
+
+
+@pytest.fixture
+def run(tmp_path):
+    return write_run(tmp_path, algo="cpo", **EPOCHS)
+
+
+def test_a_certificate_and_a_missing_one_have_a_row_each(run, tmp_path):
+    (run / "certificate.json").write_text(json.dumps(certificate()))
+    other = write_run(tmp_path, algo="p3o", **EPOCHS)
+    none = certificate(
+        certified=False, checkpoint=None, episode_return=None,
+        bounds={"mean_cost": {"bound": 31.6566, "most": 25.0}},
+    )  # fmt: skip
+    (other / "certificate.json").write_text(json.dumps(none))
+    write_run(tmp_path, algo="ppo", **EPOCHS)  # has none, and is not spoken of
+    assert main([str(tmp_path)]) == 0
+    text = (tmp_path / "report" / "report.md").read_text()
+    assert "| PointGoal1 | CPO | 0 | yes at 95% | 2,000 steps | 1.50 | 19.7 | 25 | 400 |" in text
+    assert "| no at 95% ▲ | — | — | 31.7 | 25 | 400 |" in text
+    with (tmp_path / "report" / "certificates.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert {row["algorithm"]: row["bound_mean_cost"] for row in rows} == {
+        "CPO": "19.7252",
+        next(row["algorithm"] for row in rows if row["algorithm"] != "CPO"): "31.6566",
+    }
+
+
+@pytest.mark.parametrize(
+    "content", ["[]", "{", json.dumps(certificate(bounds=[3])), json.dumps(certificate(level="a"))]
+)
+def test_an_odd_one_is_left_out_and_stops_nothing(content, run, tmp_path, capsys):
+    (run / "certificate.json").write_text(content)
+    assert main([str(tmp_path)]) == 0
+    assert "certificate" in capsys.readouterr().err
+    assert not (tmp_path / "report" / "certificates.csv").exists()
