@@ -20,7 +20,7 @@ from algorithm_results import collect, comparison, measured
 from hydra import compose, initialize_config_dir
 from omegaconf import DictConfig, OmegaConf
 
-from safe_rl.cli.keys import PARTS
+from safe_rl.cli.part_keys import PARTS
 from safe_rl.targets import accepted_names, locate
 
 ROOT = Path(__file__).resolve().parents[1]

@@ -17,8 +17,8 @@ ROOT = Path(__file__).resolve().parents[2]
 def on_config(config: MkDocsConfig) -> None:
     """Complete the navigation by what is found and made."""
     sections = {name: pages for entry in config.nav or [] for name, pages in entry.items()}
-    algorithms = sorted((ROOT / "docs" / "algorithms").glob("*.md"))
-    sections["Algorithms"] += [f"algorithms/{path.name}" for path in algorithms]
+    found = {f"algorithms/{path.name}" for path in (ROOT / "docs" / "algorithms").glob("*.md")}
+    sections["Algorithms"] += sorted(found - set(sections["Algorithms"]))
     sections["API"] += [{name: page} for page, name in api.PAGES.items()]
 
 

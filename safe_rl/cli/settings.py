@@ -137,22 +137,24 @@ def _others(
 
 def _entries_of_keys(values: Mapping[str, Any]) -> Iterator[_Entry]:
     for path, row in KEYS.items():
-        node: Any = values
-        for name in path.split("."):
-            # there is nothing below what is null
-            below = _MISSING if node is None else node
-            node = node.get(name, _MISSING) if isinstance(node, Mapping) else below
+        above, _, name = path.rpartition(".")
+        section = _at(values, above)
+        if section is None or (section is _MISSING and KEYS[above].may_lack):
+            continue  # switched off, or of another kind of algorithm
+        value = section.get(name, _MISSING) if isinstance(section, Mapping) else _MISSING
         is_part = path.startswith("collector.") and values["collector"].get("_target_")
-        if node is not _MISSING and not is_part:
-            yield _Entry(path, row, node)
-        elif node is _MISSING and not row.may_lack and not _lacks_section(values, path):
+        if value is not _MISSING and not is_part:
+            yield _Entry(path, row, value)
+        elif value is _MISSING and not row.may_lack:
             raise SettingError(f"{path} is missing: {row.meaning}.")
 
 
-def _lacks_section(values: Mapping[str, Any], path: str) -> bool:
-    """Whether a key's section is not there, and need not be."""
-    section = path.partition(".")[0]
-    return section != path and section not in values and KEYS[section].may_lack
+def _at(values: Mapping[str, Any], path: str) -> Any:
+    """The value at a dotted path; the whole for an empty one."""
+    node: Any = values
+    for name in path.split(".") if path else ():
+        node = node.get(name, _MISSING) if isinstance(node, Mapping) else node
+    return node
 
 
 def _entries_of_parts(values: Mapping[str, Any]) -> Iterator[_Entry]:
