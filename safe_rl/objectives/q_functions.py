@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import torch
@@ -16,24 +16,15 @@ from torchrl.objectives.value.functional import td0_return_estimate
 from safe_rl.objectives.keys import require
 from safe_rl.objectives.multipliers import Multiplier
 
-__all__ = ["CostCritics", "functional", "is_ensemble"]
-
-Functional = Callable[[TensorDictBase, TensorDictBase], TensorDictBase]
+__all__ = ["CostCritics", "is_ensemble", "scalars"]
 
 
 def is_ensemble(network: Any) -> bool:
-    """Whether a network evaluates several Q functions by itself, such as a `QEnsemble`."""
+    """Whether a network evaluates several Q functions by itself, such as a `QEnsemble`.
+
+    It has ``num_networks``, and takes steps [...] and parameters to values [E, ...].
+    """
     return hasattr(network, "num_networks")
-
-
-def functional(network: TensorDictModuleBase) -> Functional:
-    """An ensemble as a function of steps [...] and its parameters; values come as [E, ...]."""
-
-    def call(tensordict: TensorDictBase, params: TensorDictBase) -> TensorDictBase:
-        with params.to_module(network, preserve_module_state=False):
-            return network(tensordict)
-
-    return call
 
 
 class CostCritics(LossModule):
@@ -74,7 +65,6 @@ class CostCritics(LossModule):
                 f"There are {len(cost_keys)} cost_keys but {multiplier.num_costs} multipliers."
             )
         self.convert_to_functional(network, "cost_qvalue_network", create_target_params=True)
-        self._cost_values = functional(network)
         self.cost_keys, self.pessimism = list(cost_keys), pessimism
         # not a part of the loss: whoever moves it saves it
         self.__dict__["multiplier"] = multiplier
@@ -86,7 +76,7 @@ class CostCritics(LossModule):
         network = self.cost_qvalue_network
         inputs = steps.select(*network.in_keys, strict=False)
         inputs.set(self.tensor_keys.action, action)
-        return self._cost_values(inputs, params).get(network.out_keys[0])
+        return network(inputs, params).get(network.out_keys[0])
 
     def cost_qvalue_loss(self, tensordict: TensorDictBase, next_action: Tensor) -> Tensor:
         """Loss of the cost critics, summed over networks and costs."""

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase
 from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModuleBase, dispatch
 from torch import Tensor
@@ -15,7 +14,7 @@ from torchrl.modules.distributions.utils import rsample_and_log_prob
 from torchrl.objectives import ValueEstimators
 
 from safe_rl.objectives.multipliers import Multiplier
-from safe_rl.objectives.q_functions import CostCritics, functional, is_ensemble, scalars
+from safe_rl.objectives.q_functions import CostCritics, is_ensemble, scalars
 
 __all__ = ["SACLagrangianLoss", "SACLoss"]
 
@@ -86,7 +85,8 @@ class SACLoss(objectives.SACLoss):
 
     def _make_vmap(self) -> None:
         if is_ensemble(self.qvalue_network):
-            self._vmap_qnetworkN0 = functional(self.qvalue_network)
+            network = self.qvalue_network  # a function, for a module would become a part
+            self._vmap_qnetworkN0 = lambda steps, params: network(steps, params)
         else:
             super()._make_vmap()
 
@@ -163,6 +163,7 @@ class SACLagrangianLoss(SACLoss, CostCritics):
     """
 
     _in_keys: list[NestedKey]
+    _next_action: Tensor
 
     def __init__(
         self,
@@ -199,12 +200,23 @@ class SACLagrangianLoss(SACLoss, CostCritics):
         super()._set_in_keys()
         self._in_keys = [*self._in_keys, *(("next", key) for key in self.cost_keys)]
 
+    def _make_vmap(self) -> None:
+        super()._make_vmap()
+        values = self._vmap_qnetworkN0
+
+        def values_of(steps: TensorDictBase, params: TensorDictBase) -> TensorDictBase:
+            # TorchRL draws the actions that follow, and keeps them to itself
+            if params is self.target_qvalue_network_params:
+                self._next_action = steps.get(self.tensor_keys.action)
+            return values(steps, params)
+
+        self._vmap_qnetworkN0 = values_of
+
     def critic_losses(self, tensordict: TensorDictBase) -> TensorDict:
-        """Losses of the Q functions of reward and costs."""
+        """Losses of the Q functions of reward and costs, for the same actions that follow."""
         losses = super().critic_losses(tensordict)
-        with torch.no_grad():
-            next_action, _ = self._act(tensordict.get("next"))
-        return losses.set("loss_cost_qvalue", self.cost_qvalue_loss(tensordict, next_action))
+        loss = self.cost_qvalue_loss(tensordict, self._next_action)
+        return losses.set("loss_cost_qvalue", loss)
 
     def _act(self, steps: TensorDictBase) -> tuple[Tensor, Tensor]:
         """Actions of the present policy, through which gradients pass, and log π."""

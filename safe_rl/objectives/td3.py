@@ -13,7 +13,7 @@ from torchrl.data import TensorSpec
 from torchrl.objectives import ValueEstimators
 
 from safe_rl.objectives.multipliers import Multiplier
-from safe_rl.objectives.q_functions import CostCritics, functional, is_ensemble, scalars
+from safe_rl.objectives.q_functions import CostCritics, is_ensemble, scalars
 
 __all__ = ["TD3LagrangianLoss", "TD3Loss"]
 
@@ -70,8 +70,8 @@ class TD3Loss(objectives.TD3Loss):
     def _make_vmap(self) -> None:
         super()._make_vmap()
         if is_ensemble(self.qvalue_network):
-            values = functional(self.qvalue_network)
-            self._vmap_qvalue_network00 = lambda steps, params: values(steps[0], params)
+            network = self.qvalue_network
+            self._vmap_qvalue_network00 = lambda steps, params: network(steps[0], params)
 
     @dispatch
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
