@@ -89,7 +89,9 @@ def complete(config: DictConfig, folder: RunFolder) -> None:
     """Fill the environment's keys up, so that the run's folder tells all of them."""
     given = cast(dict[str, Any], OmegaConf.to_container(config.env, resolve=True))
     with open_dict(config):
-        config.env = complete_env(robot_of(folder, given)[0]) | given
+        full = complete_env(robot_of(folder, given)[0])
+        # what is given as null has been found out
+        config.env = full | {key: value for key, value in given.items() if value is not None}
 
 
 def run(config: DictConfig) -> None:
