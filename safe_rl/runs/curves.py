@@ -8,7 +8,9 @@ from pathlib import Path
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.ticker import EngFormatter
+from matplotlib.transforms import ScaledTranslation
 
 from safe_rl.runs.files import replacing
 from safe_rl.runs.outcome import FINAL_EPOCHS, judges_another_measure
@@ -17,6 +19,8 @@ __all__ = ["draw_learning_curves", "moving_mean", "point_marker"]
 
 SMOOTHING_EPOCHS = FINAL_EPOCHS  # so that curves end at the final figures
 """Epochs in the moving mean."""
+
+_TO_LEGEND = -0.45  # from a panel to its legend, past ticks and the label [inch]
 
 
 def draw_learning_curves(
@@ -53,7 +57,8 @@ def draw_learning_curves(
         True
     """
     multipliers = {key: f"multiplier_{key}" for key in cost_limits if f"multiplier_{key}" in table}
-    figure = Figure(figsize=(16 if multipliers else 12, 3.7), layout="constrained")
+    layout = ConstrainedLayoutEngine(h_pad=0.1)  # inch; it ends a pixel or two beside its aim
+    figure = Figure(figsize=(16 if multipliers else 12, 3.7), layout=layout)
     returns, costs, rates, *more = figure.subplots(1, 4 if multipliers else 3)
     steps = np.asarray(table["steps"], dtype=float)
     _draw(returns, steps, table["episode_return"], "C0", "return")
@@ -75,7 +80,7 @@ def draw_learning_curves(
             more[0].plot(steps, heights, color=colour, label=f"λ of {key}", marker=marker)
     names = ("Return", "Episode cost", "Cost rate", "Multiplier")
     for axes, name in zip((returns, costs, rates, *more), names, strict=False):
-        _label(axes, name, from_zero=axes is not returns)
+        _label(figure, axes, name, from_zero=axes is not returns)
     # legends stand below the panels, where they cover nothing
     lines = max(len(axes.get_legend_handles_labels()[0]) for axes in figure.axes)
     figure.set_figheight(figure.get_figheight() + 0.2 * lines)
@@ -85,7 +90,7 @@ def draw_learning_curves(
         figure.savefig(unfinished, dpi=120)
 
 
-def _label(axes: Axes, name: str, *, from_zero: bool) -> None:
+def _label(figure: Figure, axes: Axes, name: str, *, from_zero: bool) -> None:
     axes.set_title(name)
     axes.set_xlabel("Environment steps")
     axes.xaxis.set_major_formatter(EngFormatter(sep=""))
@@ -93,7 +98,11 @@ def _label(axes: Axes, name: str, *, from_zero: bool) -> None:
     if from_zero:
         axes.set_ylim(bottom=0)
     # one below the other: side by side, names of costs run into the next panel's
-    axes.legend(fontsize="small", frameon=False, loc="upper center", bbox_to_anchor=(0.5, -0.18))
+    below = ScaledTranslation(0, _TO_LEGEND, figure.dpi_scale_trans)
+    axes.legend(
+        fontsize="small", frameon=False, loc="upper center",
+        bbox_to_anchor=(0.5, 0.0), bbox_transform=axes.transAxes + below,
+    )  # fmt: skip
 
 
 def _draw_limit(axes: Axes, height: float, colour: str, label: str) -> None:
