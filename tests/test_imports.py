@@ -45,6 +45,7 @@ FLOORS = {
     "envs": (
         ("contract", "errors", "opengl", "rng", "states", "physics", "physics.base"),
         ("physics.cpu",),
+        ("simulated",),
         # Safety Gym: records, then rules, then worlds, and what is seen of them.
         ("safety_gym.records", "safety_gym.records.values", "safety_gym.geometry"),
         ("safety_gym.records.vocabulary",),

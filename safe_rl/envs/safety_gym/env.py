@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
-from torchrl.envs import EnvBase
 
 from safe_rl.envs import rng
 from safe_rl.envs.errors import require_integer
@@ -36,12 +35,11 @@ from safe_rl.envs.safety_gym.world.draws import (
 from safe_rl.envs.safety_gym.world.placements import plan_placements
 from safe_rl.envs.safety_gym.world.snapshot import check_worlds, read_state, write_state
 from safe_rl.envs.safety_gym.world.views import make_world, refresh
+from safe_rl.envs.simulated import SimulatedEnv
 from safe_rl.envs.states import require_episodes
 
-_FLAGS = ("goal_met", "done", "terminated", "truncated")
 
-
-class SafetyGymEnv(EnvBase):
+class SafetyGymEnv(SimulatedEnv):
     """N parallel worlds of one Safety Gym configuration, stepped together on a thread pool.
 
     Reads `action` [N, nu], clipped to the actuators' control range ([-1, 1] in the suite). Writes
@@ -50,6 +48,10 @@ class SafetyGymEnv(EnvBase):
     `reward`, `cost` (the aggregate), one `cost_<kind>` per constrained kind, `cost_exception`,
     `goal_met`, `done`, `terminated`, `truncated`. Time-outs are truncations. Where the physics of
     a world fails, that world gets `reward_exception`, `cost_exception` 1 and termination.
+
+    A state holds `qpos`, `qvel`, `qacc_warmstart`, `time`, `goal_pos` [N, 3], `goal_button`,
+    `buttons_timer`, `step_count`, and the layout and seeds, which may be left out where one is set.
+    What sleeps then wakes up; with `sleep` False what follows is the same to the last digit.
 
     Args:
         env: name in the suite ("PointGoal1", "Safexp-PointGoal1-v0"), mapping of configuration
@@ -72,6 +74,9 @@ class SafetyGymEnv(EnvBase):
         torch.Size([4, 10, 1])
     """
 
+    flags: ClassVar = ("goal_met", *SimulatedEnv.flags)
+    copied: ClassVar = ("_fixed_layout", *SimulatedEnv.copied)
+
     def __init__(
         self,
         env: str | Mapping[str, Any] | SafetyGymConfig,
@@ -81,9 +86,8 @@ class SafetyGymEnv(EnvBase):
         num_threads: int = 0,
         sleep: bool = True,
     ) -> None:
-        require_integer("num_envs", num_envs, lowest=1)
-        require_integer("num_threads", num_threads, lowest=0)
-        super().__init__(device=torch.device(device), batch_size=torch.Size([num_envs]))
+        super().__init__(num_envs, device, num_threads)
+        self._physics_settings += (sleep,)
         self.config = resolve(env)
         scene = build_scene(self.config, sleep)
         self._physics = BatchPhysics(scene.model, num_envs, num_threads)
@@ -93,19 +97,13 @@ class SafetyGymEnv(EnvBase):
         self._task = TASKS[self.config.task]
         low, high = torch.from_numpy(scene.model.actuator_ctrlrange.T.copy())
         self._control_range = (low, high)
-        self._episode = torch.zeros(num_envs, dtype=torch.int64)
         self._measured = self._task.measure(self._world).detach().clone()
         self._renderer = WorldRenderer(self._world, lidar_blocks(self.config, scene))
-        self._has_cost = torch.zeros(num_envs, dtype=torch.bool)
-        self._begun = torch.zeros(num_envs, dtype=torch.bool)
-        self._physics_settings = (num_threads, sleep)
         self.cost_keys = cost_keys(self.config)
         specs = make_specs(
             self.config, self._observer, self._control_range, self.cost_keys, num_envs, self.device
         )
-        self.observation_spec, self.action_spec = specs.observation, specs.action
-        self.reward_spec, self.done_spec = specs.reward, specs.done
-        self.set_seed(int(torch.randint(2**62, ())) if seed is None else seed)
+        self._announce(specs, seed)
 
     @property
     def object_names(self) -> tuple[str, ...]:
@@ -113,28 +111,15 @@ class SafetyGymEnv(EnvBase):
         return self._world.scene.names
 
     @property
-    def max_episode_steps(self) -> int:
-        """Steps after which an episode is truncated."""
-        return self.config.num_steps
-
-    @property
-    def observation_layout(self) -> dict[str, slice]:
-        """Columns of every named component in `observation`."""
-        return dict(self._observer.columns)
-
-    @property
     def observation_bounds(self) -> dict[str, tuple[float, float]]:
         """Lowest and highest value of every named component in `observation`."""
         return dict(self._observer.bounds)
 
     def _set_seed(self, seed: int | None) -> None:
-        if seed is None:
-            return
-        require_integer("seed", seed, lowest=-(2**63))
-        self._row_seed = rng.row_seeds(seed, self.batch_size[0])
-        # One layout for all rows where the configuration wants a single one.
-        self._fixed_layout = rng.fold(torch.tensor(seed), Purpose.LAYOUT)
-        self._episode.zero_()
+        super()._set_seed(seed)
+        if seed is not None:
+            # One layout for all rows where the configuration wants a single one.
+            self._fixed_layout = rng.fold(torch.tensor(seed), Purpose.LAYOUT)
 
     def set_row_seeds(self, seeds: Sequence[int | None]) -> None:
         """Seed every world on its own, [N]: with the episodes of row 0 of its seed.
@@ -164,23 +149,9 @@ class SafetyGymEnv(EnvBase):
         """Random key of the step that is being taken, [N]."""
         return rng.fold(self._row_seed, self._episode, self._world.step_count + 1)
 
-    @torch.no_grad()
-    def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDictBase:
-        mask = None if tensordict is None else tensordict.get("_reset", None)
-        if mask is None:
-            mask = torch.ones(self.batch_size, dtype=torch.bool)
-        mask = mask.reshape(self.batch_size).cpu()
-        self._episode[mask] += 1
+    def _begin(self, mask: Tensor) -> None:
         start_episodes(self._world, self._plan, self._layout_key(), mask)
         self._measured[mask] = self._task.measure(self._world)[mask]
-        self._has_cost &= ~mask
-        self._begun |= mask
-        return self._reset_output()
-
-    def _reset_output(self) -> TensorDict:
-        """What a reset returns, for the worlds as they are."""
-        none = torch.zeros(len(_FLAGS), *self.batch_size, 1, dtype=torch.bool)
-        return self._pack(dict(zip(_FLAGS, none, strict=True)))
 
     def _pack(self, outputs: dict[str, Any]) -> TensorDict:
         """Add the observation and move everything to the device."""
@@ -216,21 +187,8 @@ class SafetyGymEnv(EnvBase):
         truncated = (time_out if stuck is None else time_out | stuck) & ~terminated
         numbers = torch.cat([reward.unsqueeze(0), costs]).to(torch.float32).unsqueeze(-1)
         flags = torch.stack([met, terminated | truncated, terminated, truncated]).unsqueeze(-1)
-        names = ("reward", *self.cost_keys, *_FLAGS)
+        names = ("reward", *self.cost_keys, *self.flags)
         return self._pack(dict(zip(names, (*numbers, *flags), strict=True)))
-
-    def _step_proc_data(self, next_tensordict_out: TensorDictBase) -> TensorDictBase:
-        """Skip TorchRL's checks of every step: shapes and end flags are right by construction."""
-        return next_tensordict_out
-
-    def _checked_action(self, tensordict: TensorDictBase) -> Tensor:
-        action, needed = tensordict.get("action"), self._physics.ctrl.shape
-        if action.shape != needed or not action.dtype.is_floating_point:
-            raise ValueError(
-                f"'action' must be a floating-point tensor of shape {tuple(needed)} (num_envs, "
-                f"number of actuators), got {action.dtype} {tuple(action.shape)}."
-            )
-        return action.detach().cpu()
 
     def _advance(self, action: Tensor) -> Tensor:
         """Run the substeps of one step; returns the worlds whose physics failed [N]."""
@@ -279,60 +237,15 @@ class SafetyGymEnv(EnvBase):
         places = {"robot": self._world.robot_pos.unsqueeze(1), **self._world.objects}
         return TensorDict(places, self.batch_size).clone().to(self.device)
 
-    def get_state(self) -> TensorDict:
-        """Return a copy of everything that determines what happens next.
+    def _read_state(self) -> TensorDict:
+        return read_state(self._world)
 
-        Returns:
-            TensorDict [N] with `qpos`, `qvel`, `qacc_warmstart`, `time`, `goal_pos` [N, 3],
-            `goal_button`, `buttons_timer`, `step_count`, and the layout and seeds.
-        """
-        state = read_state(self._world)
-        state["seed"], state["episode"] = self._row_seed.clone(), self._episode.clone()
-        return state
-
-    @torch.no_grad()
-    def set_state(self, state: TensorDictBase) -> TensorDict:
-        """Set the worlds to a state, for resuming, branching and tests.
-
-        What sleeps wakes up; with `sleep` False what follows is the same to the last digit.
-
-        Args:
-            state: TensorDict [N] as `get_state` returns it; the layout and the seeds may be left
-                out, then the present ones stay.
-
-        Returns:
-            What a reset returns, for that state.
-
-        Raises:
-            KeyError: if a key is missing.
-            ValueError: if a shape or a type does not fit, the layout is not finite, or there is no
-                such goal button.
-        """
+    def _write_state(self, state: TensorDictBase) -> None:
         check_worlds(self._world, self.get_state(), state)
         if "layout" not in state and not self._episode.any():
             self.reset()
         write_state(self._world, state)
-        self._row_seed = state.get("seed", self._row_seed).clone()
-        self._episode = state.get("episode", self._episode).clone()
         self._measured.copy_(self._task.measure(self._world))
-        self._has_cost.zero_()
-        self._begun.fill_(True)
-        return self._reset_output()
-
-    def __reduce__(self) -> tuple[Any, ...]:
-        """Tell `copy` and `pickle` to build anew and set the state, as far as `set_state` does."""
-        settings = (self.config, self.batch_size[0], self.device, 0, *self._physics_settings)
-        flags = (self._has_cost.clone(), self._begun.clone())
-        return type(self), settings, (self.get_state(), self._fixed_layout, flags)
-
-    def __setstate__(self, kept: tuple[TensorDict, Tensor, tuple[Tensor, Tensor]]) -> None:
-        state, self._fixed_layout, (has_cost, begun) = kept
-        if not begun.any():  # there are seeds, and nothing else
-            self._row_seed = state["seed"].clone()
-            return
-        self.set_state(state)
-        self._has_cost.copy_(has_cost)
-        self._begun.copy_(begun)
 
     def render(
         self,
@@ -370,8 +283,3 @@ class SafetyGymEnv(EnvBase):
             OpenGLError: if there is no screen.
         """
         self._renderer.show(row, self._has_cost)
-
-    def close(self, *, raise_if_closed: bool = True) -> None:
-        """Close the viewer and free what OpenGL holds."""
-        self._renderer.close()
-        super().close(raise_if_closed=raise_if_closed)

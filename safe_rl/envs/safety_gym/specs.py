@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -12,15 +12,7 @@ from torchrl.data import Binary, Bounded, Composite, TensorSpec, Unbounded
 
 from safe_rl.envs.safety_gym.observing.observations import Observer
 from safe_rl.envs.safety_gym.records.config import SafetyGymConfig
-
-
-class Specs(NamedTuple):
-    """What `EnvBase` asks for, for N worlds."""
-
-    observation: Composite
-    action: TensorSpec
-    reward: Composite
-    done: Composite
+from safe_rl.envs.simulated import Specs
 
 
 def make_specs(

@@ -9,12 +9,10 @@ import numpy as np
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
-from torchrl.envs import EnvBase
 
-from safe_rl.envs import rng
-from safe_rl.envs.errors import require_integer
 from safe_rl.envs.physics.cpu import BatchPhysics
 from safe_rl.envs.physics.runge_kutta import runge_kutta_substep
+from safe_rl.envs.simulated import SimulatedEnv
 from safe_rl.envs.states import check_state, require_episodes
 from safe_rl.envs.velocity.config import VelocityConfig
 from safe_rl.envs.velocity.health import HEALTH
@@ -28,12 +26,11 @@ from safe_rl.envs.velocity.specs import make_velocity_specs
 from safe_rl.envs.velocity.starting import Starts
 from safe_rl.envs.velocity.suite import resolve_velocity
 
-_FLAGS = ("done", "terminated", "truncated")
 _PHYSICS_KEYS = ("qpos", "qvel", "qacc_warmstart", "time")
 _OPTIONAL_KEYS = ("place", "observation", "seed", "episode")
 
 
-class VelocityEnv(EnvBase):
+class VelocityEnv(SimulatedEnv):
     """N parallel robots of one configuration that are to run, but not too fast.
 
     Dynamics, observation, reward and termination are those of Gymnasium's environment of version 5
@@ -44,6 +41,10 @@ class VelocityEnv(EnvBase):
     and each [N, 1]: `reward`, `cost`, `cost_velocity` (the same), `done`, `terminated` (the robot
     fell), `truncated` (time is up). A robot whose physics fails gets reward and cost 0 and
     terminates.
+
+    A state holds `qpos`, `qvel`, `qacc_warmstart`, `time`, `step_count`; `place` and `observation`,
+    which belong to the last substep; and the seeds. Without `place` and `observation` both are
+    computed anew, as at the start of an episode.
 
     Args:
         env: name ("SafeHopperVelocity"), mapping with `robot` and configuration keys, or
@@ -72,9 +73,7 @@ class VelocityEnv(EnvBase):
         seed: int | None = None,
         num_threads: int = 0,
     ) -> None:
-        require_integer("num_envs", num_envs, lowest=1)
-        require_integer("num_threads", num_threads, lowest=0)
-        super().__init__(device=torch.device(device), batch_size=torch.Size([num_envs]))
+        super().__init__(num_envs, device, num_threads)
         self.config = resolve_velocity(env)
         self.cost_keys = ["cost", "cost_velocity"]
         self._robot, self._model = ROBOTS[self.config.robot], load_model(self.config)
@@ -90,63 +89,26 @@ class VelocityEnv(EnvBase):
         self._last_place = self._place()
         self._observation = torch.zeros(num_envs, self._observer.size)
         self._step_count = torch.zeros(num_envs, dtype=torch.int64)
-        self._episode = torch.zeros(num_envs, dtype=torch.int64)
-        self._has_cost = torch.zeros(num_envs, dtype=torch.bool)
-        self._begun = torch.zeros(num_envs, dtype=torch.bool)
         self._starts = Starts(self.config, self._model, num_envs)
         self._renderer = RobotRenderer(self.config)
-        self._num_threads = num_threads
         specs = make_velocity_specs(
             self._observer.size, self._control_range, self.cost_keys, num_envs, self.device
         )
-        self.observation_spec, self.action_spec = specs.observation, specs.action
-        self.reward_spec, self.done_spec = specs.reward, specs.done
-        self.set_seed(int(torch.randint(2**62, ())) if seed is None else seed)
+        self._announce(specs, seed)
 
-    @property
-    def max_episode_steps(self) -> int:
-        """Steps after which an episode is truncated."""
-        return self.config.num_steps
-
-    @property
-    def observation_layout(self) -> dict[str, slice]:
-        """Columns of every named component in `observation`."""
-        return dict(self._observer.columns)
-
-    def _set_seed(self, seed: int | None) -> None:
-        if seed is None:
-            return
-        require_integer("seed", seed, lowest=-(2**63))
-        self._row_seed = rng.row_seeds(seed, self.batch_size[0])
-        self._episode.zero_()
-
-    @torch.no_grad()
-    def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDictBase:
-        mask = None if tensordict is None else tensordict.get("_reset", None)
-        if mask is None:
-            mask = torch.ones(self.batch_size, dtype=torch.bool)
-        mask = mask.reshape(self.batch_size).cpu()
+    def _begin(self, mask: Tensor) -> None:
         physics, rows = self._physics, mask.nonzero()[:, 0]
-        self._episode += mask
         physics.reset(mask)
         start = self._starts.take(self._row_seed, self._episode, rows)
         physics.qpos[rows], physics.qvel[rows] = start
         physics.forward(mask)
         self._start(rows)
         self._step_count[rows] = 0
-        self._has_cost &= ~mask
-        self._begun |= mask
-        return self._reset_output()
 
     def _start(self, rows: Tensor) -> None:
         """Write what is derived from states that no step has led to, of robots int64 [R]."""
         self._last_place[rows] = self._place()[rows]
         self._observer.write_start(self._physics, self._observation, rows)
-
-    def _reset_output(self) -> TensorDict:
-        """What a reset returns, for the robots as they are."""
-        none = torch.zeros(len(_FLAGS), *self.batch_size, 1, dtype=torch.bool)
-        return self._pack(dict(zip(_FLAGS, none, strict=True)))
 
     def _pack(self, outputs: dict[str, Any]) -> TensorDict:
         """Add a copy of the observation and move everything to the device."""
@@ -167,7 +129,7 @@ class VelocityEnv(EnvBase):
         cost = self._has_cost.to(torch.float64)
         numbers = torch.stack([reward, cost, cost]).to(torch.float32).unsqueeze(-1)
         flags = torch.stack([terminated | truncated, terminated, truncated]).unsqueeze(-1)
-        names = ("reward", *self.cost_keys, *_FLAGS)
+        names = ("reward", *self.cost_keys, *self.flags)
         return self._pack(dict(zip(names, (*numbers, *flags), strict=True)))
 
     def _move(self, control: Tensor) -> tuple[Tensor, Tensor]:
@@ -185,19 +147,6 @@ class VelocityEnv(EnvBase):
         terminated = failed | ~healthy if config.terminate_when_unhealthy else failed
         return reward.masked_fill_(failed, 0.0), terminated
 
-    def _step_proc_data(self, next_tensordict_out: TensorDictBase) -> TensorDictBase:
-        """Skip TorchRL's checks of every step: shapes and end flags are right by construction."""
-        return next_tensordict_out
-
-    def _checked_action(self, tensordict: TensorDictBase) -> Tensor:
-        action, needed = tensordict.get("action"), self._physics.ctrl.shape
-        if action.shape != needed or not action.dtype.is_floating_point:
-            raise ValueError(
-                f"'action' must be a floating-point tensor of shape {tuple(needed)} (num_envs, "
-                f"number of actuators), got {action.dtype} {tuple(action.shape)}."
-            )
-        return action.detach().cpu()
-
     def _advance(self) -> Tensor:
         """Run the substeps of one step; returns the robots whose physics failed [N]."""
         if not self._has_forces:
@@ -211,34 +160,13 @@ class VelocityEnv(EnvBase):
             return torch.ones(self.batch_size, dtype=torch.bool)
         return HEALTH[self._robot.health](self.config, self._physics.qpos, self._physics.qvel)
 
-    def get_state(self) -> TensorDict:
-        """Return a copy of everything that determines what happens next.
-
-        Returns:
-            TensorDict [N] with `qpos`, `qvel`, `qacc_warmstart`, `time`, `step_count`; `place` and
-            `observation`, which belong to the last substep; and the seeds.
-        """
+    def _read_state(self) -> TensorDict:
         state = {key: getattr(self._physics, key).clone() for key in _PHYSICS_KEYS}
         state |= {"step_count": self._step_count.clone(), "place": self._last_place.clone()}
         state["observation"] = self._observation.clone()
-        state["seed"], state["episode"] = self._row_seed.clone(), self._episode.clone()
         return TensorDict(state, batch_size=self.batch_size)
 
-    @torch.no_grad()
-    def set_state(self, state: TensorDictBase) -> TensorDict:
-        """Set the robots to a state, for resuming, branching and tests.
-
-        Args:
-            state: TensorDict [N] as `get_state` returns it. Without `place` and `observation` both
-                are computed anew, as at the start of an episode; without seeds the present stay.
-
-        Returns:
-            What a reset returns, for that state.
-
-        Raises:
-            KeyError: if a key is missing.
-            ValueError: if a shape or a type does not fit.
-        """
+    def _write_state(self, state: TensorDictBase) -> None:
         check_state(self.get_state(), state, _OPTIONAL_KEYS)
         everyone = torch.ones(self.batch_size, dtype=torch.bool)
         self._physics.reset(everyone)
@@ -249,22 +177,6 @@ class VelocityEnv(EnvBase):
         self._start(everyone.nonzero()[:, 0])
         self._last_place.copy_(state.get("place", self._last_place))
         self._observation.copy_(state.get("observation", self._observation))
-        self._row_seed = state.get("seed", self._row_seed).clone()
-        self._episode = state.get("episode", self._episode).clone()
-        self._has_cost.zero_()
-        self._begun.fill_(True)
-        return self._reset_output()
-
-    def __reduce__(self) -> tuple[Any, ...]:
-        """Tell `copy` and `pickle` to build anew and set the state."""
-        settings = (self.config, self.batch_size[0], self.device, 0, self._num_threads)
-        return type(self), settings, (self.get_state(), self._has_cost.clone(), self._begun.clone())
-
-    def __setstate__(self, kept: tuple[TensorDict, Tensor, Tensor]) -> None:
-        state, has_cost, begun = kept
-        self.set_state(state)
-        self._has_cost.copy_(has_cost)
-        self._begun.copy_(begun)
 
     def render(
         self,
@@ -294,8 +206,3 @@ class VelocityEnv(EnvBase):
         cost = self._has_cost.numpy()
         frames = self._renderer.frames(self._physics, chosen, cost, camera, width, height)
         return frames[0] if isinstance(rows, int) else frames
-
-    def close(self, *, raise_if_closed: bool = True) -> None:
-        """Free what OpenGL holds."""
-        self._renderer.close()
-        super().close(raise_if_closed=raise_if_closed)

@@ -3,20 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
 from torch import Tensor
-from torchrl.data import Binary, Bounded, Composite, TensorSpec, Unbounded
+from torchrl.data import Binary, Bounded, Composite, Unbounded
 
-
-class VelocitySpecs(NamedTuple):
-    """What `EnvBase` asks for, for N robots."""
-
-    observation: Composite
-    action: TensorSpec
-    reward: Composite
-    done: Composite
+from safe_rl.envs.simulated import Specs
 
 
 def make_velocity_specs(
@@ -25,7 +18,7 @@ def make_velocity_specs(
     cost_keys: Sequence[str],
     num_envs: int,
     device: torch.device | None,
-) -> VelocitySpecs:
+) -> Specs:
     """Describe an environment.
 
     Args:
@@ -39,7 +32,7 @@ def make_velocity_specs(
     kind: dict[str, Any] = {"dtype": torch.float32, "device": device}
     flag = Binary(1, shape=scalar, dtype=torch.bool, device=device)
     low, high = (bound.to(torch.float32).expand(num_envs, -1) for bound in control_range)
-    return VelocitySpecs(
+    return Specs(
         observation=Composite(
             observation=Unbounded(shape=(num_envs, observation_size), **kind), shape=batch
         ),
