@@ -80,7 +80,7 @@ FLOORS = {
         ("velocity.env",),
         ("velocity.nodes",),
         ("velocity",),
-        ("gymnasium.outside", "gymnasium.processes", "gymnasium.worlds"),
+        ("gymnasium.adapting", "gymnasium.outside", "gymnasium.processes", "gymnasium.worlds"),
         ("gymnasium.conversion", "gymnasium.single", "gymnasium.vector"),
         ("gymnasium.nodes",),
         ("gymnasium.family",),

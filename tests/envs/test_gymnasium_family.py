@@ -12,6 +12,7 @@ import gymnasium_envs  # noqa: F401, registers Walk-v0
 import pytest
 import torch
 import yaml
+from torchrl.envs.utils import check_env_specs
 
 from safe_rl.cli import evaluate, report, train
 from safe_rl.collectors.workers import share_rows
@@ -154,7 +155,8 @@ def test_workers_without_a_state_to_go_on_from_have_rows_of_their_own():
         ({"workers": -1}, "'workers' must be an integer of at least 0"),
         ({"num_steps": 0}, "'num_steps' must be an integer of at least 1"),
         ({"cost_keys": None}, "Walk-v0.*reports no costs.*'cost_keys'"),
-        ({"kwargs": {"nested": True}}, "observations that are arrays.*flatten=true"),
+        ({"id": "Cliff-v0", "cost_keys": None}, "that are arrays.*flatten=true"),
+        ({"kwargs": {"nested": True}, "workers": 2}, "use workers=0"),
         ({"kwargs": {"speed": 3}}, "Walk-v0.*speed"),
     ],
 )
@@ -166,6 +168,21 @@ def test_what_cannot_be_made_is_said(keys, message):
 def test_nested_observations_become_a_vector_on_request():
     env = make_env({**NODE, "kwargs": {"nested": True}, "flatten": True}, num_envs=2)
     assert env.reset()["observation"].shape == (2, 4)
+
+
+def test_nested_observations_are_trained_on_entry_by_entry(tmp_path):
+    nested = {**NODE, "kwargs": {"nested": True}}
+    env = make_env(nested, num_envs=2, seed=0)
+    flat = make_env({**nested, "flatten": True}, num_envs=2, seed=0).reset()["observation"]
+    entries = env.reset()["observation"]
+    torch.testing.assert_close(torch.cat([entries["place"], entries["side"]], -1), flat)
+    assert env.observation_layout == {"place": slice(0, 2), "side": slice(2, 4)}
+    check_env_specs(env)
+    folder = tmp_path / "run"
+    kwargs = ("env.kwargs={nested: true}", "model=dict", "model.encoders.vector=[4]")
+    run_train(*SMALL, *kwargs, "frames=400", f"hydra.run.dir={folder}")
+    assert read_table(folder / "progress.csv")["steps"] == [200, 400]
+    assert evaluate.main([str(folder), "episodes=2", "num_envs=2"]) == 0
 
 
 def test_pictures_are_fitted_in():

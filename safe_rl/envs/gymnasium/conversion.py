@@ -16,6 +16,7 @@ from torchrl.data import Composite, Unbounded
 from torchrl.envs import GymWrapper, Transform, TransformedEnv
 from torchrl.envs.gym_like import BaseInfoDictReader
 
+from safe_rl.envs.gymnasium.adapting import adapt, check_workers, columns_of
 from safe_rl.envs.gymnasium.processes import ProcessVectorEnv
 
 AGGREGATE = "cost"
@@ -92,15 +93,14 @@ class GymnasiumEnv(TransformedEnv):
 
     Attributes:
         cost_keys: the aggregate `cost`, then one key per kind.
-        observation_layout: one component, the whole observation.
+        observation_layout: one component, the whole observation; of a dictionary, its entries.
         max_episode_steps: the largest number of steps of an episode.
     """
 
     def __init__(self, base_env: GymWrapper, cost_keys: Sequence[str], num_steps: int) -> None:
         super().__init__(base_env, CostsAsRewards(cost_keys))
-        size = base_env.observation_spec["observation"].shape[-1]
         self.cost_keys = [AGGREGATE, *(key for key in cost_keys if key != AGGREGATE)]
-        self.observation_layout = {"observation": slice(0, size)}
+        self.observation_layout = columns_of(base_env.observation_spec["observation"])
         self.max_episode_steps = num_steps
 
     def render(
@@ -166,7 +166,8 @@ def from_gymnasium(
         workers: processes that step them; 0 steps them here, one after the other, as is done in a
             process that is itself a worker.
         device: where the TensorDicts live.
-        flatten: make one vector of observations that are no arrays; False refuses them.
+        flatten: make one vector of every observation; False leaves pictures and dictionaries of
+            vectors and pictures as they are, and refuses other observations that are no arrays.
         kwargs: for `gymnasium.make`, with an id.
 
     Returns:
@@ -185,9 +186,11 @@ def from_gymnasium(
     """
     make: MakeEnv = partial(gymnasium.make, env, **kwargs) if isinstance(env, str) else env
     keys, length = describe(make, cost_keys, num_steps, flatten)
-    make_adapted = partial(_make_adapted, make, length)
+    make_adapted = partial(_make_adapted, make, length, flatten)
     worlds: VectorEnv
     if workers and not current_process().daemon:
+        if not flatten:
+            check_workers(make)
         worlds = ProcessVectorEnv(make_adapted, num_envs, min(workers, num_envs), keys)
     else:
         worlds = SyncVectorEnv([make_adapted] * num_envs, autoreset_mode=AutoresetMode.DISABLED)
@@ -208,66 +211,15 @@ def describe(
     """
     probe = make()
     try:
-        if not (flatten or isinstance(probe.observation_space, gymnasium.spaces.Box)):
-            raise ValueError(
-                f"Policies take observations that are arrays (a Box), but {probe} has "
-                f"{probe.observation_space}. flatten=true makes one vector of it: kinds (Discrete) "
-                "become one-hot, components of a dictionary follow one another."
-            )
-        adapted = adapt(probe)
+        adapted = adapt(probe, flatten=flatten)
         keys = list(cost_keys) if cost_keys is not None else _find_costs(adapted)
         return keys, _episode_length(adapted, num_steps)
     finally:
         probe.close()
 
 
-def adapt(env: gymnasium.Env, num_steps: int | None = None) -> gymnasium.Env:
-    """Wrap an environment: float32 vectors as observations, actions in [-1, 1] or choices from 0.
-
-    Args:
-        env: the environment.
-        num_steps: truncate episodes after that many steps; None leaves their length alone.
-
-    Raises:
-        ValueError: if the actions are neither continuous and bounded nor choices.
-    """
-    env = gymnasium.wrappers.FlattenObservation(env)
-    vectors = gymnasium.spaces.Box(-np.inf, np.inf, env.observation_space.shape, np.float32)
-    env = gymnasium.wrappers.TransformObservation(env, _single_precision, vectors)
-    env = _with_plain_actions(env)
-    return env if num_steps is None else gymnasium.wrappers.TimeLimit(env, num_steps)
-
-
-def _with_plain_actions(env: gymnasium.Env) -> gymnasium.Env:
-    actions = env.action_space
-    if isinstance(actions, gymnasium.spaces.Box) and actions.is_bounded():
-        env = gymnasium.wrappers.RescaleAction(env, np.float32(-1.0), np.float32(1.0))
-        return gymnasium.wrappers.TransformAction(env, _within_bounds, env.action_space)
-    start = getattr(actions, "start", None)
-    if isinstance(actions, gymnasium.spaces.Discrete):
-        plain: gymnasium.Space = gymnasium.spaces.Discrete(int(actions.n))
-    elif isinstance(actions, gymnasium.spaces.MultiDiscrete) and actions.nvec.ndim == 1:
-        plain = gymnasium.spaces.MultiDiscrete(actions.nvec)
-    else:
-        raise ValueError(
-            "The algorithms need actions that are continuous and bounded (a Box) or choices "
-            f"(Discrete, MultiDiscrete), but {env.unwrapped} has {actions}."
-        )
-    if not np.any(start):
-        return env
-    return gymnasium.wrappers.TransformAction(env, partial(np.add, start), plain)
-
-
-def _make_adapted(make: MakeEnv, num_steps: int) -> gymnasium.Env:
-    return adapt(make(), num_steps)
-
-
-def _single_precision(observation: np.ndarray) -> np.ndarray:
-    return observation.astype(np.float32)
-
-
-def _within_bounds(action: np.ndarray) -> np.ndarray:
-    return np.clip(action, -1, 1)
+def _make_adapted(make: MakeEnv, num_steps: int, flatten: bool) -> gymnasium.Env:
+    return adapt(make(), num_steps, flatten=flatten)
 
 
 def _fit(picture: np.ndarray, width: int, height: int) -> np.ndarray:

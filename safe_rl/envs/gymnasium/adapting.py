@@ -1,0 +1,127 @@
+"""Gymnasium's spaces as networks take them: vectors and pictures, actions in [-1, 1] or choices."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+from itertools import accumulate
+from typing import Any
+
+import gymnasium
+import numpy as np
+from gymnasium.spaces import Box, Dict, Discrete, MultiDiscrete
+from torchrl.data import Composite, TensorSpec
+
+__all__ = ["adapt", "check_workers", "columns_of"]
+
+_OBSERVATION = "observation"
+
+
+def adapt(
+    env: gymnasium.Env, num_steps: int | None = None, *, flatten: bool = True
+) -> gymnasium.Env:
+    """Wrap an environment: float32 vectors and pictures, actions in [-1, 1] or choices from 0.
+
+    Args:
+        env: the environment.
+        num_steps: truncate episodes after that many steps; None leaves their length alone.
+        flatten: make one vector of the observation; False leaves pictures and dictionaries.
+
+    Raises:
+        ValueError: if actions are neither continuous and bounded nor choices, or observations are
+            no arrays and not to be flattened.
+    """
+    env = _flat(env) if flatten else _by_entry(env)
+    env = _with_plain_actions(env)
+    return env if num_steps is None else gymnasium.wrappers.TimeLimit(env, num_steps)
+
+
+def check_workers(make: Callable[[], gymnasium.Env]) -> None:
+    """Refuse environments whose observations processes cannot hand over, which are arrays alone.
+
+    Raises:
+        ValueError: for dictionaries.
+    """
+    probe = make()
+    try:
+        if isinstance(probe.observation_space, Dict):
+            raise ValueError("workers are for observations that are arrays: use workers=0.")
+    finally:
+        probe.close()
+
+
+def columns_of(spec: TensorSpec) -> dict[str, slice]:
+    """Columns of every component of N observations, of entries as if they were one vector."""
+    parts = dict(spec.items()) if isinstance(spec, Composite) else {_OBSERVATION: spec}
+    sizes = {str(name): part.shape[1:].numel() for name, part in sorted(parts.items())}
+    ends = accumulate(sizes.values())
+    return {name: slice(end - sizes[name], end) for name, end in zip(sizes, ends, strict=True)}
+
+
+def _flat(env: gymnasium.Env) -> gymnasium.Env:
+    env = gymnasium.wrappers.FlattenObservation(env)
+    vectors = Box(-np.inf, np.inf, env.observation_space.shape, np.float32)
+    return gymnasium.wrappers.TransformObservation(env, _single_precision, vectors)
+
+
+def _by_entry(env: gymnasium.Env) -> gymnasium.Env:
+    space = env.observation_space
+    if isinstance(space, Dict):
+        entries = Dict({name: _entry_space(part) for name, part in space.items()})
+        nested = Dict({_OBSERVATION: entries})
+        return gymnasium.wrappers.TransformObservation(env, partial(_entries, space), nested)
+    if not isinstance(space, Box):
+        raise ValueError(
+            f"Policies take observations that are arrays (a Box) or dictionaries, but {env} has "
+            f"{space}. flatten=true makes one vector of it: kinds (Discrete) become one-hot."
+        )
+    return env if _is_picture(space) else _flat(env)
+
+
+def _is_picture(space: gymnasium.Space) -> bool:
+    return isinstance(space, Box) and len(space.shape) == 3
+
+
+def _entry_space(space: gymnasium.Space) -> gymnasium.Space:
+    if _is_picture(space):
+        return space
+    return Box(-np.inf, np.inf, (gymnasium.spaces.flatdim(space),), np.float32)
+
+
+def _entries(space: Dict, observation: dict[str, Any]) -> dict[str, dict[str, np.ndarray]]:
+    """Pictures as they are, all others as vectors, below one name."""
+    entries = {
+        name: observation[name]
+        if _is_picture(part)
+        else _single_precision(np.asarray(gymnasium.spaces.flatten(part, observation[name])))
+        for name, part in space.items()
+    }
+    return {_OBSERVATION: entries}
+
+
+def _with_plain_actions(env: gymnasium.Env) -> gymnasium.Env:
+    actions = env.action_space
+    if isinstance(actions, Box) and actions.is_bounded():
+        env = gymnasium.wrappers.RescaleAction(env, np.float32(-1.0), np.float32(1.0))
+        return gymnasium.wrappers.TransformAction(env, _within_bounds, env.action_space)
+    start = getattr(actions, "start", None)
+    if isinstance(actions, Discrete):
+        plain: gymnasium.Space = Discrete(int(actions.n))
+    elif isinstance(actions, MultiDiscrete) and actions.nvec.ndim == 1:
+        plain = MultiDiscrete(actions.nvec)
+    else:
+        raise ValueError(
+            "The algorithms need actions that are continuous and bounded (a Box) or choices "
+            f"(Discrete, MultiDiscrete), but {env.unwrapped} has {actions}."
+        )
+    if not np.any(start):
+        return env
+    return gymnasium.wrappers.TransformAction(env, partial(np.add, start), plain)
+
+
+def _single_precision(observation: np.ndarray) -> np.ndarray:
+    return observation.astype(np.float32)
+
+
+def _within_bounds(action: np.ndarray) -> np.ndarray:
+    return np.clip(action, -1, 1)
