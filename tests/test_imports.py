@@ -81,6 +81,7 @@ FLOORS = {
         ("velocity.nodes",),
         ("velocity",),
         ("gymnasium.adapting", "gymnasium.outside", "gymnasium.processes", "gymnasium.worlds"),
+        ("gymnasium.velocity",),
         ("gymnasium.conversion", "gymnasium.single", "gymnasium.vector"),
         ("gymnasium.nodes",),
         ("gymnasium.family",),

@@ -18,6 +18,7 @@ from safe_rl.envs.names import env_names, env_node
 from safe_rl.envs.safety_gym.nodes import group_node
 from safe_rl.envs.safety_gym.records.config import SafetyGymConfig
 from safe_rl.envs.safety_gym.suite import EXTRAS, SUITE, TESTING, resolve
+from safe_rl.envs.velocity.suite import VELOCITY_SUITE
 
 GROUP = "env"
 SCHEME = "safe-rl-environments"
@@ -105,7 +106,8 @@ def register_gymnasium() -> None:
     The original's environments for tests are `Testing-{name}-v0`, as there.
 
     The custom one has the defaults of every configuration key; all of them take a `config` with
-    keys to change. What the ids stand for is imported when an environment is made.
+    keys to change. The velocity family has `SafeHopperVelocity-v0` and so on. What the ids stand
+    for is imported when an environment is made.
     """
     prefixes = dict.fromkeys((*SUITE, *EXTRAS, None), "Safexp") | dict.fromkeys(TESTING, "Testing")
     for name, prefix in prefixes.items():
@@ -115,5 +117,12 @@ def register_gymnasium() -> None:
                 env_id,
                 entry_point="safe_rl.envs.gymnasium.single:SafetyGymnasiumEnv",
                 vector_entry_point="safe_rl.envs.gymnasium.vector:SafetyGymnasiumVectorEnv",
+                kwargs={"name": name},
+            )
+    for name in VELOCITY_SUITE:
+        if f"{name}-v0" not in gymnasium.registry:
+            gymnasium.register(
+                f"{name}-v0",
+                entry_point="safe_rl.envs.gymnasium.velocity:VelocityGymnasiumEnv",
                 kwargs={"name": name},
             )
