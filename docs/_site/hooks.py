@@ -17,8 +17,10 @@ ROOT = Path(__file__).resolve().parents[2]
 def on_config(config: MkDocsConfig) -> None:
     """Complete the navigation by what is found and made."""
     sections = {name: pages for entry in config.nav or [] for name, pages in entry.items()}
-    found = {f"algorithms/{path.name}" for path in (ROOT / "docs" / "algorithms").glob("*.md")}
-    sections["Algorithms"] += sorted(found - set(sections["Algorithms"]))
+    listed = set(sections["Algorithms"])
+    found = sorted((ROOT / "docs" / "algorithms").glob("*.md"))
+    named = ((path.stem, f"algorithms/{path.name}") for path in found)
+    sections["Algorithms"] += [{name: page} for name, page in named if page not in listed]
     sections["API"] += [{name: page} for page, name in api.PAGES.items()]
 
 

@@ -84,10 +84,9 @@ def _files_in(folder: str, root: Path) -> list[str]:
 
 def _list(folder: str, root: Path) -> str:
     """A page for a folder: its files, each with its page."""
-    lines = [
-        f"- [{path}]({os.path.relpath(_page_of(path), 'files')})"
-        for path in _files_in(folder, root)
-    ]
+    here = PurePosixPath(_page_of(folder)).parent
+    found = _files_in(folder, root)
+    lines = [f"- [{path}]({os.path.relpath(_page_of(path), here)})" for path in found]
     return f"# {folder}\n\n" + "\n".join(lines) + "\n"
 
 

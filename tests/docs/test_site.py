@@ -50,12 +50,16 @@ def test_pages_ask_for_every_table():
 
 
 def test_links_to_files_outside_lead_to_their_pages(tmp_path):
-    (tmp_path / "conf").mkdir()
+    (tmp_path / "conf" / "b").mkdir(parents=True)
+    (tmp_path / "conf" / "b" / "c.yaml").touch()
     (tmp_path / "conf" / "a.yaml").write_text("x: 1\n")
     text = "[a](../../conf/a.yaml) [all](../../conf#top) [gone](../../conf/b.yaml) [p](other.md)"
     pages = links.linked_files({"guides/x.md": text}, tmp_path)
-    assert set(pages) == {"files/conf/a.yaml.md", "files/conf.md"}
+    assert set(pages) == {"files/conf/a.yaml.md", "files/conf/b/c.yaml.md", "files/conf.md"}
     assert "x: 1" in pages["files/conf/a.yaml.md"]
+    assert "(conf/a.yaml.md)" in pages["files/conf.md"]
+    below = links.linked_files({"x.md": "[b](../conf/b)"}, tmp_path)
+    assert "(b/c.yaml.md)" in below["files/conf/b.md"]
     led = links.rewrite(text, "guides/x.md", tmp_path)
     assert led == (
         "[a](../files/conf/a.yaml.md) [all](../files/conf.md#top) "
