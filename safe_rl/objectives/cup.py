@@ -22,11 +22,13 @@ class CUPLoss(SurrogateLoss):
     The first step improves the policy for the reward, by PPO's loss, to π½. Then this loss is
     minimised from there (Yang et al. 2022, their projection step),
 
-        E[KL(π_θ ‖ π½) + (1 − γλ_GAE)/(1 − γ) Σᵢ νᵢ ρ A_cᵢ],  ρ = π_θ/π_k,
+        E[KL(π_θ ‖ π½) + h Σᵢ νᵢ ρ A_cᵢ],  ρ = π_θ/π_k,  h = (1 − γλ_GAE)/(1 − γ),
 
-    with advantages of π_k, which collected the batch. The factor belongs to the article's bound for
-    generalised advantage estimates. `anchor` fixes π½; a `safe_rl.algorithms.MinibatchUpdate`
-    calls it before its first step.
+    with advantages of π_k, which collected the batch. h belongs to the article's bound for
+    generalised advantage estimates. Here it is divided by 1 + h Σᵢ νᵢ, which leaves the minimum
+    where it is: otherwise gradients grow with ν, and Adam, which remembers smaller ones, takes
+    steps so large that an update ends at its KL limit after two of them. `anchor` fixes π½; a
+    `safe_rl.algorithms.MinibatchUpdate` calls it before its first step.
 
     See `SurrogateLoss` for what it reads and writes; here ``kl`` is KL(π_θ ‖ π½). Adds the
     detached ``cost_surrogate`` [k], E[ρA_c].
@@ -54,8 +56,8 @@ class CUPLoss(SurrogateLoss):
         ...     batch = actor(TensorDict(observation=torch.randn(8, 3), batch_size=[8]))
         >>> batch["advantage"], batch["cost_advantage"] = torch.randn(8, 1), torch.ones(8, 1)
         >>> losses = loss(loss.anchor(batch))  # of a policy that has not moved
-        >>> round(losses["loss_objective"].item(), 4)  # 0.5 (1 - 0.99 · 0.97) / (1 - 0.99)
-        1.985
+        >>> round(losses["loss_objective"].item(), 4)  # 0.5 h / (1 + 0.5 h)
+        0.665
     """
 
     extra_out_keys = ("cost_surrogate",)
@@ -113,7 +115,8 @@ class CUPLoss(SurrogateLoss):
         assert self.multiplier is not None
         gain = self._cost_gain(tensordict, log_weight.exp())
         penalty = (gain * self.multiplier.value).sum(-1, keepdim=True)
+        scale = 1 + self.cost_factor * self.multiplier.value.sum()
         return {
-            "loss_objective": divergence + self.cost_factor * penalty,
+            "loss_objective": (divergence + self.cost_factor * penalty) / scale,
             "cost_surrogate": self._cost_surrogates(tensordict, gain.detach()),
         }

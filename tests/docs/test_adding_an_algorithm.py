@@ -1,10 +1,14 @@
 """What the page says an algorithm of one's own takes is all that it takes."""
 
 import re
+import sys
 
+import pytest
 from point_mass import PointMass
 from run_configs import CONF, point_mass_config
 
+from safe_rl import targets
+from safe_rl.cli import user_code
 from safe_rl.cli.user_code import import_modules
 from safe_rl.runs.table import read_table
 from safe_rl.training.trainer import build_trainer
@@ -13,20 +17,30 @@ PAGE = (CONF.parent / "docs" / "algorithms" / "index.md").read_text()
 SECTION = PAGE.partition("## Adding an algorithm\n")[2].partition("\n## ")[0]
 
 
-def test_a_loss_a_configuration_and_a_test_make_an_algorithm(tmp_path):
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    """A folder of whose modules nothing is left behind."""
+    monkeypatch.setattr(sys, "path", [str(tmp_path), *sys.path])
+    monkeypatch.setattr(user_code, "_imported", [])
+    monkeypatch.setattr(targets, "_users_modules", set())
+    yield tmp_path
+    del sys.modules["my_penalty"]
+
+
+def test_a_loss_a_configuration_and_a_test_make_an_algorithm(folder):
     loss, test = re.findall(r"```python\n(.*?)```", SECTION, re.DOTALL)
     (configuration,) = re.findall(r"```yaml\n(.*?)```", SECTION, re.DOTALL)
     assert sum(len(block.splitlines()) for block in (loss, configuration, test)) < 60
     exec(loss + test, {})
-    (tmp_path / "my_penalty.py").write_text(loss)
-    (tmp_path / "my_conf" / "algo").mkdir(parents=True)
-    (tmp_path / "my_conf" / "algo" / "quadratic.yaml").write_text(configuration)
-    import_modules([str(tmp_path / "my_penalty.py")])
+    (folder / "my_penalty.py").write_text(loss)
+    (folder / "my_conf" / "algo").mkdir(parents=True)
+    (folder / "my_conf" / "algo" / "quadratic.yaml").write_text(configuration)
+    import_modules([str(folder / "my_penalty.py")])
     config = point_mass_config(
-        f"hydra.searchpath=[file://{tmp_path / 'my_conf'}]",
+        f"hydra.searchpath=[file://{folder / 'my_conf'}]",
         *("algo=quadratic", "frames=480", "cost_limits={cost_hazards: 1, cost_north: 0.5}"),
     )
-    build_trainer(config, PointMass(config.num_envs), tmp_path / "run").run()
-    penalties = read_table(tmp_path / "run" / "progress.csv")["policy_loss_penalty"]
+    build_trainer(config, PointMass(config.num_envs), folder / "run").run()
+    penalties = read_table(folder / "run" / "progress.csv")["policy_loss_penalty"]
     assert len(penalties) == 3
     assert max(penalties) > 0
