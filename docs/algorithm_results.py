@@ -14,15 +14,16 @@ LIMIT, FRAMES, QUARTER = 25.0, 1_000_000, 250_000
 
 
 def _runs(algo: str, env: str = "PointGoal1") -> dict[int, list[dict[str, float]]]:
-    """Rows of the recorded tables by seed, numbers only."""
+    """Rows of the recorded tables by seed, numbers only, of runs that came to their end."""
     found = {}
-    for path in sorted((RESULTS / env / algo).glob("seed*.csv.gz")):
+    for path in sorted((RESULTS / env / algo).glob("seed*/progress.csv.gz")):
         with gzip.open(path, "rt") as table:
             rows = [
                 {key: float(value) for key, value in row.items() if value}
                 for row in csv.DictReader(table)
             ]
-        found[int(path.name.removeprefix("seed").removesuffix(".csv.gz"))] = rows
+        if rows[-1]["steps"] >= FRAMES:
+            found[int(path.parent.name.removeprefix("seed"))] = rows
     return found
 
 
@@ -92,30 +93,11 @@ not a verdict. $\\rho_c$ is the cost per step of the whole run.
 
 {table}
 
-Commands: {_command("…", "300,301,302")}. Tables of all epochs are in
-[`results/algorithms/`](../../results/algorithms), with the commit of each run in `commits.csv`.
+Commands: {_command("…", "300,301,302")}. Tables of all epochs and the commits are in
+[`results/algorithms/`](../../results/README.md).
 """
 
 
 def _spread(values: list[float], digits: int) -> str:
     deviation = f" ± {statistics.stdev(values):.{digits}f}" if len(values) > 1 else ""
     return f"{statistics.fmean(values):.{digits}f}{deviation}"
-
-
-def collect(runs: Path, commit: str) -> None:
-    """Take finished runs over: their tables, compressed, and of the first seed its curves."""
-    RESULTS.mkdir(parents=True, exist_ok=True)
-    commits = RESULTS / "commits.csv"
-    known = commits.read_text().splitlines() if commits.exists() else ["env,algo,seed,commit"]
-    for table in sorted(runs.glob("*/*/seed*/progress.csv")):
-        env, algo, seed = table.parts[-4:-1]
-        target = RESULTS / env / algo / f"{seed}.csv.gz"
-        if int(table.read_text().splitlines()[-1].split(",")[1]) < FRAMES or target.exists():
-            continue
-        target.parent.mkdir(parents=True, exist_ok=True)
-        target.write_bytes(gzip.compress(table.read_bytes(), mtime=0))
-        known.append(f"{env},{algo},{seed.removeprefix('seed')},{commit}")
-        picture, drawn = table.with_name("curves.png"), PAGES / f"{algo}.png"
-        if env == "PointGoal1" and picture.exists() and not drawn.exists():
-            drawn.write_bytes(picture.read_bytes())
-    commits.write_text("\n".join(known) + "\n")

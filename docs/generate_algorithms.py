@@ -3,20 +3,18 @@
 ``python docs/generate_algorithms.py`` writes docs/algorithms/<name>.md and comparison.md: settings
 from conf/, their meanings from the table of keys, what is logged from docs/algorithms/index.md,
 figures from results/algorithms/, the rest from docs/algorithms/pages.yaml.
-``python docs/generate_algorithms.py collect RUNS COMMIT`` takes finished runs of a commit, RUNS/
-<environment>/<algorithm>/seed<n>, into results/algorithms/ before.
+Runs get into results/algorithms/ by ``python -m safe_rl.report RUNS archive=results/algorithms``.
 """
 
 from __future__ import annotations
 
 import re
-import sys
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
 import yaml
-from algorithm_results import collect, comparison, measured
+from algorithm_results import comparison, measured
 from hydra import compose, initialize_config_dir
 from omegaconf import DictConfig, OmegaConf
 
@@ -270,7 +268,5 @@ def _imports(targets: list[str]) -> str:
 
 
 if __name__ == "__main__":
-    if sys.argv[1:2] == ["collect"]:
-        collect(Path(sys.argv[2]), sys.argv[3])
     for file, text in pages().items():
         (PAGES / file).write_text(text)
