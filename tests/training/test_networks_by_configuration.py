@@ -9,6 +9,7 @@ import torch
 from point_mass import PointMass  # noqa: F401
 from run_configs import compose_config, without_times
 
+from safe_rl.algorithms.parts import find_recipe
 from safe_rl.cli import evaluate, train
 from safe_rl.envs import make_env
 from safe_rl.runs.table import read_table
@@ -77,6 +78,13 @@ def test_workers_normalise_as_the_first_process_does(tmp_path):
             torch.testing.assert_close(actor(batch.select("observation"))["loc"], batch["loc"])
     finally:
         trainer.close()
+
+
+@pytest.mark.parametrize("choice", ["model.normalise=10", "model=dict", "model=gru"])
+def test_learning_from_memory_takes_perceptrons_alone(choice):
+    config = compose_config("algo=sac", "env=PointGoal1", choice)
+    with pytest.raises(ValueError, match=r"algo=sac.*model\.\w+ is for on-policy algorithms"):
+        find_recipe(config).build(config, make_env("PointGoal1", num_envs=2, seed=0))
 
 
 @pytest.mark.slow
