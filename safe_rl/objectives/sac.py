@@ -37,6 +37,8 @@ class SACLoss(objectives.SACLoss):
         action_spec: of one action [A]; needed for ``target_entropy="auto"``.
 
     Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
         >>> from safe_rl.models import QEnsemble, make_squashed_actor
         >>> actor = make_squashed_actor(3, -torch.ones(2), torch.ones(2), hidden_sizes=[8])
         >>> q = QEnsemble(3, 2, hidden_sizes=[8], num_networks=2)
@@ -145,6 +147,8 @@ class SACLagrangianLoss(SACLoss, CostCritics):
         ValueError: if the cost critic is no ensemble, or keys and multipliers differ in number.
 
     Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
         >>> from safe_rl.models import QEnsemble, make_squashed_actor
         >>> from safe_rl.objectives import LagrangeMultiplier
         >>> actor = make_squashed_actor(3, -torch.ones(2), torch.ones(2), hidden_sizes=[8])
