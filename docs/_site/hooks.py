@@ -6,6 +6,7 @@ from pathlib import Path
 
 import api
 import catalogue
+import equations
 import links
 from mkdocs.config.defaults import MkDocsConfig
 from mkdocs.structure.files import File, Files, InclusionLevel
@@ -38,3 +39,8 @@ def on_files(files: Files, config: MkDocsConfig) -> None:
 def on_page_markdown(markdown: str, page: Page, **_: object) -> str:
     """Put tables in, and lead links to files outside of `docs/` to their pages."""
     return links.rewrite(catalogue.fill(markdown), page.file.src_uri, ROOT)
+
+
+def on_page_content(content: str, **_: object) -> str:
+    """Typeset equations."""
+    return equations.typeset(content)

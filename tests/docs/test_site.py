@@ -67,6 +67,21 @@ def test_links_to_files_outside_lead_to_their_pages(tmp_path):
     )
 
 
+def test_equations_become_mathml_or_an_error():
+    pytest.importorskip("latex2mathml", reason="of the extra docs, with which CI builds the site")
+    from equations import typeset
+
+    page = (
+        r'a <span class="arithmatex">\(J_c &lt; d\)</span> <div class="arithmatex">\[\rho\]</div>'
+    )
+    made = typeset(page)
+    assert made.count("<math") == 2
+    assert "<msub><mi>J</mi><mi>c</mi></msub>" in made
+    assert 'display="block"' in made
+    with pytest.raises(ValueError, match="nosuch"):
+        typeset(r'<span class="arithmatex">\(\nosuch x\)</span>')
+
+
 def test_every_page_is_in_the_navigation_once():
     class Loader(yaml.SafeLoader):
         """What names objects of Python is none of ours."""
