@@ -34,6 +34,7 @@ from safe_rl.reporting.slate_scores import (
     middle_table,
     missing_seeds,
     slate_table,
+    title_of,
 )
 from safe_rl.reporting.transfers import draw_transfer, find_transfers
 from safe_rl.scores.benchmark import Suite
@@ -229,9 +230,11 @@ def _slates(
             iqm, profiles = draw_middles(middle.records, styles), draw_profiles(aggregates, styles)
             blocks += [
                 slate_table(name, slate, aggregates),
-                Drawing(f"slate_{name}", "", iqm, f"Interquartile means, {name}"),
+                Drawing(f"slate_{name}", "", iqm, f"Interquartile means, {title_of(name)}"),
                 middle,
-                Drawing(f"profiles_{name}", "", profiles, f"Performance profiles, {name}"),
+                Drawing(
+                    f"profiles_{name}", "", profiles, f"Performance profiles, {title_of(name)}"
+                ),
                 *_if_any(improvement_table(name, aggregates)),
             ]
     return blocks

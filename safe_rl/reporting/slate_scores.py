@@ -144,8 +144,17 @@ def slate_table(slate: str, environments: Sequence[str], aggregates: Sequence[Ag
         columns += [Column(f"paper {s}", ("{:.3f}", f"paper_{n}")) for n, s in SYMBOLS.items()]
     notes = [f"On {', '.join(environments)}.", _relations(aggregates)]
     notes += [_published_steps(slate)] if slate in PUBLISHED else []
-    title = {"shared": "What all algorithms were trained on"}.get(slate, slate)
-    return Table(f"slate_{slate}", title, columns, records, " ".join(filter(None, notes)))
+    return Table(f"slate_{slate}", title_of(slate), columns, records, " ".join(filter(None, notes)))
+
+
+def title_of(slate: str) -> str:
+    """What a slate is called on the page.
+
+    Examples:
+        >>> title_of("SG6"), title_of("shared")
+        ('SG6', 'What all algorithms were trained on')
+    """
+    return {"shared": "What all algorithms were trained on"}.get(slate, slate)
 
 
 def _record(slate: str, aggregate: Aggregate) -> dict[str, Any]:
@@ -205,7 +214,7 @@ def middle_table(slate: str, aggregates: Sequence[Aggregate]) -> Table:
         records.append(record)
     columns = [Column("algorithm", ("{}", "algorithm"))]
     columns += [Column(f"IQM {s}", *interval(name, 3)) for name, s in SYMBOLS.items()]
-    return Table(f"slate_{slate}_iqm", f"{slate}, interquartile means", columns, records)
+    return Table(f"slate_{slate}_iqm", f"{title_of(slate)}, interquartile means", columns, records)
 
 
 def improvement_table(slate: str, aggregates: Sequence[Aggregate]) -> Table:
@@ -223,7 +232,7 @@ def improvement_table(slate: str, aggregates: Sequence[Aggregate]) -> Table:
     columns = [Column(name, ("{}", name)) for name in ("algorithm", "other")]
     titles = zip(SYMBOLS, ("higher", "lower", "lower"), strict=True)
     columns += [Column(f"{how} {SYMBOLS[name]}", *interval(name, 2)) for name, how in titles]
-    title = f"{slate}, probability of improvement"
+    title = f"{title_of(slate)}, probability of improvement"
     return Table(f"slate_{slate}_improvement", title, columns, records)
 
 

@@ -152,7 +152,7 @@ def test_the_page_is_for_everybody(report):
     page = Page(report / "report.html")
     assert all(th.get("scope") in ("col", "row") for th in page.of("th"))
     texts = [image["alt"] for image in page.of("img")]
-    assert all("PointGoal1" in text or "shared" in text or "Mine" in text for text in texts)
+    assert all("PointGoal1" in text or "trained on" in text or "Mine" in text for text in texts)
     assert len(set(texts)) == len(texts)
     # what is over its limit is told by a sign with a name, not by colour alone
     marked = [e for e in page.of("b") if e.get("class") == "flag"]
