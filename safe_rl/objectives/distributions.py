@@ -2,13 +2,21 @@
 
 Closed forms where there are any: of Normals (also under a transform, such as a tanh-Normal's, which
 changes neither KL divergence nor Fisher information), of everything registered with
-`torch.distributions.kl_divergence`. From samples otherwise.
+`torch.distributions.kl_divergence`. From samples otherwise. A composite distribution's parts are
+independent: everything is the sum over them, each in its own way.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+
 import torch
-from tensordict.nn import ProbabilisticTensorDictModule, ProbabilisticTensorDictSequential
+from tensordict import NestedKey, TensorDictBase
+from tensordict.nn import (
+    CompositeDistribution,
+    ProbabilisticTensorDictModule,
+    ProbabilisticTensorDictSequential,
+)
 from torch import Tensor
 from torch.distributions import Distribution, Normal, kl_divergence
 from torchrl.modules.distributions import has_analytic_entropy, has_analytic_kl
@@ -41,10 +49,46 @@ def root(distribution: Distribution) -> Distribution:
 
 def has_closed_kl(distribution: Distribution) -> bool:
     """Whether the divergence between two distributions of this kind needs no samples."""
+    if isinstance(distribution, CompositeDistribution):
+        return all(map(has_closed_kl, distribution.dists.values()))
     return isinstance(root(distribution), Normal) or has_analytic_kl(distribution, distribution)
 
 
-def kl(p: Distribution, q: Distribution, log_weight: Tensor) -> Tensor:
+def _total(numbers: Iterable[Tensor], states: torch.Size) -> Tensor:
+    """Sum over the parts, and over what a part leaves apart: [*states, ...] each -> [*states]."""
+    return torch.stack([each.reshape(*states, -1).sum(-1) for each in numbers]).sum(0)
+
+
+def composite_log_probs(
+    composite: CompositeDistribution, batch: TensorDictBase, stored: Iterable[NestedKey]
+) -> tuple[Tensor, Tensor]:
+    """Log-probability of all parts' actions together, and the one stored with them, [...] each.
+
+    Args:
+        composite: distribution in the states of the batch.
+        batch: with the actions, by the keys of the parts.
+        stored: keys of the parts' stored log-probabilities.
+    """
+    states, parts = composite.batch_shape, composite.dists.items()
+    now = _total((part.log_prob(batch[key]) for key, part in parts), states)
+    return now, _total((batch[key] for key in stored), states)
+
+
+def _composite_kl(
+    p: CompositeDistribution, q: CompositeDistribution, batch: TensorDictBase
+) -> Tensor:
+    def divergence(key: NestedKey) -> Tensor:
+        part, other, log_weight = p.dists[key], q.dists[key], torch.empty(0)
+        if not has_closed_kl(part):
+            log_weight = part.log_prob(batch[key]) - other.log_prob(batch[key])
+        return kl(part, other, log_weight)
+
+    return _total(map(divergence, p.dists), p.batch_shape)
+
+
+def kl(
+    p: Distribution, q: Distribution, log_weight: Tensor, batch: TensorDictBase | None = None
+) -> Tensor:
     """KL(p ‖ q) of two distributions of the same kind, one number per state.
 
     Without a closed form it is estimated from an action a that q sampled in each state, as
@@ -55,12 +99,18 @@ def kl(p: Distribution, q: Distribution, log_weight: Tensor) -> Tensor:
         p: distribution in the states [...].
         q: distribution in the same states.
         log_weight: log ρ of the sampled actions, [...].
+        batch: the sampled actions of composite distributions, by the keys of the parts.
 
     Returns:
         Divergence in nats, [...].
     """
+    if isinstance(p, CompositeDistribution):
+        assert batch is not None
+        return _composite_kl(p, q, batch)
     roots = root(p), root(q)
     if isinstance(roots[0], Normal) and isinstance(roots[1], Normal):
+        if not p.event_shape:
+            return kl_divergence(*roots)
         return gaussian_kl(roots[0].loc, roots[0].scale, roots[1].loc, roots[1].scale)
     if has_analytic_kl(p, q):
         return kl_divergence(p, q)
@@ -74,6 +124,8 @@ def entropy(distribution: Distribution) -> Tensor:
     The gradient of a sampled entropy goes through the sample where the distribution allows it, and
     is the score function's elsewhere; both are without bias.
     """
+    if isinstance(distribution, CompositeDistribution):
+        return _total(map(entropy, distribution.dists.values()), distribution.batch_shape)
     if has_analytic_entropy(distribution):
         return distribution.entropy()
     _, log_prob = sample_and_log_prob(distribution, reparameterize=distribution.has_rsample)
@@ -98,6 +150,16 @@ def sampler_of(actor: ProbabilisticTensorDictSequential) -> ProbabilisticTensorD
     return samplers[-1]
 
 
+def composite_keys(
+    sampler: ProbabilisticTensorDictModule,
+) -> tuple[list[NestedKey], list[NestedKey]] | None:
+    """Where the parts' actions and log-probabilities are written; None if there are no parts."""
+    made = sampler.distribution_class
+    if getattr(made, "func", made) is not CompositeDistribution:
+        return None
+    return list(sampler.dist_sample_keys), list(sampler.log_prob_keys)
+
+
 class ReferencePolicy:
     """A policy as it is now, in the states of a batch, to measure later ones against.
 
@@ -108,12 +170,18 @@ class ReferencePolicy:
     def __init__(self, distribution: Distribution) -> None:
         self.distribution = distribution
         self._sample: tuple[Tensor, Tensor] | None = None
-        if not has_closed_kl(distribution):
+        self._parts: dict[NestedKey, ReferencePolicy] = {}
+        if isinstance(distribution, CompositeDistribution):
+            self._parts = {key: ReferencePolicy(part) for key, part in distribution.dists.items()}
+        elif not has_closed_kl(distribution):
             with torch.no_grad():
                 self._sample = sample_and_log_prob(distribution)
 
     def kl(self, policy: Distribution) -> Tensor:
         """KL(policy ‖ reference) per state, [...]; always from the same samples, if from any."""
+        if isinstance(policy, CompositeDistribution):
+            parts = self._parts.items()
+            return _total((part.kl(policy.dists[k]) for k, part in parts), policy.batch_shape)
         log_weight = torch.empty(0)
         if self._sample is not None:
             action, log_prob = self._sample

@@ -11,7 +11,13 @@ from torch import Tensor
 from torch.distributions import Distribution
 from torchrl.objectives import LossModule
 
-from safe_rl.objectives.distributions import entropy, kl, sampler_of
+from safe_rl.objectives.distributions import (
+    composite_keys,
+    composite_log_probs,
+    entropy,
+    kl,
+    sampler_of,
+)
 from safe_rl.objectives.keys import key_name, require
 from safe_rl.objectives.multipliers import Multiplier
 from safe_rl.objectives.samples import sample_mask
@@ -79,6 +85,8 @@ class SurrogateLoss(LossModule):
             loc: mean of the behaviour policy, [..., n]. This and any other parameter of its
                 distribution are expected where the actor writes them.
             scale: standard deviation of the behaviour policy, [..., n].
+
+        Actions and log-probabilities of a composite distribution stand where the actor writes them.
         """
 
         advantage: NestedKey = "advantage"
@@ -116,6 +124,7 @@ class SurrogateLoss(LossModule):
         sampler = sampler_of(actor_network)
         names = [name if isinstance(name, str) else name[-1] for name in sampler.dist_keys]
         self._parameter_keys = dict(zip(names, sampler.in_keys, strict=True))
+        self._composite_keys = composite_keys(sampler)
         self.set_keys(**{k: v for k, v in self._parameter_keys.items() if k in ("loc", "scale")})
         self.out_keys = [
             "loss_objective", "loss_entropy", *self.extra_out_keys, "kl", "entropy", "ESS",
@@ -140,7 +149,8 @@ class SurrogateLoss(LossModule):
         """Entries of the batch that are read."""
         keys = self.tensor_keys
         costs = [keys.cost_advantage] if self.has_costs else []
-        behaviour = [keys.action, keys.sample_log_prob, *self.behaviour_keys.values()]
+        actions, log_probs = self._composite_keys or ([keys.action], [keys.sample_log_prob])
+        behaviour = [*actions, *log_probs, *self.behaviour_keys.values()]
         return [*self.actor_network.in_keys, *behaviour, keys.advantage, *costs]
 
     @dispatch
@@ -198,6 +208,10 @@ class SurrogateLoss(LossModule):
     def _log_weight(self, tensordict: TensorDictBase, distribution: Distribution) -> Tensor:
         """log(π_θ(a|s) / π_k(a|s)), [..., 1]."""
         keys = self.tensor_keys
+        if self._composite_keys is not None:
+            stored = self._composite_keys[1]
+            now, behaviour = composite_log_probs(distribution, tensordict, stored)
+            return (now - behaviour).unsqueeze(-1)
         log_prob = distribution.log_prob(require(tensordict, keys.action))
         behaviour = require(tensordict, keys.sample_log_prob, "The collector writes it.")
         if behaviour.shape != log_prob.shape:
@@ -215,7 +229,7 @@ class SurrogateLoss(LossModule):
         keys = self.behaviour_keys.items()
         stored = TensorDict({key: require(tensordict, found, hint) for key, found in keys})
         behaviour = self.actor_network.build_dist_from_params(stored)
-        return kl(distribution, behaviour, log_weight.squeeze(-1))
+        return kl(distribution, behaviour, log_weight.squeeze(-1), tensordict)
 
     def _advantage(self, tensordict: TensorDictBase, log_weight: Tensor) -> Tensor:
         """Reward advantage, [..., 1]."""

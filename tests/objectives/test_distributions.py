@@ -6,15 +6,29 @@ import pytest
 import torch
 from samples import NUM_OBS, perturb
 from tensordict import TensorDict
-from tensordict.nn import NormalParamExtractor, TensorDictModule
+from tensordict.nn import (
+    CompositeDistribution,
+    NormalParamExtractor,
+    TensorDictModule,
+    set_composite_lp_aggregate,
+)
 from torch import nn
-from torch.distributions import Beta, Categorical, Distribution, Independent, kl_divergence
+from torch.distributions import (
+    Beta,
+    Categorical,
+    Distribution,
+    Independent,
+    Normal,
+    kl_divergence,
+)
 from torchrl.envs.utils import ExplorationType
 from torchrl.modules import IndependentNormal, OneHotCategorical, ProbabilisticActor, TanhNormal
 from torchrl.modules import TruncatedNormal as TorchRLTruncatedNormal
 from torchrl.objectives import ClipPPOLoss
 
 from safe_rl.algorithms import CPOStep, MinibatchUpdate, TRPOStep
+from safe_rl.models.distributions import Choices
+from safe_rl.models.heads import _Components
 from safe_rl.objectives import CPOLoss, LagrangeMultiplier, PPOLagrangianLoss, PPOLoss, TRPOLoss
 from safe_rl.objectives.distributions import ReferencePolicy, entropy, kl
 from safe_rl.objectives.fisher import FisherProduct
@@ -73,6 +87,26 @@ class Positive(nn.Module):
         return tuple((1 + nn.functional.softplus(x)).chunk(2, -1))
 
 
+class Steering(nn.Module):
+    """Outputs of a network as parameters of three parts: a number, two numbers, a choice."""
+
+    def forward(self, x):
+        loc, scale = NormalParamExtractor()(x[..., :2])
+        pair, other = NormalParamExtractor()(x[..., 2:6])
+        parts = {
+            "throttle": {"loc": loc.squeeze(-1), "scale": scale.squeeze(-1)},
+            "wheel": {"loc": pair, "scale": other},
+            "gear": {"logits": x[..., 6:]},
+        }
+        return TensorDict(parts, batch_size=x.shape[:-1])
+
+
+def composite(wheel):
+    parts = {"throttle": Normal, "wheel": wheel, "gear": Categorical}
+    names = {"throttle": ("hand", "throttle"), "wheel": ("hand", "wheel"), "gear": "gear"}
+    return functools.partial(CompositeDistribution, distribution_map=parts, name_map=names)
+
+
 class Grid(nn.Module):
     """Two choices among three."""
 
@@ -92,10 +126,16 @@ KINDS = {
     "categorical": (5, nn.Identity(), ["logits"], Categorical),
     "one_hot": (5, nn.Identity(), ["logits"], OneHotCategorical),
     "multi_discrete": (6, Grid(), ["logits"], MultiCategorical),
+    "unequal_multi_discrete": (5, _Components([2, 3]), ["logits"], Choices),
+    "composite": (9, Steering(), ["params"], composite(IndependentNormal)),
+    "apart_composite": (9, Steering(), ["params"], composite(Normal)),
+    "sampled_composite": (9, Steering(), ["params"], composite(Anonymous)),
     "anonymous": (4, NormalParamExtractor(), ["loc", "scale"], Anonymous),
     "unreparametrised": (4, NormalParamExtractor(), ["loc", "scale"], Unreparametrised),
 }  # fmt: skip
 SAMPLED_KL = {"truncated_normal", "anonymous", "unreparametrised"}
+COMPOSITE = {kind for kind in KINDS if "composite" in kind}
+ACTIONS = [("hand", "throttle"), ("hand", "wheel"), "gear"]
 
 
 def make_actor(kind):
@@ -105,6 +145,7 @@ def make_actor(kind):
         TensorDictModule(net, in_keys=["observation"], out_keys=keys),
         in_keys=keys,
         distribution_class=distribution,
+        out_keys=ACTIONS if kind in COMPOSITE else None,
         default_interaction_type=ExplorationType.RANDOM,
         return_log_prob=True,
     )
@@ -130,6 +171,8 @@ def test_ppo_surrogate_agrees_with_torchrl(kind):
     actor, batch = make_case(kind)
     perturb(actor, 0.1)
     theirs = ClipPPOLoss(actor, None, critic_coeff=None, clip_epsilon=0.2, entropy_coeff=0.0)
+    if kind in COMPOSITE:
+        theirs.set_keys(action=ACTIONS, sample_log_prob=actor[-1].log_prob_keys)
     expected = theirs(batch.clone())
     losses = PPOLoss(actor, clip_epsilon=0.2, entropy_coeff=0.0)(batch)
     for key in ("loss_objective", "clip_fraction", "ESS"):
@@ -137,7 +180,7 @@ def test_ppo_surrogate_agrees_with_torchrl(kind):
     assert losses["loss_entropy"] == 0
 
 
-@pytest.mark.parametrize("kind", sorted(set(KINDS) - SAMPLED_KL))
+@pytest.mark.parametrize("kind", sorted(set(KINDS) - SAMPLED_KL - COMPOSITE))
 def test_kl_in_closed_form(kind):
     actor, batch = make_case(kind)
     perturb(actor, 0.1)
@@ -148,6 +191,49 @@ def test_kl_in_closed_form(kind):
     expected = kl_divergence(present, past).mean()
     torch.testing.assert_close(losses["kl"], expected.detach())
     assert losses["kl"] > 0
+
+
+def known(part):
+    """A part as torch knows it, one number per state."""
+    part = getattr(part, "hidden", part)
+    return Independent(part, len(part.batch_shape) - 1)
+
+
+@pytest.mark.parametrize("kind", sorted(COMPOSITE))
+def test_of_a_composite_everything_is_the_sum_over_its_parts(kind):
+    actor, batch = make_case(kind, samples=100_000)
+    perturb(actor, 0.1)
+    losses = PPOLoss(actor, clip_epsilon=0.2, entropy_coeff=0.0)(batch)
+    pairs = [
+        (known(part), known(behaviour(actor, batch).dists[key]))
+        for key, part in policy_in(actor, batch).dists.items()
+    ]
+    kls = torch.stack([kl_divergence(*pair) for pair in pairs]).sum(0)
+    entropies = torch.stack([present.entropy() for present, _ in pairs]).sum(0)
+    assert kls.shape == batch.batch_size
+    sampled = {"rtol": 0.05, "atol": 0.01} if kind == "sampled_composite" else {}
+    torch.testing.assert_close(losses["kl"], kls.mean().detach(), **sampled)
+    torch.testing.assert_close(losses["entropy"], entropies.mean().detach(), **sampled)
+    reference = ReferencePolicy(behaviour(actor, batch))
+    torch.testing.assert_close(mean_kl(reference, actor, batch), kls.mean().detach(), **sampled)
+
+
+@pytest.mark.parametrize("aggregate", [True, False])
+def test_a_composites_log_probabilities_may_be_stored_together(aggregate):
+    with set_composite_lp_aggregate(aggregate):
+        actor, batch = make_case("composite")
+        losses = PPOLoss(actor, clip_epsilon=0.2, entropy_coeff=0.0)(batch)
+    assert ("sample_log_prob" in batch) == aggregate
+    assert losses["kl"] == 0
+    torch.testing.assert_close(losses["ESS"], torch.tensor(1.0))
+    torch.testing.assert_close(losses["loss_objective"], -batch["advantage"].mean())
+
+
+def test_a_nan_within_a_part_is_found_before_anything_is_learnt():
+    actor, batch = make_case("composite")
+    batch["params", "wheel", "loc"][3, 0] = torch.nan
+    with pytest.raises(FloatingPointError, match=r"wheel.*1 of 64"):
+        TRPOStep(TRPOLoss(actor, entropy_coeff=0.0), **SETTINGS)(batch)
 
 
 @pytest.mark.parametrize("kind", [*sorted(SAMPLED_KL), "normal", "beta"])
@@ -170,7 +256,7 @@ def test_sampled_kl_is_the_divergence_on_average(kind):
     assert found.item() == pytest.approx(expected.item(), rel=0.1, abs=1e-3)
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", sorted(set(KINDS) - COMPOSITE))
 def test_entropy_bonus_is_the_entropy_and_its_slope(kind):
     """Against the mean of −log p over other samples; slopes by differences of that with p fixed."""
     actor = make_actor(kind)
