@@ -26,7 +26,7 @@ def make_loss(env: SafetyGymEnv, limit: float) -> tuple[SACLagrangianLoss, PIMul
     spec, size = env.action_spec_unbatched, env.observation_spec["observation"].shape[-1]
     layers, actions = {"hidden_sizes": [128, 128]}, spec.shape[-1]
     multiplier = PIMultiplier(
-        {"cost": limit}, init=0.0, kp=1.0, ki=0.1, saturation=0.5, highest=5.0
+        {"cost": limit}, init=0.0, kp=0.5, ki=0.1, saturation=0.5, highest=5.0
     )
     loss = SACLagrangianLoss(
         make_squashed_actor(size, spec.low, spec.high, **layers),
@@ -61,6 +61,7 @@ def main(arguments: list[str] | None = None) -> list[dict[str, float]]:
         frames_per_batch=args.frames_per_batch,
         total_frames=args.frames,
         init_random_frames=2 * args.frames_per_batch,
+        auto_register_policy_transforms=False,
     )
     buffer = TensorDictReplayBuffer(storage=LazyTensorStorage(args.frames), batch_size=256)
     targets = SoftUpdate(loss, tau=0.01)

@@ -22,7 +22,7 @@ PARTS = {
     "targets": ("naming",),
     "envs": ("lazy", "naming", "targets"),
     "objectives": ("naming",),
-    "collectors": ("processes",),
+    "collectors": ("extras", "processes"),
     "models": (),
     "algorithms": ("collectors", "models", "naming", "objectives", "targets"),
     "runs": ("algorithms", "extras", "targets"),
@@ -106,7 +106,7 @@ FLOORS = {
         ("ipo", "p3o", "rcpo"),
         ("",),
     ),
-    "collectors": (("accounting", "factory", "workers"), ("",)),
+    "collectors": (("accounting", "datasets", "factory", "workers"), ("",)),
     "models": (
         ("distributions", "memory", "normalising", "scaling"),
         ("heads",),

@@ -1,6 +1,7 @@
-"""Data collection with cost accounting."""
+"""Data collection with cost accounting, and transitions on disk."""
 
 from safe_rl.collectors.accounting import EpisodeAccounting, EpisodeStatistics
+from safe_rl.collectors.datasets import Recording, read_hdf5, read_recording, safe_episodes
 from safe_rl.collectors.factory import make_collector
 from safe_rl.collectors.workers import (
     WorkerCollector,
@@ -11,8 +12,12 @@ from safe_rl.collectors.workers import (
 __all__ = [
     "EpisodeAccounting",
     "EpisodeStatistics",
+    "Recording",
     "WorkerCollector",
     "make_collector",
     "make_process_collector",
     "make_ray_collector",
+    "read_hdf5",
+    "read_recording",
+    "safe_episodes",
 ]

@@ -1,0 +1,96 @@
+"""Transitions come back from disk as they were collected, and safe episodes are whole ones."""
+
+import numpy as np
+import pytest
+import torch
+from point_mass import PointMass
+from tensordict import TensorDict
+from torchrl.modules import RandomPolicy
+
+from safe_rl.collectors import (
+    EpisodeAccounting,
+    Recording,
+    make_collector,
+    read_hdf5,
+    read_recording,
+    safe_episodes,
+)
+
+
+def collected(batches=3):
+    torch.manual_seed(0)
+    env = PointMass(4, 20)
+    collector = make_collector(env, RandomPolicy(env.action_spec), frames_per_batch=4 * 25)
+    return [batch.clone() for batch, _ in zip(collector, range(batches), strict=False)]
+
+
+def test_a_recording_is_what_was_collected(tmp_path):
+    batches = collected()
+    recording = Recording(tmp_path, PointMass.cost_keys)
+    for number, batch in enumerate(batches):
+        recording.write(number, batch)
+    recording.write(1, batches[1])  # by a run that was interrupted and goes on
+    found, expected = read_recording(tmp_path), torch.cat(batches, -1)
+    assert found.shape == (4, 75)
+    for key in ("observation", "action", ("next", "observation"), ("next", "cost_north")):
+        assert torch.equal(found[key], expected[key])
+    assert torch.equal(found["next", "truncated"], expected["next", "done"])
+    with pytest.raises(FileNotFoundError, match="holds no transitions"):
+        read_recording(tmp_path / "elsewhere")
+
+
+@pytest.mark.parametrize("limits", [{"cost": 2.0}, {"cost_hazards": 1.0, "cost_north": 0.0}, {}])
+def test_safe_episodes_are_those_that_the_accounting_finds(limits):
+    steps = torch.cat(collected(), -1)
+    episodes = EpisodeAccounting(4, PointMass.cost_keys).update(steps)
+    within = [episodes.costs[key] <= limit for key, limit in limits.items()]
+    expected = torch.stack(within).all(0) if within else torch.ones(episodes.num_episodes) > 0
+    found = safe_episodes(steps, limits)
+    assert 0 < expected.sum() <= 12
+    assert found.shape == (1, 20 * expected.sum())
+    # whole episodes, in order: each ends once, at its last step
+    ends = found["next", "done"].reshape(-1, 20)
+    assert ends[:, -1].all()
+    assert not ends[:, :-1].any()
+    returns = found["next", "reward"].reshape(-1, 20).double().sum(-1)
+    torch.testing.assert_close(returns, episodes.returns[expected])
+
+
+def write_hdf5(path, size=6, leave_out=()):
+    h5py = pytest.importorskip("h5py", reason="comes with the extra hdf5")
+    rng = np.random.default_rng(0)
+    arrays = {
+        "observations": rng.normal(size=(size, 3)), "next_observations": rng.normal(size=(size, 3)),
+        "actions": rng.normal(size=(size, 2)), "rewards": rng.normal(size=size),
+        "costs": rng.integers(0, 2, size).astype(float), "terminals": np.arange(size) == 2,
+        "timeouts": np.arange(size) == size - 1,
+    }  # fmt: skip
+    with h5py.File(path, "w") as file:
+        for name in set(arrays) - set(leave_out):
+            file[name] = arrays[name]
+    return arrays
+
+
+def test_files_of_offline_benchmarks_are_read(tmp_path):
+    arrays = write_hdf5(tmp_path / "data.hdf5")
+    steps = read_hdf5(tmp_path / "data.hdf5")
+    assert steps.shape == (1, 6)
+    torch.testing.assert_close(
+        steps["next", "reward"], torch.tensor(arrays["rewards"]).float().reshape(1, 6, 1)
+    )
+    torch.testing.assert_close(steps["action"], torch.tensor(arrays["actions"]).float()[None])
+    assert steps["next", "done"].flatten().tolist() == [False, False, True, False, False, True]
+    assert steps["next", "terminated"].flatten().tolist().count(True) == 1
+    assert isinstance(steps, TensorDict)
+
+
+def test_what_a_file_lacks_is_named(tmp_path):
+    write_hdf5(tmp_path / "data.hdf5", leave_out=["costs"])
+    with pytest.raises(KeyError, match=r"has no costs.*What it has: actions"):
+        read_hdf5(tmp_path / "data.hdf5")
+
+
+def test_without_h5py_the_extra_is_named(tmp_path, monkeypatch):
+    monkeypatch.setattr("safe_rl.extras.find_spec", lambda name: None)
+    with pytest.raises(ModuleNotFoundError, match=r"\[hdf5\]"):
+        read_hdf5(tmp_path / "data.hdf5")
