@@ -78,7 +78,7 @@ class Memory:
     ) -> None:
         if storage not in _STORAGES:
             raise ValueError(f"storage={storage}: it must be one of {', '.join(_STORAGES)}.")
-        self.batch_size, self.keeps, self._capacity = batch_size, keep, capacity
+        self.batch_size, self.keeps, self.capacity = batch_size, keep, capacity
         self._in_keys, self._device = list(in_keys), torch.device(device or "cpu")
         if prioritised is not None and keep:
             raise ValueError("Priorities cannot be kept: set keep=false, or prioritised=null.")
@@ -140,7 +140,7 @@ class Memory:
         if size:
             steps = self._buffer[:].exclude("index").flatten_keys("/")
             # a file gets the whole of what a part of is saved
-            steps = steps if size == self._capacity else steps.clone()
+            steps = steps if size == self.capacity else steps.clone()
             state["steps"] = {key: v.as_subclass(torch.Tensor) for key, v in steps.items()}
         tail = None if self._multi_step is None else self._multi_step._buffer
         if tail is not None:

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import torch
-from omegaconf import DictConfig
+from omegaconf import DictConfig, OmegaConf
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import nn
@@ -64,8 +64,8 @@ class OffPolicy:
 
         Raises:
             ValueError: If a cost limit names a cost that the environment does not have, a
-                constrained algorithm gets no limit, actions have no bounds, or a risk measure is
-                named.
+                constrained algorithm gets no limit, actions have no bounds, a risk measure is
+                named, or the memory is smaller than what learning begins with.
         """
         limits = constrained_limits(
             config, env, is_constrained=config.get("limits") is not None, otherwise="sac"
@@ -94,14 +94,20 @@ class OffPolicy:
             reward_gamma=config.loss.gamma,
             device=device,
         )
-        exploration = config.exploration
+        random_steps = _setting(config, "exploration.random_steps")
+        if max(random_steps, memory.batch_size) > memory.capacity:
+            raise ValueError(
+                f"memory.capacity={memory.capacity}: it must hold exploration.random_steps="
+                f"{random_steps} transitions and a minibatch of {memory.batch_size}, or nothing is "
+                "ever learned."
+            )
         return cls(
-            policy=_exploring(networks["actor"], env, exploration.noise),
+            policy=_exploring(networks["actor"], env, _setting(config, "exploration.noise")),
             networks=networks,
             constraints=constraints,
             memory=memory,
             policy_update=build_part(config.policy_update, loss=loss),
-            random_steps=exploration.random_steps,
+            random_steps=random_steps,
         )
 
     @classmethod
@@ -177,6 +183,13 @@ class OffPolicy:
         return {name: part for name, part in parts.items() if part is not None}
 
 
+def _setting(config: DictConfig, key: str) -> Any:
+    value = OmegaConf.select(config, key)
+    if value is None:
+        raise ValueError(f"{key} is missing: off-policy algorithms need it.")
+    return value
+
+
 def _action_spec(env: EnvBase) -> TensorSpec:
     """Of one environment's action, [A]; it has bounds."""
     spec = env.action_spec_unbatched
@@ -214,13 +227,15 @@ def _build_networks(
         "actor": build_part(
             config.actor, observation_size=size, low=spec.low, high=spec.high, **common
         ),
-        "critic": QEnsemble(size, len(spec.low), num_networks=config.critics.rewards, **common),
+        "critic": QEnsemble(
+            size, len(spec.low), num_networks=_setting(config, "critics.rewards"), **common
+        ),
     }
     if num_costs:
         networks["cost_critic"] = QEnsemble(
             size,
             len(spec.low),
-            num_networks=config.critics.costs,
+            num_networks=_setting(config, "critics.costs"),
             num_outputs=num_costs,
             out_key="cost_state_action_value",
             **common,

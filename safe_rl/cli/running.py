@@ -65,7 +65,8 @@ def prepare(config: DictConfig, directory: Path, continues: bool) -> Trainer | N
             partial(make, evaluating=True),
             cost_keys=training.cost_keys,
             seed=default_seed(env, config.seed),
-            **config.evaluation,
+            interval=config.evaluation.interval,
+            episodes=config.evaluation.episodes,
         )
     trainer = build_trainer(config, training, directory, in_workers, evaluation)
     if continues and trainer.resume():

@@ -202,6 +202,14 @@ def test_actions_without_bounds_are_refused():
         OffPolicy.build(off_policy_config("algo=sac"), Free())
 
 
+def test_a_memory_that_never_holds_enough_is_refused():
+    config = off_policy_config("algo=sac", "memory.capacity=100")
+    with pytest.raises(ValueError, match=r"must hold exploration.random_steps=160"):
+        OffPolicy.build(config, PointMass(2))
+    with pytest.raises(ValueError, match=r"risk: algo=sac_lagrangian limits mean costs only"):
+        OffPolicy.build(off_policy_config("algo=sac_lagrangian", "risk=cvar"), PointMass(2))
+
+
 def test_a_constrained_one_needs_a_limit():
     with pytest.raises(ValueError, match="Without constraints use algo=sac"):
         OffPolicy.build(off_policy_config("algo=sac_lagrangian", "cost_limits={}"), PointMass(2))
