@@ -11,7 +11,7 @@ from safe_rl.runs.table import read_table
 from safe_rl.training.trainer import build_trainer
 
 PAGE = (CONF.parent / "docs" / "off_policy.md").read_text()
-ALL = (CONF.parent / "docs" / "algorithms.md").read_text()
+ALL = (CONF.parent / "docs" / "algorithms" / "index.md").read_text()
 
 
 def columns(page, name, cost):
