@@ -26,7 +26,7 @@ def make_loss(env: SafetyGymEnv, limit: float) -> tuple[SACLagrangianLoss, PIMul
     spec, size = env.action_spec_unbatched, env.observation_spec["observation"].shape[-1]
     layers, actions = {"hidden_sizes": [128, 128]}, spec.shape[-1]
     multiplier = PIMultiplier(
-        {"cost": limit}, init=0.0, kp=0.5, ki=0.1, saturation=0.5, highest=5.0
+        {"cost": limit}, init=0.0, kp=0.1, ki=0.05, saturation=0.5, highest=5.0
     )
     loss = SACLagrangianLoss(
         make_squashed_actor(size, spec.low, spec.high, **layers),
