@@ -20,21 +20,21 @@ def nearest(name: str, known: Iterable[str]) -> str | None:
         >>> nearest("zzz", ["hazards_num"]) is None
         True
     """
-    close = get_close_matches(name, list(known), n=3, cutoff=_LIKENESS)
-    # of equally close ones, the one of the most similar length
+    close = get_close_matches(name, list(known), n=5, cutoff=_LIKENESS)
+    # of equally close ones, one of the same letters, then the one of the most similar length
     return max(close, key=lambda found: _likeness(name, found), default=None)
 
 
-def _likeness(name: str, found: str) -> tuple[float, int]:
+def _likeness(name: str, found: str) -> tuple[float, bool, int]:
     ratio = SequenceMatcher(None, found, name).ratio()
-    return round(ratio, 6), -abs(len(found) - len(name))
+    return round(ratio, 6), sorted(found) == sorted(name), -abs(len(found) - len(name))
 
 
 def did_you_mean(name: str, known: Iterable[str]) -> str:
     """Return a sentence to append to an error, with its space, or nothing if no name is like it.
 
     Examples:
-        >>> did_you_mean("cop", ["cpo", "ppo"])
+        >>> did_you_mean("cop", ["cpo", "cup", "ppo"])
         " Did you mean 'cpo'?"
     """
     close = nearest(name, known)

@@ -7,6 +7,7 @@ or has changed, the run's copy takes its place.
 from __future__ import annotations
 
 import json
+import os
 import shutil
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -106,10 +107,10 @@ def _own_robot(env: Mapping[str, Any]) -> Path | None:
 
 
 def _read_note(folder: RunFolder) -> dict[str, Any]:
+    if not os.path.isfile(folder.robot_note):  # nor is it in a folder that cannot be
+        return {}
     try:
         note = json.loads(folder.robot_note.read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        return {}
     except (OSError, ValueError) as error:
         raise ConfigError(f"'robot_base': {folder.robot_note} cannot be read: {error}") from None
     return note if isinstance(note, dict) else {}

@@ -93,6 +93,8 @@ class EpisodeCosts:
         drift: share by which J_c changes from one policy to the next, about; it weighs the past
             against the batch. None uses the batch alone.
         length_memory: weight in [0, 1) of the past in T̄.
+        smallest: costs per step that count as J_c's size where it is smaller, for the drift: from
+            batches without any cost nothing else would lead away.
 
     Examples:
         >>> estimator = EpisodeCosts(1, max_length=1000, drift=None, length_memory=0.9)
@@ -103,9 +105,15 @@ class EpisodeCosts:
     """
 
     def __init__(
-        self, num_costs: int, *, max_length: float, drift: float | None, length_memory: float
+        self,
+        num_costs: int,
+        *,
+        max_length: float,
+        drift: float | None,
+        length_memory: float,
+        smallest: float = 0.0,
     ) -> None:
-        self.drift, self.length_memory = drift, length_memory
+        self.drift, self.length_memory, self.smallest = drift, length_memory, smallest
         self._state = {
             "length": torch.tensor(float(max_length)),
             "length_weight": torch.zeros(()),
@@ -150,7 +158,8 @@ class EpisodeCosts:
             batch = batch._replace(mean=batch.mean + charges.offset)
         self.batch = batch
         if self.drift is not None:
-            batch = shrink(self.estimate, batch, self.drift * self.estimate.mean)
+            size = torch.maximum(self.estimate.mean, self.smallest * self.length * self.unit)
+            batch = shrink(self.estimate, batch, self.drift * size)
         self._state["mean"], self._state["error"] = batch
         return batch
 

@@ -198,7 +198,11 @@ class LimitTracker:
         self.descent_steps = round(descent_steps * shrinkage)
         self.smallest_scale, self.memory, self.recovery = smallest_scale, memory, recovery
         self.costs = EpisodeCosts(
-            num_costs, max_length=max_length, drift=drift, length_memory=memory
+            num_costs,
+            max_length=max_length,
+            drift=drift,
+            length_memory=memory,
+            smallest=smallest_scale,
         )
         self.promises = PromisedChange(num_costs, memory=memory, lowest=lowest_trust)
         self.integral, self.largest_integral = integral, largest_integral

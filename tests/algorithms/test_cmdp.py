@@ -211,8 +211,18 @@ def test_unconstrained_algorithms_reach_the_target_and_violate(algorithm, cmdp):
     assert (cmdp.expected_costs(mean) > 1.5 * cmdp.limits).all()
 
 
-@pytest.mark.parametrize("cmdp", [ONE, TWO], ids=["one", "two"])
-@pytest.mark.parametrize(("algorithm", "epochs"), CONSTRAINED)
+# Two limits take as long again: for algorithms that need many epochs that is a slow test.
+@pytest.mark.parametrize(
+    ("algorithm", "epochs", "cmdp"),
+    [
+        pytest.param(
+            *row, cmdp, id=f"{row[0].__name__}-{name}",
+            marks=[pytest.mark.slow] if cmdp is TWO and row[1] >= 200 else [],
+        )
+        for name, cmdp in (("one", ONE), ("two", TWO))
+        for row in CONSTRAINED
+    ],
+)  # fmt: skip
 def test_constrained_algorithms_reach_the_boundary_at_the_optimum(algorithm, epochs, cmdp):
     actor = make_actor()
     mean = train(cmdp, actor, algorithm(actor, cmdp), epochs)[-50:].mean(0)

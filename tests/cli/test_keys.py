@@ -125,6 +125,7 @@ def keys_of(configs) -> Iterator[tuple[Any, str]]:
                 yield config, path
 
 
+@pytest.mark.slow
 def test_no_value_ends_in_a_traceback(configs):
     accepted: dict[str, list[Any]] = {}
     for config, path in keys_of(configs):

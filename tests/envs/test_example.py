@@ -64,6 +64,7 @@ def test_it_is_trained_resumed_and_evaluated_by_the_ordinary_commands(tmp_path):
     assert "cost_mines" in (tmp_path / "evaluation.json").read_text()
 
 
+@pytest.mark.slow
 def test_it_is_swept_and_reported(tmp_path):
     status, printed = run("train.py", "-m", IMPORT, *MINES, *SHORT, "seed=0,1",
                           "hydra.launcher.n_jobs=2", f"hydra.sweep.dir={tmp_path}")  # fmt: skip

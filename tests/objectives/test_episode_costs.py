@@ -64,15 +64,15 @@ def test_shrinkage_predicts_a_wandering_cost_better_than_the_batch_and_than_the_
     truth = torch.tensor([50.0])
     estimate = CostEstimate(*torch.full((2, 1), torch.nan))
     squared = {"shrunk": 0.0, "batch": 0.0, "mean of all": 0.0}
-    seen = []
-    for _ in range(4000):
+    total = torch.zeros(1)
+    for number in range(1, 4001):
         truth = truth + 3 * torch.randn(1, generator=generator)
         noisy = truth + 6 * torch.randn(1, generator=generator)
-        seen.append(noisy)
+        total += noisy
         estimate = shrink(estimate, CostEstimate(noisy, torch.tensor([6.0])), torch.tensor([3.0]))
         squared["shrunk"] += (estimate.mean - truth).square().item()
         squared["batch"] += (noisy - truth).square().item()
-        squared["mean of all"] += (sum(seen) / len(seen) - truth).square().item()
+        squared["mean of all"] += (total / number - truth).square().item()
     assert squared["shrunk"] < 0.6 * min(squared["batch"], squared["mean of all"])
     assert estimate.error.square().item() == pytest.approx(squared["shrunk"] / 4000, rel=0.15)
 

@@ -126,6 +126,17 @@ def test_a_violation_that_stays_is_asked_for_more_and_more_up_to_a_bound():
     assert states[-1].demand == -15
 
 
+def test_costs_that_come_late_are_seen():
+    """Of batches without any cost there is no spread, and no share of nothing to drift by."""
+    limits = tracker(margin=0.0, free_steps=0, descent_steps=0)
+    for _ in range(5):
+        limits.update(torch.zeros(20, 100, 1), NO_EPISODES)
+    for costs in batches(12, 0.06):
+        state = limits.update(costs, NO_EPISODES)
+    assert state.cost.item() > 40
+    assert state.violation.item() > 15
+
+
 def test_with_hysteresis_a_violation_is_made_up_for_by_more_than_itself():
     limits = tracker(
         25.0, 25.0, margin=0.0, free_steps=0, descent_steps=0, drift=None, recovery=0.8
