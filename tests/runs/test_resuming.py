@@ -79,7 +79,11 @@ def kill_after_rows(process, directory, number):
 
 @pytest.mark.parametrize(
     ("name", "sleep"),
-    [("PointGoal1", True), ("CarPush2", True), ("PointButton1", False)],
+    [
+        ("PointGoal1", True),
+        pytest.param("CarPush2", True, marks=pytest.mark.slow),
+        pytest.param("PointButton1", False, marks=pytest.mark.slow),
+    ],
 )
 def test_a_run_killed_several_times_leaves_the_table_of_one_that_was_not(tmp_path, name, sleep):
     whole, killed = tmp_path / "whole", tmp_path / "killed"

@@ -86,6 +86,7 @@ def test_ranges_that_cannot_be_are_refused(outside, message):
         make_env({**node, "outside": outside})
 
 
+@pytest.mark.slow
 def test_several_choices_at_once_are_trained_in_processes_too(tmp_path):
     """The environment itself refuses actions that it does not have."""
     limits = ("cost_limits={cost: 6}", "env.id=Boxes-v0", MINIBATCHES)

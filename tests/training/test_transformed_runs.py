@@ -100,7 +100,10 @@ def command(tmp_path, monkeypatch, capsys):
     [
         ["algo=ppo", "transforms=[saute]", "transforms.saute.unsafe_reward=-2"],
         ["algo=trpo", "transforms=[simmer]", "transforms.simmer.steps=30"],
-        ["algo=ppo", "transforms=[simmer]", "collector=process", "collector.num_collectors=2"],
+        pytest.param(
+            ["algo=ppo", "transforms=[simmer]", "collector=process", "collector.num_collectors=2"],
+            marks=pytest.mark.slow,
+        ),
         ["algo=ppo", "transforms=[saute,early_termination]", "cost_limits={cost: 0.5}"],
         [
             *("algo=ppo_lagrangian", "transforms=[action_filter]", FILTER),
