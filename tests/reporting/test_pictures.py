@@ -1,0 +1,130 @@
+"""What the report draws: curves with their bands and limits, styles, legends, fronts."""
+
+import numpy as np
+import pytest
+from matplotlib.figure import Figure
+from synthetic import experiments_in, write_run
+
+from safe_rl.reporting.pictures import (
+    add_legend,
+    algorithm_styles,
+    draw_fronts,
+    draw_learning_curves,
+    save,
+)
+from safe_rl.reporting.scoring import final_table
+
+ROWS = {"returns": (1.0, 2.0, 3.0), "rates": (0.06, 0.05, 0.04)}
+
+
+def test_panels_have_means_intervals_and_limits(tmp_path):
+    for seed, shift in ((0, 0.0), (10, 6.0)):
+        costs = [30.0 + shift] * 3
+        write_run(tmp_path, "PointGoal1", "ppo", seed, **ROWS, costs=costs)
+    write_run(tmp_path, "PointGoal2", "cpo", 0, **ROWS, costs=(1, 1, 1), limits={"cost": 10.0},
+              env_changes={"num_steps": 500}, frames=10**6)  # fmt: skip
+    experiments = experiments_in(tmp_path)
+    figure = draw_learning_curves(experiments, algorithm_styles(experiments))
+    panels = np.array(figure.axes).reshape(2, 3)
+    assert [axes.get_title() for axes in panels[0]] == ["Return", "Episode cost", "Cost rate"]
+    assert panels[0, 0].get_ylabel() == "PointGoal1"
+    cost_line, limit = panels[0, 1].lines
+    np.testing.assert_allclose(cost_line.get_ydata(), 33.0)
+    assert (limit.get_linestyle(), list(limit.get_ydata())) == ("--", [25.0, 25.0])
+    band = panels[0, 1].collections[0].get_paths()[0].get_extents()
+    assert (band.ymin, band.ymax) == pytest.approx((30.0, 36.0))
+    assert list(panels[0, 2].lines[-1].get_ydata()) == [0.025, 0.025]
+    # the limit of another task, over shorter episodes; and a run that is not finished is dotted
+    assert list(panels[1, 2].lines[-1].get_ydata()) == [0.02, 0.02]
+    assert panels[1, 0].lines[0].get_linestyle() == ":"
+    names = [text.get_text() for text in figure.legends[0].get_texts()]
+    assert names == ["PPO", "CPO (unfinished)"]
+
+
+def test_every_limited_cost_has_a_row(tmp_path):
+    directory = write_run(tmp_path, limits={"cost": 25.0, "cost_hazards": 5.0})
+    path = directory / "progress.csv"
+    head, row = path.read_text().splitlines()
+    path.write_text(f"{head},episode_cost_hazards,cost_hazards_rate\n{row},4,0.004\n")
+    experiments = experiments_in(tmp_path)
+    figure = draw_learning_curves(experiments, algorithm_styles(experiments))
+    panels = np.array(figure.axes).reshape(2, 3)
+    assert [axes.get_ylabel() for axes in panels[:, 0]] == [
+        "PointGoal1", "PointGoal1\ncost_hazards",
+    ]  # fmt: skip
+    assert [list(line.get_ydata()) for line in panels[1, 1].lines] == [[4.0], [5.0, 5.0]]
+
+
+def test_colours_stay_with_the_algorithms(tmp_path):
+    for algo in ("ppo", "cpo", "mine", "yours"):
+        write_run(tmp_path, algo=algo)
+    write_run(tmp_path, algo="cpo", frames=500, folder="variant")
+    everything = experiments_in(tmp_path)
+    colours = algorithm_styles(everything)
+    assert len(set(colours.values())) == 5
+    alone = algorithm_styles([e for e in everything if e.algorithm == "PPO"])
+    assert alone["PPO"] == colours["PPO"]
+
+
+def test_experiments_of_one_algorithm_are_told_apart(tmp_path):
+    for width in range(15):
+        model = {"model": {"width": width}, "frames": 3000}
+        write_run(tmp_path, algo="cpo", **model, **ROWS, costs=(1, 1, 1), folder=f"w{width}")
+        write_run(tmp_path, algo="cpo", **model, seed=1, folder=f"unfinished{width}")
+    experiments = experiments_in(tmp_path)
+    styles = algorithm_styles(experiments)
+    assert len(set(styles.values())) == 15
+    figure = draw_learning_curves(experiments, styles)
+    looks = [(line.get_color(), str(line._unscaled_dash_pattern)) for line in figure.axes[0].lines]
+    assert len(set(looks)) == 30
+
+
+@pytest.mark.parametrize(
+    "names",
+    [
+        ["a", "b", "c"],
+        [f"model.input_scale=a,model.hidden_sizes={n},num_envs={n}" for n in range(12)],
+        [" ".join(f"model.hidden_sizes_{n}=64" for n in range(20))],
+    ],
+)
+def test_the_legend_is_as_wide_as_the_figure_at_most(names, tmp_path):
+    figure = Figure(figsize=(12, 3), layout="constrained")
+    panels = figure.subplots(1, 3)
+    for name in names:
+        panels[0].plot([0, 1], [0, 1], label=name)
+    add_legend(figure, panels)
+    save(figure, tmp_path / "legend.png")
+    (legend,) = figure.legends
+    box = legend.get_window_extent()
+    assert 0 <= box.x0 < box.x1 <= figure.bbox.width
+    assert 0 <= box.y0 < box.y1
+    # the figure has grown, so that the panels are as high as with a short legend
+    assert panels[0].get_window_extent().height > 180
+
+
+def test_the_front_joins_what_no_other_one_beats(tmp_path):
+    for algo, value, cost in (("ppo", 20.0, 60.0), ("cpo", 10.0, 20.0), ("trpo", 5.0, 40.0)):
+        write_run(tmp_path, algo=algo, returns=[value], costs=[cost])
+    write_run(tmp_path, algo="cpo", returns=[3.0], costs=[8.0], limits={"cost": 9.0}, folder="9")
+    experiments = experiments_in(tmp_path)
+    (axis,) = draw_fronts(final_table(experiments).records, algorithm_styles(experiments)).axes
+    front = next(line for line in axis.lines if line.get_color() == "0.6")
+    assert list(zip(*front.get_data(), strict=True)) == [(8.0, 3.0), (20.0, 10.0), (60.0, 20.0)]
+    limits = sorted(line.get_xdata()[0] for line in axis.lines if line.get_linestyle() == "--")
+    assert limits == [9.0, 25.0]
+    # experiments of another limit have another sign
+    points = [c[0] for c in axis.containers]
+    assert len({(p.get_xdata()[0], p.get_marker()) for p in points}) == 4
+    assert len({p.get_marker() for p in points}) == 2
+
+
+def test_a_single_epoch_is_drawn_as_a_point(tmp_path):
+    write_run(tmp_path)
+    write_run(tmp_path, algo="cpo", frames=10**6)
+    write_run(tmp_path, algo="trpo", **ROWS, costs=(1, 1, 1))
+    experiments = experiments_in(tmp_path)
+    figure = draw_learning_curves(experiments, algorithm_styles(experiments))
+    for axis in figure.axes:
+        drawn = {line.get_label(): line.get_marker() for line in axis.lines}
+        drawn = {name: marker for name, marker in drawn.items() if not name.startswith("_")}
+        assert drawn == {"PPO": "o", "TRPO": "", "CPO (unfinished)": "o"}
