@@ -10,7 +10,7 @@ import torch
 from omegaconf import DictConfig
 from tensordict import TensorDictBase
 from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModule, TensorDictModuleBase
-from torch import nn
+from torch import Tensor, nn
 from torchrl.envs import EnvBase
 
 from safe_rl.algorithms.building import build_constraints, constrained_limits
@@ -19,6 +19,7 @@ from safe_rl.algorithms.contract import PolicyUpdate, Stateful
 from safe_rl.algorithms.in_turn import UpdatesInTurn
 from safe_rl.algorithms.minibatch import MinibatchUpdate
 from safe_rl.algorithms.parts import build_part
+from safe_rl.algorithms.side_by_side import side_by_side
 from safe_rl.algorithms.tracked_constraints import CHARGES
 from safe_rl.collectors import EpisodeStatistics
 from safe_rl.models import build_networks, make_behaviour, take_in
@@ -137,10 +138,7 @@ class OnPolicy:
         normalise_advantages(batch)
         constraints = self.constraints
         constraints.observe(episodes, batch)
-        metrics = {
-            "policy": self.policy_update(batch, constraints.violation, constraints.episode_length),
-            "critic": self.critic_update(batch),
-        }
+        metrics = self._update(batch)
         constraints.expect(metrics["policy"])
         take_in(self.networks.values(), batch)
         row = constraints.columns()
@@ -148,6 +146,15 @@ class OnPolicy:
             for name, value in values.items():
                 row |= constraints.column(f"{part}_{name}", torch.as_tensor(value))
         return row
+
+    def _update(self, batch: TensorDictBase) -> dict[str, Mapping[str, Tensor]]:
+        """Improve the policy and fit the critics: neither needs what the other does."""
+        constraints = self.constraints
+        given = (batch, constraints.violation, constraints.episode_length)
+        policy, critic = side_by_side(
+            lambda: self.policy_update(*given), lambda: self.critic_update(batch)
+        )
+        return {"policy": policy, "critic": critic}
 
     def checkpoint_components(self) -> dict[str, Stateful]:
         """Parts with a ``state_dict``, by name: together they are all that learning depends on."""

@@ -6,7 +6,6 @@ import math
 import os
 import time
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
 from pathlib import Path
 from signal import Signals
 
@@ -20,6 +19,7 @@ from torchrl.envs import EnvBase
 from safe_rl.algorithms.constraints import check_cost_limits
 from safe_rl.algorithms.contract import Algorithm, Stateful
 from safe_rl.algorithms.parts import find_recipe
+from safe_rl.algorithms.side_by_side import torch_threads
 from safe_rl.collectors import EpisodeAccounting, WorkerCollector, make_collector
 from safe_rl.collectors.workers import MakeEnv
 from safe_rl.runs.checkpoints import CheckpointStore
@@ -39,17 +39,6 @@ def seed_everything(seed: int, num_threads: int | None) -> None:
     torch.manual_seed(seed)
     if num_threads is not None:
         torch.set_num_threads(num_threads)
-
-
-@contextmanager
-def torch_threads(number: int) -> Iterator[None]:
-    """Let torch compute with `number` threads inside the block."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(number)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(before)
 
 
 def physics_threads(config: DictConfig) -> int:

@@ -1,0 +1,52 @@
+"""Policy and critics learn at the same time what they learn one after the other."""
+
+import threading
+
+import pytest
+import torch
+
+from safe_rl.algorithms.side_by_side import side_by_side, torch_threads
+
+
+@pytest.fixture
+def two_threads():
+    with torch_threads(2):
+        yield
+
+
+def test_both_are_under_way_at_once(two_threads):
+    meeting = threading.Barrier(2, timeout=10)  # breaks unless both come
+    assert side_by_side(meeting.wait, meeting.wait) in {(0, 1), (1, 0)}
+
+
+def test_one_thread_calls_them_in_turn():
+    order = []
+    with torch_threads(1):
+        side_by_side(lambda: order.append("first"), lambda: order.append("second"))
+    assert order == ["first", "second"]
+
+
+def test_threads_are_shared_and_given_back(two_threads):
+    assert side_by_side(torch.get_num_threads, torch.get_num_threads) == (1, 1)
+    assert torch.get_num_threads() == 2
+
+
+@pytest.mark.parametrize("fails", [0, 1])
+def test_the_other_ends_before_an_error_is_raised(two_threads, fails):
+    ended = threading.Event()
+    failed = threading.Event()
+
+    def fail():
+        failed.set()
+        raise FloatingPointError("diverged")
+
+    def end():
+        failed.wait(10)
+        ended.set()
+
+    calls = [end, end]
+    calls[fails] = fail
+    with pytest.raises(FloatingPointError, match="diverged"):
+        side_by_side(*calls)
+    assert ended.is_set()
+    assert torch.get_num_threads() == 2
