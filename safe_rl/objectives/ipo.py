@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
+from typing import Unpack
 
 import torch
 from tensordict import TensorDictBase
 from tensordict.nn import ProbabilisticTensorDictSequential
 from torch import Tensor
 
-from safe_rl.objectives.ppo import PPOLoss
+from safe_rl.objectives.ppo import ClippedLoss, PPOLoss
 from safe_rl.objectives.violation import Violations, constraint_value, violation_of
 
 
@@ -57,9 +58,7 @@ class IPOLoss(PPOLoss):
         constraints: where J_c − d and T̄ stand at every call.
         kappa: strength κ = 1/t of the barrier.
         max_weight: largest weight of a cost, in units of the standardised reward advantage.
-        clip_epsilon: half-width ε of the interval within which a ratio earns.
-        entropy_coeff: factor of the entropy bonus.
-        reduction: ``"mean"``, ``"sum"`` or ``"none"``; costs are always averaged.
+        settings: those of every clipped loss, see `ClippedLoss`; costs are always averaged.
 
     Examples:
         >>> from safe_rl.algorithms import Constraints
@@ -82,16 +81,9 @@ class IPOLoss(PPOLoss):
         *,
         kappa: float,
         max_weight: float,
-        clip_epsilon: float,
-        entropy_coeff: float,
-        reduction: str = "mean",
+        **settings: Unpack[ClippedLoss],
     ) -> None:
-        super().__init__(
-            actor_network,
-            clip_epsilon=clip_epsilon,
-            entropy_coeff=entropy_coeff,
-            reduction=reduction,
-        )
+        super().__init__(actor_network, **settings)
         self.constraints, self.kappa, self.max_weight = constraints, kappa, max_weight
 
     def _surrogates(self, tensordict: TensorDictBase, log_weight: Tensor) -> dict[str, Tensor]:

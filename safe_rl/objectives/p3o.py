@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from typing import Unpack
+
 from tensordict import TensorDictBase
 from tensordict.nn import ProbabilisticTensorDictSequential
 from torch import Tensor
 
-from safe_rl.objectives.ppo import PPOLoss, clipped_gain
+from safe_rl.objectives.ppo import ClippedLoss, PPOLoss, clipped_gain
 from safe_rl.objectives.violation import Violations, violation_of
 
 
@@ -30,9 +32,7 @@ class P3OLoss(PPOLoss):
         constraints: where J_c − d and T̄ stand at every call.
         kappa: penalty factor κ, for every cost, in units of the standardised reward advantage.
         gamma: γ in the factor 1 − γ of the violation; None takes 1/T̄ in its place.
-        clip_epsilon: half-width ε of the interval within which a ratio earns.
-        entropy_coeff: factor of the entropy bonus.
-        reduction: ``"mean"``, ``"sum"`` or ``"none"``; costs are always averaged.
+        settings: those of every clipped loss, see `ClippedLoss`; costs are always averaged.
 
     Examples:
         >>> import torch
@@ -62,16 +62,9 @@ class P3OLoss(PPOLoss):
         *,
         kappa: float,
         gamma: float | None,
-        clip_epsilon: float,
-        entropy_coeff: float,
-        reduction: str = "mean",
+        **settings: Unpack[ClippedLoss],
     ) -> None:
-        super().__init__(
-            actor_network,
-            clip_epsilon=clip_epsilon,
-            entropy_coeff=entropy_coeff,
-            reduction=reduction,
-        )
+        super().__init__(actor_network, **settings)
         self.constraints, self.kappa, self.gamma = constraints, kappa, gamma
 
     def _surrogates(self, tensordict: TensorDictBase, log_weight: Tensor) -> dict[str, Tensor]:

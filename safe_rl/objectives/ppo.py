@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Literal, get_args
+from typing import Literal, NotRequired, TypedDict, Unpack, get_args
 
 import torch
 from tensordict import TensorDictBase
@@ -14,6 +14,20 @@ from safe_rl.objectives.surrogate import SurrogateLoss, lagrangian, require_mult
 
 #: How PPO bounds the gain of lowering costs; see `PPOLagrangianLoss`.
 CostClipping = Literal["none", "pessimistic", "joint"]
+
+
+class ClippedLoss(TypedDict):
+    """Keyword arguments of every loss with PPO's clipped objective.
+
+    Attributes:
+        clip_epsilon: half-width ε of the interval within which a ratio earns.
+        entropy_coeff: factor of the entropy bonus.
+        reduction: ``"mean"``, ``"sum"`` or ``"none"``.
+    """
+
+    clip_epsilon: float
+    entropy_coeff: float
+    reduction: NotRequired[str]
 
 
 def clipped_gain(log_weight: Tensor, advantage: Tensor, clip_epsilon: Tensor) -> Tensor:
@@ -116,10 +130,8 @@ class PPOLagrangianLoss(PPOLoss):
     Args:
         actor_network: policy with `get_dist`; see `SurrogateLoss`.
         multiplier: one λ per column of ``cost_advantage``.
-        clip_epsilon: half-width ε of the interval within which a ratio earns.
-        entropy_coeff: factor of the entropy bonus.
         cost_clipping: ``"none"``, ``"pessimistic"`` or ``"joint"``.
-        reduction: ``"mean"``, ``"sum"`` or ``"none"``.
+        settings: those of every clipped loss, see `ClippedLoss`.
 
     Raises:
         TypeError: if there is no multiplier.
@@ -147,17 +159,10 @@ class PPOLagrangianLoss(PPOLoss):
         actor_network: ProbabilisticTensorDictSequential,
         multiplier: Multiplier,
         *,
-        clip_epsilon: float,
-        entropy_coeff: float,
         cost_clipping: CostClipping = "none",
-        reduction: str = "mean",
+        **settings: Unpack[ClippedLoss],
     ) -> None:
-        super().__init__(
-            actor_network,
-            clip_epsilon=clip_epsilon,
-            entropy_coeff=entropy_coeff,
-            reduction=reduction,
-        )
+        super().__init__(actor_network, **settings)
         self.multiplier = require_multiplier(multiplier, "PPOLoss")
         if cost_clipping not in get_args(CostClipping):
             raise ValueError(

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from typing import Unpack
+
 from tensordict import TensorDictBase
 from tensordict.nn import ProbabilisticTensorDictSequential
 from torch import Tensor
 
 from safe_rl.objectives.multipliers import Multiplier
-from safe_rl.objectives.ppo import PPOLoss
+from safe_rl.objectives.ppo import ClippedLoss, PPOLoss
 from safe_rl.objectives.surrogate import require_multiplier
 
 
@@ -22,9 +24,7 @@ class RCPOLoss(PPOLoss):
     Args:
         actor_network: policy with `get_dist`; see `SurrogateLoss`.
         multiplier: one λ per column of ``cost_advantage``, read at every call.
-        clip_epsilon: half-width ε of the interval within which a ratio earns.
-        entropy_coeff: factor of the entropy bonus.
-        reduction: ``"mean"``, ``"sum"`` or ``"none"``.
+        settings: those of every clipped loss, see `ClippedLoss`.
 
     Raises:
         TypeError: if there is no multiplier.
@@ -43,17 +43,9 @@ class RCPOLoss(PPOLoss):
         self,
         actor_network: ProbabilisticTensorDictSequential,
         multiplier: Multiplier,
-        *,
-        clip_epsilon: float,
-        entropy_coeff: float,
-        reduction: str = "mean",
+        **settings: Unpack[ClippedLoss],
     ) -> None:
-        super().__init__(
-            actor_network,
-            clip_epsilon=clip_epsilon,
-            entropy_coeff=entropy_coeff,
-            reduction=reduction,
-        )
+        super().__init__(actor_network, **settings)
         self.multiplier = require_multiplier(multiplier, "PPOLoss")
 
     def _advantage(self, tensordict: TensorDictBase, log_weight: Tensor) -> Tensor:
