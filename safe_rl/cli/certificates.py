@@ -11,25 +11,32 @@ from safe_rl.cli.robots import maker_of
 from safe_rl.evaluation import Certificate, CertificateOptions, certify
 from safe_rl.evaluation.loading import load_config
 
-__all__ = ["certify_run", "is_worth_a_certificate"]
+__all__ = ["certificate_options", "certify_run", "is_worth_a_certificate"]
 
 
 def certify_run(
     directory: Path, *, num_threads: int = 0, progress: bool = True
 ) -> Certificate | None:
-    """:func:`safe_rl.evaluation.certify` with the options of the run's own configuration.
-
-    Runs of before there were certificates get the package's options.
-    """
-    options = dict(OmegaConf.load(CONF / "config.yaml").certificate)
-    options |= load_config(directory).get("certificate") or {}
+    """:func:`safe_rl.evaluation.certify` with the options of the run's own configuration."""
     return certify(
         directory,
-        CertificateOptions(**options),
+        certificate_options(load_config(directory)),
         make_env=maker_of(directory),
         num_threads=num_threads,
         progress=progress,
     )
+
+
+def certificate_options(config: DictConfig) -> CertificateOptions:
+    """What is certified of a run: what its section ``certificate`` says, and its limit on shares.
+
+    A run that was to keep a share of episodes (``risk=chance``) is not certified without it. Runs
+    of before there were certificates get the package's options.
+    """
+    options = dict(OmegaConf.load(CONF / "config.yaml").certificate)
+    options |= config.get("certificate") or {}
+    share = (config.get("risk") or {}).get("most_over", 1.0)
+    return CertificateOptions(**options | {"most_over": min(options["most_over"], share)})
 
 
 def is_worth_a_certificate(config: DictConfig, episode_length: int) -> bool:

@@ -1,0 +1,28 @@
+"""What the certificate of a run asks for, from its configuration."""
+
+import pytest
+from omegaconf import OmegaConf
+from run_configs import compose_config
+
+from safe_rl.cli.certificates import certificate_options
+
+
+@pytest.mark.parametrize(
+    ("overrides", "share"),
+    [
+        ([], 1.0),
+        (["risk=cvar"], 1.0),
+        (["risk=chance"], 0.1),
+        (["risk=chance", "risk.most_over=0.2"], 0.2),
+        (["risk=chance", "certificate.most_over=0.05"], 0.05),
+        (["certificate.most_over=0.3"], 0.3),
+    ],
+)
+def test_a_limit_on_the_share_of_episodes_is_certified_with_the_mean(overrides, share):
+    options = certificate_options(compose_config("algo=cpo", *overrides))
+    assert options.most_over == share
+
+
+def test_runs_of_before_certificates_and_measures_get_the_packages_options():
+    old = OmegaConf.create({"cost_limits": {"cost": 25.0}})
+    assert certificate_options(old) == certificate_options(compose_config())
