@@ -17,4 +17,4 @@ __all__ = ["Run", "load", "train"]
 __version__ = "0.1.0"
 
 
-__getattr__ = import_later(__name__, dict.fromkeys(__all__, "safe_rl.cli.notebook"))
+__getattr__, __dir__ = import_later(__name__, dict.fromkeys(__all__, "safe_rl.cli.notebook"))

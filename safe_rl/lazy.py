@@ -6,6 +6,7 @@ keys; torch, TorchRL and MuJoCo take some seconds to import and are needed to bu
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable, Mapping
 from importlib import import_module
 from typing import Any
@@ -13,20 +14,24 @@ from typing import Any
 __all__ = ["import_later"]
 
 
-def import_later(package: str, homes: Mapping[str, str]) -> Callable[[str], Any]:
-    """Return a package's ``__getattr__`` that imports names from where they are defined.
+def import_later(
+    package: str, homes: Mapping[str, str]
+) -> tuple[Callable[[str], Any], Callable[[], list[str]]]:
+    """Return a package's ``__getattr__``, which imports names, and ``__dir__``, which lists them.
 
     Args:
         package: Name of the package.
         homes: Name -> the module that defines it.
 
     Examples:
-        >>> find = import_later("mine", {"sqrt": "math"})
+        >>> find, names = import_later("safe_rl.lazy", {"sqrt": "math"})
         >>> find("sqrt")(9.0)
         3.0
+        >>> "sqrt" in names()
+        True
         >>> find("root")
         Traceback (most recent call last):
-        AttributeError: module 'mine' has no attribute 'root'
+        AttributeError: module 'safe_rl.lazy' has no attribute 'root'
     """
 
     def find(name: str) -> Any:
@@ -34,4 +39,7 @@ def import_later(package: str, homes: Mapping[str, str]) -> Callable[[str], Any]
             raise AttributeError(f"module '{package}' has no attribute '{name}'")
         return getattr(import_module(homes[name]), name)
 
-    return find
+    def names() -> list[str]:
+        return sorted({*vars(sys.modules[package]), *homes})
+
+    return find, names

@@ -56,7 +56,7 @@ __all__ = [
     "store_configs",
 ]
 
-__getattr__ = import_later(
+__getattr__, __dir__ = import_later(
     __name__,
     {
         **dict.fromkeys((*_CONTRACT, "check_constrained_env"), "safe_rl.envs.contract"),

@@ -23,7 +23,7 @@ __all__ = [
     "summarise",
 ]
 
-__getattr__ = import_later(
+__getattr__, __dir__ = import_later(
     __name__,
     {
         "Certificate": "safe_rl.evaluation.certifying",

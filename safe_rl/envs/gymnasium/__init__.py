@@ -14,4 +14,4 @@ if TYPE_CHECKING:
 
 __all__ = ["make_gymnasium"]
 
-__getattr__ = import_later(__name__, {"make_gymnasium": "safe_rl.envs.gymnasium.family"})
+__getattr__, __dir__ = import_later(__name__, {"make_gymnasium": "safe_rl.envs.gymnasium.family"})

@@ -18,4 +18,4 @@ __all__ = [
     "velocity_node",
 ]
 
-__getattr__ = import_later(__name__, {"VelocityEnv": "safe_rl.envs.velocity.env"})
+__getattr__, __dir__ = import_later(__name__, {"VelocityEnv": "safe_rl.envs.velocity.env"})
