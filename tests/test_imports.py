@@ -127,7 +127,7 @@ FLOORS = {
     ),
     "runs": (
         ("archive", "files", "folder", "outcome"),
-        ("checkpoints", "curves", "identity", "keeping", "lock", "loggers", "table"),
+        ("checkpoints", "code", "curves", "identity", "keeping", "lock", "loggers", "table"),
         ("record", "resuming"),
         ("",),
     ),

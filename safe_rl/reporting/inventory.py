@@ -31,6 +31,7 @@ def run_table(experiments: Sequence[Experiment]) -> Table:
             "time": duration(run.hours),
             **run.final(["cost"]),
             "folder": clean(run.directory),
+            "code": run.code,
             "command": run.command or "not recorded",
         }
         for experiment in experiments
@@ -46,6 +47,7 @@ def run_table(experiments: Sequence[Experiment]) -> Table:
         Column("$J_r$", ("{:.2f}", "episode_return")),
         Column("$J_c$", ("{:.1f}", "episode_cost")),
         Column(r"$\rho_c$", ("{:.4f}", "cost_rate")),
+        *([Column("code", ("{}", "code"))] if any(r["code"] for r in records) else []),
         Column("command", ("{}", "command")),
     ]
     return Table("runs", "Runs", columns, records)

@@ -1,4 +1,4 @@
-"""What evaluations and certificates say, with the types that their tables need."""
+"""What evaluations, certificates and notes on the code say, with the types that tables need."""
 
 from __future__ import annotations
 
@@ -10,7 +10,9 @@ from typing import Any
 from safe_rl.reporting.cleaning import clean
 from safe_rl.runs.folder import checkpoint_steps
 
-__all__ = ["read_certificate", "read_evaluation"]
+__all__ = ["read_certificate", "read_code", "read_evaluation"]
+
+_LETTERS = 10  # of a commit's name
 
 
 def read_evaluation(path: Path) -> dict[str, Any] | None:
@@ -66,6 +68,30 @@ def read_certificate(path: Path) -> dict[str, Any]:
         }
     except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
         raise ValueError(f"it is no certificate ({type(error).__name__}: {error})") from error
+
+
+def read_code(path: Path) -> str:
+    """By which code a run was carried out, and from which step on by which other one.
+
+    Raises:
+        ValueError: If the file does not say it.
+        OSError: If it cannot be read.
+    """
+    try:
+        entries = json.loads(path.read_text(encoding="utf-8"))
+        return "; ".join(map(_code, entries[:9]))
+    except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
+        raise ValueError(
+            f"it says nothing of the code ({type(error).__name__}: {error})"
+        ) from error
+
+
+def _code(entry: dict[str, Any]) -> str:
+    commit = clean(entry["commit"] or "")[:_LETTERS]
+    words = [clean(entry["version"], 20), *filter(None, [commit])]
+    words += ["with changes"] if entry["changed"] else []
+    words += [f"from {int(entry['steps']):,} steps on"] if entry["steps"] else []
+    return " ".join(words)
 
 
 def _number(value: float | None) -> float:

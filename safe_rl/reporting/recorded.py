@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from safe_rl.reporting.cleaning import clean
-from safe_rl.reporting.measured import read_certificate, read_evaluation
+from safe_rl.reporting.measured import read_certificate, read_code, read_evaluation
 from safe_rl.runs.files import read_config, read_yaml
 from safe_rl.runs.folder import RunFolder, runs_below
 from safe_rl.runs.outcome import final_figures, judges_another_measure, violation
@@ -43,6 +43,7 @@ class Run:
         cwd: Where it was started, if Hydra has recorded it.
         evaluations: What ``safe_rl.evaluate`` has written into its folder.
         certificate: Which of its checkpoints surely keeps the limits, or by how much none does.
+        code: By which version and commit it was carried out, in words, if that is recorded.
         videos: Videos in its folder.
         modified: When its table was last written [s since 1970].
     """
@@ -56,6 +57,7 @@ class Run:
     cwd: Path | None = None
     evaluations: tuple[Mapping[str, Any], ...] = ()
     certificate: Mapping[str, Any] | None = None
+    code: str | None = None
     videos: tuple[Path, ...] = ()
     modified: float = 0.0
 
@@ -190,6 +192,7 @@ def _read_run(folder: RunFolder, root: Path, unfinished: bool, skipped: dict[Pat
         Path(cwd) if isinstance(cwd, str) else None,
         tuple(filter(None, read(folder.evaluations(), read_evaluation))),
         next(iter(read(there(folder.certificate), read_certificate)), None),
+        next(iter(read(there(folder.code), read_code)), None),
         tuple(read(sorted(folder.directory.rglob("*.mp4")), lambda path: path)),
         recorded.stat().st_mtime,
     )

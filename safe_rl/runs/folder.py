@@ -111,6 +111,11 @@ class RunFolder:
         return self.notes / "config.yaml"
 
     @property
+    def code(self) -> Path:
+        """By which code it was carried out."""
+        return self.directory / "code.json"
+
+    @property
     def checkpoints(self) -> Path:
         """Folder of the checkpoints."""
         return self.directory / "checkpoints"

@@ -1,14 +1,22 @@
-"""Runs kept for others: of every run what a report reads, its table compressed, no checkpoints."""
+"""Runs kept for others: of every run what a report reads, its table compressed, no checkpoints.
+
+Where on a machine a run was is nobody else's business, and is not kept but for what its command
+line said itself.
+"""
 
 from __future__ import annotations
 
 import gzip
+import json
 import os
 import shutil
 from collections.abc import Iterable, Iterator
+from contextlib import suppress
 from pathlib import Path
 
-from safe_rl.runs.files import replacing
+from omegaconf import OmegaConf
+
+from safe_rl.runs.files import read_yaml, replacing
 from safe_rl.runs.folder import RunFolder
 
 __all__ = ["keep_runs"]
@@ -33,7 +41,7 @@ def keep_runs(runs: Iterable[Path], root: Path, archive: Path) -> None:
         >>> run, kept = getfixture("tiny_run").directory, getfixture("tmp_path") / "kept"
         >>> keep_runs([run], run, kept)
         >>> sorted(path.name for path in kept.iterdir() if path.is_file())
-        ['config.yaml', 'progress.csv.gz']
+        ['code.json', 'config.yaml', 'progress.csv.gz']
     """
     here, there = root.resolve(), archive.resolve()
     if here.is_relative_to(there) or there.is_relative_to(here):
@@ -48,6 +56,9 @@ def _keep(run: RunFolder, kept: RunFolder) -> None:
         if path.is_file() and not path.is_symlink():
             with replacing(kept.directory / path.relative_to(run.directory)) as unfinished:
                 shutil.copyfile(path, unfinished)
+    for path, text in _without_places(run):
+        with replacing(kept.directory / path.relative_to(run.directory)) as unfinished:
+            unfinished.write_text(text, encoding="utf-8")
     table = run.recorded_table
     with replacing(kept.packed_table) as unfinished:
         if table == run.table:
@@ -60,6 +71,35 @@ def _keep(run: RunFolder, kept: RunFolder) -> None:
 
 
 def _small_files(run: RunFolder) -> Iterator[Path]:
-    yield from (run.config, run.certificate)
-    yield from (run.composed, run.overrides, run.surroundings)
-    yield from run.evaluations()
+    yield from (run.config, run.code, run.certificate, run.composed, run.overrides)
+
+
+def _without_places(run: RunFolder) -> Iterator[tuple[Path, str]]:
+    """Files that say where on its machine the run was, with what a report reads of them.
+
+    What is not as this package writes it is left out.
+    """
+    readers = dict.fromkeys(run.evaluations(), _evaluation_kept)
+    for path, reader in {**readers, run.surroundings: _surroundings_kept}.items():
+        if path.is_file() and not path.is_symlink():
+            with suppress(ValueError, LookupError, TypeError, AttributeError, RecursionError):
+                yield path, reader(path)
+
+
+def _evaluation_kept(path: Path) -> str:
+    """An evaluation without the folder of its run, which is the one that it lies in."""
+    content = json.loads(path.read_text(encoding="utf-8"))
+    content.pop("run", None)
+    content["checkpoint_file"] = Path(content["checkpoint_file"]).name
+    return json.dumps(content, indent=2) + "\n"
+
+
+def _surroundings_kept(path: Path) -> str:
+    """Of Hydra's configuration its version, and the folders that the command line has named."""
+    runtime = read_yaml(path)["hydra"]["runtime"]
+    sources = [s for s in runtime["config_sources"] if s["provider"] == "command-line"]
+    if start := runtime.get("cwd"):  # an archive's has none
+        # as a person would type them where the run was started
+        sources = [{**s, "path": os.path.relpath(s["path"], start)} for s in sources]
+    kept = {"version": runtime["version"], "config_sources": sources}
+    return OmegaConf.to_yaml({"hydra": {"runtime": kept}})

@@ -10,6 +10,7 @@ from pathlib import Path
 from omegaconf import DictConfig, OmegaConf
 from tqdm import tqdm
 
+from safe_rl.runs.code import note_code
 from safe_rl.runs.curves import draw_learning_curves
 from safe_rl.runs.files import replacing
 from safe_rl.runs.folder import RunFolder
@@ -24,8 +25,8 @@ __all__ = ["RunRecord"]
 class RunRecord:
     """Configuration, table, logger, learning curves and progress bar of one run.
 
-    The folder holds ``config.yaml`` (resolved), ``progress.csv`` (a row per epoch), ``curves.png``
-    and what the configured logger writes.
+    The folder holds ``config.yaml`` (resolved), ``code.json`` (by which commit it was carried out),
+    ``progress.csv`` (a row per epoch), ``curves.png`` and what the configured logger writes.
 
     Args:
         directory: The folder; made if it does not exist.
@@ -76,6 +77,7 @@ class RunRecord:
             if epoch is None:
                 self.files.check_is_free()
             self._table = TableWriter(self.files.table, keep_rows=epoch or 0)
+            self._steps_before = steps
             # that of a continued run is replaced when it has proved to be one that trains
             self._is_config_saved = False
             if epoch is None or not self.files.is_run:
@@ -103,6 +105,7 @@ class RunRecord:
             # replaced in one go: a run killed here can still be continued
             with replacing(self.files.config) as unfinished:
                 OmegaConf.save(self._config, unfinished, resolve=True)
+            note_code(self.files.code, self._steps_before)
             self._is_config_saved = True
 
     def record(self, row: Mapping[str, float]) -> None:

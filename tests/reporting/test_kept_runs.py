@@ -1,8 +1,10 @@
 """Runs that are kept for others: the same report from a hundredth of the bytes."""
 
 import gzip
+import json
 
 import pytest
+import yaml
 from synthetic import write_run
 
 from safe_rl.cli.report import main
@@ -58,6 +60,37 @@ def test_an_archive_follows_runs_that_go_on_and_is_the_same_bytes_otherwise(runs
     # of what is kept, a copy
     keep_runs([packed.parent], kept, tmp_path / "copy")
     assert read_table(next((tmp_path / "copy").rglob("*.gz"))) == read_table(packed)
+
+
+def test_nothing_says_where_the_runs_were_but_their_commands(runs, tmp_path, capsys):
+    run, kept = runs / "PointGoal1" / "ppo" / "seed0", tmp_path / "kept"
+    sources = [
+        {"path": "hydra.conf", "schema": "pkg", "provider": "hydra"},
+        {"path": f"{tmp_path}/conf", "schema": "file", "provider": "main"},
+        {"path": f"{tmp_path}/mine/conf", "schema": "file", "provider": "command-line"},
+    ]
+    runtime = {"version": "1.3.8", "cwd": str(tmp_path), "config_sources": sources}
+    notes = {"hydra": {"runtime": {**runtime, "output_dir": str(run)}, "job": {"name": "train"}}}
+    (run / ".hydra" / "hydra.yaml").write_text(yaml.safe_dump(notes))
+    place = {"run": str(run), "checkpoint_file": f"{run}/checkpoints/last/checkpoint-1.torchrl"}
+    (run / "evaluation.json").write_text(json.dumps({**place, "episodes": 3, "name": ""}))
+    (run / "evaluation_odd.json").write_text("no evaluation")
+    code = [{"steps": 0, "version": "0.1.0", "commit": "0123456789abcdef", "changed": True}]
+    (run / "code.json").write_text(json.dumps(code))
+    keep_runs([run], runs, kept)
+    keep_runs([run], runs, kept)
+    archived = kept / "PointGoal1" / "ppo" / "seed0"
+    texts = [path.read_text() for path in archived.rglob("*") if path.suffix in (".json", ".yaml")]
+    assert not [text for text in texts if str(tmp_path) in text]
+    evaluation = json.loads((archived / "evaluation.json").read_text())
+    assert evaluation == {"checkpoint_file": "checkpoint-1.torchrl", "episodes": 3, "name": ""}
+    assert not (archived / "evaluation_odd.json").exists()
+    # of what is kept, a copy, whose report has the command and the code
+    keep_runs([archived], kept, tmp_path / "copy")
+    assert main([str(tmp_path / "copy"), f"out={tmp_path / 'again'}"]) == 0
+    page = (tmp_path / "again" / "report.md").read_text()
+    assert "--config-dir=mine/conf" in page.replace("\\", "")
+    assert "0.1.0 0123456789 with changes" in page
 
 
 def test_an_archive_is_not_among_the_runs(runs, capsys):

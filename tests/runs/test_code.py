@@ -1,0 +1,94 @@
+"""Which code carried out a run, of checkouts made for it."""
+
+import json
+import subprocess
+
+import pytest
+
+import safe_rl
+from safe_rl.runs import code
+from safe_rl.runs.code import code_of, commit_of, note_code
+
+
+@pytest.fixture
+def checkout(tmp_path, monkeypatch):
+    """A repository with one committed module; returns its file and what runs Git in it."""
+    for name in ("GIT_AUTHOR_NAME", "GIT_COMMITTER_NAME"):
+        monkeypatch.setenv(name, "somebody")
+    for name in ("GIT_AUTHOR_EMAIL", "GIT_COMMITTER_EMAIL"):
+        monkeypatch.setenv(name, "somebody@example.org")
+
+    def git(*arguments):
+        result = subprocess.run(
+            ["git", *arguments], cwd=tmp_path, check=True, capture_output=True, text=True
+        )
+        return result.stdout.strip()
+
+    git("init", "--quiet")
+    module = tmp_path / "package" / "module.py"
+    module.parent.mkdir()
+    module.write_text("x = 1\n")
+    git("add", "package")
+    git("commit", "--quiet", "--message=first")
+    return module, git
+
+
+def test_the_commit_is_gits_and_a_change_is_told(checkout):
+    module, git = checkout
+    assert commit_of(module) == (git("rev-parse", "HEAD"), False)
+    (module.parent / "notes.txt").write_text("not under version control")
+    assert commit_of(module)[1] is False
+    module.write_text("x = 2\n")
+    assert commit_of(module) == (git("rev-parse", "HEAD"), True)
+
+
+def test_a_tag_does_not_stand_for_the_commit(checkout):
+    module, git = checkout
+    git("tag", "--annotate", "v1", "--message=one")
+    assert commit_of(module)[0] == git("rev-parse", "HEAD")
+
+
+def test_a_package_within_somebody_elses_checkout_has_no_commit(checkout):
+    module, _ = checkout
+    installed = module.parent / "site-packages" / "module.py"
+    installed.parent.mkdir()
+    installed.write_text("x = 1\n")
+    assert commit_of(installed) == (None, None)
+
+
+def test_what_a_hook_has_set_names_no_other_checkout(checkout, monkeypatch, tmp_path):
+    module, git = checkout
+    head = git("rev-parse", "HEAD")
+    monkeypatch.setenv("GIT_DIR", str(tmp_path / "elsewhere"))
+    assert commit_of(module) == (head, False)
+
+
+@pytest.mark.parametrize("found", ["nothing", "a program that fails"])
+def test_without_git_a_run_is_noted_all_the_same(found, tmp_path, monkeypatch):
+    if found != "nothing":
+        (tmp_path / "git").write_text("#!/bin/sh\nexit 1\n")
+        (tmp_path / "git").chmod(0o755)
+    monkeypatch.setenv("PATH", str(tmp_path))
+    code_of.cache_clear()
+    note_code(tmp_path / "code.json", 0)
+    code_of.cache_clear()
+    (entry,) = json.loads((tmp_path / "code.json").read_text())
+    assert entry == {"steps": 0, "version": safe_rl.__version__, "commit": None, "changed": None}
+
+
+def test_code_that_goes_on_with_a_run_stands_below_what_began_it(tmp_path, monkeypatch):
+    path = tmp_path / "code.json"
+
+    def noted(commit, steps):
+        known = {"version": "1", "commit": commit, "changed": False}
+        monkeypatch.setattr(code, "code_of", lambda: known)
+        note_code(path, steps)
+        return [(entry["steps"], entry["commit"]) for entry in json.loads(path.read_text())]
+
+    assert noted("a", 0) == [(0, "a")]
+    assert noted("a", 100) == [(0, "a")]
+    assert noted("b", 200) == [(0, "a"), (200, "b")]
+    # begun anew from an earlier checkpoint
+    assert noted("c", 150) == [(0, "a"), (150, "c")]
+    path.write_text("damaged")
+    assert noted("d", 300) == [(300, "d")]
