@@ -131,7 +131,7 @@ FLOORS = {
         ("record", "resuming"),
         ("",),
     ),
-    "training": (("evaluating", "interrupts", "state", "transfer"), ("trainer",), ("",)),
+    "training": (("evaluating", "interrupts", "state", "threads", "transfer"), ("trainer",), ("",)),
     "scores": (
         ("certificate", "dominance", "intervals", "learning", "published"),
         ("benchmark", "comparisons", "normalised", "slates"),
@@ -165,7 +165,7 @@ FLOORS = {
         ("naming",),
         ("experiments",),
         ("inventory", "pictures", "scoring", "slate_scores"),
-        ("slate_pictures", "transfers"),
+        ("lacking", "slate_pictures", "transfers"),
         ("contents",),
         ("page",),
         ("",),

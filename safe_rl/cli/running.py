@@ -25,7 +25,8 @@ from safe_rl.evaluation.loading import transforms_of
 from safe_rl.runs.folder import RunFolder
 from safe_rl.runs.lock import held
 from safe_rl.runs.resuming import is_finished, may_continue
-from safe_rl.training.trainer import Trainer, build_trainer, physics_threads, seed_everything
+from safe_rl.training.threads import physics_threads
+from safe_rl.training.trainer import Trainer, build_trainer, seed_everything
 from safe_rl.training.transfer import initialise_networks
 
 __all__ = ["complete", "prepare", "run"]

@@ -16,6 +16,7 @@ from matplotlib.figure import Figure
 from safe_rl.reporting.columns import Column, Record, Table
 from safe_rl.reporting.experiments import Experiment, group_runs
 from safe_rl.reporting.inventory import certificate_table, evaluation_table, run_table, videos
+from safe_rl.reporting.lacking import lacking_table, missing_seeds
 from safe_rl.reporting.origins import Origin, find_origins
 from safe_rl.reporting.pictures import (
     Style,
@@ -30,9 +31,7 @@ from safe_rl.reporting.slate_scores import (
     aggregate,
     can_be_normalised,
     improvement_table,
-    lacking_table,
     middle_table,
-    missing_seeds,
     slate_table,
     title_of,
 )

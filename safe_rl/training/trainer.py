@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import os
 import time
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -31,7 +30,7 @@ from safe_rl.training.evaluating import Evaluation, MakeEvaluation
 from safe_rl.training.interrupts import StopRequest
 from safe_rl.training.state import Progress, WorldSnapshot
 
-__all__ = ["Trainer", "build_trainer", "physics_threads", "seed_everything"]
+__all__ = ["Trainer", "build_trainer", "seed_everything"]
 
 
 def seed_everything(seed: int, num_threads: int | None) -> None:
@@ -39,14 +38,6 @@ def seed_everything(seed: int, num_threads: int | None) -> None:
     torch.manual_seed(seed)
     if num_threads is not None:
         torch.set_num_threads(num_threads)
-
-
-def physics_threads(config: DictConfig) -> int:
-    """Threads that step each environment; 0 is one per core. Workers share them."""
-    num_collectors = config.collector.num_collectors
-    if num_collectors == 1:
-        return config.num_threads or 0
-    return max(1, (config.num_threads or os.cpu_count() or 1) // num_collectors)
 
 
 def build_trainer(

@@ -9,6 +9,7 @@ from synthetic import SUITE, experiments_in, write_run
 from safe_rl.reporting.averages import average
 from safe_rl.reporting.columns import Column, Table, spread
 from safe_rl.reporting.contents import build_report
+from safe_rl.reporting.lacking import lacking_table, missing_seeds
 from safe_rl.reporting.recorded import find_runs
 from safe_rl.reporting.scoring import (
     dominance_table,
@@ -20,9 +21,7 @@ from safe_rl.reporting.slate_scores import (
     aggregate,
     can_be_normalised,
     improvement_table,
-    lacking_table,
     middle_table,
-    missing_seeds,
     slate_table,
 )
 from safe_rl.scores.published import PUBLISHED_STEPS, REFERENCE
