@@ -138,7 +138,7 @@ FLOORS = {
         ("",),
     ),
     "cli": (
-        ("benchmark", "conf", "options", "robots", "run_folders", "values"),
+        ("benchmark", "conf", "options", "robots", "run_folders", "sweep_display", "values"),
         ("keys",),
         ("part_keys",),
         ("failures", "settings"),

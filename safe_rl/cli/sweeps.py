@@ -17,6 +17,7 @@ from hydra.core.utils import JobReturn, JobStatus
 from hydra.experimental.callback import Callback
 from omegaconf import DictConfig
 
+from safe_rl.cli.sweep_display import SweepDisplay, last_notes
 from safe_rl.cli.user_code import import_modules, imported
 from safe_rl.processes import end_with_parent
 from safe_rl.runs.files import replacing
@@ -25,6 +26,8 @@ from safe_rl.runs.lock import RunInUseError
 
 __all__ = ["SweepReport", "count_jobs", "threads_per_job"]
 
+_IN_TURN = "hydra._internal.core_plugins.basic_launcher.BasicLauncher"
+"""The launcher whose jobs run in this process, with a bar of their own."""
 _GRACE = 30.0
 """Seconds in which a job whose sweep was killed may end its epoch and write a checkpoint."""
 
@@ -73,6 +76,11 @@ class SweepReport(Callback):
         self._num_jobs = 0
         self._process = os.getpid()
         self._modules: list[str] = []  # jobs run in processes that get this object
+        self._display: SweepDisplay | None = None
+
+    def __getstate__(self) -> dict[str, Any]:
+        """What jobs in other processes get: all but what shows them."""
+        return {**vars(self), "_display": None}
 
     def on_multirun_start(self, config: DictConfig, **kwargs: Any) -> None:
         """Share the cores out among the jobs and begin the journal."""
@@ -86,6 +94,9 @@ class SweepReport(Callback):
             os.environ["SAFE_RL_NUM_THREADS"] = str(threads)
             # bars of several jobs would overwrite each other
             os.environ.setdefault("TQDM_DISABLE", "1")
+        if config.hydra.launcher.get("_target_", _IN_TURN) != _IN_TURN:
+            self._display = SweepDisplay(self._journal, self._num_jobs)
+            self._display.start()
         # if the launcher itself fails, Hydra does not come to the end of the sweep
         atexit.register(self._print_summary)
 
@@ -134,8 +145,10 @@ class SweepReport(Callback):
     def _print_summary(self) -> bool:
         """Print what became of the jobs; returns whether one has not come to its end."""
         assert self._journal is not None
-        lines = self._journal.read_text().splitlines() if self._journal.exists() else []
-        last = {note["job"]: note for note in map(json.loads, lines)}
+        if self._display is not None:
+            self._display.stop()
+            self._display = None
+        last = last_notes(self._journal)
         done = [note for note in last.values() if note["event"] == "done"]
         print(f"Sweep: {len(done)} of {self._num_jobs} runs are finished.")
         for note in last.values():

@@ -8,7 +8,10 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 
-__all__ = ["FINAL_EPOCHS", "final_figures", "judges_another_measure", "keeps", "violation"]
+__all__ = [
+    *("FINAL_EPOCHS", "final_figures", "judges_another_measure", "keeps", "measured", "shown"),
+    "violation",
+]
 
 FINAL_EPOCHS = 5
 """Epochs over which the final J_r and J_c are averaged (Ray et al. 2019, section 5.1)."""
@@ -36,6 +39,41 @@ def violation(row: Mapping[str, float], key: str, limit: float) -> float:
     """
     own = row.get(f"violation_{key}", math.nan)
     return row[f"episode_{key}"] - limit if math.isnan(own) else own
+
+
+def measured(row: Mapping[str, float], key: str, limit: float | None) -> float:
+    """What is held against a limit; the mean episode cost where there is none.
+
+    Examples:
+        >>> measured({"episode_cost": 30.0, "violation_cost": 62.0}, "cost", 25.0)
+        87.0
+    """
+    return row[f"episode_{key}"] if limit is None else limit + violation(row, key, limit)
+
+
+def shown(row: Mapping[str, float], limits: Mapping[str, float]) -> dict[str, str]:
+    """What a bar shows of an epoch: return, costs against their limits, and λ, where known.
+
+    Args:
+        row: Of a run's table, by column.
+        limits: Cost key -> d, undiscounted cost per episode.
+
+    Examples:
+        >>> row = {"episode_return": 1.25, "episode_cost": 30.0, "multiplier_cost": 0.5}
+        >>> shown(row, {"cost": 25.0})
+        {'return': '1.25', 'cost': '30.0/25', 'λ': '0.5'}
+    """
+    figures = {}
+    if not math.isnan(row["episode_return"]):
+        figures["return"] = f"{row['episode_return']:.2f}"
+        for key in limits or ["cost"]:
+            limit = limits.get(key)
+            against = "" if limit is None else f"/{limit:g}"
+            figures[key] = f"{measured(row, key, limit):.1f}{against}"
+    multipliers = [value for name, value in row.items() if name.startswith("multiplier_")]
+    if multipliers:
+        figures["λ"] = " ".join(f"{value:.3g}" for value in multipliers)
+    return figures
 
 
 def keeps(row: Mapping[str, float], key: str, limit: float) -> bool:

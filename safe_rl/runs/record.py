@@ -15,7 +15,7 @@ from safe_rl.runs.curves import draw_learning_curves
 from safe_rl.runs.files import replacing
 from safe_rl.runs.folder import RunFolder
 from safe_rl.runs.lock import held
-from safe_rl.runs.outcome import final_figures, violation
+from safe_rl.runs.outcome import final_figures, measured, shown
 from safe_rl.runs.table import TableWriter, read_table
 from safe_rl.targets import build
 
@@ -116,27 +116,9 @@ class RunRecord:
             for name, value in row.items():
                 if not math.isnan(value):
                     self._logger.log_scalar(name, value, step=int(row["steps"]))
-        self._shown |= self._postfix(row)
+        self._shown |= shown(row, self._cost_limits)
         self._bar.set_postfix(self._shown, refresh=False)
         self._bar.update(int(row["steps"]) - self._bar.n)
-
-    def _postfix(self, row: Mapping[str, float]) -> dict[str, str]:
-        """What the bar shows of an epoch: only what is known in it."""
-        shown = {"return": f"{row['episode_return']:.2f}"}
-        for key in self._cost_limits or ["cost"]:
-            limit = f"/{self._cost_limits[key]:g}" if key in self._cost_limits else ""
-            shown[key] = f"{self._measured(row, key):.1f}{limit}"
-        if math.isnan(row["episode_return"]):
-            shown = {}
-        multipliers = [value for name, value in row.items() if name.startswith("multiplier_")]
-        if multipliers:
-            shown["λ"] = " ".join(f"{value:.3g}" for value in multipliers)
-        return shown
-
-    def _measured(self, row: Mapping[str, float], key: str) -> float:
-        """What is held against the limit; the mean episode cost where there is none."""
-        limit = self._cost_limits.get(key)
-        return row[f"episode_{key}"] if limit is None else limit + violation(row, key, limit)
 
     def draw_curves(self) -> None:
         """Write ``curves.png`` from the table."""
@@ -157,9 +139,9 @@ class RunRecord:
         for key in keys:
             name = f"[{key}]" if several else ""
             limit = f" (limit {self._cost_limits[key]:g})" if key in self._cost_limits else ""
-            mean, measured = final[f"episode_{key}"], self._measured(final, key)
-            differs = abs(measured - mean) > 0.05  # false without any episode
-            own = f", measured {measured:.1f}" if differs else ""
+            mean, held = final[f"episode_{key}"], measured(final, key, self._cost_limits.get(key))
+            differs = abs(held - mean) > 0.05  # false without any episode
+            own = f", measured {held:.1f}" if differs else ""
             parts.append(f"J_c{name} {mean:.1f}{own}{limit}")
             parts.append(f"ρ_c{name} {final[f'{key}_rate']:.4f}")  # noqa: RUF001
         parts.append(f"{final['steps_per_second']:,.0f} steps/s")

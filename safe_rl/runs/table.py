@@ -12,7 +12,7 @@ from pathlib import Path
 
 from safe_rl.runs.files import replacing
 
-__all__ = ["TableWriter", "read_table"]
+__all__ = ["TableWriter", "last_row", "read_table"]
 
 # of a table that is unpacked; ten thousand epochs with a hundred columns have about 20 million
 _MOST_BYTES = 100_000_000
@@ -109,6 +109,23 @@ def read_table(path: Path) -> dict[str, list[float]]:
     return {
         name: [float(field) if field else math.nan for field in column]
         for name, column in zip(rows[0], columns, strict=True)
+    }
+
+
+def last_row(path: Path) -> dict[str, float]:
+    """The newest row of a table that is being written.
+
+    Raises:
+        ValueError: If no epoch is finished.
+        OSError: If the file cannot be read.
+    """
+    lines = path.read_text().splitlines(keepends=True)
+    complete = [line for line in lines if line.endswith("\n")]
+    if len(complete) < 2:
+        raise ValueError(f"{path} has no row: the run has not finished an epoch.")
+    names, values = csv.reader([complete[0], complete[-1]])
+    return {
+        name: float(field) if field else math.nan for name, field in zip(names, values, strict=True)
     }
 
 
