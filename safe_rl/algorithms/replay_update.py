@@ -68,7 +68,13 @@ class ReplayUpdate:
         self.loss, self.policy_delay = loss, policy_delay
         self.updates_per_step, self.max_grad_norm = updates_per_step, max_grad_norm
         self.optimizer = optimizer(_groups(loss, rates or {}))
-        self._targets = SoftUpdate(loss, tau=tau)
+        self._device = next(loss.parameters()).device
+        # makes them equal, and refuses a loss that has none; its steps cost three times as much
+        self._share = 1 - SoftUpdate(loss, tau=tau).eps
+        tensors = dict(self._tensors())
+        names = [name for name in tensors if name.startswith("target_")]
+        self._targets = [tensors[name].data for name in names]
+        self._sources = [tensors[name.removeprefix("target_")].data for name in names]
         self._evaluate: Callable[..., tuple[Tensor, TensorDictBase]]
         self._evaluate = torch.compile(self._losses) if compile else self._losses
         self._counts = {"updates": 0, "owed": 0.0}
@@ -86,7 +92,9 @@ class ReplayUpdate:
             The mean over the steps of everything that the loss reports and that is one number, NaN
             if there was no step; and ``num_updates``.
         """
-        sums = {name: torch.zeros(2) for name in self.loss.out_keys}
+        names = self.loss.out_keys
+        nothing = torch.zeros((), device=self._device)
+        sums, counts = nothing.repeat(len(names)), dict.fromkeys(names, 0)
         for minibatch in memory.minibatches(number):
             with_actor = self._counts["updates"] % self.policy_delay == 0
             total, losses = self._evaluate(minibatch, with_actor)
@@ -94,10 +102,12 @@ class ReplayUpdate:
                 raise _divergence(losses)
             self._step(total, with_actor)
             memory.learned(minibatch)
-            for name, value in losses.items():
-                sums[name] += torch.stack([value.detach().mean(), value.new_ones(())]).cpu()
-        means = {name: total / count for name, (total, count) in sums.items()}
-        return means | {"num_updates": torch.tensor(float(number))}
+            with torch.no_grad():
+                values = dict(losses.items())
+                sums += torch.stack([_mean(values.get(name, nothing)) for name in names])
+            counts = {name: count + (name in values) for name, count in counts.items()}
+        means = sums.cpu() / torch.tensor([float(count) for count in counts.values()])
+        return dict(zip(names, means, strict=True)) | {"num_updates": torch.tensor(float(number))}
 
     def _losses(self, minibatch: TensorDictBase, with_actor: bool) -> tuple[Tensor, TensorDictBase]:
         losses = self.loss(minibatch) if with_actor else self.loss.critic_losses(minibatch)
@@ -111,7 +121,7 @@ class ReplayUpdate:
             nn.utils.clip_grad_norm_(self.loss.parameters(), self.max_grad_norm)
         self.optimizer.step()
         if with_actor:
-            self._targets.step()
+            torch._foreach_lerp_(self._targets, self._sources, self._share)
         self._counts["updates"] += 1
 
     def _tensors(self) -> Iterator[tuple[str, Tensor]]:
@@ -132,6 +142,10 @@ class ReplayUpdate:
         for name, tensor in self._tensors():
             tensor.copy_(state_dict["loss"][name])
         self._counts.update(state_dict["counts"])
+
+
+def _mean(value: Tensor) -> Tensor:
+    return value.mean() if value.ndim else value
 
 
 def _groups(loss: LossModule, rates: Mapping[str, float]) -> list[dict[str, Any]]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from itertools import pairwise
 
 import torch
@@ -61,16 +61,17 @@ class EnsembleMLP(nn.Module):
         Parameters are named as its own are.
         """
         hidden = inputs.reshape(-1, inputs.shape[-1]).expand(self.num_networks, -1, -1)
-        last = len(self.weights) - 1
-        for layer in range(last + 1):
-            if params is None:
-                weight, bias = self.weights[layer], self.biases[layer]
-            else:
-                weight, bias = (params.get((name, str(layer))) for name in ("weights", "biases"))
-            hidden = torch.baddbmm(bias, hidden, weight)
-            if layer < last:
-                hidden = hidden.relu()
+        for layer, (weight, bias) in enumerate(self._layers(params)):
+            # in place: the backward pass needs what the rectifier leaves, not what it gets
+            hidden = torch.baddbmm(bias, hidden.relu_() if layer else hidden, weight)
         return hidden.reshape(self.num_networks, *inputs.shape[:-1], hidden.shape[-1])
+
+    def _layers(self, params: TensorDictBase | None) -> Iterable[tuple[Tensor, Tensor]]:
+        if params is None:
+            return zip(self.weights, self.biases, strict=True)
+        weights, biases = params.get("weights"), params.get("biases")
+        names = map(str, range(len(self.weights)))
+        return ((weights.get(name), biases.get(name)) for name in names)
 
 
 class QEnsemble(TensorDictModuleBase):
@@ -135,7 +136,13 @@ def _perceptron(
     input_scale: Tensor | None,
     device: torch.device | None,
 ) -> list[nn.Module]:
-    perceptron = MLP(*sizes, num_cells=list(hidden_sizes), activation_class=nn.ReLU, device=device)
+    perceptron = MLP(
+        *sizes,
+        num_cells=list(hidden_sizes),
+        activation_class=nn.ReLU,
+        activation_kwargs={"inplace": True},
+        device=device,
+    )
     scaling = [] if input_scale is None else [InputScale(input_scale.to(device))]
     return [*scaling, perceptron]
 

@@ -100,6 +100,13 @@ class CostCritics(LossModule):
         weights = self._maybe_get_priority_weight(tensordict)
         return self._reduce_loss(loss, tensordict=tensordict, weights=weights)
 
+    @property
+    def _detached_cost_params(self) -> TensorDictBase:
+        # TorchRL forgets what begins so whenever parameters move to another device or dtype
+        if "_cached_cost_params" not in self.__dict__:
+            self.__dict__["_cached_cost_params"] = self.cost_qvalue_network_params.data
+        return self.__dict__["_cached_cost_params"]
+
     def _discount(self, tensordict: TensorDictBase) -> Tensor:
         """γ to the power of the steps that a transition spans, [..., 1]."""
         steps = tensordict.get("steps_to_next_obs", None)
@@ -110,7 +117,7 @@ class CostCritics(LossModule):
         self, objective: Tensor, tensordict: TensorDictBase, action: Tensor
     ) -> tuple[Tensor, Tensor]:
         """The actor's objective [...] with the costs of its actions, and their mean Q_c, [k]."""
-        values = self.cost_values(tensordict, action, self.cost_qvalue_network_params.data)
+        values = self.cost_values(tensordict, action, self._detached_cost_params)
         pessimistic = values.mean(0)
         if self.pessimism:
             pessimistic = pessimistic + self.pessimism * values.std(0, correction=0)
