@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, NotRequired, TypedDict
 
 import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase, TensorDictParams
@@ -16,7 +16,21 @@ from torchrl.objectives.value.functional import td0_return_estimate
 from safe_rl.objectives.keys import require
 from safe_rl.objectives.multipliers import Multiplier
 
-__all__ = ["CostCritics", "is_ensemble", "scalars"]
+__all__ = ["CostCritics", "CostTerms", "is_ensemble", "scalars"]
+
+
+class CostTerms(TypedDict):
+    """Keyword arguments of every loss with cost critics.
+
+    Attributes:
+        multiplier: λ; read at every call.
+        cost_keys: costs below ``next``, [..., 1] each.
+        pessimism: κ, standard deviations among the cost critics that are added to their mean.
+    """
+
+    multiplier: Multiplier
+    cost_keys: Sequence[NestedKey]
+    pessimism: NotRequired[float]
 
 
 def is_ensemble(network: Any) -> bool:
@@ -115,15 +129,25 @@ class CostCritics(LossModule):
 
     def penalised(
         self, objective: Tensor, tensordict: TensorDictBase, action: Tensor
-    ) -> tuple[Tensor, Tensor]:
-        """The actor's objective [...] with the costs of its actions, and their mean Q_c, [k]."""
+    ) -> tuple[Tensor, dict[str, Tensor]]:
+        """The actor's objective [...] with the costs of its actions.
+
+        Returns:
+            The objective, and ``cost_qvalue`` and ``cost_weight``: the mean of Q_c and what it was
+            multiplied by, [k].
+        """
         values = self.cost_values(tensordict, action, self._detached_cost_params)
         pessimistic = values.mean(0)
         if self.pessimism:
             pessimistic = pessimistic + self.pessimism * values.std(0, correction=0)
-        weights = (self.multiplier.value / self.cost_unit).to(values)
+        weights = self.cost_weights(pessimistic.detach()).to(values)
         objective = (objective + pessimistic @ weights) / (1 + weights.sum())
-        return objective, values.detach().flatten(0, -2).mean(0)
+        mean = values.detach().flatten(0, -2).mean(0)
+        return objective, {"cost_qvalue": mean, "cost_weight": weights}
+
+    def cost_weights(self, values: Tensor) -> Tensor:
+        """What the actor's Q_c, which is [..., k], is multiplied by, [k]: λ / u."""
+        return self.multiplier.value / self.cost_unit
 
 
 def scalars(**entries: Tensor) -> TensorDict:

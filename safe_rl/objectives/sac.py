@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import NotRequired, TypedDict, Unpack
 
 from tensordict import NestedKey, TensorDict, TensorDictBase
 from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModuleBase, dispatch
@@ -14,9 +15,34 @@ from torchrl.modules.distributions.utils import rsample_and_log_prob
 from torchrl.objectives import ValueEstimators
 
 from safe_rl.objectives.multipliers import Multiplier
-from safe_rl.objectives.q_functions import CostCritics, is_ensemble, scalars
+from safe_rl.objectives.q_functions import CostCritics, CostTerms, is_ensemble, scalars
 
-__all__ = ["SACLagrangianLoss", "SACLoss"]
+__all__ = ["ConstrainedSoftActorCritic", "SACLagrangianLoss", "SACLoss", "SoftActorCritic"]
+
+
+class SoftActorCritic(TypedDict):
+    """Keyword arguments of every soft actor-critic.
+
+    Attributes:
+        gamma: discount per step, of reward and costs.
+        alpha_init: first temperature α, the weight of the entropy.
+        target_entropy: of the policy, to which α is adapted; ``"auto"`` is minus the number of
+            actions.
+        fixed_alpha: whether α stays as it is.
+        loss_function: of the TD errors: ``"l2"``, ``"smooth_l1"`` or ``"l1"``.
+        action_spec: of one action [A]; needed for ``target_entropy="auto"``.
+    """
+
+    gamma: float
+    alpha_init: float
+    target_entropy: NotRequired[float | str]
+    fixed_alpha: NotRequired[bool]
+    loss_function: NotRequired[str]
+    action_spec: NotRequired[TensorSpec | None]
+
+
+class ConstrainedSoftActorCritic(SoftActorCritic, CostTerms):
+    """Keyword arguments of every soft actor-critic with cost limits."""
 
 
 class SACLoss(objectives.SACLoss):
@@ -28,13 +54,7 @@ class SACLoss(objectives.SACLoss):
     Args:
         actor_network: policy with ``get_dist``.
         qvalue_network: a `safe_rl.models.QEnsemble`, or what TorchRL takes, of which two are made.
-        gamma: discount per step.
-        alpha_init: first temperature α, the weight of the entropy.
-        target_entropy: of the policy, to which α is adapted; ``"auto"`` is minus the number of
-            actions.
-        fixed_alpha: whether α stays as it is.
-        loss_function: of the TD errors: ``"l2"``, ``"smooth_l1"`` or ``"l1"``.
-        action_spec: of one action [A]; needed for ``target_entropy="auto"``.
+        gamma: this and all others: see `SoftActorCritic`.
 
     Examples:
         >>> import torch
@@ -135,13 +155,8 @@ class SACLagrangianLoss(SACLoss, CostCritics):
         cost_qvalue_network: a `safe_rl.models.QEnsemble` with one output per cost.
         multiplier: λ; read at every call.
         cost_keys: costs below ``next``, [..., 1] each.
-        gamma: discount per step, of reward and costs.
-        alpha_init: see `SACLoss`.
-        target_entropy: see `SACLoss`.
-        fixed_alpha: see `SACLoss`.
-        loss_function: see `SACLoss`.
         pessimism: κ, standard deviations among the cost critics that are added to their mean.
-        action_spec: see `SACLoss`.
+        settings: those of every soft actor-critic, see `SoftActorCritic`.
 
     Raises:
         ValueError: if the cost critic is no ensemble, or keys and multipliers differ in number.
@@ -177,26 +192,11 @@ class SACLagrangianLoss(SACLoss, CostCritics):
         *,
         multiplier: Multiplier,
         cost_keys: Sequence[NestedKey],
-        gamma: float,
-        alpha_init: float,
-        target_entropy: float | str = "auto",
-        fixed_alpha: bool = False,
-        loss_function: str = "l2",
         pessimism: float = 0.0,
-        action_spec: TensorSpec | None = None,
+        **settings: Unpack[SoftActorCritic],
     ) -> None:
         self.cost_keys = list(cost_keys)
-        SACLoss.__init__(
-            self,
-            actor_network,
-            qvalue_network,
-            gamma=gamma,
-            alpha_init=alpha_init,
-            target_entropy=target_entropy,
-            fixed_alpha=fixed_alpha,
-            loss_function=loss_function,
-            action_spec=action_spec,
-        )
+        SACLoss.__init__(self, actor_network, qvalue_network, **settings)
         self._add_cost_critics(cost_qvalue_network, multiplier, cost_keys, pessimism)
         self.out_keys = [*self.out_keys, "loss_cost_qvalue", "cost_qvalue"]
 
@@ -238,7 +238,8 @@ class SACLagrangianLoss(SACLoss, CostCritics):
         inputs.set(self.tensor_keys.action, action)
         values = self._vmap_qnetworkN0(inputs, self._cached_detached_qvalue_params)
         lowest = values.get(self.tensor_keys.state_action_value).min(0).values.squeeze(-1)
-        objective, costs = self.penalised(self._alpha * log_prob - lowest, tensordict, action)
+        objective, found = self.penalised(self._alpha * log_prob - lowest, tensordict, action)
         weights = self._maybe_get_priority_weight(tensordict)
         loss = self._reduce_loss(objective, tensordict=tensordict, weights=weights)
-        return loss, {"log_prob": log_prob.detach(), "cost_qvalue": costs}
+        reported = {name: value for name, value in found.items() if name in self.out_keys}
+        return loss, {"log_prob": log_prob.detach(), **reported}

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import NotRequired, TypedDict, Unpack
 
 import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase
@@ -15,7 +16,25 @@ from torchrl.objectives import ValueEstimators
 from safe_rl.objectives.multipliers import Multiplier
 from safe_rl.objectives.q_functions import CostCritics, is_ensemble, scalars
 
-__all__ = ["TD3LagrangianLoss", "TD3Loss"]
+__all__ = ["TD3LagrangianLoss", "TD3Loss", "TwinDelayed"]
+
+
+class TwinDelayed(TypedDict):
+    """Keyword arguments of every TD3.
+
+    Attributes:
+        action_spec: of one action [A], bounded.
+        gamma: discount per step, of reward and costs.
+        policy_noise: standard deviation of the noise on the target policy's actions.
+        noise_clip: bound of that noise.
+        loss_function: of the TD errors: ``"l2"``, ``"smooth_l1"`` or ``"l1"``.
+    """
+
+    action_spec: TensorSpec
+    gamma: float
+    policy_noise: float
+    noise_clip: float
+    loss_function: NotRequired[str]
 
 
 class TD3Loss(objectives.TD3Loss):
@@ -24,11 +43,7 @@ class TD3Loss(objectives.TD3Loss):
     Args:
         actor_network: deterministic policy.
         qvalue_network: a `safe_rl.models.QEnsemble`, or what TorchRL takes, of which two are made.
-        action_spec: of one action [A], bounded.
-        gamma: discount per step.
-        policy_noise: standard deviation of the noise on the target policy's actions.
-        noise_clip: bound of that noise.
-        loss_function: of the TD errors: ``"l2"``, ``"smooth_l1"`` or ``"l1"``.
+        action_spec: this and all others: see `TwinDelayed`.
 
     Examples:
         >>> from safe_rl.models import QEnsemble, make_bounded_actor
@@ -104,12 +119,8 @@ class TD3LagrangianLoss(TD3Loss, CostCritics):
         cost_qvalue_network: a `safe_rl.models.QEnsemble` with one output per cost.
         multiplier: λ; read at every call.
         cost_keys: costs below ``next``, [..., 1] each.
-        action_spec: see `TD3Loss`.
-        gamma: discount per step, of reward and costs.
-        policy_noise: see `TD3Loss`.
-        noise_clip: see `TD3Loss`.
-        loss_function: see `TD3Loss`.
         pessimism: κ, standard deviations among the cost critics that are added to their mean.
+        settings: those of every TD3, see `TwinDelayed`.
 
     Raises:
         ValueError: if the cost critic is no ensemble, or keys and multipliers differ in number.
@@ -143,24 +154,11 @@ class TD3LagrangianLoss(TD3Loss, CostCritics):
         *,
         multiplier: Multiplier,
         cost_keys: Sequence[NestedKey],
-        action_spec: TensorSpec,
-        gamma: float,
-        policy_noise: float,
-        noise_clip: float,
-        loss_function: str = "l2",
         pessimism: float = 0.0,
+        **settings: Unpack[TwinDelayed],
     ) -> None:
         self.cost_keys = list(cost_keys)
-        TD3Loss.__init__(
-            self,
-            actor_network,
-            qvalue_network,
-            action_spec=action_spec,
-            gamma=gamma,
-            policy_noise=policy_noise,
-            noise_clip=noise_clip,
-            loss_function=loss_function,
-        )
+        TD3Loss.__init__(self, actor_network, qvalue_network, **settings)
         self._add_cost_critics(cost_qvalue_network, multiplier, cost_keys, pessimism)
         self.out_keys = [*self.out_keys, "loss_cost_qvalue", "cost_qvalue"]
 
@@ -193,7 +191,8 @@ class TD3LagrangianLoss(TD3Loss, CostCritics):
         params = self._cached_detach_qvalue_network_params
         values = self._vmap_qvalue_network00(inputs, params)
         values = values.get(self.tensor_keys.state_action_value).squeeze(-1)
-        objective, costs = self.penalised(-values[0], tensordict, action)
+        objective, found = self.penalised(-values[0], tensordict, action)
         weights = self._maybe_get_priority_weight(tensordict)
         loss = self._reduce_loss(objective, tensordict=tensordict, weights=weights)
-        return loss, {"state_action_value_actor": values.detach(), "cost_qvalue": costs}
+        reported = {name: value for name, value in found.items() if name in self.out_keys}
+        return loss, {"state_action_value_actor": values.detach(), **reported}
