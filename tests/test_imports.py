@@ -44,7 +44,7 @@ PARTS = {
 FLOORS = {
     "envs": (
         ("contract", "errors", "opengl", "rng", "states", "physics", "physics.base"),
-        ("physics.cpu",),
+        ("physics.cpu", "physics.dynamics"),
         ("simulated",),
         # Safety Gym: records, then rules, then worlds, and what is seen of them.
         ("safety_gym.records", "safety_gym.records.values", "safety_gym.geometry"),

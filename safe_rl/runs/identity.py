@@ -83,6 +83,9 @@ _ABSENT = {"algo._target_": "safe_rl.algorithms.OnPolicy"}
 # likewise; they say nothing where they have these values
 _SILENT: dict[str, Hashable] = {
     "env.outside": None,
+    **dict.fromkeys(
+        [f"env.{part}_scale" for part in ("mass", "friction", "damping", "strength")], 1.0
+    ),
     "model.head": "auto",
     "model.normalise": None,
     "model.encoders": None,

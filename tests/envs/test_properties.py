@@ -86,6 +86,10 @@ NUMBERS = {
     "circle_radius": between(0.1, 3.0),
     "buttons_resampling_delay": st.integers(0, 4),
     "gremlins_travel": between(0.0, 0.5),
+    "mass_scale": between(0.5, 2.0),
+    "friction_scale": between(0.1, 2.0),
+    "damping_scale": between(0.0, 2.0),
+    "strength_scale": between(0.0, 2.0),
 }
 FIXED = {"placements_extents": (-4.5, -4.5, 4.5, 4.5), "robot_locations": ()}
 

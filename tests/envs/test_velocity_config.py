@@ -10,6 +10,7 @@ from omegaconf import OmegaConf
 
 from safe_rl.envs import complete_env, make_env, store_configs
 from safe_rl.envs.errors import ConfigError
+from safe_rl.envs.physics.dynamics import SCALES
 from safe_rl.envs.velocity import (
     VELOCITY_SUITE,
     VelocityConfig,
@@ -19,7 +20,7 @@ from safe_rl.envs.velocity import (
 )
 from safe_rl.envs.velocity.robots import ROBOTS
 
-OURS = {"robot", "velocity_threshold", "num_steps"}
+OURS = {"robot", "velocity_threshold", "num_steps", *SCALES}
 THEIRS = {"xml_file", "default_camera_config", "main_body", "kwargs", "self"}
 
 

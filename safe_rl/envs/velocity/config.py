@@ -9,9 +9,11 @@ from dataclasses import dataclass
 from typing import Any
 
 from safe_rl.envs.errors import ConfigError, nearest
+from safe_rl.envs.physics.dynamics import SCALES
 from safe_rl.envs.velocity.robots import ROBOTS
 
 Range = tuple[float, float]
+_SCALES = ("reset_noise_scale", *SCALES)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -19,7 +21,8 @@ class VelocityConfig:
     """Everything that defines one environment; keys that its robot does not have are None.
 
     Keys are those of Gymnasium's environments of version 5 (Towers et al. 2024), but for `robot`,
-    `velocity_threshold` and `num_steps`. `from_dict` fills in what is not given.
+    `velocity_threshold`, `num_steps` and the scales of the dynamics. `from_dict` fills in what is
+    not given.
 
     Raises:
         ConfigError: if a value has the wrong type or is out of range.
@@ -34,6 +37,11 @@ class VelocityConfig:
     velocity_threshold: float  # m/s; faster costs 1
     num_steps: int = 1000  # of an episode
     frame_skip: int  # substeps per step
+    # factors on what Gymnasium's file says
+    mass_scale: float = 1.0
+    friction_scale: float = 1.0
+    damping_scale: float = 1.0  # of joints
+    strength_scale: float = 1.0  # of actuators
     reset_noise_scale: float  # of positions [m, rad] and velocities [m/s, rad/s]
     exclude_current_positions_from_observation: bool = True
     include_cinert_in_observation: bool | None = None
@@ -123,8 +131,11 @@ def _coerce(key: str, value: Any, default: Any) -> Any:
         return int(number)
     if not math.isfinite(number):
         raise _wrong(key, "finite", value)
-    if key in ("reset_noise_scale", "velocity_threshold") and number < 0:
+    if key in ("velocity_threshold", *_SCALES) and number < 0:
         raise _wrong(key, "0 or more", value)
+    # MuJoCo has no surfaces without friction
+    if key in ("mass_scale", "friction_scale") and number == 0:
+        raise _wrong(key, "greater than 0", value)
     return number
 
 

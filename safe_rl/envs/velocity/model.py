@@ -8,6 +8,7 @@ from pathlib import Path
 import gymnasium
 import mujoco
 
+from safe_rl.envs.physics.dynamics import SCALES, scale_dynamics
 from safe_rl.envs.velocity.config import VelocityConfig
 from safe_rl.envs.velocity.measuring import PLACES, TORSO
 from safe_rl.envs.velocity.robots import ROBOTS
@@ -33,7 +34,9 @@ def load_model(config: VelocityConfig) -> mujoco.MjModel:
     with warnings.catch_warnings():
         # Nobody who trains can change Gymnasium's files.
         warnings.filterwarnings("ignore", message="compiler attribute")
-        return spec.compile()
+        model = spec.compile()
+    scale_dynamics(model, {key: getattr(config, key) for key in SCALES}, slice(1, model.nbody))
+    return model
 
 
 def observed_parts(config: VelocityConfig) -> list[str]:

@@ -13,6 +13,8 @@ from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Any
 
+from safe_rl.envs.physics.dynamics import SCALES
+
 _PARTS = ("cinert", "cvel", "qfrc_actuator", "cfrc_ext")
 
 
@@ -48,6 +50,7 @@ def _keys(**own: Any) -> Mapping[str, Any]:
         "num_steps": 1000,
         "forward_reward_weight": 1.0,
         "exclude_current_positions_from_observation": True,
+        **dict.fromkeys(SCALES, 1.0),
     }
     return MappingProxyType(common | own)
 

@@ -2,7 +2,7 @@
 
 Names, defaults and meaning are those of the 2019 Safety Gym engine (paper, section 4.1), so that
 its dictionaries can be used as they are, see also `RETIRED`; `layout_seeds`, `layout_seeds_first`,
-`vases_rots`, `gremlins_rots` and `box_rots` are additions.
+`vases_rots`, `gremlins_rots` and `box_rots` are additions, and so are the scales of the dynamics.
 """
 
 from __future__ import annotations
@@ -77,6 +77,12 @@ class Vocabulary:
     robot_locations: Locations = key((), "(x, y) where the robot starts [m]")
     robot_keepout: float = key(0.4, _KEEPOUT, NOT_NEGATIVE)
     robot_rot: float | None = key(None, "yaw at the start; None: uniform")
+
+    # dynamics
+    mass_scale: float = key(1.0, "factor on the robot's masses and inertias", POSITIVE)
+    friction_scale: float = key(1.0, "factor on the friction of all surfaces", POSITIVE)
+    damping_scale: float = key(1.0, "factor on the damping of the robot's joints", NOT_NEGATIVE)
+    strength_scale: float = key(1.0, "factor on the forces of its actuators", NOT_NEGATIVE)
 
     # observations
     observation_flatten: bool = key(True, "one vector; False: every component by its name")

@@ -12,6 +12,7 @@ import functools
 import mujoco
 
 from safe_rl.envs.errors import ConfigError, nearest
+from safe_rl.envs.physics.dynamics import SCALES, scale_dynamics
 from safe_rl.envs.safety_gym.records.config import SafetyGymConfig
 from safe_rl.envs.safety_gym.records.scene import Scene
 from safe_rl.envs.safety_gym.rules.costs import COSTS
@@ -64,6 +65,8 @@ def _compile(config: SafetyGymConfig, content: str, sleep: bool, decorated: bool
             f"'robot_base': {config.robot_base} does not fit into the world: {error}. Rename what "
             "has the name of something in the world."
         ) from error
+    scales = {name: getattr(config, name) for name in SCALES}
+    scale_dynamics(model, scales, slice(1, 1 + robot.num_bodies))
     return _index(config, model, present, robot, in_physics, contact_names)
 
 

@@ -1,0 +1,158 @@
+"""Scaled dynamics, against models that MuJoCo compiles from files with the numbers multiplied."""
+
+import math
+
+import mujoco
+import numpy as np
+import pytest
+import torch
+from torchrl.envs.utils import check_env_specs
+
+from safe_rl.envs import ConfigError, SafetyGymEnv, env_node, make_env
+from safe_rl.envs.physics.dynamics import SCALES, scale_dynamics
+from safe_rl.envs.safety_gym.rules.robots import ROBOTS
+from safe_rl.envs.velocity import VELOCITY_SUITE, VelocityEnv
+from safe_rl.envs.velocity.model import ASSETS
+from safe_rl.envs.velocity.robots import ROBOTS as RUNNERS
+
+FILES = {name: str(path) for name, path in ROBOTS.items()} | {
+    name: str(ASSETS / row.mjcf) for name, row in RUNNERS.items()
+}
+pytestmark = pytest.mark.filterwarnings("ignore:compiler attribute")
+
+
+def heavier(spec, factor):
+    for geom in spec.geoms:
+        geom.density *= factor
+        geom.mass *= factor  # NaN where the density says it
+    if spec.compiler.settotalmass > 0:
+        spec.compiler.settotalmass *= factor
+
+
+def rougher(spec, factor):
+    for geom in spec.geoms:
+        geom.friction *= factor
+
+
+def stiffer(spec, factor):
+    for joint in spec.joints:
+        joint.damping *= factor
+
+
+def stronger(spec, factor):
+    for actuator in spec.actuators:
+        for name in ("gainprm", "biasprm", "forcerange"):
+            setattr(actuator, name, getattr(actuator, name) * factor)
+
+
+IN_THE_FILE = dict(zip(SCALES, (heavier, rougher, stiffer, stronger), strict=True))
+
+
+def numbers_of(model):
+    """Every array of a model but those of pictures and of its extent."""
+    names = [n for n in dir(model) if n.partition("_")[0] in
+             ("body", "dof", "jnt", "geom", "actuator", "tendon", "eq", "qpos0")]  # fmt: skip
+    found = {name: getattr(model, name) for name in names}
+    return {name: value for name, value in found.items() if isinstance(value, np.ndarray)}
+
+
+@pytest.mark.parametrize("scale", SCALES)
+@pytest.mark.parametrize("robot", FILES)
+def test_the_model_is_the_one_that_is_compiled_from_multiplied_numbers(robot, scale):
+    spec = mujoco.MjSpec.from_file(FILES[robot])
+    scaled = spec.compile()
+    scale_dynamics(scaled, {scale: 1.7}, slice(1, scaled.nbody))
+    spec = mujoco.MjSpec.from_file(FILES[robot])
+    IN_THE_FILE[scale](spec, 1.7)
+    compiled = spec.compile()
+    for name, value in numbers_of(compiled).items():
+        np.testing.assert_allclose(numbers_of(scaled)[name], value, rtol=1e-9, err_msg=name)
+    assert scaled.stat.meaninertia == pytest.approx(compiled.stat.meaninertia)
+
+
+@pytest.mark.parametrize("scale", SCALES)
+@pytest.mark.parametrize("name", ["SafeHopperVelocity", "SafeHumanoidVelocity"])
+def test_a_step_is_that_of_the_multiplied_model(name, scale):
+    config = VELOCITY_SUITE[name].replace(**{scale: 1.7})
+    env = VelocityEnv(config, num_envs=3, seed=0, num_threads=1)
+    spec = mujoco.MjSpec.from_file(FILES[config.robot])
+    IN_THE_FILE[scale](spec, 1.7)
+    model = spec.compile()
+    env.rollout(20, break_when_any_done=False)
+    state, action = env.get_state(), env.action_spec.rand()
+    env.step(state.empty().set("action", action))
+    after = env.get_state()
+    for row in range(3):
+        data = mujoco.MjData(model)
+        for key in ("qpos", "qvel", "qacc_warmstart"):
+            getattr(data, key)[:] = state[key][row]
+        data.ctrl[:] = action[row]
+        mujoco.mj_step(model, data, config.frame_skip)
+        np.testing.assert_allclose(after["qpos"][row], data.qpos, atol=1e-9)
+
+
+def forwards(td):
+    return td.set("action", torch.full((*td.batch_size, 2), 0.7))
+
+
+@pytest.mark.parametrize("robot", ["point", "car"])
+def test_twice_all_forces_and_masses_is_the_same_motion(robot):
+    """Newton's law: only ratios matter. Contact forces grow with the weight."""
+    keys = {"robot_base": robot, "num_steps": 60}
+    twice = dict.fromkeys(("mass_scale", "strength_scale", "damping_scale"), 2.0)
+    moved = []
+    for own in ({}, twice, {"strength_scale": 2.0}):
+        env = SafetyGymEnv({**keys, **own}, num_envs=2, seed=0, num_threads=1)
+        env.rollout(50, forwards)
+        moved.append(env.get_state()["qpos"])
+    torch.testing.assert_close(moved[1], moved[0], atol=1e-5, rtol=0)
+    assert (moved[2] - moved[0]).abs().max() > 0.05
+
+
+@pytest.mark.parametrize(
+    ("keys", "moves"),
+    [({}, True), ({"friction_scale": 0.01}, False), ({"strength_scale": 0.0}, False)],
+)
+def test_without_friction_a_car_goes_nowhere_and_without_strength_neither(keys, moves):
+    env = SafetyGymEnv({"robot_base": "car", "task": "x", **keys}, 1, seed=0, num_threads=1)
+    env.reset()
+    start = env.get_state()
+    env.rollout(50, forwards, auto_reset=False,
+                tensordict=env.set_state(start))  # fmt: skip
+    way = (env.get_state()["qpos"] - start["qpos"])[:, :2].norm().item()
+    assert way > 0.3 if moves else way < 0.06
+
+
+@pytest.mark.parametrize("name", ["PointGoal1", "SafeHopperVelocity"])
+def test_scales_are_keys_of_an_environment(name):
+    env = make_env({**env_node(name), "mass_scale": 1.5, "damping_scale": 0.5})
+    check_env_specs(env)
+    assert env.config.mass_scale == 1.5
+
+
+WRONG = [
+    ("mass_scale", 0.0, "greater than 0"),
+    ("friction_scale", 0.0, "greater than 0"),
+    ("strength_scale", math.inf, "finite"),
+    ("damping_scale", -1.0, "0 or more"),
+    ("damping_scale", "much", "number"),
+]
+
+
+@pytest.mark.parametrize(("key", "value", "words"), WRONG)
+@pytest.mark.parametrize("name", ["PointGoal1", "SafeHopperVelocity"])
+def test_factors_that_cannot_be_are_refused(name, key, value, words):
+    with pytest.raises(ConfigError, match=f"'{key}' must be .*{words}"):
+        make_env({**env_node(name), key: value})
+
+
+def test_muscles_have_no_strength_to_multiply(tmp_path):
+    servo = '<velocity name="z" gear=".3 0 0 0 0 0" jointinparent="z" kv="1"/>'
+    muscle = '<muscle name="z" joint="z" lengthrange="0 1" ctrlrange="0 1"/>'
+    wheel = ROBOTS["point"].read_text().replace(servo, muscle)
+    assert muscle in wheel
+    (tmp_path / "arm.xml").write_text(wheel)
+    keys = {"robot_base": str(tmp_path / "arm.xml")}
+    SafetyGymEnv({**keys, "mass_scale": 2.0}, 1)
+    with pytest.raises(ConfigError, match="'strength_scale' is for actuators"):
+        SafetyGymEnv({**keys, "strength_scale": 2.0}, 1)
