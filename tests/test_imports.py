@@ -89,8 +89,8 @@ FLOORS = {
         ("names",),
         # What changes any of them from outside.
         ("transforms.base",),
-        ("transforms.action_filter", "transforms.early_termination"),
-        ("transforms.policy_memory", "transforms.saute"),
+        ("transforms.action_delay", "transforms.action_filter", "transforms.early_termination"),
+        ("transforms.policy_memory", "transforms.saute", "transforms.sensor_noise"),
         ("transforms.environment",),
         ("transforms",),
         ("families",),

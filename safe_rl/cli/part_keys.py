@@ -259,6 +259,13 @@ PARTS = {
         "filter": Key(component, "the function that replaces actions"),
         "cost_key": Key(text, "name of the cost of interventions"),
     },
+    "SensorNoise": {
+        "std": Key(_NOT_NEGATIVE, "standard deviation of the noise"),
+        "components": Key(
+            optional(list_of(text, 1000)), "what is noisy; null: all that is observed"
+        ),
+    },
+    "ActionDelay": {"steps": Key(count(1, 1000), "steps from an action to its effect")},
     "PolicyMemory": {"size": Key(count(1, 16_384), "numbers that are remembered")},
     "TensorboardLogger": {"exp_name": Key(text, "folder of the event files")},
     "MLflowLogger": {

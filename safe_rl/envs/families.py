@@ -58,7 +58,7 @@ def make_env(
         env = {key: value for key, value in env.items() if key not in ("_target_", "name")}
     made = build(env, num_envs=num_envs, device=device, seed=seed, num_threads=num_threads)
     if transforms:
-        made = transform_env(made, transforms, evaluating=evaluating)
+        made = transform_env(made, transforms, evaluating=evaluating, seed=seed)
     if target is not None or transforms:
         check_constrained_env(made)
     return made

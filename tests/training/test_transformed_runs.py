@@ -29,10 +29,16 @@ def make_trainer(directory, *overrides):
     return build_trainer(config, env, directory)
 
 
-def test_an_interrupted_run_goes_on_exactly(tmp_path):
+@pytest.mark.parametrize(
+    "transforms",
+    ["simmer,early_termination", "sensor_noise,action_delay"],
+    ids=["budgets", "noise"],
+)
+def test_an_interrupted_run_goes_on_exactly(tmp_path, transforms):
     # 50 steps a batch: episodes of 20 are open at every checkpoint
     options = ["algo=ppo", "cost_limits={cost: 2}", "frames_per_batch=200"]
-    options += ["transforms=[simmer,early_termination]", "transforms.simmer.steps=150"]
+    options += [f"transforms=[{transforms}]"]
+    options += ["transforms.simmer.steps=150"] * ("simmer" in transforms)
     whole, halves = tmp_path / "whole", tmp_path / "halves"
     make_trainer(whole, *options, "frames=1200").run()
     make_trainer(halves, *options, "frames=600").run()

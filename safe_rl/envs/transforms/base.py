@@ -39,6 +39,9 @@ class ConstraintTransform(Transform):
         super().__init__()
         self._rows: dict[str, Tensor] = {}
 
+    def seed(self, seeds: Tensor) -> None:
+        """Determine every draw to come by keys of the rows, int64 [N]; resets heed it."""
+
     def start(self, done: Tensor) -> dict[str, Tensor]:
         """Return what is remembered of episodes that begin, for all rows of `done` [..., 1]."""
         return {}

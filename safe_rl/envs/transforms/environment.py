@@ -9,6 +9,7 @@ from tensordict import TensorDict, TensorDictBase
 from torchrl.envs import EnvBase, TransformedEnv
 from torchrl.envs.transforms import Compose, Transform
 
+from safe_rl.envs import rng
 from safe_rl.envs.transforms.base import ConstraintTransform
 from safe_rl.targets import TargetError, build
 
@@ -21,6 +22,7 @@ class TransformedConstrainedEnv(TransformedEnv):
     Args:
         base_env: keeps the contract `ConstrainedEnv`.
         transforms: name -> transform, any of TorchRL's; the first is the innermost.
+        seed: of what transforms draw; the environment has its own. None: of torch's generator.
 
     Attributes:
         cost_keys: the environment's, then those of the transforms.
@@ -31,7 +33,9 @@ class TransformedConstrainedEnv(TransformedEnv):
         ValueError: if the transforms do not fit the environment, or one another.
     """
 
-    def __init__(self, base_env: EnvBase, transforms: Mapping[str, Transform]) -> None:
+    def __init__(
+        self, base_env: EnvBase, transforms: Mapping[str, Transform], seed: int | None = None
+    ) -> None:
         super().__init__(base_env, Compose(*transforms.values()))
         self._names = list(transforms)
         self.cost_keys = list(base_env.cost_keys)
@@ -46,6 +50,7 @@ class TransformedConstrainedEnv(TransformedEnv):
             self.cost_keys += transform.added_costs
             self.return_key = transform.return_key or self.return_key
         self.observation_layout = layout
+        self._seed_transforms(seed)
 
     def _ours(self) -> dict[str, ConstraintTransform]:
         return {n: t for n, t in self._named().items() if isinstance(t, ConstraintTransform)}
@@ -57,6 +62,19 @@ class TransformedConstrainedEnv(TransformedEnv):
     def max_episode_steps(self) -> int:
         """The largest number of steps of an episode."""
         return self.base_env.max_episode_steps
+
+    def set_seed(self, seed: int | None = None, static_seed: bool = False) -> int | None:
+        """Determine every draw to come, of the environment and of its transforms."""
+        self._seed_transforms(seed)
+        return super().set_seed(seed, static_seed)
+
+    def _seed_transforms(self, seed: int | None) -> None:
+        if seed is None:
+            return
+        rows = rng.row_seeds(seed, self.batch_size.numel())
+        for number, transform in enumerate(self._ours().values(), 1):
+            # episodes, by which environments draw, are counted from 0
+            transform.seed(rng.fold(rows, -number))
 
     def continue_from(self, steps: int) -> None:
         """Go on with schedules after so many steps of every row; the next reset heeds it."""
@@ -93,7 +111,11 @@ class TransformedSnapshotEnv(TransformedConstrainedEnv):
 
 
 def transform_env(
-    env: EnvBase, transforms: Mapping[str, Transform | Mapping[str, Any]], *, evaluating: bool
+    env: EnvBase,
+    transforms: Mapping[str, Transform | Mapping[str, Any]],
+    *,
+    evaluating: bool,
+    seed: int | None = None,
 ) -> TransformedConstrainedEnv:
     """Change a constrained problem from outside.
 
@@ -103,6 +125,7 @@ def transform_env(
             the innermost: it sees the environment's costs, and the actions last.
         evaluating: whether the problem is the one to be solved, not the one to learn on: rewards
             are the environment's, and episodes as long.
+        seed: of what transforms draw; None takes it from torch's generator.
 
     Raises:
         ValueError: if a transform refuses its keys, or does not fit the environment.
@@ -120,7 +143,7 @@ def transform_env(
         if isinstance(transform, ConstraintTransform):
             transform.evaluating = evaluating
     stores = callable(getattr(env, "get_state", None))
-    return (TransformedSnapshotEnv if stores else TransformedConstrainedEnv)(env, made)
+    return (TransformedSnapshotEnv if stores else TransformedConstrainedEnv)(env, made, seed)
 
 
 def _transform(name: str, given: Transform | Mapping[str, Any]) -> Transform:

@@ -1,0 +1,130 @@
+"""Observations with noise, as from sensors that are not exact."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+from torchrl.data import Composite, TensorSpec, Unbounded
+
+from safe_rl.envs import rng
+from safe_rl.envs.transforms.base import ConstraintTransform
+from safe_rl.naming import did_you_mean
+
+__all__ = ["SensorNoise"]
+
+
+class SensorNoise(ConstraintTransform):
+    """Add normally distributed noise to what is observed, anew at every step.
+
+    Every draw is addressed by its row's seed, the episode, the step and the column, so that runs
+    resume to the last digit and rows do not depend on one another. It is on in evaluation too.
+    Pictures of integers stay as they are.
+
+    Args:
+        std: standard deviation, in the units of what is observed.
+        components: names of those that are noisy, as in `observation_layout`; None: all.
+
+    Raises:
+        ValueError: for a deviation below 0, or a component that there is not.
+
+    Examples:
+        >>> from safe_rl.envs import make_env
+        >>> noise = SensorNoise(std=0.1, components=["hazards_lidar"])
+        >>> exact, noisy = (
+        ...     make_env("PointGoal1", seed=0, transforms=changes)
+        ...     for changes in ({}, {"noise": noise})
+        ... )
+        >>> differs = exact.reset()["observation"] != noisy.reset()["observation"]
+        >>> exact.observation_layout["hazards_lidar"], differs[0].nonzero()[:, 0].tolist()[::15]
+        (slice(22, 38, None), [22, 37])
+    """
+
+    def __init__(self, std: float, components: Sequence[str] | None = None) -> None:
+        super().__init__()
+        if not (math.isfinite(std) and std >= 0):
+            raise ValueError(f"std={std:g} must be a number of at least 0.")
+        self._std = std
+        self._components = None if components is None else list(components)
+        self._layout: dict[str, slice] = {}
+        self._seeds: Tensor | None = None
+
+    def seed(self, seeds: Tensor) -> None:
+        """Determine every draw to come by keys of the rows, int64 [N]; resets heed it."""
+        self._seeds = seeds
+
+    def extend_layout(self, layout: Mapping[str, slice]) -> dict[str, slice]:
+        """Take note of the columns.
+
+        Raises:
+            ValueError: if a component is not among them.
+        """
+        for name in self._components or ():
+            if name not in layout:
+                raise ValueError(
+                    f"components: nothing observed is called '{name}'."
+                    f"{did_you_mean(name, layout)} There are {', '.join(layout)}."
+                )
+        self._layout = dict(layout)
+        return dict(layout)
+
+    def start(self, done: Tensor) -> dict[str, Tensor]:
+        """Return random keys of the episodes, and that no step was taken."""
+        key = self._rows.get("key")
+        if self._seeds is not None:
+            key, self._seeds = self._seeds.reshape(done.shape).to(done.device), None
+        elif key is None:
+            key = torch.randint(2**62, done.shape, device=done.device)
+        else:
+            key = rng.fold(key, 0)
+        return {"key": key, "step": torch.zeros_like(key)}
+
+    def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
+        self._rows = {**self._rows, "step": self._rows["step"] + 1}
+        return self._call(next_tensordict)
+
+    def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:
+        observation = next_tensordict.get("observation")
+        if isinstance(observation, Tensor):
+            return next_tensordict.set("observation", self._with_noise(observation, 0))
+        first = 0
+        for name in sorted(observation.keys()):
+            value = observation.get(name)
+            if self._is_noisy(name, value.dtype):
+                path = ("observation", name)
+                next_tensordict.set(path, self._with_noise(value, first, whole=True))
+            first += value.shape[observation.ndim :].numel()
+        return next_tensordict
+
+    def _is_noisy(self, name: str, dtype: torch.dtype) -> bool:
+        is_named = self._components is None or name in self._components
+        return is_named and dtype.is_floating_point
+
+    def _with_noise(self, value: Tensor, first: int, *, whole: bool = False) -> Tensor:
+        """Values with noise, whose columns are counted from `first`."""
+        key, step = self._rows["key"], self._rows["step"]
+        flat = value.reshape(*key.shape[:-1], -1)
+        columns = torch.arange(flat.shape[-1], device=flat.device)
+        if self._components is not None and not whole:
+            layout = self._layout or self.container.observation_layout
+            columns = torch.cat([columns[layout[name]] for name in self._components])
+        noise = self._std * rng.normal(key, step, columns + first)
+        return flat.index_add(-1, columns, noise.to(flat.dtype)).reshape(value.shape)
+
+    def transform_observation_spec(self, observation_spec: TensorSpec) -> TensorSpec:
+        """Say that there are no bounds."""
+        observed = observation_spec["observation"]
+        if not isinstance(observed, Composite):
+            observation_spec["observation"] = _unbounded(observed)
+            return observation_spec
+        for name in list(observed.keys()):
+            if self._is_noisy(name, observed[name].dtype):
+                observed[name] = _unbounded(observed[name])
+        return observation_spec
+
+
+def _unbounded(spec: TensorSpec) -> TensorSpec:
+    return Unbounded(shape=spec.shape, dtype=spec.dtype, device=spec.device)
