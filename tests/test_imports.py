@@ -119,7 +119,7 @@ FLOORS = {
         ("contract", "constraints", "learning_rate", "trust_region_step"),
         (
             *("c_trpo_step", "cpo_step", "crpo_step", "in_turn", "memory", "minibatch", "parts"),
-            "tracked_constraints",
+            *("side_by_side", "tracked_constraints"),
         ),
         ("building", "pcpo_step", "replay_update"),
         ("off_policy", "on_policy", "torchrl_trainers"),
