@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from typing import Unpack
 
 import torch
@@ -14,7 +13,7 @@ from safe_rl.objectives.ppo import ClippedLoss, PPOLoss
 from safe_rl.objectives.violation import Violations, constraint_value, violation_of
 
 
-def log_barrier(slack: Tensor, kappa: float, max_weight: float) -> Tensor:
+def log_barrier(slack: Tensor, kappa: Tensor | float, max_weight: float) -> Tensor:
     """−κ log(slack), continued by its tangent where its slope is beyond ``max_weight``.
 
     The tangent begins at slack = κ / max_weight, so that value and slope are continuous, and goes
@@ -22,7 +21,7 @@ def log_barrier(slack: Tensor, kappa: float, max_weight: float) -> Tensor:
 
     Args:
         slack: how far inside the limits, any shape.
-        kappa: strength κ > 0 of the barrier.
+        kappa: strength κ > 0 of the barrier, a scalar.
         max_weight: largest slope > 0.
 
     Returns:
@@ -32,9 +31,10 @@ def log_barrier(slack: Tensor, kappa: float, max_weight: float) -> Tensor:
         >>> log_barrier(torch.tensor([1.0, 0.0]), kappa=0.1, max_weight=1.0)
         tensor([-0.0000, 0.3303])
     """
+    kappa = torch.as_tensor(kappa).to(slack)
     turn = kappa / max_weight
     inside = -kappa * slack.clamp_min(turn).log()
-    outside = -kappa * math.log(turn) - max_weight * (slack - turn)
+    outside = -kappa * turn.log() - max_weight * (slack - turn)
     return torch.where(slack > turn, inside, outside)
 
 
@@ -43,12 +43,13 @@ class IPOLoss(PPOLoss):
 
     Minimises (Liu, Ding and Liu 2020, their logarithmic barrier, with κ = 1/t)
 
-        E[−min(ρA, clip(ρ)A)] − κ Σᵢ log(−cᵢ − E[ρA_cᵢ]),  cᵢ = (J_cᵢ − dᵢ) / T̄.
+        E[−min(ρA, clip(ρ)A)] − (κ / T̄) Σᵢ log(−cᵢ − E[ρA_cᵢ]),  cᵢ = (J_cᵢ − dᵢ) / T̄.
 
-    The argument is the distance to the limit that the surrogate predicts, as an average per step;
-    in any other unit the barrier differs by a constant. Near the limit and beyond it, where the
-    article has no value, the barrier goes on with the slope `max_weight`: a violated cost is
-    weighed by a constant, as by a multiplier of this size.
+    The argument is the distance to the limit that the surrogate predicts. All of it is an average
+    per step, of an objective whose barrier is −κ log(d − J_c) in the units of an episode: a cost
+    that the surrogate leaves at a distance Δ = d − J_c is weighed by κ / Δ. Near the limit and
+    beyond it, where the article has no value, the barrier goes on with the slope `max_weight`: a
+    violated cost is weighed by a constant, as by a multiplier of this size.
 
     Reads and writes what `PPOLoss` does, reads ``cost_advantage`` [..., k], and adds
     ``loss_barrier`` and the detached ``cost_surrogate`` [k], E[ρA_c].
@@ -56,7 +57,7 @@ class IPOLoss(PPOLoss):
     Args:
         actor_network: policy with `get_dist`; see `SurrogateLoss`.
         constraints: where J_c − d and T̄ stand at every call.
-        kappa: strength κ = 1/t of the barrier.
+        kappa: strength κ = 1/t of the barrier, of the costs of an episode.
         max_weight: largest weight of a cost, in units of the standardised reward advantage.
         settings: those of every clipped loss, see `ClippedLoss`; costs are always averaged.
 
@@ -91,8 +92,10 @@ class IPOLoss(PPOLoss):
         surrogates = self._cost_surrogates(tensordict, gain)
         violation = violation_of(self.constraints, surrogates)
         slack = -constraint_value(violation, self.constraints.episode_length, True) - surrogates
+        # before the first batch T̄ is not known
+        kappa = (self.kappa / self.constraints.episode_length).nan_to_num(self.kappa)
         return {
             **super()._surrogates(tensordict, log_weight),
-            "loss_barrier": log_barrier(slack, self.kappa, self.max_weight).sum(),
+            "loss_barrier": log_barrier(slack, kappa, self.max_weight).sum(),
             "cost_surrogate": surrogates.detach(),
         }

@@ -129,7 +129,7 @@ def p3o(actor, cmdp):
 
 def ipo(actor, cmdp):
     constraints = Constraints(cmdp.cost_limits)
-    loss = IPOLoss(actor, constraints, kappa=0.01, max_weight=10.0, **PPO)
+    loss = IPOLoss(actor, constraints, kappa=0.01 * STEPS, max_weight=10.0, **PPO)
     return observed_first(constraints, cmdp, ppo_update(loss, actor))
 
 

@@ -198,7 +198,7 @@ LOSSES = {
         "_target_": "safe_rl.objectives.P3OLoss", "kappa": 20.0, "gamma": 0.99, "clip_epsilon": 0.2
     },
     "ipo": {
-        "_target_": "safe_rl.objectives.IPOLoss", "kappa": 0.01, "max_weight": 10.0,
+        "_target_": "safe_rl.objectives.IPOLoss", "kappa": 0.01, "max_weight": 3.0,
         "clip_epsilon": 0.2,
     },
     "focops": {

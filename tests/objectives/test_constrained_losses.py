@@ -38,7 +38,7 @@ def projected(*values):
 
 LOSSES = {
     "p3o": lambda actor: P3OLoss(actor, held(60.0, -90.0), kappa=3.0, gamma=0.99, **CLIP),
-    "ipo": lambda actor: IPOLoss(actor, held(-200.0, 30.0), kappa=0.1, max_weight=2.0, **CLIP),
+    "ipo": lambda actor: IPOLoss(actor, held(-200.0, 30.0), kappa=10.0, max_weight=2.0, **CLIP),
     "focops": lambda actor: FOCOPSLoss(
         actor, projected(0.5, 2.0), temperature=1.5, max_state_kl=0.05, entropy_coeff=0.01
     ),
@@ -125,9 +125,10 @@ def test_p3o_clips_costs_to_their_pessimistic_side():
 
 @pytest.mark.parametrize("kappa", [0.05, 0.2])
 def test_ipo_stays_inside_by_no_more_than_the_gap_of_a_barrier(kappa):
-    """Of one barrier of strength κ the value is at most κ below the optimum."""
+    """Of one barrier of strength κ, in the units of the objective, the value is at most κ below
+    the optimum; the loss takes it in those of an episode of 100 steps."""
     actor, logits, batch = one_state(GAIN, COST)
-    loss = IPOLoss(actor, held(-20.0), kappa=kappa, max_weight=1e3, **FREE)
+    loss = IPOLoss(actor, held(-20.0), kappa=100 * kappa, max_weight=1e3, **FREE)
     _, optimum = best_within(0.2)
     found = best_on_a_grid(loss, logits, batch)
     gap = optimum - (found @ torch.tensor(GAIN)).item()
