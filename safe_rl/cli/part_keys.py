@@ -82,6 +82,12 @@ _TD3 = {
 }
 _COST_CRITICS = {
     "pessimism": Key(number(), "standard deviations among cost critics on top of their mean"),
+    "target_pessimism": Key(
+        optional(number()), "the same for what they bootstrap on; null: each on its own target"
+    ),
+    "lowest_cost_value": Key(
+        optional(number()), "lower bound of what they bootstrap on, if no cost is below it"
+    ),
 }
 _SAUTE = {
     "budgets": Key(mapping_of(_POSITIVE), "cost per episode allowed by cost"),

@@ -26,11 +26,17 @@ class CostTerms(TypedDict):
         multiplier: λ; read at every call.
         cost_keys: costs below ``next``, [..., 1] each.
         pessimism: κ, standard deviations among the cost critics that are added to their mean.
+        target_pessimism: the same for what critics bootstrap on, which all then have in common;
+            null: every critic bootstraps on its own target network.
+        lowest_cost_value: lower bound of what critics bootstrap on, e.g. 0 where no cost is
+            negative; null: none.
     """
 
     multiplier: Multiplier
     cost_keys: Sequence[NestedKey]
     pessimism: NotRequired[float]
+    target_pessimism: NotRequired[float | None]
+    lowest_cost_value: NotRequired[float | None]
 
 
 def is_ensemble(network: Any) -> bool:
@@ -44,7 +50,10 @@ def is_ensemble(network: Any) -> bool:
 class CostCritics(LossModule):
     """k cost critics for a loss on Q functions: their TD(0) loss, and the penalty on the actor.
 
-    Every network of the ensemble Q_c bootstraps on its own target network. The penalty on an
+    A policy that minimises Q_c seeks out what Q_c underestimates, and bootstrapping carries that on
+    from state to state: without a bound from above, found values of a cost that is never negative
+    fall below 0. As rewards bootstrap on the least of two networks, costs bootstrap on
+    mean_E Q' + κ' std_E Q', which is the largest of two networks for κ' = 1. The penalty on an
     action is Σ_i λ_i (mean_E Q_i + κ std_E Q_i) / u_i, with the multipliers λ, the pessimism κ and
     the size u of one cost; the sum of the actor's objective and this is divided by 1 + Σ λ_i / u_i,
     so that the step size does not grow with λ.
@@ -61,13 +70,19 @@ class CostCritics(LossModule):
     cost_unit: Tensor
     gamma: float
     loss_function: str
+    pessimism: float
+    target_pessimism: float | None
+    lowest_cost_value: float | None
 
     def _add_cost_critics(
         self,
         network: TensorDictModuleBase,
         multiplier: Multiplier,
         cost_keys: Sequence[NestedKey],
+        *,
         pessimism: float,
+        target_pessimism: float | None,
+        lowest_cost_value: float | None,
     ) -> None:
         if not is_ensemble(network):
             raise ValueError(
@@ -80,6 +95,7 @@ class CostCritics(LossModule):
             )
         self.convert_to_functional(network, "cost_qvalue_network", create_target_params=True)
         self.cost_keys, self.pessimism = list(cost_keys), pessimism
+        self.target_pessimism, self.lowest_cost_value = target_pessimism, lowest_cost_value
         # not a part of the loss: whoever moves it saves it
         self.__dict__["multiplier"] = multiplier
         device = next(network.parameters()).device
@@ -97,9 +113,7 @@ class CostCritics(LossModule):
         following = tensordict.get("next")
         costs = torch.cat([require(tensordict, ("next", key)) for key in self.cost_keys], -1)
         with torch.no_grad():
-            values = self.cost_values(
-                following, next_action, self.target_cost_qvalue_network_params
-            )
+            values = self._cost_values_of_targets(following, next_action)
             terminated = following.get(self.tensor_keys.terminated)
             target = td0_return_estimate(
                 gamma=self._discount(tensordict),
@@ -113,6 +127,13 @@ class CostCritics(LossModule):
         loss = distance_loss(found, target, loss_function=self.loss_function).sum(-1).sum(0)
         weights = self._maybe_get_priority_weight(tensordict)
         return self._reduce_loss(loss, tensordict=tensordict, weights=weights)
+
+    def _cost_values_of_targets(self, steps: TensorDictBase, action: Tensor) -> Tensor:
+        """What the critics bootstrap on, [E, ..., k]."""
+        values = self.cost_values(steps, action, self.target_cost_qvalue_network_params)
+        if self.target_pessimism is not None:
+            values = pessimistic(values, self.target_pessimism).expand_as(values)
+        return values if self.lowest_cost_value is None else values.clamp_min(self.lowest_cost_value)
 
     @property
     def _detached_cost_params(self) -> TensorDictBase:
@@ -137,17 +158,26 @@ class CostCritics(LossModule):
             multiplied by, [k].
         """
         values = self.cost_values(tensordict, action, self._detached_cost_params)
-        pessimistic = values.mean(0)
-        if self.pessimism:
-            pessimistic = pessimistic + self.pessimism * values.std(0, correction=0)
-        weights = self.cost_weights(pessimistic.detach()).to(values)
-        objective = (objective + pessimistic @ weights) / (1 + weights.sum())
+        bound = pessimistic(values, self.pessimism)
+        weights = self.cost_weights(bound.detach()).to(values)
+        objective = (objective + bound @ weights) / (1 + weights.sum())
         mean = values.detach().flatten(0, -2).mean(0)
         return objective, {"cost_qvalue": mean, "cost_weight": weights}
 
     def cost_weights(self, values: Tensor) -> Tensor:
         """What the actor's Q_c, which is [..., k], is multiplied by, [k]: λ / u."""
         return self.multiplier.value / self.cost_unit
+
+
+def pessimistic(values: Tensor, deviations: float) -> Tensor:
+    """Mean of an ensemble [E, ...] and so many standard deviations among it on top, [...].
+
+    Examples:
+        >>> pessimistic(torch.tensor([1.0, 3.0]), deviations=1.0)
+        tensor(3.)
+    """
+    mean = values.mean(0)
+    return mean + deviations * values.std(0, correction=0) if deviations else mean
 
 
 def scalars(**entries: Tensor) -> TensorDict:

@@ -155,7 +155,7 @@ class SACLagrangianLoss(SACLoss, CostCritics):
         cost_qvalue_network: a `safe_rl.models.QEnsemble` with one output per cost.
         multiplier: λ; read at every call.
         cost_keys: costs below ``next``, [..., 1] each.
-        pessimism: κ, standard deviations among the cost critics that are added to their mean.
+        pessimism, target_pessimism, lowest_cost_value: of the cost critics, see `CostTerms`.
         settings: those of every soft actor-critic, see `SoftActorCritic`.
 
     Raises:
@@ -193,11 +193,20 @@ class SACLagrangianLoss(SACLoss, CostCritics):
         multiplier: Multiplier,
         cost_keys: Sequence[NestedKey],
         pessimism: float = 0.0,
+        target_pessimism: float | None = None,
+        lowest_cost_value: float | None = None,
         **settings: Unpack[SoftActorCritic],
     ) -> None:
         self.cost_keys = list(cost_keys)
         SACLoss.__init__(self, actor_network, qvalue_network, **settings)
-        self._add_cost_critics(cost_qvalue_network, multiplier, cost_keys, pessimism)
+        self._add_cost_critics(
+            cost_qvalue_network,
+            multiplier,
+            cost_keys,
+            pessimism=pessimism,
+            target_pessimism=target_pessimism,
+            lowest_cost_value=lowest_cost_value,
+        )
         self.out_keys = [*self.out_keys, "loss_cost_qvalue", "cost_qvalue"]
 
     def _set_in_keys(self) -> None:

@@ -157,6 +157,20 @@ def test_costs_are_learned_with_targets_of_their_own_networks(kind):
 
 
 @pytest.mark.parametrize("kind", ["sac", "td3"])
+def test_costs_bootstrap_on_the_larger_of_two_networks_and_never_on_less_than_can_be(kind):
+    loss = make_loss(kind, lagrange(1.0, 1.0), target_pessimism=1.0, lowest_cost_value=0.1)
+    steps, action = make_steps(), torch.rand(6, 2)
+    found = loss.cost_qvalue_loss(steps, action)
+    network = loss.cost_qvalue_network
+    following = network(steps["next"].clone().set("action", action))["cost_value"]
+    largest = torch.maximum(following[0], following[1])
+    assert (largest > 0.1).any() and (largest < 0.1).any()
+    costs = torch.cat([steps["next", key] for key in COSTS], -1)
+    error = network(steps)["cost_value"] - (costs + 0.9 * largest.clamp(min=0.1))
+    torch.testing.assert_close(found, error.square().sum((0, 2)).mean())
+
+
+@pytest.mark.parametrize("kind", ["sac", "td3"])
 def test_nothing_follows_an_end_but_something_a_time_out(kind):
     """Moving the target networks moves the losses of all steps but terminated ones."""
     for terminated in (True, False):
