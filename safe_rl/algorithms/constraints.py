@@ -31,6 +31,7 @@ class Constraints:
     Attributes:
         keys: Keys of the k costs.
         limits: d, [k].
+        costs: J_c, undiscounted cost per episode, [k], as of the last batch.
         violation: J_c − d, [k], as of the last batch.
         episode_length: T̄, mean number of steps of an episode, scalar.
         unit: Size of one cost, by which losses divide the costs that they weigh, [k].
@@ -61,10 +62,11 @@ class Constraints:
         self.limits = torch.tensor(list(limits.values()), dtype=torch.float32, device=device)
         self.multiplier = multiplier
         self._max_length = max_length
+        self.costs = torch.full_like(self.limits, torch.nan)
         self.violation = torch.full_like(self.limits, torch.nan)
         self.episode_length = torch.full((), torch.nan, device=device)
         self.unit = torch.ones_like(self.limits)
-        self._costs = torch.full_like(self.limits, torch.nan)
+        self._finished = torch.full_like(self.limits, torch.nan)
         self._mean_length = torch.full((), torch.nan, device=device)
 
     def charge(self, episodes: EpisodeStatistics, batch: TensorDictBase) -> None:
@@ -82,9 +84,9 @@ class Constraints:
             batch: The batch itself, [N, T].
         """
         if episodes.num_episodes:
-            self._costs = episodes.mean_costs(self.keys).to(self._costs)
+            self._finished = episodes.mean_costs(self.keys).to(self._finished)
             self._mean_length = episodes.lengths.mean().to(self._mean_length)
-        costs, length = self._costs, self._mean_length
+        costs, length = self._finished, self._mean_length
         has_finished = bool(length.isfinite())
         if not has_finished:
             length = torch.full_like(length, float(self._max_length or batch.shape[-1]))
@@ -93,6 +95,7 @@ class Constraints:
             rates = [batch["next", key].to(costs).mean() for key in self.keys]
             costs = torch.stack(rates) * length
         # in place: compiled losses read the same tensors every time
+        self.costs.copy_(costs)
         self.violation.copy_(costs - self.limits)
         self.episode_length.copy_(length)
         if self.multiplier is not None and (goes_by_rate or episodes.num_episodes):
@@ -116,11 +119,11 @@ class Constraints:
 
     def state_dict(self) -> dict[str, Tensor]:
         """The costs and the length of the last batch in which an episode finished."""
-        return {"costs": self._costs, "mean_length": self._mean_length}
+        return {"costs": self._finished, "mean_length": self._mean_length}
 
     def load_state_dict(self, state_dict: Mapping[str, Tensor]) -> None:
         """Continue from :meth:`state_dict`."""
-        self._costs = state_dict["costs"].to(self._costs)
+        self._finished = state_dict["costs"].to(self._finished)
         self._mean_length = state_dict["mean_length"].to(self._mean_length)
 
 

@@ -13,6 +13,7 @@ from tensordict.nn import TensorDictModuleBase
 from torch import nn
 from torchrl.data import TensorSpec
 from torchrl.envs import EnvBase
+from torchrl.objectives import LossModule
 
 from safe_rl.algorithms.building import build_constraints, constrained_limits
 from safe_rl.algorithms.constraints import Constraints
@@ -22,6 +23,7 @@ from safe_rl.algorithms.parts import build_part
 from safe_rl.algorithms.replay_update import ReplayUpdate
 from safe_rl.collectors import EpisodeStatistics
 from safe_rl.models import ExploringPolicy, QEnsemble, input_scale_vector
+from safe_rl.objectives.q_functions import CostCritics
 
 __all__ = ["OffPolicy"]
 
@@ -65,7 +67,8 @@ class OffPolicy:
         Raises:
             ValueError: If a cost limit names a cost that the environment does not have, a
                 constrained algorithm gets no limit, actions have no bounds, a risk measure is
-                named, or the memory is smaller than what learning begins with.
+                named that the critics do not know, or the memory is smaller than what learning
+                begins with.
         """
         limits = constrained_limits(
             config, env, is_constrained=config.get("limits") is not None, otherwise="sac"
@@ -73,11 +76,6 @@ class OffPolicy:
         device = torch.device(config.device)
         networks = _build_networks(config, env, len(limits), device)
         constraints = build_constraints(config, limits, env.max_episode_steps, device)
-        if getattr(constraints, "risk", None) is not None:
-            raise ValueError(
-                f"risk: algo={config.algo.name} limits mean costs only, for what a risk measure "
-                "charges for a step depends on the episode: use risk=mean, or learn on policy."
-            )
         loss = build_part(
             config.loss,
             actor_network=networks["actor"],
@@ -87,6 +85,7 @@ class OffPolicy:
             multiplier=constraints.multiplier,
             cost_keys=constraints.keys,
         )
+        _check_risk(config, constraints, loss)
         memory = build_part(
             config.memory,
             in_keys=loss.in_keys,
@@ -146,8 +145,10 @@ class OffPolicy:
         """
         constraints = self.constraints
         if constraints.keys:
+            constraints.charge(episodes, batch)
             constraints.observe(episodes, batch)
-            self.policy_update.loss.cost_unit.copy_(constraints.unit)
+            if isinstance(self.policy_update.loss, CostCritics):
+                self.policy_update.loss.calibrate(constraints)
         self.memory.extend(batch)
         self._count_steps(batch.numel())
         may_learn = len(self.memory) >= max(self.random_steps, self.memory.batch_size)
@@ -188,6 +189,19 @@ def _setting(config: DictConfig, key: str) -> Any:
     if value is None:
         raise ValueError(f"{key} is missing: off-policy algorithms need it.")
     return value
+
+
+def _check_risk(config: DictConfig, constraints: Constraints, loss: LossModule) -> None:
+    """Refuse a risk measure that the cost critics do not know."""
+    risk, known = getattr(constraints, "risk", None), getattr(loss, "risk_measure", None)
+    if risk is None or (known is not None and isinstance(risk, known)):
+        return
+    limited = "mean costs" if known is None else f"mean costs or {known.__name__}"
+    raise ValueError(
+        f"risk: algo={config.algo.name} limits {limited} only, for what a risk measure charges for "
+        "a step depends on the episode: use risk=mean, algo=wcsac with risk=cvar, or learn on "
+        "policy."
+    )
 
 
 def _action_spec(env: EnvBase) -> TensorSpec:

@@ -71,6 +71,7 @@ class TrackedConstraints(Constraints):
         """
         state = self.tracker.update(self._costs_of(batch), episodes.lengths, self._charges)
         state = state.to(self.limits.device)
+        self.costs.copy_(state.cost)
         self.violation.copy_(state.demand)
         self.episode_length.copy_(state.length)
         self.unit.copy_(state.unit)

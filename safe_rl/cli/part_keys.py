@@ -143,6 +143,11 @@ PARTS = {
     },
     "SACLoss": _SAC,
     "SACLagrangianLoss": {**_SAC, **_COST_CRITICS},
+    "WCSACLoss": {
+        **_SAC,
+        **_COST_CRITICS,
+        "tail": Key(number(0, 1, above=True), "share of the worst cost-returns"),
+    },
     "TD3Loss": _TD3,
     "TD3LagrangianLoss": {**_TD3, **_COST_CRITICS},
     "Memory": {

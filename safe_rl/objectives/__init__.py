@@ -11,8 +11,8 @@ Everything here works on TensorDict keys alone and knows no environment:
   policy losses for an optimiser;
 - `TRPOLoss`, `TRPOLagrangianLoss`, `CPOLoss`: policy losses for the steps of `safe_rl.algorithms`,
   whose mathematics is in `safe_rl.objectives.trust_region` and `safe_rl.objectives.cpo_dual`;
-- `SACLoss`, `SACLagrangianLoss`, `TD3Loss`, `TD3LagrangianLoss`: losses on steps from a replay
-  buffer;
+- `SACLoss`, `SACLagrangianLoss`, `WCSACLoss`, `TD3Loss`, `TD3LagrangianLoss`: losses on steps from
+  a replay buffer;
 - `CriticLoss`: squared errors of the reward and the cost critic;
 - `ActorCriticLoss`, `JointAdvantages`: all losses and estimators as one, for TorchRL's trainers.
 """
@@ -38,6 +38,7 @@ from safe_rl.objectives.sac import SACLagrangianLoss, SACLoss
 from safe_rl.objectives.surrogate import SurrogateLoss
 from safe_rl.objectives.td3 import TD3LagrangianLoss, TD3Loss
 from safe_rl.objectives.trpo import TRPOLagrangianLoss, TRPOLoss
+from safe_rl.objectives.wcsac import WCSACLoss
 
 __all__ = [
     "ActorCriticLoss",
@@ -69,5 +70,6 @@ __all__ = [
     "TRPOLagrangianLoss",
     "TRPOLoss",
     "VectorGAE",
+    "WCSACLoss",
     "normalise_advantages",
 ]

@@ -11,10 +11,10 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torchrl.objectives import LossModule
 from torchrl.objectives.utils import distance_loss
-from torchrl.objectives.value.functional import td0_return_estimate
 
 from safe_rl.objectives.keys import require
 from safe_rl.objectives.multipliers import Multiplier
+from safe_rl.objectives.violation import KnownCosts
 
 __all__ = ["CostCritics", "CostTerms", "is_ensemble", "scalars"]
 
@@ -108,29 +108,46 @@ class CostCritics(LossModule):
         inputs.set(self.tensor_keys.action, action)
         return network(inputs, params).get(network.out_keys[0])
 
+    def calibrate(self, episodes: KnownCosts) -> None:
+        """Take in what a batch says about the costs of episodes, before its updates."""
+        self.cost_unit.copy_(episodes.unit)
+
     def cost_qvalue_loss(self, tensordict: TensorDictBase, next_action: Tensor) -> Tensor:
         """Loss of the cost critics, summed over networks and costs."""
         following = tensordict.get("next")
         costs = torch.cat([require(tensordict, ("next", key)) for key in self.cost_keys], -1)
         with torch.no_grad():
-            values = self._cost_values_of_targets(following, next_action)
-            terminated = following.get(self.tensor_keys.terminated)
-            target = td0_return_estimate(
-                gamma=self._discount(tensordict),
-                next_state_value=values,
-                reward=costs.expand_as(values),
-                terminated=terminated.expand_as(values),
+            values = self.cost_values(
+                following, next_action, self.target_cost_qvalue_network_params
             )
+            goes_on = following.get(self.tensor_keys.terminated).logical_not()
+            discount = self._discount(tensordict) * goes_on
         found = self.cost_values(
             tensordict, tensordict.get(self.tensor_keys.action), self.cost_qvalue_network_params
         )
-        loss = distance_loss(found, target, loss_function=self.loss_function).sum(-1).sum(0)
+        loss = self.cost_errors(found, costs, discount, values).sum(-1).sum(0)
         weights = self._maybe_get_priority_weight(tensordict)
         return self._reduce_loss(loss, tensordict=tensordict, weights=weights)
 
-    def _cost_values_of_targets(self, steps: TensorDictBase, action: Tensor) -> Tensor:
-        """What the critics bootstrap on, [E, ..., k]."""
-        values = self.cost_values(steps, action, self.target_cost_qvalue_network_params)
+    def cost_errors(
+        self, found: Tensor, costs: Tensor, discount: Tensor, following: Tensor
+    ) -> Tensor:
+        """Distance of the critics from what they should say, for every step.
+
+        Args:
+            found: outputs of the networks, [E, ..., k].
+            costs: of the steps, [..., k].
+            discount: of what follows, 0 after an end, [..., 1].
+            following: outputs of the target networks for what follows, [E, ..., k].
+
+        Returns:
+            Distances from TD(0) targets, [E, ..., k].
+        """
+        target = costs + discount * self._bounded(following)
+        return distance_loss(found, target, loss_function=self.loss_function)
+
+    def _bounded(self, values: Tensor) -> Tensor:
+        """What the critics bootstrap on, from outputs [E, ..., k] of the target networks."""
         if self.target_pessimism is not None:
             values = pessimistic(values, self.target_pessimism).expand_as(values)
         return values if self.lowest_cost_value is None else values.clamp_min(self.lowest_cost_value)
@@ -154,19 +171,29 @@ class CostCritics(LossModule):
         """The actor's objective [...] with the costs of its actions.
 
         Returns:
-            The objective, and ``cost_qvalue`` and ``cost_weight``: the mean of Q_c and what it was
-            multiplied by, [k].
+            The objective, and what is reported: `cost_figures`, and ``cost_weight``, what costs
+            were multiplied by, [k].
         """
         values = self.cost_values(tensordict, action, self._detached_cost_params)
-        bound = pessimistic(values, self.pessimism)
-        weights = self.cost_weights(bound.detach()).to(values)
-        objective = (objective + bound @ weights) / (1 + weights.sum())
-        mean = values.detach().flatten(0, -2).mean(0)
-        return objective, {"cost_qvalue": mean, "cost_weight": weights}
+        weights = self.cost_weights(values.detach()).to(values)
+        objective = (objective + self.charged(values) @ weights) / (1 + weights.sum())
+        return objective, {**self.cost_figures(values.detach()), "cost_weight": weights}
+
+    def charged(self, values: Tensor) -> Tensor:
+        """What actions cost the actor, [..., k], from outputs [E, ..., k] of the cost critics."""
+        return pessimistic(values, self.pessimism)
 
     def cost_weights(self, values: Tensor) -> Tensor:
-        """What the actor's Q_c, which is [..., k], is multiplied by, [k]: λ / u."""
+        """What the actor's costs are multiplied by, [k]: λ / u.
+
+        Args:
+            values: outputs of the cost critics for its actions, [E, ..., k].
+        """
         return self.multiplier.value / self.cost_unit
+
+    def cost_figures(self, values: Tensor) -> dict[str, Tensor]:
+        """What is reported of outputs [E, ..., k] of the cost critics, [k] each."""
+        return {"cost_qvalue": values.flatten(0, -2).mean(0)}
 
 
 def pessimistic(values: Tensor, deviations: float) -> Tensor:

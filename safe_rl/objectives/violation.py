@@ -7,7 +7,13 @@ from typing import Protocol
 import torch
 from torch import Tensor
 
-__all__ = ["Violations", "constraint_value", "matched_violation", "violation_of"]
+__all__ = [
+    "KnownCosts",
+    "Violations",
+    "constraint_value",
+    "matched_violation",
+    "violation_of",
+]
 
 
 class Violations(Protocol):
@@ -20,6 +26,18 @@ class Violations(Protocol):
 
     violation: Tensor
     episode_length: Tensor
+
+
+class KnownCosts(Violations, Protocol):
+    """What losses with cost critics take in; a `safe_rl.algorithms.Constraints` is one.
+
+    Attributes:
+        costs: J_c, undiscounted cost per episode, [k].
+        unit: size of one cost, [k].
+    """
+
+    costs: Tensor
+    unit: Tensor
 
 
 def matched_violation(violation: Tensor | None, surrogates: Tensor) -> Tensor:

@@ -18,7 +18,7 @@ from safe_rl.runs.table import read_table
 from safe_rl.training.trainer import build_trainer, seed_everything
 from safe_rl.training.transfer import initialise_networks
 
-NAMES = ["sac", "sac_lagrangian", "td3", "td3_lagrangian"]
+NAMES = ["sac", "sac_lagrangian", "td3", "td3_lagrangian", "wcsac"]
 
 
 def off_policy_config(*overrides):
@@ -49,7 +49,7 @@ def test_it_writes_a_run(algo, make_trainer, tmp_path):
     assert table["policy_num_updates"] == [0, 8, 8]
     assert table["policy_loss_qvalue"][0] != table["policy_loss_qvalue"][0]
     assert all(value == value for value in table["policy_loss_qvalue"][1:])
-    assert ("multiplier_cost" in table) == algo.endswith("lagrangian")
+    assert ("multiplier_cost" in table) == (algo not in ("sac", "td3"))
     assert "J_c" in line
 
 
@@ -65,6 +65,7 @@ def test_it_writes_a_run(algo, make_trainer, tmp_path):
             "limits/replay@limits=paper",
         ],
         ["algo=sac_lagrangian", "cost_limits={cost_hazards: 1, cost_north: 2}", "lagrangian=pid"],
+        ["algo=wcsac", "risk.window=9"],
     ],
 )
 def test_it_goes_on_with_its_memory_as_if_it_had_never_stopped(overrides, make_trainer, tmp_path):
@@ -208,6 +209,22 @@ def test_a_memory_that_never_holds_enough_is_refused():
         OffPolicy.build(config, PointMass(2))
     with pytest.raises(ValueError, match=r"risk: algo=sac_lagrangian limits mean costs only"):
         OffPolicy.build(off_policy_config("algo=sac_lagrangian", "risk=cvar"), PointMass(2))
+
+
+def test_what_is_held_against_the_limit_is_the_mean_of_the_worst_episodes(make_trainer):
+    config = ["algo=wcsac", "frames=8000", "frames_per_batch=1600", "exploration.random_steps=8000"]
+    trainer = make_trainer("run", *config, "risk.tail=0.25")
+    costs, rows, batches = [], [], trainer.batches()
+    update = trainer.accounting.update
+    trainer.accounting.update = lambda batch: (costs.append(found := update(batch)), found)[1]
+    for _ in range(5):
+        rows.append(trainer.epoch(batches))
+    of_episodes = torch.cat([found.costs["cost"] for found in costs[1:]]).sort().values
+    worst = of_episodes[-len(of_episodes) // 4 :].mean().item()
+    estimates = [row["estimate_cost"] for row in rows[1:]]
+    assert worst > 1.5 * of_episodes.mean().item()
+    assert sum(estimates) / 4 == pytest.approx(worst, rel=0.1)
+    assert rows[-1]["violation_cost"] == pytest.approx(rows[-1]["estimate_cost"] - 25.0)
 
 
 def test_a_constrained_one_needs_a_limit():

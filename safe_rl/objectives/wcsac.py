@@ -1,0 +1,173 @@
+"""Loss of the worst-case soft actor-critic: the tail of the cost-return is what actions cost."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from statistics import NormalDist
+from typing import Unpack
+
+from tensordict import NestedKey
+from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModuleBase
+from torch import Tensor
+from torch.nn.functional import softplus
+from torchrl.objectives.utils import distance_loss
+
+from safe_rl.objectives.multipliers import Multiplier
+from safe_rl.objectives.risk import CVaR
+from safe_rl.objectives.sac import SACLagrangianLoss, SoftActorCritic
+
+__all__ = ["WCSACLoss", "gaussian_tail"]
+
+_SMALLEST = 1e-8
+"""Variance from which on its root is differentiated, as in the published code."""
+
+
+def gaussian_tail(tail: float) -> float:
+    """CVaR_α of a standard Gaussian, α⁻¹ φ(Φ⁻¹(α)): the mean of the largest fraction α.
+
+    Args:
+        tail: α in (0, 1].
+
+    Raises:
+        ValueError: if α is outside its range.
+
+    Examples:
+        >>> round(gaussian_tail(0.5), 4), gaussian_tail(1.0)
+        (0.7979, 0.0)
+    """
+    if not 0 < tail <= 1:
+        raise ValueError(f"tail={tail}: the share of the worst returns must lie in (0, 1].")
+    standard = NormalDist()
+    return 0.0 if tail == 1 else standard.pdf(standard.inv_cdf(tail)) / tail
+
+
+class WCSACLoss(SACLagrangianLoss):
+    """SAC on the Lagrangian with CVaR_α of the discounted cost-return in the place of its mean.
+
+    Yang, Simão, Tindemans, Spaan, *WCSAC: Worst-Case Soft Actor Critic for Safety-Constrained
+    Reinforcement Learning* (AAAI 2021), and *Safety-constrained reinforcement learning with a
+    distributional safety critic* (Machine Learning 2023), the Gaussian one. The cost-return of an
+    action is taken for a Gaussian, with a critic for its mean Q_c and one for its variance V_c:
+
+        CVaR_α = Q_c + α⁻¹ φ(Φ⁻¹(α)) √V_c
+        Q_c ← c + γ Q_c',   V_c ← c² + 2 γ c Q_c' + γ² (V_c' + Q_c'²) − Q_c²
+
+    The critics' loss is the squared 2-Wasserstein distance of two Gaussians, (Q_c − target)² +
+    (√V_c − √target)². α = 1 is `SACLagrangianLoss` with a critic of the variance that nobody asks.
+
+    Args:
+        actor_network: policy with ``get_dist``.
+        qvalue_network: Q functions of the reward, see `SACLoss`.
+        cost_qvalue_network: a `safe_rl.models.QEnsemble` with one output per cost and an even
+            number of networks: the first half are means, the second variances before a softplus.
+        multiplier: λ; read at every call.
+        cost_keys: costs below ``next``, [..., 1] each.
+        tail: α, the share of the worst returns.
+        pessimism: κ, standard deviations among the CVaR of several pairs of critics that are added
+            to their mean.
+        settings: those of every soft actor-critic, see `SoftActorCritic`.
+
+    Raises:
+        ValueError: if α is outside (0, 1], or the number of networks is odd.
+
+    Examples:
+        >>> import torch
+        >>> from safe_rl.models import QEnsemble, make_squashed_actor
+        >>> from safe_rl.objectives import LagrangeMultiplier
+        >>> actor = make_squashed_actor(3, -torch.ones(2), torch.ones(2), hidden_sizes=[8])
+        >>> loss = WCSACLoss(
+        ...     actor,
+        ...     QEnsemble(3, 2, hidden_sizes=[8], num_networks=2),
+        ...     QEnsemble(3, 2, hidden_sizes=[8], num_networks=2, out_key="cost_value"),
+        ...     multiplier=LagrangeMultiplier({"cost": 25.0}, init=1.0, lr=0.05),
+        ...     cost_keys=["cost"],
+        ...     tail=0.5,
+        ...     gamma=0.99,
+        ...     alpha_init=0.1,
+        ...     target_entropy=-2.0,
+        ... )
+        >>> mean, variance = torch.tensor([[3.0]]), torch.tensor([[3.0]])
+        >>> loss.charged(torch.stack([mean, variance]))  # 3 + 0.7979 √softplus(3)
+        tensor([[4.3931]])
+    """
+
+    risk_measure = CVaR
+    """What of episodes may be limited besides the mean, because the critics know it."""
+
+    def __init__(
+        self,
+        actor_network: ProbabilisticTensorDictSequential,
+        qvalue_network: TensorDictModuleBase,
+        cost_qvalue_network: TensorDictModuleBase,
+        *,
+        multiplier: Multiplier,
+        cost_keys: Sequence[NestedKey],
+        tail: float,
+        pessimism: float = 0.0,
+        **settings: Unpack[SoftActorCritic],
+    ) -> None:
+        self._factor = gaussian_tail(tail)
+        super().__init__(
+            actor_network,
+            qvalue_network,
+            cost_qvalue_network,
+            multiplier=multiplier,
+            cost_keys=cost_keys,
+            pessimism=pessimism,
+            **settings,
+        )
+        if (number := cost_qvalue_network.num_networks) % 2:
+            raise ValueError(
+                f"There are {number} cost critics (critics.costs): their number has to be even, a "
+                "mean and a variance each."
+            )
+        self.tail = tail
+        self.out_keys = [*self.out_keys, "cost_deviation"]
+
+    def moments(self, values: Tensor) -> tuple[Tensor, Tensor]:
+        """Mean and variance of the cost-return, [E/2, ..., k] each, from outputs [E, ..., k]."""
+        mean, variance = values.chunk(2)
+        return mean, softplus(variance).clamp_min(_SMALLEST)
+
+    def charged(self, values: Tensor) -> Tensor:
+        """CVaR_α of the cost-return of actions, [..., k]."""
+        mean, variance = self.moments(values)
+        return super().charged(mean + self._factor * variance.sqrt())
+
+    def moment_targets(
+        self, mean: Tensor, costs: Tensor, discount: Tensor, following: tuple[Tensor, Tensor]
+    ) -> tuple[Tensor, Tensor]:
+        """What one step says that mean and variance should be, [E/2, ..., k] each.
+
+        Args:
+            mean: Q_c of the steps, [E/2, ..., k]. The variance is about it, so that what differs
+                from one successor to the next is a part of the variance.
+            costs: of the steps, [..., k].
+            discount: of what follows, 0 after an end, [..., 1].
+            following: mean and variance of what follows, [E/2, ..., k] each.
+        """
+        target = costs + discount * following[0]
+        second_moment = target.square() + discount.square() * following[1]
+        return target, (second_moment - mean.square()).clamp_min(_SMALLEST)
+
+    def cost_errors(
+        self, found: Tensor, costs: Tensor, discount: Tensor, following: Tensor
+    ) -> Tensor:
+        """Squared 2-Wasserstein distance of pairs of critics from their targets, [E/2, ..., k]."""
+        mean, variance = self.moments(found)
+        target, spread = self.moment_targets(
+            mean.detach(), costs, discount, self.moments(following)
+        )
+        distances = [
+            distance_loss(value, goal, loss_function=self.loss_function)
+            for value, goal in ((mean, target), (variance.sqrt(), spread.sqrt()))
+        ]
+        return distances[0] + distances[1]
+
+    def cost_figures(self, values: Tensor) -> dict[str, Tensor]:
+        """Means of Q_c and of √V_c, [k] each."""
+        mean, variance = self.moments(values)
+        return {
+            "cost_qvalue": mean.flatten(0, -2).mean(0),
+            "cost_deviation": variance.sqrt().flatten(0, -2).mean(0),
+        }

@@ -1,0 +1,180 @@
+"""The worst-case soft actor-critic against closed forms, sampled returns and finite differences."""
+
+import numpy as np
+import pytest
+import torch
+from scipy import integrate, stats
+from tensordict import TensorDict
+from torchrl.data import Bounded
+
+from safe_rl.models import QEnsemble, make_squashed_actor
+from safe_rl.objectives import LagrangeMultiplier, SACLagrangianLoss, WCSACLoss
+from safe_rl.objectives.wcsac import gaussian_tail
+
+BOUNDS = -torch.ones(2), torch.ones(2)
+SETTINGS = {"gamma": 0.9, "alpha_init": 0.2, "action_spec": Bounded(-1, 1, [2])}
+
+
+def make_loss(observed=3, hidden=(8,), kind=WCSACLoss, networks=2, costs=("cost",), **keys):
+    keys = {"tail": 0.3, **keys} if kind is WCSACLoss else keys
+    q = [
+        QEnsemble(observed, 2, hidden_sizes=hidden, num_networks=number, **more)
+        for number, more in ((2, {}), (networks, {"num_outputs": len(costs), "out_key": "costs"}))
+    ]
+    multiplier = LagrangeMultiplier(dict.fromkeys(costs, 25.0), init=2.0, lr=0.05)
+    return kind(
+        make_squashed_actor(observed, *BOUNDS, hidden_sizes=[8]), *q,
+        multiplier=multiplier, cost_keys=costs, **SETTINGS, **keys,
+    )  # fmt: skip
+
+
+def make_steps(observations, following, costs, terminated):
+    size = len(observations)
+    after = {
+        "observation": following, "cost": costs.reshape(size, 1), "reward": torch.zeros(size, 1),
+        "done": terminated.reshape(size, 1), "terminated": terminated.reshape(size, 1),
+    }  # fmt: skip
+    return TensorDict(
+        observation=observations, action=torch.zeros(size, 2), next=after, batch_size=[size]
+    )
+
+
+@pytest.mark.parametrize("tail", [0.01, 0.1, 0.5, 0.9, 0.999])
+def test_the_tail_is_the_mean_beyond_the_quantile(tail):
+    beyond = stats.norm.isf(tail)
+    mean = integrate.quad(lambda x: x * stats.norm.pdf(x), beyond, np.inf)[0] / tail
+    assert gaussian_tail(tail) == pytest.approx(mean, rel=1e-6)
+
+
+def inverse_softplus(value):
+    return value + np.log(-np.expm1(-value))
+
+
+@pytest.mark.parametrize("end", ["gaussian", "terminated"])
+def test_a_chain_is_learned_to_the_mean_and_variance_of_its_gaussian_return(end):
+    """Four steps of known costs; then the end, or a return that is normal with 3 and 0.8²."""
+    costs, gamma = torch.tensor([1.0, 0.0, 2.0, 0.5]), 0.9
+    loss = make_loss(5, hidden=())  # a table: linear in the number of the state
+    states = torch.eye(5)
+    last = torch.arange(4) == 3
+    steps = make_steps(states[:4], states[1:], costs, last & (end == "terminated"))
+    (layer, bias), (target, target_bias) = (
+        (params["network", "weights", "0"], params["network", "biases", "0"].data.zero_())
+        for params in (loss.cost_qvalue_network_params, loss.target_cost_qvalue_network_params)
+    )
+    layer.data[:, 4] = torch.tensor([[3.0], [inverse_softplus(0.64)]])
+    optimizer = torch.optim.Adam([layer], lr=0.05)
+    schedule = torch.optim.lr_scheduler.ExponentialLR(optimizer, 0.999)
+    for _ in range(4000):
+        target.data.copy_(layer.data)
+        optimizer.zero_grad()
+        loss.cost_qvalue_loss(steps, torch.zeros(4, 2)).backward()
+        layer.grad[:, 4] = 0
+        optimizer.step()
+        schedule.step()
+    assert not torch.cat([bias, target_bias]).any()
+    values = loss.cost_values(steps, steps["action"], loss.cost_qvalue_network_params)
+    mean, variance = (part[0, :, 0].detach() for part in loss.moments(values))
+    left = np.arange(4, 0, -1)
+    goes_on = end == "gaussian"
+    expected = [
+        sum(gamma**i * c for i, c in enumerate(costs[s:].tolist())) + goes_on * gamma**n * 3.0
+        for s, n in enumerate(left)
+    ]
+    torch.testing.assert_close(mean, torch.tensor(expected).float(), atol=2e-3, rtol=0)
+    deviation = goes_on * 0.8 * gamma**left
+    # a softplus comes to 0 slowly
+    torch.testing.assert_close(
+        variance.sqrt(), torch.tensor(deviation).float(), atol=5e-3 if goes_on else 0.15, rtol=0
+    )
+
+
+def test_targets_of_the_variance_are_right_on_average_over_costs_and_successors():
+    """Against a million sampled returns: costs 0 or 1, then one of two normal returns."""
+    rng = np.random.default_rng(0)
+    cost, which = rng.integers(0, 2, (2, 1_000_000))
+    means, deviations, discount = np.array([2.0, 5.0]), np.array([0.5, 1.5]), 0.81
+    returns = cost + discount * rng.normal(means[which], deviations[which])
+    loss = make_loss()
+    following = [torch.tensor(value[which]).reshape(1, -1, 1) for value in (means, deviations**2)]
+    target, variance = loss.moment_targets(
+        torch.tensor(returns.mean()).expand(1, len(which), 1),
+        torch.tensor(cost).reshape(-1, 1).double(),
+        torch.tensor([discount]).double(),
+        following,
+    )
+    assert target.mean().item() == pytest.approx(returns.mean(), rel=2e-3)
+    # targets below 0 are cut, of which there are none if the mean's square exceeds no second moment
+    floor = 1e-8
+    cut = (variance <= floor).double().mean().item()
+    unbiased = target.square() + discount**2 * following[1] - returns.mean() ** 2
+    assert 0 < cut < 0.6
+    torch.testing.assert_close(variance, unbiased.clamp_min(floor))
+    assert unbiased.mean().item() == pytest.approx(returns.var(), rel=5e-3)
+
+
+def test_the_actor_pays_the_tail_and_its_gradient_is_that_of_finite_differences():
+    loss = make_loss(networks=4, pessimism=0.5).double()
+    steps = make_steps(
+        torch.randn(6, 3), torch.randn(6, 3), torch.rand(6), torch.zeros(6, dtype=torch.bool)
+    ).double()
+
+    def value():
+        torch.manual_seed(1)
+        return loss.actor_losses(steps)["loss_actor"]
+
+    with torch.no_grad():
+        torch.manual_seed(1)
+        dist = loss.actor_network.get_dist(steps)
+        action = dist.rsample()
+        inputs = steps.clone().set("action", action)
+        reward = loss.qvalue_network(inputs)["state_action_value"].min(0).values.squeeze(-1)
+        raw = loss.cost_qvalue_network(inputs)["costs"].squeeze(-1).numpy()
+        mean, deviation = raw[:2], np.sqrt(np.log1p(np.exp(raw[2:])))
+        tails = [
+            [
+                stats.norm.expect(lambda x: x, loc=m, scale=s, lb=stats.norm.isf(0.3, m, s)) / 0.3
+                for m, s in zip(*row, strict=True)
+            ]
+            for row in zip(mean, deviation, strict=True)
+        ]
+        charged = np.mean(tails, 0) + 0.5 * np.std(tails, 0)
+        expected = 0.2 * dist.log_prob(action) - reward + 2.0 * torch.tensor(charged)
+    torch.testing.assert_close(value(), expected.mean() / 3)
+
+    parameter = next(p for p in loss.actor_network_params.values(True, True) if p.requires_grad)
+    gradient = torch.autograd.grad(value(), parameter)[0].flatten()
+    flat = parameter.data.view(-1)
+    for place in range(0, flat.numel(), 3):
+        sides = []
+        for change in (1e-6, -2e-6):
+            flat[place] += change
+            sides.append(value().item())
+        flat[place] += 1e-6
+        slope = (sides[0] - sides[1]) / 2e-6
+        assert gradient[place].item() == pytest.approx(slope, abs=1e-6)
+
+
+def test_the_whole_tail_is_the_mean():
+    loss, plain = make_loss(tail=1.0, costs=("cost", "b")), make_loss(
+        kind=SACLagrangianLoss, networks=1, costs=("cost", "b")
+    )  # fmt: skip
+    for name in ("actor_network_params", "qvalue_network_params"):
+        getattr(plain, name).data.update_(getattr(loss, name).data)
+    means = loss.cost_qvalue_network_params.data.apply(lambda value: value[:1].clone())
+    plain.cost_qvalue_network_params.data.update_(means)
+    steps = TensorDict(observation=torch.randn(5, 3), batch_size=[5])
+    found = []
+    for each in (loss, plain):
+        torch.manual_seed(0)
+        found.append(each.actor_losses(steps))
+    torch.testing.assert_close(found[0]["loss_actor"], found[1]["loss_actor"])
+    torch.testing.assert_close(found[0]["cost_qvalue"], found[1]["cost_qvalue"])
+    assert (found[0]["cost_deviation"] > 0).all()
+
+
+def test_what_does_not_fit_is_refused():
+    with pytest.raises(ValueError, match="tail=0: the share"):
+        make_loss(tail=0)
+    with pytest.raises(ValueError, match=r"3 cost critics .* has to be even"):
+        make_loss(networks=3)
