@@ -103,7 +103,7 @@ FLOORS = {
         ("advantages", "critics", "limits", "multipliers", "normalisation", "trust_region"),
         ("controllers", "pid", "projected", "q_functions", "surrogate", "fisher"),
         ("actor_critic", "cpo", "cup", "focops", "ppo", "sac", "td3", "trpo"),
-        ("ipo", "p3o", "rcpo", "wcsac"),
+        ("cal", "ipo", "p3o", "rcpo", "wcsac"),
         ("",),
     ),
     "collectors": (("accounting", "datasets", "factory", "workers"), ("",)),

@@ -143,6 +143,13 @@ PARTS = {
     },
     "SACLoss": _SAC,
     "SACLagrangianLoss": {**_SAC, **_COST_CRITICS},
+    "CALLoss": {
+        **_SAC,
+        **_COST_CRITICS,
+        "convexity": Key(_NOT_NEGATIVE, "c, weight per discounted cost beyond the limit"),
+        "ratio_memory": Key(number(0, 1, below=True), "weight of the past in the limit's unit"),
+        "largest_ratio": Key(number(1), "factor by which that may differ from the article's"),
+    },
     "WCSACLoss": {
         **_SAC,
         **_COST_CRITICS,

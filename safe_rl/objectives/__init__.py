@@ -11,14 +11,15 @@ Everything here works on TensorDict keys alone and knows no environment:
   policy losses for an optimiser;
 - `TRPOLoss`, `TRPOLagrangianLoss`, `CPOLoss`: policy losses for the steps of `safe_rl.algorithms`,
   whose mathematics is in `safe_rl.objectives.trust_region` and `safe_rl.objectives.cpo_dual`;
-- `SACLoss`, `SACLagrangianLoss`, `WCSACLoss`, `TD3Loss`, `TD3LagrangianLoss`: losses on steps from
-  a replay buffer;
+- `SACLoss`, `SACLagrangianLoss`, `WCSACLoss`, `CALLoss`, `TD3Loss`, `TD3LagrangianLoss`: losses on
+  steps from a replay buffer;
 - `CriticLoss`: squared errors of the reward and the cost critic;
 - `ActorCriticLoss`, `JointAdvantages`: all losses and estimators as one, for TorchRL's trainers.
 """
 
 from safe_rl.objectives.actor_critic import ActorCriticLoss, JointAdvantages
 from safe_rl.objectives.advantages import CostGAE, VectorGAE
+from safe_rl.objectives.cal import CALLoss
 from safe_rl.objectives.controllers import PIMultiplier
 from safe_rl.objectives.cpo import CPOLoss
 from safe_rl.objectives.critics import CriticLoss
@@ -42,6 +43,7 @@ from safe_rl.objectives.wcsac import WCSACLoss
 
 __all__ = [
     "ActorCriticLoss",
+    "CALLoss",
     "CPOLoss",
     "CUPLoss",
     "CVaR",

@@ -18,7 +18,7 @@ from safe_rl.runs.table import read_table
 from safe_rl.training.trainer import build_trainer, seed_everything
 from safe_rl.training.transfer import initialise_networks
 
-NAMES = ["sac", "sac_lagrangian", "td3", "td3_lagrangian", "wcsac"]
+NAMES = ["sac", "sac_lagrangian", "td3", "td3_lagrangian", "wcsac", "cal"]
 
 
 def off_policy_config(*overrides):
@@ -66,6 +66,7 @@ def test_it_writes_a_run(algo, make_trainer, tmp_path):
         ],
         ["algo=sac_lagrangian", "cost_limits={cost_hazards: 1, cost_north: 2}", "lagrangian=pid"],
         ["algo=wcsac", "risk.window=9"],
+        ["algo=cal", "lagrangian=pid"],
     ],
 )
 def test_it_goes_on_with_its_memory_as_if_it_had_never_stopped(overrides, make_trainer, tmp_path):

@@ -1,0 +1,160 @@
+"""Loss of CAL: a conservative critic of costs, and an augmented Lagrangian."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Unpack
+
+import torch
+from tensordict import NestedKey
+from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModuleBase
+from torch import Tensor
+
+from safe_rl.objectives.multipliers import Multiplier
+from safe_rl.objectives.sac import SACLagrangianLoss, SoftActorCritic
+from safe_rl.objectives.violation import KnownCosts
+
+__all__ = ["CALLoss", "discounted_share"]
+
+
+def discounted_share(gamma: float, episode_length: Tensor) -> Tensor:
+    """Discounted cost per cost of an episode, if costs are spread evenly over its T steps.
+
+    (1 − γᵀ) / ((1 − γ) T): what the published code multiplies limits by.
+
+    Examples:
+        >>> discounted_share(0.99, torch.tensor(1000.0))
+        tensor(0.1000)
+        >>> discounted_share(1.0, torch.tensor(1000.0))
+        tensor(1.)
+    """
+    if gamma == 1:
+        return torch.ones_like(episode_length)
+    return (1 - gamma**episode_length) / ((1 - gamma) * episode_length)
+
+
+class CALLoss(SACLagrangianLoss):
+    """SAC on an augmented Lagrangian of a conservative estimate of the costs.
+
+    Wu, Tang, Lin, Yu, Mao, Xie, Wang, Wang, *Off-Policy Primal-Dual Safe Reinforcement Learning*
+    (ICLR 2024). Actions cost Q_i = mean + κ std of an ensemble (conservative policy optimisation),
+    and are weighed by
+
+        λ̂_i = max(0, λ_i − c (d'_i − E[Q_i]) / u_i)                   (local policy convexification)
+
+    which is the gradient of (1 / 2c) Σ_i max(0, λ_i + c (E[Q_i] − d'_i) / u_i)²: near the limit
+    the objective is convex in E[Q_i], so that the policy comes to rest at the limit instead of
+    swinging about it. The expectation is that over a minibatch.
+
+    λ is moved by whoever knows the costs of episodes, which are undiscounted, and so is the limit
+    d; E[Q_i] is discounted. The article converts d by `discounted_share`, which is some 30 % off,
+    because states in a memory are those of older policies, and costs are not spread evenly. With
+    c = 10, λ̂ would then settle a distance from λ that no λ makes up for. So d' = ρ d, and ρ is
+    measured: what the critics (their mean, without κ) say that actions cost, over what episodes
+    cost, both averaged over the past batches; it stays near `discounted_share`.
+
+    Args:
+        actor_network: policy with ``get_dist``.
+        qvalue_network: Q functions of the reward, see `SACLoss`.
+        cost_qvalue_network: a `safe_rl.models.QEnsemble` with one output per cost.
+        multiplier: λ; read at every call.
+        cost_keys: costs below ``next``, [..., 1] each.
+        convexity: c, per unit of discounted cost.
+        ratio_memory: weight in [0, 1) of the past batches in ρ.
+        largest_ratio: factor by which ρ may differ from `discounted_share`, up or down; 1 for the
+            article's conversion.
+        pessimism: κ, standard deviations among the cost critics that are added to their mean.
+        settings: those of every soft actor-critic, see `SoftActorCritic`.
+
+    Attributes:
+        discounted_limit: d', [k]; a buffer of infinities, which let λ̂ be 0, until `calibrate` or
+            somebody else sets it.
+
+    Examples:
+        >>> from safe_rl.models import QEnsemble, make_squashed_actor
+        >>> from safe_rl.objectives import LagrangeMultiplier
+        >>> actor = make_squashed_actor(3, -torch.ones(2), torch.ones(2), hidden_sizes=[8])
+        >>> loss = CALLoss(
+        ...     actor,
+        ...     QEnsemble(3, 2, hidden_sizes=[8], num_networks=2),
+        ...     QEnsemble(3, 2, hidden_sizes=[8], num_networks=4, out_key="cost_value"),
+        ...     multiplier=LagrangeMultiplier({"cost": 25.0}, init=1.0, lr=0.05),
+        ...     cost_keys=["cost"],
+        ...     convexity=10.0,
+        ...     ratio_memory=0.9,
+        ...     largest_ratio=2.0,
+        ...     pessimism=0.5,
+        ...     gamma=0.99,
+        ...     alpha_init=0.1,
+        ...     target_entropy=-2.0,
+        ... )
+        >>> _ = loss.discounted_limit.fill_(2.5)
+        >>> values = torch.full((4, 6, 1), 2.7)  # of four networks for six actions
+        >>> loss.cost_weights(values)  # 1 + 10 (2.7 - 2.5)
+        tensor([3.0000])
+    """
+
+    discounted_limit: Tensor
+    known_costs: Tensor
+    critics_say: Tensor
+
+    def __init__(
+        self,
+        actor_network: ProbabilisticTensorDictSequential,
+        qvalue_network: TensorDictModuleBase,
+        cost_qvalue_network: TensorDictModuleBase,
+        *,
+        multiplier: Multiplier,
+        cost_keys: Sequence[NestedKey],
+        convexity: float,
+        ratio_memory: float,
+        largest_ratio: float,
+        pessimism: float = 0.0,
+        **settings: Unpack[SoftActorCritic],
+    ) -> None:
+        super().__init__(
+            actor_network,
+            qvalue_network,
+            cost_qvalue_network,
+            multiplier=multiplier,
+            cost_keys=cost_keys,
+            pessimism=pessimism,
+            **settings,
+        )
+        self.convexity = convexity
+        self.ratio_memory, self.largest_ratio = ratio_memory, largest_ratio
+        self.out_keys = [*self.out_keys, "cost_weight"]
+        zeros = torch.zeros_like(self.cost_unit)
+        self.register_buffer("discounted_limit", torch.full_like(zeros, torch.inf))
+        # sums over the past: of the critics' means and of J_c; and over the updates of a batch:
+        # of the critics' means, and their number
+        self.register_buffer("known_costs", torch.zeros(2, *zeros.shape, device=zeros.device))
+        self.register_buffer("critics_say", torch.zeros(2, *zeros.shape, device=zeros.device))
+
+    def cost_weights(self, values: Tensor) -> Tensor:
+        """λ̂ / u, [k]; what the critics say is remembered for `calibrate`."""
+        means = values.flatten(0, -2).mean(0).to(self.critics_say)
+        self.critics_say.add_(torch.stack([means, torch.ones_like(means)]))
+        charged = self.charged(values).flatten(0, -2).mean(0)
+        excess = (charged - self.discounted_limit) / self.cost_unit
+        weight = self.multiplier.value + self.convexity * excess
+        return weight.clamp_min(0) / self.cost_unit
+
+    def calibrate(self, episodes: KnownCosts) -> None:
+        """Find d', the limit in the critics' terms, from the last updates and the new batch.
+
+        Args:
+            episodes: what is known of the costs of episodes; their limit is J_c less the violation,
+                so that one that comes down is followed.
+        """
+        super().calibrate(episodes)
+        said, number = self.critics_say
+        expected = discounted_share(self.gamma, episodes.episode_length)
+        if number.any():
+            news = torch.stack([said / number, episodes.costs])
+            self.known_costs.lerp_(news, 1 - self.ratio_memory)
+            self.critics_say.zero_()
+        by_critics, by_episodes = self.known_costs
+        ratio = torch.where(by_episodes > 0, by_critics / by_episodes, expected)
+        ratio = ratio.clamp(expected / self.largest_ratio, expected * self.largest_ratio)
+        self.discounted_limit.copy_(ratio * (episodes.costs - episodes.violation))

@@ -1,0 +1,138 @@
+"""CAL against the augmented Lagrangian's own gradient, and its limit in the critics' terms."""
+
+from types import SimpleNamespace
+
+import pytest
+import torch
+from tensordict import TensorDict
+from torchrl.data import Bounded
+
+from safe_rl.models import QEnsemble, make_squashed_actor
+from safe_rl.objectives import CALLoss, LagrangeMultiplier, SACLagrangianLoss
+from safe_rl.objectives.cal import discounted_share
+
+COSTS = ["cost", "cost_other"]
+
+
+def make_loss(kind=CALLoss, init=(2.0, 0.5), **keys):
+    if kind is CALLoss:
+        keys = {"convexity": 10.0, "ratio_memory": 0.5, "largest_ratio": 2.0, **keys}
+    keys = {"gamma": 0.9, "alpha_init": 0.2, "action_spec": Bounded(-1, 1, [2]), **keys}
+    return kind(
+        make_squashed_actor(3, -torch.ones(2), torch.ones(2), hidden_sizes=[8]),
+        QEnsemble(3, 2, hidden_sizes=[8], num_networks=2),
+        QEnsemble(3, 2, hidden_sizes=[8], num_networks=4, num_outputs=2, out_key="costs"),
+        multiplier=LagrangeMultiplier(dict(zip(COSTS, (25.0, 10.0), strict=True)), init=init, lr=1),
+        cost_keys=COSTS,
+        **keys,
+    )
+
+
+def known(costs, violation, length=1000.0, unit=(1.0, 1.0)):
+    names = {"costs": costs, "violation": violation, "episode_length": length, "unit": unit}
+    return SimpleNamespace(**{name: torch.tensor(value) for name, value in names.items()})
+
+
+def test_the_conversion_is_the_discounted_sum_of_even_costs():
+    for gamma, steps in ((0.99, 400), (0.9, 7), (1.0, 5)):
+        even = sum(gamma**t / steps for t in range(steps))
+        assert discounted_share(gamma, torch.tensor(float(steps))).item() == pytest.approx(even)
+
+
+@pytest.mark.parametrize(
+    ("away", "is_active"), [((0.3, -0.01), (True, True)), ((-9.0, 0.1), (False, True))]
+)
+def test_its_gradient_is_that_of_the_augmented_lagrangian(away, is_active):
+    """By finite differences of E[α log π − Q_r] + Σ max(0, λ + c (E[Q] − d') / u)² / 2c."""
+    loss, states = make_loss(pessimism=0.5).double(), torch.randn(6, 3).double()
+    steps, unit = TensorDict(observation=states, batch_size=[6]), torch.tensor([1.0, 0.5]).double()
+    loss.cost_unit.copy_(unit)
+
+    def objective_and_costs():
+        torch.manual_seed(1)
+        dist = loss.actor_network.get_dist(steps)
+        action = dist.rsample()
+        inputs = steps.clone().set("action", action)
+        reward = loss.qvalue_network(inputs)["state_action_value"].min(0).values.squeeze(-1)
+        values = loss.cost_qvalue_network(inputs)["costs"]
+        spread = (values - values.mean(0)).square().mean(0).sqrt()
+        charged = (values.mean(0) + 0.5 * spread).mean(0)
+        return (0.2 * dist.log_prob(action) - reward).mean(), charged
+
+    @torch.no_grad()
+    def augmented():
+        objective, charged = objective_and_costs()
+        inner = loss.multiplier.value + 10 * (charged - loss.discounted_limit) / unit
+        return (objective + inner.clamp_min(0).square().sum() / 20).item()
+
+    loss.discounted_limit.copy_(objective_and_costs()[1].detach() - torch.tensor(away) * unit)
+    torch.manual_seed(1)
+    found = loss.actor_losses(steps)
+    assert tuple((found["cost_weight"] > 0).tolist()) == is_active
+    parameter = next(p for p in loss.actor_network_params.values(True, True) if p.requires_grad)
+    gradient = torch.autograd.grad(found["loss_actor"], parameter)[0].flatten()
+    gradient = gradient * (1 + found["cost_weight"].sum())
+    flat = parameter.data.view(-1)
+    for place in range(0, flat.numel(), 3):
+        sides = []
+        for change in (1e-6, -2e-6):
+            flat[place] += change
+            sides.append(augmented())
+        flat[place] += 1e-6
+        slope = (sides[0] - sides[1]) / 2e-6
+        assert gradient[place].item() == pytest.approx(slope, abs=1e-6)
+
+
+def test_without_convexity_it_is_the_lagrangian():
+    loss, plain = make_loss(convexity=0.0), make_loss(SACLagrangianLoss)
+    for name in ("actor", "qvalue", "cost_qvalue"):
+        name = f"{name}_network_params"
+        getattr(plain, name).data.update_(getattr(loss, name).data)
+    loss.discounted_limit.fill_(1.0)
+    steps = TensorDict(observation=torch.randn(5, 3), batch_size=[5])
+    losses = []
+    for each in (loss, plain):
+        torch.manual_seed(0)
+        losses.append(each.actor_losses(steps)["loss_actor"])
+    torch.testing.assert_close(*losses)
+
+
+def test_costs_are_free_until_the_limit_is_known():
+    loss = make_loss()
+    assert not loss.cost_weights(torch.rand(4, 6, 2)).any()
+
+
+def test_the_limit_is_where_critics_say_that_episodes_are_at_theirs():
+    """Critics 30 % below even spreading: half of their value is the limit if J_c is twice it."""
+    loss = make_loss(gamma=0.99, init=(1.0, 1.0))
+    loss.calibrate(known([50.0, 8.0], [25.0, -2.0], unit=(1.0, 2.0)))
+    # nothing is known of the critics: the article's conversion
+    torch.testing.assert_close(loss.discounted_limit, torch.tensor([2.5, 1.0]), rtol=1e-3, atol=0)
+    assert loss.cost_unit.tolist() == [1.0, 2.0]
+    for _ in range(3):
+        for _ in range(4):
+            loss.cost_weights(torch.tensor([3.5, 0.56]).expand(4, 6, 2))
+        loss.calibrate(known([50.0, 8.0], [25.0, -2.0]))
+    torch.testing.assert_close(loss.discounted_limit, torch.tensor([1.75, 0.7]))
+    weights = loss.cost_weights(torch.tensor([1.8, 0.65]).expand(4, 6, 2))
+    torch.testing.assert_close(weights, torch.tensor([1.5, 0.5]))
+
+
+def test_the_limit_follows_what_batches_say_and_not_too_far():
+    loss = make_loss(gamma=0.99)
+    rows = [([40.0, 0.0], (2.0, 9.0)), ([20.0, 0.0], (2.0, 9.0)), ([60.0, 0.0], (9.0, 9.0))]
+    said = spent = 0.0
+    for costs, values in rows:
+        loss.cost_weights(torch.tensor(values).expand(4, 6, 2))
+        loss.calibrate(known(costs, [costs[0] - 25.0, -10.0]))
+        said, spent = 0.5 * said + 0.5 * values[0], 0.5 * spent + 0.5 * costs[0]
+        ratio = min(max(said / spent, 0.05), 0.2)
+        assert loss.discounted_limit[0].item() == pytest.approx(25 * ratio, rel=1e-3)
+        # critics that say that there is a cost where there is none
+        assert loss.discounted_limit[1].item() == pytest.approx(1.0, rel=1e-3)
+    state = loss.state_dict()
+    other = make_loss(gamma=0.99)
+    other.load_state_dict(state)
+    for each in (loss, other):
+        each.calibrate(known([10.0, 1.0], [0.0, 0.0]))
+    assert torch.equal(loss.discounted_limit, other.discounted_limit)
