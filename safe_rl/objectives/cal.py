@@ -63,7 +63,7 @@ class CALLoss(SACLagrangianLoss):
         ratio_memory: weight in [0, 1) of the past batches in ρ.
         largest_ratio: factor by which ρ may differ from `discounted_share`, up or down; 1 for the
             article's conversion.
-        pessimism: κ, standard deviations among the cost critics that are added to their mean.
+        pessimism, target_pessimism, lowest_cost_value: of the cost critics, see `CostTerms`.
         settings: those of every soft actor-critic, see `SoftActorCritic`.
 
     Attributes:
@@ -110,6 +110,8 @@ class CALLoss(SACLagrangianLoss):
         ratio_memory: float,
         largest_ratio: float,
         pessimism: float = 0.0,
+        target_pessimism: float | None = None,
+        lowest_cost_value: float | None = None,
         **settings: Unpack[SoftActorCritic],
     ) -> None:
         super().__init__(
@@ -119,6 +121,8 @@ class CALLoss(SACLagrangianLoss):
             multiplier=multiplier,
             cost_keys=cost_keys,
             pessimism=pessimism,
+            target_pessimism=target_pessimism,
+            lowest_cost_value=lowest_cost_value,
             **settings,
         )
         self.convexity = convexity

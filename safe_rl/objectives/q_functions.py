@@ -143,14 +143,15 @@ class CostCritics(LossModule):
         Returns:
             Distances from TD(0) targets, [E, ..., k].
         """
-        target = costs + discount * self._bounded(following)
+        target = costs + discount * self.bounded(following)
         return distance_loss(found, target, loss_function=self.loss_function)
 
-    def _bounded(self, values: Tensor) -> Tensor:
+    def bounded(self, values: Tensor) -> Tensor:
         """What the critics bootstrap on, from outputs [E, ..., k] of the target networks."""
         if self.target_pessimism is not None:
             values = pessimistic(values, self.target_pessimism).expand_as(values)
-        return values if self.lowest_cost_value is None else values.clamp_min(self.lowest_cost_value)
+        lowest = self.lowest_cost_value
+        return values if lowest is None else values.clamp_min(lowest)
 
     @property
     def _detached_cost_params(self) -> TensorDictBase:

@@ -65,6 +65,8 @@ class WCSACLoss(SACLagrangianLoss):
         tail: α, the share of the worst returns.
         pessimism: κ, standard deviations among the CVaR of several pairs of critics that are added
             to their mean.
+        target_pessimism, lowest_cost_value: of the means that critics bootstrap on, see
+            `CostTerms`.
         settings: those of every soft actor-critic, see `SoftActorCritic`.
 
     Raises:
@@ -104,6 +106,8 @@ class WCSACLoss(SACLagrangianLoss):
         cost_keys: Sequence[NestedKey],
         tail: float,
         pessimism: float = 0.0,
+        target_pessimism: float | None = None,
+        lowest_cost_value: float | None = None,
         **settings: Unpack[SoftActorCritic],
     ) -> None:
         self._factor = gaussian_tail(tail)
@@ -114,6 +118,8 @@ class WCSACLoss(SACLagrangianLoss):
             multiplier=multiplier,
             cost_keys=cost_keys,
             pessimism=pessimism,
+            target_pessimism=target_pessimism,
+            lowest_cost_value=lowest_cost_value,
             **settings,
         )
         if (number := cost_qvalue_network.num_networks) % 2:
@@ -155,9 +161,9 @@ class WCSACLoss(SACLagrangianLoss):
     ) -> Tensor:
         """Squared 2-Wasserstein distance of pairs of critics from their targets, [E/2, ..., k]."""
         mean, variance = self.moments(found)
-        target, spread = self.moment_targets(
-            mean.detach(), costs, discount, self.moments(following)
-        )
+        later_mean, later_variance = self.moments(following)
+        later = self.bounded(later_mean), later_variance
+        target, spread = self.moment_targets(mean.detach(), costs, discount, later)
         distances = [
             distance_loss(value, goal, loss_function=self.loss_function)
             for value, goal in ((mean, target), (variance.sqrt(), spread.sqrt()))
