@@ -149,6 +149,7 @@ class OffPolicy:
             constraints.observe(episodes, batch)
             if isinstance(self.policy_update.loss, CostCritics):
                 self.policy_update.loss.calibrate(constraints)
+                self.policy_update.loss.measure(batch["next", "reward"])
         self.memory.extend(batch)
         self._count_steps(batch.numel())
         may_learn = len(self.memory) >= max(self.random_steps, self.memory.batch_size)

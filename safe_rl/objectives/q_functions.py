@@ -54,20 +54,25 @@ class CostCritics(LossModule):
     from state to state: without a bound from above, found values of a cost that is never negative
     fall below 0. As rewards bootstrap on the least of two networks, costs bootstrap on
     mean_E Q' + κ' std_E Q', which is the largest of two networks for κ' = 1. The penalty on an
-    action is Σ_i λ_i (mean_E Q_i + κ std_E Q_i) / u_i, with the multipliers λ, the pessimism κ and
-    the size u of one cost; the sum of the actor's objective and this is divided by 1 + Σ λ_i / u_i,
-    so that the step size does not grow with λ.
+    action is r Σ_i λ_i (mean_E Q_i + κ std_E Q_i) / u_i, with the multipliers λ, the pessimism κ,
+    the size u of one cost and the size r of rewards, so that λ has no unit: at λ = 1 one cost
+    weighs as much as a reward of one standard deviation. The sum of the actor's objective and this
+    is divided by 1 + Σ λ_i / u_i, so that the step size does not grow with λ.
 
     Classes that inherit from it call `_add_cost_critics` in their constructor.
 
     Attributes:
         cost_unit: u, the size of one cost, [k]; a buffer of ones unless somebody sets it.
+        reward_unit: r, the standard deviation of the rewards of single steps, a scalar; 1 until
+            `measure` has been called.
     """
 
     cost_qvalue_network: TensorDictModuleBase
     cost_qvalue_network_params: TensorDictParams
     target_cost_qvalue_network_params: TensorDictParams
     cost_unit: Tensor
+    reward_unit: Tensor
+    reward_sums: Tensor
     gamma: float
     loss_function: str
     pessimism: float
@@ -100,6 +105,9 @@ class CostCritics(LossModule):
         self.__dict__["multiplier"] = multiplier
         device = next(network.parameters()).device
         self.register_buffer("cost_unit", torch.ones(len(cost_keys), device=device))
+        self.register_buffer("reward_unit", torch.ones((), device=device))
+        # number, sum and sum of squares
+        self.register_buffer("reward_sums", torch.zeros(3, dtype=torch.float64, device=device))
 
     def cost_values(self, steps: TensorDictBase, action: Tensor, params: TensorDictBase) -> Tensor:
         """Q_c of actions in the states of steps [...], by every network: [E, ..., k]."""
@@ -111,6 +119,16 @@ class CostCritics(LossModule):
     def calibrate(self, episodes: KnownCosts) -> None:
         """Take in what a batch says about the costs of episodes, before its updates."""
         self.cost_unit.copy_(episodes.unit)
+
+    def measure(self, rewards: Tensor) -> None:
+        """Set the size of rewards from those of all steps so far; `rewards` are new ones, [...]."""
+        rewards = rewards.detach().flatten().to(self.reward_sums)
+        powers = torch.stack([torch.ones_like(rewards), rewards, rewards.square()])
+        self.reward_sums.add_(powers.sum(-1))
+        number, total, squares = self.reward_sums
+        variance = (squares / number - (total / number).square()).clamp_min(0)
+        # rewards that are all alike have no size, and their policy nothing to weigh
+        self.reward_unit.copy_(torch.where(variance > 0, variance.sqrt(), 1.0))
 
     def cost_qvalue_loss(self, tensordict: TensorDictBase, next_action: Tensor) -> Tensor:
         """Loss of the cost critics, summed over networks and costs."""
@@ -177,7 +195,8 @@ class CostCritics(LossModule):
         """
         values = self.cost_values(tensordict, action, self._detached_cost_params)
         weights = self.cost_weights(values.detach()).to(values)
-        objective = (objective + self.charged(values) @ weights) / (1 + weights.sum())
+        charges = self.reward_unit * (self.charged(values) @ weights)
+        objective = (objective + charges) / (1 + weights.sum())
         return objective, {**self.cost_figures(values.detach()), "cost_weight": weights}
 
     def charged(self, values: Tensor) -> Tensor:

@@ -127,6 +127,7 @@ def test_without_weight_on_costs_the_policy_learns_as_without_them(kind):
 def test_costs_are_weighed_by_their_multipliers_in_units_of_one_cost(kind):
     loss, steps = make_loss(kind, lagrange(2.0, 3.0), pessimism=0.5), make_steps()
     loss.cost_unit.copy_(torch.tensor([1.0, 0.5]))
+    loss.reward_unit.fill_(0.25)
     torch.manual_seed(1)
     found = loss.actor_losses(steps)
     base = {"sac": objectives.SACLoss, "td3": objectives.TD3Loss}[kind]
@@ -140,8 +141,18 @@ def test_costs_are_weighed_by_their_multipliers_in_units_of_one_cost(kind):
     values = loss.cost_qvalue_network(steps.clone().set("action", action))["cost_value"]
     spread = (values - values.mean(0)).square().mean(0).sqrt()
     penalty = ((values.mean(0) + 0.5 * spread) * torch.tensor([2.0, 6.0])).sum(-1).mean()
-    torch.testing.assert_close(found["loss_actor"], (reward + penalty) / 9)
+    torch.testing.assert_close(found["loss_actor"], (reward + 0.25 * penalty) / 9)
     torch.testing.assert_close(found["cost_qvalue"], values.mean((0, 1)))
+
+
+def test_the_size_of_rewards_is_the_deviation_of_all_so_far():
+    loss, rewards = make_loss("sac", lagrange(1.0, 1.0)), 1000 + 7 * torch.randn(300, 1)
+    for batch in rewards.split([50, 150, 100]):
+        loss.measure(batch.reshape(-1, 10, 1))
+    assert loss.reward_unit.item() == pytest.approx(rewards.numpy().std(), rel=1e-5)
+    loss = make_loss("sac", lagrange(1.0, 1.0))
+    loss.measure(torch.full((20, 1), 0.1))
+    assert loss.reward_unit.item() == pytest.approx(1.0)
 
 
 @pytest.mark.parametrize("kind", ["sac", "td3"])

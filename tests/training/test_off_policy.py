@@ -26,7 +26,7 @@ def off_policy_config(*overrides):
     return compose_config(
         *("env=PointMass", "frames=1280", "num_envs=4", "frames_per_batch=160", "logger=none"),
         *("model.hidden_sizes=[16]", "memory.batch_size=32", "exploration.random_steps=160"),
-        *("policy_update.updates_per_step=0.05", "memory.keep=true"),
+        *("policy_update.updates_per_step=0.05", "memory.keep=true", "memory.n_steps=1"),
         *overrides,
     )
 
