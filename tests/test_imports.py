@@ -43,8 +43,9 @@ PARTS = {
 # Inside a package a module may import those of the floors below its own.
 FLOORS = {
     "envs": (
-        ("contract", "errors", "opengl", "rng", "states", "physics", "physics.base"),
-        ("physics.cpu", "physics.dynamics"),
+        ("errors", "opengl", "rng", "states", "physics", "physics.base"),
+        ("costs", "physics.cpu", "physics.dynamics"),
+        ("contract",),
         ("simulated",),
         # Safety Gym: records, then rules, then worlds, and what is seen of them.
         ("safety_gym.records", "safety_gym.records.values", "safety_gym.geometry"),
@@ -86,6 +87,12 @@ FLOORS = {
         ("gymnasium.nodes",),
         ("gymnasium.family",),
         ("gymnasium",),
+        # TorchRL's environments, with costs made by a rule.
+        ("torchrl.outside", "torchrl.reshaping", "torchrl.rows"),
+        ("torchrl.batching", "torchrl.costing"),
+        ("torchrl.nodes", "torchrl.observing"),
+        ("torchrl.family",),
+        ("torchrl",),
         ("names",),
         # What changes any of them from outside.
         ("transforms.base",),

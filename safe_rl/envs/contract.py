@@ -14,7 +14,8 @@ from tensordict import TensorDictBase
 from torchrl.data import Bounded, Categorical, Composite, OneHot, TensorSpec
 from torchrl.envs import EnvBase
 
-COST = "cost"
+from safe_rl.envs.costs import COST
+
 #: Continuous or integers within bounds, choices as integers, choices as one-hot vectors.
 ACTIONS = (Bounded, Categorical, OneHot)
 

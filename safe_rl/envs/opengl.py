@@ -57,13 +57,14 @@ def open_renderer(model: mujoco.MjModel, width: int, height: int) -> mujoco.Rend
     """
     model.vis.global_.offwidth, model.vis.global_.offheight = width, height
     try:
-        _load_backend()
+        load_backend()
         return mujoco.Renderer(model, height, width)
     except Exception as error:  # every backend fails in its own way
         raise OpenGLError(_advice(error)) from error
 
 
-def _load_backend() -> None:
+def load_backend() -> None:
+    """Choose and load MuJoCo's OpenGL backend, for those who open their contexts themselves."""
     if not os.environ.get("MUJOCO_GL") and not has_screen():
         os.environ["MUJOCO_GL"] = "egl"
     elif hasattr(gl_context, "GLContext"):

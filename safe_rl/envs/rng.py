@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -72,3 +73,15 @@ def normal(key: Tensor, *counters: Tensor | int) -> Tensor:
 def row_seeds(seed: int, num_rows: int) -> Tensor:
     """Return one seed per row, int64 [num_rows]; row k is the same for every `num_rows`."""
     return fold(torch.full((num_rows,), seed, dtype=torch.int64), torch.arange(num_rows))
+
+
+def spread_seed(seed: int) -> int:
+    """Return a seed of 32 bits for libraries whose rows count up from it.
+
+    Those of neighbours must not be the same ones.
+
+    Examples:
+        >>> abs(spread_seed(1) - spread_seed(0)) > 1000
+        True
+    """
+    return int(np.random.SeedSequence(seed).generate_state(1)[0])

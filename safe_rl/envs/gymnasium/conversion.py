@@ -16,10 +16,10 @@ from torchrl.data import Composite, Unbounded
 from torchrl.envs import GymWrapper, Transform, TransformedEnv
 from torchrl.envs.gym_like import BaseInfoDictReader
 
+from safe_rl.envs.costs import COST, is_cost
 from safe_rl.envs.gymnasium.adapting import adapt, check_workers, columns_of
 from safe_rl.envs.gymnasium.processes import ProcessVectorEnv
 
-AGGREGATE = "cost"
 MakeEnv = Callable[[], gymnasium.Env]
 
 
@@ -28,12 +28,12 @@ class CostReader(BaseInfoDictReader):
 
     Args:
         cost_keys: names in `info`.
-        num_envs: number of environments, N.
+        batch_size: [N], or [] of a single environment.
     """
 
-    def __init__(self, cost_keys: Sequence[str], num_envs: int) -> None:
+    def __init__(self, cost_keys: Sequence[str], batch_size: Sequence[int]) -> None:
         self._cost_keys = list(cost_keys)
-        self._shape = (num_envs, 1)
+        self._shape = (*batch_size, 1)
 
     def __call__(self, info_dict: dict[str, Any], tensordict: TensorDictBase) -> TensorDictBase:
         """Write the costs of a step."""
@@ -46,7 +46,7 @@ class CostReader(BaseInfoDictReader):
     def info_spec(self) -> Composite:
         """Shapes and types of the costs."""
         costs = {key: Unbounded(shape=self._shape) for key in self._cost_keys}
-        return Composite(costs, shape=self._shape[:1])
+        return Composite(costs, shape=self._shape[:-1])
 
 
 class CostsAsRewards(Transform):
@@ -60,12 +60,12 @@ class CostsAsRewards(Transform):
     def __init__(self, cost_keys: Sequence[str]) -> None:
         super().__init__()
         self._cost_keys = list(cost_keys)
-        self._sums = AGGREGATE not in self._cost_keys
+        self._sums = COST not in self._cost_keys
 
     def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:
         if self._sums:
             costs = torch.stack([next_tensordict[key] for key in self._cost_keys])
-            next_tensordict[AGGREGATE] = costs.sum(0)
+            next_tensordict[COST] = costs.sum(0)
         return next_tensordict
 
     def _reset(
@@ -84,7 +84,7 @@ class CostsAsRewards(Transform):
             rewards[key] = observations[key]
             del observations[key]
         if self._sums:
-            rewards[AGGREGATE] = rewards[self._cost_keys[0]].clone()
+            rewards[COST] = rewards[self._cost_keys[0]].clone()
         return output_spec
 
 
@@ -99,7 +99,7 @@ class GymnasiumEnv(TransformedEnv):
 
     def __init__(self, base_env: GymWrapper, cost_keys: Sequence[str], num_steps: int) -> None:
         super().__init__(base_env, CostsAsRewards(cost_keys))
-        self.cost_keys = [AGGREGATE, *(key for key in cost_keys if key != AGGREGATE)]
+        self.cost_keys = [COST, *(key for key in cost_keys if key != COST)]
         self.observation_layout = columns_of(base_env.observation_spec["observation"])
         self.max_episode_steps = num_steps
 
@@ -195,7 +195,7 @@ def from_gymnasium(
     else:
         worlds = SyncVectorEnv([make_adapted] * num_envs, autoreset_mode=AutoresetMode.DISABLED)
     base = GymWrapper(worlds, device=torch.device(device), categorical_action_encoding=True)
-    base.set_info_dict_reader(CostReader(keys, num_envs))
+    base.set_info_dict_reader(CostReader(keys, [num_envs]))
     batch = GymnasiumEnv(base, keys, length)
     batch.set_seed(int(torch.randint(2**31, ())) if seed is None else seed)
     return batch
@@ -236,7 +236,7 @@ def _fit(picture: np.ndarray, width: int, height: int) -> np.ndarray:
 def _find_costs(probe: gymnasium.Env) -> list[str]:
     probe.reset(seed=0)
     *_, info = probe.step(np.zeros(probe.action_space.shape, dtype=probe.action_space.dtype))
-    keys = [key for key in info if key == AGGREGATE or key.startswith(f"{AGGREGATE}_")]
+    keys = [key for key in info if is_cost(key)]
     if not keys:
         raise ValueError(
             f"{probe} reports no costs: there is no 'cost' or 'cost_<kind>' in its info, which has "

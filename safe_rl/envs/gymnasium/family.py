@@ -6,12 +6,12 @@ from collections.abc import Mapping
 from typing import Any
 
 import gymnasium
-import numpy as np
 import torch
 
 from safe_rl.envs.errors import ConfigError
 from safe_rl.envs.gymnasium.conversion import GymnasiumEnv, from_gymnasium
 from safe_rl.envs.gymnasium.nodes import complete_gymnasium, maker
+from safe_rl.envs.rng import spread_seed
 
 
 def make_gymnasium(
@@ -47,15 +47,10 @@ def make_gymnasium(
             num_envs=num_envs,
             cost_keys=config["cost_keys"],
             num_steps=config["num_steps"],
-            seed=None if seed is None else _spread(seed),
+            seed=None if seed is None else spread_seed(seed),
             workers=config["workers"],
             flatten=config["flatten"],
             device=device,
         )
     except (gymnasium.error.Error, TypeError, ValueError) as error:
         raise ConfigError(f"env.id={config['id']}: {error}") from error
-
-
-def _spread(seed: int) -> int:
-    """Gymnasium's rows count up from a seed: those of neighbours must not be the same ones."""
-    return int(np.random.SeedSequence(seed).generate_state(1)[0])

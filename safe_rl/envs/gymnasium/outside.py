@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
 import gymnasium
 import numpy as np
 
+from safe_rl.envs.costs import check_range
 from safe_rl.envs.errors import ConfigError
 
 __all__ = ["CostsOutside", "check_outside"]
@@ -71,7 +71,4 @@ def check_outside(outside: Any) -> None:
         numbers = isinstance(row, Sequence) and all(isinstance(x, int | float) for x in row)
         if not numbers or len(row) != 3 or row[0] != int(row[0]) or row[0] < 0:
             raise ConfigError(f"'outside' must be as {form}; got {key}: {row!r}.")
-        if not row[1] <= row[2] or not any(map(math.isfinite, row[1:])):
-            raise ConfigError(f"'outside': {key} has the range {row[1]} to {row[2]}.")
-        if not (key == "cost" or str(key).startswith("cost_")):
-            raise ConfigError(f"'outside': costs are called cost or cost_<kind>, not '{key}'.")
+        check_range(key, row[1], row[2])

@@ -1,0 +1,159 @@
+"""From a node to N environments of TorchRL's that are stepped together."""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
+from typing import Any
+
+import gymnasium
+import torchrl.envs
+from tensordict import TensorDict
+from torchrl.envs import EnvBase, GymLikeEnv, SerialEnv
+
+from safe_rl.envs.costs import is_cost
+from safe_rl.envs.errors import ConfigError
+from safe_rl.envs.gymnasium.conversion import CostReader
+from safe_rl.envs.opengl import load_backend
+from safe_rl.envs.torchrl.reshaping import Alone, Rows
+from safe_rl.envs.torchrl.rows import ROWS
+from safe_rl.targets import locate
+
+MakeEnv = Callable[..., EnvBase]
+# of constructors that cannot do with their arguments, or lack a package
+_FAILURES = (ImportError, TypeError, ValueError, LookupError, gymnasium.error.Error)
+
+
+def make_batch(config: Mapping[str, Any], num_envs: int) -> EnvBase:
+    """Make N environments, by whatever way their class has to be many.
+
+    A class that takes `num_envs` is asked for that many. One without a state of its own is stepped
+    with the states of all rows at once, and of others there are N, stepped one after the other.
+
+    Args:
+        config: a whole node.
+        num_envs: N.
+
+    Returns:
+        An environment of batch size [N].
+
+    Raises:
+        ConfigError: if the class cannot be made, or makes another number of them.
+        TargetError: if configurations may not name it.
+
+    Examples:
+        >>> make_batch({"id": "PendulumEnv", "kwargs": None, "cost_keys": None}, 3).batch_size
+        torch.Size([3])
+    """
+    make = _maker(config)
+    try:
+        env = _batch(make, num_envs)
+    except _FAILURES as error:
+        raise _in_words(config, error) from error
+    if not isinstance(env, EnvBase) or list(env.batch_size) != [num_envs]:
+        shown = list(env.batch_size) if isinstance(env, EnvBase) else type(env).__name__
+        raise ConfigError(
+            f"env.id={config['id']}: it must make an environment [N] or a single one, got {shown}."
+        )
+    return env
+
+
+def describe(config: Mapping[str, Any]) -> tuple[list[str], int]:
+    """Return names of entries that are costs and the length of episodes, found out where None.
+
+    Raises:
+        ConfigError: if the environment does not tell.
+    """
+    make = _maker(config)
+    try:
+        env = _one(make)
+    except _FAILURES as error:
+        raise _in_words(config, error) from error
+    try:
+        steps = config["num_steps"] or _length(env)
+        if steps is None:
+            raise ConfigError(
+                f"env.id={config['id']} does not say how long episodes are: give env.num_steps=…"
+            )
+        if config["cost_keys"] is not None:
+            return list(config["cost_keys"]), steps
+        entries = (*env.observation_spec.keys(), *env.full_reward_spec.keys())
+        return [str(key) for key in entries if is_cost(key)], steps
+    finally:
+        env.close(raise_if_closed=False)
+
+
+def _maker(config: Mapping[str, Any]) -> MakeEnv:
+    name, kwargs = config["id"], dict(config["kwargs"] or {})
+    if kwargs.get("from_pixels"):
+        load_backend()
+    if "." in name:
+        made: MakeEnv = partial(locate(name, key="env.id"), **kwargs)
+    else:
+        made = partial(getattr(torchrl.envs, name), **{**ROWS[name].kwargs, **kwargs})
+    return partial(_with_infos, made, config["cost_keys"] or [])
+
+
+def _with_infos(make: MakeEnv, cost_keys: Sequence[str], **kwargs: Any) -> EnvBase:
+    """One that also says what stands in the `info` of an environment of Gymnasium's."""
+    env = make(**kwargs)
+    if isinstance(env, GymLikeEnv):
+        known = (*env.observation_spec.keys(), *env.full_reward_spec.keys())
+        reported = [key for key in cost_keys if key not in known]
+        if reported:
+            env.set_info_dict_reader(CostReader(reported, env.batch_size))
+    return env
+
+
+def _in_words(config: Mapping[str, Any], error: Exception) -> ConfigError:
+    return ConfigError(f"env.id={config['id']}: {type(error).__name__}: {error}")
+
+
+def _one(make: MakeEnv) -> EnvBase:
+    return make(num_envs=1) if "num_envs" in _parameters(make) else make()
+
+
+def _batch(make: MakeEnv, num_envs: int) -> EnvBase:
+    env = _one(make)
+    if not env.batch_size and not env.batch_locked and _takes_rows(env):
+        return Rows(env, num_envs)
+    if list(env.batch_size) == [num_envs]:
+        return env
+    env.close(raise_if_closed=False)
+    if not env.batch_size:
+        return SerialEnv(num_envs, make)
+    many = make(num_envs=num_envs)
+    if list(many.batch_size) != [num_envs, 1]:  # of MuJoCo's own library, which is in line anyway
+        return many
+    return SerialEnv(num_envs, partial(_alone, make))
+
+
+def _alone(make: MakeEnv) -> EnvBase:
+    return Alone(_one(make))
+
+
+def _parameters(make: MakeEnv) -> Mapping[str, Any]:
+    """What the class, or function, takes that is innermost in partial functions."""
+    found: Any = make
+    while isinstance(found, partial):
+        found = found.args[0] if found.func is _with_infos else found.func
+    made = found.__init__ if inspect.isclass(found) else found
+    return inspect.signature(made).parameters
+
+
+def _takes_rows(env: EnvBase) -> bool:
+    """Whether it does as `batch_locked=False` promises, which not every class keeps."""
+    try:
+        env.reset(TensorDict(batch_size=[2], device=env.device))
+    except Exception:  # whatever its own code stumbles over
+        return False
+    return True
+
+
+def _length(env: EnvBase) -> int | None:
+    """What an environment, or that of Gymnasium within it, says of its episodes."""
+    known = getattr(env, "max_episode_steps", None)
+    if known is None and isinstance(env, GymLikeEnv):
+        known = getattr(env.spec, "max_episode_steps", None)
+    return known if isinstance(known, int) else None

@@ -1,0 +1,175 @@
+"""What a step costs: entries of the environment's, ranges that one leaves, a function of one's own.
+
+All of them are functions of a step as TorchRL has it: what was before and the action that was taken
+at the root, what is after below "next".
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
+from typing import Any
+
+import torch
+from tensordict import NestedKey, TensorDictBase
+from torch import Tensor
+from torchrl.data import Composite, Unbounded
+from torchrl.envs.transforms import Transform
+
+from safe_rl.envs.costs import COST, is_cost
+from safe_rl.envs.errors import ConfigError, nearest
+from safe_rl.envs.torchrl.outside import Range, parse_outside
+from safe_rl.targets import locate
+
+CostFunction = Callable[[TensorDictBase], Tensor | Mapping[str, Tensor]]
+
+
+def entry_key(name: str) -> NestedKey:
+    """Return the key of an entry that is named with dots.
+
+    Examples:
+        >>> entry_key("params.g"), entry_key("thdot")
+        (('params', 'g'), 'thdot')
+    """
+    parts = tuple(name.split("."))
+    return parts[0] if len(parts) == 1 else parts
+
+
+def cost_function(config: Mapping[str, Any]) -> CostFunction | None:
+    """Return the function that `cost` names: `module:function`, or a node with its arguments.
+
+    Raises:
+        ConfigError: if it names none.
+        TargetError: if its module was not named by `import=`.
+    """
+    given = config["cost"]
+    if given is None:
+        return None
+    node = dict(given) if isinstance(given, Mapping) else {"_target_": given}
+    target = node.pop("_target_", None)
+    if not isinstance(target, str):
+        raise ConfigError(
+            f"'cost' names a function: my_module:speed, or '{{_target_: my_module.speed, limit: 4}}"
+            f"' with its arguments; got {given!r}."
+        )
+    return partial(locate(target.replace(":", "."), key="env.cost"), **node)
+
+
+class StepCosts:
+    """All costs of a step, by name, the sum first.
+
+    Args:
+        entries: names of entries that are costs.
+        outside: name of a cost -> range, as `parse_outside` takes them.
+        function: makes others, [N] or [N, 1], one that is called `cost` or several by name.
+
+    Examples:
+        >>> from tensordict import TensorDict
+        >>> costs = StepCosts([], {"cost_speed": ["thdot", -4, 4]}, None)
+        >>> step = TensorDict({"next": {"thdot": torch.tensor([3.0, -5.0])}}, [2])
+        >>> {name: cost.flatten().tolist() for name, cost in costs(step).items()}
+        {'cost': [0.0, 1.0], 'cost_speed': [0.0, 1.0]}
+    """
+
+    def __init__(
+        self,
+        entries: Sequence[str],
+        outside: Mapping[str, Any] | None,
+        function: CostFunction | None,
+    ) -> None:
+        self.entries = list(entries)
+        self._ranges = parse_outside(outside or {})
+        self._function = function
+
+    def __call__(self, step: TensorDictBase) -> dict[str, Tensor]:
+        """Costs [N, 1] of a step [N].
+
+        Raises:
+            ConfigError: for an entry that there is not, or what is no cost of N rows.
+        """
+        found = [(name.rpartition(".")[2], _entry(step, name)) for name in self.entries]
+        found += [(name, _outside(step, row)) for name, row in self._ranges.items()]
+        if self._function is not None:
+            own = self._function(step)
+            found += _own(own)
+        costs: dict[str, Tensor] = {}
+        for name, cost in found:
+            if name in costs:
+                raise ConfigError(f"There are two costs called '{name}'.")
+            costs[name] = _column(name, cost, step.batch_size)
+        if COST in costs:
+            return {COST: costs.pop(COST), **costs}
+        return {COST: torch.stack(list(costs.values())).sum(0), **costs}
+
+
+def _entry(step: TensorDictBase, name: str) -> Tensor:
+    after = step["next"]
+    value = after.get(entry_key(name), None)
+    if value is None:
+        known = [".".join(k) if isinstance(k, tuple) else k for k in after.keys(True, True)]
+        raise ConfigError(
+            f"There is no entry '{name}'.{nearest(name, known)} A step writes {', '.join(known)}."
+        )
+    return value
+
+
+def _outside(step: TensorDictBase, row: Range) -> Tensor:
+    values = _entry(step, row.entry).reshape(*step.batch_size, -1)
+    if row.column >= values.shape[-1]:
+        raise ConfigError(
+            f"'outside': column {row.column} of {row.entry}, which has {values.shape[-1]}, counted "
+            "from 0."
+        )
+    value = values[..., row.column]
+    return (value < row.low) | (value > row.high)
+
+
+def _own(returned: Any) -> list[tuple[str, Any]]:
+    if not isinstance(returned, Mapping):
+        return [(COST, returned)]
+    for name in returned:
+        if not is_cost(name):
+            raise ConfigError(f"env.cost returns '{name}': costs are called cost or cost_<kind>.")
+    return list(returned.items())
+
+
+def _column(name: str, cost: Any, batch_size: torch.Size) -> Tensor:
+    if not isinstance(cost, Tensor) or cost.numel() != batch_size.numel():
+        shown = list(cost.shape) if isinstance(cost, Tensor) else type(cost).__name__
+        raise ConfigError(f"The cost '{name}' must be one number per row, [N], got {shown}.")
+    return cost.float().reshape(*batch_size, 1)
+
+
+class CostsBesideRewards(Transform):
+    """Writes the costs of a step beside its reward.
+
+    Args:
+        costs: from a step to costs [N, 1] by name.
+        names: what they are called.
+    """
+
+    def __init__(self, costs: StepCosts, names: Sequence[str]) -> None:
+        super().__init__()
+        self._costs, self._names = costs, list(names)
+        self._taken = [entry_key(name) for name in costs.entries]
+
+    def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
+        costs = self._costs(tensordict.clone(False).set("next", next_tensordict))
+        return next_tensordict.exclude(*self._taken).update(costs)
+
+    def _reset(
+        self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
+    ) -> TensorDictBase:
+        return tensordict_reset.exclude(*self._taken)
+
+    def transform_output_spec(self, output_spec: Composite) -> Composite:
+        """Add the costs to the rewards, and take what are costs out of the observations."""
+        output_spec = super().transform_output_spec(output_spec)
+        observed, rewards = output_spec["full_observation_spec"], output_spec["full_reward_spec"]
+        for spec in (observed, rewards):
+            for key in self._taken:
+                if key in spec.keys(True):
+                    del spec[key]
+        for name in self._names:
+            rewards[name] = Unbounded((*rewards.shape, 1), device=rewards.device)
+        return output_spec

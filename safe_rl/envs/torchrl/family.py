@@ -1,0 +1,96 @@
+"""Environments of TorchRL as a family: `env=torchrl env.id=…`."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+import torch
+from torchrl.data import Bounded
+from torchrl.envs import ActionScaling, ClipTransform, Compose, EnvBase, StepCounter, TransformedEnv
+from torchrl.envs.transforms import Transform
+
+from safe_rl.envs.errors import ConfigError
+from safe_rl.envs.rng import spread_seed
+from safe_rl.envs.torchrl.batching import make_batch
+from safe_rl.envs.torchrl.costing import CostsBesideRewards, StepCosts, cost_function
+from safe_rl.envs.torchrl.nodes import complete_torchrl
+from safe_rl.envs.torchrl.observing import Observe, choose_entries
+
+# another name than environments themselves may have for it
+_STEP = "episode_step"
+
+
+class TorchRLEnv(TransformedEnv):
+    """N environments of TorchRL with costs, made by `make_torchrl`.
+
+    Attributes:
+        cost_keys: the aggregate `cost`, then one key per kind.
+        observation_layout: columns of every entry that is observed.
+        max_episode_steps: the largest number of steps of an episode.
+    """
+
+    def __init__(self, base_env: EnvBase, config: Mapping[str, Any]) -> None:
+        costs = StepCosts(config["cost_keys"], config["outside"], cost_function(config))
+        # only a step tells what a function of one's own returns
+        names = list(costs(base_env.rand_step(base_env.reset())))
+        beside = CostsBesideRewards(costs, names)
+        observe = _observe(TransformedEnv(base_env, beside.clone()), config)
+        length = StepCounter(max_steps=config["num_steps"], step_count_key=_STEP)
+        super().__init__(base_env, Compose(beside, length, *_actions(base_env), observe))
+        self.cost_keys = names
+        self.observation_layout = observe.layout
+        self.max_episode_steps = int(config["num_steps"])
+
+
+def make_torchrl(
+    config: Mapping[str, Any],
+    *,
+    num_envs: int,
+    device: torch.device | str = "cpu",
+    seed: int | None = None,
+    num_threads: int = 0,
+) -> TorchRLEnv:
+    """Make environments of a class of TorchRL's, or of one's own.
+
+    Args:
+        config: `id` and any other key of `safe_rl.envs.torchrl.nodes`.
+        num_envs: number of environments, N.
+        device: where the TensorDicts live.
+        seed: determines every row; rows of different seeds have nothing in common.
+        num_threads: taken as any family does; these environments have no use for it.
+
+    Raises:
+        ConfigError: for an unknown key or class, or an environment that algorithms cannot use.
+        TargetError: for a class or function whose module was not named by `import=`.
+
+    Examples:
+        >>> config = {"id": "PendulumEnv", "num_steps": 200}
+        >>> config["outside"] = {"cost_speed": ["thdot", -4, 4]}
+        >>> env = make_torchrl(config, num_envs=3, seed=0)
+        >>> env.rollout(5)["next", "cost_speed"].shape
+        torch.Size([3, 5, 1])
+    """
+    config = complete_torchrl(config)
+    env = TorchRLEnv(make_batch(config, num_envs).to(torch.device(device)), config)
+    env.set_seed(int(torch.randint(2**31, ())) if seed is None else spread_seed(seed))
+    return env
+
+
+def _observe(env: EnvBase, config: Mapping[str, Any]) -> Observe:
+    entries = choose_entries(env.observation_spec, config["observe"])
+    kept = [".".join(k) if isinstance(k, tuple) else k for k in env.state_spec.keys(True, True)]
+    return Observe(entries, config["flatten"], kept)
+
+
+def _actions(env: EnvBase) -> Iterator[Transform]:
+    """Continuous actions are cut to [-1, 1] and stretched to the bounds; choices stay."""
+    spec = env.action_spec
+    if not isinstance(spec, Bounded):
+        if spec.dtype.is_floating_point and not hasattr(spec.space, "n"):
+            raise ConfigError("The algorithms need actions that are bounded, or choices.")
+        return
+    if not spec.dtype.is_floating_point:
+        return
+    yield ActionScaling()
+    yield ClipTransform(in_keys_inv=["action"], low=-1.0, high=1.0)

@@ -1,0 +1,273 @@
+"""TorchRL's own environments, and somebody's for it, through the ordinary commands."""
+
+import json
+import shutil
+import sys
+from pathlib import Path
+
+import gymnasium
+import gymnasium_envs  # noqa: F401, registers Walk-v0
+import pytest
+import torch
+import torchrl_envs
+import yaml
+from torchrl.envs import PendulumEnv
+from torchrl.envs.utils import check_env_specs
+
+from safe_rl import targets
+from safe_rl.cli import evaluate, report, train
+from safe_rl.collectors.workers import share_rows
+from safe_rl.envs import ConfigError, complete_env, make_env
+from safe_rl.envs.torchrl.nodes import ROWS
+from safe_rl.runs.table import read_table
+from safe_rl.targets import TargetError
+
+TARGET = "safe_rl.envs.torchrl.make_torchrl"
+OUTSIDE = {"cost_speed": ["thdot", -4, 4]}
+PENDULUM = {"_target_": TARGET, "id": "PendulumEnv", "num_steps": 30, "outside": OUTSIDE}
+GYM = {"_target_": TARGET, "id": "GymEnv", "kwargs": {"env_name": "Pendulum-v1"}}
+RUNNER = {"_target_": TARGET, "id": "torchrl_envs.Runner", "num_steps": 5}
+SMALL = (
+    *("env=torchrl", "env.id=PendulumEnv", "env.num_steps=20", "num_envs=4"),
+    *("frames_per_batch=160", "logger=none", "model.hidden_sizes=[8]", "num_threads=1"),
+    *("policy_update.minibatch_size=40", "critic_update.minibatch_size=40"),
+)
+
+
+@pytest.fixture
+def trusted(monkeypatch):
+    """As after `import=torchrl_envs`."""
+    monkeypatch.setattr(targets, "_users_modules", {"torchrl_envs"})
+
+
+def run_train(*arguments: str) -> None:
+    """What `python train.py …` does, in this process."""
+    before = sys.argv
+    try:
+        assert train.main(arguments) == 0
+    finally:
+        sys.argv = before
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory) -> Path:
+    folder = tmp_path_factory.mktemp("runs") / "pendulum"
+    own = (f"import={torchrl_envs.__file__}", "env.cost=torchrl_envs:upright")
+    outside = ("env.outside={cost_speed: [thdot, -4, 4]}", "cost_limits={cost_speed: 3}")
+    run_train(*SMALL, *own, *outside, "frames=320", f"hydra.run.dir={folder}")
+    return folder
+
+
+def test_its_folder_tells_everything(run):
+    env = yaml.safe_load((run / "config.yaml").read_text())["env"]
+    assert env["name"] == "PendulumEnv"
+    assert env["cost"] == "torchrl_envs:upright"
+    table = read_table(run / "progress.csv")
+    assert table["steps"] == [160, 320]
+    assert table["episode_length"] == [20, 20]
+    assert all(cost > 0 for cost in table["episode_cost_speed"] + table["episode_cost"])
+
+
+def test_it_resumes_is_evaluated_and_reported(run, tmp_path, capsys):
+    folder = tmp_path / "runs" / "copied"
+    shutil.copytree(run, folder)
+    trust = f"import={torchrl_envs.__file__}"
+    run_train(trust, f"resume={folder}", "frames=480")
+    assert read_table(folder / "progress.csv")["steps"] == [160, 320, 480]
+    assert "The state of its environments is not stored" in capsys.readouterr().out
+    assert evaluate.main([str(folder), "episodes=4", "num_envs=2"]) == 1
+    assert "add that to the command if you trust" in capsys.readouterr().err
+    assert evaluate.main([str(folder), "episodes=4", "num_envs=2", trust]) == 0
+    facts = json.loads((folder / "evaluation.json").read_text())
+    assert facts["environment"] == "PendulumEnv"
+    assert facts["estimates"]["episode_length"]["value"] == 20
+    assert report.main([str(folder.parent)]) == 0
+    assert "PendulumEnv" in (folder.parent / "report" / "report.md").read_text()
+
+
+@pytest.mark.parametrize("name", sorted(set(ROWS) - {"GymEnv"}))
+def test_specs_hold_for_every_row(name):
+    entry = {"PendulumEnv": "thdot", "FinancialRegimeEnv": "entry_price"}.get(name, "observation")
+    node = {"_target_": TARGET, "id": name, "outside": {"cost_far": [entry, -1, 1]}}
+    for num_envs in (1, 3):
+        env = make_env({**node, "num_steps": 4}, num_envs=num_envs, seed=0)
+        check_env_specs(env)
+        rollout = env.rollout(9, break_when_any_done=False)
+        assert rollout.shape == (num_envs, 9)
+        step = rollout["next"]
+        torch.testing.assert_close(step["truncated"], step["episode_step"] == 4)
+        env.close()
+
+
+def test_a_step_is_that_of_the_environment():
+    env = make_env(PENDULUM, num_envs=3, seed=0)
+    start = env.reset()
+    start["action"] = torch.tensor([[0.5], [-1.0], [7.0]])
+    step = env.step(start.clone())["next"]
+    bare = start.select("th", "thdot", "params")
+    bare["action"] = torch.tensor([[1.0], [-2.0], [2.0]])  # stretched to its bounds, and cut
+    after = PendulumEnv().step(bare)["next"]
+    torch.testing.assert_close(step["reward"], after["reward"])
+    torch.testing.assert_close(
+        step["observation"], torch.stack([after["th"], after["thdot"]], -1), rtol=0, atol=0
+    )
+    assert env.observation_layout == {"th": slice(0, 1), "thdot": slice(1, 2)}
+    assert start["th"].unique().numel() == 3  # rows begin on their own
+
+
+def test_rows_end_and_begin_apart():
+    env = make_env(PENDULUM | {"num_steps": 8}, num_envs=3, seed=0)
+    state = env.reset()
+    state["episode_step"] = torch.tensor([[0], [6], [3]])
+    ended = []
+    for _ in range(8):
+        state["action"] = torch.zeros(3, 1)
+        step, state = env.step_and_maybe_reset(state)
+        done = step["next", "done"].squeeze(-1)
+        same = (state["th"] == step["next", "th"]) & (state["thdot"] == step["next", "thdot"])
+        assert (same == ~done).all()
+        ended.append(done.tolist())
+    assert [[row[i] for row in ended].index(True) for i in range(3)] == [7, 1, 4]
+
+
+def test_gymnasiums_environments_step_as_they_do_there():
+    node = GYM | {"outside": {"cost_speed": ["observation", 2, -4, 4]}}
+    env = make_env(node, num_envs=2, seed=3)
+    assert env.max_episode_steps == 200
+    state = env.reset()
+    plain = gymnasium.make("Pendulum-v1")
+    plain.reset(seed=0)
+    x, y, speed = state["observation"][1].double().tolist()
+    plain.unwrapped.state = [torch.atan2(torch.tensor(y), torch.tensor(x)).item(), speed]
+    for action in (0.3, -0.9, 1.0, 1.0, 1.0):
+        state["action"] = torch.tensor([[0.0], [action]])
+        step = env.step(state)["next"]
+        observation, reward, *_ = plain.step([2 * action])
+        torch.testing.assert_close(
+            step["observation"][1], torch.from_numpy(observation), rtol=1e-4, atol=1e-4
+        )
+        assert step["reward"][1].item() == pytest.approx(reward, rel=1e-3, abs=1e-3)
+        assert step["cost"][1].item() == float(abs(observation[2]) > 4)
+        state = step
+    discrete = GYM | {"kwargs": {"env_name": "CartPole-v1"}}
+    discrete |= {"outside": {"cost_position": ["observation", 0, -0.05, 0.05]}}
+    env = make_env(discrete, num_envs=3, seed=0)
+    check_env_specs(env)
+    step = env.rollout(60, break_when_any_done=False)["next"]
+    far = step["observation"][..., :1].abs() > 0.05
+    torch.testing.assert_close(step["cost"], far.float())
+    assert 0 < far.sum() < far.numel()
+
+
+def test_numbers_in_info_are_costs_where_they_are_named():
+    node = GYM | {"kwargs": {"env_name": "Walk-v0"}, "cost_keys": ["fast", "far"]}
+    env = make_env(node, num_envs=2, seed=0)
+    check_env_specs(env)
+    rollout = env.rollout(30, break_when_any_done=False)
+    place, speed = rollout["next", "observation"].split(1, -1)
+    torch.testing.assert_close(rollout["next", "fast"], (speed.abs() > 1).float())
+    torch.testing.assert_close(rollout["next", "far"], place.abs())
+    torch.testing.assert_close(rollout["next", "cost"], rollout["next", "fast"] + place.abs())
+    assert env.max_episode_steps == 25
+
+
+def test_costs_may_be_entries_ranges_and_functions_at_once(trusted):
+    env = make_env(RUNNER | {"outside": {"cost_out": ["place", -9, 1.5]}}, num_envs=3, seed=0)
+    assert env.cost_keys == ["cost", "cost_effort", "cost_out"]
+    assert "cost_effort" not in env.observation_spec.keys()  # noqa: SIM118
+    check_env_specs(env)
+    step = env.rollout(5)["next"]
+    torch.testing.assert_close(step["cost_effort"], step["reward"] ** 2)
+    torch.testing.assert_close(step["cost_out"], (step["observation"] > 1.5).float())
+    torch.testing.assert_close(step["cost"], step["cost_effort"] + step["cost_out"])
+    assert 0 < step["cost_out"].sum() < 15
+    env = make_env(PENDULUM | {"outside": None, "cost": "torchrl_envs:kinds"}, num_envs=4, seed=0)
+    assert env.cost_keys == ["cost", "cost_effort", "cost_fast"]
+    rollout = env.rollout(30)
+    torch.testing.assert_close(rollout["next", "cost_effort"], 2 * rollout["action"].abs())
+
+
+def test_a_function_takes_arguments(trusted):
+    cost = {"_target_": "torchrl_envs.upright", "limit": 2.0}
+    env = make_env(PENDULUM | {"outside": None, "cost": cost}, num_envs=8, seed=0)
+    assert env.cost_keys == ["cost"]
+    step = env.rollout(30)["next"]
+    torch.testing.assert_close(step["cost"], (step["th"].unsqueeze(-1).abs() < 2).float())
+    assert 0 < step["cost"].mean() < 1
+
+
+def test_several_entries_become_a_vector_or_a_dictionary():
+    node = {"_target_": TARGET, "id": "FinancialRegimeEnv", "num_steps": 6}
+    node |= {"outside": {"cost_owning": ["current_holdings", 0, 0]}}
+    node |= {"observe": ["current_holdings", "price_history"]}
+    flat, nested = (make_env(node | {"flatten": f}, num_envs=2, seed=0) for f in (True, False))
+    vector, parts = flat.reset()["observation"], nested.reset()["observation"]
+    check_env_specs(nested)
+    torch.testing.assert_close(vector[:, 1:], parts["price_history"], rtol=0, atol=0)
+    assert parts["current_holdings"].shape == (2, 1)
+    assert flat.observation_layout == nested.observation_layout
+    assert flat.observation_layout["price_history"] == slice(1, 51)
+
+
+def test_a_dictionary_is_trained_on_entry_by_entry(tmp_path):
+    parts = ("env.flatten=false", "model=dict", "model.encoders.vector=[4]")
+    outside = "env.outside={cost_speed: [thdot, -4, 4]}"
+    run_train(*SMALL, outside, *parts, "frames=160", f"hydra.run.dir={tmp_path / 'run'}")
+    assert read_table(tmp_path / "run" / "progress.csv")["steps"] == [160]
+
+
+def starts(seed: int, num_envs: int = 4) -> list[float]:
+    return make_env(PENDULUM, num_envs=num_envs, seed=seed).reset()["th"].tolist()
+
+
+def test_seeds_determine_rows_and_share_none():
+    assert starts(0) == starts(0)
+    assert len({*starts(0), *starts(1), *starts(2)}) == 12
+
+
+def test_workers_have_rows_of_their_own():
+    def make(num_envs=1, seed=0):
+        return make_env(PENDULUM, num_envs=num_envs, seed=seed)
+
+    shares = [share() for share in share_rows(make(num_envs=4), make, num_collectors=2)]
+    rows = [share.reset()["th"].tolist() for share in shares]
+    assert len({*rows[0], *rows[1]}) == 4
+
+
+@pytest.mark.parametrize(
+    ("keys", "message"),
+    [
+        ({"id": None}, r"env\.id="),
+        ({"id": "PendulunEnv"}, "Did you mean 'PendulumEnv'.*import=torchrl.envs"),
+        ({"speed": 3}, "no key 'speed'.*env.kwargs"),
+        ({"num_step": 3}, "Did you mean 'num_steps'"),
+        ({"num_steps": 0}, "'num_steps' must be an integer of at least 1"),
+        ({"num_steps": None}, "does not say how long"),
+        ({"outside": None}, "what does a step cost"),
+        ({"outside": {"speed": ["thdot", -4, 4]}}, "called cost or cost_<kind>, not 'speed'"),
+        ({"outside": {"cost_speed": ["thdto", -4, 4]}}, "Did you mean 'thdot'"),
+        ({"outside": {"cost_speed": ["thdot", 1, -4, 4]}}, "column 1 of thdot, which has 1"),
+        ({"outside": {"cost_speed": ["thdot", 4, -4]}}, "range 4 to -4"),
+        ({"outside": {"cost_speed": 4}}, "must be as"),
+        ({"observe": ["thdto"]}, "Did you mean 'thdot'"),
+        ({"observe": "th"}, "must be a list"),
+        ({"cost_keys": ["cost_none"]}, "no entry 'cost_none'"),
+        ({"kwargs": {"mass": 3}}, "env.id=PendulumEnv: TypeError.*mass"),
+        ({**GYM, "kwargs": {"env_name": "os.path:Walk-v0"}}, "import=os.path and env_name: Walk"),
+        ({**GYM, "kwargs": {"env_name": "Pendulum-v9"}}, "env.id=GymEnv: VersionNotFound.*`v9`"),
+        ({"cost": 3}, "'cost' names a function"),
+    ],
+)
+def test_what_cannot_be_made_is_said(keys, message):
+    with pytest.raises(ConfigError, match=message):
+        make_env({**PENDULUM, **keys})
+
+
+def test_only_what_was_imported_is_reached(trusted):
+    with pytest.raises(ConfigError, match="one number per row"):
+        make_env(PENDULUM | {"cost": "torchrl_envs:wrong"}, num_envs=2)
+    with pytest.raises(TargetError, match=r"env\.cost=os\.getcwd.*import=os"):
+        make_env(PENDULUM | {"cost": "os:getcwd"})
+    with pytest.raises(TargetError, match=r"env\.id=torchrl\.envs.*import=torchrl\.envs"):
+        make_env(PENDULUM | {"id": "torchrl.envs.DMControlEnv"})
+    assert complete_env(RUNNER)["cost_keys"] == ["cost_effort"]

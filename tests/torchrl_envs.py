@@ -1,0 +1,56 @@
+"""What somebody could write for TorchRL: an environment with a cost as an entry, and costs."""
+
+import torch
+from tensordict import TensorDict
+from torchrl.data import Bounded, Composite, Unbounded
+from torchrl.envs import EnvBase
+
+
+class Runner(EnvBase):
+    """A point on a line that earns its speed and observes it; N of them, or one without a batch."""
+
+    def __init__(self, num_envs=2, top=1.0, device="cpu", seed=None):
+        super().__init__(device=device, batch_size=[num_envs])
+        shape, self._top = (num_envs, 1), top
+        self.observation_spec = Composite(
+            place=Unbounded(shape), cost_effort=Unbounded(shape), shape=[num_envs]
+        )
+        self.action_spec = Bounded(0.0, top, shape)
+        self.reward_spec = Unbounded(shape)
+        self._places = torch.zeros(shape)
+
+    def _reset(self, tensordict=None, **_):
+        begins = None if tensordict is None else tensordict.get("_reset", None)
+        begins = torch.ones(self._places.shape, dtype=bool) if begins is None else begins
+        self._places = torch.where(begins.view_as(self._places), torch.rand(1), self._places)
+        return self._said(torch.zeros_like(self._places))
+
+    def _step(self, tensordict):
+        speed = tensordict["action"]
+        assert speed.min() >= 0
+        assert speed.max() <= self._top
+        self._places = self._places + speed
+        return self._said(speed**2).update({"reward": speed})
+
+    def _said(self, cost):
+        done = torch.zeros(self._places.shape, dtype=bool)
+        values = {"place": self._places.clone(), "cost_effort": cost, "done": done}
+        return TensorDict({**values, "terminated": done.clone()}, self.batch_size)
+
+    def _set_seed(self, seed):
+        torch.manual_seed(seed)
+
+
+def upright(step, limit=1.0):
+    """A cost for being within a range of the top, [N]."""
+    return step["next", "th"].abs() < limit
+
+
+def kinds(step):
+    """Two costs by name, [N, 1]; one of the action as the environment takes it."""
+    effort = step["action"].abs()
+    return {"cost_effort": effort, "cost_fast": step["next", "thdot"].abs().unsqueeze(-1) > 4}
+
+
+def wrong(step):
+    return torch.zeros(7)
