@@ -172,7 +172,7 @@ FLOORS = {
         ("naming",),
         ("experiments",),
         ("inventory", "pictures", "scoring", "slate_scores"),
-        ("lacking", "slate_pictures", "transfers"),
+        ("fronts", "lacking", "slate_pictures", "transfers"),
         ("contents",),
         ("page",),
         ("",),

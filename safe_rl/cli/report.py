@@ -42,6 +42,13 @@ class ReportOptions:
         default=None,
         metadata={"help": "folder to keep the runs in for others, tables compressed; null: none"},
     )
+    good: float = field(
+        default=0.5,
+        metadata={
+            "help": "x of the first step with J_r >= x and J_c <= d: share of the published PPO's "
+            "return, elsewhere of the best one here"
+        },
+    )
     title: str | None = field(default=None, metadata={"help": "heading; null: the folder's name"})
 
 
@@ -57,11 +64,16 @@ def report(root: Path, options: ReportOptions) -> tuple[Report, Path]:
 
     Raises:
         FileNotFoundError: If there is no run.
-        ValueError: If a slate is to take less than one run per environment.
+        ValueError: If a slate is to take less than one run per environment, or what is good is no
+            share of a return.
     """
     if options.seeds < 1:
         raise ValueError(f"seeds={options.seeds}: a slate takes at least one run per environment.")
-    result = build_report(root, suite(), seeds_needed=options.seeds, unfinished=options.unfinished)
+    if not 0.0 < options.good <= 10.0:
+        raise ValueError(f"good={options.good}: a share of a return, for example 0.5 for half.")
+    result = build_report(
+        root, suite(), seeds_needed=options.seeds, unfinished=options.unfinished, good=options.good
+    )
     out = root / "report" if options.out is None else Path(options.out)
     return result, write_report(result, out, options.title or root.resolve().name)
 

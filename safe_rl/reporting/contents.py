@@ -6,7 +6,6 @@ from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from importlib.resources import files
-from math import isfinite, nan
 from pathlib import Path
 from typing import NamedTuple
 
@@ -15,22 +14,30 @@ from matplotlib.figure import Figure
 
 from safe_rl.reporting.columns import Column, Record, Table
 from safe_rl.reporting.experiments import Experiment, group_runs
-from safe_rl.reporting.inventory import certificate_table, evaluation_table, run_table, videos
+from safe_rl.reporting.fronts import compared, draw_fronts
+from safe_rl.reporting.inventory import (
+    certificate_table,
+    evaluation_table,
+    run_table,
+    variant_table,
+    videos,
+)
 from safe_rl.reporting.lacking import lacking_table, missing_seeds
 from safe_rl.reporting.origins import Origin, find_origins
 from safe_rl.reporting.pictures import (
     Style,
     algorithm_styles,
-    draw_fronts,
     draw_learning_curves,
 )
 from safe_rl.reporting.recorded import Run, clean, find_runs
 from safe_rl.reporting.scoring import dominance_table, final_table, learning_table
 from safe_rl.reporting.slate_pictures import draw_middles, draw_profiles
 from safe_rl.reporting.slate_scores import (
+    Aggregate,
     aggregate,
     can_be_normalised,
     improvement_table,
+    lengths,
     middle_table,
     slate_table,
     title_of,
@@ -101,7 +108,9 @@ class Report:
         return [run for experiment in self.experiments for run in experiment.runs]
 
 
-def build_report(root: Path, suite: Suite, *, seeds_needed: int, unfinished: bool) -> Report:
+def build_report(
+    root: Path, suite: Suite, *, seeds_needed: int, unfinished: bool, good: float = 0.5
+) -> Report:
     """Find the runs below a folder and put everything together.
 
     Args:
@@ -109,6 +118,8 @@ def build_report(root: Path, suite: Suite, *, seeds_needed: int, unfinished: boo
         suite: The benchmark.
         seeds_needed: Finished runs that a slate takes per environment.
         unfinished: Whether unfinished runs count as finished ones.
+        good: Share of a return that a good policy has, see
+            :func:`safe_rl.reporting.scoring.learning_table`.
 
     Raises:
         FileNotFoundError: If there is no run.
@@ -122,9 +133,10 @@ def build_report(root: Path, suite: Suite, *, seeds_needed: int, unfinished: boo
     finals = [final_table(group) for group in groups]
     records = [record for table in finals for record in table.records]
     lacking = lacking_table(experiments, seeds_needed)
+    learning = [learning_table(group, good) for group in groups]
     sections = [
         Section("final", "Final scores", finals or ["No run is finished."]),
-        Section("learning", "What learning cost", list(filter(None, map(learning_table, groups)))),
+        Section("learning", "What learning cost", list(filter(None, learning))),
         Section("curves", "Learning curves", _curves(experiments, styles)),
         Section("fronts", "Return against cost", _fronts(records, styles)),
         Section("transfer", "Transfer", _transfers(experiments, origins, styles)),
@@ -137,7 +149,15 @@ def build_report(root: Path, suite: Suite, *, seeds_needed: int, unfinished: boo
         Section("certificates", "Certificates", _if_any(certificate_table(experiments))),
         Section("evaluations", "Evaluations", _if_any(evaluation_table(experiments))),
         Section("videos", "Videos", [Film(clean(c), path) for c, path in videos(experiments)]),
-        Section("runs", "Runs", [run_table(experiments), *_if_any(_left_out(skipped))]),
+        Section(
+            "runs",
+            "Runs",
+            [
+                run_table(experiments),
+                *_if_any(variant_table(experiments)),
+                *_if_any(_left_out(skipped)),
+            ],
+        ),
     ]
     return Report(experiments, [s for s in sections if s.blocks], lacking, skipped)
 
@@ -160,12 +180,12 @@ def _by_environment(experiments: Iterable[Experiment]) -> list[list[Experiment]]
 
 
 def _fronts(records: Sequence[Record], styles: Mapping[str, Style]) -> list[Drawing]:
-    """Environments on which at least two experiments have both a return and a cost."""
-    known = [r for r in records if isfinite(r["episode_return"] + r.get("episode_cost", nan))]
-    names = [record["environment"] for record in known]
-    shown = [record for record in known if names.count(record["environment"]) > 1]
-    says = f"Final return against final cost: {', '.join(dict.fromkeys(names))}"
-    return [Drawing("fronts", "", draw_fronts(shown, styles), says)] if shown else []
+    groups = compared(records)
+    if not groups:
+        return []
+    panels = [f"{what}: {', '.join(r['algorithm'] for r in own)}" for what, own in groups.items()]
+    says = f"Final return against final episode cost. {'; '.join(panels)}"
+    return [Drawing("fronts", "", draw_fronts(records, styles), says)]
 
 
 def _curves(experiments: Sequence[Experiment], styles: Mapping[str, Style]) -> list[Drawing]:
@@ -225,15 +245,27 @@ def _slates(
             for a in members
         ]
         if aggregates:
-            middle = middle_table(name, aggregates)
-            iqm, profiles = draw_middles(middle.records, styles), draw_profiles(aggregates, styles)
-            blocks += [
-                slate_table(name, slate, aggregates),
-                Drawing(f"slate_{name}", "", iqm, f"Interquartile means, {title_of(name)}"),
-                middle,
-                Drawing(
-                    f"profiles_{name}", "", profiles, f"Performance profiles, {title_of(name)}"
-                ),
-                *_if_any(improvement_table(name, aggregates)),
-            ]
+            blocks.append(slate_table(name, slate, aggregates))
+            for after, group in lengths(aggregates).items():
+                blocks += _middles_and_profiles(name, group, after, styles)
+            blocks += _if_any(improvement_table(name, aggregates))
     return blocks
+
+
+def _middles_and_profiles(
+    slate: str, aggregates: Sequence[Aggregate], after: str, styles: Mapping[str, Style]
+) -> list[Block]:
+    """What can be seen of a slate's runs as a whole, of algorithms that were trained equally long.
+
+    A single run has no middle and no profile.
+    """
+    if max(one.num_runs for one in aggregates) == 1:
+        return []
+    middle = middle_table(slate, aggregates, after)
+    iqm, profiles = draw_middles(middle.records, styles), draw_profiles(aggregates, styles)
+    says = ", ".join([title_of(slate) + after, *(one.algorithm for one in aggregates)])
+    return [
+        middle,
+        Drawing(f"slate_{slate}", "", iqm, f"Interquartile means with 95 % intervals: {says}"),
+        Drawing(f"profiles_{slate}", "", profiles, f"Share of runs above every score: {says}"),
+    ]

@@ -25,12 +25,17 @@ class Experiment:
         algorithm: Name of the algorithm, with what tells it from others of that name.
         benchmark: Name in the suite if the environment is exactly that one, else None.
         runs: One per seed.
+        family: Name of the algorithm where limits are no difference, so that the same algorithm
+            under several limits has one; "" is a family of its own.
+        settings: All that differs from its namesakes, if that is more than its name says.
     """
 
     environment: str
     algorithm: str
     benchmark: str | None
     runs: tuple[Run, ...]
+    family: str = ""
+    settings: str = ""
 
     @property
     def reference(self) -> Scores | None:
@@ -88,15 +93,18 @@ def group_runs(
     """
     environments = environment_names(runs, suite)
     algorithms = algorithm_names(runs, environments, origins, root)
+    families = algorithm_names(runs, environments, origins, root, but_for="cost_limits")
     cells: dict[tuple[str, str], list[Run]] = defaultdict(list)
     for run in runs:
-        cells[environments[run.directory], algorithms[run.directory]].append(run)
+        cells[environments[run.directory], algorithms[run.directory].name].append(run)
     skipped: dict[Path, str] = {}
     experiments = []
     for (environment, algorithm), members in cells.items():
         kept = _without_repetitions(members, skipped)
         benchmark = suite.name_of(kept[0].config["env"])
-        experiments.append(Experiment(environment, algorithm, benchmark, tuple(kept)))
+        first = kept[0].directory
+        further = (families[first].name, algorithms[first].settings)
+        experiments.append(Experiment(environment, algorithm, benchmark, tuple(kept), *further))
     return sorted(experiments, key=_order), skipped
 
 

@@ -12,7 +12,9 @@ from safe_rl.reporting.columns import Column, Record, Table, interval
 from safe_rl.reporting.experiments import Experiment
 from safe_rl.reporting.recorded import Run, clean
 
-__all__ = ["certificate_table", "duration", "evaluation_table", "run_table", "videos"]
+__all__ = [
+    *("certificate_table", "duration", "evaluation_table", "run_table", "variant_table", "videos"),
+]
 
 _WHERE = tuple(Column(name, ("{}", name)) for name in ("environment", "algorithm"))
 _SEED = Column("seed", ("{:d}", "seed"))
@@ -51,6 +53,14 @@ def run_table(experiments: Sequence[Experiment]) -> Table:
         Column("command", ("{}", "command")),
     ]
     return Table("runs", "Runs", columns, records)
+
+
+def variant_table(experiments: Sequence[Experiment]) -> Table:
+    """In what namesakes differ beyond what their names say."""
+    settings = {e.algorithm: e.settings for e in experiments if e.settings}
+    records = [{"algorithm": name, "settings": text} for name, text in settings.items()]
+    columns = [Column("algorithm", ("{}", "algorithm")), Column("all of it", ("{}", "settings"))]
+    return Table("variants", "What differs between runs of one algorithm", columns, records)
 
 
 def duration(hours: float) -> str:

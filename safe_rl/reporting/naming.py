@@ -5,19 +5,36 @@ from __future__ import annotations
 from collections import defaultdict
 from collections.abc import Hashable, Iterable, Mapping, Sequence
 from pathlib import Path
+from typing import NamedTuple
 
 from safe_rl.reporting.origins import Origin, source_of_seeds
 from safe_rl.reporting.recorded import Run, clean
-from safe_rl.runs.identity import experiment_of, flatten
+from safe_rl.runs.identity import Role, experiment_of, flatten, role_of
 from safe_rl.scores.benchmark import Suite
 from safe_rl.scores.published import ALGORITHMS
 
-__all__ = ["algorithm_names", "distinguishing_keys", "environment_names"]
+__all__ = ["Named", "algorithm_names", "distinguishing_keys", "environment_names", "title_of"]
 
 Settings = dict[str, Hashable]
 
 # keys in a name, and letters of a name: beyond, a name is cut off and numbered
 _MOST_KEYS, _LONGEST_NAME, _LONGEST_VALUE = 12, 240, 60
+# from how many differing keys on a name has only as many as it takes, and these
+_MANY_KEYS = 3
+_ALWAYS_NAMED = ("preset", "init_from", "frames", "cost_limits", "risk")
+# of those that the paper does not name; where there is none, the file in conf/algo is its name
+_TITLES = {
+    **{name: name.upper() for name in ("crpo", "cup", "focops", "ipo", "p3o", "pcpo", "rcpo")},
+    **{"c_trpo": "C-TRPO", "sac": "SAC", "td3": "TD3"},
+    **{"sac_lagrangian": "SAC-Lagrangian", "td3_lagrangian": "TD3-Lagrangian"},
+}
+
+
+class Named(NamedTuple):
+    """A name, and all settings that differ among namesakes if not all of them are in it."""
+
+    name: str
+    settings: str
 
 
 def environment_names(runs: Sequence[Run], suite: Suite) -> dict[Path, str]:
@@ -47,11 +64,25 @@ def algorithm_names(
     environments: Mapping[Path, str],
     origins: Mapping[Path, Origin],
     root: Path,
-) -> dict[Path, str]:
-    """Folder -> name of the algorithm, with the settings that tell it from its namesakes."""
-    titles, settings = {}, {}
+    *,
+    but_for: str = "",
+) -> dict[Path, Named]:
+    """Folder -> name of the algorithm, with the settings that tell it from its namesakes.
+
+    Where many settings differ, as few are in the name as tell all apart.
+
+    Args:
+        runs: Runs of any algorithms.
+        environments: Folder -> name of the environment.
+        origins: Folder -> what the run started from.
+        root: Folder of all runs.
+        but_for: A group of settings that is to tell nothing apart.
+    """
+    titles, settings, differing = {}, {}, {}
     for run in runs:
-        settings[run.directory] = _learning_settings(run, origins.get(run.directory), root)
+        own = _learning_settings(run, origins.get(run.directory), root)
+        kept = {key: value for key, value in own.items() if key.partition(".")[0] != but_for}
+        settings[run.directory] = kept
     for algorithm in {run.algorithm for run in runs}:
         members = [run.directory for run in runs if run.algorithm == algorithm]
         cells: dict[str, list[Settings]] = defaultdict(list)
@@ -60,17 +91,53 @@ def algorithm_names(
         # an experiment may train longer on one environment than on another
         anywhere = [{**settings[member], "frames": None} for member in members]
         keys = distinguishing_keys([*cells.values(), anywhere])
+        short = _enough(keys, [settings[member] for member in members])
         for member in members:
             own = {key: settings[member].get(key) for key in keys}
             known = {key: value for key, value in own.items() if value is not None}
+            named = {key: value for key, value in known.items() if key in short}
             settings[member] = {"algo": algorithm, **own}
-            titles[member] = clean(ALGORITHMS.get(algorithm, algorithm), 80) + _in_brackets(known)
-    return _unique(titles, settings)
+            titles[member] = clean(title_of(algorithm), 80) + _in_brackets(named)
+            differing[member] = _in_brackets(known)[2:-1] if len(known) > len(named) else ""
+    names = _unique(titles, settings)
+    return {place: Named(name, differing[place]) for place, name in names.items()}
+
+
+def _enough(keys: Sequence[str], members: Sequence[Settings]) -> set[str]:
+    """As few of the keys as tell all apart that differ in any, where it would be many.
+
+    What a reader looks for in a name stays in it.
+    """
+    kept = [k for k in keys if k.partition(".")[0] in _ALWAYS_NAMED]
+
+    def groups(names: Sequence[str]) -> int:
+        return len({tuple(member.get(name) for name in names) for member in members})
+
+    while len(keys) > _MANY_KEYS and groups(kept) < groups(keys):
+        left = [key for key in keys if key not in kept]
+        kept.append(max(left, key=lambda key: groups([*kept, key])))
+    return set(keys) if len(keys) <= _MANY_KEYS else set(kept)
+
+
+def title_of(algorithm: str) -> str:
+    """How the field writes the name of an algorithm.
+
+    Examples:
+        >>> title_of("c_trpo"), title_of("sac_lagrangian"), title_of("mine")
+        ('C-TRPO', 'SAC-Lagrangian', 'mine')
+    """
+    return ALGORITHMS.get(algorithm) or _TITLES.get(algorithm, algorithm)
 
 
 def _learning_settings(run: Run, origin: Origin | None, root: Path) -> Settings:
     named = experiment_of(run.config).items()
     settings = {key: value for key, value in named if key.partition(".")[0] != "env"}
+    # what only says again how long the run is
+    settings = {
+        key: value
+        for key, value in settings.items()
+        if key == "frames" or role_of(key) is not Role.LENGTH or value != settings.get("frames")
+    }
     if run.init_from is not None:
         settings["init_from"] = source_of_seeds(run, origin, root)
     # what is as the preset has it for the robot, and so as on another robot, tells nothing apart

@@ -1,4 +1,4 @@
-"""Pictures of experiments: the paper's Figures 7 to 9, and returns against costs."""
+"""Pictures of experiments: the paper's Figures 7 to 9, and what all pictures share."""
 
 from __future__ import annotations
 
@@ -8,25 +8,22 @@ from pathlib import Path
 from textwrap import fill
 from typing import Any, NamedTuple
 
-import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter, MaxNLocator
 
 from safe_rl.reporting.averages import average
-from safe_rl.reporting.columns import Record
 from safe_rl.reporting.experiments import Experiment, cost_keys_of
 from safe_rl.reporting.recorded import clean
 from safe_rl.runs.curves import point_marker
 from safe_rl.runs.files import replacing
-from safe_rl.scores.comparisons import pareto_front
 from safe_rl.scores.published import ALGORITHMS
 
 __all__ = [
     *("LIMIT_STYLE", "ROW_HEIGHT", "WIDTH", "Style", "add_legend", "algorithm_styles"),
-    *("draw_experiment", "draw_fronts", "draw_learning_curves", "drawn_keys", "limits_of"),
-    *("literal", "save", "set_axes"),
+    *("draw_experiment", "draw_learning_curves", "drawn_keys", "limits_of", "literal", "save"),
+    *("set_axes", "set_grid"),
 ]
 
 # Okabe and Ito's palette, which people with colour-blindness can read.
@@ -43,7 +40,6 @@ _LINES: tuple[tuple[Any, Any], ...] = (
     ("-", ":"), ("-.", (0, (1, 4))), ((0, (8, 2)), (0, (3, 3))),
     ((0, (8, 2, 1, 2, 1, 2)), (0, (1, 1, 1, 6))),
 )  # fmt: skip
-_MARKERS = "osD^vP"
 _DPI = 130
 LIMIT_STYLE: dict[str, Any] = {"color": "#c00000", "linestyle": "--", "linewidth": 1.1}
 """How limits are drawn."""
@@ -183,7 +179,7 @@ def set_axes(axes: Sequence[Axes]) -> None:
     for axis in axes:
         axis.xaxis.set_major_formatter(EngFormatter(sep=""))
         axis.xaxis.set_major_locator(MaxNLocator(6))
-        _clear(axis)
+        set_grid(axis)
         axis.set_xlim(left=0)
     for axis in axes[1:]:
         # with zero among the data, the margin above them is a share of their height
@@ -192,7 +188,8 @@ def set_axes(axes: Sequence[Axes]) -> None:
         axis.set_ylim(bottom=0)
 
 
-def _clear(axis: Axes) -> None:
+def set_grid(axis: Axes) -> None:
+    """Faint lines behind a panel, and no frame above and to the right of it."""
     axis.grid(alpha=0.25)
     axis.spines[["top", "right"]].set_visible(False)
 
@@ -220,47 +217,6 @@ def add_legend(figure: Figure, axes: Iterable[Axes]) -> None:
             break
         legend.remove()
     figure.set_figheight(figure.get_figheight() + size.height / figure.dpi)
-
-
-def draw_fronts(records: Sequence[Record], styles: Mapping[str, Style]) -> Figure:
-    """Draw final returns against final costs, a panel per environment.
-
-    A point is an experiment, with the standard deviations over its seeds; its limit, a vertical
-    line, tells experiments of one algorithm apart. The grey line joins those that no other one
-    beats in both.
-
-    Args:
-        records: Final scores, see :func:`safe_rl.reporting.scoring.final_record`.
-        styles: Name of an algorithm -> how it is drawn.
-    """
-    environments = list(dict.fromkeys(record["environment"] for record in records))
-    columns = min(3, len(environments))
-    rows = -(-len(environments) // columns)
-    figure = Figure(figsize=(WIDTH, 3.4 * rows + 0.3), layout="constrained")
-    panels = figure.subplots(rows, columns, squeeze=False).ravel()
-    for axis, environment in zip(panels, environments, strict=False):
-        own = [r for r in records if r["environment"] == environment]
-        points = np.array([(r["episode_cost"], r["episode_return"]) for r in own])
-        front = points[pareto_front(points[:, 1], points[:, 0])]
-        axis.plot(*front.T, color="0.6", linewidth=1, zorder=1, drawstyle="steps-post")
-        limits = sorted({r["limit_cost"] for r in own if "limit_cost" in r})
-        for record, (cost, value) in zip(own, points, strict=True):
-            limit = record.get("limit_cost")
-            marker = "x" if limit is None else _MARKERS[limits.index(limit) % len(_MARKERS)]
-            axis.errorbar(
-                cost, value, xerr=record["episode_cost_std"], yerr=record["episode_return_std"],
-                color=styles[record["algorithm"]].colour, marker=marker, markersize=7,
-                linestyle="", elinewidth=1, label=literal(record["algorithm"]),
-            )  # fmt: skip
-        for limit in limits:
-            axis.axvline(limit, **LIMIT_STYLE)
-        axis.set_title(literal(fill(environment, 44)), fontsize=10, fontweight="bold")
-        axis.set(xlabel="final episode cost", ylabel="final return")
-        _clear(axis)
-    for axis in panels[len(environments) :]:
-        axis.set_axis_off()
-    add_legend(figure, panels)
-    return figure
 
 
 def save(figure: Figure, path: Path) -> Path:

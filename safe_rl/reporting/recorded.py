@@ -88,6 +88,16 @@ class Run:
         return int(self.table["steps"][-1])
 
     @property
+    def length(self) -> int:
+        """Environment steps that it was meant to take; of an unfinished run, those it has taken.
+
+        A run ends with a whole batch, some steps later, which is no longer training than that of
+        another one with smaller batches.
+        """
+        meant = self.config["frames"]
+        return int(meant) if 0 < meant <= self.steps else self.steps
+
+    @property
     def is_finished(self) -> bool:
         """Whether it has come to its end."""
         return self.steps >= self.frames

@@ -40,8 +40,9 @@ def final_record(experiment: Experiment, cost_keys: Sequence[str]) -> dict[str, 
     record: dict[str, Any] = {
         "environment": experiment.environment,
         "algorithm": experiment.algorithm,
+        "family": experiment.family or experiment.algorithm,
         "seeds": len(runs),
-        "steps": max(run.steps for run in runs),
+        "steps": max(run.length for run in runs),
         "hours": float(np.mean([run.hours for run in runs])),
     }
     record |= _over_seeds([run.final(cost_keys) for run in runs])
@@ -142,8 +143,12 @@ def _measure_note(record: Record, key: str) -> str:
     )
 
 
-def learning_table(experiments: Sequence[Experiment]) -> Table | None:
+def learning_table(experiments: Sequence[Experiment], good: float = 0.5) -> Table | None:
     """What learning has cost on one environment, and when it came to something.
+
+    Args:
+        experiments: All on the environment.
+        good: Share of a return, the published PPO's or the best here, from which on one is good.
 
     Returns:
         The table, or None if nothing on it has a limit.
@@ -156,7 +161,7 @@ def learning_table(experiments: Sequence[Experiment]) -> Table | None:
     finals = [[run.final([])["episode_return"] for run in e.finished] for e in experiments]
     reference = experiments[0].reference
     whose = "the final return of the best here" if reference is None else "the published PPO's"
-    least = 0.5 * (max(map(mean, finals)) if reference is None else reference.episode_return)
+    least = good * (max(map(mean, finals)) if reference is None else reference.episode_return)
     records = []
     for experiment in experiments:
         figures = [_learning_figures(run, least) for run in experiment.finished]
@@ -166,6 +171,7 @@ def learning_table(experiments: Sequence[Experiment]) -> Table | None:
                 "environment": environment,
                 "algorithm": experiment.algorithm,
                 "seeds": len(figures),
+                "hours": mean(run.hours for run in experiment.finished),
                 "seeds_good": reached,
                 **_over_seeds(figures),
             }
@@ -179,13 +185,14 @@ def learning_table(experiments: Sequence[Experiment]) -> Table | None:
             Column(f"longest streak{suffix}", ("{:.0f}", f"streak_{key}")),
         ]
     columns += [
-        Column("good after", ("{:,.0f} steps", "good_steps")),
-        Column("and", ("{:.2f} h", "good_hours")),
-        Column("in", ("{:d} of {:d} seeds", "seeds_good", "seeds")),
+        Column("steps until good", ("{:,.0f}", "good_steps")),
+        Column("hours until good", ("{:.2f}", "good_hours")),
+        Column("hours in all", ("{:.2f}", "hours")),
+        Column("good seeds", ("{:d} of {:d}", "seeds_good", "seeds")),
     ]
     note = (
-        f"Good: $J_r$ at least {least:.4g}, half of {whose}, and every $J_c$ within its limit, "
-        "over five epochs; mean over the seeds that came to it."
+        f"Good: $J_r$ at least {least:.4g}, {good:.0%} of {whose}, and every $J_c$ within its "
+        "limit, over five epochs; steps and hours are means over the seeds that came to it."
     )
     return Table(stem("learning", environment), environment, columns, records, note)
 

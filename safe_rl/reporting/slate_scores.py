@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from itertools import permutations
+from itertools import combinations
 from typing import Any
 
 import numpy as np
@@ -23,7 +23,7 @@ from safe_rl.scores.published import PUBLISHED, PUBLISHED_STEPS, Normalised
 from safe_rl.scores.slates import SLATES
 
 __all__ = [
-    *("SYMBOLS", "Aggregate", "aggregate", "can_be_normalised", "improvement_table"),
+    *("SYMBOLS", "Aggregate", "aggregate", "can_be_normalised", "improvement_table", "lengths"),
     *("middle_table", "normalised_scores", "slate_table", "title_of"),
 ]
 
@@ -111,7 +111,7 @@ def aggregate(experiments: Sequence[Experiment]) -> Aggregate:
         first.algorithm,
         first.runs[0].algorithm if all(e.has_published_limit for e in experiments) else "",
         {name: [score[name] for score in scores] for name in Normalised._fields},
-        tuple(max(run.steps for run in e.finished) for e in experiments),
+        tuple(max(run.length for run in e.finished) for e in experiments),
     )
 
 
@@ -198,24 +198,57 @@ def _relations(aggregates: Sequence[Aggregate]) -> str:
     return " ".join(parts)
 
 
-def middle_table(slate: str, aggregates: Sequence[Aggregate]) -> Table:
-    """Interquartile means over all runs with their intervals."""
+def lengths(aggregates: Sequence[Aggregate]) -> dict[str, list[Aggregate]]:
+    """What can be compared: aggregates by how long they were trained, in words.
+
+    The words are empty where all were trained for equally many steps.
+    """
+    groups: dict[tuple[int, ...], list[Aggregate]] = {}
+    for one in sorted(aggregates, key=lambda one: one.steps):
+        groups.setdefault(one.steps, []).append(one)
+    if len(groups) == 1:
+        return {"": list(aggregates)}
+    return {f", {_span(steps)} steps": members for steps, members in groups.items()}
+
+
+def _span(steps: Sequence[int]) -> str:
+    fewest, most = min(steps), max(steps)
+    return f"{fewest:,}" if fewest == most else f"{fewest:,} to {most:,}"
+
+
+def middle_table(slate: str, aggregates: Sequence[Aggregate], after: str = "") -> Table:
+    """Interquartile means over all runs with their intervals.
+
+    Args:
+        slate: Its name.
+        aggregates: One per algorithm.
+        after: How long they were trained, see :func:`lengths`.
+    """
     records = []
     for one in aggregates:
-        record: dict[str, Any] = {"slate": slate, "algorithm": one.algorithm, "runs": one.num_runs}
+        record: dict[str, Any] = {
+            "slate": slate, "algorithm": one.algorithm, "runs": one.num_runs,
+            "fewest_steps": min(one.steps), "most_steps": max(one.steps),
+        }  # fmt: skip
         for name in SYMBOLS:
             value, low, high = one.middle(name)
             record |= {name: value, f"{name}_low": low, f"{name}_high": high}
         records.append(record)
     columns = [Column("algorithm", ("{}", "algorithm"))]
     columns += [Column(f"IQM {s}", *interval(name, 3)) for name, s in SYMBOLS.items()]
-    return Table(f"slate_{slate}_iqm", f"{title_of(slate)}, interquartile means", columns, records)
+    title = f"{title_of(slate)}, interquartile means{after}"
+    return Table(f"slate_{slate}_iqm", title, columns, records)
 
 
 def improvement_table(slate: str, aggregates: Sequence[Aggregate]) -> Table:
-    """How likely a run of one algorithm is better than one of another, in each score."""
+    """How likely a run of one algorithm is better than one of another, in each score.
+
+    Pairs that were trained for equally many steps, each once; two single runs have no probability.
+    """
     records = []
-    for first, second in permutations(aggregates, 2):
+    for first, second in combinations(aggregates, 2):
+        if first.steps != second.steps or max(first.num_runs, second.num_runs) == 1:
+            continue
         record: dict[str, Any] = {
             "slate": slate, "algorithm": first.algorithm, "other": second.algorithm,
         }  # fmt: skip
@@ -228,4 +261,5 @@ def improvement_table(slate: str, aggregates: Sequence[Aggregate]) -> Table:
     titles = zip(SYMBOLS, ("higher", "lower", "lower"), strict=True)
     columns += [Column(f"{how} {SYMBOLS[name]}", *interval(name, 2)) for name, how in titles]
     title = f"{title_of(slate)}, probability of improvement"
-    return Table(f"slate_{slate}_improvement", title, columns, records)
+    note = "Each pair once: the other way round it is one minus the number."
+    return Table(f"slate_{slate}_improvement", title, columns, records, note)

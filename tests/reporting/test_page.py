@@ -111,7 +111,7 @@ def test_page_and_markdown_say_the_same(report):
     for heading in page.headings[1:]:
         assert heading in text
     # a row of the table of final scores, and one of an evaluation
-    (row,) = (r for r in page.rows if r[:2] == ["PPO", "2"] and len(r) == 9)
+    (row,) = (r for r in page.rows if r[:3] == ["PPO", "2", "3,000"] and len(r) == 9)
     assert row[2:7] == ["3,000", "2.00 ± 0.00", "55.5 ± 0.7▲", "25", "0.0400 ± 0.0000"]
     assert "| PPO | 2 | 3,000 | 2.00 ± 0.00 | 55.5 ± 0.7 ▲ | 25 | 0.0400 ± 0.0000 |" in text
     (row,) = (r for r in page.rows if "mean actions, x=1, 0% known layouts" in r)
@@ -235,7 +235,12 @@ def test_slates_that_all_share_are_averaged(tmp_path, capsys):
 
 @pytest.mark.parametrize(
     ("arguments", "message"),
-    [(["sedes=1"], "'seeds'"), (["seeds=0"], "at least one run"), (["seeds=two"], "'seeds'")],
+    [
+        (["sedes=1"], "'seeds'"),
+        (["seeds=0"], "at least one run"),
+        (["seeds=two"], "'seeds'"),
+        (["good=0"], "for half"),
+    ],
 )
 def test_what_cannot_be_done_ends_in_one_line(tmp_path, arguments, message, capsys):
     write_run(tmp_path)

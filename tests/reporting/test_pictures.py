@@ -5,10 +5,10 @@ import pytest
 from matplotlib.figure import Figure
 from synthetic import experiments_in, write_run
 
+from safe_rl.reporting.fronts import draw_fronts
 from safe_rl.reporting.pictures import (
     add_legend,
     algorithm_styles,
-    draw_fronts,
     draw_learning_curves,
     save,
 )
@@ -112,10 +112,29 @@ def test_the_front_joins_what_no_other_one_beats(tmp_path):
     assert list(zip(*front.get_data(), strict=True)) == [(8.0, 3.0), (20.0, 10.0), (60.0, 20.0)]
     limits = sorted(line.get_xdata()[0] for line in axis.lines if line.get_linestyle() == "--")
     assert limits == [9.0, 25.0]
-    # experiments of another limit have another sign
+    # experiments of another limit have another sign, which is explained
     points = [c[0] for c in axis.containers]
-    assert len({(p.get_xdata()[0], p.get_marker()) for p in points}) == 4
-    assert len({p.get_marker() for p in points}) == 2
+    marks = {p.get_xdata()[0]: p.get_marker() for p in points}
+    assert len(marks) == 4
+    assert marks[20.0] == marks[40.0] == marks[60.0] != marks[8.0]
+    names = {line.get_label(): line.get_marker() for line in axis.lines}
+    assert (names["limit 25"], names["limit 9"]) == (marks[20.0], marks[8.0])
+    # one algorithm under two limits is one line, from the lower to the higher
+    (line,) = [line for line in axis.lines if line.get_label() == "CPO"]
+    assert list(zip(*line.get_data(), strict=True)) == [(8.0, 3.0), (20.0, 10.0)]
+
+
+def test_fronts_join_nothing_that_was_trained_for_longer(tmp_path):
+    for algo, epochs in (("ppo", 1), ("cpo", 1), ("trpo", 3), ("ppo_lagrangian", 3), ("mine", 9)):
+        rows = {name: [1.0] * epochs for name in ("returns", "costs", "rates")}
+        write_run(tmp_path, algo=algo, **rows, limits={} if algo == "ppo" else None)
+    experiments = experiments_in(tmp_path)
+    figure = draw_fronts(final_table(experiments).records, algorithm_styles(experiments))
+    shown = {axis.get_title(): axis for axis in figure.axes if axis.get_title()}
+    assert list(shown) == ["PointGoal1, 1,000 steps", "PointGoal1, 3,000 steps"]
+    assert len(shown["PointGoal1, 1,000 steps"].containers) == 2
+    labels = shown["PointGoal1, 1,000 steps"].get_legend_handles_labels()[1]
+    assert labels == ["PPO", "CPO", "no limit", "limit 25"]
 
 
 def test_a_single_epoch_is_drawn_as_a_point(tmp_path):

@@ -6,6 +6,7 @@ import os
 import pytest
 from synthetic import grouped, write_run
 
+from safe_rl.reporting.inventory import variant_table
 from safe_rl.reporting.naming import distinguishing_keys
 from safe_rl.reporting.recorded import find_runs
 
@@ -150,7 +151,7 @@ def test_seeds_that_start_from_checkpoints_of_seeds_are_one_experiment(tmp_path)
     ]
 
 
-def test_what_differs_between_environments_is_named_in_full(tmp_path):
+def test_what_differs_between_environments_is_said_in_full(tmp_path):
     lagrangian = {"_target_": "a.PIDMultiplier", "ki": 0.1}
     write_run(tmp_path, "PointGoal1", num_envs=20, frames_per_batch=20, lagrangian=lagrangian)
     write_run(
@@ -159,16 +160,34 @@ def test_what_differs_between_environments_is_named_in_full(tmp_path):
     )  # fmt: skip
     other = {"num_envs": 4, "frames_per_batch": 40, "lagrangian": {**lagrangian, "ki": 0.2}}
     write_run(tmp_path, "DoggoGoal1", **other, tail=0.1, init_from="runs/x/seed0")
-    found = {environment: name for environment, name, _ in names(grouped(tmp_path)[0])}
+    experiments, _ = grouped(tmp_path)
     pid = "lagrangian=PIDMultiplier"
-    assert found == {
-        "PointGoal1": "PPO (frames_per_batch=20, num_envs=20, "
-                      f"cost ≤ 25, {pid}, lagrangian.ki=0.1)",
-        "CarGoal1": "PPO (frames_per_batch=40, num_envs=4, cost_hazards ≤ 10, "
-                    "lagrangian=LagrangeMultiplier)",
-        "DoggoGoal1": "PPO (frames_per_batch=40, init_from=runs/x, num_envs=4, tail=0.1, "
-                      f"cost ≤ 25, {pid}, lagrangian.ki=0.2)",
+    assert {e.environment: e.settings for e in experiments} == {
+        "PointGoal1": f"frames_per_batch=20, num_envs=20, cost ≤ 25, {pid}, lagrangian.ki=0.1",
+        "CarGoal1": "frames_per_batch=40, num_envs=4, cost_hazards ≤ 10, "
+                    "lagrangian=LagrangeMultiplier",
+        "DoggoGoal1": "frames_per_batch=40, init_from=runs/x, num_envs=4, tail=0.1, "
+                      f"cost ≤ 25, {pid}, lagrangian.ki=0.2",
     }  # fmt: skip
+    # in names, limits and origins, which tell all of these apart
+    assert {e.environment: e.algorithm for e in experiments} == {
+        "PointGoal1": "PPO (cost ≤ 25)",
+        "CarGoal1": "PPO (cost_hazards ≤ 10)",
+        "DoggoGoal1": "PPO (init_from=runs/x, cost ≤ 25)",
+    }
+    table = variant_table(experiments)
+    assert [record["settings"] for record in table.records] == [e.settings for e in experiments]
+
+
+def test_names_have_as_many_settings_as_it_takes(tmp_path):
+    # two numbers tell apart what differs in five; neither of them does alone
+    for number, (a, b) in enumerate(((1, 1), (1, 2), (2, 1), (2, 2))):
+        own = {"loss": {"a": a, "b": b, "c": a, "d": b, "e": 1 if a == b == 1 else 2}}
+        write_run(tmp_path, algo="mine", folder=str(number), **own)
+    experiments, _ = grouped(tmp_path)
+    found = sorted(e.algorithm for e in experiments)
+    assert found == [f"mine (loss.a={a}, loss.b={b})" for a in (1, 2) for b in (1, 2)]
+    assert "loss.a=1, loss.b=2, loss.c=1, loss.d=2, loss.e=2" in {e.settings for e in experiments}
 
 
 def test_what_a_preset_holds_for_every_robot_tells_nothing_apart(tmp_path):
@@ -181,6 +200,28 @@ def test_what_a_preset_holds_for_every_robot_tells_nothing_apart(tmp_path):
     found = {environment: name for environment, name, _ in names(grouped(tmp_path)[0])}
     assert found["DoggoGoal2"] == "CPO (num_envs=30)"
     assert {name for env, name in found.items() if env != "DoggoGoal2"} == {"CPO"}
+
+
+def test_how_long_a_run_is_is_said_once(tmp_path):
+    for env, frames in (("PointGoal1", 2000), ("DoggoGoal1", 1000)):
+        write_run(tmp_path, env, "cpo", frames=frames, paper={})
+    for directory in tmp_path.glob("*/cpo/*"):
+        path = directory / "config.yaml"
+        frames = 2000 if "Point" in str(directory) else 1000
+        path.write_text(path.read_text() + f"limits: {{frames: {frames}}}\n")
+    assert {name for _, name, _ in names(grouped(tmp_path)[0])} == {"CPO"}
+
+
+def test_an_algorithm_under_several_limits_is_one_family(tmp_path):
+    for limit in (10.0, 25.0):
+        write_run(tmp_path, algo="c_trpo", limits={"cost": limit}, folder=f"{limit}")
+    write_run(tmp_path, algo="c_trpo", preset="paper", folder="paper")
+    experiments, _ = grouped(tmp_path)
+    assert [(e.algorithm, e.family) for e in experiments] == [
+        ("C-TRPO (preset=default, cost ≤ 10)", "C-TRPO (preset=default)"),
+        ("C-TRPO (preset=default, cost ≤ 25)", "C-TRPO (preset=default)"),
+        ("C-TRPO (preset=paper, cost ≤ 25)", "C-TRPO (preset=paper)"),
+    ]
 
 
 def test_the_preset_stands_for_what_follows_from_it():

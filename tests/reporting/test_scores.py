@@ -21,6 +21,7 @@ from safe_rl.reporting.slate_scores import (
     aggregate,
     can_be_normalised,
     improvement_table,
+    lengths,
     middle_table,
     slate_table,
 )
@@ -373,6 +374,13 @@ def test_what_learning_cost_is_counted_over_all_of_training(tmp_path):
     assert record["good_hours"] == pytest.approx(record["good_steps"] / 1000 * 3.6 / 3600)
     assert (record["seeds"], record["seeds_good"]) == (2, 1)
     assert f"{reference / 2:.4g}" in table.note
+    assert table.records[0]["hours"] == pytest.approx(7 * 3.6 / 3600)
+    # of less, both seeds have enough; of more, none
+    (modest,), (ambitious,) = (
+        learning_table(experiments_in(tmp_path), good).records for good in (0.1, 0.9)
+    )
+    assert (modest["seeds_good"], ambitious["seeds_good"]) == (2, 0)
+    assert "good_steps" not in ambitious
 
 
 def test_without_a_limit_learning_costs_nothing_to_speak_of(tmp_path):
@@ -386,6 +394,38 @@ def test_improvement_is_a_probability_per_score(tmp_path):
             write_run(tmp_path, algo=algo, seed=seed, returns=[value], costs=[cost])
     table = improvement_table("x", [aggregate([e]) for e in experiments_in(tmp_path)])
     found = {r["algorithm"]: (r["episode_return"], r["violation"]) for r in table.records}
-    assert found == {"PPO": (1.0, 0.0), "CPO": (0.0, 1.0)}
-    # the cost rates are equal
+    # each pair once; the cost rates are equal
+    assert found == {"PPO": (1.0, 0.0)}
     assert {r["cost_rate"] for r in table.records} == {0.5}
+
+
+def test_what_was_trained_for_longer_is_compared_apart(tmp_path):
+    for algo, epochs in (("ppo", 1), ("cpo", 1), ("trpo", 30), ("mine", 30)):
+        for seed in (0, 10):
+            rows = {name: [value + seed] * epochs for name, value in
+                    (("returns", 3.0), ("costs", 20.0), ("rates", 0.1))}  # fmt: skip
+            write_run(tmp_path, algo=algo, seed=seed, **rows)
+    everything = [aggregate([e]) for e in experiments_in(tmp_path)]
+    groups = {after: [a.algorithm for a in own] for after, own in lengths(everything).items()}
+    assert groups == {", 1,000 steps": ["PPO", "CPO"], ", 30,000 steps": ["TRPO", "mine"]}
+    assert list(lengths(everything[:1])) == [""]
+    pairs = [(r["algorithm"], r["other"]) for r in improvement_table("x", everything).records]
+    assert pairs == [("PPO", "CPO"), ("TRPO", "mine")]
+    report = build_report(tmp_path, SUITE, seeds_needed=2, unfinished=False)
+    shown = {b.shows for s in report.sections for b in s.blocks if hasattr(b, "shows")}
+    for steps, names in (("1,000", "PPO, CPO"), ("30,000", "TRPO, mine")):
+        whole = f"What all algorithms were trained on, {steps} steps, {names}"
+        assert f"Share of runs above every score: {whole}" in shown
+    assert any("PointGoal1, 1,000 steps: PPO, CPO; PointGoal1, 30,000" in says for says in shown)
+
+
+def test_steps_beyond_the_end_of_training_are_no_longer_training(tmp_path):
+    # batches of 1000 and of 750 steps, until there are at least 2500
+    for algo, epochs, frames in (("ppo", 3, 2500), ("cpo", 4, 2500), ("trpo", 2, 2500)):
+        rows = {name: [1.0] * epochs for name in ("returns", "costs", "rates")}
+        write_run(tmp_path, algo=algo, **rows, frames=frames)
+    by_name = {e.algorithm: e.runs[0] for e in experiments_in(tmp_path)}
+    assert {name: run.length for name, run in by_name.items()} == {
+        "PPO": 2500, "CPO": 2500, "TRPO": 2000,
+    }  # fmt: skip
+    assert by_name["CPO"].steps == 4000
