@@ -11,9 +11,10 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parents[1]
 PAGES, RESULTS = ROOT / "docs" / "algorithms", ROOT / "results" / "algorithms"
 LIMIT, FRAMES, QUARTER = 25.0, 1_000_000, 250_000
+ENVIRONMENTS = ("PointGoal1", "CarGoal1")
 
 
-def _runs(algo: str, env: str = "PointGoal1") -> dict[int, list[dict[str, float]]]:
+def _runs(algo: str, env: str) -> dict[int, list[dict[str, float]]]:
     """Rows of the recorded tables by seed, numbers only, of runs that came to their end."""
     found = {}
     for path in sorted((RESULTS / env / algo).glob("seed*/progress.csv.gz")):
@@ -38,17 +39,30 @@ def _part_of(rows: list[dict[str, float]], start: int, end: int) -> dict[str, fl
     }
 
 
-def _command(algo: str, seeds: str, env: str = "PointGoal1") -> str:
+def _command(algo: str, seeds: str, env: str) -> str:
     return f"`python train.py -m env={env} algo={algo} seed={seeds} frames=1_000_000`"
 
 
 def measured(algo: str) -> str:
     """What an algorithm's page says of its runs."""
-    runs = _runs(algo)
+    runs = {env: found for env in ENVIRONMENTS if (found := _runs(algo, env))}
     if not runs:
-        return f"Not yet: {_command(algo, '300,301,302')} is what the comparison is made of."
+        command = _command(algo, "300,301,302", ENVIRONMENTS[0])
+        return f"Not yet: {command} is what the comparison is made of."
+    tables = "\n\n".join(_quarters(algo, env, found) for env, found in runs.items())
+    picture = PAGES / f"{algo}.png"
+    shown = f"\n\n![Learning curves]({picture.name})" if picture.exists() else ""
+    return f"""Limit 25, `preset=default`, return / episode cost by quarters of the run
+([all algorithms](comparison.md)):
+
+{tables}{shown}"""
+
+
+def _quarters(algo: str, env: str, runs: dict[int, list[dict[str, float]]]) -> str:
+    """Table of the runs in one environment, a row per seed."""
     rows = [
-        "| seed | first | second | third | last | epochs of the last above the limit | $\\rho_c$ |",
+        f"| {env}, seed | first | second | third | last | epochs of the last above the limit "
+        "| $\\rho_c$ |",
         "|---|---|---|---|---|---|---|",
     ]
     for seed, table in runs.items():
@@ -56,24 +70,36 @@ def measured(algo: str) -> str:
         cells = [f"{part['return']:.1f} / {part['cost']:.0f}" for part in quarters]
         last = quarters[-1]
         rows.append(f"| {seed} | {' | '.join(cells)} | {last['above']:.0%} | {last['rate']:.3f} |")
-    table = "\n".join(rows)
-    command = _command(algo, ",".join(map(str, runs)))
-    picture = f"\n\n![Learning curves]({algo}.png)" if (PAGES / f"{algo}.png").exists() else ""
-    return f"""PointGoal1, limit 25, `preset=default`, return / episode cost by quarters of the run:
-
-{table}
-
-{command}; [all algorithms](comparison.md).{picture}"""
+    return "\n".join(rows) + "\n\n" + _command(algo, ",".join(map(str, runs)), env)
 
 
 def comparison(algorithms: Iterable[str]) -> str:
     """The page that compares all algorithms, a row each."""
+    names = list(algorithms)
+    tables = "\n\n".join(_compared(names, env) for env in ENVIRONMENTS)
+    return f"""# The algorithms compared
+
+Limit 25, one million steps, `preset=default`: means over the last quarter million steps of
+training, ± the standard deviation among seeds where there are several. A single seed is a
+direction, not a verdict. $\\rho_c$ is the cost per step of the whole run. Off-policy algorithms
+take about ten times as long for as many steps.
+
+{tables}
+
+Commands are on the page of each algorithm; tables of all epochs and the commits in
+[`results/algorithms/`](../../results/README.md).
+"""
+
+
+def _compared(algorithms: Iterable[str], env: str) -> str:
+    """Table of the algorithms in one environment, a row each."""
     rows = [
-        "| `algo=` | seeds | return | episode cost | epochs above 25 | $\\rho_c$ |",
+        f"| {env}, `algo=` | seeds | return | episode cost | epochs above 25 | $\\rho_c$ |",
         "|---|---|---|---|---|---|",
     ]
     for algo in algorithms:
-        parts = [_part_of(table, FRAMES - QUARTER, FRAMES) for table in _runs(algo).values()]
+        tables = _runs(algo, env).values()
+        parts = [_part_of(table, FRAMES - QUARTER, FRAMES) for table in tables]
         if not parts:
             rows.append(f"| [`{algo}`]({algo}.md) | 0 | not yet | | | |")
             continue
@@ -84,18 +110,7 @@ def comparison(algorithms: Iterable[str]) -> str:
             f"{statistics.fmean(part['rate'] for part in parts):.3f}",
         ]
         rows.append(f"| [`{algo}`]({algo}.md) | {len(parts)} | {' | '.join(cells)} |")
-    table = "\n".join(rows)
-    return f"""# The on-policy algorithms compared
-
-PointGoal1, limit 25, one million steps, `preset=default`: means over the last quarter million
-steps, ± the standard deviation among seeds where there are several. A single seed is a direction,
-not a verdict. $\\rho_c$ is the cost per step of the whole run.
-
-{table}
-
-Commands: {_command("…", "300,301,302")}. Tables of all epochs and the commits are in
-[`results/algorithms/`](../../results/README.md).
-"""
+    return "\n".join(rows)
 
 
 def _spread(values: list[float], digits: int) -> str:
