@@ -165,8 +165,8 @@ FLOORS = {
         ("",),
     ),
     "reporting": (
-        ("cleaning", "columns"),
-        ("measured",),
+        ("cleaning",),
+        ("columns", "measured"),
         ("recorded",),
         ("averages", "origins"),
         ("naming",),

@@ -11,11 +11,12 @@ from itertools import chain, zip_longest
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from safe_rl.reporting.cleaning import clean
 from safe_rl.runs.files import replacing
 
 __all__ = [
-    *("MISSING", "SYMBOL", "Cell", "Column", "Record", "Table", "escaped", "interval", "mark_best"),
-    *("power_of_ten", "spread"),
+    *("MISSING", "SYMBOL", "Cell", "Column", "Record", "Table", "each_cost", "escaped", "interval"),
+    *("mark_best", "power_of_ten", "spread"),
 ]
 
 MISSING = "—"
@@ -92,6 +93,41 @@ def interval(name: str, decimals: int) -> tuple[tuple[str, ...], ...]:
     return (f"{{:.{decimals}f}}", name), (ends, f"{name}_low", f"{name}_high")
 
 
+def each_cost(
+    keys: Sequence[str], fields: Mapping[str, str]
+) -> Callable[[Record], Sequence[Record]]:
+    """How a record is shown that has figures of several costs: as a row of each.
+
+    A column of each cost would make tables as wide as there are costs.
+
+    Args:
+        keys: Keys of the costs.
+        fields: Field of a row -> that of the record, with braces in place of the cost's key.
+
+    Examples:
+        >>> rows = each_cost(["a", "b", "c"], {"mean": "episode_{}"})
+        >>> for row in rows({"seed": 0, "episode_a": 1.0, "episode_c": 3.0}):
+        ...     print(row["seed"], row["of"], row["mean"])
+        0 a 1.0
+        0 c 3.0
+    """
+
+    def rows(record: Record) -> Sequence[Record]:
+        shown: list[Record] = []
+        for key in keys:
+            places = {name: place.format(key) for name, place in fields.items()}
+            own = {name: record[place] for name, place in places.items() if place in record}
+            if own:
+                shown.append({**record, "of": key, "named": clean(key, 40), **own})
+        return shown or [record]
+
+    return rows
+
+
+def _as_it_is(record: Record) -> Sequence[Record]:
+    return [record]
+
+
 @dataclass(frozen=True)
 class Table:
     """Records, and how they are shown.
@@ -100,8 +136,9 @@ class Table:
         name: Stem of the file.
         title: Its heading.
         columns: What is shown.
-        records: A row each; the CSV file holds all their fields, as numbers.
+        records: A row each as a rule; the CSV file holds all their fields, as numbers.
         note: Said below it.
+        shown_as: The rows of a record, see :func:`each_cost`.
 
     Examples:
         >>> table = Table("t", "A table", [Column("x", ("{:.2f}", "x"))], [{"x": 1.23456}])
@@ -116,12 +153,14 @@ class Table:
     columns: Sequence[Column]
     records: Sequence[Record]
     note: str = ""
+    shown_as: Callable[[Record], Sequence[Record]] = _as_it_is
 
     def rows(self) -> list[list[Cell]]:
         """What a reader sees."""
         return [
-            [Cell(c.title, c.text(record), c.mark(record), c.is_number) for c in self.columns]
+            [Cell(c.title, c.text(row), c.mark(row), c.is_number) for c in self.columns]
             for record in self.records
+            for row in self.shown_as(record)
         ]
 
     def markdown(self) -> str:

@@ -49,8 +49,8 @@ from safe_rl.scores.slates import SLATES
 
 __all__ = ["Block", "Drawing", "Film", "Report", "Section", "build_report"]
 
-# rows of a picture of learning curves, in environments
-_MOST_ROWS = 20
+# rows of a picture of learning curves, in environments: what a printed page holds
+_MOST_ROWS = 6
 _TEXTS = yaml.safe_load(files(__package__).joinpath("texts.yaml").read_text(encoding="utf-8"))
 
 

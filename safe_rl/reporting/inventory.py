@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from functools import partial
 from math import inf
 from pathlib import Path
 from typing import Any
 
-from safe_rl.reporting.columns import Column, Record, Table, interval
+from safe_rl.reporting.columns import Column, Record, Table, each_cost, interval
 from safe_rl.reporting.experiments import Experiment
 from safe_rl.reporting.recorded import Run, clean
 
@@ -91,21 +90,17 @@ def evaluation_table(experiments: Sequence[Experiment]) -> Table:
         Column("episodes", ("{:d}", "episodes")),
         Column("what", ("{}", "manner")),
         Column("$J_r$", *interval("episode_return", 2)),
+        *([Column("cost", ("{}", "named"))] if len(keys) > 1 else []),
+        Column("$J_c$", *interval("mean", 1), mark=_is_over),
+        Column("$d$", ("{:g}", "limit")),
+        Column("P($C$ > $d$)", ("{:.0%}", "over")),
+        Column("CVaR", ("{:.0%}: {:.1f}", "cvar_alpha", "cvar"), interval("cvar", 1)[1]),
     ]
-    for key in keys:
-        suffix = "" if len(keys) == 1 else f" [{clean(key, 40)}]"
-        tail = interval(f"cvar_{key}", 1)
-        columns += [
-            Column(f"$J_c${suffix}", *interval(f"episode_{key}", 1), mark=partial(_is_over, key)),
-            Column(f"$d${suffix}", ("{:g}", f"limit_{key}")),
-            Column(f"P($C$ > $d$){suffix}", ("{:.0%}", f"over_limit_{key}")),
-            Column(
-                f"CVaR of the cost{suffix}",
-                ("{:.0%}: {:.1f}", "cvar_alpha", f"cvar_{key}"),
-                tail[1],
-            ),
-        ]
-    return Table("evaluations", "Evaluations", columns, records)
+    fields = {"limit": "limit_{}", "over": "over_limit_{}"}
+    for end in ("", "_low", "_high"):
+        fields |= {f"mean{end}": f"episode_{{}}{end}", f"cvar{end}": f"cvar_{{}}{end}"}
+    shown = each_cost(keys, fields)
+    return Table("evaluations", "Evaluations", columns, records, shown_as=shown)
 
 
 def certificate_table(experiments: Sequence[Experiment]) -> Table:
@@ -124,14 +119,13 @@ def certificate_table(experiments: Sequence[Experiment]) -> Table:
         Column("certified", ("{}", "certified"), (" at {:.0%}", "level"), mark=_is_missing),
         Column("at", ("{:,} steps", "checkpoint")),
         Column("$J_r$", ("{:.2f}", "certified_return")),
+        Column("bound on", ("{}", "named")),
+        Column("is", ("{:.3g}", "bound")),
+        Column("limit", ("{:g}", "most")),
+        Column("episodes", ("{:d}", "episodes")),
     ]
-    for name in names:
-        columns += [
-            Column(f"{name} ≤", ("{:.3g}", f"bound_{name}")),
-            Column(f"wanted: {name} ≤", ("{:g}", f"most_{name}")),
-        ]
-    columns.append(Column("episodes", ("{:d}", "episodes")))
-    return Table("certificates", "Certificates", columns, records)
+    shown = each_cost(names, {"bound": "bound_{}", "most": "most_{}"})
+    return Table("certificates", "Certificates", columns, records, shown_as=shown)
 
 
 def _certificate_record(
@@ -174,11 +168,11 @@ def _evaluation_record(
     return record
 
 
-def _is_over(key: str, record: Record) -> str:
+def _is_over(row: Record) -> str:
     # of another measure than the mean these episodes do not say whether it keeps the limit
-    if key in record["other_measures"]:
+    if row.get("of") in row["other_measures"]:
         return ""
-    return "bad" if record.get(f"episode_{key}", 0.0) > record.get(f"limit_{key}", inf) else ""
+    return "bad" if row.get("mean", 0.0) > row.get("limit", inf) else ""
 
 
 def videos(experiments: Sequence[Experiment]) -> Iterator[tuple[str, Path]]:

@@ -215,4 +215,7 @@ def _text(value: Hashable) -> str:
         return {True: "true", False: "false", None: "null"}[value]
     if isinstance(value, tuple):
         return f"[{','.join(map(_text, value))}]"
-    return f"{value:g}" if isinstance(value, float) else str(value)
+    if isinstance(value, float):
+        return f"{value:g}"
+    # as Hydra takes it, too
+    return f"{value:_}" if isinstance(value, int) else str(value)

@@ -104,7 +104,7 @@ def draw_learning_curves(experiments: Sequence[Experiment], styles: Mapping[str,
         shown = [e for e in experiments if e.environment == environment]
         for experiment in shown:
             draw_experiment(experiment, key, axes, styles[experiment.algorithm])
-        name = literal(fill(environment.replace(" (", "\n("), 30, replace_whitespace=False))
+        name = literal(fill(environment.replace(" (", "\n("), 24, replace_whitespace=False))
         axes[0].set_ylabel(
             name if key == "cost" else f"{name}\n{literal(clean(key, 40))}", fontweight="bold"
         )

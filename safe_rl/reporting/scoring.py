@@ -3,14 +3,21 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from functools import partial
+from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
 from statistics import mean
 from typing import Any
 
 import numpy as np
 
-from safe_rl.reporting.columns import Column, Record, Table, mark_best, power_of_ten, spread
+from safe_rl.reporting.columns import (
+    Column,
+    Record,
+    Table,
+    each_cost,
+    mark_best,
+    power_of_ten,
+    spread,
+)
 from safe_rl.reporting.experiments import Experiment, cost_keys_of
 from safe_rl.reporting.recorded import Run, clean
 from safe_rl.runs.curves import moving_mean
@@ -31,6 +38,15 @@ from safe_rl.scores.published import (
 __all__ = ["dominance_table", "final_record", "final_table", "learning_table", "stem"]
 
 Records = list[dict[str, Any]]
+# of a cost: field of a row -> that of a record
+_FIGURES = {
+    **{"mean": "episode_{}", "mean_std": "episode_{}_std", "limit": "limit_{}"},
+    **{"rate": "{}_rate", "rate_std": "{}_rate_std", "excess": "excess_{}"},
+}
+_COURSE = {
+    **{"regret": "regret_{}", "regret_std": "regret_{}_std"},
+    **{"share_over": "share_over_{}", "streak": "streak_{}"},
+}
 IDENTITY = (Column("algorithm", ("{}", "algorithm")), Column("seeds", ("{:d}", "seeds")))
 
 
@@ -88,16 +104,12 @@ def final_table(experiments: Sequence[Experiment]) -> Table:
     columns = [
         *IDENTITY,
         Column("steps", ("{:,}", "steps")),
-        _marked("$J_r$", "episode_return", 2, records, max),
+        Column("$J_r$", *spread("episode_return", 2), mark=_best(records, "episode_return", max)),
+        *_which(cost_keys),
+        Column("$J_c$", *spread("mean", 1), mark=_is_over),
+        Column("$d$", ("{:g}", "limit")),
+        Column(r"$\rho_c$", *spread("rate", 4), mark=_best(records, "cost_rate", min)),
     ]
-    for key in cost_keys:
-        suffix = "" if len(cost_keys) == 1 else f" [{clean(key, 40)}]"
-        ranked = records if key == "cost" else []
-        columns += [
-            Column(f"$J_c${suffix}", *spread(f"episode_{key}", 1), mark=partial(_is_over, key)),
-            Column(f"$d${suffix}", ("{:g}", f"limit_{key}")),
-            _marked(rf"$\rho_c${suffix}", f"{key}_rate", 4, ranked, min),
-        ]
     if any("paper_episode_return" in record for record in records):
         steps = power_of_ten(PUBLISHED_STEPS[experiments[0].benchmark or ""])
         names = ("paper_episode_return", "paper_episode_cost", "paper_cost_rate")
@@ -111,7 +123,13 @@ def final_table(experiments: Sequence[Experiment]) -> Table:
         for record, experiment in zip(records, experiments, strict=True)
         for key in experiment.limits_of_other_measures
     ]
-    return Table(stem("final", environment), environment, columns, records, " ".join(notes))
+    shown = each_cost(cost_keys, _FIGURES)
+    return Table(stem("final", environment), environment, columns, records, " ".join(notes), shown)
+
+
+def _which(cost_keys: Sequence[str]) -> list[Column]:
+    """The column that says of which cost a row is, where there are several."""
+    return [Column("cost", ("{}", "named"))] if len(cost_keys) > 1 else []
 
 
 def stem(kind: str, environment: str) -> str:
@@ -119,18 +137,23 @@ def stem(kind: str, environment: str) -> str:
     return f"{kind}_{re.sub(r'[^A-Za-z0-9]+', '_', environment).strip('_')[:80]}"
 
 
-def _is_over(key: str, record: Record) -> str:
-    return "bad" if record.get(f"excess_{key}", 0.0) > 0 else ""
+def _is_over(row: Record) -> str:
+    return "bad" if row.get("excess", 0.0) > 0 else ""
 
 
-def _marked(
-    title: str, name: str, decimals: int, records: Sequence[Record], best: Callable[..., float]
-) -> Column:
-    """A column with a mark at the best among those that satisfy their constraints."""
-    mark = mark_best(
-        records, name, best, is_able=lambda r: r["satisfies"], steps=lambda r: r["steps"]
-    )
-    return Column(title, *spread(name, decimals), mark=mark)
+def _best(
+    records: Sequence[Record], name: str, best: Callable[..., float]
+) -> Callable[[Record], str]:
+    """Mark of the best among those that satisfy the same constraints after equally many steps."""
+    mark = mark_best(records, name, best, is_able=lambda r: r["satisfies"], steps=rivals)
+    # what single costs cost is not ranked
+    return lambda row: mark(row) if name == "episode_return" or row["of"] == "cost" else ""
+
+
+def rivals(record: Record) -> Hashable:
+    """What is equal in experiments that can be ranked: the length of training, and the limits."""
+    limits = {key: value for key, value in record.items() if key.startswith("limit_")}
+    return record["steps"], frozenset(limits.items())
 
 
 def _measure_note(record: Record, key: str) -> str:
@@ -176,15 +199,12 @@ def learning_table(experiments: Sequence[Experiment], good: float = 0.5) -> Tabl
                 **_over_seeds(figures),
             }
         )
-    columns = [*IDENTITY]
-    for key in keys:
-        suffix = "" if len(keys) == 1 else f" [{clean(key, 40)}]"
-        columns += [
-            Column(f"regret{suffix}", *spread(f"regret_{key}", 1)),
-            Column(f"epochs over{suffix}", ("{:.0%}", f"share_over_{key}")),
-            Column(f"longest streak{suffix}", ("{:.0f}", f"streak_{key}")),
-        ]
-    columns += [
+    columns = [
+        *IDENTITY,
+        *_which(keys),
+        Column("regret", *spread("regret", 1)),
+        Column("epochs over", ("{:.0%}", "share_over")),
+        Column("longest streak", ("{:.0f}", "streak")),
         Column("steps until good", ("{:,.0f}", "good_steps")),
         Column("hours until good", ("{:.2f}", "good_hours")),
         Column("hours in all", ("{:.2f}", "hours")),
@@ -194,7 +214,8 @@ def learning_table(experiments: Sequence[Experiment], good: float = 0.5) -> Tabl
         f"Good: $J_r$ at least {least:.4g}, {good:.0%} of {whose}, and every $J_c$ within its "
         "limit, over five epochs; steps and hours are means over the seeds that came to it."
     )
-    return Table(stem("learning", environment), environment, columns, records, note)
+    shown = each_cost(keys, _COURSE)
+    return Table(stem("learning", environment), environment, columns, records, note, shown)
 
 
 def _learning_figures(run: Run, least_return: float) -> dict[str, float | None]:
@@ -225,7 +246,7 @@ def dominance_table(records: Iterable[Record]) -> Table:
     for environment in dict.fromkeys(record["environment"] for record in records):
         agents = {
             r["algorithm"]: Agent(
-                r["episode_return"], r.get("cost_rate", 0.0), r["satisfies"], r["steps"]
+                r["episode_return"], r.get("cost_rate", 0.0), r["satisfies"], rivals(r)
             )
             for r in records
             if r["environment"] == environment

@@ -42,12 +42,14 @@ class Aggregate:
         published: Its name in ``conf/algo``, or "" if its limits are not the published ones.
         strata: Score -> its values per environment, one of each run.
         steps: Environment steps of training, per environment.
+        limits: d, per environment.
     """
 
     algorithm: str
     published: str
     strata: Mapping[str, list[np.ndarray]]
     steps: tuple[int, ...]
+    limits: tuple[float, ...]
 
     @property
     def mean(self) -> Normalised:
@@ -112,19 +114,20 @@ def aggregate(experiments: Sequence[Experiment]) -> Aggregate:
         first.runs[0].algorithm if all(e.has_published_limit for e in experiments) else "",
         {name: [score[name] for score in scores] for name in Normalised._fields},
         tuple(max(run.length for run in e.finished) for e in experiments),
+        tuple(e.limits["cost"] for e in experiments),
     )
 
 
 def slate_table(slate: str, environments: Sequence[str], aggregates: Sequence[Aggregate]) -> Table:
     """One of the paper's Tables 1 and 2, the published values beside ours."""
     records = [_record(slate, aggregate) for aggregate in aggregates]
-    steps = {aggregate.algorithm: aggregate.steps for aggregate in aggregates}
+    rivals = {one.algorithm: (one.steps, one.limits) for one in aggregates}
 
     def best(name: str, of: Any) -> Any:
         return mark_best(
             records, name, of,
             is_able=lambda r: r["violation"] <= NOISE_OF_ZERO,
-            steps=lambda r: steps[r["algorithm"]],
+            steps=lambda r: rivals[r["algorithm"]],
         )  # fmt: skip
 
     marks = {"episode_return": best("episode_return", max), "cost_rate": best("cost_rate", min)}
@@ -181,7 +184,10 @@ def _relations(aggregates: Sequence[Aggregate]) -> str:
     """Who fails, and who dominates whom, in words."""
     agents = {
         a.algorithm: Agent(
-            a.mean.episode_return, a.mean.cost_rate, a.mean.violation <= NOISE_OF_ZERO, a.steps
+            a.mean.episode_return,
+            a.mean.cost_rate,
+            a.mean.violation <= NOISE_OF_ZERO,
+            (a.steps, a.limits),
         )
         for a in aggregates
     }

@@ -22,7 +22,8 @@ class Agent(NamedTuple):
         episode_return: J_r, or J̄_r of a slate.
         cost_rate: ρ_c, or ρ̄_c.
         is_satisfying: Whether every constraint is satisfied.
-        steps: Environment steps of training: a number, or one per environment of a slate.
+        steps: What has to be equal in two agents that are compared: environment steps of training,
+            one number per environment of a slate; where they differ, the limits, too.
     """
 
     episode_return: float

@@ -123,6 +123,19 @@ def test_only_what_was_trained_for_equally_many_steps_is_ranked(tmp_path):
     assert ranks == [("c", "b", "satisfies")]
 
 
+def test_only_what_has_the_same_limits_is_ranked(tmp_path):
+    for algo, limit, value in (("a", 25.0, 3.0), ("b", 25.0, 2.0), ("c", 50.0, 9.0)):
+        cost = 40.0 if algo == "b" else 20.0
+        write_run(tmp_path, algo=algo, returns=[value], costs=[cost], limits={"cost": limit})
+    write_run(tmp_path, algo="d", returns=[20.0], costs=[60.0], limits={})
+    table = table_of(tmp_path)
+    assert [row[-2].text for row in table.rows()] == ["25", "25", "50", "—"]
+    # what has no limit keeps none, and is no better than what breaks one
+    ranks = [(r["better"], r["worse"]) for r in dominance_table(table.records).records]
+    assert ranks == [("a", "b")]
+    assert marks(table, "$J_r$") == ["best", "", "", ""]
+
+
 @pytest.mark.parametrize(
     ("slate", "text"), [("SGPoint", "after 10⁷ steps"), ("SG6", "after 10⁷ and 10⁸ (Doggo) steps")]
 )
