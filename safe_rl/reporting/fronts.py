@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
+from itertools import cycle
 from math import isfinite, nan
 from textwrap import fill
 
@@ -57,8 +58,11 @@ def draw_fronts(records: Sequence[Record], styles: Mapping[str, Style]) -> Figur
     rows = -(-len(groups) // columns)
     figure = Figure(figsize=(WIDTH, 3.4 * rows + 0.3), layout="constrained")
     panels = figure.subplots(rows, columns, squeeze=False).ravel()
+    # a family's is that of the first of its experiments
+    colours = {r["family"]: styles[r["algorithm"]].colour for r in reversed(records)}
+    markers = _markers(records)
     for axis, (title, own) in zip(panels, groups.items(), strict=False):
-        _draw_front(axis, own, _colours(records, styles))
+        _draw_front(axis, own, colours, markers)
         axis.set_title(literal(fill(title, 44)), fontsize=10, fontweight="bold")
         axis.set(xlabel="final episode cost", ylabel="final return")
         set_grid(axis)
@@ -68,17 +72,21 @@ def draw_fronts(records: Sequence[Record], styles: Mapping[str, Style]) -> Figur
     return figure
 
 
-def _colours(records: Sequence[Record], styles: Mapping[str, Style]) -> dict[str, str]:
-    """Family -> colour: that of the first of its experiments."""
-    return {r["family"]: styles[r["algorithm"]].colour for r in reversed(records)}
+def _markers(records: Sequence[Record]) -> dict[float | None, str]:
+    """Limit -> marker, the same in all panels."""
+    limits = sorted({r["limit_cost"] for r in records if "limit_cost" in r})
+    return {None: _UNLIMITED, **dict(zip(limits, cycle(_MARKERS), strict=False))}
 
 
-def _draw_front(axis: Axes, records: Sequence[Record], colours: Mapping[str, str]) -> None:
+def _draw_front(
+    axis: Axes,
+    records: Sequence[Record],
+    colours: Mapping[str, str],
+    markers: Mapping[float | None, str],
+) -> None:
     points = np.array([(r["episode_cost"], r["episode_return"]) for r in records])
     front = points[pareto_front(points[:, 1], points[:, 0])]
     axis.plot(*front.T, color="0.6", linewidth=1, zorder=1, drawstyle="steps-post")
-    limits = sorted({r["limit_cost"] for r in records if "limit_cost" in r})
-    markers = dict(zip(limits, _cycled(len(limits)), strict=True))
     for family in dict.fromkeys(r["family"] for r in records):
         own = [r for r in records if r["family"] == family]
         own.sort(key=lambda r: r.get("limit_cost", np.inf))
@@ -88,16 +96,12 @@ def _draw_front(axis: Axes, records: Sequence[Record], colours: Mapping[str, str
             axis.errorbar(
                 cost, value, xerr=record["episode_cost_std"], yerr=record["episode_return_std"],
                 color=colours[family], linestyle="", elinewidth=1, markersize=7,
-                marker=markers.get(record.get("limit_cost"), _UNLIMITED),
+                marker=markers[record.get("limit_cost")],
             )  # fmt: skip
-    if len(markers) < len({r.get("limit_cost") for r in records}):
-        markers = {None: _UNLIMITED, **markers}
+    there = {r.get("limit_cost") for r in records}
     for limit, marker in markers.items():
-        name = "no limit" if limit is None else f"limit {limit:g}"
-        axis.plot([], [], color="0.3", linestyle="", marker=marker, markersize=7, label=name)
-        if limit is not None:
+        if limit in there:
+            name = "no limit" if limit is None else f"limit {limit:g}"
+            axis.plot([], [], color="0.3", linestyle="", marker=marker, markersize=7, label=name)
+        if limit in there and limit is not None:
             axis.axvline(limit, **LIMIT_STYLE)
-
-
-def _cycled(number: int) -> Iterator[str]:
-    return (_MARKERS[index % len(_MARKERS)] for index in range(number))

@@ -124,6 +124,19 @@ def test_the_front_joins_what_no_other_one_beats(tmp_path):
     assert list(zip(*line.get_data(), strict=True)) == [(8.0, 3.0), (20.0, 10.0)]
 
 
+def test_a_limit_has_one_mark_in_all_panels(tmp_path):
+    for env, limits in (("PointGoal1", (10.0, 25.0)), ("CarGoal1", (25.0, 25.0))):
+        for algo, limit in zip(("ppo", "cpo"), limits, strict=True):
+            write_run(tmp_path, env, algo, limits={"cost": limit})
+    experiments = experiments_in(tmp_path)
+    records = [final_table([e]).records[0] for e in experiments]
+    figure = draw_fronts(records, algorithm_styles(experiments))
+    labels = [axis.get_legend_handles_labels() for axis in figure.axes[:2]]
+    marks = [dict(zip(names, (h.get_marker() for h in handles), strict=True))
+             for handles, names in labels]  # fmt: skip
+    assert marks[0]["limit 25"] == marks[1]["limit 25"] != marks[1]["limit 10"]
+
+
 def test_fronts_join_nothing_that_was_trained_for_longer(tmp_path):
     for algo, epochs in (("ppo", 1), ("cpo", 1), ("trpo", 3), ("ppo_lagrangian", 3), ("mine", 9)):
         rows = {name: [1.0] * epochs for name in ("returns", "costs", "rates")}
