@@ -107,11 +107,22 @@ class Memory:
         """Take in the steps [N, T] that follow those of the last call."""
         steps: TensorDictBase | None = batch
         if self._multi_step is not None:
-            wanted = {("next", "done"), *self._in_keys} - {"steps_to_next_obs"}
+            wanted = {("next", "done"), *self.in_keys}
             steps = self._multi_step.inv(batch.select(*wanted))
         if steps is None:  # fewer than n steps so far
             return
         self._buffer.extend(steps.select(*self._in_keys).reshape(-1))
+
+    def end_rows(self) -> None:
+        """What comes next does not follow what came last: sums over n steps begin anew."""
+        if self._multi_step is not None:
+            # the transform has no public way to its last steps
+            self._multi_step._buffer = None
+
+    @property
+    def in_keys(self) -> list[NestedKey]:
+        """Entries of a step that it takes in."""
+        return [key for key in self._in_keys if key != "steps_to_next_obs"]
 
     def minibatches(self, number: int) -> Iterator[TensorDictBase]:
         """Draw a number of minibatches.
@@ -156,12 +167,10 @@ class Memory:
             steps = TensorDict(state_dict["steps"], batch_size=[size]).unflatten_keys("/")
             self._buffer.extend(steps)
         self._buffer.writer.load_state_dict(state_dict["writer"])
-        if self._multi_step is not None:
-            # the transform has no public way to its last steps
-            self._multi_step._buffer = None
-            if "tail" in state_dict:
-                tail = TensorDict(state_dict["tail"], batch_size=state_dict["tail_shape"])
-                self._multi_step._buffer = tail.unflatten_keys("/")
+        self.end_rows()
+        if self._multi_step is not None and "tail" in state_dict:
+            tail = TensorDict(state_dict["tail"], batch_size=state_dict["tail_shape"])
+            self._multi_step._buffer = tail.unflatten_keys("/")
 
 
 def _sampler(capacity: int, prioritised: Mapping[str, float] | None) -> Sampler:

@@ -7,27 +7,31 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import torch
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import nn
-from torchrl.data import TensorSpec
 from torchrl.envs import EnvBase
 from torchrl.objectives import LossModule
 
 from safe_rl.algorithms.building import build_constraints, constrained_limits
-from safe_rl.algorithms.constraints import Constraints
+from safe_rl.algorithms.constraints import Constraints, check_cost_limits
 from safe_rl.algorithms.contract import Stateful
+from safe_rl.algorithms.dataset import fill_memory
 from safe_rl.algorithms.memory import Memory
 from safe_rl.algorithms.parts import build_part
+from safe_rl.algorithms.replay_networks import (
+    bounded_actions,
+    build_networks,
+    exploring,
+    setting,
+)
 from safe_rl.algorithms.replay_update import ReplayUpdate
 from safe_rl.collectors import EpisodeStatistics
-from safe_rl.models import ExploringPolicy, QEnsemble, input_scale_vector
+from safe_rl.models import ExploringPolicy
 from safe_rl.objectives.q_functions import CostCritics
 
 __all__ = ["OffPolicy"]
-
-_ON_POLICY_ONLY = ("encoders", "memory", "normalise")
 
 
 @dataclass
@@ -43,6 +47,8 @@ class OffPolicy:
         policy_update: Trains all networks on minibatches.
         random_steps: Steps of environments that are taken at random in the beginning. Learning
             begins when the memory holds as many.
+        collects: Whether what is collected goes into the memory.
+        learns_from: What was in it from the beginning, in a sentence; nothing if it was empty.
     """
 
     policy: ExploringPolicy
@@ -51,6 +57,8 @@ class OffPolicy:
     memory: Memory
     policy_update: ReplayUpdate
     random_steps: int
+    collects: bool = True
+    learns_from: str = ""
     _counts: dict[str, int] = field(default_factory=lambda: {"steps": 0})
 
     def __post_init__(self) -> None:
@@ -68,32 +76,35 @@ class OffPolicy:
             ValueError: If a cost limit names a cost that the environment does not have, a
                 constrained algorithm gets no limit, actions have no bounds, a risk measure is
                 named that the critics do not know, or the memory is smaller than what learning
-                begins with.
+                begins with; or if a dataset does not fit.
+            FileNotFoundError: If there is no such dataset.
         """
         limits = constrained_limits(
             config, env, is_constrained=config.get("limits") is not None, otherwise="sac"
         )
         device = torch.device(config.device)
-        networks = _build_networks(config, env, len(limits), device)
+        networks = build_networks(config, env, len(limits), device)
         constraints = build_constraints(config, limits, env.max_episode_steps, device)
         loss = build_part(
             config.loss,
             actor_network=networks["actor"],
-            qvalue_network=networks["critic"],
+            qvalue_network=networks.get("critic"),
             cost_qvalue_network=networks.get("cost_critic"),
-            action_spec=_action_spec(env).to(device),
+            action_spec=bounded_actions(env).to(device),
             multiplier=constraints.multiplier,
             cost_keys=constraints.keys,
         )
         _check_risk(config, constraints, loss)
+        _check_memory(config, loss)
         memory = build_part(
             config.memory,
             in_keys=loss.in_keys,
             reward_keys=["reward", *constraints.keys],
-            reward_gamma=config.loss.gamma,
+            reward_gamma=config.loss.get("gamma", 1.0),
             device=device,
         )
-        random_steps = _setting(config, "exploration.random_steps")
+        learns_from, collects = _fill(config, memory, env)
+        random_steps = setting(config, "exploration.random_steps")
         if max(random_steps, memory.batch_size) > memory.capacity:
             raise ValueError(
                 f"memory.capacity={memory.capacity}: it must hold exploration.random_steps="
@@ -101,12 +112,14 @@ class OffPolicy:
                 "ever learned."
             )
         return cls(
-            policy=_exploring(networks["actor"], env, _setting(config, "exploration.noise")),
+            policy=exploring(networks["actor"], env, setting(config, "exploration.noise")),
             networks=networks,
             constraints=constraints,
             memory=memory,
             policy_update=build_part(config.policy_update, loss=loss),
             random_steps=random_steps,
+            collects=collects,
+            learns_from=learns_from,
         )
 
     @classmethod
@@ -114,8 +127,8 @@ class OffPolicy:
         cls, config: DictConfig, env: EnvBase, device: torch.device
     ) -> tuple[TensorDictModuleBase, Mapping[str, nn.Module]]:
         """Build what acts; the noise that explores with a deterministic actor is no part of it."""
-        actor = _build_networks(config, env, 0, device)["actor"]
-        return _exploring(actor, env, 0.0), {"actor": actor}
+        actor = build_networks(config, env, 0, device)["actor"]
+        return exploring(actor, env, 0.0), {"actor": actor}
 
     @property
     def cost_keys(self) -> Sequence[str]:
@@ -125,12 +138,14 @@ class OffPolicy:
     @property
     def lost_on_resume(self) -> str:
         """What a checkpoint does not hold, in a sentence; nothing if it holds all."""
-        if self.memory.keeps:
+        if self.memory.keeps or not self.collects:
             return ""
+        goes_on = f"goes on when it holds {self.random_steps:,} new ones"
+        if self.learns_from:
+            goes_on = "goes on from those of the dataset alone"
         return (
-            "The transitions in its memory are not stored, by memory.keep=false: learning goes on "
-            f"when it holds {self.random_steps:,} new ones, and differs from a run that was not "
-            "interrupted."
+            "The transitions in its memory are not stored, by memory.keep=false: learning "
+            f"{goes_on}, and differs from a run that was not interrupted."
         )
 
     def learn(self, batch: TensorDictBase, episodes: EpisodeStatistics) -> dict[str, float]:
@@ -150,7 +165,8 @@ class OffPolicy:
             if isinstance(self.policy_update.loss, CostCritics):
                 self.policy_update.loss.calibrate(constraints)
                 self.policy_update.loss.measure(batch["next", "reward"])
-        self.memory.extend(batch)
+        if self.collects:
+            self.memory.extend(batch)
         self._count_steps(batch.numel())
         may_learn = len(self.memory) >= max(self.random_steps, self.memory.batch_size)
         number = self.policy_update.due(batch.numel()) if may_learn else 0
@@ -185,11 +201,30 @@ class OffPolicy:
         return {name: part for name, part in parts.items() if part is not None}
 
 
-def _setting(config: DictConfig, key: str) -> Any:
-    value = OmegaConf.select(config, key)
-    if value is None:
-        raise ValueError(f"{key} is missing: off-policy algorithms need it.")
-    return value
+def _fill(config: DictConfig, memory: Memory, env: EnvBase) -> tuple[str, bool]:
+    """Begin a memory with a dataset, if there is one; what was taken, and whether more comes."""
+    node = config.get("dataset")
+    if node is None or node.path is None:
+        if node is not None and node.alone:
+            raise ValueError(
+                f"dataset.path is missing: algo={config.algo.name} with dataset.alone=true learns "
+                "from nothing else. Give the folder of a recording (record=true), or an HDF5 file."
+            )
+        return "", True
+    limits = check_cost_limits(config.cost_limits, env.cost_keys)
+    return fill_memory(memory, node, limits, env, bounded_actions(env)), not node.alone
+
+
+def _check_memory(config: DictConfig, loss: LossModule) -> None:
+    """Refuse what makes sense of values only for a loss that learns none."""
+    if ("next", "reward") in loss.in_keys:
+        return
+    for key, off in (("n_steps", 1), ("prioritised", None)):
+        if config.memory[key] != off:
+            raise ValueError(
+                f"memory.{key}={config.memory[key]}: algo={config.algo.name} learns no values, of "
+                f"which this would be about. Use memory.{key}={'null' if off is None else off}."
+            )
 
 
 def _check_risk(config: DictConfig, constraints: Constraints, loss: LossModule) -> None:
@@ -203,56 +238,3 @@ def _check_risk(config: DictConfig, constraints: Constraints, loss: LossModule) 
         "a step depends on the episode: use risk=mean, algo=wcsac with risk=cvar, or learn on "
         "policy."
     )
-
-
-def _action_spec(env: EnvBase) -> TensorSpec:
-    """Of one environment's action, [A]; it has bounds."""
-    spec = env.action_spec_unbatched
-    is_continuous = hasattr(spec, "low") and spec.dtype.is_floating_point
-    if not is_continuous or not (spec.low.isfinite() & spec.high.isfinite()).all():
-        raise ValueError(
-            "This algorithm's actions lie within bounds, and those of this environment have none: "
-            f"its action_spec is {type(spec).__name__}. Use algo=ppo_lagrangian, or bound them."
-        )
-    return spec
-
-
-def _exploring(actor: TensorDictModuleBase, env: EnvBase, noise: float) -> ExploringPolicy:
-    spec = _action_spec(env)
-    return ExploringPolicy(actor, spec.low, spec.high, noise=noise)
-
-
-def _build_networks(
-    config: DictConfig, env: EnvBase, num_costs: int, device: torch.device
-) -> dict[str, Any]:
-    """The actor, the reward critic and, for ``num_costs`` > 0, the cost critic."""
-    model, spec = config.model, _action_spec(env)
-    if others := [key for key in _ON_POLICY_ONLY if model.get(key)]:
-        raise ValueError(
-            f"algo={config.algo.name} learns with perceptrons on a vector as it is; model."
-            f"{others[0]} is for on-policy algorithms. Use model=mlp without it."
-        )
-    size = env.observation_spec["observation"].shape[-1]
-    common: dict[str, Any] = {
-        "hidden_sizes": list(model.hidden_sizes),
-        "input_scale": input_scale_vector(model.input_scale, env.observation_layout),
-        "device": device,
-    }
-    networks: dict[str, Any] = {
-        "actor": build_part(
-            config.actor, observation_size=size, low=spec.low, high=spec.high, **common
-        ),
-        "critic": QEnsemble(
-            size, len(spec.low), num_networks=_setting(config, "critics.rewards"), **common
-        ),
-    }
-    if num_costs:
-        networks["cost_critic"] = QEnsemble(
-            size,
-            len(spec.low),
-            num_networks=_setting(config, "critics.costs"),
-            num_outputs=num_costs,
-            out_key="cost_state_action_value",
-            **common,
-        )
-    return networks

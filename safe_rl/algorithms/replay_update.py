@@ -21,12 +21,14 @@ class ReplayUpdate:
     """Minimise the sum of all ``loss_*`` on minibatches, and let target networks follow.
 
     Args:
-        loss: Loss module with target parameters. For a ``policy_delay`` above 1 it has
-            ``critic_losses`` and ``actor_losses``, which together are what it returns.
+        loss: Loss module, with target parameters unless ``tau`` is None. For a ``policy_delay``
+            above 1 it has ``critic_losses`` and ``actor_losses``, which together are what it
+            returns.
         optimizer: Function of the parameters that builds the optimiser, for example
             ``functools.partial(torch.optim.Adam, lr=3e-4, fused=True)``.
         updates_per_step: Gradient steps per step of an environment, the update-to-data ratio.
-        tau: Share τ of the way that target networks go to the networks after every step.
+        tau: Share τ of the way that target networks go to the networks after every step; None
+            without any.
         policy_delay: Steps of the critics per step of the policy, and of the targets.
         rates: Learning rates of parameters whose names begin with a key, such as ``log_alpha``;
             others have the optimiser's.
@@ -59,7 +61,7 @@ class ReplayUpdate:
         *,
         optimizer: Callable[[Iterable[Any]], Optimizer],
         updates_per_step: float,
-        tau: float,
+        tau: float | None,
         policy_delay: int = 1,
         rates: Mapping[str, float] | None = None,
         max_grad_norm: float | None = None,
@@ -70,7 +72,7 @@ class ReplayUpdate:
         self.optimizer = optimizer(_groups(loss, rates or {}))
         self._device = next(loss.parameters()).device
         # makes them equal, and refuses a loss that has none; its steps cost three times as much
-        self._share = 1 - SoftUpdate(loss, tau=tau).eps
+        self._share = 0.0 if tau is None else 1 - SoftUpdate(loss, tau=tau).eps
         tensors = dict(self._tensors())
         names = [name for name in tensors if name.startswith("target_")]
         self._targets = [tensors[name].data for name in names]
@@ -120,7 +122,7 @@ class ReplayUpdate:
         if self.max_grad_norm is not None:
             nn.utils.clip_grad_norm_(self.loss.parameters(), self.max_grad_norm)
         self.optimizer.step()
-        if with_actor:
+        if with_actor and self._targets:
             torch._foreach_lerp_(self._targets, self._sources, self._share)
         self._counts["updates"] += 1
 

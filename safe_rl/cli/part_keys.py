@@ -143,6 +143,7 @@ PARTS = {
     },
     "SACLoss": _SAC,
     "SACLagrangianLoss": {**_SAC, **_COST_CRITICS},
+    "BCLoss": {"loss_function": _Q_FUNCTIONS["loss_function"]},
     "CALLoss": {
         **_SAC,
         **_COST_CRITICS,
@@ -168,7 +169,10 @@ PARTS = {
     "ReplayUpdate": {
         "optimizer": Key(component, "the optimiser"),
         "updates_per_step": Key(_POSITIVE, "gradient steps per step of an environment"),
-        "tau": Key(number(0, 0.5, above=True), "share of the way that target networks go"),
+        "tau": Key(
+            optional(number(0, 0.5, above=True)),
+            "share of the way that target networks go; null: there are none",
+        ),
         "policy_delay": Key(count(1, 10_000), "steps of the critics per step of the policy"),
         "rates": Key(optional(mapping_of(_POSITIVE)), "learning rates by name of parameters"),
         "max_grad_norm": Key(optional(_POSITIVE), "norm to which the gradient is clipped"),

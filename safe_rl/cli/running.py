@@ -70,6 +70,8 @@ def prepare(config: DictConfig, directory: Path, continues: bool) -> Trainer | N
             episodes=config.evaluation.episodes,
         )
     trainer = build_trainer(config, training, directory, in_workers, evaluation)
+    if learns_from := getattr(trainer.algorithm, "learns_from", ""):
+        print(learns_from)
     if continues and trainer.resume():
         print(f"Going on after {trainer.progress.steps:,} of {config.frames:,} frames.")
         if trainer.begins_anew:

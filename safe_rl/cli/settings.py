@@ -30,6 +30,7 @@ _SECTIONS = (
         "checkpoint",
         "collector",
         "critics",
+        "dataset",
         "evaluation",
         "exploration",
         "logger",

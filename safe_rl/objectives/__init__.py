@@ -13,12 +13,14 @@ Everything here works on TensorDict keys alone and knows no environment:
   whose mathematics is in `safe_rl.objectives.trust_region` and `safe_rl.objectives.cpo_dual`;
 - `SACLoss`, `SACLagrangianLoss`, `WCSACLoss`, `CALLoss`, `TD3Loss`, `TD3LagrangianLoss`: losses on
   steps from a replay buffer;
+- `BCLoss`: behaviour cloning;
 - `CriticLoss`: squared errors of the reward and the cost critic;
 - `ActorCriticLoss`, `JointAdvantages`: all losses and estimators as one, for TorchRL's trainers.
 """
 
 from safe_rl.objectives.actor_critic import ActorCriticLoss, JointAdvantages
 from safe_rl.objectives.advantages import CostGAE, VectorGAE
+from safe_rl.objectives.bc import BCLoss
 from safe_rl.objectives.cal import CALLoss
 from safe_rl.objectives.controllers import PIMultiplier
 from safe_rl.objectives.cpo import CPOLoss
@@ -43,6 +45,7 @@ from safe_rl.objectives.wcsac import WCSACLoss
 
 __all__ = [
     "ActorCriticLoss",
+    "BCLoss",
     "CALLoss",
     "CPOLoss",
     "CUPLoss",

@@ -57,6 +57,10 @@ def test_every_combination_composes_and_resolves(env, algo, preset):
 @pytest.mark.parametrize(("algo", "preset"), COMBINATIONS)
 def test_every_combination_builds(algo, preset):
     config = compose_config("env=PointMass", f"algo={algo}", f"preset={preset}")
+    if config.get("dataset", {}).get("alone"):
+        with pytest.raises(ValueError, match=r"dataset\.path is missing"):
+            find_recipe(config).build(config, PointMass(2))
+        return
     algorithm = find_recipe(config).build(config, PointMass(2))
     assert ("cost_critic" in algorithm.networks) == bool(algorithm.cost_keys)
     assert (algorithm.constraints.multiplier is not None) == (algo in LAGRANGIAN)

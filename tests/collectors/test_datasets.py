@@ -11,6 +11,7 @@ from safe_rl.collectors import (
     EpisodeAccounting,
     Recording,
     make_collector,
+    read_dataset,
     read_hdf5,
     read_recording,
     safe_episodes,
@@ -84,9 +85,79 @@ def test_files_of_offline_benchmarks_are_read(tmp_path):
     assert isinstance(steps, TensorDict)
 
 
+def test_what_follows_a_step_is_the_next_observation_where_a_file_does_not_say(tmp_path):
+    arrays = write_hdf5(tmp_path / "data.hdf5", leave_out=["next_observations"])
+    steps = read_dataset(tmp_path / "data.hdf5")
+    rows = [1, 2, 2, 4, 5, 5]  # episodes end with the third step and the sixth
+    expected = torch.tensor(arrays["observations"][rows]).float()[None]
+    torch.testing.assert_close(steps["next", "observation"], expected)
+
+
+def write_minari(path, lengths=(3, 12), reset_infos=True):
+    """Twelve episodes are needed for names in another order than numbers; the rest have a step."""
+    h5py = pytest.importorskip("h5py", reason="comes with the extra hdf5")
+    rng = np.random.default_rng(0)
+    episodes = []
+    with h5py.File(path, "w") as file:
+        for number, length in enumerate((*lengths, *[1] * 10)):
+            episode = {
+                "observations": rng.normal(size=(length + 1, 3)),
+                "actions": rng.normal(size=(length, 2)), "rewards": rng.normal(size=length),
+                "terminations": np.arange(length) == (length - 1 if number == 0 else -1),
+                "truncations": np.zeros(length, bool),
+            }  # fmt: skip
+            cost = rng.integers(0, 2, length + reset_infos).astype(float)
+            group = file.create_group(f"episode_{number}")
+            for name, array in episode.items():
+                group[name] = array
+            group["infos/cost"], group["infos/cost_hazards"] = cost, 2 * cost
+            group["infos/is_good"] = cost > 0
+            episodes.append(episode | {"cost": cost[-length:]})
+    return episodes
+
+
+@pytest.mark.parametrize("reset_infos", [True, False])
+def test_episodes_of_minari_are_read_in_their_order(reset_infos, tmp_path):
+    episodes = write_minari(tmp_path / "main_data.hdf5", reset_infos=reset_infos)
+    steps = read_dataset(tmp_path / "main_data.hdf5")
+    assert steps.shape == (1, 25)
+    for key, parts in {
+        "observation": [e["observations"][:-1] for e in episodes],
+        ("next", "observation"): [e["observations"][1:] for e in episodes],
+        "action": [e["actions"] for e in episodes],
+        ("next", "reward"): [e["rewards"][:, None] for e in episodes],
+        ("next", "cost"): [e["cost"][:, None] for e in episodes],
+        ("next", "cost_hazards"): [2 * e["cost"][:, None] for e in episodes],
+    }.items():
+        torch.testing.assert_close(steps[key], torch.tensor(np.concatenate(parts)).float()[None])
+    ends = np.cumsum([len(e["actions"]) for e in episodes]) - 1
+    assert steps["next", "done"].flatten().nonzero().flatten().tolist() == ends.tolist()
+    # the first one terminates, the others were cut off
+    assert steps["next", "terminated"].flatten().nonzero().flatten().tolist() == [2]
+    assert "is_good" not in steps["next"].keys()  # noqa: SIM118
+
+
+def test_minari_without_costs_is_refused(tmp_path):
+    h5py = pytest.importorskip("h5py", reason="comes with the extra hdf5")
+    write_minari(tmp_path / "data.hdf5")
+    with h5py.File(tmp_path / "data.hdf5", "a") as file:
+        del file["episode_4/infos/cost"]
+    with pytest.raises(ValueError, match=r"no infos/cost: .*has: infos/cost_hazards, infos/is"):
+        read_hdf5(tmp_path / "data.hdf5")
+
+
+def test_what_is_no_dataset_is_refused(tmp_path):
+    pytest.importorskip("h5py", reason="comes with the extra hdf5")
+    (tmp_path / "notes.txt").write_text("words")
+    with pytest.raises(ValueError, match="neither the folder of a recording nor an HDF5 file"):
+        read_dataset(tmp_path / "notes.txt")
+    with pytest.raises(FileNotFoundError, match="no such recording"):
+        read_dataset(tmp_path / "nothing")
+
+
 def test_what_a_file_lacks_is_named(tmp_path):
     write_hdf5(tmp_path / "data.hdf5", leave_out=["costs"])
-    with pytest.raises(KeyError, match=r"has no costs.*What it has: actions"):
+    with pytest.raises(ValueError, match=r"has no costs.*What it has: actions"):
         read_hdf5(tmp_path / "data.hdf5")
 
 

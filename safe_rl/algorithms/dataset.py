@@ -1,0 +1,77 @@
+"""Transitions of a dataset in a memory, before anything is collected or instead of it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from omegaconf import DictConfig
+from tensordict import TensorDictBase
+from torchrl.data import TensorSpec
+from torchrl.envs import EnvBase
+
+from safe_rl.algorithms.memory import Memory
+from safe_rl.collectors import read_dataset, safe_episodes
+
+__all__ = ["fill_memory"]
+
+
+def fill_memory(
+    memory: Memory, node: DictConfig, limits: Mapping[str, float], env: EnvBase, actions: TensorSpec
+) -> str:
+    """Put the transitions of a dataset into a memory.
+
+    Args:
+        memory: An empty one.
+        node: ``path`` of a recording's folder or of an HDF5 file, and ``safe_episodes``: whether
+            only whole episodes count that keep the limits.
+        limits: Cost key -> undiscounted cost allowed per episode.
+        env: Environment that the transitions should be of.
+        actions: Spec of one of its actions, to the bounds of which actions are cut.
+
+    Returns:
+        What was taken, in a sentence.
+
+    Raises:
+        ValueError: If they are not of this environment, lack what is learned from, no episode
+            keeps the limits, or the memory is too small.
+    """
+    steps = read_dataset(node.path)
+    _check(steps, node, memory, env, actions)
+    number = steps.batch_size.numel()
+    if node.safe_episodes:
+        if missing := [key for key in limits if ("next", key) not in steps.keys(True)]:
+            raise ValueError(
+                f"dataset.path={node.path} has no {', '.join(missing)}, which cost_limits names."
+            )
+        steps = safe_episodes(steps, limits)
+    taken = steps.batch_size.numel()
+    if not 0 < taken <= memory.capacity:
+        what = " in whole episodes that keep cost_limits" if node.safe_episodes else ""
+        raise ValueError(
+            f"dataset.path={node.path}: of its {number:,} transitions {taken:,} are taken"
+            f"{what}. There must be some, and room for them: memory.capacity={memory.capacity}."
+        )
+    steps["action"] = steps["action"].clamp(actions.low.cpu(), actions.high.cpu())
+    memory.extend(steps)
+    memory.end_rows()
+    kept = "those of whole episodes that keep the limits" if node.safe_episodes else "all"
+    return f"Learning from {taken:,} of {number:,} transitions in {node.path}: {kept}."
+
+
+def _check(
+    steps: TensorDictBase, node: DictConfig, memory: Memory, env: EnvBase, actions: TensorSpec
+) -> None:
+    """Refuse what is of another environment, or not enough to learn from."""
+    if missing := [key for key in memory.in_keys if key not in steps.keys(True)]:
+        names = ", ".join(key if isinstance(key, str) else key[-1] for key in missing)
+        raise ValueError(f"dataset.path={node.path} has no {names}, which is learned from.")
+    sizes = {
+        "observation": env.observation_spec["observation"].shape[-1],
+        "action": actions.shape[-1],
+    }
+    for key, size in sizes.items():
+        if steps[key].shape[-1] != size:
+            raise ValueError(
+                f"dataset.path={node.path}: its {key}s are {steps[key].shape[-1]} numbers, those "
+                f"of this environment {size}. It is a dataset of another one."
+            )

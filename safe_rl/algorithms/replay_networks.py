@@ -1,0 +1,101 @@
+"""Networks of algorithms that learn from memory, as a configuration describes them."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from omegaconf import DictConfig, OmegaConf
+from tensordict.nn import TensorDictModuleBase
+from torchrl.data import TensorSpec
+from torchrl.envs import EnvBase
+
+from safe_rl.algorithms.parts import build_part
+from safe_rl.models import ExploringPolicy, QEnsemble, input_scale_vector
+
+__all__ = ["bounded_actions", "build_networks", "exploring", "setting"]
+
+_ON_POLICY_ONLY = ("encoders", "memory", "normalise")
+
+
+def setting(config: DictConfig, key: str) -> Any:
+    """The value of a key that has to be there.
+
+    Raises:
+        ValueError: If it is not.
+    """
+    value = OmegaConf.select(config, key)
+    if value is None:
+        raise ValueError(f"{key} is missing: off-policy algorithms need it.")
+    return value
+
+
+def bounded_actions(env: EnvBase) -> TensorSpec:
+    """Spec of one environment's action, [A], which has bounds.
+
+    Raises:
+        ValueError: If it has none.
+    """
+    spec = env.action_spec_unbatched
+    is_continuous = hasattr(spec, "low") and spec.dtype.is_floating_point
+    if not is_continuous or not (spec.low.isfinite() & spec.high.isfinite()).all():
+        raise ValueError(
+            "This algorithm's actions lie within bounds, and those of this environment have none: "
+            f"its action_spec is {type(spec).__name__}. Use algo=ppo_lagrangian, or bound them."
+        )
+    return spec
+
+
+def exploring(actor: TensorDictModuleBase, env: EnvBase, noise: float) -> ExploringPolicy:
+    """The policy that acts with an actor, within the bounds of an environment's actions."""
+    spec = bounded_actions(env)
+    return ExploringPolicy(actor, spec.low, spec.high, noise=noise)
+
+
+def build_networks(
+    config: DictConfig, env: EnvBase, num_costs: int, device: torch.device
+) -> dict[str, Any]:
+    """Build the actor, the critic of the reward and that of costs.
+
+    Args:
+        config: Configuration as composed from ``conf/``.
+        env: Tells the sizes of observations and actions.
+        num_costs: Costs that are constrained; without them, there is no critic of costs.
+        device: Of the parameters.
+
+    Returns:
+        ``actor`` and, as far as ``critics.rewards`` and ``critics.costs`` are not 0, ``critic``
+        and ``cost_critic``.
+
+    Raises:
+        ValueError: If actions have no bounds, or the model is one for on-policy algorithms.
+    """
+    model, spec = config.model, bounded_actions(env)
+    if others := [key for key in _ON_POLICY_ONLY if model.get(key)]:
+        raise ValueError(
+            f"algo={config.algo.name} learns with perceptrons on a vector as it is; model."
+            f"{others[0]} is for on-policy algorithms. Use model=mlp without it."
+        )
+    size = env.observation_spec["observation"].shape[-1]
+    common: dict[str, Any] = {
+        "hidden_sizes": list(model.hidden_sizes),
+        "input_scale": input_scale_vector(model.input_scale, env.observation_layout),
+        "device": device,
+    }
+    networks = {
+        "actor": build_part(
+            config.actor, observation_size=size, low=spec.low, high=spec.high, **common
+        )
+    }
+    if number := setting(config, "critics.rewards"):
+        networks["critic"] = QEnsemble(size, len(spec.low), num_networks=number, **common)
+    if num_costs and (number := setting(config, "critics.costs")):
+        networks["cost_critic"] = QEnsemble(
+            size,
+            len(spec.low),
+            num_networks=number,
+            num_outputs=num_costs,
+            out_key="cost_state_action_value",
+            **common,
+        )
+    return networks

@@ -1,0 +1,59 @@
+"""Loss of behaviour cloning."""
+
+from __future__ import annotations
+
+from tensordict import TensorDict, TensorDictBase, TensorDictParams
+from tensordict.nn import TensorDictModuleBase, dispatch
+from torchrl.objectives import LossModule
+from torchrl.objectives.utils import distance_loss
+
+from safe_rl.objectives.keys import require
+
+__all__ = ["BCLoss"]
+
+
+class BCLoss(LossModule):
+    """Distance of a deterministic policy's actions from those that were taken.
+
+    Liu et al., *Datasets and Benchmarks for Offline Safe Reinforcement Learning* (2024), where the
+    steps are those of safe episodes (BC-Safe). Costs and rewards choose what is cloned, and are
+    not seen by the loss.
+
+    Args:
+        actor_network: deterministic policy.
+        loss_function: of the errors: ``"l2"``, ``"smooth_l1"`` or ``"l1"``.
+
+    Examples:
+        >>> import torch
+        >>> from safe_rl.models import make_bounded_actor
+        >>> actor = make_bounded_actor(3, -torch.ones(2), torch.ones(2), hidden_sizes=[8])
+        >>> loss = BCLoss(actor)
+        >>> steps = actor(TensorDict(observation=torch.randn(4, 3), batch_size=[4]))
+        >>> loss(steps.detach())["loss_actor"]
+        tensor(0., grad_fn=<MeanBackward0>)
+    """
+
+    actor_network: TensorDictModuleBase
+    actor_network_params: TensorDictParams
+
+    def __init__(self, actor_network: TensorDictModuleBase, *, loss_function: str = "l2") -> None:
+        super().__init__()
+        self.convert_to_functional(actor_network, "actor_network")
+        self.loss_function = loss_function
+        self.in_keys = [*actor_network.in_keys, *actor_network.out_keys]
+        self.out_keys = ["loss_actor"]
+
+    @dispatch
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Evaluate the loss on steps [...]: a mean over steps and actions.
+
+        Raises:
+            KeyError: If an entry is missing; the message names it.
+        """
+        (key,) = self.actor_network.out_keys
+        taken = require(tensordict, key)
+        inputs = tensordict.select(*self.actor_network.in_keys)
+        with self.actor_network_params.to_module(self.actor_network):
+            chosen = self.actor_network(inputs).get(key)
+        error = distance_loss(chosen, taken, loss_function=self.loss_function)
+        return TensorDict(loss_actor=error.mean())

@@ -1,0 +1,164 @@
+"""Learning from a dataset: what is taken of it, what is cloned, and what does not fit."""
+
+import numpy as np
+import pytest
+import torch
+from point_mass import PointMass
+from run_configs import compose_config, without_times
+from tensordict import TensorDict
+from tensordict.nn import TensorDictModule
+
+from safe_rl.algorithms import OffPolicy
+from safe_rl.collectors import Recording, make_collector
+from safe_rl.evaluation.episodes import collect_episodes
+from safe_rl.models import make_bounded_actor
+from safe_rl.objectives import BCLoss
+from safe_rl.runs.table import read_table
+from safe_rl.training.trainer import build_trainer, seed_everything
+
+
+def head_north(observation):
+    """Around the hazard by the north, where it costs as well."""
+    return torch.tensor([-0.5, 0.9]).expand(*observation.shape[:-1], 2)
+
+
+def head_south(observation):
+    """Around it by the south, and away: no costs, and a return that is not the best."""
+    return torch.tensor([-0.2, -0.7]).expand(*observation.shape[:-1], 2)
+
+
+def record(folder, *policies, num_steps=20, batches=2):
+    """Episodes of policies one after the other, as runs record them."""
+    recording, number = Recording(folder, PointMass.cost_keys), 0
+    for policy in policies:
+        env = PointMass(4, num_steps)
+        module = TensorDictModule(policy, ["observation"], ["action"])
+        collector = make_collector(env, module, frames_per_batch=4 * num_steps)
+        for batch, _ in zip(collector, range(batches), strict=False):
+            recording.write(number, batch)
+            number += 1
+    return folder
+
+
+def offline_config(folder, *overrides, algo="bc", limits="{cost: 1}"):
+    return compose_config(
+        *(f"algo={algo}", "env=PointMass", f"dataset.path={folder}", "logger=none"),
+        *("num_envs=4", "frames=1280", "frames_per_batch=160", "model.hidden_sizes=[16]"),
+        *("memory.batch_size=64", f"cost_limits={limits}"),
+        *overrides,
+    )
+
+
+def make_trainer(config, directory):
+    seed_everything(config.seed, None)
+    return build_trainer(config, PointMass(config.num_envs, 20, config.seed), directory)
+
+
+def test_what_is_cloned_are_the_safe_episodes(tmp_path):
+    data = record(tmp_path / "data", head_north, head_south)
+    trainer = make_trainer(offline_config(data), tmp_path / "run")
+    assert trainer.algorithm.learns_from == (
+        f"Learning from 160 of 320 transitions in {data}: those of whole episodes that keep the "
+        "limits."
+    )
+    trainer.run()
+    found = collect_episodes(
+        PointMass(4, 20, seed=9), trainer.algorithm.policy, 8, ["cost"], deterministic=True
+    )
+    assert not found.costs["cost"].any()
+    state = PointMass(4, 20, seed=9).reset()
+    action = trainer.algorithm.policy(state)["action"]
+    torch.testing.assert_close(action, head_south(state["observation"]), atol=0.05, rtol=0)
+    table = read_table(tmp_path / "run" / "progress.csv")
+    assert table["policy_loss_actor"][-1] < 0.01 < table["policy_loss_actor"][0]
+    assert table["policy_num_updates"] == [160] * 8
+    assert len(trainer.algorithm.memory) == 160  # nothing of what it did itself
+
+
+def test_it_goes_on_as_if_it_had_never_stopped(tmp_path):
+    data = record(tmp_path / "data", head_south)
+    make_trainer(offline_config(data), tmp_path / "whole").run()
+    make_trainer(offline_config(data, "frames=640"), tmp_path / "halves").run()
+    torch.rand(7)
+    resumed = make_trainer(offline_config(data), tmp_path / "halves")
+    assert resumed.resume()
+    assert resumed.algorithm.lost_on_resume == ""
+    resumed.run()
+    table, expected = (without_times(tmp_path / n / "progress.csv") for n in ("halves", "whole"))
+    assert table == expected
+
+
+def test_any_algorithm_may_begin_with_a_dataset(tmp_path):
+    data = record(tmp_path / "data", head_north, head_south)
+    keys = ["exploration.random_steps=0", "policy_update.updates_per_step=0.05", "memory.n_steps=3"]
+    trainer = make_trainer(offline_config(data, *keys, algo="sac"), tmp_path / "run")
+    assert len(trainer.algorithm.memory) == 320 - 4 * 3
+    before = len(trainer.algorithm.memory)
+    trainer.epoch(trainer.batches())
+    # the last three of each row wait for what follows them
+    assert len(trainer.algorithm.memory) == before + 4 * 37
+    assert "dataset alone" in trainer.algorithm.lost_on_resume
+    alone = make_trainer(
+        offline_config(data, *keys, "dataset.alone=true", algo="sac_lagrangian"), tmp_path / "alone"
+    )
+    row = alone.epoch(alone.batches())
+    assert row["policy_num_updates"] == 8
+    assert len(alone.algorithm.memory) == before
+
+
+def test_the_loss_is_the_mean_squared_difference():
+    actor = make_bounded_actor(3, -torch.ones(2), torch.ones(2), hidden_sizes=[8])
+    steps = TensorDict(observation=torch.randn(7, 3), action=torch.rand(7, 2), batch_size=[7])
+    loss = BCLoss(actor)(steps)["loss_actor"]
+    chosen = actor(steps.clone())["action"].detach().numpy()
+    expected = np.square(chosen - steps["action"].numpy()).mean()
+    assert loss.item() == pytest.approx(expected, rel=1e-6)
+    loss.backward()
+    assert all(p.grad is not None for p in actor.parameters())
+    with pytest.raises(KeyError, match="action"):
+        BCLoss(actor)(steps.exclude("action"))
+
+
+class Wider(PointMass):
+    """Of another kind: five numbers are observed."""
+
+    def __init__(self):
+        super().__init__(2)
+        spec = self.observation_spec
+        spec["observation"] = type(spec["observation"])((2, 5))
+        self.observation_spec = spec
+
+
+@pytest.mark.parametrize(
+    ("overrides", "env", "words"),
+    [
+        (["dataset.path=null"], PointMass, r"dataset\.path is missing: algo=bc"),
+        (["dataset.path=/no/where"], PointMass, "/no/where: there is no such recording"),
+        (["+limit=0"], PointMass, "of its 160 transitions 0 are taken in whole"),
+        (["memory.capacity=80"], PointMass, "room for them: memory.capacity=80"),
+        ([], Wider, "its observations are 4 numbers, those of this environment 5"),
+        (["memory.n_steps=3"], PointMass, "memory.n_steps=3: algo=bc learns no values"),
+        (
+            ["memory.prioritised={alpha: 0.6, beta: 0.4}"],
+            PointMass,
+            "algo=bc learns no values.*Use memory.prioritised=null",
+        ),
+    ],
+)
+def test_what_does_not_fit_is_said(overrides, env, words, tmp_path):
+    data = record(tmp_path / "data", head_north)
+    limits = "{cost: 0}" if "+limit=0" in overrides else "{cost: 20}"
+    config = offline_config(data, *overrides, limits=limits)
+    with pytest.raises((ValueError, FileNotFoundError), match=words):
+        OffPolicy.build(config, env())
+
+
+def test_costs_that_a_dataset_lacks_are_named(tmp_path):
+    folder = tmp_path / "data"
+    batch = PointMass(2, 20).rollout(20)
+    Recording(folder, ["cost"]).write(0, batch)
+    limits = "{cost_north: 3}"
+    with pytest.raises(ValueError, match="has no cost_north, which cost_limits names"):
+        OffPolicy.build(offline_config(folder, limits=limits), PointMass(2))
+    with pytest.raises(ValueError, match="has no cost_north, which is learned from"):
+        OffPolicy.build(offline_config(folder, algo="sac_lagrangian", limits=limits), PointMass(2))
