@@ -28,7 +28,7 @@ PARTS = {
     "runs": ("algorithms", "extras", "targets"),
     "training": ("algorithms", "collectors", "runs", "targets"),
     "scores": ("extras",),
-    "evaluation": ("algorithms", "extras", "lazy", "models", "runs", "scores"),
+    "evaluation": ("algorithms", "collectors", "extras", "lazy", "models", "runs", "scores"),
     "reporting": ("extras", "runs", "scores"),
     "cli": (
         *("envs", "evaluation", "extras", "naming", "openmp", "processes", "reporting", "runs"),

@@ -68,6 +68,7 @@ KEYS = {
     "device": Key(text, "where networks are trained: cpu or cuda"),
     # torch starts all of them at once, and crashes where the system gives it no more
     "num_threads": Key(optional(count(1, 1024)), "threads of physics and torch; null: all cores"),
+    "record": Key(boolean, "whether transitions are written to disk", may_lack=True),
     "compile": Key(boolean, "whether to compile the losses"),
     "preset": Key(text, "set of numbers"),
     "note": Key(anything, "free words about the run, for its config.yaml", may_lack=True),

@@ -4,7 +4,7 @@ from safe_rl.collectors.accounting import EpisodeAccounting, EpisodeStatistics
 from safe_rl.collectors.datasets import read_dataset, safe_episodes
 from safe_rl.collectors.factory import make_collector
 from safe_rl.collectors.hdf5 import read_hdf5
-from safe_rl.collectors.recording import Recording, read_recording
+from safe_rl.collectors.recording import Recording, StepRecorder, read_recording
 from safe_rl.collectors.workers import (
     WorkerCollector,
     make_process_collector,
@@ -15,6 +15,7 @@ __all__ = [
     "EpisodeAccounting",
     "EpisodeStatistics",
     "Recording",
+    "StepRecorder",
     "WorkerCollector",
     "make_collector",
     "make_process_collector",

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import shutil
+import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 
 import torch
 from tensordict import TensorDict, TensorDictBase
 
-__all__ = ["Recording", "read_recording"]
+__all__ = ["Recording", "StepRecorder", "read_recording"]
 
 # of a step and of what follows it; what a policy writes besides is not recorded
 _FLAGS = ("done", "terminated", "truncated")
@@ -25,7 +27,6 @@ class Recording:
         KeyError: When a batch is written that lacks one of the entries.
 
     Examples:
-        >>> import tempfile
         >>> folder = Path(tempfile.mkdtemp())
         >>> done = torch.tensor([[[False], [True], [False]]])
         >>> following = {
@@ -48,10 +49,64 @@ class Recording:
         following = ("observation", "reward", *cost_keys, *_FLAGS)
         self._keys = ["observation", "action", *(("next", key) for key in following)]
 
+    def begin(self) -> None:
+        """Remove what is there of an earlier recording."""
+        for path in _pieces(self.folder):
+            shutil.rmtree(path)
+
     def write(self, number: int, batch: TensorDictBase) -> None:
         """Write a batch [N, T] under its number; one that is there already is replaced."""
-        piece = batch.select(*self._keys).cpu()
-        piece.memmap(str(self.folder / f"{number:08d}"), copy_existing=True)
+        place = self.folder / f"{number:08d}"
+        # whole or not at all: a run may end at any moment
+        with tempfile.TemporaryDirectory(prefix=".", dir=_made(self.folder)) as unfinished:
+            written = Path(unfinished) / place.name
+            batch.select(*self._keys).cpu().memmap(str(written), copy_existing=True)
+            if place.exists():
+                shutil.rmtree(place)
+            written.rename(place)
+
+
+class StepRecorder:
+    """Hands single steps [N] on to a recording, many at a time.
+
+    Args:
+        recording: Where they go, as batches 0, 1, 2, …; what is there already is removed.
+        steps: How many make a batch.
+
+    Examples:
+        >>> done = torch.zeros(4, 1, dtype=torch.bool)
+        >>> following = {"observation": torch.ones(4, 2), "reward": torch.ones(4, 1)}
+        >>> following |= {"done": done, "terminated": done, "truncated": done}
+        >>> step = TensorDict(
+        ...     observation=torch.zeros(4, 2), action=torch.zeros(4, 1), next=following,
+        ...     batch_size=[4],
+        ... )
+        >>> folder = tempfile.mkdtemp()
+        >>> recorder = StepRecorder(Recording(folder, []), steps=2)
+        >>> for _ in range(3):
+        ...     recorder(step)
+        >>> recorder.flush()
+        >>> read_recording(folder).shape
+        torch.Size([4, 3])
+    """
+
+    def __init__(self, recording: Recording, steps: int = 500) -> None:
+        recording.begin()
+        self._recording, self._number = recording, steps
+        self._steps: list[TensorDictBase] = []
+        self._written = 0
+
+    def __call__(self, step: TensorDictBase) -> None:
+        """Take in the next step [N]."""
+        self._steps.append(step.clone())
+        if len(self._steps) == self._number:
+            self.flush()
+
+    def flush(self) -> None:
+        """Write what has not been written yet."""
+        if self._steps:
+            self._recording.write(self._written, torch.stack(self._steps, -1))
+            self._steps, self._written = [], self._written + 1
 
 
 def read_recording(folder: Path | str) -> TensorDict:
@@ -60,7 +115,17 @@ def read_recording(folder: Path | str) -> TensorDict:
     Raises:
         FileNotFoundError: If there are none.
     """
-    pieces = sorted(path for path in Path(folder).glob("[0-9]*") if path.is_dir())
+    pieces = _pieces(Path(folder))
     if not pieces:
         raise FileNotFoundError(f"{folder} holds no transitions: is it the folder of a recording?")
     return torch.cat([TensorDict.load_memmap(str(path)).clone() for path in pieces], -1)
+
+
+def _pieces(folder: Path) -> list[Path]:
+    """Folders of the batches, in order of their numbers."""
+    return sorted(path for path in folder.glob("[0-9]*") if path.is_dir())
+
+
+def _made(folder: Path) -> Path:
+    folder.mkdir(parents=True, exist_ok=True)
+    return folder

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import torch
+from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torchrl.envs import EnvBase
@@ -45,6 +46,7 @@ def collect_episodes(
     *,
     deterministic: bool,
     progress: bool = False,
+    record: Callable[[TensorDictBase], None] | None = None,
 ) -> Episodes:
     """Run a policy for exactly ``num_episodes`` episodes.
 
@@ -58,6 +60,7 @@ def collect_episodes(
         cost_keys: Keys of the costs to sum, below "next".
         deterministic: Whether the policy acts with its mean.
         progress: Whether to show a bar.
+        record: Gets every step [N], also those of worlds that go on unobserved.
 
     Examples:
         >>> from safe_rl.envs import make_env
@@ -81,6 +84,8 @@ def collect_episodes(
     ):
         while (finished < quota).any():
             step, state = env.step_and_maybe_reset(policy(state))
+            if record is not None:
+                record(step)
             after = step["next"]
             signals = [torch.ones_like(after["reward"]), after["reward"]]
             signals += [after[key] for key in cost_keys]

@@ -10,9 +10,11 @@ from typing import Any
 
 import torch
 from omegaconf import DictConfig, OmegaConf
+from tensordict.nn import TensorDictModuleBase
 from torchrl.envs import EnvBase
 
-from safe_rl.evaluation.episodes import collect_episodes
+from safe_rl.collectors import Recording, StepRecorder
+from safe_rl.evaluation.episodes import Episodes, collect_episodes
 from safe_rl.evaluation.layouts import default_seed, shared_layouts
 from safe_rl.evaluation.loading import (
     evaluated,
@@ -91,29 +93,55 @@ def evaluate(
         with closing(make(1, **drawing)) as single:
             check_camera(single, options.camera)
     manner = {"deterministic": options.deterministic}
+    places = {
+        suffix: RunFolder(directory).evaluation(options.name, suffix)
+        for suffix in ("json", "csv", "transitions", "mp4")
+    }
     with closing(make(min(options.num_envs, options.episodes))) as env:
         cost_keys = env.cost_keys
         policy = load_policy(config, env, checkpoint, torch.device(options.device))
         torch.manual_seed(seed)
-        episodes = collect_episodes(
-            env, policy, options.episodes, cost_keys, **manner, progress=progress
-        )
+        episodes = _collect(env, policy, options, places["transitions"], progress)
     limits = {key: float(d) for key, d in config.cost_limits.items() if key in cost_keys}
     reference = suite.reference(node, but_for=_LAYOUTS)
     estimates = summarise(episodes, limits, reference, options.cvar_alpha)
     facts = _facts(directory, config, checkpoint, options, node, seed) | {"cost_limits": limits}
-    run = RunFolder(directory)
-    files = [run.evaluation(options.name, suffix) for suffix in ("json", "csv", "mp4")]
-    write_summary(files[0], facts, estimates)
-    write_episodes(files[1], episodes)
-    if not options.video:
-        return Evaluation(facts, estimates, tuple(files[:2]))
-    torch.manual_seed(seed)
-    # the first world draws the same episodes whatever the number of worlds
-    with closing(make(1, **drawing)) as single:
-        frames = record_episode(single, policy, cost_keys, **manner, camera=options.camera)
-        write_video(files[2], frames)
+    write_summary(places["json"], facts, estimates)
+    write_episodes(places["csv"], episodes)
+    if options.video:
+        torch.manual_seed(seed)
+        # the first world draws the same episodes whatever the number of worlds
+        with closing(make(1, **drawing)) as single:
+            frames = record_episode(single, policy, cost_keys, **manner, camera=options.camera)
+            write_video(places["mp4"], frames)
+    is_written = {"transitions": options.record, "mp4": options.video}
+    files = [path for suffix, path in places.items() if is_written.get(suffix, True)]
     return Evaluation(facts, estimates, tuple(files))
+
+
+def _collect(
+    env: EnvBase,
+    policy: TensorDictModuleBase,
+    options: EvaluationOptions,
+    transitions: Path,
+    progress: bool,
+) -> Episodes:
+    """Whole episodes; all steps on the way are written if that is wanted."""
+    recorder = None
+    if options.record:
+        recorder = StepRecorder(Recording(transitions, env.cost_keys))
+    episodes = collect_episodes(
+        env,
+        policy,
+        options.episodes,
+        env.cost_keys,
+        deterministic=options.deterministic,
+        progress=progress,
+        record=recorder,
+    )
+    if recorder is not None:
+        recorder.flush()
+    return episodes
 
 
 def _facts(

@@ -47,6 +47,7 @@ class EvaluationOptions:
     cvar_alpha: float = _option(0.1, "share of the costliest episodes in the CVaR")
     video: bool = _option(False, "write an MP4 of the first episode (extra 'video')")
     camera: str = _option("free", "of the video: free, fixednear, fixedfar, track or vision")
+    record: bool = _option(False, "write every transition to disk, for dataset.path=…")
     certify: bool = _option(
         False, "find the best checkpoint that surely keeps the limits, instead of evaluating one"
     )

@@ -130,12 +130,17 @@ class RunFolder:
         return found[-1] if found else None
 
     @property
+    def transitions(self) -> Path:
+        """Folder of what was collected, if it was recorded."""
+        return self.directory / "transitions"
+
+    @property
     def certificate(self) -> Path:
         """Which checkpoint surely keeps the limits."""
         return self.directory / "certificate.json"
 
     def evaluation(self, name: str, suffix: str) -> Path:
-        """A file of an evaluation: ``json`` for estimates, ``csv`` for episodes, ``mp4``."""
+        """What an evaluation leaves: ``json`` for estimates, ``csv``, ``mp4``, ``transitions``."""
         return self.directory / f"{'_'.join(filter(None, ('evaluation', name)))}.{suffix}"
 
     def evaluations(self) -> list[Path]:

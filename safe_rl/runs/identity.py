@@ -71,6 +71,7 @@ ROLES: dict[str, Role] = {
     "import": Role.MACHINE,
     "logger": Role.MACHINE,
     "num_threads": Role.MACHINE,
+    "record": Role.MACHINE,  # what is kept of a run
     "hydra": Role.MACHINE,
     "hydra.output_subdir": Role.MANNER,
     "hydra.run": Role.MANNER,
@@ -86,6 +87,9 @@ _SILENT: dict[str, Hashable] = {
     **dict.fromkeys(
         [f"env.{part}_scale" for part in ("mass", "friction", "damping", "strength")], 1.0
     ),
+    "dataset.path": None,
+    "dataset.safe_episodes": False,
+    "dataset.alone": False,
     "model.head": "auto",
     "model.normalise": None,
     "model.encoders": None,

@@ -19,7 +19,7 @@ from safe_rl.algorithms.constraints import check_cost_limits
 from safe_rl.algorithms.contract import Algorithm, Stateful
 from safe_rl.algorithms.parts import find_recipe
 from safe_rl.algorithms.side_by_side import torch_threads
-from safe_rl.collectors import EpisodeAccounting, WorkerCollector, make_collector
+from safe_rl.collectors import EpisodeAccounting, Recording, WorkerCollector, make_collector
 from safe_rl.collectors.workers import MakeEnv
 from safe_rl.runs.checkpoints import CheckpointStore
 from safe_rl.runs.lock import held
@@ -63,14 +63,17 @@ def build_trainer(
     """
     cost_limits = check_cost_limits(config.cost_limits, env.cost_keys)
     algorithm = find_recipe(config).build(config, env)
+    folder = RunRecord(directory, config, cost_limits, env.max_episode_steps)
+    recording = Recording(folder.files.transitions, env.cost_keys)
     return Trainer(
         env=env,
         algorithm=algorithm,
         collector=_build_collector(config, env, make_env, algorithm),
         cost_limits=cost_limits,
-        folder=RunRecord(directory, config, cost_limits, env.max_episode_steps),
+        folder=folder,
         config=config,
         evaluation=None if make_evaluation is None else make_evaluation(algorithm.policy),
+        recording=recording if config.get("record") else None,
     )
 
 
@@ -95,6 +98,7 @@ class Trainer:
         folder: Where the run writes.
         config: Configuration of the run, for ``frames`` and ``checkpoint``.
         evaluation: Evaluates the policy after every epoch in which that is due, or None.
+        recording: Where every batch is written, or None.
     """
 
     def __init__(
@@ -107,6 +111,7 @@ class Trainer:
         folder: RunRecord,
         config: DictConfig,
         evaluation: Evaluation | None = None,
+        recording: Recording | None = None,
     ) -> None:
         self.algorithm = algorithm
         self.accounting = EpisodeAccounting(
@@ -121,7 +126,7 @@ class Trainer:
         self.interrupted_by: Signals | None = None
         self._collector = collector
         self._env = env
-        self._evaluation = evaluation
+        self._evaluation, self._recording = evaluation, recording
         # the worlds of workers are out of reach
         self._worlds = None
         if isinstance(collector, Collector) and hasattr(env, "get_state"):
@@ -254,6 +259,8 @@ class Trainer:
             batch = next(batches)
             if self._worlds is not None:
                 self._worlds.take()
+        if self._recording is not None:
+            self._recording.write(self.progress.epoch, batch)
         collected = time.perf_counter()
         episodes = self.accounting.update(batch)
         learned = self.algorithm.learn(batch, episodes)

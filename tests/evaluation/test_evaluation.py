@@ -17,6 +17,7 @@ from run_configs import compose_config
 from safe_rl.cli.benchmark import suite
 from safe_rl.cli.evaluate import evaluate_run as evaluate
 from safe_rl.cli.evaluate import main
+from safe_rl.collectors import read_recording
 from safe_rl.envs import OpenGLError, make_env, store_configs
 from safe_rl.evaluation.settings import EvaluationOptions
 from safe_rl.evaluation.video import HEIGHT, STEPS_PER_FRAME, WIDTH
@@ -337,3 +338,21 @@ def test_the_video_shows_an_episode(run):
     assert caption.min() < 80
     assert np.abs(frames[0, :HEIGHT].astype(float) - frames[-1, :HEIGHT]).max() > 50
     assert not list(run.glob(".*unfinished*"))
+
+
+def test_what_an_evaluation_records_is_what_it_measured(run):
+    """Seven episodes of three worlds, which go on together until the last one is done."""
+    result = evaluate(run, options(record=True, name="kept"))
+    assert [path.name for path in result.files] == [
+        *("evaluation_kept.json", "evaluation_kept.csv", "evaluation_kept.transitions"),
+    ]
+    steps = read_recording(result.files[-1])
+    assert steps.shape == (3, 3 * NUM_STEPS)
+    returns = steps["next", "reward"].double().reshape(3, 3, NUM_STEPS).sum(-1)
+    with result.files[1].open() as table:
+        found = [float(row["return"]) for row in csv.DictReader(table)]
+    # three of the first world, two of the others
+    expected = [*returns[0].tolist(), *returns[1:, :2].flatten().tolist()]
+    assert found == pytest.approx(expected, abs=1e-5)
+    evaluate(run, options(episodes=1, num_envs=1, record=True, name="kept"))
+    assert read_recording(result.files[-1]).shape == (1, NUM_STEPS)

@@ -9,7 +9,7 @@ from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 
 from safe_rl.algorithms import OffPolicy
-from safe_rl.collectors import Recording, make_collector
+from safe_rl.collectors import Recording, make_collector, read_recording
 from safe_rl.evaluation.episodes import collect_episodes
 from safe_rl.models import make_bounded_actor
 from safe_rl.objectives import BCLoss
@@ -86,6 +86,50 @@ def test_it_goes_on_as_if_it_had_never_stopped(tmp_path):
     resumed.run()
     table, expected = (without_times(tmp_path / n / "progress.csv") for n in ("halves", "whole"))
     assert table == expected
+
+
+@pytest.mark.parametrize("algo", ["ppo_lagrangian", "sac_lagrangian"])
+def test_a_run_that_is_recorded_can_be_learned_from(algo, tmp_path):
+    sizes = ["num_envs=4", "frames_per_batch=160", "model.hidden_sizes=[16]", "logger=none"]
+    keys = ["env=PointMass", f"algo={algo}", "frames=480", "record=true", *sizes]
+    config = compose_config(*keys)
+    trainer = make_trainer(config, tmp_path / "run")
+    collected, update = [], trainer.accounting.update
+    trainer.accounting.update = lambda batch: (collected.append(batch.clone()), update(batch))[1]
+    trainer.run()
+    found, expected = read_recording(tmp_path / "run" / "transitions"), torch.cat(collected, -1)
+    for key in (*("observation", "action"), *(("next", k) for k in ("reward", "cost", "done"))):
+        assert torch.equal(found[key], expected[key])
+    clone = make_trainer(
+        offline_config(tmp_path / "run" / "transitions", "frames=160", limits="{cost: 25}"),
+        tmp_path / "clone",
+    )
+    clone.run()
+    # rows begin at different points of their first episode: only whole ones are taken
+    assert 0 < len(clone.algorithm.memory) <= 480
+    actions = torch.cat(list(clone.algorithm.memory.minibatches(4)))["action"]
+    assert actions.abs().max() <= 1
+
+
+def test_a_run_that_goes_on_records_what_it_does_again(tmp_path):
+    keys = ["env=PointMass", "algo=ppo", "frames=480", "logger=none", "record=true"]
+    keys += ["num_envs=4", "frames_per_batch=160", "model.hidden_sizes=[16]"]
+    make_trainer(compose_config(*keys), tmp_path / "whole").run()
+    make_trainer(compose_config(*keys, "frames=160"), tmp_path / "halves").run()
+    # of a process that was killed before it could write a checkpoint
+    ahead = tmp_path / "halves" / "transitions"
+    Recording(ahead, []).write(1, TensorDict(
+        observation=torch.zeros(4, 1), action=torch.zeros(4, 1), batch_size=[4, 1],
+        next={key: torch.zeros(4, 1, 1) for key in (
+            "observation", "reward", "done", "terminated", "truncated",
+        )},
+    ))  # fmt: skip
+    resumed = make_trainer(compose_config(*keys), tmp_path / "halves")
+    assert resumed.resume()
+    resumed.run()
+    whole, halves = (read_recording(tmp_path / n / "transitions") for n in ("whole", "halves"))
+    assert whole.shape == halves.shape == (4, 120)
+    assert torch.equal(whole["observation"], halves["observation"])
 
 
 def test_any_algorithm_may_begin_with_a_dataset(tmp_path):
