@@ -127,7 +127,7 @@ FLOORS = {
         ("",),
     ),
     "algorithms": (
-        ("contract", "constraints", "learning_rate", "trust_region_step"),
+        ("contract", "constraints", "learning_rate", "prioritised", "trust_region_step"),
         (
             *("c_trpo_step", "cpo_step", "crpo_step", "in_turn", "memory", "minibatch", "parts"),
             *("side_by_side", "tracked_constraints"),

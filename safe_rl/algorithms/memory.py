@@ -13,10 +13,11 @@ from torchrl.data import (
     RandomSampler,
     TensorDictReplayBuffer,
 )
-from torchrl.data.replay_buffers.samplers import PrioritizedSampler, Sampler
+from torchrl.data.replay_buffers.samplers import Sampler
 from torchrl.envs import MultiStepTransform
 
 from safe_rl.algorithms.contract import Stateful
+from safe_rl.algorithms.prioritised import ProportionalSampler
 
 __all__ = ["Memory"]
 
@@ -47,8 +48,7 @@ class Memory:
         device: Device of the minibatches.
 
     Raises:
-        ValueError: If there is no such storage, if priorities were to be kept, or if TorchRL was
-            installed without the compiled extension that they need.
+        ValueError: If there is no such storage, or priorities lack an exponent.
 
     Examples:
         >>> memory = Memory(
@@ -80,15 +80,12 @@ class Memory:
             raise ValueError(f"storage={storage}: it must be one of {', '.join(_STORAGES)}.")
         self.batch_size, self.keeps, self.capacity = batch_size, keep, capacity
         self._in_keys, self._device = list(in_keys), torch.device(device or "cpu")
-        if prioritised is not None and keep:
-            raise ValueError("Priorities cannot be kept: set keep=false, or prioritised=null.")
         self._is_prioritised = prioritised is not None
         self._buffer = TensorDictReplayBuffer(
             storage=_STORAGES[storage](
                 capacity, device=self._device if storage == "tensor" else torch.device("cpu")
             ),
             sampler=_sampler(capacity, prioritised),
-            priority_key="td_error",
         )
         self._multi_step: MultiStepTransform | None = None
         if n_steps > 1:
@@ -138,7 +135,7 @@ class Memory:
     def learned(self, minibatch: TensorDictBase) -> None:
         """Set the priorities of a minibatch by the TD errors that a loss has written into it."""
         if self._is_prioritised:
-            self._buffer.update_tensordict_priority(minibatch)
+            self._buffer.update_priority(minibatch["index"], minibatch["td_error"])
 
     def components(self) -> dict[str, Stateful]:
         """What a checkpoint holds of it: itself, if it is to be kept."""
@@ -148,6 +145,8 @@ class Memory:
         """The transitions, where the next one goes, and what the next n-step sums need."""
         size = len(self)
         state: dict[str, Any] = {"size": size, "writer": self._buffer.writer.state_dict()}
+        if self._is_prioritised:
+            state["sampler"] = self._buffer.sampler.state_dict()
         if size:
             steps = self._buffer[:].exclude("index").flatten_keys("/")
             # a file gets the whole of what a part of is saved
@@ -167,6 +166,8 @@ class Memory:
             steps = TensorDict(state_dict["steps"], batch_size=[size]).unflatten_keys("/")
             self._buffer.extend(steps)
         self._buffer.writer.load_state_dict(state_dict["writer"])
+        if self._is_prioritised:
+            self._buffer.sampler.load_state_dict(state_dict["sampler"])
         self.end_rows()
         if self._multi_step is not None and "tail" in state_dict:
             tail = TensorDict(state_dict["tail"], batch_size=state_dict["tail_shape"])
@@ -176,11 +177,9 @@ class Memory:
 def _sampler(capacity: int, prioritised: Mapping[str, float] | None) -> Sampler:
     if prioritised is None:
         return RandomSampler()
-    try:
-        return PrioritizedSampler(capacity, **prioritised)
-    except (RuntimeError, TypeError) as error:
+    if set(prioritised) != {"alpha", "beta"}:
         raise ValueError(
-            f"prioritised={dict(prioritised)} needs an alpha and a beta, and TorchRL's compiled "
-            f"extension ({error}): set memory.prioritised=null, or install a torchrl that was "
-            "built for this torch."
-        ) from error
+            f"memory.prioritised={dict(prioritised)}: it must hold alpha and beta, as in "
+            "{alpha: 0.6, beta: 0.4}, or be null."
+        )
+    return ProportionalSampler(capacity, **prioritised)

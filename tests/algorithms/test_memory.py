@@ -1,9 +1,10 @@
 """What a memory gives back: the transitions that went in, over one step or over several."""
 
+import numpy as np
 import pytest
 import torch
+from scipy import stats
 from tensordict import TensorDict
-from torchrl.data.replay_buffers.samplers.prioritized import SumSegmentTreeFp32
 
 from safe_rl.algorithms import Memory
 
@@ -108,30 +109,74 @@ def test_a_copy_goes_on_in_the_same_way(storage, n_steps, batches, tmp_path):
     assert torch.equal(*drawn)
 
 
-def make_prioritised(**keys):
-    keys |= {"keep": False, "prioritised": {"alpha": 1.0, "beta": 1.0}}
-    if SumSegmentTreeFp32 is None:
-        with pytest.raises(ValueError, match="prioritised=null"):
-            make_memory(**keys)
-        pytest.skip("torchrl is installed without its compiled extension")
-    return make_memory(**keys)
+EXPONENTS = {"alpha": 0.7, "beta": 0.4}
 
 
-def test_large_errors_are_drawn_more_often():
-    memory = make_prioritised()
+def prioritised_by(errors, **exponents):
+    """A memory of ten transitions whose errors have been learned."""
+    memory = make_memory(keep=False, prioritised={**EXPONENTS, **exponents})
     memory.extend(make_batch(0, 10, rows=1))
     for minibatch in memory.minibatches(5):
-        minibatch["td_error"] = torch.where(minibatch["observation"].squeeze(-1) == 3, 9.0, 1.0)
+        number = minibatch["observation"].squeeze(-1).long()
+        minibatch["td_error"] = torch.tensor(errors)[number]
         memory.learned(minibatch)
+    return memory
+
+
+def test_draws_and_weights_are_those_of_the_article():
+    """Schaul et al. 2016: P(i) = p_i^α / Σ p^α, w_i = (N P(i))^−β over the largest."""
+    errors = np.linspace(0.2, 4.0, 10)
+    drawn = torch.cat(list(prioritised_by(errors).minibatches(600)))
+    number = drawn["observation"].squeeze(-1).long().numpy()
+    chances = errors**0.7 / (errors**0.7).sum()
+    counts = np.bincount(number, minlength=10)
+    assert stats.chisquare(counts, chances * counts.sum()).pvalue > 1e-3
+    weights = (10 * chances) ** -0.4
+    expected = torch.tensor(weights / weights.max()).float()[number]
+    torch.testing.assert_close(drawn["priority_weight"], expected)
+
+
+def test_new_transitions_are_drawn_like_the_worst_ones():
+    memory = prioritised_by([1.0] * 9 + [50.0], alpha=1.0)
+    memory.extend(make_batch(10, 1, rows=1))
     drawn = torch.cat([m["observation"] for m in memory.minibatches(100)])
-    assert (drawn == 3).float().mean().item() == pytest.approx(0.5, abs=0.03)
+    shares = [(drawn == number).float().mean().item() for number in (9, 10)]
+    assert shares == pytest.approx([50 / 109] * 2, abs=0.03)
+
+
+def test_the_oldest_go_with_their_priorities():
+    memory = make_memory(capacity=4, keep=False, prioritised={"alpha": 1.0, "beta": 1.0})
+    memory.extend(make_batch(0, 4, rows=1))
+    for minibatch in memory.minibatches(2):
+        minibatch["td_error"] = minibatch["observation"].squeeze(-1) * 0
+        memory.learned(minibatch)
+    memory.extend(make_batch(4, 2, rows=1))
+    drawn = torch.cat([m["observation"] for m in memory.minibatches(20)])
+    assert set(drawn.flatten().tolist()) == {4, 5}
+
+
+def test_a_copy_goes_on_with_the_same_priorities(tmp_path):
+    memory = prioritised_by(np.linspace(0.2, 4.0, 10))
+    copy = make_memory(keep=False, prioritised=EXPONENTS)
+    torch.save(memory.state_dict(), tmp_path / "state")
+    copy.load_state_dict(torch.load(tmp_path / "state", weights_only=True))
+    drawn = []
+    for each in (memory, copy):
+        torch.manual_seed(3)
+        each.extend(make_batch(10, 5, rows=1))
+        drawn.append(torch.cat([m["observation"] for m in each.minibatches(3)]))
+    assert torch.equal(*drawn)
+
+
+@pytest.mark.parametrize("exponents", [{"alpha": 0.6}, {"alpha": 0.6, "beta": 0.4, "eps": 1.0}])
+def test_exponents_that_are_missing_or_too_many_are_named(exponents):
+    with pytest.raises(ValueError, match="it must hold alpha and beta, as in"):
+        make_memory(prioritised=exponents)
 
 
 def test_only_a_memory_that_is_kept_is_part_of_checkpoints():
     assert set(make_memory().components()) == {"memory"}
     assert not make_memory(keep=False).components()
-    with pytest.raises(ValueError, match="Priorities cannot be kept"):
-        make_memory(prioritised={"alpha": 1.0, "beta": 1.0})
 
 
 def test_a_storage_that_does_not_exist_is_named():
