@@ -70,7 +70,11 @@ class Algorithm(Protocol):
 
 
 class Recipe(Protocol):
-    """How an algorithm is put together; a configuration names it as ``algo._target_``."""
+    """How an algorithm is put together; a configuration names it as ``algo._target_``.
+
+    ``unread``, if it has one, holds keys that presets bring along and that it makes no use of, each
+    with the reason: on a command line they are refused.
+    """
 
     @classmethod
     def build(cls, config: DictConfig, env: EnvBase) -> Algorithm:

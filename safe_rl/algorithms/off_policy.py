@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, ClassVar
 
 import torch
 from omegaconf import DictConfig
@@ -33,6 +33,16 @@ from safe_rl.objectives.q_functions import CostCritics
 
 __all__ = ["OffPolicy"]
 
+_UNREAD = {
+    "advantage": "It learns values of single transitions, not advantages of batches: the discount "
+    "is loss.gamma, and memory.n_steps says how many steps a transition spans.",
+    "cost_advantage": "It learns values of single transitions, not advantages of batches.",
+    "critic_update": "Its Q functions are trained together with the policy: policy_update.",
+    "then": "It has one update.",
+    "model.head": "The distribution of its actions is the algorithm's own, within their bounds.",
+    "model.initial_log_std": "Its network tells the standard deviation state by state.",
+}
+
 
 @dataclass
 class OffPolicy:
@@ -49,7 +59,10 @@ class OffPolicy:
             begins when the memory holds as many.
         collects: Whether what is collected goes into the memory.
         learns_from: What was in it from the beginning, in a sentence; nothing if it was empty.
+        unread: Keys of configurations that are for other recipes, and why.
     """
+
+    unread: ClassVar[Mapping[str, str]] = _UNREAD
 
     policy: ExploringPolicy
     networks: Mapping[str, nn.Module]

@@ -30,6 +30,7 @@ from safe_rl.cli.overrides import (
     check_added,
     check_choices,
     check_limits,
+    check_read,
     explain,
 )
 from safe_rl.cli.settings import check_settings
@@ -68,6 +69,7 @@ def check_command(arguments: Sequence[str], conf: Path) -> None:
         for job in _jobs(overrides) if _is_sweep(flags) else [flags.overrides]:
             config = _compose(hydra, flags.config_name or "config", job)
             if flags.cfg is None and flags.info is None:
+                check_read(overrides, config)
                 _check_run(config, "hydra.sweep.dir" if _is_sweep(flags) else "hydra.run.dir")
                 check_added(overrides, config)
 

@@ -17,8 +17,18 @@ from omegaconf import DictConfig, OmegaConf
 from safe_rl.cli.keys import KEYS
 from safe_rl.cli.settings import optional_keys, plain
 from safe_rl.naming import did_you_mean, nearest
+from safe_rl.targets import locate
 
-__all__ = ["CommandLineError", "check_added", "check_choices", "check_limits", "explain"]
+__all__ = [
+    "CommandLineError",
+    "check_added",
+    "check_choices",
+    "check_limits",
+    "check_read",
+    "explain",
+]
+
+_DEFAULT_RECIPE = "safe_rl.algorithms.OnPolicy"
 
 
 class CommandLineError(ValueError):
@@ -99,6 +109,28 @@ def check_added(overrides: Sequence[Override], config: DictConfig) -> None:
         if not re.search(rf"\$\{{(?:[^${{}}]*[:,])?{re.escape(head)}[.,}}]", text):
             others = {key: node for key, node in plain(config).items() if key != head}
             raise CommandLineError(_unread(override.input_line, override.key_or_group, others))
+
+
+def check_read(overrides: Sequence[Override], config: DictConfig) -> None:
+    """Refuse keys that a configuration holds and its algorithm does not read.
+
+    Args:
+        overrides: Overrides of a command line.
+        config: What they make.
+
+    Raises:
+        CommandLineError: For the first one; it says why.
+        TargetError: If there is no such algorithm.
+    """
+    recipe = locate(config.algo.get("_target_", _DEFAULT_RECIPE), "algo._target_")
+    for override in overrides:
+        key = override.key_or_group.replace("/", ".")
+        for unread, reason in getattr(recipe, "unread", {}).items():
+            if f"{key}.".startswith(f"{unread}."):
+                raise CommandLineError(
+                    f"'{override.input_line}': algo={config.algo.name} does not read '{unread}'. "
+                    f"{reason}"
+                )
 
 
 def explain(

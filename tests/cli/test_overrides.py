@@ -87,6 +87,29 @@ def test_multipliers_go_with_algorithms_that_have_them(override):
         check_command(["algo=ppo", override], CONF)
 
 
+UNREAD = {
+    "advantage.gamma=0.9": r"algo=td3 does not read 'advantage'\. .*the discount is loss\.gamma",
+    "critic_update.optimizer.lr=1e-4": "'critic_update'. Its Q functions are trained together with",
+    "+critic_update.max_grad_norm=1": "does not read 'critic_update'",
+    "+cost_advantage.gamma=0.9": "does not read 'cost_advantage'",
+    "+then.again.loss._target_=safe_rl.objectives.PPOLoss": "'then'. It has one update",
+    "model.head=tanh": "'model.head'. The distribution of its actions is the algorithm's own",
+    "model.initial_log_std=-1": "Its network tells the standard deviation",
+}
+
+
+@pytest.mark.parametrize("argument", UNREAD)
+def test_what_only_other_algorithms_read_is_refused_with_the_reason(argument):
+    with pytest.raises(CommandLineError, match=UNREAD[argument]):
+        check_command(["algo=td3", argument], CONF)
+    if "+" not in argument:
+        check_command(["algo=ppo", argument], CONF)
+        with pytest.raises(CommandLineError, match="algo=sac does not"):
+            check_command(["-m", "algo=ppo,sac", argument], CONF)
+        with pytest.raises(CommandLineError, match=f"'{argument}': algo=bc does not read"):
+            check_command(["algo=bc", argument], CONF)
+
+
 @pytest.mark.parametrize("flag", ["--config-dir=", "hydra.searchpath=[file://"])
 def test_folders_of_ones_own_are_searched_too(own_conf, flag):
     folder = f"{flag}{own_conf}{']' if '[' in flag else ''}"
