@@ -110,6 +110,14 @@ def test_overrides_reach_the_environment():
         compose_config("env=PointGoal1", "env.hazard_num=3")
 
 
+def test_learning_rates_are_given_by_the_names_of_parameters():
+    config = compose_config("env=PointMass", "algo=sac", "policy_update.rates={log_alpha: 1e-4}")
+    update = find_recipe(config).build(config, PointMass(2)).policy_update
+    rates = {len(group["params"]): group["lr"] for group in update.optimizer.param_groups}
+    assert rates[1] == 1e-4
+    assert max(rates.values()) == config.policy_update.optimizer.lr
+
+
 # The whole of what decides how a run learns with preset=paper, from the paper's section 5.2 and the
 # code published with it. A number that is in the configuration and not here fails the tests.
 ADAM = {"_target_": "torch.optim.Adam", "_partial_": True, "fused": True}
