@@ -89,14 +89,14 @@ def evaluate(
 
     # environments that draw nothing unless they are told have a key for it
     drawing = {key: "rgb_array" for key in ("render_mode",) if key in node}
-    if options.video:
+    run = RunFolder(directory)
+    films = [run.evaluation(options.name, "mp4")] if options.video else []
+    films += [Path(options.picture)] if options.picture else []
+    for film in films:
         with closing(make(1, **drawing)) as single:
-            check_camera(single, options.camera)
+            check_camera(single, options.camera, film.suffix[1:])
     manner = {"deterministic": options.deterministic}
-    places = {
-        suffix: RunFolder(directory).evaluation(options.name, suffix)
-        for suffix in ("json", "csv", "transitions", "mp4")
-    }
+    places = {kind: run.evaluation(options.name, kind) for kind in ("json", "csv", "transitions")}
     with closing(make(min(options.num_envs, options.episodes))) as env:
         cost_keys = env.cost_keys
         policy = load_policy(config, env, checkpoint, torch.device(options.device))
@@ -108,15 +108,16 @@ def evaluate(
     facts = _facts(directory, config, checkpoint, options, node, seed) | {"cost_limits": limits}
     write_summary(places["json"], facts, estimates)
     write_episodes(places["csv"], episodes)
-    if options.video:
+    for film in films:
         torch.manual_seed(seed)
         # the first world draws the same episodes whatever the number of worlds
         with closing(make(1, **drawing)) as single:
-            frames = record_episode(single, policy, cost_keys, **manner, camera=options.camera)
-            write_video(places["mp4"], frames)
-    is_written = {"transitions": options.record, "mp4": options.video}
-    files = [path for suffix, path in places.items() if is_written.get(suffix, True)]
-    return Evaluation(facts, estimates, tuple(files))
+            frames = record_episode(
+                single, policy, cost_keys, **manner, camera=options.camera, suffix=film.suffix[1:]
+            )
+            write_video(film, frames)
+    kept = [places["transitions"]] if options.record else []
+    return Evaluation(facts, estimates, (places["json"], places["csv"], *kept, *films))
 
 
 def _collect(

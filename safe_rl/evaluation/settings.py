@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -18,6 +19,9 @@ _RANGES = {
     "num_threads": (0, 1024),
     "seed": (0, 2**62),
 }
+
+
+_PICTURES = (".gif", ".webp")
 
 
 def _option(default: Any, help: str) -> Any:
@@ -46,7 +50,10 @@ class EvaluationOptions:
     device: str = _option("cpu", "of the policy")
     cvar_alpha: float = _option(0.1, "share of the costliest episodes in the CVaR")
     video: bool = _option(False, "write an MP4 of the first episode (extra 'video')")
-    camera: str = _option("free", "of the video: free, fixednear, fixedfar, track or vision")
+    picture: str | None = _option(
+        None, "file for an animated picture of the first episode, .gif or .webp"
+    )
+    camera: str = _option("free", "of these: free, fixednear, fixedfar, track or vision")
     record: bool = _option(False, "write every transition to disk, for dataset.path=…")
     certify: bool = _option(
         False, "find the best checkpoint that surely keeps the limits, instead of evaluating one"
@@ -71,9 +78,18 @@ def check_options(options: EvaluationOptions) -> None:
     check_share(options.cvar_alpha)
     if "/" in options.name or not options.name.isprintable():
         raise ValueError(f"name={options.name}: it is part of the files' names, without /.")
-    if not options.video and options.camera != EvaluationOptions.camera:
+    if not (options.video or options.picture) and options.camera != EvaluationOptions.camera:
         raise ValueError(f"camera={options.camera}: it is the video's: add video=true.")
+    if options.picture is not None:
+        _check_picture(Path(options.picture))
     check_device(options.device)
+
+
+def _check_picture(path: Path) -> None:
+    if path.suffix not in _PICTURES:
+        raise ValueError(f"picture={path}: its name must end in {' or '.join(_PICTURES)}.")
+    if not path.parent.is_dir():
+        raise ValueError(f"picture={path}: there is no folder {path.parent}.")
 
 
 def check_device(device: str) -> None:

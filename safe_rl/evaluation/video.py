@@ -1,11 +1,11 @@
-"""An episode as an MP4 that browsers play."""
+"""An episode as an MP4 that browsers play, or as an animated picture for pages of text."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from inspect import signature
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -17,40 +17,63 @@ from safe_rl.evaluation.episodes import exploration
 from safe_rl.extras import import_extra
 from safe_rl.runs.files import replacing
 
-__all__ = ["check_camera", "record_episode", "write_video"]
+__all__ = ["MANNERS", "Manner", "check_camera", "record_episode", "write_video"]
 
-WIDTH, HEIGHT = 640, 480
-"""Of the picture in pixels, where the environment lets it be chosen."""
-STEPS_PER_FRAME = 2
-FRAMES_PER_SECOND = 25
-"""With ``STEPS_PER_FRAME``, an episode of 1000 steps lasts 20 s: Point's own time."""
+
+class Manner(NamedTuple):
+    """How an episode is recorded.
+
+    Attributes:
+        width: Of the picture in pixels, where the environment lets it be chosen.
+        height: Likewise.
+        steps_per_frame: Environment steps from one frame to the next.
+        frames_per_second: When it is played.
+        write: Encodes the frames into a file: (file, frames, suffix, frames per second).
+    """
+
+    width: int
+    height: int
+    steps_per_frame: int
+    frames_per_second: int
+    write: Callable[[Path, Iterator[np.ndarray], str, int], None]
+
+
 DEFAULT_CAMERA = "free"
 _CAPTION_HEIGHT = 20
+# of a GIF's palette; and how long its last frame stays [ms]
+_COLOURS, _LAST = 64, 1500
 
 
-def check_camera(env: EnvBase, camera: str) -> None:
+def check_camera(env: EnvBase, camera: str, suffix: str = "mp4") -> None:
     """Draw a picture, to notice before any episode what would prevent a video.
+
+    Args:
+        env: Environment with one world.
+        camera: A name that ``env.render`` knows.
+        suffix: Of the file that is to be written, see :data:`MANNERS`.
 
     Raises:
         ValueError: If the environment draws no pictures, or has no such camera.
         ModuleNotFoundError: If the encoder is missing; the message names the extra.
     """
-    import_extra("imageio_ffmpeg", "video")
+    if suffix == "mp4":
+        import_extra("imageio_ffmpeg", "video")
     if not callable(getattr(env, "render", None)):
         raise ValueError("video=true: this environment draws no pictures, it has no 'render'.")
     if camera != DEFAULT_CAMERA and "camera" not in _parameters(env):
         raise ValueError(f"camera={camera}: this environment has no cameras to choose from.")
     env.reset()
-    _picture(env, camera)
+    _picture(env, camera, MANNERS[suffix])
 
 
 def _parameters(env: EnvBase) -> set[str]:
     return set(signature(env.render).parameters)
 
 
-def _picture(env: EnvBase, camera: str) -> np.ndarray:
+def _picture(env: EnvBase, camera: str, manner: Manner) -> np.ndarray:
     """World 0 as it is, uint8 [height, width, 3]; sizes and cameras where they can be chosen."""
-    wanted: dict[str, Any] = {"rows": 0, "camera": camera, "width": WIDTH, "height": HEIGHT}
+    size = {"width": manner.width, "height": manner.height}
+    wanted: dict[str, Any] = {"rows": 0, "camera": camera, **size}
     known = _parameters(env)
     picture = np.asarray(env.render(**{k: v for k, v in wanted.items() if k in known}))
     picture = picture[0] if picture.ndim == 4 else picture
@@ -66,6 +89,7 @@ def record_episode(
     *,
     deterministic: bool,
     camera: str = DEFAULT_CAMERA,
+    suffix: str = "mp4",
 ) -> Iterator[np.ndarray]:
     """Run one episode and yield its frames, uint8 [height, width, 3].
 
@@ -75,14 +99,16 @@ def record_episode(
         cost_keys: Keys of its costs; the first is counted below the picture.
         deterministic: Whether it acts with its mean.
         camera: A name that ``env.render`` knows.
+        suffix: Of the file that the frames are for, see :data:`MANNERS`.
     """
+    manner = MANNERS[suffix]
     state = env.reset()
     total = dict.fromkeys(("reward", *cost_keys[:1]), 0.0)
     step = 0
     with exploration(deterministic):
         while True:
-            if step % STEPS_PER_FRAME == 0:
-                yield _with_caption(_picture(env, camera), step, *total.values())
+            if step % manner.steps_per_frame == 0:
+                yield _with_caption(_picture(env, camera, manner), step, *total.values())
             after = env.step(policy(state))["next"]
             step += 1
             total = {key: value + float(after[key]) for key, value in total.items()}
@@ -106,26 +132,54 @@ def _with_caption(
 
 
 def write_video(path: Path, frames: Iterator[np.ndarray]) -> None:
-    """Encode frames as H.264 in an MP4, replaced in one go.
+    """Encode frames, replaced in one go; the file's suffix says how, see :data:`MANNERS`.
 
     Raises:
         ModuleNotFoundError: If the encoder is missing; the message names the extra.
     """
+    suffix = path.suffix.lstrip(".")
+    manner = MANNERS[suffix]
+    with replacing(path) as unfinished:
+        manner.write(unfinished, frames, suffix, manner.frames_per_second)
+
+
+def _write_film(path: Path, frames: Iterator[np.ndarray], suffix: str, rate: int) -> None:
     import_extra("imageio_ffmpeg", "video")
     imageio = import_extra("imageio.v2", "video")
     # pixel format and index at the front: what browsers ask of a video
-    with (
-        replacing(path) as unfinished,
-        imageio.get_writer(
-            unfinished,
-            format="FFMPEG",
-            fps=FRAMES_PER_SECOND,
-            codec="libx264",
-            pixelformat="yuv420p",
-            macro_block_size=4,
-            output_params=["-crf", "26", "-preset", "veryfast", "-movflags", "+faststart"],
-            ffmpeg_log_level="error",
-        ) as writer,
-    ):
+    with imageio.get_writer(
+        path,
+        format="FFMPEG",
+        fps=rate,
+        codec="libx264",
+        pixelformat="yuv420p",
+        macro_block_size=4,
+        output_params=["-crf", "26", "-preset", "veryfast", "-movflags", "+faststart"],
+        ffmpeg_log_level="error",
+    ) as writer:
         for frame in frames:
             writer.append_data(frame)
+
+
+def _write_animation(path: Path, frames: Iterator[np.ndarray], suffix: str, rate: int) -> None:
+    pictures = [Image.fromarray(frame) for frame in frames]
+    if suffix == "gif":
+        # one palette for all, and no dither, so that what stands still is stored once
+        few = np.concatenate([np.asarray(one) for one in pictures[:: len(pictures) // 8 + 1]])
+        palette = Image.fromarray(few).quantize(_COLOURS)
+        pictures = [p.quantize(palette=palette, dither=Image.Dither.NONE) for p in pictures]
+    durations = [1000 // rate] * (len(pictures) - 1) + [_LAST]
+    pictures[0].save(
+        path, format=suffix, save_all=True, append_images=pictures[1:], duration=durations,
+        loop=0, optimize=True, quality=60, method=6,
+    )  # fmt: skip
+
+
+# an episode of 1000 steps lasts 20 s as a film, Point's own time, and half as long as a picture
+_ANIMATION = Manner(400, 300, 5, 20, _write_animation)
+MANNERS = {
+    "mp4": Manner(640, 480, 2, 25, _write_film),
+    "gif": _ANIMATION,
+    "webp": _ANIMATION,
+}
+"""Suffix of a file -> how an episode is recorded into it."""

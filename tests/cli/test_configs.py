@@ -230,7 +230,15 @@ SIZES = {
 }
 # what is no part of the algorithm, and the tables that other keys read
 ASIDE = {"collector", "env", "algo", "preset", "logger", "seed", "device", "num_threads", "compile"}
-ASIDE |= {"certificate", "checkpoint", "default_cost_limits", "import", "paper", "record", "transforms"}
+ASIDE |= {
+    "certificate",
+    "checkpoint",
+    "default_cost_limits",
+    "import",
+    "paper",
+    "record",
+    "transforms",
+}
 
 
 @pytest.mark.parametrize("env", SIZES)

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 import yaml
 from omegaconf import OmegaConf
+from PIL import Image
 from run_configs import compose_config
 
 from safe_rl.cli.benchmark import suite
@@ -20,7 +21,7 @@ from safe_rl.cli.evaluate import main
 from safe_rl.collectors import read_recording
 from safe_rl.envs import OpenGLError, make_env, store_configs
 from safe_rl.evaluation.settings import EvaluationOptions
-from safe_rl.evaluation.video import HEIGHT, STEPS_PER_FRAME, WIDTH
+from safe_rl.evaluation.video import MANNERS
 from safe_rl.scores.published import REFERENCE
 from safe_rl.training.trainer import build_trainer, seed_everything
 
@@ -229,6 +230,8 @@ def test_the_command_prints_a_table(run, capsys):
         (["env.lidar_num_bins=8"], "trained on other observations"),
         (["cvar_alpha=2"], "cvar_alpha"),
         (["camera=nowhere", "video=true"], "nowhere"),
+        (["picture=there.png"], "must end in .gif or .webp"),
+        (["picture=nowhere/there.gif"], "there is no folder nowhere"),
     ],
 )
 def test_what_cannot_be_done_ends_in_one_line(run, arguments, message, capsys, monkeypatch):
@@ -323,6 +326,7 @@ def test_the_video_shows_an_episode(run):
     imageio = pytest.importorskip("imageio.v2", reason="needs the extra 'video'")
     pytest.importorskip("imageio_ffmpeg", reason="needs the extra 'video'")
     skip_without_opengl()
+    film = MANNERS["mp4"]
     result = evaluate(run, options(episodes=1, video=True))
     assert result.files[-1] == run / "evaluation.mp4"
     with imageio.get_reader(run / "evaluation.mp4") as reader:
@@ -330,13 +334,13 @@ def test_the_video_shows_an_episode(run):
         frames = np.stack([frame for frame in reader])  # noqa: C416, a list() would ask for its length
     assert facts["codec"] == "h264"
     assert facts["pix_fmt"].startswith("yuv420p")
-    assert len(frames) == NUM_STEPS // STEPS_PER_FRAME
-    assert frames.shape[2] == WIDTH
+    assert len(frames) == NUM_STEPS // film.steps_per_frame
+    assert frames.shape[2] == film.width
     # below the picture stands a white line with black text
-    caption = frames[:, HEIGHT + 2 :]
+    caption = frames[:, film.height + 2 :]
     assert np.median(caption) > 240
     assert caption.min() < 80
-    assert np.abs(frames[0, :HEIGHT].astype(float) - frames[-1, :HEIGHT]).max() > 50
+    assert np.abs(frames[0, : film.height].astype(float) - frames[-1, : film.height]).max() > 50
     assert not list(run.glob(".*unfinished*"))
 
 
@@ -356,3 +360,33 @@ def test_what_an_evaluation_records_is_what_it_measured(run):
     assert found == pytest.approx(expected, abs=1e-5)
     evaluate(run, options(episodes=1, num_envs=1, record=True, name="kept"))
     assert read_recording(result.files[-1]).shape == (1, NUM_STEPS)
+
+
+@pytest.mark.parametrize("suffix", ["gif", "webp"])
+def test_an_animated_picture_shows_the_same_episode(run, tmp_path, suffix):
+    skip_without_opengl()
+    film, path = MANNERS[suffix], tmp_path / f"episode.{suffix}"
+    found = [
+        evaluate(run, options(episodes=2, picture=str(path), **extra))
+        for extra in ({}, {"camera": "fixedfar"})
+    ]
+    assert found[0].files[-1] == path
+    with Image.open(path) as picture:
+        assert picture.info["loop"] == 0
+        assert picture.n_frames == -(-NUM_STEPS // film.steps_per_frame)
+        frames = []
+        for frame in range(picture.n_frames):
+            picture.seek(frame)
+            picture.load()
+            frames.append(np.asarray(picture.convert("RGB"), dtype=float))
+    assert {frame.shape[1] for frame in frames} == {film.width}
+    caption = np.stack(frames)[:, film.height + 4 :]
+    assert np.median(caption) > 240
+    assert caption.min() < 110
+    # something moves, and what stands still is the same in all frames
+    moved = np.abs(frames[0] - frames[-1])[: film.height].max(-1) > 40
+    assert 0.0 < moved.mean() < 0.5
+    assert [e.estimates["episode_return"] for e in found] == [
+        found[0].estimates["episode_return"]
+    ] * 2
+    assert not list(tmp_path.glob(".*unfinished*"))
