@@ -1,0 +1,109 @@
+"""The way from the first page to an algorithm of one's own in the table, as a stranger goes it.
+
+Every command is one that stands on the page that the one before leads to. It is carried out as it
+stands there, but for the size of the run: few steps of short episodes, and limits that any policy
+keeps, so that there is something to certify.
+"""
+
+import csv
+import itertools
+import json
+import os
+import re
+import shlex
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[2]
+DOCS = ROOT / "docs"
+WALK = ("index.md", "start.md", "guides/environment.md", "guides/algorithm.md")
+TINY = [
+    *("frames=800", "num_envs=4", "frames_per_batch=200", "env.num_steps=20", "logger=none"),
+    *(
+        "num_threads=1",
+        "model.hidden_sizes=[8]",
+        "certificate.ranking=4",
+        "certificate.episodes=40",
+    ),
+]
+FILE = re.compile(r"^<!-- file: (\S+) -->\n```\w*\n(.*?)^```", re.M | re.S)
+
+
+@pytest.fixture
+def place(tmp_path):
+    """Where the reader is: a folder with the files of the pages, as if in a checkout."""
+    (tmp_path / "train.py").symlink_to(ROOT / "train.py")
+    for page in WALK:
+        for name, text in FILE.findall((DOCS / page).read_text()):
+            (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+            (tmp_path / name).write_text(text)
+    return tmp_path
+
+
+def command(page, *words):
+    """The line of a page that has these words."""
+    lines = (DOCS / page).read_text().splitlines()
+    found = [line for line in lines if line.startswith("python ") and all(w in line for w in words)]
+    assert found, f"{page} has no command with {words}"
+    return shlex.split(found[0], comments=True)[1:]
+
+
+def carry_out(words, place, *, seeds=False):
+    """Run a command of a page; of a sweep over seeds two, one after the other."""
+    if words[0] == "train.py":
+        limits = [re.sub(r"\d+", "1000", w) for w in words if w.startswith("cost_limits")]
+        words = [w for w in words if not re.match(r"frames=|cost_limits=", w)] + TINY
+        words += limits or ["cost_limits={cost: 1000}"]
+    if seeds:
+        words = [w.replace("seed=0,10,20", "seed=0,10") for w in words] + ["hydra/launcher=basic"]
+    done = subprocess.run(
+        [sys.executable, *words],
+        cwd=place,
+        env=os.environ | {"OMP_NUM_THREADS": "1"},
+        capture_output=True,
+        text=True,
+        timeout=280,
+    )
+    assert done.returncode == 0, f"{shlex.join(words)}\n{done.stdout}\n{done.stderr}"
+    return done.stdout
+
+
+def test_every_page_leads_to_the_next():
+    for page, following in itertools.pairwise(WALK):
+        targets = re.findall(r"\]\(([^)#]+)", (DOCS / page).read_text())
+        there = {(DOCS / page).parent.joinpath(target).resolve() for target in targets}
+        assert DOCS / following in there, f"{page} does not lead to {following}"
+
+
+def test_from_the_first_page_to_a_certified_policy(place):
+    assert command("index.md", "env=PointGoal1")[:3] == command("start.md", "env=PointGoal1")[:3]
+    said = carry_out(command("start.md", "train.py", "runs/first"), place)
+    assert "Certified at 95%: mean_cost ≤" in said
+    assert json.loads((place / "runs/first/certificate.json").read_text())["certified"]
+    look = command("start.md", "safe_rl.evaluate", "checkpoint=certified")
+    quick = [re.sub("episodes=100", "episodes=3", word) for word in look if word != "video=true"]
+    assert "3 episodes" in carry_out(quick, place)
+    assert (place / "runs/first/evaluation.json").is_file()
+
+
+def test_from_an_environment_and_an_algorithm_of_ones_own_to_the_table(place):
+    both = command("guides/algorithm.md", "env=SlowGoal", "my_penalty.py")
+    carry_out(
+        [word.replace("quadratic,cpo", "quadratic,cpo,ppo") for word in both], place, seeds=True
+    )
+    report = command("guides/algorithm.md", "safe_rl.report")
+    carry_out(report, place)
+    with (place / "runs/report/final_SlowGoal.csv").open(newline="") as file:
+        rows = {row["algorithm"]: row for row in csv.DictReader(file)}
+    assert set(rows) == {"quadratic", "CPO", "PPO"}
+    assert {row["seeds"] for row in rows.values()} == {"2"}
+    runs = list(place.glob("runs/SlowGoal/quadratic/**/progress.csv"))
+    assert len(runs) == 2
+    # what it costs to drive fast is counted beside what was there before
+    with runs[0].open(newline="") as file:
+        assert {"episode_cost_speed", "episode_cost_hazards", "policy_loss_penalty"} <= set(
+            csv.DictReader(file).fieldnames or ()
+        )
