@@ -150,6 +150,13 @@ def explain(
         return words if there is None else f"'{there}' is there already: write it without +."
     given = next(text for text in overrides if text.lstrip("+").startswith(f"{key}="))
     values = plain(compose(given))
+    inner = _quoted(r"full_key: (\S+)", str(error.__cause__))
+    if inner is not None and inner.startswith(f"{key}."):
+        section, _, name = inner.rpartition(".")
+        inside = [path.removeprefix(f"{section}.") for path in _paths(values)]
+        meant = nearest(name, inside)
+        advice = f"add +{inner}=…" if meant is None else f"did you mean '{meant}'?"
+        return f"'{given}': '{section}' has no '{name}', {advice}"
     section = key.partition(".")[0]
     if section not in values and any(path.partition(".")[0] == section for path in KEYS):
         return f"'{given}': algo={values['algo']['name']} has no '{section}'."

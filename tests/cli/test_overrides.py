@@ -41,6 +41,8 @@ WRONG = {
     "+logger.path=x": "logger.path: nothing reads",
     "~logger": "logger is missing: .*logger=none for nothing",
     "~frames": "'frames' not found",
+    "model.input_scale={velocimeter: 0.5}": r"no 'velocimeter', add \+model\.input_scale\.velo",
+    "certificate={episodez: 5}": "'certificate' has no 'episodez', did you mean 'episodes'",
     "+seed=1": "'seed' is there already: write it without +",
     "env=PointGaol1": "no env 'PointGaol1'. Did you mean 'PointGoal1'",
     "env=CarGoal2,CarGaol2": "no env 'CarGaol2'. Did you mean 'CarGoal2'",
