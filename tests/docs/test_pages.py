@@ -47,6 +47,20 @@ def blocks(page: str) -> list[Block]:
     return [Block(*match.groups()) for match in BLOCK.finditer((ROOT / page).read_text())]
 
 
+def linked(page: str) -> list[str]:
+    """Pages that a page links to, whose files a reader may have."""
+    targets = re.findall(r"\]\(([^)#]+\.md)", (ROOT / page).read_text())
+    places = [(ROOT / page).parent.joinpath(target).resolve() for target in targets]
+    return [str(path.relative_to(ROOT)) for path in places if path.is_file()]
+
+
+def write_files(found: list[Block], place: Path) -> None:
+    for block in found:
+        if block.file:
+            (place / block.file).parent.mkdir(parents=True, exist_ok=True)
+            (place / block.file).write_text(block.text)
+
+
 def commands(text: str) -> list[list[str]]:
     """Words of our commands in a block, without comments and the words before them."""
     lines = text.replace("\\\n", " ").splitlines()
@@ -102,10 +116,11 @@ def check(words: list[str], run: Path) -> None:
 @pytest.mark.parametrize("page", PAGES)
 def test_snippets_run_and_commands_are_taken(page, workplace, run_folder):
     names = {"__name__": "page"}
+    for other in linked(page):
+        write_files(blocks(other), workplace)
     for block in blocks(page):
         if block.file:
-            (workplace / block.file).parent.mkdir(parents=True, exist_ok=True)
-            (workplace / block.file).write_text(block.text)
+            write_files([block], workplace)
         elif block.language == "python" and not page.startswith(TESTED_ELSEWHERE):
             exec(compile(block.text, page, "exec"), names)
         elif block.language in ("", "sh", "bash"):

@@ -62,7 +62,7 @@ def carry_out(words, place, *, seeds=False):
     done = subprocess.run(
         [sys.executable, *words],
         cwd=place,
-        env=os.environ | {"OMP_NUM_THREADS": "1"},
+        env=os.environ | {"OMP_NUM_THREADS": "1", "PYTHONPATH": str(ROOT)},
         capture_output=True,
         text=True,
         timeout=280,
