@@ -13,6 +13,7 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
+import replay_pages
 import yaml
 from algorithm_results import comparison, measured
 from hydra import compose, initialize_config_dir
@@ -27,8 +28,9 @@ TEXTS: dict[str, dict[str, Any]] = yaml.safe_load((PAGES / "pages.yaml").read_te
 GENERATED = "<!-- made by docs/generate_algorithms.py: change pages.yaml, conf/ or results/ -->"
 # nodes of a configuration that are an algorithm's own, and what the live arguments are called here
 NODES = ("loss", "policy_update", "lagrangian", "then.projection.loss")
-NODES += ("then.projection.policy_update",)
+NODES += ("then.projection.policy_update", *replay_pages.NODES)
 LIVE = ("actor_network", "multiplier", "constraints", "cost_limits")
+OPTIONAL = ("columns", "loop", "problem")  # of a page, that no blank of the template stands for
 SHOWN = {"actor_network": "actor", "cost_limits": "limits"}
 
 TEMPLATE = """{mark}
@@ -44,13 +46,13 @@ $$
 
 {how}
 
-The notation is that of [the overview](index.md), as are batches, advantages and critics.
+{notation}
 
 ## Settings
 
 {keys}
 
-Shared by all algorithms: [presets](index.md#presets){limits}.
+{shared}{limits}.
 
 ## What is logged
 
@@ -60,8 +62,7 @@ Besides the columns that [all algorithms](index.md#what-is-logged) have:
 
 ## In a loop of your own
 
-The {parts} to any TorchRL policy and to any batch that has advantages, which `VectorGAE` and
-`CostGAE` write, or whatever you have.
+{parts}
 
 ```python
 {snippet}
@@ -81,6 +82,23 @@ The {parts} to any TorchRL policy and to any batch that has advantages, which `V
 """
 
 
+LOSS = {
+    "notation": "The notation is that of [the overview](index.md), as are batches, advantages and "
+    "critics.",
+    "shared": "Shared by all algorithms: [presets](index.md#presets)",
+    "parts": "The loss applies to any TorchRL policy and to any batch that has advantages, which "
+    "`VectorGAE` and\n`CostGAE` write, or whatever you have.",
+}
+STEP = LOSS | {"parts": LOSS["parts"].replace("loss applies", "loss and the step apply")}
+REPLAY = {
+    "notation": "The notation is that of [learning from memory](../off_policy.md), as are targets, "
+    "time-outs and multipliers.",
+    "shared": "Shared by all that learn from memory: [keys](../off_policy.md#keys)",
+    "parts": "The loss applies to any steps, a replay buffer's or a dataset's; networks may be "
+    "yours.",
+}
+
+
 def pages() -> dict[str, str]:
     """All pages by file name."""
     written = {f"{name}.md": _page(name) for name in TEXTS}
@@ -90,24 +108,27 @@ def pages() -> dict[str, str]:
 def _page(name: str) -> str:
     texts = TEXTS[name]
     config, paper = (_compose(name, preset) for preset in ("default", "paper"))
-    constrained = "constrained" in texts["columns"]
-    problem = r"$\max_\pi J_r(\pi)$"
-    if constrained:
-        problem += (
-            r" subject to $J_{c_i}(\pi) \le d_i$, $i = 1 \dots k$, undiscounted costs per episode"
-        )
+    constrained = bool({"constrained", "costs"} & set(texts["columns"]))
+    within = r" subject to $J_{c_i}(\pi) \le d_i$, $i = 1 \dots k$, undiscounted costs per episode"
+    problem = r"$\max_\pi J_r(\pi)$" + (within if constrained else "")
     is_step = "lr" not in OmegaConf.to_yaml(config.policy_update)
+    if replay_pages.learns_from_memory(config):
+        snippet = replay_pages.loop(config, _by_path(config), _call, texts.get("loop", ""))
+        frame = REPLAY
+    else:
+        snippet = _snippet(config, is_step, constrained)
+        frame = STEP if is_step else LOSS
     return TEMPLATE.format(
+        **frame,
         mark=GENERATED,
         name=name,
-        problem=f"{problem}.",
+        problem=f"{texts.get('problem', problem).strip()}.",
         keys=_keys(config, paper),
         limits=", [holding the limit](index.md#holding-the-limit)" if constrained else "",
         columns=_columns(texts["columns"]),
-        parts="loss and the step apply" if is_step else "loss applies",
-        snippet=_snippet(config, is_step, constrained),
+        snippet=snippet,
         measured=measured(name),
-        **{key: str(texts[key]).strip() for key in texts if key != "columns"},
+        **{key: str(texts[key]).strip() for key in texts if key not in OPTIONAL},
     )
 
 
@@ -126,6 +147,10 @@ def _parts(config: DictConfig) -> Iterator[tuple[str, str, dict[str, Any]]]:
             yield path, target, plain
 
 
+def _by_path(config: DictConfig) -> dict[str, tuple[str, dict[str, Any]]]:
+    return {path: (target, arguments) for path, target, arguments in _parts(config)}
+
+
 def _keys(config: DictConfig, paper: DictConfig) -> str:
     rows = ["| key | `preset=default` | `preset=paper` | meaning |", "|---|---|---|---|"]
     for path, target, arguments in _parts(config):
@@ -141,11 +166,14 @@ def _keys(config: DictConfig, paper: DictConfig) -> str:
             if key == "optimizer":
                 key, value, theirs = "optimizer.lr", value["lr"], theirs.lr if theirs else None
             meaning = known[key].meaning if key in known else "learning rate of Adam"
-            if isinstance(value, dict):
+            if isinstance(value, dict) and "_target_" in value:
                 value = value.get("_target_", "").rpartition(".")[2]
                 theirs = theirs and theirs.get("_target_", "").rpartition(".")[2]
             cells = (_cell(value), _cell(theirs) if same else "—")
             rows.append(f"| `{path}.{key}` | {cells[0]} | {cells[1]} | {meaning} |")
+    if replay_pages.learns_from_memory(config):
+        for key, default, theirs, meaning in replay_pages.settings(config, paper):
+            rows.append(f"| `{key}` | {_cell(default)} | {_cell(theirs)} | {meaning} |")
     return "\n".join(rows)
 
 
@@ -155,14 +183,16 @@ def _cell(value: Any) -> str:
 
 
 def _columns(names: list[str]) -> str:
-    index = (PAGES / "index.md").read_text()
+    index = (PAGES / "index.md").read_text() + (PAGES.parent / "off_policy.md").read_text()
     tables = [
         re.search(rf"<!-- table: columns of {name} -->\n(.*?)\n\n", index, re.DOTALL)[1]  # type: ignore[index]
         for name in names
     ]
     rows = [row for table in tables for row in table.splitlines()[2:]]
     text = "\n".join(["| column | meaning |", "|---|---|", *rows])
-    return text.replace("(#", "(index.md#").replace("(../../", "(../../")
+    return (
+        text.replace("(#", "(index.md#").replace("(algorithms/", "(").replace("(../../", "(../../")
+    )
 
 
 def _call(target: str, arguments: Mapping[str, Any], first: tuple[str, ...] = ()) -> str:
@@ -180,7 +210,7 @@ def _call(target: str, arguments: Mapping[str, Any], first: tuple[str, ...] = ()
 
 
 def _snippet(config: DictConfig, is_step: bool, constrained: bool) -> str:
-    parts = {path: (target, arguments) for path, target, arguments in _parts(config)}
+    parts = _by_path(config)
     targets = [parts["loss"][0]]
     lines = ['limits = {"cost": 25.0}'] if constrained else []
     names = accepted_names(locate(parts["loss"][0]))

@@ -17,19 +17,21 @@ FOLDER = CONF.parent / "docs" / "algorithms"
 PAGE = (FOLDER / "index.md").read_text()
 COSTS, LIMITED = PointMass.cost_keys, ["cost_hazards", "cost_north"]
 TEXTS = yaml.safe_load((FOLDER / "pages.yaml").read_text())
-TABLES = {algo: texts["columns"] for algo, texts in TEXTS.items()}
 
 
 def composed(algo):
     return compose_config(f"algo={algo}", "env=PointMass")
 
 
-def test_every_algorithm_has_a_page():
-    algorithms = {path.stem for path in (CONF / "algo").glob("*.yaml")}
-    from_memory = {a for a in algorithms if find_recipe(composed(a)) is OffPolicy}
-    assert set(TABLES) == algorithms - from_memory
+FROM_MEMORY = {algo for algo in TEXTS if find_recipe(composed(algo)) is OffPolicy}
+TABLES = {algo: texts["columns"] for algo, texts in TEXTS.items() if algo not in FROM_MEMORY}
+
+
+def test_every_algorithm_has_a_page_and_is_in_the_lists():
+    assert set(TEXTS) == {path.stem for path in (CONF / "algo").glob("*.yaml")}
+    assert all(f"| [`{algo}`]({algo}.md) |" in PAGE for algo in TEXTS)
     page = (FOLDER.parent / "off_policy.md").read_text()
-    assert all(f"| `{algo}` |" in page for algo in from_memory)
+    assert all(f"| [`{algo}`](algorithms/{algo}.md) |" in page for algo in FROM_MEMORY)
 
 
 def rows(name):
