@@ -153,7 +153,8 @@ def explain(
     inner = _quoted(r"full_key: (\S+)", str(error.__cause__))
     if inner is not None and inner.startswith(f"{key}."):
         section, _, name = inner.rpartition(".")
-        inside = [path.removeprefix(f"{section}.") for path in _paths(values)]
+        head = f"{section}."
+        inside = [path.removeprefix(head) for path in _paths(values) if path.startswith(head)]
         meant = nearest(name, inside)
         advice = f"add +{inner}=…" if meant is None else f"did you mean '{meant}'?"
         return f"'{given}': '{section}' has no '{name}', {advice}"
