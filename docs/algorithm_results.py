@@ -97,11 +97,12 @@ def _compared(algorithms: Iterable[str], env: str) -> str:
         f"| {env}, `algo=` | seeds | return | episode cost | epochs above 25 | $\\rho_c$ |",
         "|---|---|---|---|---|---|",
     ]
+    missing: list[str] = []
     for algo in algorithms:
         tables = _runs(algo, env).values()
         parts = [_part_of(table, FRAMES - QUARTER, FRAMES) for table in tables]
         if not parts:
-            rows.append(f"| [`{algo}`]({algo}.md) | 0 | not yet | | | |")
+            missing.append(f"`{algo}`")
             continue
         cells = [
             _spread([part["return"] for part in parts], 1),
@@ -110,7 +111,8 @@ def _compared(algorithms: Iterable[str], env: str) -> str:
             f"{statistics.fmean(part['rate'] for part in parts):.3f}",
         ]
         rows.append(f"| [`{algo}`]({algo}.md) | {len(parts)} | {' | '.join(cells)} |")
-    return "\n".join(rows)
+    found = "\n".join(rows) + "\n\n" if len(rows) > 2 else ""
+    return f"{found}Not run yet on {env}: {', '.join(missing)}." if missing else found.rstrip()
 
 
 def _spread(values: list[float], digits: int) -> str:
