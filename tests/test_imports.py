@@ -93,6 +93,13 @@ FLOORS = {
         ("torchrl.nodes", "torchrl.observing"),
         ("torchrl.family",),
         ("torchrl",),
+        # Steps with six values, from this Python or another one.
+        ("safety_gymnasium.serve", "safety_gymnasium.where"),
+        ("safety_gymnasium.other_python", "safety_gymnasium.six_values"),
+        ("safety_gymnasium.sources", "safety_gymnasium.vectors"),
+        ("safety_gymnasium.nodes",),
+        ("safety_gymnasium.family",),
+        ("safety_gymnasium",),
         ("names",),
         # What changes any of them from outside.
         ("transforms.base",),

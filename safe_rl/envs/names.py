@@ -11,6 +11,10 @@ from typing import Any, NamedTuple
 from safe_rl.envs.gymnasium.nodes import GYMNASIUM_TARGET, complete_gymnasium
 from safe_rl.envs.safety_gym.nodes import complete_safety_gym, safety_gym_node
 from safe_rl.envs.safety_gym.suite import EXTRAS, SUITE
+from safe_rl.envs.safety_gymnasium.nodes import (
+    SAFETY_GYMNASIUM_TARGET,
+    complete_safety_gymnasium,
+)
 from safe_rl.envs.torchrl.nodes import TORCHRL_TARGET, complete_torchrl
 from safe_rl.envs.velocity.nodes import VELOCITY_TARGET, complete_velocity, velocity_node
 from safe_rl.envs.velocity.suite import VELOCITY_SUITE
@@ -34,6 +38,7 @@ _COMPLETE: dict[str | None, Callable[[Mapping[str, Any]], dict[str, Any]]] = {
     VELOCITY_TARGET: complete_velocity,
     GYMNASIUM_TARGET: complete_gymnasium,
     TORCHRL_TARGET: complete_torchrl,
+    SAFETY_GYMNASIUM_TARGET: complete_safety_gymnasium,
 }
 
 

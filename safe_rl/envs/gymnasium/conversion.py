@@ -194,9 +194,29 @@ def from_gymnasium(
         worlds = ProcessVectorEnv(make_adapted, num_envs, min(workers, num_envs), keys)
     else:
         worlds = SyncVectorEnv([make_adapted] * num_envs, autoreset_mode=AutoresetMode.DISABLED)
+    return from_vector(worlds, keys, length, seed=seed, device=device)
+
+
+def from_vector(
+    worlds: VectorEnv,
+    cost_keys: Sequence[str],
+    num_steps: int,
+    *,
+    seed: int | None = None,
+    device: torch.device | str = "cpu",
+) -> GymnasiumEnv:
+    """Make a TorchRL environment of a batch whose observations and actions suit networks.
+
+    Args:
+        worlds: N environments that are reset by a mask, and only then.
+        cost_keys: names of the costs in `info`.
+        num_steps: the largest number of steps of an episode.
+        seed: of all environments.
+        device: where the TensorDicts live.
+    """
     base = GymWrapper(worlds, device=torch.device(device), categorical_action_encoding=True)
-    base.set_info_dict_reader(CostReader(keys, [num_envs]))
-    batch = GymnasiumEnv(base, keys, length)
+    base.set_info_dict_reader(CostReader(cost_keys, [worlds.num_envs]))
+    batch = GymnasiumEnv(base, cost_keys, num_steps)
     batch.set_seed(int(torch.randint(2**31, ())) if seed is None else seed)
     return batch
 
