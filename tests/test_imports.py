@@ -182,7 +182,7 @@ FLOORS = {
         ("averages", "origins"),
         ("naming",),
         ("experiments",),
-        ("inventory", "pictures", "scoring", "slate_scores"),
+        ("campaigns", "inventory", "pictures", "scoring", "slate_scores"),
         ("fronts", "lacking", "slate_pictures", "transfers"),
         ("contents",),
         ("page",),

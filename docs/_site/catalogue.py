@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import mujoco
+from campaigns import campaigns
 
 from safe_rl.envs import EXTRAS, SUITE, SafetyGymConfig, SafetyGymEnv, key_table
 from safe_rl.envs.safety_gym.records.vocabulary import Vocabulary
@@ -173,7 +174,7 @@ def robots() -> str:
 # what a page has where it says `<!-- made: name -->`
 TABLES: dict[str, Callable[[], str]] = {
     table.__name__: table
-    for table in (benchmark, debug, velocity, keys, observations, lidars, costs, robots)
+    for table in (benchmark, debug, velocity, keys, observations, lidars, costs, robots, campaigns)
 }
 
 

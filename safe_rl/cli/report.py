@@ -100,5 +100,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(f"left out {clean(path)}: {reason}", file=sys.stderr)
     for gap in result.lacking.records:
         print(f"{gap['slate']} lacks {gap['runs']} runs of {gap['algorithm']}")
+    for name, (plan, *_) in result.campaigns.items():
+        print(f"{name}: {plan.note}")
     print(f"wrote {page}")
     return 0

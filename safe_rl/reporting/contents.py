@@ -12,6 +12,7 @@ from typing import NamedTuple
 import yaml
 from matplotlib.figure import Figure
 
+from safe_rl.reporting.campaigns import campaign_tables
 from safe_rl.reporting.columns import Column, Record, Table
 from safe_rl.reporting.experiments import Experiment, group_runs
 from safe_rl.reporting.fronts import compared, draw_fronts
@@ -94,12 +95,14 @@ class Report:
         experiments: Runs, grouped.
         sections: What is said of them; none is empty.
         lacking: Which runs slates still lack.
+        campaigns: Name -> tables of what was planned, and what of it is done.
         skipped: Folder or file -> why it was left out.
     """
 
     experiments: Sequence[Experiment]
     sections: Sequence[Section]
     lacking: Table
+    campaigns: Mapping[str, Sequence[Table]]
     skipped: Mapping[Path, str]
 
     @property
@@ -127,7 +130,8 @@ def build_report(
     runs, skipped = find_runs(root, unfinished=unfinished)
     origins = find_origins(runs)
     experiments, repeated = group_runs(runs, suite, origins, root)
-    skipped |= repeated
+    campaigns, no_plans = campaign_tables(root, runs)
+    skipped |= repeated | no_plans
     styles = algorithm_styles(experiments)
     groups = _by_environment(e for e in experiments if e.finished)
     finals = [final_table(group) for group in groups]
@@ -149,6 +153,7 @@ def build_report(
         Section("certificates", "Certificates", _if_any(certificate_table(experiments))),
         Section("evaluations", "Evaluations", _if_any(evaluation_table(experiments))),
         Section("videos", "Videos", [Film(clean(c), path) for c, path in videos(experiments)]),
+        Section("campaigns", "Campaigns", [t for own in campaigns.values() for t in own]),
         Section(
             "runs",
             "Runs",
@@ -159,7 +164,7 @@ def build_report(
             ],
         ),
     ]
-    return Report(experiments, [s for s in sections if s.blocks], lacking, skipped)
+    return Report(experiments, [s for s in sections if s.blocks], lacking, campaigns, skipped)
 
 
 def _if_any(table: Table) -> list[Table]:

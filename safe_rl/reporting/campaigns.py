@@ -1,0 +1,187 @@
+"""What campaigns are to hold, as their ``plan.yaml`` says, and which of it is done.
+
+A plan is a list of sweeps, each a mapping of keys to one value or a list of values, of which all
+combinations are to be run::
+
+    - {env: [PointGoal1, CarGoal1], algo: [ppo, cpo], seed: [0, 10, 20], frames: 1_000_000}
+    - {env: PointGoal1, algo: cpo, seed: [0, 10, 20], frames: 1_000_000, cost_limits: {cost: 10}}
+"""
+
+from __future__ import annotations
+
+import shlex
+from collections.abc import Iterator, Mapping, Sequence
+from itertools import product
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from safe_rl.reporting.cleaning import clean
+from safe_rl.reporting.columns import MISSING, Column, Table
+from safe_rl.reporting.recorded import Run
+from safe_rl.runs.files import read_yaml
+from safe_rl.runs.identity import flatten, role_of
+
+__all__ = ["PLAN", "campaign_tables", "read_plan"]
+
+PLAN = "plan.yaml"
+"""Name of the file, in a campaign's folder."""
+
+_NEEDED = ("env", "algo", "seed", "frames")
+_MOST_RUNS = 10_000
+
+
+class Cell(NamedTuple):
+    """Runs that differ in the seed alone.
+
+    Attributes:
+        chosen: Key -> value, as on the command line.
+        seeds: Of the runs.
+    """
+
+    chosen: Mapping[str, Any]
+    seeds: tuple[int, ...]
+
+
+def read_plan(path: Path) -> list[Cell]:
+    """Read what a campaign is to hold.
+
+    Raises:
+        ValueError: If the file is no plan; the message says what one is.
+        OSError: If it cannot be read.
+
+    Examples:
+        >>> path = getfixture("tmp_path") / "plan.yaml"
+        >>> _ = path.write_text("- {env: Goal, algo: [ppo, cpo], seed: [0, 1], frames: 1_000}")
+        >>> for cell in read_plan(path):
+        ...     print(cell.chosen, cell.seeds)
+        {'env': 'Goal', 'algo': 'ppo', 'frames': 1000} (0, 1)
+        {'env': 'Goal', 'algo': 'cpo', 'frames': 1000} (0, 1)
+    """
+    sweeps = read_yaml(path)
+    if not isinstance(sweeps, list) or not all(isinstance(sweep, dict) for sweep in sweeps):
+        raise ValueError(f"{path.name} is no plan: it takes a list of mappings, a sweep each")
+    cells = [cell for sweep in sweeps for cell in _cells(sweep, path.name)]
+    if sum(len(cell.seeds) for cell in cells) > _MOST_RUNS:
+        raise ValueError(f"{path.name} plans more than {_MOST_RUNS:,} runs")
+    return cells
+
+
+def _cells(sweep: Mapping[str, Any], name: str) -> Iterator[Cell]:
+    missing = [key for key in _NEEDED if key not in sweep]
+    if missing:
+        raise ValueError(f"{name}: a sweep says {', '.join(_NEEDED)}, and here is no {missing[0]}")
+    values = {key: value if isinstance(value, list) else [value] for key, value in sweep.items()}
+    seeds, lengths = values.pop("seed"), values["frames"]
+    for key, numbers in (("seed", seeds), ("frames", lengths)):
+        if not all(isinstance(n, int) and n >= 0 for n in numbers):
+            raise ValueError(f"{name}: {key} takes whole numbers")
+    for combination in product(*values.values()):
+        yield Cell(dict(zip(values, combination, strict=True)), tuple(seeds))
+
+
+def campaign_tables(
+    root: Path, runs: Sequence[Run]
+) -> tuple[dict[str, list[Table]], dict[Path, str]]:
+    """Campaigns below a folder, and plan -> why it was left out.
+
+    Args:
+        root: The folder.
+        runs: Those below it.
+
+    Returns:
+        Name of a campaign -> its table, and one of the commands of what is missing if any is.
+    """
+    tables, skipped = {}, {}
+    for path in sorted(root.rglob(PLAN)):
+        try:
+            if not path.resolve().is_relative_to(root.resolve()):
+                raise ValueError(f"{path.name} is a link to outside of the folder")
+            own = [run for run in runs if run.directory.is_relative_to(path.parent)]
+            name = clean(path.parent.resolve().name, 60)
+            tables[name] = _tables(name, read_plan(path), own)
+        except (ValueError, OSError) as error:
+            skipped[path] = clean(error)
+    return tables, skipped
+
+
+def _tables(name: str, cells: Sequence[Cell], runs: Sequence[Run]) -> list[Table]:
+    records = [_record(name, cell, runs) for cell in cells]
+    planned = sum(len(cell.seeds) for cell in cells)
+    done, begun = (sum(record[key] for record in records) for key in ("num_done", "num_begun"))
+    note = f"{done} of {planned} runs are done"
+    note += f", {begun} have begun." if begun else "."
+    columns = [
+        Column("environment", ("{}", "env")),
+        Column("algorithm", ("{}", "algo")),
+        Column("steps", ("{:,}", "frames")),
+        *([Column("with", ("{}", "further"))] if any(r["further"] for r in records) else []),
+        *(Column(state, ("{}", state)) for state in ("done", "begun", "missing")),
+    ]
+    shown = [Table(f"campaign_{name}", name, columns, records, note)]
+    commands = _commands(cells, [record["seeds_missing"] for record in records])
+    if commands:
+        columns = [Column("runs", ("{:d}", "runs")), Column("command", ("{}", "command"))]
+        shown.append(Table(f"campaign_{name}_missing", f"{name}: missing", columns, commands))
+    return shown
+
+
+def _record(name: str, cell: Cell, runs: Sequence[Run]) -> dict[str, Any]:
+    own = {run.seed: run for run in runs if run.seed in cell.seeds and _is_of(run, cell.chosen)}
+    done = [seed for seed, run in sorted(own.items()) if run.steps >= cell.chosen["frames"]]
+    begun = [seed for seed in sorted(own) if seed not in done]
+    missing = tuple(seed for seed in cell.seeds if seed not in own)
+    shares = [f"{seed} ({own[seed].steps / cell.chosen['frames']:.0%})" for seed in begun]
+    further = {key: value for key, value in cell.chosen.items() if key not in _NEEDED}
+    return {
+        "campaign": name,
+        **{key: clean(cell.chosen[key], 80) for key in ("env", "algo")},
+        "frames": cell.chosen["frames"],
+        "further": clean(" ".join(_words(further))) or None,
+        "num_done": len(done),
+        "num_begun": len(begun),
+        "num_missing": len(missing),
+        "seeds_missing": missing,
+        "done": ", ".join(map(str, done)) or MISSING,
+        "begun": ", ".join(shares) or MISSING,
+        "missing": ", ".join(map(str, missing)) or MISSING,
+    }
+
+
+def _is_of(run: Run, chosen: Mapping[str, Any]) -> bool:
+    """Whether a run is what was planned, seeds aside."""
+    settings = flatten(run.config)
+    settings |= {"env": run.config["env"].get("name"), "algo": run.algorithm}
+    # what else a command line has chosen makes it another experiment
+    said = (override.lstrip("+~").partition("=")[0] for override in run.overrides or ())
+    others = [key for key in said if role_of(key).names_experiment and key not in chosen]
+    return not others and all(settings.get(k) == v for k, v in flatten(chosen).items())
+
+
+def _commands(cells: Sequence[Cell], missing: Sequence[tuple[int, ...]]) -> list[dict[str, Any]]:
+    """A sweep for all algorithms that lack the same seeds of what is alike otherwise."""
+    groups: dict[tuple[tuple[str, ...], tuple[int, ...]], list[str]] = {}
+    for cell, seeds in zip(cells, missing, strict=True):
+        if seeds:
+            alike = {key: value for key, value in cell.chosen.items() if key != "algo"}
+            own = groups.setdefault((tuple(_words(alike)), seeds), [])
+            own.append(clean(cell.chosen["algo"], 80))
+    records = []
+    for (others, seeds), algorithms in groups.items():
+        number = len(algorithms) * len(seeds)
+        words = [f"algo={','.join(algorithms)}", *others, f"seed={','.join(map(str, seeds))}"]
+        command = shlex.join(["python", "train.py", *(["-m"] if number > 1 else []), *words])
+        records.append({"runs": number, "command": clean(command, 1000)})
+    return records
+
+
+def _words(chosen: Mapping[str, Any]) -> list[str]:
+    """Overrides of a command line."""
+    return [f"{key}={_text(value)}" for key, value in chosen.items()]
+
+
+def _text(value: Any) -> str:
+    if isinstance(value, dict):
+        return f"{{{', '.join(f'{key}: {_text(part)}' for key, part in value.items())}}}"
+    if isinstance(value, bool) or value is None:
+        return {True: "true", False: "false", None: "null"}[value]
+    return f"{value:_}" if isinstance(value, int) else str(value)
