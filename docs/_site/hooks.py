@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import api
+import campaigns
 import catalogue
 import equations
 import links
@@ -28,7 +29,7 @@ def on_config(config: MkDocsConfig) -> None:
 def on_files(files: Files, config: MkDocsConfig) -> None:
     """Add the pages that are made, and those of files that pages link to."""
     made = api.pages() | {page: (ROOT / source).read_text() for page, source in links.PAGES.items()}
-    for uri, text in made.items():
+    for uri, text in (made | {"report.html": campaigns.report()}).items():
         files.append(File.generated(config, uri, content=text))
     texts = {page.src_uri: page.content_string for page in files.documentation_pages()}
     for uri, text in links.linked_files(texts, ROOT).items():
