@@ -13,6 +13,7 @@ from safe_rl.cli.certificates import certify_run
 from safe_rl.cli.options import OptionError, parse_options, usage
 from safe_rl.cli.robots import maker_of
 from safe_rl.cli.user_code import check_imports, import_modules, split_imports
+from safe_rl.cli.variations import evaluate_varied, table_of
 from safe_rl.envs import ConfigError, OpenGLError
 from safe_rl.evaluation import Evaluation, EvaluationOptions, evaluate
 from safe_rl.evaluation.loading import load_config
@@ -47,6 +48,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
             certificate = certify_run(directory, num_threads=options.num_threads)
             print(certificate or "Nothing to certify: the run has no limits, or no checkpoints.")
             return 0 if certificate is not None and certificate.checkpoint is not None else 1
+        if options.variations is not None:
+            found, picture = evaluate_varied(directory, options, progress=True)
+            print(table_of(found), f"wrote {found.file}", f"wrote {picture}", sep="\n")
+            return 0
         result = evaluate_run(directory, options, progress=True)
     except (
         *(OptionError, ConfigError, CheckpointError, OpenGLError),

@@ -28,6 +28,7 @@ from safe_rl.cli.evaluate import evaluate_run
 from safe_rl.cli.robots import maker_of
 from safe_rl.cli.running import complete, prepare
 from safe_rl.cli.user_code import check_imports, import_modules, note_imports, quote
+from safe_rl.cli.variations import evaluate_varied
 from safe_rl.envs import store_configs
 from safe_rl.evaluation import Evaluation, EvaluationOptions
 from safe_rl.evaluation.layouts import default_seed
@@ -38,6 +39,7 @@ from safe_rl.evaluation.loading import (
     load_policy,
     override_env,
 )
+from safe_rl.evaluation.varying import Varied
 from safe_rl.runs.folder import RunFolder
 from safe_rl.runs.lock import held
 from safe_rl.runs.outcome import final_figures
@@ -123,6 +125,17 @@ class Run:
         return evaluate_run(
             self.directory, EvaluationOptions(**{"checkpoint": self.checkpoint, **options})
         )
+
+    def vary(self, variations: Any, **options: Any) -> Varied:
+        """Run the policy under variations of its environment; writes what the command writes.
+
+        Args:
+            variations: As the command's ``variations=``: ``"dynamics"``, or rows of one's own,
+                ``{"mass": {"env.mass_scale": [0.5, 2.0]}}``.
+            options: Those of :class:`safe_rl.evaluation.EvaluationOptions`.
+        """
+        given = {"checkpoint": self.checkpoint, "variations": variations, **options}
+        return evaluate_varied(self.directory, EvaluationOptions(**given))[0]
 
 
 def train(

@@ -59,6 +59,10 @@ class EvaluationOptions:
         False, "find the best checkpoint that surely keeps the limits, instead of evaluating one"
     )
     name: str = _option("", "told apart by it, several evaluations of a run can stand side by side")
+    variations: Any = field(
+        default=None,
+        metadata={"help": "run it in these too: dynamics, sensing, layout, a list, a YAML, keys"},
+    )
     env: dict[str, Any] = field(
         default_factory=dict,
         metadata={"help": "keys of the environment, as in training: env.hazards_num=12"},
@@ -78,7 +82,12 @@ def check_options(options: EvaluationOptions) -> None:
     check_share(options.cvar_alpha)
     if "/" in options.name or not options.name.isprintable():
         raise ValueError(f"name={options.name}: it is part of the files' names, without /.")
-    if not (options.video or options.picture) and options.camera != EvaluationOptions.camera:
+    films = options.video or options.picture
+    if options.variations is not None and (films or options.certify):
+        raise ValueError(
+            "variations=… stands for itself: leave video=true, picture=… and certify=true away."
+        )
+    if not films and options.camera != EvaluationOptions.camera:
         raise ValueError(f"camera={options.camera}: it is the video's: add video=true.")
     if options.picture is not None:
         _check_picture(Path(options.picture))

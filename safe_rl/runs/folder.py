@@ -143,6 +143,10 @@ class RunFolder:
         """What an evaluation leaves: ``json`` for estimates, ``csv``, ``mp4``, ``transitions``."""
         return self.directory / f"{'_'.join(filter(None, ('evaluation', name)))}.{suffix}"
 
+    def variations(self, name: str, suffix: str) -> Path:
+        """A file of an evaluation under variations: ``csv`` the table, ``png`` the picture."""
+        return self.directory / f"{'_'.join(filter(None, ('variations', name)))}.{suffix}"
+
     def evaluations(self) -> list[Path]:
         """The estimates of all evaluations."""
         return sorted(self.directory.glob("evaluation*.json"))

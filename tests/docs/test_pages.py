@@ -24,6 +24,7 @@ from safe_rl.cli.options import parse_options
 from safe_rl.cli.report import ReportOptions
 from safe_rl.cli.shorthands import expand_arguments
 from safe_rl.cli.user_code import import_modules, note_imports, split_imports
+from safe_rl.cli.variations import read_variations
 from safe_rl.evaluation.settings import check_options
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -103,6 +104,8 @@ def check(words: list[str], run: Path) -> None:
         parsed = parse_options(options, schema)
         if isinstance(parsed, EvaluationOptions):
             check_options(parsed)
+            if parsed.variations is not None and "my_" not in str(parsed.variations):
+                assert any(read_variations(parsed.variations))
         return
     modules, given = split_imports(arguments)
     if modules is not None:

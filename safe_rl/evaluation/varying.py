@@ -1,0 +1,158 @@
+"""A trained policy under variations of its environment: return and cost under each."""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import closing
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import torch
+from omegaconf import DictConfig
+from torchrl.envs import EnvBase
+
+from safe_rl.evaluation.episodes import Episodes, collect_episodes
+from safe_rl.evaluation.layouts import default_seed
+from safe_rl.evaluation.loading import (
+    evaluated,
+    find_checkpoint,
+    load_config,
+    load_policy,
+    override_env,
+)
+from safe_rl.evaluation.settings import EvaluationOptions, check_options
+from safe_rl.evaluation.summary import summarise
+from safe_rl.evaluation.variations import TransformNode, Variation, varied
+from safe_rl.runs.files import replacing
+from safe_rl.runs.folder import RunFolder, checkpoint_steps
+from safe_rl.scores.intervals import Estimate
+
+__all__ = ["AS_TRAINED", "Varied", "VariedRow", "evaluate_variations"]
+
+AS_TRAINED = Variation("as trained", None, {})
+
+
+class VariedRow(NamedTuple):
+    """What was found under a variation.
+
+    Attributes:
+        variation: What was changed; `AS_TRAINED` for nothing.
+        estimates: As :func:`safe_rl.evaluation.summary.summarise` returns them.
+    """
+
+    variation: Variation
+    estimates: Mapping[str, Estimate]
+
+
+@dataclass(frozen=True)
+class Varied:
+    """What an evaluation under variations found.
+
+    Attributes:
+        rows: First the environment as trained on, then every variation.
+        left_out: Variations that this environment cannot have, and why.
+        cost_limits: Cost key -> d.
+        facts: Of what, for the terminal.
+        file: The table.
+    """
+
+    rows: tuple[VariedRow, ...]
+    left_out: tuple[tuple[Variation, str], ...]
+    cost_limits: Mapping[str, float]
+    facts: Mapping[str, Any]
+    file: Path
+
+
+def evaluate_variations(
+    directory: Path,
+    options: EvaluationOptions,
+    variations: Sequence[Variation],
+    *,
+    make_env: Callable[..., EnvBase],
+    transform_node: TransformNode,
+    refusals: tuple[type[Exception], ...],
+    may_lack: Callable[[Variation], bool],
+    progress: Callable[[Variation], None] = lambda variation: None,
+) -> Varied:
+    """Run a trained policy in its own environment and in variations of it.
+
+    All of them draw from the same seed, so that what differs between them is not luck.
+
+    Args:
+        directory: Folder of a run.
+        options: As for an evaluation; ``env`` changes every one of the environments.
+        variations: What is changed.
+        make_env: ``make_env(node, num_envs=, device=, seed=, num_threads=)``.
+        transform_node: Name of a transform -> its node, for those that the run lacks.
+        refusals: What an environment raises that cannot have a variation, beside ValueError.
+        may_lack: Whether a variation is left out where the environment cannot have it.
+        progress: Is told what is next.
+
+    Raises:
+        FileNotFoundError: If the folder is not a run's, or has no such checkpoint.
+        CheckpointError: If the policy does not fit a varied environment.
+        ValueError: If an environment cannot have a variation that was asked for by itself.
+    """
+    check_options(options)
+    config = load_config(directory)
+    config.env = override_env(config, options.env)
+    checkpoint = find_checkpoint(directory, options.checkpoint)
+    rows: list[VariedRow] = []
+    left_out: list[tuple[Variation, str]] = []
+    cannot: tuple[type[Exception], ...] = (ValueError, *refusals)
+    for variation in (AS_TRAINED, *variations):
+        try:
+            changed = varied(config, variation, transform_node) if variation.keys else config
+            if changed is None:
+                left_out.append((variation, "that is how it was trained"))
+                continue
+            progress(variation)
+            episodes = _episodes(changed, checkpoint, options, make_env)
+        except cannot as error:
+            if variation is AS_TRAINED or not may_lack(variation):
+                raise
+            left_out.append((variation, str(error)))
+            continue
+        limits = {k: float(d) for k, d in config.cost_limits.items() if k in episodes.costs}
+        rows.append(VariedRow(variation, summarise(episodes, limits, None, options.cvar_alpha)))
+    file = RunFolder(directory).variations(options.name, "csv")
+    _write(file, rows)
+    facts = {"algorithm": config.algo.name, "environment": config.env.get("name", "")}
+    facts |= {"steps": checkpoint_steps(checkpoint), "episodes": options.episodes}
+    return Varied(tuple(rows), tuple(left_out), limits, facts, file)
+
+
+def _episodes(
+    config: DictConfig, checkpoint: Path, options: EvaluationOptions, make_env: Any
+) -> Episodes:
+    node = override_env(config, {})
+    seed = default_seed(node, config.seed) if options.seed is None else options.seed
+    env = evaluated(make_env, config)(
+        node,
+        num_envs=min(options.num_envs, options.episodes),
+        device=options.device,
+        seed=seed,
+        num_threads=options.num_threads,
+    )
+    with closing(env):
+        policy = load_policy(config, env, checkpoint, torch.device(options.device))
+        torch.manual_seed(seed)
+        return collect_episodes(
+            env, policy, options.episodes, env.cost_keys, deterministic=options.deterministic
+        )
+
+
+def _write(path: Path, rows: Sequence[VariedRow]) -> None:
+    """A row per variation: what was changed to what, and every estimate with its interval."""
+    names = list(rows[0].estimates)
+    columns = [f"{name}{end}" for name in names for end in ("", "_low", "_high")]
+    with replacing(path) as unfinished, unfinished.open("w", newline="") as file:
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow(["variation", "row", "value", "keys", *columns])
+        for (row, value, keys), estimates in rows:
+            changes = " ".join(f"{key}={changed}" for key, changed in keys.items())
+            found = [number for name in names for number in estimates[name]]
+            label = str(Variation(row, value, keys))
+            writer.writerow([label, row, "" if value is None else value, changes, *found])

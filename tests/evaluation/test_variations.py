@@ -1,0 +1,184 @@
+"""A trained policy under variations of its environment: what is changed, measured and written."""
+
+import csv
+import shutil
+import sys
+from pathlib import Path
+
+import gymnasium_envs  # noqa: F401, registers Walk-v0
+import numpy as np
+import pytest
+import yaml
+from omegaconf import OmegaConf
+from PIL import Image
+
+import safe_rl
+from safe_rl.cli import train
+from safe_rl.cli.composing import check_command
+from safe_rl.cli.conf import CONF
+from safe_rl.cli.evaluate import evaluate_run, main
+from safe_rl.cli.shorthands import expand_arguments
+from safe_rl.cli.variations import read_variations
+from safe_rl.evaluation import EvaluationOptions
+from safe_rl.evaluation.variations import Variation, expand, varied
+
+SMALL = {"num_envs": 4, "frames_per_batch": 160, "frames": 160, "logger": "none", "num_threads": 1}
+QUICK = ("episodes=6", "num_envs=3", "num_threads=1")
+SETS = sorted(path.stem for path in (CONF / "variations").glob("*.yaml"))
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("runs") / "run"
+    keys = {"env.num_steps": 40, "model.hidden_sizes": [16], "algo": "ppo_lagrangian"}
+    return safe_rl.train("PointGoal1", directory=folder, **SMALL, **keys).directory
+
+
+@pytest.fixture
+def run(trained, tmp_path):
+    """A copy to write into."""
+    return Path(shutil.copytree(trained, tmp_path / "run"))
+
+
+def rows_of(folder, name="variations"):
+    with (folder / f"{name}.csv").open(newline="") as file:
+        return {row["variation"]: row for row in csv.DictReader(file)}
+
+
+def numbers(row):
+    return {k: float(v) for k, v in row.items() if k.startswith(("episode_", "over_", "cvar_"))}
+
+
+def test_every_row_is_the_evaluation_of_its_environment(run, capsys):
+    rows = "{mass: {env.mass_scale: [0.5, 2]}, dense: {env.hazards_num: x1.5}}"
+    assert main([str(run), f"variations={rows}", *QUICK]) == 0
+    found = rows_of(run)
+    assert list(found) == ["as trained", "mass 0.5", "mass 2", "dense"]
+    keys = ({}, {"mass_scale": 0.5}, {"mass_scale": 2}, {"hazards_num": 12})
+    for row, env in zip(found.values(), keys, strict=True):
+        options = EvaluationOptions(episodes=6, num_envs=3, num_threads=1, env=env)
+        estimates = evaluate_run(run, options).estimates
+        for name, estimate in estimates.items():
+            if not name.startswith("normalised"):
+                ends = [float(row[f"{name}{end}"]) for end in ("", "_low", "_high")]
+                np.testing.assert_allclose(ends, estimate)
+    assert len({row["episode_return"] for row in found.values()}) == 4
+    shown = capsys.readouterr().out
+    assert "6 episodes each" in shown
+    assert "left out" not in shown
+    for row in found.values():
+        assert f"{row['variation']} " in shown
+    with Image.open(run / "variations.png") as picture:
+        assert picture.width > 400
+
+
+def test_transforms_are_those_of_a_run_that_has_them(run, tmp_path):
+    rows = "{noise: {transforms.sensor_noise.std: 0.5}, late: {transforms.action_delay.steps: 3}}"
+    assert main([str(run), f"variations={rows}", "name=sensed", *QUICK]) == 0
+    found = rows_of(run, "variations_sensed")
+    for row, transform, key, value in (
+        ("noise", "sensor_noise", "std", 0.5),
+        ("late", "action_delay", "steps", 3),
+    ):
+        copy = Path(shutil.copytree(run, tmp_path / row))
+        config = OmegaConf.load(copy / "config.yaml")
+        node = yaml.safe_load((CONF / "transforms" / f"{transform}.yaml").read_text())
+        config.transforms = node
+        config.transforms[transform][key] = value
+        OmegaConf.save(config, copy / "config.yaml")
+        options = EvaluationOptions(episodes=6, num_envs=3, num_threads=1)
+        estimates = evaluate_run(copy, options).estimates
+        assert float(found[row]["episode_return"]) == estimates["episode_return"].value
+        assert found[row]["episode_return"] != found["as trained"]["episode_return"]
+
+
+def test_a_factor_changes_the_runs_own_value(run):
+    config = OmegaConf.create({"env": {"hazards_num": 5, "size": 0.2, "kwargs": None}})
+    for text, number in (("x0.5", 2), ("x1.5", 8), ("x2", 10)):
+        changed = varied(config, Variation("h", text, {"env.hazards_num": text}), dict)
+        assert changed.env.hazards_num == number  # whole numbers, halves to even ones
+    wider = varied(config, Variation("s", None, {"env.size": "x1.5"}), dict)
+    assert wider.env.size == pytest.approx(0.3)
+    assert varied(config, Variation("s", None, {"env.size": 0.2}), dict) is None
+    deep = varied(config, Variation("g", None, {"env.kwargs.g": 5}), dict)
+    assert deep.env == {"hazards_num": 5, "size": 0.2, "kwargs": {"g": 5}}
+    with pytest.raises(ValueError, match=r"no number 'env\.vases_num'"):
+        varied(config, Variation("v", None, {"env.vases_num": "x2"}), dict)
+
+
+def test_what_sets_ask_for_in_vain_is_left_out(tmp_path, capsys):
+    folder = tmp_path / "walk"
+    before = sys.argv
+    small = [f"{key}={value}" for key, value in SMALL.items()]
+    env = ("env=gymnasium", "env.id=Walk-v0", "env.cost_keys=[fast]", "cost_limits={fast: 3}")
+    widths = ("model.hidden_sizes=[8]", f"hydra.run.dir={folder}", "certificate.episodes=0")
+    try:
+        assert train.main([*env, *small, *widths]) == 0
+    finally:
+        sys.argv = before
+    assert main([str(folder), "variations=[dynamics,sensing]", "episodes=3", "num_envs=3"]) == 0
+    found = rows_of(folder)
+    assert [name.split()[0] for name in found] == ["as", *["noise"] * 4, *["delay"] * 4]
+    shown = capsys.readouterr().out
+    assert "left out: mass 0.5, mass 0.75, mass 1.5, mass 2.0: " in shown
+    assert "no key 'mass_scale'" in shown
+    # what is asked for by itself is an error
+    assert main([str(folder), "variations={heavy: {env.mass_scale: 2}}", "episodes=3"]) == 1
+    assert "no key 'mass_scale'" in capsys.readouterr().err
+    assert main([str(folder), "variations={far: {env.kwargs.border: 9.0}}", "episodes=3"]) == 0
+    assert list(rows_of(folder)) == ["as trained", "far"]
+
+
+def test_a_file_of_ones_own(run, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    Path("my_set.yaml").write_text("light: {env.mass_scale: 0.7}\n")
+    named, own = read_variations("my_set.yaml")
+    assert (named, [str(variation) for variation in own]) == ([], ["light"])
+    assert main([str(run), "variations=my_set.yaml", *QUICK]) == 0
+    assert rows_of(run)["light"]["keys"] == "env.mass_scale=0.7"
+    found = safe_rl.load(run).vary("my_set.yaml", episodes=6, num_envs=3, num_threads=1)
+    assert found.rows[1].estimates["episode_return"].value == float(
+        rows_of(run)["light"]["episode_return"]
+    )
+
+
+@pytest.mark.parametrize("name", SETS)
+def test_keys_of_sets_are_taken_by_training(name):
+    """Every row, as a command line has it; `x1.5` is a number there."""
+    for variation in read_variations(name)[0]:
+        keys = {k: 4 if str(v).startswith("x") else v for k, v in variation.keys.items()}
+        if any(key.endswith("_size") for key in keys):
+            keys = dict.fromkeys(keys, 0.25)
+        transforms = {key.split(".")[1] for key in keys if key.startswith("transforms.")}
+        chosen = [f"transforms=[{','.join(transforms)}]"] if transforms else []
+        changes = [f"{key}={value}" for key, value in keys.items()]
+        check_command(expand_arguments(["env=PointGoal1", *chosen, *changes]), CONF)
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ("variations=dynamic", "Did you mean 'dynamics'"),
+        ("variations=nowhere.yaml", "nowhere.yaml: No such file"),
+        ("variations={heavy: 2}", "'heavy' must have keys"),
+        ("variations={heavy: {algo.name: cpo}}", "must be a key of the environment"),
+        ("variations={noise: {transforms.sensor_noise: 2}}", "must be a key of the environment"),
+        ("variations={noise: {transforms.sensor_nois.std: 2}}", "Did you mean 'sensor_noise'"),
+        ("variations={heavy: {env.mas_scale: 2}}", "Did you mean 'mass_scale'"),
+        ("variations={a: {env.mass_scale: [1], env.friction_scale: [2]}}", "several lists"),
+        ("variations=dynamics video=true", "leave video=true"),
+    ],
+)
+def test_what_cannot_be_varied_is_said(run, given, message, capsys):
+    arguments = given.split(" video=")
+    more = [f"video={arguments[1]}"] if len(arguments) > 1 else []
+    assert main([str(run), arguments[0], *more, *QUICK]) == 1
+    assert message in capsys.readouterr().err
+
+
+def test_rows_with_a_list_are_several():
+    found = expand({"mass": {"env.mass_scale": [0.5, 2], "env.friction_scale": 0.9}})
+    assert [v.keys for v in found] == [
+        {"env.mass_scale": 0.5, "env.friction_scale": 0.9},
+        {"env.mass_scale": 2, "env.friction_scale": 0.9},
+    ]
