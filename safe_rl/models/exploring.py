@@ -70,7 +70,8 @@ class ExploringPolicy(TensorDictModuleBase):
         if isinstance(actor, ProbabilisticTensorDictSequential):
             parameters, sampler = actor.module[0], actor.module[-1]
             self._samples = True
-            if len(actor.module) != 2 or sampler.distribution_class is not TanhNormal:
+            is_squashed = issubclass(sampler.distribution_class, TanhNormal)
+            if len(actor.module) != 2 or not is_squashed:
                 raise TypeError(
                     "ExploringPolicy samples a network followed by a TanhNormal, got "
                     f"{len(actor.module)} modules and {sampler.distribution_class.__name__}."

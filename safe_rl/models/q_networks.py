@@ -15,8 +15,9 @@ from tensordict.nn import (
 )
 from torch import Tensor, nn
 from torchrl.envs.utils import ExplorationType
-from torchrl.modules import MLP, NormalParamExtractor, TanhNormal
+from torchrl.modules import MLP, NormalParamExtractor
 
+from safe_rl.models.distributions import SquashedNormal
 from safe_rl.models.scaling import InputScale
 
 __all__ = ["EnsembleMLP", "QEnsemble", "make_bounded_actor", "make_squashed_actor"]
@@ -183,7 +184,7 @@ def make_squashed_actor(
         ProbabilisticTensorDictModule(
             in_keys=["loc", "scale"],
             out_keys=[action_key],
-            distribution_class=TanhNormal,
+            distribution_class=SquashedNormal,
             distribution_kwargs={"low": low.to(device), "high": high.to(device)},
             return_log_prob=True,
             log_prob_key="action_log_prob",

@@ -16,7 +16,7 @@ from safe_rl.objectives.keys import require
 from safe_rl.objectives.multipliers import Multiplier
 from safe_rl.objectives.violation import KnownCosts
 
-__all__ = ["CostCritics", "CostTerms", "is_ensemble", "scalars"]
+__all__ = ["CostCritics", "CostTerms", "discount_of", "is_ensemble", "scalars"]
 
 
 class CostTerms(TypedDict):
@@ -139,7 +139,7 @@ class CostCritics(LossModule):
                 following, next_action, self.target_cost_qvalue_network_params
             )
             goes_on = following.get(self.tensor_keys.terminated).logical_not()
-            discount = self._discount(tensordict) * goes_on
+            discount = discount_of(tensordict, self.gamma) * goes_on
         found = self.cost_values(
             tensordict, tensordict.get(self.tensor_keys.action), self.cost_qvalue_network_params
         )
@@ -177,12 +177,6 @@ class CostCritics(LossModule):
         if "_cached_cost_params" not in self.__dict__:
             self.__dict__["_cached_cost_params"] = self.cost_qvalue_network_params.data
         return self.__dict__["_cached_cost_params"]
-
-    def _discount(self, tensordict: TensorDictBase) -> Tensor:
-        """γ to the power of the steps that a transition spans, [..., 1]."""
-        steps = tensordict.get("steps_to_next_obs", None)
-        gamma = self.cost_unit.new_full((1,), self.gamma)
-        return gamma if steps is None else gamma ** steps.unsqueeze(-1)
 
     def penalised(
         self, objective: Tensor, tensordict: TensorDictBase, action: Tensor
@@ -225,6 +219,12 @@ def pessimistic(values: Tensor, deviations: float) -> Tensor:
     """
     mean = values.mean(0)
     return mean + deviations * values.std(0, correction=0) if deviations else mean
+
+
+def discount_of(tensordict: TensorDictBase, gamma: float) -> Tensor | float:
+    """γ, or γ to the power of the steps that each transition spans, [..., 1]."""
+    steps = tensordict.get("steps_to_next_obs", None)
+    return gamma if steps is None else gamma ** steps.unsqueeze(-1)
 
 
 def scalars(**entries: Tensor) -> TensorDict:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import NotRequired, TypedDict, Unpack
 
+import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase
 from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModuleBase, dispatch
 from torch import Tensor
@@ -13,9 +14,16 @@ from torchrl.data import TensorSpec
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 from torchrl.modules.distributions.utils import rsample_and_log_prob
 from torchrl.objectives import ValueEstimators
+from torchrl.objectives.value import TD0Estimator
 
 from safe_rl.objectives.multipliers import Multiplier
-from safe_rl.objectives.q_functions import CostCritics, CostTerms, is_ensemble, scalars
+from safe_rl.objectives.q_functions import (
+    CostCritics,
+    CostTerms,
+    discount_of,
+    is_ensemble,
+    scalars,
+)
 
 __all__ = ["ConstrainedSoftActorCritic", "SACLagrangianLoss", "SACLoss", "SoftActorCritic"]
 
@@ -78,6 +86,8 @@ class SACLoss(objectives.SACLoss):
         ['loss_qvalue', 'loss_actor', 'loss_alpha']
     """
 
+    _next_action: Tensor
+
     def __init__(
         self,
         actor_network: ProbabilisticTensorDictSequential,
@@ -111,6 +121,31 @@ class SACLoss(objectives.SACLoss):
             self._vmap_qnetworkN0 = lambda steps, params: network(steps, params)
         else:
             super()._make_vmap()
+
+    def _compute_target_v2(self, tensordict: TensorDictBase) -> Tensor:
+        """TorchRL's targets [...]; those of TD(0), the default, in half of the time."""
+        keys, following = self.tensor_keys, tensordict.get("next")
+        with torch.no_grad():
+            self._next_action, log_prob = self._act(following)
+            if not isinstance(self.value_estimator, TD0Estimator):
+                return super()._compute_target_v2(tensordict)
+            inputs = following.select(*self.qvalue_network.in_keys, strict=False)
+            inputs.set(keys.action, self._next_action)
+            values = self._vmap_qnetworkN0(inputs, self.target_qvalue_network_params)
+            lowest = values.get(keys.state_action_value).min(0).values
+            soft = lowest - self._alpha * log_prob.unsqueeze(-1)
+            goes_on = following.get(keys.terminated).logical_not()
+            discount = discount_of(tensordict, self.gamma)
+            return (following.get(keys.reward) + discount * goes_on * soft).squeeze(-1)
+
+    def _act(self, steps: TensorDictBase) -> tuple[Tensor, Tensor]:
+        """Actions of the present policy, through which gradients pass, and log π."""
+        params = self.actor_network_params
+        with (
+            set_exploration_type(ExplorationType.RANDOM),
+            params.to_module(self.actor_network, preserve_module_state=False),
+        ):
+            return rsample_and_log_prob(self.actor_network.get_dist(steps))
 
     @dispatch
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -182,7 +217,6 @@ class SACLagrangianLoss(SACLoss, CostCritics):
     """
 
     _in_keys: list[NestedKey]
-    _next_action: Tensor
 
     def __init__(
         self,
@@ -213,32 +247,11 @@ class SACLagrangianLoss(SACLoss, CostCritics):
         super()._set_in_keys()
         self._in_keys = [*self._in_keys, *(("next", key) for key in self.cost_keys)]
 
-    def _make_vmap(self) -> None:
-        super()._make_vmap()
-        values = self._vmap_qnetworkN0
-
-        def values_of(steps: TensorDictBase, params: TensorDictBase) -> TensorDictBase:
-            # TorchRL draws the actions that follow, and keeps them to itself
-            if params is self.target_qvalue_network_params:
-                self._next_action = steps.get(self.tensor_keys.action)
-            return values(steps, params)
-
-        self._vmap_qnetworkN0 = values_of
-
     def critic_losses(self, tensordict: TensorDictBase) -> TensorDict:
         """Losses of the Q functions of reward and costs, for the same actions that follow."""
         losses = super().critic_losses(tensordict)
         loss = self.cost_qvalue_loss(tensordict, self._next_action)
         return losses.set("loss_cost_qvalue", loss)
-
-    def _act(self, steps: TensorDictBase) -> tuple[Tensor, Tensor]:
-        """Actions of the present policy, through which gradients pass, and log π."""
-        params = self.actor_network_params
-        with (
-            set_exploration_type(ExplorationType.RANDOM),
-            params.to_module(self.actor_network, preserve_module_state=False),
-        ):
-            return rsample_and_log_prob(self.actor_network.get_dist(steps))
 
     def actor_loss(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
         """Loss of the policy; TorchRL's does not tell the actions whose costs are needed."""

@@ -90,6 +90,7 @@ def test_every_key_of_every_file_has_a_row(configs):
                 "cost_limits",
                 "default_cost_limits",
                 "model.input_scale",
+                "policy_update.rates",
             )
             assert (
                 path in KEYS or name in known or is_within or (is_optimiser and name[0] == "_")

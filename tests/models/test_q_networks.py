@@ -5,7 +5,7 @@ import torch
 from tensordict import TensorDict
 from torch.func import functional_call
 from torchrl.envs.utils import ExplorationType, set_exploration_type
-from torchrl.modules import MLP
+from torchrl.modules import MLP, TanhNormal
 
 from safe_rl.models import (
     EnsembleMLP,
@@ -15,6 +15,7 @@ from safe_rl.models import (
     make_bounded_actor,
     make_squashed_actor,
 )
+from safe_rl.models.distributions import SquashedNormal
 
 LOW, HIGH = torch.tensor([-1.0, -3.0]), torch.tensor([1.0, 5.0])
 
@@ -106,3 +107,37 @@ def test_it_begins_at_random_but_is_never_evaluated_so():
 def test_actors_of_another_kind_are_refused():
     with pytest.raises(TypeError, match="TanhNormal, got 2 modules and IndependentNormal"):
         ExploringPolicy(make_actor(5, 2, hidden_sizes=[8], initial_log_std=0.0), LOW, HIGH)
+
+
+def test_a_squashed_normal_is_torchrls():
+    """Samples and scores as its, without building it; everything else by building it."""
+    loc = torch.randn(6, 2, dtype=torch.double).requires_grad_()
+    scale = (torch.rand(6, 2, dtype=torch.double) + 0.3).requires_grad_()
+    bounds = {"low": LOW.double(), "high": HIGH.double()}
+    ours = SquashedNormal(loc, scale, **bounds)
+    torch.manual_seed(0)
+    action, log_prob = ours.rsample_and_log_prob()
+    assert "base_dist" not in vars(ours)
+    stock = TanhNormal(loc, scale, **bounds)
+    torch.testing.assert_close(log_prob, stock.log_prob(action))
+    torch.manual_seed(0)
+    expected = stock.rsample_and_log_prob()
+    torch.testing.assert_close((action, log_prob), expected)
+    for ours_sum, stock_sum in zip((action, log_prob), expected, strict=True):
+        gradients = [
+            torch.autograd.grad(each.sum(), (loc, scale), retain_graph=True)
+            for each in (ours_sum, stock_sum)
+        ]
+        torch.testing.assert_close(*gradients)
+    assert torch.equal(ours.deterministic_sample, stock.deterministic_sample)
+    assert ours.batch_shape == stock.batch_shape
+    assert ours.rsample_and_log_prob((3,))[1].shape == (3, 6)
+    with pytest.raises(AttributeError, match="has no attribute 'colour'"):
+        _ = ours.colour
+
+
+def test_samples_at_the_bounds_are_scored():
+    far = SquashedNormal(torch.full((4, 2), 30.0), torch.ones(4, 2), low=LOW, high=HIGH)
+    action, log_prob = far.rsample_and_log_prob()
+    assert torch.equal(action, HIGH.expand(4, 2))
+    assert log_prob.isfinite().all()
