@@ -68,6 +68,8 @@ COST_MEANINGS = {
     "cost_pillars": "contact points of the robot with pillars",
     "cost_buttons": "contact points with buttons that are not the goal, while buttons are awake",
     "cost_gremlins": "contact points of the robot with gremlins",
+    "cost_boundary": "the robot's centre is outside of a boundary; how far [m]",
+    "cost_velocity": "the robot is faster than `velocity_limit`; how much [m/s]",
     EXCEPTION_KEY: "the physics failed, and the episode with it",
 }
 _UNITS = {
@@ -91,7 +93,7 @@ def benchmark() -> str:
 
 
 def debug() -> str:
-    """Environments without anything to avoid."""
+    """Circle and Run, free and within boundaries."""
     names = (name for name in EXTRAS if not name.endswith("Vision"))
     return _table(_SUITE_HEADS, map(_suite_row, names))
 

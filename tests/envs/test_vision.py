@@ -137,7 +137,9 @@ def test_a_robot_without_a_camera_is_an_error(tmp_path):
 def test_every_environment_has_a_variant_with_vision():
     debug = [name for name in EXTRAS if not name.endswith("Vision")]
     assert sorted(debug) == sorted(
-        f"{robot}{task}" for robot in ("Point", "Car", "Doggo") for task in ("Run", "Circle")
+        f"{robot}{task}"
+        for robot in ("Point", "Car", "Doggo")
+        for task in ("Run", "Run1", "Circle", "Circle1", "Circle2")
     )
     assert len(SUITE) == 27
     for name in (*SUITE, *debug):

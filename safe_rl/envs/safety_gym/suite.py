@@ -1,8 +1,9 @@
 """The benchmark suite: names, configurations, and the one way from a name to an environment.
 
 27 environments, {Point, Car, Doggo} x {Goal, Button, Push} x {0, 1, 2} (paper section 4.2). Beside
-them stand debug environments, {Point, Car, Doggo} x {Run, Circle}, and a variant of every
-environment with the robot's camera in a nested observation, {name}Vision.
+them stand debug environments, {Point, Car, Doggo} x {Run, Circle}, the same tasks within
+boundaries, {Run1, Circle1, Circle2}, and a variant of every environment with the robot's camera in
+a nested observation, {name}Vision.
 """
 
 from __future__ import annotations
@@ -150,12 +151,28 @@ _DEBUG: dict[str, Values] = {
     "Run": {"task": "x", "robot_rot": 0.0},
     "Circle": {"task": "circle", "observe_circle": True, "lidar_max_dist": 6.0},
 }
+# Circle of the CPO paper (Achiam et al. 2017) and Run of Bullet-Safety-Gym (Gronauer 2022), with
+# the sizes of Safety-Gymnasium 1.0, whose Run has no limit of speed: here two thirds of Point's.
+_WITHIN: Values = {"num_steps": 500, "robot_keepout": 0.0, "constrain_boundary": True}
+_CIRCLE: Values = {**_WITHIN, "robot_placements": ((-0.8, -0.8, 0.8, 0.8),), "boundary_x": 1.125}
+_BOUNDED: dict[str, Values] = {
+    "Run1": {
+        **_DEBUG["Run"],
+        **_WITHIN,
+        "robot_placements": ((-0.2, -0.2, 0.2, 0.2),),
+        "boundary_y": 0.5,
+        "constrain_velocity": True,
+        "velocity_limit": 1.0,
+    },
+    "Circle1": {**_DEBUG["Circle"], **_CIRCLE},
+    "Circle2": {**_DEBUG["Circle"], **_CIRCLE, "boundary_y": 1.125},
+}
 _NO_TARGETS: Values = {"observe_goal_lidar": False, "observe_box_lidar": False, **_extents(1.0)}
 
 _DEBUG_SUITE = {
     f"{robot}{task}": SafetyGymConfig(**{**_COMMON, **_NO_TARGETS, **values, **own})
     for robot, own in _ROBOTS.items()
-    for task, values in _DEBUG.items()
+    for task, values in (_DEBUG | _BOUNDED).items()
 }
 _WITH_VISION: Values = {"observe_vision": True, "observation_flatten": False}
 
@@ -237,7 +254,7 @@ def resolve(env: str | Mapping[str, Any] | SafetyGymConfig) -> SafetyGymConfig:
         raise ConfigError(
             f"Unknown environment '{env}'.{nearest(name, named)} The suite has "
             "{Point, Car, Doggo}{Goal, Button, Push}{0, 1, 2}, for example 'PointGoal1'; beyond it "
-            "there are {Point, Car, Doggo}{Run, Circle}, and a {name}Vision of every one; "
-            "for tests, {Point, Car, Doggo}Grid{0, 1, 2, 4, Wall}."
+            "there are {Point, Car, Doggo}{Run, Run1, Circle, Circle1, Circle2}, and a "
+            "{name}Vision of every one; for tests, {Point, Car, Doggo}Grid{0, 1, 2, 4, Wall}."
         )
     return named[name]

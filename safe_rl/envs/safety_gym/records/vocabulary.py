@@ -2,7 +2,8 @@
 
 Names, defaults and meaning are those of the 2019 Safety Gym engine (paper, section 4.1), so that
 its dictionaries can be used as they are, see also `RETIRED`; `layout_seeds`, `layout_seeds_first`,
-`vases_rots`, `gremlins_rots` and `box_rots` are additions, and so are the scales of the dynamics.
+`vases_rots`, `gremlins_rots` and `box_rots` are additions, and so are the scales of the dynamics,
+boundaries and `velocity_limit`.
 """
 
 from __future__ import annotations
@@ -161,6 +162,13 @@ class Vocabulary:
     constrain_pillars: bool = key(False, _COSTS + "touching pillars")
     constrain_buttons: bool = key(False, _COSTS + "pressing wrong buttons")
     constrain_gremlins: bool = key(False, _COSTS + "touching gremlins")
+    constrain_boundary: bool = key(False, _COSTS + "leaving the boundaries")
+    boundary_x: float | None = key(None, "beyond this |x| is outside [m]; None: nothing", POSITIVE)
+    boundary_y: float | None = key(None, "beyond this |y| is outside [m]; None: nothing", POSITIVE)
+    constrain_velocity: bool = key(False, _COSTS + "being faster than velocity_limit")
+    velocity_limit: float | None = key(
+        None, "speed of the robot that costs nothing [m/s]", POSITIVE
+    )
     constrain_indicator: bool = key(True, "costs are 0 or 1 per step; False: their magnitudes")
 
     # walls

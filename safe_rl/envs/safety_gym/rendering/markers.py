@@ -1,4 +1,4 @@
-"""What pictures show beyond the objects: lidar halos, the goal button, costs.
+"""What pictures show beyond the objects: lidar halos, the goal button, boundaries, costs.
 
 Every function describes markers of one world as plain numbers; drawing them is the display's
 business. Positions in metres, in the world.
@@ -14,9 +14,12 @@ import mujoco
 import numpy as np
 
 from safe_rl.envs.safety_gym.records.config import SafetyGymConfig
-from safe_rl.envs.safety_gym.rules.elements import CYLINDER, ELEMENTS, SPHERE
+from safe_rl.envs.safety_gym.rules.elements import BOX, CYLINDER, ELEMENTS, SPHERE
 
 COST_RGBA, COST_RADIUS = (1.0, 0.0, 0.0, 0.5), 0.25
+# of boundaries [m]: as good as endless
+WALL_HALF_WIDTH, WALL_HALF_HEIGHT, WALL_HALF_LENGTH = 0.02, 0.1, 20.0
+WALL_RGBA = (1.0, 0.4, 0.1, 0.3)
 GOAL_BUTTON_RGBA = (0.4, 0.4, 0.4, 0.25)
 # Share of its colour that a bin shows where it reads nothing, so that the ring can be seen.
 DIMMEST = 0.1
@@ -70,6 +73,22 @@ def goal_button(config: SafetyGymConfig, button_pos: np.ndarray) -> Marker:
     """A faint grey cylinder around the button that is the goal, centred at `button_pos` [3]."""
     radius = 2 * config.buttons_size
     return Marker(CYLINDER, (radius, radius, radius), button_pos, GOAL_BUTTON_RGBA)
+
+
+def boundaries(config: SafetyGymConfig) -> Iterator[Marker]:
+    """Low translucent walls where the robot must not go beyond."""
+    if not config.constrain_boundary:
+        return
+    halves = [config.boundary_x, config.boundary_y]
+    for axis, half in enumerate(halves):
+        if half is None:
+            continue
+        size = [0.0, 0.0, WALL_HALF_HEIGHT]
+        size[axis], size[1 - axis] = WALL_HALF_WIDTH, halves[1 - axis] or WALL_HALF_LENGTH
+        for side in (-half, half):
+            pos = np.array([0.0, 0.0, WALL_HALF_HEIGHT])
+            pos[axis] = side
+            yield Marker(BOX, (size[0], size[1], size[2]), pos, WALL_RGBA)
 
 
 def cost_sphere(robot_pos: np.ndarray) -> Marker:

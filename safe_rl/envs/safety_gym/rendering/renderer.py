@@ -10,7 +10,13 @@ from torch import Tensor
 
 from safe_rl.envs.safety_gym.records.world import NO_BUTTON, Block, World
 from safe_rl.envs.safety_gym.rendering.display import Camera, Display
-from safe_rl.envs.safety_gym.rendering.markers import Marker, cost_sphere, goal_button, lidar_halos
+from safe_rl.envs.safety_gym.rendering.markers import (
+    Marker,
+    boundaries,
+    cost_sphere,
+    goal_button,
+    lidar_halos,
+)
 from safe_rl.envs.safety_gym.rendering.viewer import Viewer
 from safe_rl.envs.safety_gym.world.scenery import VISION
 
@@ -94,6 +100,7 @@ class WorldRenderer:
         button = int(world.goal_button[row])
         if button != NO_BUTTON:
             yield goal_button(self._config, world.at("buttons")[row, button].cpu().numpy())
+        yield from boundaries(self._config)
         if has_cost:
             yield cost_sphere(robot_pos)
 

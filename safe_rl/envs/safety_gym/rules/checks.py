@@ -32,6 +32,10 @@ def check(config: SafetyGymConfig) -> SafetyGymConfig:
         )
     if goal_is_button(config.task) and config.buttons_num < 1:
         raise ConfigError(f"'task' {config.task} needs at least one button: set 'buttons_num'.")
+    if config.constrain_boundary and config.boundary_x is None and config.boundary_y is None:
+        raise ConfigError("'constrain_boundary' needs 'boundary_x', 'boundary_y' or both [m].")
+    if config.constrain_velocity and config.velocity_limit is None:
+        raise ConfigError("'constrain_velocity' needs 'velocity_limit' [m/s].")
     return config
 
 

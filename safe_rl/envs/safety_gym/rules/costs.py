@@ -6,6 +6,7 @@ Spec: paper section 4.1.3. Every function returns one number per world, [N], bef
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -61,6 +62,26 @@ def wrong_button_cost(contacts: Tensor, goal_button: Tensor, timer: Tensor) -> T
     """
     wrong = torch.arange(contacts.shape[-1]) != goal_button.unsqueeze(-1)
     return (contacts * wrong).sum(-1) * (timer == 0)
+
+
+def boundary_cost(xy: Tensor, half_x: float | None, half_y: float | None) -> Tensor:
+    """How far [m] the robot is outside of |x| ≤ half_x and |y| ≤ half_y, summed: [N, 2] -> [N].
+
+    The CPO paper's circle task (Achiam et al. 2017, section 8.1) has the first of them.
+
+    Args:
+        xy: of the robot.
+        half_x: None is no boundary.
+        half_y: likewise.
+    """
+    halves = xy.new_tensor([math.inf if half is None else half for half in (half_x, half_y)])
+    return (xy.abs() - halves).clamp_(min=0.0).sum(-1)
+
+
+def excess_speed(velocity: Tensor, limit: float | None) -> Tensor:
+    """How much faster [m/s] than the limit the robot moves in the plane: [N, 3] -> [N]."""
+    speed = torch.hypot(velocity[:, 0], velocity[:, 1])
+    return (speed - (math.inf if limit is None else limit)).clamp_(min=0.0)
 
 
 class Cost(NamedTuple):
@@ -131,6 +152,16 @@ COSTS: list[Cost] = [
         lambda c: c.constrain_gremlins,
         lambda c, w: c.gremlins_contact_cost * contact_cost(w.contacts_with("gremlins")),
         touches=("gremlins",),
+    ),
+    Cost(
+        "cost_boundary",
+        lambda c: c.constrain_boundary,
+        lambda c, w: boundary_cost(w.robot_xy, c.boundary_x, c.boundary_y),
+    ),
+    Cost(
+        "cost_velocity",
+        lambda c: c.constrain_velocity,
+        lambda c, w: excess_speed(w.robot_vel, c.velocity_limit),
     ),
 ]
 EXCEPTION_KEY = "cost_exception"
