@@ -84,6 +84,7 @@ NUMBERS = {
     "reward_clip": st.none() | between(0.0, 10.0),
     "reward_orientation_scale": between(-1.0, 1.0),
     "circle_radius": between(0.1, 3.0),
+    "boundary_y": st.none() | between(0.1, 3.0),
     "buttons_resampling_delay": st.integers(0, 4),
     "gremlins_travel": between(0.0, 0.5),
     "mass_scale": between(0.5, 2.0),
@@ -106,6 +107,9 @@ def configurations(draw) -> dict:
     config |= FIXED
     config["robot_base"] = draw(st.sampled_from(["point", "car", "doggo"]))
     config["task"] = draw(st.sampled_from(["goal", "button", "push", "x", "z", "circle", "none"]))
+    # what is constrained needs a bound
+    config["boundary_x"] = draw(between(0.1, 3.0))
+    config["velocity_limit"] = draw(between(0.01, 3.0))
     if config["task"] == "button":
         config["buttons_num"] = max(1, config.get("buttons_num", 0))
     if config["robot_base"] == "point":
