@@ -110,6 +110,7 @@ IGNORED = {
     *("placements_extents", "placements_margin", "randomize_layout", "terminate_resample_failure"),
     *("layout_seeds", "layout_seeds_first"),
     *("mass_scale", "friction_scale", "damping_scale", "strength_scale"),
+    *("constrain_boundary", "boundary_x", "boundary_y", "constrain_velocity", "velocity_limit"),
     *("robot_rot", "vases_rots", "gremlins_rots", "box_rots", "gremlins_dist_threshold"),
     *("gremlins_dist_cost", "observation_flatten", "vision_size", "vision_render"),
     *("vision_render_size", "render_labels", "render_lidar_markers", "render_lidar_radius"),

@@ -264,6 +264,15 @@ def test_a_signal_in_the_last_epoch_interrupts_nothing(tmp_path):
     assert trainer.interrupted_by is None
 
 
+@pytest.fixture
+def heeding_interrupts():
+    """What a shell runs in the background ignores them."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
+@pytest.mark.usefixtures("heeding_interrupts")
 def test_a_second_interrupt_acts_at_once():
     with StopRequest() as stop:
         signal.raise_signal(signal.SIGINT)
