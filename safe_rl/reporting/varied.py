@@ -2,20 +2,23 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
+from itertools import cycle
 from pathlib import Path
 from typing import Any
 
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from safe_rl.reporting.pictures import LIMIT_STYLE, ROW_HEIGHT, literal, save
+from safe_rl.reporting.pictures import LIMIT_STYLE, literal, save
 from safe_rl.scores.intervals import Estimate
 
 __all__ = ["draw_variations"]
 
-# of a panel, and of each of its values beyond the third [inch]
-_WIDTH, _WIDER = 2.2, 0.35
+# of a panel [inch]
+_WIDTH, _HEIGHT = 2.2, 2.0
+_MOST_COLUMNS = 5
 _COLOURS = ("#0072b2", "#d55e00", "#cc79a7", "#009e73")
 _OTHERS = "others"
 
@@ -52,22 +55,29 @@ def draw_variations(
         groups.setdefault(_OTHERS if single else variation.row, []).append((label, estimates))
     names = ["episode_return", *(f"episode_{key}" for key in cost_limits or ["cost"])]
     groups = groups or {_OTHERS: [("as trained", trained)]}
-    widths = [_WIDTH + _WIDER * max(0, len(group) - 3) for group in groups.values()]
-    figure = Figure(
-        figsize=(0.8 + sum(widths), 0.4 + ROW_HEIGHT * len(names)), layout="constrained"
-    )
-    panels = figure.subplots(
-        len(names), len(groups), sharey="row", squeeze=False, width_ratios=widths
-    )
-    for line, (name, colour) in enumerate(zip(names, _COLOURS * len(names), strict=False)):
+    columns = min(len(groups), _MOST_COLUMNS)
+    bands = math.ceil(len(groups) / columns)
+    lines = bands * len(names)
+    figure = Figure(figsize=(0.8 + _WIDTH * columns, 0.5 + _HEIGHT * lines), layout="constrained")
+    panels = figure.subplots(lines, columns, squeeze=False)
+    for name, colour, line in zip(names, cycle(_COLOURS), range(len(names)), strict=False):
         limit = cost_limits.get(name.removeprefix("episode_"))
-        for axis, (row, group) in zip(panels[line], groups.items(), strict=True):
+        drawn = []
+        for number, (row, group) in enumerate(groups.items()):
+            axis = panels[number // columns * len(names) + line][number % columns]
             _draw(axis, [(label, found[name]) for label, found in group], trained[name], colour)
             if limit is not None:
                 axis.axhline(limit, **LIMIT_STYLE)
             if line == 0:
                 axis.set_title(literal(row))
-        panels[line][0].set_ylabel(literal(name.removeprefix("episode_")))
+            if number % columns == 0:
+                axis.set_ylabel(literal(name.removeprefix("episode_")))
+            drawn.append(axis)
+        low, high = zip(*(axis.get_ylim() for axis in drawn), strict=True)
+        for axis in drawn:
+            axis.set_ylim(min(low), max(high))
+    for axis in panels.flat:
+        axis.set_visible(axis.has_data())
     figure.supxlabel("grey: as trained; dashed: the limit", fontsize="small", color="0.3")
     save(figure, path)
 
