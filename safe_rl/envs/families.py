@@ -12,9 +12,11 @@ from typing import Any
 import torch
 
 from safe_rl.envs.contract import ConstrainedEnv, check_constrained_env
-from safe_rl.envs.names import env_names, env_node
+from safe_rl.envs.errors import ConfigError, nearest
+from safe_rl.envs.names import env_names, env_node, known_names, stored_node
 from safe_rl.envs.safety_gym.env import SafetyGymEnv
 from safe_rl.envs.safety_gym.records.config import SafetyGymConfig
+from safe_rl.envs.safety_gym.suite import resolve
 from safe_rl.envs.transforms.environment import transform_env
 from safe_rl.targets import locate
 
@@ -32,8 +34,8 @@ def make_env(
     """Make a batch of environments of any family.
 
     Args:
-        env: a name, a configuration of Safety Gym, or a node of the group `env`: `name`, `_target_`
-            and the family's keys.
+        env: a name, also one that `store_config` has given; a configuration of Safety Gym; or a
+            node of the group `env`: `name`, `_target_` and the family's keys.
         num_envs: number of environments, N.
         device: where the TensorDicts live.
         seed: determines every draw; None takes one from torch's generator.
@@ -50,8 +52,7 @@ def make_env(
         >>> make_env({"name": "mine", "robot_base": "point"}, num_envs=2).batch_size
         torch.Size([2])
     """
-    if isinstance(env, str) and env in env_names():
-        env = env_node(env)
+    env = _named(env) if isinstance(env, str) else env
     target = env.get("_target_") if isinstance(env, Mapping) else None
     build = SafetyGymEnv if target is None else locate(target, key="env._target_")
     if isinstance(env, Mapping):
@@ -62,3 +63,20 @@ def make_env(
     if target is not None or transforms:
         check_constrained_env(made)
     return made
+
+
+def _named(name: str) -> str | dict[str, Any]:
+    """A name's node; what the 2019 engine calls it is for its family to understand."""
+    if name in env_names():
+        return env_node(name)
+    stored = stored_node(name)
+    if stored is not None:
+        return stored
+    try:
+        resolve(name)
+    except ConfigError:
+        raise ConfigError(
+            f"Unknown environment '{name}'.{nearest(name, known_names())} A module of yours that "
+            "stores it by that name (store_config) has to be imported before."
+        ) from None
+    return name

@@ -8,6 +8,9 @@ from __future__ import annotations
 from collections.abc import Callable, Collection, Mapping
 from typing import Any, NamedTuple
 
+from hydra.core.config_store import ConfigStore
+from omegaconf import OmegaConf
+
 from safe_rl.envs.gymnasium.nodes import GYMNASIUM_TARGET, complete_gymnasium
 from safe_rl.envs.safety_gym.nodes import complete_safety_gym, safety_gym_node
 from safe_rl.envs.safety_gym.suite import EXTRAS, SUITE
@@ -18,6 +21,9 @@ from safe_rl.envs.safety_gymnasium.nodes import (
 from safe_rl.envs.torchrl.nodes import TORCHRL_TARGET, complete_torchrl
 from safe_rl.envs.velocity.nodes import VELOCITY_TARGET, complete_velocity, velocity_node
 from safe_rl.envs.velocity.suite import VELOCITY_SUITE
+
+GROUP = "env"
+"""Of configurations, in Hydra."""
 
 
 class Named(NamedTuple):
@@ -45,6 +51,33 @@ _COMPLETE: dict[str | None, Callable[[Mapping[str, Any]], dict[str, Any]]] = {
 def env_names() -> list[str]:
     """Names that stand for an environment of any family."""
     return [name for family in NAMED for name in family.names()]
+
+
+def stored_node(name: str) -> dict[str, Any] | None:
+    """Return the node that was stored by a name, see `safe_rl.envs.store_config`; None without.
+
+    Examples:
+        >>> from safe_rl.envs import store_config
+        >>> store_config("MyPoint", {"robot_base": "point", "hazards_num": 3})
+        >>> stored_node("MyPoint")["hazards_num"]
+        3
+    """
+    held = _stored().get(f"{name}.yaml")
+    if held is None:
+        return None
+    node = OmegaConf.to_container(OmegaConf.create(held.node), resolve=False)
+    return {str(key): value for key, value in node.items()} if isinstance(node, dict) else None
+
+
+def known_names() -> list[str]:
+    """Names that `make_env` takes: those of every family, and what has been stored."""
+    return [*env_names(), *(key.removesuffix(".yaml") for key in _stored())]
+
+
+def _stored() -> Mapping[str, Any]:
+    """What Hydra holds in its group of environments, by file name."""
+    group = ConfigStore.instance().repo.get(GROUP, {})
+    return {key: held for key, held in group.items() if hasattr(held, "node")}
 
 
 def env_node(name: str) -> dict[str, Any]:

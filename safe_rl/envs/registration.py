@@ -14,13 +14,13 @@ from hydra.plugins.config_source import ConfigLoadError, ConfigResult, ConfigSou
 from hydra.plugins.search_path_plugin import SearchPathPlugin
 from omegaconf import OmegaConf
 
-from safe_rl.envs.names import env_names, env_node
+from safe_rl.envs.names import GROUP, env_names, env_node
 from safe_rl.envs.safety_gym.nodes import group_node
 from safe_rl.envs.safety_gym.records.config import SafetyGymConfig
 from safe_rl.envs.safety_gym.suite import EXTRAS, SUITE, TESTING, resolve
 from safe_rl.envs.velocity.suite import VELOCITY_SUITE
+from safe_rl.targets import allow
 
-GROUP = "env"
 SCHEME = "safe-rl-environments"
 
 
@@ -77,18 +77,30 @@ class EnvironmentsSearchPath(SearchPathPlugin):
 
 
 def store_config(name: str, config: Mapping[str, Any] | SafetyGymConfig) -> None:
-    """Put a configuration into Hydra's group `env` by a name, so that `env=<name>` finds it.
+    """Give a configuration a name, by which `env=<name>` and `make_env(name)` find it.
 
     Args:
         name: of the environment.
         config: a configuration of Safety Gym, whole or what differs from the defaults, or a node
-            with the `_target_` of another family.
+            with the `_target_` of another family; code that names one is trusted with its module,
+            as `import=` is.
 
     Raises:
         ConfigError: for an unknown key, or a value that cannot be used.
+
+    Examples:
+        >>> from safe_rl.envs import make_env
+        >>> store_config("CrowdedPoint", {"robot_base": "point", "hazards_num": 9})
+        >>> make_env("CrowdedPoint").config.hazards_num
+        9
     """
-    if isinstance(config, Mapping) and config.get("_target_") is not None:
+    target = config.get("_target_") if isinstance(config, Mapping) else None
+    if target is not None:
+        assert isinstance(config, Mapping)
         node = {"name": name, **config}
+        module = str(target).rpartition(".")[0]
+        if module.partition(".")[0] not in ("safe_rl", "torch"):
+            allow(module)
     else:
         node = group_node(name, resolve(config))
     ConfigStore.instance().store(group=GROUP, name=name, node=node)

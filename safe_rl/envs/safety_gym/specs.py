@@ -72,11 +72,13 @@ def _observation(
 
 
 def _within(bounds: Tensor, shape: tuple[int, ...], kind: dict[str, Any]) -> TensorSpec:
-    """Numbers within (low, high), which may be infinite here and there, as in TorchRL's wrappers.
+    """Numbers within (low, high); where only some are bounded the others are as good as not.
 
-    Where all are, numbers can be drawn of the spec.
+    TorchRL draws from a spec by its width, and that of infinite bounds makes numbers that are none.
     """
     if bounds.isinf().all():
         return Unbounded(shape=shape, **kind)
-    low, high = (bound.expand(shape).clone() for bound in bounds)
+    # half as far as there are numbers, so that there is one for the width
+    far = torch.finfo(kind["dtype"]).max / 2
+    low, high = (bound.clamp(-far, far).expand(shape).clone() for bound in bounds)
     return Bounded(low, high, shape=shape, **kind)

@@ -1,0 +1,76 @@
+"""Names that environments are made by: the families', what is stored, and what is not known."""
+
+import sys
+import types
+
+import gymnasium_envs  # noqa: F401, registers Walk-v0
+import pytest
+from hydra.core.config_store import ConfigStore
+
+from safe_rl import targets
+from safe_rl.envs import ConfigError, make_env, store_config
+from safe_rl.envs.velocity import VelocityEnv
+from safe_rl.targets import TargetError
+
+
+@pytest.fixture(autouse=True)
+def _as_before(monkeypatch):
+    """What a test stores and allows is gone afterwards."""
+    group = ConfigStore.instance().repo.setdefault("env", {})
+    before = dict(group)
+    monkeypatch.setattr(targets, "_users_modules", set())
+    yield
+    group.clear()
+    group.update(before)
+
+
+def make_small(config, *, num_envs, **others):
+    """A family of one's own, from another one."""
+    return VelocityEnv({"robot": "hopper", **config}, num_envs=num_envs)
+
+
+@pytest.fixture
+def my_family(monkeypatch):
+    module = types.ModuleType("my_family")
+    module.make_small = make_small
+    monkeypatch.setattr(make_small, "__module__", "my_family")
+    monkeypatch.setitem(sys.modules, "my_family", module)
+
+
+def test_what_is_stored_is_made_by_its_name(my_family):
+    store_config("Crowded", {"robot_base": "point", "hazards_num": 11})
+    assert make_env("Crowded", num_envs=2, seed=0).config.hazards_num == 11
+    keys = {"id": "Walk-v0", "cost_keys": ["fast"], "num_steps": 4}
+    store_config("Stroll", {"_target_": "safe_rl.envs.gymnasium.make_gymnasium", **keys})
+    assert make_env("Stroll", num_envs=2, seed=0).max_episode_steps == 4
+    store_config("Slow", {"_target_": "my_family.make_small", "velocity_threshold": 0.125})
+    assert make_env("Slow", num_envs=2, seed=0).config.velocity_threshold == 0.125
+
+
+def test_storing_trusts_the_module_and_no_other(my_family):
+    node = {"_target_": "my_family.make_small"}
+    with pytest.raises(TargetError, match="import=my_family"):
+        make_env(node)
+    store_config("Slow", node)
+    assert make_env(node).batch_size == (1,)
+    with pytest.raises(TargetError, match="import=os"):
+        make_env({"_target_": "os.getcwd"})
+
+
+def test_names_of_families_and_of_2019_are_known():
+    assert make_env("SafeSwimmerVelocity").config.robot == "swimmer"
+    assert make_env("Safexp-CarGoal1-v0").config.robot_base == "car"
+
+
+@pytest.mark.parametrize(
+    ("name", "nearest"),
+    [
+        ("PointGaol1", "PointGoal1"),
+        ("SafeHoperVelocity", "SafeHopperVelocity"),
+        ("Crowdd", "Crowded"),
+    ],
+)
+def test_the_nearest_of_all_names_is_told(name, nearest):
+    store_config("Crowded", {"robot_base": "point"})
+    with pytest.raises(ConfigError, match=f"Did you mean '{nearest}'"):
+        make_env(name)
