@@ -1,23 +1,26 @@
-"""What runs of the algorithms came to: tables for their pages from results/algorithms/."""
+"""What runs came to: tables for the pages of the algorithms from results/algorithms/."""
 
 from __future__ import annotations
 
 import csv
 import gzip
 import statistics
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
-PAGES, RESULTS = ROOT / "docs" / "algorithms", ROOT / "results" / "algorithms"
+PAGES, RESULTS = ROOT / "docs" / "algorithms", ROOT / "results"
 LIMIT, FRAMES, QUARTER = 25.0, 1_000_000, 250_000
 ENVIRONMENTS = ("PointGoal1", "CarGoal1")
+ARCHIVE = RESULTS / "algorithms"
+
+Rows = list[dict[str, float]]
 
 
-def _runs(algo: str, env: str) -> dict[int, list[dict[str, float]]]:
+def finished_runs(archive: Path, algo: str, env: str) -> dict[int, Rows]:
     """Rows of the recorded tables by seed, numbers only, of runs that came to their end."""
     found = {}
-    for path in sorted((RESULTS / env / algo).glob("seed*/progress.csv.gz")):
+    for path in sorted((archive / env / algo).glob("seed*/progress.csv.gz")):
         with gzip.open(path, "rt") as table:
             rows = [
                 {key: float(value) for key, value in row.items() if value}
@@ -28,7 +31,12 @@ def _runs(algo: str, env: str) -> dict[int, list[dict[str, float]]]:
     return found
 
 
-def _part_of(rows: list[dict[str, float]], start: int, end: int) -> dict[str, float]:
+def last_quarter(runs: Iterable[Rows]) -> list[dict[str, float]]:
+    """Return, episode cost and share of epochs above the limit of every run towards its end."""
+    return [_part_of(rows, FRAMES - QUARTER, FRAMES) for rows in runs]
+
+
+def _part_of(rows: Rows, start: int, end: int) -> dict[str, float]:
     """Means over the epochs of a part of a run in which episodes ended."""
     part = [row for row in rows if start < row["steps"] <= end and "episode_return" in row]
     return {
@@ -45,7 +53,7 @@ def _command(algo: str, seeds: str, env: str) -> str:
 
 def measured(algo: str) -> str:
     """What an algorithm's page says of its runs."""
-    runs = {env: found for env in ENVIRONMENTS if (found := _runs(algo, env))}
+    runs = {env: found for env in ENVIRONMENTS if (found := finished_runs(ARCHIVE, algo, env))}
     if not runs:
         command = _command(algo, "300,301,302", ENVIRONMENTS[0])
         return f"Not yet: {command} is what the comparison is made of."
@@ -58,7 +66,7 @@ def measured(algo: str) -> str:
 {tables}{shown}"""
 
 
-def _quarters(algo: str, env: str, runs: dict[int, list[dict[str, float]]]) -> str:
+def _quarters(algo: str, env: str, runs: dict[int, Rows]) -> str:
     """Table of the runs in one environment, a row per seed."""
     rows = [
         f"| {env}, seed | first | second | third | last | epochs of the last above the limit "
@@ -99,15 +107,12 @@ def _compared(algorithms: Iterable[str], env: str) -> str:
     ]
     missing: list[str] = []
     for algo in algorithms:
-        tables = _runs(algo, env).values()
-        parts = [_part_of(table, FRAMES - QUARTER, FRAMES) for table in tables]
+        parts = last_quarter(finished_runs(ARCHIVE, algo, env).values())
         if not parts:
             missing.append(f"`{algo}`")
             continue
         cells = [
-            _spread([part["return"] for part in parts], 1),
-            _spread([part["cost"] for part in parts], 1),
-            f"{statistics.fmean(part['above'] for part in parts):.0%}",
+            *end_cells(parts, 1),
             f"{statistics.fmean(part['rate'] for part in parts):.3f}",
         ]
         rows.append(f"| [`{algo}`]({algo}.md) | {len(parts)} | {' | '.join(cells)} |")
@@ -115,6 +120,20 @@ def _compared(algorithms: Iterable[str], env: str) -> str:
     return f"{found}Not run yet on {env}: {', '.join(missing)}." if missing else found.rstrip()
 
 
+def end_cells(parts: Sequence[dict[str, float]], digits: int) -> list[str]:
+    """Cells of a table: return with so many digits, episode cost, epochs above the limit."""
+    return [
+        _spread([part["return"] for part in parts], digits),
+        _spread([part["cost"] for part in parts], 1),
+        f"{statistics.fmean(part['above'] for part in parts):.0%}",
+    ]
+
+
 def _spread(values: list[float], digits: int) -> str:
-    deviation = f" ± {statistics.stdev(values):.{digits}f}" if len(values) > 1 else ""
-    return f"{statistics.fmean(values):.{digits}f}{deviation}"
+    several = len(values) > 1
+    return spread(statistics.fmean(values), statistics.stdev(values) if several else None, digits)
+
+
+def spread(mean: float, deviation: float | None, digits: int) -> str:
+    """A mean and, if there is one, the deviation around it."""
+    return f"{mean:.{digits}f}" + ("" if deviation is None else f" ± {deviation:.{digits}f}")

@@ -1,8 +1,8 @@
-"""Makes the pages of the algorithms, and their comparison, from what the program itself says.
+"""Makes the pages of the algorithms, and of results, from what the program itself says.
 
 ``python docs/generate_algorithms.py`` writes docs/algorithms/<name>.md and comparison.md: settings
 from conf/, their meanings from the table of keys, what is logged from docs/algorithms/index.md,
-figures from results/algorithms/, the rest from docs/algorithms/pages.yaml.
+figures from results/, the rest from docs/algorithms/pages.yaml; and docs/environments/velocity.md.
 Runs get into results/algorithms/ by ``python -m safe_rl.report RUNS archive=results/algorithms``.
 """
 
@@ -18,6 +18,7 @@ import yaml
 from algorithm_results import comparison, measured
 from hydra import compose, initialize_config_dir
 from omegaconf import DictConfig, OmegaConf
+from velocity_results import velocity_page
 
 from safe_rl.cli.part_keys import PARTS
 from safe_rl.targets import accepted_names, locate
@@ -81,7 +82,6 @@ Besides the columns that [all algorithms](index.md#what-is-logged) have:
 {weaknesses}
 """
 
-
 LOSS = {
     "notation": "The notation is that of [the overview](index.md), as are batches, advantages and "
     "critics.",
@@ -100,9 +100,10 @@ REPLAY = {
 
 
 def pages() -> dict[str, str]:
-    """All pages by file name."""
-    written = {f"{name}.md": _page(name) for name in TEXTS}
-    return {**written, "comparison.md": f"{GENERATED}\n{comparison(TEXTS)}"}
+    """All pages by file, below docs/."""
+    written = {f"algorithms/{name}.md": _page(name) for name in TEXTS}
+    written["algorithms/comparison.md"] = f"{GENERATED}\n{comparison(TEXTS)}"
+    return written | {"environments/velocity.md": velocity_page()}
 
 
 def _page(name: str) -> str:
@@ -275,12 +276,9 @@ assert learn({given_to_learn})["kl"] < 0.1"""
 
 
 def _passes(loss: str, optimizer: str) -> str:
-    anchored = (
-        f"    {loss}.anchor(batch)  # from where the first step has led\n"
-        if optimizer == "back"
-        else ""
-    )
-    return f"""{anchored}    for minibatch in batch.split(250):
+    anchored = f"    {loss}.anchor(batch)  # from where the first step has led\n"
+    first = anchored if optimizer == "back" else ""
+    return f"""{first}    for minibatch in batch.split(250):
         losses = {loss}(minibatch)
         {optimizer}.zero_grad()
         sum(value for key, value in losses.items() if key.startswith("loss_")).backward()
@@ -299,4 +297,4 @@ def _imports(targets: list[str]) -> str:
 
 if __name__ == "__main__":
     for file, text in pages().items():
-        (PAGES / file).write_text(text)
+        (ROOT / "docs" / file).write_text(text)
