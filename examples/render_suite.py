@@ -1,20 +1,25 @@
-"""Draw the benchmark's environments, and how layouts differ, into `docs/`.
+"""Draw environments into `docs/`.
 
-`python examples/render_suite.py` writes two pictures: `suite.png`, one environment per tile with
-the tasks in lines and robots and levels in columns, and `layouts.png`, starts of PointPush2.
+`python examples/render_suite.py` writes `suite.png`, one environment of the benchmark per tile with
+the tasks in lines and robots and levels in columns; `layouts.png`, starts of PointPush2; and below
+`environments/pictures/` a small picture for every family of environments. Names of pictures behind
+the command draw those alone.
 """
 
 import argparse
+from collections.abc import Callable
 from pathlib import Path
 
 import mujoco
 import numpy as np
 from PIL import Image
 
-from safe_rl.envs import SUITE, SafetyGymEnv
+from safe_rl.envs import EXTRAS, SUITE, SafetyGymEnv, make_env
+from safe_rl.envs.velocity import VELOCITY_SUITE
 
 ROBOTS, TASKS, LEVELS = ("Point", "Car", "Doggo"), ("Goal", "Button", "Push"), (0, 1, 2)
 GAP = 2  # white pixels between tiles
+SIZE, COLOURS = (240, 160), 128  # of a family's picture; few colours make small files
 
 
 def camera_for(half_extent: float) -> mujoco.MjvCamera:
@@ -26,12 +31,15 @@ def camera_for(half_extent: float) -> mujoco.MjvCamera:
     return camera
 
 
-def starts(name: str, num_rows: int, seed: int, width: int, height: int) -> np.ndarray:
+def starts(
+    name: str, num_rows: int, seed: int, width: int, height: int, nearness: float = 1.0
+) -> np.ndarray:
     """Frames of starting states, uint8 [num_rows, height, width, 3]."""
-    config = SUITE[name].replace(floor_display_mode=True)
+    config = (SUITE | EXTRAS)[name].replace(floor_display_mode=True)
     env = SafetyGymEnv(config, num_envs=num_rows, seed=seed)
     env.reset()
     camera = camera_for(config.placements_extents[2])
+    camera.distance /= nearness
     frames = env.render(camera=camera, width=width, height=height)
     env.close()
     return frames
@@ -69,16 +77,86 @@ def draw_layouts(seed: int) -> Image.Image:
     return grid(frames.reshape(2, 5, *frames.shape[1:]))
 
 
+def draw_safety_gym(seed: int) -> Image.Image:
+    """A start of the benchmark, the wide picture filled."""
+    return Image.fromarray(starts("CarPush2", 1, seed, *SIZE, nearness=1.25)[0])
+
+
+def draw_circle(seed: int) -> Image.Image:
+    """A start within boundaries."""
+    return Image.fromarray(starts("PointCircle2", 1, seed, *SIZE)[0])
+
+
+def draw_vision(seed: int) -> Image.Image:
+    """What the robot's camera sees, of several worlds that in which there is most to see."""
+    config = EXTRAS["PointGoal1Vision"].replace(vision_size=SIZE)
+    seen = SafetyGymEnv(config, num_envs=12, seed=seed).reset()["observation", "vision"]
+    pictures = [Image.fromarray(picture) for picture in (seen * 255).byte().numpy()]
+    return max(pictures, key=lambda picture: picture.entropy())
+
+
+def draw_velocity(seed: int) -> Image.Image:
+    """The six robots of the velocity family."""
+    side = SIZE[1]  # twice what is left of it
+    frames = []
+    for name in VELOCITY_SUITE:
+        env = make_env(name, num_envs=1, seed=seed)
+        env.reset()
+        frames.append(env.render(0, width=side, height=side))
+    return grid(np.array(frames).reshape(2, 3, side, side, 3)).resize(SIZE)
+
+
+def draw_gymnasium(seed: int) -> Image.Image:
+    """A cart with a pole, of Gymnasium's that MuJoCo draws."""
+    width, height = SIZE
+    size = {"width": width, "height": height}
+    node = {"id": "InvertedPendulum-v5", "kwargs": size, "render_mode": "rgb_array"}
+    node |= {"outside": {"cost_place": [0, -1, 1]}}
+    env = make_env({"_target_": "safe_rl.envs.gymnasium.make_gymnasium", **node}, seed=seed)
+    env.reset()
+    return Image.fromarray(env.render(0, **size))
+
+
+def draw_torchrl(seed: int) -> Image.Image:
+    """The humanoid of TorchRL's, the middle of a larger picture."""
+    width, height = SIZE
+    size = {"from_pixels": True, "render_width": 2 * width, "render_height": 2 * height}
+    node = {"id": "HumanoidEnv", "kwargs": size, "observe": ["pixels"], "num_steps": 100}
+    node |= {"outside": {"cost_height": ["observation", 0, 1, 2]}}
+    env = make_env({"_target_": "safe_rl.envs.torchrl.make_torchrl", **node}, seed=seed)
+    picture = Image.fromarray(env.reset()["observation"][0].numpy())
+    return picture.crop((width // 2, height // 2, width * 3 // 2, height * 3 // 2))
+
+
+FAMILIES: dict[str, Callable[[int], Image.Image]] = {
+    "safety_gym": draw_safety_gym,
+    "circle": draw_circle,
+    "vision": draw_vision,
+    "velocity": draw_velocity,
+    "gymnasium": draw_gymnasium,
+    "torchrl": draw_torchrl,
+}
+PICTURES = {
+    "suite.png": draw_suite,
+    "layouts.png": draw_layouts,
+    **{f"environments/pictures/{name}.png": draw for name, draw in FAMILIES.items()},
+}
+
+
 def main() -> None:
-    """Draw both pictures."""
+    """Draw the pictures."""
     parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("pictures", nargs="*", help=f"all by themselves: {', '.join(PICTURES)}")
     parser.add_argument("--folder", type=Path, default=Path(__file__).parents[1] / "docs")
     parser.add_argument("--seed", type=int, default=1)
     options = parser.parse_args()
-    options.folder.mkdir(parents=True, exist_ok=True)
-    for name, draw in (("suite.png", draw_suite), ("layouts.png", draw_layouts)):
+    for name in options.pictures or PICTURES:
         path = options.folder / name
-        draw(options.seed).save(path, optimize=True)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        picture = PICTURES[name](options.seed)
+        if picture.size == SIZE:
+            picture = picture.quantize(COLOURS)
+        picture.save(path, optimize=True)
         print(f"{path}: {path.stat().st_size / 1000:.0f} kB")
 
 

@@ -1,8 +1,8 @@
 """Every page: its snippets run, and its commands are what the program takes.
 
 In the order in which they stand on the page: a block below `<!-- file: name -->` is that file,
-blocks of Python run, and of commands everything is checked that is checked before a run begins. A
-command with an ellipsis is for the reader to fill in.
+blocks of Python run, and of commands, those within sentences and tables too, everything is checked
+that is checked before a run begins. A command with an ellipsis is for the reader to fill in.
 """
 
 import re
@@ -31,6 +31,8 @@ ROOT = Path(__file__).resolve().parents[2]
 PAGES = ["README.md", *(str(p.relative_to(ROOT)) for p in sorted((ROOT / "docs").rglob("*.md")))]
 # snippets that have tests of their own, with more to say
 TESTED_ELSEWHERE = ("README.md", "docs/environments.md", "docs/algorithms")
+# a package that not everybody has
+LACKING = ("comes with the extra", "cannot be imported in this Python")
 BLOCK = re.compile(
     r"^(?:<!-- file: (?P<file>\S+) -->\n)?```(?P<language>\w*)\n(?P<text>.*?)^```", re.M | re.S
 )
@@ -93,6 +95,13 @@ def workplace(tmp_path, monkeypatch):
             del sys.modules[name]
 
 
+def inline(page: str) -> list[list[str]]:
+    """Words of our commands that have keys, in sentences and tables."""
+    text = BLOCK.sub("", (ROOT / page).read_text())
+    found = re.findall(r"`(python (?:train\.py|-m safe_rl\.\w+) [^`]+)`", text)
+    return [words for code in found for words in commands(" ".join(code.split()))]
+
+
 def check(words: list[str], run: Path) -> None:
     """Check a command as the program does, up to where it begins to work."""
     place = re.compile(r"^((?:resume|init_from)=)?(?:runs/[\w/.-]+|RUN_DIR)$")
@@ -116,6 +125,16 @@ def check(words: list[str], run: Path) -> None:
     check_command(expand_arguments(given), CONF)
 
 
+def check_all(found: list[list[str]], run: Path, page: str) -> None:
+    for words in found:
+        try:
+            check(words, run)
+        except Exception as error:
+            if any(reason in str(error) for reason in LACKING):
+                continue
+            raise AssertionError(f"{page}: {shlex.join(words)}: {error}") from error
+
+
 @pytest.mark.parametrize("page", PAGES)
 def test_snippets_run_and_commands_are_taken(page, workplace, run_folder):
     names = {"__name__": "page"}
@@ -127,13 +146,8 @@ def test_snippets_run_and_commands_are_taken(page, workplace, run_folder):
         elif block.language == "python" and not page.startswith(TESTED_ELSEWHERE):
             exec(compile(block.text, page, "exec"), names)
         elif block.language in ("", "sh", "bash"):
-            for words in commands(block.text):
-                try:
-                    check(words, run_folder)
-                except Exception as error:
-                    if "comes with the extra" in str(error):
-                        continue  # which not everybody has
-                    raise AssertionError(f"{page}: {shlex.join(words)}: {error}") from error
+            check_all(commands(block.text), run_folder, page)
+    check_all(inline(page), run_folder, page)
 
 
 @pytest.mark.parametrize(
@@ -148,6 +162,7 @@ def test_a_wrong_command_is_found(wrong, workplace, run_folder):
 def test_there_are_commands_and_snippets():
     """The pattern finds them: pages that teach have both."""
     found = {page: blocks(page) for page in PAGES}
+    assert ["train.py", "env=CarPush2"] in inline("README.md")
     for page in ("docs/start.md", "docs/guides/environment.md", "docs/guides/gymnasium.md"):
         assert any(block.language == "python" for block in found[page]), page
         assert sum(len(commands(block.text)) for block in found[page] if not block.file), page

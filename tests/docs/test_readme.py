@@ -5,7 +5,15 @@ import subprocess
 import sys
 from pathlib import Path
 
-README = Path(__file__).resolve().parents[2] / "README.md"
+from PIL import Image
+
+from safe_rl.envs.names import env_names
+
+ROOT = Path(__file__).resolve().parents[2]
+README = ROOT / "README.md"
+sys.path.insert(0, str(ROOT / "examples"))
+
+import render_suite  # noqa: E402
 
 
 def block_after(mark):
@@ -34,3 +42,20 @@ def test_the_library_example_trains(tmp_path):
 def test_commands_are_there():
     for command in ("run", "test"):
         assert block_after(f"command: {command}").startswith("python3 -m venv")
+
+
+def test_every_family_has_its_small_picture_which_the_script_redraws():
+    shown = re.findall(r'<img src="(docs/environments/pictures/\S+)"', README.read_text())
+    there = {path.name for path in (ROOT / "docs/environments/pictures").iterdir()}
+    drawn = {f"docs/{name}" for name in render_suite.PICTURES if "/" in name}
+    assert set(shown) == drawn == {f"docs/environments/pictures/{name}" for name in there}
+    for path in shown:
+        assert (ROOT / path).stat().st_size < 25_000
+        assert Image.open(ROOT / path).size == render_suite.SIZE
+
+
+def test_the_table_of_environments_has_every_family():
+    rows = re.findall(r"`python train\.py env=(\w+)[^`]*` \|$", README.read_text(), re.MULTILINE)
+    others = {path.stem for path in (ROOT / "conf" / "env").glob("*.yaml")}
+    assert others <= set(rows)
+    assert set(rows) - others <= set(env_names())
