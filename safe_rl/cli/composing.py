@@ -26,6 +26,7 @@ from omegaconf import DictConfig, OmegaConf, open_dict, read_write
 from omegaconf.errors import OmegaConfBaseException
 
 from safe_rl.cli.overrides import (
+    COMPOSING_ERRORS,
     CommandLineError,
     check_added,
     check_choices,
@@ -126,10 +127,9 @@ def _compose(hydra: Hydra, name: str, overrides: list[str]) -> DictConfig:
 
     try:
         return compose(overrides)
-    except (HydraException, OmegaConfBaseException) as error:
+    except COMPOSING_ERRORS as error:
         choices = [text for text in overrides if _chooses(text, hydra)]
-        words = explain(error, overrides, lambda given: compose([c for c in choices if c != given]))
-        raise CommandLineError(words) from None
+        raise CommandLineError(explain(error, overrides, choices, compose)) from None
 
 
 def _chooses(override: str, hydra: Hydra) -> bool:

@@ -12,7 +12,10 @@ from typing import Any
 from hydra.core.config_loader import ConfigLoader
 from hydra.core.object_type import ObjectType
 from hydra.core.override_parser.types import Override
+from hydra.errors import HydraException
 from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+from yaml import YAMLError
 
 from safe_rl.cli.keys import KEYS
 from safe_rl.cli.settings import optional_keys, plain
@@ -20,6 +23,7 @@ from safe_rl.naming import did_you_mean, nearest
 from safe_rl.targets import locate
 
 __all__ = [
+    "COMPOSING_ERRORS",
     "CommandLineError",
     "check_added",
     "check_choices",
@@ -27,6 +31,9 @@ __all__ = [
     "check_read",
     "explain",
 ]
+
+COMPOSING_ERRORS = (HydraException, OmegaConfBaseException, YAMLError, ValueError)
+"""What Hydra raises about overrides and files."""
 
 _DEFAULT_RECIPE = "safe_rl.algorithms.OnPolicy"
 
@@ -122,34 +129,52 @@ def check_read(overrides: Sequence[Override], config: DictConfig) -> None:
         CommandLineError: For the first one; it says why.
         TargetError: If there is no such algorithm.
     """
-    recipe = locate(config.algo.get("_target_", _DEFAULT_RECIPE), "algo._target_")
+    algo = config.get("algo") or {}
+    refused = _unread_by(algo)
     for override in overrides:
         key = override.key_or_group.replace("/", ".")
-        for unread, reason in getattr(recipe, "unread", {}).items():
+        for unread, reason in refused.items():
             if f"{key}.".startswith(f"{unread}."):
                 raise CommandLineError(
-                    f"'{override.input_line}': algo={config.algo.name} does not read '{unread}'. "
+                    f"'{override.input_line}': algo={algo.get('name')} does not read '{unread}'. "
                     f"{reason}"
                 )
 
 
+def _unread_by(algo: Mapping[str, Any]) -> Mapping[str, str]:
+    """Keys that an algorithm does not read, and why."""
+    recipe = locate(algo.get("_target_", _DEFAULT_RECIPE), "algo._target_")
+    return getattr(recipe, "unread", {})
+
+
 def explain(
-    error: Exception, overrides: Sequence[str], compose: Callable[[str], DictConfig]
+    error: Exception,
+    overrides: Sequence[str],
+    choices: list[str],
+    compose: Callable[[list[str]], DictConfig],
 ) -> str:
-    """Say what is wrong with overrides that Hydra could not compose, in one line.
+    """Say what is wrong with overrides, or files, that Hydra could not compose, in one line.
 
     Args:
         error: What Hydra says.
         overrides: The overrides.
-        compose: Composes what they choose, without the one that it gets and all that set keys.
+        choices: Those among them that choose files.
+        compose: Composes what some of these choose.
     """
     words = " ".join(str(error.__cause__ or error if not str(error) else error).split())
+    if (place := re.match(r"In '([^']+)': (.*)", words)) is not None:  # said of files alone
+        return _in_file(*place.groups(), getattr(error, "options", None))
+    if (there := _quoted(r"An item is already at '([^']+)'", words)) is not None:
+        return f"'{there}' is there already: write it without +."
     key = _quoted(r"Could not override '([^']+)'", words)
-    if key is None:
-        there = _quoted(r"An item is already at '([^']+)'", words)
-        return words if there is None else f"'{there}' is there already: write it without +."
-    given = next(text for text in overrides if text.lstrip("+").startswith(f"{key}="))
-    values = plain(compose(given))
+    given = next((text for text in overrides if text.lstrip("+").startswith(f"{key}=")), None)
+    if key is None or given is None:
+        return _of_a_choice(words, choices, compose)
+    others = [choice for choice in choices if choice != given]
+    try:
+        values = plain(compose(others))
+    except COMPOSING_ERRORS as another:
+        return explain(another, others, others, compose)
     inner = _quoted(r"full_key: (\S+)", str(error.__cause__))
     if inner is not None and inner.startswith(f"{key}."):
         section, _, name = inner.rpartition(".")
@@ -164,6 +189,42 @@ def explain(
     return _unread(given, key, values)
 
 
+def _of_a_choice(
+    words: str, choices: Sequence[str], compose: Callable[[list[str]], DictConfig]
+) -> str:
+    """Words on what is wrong, after the choice without which the others compose, if it is one."""
+
+    def compose_without(choice: str | None) -> bool:
+        try:
+            compose([other for other in choices if other != choice])
+        except COMPOSING_ERRORS:
+            return False
+        return True
+
+    at_fault = None if compose_without(None) else next(filter(compose_without, choices), None)
+    return words if at_fault is None else f"'{at_fault}': {words}"
+
+
+def _in_file(file: str, words: str, options: Sequence[str] | None) -> str:
+    """What is wrong with a file of configurations, named by its path in their folder."""
+    choice = _quoted(r"Could not override '([^']+)'", words)
+    if choice is not None:
+        likely = _quoted(r"Did you mean to override (.+)\?$", words)
+        advice = "to choose it there, write it without 'override'"
+        return (
+            f"{file}.yaml: 'override /{choice}' in its defaults, but nothing before chooses "
+            f"'{choice}': {advice if likely is None else f'did you mean {likely!r}?'}"
+        )
+    missing = _quoted(r"Could not (?:find|load) '([^']+)'", words)
+    if missing is not None:
+        hint = did_you_mean(missing.rpartition("/")[2], options or ())
+        return (
+            f"{file}.yaml: there is no '{missing}', which its defaults name, or an override of "
+            f"them in a file that builds on it.{hint}"
+        )
+    return f"{file}.yaml: {words}"
+
+
 def _quoted(pattern: str, words: str) -> str | None:
     found = re.search(pattern, words)
     return None if found is None else found[1]
@@ -173,8 +234,16 @@ def _unread(given: str | None, key: str, values: Mapping[str, Any]) -> str:
     """That nothing reads a key, and the full paths of those that were meant."""
     written = {path: path for path in _paths(values)}
     written |= {path: f"+{path}" for path in optional_keys(values)}
-    meant = [f"'{written[path]}'" for path in _meant(key, list(written))]
-    hint = f" Did you mean {' or '.join(meant)}?" if meant else ""
+    meant = _meant(key, list(written))
+    refused = _unread_by(values.get("algo") or {})
+    reasons = [
+        next((why for head, why in refused.items() if f"{path}.".startswith(f"{head}.")), None)
+        for path in meant
+    ]
+    read = [f"'{written[path]}'" for path, why in zip(meant, reasons, strict=True) if why is None]
+    if meant and not read:
+        return f"'{given}': algo={values['algo']['name']} does not read '{meant[0]}'. {reasons[0]}"
+    hint = f" Did you mean {' or '.join(read)}?" if read else ""
     return f"'{given}': nothing reads '{key}'.{hint}"
 
 

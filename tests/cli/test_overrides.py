@@ -112,6 +112,60 @@ def test_what_only_other_algorithms_read_is_refused_with_the_reason(argument):
             check_command(["algo=bc", argument], CONF)
 
 
+@pytest.mark.parametrize(
+    ("argument", "message"),
+    {
+        "lr=1e-3": r"nothing reads 'lr'\. Did you mean 'policy_update.optimizer.lr'\?$",
+        "+lr=1e-3": r"nothing reads 'lr'\. Did you mean 'policy_update.optimizer.lr'\?$",
+        "gamma=0.9": r"Did you mean 'loss.gamma'\?$",
+        "lmbda=0.9": "algo=sac does not read 'advantage.lmbda'. .*memory.n_steps",
+        "initial_log_std=0": "does not read 'model.initial_log_std'. Its network tells",
+    }.items(),
+)
+def test_only_keys_that_the_algorithm_reads_are_proposed(argument, message):
+    with pytest.raises(CommandLineError, match=message):
+        check_command(["algo=sac", argument], CONF)
+
+
+def test_what_is_proposed_is_taken():
+    check_command(["algo=sac", "policy_update.optimizer.lr=1e-3", "loss.gamma=0.9"], CONF)
+
+
+def test_of_two_choices_that_an_algorithm_lacks_one_is_named():
+    with pytest.raises(CommandLineError, match=r"algo=ppo has no '(lagrangian|cost_advantage)'"):
+        check_command(["algo=ppo", "lagrangian=adam", "cost_advantage=paper"], CONF)
+
+
+# files of one's own, each with what the line about it must name: the file, and the key or the place
+FAULTY = {
+    "defaults: [ppo, {override /lagrangian: pid}]": (
+        r"algo/mine\.yaml: 'override /lagrangian'.*without 'override'"
+    ),
+    "defaults: [sac_lagrangian, {override /limits/replay: default}]": (
+        r"algo/mine\.yaml: .*did you mean 'limits/replay@limits'"
+    ),
+    "defaults: [ppo_lagrangien]": r"algo/mine\.yaml: there is no 'algo/ppo_lagrangien'",
+    # Hydra says it of the file whose choice is overridden
+    "defaults: [ppo_lagrangian, {override /lagrangian: pidd}]": (
+        r"algo/ppo_lagrangian\.yaml: there is no 'lagrangian/pidd'.* builds on it.*mean 'pid'\?"
+    ),
+    "defaults: [ppo_lagrangian, {/lagrangian: pid}]": "'algo=mine': Multiple values for lagrangian",
+    "defaults: {ppo: null}": r"'algo=mine': Invalid defaults list in 'algo/mine'",
+    "- 1": r"algo/mine\.yaml: ",
+    "loss: {a: 1\nb: 2": r"'algo=mine': .*mine\.yaml\", line 3",
+    "frames: ${a": "'algo=mine': .*frames",
+    "frames: 3": r"algo\.name' not found",
+}
+
+
+@pytest.mark.parametrize("text", FAULTY)
+def test_faults_of_files_are_told_by_the_file(own_conf, text):
+    (own_conf / "algo" / "mine.yaml").write_text(f"# @package _global_\n{text}\n")
+    with pytest.raises(CommandLineError, match=FAULTY[text]) as caught:
+        check_command([f"--config-dir={own_conf}", "algo=mine"], CONF)
+    assert len(str(caught.value).splitlines()) == 1
+
+
 @pytest.mark.parametrize("flag", ["--config-dir=", "hydra.searchpath=[file://"])
 def test_folders_of_ones_own_are_searched_too(own_conf, flag):
     folder = f"{flag}{own_conf}{']' if '[' in flag else ''}"
