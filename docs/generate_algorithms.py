@@ -9,7 +9,7 @@ Runs get into results/algorithms/ by ``python -m safe_rl.report RUNS archive=res
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -18,18 +18,16 @@ import yaml
 from algorithm_results import comparison, measured
 from hydra import compose, initialize_config_dir
 from omegaconf import DictConfig, OmegaConf
+from setting_tables import own_parts, setting_table
 from velocity_results import velocity_page
 
-from safe_rl.cli.part_keys import PARTS
 from safe_rl.targets import accepted_names, locate
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = ROOT / "docs" / "algorithms"
 TEXTS: dict[str, dict[str, Any]] = yaml.safe_load((PAGES / "pages.yaml").read_text())
 GENERATED = "<!-- made by docs/generate_algorithms.py: change pages.yaml, conf/ or results/ -->"
-# nodes of a configuration that are an algorithm's own, and what the live arguments are called here
-NODES = ("loss", "policy_update", "lagrangian", "then.projection.loss")
-NODES += ("then.projection.policy_update", *replay_pages.NODES)
+# what the live arguments are called here
 LIVE = ("actor_network", "multiplier", "constraints", "cost_limits")
 OPTIONAL = ("columns", "loop", "problem")  # of a page, that no blank of the template stands for
 SHOWN = {"actor_network": "actor", "cost_limits": "limits"}
@@ -124,7 +122,7 @@ def _page(name: str) -> str:
         mark=GENERATED,
         name=name,
         problem=f"{texts.get('problem', problem).strip()}.",
-        keys=_keys(config, paper),
+        keys=setting_table(config, paper),
         limits=", [holding the limit](index.md#holding-the-limit)" if constrained else "",
         columns=_columns(texts["columns"]),
         snippet=snippet,
@@ -138,49 +136,8 @@ def _compose(algo: str, preset: str) -> DictConfig:
         return compose("config", [f"algo={algo}", f"preset={preset}", "env=gymnasium"])
 
 
-def _parts(config: DictConfig) -> Iterator[tuple[str, str, dict[str, Any]]]:
-    """Path, class and arguments of every part that is the algorithm's own."""
-    for path in NODES:
-        node = OmegaConf.select(config, path)
-        if node is not None:
-            plain = OmegaConf.to_container(node, resolve=True)
-            target = plain.pop("_target_")
-            yield path, target, plain
-
-
 def _by_path(config: DictConfig) -> dict[str, tuple[str, dict[str, Any]]]:
-    return {path: (target, arguments) for path, target, arguments in _parts(config)}
-
-
-def _keys(config: DictConfig, paper: DictConfig) -> str:
-    rows = ["| key | `preset=default` | `preset=paper` | meaning |", "|---|---|---|---|"]
-    for path, target, arguments in _parts(config):
-        name = target.rpartition(".")[2]
-        other = OmegaConf.select(paper, f"{path}._target_")
-        same = other == target
-        rows.append(
-            f"| `{path}._target_` | `{name}` | `{str(other).rpartition('.')[2]}` | the class |"
-        )
-        known = PARTS.get(name, {})
-        for key, value in arguments.items():
-            theirs = OmegaConf.select(paper, f"{path}.{key}") if same else None
-            if key == "optimizer":
-                key, value, theirs = "optimizer.lr", value["lr"], theirs.lr if theirs else None
-            meaning = known[key].meaning if key in known else "learning rate of Adam"
-            if isinstance(value, dict) and "_target_" in value:
-                value = value.get("_target_", "").rpartition(".")[2]
-                theirs = theirs and theirs.get("_target_", "").rpartition(".")[2]
-            cells = (_cell(value), _cell(theirs) if same else "—")
-            rows.append(f"| `{path}.{key}` | {cells[0]} | {cells[1]} | {meaning} |")
-    if replay_pages.learns_from_memory(config):
-        for key, default, theirs, meaning in replay_pages.settings(config, paper):
-            rows.append(f"| `{key}` | {_cell(default)} | {_cell(theirs)} | {meaning} |")
-    return "\n".join(rows)
-
-
-def _cell(value: Any) -> str:
-    written = {None: "null", True: "true", False: "false"}
-    return f"`{written[value] if value is None or isinstance(value, bool) else value}`"
+    return {path: (target, arguments) for path, target, arguments in own_parts(config)}
 
 
 def _columns(names: list[str]) -> str:

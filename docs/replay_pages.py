@@ -22,12 +22,11 @@ def learns_from_memory(config: DictConfig) -> bool:
     return OmegaConf.select(config, "algo._target_") == "safe_rl.algorithms.OffPolicy"
 
 
-def settings(config: DictConfig, paper: DictConfig) -> Iterator[tuple[str, Any, Any, str]]:
-    """Path, values of both presets and meaning of keys that belong to no part."""
+def settings(config: DictConfig) -> Iterator[tuple[str, Any, str]]:
+    """Path, value and meaning of keys that belong to no part."""
     paths = [*_SHOWN, *(f"{name}.{key}" for name in _SECTIONS for key in config.get(name, {}))]
     for path in paths:
-        values = (OmegaConf.select(node, path) for node in (config, paper))
-        yield path, *values, KEYS[path].meaning
+        yield path, OmegaConf.select(config, path), KEYS[path].meaning
 
 
 def loop(

@@ -72,8 +72,9 @@ class Algorithm(Protocol):
 class Recipe(Protocol):
     """How an algorithm is put together; a configuration names it as ``algo._target_``.
 
-    ``unread``, if it has one, holds keys that presets bring along and that it makes no use of, each
-    with the reason: on a command line they are refused.
+    ``unread``, if it has one, holds keys that presets bring along and that it makes no use of, and
+    choices that are not for it (``preset=paper``), each with the reason: on a command line they are
+    refused.
     """
 
     @classmethod

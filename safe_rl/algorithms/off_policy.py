@@ -41,6 +41,8 @@ _UNREAD = {
     "then": "It has one update.",
     "model.head": "The distribution of its actions is the algorithm's own, within their bounds.",
     "model.initial_log_std": "Its network tells the standard deviation state by state.",
+    "preset=paper": "It is the setting of Ray, Achiam, Amodei (2019), none of whose algorithms "
+    "learns from memory: without it the algorithm has numbers of its own.",
 }
 
 
@@ -59,7 +61,7 @@ class OffPolicy:
             begins when the memory holds as many.
         collects: Whether what is collected goes into the memory.
         learns_from: What was in it from the beginning, in a sentence; nothing if it was empty.
-        unread: Keys of configurations that are for other recipes, and why.
+        unread: Keys and choices of configurations that are for other recipes, and why.
     """
 
     unread: ClassVar[Mapping[str, str]] = _UNREAD

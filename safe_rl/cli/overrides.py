@@ -134,15 +134,17 @@ def check_read(overrides: Sequence[Override], config: DictConfig) -> None:
     for override in overrides:
         key = override.key_or_group.replace("/", ".")
         for unread, reason in refused.items():
-            if f"{key}.".startswith(f"{unread}."):
+            path, _, choice = unread.partition("=")
+            is_chosen = not choice or OmegaConf.select(config, path) == choice
+            if is_chosen and f"{key}.".startswith(f"{path}."):
+                verb = "has no" if choice else "does not read"
                 raise CommandLineError(
-                    f"'{override.input_line}': algo={algo.get('name')} does not read '{unread}'. "
-                    f"{reason}"
+                    f"'{override.input_line}': algo={algo.get('name')} {verb} '{unread}'. {reason}"
                 )
 
 
 def _unread_by(algo: Mapping[str, Any]) -> Mapping[str, str]:
-    """Keys that an algorithm does not read, and why."""
+    """Keys that an algorithm does not read, choices that are not for it, and the reasons."""
     recipe = locate(algo.get("_target_", _DEFAULT_RECIPE), "algo._target_")
     return getattr(recipe, "unread", {})
 

@@ -255,9 +255,8 @@ def test_the_paper_preset_is_the_paper(env, algo):
 def test_the_paper_has_no_algorithm_that_learns_from_memory():
     others = set(ALGORITHMS) - set(PAPER)
     assert all(find_recipe(compose_config(f"algo={name}")) is OffPolicy for name in others)
-    # of what all share they have their own numbers unless it is the paper's setting
+    # of what all share they have their own numbers
     assert compose_config("algo=sac").frames_per_batch == 5_000
-    assert compose_config("algo=sac", "preset=paper").frames_per_batch == 30_000
     assert compose_config("algo=ppo").frames_per_batch == 20_000
 
 

@@ -131,6 +131,16 @@ def test_what_is_proposed_is_taken():
     check_command(["algo=sac", "policy_update.optimizer.lr=1e-3", "loss.gamma=0.9"], CONF)
 
 
+def test_the_paper_s_setting_is_refused_where_the_paper_has_none():
+    check_command(["algo=cpo", "preset=paper"], CONF)
+    check_command(["-m", "algo=cpo,sac", "preset=default"], CONF)
+    for choices in (["algo=sac"], ["algo=bc"], ["-m", "algo=cpo,sac"]):
+        with pytest.raises(CommandLineError, match=r"has no 'preset=paper'\. It is the setting of"):
+            check_command([*choices, "preset=paper"], CONF)
+    with pytest.raises(CommandLineError, match="algo=sac has no 'preset=paper'"):
+        check_command(["-m", "algo=sac", "preset=default,paper"], CONF)
+
+
 def test_of_two_choices_that_an_algorithm_lacks_one_is_named():
     with pytest.raises(CommandLineError, match=r"algo=ppo has no '(lagrangian|cost_advantage)'"):
         check_command(["algo=ppo", "lagrangian=adam", "cost_advantage=paper"], CONF)

@@ -1,0 +1,64 @@
+"""Tables of an algorithm's settings for its page: key, values in the presets, meaning."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Sequence
+from typing import Any
+
+import replay_pages
+from omegaconf import DictConfig, OmegaConf
+
+from safe_rl.cli.part_keys import PARTS
+
+# nodes of a configuration that are an algorithm's own
+NODES = ("loss", "policy_update", "lagrangian", "then.projection.loss")
+NODES += ("then.projection.policy_update", *replay_pages.NODES)
+
+
+def own_parts(config: DictConfig) -> Iterator[tuple[str, str, dict[str, Any]]]:
+    """Path, class and arguments of every part that is the algorithm's own."""
+    for path in NODES:
+        node = OmegaConf.select(config, path)
+        if node is not None:
+            plain = OmegaConf.to_container(node, resolve=True)
+            target = plain.pop("_target_")
+            yield path, target, plain
+
+
+def setting_table(config: DictConfig, paper: DictConfig) -> str:
+    """Table of an algorithm's settings; the paper has none for those that learn from memory."""
+    if not replay_pages.learns_from_memory(config):
+        head = ("key", "`preset=default`", "`preset=paper`", "meaning")
+        return _table(head, _settings(config, paper))
+    rows = [(path, own, meaning) for path, own, _, meaning in _settings(config, config)]
+    rows += [(f"`{key}`", _cell(own), what) for key, own, what in replay_pages.settings(config)]
+    return _table(("key", "default", "meaning"), rows)
+
+
+def _settings(config: DictConfig, paper: DictConfig) -> Iterator[tuple[str, str, str, str]]:
+    """Path, value in both presets and meaning of all keys of the algorithm's own parts."""
+    for path, target, arguments in own_parts(config):
+        name = target.rpartition(".")[2]
+        other = str(OmegaConf.select(paper, f"{path}._target_"))
+        same = other == target
+        yield f"`{path}._target_`", f"`{name}`", f"`{other.rpartition('.')[2]}`", "the class"
+        known = PARTS.get(name, {})
+        for key, value in arguments.items():
+            theirs = OmegaConf.select(paper, f"{path}.{key}") if same else None
+            if key == "optimizer":
+                key, value, theirs = "optimizer.lr", value["lr"], theirs.lr if theirs else None
+            meaning = known[key].meaning if key in known else "learning rate of Adam"
+            if isinstance(value, dict) and "_target_" in value:
+                value = value.get("_target_", "").rpartition(".")[2]
+                theirs = theirs and theirs.get("_target_", "").rpartition(".")[2]
+            yield f"`{path}.{key}`", _cell(value), _cell(theirs) if same else "—", meaning
+
+
+def _table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    lines = [f"| {' | '.join(row)} |" for row in (head, *rows)]
+    return "\n".join([lines[0], "|---" * len(head) + "|", *lines[1:]])
+
+
+def _cell(value: Any) -> str:
+    written = {None: "null", True: "true", False: "false"}
+    return f"`{written[value] if value is None or isinstance(value, bool) else value}`"
