@@ -158,6 +158,7 @@ FLOORS = {
     "cli": (
         ("benchmark", "conf", "options", "robots", "run_folders", "sweep_display", "values"),
         ("keys",),
+        ("loss_keys",),
         ("part_keys",),
         ("failures", "settings", "variations"),
         ("overrides",),

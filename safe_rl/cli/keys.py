@@ -9,6 +9,9 @@ from __future__ import annotations
 from typing import NamedTuple
 
 from safe_rl.cli.values import (
+    NOT_NEGATIVE,
+    POSITIVE,
+    SHARE,
     Values,
     anything,
     boolean,
@@ -46,9 +49,6 @@ class Key(NamedTuple):
     may_lack: bool = False
 
 
-_SHARE = number(0, 1)
-_POSITIVE = number(0, above=True)
-_NOT_NEGATIVE = number(0)
 _LIMITS = mapping_of(number(0))
 _SECTION = mapping_of(anything)
 _WIDTH = count(1, 16_384)
@@ -95,14 +95,14 @@ KEYS = {
     "certificate.level": Key(
         number(0.5, 1, above=True, below=True), "confidence of a certificate", may_lack=True
     ),
-    "certificate.most_over": Key(_SHARE, "share of episodes over a limit", may_lack=True),
+    "certificate.most_over": Key(SHARE, "share of episodes over a limit", may_lack=True),
     "collector.num_collectors": Key(count(1, 1024), "processes that step environments"),
     "model.hidden_sizes": Key(_WIDTHS, "widths of layers, such as [64, 64]"),
     "model.initial_log_std": Key(number(-20, 10), "log of the policy's first standard deviation"),
-    "model.input_scale": Key(mapping_of(_POSITIVE), "factors by observation component"),
+    "model.input_scale": Key(mapping_of(POSITIVE), "factors by observation component"),
     "model.head": Key(_HEADS, "distribution of the actions", may_lack=True),
     "model.normalise": Key(
-        optional(_POSITIVE), "where normalised observations are cut; null: not", may_lack=True
+        optional(POSITIVE), "where normalised observations are cut; null: not", may_lack=True
     ),
     "model.encoders": Key(optional(_SECTION), "what encodes every entry observed", may_lack=True),
     "model.encoders.vector": Key(_WIDTHS, "layers for a vector"),
@@ -132,7 +132,7 @@ KEYS = {
     "exploration": Key(_SECTION, "how a memory is filled", may_lack=True),
     "exploration.random_steps": Key(count(0), "steps taken at random first"),
     "exploration.noise": Key(
-        _NOT_NEGATIVE, "standard deviation of a deterministic actor's noise", may_lack=True
+        NOT_NEGATIVE, "standard deviation of a deterministic actor's noise", may_lack=True
     ),
     "evaluation": Key(optional(_SECTION), "evaluation while training", may_lack=True),
     "evaluation.interval": Key(count(), "steps between evaluations", may_lack=True),

@@ -1,12 +1,16 @@
 """The keys of the parts that a run is built from, by class: what each may hold, and what it means.
 
-They hold whatever node of the configuration a part stands in.
+They hold whatever node of the configuration a part stands in. Those of losses are in `loss_keys`.
 """
 
 from __future__ import annotations
 
 from safe_rl.cli.keys import KEYS, Key
+from safe_rl.cli.loss_keys import LOSSES
 from safe_rl.cli.values import (
+    NOT_NEGATIVE,
+    POSITIVE,
+    SHARE,
     Values,
     anything,
     boolean,
@@ -23,16 +27,12 @@ from safe_rl.cli.values import (
 
 __all__ = ["EXTRAS", "FLAGS", "PARTS"]
 
-_SHARE = number(0, 1)
-_POSITIVE = number(0, above=True)
-_NOT_NEGATIVE = number(0)
-_STRENGTH = number(1e-9, 1e9)  # what is divided by, and divides
 
 _OPTIMIZER = {
     "lr": Key(number(0, 1000, above=True), "learning rate"),
     "betas": Key(list_of(number(0, 1, below=True), 3), "decay rates of the moments"),
-    "eps": Key(_NOT_NEGATIVE, "what denominators are kept above"),
-    "weight_decay": Key(_NOT_NEGATIVE, "decay of the weights"),
+    "eps": Key(NOT_NEGATIVE, "what denominators are kept above"),
+    "weight_decay": Key(NOT_NEGATIVE, "decay of the weights"),
     "momentum": Key(number(0, 1, below=True), "weight of past gradients"),
     "fused": Key(optional(boolean), "whether to step in one kernel"),
     "foreach": Key(optional(boolean), "whether to step all tensors together"),
@@ -40,13 +40,13 @@ _OPTIMIZER = {
     "nesterov": Key(boolean, "whether to look ahead"),
 }
 _ESTIMATOR = {
-    "gamma": Key(_SHARE, "discount per step"),
-    "lmbda": Key(_SHARE, "decay of the TD errors"),
+    "gamma": Key(SHARE, "discount per step"),
+    "lmbda": Key(SHARE, "decay of the TD errors"),
     "value_target": Key(choice("lambda_return", "return_to_go"), "what critics learn"),
 }
 _TRUST_REGION = {
-    "target_kl": Key(_POSITIVE, "radius δ of the trust region, a mean KL divergence"),
-    "damping": Key(_NOT_NEGATIVE, "multiple of the identity added to the Fisher matrix"),
+    "target_kl": Key(POSITIVE, "radius δ of the trust region, a mean KL divergence"),
+    "damping": Key(NOT_NEGATIVE, "multiple of the identity added to the Fisher matrix"),
     "cg_iterations": Key(count(1, 10_000), "iterations of conjugate gradients"),
     "backtrack_coeff": Key(
         number(0, 1, above=True, below=True), "factor from one try of the line search to the next"
@@ -54,43 +54,8 @@ _TRUST_REGION = {
     "max_backtracks": Key(count(1, 10_000), "tries of the line search"),
     "fisher_subsample": Key(number(0, 1, above=True), "share of the batch for the Fisher matrix"),
 }
-_LOSS = {
-    "entropy_coeff": Key(_NOT_NEGATIVE, "factor of the entropy bonus"),
-    "reduction": Key(choice("mean", "sum"), "how samples are reduced"),
-}
-_CLIPPED_LOSS = {
-    **_LOSS,
-    "clip_epsilon": Key(number(0, 1000, above=True), "half-width of the ratios that earn"),
-}
-_Q_FUNCTIONS = {
-    "gamma": Key(_SHARE, "discount per step"),
-    "loss_function": Key(choice("l2", "smooth_l1", "l1"), "of the TD errors"),
-}
-_SAC = {
-    **_Q_FUNCTIONS,
-    "alpha_init": Key(_STRENGTH, "first weight of the entropy"),
-    "target_entropy": Key(
-        Values(lambda v: v == "auto" or number().hold(v), f"auto, or {number().words}"),
-        "entropy to which its weight is adapted; auto: minus the number of actions",
-    ),
-    "fixed_alpha": Key(boolean, "whether the weight of the entropy stays as it is"),
-}
-_TD3 = {
-    **_Q_FUNCTIONS,
-    "policy_noise": Key(_NOT_NEGATIVE, "deviation of the noise on the target policy's actions"),
-    "noise_clip": Key(_NOT_NEGATIVE, "bound of that noise"),
-}
-_COST_CRITICS = {
-    "pessimism": Key(number(), "standard deviations among cost critics on top of their mean"),
-    "target_pessimism": Key(
-        optional(number()), "the same for what they bootstrap on; null: each on its own target"
-    ),
-    "lowest_cost_value": Key(
-        optional(number()), "lower bound of what they bootstrap on, if no cost is below it"
-    ),
-}
 _SAUTE = {
-    "budgets": Key(mapping_of(_POSITIVE), "cost per episode allowed by cost"),
+    "budgets": Key(mapping_of(POSITIVE), "cost per episode allowed by cost"),
     "discount": Key(number(0, 1, above=True), "discount of the costs that a budget is for"),
     "unsafe_reward": Key(number(), "reward of a step once a budget is spent"),
     "rescale_budgets": Key(boolean, "whether budgets are undiscounted"),
@@ -98,12 +63,13 @@ _SAUTE = {
 _WORKERS = {"num_collectors": KEYS["collector.num_collectors"]}
 
 PARTS = {
+    **LOSSES,
     "MinibatchUpdate": {
         "optimizer": Key(component, "the optimiser"),
         "num_passes": Key(count(1, 10**9), "passes over the batch"),
         "minibatch_size": Key(optional(count()), "samples per step; null: the whole batch"),
-        "max_kl": Key(optional(_POSITIVE), "mean KL divergence that ends the update"),
-        "max_grad_norm": Key(optional(_POSITIVE), "norm to which the gradient is clipped"),
+        "max_kl": Key(optional(POSITIVE), "mean KL divergence that ends the update"),
+        "max_grad_norm": Key(optional(POSITIVE), "norm to which the gradient is clipped"),
         "adapt_rate": Key(optional(component), "what adapts the learning rate"),
         "compile": Key(boolean, "whether to compile the loss"),
     },
@@ -111,8 +77,8 @@ PARTS = {
         "factor": Key(number(1, above=True), "by which the rate is divided or multiplied"),
         "lowest": Key(number(0, 1000, above=True), "lower bound of the rate"),
         "highest": Key(number(0, 1000, above=True), "upper bound of the rate"),
-        "few_steps": Key(_SHARE, "share of the steps below which an update ended early"),
-        "low_kl": Key(_SHARE, "share of the KL limit below which an update fell short"),
+        "few_steps": Key(SHARE, "share of the steps below which an update ended early"),
+        "low_kl": Key(SHARE, "share of the KL limit below which an update fell short"),
     },
     "TRPOStep": _TRUST_REGION,
     "CPOStep": {
@@ -126,118 +92,72 @@ PARTS = {
     },
     "CRPOStep": {
         **_TRUST_REGION,
-        "tolerance": Key(_NOT_NEGATIVE, "η, violation of an episode's cost that is let pass"),
+        "tolerance": Key(NOT_NEGATIVE, "η, violation of an episode's cost that is let pass"),
     },
     "CTRPOStep": {
         **_TRUST_REGION,
-        "beta": Key(_NOT_NEGATIVE, "β, weight of the barrier, per unit of an episode's cost"),
+        "beta": Key(NOT_NEGATIVE, "β, weight of the barrier, per unit of an episode's cost"),
         "gamma": Key(
             optional(number(0, 1, below=True)), "discount that makes sums of averages; null: T̄ does"
         ),
         "hysteresis": Key(number(0, 1, above=True), "share of a limit at which a recovery ends"),
     },
-    "PPOLoss": _CLIPPED_LOSS,
-    "PPOLagrangianLoss": {
-        **_CLIPPED_LOSS,
-        "cost_clipping": Key(choice("none", "pessimistic", "joint"), "how cost surrogates are cut"),
-    },
-    "SACLoss": _SAC,
-    "SACLagrangianLoss": {**_SAC, **_COST_CRITICS},
-    "BCLoss": {"loss_function": _Q_FUNCTIONS["loss_function"]},
-    "CALLoss": {
-        **_SAC,
-        **_COST_CRITICS,
-        "convexity": Key(_NOT_NEGATIVE, "c, weight per discounted cost beyond the limit"),
-        "ratio_memory": Key(number(0, 1, below=True), "weight of the past in the limit's unit"),
-        "largest_ratio": Key(number(1), "factor by which that may differ from the article's"),
-    },
-    "WCSACLoss": {
-        **_SAC,
-        **_COST_CRITICS,
-        "tail": Key(number(0, 1, above=True), "share of the worst cost-returns"),
-    },
-    "TD3Loss": _TD3,
-    "TD3LagrangianLoss": {**_TD3, **_COST_CRITICS},
     "Memory": {
         "capacity": Key(count(), "transitions that are kept", bytes_each=50),
         "batch_size": Key(count(), "transitions in a minibatch"),
         "n_steps": Key(count(1, 1000), "steps that a transition spans"),
         "storage": Key(choice("tensor", "memmap"), "where transitions are kept"),
-        "prioritised": Key(optional(mapping_of(_SHARE)), "{alpha: …, beta: …}; null: uniform"),
+        "prioritised": Key(optional(mapping_of(SHARE)), "{alpha: …, beta: …}; null: uniform"),
         "keep": Key(boolean, "whether checkpoints hold the transitions"),
     },
     "ReplayUpdate": {
         "optimizer": Key(component, "the optimiser"),
-        "updates_per_step": Key(_POSITIVE, "gradient steps per step of an environment"),
+        "updates_per_step": Key(POSITIVE, "gradient steps per step of an environment"),
         "tau": Key(
             optional(number(0, 0.5, above=True)),
             "share of the way that target networks go; null: there are none",
         ),
         "policy_delay": Key(count(1, 10_000), "steps of the critics per step of the policy"),
-        "rates": Key(optional(mapping_of(_POSITIVE)), "learning rates by name of parameters"),
-        "max_grad_norm": Key(optional(_POSITIVE), "norm to which the gradient is clipped"),
+        "rates": Key(optional(mapping_of(POSITIVE)), "learning rates by name of parameters"),
+        "max_grad_norm": Key(optional(POSITIVE), "norm to which the gradient is clipped"),
         "compile": Key(boolean, "whether to compile the loss"),
     },
     "make_squashed_actor": {},
     "make_bounded_actor": {},
-    "TRPOLoss": _LOSS,
-    "TRPOLagrangianLoss": _LOSS,
-    "CPOLoss": _LOSS,
-    "RCPOLoss": _CLIPPED_LOSS,
-    "P3OLoss": {
-        **_CLIPPED_LOSS,
-        "kappa": Key(_NOT_NEGATIVE, "penalty factor κ"),
-        "gamma": Key(optional(_SHARE), "discount that weighs the violation; null: 1/T̄ does"),
-    },
-    "IPOLoss": {
-        **_CLIPPED_LOSS,
-        "kappa": Key(_STRENGTH, "strength κ of the barrier"),
-        "max_weight": Key(_STRENGTH, "weight of costs at the limit and beyond"),
-    },
-    "FOCOPSLoss": {
-        **_LOSS,
-        "temperature": Key(_STRENGTH, "β, the trust region's multiplier"),
-        "max_state_kl": Key(_POSITIVE, "KL divergence beyond which a state teaches nothing"),
-    },
-    "CUPLoss": {
-        **_LOSS,
-        "gamma": Key(number(0, 1, below=True), "discount of the cost advantages"),
-        "lmbda": Key(_SHARE, "decay of their TD errors"),
-    },
     "VectorGAE": _ESTIMATOR,
     "CostGAE": _ESTIMATOR,
     "LagrangeMultiplier": {
         "init": Key(one_or_per_cost(number(0, 1e6, above=True)), "first λ"),
-        "lr": Key(_POSITIVE, "step size of Adam"),
+        "lr": Key(POSITIVE, "step size of Adam"),
         "betas": _OPTIMIZER["betas"],
         "eps": _OPTIMIZER["eps"],
     },
     "ProjectedMultiplier": {
         "init": Key(one_or_per_cost(number(0, 1e6)), "first λ"),
-        "lr": Key(_POSITIVE, "change of λ per unit of violation"),
-        "highest": Key(optional(_POSITIVE), "upper bound of λ; null: none"),
+        "lr": Key(POSITIVE, "change of λ per unit of violation"),
+        "highest": Key(optional(POSITIVE), "upper bound of λ; null: none"),
     },
     "PIMultiplier": {
         "init": Key(one_or_per_cost(number(0, 1e6)), "first λ"),
-        "kp": Key(_NOT_NEGATIVE, "proportional gain"),
-        "ki": Key(_NOT_NEGATIVE, "integral gain"),
-        "saturation": Key(_POSITIVE, "bound of the error, in units of the limit"),
-        "highest": Key(_POSITIVE, "upper bound of λ"),
+        "kp": Key(NOT_NEGATIVE, "proportional gain"),
+        "ki": Key(NOT_NEGATIVE, "integral gain"),
+        "saturation": Key(POSITIVE, "bound of the error, in units of the limit"),
+        "highest": Key(POSITIVE, "upper bound of λ"),
     },
     "LimitTracker": {
-        "margin": Key(_NOT_NEGATIVE, "standard errors of a batch's J_c below the limit"),
-        "largest_margin": Key(_SHARE, "bound of the margin, as a share of the limit"),
+        "margin": Key(NOT_NEGATIVE, "standard errors of a batch's J_c below the limit"),
+        "largest_margin": Key(SHARE, "bound of the margin, as a share of the limit"),
         "free_steps": Key(count(0), "steps for which costs are free"),
         "descent_steps": Key(count(0), "steps in which the limit then comes down"),
-        "recovery": Key(_SHARE, "share of a limit to come down to, once above it"),
+        "recovery": Key(SHARE, "share of a limit to come down to, once above it"),
         "frames": Key(count(), "steps of the whole run"),
         "latest_end": Key(number(0, 1, above=True), "share of a run by which the descent is over"),
-        "smallest_scale": Key(_POSITIVE, "unit of violations of limits near 0, costs per step"),
-        "drift": Key(optional(_POSITIVE), "share by which J_c changes per update"),
+        "smallest_scale": Key(POSITIVE, "unit of violations of limits near 0, costs per step"),
+        "drift": Key(optional(POSITIVE), "share by which J_c changes per update"),
         "memory": Key(number(0, 1, below=True), "weight of the past"),
         "lowest_trust": Key(number(0, 1, above=True), "share of a promise believed at least"),
-        "integral": Key(_NOT_NEGATIVE, "share of a violation that is asked for again"),
-        "largest_integral": Key(_NOT_NEGATIVE, "bound of that, in units of violations"),
+        "integral": Key(NOT_NEGATIVE, "share of a violation that is asked for again"),
+        "largest_integral": Key(NOT_NEGATIVE, "bound of that, in units of violations"),
     },
     "CVaR": {
         "tail": Key(number(0, 1, above=True), "share of the episodes, the worst"),
@@ -248,16 +168,16 @@ PARTS = {
     "Chance": {"most_over": Key(number(0, 1, below=True), "share of episodes over the limit")},
     "PIDMultiplier": {
         "init": Key(one_or_per_cost(number(0, 1e6)), "first λ"),
-        "kp": Key(_NOT_NEGATIVE, "proportional gain"),
-        "ki": Key(_NOT_NEGATIVE, "integral gain"),
-        "kd": Key(_NOT_NEGATIVE, "derivative gain"),
+        "kp": Key(NOT_NEGATIVE, "proportional gain"),
+        "ki": Key(NOT_NEGATIVE, "integral gain"),
+        "kd": Key(NOT_NEGATIVE, "derivative gain"),
         "proportional_ema": Key(number(0, 1, below=True), "weight of the past in the error"),
         "derivative_ema": Key(number(0, 1, below=True), "weight of the past in the cost"),
         "derivative_delay": Key(count(1, 100_000), "updates over which growth is measured"),
         "scale": Key(
             Values(
-                lambda v: v == "limit" or one_or_per_cost(_POSITIVE).hold(v),
-                f"limit, or {one_or_per_cost(_POSITIVE).words}",
+                lambda v: v == "limit" or one_or_per_cost(POSITIVE).hold(v),
+                f"limit, or {one_or_per_cost(POSITIVE).words}",
             ),
             "unit of the errors",
         ),
@@ -275,14 +195,14 @@ PARTS = {
         "steps": Key(count(), "steps of each environment until budgets are whole"),
     },
     "EarlyTermination": {
-        "budgets": Key(mapping_of(_NOT_NEGATIVE), "cost per episode that ends it if exceeded")
+        "budgets": Key(mapping_of(NOT_NEGATIVE), "cost per episode that ends it if exceeded")
     },
     "ActionFilter": {
         "filter": Key(component, "the function that replaces actions"),
         "cost_key": Key(text, "name of the cost of interventions"),
     },
     "SensorNoise": {
-        "std": Key(_NOT_NEGATIVE, "standard deviation of the noise"),
+        "std": Key(NOT_NEGATIVE, "standard deviation of the noise"),
         "components": Key(
             optional(list_of(text, 1000)), "what is noisy; null: all that is observed"
         ),

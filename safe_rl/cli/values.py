@@ -7,18 +7,9 @@ from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
 __all__ = [
-    *(
-        "Values",
-        "anything",
-        "boolean",
-        "choice",
-        "component",
-        "count",
-        "folder_name",
-        "list_of",
-        "mapping_of",
-    ),
-    *("mapping_of", "number", "one_or_per_cost", "optional", "text"),
+    *("NOT_NEGATIVE", "POSITIVE", "SHARE", "Values", "anything", "boolean", "choice", "component"),
+    *("count", "folder_name", "list_of", "mapping_of", "number", "one_or_per_cost", "optional"),
+    "text",
 ]
 
 
@@ -121,3 +112,6 @@ component = Values(
     lambda value: isinstance(value, Mapping) and _is_text(value.get("_target_")),
     "a part with a _target_, as the files in conf/ have it",
 )
+SHARE = number(0, 1)
+POSITIVE = number(0, above=True)
+NOT_NEGATIVE = number(0)
