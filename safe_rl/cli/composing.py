@@ -30,8 +30,8 @@ from safe_rl.cli.overrides import (
     CommandLineError,
     check_added,
     check_choices,
-    check_limits,
     check_read,
+    check_whole,
     explain,
 )
 from safe_rl.cli.settings import check_settings
@@ -66,7 +66,7 @@ def check_command(arguments: Sequence[str], conf: Path) -> None:
     overrides = [_parse(text) for text in flags.overrides]
     with _open_hydra(flags, overrides, conf) as hydra:
         check_choices(overrides, hydra.config_loader)
-        check_limits(overrides)
+        check_whole(overrides)
         for job in _jobs(overrides) if _is_sweep(flags) else [flags.overrides]:
             config = _compose(hydra, flags.config_name or "config", job)
             if flags.cfg is None and flags.info is None:

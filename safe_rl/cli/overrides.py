@@ -27,14 +27,15 @@ __all__ = [
     "CommandLineError",
     "check_added",
     "check_choices",
-    "check_limits",
     "check_read",
+    "check_whole",
     "explain",
 ]
 
 COMPOSING_ERRORS = (HydraException, OmegaConfBaseException, YAMLError, ValueError)
 """What Hydra raises about overrides and files."""
 
+_GIVEN_WHOLE = {"cost_limits": "limits", "model.input_scale": "factors"}
 _DEFAULT_RECIPE = "safe_rl.algorithms.OnPolicy"
 
 
@@ -78,19 +79,20 @@ def _names(choices: Iterable[str]) -> Iterator[str]:
         yield from filter(None, re.split(r"[\[\],\s'\"]+", choice))
 
 
-def check_limits(overrides: Sequence[Override]) -> None:
-    """Refuse single limits, which would be merged into the default ones.
+def check_whole(overrides: Sequence[Override]) -> None:
+    """Refuse single limits and factors, which would take the place of all default ones.
 
     Raises:
         CommandLineError: If there is one.
     """
     for override in overrides:
-        section, _, cost = override.key_or_group.partition(".")
-        if section == "cost_limits" and cost:
-            raise CommandLineError(
-                f"'{override.input_line}': limits are given all at once, as "
-                f"cost_limits='{{{cost}: {override.get_value_element_as_str()}}}'."
-            )
+        for section, what in _GIVEN_WHOLE.items():
+            name = override.key_or_group.removeprefix(f"{section}.")
+            if name != override.key_or_group:
+                raise CommandLineError(
+                    f"'{override.input_line}': {what} are given all at once, as "
+                    f"{section}='{{{name}: {override.get_value_element_as_str()}}}'."
+                )
 
 
 def check_added(overrides: Sequence[Override], config: DictConfig) -> None:

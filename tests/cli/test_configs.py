@@ -265,6 +265,15 @@ def test_a_robot_of_ones_own_has_the_numbers_of_point():
     assert (config.frames, config.num_envs, config.frames_per_batch) == (10_000_000, 30, 30_000)
 
 
+def test_factors_on_the_command_line_replace_those_of_the_preset():
+    assert compose_config().model.input_scale == {"accelerometer": 0.1, "gyro": 0.3}
+    assert compose_config("preset=paper").model.input_scale == {}
+    for preset in ("default", "paper"):
+        for written, factors in (("gyro: 1, x: 0.5", {"gyro": 1, "x": 0.5}), ("", {})):
+            config = compose_config(f"preset={preset}", f"model.input_scale={{{written}}}")
+            assert config.model.input_scale == factors
+
+
 def test_cost_limits_on_the_command_line_replace_the_default():
     assert compose_config().cost_limits == {"cost": 25.0}
     config = compose_config("cost_limits={cost_hazards: 10, cost_vases_contact: 5}")
@@ -313,7 +322,7 @@ def test_hyper_parameters_have_one_home():
 
 
 def test_networks_scale_the_components_that_are_observed():
-    config = compose_config("env=PointMass", "+model.input_scale.velocity=0.5")
+    config = compose_config("env=PointMass", "model.input_scale={velocity: 0.5}")
     network = OnPolicy.build(config, PointMass(2)).actor
     scales = [value for name, value in network.state_dict().items() if name.endswith("0.scale")]
     torch.testing.assert_close(scales, [torch.tensor([1.0, 1.0, 0.5, 0.5])])

@@ -20,7 +20,7 @@ RIGHT = [
     ["-m", "env=PointGoal1,CarGoal2", "env.hazards_num=3,4", "seed=range(3)", "+note=a,b"],
     ["algo=trpo_lagrangian", "lagrangian=adam", "lagrangian.lr=0.1", "cost_limits={cost: 3}"],
     ["collector=process", "logger=none", "hydra.run.dir=x", "checkpoint.interval=5", "frames=3e5"],
-    ["hydra/launcher=basic", "+policy_update.max_grad_norm=0.5", "+model.input_scale.position=2"],
+    ["hydra/launcher=basic", "+policy_update.max_grad_norm=0.5", "model.input_scale={position: 2}"],
     ["algo=cpo", "preset=paper", "policy_update.target_kl=0.02", "++seed=3"],
     ["policy_update/ppo@policy_update=paper"],
 ]
@@ -41,7 +41,8 @@ WRONG = {
     "+logger.path=x": "logger.path: nothing reads",
     "~logger": "logger is missing: .*logger=none for nothing",
     "~frames": "'frames' not found",
-    "model.input_scale={velocimeter: 0.5}": r"no 'velocimeter', add \+model\.input_scale\.velo",
+    "model.input_scale.gyro=1": r"factors are given all at once, as .*='\{gyro: 1\}'",
+    "+model.input_scale.velocimeter=0.5": r"model.input_scale='\{velocimeter: 0.5\}'",
     "certificate={episodez: 5}": "'certificate' has no 'episodez', did you mean 'episodes'",
     "+seed=1": "'seed' is there already: write it without +",
     "env=PointGaol1": "no env 'PointGaol1'. Did you mean 'PointGoal1'",
@@ -139,6 +140,11 @@ def test_the_paper_s_setting_is_refused_where_the_paper_has_none():
             check_command([*choices, "preset=paper"], CONF)
     with pytest.raises(CommandLineError, match="algo=sac has no 'preset=paper'"):
         check_command(["-m", "algo=sac", "preset=default,paper"], CONF)
+
+
+def test_what_a_mapping_lacks_is_added_with_a_plus():
+    with pytest.raises(CommandLineError, match=r"no 'num_gpus', add \+collector\.ray_init"):
+        check_command(["collector=ray", "collector.ray_init={num_gpus: 3}"], CONF)
 
 
 def test_of_two_choices_that_an_algorithm_lacks_one_is_named():
