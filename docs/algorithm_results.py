@@ -6,6 +6,7 @@ import csv
 import gzip
 import statistics
 from collections.abc import Iterable, Sequence
+from itertools import accumulate, pairwise, product
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -13,6 +14,8 @@ PAGES, RESULTS = ROOT / "docs" / "algorithms", ROOT / "results"
 LIMIT, FRAMES, QUARTER = 25.0, 1_000_000, 250_000
 ENVIRONMENTS = ("PointGoal1", "CarGoal1")
 ARCHIVE = RESULTS / "algorithms"
+BUDGETS = (60, 120, 300, 600)  # seconds of training
+PAUSE = 20  # times the median of a run's epochs: longer ones are not training alone
 
 Rows = list[dict[str, float]]
 
@@ -85,14 +88,30 @@ def comparison(algorithms: Iterable[str]) -> str:
     """The page that compares all algorithms, a row each."""
     names = list(algorithms)
     tables = "\n\n".join(_compared(names, env) for env in ENVIRONMENTS)
+    timed = "\n\n".join(filter(None, (_timed(names, env) for env in ENVIRONMENTS)))
+    factor = _spread_of_times(names)
     return f"""# The algorithms compared
 
-Limit 25, one million steps, `preset=default`: means over the last quarter million steps of
-training, ± the standard deviation among seeds where there are several. A single seed is a
-direction, not a verdict. $\\rho_c$ is the cost per step of the whole run. Off-policy algorithms
-take about ten times as long for as many steps.
+Limit 25, one million steps, `preset=default`. A single seed is a direction, not a verdict.
+
+## At equal steps
+
+Means over the last quarter million steps of training, ± the standard deviation among seeds where
+there are several. $\\rho_c$ is the cost per step of the whole run.
 
 {tables}
+
+## At equal wall-clock
+
+Return / episode cost after as many seconds of collecting and learning (`time_total`), means over
+the last tenth of the steps until then, and in brackets how many steps these were [million]; —: one
+of the runs had come to its end, or had not finished an episode. Every run had one thread but not
+the machine to itself: seeds of one algorithm took up to {factor:.1f} times as long as each other,
+and that much says nothing between algorithms, either. An epoch that took {PAUSE} times the median
+of its run's, as if the machine had stood still, counts as the median. Limits come down by steps,
+not by time: after few steps costs are still free.
+
+{timed}
 
 Commands are on the page of each algorithm; tables of all epochs and the commits in
 [`results/algorithms/`](../../results/README.md).
@@ -137,3 +156,45 @@ def _spread(values: list[float], digits: int) -> str:
 def spread(mean: float, deviation: float | None, digits: int) -> str:
     """A mean and, if there is one, the deviation around it."""
     return f"{mean:.{digits}f}" + ("" if deviation is None else f" ± {deviation:.{digits}f}")
+
+
+def _timed(algorithms: Iterable[str], env: str) -> str:
+    """Table of what the algorithms came to in one environment in equal times, a row each."""
+    budgets = " | ".join(f"{seconds} s" for seconds in BUDGETS)
+    rows = [f"| {env}, `algo=` | seeds | {budgets} |", "|---|---|" + "---|" * len(BUDGETS)]
+    for algo in algorithms:
+        tables = list(finished_runs(ARCHIVE, algo, env).values())
+        if tables:
+            cells = " | ".join(_within(tables, seconds) for seconds in BUDGETS)
+            rows.append(f"| [`{algo}`]({algo}.md) | {len(tables)} | {cells} |")
+    return "\n".join(rows) if len(rows) > 2 else ""
+
+
+def _within(tables: list[Rows], seconds: float) -> str:
+    """Return / cost of runs after a time, and their steps by then; a dash if one of them ended."""
+    parts = []
+    for rows in tables:
+        done = [row for row, time in zip(rows, _times(rows), strict=True) if time <= seconds]
+        steps = done[-1]["steps"] if done else 0.0
+        shown = [row for row in done if row["steps"] > 0.9 * steps and "episode_return" in row]
+        if len(done) == len(rows) or not shown:
+            return "—"
+        parts.append(_part_of(done, 0.9 * steps, steps) | {"steps": steps})
+    mean = {key: statistics.fmean(part[key] for part in parts) for key in parts[0]}
+    return f"{mean['return']:.1f} / {mean['cost']:.0f} ({mean['steps'] / 1e6:.2f})"
+
+
+def _spread_of_times(algorithms: Iterable[str]) -> float:
+    """Largest factor between the times that seeds of one algorithm took, in any environment."""
+    pairs = product(algorithms, ENVIRONMENTS)
+    found = (finished_runs(ARCHIVE, algo, env).values() for algo, env in pairs)
+    times = [[_times(rows)[-1] for rows in tables] for tables in found if tables]
+    return max((max(of_one) / min(of_one) for of_one in times), default=1.0)
+
+
+def _times(rows: Rows) -> list[float]:
+    """Seconds of training by the end of each epoch, without pauses."""
+    totals = [row["time_total"] for row in rows]
+    epochs = [after - before for before, after in pairwise([0.0, *totals])]
+    usual = statistics.median(epochs)
+    return list(accumulate(time if time < PAUSE * usual else usual for time in epochs))
