@@ -104,7 +104,8 @@ FLOORS = {
         # What changes any of them from outside.
         ("transforms.base",),
         ("transforms.action_delay", "transforms.action_filter", "transforms.early_termination"),
-        ("transforms.policy_memory", "transforms.saute", "transforms.sensor_noise"),
+        ("transforms.policy_memory", "transforms.reward_scale", "transforms.saute"),
+        ("transforms.sensor_noise",),
         ("transforms.environment",),
         ("transforms",),
         ("families",),

@@ -9,7 +9,7 @@ import torch
 from point_mass import PointMass
 from tensordict import TensorDict
 from torchrl.envs import TransformedEnv
-from torchrl.envs.transforms import StepCounter
+from torchrl.envs.transforms import RewardScaling, StepCounter
 from torchrl.envs.utils import check_env_specs
 
 from safe_rl.envs import (
@@ -24,6 +24,7 @@ from safe_rl.envs.transforms import (
     ActionFilter,
     ConstraintTransform,
     EarlyTermination,
+    RewardScale,
     Saute,
     Simmer,
     transform_env,
@@ -57,6 +58,7 @@ TRANSFORMS = {
     "simmer": lambda: Simmer({"cost": 2.0}, first=0.25, steps=16, **SAUTE),
     "early_termination": lambda: EarlyTermination({"cost": 2.0}),
     "action_filter": lambda: ActionFilter(half_speed),
+    "reward_scale": lambda: RewardScale(0.5),
 }
 ENVIRONMENTS = {
     "point_mass": lambda: PointMass(3),
@@ -72,10 +74,15 @@ def transformed(env, *names, evaluating=False):
     return transform_env(env, {name: TRANSFORMS[name]() for name in names}, evaluating=evaluating)
 
 
-def still(env, steps):
+def still(env, steps, action=0.0):
     """Rollout of a point that does nothing, over the ends of episodes."""
-    return env.rollout(steps, lambda td: td.set("action", torch.zeros(*env.batch_size, 2)),
-                       break_when_any_done=False)  # fmt: skip
+    chosen = torch.full((*env.batch_size, 2), action)
+    return env.rollout(steps, lambda td: td.set("action", chosen), break_when_any_done=False)
+
+
+def rewards_of(env, steps=6):
+    """What a point earns that moves, [N, T, 1] by entry."""
+    return still(env, steps, action=-0.5)["next"]
 
 
 @pytest.mark.parametrize("evaluating", [False, True])
@@ -141,6 +148,32 @@ def test_evaluation_observes_the_budget_and_leaves_the_reward_alone():
     batch = still(env, 4)
     assert torch.equal(batch["next", "reward"], still(Priced(costs), 4)["next", "reward"])
     assert batch["next", "observation"][0, 1, -1] < 0
+
+
+def test_a_scaled_reward_is_torchrls_and_returns_are_the_own_ones():
+    costs = [[0.0] * 6] * 2
+    own = rewards_of(Priced(costs))["reward"]
+    assert (own != 0).all()
+    env = transform_env(Priced(costs), {"scale": RewardScale(0.25)}, evaluating=False)
+    batch = rewards_of(env)
+    theirs = rewards_of(TransformedEnv(Priced(costs), RewardScaling(0.0, 0.25)))
+    torch.testing.assert_close(batch["reward"], theirs["reward"])
+    assert torch.equal(batch[env.return_key], own)
+    solved = transform_env(Priced(costs), {"scale": RewardScale(0.25)}, evaluating=True)
+    assert torch.equal(rewards_of(solved)["reward"], own)
+
+
+@pytest.mark.parametrize(("first", "spent"), [("saute", -1.5), ("scale", -3.0)])
+def test_the_own_reward_is_kept_through_several_changes(first, spent):
+    costs = [[1.0, 1.0, 0.0, 0.0]]
+    own = rewards_of(Priced(costs), 4)["reward"]
+    saute = Saute({"cost": 2.0}, discount=1.0, unsafe_reward=-3.0, rescale_budgets=False)
+    both = {"saute": saute, "scale": RewardScale(0.5)}
+    named = {first: both.pop(first), **both}
+    batch = rewards_of(transform_env(Priced(costs), named, evaluating=False), 4)
+    expected = torch.cat([0.5 * own[:, :1], torch.full_like(own[:, 1:], spent)], 1)
+    torch.testing.assert_close(batch["reward"], expected)
+    assert torch.equal(batch["task_reward"], own)
 
 
 def test_a_rescaled_budget_is_spent_by_costs_that_are_spread_over_the_episode():
@@ -276,6 +309,7 @@ def test_nodes_are_built_and_their_keys_named():
         (lambda: Saute({"cost": 0.0}, **SAUTE), "above 0"),
         (lambda: EarlyTermination({"cost": math.nan}), "at least 0"),
         (lambda: Saute({"cost": 1.0}, **SAUTE | {"discount": 0.0}), "discount=0"),
+        (lambda: RewardScale(0.0), "factor=0"),
         (lambda: Simmer({"cost": 1.0}, first=0.0, steps=9, **SAUTE), "first=0"),
         (lambda: Simmer({"cost": 1.0}, first=0.5, steps=0, **SAUTE), "steps=0"),
         (lambda: transformed(PointMass(1), "saute", "simmer"), "one of saute and simmer"),

@@ -6,6 +6,7 @@ from safe_rl.envs.transforms.base import ConstraintTransform
 from safe_rl.envs.transforms.early_termination import EarlyTermination
 from safe_rl.envs.transforms.environment import TransformedConstrainedEnv, transform_env
 from safe_rl.envs.transforms.policy_memory import PolicyMemory
+from safe_rl.envs.transforms.reward_scale import RewardScale
 from safe_rl.envs.transforms.saute import Saute, Simmer
 from safe_rl.envs.transforms.sensor_noise import SensorNoise
 
@@ -15,6 +16,7 @@ __all__ = [
     "ConstraintTransform",
     "EarlyTermination",
     "PolicyMemory",
+    "RewardScale",
     "Saute",
     "SensorNoise",
     "Simmer",

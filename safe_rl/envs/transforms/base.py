@@ -13,6 +13,9 @@ from torchrl.envs.transforms import Transform
 
 from safe_rl.naming import did_you_mean
 
+OWN_REWARD = "task_reward"
+"""Where transforms that change the reward leave the environment's own one."""
+
 
 class ConstraintTransform(Transform):
     """A transform that the environment's contract and a run's snapshots know of.
@@ -110,6 +113,24 @@ def check_known(budgets: Collection[str], cost_keys: Collection[str]) -> None:
 def costs_of(step: TensorDictBase, keys: Collection[str]) -> Tensor:
     """Return costs of a step side by side as float64, [..., k]."""
     return torch.cat([step.get(key) for key in keys], -1).double()
+
+
+def keep_reward(step: TensorDictBase, key: str) -> Tensor:
+    """Leave the environment's own reward in `key`, where no other transform has, before a change.
+
+    Returns:
+        The reward as it is so far.
+    """
+    reward = step.get("reward")
+    step.set(key, step.get(key, reward))
+    return reward
+
+
+def kept_reward_spec(spec: Composite, key: str) -> Composite:
+    """Say that the reward, and the own one in `key`, may be any number."""
+    for name in (key, "reward"):
+        spec[name] = reward_like(spec)
+    return spec
 
 
 def reward_like(spec: Composite) -> TensorSpec:

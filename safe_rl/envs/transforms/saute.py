@@ -10,11 +10,13 @@ from torch import Tensor
 from torchrl.data import Composite, TensorSpec, Unbounded
 
 from safe_rl.envs.transforms.base import (
+    OWN_REWARD,
     ConstraintTransform,
     check_budgets,
     check_known,
     costs_of,
-    reward_like,
+    keep_reward,
+    kept_reward_spec,
 )
 
 BUDGET = "budget"
@@ -55,7 +57,7 @@ class Saute(ConstraintTransform):
         tensor([1., 2.])
     """
 
-    return_key = "task_reward"
+    return_key = OWN_REWARD
 
     def __init__(
         self,
@@ -112,8 +114,7 @@ class Saute(ConstraintTransform):
         costs = costs_of(next_tensordict, self._budgets)
         left = (self._rows[BUDGET] - costs / self._allowed(costs)) / self._discount
         self._rows = {**self._rows, BUDGET: left}
-        reward = next_tensordict.get("reward")
-        next_tensordict.set(self.return_key, next_tensordict.get(self.return_key, reward))
+        reward = keep_reward(next_tensordict, self.return_key)
         if not self.evaluating:
             spent = (left <= _ROUNDING).any(-1, keepdim=True)
             next_tensordict.set("reward", reward.masked_fill(spent, self._unsafe_reward))
@@ -142,9 +143,7 @@ class Saute(ConstraintTransform):
 
     def transform_reward_spec(self, reward_spec: TensorSpec) -> TensorSpec:
         """Add the environment's own reward."""
-        for key in (self.return_key, "reward"):
-            reward_spec[key] = reward_like(reward_spec)
-        return reward_spec
+        return kept_reward_spec(reward_spec, self.return_key)
 
 
 class Simmer(Saute):
