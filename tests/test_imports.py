@@ -122,7 +122,8 @@ FLOORS = {
         ("",),
     ),
     "collectors": (
-        ("accounting", "factory", "hdf5", "recording", "workers"),
+        ("accounting", "ahead", "ending", "factory", "hdf5", "recording"),
+        ("workers",),
         ("datasets",),
         ("",),
     ),

@@ -182,7 +182,10 @@ PARTS = {
             "unit of the errors",
         ),
     },
-    "make_process_collector": _WORKERS,
+    "make_process_collector": {
+        **_WORKERS,
+        "ahead": Key(boolean, "whether the next batch is collected while one is learned from"),
+    },
     "make_ray_collector": {
         **_WORKERS,
         "ray_init": Key(mapping_of(anything), "arguments of ray.init"),

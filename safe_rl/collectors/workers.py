@@ -8,10 +8,10 @@ from __future__ import annotations
 
 import signal
 import sys
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
+from concurrent.futures import Future, wait
 from functools import partial
 from multiprocessing import parent_process
-from multiprocessing.queues import Queue
 from threading import Thread
 from typing import Any, Protocol
 
@@ -22,6 +22,8 @@ from torchrl.collectors import MultiSyncCollector
 from torchrl.collectors.distributed import RayCollector
 from torchrl.envs import EnvBase
 
+from safe_rl.collectors.ahead import behind
+from safe_rl.collectors.ending import end_processes
 from safe_rl.processes import end_with_parent, is_stopped
 
 __all__ = ["MakeEnv", "WorkerCollector", "make_process_collector", "make_ray_collector"]
@@ -52,13 +54,22 @@ class WorkerCollector:
             has processes it is given to the function that ``start`` gets.
         num_envs: Rows of all workers together, N.
         device: Device of the batches.
+        refresh: None, or what a batch is put through if the workers are to collect the next one
+            while it is learned from: it is then of the policy before the last update.
     """
 
-    def __init__(self, start: Callable[[Known], Any], num_envs: int, device: torch.device) -> None:
+    def __init__(
+        self,
+        start: Callable[[Known], Any],
+        num_envs: int,
+        device: torch.device,
+        refresh: Callable[[TensorDictBase], TensorDictBase] | None = None,
+    ) -> None:
         self.storing_device = device
         self._start = start
         self._workers: Any = None
         self._num_envs = num_envs
+        self._refresh = refresh
         self._looks = 0
 
     def __iter__(self) -> Iterator[TensorDictBase]:
@@ -67,38 +78,35 @@ class WorkerCollector:
         Raises:
             RuntimeError: If a worker has died or stands still.
         """
-        self._supervised(lambda: self._start(self._known))
+        self._wait_for(_begin(lambda: self._start(self._known)))
         batches = iter(self._workers)
+        asked = _begin(lambda: next(batches))
         while True:
-            batch = self._supervised(lambda: next(batches))
-            yield batch.reshape(self._num_envs, -1).to(self.storing_device)
-            self._supervised(self._workers.update_policy_weights_)
+            batch = self._wait_for(asked).reshape(self._num_envs, -1).to(self.storing_device)
+            if self._refresh is not None:
+                # the workers write the next one where this one lies
+                batch = self._refresh(batch.clone())
+            else:
+                yield batch
+            self._wait_for(_begin(self._workers.update_policy_weights_))
+            asked = _begin(lambda: next(batches))
+            if self._refresh is not None:
+                yield batch
 
     def _known(self, workers: Any) -> None:
         """Take note of TorchRL's collector, which is told while it still starts its processes."""
         self._workers = workers
 
-    def _supervised(self, wait: Callable[[], Any]) -> Any:
+    def _wait_for(self, asked: Future[Any]) -> Any:
         """The result of a call that for ever waits for a worker that has died."""
-        outcome: list[Any] = []
-        failures: list[BaseException] = []
-
-        def run() -> None:
-            try:
-                outcome.append(wait())
-            except BaseException as error:  # also StopIteration
-                failures.append(error)
-
-        thread = Thread(target=run, daemon=True)
-        thread.start()
-        while thread.is_alive():
-            thread.join(timeout=1.0)
+        while not wait([asked], timeout=1.0).done:
             self._check_workers()
-        if failures:
-            self._check_workers()
-            end_processes(self._workers)
-            raise failures[0]
-        return outcome[0]
+        failure = asked.exception()
+        if failure is None:
+            return asked.result()
+        self._check_workers()
+        end_processes(self._workers)
+        raise failure
 
     def _check_workers(self) -> None:
         """Raise if a process was killed, or is missing for some time; all are ended then."""
@@ -127,38 +135,26 @@ class WorkerCollector:
             self._workers.shutdown()
 
 
+def _begin(call: Callable[[], Any]) -> Future[Any]:
+    """Begin a call in a thread that does not keep Python from ending."""
+    asked: Future[Any] = Future()
+
+    def run() -> None:
+        try:
+            asked.set_result(call())
+        except BaseException as error:  # also StopIteration
+            asked.set_exception(error)
+
+    Thread(target=run, daemon=True).start()
+    return asked
+
+
 class _ProcessCollector(MultiSyncCollector):
     """TorchRL's, known while it starts: its processes are what it may for ever wait for."""
 
     def __init__(self, known: Known, *args: Any, **options: Any) -> None:
         known(self)
         super().__init__(*args, **options)
-
-
-def end_processes(collector: Any) -> None:
-    """Kill the processes of a collector, and let go of all that this one would wait for."""
-    processes = [p for p in getattr(collector, "procs", []) if not p._closed]
-    for process in processes:
-        process.kill()
-    for process in processes:
-        process.join(timeout=5.0)
-    # weights on their way to a process that is no more: Python would wait for them at exit, and for
-    # a thread that the schemes begin when they are deleted then
-    schemes = (getattr(collector, "_weight_sync_schemes", None) or {}).values()
-    for holder in (collector, *schemes):
-        for queue in _queues(vars(holder).values()):
-            queue.cancel_join_thread()
-    for scheme in schemes:
-        scheme.shutdown()
-    collector.closed = True
-
-
-def _queues(values: Iterable[Any]) -> Iterator[Queue]:
-    for value in values:
-        if isinstance(value, Queue):
-            yield value
-        elif isinstance(value, dict):
-            yield from _queues(value.values())
 
 
 def make_process_collector(
@@ -169,6 +165,7 @@ def make_process_collector(
     frames_per_batch: int,
     num_collectors: int,
     device: torch.device | str,
+    ahead: bool = False,
 ) -> WorkerCollector:
     """Collect in processes of this machine.
 
@@ -179,17 +176,22 @@ def make_process_collector(
         frames_per_batch: Steps of all rows together in one batch, N·T.
         num_collectors: Number of processes, W, that divides N.
         device: Device of policy and batches.
+        ahead: Whether every batch is collected while the one before is learned from: the cores
+            have more to do, and a batch is of the policy before the last update.
 
     Raises:
-        ValueError: If N is not a multiple of W, or ``frames_per_batch`` of N.
+        ValueError: If N is not a multiple of W, or ``frames_per_batch`` of N, or the policy has a
+            memory and is to collect ahead.
     """
     check_shares(env, num_collectors, frames_per_batch)
+    # the weights of a policy lie where the workers read them, also while they step
+    acting, refresh = behind(policy, env.action_keys) if ahead else (policy, None)
 
     def start(known: Known) -> None:
         _ProcessCollector(
             known,
             share_rows(env, make_env, num_collectors),
-            policy,
+            acting,
             frames_per_batch=frames_per_batch,
             total_frames=-1,
             policy_device="cpu",
@@ -200,7 +202,7 @@ def make_process_collector(
             auto_register_policy_transforms=False,
         )
 
-    return WorkerCollector(start, env.batch_size.numel(), torch.device(device))
+    return WorkerCollector(start, env.batch_size.numel(), torch.device(device), refresh)
 
 
 def make_ray_collector(
