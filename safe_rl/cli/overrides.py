@@ -167,7 +167,7 @@ def explain(
     """
     words = " ".join(str(error.__cause__ or error if not str(error) else error).split())
     if (place := re.match(r"In '([^']+)': (.*)", words)) is not None:  # said of files alone
-        return _in_file(*place.groups(), getattr(error, "options", None))
+        return _in_file(place[1], place[2], getattr(error, "options", None))
     if (there := _quoted(r"An item is already at '([^']+)'", words)) is not None:
         return f"'{there}' is there already: write it without +."
     key = _quoted(r"Could not override '([^']+)'", words)

@@ -204,7 +204,7 @@ PARTS = {
         "filter": Key(component, "the function that replaces actions"),
         "cost_key": Key(text, "name of the cost of interventions"),
     },
-    "RewardScale": {"factor": Key(_POSITIVE, "what rewards are multiplied by")},
+    "RewardScale": {"factor": Key(POSITIVE, "what rewards are multiplied by")},
     "SensorNoise": {
         "std": Key(NOT_NEGATIVE, "standard deviation of the noise"),
         "components": Key(
