@@ -1,0 +1,129 @@
+"""How much of what a policy step gains on its own batch it gains on batches it has not seen.
+
+Batches of one policy, that of a run's last checkpoint; a TRPO step on each, and its surrogate
+gain there and on all others. What is gained on its own batch only is noise of the advantages, and
+λ_GAE says how much of it there is: of the cost's advantages most.
+
+    python benchmarks/held_out_gain.py RUN_DIR --lmbda 0.97,0.97 0.95,0.9 0.9,0.9
+
+Pairs are λ_GAE of rewards and of costs. Gains on other batches are always measured by the
+run's own estimators, so that columns can be compared down a table. A row per pair; a column per
+Lagrange multiplier: gain on its own batch / on the others ± standard error, in thousandths.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+import statistics
+import tempfile
+from pathlib import Path
+
+import torch
+from omegaconf import OmegaConf
+from train_throughput import new_env
+
+from safe_rl.algorithms import TRPOStep
+from safe_rl.objectives import LagrangeMultiplier, TRPOLagrangianLoss
+from safe_rl.objectives.normalisation import normalise_advantages
+from safe_rl.training.trainer import build_trainer, seed_everything
+
+STEP = {
+    "target_kl": 0.01,
+    "damping": 0.1,
+    "cg_iterations": 10,
+    "backtrack_coeff": 0.9,
+    "max_backtracks": 30,
+}
+
+
+def restored(run: Path, directory: Path):
+    """Trainer of a run at its newest checkpoint, with another seed for what comes."""
+    config = OmegaConf.load(run / "config.yaml")
+    trainer = build_trainer(config, new_env(config), directory)
+    trainer.restore(sorted((run / "checkpoints" / "last").iterdir())[-1])
+    seed_everything(12_345, None)
+    return trainer
+
+
+def collect(trainer, number: int) -> list:
+    """Batches of the present policy with what constraints charge for each step."""
+    batches, found = trainer.batches(), []
+    for _ in range(number):
+        batch = next(batches).clone()
+        trainer.algorithm.constraints.charge(trainer.accounting.update(batch), batch)
+        found.append(batch)
+    return found
+
+
+def estimated(algorithm, batch, lmbdas: tuple[float, ...] | None):
+    """The batch with advantages, standardised as in training; None: the run's own λ_GAE."""
+    estimators = algorithm.advantage, algorithm.cost_advantage
+    own = [estimator.lmbda for estimator in estimators]
+    batch = batch.clone()
+    for estimator, lmbda, before in zip(estimators, lmbdas or own, own, strict=True):
+        estimator.lmbda = lmbda
+        estimator(batch)
+        estimator.lmbda = before
+    return normalise_advantages(batch)
+
+
+def gains(algorithm, batches, references, multiplier) -> tuple[list[float], list[float]]:
+    """Surrogate gain of a step on every batch: there, and on average over all other references."""
+    actor = algorithm.actor
+    start = {name: tensor.clone() for name, tensor in actor.state_dict().items()}
+    loss = TRPOLagrangianLoss(actor, multiplier, entropy_coeff=0.0)
+    step = TRPOStep(loss, **STEP)
+
+    @torch.no_grad()
+    def value(batch) -> float:
+        return -float(loss(batch)["loss_objective"])
+
+    before = [value(batch) for batch in batches], [value(batch) for batch in references]
+    own, others = [], []
+    for index, batch in enumerate(batches):
+        step(batch)
+        own.append(value(batch) - before[0][index])
+        others.append(
+            statistics.fmean(
+                value(reference) - before[1][number]
+                for number, reference in enumerate(references)
+                if number != index
+            )
+        )
+        actor.load_state_dict(start)
+    return own, others
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("run", type=Path)
+    parser.add_argument("--batches", type=int, default=8)
+    parser.add_argument("--lmbda", nargs="+", default=["0.97,0.97", "0.95,0.9", "0.9,0.9"])
+    parser.add_argument("--multipliers", nargs="+", type=float, default=[0.0, 1.0, 2.5])
+    options = parser.parse_args()
+    with tempfile.TemporaryDirectory() as directory:
+        trainer = restored(options.run, Path(directory))
+        collected = collect(trainer, options.batches)
+    algorithm = trainer.algorithm
+    limits = dict.fromkeys(algorithm.cost_keys, 0.0)
+    references = [estimated(algorithm, batch, None) for batch in collected]
+    print("| λ_GAE | " + " | ".join(f"multiplier {m:g}" for m in options.multipliers) + " |")
+    print("|---|" + "---|" * len(options.multipliers))
+    for pair in options.lmbda:
+        lmbdas = tuple(map(float, pair.split(",")))
+        batches = [estimated(algorithm, batch, lmbdas) for batch in collected]
+        cells = []
+        for value in options.multipliers:
+            fixed = LagrangeMultiplier(limits, init=max(value, 1e-6), lr=0.0)
+            own, others = gains(algorithm, batches, references, fixed)
+            error = statistics.stdev(others) / math.sqrt(len(others))
+            cells.append(
+                f"{1e3 * statistics.fmean(own):.1f} / "
+                f"{1e3 * statistics.fmean(others):.2f} ± {1e3 * error:.2f}"
+            )
+        print(f"| {pair} | {' | '.join(cells)} |", flush=True)
+
+
+if __name__ == "__main__":
+    main()
