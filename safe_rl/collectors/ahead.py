@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection
 from copy import deepcopy
+from itertools import chain
 
 import torch
 from tensordict import NestedKey, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
+from torch import nn
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 __all__ = ["behind", "measured_from"]
@@ -38,10 +40,22 @@ def behind(
     copy = deepcopy(policy)
 
     def refresh(batch: TensorDictBase) -> TensorDictBase:
-        copy.load_state_dict(policy.state_dict())
+        _equate(copy, policy)
         return measured_from(policy, batch, sampled)
 
     return copy, refresh
+
+
+@torch.no_grad()
+def _equate(copy: nn.Module, policy: nn.Module) -> None:
+    """Give a copy what its original holds by now, in place.
+
+    A ``state_dict`` would leave out what belongs to no checkpoint of the network's, such as whether
+    an `ExploringPolicy` still acts at random.
+    """
+    pairs = (chain(module.parameters(), module.buffers()) for module in (copy, policy))
+    for own, present in zip(*pairs, strict=True):
+        own.copy_(present)
 
 
 @torch.no_grad()

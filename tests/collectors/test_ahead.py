@@ -6,15 +6,18 @@ from itertools import pairwise
 
 import pytest
 import torch
+from tensordict import TensorDict
 from tensordict.nn import TensorDictModule, TensorDictSequential
 from torch import nn
 
 from safe_rl.collectors import make_process_collector
+from safe_rl.collectors.ahead import behind
 from safe_rl.envs import SafetyGymEnv
-from safe_rl.models import BehaviourPolicy, make_actor
+from safe_rl.models import BehaviourPolicy, ExploringPolicy, make_actor, make_bounded_actor
 
 MAKE = partial(SafetyGymEnv, "PointGoal1", seed=3, num_threads=1)
 NUMBERS = {"frames_per_batch": 80, "num_collectors": 1, "device": "cpu"}
+BOUNDS = -torch.ones(2), torch.ones(2)
 
 
 def make_actor_for(env):
@@ -47,6 +50,21 @@ def test_a_batch_is_of_the_policy_before_the_last_update():
         assert (batch == copy).all()
     for (one, _), (other, _) in pairwise(kept):
         assert torch.equal(other["observation"][:, 0], one["next", "observation"][:, -1])
+
+
+@torch.no_grad()
+def test_a_copy_ceases_to_act_at_random_with_its_policy():
+    actor = make_bounded_actor(3, *BOUNDS, hidden_sizes=[8])
+    policy = ExploringPolicy(actor, *BOUNDS)
+    policy.is_random.fill_(True)
+    acting, refresh = behind(policy, ["action"])
+    steps = TensorDict(observation=torch.randn(5, 3), batch_size=[5])
+    own = actor(steps.clone())["action"]
+    at_random = acting(steps.clone())
+    assert not torch.isclose(at_random["action"], own).any()
+    policy.is_random.fill_(False)
+    refresh(at_random)
+    torch.testing.assert_close(acting(steps.clone())["action"], own)
 
 
 def test_a_policy_with_a_memory_is_refused():
