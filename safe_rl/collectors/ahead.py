@@ -17,7 +17,7 @@ __all__ = ["behind", "measured_from"]
 
 def behind(
     policy: TensorDictModuleBase, sampled: Collection[NestedKey]
-) -> tuple[TensorDictModuleBase, Callable[[TensorDictBase], TensorDictBase]]:
+) -> tuple[TensorDictModuleBase, Callable[[], None], Callable[[TensorDictBase], TensorDictBase]]:
     """What collects ahead of a policy's updates.
 
     Args:
@@ -25,8 +25,9 @@ def behind(
         sampled: keys of its actions.
 
     Returns:
-        A copy of the policy, and what every batch is put through while nothing is collected: the
-        copy gets the present weights, and the batch is `measured_from` the present policy.
+        A copy of the policy; what gives it the present weights, before anything is collected; and
+        what every batch is put through while nothing is collected: the copy gets the present
+        weights, and the batch is `measured_from` the present policy.
 
     Raises:
         ValueError: if the policy has a memory, which would be of older weights.
@@ -39,11 +40,14 @@ def behind(
         )
     copy = deepcopy(policy)
 
-    def refresh(batch: TensorDictBase) -> TensorDictBase:
+    def catch_up() -> None:
         _equate(copy, policy)
+
+    def refresh(batch: TensorDictBase) -> TensorDictBase:
+        catch_up()
         return measured_from(policy, batch, sampled)
 
-    return copy, refresh
+    return copy, catch_up, refresh
 
 
 @torch.no_grad()

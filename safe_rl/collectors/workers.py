@@ -185,9 +185,11 @@ def make_process_collector(
     """
     check_shares(env, num_collectors, frames_per_batch)
     # the weights of a policy lie where the workers read them, also while they step
-    acting, refresh = behind(policy, env.action_keys) if ahead else (policy, None)
+    is_present = policy, lambda: None, None
+    acting, catch_up, refresh = behind(policy, env.action_keys) if ahead else is_present
 
     def start(known: Known) -> None:
+        catch_up()  # since it was built, the policy may have got the weights of a checkpoint
         _ProcessCollector(
             known,
             share_rows(env, make_env, num_collectors),

@@ -30,6 +30,7 @@ def test_a_batch_is_of_the_policy_before_the_last_update():
     env = MAKE(num_envs=4)
     actor = make_actor_for(env)
     collector = make_process_collector(env, MAKE, BehaviourPolicy(actor), ahead=True, **NUMBERS)
+    actor.load_state_dict(make_actor_for(env).state_dict())  # as a run does that is resumed
     batches = iter(collector)
     before = deepcopy(actor)  # what the batch is of
     kept = []
@@ -57,7 +58,7 @@ def test_a_copy_ceases_to_act_at_random_with_its_policy():
     actor = make_bounded_actor(3, *BOUNDS, hidden_sizes=[8])
     policy = ExploringPolicy(actor, *BOUNDS)
     policy.is_random.fill_(True)
-    acting, refresh = behind(policy, ["action"])
+    acting, _, refresh = behind(policy, ["action"])
     steps = TensorDict(observation=torch.randn(5, 3), batch_size=[5])
     own = actor(steps.clone())["action"]
     at_random = acting(steps.clone())
