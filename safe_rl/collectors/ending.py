@@ -10,7 +10,13 @@ __all__ = ["end_processes"]
 
 
 def end_processes(collector: Any) -> None:
-    """Kill the processes of a collector, and let go of all that this one would wait for."""
+    """Kill the processes of a collector, and let go of all that this one would wait for.
+
+    Args:
+        collector: TorchRL's; None if it has failed before it came to have any.
+    """
+    if collector is None:
+        return
     processes = [p for p in getattr(collector, "procs", []) if not p._closed]
     for process in processes:
         process.kill()

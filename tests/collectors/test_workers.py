@@ -11,7 +11,7 @@ from functools import partial
 import pytest
 import torch
 
-from safe_rl.collectors import make_process_collector, make_ray_collector
+from safe_rl.collectors import WorkerCollector, make_process_collector, make_ray_collector
 from safe_rl.collectors.workers import share_rows
 from safe_rl.envs import SafetyGymEnv
 from safe_rl.models import BehaviourPolicy, make_actor
@@ -69,6 +69,16 @@ def test_batches_follow_the_weights_until_a_worker_dies():
     with pytest.raises(RuntimeError, match=r"worker .* died \(exit code -9.*resume="):
         next(batches)
     assert time.monotonic() - start < 30
+    collector.shutdown()
+
+
+def test_what_keeps_workers_from_starting_is_told():
+    def start(known):
+        raise OSError("no room for another process")
+
+    collector = WorkerCollector(start, num_envs=4, device=torch.device("cpu"))
+    with pytest.raises(OSError, match="no room for another process"):
+        next(iter(collector))
     collector.shutdown()
 
 
