@@ -38,6 +38,9 @@ class Algorithm(Protocol):
         networks: What is trained, by name. Another run can start from them; those whose names
             begin with ``cost_`` are then taken over only if both runs constrain the same costs.
 
+    If something else has to follow when the networks begin with the weights of another run, such as
+    target networks, a method ``networks_were_given`` sees to it.
+
     If checkpoints do not hold all that learning depends on, ``lost_on_resume`` is a sentence on
     what a run that is resumed has lost.
     """

@@ -190,6 +190,10 @@ class OffPolicy:
             row |= constraints.column(f"policy_{name}", value)
         return row
 
+    def networks_were_given(self) -> None:
+        """Let target networks begin where the networks do, which have got another run's weights."""
+        self.policy_update.equate_targets()
+
     def _count_steps(self, steps: int) -> None:
         self._counts["steps"] += steps
         self.policy.is_random.fill_(self._counts["steps"] < self.random_steps)

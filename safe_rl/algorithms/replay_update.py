@@ -81,6 +81,12 @@ class ReplayUpdate:
         self._evaluate = torch.compile(self._losses) if compile else self._losses
         self._counts = {"updates": 0, "owed": 0.0}
 
+    @torch.no_grad()
+    def equate_targets(self) -> None:
+        """Make target networks equal to the networks, whose weights have been replaced."""
+        for target, source in zip(self._targets, self._sources, strict=True):
+            target.copy_(source)
+
     def due(self, steps: int) -> int:
         """Gradient steps that have become due with as many steps of environments."""
         owed = self._counts["owed"] + steps * self.updates_per_step

@@ -27,7 +27,7 @@ from safe_rl.runs.lock import held
 from safe_rl.runs.resuming import is_finished, may_continue
 from safe_rl.training.threads import physics_threads
 from safe_rl.training.trainer import Trainer, build_trainer, seed_everything
-from safe_rl.training.transfer import initialise_networks
+from safe_rl.training.transfer import begin_from
 
 __all__ = ["complete", "prepare", "run"]
 
@@ -82,8 +82,7 @@ def prepare(config: DictConfig, directory: Path, continues: bool) -> Trainer | N
     if continues and trainer.folder.files.num_rows:
         print("No checkpoint was written yet: starting over, with a new progress.csv.")
     if config.init_from is not None:
-        algorithm = trainer.algorithm
-        initialise_networks(algorithm.networks, Path(config.init_from), list(algorithm.cost_keys))
+        begin_from(trainer.algorithm, Path(config.init_from))
     if not (continues and folder.robot_note.exists()):
         keep_robot(folder, given)
     return trainer

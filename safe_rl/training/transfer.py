@@ -9,11 +9,21 @@ from typing import Any
 from torch import Tensor, nn
 from torchrl.checkpoint import CheckpointError
 
+from safe_rl.algorithms.contract import Algorithm
 from safe_rl.runs.archive import read_states
 from safe_rl.runs.files import read_config
 from safe_rl.runs.folder import RunFolder, run_of
 
-__all__ = ["initialise_networks"]
+__all__ = ["begin_from", "initialise_networks"]
+
+
+def begin_from(algorithm: Algorithm, source: Path) -> list[str]:
+    """Let an algorithm begin with the networks of a run; see `initialise_networks`."""
+    taken = initialise_networks(algorithm.networks, source, list(algorithm.cost_keys))
+    follow = getattr(algorithm, "networks_were_given", None)
+    if follow is not None:
+        follow()
+    return taken
 
 
 def initialise_networks(

@@ -16,7 +16,7 @@ from safe_rl.evaluation.episodes import collect_episodes
 from safe_rl.evaluation.loading import find_checkpoint, load_config, load_policy
 from safe_rl.runs.table import read_table
 from safe_rl.training.trainer import build_trainer, seed_everything
-from safe_rl.training.transfer import initialise_networks
+from safe_rl.training.transfer import begin_from, initialise_networks
 
 NAMES = ["sac", "sac_lagrangian", "td3", "td3_lagrangian", "wcsac", "cal"]
 
@@ -147,6 +147,13 @@ def test_another_run_starts_from_its_networks(make_trainer, tmp_path):
     assert initialise_networks(networks, tmp_path / "first", ["cost_north"]) == taken[:2]
     ours, theirs = (t.algorithm.networks["cost_critic"].parameters() for t in (first, second))
     assert all(torch.equal(a, b) for a, b in zip(ours, theirs, strict=True))
+    # and its targets start from them, too
+    third = make_trainer("third", "algo=sac_lagrangian", "seed=2").algorithm
+    begin_from(third, tmp_path / "first")
+    loss = third.policy_update.loss
+    for name in ("qvalue_network_params", "cost_qvalue_network_params"):
+        targets, sources = (getattr(loss, prefix + name).data for prefix in ("target_", ""))
+        assert (targets == sources).all()
 
 
 @pytest.mark.parametrize("algo", ["sac", "td3"])
