@@ -82,7 +82,7 @@ def prepare(config: DictConfig, directory: Path, continues: bool) -> Trainer | N
     if continues and trainer.folder.files.num_rows:
         print("No checkpoint was written yet: starting over, with a new progress.csv.")
     if config.init_from is not None:
-        begin_from(trainer.algorithm, Path(config.init_from))
+        begin_from(trainer.algorithm, config)
     if not (continues and folder.robot_note.exists()):
         keep_robot(folder, given)
     return trainer

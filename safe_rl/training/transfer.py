@@ -17,9 +17,11 @@ from safe_rl.runs.folder import RunFolder, run_of
 __all__ = ["begin_from", "initialise_networks"]
 
 
-def begin_from(algorithm: Algorithm, source: Path) -> list[str]:
-    """Let an algorithm begin with the networks of a run; see `initialise_networks`."""
-    taken = initialise_networks(algorithm.networks, source, list(algorithm.cost_keys))
+def begin_from(algorithm: Algorithm, config: Mapping[str, Any]) -> list[str]:
+    """Let an algorithm begin with the networks of ``init_from``; see `initialise_networks`."""
+    taken = initialise_networks(
+        algorithm.networks, Path(config["init_from"]), algorithm.cost_keys, _cost_loss(config)
+    )
     follow = getattr(algorithm, "networks_were_given", None)
     if follow is not None:
         follow()
@@ -27,17 +29,21 @@ def begin_from(algorithm: Algorithm, source: Path) -> list[str]:
 
 
 def initialise_networks(
-    networks: Mapping[str, nn.Module], source: Path, cost_keys: Sequence[str]
+    networks: Mapping[str, nn.Module],
+    source: Path,
+    cost_keys: Sequence[str],
+    cost_loss: str | None = None,
 ) -> list[str]:
     """Give networks the weights that a run has learned.
 
     Optimisers, multipliers and counters start anew. Networks whose names begin with ``cost_`` are
-    taken over if the run constrained the same costs.
+    taken over if the run constrained the same costs, and had the same loss say what they are.
 
     Args:
         networks: The new run's by name, changed in place.
         source: Folder of the run, of which the newest checkpoint is read, or a checkpoint.
         cost_keys: Keys of the new run's constrained costs.
+        cost_loss: Loss of the new run's cost critics if they learn from a memory.
 
     Returns:
         Names of the networks that were taken over.
@@ -49,7 +55,7 @@ def initialise_networks(
     if not source.exists():
         raise CheckpointError(f"init_from={source}: there is no such folder or file.")
     checkpoint = _newest(source) if source.is_dir() else source
-    same_costs = _constrained_costs(checkpoint) == list(cost_keys)
+    same_costs = _cost_critics(checkpoint) == (list(cost_keys), cost_loss)
     taken = {
         name: network
         for name, network in networks.items()
@@ -73,12 +79,18 @@ def _newest(directory: Path) -> Path:
     return newest
 
 
-def _constrained_costs(checkpoint: Path) -> list[str]:
-    """Costs that the cost critic of a checkpoint's run is for; none if that is not known."""
+def _cost_critics(checkpoint: Path) -> tuple[list[str], str | None]:
+    """Costs that the cost critic of a checkpoint's run is for, none if not known; and its loss."""
     run = RunFolder(run_of(checkpoint)[0])
     config = read_config(run.config) if run.is_run else {}
     is_constrained = config.get("cost_advantage") or config.get("limits") is not None
-    return list(config.get("cost_limits", {})) if is_constrained else []
+    costs = list(config.get("cost_limits", {})) if is_constrained else []
+    return costs, _cost_loss(config)
+
+
+def _cost_loss(config: Mapping[str, Any]) -> str | None:
+    """Loss of critics that learn from a memory: of two alike, one may be a mean, one a variance."""
+    return (config.get("loss") or {}).get("_target_") if config.get("critics") else None
 
 
 def _check_sizes(
@@ -96,6 +108,16 @@ def _check_sizes(
             f"The {name} of {checkpoint} scales its inputs and this run's does not, or the other "
             "way round: set model.input_scale as in the other run's config.yaml."
         )
+    shapes = [_shapes(weights) for weights in (own, given)]
+    if other := next((key for key in own if shapes[0][key] != shapes[1][key]), None):
+        raise CheckpointError(
+            f"The {name} of {checkpoint} has a {other} of shape {shapes[1][other]}, this run's has "
+            f"{shapes[0][other]}: set model.… and critics.… as in the other run's config.yaml."
+        )
+
+
+def _shapes(weights: Mapping[str, Any]) -> dict[str, tuple[int, ...]]:
+    return {key: tuple(getattr(value, "shape", ())) for key, value in weights.items()}
 
 
 def _layer_sizes(weights: Mapping[str, Any]) -> list[int]:

@@ -16,7 +16,7 @@ from safe_rl.evaluation.episodes import collect_episodes
 from safe_rl.evaluation.loading import find_checkpoint, load_config, load_policy
 from safe_rl.runs.table import read_table
 from safe_rl.training.trainer import build_trainer, seed_everything
-from safe_rl.training.transfer import begin_from, initialise_networks
+from safe_rl.training.transfer import begin_from
 
 NAMES = ["sac", "sac_lagrangian", "td3", "td3_lagrangian", "wcsac", "cal"]
 
@@ -140,20 +140,24 @@ def test_multipliers_go_by_the_costs_of_episodes(make_trainer, tmp_path):
 def test_another_run_starts_from_its_networks(make_trainer, tmp_path):
     first = make_trainer("first", "algo=sac_lagrangian", "frames=320")
     first.run()
-    second = make_trainer("second", "algo=sac_lagrangian", "seed=1")
-    networks = second.algorithm.networks
-    taken = initialise_networks(networks, tmp_path / "first", ["cost"])
+
+    def start(name, *overrides):
+        config = off_policy_config(*overrides, f"init_from={tmp_path / 'first'}", "seed=1")
+        algorithm = make_trainer(name, *overrides, "seed=1").algorithm
+        return algorithm, begin_from(algorithm, config)
+
+    second, taken = start("second", "algo=sac_lagrangian")
     assert taken == ["actor", "critic", "cost_critic"]
-    assert initialise_networks(networks, tmp_path / "first", ["cost_north"]) == taken[:2]
-    ours, theirs = (t.algorithm.networks["cost_critic"].parameters() for t in (first, second))
+    ours, theirs = (each.networks["cost_critic"].parameters() for each in (first.algorithm, second))
     assert all(torch.equal(a, b) for a, b in zip(ours, theirs, strict=True))
-    # and its targets start from them, too
-    third = make_trainer("third", "algo=sac_lagrangian", "seed=2").algorithm
-    begin_from(third, tmp_path / "first")
-    loss = third.policy_update.loss
+    # target networks start from them, too
+    loss = second.policy_update.loss
     for name in ("qvalue_network_params", "cost_qvalue_network_params"):
         targets, sources = (getattr(loss, prefix + name).data for prefix in ("target_", ""))
         assert (targets == sources).all()
+    # critics of other costs do not, and no mean becomes the variance that is as large
+    assert start("third", "algo=sac_lagrangian", "cost_limits={cost_north: 1}")[1] == taken[:2]
+    assert start("fourth", "algo=wcsac")[1] == taken[:2]
 
 
 @pytest.mark.parametrize("algo", ["sac", "td3"])

@@ -9,6 +9,8 @@ from point_mass import PointMass
 from run_configs import point_mass_config
 from torchrl.checkpoint import CheckpointError
 
+from safe_rl.models import QEnsemble, make_bounded_actor
+from safe_rl.runs.checkpoints import CheckpointStore
 from safe_rl.training.trainer import build_trainer, seed_everything
 from safe_rl.training.transfer import initialise_networks
 
@@ -86,6 +88,20 @@ def test_other_sizes_are_named_and_nothing_changes(trained, override, message):
     with pytest.raises(CheckpointError, match=message):
         initialise_networks(fresh.algorithm.networks, trained.folder.directory, ["cost"])
     after = fresh.algorithm.actor.state_dict()
+    assert all(torch.equal(after[key], value) for key, value in before.items())
+
+
+def test_an_ensemble_of_another_number_is_named_and_nothing_changes(tmp_path):
+    def make(number):
+        actor = make_bounded_actor(3, -torch.ones(2), torch.ones(2), hidden_sizes=[8])
+        return {"actor": actor, "critic": QEnsemble(3, 2, hidden_sizes=[8], num_networks=number)}
+
+    checkpoint = CheckpointStore(tmp_path, make(2), keep_last=1).save(10)
+    networks = make(4)
+    before = {k: v.clone() for k, v in networks["actor"].state_dict().items()}
+    with pytest.raises(CheckpointError, match=r"critic of .*shape \(2, .*this run's has \(4, "):
+        initialise_networks(networks, checkpoint, [])
+    after = networks["actor"].state_dict()
     assert all(torch.equal(after[key], value) for key, value in before.items())
 
 
