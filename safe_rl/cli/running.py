@@ -20,7 +20,7 @@ from safe_rl.cli.settings import check_settings
 from safe_rl.cli.user_code import imported, make_after_imports
 from safe_rl.envs import LayoutError, complete_env, make_env
 from safe_rl.evaluation.during import PeriodicEvaluation
-from safe_rl.evaluation.layouts import default_seed
+from safe_rl.evaluation.layouts import default_seed, has_fixed_layout
 from safe_rl.evaluation.loading import transforms_of
 from safe_rl.runs.folder import RunFolder
 from safe_rl.runs.lock import held
@@ -66,6 +66,7 @@ def prepare(config: DictConfig, directory: Path, continues: bool) -> Trainer | N
             partial(make, evaluating=True),
             cost_keys=training.cost_keys,
             seed=default_seed(env, config.seed),
+            fixed_layout=has_fixed_layout(env),
             interval=config.evaluation.interval,
             episodes=config.evaluation.episodes,
         )

@@ -16,7 +16,7 @@ from omegaconf import DictConfig
 from torchrl.envs import EnvBase
 
 from safe_rl.evaluation.episodes import Episodes, collect_episodes
-from safe_rl.evaluation.layouts import default_seed
+from safe_rl.evaluation.layouts import default_seed, has_fixed_layout
 from safe_rl.evaluation.loading import evaluated, load_config, load_policy, override_env
 from safe_rl.runs.files import replacing
 from safe_rl.runs.folder import RunFolder, checkpoint_steps, checkpoints_in
@@ -148,16 +148,17 @@ class _Runner:
     def run(self, checkpoint: Path, number: int, purpose: int) -> Episodes:
         node = override_env(self._config, {})
         # of all candidates the same layouts: what differs between them is not luck
-        seed = default_seed(node, self._config.seed) + 1 + purpose
+        seed = default_seed(node, self._config.seed)
+        fresh = seed + 1 + purpose
         env = self._make_env(
             node,
             num_envs=min(number, _MOST_WORLDS),
             device="cpu",
-            seed=seed,
+            seed=seed if has_fixed_layout(node) else fresh,
             num_threads=self._threads,
         )
         policy = load_policy(self._config, env, checkpoint, torch.device("cpu"))
-        torch.manual_seed(seed)
+        torch.manual_seed(fresh)
         keys = list(self._config.cost_limits)
         try:
             return collect_episodes(

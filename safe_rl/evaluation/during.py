@@ -30,7 +30,8 @@ class PeriodicEvaluation:
         cost_keys: Keys of the costs to sum.
         interval: Steps of training from one evaluation to the next.
         episodes: Episodes of each.
-        seed: Of the worlds.
+        seed: Of the worlds, to which the steps of training are added, and of what the policy draws.
+        fixed_layout: Whether worlds have one layout, that of ``seed``: then it is no other.
 
     Examples:
         >>> from safe_rl.envs import make_env
@@ -39,7 +40,9 @@ class PeriodicEvaluation:
         ...     return make_env({"robot_base": "point", "num_steps": 5}, **keys)
         >>> size = make(num_envs=1, seed=0).observation_spec["observation"].shape[-1]
         >>> policy = BehaviourPolicy(make_actor(size, 2, hidden_sizes=[8], initial_log_std=-0.5))
-        >>> evaluate = PeriodicEvaluation(make, policy, ["cost"], interval=100, episodes=2, seed=1)
+        >>> evaluate = PeriodicEvaluation(
+        ...     make, policy, ["cost"], interval=100, episodes=2, seed=1, fixed_layout=False
+        ... )
         >>> evaluate(50, 90)
         {'evaluation_return': nan, 'evaluation_cost': nan}
         >>> evaluate(90, 130)["evaluation_cost"]
@@ -55,9 +58,11 @@ class PeriodicEvaluation:
         interval: int,
         episodes: int,
         seed: int,
+        fixed_layout: bool,
     ) -> None:
         self._make_env, self._policy, self._cost_keys = make_env, policy, list(cost_keys)
         self._interval, self._episodes, self._seed = interval, episodes, seed
+        self._fixed_layout = fixed_layout
 
     def __call__(self, before: int, after: int) -> dict[str, float]:
         """Means over episodes, if one is due between two numbers of steps; otherwise NaN."""
@@ -66,11 +71,13 @@ class PeriodicEvaluation:
             return {f"evaluation_{name}": math.nan for name in names}
         # new ones every time: not all environments forget what was before a new seed
         worlds = min(self._episodes, _MOST_WORLDS)
+        fresh = (self._seed + after) % 2**62
+        seed = self._seed if self._fixed_layout else fresh
         with (
-            closing(self._make_env(num_envs=worlds, seed=(self._seed + after) % 2**62)) as env,
+            closing(self._make_env(num_envs=worlds, seed=seed)) as env,
             torch.random.fork_rng(devices=[]),
         ):
-            torch.manual_seed(self._seed + after)
+            torch.manual_seed(fresh)
             found = collect_episodes(
                 env, self._policy, self._episodes, self._cost_keys, deterministic=True
             )

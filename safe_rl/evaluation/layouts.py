@@ -5,12 +5,17 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-__all__ = ["default_seed", "shared_layouts"]
+__all__ = ["default_seed", "has_fixed_layout", "shared_layouts"]
 
 # Far from any seed that a person counts up from a run's own.
 _OFFSET = 1_000_000_007
 # where a configuration does not say, or its environments have no layouts: every episode is new
 _UNLIMITED = {"randomize_layout": True, "layout_seeds": None, "layout_seeds_first": 0}
+
+
+def has_fixed_layout(env: Mapping[str, Any]) -> bool:
+    """Whether all episodes of a world have one layout, which is drawn from the seed."""
+    return not (_UNLIMITED | {**env})["randomize_layout"]
 
 
 def default_seed(env: Mapping[str, Any], training_seed: int) -> int:
@@ -19,7 +24,7 @@ def default_seed(env: Mapping[str, Any], training_seed: int) -> int:
     Where the layout is fixed it is drawn from the seed, and belongs to what was learned; then it
     is training's.
     """
-    return training_seed + (_OFFSET if (_UNLIMITED | {**env})["randomize_layout"] else 0)
+    return training_seed + (0 if has_fixed_layout(env) else _OFFSET)
 
 
 def shared_layouts(

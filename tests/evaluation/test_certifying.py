@@ -74,3 +74,23 @@ def test_the_same_run_gets_the_same_certificate(train):
 def test_without_limits_there_is_nothing_to_certify(train):
     directory = train("{}", "algo=ppo")
     assert certify(directory, OPTIONS, make_env=make_env) is None
+
+
+def test_a_fixed_layout_is_certified_as_it_was_learned(train):
+    met = []
+
+    def make(node, *, seed, **keys):
+        met.append(seed)
+        return make_env(node, seed=seed, **keys)
+
+    directory = train("{cost: 1000}", "+env.randomize_layout=false", "seed=3")
+    certify(directory, OPTIONS, make_env=make)
+    assert set(met) == {3}
+    # where layouts are drawn, neither training's nor the ranking's are tested
+    met.clear()
+    directory.joinpath("config.yaml").write_text(
+        directory.joinpath("config.yaml").read_text().replace("randomize_layout: false", "")
+    )
+    certify(directory, OPTIONS, make_env=make)
+    assert len(set(met)) == 2
+    assert 3 not in met

@@ -9,6 +9,7 @@ from tensordict import TensorDict
 from torchrl.data import Bounded, Categorical, Composite, Unbounded
 from torchrl.envs import EnvBase
 
+from safe_rl.evaluation.during import PeriodicEvaluation
 from safe_rl.evaluation.episodes import collect_episodes
 from safe_rl.evaluation.layouts import default_seed, shared_layouts
 from safe_rl.evaluation.video import check_camera, record_episode
@@ -137,3 +138,19 @@ def test_a_fixed_layout_is_trainings_only_with_its_seed():
     assert shared_layouts(fixed, fixed, same_seed=False) == 0.0
     assert shared_layouts(unlimited, unlimited, same_seed=False) == 0.0
     assert shared_layouts(unlimited, fixed, same_seed=True) == 0.0
+
+
+@pytest.mark.parametrize(("fixed", "seeds"), [(True, [7, 7]), (False, [107, 207])])
+def test_evaluations_in_between_keep_to_a_fixed_layout(fixed, seeds):
+    met = []
+
+    def make(*, num_envs, seed):
+        met.append(seed)
+        return KnownLengths([[2, 2]] * num_envs)
+
+    policy = BehaviourPolicy(make_actor(1, 1, hidden_sizes=[4], initial_log_std=-0.5))
+    evaluate = PeriodicEvaluation(
+        make, policy, ["cost"], interval=100, episodes=3, seed=7, fixed_layout=fixed
+    )
+    assert [evaluate(after - 100, after)["evaluation_cost"] for after in (100, 200)] == [1.0, 1.0]
+    assert met == seeds

@@ -185,7 +185,7 @@ def test_it_is_evaluated_in_between_without_noise_and_without_consequences(tmp_p
         if interval:
             evaluation = partial(
                 PeriodicEvaluation, partial(PointMass, num_steps=20),
-                cost_keys=["cost"], interval=interval, episodes=6, seed=5,
+                cost_keys=["cost"], interval=interval, episodes=6, seed=5, fixed_layout=False,
             )  # fmt: skip
         env = PointMass(4, 20)
         trainer = build_trainer(config, env, tmp_path / name, make_evaluation=evaluation)
