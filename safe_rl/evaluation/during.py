@@ -64,6 +64,10 @@ class PeriodicEvaluation:
         self._interval, self._episodes, self._seed = interval, episodes, seed
         self._fixed_layout = fixed_layout
 
+    def _devices(self) -> set[torch.device]:
+        """Devices, besides the CPU, that the policy draws on."""
+        return {parameter.device for parameter in self._policy.parameters() if parameter.is_cuda}
+
     def __call__(self, before: int, after: int) -> dict[str, float]:
         """Means over episodes, if one is due between two numbers of steps; otherwise NaN."""
         names = ["return", *self._cost_keys]
@@ -75,7 +79,7 @@ class PeriodicEvaluation:
         seed = self._seed if self._fixed_layout else fresh
         with (
             closing(self._make_env(num_envs=worlds, seed=seed)) as env,
-            torch.random.fork_rng(devices=[]),
+            torch.random.fork_rng(devices=self._devices()),
         ):
             torch.manual_seed(fresh)
             found = collect_episodes(

@@ -140,6 +140,12 @@ def test_a_fixed_layout_is_trainings_only_with_its_seed():
     assert shared_layouts(unlimited, fixed, same_seed=True) == 0.0
 
 
+def make_evaluation(make, device="cpu", **keys):
+    actor = make_actor(1, 1, hidden_sizes=[4], initial_log_std=-0.5, device=device)
+    policy = BehaviourPolicy(actor)
+    return PeriodicEvaluation(make, policy, ["cost"], interval=100, episodes=3, seed=7, **keys)
+
+
 @pytest.mark.parametrize(("fixed", "seeds"), [(True, [7, 7]), (False, [107, 207])])
 def test_evaluations_in_between_keep_to_a_fixed_layout(fixed, seeds):
     met = []
@@ -148,9 +154,17 @@ def test_evaluations_in_between_keep_to_a_fixed_layout(fixed, seeds):
         met.append(seed)
         return KnownLengths([[2, 2]] * num_envs)
 
-    policy = BehaviourPolicy(make_actor(1, 1, hidden_sizes=[4], initial_log_std=-0.5))
-    evaluate = PeriodicEvaluation(
-        make, policy, ["cost"], interval=100, episodes=3, seed=7, fixed_layout=fixed
-    )
+    evaluate = make_evaluation(make, fixed_layout=fixed)
     assert [evaluate(after - 100, after)["evaluation_cost"] for after in (100, 200)] == [1.0, 1.0]
     assert met == seeds
+
+
+@pytest.mark.gpu
+def test_evaluations_in_between_leave_an_accelerators_draws_alone():
+    def make(*, num_envs, seed):
+        return KnownLengths([[2, 2]] * num_envs).to("cuda")
+
+    evaluate = make_evaluation(make, device="cuda", fixed_layout=False)
+    before = torch.cuda.get_rng_state()
+    assert evaluate(0, 100)["evaluation_cost"] == 1.0
+    assert torch.equal(torch.cuda.get_rng_state(), before)
