@@ -68,7 +68,14 @@ class Certificate:
         level = f"at {self.options.level:.0%}"
         if self.checkpoint is None:
             missing = ", ".join(f"{n} by {v:.3g}" for n, v in self.verdict.shortfalls.items())
-            return f"Not certified {level}: no checkpoint's bound is within its limit ({missing})."
+            unseen = (
+                f" All tested episodes had the same {', '.join(self.verdict.alike)}: the bound is "
+                "what unseen ones may cost at most, and no number of episodes brings it down to 0."
+            )
+            return (
+                f"Not certified {level}: no checkpoint's bound is within its limit ({missing})."
+                f"{unseen if self.verdict.alike else ''}"
+            )
         bounds = ", ".join(f"{n} ≤ {b:.3g}" for n, (b, _) in self.verdict.bounds.items())
         steps = checkpoint_steps(self.checkpoint)
         return f"Certified {level}: {bounds}, return {self.episode_return:.2f}, at {steps:,} steps."
@@ -103,9 +110,9 @@ def certify(
     limits = {key: float(limit) for key, limit in config.cost_limits.items()}
     if not limits or not candidates:
         return None
-    claim = Claim(limits, options.most_over, options.level)
     runner = _Runner(config, make_env, num_threads, progress)
     first = [runner.run(path, options.ranking, purpose=0) for path in candidates]
+    claim = Claim(limits, options.most_over, options.level, runner.largest)
     order = rank([e.returns.numpy() for e in first], [_costs(e) for e in first], claim)
     returns: dict[int, float] = {}
 
@@ -144,6 +151,7 @@ class _Runner:
     ) -> None:
         self._config, self._make_env = config, evaluated(make_env, config)
         self._threads, self._progress = threads, progress
+        self.largest: dict[str, float] = {}
 
     def run(self, checkpoint: Path, number: int, purpose: int) -> Episodes:
         node = override_env(self._config, {})
@@ -160,12 +168,24 @@ class _Runner:
         policy = load_policy(self._config, env, checkpoint, torch.device("cpu"))
         torch.manual_seed(fresh)
         keys = list(self._config.cost_limits)
+        self.largest = {key: _largest_cost(env, key) for key in keys}
         try:
             return collect_episodes(
                 env, policy, number, keys, deterministic=False, progress=self._progress
             )
         finally:
             env.close()
+
+
+def _largest_cost(env: EnvBase, key: str) -> float:
+    """The most that an episode can cost: its steps times the upper bound of one in the spec."""
+    spec = env.full_reward_spec[key]
+    if not hasattr(spec, "high"):
+        return math.inf
+    highest = float(spec.high.max())
+    # the largest number that there is stands for no bound
+    is_bounded = highest < torch.finfo(torch.float32).max
+    return highest * float(env.max_episode_steps) if is_bounded else math.inf
 
 
 def _keep(folder: RunFolder, checkpoint: Path | None) -> Path | None:
@@ -188,6 +208,7 @@ def _write(folder: RunFolder, certificate: Certificate, candidates: list[int | N
             name: {"bound": bound, "most": most} for name, (bound, most) in verdict.bounds.items()
         },
         "shortfalls": verdict.shortfalls,
+        "alike": verdict.alike,
         "candidates": candidates,
         "tested": [candidates[number] for number in verdict.tested],
         **asdict(certificate.options),

@@ -7,6 +7,7 @@ that is shared out among the tests.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from statistics import NormalDist
@@ -17,7 +18,7 @@ from numpy.typing import ArrayLike
 __all__ = ["Claim", "Verdict", "first_certified", "mean_bound", "rank", "share_bound"]
 
 
-def mean_bound(values: ArrayLike, level: float) -> np.ndarray:
+def mean_bound(values: ArrayLike, level: float, largest: float = math.inf) -> np.ndarray:
     """Upper confidence bound of the mean of a distribution that may have a heavy right tail.
 
     x̄ + (t + γ (1 + 2 t²) / (6 √n)) s / √n, with Student's quantile t and the skewness γ where it is
@@ -25,9 +26,14 @@ def mean_bound(values: ArrayLike, level: float) -> np.ndarray:
     Student's bound alone falls below their mean too often. A sample underestimates the skewness of
     a heavy tail; γ is twice the sample's, with which lognormal costs (σ = 0.9) keep the level too.
 
+    A sample without any spread says nothing of that of its distribution. Then the bound is
+    x̄ + p (m − x̄), with the exact upper bound p of the share of values that are others
+    (`share_bound`) and the largest possible value m: it holds for every distribution.
+
     Args:
         values: Independent values, shape [..., n].
         level: Confidence, in (0.5, 1).
+        largest: The largest possible value, m.
 
     Returns:
         The bound, shape [...]; infinite for fewer than two values.
@@ -35,6 +41,8 @@ def mean_bound(values: ArrayLike, level: float) -> np.ndarray:
     Examples:
         >>> float(mean_bound([20.0, 22.0, 24.0, 26.0], level=0.95).round(2))
         26.04
+        >>> float(mean_bound([0.0] * 59, level=0.95, largest=100.0).round(1))  # 5 % may cost 100
+        5.0
     """
     from scipy import stats  # here: it takes half a second, and not every command needs it
 
@@ -47,7 +55,15 @@ def mean_bound(values: ArrayLike, level: float) -> np.ndarray:
     sample = np.divide(cubes, spread**3, out=np.zeros_like(mean), where=spread > 0)
     quantile = stats.t.ppf(level, number - 1)
     correction = 2 * sample.clip(0) * (1 + 2 * quantile**2) / (6 * np.sqrt(number))
-    return mean + (quantile + correction) * spread / np.sqrt(number)
+    bound = mean + (quantile + correction) * spread / np.sqrt(number)
+    others = share_bound(np.zeros(number), 0.0, level)
+    return np.where(_are_alike(values), mean + others * (largest - mean).clip(0), bound)
+
+
+def _are_alike(values: ArrayLike) -> np.ndarray:
+    """Whether all of n values [..., n] are the same, [...]."""
+    values = np.asarray(values, dtype=float)
+    return values.min(-1) == values.max(-1)
 
 
 def share_bound(values: ArrayLike, limit: float, level: float) -> float:
@@ -74,6 +90,7 @@ class Claim:
         limits: Cost key -> d, of the mean cost per episode.
         most_over: Largest share of episodes that may cost more than d; 1 asks for nothing.
         level: Confidence of the whole statement.
+        largest: Cost key -> the most that an episode can cost; infinite where nothing is said.
 
     Examples:
         >>> Claim({"cost": 25.0}).shortfalls({"cost": [20.0, 21.0, 22.0, 20.0]}, tests=1)
@@ -83,6 +100,7 @@ class Claim:
     limits: Mapping[str, float]
     most_over: float = 1.0
     level: float = 0.95
+    largest: Mapping[str, float] = field(default_factory=dict)
 
     def bounds(self, costs: Mapping[str, ArrayLike], tests: int) -> dict[str, tuple[float, float]]:
         """Every upper confidence bound beside what it has to keep, by name.
@@ -95,8 +113,10 @@ class Claim:
         asks_for_shares = self.most_over < 1
         number = tests * len(self.limits) * (2 if asks_for_shares else 1)
         level = 1 - (1 - self.level) / max(1, number)
+        largest = dict.fromkeys(self.limits, math.inf) | {**self.largest}
         bounds = {
-            f"mean_{k}": (float(mean_bound(costs[k], level)), d) for k, d in self.limits.items()
+            f"mean_{key}": (float(mean_bound(costs[key], level, largest[key])), limit)
+            for key, limit in self.limits.items()
         }
         if asks_for_shares:
             bounds |= {
@@ -110,6 +130,10 @@ class Claim:
         bounds = self.bounds(costs, tests)
         return {name: bound - most for name, (bound, most) in bounds.items() if bound > most}
 
+    def alike(self, costs: Mapping[str, ArrayLike]) -> list[str]:
+        """Names of costs that were the same in all episodes, [E] each."""
+        return [key for key in self.limits if _are_alike(costs[key])]
+
 
 @dataclass(frozen=True)
 class Verdict:
@@ -120,12 +144,15 @@ class Verdict:
         tested: Numbers of the policies that were tested, in this order.
         bounds: Of the policy tested last: name -> (bound, what it has to keep).
         shortfalls: Of the policy that fell short least, if none is certified.
+        alike: Costs that were the same in all its episodes, of which a bound is about those that
+            nobody has seen.
     """
 
     certified: int | None
     tested: list[int]
     bounds: dict[str, tuple[float, float]] = field(default_factory=dict)
     shortfalls: dict[str, float] = field(default_factory=dict)
+    alike: list[str] = field(default_factory=list)
 
 
 def rank(
@@ -183,7 +210,7 @@ def first_certified(
         >>> first_certified([0, 1], collect, Claim({"cost": 25.0}), tests=2).certified
         1
     """
-    nearest: tuple[float, dict[str, float]] = (float("inf"), {})
+    failed: list[tuple[dict[str, float], list[str]]] = []
     tested: list[int] = []
     bounds: dict[str, tuple[float, float]] = {}
     for candidate in order[:tests]:
@@ -193,5 +220,8 @@ def first_certified(
         missing = claim.shortfalls(costs, tests)
         if not missing:
             return Verdict(candidate, tested, bounds)
-        nearest = min(nearest, (max(missing.values()), missing), key=lambda pair: pair[0])
-    return Verdict(None, tested, bounds, nearest[1])
+        failed.append((missing, claim.alike(costs)))
+    if not failed:
+        return Verdict(None, tested)
+    nearest, alike = min(failed, key=lambda pair: max(pair[0].values()))
+    return Verdict(None, tested, bounds, nearest, alike)

@@ -1,14 +1,18 @@
 """The certificate of a run on the point mass, whose costs are known to be kept or broken."""
 
 import json
+import math
 
 import pytest
 import torch
 from point_mass import PointMass
 from run_configs import point_mass_config
 
-from safe_rl.evaluation import CertificateOptions, certify
+from safe_rl import envs
+from safe_rl.evaluation import Certificate, CertificateOptions, certify
+from safe_rl.evaluation.certifying import _largest_cost
 from safe_rl.evaluation.loading import find_checkpoint
+from safe_rl.scores.certificate import Verdict
 from safe_rl.training.trainer import build_trainer, seed_everything
 
 OPTIONS = CertificateOptions(ranking=6, episodes=12, tests=2, level=0.95, most_over=1.0)
@@ -94,3 +98,21 @@ def test_a_fixed_layout_is_certified_as_it_was_learned(train):
     certify(directory, OPTIONS, make_env=make)
     assert len(set(met)) == 2
     assert 3 not in met
+
+
+def test_what_an_episode_can_cost_is_known_from_the_environment():
+    def largest(name, **keys):
+        return _largest_cost(envs.make_env({**name, **keys}, num_envs=1, seed=0), "cost")
+
+    point = {"robot_base": "point", "num_steps": 30, "hazards_num": 1, "constrain_hazards": True}
+    assert largest(point) == 30.0
+    assert largest(point, constrain_indicator=False) == math.inf
+    assert _largest_cost(PointMass(2, 20), "cost") == math.inf
+
+
+def test_a_certificate_that_says_why_a_limit_of_nothing_is_not_kept():
+    verdict = Verdict(None, [0], {"mean_cost": (4.0, 0.0)}, {"mean_cost": 4.0}, ["cost"])
+    line = str(Certificate(None, math.nan, verdict, OPTIONS))
+    assert "by 4). All tested episodes had the same cost: the bound is what unseen ones" in line
+    verdict = Verdict(None, [0], {"mean_cost": (4.0, 0.0)}, {"mean_cost": 4.0})
+    assert str(Certificate(None, math.nan, verdict, OPTIONS)).endswith("(mean_cost by 4).")

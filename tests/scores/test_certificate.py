@@ -92,5 +92,34 @@ def test_shares_of_episodes_can_be_asked_for():
 
 def test_every_limit_has_to_be_kept():
     costs = {"cost": np.full(50, 10.0), "cost_hazards": np.full(50, 6.0)}
-    claim = Claim({"cost": 25.0, "cost_hazards": 5.0})
+    claim = Claim({"cost": 25.0, "cost_hazards": 5.0}, largest={"cost": 20.0, "cost_hazards": 6.0})
     assert claim.shortfalls(costs, tests=1) == {"mean_cost_hazards": pytest.approx(1.0)}
+
+
+@pytest.mark.parametrize("number", [20, 100, 600])
+@pytest.mark.parametrize("expected", [0.2, 1.0, 2.7, 4.0])
+def test_costs_that_are_rare_keep_the_level(number, expected):
+    """Of a policy that costs 100 in a few episodes of so many, often nothing but 0 is seen."""
+    share = expected / number
+    draws = 100.0 * (np.random.default_rng(0).random((2000, number)) < share)
+    assert np.mean(mean_bound(draws, LEVEL, largest=100.0) < 100.0 * share) < 1 - LEVEL
+
+
+def test_the_bound_of_what_was_not_seen_is_the_exact_one():
+    exact = stats.binomtest(0, 30).proportion_ci(0.9, method="exact").high
+    assert mean_bound(np.full(30, 4.0), LEVEL, largest=50.0) == pytest.approx(4 + exact * 46)
+    assert mean_bound(np.zeros(30), LEVEL) == np.inf
+    # rows of a table are judged one by one
+    both = mean_bound([[0.0, 0.0, 0.0], [1.0, 2.0, 3.0]], LEVEL, largest=1.0)
+    assert both[1] == mean_bound([1.0, 2.0, 3.0], LEVEL)
+
+
+def test_a_limit_of_nothing_is_never_certified_and_it_says_why():
+    claim = Claim({"cost": 0.0}, largest={"cost": 1000.0})
+    verdict = first_certified([0], lambda _: {"cost": np.zeros(10_000)}, claim, tests=1)
+    assert verdict.certified is None
+    assert 0 < verdict.shortfalls["mean_cost"] < 1
+    assert verdict.alike == ["cost"]
+    nothing_known = Claim({"cost": 25.0})
+    verdict = first_certified([0], lambda _: {"cost": np.zeros(100)}, nothing_known, tests=1)
+    assert verdict.shortfalls == {"mean_cost": np.inf}
