@@ -65,7 +65,7 @@ class Certificate:
 
     def __str__(self) -> str:
         """One line for the terminal."""
-        level = f"at {self.options.level:.0%}"
+        level = f"at {100 * self.options.level:.12g}%"
         if self.checkpoint is None:
             missing = ", ".join(f"{n} by {v:.3g}" for n, v in self.verdict.shortfalls.items())
             unseen = (

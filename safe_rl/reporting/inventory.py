@@ -116,7 +116,7 @@ def certificate_table(experiments: Sequence[Experiment]) -> Table:
     columns = [
         *_WHERE,
         _SEED,
-        Column("certified", ("{}", "certified"), (" at {:.0%}", "level"), mark=_is_missing),
+        Column("certified", ("{}", "certified"), (" at {:.1%}", "level"), mark=_is_missing),
         Column("at", ("{:,} steps", "checkpoint")),
         Column("$J_r$", ("{:.2f}", "certified_return")),
         Column("bound on", ("{}", "named")),

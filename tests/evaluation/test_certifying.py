@@ -2,6 +2,7 @@
 
 import json
 import math
+from dataclasses import replace
 
 import pytest
 import torch
@@ -108,6 +109,12 @@ def test_what_an_episode_can_cost_is_known_from_the_environment():
     assert largest(point) == 30.0
     assert largest(point, constrain_indicator=False) == math.inf
     assert _largest_cost(PointMass(2, 20), "cost") == math.inf
+
+
+@pytest.mark.parametrize(("level", "shown"), [(0.995, "99.5%"), (0.95, "95%"), (0.999, "99.9%")])
+def test_levels_are_not_rounded(level, shown):
+    certificate = Certificate(None, math.nan, Verdict(None, []), replace(OPTIONS, level=level))
+    assert f"at {shown}: " in str(certificate)
 
 
 def test_a_certificate_that_says_why_a_limit_of_nothing_is_not_kept():
