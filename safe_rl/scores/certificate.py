@@ -160,8 +160,9 @@ def rank(
 ) -> list[int]:
     """Order candidates for the tests: those likely to pass by return, then the others by cost.
 
-    Likely is a policy whose mean costs on these episodes are within the limits by a standard error
-    of two, one for the ranking's episodes and one for as many of the test.
+    Likely is a policy whose mean costs on these episodes are within the limits by z standard
+    errors, with the normal distribution's quantile z of the claim's level: those that the test,
+    on other episodes, will ask for.
 
     Args:
         returns: Episode returns of every candidate.
@@ -180,7 +181,7 @@ def rank(
 
 
 def _expected_excess(costs: Mapping[str, ArrayLike], claim: Claim) -> list[float]:
-    """Mean cost plus two standard errors, over the limit in units of it, for every limit."""
+    """Mean cost plus z standard errors less the limit, in units of the limit, for every limit."""
     excesses = []
     for name, limit in claim.limits.items():
         values = np.asarray(costs[name], dtype=float)
