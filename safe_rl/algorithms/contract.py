@@ -39,7 +39,8 @@ class Algorithm(Protocol):
             begin with ``cost_`` are then taken over only if both runs constrain the same costs.
 
     If something else has to follow when the networks begin with the weights of another run, such as
-    target networks, a method ``networks_were_given`` sees to it.
+    target networks, a method ``networks_were_given`` sees to it. Where a run that is resumed begins
+    new episodes, ``forget_open_episodes`` ends what goes from step to step, such as n-step sums.
 
     If checkpoints do not hold all that learning depends on, ``lost_on_resume`` is a sentence on
     what a run that is resumed has lost.

@@ -194,6 +194,10 @@ class OffPolicy:
         """Let target networks begin where the networks do, which have got another run's weights."""
         self.policy_update.equate_targets()
 
+    def forget_open_episodes(self) -> None:
+        """Let no sum over n steps reach into what comes next, which belongs to new episodes."""
+        self.memory.end_rows()
+
     def _count_steps(self, steps: int) -> None:
         self._counts["steps"] += steps
         self.policy.is_random.fill_(self._counts["steps"] < self.random_steps)

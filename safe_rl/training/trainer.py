@@ -197,6 +197,7 @@ class Trainer:
         if self._worlds is not None:
             return
         self.accounting.forget_open_episodes()
+        getattr(self.algorithm, "forget_open_episodes", lambda: None)()
         if hasattr(self._env, "continue_from"):
             self._env.continue_from(self.progress.steps // self._env.batch_size.numel())
         if isinstance(self._collector, Collector):

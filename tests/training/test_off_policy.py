@@ -137,6 +137,24 @@ def test_multipliers_go_by_the_costs_of_episodes(make_trainer, tmp_path):
         assert found == pytest.approx(penalty, abs=1e-5)
 
 
+def test_sums_over_steps_end_where_a_resumed_run_begins_new_episodes(tmp_path):
+    class Forgetful(PointMass):
+        get_state = property()  # raises AttributeError: its worlds cannot be stored
+
+    def build():
+        config = off_policy_config("algo=sac", "memory.n_steps=3", "frames=160")
+        seed_everything(config.seed, None)
+        # after 40 steps, episodes of 30 are open
+        return build_trainer(config, Forgetful(4, 30, config.seed), tmp_path / "run")
+
+    build().run()
+    resumed = build()
+    assert resumed.resume()
+    resumed.epoch(resumed.batches())
+    # the last two of 40 steps in a row have no third after them, before and after
+    assert len(resumed.algorithm.memory) == 4 * (38 + 38)
+
+
 def test_another_run_starts_from_its_networks(make_trainer, tmp_path):
     first = make_trainer("first", "algo=sac_lagrangian", "frames=320")
     first.run()
