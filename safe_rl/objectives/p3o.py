@@ -73,7 +73,9 @@ class P3OLoss(PPOLoss):
         gain = -clipped_gain(log_weight, -cost_advantage, self.clip_epsilon)
         surrogates = self._cost_surrogates(tensordict, gain)
         violation = violation_of(self.constraints, surrogates)
-        per_step = 1 / self.constraints.episode_length if self.gamma is None else 1 - self.gamma
+        # no episode has a length before the first batch, when the violation counts as 0
+        inverse = (1 / self.constraints.episode_length).nan_to_num(0.0)
+        per_step = inverse if self.gamma is None else 1 - self.gamma
         excess = surrogates + per_step * violation
         return {
             **super()._surrogates(tensordict, log_weight),

@@ -220,7 +220,8 @@ def test_a_violation_is_needed_for_every_cost(name):
         LOSSES[name](actor)(make_batch(actor, [8], 1))
 
 
-def test_before_any_batch_the_policy_counts_as_at_its_limit():
+@pytest.mark.parametrize("gamma", [0.99, None])
+def test_before_any_batch_the_policy_counts_as_at_its_limit(gamma):
     actor, _, batch = one_state(GAIN, COST)
-    losses = P3OLoss(actor, Constraints({"cost": 25.0}), kappa=20.0, gamma=0.99, **FREE)(batch)
+    losses = P3OLoss(actor, Constraints({"cost": 25.0}), kappa=20.0, gamma=gamma, **FREE)(batch)
     assert losses["loss_penalty"].abs() < 1e-5
