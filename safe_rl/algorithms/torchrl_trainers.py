@@ -31,6 +31,9 @@ class ConstraintHook(TrainerHookBase):
         constraints: what is limited; its multiplier, if any, is the one that the loss reads.
         accounting: sums costs and rewards of the collector's batches over episodes.
 
+    Raises:
+        TypeError: if the constraints charge steps, as `TrackedConstraints` do for a risk measure.
+
     Examples:
         >>> accounting = EpisodeAccounting(num_envs=1, cost_keys=["cost"])
         >>> hook = ConstraintHook(Constraints({"cost": 1.0}), accounting)
@@ -42,6 +45,13 @@ class ConstraintHook(TrainerHookBase):
     """
 
     def __init__(self, constraints: Constraints, accounting: EpisodeAccounting) -> None:
+        if type(constraints).charge is not Constraints.charge:
+            raise TypeError(
+                f"ConstraintHook takes plain Constraints, not {type(constraints).__name__}: these "
+                "put charges of their own in the place of costs before advantages are estimated, "
+                "and estimates of TorchRL's trainers would not see them. Use Constraints(limits), "
+                "or train.py with risk=…."
+            )
         self.constraints, self.accounting = constraints, accounting
         self._row: dict[str, float] = {}
 

@@ -15,11 +15,13 @@ from torchrl.trainers.algorithms import PPOTrainer
 from safe_rl import models
 from safe_rl.algorithms import Constraints
 from safe_rl.algorithms.torchrl_trainers import ConstraintHook
+from safe_rl.algorithms.tracked_constraints import TrackedConstraints
 from safe_rl.collectors import EpisodeAccounting, make_collector
 from safe_rl.objectives import (
     ActorCriticLoss,
     CostGAE,
     CriticLoss,
+    CVaR,
     JointAdvantages,
     LagrangeMultiplier,
     PPOLagrangianLoss,
@@ -178,6 +180,14 @@ def test_the_hook_continues_from_its_state():
     assert rows[2]["episode_cost"] == 10
     # a batch of 4 steps, shorter than episodes of 8 by now: what they cost at its rate
     assert rows[2]["violation_cost"] == 0.5 * 8 - 1
+
+
+def test_constraints_that_charge_steps_are_refused():
+    accounting = EpisodeAccounting(num_envs=1, cost_keys=["cost"])
+    risk = CVaR(torch.tensor([1.0]), tail=0.1, window=20, ramp_start=0, ramp_steps=0)
+    constraints = TrackedConstraints({"cost": 1.0}, tracker=None, risk=risk)
+    with pytest.raises(TypeError, match=r"plain Constraints, not TrackedConstraints.*risk="):
+        ConstraintHook(constraints, accounting)
 
 
 def test_the_command_of_the_example(example, capsys, monkeypatch):
