@@ -132,10 +132,10 @@ class Memory:
             drawn = self._buffer.sample(count * self.batch_size).to(self._device)
             yield from drawn.split(self.batch_size)
 
-    def learned(self, minibatch: TensorDictBase) -> None:
+    def learned(self, minibatch: TensorDictBase, priority: NestedKey = "td_error") -> None:
         """Set the priorities of a minibatch by the TD errors that a loss has written into it."""
         if self._is_prioritised:
-            self._buffer.update_priority(minibatch["index"], minibatch["td_error"])
+            self._buffer.update_priority(minibatch["index"], minibatch[priority])
 
     def components(self) -> dict[str, Stateful]:
         """What a checkpoint holds of it: itself, if it is to be kept."""

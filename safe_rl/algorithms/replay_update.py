@@ -109,7 +109,8 @@ class ReplayUpdate:
             if not total.isfinite():
                 raise _divergence(losses)
             self._step(total, with_actor)
-            memory.learned(minibatch)
+            # a loss that learns no values has no key for it, and its memory no priorities
+            memory.learned(minibatch, getattr(self.loss.tensor_keys, "priority", "td_error"))
             with torch.no_grad():
                 values = dict(losses.items())
                 sums += torch.stack([_mean(values.get(name, nothing)) for name in names])

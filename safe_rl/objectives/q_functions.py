@@ -139,7 +139,8 @@ class CostCritics(LossModule):
                 following, next_action, self.target_cost_qvalue_network_params
             )
             goes_on = following.get(self.tensor_keys.terminated).logical_not()
-            discount = discount_of(tensordict, self.gamma) * goes_on
+            spanned = self.value_estimator.tensor_keys.steps_to_next_obs
+            discount = discount_of(tensordict, self.gamma, spanned) * goes_on
         found = self.cost_values(
             tensordict, tensordict.get(self.tensor_keys.action), self.cost_qvalue_network_params
         )
@@ -221,9 +222,9 @@ def pessimistic(values: Tensor, deviations: float) -> Tensor:
     return mean + deviations * values.std(0, correction=0) if deviations else mean
 
 
-def discount_of(tensordict: TensorDictBase, gamma: float) -> Tensor | float:
-    """γ, or γ to the power of the steps that each transition spans, [..., 1]."""
-    steps = tensordict.get("steps_to_next_obs", None)
+def discount_of(tensordict: TensorDictBase, gamma: float, spanned: NestedKey) -> Tensor | float:
+    """γ, or γ to the power of the steps that each transition spans, [..., 1], if it has the key."""
+    steps = tensordict.get(spanned, None)
     return gamma if steps is None else gamma ** steps.unsqueeze(-1)
 
 

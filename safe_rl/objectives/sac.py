@@ -135,7 +135,8 @@ class SACLoss(objectives.SACLoss):
             lowest = values.get(keys.state_action_value).min(0).values
             soft = lowest - self._alpha * log_prob.unsqueeze(-1)
             goes_on = following.get(keys.terminated).logical_not()
-            discount = discount_of(tensordict, self.gamma)
+            spanned = self.value_estimator.tensor_keys.steps_to_next_obs
+            discount = discount_of(tensordict, self.gamma, spanned)
             return (following.get(keys.reward) + discount * goes_on * soft).squeeze(-1)
 
     def _act(self, steps: TensorDictBase) -> tuple[Tensor, Tensor]:

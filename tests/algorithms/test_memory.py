@@ -1,12 +1,16 @@
 """What a memory gives back: the transitions that went in, over one step or over several."""
 
+from functools import partial
+
 import numpy as np
 import pytest
 import torch
 from scipy import stats
 from tensordict import TensorDict
 
-from safe_rl.algorithms import Memory
+from safe_rl.algorithms import Memory, ReplayUpdate
+from safe_rl.models import QEnsemble, make_squashed_actor
+from safe_rl.objectives import SACLoss
 
 IN_KEYS = [
     *("observation", "action"),
@@ -166,6 +170,26 @@ def test_a_copy_goes_on_with_the_same_priorities(tmp_path):
         each.extend(make_batch(10, 5, rows=1))
         drawn.append(torch.cat([m["observation"] for m in each.minibatches(3)]))
     assert torch.equal(*drawn)
+
+
+def test_errors_are_read_where_the_loss_writes_them():
+    actor = make_squashed_actor(1, -torch.ones(1), torch.ones(1), hidden_sizes=[8])
+    loss = SACLoss(
+        actor,
+        QEnsemble(1, 1, hidden_sizes=[8], num_networks=2),
+        gamma=0.9,
+        alpha_init=0.1,
+        target_entropy=-1.0,
+    )
+    loss.set_keys(priority="error")
+    memory = make_memory(batch_size=8, keep=False, prioritised=EXPONENTS)
+    memory.extend(make_batch(0, 10, rows=1))
+    update = ReplayUpdate(
+        loss, optimizer=partial(torch.optim.SGD, lr=0.0), updates_per_step=1.0, tau=0.1
+    )
+    update(memory, 1)
+    # the rewards of these steps differ, and so do the errors
+    assert next(memory.minibatches(1))["priority_weight"].unique().numel() > 1
 
 
 @pytest.mark.parametrize("exponents", [{"alpha": 0.6}, {"alpha": 0.6, "beta": 0.4, "eps": 1.0}])

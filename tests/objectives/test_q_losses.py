@@ -201,9 +201,11 @@ def test_nothing_follows_an_end_but_something_a_time_out(kind):
             assert torch.equal(losses[0][name], losses[1][name]) is terminated
 
 
-def test_a_transition_over_steps_is_discounted_by_as_many():
+@pytest.mark.parametrize("key", ["steps_to_next_obs", "span"])
+def test_a_transition_over_steps_is_discounted_by_as_many(key):
     loss, steps = make_loss("sac", lagrange(1.0, 1.0)), make_steps()
-    steps["steps_to_next_obs"] = torch.tensor([1, 2, 3, 1, 2, 3])
+    loss.value_estimator.set_keys(steps_to_next_obs=key)
+    steps[key] = torch.tensor([1, 2, 3, 1, 2, 3])
     found = loss.cost_qvalue_loss(steps, steps["action"])
     network = loss.cost_qvalue_network
     following = network(steps["next"].clone().set("action", steps["action"]))["cost_value"]
