@@ -136,7 +136,8 @@ FLOORS = {
         ("",),
     ),
     "algorithms": (
-        ("contract", "constraints", "learning_rate", "prioritised", "trust_region_step"),
+        ("contract", "constraints", "learning_rate", "losses", "prioritised"),
+        ("trust_region_step",),
         (
             *("c_trpo_step", "cpo_step", "crpo_step", "in_turn", "memory", "minibatch", "parts"),
             *("side_by_side", "tracked_constraints"),

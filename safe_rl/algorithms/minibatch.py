@@ -20,6 +20,7 @@ from torchrl.objectives import LossModule
 from torchrl.objectives.common import AUTO_LOSS_MASK_KEYS
 
 from safe_rl.algorithms.learning_rate import KLAdaptiveRate
+from safe_rl.algorithms.losses import divergence, sum_of_losses
 from safe_rl.objectives.samples import learning_samples, require_finite
 
 __all__ = ["MinibatchUpdate"]
@@ -147,7 +148,7 @@ class MinibatchUpdate:
             if self.max_kl is not None and losses["kl"] > self.max_kl:
                 break
             if not total.isfinite():
-                raise self._divergence(losses)
+                raise divergence(losses)
             self._step(total)
             num_steps += 1
         diagnostics = self._diagnostics(history, num_steps)
@@ -192,8 +193,7 @@ class MinibatchUpdate:
 
     def _total_loss(self, minibatch: TensorDictBase) -> tuple[Tensor, TensorDictBase]:
         losses = self.loss(minibatch)
-        total = torch.stack([v for k, v in losses.items() if k.startswith("loss_")]).sum()
-        return total, losses
+        return sum_of_losses(losses), losses
 
     def _step(self, total: Tensor) -> None:
         self.optimizer.zero_grad(set_to_none=True)
@@ -209,20 +209,6 @@ class MinibatchUpdate:
         if "kl" in means:
             means["kl"] = steps["kl"][-1]
         return means | {"num_steps": torch.tensor(num_steps)}
-
-    @staticmethod
-    def _divergence(losses: TensorDictBase) -> FloatingPointError:
-        wrong = {
-            name: value.item()
-            for name, value in losses.items()
-            if name.startswith("loss_") and not value.isfinite()
-        }
-        named = " and ".join(f"{name!r} is {value}" for name, value in wrong.items())
-        return FloatingPointError(
-            f"{named or 'The sum of the losses is not finite'}: training has diverged. The step "
-            "that would follow is not taken. Lower the learning rate, or look for a policy that "
-            "has collapsed."
-        )
 
     def state_dict(self) -> dict[str, Any]:
         """State of the optimiser and of the shuffles; the parameters belong to the network."""

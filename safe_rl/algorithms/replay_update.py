@@ -12,6 +12,7 @@ from torch import Tensor, nn
 from torch.optim import Optimizer
 from torchrl.objectives import LossModule, SoftUpdate
 
+from safe_rl.algorithms.losses import divergence, sum_of_losses
 from safe_rl.algorithms.memory import Memory
 
 __all__ = ["ReplayUpdate"]
@@ -107,7 +108,7 @@ class ReplayUpdate:
             with_actor = self._counts["updates"] % self.policy_delay == 0
             total, losses = self._evaluate(minibatch, with_actor)
             if not total.isfinite():
-                raise _divergence(losses)
+                raise divergence(losses)
             self._step(total, with_actor)
             # a loss that learns no values has no key for it, and its memory no priorities
             memory.learned(minibatch, getattr(self.loss.tensor_keys, "priority", "td_error"))
@@ -120,8 +121,7 @@ class ReplayUpdate:
 
     def _losses(self, minibatch: TensorDictBase, with_actor: bool) -> tuple[Tensor, TensorDictBase]:
         losses = self.loss(minibatch) if with_actor else self.loss.critic_losses(minibatch)
-        total = torch.stack([v for k, v in losses.items() if k.startswith("loss_")]).sum()
-        return total, losses
+        return sum_of_losses(losses), losses
 
     def _step(self, total: Tensor, with_actor: bool) -> None:
         self.optimizer.zero_grad(set_to_none=True)
@@ -171,11 +171,3 @@ def _groups(loss: LossModule, rates: Mapping[str, float]) -> list[dict[str, Any]
         {"params": group} | ({"lr": rates[prefix]} if prefix else {})
         for prefix, group in groups.items()
     ]
-
-
-def _divergence(losses: TensorDictBase) -> FloatingPointError:
-    wrong = [f"{k!r} is {v.item()}" for k, v in losses.items() if not v.isfinite().all()]
-    return FloatingPointError(
-        f"{' and '.join(wrong) or 'The sum of the losses is not finite'}: training has diverged. "
-        "The step that would follow is not taken. Lower the learning rate."
-    )

@@ -11,6 +11,7 @@ from tensordict import TensorDictBase
 from tensordict.nn import ProbabilisticTensorDictSequential
 from torch import Tensor
 
+from safe_rl.algorithms.losses import sum_of_losses
 from safe_rl.objectives.distributions import ReferencePolicy
 from safe_rl.objectives.fisher import FisherProduct
 from safe_rl.objectives.samples import learning_samples, require_finite
@@ -72,7 +73,7 @@ def total_loss(losses: TensorDictBase) -> Tensor:
     Raises:
         FloatingPointError: if it is not finite.
     """
-    total = torch.stack([v for k, v in losses.items() if k.startswith("loss_")]).sum()
+    total = sum_of_losses(losses)
     if not total.isfinite():
         raise FloatingPointError(
             f"The policy loss is {total.item()}: look for non-finite rewards, costs or "
