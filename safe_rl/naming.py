@@ -1,14 +1,25 @@
-"""The known name that is most like a wrong one: what errors about names end with."""
+"""Names: that of a nested key, and the known one most like a wrong one, with which errors end."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable
 from difflib import SequenceMatcher, get_close_matches
+from typing import Any
 
-__all__ = ["did_you_mean", "nearest"]
+__all__ = ["did_you_mean", "key_name", "nearest"]
 
 _LIKENESS = 0.5
 """Ratio of difflib's below which two names have nothing to do with each other."""
+
+
+def key_name(key: str | tuple[Any, ...]) -> str:
+    """A key of a TensorDict, nested or not, as one string, its parts joined by ``/``.
+
+    Examples:
+        >>> key_name(("agents", "cost")), key_name("cost")
+        ('agents/cost', 'cost')
+    """
+    return key if isinstance(key, str) else "/".join(key)
 
 
 def nearest(name: str, known: Iterable[str]) -> str | None:

@@ -10,6 +10,8 @@ import torch
 from tensordict import NestedKey, TensorDictBase, unravel_key
 from torch import Tensor
 
+from safe_rl.naming import key_name
+
 __all__ = ["EpisodeAccounting", "EpisodeStatistics"]
 
 
@@ -68,11 +70,6 @@ class EpisodeStatistics:
         rows |= {f"episode_{key}": costs.mean().item() for key, costs in self.costs.items()}
         rows |= {f"{key}_rate": rate.item() for key, rate in self.cost_rates.items()}
         return rows
-
-
-def _key_name(key: NestedKey) -> str:
-    """A possibly nested key as one string, its parts joined by `/`."""
-    return key if isinstance(key, str) else "/".join(key)
 
 
 class EpisodeAccounting:
@@ -144,7 +141,7 @@ class EpisodeAccounting:
         finished = self._close_episodes(signals, self._column(batch, self.done_key).long())
         finished = finished[finished[:, 0].isfinite()]
         self._totals += signals.sum((0, 1))
-        names = [_key_name(key) for key in self.cost_keys]
+        names = [key_name(key) for key in self.cost_keys]
         rates = self._totals[2:] / self._totals[0]
         return EpisodeStatistics(
             returns=finished[:, 1],

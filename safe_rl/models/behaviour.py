@@ -10,7 +10,7 @@ from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModuleBas
 from torchrl.envs.utils import ExplorationType, exploration_type
 from torchrl.modules import IndependentNormal
 
-__all__ = ["BehaviourPolicy", "make_behaviour"]
+__all__ = ["WITHOUT_NOISE", "BehaviourPolicy", "make_behaviour"]
 
 
 def make_behaviour(actor: ProbabilisticTensorDictSequential) -> TensorDictModuleBase:
@@ -21,7 +21,8 @@ def make_behaviour(actor: ProbabilisticTensorDictSequential) -> TensorDictModule
         return actor
 
 
-_WITHOUT_NOISE = (ExplorationType.DETERMINISTIC, ExplorationType.MODE, ExplorationType.MEAN)
+WITHOUT_NOISE = (ExplorationType.DETERMINISTIC, ExplorationType.MODE, ExplorationType.MEAN)
+"""Kinds of exploration under which policies act without what they draw."""
 
 
 class BehaviourPolicy(TensorDictModuleBase):
@@ -66,7 +67,7 @@ class BehaviourPolicy(TensorDictModuleBase):
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write the distribution's parameters, the action and its log-probability."""
         loc, scale = self.network(*(tensordict.get(key) for key in self.in_keys))
-        if exploration_type() in _WITHOUT_NOISE:
+        if exploration_type() in WITHOUT_NOISE:
             noise = torch.zeros_like(loc)
         else:
             noise = torch.randn_like(loc)

@@ -10,12 +10,12 @@ from tensordict.nn import (
     TensorDictModuleBase,
 )
 from torch import Tensor
-from torchrl.envs.utils import ExplorationType, exploration_type
+from torchrl.envs.utils import exploration_type
 from torchrl.modules import TanhNormal
 
-__all__ = ["ExploringPolicy"]
+from safe_rl.models.behaviour import WITHOUT_NOISE
 
-_WITHOUT_NOISE = (ExplorationType.DETERMINISTIC, ExplorationType.MODE, ExplorationType.MEAN)
+__all__ = ["ExploringPolicy"]
 
 
 class ExploringPolicy(TensorDictModuleBase):
@@ -89,7 +89,7 @@ class ExploringPolicy(TensorDictModuleBase):
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write the action."""
         outputs = self.network(tensordict.get(self.in_keys[0]))
-        is_noisy = exploration_type() not in _WITHOUT_NOISE
+        is_noisy = exploration_type() not in WITHOUT_NOISE
         half = (self.high - self.low) / 2
         if self._samples:
             loc, scale = outputs

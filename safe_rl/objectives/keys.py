@@ -6,12 +6,7 @@ from tensordict import NestedKey, TensorDictBase
 from tensordict.utils import unravel_key
 from torch import Tensor
 
-from safe_rl.naming import nearest
-
-
-def key_name(key: NestedKey) -> str:
-    """A nested key as one string, its parts joined by ``/``."""
-    return key if isinstance(key, str) else "/".join(key)
+from safe_rl.naming import key_name, nearest
 
 
 def require(tensordict: TensorDictBase, key: NestedKey, hint: str = "") -> Tensor:

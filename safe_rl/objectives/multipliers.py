@@ -15,7 +15,7 @@ from tensordict import NestedKey
 from torch import Tensor, nn
 from torch.nn.functional import softplus
 
-from safe_rl.objectives.keys import key_name
+from safe_rl.naming import key_name
 
 CostLimits = Mapping[NestedKey, float] | Sequence[float] | float
 

@@ -11,6 +11,7 @@ from torch import Tensor
 from torch.distributions import Distribution
 from torchrl.objectives import LossModule
 
+from safe_rl.naming import key_name
 from safe_rl.objectives.distributions import (
     composite_keys,
     composite_log_probs,
@@ -18,7 +19,7 @@ from safe_rl.objectives.distributions import (
     kl,
     sampler_of,
 )
-from safe_rl.objectives.keys import key_name, require
+from safe_rl.objectives.keys import require
 from safe_rl.objectives.multipliers import Multiplier
 from safe_rl.objectives.samples import sample_mask
 
