@@ -123,7 +123,7 @@ def _page(name: str) -> str:
         name=name,
         problem=f"{texts.get('problem', problem).strip()}.",
         keys=setting_table(config, paper),
-        limits=", [holding the limit](index.md#holding-the-limit)" if constrained else "",
+        limits=", [holding the limit](holding_the_limit.md)" if constrained else "",
         columns=_columns(texts["columns"]),
         snippet=snippet,
         measured=measured(name),

@@ -9,6 +9,7 @@ import campaigns
 import catalogue
 import equations
 import links
+import navigation
 from mkdocs.config.defaults import MkDocsConfig
 from mkdocs.structure.files import File, Files, InclusionLevel
 from mkdocs.structure.pages import Page
@@ -19,10 +20,8 @@ ROOT = Path(__file__).resolve().parents[2]
 def on_config(config: MkDocsConfig) -> None:
     """Complete the navigation by what is found and made."""
     sections = {name: pages for entry in config.nav or [] for name, pages in entry.items()}
-    listed = set(sections["Algorithms"])
-    found = sorted((ROOT / "docs" / "algorithms").glob("*.md"))
-    named = ((path.stem, f"algorithms/{path.name}") for path in found)
-    sections["Algorithms"] += [{name: page} for name, page in named if page not in listed]
+    algorithms = sections["Algorithms"]
+    algorithms += navigation.unlisted(algorithms, ROOT / "docs" / "algorithms")
     sections["API"] += [{name: page} for page, name in api.PAGES.items()]
 
 

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import catalogue
 import links
+import navigation
 import pytest
 import yaml
 
@@ -80,6 +81,18 @@ def test_equations_become_mathml_or_an_error():
     assert 'display="block"' in made
     with pytest.raises(ValueError, match="nosuch"):
         typeset(r'<span class="arithmatex">\(\nosuch x\)</span>')
+
+
+def test_pages_that_the_navigation_does_not_list_are_found_with_their_titles(tmp_path):
+    for name in ("b", "a", "listed", "titled"):
+        (tmp_path / f"{name}.md").write_text(
+            f"<!-- a mark -->\n# Heading of {name}\n\n# Not this\n"
+        )
+    listed = [f"{tmp_path.name}/listed.md", {"A title": f"{tmp_path.name}/titled.md"}]
+    assert navigation.unlisted(listed, tmp_path) == [
+        {"a: Heading of a": f"{tmp_path.name}/a.md"},
+        {"b: Heading of b": f"{tmp_path.name}/b.md"},
+    ]
 
 
 def test_every_page_is_in_the_navigation_once():
