@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from pathlib import Path
 
 from omegaconf import DictConfig, OmegaConf
@@ -11,7 +12,7 @@ from safe_rl.cli.robots import maker_of
 from safe_rl.evaluation import Certificate, CertificateOptions, certify
 from safe_rl.evaluation.loading import load_config
 
-__all__ = ["certificate_options", "certify_run", "is_worth_a_certificate"]
+__all__ = ["certificate_options", "certify_run", "is_worth_a_certificate", "why_not_certified"]
 
 
 def certify_run(
@@ -41,5 +42,21 @@ def certificate_options(config: DictConfig) -> CertificateOptions:
 
 def is_worth_a_certificate(config: DictConfig, episode_length: int) -> bool:
     """Whether a run is longer than the test by which it would be certified."""
-    episodes = config.certificate.episodes if "certificate" in config else 0
-    return 0 < episodes * episode_length <= config.frames
+    return 0 < _test_steps(config, episode_length) <= config.frames
+
+
+def why_not_certified(config: DictConfig, episode_length: int, directory: Path) -> str | None:
+    """What a run says that is too short for a certificate; None if it was to have none."""
+    steps = _test_steps(config, episode_length)
+    if not steps:
+        return None
+    return (
+        f"Not certified: the run has {config.frames:,} steps, fewer than the {steps:,} of a test "
+        f"(certificate.episodes={config.certificate.episodes}). To test it all the same: "
+        f"python -m safe_rl.evaluate {shlex.quote(str(directory))} certify=true"
+    )
+
+
+def _test_steps(config: DictConfig, episode_length: int) -> int:
+    """Steps of one test at most; 0 if there is to be none."""
+    return int(config.certificate.episodes * episode_length) if "certificate" in config else 0

@@ -12,7 +12,7 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf, open_dict
 
-from safe_rl.cli.certificates import certify_run, is_worth_a_certificate
+from safe_rl.cli.certificates import certify_run, is_worth_a_certificate, why_not_certified
 from safe_rl.cli.failures import SETTING_ERRORS, errors_in_a_line
 from safe_rl.cli.robots import keep_robot, robot_of
 from safe_rl.cli.run_folders import write_notes
@@ -127,5 +127,12 @@ def run(config: DictConfig) -> None:
     if trainer.interrupted_by is not None:
         print(f"Interrupted. Continue with: python train.py resume={folder.directory}")
         raise SystemExit(128 + trainer.interrupted_by)
-    if trainer.algorithm.cost_keys and is_worth_a_certificate(config, trainer.episode_length):
+    if trainer.algorithm.cost_keys:
+        _say_certificate(config, folder, trainer.episode_length)
+
+
+def _say_certificate(config: DictConfig, folder: RunFolder, episode_length: int) -> None:
+    if is_worth_a_certificate(config, episode_length):
         print(certify_run(folder.directory, num_threads=config.num_threads or 0))
+    elif reason := why_not_certified(config, episode_length, folder.directory):
+        print(reason)

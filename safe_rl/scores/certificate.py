@@ -142,8 +142,9 @@ class Verdict:
     Attributes:
         certified: Number of the policy that is certified, or None.
         tested: Numbers of the policies that were tested, in this order.
-        bounds: Of the policy tested last: name -> (bound, what it has to keep).
-        shortfalls: Of the policy that fell short least, if none is certified.
+        bounds: Of the policy that is certified, or else of the one that fell short least: name ->
+            (bound, what it has to keep).
+        shortfalls: Of the same policy, if none is certified.
         alike: Costs that were the same in all its episodes, of which a bound is about those that
             nobody has seen.
     """
@@ -211,9 +212,8 @@ def first_certified(
         >>> first_certified([0, 1], collect, Claim({"cost": 25.0}), tests=2).certified
         1
     """
-    failed: list[tuple[dict[str, float], list[str]]] = []
     tested: list[int] = []
-    bounds: dict[str, tuple[float, float]] = {}
+    fell_short: list[Verdict] = []
     for candidate in order[:tests]:
         costs = collect(candidate)
         tested.append(candidate)
@@ -221,8 +221,7 @@ def first_certified(
         missing = claim.shortfalls(costs, tests)
         if not missing:
             return Verdict(candidate, tested, bounds)
-        failed.append((missing, claim.alike(costs)))
-    if not failed:
-        return Verdict(None, tested)
-    nearest, alike = min(failed, key=lambda pair: max(pair[0].values()))
-    return Verdict(None, tested, bounds, nearest, alike)
+        fell_short.append(Verdict(None, tested, bounds, missing, claim.alike(costs)))
+    return min(
+        fell_short, key=lambda one: max(one.shortfalls.values()), default=Verdict(None, tested)
+    )

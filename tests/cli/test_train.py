@@ -68,6 +68,28 @@ def test_the_whole_error_is_there_for_those_who_ask(command, monkeypatch):
         command("lr=1e-4")
 
 
+@pytest.mark.parametrize(
+    ("overrides", "lines"),
+    [
+        (["algo=ppo_lagrangian"], 1),
+        (["algo=ppo_lagrangian", "certificate.episodes=0"], 0),
+        (["algo=ppo"], 0),
+    ],
+)
+def test_a_run_too_short_for_its_certificate_says_so(command, overrides, lines):
+    small = ["env=PointGoal1", "env.num_steps=20", "num_envs=2", "frames=40", "frames_per_batch=40"]
+    status, out, _ = command(*small, *overrides, "logger=none", "hydra.run.dir=runs/short")
+    assert not status
+    said = [line for line in out.splitlines() if line.startswith("Not certified: ")]
+    assert len(said) == lines
+    for line in said:
+        assert "40 steps, fewer than the 12,000 of a test (certificate.episodes=600)" in line
+        assert line.endswith(
+            f"python -m safe_rl.evaluate {Path('runs/short').resolve()} certify=true"
+        )
+    assert not Path("runs/short/certificate.json").exists()
+
+
 @pytest.mark.parametrize("room", ["safe_rl.training", "safe_rl.cli"])
 def test_rooms_are_no_commands(room):
     result = subprocess.run([sys.executable, "-m", room], cwd=ROOT, capture_output=True, text=True)

@@ -81,6 +81,20 @@ def test_none_is_named_where_none_keeps_the_limit_and_by_how_much():
     assert 5 < verdict.shortfalls["mean_cost"] < 15
 
 
+def test_bounds_and_shortfalls_are_those_of_the_policy_that_fell_short_least():
+    costs = [np.full(50, 30.0), np.full(50, 27.0), np.full(50, 45.0)]  # whose bounds they are
+    verdict = first_certified(
+        [0, 1, 2], lambda k: {"cost": costs[k]}, Claim({"cost": 25.0}), tests=3
+    )
+    assert verdict.tested == [0, 1, 2]
+    assert verdict.bounds == {"mean_cost": (pytest.approx(27.0), 25.0)}
+    assert verdict.shortfalls == {"mean_cost": pytest.approx(2.0)}
+
+
+def test_nothing_tested_is_nothing_certified():
+    assert first_certified([], dict, Claim({"cost": 25.0}), tests=3).certified is None
+
+
 def test_shares_of_episodes_can_be_asked_for():
     costs = {"cost": np.r_[np.zeros(150), np.full(100, 30.0)]}  # mean 12, two fifths over 25
     assert not Claim({"cost": 25.0}).shortfalls(costs, tests=1)
