@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-import csv
-import gzip
 import statistics
 from collections.abc import Iterable, Sequence
 from itertools import accumulate, pairwise, product
 from pathlib import Path
+
+import archived_runs
+from archived_runs import Rows
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGES, RESULTS = ROOT / "docs" / "algorithms", ROOT / "results"
@@ -15,23 +16,13 @@ LIMIT, FRAMES, QUARTER = 25.0, 1_000_000, 250_000
 ENVIRONMENTS = ("PointGoal1", "CarGoal1")
 ARCHIVE = RESULTS / "algorithms"
 BUDGETS = (60, 120, 300, 600)  # seconds of training
+MISSING = "—"
 PAUSE = 20  # times the median of a run's epochs: longer ones are not training alone
-
-Rows = list[dict[str, float]]
 
 
 def finished_runs(archive: Path, algo: str, env: str) -> dict[int, Rows]:
-    """Rows of the recorded tables by seed, numbers only, of runs that came to their end."""
-    found = {}
-    for path in sorted((archive / env / algo).glob("seed*/progress.csv.gz")):
-        with gzip.open(path, "rt") as table:
-            rows = [
-                {key: float(value) for key, value in row.items() if value}
-                for row in csv.DictReader(table)
-            ]
-        if rows[-1]["steps"] >= FRAMES:
-            found[int(path.parent.name.removeprefix("seed"))] = rows
-    return found
+    """Tables by seed of the runs that are as long as those that are compared."""
+    return archived_runs.finished_runs(archive, algo, env, FRAMES)
 
 
 def last_quarter(runs: Iterable[Rows]) -> list[dict[str, float]]:
@@ -50,8 +41,18 @@ def _part_of(rows: Rows, start: int, end: int) -> dict[str, float]:
     }
 
 
-def _command(algo: str, seeds: str, env: str) -> str:
-    return f"`python train.py -m env={env} algo={algo} seed={seeds} frames=1_000_000`"
+def _command(algo: str, seeds: str, env: str, settings: str = "") -> str:
+    words = f"python train.py -m env={env} algo={algo} seed={seeds} frames=1_000_000 {settings}"
+    return f"`{words.rstrip()}`"
+
+
+def _groups(algo: str, env: str, runs: dict[int, Rows]) -> list[tuple[str, list[int]]]:
+    return archived_runs.groups(ARCHIVE, algo, env, list(runs))
+
+
+def _named(algo: str, settings: str) -> str:
+    """First cell of a row: the algorithm, and what tells its settings from another row's."""
+    return f"[`{algo}`]({algo}.md)" + (f" `{settings}`" if settings else "")
 
 
 def measured(algo: str) -> str:
@@ -63,8 +64,8 @@ def measured(algo: str) -> str:
     tables = "\n\n".join(_quarters(algo, env, found) for env, found in runs.items())
     picture = PAGES / f"{algo}.png"
     shown = f"\n\n![Learning curves]({picture.name})" if picture.exists() else ""
-    return f"""Limit 25, `preset=default`, return / episode cost by quarters of the run
-([all algorithms](comparison.md)):
+    return f"""Limit 25, defaults of the commit of each run unless a setting is named; return /
+episode cost by quarters of the run ([all algorithms](comparison.md)):
 
 {tables}{shown}"""
 
@@ -76,12 +77,16 @@ def _quarters(algo: str, env: str, runs: dict[int, Rows]) -> str:
         "| $\\rho_c$ |",
         "|---|---|---|---|---|---|---|",
     ]
+    groups = _groups(algo, env, runs)
+    settings = {seed: f", `{named}`" if named else "" for named, seeds in groups for seed in seeds}
     for seed, table in runs.items():
         quarters = [_part_of(table, start, start + QUARTER) for start in range(0, FRAMES, QUARTER)]
         cells = [f"{part['return']:.1f} / {part['cost']:.0f}" for part in quarters]
         last = quarters[-1]
-        rows.append(f"| {seed} | {' | '.join(cells)} | {last['above']:.0%} | {last['rate']:.3f} |")
-    return "\n".join(rows) + "\n\n" + _command(algo, ",".join(map(str, runs)), env)
+        named = f"{seed}{settings[seed]}"
+        rows.append(f"| {named} | {' | '.join(cells)} | {last['above']:.0%} | {last['rate']:.3f} |")
+    commands = [_command(algo, ",".join(map(str, seeds)), env, named) for named, seeds in groups]
+    return "\n".join(rows) + "\n\n" + "\n\n".join(commands)
 
 
 def comparison(algorithms: Iterable[str]) -> str:
@@ -92,12 +97,16 @@ def comparison(algorithms: Iterable[str]) -> str:
     factor = _spread_of_times(names)
     return f"""# The algorithms compared
 
-Limit 25, one million steps, `preset=default`. A single seed is a direction, not a verdict.
+Limit 25, one million steps, with the defaults of the commit of each run. Seeds that were run with
+different settings have a row for each, which names what differs. A single seed is a direction, not
+a verdict.
 
 ## At equal steps
 
 Means over the last quarter million steps of training, ± the standard deviation among seeds where
-there are several. $\\rho_c$ is the cost per step of the whole run.
+there are several. $\\rho_c$ is the cost per step of the whole run. *Certified*: how many of the
+runs that were tested have a checkpoint that [surely keeps the limit](../guides/certificate.md);
+—: none was tested.
 
 {tables}
 
@@ -107,8 +116,9 @@ Return / episode cost after as many seconds of collecting and learning (`time_to
 the last tenth of the steps until then, and in brackets how many steps these were [million]; —: one
 of the runs had come to its end, or had not finished an episode. Every run had one thread but not
 the machine to itself: seeds of one algorithm took up to {factor:.1f} times as long as each other,
-and that much says nothing between algorithms, either. An epoch that took {PAUSE} times the median
-of its run's, as if the machine had stood still, counts as the median. Limits come down by steps,
+and that much says nothing between algorithms, either. Times by which more than half of the rows
+would be empty are left out. An epoch that took {PAUSE} times the median of its run's, as if the
+machine had stood still, counts as the median. Limits come down by steps,
 not by time: after few steps costs are still free.
 
 {timed}
@@ -121,20 +131,25 @@ Commands are on the page of each algorithm; tables of all epochs and the commits
 def _compared(algorithms: Iterable[str], env: str) -> str:
     """Table of the algorithms in one environment, a row each."""
     rows = [
-        f"| {env}, `algo=` | seeds | return | episode cost | epochs above 25 | $\\rho_c$ |",
-        "|---|---|---|---|---|---|",
+        f"| {env}, `algo=` | seeds | return | episode cost | epochs above 25 | $\\rho_c$ "
+        "| certified |",
+        "|---|---|---|---|---|---|---|",
     ]
     missing: list[str] = []
     for algo in algorithms:
-        parts = last_quarter(finished_runs(ARCHIVE, algo, env).values())
-        if not parts:
+        runs = finished_runs(ARCHIVE, algo, env)
+        if not runs:
             missing.append(f"`{algo}`")
-            continue
-        cells = [
-            *end_cells(parts, 1),
-            f"{statistics.fmean(part['rate'] for part in parts):.3f}",
-        ]
-        rows.append(f"| [`{algo}`]({algo}.md) | {len(parts)} | {' | '.join(cells)} |")
+        for settings, seeds in _groups(algo, env, runs):
+            parts = last_quarter(runs[seed] for seed in seeds)
+            cells = [
+                _named(algo, settings),
+                str(len(parts)),
+                *end_cells(parts, 1),
+                f"{statistics.fmean(part['rate'] for part in parts):.3f}",
+                archived_runs.certificates(ARCHIVE, algo, env, seeds),
+            ]
+            rows.append(f"| {' | '.join(cells)} |")
     found = "\n".join(rows) + "\n\n" if len(rows) > 2 else ""
     return f"{found}Not run yet on {env}: {', '.join(missing)}." if missing else found.rstrip()
 
@@ -159,15 +174,25 @@ def spread(mean: float, deviation: float | None, digits: int) -> str:
 
 
 def _timed(algorithms: Iterable[str], env: str) -> str:
-    """Table of what the algorithms came to in one environment in equal times, a row each."""
-    budgets = " | ".join(f"{seconds} s" for seconds in BUDGETS)
-    rows = [f"| {env}, `algo=` | seeds | {budgets} |", "|---|---|" + "---|" * len(BUDGETS)]
+    """Table of what the algorithms came to in one environment in equal times, a row each.
+
+    Times by which most of the runs had come to their end are left out.
+    """
+    cells: dict[tuple[str, int], list[str]] = {}
     for algo in algorithms:
-        tables = list(finished_runs(ARCHIVE, algo, env).values())
-        if tables:
-            cells = " | ".join(_within(tables, seconds) for seconds in BUDGETS)
-            rows.append(f"| [`{algo}`]({algo}.md) | {len(tables)} | {cells} |")
-    return "\n".join(rows) if len(rows) > 2 else ""
+        runs = finished_runs(ARCHIVE, algo, env)
+        for settings, seeds in _groups(algo, env, runs):
+            tables = [runs[seed] for seed in seeds]
+            row = [_within(tables, seconds) for seconds in BUDGETS]
+            cells[_named(algo, settings), len(seeds)] = row
+    empty = [sum(row[n] == MISSING for row in cells.values()) for n in range(len(BUDGETS))]
+    shown = [n for n in range(len(BUDGETS)) if 2 * empty[n] <= len(cells)]
+    if not (cells and shown):
+        return ""
+    heads = [f"{env}, `algo=`", "seeds", *(f"{BUDGETS[n]} s" for n in shown)]
+    rows = [[name, str(seeds), *(row[n] for n in shown)] for (name, seeds), row in cells.items()]
+    lines = [f"| {' | '.join(row)} |" for row in (heads, *rows)]
+    return "\n".join([lines[0], "|---" * len(heads) + "|", *lines[1:]])
 
 
 def _within(tables: list[Rows], seconds: float) -> str:
@@ -178,7 +203,7 @@ def _within(tables: list[Rows], seconds: float) -> str:
         steps = done[-1]["steps"] if done else 0.0
         shown = [row for row in done if row["steps"] > 0.9 * steps and "episode_return" in row]
         if len(done) == len(rows) or not shown:
-            return "—"
+            return MISSING
         parts.append(_part_of(done, 0.9 * steps, steps) | {"steps": steps})
     mean = {key: statistics.fmean(part[key] for part in parts) for key in parts[0]}
     return f"{mean['return']:.1f} / {mean['cost']:.0f} ({mean['steps'] / 1e6:.2f})"

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
 import replay_pages
@@ -40,18 +40,29 @@ def _settings(config: DictConfig, paper: DictConfig) -> Iterator[tuple[str, str,
     for path, target, arguments in own_parts(config):
         name = target.rpartition(".")[2]
         other = str(OmegaConf.select(paper, f"{path}._target_"))
-        same = other == target
         yield f"`{path}._target_`", f"`{name}`", f"`{other.rpartition('.')[2]}`", "the class"
-        known = PARTS.get(name, {})
-        for key, value in arguments.items():
-            theirs = OmegaConf.select(paper, f"{path}.{key}") if same else None
-            if key == "optimizer":
-                key, value, theirs = "optimizer.lr", value["lr"], theirs.lr if theirs else None
+        lacking = _cell(None) if other == target else "—"
+        known = PARTS.get(other.rpartition(".")[2], {}) | PARTS.get(name, {})
+        node = OmegaConf.to_container(
+            OmegaConf.select(paper, path) or OmegaConf.create(), resolve=True
+        )
+        both = [_named(arguments), _named(node)]
+        for key in dict.fromkeys([*both[0], *both[1]]):
             meaning = known[key].meaning if key in known else "learning rate of Adam"
-            if isinstance(value, dict) and "_target_" in value:
-                value = value.get("_target_", "").rpartition(".")[2]
-                theirs = theirs and theirs.get("_target_", "").rpartition(".")[2]
-            yield f"`{path}.{key}`", _cell(value), _cell(theirs) if same else "—", meaning
+            own, theirs = (_cell(part[key]) if key in part else lacking for part in both)
+            yield f"`{path}.{key}`", own, theirs, meaning
+
+
+def _named(arguments: Mapping[str, Any]) -> dict[str, Any]:
+    """Arguments as tables show them: of an optimiser its rate, of another part its class."""
+    shown: dict[str, Any] = {}
+    for key, value in arguments.items():
+        if key == "optimizer":
+            shown["optimizer.lr"] = value["lr"]
+        elif key != "_target_":
+            is_part = isinstance(value, Mapping) and "_target_" in value
+            shown[key] = value["_target_"].rpartition(".")[2] if is_part else value
+    return shown
 
 
 def _table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:

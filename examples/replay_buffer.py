@@ -3,7 +3,8 @@
     python examples/replay_buffer.py --env PointGoal1 --frames 200_000
 
 Only networks, loss, multiplier and accounting are this package's. `train.py algo=sac_lagrangian`
-does the same from configurations, with checkpoints, evaluation and a table.
+is the whole of it: costs taken pessimistically (`loss.pessimism`), a limit that comes down,
+checkpoints, evaluation and a table.
 """
 
 from __future__ import annotations

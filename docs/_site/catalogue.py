@@ -60,7 +60,7 @@ COMPONENTS = [
     Component("vision", "1", "picture of the robot's camera, height × width × 3", "observe_vision"),
 ]  # fmt: skip
 COST_MEANINGS = {
-    "cost": "the sum of the others",
+    "cost": "any of the others is; with `constrain_indicator=false` it is their sum",
     "cost_hazards": "the robot's centre is in a hazard; how deep [m]",
     "cost_vases_contact": "contact points of the robot with vases",
     "cost_vases_displace": "how far vases have been moved since the reset [m]",
