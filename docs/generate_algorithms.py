@@ -89,8 +89,8 @@ LOSS = {
 }
 STEP = LOSS | {"parts": LOSS["parts"].replace("loss applies", "loss and the step apply")}
 REPLAY = {
-    "notation": "The notation is that of [off-policy algorithms](../off_policy.md), as are targets, "
-    "time-outs and multipliers.",
+    "notation": "The notation is that of [off-policy algorithms](../off_policy.md), as are targets,"
+    " time-outs and multipliers.",
     "shared": "Shared by all off-policy algorithms: [keys](../off_policy.md#keys)",
     "parts": "The loss applies to any steps, a replay buffer's or a dataset's; networks may be "
     "yours.",

@@ -11,6 +11,8 @@ from typing import Any, NamedTuple
 
 import mujoco
 from campaigns import campaigns
+from run_keys import run_keys
+from tables import table as _table
 
 from safe_rl.envs import EXTRAS, SUITE, SafetyGymConfig, SafetyGymEnv, key_table
 from safe_rl.envs.safety_gym.records.vocabulary import Vocabulary
@@ -176,7 +178,10 @@ def robots() -> str:
 # what a page has where it says `<!-- made: name -->`
 TABLES: dict[str, Callable[[], str]] = {
     table.__name__: table
-    for table in (benchmark, debug, velocity, keys, observations, lidars, costs, robots, campaigns)
+    for table in (
+        *(benchmark, debug, velocity, keys, observations, lidars, costs, robots),
+        *(campaigns, run_keys),
+    )
 }
 
 
@@ -273,10 +278,3 @@ def _headings() -> dict[str, str]:
 def _unit(kind: Any) -> str:
     name = mujoco.mjtSensor(int(kind)).name.removeprefix("mjSENS_").lower()
     return _UNITS[name]
-
-
-def _table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    lines = [head, ["---"] * len(head), *rows]
-    return (
-        "\n".join(f"| {' | '.join(c.replace('|', '¦') for c in line)} |" for line in lines) + "\n"
-    )

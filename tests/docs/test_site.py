@@ -9,6 +9,8 @@ import navigation
 import pytest
 import yaml
 
+from safe_rl.cli.keys import KEYS
+from safe_rl.cli.part_keys import PARTS
 from safe_rl.envs import SUITE, key_table
 from safe_rl.envs.safety_gym.rules.costs import COSTS
 
@@ -26,6 +28,15 @@ def test_every_key_has_its_row_below_a_heading():
     assert {row.name for row in key_table()} <= set(cells(page))
     assert "| number | greater than 0 | `0.3` | radius [m] |" in cells(page)["hazards_size"]
     assert page.index("## Hazards") < page.index("`hazards_size`") < page.index("## Vases")
+
+
+def test_every_key_of_a_run_has_its_row_with_its_default():
+    rows = cells(catalogue.run_keys())
+    assert set(KEYS) <= set(rows)
+    assert set().union(*PARTS.values()) <= set(rows)
+    level = "| a number above 0.5 and below 1 | `0.95` | confidence of a certificate |"
+    assert level in rows["certificate.level"]
+    assert "| `256` |" in rows["batch_size"]  # which only off-policy algorithms have
 
 
 def test_every_environment_and_cost_has_its_row():
