@@ -38,7 +38,15 @@ class CPOStep(TRPOStep):
             ``loss_…`` and the differentiable ``cost_surrogate``, [k].
         rescale_violation: whether to divide the violations by the episode length; see
             `constraint_value`.
+        largest_demand: bound of every c, as a share of √(2δ bᵀH⁻¹b), the most that a step within
+            the trust region lowers its surrogate by; None for none. A policy that is further
+            above its limit than one step mends takes recoveries (case 0), which do not look at the
+            reward, until the limit is reached: a return learned in 20 updates is forgotten in as
+            many. With 0.8, one constraint leaves √(1 − 0.8²) = 0.6 of the step to the reward.
         settings: those of every step, see `TrustRegion`.
+
+    Raises:
+        ValueError: if `largest_demand` is not positive.
 
     Examples:
         >>> from tensordict import TensorDict
@@ -75,10 +83,13 @@ class CPOStep(TRPOStep):
         loss: Callable[[TensorDictBase], TensorDictBase],
         *,
         rescale_violation: bool,
+        largest_demand: float | None = None,
         **settings: Unpack[TrustRegion],
     ) -> None:
         super().__init__(loss, **settings)
-        self.rescale_violation = rescale_violation
+        if largest_demand is not None and not largest_demand > 0:
+            raise ValueError(f"largest_demand must be positive or None: {largest_demand}.")
+        self.rescale_violation, self.largest_demand = rescale_violation, largest_demand
 
     def _propose(
         self,
@@ -95,10 +106,18 @@ class CPOStep(TRPOStep):
         b = b * ~((b.square().sum(-1, keepdim=True) <= _NO_GRADIENT) & (c[:, None] < 0))
         v, w = self._solve_all(fisher, g, b)
         q, r, s = g @ v, w @ g, b @ w.T
+        c = self._bounded(c, s.diagonal())
         dual = solve_dual(q, r, s, c, self.target_kl)
         step = -(dual.reward_coefficient * v + dual.cost_coefficient @ w)
         accepts = self._acceptance(losses, c, may_be_worse=dual.case < 2)
         return Proposal(step, accepts, self._diagnostics(q, r, s.diagonal(), c, dual))
+
+    def _bounded(self, c: Tensor, s: Tensor) -> Tensor:
+        """c, at most `largest_demand` of what a step can lower the surrogates by, [k]."""
+        if self.largest_demand is None:
+            return c
+        within_reach = (2 * self.target_kl * s.clamp_min(0)).sqrt()
+        return torch.minimum(c, self.largest_demand * within_reach)
 
     @staticmethod
     def _acceptance(

@@ -84,6 +84,9 @@ PARTS = {
     "CPOStep": {
         **_TRUST_REGION,
         "rescale_violation": Key(boolean, "whether violations are divided by the episode length"),
+        "largest_demand": Key(
+            optional(POSITIVE), "bound of a violation, as a share of what a step can mend"
+        ),
     },
     "PCPOStep": {
         **_TRUST_REGION,

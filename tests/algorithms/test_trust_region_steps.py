@@ -271,6 +271,38 @@ def test_unconverged_cpo_steps_meet_the_linear_constraints_and_the_radius(violat
     assert (g @ x).item() >= -((2 * DELTA * g @ solution).sqrt().item()) * 1.001
 
 
+def test_a_bounded_demand_leaves_the_rest_of_the_step_to_the_reward():
+    """In the metric of the dense Fisher matrix: 0.8 of the radius along b, 0.6 of it beside."""
+    actor, batch = make_case(1, (2000,))
+    parameters = list(actor.parameters())
+    matrix = dense_fisher(actor, batch).double()
+    losses = CPOLoss(actor, entropy_coeff=0.0)(batch)
+    g, b = (
+        flatten(torch.autograd.grad(value, parameters, retain_graph=True)).double()
+        for value in (losses["loss_objective"], losses["cost_surrogate"][0])
+    )
+    fisher = FisherProduct(actor, batch, parameters, SETTINGS["damping"])
+
+    def proposed(violation, **settings):
+        step = cpo_step(actor, cg_iterations=60, **settings)
+        found = step._propose(step.loss(batch), fisher, torch.tensor([violation]), LENGTH)
+        return found.step.double(), found.diagnostics
+
+    step, found = proposed(1e4, largest_demand=0.8)
+    radius = (2 * DELTA) ** 0.5
+    w, v = torch.linalg.solve(matrix, b), torch.linalg.solve(matrix, g)
+    along = w / (b @ w).sqrt()
+    beside = v - (b @ v) / (b @ w) * w
+    beside = beside / (beside @ matrix @ beside).sqrt()
+    expected = -radius * (0.8 * along + 0.6 * beside)
+    assert found["case"] == 1
+    difference = step - expected
+    assert (difference @ matrix @ difference).sqrt() < 0.02 * radius
+    within_reach = 50 * radius * (b @ w).sqrt().item()
+    assert torch.equal(proposed(within_reach, largest_demand=0.8)[0], proposed(within_reach)[0])
+    assert proposed(1e4)[1]["case"] == 0
+
+
 def test_cpo_without_cost_gradient_is_trpo():
     actor, batch = make_case(1)
     batch["cost_advantage"].zero_()
@@ -328,6 +360,8 @@ def test_errors_say_what_to_change():
         step(batch, torch.zeros(2), LENGTH)
     with pytest.raises(ValueError, match="fisher_subsample in"):
         cpo_step(actor, fisher_subsample=2.0)
+    with pytest.raises(ValueError, match="largest_demand must be positive"):
+        cpo_step(actor, largest_demand=0.0)
     with pytest.raises(TypeError, match="use TRPOLoss"):
         TRPOLagrangianLoss(actor, None, entropy_coeff=0.0)
 

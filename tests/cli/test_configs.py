@@ -156,7 +156,8 @@ TRUST_REGION = {
 TRPO = {"policy_update": {"_target_": "safe_rl.algorithms.TRPOStep", **TRUST_REGION}}
 CPO = {
     "policy_update": {
-        "_target_": "safe_rl.algorithms.CPOStep", **TRUST_REGION, "rescale_violation": True
+        "_target_": "safe_rl.algorithms.CPOStep", **TRUST_REGION, "rescale_violation": True,
+        "largest_demand": None,
     }
 }  # fmt: skip
 CRPO = {
@@ -165,9 +166,11 @@ CRPO = {
     }
 }  # fmt: skip
 PCPO = {
-    "policy_update": CPO["policy_update"]
-    | {"_target_": "safe_rl.algorithms.PCPOStep", "projection": "kl"}
-}
+    "policy_update": {
+        "_target_": "safe_rl.algorithms.PCPOStep", **TRUST_REGION, "projection": "kl",
+        "rescale_violation": True,
+    }
+}  # fmt: skip
 C_TRPO = {
     "policy_update": TRPO["policy_update"]
     | {"_target_": "safe_rl.algorithms.CTRPOStep", "beta": 1.0, "gamma": 0.99, "hysteresis": 0.8}
