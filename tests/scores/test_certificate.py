@@ -82,7 +82,7 @@ def test_none_is_named_where_none_keeps_the_limit_and_by_how_much():
 
 
 def test_bounds_and_shortfalls_are_those_of_the_policy_that_fell_short_least():
-    costs = [np.full(50, 30.0), np.full(50, 27.0), np.full(50, 45.0)]  # whose bounds they are
+    costs = [np.tile([mean - 1e-6, mean + 1e-6], 25) for mean in (30.0, 27.0, 45.0)]
     verdict = first_certified(
         [0, 1, 2], lambda k: {"cost": costs[k]}, Claim({"cost": 25.0}), tests=3
     )
