@@ -67,6 +67,7 @@ class PCPOStep(CPOStep):
         loss: as of a `CPOStep`.
         projection: ``"kl"`` or ``"l2"``, the distance that the projection keeps small.
         rescale_violation: whether to divide the violations by the episode length.
+        largest_demand: bound of every c, as of a `CPOStep`; None for none.
         settings: those of every step, see `TrustRegion`.
 
     Raises:
@@ -94,9 +95,12 @@ class PCPOStep(CPOStep):
         *,
         projection: Projection,
         rescale_violation: bool,
+        largest_demand: float | None = None,
         **settings: Unpack[TrustRegion],
     ) -> None:
-        super().__init__(loss, rescale_violation=rescale_violation, **settings)
+        super().__init__(
+            loss, rescale_violation=rescale_violation, largest_demand=largest_demand, **settings
+        )
         if projection not in get_args(Projection):
             raise ValueError(f"projection must be one of {get_args(Projection)}: {projection!r}.")
         self.projection = projection
@@ -113,7 +117,7 @@ class PCPOStep(CPOStep):
         g = flat_gradient(total_loss(losses), self.parameters, retain_graph=True)
         b = self._gradients(surrogates)
         v, w = self._solve_all(fisher, g, b)
-        q = g @ v
+        q, c = g @ v, self._bounded(c, (b * w).sum(-1))
         for_reward = torch.where(q > 0, (2 * self.target_kl / q).sqrt(), 0.0) * -v
         back = w if self.projection == "kl" else b
         nu = nearest_feasible(c + b @ for_reward, b @ back.T)

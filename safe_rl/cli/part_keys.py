@@ -54,6 +54,12 @@ _TRUST_REGION = {
     "max_backtracks": Key(count(1, 10_000), "tries of the line search"),
     "fisher_subsample": Key(number(0, 1, above=True), "share of the batch for the Fisher matrix"),
 }
+_CONSTRAINED = {
+    "rescale_violation": Key(boolean, "whether violations are divided by the episode length"),
+    "largest_demand": Key(
+        optional(POSITIVE), "bound of a violation, as a share of what a step can mend"
+    ),
+}
 _SAUTE = {
     "budgets": Key(mapping_of(POSITIVE), "cost per episode allowed by cost"),
     "discount": Key(number(0, 1, above=True), "discount of the costs that a budget is for"),
@@ -81,17 +87,11 @@ PARTS = {
         "low_kl": Key(SHARE, "share of the KL limit below which an update fell short"),
     },
     "TRPOStep": _TRUST_REGION,
-    "CPOStep": {
-        **_TRUST_REGION,
-        "rescale_violation": Key(boolean, "whether violations are divided by the episode length"),
-        "largest_demand": Key(
-            optional(POSITIVE), "bound of a violation, as a share of what a step can mend"
-        ),
-    },
+    "CPOStep": {**_TRUST_REGION, **_CONSTRAINED},
     "PCPOStep": {
         **_TRUST_REGION,
+        **_CONSTRAINED,
         "projection": Key(choice("kl", "l2"), "distance that the projection keeps small"),
-        "rescale_violation": Key(boolean, "whether violations are divided by the episode length"),
     },
     "CRPOStep": {
         **_TRUST_REGION,

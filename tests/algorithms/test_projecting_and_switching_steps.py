@@ -81,6 +81,26 @@ def test_pcpo_is_the_equation_of_its_article(projection, violation):
     )
 
 
+def test_a_bounded_demand_is_a_smaller_violation():
+    actor, batch = make_case()
+    batch["cost_advantage"] = batch["cost_advantage"][:, :1]
+    parameters = list(actor.parameters())
+    fisher = FisherProduct(actor, batch, parameters, SETTINGS["damping"])
+    matrix = torch.stack([fisher(row) for row in torch.eye(flatten(parameters).numel())]).double()
+
+    def proposed(violation, **settings):
+        loss = CPOLoss(actor, entropy_coeff=0.0)
+        step = PCPOStep(loss, projection="kl", rescale_violation=True, **settings, **SETTINGS)
+        return step._propose(step.loss(batch), fisher, torch.tensor([violation]), LENGTH).step
+
+    cost = CPOLoss(actor, entropy_coeff=0.0)(batch)["cost_surrogate"][0]
+    b = flatten(torch.autograd.grad(cost, parameters)).double()
+    reach = (2 * DELTA * b @ torch.linalg.solve(matrix, b)).sqrt().item()
+    bounded = proposed(1e4, largest_demand=0.5)
+    torch.testing.assert_close(bounded, proposed(50 * reach), atol=1e-4, rtol=1e-2)
+    assert not torch.allclose(bounded, proposed(1e4), atol=1e-4, rtol=1e-2)
+
+
 @pytest.mark.parametrize("projection", ["kl", "l2"])
 @pytest.mark.parametrize("violation", [-1e4, -1.0, 0.5, 1e4])
 def test_pcpo_keeps_the_trust_region_and_lowers_costs_outside(projection, violation):
