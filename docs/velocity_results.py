@@ -42,7 +42,8 @@ it stood at commit 005e482; ± as given there).
 
 {missing}
 
-Ten times the steps is one difference, another one the robots: ours are Gymnasium's of version 5,
+A million steps are fifty updates of the default preset: robots that are hard to keep upright have
+hardly begun to walk by then. Ten times the steps is one difference, another one the robots: ours are Gymnasium's of version 5,
 those of Safety-Gymnasium, on which OmniSafe trains, of version 4, whose rewards differ for some of
 them. Thresholds are the same. So compare orders of magnitude, and costs with the limit.
 
