@@ -32,8 +32,8 @@ PUBLISHED = {
 TEMPLATE = """# Velocity limits, measured
 
 PPO-Lagrangian with its defaults and normalised observations, as OmniSafe has them, on
-[Gymnasium's robots](suite.md#velocity-limits), limit 25, one million steps: means over the last quarter million steps of training, ± the standard deviation among
-seeds. Beside them what OmniSafe publishes of its PPO-Lagrangian (`PPOLag`), evaluated after **ten
+[Gymnasium's robots](suite.md#velocity-limits), limit 25, one million steps: means over the last
+quarter million steps of training, ± the standard deviation among seeds. Beside them what OmniSafe publishes of its PPO-Lagrangian (`PPOLag`), evaluated after **ten
 million** steps, also with a limit of 25 ([table 2 of its
 benchmark](https://github.com/PKU-Alignment/omnisafe/blob/main/benchmarks/on-policy/README.md), as
 it stood at commit 005e482; ± as given there).
@@ -43,7 +43,8 @@ it stood at commit 005e482; ± as given there).
 {missing}
 
 A million steps are fifty updates of the default preset: robots that are hard to keep upright have
-hardly begun to walk by then. Ten times the steps is one difference, another one the robots: ours are Gymnasium's of version 5,
+hardly begun to walk by then, and Hopper, whose episodes end early, has only begun to slow down.
+Ten times the steps is one difference, another one the robots: ours are Gymnasium's of version 5,
 those of Safety-Gymnasium, on which OmniSafe trains, of version 4, whose rewards differ for some of
 them. Thresholds are the same. So compare orders of magnitude, and costs with the limit.
 
