@@ -33,8 +33,9 @@ TEMPLATE = """# Velocity limits, measured
 
 PPO-Lagrangian with its defaults and normalised observations, as OmniSafe has them, on
 [Gymnasium's robots](suite.md#velocity-limits), limit 25, one million steps: means over the last
-quarter million steps of training, ± the standard deviation among seeds. Beside them what OmniSafe publishes of its PPO-Lagrangian (`PPOLag`), evaluated after **ten
-million** steps, also with a limit of 25 ([table 2 of its
+quarter million steps of training, ± the standard deviation among seeds. Beside them what OmniSafe
+publishes of its PPO-Lagrangian (`PPOLag`), evaluated after **ten million** steps, also with a limit
+of 25 ([table 2 of its
 benchmark](https://github.com/PKU-Alignment/omnisafe/blob/main/benchmarks/on-policy/README.md), as
 it stood at commit 005e482; ± as given there).
 
@@ -49,7 +50,8 @@ those of Safety-Gymnasium, on which OmniSafe trains, of version 4, whose rewards
 them. Thresholds are the same. So compare orders of magnitude, and costs with the limit.
 
 ```
-python train.py -m env=SafeHopperVelocity algo=ppo_lagrangian model.normalise=10 seed=300,301,302 frames=1_000_000
+python train.py -m env=SafeHopperVelocity algo=ppo_lagrangian model.normalise=10 \\
+    seed=300,301,302 frames=1_000_000
 ```
 
 Tables of all epochs and the commits are in [`results/velocity/`](../../results/README.md).
