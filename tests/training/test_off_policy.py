@@ -151,8 +151,8 @@ def test_sums_over_steps_end_where_a_resumed_run_begins_new_episodes(tmp_path):
     resumed = build()
     assert resumed.resume()
     resumed.epoch(resumed.batches())
-    # the last two of 40 steps in a row have no third after them, before and after
-    assert len(resumed.algorithm.memory) == 4 * (38 + 38)
+    # TorchRL keeps the last three of 40 steps in a row back, before and after
+    assert len(resumed.algorithm.memory) == 4 * (37 + 37)
 
 
 def test_another_run_starts_from_its_networks(make_trainer, tmp_path):
