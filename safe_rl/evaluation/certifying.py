@@ -68,17 +68,28 @@ class Certificate:
         level = f"at {100 * self.options.level:.12g}%"
         if self.checkpoint is None:
             missing = ", ".join(f"{n} by {v:.3g}" for n, v in self.verdict.shortfalls.items())
-            unseen = (
-                f" All tested episodes had the same {', '.join(self.verdict.alike)}: the bound is "
-                "what unseen ones may cost at most, and no number of episodes brings it down to 0."
-            )
             return (
                 f"Not certified {level}: no checkpoint's bound is within its limit ({missing})."
-                f"{unseen if self.verdict.alike else ''}"
+                f"{_unseen(self.verdict)}"
             )
         bounds = ", ".join(f"{n} ≤ {b:.3g}" for n, (b, _) in self.verdict.bounds.items())
         steps = checkpoint_steps(self.checkpoint)
         return f"Certified {level}: {bounds}, return {self.episode_return:.2f}, at {steps:,} steps."
+
+
+def _unseen(verdict: Verdict) -> str:
+    """What to say of a test all of whose episodes cost the same; nothing of another one."""
+    if not verdict.alike:
+        return ""
+    said = f" All tested episodes had the same {', '.join(verdict.alike)}: the bound is "
+    if all(math.isfinite(bound) for bound, _ in verdict.bounds.values()):
+        return said + (
+            "what unseen ones may cost at most, and no number of episodes brings it down to 0."
+        )
+    return said + (
+        "what unseen ones may cost at most, and the environment's spec does not say what that is. "
+        "Give the cost's spec an upper bound (Bounded instead of Unbounded)."
+    )
 
 
 def certify(
@@ -198,6 +209,11 @@ def _keep(folder: RunFolder, checkpoint: Path | None) -> Path | None:
     return Path(shutil.copy2(checkpoint, directory))
 
 
+def _finite(value: float) -> float | None:
+    """A number as JSON has it, which knows no infinity."""
+    return value if math.isfinite(value) else None
+
+
 def _write(folder: RunFolder, certificate: Certificate, candidates: list[int | None]) -> None:
     verdict = certificate.verdict
     content: Mapping[str, Any] = {
@@ -205,9 +221,10 @@ def _write(folder: RunFolder, certificate: Certificate, candidates: list[int | N
         "checkpoint": None if certificate.checkpoint is None else certificate.checkpoint.name,
         "episode_return": None if verdict.certified is None else certificate.episode_return,
         "bounds": {
-            name: {"bound": bound, "most": most} for name, (bound, most) in verdict.bounds.items()
+            name: {"bound": _finite(bound), "most": most}
+            for name, (bound, most) in verdict.bounds.items()
         },
-        "shortfalls": verdict.shortfalls,
+        "shortfalls": {name: _finite(value) for name, value in verdict.shortfalls.items()},
         "alike": verdict.alike,
         "candidates": candidates,
         "tested": [candidates[number] for number in verdict.tested],

@@ -11,8 +11,10 @@ from run_configs import point_mass_config
 
 from safe_rl import envs
 from safe_rl.evaluation import Certificate, CertificateOptions, certify
-from safe_rl.evaluation.certifying import _largest_cost
+from safe_rl.evaluation.certifying import _largest_cost, _write
 from safe_rl.evaluation.loading import find_checkpoint
+from safe_rl.reporting.measured import read_certificate
+from safe_rl.runs.folder import RunFolder
 from safe_rl.scores.certificate import Verdict
 from safe_rl.training.trainer import build_trainer, seed_everything
 
@@ -123,3 +125,17 @@ def test_a_certificate_that_says_why_a_limit_of_nothing_is_not_kept():
     assert "by 4). All tested episodes had the same cost: the bound is what unseen ones" in line
     verdict = Verdict(None, [0], {"mean_cost": (4.0, 0.0)}, {"mean_cost": 4.0})
     assert str(Certificate(None, math.nan, verdict, OPTIONS)).endswith("(mean_cost by 4).")
+
+
+def test_a_cost_without_a_largest_is_said_in_words_and_written_as_json(tmp_path):
+    verdict = Verdict(None, [0], {"mean_cost": (math.inf, 25.0)}, {"mean_cost": math.inf}, ["cost"])
+    certificate = Certificate(None, math.nan, verdict, OPTIONS)
+    assert "the environment's spec does not say" in str(certificate)
+
+    def refuse(constant):
+        raise AssertionError(f"{constant} is no JSON")
+
+    _write(RunFolder(tmp_path), certificate, [100])
+    content = json.loads((tmp_path / "certificate.json").read_text(), parse_constant=refuse)
+    assert content["bounds"] == {"mean_cost": {"bound": None, "most": 25.0}}
+    assert read_certificate(tmp_path / "certificate.json")["bounds"]["mean_cost"][1] == 25.0
