@@ -1,0 +1,161 @@
+"""Curves over seeds, tables as they are written, and what learning cost, of chosen numbers."""
+
+import csv
+
+import numpy as np
+import pytest
+from synthetic import SUITE, experiments_in, write_run
+
+from safe_rl.reporting.averages import average
+from safe_rl.reporting.columns import Column, Table, spread
+from safe_rl.reporting.contents import build_report
+from safe_rl.reporting.recorded import find_runs
+from safe_rl.reporting.scoring import (
+    final_record,
+    learning_table,
+)
+from safe_rl.reporting.slate_scores import (
+    aggregate,
+    improvement_table,
+    lengths,
+)
+from safe_rl.scores.published import REFERENCE
+
+
+def test_curves_are_means_over_seeds_on_common_steps(tmp_path):
+    slow = {"returns": [0.0, 2.0, 4.0], "costs": [1, 1, 1], "rates": [0.1, 0.2, 0.3]}
+    fast = {"returns": [10.0, 12.0], "costs": [1, 1], "rates": [0.3, 0.6]}
+    write_run(tmp_path, seed=0, **slow, frames=0)
+    write_run(tmp_path, seed=1, **fast, frames=0)
+    runs, _ = find_runs(tmp_path)
+    curve = average(runs, "cost_rate", smooth=False)
+    # until the shorter one ends, with as many points as the longer one has epochs
+    np.testing.assert_allclose(curve.steps, [1000, 1500, 2000])
+    np.testing.assert_allclose(curve.mean, [0.2, 0.3, 0.4])
+    # two seeds: the same is drawn twice in half of all resamples
+    np.testing.assert_allclose(curve.low, [0.1, 0.15, 0.2])
+    np.testing.assert_allclose(curve.high, [0.3, 0.45, 0.6])
+    alone = average(runs[:1], "episode_return", smooth=True)
+    np.testing.assert_allclose(alone.mean, [0.0, 1.0, 2.0])
+    assert np.isnan(alone.low).all()
+    assert average(runs, "no_such_column", smooth=False) is None
+
+
+def test_a_curve_ends_at_the_final_score(tmp_path):
+    returns = [1.0, 2.0, 4.0, 8.0, 16.0, 32.0, 65.0]
+    write_run(tmp_path, returns=returns, costs=returns, rates=returns)
+    (experiment,) = experiments_in(tmp_path)
+    curve = average(experiment.runs, "episode_cost", smooth=True)
+    assert curve.mean[-1] == pytest.approx(25.0)
+    assert curve.mean[-1] == pytest.approx(final_record(experiment, ["cost"])["episode_cost"])
+
+
+def test_epochs_without_an_episode_are_bridged(tmp_path):
+    nan = float("nan")
+    values = {"returns": [1.0, nan, 3.0], "costs": [1, nan, 1], "rates": [0.1, 0.1, 0.1]}
+    directory = write_run(tmp_path, **values)
+    text = (directory / "progress.csv").read_text().replace("nan", "")
+    (directory / "progress.csv").write_text(text)
+    curve = average(find_runs(tmp_path)[0], "episode_return", smooth=False)
+    np.testing.assert_allclose(curve.mean, [1.0, 3.0])
+    np.testing.assert_allclose(curve.steps, [1000, 3000])
+
+
+def test_tables_write_all_fields_and_show_the_chosen(tmp_path):
+    records = [
+        {"name": "a|b", "x": 1.25, "x_std": 0.5}, {"name": "=b", "x": float("nan"), "more": 7},
+        {"name": "c", "x": 3.0},
+    ]  # fmt: skip
+    looks = {"a|b": "best", "c": "bad"}
+    columns = [
+        Column("name", ("{}", "name")),
+        Column("x", *spread("x", 1), mark=lambda r: looks.get(r["name"], "")),
+    ]
+    table = Table("scores", "Scores", columns, records)
+    assert table.markdown().splitlines() == [
+        "| name | x |", "|---|---:|", r"| a\|b | **1.2 ± 0.5** |", "| =b | — |", "| c | 3.0 ▲ |",
+    ]  # fmt: skip
+    table.write_csv(tmp_path / "scores.csv")
+    with (tmp_path / "scores.csv").open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert rows == [
+        {"name": "a|b", "x": "1.25", "x_std": "0.5", "more": ""},
+        # no formula for a spreadsheet
+        {"name": "'=b", "x": "", "x_std": "", "more": "7"},
+        {"name": "c", "x": "3.0", "x_std": "", "more": ""},
+    ]
+
+
+def test_what_learning_cost_is_counted_over_all_of_training(tmp_path):
+    reference = REFERENCE["PointGoal1"].episode_return
+    costs = [45.0, 35.0, 5.0, 5.0, 5.0, 5.0, 30.0]
+    for seed, level in ((0, 0.8), (10, 0.2)):
+        write_run(tmp_path, algo="cpo", seed=seed, returns=[level * reference] * 7, costs=costs,
+                  rates=[0.01] * 7)  # fmt: skip
+    table = learning_table(experiments_in(tmp_path))
+    (record,) = table.records
+    assert record["regret_cost"] == pytest.approx((20 + 10 + 5) / 7)
+    assert record["share_over_cost"] == pytest.approx(3 / 7)
+    assert record["streak_cost"] == 2
+    # the mean over five epochs is within 25 for the first time in the third; one seed returns
+    # less than half of the reference for ever
+    assert np.mean(costs[:2]) > 25 > np.mean(costs[:4])
+    assert record["good_steps"] == (3000 if np.mean(costs[:3]) <= 25 else 4000)
+    assert record["good_hours"] == pytest.approx(record["good_steps"] / 1000 * 3.6 / 3600)
+    assert (record["seeds"], record["seeds_good"]) == (2, 1)
+    assert f"{reference / 2:.4g}" in table.note
+    assert table.records[0]["hours"] == pytest.approx(7 * 3.6 / 3600)
+    # of less, both seeds have enough; of more, none
+    (modest,), (ambitious,) = (
+        learning_table(experiments_in(tmp_path), good).records for good in (0.1, 0.9)
+    )
+    assert (modest["seeds_good"], ambitious["seeds_good"]) == (2, 0)
+    assert "good_steps" not in ambitious
+
+
+def test_without_a_limit_learning_costs_nothing_to_speak_of(tmp_path):
+    write_run(tmp_path, limits={})
+    assert learning_table(experiments_in(tmp_path)) is None
+
+
+def test_improvement_is_a_probability_per_score(tmp_path):
+    for algo, value, cost in (("ppo", 2.0, 60.0), ("cpo", 1.0, 20.0)):
+        for seed in (0, 10):
+            write_run(tmp_path, algo=algo, seed=seed, returns=[value], costs=[cost])
+    table = improvement_table("x", [aggregate([e]) for e in experiments_in(tmp_path)])
+    found = {r["algorithm"]: (r["episode_return"], r["violation"]) for r in table.records}
+    # each pair once; the cost rates are equal
+    assert found == {"PPO": (1.0, 0.0)}
+    assert {r["cost_rate"] for r in table.records} == {0.5}
+
+
+def test_what_was_trained_for_longer_is_compared_apart(tmp_path):
+    for algo, epochs in (("ppo", 1), ("cpo", 1), ("trpo", 30), ("mine", 30)):
+        for seed in (0, 10):
+            rows = {name: [value + seed] * epochs for name, value in
+                    (("returns", 3.0), ("costs", 20.0), ("rates", 0.1))}  # fmt: skip
+            write_run(tmp_path, algo=algo, seed=seed, **rows)
+    everything = [aggregate([e]) for e in experiments_in(tmp_path)]
+    groups = {after: [a.algorithm for a in own] for after, own in lengths(everything).items()}
+    assert groups == {", 1,000 steps": ["PPO", "CPO"], ", 30,000 steps": ["TRPO", "mine"]}
+    assert list(lengths(everything[:1])) == [""]
+    pairs = [(r["algorithm"], r["other"]) for r in improvement_table("x", everything).records]
+    assert pairs == [("PPO", "CPO"), ("TRPO", "mine")]
+    report = build_report(tmp_path, SUITE, seeds_needed=2, unfinished=False)
+    shown = {b.shows for s in report.sections for b in s.blocks if hasattr(b, "shows")}
+    for steps, names in (("1,000", "PPO, CPO"), ("30,000", "TRPO, mine")):
+        whole = f"What all algorithms were trained on, {steps} steps, {names}"
+        assert f"Share of runs above every score: {whole}" in shown
+    assert any("PointGoal1, 1,000 steps: PPO, CPO; PointGoal1, 30,000" in says for says in shown)
+
+
+def test_steps_beyond_the_end_of_training_are_no_longer_training(tmp_path):
+    # batches of 1000 and of 750 steps, until there are at least 2500
+    for algo, epochs, frames in (("ppo", 3, 2500), ("cpo", 4, 2500), ("trpo", 2, 2500)):
+        rows = {name: [1.0] * epochs for name in ("returns", "costs", "rates")}
+        write_run(tmp_path, algo=algo, **rows, frames=frames)
+    by_name = {e.algorithm: e.runs[0] for e in experiments_in(tmp_path)}
+    assert {name: run.length for name, run in by_name.items()} == {
+        "PPO": 2500, "CPO": 2500, "TRPO": 2000,
+    }  # fmt: skip
+    assert by_name["CPO"].steps == 4000
