@@ -24,6 +24,7 @@ from omegaconf import OmegaConf
 from train_throughput import new_env
 
 from safe_rl.algorithms import TRPOStep
+from safe_rl.evaluation.loading import find_checkpoint
 from safe_rl.objectives import LagrangeMultiplier, TRPOLagrangianLoss
 from safe_rl.objectives.normalisation import normalise_advantages
 from safe_rl.training.trainer import build_trainer, seed_everything
@@ -41,7 +42,7 @@ def restored(run: Path, directory: Path):
     """Trainer of a run at its newest checkpoint, with another seed for what comes."""
     config = OmegaConf.load(run / "config.yaml")
     trainer = build_trainer(config, new_env(config), directory)
-    trainer.restore(sorted((run / "checkpoints" / "last").iterdir())[-1])
+    trainer.restore(find_checkpoint(run, "last"))
     seed_everything(12_345, None)
     return trainer
 

@@ -1,7 +1,7 @@
 """Learning curves for the pages of the algorithms, from results/algorithms/.
 
 ``python docs/draw_algorithms.py`` draws docs/algorithms/<name>.png: every environment a row, with
-mean and 95 % interval over the seeds whose settings are the defaults.
+mean and 95 % interval over seeds; seeds of other settings have curves of their own.
 """
 
 from __future__ import annotations
