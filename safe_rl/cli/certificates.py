@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shlex
+from collections.abc import Collection
 from pathlib import Path
 
 from omegaconf import DictConfig, OmegaConf
@@ -12,7 +13,10 @@ from safe_rl.cli.robots import maker_of
 from safe_rl.evaluation import Certificate, CertificateOptions, certify
 from safe_rl.evaluation.loading import load_config
 
-__all__ = ["certificate_options", "certify_run", "is_worth_a_certificate", "why_not_certified"]
+__all__ = [
+    *("certificate_options", "certify_run", "is_to_keep_limits", "is_worth_a_certificate"),
+    "why_not_certified",
+]
 
 
 def certify_run(
@@ -38,6 +42,17 @@ def certificate_options(config: DictConfig) -> CertificateOptions:
     options |= config.get("certificate") or {}
     share = (config.get("risk") or {}).get("most_over", 1.0)
     return CertificateOptions(**options | {"most_over": min(options["most_over"], share)})
+
+
+def is_to_keep_limits(config: DictConfig, cost_keys: Collection[str]) -> bool:
+    """Whether limits are kept by the algorithm, or by a transform that gives episodes a budget.
+
+    Args:
+        config: Configuration of the run.
+        cost_keys: Costs that its algorithm constrains.
+    """
+    transforms = (config.get("transforms") or {}).values()
+    return bool(cost_keys) or any("budgets" in transform for transform in transforms)
 
 
 def is_worth_a_certificate(config: DictConfig, episode_length: int) -> bool:

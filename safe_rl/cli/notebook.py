@@ -21,7 +21,7 @@ from omegaconf import DictConfig, OmegaConf, open_dict
 from tensordict.nn import TensorDictModuleBase
 from torchrl.envs import EnvBase
 
-from safe_rl.cli.certificates import certify_run, is_worth_a_certificate
+from safe_rl.cli.certificates import certify_run, is_to_keep_limits, is_worth_a_certificate
 from safe_rl.cli.composing import check_command
 from safe_rl.cli.conf import CONF
 from safe_rl.cli.evaluate import evaluate_run
@@ -194,7 +194,9 @@ def train(
     finally:
         if is_new and not has_begun:
             shutil.rmtree(folder, ignore_errors=True)
-    if trainer.algorithm.cost_keys and is_worth_a_certificate(config, trainer.episode_length):
+    if is_to_keep_limits(config, trainer.algorithm.cost_keys) and is_worth_a_certificate(
+        config, trainer.episode_length
+    ):
         certify_run(folder)
     return Run(folder)
 

@@ -12,7 +12,12 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf, open_dict
 
-from safe_rl.cli.certificates import certify_run, is_worth_a_certificate, why_not_certified
+from safe_rl.cli.certificates import (
+    certify_run,
+    is_to_keep_limits,
+    is_worth_a_certificate,
+    why_not_certified,
+)
 from safe_rl.cli.failures import SETTING_ERRORS, errors_in_a_line
 from safe_rl.cli.robots import keep_robot, robot_of
 from safe_rl.cli.run_folders import write_notes
@@ -127,7 +132,7 @@ def run(config: DictConfig) -> None:
     if trainer.interrupted_by is not None:
         print(f"Interrupted. Continue with: python train.py resume={folder.directory}")
         raise SystemExit(128 + trainer.interrupted_by)
-    if trainer.algorithm.cost_keys:
+    if is_to_keep_limits(config, trainer.algorithm.cost_keys):
         _say_certificate(config, folder, trainer.episode_length)
 
 

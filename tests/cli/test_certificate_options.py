@@ -4,7 +4,7 @@ import pytest
 from omegaconf import OmegaConf
 from run_configs import compose_config
 
-from safe_rl.cli.certificates import certificate_options
+from safe_rl.cli.certificates import certificate_options, is_to_keep_limits
 
 
 @pytest.mark.parametrize(
@@ -26,3 +26,17 @@ def test_a_limit_on_the_share_of_episodes_is_certified_with_the_mean(overrides, 
 def test_runs_of_before_certificates_and_measures_get_the_packages_options():
     old = OmegaConf.create({"cost_limits": {"cost": 25.0}})
     assert certificate_options(old) == certificate_options(compose_config())
+
+
+@pytest.mark.parametrize(
+    ("overrides", "cost_keys", "is_to"),
+    [
+        ([], ["cost"], True),
+        ([], [], False),
+        (["transforms=[early_termination]"], [], True),
+        (["transforms=[reward_scale]"], [], False),
+    ],
+)
+def test_a_budget_of_a_transform_is_a_limit_to_keep(overrides, cost_keys, is_to):
+    config = compose_config("algo=ppo", *overrides)
+    assert is_to_keep_limits(config, cost_keys) == is_to

@@ -224,6 +224,13 @@ def test_episodes_of_an_evaluation_are_whole():
     assert batch["done"].squeeze().tolist() == [False] * 5 + [True]
 
 
+def test_episodes_of_an_evaluation_end_too_where_that_is_asked_for():
+    switch = EarlyTermination({"cost": 5.0}, in_evaluation=True)
+    env = transform_env(Priced([[3.0] * 6]), {"switch": switch}, evaluating=True)
+    batch = still(env, 6)["next"]
+    assert batch["terminated"].squeeze().tolist() == [False, True] * 3
+
+
 def test_replaced_actions_are_taken_and_counted_and_the_chosen_ones_kept():
     env = transformed(PointMass(2), "action_filter")
     assert env.cost_keys == [*PointMass.cost_keys, "cost_interventions"]

@@ -22,11 +22,14 @@ class EarlyTermination(ConstraintTransform):
     So no reward is to be had beyond the budget, and an algorithm without constraints keeps it: the
     early terminated MDP of Sun et al. 2021, "Safe Exploration by Solving Early Terminated MDP".
     How much is left is not observed; with `saute` before it, it is. Episodes of an
-    evaluation go on, as in the paper: there the cost of the whole episode counts.
+    evaluation go on, as in the paper: there the cost of the whole episode counts. With
+    `in_evaluation` they end, too: then what is evaluated is the policy with its switch, which surely
+    costs no more than the budget and the last step.
 
     Args:
         budgets: cost key -> undiscounted cost per episode; an episode that costs exactly this much
             goes on.
+        in_evaluation: whether episodes of an evaluation end in the same way.
 
     Raises:
         ValueError: for a budget below 0.
@@ -39,8 +42,9 @@ class EarlyTermination(ConstraintTransform):
         torch.Size([2, 3])
     """
 
-    def __init__(self, budgets: Mapping[str, float]) -> None:
+    def __init__(self, budgets: Mapping[str, float], in_evaluation: bool = False) -> None:
         super().__init__()
+        self.in_evaluation = in_evaluation
         self._budgets = check_budgets(budgets, above_zero=False)
 
     def check(self, cost_keys: Collection[str]) -> None:
@@ -55,7 +59,7 @@ class EarlyTermination(ConstraintTransform):
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
         spent = self._rows["spent"] + costs_of(next_tensordict, self._budgets)
         self._rows = {"spent": spent}
-        if self.evaluating:
+        if self.evaluating and not self.in_evaluation:
             return next_tensordict
         over = (spent > spent.new_tensor(list(self._budgets.values()))).any(-1, keepdim=True)
         for key in ("done", "terminated"):
