@@ -23,8 +23,8 @@ class EarlyTermination(ConstraintTransform):
     early terminated MDP of Sun et al. 2021, "Safe Exploration by Solving Early Terminated MDP".
     How much is left is not observed; with `saute` before it, it is. Episodes of an
     evaluation go on, as in the paper: there the cost of the whole episode counts. With
-    `in_evaluation` they end, too: then what is evaluated is the policy with its switch, which surely
-    costs no more than the budget and the last step.
+    `in_evaluation` they end, too: then what is evaluated is the policy with its switch, which
+    surely costs no more than the budget and the last step.
 
     Args:
         budgets: cost key -> undiscounted cost per episode; an episode that costs exactly this much
