@@ -201,7 +201,8 @@ PARTS = {
         "steps": Key(count(), "steps of each environment until budgets are whole"),
     },
     "EarlyTermination": {
-        "budgets": Key(mapping_of(NOT_NEGATIVE), "cost per episode that ends it if exceeded")
+        "budgets": Key(mapping_of(NOT_NEGATIVE), "cost per episode that ends it if exceeded"),
+        "in_evaluation": Key(boolean, "whether episodes of an evaluation end as well"),
     },
     "ActionFilter": {
         "filter": Key(component, "the function that replaces actions"),

@@ -6,11 +6,12 @@ The best checkpoint, the terminal, the curves and the report all ask here.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from statistics import fmean
 
 __all__ = [
-    *("FINAL_EPOCHS", "final_figures", "judges_another_measure", "keeps", "measured", "shown"),
-    "violation",
+    *("FINAL_EPOCHS", "feasible_return", "final_figures", "judges_another_measure", "keeps"),
+    *("mean_row", "measured", "shown", "violation"),
 ]
 
 FINAL_EPOCHS = 5
@@ -96,6 +97,45 @@ def keeps(row: Mapping[str, float], key: str, limit: float) -> bool:
     estimate = row.get(f"estimate_{key}", -math.inf)
     target = min(limit, row.get(f"target_{key}", limit))
     return violation(row, key, limit) <= 0 and estimate <= target
+
+
+def mean_row(rows: Iterable[Mapping[str, float]]) -> dict[str, float]:
+    """Means of several epochs, by column, over the epochs in which the column has a number.
+
+    Examples:
+        >>> mean_row([{"episode_cost": 20.0}, {"episode_cost": math.nan}, {"episode_cost": 30.0}])
+        {'episode_cost': 25.0}
+    """
+    columns: dict[str, list[float]] = {}
+    for row in rows:
+        for name, value in row.items():
+            columns.setdefault(name, [])
+            if not math.isnan(value):
+                columns[name].append(value)
+    return {name: fmean(values) if values else math.nan for name, values in columns.items()}
+
+
+def feasible_return(
+    latest: Sequence[Mapping[str, float]], limits: Mapping[str, float]
+) -> float | None:
+    """Mean return of a run's latest epochs, if their policies keep every limit, else None.
+
+    Limits are kept by the last epoch and by the mean of all, which is less a matter of luck.
+
+    Args:
+        latest: The epochs' rows, at least one.
+        limits: Cost key -> d, undiscounted cost per episode.
+
+    Examples:
+        >>> rows = [{"episode_return": 4.0, "episode_cost": 29.0}]
+        >>> rows.append({"episode_return": 6.0, "episode_cost": 20.0})
+        >>> feasible_return(rows, {"cost": 25.0}), feasible_return(rows[:1], {"cost": 25.0})
+        (5.0, None)
+    """
+    last, mean = latest[-1], mean_row(latest)
+    # a constrained algorithm says itself what it holds against the limits
+    feasible = all(keeps(row, key, d) for row in (last, mean) for key, d in limits.items())
+    return mean["episode_return"] if feasible and not math.isnan(last["episode_return"]) else None
 
 
 def judges_another_measure(table: Mapping[str, Sequence[float]], key: str, limit: float) -> bool:

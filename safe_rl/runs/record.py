@@ -120,6 +120,13 @@ class RunRecord:
         self._bar.set_postfix(self._shown, refresh=False)
         self._bar.update(int(row["steps"]) - self._bar.n)
 
+    def rows(self) -> list[dict[str, float]]:
+        """Return the epochs that are in the table, by column."""
+        if not self.files.num_rows:
+            return []
+        table = read_table(self.files.table)
+        return [dict(zip(table, row, strict=True)) for row in zip(*table.values(), strict=True)]
+
     def draw_curves(self) -> None:
         """Write ``curves.png`` from the table."""
         table = read_table(self.files.table)

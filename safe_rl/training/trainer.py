@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-import math
 import time
+from collections import deque
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from signal import Signals
+from typing import Any
 
 import torch
 from omegaconf import DictConfig
@@ -23,7 +24,7 @@ from safe_rl.collectors import EpisodeAccounting, Recording, WorkerCollector, ma
 from safe_rl.collectors.workers import MakeEnv
 from safe_rl.runs.checkpoints import CheckpointStore
 from safe_rl.runs.lock import held
-from safe_rl.runs.outcome import keeps
+from safe_rl.runs.outcome import feasible_return
 from safe_rl.runs.record import RunRecord
 from safe_rl.targets import build
 from safe_rl.training.evaluating import Evaluation, MakeEvaluation
@@ -138,6 +139,7 @@ class Trainer:
         self._cost_limits = dict(cost_limits)
         self._frames = config.frames
         self._checkpoint_interval = config.checkpoint.interval
+        self._latest: deque[Any] = deque(maxlen=config.checkpoint.get("best_over", 1))
         self._checkpoints = CheckpointStore(
             folder.files.checkpoints,
             self.components(),
@@ -236,6 +238,7 @@ class Trainer:
         with self.folder.writing(behind, self.progress.steps), StopRequest() as stop:
             if not self.progress.epoch:
                 self._checkpoints.begin()
+            self._latest.extend(self.folder.rows())
             while self.progress.steps < self._frames and not stop.received:
                 row = self.epoch(batches)
                 self.folder.record(row)
@@ -290,9 +293,8 @@ class Trainer:
 
     def _save_if_best(self, row: Mapping[str, float]) -> None:
         """Keep the policy with the highest return among those that kept every limit."""
-        # a constrained algorithm says itself what it holds against the limits
-        feasible = all(keeps(row, key, limit) for key, limit in self._cost_limits.items())
-        if feasible and not math.isnan(row["episode_return"]):
-            self._checkpoints.save_best(
-                self.progress.steps, row["episode_return"], {"epoch": self.progress.epoch}
-            )
+        self._latest.append(row)
+        score = feasible_return(self._latest, self._cost_limits)
+        if score is not None:
+            facts = {"epoch": self.progress.epoch}
+            self._checkpoints.save_best(self.progress.steps, score, facts)
