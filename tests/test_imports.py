@@ -128,7 +128,7 @@ FLOORS = {
         ("",),
     ),
     "models": (
-        ("distributions", "memory", "normalising", "scaling"),
+        ("activations", "distributions", "memory", "normalising", "scaling"),
         ("heads",),
         ("networks", "q_networks"),
         ("behaviour", "encoders"),

@@ -14,6 +14,7 @@ from tensordict.nn import (
 from torch import nn
 from torchrl.data import Composite, TensorSpec
 
+from safe_rl.models.activations import Tanh
 from safe_rl.models.encoders import Body, Observed, observed_entries
 from safe_rl.models.heads import AUTO, Head, make_head
 from safe_rl.models.memory import FEATURES, MEMORY, GatedMemory
@@ -102,7 +103,7 @@ def _recurrent_actor(
     """Hidden layers, the memory, and a linear layer to the head."""
     if not widths:
         raise ValueError("model.hidden_sizes=[]: a memory needs at least one layer before it.")
-    encoder = Chain(_body(observed, widths[-1], widths[:-1], 0, device), nn.Tanh())
+    encoder = Chain(_body(observed, widths[-1], widths[:-1], 0, device), Tanh())
     before: list[TensorDictModuleBase] = [
         TensorDictModule(encoder, in_keys=observed.keys, out_keys=[FEATURES]),
         GatedMemory(widths[-1], remembered, device=device),

@@ -11,6 +11,7 @@ from torch import Tensor, nn
 from torchrl.data import Composite, TensorSpec
 from torchrl.modules import ConvNet
 
+from safe_rl.models.activations import Tanh
 from safe_rl.models.networks import perceptron
 from safe_rl.models.normalising import RunningScale
 from safe_rl.models.scaling import InputScale, input_scale_vector
@@ -149,7 +150,7 @@ def _vector(entry: Entry, observed: Observed, device: torch.device | None) -> nn
     elif scale is not None:
         layers.append(InputScale(scale.to(device)))
     for before, width in zip([size, *widths], widths, strict=False):
-        layers += [*perceptron(before, width, [], None, device), nn.Tanh()]
+        layers += [*perceptron(before, width, [], None, device), Tanh()]
     return nn.Sequential(*layers)
 
 

@@ -20,6 +20,7 @@ from torch import Tensor, nn
 from torchrl.envs.utils import ExplorationType
 from torchrl.modules import MLP
 
+from safe_rl.models.activations import Tanh
 from safe_rl.models.heads import Head, gaussian_head
 from safe_rl.models.scaling import InputScale
 
@@ -53,7 +54,7 @@ def perceptron(
 ) -> nn.Sequential:
     """Tanh perceptron with Glorot-uniform weights, zero biases and a linear output."""
     perceptron = MLP(
-        in_features, out_features, num_cells=list(hidden_sizes), activation_class=nn.Tanh,
+        in_features, out_features, num_cells=list(hidden_sizes), activation_class=Tanh,
         device=device,
     )  # fmt: skip
     for layer in perceptron:
