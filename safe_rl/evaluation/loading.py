@@ -14,7 +14,7 @@ from torchrl.checkpoint import CheckpointError
 from torchrl.envs import EnvBase
 
 from safe_rl.algorithms.parts import find_recipe
-from safe_rl.runs.checkpoints import CheckpointStore
+from safe_rl.runs.checkpoints import CheckpointStore, best_checkpoint
 from safe_rl.runs.files import read_config
 from safe_rl.runs.folder import KINDS, RunFolder
 
@@ -75,7 +75,9 @@ def find_checkpoint(directory: Path, which: str) -> Path:
             )
         return Path(which)
     # readable or not: an older one is not silently put in its place
-    found = {kind: RunFolder(directory).newest_checkpoint(kind) for kind in KINDS}
+    folder = RunFolder(directory)
+    found = {kind: folder.newest_checkpoint(kind) for kind in KINDS}
+    found["best"] = best_checkpoint(folder.checkpoints / "best")
     path = found.pop(which)
     if path is None:
         reason = {

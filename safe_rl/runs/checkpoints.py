@@ -1,4 +1,4 @@
-"""Checkpoints of a run: the last few and the best feasible one, written atomically."""
+"""Checkpoints of a run: the last few and the best feasible ones, written atomically."""
 
 from __future__ import annotations
 
@@ -15,20 +15,37 @@ from safe_rl.algorithms.contract import Stateful
 from safe_rl.runs.archive import read_facts, restore, writer
 from safe_rl.runs.folder import checkpoint_name, checkpoint_steps, checkpoints_in
 
-__all__ = ["CheckpointStore"]
+__all__ = ["CheckpointStore", "best_checkpoint"]
+
+
+def best_checkpoint(directory: Path) -> Path | None:
+    """The checkpoint with the highest score in a folder, of equal ones the newest.
+
+    One that cannot be read counts as the best: another is not silently put in its place.
+    """
+    found = checkpoints_in(directory)
+    return max(found, key=lambda path: (_score(path, otherwise=math.inf), path.name), default=None)
+
+
+def _score(path: Path, otherwise: float = -math.inf) -> float:
+    """What a best checkpoint was kept for; something else of one that does not say."""
+    try:
+        return float(read_facts(path)["score"])
+    except (CheckpointError, KeyError, TypeError, ValueError):
+        return otherwise
 
 
 class CheckpointStore:
     """The checkpoints in a run's folder.
 
-    ``last/`` keeps the newest, ``best/`` the one with the highest return among those in which
-    every cost was within its limit. Names carry the number of environment steps.
+    ``last/`` keeps the newest, ``best/`` those with the highest returns among those in which every
+    cost was within its limit. Names carry the number of environment steps.
 
     Args:
         directory: Folder of the checkpoints.
         components: Parts of the run, by name.
         keep_last: Number of newest checkpoints to keep.
-        keep_best: Number of best checkpoints to keep; each was the best when it was written.
+        keep_best: Number of best checkpoints to keep.
         run: JSON-compatible facts of the run that every checkpoint holds: one with others is not
             resumed from.
 
@@ -76,45 +93,40 @@ class CheckpointStore:
             steps: Environment steps so far.
             facts: JSON-compatible facts, readable without loading.
         """
-        path = self._save(self.last, steps, facts, self._keep_last)
+        path = self._write(self.last, steps, facts)
+        others = [other for other in checkpoints_in(self.last) if other != path]
+        for old in others[: max(0, len(others) + 1 - self._keep_last)]:
+            old.unlink()
         self._none_yet.unlink(missing_ok=True)
         return path
 
     def save_best(self, steps: int, score: float, facts: Mapping[str, Any] | None = None) -> bool:
-        """Write a checkpoint if ``score`` is higher than that of the best one.
+        """Write a checkpoint if there is room, or if ``score`` is higher than that of a kept one.
 
         Returns:
             Whether it was written.
         """
-        if not score > self._best_score():
+        scores = sorted(filter(math.isfinite, map(_score, checkpoints_in(self.best))))
+        if len(scores) >= self._keep_best and not score > scores[-self._keep_best]:
             return False
-        self._save(self.best, steps, {**(facts or {}), "score": score}, self._keep_best)
+        path = self._write(self.best, steps, {**(facts or {}), "score": score})
+        others = [other for other in checkpoints_in(self.best) if other != path]
+        others.sort(key=_score, reverse=True)
+        for worse in others[self._keep_best - 1 :]:
+            worse.unlink()
         return True
 
-    def _best_score(self) -> float:
-        for path in reversed(checkpoints_in(self.best)):
-            try:
-                return float(read_facts(path)["score"])
-            except (CheckpointError, KeyError, TypeError, ValueError):
-                continue
-        return -math.inf
-
-    def _save(
-        self, directory: Path, steps: int, facts: Mapping[str, Any] | None, keep: int
-    ) -> Path:
+    def _write(self, directory: Path, steps: int, facts: Mapping[str, Any] | None) -> Path:
         path = directory / checkpoint_name(steps)
         facts = {**(facts or {}), **({"run": self._run} if self._run else {})}
         self._writer.save(path, metadata=facts)
-        others = [other for other in checkpoints_in(directory) if other != path]
-        for old in others[: max(0, len(others) + 1 - keep)]:
-            old.unlink()
         return path
 
     def resume(self, epochs: int = 0) -> Path | None:
         """Restore the newest checkpoint, or with a warning the next older one if it is damaged.
 
-        The best one goes if it is newer than the restored: what it was the best of is forgotten.
-        So do the beginnings of checkpoints during whose writing the run was killed.
+        Best ones go that are newer than the restored: what they were the best of is forgotten. So
+        do the beginnings of checkpoints during whose writing the run was killed.
 
         Args:
             epochs: Rows of the run's table.

@@ -12,7 +12,7 @@ from torch import nn
 from torchrl.checkpoint import Checkpoint, CheckpointError, StateDictCheckpointAdapter
 
 from safe_rl.runs.archive import read_facts, writer
-from safe_rl.runs.checkpoints import CheckpointStore
+from safe_rl.runs.checkpoints import CheckpointStore, best_checkpoint
 from safe_rl.runs.folder import checkpoint_steps, checkpoints_in
 
 
@@ -60,6 +60,17 @@ def test_the_best_one_is_replaced_only_by_a_better_one(tmp_path):
     restored = parts(0)
     CheckpointStore.load(best, restored)
     assert restored["counter"].value == 3
+
+
+def test_several_best_ones_are_those_with_the_highest_scores(tmp_path):
+    store = CheckpointStore(tmp_path, parts(1), keep_last=1, keep_best=2)
+    scores = ((1, 3.0), (2, 9.0), (3, 5.0), (4, 4.0), (5, 9.0), (6, 9.0))
+    assert [store.save_best(*one) for one in scores] == [True, True, True, False, True, False]
+    assert [checkpoint_steps(path) for path in checkpoints_in(store.best)] == [2, 5]
+    assert checkpoint_steps(best_checkpoint(store.best)) == 5
+    (store.best / "checkpoint-000000000001.torchrl").write_text("damaged")
+    assert checkpoint_steps(best_checkpoint(store.best)) == 1
+    assert best_checkpoint(tmp_path / "none") is None
 
 
 def test_a_part_can_be_restored_alone(tmp_path):
