@@ -1,4 +1,4 @@
-"""Seconds of training and testing until the first policy that is good and surely safe.
+r"""Seconds of training and testing until the first policy that is good and surely safe.
 
 After an epoch whose estimates keep every limit and whose last three returns reach the target, the
 policy is tested on fresh episodes: it passes if its mean return reaches the target and the upper
@@ -7,6 +7,9 @@ so that passing means something however often it was tried. Seconds are those of
 the tests, from the first step; starting Python and compiling come on top.
 
     python benchmarks/time_to_safe.py env=PointGoal1 algo=ppo_lagrangian --seeds 0 1 2 3 4
+    python benchmarks/time_to_safe.py env=PointGoal1 algo=trpo transforms=[early_termination] \
+        transforms.early_termination.in_evaluation=true \
+        transforms.early_termination.budgets='{cost: 24}' --seeds 0 1 2 3 4
 """
 
 import argparse
@@ -34,7 +37,7 @@ def is_promising(rows, limits, target):
 def passes(config, policy, claim, options, number):
     """Test a policy; returns its mean return, whether it passes, and the bounds."""
     worlds = {"num_envs": min(100, options.episodes), "seed": config.seed + 10**6 + number}
-    test = new_env(OmegaConf.merge(config, worlds))
+    test = new_env(OmegaConf.merge(config, worlds), evaluating=True)
     episodes = collect_episodes(
         test, policy, options.episodes, list(claim.limits), deterministic=False
     )

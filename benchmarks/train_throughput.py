@@ -16,6 +16,7 @@ from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 
 from safe_rl.envs import make_env, store_configs
+from safe_rl.evaluation.loading import transforms_of
 from safe_rl.training.trainer import build_trainer, seed_everything
 
 CONF = Path(__file__).resolve().parents[1] / "conf"
@@ -27,13 +28,15 @@ def compose_config(overrides):
         return compose("config", overrides=[*overrides, "logger=none"])
 
 
-def new_env(config):
+def new_env(config, evaluating=False):
     return make_env(
         OmegaConf.to_container(config.env, resolve=True),
         num_envs=config.num_envs,
         device=config.device,
         seed=config.seed,
         num_threads=config.num_threads or 0,
+        transforms=transforms_of(config),
+        evaluating=evaluating,
     )
 
 
