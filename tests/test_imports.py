@@ -45,7 +45,7 @@ FLOORS = {
     "envs": (
         ("errors", "opengl", "rng", "states", "physics", "physics.base"),
         ("costs", "physics.cpu", "physics.dynamics"),
-        ("contract",),
+        ("contract", "cost_specs"),
         ("simulated",),
         # Safety Gym: records, then rules, then worlds, and what is seen of them.
         ("safety_gym.records", "safety_gym.records.values", "safety_gym.geometry"),

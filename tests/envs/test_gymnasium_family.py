@@ -210,3 +210,13 @@ def test_registered_arguments_and_limits_are_kept():
     assert rollout.shape == (2, 3)
     assert rollout["next", "truncated"][:, -1].all()
     assert make_env({**NODE, "num_steps": 2}, seed=0).rollout(10).shape == (1, 2)
+
+
+def test_costs_of_ranges_are_bounded_in_the_spec():
+    node = {"id": "CartPole-v1", "num_steps": 10, "outside": {"cost_a": [0, -1, 1]}}
+    env = make_env({"_target_": "safe_rl.envs.gymnasium.make_gymnasium"} | node, num_envs=2, seed=0)
+    assert [env.full_reward_spec[key].high.max().item() for key in env.cost_keys] == [1.0, 1.0]
+    node["outside"] |= {"cost_b": [2, -0.1, 0.1]}
+    env = make_env({"_target_": "safe_rl.envs.gymnasium.make_gymnasium"} | node, num_envs=2, seed=0)
+    assert [env.full_reward_spec[key].high.max().item() for key in env.cost_keys] == [2.0, 1.0, 1.0]
+    check_env_specs(env)

@@ -11,6 +11,7 @@ import pytest
 import torch
 import torchrl_envs
 import yaml
+from torchrl.data import Unbounded
 from torchrl.envs import PendulumEnv
 from torchrl.envs.utils import check_env_specs
 
@@ -271,3 +272,11 @@ def test_only_what_was_imported_is_reached(trusted):
     with pytest.raises(TargetError, match=r"env\.id=torchrl\.envs.*import=torchrl\.envs"):
         make_env(PENDULUM | {"id": "torchrl.envs.DMControlEnv"})
     assert complete_env(RUNNER)["cost_keys"] == ["cost_effort"]
+
+
+def test_costs_of_ranges_are_bounded_in_the_spec_and_others_are_not():
+    env = make_env(PENDULUM, num_envs=2, seed=0)
+    bounds = {key: env.full_reward_spec[key].high.max().item() for key in env.cost_keys}
+    assert bounds == dict.fromkeys(["cost", *OUTSIDE], 1.0)
+    own = make_env(PENDULUM | {"outside": None, "cost": "torchrl_envs:kinds"}, num_envs=2, seed=0)
+    assert all(isinstance(own.full_reward_spec[key], Unbounded) for key in own.cost_keys)

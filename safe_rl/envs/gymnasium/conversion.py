@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from multiprocessing import current_process
 from typing import Any
@@ -12,10 +12,11 @@ import numpy as np
 import torch
 from gymnasium.vector import AutoresetMode, SyncVectorEnv, VectorEnv
 from tensordict import TensorDictBase
-from torchrl.data import Composite, Unbounded
+from torchrl.data import Bounded, Composite, TensorSpec
 from torchrl.envs import GymWrapper, Transform, TransformedEnv
 from torchrl.envs.gym_like import BaseInfoDictReader
 
+from safe_rl.envs.cost_specs import cost_spec
 from safe_rl.envs.costs import COST, is_cost
 from safe_rl.envs.gymnasium.adapting import adapt, check_workers, columns_of
 from safe_rl.envs.gymnasium.processes import ProcessVectorEnv
@@ -29,11 +30,18 @@ class CostReader(BaseInfoDictReader):
     Args:
         cost_keys: names in `info`.
         batch_size: [N], or [] of a single environment.
+        highest: name -> the most that a step can cost, where that is known.
     """
 
-    def __init__(self, cost_keys: Sequence[str], batch_size: Sequence[int]) -> None:
+    def __init__(
+        self,
+        cost_keys: Sequence[str],
+        batch_size: Sequence[int],
+        highest: Mapping[str, float] | None = None,
+    ) -> None:
         self._cost_keys = list(cost_keys)
         self._shape = (*batch_size, 1)
+        self._highest = dict(highest or {})
 
     def __call__(self, info_dict: dict[str, Any], tensordict: TensorDictBase) -> TensorDictBase:
         """Write the costs of a step."""
@@ -45,7 +53,7 @@ class CostReader(BaseInfoDictReader):
     @property
     def info_spec(self) -> Composite:
         """Shapes and types of the costs."""
-        costs = {key: Unbounded(shape=self._shape) for key in self._cost_keys}
+        costs = {key: cost_spec(self._highest.get(key), self._shape) for key in self._cost_keys}
         return Composite(costs, shape=self._shape[:-1])
 
 
@@ -84,7 +92,7 @@ class CostsAsRewards(Transform):
             rewards[key] = observations[key]
             del observations[key]
         if self._sums:
-            rewards[COST] = rewards[self._cost_keys[0]].clone()
+            rewards[COST] = _spec_of_sum([rewards[key] for key in self._cost_keys])
         return output_spec
 
 
@@ -148,6 +156,7 @@ def from_gymnasium(
     workers: int = 0,
     device: torch.device | str = "cpu",
     flatten: bool = True,
+    highest_costs: Mapping[str, float] | None = None,
     **kwargs: Any,
 ) -> GymnasiumEnv:
     """Make a TorchRL environment of any Gymnasium environment that reports costs in `info`.
@@ -168,6 +177,8 @@ def from_gymnasium(
         device: where the TensorDicts live.
         flatten: make one vector of every observation; False leaves pictures and dictionaries of
             vectors and pictures as they are, and refuses other observations that are no arrays.
+        highest_costs: cost key -> the most that a step can cost, where that is known; the specs
+            say so then, and certificates use it.
         kwargs: for `gymnasium.make`, with an id.
 
     Returns:
@@ -194,7 +205,7 @@ def from_gymnasium(
         worlds = ProcessVectorEnv(make_adapted, num_envs, min(workers, num_envs), keys)
     else:
         worlds = SyncVectorEnv([make_adapted] * num_envs, autoreset_mode=AutoresetMode.DISABLED)
-    return from_vector(worlds, keys, length, seed=seed, device=device)
+    return from_vector(worlds, keys, length, seed=seed, device=device, highest_costs=highest_costs)
 
 
 def from_vector(
@@ -204,6 +215,7 @@ def from_vector(
     *,
     seed: int | None = None,
     device: torch.device | str = "cpu",
+    highest_costs: Mapping[str, float] | None = None,
 ) -> GymnasiumEnv:
     """Make a TorchRL environment of a batch whose observations and actions suit networks.
 
@@ -213,9 +225,10 @@ def from_vector(
         num_steps: the largest number of steps of an episode.
         seed: of all environments.
         device: where the TensorDicts live.
+        highest_costs: cost key -> the most that a step can cost, where that is known.
     """
     base = GymWrapper(worlds, device=torch.device(device), categorical_action_encoding=True)
-    base.set_info_dict_reader(CostReader(cost_keys, [worlds.num_envs]))
+    base.set_info_dict_reader(CostReader(cost_keys, [worlds.num_envs], highest_costs))
     batch = GymnasiumEnv(base, cost_keys, num_steps)
     batch.set_seed(int(torch.randint(2**31, ())) if seed is None else seed)
     return batch
@@ -236,6 +249,12 @@ def describe(
         return keys, _episode_length(adapted, num_steps)
     finally:
         probe.close()
+
+
+def _spec_of_sum(specs: Sequence[TensorSpec]) -> TensorSpec:
+    highest = [float(spec.high.max()) for spec in specs if isinstance(spec, Bounded)]
+    is_known = len(highest) == len(specs)
+    return cost_spec(sum(highest) if is_known else None, specs[0].shape, specs[0].device)
 
 
 def _make_adapted(make: MakeEnv, num_steps: int, flatten: bool) -> gymnasium.Env:

@@ -51,6 +51,7 @@ def make_gymnasium(
             workers=config["workers"],
             flatten=config["flatten"],
             device=device,
+            highest_costs=dict.fromkeys(config["outside"] or {}, 1.0),
         )
     except (gymnasium.error.Error, TypeError, ValueError) as error:
         raise ConfigError(f"env.id={config['id']}: {error}") from error

@@ -13,9 +13,10 @@ from typing import Any
 import torch
 from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
-from torchrl.data import Composite, Unbounded
+from torchrl.data import Composite
 from torchrl.envs.transforms import Transform
 
+from safe_rl.envs.cost_specs import cost_spec, highest_costs
 from safe_rl.envs.costs import COST, is_cost
 from safe_rl.envs.errors import ConfigError, nearest
 from safe_rl.envs.torchrl.outside import Range, parse_outside
@@ -78,7 +79,7 @@ class StepCosts:
         function: CostFunction | None,
     ) -> None:
         self.entries = list(entries)
-        self._ranges = parse_outside(outside or {})
+        self.ranges = parse_outside(outside or {})
         self._function = function
 
     def __call__(self, step: TensorDictBase) -> dict[str, Tensor]:
@@ -88,7 +89,7 @@ class StepCosts:
             ConfigError: for an entry that there is not, or what is no cost of N rows.
         """
         found = [(name.rpartition(".")[2], _entry(step, name)) for name in self.entries]
-        found += [(name, _outside(step, row)) for name, row in self._ranges.items()]
+        found += [(name, _outside(step, row)) for name, row in self.ranges.items()]
         if self._function is not None:
             own = self._function(step)
             found += _own(own)
@@ -170,6 +171,8 @@ class CostsBesideRewards(Transform):
             for key in self._taken:
                 if key in spec.keys(True):
                     del spec[key]
+        highest = highest_costs(self._names, self._costs.ranges)
         for name in self._names:
-            rewards[name] = Unbounded((*rewards.shape, 1), device=rewards.device)
+            shape = (*rewards.shape, 1)
+            rewards[name] = cost_spec(highest.get(name), shape, rewards.device)
         return output_spec
