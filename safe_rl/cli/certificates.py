@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 import shlex
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
 from pathlib import Path
+from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
 
 from safe_rl.cli.conf import CONF
+from safe_rl.cli.keys import KEYS
 from safe_rl.cli.robots import maker_of
 from safe_rl.evaluation import Certificate, CertificateOptions, certify
 from safe_rl.evaluation.loading import load_config
+from safe_rl.naming import did_you_mean
 
 __all__ = [
     *("certificate_options", "certify_run", "is_to_keep_limits", "is_worth_a_certificate"),
@@ -20,28 +23,61 @@ __all__ = [
 
 
 def certify_run(
-    directory: Path, *, num_threads: int = 0, progress: bool = True
+    directory: Path,
+    *,
+    num_threads: int = 0,
+    progress: bool = True,
+    changes: Mapping[str, Any] | None = None,
 ) -> Certificate | None:
-    """:func:`safe_rl.evaluation.certify` with the options of the run's own configuration."""
+    """:func:`safe_rl.evaluation.certify` with the options of the run's own configuration.
+
+    Args:
+        directory: Folder of the run.
+        num_threads: Threads that step environments; 0 is one per core.
+        progress: Whether to show a bar.
+        changes: Options to replace, such as ``{"episodes": 2000}``.
+
+    Raises:
+        ValueError: If an option does not exist, or cannot have its value.
+    """
     return certify(
         directory,
-        certificate_options(load_config(directory)),
+        certificate_options(load_config(directory), changes or {}),
         make_env=maker_of(directory),
         num_threads=num_threads,
         progress=progress,
     )
 
 
-def certificate_options(config: DictConfig) -> CertificateOptions:
+def certificate_options(
+    config: DictConfig, changes: Mapping[str, Any] | None = None
+) -> CertificateOptions:
     """What is certified of a run: what its section ``certificate`` says, and its limit on shares.
 
     A run that was to keep a share of episodes (``risk=chance``) is not certified without it. Runs
     of before there were certificates get the package's options.
     """
     options = dict(OmegaConf.load(CONF / "config.yaml").certificate)
-    options |= config.get("certificate") or {}
+    own = dict(config.get("certificate") or {})
+    if not own.get("episodes", 1):  # the run was to end without a certificate
+        del own["episodes"]
+    options |= own
+    for name, value in (changes or {}).items():
+        _check_change(name, value, options)
+    options |= changes or {}
     share = (config.get("risk") or {}).get("most_over", 1.0)
     return CertificateOptions(**options | {"most_over": min(options["most_over"], share)})
+
+
+def _check_change(name: str, value: Any, known: Collection[str]) -> None:
+    if name not in known:
+        raise ValueError(
+            f"There is no certificate.{name}.{did_you_mean(name, known)} There are: "
+            f"{', '.join(known)}."
+        )
+    values = KEYS[f"certificate.{name}"].values
+    if not values.hold(value) or (name == "episodes" and not value):
+        raise ValueError(f"certificate.{name}={value}: it must be {values.words}, and not 0.")
 
 
 def is_to_keep_limits(config: DictConfig, cost_keys: Collection[str]) -> bool:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Sequence
+from dataclasses import fields
 from pathlib import Path
 
 from torchrl.checkpoint import CheckpointError
@@ -14,7 +15,7 @@ from safe_rl.cli.options import OptionError, parse_options, usage
 from safe_rl.cli.robots import maker_of
 from safe_rl.cli.user_code import check_imports, import_modules, split_imports
 from safe_rl.cli.variations import evaluate_varied, table_of
-from safe_rl.envs import ConfigError, OpenGLError
+from safe_rl.envs import ConfigError, LayoutError, OpenGLError
 from safe_rl.evaluation import Evaluation, EvaluationOptions, evaluate
 from safe_rl.evaluation.loading import load_config
 from safe_rl.evaluation.summary import format_estimates
@@ -27,7 +28,13 @@ COMMAND = "python -m safe_rl.evaluate"
 def evaluate_run(
     directory: Path, options: EvaluationOptions, *, progress: bool = False
 ) -> Evaluation:
-    """:func:`safe_rl.evaluation.evaluate` with this package's environments and benchmark."""
+    """:func:`safe_rl.evaluation.evaluate` with this package's environments and benchmark.
+
+    Raises:
+        ValueError: If the options ask for something else than an evaluation.
+    """
+    if options.certify or options.variations is not None:
+        raise ValueError("evaluate: certificates are made by certify(), variations by vary(…).")
     return evaluate(
         directory, options, make_env=maker_of(directory), suite=suite(), progress=progress
     )
@@ -45,7 +52,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
         check_imports(load_config(directory), modules, directory)
         import_modules(modules or ())
         if options.certify:
-            certificate = certify_run(directory, num_threads=options.num_threads)
+            _refuse_beside_certify(options)
+            certificate = certify_run(
+                directory, num_threads=options.num_threads, changes=options.certificate
+            )
             print(certificate or "Nothing to certify: the run has no limits, or no checkpoints.")
             return 0 if certificate is not None and certificate.checkpoint is not None else 1
         if options.variations is not None:
@@ -54,13 +64,25 @@ def main(arguments: Sequence[str] | None = None) -> int:
             return 0
         result = evaluate_run(directory, options, progress=True)
     except (
-        *(OptionError, ConfigError, CheckpointError, OpenGLError),
+        *(OptionError, ConfigError, CheckpointError, LayoutError, OpenGLError),
         *(FileNotFoundError, ModuleNotFoundError, ValueError),
     ) as error:
         print(f"error: {error}", file=sys.stderr)
         return 1
     print(_report(result))
     return 0
+
+
+def _refuse_beside_certify(options: EvaluationOptions) -> None:
+    """A certificate is of the run's own problem: what else is asked for would have no effect."""
+    heeded = ("certify", "certificate", "num_threads")
+    plain = EvaluationOptions()
+    for field in fields(options):
+        if field.name not in heeded and getattr(options, field.name) != getattr(plain, field.name):
+            raise OptionError(
+                f"{field.name}: certify=true does not heed it. A certificate is of the run's own "
+                "environment, and takes certificate.episodes=… and the like, and num_threads=…"
+            )
 
 
 def _report(result: Evaluation) -> str:

@@ -50,6 +50,9 @@ class Key(NamedTuple):
 
 
 _LIMITS = mapping_of(number(0))
+_FOLDER_OF_ENV = folder_name._replace(
+    words=f"{folder_name.words}: it names folders, and env.name=… gives another name"
+)
 _SECTION = mapping_of(anything)
 _WIDTH = count(1, 16_384)
 _WIDTHS = list_of(_WIDTH, 32)
@@ -83,7 +86,7 @@ KEYS = {
         mapping_of(component), "what changes the problem: transforms=[saute]", may_lack=True
     ),
     "logger": Key(_SECTION, "what is logged besides the table: logger=none for nothing"),
-    "env.name": Key(folder_name, "name of the environment"),
+    "env.name": Key(_FOLDER_OF_ENV, "name of the environment"),
     "algo.name": Key(folder_name, "name of the algorithm"),
     "checkpoint.interval": Key(number(0), "seconds between checkpoints"),
     "checkpoint.keep_last": Key(count(1, 10_000), "checkpoints that are kept besides the best"),

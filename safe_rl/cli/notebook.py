@@ -12,6 +12,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
+from signal import Signals
 from typing import Any
 
 import torch
@@ -30,7 +31,7 @@ from safe_rl.cli.running import complete, prepare
 from safe_rl.cli.user_code import check_imports, import_modules, note_imports, quote
 from safe_rl.cli.variations import evaluate_varied
 from safe_rl.envs import store_configs
-from safe_rl.evaluation import Evaluation, EvaluationOptions
+from safe_rl.evaluation import Certificate, Evaluation, EvaluationOptions
 from safe_rl.evaluation.layouts import default_seed
 from safe_rl.evaluation.loading import (
     evaluated,
@@ -120,11 +121,25 @@ class Run:
 
         Args:
             options: Those of :class:`safe_rl.evaluation.EvaluationOptions`, such as
-                ``episodes=100``.
+                ``episodes=100``; keys of the environment as ``env={"hazards_num": 12}``.
         """
         return evaluate_run(
             self.directory, EvaluationOptions(**{"checkpoint": self.checkpoint, **options})
         )
+
+    def certify(self, **changes: Any) -> Certificate | None:
+        """Find its best checkpoint that surely keeps the limits, as at the end of training.
+
+        Args:
+            changes: Keys of the section ``certificate`` to replace, such as ``episodes=2000``.
+
+        Returns:
+            The certificate; None if the run has no limits or no checkpoints.
+
+        Raises:
+            ValueError: If there is no such key, or it cannot have the value.
+        """
+        return certify_run(self.directory, changes=changes)
 
     def vary(self, variations: Any, **options: Any) -> Varied:
         """Run the policy under variations of its environment; writes what the command writes.
@@ -164,6 +179,8 @@ def train(
     Raises:
         ValueError: If a setting cannot be; the message names it.
         FileExistsError: If the folder holds a run.
+        KeyboardInterrupt: After Ctrl-C, when the epoch at hand has its checkpoint; the command
+            ``python train.py resume=…`` goes on from there.
 
     Examples:
         >>> small = {"num_envs": 2, "frames_per_batch": 40, "env.num_steps": 20, "logger": "none"}
@@ -194,6 +211,11 @@ def train(
     finally:
         if is_new and not has_begun:
             shutil.rmtree(folder, ignore_errors=True)
+    if trainer.interrupted_by is not None:
+        print(f"Interrupted. Continue with: python train.py resume={folder}")
+        if trainer.interrupted_by is Signals.SIGINT:
+            raise KeyboardInterrupt
+        raise SystemExit(128 + trainer.interrupted_by)
     if is_to_keep_limits(config, trainer.algorithm.cost_keys) and is_worth_a_certificate(
         config, trainer.episode_length
     ):
@@ -226,11 +248,15 @@ def load(directory: str | Path, checkpoint: str = "last", imports: Sequence[str]
     return run
 
 
+# mappings that are given all at once
+_WHOLE = ("cost_limits", "model.input_scale", "env.outside", "env.kwargs")
+
+
 def _overrides(settings: Mapping[str, Any], prefix: str = "") -> Iterator[str]:
     """Settings in Hydra's grammar, which is nearly JSON's."""
     for name, value in settings.items():
         key = f"{prefix}{name}"
-        if isinstance(value, Mapping) and key != "cost_limits":  # which are given all at once
+        if isinstance(value, Mapping) and key not in _WHOLE:
             yield from _overrides(value, f"{key}.")
         else:
             yield f"{key}={_literal(value)}"
@@ -243,7 +269,8 @@ def _literal(value: Any) -> str:
         return "[" + ",".join(map(_literal, value)) + "]"
     if isinstance(value, str | Path):
         return quote(str(value))
-    return json.dumps(value)
+    # numbers of NumPy and torch are not JSON's
+    return json.dumps(value.item() if hasattr(value, "item") else value)
 
 
 def _compose(overrides: list[str]) -> DictConfig:

@@ -175,10 +175,12 @@ def explain(
     if key is None or given is None:
         return _of_a_choice(words, choices, compose)
     others = [choice for choice in choices if choice != given]
+    # with all that is right, for what refers to it: the name of env=gymnasium is its env.id
+    right = [text for text in overrides if text != given]
     try:
-        values = plain(compose(others))
+        values = plain(compose(right))
     except COMPOSING_ERRORS as another:
-        return explain(another, others, others, compose)
+        return explain(another, right, others, compose)
     inner = _quoted(r"full_key: (\S+)", str(error.__cause__))
     if inner is not None and inner.startswith(f"{key}."):
         section, _, name = inner.rpartition(".")

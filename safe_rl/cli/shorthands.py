@@ -23,6 +23,7 @@ __all__ = ["expand_arguments"]
 
 # of Hydra, that would make it read another configuration than the run's
 _OTHER_CONFIGURATIONS = ("--config-path", "-cp", "--config-name", "-cn")
+_FLAGS_WITH_VALUE = (*_OTHER_CONFIGURATIONS, "--config-dir", "-cd", "--package", "-p")
 _JOBLIB = "hydra_plugins.hydra_joblib_launcher"
 
 
@@ -43,7 +44,7 @@ def expand_arguments(arguments: Sequence[str]) -> list[str]:
         >>> expand_arguments(["-m", "slate=SGDoggo", "seed=0"])[1]
         'env=DoggoGoal1,DoggoGoal2,DoggoButton1,DoggoButton2,DoggoPush1,DoggoPush2'
     """
-    expanded = list(arguments)
+    expanded = _flags_first(arguments)
     for name, expand in _SHORTHANDS.items():
         given = [a for a in expanded if a.lstrip("+").startswith(f"{name}=")]
         if len(given) > 1:
@@ -52,6 +53,25 @@ def expand_arguments(arguments: Sequence[str]) -> list[str]:
             others = [argument for argument in expanded if argument != given[0]]
             expanded = expand(given[0].partition("=")[2], others)
     return _with_launcher(expanded)
+
+
+def _flags_first(arguments: Sequence[str]) -> list[str]:
+    """Flags, each in one word with its value, and then overrides: Hydra wants these in one piece.
+
+    Examples:
+        >>> _flags_first(["seed=0,1", "-m", "--config-dir", "mine", "algo=cpo"])
+        ['-m', '--config-dir=mine', 'seed=0,1', 'algo=cpo']
+    """
+    flags: list[str] = []
+    overrides: list[str] = []
+    words = iter(arguments)
+    for word in words:
+        if word in _FLAGS_WITH_VALUE:
+            value = next(words, None)
+            flags.append(word if value is None else f"{word}={value}")
+        else:
+            (flags if word.startswith("-") else overrides).append(word)
+    return [*flags, *overrides]
 
 
 def _with_launcher(arguments: list[str]) -> list[str]:

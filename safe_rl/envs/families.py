@@ -1,7 +1,8 @@
 """Families of environments: from a node of the configuration, or a name, to an environment.
 
-The key `_target_` of a node names its family: a function or class that is called with the node's
-other keys, and `num_envs`, `device`, `seed` and `num_threads`. A node without one is Safety Gym's.
+The key `_target_` of a node names its family: a function or class that is called with a mapping of
+the node's other keys, and `num_envs=`, `device=`, `seed=` and `num_threads=`. A node without one is
+Safety Gym's.
 """
 
 from __future__ import annotations

@@ -58,6 +58,10 @@ class EvaluationOptions:
     certify: bool = _option(
         False, "find the best checkpoint that surely keeps the limits, instead of evaluating one"
     )
+    certificate: dict[str, Any] = field(
+        default_factory=dict,
+        metadata={"help": "with certify=true: certificate.episodes=2000, as in training"},
+    )
     name: str = _option("", "told apart by it, several evaluations of a run can stand side by side")
     variations: Any = field(
         default=None,
@@ -80,6 +84,8 @@ def check_options(options: EvaluationOptions) -> None:
         if value is not None and not lowest <= value <= highest:
             raise ValueError(f"{name}={value}: at least {lowest} and at most {highest:,}.")
     check_share(options.cvar_alpha)
+    if options.certificate and not options.certify:
+        raise ValueError("certificate.…: it is the certificate's: add certify=true.")
     if "/" in options.name or not options.name.isprintable():
         raise ValueError(f"name={options.name}: it is part of the files' names, without /.")
     films = options.video or options.picture

@@ -40,3 +40,16 @@ def test_runs_of_before_certificates_and_measures_get_the_packages_options():
 def test_a_budget_of_a_transform_is_a_limit_to_keep(overrides, cost_keys, is_to):
     config = compose_config("algo=ppo", *overrides)
     assert is_to_keep_limits(config, cost_keys) == is_to
+
+
+def test_options_are_replaced_and_wrong_ones_named():
+    config = compose_config("algo=cpo", "certificate.episodes=0", "certificate.tests=2")
+    assert certificate_options(config, {"level": 0.99}).level == 0.99
+    # such a run ended without one; who asks for one gets the package's number
+    assert certificate_options(config).episodes == compose_config().certificate.episodes
+    assert certificate_options(config).tests == 2
+    with pytest.raises(ValueError, match=r"no certificate\.episode\. Did you mean 'episodes'"):
+        certificate_options(config, {"episode": 10})
+    for changes in ({"episodes": 0}, {"level": 1.5}):
+        with pytest.raises(ValueError, match="it must be"):
+            certificate_options(config, changes)

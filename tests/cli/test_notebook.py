@@ -1,9 +1,11 @@
 """The way in from Python does what the commands do, whatever state Hydra is in."""
 
 import math
+import signal
 import subprocess
 import sys
 
+import numpy as np
 import pytest
 import torch
 from hydra import compose, initialize_config_dir
@@ -15,6 +17,7 @@ import safe_rl
 from safe_rl.cli.notebook import _overrides
 from safe_rl.envs import ConfigError
 from safe_rl.runs.table import read_table
+from safe_rl.training.trainer import Trainer
 
 SMALL = {
     **{"num_envs": 2, "frames_per_batch": 40, "env.num_steps": 20, "logger": "none"},
@@ -112,3 +115,33 @@ def test_strange_texts_arrive_as_they_are(text):
     parsed = OverridesParser.create().parse_override(override)
     assert parsed.key_or_group == "a.b"
     assert parsed.value() == [text, {"c": text}]
+
+
+def test_a_run_is_certified_and_what_is_no_evaluation_refused(run):
+    certificate = run.certify(ranking=2, episodes=4, tests=1)
+    assert certificate.options.episodes == 4
+    assert (run.directory / "certificate.json").is_file()
+    with pytest.raises(ValueError, match="made by certify"):
+        run.evaluate(certify=True)
+    with pytest.raises(ValueError, match=r"variations by vary"):
+        run.evaluate(variations="dynamics")
+
+
+def test_an_interrupted_run_says_how_to_go_on(tmp_path, monkeypatch, capsys):
+    def epoch_that_is_stopped(trainer, batches):
+        signal.raise_signal(signal.SIGINT)
+        return own(trainer, batches)
+
+    own = Trainer.epoch
+    monkeypatch.setattr(Trainer, "epoch", epoch_that_is_stopped)
+    small = {**SMALL, "certificate.episodes": 1}
+    with pytest.raises(KeyboardInterrupt):
+        safe_rl.train("PointGoal0", algo="cpo", frames=400, directory=tmp_path / "run", **small)
+    assert f"resume={tmp_path / 'run'}" in capsys.readouterr().out
+    assert not (tmp_path / "run" / "certificate.json").exists()
+    assert len(read_table(tmp_path / "run" / "progress.csv")["steps"]) == 1
+
+
+def test_mappings_that_go_together_and_numbers_of_numpy_are_written_as_hydra_takes_them():
+    given = {"env.outside": {"cost_a": [0, -1, 1]}, "seed": np.int64(3)}
+    assert list(_overrides(given)) == ["env.outside={cost_a:[0,-1,1]}", "seed=3"]

@@ -234,3 +234,8 @@ def test_every_key_of_the_files_can_be_overridden_by_its_own_value():
     config = OmegaConf.load(CONF / "policy_update" / "ppo" / "default.yaml")
     keys = {"optimizer.lr": config.optimizer.lr, "adapt_rate.factor": config.adapt_rate.factor}
     check_command([f"policy_update.{key}={value}" for key, value in keys.items()], CONF)
+
+
+def test_a_wrong_key_beside_a_name_that_others_refer_to():
+    with pytest.raises(CommandLineError, match=r"nothing reads 'env\.cost_kyes'.*env\.cost_keys"):
+        check_command(["env=gymnasium", "env.id=CartPole-v1", "env.cost_kyes=[cost_a]"], CONF)

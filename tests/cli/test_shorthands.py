@@ -73,6 +73,14 @@ def test_a_slate_is_its_environments(shorthand):
     assert expanded[:3] == ["-m", f"env={','.join(SLATES['SG6'])}", "algo=ppo,cpo"]
 
 
+def test_flags_may_stand_anywhere_and_keep_their_values(run, tmp_path):
+    given = ["seed=0,1", "-m", "slate=SG6", "--config-dir", "mine", "hydra/launcher=basic"]
+    assert expand_arguments(given)[:2] == ["-m", "--config-dir=mine"]
+    resumed = expand_arguments([f"resume={run}", "--config-dir", str(tmp_path), "frames=9"])
+    assert resumed[-1] == "frames=9"
+    assert f"--config-dir={tmp_path}" in resumed
+
+
 def test_slates_that_cannot_be_written_out():
     with pytest.raises(CommandLineError, match="Did you mean 'SGPoint'"):
         expand_arguments(["-m", "slate=Point"])

@@ -107,3 +107,25 @@ def test_from_an_environment_and_an_algorithm_of_ones_own_to_the_table(place):
         assert {"episode_cost_speed", "episode_cost_hazards", "policy_loss_penalty"} <= set(
             csv.DictReader(file).fieldnames or ()
         )
+
+
+def test_a_simulator_of_ones_own_is_trained_on(place):
+    corridor = command("guides/environment.md", "env=corridor")
+    small = [word for word in TINY if not word.startswith("env.")]
+    limits = [word for word in corridor if not word.startswith("cost_limits")]
+    done = subprocess.run(
+        [
+            sys.executable,
+            *limits,
+            *small,
+            "cost_limits={cost: 1000}",
+            "hydra.run.dir=runs/corridor",
+        ],
+        cwd=place,
+        env=os.environ | {"OMP_NUM_THREADS": "1", "PYTHONPATH": str(ROOT)},
+        capture_output=True,
+        text=True,
+        timeout=280,
+    )
+    assert done.returncode == 0, done.stderr
+    assert (place / "runs/corridor/progress.csv").is_file()

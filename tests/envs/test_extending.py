@@ -107,6 +107,12 @@ def test_contacts_that_nothing_counts_are_an_error_that_says_so():
         make({"walls_num": 1}).rollout(1)
 
 
+def test_a_cost_of_another_shape_is_named():
+    register_cost(Cost("cost_wide", lambda c: True, lambda c, w: w.robot_xy))
+    with pytest.raises(ConfigError, match=r"cost_wide .*\[2\], got \[2, 2\]"):
+        SafetyGymEnv({"robot_base": "point"}, num_envs=2, seed=0).rollout(1)
+
+
 def test_free_bodies_are_pushed_and_have_a_density():
     register_element(cube("crates", "crate", Motion.FREE), keys={"crates_density": 0.5})
     env = make({"crates_num": 1, "crates_rots": [0.3], "vases_num": 1, "task": "push"})

@@ -232,6 +232,10 @@ def test_the_command_prints_a_table(run, capsys):
         (["camera=nowhere", "video=true"], "nowhere"),
         (["picture=there.png"], "must end in .gif or .webp"),
         (["picture=nowhere/there.gif"], "there is no folder nowhere"),
+        (["certify=true", "env.hazards_num=3"], "env: certify=true does not heed it"),
+        (["certificate.episodes=9"], "add certify=true"),
+        (["certify=true", "certificate.episode=9"], "Did you mean 'episodes'?"),
+        (["env.hazards_num=200", "episodes=1"], "hazards"),
     ],
 )
 def test_what_cannot_be_done_ends_in_one_line(run, arguments, message, capsys, monkeypatch):

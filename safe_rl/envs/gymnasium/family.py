@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping, Sequence
 from typing import Any
 
 import gymnasium
@@ -45,7 +45,7 @@ def make_gymnasium(
         return from_gymnasium(
             make,
             num_envs=num_envs,
-            cost_keys=config["cost_keys"],
+            cost_keys=_named_costs(config["cost_keys"], config["outside"] or {}),
             num_steps=config["num_steps"],
             seed=None if seed is None else spread_seed(seed),
             workers=config["workers"],
@@ -55,3 +55,8 @@ def make_gymnasium(
         )
     except (gymnasium.error.Error, TypeError, ValueError) as error:
         raise ConfigError(f"env.id={config['id']}: {error}") from error
+
+
+def _named_costs(reported: Sequence[str] | None, outside: Collection[str]) -> list[str] | None:
+    """Names of all costs, those of leaving a range among them; None if they are to be found out."""
+    return None if reported is None else [*dict.fromkeys([*reported, *outside])]

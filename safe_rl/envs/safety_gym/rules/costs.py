@@ -13,6 +13,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from safe_rl.envs.errors import ConfigError
 from safe_rl.envs.safety_gym.records.config import SafetyGymConfig
 from safe_rl.envs.safety_gym.records.world import World
 
@@ -172,6 +173,15 @@ def cost_keys(config: SafetyGymConfig) -> list[str]:
     return ["cost", *(row.key for row in COSTS if row.active(config)), EXCEPTION_KEY]
 
 
+def _magnitude(row: Cost, config: SafetyGymConfig, world: World) -> Tensor:
+    cost, shape = row.magnitude(config, world), world.robot_xy.shape[:1]
+    if cost.shape != shape:
+        raise ConfigError(
+            f"{row.key} must be one number per world, {list(shape)}, got {list(cost.shape)}."
+        )
+    return cost
+
+
 def compute_costs(config: SafetyGymConfig, world: World, failed: Tensor) -> Tensor:
     """Compute every cost of the worlds as they are.
 
@@ -183,7 +193,7 @@ def compute_costs(config: SafetyGymConfig, world: World, failed: Tensor) -> Tens
     Returns:
         One row for each of `cost_keys(config)`, [1 + number of kinds + 1, N].
     """
-    magnitudes = [row.magnitude(config, world) for row in COSTS if row.active(config)]
+    magnitudes = [_magnitude(row, config, world) for row in COSTS if row.active(config)]
     if failed.any():
         magnitudes = [torch.where(failed, 0.0, magnitude) for magnitude in magnitudes]
     exceptions = failed.to(torch.float64)  # the sum has this type, whatever a registered cost has
