@@ -223,7 +223,9 @@ def train(
     return Run(folder)
 
 
-def load(directory: str | Path, checkpoint: str = "last", imports: Sequence[str] = ()) -> Run:
+def load(
+    directory: str | Path, checkpoint: str = "last", imports: Sequence[str] | None = None
+) -> Run:
     """Open a run: its figures, environment and policy.
 
     Args:
@@ -231,6 +233,7 @@ def load(directory: str | Path, checkpoint: str = "last", imports: Sequence[str]
         checkpoint: "last", "best" (highest return that kept every limit), "certified" (surely keeps
             them), or a path.
         imports: Modules that its environment or policy needs; none is imported unless named here.
+            ``[]`` goes without those that the run has used.
 
     Raises:
         FileNotFoundError: If the folder is not that of a run, or has no such checkpoint.
@@ -242,8 +245,8 @@ def load(directory: str | Path, checkpoint: str = "last", imports: Sequence[str]
         torch.Size([1, 2])
     """
     run = Run(Path(directory), checkpoint)
-    check_imports(run.config, imports or None, run.directory)
-    import_modules(imports)
+    check_imports(run.config, imports, run.directory)
+    import_modules(imports or ())
     find_checkpoint(run.directory, checkpoint)
     return run
 

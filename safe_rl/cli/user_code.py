@@ -157,5 +157,5 @@ def check_imports(config: Mapping[Any, Any], given: Sequence[str] | None, run: P
         words = " ".join(f"{KEY}={module}" for module in noted)
         raise CommandLineError(
             f"{run} was trained with {words}: add that to the command if you trust this code, or "
-            f"'{KEY}=[]' to go without."
+            f"'{KEY}=[]' to go without. In Python: safe_rl.load(…, imports=[…])."
         )
