@@ -53,9 +53,10 @@ class CTRPOStep(TRPOStep):
     a limit is near, the natural gradient turns along it. The line search takes the first fraction
     with D_C ≤ δ that does not worsen the loss.
 
-    A policy beyond a limit recovers: `TRPOStep`'s step against E[ρ A_c] until J_c is below the
-    share `hysteresis` of d. The barriers of the costs that are within their limits stay; of several
-    to recover, the one exceeded most comes first.
+    A policy beyond a limit recovers: `TRPOStep`'s step against E[ρ A_c] until J_c is (1 −
+    `hysteresis`) d below what it is held against, which is d or, by a margin, less. The barriers
+    of the costs that are within their limits stay; of several to recover, the one exceeded most
+    comes first.
 
     Adds ``recovers`` to the diagnostics, [k]: 1 for the costs that are being recovered.
 
@@ -65,7 +66,7 @@ class CTRPOStep(TRPOStep):
         cost_limits: d, as of a multiplier; see `parse_cost_limits`.
         beta: β, per unit of an episode's cost, for every cost.
         gamma: γ in the factor h = 1/(1 − γ); None takes T̄ in its place, that of undiscounted sums.
-        hysteresis: share of d in (0, 1] below which a recovery ends; 1 ends it at the limit.
+        hysteresis: share of d in (0, 1] at which a recovery ends; 1 ends it at the limit.
         settings: those of every step, see `TrustRegion`.
 
     Raises:

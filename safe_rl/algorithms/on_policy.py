@@ -78,7 +78,7 @@ class OnPolicy:
             "constraints": constraints,
             "multiplier": constraints.multiplier,
             "cost_keys": constraints.keys,
-            "cost_limits": limits,
+            "cost_limits": _held_limits(limits, constraints),
         }
         critic, cost_critic = networks["critic"], networks.get("cost_critic")
         cost_advantage = None
@@ -166,6 +166,12 @@ class OnPolicy:
             "algorithm": self.constraints,
         }
         return {name: part for name, part in parts.items() if part is not None}
+
+
+def _held_limits(limits: Mapping[str, float], constraints: Constraints) -> dict[str, float]:
+    """What violations are differences from: not d where a risk measure has a limit of its own."""
+    held = getattr(getattr(constraints, "risk", None), "held_limits", None)
+    return dict(limits) if held is None else dict(zip(limits, held.tolist(), strict=True))
 
 
 def _build_update(config: DictConfig, **parts: Any) -> PolicyUpdate:

@@ -149,7 +149,8 @@ class ReplayUpdate:
         """Continue from :meth:`state_dict`."""
         self.optimizer.load_state_dict(state_dict["optimizer"])
         for name, tensor in self._tensors():
-            tensor.copy_(state_dict["loss"][name])
+            if name in state_dict["loss"]:  # TorchRL makes some constants with the first loss
+                tensor.copy_(state_dict["loss"][name])
         self._counts.update(state_dict["counts"])
 
 

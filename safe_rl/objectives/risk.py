@@ -184,13 +184,18 @@ class Chance:
         self.weight = self.limits.clamp_min(1.0)
         self.most_over = most_over
 
+    @property
+    def held_limits(self) -> Tensor:
+        """What an episode's charges are held against on average, w ε, [k]."""
+        return self.weight * self.most_over
+
     def __call__(self, costs: Tensor, ends: Tensor, before: Tensor, finished: Tensor) -> Charges:
         """Charge the steps of a batch: see `RiskMeasure`."""
         over = cost_so_far(costs, ends, before) > self.limits
         was_over = (over & ~ends.unsqueeze(-1)).roll(1, 1)
         was_over[:, 0] = before > self.limits
         charged = torch.where(over & ~was_over, self.weight, 0.0).to(costs)
-        return Charges(charged, torch.zeros_like(self.limits), self.weight * self.most_over)
+        return Charges(charged, torch.zeros_like(self.limits), self.held_limits)
 
     def state_dict(self) -> dict[str, Any]:
         """Nothing: charges depend on the batch alone."""

@@ -146,7 +146,9 @@ class SACLoss(objectives.SACLoss):
             set_exploration_type(ExplorationType.RANDOM),
             params.to_module(self.actor_network, preserve_module_state=False),
         ):
-            return rsample_and_log_prob(self.actor_network.get_dist(steps))
+            # of a copy: a policy writes what its distribution is made of
+            inputs = steps.select(*self.actor_network.in_keys)
+            return rsample_and_log_prob(self.actor_network.get_dist(inputs))
 
     @dispatch
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -165,7 +167,7 @@ class SACLoss(objectives.SACLoss):
 
     def actor_losses(self, tensordict: TensorDictBase) -> TensorDict:
         """Losses of the policy and of the temperature, and what both come from."""
-        loss, metadata = self.actor_loss(tensordict)
+        loss, metadata = self.actor_loss(tensordict.copy())
         log_prob = metadata.pop("log_prob")
         weights = self._maybe_get_priority_weight(tensordict)
         alpha = self._reduce_loss(self.alpha_loss(log_prob), tensordict=tensordict, weights=weights)

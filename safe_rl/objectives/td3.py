@@ -25,8 +25,9 @@ class TwinDelayed(TypedDict):
     Attributes:
         action_spec: of one action [A], bounded.
         gamma: discount per step, of reward and costs.
-        policy_noise: standard deviation of the noise on the target policy's actions.
-        noise_clip: bound of that noise.
+        policy_noise: standard deviation of the noise on the target policy's actions, of half the
+            range of each.
+        noise_clip: bound of that noise, likewise.
         loss_function: of the TD errors: ``"l2"``, ``"smooth_l1"`` or ``"l1"``.
     """
 
@@ -76,6 +77,11 @@ class TD3Loss(objectives.TD3Loss):
             noise_clip=noise_clip,
             loss_function=loss_function,
         )
+        # of half the range of each action, as the published code has it
+        half = (self.max_action - self.min_action) / 2
+        del self.policy_noise, self.noise_clip
+        self.register_buffer("policy_noise", policy_noise * half)
+        self.register_buffer("noise_clip", noise_clip * half)
         # copies of the steps that go into the Q functions: an ensemble needs none
         self.num_qvalue_nets = 1 if joint else 2
         self.gamma = gamma
@@ -100,7 +106,9 @@ class TD3Loss(objectives.TD3Loss):
     def critic_losses(self, tensordict: TensorDictBase) -> TensorDict:
         """Losses of the Q functions."""
         loss, metadata = self.value_loss(tensordict)
-        tensordict.set(self.tensor_keys.priority, metadata["td_error"].detach().max(0).values)
+        # TorchRL's errors are squared
+        td_error = metadata["td_error"].detach().max(0).values.sqrt()
+        tensordict.set(self.tensor_keys.priority, td_error)
         return scalars(loss_qvalue=loss)
 
     def actor_losses(self, tensordict: TensorDictBase) -> TensorDict:

@@ -4,9 +4,11 @@ import math
 
 import pytest
 import torch
+from point_mass import PointMass
+from run_configs import point_mass_config
 from samples import make_actor, make_batch
 
-from safe_rl.algorithms import CTRPOStep
+from safe_rl.algorithms import CTRPOStep, OnPolicy
 from safe_rl.algorithms.c_trpo_step import barrier_divergence
 from safe_rl.objectives import CPOLoss
 from safe_rl.objectives.distributions import gaussian_kl
@@ -147,3 +149,14 @@ def test_errors_say_what_to_change():
         c_trpo(actor, 1, gamma=None)(batch, torch.tensor([-1.0]))
     with pytest.raises(ValueError, match="one per cost surrogate"):
         c_trpo(actor, 1)(batch, torch.zeros(2))
+
+
+def test_the_limit_of_a_share_of_episodes_is_what_recoveries_go_by():
+    """Charges are at most w ε below their limit: a recovery that waits for more never ends."""
+    ends = []
+    for risk in ("risk=chance", "risk=mean"):
+        given = ("algo=c_trpo", "cost_limits={cost: 25}", risk)
+        config = point_mass_config(*given, minibatch_size=None)
+        step = OnPolicy.build(config, PointMass(config.num_envs)).policy_update
+        ends.append(step.recovered.item())
+    assert ends == pytest.approx([-0.2 * 25.0 * 0.1, -0.2 * 25.0])

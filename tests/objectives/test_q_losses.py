@@ -223,3 +223,29 @@ def test_what_does_not_fit_is_refused():
         SACLagrangianLoss(actor, make_q(), critic, cost_keys=COSTS, **keys)
     with pytest.raises(ValueError, match="1 cost_keys but 2 multipliers"):
         SACLagrangianLoss(actor, make_q(), make_q(num_outputs=2), cost_keys=["cost"], **keys)
+
+
+def test_the_smoothing_of_td3_is_of_the_range_of_actions():
+    low, high = torch.tensor([-0.4, -2.0]), torch.tensor([0.4, 2.0])
+    actor = make_bounded_actor(3, low, high, hidden_sizes=[8])
+    settings = TD3 | {"action_spec": Bounded(low, high)}
+    loss = TD3Loss(actor, QEnsemble(3, 2, hidden_sizes=[8], num_networks=2), **settings)
+    torch.testing.assert_close(loss.policy_noise, 0.2 * high)
+    torch.testing.assert_close(loss.noise_clip, 0.5 * high)
+
+
+@pytest.mark.parametrize("kind", ["sac", "td3"])
+def test_steps_get_their_priority_and_nothing_else(kind):
+    loss, steps = make_loss(kind), make_steps()
+    before = set(steps.keys(True, True))
+    loss(steps)
+    assert set(steps.keys(True, True)) - before == {"td_error"}
+
+
+def test_the_priority_of_td3_is_the_error_and_not_its_square():
+    loss, steps = make_loss("td3"), make_steps()
+    torch.manual_seed(1)
+    _, metadata = loss.value_loss(steps.clone())
+    torch.manual_seed(1)
+    loss.critic_losses(steps)
+    torch.testing.assert_close(steps["td_error"].square(), metadata["td_error"].max(0).values)
