@@ -99,9 +99,8 @@ def comparison(algorithms: Iterable[str]) -> str:
 
 Limit 25, one million steps, with the defaults of the commit of each run. Seeds that were run with
 different settings have a row for each, which names what differs. A single seed is a direction, not
-a verdict. The on-policy runs are of before the
-[present defaults](holding_the_limit.md#settings-tried), with which PPO-Lagrangian, TRPO-Lagrangian
-and CPO earn more at the same costs.
+a verdict. The on-policy runs on CarGoal1 are of before the
+[present defaults](holding_the_limit.md#settings-tried).
 
 ## At equal steps
 
