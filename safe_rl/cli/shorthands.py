@@ -23,7 +23,11 @@ __all__ = ["expand_arguments"]
 
 # of Hydra, that would make it read another configuration than the run's
 _OTHER_CONFIGURATIONS = ("--config-path", "-cp", "--config-name", "-cn")
-_FLAGS_WITH_VALUE = (*_OTHER_CONFIGURATIONS, "--config-dir", "-cd", "--package", "-p")
+_FLAGS_WITH_VALUE = (
+    *(*_OTHER_CONFIGURATIONS, "--config-dir", "-cd", "--package", "-p", "--cfg", "-c"),
+    "--experimental-rerun",
+)
+_INFO = ("--info", "-i")  # whose value may lack
 _JOBLIB = "hydra_plugins.hydra_joblib_launcher"
 
 
@@ -61,16 +65,20 @@ def _flags_first(arguments: Sequence[str]) -> list[str]:
     Examples:
         >>> _flags_first(["seed=0,1", "-m", "--config-dir", "mine", "algo=cpo"])
         ['-m', '--config-dir=mine', 'seed=0,1', 'algo=cpo']
+        >>> _flags_first(["algo=cpo", "--info", "--cfg", "job"])
+        ['--info', '--cfg=job', 'algo=cpo']
     """
     flags: list[str] = []
     overrides: list[str] = []
-    words = iter(arguments)
-    for word in words:
-        if word in _FLAGS_WITH_VALUE:
-            value = next(words, None)
-            flags.append(word if value is None else f"{word}={value}")
+    last = ""
+    for word in arguments:
+        if word.startswith("-"):
+            flags.append(word)
+        elif last in _FLAGS_WITH_VALUE or (last in _INFO and "=" not in word):
+            flags[-1] = f"{last}={word}"
         else:
-            (flags if word.startswith("-") else overrides).append(word)
+            overrides.append(word)
+        last = word
     return [*flags, *overrides]
 
 
