@@ -148,9 +148,11 @@ class ReplayUpdate:
     def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
         """Continue from :meth:`state_dict`."""
         self.optimizer.load_state_dict(state_dict["optimizer"])
+        stored = state_dict["loss"]
         for name, tensor in self._tensors():
-            if name in state_dict["loss"]:  # TorchRL makes some constants with the first loss
-                tensor.copy_(state_dict["loss"][name])
+            # a constant that TorchRL makes with the first loss: a run without one has not stored it
+            if name in stored or name != "_target_entropy":
+                tensor.copy_(stored[name])
         self._counts.update(state_dict["counts"])
 
 

@@ -76,8 +76,10 @@ def _check_change(name: str, value: Any, known: Collection[str]) -> None:
             f"{', '.join(known)}."
         )
     values = KEYS[f"certificate.{name}"].values
-    if not values.hold(value) or (name == "episodes" and not value):
-        raise ValueError(f"certificate.{name}={value}: it must be {values.words}, and not 0.")
+    if not values.hold(value):
+        raise ValueError(f"certificate.{name}={value}: it must be {values.words}.")
+    if name == "episodes" and not value:
+        raise ValueError("certificate.episodes=0: it must be at least 1 to test anything.")
 
 
 def is_to_keep_limits(config: DictConfig, cost_keys: Collection[str]) -> bool:

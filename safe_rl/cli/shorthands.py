@@ -166,9 +166,7 @@ def _expand_slate(value: str, others: list[str]) -> list[str]:
         raise CommandLineError(
             f"{value} is {len(environments)} environments: add -m to train on every one of them."
         )
-    flags = [argument for argument in others if argument.startswith("-")]
-    overrides = [argument for argument in others if not argument.startswith("-")]
-    return [*flags, f"env={','.join(environments)}", *overrides]
+    return _flags_first([f"env={','.join(environments)}", *others])
 
 
 def _is_installed(module: str) -> bool:

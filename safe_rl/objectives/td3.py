@@ -77,16 +77,31 @@ class TD3Loss(objectives.TD3Loss):
             noise_clip=noise_clip,
             loss_function=loss_function,
         )
-        # of half the range of each action, as the published code has it
-        half = (self.max_action - self.min_action) / 2
-        del self.policy_noise, self.noise_clip
-        self.register_buffer("policy_noise", policy_noise * half)
-        self.register_buffer("noise_clip", noise_clip * half)
         # copies of the steps that go into the Q functions: an ensemble needs none
         self.num_qvalue_nets = 1 if joint else 2
         self.gamma = gamma
         self.make_value_estimator(ValueEstimators.TD0, gamma=gamma)
         self.out_keys = ["loss_qvalue", "loss_actor", "qvalue"]
+
+    # TorchRL sets and reads both; in units of each action, as the published code has them. No
+    # buffers: a run that is resumed may change the numbers
+    @property
+    def policy_noise(self) -> Tensor:
+        """Standard deviation of the noise on the target policy's actions, [A]."""
+        return self._policy_noise * (self.max_action - self.min_action) / 2
+
+    @policy_noise.setter
+    def policy_noise(self, share: float) -> None:
+        self._policy_noise = share
+
+    @property
+    def noise_clip(self) -> Tensor:
+        """Bound of that noise, [A]."""
+        return self._noise_clip * (self.max_action - self.min_action) / 2
+
+    @noise_clip.setter
+    def noise_clip(self, share: float) -> None:
+        self._noise_clip = share
 
     def _make_vmap(self) -> None:
         super()._make_vmap()

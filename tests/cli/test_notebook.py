@@ -1,6 +1,7 @@
 """The way in from Python does what the commands do, whatever state Hydra is in."""
 
 import math
+import shutil
 import signal
 import subprocess
 import sys
@@ -62,6 +63,15 @@ def test_a_run_is_opened_again(run):
         safe_rl.load(run.directory, checkpoint="newest")
     with pytest.raises(FileNotFoundError, match="not the folder of a run"):
         safe_rl.load(run.directory / "nowhere")
+
+
+def test_a_run_with_modules_is_opened_without_them_if_that_is_said(run, tmp_path):
+    copied = shutil.copytree(run.directory, tmp_path / "copied")
+    text = (copied / "config.yaml").read_text()
+    (copied / "config.yaml").write_text(text.replace("import: []", "import: [nowhere]"))
+    with pytest.raises(ValueError, match=r"import=nowhere.*imports=\[…\]"):
+        safe_rl.load(copied)
+    assert safe_rl.load(copied, imports=[]).table == run.table
 
 
 def test_it_is_the_run_of_the_command(run, tmp_path):

@@ -220,3 +220,10 @@ def test_costs_of_ranges_are_bounded_in_the_spec():
     env = make_env({"_target_": "safe_rl.envs.gymnasium.make_gymnasium"} | node, num_envs=2, seed=0)
     assert [env.full_reward_spec[key].high.max().item() for key in env.cost_keys] == [2.0, 1.0, 1.0]
     check_env_specs(env)
+
+
+def test_costs_that_are_reported_and_costs_of_ranges_stand_together():
+    outside = {"cost_far": [0, -1, 1]}
+    node = {"_target_": "safe_rl.envs.gymnasium.make_gymnasium", "id": "CartPole-v1"}
+    node |= {"num_steps": 10, "cost_keys": ["cost_told"], "outside": outside}
+    assert make_env(node, num_envs=2, seed=0).cost_keys == ["cost", "cost_told", "cost_far"]

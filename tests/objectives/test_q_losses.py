@@ -232,6 +232,8 @@ def test_the_smoothing_of_td3_is_of_the_range_of_actions():
     loss = TD3Loss(actor, QEnsemble(3, 2, hidden_sizes=[8], num_networks=2), **settings)
     torch.testing.assert_close(loss.policy_noise, 0.2 * high)
     torch.testing.assert_close(loss.noise_clip, 0.5 * high)
+    # what a resumed run is given is not replaced by what it was before
+    assert not [name for name in loss.state_dict() if "noise" in name]
 
 
 @pytest.mark.parametrize("kind", ["sac", "td3"])
