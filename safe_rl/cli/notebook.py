@@ -26,6 +26,7 @@ from safe_rl.cli.certificates import certify_run, is_to_keep_limits, is_worth_a_
 from safe_rl.cli.composing import check_command
 from safe_rl.cli.conf import CONF
 from safe_rl.cli.evaluate import evaluate_run
+from safe_rl.cli.overrides import GIVEN_WHOLE
 from safe_rl.cli.robots import maker_of
 from safe_rl.cli.running import complete, prepare
 from safe_rl.cli.user_code import check_imports, import_modules, note_imports, quote
@@ -252,7 +253,7 @@ def load(
 
 
 # mappings that are given all at once
-_WHOLE = ("cost_limits", "model.input_scale", "env.outside", "env.kwargs")
+_WHOLE = (*GIVEN_WHOLE, "env.outside", "env.kwargs")
 
 
 def _overrides(settings: Mapping[str, Any], prefix: str = "") -> Iterator[str]:

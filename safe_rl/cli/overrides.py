@@ -24,6 +24,7 @@ from safe_rl.targets import locate
 
 __all__ = [
     "COMPOSING_ERRORS",
+    "GIVEN_WHOLE",
     "CommandLineError",
     "check_added",
     "check_choices",
@@ -35,7 +36,7 @@ __all__ = [
 COMPOSING_ERRORS = (HydraException, OmegaConfBaseException, YAMLError, ValueError)
 """What Hydra raises about overrides and files."""
 
-_GIVEN_WHOLE = {"cost_limits": "limits", "model.input_scale": "factors"}
+GIVEN_WHOLE = {"cost_limits": "limits", "model.input_scale": "factors"}
 _DEFAULT_RECIPE = "safe_rl.algorithms.OnPolicy"
 
 
@@ -86,7 +87,7 @@ def check_whole(overrides: Sequence[Override]) -> None:
         CommandLineError: If there is one.
     """
     for override in overrides:
-        for section, what in _GIVEN_WHOLE.items():
+        for section, what in GIVEN_WHOLE.items():
             name = override.key_or_group.removeprefix(f"{section}.")
             if name != override.key_or_group:
                 raise CommandLineError(

@@ -2,32 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Sequence
 
 import torch
 from torchrl.data import Bounded, TensorSpec, Unbounded
 
-from safe_rl.envs.costs import COST
-
-__all__ = ["cost_spec", "highest_costs"]
-
-
-def highest_costs(names: Collection[str], ranges: Collection[str]) -> dict[str, float]:
-    """The most that a step can cost, where that is known, by name.
-
-    Args:
-        names: of all costs; `cost` is the sum of the others unless it has a range.
-        ranges: of those that cost 1 outside of a range, and else nothing.
-
-    Examples:
-        >>> highest_costs(["cost", "cost_speed", "cost_height"], ["cost_speed", "cost_height"])
-        {'cost_speed': 1.0, 'cost_height': 1.0, 'cost': 2.0}
-    """
-    highest = {name: 1.0 for name in names if name in ranges}
-    kinds = [name for name in names if name != COST]
-    if COST not in highest and kinds and all(name in highest for name in kinds):
-        highest[COST] = float(len(kinds))
-    return highest
+__all__ = ["cost_spec"]
 
 
 def cost_spec(

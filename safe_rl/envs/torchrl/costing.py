@@ -16,7 +16,7 @@ from torch import Tensor
 from torchrl.data import Composite
 from torchrl.envs.transforms import Transform
 
-from safe_rl.envs.cost_specs import cost_spec, highest_costs
+from safe_rl.envs.cost_specs import cost_spec
 from safe_rl.envs.costs import COST, is_cost
 from safe_rl.envs.errors import ConfigError, nearest
 from safe_rl.envs.torchrl.outside import Range, parse_outside
@@ -79,8 +79,17 @@ class StepCosts:
         function: CostFunction | None,
     ) -> None:
         self.entries = list(entries)
-        self.ranges = parse_outside(outside or {})
+        self._ranges = parse_outside(outside or {})
         self._function = function
+
+    @property
+    def highest(self) -> dict[str, float]:
+        """The most that a step can cost, by name, where that is known: 1 of leaving a range."""
+        known = dict.fromkeys(self._ranges, 1.0)
+        # entries and functions may have a cost of their own that is called so
+        if known and COST not in known and not self.entries and self._function is None:
+            known[COST] = float(len(known))
+        return known
 
     def __call__(self, step: TensorDictBase) -> dict[str, Tensor]:
         """Costs [N, 1] of a step [N].
@@ -89,7 +98,7 @@ class StepCosts:
             ConfigError: for an entry that there is not, or what is no cost of N rows.
         """
         found = [(name.rpartition(".")[2], _entry(step, name)) for name in self.entries]
-        found += [(name, _outside(step, row)) for name, row in self.ranges.items()]
+        found += [(name, _outside(step, row)) for name, row in self._ranges.items()]
         if self._function is not None:
             own = self._function(step)
             found += _own(own)
@@ -171,7 +180,7 @@ class CostsBesideRewards(Transform):
             for key in self._taken:
                 if key in spec.keys(True):
                     del spec[key]
-        highest = highest_costs(self._names, self._costs.ranges)
+        highest = self._costs.highest
         for name in self._names:
             shape = (*rewards.shape, 1)
             rewards[name] = cost_spec(highest.get(name), shape, rewards.device)
