@@ -5,11 +5,13 @@
 Both do the same matrix products in turns in one run. The bare ones are plain `torch.nn` perceptrons
 on a fixed minibatch, forward and backward, without TensorDicts, optimiser or buffer; what
 the ratio lacks to 1 is the share of an update that is spent outside of the networks' arithmetic.
+Both multiply matrices as updates of runs do, by oneDNN where it is the faster; ``--plain``: by MKL.
 """
 
 from __future__ import annotations
 
 import argparse
+import contextlib
 import functools
 import statistics
 import time
@@ -22,6 +24,7 @@ from torch import Tensor, nn
 from torchrl.data import Bounded
 
 from safe_rl.algorithms import Memory, ReplayUpdate
+from safe_rl.algorithms.matrix_products import fast_products
 from safe_rl.models import QEnsemble, make_squashed_actor
 from safe_rl.objectives import LagrangeMultiplier, SACLagrangianLoss
 
@@ -122,6 +125,7 @@ def main() -> None:
     parser.add_argument("--repeats", type=int, default=10)
     parser.add_argument("--threads", type=int, default=1)
     parser.add_argument("--compile", action="store_true")
+    parser.add_argument("--plain", action="store_true")
     args = parser.parse_args()
     torch.set_num_threads(args.threads)
     torch.manual_seed(0)
@@ -133,9 +137,10 @@ def main() -> None:
     for call in calls.values():
         call()
     taken: dict[str, list[tuple[float, float]]] = {name: [] for name in calls}
-    for _ in range(args.repeats):
-        for name, call in calls.items():
-            taken[name].append(seconds(call))
+    with contextlib.nullcontext() if args.plain else fast_products():
+        for _ in range(args.repeats):
+            for name, call in calls.items():
+                taken[name].append(seconds(call))
     print(f"{args.hidden}, minibatches of {args.batch_size}, {args.threads} threads")
     for kind, name in enumerate(("wall clock", "processor")):
         rates = {

@@ -137,7 +137,10 @@ FLOORS = {
         ("",),
     ),
     "algorithms": (
-        ("contract", "constraints", "learning_rate", "losses", "prioritised"),
+        (
+            *("contract", "constraints", "learning_rate", "losses", "matrix_products"),
+            "prioritised",
+        ),
         ("trust_region_step",),
         (
             *("c_trpo_step", "cpo_step", "crpo_step", "in_turn", "memory", "minibatch", "parts"),

@@ -18,6 +18,7 @@ from torchrl.envs import EnvBase
 
 from safe_rl.algorithms.constraints import check_cost_limits
 from safe_rl.algorithms.contract import Algorithm, Stateful
+from safe_rl.algorithms.matrix_products import fast_products
 from safe_rl.algorithms.parts import find_recipe
 from safe_rl.algorithms.side_by_side import torch_threads
 from safe_rl.collectors import EpisodeAccounting, Recording, WorkerCollector, make_collector
@@ -267,7 +268,8 @@ class Trainer:
             self._recording.write(self.progress.epoch, batch)
         collected = time.perf_counter()
         episodes = self.accounting.update(batch)
-        learned = self.algorithm.learn(batch, episodes)
+        with fast_products():
+            learned = self.algorithm.learn(batch, episodes)
         end = time.perf_counter()
         before = self.progress.steps
         self.progress.add(batch.numel(), end - start)
