@@ -1,0 +1,100 @@
+"""Updates from a memory: targets that follow, and checkpoints that lack nothing."""
+
+from copy import deepcopy
+from functools import partial
+
+import pytest
+import torch
+from tensordict import TensorDict
+from torchrl.data import Bounded
+
+from safe_rl.algorithms import Memory, ReplayUpdate
+from safe_rl.models import QEnsemble, make_squashed_actor
+from safe_rl.objectives import SACLoss
+
+
+def make_update(seed):
+    torch.manual_seed(seed)
+    spec = Bounded(-1, 1, [2])
+    loss = SACLoss(
+        make_squashed_actor(3, spec.low, spec.high, hidden_sizes=[8]),
+        QEnsemble(3, 2, hidden_sizes=[8], num_networks=2),
+        action_spec=spec,
+        gamma=0.9,
+        alpha_init=0.1,
+    )
+    optimizer = partial(torch.optim.Adam, lr=0.01)
+    return ReplayUpdate(loss, optimizer=optimizer, updates_per_step=0.5, tau=0.1)
+
+
+@pytest.fixture
+def memory():
+    generator = torch.Generator().manual_seed(0)
+    memory = Memory(
+        capacity=100, batch_size=16, in_keys=make_update(0).loss.in_keys, reward_keys=["reward"],
+        reward_gamma=0.9, n_steps=1, storage="tensor", keep=False,
+    )  # fmt: skip
+    flags = torch.zeros(2, 40, 1, dtype=torch.bool)
+    following = {"observation": torch.randn(2, 40, 3, generator=generator), "done": flags}
+    following |= {"terminated": flags, "reward": torch.randn(2, 40, 1, generator=generator)}
+    memory.extend(
+        TensorDict(
+            observation=torch.randn(2, 40, 3, generator=generator),
+            action=torch.rand(2, 40, 2, generator=generator),
+            next=following,
+            batch_size=[2, 40],
+        )
+    )
+    return memory
+
+
+def networks(update):
+    """Trained and target parameters of the Q functions, by name."""
+    trained = update.loss.qvalue_network_params.flatten_keys(".")
+    target = update.loss.target_qvalue_network_params.flatten_keys(".")
+    return {name: (value.detach().clone(), target[name].clone()) for name, value in trained.items()}
+
+
+def test_targets_go_a_tenth_of_the_way_to_where_the_networks_have_gone(memory):
+    update = make_update(0)
+    before = networks(update)
+    update(memory, 1)
+    for name, (trained, target) in networks(update).items():
+        start = before[name][1]
+        torch.testing.assert_close(target, start + 0.1 * (trained - start))
+        assert not trained.equal(before[name][0])
+
+
+def test_a_loaded_update_goes_on_as_the_saved_one(memory):
+    saved, loaded = make_update(0), make_update(1)
+    saved(memory, 6)
+    loaded.load_state_dict(deepcopy(saved.state_dict()))
+    for update in (saved, loaded):
+        torch.manual_seed(2)
+        update(memory, 6)
+    for (name, (trained, target)), others in zip(
+        networks(saved).items(), networks(loaded).values(), strict=True
+    ):
+        assert trained.equal(others[0]), name
+        assert target.equal(others[1]), name
+
+
+def test_a_checkpoint_of_before_the_first_update_is_whole(memory):
+    fresh, trained = make_update(0).state_dict(), make_update(1)
+    trained(memory, 2)
+    # TorchRL makes this constant of the action spec when a loss is first computed
+    assert set(trained.state_dict()["loss"]) - set(fresh["loss"]) <= {"_target_entropy"}
+    trained.load_state_dict(fresh)
+    assert trained.loss.alpha_init.equal(make_update(0).loss.alpha_init)
+
+
+@pytest.mark.parametrize(
+    "part", ["log_alpha", "target_qvalue_network_params", "actor_network_params"]
+)
+def test_a_checkpoint_that_lacks_a_tensor_is_refused(part):
+    update = make_update(0)
+    state = update.state_dict()
+    name = next(name for name in state["loss"] if name.startswith(part))
+    del state["loss"][name]
+    with pytest.raises(KeyError, match=name):
+        update.load_state_dict(state)
