@@ -60,7 +60,7 @@ FLOORS = {
         ("safety_gym.suite", "safety_gym.world", "safety_gym.world.scenery"),
         ("safety_gym.world.placements",),
         ("safety_gym.world.bodies", "safety_gym.world.layout", "safety_gym.world.views"),
-        ("safety_gym.world.building", "safety_gym.world.draws"),
+        ("safety_gym.world.ahead", "safety_gym.world.building", "safety_gym.world.draws"),
         ("safety_gym.extending", "safety_gym.world.snapshot"),
         ("safety_gym.rendering", "safety_gym.rendering.markers"),
         ("safety_gym.rendering.display",),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from functools import partial
 from typing import Any, ClassVar
 
 import numpy as np
@@ -22,10 +23,12 @@ from safe_rl.envs.safety_gym.rules.costs import compute_costs, cost_keys
 from safe_rl.envs.safety_gym.rules.tasks import TASKS, dense_reward
 from safe_rl.envs.safety_gym.specs import make_specs
 from safe_rl.envs.safety_gym.suite import resolve
+from safe_rl.envs.safety_gym.world.ahead import LayoutsAhead
 from safe_rl.envs.safety_gym.world.building import build_scene
 from safe_rl.envs.safety_gym.world.draws import (
     Purpose,
     control_noise,
+    draw_layouts,
     draw_substeps,
     gremlin_path,
     next_goals,
@@ -93,6 +96,9 @@ class SafetyGymEnv(SimulatedEnv):
         self._physics = BatchPhysics(scene.model, num_envs, num_threads)
         self._world = make_world(scene, self._physics)
         self._plan = plan_placements(self.config, scene.slots, len(scene.names))
+        self._layouts = LayoutsAhead(
+            partial(draw_layouts, self._plan), num_envs, self._plan.num_columns
+        )
         self._observer = make_observer(scene)
         self._task = TASKS[self.config.task]
         low, high = torch.from_numpy(scene.model.actuator_ctrlrange.T.copy())
@@ -139,8 +145,9 @@ class SafetyGymEnv(SimulatedEnv):
                 self._fixed_layout[row] = rng.fold(torch.tensor(seed), Purpose.LAYOUT)
                 self._episode[row] = 0
 
-    def _layout_key(self) -> Tensor:
-        key = rng.fold(self._row_seed, self._episode)
+    def _layout_key(self, ahead: int = 0) -> Tensor:
+        """Random key of the layouts of so many episodes after the present ones, [N]."""
+        key = rng.fold(self._row_seed, self._episode + ahead)
         if not self.config.randomize_layout:
             key = self._fixed_layout.expand(self.batch_size)
         return key if self.config.layout_seeds is None else pick_layouts(self.config, key)
@@ -150,7 +157,9 @@ class SafetyGymEnv(SimulatedEnv):
         return rng.fold(self._row_seed, self._episode, self._world.step_count + 1)
 
     def _begin(self, mask: Tensor) -> None:
-        start_episodes(self._world, self._plan, self._layout_key(), mask)
+        key = self._layout_key()
+        layouts = self._layouts(key, self._layout_key(ahead=1), mask)
+        start_episodes(self._world, layouts, key, mask)
         self._measured[mask] = self._task.measure(self._world)[mask]
 
     def _pack(self, outputs: dict[str, Any]) -> TensorDict:

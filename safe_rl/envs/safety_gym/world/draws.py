@@ -65,24 +65,37 @@ def pinned_yaws(scene: Scene) -> Tensor:
     return yaws
 
 
-def start_episodes(world: World, plan: PlacementPlan, key: Tensor, mask: Tensor) -> None:
-    """Draw a new layout for some worlds and set them to its initial state.
+def draw_layouts(plan: PlacementPlan, key: Tensor) -> Tensor:
+    """Draw where everything stands when episodes begin.
 
     Args:
-        world: the worlds; those in `mask` are brought up to date.
         plan: what is placed where.
-        key: random key of each layout, int64 [N].
-        mask: worlds to start anew, bool [N].
+        key: random key of each episode, int64 [B].
+
+    Returns:
+        Positions [B, 1 + M, 2]: the robot, then the objects by slot.
 
     Raises:
         LayoutError: naming the object that did not fit.
     """
-    scene = world.scene
-    rows = mask.nonzero()[:, 0]
-    key = key[rows]
     layouts = sample_layouts(plan, rng.fold(key, Purpose.LAYOUT))
     if "goal" in plan.names:
         _redraw_goals(plan, rng.fold(key, Purpose.FIRST_GOAL), layouts)
+    return layouts
+
+
+def start_episodes(world: World, layouts: Tensor, key: Tensor, mask: Tensor) -> None:
+    """Set some worlds to the initial state of a new episode.
+
+    Args:
+        world: the worlds; those in `mask` are brought up to date.
+        layouts: where everything stands in the B worlds of `mask`, [B, 1 + M, 2].
+        key: random key of each world's episode, int64 [N].
+        mask: worlds to start anew, bool [N].
+    """
+    scene = world.scene
+    rows = mask.nonzero()[:, 0]
+    key = key[rows]
     world.layout[rows] = layouts
     drawn = 2 * math.pi * rng.uniform(key[:, None], Purpose.YAW, torch.arange(1 + scene.num_free))
     pinned = pinned_yaws(scene)
