@@ -7,6 +7,7 @@ from safe_rl.algorithms.cpo_step import CPOStep
 from safe_rl.algorithms.crpo_step import CRPOStep
 from safe_rl.algorithms.in_turn import UpdatesInTurn
 from safe_rl.algorithms.learning_rate import KLAdaptiveRate
+from safe_rl.algorithms.matrix_products import fast_products
 from safe_rl.algorithms.memory import Memory
 from safe_rl.algorithms.minibatch import MinibatchUpdate
 from safe_rl.algorithms.off_policy import OffPolicy
@@ -32,4 +33,5 @@ __all__ = [
     "ReplayUpdate",
     "TRPOStep",
     "UpdatesInTurn",
+    "fast_products",
 ]
