@@ -36,7 +36,7 @@ def mean_bound(values: ArrayLike, level: float, largest: float = math.inf) -> np
         largest: The largest possible value, m.
 
     Returns:
-        The bound, shape [...]; infinite for fewer than two values.
+        The bound, shape [...]; infinite for fewer than two values, or where one is no number.
 
     Examples:
         >>> float(mean_bound([20.0, 22.0, 24.0, 26.0], level=0.95).round(2))
@@ -47,6 +47,7 @@ def mean_bound(values: ArrayLike, level: float, largest: float = math.inf) -> np
     from scipy import stats  # here: it takes half a second, and not every command needs it
 
     values = np.asarray(values, dtype=float)
+    values = np.where(np.isfinite(values), values, np.nan)
     number = values.shape[-1]
     if number < 2:
         return np.full(values.shape[:-1], np.inf)
@@ -57,7 +58,9 @@ def mean_bound(values: ArrayLike, level: float, largest: float = math.inf) -> np
     correction = 2 * sample.clip(0) * (1 + 2 * quantile**2) / (6 * np.sqrt(number))
     bound = mean + (quantile + correction) * spread / np.sqrt(number)
     others = share_bound(np.zeros(number), 0.0, level)
-    return np.where(_are_alike(values), mean + others * (largest - mean).clip(0), bound)
+    bound = np.where(_are_alike(values), mean + others * (largest - mean).clip(0), bound)
+    # NaN is above no limit, and would be taken for a bound that keeps all
+    return np.where(np.isnan(bound), np.inf, bound)
 
 
 def _are_alike(values: ArrayLike) -> np.ndarray:
@@ -69,6 +72,8 @@ def _are_alike(values: ArrayLike) -> np.ndarray:
 def share_bound(values: ArrayLike, limit: float, level: float) -> float:
     """Upper confidence bound of P(value > limit), exact (Clopper and Pearson 1934).
 
+    A value that is no number counts as one above it.
+
     Examples:
         >>> round(share_bound([1.0] * 59, limit=2.0, level=0.95), 3)  # none of 59: below 5 %
         0.05
@@ -76,7 +81,7 @@ def share_bound(values: ArrayLike, limit: float, level: float) -> float:
     from scipy import stats
 
     values = np.asarray(values, dtype=float)
-    over, number = int((values > limit).sum()), len(values)
+    over, number = int((~(values <= limit)).sum()), len(values)
     if over == number:
         return 1.0
     return float(stats.beta.ppf(level, over + 1, number - over))
@@ -173,10 +178,8 @@ def rank(
 
     def key(candidate: int) -> tuple[bool, float]:
         excess = max(_expected_excess(costs[candidate], claim), default=0.0)
-        return (
-            excess > 0,
-            excess if excess > 0 else -float(np.asarray(returns[candidate], dtype=float).mean()),
-        )
+        loss = -float(np.asarray(returns[candidate], dtype=float).mean())
+        return excess > 0, excess if excess > 0 else _or_infinite(loss)
 
     return sorted(range(len(returns)), key=key)
 
@@ -188,8 +191,14 @@ def _expected_excess(costs: Mapping[str, ArrayLike], claim: Claim) -> list[float
         values = np.asarray(costs[name], dtype=float)
         error = values.std(ddof=1) / np.sqrt(len(values)) if len(values) > 1 else 0.0
         quantile = NormalDist().inv_cdf(claim.level)
-        excesses.append((values.mean() + quantile * error - limit) / max(limit, 1.0))
+        expected = float(values.mean() + quantile * error)
+        excesses.append((_or_infinite(expected) - limit) / max(limit, 1.0))
     return excesses
+
+
+def _or_infinite(value: float) -> float:
+    """A number; infinity for what is none, which sorts it behind all others."""
+    return math.inf if math.isnan(value) else value
 
 
 def first_certified(

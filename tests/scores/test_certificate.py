@@ -137,3 +137,23 @@ def test_a_limit_of_nothing_is_never_certified_and_it_says_why():
     nothing_known = Claim({"cost": 25.0})
     verdict = first_certified([0], lambda _: {"cost": np.zeros(100)}, nothing_known, tests=1)
     assert verdict.shortfalls == {"mean_cost": np.inf}
+
+
+@pytest.mark.parametrize("odd", [np.nan, np.inf], ids=["nan", "infinite"])
+def test_a_cost_that_is_no_number_is_never_below_its_limit(odd):
+    costs = {"cost": np.r_[odd, np.tile([0.0, 1.0], 200)]}
+    claim = Claim({"cost": 25.0}, most_over=0.5)
+    assert first_certified([0], lambda _: costs, claim, tests=1).certified is None
+    assert claim.shortfalls(costs, tests=1) == {"mean_cost": np.inf}
+    exact = stats.binomtest(1, 401).proportion_ci(0.9, method="exact").high
+    assert share_bound(costs["cost"], 25.0, LEVEL) == pytest.approx(exact)
+    # the others of a table keep their bounds
+    both = mean_bound(np.stack([costs["cost"], np.r_[0.0, costs["cost"][1:]]]), LEVEL)
+    assert np.isfinite(both).tolist() == [False, True]
+
+
+def test_policies_with_costs_or_returns_that_are_no_numbers_are_tested_last():
+    fair = {"cost": np.array([1.0, 2.0])}
+    costs = [{"cost": np.array([np.nan, 2.0])}, fair, {"cost": np.array([90.0, 95.0])}, fair]
+    returns = [[9.0, 9.0], [np.nan, 9.0], [5.0, 5.0], [1.0, 1.0]]
+    assert rank(returns, costs, Claim({"cost": 25.0})) == [3, 1, 2, 0]
