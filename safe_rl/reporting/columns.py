@@ -237,8 +237,11 @@ def mark_best(
         rivals = [other for other in records if steps(other) == steps(record)]
         if len(rivals) < 2 or name not in record or not is_able(record):
             return ""
-        winner = best(other[name] for other in rivals if name in other and is_able(other))
-        return "best" if math.isclose(record[name], winner, rel_tol=1e-9) else ""
+        values = [other[name] for other in rivals if name in other and is_able(other)]
+        # NaN is neither above nor below, and would be the best of all if it came first
+        known = [value for value in values if not math.isnan(value)]
+        is_best = bool(known) and math.isclose(record[name], best(known), rel_tol=1e-9)
+        return "best" if is_best else ""
 
     return mark
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
 from statistics import mean
@@ -73,7 +74,7 @@ def final_record(experiment: Experiment, cost_keys: Sequence[str]) -> dict[str, 
 def _over_seeds(values: Sequence[Mapping[str, float | None]]) -> dict[str, float]:
     """Mean and standard deviation of figures over the seeds that have them."""
     record = {}
-    for name in values[0]:
+    for name in dict.fromkeys(name for one in values for name in one):
         known = np.array([one[name] for one in values if one.get(name) is not None], dtype=float)
         if known.size:
             record[name] = float(known.mean())
@@ -181,10 +182,7 @@ def learning_table(experiments: Sequence[Experiment], good: float = 0.5) -> Tabl
         return None
     environment, keys = experiments[0].environment, cost_keys_of(experiments)
     keys = [key for key in keys if any(key in e.limits for e in experiments)]
-    finals = [[run.final([])["episode_return"] for run in e.finished] for e in experiments]
-    reference = experiments[0].reference
-    whose = "the final return of the best here" if reference is None else "the published PPO's"
-    least = good * (max(map(mean, finals)) if reference is None else reference.episode_return)
+    least, definition = _good(experiments, good)
     records = []
     for experiment in experiments:
         figures = [_learning_figures(run, least) for run in experiment.finished]
@@ -195,7 +193,7 @@ def learning_table(experiments: Sequence[Experiment], good: float = 0.5) -> Tabl
                 "algorithm": experiment.algorithm,
                 "seeds": len(figures),
                 "hours": mean(run.hours for run in experiment.finished),
-                "seeds_good": reached,
+                "seeds_good": None if least is None else reached,
                 **_over_seeds(figures),
             }
         )
@@ -210,15 +208,32 @@ def learning_table(experiments: Sequence[Experiment], good: float = 0.5) -> Tabl
         Column("hours in all", ("{:.2f}", "hours")),
         Column("good seeds", ("{:d} of {:d}", "seeds_good", "seeds")),
     ]
-    note = (
-        f"Good: $J_r$ at least {least:.4g}, {good:.0%} of {whose}, and every $J_c$ within its "
-        "limit, over five epochs; steps and hours are means over the seeds that came to it."
-    )
     shown = each_cost(keys, _COURSE)
-    return Table(stem("learning", environment), environment, columns, records, note, shown)
+    return Table(stem("learning", environment), environment, columns, records, definition, shown)
 
 
-def _learning_figures(run: Run, least_return: float) -> dict[str, float | None]:
+def _good(experiments: Sequence[Experiment], share: float) -> tuple[float | None, str]:
+    """The least return of a good policy on an environment, and the definition in words.
+
+    None if the best final return is not above 0: a share of it would be more than all of it.
+    """
+    reference, whose = experiments[0].reference, "the published PPO's"
+    if reference is not None:
+        whole = reference.episode_return
+    else:
+        whose = "the final return of the best here"
+        finals = [[run.final([])["episode_return"] for run in e.finished] for e in experiments]
+        known = [value for value in map(mean, finals) if math.isfinite(value)]
+        whole = max(known, default=0.0)
+    if whole <= 0:
+        return None, f"Good: not defined, as {whose} is not above 0, and has no share."
+    return share * whole, (
+        f"Good: $J_r$ at least {share * whole:.4g}, {share:.0%} of {whose}, and every $J_c$ within "
+        "its limit, over five epochs; steps and hours are means over the seeds that came to it."
+    )
+
+
+def _learning_figures(run: Run, least_return: float | None) -> dict[str, float | None]:
     returns = run.column("episode_return")
     figures: dict[str, float | None] = {"good_steps": None, "good_hours": None}
     if not returns.size:
@@ -233,7 +248,8 @@ def _learning_figures(run: Run, least_return: float) -> dict[str, float | None]:
         figures[f"share_over_{key}"] = share_of_epochs_over(judged, limit)
         figures[f"streak_{key}"] = longest_streak(judged, limit)
         worst = np.maximum(worst, moving_mean(judged) - limit)
-    epoch = first_good_epoch(moving_mean(returns), worst, least_return, 0.0)
+    least = math.inf if least_return is None else least_return
+    epoch = first_good_epoch(moving_mean(returns), worst, least, 0.0)
     if epoch is not None:
         figures["good_steps"] = float(run.column("steps")[epoch])
         figures["good_hours"] = float(run.column("time_total")[epoch]) / 3600
@@ -241,8 +257,11 @@ def _learning_figures(run: Run, least_return: float) -> dict[str, float | None]:
 
 
 def dominance_table(records: Iterable[Record]) -> Table:
-    """Which algorithm is better than which on each environment."""
-    records, relations = list(records), []
+    """Which algorithm is better than which on each environment.
+
+    What has finished no episode neither keeps its limits nor breaks them, and is not ranked.
+    """
+    records, relations = [record for record in records if _is_measured(record)], []
     for environment in dict.fromkeys(record["environment"] for record in records):
         agents = {
             r["algorithm"]: Agent(
@@ -265,6 +284,11 @@ def dominance_table(records: Iterable[Record]) -> Table:
         [Column(name, ("{}", name)) for name in names],
         relations,
     )
+
+
+def _is_measured(record: Record) -> bool:
+    judged = [value for name, value in record.items() if name.startswith("excess_")]
+    return all(map(math.isfinite, [record["episode_return"], *judged]))
 
 
 _REASONS = {"satisfies": "keeps its limits, the other does not", "dominates": "≻ dominates"}

@@ -59,12 +59,14 @@ def draw_profiles(aggregates: Sequence[Aggregate], styles: Mapping[str, Style]) 
     """
     figure = Figure(figsize=(WIDTH, 3.0), layout="constrained")
     panels = figure.subplots(1, 3, sharey=True)
-    for axis, (name, symbol) in zip(panels, SYMBOLS.items(), strict=True):
-        values = np.concatenate([v for one in aggregates for v in one.strata[name]])
+    # where a run has finished no episode there is no share of runs
+    known = [one for one in aggregates if np.isfinite(one.mean).all()]
+    for axis, (name, symbol) in zip(panels, SYMBOLS.items() if known else (), strict=False):
+        values = np.concatenate([v for one in known for v in one.strata[name]])
         # from where all runs are above to where none is
         margin = 0.05 * float(np.ptp(values)) + 1e-3
         thresholds = np.linspace(values.min() - margin, values.max() + margin, _NUM_POINTS)
-        for one in aggregates:
+        for one in known:
             share, low, high = performance_profile(one.strata[name], thresholds)
             style = styles[one.algorithm]
             label = literal(one.algorithm)

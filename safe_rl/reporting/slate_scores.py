@@ -190,6 +190,7 @@ def _relations(aggregates: Sequence[Aggregate]) -> str:
             (a.steps, a.limits),
         )
         for a in aggregates
+        if np.isfinite(a.mean).all()  # without an episode nothing is kept, and nothing violated
     }
     failing = [name for name, agent in agents.items() if not agent.is_satisfying]
     pairs = [f"{a} ≻ {b}" for a, b, reason in compare(agents) if reason == "dominates"]

@@ -113,6 +113,30 @@ def test_what_learning_cost_is_counted_over_all_of_training(tmp_path):
     assert "good_steps" not in ambitious
 
 
+@pytest.mark.parametrize("returns", [(-400.0, -150.0), (-1.0, 0.0)], ids=["negative", "zero"])
+def test_a_return_that_is_not_above_nothing_has_no_share_that_is_good(returns, tmp_path):
+    """Half of -150 is -75, which is better than the best."""
+    write_run(tmp_path, "Pendulum", "cpo", returns=[returns[-1]])
+    write_run(tmp_path, "Pendulum", "ppo", returns=[returns[0]])
+    table = learning_table(experiments_in(tmp_path))
+    shown = [cell.text for row in table.rows() for cell in row if "good" in cell.title]
+    assert set(shown) == {"—"}
+    assert "not above 0" in table.note
+
+
+def test_what_has_finished_no_episode_is_not_what_good_is_measured_by(tmp_path):
+    nothing = [float("nan")] * 2
+    for algo, seed in (("a", 0), ("b", 0), ("b", 1)):
+        write_run(tmp_path, "Mine", algo, seed, returns=nothing, costs=nothing, rates=[0, 0])
+    for algo, seed in (("b", 2), ("c", 0)):
+        write_run(tmp_path, "Mine", algo, seed, returns=[6, 10], costs=[26, 20], rates=[0, 0])
+    table = learning_table(experiments_in(tmp_path))
+    assert "at least 4," in table.note
+    found = {r["algorithm"]: (r["seeds_good"], r.get("regret_cost")) for r in table.records}
+    # of the seeds that have any figures
+    assert found == {"a": (0, None), "b": (1, 0.5), "c": (1, 0.5)}
+
+
 def test_without_a_limit_learning_costs_nothing_to_speak_of(tmp_path):
     write_run(tmp_path, limits={})
     assert learning_table(experiments_in(tmp_path)) is None

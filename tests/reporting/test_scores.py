@@ -6,11 +6,13 @@ from synthetic import SUITE, experiments_in, write_run
 
 from safe_rl.reporting.contents import build_report
 from safe_rl.reporting.lacking import lacking_table, missing_seeds
+from safe_rl.reporting.pictures import algorithm_styles
 from safe_rl.reporting.scoring import (
     dominance_table,
     final_record,
     final_table,
 )
+from safe_rl.reporting.slate_pictures import draw_profiles
 from safe_rl.reporting.slate_scores import (
     aggregate,
     can_be_normalised,
@@ -295,3 +297,30 @@ def test_runs_that_continue_others_count_towards_no_slate(tmp_path):
     assert len(missing_seeds("SG6", experiments[0].algorithm, experiments, 1)) == 6
     result = build_report(tmp_path, SUITE, seeds_needed=1, unfinished=False)
     assert "normalised" not in [section.name for section in result.sections]
+
+
+def test_what_has_finished_no_episode_is_neither_best_nor_worse_than_others(tmp_path):
+    nothing = [float("nan")]
+    for seed in (0, 10):
+        write_run(tmp_path, algo="ppo", seed=seed, returns=nothing, costs=nothing, limits={})
+        write_run(tmp_path, algo="trpo", seed=seed, limits={})
+        write_run(tmp_path, algo="trpo_lagrangian", seed=seed, returns=[0.5 + seed], limits={})
+        write_run(tmp_path, algo="cpo", seed=seed, returns=nothing, costs=nothing)
+        write_run(tmp_path, algo="ppo_lagrangian", seed=seed, returns=[2.0 + seed], costs=[20.0])
+        write_run(tmp_path, algo="mine", seed=seed, returns=[2.0 + seed], costs=[90.0])
+    experiments = experiments_in(tmp_path)
+    table = final_table(experiments)
+    better = {(r["better"], r["worse"]) for r in dominance_table(table.records).records}
+    assert ("PPO-Lagrangian", "mine") in better
+    assert not {"PPO", "CPO"} & {name for pair in better for name in pair}
+    found = dict(zip((r["algorithm"] for r in table.records), marks(table, "$J_r$"), strict=True))
+    assert [name for name, mark in found.items() if mark] == ["PPO-Lagrangian", "TRPO-Lagrangian"]
+    own = [aggregate([e]) for e in experiments if e.algorithm in ("CPO", "PPO-Lagrangian", "mine")]
+    note = slate_table("SG6", SLATES["SG6"], own).note
+    assert "after equally many steps: mine." in note
+    assert "CPO" not in note
+    # and nobody else's profile is lost with its own
+    for panel in draw_profiles(own, algorithm_styles(experiments)).axes:
+        labels = [line.get_label() for line in panel.lines]
+        assert labels == ["PPO-Lagrangian", "mine"]
+        assert all(np.isfinite(line.get_xydata()).all() for line in panel.lines)
