@@ -92,16 +92,27 @@ def campaign_tables(
         Name of a campaign -> its table, and one of the commands of what is missing if any is.
     """
     tables, skipped = {}, {}
-    for path in sorted(root.rglob(PLAN)):
+    for path, name in _names(root).items():
         try:
             if not path.resolve().is_relative_to(root.resolve()):
                 raise ValueError(f"{path.name} is a link to outside of the folder")
             own = [run for run in runs if run.directory.is_relative_to(path.parent)]
-            name = clean(path.parent.resolve().name, 60)
             tables[name] = _tables(name, read_plan(path), own)
         except (ValueError, OSError) as error:
             skipped[path] = clean(error)
     return tables, skipped
+
+
+def _names(root: Path) -> dict[Path, str]:
+    """Plan -> name of its campaign: its folder's, with the way there if several are called so."""
+    plans = {path: path.parent.resolve().name for path in sorted(root.rglob(PLAN))}
+    names = list(plans.values())
+    return {
+        path: clean(name, 60)
+        if names.count(name) == 1 or path.parent == root
+        else clean(path.parent.relative_to(root).as_posix())
+        for path, name in plans.items()
+    }
 
 
 def _tables(name: str, cells: Sequence[Cell], runs: Sequence[Run]) -> list[Table]:
@@ -126,7 +137,9 @@ def _tables(name: str, cells: Sequence[Cell], runs: Sequence[Run]) -> list[Table
 
 
 def _record(name: str, cell: Cell, runs: Sequence[Run]) -> dict[str, Any]:
-    own = {run.seed: run for run in runs if run.seed in cell.seeds and _is_of(run, cell.chosen)}
+    found = [run for run in runs if run.seed in cell.seeds and _is_of(run, cell.chosen)]
+    # of one seed the run that has come furthest
+    own = {run.seed: run for run in sorted(found, key=lambda run: run.steps)}
     done = [seed for seed, run in sorted(own.items()) if run.steps >= cell.chosen["frames"]]
     begun = [seed for seed in sorted(own) if seed not in done]
     missing = tuple(seed for seed in cell.seeds if seed not in own)
@@ -152,9 +165,19 @@ def _is_of(run: Run, chosen: Mapping[str, Any]) -> bool:
     settings = flatten(run.config)
     settings |= {"env": run.config["env"].get("name"), "algo": run.algorithm}
     # what else a command line has chosen makes it another experiment
-    said = (override.lstrip("+~").partition("=")[0] for override in run.overrides or ())
+    words = (override.lstrip("+~").partition("=") for override in run.overrides or ())
+    said = {key: value for key, _, value in words}
     others = [key for key in said if role_of(key).names_experiment and key not in chosen]
-    return not others and all(settings.get(k) == v for k, v in flatten(chosen).items())
+    limits = chosen.get("cost_limits")
+    # a limit that the plan does not name makes it another one, too
+    others += set(run.limits) - set(limits) if isinstance(limits, Mapping) else []
+
+    def has(key: str, value: Any) -> bool:
+        # what a group was chosen by, as in risk=cvar, only the command line says
+        chose = key not in settings and said.get(key) == value
+        return settings.get(key) == value or chose
+
+    return not others and all(has(key, value) for key, value in flatten(chosen).items())
 
 
 def _commands(cells: Sequence[Cell], missing: Sequence[tuple[int, ...]]) -> list[dict[str, Any]]:

@@ -81,6 +81,47 @@ def test_other_keys_have_to_be_as_planned(tmp_path):
     assert "loss.strength=1.5" in shlex.split(second)
 
 
+ONE = {"env": "PointGoal1", "algo": "cpo", "seed": 0, "frames": 3000}
+
+
+def states(tables):
+    return [(r["done"], r["begun"], r["missing"]) for r in tables[0].records]
+
+
+def test_a_run_that_was_begun_again_is_still_done(tmp_path):
+    plan(tmp_path, ONE)
+    write_run(tmp_path, algo="cpo", **ROWS, folder="a")
+    write_run(tmp_path, algo="cpo", frames=3000, folder="b")
+    (tables,) = tables_of(tmp_path)[0].values()
+    assert states(tables) == [("0", "—", "—")]
+
+
+def test_campaigns_of_one_name_are_told_apart(tmp_path):
+    for year in ("2025", "2026"):
+        plan(tmp_path / year / "seeds", ONE)
+    write_run(tmp_path / "2025" / "seeds", algo="cpo", **ROWS)
+    found, _ = tables_of(tmp_path)
+    assert {name: states(tables)[0] for name, tables in found.items()} == {
+        "2025/seeds": ("0", "—", "—"), "2026/seeds": ("—", "—", "0"),
+    }  # fmt: skip
+
+
+def test_a_run_with_a_further_limit_is_another_one(tmp_path):
+    both = {"cost": 25.0, "cost_hazards": 5.0}
+    plan(tmp_path, {**ONE, "cost_limits": [{"cost": 25}, both]})
+    write_run(tmp_path, algo="cpo", limits=both, **ROWS)
+    (tables,) = tables_of(tmp_path)[0].values()
+    assert states(tables) == [("—", "—", "0"), ("0", "—", "—")]
+
+
+def test_a_plan_can_choose_from_a_group(tmp_path):
+    plan(tmp_path, {**ONE, "risk": ["cvar", "chance"]})
+    said = ["env=PointGoal1", "algo=cpo", "+risk=cvar"]
+    write_run(tmp_path, algo="cpo", risk={"_target_": "a.CVaR"}, overrides=said, **ROWS)
+    (tables,) = tables_of(tmp_path)[0].values()
+    assert states(tables) == [("0", "—", "—"), ("—", "—", "0")]
+
+
 @pytest.mark.parametrize(
     ("text", "words"),
     [
