@@ -16,7 +16,7 @@ from safe_rl.runs.files import replacing
 
 __all__ = [
     *("MISSING", "SYMBOL", "Cell", "Column", "Record", "Table", "each_cost", "escaped", "interval"),
-    *("mark_best", "power_of_ten", "spread"),
+    *("mark_best", "power_of_ten", "span", "spread"),
 ]
 
 MISSING = "—"
@@ -244,6 +244,17 @@ def mark_best(
         return "best" if is_best else ""
 
     return mark
+
+
+def span(numbers: Sequence[int]) -> str:
+    """From the lowest to the highest of some numbers.
+
+    Examples:
+        >>> span([3000, 1000]), span([1000, 1000])
+        ('1,000 to 3,000', '1,000')
+    """
+    lowest, highest = min(numbers), max(numbers)
+    return f"{lowest:,}" if lowest == highest else f"{lowest:,} to {highest:,}"
 
 
 def power_of_ten(value: int) -> str:

@@ -67,6 +67,14 @@ class Experiment:
         """Runs that have come to their configured end."""
         return tuple(run for run in self.runs if run.is_finished)
 
+    @property
+    def lengths(self) -> tuple[int, ...]:
+        """Environment steps of its finished runs, ascending, each number once.
+
+        It is one number, unless unfinished runs count as finished.
+        """
+        return tuple(sorted({run.length for run in self.finished}))
+
 
 def cost_keys_of(experiments: Iterable[Experiment]) -> list[str]:
     """The aggregate cost if there is one, and every cost key that an experiment limits."""

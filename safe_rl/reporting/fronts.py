@@ -11,7 +11,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from safe_rl.reporting.columns import Record
+from safe_rl.reporting.columns import Record, span
 from safe_rl.reporting.pictures import (
     LIMIT_STYLE,
     WIDTH,
@@ -34,12 +34,13 @@ def compared(records: Sequence[Record]) -> dict[str, list[Record]]:
     They have a return and a cost on the same environment after equally many steps, and there are
     at least two of them.
     """
-    groups: dict[tuple[str, int], list[Record]] = {}
+    groups: dict[tuple[str, int, int], list[Record]] = {}
     for record in records:
         if isfinite(record["episode_return"] + record.get("episode_cost", nan)):
-            groups.setdefault((record["environment"], record["steps"]), []).append(record)
-    kept = {key: members for key, members in groups.items() if len(members) > 1}
-    return {f"{name}, {steps:,} steps": kept[name, steps] for name, steps in sorted(kept)}
+            key = (record["environment"], record["fewest_steps"], record["steps"])
+            groups.setdefault(key, []).append(record)
+    kept = {key: members for key, members in sorted(groups.items()) if len(members) > 1}
+    return {f"{name}, {span(steps)} steps": own for (name, *steps), own in kept.items()}
 
 
 def draw_fronts(records: Sequence[Record], styles: Mapping[str, Style]) -> Figure:

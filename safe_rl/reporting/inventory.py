@@ -27,7 +27,7 @@ def run_table(experiments: Sequence[Experiment]) -> Table:
             "algorithm": experiment.algorithm,
             "seed": run.seed,
             "steps": run.steps,
-            "state": "finished" if run.is_finished else f"{run.steps / run.frames:.0%}",
+            "state": _state(run),
             "hours": run.hours,
             "time": duration(run.hours),
             **run.final(["cost"]),
@@ -52,6 +52,12 @@ def run_table(experiments: Sequence[Experiment]) -> Table:
         Column("command", ("{}", "command")),
     ]
     return Table("runs", "Runs", columns, records)
+
+
+def _state(run: Run) -> str:
+    # of its own end, whether or not an unfinished run is to count as a finished one
+    meant = run.config["frames"]
+    return "finished" if run.steps >= meant else f"{run.steps / meant:.0%}"
 
 
 def variant_table(experiments: Sequence[Experiment]) -> Table:

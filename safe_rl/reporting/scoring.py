@@ -53,13 +53,15 @@ IDENTITY = (Column("algorithm", ("{}", "algorithm")), Column("seeds", ("{:d}", "
 
 def final_record(experiment: Experiment, cost_keys: Sequence[str]) -> dict[str, Any]:
     """Final J_r, J_c and ρ_c of an experiment: mean and standard deviation over its seeds."""
-    runs = experiment.finished
+    runs, lengths = experiment.finished, experiment.lengths
     record: dict[str, Any] = {
         "environment": experiment.environment,
         "algorithm": experiment.algorithm,
         "family": experiment.family or experiment.algorithm,
         "seeds": len(runs),
-        "steps": max(run.length for run in runs),
+        "steps": lengths[-1],
+        "fewest_steps": lengths[0],
+        "most_steps": lengths[-1] if lengths[1:] else None,
         "hours": float(np.mean([run.hours for run in runs])),
     }
     record |= _over_seeds([run.final(cost_keys) for run in runs])
@@ -104,7 +106,7 @@ def final_table(experiments: Sequence[Experiment]) -> Table:
     records = [final_record(experiment, cost_keys) for experiment in experiments]
     columns = [
         *IDENTITY,
-        Column("steps", ("{:,}", "steps")),
+        Column("steps", ("{:,}", "fewest_steps"), (" to {:,}", "most_steps")),
         Column("$J_r$", *spread("episode_return", 2), mark=_best(records, "episode_return", max)),
         *_which(cost_keys),
         Column("$J_c$", *spread("mean", 1), mark=_is_over),
@@ -154,7 +156,7 @@ def _best(
 def rivals(record: Record) -> Hashable:
     """What is equal in experiments that can be ranked: the length of training, and the limits."""
     limits = {key: value for key, value in record.items() if key.startswith("limit_")}
-    return record["steps"], frozenset(limits.items())
+    return record["fewest_steps"], record["steps"], frozenset(limits.items())
 
 
 def _measure_note(record: Record, key: str) -> str:

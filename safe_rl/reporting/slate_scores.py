@@ -9,7 +9,14 @@ from typing import Any
 
 import numpy as np
 
-from safe_rl.reporting.columns import Column, Table, interval, mark_best, power_of_ten
+from safe_rl.reporting.columns import (
+    Column,
+    Table,
+    interval,
+    mark_best,
+    power_of_ten,
+    span,
+)
 from safe_rl.reporting.experiments import Experiment
 from safe_rl.scores.comparisons import probability_of_improvement
 from safe_rl.scores.dominance import NOISE_OF_ZERO, Agent, compare
@@ -41,7 +48,8 @@ class Aggregate:
         algorithm: Its name, as experiments have it.
         published: Its name in ``conf/algo``, or "" if its limits are not the published ones.
         strata: Score -> its values per environment, one of each run.
-        steps: Environment steps of training, per environment.
+        steps: Environment steps of training, per environment; several where runs are not equally
+            long, see :attr:`Experiment.lengths`.
         limits: d, per environment.
     """
 
@@ -113,7 +121,7 @@ def aggregate(experiments: Sequence[Experiment]) -> Aggregate:
         first.algorithm,
         first.runs[0].algorithm if all(e.has_published_limit for e in experiments) else "",
         {name: [score[name] for score in scores] for name in Normalised._fields},
-        tuple(max(run.length for run in e.finished) for e in experiments),
+        tuple(steps for e in experiments for steps in e.lengths),
         tuple(e.limits["cost"] for e in experiments),
     )
 
@@ -215,12 +223,7 @@ def lengths(aggregates: Sequence[Aggregate]) -> dict[str, list[Aggregate]]:
         groups.setdefault(one.steps, []).append(one)
     if len(groups) == 1:
         return {"": list(aggregates)}
-    return {f", {_span(steps)} steps": members for steps, members in groups.items()}
-
-
-def _span(steps: Sequence[int]) -> str:
-    fewest, most = min(steps), max(steps)
-    return f"{fewest:,}" if fewest == most else f"{fewest:,} to {most:,}"
+    return {f", {span(steps)} steps": members for steps, members in groups.items()}
 
 
 def middle_table(slate: str, aggregates: Sequence[Aggregate], after: str = "") -> Table:

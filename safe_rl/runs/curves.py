@@ -144,7 +144,8 @@ def moving_mean(values: np.ndarray) -> np.ndarray:
         >>> moving_mean(np.array([1.0, 3.0, 5.0, 7.0, 9.0, 11.0])).tolist()
         [1.0, 2.0, 3.0, 4.0, 5.0, 7.0]
     """
-    sums = np.cumsum(np.concatenate([[0.0], values]))
-    ends = np.arange(1, len(values) + 1)
-    starts = np.maximum(ends - SMOOTHING_EPOCHS, 0)
-    return (sums[ends] - sums[starts]) / (ends - starts)
+    # no differences of running sums: after one huge value nothing would be left of the others
+    sums = np.zeros(len(values))
+    for back in range(min(SMOOTHING_EPOCHS, len(values))):
+        sums[back:] += values[: len(values) - back]
+    return sums / np.minimum(np.arange(1, len(values) + 1), SMOOTHING_EPOCHS)

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 from synthetic import SUITE, experiments_in, write_run
 
-from safe_rl.reporting.contents import build_report
+from safe_rl.reporting.columns import Table
+from safe_rl.reporting.contents import Drawing, build_report
 from safe_rl.reporting.lacking import lacking_table, missing_seeds
 from safe_rl.reporting.pictures import algorithm_styles
 from safe_rl.reporting.scoring import (
@@ -115,6 +116,33 @@ def test_only_what_was_trained_for_equally_many_steps_is_ranked(tmp_path):
     table = dominance_table(table_of(tmp_path).records)
     ranks = [(r["better"], r["worse"], r["reason"]) for r in table.records]
     assert ranks == [("c", "b", "satisfies")]
+
+
+def test_seeds_that_have_not_come_equally_far_are_not_ranked_with_those_that_have(tmp_path):
+    """Where unfinished runs are to count, the longest of an experiment does not stand for all."""
+    long = {name: [1.0] * 10 for name in ("returns", "costs", "rates")}
+    write_run(tmp_path, algo="cpo", **long)
+    write_run(tmp_path, algo="cpo", seed=10, returns=[9.0], frames=10_000)
+    for seed in (0, 10):
+        for algo in ("trpo_lagrangian", "ppo_lagrangian"):
+            write_run(tmp_path, algo=algo, seed=seed, **long)
+    report = build_report(tmp_path, SUITE, seeds_needed=2, unfinished=True)
+    tables = {b.name: b for s in report.sections for b in s.blocks if isinstance(b, Table)}
+    drawn = {b.name: b.shows for s in report.sections for b in s.blocks if isinstance(b, Drawing)}
+    final = tables["final_PointGoal1"]
+    assert [row[2].text for row in final.rows()] == ["10,000", "10,000", "1,000 to 10,000"]
+    assert marks(final, "$J_r$") == ["best", "best", ""]
+    assert "dominance" not in tables
+    assert drawn["fronts"].endswith("PointGoal1, 10,000 steps: PPO-Lagrangian, TRPO-Lagrangian")
+    slate = tables["slate_shared"]
+    assert [row[2].text for row in slate.rows()] == ["10,000", "10,000", "1,000 to 10,000"]
+    assert marks(slate, r"$\bar J_r$") == ["best", "best", ""]
+    pairs = [(r["algorithm"], r["other"]) for r in tables["slate_shared_improvement"].records]
+    assert pairs == [("PPO-Lagrangian", "TRPO-Lagrangian")]
+    # and it is not said to be finished
+    states = {(r["algorithm"], r["seed"]): r["state"] for r in tables["runs"].records}
+    assert states["CPO", 10] == "10%"
+    assert list(states.values()).count("finished") == 5
 
 
 def test_only_what_has_the_same_limits_is_ranked(tmp_path):

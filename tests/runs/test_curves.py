@@ -8,7 +8,7 @@ import pytest
 from matplotlib.figure import Figure
 from matplotlib.image import imread
 
-from safe_rl.runs.curves import draw_learning_curves
+from safe_rl.runs.curves import draw_learning_curves, moving_mean
 
 TABLE = {
     "steps": [100, 200, 300, 400, 500, 600, 700],
@@ -63,6 +63,13 @@ def test_single_epochs_and_their_moving_mean_over_five(drawn):
     np.testing.assert_allclose(single.get_ydata(), [1, 3, 4, 5, 6, 13])
     np.testing.assert_allclose(single.get_xdata(), [100, 300, 400, 500, 600, 700])
     np.testing.assert_allclose(mean.get_ydata(), [1, 2, 8 / 3, 13 / 4, 19 / 5, 31 / 5])
+
+
+@pytest.mark.parametrize("first", [3.0, -1e20, math.nan], ids=["usual", "huge", "nan"])
+def test_a_curve_forgets_an_epoch_that_is_five_epochs_ago(first):
+    values = np.array([first, *range(1, 9)])
+    windows = [values[max(0, end - 5) : end].mean() for end in range(1, 10)]
+    np.testing.assert_allclose(moving_mean(values), windows)
 
 
 def test_several_costs_have_a_line_a_limit_and_a_name_each(drawn):
