@@ -200,13 +200,23 @@ def _largest_cost(env: EnvBase, key: str) -> float:
 
 
 def _keep(folder: RunFolder, checkpoint: Path | None) -> Path | None:
-    """Copy the certified checkpoint to where no other takes its place."""
+    """Copy the certified checkpoint to where no other takes its place.
+
+    That of an earlier certificate goes when the copy is complete: with its replay buffer one takes
+    long enough to be interrupted.
+    """
     directory = folder.checkpoints / "certified"
-    shutil.rmtree(directory, ignore_errors=True)
     if checkpoint is None:
+        shutil.rmtree(directory, ignore_errors=True)
         return None
-    directory.mkdir(parents=True)
-    return Path(shutil.copy2(checkpoint, directory))
+    directory.mkdir(parents=True, exist_ok=True)
+    kept = directory / checkpoint.name
+    with replacing(kept) as unfinished:
+        shutil.copy2(checkpoint, unfinished)
+    for other in directory.iterdir():
+        if other != kept:
+            other.unlink()
+    return kept
 
 
 def _finite(value: float) -> float | None:

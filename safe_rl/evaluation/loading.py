@@ -107,8 +107,9 @@ def load_policy(
     except CheckpointError as error:
         if "size mismatch" not in str(error):
             raise
-        first = env.reset()[0]
-        sizes = [first["observation"].numel(), env.action_spec.zero()[0].numel()]
+        # of a dictionary all entries
+        seen = env.reset()[0].select("observation").values(include_nested=True, leaves_only=True)
+        sizes = [sum(part.numel() for part in seen), env.action_spec.zero()[0].numel()]
         raise CheckpointError(
             f"The policy in {checkpoint} was trained on other observations or actions than this "
             f"environment's ({sizes[0]} numbers, {sizes[1]} actions): undo the env.… "

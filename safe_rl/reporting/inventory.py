@@ -99,7 +99,8 @@ def evaluation_table(experiments: Sequence[Experiment]) -> Table:
         *([Column("cost", ("{}", "named"))] if len(keys) > 1 else []),
         Column("$J_c$", *interval("mean", 1), mark=_is_over),
         Column("$d$", ("{:g}", "limit")),
-        Column("P($C$ > $d$)", ("{:.0%}", "over")),
+        # of many episodes a few are not none
+        Column("P($C$ > $d$)", ("{:.1%}", "over")),
         Column("CVaR", ("{:.0%}: {:.1f}", "cvar_alpha", "cvar"), interval("cvar", 1)[1]),
     ]
     fields = {"limit": "limit_{}", "over": "over_limit_{}"}
@@ -122,7 +123,7 @@ def certificate_table(experiments: Sequence[Experiment]) -> Table:
     columns = [
         *_WHERE,
         _SEED,
-        Column("certified", ("{}", "certified"), (" at {:.1%}", "level"), mark=_is_missing),
+        Column("certified", ("{}", "certified"), (" at {}", "surely"), mark=_is_missing),
         Column("at", ("{:,} steps", "checkpoint")),
         Column("$J_r$", ("{:.2f}", "certified_return")),
         Column("bound on", ("{}", "named")),
@@ -143,6 +144,7 @@ def _certificate_record(
         "algorithm": experiment.algorithm,
         "seed": run.seed,
         "certified": "no" if certificate["checkpoint"] is None else "yes",
+        "surely": f"{100 * certificate['level']:.12g}%",  # not rounded up to 100
         **{name: value for name, value in certificate.items() if name != "bounds"},
         **{f"bound_{name}": bound for name, (bound, _) in bounds},
         **{f"most_{name}": most for name, (_, most) in bounds},

@@ -71,6 +71,37 @@ def test_a_certificate_is_taken_back_with_its_policy(train):
         find_checkpoint(directory, "certified")
 
 
+def test_an_interrupted_certificate_leaves_the_policy_of_before(train, monkeypatch):
+    directory = train("{cost: 1000}")
+    before = certify(directory, OPTIONS, make_env=make_env).checkpoint
+    content = before.read_bytes()
+
+    def interrupt(source, target):
+        target = target / source.name if target.is_dir() else target
+        target.write_bytes(source.read_bytes()[:100])
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("shutil.copy2", interrupt)
+    with pytest.raises(KeyboardInterrupt):
+        certify(directory, replace(OPTIONS, episodes=13), make_env=make_env)
+    assert find_checkpoint(directory, "certified") == before
+    assert before.read_bytes() == content
+    assert list(before.parent.iterdir()) == [before]
+
+
+def test_a_new_certificate_takes_the_place_of_the_one_before(train):
+    directory = train("{cost: 1000}")
+    before = certify(directory, OPTIONS, make_env=make_env).checkpoint
+    others = {path for kind in ("best", "last")
+              for path in (directory / "checkpoints" / kind).glob("*.torchrl")}  # fmt: skip
+    for path in others:
+        if path.name == before.name:
+            path.unlink()
+    after = certify(directory, OPTIONS, make_env=make_env).checkpoint
+    assert after.name != before.name
+    assert list(after.parent.iterdir()) == [after]
+
+
 def test_the_same_run_gets_the_same_certificate(train):
     directory = train("{cost: 1000}")
     first = certify(directory, OPTIONS, make_env=make_env)

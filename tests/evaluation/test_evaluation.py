@@ -28,8 +28,7 @@ from safe_rl.training.trainer import build_trainer, seed_everything
 NUM_STEPS = 40
 
 
-@pytest.fixture(scope="module")
-def trained(tmp_path_factory):
+def train(directory, *overrides):
     """A run of two epochs on PointGoal1 with short episodes."""
     store_configs()
     config = compose_config(
@@ -42,13 +41,18 @@ def trained(tmp_path_factory):
         "policy_update.minibatch_size=80",
         "critic_update.minibatch_size=80",
         "logger=none",
+        *overrides,
     )
     seed_everything(config.seed, num_threads=1)
     node = OmegaConf.to_container(config.env, resolve=True)
     env = make_env(node, num_envs=4, seed=config.seed, num_threads=1)
-    directory = tmp_path_factory.mktemp("runs") / "run"
     build_trainer(config, env, directory).run()
     return directory
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory):
+    return train(tmp_path_factory.mktemp("runs") / "run")
 
 
 @pytest.fixture
@@ -247,6 +251,18 @@ def test_what_cannot_be_done_ends_in_one_line(run, arguments, message, capsys, m
     error = capsys.readouterr().err.splitlines()[-1]
     assert error.startswith("error: ")
     assert message in error
+
+
+def test_a_dictionary_of_another_size_ends_in_one_line_too(tmp_path, capsys):
+    run = train(tmp_path / "run", "env.observation_flatten=false", "model=dict")
+    assert main([str(run), "env.lidar_num_bins=8"]) == 1
+    error = capsys.readouterr().err.splitlines()[-1]
+    assert error.startswith("error: ")
+    # as many as the same environment has in one vector
+    own = OmegaConf.to_container(OmegaConf.load(run / "config.yaml").env)
+    flat = {**own, "observation_flatten": True, "lidar_num_bins": 8}
+    size = make_env(flat, num_envs=1, seed=0).observation_spec["observation"].shape[-1]
+    assert f"trained on other observations or actions than this environment's ({size} num" in error
 
 
 @pytest.mark.parametrize(

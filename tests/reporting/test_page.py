@@ -119,7 +119,7 @@ def test_page_and_markdown_say_the_same(report):
         "12.00 [11.00, 13.00]",
         "21.0 [20.0, 22.0]",
         "25",
-        "25%",
+        "25.0%",
         "10%: 70.0 [69.0, 71.0]",
     ]
     assert [
@@ -189,8 +189,16 @@ def test_an_evaluation_shows_every_limit(tmp_path):
         assert cells["$J_c$"].text == f"{cost}.0 [{cost - 1}.0, {cost + 1}.0]"
         assert cells["$J_c$"].mark == mark
         assert cells["$d$"].text == limit
-        assert cells["P($C$ > $d$)"].text == "25%"
+        assert cells["P($C$ > $d$)"].text == "25.0%"
         assert cells["CVaR"].text.startswith(f"10%: {cost + 10}.0 [")
+
+
+def test_a_few_of_many_episodes_are_not_none(tmp_path):
+    directory = write_run(tmp_path)
+    estimates = {**EVALUATION["estimates"], "over_limit_cost": _estimate(0.004)}
+    (directory / "evaluation.json").write_text(json.dumps({**EVALUATION, "estimates": estimates}))
+    (row,) = evaluation_table(experiments_in(tmp_path)).rows()
+    assert {cell.title: cell.text for cell in row}["P($C$ > $d$)"] == "0.4%"
 
 
 def test_an_evaluation_is_not_judged_by_the_mean_if_training_was_not(tmp_path):
