@@ -56,7 +56,7 @@ def fast_products() -> Iterator[None]:
         >>> product[0, 0].item()
         64.0
     """
-    products = torch.backends.mkldnn.matmul
+    products = torch.backends.mkldnn.matmul  # type: ignore[attr-defined]  # made at run time
     before = products.fp32_precision
     if before != "none" or not _is_of_use():
         yield
