@@ -17,6 +17,9 @@ from safe_rl.algorithms.memory import Memory
 
 __all__ = ["ReplayUpdate"]
 
+_SETTINGS = "_value_estimator."
+"""Where losses keep numbers of their value estimators, which a run that is resumed may change."""
+
 
 class ReplayUpdate:
     """Minimise the sum of all ``loss_*`` on minibatches, and let target networks follow.
@@ -134,7 +137,9 @@ class ReplayUpdate:
         self._counts["updates"] += 1
 
     def _tensors(self) -> Iterator[tuple[str, Tensor]]:
-        return chain(self.loss.named_parameters(), self.loss.named_buffers())
+        """What the loss has come to hold, by name."""
+        named = chain(self.loss.named_parameters(), self.loss.named_buffers())
+        return ((name, tensor) for name, tensor in named if not name.startswith(_SETTINGS))
 
     def state_dict(self) -> dict[str, Any]:
         """Optimiser, target networks and whatever else the loss holds."""

@@ -141,7 +141,7 @@ class CALLoss(SACLagrangianLoss):
         self.critics_say.add_(torch.stack([means, torch.ones_like(means)]))
         charged = self.charged(values).flatten(0, -2).mean(0)
         excess = (charged - self.discounted_limit) / self.cost_unit
-        weight = self.multiplier.value + self.convexity * excess
+        weight = self.multiplier.value.to(excess) + self.convexity * excess
         return weight.clamp_min(0) / self.cost_unit
 
     def calibrate(self, episodes: KnownCosts) -> None:

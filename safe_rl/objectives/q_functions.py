@@ -11,12 +11,20 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torchrl.objectives import LossModule
 from torchrl.objectives.utils import distance_loss
+from torchrl.objectives.value import ValueEstimatorBase
 
 from safe_rl.objectives.keys import require
 from safe_rl.objectives.multipliers import Multiplier
 from safe_rl.objectives.violation import KnownCosts
 
-__all__ = ["CostCritics", "CostTerms", "discount_of", "is_ensemble", "scalars"]
+__all__ = [
+    "CostCritics",
+    "CostTerms",
+    "QFunctionLoss",
+    "discount_of",
+    "is_ensemble",
+    "scalars",
+]
 
 
 class CostTerms(TypedDict):
@@ -45,6 +53,30 @@ def is_ensemble(network: Any) -> bool:
     It has ``num_networks``, and takes steps [...] and parameters to values [E, ...].
     """
     return hasattr(network, "num_networks")
+
+
+class QFunctionLoss(LossModule):
+    """What a loss on Q functions has besides TorchRL's: one discount, and copies of their own.
+
+    Classes put it before TorchRL's loss that they inherit from.
+
+    Attributes:
+        gamma: discount per step, of reward and costs; that of the value estimator.
+    """
+
+    gamma: float
+
+    def make_value_estimator(self, value_type: Any = None, **hyperparams: Any) -> LossModule | None:
+        """As TorchRL's; its ``gamma`` holds for the critics of the costs as well."""
+        made = super().make_value_estimator(value_type, **hyperparams)
+        if isinstance(value_type, ValueEstimatorBase):
+            hyperparams = {"gamma": value_type.gamma.item()}
+        self.gamma = hyperparams.get("gamma", self.gamma)
+        return made
+
+    def __getstate__(self) -> dict[str, Any]:
+        # the parameters without gradients, which TorchRL keeps, would be those of another loss
+        return {name: x for name, x in self.__dict__.items() if not name.startswith("_cache")}
 
 
 class CostCritics(LossModule):
@@ -204,7 +236,7 @@ class CostCritics(LossModule):
         Args:
             values: outputs of the cost critics for its actions, [E, ..., k].
         """
-        return self.multiplier.value / self.cost_unit
+        return self.multiplier.value.to(self.cost_unit) / self.cost_unit
 
     def cost_figures(self, values: Tensor) -> dict[str, Tensor]:
         """What is reported of outputs [E, ..., k] of the cost critics, [k] each."""

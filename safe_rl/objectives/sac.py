@@ -20,6 +20,7 @@ from safe_rl.objectives.multipliers import Multiplier
 from safe_rl.objectives.q_functions import (
     CostCritics,
     CostTerms,
+    QFunctionLoss,
     discount_of,
     is_ensemble,
     scalars,
@@ -53,7 +54,7 @@ class ConstrainedSoftActorCritic(SoftActorCritic, CostTerms):
     """Keyword arguments of every soft actor-critic with cost limits."""
 
 
-class SACLoss(objectives.SACLoss):
+class SACLoss(QFunctionLoss, objectives.SACLoss):
     """TorchRL's loss with an ensemble of Q functions that needs no vmap, in two halves.
 
     `critic_losses` and `actor_losses` together are what a call returns, so that an update may take
@@ -127,15 +128,17 @@ class SACLoss(objectives.SACLoss):
         keys, following = self.tensor_keys, tensordict.get("next")
         with torch.no_grad():
             self._next_action, log_prob = self._act(following)
-            if not isinstance(self.value_estimator, TD0Estimator):
-                return super()._compute_target_v2(tensordict)
             inputs = following.select(*self.qvalue_network.in_keys, strict=False)
             inputs.set(keys.action, self._next_action)
             values = self._vmap_qnetworkN0(inputs, self.target_qvalue_network_params)
             lowest = values.get(keys.state_action_value).min(0).values
             soft = lowest - self._alpha * log_prob.unsqueeze(-1)
+            estimator = self.value_estimator
+            if type(estimator) is not TD0Estimator or estimator.average_rewards:
+                steps = tensordict.clone(False).set(("next", estimator.tensor_keys.value), soft)
+                return estimator.value_estimate(steps).squeeze(-1)
             goes_on = following.get(keys.terminated).logical_not()
-            spanned = self.value_estimator.tensor_keys.steps_to_next_obs
+            spanned = estimator.tensor_keys.steps_to_next_obs
             discount = discount_of(tensordict, self.gamma, spanned)
             return (following.get(keys.reward) + discount * goes_on * soft).squeeze(-1)
 

@@ -14,7 +14,7 @@ from torchrl.data import TensorSpec
 from torchrl.objectives import ValueEstimators
 
 from safe_rl.objectives.multipliers import Multiplier
-from safe_rl.objectives.q_functions import CostCritics, is_ensemble, scalars
+from safe_rl.objectives.q_functions import CostCritics, QFunctionLoss, is_ensemble, scalars
 
 __all__ = ["TD3LagrangianLoss", "TD3Loss", "TwinDelayed"]
 
@@ -38,7 +38,7 @@ class TwinDelayed(TypedDict):
     loss_function: NotRequired[str]
 
 
-class TD3Loss(objectives.TD3Loss):
+class TD3Loss(QFunctionLoss, objectives.TD3Loss):
     """TorchRL's loss with an ensemble of Q functions that needs no vmap, in two halves.
 
     Args:

@@ -58,6 +58,7 @@ ROLES: dict[str, Role] = {
     "lagrangian.init": Role.EXPERIMENT,
     "lagrangian.scale": Role.EXPERIMENT,
     "lagrangian.derivative_delay": Role.EXPERIMENT,
+    "loss.alpha_init": Role.EXPERIMENT,
     "*._target_": Role.EXPERIMENT,
     "collector": Role.MANNER,
     "collector.ray_init": Role.MACHINE,

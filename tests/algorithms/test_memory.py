@@ -7,10 +7,12 @@ import pytest
 import torch
 from scipy import stats
 from tensordict import TensorDict
+from torchrl.data import Bounded
+from torchrl.objectives import ValueEstimators
 
 from safe_rl.algorithms import Memory, ReplayUpdate
-from safe_rl.models import QEnsemble, make_squashed_actor
-from safe_rl.objectives import SACLoss
+from safe_rl.models import QEnsemble, make_bounded_actor, make_squashed_actor
+from safe_rl.objectives import SACLoss, TD3Loss
 
 IN_KEYS = [
     *("observation", "action"),
@@ -190,6 +192,26 @@ def test_errors_are_read_where_the_loss_writes_them():
     update(memory, 1)
     # the rewards of these steps differ, and so do the errors
     assert next(memory.minibatches(1))["priority_weight"].unique().numel() > 1
+
+
+def make_td3(gamma):
+    actor = make_bounded_actor(1, -torch.ones(1), torch.ones(1), hidden_sizes=[8])
+    q = QEnsemble(1, 1, hidden_sizes=[8], num_networks=2)
+    settings = {"policy_noise": 0.0, "noise_clip": 0.5, "action_spec": Bounded(-1, 1, [1])}
+    return TD3Loss(actor, q, gamma=gamma, **settings)
+
+
+def test_an_update_that_is_resumed_discounts_as_it_is_told():
+    def update_of(loss):
+        sgd = partial(torch.optim.SGD, lr=0.0)
+        return ReplayUpdate(loss, optimizer=sgd, updates_per_step=1.0, tau=0.1)
+
+    before, resumed = make_td3(0.9), make_td3(0.1)
+    update_of(resumed).load_state_dict(update_of(before).state_dict())
+    before.make_value_estimator(ValueEstimators.TD0, gamma=0.1)
+    steps = make_batch(0, 5, terminates=False).reshape(-1)
+    losses = [loss.critic_losses(steps.clone())["loss_qvalue"] for loss in (resumed, before)]
+    torch.testing.assert_close(*losses)
 
 
 @pytest.mark.parametrize("exponents", [{"alpha": 0.6}, {"alpha": 0.6, "beta": 0.4, "eps": 1.0}])

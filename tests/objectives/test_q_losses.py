@@ -1,5 +1,7 @@
 """Losses on Q functions against TorchRL's own, against formulas written out, and finite limits."""
 
+import copy
+
 import pytest
 import torch
 from tensordict import TensorDict
@@ -8,6 +10,7 @@ from torchrl import objectives
 from torchrl.data import Bounded
 from torchrl.modules import MLP, ValueOperator
 from torchrl.objectives import ValueEstimators
+from torchrl.objectives.value import TD0Estimator
 
 from safe_rl.models import QEnsemble, make_bounded_actor, make_squashed_actor
 from safe_rl.objectives import (
@@ -251,3 +254,49 @@ def test_the_priority_of_td3_is_the_error_and_not_its_square():
     torch.manual_seed(1)
     loss.critic_losses(steps)
     torch.testing.assert_close(steps["td_error"].square(), metadata["td_error"].max(0).values)
+
+
+@pytest.mark.parametrize("kind", ["sac", "td3"])
+@pytest.mark.parametrize("given", ["number", "estimator", "averaged"])
+def test_the_value_estimator_that_one_asks_for_is_used(kind, given):
+    loss, steps = make_loss(kind, lagrange(1.0, 1.0)), make_steps()
+    stock = as_stock(loss, kind)
+    for module in (stock, loss):
+        if given == "estimator":
+            estimator = TD0Estimator(gamma=0.25, value_network=None)
+            estimator.set_keys(value=module.value_estimator.tensor_keys.value)
+            module.make_value_estimator(estimator)
+        else:
+            average = {"average_rewards": True} if given == "averaged" else {}
+            module.make_value_estimator(ValueEstimators.TD0, gamma=0.25, **average)
+    torch.manual_seed(1)
+    rewards = (stock.value_loss if kind == "td3" else stock.qvalue_v2_loss)(steps.clone())[0]
+    torch.manual_seed(1)
+    losses = loss.critic_losses(steps.clone())
+    torch.testing.assert_close(losses["loss_qvalue"], rewards)
+    expected = make_loss(kind, lagrange(1.0, 1.0))
+    expected.load_state_dict(loss.state_dict())
+    expected.gamma = 0.25
+    torch.manual_seed(1)
+    costs = expected.critic_losses(steps.clone())["loss_cost_qvalue"]
+    torch.testing.assert_close(losses["loss_cost_qvalue"], costs)
+
+
+@pytest.mark.parametrize("kind", ["sac", "td3"])
+def test_a_copy_learns_from_its_own_critics(kind):
+    loss, fresh, steps = *(make_loss(kind, lagrange(1.0, 1.0)) for _ in range(2)), make_steps()
+    loss(steps.clone())
+    copied = copy.deepcopy(loss)
+    copied.load_state_dict(fresh.state_dict())
+    found = []
+    for module in (copied, fresh):
+        torch.manual_seed(1)
+        found.append(module.actor_losses(steps)["loss_actor"])
+    torch.testing.assert_close(*found)
+
+
+@pytest.mark.parametrize("kind", ["sac", "td3"])
+def test_the_multiplier_may_be_elsewhere_than_the_loss(kind):
+    loss = make_loss(kind, lagrange(1.0, 1.0))
+    loss.cost_unit = loss.cost_unit.to("meta")
+    assert loss.cost_weights(torch.zeros(2, 6, 2, device="meta")).device.type == "meta"
