@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 
 import torch
-from tensordict import TensorDictBase
+from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
 
 from safe_rl.collectors import EpisodeStatistics
-from safe_rl.naming import did_you_mean
+from safe_rl.naming import did_you_mean, key_name
 from safe_rl.objectives.multipliers import Multiplier
 
 __all__ = ["Constraints", "check_cost_limits"]
@@ -52,7 +52,7 @@ class Constraints:
 
     def __init__(
         self,
-        limits: Mapping[str, float],
+        limits: Mapping[NestedKey, float],
         *,
         max_length: int | None = None,
         multiplier: Multiplier | None = None,
@@ -112,10 +112,16 @@ class Constraints:
         return row
 
     def column(self, name: str, value: Tensor) -> dict[str, float]:
-        """One column for a scalar, one per constraint for a vector [k]."""
+        """One column for a scalar, one per constraint for a vector [k].
+
+        Examples:
+            >>> Constraints({("agents", "cost"): 25.0}).column("violation", torch.tensor([5.0]))
+            {'violation_agents/cost': 5.0}
+        """
         if value.ndim == 0:
             return {name: value.item()}
-        return {f"{name}_{key}": v for key, v in zip(self.keys, value.tolist(), strict=True)}
+        names = map(key_name, self.keys)
+        return {f"{name}_{key}": v for key, v in zip(names, value.tolist(), strict=True)}
 
     def state_dict(self) -> dict[str, Tensor]:
         """The costs and the length of the last batch in which an episode finished."""

@@ -133,9 +133,11 @@ class OnPolicy:
         """
         self.constraints.charge(episodes, batch)
         self.advantage(batch)
+        keys = {"advantage": self.advantage.tensor_keys.advantage}
         if self.cost_advantage is not None:
             self.cost_advantage(batch)
-        normalise_advantages(batch)
+            keys["cost_advantage"] = self.cost_advantage.tensor_keys.advantage
+        normalise_advantages(batch, **keys)
         constraints = self.constraints
         constraints.observe(episodes, batch)
         metrics = self._update(batch)

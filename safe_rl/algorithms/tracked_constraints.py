@@ -6,11 +6,12 @@ from collections.abc import Mapping
 from typing import Any
 
 import torch
-from tensordict import TensorDictBase
+from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
 
 from safe_rl.algorithms.constraints import Constraints
 from safe_rl.collectors import EpisodeStatistics
+from safe_rl.naming import key_name
 from safe_rl.objectives.limits import LimitTracker
 from safe_rl.objectives.multipliers import Multiplier
 from safe_rl.objectives.risk import Charges, RiskMeasure
@@ -32,20 +33,23 @@ class TrackedConstraints(Constraints):
         tracker: Estimates J_c and what it should be by now.
         multiplier: Weighs the costs against the return, or None.
         risk: What is limited instead of the mean cost of an episode, or None.
+        cost_advantage: Key of the cost advantages that the multiplier weighs.
         device: Of all tensors.
     """
 
     def __init__(
         self,
-        limits: Mapping[str, float],
+        limits: Mapping[NestedKey, float],
         *,
         tracker: LimitTracker,
         multiplier: Multiplier | None = None,
         risk: RiskMeasure | None = None,
+        cost_advantage: NestedKey = "cost_advantage",
         device: torch.device | str | None = None,
     ) -> None:
         super().__init__(limits, multiplier=multiplier, device=device)
         self.tracker, self.risk = tracker, risk
+        self.cost_advantage = cost_advantage
         self._charges: Charges | None = None
         self._row: dict[str, float] = {}
 
@@ -55,7 +59,7 @@ class TrackedConstraints(Constraints):
             return
         costs = self._costs_of(batch).cpu()
         ends = batch["next", "done"].squeeze(-1).cpu()
-        before = torch.stack([episodes.open_costs[key] for key in self.keys], -1)
+        before = torch.stack([episodes.open_costs[key_name(key)] for key in self.keys], -1)
         finished = episodes.episode_costs(self.keys).cpu()
         self._charges = self.risk(costs, ends, before.nan_to_num(0.0).to(costs), finished)
         batch["next", CHARGES] = self._charges.costs.to(batch.device or self.limits.device)
@@ -84,9 +88,9 @@ class TrackedConstraints(Constraints):
             return
         self.multiplier.set_scale(state.scale)
         self.multiplier.update(self.limits + state.violation)
-        advantage = batch.get("cost_advantage", None)
+        advantage = batch.get(self.cost_advantage, None)
         if advantage is not None:
-            batch["cost_advantage"] = advantage / state.unit
+            batch[self.cost_advantage] = advantage / state.unit
 
     def expect(self, metrics: Mapping[str, Tensor]) -> None:
         """Note the change of J_c that an update's surrogates promise, if it reports them."""

@@ -21,7 +21,8 @@ class EpisodeStatistics:
 
     Attributes:
         returns: Undiscounted return of every episode that finished in the batch, shape [E].
-        costs: Cost key -> undiscounted cost of every finished episode, shape [E].
+        costs: Cost key -> undiscounted cost of every finished episode, shape [E]. Here and below,
+            nested keys are joined by ``/``.
         lengths: Steps of every finished episode, shape [E].
         cost_rates: Cost key -> all cost so far divided by all steps so far, ρ_c, scalar tensors.
         open_costs: Cost key -> what the open episode of every row had cost before the batch, shape
@@ -50,13 +51,13 @@ class EpisodeStatistics:
         """Number of episodes that finished in the batch, E."""
         return self.returns.shape[0]
 
-    def episode_costs(self, cost_keys: Sequence[str]) -> Tensor:
+    def episode_costs(self, cost_keys: Sequence[NestedKey]) -> Tensor:
         """Undiscounted costs of every finished episode, shape [E, len(cost_keys)]."""
         if not cost_keys:
             return self.returns.new_empty(self.num_episodes, 0)
-        return torch.stack([self.costs[key] for key in cost_keys], -1)
+        return torch.stack([self.costs[key_name(key)] for key in cost_keys], -1)
 
-    def mean_costs(self, cost_keys: Sequence[str]) -> Tensor:
+    def mean_costs(self, cost_keys: Sequence[NestedKey]) -> Tensor:
         """Mean episode cost J_c per key, shape [len(cost_keys)]; NaN if no episode finished."""
         return self.episode_costs(cost_keys).mean(0)
 

@@ -1,0 +1,122 @@
+"""Parts put together by hand, with entries below another one, learn what they do without."""
+
+from functools import partial
+
+import pytest
+import torch
+from tensordict import TensorDict
+
+from safe_rl.algorithms import MinibatchUpdate, OnPolicy
+from safe_rl.algorithms.constraints import Constraints
+from safe_rl.algorithms.tracked_constraints import TrackedConstraints
+from safe_rl.collectors import EpisodeAccounting
+from safe_rl.models import make_actor, make_critic
+from safe_rl.objectives import (
+    CostGAE,
+    CriticLoss,
+    LagrangeMultiplier,
+    LimitTracker,
+    PPOLagrangianLoss,
+    VectorGAE,
+)
+
+SETTINGS = {"gamma": 0.99, "lmbda": 0.97, "value_target": "lambda_return"}
+TRACKER = {
+    "max_length": 5, "margin": 0.5, "largest_margin": 0.2, "free_steps": 0, "descent_steps": 100,
+    "frames": 1000, "latest_end": 0.7, "smallest_scale": 0.01, "drift": 0.2, "memory": 0.9,
+    "lowest_trust": 0.1, "integral": 0.0, "largest_integral": 0.5,
+}  # fmt: skip
+WRITTEN = {
+    "actor": {"action_key": "action", "log_prob_key": "action_log_prob"},
+    "critic": {"out_key": "state_value"},
+    "cost_critic": {"out_key": "cost_value"},
+    "advantage": {"advantage": "advantage", "value_target": "value_target", "value": "state_value",
+                  "reward": "reward", "done": "done", "terminated": "terminated"},
+    "cost_advantage": {"advantage": "cost_advantage", "value_target": "cost_value_target",
+                       "value": "cost_value", "done": "done", "terminated": "terminated"},
+    "loss": {"action": "action", "sample_log_prob": "action_log_prob", "advantage": "advantage",
+             "cost_advantage": "cost_advantage"},
+    "critic_loss": {"value": "state_value", "value_target": "value_target",
+                    "cost_value": "cost_value", "cost_value_target": "cost_value_target"},
+}  # fmt: skip
+
+
+def make_algorithm(below, constraints_of):
+    """PPO-Lagrangian whose every entry is `below` a key, or at the root."""
+
+    def at(name):
+        return (*below, name) if below else name
+
+    def keys(part):
+        return {name: at(key) for name, key in WRITTEN[part].items()}
+
+    torch.manual_seed(0)
+    sizes = {"hidden_sizes": [8], "in_key": at("observation")}
+    actor = make_actor(3, 2, initial_log_std=-0.5, **sizes, **keys("actor"))
+    critic = make_critic(3, **sizes, **keys("critic"))
+    cost_critic = make_critic(3, **sizes, **keys("cost_critic"))
+    constraints = constraints_of(at)
+    advantage = VectorGAE(critic, **SETTINGS)
+    cost_advantage = CostGAE([at("cost")], cost_critic, **SETTINGS)
+    loss = PPOLagrangianLoss(actor, constraints.multiplier, clip_epsilon=0.2, entropy_coeff=0.0)
+    critic_loss = CriticLoss(critic, cost_critic)
+    for part, given in (
+        (advantage, "advantage"), (cost_advantage, "cost_advantage"), (loss, "loss"),
+        (critic_loss, "critic_loss"),
+    ):  # fmt: skip
+        part.set_keys(**keys(given))
+    update = partial(
+        MinibatchUpdate, optimizer=partial(torch.optim.SGD, lr=0.1), num_passes=2,
+        minibatch_size=None,
+    )  # fmt: skip
+    return OnPolicy(
+        actor, critic, cost_critic, constraints, advantage, cost_advantage,
+        update(loss), update(critic_loss),
+    )  # fmt: skip
+
+
+def make_batch(algorithm, below):
+    generator = torch.Generator().manual_seed(1)
+    draw = partial(torch.randn, 4, 10, generator=generator)
+    done = torch.zeros(4, 10, 1, dtype=torch.bool)
+    done[:, 4::5] = True
+    following = {"observation": draw(3), "reward": draw(1), "done": done, "terminated": done}
+    following["cost"] = 3.0 * (draw(1) > 0)
+    here = {"observation": draw(3)}
+    if below:
+        here, following = {below[0]: here}, {below[0]: following}
+    batch = TensorDict({**here, "next": following}, [4, 10])
+    torch.manual_seed(2)
+    with torch.no_grad():
+        return algorithm.actor(batch)
+
+
+def plain(at):
+    multiplier = LagrangeMultiplier({at("cost"): 1.0}, init=1.0, lr=0.1)
+    return Constraints({at("cost"): 1.0}, multiplier=multiplier)
+
+
+def tracked(at):
+    return TrackedConstraints(
+        {at("cost"): 1.0},
+        tracker=LimitTracker(torch.tensor([1.0]), **TRACKER),
+        multiplier=LagrangeMultiplier({at("cost"): 1.0}, init=1.0, lr=0.1),
+        cost_advantage=at("cost_advantage"),
+    )
+
+
+@pytest.mark.parametrize("constraints_of", [plain, tracked])
+def test_entries_below_another_one_are_learned_from_as_at_the_root(constraints_of):
+    rows, learned, advantages = [], [], []
+    for below in ((), ("agents",)):
+        algorithm = make_algorithm(below, constraints_of)
+        batch = make_batch(algorithm, below)
+        keys = [(*below, name) for name in ("cost", "reward", "done")]
+        accounting = EpisodeAccounting(4, keys[:1], reward_key=keys[1], done_key=keys[2])
+        row = algorithm.learn(batch, accounting.update(batch))
+        rows.append({name.replace("agents/", ""): value for name, value in row.items()})
+        learned.append(torch.cat([p.detach().flatten() for p in algorithm.actor.parameters()]))
+        advantages.append(batch[(*below, "cost_advantage")])
+    assert rows[0] == rows[1]
+    assert torch.equal(*learned)
+    assert torch.equal(*advantages)
