@@ -82,7 +82,7 @@ FLOORS = {
         ("velocity.nodes",),
         ("velocity",),
         ("gymnasium.adapting", "gymnasium.outside", "gymnasium.processes", "gymnasium.worlds"),
-        ("gymnasium.velocity",),
+        ("gymnasium.reading", "gymnasium.velocity"),
         ("gymnasium.conversion", "gymnasium.single", "gymnasium.vector"),
         ("gymnasium.nodes",),
         ("gymnasium.family",),

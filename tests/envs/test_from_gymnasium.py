@@ -1,5 +1,7 @@
 """Environments that are not ours, with costs in `info`, in TorchRL and under our algorithms."""
 
+import warnings
+
 import gymnasium
 import numpy as np
 import pytest
@@ -68,6 +70,37 @@ def test_costs_stand_beside_the_reward_and_are_those_of_the_environment():
     torch.testing.assert_close(step["cost_upright"], x.clamp(min=0))
     torch.testing.assert_close(step["cost"], step["cost_speed"] + step["cost_upright"])
     assert 0 < step["cost_speed"].sum() < 60
+
+
+@pytest.mark.parametrize("workers", [0, 2])
+def test_a_cost_that_no_info_has_is_told_with_the_nearest_that_there_is(workers):
+    keys = ["cost_upright", "cost_spede"]
+    env = from_gymnasium(
+        make_pendulum, num_envs=2, num_steps=5, cost_keys=keys, seed=0, workers=workers
+    )
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        env.rollout(5)
+    told = r"'cost_spede' is in no info of the first 5 steps.*Did you mean 'cost_speed'\?.*torque"
+    with pytest.warns(UserWarning, match=told) as caught:
+        step = env.rollout(20, break_when_any_done=False)["next"]
+    assert len(caught) == 1
+    assert step["cost_spede"].eq(0).all()
+    assert step["cost_upright"].gt(0).any()
+    env.close()
+
+
+def test_a_cost_that_is_reported_where_it_occurs_is_nothing_to_tell():
+    class Late(Counter):
+        def step(self, action):
+            *values, _ = super().step(action)
+            return *values, {"cost": 1.0} if self.count == 2 else {}
+
+    env = from_gymnasium(Late, num_envs=2, num_steps=4, cost_keys=["cost"], seed=3)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        costs = env.rollout(12, break_when_any_done=False)["next", "cost"]
+    assert costs[0].flatten().tolist() == [0, 1, 0] * 4
 
 
 def test_torchrls_checker():

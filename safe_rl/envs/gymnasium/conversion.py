@@ -14,47 +14,14 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv, VectorEnv
 from tensordict import TensorDictBase
 from torchrl.data import Bounded, Composite, TensorSpec
 from torchrl.envs import GymWrapper, Transform, TransformedEnv
-from torchrl.envs.gym_like import BaseInfoDictReader
 
 from safe_rl.envs.cost_specs import cost_spec
 from safe_rl.envs.costs import COST, is_cost
 from safe_rl.envs.gymnasium.adapting import adapt, check_workers, columns_of
 from safe_rl.envs.gymnasium.processes import ProcessVectorEnv
+from safe_rl.envs.gymnasium.reading import CostReader
 
 MakeEnv = Callable[[], gymnasium.Env]
-
-
-class CostReader(BaseInfoDictReader):
-    """Reads costs from `info` into the TensorDict, float32 [N, 1]; 0 where none is reported.
-
-    Args:
-        cost_keys: names in `info`.
-        batch_size: [N], or [] of a single environment.
-        highest: name -> the most that a step can cost, where that is known.
-    """
-
-    def __init__(
-        self,
-        cost_keys: Sequence[str],
-        batch_size: Sequence[int],
-        highest: Mapping[str, float] | None = None,
-    ) -> None:
-        self._cost_keys = list(cost_keys)
-        self._shape = (*batch_size, 1)
-        self._highest = dict(highest or {})
-
-    def __call__(self, info_dict: dict[str, Any], tensordict: TensorDictBase) -> TensorDictBase:
-        """Write the costs of a step."""
-        for key in self._cost_keys:
-            value = info_dict.get(key, np.zeros(self._shape))
-            tensordict[key] = torch.as_tensor(value, dtype=torch.float32).reshape(self._shape)
-        return tensordict
-
-    @property
-    def info_spec(self) -> Composite:
-        """Shapes and types of the costs."""
-        costs = {key: cost_spec(self._highest.get(key), self._shape) for key in self._cost_keys}
-        return Composite(costs, shape=self._shape[:-1])
 
 
 class CostsAsRewards(Transform):
@@ -228,7 +195,8 @@ def from_vector(
         highest_costs: cost key -> the most that a step can cost, where that is known.
     """
     base = GymWrapper(worlds, device=torch.device(device), categorical_action_encoding=True)
-    base.set_info_dict_reader(CostReader(cost_keys, [worlds.num_envs], highest_costs))
+    reader = CostReader(cost_keys, [worlds.num_envs], highest_costs, patience=num_steps)
+    base.set_info_dict_reader(reader)
     batch = GymnasiumEnv(base, cost_keys, num_steps)
     batch.set_seed(int(torch.randint(2**31, ())) if seed is None else seed)
     return batch

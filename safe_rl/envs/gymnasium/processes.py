@@ -29,7 +29,8 @@ class ProcessVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         make: makes one environment, in a process of its own.
         num_envs: N.
         workers: W, at most N.
-        info_keys: numbers that are taken over from `info`; 0 where it has none.
+        info_keys: numbers that are taken over from `info`; 0 in processes that have none. Others
+            are there by name only, and what no process has is not.
 
     Raises:
         RuntimeError: if an environment fails; the message is that of its process.
@@ -104,11 +105,13 @@ class ProcessVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         observation, reward, terminated, truncated = map(np.concatenate, arrays)
         self._observation[:] = observation
         sizes = [len(rewards) for rewards in arrays[1]]
-        reported = {
+        reported: dict[str, Any] = {name: None for info in infos for name in info}
+        reported |= {
             key: np.concatenate(
                 [info.get(key, np.zeros(size)) for info, size in zip(infos, sizes, strict=True)]
             )
             for key in self._info_keys
+            if key in reported
         }
         return observation, reward, terminated, truncated, reported
 

@@ -14,7 +14,7 @@ from torchrl.envs import EnvBase, GymLikeEnv, SerialEnv
 
 from safe_rl.envs.costs import is_cost
 from safe_rl.envs.errors import ConfigError
-from safe_rl.envs.gymnasium.conversion import CostReader
+from safe_rl.envs.gymnasium.reading import CostReader
 from safe_rl.envs.opengl import load_backend
 from safe_rl.envs.torchrl.reshaping import Alone, Rows
 from safe_rl.envs.torchrl.rows import ROWS
@@ -92,17 +92,19 @@ def _maker(config: Mapping[str, Any]) -> MakeEnv:
         made: MakeEnv = partial(locate(name, key="env.id"), **kwargs)
     else:
         made = partial(getattr(torchrl.envs, name), **{**ROWS[name].kwargs, **kwargs})
-    return partial(_with_infos, made, config["cost_keys"] or [])
+    return partial(_with_infos, made, config["cost_keys"] or [], config["num_steps"])
 
 
-def _with_infos(make: MakeEnv, cost_keys: Sequence[str], **kwargs: Any) -> EnvBase:
+def _with_infos(
+    make: MakeEnv, cost_keys: Sequence[str], num_steps: int | None, **kwargs: Any
+) -> EnvBase:
     """One that also says what stands in the `info` of an environment of Gymnasium's."""
     env = make(**kwargs)
     if isinstance(env, GymLikeEnv):
         known = (*env.observation_spec.keys(), *env.full_reward_spec.keys())
         reported = [key for key in cost_keys if key not in known]
         if reported:
-            env.set_info_dict_reader(CostReader(reported, env.batch_size))
+            env.set_info_dict_reader(CostReader(reported, env.batch_size, patience=num_steps))
     return env
 
 
