@@ -1,8 +1,9 @@
 """Constrained reinforcement learning on TorchRL.
 
-`safe_rl.train` and `safe_rl.load` are the way in from Python. `safe_rl.envs` holds the
-environments, `safe_rl.objectives` the constrained losses and solvers, `safe_rl.algorithms` what
-learns with them, `safe_rl.collectors` data collection with cost accounting.
+`safe_rl.train`, `safe_rl.resume` and `safe_rl.load` are the way in from Python. `safe_rl.envs`
+holds the environments, `safe_rl.objectives` the constrained losses and solvers,
+`safe_rl.algorithms` what learns with them, `safe_rl.collectors` data collection with cost
+accounting.
 """
 
 from typing import TYPE_CHECKING
@@ -11,9 +12,9 @@ import safe_rl.openmp  # noqa: F401, whatever is imported first, this comes befo
 from safe_rl.lazy import import_later
 
 if TYPE_CHECKING:
-    from safe_rl.cli.notebook import Run, load, train
+    from safe_rl.cli.notebook import Run, load, resume, train
 
-__all__ = ["Run", "load", "train"]
+__all__ = ["Run", "load", "resume", "train"]
 __version__ = "0.1.0"
 
 

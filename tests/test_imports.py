@@ -174,6 +174,7 @@ FLOORS = {
         ("certificates",),
         ("running",),
         ("evaluate", "report", "train"),
+        ("python_settings",),
         ("notebook",),
         ("",),
     ),

@@ -1,14 +1,12 @@
-"""The way in from Python: ``safe_rl.train`` and ``safe_rl.load``, for notebooks and scripts.
+"""The way in from Python: ``safe_rl.train``, ``resume`` and ``load``, for notebooks and scripts.
 
 They do what the commands do, from the same configurations; Hydra stays inside.
 """
 
 from __future__ import annotations
 
-import json
 import shutil
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -16,20 +14,16 @@ from signal import Signals
 from typing import Any
 
 import torch
-from hydra import compose, initialize_config_dir
-from hydra.core.global_hydra import GlobalHydra
-from omegaconf import DictConfig, OmegaConf, open_dict
+from omegaconf import DictConfig, open_dict
 from tensordict.nn import TensorDictModuleBase
 from torchrl.envs import EnvBase
 
 from safe_rl.cli.certificates import certify_run, is_to_keep_limits, is_worth_a_certificate
-from safe_rl.cli.composing import check_command
-from safe_rl.cli.conf import CONF
 from safe_rl.cli.evaluate import evaluate_run
-from safe_rl.cli.overrides import GIVEN_WHOLE
+from safe_rl.cli.python_settings import compose_new, compose_resumed, overrides_of
 from safe_rl.cli.robots import maker_of
 from safe_rl.cli.running import complete, prepare
-from safe_rl.cli.user_code import check_imports, import_modules, note_imports, quote
+from safe_rl.cli.user_code import check_imports, import_modules, note_imports
 from safe_rl.cli.variations import evaluate_varied
 from safe_rl.envs import store_configs
 from safe_rl.evaluation import Certificate, Evaluation, EvaluationOptions
@@ -47,7 +41,7 @@ from safe_rl.runs.lock import held
 from safe_rl.runs.outcome import final_figures
 from safe_rl.runs.table import read_table
 
-__all__ = ["Run", "load", "train"]
+__all__ = ["Run", "load", "resume", "train"]
 
 
 @dataclass(frozen=True)
@@ -180,8 +174,8 @@ def train(
     Raises:
         ValueError: If a setting cannot be; the message names it.
         FileExistsError: If the folder holds a run.
-        KeyboardInterrupt: After Ctrl-C, when the epoch at hand has its checkpoint; the command
-            ``python train.py resume=…`` goes on from there.
+        KeyboardInterrupt: After Ctrl-C, when the epoch at hand has its checkpoint; :func:`resume`
+            goes on from there.
 
     Examples:
         >>> small = {"num_envs": 2, "frames_per_batch": 40, "env.num_steps": 20, "logger": "none"}
@@ -192,28 +186,66 @@ def train(
     """
     import_modules(imports)
     store_configs()
-    overrides = [f"env={env}", f"algo={algo}", *_overrides(settings)]
+    overrides = [f"env={env}", f"algo={algo}", *overrides_of(settings)]
     if imports:
         overrides = note_imports(imports, overrides)
     if config_dir is not None:
         overrides.append(f"hydra.searchpath=[file://{Path(config_dir).resolve()}]")
-    config = _compose(overrides)
+    config = compose_new(overrides)
     folder = Path(config.hydra.run.dir if directory is None else directory)
     with open_dict(config):
         del config["hydra"]
+    return _carry_out(config, folder, continues=False)
+
+
+def resume(directory: str | Path, *, imports: Sequence[str] | None = None, **settings: Any) -> Run:
+    """Go on with a run, as ``python train.py resume=…`` does; a finished one stays as it is.
+
+    Args:
+        directory: Folder of the run.
+        imports: Modules that it needs; as in :func:`load`.
+        settings: What is to be different from now on: ``frames=500_000``,
+            ``policy_update={"max_kl": 0.01}``.
+
+    Raises:
+        ValueError: If the folder is not that of a run, the run has used modules that ``imports``
+            lacks, or a setting cannot change; the message names it.
+        KeyboardInterrupt: As by :func:`train`.
+
+    Examples:
+        >>> small = {"num_envs": 2, "frames_per_batch": 40, "env.num_steps": 20, "logger": "none"}
+        >>> run = train("PointGoal1", directory=getfixture("tmp_path") / "a", frames=40, **small)
+        >>> resume(run.directory, frames=80).table["steps"]
+        Going on after 40 of 80 frames.
+        [40.0, 80.0]
+    """
+    import_modules(imports or ())
+    store_configs()
+    overrides = list(overrides_of(settings))
+    if imports is not None:
+        overrides = note_imports(imports, overrides)
+    folder = Path(directory).expanduser()
+    return _carry_out(compose_resumed(folder, overrides), folder, continues=True)
+
+
+def _carry_out(config: DictConfig, folder: Path, *, continues: bool) -> Run:
     complete(config, RunFolder(folder))
     is_new, has_begun = not folder.exists(), False
     try:
         with held(RunFolder(folder)):
-            trainer = prepare(config, folder, continues=False)
-            assert trainer is not None
+            trainer = prepare(config, folder, continues)
             has_begun = True
+            if trainer is None:
+                return Run(folder)
             trainer.run()
     finally:
         if is_new and not has_begun:
             shutil.rmtree(folder, ignore_errors=True)
     if trainer.interrupted_by is not None:
-        print(f"Interrupted. Continue with: python train.py resume={folder}")
+        print(
+            f"Interrupted. Continue with: python train.py resume={folder}, or "
+            f"safe_rl.resume({str(folder)!r})"
+        )
         if trainer.interrupted_by is Signals.SIGINT:
             raise KeyboardInterrupt
         raise SystemExit(128 + trainer.interrupted_by)
@@ -250,48 +282,3 @@ def load(
     import_modules(imports or ())
     find_checkpoint(run.directory, checkpoint)
     return run
-
-
-# mappings that are given all at once
-_WHOLE = (*GIVEN_WHOLE, "env.outside", "env.kwargs")
-
-
-def _overrides(settings: Mapping[str, Any], prefix: str = "") -> Iterator[str]:
-    """Settings in Hydra's grammar, which is nearly JSON's."""
-    for name, value in settings.items():
-        key = f"{prefix}{name}"
-        if isinstance(value, Mapping) and key not in _WHOLE:
-            yield from _overrides(value, f"{key}.")
-        else:
-            yield f"{key}={_literal(value)}"
-
-
-def _literal(value: Any) -> str:
-    if isinstance(value, Mapping):
-        return "{" + ",".join(f"{key}:{_literal(item)}" for key, item in value.items()) + "}"
-    if isinstance(value, list | tuple):
-        return "[" + ",".join(map(_literal, value)) + "]"
-    if isinstance(value, str | Path):
-        return quote(str(value))
-    # numbers of NumPy and torch are not JSON's
-    return json.dumps(value.item() if hasattr(value, "item") else value)
-
-
-def _compose(overrides: list[str]) -> DictConfig:
-    with _fresh_hydra():
-        check_command(overrides, CONF)
-        with initialize_config_dir(str(CONF), version_base="1.3"):
-            config = compose("config", overrides=overrides, return_hydra_config=True)
-            OmegaConf.resolve(config.hydra.run)
-            return config
-
-
-@contextmanager
-def _fresh_hydra() -> Iterator[None]:
-    """Whoever has initialised Hydra finds it as it was."""
-    before = GlobalHydra.instance().hydra
-    GlobalHydra.instance().clear()
-    try:
-        yield
-    finally:
-        GlobalHydra.instance().hydra = before

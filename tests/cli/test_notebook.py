@@ -15,7 +15,7 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from run_configs import CONF, without_times
 
 import safe_rl
-from safe_rl.cli.notebook import _overrides
+from safe_rl.cli.python_settings import overrides_of
 from safe_rl.envs import ConfigError
 from safe_rl.runs.table import read_table
 from safe_rl.training.trainer import Trainer
@@ -121,7 +121,7 @@ def test_errors_name_the_setting(settings, message, tmp_path):
 
 @pytest.mark.parametrize("text", ["it's", "a,b=c", "x: [y]", "back\\slash\\", "\\'", "", "3"])
 def test_strange_texts_arrive_as_they_are(text):
-    (override,) = _overrides({"a": {"b": [text, {"c": text}]}})
+    (override,) = overrides_of({"a": {"b": [text, {"c": text}]}})
     parsed = OverridesParser.create().parse_override(override)
     assert parsed.key_or_group == "a.b"
     assert parsed.value() == [text, {"c": text}]
@@ -154,4 +154,31 @@ def test_an_interrupted_run_says_how_to_go_on(tmp_path, monkeypatch, capsys):
 
 def test_mappings_that_go_together_and_numbers_of_numpy_are_written_as_hydra_takes_them():
     given = {"env.outside": {"cost_a": [0, -1, 1]}, "seed": np.int64(3)}
-    assert list(_overrides(given)) == ["env.outside={cost_a:[0,-1,1]}", "seed=3"]
+    assert list(overrides_of(given)) == ["env.outside={cost_a:[0,-1,1]}", "seed=3"]
+
+
+def test_an_interrupted_run_is_resumed_to_the_same_table(run, tmp_path, monkeypatch):
+    def epoch_that_is_stopped(trainer, batches):
+        signal.raise_signal(signal.SIGINT)
+        return own(trainer, batches)
+
+    own, folder = Trainer.epoch, tmp_path / "a=run"
+    settings = {"cost_limits": {"cost_hazards": 3, "cost": 5.5}, "seed": 4, **SMALL}
+    monkeypatch.setattr(Trainer, "epoch", epoch_that_is_stopped)
+    with pytest.raises(KeyboardInterrupt):
+        safe_rl.train("CarGoal1", algo="cpo", frames=120, directory=folder, **settings)
+    monkeypatch.undo()
+    assert len(read_table(folder / "progress.csv")["steps"]) == 1
+    resumed = safe_rl.resume(folder)
+    assert resumed.directory == folder
+    tables = [without_times(path / "progress.csv") for path in (run.directory, folder)]
+    assert tables[0] == tables[1]
+    assert safe_rl.resume(folder).table == resumed.table
+    longer = safe_rl.resume(folder, frames=160, policy_update={"target_kl": 0.005})
+    assert longer.table["steps"] == [40, 80, 120, 160]
+    assert (longer.config.frames, longer.config.policy_update.target_kl) == (160, 0.005)
+    with pytest.raises(ValueError, match=r"env.num_steps=10.*cannot change"):
+        safe_rl.resume(folder, **{"env.num_steps": 10})
+    with pytest.raises(ValueError, match="not the folder of a run"):
+        safe_rl.resume(tmp_path / "nowhere")
+    assert not (tmp_path / "nowhere").exists()

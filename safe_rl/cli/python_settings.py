@@ -1,0 +1,82 @@
+"""Settings from Python in Hydra's grammar, and the configuration that Hydra makes of them."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from hydra import compose, initialize_config_dir
+from hydra.core.global_hydra import GlobalHydra
+from omegaconf import DictConfig, OmegaConf
+
+from safe_rl.cli.composing import check_command
+from safe_rl.cli.conf import CONF
+from safe_rl.cli.overrides import GIVEN_WHOLE
+from safe_rl.cli.shorthands import expand_arguments
+from safe_rl.cli.user_code import quote
+
+__all__ = ["compose_new", "compose_resumed", "overrides_of"]
+
+# mappings that are given all at once
+_WHOLE = (*GIVEN_WHOLE, "env.outside", "env.kwargs")
+
+
+def overrides_of(settings: Mapping[str, Any], prefix: str = "") -> Iterator[str]:
+    """Settings in Hydra's grammar, which is nearly JSON's."""
+    for name, value in settings.items():
+        key = f"{prefix}{name}"
+        if isinstance(value, Mapping) and key not in _WHOLE:
+            yield from overrides_of(value, f"{key}.")
+        else:
+            yield f"{key}={_literal(value)}"
+
+
+def _literal(value: Any) -> str:
+    if isinstance(value, Mapping):
+        return "{" + ",".join(f"{key}:{_literal(item)}" for key, item in value.items()) + "}"
+    if isinstance(value, list | tuple):
+        return "[" + ",".join(map(_literal, value)) + "]"
+    if isinstance(value, str | Path):
+        return quote(str(value))
+    # numbers of NumPy and torch are not JSON's
+    return json.dumps(value.item() if hasattr(value, "item") else value)
+
+
+def compose_new(overrides: Sequence[str]) -> DictConfig:
+    """Configuration of a new run, with Hydra's own node.
+
+    Raises:
+        ValueError: If the command could not be given so.
+    """
+    with _fresh_hydra():
+        check_command(overrides, CONF)
+        with initialize_config_dir(str(CONF), version_base="1.3"):
+            config = compose("config", overrides=list(overrides), return_hydra_config=True)
+            OmegaConf.resolve(config.hydra.run)
+            return config
+
+
+def compose_resumed(directory: Path, overrides: Sequence[str]) -> DictConfig:
+    """Configuration of the run in a folder, with what is to be different from now on.
+
+    Raises:
+        ValueError: If it is not the folder of a run, or something cannot change.
+    """
+    with _fresh_hydra():
+        check_command(expand_arguments([f"resume={directory}", *overrides]), CONF)
+        with initialize_config_dir(str(directory.expanduser().absolute()), version_base="1.3"):
+            return compose("config", overrides=list(overrides))
+
+
+@contextmanager
+def _fresh_hydra() -> Iterator[None]:
+    """Whoever has initialised Hydra finds it as it was."""
+    before = GlobalHydra.instance().hydra
+    GlobalHydra.instance().clear()
+    try:
+        yield
+    finally:
+        GlobalHydra.instance().hydra = before
