@@ -23,8 +23,7 @@ from tensordict import TensorDict
 from torch import Tensor, nn
 from torchrl.data import Bounded
 
-from safe_rl.algorithms import Memory, ReplayUpdate
-from safe_rl.algorithms.matrix_products import fast_products
+from safe_rl.algorithms import Memory, ReplayUpdate, fast_products
 from safe_rl.models import QEnsemble, make_squashed_actor
 from safe_rl.objectives import LagrangeMultiplier, SACLagrangianLoss
 

@@ -43,7 +43,8 @@ def make_batch(config: Mapping[str, Any], num_envs: int) -> EnvBase:
         TargetError: if configurations may not name it.
 
     Examples:
-        >>> make_batch({"id": "PendulumEnv", "kwargs": None, "cost_keys": None}, 3).batch_size
+        >>> node = {"id": "PendulumEnv", "kwargs": None, "cost_keys": None, "num_steps": 200}
+        >>> make_batch(node, 3).batch_size
         torch.Size([3])
     """
     make = _maker(config)
