@@ -2,9 +2,12 @@
 
 import pytest
 import torch
+from point_mass import PointMass
+from run_configs import point_mass_config
 
 from safe_rl.algorithms import matrix_products
 from safe_rl.algorithms.matrix_products import fast_products, prefers_onednn
+from safe_rl.training.trainer import build_trainer
 
 ZEN = "vendor_id : AuthenticAMD\nmodel name : AMD EPYC\nflags : fpu avx2 avx512f avx512_bf16\n"
 
@@ -73,3 +76,18 @@ def test_elsewhere_nothing_changes(of_use, monkeypatch):
     monkeypatch.setattr(matrix_products, "_is_of_use", lambda: False)
     with fast_products():
         assert of_use.fp32_precision == "none"
+
+
+def test_training_has_it_for_updates_alone(of_use, tmp_path):
+    config = point_mass_config("algo=ppo")
+    trainer = build_trainer(config, PointMass(config.num_envs, 20, config.seed), tmp_path)
+    learn, seen = trainer.algorithm.learn, []
+
+    def watched(*args):
+        seen.append(of_use.fp32_precision)
+        return learn(*args)
+
+    trainer.algorithm.learn = watched
+    trainer.run()
+    assert set(seen) == {"bf16"}
+    assert of_use.fp32_precision == "none"
