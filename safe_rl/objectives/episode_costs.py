@@ -92,12 +92,12 @@ class EpisodeCosts:
         max_length: steps after which an episode is over: T̄ until an episode has finished.
         drift: share by which J_c changes from one policy to the next, about; it weighs the past
             against the batch. None uses the batch alone.
-        length_memory: weight in [0, 1) of the past in T̄.
+        memory: weight in [0, 1) of the past in T̄ and in how much costs scatter.
         smallest: costs per step that count as J_c's size where it is smaller, for the drift: from
             batches without any cost nothing else would lead away.
 
     Examples:
-        >>> estimator = EpisodeCosts(1, max_length=1000, drift=None, length_memory=0.9)
+        >>> estimator = EpisodeCosts(1, max_length=1000, drift=None, memory=0.9)
         >>> costs = torch.zeros(4, 200, 1)
         >>> costs[:, ::50] = 1.0
         >>> estimator.update(costs, torch.empty(0)).mean
@@ -110,16 +110,17 @@ class EpisodeCosts:
         *,
         max_length: float,
         drift: float | None,
-        length_memory: float,
+        memory: float,
         smallest: float = 0.0,
     ) -> None:
-        self.drift, self.length_memory, self.smallest = drift, length_memory, smallest
+        self.drift, self.memory, self.smallest = drift, memory, smallest
         self._state = {
             "length": torch.tensor(float(max_length)),
             "length_weight": torch.zeros(()),
             "mean": torch.full((num_costs,), torch.nan),
             "error": torch.full((num_costs,), torch.nan),
             "sums": torch.zeros(2, num_costs, dtype=torch.float64),
+            "scatter": torch.zeros(2, num_costs),
         }
 
     @property
@@ -158,13 +159,31 @@ class EpisodeCosts:
             batch = batch._replace(mean=batch.mean + charges.offset)
         self.batch = batch
         if self.drift is not None:
-            size = torch.maximum(self.estimate.mean, self.smallest * self.length * self.unit)
-            batch = shrink(self.estimate, batch, self.drift * size)
+            size = self._size(self.estimate.mean)
+            expected = batch._replace(error=self._expected_error(batch, size))
+            batch = shrink(self.estimate, expected, self.drift * size)
         self._state["mean"], self._state["error"] = batch
         return batch
 
+    def _size(self, mean: Tensor) -> Tensor:
+        """J_c, or the least that counts as its size, [k]."""
+        return torch.maximum(mean, self.smallest * self.length * self.unit)
+
+    def _expected_error(self, batch: CostEstimate, size: Tensor) -> Tensor:
+        """Standard error of a batch as the batches before it say, for J_c of this size, [k].
+
+        Costs come in heaps: a batch that has few of them by luck also shows little spread. Weighed
+        by its own error it would count for more than a dear one, and the estimate would be too low.
+        The variance is taken as in proportion to J_c, as for counts, by a factor φ that is learned.
+        """
+        seen = torch.stack([batch.error.square(), self._size(batch.mean)])
+        self._state["scatter"] = torch.lerp(seen, self._state["scatter"], self.memory)
+        squared, sizes = self._state["scatter"]
+        error = (squared / sizes * size).sqrt()
+        return torch.where(error.isfinite(), error, batch.error)
+
     def _add_lengths(self, lengths: Tensor) -> None:
-        kept = self._state["length_weight"] * self.length_memory
+        kept = self._state["length_weight"] * self.memory
         total = kept + lengths.numel()
         self._state["length"] = (kept * self.length + lengths.sum().to(self.length)) / total
         self._state["length_weight"] = total
@@ -176,4 +195,5 @@ class EpisodeCosts:
     def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
         """Continue from :meth:`state_dict`."""
         for name, value in self._state.items():
-            self._state[name] = state_dict[name].to(value)
+            # checkpoints of earlier versions lack what batches scatter: it is learned again
+            self._state[name] = state_dict.get(name, value).to(value)

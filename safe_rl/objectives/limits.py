@@ -201,7 +201,7 @@ class LimitTracker:
             num_costs,
             max_length=max_length,
             drift=drift,
-            length_memory=memory,
+            memory=memory,
             smallest=smallest_scale,
         )
         self.promises = PromisedChange(num_costs, memory=memory, lowest=lowest_trust)

@@ -26,7 +26,7 @@ def renewals(rows: int, steps: int, generator: torch.Generator):
 
 def test_rate_times_length_is_the_mean_cost_though_length_and_cost_are_correlated():
     generator = torch.Generator().manual_seed(0)
-    estimator = EpisodeCosts(1, max_length=40, drift=None, length_memory=0.99)
+    estimator = EpisodeCosts(1, max_length=40, drift=None, memory=0.99)
     estimates = []
     for _ in range(60):
         costs, lengths = renewals(20, 200, generator)
@@ -36,7 +36,7 @@ def test_rate_times_length_is_the_mean_cost_though_length_and_cost_are_correlate
 
 def test_a_batch_of_whole_episodes_gives_their_mean_cost_whatever_their_lengths():
     costs = torch.rand(3, 12, 2)
-    estimator = EpisodeCosts(2, max_length=100, drift=None, length_memory=0.0)
+    estimator = EpisodeCosts(2, max_length=100, drift=None, memory=0.0)
     lengths = torch.tensor([4.0, 8.0, 12.0, 6.0, 6.0])
     estimate = estimator.update(costs, lengths)
     torch.testing.assert_close(estimate.mean, costs.sum((0, 1)) / 5)
@@ -44,7 +44,7 @@ def test_a_batch_of_whole_episodes_gives_their_mean_cost_whatever_their_lengths(
 
 
 def test_before_an_episode_has_finished_its_length_is_the_limit_of_steps():
-    estimator = EpisodeCosts(1, max_length=1000, drift=None, length_memory=0.9)
+    estimator = EpisodeCosts(1, max_length=1000, drift=None, memory=0.9)
     estimate = estimator.update(torch.full((5, 20, 1), 0.03), torch.empty(0))
     torch.testing.assert_close(estimate.mean, torch.tensor([30.0]))
 
@@ -77,9 +77,40 @@ def test_shrinkage_predicts_a_wandering_cost_better_than_the_batch_and_than_the_
     assert estimate.error.square().item() == pytest.approx(squared["shrunk"] / 4000, rel=0.15)
 
 
+def heaps(generator: torch.Generator, per_step: float = 0.001, size: float = 25.0):
+    """Rows of 200 steps with costs as robots pay them: rarely, and then many steps on end."""
+    begun = torch.rand(100, 200, generator=generator) < per_step
+    costs = torch.zeros(100, 200)
+    for row, step in begun.nonzero().tolist():
+        length = 1 + int(torch.empty(()).exponential_(1 / size, generator=generator))
+        costs[row, step : step + length] = 1.0
+    return costs.unsqueeze(-1)
+
+
+def test_costs_that_come_in_heaps_are_not_underestimated():
+    # a batch with few heaps shows a small standard error; weighed by it, estimates were 10 % low
+    generator = torch.Generator().manual_seed(2)
+    estimator = EpisodeCosts(1, max_length=1000, drift=0.2, memory=0.9, smallest=0.01)
+    estimates, batches = [], []
+    for _ in range(400):
+        estimates.append(estimator.update(heaps(generator), torch.empty(0)).mean)
+        batches.append(estimator.batch.mean)
+    estimate, truth = (torch.stack(values[20:]).mean().item() for values in (estimates, batches))
+    assert estimate == pytest.approx(truth, rel=0.02)
+
+
+def test_a_checkpoint_without_the_scatter_of_batches_can_be_loaded():
+    one, other = (EpisodeCosts(1, max_length=40, drift=0.1, memory=0.9) for _ in "ab")
+    one.update(*renewals(8, 50, torch.Generator().manual_seed(4)))
+    saved = one.state_dict()
+    del saved["scatter"]
+    other.load_state_dict(saved)
+    assert torch.equal(other.estimate.mean, one.estimate.mean)
+
+
 def test_the_unit_of_a_cost_is_1_for_indicators_and_grows_with_the_cost():
     costs = (torch.rand(4, 50, 1) < 0.2).float() * torch.tensor([1.0, 7.0])
-    estimator = EpisodeCosts(2, max_length=50, drift=0.1, length_memory=0.9)
+    estimator = EpisodeCosts(2, max_length=50, drift=0.1, memory=0.9)
     assert estimator.unit.tolist() == [1.0, 1.0]
     estimator.update(costs, torch.empty(0))
     assert estimator.unit.tolist() == [1.0, 7.0]
@@ -90,7 +121,7 @@ def test_a_saved_state_goes_on_as_if_it_had_never_stopped():
         generator = torch.Generator().manual_seed(3)
         return [renewals(8, 50, generator) for _ in range(6)]
 
-    whole, second = (EpisodeCosts(1, max_length=40, drift=0.1, length_memory=0.9) for _ in "ab")
+    whole, second = (EpisodeCosts(1, max_length=40, drift=0.1, memory=0.9) for _ in "ab")
     *before, last = batches()
     for batch in before:
         whole.update(*batch)
