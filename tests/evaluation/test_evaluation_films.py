@@ -1,0 +1,82 @@
+"""Videos, animated pictures and recordings of evaluated episodes."""
+
+import csv
+
+import numpy as np
+import pytest
+from evaluated_runs import NUM_STEPS, options, skip_without_opengl
+from PIL import Image
+
+from safe_rl.cli.evaluate import evaluate_run as evaluate
+from safe_rl.collectors import read_recording
+from safe_rl.evaluation.video import MANNERS
+
+
+def test_the_video_shows_an_episode(run):
+    imageio = pytest.importorskip("imageio.v2", reason="needs the extra 'video'")
+    pytest.importorskip("imageio_ffmpeg", reason="needs the extra 'video'")
+    skip_without_opengl()
+    film = MANNERS["mp4"]
+    result = evaluate(run, options(episodes=1, video=True))
+    assert result.files[-1] == run / "evaluation.mp4"
+    with imageio.get_reader(run / "evaluation.mp4") as reader:
+        facts = reader.get_meta_data()
+        frames = np.stack([frame for frame in reader])  # noqa: C416, a list() would ask for its length
+    assert facts["codec"] == "h264"
+    assert facts["pix_fmt"].startswith("yuv420p")
+    assert len(frames) == NUM_STEPS // film.steps_per_frame
+    assert frames.shape[2] == film.width
+    # below the picture stands a white line with black text
+    caption = frames[:, film.height + 2 :]
+    assert np.median(caption) > 240
+    assert caption.min() < 80
+    assert np.abs(frames[0, : film.height].astype(float) - frames[-1, : film.height]).max() > 50
+    assert not list(run.glob(".*unfinished*"))
+
+
+def test_what_an_evaluation_records_is_what_it_measured(run):
+    """Seven episodes of three worlds, which go on together until the last one is done."""
+    result = evaluate(run, options(record=True, name="kept"))
+    assert [path.name for path in result.files] == [
+        *("evaluation_kept.json", "evaluation_kept.csv", "evaluation_kept.transitions"),
+    ]
+    steps = read_recording(result.files[-1])
+    assert steps.shape == (3, 3 * NUM_STEPS)
+    returns = steps["next", "reward"].double().reshape(3, 3, NUM_STEPS).sum(-1)
+    with result.files[1].open() as table:
+        found = [float(row["return"]) for row in csv.DictReader(table)]
+    # three of the first world, two of the others
+    expected = [*returns[0].tolist(), *returns[1:, :2].flatten().tolist()]
+    assert found == pytest.approx(expected, abs=1e-5)
+    evaluate(run, options(episodes=1, num_envs=1, record=True, name="kept"))
+    assert read_recording(result.files[-1]).shape == (1, NUM_STEPS)
+
+
+@pytest.mark.parametrize("suffix", ["gif", "webp"])
+def test_an_animated_picture_shows_the_same_episode(run, tmp_path, suffix):
+    skip_without_opengl()
+    film, path = MANNERS[suffix], tmp_path / f"episode.{suffix}"
+    found = [
+        evaluate(run, options(episodes=2, picture=str(path), **extra))
+        for extra in ({}, {"camera": "fixedfar"})
+    ]
+    assert found[0].files[-1] == path
+    with Image.open(path) as picture:
+        assert picture.info["loop"] == 0
+        assert picture.n_frames == -(-NUM_STEPS // film.steps_per_frame)
+        frames = []
+        for frame in range(picture.n_frames):
+            picture.seek(frame)
+            picture.load()
+            frames.append(np.asarray(picture.convert("RGB"), dtype=float))
+    assert {frame.shape[1] for frame in frames} == {film.width}
+    caption = np.stack(frames)[:, film.height + 4 :]
+    assert np.median(caption) > 240
+    assert caption.min() < 110
+    # something moves, and what stands still is the same in all frames
+    moved = np.abs(frames[0] - frames[-1])[: film.height].max(-1) > 40
+    assert 0.0 < moved.mean() < 0.5
+    assert [e.estimates["episode_return"] for e in found] == [
+        found[0].estimates["episode_return"]
+    ] * 2
+    assert not list(tmp_path.glob(".*unfinished*"))

@@ -1,0 +1,121 @@
+"""What an evaluation refuses: wrong options, other observations, broken checkpoints, code in it."""
+
+import pickle
+import shutil
+import zipfile
+
+import pytest
+from evaluated_runs import skip_without_opengl, train
+from omegaconf import OmegaConf
+
+from safe_rl.cli.evaluate import main
+from safe_rl.envs import make_env
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["epsiodes=3"], "Did you mean 'episodes'?"),
+        (["env.hazard_num=3"], "hazards_num"),
+        (["episodes=0"], "episodes=0"),
+        (["checkpoint=there.torchrl"], "checkpoint is last, best, certified or the path"),
+        (["env.lidar_num_bins=8"], "trained on other observations"),
+        (["cvar_alpha=2"], "cvar_alpha"),
+        (["camera=nowhere", "video=true"], "nowhere"),
+        (["picture=there.png"], "must end in .gif or .webp"),
+        (["picture=nowhere/there.gif"], "there is no folder nowhere"),
+        (["certify=true", "env.hazards_num=3"], "env: certify=true does not heed it"),
+        (["certificate.episodes=9"], "add certify=true"),
+        (["certify=true", "certificate.episode=9"], "Did you mean 'episodes'?"),
+        (["env.hazards_num=200", "episodes=1"], "hazards"),
+    ],
+)
+def test_what_cannot_be_done_ends_in_one_line(run, arguments, message, capsys, monkeypatch):
+    if "video=true" in arguments:
+        skip_without_opengl()
+        # before any episode
+        monkeypatch.setattr("safe_rl.evaluation.measuring.collect_episodes", None)
+    assert main([str(run), *arguments]) == 1
+    error = capsys.readouterr().err.splitlines()[-1]
+    assert error.startswith("error: ")
+    assert message in error
+
+
+def test_a_dictionary_of_another_size_ends_in_one_line_too(tmp_path, capsys):
+    run = train(tmp_path / "run", "env.observation_flatten=false", "model=dict")
+    assert main([str(run), "env.lidar_num_bins=8"]) == 1
+    error = capsys.readouterr().err.splitlines()[-1]
+    assert error.startswith("error: ")
+    # as many as the same environment has in one vector
+    own = OmegaConf.to_container(OmegaConf.load(run / "config.yaml").env)
+    flat = {**own, "observation_flatten": True, "lidar_num_bins": 8}
+    size = make_env(flat, num_envs=1, seed=0).observation_spec["observation"].shape[-1]
+    assert f"trained on other observations or actions than this environment's ({size} num" in error
+
+
+@pytest.mark.parametrize(
+    ("argument", "others"), [("episodes=0", "num_envs"), ("num_envs=0", "episodes"),
+                             ("cvar_alpha=3.0", "episodes="), ("cvar_alpha=nan", "episodes=")]
+)  # fmt: skip
+def test_options_out_of_range_are_refused_before_anything_runs(
+    argument, others, run, capsys, monkeypatch
+):
+    monkeypatch.setattr("safe_rl.evaluation.measuring.load_config", None)
+    assert main([str(run), argument]) == 1
+    error = capsys.readouterr().err
+    assert error.startswith(f"error: {argument}")
+    assert others not in error
+
+
+def test_a_folder_above_runs_names_them(run, capsys):
+    assert main([str(run.parent)]) == 1
+    assert f"Runs below it: {run}" in capsys.readouterr().err
+
+
+def test_without_a_best_checkpoint_the_last_is_offered(run, capsys):
+    shutil.rmtree(run / "checkpoints" / "best")
+    assert main([str(run), "checkpoint=best"]) == 1
+    error = capsys.readouterr().err
+    assert "no epoch kept every cost limit. Use checkpoint=last" in error
+
+
+def last_checkpoint(run):
+    return next((run / "checkpoints" / "last").iterdir())
+
+
+def test_a_truncated_checkpoint_is_named(run, capsys):
+    path = last_checkpoint(run)
+    path.write_bytes(path.read_bytes()[:2000])
+    assert main([str(run)]) == 1
+    assert path.name in capsys.readouterr().err
+    assert not (run / "evaluation.json").exists()
+
+
+class Trap:
+    """Unpickling it makes a file."""
+
+    def __init__(self, path):
+        self.path = str(path)
+
+    def __reduce__(self):
+        return open, (self.path, "w")
+
+
+@pytest.mark.parametrize("bare", [True, False])
+def test_a_checkpoint_runs_no_code(run, bare, tmp_path, capsys):
+    sprung = tmp_path / "sprung"
+    path = last_checkpoint(run)
+    if bare:
+        path.write_bytes(pickle.dumps(Trap(sprung), protocol=2))
+    else:
+        with zipfile.ZipFile(path) as archive:
+            members = {name: archive.read(name) for name in archive.namelist()}
+        with zipfile.ZipFile(path, "w") as archive:
+            for name, content in members.items():
+                trapped = not name.endswith(".json")
+                archive.writestr(
+                    name, pickle.dumps(Trap(sprung), protocol=2) if trapped else content
+                )
+    assert main([str(run)]) == 1
+    assert path.name in capsys.readouterr().err
+    assert not sprung.exists()
