@@ -156,7 +156,11 @@ FLOORS = {
         ("record", "resuming"),
         ("",),
     ),
-    "training": (("evaluating", "interrupts", "state", "threads", "transfer"), ("trainer",), ("",)),
+    "training": (
+        ("candidates", "evaluating", "interrupts", "state", "threads", "transfer"),
+        ("trainer",),
+        ("",),
+    ),
     "scores": (
         ("certificate", "dominance", "intervals", "learning", "published"),
         ("benchmark", "comparisons", "normalised", "slates"),

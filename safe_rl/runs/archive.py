@@ -18,7 +18,10 @@ from torchrl.checkpoint import Checkpoint, CheckpointError, StateDictCheckpointA
 
 from safe_rl.algorithms.contract import Stateful
 
-__all__ = ["read_facts", "read_states", "restore", "writer"]
+__all__ = ["as_parts", "read_facts", "read_states", "restore", "writer"]
+
+# parts that checkpoints of earlier versions lack: they begin anew
+_ADDED_LATER = {"candidates"}
 
 
 class _WeightsOnly(StateDictCheckpointAdapter):
@@ -42,13 +45,14 @@ class _WeightsOnly(StateDictCheckpointAdapter):
         return super().load(component, path, **options)
 
 
-class _Received:
-    """Takes a part's state out of a file, without the part."""
+class _State:
+    """A part's state, without the part: on its way into a file, or out of one."""
 
-    state: Any = None
+    def __init__(self, state: Any = None) -> None:
+        self.state = state
 
     def state_dict(self) -> Mapping[str, Any]:
-        return {}
+        return {} if self.state is None else self.state
 
     def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
         self.state = state_dict
@@ -61,6 +65,11 @@ def writer(components: Mapping[str, Stateful]) -> Checkpoint:
     for name, component in components.items():
         checkpoint.register(name, component, adapter=adapter)
     return checkpoint
+
+
+def as_parts(states: Mapping[str, Any]) -> dict[str, Stateful]:
+    """States by name as parts that have them, for :func:`writer`."""
+    return {name: _State(state) for name, state in states.items()}
 
 
 def read_facts(path: Path) -> dict[str, Any]:
@@ -85,7 +94,7 @@ def read_states(path: Path, names: Collection[str]) -> dict[str, Any]:
     Raises:
         CheckpointError: If the file is no checkpoint, is damaged, or lacks a part.
     """
-    received = {name: _Received() for name in names}
+    received = {name: _State() for name in names}
     # where there is no such device any more, tensors are read into main memory
     device = None if torch.cuda.is_available() else "cpu"
     try:
@@ -102,12 +111,22 @@ def restore(path: Path, components: Mapping[str, Stateful]) -> None:
     Raises:
         CheckpointError: If the file is no checkpoint, or does not fit the parts.
     """
-    states = read_states(path, components)
-    for name in sorted(components):
+    absent = _ADDED_LATER - _part_names(path) if _ADDED_LATER & components.keys() else set()
+    states = read_states(path, components.keys() - absent)
+    for name in sorted(states):
         try:
             components[name].load_state_dict(states[name])
         except Exception as error:
             raise _cannot_use(path, error, f"its {name!r} does not fit: ") from error
+
+
+def _part_names(path: Path) -> set[str]:
+    """Names of the parts in a file; none of one that cannot be read."""
+    try:
+        _check_kind(path)
+        return set(Checkpoint.manifest(path)["components"])
+    except Exception:  # who reads it says what is wrong
+        return set()
 
 
 def _check_kind(path: Path) -> None:

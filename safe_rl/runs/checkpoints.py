@@ -9,10 +9,10 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from torchrl.checkpoint import CheckpointError
+from torchrl.checkpoint import Checkpoint, CheckpointError
 
 from safe_rl.algorithms.contract import Stateful
-from safe_rl.runs.archive import read_facts, restore, writer
+from safe_rl.runs.archive import as_parts, read_facts, restore, writer
 from safe_rl.runs.folder import checkpoint_name, checkpoint_steps, checkpoints_in
 
 __all__ = ["CheckpointStore", "best_checkpoint"]
@@ -93,15 +93,28 @@ class CheckpointStore:
             steps: Environment steps so far.
             facts: JSON-compatible facts, readable without loading.
         """
-        path = self._write(self.last, steps, facts)
+        path = self._write(self.last, steps, facts, self._writer)
         others = [other for other in checkpoints_in(self.last) if other != path]
         for old in others[: max(0, len(others) + 1 - self._keep_last)]:
             old.unlink()
         self._none_yet.unlink(missing_ok=True)
         return path
 
-    def save_best(self, steps: int, score: float, facts: Mapping[str, Any] | None = None) -> bool:
+    def save_best(
+        self,
+        steps: int,
+        score: float,
+        facts: Mapping[str, Any] | None = None,
+        *,
+        states: Mapping[str, Any] | None = None,
+    ) -> bool:
         """Write a checkpoint if there is room, or if ``score`` is higher than that of a kept one.
+
+        Args:
+            steps: Environment steps then.
+            score: What is compared.
+            facts: JSON-compatible facts, readable without loading.
+            states: States of parts by name, where it is not the present ones that are kept.
 
         Returns:
             Whether it was written.
@@ -109,17 +122,20 @@ class CheckpointStore:
         scores = sorted(filter(math.isfinite, map(_score, checkpoints_in(self.best))))
         if len(scores) >= self._keep_best and not score > scores[-self._keep_best]:
             return False
-        path = self._write(self.best, steps, {**(facts or {}), "score": score})
+        saver = self._writer if states is None else writer(as_parts(states))
+        path = self._write(self.best, steps, {**(facts or {}), "score": score}, saver)
         others = [other for other in checkpoints_in(self.best) if other != path]
         others.sort(key=_score, reverse=True)
         for worse in others[self._keep_best - 1 :]:
             worse.unlink()
         return True
 
-    def _write(self, directory: Path, steps: int, facts: Mapping[str, Any] | None) -> Path:
+    def _write(
+        self, directory: Path, steps: int, facts: Mapping[str, Any] | None, saver: Checkpoint
+    ) -> Path:
         path = directory / checkpoint_name(steps)
         facts = {**(facts or {}), **({"run": self._run} if self._run else {})}
-        self._writer.save(path, metadata=facts)
+        saver.save(path, metadata=facts)
         return path
 
     def resume(self, epochs: int = 0) -> Path | None:

@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import time
-from collections import deque
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from signal import Signals
-from typing import Any
 
 import torch
 from omegaconf import DictConfig
@@ -25,9 +23,9 @@ from safe_rl.collectors import EpisodeAccounting, Recording, WorkerCollector, ma
 from safe_rl.collectors.workers import MakeEnv
 from safe_rl.runs.checkpoints import CheckpointStore
 from safe_rl.runs.lock import held
-from safe_rl.runs.outcome import feasible_return
 from safe_rl.runs.record import RunRecord
 from safe_rl.targets import build
+from safe_rl.training.candidates import Candidates, Judged, epochs_until_judged
 from safe_rl.training.evaluating import Evaluation, MakeEvaluation
 from safe_rl.training.interrupts import StopRequest
 from safe_rl.training.state import Progress, WorldSnapshot
@@ -137,10 +135,9 @@ class Trainer:
         wanted = config.get("staggered_starts")
         if wanted and self._worlds is not None and self._worlds.stagger(env.max_episode_steps):
             self.accounting.ignore_open_episodes()
-        self._cost_limits = dict(cost_limits)
-        self._frames = config.frames
+        self._frames, self._frames_per_batch = config.frames, config.frames_per_batch
         self._checkpoint_interval = config.checkpoint.interval
-        self._latest: deque[Any] = deque(maxlen=config.checkpoint.get("best_over", 1))
+        self._candidates = self._find_candidates(config.checkpoint.get("best_over", 1), cost_limits)
         self._checkpoints = CheckpointStore(
             folder.files.checkpoints,
             self.components(),
@@ -153,8 +150,21 @@ class Trainer:
             },
         )
 
+    def _find_candidates(self, over: int, limits: Mapping[str, float]) -> Candidates:
+        rows = self._env.batch_size.numel()
+        return Candidates(
+            # what a policy remembers fills gigabytes: the last checkpoints alone have it
+            {name: part for name, part in self._parts().items() if name != "memory"},
+            limits,
+            over=over,
+            delay=epochs_until_judged(over, self.episode_length, self._frames_per_batch / rows),
+        )
+
     def components(self) -> dict[str, Stateful]:
         """Parts of a checkpoint, by name."""
+        return {**self._parts(), "candidates": self._candidates}
+
+    def _parts(self) -> dict[str, Stateful]:
         parts: dict[str, Stateful] = {
             **self.algorithm.checkpoint_components(),
             "accounting": self.accounting,
@@ -239,17 +249,19 @@ class Trainer:
         with self.folder.writing(behind, self.progress.steps), StopRequest() as stop:
             if not self.progress.epoch:
                 self._checkpoints.begin()
-            self._latest.extend(self.folder.rows())
+            self._candidates.go_on_after(self.folder.rows())
             while self.progress.steps < self._frames and not stop.received:
                 row = self.epoch(batches)
                 self.folder.record(row)
-                self._save_if_best(row)
+                self._keep(self._candidates.add(row))
                 if time.monotonic() - saved_at > self._checkpoint_interval:
                     self._save()
                     saved_at = time.monotonic()
             self._save()
             if self.progress.steps < self._frames:
                 self.interrupted_by = stop.received
+            else:
+                self._keep(self._candidates.judge_all())
 
     def batches(self) -> Iterator[TensorDictBase]:
         """Rollouts [N, T] of the present policy, without end."""
@@ -293,10 +305,7 @@ class Trainer:
         self._checkpoints.save(self.progress.steps, {"epoch": self.progress.epoch})
         self.folder.draw_curves()
 
-    def _save_if_best(self, row: Mapping[str, float]) -> None:
-        """Keep the policy with the highest return among those that kept every limit."""
-        self._latest.append(row)
-        score = feasible_return(self._latest, self._cost_limits)
-        if score is not None:
-            facts = {"epoch": self.progress.epoch}
-            self._checkpoints.save_best(self.progress.steps, score, facts)
+    def _keep(self, judged: Iterable[Judged]) -> None:
+        """Keep those of the policies that are among the best so far."""
+        for one in judged:
+            self._checkpoints.save_best(one.steps, one.score, one.facts, states=one.states)

@@ -1,5 +1,6 @@
 """Checkpoints: rotation, the best one, and files that are not what they should be."""
 
+import copy
 import errno
 import json
 import zipfile
@@ -306,3 +307,23 @@ def test_the_number_of_checkpoints_is_kept(tmp_path):
         assert [checkpoint_steps(p) for p in checkpoints_in(store.last)] == list(
             range(max(1, steps - 2), steps + 1)
         )
+
+
+def test_a_checkpoint_of_before_there_were_candidates_is_resumed_from(tmp_path):
+    CheckpointStore(tmp_path, {"counter": Counter(7)}, keep_last=1).save(10)
+    present = {"counter": Counter(0), "candidates": Counter(3)}
+    assert CheckpointStore(tmp_path, present, keep_last=1).resume()
+    assert (present["counter"].value, present["candidates"].value) == (7, 3)
+    with pytest.raises(CheckpointError, match="other"):
+        CheckpointStore(tmp_path, {**present, "other": Counter(1)}, keep_last=1).resume()
+
+
+def test_the_best_can_be_one_of_before(tmp_path):
+    components = parts(1)
+    store = CheckpointStore(tmp_path, components, keep_last=1)
+    states = {name: copy.deepcopy(part.state_dict()) for name, part in components.items()}
+    components["counter"].value = 2
+    assert store.save_best(10, 1.0, states=states)
+    restored = parts(0)
+    CheckpointStore.load(best_checkpoint(store.best), restored)
+    assert restored["counter"].value == 1

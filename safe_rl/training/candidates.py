@@ -1,0 +1,123 @@
+"""Which policies of a run are its best: each is judged by the episodes that it played itself."""
+
+from __future__ import annotations
+
+import copy
+from collections import deque
+from collections.abc import Iterable, Mapping
+from typing import Any, NamedTuple
+
+from safe_rl.algorithms.contract import Stateful
+from safe_rl.runs.outcome import feasible_return
+
+__all__ = ["Candidates", "Judged", "epochs_until_judged"]
+
+# longer than this no policy waits: what waits is in memory, and in every checkpoint
+_LONGEST = 10
+
+
+def epochs_until_judged(over: int, max_length: float, steps_per_epoch: float) -> int:
+    """Epochs from an update until the episodes that end were played, on average, by its policy.
+
+    The batch that a policy collects comes an epoch after the update. Where batches are shorter than
+    episodes, what ends in it began before; half an episode later it is in the middle.
+
+    Args:
+        over: Epochs by whose mean a policy is judged, of which this is the last.
+        max_length: Steps after which an episode is over.
+        steps_per_epoch: Steps of every row in an epoch.
+
+    Examples:
+        >>> epochs_until_judged(over=1, max_length=1000, steps_per_epoch=1000)
+        1
+        >>> epochs_until_judged(over=3, max_length=1000, steps_per_epoch=200)
+        4
+    """
+    lag = max_length / steps_per_epoch / 2 if max_length > steps_per_epoch else 0.0
+    return 1 + min(_LONGEST, int(lag) + over // 2)
+
+
+class Judged(NamedTuple):
+    """A policy that kept every limit: the arguments of `CheckpointStore.save_best`.
+
+    Attributes:
+        steps: Environment steps after which it was the run's policy.
+        score: Its return.
+        facts: What its checkpoint says of it.
+        states: The parts of the run then, by name.
+    """
+
+    steps: int
+    score: float
+    facts: dict[str, Any]
+    states: dict[str, Any]
+
+
+class Candidates:
+    """Policies that wait for the epochs by which they are judged.
+
+    Args:
+        components: Parts of the run, by name, that a checkpoint of a policy holds.
+        limits: Cost key -> d, undiscounted cost per episode.
+        over: Epochs by whose mean a policy is judged.
+        delay: Epochs from its update until the last of them.
+
+    Examples:
+        >>> import torch
+        >>> network = torch.nn.Linear(2, 1)
+        >>> candidates = Candidates({"network": network}, {"cost": 25.0}, over=1, delay=1)
+        >>> row = {"episode_return": 5.0, "episode_cost": 20.0}
+        >>> candidates.add({"epoch": 1, "steps": 100, **row})
+        []
+        >>> [(one.steps, one.score) for one in candidates.add({"epoch": 2, "steps": 200, **row})]
+        [(100, 5.0)]
+    """
+
+    def __init__(
+        self,
+        components: Mapping[str, Stateful],
+        limits: Mapping[str, float],
+        *,
+        over: int,
+        delay: int,
+    ) -> None:
+        self._components, self._limits, self._delay = dict(components), dict(limits), delay
+        self._latest: deque[Mapping[str, float]] = deque(maxlen=over)
+        self._waiting: deque[dict[str, Any]] = deque()
+
+    def go_on_after(self, rows: Iterable[Mapping[str, float]]) -> None:
+        """Take in the epochs of a run that is continued."""
+        self._latest.extend(rows)
+
+    def add(self, row: Mapping[str, float]) -> list[Judged]:
+        """Take in an epoch: its policy waits, and the one whose turn it is is judged.
+
+        Args:
+            row: Of the run's table, by column.
+
+        Returns:
+            The judged policy, if it kept every limit.
+        """
+        self._latest.append(row)
+        states = {name: copy.deepcopy(part.state_dict()) for name, part in self._components.items()}
+        self._waiting.append({"steps": row["steps"], "epoch": row["epoch"], "states": states})
+        return self._judge() if len(self._waiting) > self._delay else []
+
+    def judge_all(self) -> list[Judged]:
+        """Judge those that still wait by the epochs that there are: none come after them."""
+        return [one for _ in range(len(self._waiting)) for one in self._judge()]
+
+    def _judge(self) -> list[Judged]:
+        policy = self._waiting.popleft()
+        score = feasible_return(self._latest, self._limits)
+        if score is None:
+            return []
+        return [Judged(policy["steps"], score, {"epoch": policy["epoch"]}, policy["states"])]
+
+    def state_dict(self) -> dict[str, Any]:
+        """Those that wait."""
+        return {"waiting": list(self._waiting)}
+
+    def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
+        """Continue from :meth:`state_dict`."""
+        self._waiting = deque(state_dict["waiting"])

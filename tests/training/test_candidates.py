@@ -1,0 +1,99 @@
+"""The best policies: judged by episodes whose policies are known by construction."""
+
+import pytest
+import torch
+
+from safe_rl.training.candidates import Candidates, epochs_until_judged
+
+EPISODE = 1000
+
+
+class Policy:
+    """Its state is a number, which its owner sets."""
+
+    def __init__(self):
+        self.number = 0
+
+    def state_dict(self):
+        return {"number": torch.tensor(self.number)}
+
+    def load_state_dict(self, state_dict):
+        raise AssertionError("nothing is loaded here")
+
+
+def epochs(values, rows, steps):
+    """Rows of a table: policy i is worth values[i] per episode, and collects batch i.
+
+    Row k of N begins its episodes at step k · 1000 / N; those that end in a batch are a mean over
+    the policies that collected their steps.
+    """
+    worth = torch.tensor(values).repeat_interleave(steps) / EPISODE
+    sums = worth.cumsum(0)
+    for epoch in range(1, len(values) + 1):
+        ends = [
+            end
+            for row in range(rows)
+            for end in range(EPISODE - row * EPISODE // rows, epoch * steps + 1, EPISODE)
+            if end > (epoch - 1) * steps and end >= EPISODE
+        ]
+        returns = [float(sums[end - 1] - (sums[end - 1001] if end > 1000 else 0)) for end in ends]
+        mean = sum(returns) / len(returns) if returns else float("nan")
+        yield {"epoch": epoch, "steps": epoch * steps * rows, "episode_return": mean}
+
+
+def judge(values, rows, steps, over=3):
+    """Scores by the number of the policy."""
+    policy = Policy()
+    delay = epochs_until_judged(over, EPISODE, steps)
+    candidates = Candidates({"policy": policy}, {}, over=over, delay=delay)
+    judged = []
+    for row in epochs(values, rows, steps):
+        # what collected this batch was policy epoch − 1; the update makes it the next one
+        policy.number = row["epoch"]
+        judged += candidates.add(row)
+    return {int(one.states["policy"]["number"]): one.score for one in judged}
+
+
+@pytest.mark.parametrize(("rows", "steps"), [(100, 200), (20, 1000), (50, 500), (100, 100)])
+def test_the_score_of_a_policy_is_that_of_the_episodes_around_it(rows, steps):
+    # a hill of returns: whoever is judged by episodes of earlier policies finds a later summit
+    summit = 24
+    values = [-abs(number - summit) / 4 + 10.0 for number in range(48)]
+    scores = judge(values, rows, steps)
+    best = max(scores, key=scores.get)
+    assert abs(best - summit) <= 1
+    lag = EPISODE // steps
+    for number in range(2 * lag, len(values) - 2 * lag):
+        assert scores[number] == pytest.approx(values[number], abs=0.15 * max(lag, 2))
+
+
+def test_a_single_epoch_of_whole_episodes_judges_the_policy_that_played_them():
+    scores = judge([float(number % 7) for number in range(20)], rows=1, steps=1000, over=1)
+    assert scores == pytest.approx({number: float(number % 7) for number in range(1, 20)})
+
+
+def test_limits_are_held_against_the_mean_of_the_epochs():
+    candidates = Candidates({}, {"cost": 25.0}, over=2, delay=1)
+    kept = []
+    for epoch, cost in enumerate((20.0, 28.0, 30.0, 16.0, 10.0), 1):
+        row = {"epoch": epoch, "steps": epoch, "episode_return": 1.0, "episode_cost": cost}
+        kept += [one.steps for one in candidates.add(row)]
+    # means of 24, 29, 23, 13, of which each judges the policy of the epoch before
+    assert kept == [1, 3, 4]
+    assert [one.steps for one in candidates.judge_all()] == [5]
+    assert candidates.judge_all() == []
+
+
+def test_what_waits_is_a_copy_and_survives_a_checkpoint():
+    network = torch.nn.Linear(1, 1)
+    row = {"episode_return": 1.0}
+    first = Candidates({"network": network}, {}, over=1, delay=1)
+    assert first.add({"epoch": 1, "steps": 1, **row}) == []
+    before = network.weight.detach().clone()
+    with torch.no_grad():
+        network.weight.add_(1.0)
+    second = Candidates({"network": network}, {}, over=1, delay=1)
+    second.load_state_dict(first.state_dict())
+    (judged,) = second.add({"epoch": 2, "steps": 2, **row})
+    assert judged.steps == 1
+    assert torch.equal(judged.states["network"]["weight"], before)
