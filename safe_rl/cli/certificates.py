@@ -18,7 +18,7 @@ from safe_rl.naming import did_you_mean
 
 __all__ = [
     *("certificate_options", "certify_run", "is_to_keep_limits", "is_worth_a_certificate"),
-    "why_not_certified",
+    *("how_to_train_on", "why_not_certified"),
 ]
 
 
@@ -107,6 +107,14 @@ def why_not_certified(config: DictConfig, episode_length: int, directory: Path) 
         f"Not certified: the run has {config.frames:,} steps, fewer than the {steps:,} of a test "
         f"(certificate.episodes={config.certificate.episodes}). To test it all the same: "
         f"python -m safe_rl.evaluate {shlex.quote(str(directory))} certify=true"
+    )
+
+
+def how_to_train_on(config: DictConfig, directory: Path) -> str:
+    """What a run says whose policies are not safe enough yet: how to go on with it."""
+    return (
+        f"To train on: python train.py resume={shlex.quote(str(directory))} "
+        f"frames={2 * config.frames:_}"
     )
 
 

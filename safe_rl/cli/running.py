@@ -14,6 +14,7 @@ from omegaconf import DictConfig, OmegaConf, open_dict
 
 from safe_rl.cli.certificates import (
     certify_run,
+    how_to_train_on,
     is_to_keep_limits,
     is_worth_a_certificate,
     why_not_certified,
@@ -138,6 +139,9 @@ def run(config: DictConfig) -> None:
 
 def _say_certificate(config: DictConfig, folder: RunFolder, episode_length: int) -> None:
     if is_worth_a_certificate(config, episode_length):
-        print(certify_run(folder.directory, num_threads=config.num_threads or 0))
+        certificate = certify_run(folder.directory, num_threads=config.num_threads or 0)
+        print(certificate)
+        if certificate is not None and certificate.checkpoint is None:
+            print(how_to_train_on(config, folder.directory))
     elif reason := why_not_certified(config, episode_length, folder.directory):
         print(reason)

@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 
 from safe_rl.cli import train
+from safe_rl.runs.table import read_table
 
 ROOT = Path(__file__).parents[2]
 
@@ -88,6 +89,21 @@ def test_a_run_too_short_for_its_certificate_says_so(command, overrides, lines):
             f"python -m safe_rl.evaluate {Path('runs/short').resolve()} certify=true"
         )
     assert not Path("runs/short/certificate.json").exists()
+
+
+def test_a_run_without_a_certified_policy_says_how_to_train_on(command):
+    # two episodes can certify nothing
+    status, out, _ = command(
+        *["env=PointGoal1", "env.num_steps=20", "num_envs=2", "frames=40", "frames_per_batch=40"],
+        *["algo=ppo_lagrangian", "certificate.episodes=2", "certificate.ranking=2", "logger=none"],
+        *["cost_limits={cost: 0.5}", "hydra.run.dir=runs/unsafe"],
+    )
+    assert not status
+    line = out.splitlines()[-1]
+    before, _, overrides = line.partition("python train.py ")
+    assert before == "To train on: "
+    assert command(*overrides.split())[0] == 0
+    assert int(read_table(Path("runs/unsafe/progress.csv"))["steps"][-1]) == 80
 
 
 @pytest.mark.parametrize("room", ["safe_rl.training", "safe_rl.cli"])
