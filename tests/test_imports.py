@@ -138,7 +138,8 @@ FLOORS = {
     ),
     "algorithms": (
         (
-            *("contract", "constraints", "learning_rate", "losses", "matrix_products"),
+            *("contract", "constraints", "learning_rate", "loss_state", "losses"),
+            "matrix_products",
             "prioritised",
         ),
         ("trust_region_step",),
