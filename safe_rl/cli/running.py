@@ -23,7 +23,7 @@ from safe_rl.cli.robots import keep_robot, robot_of
 from safe_rl.cli.run_folders import write_notes
 from safe_rl.cli.settings import check_settings
 from safe_rl.cli.user_code import imported, make_after_imports
-from safe_rl.envs import LayoutError, complete_env, make_env
+from safe_rl.envs import ConfigError, LayoutError, complete_env, make_env
 from safe_rl.evaluation.during import PeriodicEvaluation
 from safe_rl.evaluation.layouts import default_seed, has_fixed_layout
 from safe_rl.evaluation.loading import transforms_of
@@ -125,7 +125,8 @@ def run(config: DictConfig) -> None:
             trainer = prepare(config, folder.directory, continues)
         if trainer is None:
             return
-        with in_a_line(OSError):
+        # the last is what is not finite: where it stands says less than the message
+        with in_a_line(OSError, ConfigError, FloatingPointError):
             if not continues or (is_job and not folder.notes.exists()):
                 write_notes(folder, config)
             print(trainer.run())
