@@ -28,7 +28,9 @@ PARTS = {
     "runs": ("algorithms", "extras", "targets"),
     "training": ("algorithms", "collectors", "runs", "targets"),
     "scores": ("extras",),
-    "evaluation": ("algorithms", "collectors", "extras", "lazy", "models", "runs", "scores"),
+    "evaluation": (
+        *("algorithms", "collectors", "extras", "lazy", "models", "naming", "runs", "scores"),
+    ),
     "reporting": ("extras", "runs", "scores"),
     "cli": (
         *("envs", "evaluation", "extras", "naming", "openmp", "processes", "reporting", "runs"),
