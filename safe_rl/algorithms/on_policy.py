@@ -184,6 +184,11 @@ def _held_limits(limits: Mapping[str, float], constraints: Constraints) -> dict[
 def _build_update(config: DictConfig, **parts: Any) -> PolicyUpdate:
     """What moves the policy: ``policy_update`` on ``loss``, and the pairs of ``then`` after it."""
     loss = build_part(config.loss, **parts)
+    if getattr(loss, "has_costs", False) and not parts["cost_limits"]:
+        raise ValueError(
+            f"{type(loss).__name__} needs cost_advantage (has_costs): its algorithm lacks "
+            "'- /cost_advantage: ${preset}' among the defaults."
+        )
     others = {name: part for name, part in parts.items() if name != "actor_network"}
     update = build_part(config.policy_update, loss=loss, **others)  # asks its loss for the actor
     then = config.get("then") or {}

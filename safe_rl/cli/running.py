@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import sys
 from contextlib import AbstractContextManager, ExitStack, nullcontext
 from functools import partial
 from pathlib import Path
@@ -131,7 +132,8 @@ def run(config: DictConfig) -> None:
                 write_notes(folder, config)
             print(trainer.run())
     if trainer.interrupted_by is not None:
-        print(f"Interrupted. Continue with: python train.py resume={folder.directory}")
+        command = sys.argv[0] if sys.argv[0].startswith("safe-rl") else "python train.py"
+        print(f"Interrupted. Continue with: {command} resume={folder.directory}")
         raise SystemExit(128 + trainer.interrupted_by)
     if is_to_keep_limits(config, trainer.algorithm.cost_keys):
         _say_certificate(config, folder, trainer.episode_length)
