@@ -28,7 +28,9 @@ PARTS = {
     "runs": ("algorithms", "extras", "targets"),
     "training": ("algorithms", "collectors", "runs", "targets"),
     "scores": ("extras",),
-    "evaluation": ("algorithms", "collectors", "extras", "lazy", "models", "runs", "scores"),
+    "evaluation": (
+        *("algorithms", "collectors", "extras", "lazy", "models", "naming", "runs", "scores"),
+    ),
     "reporting": ("extras", "runs", "scores"),
     "cli": (
         *("envs", "evaluation", "extras", "naming", "openmp", "processes", "reporting", "runs"),
@@ -138,7 +140,8 @@ FLOORS = {
     ),
     "algorithms": (
         (
-            *("contract", "constraints", "learning_rate", "losses", "matrix_products"),
+            *("contract", "constraints", "learning_rate", "loss_state", "losses"),
+            "matrix_products",
             "prioritised",
         ),
         ("trust_region_step",),

@@ -17,6 +17,7 @@ MODULES = {
     "safe_rl.models": "Networks",
     "safe_rl.collectors": "Collection and accounting",
     "safe_rl.evaluation": "Evaluation and certificates",
+    "safe_rl.scores.certificate": "Claims and their bounds",
     "safe_rl.scores.intervals": "Intervals",
     "safe_rl.scores.normalised": "Normalised scores",
     "safe_rl.reporting": "Reports",

@@ -17,6 +17,7 @@ from safe_rl.algorithms.building import build_constraints, constrained_limits
 from safe_rl.algorithms.constraints import Constraints
 from safe_rl.algorithms.contract import PolicyUpdate, Stateful
 from safe_rl.algorithms.in_turn import UpdatesInTurn
+from safe_rl.algorithms.loss_state import LossState
 from safe_rl.algorithms.minibatch import MinibatchUpdate
 from safe_rl.algorithms.parts import build_part
 from safe_rl.algorithms.side_by_side import side_by_side
@@ -160,9 +161,13 @@ class OnPolicy:
 
     def checkpoint_components(self) -> dict[str, Stateful]:
         """Parts with a ``state_dict``, by name: together they are all that learning depends on."""
+        multiplier = self.constraints.multiplier
+        kept = [*self.networks.values(), *([] if multiplier is None else [multiplier])]
         parts: dict[str, Stateful | None] = {
             **self.networks,
-            "multiplier": self.constraints.multiplier,
+            "multiplier": multiplier,
+            # None where losses hold nothing, as all of the package's do
+            "losses": LossState(self.policy_update, besides=kept) or None,
             "policy_update": self.policy_update,
             "critic_update": self.critic_update,
             "algorithm": self.constraints,
@@ -179,6 +184,11 @@ def _held_limits(limits: Mapping[str, float], constraints: Constraints) -> dict[
 def _build_update(config: DictConfig, **parts: Any) -> PolicyUpdate:
     """What moves the policy: ``policy_update`` on ``loss``, and the pairs of ``then`` after it."""
     loss = build_part(config.loss, **parts)
+    if getattr(loss, "has_costs", False) and not parts["cost_limits"]:
+        raise ValueError(
+            f"{type(loss).__name__} needs cost_advantage (has_costs): its algorithm lacks "
+            "'- /cost_advantage: ${preset}' among the defaults."
+        )
     others = {name: part for name, part in parts.items() if name != "actor_network"}
     update = build_part(config.policy_update, loss=loss, **others)  # asks its loss for the actor
     then = config.get("then") or {}

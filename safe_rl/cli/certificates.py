@@ -18,7 +18,7 @@ from safe_rl.naming import did_you_mean
 
 __all__ = [
     *("certificate_options", "certify_run", "is_to_keep_limits", "is_worth_a_certificate"),
-    *("how_to_train_on", "why_not_certified"),
+    *("train_on", "why_not_certified"),
 ]
 
 
@@ -110,12 +110,9 @@ def why_not_certified(config: DictConfig, episode_length: int, directory: Path) 
     )
 
 
-def how_to_train_on(config: DictConfig, directory: Path) -> str:
-    """What a run says whose policies are not safe enough yet: how to go on with it."""
-    return (
-        f"To train on: python train.py resume={shlex.quote(str(directory))} "
-        f"frames={2 * config.frames:_}"
-    )
+def train_on(config: DictConfig, directory: Path) -> str:
+    """Arguments that go on with a run whose policies are not safe enough yet."""
+    return f"resume={shlex.quote(str(directory))} frames={2 * config.frames:_}"
 
 
 def _test_steps(config: DictConfig, episode_length: int) -> int:

@@ -70,6 +70,7 @@ def check_command(arguments: Sequence[str], conf: Path) -> None:
         for job in _jobs(overrides) if _is_sweep(flags) else [flags.overrides]:
             config = _compose(hydra, flags.config_name or "config", job)
             if flags.cfg is None and flags.info is None:
+                _check_package(config)
                 check_read(overrides, config)
                 _check_run(config, "hydra.sweep.dir" if _is_sweep(flags) else "hydra.run.dir")
                 check_added(overrides, config)
@@ -136,6 +137,16 @@ def _chooses(override: str, hydra: Hydra) -> bool:
     """Whether an override chooses a file of a group."""
     group = override.partition("=")[0].lstrip("+").partition("@")[0]
     return bool(hydra.config_loader.get_group_options(group, ObjectType.CONFIG))
+
+
+def _check_package(config: DictConfig) -> None:
+    """An algorithm's file that does not say so ends up below ``algo``, with all its keys."""
+    misplaced = [str(key) for key in config.get("algo") or () if key in config]
+    if misplaced:
+        raise CommandLineError(
+            f"algo={config.hydra.runtime.choices.get('algo')}: {', '.join(misplaced)} would stand "
+            "below algo: its file has to begin with the line '# @package _global_'."
+        )
 
 
 def _check_run(config: DictConfig, folder_key: str) -> None:

@@ -20,6 +20,7 @@ from torchrl.envs import EnvBase
 
 from safe_rl.cli.certificates import certify_run, is_to_keep_limits, is_worth_a_certificate
 from safe_rl.cli.evaluate import evaluate_run
+from safe_rl.cli.options import take_options
 from safe_rl.cli.python_settings import compose_new, compose_resumed, overrides_of
 from safe_rl.cli.robots import maker_of
 from safe_rl.cli.running import complete, prepare
@@ -117,10 +118,12 @@ class Run:
         Args:
             options: Those of :class:`safe_rl.evaluation.EvaluationOptions`, such as
                 ``episodes=100``; keys of the environment as ``env={"hazards_num": 12}``.
+
+        Raises:
+            ValueError: If there is no such option, or it cannot have the value.
         """
-        return evaluate_run(
-            self.directory, EvaluationOptions(**{"checkpoint": self.checkpoint, **options})
-        )
+        given = {"checkpoint": self.checkpoint, **options}
+        return evaluate_run(self.directory, take_options(given, EvaluationOptions))
 
     def certify(self, **changes: Any) -> Certificate | None:
         """Find its best checkpoint that surely keeps the limits, as at the end of training.
@@ -145,7 +148,7 @@ class Run:
             options: Those of :class:`safe_rl.evaluation.EvaluationOptions`.
         """
         given = {"checkpoint": self.checkpoint, "variations": variations, **options}
-        return evaluate_varied(self.directory, EvaluationOptions(**given))[0]
+        return evaluate_varied(self.directory, take_options(given, EvaluationOptions))[0]
 
 
 def train(

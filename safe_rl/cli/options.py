@@ -5,9 +5,9 @@ The schema is a dataclass; its fields' metadata holds the help texts.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import MISSING, fields
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import yaml
 from omegaconf import DictConfig, OmegaConf
@@ -15,7 +15,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from safe_rl.naming import did_you_mean
 
-__all__ = ["OptionError", "parse_options", "usage"]
+__all__ = ["OptionError", "parse_options", "take_options", "usage"]
 
 if TYPE_CHECKING:
     from _typeshed import DataclassInstance
@@ -51,22 +51,56 @@ def parse_options(arguments: Sequence[str], schema: type[Schema]) -> Schema:
         ...
         safe_rl.cli.options.OptionError: Unknown option 'episode'. Did you mean 'episodes'? Options are: episodes, video.
     """  # noqa: E501
-    known = [field.name for field in fields(schema)]
     for argument in arguments:
         key, equals, _ = argument.partition("=")
         if not equals:
             raise OptionError(
                 f"'{argument}' is not an option: options are written key=value, for example "
-                f"{known[0]}=…"
+                f"{fields(schema)[0].name}=…"
             )
-        name = key.partition(".")[0]
-        if name not in known:
-            raise OptionError(
-                f"Unknown option '{name}'.{did_you_mean(name, known)} Options are: "
-                f"{', '.join(known)}."
-            )
+        _check_name(key.partition(".")[0], schema)
+    return _merged(schema, lambda: OmegaConf.from_dotlist(list(arguments)), " ".join(arguments))
+
+
+def take_options(given: Mapping[str, Any], schema: type[Schema]) -> Schema:
+    """Check keyword arguments, as :func:`parse_options` checks texts.
+
+    Raises:
+        OptionError: For an option that is unknown, or of another type than the schema's.
+
+    Examples:
+        >>> from dataclasses import dataclass
+        >>> @dataclass
+        ... class Options:
+        ...     episodes: int = 100
+        >>> take_options({"episodes": 7}, Options)
+        Options(episodes=7)
+    """
+    for name in given:
+        _check_name(name, schema)
+    return _merged(schema, lambda: OmegaConf.create(_plain(given)), str(dict(given)))
+
+
+def _plain(value: Any) -> Any:
+    """Numbers and arrays of NumPy and torch are none of OmegaConf's."""
+    if isinstance(value, Mapping):
+        return {key: _plain(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(item) for item in value]
+    return value.tolist() if hasattr(value, "tolist") else value
+
+
+def _check_name(name: str, schema: type[DataclassInstance]) -> None:
+    known = [field.name for field in fields(schema)]
+    if name not in known:
+        raise OptionError(
+            f"Unknown option '{name}'.{did_you_mean(name, known)} Options are: {', '.join(known)}."
+        )
+
+
+def _merged(schema: type[Schema], read: Callable[[], DictConfig], shown: str) -> Schema:
     try:
-        given = OmegaConf.from_dotlist(list(arguments))
+        given = read()
         _check_switches(given, schema)
         merged = OmegaConf.merge(OmegaConf.structured(schema), given)
         return OmegaConf.to_object(merged)  # type: ignore[return-value]
@@ -74,7 +108,7 @@ def parse_options(arguments: Sequence[str], schema: type[Schema]) -> Schema:
         raise OptionError(f"{str(error).splitlines()[0]} (option '{error.full_key}')") from error
     except yaml.YAMLError as error:
         words = " ".join(str(error).split())
-        raise OptionError(f"{' '.join(arguments)}: a value cannot be read: {words}") from error
+        raise OptionError(f"{shown}: a value cannot be read: {words}") from error
 
 
 def _check_switches(given: DictConfig, schema: type[DataclassInstance]) -> None:

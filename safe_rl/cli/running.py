@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import sys
 from contextlib import AbstractContextManager, ExitStack, nullcontext
 from functools import partial
 from pathlib import Path
@@ -14,9 +15,9 @@ from omegaconf import DictConfig, OmegaConf, open_dict
 
 from safe_rl.cli.certificates import (
     certify_run,
-    how_to_train_on,
     is_to_keep_limits,
     is_worth_a_certificate,
+    train_on,
     why_not_certified,
 )
 from safe_rl.cli.failures import SETTING_ERRORS, errors_in_a_line
@@ -24,7 +25,7 @@ from safe_rl.cli.robots import keep_robot, robot_of
 from safe_rl.cli.run_folders import write_notes
 from safe_rl.cli.settings import check_settings
 from safe_rl.cli.user_code import imported, make_after_imports
-from safe_rl.envs import LayoutError, complete_env, make_env
+from safe_rl.envs import ConfigError, LayoutError, complete_env, make_env
 from safe_rl.evaluation.during import PeriodicEvaluation
 from safe_rl.evaluation.layouts import default_seed, has_fixed_layout
 from safe_rl.evaluation.loading import transforms_of
@@ -126,15 +127,21 @@ def run(config: DictConfig) -> None:
             trainer = prepare(config, folder.directory, continues)
         if trainer is None:
             return
-        with in_a_line(OSError):
+        # the last is what is not finite: where it stands says less than the message
+        with in_a_line(OSError, ConfigError, FloatingPointError):
             if not continues or (is_job and not folder.notes.exists()):
                 write_notes(folder, config)
             print(trainer.run())
     if trainer.interrupted_by is not None:
-        print(f"Interrupted. Continue with: python train.py resume={folder.directory}")
+        print(f"Interrupted. Continue with: {_this_command()} resume={folder.directory}")
         raise SystemExit(128 + trainer.interrupted_by)
     if is_to_keep_limits(config, trainer.algorithm.cost_keys):
         _say_certificate(config, folder, trainer.episode_length)
+
+
+def _this_command() -> str:
+    """What trains, as the user has called it."""
+    return sys.argv[0] if sys.argv[0].startswith("safe-rl") else "python train.py"
 
 
 def _say_certificate(config: DictConfig, folder: RunFolder, episode_length: int) -> None:
@@ -142,6 +149,6 @@ def _say_certificate(config: DictConfig, folder: RunFolder, episode_length: int)
         certificate = certify_run(folder.directory, num_threads=config.num_threads or 0)
         print(certificate)
         if certificate is not None and certificate.checkpoint is None:
-            print(how_to_train_on(config, folder.directory))
+            print(f"To train on: {_this_command()} {train_on(config, folder.directory)}")
     elif reason := why_not_certified(config, episode_length, folder.directory):
         print(reason)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -14,13 +14,14 @@ from torchrl.checkpoint import CheckpointError
 from torchrl.envs import EnvBase
 
 from safe_rl.algorithms.parts import find_recipe
+from safe_rl.naming import did_you_mean
 from safe_rl.runs.checkpoints import CheckpointStore, best_checkpoint
 from safe_rl.runs.files import read_config
 from safe_rl.runs.folder import KINDS, RunFolder
 
 __all__ = [
-    *("evaluated", "find_checkpoint", "load_config", "load_policy", "override_env"),
-    "transforms_of",
+    *("evaluated", "find_checkpoint", "limits_of", "load_config", "load_policy"),
+    *("override_env", "transforms_of"),
 ]
 
 
@@ -44,6 +45,29 @@ def load_config(directory: Path) -> DictConfig:
 def override_env(config: DictConfig, overrides: Mapping[str, Any]) -> dict[str, Any]:
     """The run's environment with some keys changed; their names are checked where it is made."""
     return {**OmegaConf.to_container(config.env), **overrides}  # type: ignore[dict-item]
+
+
+def limits_of(
+    config: DictConfig, others: Mapping[str, float], cost_keys: Collection[str]
+) -> dict[str, float]:
+    """Cost key -> d, of the run, and in their place others that are asked for.
+
+    Raises:
+        ValueError: If others name a cost that the environment does not have.
+
+    Examples:
+        >>> config = OmegaConf.create({"cost_limits": {"cost": 25, "cost_vases": 5}})
+        >>> limits_of(config, {"cost": 10.0}, ["cost", "cost_vases", "cost_hazards"])
+        {'cost': 10.0, 'cost_vases': 5.0}
+    """
+    for key in others:
+        if key not in cost_keys:
+            raise ValueError(
+                f"cost_limits names '{key}', but this environment has no such cost."
+                f"{did_you_mean(key, cost_keys)} It has {', '.join(cost_keys)}."
+            )
+    limits = {**config.cost_limits, **others}
+    return {key: float(limit) for key, limit in limits.items() if key in cost_keys}
 
 
 def transforms_of(config: DictConfig) -> dict[str, Any]:

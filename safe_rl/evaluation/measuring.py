@@ -19,6 +19,7 @@ from safe_rl.evaluation.layouts import default_seed, shared_layouts
 from safe_rl.evaluation.loading import (
     evaluated,
     find_checkpoint,
+    limits_of,
     load_config,
     load_policy,
     override_env,
@@ -99,10 +100,10 @@ def evaluate(
     places = {kind: run.evaluation(options.name, kind) for kind in ("json", "csv", "transitions")}
     with closing(make(min(options.num_envs, options.episodes))) as env:
         cost_keys = env.cost_keys
+        limits = limits_of(config, options.cost_limits, cost_keys)
         policy = load_policy(config, env, checkpoint, torch.device(options.device))
         torch.manual_seed(seed)
         episodes = _collect(env, policy, options, places["transitions"], progress)
-    limits = {key: float(d) for key, d in config.cost_limits.items() if key in cost_keys}
     reference = suite.reference(node, but_for=_LAYOUTS)
     estimates = summarise(episodes, limits, reference, options.cvar_alpha)
     facts = _facts(directory, config, checkpoint, options, node, seed) | {"cost_limits": limits}

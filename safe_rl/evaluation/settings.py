@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -62,6 +63,10 @@ class EvaluationOptions:
         default_factory=dict,
         metadata={"help": "with certify=true: certificate.episodes=2000, as in training"},
     )
+    cost_limits: dict[str, float] = field(
+        default_factory=dict,
+        metadata={"help": "to measure against in place of the run's own, such as '{cost: 10}'"},
+    )
     name: str = _option("", "told apart by it, several evaluations of a run can stand side by side")
     variations: Any = field(
         default=None,
@@ -83,6 +88,9 @@ def check_options(options: EvaluationOptions) -> None:
         value = getattr(options, name)
         if value is not None and not lowest <= value <= highest:
             raise ValueError(f"{name}={value}: at least {lowest} and at most {highest:,}.")
+    for key, limit in options.cost_limits.items():
+        if not 0 <= limit < math.inf:
+            raise ValueError(f"cost_limits.{key}={limit}: it must be a number from 0.")
     check_share(options.cvar_alpha)
     if options.certificate and not options.certify:
         raise ValueError("certificate.…: it is the certificate's: add certify=true.")

@@ -18,6 +18,7 @@ from safe_rl.evaluation.layouts import default_seed
 from safe_rl.evaluation.loading import (
     evaluated,
     find_checkpoint,
+    limits_of,
     load_config,
     load_policy,
     override_env,
@@ -115,7 +116,7 @@ def evaluate_variations(
                 raise
             left_out.append((variation, str(error)))
             continue
-        limits = {k: float(d) for k, d in config.cost_limits.items() if k in episodes.costs}
+        limits = limits_of(config, options.cost_limits, episodes.costs)
         rows.append(VariedRow(variation, summarise(episodes, limits, None, options.cvar_alpha)))
     file = RunFolder(directory).variations(options.name, "csv")
     _write(file, rows)

@@ -21,7 +21,7 @@ from safe_rl.algorithms.contract import Stateful
 __all__ = ["as_parts", "read_facts", "read_states", "restore", "writer"]
 
 # parts that checkpoints of earlier versions lack: they begin anew
-_ADDED_LATER = {"candidates"}
+_ADDED_LATER = {"candidates", "losses"}
 
 
 class _WeightsOnly(StateDictCheckpointAdapter):

@@ -1,5 +1,6 @@
 """The way in from Python does what the commands do, whatever state Hydra is in."""
 
+import csv
 import math
 import shutil
 import signal
@@ -17,6 +18,7 @@ from run_configs import CONF, without_times
 import safe_rl
 from safe_rl.cli.python_settings import overrides_of
 from safe_rl.envs import ConfigError
+from safe_rl.evaluation.loading import find_checkpoint
 from safe_rl.runs.table import read_table
 from safe_rl.training.trainer import Trainer
 
@@ -125,6 +127,39 @@ def test_strange_texts_arrive_as_they_are(text):
     parsed = OverridesParser.create().parse_override(override)
     assert parsed.key_or_group == "a.b"
     assert parsed.value() == [text, {"c": text}]
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"episode": 3}, "Unknown option 'episode'. Did you mean 'episodes'"),
+        ({"episodes": "many"}, "'many'.*option 'episodes'"),
+        ({"video": 7}, "video=7: it must be true or false"),
+        ({"episodes": 2, "cost_limits": {"cots": 3}}, "no such cost. Did you mean 'cost'"),
+    ],
+)
+def test_an_evaluation_cannot_be_asked_for_what_there_is_not(run, options, message):
+    with pytest.raises(ValueError, match=message):
+        run.evaluate(**options)
+    with pytest.raises(ValueError, match=message):
+        run.vary({"few": {"env.hazards_num": 2}}, **options)
+
+
+def test_a_run_is_measured_against_other_limits(run):
+    path = find_checkpoint(run.directory, "last")
+    own, none = (
+        run.evaluate(episodes=4, seed=5, checkpoint=path, name=name, cost_limits=limits)
+        for name, limits in (("own", {}), ("none", {"cost": 0}))
+    )
+    assert own.facts["cost_limits"] == dict(run.config.cost_limits)
+    assert none.facts["cost_limits"] == {**run.config.cost_limits, "cost": 0.0}
+    with none.files[1].open() as file:
+        costs = [float(row["cost"]) for row in csv.DictReader(file)]
+    share = sum(cost > 0 for cost in costs) / 4
+    assert none.estimates["over_limit_cost"].value == share
+    assert own.estimates["episode_cost"] == none.estimates["episode_cost"]
+    varied = run.vary({"few": {"env.hazards_num": 2}}, episodes=2, cost_limits={"cost": 0})
+    assert varied.cost_limits["cost"] == 0
 
 
 def test_a_run_is_certified_and_what_is_no_evaluation_refused(run):

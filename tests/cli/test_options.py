@@ -2,11 +2,13 @@
 
 import re
 from dataclasses import fields
+from pathlib import Path
 
+import numpy as np
 import pytest
 
 from safe_rl.cli.evaluate import evaluate_run
-from safe_rl.cli.options import OptionError, parse_options, usage
+from safe_rl.cli.options import OptionError, parse_options, take_options, usage
 from safe_rl.evaluation.settings import EvaluationOptions
 from safe_rl.extras import import_extra
 
@@ -33,6 +35,7 @@ def test_values_are_read_with_their_types():
         ("deterministic=2", "deterministic=2: it must be true or false"),
         ("episodes=nan", "'nan'.*option 'episodes'"),
         ("episodes=[1", "a value cannot be read"),
+        ("cost_limits={cost: low}", "'low'.*option 'cost_limits.cost'"),
     ],
 )
 def test_errors_say_what_to_write(argument, message):
@@ -51,12 +54,23 @@ def test_errors_say_what_to_write(argument, message):
         ("camera=track", r"camera=track: it is the video's: add video=true\."),
         ("device=meta", "device=meta: it must be cpu, cuda or"),
         ("cvar_alpha=nan", "nan"),
+        ("cost_limits={cost: -1}", r"cost_limits.cost=-1.0: it must be a number from 0"),
+        ("cost_limits={cost: .nan}", r"cost_limits.cost=nan: it must be a number from 0"),
     ],
 )
 def test_options_are_checked_before_anything_is_done(tmp_path, argument, message):
     options = parse_options([argument], EvaluationOptions)
     with pytest.raises(ValueError, match=message):
         evaluate_run(tmp_path / "no run at all", options)
+
+
+def test_keywords_may_be_numbers_of_numpy_and_paths():
+    given = {"episodes": np.int64(3), "checkpoint": Path("a/b"), "env": {"x": np.array([1.5, 2])}}
+    options = take_options(
+        given | {"variations": {"m": {"k": (np.float32(0.5), 1)}}}, EvaluationOptions
+    )
+    assert (options.episodes, options.checkpoint, options.env) == (3, "a/b", {"x": [1.5, 2.0]})
+    assert options.variations == {"m": {"k": [0.5, 1]}}
 
 
 def test_the_help_has_every_option_and_its_default():

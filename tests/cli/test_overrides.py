@@ -182,6 +182,13 @@ def test_faults_of_files_are_told_by_the_file(own_conf, text):
     assert len(str(caught.value).splitlines()) == 1
 
 
+def test_an_algorithm_below_its_own_name_is_told_its_first_line(own_conf):
+    file = own_conf / "algo" / "mine.yaml"
+    file.write_text(file.read_text().partition("\n")[2])
+    with pytest.raises(CommandLineError, match=r"algo=mine: .*with the line '# @package _gl"):
+        check_command([f"--config-dir={own_conf}", "algo=mine"], CONF)
+
+
 @pytest.mark.parametrize("flag", ["--config-dir=", "hydra.searchpath=[file://"])
 def test_folders_of_ones_own_are_searched_too(own_conf, flag):
     folder = f"{flag}{own_conf}{']' if '[' in flag else ''}"

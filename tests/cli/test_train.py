@@ -4,6 +4,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+import gymnasium
+import numpy as np
 import pytest
 
 from safe_rl.cli import train
@@ -104,6 +106,41 @@ def test_a_run_without_a_certified_policy_says_how_to_train_on(command):
     assert before == "To train on: "
     assert command(*overrides.split())[0] == 0
     assert int(read_table(Path("runs/unsafe/progress.csv"))["steps"][-1]) == 80
+
+
+class OddCost(gymnasium.Env):
+    """Two steps without a cost, then one of `cost`."""
+
+    observation_space = gymnasium.spaces.Box(-1, 1, (1,), np.float32)
+    action_space = gymnasium.spaces.Box(-1, 1, (1,), np.float32)
+
+    def __init__(self, cost):
+        self.cost = cost
+
+    def reset(self, *, seed=None, options=None):
+        self.costs = [0.0, 0.0, self.cost]
+        return np.zeros(1, np.float32), {}
+
+    def step(self, action):
+        return np.zeros(1, np.float32), 0.0, False, False, {"cost": self.costs.pop(0)}
+
+
+gymnasium.register("OddCost-v0", OddCost, max_episode_steps=3)
+
+
+@pytest.mark.parametrize(
+    ("cost", "words"),
+    [
+        ("nan", "('next', 'cost') is not finite in 4 of 12 samples"),
+        ("much", "info['cost'] must be one number per step"),
+    ],
+)
+def test_what_is_wrong_with_a_cost_ends_training_in_a_line(command, cost, words):
+    keys = ["env=gymnasium", "env.id=OddCost-v0", f"env.kwargs={{cost: {cost}}}"]
+    small = ["env.cost_keys=[cost]", "num_envs=2", "frames=12", "frames_per_batch=12"]
+    status, _, _ = command(*keys, *small, "logger=none", "algo=ppo_lagrangian")
+    assert words in status
+    assert len(status.splitlines()) == 1
 
 
 @pytest.mark.parametrize("room", ["safe_rl.training", "safe_rl.cli"])

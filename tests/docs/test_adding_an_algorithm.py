@@ -40,6 +40,9 @@ def test_a_loss_a_configuration_and_a_test_make_an_algorithm(folder):
         *("algo=quadratic", "frames=480", "cost_limits={cost_hazards: 1, cost_north: 0.5}"),
     )
     build_trainer(config, PointMass(config.num_envs), folder / "run").run()
+    config.cost_advantage = None
+    with pytest.raises(ValueError, match="QuadraticPenaltyLoss needs cost_advantage"):
+        build_trainer(config, PointMass(config.num_envs), folder / "without")
     penalties = read_table(folder / "run" / "progress.csv")["policy_loss_penalty"]
     assert len(penalties) == 3
     assert max(penalties) > 0

@@ -107,9 +107,18 @@ def test_contacts_that_nothing_counts_are_an_error_that_says_so():
         make({"walls_num": 1}).rollout(1)
 
 
-def test_a_cost_of_another_shape_is_named():
-    register_cost(Cost("cost_wide", lambda c: True, lambda c, w: w.robot_xy))
-    with pytest.raises(ConfigError, match=r"cost_wide .*\[2\], got \[2, 2\]"):
+@pytest.mark.parametrize(
+    ("magnitude", "told"),
+    [
+        (lambda c, w: w.robot_xy, r"cost_odd .*\[2\], got \[2, 2\]"),
+        (lambda c, w: 1.0, r"cost_odd .*\[2\], got a float"),
+        (lambda c, w: w.robot_xy[:, 0].numpy(), r"cost_odd .*\[2\], got a ndarray"),
+        (lambda c, w: torch.tensor([0.5, -2.0]), "cost_odd must be 0 or more, got -2"),
+    ],
+)
+def test_a_cost_that_is_not_one_number_of_at_least_0_per_world_is_named(magnitude, told):
+    register_cost(Cost("cost_odd", lambda c: True, magnitude))
+    with pytest.raises(ConfigError, match=told):
         SafetyGymEnv({"robot_base": "point"}, num_envs=2, seed=0).rollout(1)
 
 

@@ -10,7 +10,7 @@ from run_configs import compose_config
 from torchrl.envs import RewardSum, TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
-from safe_rl.envs import SafetyGymEnv, from_gymnasium, store_configs
+from safe_rl.envs import ConfigError, SafetyGymEnv, from_gymnasium, store_configs
 from safe_rl.runs.table import read_table
 from safe_rl.training.trainer import build_trainer, seed_everything
 
@@ -88,6 +88,19 @@ def test_a_cost_that_no_info_has_is_told_with_the_nearest_that_there_is(workers)
     assert step["cost_spede"].eq(0).all()
     assert step["cost_upright"].gt(0).any()
     env.close()
+
+
+@pytest.mark.parametrize("cost", [np.ones(3), "hot", None])
+@pytest.mark.parametrize("num_envs", [1, 2])
+def test_a_cost_that_is_no_number_is_told_with_its_name(cost, num_envs):
+    class Odd(Counter):
+        def step(self, action):
+            *values, _ = super().step(action)
+            return *values, {"cost_odd": cost}
+
+    env = from_gymnasium(Odd, num_envs=num_envs, num_steps=4, cost_keys=["cost_odd"], seed=3)
+    with pytest.raises(ConfigError, match=r"info\['cost_odd'\] must be one number per step"):
+        env.rollout(2)
 
 
 def test_a_cost_that_is_reported_where_it_occurs_is_nothing_to_tell():

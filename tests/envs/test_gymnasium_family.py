@@ -165,6 +165,12 @@ def test_what_cannot_be_made_is_said(keys, message):
         make_env({**NODE, **keys})
 
 
+def test_an_unknown_name_is_said_once_where_costs_are_to_be_found_out():
+    with pytest.raises(ConfigError, match="Did you mean 'Walk-v0'") as error:
+        complete_env({**NODE, "id": "Wolk-v0", "cost_keys": None})
+    assert str(error.value).count("env.id=") == 1
+
+
 def test_nested_observations_become_a_vector_on_request():
     env = make_env({**NODE, "kwargs": {"nested": True}, "flatten": True}, num_envs=2)
     assert env.reset()["observation"].shape == (2, 4)

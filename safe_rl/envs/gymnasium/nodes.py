@@ -50,6 +50,8 @@ def complete_gymnasium(node: Mapping[str, Any]) -> dict[str, Any]:
             costs, steps = describe(
                 maker(full), full["cost_keys"], full["num_steps"], full["flatten"]
             )
+        except ConfigError:  # says which environment it is about
+            raise
         except (gymnasium.error.Error, TypeError, ValueError) as error:
             raise ConfigError(f"env.id={full['id']}: {error}") from error
         full |= {"cost_keys": costs, "num_steps": steps}

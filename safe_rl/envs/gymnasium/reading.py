@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+import reprlib
 import warnings
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -9,11 +11,12 @@ from typing import Any
 import numpy as np
 import torch
 from tensordict import TensorDictBase
+from torch import Tensor
 from torchrl.data import Composite
 from torchrl.envs.gym_like import BaseInfoDictReader
 
 from safe_rl.envs.cost_specs import cost_spec
-from safe_rl.envs.errors import nearest
+from safe_rl.envs.errors import ConfigError, nearest
 
 __all__ = ["CostReader"]
 
@@ -35,6 +38,9 @@ class CostReader(BaseInfoDictReader):
         >>> reader = CostReader(["cost_crash"], [2])
         >>> reader({"speed": np.ones(2)}, TensorDict(batch_size=[2]))["cost_crash"].flatten()
         tensor([0., 0.])
+
+    Raises:
+        ConfigError: by the call, if a cost is not one number per step.
     """
 
     def __init__(
@@ -56,9 +62,17 @@ class CostReader(BaseInfoDictReader):
         if self._unseen:
             self._look_for_unseen(info_dict, is_step="reward" in tensordict)
         for key in self._cost_keys:
-            value = info_dict.get(key, np.zeros(self._shape))
-            tensordict[key] = torch.as_tensor(value, dtype=torch.float32).reshape(self._shape)
+            tensordict[key] = self._one_each(key, info_dict.get(key, np.zeros(self._shape)))
         return tensordict
+
+    def _one_each(self, key: str, value: Any) -> Tensor:
+        try:
+            return torch.as_tensor(value, dtype=torch.float32).reshape(self._shape)
+        except (TypeError, ValueError, RuntimeError):
+            raise ConfigError(
+                f"info['{key}'] must be one number per step, as a cost is; the steps of "
+                f"{math.prod(self._shape)} environments brought {reprlib.repr(value)}."
+            ) from None
 
     def _look_for_unseen(self, info_dict: Mapping[str, Any], is_step: bool) -> None:
         self._unseen.difference_update(info_dict)

@@ -175,9 +175,10 @@ def cost_keys(config: SafetyGymConfig) -> list[str]:
 
 def _magnitude(row: Cost, config: SafetyGymConfig, world: World) -> Tensor:
     cost, shape = row.magnitude(config, world), world.robot_xy.shape[:1]
-    if cost.shape != shape:
+    if not isinstance(cost, Tensor) or cost.shape != shape:
+        got = list(cost.shape) if isinstance(cost, Tensor) else f"a {type(cost).__name__}"
         raise ConfigError(
-            f"{row.key} must be one number per world, {list(shape)}, got {list(cost.shape)}."
+            f"{row.key} must be a tensor of one number per world, {list(shape)}, got {got}."
         )
     return cost
 
@@ -192,10 +193,16 @@ def compute_costs(config: SafetyGymConfig, world: World, failed: Tensor) -> Tens
 
     Returns:
         One row for each of `cost_keys(config)`, [1 + number of kinds + 1, N].
+
+    Raises:
+        ConfigError: if a registered cost is not one number of at least 0 per world.
     """
     magnitudes = [_magnitude(row, config, world) for row in COSTS if row.active(config)]
     if failed.any():
         magnitudes = [torch.where(failed, 0.0, magnitude) for magnitude in magnitudes]
     exceptions = failed.to(torch.float64)  # the sum has this type, whatever a registered cost has
     costs = torch.stack([sum(magnitudes, start=exceptions), *magnitudes, exceptions])
+    if (costs < 0.0).any():
+        key = cost_keys(config)[1 + int((costs[1:] < 0.0).any(-1).nonzero()[0])]
+        raise ConfigError(f"{key} must be 0 or more, got {costs.min():.4g}: clamp(min=0) it.")
     return costs.gt_(0.0) if config.constrain_indicator else costs

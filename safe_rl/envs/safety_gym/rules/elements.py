@@ -33,12 +33,20 @@ NUM_RAY_GROUPS = int(mujoco.mjNGROUP)
 
 
 class Motion(Enum):
-    """How an element takes part in the physics."""
+    """How an element takes part in the physics.
 
-    FREE = "free"  # a free body that can be pushed
-    GUIDED = "guided"  # a free body welded to a target that runs in a circle
-    STATIC = "static"  # collides and never moves within an episode
-    VIRTUAL = "virtual"  # an area without physics
+    Attributes:
+        FREE: a body that can be pushed, as vases.
+        GUIDED: a body pulled along by a target that runs in a circle of radius `<kind>_travel` [m]
+            around where the layout puts it, as gremlins; it moves by itself and can be pushed.
+        STATIC: collides and never moves within an episode, as pillars.
+        VIRTUAL: an area without physics, as hazards.
+    """
+
+    FREE = "free"
+    GUIDED = "guided"
+    STATIC = "static"
+    VIRTUAL = "virtual"
 
 
 class Geom(NamedTuple):
@@ -61,7 +69,8 @@ class Element:
         height: z of the object's centre [m].
         geoms: its shapes.
         rgb: colour in pictures and lidar halos.
-        group: MuJoCo geom group, which natural lidar selects by.
+        group: MuJoCo geom group, which `lidar_type="natural"` selects by: kinds of the same group
+            are then seen as one. Otherwise any number from 0 to 5 will do.
         flag: configuration key that turns its lidar on; "" for `observe_<kind>`.
         always_observed: whether the lidar is there (all zeros) even without any object.
     """

@@ -1,0 +1,80 @@
+"""What a loss of one's own keeps from one batch to the next, for checkpoints."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping
+from itertools import chain
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+__all__ = ["LossState"]
+
+
+class LossState:
+    """Buffers and parameters of losses that no network and no multiplier holds.
+
+    Coefficients that TorchRL schedules (``register_coeff_buffer``) are settings, and left out: a
+    run that goes on may be given others.
+
+    Args:
+        update: What moves the policy: an update with a ``loss``, or `UpdatesInTurn`. Losses that
+            are plain functions hold nothing.
+        besides: Modules whose state is kept elsewhere; losses share their tensors.
+
+    Examples:
+        >>> import types
+        >>> network, loss = torch.nn.Linear(2, 1), torch.nn.Module()
+        >>> loss.network = network
+        >>> loss.register_buffer("weight", torch.tensor(0.5))
+        >>> LossState(types.SimpleNamespace(loss=loss), besides=[network]).state_dict()
+        {'loss.weight': tensor(0.5000)}
+    """
+
+    def __init__(self, update: Any, besides: Iterable[nn.Module]) -> None:
+        self._losses = list(_losses(update))
+        self._besides = list(besides)
+
+    def __bool__(self) -> bool:
+        """Whether there is anything to keep."""
+        return bool(self._own())
+
+    def state_dict(self) -> dict[str, Tensor]:
+        """Copies, by the place of the loss and the name that it has for them."""
+        return {name: tensor.detach().clone() for name, tensor in self._own().items()}
+
+    @torch.no_grad()
+    def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
+        """Continue from :meth:`state_dict`, in place: an optimiser holds the same tensors."""
+        for name, tensor in self._own().items():
+            tensor.copy_(state_dict[name])
+
+    def _own(self) -> dict[str, Tensor]:
+        # looked up anew: a loss may put another tensor in the place of a buffer
+        known = {tensor.data_ptr() for module in self._besides for _, tensor in _tensors(module)}
+        return {
+            f"{place}.{name}": tensor
+            for place, loss in self._losses
+            for name, tensor in _tensors(loss)
+            if tensor.data_ptr() not in known and name not in _coefficients(loss)
+        }
+
+
+def _losses(update: Any, place: str = "loss") -> Iterator[tuple[str, nn.Module]]:
+    if isinstance(getattr(update, "loss", None), nn.Module):
+        yield place, update.loss
+    if hasattr(update, "first"):
+        yield from _losses(update.first, place)
+    for name, other in getattr(update, "then", {}).items():
+        yield from _losses(other, f"{place}.{name}")
+
+
+def _tensors(module: nn.Module) -> Iterator[tuple[str, Tensor]]:
+    return chain(module.named_parameters(), module.named_buffers())
+
+
+def _coefficients(loss: nn.Module) -> set[str]:
+    """What TorchRL's schedulers may set, of all classes that the loss inherits from."""
+    declared = (getattr(kind, "_schedulable_buffers", ()) for kind in type(loss).__mro__)
+    return set(chain.from_iterable(declared))

@@ -1,0 +1,83 @@
+"""What a loss of one's own keeps from batch to batch is part of a checkpoint."""
+
+import pytest
+import torch
+from point_mass import PointMass
+from run_configs import point_mass_config
+
+from safe_rl import targets
+from safe_rl.objectives import PPOLagrangianLoss, TRPOLagrangianLoss
+from safe_rl.runs.table import read_table
+from safe_rl.training.trainer import build_trainer, seed_everything
+
+
+class _Remembering:
+    """Counts its calls in a buffer that it replaces, and learns a number and a layer."""
+
+    extra_out_keys = ("loss_own", "calls", "number")
+
+    def __init__(self, *args, **kwargs):
+        super().__init__(*args, **kwargs)
+        self.register_buffer("calls", torch.zeros(()))
+        self.number = torch.nn.Parameter(torch.zeros(()))
+        self.layer = torch.nn.Linear(1, 1)
+
+    def _surrogates(self, tensordict, log_weight):
+        self.calls = self.calls + 1
+        own = (self.number - self.layer(torch.ones(1)).sum() - 1).square()
+        said = {"loss_own": own, "calls": self.calls.clone(), "number": self.number.detach()}
+        return super()._surrogates(tensordict, log_weight) | said
+
+
+class RememberingPPO(_Remembering, PPOLagrangianLoss):
+    extra_out_keys = ("clip_fraction", *_Remembering.extra_out_keys)
+
+
+class RememberingTRPO(_Remembering, TRPOLagrangianLoss):
+    pass
+
+
+@pytest.fixture(autouse=True)
+def _allowed(monkeypatch):
+    monkeypatch.setattr(targets, "_users_modules", {*targets._users_modules, __name__})
+
+
+def _trainer(folder, algo, loss, frames, *overrides):
+    config = point_mass_config(
+        *(f"algo={algo}", f"loss._target_={__name__}.{loss}", f"frames={frames}", *overrides),
+        minibatch_size=None if algo.startswith("trpo") else 40,
+    )
+    seed_everything(config.seed, 1)
+    return build_trainer(config, PointMass(config.num_envs, 20, config.seed), folder)
+
+
+@pytest.mark.parametrize(
+    ("algo", "loss"), [("ppo_lagrangian", "RememberingPPO"), ("trpo_lagrangian", "RememberingTRPO")]
+)
+def test_a_resumed_run_goes_on_with_it(tmp_path, algo, loss):
+    _trainer(tmp_path / "whole", algo, loss, 640).run()
+    _trainer(tmp_path / "parts", algo, loss, 320).run()
+    resumed = _trainer(tmp_path / "parts", algo, loss, 640)
+    assert resumed.resume()
+    resumed.run()
+    whole, parts = (read_table(tmp_path / name / "progress.csv") for name in ("whole", "parts"))
+    assert len(whole["steps"]) > 2
+    for column in ("policy_calls", "policy_number", "policy_loss_own", "episode_return"):
+        assert parts[column] == whole[column]
+
+
+def test_coefficients_are_those_of_the_run_that_goes_on(tmp_path):
+    given = ("ppo_lagrangian", "RememberingPPO")
+    _trainer(tmp_path, *given, 320).run()
+    resumed = _trainer(tmp_path, *given, 640, "loss.clip_epsilon=0.05", "loss.entropy_coeff=0.5")
+    assert resumed.resume()
+    loss = resumed.algorithm.policy_update.loss
+    assert (float(loss.clip_epsilon), float(loss.entropy_coeff)) == pytest.approx((0.05, 0.5))
+    assert loss.calls > 0
+
+
+@pytest.mark.parametrize("algo", ["ppo", "cpo", "focops", "cup", "ipo", "ppo_lagrangian"])
+def test_checkpoints_of_the_package_s_losses_have_no_part_for_it(tmp_path, algo):
+    config = point_mass_config(f"algo={algo}", minibatch_size=None if algo == "cpo" else 40)
+    trainer = build_trainer(config, PointMass(config.num_envs, 20, config.seed), tmp_path)
+    assert "losses" not in trainer.components()
