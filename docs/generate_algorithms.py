@@ -214,10 +214,11 @@ def _snippet(config: DictConfig, is_step: bool, constrained: bool) -> str:
     arguments_of_learn = "batch, mean_costs" if constrained else "batch"
     given_to_learn = "batch, mean_costs=torch.tensor([30.0])" if constrained else "batch"
     setting = "\n".join(lines)
-    return f"""import torch
-from tensordict import TensorDict
+    # the package first: it tells torch's threads not to spin
+    return f"""{imports}
 
-{imports}
+import torch
+from tensordict import TensorDict
 
 {setting}
 

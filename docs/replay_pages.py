@@ -91,11 +91,11 @@ def _imports(targets: set[str], is_cloning: bool) -> str:
     )
 
 
-_LOOP = """import torch
+_LOOP = """{imports}
+
+import torch
 from tensordict import TensorDict
 from torchrl.data import {bounded}LazyTensorStorage, TensorDictReplayBuffer{soft_update}
-
-{imports}
 
 {limits}actor = {actor}
 {own}

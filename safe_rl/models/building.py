@@ -126,7 +126,8 @@ def _body(
         shapes = ", ".join(f"{entry.name} {list(entry.shape)}" for entry in observed.entries)
         raise ValueError(
             f"This environment observes {shapes}, and model=mlp takes one vector: use model=dict, "
-            "which has an encoder for each, or make the environment flatten them."
+            "which has an encoder for each, or make the environment flatten them: with "
+            "env.observation_flatten=true in Safety Gym, else with env.flatten=true."
         )
     if observed.encoders is not None or remembered:
         plain = observed._replace(encoders=observed.encoders or _AS_IT_IS)
