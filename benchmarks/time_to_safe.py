@@ -1,6 +1,6 @@
 r"""Seconds of training and testing until the first policy that is good and surely safe.
 
-After an epoch whose estimates keep every limit and whose last three returns reach the target, the
+After an epoch by which the last three on average keep every limit and reach the target return, the
 policy is tested on fresh episodes: it passes if its mean return reaches the target and the upper
 confidence bound of every J_c is within its limit. All tests of a run share one level (Bonferroni),
 so that passing means something however often it was tried. Seconds are those of training and of
@@ -22,16 +22,15 @@ from omegaconf import OmegaConf
 from train_throughput import compose_config, new_env
 
 from safe_rl.evaluation import collect_episodes
-from safe_rl.runs.outcome import keeps
+from safe_rl.runs.outcome import feasible_return
 from safe_rl.scores.certificate import Claim
 from safe_rl.training.trainer import build_trainer, seed_everything
 
 
 def is_promising(rows, limits, target):
     """Whether a test is worth its time after these rows of the table."""
-    recent = [row["episode_return"] for row in rows[-3:]]
-    is_safe = all(keeps(rows[-1], key, limit) for key, limit in limits.items())
-    return is_safe and len(recent) == 3 and sum(recent) / 3 >= target
+    mean = feasible_return(rows[-3:], limits)
+    return len(rows) >= 3 and mean is not None and mean >= target
 
 
 def passes(config, policy, claim, options, number):
