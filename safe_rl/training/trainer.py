@@ -250,6 +250,8 @@ class Trainer:
             if not self.progress.epoch:
                 self._checkpoints.begin()
             self._candidates.go_on_after(self.folder.rows())
+            # a shorter run that had come to its end has judged them by fewer epochs
+            self._checkpoints.forget_best(self._candidates.waiting)
             while self.progress.steps < self._frames and not stop.received:
                 row = self.epoch(batches)
                 self.folder.record(row)
@@ -257,11 +259,12 @@ class Trainer:
                 if time.monotonic() - saved_at > self._checkpoint_interval:
                     self._save()
                     saved_at = time.monotonic()
-            self._save()
             if self.progress.steps < self._frames:
                 self.interrupted_by = stop.received
             else:
+                # before the last checkpoint: with that, nobody would come back to them
                 self._keep(self._candidates.judge_all())
+            self._save()
 
     def batches(self) -> Iterator[TensorDictBase]:
         """Rollouts [N, T] of the present policy, without end."""
