@@ -151,13 +151,15 @@ class Trainer:
         )
 
     def _find_candidates(self, over: int, limits: Mapping[str, float]) -> Candidates:
-        rows = self._env.batch_size.numel()
+        steps = self._frames_per_batch / self._env.batch_size.numel()
+        # a batch that is collected ahead is of the policy before
+        behind = getattr(self._collector, "updates_behind", 0)
         return Candidates(
             # what a policy remembers fills gigabytes: the last checkpoints alone have it
             {name: part for name, part in self._parts().items() if name != "memory"},
             limits,
             over=over,
-            delay=epochs_until_judged(over, self.episode_length, self._frames_per_batch / rows),
+            delay=behind + epochs_until_judged(over, self.episode_length, steps),
         )
 
     def components(self) -> dict[str, Stateful]:
