@@ -9,14 +9,16 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from safe_rl.algorithms.losses import ESTIMATOR
+
 __all__ = ["LossState"]
 
 
 class LossState:
     """Buffers and parameters of losses that no network and no multiplier holds.
 
-    Coefficients that TorchRL schedules (``register_coeff_buffer``) are settings, and left out: a
-    run that goes on may be given others.
+    Coefficients that TorchRL schedules (``register_coeff_buffer``) and numbers of its value
+    estimators are settings, and left out: a run that goes on may be given others.
 
     Args:
         update: What moves the policy: an update with a ``loss``, or `UpdatesInTurn`. Losses that
@@ -57,7 +59,7 @@ class LossState:
             f"{place}.{name}": tensor
             for place, loss in self._losses
             for name, tensor in _tensors(loss)
-            if tensor.data_ptr() not in known and name not in _coefficients(loss)
+            if tensor.data_ptr() not in known and not _is_setting(name, loss)
         }
 
 
@@ -74,7 +76,7 @@ def _tensors(module: nn.Module) -> Iterator[tuple[str, Tensor]]:
     return chain(module.named_parameters(), module.named_buffers())
 
 
-def _coefficients(loss: nn.Module) -> set[str]:
-    """What TorchRL's schedulers may set, of all classes that the loss inherits from."""
+def _is_setting(name: str, loss: nn.Module) -> bool:
+    """Whether TorchRL schedules it, by any class of the loss, or it is an estimator's."""
     declared = (getattr(kind, "_schedulable_buffers", ()) for kind in type(loss).__mro__)
-    return set(chain.from_iterable(declared))
+    return name.startswith(ESTIMATOR) or name in chain.from_iterable(declared)

@@ -9,7 +9,10 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
-__all__ = ["divergence", "sum_of_losses"]
+__all__ = ["ESTIMATOR", "divergence", "sum_of_losses"]
+
+ESTIMATOR = "_value_estimator."
+"""Where losses keep numbers of their value estimators, which a run that is resumed may change."""
 
 _PREFIX = "loss_"
 

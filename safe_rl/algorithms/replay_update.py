@@ -12,13 +12,10 @@ from torch import Tensor, nn
 from torch.optim import Optimizer
 from torchrl.objectives import LossModule, SoftUpdate
 
-from safe_rl.algorithms.losses import divergence, sum_of_losses
+from safe_rl.algorithms.losses import ESTIMATOR, divergence, sum_of_losses
 from safe_rl.algorithms.memory import Memory
 
 __all__ = ["ReplayUpdate"]
-
-_SETTINGS = "_value_estimator."
-"""Where losses keep numbers of their value estimators, which a run that is resumed may change."""
 
 
 class ReplayUpdate:
@@ -139,7 +136,7 @@ class ReplayUpdate:
     def _tensors(self) -> Iterator[tuple[str, Tensor]]:
         """What the loss has come to hold, by name."""
         named = chain(self.loss.named_parameters(), self.loss.named_buffers())
-        return ((name, tensor) for name, tensor in named if not name.startswith(_SETTINGS))
+        return ((name, tensor) for name, tensor in named if not name.startswith(ESTIMATOR))
 
     def state_dict(self) -> dict[str, Any]:
         """Optimiser, target networks and whatever else the loss holds."""

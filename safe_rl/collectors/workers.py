@@ -72,6 +72,11 @@ class WorkerCollector:
         self._refresh = refresh
         self._looks = 0
 
+    @property
+    def updates_behind(self) -> int:
+        """Updates of the policy that a batch comes too early for: 1 if it is collected ahead."""
+        return int(self._refresh is not None)
+
     def __iter__(self) -> Iterator[TensorDictBase]:
         """Start the workers and collect without end.
 

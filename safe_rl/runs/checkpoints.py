@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import shutil
 import warnings
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -129,6 +129,11 @@ class CheckpointStore:
         for worse in others[self._keep_best - 1 :]:
             worse.unlink()
         return True
+
+    def forget_best(self, steps: Iterable[int]) -> None:
+        """Remove the best checkpoints, if any, of so many environment steps."""
+        for number in steps:
+            (self.best / checkpoint_name(number)).unlink(missing_ok=True)
 
     def _write(
         self, directory: Path, steps: int, facts: Mapping[str, Any] | None, saver: Checkpoint

@@ -101,14 +101,21 @@ class Candidates:
         self._latest.append(row)
         states = {name: copy.deepcopy(part.state_dict()) for name, part in self._components.items()}
         self._waiting.append({"steps": row["steps"], "epoch": row["epoch"], "states": states})
-        return self._judge() if len(self._waiting) > self._delay else []
+        return self._judge(self._waiting.popleft()) if len(self._waiting) > self._delay else []
+
+    @property
+    def waiting(self) -> list[int]:
+        """Environment steps after which those that wait were the run's policies."""
+        return [policy["steps"] for policy in self._waiting]
 
     def judge_all(self) -> list[Judged]:
-        """Judge those that still wait by the epochs that there are: none come after them."""
-        return [one for _ in range(len(self._waiting)) for one in self._judge()]
+        """Judge those that wait by the epochs that there are: so far, none come after them.
 
-    def _judge(self) -> list[Judged]:
-        policy = self._waiting.popleft()
+        They go on waiting: a run that is trained on has later epochs to judge them by.
+        """
+        return [one for policy in self._waiting for one in self._judge(policy)]
+
+    def _judge(self, policy: Mapping[str, Any]) -> list[Judged]:
         score = feasible_return(self._latest, self._limits)
         if score is None:
             return []

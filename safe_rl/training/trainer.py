@@ -151,13 +151,15 @@ class Trainer:
         )
 
     def _find_candidates(self, over: int, limits: Mapping[str, float]) -> Candidates:
-        rows = self._env.batch_size.numel()
+        steps = self._frames_per_batch / self._env.batch_size.numel()
+        # a batch that is collected ahead is of the policy before
+        behind = getattr(self._collector, "updates_behind", 0)
         return Candidates(
             # what a policy remembers fills gigabytes: the last checkpoints alone have it
             {name: part for name, part in self._parts().items() if name != "memory"},
             limits,
             over=over,
-            delay=epochs_until_judged(over, self.episode_length, self._frames_per_batch / rows),
+            delay=behind + epochs_until_judged(over, self.episode_length, steps),
         )
 
     def components(self) -> dict[str, Stateful]:
@@ -250,6 +252,8 @@ class Trainer:
             if not self.progress.epoch:
                 self._checkpoints.begin()
             self._candidates.go_on_after(self.folder.rows())
+            # a shorter run that had come to its end has judged them by fewer epochs
+            self._checkpoints.forget_best(self._candidates.waiting)
             while self.progress.steps < self._frames and not stop.received:
                 row = self.epoch(batches)
                 self.folder.record(row)
@@ -257,11 +261,12 @@ class Trainer:
                 if time.monotonic() - saved_at > self._checkpoint_interval:
                     self._save()
                     saved_at = time.monotonic()
-            self._save()
             if self.progress.steps < self._frames:
                 self.interrupted_by = stop.received
             else:
+                # before the last checkpoint: with that, nobody would come back to them
                 self._keep(self._candidates.judge_all())
+            self._save()
 
     def batches(self) -> Iterator[TensorDictBase]:
         """Rollouts [N, T] of the present policy, without end."""

@@ -31,6 +31,7 @@ def test_a_batch_is_of_the_policy_before_the_last_update():
     actor = make_actor_for(env)
     collector = make_process_collector(env, MAKE, BehaviourPolicy(actor), ahead=True, **NUMBERS)
     actor.load_state_dict(make_actor_for(env).state_dict())  # as a run does that is resumed
+    assert collector.updates_behind == 1
     batches = iter(collector)
     before = deepcopy(actor)  # what the batch is of
     kept = []

@@ -122,6 +122,13 @@ def test_a_cost_that_is_not_one_number_of_at_least_0_per_world_is_named(magnitud
         SafetyGymEnv({"robot_base": "point"}, num_envs=2, seed=0).rollout(1)
 
 
+def test_of_several_costs_below_0_the_first_is_named_with_its_own_number():
+    for key, number in (("cost_odd", -2.0), ("cost_odder", -3.0)):
+        register_cost(Cost(key, lambda c: True, lambda c, w, n=number: torch.full((2,), n)))
+    with pytest.raises(ConfigError, match=r"cost_odd must be 0 or more, got -2:"):
+        SafetyGymEnv({"robot_base": "point"}, num_envs=2, seed=0).rollout(1)
+
+
 def test_free_bodies_are_pushed_and_have_a_density():
     register_element(cube("crates", "crate", Motion.FREE), keys={"crates_density": 0.5})
     env = make({"crates_num": 1, "crates_rots": [0.3], "vases_num": 1, "task": "push"})

@@ -1,11 +1,17 @@
 """What a loss of one's own keeps from batch to batch is part of a checkpoint."""
 
+import types
+
 import pytest
 import torch
 from point_mass import PointMass
 from run_configs import point_mass_config
+from tensordict.nn import TensorDictModule
+from torchrl.objectives import A2CLoss, ClipPPOLoss, KLPENPPOLoss
 
 from safe_rl import targets
+from safe_rl.algorithms.loss_state import LossState
+from safe_rl.models import make_actor
 from safe_rl.objectives import PPOLagrangianLoss, TRPOLagrangianLoss
 from safe_rl.runs.table import read_table
 from safe_rl.training.trainer import build_trainer, seed_everything
@@ -74,6 +80,15 @@ def test_coefficients_are_those_of_the_run_that_goes_on(tmp_path):
     loss = resumed.algorithm.policy_update.loss
     assert (float(loss.clip_epsilon), float(loss.entropy_coeff)) == pytest.approx((0.05, 0.5))
     assert loss.calls > 0
+
+
+@pytest.mark.parametrize("kind", [A2CLoss, ClipPPOLoss, KLPENPPOLoss])
+def test_losses_of_torchrl_s_keep_no_settings_of_their_value_estimators(kind):
+    actor = make_actor(3, 2, hidden_sizes=[8], initial_log_std=-0.5)
+    critic = TensorDictModule(torch.nn.Linear(3, 1), ["observation"], ["state_value"])
+    loss = kind(actor, critic)
+    loss.make_value_estimator(gamma=0.9, lmbda=0.8)
+    assert not LossState(types.SimpleNamespace(loss=loss), besides=[actor, critic])
 
 
 @pytest.mark.parametrize("algo", ["ppo", "cpo", "focops", "cup", "ipo", "ppo_lagrangian"])

@@ -13,10 +13,13 @@ from run_configs import point_mass_config, without_times
 from torchrl.checkpoint import Checkpoint
 
 from safe_rl.objectives import PPOLagrangianLoss
+from safe_rl.runs.archive import read_facts
+from safe_rl.runs.checkpoints import CheckpointStore
+from safe_rl.runs.folder import checkpoints_in
 from safe_rl.runs.table import read_table
 from safe_rl.targets import allow
 from safe_rl.training.interrupts import StopRequest
-from safe_rl.training.trainer import build_trainer, seed_everything
+from safe_rl.training.trainer import Trainer, build_trainer, seed_everything
 
 allow("test_training")
 
@@ -114,6 +117,61 @@ def test_the_best_of_a_resumed_run_is_that_of_a_whole_one(tmp_path):
         for run in (whole, halves)
     ]
     assert names[0] == names[1]
+
+
+def best_of(folder):
+    """Scores of the best checkpoints by name."""
+    found = checkpoints_in(folder / "checkpoints/best")
+    return {path.name: read_facts(path)["score"] for path in found}
+
+
+def test_what_the_end_of_a_shorter_run_said_of_the_best_is_forgotten(tmp_path, monkeypatch):
+    learned = Trainer.epoch
+
+    def told(trainer, batches):
+        row = learned(trainer, batches)
+        cost = 20.0 if row["epoch"] <= 6 else 40.0
+        return row | {"episode_return": float(row["epoch"]), "episode_cost": cost}
+
+    monkeypatch.setattr(Trainer, "epoch", told)
+    options = ("algo=ppo", "cost_limits={cost: 25}", "checkpoint.best_over=3")
+    train(tmp_path / "whole", *options, "frames=1440")
+    train(tmp_path / "halves", *options, "frames=960")
+    # by the epochs until then the sixth policy keeps the limit, by its own it does not
+    assert max(best_of(tmp_path / "halves")) == "checkpoint-000000000960.torchrl"
+    resumed = make_trainer(tmp_path / "halves", *options, "frames=1440")
+    assert resumed.resume()
+    resumed.run()
+    expected = {f"checkpoint-{160 * epoch:012}.torchrl": epoch + 1.0 for epoch in range(1, 5)}
+    assert best_of(tmp_path / "halves") == best_of(tmp_path / "whole") == expected
+
+
+def test_a_policy_that_collects_an_epoch_later_is_judged_an_epoch_later(tmp_path):
+    row = {"epoch": 1, "steps": 160, "episode_return": 1.0, "episode_cost": 0.0}
+    epochs = {}
+    for collector in ("local", "ahead"):
+        config = point_mass_config("algo=ppo", f"collector={collector}")
+        env = PointMass(config.num_envs, 20, config.seed)
+        trainer = build_trainer(config, env, tmp_path / collector, PointMass)
+        candidates = trainer.components()["candidates"]
+        epochs[collector] = next(count for count in itertools.count(1) if candidates.add(row))
+        trainer.close()
+    assert epochs["ahead"] == epochs["local"] + 1
+
+
+def test_the_last_checkpoint_comes_after_the_best_ones(tmp_path, monkeypatch):
+    # a run that is killed in between is not finished, and resumes
+    found = []
+    save = CheckpointStore.save
+
+    def saved(store, *arguments):
+        found.append(best_of(tmp_path))
+        return save(store, *arguments)
+
+    monkeypatch.setattr(CheckpointStore, "save", saved)
+    train(tmp_path, "cost_limits={cost: 1000}")
+    assert found[-1]
+    assert found[-1] == best_of(tmp_path)
 
 
 def test_the_folder_of_a_run(tmp_path):

@@ -202,7 +202,12 @@ def compute_costs(config: SafetyGymConfig, world: World, failed: Tensor) -> Tens
         magnitudes = [torch.where(failed, 0.0, magnitude) for magnitude in magnitudes]
     exceptions = failed.to(torch.float64)  # the sum has this type, whatever a registered cost has
     costs = torch.stack([sum(magnitudes, start=exceptions), *magnitudes, exceptions])
-    if (costs < 0.0).any():
-        key = cost_keys(config)[1 + int((costs[1:] < 0.0).any(-1).nonzero()[0])]
-        raise ConfigError(f"{key} must be 0 or more, got {costs.min():.4g}: clamp(min=0) it.")
+    lowest = costs.amin(-1)
+    if (lowest < 0.0).any():
+        # after the sum, which may be lower still
+        number = 1 + int((lowest[1:] < 0.0).nonzero()[0])
+        raise ConfigError(
+            f"{cost_keys(config)[number]} must be 0 or more, got {lowest[number]:.4g}: "
+            "clamp(min=0) it."
+        )
     return costs.gt_(0.0) if config.constrain_indicator else costs
