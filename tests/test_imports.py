@@ -140,11 +140,11 @@ FLOORS = {
     ),
     "algorithms": (
         (
-            *("contract", "constraints", "learning_rate", "loss_state", "losses"),
+            *("contract", "constraints", "learning_rate", "losses"),
             "matrix_products",
             "prioritised",
         ),
-        ("trust_region_step",),
+        ("loss_state", "trust_region_step"),
         (
             *("c_trpo_step", "cpo_step", "crpo_step", "in_turn", "memory", "minibatch", "parts"),
             *("side_by_side", "tracked_constraints"),

@@ -32,6 +32,10 @@ from safe_rl.training.state import Progress, WorldSnapshot
 
 __all__ = ["Trainer", "build_trainer", "seed_everything"]
 
+# what only going on takes, which the last checkpoints have: several times what a policy is, and a
+# memory fills gigabytes
+_TO_GO_ON = {"memory", "policy_update", "critic_update", "env", "accounting", "rng"}
+
 
 def seed_everything(seed: int, num_threads: int | None) -> None:
     """Seed torch and set the number of threads it computes with; None leaves the number alone."""
@@ -155,8 +159,7 @@ class Trainer:
         # a batch that is collected ahead is of the policy before
         behind = getattr(self._collector, "updates_behind", 0)
         return Candidates(
-            # what a policy remembers fills gigabytes: the last checkpoints alone have it
-            {name: part for name, part in self._parts().items() if name != "memory"},
+            {name: part for name, part in self._parts().items() if name not in _TO_GO_ON},
             limits,
             over=over,
             delay=behind + epochs_until_judged(over, self.episode_length, steps),
