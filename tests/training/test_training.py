@@ -193,6 +193,13 @@ def test_the_folder_of_a_run(tmp_path):
         "score": pytest.approx(means[best]),
         "run": {"environment": "PointMass", "algorithm": "ppo_lagrangian", "seed": 0},
     }
+    # what acts, and not what going on takes
+    kept, last = (
+        set(Checkpoint.manifest(file)["components"])
+        for file in (path, max((tmp_path / "checkpoints" / "last").iterdir()))
+    )
+    assert {"actor", "critic", "cost_critic", "multiplier"} <= kept
+    assert last - kept >= {"policy_update", "critic_update", "env", "accounting", "rng"}
     assert line.startswith("J_r ")
     assert line.endswith(str(tmp_path))
 
