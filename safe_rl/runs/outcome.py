@@ -133,9 +133,8 @@ def feasible_return(
     mean = mean_row(latest)
     # a constrained algorithm says itself what it holds against the limits
     is_feasible = all(keeps(mean, key, limit) for key, limit in limits.items())
-    return (
-        mean["episode_return"] if is_feasible and not math.isnan(mean["episode_return"]) else None
-    )
+    score = mean["episode_return"]
+    return score if is_feasible and not math.isnan(score) else None
 
 
 def judges_another_measure(table: Mapping[str, Sequence[float]], key: str, limit: float) -> bool:
