@@ -12,7 +12,7 @@ from torchrl.envs.utils import check_env_specs
 
 from safe_rl.envs import ConfigError, SafetyGymEnv, from_gymnasium, store_configs
 from safe_rl.runs.table import read_table
-from safe_rl.training.trainer import build_trainer, seed_everything
+from safe_rl.training.building import build_trainer, seed_everything
 
 store_configs()
 
@@ -101,6 +101,31 @@ def test_a_cost_that_is_no_number_is_told_with_its_name(cost, num_envs):
     env = from_gymnasium(Odd, num_envs=num_envs, num_steps=4, cost_keys=["cost_odd"], seed=3)
     with pytest.raises(ConfigError, match=r"info\['cost_odd'\] must be one number per step"):
         env.rollout(2)
+
+
+class Toll(gymnasium.Env):
+    """A step costs what the seed says in a list, where the types are as they come."""
+
+    observation_space = gymnasium.spaces.Box(0, 9, (1,), np.float32)
+    action_space = gymnasium.spaces.Box(-1, 1, (1,), np.float32)
+    costs = (0, 0.5, np.True_, np.float32(0.25), True, np.int64(2))
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.cost = self.cost if seed is None else self.costs[seed % len(self.costs)]
+        return np.zeros(1, np.float32), {}
+
+    def step(self, action):
+        return np.zeros(1, np.float32), 0.0, False, False, {"cost": self.cost}
+
+
+@pytest.mark.parametrize("workers", [0, 2])
+def test_costs_of_rows_may_be_of_different_types(workers):
+    env = from_gymnasium(Toll, num_envs=6, num_steps=5, seed=0, workers=workers)
+    cost = env.rollout(2)["next", "cost"]
+    env.close()
+    assert cost[:, 0, 0].tolist() == [0.0, 0.5, 1.0, 0.25, 1.0, 2.0]
+    assert torch.equal(cost[:, 0], cost[:, 1])
 
 
 def test_a_cost_that_is_reported_where_it_occurs_is_nothing_to_tell():

@@ -319,6 +319,11 @@ def test_every_world_may_have_a_seed_of_its_own(keys):
         assert (again[0] != first[0]).any()
     with pytest.raises(ValueError, match="3 worlds need as many seeds, got 2"):
         envs.reset(seed=[1, 2])
+    as_array, _ = envs.reset(seed=np.array([3, 11, 2]))
+    np.testing.assert_array_equal(as_array, envs.reset(seed=[3, 11, 2])[0])
+    for wrong in (2.5, "3"):
+        with pytest.raises(TypeError, match="A seed is an integer, or one for every world"):
+            envs.reset(seed=wrong)
 
 
 def envs_of(make, num_envs):

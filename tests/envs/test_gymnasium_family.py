@@ -158,6 +158,12 @@ def test_workers_without_a_state_to_go_on_from_have_rows_of_their_own():
         ({"id": "Cliff-v0", "cost_keys": None}, "that are arrays.*flatten=true"),
         ({"kwargs": {"nested": True}, "workers": 2}, "use workers=0"),
         ({"kwargs": {"speed": 3}}, "Walk-v0.*speed"),
+        ({"kwargs": 3, "num_steps": 5}, "'kwargs' must be arguments by name"),
+        ({"cost_keys": "fast", "num_steps": 5}, "'cost_keys' must be a list of names.*'fast'"),
+        ({"cost_keys": []}, "'cost_keys' is empty"),
+        ({"cost_keys": ["fast", "reward"]}, "'reward' is none of them"),
+        ({"flatten": "ture"}, "'flatten' must be true or false"),
+        ({"outside": {"cost_x": [float("inf"), 0, 1]}}, "'outside' must be as"),
     ],
 )
 def test_what_cannot_be_made_is_said(keys, message):

@@ -182,6 +182,8 @@ def test_pictures_come_from_either_python(elsewhere, monkeypatch):
         ({"border": 3}, "no key 'border'.*env.kwargs"),
         ({"kwargs": {"speed": 3}}, "SafetyIce1-v0.*speed"),
         ({"workers": -1}, "'workers' must be an integer of at least 0"),
+        ({"kwargs": 3}, "'kwargs' must be arguments by name"),
+        ({"cost_keys": "cost"}, "'cost_keys' must be a list of names"),
         ({"num_steps": 0}, "'num_steps' must be an integer of at least 1"),
     ],
 )

@@ -19,6 +19,7 @@ def test_ids_make_what_gymnasium_checks(name):
     check_env(env.unwrapped, skip_render_check=True)
     assert env.spec.max_episode_steps == 1000
     theirs = gymnasium.make(env.unwrapped.robot._robot.gymnasium_id)
+    assert env.metadata["render_fps"] == theirs.unwrapped.metadata["render_fps"]
     assert env.observation_space.shape == theirs.observation_space.shape
     assert np.array_equal(env.action_space.low, theirs.action_space.low)
     assert np.array_equal(env.action_space.high, theirs.action_space.high)

@@ -17,11 +17,13 @@ from torchrl.envs import GymWrapper, Transform, TransformedEnv
 
 from safe_rl.envs.cost_specs import cost_spec
 from safe_rl.envs.costs import COST, is_cost
+from safe_rl.envs.errors import require_names
 from safe_rl.envs.gymnasium.adapting import adapt, check_workers, columns_of
 from safe_rl.envs.gymnasium.processes import ProcessVectorEnv
-from safe_rl.envs.gymnasium.reading import CostReader
+from safe_rl.envs.gymnasium.reading import CostReader, FloatCosts
 
 MakeEnv = Callable[[], gymnasium.Env]
+_NO_COSTS = {"observation", "action", "reward", "done", "terminated", "truncated"}
 
 
 class CostsAsRewards(Transform):
@@ -162,9 +164,11 @@ def from_gymnasium(
         >>> env.rollout(3)["next", "cost_hazards"].shape
         torch.Size([2, 3, 1])
     """
+    require_names("cost_keys", cost_keys)
     make: MakeEnv = partial(gymnasium.make, env, **kwargs) if isinstance(env, str) else env
     keys, length = describe(make, cost_keys, num_steps, flatten)
-    make_adapted = partial(_make_adapted, make, length, flatten)
+    _check_keys(keys)
+    make_adapted = partial(_make_adapted, make, length, flatten, keys)
     worlds: VectorEnv
     if workers and not current_process().daemon:
         if not flatten:
@@ -213,7 +217,7 @@ def describe(
     probe = make()
     try:
         adapted = adapt(probe, flatten=flatten)
-        keys = list(cost_keys) if cost_keys is not None else _find_costs(adapted)
+        keys = _find_costs(adapted) if cost_keys is None else [*dict.fromkeys(cost_keys)]
         return keys, _episode_length(adapted, num_steps)
     finally:
         probe.close()
@@ -225,8 +229,10 @@ def _spec_of_sum(specs: Sequence[TensorSpec]) -> TensorSpec:
     return cost_spec(sum(highest) if is_known else None, specs[0].shape, specs[0].device)
 
 
-def _make_adapted(make: MakeEnv, num_steps: int, flatten: bool) -> gymnasium.Env:
-    return adapt(make(), num_steps, flatten=flatten)
+def _make_adapted(
+    make: MakeEnv, num_steps: int, flatten: bool, cost_keys: Sequence[str]
+) -> gymnasium.Env:
+    return FloatCosts(adapt(make(), num_steps, flatten=flatten), cost_keys)
 
 
 def _fit(picture: np.ndarray, width: int, height: int) -> np.ndarray:
@@ -238,6 +244,13 @@ def _fit(picture: np.ndarray, width: int, height: int) -> np.ndarray:
     canvas = np.zeros((height, width, 3), dtype=np.uint8)
     canvas[: len(lines), : len(columns)] = picture[lines[:, None], columns]
     return canvas
+
+
+def _check_keys(keys: Sequence[str]) -> None:
+    if not keys:
+        raise ValueError("'cost_keys' is empty: name costs in info, or leave it away (null).")
+    for key in _NO_COSTS.intersection(keys):
+        raise ValueError(f"'cost_keys' are names of numbers in info, and '{key}' is none of them.")
 
 
 def _find_costs(probe: gymnasium.Env) -> list[str]:

@@ -12,7 +12,14 @@ from typing import Any
 
 import gymnasium
 
-from safe_rl.envs.errors import ConfigError, nearest, require_integer
+from safe_rl.envs.errors import (
+    ConfigError,
+    nearest,
+    require_boolean,
+    require_integer,
+    require_mapping,
+    require_names,
+)
 from safe_rl.envs.gymnasium.outside import CostsOutside, Ranges, check_outside
 
 GYMNASIUM_TARGET = "safe_rl.envs.gymnasium.make_gymnasium"
@@ -38,6 +45,9 @@ def complete_gymnasium(node: Mapping[str, Any]) -> dict[str, Any]:
     defaults |= {"render_mode": None}
     full = {**defaults, **node}
     require_integer("workers", full["workers"], lowest=0)
+    require_boolean("flatten", full["flatten"])
+    require_mapping("kwargs", full["kwargs"])
+    require_names("cost_keys", full["cost_keys"])
     if full["outside"] is not None:
         check_outside(full["outside"])
     if full["num_steps"] is not None:

@@ -69,6 +69,6 @@ def check_outside(outside: Any) -> None:
         raise ConfigError(f"'outside' must be as {form}; got {outside!r}.")
     for key, row in outside.items():
         numbers = isinstance(row, Sequence) and all(isinstance(x, int | float) for x in row)
-        if not numbers or len(row) != 3 or row[0] != int(row[0]) or row[0] < 0:
+        if not numbers or len(row) != 3 or row[0] % 1 or row[0] < 0:
             raise ConfigError(f"'outside' must be as {form}; got {key}: {row!r}.")
         check_range(key, row[1], row[2])

@@ -8,6 +8,7 @@ import warnings
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+import gymnasium
 import numpy as np
 import torch
 from tensordict import TensorDictBase
@@ -18,7 +19,41 @@ from torchrl.envs.gym_like import BaseInfoDictReader
 from safe_rl.envs.cost_specs import cost_spec
 from safe_rl.envs.errors import ConfigError, nearest
 
-__all__ = ["CostReader"]
+__all__ = ["CostReader", "FloatCosts"]
+
+
+class FloatCosts(gymnasium.Wrapper):
+    """Makes costs in `info` floats.
+
+    Gymnasium puts those of a batch into an array of the type that the first row reports: beside an
+    integer 0 all costs would be rounded down, and booleans of NumPy's would be no numbers at all.
+
+    Args:
+        env: the environment.
+        cost_keys: names in `info`; what is no single number stays as it is.
+
+    Examples:
+        >>> class Push(gymnasium.Env):
+        ...     def step(self, action):
+        ...         return 0, 0.0, False, False, {"cost": 0, "pushes": 3}
+        >>> FloatCosts(Push(), ["cost"]).step(None)[-1]
+        {'cost': 0.0, 'pushes': 3}
+    """
+
+    def __init__(self, env: gymnasium.Env, cost_keys: Sequence[str]) -> None:
+        super().__init__(env)
+        self._cost_keys = list(cost_keys)
+
+    def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
+        """Step, and convert what is reported."""
+        observation, reward, terminated, truncated, info = self.env.step(action)
+        costs = {
+            key: float(info[key])
+            for key in self._cost_keys
+            if isinstance(info.get(key), bool | int | float | np.generic)
+            and not isinstance(info[key], np.flexible)
+        }
+        return observation, reward, terminated, truncated, {**info, **costs}
 
 
 class CostReader(BaseInfoDictReader):

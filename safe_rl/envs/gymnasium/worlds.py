@@ -24,7 +24,7 @@ RENDER_MODES = ("human", "rgb_array")
 NUM_SEEDS = 2**62
 
 Observation = np.ndarray | dict[str, np.ndarray]
-Seeds = int | Sequence[int | None] | None
+Seeds = int | Sequence[int | None] | np.ndarray | None
 Arrays = dict[str, np.ndarray]
 
 
@@ -142,8 +142,13 @@ class Worlds:
         """Seed all episodes to come; without a seed, once, with one that is drawn.
 
         Raises:
+            TypeError: for what is neither a seed nor a sequence of seeds.
             ValueError: for a sequence with another length than the number of worlds.
         """
+        if isinstance(seed, np.ndarray):
+            seed = seed.tolist()
+        if isinstance(seed, str) or not isinstance(seed, int | np.integer | Sequence | None):
+            raise TypeError(f"A seed is an integer, or one for every world, got {seed!r}.")
         if isinstance(seed, int | np.integer):
             self.env.set_seed(int(seed) % NUM_SEEDS)
         elif not self._is_seeded:

@@ -6,7 +6,13 @@ from collections.abc import Mapping
 from typing import Any
 
 from safe_rl.envs.costs import COST
-from safe_rl.envs.errors import ConfigError, nearest, require_integer
+from safe_rl.envs.errors import (
+    ConfigError,
+    nearest,
+    require_integer,
+    require_mapping,
+    require_names,
+)
 
 SAFETY_GYMNASIUM_TARGET = "safe_rl.envs.safety_gymnasium.make_safety_gymnasium"
 DEFAULTS: dict[str, Any] = {
@@ -32,6 +38,8 @@ def complete_safety_gymnasium(node: Mapping[str, Any]) -> dict[str, Any]:
         raise ConfigError("Which environment? env.id=SafetyPointGoal1-v0, for example.")
     full = {"name": node["id"], **DEFAULTS, **node}
     require_integer("workers", full["workers"], lowest=0)
+    require_mapping("kwargs", full["kwargs"])
+    require_names("cost_keys", full["cost_keys"])
     if full["num_steps"] is not None:
         require_integer("num_steps", full["num_steps"], lowest=1)
     if None in (full["cost_keys"], full["num_steps"]):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import torch
@@ -13,7 +13,12 @@ from torchrl.envs.transforms import Transform
 from safe_rl.envs.errors import ConfigError
 from safe_rl.envs.rng import spread_seed
 from safe_rl.envs.torchrl.batching import make_batch
-from safe_rl.envs.torchrl.costing import CostsBesideRewards, StepCosts, cost_function
+from safe_rl.envs.torchrl.costing import (
+    CostsBesideRewards,
+    StepCosts,
+    cost_function,
+    entry_key,
+)
 from safe_rl.envs.torchrl.nodes import complete_torchrl
 from safe_rl.envs.torchrl.observing import Observe, choose_entries
 
@@ -32,6 +37,7 @@ class TorchRLEnv(TransformedEnv):
 
     def __init__(self, base_env: EnvBase, config: Mapping[str, Any]) -> None:
         costs = StepCosts(config["cost_keys"], config["outside"], cost_function(config))
+        _check_entries(base_env, costs.entries)
         # only a step tells what a function of one's own returns
         names = list(costs(base_env.rand_step(base_env.reset())))
         beside = CostsBesideRewards(costs, names)
@@ -75,6 +81,17 @@ def make_torchrl(
     env = TorchRLEnv(make_batch(config, num_envs).to(torch.device(device)), config)
     env.set_seed(int(torch.randint(2**31, ())) if seed is None else spread_seed(seed))
     return env
+
+
+def _check_entries(env: EnvBase, names: Sequence[str]) -> None:
+    """Refuse costs that a step cannot do without: what is a cost is nothing else any more."""
+    needed = [env.full_state_spec, env.full_action_spec, env.full_reward_spec, env.full_done_spec]
+    for name in names:
+        if any(entry_key(name) in spec.keys(True, True) for spec in needed):
+            raise ConfigError(
+                f"env.cost_keys: '{name}' is a state, an action, a reward or an end, and stays "
+                "one. Make a cost of it by env.outside, or by a function of yours (env.cost)."
+            )
 
 
 def _observe(env: EnvBase, config: Mapping[str, Any]) -> Observe:

@@ -9,7 +9,14 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from safe_rl.envs.errors import ConfigError, nearest, require_integer
+from safe_rl.envs.errors import (
+    ConfigError,
+    nearest,
+    require_boolean,
+    require_integer,
+    require_mapping,
+    require_names,
+)
 from safe_rl.envs.torchrl.outside import parse_outside
 from safe_rl.envs.torchrl.rows import ROWS
 
@@ -62,10 +69,9 @@ def _check(node: Mapping[str, Any]) -> None:
     if node["num_steps"] is not None:
         require_integer("num_steps", node["num_steps"], lowest=1)
     for key in ("observe", "cost_keys"):
-        value = node[key]
-        is_list = isinstance(value, list | tuple) and all(isinstance(name, str) for name in value)
-        if value is not None and not is_list:
-            raise ConfigError(f"'{key}' must be a list of entries, as [th, thdot]; got {value!r}.")
+        require_names(key, node[key])
+    require_boolean("flatten", node["flatten"])
+    require_mapping("kwargs", node["kwargs"])
     if node["outside"] is not None:
         parse_outside(node["outside"])
     name = (node["kwargs"] or {}).get("env_name")

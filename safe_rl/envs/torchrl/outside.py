@@ -49,7 +49,7 @@ def _range(key: Any, row: Any) -> Range:
     if not isinstance(row, list | tuple) or len(row) not in (3, 4) or not isinstance(row[0], str):
         raise ConfigError(f"'outside' must be as {_FORM}; got {key}: {row!r}.")
     column, low, high = (0, *row[1:]) if len(row) == 3 else row[1:]
-    if not all(map(_is_number, (column, low, high))) or column != int(column) or column < 0:
+    if not all(map(_is_number, (column, low, high))) or column % 1 or column < 0:
         raise ConfigError(f"'outside' must be as {_FORM}; got {key}: {row!r}.")
     check_range(key, low, high)
     return Range(row[0], int(column), low, high)
