@@ -1,5 +1,6 @@
 """Robots by the path of an MJCF file: what works, and what an unusable file is told."""
 
+import copy
 import math
 
 import numpy as np
@@ -290,3 +291,34 @@ def test_so_is_one_that_it_includes(make, tmp_path):
     part.write_text('<mujoco><worldbody><replicate count="1000000"/></worldbody></mujoco>')
     with pytest.raises(ConfigError, match=r"'robot_base'.*robot\.xml.*elements"):
         make(changed(DISC, default, '<include file="part.xml"/>'))
+
+
+SLOW_MOTOR = {
+    "filter": ("general", 'dyntype="filter" dynprm="0.5"'),
+    "delay": ("motor", 'delay="0.05" nsample="30"'),
+}
+
+
+@pytest.mark.parametrize("kind", SLOW_MOTOR)
+def test_what_actuators_remember_is_part_of_a_state(make, kind):
+    tag, keys = SLOW_MOTOR[kind]
+    drive = '<motor name="drive"'
+    assert drive in DISC
+    env = make(DISC.replace(drive, f'<{tag} {keys} name="drive"'), sensors_obs=["speed"])
+    idle = torch.zeros(2, 3)
+    here = env.reset()
+    for _ in range(10):
+        here = env.step(here.set("action", torch.ones(2, 3)))["next"]
+    state, twin = env.get_state(), copy.deepcopy(env)
+    if kind == "filter":  # 100 substeps of Euler's
+        remembered = torch.full((2,), 1 - (1 - 0.004 / 0.5) ** 100, dtype=torch.float64)
+        torch.testing.assert_close(state["act"][:, 0], remembered)
+    onward = env.step(here.clone().set("action", idle))["next", "observation"]
+    assert torch.equal(twin.step(here.clone().set("action", idle))["next", "observation"], onward)
+    env.set_state(state)
+    assert torch.equal(env.step(here.clone().set("action", idle))["next", "observation"], onward)
+    forgetful = state.exclude("act", "history")  # of a run before they were part of it
+    env.set_state(forgetful)
+    assert not torch.equal(
+        env.step(here.clone().set("action", idle))["next", "observation"], onward
+    )

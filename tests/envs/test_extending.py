@@ -114,12 +114,41 @@ def test_contacts_that_nothing_counts_are_an_error_that_says_so():
         (lambda c, w: 1.0, r"cost_odd .*\[2\], got a float"),
         (lambda c, w: w.robot_xy[:, 0].numpy(), r"cost_odd .*\[2\], got a ndarray"),
         (lambda c, w: torch.tensor([0.5, -2.0]), "cost_odd must be 0 or more, got -2"),
+        (lambda c, w: torch.tensor([0.5, math.nan]), "cost_odd must be 0 or more, got nan: give"),
     ],
 )
 def test_a_cost_that_is_not_one_number_of_at_least_0_per_world_is_named(magnitude, told):
     register_cost(Cost("cost_odd", lambda c: True, magnitude))
     with pytest.raises(ConfigError, match=told):
         SafetyGymEnv({"robot_base": "point"}, num_envs=2, seed=0).rollout(1)
+
+
+@pytest.mark.parametrize(
+    ("task", "told"),
+    [
+        (Task(lambda c, w, b, n: w.robot_pos[:, :1]), r"'reward' .*\[2\], got \[2, 1\]"),
+        (Task(lambda c, w, b, n: 1.0), r"'reward' .*\[2\], got a float"),
+        (
+            Task(lambda c, w, b, n: n[:, 0], met=lambda c, w, n: n > 0, elements=("goal",),
+                 measure=lambda w: w.robot_pos[:, :1]),
+            r"'met' .*\[2\], got \[2, 1\]",
+        ),
+    ],
+)  # fmt: skip
+def test_a_task_that_does_not_say_one_value_per_world_is_named(task, told):
+    register_task("odd", task)
+    with pytest.raises(ConfigError, match=rf"{told}"):
+        SafetyGymEnv({**POINT, "task": "odd"}, num_envs=2, seed=0).rollout(1)
+
+
+@pytest.mark.parametrize("given", [2, 3, None])
+def test_an_observation_of_another_width_than_it_says_is_named(given):
+    read = (lambda w: w.robot_pos[:, 2]) if given is None else (lambda w: w.qpos[:, :given])
+    size = 3 if given == 2 else 1
+    register_observation(Reading("odd", lambda c: True, lambda c, scene: size, read))
+    wanted = rf"'odd' .*\[2, {size}\].*got \[2{'' if given is None else f', {given}'}\]"
+    with pytest.raises(ConfigError, match=wanted):
+        SafetyGymEnv(POINT, num_envs=2, seed=0).reset()
 
 
 def test_of_several_costs_below_0_the_first_is_named_with_its_own_number():
@@ -320,3 +349,15 @@ def test_registering_again_replaces_the_row():
     assert env.object_names == ("hazard0", "bomb0", "bomb1")
     result = step_from(env, arrange(env, robot=(0, 0), bomb0=(0.3, 0), bomb1=(5, 5)), 0.0, 0.0)
     assert float(result["cost_mines"]) == 7.0 * 2.5
+
+
+def test_environments_made_before_keep_the_costs_and_the_task_that_they_were_made_with():
+    register_cost(Cost("cost_steady", lambda c: True, lambda c, w: torch.full((1,), 2.0)))
+    register_task("steady", Task(lambda c, w, b, n: torch.full((1,), 3.0)))
+    env = make({"task": "steady", "constrain_indicator": False})
+    register_cost(Cost("cost_steady", lambda c: True, lambda c, w: torch.full((1,), 5.0)))
+    register_cost(Cost("cost_newer", lambda c: True, lambda c, w: torch.full((1,), 7.0)))
+    register_task("steady", Task(lambda c, w, b, n: torch.full((1,), 9.0)))
+    result = step_from(env, env.get_state(), 0.0, 0.0)
+    assert [float(result[key]) for key in ("cost", "cost_steady", "reward")] == [2.0, 2.0, 3.0]
+    assert "cost_newer" not in result

@@ -190,3 +190,10 @@ def test_no_task_no_reward():
     for _, got, _ in walk(env, 5):
         assert not got["reward"].any()
         assert not got["goal_met"].any()
+
+
+def test_the_very_centre_of_the_circle_is_no_motion_about_it():
+    centre, velocity = torch.zeros(1, 2).double(), torch.tensor([[1.0, -2.0]]).double()
+    assert circle_speed(centre, velocity, 1.5).tolist() == [0.0]
+    near = torch.tensor([[1e-9, 0.0]]).double()  # all of the speed across, less the distance
+    torch.testing.assert_close(circle_speed(near, velocity, 1.5), torch.tensor([-2 / 2.5]).double())

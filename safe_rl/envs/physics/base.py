@@ -24,6 +24,8 @@ class Physics(Protocol):
     ctrl: Tensor  # [N, nu]
     mocap_pos: Tensor  # [N, nmocap, 3] m
     mocap_quat: Tensor  # [N, nmocap, 4]
+    # of actuators and sensors that remember: `act` [N, na], `history` [N, nhistory]; else empty
+    memory: Mapping[str, Tensor]
     # outputs
     xpos: Tensor  # [N, nbody, 3] m
     xmat: Tensor  # [N, nbody, 3, 3]

@@ -13,6 +13,7 @@ from mujoco.batch import Batch
 from torch import Tensor
 
 _STATE = ("time", "qpos", "qvel", "qacc_warmstart", "ctrl", "mocap_pos", "mocap_quat")
+_MEMORY = ("act", "history")
 _OUTPUTS = ("xpos", "xmat", "sensordata", "subtree_com")
 _PATH_INPUTS = int(mujoco.mjtState.mjSTATE_CTRL) | int(mujoco.mjtState.mjSTATE_MOCAP_POS)
 _NO_SENSORS = int(mujoco.mjtDisableBit.mjDSBL_SENSOR)
@@ -72,6 +73,9 @@ class BatchPhysics:
         self._batch = Batch(model, num_envs, num_threads, persistent=sleeps)
         # Every field is bound before the first call: later ones would be zero until the next.
         state = {name: _share(self._batch.bind(name)) for name in _STATE}
+        sizes = dict(zip(_MEMORY, (model.na, model.nhistory), strict=True))
+        remembered = [name for name in _MEMORY if sizes[name]]
+        self.memory: Mapping[str, Tensor] = {n: _share(self._batch.bind(n)) for n in remembered}
         read = {name: _share(self._batch.bind(name)) for name in outputs}
         if "xmat" in read:
             read["xmat"] = read["xmat"].view(num_envs, model.nbody, 3, 3)

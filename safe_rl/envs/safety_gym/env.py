@@ -19,8 +19,8 @@ from safe_rl.envs.safety_gym.observing.observations import make_observer
 from safe_rl.envs.safety_gym.records.config import SafetyGymConfig
 from safe_rl.envs.safety_gym.rendering.display import Camera
 from safe_rl.envs.safety_gym.rendering.renderer import WorldRenderer
-from safe_rl.envs.safety_gym.rules.costs import compute_costs, cost_keys
-from safe_rl.envs.safety_gym.rules.tasks import TASKS, dense_reward
+from safe_rl.envs.safety_gym.rules.costs import active_costs, compute_costs, cost_keys
+from safe_rl.envs.safety_gym.rules.tasks import TASKS, dense_reward, goals_met
 from safe_rl.envs.safety_gym.specs import make_specs
 from safe_rl.envs.safety_gym.suite import resolve
 from safe_rl.envs.safety_gym.world.ahead import LayoutsAhead
@@ -53,8 +53,9 @@ class SafetyGymEnv(SimulatedEnv):
     a world fails, that world gets `reward_exception`, `cost_exception` 1 and termination.
 
     A state holds `qpos`, `qvel`, `qacc_warmstart`, `time`, `goal_pos` [N, 3], `goal_button`,
-    `buttons_timer`, `step_count`, and the layout and seeds, which may be left out where one is set.
-    What sleeps then wakes up; with `sleep` False what follows is the same to the last digit.
+    `buttons_timer`, `step_count`, `act` and `history` of actuators that remember, and the layout
+    and seeds, which may be left out where one is set. What sleeps then wakes up; with `sleep` False
+    what follows is the same to the last digit.
 
     Args:
         env: name in the suite ("PointGoal1", "Safexp-PointGoal1-v0"), mapping of configuration
@@ -105,7 +106,8 @@ class SafetyGymEnv(SimulatedEnv):
         self._control_range = (low, high)
         self._measured = self._task.measure(self._world).detach().clone()
         self._renderer = WorldRenderer(self._world, lidar_blocks(self.config, scene))
-        self.cost_keys = cost_keys(self.config)
+        self._costs = active_costs(self.config)
+        self.cost_keys = cost_keys(self._costs)
         specs = make_specs(
             self.config, self._observer, self._control_range, self.cost_keys, num_envs, self.device
         )
@@ -183,8 +185,8 @@ class SafetyGymEnv(SimulatedEnv):
         require_episodes(self._begun)
         failed = self._advance(action)
         now = self._task.measure(world)
-        reward = dense_reward(config, world, self._measured, now)
-        costs = compute_costs(config, world, failed)
+        reward = dense_reward(self._task, config, world, self._measured, now)
+        costs = compute_costs(self._costs, config, world, failed)
         torch.gt(costs[0], 0.0, out=self._has_cost)
         world.buttons_timer.sub_(1).clamp_(min=0)
         met, stuck = self._handle_goals(now, failed)
@@ -221,7 +223,7 @@ class SafetyGymEnv(SimulatedEnv):
         self._measured.copy_(now)
         if self._task.met is None:
             return torch.zeros_like(failed), None
-        met = self._task.met(self.config, self._world, now) & ~failed
+        met = goals_met(self._task, self.config, self._world, now) & ~failed
         if not (self.config.continue_goal and met.any()):
             return met, None
         stuck = next_goals(self._world, self._plan, self._step_key(), met)

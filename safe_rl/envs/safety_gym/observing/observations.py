@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from functools import partial
 from typing import NamedTuple
 
 import torch
@@ -20,15 +21,28 @@ from safe_rl.envs.safety_gym.observing.vision import vision_blocks
 from safe_rl.envs.safety_gym.records.config import SafetyGymConfig
 from safe_rl.envs.safety_gym.records.scene import Scene
 from safe_rl.envs.safety_gym.records.world import Block, Bounds, Shapes, World
-from safe_rl.envs.safety_gym.rules.readings import READINGS
+from safe_rl.envs.safety_gym.rules.readings import READINGS, Reading
 
 
 def _plain(config: SafetyGymConfig, scene: Scene) -> list[Block]:
     return [
-        Block({row.name: (row.size(config, scene),)}, row.read, row.bounds)
+        Block({row.name: (size,)}, partial(_read, row, size), row.bounds)
         for row in READINGS
         if row.present(config)
+        for size in [row.size(config, scene)]
     ]
+
+
+def _read(row: Reading, size: int, world: World) -> Tensor:
+    """The values of a reading [N, size]; of another width they would move all that follow."""
+    values, shape = row.read(world), (len(world.step_count), size)
+    if not isinstance(values, Tensor) or values.shape != shape:
+        got = list(values.shape) if isinstance(values, Tensor) else f"a {type(values).__name__}"
+        raise ConfigError(
+            f"The observation '{row.name}' must be a tensor {list(shape)} (worlds, its 'size'), "
+            f"got {got}."
+        )
+    return values
 
 
 SOURCES: tuple[Callable[[SafetyGymConfig, Scene], list[Block]], ...] = (

@@ -7,7 +7,7 @@ Spec: paper section 4.1.3. Every function returns one number per world, [N], bef
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import torch
@@ -168,9 +168,14 @@ COSTS: list[Cost] = [
 EXCEPTION_KEY = "cost_exception"
 
 
-def cost_keys(config: SafetyGymConfig) -> list[str]:
+def active_costs(config: SafetyGymConfig) -> list[Cost]:
+    """Return the rows that a configuration has, as the table is now."""
+    return [row for row in COSTS if row.active(config)]
+
+
+def cost_keys(rows: Sequence[Cost]) -> list[str]:
     """Return the keys an environment writes: the aggregate `cost`, then one per kind."""
-    return ["cost", *(row.key for row in COSTS if row.active(config)), EXCEPTION_KEY]
+    return ["cost", *(row.key for row in rows), EXCEPTION_KEY]
 
 
 def _magnitude(row: Cost, config: SafetyGymConfig, world: World) -> Tensor:
@@ -183,31 +188,33 @@ def _magnitude(row: Cost, config: SafetyGymConfig, world: World) -> Tensor:
     return cost
 
 
-def compute_costs(config: SafetyGymConfig, world: World, failed: Tensor) -> Tensor:
+def compute_costs(
+    rows: Sequence[Cost], config: SafetyGymConfig, world: World, failed: Tensor
+) -> Tensor:
     """Compute every cost of the worlds as they are.
 
     Args:
+        rows: what the environment was made with, from `active_costs`.
         config: the environment.
         world: the worlds, up to date.
         failed: worlds whose physics failed, bool [N]; their only cost is `cost_exception`.
 
     Returns:
-        One row for each of `cost_keys(config)`, [1 + number of kinds + 1, N].
+        One row for each of `cost_keys(rows)`, [1 + number of kinds + 1, N].
 
     Raises:
         ConfigError: if a registered cost is not one number of at least 0 per world.
     """
-    magnitudes = [_magnitude(row, config, world) for row in COSTS if row.active(config)]
+    magnitudes = [_magnitude(row, config, world) for row in rows]
     if failed.any():
         magnitudes = [torch.where(failed, 0.0, magnitude) for magnitude in magnitudes]
     exceptions = failed.to(torch.float64)  # the sum has this type, whatever a registered cost has
     costs = torch.stack([sum(magnitudes, start=exceptions), *magnitudes, exceptions])
     lowest = costs.amin(-1)
-    if (lowest < 0.0).any():
+    if not (lowest >= 0.0).all():  # NaN is not: an indicator would make 0 of it
         # after the sum, which may be lower still
-        number = 1 + int((lowest[1:] < 0.0).nonzero()[0])
-        raise ConfigError(
-            f"{cost_keys(config)[number]} must be 0 or more, got {lowest[number]:.4g}: "
-            "clamp(min=0) it."
-        )
+        number = 1 + int((~(lowest[1:] >= 0.0)).nonzero()[0])
+        wrong = float(lowest[number])
+        hint = "give every world a number" if math.isnan(wrong) else "clamp(min=0) it"
+        raise ConfigError(f"{cost_keys(rows)[number]} must be 0 or more, got {wrong:.4g}: {hint}.")
     return costs.gt_(0.0) if config.constrain_indicator else costs

@@ -13,9 +13,12 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from safe_rl.envs.errors import ConfigError
 from safe_rl.envs.safety_gym.geometry import distance
 from safe_rl.envs.safety_gym.records.config import SafetyGymConfig
 from safe_rl.envs.safety_gym.records.world import World
+
+_CENTRE = 1e-12  # [m]
 
 
 def circle_speed(com_xy: Tensor, velocity_xy: Tensor, radius: float) -> Tensor:
@@ -28,7 +31,8 @@ def circle_speed(com_xy: Tensor, velocity_xy: Tensor, radius: float) -> Tensor:
     """
     (x, y), (u, v) = com_xy.unbind(-1), velocity_xy.unbind(-1)
     r = torch.sqrt(x**2 + y**2)
-    return ((-u * y + v * x) / r) / (1 + torch.abs(r - radius))
+    # at the very centre, where a round robot may start, there is no motion about it
+    return ((-u * y + v * x) / r.clamp_min(_CENTRE)) / (1 + torch.abs(r - radius))
 
 
 class NextGoal(Enum):
@@ -129,18 +133,53 @@ def goal_is_button(task: str) -> bool:
     return TASKS[task].next_goal is NextGoal.BUTTON
 
 
-def dense_reward(config: SafetyGymConfig, world: World, before: Tensor, now: Tensor) -> Tensor:
+def dense_reward(
+    task: Task, config: SafetyGymConfig, world: World, before: Tensor, now: Tensor
+) -> Tensor:
     """Reward of a step without the bonus for a goal, clipped to ±`reward_clip`: [N].
 
     Args:
+        task: what the environment was made with.
         config: the environment.
         world: the worlds after the step.
         before: the task's measurements before the step [N, D].
         now: and after it [N, D].
+
+    Raises:
+        ConfigError: if a registered task's reward is not one number per world.
     """
-    reward = TASKS[config.task].reward(config, world, before, now)
+    reward = task.reward(config, world, before, now)
+    _check_values("reward", reward, config, world)
     if config.reward_orientation:
         reward = reward + config.reward_orientation_scale * world.up
     if config.reward_clip:
         reward = reward.clamp(-config.reward_clip, config.reward_clip)
     return reward
+
+
+def goals_met(task: Task, config: SafetyGymConfig, world: World, now: Tensor) -> Tensor:
+    """Which worlds meet their goals: bool [N], for tasks with goals.
+
+    Args:
+        task: what the environment was made with.
+        config: the environment.
+        world: the worlds after the step.
+        now: the task's measurements [N, D].
+
+    Raises:
+        ConfigError: if a registered task does not say so of every world.
+    """
+    assert task.met is not None
+    met = task.met(config, world, now)
+    _check_values("met", met, config, world)
+    return met > 0
+
+
+def _check_values(what: str, values: Tensor, config: SafetyGymConfig, world: World) -> None:
+    shape = world.robot_xy.shape[:1]
+    if not isinstance(values, Tensor) or values.shape not in (shape, ()):
+        got = list(values.shape) if isinstance(values, Tensor) else f"a {type(values).__name__}"
+        raise ConfigError(
+            f"'{what}' of task '{config.task}' must return a tensor of one value per world, "
+            f"{list(shape)}, got {got}."
+        )

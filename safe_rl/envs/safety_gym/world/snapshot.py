@@ -15,7 +15,7 @@ PHYSICS_KEYS = ("qpos", "qvel", "qacc_warmstart", "time")
 TASK_KEYS = ("goal_button", "buttons_timer", "step_count")
 LAYOUT_KEYS = ("layout", "start_pose")
 # Without the last control, sensors that feel the actuators differ until the next step.
-OPTIONAL_KEYS = (*LAYOUT_KEYS, "target_quat", "ctrl", "seed", "episode")
+OPTIONAL_KEYS = (*LAYOUT_KEYS, "target_quat", "ctrl", "act", "history", "seed", "episode")
 # What is not part of the physics, whose failures are noticed by themselves.
 FINITE_KEYS = (*LAYOUT_KEYS, "goal_pos", "target_quat")
 
@@ -26,6 +26,7 @@ def read_state(world: World) -> TensorDict:
     state |= {key: getattr(world, key).clone() for key in (*TASK_KEYS, *LAYOUT_KEYS)}
     goal = world.at("goal")[:, 0] if "goal" in world.scene.slots else torch.zeros_like(world.com)
     state["goal_pos"] = goal.clone()
+    state |= {key: memory.clone() for key, memory in world.physics.memory.items()}
     state["target_quat"] = world.physics.mocap_quat[:, : world.scene.num_targets].clone()
     return TensorDict(state, batch_size=[len(world.step_count)])
 
@@ -36,7 +37,8 @@ def write_state(world: World, state: TensorDictBase) -> None:
     Args:
         world: the worlds.
         state: TensorDict [N] as `read_state` returns it, which `check_worlds` has passed; `layout`,
-            `start_pose`, `target_quat` and `ctrl` may be missing.
+            `start_pose`, `target_quat` and `ctrl` may be missing, and then actuators remember
+            nothing where `act` and `history` are.
     """
     scene, physics = world.scene, world.physics
     target_quat = state.get("target_quat", physics.mocap_quat[:, : scene.num_targets].clone())
@@ -46,6 +48,9 @@ def write_state(world: World, state: TensorDictBase) -> None:
     for key in (*TASK_KEYS, *LAYOUT_KEYS):
         if key in state:
             getattr(world, key).copy_(state[key])
+    for key, memory in physics.memory.items():
+        if key in state:
+            memory.copy_(state[key])
     if "ctrl" in state:
         physics.ctrl.copy_(state["ctrl"])
     physics.mocap_quat[:, : scene.num_targets] = target_quat
