@@ -13,7 +13,7 @@ import torch
 
 from safe_rl.collectors import WorkerCollector, make_process_collector, make_ray_collector
 from safe_rl.collectors.workers import share_rows
-from safe_rl.envs import SafetyGymEnv
+from safe_rl.envs import SafetyGymEnv, make_env
 from safe_rl.models import BehaviourPolicy, make_actor
 
 CONFIG = {"robot_base": "point", "task": "goal", "num_steps": 30, "observe_goal_lidar": True}
@@ -27,6 +27,16 @@ def test_workers_step_the_rows_that_one_process_would():
     rows = torch.cat([share.reset()["observation"] for share in shares])
     assert torch.equal(rows, expected)
     assert len({tuple(row.tolist()) for row in rows}) == 6
+
+
+def test_workers_have_the_noise_that_the_rows_of_one_process_would():
+    noise = {"noise": {"_target_": "safe_rl.envs.transforms.SensorNoise", "std": 0.5}}
+    make = partial(make_env, CONFIG, seed=3, num_threads=1, transforms=noise)
+    whole = make(num_envs=4)
+    shares = [make() for make in share_rows(whole, make, num_collectors=2)]
+    expected = whole.reset()["observation"]
+    rows = torch.cat([share.reset()["observation"] for share in shares])
+    assert torch.equal(rows, expected)
 
 
 @pytest.mark.parametrize(("num_collectors", "frames"), [(4, 60), (2, 63), (0, 60)])

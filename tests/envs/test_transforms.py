@@ -242,6 +242,21 @@ def test_replaced_actions_are_taken_and_counted_and_the_chosen_ones_kept():
     torch.testing.assert_close(moved, 0.15 * torch.tensor([[0.2, -0.2], [0.2, 0.5]]))
 
 
+def test_a_filter_may_change_actions_in_place():
+    env = PointMass(2)
+    in_place = transform_env(
+        env, {"f": ActionFilter(lambda step: step["action"].mul_(0.5))}, evaluating=False
+    )
+    chosen = torch.ones(2, *env.action_spec.shape[1:])
+    stepped = in_place.step(in_place.reset().set("action", chosen.clone()))
+    assert torch.equal(stepped["action"], chosen)
+    assert stepped["next", "cost_interventions"].flatten().tolist() == [1.0, 1.0]
+    other = transform_env(PointMass(2), {"f": ActionFilter(half_speed)}, evaluating=False)
+    wanted = other.step(other.reset().set("action", chosen.clone()))
+    for key in ("observation", "reward"):
+        assert torch.equal(stepped["next", key], wanted["next", key])
+
+
 def test_a_filter_that_returns_no_actions_is_refused():
     broken = ActionFilter(lambda step: step["action"][:, :1])
     env = transform_env(PointMass(2), {"filter": broken}, evaluating=False)

@@ -55,7 +55,8 @@ class ActionFilter(ConstraintTransform):
 
     def _inv_call(self, tensordict: TensorDictBase) -> TensorDictBase:
         action = tensordict.get("action")
-        replaced = self._filter(tensordict)
+        # a copy: what changes actions in place would change the one that is learned from
+        replaced = self._filter(tensordict.set("action", action.clone()))
         if not isinstance(replaced, Tensor) or replaced.shape != action.shape:
             got = tuple(replaced.shape) if isinstance(replaced, Tensor) else type(replaced).__name__
             raise ValueError(

@@ -56,6 +56,11 @@ class SensorNoise(ConstraintTransform):
         """Determine every draw to come by keys of the rows, int64 [N]; resets heed it."""
         self._seeds = seeds
 
+    def put_rows(self, rows: Mapping[str, Tensor]) -> None:
+        """Go on from what `rows` returned: with its keys, whatever was seeded before."""
+        super().put_rows(rows)
+        self._seeds = None
+
     def extend_layout(self, layout: Mapping[str, slice]) -> dict[str, slice]:
         """Take note of the columns.
 
