@@ -195,5 +195,6 @@ class EpisodeAccounting:
                     f"The saved '{name}' has shape {list(state_dict[name].shape)}, this run needs "
                     f"{list(target.shape)}: it has other environments or cost keys than the saved."
                 )
-        self._open_sums = state_dict["open_sums"].to(self._open_sums)
-        self._totals = state_dict["totals"].to(self._totals)
+        # copies, because both are changed in place
+        self._open_sums = state_dict["open_sums"].to(self._open_sums, copy=True)
+        self._totals = state_dict["totals"].to(self._totals, copy=True)

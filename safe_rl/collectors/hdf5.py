@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
+from re import fullmatch
 from typing import Any
 
 import numpy as np
@@ -33,7 +34,8 @@ _OF_AN_EPISODE: dict[NestedKey, str] = {
     ("next", "terminated"): "terminations",
     ("next", "truncated"): "truncations",
 }
-_EPISODE = "episode_"
+_EPISODE = r"episode_(\d+)"
+_NUMBERS = "biuf"  # kinds of NumPy's types
 _FLAGS = (("next", "terminated"), ("next", "truncated"))
 
 
@@ -51,21 +53,21 @@ def read_hdf5(path: Path | str) -> TensorDict:
       any ``cost_<kind>``. An episode that was cut off counts as truncated.
 
     Raises:
-        ValueError: If the file is no HDF5 file, or an array is missing; the message names those
-            that are there.
+        ValueError: If the file is no HDF5 file, or damaged; if an array is missing, of another
+            length than the actions, or not of numbers. The message names what is there.
         ModuleNotFoundError: If h5py is not installed.
     """
     h5py = import_extra("h5py", "hdf5")
     if not h5py.is_hdf5(path):
         raise ValueError(f"{path} is neither the folder of a recording nor an HDF5 file.")
-    with h5py.File(path, "r") as file:
-        names = [name for name in file if name.startswith(_EPISODE)]
-        if names:
-            names.sort(key=lambda name: int(name.removeprefix(_EPISODE)))
-            episodes = [_read_episode(path, file[name]) for name in names]
-            arrays = {key: np.concatenate([e[key] for e in episodes]) for key in episodes[0]}
-        else:
-            arrays = _read_flat(path, file)
+    try:
+        with h5py.File(path, "r") as file:
+            names = [n for n in file if fullmatch(_EPISODE, n)]
+            arrays = _read_episodes(path, file, names) if names else _read_flat(path, file)
+    except OSError as error:
+        raise ValueError(f"{path} cannot be read, is it whole? {error}") from error
+    if not len(arrays["action"]):
+        raise ValueError(f"{path} holds no transitions.")
     steps = TensorDict(batch_size=[1, len(arrays["action"])])
     for key, column in _columns(arrays):
         steps[key] = column
@@ -73,16 +75,30 @@ def read_hdf5(path: Path | str) -> TensorDict:
     return steps
 
 
+def _read_episodes(path: Path | str, file: Any, names: list[str]) -> Arrays:
+    names.sort(key=lambda name: int(name.rpartition("_")[2]))
+    episodes = [_read_episode(path, file[name]) for name in names]
+    costs = [sorted(key[1] for key in e if key[1].startswith("cost")) for e in episodes]
+    for name, those in zip(names, costs, strict=True):
+        if those != costs[0]:
+            raise ValueError(
+                f"{path}: the costs of {name} are {', '.join(those)}, those of {names[0]} "
+                f"{', '.join(costs[0])}."
+            )
+    return {key: np.concatenate([e[key] for e in episodes]) for key in episodes[0]}
+
+
 def _read_flat(path: Path | str, file: Any) -> Arrays:
     arrays = _arrays(path, file, _FLAT)
     if "next_observations" in file:
         following = file["next_observations"][:]
     else:
+        _check_lengths(path, arrays)
         here = arrays["observation"]
         ends = arrays["next", "terminated"] | arrays["next", "truncated"]
         ends = np.append(ends[:-1], True).reshape(-1, *[1] * (here.ndim - 1))
         following = np.where(ends, here, np.roll(here, -1, 0))
-    return {**arrays, ("next", "observation"): following}
+    return _check_lengths(path, {**arrays, ("next", "observation"): following})
 
 
 def _read_episode(path: Path | str, group: Any) -> Arrays:
@@ -90,16 +106,42 @@ def _read_episode(path: Path | str, group: Any) -> Arrays:
     observed, number = arrays["observation"], len(arrays["action"])
     infos = group.get("infos", {})
     # infos of the reset come first, if they were stored
-    costs = {("next", name): infos[name][:][-number:] for name in infos if name.startswith("cost")}
+    named = [name for name in infos if name.startswith("cost") and _is_array(infos[name])]
+    costs = {("next", name): _last(infos[name][:], number) for name in named}
     if ("next", "cost") not in costs:
         raise _lacking(path, ["infos/cost"], [f"infos/{name}" for name in infos] or list(group))
-    arrays["next", "truncated"][-1] |= not arrays["next", "terminated"][-1]
     here, following = observed[:number], observed[1 : number + 1]
-    return {**arrays, **costs, "observation": here, ("next", "observation"): following}
+    arrays = {**arrays, **costs, "observation": here, ("next", "observation"): following}
+    _check_lengths(f"{path}, {group.name[1:]}", arrays)
+    arrays["next", "truncated"][-1:] |= ~arrays["next", "terminated"][-1:]
+    return arrays
+
+
+def _last(array: np.ndarray, number: int) -> np.ndarray:
+    return array[max(0, len(array) - number) :]
+
+
+def _is_array(node: Any) -> bool:
+    """Whether a node of a file is an array with a row for each step, not a number or a group."""
+    return bool(getattr(node, "shape", ()))
+
+
+def _check_lengths(where: Path | str, arrays: Arrays) -> Arrays:
+    """Refuse arrays that are not of the same steps, or of something else than numbers."""
+    number = len(arrays["action"])
+    for key, array in arrays.items():
+        name = " ".join(key) if isinstance(key, tuple) else key
+        if len(array) != number:
+            raise ValueError(
+                f"{where}: the {name} is given for {len(array):,} steps, the action for {number:,}."
+            )
+        if array.dtype.kind not in _NUMBERS:
+            raise ValueError(f"{where}: the {name} must be numbers, got {array.dtype}.")
+    return arrays
 
 
 def _arrays(path: Path | str, group: Any, names: Mapping[NestedKey, str]) -> Arrays:
-    found = [name for name in group if hasattr(group[name], "shape")]
+    found = [name for name in group if _is_array(group[name])]
     if missing := sorted(set(names.values()) - set(found)):
         raise _lacking(path, missing, found)
     return {

@@ -121,6 +121,11 @@ def test_saved_state_is_not_changed_by_later_batches():
     before = {name: value.clone() for name, value in state.items()}
     accounting.update(random_batch(generator, 4, 10, 0.1))
     assert all(torch.equal(state[name], before[name]) for name in state)
+    other = EpisodeAccounting(4, COST_KEYS)
+    other.load_state_dict(state)
+    other.forget_open_episodes()
+    other.update(random_batch(generator, 4, 10, 0.1))
+    assert all(torch.equal(state[name], before[name]) for name in state)
 
 
 def test_errors_say_what_is_wrong():

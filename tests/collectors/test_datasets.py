@@ -161,6 +161,79 @@ def test_what_a_file_lacks_is_named(tmp_path):
         read_hdf5(tmp_path / "data.hdf5")
 
 
+@pytest.mark.parametrize(
+    ("changes", "told"),
+    [
+        ({"actions": np.zeros((4, 2))}, "observation is given for 6 steps, the action for 4"),
+        ({"terminals": np.zeros(1)}, "next terminated is given for 1 steps, the action for 6"),
+        ({"next_observations": np.zeros((5, 3))}, "next observation is given for 5 steps"),
+        ({"rewards": np.float64(1.0)}, "has no rewards"),
+        ({"actions": np.array([b"left"] * 6)}, "the action must be numbers"),
+    ],
+)
+def test_a_file_whose_arrays_do_not_fit_together_is_refused(changes, told, tmp_path):
+    h5py = pytest.importorskip("h5py", reason="comes with the extra hdf5")
+    path = tmp_path / "data.hdf5"
+    write_hdf5(path)
+    with h5py.File(path, "a") as file:
+        for name, array in changes.items():
+            del file[name]
+            file[name] = array
+    with pytest.raises(ValueError, match=told):
+        read_hdf5(path)
+
+
+@pytest.mark.parametrize(
+    ("name", "array", "told"),
+    [
+        ("observations", np.zeros((1, 3)), "episode_4: the next observation is given for 0 steps"),
+        ("infos/cost", np.zeros(0), "episode_4: the next cost is given for 0 steps"),
+        ("infos/cost_hazards", None, "costs of episode_4 are cost, those of episode_0 cost, cost_"),
+        ("infos/cost", "group", "no infos/cost"),
+    ],
+)
+def test_an_episode_that_does_not_fit_is_named(name, array, told, tmp_path):
+    h5py = pytest.importorskip("h5py", reason="comes with the extra hdf5")
+    write_minari(tmp_path / "data.hdf5")
+    with h5py.File(tmp_path / "data.hdf5", "a") as file:
+        del file[f"episode_4/{name}"]
+        if isinstance(array, str):
+            file.create_group(f"episode_4/{name}")
+        elif array is not None:
+            file[f"episode_4/{name}"] = array
+    with pytest.raises(ValueError, match=told):
+        read_hdf5(tmp_path / "data.hdf5")
+
+
+def test_episodes_without_a_step_and_other_groups_are_passed_over(tmp_path):
+    h5py = pytest.importorskip("h5py", reason="comes with the extra hdf5")
+    write_minari(tmp_path / "data.hdf5")
+    whole = read_hdf5(tmp_path / "data.hdf5")
+    with h5py.File(tmp_path / "data.hdf5", "a") as file:
+        file.create_group("episode_notes")
+        empty = file.create_group("episode_12")
+        for key, shape in {"observations": (1, 3), "actions": (0, 2), "infos/cost": 1,
+                           "infos/cost_hazards": 1}.items():  # fmt: skip
+            empty[key] = np.ones(shape)
+        for key in ("rewards", "terminations", "truncations"):
+            empty[key] = np.zeros(0)
+    assert (read_hdf5(tmp_path / "data.hdf5") == whole).all()
+
+
+def test_a_damaged_or_empty_file_is_told(tmp_path):
+    h5py = pytest.importorskip("h5py", reason="comes with the extra hdf5")
+    path = tmp_path / "data.hdf5"
+    write_hdf5(path)
+    path.write_bytes(path.read_bytes()[:3000])
+    with pytest.raises(ValueError, match=r"data\.hdf5 cannot be read, is it whole"):
+        read_hdf5(path)
+    with h5py.File(tmp_path / "none.hdf5", "w") as file:
+        for name in ("observations", "actions", "rewards", "costs", "terminals", "timeouts"):
+            file[name] = np.zeros((0, 2))
+    with pytest.raises(ValueError, match="holds no transitions"):
+        read_hdf5(tmp_path / "none.hdf5")
+
+
 def test_without_h5py_the_extra_is_named(tmp_path, monkeypatch):
     monkeypatch.setattr("safe_rl.extras.find_spec", lambda name: None)
     with pytest.raises(ModuleNotFoundError, match=r"\[hdf5\]"):
