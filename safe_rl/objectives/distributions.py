@@ -18,7 +18,7 @@ from tensordict.nn import (
     ProbabilisticTensorDictSequential,
 )
 from torch import Tensor
-from torch.distributions import Distribution, Normal, kl_divergence
+from torch.distributions import Categorical, Distribution, Normal, kl_divergence
 from torchrl.modules.distributions import has_analytic_entropy, has_analytic_kl
 from torchrl.modules.distributions.utils import sample_and_log_prob
 
@@ -38,6 +38,16 @@ def gaussian_kl(loc_p: Tensor, scale_p: Tensor, loc_q: Tensor, scale_q: Tensor) 
     ratio = (scale_p / scale_q).square()
     shift = ((loc_p - loc_q) / scale_q).square()
     return 0.5 * (ratio + shift - 1 - ratio.log()).sum(-1)
+
+
+def categorical_kl(p: Categorical, q: Categorical) -> Tensor:
+    """KL(p ‖ q) of single choices, [...], as torch's, with a gradient where choices are masked.
+
+    A choice that neither has adds 0 to the divergence; torch multiplies 0 by −∞ + ∞, and the
+    gradient of that is no number.
+    """
+    change = (p.logits - q.logits).masked_fill(p.probs == 0, 0.0)
+    return (p.probs * change).masked_fill((q.probs == 0) & (p.probs > 0), torch.inf).sum(-1)
 
 
 def root(distribution: Distribution) -> Distribution:
@@ -111,7 +121,11 @@ def kl(
     if isinstance(roots[0], Normal) and isinstance(roots[1], Normal):
         if not p.event_shape:
             return kl_divergence(*roots)
-        return gaussian_kl(roots[0].loc, roots[0].scale, roots[1].loc, roots[1].scale)
+        divergence = gaussian_kl(roots[0].loc, roots[0].scale, roots[1].loc, roots[1].scale)
+        several = len(p.event_shape) > 1  # dimensions of an action
+        return divergence.flatten(len(p.batch_shape)).sum(-1) if several else divergence
+    if isinstance(p, Categorical) and isinstance(q, Categorical):
+        return categorical_kl(p, q)
     if has_analytic_kl(p, q):
         return kl_divergence(p, q)
     ratio = log_weight.exp()

@@ -196,4 +196,5 @@ class EpisodeCosts:
         """Continue from :meth:`state_dict`."""
         for name, value in self._state.items():
             # checkpoints of earlier versions lack what batches scatter: it is learned again
-            self._state[name] = state_dict.get(name, value).to(value)
+            # a copy, because sums are added to in place
+            self._state[name] = state_dict.get(name, value).to(value, copy=True)

@@ -83,7 +83,7 @@ def policy_geometry(actor: ProbabilisticTensorDictSequential, batch: TensorDictB
     distribution = policy_in(actor, batch)
     base = root(distribution)
     if isinstance(base, Normal):
-        return _normal_geometry(base, base.scale.numel() // base.scale.shape[-1])
+        return _normal_geometry(base, _num_states(distribution))
     if isinstance(base, Categorical):
         return _categorical_geometry(base, _num_states(distribution))
     return _geometry_by_differentiation(actor, batch)
@@ -128,7 +128,9 @@ class FisherProduct:
         damping: float,
     ) -> None:
         self.parameters, self.damping = list(parameters), damping
-        self._outputs, self._metric = policy_geometry(actor_network, batch)
+        # cuDNN's recurrent networks cannot be differentiated twice
+        with torch.backends.cudnn.flags(enabled=False):
+            self._outputs, self._metric = policy_geometry(actor_network, batch)
         self._dummies = [torch.zeros_like(output, requires_grad=True) for output in self._outputs]
         self._vjp = torch.autograd.grad(
             self._outputs,

@@ -174,7 +174,9 @@ class PPOLagrangianLoss(PPOLoss):
         if self.cost_clipping == "none":
             return super()._cost_gain(tensordict, ratio)
         cost_advantage = self._cost_advantage(tensordict)
-        return -clipped_gain(ratio.log(), -cost_advantage, self.clip_epsilon)
+        # a ratio that has underflowed has a logarithm of infinite slope
+        log_weight = ratio.clamp_min(torch.finfo(ratio.dtype).tiny).log()
+        return -clipped_gain(log_weight, -cost_advantage, self.clip_epsilon)
 
     def _objective(self, tensordict: TensorDictBase, log_weight: Tensor) -> Tensor:
         if self.cost_clipping != "joint" or self.multiplier is None:

@@ -257,7 +257,7 @@ def pessimistic(values: Tensor, deviations: float) -> Tensor:
 def discount_of(tensordict: TensorDictBase, gamma: float, spanned: NestedKey) -> Tensor | float:
     """γ, or γ to the power of the steps that each transition spans, [..., 1], if it has the key."""
     steps = tensordict.get(spanned, None)
-    return gamma if steps is None else gamma ** steps.unsqueeze(-1)
+    return gamma if steps is None else gamma ** steps.reshape(*tensordict.batch_size, 1)
 
 
 def scalars(**entries: Tensor) -> TensorDict:

@@ -184,7 +184,9 @@ class SACLoss(QFunctionLoss, objectives.SACLoss):
 
 
 class SACLagrangianLoss(SACLoss, CostCritics):
-    """SAC on the Lagrangian: min_π E[α log π − min Q_r + Σ_i w_i Q_i] / (1 + Σ_i w_i), w = λ / u.
+    """SAC on the Lagrangian: min_π E[α log π − min Q_r + r Σ_i w_i Q_i] / (1 + Σ_i w_i), w = λ / u.
+
+    The sizes r of rewards and u of costs are 1 until they are measured; see `CostCritics`.
 
     Ha et al., *Learning to Walk in the Real World with Minimal Human Effort* (2020); there as here
     costs have critics of their own. λ is moved by whoever knows the costs of episodes, which

@@ -134,7 +134,9 @@ class TD3Loss(QFunctionLoss, objectives.TD3Loss):
 
 
 class TD3LagrangianLoss(TD3Loss, CostCritics):
-    """TD3 on the Lagrangian: max_π E[Q_1 − Σ_i λ_i Q_i / u_i] / (1 + Σ_i λ_i / u_i).
+    """TD3 on the Lagrangian: max_π E[Q_1 − r Σ_i w_i Q_i] / (1 + Σ_i w_i), w = λ / u.
+
+    The sizes r of rewards and u of costs are 1 until they are measured; see `CostCritics`.
 
     Args:
         actor_network: see `TD3Loss`.

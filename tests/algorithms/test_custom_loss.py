@@ -16,7 +16,7 @@ from safe_rl.cli.user_code import import_modules
 from safe_rl.models import make_actor
 from safe_rl.runs.table import read_table
 from safe_rl.targets import allow
-from safe_rl.training.trainer import build_trainer
+from safe_rl.training.building import build_trainer
 
 ROOT = CONF.parent
 EXAMPLES = ROOT / "examples"

@@ -7,7 +7,7 @@ from run_configs import point_mass_config
 
 from safe_rl.algorithms import matrix_products
 from safe_rl.algorithms.matrix_products import fast_products, prefers_onednn
-from safe_rl.training.trainer import build_trainer
+from safe_rl.training.building import build_trainer
 
 ZEN = "vendor_id : AuthenticAMD\nmodel name : AMD EPYC\nflags : fpu avx2 avx512f avx512_bf16\n"
 

@@ -16,7 +16,7 @@ from safe_rl.collectors import EpisodeAccounting
 from safe_rl.objectives import Chance, CostGAE, CVaR, TRPOLoss
 from safe_rl.objectives.risk import cost_so_far, value_at_risk
 from safe_rl.runs.table import read_table
-from safe_rl.training.trainer import build_trainer
+from safe_rl.training.building import build_trainer
 
 
 def cvar_of(limits, tail=0.25, window=10_000, ramp_start=0, ramp_steps=0):

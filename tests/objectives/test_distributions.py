@@ -22,14 +22,25 @@ from torch.distributions import (
     kl_divergence,
 )
 from torchrl.envs.utils import ExplorationType
-from torchrl.modules import IndependentNormal, OneHotCategorical, ProbabilisticActor, TanhNormal
+from torchrl.modules import (
+    IndependentNormal,
+    OneHotCategorical,
+    ProbabilisticActor,
+    TanhNormal,
+)
 from torchrl.modules import TruncatedNormal as TorchRLTruncatedNormal
 from torchrl.objectives import ClipPPOLoss
 
 from safe_rl.algorithms import CPOStep, MinibatchUpdate, TRPOStep
 from safe_rl.models.distributions import Choices
 from safe_rl.models.heads import _Components
-from safe_rl.objectives import CPOLoss, LagrangeMultiplier, PPOLagrangianLoss, PPOLoss, TRPOLoss
+from safe_rl.objectives import (
+    CPOLoss,
+    LagrangeMultiplier,
+    PPOLagrangianLoss,
+    PPOLoss,
+    TRPOLoss,
+)
 from safe_rl.objectives.distributions import ReferencePolicy, entropy, kl
 from safe_rl.objectives.fisher import FisherProduct
 from safe_rl.objectives.trust_region import flatten, mean_kl, policy_in, set_parameters
@@ -54,6 +65,13 @@ class MultiCategorical(Independent):
 
     def __init__(self, logits):
         super().__init__(Categorical(logits=logits), 1)
+
+
+class MatrixNormal(Independent):
+    """Normal in every entry of a matrix."""
+
+    def __init__(self, loc, scale):
+        super().__init__(Normal(loc, scale), 2)
 
 
 class Anonymous(Distribution):
@@ -107,6 +125,19 @@ def composite(wheel):
     return functools.partial(CompositeDistribution, distribution_map=parts, name_map=names)
 
 
+class Shaped(nn.Module):
+    """Means and standard deviations in the shape of an action that is no vector."""
+
+    def __init__(self, *shape):
+        super().__init__()
+        self.shape = shape
+
+    def forward(self, x):
+        loc, scale = NormalParamExtractor()(x)
+        size = (*x.shape[:-1], *self.shape)
+        return loc.reshape(size), scale.reshape(size)
+
+
 class Grid(nn.Module):
     """Two choices among three."""
 
@@ -116,6 +147,8 @@ class Grid(nn.Module):
 
 KINDS = {
     "normal": (4, NormalParamExtractor(), ["loc", "scale"], IndependentNormal),
+    "number": (2, Shaped(), ["loc", "scale"], Normal),
+    "matrix": (12, Shaped(2, 3), ["loc", "scale"], MatrixNormal),
     "tanh_normal": (4, NormalParamExtractor(), ["loc", "scale"], TanhNormal),
     "bounded_tanh_normal": (
         4, NormalParamExtractor(), ["loc", "scale"],

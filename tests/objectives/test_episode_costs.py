@@ -130,3 +130,17 @@ def test_a_saved_state_goes_on_as_if_it_had_never_stopped():
     assert all(torch.equal(one, other) for one, other in zip(ours, theirs, strict=True))
     assert torch.equal(whole.length, second.length)
     assert torch.equal(whole.unit, second.unit)
+
+
+def test_a_state_that_was_loaded_is_as_good_for_the_next():
+    one, other, third = (EpisodeCosts(1, max_length=40, drift=0.1, memory=0.9) for _ in "abc")
+    generator = torch.Generator().manual_seed(3)
+    one.update(*renewals(8, 50, generator))
+    state, batch = one.state_dict(), renewals(8, 50, generator)
+    results = []
+    for estimator in (other, third):
+        estimator.load_state_dict(state)
+        estimator.update(*batch)
+        results.append(estimator.state_dict())
+    first, second = results
+    assert all(torch.equal(first[name], second[name]) for name in first)

@@ -123,6 +123,21 @@ def test_clipped_costs_from_the_definition(clipping):
     assert loss.item() == pytest.approx(-total / 64, rel=1e-5)
 
 
+@pytest.mark.parametrize("clipping", ["none", "pessimistic", "joint"])
+@pytest.mark.parametrize("log_weight", [-80.0, -95.0, -200.0])
+def test_an_action_that_has_become_impossible_leaves_the_gradient_to_the_others(
+    clipping, log_weight
+):
+    """A ratio that single precision rounds to 0, or nearly: as if its advantages were 0."""
+    actor = make_actor()
+    batch = make_batch(actor, [16], 2)
+    batch["action_log_prob"][0] -= log_weight
+    loss = make_lagrangian(actor, cost_clipping=clipping)
+    found = gradient(loss(batch)["loss_objective"], actor)
+    batch["advantage"][0], batch["cost_advantage"][0] = 0.0, 0.0
+    torch.testing.assert_close(found, gradient(loss(batch)["loss_objective"], actor))
+
+
 def test_an_unknown_clipping_is_refused():
     with pytest.raises(ValueError, match="cost_clipping must be one of"):
         make_lagrangian(make_actor(), cost_clipping="both")

@@ -218,6 +218,23 @@ def test_a_transition_over_steps_is_discounted_by_as_many(key):
     torch.testing.assert_close(found, error.square().sum((0, 2)).mean())
 
 
+@pytest.mark.parametrize("shape", [(6,), (6, 1)])
+@pytest.mark.parametrize("kind", ["sac", "td3"])
+def test_spans_may_have_a_dimension_of_their_own_as_in_torchrl(kind, shape):
+    loss, steps = make_loss(kind, lagrange(1.0, 1.0)), make_steps()
+    steps["steps_to_next_obs"] = torch.tensor([1, 2, 3, 1, 2, 3]).reshape(shape)
+    stock = as_stock(loss, kind)
+    torch.manual_seed(1)
+    found = loss.critic_losses(steps.clone())
+    torch.manual_seed(1)
+    expected = stock(steps.clone())["loss_qvalue"]
+    torch.testing.assert_close(found["loss_qvalue"], expected)
+    other = steps.clone().set("steps_to_next_obs", steps["steps_to_next_obs"].flatten())
+    torch.manual_seed(1)
+    losses = loss.critic_losses(other)
+    assert found["loss_cost_qvalue"] == losses["loss_cost_qvalue"]
+
+
 def test_what_does_not_fit_is_refused():
     critic = ValueOperator(nn.Linear(3, 1), in_keys=["observation"])
     actor = make_squashed_actor(3, *BOUNDS, hidden_sizes=[8])

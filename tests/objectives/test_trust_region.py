@@ -109,6 +109,45 @@ def test_fisher_product_is_the_second_difference_of_the_kl():
     torch.testing.assert_close(sum(values) / size**2, curvature, rtol=1e-4, atol=0)
 
 
+class Recurrent(nn.Module):
+    """Sequences [N, T] through a recurrent layer; notes whether cuDNN was in use."""
+
+    def __init__(self, **options):
+        super().__init__()
+        self.gru = nn.GRU(NUM_OBS, NUM_ACTIONS, batch_first=True, **options)
+        self.met = []
+
+    def forward(self, observation):
+        self.met.append(torch.backends.cudnn.enabled)
+        loc = self.gru(observation)[0]
+        return loc, loc.exp()
+
+
+def fisher_of_a_sequence(**options):
+    net = Recurrent(**options)
+    actor = ProbabilisticActor(
+        TensorDictModule(net, in_keys=["observation"], out_keys=["loc", "scale"]),
+        in_keys=["loc", "scale"],
+        distribution_class=IndependentNormal,
+    )
+    observation = torch.randn(2, 5, NUM_OBS, **options)
+    batch = TensorDict(observation=observation, batch_size=[2, 5])
+    product = FisherProduct(actor, batch, list(actor.parameters()), damping=0.1)
+    return net, product(torch.ones(sum(p.numel() for p in actor.parameters()), **options))
+
+
+def test_the_graph_that_is_differentiated_twice_is_none_of_cudnns():
+    before = torch.backends.cudnn.enabled
+    net, _ = fisher_of_a_sequence()
+    assert net.met == [False]
+    assert torch.backends.cudnn.enabled == before
+
+
+@pytest.mark.gpu
+def test_recurrent_policies_have_a_fisher_matrix_on_an_accelerator():
+    assert fisher_of_a_sequence(device="cuda")[1].isfinite().all()
+
+
 def test_frozen_parameters_are_left_out():
     actor, batch, parameters = setup_actor("state-dependent scale")
     whole = FisherProduct(actor, batch, parameters, damping=0.0)
