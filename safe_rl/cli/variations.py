@@ -97,7 +97,7 @@ def table_of(found: Varied) -> str:
     heads = ["", "return", *keys, *(f"over {d:g}" for d in found.cost_limits.values())]
     names = ["episode_return", *(f"episode_{key}" for key in keys)]
     names += [f"over_limit_{key}" for key in found.cost_limits]
-    lines = [[str(v), *(str(e[name]) for name in names)] for v, e in found.rows]
+    lines = [[str(v), *(str(e.get(name, "—")) for name in names)] for v, e in found.rows]
     widths = [max(map(len, column)) for column in zip(heads, *lines, strict=True)]
     facts = found.facts
     steps = "" if facts["steps"] is None else f" at {facts['steps']:,} steps"

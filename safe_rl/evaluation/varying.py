@@ -54,7 +54,7 @@ class Varied:
     Attributes:
         rows: First the environment as trained on, then every variation.
         left_out: Variations that this environment cannot have, and why.
-        cost_limits: Cost key -> d.
+        cost_limits: Cost key -> d, of the environment as trained on.
         facts: Of what, for the terminal.
         file: The table.
     """
@@ -101,6 +101,7 @@ def evaluate_variations(
     config.env = override_env(config, options.env)
     checkpoint = find_checkpoint(directory, options.checkpoint)
     rows: list[VariedRow] = []
+    trained_limits: dict[str, float] = {}
     left_out: list[tuple[Variation, str]] = []
     cannot: tuple[type[Exception], ...] = (ValueError, *refusals)
     for variation in (AS_TRAINED, *variations):
@@ -117,12 +118,13 @@ def evaluate_variations(
             left_out.append((variation, str(error)))
             continue
         limits = limits_of(config, options.cost_limits, episodes.costs)
+        trained_limits = trained_limits if rows else limits
         rows.append(VariedRow(variation, summarise(episodes, limits, None, options.cvar_alpha)))
     file = RunFolder(directory).variations(options.name, "csv")
     _write(file, rows)
     facts = {"algorithm": config.algo.name, "environment": config.env.get("name", "")}
     facts |= {"steps": checkpoint_steps(checkpoint), "episodes": options.episodes}
-    return Varied(tuple(rows), tuple(left_out), limits, facts, file)
+    return Varied(tuple(rows), tuple(left_out), trained_limits, facts, file)
 
 
 def _episodes(
@@ -146,14 +148,17 @@ def _episodes(
 
 
 def _write(path: Path, rows: Sequence[VariedRow]) -> None:
-    """A row per variation: what was changed to what, and every estimate with its interval."""
-    names = list(rows[0].estimates)
+    """A row per variation: what was changed to what, and every estimate with its interval.
+
+    Nothing stands where a variation has not the cost of another one.
+    """
+    names = list(dict.fromkeys(name for row in rows for name in row.estimates))
     columns = [f"{name}{end}" for name in names for end in ("", "_low", "_high")]
     with replacing(path) as unfinished, unfinished.open("w", newline="") as file:
         writer = csv.writer(file, lineterminator="\n")
         writer.writerow(["variation", "row", "value", "keys", *columns])
         for (row, value, keys), estimates in rows:
             changes = " ".join(f"{key}={changed}" for key, changed in keys.items())
-            found = [number for name in names for number in estimates[name]]
+            found = [number for name in names for number in estimates.get(name, ("", "", ""))]
             label = str(Variation(row, value, keys))
             writer.writerow([label, row, "" if value is None else value, changes, *found])

@@ -21,6 +21,7 @@ _WIDTH, _HEIGHT = 2.2, 2.0
 _MOST_COLUMNS = 5
 _COLOURS = ("#0072b2", "#d55e00", "#cc79a7", "#009e73")
 _OTHERS = "others"
+_NONE = Estimate(math.nan, math.nan, math.nan)  # of a cost that a variation has not
 
 
 def draw_variations(
@@ -65,7 +66,12 @@ def draw_variations(
         drawn = []
         for number, (row, group) in enumerate(groups.items()):
             axis = panels[number // columns * len(names) + line][number % columns]
-            _draw(axis, [(label, found[name]) for label, found in group], trained[name], colour)
+            _draw(
+                axis,
+                [(label, found.get(name, _NONE)) for label, found in group],
+                trained[name],
+                colour,
+            )
             if limit is not None:
                 axis.axhline(limit, **LIMIT_STYLE)
             if line == 0:

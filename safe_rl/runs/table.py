@@ -99,10 +99,13 @@ def _field(value: float) -> str:
 def read_table(path: Path) -> dict[str, list[float]]:
     """Read a table by columns, also a compressed one (``.gz``); empty fields are NaN.
 
+    A last line without its end, as a run that was killed leaves it, is no row.
+
     Raises:
         ValueError: If the file has no header, or holds more than any table of a run.
     """
-    rows = list(csv.reader(io.StringIO(_text(path), newline="")))
+    whole = _text(path).rpartition("\n")[0]
+    rows = list(csv.reader(io.StringIO(whole, newline="")))
     if not rows:
         raise ValueError(f"{path} is empty: the run has not finished an epoch.")
     columns = zip(*rows[1:], strict=True) if len(rows) > 1 else ([] for _ in rows[0])

@@ -72,6 +72,25 @@ def test_every_row_is_the_evaluation_of_its_environment(run, capsys):
         assert picture.width > 400
 
 
+def test_variations_may_have_other_costs(run, capsys):
+    config = OmegaConf.load(run / "config.yaml")
+    config.cost_limits = {"cost": 25, "cost_hazards": 20}
+    OmegaConf.save(config, run / "config.yaml")
+    rows = "{more: {env.constrain_vases: true}, free: {env.constrain_hazards: false}}"
+    assert main([str(run), f"variations={rows}", *QUICK]) == 0
+    found = rows_of(run)
+    has = {
+        name: [row["variation"] for row in found.values() if row[name]] for name in found["more"]
+    }
+    for name in ("episode_cost_hazards", "over_limit_cost_hazards_high"):
+        assert has[name] == ["as trained", "more"]
+    assert has["episode_cost_vases_contact"] == ["more"]
+    assert has["episode_cost_low"] == ["as trained", "more", "free"]
+    lines = {line.split()[0]: line for line in capsys.readouterr().out.splitlines() if line}
+    assert (lines["free"].count("—"), lines["more"].count("—")) == (2, 0)
+    assert "over 20" in lines["return"]
+
+
 def test_transforms_are_those_of_a_run_that_has_them(run, tmp_path):
     rows = "{noise: {transforms.sensor_noise.std: 0.5}, late: {transforms.action_delay.steps: 3}}"
     assert main([str(run), f"variations={rows}", "name=sensed", *QUICK]) == 0

@@ -52,3 +52,13 @@ def test_a_header_without_rows_gives_empty_columns(tmp_path):
     path = tmp_path / "progress.csv"
     path.write_text("epoch,steps\n")
     assert read_table(path) == {"epoch": [], "steps": []}
+
+
+def test_a_row_that_is_cut_off_is_no_row(tmp_path):
+    path = tmp_path / "progress.csv"
+    for cut_off in ("2", "2,4", "2,40"):
+        path.write_text(f"epoch,steps\n1,20\n{cut_off}")
+        assert read_table(path) == {"epoch": [1.0], "steps": [20.0]}
+    path.write_text("epoch,st")
+    with pytest.raises(ValueError, match="has not finished an epoch"):
+        read_table(path)
