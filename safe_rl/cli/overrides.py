@@ -36,7 +36,12 @@ __all__ = [
 COMPOSING_ERRORS = (HydraException, OmegaConfBaseException, YAMLError, ValueError)
 """What Hydra raises about overrides and files."""
 
-GIVEN_WHOLE = {"cost_limits": "limits", "model.input_scale": "factors"}
+_BUDGETED = ("saute", "simmer", "early_termination")
+GIVEN_WHOLE = {
+    **{"cost_limits": "limits", "model.input_scale": "factors"},
+    **{f"transforms.{name}.budgets": "budgets" for name in _BUDGETED},
+}
+_MOST_LISTED = 40
 _DEFAULT_RECIPE = "safe_rl.algorithms.OnPolicy"
 
 
@@ -70,7 +75,7 @@ def check_choices(overrides: Sequence[Override], loader: ConfigLoader) -> None:
             if name not in known:
                 raise CommandLineError(
                     f"'{override.input_line}': there is no {group} '{name}'."
-                    f"{did_you_mean(name, known)}"
+                    f"{did_you_mean(name, known) or _listed(known)}"
                 )
 
 
@@ -78,6 +83,13 @@ def _names(choices: Iterable[str]) -> Iterator[str]:
     """Single names of choices that are names or lists of them."""
     for choice in choices:
         yield from filter(None, re.split(r"[\[\],\s'\"]+", choice))
+
+
+def _listed(choices: Sequence[str]) -> str:
+    """What there is to choose from, or where that is told if a line cannot hold it."""
+    if len(choices) > _MOST_LISTED:
+        return " 'python train.py --help' names all there are."
+    return f" There are {', '.join(choices)}."
 
 
 def check_whole(overrides: Sequence[Override]) -> None:

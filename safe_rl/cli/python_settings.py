@@ -21,7 +21,10 @@ from safe_rl.cli.user_code import quote
 __all__ = ["compose_new", "compose_resumed", "overrides_of"]
 
 # mappings that are given all at once
-_WHOLE = (*GIVEN_WHOLE, "env.outside", "env.kwargs")
+_WHOLE = (
+    *GIVEN_WHOLE,
+    *("env.outside", "env.kwargs", "env.cost", "memory.prioritised", "policy_update.rates"),
+)
 
 
 def overrides_of(settings: Mapping[str, Any], prefix: str = "") -> Iterator[str]:

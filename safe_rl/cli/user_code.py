@@ -45,6 +45,9 @@ def split_imports(arguments: Sequence[str]) -> tuple[list[str] | None, list[str]
     Returns:
         The modules, None if ``import=`` is not given; and the other arguments.
 
+    Raises:
+        CommandLineError: If a list cannot be read.
+
     Examples:
         >>> split_imports(["import=mine", "seed=1", "import=[examples/other.py]"])
         (['mine', 'examples/other.py'], ['seed=1'])
@@ -54,9 +57,18 @@ def split_imports(arguments: Sequence[str]) -> tuple[list[str] | None, list[str]
     modules: list[str] = []
     for argument in given:
         text = argument.partition("=")[2]
-        value = yaml.safe_load(text) if text.startswith("[") else text
+        value = _read_list(argument, text) if text.startswith("[") else text
         modules += map(str, value) if isinstance(value, list) else [value]
     return (list(dict.fromkeys(modules)) if given else None), others
+
+
+def _read_list(argument: str, text: str) -> Any:
+    try:
+        return yaml.safe_load(text)
+    except yaml.YAMLError:
+        raise CommandLineError(
+            f"'{argument}' is no list: write {KEY}=[my_module,other_module]."
+        ) from None
 
 
 def note_imports(modules: Sequence[str], arguments: Sequence[str]) -> list[str]:
@@ -93,6 +105,8 @@ def import_modules(modules: Sequence[str]) -> None:
         CommandLineError: If one does not exist, cannot be imported, or is hidden by another.
     """
     for module in modules:
+        if not module.strip(". /"):
+            raise CommandLineError(f"{KEY}={module}: name a module, or a file by its path.")
         name, path = module, Path(*module.split(".")).with_suffix(".py")
         if module.endswith(".py"):
             path = Path(module).expanduser()

@@ -13,11 +13,12 @@ import torch
 from hydra import compose, initialize_config_dir
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.override_parser.overrides_parser import OverridesParser
+from omegaconf import OmegaConf
 from run_configs import CONF, without_times
 
 import safe_rl
-from safe_rl.cli.python_settings import overrides_of
-from safe_rl.envs import ConfigError
+from safe_rl.cli.python_settings import compose_new, overrides_of
+from safe_rl.envs import ConfigError, store_configs
 from safe_rl.evaluation.loading import find_checkpoint
 from safe_rl.runs.table import read_table
 from safe_rl.training.trainer import Trainer
@@ -190,6 +191,21 @@ def test_an_interrupted_run_says_how_to_go_on(tmp_path, monkeypatch, capsys):
 def test_mappings_that_go_together_and_numbers_of_numpy_are_written_as_hydra_takes_them():
     given = {"env.outside": {"cost_a": [0, -1, 1]}, "seed": np.int64(3)}
     assert list(overrides_of(given)) == ["env.outside={cost_a:[0,-1,1]}", "seed=3"]
+
+
+@pytest.mark.parametrize(
+    ("algo", "key", "value"),
+    [
+        ("ppo", "transforms.saute.budgets", {"cost_hazards": 10}),
+        ("sac", "memory.prioritised", {"alpha": 0.6, "beta": 0.4}),
+        ("sac", "policy_update.rates", {"alpha": 0.001}),
+    ],
+)
+def test_mappings_take_the_place_of_what_is_none(algo, key, value):
+    store_configs()
+    given = {"algo": algo, "transforms": ["saute"], key: value}
+    config = compose_new(list(overrides_of(given)))
+    assert OmegaConf.select(config, key) == value
 
 
 def test_an_interrupted_run_is_resumed_to_the_same_table(run, tmp_path, monkeypatch):

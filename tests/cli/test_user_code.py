@@ -14,7 +14,7 @@ from safe_rl.cli.overrides import CommandLineError
 from safe_rl.cli.shorthands import expand_arguments
 from safe_rl.cli.user_code import check_imports, import_modules, note_imports, split_imports
 from safe_rl.runs.record import RunRecord
-from safe_rl.training.trainer import build_trainer
+from safe_rl.training.building import build_trainer
 
 MODULE = """
 import pathlib
@@ -48,6 +48,11 @@ def test_a_noted_list_is_read_again(modules):
         assert split_imports(noted) == (modules, ["seed=1"])
 
 
+def test_a_list_that_cannot_be_read_is_told():
+    with pytest.raises(CommandLineError, match=r"'import=\[mine' is no list"):
+        split_imports(["import=[mine", "seed=1"])
+
+
 def test_overrides_stay_together():
     arguments = ["--config-dir", "conf", "algo=mine", "seed=1"]
     assert note_imports(["m"], arguments)[:3] == ["--config-dir", "conf", "++import=['m']"]
@@ -69,6 +74,8 @@ def test_modules_are_found_by_name_and_by_file(folder):
 @pytest.mark.parametrize(
     ("module", "message"),
     [
+        ("", "name a module"),
+        ("./", "name a module"),
         ("users_nowhere", "import=users_nowhere: there is no module 'users_nowhere'"),
         ("users_nowhere.py", "import=users_nowhere.py: there is no such file"),
         ("users_broken", r"ZeroDivisionError: .*users_broken.py, line 2\)"),
