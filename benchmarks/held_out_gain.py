@@ -27,7 +27,7 @@ from safe_rl.algorithms import TRPOStep
 from safe_rl.evaluation.loading import find_checkpoint
 from safe_rl.objectives import LagrangeMultiplier, TRPOLagrangianLoss
 from safe_rl.objectives.normalisation import normalise_advantages
-from safe_rl.training.trainer import build_trainer, seed_everything
+from safe_rl.training.building import build_trainer, seed_everything
 
 STEP = {
     "target_kl": 0.01,

@@ -24,7 +24,7 @@ from train_throughput import compose_config, new_env
 from safe_rl.evaluation import collect_episodes
 from safe_rl.runs.outcome import feasible_return
 from safe_rl.scores.certificate import Claim
-from safe_rl.training.trainer import build_trainer, seed_everything
+from safe_rl.training.building import build_trainer, seed_everything
 
 
 def is_promising(rows, limits, target):

@@ -17,7 +17,7 @@ from omegaconf import OmegaConf
 
 from safe_rl.envs import make_env, store_configs
 from safe_rl.evaluation.loading import transforms_of
-from safe_rl.training.trainer import build_trainer, seed_everything
+from safe_rl.training.building import build_trainer, seed_everything
 
 CONF = Path(__file__).resolve().parents[1] / "conf"
 

@@ -162,6 +162,7 @@ FLOORS = {
     "training": (
         ("candidates", "evaluating", "interrupts", "state", "threads", "transfer"),
         ("trainer",),
+        ("building",),
         ("",),
     ),
     "scores": (

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import copy
+import math
 from collections import deque
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any, NamedTuple
 
 from safe_rl.algorithms.contract import Stateful
@@ -16,7 +17,7 @@ __all__ = ["Candidates", "Judged", "epochs_until_judged"]
 _LONGEST = 10
 
 
-def epochs_until_judged(over: int, max_length: float, steps_per_epoch: float) -> int:
+def epochs_until_judged(over: int, length: float, steps_per_epoch: float) -> int:
     """Epochs from an update until the episodes that end were played, on average, by its policy.
 
     The batch that a policy collects comes an epoch after the update. Where batches are shorter than
@@ -24,16 +25,16 @@ def epochs_until_judged(over: int, max_length: float, steps_per_epoch: float) ->
 
     Args:
         over: Epochs by whose mean a policy is judged, of which this is the last.
-        max_length: Steps after which an episode is over.
+        length: Steps of an episode.
         steps_per_epoch: Steps of every row in an epoch.
 
     Examples:
-        >>> epochs_until_judged(over=1, max_length=1000, steps_per_epoch=1000)
+        >>> epochs_until_judged(over=1, length=1000, steps_per_epoch=1000)
         1
-        >>> epochs_until_judged(over=3, max_length=1000, steps_per_epoch=200)
+        >>> epochs_until_judged(over=3, length=1000, steps_per_epoch=200)
         4
     """
-    lag = max_length / steps_per_epoch / 2 if max_length > steps_per_epoch else 0.0
+    lag = length / steps_per_epoch / 2 if length > steps_per_epoch else 0.0
     return 1 + min(_LONGEST, int(lag) + over // 2)
 
 
@@ -60,12 +61,18 @@ class Candidates:
         components: Parts of the run, by name, that a checkpoint of a policy holds.
         limits: Cost key -> d, undiscounted cost per episode.
         over: Epochs by whose mean a policy is judged.
-        delay: Epochs from its update until the last of them.
+        delay: Of the mean length of the episodes that end, epochs from a policy's update until the
+            last of those by which it is judged.
+        longest: Steps after which an episode is over: the length until one has ended.
 
     Examples:
+        >>> import functools
         >>> import torch
         >>> network = torch.nn.Linear(2, 1)
-        >>> candidates = Candidates({"network": network}, {"cost": 25.0}, over=1, delay=1)
+        >>> delay = functools.partial(epochs_until_judged, 1, steps_per_epoch=10)
+        >>> candidates = Candidates(
+        ...     {"network": network}, {"cost": 25.0}, over=1, delay=delay, longest=10
+        ... )
         >>> row = {"episode_return": 5.0, "episode_cost": 20.0}
         >>> candidates.add({"epoch": 1, "steps": 100, **row})
         []
@@ -79,15 +86,18 @@ class Candidates:
         limits: Mapping[str, float],
         *,
         over: int,
-        delay: int,
+        delay: Callable[[float], int],
+        longest: float,
     ) -> None:
-        self._components, self._limits, self._delay = dict(components), dict(limits), delay
+        self._components, self._limits = dict(components), dict(limits)
+        self._delay, self._length = delay, float(longest)
         self._latest: deque[Mapping[str, float]] = deque(maxlen=over)
         self._waiting: deque[dict[str, Any]] = deque()
 
     def go_on_after(self, rows: Iterable[Mapping[str, float]]) -> None:
         """Take in the epochs of a run that is continued."""
-        self._latest.extend(rows)
+        for row in rows:
+            self._take(row)
 
     def add(self, row: Mapping[str, float]) -> list[Judged]:
         """Take in an epoch: its policy waits, and the one whose turn it is is judged.
@@ -96,12 +106,20 @@ class Candidates:
             row: Of the run's table, by column.
 
         Returns:
-            The judged policy, if it kept every limit.
+            The judged policy, if it kept every limit. Where episodes have become shorter, those
+            before it, whose own episodes are over, are passed over.
         """
-        self._latest.append(row)
+        self._take(row)
         states = {name: copy.deepcopy(part.state_dict()) for name, part in self._components.items()}
         self._waiting.append({"steps": row["steps"], "epoch": row["epoch"], "states": states})
-        return self._judge(self._waiting.popleft()) if len(self._waiting) > self._delay else []
+        due = len(self._waiting) - self._delay(self._length)
+        passed = [self._waiting.popleft() for _ in range(due)]
+        return self._judge(passed[-1]) if passed else []
+
+    def _take(self, row: Mapping[str, float]) -> None:
+        self._latest.append(row)
+        length = row.get("episode_length", math.nan)
+        self._length = length if math.isfinite(length) else self._length
 
     @property
     def waiting(self) -> list[int]:

@@ -14,81 +14,23 @@ from torchrl.checkpoint import GlobalRNGState
 from torchrl.collectors import Collector
 from torchrl.envs import EnvBase
 
-from safe_rl.algorithms.constraints import check_cost_limits
 from safe_rl.algorithms.contract import Algorithm, Stateful
 from safe_rl.algorithms.matrix_products import fast_products
-from safe_rl.algorithms.parts import find_recipe
 from safe_rl.algorithms.side_by_side import torch_threads
-from safe_rl.collectors import EpisodeAccounting, Recording, WorkerCollector, make_collector
-from safe_rl.collectors.workers import MakeEnv
+from safe_rl.collectors import EpisodeAccounting, Recording, WorkerCollector
 from safe_rl.runs.checkpoints import CheckpointStore
 from safe_rl.runs.lock import held
 from safe_rl.runs.record import RunRecord
-from safe_rl.targets import build
 from safe_rl.training.candidates import Candidates, Judged, epochs_until_judged
-from safe_rl.training.evaluating import Evaluation, MakeEvaluation
+from safe_rl.training.evaluating import Evaluation
 from safe_rl.training.interrupts import StopRequest
 from safe_rl.training.state import Progress, WorldSnapshot
 
-__all__ = ["Trainer", "build_trainer", "seed_everything"]
+__all__ = ["Trainer"]
 
 # what only going on takes, which the last checkpoints have: several times what a policy is, and a
 # memory fills gigabytes
 _TO_GO_ON = {"memory", "policy_update", "critic_update", "env", "accounting", "rng"}
-
-
-def seed_everything(seed: int, num_threads: int | None) -> None:
-    """Seed torch and set the number of threads it computes with; None leaves the number alone."""
-    torch.manual_seed(seed)
-    if num_threads is not None:
-        torch.set_num_threads(num_threads)
-
-
-def build_trainer(
-    config: DictConfig,
-    env: EnvBase,
-    directory: Path,
-    make_env: MakeEnv | None = None,
-    make_evaluation: MakeEvaluation | None = None,
-) -> Trainer:
-    """Build everything that a run consists of.
-
-    Args:
-        config: Configuration as composed from ``conf/``.
-        env: Seeded environment that keeps the contract of `safe_rl.envs`; if it has ``get_state``
-            and ``set_state``, a checkpoint holds the state of its worlds.
-        directory: Folder of the run.
-        make_env: Makes an environment like ``env`` with another ``num_envs``, for collectors with
-            workers.
-        make_evaluation: Makes, of the policy, what evaluates it in between.
-
-    Raises:
-        ValueError: If parts of the configuration do not fit together.
-    """
-    cost_limits = check_cost_limits(config.cost_limits, env.cost_keys)
-    algorithm = find_recipe(config).build(config, env)
-    folder = RunRecord(directory, config, cost_limits, env.max_episode_steps)
-    recording = Recording(folder.files.transitions, env.cost_keys)
-    return Trainer(
-        env=env,
-        algorithm=algorithm,
-        collector=_build_collector(config, env, make_env, algorithm),
-        cost_limits=cost_limits,
-        folder=folder,
-        config=config,
-        evaluation=None if make_evaluation is None else make_evaluation(algorithm.policy),
-        recording=recording if config.get("record") else None,
-    )
-
-
-def _build_collector(
-    config: DictConfig, env: EnvBase, make_env: MakeEnv | None, algorithm: Algorithm
-) -> Collector | WorkerCollector:
-    policy = algorithm.policy
-    numbers = {"frames_per_batch": config.frames_per_batch, "device": config.device}
-    if config.collector.get("_target_") is None:
-        return make_collector(env, policy, **numbers)
-    return build(config.collector, env=env, make_env=make_env, policy=policy, **numbers)
 
 
 class Trainer:
@@ -162,7 +104,8 @@ class Trainer:
             {name: part for name, part in self._parts().items() if name not in _TO_GO_ON},
             limits,
             over=over,
-            delay=behind + epochs_until_judged(over, self.episode_length, steps),
+            delay=lambda length: behind + epochs_until_judged(over, length, steps),
+            longest=self.episode_length,
         )
 
     def components(self) -> dict[str, Stateful]:
@@ -218,9 +161,10 @@ class Trainer:
         getattr(self.algorithm, "forget_open_episodes", lambda: None)()
         if hasattr(self._env, "continue_from"):
             self._env.continue_from(self.progress.steps // self._env.batch_size.numel())
+        # otherwise it would meet the episodes again that the run began with; workers, which have
+        # not begun, go on from its state
+        self._env.set_seed(int(torch.randint(2**31, ())))
         if isinstance(self._collector, Collector):
-            # otherwise it would meet the episodes again that the run began with
-            self._env.set_seed(int(torch.randint(2**31, ())))
             self._collector.reset()
 
     def run(self) -> str:

@@ -11,7 +11,7 @@ from safe_rl import targets
 from safe_rl.cli import user_code
 from safe_rl.cli.user_code import import_modules
 from safe_rl.runs.table import read_table
-from safe_rl.training.trainer import build_trainer
+from safe_rl.training.building import build_trainer
 
 PAGE = (CONF.parent / "docs" / "guides" / "algorithm.md").read_text()
 

@@ -11,7 +11,7 @@ from run_configs import CONF, compose_config, point_mass_config
 from safe_rl.algorithms import OffPolicy
 from safe_rl.algorithms.parts import find_recipe
 from safe_rl.runs.table import read_table
-from safe_rl.training.trainer import build_trainer
+from safe_rl.training.building import build_trainer
 
 FOLDER = CONF.parent / "docs" / "algorithms"
 PAGE = (FOLDER / "index.md").read_text()

@@ -10,7 +10,7 @@ from run_configs import CONF, compose_config
 
 from safe_rl.collectors import Recording
 from safe_rl.runs.table import read_table
-from safe_rl.training.trainer import build_trainer
+from safe_rl.training.building import build_trainer
 
 PAGE = (CONF.parent / "docs" / "off_policy.md").read_text()
 ALL = (CONF.parent / "docs" / "algorithms" / "index.md").read_text()

@@ -6,7 +6,7 @@ from run_configs import compose_config
 
 from safe_rl.envs import OpenGLError, make_env, store_configs
 from safe_rl.evaluation.settings import EvaluationOptions
-from safe_rl.training.trainer import build_trainer, seed_everything
+from safe_rl.training.building import build_trainer, seed_everything
 
 NUM_STEPS = 40
 

@@ -16,7 +16,7 @@ from safe_rl.evaluation.loading import find_checkpoint
 from safe_rl.reporting.measured import read_certificate
 from safe_rl.runs.folder import RunFolder
 from safe_rl.scores.certificate import Verdict
-from safe_rl.training.trainer import build_trainer, seed_everything
+from safe_rl.training.building import build_trainer, seed_everything
 
 OPTIONS = CertificateOptions(ranking=6, episodes=12, tests=2, level=0.95, most_over=1.0)
 

@@ -36,7 +36,7 @@ def evaluate(run, text):
 
 
 def table(run, text):
-    (run / "progress.csv").write_text(text)
+    (run / "progress.csv").write_text(text and f"{text}\n")
 
 
 def instead(run, name):

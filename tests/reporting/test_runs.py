@@ -71,7 +71,7 @@ def test_what_is_no_run_is_named_with_its_reason(tmp_path):
     (foreign / "config.yaml").write_text("some: thing")
     (unbegun / "progress.csv").unlink()
     (empty / "progress.csv").write_text("epoch,steps\n")
-    (torn / "progress.csv").write_text("epoch,steps\n1,1000\n2")
+    (torn / "progress.csv").write_text("epoch,steps\n1,1000\n2\n")
     (garbled / "config.yaml").write_text("{")
     runs, skipped = find_runs(tmp_path)
     assert [run.directory for run in runs] == [good]

@@ -8,7 +8,7 @@ from run_configs import point_mass_config
 
 from safe_rl.runs.loggers import WandbLogger
 from safe_rl.runs.table import read_table
-from safe_rl.training.trainer import build_trainer, seed_everything
+from safe_rl.training.building import build_trainer, seed_everything
 
 
 def train(directory, *overrides):

@@ -23,7 +23,7 @@ from safe_rl.runs.folder import RunFolder
 from safe_rl.runs.lock import RunInUseError
 from safe_rl.runs.resuming import check_same_run, is_finished, may_continue
 from safe_rl.runs.table import read_table
-from safe_rl.training.trainer import build_trainer, seed_everything
+from safe_rl.training.building import build_trainer, seed_everything
 
 store_configs()
 

@@ -1,5 +1,7 @@
 """The best policies: judged by episodes whose policies are known by construction."""
 
+import functools
+
 import pytest
 import torch
 
@@ -44,8 +46,8 @@ def epochs(values, rows, steps):
 def judge(values, rows, steps, over=3):
     """Scores by the number of the policy."""
     policy = Policy()
-    delay = epochs_until_judged(over, EPISODE, steps)
-    candidates = Candidates({"policy": policy}, {}, over=over, delay=delay)
+    delay = functools.partial(epochs_until_judged, over, steps_per_epoch=steps)
+    candidates = Candidates({"policy": policy}, {}, over=over, delay=delay, longest=EPISODE)
     judged = []
     for row in epochs(values, rows, steps):
         # what collected this batch was policy epoch − 1; the update makes it the next one
@@ -73,7 +75,7 @@ def test_a_single_epoch_of_whole_episodes_judges_the_policy_that_played_them():
 
 
 def test_limits_are_held_against_the_mean_of_the_epochs():
-    candidates = Candidates({}, {"cost": 25.0}, over=2, delay=1)
+    candidates = Candidates({}, {"cost": 25.0}, over=2, delay=lambda length: 1, longest=1)
     kept = []
     for epoch, cost in enumerate((20.0, 28.0, 30.0, 16.0, 10.0), 1):
         row = {"epoch": epoch, "steps": epoch, "episode_return": 1.0, "episode_cost": cost}
@@ -84,7 +86,7 @@ def test_limits_are_held_against_the_mean_of_the_epochs():
 
 
 def test_who_was_judged_at_the_end_is_judged_again_by_epochs_that_come_later():
-    candidates = Candidates({}, {"cost": 25.0}, over=1, delay=1)
+    candidates = Candidates({}, {"cost": 25.0}, over=1, delay=lambda length: 1, longest=1)
     row = {"epoch": 1, "steps": 1, "episode_return": 1.0}
     assert candidates.add(row | {"episode_cost": 20.0}) == []
     assert [one.steps for one in candidates.judge_all()] == [1]
@@ -95,13 +97,28 @@ def test_who_was_judged_at_the_end_is_judged_again_by_epochs_that_come_later():
 def test_what_waits_is_a_copy_and_survives_a_checkpoint():
     network = torch.nn.Linear(1, 1)
     row = {"episode_return": 1.0}
-    first = Candidates({"network": network}, {}, over=1, delay=1)
+    first = Candidates({"network": network}, {}, over=1, delay=lambda length: 1, longest=1)
     assert first.add({"epoch": 1, "steps": 1, **row}) == []
     before = network.weight.detach().clone()
     with torch.no_grad():
         network.weight.add_(1.0)
-    second = Candidates({"network": network}, {}, over=1, delay=1)
+    second = Candidates({"network": network}, {}, over=1, delay=lambda length: 1, longest=1)
     second.load_state_dict(first.state_dict())
     (judged,) = second.add({"epoch": 2, "steps": 2, **row})
     assert judged.steps == 1
     assert torch.equal(judged.states["network"]["weight"], before)
+
+
+def test_of_short_episodes_nobody_waits_as_if_they_were_long():
+    delay = functools.partial(epochs_until_judged, 1, steps_per_epoch=200)
+    candidates = Candidates({}, {}, over=1, delay=delay, longest=1000)
+    judged = []
+    for epoch, length in enumerate((float("nan"), 1000.0, 1000.0, 50.0, 50.0, float("nan")), 1):
+        row = {"epoch": epoch, "steps": epoch, "episode_return": epoch, "episode_length": length}
+        judged.append([(one.steps, one.score) for one in candidates.add(row)])
+    # the batch after their update, once it is known that episodes are short
+    assert judged == [[], [], [], [(3, 4)], [(4, 5)], [(5, 6)]]
+    again = Candidates({}, {}, over=1, delay=delay, longest=1000)
+    again.go_on_after([{"episode_length": 50.0}])
+    row = {"epoch": 7, "steps": 7, "episode_return": 7.0}
+    assert [again.add(row), [one.steps for one in again.add(row | {"steps": 8})]] == [[], [7]]

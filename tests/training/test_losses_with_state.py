@@ -14,7 +14,7 @@ from safe_rl.algorithms.loss_state import LossState
 from safe_rl.models import make_actor
 from safe_rl.objectives import PPOLagrangianLoss, TRPOLagrangianLoss
 from safe_rl.runs.table import read_table
-from safe_rl.training.trainer import build_trainer, seed_everything
+from safe_rl.training.building import build_trainer, seed_everything
 
 
 class _Remembering:

@@ -11,9 +11,10 @@ from run_configs import compose_config, without_times
 
 from safe_rl.algorithms.parts import find_recipe
 from safe_rl.cli import evaluate, train
+from safe_rl.collectors import read_dataset
 from safe_rl.envs import make_env
 from safe_rl.runs.table import read_table
-from safe_rl.training.trainer import build_trainer, seed_everything
+from safe_rl.training.building import build_trainer, seed_everything
 
 SMALL = (
     *("logger=none", "num_threads=1", "certificate.episodes=0", "num_envs=4", "env.num_steps=25"),
@@ -99,3 +100,14 @@ def test_a_memory_recalls_what_was_shown_once(model, lowest, highest, tmp_path):
     )
     table = read_table(tmp_path / "progress.csv")
     assert lowest < sum(table["episode_return"][-5:]) / 5 <= highest
+
+
+def test_workers_of_a_resumed_run_do_not_begin_with_its_first_episodes_again(tmp_path):
+    """They have no worlds to go on with, and get new ones."""
+    keys = ("env=PointGoal1", "collector=process", "collector.num_collectors=1", "record=true")
+    run_train(*SMALL, *PPO, *keys, "frames=160", f"hydra.run.dir={tmp_path}")
+    run_train(f"resume={tmp_path}", "frames=320")
+    steps = read_dataset(tmp_path / "transitions")
+    assert steps.shape == (4, 80)
+    first, resumed = steps["observation"][:, 0], steps["observation"][:, 40]
+    assert not (first == resumed).all(-1).any()

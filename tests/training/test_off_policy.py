@@ -15,7 +15,7 @@ from safe_rl.evaluation.during import PeriodicEvaluation
 from safe_rl.evaluation.episodes import collect_episodes
 from safe_rl.evaluation.loading import find_checkpoint, load_config, load_policy
 from safe_rl.runs.table import read_table
-from safe_rl.training.trainer import build_trainer, seed_everything
+from safe_rl.training.building import build_trainer, seed_everything
 from safe_rl.training.transfer import begin_from
 
 NAMES = ["sac", "sac_lagrangian", "td3", "td3_lagrangian", "wcsac", "cal"]

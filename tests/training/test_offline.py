@@ -14,7 +14,7 @@ from safe_rl.evaluation.episodes import collect_episodes
 from safe_rl.models import make_bounded_actor
 from safe_rl.objectives import BCLoss
 from safe_rl.runs.table import read_table
-from safe_rl.training.trainer import build_trainer, seed_everything
+from safe_rl.training.building import build_trainer, seed_everything
 
 
 def head_north(observation):

@@ -18,8 +18,9 @@ from safe_rl.runs.checkpoints import CheckpointStore
 from safe_rl.runs.folder import checkpoints_in
 from safe_rl.runs.table import read_table
 from safe_rl.targets import allow
+from safe_rl.training.building import build_trainer, seed_everything
 from safe_rl.training.interrupts import StopRequest
-from safe_rl.training.trainer import Trainer, build_trainer, seed_everything
+from safe_rl.training.trainer import Trainer
 
 allow("test_training")
 

@@ -11,7 +11,7 @@ from torchrl.checkpoint import CheckpointError
 
 from safe_rl.models import QEnsemble, make_bounded_actor
 from safe_rl.runs.checkpoints import CheckpointStore
-from safe_rl.training.trainer import build_trainer, seed_everything
+from safe_rl.training.building import build_trainer, seed_everything
 from safe_rl.training.transfer import initialise_networks
 
 

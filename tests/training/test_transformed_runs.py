@@ -15,7 +15,7 @@ from safe_rl.envs.transforms import transform_env
 from safe_rl.evaluation.loading import transforms_of
 from safe_rl.runs.identity import experiment_of
 from safe_rl.runs.table import read_table
-from safe_rl.training.trainer import build_trainer, seed_everything
+from safe_rl.training.building import build_trainer, seed_everything
 
 SAUTE = ["algo=ppo", "transforms=[saute]", "cost_limits={cost: 0.5}"]
 
