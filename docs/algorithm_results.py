@@ -99,8 +99,8 @@ def comparison(algorithms: Iterable[str]) -> str:
 
 Limit 25, one million steps, with the defaults of the commit of each run. Seeds that were run with
 different settings have a row for each, which names what differs. A single seed is a direction, not
-a verdict. The constrained on-policy runs are of before the
-[estimate of the cost](holding_the_limit.md) was mended, those on CarGoal1 also of before the
+a verdict. The constrained on-policy runs on CarGoal1 are of before the
+[estimate of the cost](holding_the_limit.md) was mended and of before the
 [present defaults](holding_the_limit.md#settings-tried).
 
 ## At equal steps
