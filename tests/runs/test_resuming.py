@@ -7,6 +7,7 @@ import random
 import shutil
 import signal
 import time
+from threading import RLock
 from types import SimpleNamespace
 
 import pytest
@@ -16,6 +17,7 @@ from point_mass import PointMass
 from run_configs import compose_config, point_mass_config, without_times
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from torchrl.checkpoint import Checkpoint, CheckpointError
+from tqdm import tqdm
 
 from safe_rl.envs import SafetyGymEnv, store_configs
 from safe_rl.runs.checkpoints import CheckpointStore
@@ -56,8 +58,14 @@ def train(directory, *overrides, **options):
 
 def in_a_process(directory, *overrides, **options):
     """Start a process of its own that trains; only such a one can be killed."""
+
+    def train_with_a_lock_of_its_own():
+        # forked processes share that of progress bars: a killed one may leave it locked for ever
+        tqdm.set_lock(RLock())
+        train(directory, *overrides, **options)
+
     process = multiprocessing.get_context("fork").Process(
-        target=train, args=(directory, *overrides), kwargs=options, daemon=True
+        target=train_with_a_lock_of_its_own, daemon=True
     )
     process.start()
     return process
