@@ -1,7 +1,7 @@
-"""Processes that end with the one that has started them.
+"""Processes that end with the one that has started them, and leave signals to it.
 
-It stands on the top floor because sweeps and collectors start processes, and neither room may know
-the other.
+It stands on the top floor because sweeps, collectors and environments start processes, and these
+rooms may not know each other.
 """
 
 from __future__ import annotations
@@ -9,9 +9,12 @@ from __future__ import annotations
 import os
 import signal
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from multiprocessing import resource_tracker
 from threading import Thread
 
-__all__ = ["end_with_parent", "is_stopped"]
+__all__ = ["end_with_parent", "is_stopped", "leave_signals_to_parent", "starting_processes"]
 
 _LOOK = 1.0
 """Seconds between looks at the parent."""
@@ -40,6 +43,45 @@ def end_with_parent(grace: float = 0.0) -> None:
         os._exit(1)
 
     Thread(target=watch, name="end with parent", daemon=True).start()
+
+
+@contextmanager
+def starting_processes() -> Iterator[None]:
+    """Keep SIGINT and SIGTERM from processes that this thread starts meanwhile.
+
+    Ctrl-C, and what ends the jobs of a cluster, reach all processes of a run; its first one heeds
+    them. The others take seconds to start, in which they would be ended. They keep both signals
+    waiting until they call :func:`leave_signals_to_parent`.
+    """
+    # which would let signals through again when it is started along with the first process
+    resource_tracker.ensure_running()
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT, signal.SIGTERM})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+def leave_signals_to_parent() -> None:
+    """End with the parent, or when it sends SIGTERM; pass over SIGINT, and SIGTERM of others.
+
+    To be called in the main thread of a process that was begun within :func:`starting_processes`.
+    Where the system does not tell who has sent a signal, as macOS, SIGTERM of anybody ends it.
+    """
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    parent = os.getppid()
+    end_with_parent()
+    if not hasattr(signal, "sigwaitinfo"):
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGTERM})
+        return
+    signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGTERM})
+
+    def wait() -> None:
+        while signal.sigwaitinfo({signal.SIGTERM}).si_pid != parent:
+            pass
+        os._exit(128 + signal.SIGTERM)
+
+    Thread(target=wait, name="wait for the parent's order", daemon=True).start()
 
 
 def is_stopped(pid: int) -> bool:

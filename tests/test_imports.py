@@ -20,7 +20,7 @@ PARTS = {
     "naming": (),
     "lazy": (),
     "targets": ("naming",),
-    "envs": ("lazy", "naming", "targets"),
+    "envs": ("lazy", "naming", "processes", "targets"),
     "objectives": ("naming",),
     "collectors": ("extras", "naming", "processes"),
     "models": (),
@@ -171,7 +171,8 @@ FLOORS = {
         ("",),
     ),
     "cli": (
-        ("benchmark", "conf", "options", "robots", "run_folders", "sweep_display", "values"),
+        ("benchmark", "conf", "interrupting", "options", "robots", "run_folders"),
+        ("sweep_display", "values"),
         ("keys",),
         ("loss_keys",),
         ("part_keys",),

@@ -15,10 +15,12 @@ from safe_rl.cli.robots import maker_of
 from safe_rl.evaluation import Certificate, CertificateOptions, certify
 from safe_rl.evaluation.loading import load_config
 from safe_rl.naming import did_you_mean
+from safe_rl.runs.folder import RunFolder
+from safe_rl.runs.lock import held
 
 __all__ = [
-    *("certificate_options", "certify_run", "is_to_keep_limits", "is_worth_a_certificate"),
-    *("train_on", "why_not_certified"),
+    *("certificate_options", "certify_ended", "certify_run", "is_to_keep_limits"),
+    *("is_worth_a_certificate", "train_on", "why_not_certified"),
 ]
 
 
@@ -40,13 +42,31 @@ def certify_run(
     Raises:
         ValueError: If an option does not exist, or cannot have its value.
     """
-    return certify(
+    certificate = certify(
         directory,
         certificate_options(load_config(directory), changes or {}),
         make_env=maker_of(directory),
         num_threads=num_threads,
         progress=progress,
     )
+    RunFolder(directory).certifying.unlink(missing_ok=True)
+    return certificate
+
+
+def certify_ended(directory: Path, num_threads: int = 0) -> Certificate | None:
+    """:func:`certify_run` for one that has come to its end; interrupted, it leaves a note of that.
+
+    Args:
+        directory: Folder of the run, into which nobody else writes meanwhile.
+        num_threads: Threads that step environments; 0 is one per core.
+
+    Raises:
+        RunInUseError: If another process writes there.
+    """
+    folder = RunFolder(directory)
+    with held(folder):
+        folder.certifying.touch()
+        return certify_run(directory, num_threads=num_threads)
 
 
 def certificate_options(

@@ -11,6 +11,7 @@ from torchrl.checkpoint import CheckpointError
 
 from safe_rl.cli.benchmark import suite
 from safe_rl.cli.certificates import certify_run
+from safe_rl.cli.interrupting import say_interruptions
 from safe_rl.cli.options import OptionError, parse_options, usage
 from safe_rl.cli.robots import maker_of
 from safe_rl.cli.user_code import check_imports, import_modules, split_imports
@@ -42,6 +43,7 @@ def evaluate_run(
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """The command; returns its exit status."""
+    say_interruptions()
     arguments = sys.argv[1:] if arguments is None else list(arguments)
     if not arguments or arguments[0] in ("-h", "--help"):
         print(usage(f"{COMMAND} RUN_DIR", EvaluationOptions))

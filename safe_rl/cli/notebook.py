@@ -18,7 +18,12 @@ from omegaconf import DictConfig, open_dict
 from tensordict.nn import TensorDictModuleBase
 from torchrl.envs import EnvBase
 
-from safe_rl.cli.certificates import certify_run, is_to_keep_limits, is_worth_a_certificate
+from safe_rl.cli.certificates import (
+    certify_ended,
+    certify_run,
+    is_to_keep_limits,
+    is_worth_a_certificate,
+)
 from safe_rl.cli.evaluate import evaluate_run
 from safe_rl.cli.options import take_options
 from safe_rl.cli.python_settings import compose_new, compose_resumed, overrides_of
@@ -239,6 +244,8 @@ def _carry_out(config: DictConfig, folder: Path, *, continues: bool) -> Run:
             trainer = prepare(config, folder, continues)
             has_begun = True
             if trainer is None:
+                if RunFolder(folder).certifying.exists():
+                    certify_ended(folder)
                 return Run(folder)
             trainer.run()
     finally:
@@ -255,7 +262,7 @@ def _carry_out(config: DictConfig, folder: Path, *, continues: bool) -> Run:
     if is_to_keep_limits(config, trainer.algorithm.cost_keys) and is_worth_a_certificate(
         config, trainer.episode_length
     ):
-        certify_run(folder)
+        certify_ended(folder)
     return Run(folder)
 
 

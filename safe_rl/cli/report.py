@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from safe_rl.cli.benchmark import suite
+from safe_rl.cli.interrupting import say_interruptions
 from safe_rl.cli.options import OptionError, parse_options, usage
 from safe_rl.cli.user_code import import_modules, split_imports
 from safe_rl.reporting import Report, build_report, write_report
@@ -80,6 +81,7 @@ def report(root: Path, options: ReportOptions) -> tuple[Report, Path]:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """The command; returns its exit status."""
+    say_interruptions()
     arguments = sys.argv[1:] if arguments is None else list(arguments)
     if not arguments or arguments[0] in ("-h", "--help"):
         print(usage(f"{COMMAND} RUNS_DIR", ReportOptions))

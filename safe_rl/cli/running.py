@@ -7,6 +7,7 @@ import sys
 from contextlib import AbstractContextManager, ExitStack, nullcontext
 from functools import partial
 from pathlib import Path
+from signal import SIGINT
 from typing import Any, cast
 
 from hydra.core.hydra_config import HydraConfig
@@ -14,7 +15,7 @@ from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf, open_dict
 
 from safe_rl.cli.certificates import (
-    certify_run,
+    certify_ended,
     is_to_keep_limits,
     is_worth_a_certificate,
     train_on,
@@ -127,6 +128,8 @@ def run(config: DictConfig) -> None:
             stack.enter_context(held(folder))
             trainer = prepare(config, folder.directory, continues)
         if trainer is None:
+            if folder.certifying.exists():
+                _say_certificate(config, folder)
             return
         # the last is what is not finite: where it stands says less than the message
         with in_a_line(OSError, ConfigError, FloatingPointError):
@@ -136,8 +139,12 @@ def run(config: DictConfig) -> None:
     if trainer.interrupted_by is not None:
         print(f"Interrupted. Continue with: {_this_command()} resume={folder.directory}")
         raise SystemExit(128 + trainer.interrupted_by)
-    if is_to_keep_limits(config, trainer.algorithm.cost_keys):
-        _say_certificate(config, folder, trainer.episode_length)
+    if not is_to_keep_limits(config, trainer.algorithm.cost_keys):
+        return
+    if is_worth_a_certificate(config, trainer.episode_length):
+        _say_certificate(config, folder)
+    elif reason := why_not_certified(config, trainer.episode_length, folder.directory):
+        print(reason)
 
 
 def _this_command() -> str:
@@ -145,11 +152,13 @@ def _this_command() -> str:
     return sys.argv[0] if sys.argv[0].startswith("safe-rl") else "python train.py"
 
 
-def _say_certificate(config: DictConfig, folder: RunFolder, episode_length: int) -> None:
-    if is_worth_a_certificate(config, episode_length):
-        certificate = certify_run(folder.directory, num_threads=config.num_threads or 0)
-        print(certificate)
-        if certificate is not None and certificate.checkpoint is None:
-            print(f"To train on: {_this_command()} {train_on(config, folder.directory)}")
-    elif reason := why_not_certified(config, episode_length, folder.directory):
-        print(reason)
+def _say_certificate(config: DictConfig, folder: RunFolder) -> None:
+    try:
+        certificate = certify_ended(folder.directory, config.num_threads or 0)
+    except KeyboardInterrupt:
+        again = f"{_this_command()} resume={folder.directory}"
+        print(f"Interrupted before it was certified. To do so: {again}")
+        raise SystemExit(128 + SIGINT) from None
+    print(certificate)
+    if certificate is not None and certificate.checkpoint is None:
+        print(f"To train on: {_this_command()} {train_on(config, folder.directory)}")

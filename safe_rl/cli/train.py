@@ -12,6 +12,7 @@ from omegaconf import DictConfig
 
 from safe_rl.cli.composing import check_command
 from safe_rl.cli.conf import CONF
+from safe_rl.cli.interrupting import say_interruptions
 from safe_rl.cli.overrides import CommandLineError
 from safe_rl.cli.settings import SettingError
 from safe_rl.cli.shorthands import expand_arguments
@@ -32,6 +33,7 @@ def train(config: DictConfig) -> None:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """The command: expand shorthands, check what is asked for, and hand over to Hydra."""
+    say_interruptions()
     try:
         given = sys.argv[1:] if arguments is None else list(arguments)
         modules, given = split_imports(given)

@@ -6,7 +6,6 @@ have in a single process, so that a run meets the same kind of episodes however 
 
 from __future__ import annotations
 
-import signal
 import sys
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, wait
@@ -24,7 +23,7 @@ from torchrl.envs import EnvBase
 
 from safe_rl.collectors.ahead import behind
 from safe_rl.collectors.ending import end_processes
-from safe_rl.processes import end_with_parent, is_stopped
+from safe_rl.processes import is_stopped, leave_signals_to_parent, starting_processes
 
 __all__ = ["MakeEnv", "WorkerCollector", "make_process_collector", "make_ray_collector"]
 
@@ -134,6 +133,13 @@ class WorkerCollector:
             "resume=."
         )
 
+    def kill(self) -> None:
+        """End the workers at once, whatever they are at; those on other machines as they end."""
+        if getattr(self._workers, "procs", None):
+            end_processes(self._workers)
+        else:
+            self.shutdown()
+
     def shutdown(self) -> None:
         """End the workers, if there are any."""
         if self._workers is not None and not getattr(self._workers, "closed", False):
@@ -195,19 +201,21 @@ def make_process_collector(
 
     def start(known: Known) -> None:
         catch_up()  # since it was built, the policy may have got the weights of a checkpoint
-        _ProcessCollector(
-            known,
-            share_rows(env, make_env, num_collectors),
-            acting,
-            frames_per_batch=frames_per_batch,
-            total_frames=-1,
-            policy_device="cpu",
-            env_device="cpu",
-            storing_device="cpu",
-            cat_results=0,
-            use_buffers=True,
-            auto_register_policy_transforms=False,
-        )
+        shares = share_rows(env, make_env, num_collectors)
+        with starting_processes():
+            _ProcessCollector(
+                known,
+                shares,
+                acting,
+                frames_per_batch=frames_per_batch,
+                total_frames=-1,
+                policy_device="cpu",
+                env_device="cpu",
+                storing_device="cpu",
+                cat_results=0,
+                use_buffers=True,
+                auto_register_policy_transforms=False,
+            )
 
     return WorkerCollector(start, env.batch_size.numel(), torch.device(device), refresh)
 
@@ -294,9 +302,8 @@ def _make_share(
     # of the policy's noise: every worker needs its own
     torch.manual_seed(seed)
     if parent_process() is not None:
-        # Ctrl-C reaches every process; it is the first one's to end the run, with a checkpoint
-        signal.signal(signal.SIGINT, signal.SIG_IGN)
-        end_with_parent()
+        # which ends the run, with a checkpoint
+        leave_signals_to_parent()
     env = make_env(num_envs=num_envs)
     if state is not None:
         env.set_state(state)

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import os
 import re
 from dataclasses import dataclass
+from fnmatch import fnmatchcase
 from pathlib import Path
 
 __all__ = [
@@ -13,6 +15,7 @@ __all__ = [
     "checkpoint_steps",
     "checkpoints_in",
     "common_source",
+    "files_below",
     "run_of",
     "runs_below",
 ]
@@ -139,6 +142,11 @@ class RunFolder:
         """Which checkpoint surely keeps the limits."""
         return self.directory / "certificate.json"
 
+    @property
+    def certifying(self) -> Path:
+        """What is there from the end of training until it is found out what the run comes to."""
+        return self.directory / ".certifying"
+
     def evaluation(self, name: str, suffix: str) -> Path:
         """What an evaluation leaves: ``json`` for estimates, ``csv``, ``mp4``, ``transitions``."""
         return self.directory / f"{'_'.join(filter(None, ('evaluation', name)))}.{suffix}"
@@ -209,9 +217,19 @@ class RunFolder:
 
 def runs_below(root: Path) -> list[RunFolder]:
     """Folders of runs below a folder, itself included, in the order of their paths."""
-    found = root.rglob(RunFolder(root).config.name)
+    found = files_below(root, RunFolder(root).config.name)
     notes = RunFolder(root).notes.name
-    return [RunFolder(path.parent) for path in sorted(found) if path.parent.name != notes]
+    return [RunFolder(path.parent) for path in found if path.parent.name != notes]
+
+
+def files_below(root: Path, pattern: str) -> list[Path]:
+    """Files of such names below a folder, sorted; links to folders are not followed.
+
+    Folders may vanish meanwhile, as those of a checkpoint that is being written do, at which
+    `Path.rglob` fails.
+    """
+    names = ((Path(folder), name) for folder, _, names in os.walk(root) for name in names)
+    return sorted(folder / name for folder, name in names if fnmatchcase(name, pattern))
 
 
 def checkpoint_name(steps: int) -> str:

@@ -76,12 +76,13 @@ class RunRecord:
         with held(self.files):
             if epoch is None:
                 self.files.check_is_free()
-            self._table = TableWriter(self.files.table, keep_rows=epoch or 0)
             self._steps_before = steps
             # that of a continued run is replaced when it has proved to be one that trains
             self._is_config_saved = False
+            # before the table: one that is killed in between is no run yet, or one to go on with
             if epoch is None or not self.files.is_run:
                 self._save_config()
+            self._table = TableWriter(self.files.table, keep_rows=epoch or 0)
             self._logger = build(self._config.logger, log_dir=str(self.directory))
             if epoch is not None and hasattr(self._logger, "continue_from"):
                 self._logger.continue_from(steps)

@@ -186,8 +186,11 @@ class Trainer:
         return self.folder.summary()
 
     def close(self) -> None:
-        """End what collects: workers, if there are any, and the environment."""
-        self._collector.shutdown()
+        """End what collects, whatever it is at: workers, if there are any, and the environment."""
+        if isinstance(self._collector, WorkerCollector):
+            self._collector.kill()
+        else:
+            self._collector.shutdown()
         if not self._env.is_closed:
             self._env.close()
 

@@ -31,7 +31,7 @@ def claim(directory):
 def test_runs_that_begin_in_the_same_second_get_folders_of_their_own(tmp_path):
     wanted = tmp_path / "PointGoal1" / "ppo" / "2026-01-31_12-00-00_seed0"
     with multiprocessing.get_context("fork").Pool(4) as pool:
-        made = pool.map(claim, [wanted] * 12)
+        made = pool.map_async(claim, [wanted] * 12).get(timeout=300)
     assert sorted(made) == sorted(str(path) for path in wanted.parent.iterdir())
     assert str(wanted) in made
     assert len(set(made)) == 12

@@ -1,5 +1,6 @@
 """The command train.py as a whole: what Hydra is asked passes, what is wrong leaves nothing."""
 
+import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -8,7 +9,7 @@ import gymnasium
 import numpy as np
 import pytest
 
-from safe_rl.cli import train
+from safe_rl.cli import certificates, train
 from safe_rl.runs.table import read_table
 
 ROOT = Path(__file__).parents[2]
@@ -106,6 +107,41 @@ def test_a_run_without_a_certified_policy_says_how_to_train_on(command):
     assert before == "To train on: "
     assert command(*overrides.split())[0] == 0
     assert int(read_table(Path("runs/unsafe/progress.csv"))["steps"][-1]) == 80
+
+
+def test_a_run_interrupted_while_it_is_certified_is_certified_when_it_is_resumed(
+    command, monkeypatch
+):
+    def interrupt(*arguments, **options):
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(certificates, "certify", interrupt)
+        status, out, _ = command(
+            *["env=PointGoal1", "env.num_steps=20", "num_envs=2", "frames=40", "logger=none"],
+            *["frames_per_batch=40", "algo=ppo_lagrangian", "certificate.episodes=2"],
+            *["certificate.ranking=2", "hydra.run.dir=runs/mine"],
+        )
+    assert status == 130
+    before, _, resume = out.splitlines()[-1].partition("python train.py ")
+    assert before == "Interrupted before it was certified. To do so: "
+    assert not Path("runs/mine/certificate.json").exists()
+    assert command(resume)[0] == 0
+    written = Path("runs/mine/certificate.json")
+    assert written.exists()
+    assert not Path("runs/mine/.certifying").exists()
+    written.unlink()
+    assert command(resume)[0] == 0  # now it is one that is finished
+    assert not written.exists()
+
+
+def test_an_interruption_is_said_in_a_line_and_ends_by_the_signal():
+    source = "from safe_rl.cli.interrupting import say_interruptions as say\nsay()\n"
+    ended = subprocess.run(
+        [sys.executable, "-c", f"{source}raise KeyboardInterrupt"],
+        cwd=ROOT, capture_output=True, text=True, timeout=300,
+    )  # fmt: skip
+    assert (ended.returncode, ended.stderr) == (-signal.SIGINT, "Interrupted.\n")
 
 
 class OddCost(gymnasium.Env):

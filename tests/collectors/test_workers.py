@@ -7,6 +7,7 @@ import subprocess
 import sys
 import time
 from functools import partial
+from threading import Thread
 
 import pytest
 import torch
@@ -78,8 +79,40 @@ def test_batches_follow_the_weights_until_a_worker_dies():
     start = time.monotonic()
     with pytest.raises(RuntimeError, match=r"worker .* died \(exit code -9.*resume="):
         next(batches)
-    assert time.monotonic() - start < 30
+    assert time.monotonic() - start < 300
     collector.shutdown()
+
+
+def test_workers_leave_signals_to_the_first_process_from_their_start_on():
+    """Ctrl-C and what ends a cluster's job reach all; the first one ends its epoch with them."""
+    env = MAKE(num_envs=4)
+    actor = make_actor(
+        env.observation_spec["observation"].shape[-1], 2, hidden_sizes=[8], initial_log_std=-0.5
+    )
+    collector = make_process_collector(
+        env, MAKE, BehaviourPolicy(actor), frames_per_batch=80, num_collectors=1, device="cpu"
+    )
+
+    def processes():
+        return getattr(collector._workers, "procs", [])
+
+    def send_signals():
+        deadline = time.monotonic() + 300
+        while not processes() and time.monotonic() < deadline:
+            time.sleep(0.01)
+        for name in ("INT", "TERM"):
+            subprocess.run(["kill", f"-{name}", str(processes()[0].pid)], check=True)
+
+    starting = Thread(target=send_signals, daemon=True)
+    starting.start()
+    batches = iter(collector)
+    next(batches)
+    starting.join(300)
+    send_signals()
+    for _ in range(2):
+        assert next(batches).shape == (4, 20)
+    collector.kill()
+    assert [process.exitcode for process in processes()] == [-signal.SIGKILL]
 
 
 def test_what_keeps_workers_from_starting_is_told():

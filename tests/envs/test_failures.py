@@ -265,7 +265,7 @@ def test_a_fork_with_threads_is_an_error_instead_of_a_hang():
     child = context.Process(target=_step_forked, args=(env, answers), daemon=True)
     child.start()
     try:
-        assert "num_threads=1" in answers.get(timeout=30)
+        assert "num_threads=1" in answers.get(timeout=300)
     finally:
         child.kill()
-        child.join()
+        child.join(300)

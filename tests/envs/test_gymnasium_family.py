@@ -3,6 +3,7 @@
 import json
 import os
 import signal
+import subprocess
 import sys
 from functools import partial
 from pathlib import Path
@@ -122,9 +123,19 @@ def test_what_fails_in_a_process_is_told():
     env = make_env({**NODE, "workers": 2}, num_envs=2, seed=0)
     process = env.base_env._env._workers[1][0]
     os.kill(process.pid, signal.SIGKILL)
-    process.join()
+    process.join(300)
     with pytest.raises(RuntimeError, match=r"died \(exit code -9\)"):
         env.rollout(2)
+
+
+def test_signals_pass_over_processes_of_environments():
+    """Ctrl-C and what ends a cluster's job reach all; the first one ends its epoch with them."""
+    env = make_env({**NODE, "workers": 2}, num_envs=2, seed=0)
+    for process, _ in env.base_env._env._workers:
+        for name in ("INT", "TERM"):
+            subprocess.run(["kill", f"-{name}", str(process.pid)], check=True)
+    assert env.rollout(2).shape == (2, 2)
+    env.close()
 
 
 def starts(seed: int, num_envs: int = 4) -> list[float]:

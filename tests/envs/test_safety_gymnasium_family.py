@@ -6,6 +6,7 @@ The package itself wants another Python; where SAFETY_GYMNASIUM_PYTHON names it,
 import importlib
 import json
 import os
+import subprocess
 import sys
 from pathlib import Path
 
@@ -220,6 +221,17 @@ def test_a_process_that_dies_is_told(elsewhere):
     process.wait()
     with pytest.raises((RuntimeError, BrokenPipeError), match=r"has ended|Broken pipe"):
         env.rollout(3)
+
+
+def test_signals_pass_over_its_processes(elsewhere):
+    """Ctrl-C and what ends a cluster's job reach all; the first one ends its epoch with them."""
+    env = make_env(NODE, num_envs=1, seed=0)
+    process = env.base_env._env.env._servers[0]._process
+    for name in ("INT", "TERM"):
+        subprocess.run(["kill", f"-{name}", str(process.pid)], check=True)
+    assert env.rollout(3).shape == (1, 3)
+    env.close()
+    assert process.wait(300) == 0
 
 
 @pytest.mark.skipif(REAL is None, reason="SAFETY_GYMNASIUM_PYTHON names a Python with the package")

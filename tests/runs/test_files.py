@@ -1,4 +1,6 @@
-"""Configurations of strangers, and files that are written in one go."""
+"""Configurations of strangers, files that are written in one go, and folders that vanish."""
+
+import os
 
 import pytest
 from hypothesis import given, settings
@@ -6,6 +8,7 @@ from hypothesis import strategies as st
 from omegaconf import OmegaConf
 
 from safe_rl.runs.files import read_config, read_yaml, replacing
+from safe_rl.runs.folder import files_below, runs_below
 
 VALUES = st.recursive(
     st.none() | st.booleans() | st.integers() | st.floats(allow_nan=False) | st.text("ab -:#'1"),
@@ -67,3 +70,19 @@ def test_a_file_is_replaced_when_it_is_complete(tmp_path):
         unfinished.write_text("half \udc80")
     assert [file.name for file in tmp_path.iterdir()] == ["table.csv"]
     assert path.read_text() == "aft"
+
+
+def test_runs_are_found_while_folders_of_a_checkpoint_come_and_go(tmp_path, monkeypatch):
+    for run in ("b", "a"):
+        (tmp_path / run / "checkpoints" / ".stage").mkdir(parents=True)
+        (tmp_path / run / "config.yaml").touch()
+    list_folder = os.scandir
+
+    def vanish(path):
+        if os.path.basename(path) == ".stage":
+            raise FileNotFoundError(path)
+        return list_folder(path)
+
+    monkeypatch.setattr(os, "scandir", vanish)
+    assert [run.directory.name for run in runs_below(tmp_path)] == ["a", "b"]
+    assert files_below(tmp_path, "*.mp4") == []

@@ -7,6 +7,7 @@ from omegaconf import OmegaConf
 from run_configs import compose_config
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
+from safe_rl.runs.folder import RunFolder
 from safe_rl.runs.outcome import final_figures
 from safe_rl.runs.record import RunRecord
 
@@ -104,6 +105,21 @@ def test_a_new_run_does_not_overwrite_another(tmp_path):
     again = RunRecord(tmp_path, config, {}, 1000).writing()
     with pytest.raises(FileExistsError, match="already holds a run"):
         again.__enter__()
+
+
+def test_what_is_killed_while_it_begins_leaves_no_table_without_a_configuration(
+    tmp_path, monkeypatch
+):
+    """Which could neither be begun anew nor continued."""
+
+    def kill(*arguments):
+        raise KeyboardInterrupt
+
+    config = compose_config("env=PointMass", "logger=none")
+    monkeypatch.setattr(RunRecord, "_save_config", kill)
+    with pytest.raises(KeyboardInterrupt):
+        RunRecord(tmp_path, config, {}, 1000).writing().__enter__()
+    assert not RunFolder(tmp_path).has_begun
 
 
 def test_writing_ends_cleanly_when_training_fails(tmp_path):

@@ -6,7 +6,6 @@ the memory and the start of an interpreter.
 
 from __future__ import annotations
 
-import signal
 import traceback
 from collections.abc import Callable, Sequence
 from contextlib import suppress
@@ -18,6 +17,8 @@ import gymnasium
 import numpy as np
 from gymnasium.vector import AutoresetMode, SyncVectorEnv, VectorEnv
 from gymnasium.vector.utils import CloudpickleWrapper, batch_space
+
+from safe_rl.processes import leave_signals_to_parent, starting_processes
 
 SECONDS_TO_END = 5.0
 
@@ -57,14 +58,15 @@ class ProcessVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         self._workers: list[tuple[Any, Connection]] = []
         # Forked processes could inherit locks that a thread of torch's holds.
         context = get_context("spawn")
-        for number in shares:
-            ours, theirs = context.Pipe()
-            process = context.Process(
-                target=_serve, args=(theirs, CloudpickleWrapper(make), number), daemon=True
-            )
-            process.start()
-            theirs.close()
-            self._workers.append((process, ours))
+        with starting_processes():
+            for number in shares:
+                ours, theirs = context.Pipe()
+                process = context.Process(
+                    target=_serve, args=(theirs, CloudpickleWrapper(make), number), daemon=True
+                )
+                process.start()
+                theirs.close()
+                self._workers.append((process, ours))
         spaces = self._receive()[0]
         self.single_observation_space, self.single_action_space, metadata, self.render_mode = spaces
         self.autoreset_mode = AutoresetMode.DISABLED
@@ -153,8 +155,7 @@ class ProcessVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
 
 def _serve(connection: Connection, make: CloudpickleWrapper, number: int) -> None:
     """Do what the other side asks of this process's environments, until it closes."""
-    # Ctrl-C reaches every process; it is the first one's to end the run.
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    leave_signals_to_parent()
     worlds: SyncVectorEnv | None = None
     try:
         worlds = SyncVectorEnv([make.fn] * number, autoreset_mode=AutoresetMode.DISABLED)

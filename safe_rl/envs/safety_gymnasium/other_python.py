@@ -18,6 +18,7 @@ from gymnasium.vector.utils import batch_space
 
 from safe_rl.envs.costs import COST
 from safe_rl.envs.safety_gymnasium import serve
+from safe_rl.processes import starting_processes
 
 __all__ = ["ServedVectorEnv", "Server", "open_server"]
 
@@ -33,13 +34,15 @@ class Server:
 
     def __init__(self, python: str) -> None:
         clean = {key: value for key, value in os.environ.items() if key != "PYTHONSTARTUP"}
-        self._process = subprocess.Popen(
-            [python, "-W", "ignore", str(Path(serve.__file__).resolve())],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.DEVNULL,  # what fails comes as an answer
-            env=clean,
-        )
+        # signals wait in it for ever: it ends when this process closes its pipe, or is no more
+        with starting_processes():
+            self._process = subprocess.Popen(
+                [python, "-W", "ignore", str(Path(serve.__file__).resolve())],
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
+                stderr=subprocess.DEVNULL,  # what fails comes as an answer
+                env=clean,
+            )
 
     def ask(self, method: str, fields: Mapping[str, Any] | None = None, **arrays: Any) -> None:
         """Send a request; `answer` waits for what comes of it."""
