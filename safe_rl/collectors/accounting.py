@@ -175,6 +175,11 @@ class EpisodeAccounting:
             raise KeyError(f"The batch has no ('next', {key!r}). What it has there: {known}.")
         return entry.squeeze(-1).double()
 
+    @property
+    def have_begun(self) -> Tensor:
+        """Rows [N] that are within an episode, between two batches."""
+        return self._open_sums[:, 0] != 0
+
     def forget_open_episodes(self) -> None:
         """Drop the sums of episodes that will never be finished: the environment starts anew."""
         self._open_sums.zero_()

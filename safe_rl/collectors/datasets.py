@@ -9,7 +9,7 @@ import torch
 from tensordict import TensorDictBase
 
 from safe_rl.collectors.hdf5 import read_hdf5
-from safe_rl.collectors.recording import read_recording
+from safe_rl.collectors.recording import PARTIAL, read_recording
 
 __all__ = ["read_dataset", "safe_episodes"]
 
@@ -31,7 +31,8 @@ def safe_episodes(steps: TensorDictBase, limits: Mapping[str, float]) -> TensorD
     """Steps [1, M] of the whole episodes that cost no more than limits allow, one after the other.
 
     Args:
-        steps: Consecutive steps [N, T]; a row's last episode counts only if it is over.
+        steps: Consecutive steps [N, T]; a row's last episode counts only if it is over, and none
+            that is ``partial`` in a step, where there is such an entry.
         limits: Cost key -> undiscounted cost allowed per episode.
 
     Examples:
@@ -46,6 +47,9 @@ def safe_episodes(steps: TensorDictBase, limits: Mapping[str, float]) -> TensorD
     episode = done.cumsum(-1) - done
     number = int(episode.max()) + 1
     is_kept = torch.zeros(done.shape[0], number).scatter_add_(1, episode, done.float()) > 0
+    if (partial := steps.get(PARTIAL, None)) is not None:
+        parts = torch.zeros(done.shape[0], number)
+        is_kept = is_kept & (parts.scatter_add_(1, episode, partial.squeeze(-1).float()) == 0)
     for key, limit in limits.items():
         cost = steps["next", key].squeeze(-1).double()
         total = torch.zeros(done.shape[0], number, dtype=torch.float64)

@@ -9,8 +9,12 @@ from pathlib import Path
 
 import torch
 from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
 
-__all__ = ["Recording", "StepRecorder", "read_recording"]
+__all__ = ["PARTIAL", "Recording", "StepRecorder", "read_recording"]
+
+PARTIAL = "partial"
+"""Entry [N, T, 1], true in an episode that the recording has not the whole of."""
 
 # of a step and of what follows it; what a policy writes besides is not recorded
 _FLAGS = ("done", "terminated", "truncated")
@@ -54,13 +58,40 @@ class Recording:
         for path in _pieces(self.folder):
             shutil.rmtree(path)
 
-    def write(self, number: int, batch: TensorDictBase) -> None:
-        """Write a batch [N, T] under its number; one that is there already is replaced."""
-        place = self.folder / f"{number:08d}"
+    def write(self, number: int, batch: TensorDictBase, *, begun: Tensor | None = None) -> None:
+        """Write a batch [N, T] under its number; one that is there already is replaced.
+
+        Args:
+            number: Of the batch, which follows the one before it.
+            batch: Consecutive steps.
+            begun: Rows [N] whose first step is not the first of its episode, for where the batch
+                before is not recorded.
+        """
+        steps = batch.select(*self._keys).cpu()
+        steps[PARTIAL] = torch.zeros_like(steps["next", "done"])
+        if begun is not None and not self._place(number - 1).exists():
+            steps[PARTIAL][:, 0] |= begun.cpu().unsqueeze(-1)
+        self._store(number, steps)
+
+    def cut_after(self, number: int) -> None:
+        """Note that what follows a batch begins anew: episodes that are open there stay partial."""
+        if not self._place(number).exists():
+            return
+        steps = TensorDict.load_memmap(str(self._place(number))).clone()
+        is_open = ~steps["next", "done"][:, -1]
+        for key in (PARTIAL, ("next", "done"), ("next", "truncated")):
+            steps[key][:, -1] |= is_open
+        self._store(number, steps)
+
+    def _place(self, number: int) -> Path:
+        return self.folder / f"{number:08d}"
+
+    def _store(self, number: int, steps: TensorDictBase) -> None:
+        place = self._place(number)
         # whole or not at all: a run may end at any moment
         with tempfile.TemporaryDirectory(prefix=".", dir=_made(self.folder)) as unfinished:
             written = Path(unfinished) / place.name
-            batch.select(*self._keys).cpu().memmap(str(written), copy_existing=True)
+            steps.memmap(str(written), copy_existing=True)
             if place.exists():
                 shutil.rmtree(place)
             written.rename(place)
@@ -112,13 +143,21 @@ class StepRecorder:
 def read_recording(folder: Path | str) -> TensorDict:
     """Transitions [N, T] of a folder in order of time, in main memory.
 
+    Of an episode that is not all there ``partial`` is true in one step or more: where rows began
+    within their first episode (``staggered_starts``), and where a run went on without the state of
+    its worlds. The latter is the end of the episode as well, a truncation.
+
     Raises:
         FileNotFoundError: If there are none.
     """
     pieces = _pieces(Path(folder))
     if not pieces:
         raise FileNotFoundError(f"{folder} holds no transitions: is it the folder of a recording?")
-    return torch.cat([TensorDict.load_memmap(str(path)).clone() for path in pieces], -1)
+    batches = [TensorDict.load_memmap(str(path)).clone() for path in pieces]
+    for batch in batches:
+        if PARTIAL not in batch.keys():  # of an earlier version
+            batch[PARTIAL] = torch.zeros_like(batch["next", "done"])
+    return torch.cat(batches, -1)
 
 
 def _pieces(folder: Path) -> list[Path]:

@@ -35,6 +35,7 @@ class BCLoss(LossModule):
 
     actor_network: TensorDictModuleBase
     actor_network_params: TensorDictParams
+    target_actor_network_params: TensorDictParams
 
     def __init__(self, actor_network: TensorDictModuleBase, *, loss_function: str = "l2") -> None:
         super().__init__()

@@ -158,6 +158,8 @@ class Trainer:
         if self._worlds is not None:
             return
         self.accounting.forget_open_episodes()
+        if self._recording is not None:
+            self._recording.cut_after(self.progress.epoch - 1)
         getattr(self.algorithm, "forget_open_episodes", lambda: None)()
         if hasattr(self._env, "continue_from"):
             self._env.continue_from(self.progress.steps // self._env.batch_size.numel())
@@ -232,7 +234,8 @@ class Trainer:
             if self._worlds is not None:
                 self._worlds.take()
         if self._recording is not None:
-            self._recording.write(self.progress.epoch, batch)
+            begun = self.accounting.have_begun
+            self._recording.write(self.progress.epoch, batch, begun=begun)
         collected = time.perf_counter()
         episodes = self.accounting.update(batch)
         with fast_products():

@@ -1,5 +1,7 @@
 """Learning from a dataset: what is taken of it, what is cloned, and what does not fit."""
 
+import warnings
+
 import numpy as np
 import pytest
 import torch
@@ -9,7 +11,7 @@ from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 
 from safe_rl.algorithms import OffPolicy
-from safe_rl.collectors import Recording, make_collector, read_recording
+from safe_rl.collectors import Recording, make_collector, read_recording, safe_episodes
 from safe_rl.evaluation.episodes import collect_episodes
 from safe_rl.models import make_bounded_actor
 from safe_rl.objectives import BCLoss
@@ -132,6 +134,54 @@ def test_a_run_that_goes_on_records_what_it_does_again(tmp_path):
     assert torch.equal(whole["observation"], halves["observation"])
 
 
+class Forgetful(PointMass):
+    get_state = property()  # raises AttributeError: its worlds cannot be stored
+
+
+@pytest.mark.parametrize(("kind", "staggered"), [(PointMass, "true"), (Forgetful, "null")])
+def test_whole_episodes_of_a_recording_are_those_of_the_table(kind, staggered, tmp_path):
+    """Not those that began before it, nor those that a run left open when it was interrupted."""
+
+    def build(frames):
+        keys = ["env=PointMass", "algo=ppo", f"frames={frames}", "logger=none", "record=true"]
+        keys += ["num_envs=4", "frames_per_batch=200", "model.hidden_sizes=[16]"]
+        config = compose_config(*keys, f"staggered_starts={staggered}")
+        seed_everything(config.seed, None)
+        return build_trainer(config, kind(4, 20, config.seed), tmp_path)
+
+    build(600).run()
+    resumed = build(1200)
+    assert resumed.resume()
+    resumed.run()
+    steps, table = read_recording(tmp_path / "transitions"), read_table(tmp_path / "progress.csv")
+    assert steps.shape == (4, 300)
+    number = sum(table["episodes"])
+    assert steps["next", "done"].sum() == number + 4  # and parts of four others
+    found = safe_episodes(steps, {})
+    assert found.shape == (1, 20 * number)
+    costs = sum(n * c for n, c in zip(table["episodes"], table["episode_cost"], strict=True))
+    assert found["next", "cost"].double().sum() == pytest.approx(costs)
+
+
+def test_recording_may_begin_within_episodes(tmp_path):
+    """Of a run that goes on where it was, and was not recorded until then."""
+
+    def build(frames, record):
+        keys = ["env=PointMass", "algo=ppo", f"frames={frames}", "logger=none", f"record={record}"]
+        keys += ["num_envs=4", "frames_per_batch=200", "staggered_starts=null"]
+        config = compose_config(*keys, "model.hidden_sizes=[16]")
+        return make_trainer(config, tmp_path)
+
+    build(200, "false").run()
+    resumed = build(600, "true")
+    assert resumed.resume()
+    resumed.run()
+    steps = read_recording(tmp_path / "transitions")
+    assert steps["partial"].nonzero().tolist() == [[row, 0, 0] for row in range(4)]
+    # of 100 steps 10 belong to the episodes before, and 10 to what is still open
+    assert safe_episodes(steps, {}).shape == (1, 4 * 80)
+
+
 def test_any_algorithm_may_begin_with_a_dataset(tmp_path):
     data = record(tmp_path / "data", head_north, head_south)
     keys = ["exploration.random_steps=0", "policy_update.updates_per_step=0.05", "memory.n_steps=3"]
@@ -206,3 +256,9 @@ def test_costs_that_a_dataset_lacks_are_named(tmp_path):
         OffPolicy.build(offline_config(folder, limits=limits), PointMass(2))
     with pytest.raises(ValueError, match="has no cost_north, which is learned from"):
         OffPolicy.build(offline_config(folder, algo="sac_lagrangian", limits=limits), PointMass(2))
+
+
+def test_the_loss_of_cloning_warns_of_nothing():
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        BCLoss(make_bounded_actor(3, -torch.ones(2), torch.ones(2), hidden_sizes=[8]))
