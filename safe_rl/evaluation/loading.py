@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -20,7 +20,7 @@ from safe_rl.runs.files import read_config
 from safe_rl.runs.folder import KINDS, RunFolder
 
 __all__ = [
-    *("evaluated", "find_checkpoint", "limits_of", "load_config", "load_policy"),
+    *("check_env_keys", "evaluated", "find_checkpoint", "limits_of", "load_config", "load_policy"),
     *("override_env", "transforms_of"),
 ]
 
@@ -43,8 +43,44 @@ def load_config(directory: Path) -> DictConfig:
 
 
 def override_env(config: DictConfig, overrides: Mapping[str, Any]) -> dict[str, Any]:
-    """The run's environment with some keys changed; their names are checked where it is made."""
-    return {**OmegaConf.to_container(config.env), **overrides}  # type: ignore[dict-item]
+    """The run's environment with some keys changed.
+
+    Raises:
+        ValueError: As by `check_env_keys`; the package's families look at their keys themselves.
+    """
+    env = OmegaConf.to_container(config.env)
+    check_env_keys(env, overrides)  # type: ignore[arg-type]
+    return {**env, **overrides}  # type: ignore[dict-item]
+
+
+def check_env_keys(env: Mapping[str, Any], keys: Iterable[str]) -> None:
+    """Refuse keys that an environment of one's own family does not have.
+
+    What such a family is given beyond its own keys it leaves alone, so that what was measured would
+    be called something that it is not.
+
+    Args:
+        env: Node of a run's environment.
+        keys: Which of its keys are to be changed.
+
+    Raises:
+        ValueError: If the run's environment has no such key.
+
+    Examples:
+        >>> check_env_keys({"_target_": "mine.make", "edge": 1.0}, ["edgy"])
+        Traceback (most recent call last):
+        ValueError: env.edgy: mine.make has no such key. Did you mean 'edge'? The run has edge.
+    """
+    target = str(env.get("_target_", "safe_rl."))
+    if target.startswith("safe_rl."):
+        return
+    own = [key for key in env if key not in ("_target_", "name")]
+    for key in keys:
+        if key not in env:
+            known = f"The run has {', '.join(own)}." if own else "The run has none."
+            raise ValueError(
+                f"env.{key}: {target} has no such key.{did_you_mean(key, own)} {known}"
+            )
 
 
 def limits_of(

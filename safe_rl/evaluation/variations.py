@@ -7,6 +7,8 @@ from typing import Any, NamedTuple
 
 from omegaconf import DictConfig, OmegaConf
 
+from safe_rl.evaluation.loading import check_env_keys
+
 __all__ = ["Variation", "expand", "varied"]
 
 TransformNode = Callable[[str], Mapping[str, Any]]
@@ -85,7 +87,8 @@ def varied(
         The configuration; None if the run has these values itself.
 
     Raises:
-        ValueError: For a factor of what the environment lacks, or of no number.
+        ValueError: For a factor of what the environment lacks, or of no number; for a key that an
+            environment of one's own does not have.
 
     Examples:
         >>> config = OmegaConf.create({"env": {"hazards_num": 8}})
@@ -98,6 +101,8 @@ def varied(
     changed = before
     for key, value in variation.keys.items():
         part, *path = key.split(".")
+        if part == "env":
+            check_env_keys(before[part], path[:1])
         if part == "transforms" and path[0] not in changed[part]:
             changed = _with(changed, [part, path[0]], dict(transform_node(path[0])))
         changed = _with(changed, [part, *path], _resolved(value, changed[part], key))

@@ -10,6 +10,8 @@ from omegaconf import OmegaConf
 
 from safe_rl.cli.evaluate import main
 from safe_rl.envs import make_env
+from safe_rl.evaluation.loading import override_env
+from safe_rl.evaluation.variations import Variation, varied
 
 
 @pytest.mark.parametrize(
@@ -119,3 +121,17 @@ def test_a_checkpoint_runs_no_code(run, bare, tmp_path, capsys):
     assert main([str(run)]) == 1
     assert path.name in capsys.readouterr().err
     assert not sprung.exists()
+
+
+def test_keys_that_an_environment_of_ones_own_does_not_have_are_refused(run, capsys):
+    """It would leave them alone, and what was not changed would be measured as if it were."""
+    config = OmegaConf.load(run / "config.yaml")
+    config.env = {"_target_": "users.make", "name": "mine", "edge": 1.0}
+    OmegaConf.save(config, run / "config.yaml")
+    assert main([str(run), "env.edgy=0.5"]) == 1
+    error = capsys.readouterr().err
+    assert "users.make has no such key. Did you mean 'edge'? The run has edge." in error
+    assert override_env(config, {"edge": 0.5})["edge"] == 0.5
+    with pytest.raises(ValueError, match=r"env\.mass_scale: users\.make has no such key"):
+        varied(config, Variation("mass", 2.0, {"env.mass_scale": 2.0}), dict)
+    assert varied(config, Variation("wide", 2.0, {"env.edge": "x2"}), dict).env.edge == 2.0
