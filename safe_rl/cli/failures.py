@@ -12,13 +12,14 @@ from hydra.errors import InstantiationException
 from omegaconf.errors import OmegaConfBaseException
 from torchrl.checkpoint import CheckpointError
 
+from safe_rl.envs import ContractError
 from safe_rl.runs.folder import RunFolder
 
 __all__ = ["SETTING_ERRORS", "errors_in_a_line"]
 
 SETTING_ERRORS: Collection[type[Exception]] = (
     *(ValueError, CheckpointError, InstantiationException, OmegaConfBaseException, OSError),
-    ModuleNotFoundError,
+    *(ModuleNotFoundError, ContractError),
 )
 """What goes wrong for the sake of settings and files while a run is built."""
 

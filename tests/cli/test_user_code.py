@@ -10,9 +10,11 @@ from run_configs import point_mass_config
 
 from safe_rl import targets
 from safe_rl.cli import user_code
+from safe_rl.cli.failures import SETTING_ERRORS, errors_in_a_line
 from safe_rl.cli.overrides import CommandLineError
 from safe_rl.cli.shorthands import expand_arguments
 from safe_rl.cli.user_code import check_imports, import_modules, note_imports, split_imports
+from safe_rl.envs import make_env
 from safe_rl.runs.record import RunRecord
 from safe_rl.training.building import build_trainer
 
@@ -159,3 +161,18 @@ def test_what_hydra_itself_would_run_is_refused(folder, text):
     path.write_text(f"{text}\n{path.read_text()}")
     with pytest.raises(CommandLineError, match="which runs never write"):
         expand_arguments([f"resume={folder / 'run'}"])
+
+
+def make_without_costs(config, **kind):
+    env = PointMass(kind["num_envs"])
+    env.cost_keys = ["cost_hazards"]
+    return env
+
+
+def test_what_an_environment_of_ones_own_lacks_is_said_in_a_line(folder):
+    targets.allow(__name__)
+    node = {"_target_": f"{__name__}.make_without_costs", "name": "mine"}
+    with pytest.raises(SystemExit) as error, errors_in_a_line(folder, False, *SETTING_ERRORS):
+        make_env(node, num_envs=2)
+    assert "PointMass is no constrained environment: - 'cost_keys' must be" in str(error.value)
+    assert "\n" not in str(error.value)
