@@ -146,8 +146,8 @@ def check_cost_limits(
         if key not in cost_keys:
             raise ValueError(
                 f"cost_limits names '{key}', but this environment has no such cost."
-                f"{did_you_mean(key, cost_keys)} It has {', '.join(cost_keys)}; "
-                "env.constrain_<kind>=true adds those of another kind."
+                f"{did_you_mean(key, cost_keys)} It has {', '.join(cost_keys)}; in Safety Gym's "
+                "environments env.constrain_<kind>=true adds those of another kind."
             )
         if isinstance(limit, bool) or not isinstance(limit, int | float) or not limit >= 0:
             raise ValueError(

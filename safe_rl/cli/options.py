@@ -59,7 +59,12 @@ def parse_options(arguments: Sequence[str], schema: type[Schema]) -> Schema:
                 f"{fields(schema)[0].name}=…"
             )
         _check_name(key.partition(".")[0], schema)
-    return _merged(schema, lambda: OmegaConf.from_dotlist(list(arguments)), " ".join(arguments))
+
+    def read() -> DictConfig:
+        given = OmegaConf.to_container(OmegaConf.from_dotlist(list(arguments)))
+        return OmegaConf.create(_with_values(given))  # type: ignore[no-any-return]
+
+    return _merged(schema, read, " ".join(arguments))
 
 
 def take_options(given: Mapping[str, Any], schema: type[Schema]) -> Schema:
@@ -79,6 +84,25 @@ def take_options(given: Mapping[str, Any], schema: type[Schema]) -> Schema:
     for name in given:
         _check_name(name, schema)
     return _merged(schema, lambda: OmegaConf.create(_plain(given)), str(dict(given)))
+
+
+def _with_values(value: Any) -> Any:
+    """What ``train.py`` takes for a mapping: of ``{cost:20}`` YAML makes a name without a value.
+
+    Examples:
+        >>> _with_values({"cost_limits": {"cost:20": None}})
+        {'cost_limits': {'cost': 20}}
+    """
+    if not isinstance(value, Mapping):
+        return value
+    pairs = {}
+    for key, item in value.items():
+        name, _, text = str(key).partition(":")
+        if text and item is None:
+            pairs[name] = yaml.safe_load(text)
+        else:
+            pairs[key] = _with_values(item)
+    return pairs
 
 
 def _plain(value: Any) -> Any:

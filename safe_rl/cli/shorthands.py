@@ -49,6 +49,7 @@ def expand_arguments(arguments: Sequence[str]) -> list[str]:
         'env=DoggoGoal1,DoggoGoal2,DoggoButton1,DoggoButton2,DoggoPush1,DoggoPush2'
     """
     expanded = _flags_first(arguments)
+    _refuse_other_folders(expanded)
     for name, expand in _SHORTHANDS.items():
         given = [a for a in expanded if a.lstrip("+").startswith(f"{name}=")]
         if len(given) > 1:
@@ -80,6 +81,17 @@ def _flags_first(arguments: Sequence[str]) -> list[str]:
             overrides.append(word)
         last = word
     return [*flags, *overrides]
+
+
+def _refuse_other_folders(arguments: Sequence[str]) -> None:
+    """Hydra takes the last of several folders, and says nothing of the others."""
+    given = [a.partition("=")[2] for a in arguments if a.startswith(("--config-dir=", "-cd="))]
+    if len(given) > 1:
+        others = ",".join(f"file://{Path(folder).absolute()}" for folder in given[1:])
+        raise CommandLineError(
+            f"--config-dir is given more than once: {', '.join(given)}. Leave the first, and add "
+            f"'hydra.searchpath=[{others}]'."
+        )
 
 
 def _with_launcher(arguments: list[str]) -> list[str]:

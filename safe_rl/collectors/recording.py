@@ -155,7 +155,7 @@ def read_recording(folder: Path | str) -> TensorDict:
         raise FileNotFoundError(f"{folder} holds no transitions: is it the folder of a recording?")
     batches = [TensorDict.load_memmap(str(path)).clone() for path in pieces]
     for batch in batches:
-        if PARTIAL not in batch.keys():  # of an earlier version
+        if PARTIAL not in batch:  # of an earlier version
             batch[PARTIAL] = torch.zeros_like(batch["next", "done"])
     return torch.cat(batches, -1)
 

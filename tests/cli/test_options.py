@@ -25,6 +25,16 @@ def test_values_are_read_with_their_types():
     )
 
 
+def test_mappings_are_read_as_training_reads_them():
+    """Without spaces, too: YAML alone makes a name without a value of that."""
+    options = parse_options(
+        ["cost_limits={cost:20,cost_hazards: 5}", "env.kwargs={a:{b:1.5},c:[1,2]}"],
+        EvaluationOptions,
+    )
+    assert options.cost_limits == {"cost": 20.0, "cost_hazards": 5.0}
+    assert options.env == {"kwargs": {"a": {"b": 1.5}, "c": [1, 2]}}
+
+
 @pytest.mark.parametrize(
     ("argument", "message"),
     [

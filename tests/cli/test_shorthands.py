@@ -146,3 +146,12 @@ def test_what_ray_is_started_with_is_not_taken_from_a_file(run):
     path.write_text(local.replace("null}", "null, runtime_env: {pip: [theirs]}}"))
     with pytest.raises(CommandLineError, match="starts Ray with runtime_env"):
         expand_arguments([f"resume={run}"])
+
+
+def test_several_folders_of_configurations_are_not_taken_for_the_last():
+    both = ["--config-dir", "first", "algo=mine", "--config-dir=second", "env=mine"]
+    with pytest.raises(
+        CommandLineError, match=r"once: first, second\..*searchpath=\[file:///.*second\]"
+    ):
+        expand_arguments(both)
+    assert expand_arguments(both[:3]) == ["--config-dir=first", "algo=mine"]
