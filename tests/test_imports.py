@@ -188,6 +188,7 @@ FLOORS = {
         ("",),
     ),
     "evaluation": (
+        ("env_keys",),
         ("episodes", "layouts", "loading", "settings", "variations"),
         ("certifying", "during", "summary", "video"),
         ("measuring", "varying"),

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -14,13 +14,14 @@ from torchrl.checkpoint import CheckpointError
 from torchrl.envs import EnvBase
 
 from safe_rl.algorithms.parts import find_recipe
+from safe_rl.evaluation.env_keys import check_env_keys
 from safe_rl.naming import did_you_mean
 from safe_rl.runs.checkpoints import CheckpointStore, best_checkpoint
 from safe_rl.runs.files import read_config
 from safe_rl.runs.folder import KINDS, RunFolder
 
 __all__ = [
-    *("check_env_keys", "evaluated", "find_checkpoint", "limits_of", "load_config", "load_policy"),
+    *("evaluated", "find_checkpoint", "limits_of", "load_config", "load_policy"),
     *("override_env", "transforms_of"),
 ]
 
@@ -51,36 +52,6 @@ def override_env(config: DictConfig, overrides: Mapping[str, Any]) -> dict[str, 
     env = OmegaConf.to_container(config.env)
     check_env_keys(env, overrides)  # type: ignore[arg-type]
     return {**env, **overrides}  # type: ignore[dict-item]
-
-
-def check_env_keys(env: Mapping[str, Any], keys: Iterable[str]) -> None:
-    """Refuse keys that an environment of one's own family does not have.
-
-    What such a family is given beyond its own keys it leaves alone, so that what was measured would
-    be called something that it is not.
-
-    Args:
-        env: Node of a run's environment.
-        keys: Which of its keys are to be changed.
-
-    Raises:
-        ValueError: If the run's environment has no such key.
-
-    Examples:
-        >>> check_env_keys({"_target_": "mine.make", "edge": 1.0}, ["edgy"])
-        Traceback (most recent call last):
-        ValueError: env.edgy: mine.make has no such key. Did you mean 'edge'? The run has edge.
-    """
-    target = str(env.get("_target_", "safe_rl."))
-    if target.startswith("safe_rl."):
-        return
-    own = [key for key in env if key not in ("_target_", "name")]
-    for key in keys:
-        if key not in env:
-            known = f"The run has {', '.join(own)}." if own else "The run has none."
-            raise ValueError(
-                f"env.{key}: {target} has no such key.{did_you_mean(key, own)} {known}"
-            )
 
 
 def limits_of(
