@@ -60,7 +60,7 @@ class OffPolicy:
         random_steps: Steps of environments that are taken at random in the beginning. Learning
             begins when the memory holds as many.
         collects: Whether what is collected goes into the memory.
-        learns_from: What was in it from the beginning, in a sentence; nothing if it was empty.
+        learns_from: What was in it from the beginning, in a sentence, or that nothing will be.
         unread: Keys and choices of configurations that are for other recipes, and why.
     """
 
@@ -225,7 +225,7 @@ class OffPolicy:
 
 
 def _fill(config: DictConfig, memory: Memory, env: EnvBase) -> tuple[str, bool]:
-    """Begin a memory with a dataset, if there is one; what was taken, and whether more comes."""
+    """Begin a memory with a dataset, if there is one; what is learned from, and if more comes."""
     node = config.get("dataset")
     if node is None or node.path is None:
         if node is not None and node.alone:
@@ -233,9 +233,20 @@ def _fill(config: DictConfig, memory: Memory, env: EnvBase) -> tuple[str, bool]:
                 f"dataset.path is missing: algo={config.algo.name} with dataset.alone=true learns "
                 "from nothing else. Give the folder of a recording (record=true), or an HDF5 file."
             )
-        return "", True
+        return _nothing_learned(config), True
     limits = check_cost_limits(config.cost_limits, env.cost_keys)
     return fill_memory(memory, node, limits, env, bounded_actions(env)), not node.alone
+
+
+def _nothing_learned(config: DictConfig) -> str:
+    """That a run ends before it learns, whose figures look like those of one that has learned."""
+    random_steps = setting(config, "exploration.random_steps")
+    if config.frames >= random_steps:
+        return ""
+    return (
+        f"Nothing will be learned: exploration.random_steps={random_steps} come first, and the run "
+        f"has {config.frames:,}."
+    )
 
 
 def _check_memory(config: DictConfig, loss: LossModule) -> None:

@@ -280,3 +280,11 @@ def test_it_learns_to_go_around_a_hazard(algo, tmp_path):
     episodes = collect_episodes(env, trainer.algorithm.policy, 40, ["cost"], deterministic=True)
     assert episodes.returns.mean() > 0.9
     assert episodes.costs["cost"].mean() < 1.5
+
+
+def test_a_run_that_ends_before_it_learns_says_so(make_trainer):
+    short = make_trainer("short", "algo=sac", "frames=320", "exploration.random_steps=321")
+    said = "Nothing will be learned: exploration.random_steps=321 come first, and the run has 320."
+    assert short.algorithm.learns_from == said
+    enough = make_trainer("longer", "algo=sac", "frames=320", "exploration.random_steps=320")
+    assert enough.algorithm.learns_from == ""
