@@ -49,7 +49,7 @@ def columns(name, costs):
 
 def test_snippets_run_one_after_the_other():
     snippets = re.findall(r"```python\n(.*?)```", PAGE, re.DOTALL)
-    assert len(snippets) == 5
+    assert len(snippets) == 6
     exec("\n".join(snippets), {})
 
 
