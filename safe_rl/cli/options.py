@@ -62,7 +62,7 @@ def parse_options(arguments: Sequence[str], schema: type[Schema]) -> Schema:
 
     def read() -> DictConfig:
         given = OmegaConf.to_container(OmegaConf.from_dotlist(list(arguments)))
-        return OmegaConf.create(_with_values(given))  # type: ignore[no-any-return]
+        return OmegaConf.create(_with_values(given))
 
     return _merged(schema, read, " ".join(arguments))
 
