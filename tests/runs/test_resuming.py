@@ -7,13 +7,14 @@ import random
 import shutil
 import signal
 import time
+from functools import partial
 from threading import Thread
 from types import SimpleNamespace
 
 import pytest
 from hydra.types import RunMode
 from omegaconf import OmegaConf
-from point_mass import PointMass
+from point_mass_runs import point_mass_trainer as trainer_of_point_mass
 from run_configs import compose_config, point_mass_config, without_times
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from torchrl.checkpoint import Checkpoint, CheckpointError
@@ -127,10 +128,8 @@ def test_checkpoints_change_nothing(tmp_path):
     assert without_times(often / "progress.csv") == without_times(never / "progress.csv")
 
 
-def point_mass_trainer(directory, *overrides):
-    config = point_mass_config(*overrides)
-    seed_everything(config.seed, 1)
-    return build_trainer(config, PointMass(config.num_envs, 27, config.seed), directory)
+# episodes are open at the end of every epoch of 40 steps
+point_mass_trainer = partial(trainer_of_point_mass, num_steps=27)
 
 
 def test_a_run_without_a_checkpoint_starts_over(tmp_path):

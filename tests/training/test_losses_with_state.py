@@ -4,8 +4,7 @@ import types
 
 import pytest
 import torch
-from point_mass import PointMass
-from run_configs import point_mass_config
+from point_mass_runs import point_mass_trainer
 from tensordict.nn import TensorDictModule
 from torchrl.objectives import A2CLoss, ClipPPOLoss, KLPENPPOLoss
 
@@ -14,7 +13,6 @@ from safe_rl.algorithms.loss_state import LossState
 from safe_rl.models import make_actor
 from safe_rl.objectives import PPOLagrangianLoss, TRPOLagrangianLoss
 from safe_rl.runs.table import read_table
-from safe_rl.training.building import build_trainer, seed_everything
 
 
 class _Remembering:
@@ -49,12 +47,11 @@ def _allowed(monkeypatch):
 
 
 def _trainer(folder, algo, loss, frames, *overrides):
-    config = point_mass_config(
+    return point_mass_trainer(
+        folder,
         *(f"algo={algo}", f"loss._target_={__name__}.{loss}", f"frames={frames}", *overrides),
         minibatch_size=None if algo.startswith("trpo") else 40,
     )
-    seed_everything(config.seed, 1)
-    return build_trainer(config, PointMass(config.num_envs, 20, config.seed), folder)
 
 
 @pytest.mark.parametrize(
@@ -93,6 +90,6 @@ def test_losses_of_torchrl_s_keep_no_settings_of_their_value_estimators(kind):
 
 @pytest.mark.parametrize("algo", ["ppo", "cpo", "focops", "cup", "ipo", "ppo_lagrangian"])
 def test_checkpoints_of_the_package_s_losses_have_no_part_for_it(tmp_path, algo):
-    config = point_mass_config(f"algo={algo}", minibatch_size=None if algo == "cpo" else 40)
-    trainer = build_trainer(config, PointMass(config.num_envs, 20, config.seed), tmp_path)
+    minibatch_size = None if algo == "cpo" else 40
+    trainer = point_mass_trainer(tmp_path, f"algo={algo}", minibatch_size=minibatch_size)
     assert "losses" not in trainer.components()

@@ -2,13 +2,12 @@
 
 import itertools
 import math
-import signal
-import threading
 from statistics import fmean
 
 import pytest
 import torch
 from point_mass import PointMass
+from point_mass_runs import point_mass_trainer
 from run_configs import point_mass_config, without_times
 from torchrl.checkpoint import Checkpoint
 
@@ -18,22 +17,15 @@ from safe_rl.runs.checkpoints import CheckpointStore
 from safe_rl.runs.folder import checkpoints_in
 from safe_rl.runs.table import read_table
 from safe_rl.targets import allow
-from safe_rl.training.building import build_trainer, seed_everything
-from safe_rl.training.interrupts import StopRequest
+from safe_rl.training.building import build_trainer
 from safe_rl.training.trainer import Trainer
 
 allow("test_training")
 
 
-def make_trainer(directory, *overrides, num_steps=20):
-    config = point_mass_config(*overrides)
-    seed_everything(config.seed, None)
-    return build_trainer(config, PointMass(config.num_envs, num_steps, config.seed), directory)
-
-
 def train(directory, *overrides, **options):
     """Run to the end; returns the trainer and its table."""
-    trainer = make_trainer(directory, *overrides, **options)
+    trainer = point_mass_trainer(directory, *overrides, **options)
     trainer.run()
     return trainer, read_table(directory / "progress.csv")
 
@@ -96,7 +88,7 @@ def test_a_restored_run_continues_as_if_it_had_never_stopped(tmp_path):
     train(whole, paper, **options)
     train(halves, paper, "frames=640", **options)
     torch.rand(7)
-    resumed = make_trainer(halves, paper, **options)
+    resumed = point_mass_trainer(halves, paper, **options)
     (checkpoint,) = (halves / "checkpoints" / "last").iterdir()
     resumed.restore(checkpoint)
     resumed.run()
@@ -110,7 +102,7 @@ def test_the_best_of_a_resumed_run_is_that_of_a_whole_one(tmp_path):
     options = ("limits=paper", "cost_limits={cost: 1000}", "checkpoint.keep_best=8")
     train(whole, *options)
     train(halves, *options, "frames=640")
-    resumed = make_trainer(halves, *options)
+    resumed = point_mass_trainer(halves, *options)
     assert resumed.resume()
     resumed.run()
     names = [
@@ -140,7 +132,7 @@ def test_what_the_end_of_a_shorter_run_said_of_the_best_is_forgotten(tmp_path, m
     train(tmp_path / "halves", *options, "frames=960")
     # by the epochs until then the sixth policy keeps the limit, by its own it does not
     assert max(best_of(tmp_path / "halves")) == "checkpoint-000000000960.torchrl"
-    resumed = make_trainer(tmp_path / "halves", *options, "frames=1440")
+    resumed = point_mass_trainer(tmp_path / "halves", *options, "frames=1440")
     assert resumed.resume()
     resumed.run()
     expected = {f"checkpoint-{160 * epoch:012}.torchrl": epoch + 1.0 for epoch in range(1, 5)}
@@ -176,7 +168,7 @@ def test_the_last_checkpoint_comes_after_the_best_ones(tmp_path, monkeypatch):
 
 
 def test_the_folder_of_a_run(tmp_path):
-    trainer = make_trainer(tmp_path, "checkpoint.interval=0", "cost_limits={cost: 1000}")
+    trainer = point_mass_trainer(tmp_path, "checkpoint.interval=0", "cost_limits={cost: 1000}")
     line = trainer.run()
     names = {path.relative_to(tmp_path).as_posix() for path in tmp_path.rglob("*")}
     assert {"config.yaml", "progress.csv", "curves.png"} <= names
@@ -315,71 +307,8 @@ def test_frames_are_rounded_up_to_whole_batches(tmp_path):
     assert table["steps"] == [160, 320]
 
 
-def test_a_signal_ends_the_run_after_the_epoch_with_a_checkpoint(tmp_path):
-    trainer = make_trainer(tmp_path, "frames=100_000_000")
-    record = trainer.folder.record
-
-    def record_and_signal(row):
-        record(row)
-        if row["epoch"] == 3:
-            signal.raise_signal(signal.SIGTERM)
-
-    trainer.folder.record = record_and_signal
-    handler = signal.getsignal(signal.SIGTERM)
-    trainer.run()
-    assert signal.getsignal(signal.SIGTERM) is handler
-    assert read_table(tmp_path / "progress.csv")["epoch"] == [1, 2, 3]
-    assert [path.name for path in (tmp_path / "checkpoints" / "last").iterdir()] == [
-        "checkpoint-000000000480.torchrl"
-    ]
-
-
-def test_a_signal_in_the_last_epoch_interrupts_nothing(tmp_path):
-    trainer = make_trainer(tmp_path, "frames=160")
-    record = trainer.folder.record
-
-    def record_and_signal(row):
-        record(row)
-        signal.raise_signal(signal.SIGTERM)
-
-    trainer.folder.record = record_and_signal
-    trainer.run()
-    assert trainer.progress.steps == 160
-    assert trainer.interrupted_by is None
-
-
-@pytest.fixture
-def heeding_interrupts():
-    """What a shell runs in the background ignores them."""
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)
-    yield
-    signal.signal(signal.SIGINT, before)
-
-
-@pytest.mark.usefixtures("heeding_interrupts")
-def test_a_second_interrupt_acts_at_once():
-    with StopRequest() as stop:
-        signal.raise_signal(signal.SIGINT)
-        assert stop.received
-        with pytest.raises(KeyboardInterrupt):
-            signal.raise_signal(signal.SIGINT)
-
-
-def test_signals_are_left_alone_outside_the_main_thread():
-    received = []
-
-    def request():
-        with StopRequest() as stop:
-            received.append(stop.received)
-
-    thread = threading.Thread(target=request)
-    thread.start()
-    thread.join()
-    assert received == [None]
-
-
 def test_diverged_training_says_so(tmp_path):
-    trainer = make_trainer(tmp_path)
+    trainer = point_mass_trainer(tmp_path)
     with torch.no_grad():
         for parameter in trainer.algorithm.critic.parameters():
             parameter.fill_(torch.nan)

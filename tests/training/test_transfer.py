@@ -5,25 +5,17 @@ from pathlib import Path
 import pytest
 import torch
 from omegaconf import OmegaConf
-from point_mass import PointMass
-from run_configs import point_mass_config
+from point_mass_runs import point_mass_trainer
 from torchrl.checkpoint import CheckpointError
 
 from safe_rl.models import QEnsemble, make_bounded_actor
 from safe_rl.runs.checkpoints import CheckpointStore
-from safe_rl.training.building import build_trainer, seed_everything
 from safe_rl.training.transfer import initialise_networks
-
-
-def make_trainer(directory, *overrides, minibatch_size=40):
-    config = point_mass_config(*overrides, minibatch_size=minibatch_size)
-    seed_everything(config.seed, 1)
-    return build_trainer(config, PointMass(config.num_envs, 20, config.seed), directory)
 
 
 @pytest.fixture
 def trained(tmp_path):
-    trainer = make_trainer(tmp_path / "first", "frames=320")
+    trainer = point_mass_trainer(tmp_path / "first", "frames=320")
     trainer.run()
     return trainer
 
@@ -34,7 +26,7 @@ def same(first, second):
 
 
 def take_over(trained, *overrides):
-    fresh = make_trainer(trained.folder.directory.parent / "second", "seed=1", *overrides)
+    fresh = point_mass_trainer(trained.folder.directory.parent / "second", "seed=1", *overrides)
     networks, algorithm = fresh.algorithm.networks, fresh.algorithm
     assert not same(networks["actor"], trained.algorithm.actor)
     taken = initialise_networks(networks, trained.folder.directory, list(algorithm.cost_keys))
@@ -70,7 +62,7 @@ def test_the_cost_critic_stays_new_where_the_costs_are_others(trained, overrides
 
 def test_a_checkpoint_can_be_named(trained):
     path = trained.folder.files.newest_checkpoint()
-    fresh = make_trainer(trained.folder.directory.parent / "second", "seed=1")
+    fresh = point_mass_trainer(trained.folder.directory.parent / "second", "seed=1")
     initialise_networks(fresh.algorithm.networks, path, ["cost"])
     assert same(fresh.algorithm.networks["actor"], trained.algorithm.actor)
 
@@ -83,7 +75,7 @@ def test_a_checkpoint_can_be_named(trained):
     ],
 )
 def test_other_sizes_are_named_and_nothing_changes(trained, override, message):
-    fresh = make_trainer(trained.folder.directory.parent / "second", "seed=1", override)
+    fresh = point_mass_trainer(trained.folder.directory.parent / "second", "seed=1", override)
     before = {k: v.clone() for k, v in fresh.algorithm.actor.state_dict().items()}
     with pytest.raises(CheckpointError, match=message):
         initialise_networks(fresh.algorithm.networks, trained.folder.directory, ["cost"])
@@ -117,5 +109,5 @@ def test_a_source_that_does_not_exist_is_named(trained, path):
 
 
 def test_the_configuration_records_where_a_run_came_from(tmp_path):
-    make_trainer(tmp_path, "init_from=runs/first", "frames=160").run()
+    point_mass_trainer(tmp_path, "init_from=runs/first", "frames=160").run()
     assert OmegaConf.load(tmp_path / "config.yaml").init_from == "runs/first"
