@@ -128,6 +128,7 @@ def test_a_cost_that_is_not_one_number_of_at_least_0_per_world_is_named(magnitud
     [
         (Task(lambda c, w, b, n: w.robot_pos[:, :1]), r"'reward' .*\[2\], got \[2, 1\]"),
         (Task(lambda c, w, b, n: 1.0), r"'reward' .*\[2\], got a float"),
+        (Task(lambda c, w, b, n: torch.tensor([0.5, math.nan])), "'reward' of task 'odd' is NaN"),
         (
             Task(lambda c, w, b, n: n[:, 0], met=lambda c, w, n: n > 0, elements=("goal",),
                  measure=lambda w: w.robot_pos[:, :1]),

@@ -185,7 +185,7 @@ class SafetyGymEnv(SimulatedEnv):
         require_episodes(self._begun)
         failed = self._advance(action)
         now = self._task.measure(world)
-        reward = dense_reward(self._task, config, world, self._measured, now)
+        reward = dense_reward(self._task, config, world, self._measured, now, failed)
         costs = compute_costs(self._costs, config, world, failed)
         torch.gt(costs[0], 0.0, out=self._has_cost)
         world.buttons_timer.sub_(1).clamp_(min=0)

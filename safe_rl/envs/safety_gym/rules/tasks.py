@@ -134,7 +134,12 @@ def goal_is_button(task: str) -> bool:
 
 
 def dense_reward(
-    task: Task, config: SafetyGymConfig, world: World, before: Tensor, now: Tensor
+    task: Task,
+    config: SafetyGymConfig,
+    world: World,
+    before: Tensor,
+    now: Tensor,
+    failed: Tensor,
 ) -> Tensor:
     """Reward of a step without the bonus for a goal, clipped to ±`reward_clip`: [N].
 
@@ -144,12 +149,18 @@ def dense_reward(
         world: the worlds after the step.
         before: the task's measurements before the step [N, D].
         now: and after it [N, D].
+        failed: worlds whose physics failed [N], whose reward means nothing.
 
     Raises:
         ConfigError: if a registered task's reward is not one number per world.
     """
     reward = task.reward(config, world, before, now)
     _check_values("reward", reward, config, world)
+    if (reward.isnan() & ~failed).any():
+        raise ConfigError(
+            f"'reward' of task '{config.task}' is NaN, which nothing can be learned from: give "
+            "every world a number."
+        )
     if config.reward_orientation:
         reward = reward + config.reward_orientation_scale * world.up
     if config.reward_clip:
