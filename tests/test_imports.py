@@ -124,7 +124,7 @@ FLOORS = {
         ("",),
     ),
     "collectors": (
-        ("accounting", "ahead", "ending", "factory", "hdf5", "recording"),
+        ("accounting", "ahead", "ending", "factory", "hdf5", "recording", "shares"),
         ("workers",),
         ("datasets",),
         ("",),

@@ -13,7 +13,7 @@ import pytest
 import torch
 
 from safe_rl.collectors import WorkerCollector, make_process_collector, make_ray_collector
-from safe_rl.collectors.workers import share_rows
+from safe_rl.collectors.shares import share_rows
 from safe_rl.envs import SafetyGymEnv, make_env
 from safe_rl.models import BehaviourPolicy, make_actor
 

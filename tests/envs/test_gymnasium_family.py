@@ -16,7 +16,7 @@ import yaml
 from torchrl.envs.utils import check_env_specs
 
 from safe_rl.cli import evaluate, report, train
-from safe_rl.collectors.workers import share_rows
+from safe_rl.collectors.shares import share_rows
 from safe_rl.envs import ConfigError, complete_env, make_env
 from safe_rl.runs.table import read_table
 

@@ -17,7 +17,7 @@ from torchrl.envs.utils import check_env_specs
 
 from safe_rl import targets
 from safe_rl.cli import evaluate, report, train
-from safe_rl.collectors.workers import share_rows
+from safe_rl.collectors.shares import share_rows
 from safe_rl.envs import ConfigError, complete_env, make_env
 from safe_rl.envs.torchrl.nodes import ROWS
 from safe_rl.runs.table import read_table

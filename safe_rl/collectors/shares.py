@@ -1,0 +1,75 @@
+"""The shares of a batched environment's rows that workers step.
+
+Every worker has the seeds that its rows have in a single process, so that a run meets the same kind
+of episodes however it is spread.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+from multiprocessing import parent_process
+from typing import Protocol
+
+import torch
+from tensordict import TensorDictBase
+from torchrl.envs import EnvBase
+
+from safe_rl.processes import leave_signals_to_parent
+
+__all__ = ["MakeEnv", "check_shares", "share_rows"]
+
+
+class MakeEnv(Protocol):
+    """Makes the run's environment with another number of rows; workers call it."""
+
+    def __call__(self, *, num_envs: int) -> EnvBase:
+        """Make an environment of ``num_envs`` rows."""
+        ...
+
+
+def check_shares(env: EnvBase, num_collectors: int, frames_per_batch: int) -> None:
+    """Refuse numbers that cannot be shared equally."""
+    num_envs = env.batch_size.numel()
+    if num_collectors < 1 or num_envs % num_collectors or frames_per_batch % num_envs:
+        raise ValueError(
+            f"{num_collectors} collectors cannot share {num_envs} environments and batches of "
+            f"{frames_per_batch} frames equally: num_envs must be a multiple of num_collectors, "
+            "and frames_per_batch of num_envs."
+        )
+
+
+def share_rows(env: EnvBase, make_env: MakeEnv, num_collectors: int) -> list[Callable[[], EnvBase]]:
+    """Functions that make every worker's environment, with its share of the rows of ``env``.
+
+    An environment with ``get_state`` and ``set_state`` has its rows continued by the workers, from
+    their next reset; any other one is made anew, and seeded apart from the other workers'.
+    """
+    states: list[TensorDictBase | None]
+    if not hasattr(env, "get_state"):
+        states = [None] * num_collectors
+    else:
+        env.reset()
+        states = list(env.get_state().chunk(num_collectors))
+    seeds = torch.randint(2**62, (num_collectors,)).tolist()
+    rows = env.batch_size.numel() // num_collectors
+    return [
+        partial(_make_share, make_env, rows, state, seed)
+        for state, seed in zip(states, seeds, strict=True)
+    ]
+
+
+def _make_share(
+    make_env: MakeEnv, num_envs: int, state: TensorDictBase | None, seed: int
+) -> EnvBase:
+    # of the policy's noise: every worker needs its own
+    torch.manual_seed(seed)
+    if parent_process() is not None:
+        # which ends the run, with a checkpoint
+        leave_signals_to_parent()
+    env = make_env(num_envs=num_envs)
+    if state is not None:
+        env.set_state(state)
+    else:
+        env.set_seed(seed % 2**31)
+    return env
