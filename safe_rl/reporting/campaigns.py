@@ -19,7 +19,7 @@ from safe_rl.reporting.cleaning import clean
 from safe_rl.reporting.columns import MISSING, Column, Table
 from safe_rl.reporting.recorded import Run
 from safe_rl.runs.files import read_yaml
-from safe_rl.runs.folder import files_below
+from safe_rl.runs.folder import paths_below
 from safe_rl.runs.identity import flatten, role_of
 
 __all__ = ["PLAN", "campaign_tables", "read_plan"]
@@ -106,7 +106,7 @@ def campaign_tables(
 
 def _names(root: Path) -> dict[Path, str]:
     """Plan -> name of its campaign: its folder's, with the way there if several are called so."""
-    plans = {path: path.parent.resolve().name for path in files_below(root, PLAN)}
+    plans = {path: path.parent.resolve().name for path in paths_below(root, PLAN)}
     names = list(plans.values())
     return {
         path: clean(name, 60)

@@ -19,7 +19,7 @@ import numpy as np
 from safe_rl.reporting.cleaning import clean
 from safe_rl.reporting.measured import read_certificate, read_code, read_evaluation
 from safe_rl.runs.files import read_config, read_yaml
-from safe_rl.runs.folder import RunFolder, files_below, runs_below
+from safe_rl.runs.folder import RunFolder, paths_below, runs_below
 from safe_rl.runs.outcome import final_figures, judges_another_measure, violation
 from safe_rl.runs.table import read_table
 
@@ -203,7 +203,7 @@ def _read_run(folder: RunFolder, root: Path, unfinished: bool, skipped: dict[Pat
         tuple(filter(None, read(folder.evaluations(), read_evaluation))),
         next(iter(read(there(folder.certificate), read_certificate)), None),
         next(iter(read(there(folder.code), read_code)), None),
-        tuple(read(files_below(folder.directory, "*.mp4"), lambda path: path)),
+        tuple(read(paths_below(folder.directory, "*.mp4"), lambda path: path)),
         recorded.stat().st_mtime,
     )
 

@@ -15,7 +15,7 @@ __all__ = [
     "checkpoint_steps",
     "checkpoints_in",
     "common_source",
-    "files_below",
+    "paths_below",
     "run_of",
     "runs_below",
 ]
@@ -217,19 +217,23 @@ class RunFolder:
 
 def runs_below(root: Path) -> list[RunFolder]:
     """Folders of runs below a folder, itself included, in the order of their paths."""
-    found = files_below(root, RunFolder(root).config.name)
+    found = paths_below(root, RunFolder(root).config.name)
     notes = RunFolder(root).notes.name
     return [RunFolder(path.parent) for path in found if path.parent.name != notes]
 
 
-def files_below(root: Path, pattern: str) -> list[Path]:
-    """Files of such names below a folder, sorted; links to folders are not followed.
+def paths_below(root: Path, pattern: str) -> list[Path]:
+    """Files and folders of such names below a folder, sorted; links to folders are not followed.
 
     Folders may vanish meanwhile, as those of a checkpoint that is being written do, at which
     `Path.rglob` fails.
     """
-    names = ((Path(folder), name) for folder, _, names in os.walk(root) for name in names)
-    return sorted(folder / name for folder, name in names if fnmatchcase(name, pattern))
+    return sorted(
+        Path(folder, name)
+        for folder, folders, files in os.walk(root)
+        for name in (*folders, *files)
+        if fnmatchcase(name, pattern)
+    )
 
 
 def checkpoint_name(steps: int) -> str:

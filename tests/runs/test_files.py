@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from omegaconf import OmegaConf
 
 from safe_rl.runs.files import read_config, read_yaml, replacing
-from safe_rl.runs.folder import files_below, runs_below
+from safe_rl.runs.folder import paths_below, runs_below
 
 VALUES = st.recursive(
     st.none() | st.booleans() | st.integers() | st.floats(allow_nan=False) | st.text("ab -:#'1"),
@@ -85,4 +85,4 @@ def test_runs_are_found_while_folders_of_a_checkpoint_come_and_go(tmp_path, monk
 
     monkeypatch.setattr(os, "scandir", vanish)
     assert [run.directory.name for run in runs_below(tmp_path)] == ["a", "b"]
-    assert files_below(tmp_path, "*.mp4") == []
+    assert paths_below(tmp_path, "*.mp4") == []
