@@ -47,15 +47,17 @@ def end_with_parent(grace: float = 0.0) -> None:
 
 @contextmanager
 def starting_processes() -> Iterator[None]:
-    """Keep SIGINT and SIGTERM from processes that this thread starts meanwhile.
+    """Keep SIGINT, SIGTERM and SIGHUP from processes that this thread starts meanwhile.
 
-    Ctrl-C, and what ends the jobs of a cluster, reach all processes of a run; its first one heeds
-    them. The others take seconds to start, in which they would be ended. They keep both signals
-    waiting until they call :func:`leave_signals_to_parent`.
+    Ctrl-C, the end of a terminal, and what ends the jobs of a cluster, reach all processes of a
+    run; its first one heeds them. The others take seconds to start, in which they would be ended.
+    They keep these signals waiting until they call :func:`leave_signals_to_parent`.
     """
     # which would let signals through again when it is started along with the first process
     resource_tracker.ensure_running()
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT, signal.SIGTERM})
+    before = signal.pthread_sigmask(
+        signal.SIG_BLOCK, {signal.SIGINT, signal.SIGTERM, signal.SIGHUP}
+    )
     try:
         yield
     finally:
@@ -63,12 +65,13 @@ def starting_processes() -> Iterator[None]:
 
 
 def leave_signals_to_parent() -> None:
-    """End with the parent, or when it sends SIGTERM; pass over SIGINT, and SIGTERM of others.
+    """End with the parent, or by its SIGTERM; pass over SIGINT, SIGHUP and SIGTERM of others.
 
     To be called in the main thread of a process that was begun within :func:`starting_processes`.
     Where the system does not tell who has sent a signal, as macOS, SIGTERM of anybody ends it.
     """
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    for number in (signal.SIGINT, signal.SIGHUP):
+        signal.signal(number, signal.SIG_IGN)
     parent = os.getppid()
     end_with_parent()
     if not hasattr(signal, "sigwaitinfo"):

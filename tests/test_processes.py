@@ -73,7 +73,7 @@ time.sleep(600)
 
 
 def send_from_elsewhere(pid):
-    for name in ("INT", "TERM"):
+    for name in ("INT", "TERM", "HUP"):
         subprocess.run(["kill", f"-{name}", str(pid)], check=True)
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import sys
-from contextlib import AbstractContextManager, ExitStack, nullcontext
+from contextlib import AbstractContextManager, ExitStack, nullcontext, suppress
 from functools import partial
 from pathlib import Path
 from signal import SIGINT
@@ -137,7 +137,8 @@ def run(config: DictConfig) -> None:
                 write_notes(folder, config)
             print(trainer.run())
     if trainer.interrupted_by is not None:
-        print(f"Interrupted. Continue with: {_this_command()} resume={folder.directory}")
+        with suppress(OSError):  # its terminal may be what ended it
+            print(f"Interrupted. Continue with: {_this_command()} resume={folder.directory}")
         raise SystemExit(128 + trainer.interrupted_by)
     if not is_to_keep_limits(config, trainer.algorithm.cost_keys):
         return

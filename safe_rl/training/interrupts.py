@@ -10,8 +10,9 @@ __all__ = ["StopRequest"]
 
 
 class StopRequest:
-    """Remembers the first SIGINT (Ctrl-C) or SIGTERM; the second acts as it always did.
+    """Remembers the first SIGINT (Ctrl-C), SIGTERM or SIGHUP; the second acts as it always did.
 
+    SIGHUP, which comes when a terminal is closed, stays ignored where it is, as below ``nohup``.
     Signals can only be caught in the main thread; elsewhere this does nothing.
 
     Examples:
@@ -22,7 +23,7 @@ class StopRequest:
         True
     """
 
-    _SIGNALS = (signal.SIGINT, signal.SIGTERM)
+    _SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
     def __init__(self) -> None:
         self.received: signal.Signals | None = None
@@ -30,7 +31,9 @@ class StopRequest:
 
     def __enter__(self) -> StopRequest:
         if threading.current_thread() is threading.main_thread():
-            self._previous = {number: signal.signal(number, self._stop) for number in self._SIGNALS}
+            is_kept_up = signal.getsignal(signal.SIGHUP) is signal.SIG_IGN
+            heeded = self._SIGNALS[:-1] if is_kept_up else self._SIGNALS
+            self._previous = {number: signal.signal(number, self._stop) for number in heeded}
         return self
 
     def __exit__(self, *exception: object) -> None:

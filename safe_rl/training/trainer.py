@@ -172,7 +172,7 @@ class Trainer:
     def run(self) -> str:
         """Train for ``frames`` steps, rounded up to whole batches.
 
-        Ctrl-C or SIGTERM ends the run after the epoch at hand, with a checkpoint;
+        Ctrl-C, SIGTERM or SIGHUP ends the run after the epoch at hand, with a checkpoint;
         ``interrupted_by`` then holds the signal, unless that epoch was the last one.
 
         Returns:
