@@ -1,0 +1,161 @@
+"""Policies of every kind of distribution, small ones, and batches of what they do."""
+
+import functools
+
+import torch
+from samples import NUM_OBS
+from tensordict import TensorDict
+from tensordict.nn import CompositeDistribution, NormalParamExtractor, TensorDictModule
+from torch import nn
+from torch.distributions import Beta, Categorical, Distribution, Independent, Normal
+from torchrl.envs.utils import ExplorationType
+from torchrl.modules import IndependentNormal, OneHotCategorical, ProbabilisticActor, TanhNormal
+from torchrl.modules import TruncatedNormal as TorchRLTruncatedNormal
+
+from safe_rl.models.distributions import Choices
+from safe_rl.models.heads import _Components
+
+
+class IndependentBeta(Independent):
+    """Beta in every dimension of the action."""
+
+    def __init__(self, alpha, beta):
+        super().__init__(Beta(alpha, beta), 1)
+
+    @property
+    def deterministic_sample(self):
+        return self.mean
+
+
+class MultiCategorical(Independent):
+    """As many choices in every component of the action."""
+
+    def __init__(self, logits):
+        super().__init__(Categorical(logits=logits), 1)
+
+
+class MatrixNormal(Independent):
+    """Normal in every entry of a matrix."""
+
+    def __init__(self, loc, scale):
+        super().__init__(Normal(loc, scale), 2)
+
+
+class Anonymous(Distribution):
+    """A normal distribution that tells neither its entropy nor what it is made of."""
+
+    arg_constraints = {}  # noqa: RUF012
+    has_rsample = True
+
+    def __init__(self, loc, scale):
+        self.hidden = IndependentNormal(loc, scale)
+        super().__init__(self.hidden.batch_shape, self.hidden.event_shape, validate_args=False)
+
+    def rsample(self, sample_shape=()):
+        return self.hidden.rsample(sample_shape)
+
+    def log_prob(self, value):
+        return self.hidden.log_prob(value)
+
+
+class Unreparametrised(Anonymous):
+    has_rsample = False
+
+    def sample(self, sample_shape=()):
+        return self.hidden.sample(sample_shape)
+
+
+class Positive(nn.Module):
+    """Two parameters above 1 per dimension."""
+
+    def forward(self, x):
+        return tuple((1 + nn.functional.softplus(x)).chunk(2, -1))
+
+
+class Steering(nn.Module):
+    """Outputs of a network as parameters of three parts: a number, two numbers, a choice."""
+
+    def forward(self, x):
+        loc, scale = NormalParamExtractor()(x[..., :2])
+        pair, other = NormalParamExtractor()(x[..., 2:6])
+        parts = {
+            "throttle": {"loc": loc.squeeze(-1), "scale": scale.squeeze(-1)},
+            "wheel": {"loc": pair, "scale": other},
+            "gear": {"logits": x[..., 6:]},
+        }
+        return TensorDict(parts, batch_size=x.shape[:-1])
+
+
+def composite(wheel):
+    parts = {"throttle": Normal, "wheel": wheel, "gear": Categorical}
+    names = {"throttle": ("hand", "throttle"), "wheel": ("hand", "wheel"), "gear": "gear"}
+    return functools.partial(CompositeDistribution, distribution_map=parts, name_map=names)
+
+
+class Shaped(nn.Module):
+    """Means and standard deviations in the shape of an action that is no vector."""
+
+    def __init__(self, *shape):
+        super().__init__()
+        self.shape = shape
+
+    def forward(self, x):
+        loc, scale = NormalParamExtractor()(x)
+        size = (*x.shape[:-1], *self.shape)
+        return loc.reshape(size), scale.reshape(size)
+
+
+class Grid(nn.Module):
+    """Two choices among three."""
+
+    def forward(self, x):
+        return x.unflatten(-1, (2, 3))
+
+
+KINDS = {
+    "normal": (4, NormalParamExtractor(), ["loc", "scale"], IndependentNormal),
+    "number": (2, Shaped(), ["loc", "scale"], Normal),
+    "matrix": (12, Shaped(2, 3), ["loc", "scale"], MatrixNormal),
+    "tanh_normal": (4, NormalParamExtractor(), ["loc", "scale"], TanhNormal),
+    "bounded_tanh_normal": (
+        4, NormalParamExtractor(), ["loc", "scale"],
+        functools.partial(TanhNormal, low=-2.0, high=3.0),
+    ),
+    "truncated_normal": (4, NormalParamExtractor(), ["loc", "scale"], TorchRLTruncatedNormal),
+    "beta": (4, Positive(), ["alpha", "beta"], IndependentBeta),
+    "categorical": (5, nn.Identity(), ["logits"], Categorical),
+    "one_hot": (5, nn.Identity(), ["logits"], OneHotCategorical),
+    "multi_discrete": (6, Grid(), ["logits"], MultiCategorical),
+    "unequal_multi_discrete": (5, _Components([2, 3]), ["logits"], Choices),
+    "composite": (9, Steering(), ["params"], composite(IndependentNormal)),
+    "apart_composite": (9, Steering(), ["params"], composite(Normal)),
+    "sampled_composite": (9, Steering(), ["params"], composite(Anonymous)),
+    "anonymous": (4, NormalParamExtractor(), ["loc", "scale"], Anonymous),
+    "unreparametrised": (4, NormalParamExtractor(), ["loc", "scale"], Unreparametrised),
+}  # fmt: skip
+SAMPLED_KL = {"truncated_normal", "anonymous", "unreparametrised"}
+COMPOSITE = {kind for kind in KINDS if "composite" in kind}
+ACTIONS = [("hand", "throttle"), ("hand", "wheel"), "gear"]
+
+
+def make_actor(kind):
+    outputs, head, keys, distribution = KINDS[kind]
+    net = nn.Sequential(nn.Linear(NUM_OBS, 6), nn.Tanh(), nn.Linear(6, outputs), head)
+    return ProbabilisticActor(
+        TensorDictModule(net, in_keys=["observation"], out_keys=keys),
+        in_keys=keys,
+        distribution_class=distribution,
+        out_keys=ACTIONS if kind in COMPOSITE else None,
+        default_interaction_type=ExplorationType.RANDOM,
+        return_log_prob=True,
+    )
+
+
+def make_case(kind, samples=64, costs=1):
+    actor = make_actor(kind)
+    batch = TensorDict(observation=torch.randn(samples, NUM_OBS), batch_size=[samples])
+    with torch.no_grad():
+        actor(batch)
+    batch["advantage"] = torch.randn(samples, 1)
+    batch["cost_advantage"] = torch.randn(samples, costs)
+    return actor, batch
