@@ -117,8 +117,16 @@ FLOORS = {
     "objectives": (
         ("keys", "distributions", "samples", "gae", "cpo_dual", "risk", "violation"),
         ("episode_costs",),
-        ("advantages", "critics", "limits", "multipliers", "normalisation", "trust_region"),
-        ("bc", "controllers", "pid", "projected", "q_functions", "surrogate", "fisher"),
+        (
+            "advantages",
+            "critics",
+            "limits",
+            "multipliers",
+            "normalisation",
+            "q_functions",
+            "trust_region",
+        ),
+        ("bc", "controllers", "cost_critics", "pid", "projected", "surrogate", "fisher"),
         ("actor_critic", "cpo", "cup", "focops", "ppo", "sac", "td3", "trpo"),
         ("cal", "ipo", "p3o", "rcpo", "wcsac"),
         ("",),

@@ -29,7 +29,7 @@ from safe_rl.algorithms.replay_networks import (
 from safe_rl.algorithms.replay_update import ReplayUpdate
 from safe_rl.collectors import EpisodeStatistics
 from safe_rl.models import ExploringPolicy
-from safe_rl.objectives.q_functions import CostCritics
+from safe_rl.objectives.cost_critics import CostCritics
 
 __all__ = ["OffPolicy"]
 

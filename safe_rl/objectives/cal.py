@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Unpack
 
 import torch
-from tensordict import NestedKey
 from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModuleBase
 from torch import Tensor
 
-from safe_rl.objectives.multipliers import Multiplier
-from safe_rl.objectives.sac import SACLagrangianLoss, SoftActorCritic
+from safe_rl.objectives.sac import ConstrainedSoftActorCritic, SACLagrangianLoss
 from safe_rl.objectives.violation import KnownCosts
 
 __all__ = ["CALLoss", "discounted_share"]
@@ -104,27 +101,12 @@ class CALLoss(SACLagrangianLoss):
         qvalue_network: TensorDictModuleBase,
         cost_qvalue_network: TensorDictModuleBase,
         *,
-        multiplier: Multiplier,
-        cost_keys: Sequence[NestedKey],
         convexity: float,
         ratio_memory: float,
         largest_ratio: float,
-        pessimism: float = 0.0,
-        target_pessimism: float | None = None,
-        lowest_cost_value: float | None = None,
-        **settings: Unpack[SoftActorCritic],
+        **settings: Unpack[ConstrainedSoftActorCritic],
     ) -> None:
-        super().__init__(
-            actor_network,
-            qvalue_network,
-            cost_qvalue_network,
-            multiplier=multiplier,
-            cost_keys=cost_keys,
-            pessimism=pessimism,
-            target_pessimism=target_pessimism,
-            lowest_cost_value=lowest_cost_value,
-            **settings,
-        )
+        super().__init__(actor_network, qvalue_network, cost_qvalue_network, **settings)
         self.convexity = convexity
         self.ratio_memory, self.largest_ratio = ratio_memory, largest_ratio
         self.out_keys = [*self.out_keys, "cost_weight"]

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import NotRequired, TypedDict, Unpack
+from typing import NotRequired, TypedDict
 
 import torch
-from tensordict import NestedKey, TensorDict, TensorDictBase
-from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModuleBase, dispatch
+from tensordict import TensorDict, TensorDictBase
+from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModuleBase
 from torch import Tensor
 from torchrl import objectives
 from torchrl.data import TensorSpec
@@ -16,15 +15,8 @@ from torchrl.modules.distributions.utils import rsample_and_log_prob
 from torchrl.objectives import ValueEstimators
 from torchrl.objectives.value import TD0Estimator
 
-from safe_rl.objectives.multipliers import Multiplier
-from safe_rl.objectives.q_functions import (
-    CostCritics,
-    CostTerms,
-    QFunctionLoss,
-    discount_of,
-    is_ensemble,
-    scalars,
-)
+from safe_rl.objectives.cost_critics import CostCritics, CostTerms
+from safe_rl.objectives.q_functions import QFunctionLoss, discount_of, is_ensemble, scalars
 
 __all__ = ["ConstrainedSoftActorCritic", "SACLagrangianLoss", "SACLoss", "SoftActorCritic"]
 
@@ -153,15 +145,6 @@ class SACLoss(QFunctionLoss, objectives.SACLoss):
             inputs = steps.select(*self.actor_network.in_keys)
             return rsample_and_log_prob(self.actor_network.get_dist(inputs))
 
-    @dispatch
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Evaluate all losses on steps [...]; the TD error is written as their priority.
-
-        Returns:
-            TensorDict with `out_keys`, without batch dimension.
-        """
-        return self.critic_losses(tensordict).update(self.actor_losses(tensordict))
-
     def critic_losses(self, tensordict: TensorDictBase) -> TensorDict:
         """Losses of the Q functions."""
         loss, metadata = self.qvalue_v2_loss(tensordict)
@@ -183,7 +166,7 @@ class SACLoss(QFunctionLoss, objectives.SACLoss):
         )
 
 
-class SACLagrangianLoss(SACLoss, CostCritics):
+class SACLagrangianLoss(CostCritics, SACLoss):
     """SAC on the Lagrangian: min_π E[α log π − min Q_r + r Σ_i w_i Q_i] / (1 + Σ_i w_i), w = λ / u.
 
     The sizes r of rewards and u of costs are 1 until they are measured; see `CostCritics`.
@@ -223,37 +206,6 @@ class SACLagrangianLoss(SACLoss, CostCritics):
         >>> ("next", "cost") in loss.in_keys, "loss_cost_qvalue" in loss.out_keys
         (True, True)
     """
-
-    _in_keys: list[NestedKey]
-
-    def __init__(
-        self,
-        actor_network: ProbabilisticTensorDictSequential,
-        qvalue_network: TensorDictModuleBase,
-        cost_qvalue_network: TensorDictModuleBase,
-        *,
-        multiplier: Multiplier,
-        cost_keys: Sequence[NestedKey],
-        pessimism: float = 0.0,
-        target_pessimism: float | None = None,
-        lowest_cost_value: float | None = None,
-        **settings: Unpack[SoftActorCritic],
-    ) -> None:
-        self.cost_keys = list(cost_keys)
-        SACLoss.__init__(self, actor_network, qvalue_network, **settings)
-        self._add_cost_critics(
-            cost_qvalue_network,
-            multiplier,
-            cost_keys,
-            pessimism=pessimism,
-            target_pessimism=target_pessimism,
-            lowest_cost_value=lowest_cost_value,
-        )
-        self.out_keys = [*self.out_keys, "loss_cost_qvalue", "cost_qvalue"]
-
-    def _set_in_keys(self) -> None:
-        super()._set_in_keys()
-        self._in_keys = [*self._in_keys, *(("next", key) for key in self.cost_keys)]
 
     def critic_losses(self, tensordict: TensorDictBase) -> TensorDict:
         """Losses of the Q functions of reward and costs, for the same actions that follow."""

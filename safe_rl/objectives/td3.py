@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import NotRequired, TypedDict, Unpack
+from typing import NotRequired, TypedDict
 
 import torch
-from tensordict import NestedKey, TensorDict, TensorDictBase
-from tensordict.nn import TensorDictModuleBase, dispatch
+from tensordict import TensorDict, TensorDictBase
+from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torchrl import objectives
 from torchrl.data import TensorSpec
 from torchrl.objectives import ValueEstimators
 
-from safe_rl.objectives.multipliers import Multiplier
-from safe_rl.objectives.q_functions import CostCritics, QFunctionLoss, is_ensemble, scalars
+from safe_rl.objectives.cost_critics import CostCritics
+from safe_rl.objectives.q_functions import QFunctionLoss, is_ensemble, scalars
 
 __all__ = ["TD3LagrangianLoss", "TD3Loss", "TwinDelayed"]
 
@@ -109,15 +108,6 @@ class TD3Loss(QFunctionLoss, objectives.TD3Loss):
             network = self.qvalue_network
             self._vmap_qvalue_network00 = lambda steps, params: network(steps[0], params)
 
-    @dispatch
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Evaluate both losses on steps [...]; the TD error is written as their priority.
-
-        Returns:
-            TensorDict with `out_keys`, without batch dimension.
-        """
-        return self.critic_losses(tensordict).update(self.actor_losses(tensordict))
-
     def critic_losses(self, tensordict: TensorDictBase) -> TensorDict:
         """Losses of the Q functions."""
         loss, metadata = self.value_loss(tensordict)
@@ -133,7 +123,7 @@ class TD3Loss(QFunctionLoss, objectives.TD3Loss):
         return scalars(loss_actor=loss, qvalue=values.mean(), **metadata)
 
 
-class TD3LagrangianLoss(TD3Loss, CostCritics):
+class TD3LagrangianLoss(CostCritics, TD3Loss):
     """TD3 on the Lagrangian: max_π E[Q_1 − r Σ_i w_i Q_i] / (1 + Σ_i w_i), w = λ / u.
 
     The sizes r of rewards and u of costs are 1 until they are measured; see `CostCritics`.
@@ -168,37 +158,6 @@ class TD3LagrangianLoss(TD3Loss, CostCritics):
         >>> loss.out_keys[-2:]
         ['loss_cost_qvalue', 'cost_qvalue']
     """
-
-    _in_keys: list[NestedKey]
-
-    def __init__(
-        self,
-        actor_network: TensorDictModuleBase,
-        qvalue_network: TensorDictModuleBase,
-        cost_qvalue_network: TensorDictModuleBase,
-        *,
-        multiplier: Multiplier,
-        cost_keys: Sequence[NestedKey],
-        pessimism: float = 0.0,
-        target_pessimism: float | None = None,
-        lowest_cost_value: float | None = None,
-        **settings: Unpack[TwinDelayed],
-    ) -> None:
-        self.cost_keys = list(cost_keys)
-        TD3Loss.__init__(self, actor_network, qvalue_network, **settings)
-        self._add_cost_critics(
-            cost_qvalue_network,
-            multiplier,
-            cost_keys,
-            pessimism=pessimism,
-            target_pessimism=target_pessimism,
-            lowest_cost_value=lowest_cost_value,
-        )
-        self.out_keys = [*self.out_keys, "loss_cost_qvalue", "cost_qvalue"]
-
-    def _set_in_keys(self) -> None:
-        super()._set_in_keys()
-        self._in_keys = [*self._in_keys, *(("next", key) for key in self.cost_keys)]
 
     def critic_losses(self, tensordict: TensorDictBase) -> TensorDict:
         """Losses of the Q functions of reward and costs."""

@@ -2,19 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from statistics import NormalDist
 from typing import Unpack
 
-from tensordict import NestedKey
 from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModuleBase
 from torch import Tensor
 from torch.nn.functional import softplus
 from torchrl.objectives.utils import distance_loss
 
-from safe_rl.objectives.multipliers import Multiplier
 from safe_rl.objectives.risk import CVaR
-from safe_rl.objectives.sac import SACLagrangianLoss, SoftActorCritic
+from safe_rl.objectives.sac import ConstrainedSoftActorCritic, SACLagrangianLoss
 
 __all__ = ["WCSACLoss", "gaussian_tail"]
 
@@ -102,26 +99,11 @@ class WCSACLoss(SACLagrangianLoss):
         qvalue_network: TensorDictModuleBase,
         cost_qvalue_network: TensorDictModuleBase,
         *,
-        multiplier: Multiplier,
-        cost_keys: Sequence[NestedKey],
         tail: float,
-        pessimism: float = 0.0,
-        target_pessimism: float | None = None,
-        lowest_cost_value: float | None = None,
-        **settings: Unpack[SoftActorCritic],
+        **settings: Unpack[ConstrainedSoftActorCritic],
     ) -> None:
         self._factor = gaussian_tail(tail)
-        super().__init__(
-            actor_network,
-            qvalue_network,
-            cost_qvalue_network,
-            multiplier=multiplier,
-            cost_keys=cost_keys,
-            pessimism=pessimism,
-            target_pessimism=target_pessimism,
-            lowest_cost_value=lowest_cost_value,
-            **settings,
-        )
+        super().__init__(actor_network, qvalue_network, cost_qvalue_network, **settings)
         if (number := cost_qvalue_network.num_networks) % 2:
             raise ValueError(
                 f"There are {number} cost critics (critics.costs): their number has to be even, a "

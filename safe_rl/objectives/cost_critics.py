@@ -1,0 +1,238 @@
+"""Critics of k costs, for any loss on Q functions."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, NotRequired, TypedDict
+
+import torch
+from tensordict import NestedKey, TensorDictBase, TensorDictParams
+from tensordict.nn import TensorDictModuleBase
+from torch import Tensor
+from torchrl.objectives.utils import distance_loss
+
+from safe_rl.objectives.keys import require
+from safe_rl.objectives.multipliers import Multiplier
+from safe_rl.objectives.q_functions import QFunctionLoss, discount_of, is_ensemble
+from safe_rl.objectives.violation import KnownCosts
+
+__all__ = ["CostCritics", "CostTerms"]
+
+
+class CostTerms(TypedDict):
+    """Keyword arguments of every loss with cost critics.
+
+    Attributes:
+        multiplier: λ; read at every call.
+        cost_keys: costs below ``next``, [..., 1] each.
+        pessimism: κ, standard deviations among the cost critics that are added to their mean.
+        target_pessimism: the same for what critics bootstrap on, which all then have in common;
+            null: every critic bootstraps on its own target network.
+        lowest_cost_value: lower bound of what critics bootstrap on, e.g. 0 where no cost is
+            negative; null: none.
+    """
+
+    multiplier: Multiplier
+    cost_keys: Sequence[NestedKey]
+    pessimism: NotRequired[float]
+    target_pessimism: NotRequired[float | None]
+    lowest_cost_value: NotRequired[float | None]
+
+
+class CostCritics(QFunctionLoss):
+    """k cost critics for a loss on Q functions: their TD(0) loss, and the penalty on the actor.
+
+    A policy that minimises Q_c seeks out what Q_c underestimates, and bootstrapping carries that on
+    from state to state: without a bound from above, found values of a cost that is never negative
+    fall below 0. As rewards bootstrap on the least of two networks, costs bootstrap on
+    mean_E Q' + κ' std_E Q', which is the largest of two networks for κ' = 1. The penalty on an
+    action is r Σ_i λ_i (mean_E Q_i + κ std_E Q_i) / u_i, with the multipliers λ, the pessimism κ,
+    the size u of one cost and the size r of rewards, so that λ has no unit: at λ = 1 one cost
+    weighs as much as a reward of one standard deviation. The sum of the actor's objective and this
+    is divided by 1 + Σ λ_i / u_i, so that the step size does not grow with λ.
+
+    Classes put it before the loss without costs that they inherit from; both halves of that take
+    something from it: `cost_qvalue_loss` and `penalised`.
+
+    Args:
+        actor_network, qvalue_network: of the loss without costs.
+        cost_qvalue_network: a `safe_rl.models.QEnsemble` with one output per cost.
+        multiplier: this and the next: see `CostTerms`.
+        settings: of the loss without costs.
+
+    Raises:
+        ValueError: if the cost critic is no ensemble, or keys and multipliers differ in number.
+
+    Attributes:
+        cost_unit: u, the size of one cost, [k]; a buffer of ones unless somebody sets it.
+        reward_unit: r, the standard deviation of the rewards of single steps, a scalar; 1 until
+            `measure` has been called.
+    """
+
+    _in_keys: list[NestedKey]
+    out_keys: list[str]
+    cost_qvalue_network: TensorDictModuleBase
+    cost_qvalue_network_params: TensorDictParams
+    target_cost_qvalue_network_params: TensorDictParams
+    cost_unit: Tensor
+    reward_unit: Tensor
+    reward_sums: Tensor
+    gamma: float
+    loss_function: str
+    pessimism: float
+    target_pessimism: float | None
+    lowest_cost_value: float | None
+
+    def __init__(
+        self,
+        actor_network: TensorDictModuleBase,
+        qvalue_network: TensorDictModuleBase,
+        cost_qvalue_network: TensorDictModuleBase,
+        *,
+        multiplier: Multiplier,
+        cost_keys: Sequence[NestedKey],
+        pessimism: float = 0.0,
+        target_pessimism: float | None = None,
+        lowest_cost_value: float | None = None,
+        **settings: Any,
+    ) -> None:
+        if not is_ensemble(cost_qvalue_network):
+            raise ValueError(
+                "The cost critic has to be a safe_rl.models.QEnsemble with one output per cost, "
+                f"not a {type(cost_qvalue_network).__name__}."
+            )
+        if len(cost_keys) != multiplier.num_costs:
+            raise ValueError(
+                f"There are {len(cost_keys)} cost_keys but {multiplier.num_costs} multipliers."
+            )
+        self.cost_keys = list(cost_keys)  # of which keys are made
+        super().__init__(actor_network, qvalue_network, **settings)
+        self.convert_to_functional(
+            cost_qvalue_network, "cost_qvalue_network", create_target_params=True
+        )
+        self.out_keys = [*self.out_keys, "loss_cost_qvalue", "cost_qvalue"]
+        self.pessimism, self.target_pessimism = pessimism, target_pessimism
+        self.lowest_cost_value = lowest_cost_value
+        # not a part of the loss: whoever moves it saves it
+        self.__dict__["multiplier"] = multiplier
+        device = next(cost_qvalue_network.parameters()).device
+        self.register_buffer("cost_unit", torch.ones(len(cost_keys), device=device))
+        self.register_buffer("reward_unit", torch.ones((), device=device))
+        # number, sum and sum of squares
+        self.register_buffer("reward_sums", torch.zeros(3, dtype=torch.float64, device=device))
+
+    def _set_in_keys(self) -> None:
+        super()._set_in_keys()
+        self._in_keys = [*self._in_keys, *(("next", key) for key in self.cost_keys)]
+
+    def cost_values(self, steps: TensorDictBase, action: Tensor, params: TensorDictBase) -> Tensor:
+        """Q_c of actions in the states of steps [...], by every network: [E, ..., k]."""
+        network = self.cost_qvalue_network
+        inputs = steps.select(*network.in_keys, strict=False)
+        inputs.set(self.tensor_keys.action, action)
+        return network(inputs, params).get(network.out_keys[0])
+
+    def calibrate(self, episodes: KnownCosts) -> None:
+        """Take in what a batch says about the costs of episodes, before its updates."""
+        self.cost_unit.copy_(episodes.unit)
+
+    def measure(self, rewards: Tensor) -> None:
+        """Set the size of rewards from those of all steps so far; `rewards` are new ones, [...]."""
+        rewards = rewards.detach().flatten().to(self.reward_sums)
+        powers = torch.stack([torch.ones_like(rewards), rewards, rewards.square()])
+        self.reward_sums.add_(powers.sum(-1))
+        number, total, squares = self.reward_sums
+        variance = (squares / number - (total / number).square()).clamp_min(0)
+        # rewards that are all alike have no size, and their policy nothing to weigh
+        self.reward_unit.copy_(torch.where(variance > 0, variance.sqrt(), 1.0))
+
+    def cost_qvalue_loss(self, tensordict: TensorDictBase, next_action: Tensor) -> Tensor:
+        """Loss of the cost critics, summed over networks and costs."""
+        following = tensordict.get("next")
+        costs = torch.cat([require(tensordict, ("next", key)) for key in self.cost_keys], -1)
+        with torch.no_grad():
+            values = self.cost_values(
+                following, next_action, self.target_cost_qvalue_network_params
+            )
+            goes_on = following.get(self.tensor_keys.terminated).logical_not()
+            spanned = self.value_estimator.tensor_keys.steps_to_next_obs
+            discount = discount_of(tensordict, self.gamma, spanned) * goes_on
+        found = self.cost_values(
+            tensordict, tensordict.get(self.tensor_keys.action), self.cost_qvalue_network_params
+        )
+        loss = self.cost_errors(found, costs, discount, values).sum(-1).sum(0)
+        weights = self._maybe_get_priority_weight(tensordict)
+        return self._reduce_loss(loss, tensordict=tensordict, weights=weights)
+
+    def cost_errors(
+        self, found: Tensor, costs: Tensor, discount: Tensor, following: Tensor
+    ) -> Tensor:
+        """Distance of the critics from what they should say, for every step.
+
+        Args:
+            found: outputs of the networks, [E, ..., k].
+            costs: of the steps, [..., k].
+            discount: of what follows, 0 after an end, [..., 1].
+            following: outputs of the target networks for what follows, [E, ..., k].
+
+        Returns:
+            Distances from TD(0) targets, [E, ..., k].
+        """
+        target = costs + discount * self.bounded(following)
+        return distance_loss(found, target, loss_function=self.loss_function)
+
+    def bounded(self, values: Tensor) -> Tensor:
+        """What the critics bootstrap on, from outputs [E, ..., k] of the target networks."""
+        if self.target_pessimism is not None:
+            values = pessimistic(values, self.target_pessimism).expand_as(values)
+        lowest = self.lowest_cost_value
+        return values if lowest is None else values.clamp_min(lowest)
+
+    @property
+    def _detached_cost_params(self) -> TensorDictBase:
+        # TorchRL forgets what begins so whenever parameters move to another device or dtype
+        if "_cached_cost_params" not in self.__dict__:
+            self.__dict__["_cached_cost_params"] = self.cost_qvalue_network_params.data
+        return self.__dict__["_cached_cost_params"]
+
+    def penalised(
+        self, objective: Tensor, tensordict: TensorDictBase, action: Tensor
+    ) -> tuple[Tensor, dict[str, Tensor]]:
+        """The actor's objective [...] with the costs of its actions.
+
+        Returns:
+            The objective, and what is reported: `cost_figures`, and ``cost_weight``, what costs
+            were multiplied by, [k].
+        """
+        values = self.cost_values(tensordict, action, self._detached_cost_params)
+        weights = self.cost_weights(values.detach()).to(values)
+        charges = self.reward_unit * (self.charged(values) @ weights)
+        objective = (objective + charges) / (1 + weights.sum())
+        return objective, {**self.cost_figures(values.detach()), "cost_weight": weights}
+
+    def charged(self, values: Tensor) -> Tensor:
+        """What actions cost the actor, [..., k], from outputs [E, ..., k] of the cost critics."""
+        return pessimistic(values, self.pessimism)
+
+    def cost_weights(self, values: Tensor) -> Tensor:
+        """What the actor's costs are multiplied by, [k]: λ / u.
+
+        Args:
+            values: outputs of the cost critics for its actions, [E, ..., k].
+        """
+        return self.multiplier.value.to(self.cost_unit) / self.cost_unit
+
+    def cost_figures(self, values: Tensor) -> dict[str, Tensor]:
+        """What is reported of outputs [E, ..., k] of the cost critics, [k] each."""
+        return {"cost_qvalue": values.flatten(0, -2).mean(0)}
+
+
+def pessimistic(values: Tensor, deviations: float) -> Tensor:
+    """Mean of an ensemble [E, ...] and so many standard deviations among it on top, [...].
+
+    Examples:
+        >>> pessimistic(torch.tensor([1.0, 3.0]), deviations=1.0)
+        tensor(3.)
+    """
+    mean = values.mean(0)
+    return mean + deviations * values.std(0, correction=0) if deviations else mean
