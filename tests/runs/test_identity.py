@@ -22,10 +22,10 @@ def nodes(config, prefix=""):
 
 @pytest.fixture(scope="module")
 def all_keys():
-    ray = compose_config("env=PointMass", "collector=ray")
+    collectors = [compose_config("env=PointMass", f"collector={n}") for n in ("ray", "process")]
     pairs = [(algorithm, "none") for algorithm in ALGORITHMS]
     pairs += [(ALGORITHMS[0], logger) for logger in LOGGERS]
-    found = set(nodes(OmegaConf.to_container(ray)))
+    found = {key for one in collectors for key in nodes(OmegaConf.to_container(one))}
     for (algo, logger), preset in itertools.product(pairs, ("default", "paper")):
         config = compose_config("env=PointMass", f"algo={algo}", f"logger={logger}", f"preset={preset}")  # fmt: skip  # noqa: E501
         found |= set(nodes(OmegaConf.to_container(config)))
@@ -62,6 +62,7 @@ def test_folders_of_a_sweep_name_all_but_the_machine_and_what_is_in_the_path(all
         ("policy_update.compile", Role.MACHINE),
         ("logger._target_", Role.MACHINE),
         ("collector._target_", Role.MANNER),
+        ("collector.ahead", Role.EXPERIMENT),
         ("hydra.verbose", Role.MACHINE),
         ("hydra.run.dir", Role.MANNER),
         ("env.hazards_num", Role.EXPERIMENT),
@@ -85,7 +86,11 @@ def test_seeds_and_machines_make_no_other_experiment(override):
 
 
 @pytest.mark.parametrize(
-    "override", ["frames=7", "policy_update.max_kl=0.1", "cost_limits={cost: 3}", "env.name=Other"]
+    "override",
+    [
+        *("frames=7", "policy_update.max_kl=0.1", "cost_limits={cost: 3}", "env.name=Other"),
+        "collector=ahead",  # batches are of an older policy
+    ],
 )
 def test_everything_else_does(override):
     assert experiment_of(as_saved(override)) != experiment_of(as_saved())
