@@ -203,9 +203,19 @@ def _read_run(folder: RunFolder, root: Path, unfinished: bool, skipped: dict[Pat
         tuple(filter(None, read(folder.evaluations(), read_evaluation))),
         next(iter(read(there(folder.certificate), read_certificate)), None),
         next(iter(read(there(folder.code), read_code)), None),
-        tuple(read(paths_below(folder.directory, "*.mp4"), lambda path: path)),
+        tuple(read(_films(folder), lambda path: path)),
         recorded.stat().st_mtime,
     )
+
+
+def _films(run: RunFolder) -> list[Path]:
+    """Videos in a run's folder: neither those of runs below it, nor what a killed one has left."""
+
+    def is_own(path: Path) -> bool:
+        nearest = next(folder for folder in path.parents if RunFolder(folder).is_run)
+        return nearest == run.directory and not path.name.startswith(".")
+
+    return list(filter(is_own, paths_below(run.directory, "*.mp4")))
 
 
 def _own(path: Path, root: Path) -> Path:

@@ -219,3 +219,18 @@ def test_whatever_happens_to_bytes_of_a_run_the_others_are_reported(tmp_path_fac
         (run / name).write_bytes(bytes(content[:place]) + noise + bytes(content[kept:]))
     found = build_report(root, SUITE, seeds_needed=1, unfinished=False)
     assert "good" in {known.directory.name for known in found.runs}
+
+
+def test_films_are_a_runs_own_and_complete(tmp_path):
+    """A killed evaluation leaves a film that plays nothing; a run may lie in another's folder."""
+    first = write_run(tmp_path, **EPOCHS)
+    (first / ".evaluation.unfinished.mp4").write_bytes(b"half of it")
+    second = write_run(first, seed=1, **EPOCHS)
+    for film in (first / "films" / "b.mp4", second / "a.mp4"):
+        film.parent.mkdir(exist_ok=True)
+        film.write_bytes(b"all of it")
+    found = build_report(tmp_path, SUITE, seeds_needed=1, unfinished=False)
+    assert {run.seed: [path.name for path in run.videos] for run in found.runs} == {
+        0: ["b.mp4"], 1: ["a.mp4"],
+    }  # fmt: skip
+    assert not found.skipped
