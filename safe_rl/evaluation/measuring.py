@@ -111,7 +111,7 @@ def evaluate(
     write_episodes(places["csv"], episodes)
     for film in films:
         torch.manual_seed(seed)
-        # the first world draws the same episodes whatever the number of worlds
+        # the first world draws the same layouts whatever the number of worlds; actions are others
         with closing(make(1, **drawing)) as single:
             frames = record_episode(
                 single, policy, cost_keys, **manner, camera=options.camera, suffix=film.suffix[1:]

@@ -50,9 +50,12 @@ class EvaluationOptions:
     num_threads: int = _option(0, "threads that step them; 0: one per core")
     device: str = _option("cpu", "of the policy")
     cvar_alpha: float = _option(0.1, "share of the costliest episodes in the CVaR")
-    video: bool = _option(False, "write an MP4 of the first episode (extra 'video')")
+    video: bool = _option(
+        False,
+        "write an MP4 of an episode on the first layout; num_envs=1: the first (extra 'video')",
+    )
     picture: str | None = _option(
-        None, "file for an animated picture of the first episode, .gif or .webp"
+        None, "file for an animated picture of the same episode, .gif or .webp"
     )
     camera: str = _option("free", "of these: free, fixednear, fixedfar, track or vision")
     record: bool = _option(False, "write every transition to disk, for dataset.path=…")

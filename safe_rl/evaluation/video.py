@@ -39,7 +39,8 @@ class Manner(NamedTuple):
 
 
 DEFAULT_CAMERA = "free"
-_CAPTION_HEIGHT = 20
+# of the line below the picture, and what its text takes of a width at least [pixels]
+_CAPTION_HEIGHT, _CAPTION_WIDTH = 20, 280
 # of a GIF's palette; and how long its last frame stays [ms]
 _COLOURS, _LAST = 64, 1500
 
@@ -53,32 +54,49 @@ def check_camera(env: EnvBase, camera: str, suffix: str = "mp4") -> None:
         suffix: Of the file that is to be written, see :data:`MANNERS`.
 
     Raises:
-        ValueError: If the environment draws no pictures, or has no such camera.
+        ValueError: If the environment draws no pictures, whatever its ``render`` fails of, or has
+            no such camera.
         ModuleNotFoundError: If the encoder is missing; the message names the extra.
     """
+    asked = "video=true" if suffix == "mp4" else "picture=…"
     if suffix == "mp4":
-        import_extra("imageio_ffmpeg", "video")
+        for package in ("imageio", "imageio_ffmpeg"):
+            import_extra(package, "video")
     if not callable(getattr(env, "render", None)):
-        raise ValueError("video=true: this environment draws no pictures, it has no 'render'.")
+        raise ValueError(f"{asked}: this environment draws no pictures, it has no 'render'.")
     if camera != DEFAULT_CAMERA and "camera" not in _parameters(env):
         raise ValueError(f"camera={camera}: this environment has no cameras to choose from.")
     env.reset()
-    _picture(env, camera, MANNERS[suffix])
+    try:
+        picture = _picture(env, camera, MANNERS[suffix])
+    except ValueError:
+        raise
+    except Exception as error:  # a 'render' is anybody's
+        words = " ".join(str(error).split()) or type(error).__name__
+        raise ValueError(f"{asked}: this environment cannot be drawn: {words}") from error
+    if picture is None:
+        raise ValueError(
+            f"{asked}: this environment draws no pictures: its 'render' returns none. One of "
+            "Gymnasium's may have to be made with render_mode=rgb_array, here one of env.kwargs."
+        )
 
 
 def _parameters(env: EnvBase) -> set[str]:
     return set(signature(env.render).parameters)
 
 
-def _picture(env: EnvBase, camera: str, manner: Manner) -> np.ndarray:
-    """World 0 as it is, uint8 [height, width, 3]; sizes and cameras where they can be chosen."""
+def _picture(env: EnvBase, camera: str, manner: Manner) -> Image.Image | None:
+    """World 0 as it is, if that is drawn; sizes and cameras where they can be chosen."""
     size = {"width": manner.width, "height": manner.height}
     wanted: dict[str, Any] = {"rows": 0, "camera": camera, **size}
     known = _parameters(env)
-    picture = np.asarray(env.render(**{k: v for k, v in wanted.items() if k in known}))
-    picture = picture[0] if picture.ndim == 4 else picture
+    pixels = np.asarray(env.render(**{k: v for k, v in wanted.items() if k in known}))
+    if pixels.dtype == object:  # None, or a list of it
+        return None
+    # grey ones, and those with a fourth channel, are pictures, too
+    picture = Image.fromarray(pixels[0] if pixels.ndim == 4 else pixels)
     # the encoding halves both sides
-    return picture[: picture.shape[0] // 4 * 4, : picture.shape[1] // 4 * 4]
+    return picture.crop((0, 0, picture.width // 4 * 4, picture.height // 4 * 4))
 
 
 @torch.no_grad()
@@ -92,6 +110,8 @@ def record_episode(
     suffix: str = "mp4",
 ) -> Iterator[np.ndarray]:
     """Run one episode and yield its frames, uint8 [height, width, 3].
+
+    The last one shows how it ended, and below that what it has come to.
 
     Args:
         env: Environment with one world and ``render``.
@@ -108,26 +128,34 @@ def record_episode(
     with exploration(deterministic):
         while True:
             if step % manner.steps_per_frame == 0:
-                yield _with_caption(_picture(env, camera, manner), step, *total.values())
+                yield _frame(env, camera, manner, step, *total.values())
             after = env.step(policy(state))["next"]
             step += 1
             total = {key: value + float(after[key]) for key, value in total.items()}
             if after["done"].any():
+                yield _frame(env, camera, manner, step, *total.values())
                 return
             state = after.exclude("reward")
 
 
-def _with_caption(
-    picture: np.ndarray, step: int, episode_return: float, cost: float | None = None
+def _frame(
+    env: EnvBase,
+    camera: str,
+    manner: Manner,
+    step: int,
+    episode_return: float,
+    cost: float | None = None,
 ) -> np.ndarray:
-    """The picture above a line with what the episode has come to."""
-    height, width, _ = picture.shape
-    canvas = Image.new("RGB", (width, height + _CAPTION_HEIGHT), "white")
-    canvas.paste(Image.fromarray(picture))
+    """The picture above a line with what the episode has come to, uint8 [height, width, 3]."""
+    picture = _picture(env, camera, manner)
+    assert picture is not None, "check_camera has seen one"
+    size = (max(picture.width, _CAPTION_WIDTH), picture.height + _CAPTION_HEIGHT)
+    canvas = Image.new("RGB", size, "white")
+    canvas.paste(picture)
     text = f"step {step:>5}     return {episode_return:>7.2f}"
     text += "" if cost is None else f"     cost {cost:>5.0f}"
     font = ImageFont.load_default(size=14)
-    ImageDraw.Draw(canvas).text((8, height + 1), text, fill="black", font=font)
+    ImageDraw.Draw(canvas).text((8, picture.height + 1), text, fill="black", font=font)
     return np.asarray(canvas)
 
 

@@ -9,6 +9,7 @@ from PIL import Image
 
 from safe_rl.cli.evaluate import evaluate_run as evaluate
 from safe_rl.collectors import read_recording
+from safe_rl.evaluation import video
 from safe_rl.evaluation.video import MANNERS
 
 
@@ -24,7 +25,7 @@ def test_the_video_shows_an_episode(run):
         frames = np.stack([frame for frame in reader])  # noqa: C416, a list() would ask for its length
     assert facts["codec"] == "h264"
     assert facts["pix_fmt"].startswith("yuv420p")
-    assert len(frames) == NUM_STEPS // film.steps_per_frame
+    assert len(frames) == NUM_STEPS // film.steps_per_frame + 1  # and the end
     assert frames.shape[2] == film.width
     # below the picture stands a white line with black text
     caption = frames[:, film.height + 2 :]
@@ -63,7 +64,7 @@ def test_an_animated_picture_shows_the_same_episode(run, tmp_path, suffix):
     assert found[0].files[-1] == path
     with Image.open(path) as picture:
         assert picture.info["loop"] == 0
-        assert picture.n_frames == -(-NUM_STEPS // film.steps_per_frame)
+        assert picture.n_frames == -(-NUM_STEPS // film.steps_per_frame) + 1
         frames = []
         for frame in range(picture.n_frames):
             picture.seek(frame)
@@ -80,3 +81,22 @@ def test_an_animated_picture_shows_the_same_episode(run, tmp_path, suffix):
         found[0].estimates["episode_return"]
     ] * 2
     assert not list(tmp_path.glob(".*unfinished*"))
+
+
+@pytest.mark.parametrize("deterministic", [False, True])
+def test_of_one_world_it_is_the_first_episode_to_its_end(run, deterministic, tmp_path, monkeypatch):
+    skip_without_opengl()
+    shown, draw = [], video._frame
+
+    def note(env, camera, manner, *counts):
+        shown.append(counts)
+        return draw(env, camera, manner, *counts)
+
+    monkeypatch.setattr(video, "_frame", note)
+    picture = str(tmp_path / "episode.webp")
+    changes = {"num_envs": 1, "deterministic": deterministic}
+    result = evaluate(run, options(episodes=2, picture=picture, **changes))
+    with result.files[1].open() as table:
+        first = next(csv.DictReader(table))
+    expected = [float(first[name]) for name in ("length", "return", "cost")]
+    assert shown[-1] == pytest.approx(expected, abs=1e-5)

@@ -91,11 +91,23 @@ def test_a_film_takes_the_pictures_that_an_environment_has():
     env, policy = Drawn(), BehaviourPolicy(make_actor(1, 1, hidden_sizes=[4], initial_log_std=0.0))
     check_camera(env, "free")
     frames = list(record_episode(env, policy, ["cost"], deterministic=True))
-    # every other step of six; what the encoder cannot halve twice is cut off
-    assert [frame[0, 0, 0] for frame in frames] == [0, 20, 40]
-    assert {frame.shape for frame in frames} == {(48 + 20, 68, 3)}
+    # every other step of six, and the end; what the encoder cannot halve twice is cut off
+    assert [frame[0, 0, 0] for frame in frames] == [0, 20, 40, 60]
+    # beside the narrow picture there is room for what stands below it
+    assert {frame.shape for frame in frames} == {(48 + 20, 280, 3)}
+    assert {int(frame[:48, 68:].min()) for frame in frames} == {255}
     without_costs = list(record_episode(env, policy, [], deterministic=True))
-    assert len(without_costs) == 3
+    assert len(without_costs) == 4
+    assert len({frame[48:].tobytes() for frame in (*frames, *without_costs)}) == 8
+
+
+@pytest.mark.parametrize("shape", [(50, 70), (1, 50, 70, 3), (50, 70, 4)])
+def test_a_film_takes_grey_pictures_batches_and_fourth_channels(shape):
+    env, policy = Drawn(), BehaviourPolicy(make_actor(1, 1, hidden_sizes=[4], initial_log_std=0.0))
+    env.render = lambda: np.full(shape, 200, np.uint8)
+    check_camera(env, "free")
+    frames = list(record_episode(env, policy, ["cost"], deterministic=True))
+    assert {(frame.shape, int(frame[0, 0, 0])) for frame in frames} == {((68, 280, 3), 200)}
 
 
 def test_what_prevents_a_film_is_said_before_any_episode():
@@ -105,6 +117,28 @@ def test_what_prevents_a_film_is_said_before_any_episode():
     without_pictures.render = None
     with pytest.raises(ValueError, match="draws no pictures"):
         check_camera(without_pictures, "free")
+    for nothing in (None, [None]):  # as Gymnasium's without a mode, and batches of them
+        without_pictures.render = lambda nothing=nothing: nothing
+        with pytest.raises(ValueError, match=r"picture=…: .* draws no .* render_mode=rgb_array"):
+            check_camera(without_pictures, "free", "gif")
+
+
+@pytest.mark.parametrize(
+    ("error", "words"),
+    [
+        (RuntimeError("pygame is\nnot installed"), "pygame is not installed"),
+        (KeyError(), "KeyError"),
+    ],
+)
+def test_whatever_a_render_fails_of_prevents_a_film(error, words):
+    env = Drawn()
+
+    def render():
+        raise error
+
+    env.render = render
+    with pytest.raises(ValueError, match=f"video=true: this environment cannot be drawn: {words}"):
+        check_camera(env, "free")
 
 
 def layouts(env):
