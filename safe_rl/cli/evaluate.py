@@ -67,7 +67,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         result = evaluate_run(directory, options, progress=True)
     except (
         *(OptionError, ConfigError, CheckpointError, LayoutError, OpenGLError),
-        *(FileNotFoundError, ModuleNotFoundError, ValueError),
+        *(OSError, ModuleNotFoundError, ValueError),
     ) as error:
         print(f"error: {error}", file=sys.stderr)
         return 1

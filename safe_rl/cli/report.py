@@ -13,6 +13,7 @@ from safe_rl.cli.options import OptionError, parse_options, usage
 from safe_rl.cli.user_code import import_modules, split_imports
 from safe_rl.reporting import Report, build_report, write_report
 from safe_rl.reporting.recorded import clean
+from safe_rl.runs.files import check_place
 from safe_rl.runs.keeping import keep_runs
 from safe_rl.scores.published import SEEDS
 
@@ -65,6 +66,7 @@ def report(root: Path, options: ReportOptions) -> tuple[Report, Path]:
 
     Raises:
         FileNotFoundError: If there is no run.
+        OSError: If the page cannot be written, which is seen before any run is read.
         ValueError: If a slate is to take less than one run per environment, or what is good is no
             share of a return.
     """
@@ -72,10 +74,12 @@ def report(root: Path, options: ReportOptions) -> tuple[Report, Path]:
         raise ValueError(f"seeds={options.seeds}: a slate takes at least one run per environment.")
     if not 0.0 < options.good <= 10.0:
         raise ValueError(f"good={options.good}: a share of a return, for example 0.5 for half.")
+    out = root / "report" if options.out is None else Path(options.out)
+    if root.is_dir():
+        check_place(out / "report.html", "out=FOLDER writes the report elsewhere.")
     result = build_report(
         root, suite(), seeds_needed=options.seeds, unfinished=options.unfinished, good=options.good
     )
-    out = root / "report" if options.out is None else Path(options.out)
     return result, write_report(result, out, options.title or root.resolve().name)
 
 

@@ -25,7 +25,7 @@ from safe_rl.evaluation.loading import (
     override_env,
 )
 from safe_rl.evaluation.settings import EvaluationOptions, check_options
-from safe_rl.evaluation.summary import summarise, write_episodes, write_summary
+from safe_rl.evaluation.summary import check_places, summarise, write_episodes, write_summary
 from safe_rl.evaluation.video import check_camera, record_episode, write_video
 from safe_rl.runs.folder import RunFolder, checkpoint_steps
 from safe_rl.scores.benchmark import Suite
@@ -72,9 +72,10 @@ def evaluate(
 
     Raises:
         FileNotFoundError: If the folder is not a run's, or has no such checkpoint.
+        OSError: If what it finds cannot be written, which is seen before any episode.
         CheckpointError: If the checkpoint is damaged, or does not fit the environment.
         ConfigError: If the environment does not accept an override.
-        ValueError: If an option is out of its range, or there is no such camera.
+        ValueError: If an option is out of its range, or the environment cannot be drawn.
     """
     check_options(options)
     config = load_config(directory)
@@ -91,13 +92,14 @@ def evaluate(
     # environments that draw nothing unless they are told have a key for it
     drawing = {key: "rgb_array" for key in ("render_mode",) if key in node}
     run = RunFolder(directory)
+    places = {kind: run.evaluation(options.name, kind) for kind in ("json", "csv", "transitions")}
     films = [run.evaluation(options.name, "mp4")] if options.video else []
     films += [Path(options.picture)] if options.picture else []
+    check_places([places["json"], places["csv"], *films])
     for film in films:
         with closing(make(1, **drawing)) as single:
             check_camera(single, options.camera, film.suffix[1:])
     manner = {"deterministic": options.deterministic}
-    places = {kind: run.evaluation(options.name, kind) for kind in ("json", "csv", "transitions")}
     with closing(make(min(options.num_envs, options.episodes))) as env:
         cost_keys = env.cost_keys
         limits = limits_of(config, options.cost_limits, cost_keys)

@@ -5,17 +5,27 @@ from __future__ import annotations
 import csv
 import json
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
 from safe_rl.evaluation.episodes import Episodes
-from safe_rl.runs.files import replacing
+from safe_rl.runs.files import check_place, replacing
 from safe_rl.scores.intervals import Estimate, cvar, mean, share_over
 from safe_rl.scores.normalised import normalised_return, normalised_violation
 from safe_rl.scores.published import Scores
 
-__all__ = ["format_estimates", "summarise", "write_episodes", "write_summary"]
+__all__ = ["check_places", "format_estimates", "summarise", "write_episodes", "write_summary"]
+
+
+def check_places(places: Iterable[Path]) -> None:
+    """Refuse files that cannot be written, before any episode.
+
+    Raises:
+        OSError: If one cannot be.
+    """
+    for place in places:
+        check_place(place, "A run's evaluations lie in its folder: evaluate a copy of that.")
 
 
 def summarise(

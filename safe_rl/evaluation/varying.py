@@ -24,7 +24,7 @@ from safe_rl.evaluation.loading import (
     override_env,
 )
 from safe_rl.evaluation.settings import EvaluationOptions, check_options
-from safe_rl.evaluation.summary import summarise
+from safe_rl.evaluation.summary import check_places, summarise
 from safe_rl.evaluation.variations import TransformNode, Variation, varied
 from safe_rl.runs.files import replacing
 from safe_rl.runs.folder import RunFolder, checkpoint_steps
@@ -93,6 +93,7 @@ def evaluate_variations(
 
     Raises:
         FileNotFoundError: If the folder is not a run's, or has no such checkpoint.
+        OSError: If what it finds cannot be written, which is seen before any episode.
         CheckpointError: If the policy does not fit a varied environment.
         ValueError: If an environment cannot have a variation that was asked for by itself.
     """
@@ -100,6 +101,8 @@ def evaluate_variations(
     config = load_config(directory)
     config.env = override_env(config, options.env)
     checkpoint = find_checkpoint(directory, options.checkpoint)
+    file = RunFolder(directory).variations(options.name, "csv")
+    check_places([file, RunFolder(directory).variations(options.name, "png")])
     rows: list[VariedRow] = []
     trained_limits: dict[str, float] = {}
     left_out: list[tuple[Variation, str]] = []
@@ -120,7 +123,6 @@ def evaluate_variations(
         limits = limits_of(config, options.cost_limits, episodes.costs)
         trained_limits = trained_limits if rows else limits
         rows.append(VariedRow(variation, summarise(episodes, limits, None, options.cvar_alpha)))
-    file = RunFolder(directory).variations(options.name, "csv")
     _write(file, rows)
     facts = {"algorithm": config.algo.name, "environment": config.env.get("name", "")}
     facts |= {"steps": checkpoint_steps(checkpoint), "episodes": options.episodes}

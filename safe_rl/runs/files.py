@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -11,7 +12,7 @@ import yaml
 from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-__all__ = ["read_config", "read_yaml", "replacing"]
+__all__ = ["check_place", "read_config", "read_yaml", "replacing"]
 
 # of a configuration; that of a run has about six thousand
 _MOST_LETTERS = 1_000_000
@@ -90,3 +91,28 @@ def replacing(path: Path) -> Iterator[Path]:
         unfinished.replace(path)
     finally:
         unfinished.unlink(missing_ok=True)
+
+
+def check_place(path: Path, otherwise: str) -> None:
+    """Refuse a place for a file that cannot be written there, before the work that makes it.
+
+    Args:
+        path: The file; folders above it may be missing.
+        otherwise: What to do then, a sentence.
+
+    Raises:
+        OSError: If it is a folder, or may not be made.
+
+    Examples:
+        >>> check_place(getfixture("tmp_path"), "Take another name.")  # doctest: +ELLIPSIS
+        Traceback (most recent call last):
+        ...
+        IsADirectoryError: ... is a folder, where a file is to be written. Take another name.
+    """
+    if path.is_dir():
+        raise IsADirectoryError(f"{path} is a folder, where a file is to be written. {otherwise}")
+    above = next(folder for folder in path.parents if folder.exists())
+    if not above.is_dir():
+        raise NotADirectoryError(f"{path} cannot be written: {above} is no folder. {otherwise}")
+    if not os.access(above, os.W_OK | os.X_OK):
+        raise PermissionError(f"{path} cannot be written: {above} is read-only. {otherwise}")

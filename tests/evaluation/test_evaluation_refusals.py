@@ -69,6 +69,36 @@ def test_options_out_of_range_are_refused_before_anything_runs(
     assert others not in error
 
 
+@pytest.mark.parametrize(
+    ("arguments", "places"),
+    [
+        ([], ["evaluation.json"]),
+        (["picture=there.gif"], ["../there.gif"]),
+        (["variations=sensing"], ["variations.csv", "variations.png"]),
+    ],
+)
+def test_what_cannot_be_written_is_said_before_any_episode(
+    arguments, places, run, capsys, monkeypatch
+):
+    monkeypatch.chdir(run.parent)
+    for module in ("measuring", "varying"):
+        monkeypatch.setattr(f"safe_rl.evaluation.{module}.collect_episodes", None)
+    for place in places:
+        (run / place).mkdir()
+        assert main([str(run), *arguments]) == 1
+        error = capsys.readouterr().err.splitlines()[-1]
+        assert error.startswith("error: ")
+        assert f"{place.removeprefix('../')} is a folder, where a file is to be written." in error
+        (run / place).rmdir()
+
+
+def test_a_run_that_others_may_only_read_is_evaluated_as_a_copy(run, capsys, monkeypatch):
+    monkeypatch.setattr("os.access", lambda path, mode: False)  # root may write anywhere
+    assert main([str(run)]) == 1
+    error = capsys.readouterr().err.splitlines()[-1]
+    assert f"{run} is read-only. A run's evaluations lie in its folder: evaluate a copy" in error
+
+
 def test_a_folder_above_runs_names_them(run, capsys):
     assert main([str(run.parent)]) == 1
     assert f"Runs below it: {run}" in capsys.readouterr().err

@@ -263,6 +263,18 @@ def test_what_cannot_be_done_ends_in_one_line(tmp_path, arguments, message, caps
     assert message in error
 
 
+def test_where_the_page_cannot_be_is_said_before_any_run_is_read(tmp_path, capsys, monkeypatch):
+    write_run(tmp_path)
+    (tmp_path / "file").touch()
+    monkeypatch.setattr("safe_rl.cli.report.build_report", None)
+    assert main([str(tmp_path), f"out={tmp_path / 'file'}"]) == 1
+    assert "file is no folder. out=FOLDER writes the report elsewhere." in capsys.readouterr().err
+    monkeypatch.setattr("os.access", lambda path, mode: False)  # root may write anywhere
+    assert main([str(tmp_path)]) == 1
+    error = capsys.readouterr().err
+    assert f"{tmp_path} is read-only. out=FOLDER writes the report elsewhere." in error
+
+
 # appended to the page: what the browser makes of it, as JSON in an element
 PROBE = """
 <script>
