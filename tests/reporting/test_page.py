@@ -281,7 +281,9 @@ PROBE = """
   const images = [...document.images].map(image => image.naturalWidth);
   const tables = [...document.querySelectorAll("table")].map(
     table => [table.offsetWidth, table.parentElement.clientWidth]);
-  const facts = {images, tables, page: document.documentElement.scrollWidth,
+  const entries = Math.max(...[...document.querySelectorAll("td span")].map(
+    entry => entry.getBoundingClientRect().right));
+  const facts = {images, tables, entries, page: document.documentElement.scrollWidth,
                  window: window.innerWidth, heading: document.querySelector("h1").textContent};
   const probe = document.createElement("pre");
   probe.id = "probe";
@@ -323,6 +325,15 @@ def test_a_browser_shows_the_page(report, tmp_path, width):
     # nothing sticks out of the window, nor a table out of its box
     assert facts["page"] <= facts["window"]
     assert all(table <= box for table, box in facts["tables"])
+
+
+@pytest.mark.skipif(CHROMIUM is None, reason="Chromium is not installed")
+def test_long_words_stay_on_their_cards(tmp_path):
+    for folder in ("first", "second"):  # why one is left out names the other
+        write_run(tmp_path, folder=f"{folder}_{'x' * 120}", **ROWS, costs=(30.0, 20.0, 20.0))
+    assert main([str(tmp_path)]) == 0
+    facts = facts_in_a_browser(tmp_path / "report", tmp_path, 500)
+    assert facts["entries"] <= facts["window"]
 
 
 @pytest.mark.skipif(CHROMIUM is None, reason="Chromium is not installed")
