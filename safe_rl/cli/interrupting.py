@@ -1,4 +1,4 @@
-"""Ctrl-C ends a command with a line."""
+"""What ends a run before its time is said in a line."""
 
 from __future__ import annotations
 
@@ -6,7 +6,17 @@ import os
 import sys
 from types import TracebackType
 
-__all__ = ["say_interruptions"]
+__all__ = ["say_if_heard", "say_interruptions"]
+
+
+def say_if_heard(*lines: str) -> None:
+    """Print lines, unless their terminal was closed, which may be what has ended the run."""
+    try:
+        for line in lines:
+            print(line)
+    except OSError:
+        # what is left unsaid would be tried again at the very end, and change the exit status
+        sys.stdout = open(os.devnull, "w")  # noqa: SIM115
 
 
 def say_interruptions() -> None:

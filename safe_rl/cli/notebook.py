@@ -25,6 +25,7 @@ from safe_rl.cli.certificates import (
     is_worth_a_certificate,
 )
 from safe_rl.cli.evaluate import evaluate_run
+from safe_rl.cli.interrupting import say_if_heard
 from safe_rl.cli.options import take_options
 from safe_rl.cli.python_settings import compose_new, compose_resumed, overrides_of
 from safe_rl.cli.robots import maker_of
@@ -252,7 +253,7 @@ def _carry_out(config: DictConfig, folder: Path, *, continues: bool) -> Run:
         if is_new and not has_begun:
             shutil.rmtree(folder, ignore_errors=True)
     if trainer.interrupted_by is not None:
-        print(
+        say_if_heard(
             f"Interrupted. Continue with: python train.py resume={folder}, or "
             f"safe_rl.resume({str(folder)!r})"
         )

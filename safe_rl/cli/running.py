@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import sys
-from contextlib import AbstractContextManager, ExitStack, nullcontext, suppress
+from contextlib import AbstractContextManager, ExitStack, nullcontext
 from functools import partial
 from pathlib import Path
 from signal import SIGINT
@@ -22,6 +22,7 @@ from safe_rl.cli.certificates import (
     why_not_certified,
 )
 from safe_rl.cli.failures import SETTING_ERRORS, errors_in_a_line
+from safe_rl.cli.interrupting import say_if_heard
 from safe_rl.cli.robots import keep_robot, robot_of
 from safe_rl.cli.run_folders import write_notes
 from safe_rl.cli.settings import check_settings
@@ -135,11 +136,12 @@ def run(config: DictConfig) -> None:
         with in_a_line(OSError, ConfigError, FloatingPointError):
             if not continues or (is_job and not folder.notes.exists()):
                 write_notes(folder, config)
-            print(trainer.run())
+            outcome = trainer.run()
     if trainer.interrupted_by is not None:
-        with suppress(OSError):  # its terminal may be what ended it
-            print(f"Interrupted. Continue with: {_this_command()} resume={folder.directory}")
+        again = f"{_this_command()} resume={folder.directory}"
+        say_if_heard(outcome, f"Interrupted. Continue with: {again}")
         raise SystemExit(128 + trainer.interrupted_by)
+    print(outcome)
     if not is_to_keep_limits(config, trainer.algorithm.cost_keys):
         return
     if is_worth_a_certificate(config, trainer.episode_length):

@@ -23,7 +23,7 @@ class StopRequest:
         True
     """
 
-    _SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+    _SIGNALS = frozenset({signal.SIGINT, signal.SIGTERM, signal.SIGHUP})
 
     def __init__(self) -> None:
         self.received: signal.Signals | None = None
@@ -31,8 +31,9 @@ class StopRequest:
 
     def __enter__(self) -> StopRequest:
         if threading.current_thread() is threading.main_thread():
+            # what a shell runs in the background ignores SIGINT, too, but is to heed it when asked
             is_kept_up = signal.getsignal(signal.SIGHUP) is signal.SIG_IGN
-            heeded = self._SIGNALS[:-1] if is_kept_up else self._SIGNALS
+            heeded = self._SIGNALS - {signal.SIGHUP} if is_kept_up else self._SIGNALS
             self._previous = {number: signal.signal(number, self._stop) for number in heeded}
         return self
 

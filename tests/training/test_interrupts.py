@@ -1,14 +1,7 @@
 """Signals: what they end, when, and what they leave alone."""
 
-import os
-import pty
-import select
 import signal
-import subprocess
-import sys
-import termios
 import threading
-from pathlib import Path
 
 import pytest
 from point_mass_runs import point_mass_trainer
@@ -78,41 +71,6 @@ def test_signals_are_left_alone_outside_the_main_thread():
     thread.start()
     thread.join()
     assert received == [None]
-
-
-IN_A_TERMINAL = """
-import fcntl, sys, termios
-from pathlib import Path
-from point_mass_runs import point_mass_trainer
-fcntl.ioctl(0, termios.TIOCSCTTY, 0)
-trainer = point_mass_trainer(Path(sys.argv[1]), "frames=100_000_000")
-trainer.run()
-sys.exit(128 + trainer.interrupted_by)
-"""
-
-
-def test_a_closed_terminal_ends_the_run_after_the_epoch_with_a_checkpoint(tmp_path):
-    near, far = pty.openpty()
-    termios.tcsetwinsize(near, (24, 160))
-    process = subprocess.Popen(
-        [sys.executable, "-c", IN_A_TERMINAL, str(tmp_path)],
-        stdin=far, stdout=far, stderr=far, start_new_session=True,
-        env=os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))},
-        cwd=Path(__file__).parents[2],
-    )  # fmt: skip
-    os.close(far)
-    try:
-        shown = b""
-        while b"steps/s" not in shown:
-            assert select.select([near], [], [], 300)[0], shown
-            shown += os.read(near, 4096)
-        os.close(near)
-        assert process.wait(300) == 128 + signal.SIGHUP
-    finally:
-        process.kill()
-    epochs = len(read_table(tmp_path / "progress.csv")["epoch"])
-    (last,) = (tmp_path / "checkpoints" / "last").iterdir()
-    assert last.name == f"checkpoint-{160 * epochs:012d}.torchrl"
 
 
 def test_a_run_that_a_terminal_must_not_end_goes_on():
