@@ -27,10 +27,10 @@ from safe_rl.cli.certificates import (
 from safe_rl.cli.evaluate import evaluate_run
 from safe_rl.cli.interrupting import say_if_heard
 from safe_rl.cli.options import take_options
-from safe_rl.cli.python_settings import compose_new, compose_resumed, overrides_of
+from safe_rl.cli.python_settings import compose_new, compose_resumed, overrides_of, search_path
 from safe_rl.cli.robots import maker_of
 from safe_rl.cli.running import complete, prepare
-from safe_rl.cli.user_code import check_imports, import_modules, note_imports
+from safe_rl.cli.user_code import check_imports, import_modules, note_imports, several
 from safe_rl.cli.variations import evaluate_varied
 from safe_rl.envs import store_configs
 from safe_rl.evaluation import Certificate, Evaluation, EvaluationOptions
@@ -162,8 +162,8 @@ def train(
     *,
     algo: str = "ppo_lagrangian",
     directory: str | Path | None = None,
-    imports: Sequence[str] = (),
-    config_dir: str | Path | None = None,
+    imports: str | Sequence[str] = (),
+    config_dir: str | Path | Sequence[str | Path] = (),
     **settings: Any,
 ) -> Run:
     """Train, as ``python train.py env=… algo=…`` does.
@@ -174,8 +174,8 @@ def train(
         env: Name of an environment.
         algo: Name of an algorithm.
         directory: Folder of the run; None: ``runs/<env>/<algo>/<date>_seed<seed>``.
-        imports: Modules of yours to import before, as the command's ``import=``.
-        config_dir: Folder with YAMLs of yours, as the command's ``--config-dir``.
+        imports: Module of yours to import before, or several, as the command's ``import=``.
+        config_dir: Folder with YAMLs of yours, or several, as the command's ``--config-dir``.
         settings: Any key of ``conf/``: ``frames=100_000``, ``preset="paper"``,
             ``cost_limits={"cost_hazards": 10}``. Keys below another one are dictionaries,
             ``policy_update={"max_kl": 0.02}``, or written with dots, ``**{"env.hazards_num": 12}``.
@@ -193,13 +193,11 @@ def train(
         >>> run.table["steps"]
         [40.0, 80.0]
     """
-    import_modules(imports)
+    modules = import_modules(imports)
     store_configs()
-    overrides = [f"env={env}", f"algo={algo}", *overrides_of(settings)]
-    if imports:
-        overrides = note_imports(imports, overrides)
-    if config_dir is not None:
-        overrides.append(f"hydra.searchpath=[file://{Path(config_dir).resolve()}]")
+    overrides = [f"env={env}", f"algo={algo}", *overrides_of(settings), *search_path(config_dir)]
+    if modules:
+        overrides = note_imports(modules, overrides)
     config = compose_new(overrides)
     folder = Path(config.hydra.run.dir if directory is None else directory)
     with open_dict(config):
@@ -207,7 +205,9 @@ def train(
     return _carry_out(config, folder, continues=False)
 
 
-def resume(directory: str | Path, *, imports: Sequence[str] | None = None, **settings: Any) -> Run:
+def resume(
+    directory: str | Path, *, imports: str | Sequence[str] | None = None, **settings: Any
+) -> Run:
     """Go on with a run, as ``python train.py resume=…`` does; a finished one stays as it is.
 
     Args:
@@ -228,11 +228,11 @@ def resume(directory: str | Path, *, imports: Sequence[str] | None = None, **set
         Going on after 40 of 80 frames.
         [40.0, 80.0]
     """
-    import_modules(imports or ())
+    modules = import_modules(imports or ())
     store_configs()
     overrides = list(overrides_of(settings))
     if imports is not None:
-        overrides = note_imports(imports, overrides)
+        overrides = note_imports(modules, overrides)
     folder = Path(directory).expanduser()
     return _carry_out(compose_resumed(folder, overrides), folder, continues=True)
 
@@ -268,7 +268,7 @@ def _carry_out(config: DictConfig, folder: Path, *, continues: bool) -> Run:
 
 
 def load(
-    directory: str | Path, checkpoint: str = "last", imports: Sequence[str] | None = None
+    directory: str | Path, checkpoint: str = "last", imports: str | Sequence[str] | None = None
 ) -> Run:
     """Open a run: its figures, environment and policy.
 
@@ -289,7 +289,7 @@ def load(
         torch.Size([1, 2])
     """
     run = Run(Path(directory), checkpoint)
-    check_imports(run.config, imports, run.directory)
+    check_imports(run.config, imports if imports is None else several(imports), run.directory)
     import_modules(imports or ())
     find_checkpoint(run.directory, checkpoint)
     return run

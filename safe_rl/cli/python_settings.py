@@ -14,11 +14,11 @@ from omegaconf import DictConfig, OmegaConf
 
 from safe_rl.cli.composing import check_command
 from safe_rl.cli.conf import CONF
-from safe_rl.cli.overrides import GIVEN_WHOLE
+from safe_rl.cli.overrides import GIVEN_WHOLE, CommandLineError
 from safe_rl.cli.shorthands import expand_arguments
 from safe_rl.cli.user_code import quote
 
-__all__ = ["compose_new", "compose_resumed", "overrides_of"]
+__all__ = ["compose_new", "compose_resumed", "overrides_of", "search_path"]
 
 # mappings that are given all at once
 _WHOLE = (
@@ -46,6 +46,20 @@ def _literal(value: Any) -> str:
         return quote(str(value))
     # numbers of NumPy and torch are not JSON's
     return json.dumps(value.item() if hasattr(value, "item") else value)
+
+
+def search_path(folders: str | Path | Sequence[str | Path]) -> list[str]:
+    """The override that lets Hydra look for YAMLs in folders, too; none for no folder.
+
+    Raises:
+        CommandLineError: If one is not there.
+    """
+    given = [folders] if isinstance(folders, str | Path) else folders
+    found = [Path(folder).expanduser().absolute() for folder in given]
+    if missing := next((folder for folder in found if not folder.is_dir()), None):
+        raise CommandLineError(f"config_dir={missing}: there is no such folder.")
+    paths = [f"file://{folder}" for folder in found]
+    return list(overrides_of({"hydra.searchpath": paths})) if paths else []
 
 
 def compose_new(overrides: Sequence[str]) -> DictConfig:

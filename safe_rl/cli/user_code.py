@@ -28,6 +28,7 @@ __all__ = [
     "make_after_imports",
     "note_imports",
     "quote",
+    "several",
     "split_imports",
 ]
 
@@ -95,15 +96,19 @@ def quote(text: str) -> str:
     return "'" + re.sub(r"(\\*)('|$)", lambda m: m[1] * 2 + ("\\'" if m[2] else ""), text) + "'"
 
 
-def import_modules(modules: Sequence[str]) -> None:
+def import_modules(modules: str | Sequence[str]) -> list[str]:
     """Import modules and let configurations name what they define.
 
     Args:
-        modules: Dotted names, looked for in the current directory too, or paths of files.
+        modules: Dotted names, looked for in the current directory too, or paths of files; or one.
+
+    Returns:
+        All of them.
 
     Raises:
         CommandLineError: If one does not exist, cannot be imported, or is hidden by another.
     """
+    modules = several(modules)
     for module in modules:
         if not module.strip(". /"):
             raise CommandLineError(f"{KEY}={module}: name a module, or a file by its path.")
@@ -126,6 +131,17 @@ def import_modules(modules: Sequence[str]) -> None:
         where = module if name == module else str(path.resolve())
         if where not in _imported:
             _imported.append(where)
+    return modules
+
+
+def several(given: str | Sequence[str]) -> list[str]:
+    """What may be given alone or in a list; a text, which is a sequence itself, is given alone.
+
+    Examples:
+        >>> several("losses.py"), several(("losses.py", "my.envs")), several(())
+        (['losses.py'], ['losses.py', 'my.envs'], [])
+    """
+    return [given] if isinstance(given, str) else list(given)
 
 
 def imported() -> list[str]:

@@ -97,6 +97,12 @@ def _check_sizes(
     name: str, own: Mapping[str, Any], given: Mapping[str, Any], checkpoint: Path
 ) -> None:
     sizes = [_layer_sizes(weights) for weights in (own, given)]
+    if name == "actor" and _gives_spread_too(*sizes):
+        raise CheckpointError(
+            f"The actor of {checkpoint} has {sizes[1][-1]} outputs, this run's has {sizes[0][-1]}: "
+            "one gives the mean of the actions, the other their spread, too, as SAC's does and "
+            "PPO's does not. init_from needs a run whose actor is of the same kind."
+        )
     if sizes[0] != sizes[1]:
         raise CheckpointError(
             f"The {name} of {checkpoint} has layers of {_arrows(sizes[1])} numbers, this run's has "
@@ -114,6 +120,12 @@ def _check_sizes(
             f"The {name} of {checkpoint} has a {other} of shape {shapes[1][other]}, this run's has "
             f"{shapes[0][other]}: set model.… and critics.… as in the other run's config.yaml."
         )
+
+
+def _gives_spread_too(own: list[int], given: list[int]) -> bool:
+    """Whether of two networks of the same observations one has twice the other's outputs."""
+    few, many = sorted(sizes[-1:] for sizes in (own, given))
+    return own[:1] == given[:1] and [2 * width for width in few] == many
 
 
 def _shapes(weights: Mapping[str, Any]) -> dict[str, tuple[int, ...]]:

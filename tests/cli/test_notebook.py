@@ -17,7 +17,7 @@ from omegaconf import OmegaConf
 from run_configs import CONF, without_times
 
 import safe_rl
-from safe_rl.cli.python_settings import compose_new, overrides_of
+from safe_rl.cli.python_settings import compose_new, overrides_of, search_path
 from safe_rl.envs import ConfigError, store_configs
 from safe_rl.evaluation.loading import find_checkpoint
 from safe_rl.runs.table import read_table
@@ -114,12 +114,35 @@ def test_hydra_is_left_as_it_was(tmp_path, monkeypatch):
         ({"policy_update": {"max_kll": 1}}, "max_kll"),
         ({"env.hazard_num": 1}, "hazards_num"),
         ({"imports": ["users_nowhere"]}, "import=users_nowhere"),
+        ({"imports": "users_nowhere"}, "import=users_nowhere"),
+        ({"config_dir": "nowhere"}, "config_dir=.*nowhere: there is no such folder"),
     ],
 )
 def test_errors_name_the_setting(settings, message, tmp_path):
     with pytest.raises(ValueError, match=message):
         safe_rl.train(directory=tmp_path / "run", **settings)
     assert not (tmp_path / "run").exists()
+
+
+def test_folders_of_ones_own_one_or_several(tmp_path):
+    folders = [tmp_path / "first, with a comma", tmp_path / "second"]
+    head = "# @package _global_\ndefaults: [ppo_lagrangian, _self_]\n"
+    for place, folder in enumerate(folders):
+        (folder / "algo").mkdir(parents=True)
+        text = f"{head}lagrangian: {{init: {place + 1}}}\n"
+        (folder / "algo" / f"mine{place}.yaml").write_text(text)
+    for given in (folders, folders[1], str(folders[1])):
+        config = compose_new(["algo=mine1", *search_path(given)])
+        assert config.lagrangian.init == 2
+    assert compose_new(["algo=mine0", *search_path(folders)]).lagrangian.init == 1
+    (tmp_path / "mine.py").write_text("imported = True\n")
+    run = safe_rl.train(
+        algo="mine0", frames=40, directory=tmp_path / "run", config_dir=folders[0],
+        imports=str(tmp_path / "mine.py"), **SMALL,
+    )  # fmt: skip
+    assert run.config.lagrangian.init == 1
+    assert run.config["import"] == [str(tmp_path / "mine.py")]
+    assert safe_rl.load(run.directory, imports=str(tmp_path / "mine.py")).table == run.table
 
 
 @pytest.mark.parametrize("text", ["it's", "a,b=c", "x: [y]", "back\\slash\\", "\\'", "", "3"])

@@ -8,7 +8,7 @@ from omegaconf import OmegaConf
 from point_mass_runs import point_mass_trainer
 from torchrl.checkpoint import CheckpointError
 
-from safe_rl.models import QEnsemble, make_bounded_actor
+from safe_rl.models import QEnsemble, make_actor, make_bounded_actor, make_squashed_actor
 from safe_rl.runs.checkpoints import CheckpointStore
 from safe_rl.training.transfer import initialise_networks
 
@@ -95,6 +95,17 @@ def test_an_ensemble_of_another_number_is_named_and_nothing_changes(tmp_path):
         initialise_networks(networks, checkpoint, [])
     after = networks["actor"].state_dict()
     assert all(torch.equal(after[key], value) for key, value in before.items())
+
+
+def test_an_actor_of_another_kind_is_not_one_of_other_sizes(tmp_path):
+    """SAC's has a spread for every observation, and its own widths, which are not what is wrong."""
+    low, high = -torch.ones(2), torch.ones(2)
+    sac = make_squashed_actor(3, low, high, hidden_sizes=[16])
+    ppo = make_actor(3, 2, hidden_sizes=[8], initial_log_std=0.0)
+    for first, second, numbers in ((ppo, sac, "2 outputs, this run's has 4"), (sac, ppo, "4 .* 2")):
+        store = CheckpointStore(tmp_path / numbers[0], {"actor": first}, keep_last=1)
+        with pytest.raises(CheckpointError, match=rf"{numbers}.*as SAC's does and PPO's does not"):
+            initialise_networks({"actor": second}, store.save(10), [])
 
 
 def test_a_folder_without_a_checkpoint(trained, tmp_path):
