@@ -56,7 +56,7 @@ def _keep(run: RunFolder, kept: RunFolder) -> None:
         if path.is_file() and not path.is_symlink():
             with replacing(kept.directory / path.relative_to(run.directory)) as unfinished:
                 shutil.copyfile(path, unfinished)
-    for path, text in _without_places(run):
+    for path, text in _shortened(run):
         with replacing(kept.directory / path.relative_to(run.directory)) as unfinished:
             unfinished.write_text(text, encoding="utf-8")
     table = run.recorded_table
@@ -71,16 +71,17 @@ def _keep(run: RunFolder, kept: RunFolder) -> None:
 
 
 def _small_files(run: RunFolder) -> Iterator[Path]:
-    yield from (run.config, run.code, run.certificate, run.composed, run.overrides)
+    yield from (run.config, run.code, run.certificate, run.overrides)
 
 
-def _without_places(run: RunFolder) -> Iterator[tuple[Path, str]]:
-    """Files that say where on its machine the run was, with what a report reads of them.
+def _shortened(run: RunFolder) -> Iterator[tuple[Path, str]]:
+    """Files that say where on its machine the run was, or things twice, with what a report reads.
 
     What is not as this package writes it is left out.
     """
     readers = dict.fromkeys(run.evaluations(), _evaluation_kept)
-    for path, reader in {**readers, run.surroundings: _surroundings_kept}.items():
+    notes = {run.surroundings: _surroundings_kept, run.composed: _composed_kept}
+    for path, reader in {**readers, **notes}.items():
         if path.is_file() and not path.is_symlink():
             with suppress(ValueError, LookupError, TypeError, AttributeError, RecursionError):
                 yield path, reader(path)
@@ -103,3 +104,8 @@ def _surroundings_kept(path: Path) -> str:
         sources = [{**s, "path": os.path.relpath(s["path"], start)} for s in sources]
     kept = {"version": runtime["version"], "config_sources": sources}
     return OmegaConf.to_yaml({"hydra": {"runtime": kept}})
+
+
+def _composed_kept(path: Path) -> str:
+    """How long the run was to be at first; all else stands in its configuration."""
+    return OmegaConf.to_yaml({"frames": read_yaml(path)["frames"]})

@@ -8,6 +8,7 @@ import yaml
 from synthetic import write_run
 
 from safe_rl.cli.report import main
+from safe_rl.reporting.recorded import find_runs
 from safe_rl.runs import table as tables
 from safe_rl.runs.keeping import keep_runs
 from safe_rl.runs.table import read_table
@@ -91,6 +92,19 @@ def test_nothing_says_where_the_runs_were_but_their_commands(runs, tmp_path, cap
     page = (tmp_path / "again" / "report.md").read_text()
     assert "--config-dir=mine/conf" in page.replace("\\", "")
     assert "0.1.0 0123456789 with changes" in page
+
+
+def test_of_what_a_run_was_to_be_at_first_only_its_length_is_kept(runs, tmp_path):
+    first, second = (runs / "PointGoal1" / "ppo" / f"seed{seed}" for seed in (0, 1))
+    (first / ".hydra" / "config.yaml").write_text("env: {name: PointGoal1}\nframes: 500\n")
+    kept = tmp_path / "kept"
+    keep_runs([first, second], runs, kept)
+    notes = [kept / run.relative_to(runs) / ".hydra" / "config.yaml" for run in (first, second)]
+    assert yaml.safe_load(notes[0].read_text()) == {"frames": 500}
+    assert not notes[1].exists()  # "not: this one"
+    frames = yaml.safe_load((first / "config.yaml").read_text())["frames"]
+    commands = [run.command for run in find_runs(kept)[0]]
+    assert [f"frames={frames}" in command for command in commands] == [True, False]
 
 
 def test_an_archive_is_not_among_the_runs(runs, capsys):
