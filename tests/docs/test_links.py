@@ -1,0 +1,40 @@
+"""Links between files in Markdown, as they stand on GitHub: every one leads somewhere."""
+
+import re
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[2]
+PAGES = sorted(
+    path.relative_to(ROOT)
+    for folder in (".", "docs", "results", "benchmarks", "examples")
+    for path in (ROOT / folder).glob("*.md" if folder == "." else "**/*.md")
+)
+# pages that only the site has, where the strict build finds them
+MADE = ("docs/api/", "docs/report.html")
+# not to other sites
+_LINK = re.compile(r"\]\((?!\w+:)([^)\s#]*)(?:#([^)\s]+))?\)")
+
+
+def headings(text):
+    """Anchors of a page's headings, as GitHub makes them."""
+    said = re.findall(r"^#+ (.+)$", re.sub(r"```.*?```", "", text, flags=re.DOTALL), re.MULTILINE)
+    bare = (re.sub(r"\[([^\]]*)\]\([^)]*\)", r"\1", title) for title in said)
+    return {re.sub(r"[^\w\- ]", "", title.lower()).replace(" ", "-") for title in bare}
+
+
+@pytest.mark.parametrize("page", PAGES, ids=str)
+def test_links_lead_to_files_and_headings(page):
+    text = (ROOT / page).read_text()
+    for path, anchor in _LINK.findall(re.sub(r"```.*?```", "", text, flags=re.DOTALL)):
+        target = (ROOT / page.parent / path if path else ROOT / page).resolve()
+        if not str(target.relative_to(ROOT)).startswith(MADE):
+            assert target.exists(), path
+        if anchor and target.suffix == ".md":
+            assert anchor in headings(target.read_text()), f"{path}#{anchor}"
+
+
+def test_an_anchor_is_a_heading_without_what_github_drops():
+    page = "# One *two*\n## `a_key`: [there](x.md), 3\n```\n# no heading\n```\n"
+    assert headings(page) == {"one-two", "a_key-there-3"}
