@@ -9,6 +9,7 @@ import numpy as np
 
 from safe_rl.reporting.recorded import Run
 from safe_rl.runs.curves import moving_mean
+from safe_rl.runs.outcome import final_width
 from safe_rl.scores.intervals import bootstrap
 
 __all__ = ["Average", "average"]
@@ -55,8 +56,9 @@ def average(runs: Sequence[Run], column: str, *, smooth: bool) -> Average | None
     stop = min(steps[-1] for steps, _ in series)
     longest = max(len(steps) for steps, _ in series)
     grid = np.linspace(start, stop, min(longest, NUM_POINTS)) if stop > start else np.array([stop])
+    heights = [moving_mean(y, final_width(steps)) if smooth else y for steps, y in series]
     values = np.stack(
-        [np.interp(grid, steps, moving_mean(y) if smooth else y) for steps, y in series], -1
+        [np.interp(grid, steps, y) for (steps, _), y in zip(series, heights, strict=True)], -1
     )
     return Average(grid, values.mean(-1), *bootstrap([values], np.mean))
 

@@ -124,7 +124,7 @@ class Run:
         return final_figures(self.table, own)
 
     def excess(self, key: str) -> float:
-        """What the limit of a cost judges, minus d: a mean over the last five epochs."""
+        """What the limit of a cost judges, minus d: a mean over the last epochs."""
         return violation(self.final([key]), key, self.limits[key])
 
     def limits_another_measure(self, key: str) -> bool:

@@ -22,6 +22,7 @@ from safe_rl.reporting.columns import (
 from safe_rl.reporting.experiments import Experiment, cost_keys_of
 from safe_rl.reporting.recorded import Run, clean
 from safe_rl.runs.curves import moving_mean
+from safe_rl.runs.outcome import final_width
 from safe_rl.scores.dominance import Agent, compare
 from safe_rl.scores.learning import (
     first_good_epoch,
@@ -165,7 +166,7 @@ def _measure_note(record: Record, key: str) -> str:
     verdict = f"{abs(excess):.1f} {'over' if excess > 0 else 'below'} $d$"
     return (
         f"{record['algorithm']}: the limit of {clean(key, 40)} is on another measure than the mean "
-        f"$J_c$; over the last five epochs that measure was {verdict}, and this is what is judged."
+        f"$J_c$; over the last epochs that measure was {verdict}, and this is what is judged."
     )
 
 
@@ -231,7 +232,8 @@ def _good(experiments: Sequence[Experiment], share: float) -> tuple[float | None
         return None, f"Good: not defined, as {whose} is not above 0, and has no share."
     return share * whole, (
         f"Good: $J_r$ at least {share * whole:.4g}, {share:.0%} of {whose}, and every $J_c$ within "
-        "its limit, over five epochs; steps and hours are means over the seeds that came to it."
+        "its limit, over as many epochs as final figures; steps and hours are means over the seeds "
+        "that came to it."
     )
 
 
@@ -240,7 +242,7 @@ def _learning_figures(run: Run, least_return: float | None) -> dict[str, float |
     figures: dict[str, float | None] = {"good_steps": None, "good_hours": None}
     if not returns.size:
         return figures
-    worst = np.full(returns.shape, -np.inf)
+    worst, width = np.full(returns.shape, -np.inf), final_width(run.column("steps"))
     for key, limit in run.limits.items():
         violation = run.column(f"violation_{key}")
         costs = run.column(f"episode_{key}")
@@ -249,9 +251,9 @@ def _learning_figures(run: Run, least_return: float | None) -> dict[str, float |
         figures[f"regret_{key}"] = regret(judged, limit)
         figures[f"share_over_{key}"] = share_of_epochs_over(judged, limit)
         figures[f"streak_{key}"] = longest_streak(judged, limit)
-        worst = np.maximum(worst, moving_mean(judged) - limit)
+        worst = np.maximum(worst, moving_mean(judged, width) - limit)
     least = math.inf if least_return is None else least_return
-    epoch = first_good_epoch(moving_mean(returns), worst, least, 0.0)
+    epoch = first_good_epoch(moving_mean(returns, width), worst, least, 0.0)
     if epoch is not None:
         figures["good_steps"] = float(run.column("steps")[epoch])
         figures["good_hours"] = float(run.column("time_total")[epoch]) / 3600

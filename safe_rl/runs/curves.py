@@ -13,12 +13,9 @@ from matplotlib.ticker import EngFormatter
 from matplotlib.transforms import ScaledTranslation
 
 from safe_rl.runs.files import replacing
-from safe_rl.runs.outcome import FINAL_EPOCHS, judges_another_measure
+from safe_rl.runs.outcome import final_width, judges_another_measure
 
 __all__ = ["draw_learning_curves", "moving_mean", "point_marker"]
-
-SMOOTHING_EPOCHS = FINAL_EPOCHS  # so that curves end at the final figures
-"""Epochs in the moving mean."""
 
 _TO_LEGEND = -0.45  # from a panel to its legend, past ticks and the label [inch]
 
@@ -120,9 +117,10 @@ def _draw(
     known = np.isfinite(values)
     steps, heights = steps[known], np.asarray(values, dtype=float)[known]
     marker = point_marker(steps)
-    mean = f"{label}, mean of {SMOOTHING_EPOCHS} epochs"
+    width = final_width(steps)  # so that curves end at the final figures
+    mean = f"{label}, mean of {width} epochs"
     axes.plot(steps, heights, color=colour, alpha=0.3, linewidth=1, label=f"{label}, of an epoch")
-    axes.plot(steps, moving_mean(heights), color=colour, label=mean, marker=marker)
+    axes.plot(steps, moving_mean(heights, width), color=colour, label=mean, marker=marker)
 
 
 def point_marker(values: np.ndarray) -> str:
@@ -135,17 +133,15 @@ def point_marker(values: np.ndarray) -> str:
     return "o" if len(values) == 1 else ""
 
 
-def moving_mean(values: np.ndarray) -> np.ndarray:
-    """Mean of each value, shape [n], and the up to ``SMOOTHING_EPOCHS - 1`` before it.
-
-    The last one is the final figure of a run.
+def moving_mean(values: np.ndarray, width: int) -> np.ndarray:
+    """Mean of each value, shape [n], and the up to ``width - 1`` before it.
 
     Examples:
-        >>> moving_mean(np.array([1.0, 3.0, 5.0, 7.0, 9.0, 11.0])).tolist()
+        >>> moving_mean(np.array([1.0, 3.0, 5.0, 7.0, 9.0, 11.0]), 5).tolist()
         [1.0, 2.0, 3.0, 4.0, 5.0, 7.0]
     """
     # no differences of running sums: after one huge value nothing would be left of the others
     sums = np.zeros(len(values))
-    for back in range(min(SMOOTHING_EPOCHS, len(values))):
+    for back in range(min(width, len(values))):
         sums[back:] += values[: len(values) - back]
-    return sums / np.minimum(np.arange(1, len(values) + 1), SMOOTHING_EPOCHS)
+    return sums / np.minimum(np.arange(1, len(values) + 1), width)

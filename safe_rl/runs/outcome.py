@@ -10,12 +10,15 @@ from collections.abc import Iterable, Mapping, Sequence
 from statistics import fmean
 
 __all__ = [
-    *("FINAL_EPOCHS", "feasible_return", "final_figures", "judges_another_measure", "keeps"),
-    *("mean_row", "measured", "shown", "violation"),
+    *("FINAL_EPOCHS", "FINAL_STEPS", "feasible_return", "final_figures", "final_width"),
+    *("judges_another_measure", "keeps", "mean_row", "measured", "shown", "violation"),
 ]
 
 FINAL_EPOCHS = 5
 """Epochs over which the final J_r and J_c are averaged (Ray et al. 2019, section 5.1)."""
+
+FINAL_STEPS = 100_000
+"""Steps that these epochs have at least: five of SAC's are 25 episodes, five of PPO's a hundred."""
 
 
 def violation(row: Mapping[str, float], key: str, limit: float) -> float:
@@ -160,13 +163,32 @@ def judges_another_measure(table: Mapping[str, Sequence[float]], key: str, limit
     )
 
 
+def final_width(steps: Iterable[float]) -> int:
+    """Over how many epochs final figures, and the moving means of curves, are taken.
+
+    ``FINAL_EPOCHS``; more where epochs are so short that these have not ``FINAL_STEPS``, nor a
+    fifth of the run.
+
+    Args:
+        steps: Steps at the end of every epoch in which an episode finished.
+
+    Examples:
+        >>> [final_width(range(epoch, 1_000_001, epoch)) for epoch in (20_000, 5_000)]
+        [5, 20]
+    """
+    ends = list(steps)
+    last = max(ends, default=0)
+    begin = last - min(FINAL_STEPS, last / FINAL_EPOCHS)
+    return max(FINAL_EPOCHS, sum(end > begin for end in ends))
+
+
 def final_figures(
     table: Mapping[str, Sequence[float]], cost_keys: Sequence[str]
 ) -> dict[str, float]:
     """Final J_r, J_c and ρ_c (Ray et al. 2019, section 5.1), and steps per second of the run.
 
-    J_r, J_c and violations of limits are means over the last ``FINAL_EPOCHS`` epochs in which an
-    episode finished, ρ_c is that of the last epoch.
+    J_r, J_c and violations of limits are means over the last epochs in which an episode finished,
+    as many as :func:`final_width` says; ρ_c is that of the last epoch.
 
     Args:
         table: Columns of the run's table.
@@ -174,9 +196,10 @@ def final_figures(
     """
     known = [row for row, value in enumerate(table["episode_return"]) if not math.isnan(value)]
     costs = [f"{kind}_{key}" for key in cost_keys for kind in ("episode", "violation")]
+    last = known[-final_width([table["steps"][row] for row in known]) :]
     final = {}
     for name in ("episode_return", *(name for name in costs if name in table)):
-        values = [table[name][row] for row in known[-FINAL_EPOCHS:]]
+        values = [table[name][row] for row in last]
         values = [value for value in values if not math.isnan(value)]
         final[name] = sum(values) / len(values) if values else math.nan
     final |= {f"{key}_rate": table[f"{key}_rate"][-1] for key in cost_keys}

@@ -69,7 +69,7 @@ def test_single_epochs_and_their_moving_mean_over_five(drawn):
 def test_a_curve_forgets_an_epoch_that_is_five_epochs_ago(first):
     values = np.array([first, *range(1, 9)])
     windows = [values[max(0, end - 5) : end].mean() for end in range(1, 10)]
-    np.testing.assert_allclose(moving_mean(values), windows)
+    np.testing.assert_allclose(moving_mean(values, 5), windows)
 
 
 def test_several_costs_have_a_line_a_limit_and_a_name_each(drawn):

@@ -42,6 +42,24 @@ def test_final_figures_are_means_of_the_last_five_epochs_with_episodes():
     }  # fmt: skip
 
 
+@pytest.mark.parametrize(
+    ("epoch", "epochs", "width"),
+    [(20_000, 50, 5), (30_000, 30, 5), (5_000, 200, 20), (5_000, 40, 8), (1_000, 7, 5), (10, 3, 3)],
+)
+def test_algorithms_with_short_epochs_are_judged_by_as_many_steps(epoch, epochs, width):
+    numbers = [float(number) for number in range(epochs)]
+    table = {
+        "episode_return": numbers,
+        "cost_rate": numbers,
+        "episode_cost": [2 * number for number in numbers],
+        "steps": [epoch * (number + 1) for number in numbers],
+        "time_total": [1.0] * epochs,
+    }
+    final = final_figures(table, ["cost"])
+    assert final["episode_return"] == pytest.approx(sum(numbers[-width:]) / width)
+    assert final["episode_cost"] == pytest.approx(2 * final["episode_return"])
+
+
 def test_final_figures_without_any_episode_are_nan():
     table = {"episode_return": [NAN], "steps": [10.0], "time_total": [1.0]}
     assert math.isnan(final_figures(table, [])["episode_return"])
