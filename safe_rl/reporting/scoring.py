@@ -22,10 +22,11 @@ from safe_rl.reporting.columns import (
 from safe_rl.reporting.experiments import Experiment, cost_keys_of
 from safe_rl.reporting.recorded import Run, clean
 from safe_rl.runs.curves import moving_mean
-from safe_rl.runs.outcome import final_width
+from safe_rl.runs.outcome import FINAL_EPOCHS, final_width
 from safe_rl.scores.dominance import Agent, compare
 from safe_rl.scores.learning import (
     first_good_epoch,
+    joined,
     longest_streak,
     regret,
     share_of_epochs_over,
@@ -248,9 +249,10 @@ def _learning_figures(run: Run, least_return: float | None) -> dict[str, float |
         costs = run.column(f"episode_{key}")
         judged = np.where(np.isfinite(violation), limit + violation, costs)
         judged = judged if run.limits_another_measure(key) else costs
-        figures[f"regret_{key}"] = regret(judged, limit)
-        figures[f"share_over_{key}"] = share_of_epochs_over(judged, limit)
-        figures[f"streak_{key}"] = longest_streak(judged, limit)
+        spans = joined(judged, width // FINAL_EPOCHS)
+        figures[f"regret_{key}"] = regret(spans, limit)
+        figures[f"share_over_{key}"] = share_of_epochs_over(spans, limit)
+        figures[f"streak_{key}"] = longest_streak(spans, limit)
         worst = np.maximum(worst, moving_mean(judged, width) - limit)
     least = math.inf if least_return is None else least_return
     epoch = first_good_epoch(moving_mean(returns, width), worst, least, 0.0)

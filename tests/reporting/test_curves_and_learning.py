@@ -113,6 +113,15 @@ def test_what_learning_cost_is_counted_over_all_of_training(tmp_path):
     assert "good_steps" not in ambitious
 
 
+def test_epochs_of_few_steps_are_counted_together(tmp_path):
+    """200 epochs of 1000 steps: eight are a 25th of the run, which is an epoch of other runs."""
+    costs = [0.0, 48.0] * 92 + [50.0] * 8 + [0.0, 48.0] * 4
+    write_run(tmp_path, algo="cpo", returns=[1.0] * 200, costs=costs, rates=[0.01] * 200)
+    (record,) = learning_table(experiments_in(tmp_path)).records
+    assert (record["streak_cost"], record["share_over_cost"]) == (1, pytest.approx(1 / 25))
+    assert record["regret_cost"] == pytest.approx((50 - 25) / 25)
+
+
 @pytest.mark.parametrize("returns", [(-400.0, -150.0), (-1.0, 0.0)], ids=["negative", "zero"])
 def test_a_return_that_is_not_above_nothing_has_no_share_that_is_good(returns, tmp_path):
     """Half of -150 is -75, which is better than the best."""
