@@ -49,7 +49,11 @@ def prepare(config: DictConfig, directory: Path, continues: bool) -> Trainer | N
         folder.check_is_free()
     check_settings(config, folder if continues else None)
     if continues and is_finished(directory, config.frames):
-        print(f"{directory} has its {config.frames:,} frames already: raise 'frames' to train on.")
+        was_interrupted = folder.certifying.exists()  # before it was certified
+        what = (
+            "; certifying it, as was begun" if was_interrupted else ": raise 'frames' to train on"
+        )
+        print(f"{directory} has its {config.frames:,} frames already{what}.")
         return None
     if config.frames % config.frames_per_batch:
         whole = math.ceil(config.frames / config.frames_per_batch) * config.frames_per_batch

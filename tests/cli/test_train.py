@@ -126,12 +126,16 @@ def test_a_run_interrupted_while_it_is_certified_is_certified_when_it_is_resumed
     before, _, resume = out.splitlines()[-1].partition("python train.py ")
     assert before == "Interrupted before it was certified. To do so: "
     assert not Path("runs/mine/certificate.json").exists()
-    assert command(resume)[0] == 0
+    status, out, _ = command(resume)
+    assert status == 0
+    assert "40 frames already; certifying it, as was begun." in out
     written = Path("runs/mine/certificate.json")
     assert written.exists()
     assert not Path("runs/mine/.certifying").exists()
     written.unlink()
-    assert command(resume)[0] == 0  # now it is one that is finished
+    status, out, _ = command(resume)
+    assert status == 0  # now it is one that is finished
+    assert "40 frames already: raise 'frames' to train on." in out
     assert not written.exists()
 
 
