@@ -163,7 +163,7 @@ def train(
     algo: str = "ppo_lagrangian",
     directory: str | Path | None = None,
     imports: str | Sequence[str] = (),
-    config_dir: str | Path | Sequence[str | Path] = (),
+    config_dir: str | Path | Sequence[str | Path] | None = None,
     **settings: Any,
 ) -> Run:
     """Train, as ``python train.py env=… algo=…`` does.
@@ -195,7 +195,12 @@ def train(
     """
     modules = import_modules(imports)
     store_configs()
-    overrides = [f"env={env}", f"algo={algo}", *overrides_of(settings), *search_path(config_dir)]
+    overrides = [
+        f"env={env}",
+        f"algo={algo}",
+        *overrides_of(settings),
+        *search_path(config_dir or ()),
+    ]
     if modules:
         overrides = note_imports(modules, overrides)
     config = compose_new(overrides)

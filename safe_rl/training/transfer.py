@@ -100,8 +100,8 @@ def _check_sizes(
     if name == "actor" and _gives_spread_too(*sizes):
         raise CheckpointError(
             f"The actor of {checkpoint} has {sizes[1][-1]} outputs, this run's has {sizes[0][-1]}: "
-            "one gives the mean of the actions, the other their spread, too, as SAC's does and "
-            "PPO's does not. init_from needs a run whose actor is of the same kind."
+            "of as many actions one gives the mean, the other their spread, too, as SAC's does and "
+            "PPO's does not. init_from needs a run with these actions and this kind of actor."
         )
     if sizes[0] != sizes[1]:
         raise CheckpointError(
@@ -124,8 +124,10 @@ def _check_sizes(
 
 def _gives_spread_too(own: list[int], given: list[int]) -> bool:
     """Whether of two networks of the same observations one has twice the other's outputs."""
-    few, many = sorted(sizes[-1:] for sizes in (own, given))
-    return own[:1] == given[:1] and [2 * width for width in few] == many
+    if not own or not given or own[0] != given[0]:
+        return False
+    few, many = sorted((own[-1], given[-1]))
+    return 2 * few == many
 
 
 def _shapes(weights: Mapping[str, Any]) -> dict[str, tuple[int, ...]]:

@@ -140,6 +140,8 @@ def test_folders_of_ones_own_one_or_several(tmp_path):
         algo="mine0", frames=40, directory=tmp_path / "run", config_dir=folders[0],
         imports=str(tmp_path / "mine.py"), **SMALL,
     )  # fmt: skip
+    with pytest.raises(ValueError, match="mine0"):
+        safe_rl.train(algo="mine0", config_dir=None, directory=tmp_path / "none", **SMALL)
     assert run.config.lagrangian.init == 1
     assert run.config["import"] == [str(tmp_path / "mine.py")]
     assert safe_rl.load(run.directory, imports=str(tmp_path / "mine.py")).table == run.table

@@ -108,6 +108,14 @@ def test_an_actor_of_another_kind_is_not_one_of_other_sizes(tmp_path):
             initialise_networks({"actor": second}, store.save(10), [])
 
 
+def test_an_actor_without_matrices_has_no_sizes_that_could_differ(tmp_path):
+    first, second = (torch.nn.LayerNorm(3) for _ in range(2))
+    torch.nn.init.uniform_(first.weight)
+    checkpoint = CheckpointStore(tmp_path, {"actor": first}, keep_last=1).save(10)
+    assert initialise_networks({"actor": second}, checkpoint, []) == ["actor"]
+    assert torch.equal(first.weight, second.weight)
+
+
 def test_a_folder_without_a_checkpoint(trained, tmp_path):
     with pytest.raises(CheckpointError, match=r"init_from=.*no checkpoint"):
         initialise_networks(trained.algorithm.networks, tmp_path, ["cost"])
