@@ -1,5 +1,6 @@
 """The results in the repository: complete, readable, and what is said of them is what they hold."""
 
+import json
 import re
 from pathlib import Path
 
@@ -11,7 +12,9 @@ from safe_rl.runs.table import read_table
 
 RESULTS = Path(__file__).parents[2] / "results"
 PAGE = (RESULTS / "README.md").read_text()
-ROWS = re.findall(r"^\| `(\S+/seed\d+)` \| (.*) \|$", PAGE, re.MULTILINE)
+ALL_ROWS = re.findall(r"^\| `(\S+/seed\d+)` \| (.*) \|$", PAGE, re.MULTILINE)
+QUARTERS = [(run, row) for run, row in ALL_ROWS if "/limit" in run]
+ROWS = [row for row in ALL_ROWS if row not in QUARTERS]
 
 
 def test_every_run_can_be_reported_and_every_campaign_is_listed():
@@ -42,5 +45,24 @@ def test_the_figures_are_those_of_the_tables(run, row):
     assert f"{np.mean(costs[steps > 1_000_000] > 25):.0%}".replace("%", " %") == above
 
 
+@pytest.mark.parametrize(("run", "row"), QUARTERS)
+def test_the_figures_under_other_limits_are_those_of_tables_and_certificates(run, row):
+    folder = RESULTS / "limits" / run
+    columns = read_table(folder / "progress.csv.gz")
+    steps, returns, costs = (
+        np.array(columns[name]) for name in ("steps", "episode_return", "episode_cost")
+    )
+    *quarters, certified = row.split(" | ")
+    assert len(quarters) == 4
+    for number, said in enumerate(quarters):
+        known = np.ceil(4 * steps / steps[-1]) == number + 1
+        assert f"{np.nanmean(returns[known]):.1f} / {np.nanmean(costs[known]):.0f}" == said
+    told = json.loads((folder / "certificate.json").read_text())
+    bound = told["bounds"].get("mean_cost", {}).get("bound", np.nan)
+    kept = f"≤ {bound:.1f} at {told['episode_return']:.1f}" if told["certified"] else ""
+    assert (kept or f"no, by {told['shortfalls']['mean_cost']:.1f}") == certified
+
+
 def test_there_are_rows():
     assert len(ROWS) >= 2
+    assert len(QUARTERS) >= 2
