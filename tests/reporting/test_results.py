@@ -15,6 +15,7 @@ PAGE = (RESULTS / "README.md").read_text()
 ALL_ROWS = re.findall(r"^\| `(\S+/seed\d+)` \| (.*) \|$", PAGE, re.MULTILINE)
 QUARTERS = [(run, row) for run, row in ALL_ROWS if "/limit" in run]
 ROWS = [row for row in ALL_ROWS if row not in QUARTERS]
+WIDTHS = {"doggo": 2_000_000}  # steps that a column is of, where it is not half a million
 
 
 def test_every_run_can_be_reported_and_every_campaign_is_listed():
@@ -33,16 +34,19 @@ def test_every_run_can_be_reported_and_every_campaign_is_listed():
 
 @pytest.mark.parametrize(("run", "row"), ROWS)
 def test_the_figures_are_those_of_the_tables(run, row):
-    columns = read_table(next(RESULTS.glob(f"*/{run}")) / "progress.csv.gz")
+    folder = next(RESULTS.glob(f"*/{run}"))
+    width = WIDTHS.get(folder.relative_to(RESULTS).parts[0], 500_000)
+    columns = read_table(folder / "progress.csv.gz")
     steps, returns, costs = (
         np.array(columns[name]) for name in ("steps", "episode_return", "episode_cost")
     )
-    *halves, above = row.split(" | ")
-    assert len(halves) == steps[-1] / 500_000
-    for number, said in enumerate(halves):
-        known = (steps > number * 500_000) & (steps <= (number + 1) * 500_000)
+    *cells, above = row.split(" |")
+    means = [cell.strip() for cell in cells if cell.strip()]
+    assert len(means) == np.ceil(steps[-1] / width)
+    for number, said in enumerate(means):
+        known = (steps > number * width) & (steps <= (number + 1) * width)
         assert f"{np.nanmean(returns[known]):.1f} / {np.nanmean(costs[known]):.0f}" == said
-    assert f"{np.mean(costs[steps > 1_000_000] > 25):.0%}".replace("%", " %") == above
+    assert f"{np.mean(costs[steps > 1_000_000] > 25):.0%}".replace("%", " %") == above.strip()
 
 
 @pytest.mark.parametrize(("run", "row"), QUARTERS)
