@@ -24,6 +24,8 @@ __all__ = ["Memory"]
 _STORAGES = {"tensor": LazyTensorStorage, "memmap": LazyMemmapStorage}
 _MOST_AT_ONCE = 16_384
 """Steps that are gathered at a time, to be cut into minibatches."""
+_LONGEST_ROW = 1_000
+"""Steps of a row that are summed at a time: TorchRL goes through all of them for every episode."""
 
 
 class Memory:
@@ -102,13 +104,18 @@ class Memory:
 
     def extend(self, batch: TensorDictBase) -> None:
         """Take in the steps [N, T] that follow those of the last call."""
-        steps: TensorDictBase | None = batch
-        if self._multi_step is not None:
-            wanted = {("next", "done"), *self.in_keys}
-            steps = self._multi_step.inv(batch.select(*wanted))
-        if steps is None:  # fewer than n steps so far
+        pieces = [batch] if self._multi_step is None else self._summed(batch, self._multi_step)
+        if not pieces:  # fewer than n steps so far
             return
-        self._buffer.extend(steps.select(*self._in_keys).reshape(-1))
+        pieces = [piece.select(*self._in_keys) for piece in pieces]
+        steps = pieces[0] if len(pieces) == 1 else torch.cat(pieces, -1)
+        self._buffer.extend(steps.reshape(-1))
+
+    def _summed(self, batch: TensorDictBase, transform: MultiStepTransform) -> list[TensorDictBase]:
+        """Transitions over n steps, piece by piece; the transform remembers what came before."""
+        wanted = batch.select(*{("next", "done"), *self.in_keys})
+        found = [transform.inv(piece) for piece in wanted.split(_LONGEST_ROW, -1)]
+        return [piece for piece in found if piece is not None]
 
     def end_rows(self) -> None:
         """What comes next does not follow what came last: sums over n steps begin anew."""

@@ -7,6 +7,7 @@ import pytest
 import torch
 from scipy import stats
 from tensordict import TensorDict
+from torch.utils._python_dispatch import TorchDispatchMode
 from torchrl.data import Bounded
 from torchrl.objectives import ValueEstimators
 
@@ -228,3 +229,34 @@ def test_only_a_memory_that_is_kept_is_part_of_checkpoints():
 def test_a_storage_that_does_not_exist_is_named():
     with pytest.raises(ValueError, match="storage=disk: it must be one of tensor, memmap"):
         make_memory(storage="disk")
+
+
+class Largest(TorchDispatchMode):
+    """How many numbers the largest tensor has that is made in it."""
+
+    def __init__(self):
+        super().__init__()
+        self.numel = 0
+
+    def __torch_dispatch__(self, func, types, args=(), kwargs=None):
+        made = func(*args, **(kwargs or {}))
+        if isinstance(made, torch.Tensor):
+            self.numel = max(self.numel, made.numel())
+        return made
+
+
+def test_sums_over_many_episodes_take_no_more_than_the_steps_do():
+    """A row of a dataset has all episodes of it, of which TorchRL makes a copy for each."""
+    memory, length = make_memory(n_steps=3, capacity=20_000), 6_000
+    batch = make_batch(0, length, ends=range(9, length, 10))
+    with Largest() as largest:
+        memory.extend(batch)
+    assert largest.numel < 40 * batch.numel()
+    # one after the other, as rows of batches that are shorter come
+    steps = memory.state_dict()["steps"]
+    observations = torch.stack([torch.arange(length - 3) + 1000.0 * row for row in range(2)])
+    assert torch.equal(steps["observation"].reshape(2, -1), observations)
+    spanned = (10 - torch.arange(length - 3) % 10).clamp(max=3)
+    assert torch.equal(steps["steps_to_next_obs"].reshape(2, -1), spanned.expand(2, -1))
+    following = steps["next/observation"].reshape(2, -1)
+    assert torch.equal(following, observations + spanned)
