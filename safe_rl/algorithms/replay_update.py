@@ -14,6 +14,7 @@ from torchrl.objectives import LossModule, SoftUpdate
 
 from safe_rl.algorithms.losses import ESTIMATOR, divergence, sum_of_losses
 from safe_rl.algorithms.memory import Memory
+from safe_rl.naming import did_you_mean
 
 __all__ = ["ReplayUpdate"]
 
@@ -37,7 +38,8 @@ class ReplayUpdate:
         compile: Whether to compile the losses with :func:`torch.compile`.
 
     Raises:
-        ValueError: If a key of ``rates`` is the beginning of no parameter's name.
+        ValueError: If a key of ``rates`` is the beginning of no parameter's name, or the loss has
+            target networks and there is no ``tau``.
         FloatingPointError: By the call, if a loss is not finite, before the step that would follow.
 
     Examples:
@@ -78,6 +80,11 @@ class ReplayUpdate:
         names = [name for name in tensors if name.startswith("target_")]
         self._targets = [tensors[name].data for name in names]
         self._sources = [tensors[name.removeprefix("target_")].data for name in names]
+        if names and tau is None:
+            raise ValueError(
+                f"tau is null, but {type(loss).__name__} has target networks: they would stay as "
+                "they are at first. Give the share of the way that they go, such as tau=0.01."
+            )
         self._evaluate: Callable[..., tuple[Tensor, TensorDictBase]]
         self._evaluate = torch.compile(self._losses) if compile else self._losses
         self._counts = {"updates": 0, "owed": 0.0}
@@ -167,11 +174,15 @@ def _groups(loss: LossModule, rates: Mapping[str, float]) -> list[dict[str, Any]
     groups: dict[str, list[Tensor]] = {"": [], **{prefix: [] for prefix in rates}}
     for name, parameter in loss.named_parameters():
         if parameter.requires_grad:
-            groups[next((p for p in rates if name.startswith(p)), "")].append(parameter)
+            # the longest, of which the others may be beginnings
+            groups[max(filter(name.startswith, rates), key=len, default="")].append(parameter)
     empty = [prefix for prefix in rates if not groups[prefix]]
     if empty:
         known = sorted({name.partition(".")[0] for name, _ in loss.named_parameters()})
-        raise ValueError(f"rates names '{empty[0]}', but the loss has only {', '.join(known)}.")
+        raise ValueError(
+            f"rates names '{empty[0]}', but the loss has only {', '.join(known)}."
+            f"{did_you_mean(empty[0], known)}"
+        )
     return [
         {"params": group} | ({"lr": rates[prefix]} if prefix else {})
         for prefix, group in groups.items()

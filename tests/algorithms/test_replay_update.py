@@ -13,7 +13,7 @@ from safe_rl.models import QEnsemble, make_squashed_actor
 from safe_rl.objectives import SACLoss
 
 
-def make_update(seed):
+def make_update(seed, tau=0.1, **keys):
     torch.manual_seed(seed)
     spec = Bounded(-1, 1, [2])
     loss = SACLoss(
@@ -24,7 +24,7 @@ def make_update(seed):
         alpha_init=0.1,
     )
     optimizer = partial(torch.optim.Adam, lr=0.01)
-    return ReplayUpdate(loss, optimizer=optimizer, updates_per_step=0.5, tau=0.1)
+    return ReplayUpdate(loss, optimizer=optimizer, updates_per_step=0.5, tau=tau, **keys)
 
 
 @pytest.fixture
@@ -98,3 +98,20 @@ def test_a_checkpoint_that_lacks_a_tensor_is_refused(part):
     del state["loss"][name]
     with pytest.raises(KeyError, match=name):
         update.load_state_dict(state)
+
+
+def test_targets_that_would_never_move_are_refused():
+    with pytest.raises(ValueError, match="tau is null, but SACLoss has target networks"):
+        make_update(0, tau=None)
+
+
+def test_rates_are_those_of_the_longest_beginning_and_wrong_ones_are_told_the_nearest():
+    rates = {"qvalue_network_params": 0.1, "qvalue_network_params.network.weights": 0.2}
+    groups = make_update(0, rates=rates).optimizer.param_groups
+    assert [(group["lr"], len(group["params"])) for group in groups] == [
+        (0.01, 5),
+        (0.1, 2),
+        (0.2, 2),
+    ]
+    with pytest.raises(ValueError, match=r"names 'alpha', but .* Did you mean 'log_alpha'"):
+        make_update(0, rates={"alpha": 1e-4})
