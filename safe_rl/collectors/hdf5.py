@@ -37,6 +37,8 @@ _OF_AN_EPISODE: dict[NestedKey, str] = {
 _EPISODE = r"episode_(\d+)"
 _NUMBERS = "biuf"  # kinds of NumPy's types
 _FLAGS = (("next", "terminated"), ("next", "truncated"))
+_VECTORS = ("observation", "action", ("next", "observation"))
+"""What may be several numbers in a step."""
 
 
 def read_hdf5(path: Path | str) -> TensorDict:
@@ -54,7 +56,8 @@ def read_hdf5(path: Path | str) -> TensorDict:
 
     Raises:
         ValueError: If the file is no HDF5 file, or damaged; if an array is missing, of another
-            length than the actions, or not of numbers. The message names what is there.
+            length than the actions, not of numbers, or of more of them for a step than there should
+            be. The message names what is there.
         ModuleNotFoundError: If h5py is not installed.
     """
     h5py = import_extra("h5py", "hdf5")
@@ -127,7 +130,7 @@ def _is_array(node: Any) -> bool:
 
 
 def _check_lengths(where: Path | str, arrays: Arrays) -> Arrays:
-    """Refuse arrays that are not of the same steps, or of something else than numbers."""
+    """Refuse arrays that are not of the same steps, not of numbers, or of too many of them."""
     number = len(arrays["action"])
     for key, array in arrays.items():
         name = " ".join(key) if isinstance(key, tuple) else key
@@ -137,6 +140,16 @@ def _check_lengths(where: Path | str, arrays: Arrays) -> Arrays:
             )
         if array.dtype.kind not in _NUMBERS:
             raise ValueError(f"{where}: the {name} must be numbers, got {array.dtype}.")
+        if key not in _VECTORS and array.size != number:
+            raise ValueError(
+                f"{where}: the {name} must be one number a step, its shape is {array.shape}."
+            )
+    here, following = (arrays.get(key) for key in ("observation", ("next", "observation")))
+    if here is not None and following is not None and here.shape != following.shape:
+        raise ValueError(
+            f"{where}: the next observation must be like the observation, whose shape is "
+            f"{here.shape}, got {following.shape}."
+        )
     return arrays
 
 

@@ -61,6 +61,9 @@ class Recording:
     def write(self, number: int, batch: TensorDictBase, *, begun: Tensor | None = None) -> None:
         """Write a batch [N, T] under its number; one that is there already is replaced.
 
+        Episodes that are open in the last batch there is end there, as partial ones, if it is not
+        the one before this.
+
         Args:
             number: Of the batch, which follows the one before it.
             batch: Consecutive steps.
@@ -69,8 +72,11 @@ class Recording:
         """
         steps = batch.select(*self._keys).cpu()
         steps[PARTIAL] = torch.zeros_like(steps["next", "done"])
-        if begun is not None and not self._place(number - 1).exists():
-            steps[PARTIAL][:, 0] |= begun.cpu().unsqueeze(-1)
+        if not self._place(number - 1).exists():
+            before = [int(path.name) for path in _pieces(self.folder) if int(path.name) < number]
+            self.cut_after(max(before, default=-1))
+            if begun is not None:
+                steps[PARTIAL][:, 0] |= begun.cpu().unsqueeze(-1)
         self._store(number, steps)
 
     def cut_after(self, number: int) -> None:
@@ -145,7 +151,8 @@ def read_recording(folder: Path | str) -> TensorDict:
 
     Of an episode that is not all there ``partial`` is true in one step or more: where rows began
     within their first episode (``staggered_starts``), and where a run went on without the state of
-    its worlds. The latter is the end of the episode as well, a truncation.
+    its worlds or without being recorded. The latter are the end of the episode as well, a
+    truncation.
 
     Raises:
         FileNotFoundError: If there are none.

@@ -40,6 +40,23 @@ def test_a_recording_is_what_was_collected(tmp_path):
         read_recording(tmp_path / "elsewhere")
 
 
+def test_episodes_end_where_batches_are_missing(tmp_path):
+    """A run that was recorded, then not, and is again: what is on disk has a gap."""
+    batches = collected(4)  # of 25 steps, with episodes of 20: five are open after the first
+    recording = Recording(tmp_path, PointMass.cost_keys)
+    for number in (0, 3):
+        recording.write(number, batches[number], begun=torch.tensor([number > 0] * 4))
+    steps = read_recording(tmp_path)
+    assert steps["next", "done"][0].flatten().nonzero().flatten().tolist() == [19, 24, 29, 49]
+    assert not steps["next", "terminated"].any()
+    whole = safe_episodes(steps, {})
+    # the first twenty steps and the last twenty
+    assert torch.equal(
+        whole["observation"].reshape(4, 40, 4),
+        steps["observation"][:, [*range(20), *range(30, 50)]],
+    )
+
+
 @pytest.mark.parametrize("limits", [{"cost": 2.0}, {"cost_hazards": 1.0, "cost_north": 0.0}, {}])
 def test_safe_episodes_are_those_that_the_accounting_finds(limits):
     steps = torch.cat(collected(), -1)
@@ -169,6 +186,10 @@ def test_what_a_file_lacks_is_named(tmp_path):
         ({"next_observations": np.zeros((5, 3))}, "next observation is given for 5 steps"),
         ({"rewards": np.float64(1.0)}, "has no rewards"),
         ({"actions": np.array([b"left"] * 6)}, "the action must be numbers"),
+        ({"rewards": np.zeros((6, 2))}, r"the next reward must be one number .* shape is \(6, 2\)"),
+        ({"costs": np.zeros((6, 2))}, "the next cost must be one number a step"),
+        ({"terminals": np.zeros((6, 2))}, "the next terminated must be one number a step"),
+        ({"next_observations": np.zeros((6, 4))}, r"must be like the observation, .*got \(6, 4\)"),
     ],
 )
 def test_a_file_whose_arrays_do_not_fit_together_is_refused(changes, told, tmp_path):
@@ -188,6 +209,7 @@ def test_a_file_whose_arrays_do_not_fit_together_is_refused(changes, told, tmp_p
     [
         ("observations", np.zeros((1, 3)), "episode_4: the next observation is given for 0 steps"),
         ("infos/cost", np.zeros(0), "episode_4: the next cost is given for 0 steps"),
+        ("infos/cost", np.zeros((1, 2)), "episode_4: the next cost must be one number a step"),
         ("infos/cost_hazards", None, "costs of episode_4 are cost, those of episode_0 cost, cost_"),
         ("infos/cost", "group", "no infos/cost"),
     ],
