@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 from omegaconf import DictConfig
-from tensordict import TensorDictBase
+from tensordict import NestedKey, TensorDictBase
 from torchrl.data import TensorSpec
 from torchrl.envs import EnvBase
 
@@ -32,8 +32,8 @@ def fill_memory(
         What was taken, in a sentence.
 
     Raises:
-        ValueError: If they are not of this environment, lack what is learned from, no episode
-            keeps the limits, or the memory is too small.
+        ValueError: If they are not of this environment, lack what is learned from or are not finite
+            there, no episode keeps the limits, or the memory is too small.
     """
     steps = read_dataset(node.path)
     _check(steps, node, memory, env, actions)
@@ -43,6 +43,7 @@ def fill_memory(
             raise ValueError(
                 f"dataset.path={node.path} has no {', '.join(missing)}, which cost_limits names."
             )
+        _check_finite(steps, node, [("next", key) for key in limits])
         steps = safe_episodes(steps, limits)
     taken = steps.batch_size.numel()
     if not 0 < taken <= memory.capacity:
@@ -51,6 +52,7 @@ def fill_memory(
             f"dataset.path={node.path}: of its {number:,} transitions {taken:,} are taken"
             f"{what}. There must be some, and room for them: memory.capacity={memory.capacity}."
         )
+    _check_finite(steps, node, memory.in_keys)
     steps["action"] = steps["action"].clamp(actions.low.cpu(), actions.high.cpu())
     memory.extend(steps)
     memory.end_rows()
@@ -63,7 +65,7 @@ def _check(
 ) -> None:
     """Refuse what is of another environment, or not enough to learn from."""
     if missing := [key for key in memory.in_keys if key not in steps.keys(True)]:
-        names = ", ".join(key if isinstance(key, str) else key[-1] for key in missing)
+        names = ", ".join(map(_name, missing))
         raise ValueError(f"dataset.path={node.path} has no {names}, which is learned from.")
     sizes = {
         "observation": env.observation_spec["observation"].shape[-1],
@@ -75,3 +77,17 @@ def _check(
                 f"dataset.path={node.path}: its {key}s are {steps[key].shape[-1]} numbers, those "
                 f"of this environment {size}. It is a dataset of another one."
             )
+
+
+def _check_finite(steps: TensorDictBase, node: DictConfig, keys: Sequence[NestedKey]) -> None:
+    """Refuse numbers that would end a run as if training had diverged, or pass for no cost."""
+    for key in keys:
+        if wrong := int((~steps[key].isfinite()).any(-1).sum()):
+            raise ValueError(
+                f"dataset.path={node.path}: the {_name(key)} of {wrong:,} transitions is not "
+                "finite. Leave the episodes out that they are in, or mend the file."
+            )
+
+
+def _name(key: NestedKey) -> str:
+    return key if isinstance(key, str) else key[-1]

@@ -120,12 +120,7 @@ class OffPolicy:
         )
         learns_from, collects = _fill(config, memory, env)
         random_steps = setting(config, "exploration.random_steps")
-        if max(random_steps, memory.batch_size) > memory.capacity:
-            raise ValueError(
-                f"memory.capacity={memory.capacity}: it must hold exploration.random_steps="
-                f"{random_steps} transitions and a minibatch of {memory.batch_size}, or nothing is "
-                "ever learned."
-            )
+        _check_room(memory, random_steps, collects)
         return cls(
             policy=exploring(networks["actor"], env, setting(config, "exploration.noise")),
             networks=networks,
@@ -247,6 +242,22 @@ def _nothing_learned(config: DictConfig) -> str:
         f"Nothing will be learned: exploration.random_steps={random_steps} come first, and the run "
         f"has {config.frames:,}."
     )
+
+
+def _check_room(memory: Memory, random_steps: int, collects: bool) -> None:
+    """Refuse a memory that never comes to hold what learning begins with."""
+    needed = (
+        f"exploration.random_steps={random_steps} transitions and a minibatch of "
+        f"{memory.batch_size} (memory.batch_size), or nothing is ever learned."
+    )
+    least = max(random_steps, memory.batch_size)
+    if least > memory.capacity:
+        raise ValueError(f"memory.capacity={memory.capacity}: it must hold {needed}")
+    if not collects and least > len(memory):
+        raise ValueError(
+            f"dataset.alone=true: the memory holds {len(memory):,} transitions of the dataset and "
+            f"gets no others. It must hold {needed}"
+        )
 
 
 def _check_memory(config: DictConfig, loss: LossModule) -> None:

@@ -213,6 +213,42 @@ def test_the_loss_is_the_mean_squared_difference():
         BCLoss(actor)(steps.exclude("action"))
 
 
+@pytest.mark.parametrize(
+    ("overrides", "words"),
+    [
+        (["algo=bc", "memory.batch_size=512"], "a minibatch of 512 (memory.batch_size)"),
+        (
+            ["algo=sac_lagrangian", "dataset.alone=true", "memory.n_steps=1"],
+            "exploration.random_steps=10000 transitions",
+        ),
+    ],
+)
+def test_a_dataset_from_which_nothing_would_ever_be_learned_is_refused(overrides, words, tmp_path):
+    data = record(tmp_path / "data", head_south)
+    with pytest.raises(ValueError, match="alone=true: the memory holds 160 transitions") as error:
+        OffPolicy.build(offline_config(data, *overrides), PointMass(4))
+    assert words in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("algo", "key", "value"),
+    [
+        ("bc", ("next", "cost"), torch.nan),
+        ("bc", "action", torch.inf),
+        ("sac_lagrangian", ("next", "reward"), torch.nan),
+    ],
+)
+def test_numbers_that_are_not_finite_are_refused(algo, key, value, tmp_path):
+    batch = PointMass(2, 20).rollout(20)
+    batch[key][1, 3:5] = value
+    Recording(tmp_path / "data", PointMass.cost_keys).write(0, batch)
+    name = key if isinstance(key, str) else key[1]
+    with pytest.raises(ValueError, match=f"the {name} of 2 transitions is not finite"):
+        OffPolicy.build(
+            offline_config(tmp_path / "data", limits="{cost: 25}", algo=algo), PointMass(2)
+        )
+
+
 class Wider(PointMass):
     """Of another kind: five numbers are observed."""
 
