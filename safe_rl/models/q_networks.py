@@ -125,7 +125,7 @@ class QEnsemble(TensorDictModuleBase):
             tensordict: Observations and actions.
             params: Parameters to take instead of its own, such as a target network's.
         """
-        observation, action = (tensordict.get(key) for key in self.in_keys)
+        observation, action = (tensordict[key] for key in self.in_keys)
         given = None if params is None else params.get("network")
         values = self.network(torch.cat([self.scale(observation), action], -1), given)
         return TensorDict({self.out_keys[0]: values}, batch_size=values.shape[:-1])

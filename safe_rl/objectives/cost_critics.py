@@ -154,9 +154,9 @@ class CostCritics(QFunctionLoss):
             values = self.cost_values(
                 following, next_action, self.target_cost_qvalue_network_params
             )
-            goes_on = following.get(self.tensor_keys.terminated).logical_not()
+            ends = require(tensordict, ("next", self.tensor_keys.terminated))
             spanned = self.value_estimator.tensor_keys.steps_to_next_obs
-            discount = discount_of(tensordict, self.gamma, spanned) * goes_on
+            discount = discount_of(tensordict, self.gamma, spanned) * ends.logical_not()
         found = self.cost_values(
             tensordict, tensordict.get(self.tensor_keys.action), self.cost_qvalue_network_params
         )

@@ -11,6 +11,7 @@ from torchrl.objectives import LossModule
 from torchrl.objectives.value import ValueEstimatorBase
 
 __all__ = [
+    "InOneCall",
     "QFunctionLoss",
     "discount_of",
     "is_ensemble",
@@ -26,6 +27,25 @@ def is_ensemble(network: Any) -> bool:
     return hasattr(network, "num_networks")
 
 
+class InOneCall:
+    """An ensemble as TorchRL's losses call what they have vmapped, and as losses may keep it.
+
+    It is no module, which would become a part of the loss, and no function, which could neither be
+    stored nor follow a copy of the loss to another device.
+
+    Args:
+        network: the ensemble.
+        of_copies: whether steps come once per network: of one copy then, the first is taken.
+    """
+
+    def __init__(self, network: Any, *, of_copies: bool = False) -> None:
+        self.network, self.of_copies = network, of_copies
+
+    def __call__(self, steps: TensorDictBase, params: TensorDictBase) -> TensorDictBase:
+        """Values [E, ...] of steps, with parameters that are given."""
+        return self.network(steps[0] if self.of_copies else steps, params)
+
+
 class QFunctionLoss(LossModule):
     """What a loss on Q functions has besides TorchRL's: halves, one discount, copies of their own.
 
@@ -36,6 +56,8 @@ class QFunctionLoss(LossModule):
     """
 
     gamma: float
+    # TorchRL's TD3 has a list in its place, of which those that inherit it cannot select
+    out_keys = LossModule.out_keys
 
     @dispatch
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:

@@ -16,7 +16,14 @@ from torchrl.objectives import ValueEstimators
 from torchrl.objectives.value import TD0Estimator
 
 from safe_rl.objectives.cost_critics import CostCritics, CostTerms
-from safe_rl.objectives.q_functions import QFunctionLoss, discount_of, is_ensemble, scalars
+from safe_rl.objectives.keys import require
+from safe_rl.objectives.q_functions import (
+    InOneCall,
+    QFunctionLoss,
+    discount_of,
+    is_ensemble,
+    scalars,
+)
 
 __all__ = ["ConstrainedSoftActorCritic", "SACLagrangianLoss", "SACLoss", "SoftActorCritic"]
 
@@ -110,8 +117,7 @@ class SACLoss(QFunctionLoss, objectives.SACLoss):
 
     def _make_vmap(self) -> None:
         if is_ensemble(self.qvalue_network):
-            network = self.qvalue_network  # a function, for a module would become a part
-            self._vmap_qnetworkN0 = lambda steps, params: network(steps, params)
+            self._vmap_qnetworkN0 = InOneCall(self.qvalue_network)
         else:
             super()._make_vmap()
 
@@ -129,10 +135,11 @@ class SACLoss(QFunctionLoss, objectives.SACLoss):
             if type(estimator) is not TD0Estimator or estimator.average_rewards:
                 steps = tensordict.clone(False).set(("next", estimator.tensor_keys.value), soft)
                 return estimator.value_estimate(steps).squeeze(-1)
-            goes_on = following.get(keys.terminated).logical_not()
+            goes_on = require(tensordict, ("next", keys.terminated)).logical_not()
             spanned = estimator.tensor_keys.steps_to_next_obs
             discount = discount_of(tensordict, self.gamma, spanned)
-            return (following.get(keys.reward) + discount * goes_on * soft).squeeze(-1)
+            reward = require(tensordict, ("next", keys.reward))
+            return (reward + discount * goes_on * soft).squeeze(-1)
 
     def _act(self, steps: TensorDictBase) -> tuple[Tensor, Tensor]:
         """Actions of the present policy, through which gradients pass, and log π."""

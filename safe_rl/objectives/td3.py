@@ -13,7 +13,7 @@ from torchrl.data import TensorSpec
 from torchrl.objectives import ValueEstimators
 
 from safe_rl.objectives.cost_critics import CostCritics
-from safe_rl.objectives.q_functions import QFunctionLoss, is_ensemble, scalars
+from safe_rl.objectives.q_functions import InOneCall, QFunctionLoss, is_ensemble, scalars
 
 __all__ = ["TD3LagrangianLoss", "TD3Loss", "TwinDelayed"]
 
@@ -103,10 +103,10 @@ class TD3Loss(QFunctionLoss, objectives.TD3Loss):
         self._noise_clip = share
 
     def _make_vmap(self) -> None:
-        super()._make_vmap()
         if is_ensemble(self.qvalue_network):
-            network = self.qvalue_network
-            self._vmap_qvalue_network00 = lambda steps, params: network(steps[0], params)
+            self._vmap_qvalue_network00 = InOneCall(self.qvalue_network, of_copies=True)
+        else:
+            super()._make_vmap()
 
     def critic_losses(self, tensordict: TensorDictBase) -> TensorDict:
         """Losses of the Q functions."""

@@ -1,6 +1,7 @@
 """Losses on Q functions against TorchRL's own, against formulas written out, and finite limits."""
 
 import copy
+import pickle
 
 import pytest
 import torch
@@ -317,3 +318,39 @@ def test_the_multiplier_may_be_elsewhere_than_the_loss(kind):
     loss = make_loss(kind, lagrange(1.0, 1.0))
     loss.cost_unit = loss.cost_unit.to("meta")
     assert loss.cost_weights(torch.zeros(2, 6, 2, device="meta")).device.type == "meta"
+
+
+@pytest.mark.parametrize("kind", ["sac", "td3"])
+@pytest.mark.parametrize("multiplier", [None, (1.0, 1.0)])
+def test_a_loss_may_be_stored_whole(kind, multiplier):
+    loss = make_loss(kind, multiplier and lagrange(*multiplier))
+    stored, steps, found = pickle.loads(pickle.dumps(loss)), make_steps(), []
+    for module in (loss, stored):
+        torch.manual_seed(1)
+        found.append(module(steps.clone()))
+    for name, value in found[0].items():
+        assert torch.equal(value, found[1][name])
+
+
+@pytest.mark.parametrize("kind", ["td3", "sac"])
+@pytest.mark.parametrize("multiplier", [None, (1.0, 1.0)])
+def test_losses_may_be_asked_for_one_entry(kind, multiplier):
+    loss = make_loss(kind, multiplier and lagrange(*multiplier))
+    loss.select_out_keys("loss_actor")
+    assert list(loss(make_steps()).keys()) == ["loss_actor"]
+    loss.reset_out_keys()
+    assert "loss_qvalue" in loss(make_steps()).keys()  # noqa: SIM118
+
+
+@pytest.mark.parametrize(
+    ("kind", "key"),
+    [
+        *(("sac", key) for key in ("observation", "action", ("next", "reward"))),
+        *((kind, ("next", key)) for kind in ("sac", "td3") for key in ("terminated", "cost")),
+        ("td3", "observation"),  # its actions and rewards are read by TorchRL's own code
+    ],
+)
+def test_an_entry_that_is_missing_is_named(kind, key):
+    name = key if isinstance(key, str) else key[1]
+    with pytest.raises(KeyError, match=name):
+        make_loss(kind, lagrange(1.0, 1.0))(make_steps().exclude(key))
