@@ -206,10 +206,12 @@ class Trainer:
             self._candidates.go_on_after(self.folder.rows())
             # a shorter run that had come to its end has judged them by fewer epochs
             self._checkpoints.forget_best(self._candidates.waiting)
-            while self.progress.steps < self._frames and not stop.received:
+            while self.progress.steps < self._frames:
                 row = self.epoch(batches)
                 self.folder.record(row)
                 self._keep(self._candidates.add(row))
+                if stop.received:  # not before the first: a run has an epoch to show
+                    break
                 if time.monotonic() - saved_at > self._checkpoint_interval:
                     self._save()
                     saved_at = time.monotonic()

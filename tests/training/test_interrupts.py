@@ -29,6 +29,15 @@ def test_a_signal_ends_the_run_after_the_epoch_with_a_checkpoint(tmp_path):
     ]
 
 
+def test_a_signal_before_the_first_epoch_lets_it_end(tmp_path):
+    trainer = point_mass_trainer(tmp_path, "frames=100_000_000")
+    rows = trainer.folder.rows
+    trainer.folder.rows = lambda: signal.raise_signal(signal.SIGTERM) or rows()
+    trainer.run()
+    assert trainer.interrupted_by is signal.SIGTERM
+    assert read_table(tmp_path / "progress.csv")["epoch"] == [1]
+
+
 def test_a_signal_in_the_last_epoch_interrupts_nothing(tmp_path):
     trainer = point_mass_trainer(tmp_path, "frames=160")
     record = trainer.folder.record
