@@ -200,7 +200,7 @@ class Trainer:
         batches = self.batches()
         saved_at = time.monotonic()
         behind = self.progress.epoch if self._is_continued else None
-        with self.folder.writing(behind, self.progress.steps), StopRequest() as stop:
+        with StopRequest() as stop, self.folder.writing(behind, self.progress.steps):
             if not self.progress.epoch:
                 self._checkpoints.begin()
             self._candidates.go_on_after(self.folder.rows())
