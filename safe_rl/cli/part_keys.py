@@ -152,7 +152,6 @@ PARTS = {
         "largest_margin": Key(SHARE, "bound of the margin, as a share of the limit"),
         "free_steps": Key(count(0), "steps for which costs are free"),
         "descent_steps": Key(count(0), "steps in which the limit then comes down"),
-        "ratchet": Key(boolean, "whether a lower cost takes the limit along"),
         "recovery": Key(SHARE, "share of a limit to come down to, once above it"),
         "frames": Key(count(), "steps of the whole run"),
         "latest_end": Key(number(0, 1, above=True), "share of a run by which the descent is over"),

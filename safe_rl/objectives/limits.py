@@ -143,8 +143,6 @@ class LimitTracker:
         largest_margin: bound of the margin, as a share of d.
         free_steps: environment steps for which costs are free.
         descent_steps: environment steps in which the limit then comes down.
-        ratchet: whether a cost that comes down faster than the limit takes the limit along. It does
-            so by luck, too, so that the limit is down early; without, it comes down by steps alone.
         recovery: hysteresis: once J_c is above d, the aim is this share of d until J_c is there, as
             in the published C-TRPO and CPO with hysteresis; 1 for none.
         frames: environment steps of the whole run.
@@ -190,8 +188,7 @@ class LimitTracker:
         lowest_trust: float,
         integral: float,
         largest_integral: float,
-        recovery: float = 1.0,  # configurations of earlier runs lack these two
-        ratchet: bool = True,
+        recovery: float = 1.0,  # configurations of earlier runs lack it
     ) -> None:
         self.limits = cost_limits.detach().cpu().float()
         num_costs = len(self.limits)
@@ -199,8 +196,7 @@ class LimitTracker:
         shrinkage = min(1.0, latest_end * frames / max(free_steps + descent_steps, 1))
         self.free_steps = round(free_steps * shrinkage)
         self.descent_steps = round(descent_steps * shrinkage)
-        self.smallest_scale, self.memory = smallest_scale, memory
-        self.recovery, self.ratchet = recovery, ratchet
+        self.smallest_scale, self.memory, self.recovery = smallest_scale, memory, recovery
         self.costs = EpisodeCosts(
             num_costs,
             max_length=max_length,
@@ -257,10 +253,8 @@ class LimitTracker:
         margin = torch.minimum(self.margin * self._noise, self.largest_margin * self.limits)
         left = self.free_steps + self.descent_steps - self._steps + num_steps
         share = num_steps / left if left > num_steps else 1.0
-        # from what it costs when costs begin to count, or now, where that is less
-        begins = self._reached.isinf() | self.ratchet
-        present = torch.minimum(self._reached, estimate.mean)
-        self._reached = torch.where(begins, present, self._reached)
+        # from the present cost, where that has come down faster than the limit
+        self._reached = torch.minimum(self._reached, estimate.mean)
         self._reached = descend(self._reached, self.limits - margin, share)
         if left > num_steps:
             return self._reached

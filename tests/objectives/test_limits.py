@@ -66,14 +66,6 @@ def test_the_descent_goes_on_from_the_cost_where_that_came_down_faster():
     assert later.target < state.target
 
 
-def test_without_a_ratchet_the_limit_comes_down_by_steps_alone():
-    limits = tracker(margin=0.0, free_steps=2_000, drift=None, ratchet=False)
-    rates = [0.3, 0.1, 0.03, 0.2, 0.01, 0.05, 0.04]  # the first is while costs are free
-    states = [limits.update(torch.full((20, 100, 1), rate), NO_EPISODES) for rate in rates]
-    targets = torch.cat([state.target for state in states[1:]])
-    torch.testing.assert_close(targets, torch.tensor([85.0, 70, 55, 40, 25, 25]))
-
-
 def test_descend_stays_at_the_goal_once_it_is_there():
     goal = torch.tensor([25.0])
     assert descend(torch.tensor([10.0]), goal, 0.3) == goal
