@@ -1,0 +1,154 @@
+"""Figures that README and the pages name are those of the archived runs."""
+
+import json
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from safe_rl.runs.table import read_table
+
+ROOT = Path(__file__).resolve().parents[2]
+RESULTS = ROOT / "results"
+README = (ROOT / "README.md").read_text()
+OFF_POLICY = (ROOT / "docs" / "off_policy.md").read_text()
+
+SEEDS = r"^\| (\w+) \| `(\w+)` \| (\d+(?:\W\d+)?) \| (.+) \|$"
+HELD_OUT = re.findall(SEEDS, README, re.MULTILINE)
+THREE_MILLION = re.findall(r"^\| (40\d) \| (.+) \|$", OFF_POLICY, re.MULTILINE)
+ONE_MILLION = [
+    (env, algo, seed, cells)
+    for env, table in re.findall(
+        r"^\| (\w+), `algo=` \|.*\n((?:\|.*\n)+)", OFF_POLICY, re.MULTILINE
+    )
+    for algo, rows in re.findall(r"^\| `(\w+)` (\|.*\n(?:\|  ?\|.*\n)*)", table, re.MULTILINE)
+    for seed, cells in re.findall(r"\| (30\d) \| (.+) \|$", rows, re.MULTILINE)
+]
+
+
+def figures(folder):
+    columns = read_table(folder / "progress.csv.gz")
+    names = ("steps", "episode_return", "episode_cost")
+    return [np.array(columns[name]) for name in names], columns
+
+
+def last(folder, share):
+    """Mean return and cost of the last `share` of a run."""
+    (steps, returns, costs), _ = figures(folder)
+    late = steps > steps[-1] * (1 - share)
+    return np.nanmean(returns[late]), np.nanmean(costs[late])
+
+
+def from_a_million_on(folder):
+    """Mean cost, and the share of spans of 20,000 steps that cost more than 25."""
+    (steps, _, costs), _ = figures(folder)
+    spans = [
+        costs[(steps > end - 20_000) & (steps <= end)]
+        for end in range(1_020_000, int(steps[-1]) + 1, 20_000)
+    ]
+    return np.nanmean(costs[steps > 1_000_000]), np.mean([np.nanmean(span) > 25 for span in spans])
+
+
+def certificate(folder, what="≤ {:.1f} at {:.1f}"):
+    told = json.loads((folder / "certificate.json").read_text())
+    if told["certified"]:
+        return what.format(told["bounds"]["mean_cost"]["bound"], told["episode_return"])
+    return f"no, by {told['shortfalls']['mean_cost']:.1f}"
+
+
+def percent(share):
+    return f"{share:.0%}".replace("%", " %")
+
+
+@pytest.mark.parametrize(("env", "algo", "seeds", "cells"), HELD_OUT)
+def test_the_table_of_readme_is_that_of_the_held_out_runs(env, algo, seeds, cells):
+    first, *final = map(int, re.findall(r"\d+", seeds))
+    numbers = range(first, (final or [first])[0] + 1)
+    folders = [RESULTS / "holding_the_limit" / env / algo / f"seed{n}" for n in numbers]
+    returns, costs = np.mean([last(folder, 1 / 6) for folder in folders], axis=0)
+    mean_cost, above = np.mean([from_a_million_on(folder) for folder in folders], axis=0)
+    assert cells.split(" | ") == [
+        f"{returns:.1f} / {costs:.1f}",
+        f"{mean_cost:.1f}",
+        percent(above),
+        "; ".join(map(certificate, folders)),
+    ]
+
+
+@pytest.mark.parametrize(("seed", "cells"), THREE_MILLION)
+def test_three_million_steps_from_memory(seed, cells):
+    folder = RESULTS / "holding_the_limit" / "PointGoal1" / "sac_lagrangian" / f"seed{seed}"
+    returns, costs = last(folder, 1 / 6)
+    mean_cost, above = from_a_million_on(folder)
+    said = cells.replace("mean cost ", "").replace("return ", "")
+    assert said.split(" | ") == [
+        f"{returns:.1f} / {costs:.1f}",
+        f"{mean_cost:.1f}, {percent(above)}",
+        certificate(folder),
+    ]
+
+
+@pytest.mark.parametrize(("env", "algo", "seed", "cells"), ONE_MILLION)
+def test_one_million_steps_from_memory(env, algo, seed, cells):
+    folder = RESULTS / "algorithms" / env / algo / f"seed{seed}"
+    (steps, _, _), columns = figures(folder)
+    late = steps > steps[-1] * 0.75
+    quiet = [
+        np.nanmean(np.array(columns[f"evaluation_{name}"])[late]) for name in ("return", "cost")
+    ]
+    said = cells.replace("mean cost ", "").replace("return ", "")
+    assert said.split(" | ") == [
+        "{:.1f} / {:.1f}".format(*last(folder, 0.25)),
+        "{:.1f} / {:.1f}".format(*quiet),
+        certificate(folder),
+    ]
+
+
+def test_the_tables_are_found():
+    assert len(HELD_OUT) >= 16
+    assert len(THREE_MILLION) >= 4
+    assert len(ONE_MILLION) >= 12
+
+
+def means(folders, share, form="{:.1f} / {:.1f}"):
+    return form.format(*np.mean([last(folder, share) for folder in folders], axis=0))
+
+
+@pytest.mark.parametrize(
+    ("env", "algo", "share", "form"),
+    [
+        ("PointGoal1", "ppo", 0.25, "PPO {:.1f} / {:.1f}"),
+        ("PointGoal1", "trpo", 0.25, "TRPO\n{:.1f} / {:.1f}"),
+        ("PointGoal1", "sac_lagrangian", 0.25, "last quarter of training: {:.1f} / {:.1f} and"),
+        ("PointGoal1", "td3_lagrangian", 0.25, "and\n{:.1f} / {:.1f};"),
+        ("CarGoal1", "sac_lagrangian", 0.25, "On CarGoal1 they come to {:.1f} / {:.1f} and\n"),
+        ("CarGoal1", "td3_lagrangian", 0.25, "and\n{:.1f} / {:.1f};"),
+    ],
+)
+def test_means_of_a_million_steps_in_readme(env, algo, share, form):
+    assert means((RESULTS / "algorithms" / env / algo).glob("seed*"), share, form) in README
+
+
+@pytest.mark.parametrize(
+    "env", ["PointGoal1", "CarGoal1", "PointGoal2", "PointButton1", "PointPush1"]
+)
+def test_means_without_a_limit_in_readme(env):
+    form = "{:.1f} / {:.0f}"
+    ends = [
+        means((RESULTS / "reference" / env / a).glob("seed*"), 1 / 6, form) for a in ("ppo", "trpo")
+    ]
+    assert " and ".join(ends) in README
+
+
+def test_what_readme_says_of_pushing():
+    runs = [RESULTS / "push" / "PointPush1" / "after_trpo" / f"seed{n}" for n in (401, 402, 403)]
+    ends = ["{:.1f} / {:.0f}".format(*last(run, 0.25)) for run in runs]
+    returns = [certificate(run, "{1:.1f}") for run in runs]
+    assert "{}, {} and {} over the\n".format(*ends) in README
+    assert "certified at returns of {}, {} and {} ".format(*returns) in README
+    starts = [RESULTS / "reference" / "PointPush1" / "trpo" / f"seed{n}" for n in (0, 20)]
+    assert (
+        "TRPO's {} and {};".format(*("{:.1f} / {:.0f}".format(*last(r, 1 / 6)) for r in starts))
+        in README
+    )
