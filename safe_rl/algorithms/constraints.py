@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 
 import torch
@@ -139,7 +140,7 @@ def check_cost_limits(
     """Return the limits as a plain dictionary, once every key is known to the environment.
 
     Raises:
-        ValueError: If a key is unknown, or a limit is negative or not a number.
+        ValueError: If a key is unknown, or a limit is negative, infinite or not a number.
     """
     limits: dict[str, float] = {}
     for key, limit in cost_limits.items():
@@ -149,10 +150,11 @@ def check_cost_limits(
                 f"{did_you_mean(key, cost_keys)} It has {', '.join(cost_keys)}; in Safety Gym's "
                 "environments env.constrain_<kind>=true adds those of another kind."
             )
-        if isinstance(limit, bool) or not isinstance(limit, int | float) or not limit >= 0:
+        is_number = isinstance(limit, int | float) and not isinstance(limit, bool)
+        if not is_number or not 0 <= limit < math.inf:
             raise ValueError(
                 f"The limit of '{key}' is {limit!r}: it must be a number of at least 0, the "
-                "undiscounted cost allowed per episode."
+                "undiscounted cost allowed per episode. Leave out a cost that has no limit."
             )
         limits[key] = float(limit)
     return limits
