@@ -56,7 +56,7 @@ class CTRPOStep(TRPOStep):
     A policy beyond a limit recovers: `TRPOStep`'s step against E[ρ A_c] until J_c is (1 −
     `hysteresis`) d below what it is held against, which is d or, by a margin, less. The barriers
     of the costs that are within their limits stay; of several to recover, the one exceeded most
-    comes first.
+    comes first. A limit of 0 has no barrier, and where nothing costs there is nothing to recover.
 
     Adds ``recovers`` to the diagnostics, [k]: 1 for the costs that are being recovered.
 
@@ -105,10 +105,10 @@ class CTRPOStep(TRPOStep):
                 f"hysteresis must be in (0, 1] and gamma in [0, 1) or null, got {hysteresis} and "
                 f"{gamma}."
             )
-        limits = parse_cost_limits(cost_limits)[1]
+        self.limits = parse_cost_limits(cost_limits)[1]
         self.beta, self.gamma = beta, gamma
-        self.recovered = -(1 - hysteresis) * limits
-        self.recovering = torch.zeros_like(limits, dtype=torch.bool)
+        self.recovered = -(1 - hysteresis) * self.limits
+        self.recovering = torch.zeros_like(self.limits, dtype=torch.bool)
 
     def _propose(
         self,
@@ -121,11 +121,13 @@ class CTRPOStep(TRPOStep):
         violation = matched_violation(cost_violation, surrogates)
         above = violation - self.recovered.to(violation)
         was_recovering = self.recovering.to(violation.device) & (above >= 0)
-        self.recovering = (violation >= 0) | was_recovering
-        inside, horizon = ~self.recovering, self._horizon(episode_length)
+        costs_anything = violation > -self.limits.to(violation)
+        self.recovering = ((violation >= 0) | was_recovering) & costs_anything
+        inside, horizon = ~self.recovering & (violation < 0), self._horizon(episode_length)
         slack, start = -violation[inside], horizon * surrogates[inside].detach()
-        worst = int(above.masked_fill(inside, -torch.inf).argmax())
-        objective = total_loss if inside.all() else lambda of: of["cost_surrogate"][worst]
+        worst = int(above.masked_fill(~self.recovering, -torch.inf).argmax())
+        recovers = self.recovering.any()
+        objective = (lambda of: of["cost_surrogate"][worst]) if recovers else total_loss
         loss = objective(losses)
         g = flat_gradient(loss, self.parameters, retain_graph=True)
         b = self._gradients(surrogates[inside])
@@ -144,8 +146,8 @@ class CTRPOStep(TRPOStep):
             divergence = kl + self.beta * barrier_divergence(change, slack).sum()
             return bool((divergence <= self.target_kl) & (objective(after) <= before))
 
-        recovers = self.recovering.to(surrogates.dtype)
-        return Proposal(-length * direction, is_acceptable, {"recovers": recovers})
+        diagnostics = {"recovers": self.recovering.to(surrogates.dtype)}
+        return Proposal(-length * direction, is_acceptable, diagnostics)
 
     def _horizon(self, episode_length: Tensor | None) -> Tensor | float:
         """h, what makes a sum over an episode of an average per step."""

@@ -130,6 +130,19 @@ def test_of_several_costs_the_worst_is_recovered_within_the_limits_of_the_others
     assert change[2] < 0.2
 
 
+def test_at_a_limit_of_nothing_a_policy_without_costs_learns_from_its_rewards():
+    actor, batch = make_case(2)
+    batch["cost_advantage"] = batch["cost_advantage"] * torch.tensor([0.0, 1.0])
+    settings = {"beta": BETA, "gamma": 0.99, "hysteresis": 0.8, **SETTINGS}
+    step = CTRPOStep(CPOLoss(actor, entropy_coeff=0.0), [0.0, 25.0], **settings)
+    recovers = []
+    for violation in (2.0, 0.0, 0.0):
+        before = step.loss(batch)["loss_objective"]
+        recovers.append(step(batch, torch.tensor([violation, -10.0]))["recovers"].tolist())
+    assert recovers == [[1.0, 0.0], [0.0, 0.0], [0.0, 0.0]]
+    assert step.loss(batch)["loss_objective"] < before
+
+
 def test_undiscounted_sums_take_the_length_of_an_episode():
     actor, batch = make_case(1)
     state = {name: value.clone() for name, value in actor.state_dict().items()}
