@@ -21,7 +21,7 @@ from safe_rl.algorithms.loss_state import LossState
 from safe_rl.algorithms.minibatch import MinibatchUpdate
 from safe_rl.algorithms.parts import build_part
 from safe_rl.algorithms.side_by_side import side_by_side
-from safe_rl.algorithms.tracked_constraints import CHARGES
+from safe_rl.algorithms.tracked_constraints import CHARGES, TrackedConstraints
 from safe_rl.collectors import EpisodeStatistics
 from safe_rl.models import build_networks, make_behaviour, take_in
 from safe_rl.objectives import CriticLoss
@@ -85,8 +85,10 @@ class OnPolicy:
         cost_advantage = None
         if limits:
             cost_advantage = build_part(config.cost_advantage, value_network=cost_critic, **parts)
-            if getattr(constraints, "risk", None) is not None:
-                cost_advantage.set_keys(reward=[CHARGES])
+            if isinstance(constraints, TrackedConstraints):
+                constraints.cost_advantage = cost_advantage.tensor_keys.advantage
+                if constraints.risk is not None:
+                    cost_advantage.set_keys(reward=[CHARGES])
         policy_update = _build_update(config, critic_network=critic, **parts)
         del parts["actor_network"]
         return cls(

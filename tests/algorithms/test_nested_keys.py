@@ -1,10 +1,13 @@
 """Parts put together by hand, with entries below another one, learn what they do without."""
 
+from dataclasses import dataclass
 from functools import partial
 
 import pytest
 import torch
-from tensordict import TensorDict
+from point_mass import PointMass
+from run_configs import point_mass_config
+from tensordict import NestedKey, TensorDict
 
 from safe_rl.algorithms import MinibatchUpdate, OnPolicy
 from safe_rl.algorithms.constraints import Constraints
@@ -19,6 +22,7 @@ from safe_rl.objectives import (
     PPOLagrangianLoss,
     VectorGAE,
 )
+from safe_rl.targets import allow
 
 SETTINGS = {"gamma": 0.99, "lmbda": 0.97, "value_target": "lambda_return"}
 TRACKER = {
@@ -120,3 +124,25 @@ def test_entries_below_another_one_are_learned_from_as_at_the_root(constraints_o
     assert rows[0] == rows[1]
     assert torch.equal(*learned)
     assert torch.equal(*advantages)
+
+
+class CostsElsewhere(CostGAE):
+    """Writes its advantages to where its own loss looks for them."""
+
+    @dataclass
+    class _AcceptedKeys:
+        advantage: NestedKey = ("costs", "advantage")
+        value_target: NestedKey = "cost_value_target"
+        value: NestedKey = "cost_value"
+        reward: NestedKey | list[NestedKey] = "cost"
+        done: NestedKey = "done"
+        terminated: NestedKey = "terminated"
+
+    default_keys = _AcceptedKeys
+
+
+def test_a_recipe_weighs_cost_advantages_where_its_estimator_writes_them():
+    allow(__name__)
+    config = point_mass_config(f"cost_advantage._target_={__name__}.CostsElsewhere")
+    algorithm = OnPolicy.build(config, PointMass(4))
+    assert algorithm.constraints.cost_advantage == ("costs", "advantage")
