@@ -87,6 +87,7 @@ class TrackedConstraints(Constraints):
             self._row |= self.column("trust", state.trust)
             return
         self.multiplier.set_scale(state.scale)
+        self.multiplier.set_unit(state.unit)
         self.multiplier.update(self.limits + state.violation)
         advantage = batch.get(self.cost_advantage, None)
         if advantage is not None:

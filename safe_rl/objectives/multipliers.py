@@ -125,6 +125,9 @@ class Multiplier(nn.Module):
     def set_scale(self, scale: Tensor) -> None:
         """Take note of the units of violations, [k] > 0; most multipliers have their own."""
 
+    def set_unit(self, unit: Tensor) -> None:
+        """Take note of the size of one cost, [k] > 0, in which what λ weighs is measured."""
+
     def _step(self, mean_costs: Tensor) -> dict[str, Tensor]:
         """Return the new value of every state buffer ([..., k]) given finite J_c [k]."""
         raise NotImplementedError

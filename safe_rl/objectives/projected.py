@@ -11,15 +11,16 @@ from safe_rl.objectives.multipliers import CostLimits, Multiplier, per_cost
 
 
 class ProjectedMultiplier(Multiplier):
-    """λ ← clip(λ + α (J_c − d), 0, λ_max), the plain dual ascent.
+    """λ ← clip(λ + α (J_c − d) / u, 0, λ_max), the plain dual ascent.
 
     Of FOCOPS (Zhang, Vuong and Ross 2020), CUP (Yang et al. 2022) and,
-    slow and without λ_max, RCPO (Tessler et al. 2019, algorithm 1).
+    slow and without λ_max, RCPO (Tessler et al. 2019, algorithm 1). u is the size of one cost: 1,
+    as in the articles, unless what λ weighs is in other units (`set_unit`).
 
     Args:
         cost_limits: mapping from cost key to limit d, or limits alone; see `parse_cost_limits`.
         init: initial λ in [0, `highest`], for all costs or one per cost.
-        lr: α, λ per unit of an episode's cost.
+        lr: α, λ per cost of size u in an episode.
         highest: λ_max, or None for no bound.
 
     Raises:
@@ -36,6 +37,7 @@ class ProjectedMultiplier(Multiplier):
     """
 
     penalty: Tensor
+    unit: Tensor
 
     def __init__(
         self,
@@ -51,12 +53,18 @@ class ProjectedMultiplier(Multiplier):
         if not torch.equal(initial.clamp(0, highest), initial):
             raise ValueError(f"init must be between 0 and highest={highest}, got {init}.")
         self.register_buffer("penalty", initial)
+        # told anew before every update, and unknown to checkpoints of earlier versions
+        self.register_buffer("unit", torch.ones_like(initial), persistent=False)
 
     @property
     def value(self) -> Tensor:
         """The multipliers λ ≥ 0, [k], detached."""
         return self.penalty.detach()
 
+    def set_unit(self, unit: Tensor) -> None:
+        """Set u, [k] > 0."""
+        self.unit.copy_(unit)
+
     def _step(self, mean_costs: Tensor) -> dict[str, Tensor]:
-        moved = self.penalty + self.lr * (mean_costs - self.limits)
+        moved = self.penalty + self.lr * (mean_costs - self.limits) / self.unit
         return {"penalty": moved.clamp(0, self.highest)}

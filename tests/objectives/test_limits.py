@@ -2,7 +2,11 @@
 
 import pytest
 import torch
+from tensordict import TensorDict
 
+from safe_rl.algorithms.tracked_constraints import TrackedConstraints
+from safe_rl.collectors import EpisodeStatistics
+from safe_rl.objectives import ProjectedMultiplier
 from safe_rl.objectives.limits import LimitTracker, PromisedChange, descend
 
 SETTINGS = {
@@ -99,6 +103,25 @@ def test_a_cost_and_a_limit_ten_times_as_large_give_the_same_picture():
         torch.testing.assert_close(one.violation / one.scale, ten.violation / ten.scale)
         torch.testing.assert_close(10 * one.target, ten.target)
         torch.testing.assert_close(10 * one.unit, ten.unit)
+
+
+@pytest.mark.parametrize("size", [0.01, 1000.0])
+def test_plain_dual_ascent_weighs_costs_of_any_size_alike(size):
+    """Its λ weighs advantages in units of one cost, and so has to move by violations in them."""
+    episodes = EpisodeStatistics(NO_EPISODES, {}, NO_EPISODES, {})
+    found = []
+    for unit in (1.0, size):
+        limits = {"cost": 25.0 * unit}
+        constraints = TrackedConstraints(
+            limits,
+            tracker=tracker(25.0 * unit, free_steps=0, descent_steps=0),
+            multiplier=ProjectedMultiplier(limits, init=0.0, lr=0.01, highest=None),
+        )
+        for costs in batches(5, 0.05, unit=unit):
+            constraints.observe(episodes, TensorDict({"next": {"cost": costs}}, [20, 100]))
+        found.append(constraints.multiplier.value)
+    assert found[0] > 1.0
+    torch.testing.assert_close(*found)
 
 
 @pytest.mark.parametrize("kept", [0.2, 0.7])
