@@ -14,6 +14,8 @@ and of 1 where β is a tenth.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import torch
 from torch import Tensor
 
@@ -55,7 +57,7 @@ class PIMultiplier(Multiplier):
         self,
         cost_limits: CostLimits,
         *,
-        init: float,
+        init: float | Sequence[float],
         kp: float,
         ki: float,
         saturation: float,

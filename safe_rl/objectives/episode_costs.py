@@ -4,7 +4,8 @@ The cost rate of a batch times the mean length of an episode, J_c = (Σ c / step
 step that was taken. By the renewal-reward theorem it tends to E[C] even where the length and the
 cost of an episode depend on each other, if rows are at independent points of their episodes (see
 `stagger` of the accounting); while all rows are in the same part of an episode, it is the rate of
-that part. For a batch of whole episodes it *is* their mean cost.
+that part. For a batch of whole episodes it *is* their mean cost, as long as T̄ is their length: T̄ is
+a mean over past batches too, and lags where episodes become longer or shorter.
 """
 
 from __future__ import annotations
