@@ -75,7 +75,7 @@ FLOORS = {
         ("safety_gym.env",),
         ("safety_gym", "safety_gym.nodes", "extending"),
         # The velocity family: rows, configurations, then functions over tensors, the environment.
-        ("physics.runge_kutta", "velocity.robots", "velocity.specs"),
+        ("physics.runge_kutta", "velocity.robots"),
         ("velocity.config", "velocity.measuring"),
         ("velocity.health", "velocity.rewarding", "velocity.starting", "velocity.suite"),
         ("velocity.model",),

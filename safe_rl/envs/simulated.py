@@ -3,27 +3,20 @@
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Mapping
-from typing import Any, ClassVar, NamedTuple
+from collections.abc import Mapping, Sequence
+from typing import Any, ClassVar
 
+import mujoco
+import numpy as np
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
-from torchrl.data import Composite, TensorSpec
+from torchrl.data import Binary, Bounded, Composite, TensorSpec, Unbounded
 from torchrl.envs import EnvBase
 
 from safe_rl.envs import rng
 from safe_rl.envs.errors import require_integer
 from safe_rl.envs.physics.cpu import BatchPhysics
-
-
-class Specs(NamedTuple):
-    """What `EnvBase` asks for, for N worlds."""
-
-    observation: Composite
-    action: TensorSpec
-    reward: Composite
-    done: Composite
 
 
 class SimulatedEnv(EnvBase):
@@ -44,6 +37,7 @@ class SimulatedEnv(EnvBase):
     copied: ClassVar[tuple[str, ...]] = ("_row_seed", "_has_cost", "_begun")
 
     config: Any
+    cost_keys: list[str]
     _physics: BatchPhysics
     _observer: Any
     _renderer: Any
@@ -57,10 +51,30 @@ class SimulatedEnv(EnvBase):
         self._begun = torch.zeros(num_envs, dtype=torch.bool)
         self._physics_settings: tuple[Any, ...] = (num_threads,)
 
-    def _announce(self, specs: Specs, seed: int | None) -> None:
-        """Take the specs and the first seed, when everything else is built."""
-        self.observation_spec, self.action_spec = specs.observation, specs.action
-        self.reward_spec, self.done_spec = specs.reward, specs.done
+    def _announce(
+        self, model: mujoco.MjModel, observation: TensorSpec, highest: float, seed: int | None
+    ) -> None:
+        """Say what is read and written, and take the first seed, when everything else is built.
+
+        Args:
+            model: whose actuators are controlled.
+            observation: spec of what is observed in N worlds.
+            highest: the most that a step can cost.
+            seed: of the environment; None takes one from torch's generator.
+        """
+        low, high = torch.from_numpy(model.actuator_ctrlrange.T.copy())
+        self._control_range = (low, high)
+        batch, scalar = self.batch_size, (*self.batch_size, 1)
+        kind: dict[str, Any] = {"dtype": torch.float32, "device": self.device}
+        flag = Binary(1, shape=scalar, dtype=torch.bool, device=self.device)
+        ends = {name: flag.clone() for name in SimulatedEnv.flags}
+        events = {name: flag.clone() for name in self.flags if name not in ends}
+        costs = {key: Bounded(0.0, highest, shape=scalar, **kind) for key in self.cost_keys}
+        low, high = (bound.to(torch.float32).expand(*batch, -1) for bound in (low, high))
+        self.observation_spec = Composite(observation=observation, **events, shape=batch)
+        self.action_spec = Bounded(low, high, **kind)
+        self.reward_spec = Composite(reward=Unbounded(shape=scalar, **kind), **costs, shape=batch)
+        self.done_spec = Composite(**ends, shape=batch)
         self.set_seed(int(torch.randint(2**62, ())) if seed is None else seed)
 
     @property
@@ -97,6 +111,20 @@ class SimulatedEnv(EnvBase):
         none = torch.zeros(len(self.flags), *self.batch_size, 1, dtype=torch.bool)
         return self._pack(dict(zip(self.flags, none, strict=True)))
 
+    def _step_output(self, numbers: Tensor, flags: Tensor) -> TensorDict:
+        """What a step returns: reward and costs [1 + K, N], and `flags`, bool [F, N]."""
+        names = ("reward", *self.cost_keys, *self.flags)
+        values = (*numbers.to(torch.float32).unsqueeze(-1), *flags.unsqueeze(-1))
+        return self._pack(dict(zip(names, values, strict=True)))
+
+    def _pack(self, outputs: dict[str, Any]) -> TensorDict:
+        """Move outputs to the device, and add the observation."""
+        if self.device.type != "cpu":
+            outputs = {key: value.to(self.device) for key, value in outputs.items()}
+        outputs["observation"] = self._observe()
+        # As TorchRL's own environments do: every shape and device is right by construction.
+        return TensorDict._new_unsafe(outputs, batch_size=self.batch_size, device=self.device)
+
     def _step_proc_data(self, next_tensordict_out: TensorDictBase) -> TensorDictBase:
         """Skip TorchRL's checks of every step: shapes and end flags are right by construction."""
         return next_tensordict_out
@@ -115,8 +143,8 @@ class SimulatedEnv(EnvBase):
         """Begin the episodes `_episode` in worlds of a mask, bool [N]."""
 
     @abstractmethod
-    def _pack(self, outputs: dict[str, Any]) -> TensorDict:
-        """Add the observation and move everything to the device."""
+    def _observe(self) -> Tensor | TensorDict:
+        """Return what is observed, on the device; later steps leave it as it is."""
 
     @abstractmethod
     def _read_state(self) -> TensorDict:
@@ -169,6 +197,15 @@ class SimulatedEnv(EnvBase):
             self.set_state(state)
         for name, tensor in tensors.items():
             setattr(self, name, tensor)
+
+    def _frames(
+        self, rows: int | Sequence[int] | None, camera: Any, width: int, height: int
+    ) -> np.ndarray:
+        """One frame for an integer, else frames of some worlds, or of all."""
+        everyone = range(self.batch_size[0])
+        chosen = [rows] if isinstance(rows, int) else list(everyone if rows is None else rows)
+        frames = self._renderer.frames(chosen, self._has_cost, camera, width, height)
+        return frames[0] if isinstance(rows, int) else frames
 
     def close(self, *, raise_if_closed: bool = True) -> None:
         """Free what OpenGL holds, and close the viewer if there is one."""

@@ -21,7 +21,7 @@ from safe_rl.envs.safety_gym.rendering.display import Camera
 from safe_rl.envs.safety_gym.rendering.renderer import WorldRenderer
 from safe_rl.envs.safety_gym.rules.costs import active_costs, compute_costs, cost_keys
 from safe_rl.envs.safety_gym.rules.tasks import TASKS, dense_reward, goals_met
-from safe_rl.envs.safety_gym.specs import make_specs
+from safe_rl.envs.safety_gym.specs import observation_spec
 from safe_rl.envs.safety_gym.suite import resolve
 from safe_rl.envs.safety_gym.world.ahead import LayoutsAhead
 from safe_rl.envs.safety_gym.world.building import build_scene
@@ -102,16 +102,13 @@ class SafetyGymEnv(SimulatedEnv):
         )
         self._observer = make_observer(scene)
         self._task = TASKS[self.config.task]
-        low, high = torch.from_numpy(scene.model.actuator_ctrlrange.T.copy())
-        self._control_range = (low, high)
         self._measured = self._task.measure(self._world).detach().clone()
         self._renderer = WorldRenderer(self._world, lidar_blocks(self.config, scene))
         self._costs = active_costs(self.config)
         self.cost_keys = cost_keys(self._costs)
-        specs = make_specs(
-            self.config, self._observer, self._control_range, self.cost_keys, num_envs, self.device
-        )
-        self._announce(specs, seed)
+        observed = observation_spec(self.config, self._observer, num_envs, self.device)
+        highest = 1.0 if self.config.constrain_indicator else torch.finfo(torch.float32).max
+        self._announce(scene.model, observed, highest, seed)
 
     @property
     def object_names(self) -> tuple[str, ...]:
@@ -164,19 +161,13 @@ class SafetyGymEnv(SimulatedEnv):
         start_episodes(self._world, layouts, key, mask)
         self._measured[mask] = self._task.measure(self._world)[mask]
 
-    def _pack(self, outputs: dict[str, Any]) -> TensorDict:
-        """Add the observation and move everything to the device."""
-        flat = self._observer.read(self._world)
-        if self.device.type != "cpu":
-            outputs = {key: value.to(self.device) for key, value in outputs.items()}
-            flat = flat.to(self.device)
-        outputs["observation"] = flat
-        if not self.config.observation_flatten:
-            outputs["observation"] = TensorDict(
-                self._observer.split(flat), batch_size=self.batch_size, device=self.device
-            )
-        # As TorchRL's own environments do: every shape and device is right by construction.
-        return TensorDict._new_unsafe(outputs, batch_size=self.batch_size, device=self.device)
+    def _observe(self) -> Tensor | TensorDict:
+        flat = self._observer.read(self._world).to(self.device)
+        if self.config.observation_flatten:
+            return flat
+        return TensorDict(
+            self._observer.split(flat), batch_size=self.batch_size, device=self.device
+        )
 
     @torch.no_grad()
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -196,10 +187,8 @@ class SafetyGymEnv(SimulatedEnv):
         time_out = world.step_count >= config.num_steps
         terminated = failed if config.continue_goal else failed | met
         truncated = (time_out if stuck is None else time_out | stuck) & ~terminated
-        numbers = torch.cat([reward.unsqueeze(0), costs]).to(torch.float32).unsqueeze(-1)
-        flags = torch.stack([met, terminated | truncated, terminated, truncated]).unsqueeze(-1)
-        names = ("reward", *self.cost_keys, *self.flags)
-        return self._pack(dict(zip(names, (*numbers, *flags), strict=True)))
+        flags = torch.stack([met, terminated | truncated, terminated, truncated])
+        return self._step_output(torch.cat([reward.unsqueeze(0), costs]), flags)
 
     def _advance(self, action: Tensor) -> Tensor:
         """Run the substeps of one step; returns the worlds whose physics failed [N]."""
@@ -282,10 +271,7 @@ class SafetyGymEnv(SimulatedEnv):
             OpenGLError: if OpenGL is missing; the message names the package to install.
             ValueError: for an unknown camera.
         """
-        if isinstance(rows, int):
-            return self._renderer.frames([rows], self._has_cost, camera, width, height)[0]
-        chosen = range(self.batch_size[0]) if rows is None else rows
-        return self._renderer.frames(list(chosen), self._has_cost, camera, width, height)
+        return self._frames(rows, camera, width, height)
 
     def show(self, row: int = 0) -> None:
         """Show one world as it is in MuJoCo's viewer, opened by the first call.

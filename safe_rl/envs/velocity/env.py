@@ -9,6 +9,7 @@ import numpy as np
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
+from torchrl.data import Unbounded
 
 from safe_rl.envs.physics.cpu import BatchPhysics
 from safe_rl.envs.physics.runge_kutta import runge_kutta_substep
@@ -22,7 +23,6 @@ from safe_rl.envs.velocity.observing import Observer
 from safe_rl.envs.velocity.rendering import Camera, RobotRenderer
 from safe_rl.envs.velocity.rewarding import locomotion_reward
 from safe_rl.envs.velocity.robots import ROBOTS
-from safe_rl.envs.velocity.specs import make_velocity_specs
 from safe_rl.envs.velocity.starting import Starts
 from safe_rl.envs.velocity.suite import resolve_velocity
 
@@ -84,17 +84,13 @@ class VelocityEnv(SimulatedEnv):
         self._duration = self._physics.timestep * self.config.frame_skip
         self._observer = Observer(self.config, self._model)
         self._place = PLACES[self._robot.place].reading(self._model, self._physics)
-        low, high = torch.from_numpy(self._model.actuator_ctrlrange.T.copy())
-        self._control_range = (low, high)
         self._last_place = self._place()
         self._observation = torch.zeros(num_envs, self._observer.size)
         self._step_count = torch.zeros(num_envs, dtype=torch.int64)
         self._starts = Starts(self.config, self._model, num_envs)
-        self._renderer = RobotRenderer(self.config)
-        specs = make_velocity_specs(
-            self._observer.size, self._control_range, self.cost_keys, num_envs, self.device
-        )
-        self._announce(specs, seed)
+        self._renderer = RobotRenderer(self.config, self._physics)
+        observed = Unbounded(self._observation.shape, dtype=torch.float32, device=self.device)
+        self._announce(self._model, observed, highest=1.0, seed=seed)
 
     def _begin(self, mask: Tensor) -> None:
         physics, rows = self._physics, mask.nonzero()[:, 0]
@@ -110,13 +106,8 @@ class VelocityEnv(SimulatedEnv):
         self._last_place[rows] = self._place()[rows]
         self._observer.write_start(self._physics, self._observation, rows)
 
-    def _pack(self, outputs: dict[str, Any]) -> TensorDict:
-        """Add a copy of the observation and move everything to the device."""
-        outputs["observation"] = self._observation.clone()
-        if self.device.type != "cpu":
-            outputs = {key: value.to(self.device) for key, value in outputs.items()}
-        # As TorchRL's own environments do: every shape and device is right by construction.
-        return TensorDict._new_unsafe(outputs, batch_size=self.batch_size, device=self.device)
+    def _observe(self) -> Tensor:
+        return self._observation.clone().to(self.device)
 
     @torch.no_grad()
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -127,10 +118,8 @@ class VelocityEnv(SimulatedEnv):
         self._step_count += 1
         truncated = (self._step_count >= self.config.num_steps) & ~terminated
         cost = self._has_cost.to(torch.float64)
-        numbers = torch.stack([reward, cost, cost]).to(torch.float32).unsqueeze(-1)
-        flags = torch.stack([terminated | truncated, terminated, truncated]).unsqueeze(-1)
-        names = ("reward", *self.cost_keys, *self.flags)
-        return self._pack(dict(zip(names, (*numbers, *flags), strict=True)))
+        flags = torch.stack([terminated | truncated, terminated, truncated])
+        return self._step_output(torch.stack([reward, cost, cost]), flags)
 
     def _move(self, control: Tensor) -> tuple[Tensor, Tensor]:
         """Take one step; returns reward and termination, float64 and bool [N]."""
@@ -201,8 +190,4 @@ class VelocityEnv(SimulatedEnv):
             OpenGLError: if OpenGL is missing; the message names the package to install.
             ValueError: for an unknown camera.
         """
-        everyone = list(range(self.batch_size[0]))
-        chosen = [rows] if isinstance(rows, int) else everyone if rows is None else list(rows)
-        cost = self._has_cost.numpy()
-        frames = self._renderer.frames(self._physics, chosen, cost, camera, width, height)
-        return frames[0] if isinstance(rows, int) else frames
+        return self._frames(rows, camera, width, height)

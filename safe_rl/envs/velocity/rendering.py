@@ -6,6 +6,7 @@ from typing import TypeAlias
 
 import mujoco
 import numpy as np
+from torch import Tensor
 
 from safe_rl.envs.errors import nearest
 from safe_rl.envs.opengl import open_renderer
@@ -26,26 +27,20 @@ class RobotRenderer:
 
     Args:
         config: the environment.
+        physics: the robots, drawn as they are at the time.
     """
 
-    def __init__(self, config: VelocityConfig) -> None:
-        self._config = config
+    def __init__(self, config: VelocityConfig, physics: Physics) -> None:
+        self._config, self._physics = config, physics
         self._renderers: dict[tuple[int, int], mujoco.Renderer] = {}
         self._model: mujoco.MjModel | None = None
 
     def frames(
-        self,
-        physics: Physics,
-        rows: list[int],
-        has_cost: np.ndarray,
-        camera: Camera,
-        width: int,
-        height: int,
+        self, rows: list[int], has_cost: Tensor, camera: Camera, width: int, height: int
     ) -> np.ndarray:
         """Draw some robots as they are now.
 
         Args:
-            physics: all of them.
             rows: which, R of them.
             has_cost: which of all incurred a cost in the last step, bool [N].
             camera: "free" (beside the robot and moving with it), a name in the model, or a camera
@@ -67,7 +62,7 @@ class RobotRenderer:
         renderer, data = self._renderers[width, height], mujoco.MjData(model)
         frames = np.empty((len(rows), height, width, 3), dtype=np.uint8)
         for frame, row in zip(frames, rows, strict=True):
-            data.qpos[:] = physics.qpos[row].numpy()
+            data.qpos[:] = self._physics.qpos[row].numpy()
             mujoco.mj_kinematics(model, data)
             mujoco.mj_comPos(model, data)
             mujoco.mj_camlight(model, data)
