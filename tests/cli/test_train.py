@@ -8,8 +8,9 @@ from pathlib import Path
 import gymnasium
 import numpy as np
 import pytest
+from commands import status_of
 
-from safe_rl.cli import certificates, train
+from safe_rl.cli import certificates
 from safe_rl.runs.table import read_table
 
 ROOT = Path(__file__).parents[2]
@@ -21,15 +22,7 @@ def command(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     monkeypatch.delenv("HYDRA_FULL_ERROR", raising=False)
 
-    def run(*arguments):
-        monkeypatch.setattr(sys, "argv", ["train.py", *arguments])
-        try:
-            status = train.main()
-        except SystemExit as end:
-            status = end.code
-        return status, *capsys.readouterr()
-
-    return run
+    return lambda *arguments: (status_of(*arguments), *capsys.readouterr())
 
 
 def test_tab_completion_can_be_installed(command):

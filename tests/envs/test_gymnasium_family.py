@@ -4,7 +4,6 @@ import json
 import os
 import signal
 import subprocess
-import sys
 from functools import partial
 from pathlib import Path
 
@@ -13,9 +12,10 @@ import gymnasium_envs  # noqa: F401, registers Walk-v0
 import pytest
 import torch
 import yaml
+from commands import run_train
 from torchrl.envs.utils import check_env_specs
 
-from safe_rl.cli import evaluate, report, train
+from safe_rl.cli import evaluate, report
 from safe_rl.collectors.shares import share_rows
 from safe_rl.envs import ConfigError, complete_env, make_env
 from safe_rl.runs.table import read_table
@@ -31,15 +31,6 @@ SMALL = (
     *("policy_update.minibatch_size=50", "critic_update.minibatch_size=50"),
     "cost_limits={fast: 3}",
 )
-
-
-def run_train(*arguments: str) -> None:
-    """What `python train.py …` does, in this process."""
-    before = sys.argv
-    try:
-        assert train.main(arguments) == 0
-    finally:
-        sys.argv = before
 
 
 @pytest.fixture(scope="module")

@@ -14,9 +14,10 @@ import gymnasium
 import pytest
 import torch
 import yaml
+from commands import run_train
 from torchrl.envs.utils import check_env_specs
 
-from safe_rl.cli import evaluate, report, train
+from safe_rl.cli import evaluate, report
 from safe_rl.envs import ConfigError, complete_env, make_env
 from safe_rl.envs.safety_gymnasium import from_six_values
 from safe_rl.runs.table import read_table
@@ -55,15 +56,6 @@ def elsewhere(monkeypatch):
     """The stand-in in another Python: this one, in a process that finds it."""
     monkeypatch.setenv("PYTHONPATH", STAND_IN)
     monkeypatch.setenv("SAFETY_GYMNASIUM_PYTHON", sys.executable)
-
-
-def run_train(*arguments: str) -> None:
-    """What `python train.py …` does, in this process."""
-    before = sys.argv
-    try:
-        assert train.main(arguments) == 0
-    finally:
-        sys.argv = before
 
 
 def rollout(env, steps=40):

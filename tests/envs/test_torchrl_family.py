@@ -2,7 +2,6 @@
 
 import json
 import shutil
-import sys
 from pathlib import Path
 
 import gymnasium
@@ -11,12 +10,13 @@ import pytest
 import torch
 import torchrl_envs
 import yaml
+from commands import run_train
 from torchrl.data import Unbounded
 from torchrl.envs import PendulumEnv
 from torchrl.envs.utils import check_env_specs
 
 from safe_rl import targets
-from safe_rl.cli import evaluate, report, train
+from safe_rl.cli import evaluate, report
 from safe_rl.collectors.shares import share_rows
 from safe_rl.envs import ConfigError, complete_env, make_env
 from safe_rl.envs.torchrl.nodes import ROWS
@@ -39,15 +39,6 @@ SMALL = (
 def trusted(monkeypatch):
     """As after `import=torchrl_envs`."""
     monkeypatch.setattr(targets, "_users_modules", {"torchrl_envs"})
-
-
-def run_train(*arguments: str) -> None:
-    """What `python train.py …` does, in this process."""
-    before = sys.argv
-    try:
-        assert train.main(arguments) == 0
-    finally:
-        sys.argv = before
 
 
 @pytest.fixture(scope="module")

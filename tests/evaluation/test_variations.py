@@ -2,18 +2,17 @@
 
 import csv
 import shutil
-import sys
 from pathlib import Path
 
 import gymnasium_envs  # noqa: F401, registers Walk-v0
 import numpy as np
 import pytest
 import yaml
+from commands import run_train
 from omegaconf import OmegaConf
 from PIL import Image
 
 import safe_rl
-from safe_rl.cli import train
 from safe_rl.cli.composing import check_command
 from safe_rl.cli.conf import CONF
 from safe_rl.cli.evaluate import evaluate_run, main
@@ -127,14 +126,10 @@ def test_a_factor_changes_the_runs_own_value(run):
 
 def test_what_sets_ask_for_in_vain_is_left_out(tmp_path, capsys):
     folder = tmp_path / "walk"
-    before = sys.argv
     small = [f"{key}={value}" for key, value in SMALL.items()]
     env = ("env=gymnasium", "env.id=Walk-v0", "env.cost_keys=[fast]", "cost_limits={fast: 3}")
     widths = ("model.hidden_sizes=[8]", f"hydra.run.dir={folder}", "certificate.episodes=0")
-    try:
-        assert train.main([*env, *small, *widths]) == 0
-    finally:
-        sys.argv = before
+    run_train(*env, *small, *widths)
     assert main([str(folder), "variations=[dynamics,sensing]", "episodes=3", "num_envs=3"]) == 0
     found = rows_of(folder)
     assert [name.split()[0] for name in found] == ["as", *["noise"] * 4, *["delay"] * 4]

@@ -1,14 +1,14 @@
 """Environments whose actions are choices, from the command line."""
 
 import json
-import sys
 
 import gymnasium_envs  # noqa: F401, registers Cliff-v0 and Boxes-v0
 import pytest
 import torch
 import yaml
+from commands import run_train
 
-from safe_rl.cli import evaluate, train
+from safe_rl.cli import evaluate
 from safe_rl.envs import ConfigError, make_env
 from safe_rl.runs.table import read_table
 
@@ -18,15 +18,6 @@ SMALL = (
 )
 CART_POLE = ("env.id=CartPole-v1", "env.outside={cost_position: [0, -0.05, 0.05]}")
 MINIBATCHES = "policy_update.minibatch_size=50"
-
-
-def run_train(*arguments):
-    """What `python train.py …` does, in this process."""
-    before = sys.argv
-    try:
-        assert train.main(arguments) == 0
-    finally:
-        sys.argv = before
 
 
 @pytest.mark.parametrize(

@@ -1,16 +1,16 @@
 """Networks by configuration, from the command line: trained, resumed exactly, evaluated."""
 
 import json
-import sys
 
 import gymnasium_envs  # noqa: F401, registers Recall-v0
 import pytest
 import torch
+from commands import run_train
 from point_mass import PointMass  # noqa: F401
 from run_configs import compose_config, without_times
 
 from safe_rl.algorithms.parts import find_recipe
-from safe_rl.cli import evaluate, train
+from safe_rl.cli import evaluate
 from safe_rl.collectors import read_dataset
 from safe_rl.envs import make_env
 from safe_rl.runs.table import read_table
@@ -31,15 +31,6 @@ CHOICES = {
     "memory": ("model=gru", "model.memory.size=4", "model.normalise=10", *PPO),
     "memory_cpo": ("model=gru", "model.memory.size=4", "algo=cpo"),
 }
-
-
-def run_train(*arguments):
-    """What `python train.py …` does, in this process."""
-    before = sys.argv
-    try:
-        assert train.main(arguments) == 0
-    finally:
-        sys.argv = before
 
 
 @pytest.mark.parametrize("kind", CHOICES)

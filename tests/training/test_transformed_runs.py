@@ -6,10 +6,11 @@ from pathlib import Path
 
 import pytest
 import torch
+from commands import status_of
 from point_mass import PointMass
 from run_configs import point_mass_config, without_times
 
-from safe_rl.cli import evaluate, train
+from safe_rl.cli import evaluate
 from safe_rl.cli.evaluate import EvaluationOptions, evaluate_run
 from safe_rl.envs.transforms import transform_env
 from safe_rl.evaluation.loading import transforms_of
@@ -90,15 +91,7 @@ def command(tmp_path, monkeypatch, capsys):
     monkeypatch.delitem(sys.modules, "test_transforms_filters")
     monkeypatch.syspath_prepend(str(tmp_path))
 
-    def run(*arguments):
-        monkeypatch.setattr(sys, "argv", ["train.py", *arguments])
-        try:
-            status = train.main()
-        except SystemExit as end:
-            status = end.code
-        return status, *capsys.readouterr()
-
-    return run
+    return lambda *arguments: (status_of(*arguments), *capsys.readouterr())
 
 
 @pytest.mark.parametrize(
