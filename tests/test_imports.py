@@ -27,7 +27,7 @@ PARTS = {
     "algorithms": ("collectors", "models", "naming", "objectives", "targets"),
     "runs": ("algorithms", "extras", "targets"),
     "training": ("algorithms", "collectors", "runs", "targets"),
-    "scores": ("extras",),
+    "scores": (),
     "evaluation": (
         *("algorithms", "collectors", "extras", "lazy", "models", "naming", "runs", "scores"),
     ),

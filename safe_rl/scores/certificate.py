@@ -13,6 +13,7 @@ from dataclasses import dataclass, field
 from statistics import NormalDist
 
 import numpy as np
+import scipy  # which loads its parts when they are asked for: half a second
 from numpy.typing import ArrayLike
 
 __all__ = ["Claim", "Verdict", "first_certified", "mean_bound", "rank", "share_bound"]
@@ -44,8 +45,6 @@ def mean_bound(values: ArrayLike, level: float, largest: float = math.inf) -> np
         >>> float(mean_bound([0.0] * 59, level=0.95, largest=100.0).round(1))  # 5 % may cost 100
         5.0
     """
-    from scipy import stats  # here: it takes half a second, and not every command needs it
-
     values = np.asarray(values, dtype=float)
     values = np.where(np.isfinite(values), values, np.nan)
     number = values.shape[-1]
@@ -54,7 +53,7 @@ def mean_bound(values: ArrayLike, level: float, largest: float = math.inf) -> np
     mean, spread = values.mean(-1), values.std(-1, ddof=1)
     cubes = ((values - mean[..., np.newaxis]) ** 3).mean(-1)
     sample = np.divide(cubes, spread**3, out=np.zeros_like(mean), where=spread > 0)
-    quantile = stats.t.ppf(level, number - 1)
+    quantile = scipy.stats.t.ppf(level, number - 1)
     correction = 2 * sample.clip(0) * (1 + 2 * quantile**2) / (6 * np.sqrt(number))
     bound = mean + (quantile + correction) * spread / np.sqrt(number)
     others = share_bound(np.zeros(number), 0.0, level)
@@ -78,13 +77,11 @@ def share_bound(values: ArrayLike, limit: float, level: float) -> float:
         >>> round(share_bound([1.0] * 59, limit=2.0, level=0.95), 3)  # none of 59: below 5 %
         0.05
     """
-    from scipy import stats
-
     values = np.asarray(values, dtype=float)
     over, number = int((~(values <= limit)).sum()), len(values)
     if over == number:
         return 1.0
-    return float(stats.beta.ppf(level, over + 1, number - over))
+    return float(scipy.stats.beta.ppf(level, over + 1, number - over))
 
 
 @dataclass(frozen=True)

@@ -11,9 +11,8 @@ from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
+import scipy  # which loads its parts when they are asked for: half a second
 from numpy.typing import ArrayLike
-
-from safe_rl.extras import import_extra
 
 __all__ = [
     *("LEVEL", "Estimate", "bootstrap", "check_share", "cvar", "interquartile_mean", "mean"),
@@ -68,7 +67,7 @@ def bootstrap(
     if max(sample.shape[-1] for sample in samples) < 2:
         shape = np.shape(statistic(*samples, axis=-1))
         return np.full(shape, math.nan), np.full(shape, math.nan)
-    result = import_extra("scipy.stats", "report").bootstrap(
+    result = scipy.stats.bootstrap(
         [sample for sample in samples if sample.shape[-1] > 1],
         _with_constants(samples, statistic),
         n_resamples=NUM_RESAMPLES,
@@ -129,8 +128,7 @@ def interquartile_mean(strata: Sequence[ArrayLike]) -> Estimate:
 
 
 def _trimmed_mean(*samples: np.ndarray, axis: int = -1) -> np.ndarray:
-    stats = import_extra("scipy.stats", "report")
-    return stats.trim_mean(np.concatenate(samples, axis=axis), 0.25, axis=axis)
+    return scipy.stats.trim_mean(np.concatenate(samples, axis=axis), 0.25, axis=axis)
 
 
 def cvar(values: ArrayLike, alpha: float) -> Estimate:
@@ -172,6 +170,6 @@ def share_over(values: ArrayLike, limit: float) -> Estimate:
     """Share of values above a limit, with Wilson's interval of a proportion."""
     values = np.asarray(values, dtype=float)
     over = int((values > limit).sum())
-    test = import_extra("scipy.stats", "report").binomtest(over, len(values))
+    test = scipy.stats.binomtest(over, len(values))
     interval = test.proportion_ci(LEVEL, method="wilson")
     return Estimate(over / len(values), float(interval.low), float(interval.high))
