@@ -8,7 +8,6 @@ from collections.abc import Collection, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from hydra.errors import InstantiationException
 from omegaconf.errors import OmegaConfBaseException
 from torchrl.checkpoint import CheckpointError
 
@@ -18,7 +17,7 @@ from safe_rl.runs.folder import RunFolder
 __all__ = ["SETTING_ERRORS", "errors_in_a_line"]
 
 SETTING_ERRORS: Collection[type[Exception]] = (
-    *(ValueError, CheckpointError, InstantiationException, OmegaConfBaseException, OSError),
+    *(ValueError, CheckpointError, OmegaConfBaseException, OSError),
     *(ModuleNotFoundError, ContractError),
 )
 """What goes wrong for the sake of settings and files while a run is built."""
@@ -43,15 +42,4 @@ def errors_in_a_line(directory: Path, is_new: bool, *errors: type[Exception]) ->
             raise
         if is_new and directory.is_dir() and RunFolder(directory).is_untouched:
             shutil.rmtree(directory)
-        raise SystemExit(_in_words(error)) from None
-
-
-def _in_words(error: Exception) -> str:
-    """A component's own words, and the key of the component, in one line."""
-    cause = error.__cause__
-    words = str(error)
-    if isinstance(error, InstantiationException) and cause is not None:
-        key = str(error).rpartition("full_key: ")[2]
-        words = str(cause) if isinstance(cause, ValueError) else f"{type(cause).__name__}: {cause}"
-        words = f"{key}: {words}"
-    return " ".join(words.split())
+        raise SystemExit(" ".join(str(error).split())) from None
