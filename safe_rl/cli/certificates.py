@@ -25,18 +25,13 @@ __all__ = [
 
 
 def certify_run(
-    directory: Path,
-    *,
-    num_threads: int = 0,
-    progress: bool = True,
-    changes: Mapping[str, Any] | None = None,
+    directory: Path, *, num_threads: int = 0, changes: Mapping[str, Any] | None = None
 ) -> Certificate | None:
     """:func:`safe_rl.evaluation.certify` with the options of the run's own configuration.
 
     Args:
         directory: Folder of the run.
         num_threads: Threads that step environments; 0 is one per core.
-        progress: Whether to show a bar.
         changes: Options to replace, such as ``{"episodes": 2000}``.
 
     Raises:
@@ -47,7 +42,7 @@ def certify_run(
         certificate_options(load_config(directory), changes or {}),
         make_env=maker_of(directory),
         num_threads=num_threads,
-        progress=progress,
+        progress=True,
     )
     RunFolder(directory).certifying.unlink(missing_ok=True)
     return certificate

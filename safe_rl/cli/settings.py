@@ -24,18 +24,8 @@ __all__ = ["SettingError", "check_settings", "optional_keys", "plain"]
 
 _MISSING = object()
 _SECTIONS = (
-    *(
-        "algo",
-        "certificate",
-        "checkpoint",
-        "collector",
-        "critics",
-        "dataset",
-        "evaluation",
-        "exploration",
-        "logger",
-        "model",
-    ),
+    *("algo", "certificate", "checkpoint", "collector", "critics", "dataset", "evaluation"),
+    *("exploration", "logger", "model"),
 )
 
 

@@ -15,7 +15,6 @@ from safe_rl.runs.files import replacing
 
 __all__ = ["code_of", "commit_of", "note_code"]
 
-_PACKAGE = "safe_rl"
 # not to be taken for another checkout's by what a hook has set, nor to write into anybody's index
 _CLEARED = ("GIT_DIR", "GIT_WORK_TREE", "GIT_INDEX_FILE")
 _PATIENCE = 5.0  # seconds
@@ -38,7 +37,7 @@ def note_code(path: Path, steps: int) -> None:
 
 
 @cache
-def code_of(package: str = _PACKAGE) -> Mapping[str, Any]:
+def code_of() -> Mapping[str, Any]:
     """What this process has imported: ``version``, ``commit`` and ``changed``.
 
     The last two are None if the package stands in no checkout, or Git is missing.
@@ -47,7 +46,7 @@ def code_of(package: str = _PACKAGE) -> Mapping[str, Any]:
         >>> sorted(code_of())
         ['changed', 'commit', 'version']
     """
-    module = import_module(package)
+    module = import_module("safe_rl")
     commit, changed = commit_of(Path(str(module.__file__)))
     return {"version": module.__version__, "commit": commit, "changed": changed}
 
