@@ -168,7 +168,7 @@ FLOORS = {
         ("",),
     ),
     "training": (
-        ("candidates", "evaluating", "interrupts", "state", "threads", "transfer"),
+        ("candidates", "interrupts", "state", "transfer"),
         ("trainer",),
         ("building",),
         ("",),

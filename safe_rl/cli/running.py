@@ -34,8 +34,7 @@ from safe_rl.evaluation.loading import transforms_of
 from safe_rl.runs.folder import RunFolder
 from safe_rl.runs.lock import held
 from safe_rl.runs.resuming import is_finished, may_continue
-from safe_rl.training.building import build_trainer, seed_everything
-from safe_rl.training.threads import physics_threads
+from safe_rl.training.building import build_trainer, physics_threads, seed_everything
 from safe_rl.training.trainer import Trainer
 from safe_rl.training.transfer import begin_from
 

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import os
+from collections.abc import Callable
 from pathlib import Path
 
 import torch
 from omegaconf import DictConfig
+from tensordict.nn import TensorDictModuleBase
 from torchrl.collectors import Collector
 from torchrl.envs import EnvBase
 
@@ -16,10 +19,20 @@ from safe_rl.collectors import Recording, WorkerCollector, make_collector
 from safe_rl.collectors.shares import MakeEnv
 from safe_rl.runs.record import RunRecord
 from safe_rl.targets import build
-from safe_rl.training.evaluating import MakeEvaluation
-from safe_rl.training.trainer import Trainer
+from safe_rl.training.trainer import Evaluation, Trainer
 
-__all__ = ["build_trainer", "seed_everything"]
+__all__ = ["build_trainer", "physics_threads", "seed_everything"]
+
+MakeEvaluation = Callable[[TensorDictModuleBase], Evaluation]
+"""Makes an evaluation of a policy that goes on learning."""
+
+
+def physics_threads(config: DictConfig) -> int:
+    """Threads that step each environment; 0 is one per core. Workers share them."""
+    num_collectors = config.collector.num_collectors
+    if num_collectors == 1:
+        return config.num_threads or 0
+    return max(1, (config.num_threads or os.cpu_count() or 1) // num_collectors)
 
 
 def seed_everything(seed: int, num_threads: int | None) -> None:

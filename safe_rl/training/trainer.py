@@ -6,6 +6,7 @@ import time
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from signal import Signals
+from typing import Protocol
 
 import torch
 from omegaconf import DictConfig
@@ -22,15 +23,22 @@ from safe_rl.runs.checkpoints import CheckpointStore
 from safe_rl.runs.lock import held
 from safe_rl.runs.record import RunRecord
 from safe_rl.training.candidates import Candidates, Judged, epochs_until_judged
-from safe_rl.training.evaluating import Evaluation
 from safe_rl.training.interrupts import StopRequest
 from safe_rl.training.state import Progress, WorldSnapshot
 
-__all__ = ["Trainer"]
+__all__ = ["Evaluation", "Trainer"]
 
 # what only going on takes, which the last checkpoints have: several times what a policy is, and a
 # memory fills gigabytes
 _TO_GO_ON = {"memory", "policy_update", "critic_update", "env", "accounting", "rng"}
+
+
+class Evaluation(Protocol):
+    """What evaluates a policy while it is trained."""
+
+    def __call__(self, before: int, after: int) -> dict[str, float]:
+        """Columns after an epoch, between two numbers of steps: the same at every call."""
+        ...
 
 
 class Trainer:
