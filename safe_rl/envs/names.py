@@ -5,8 +5,8 @@ Nothing here builds an environment, so that names and keys are known without imp
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Mapping
-from typing import Any, NamedTuple
+from collections.abc import Callable, Mapping
+from typing import Any
 
 from hydra.core.config_store import ConfigStore
 from omegaconf import OmegaConf
@@ -26,17 +26,11 @@ GROUP = "env"
 """Of configurations, in Hydra."""
 
 
-class Named(NamedTuple):
-    """Names of a family, and the node that each of them stands for."""
-
-    names: Callable[[], Collection[str]]
-    node: Callable[[str], dict[str, Any]]
-
-
-NAMED = [
-    Named(lambda: [*SUITE, *EXTRAS], safety_gym_node),
-    Named(lambda: list(VELOCITY_SUITE), velocity_node),
-]
+# What makes the node of a name.
+_NODES: dict[str, Callable[[str], dict[str, Any]]] = {
+    **dict.fromkeys([*SUITE, *EXTRAS], safety_gym_node),
+    **dict.fromkeys(VELOCITY_SUITE, velocity_node),
+}
 
 # What fills a family's nodes up; others are taken as they are.
 _COMPLETE: dict[str | None, Callable[[Mapping[str, Any]], dict[str, Any]]] = {
@@ -50,7 +44,7 @@ _COMPLETE: dict[str | None, Callable[[Mapping[str, Any]], dict[str, Any]]] = {
 
 def env_names() -> list[str]:
     """Names that stand for an environment of any family."""
-    return [name for family in NAMED for name in family.names()]
+    return list(_NODES)
 
 
 def stored_node(name: str) -> dict[str, Any] | None:
@@ -90,10 +84,7 @@ def env_node(name: str) -> dict[str, Any]:
         >>> env_node("CarPush2")["pillars_num"]
         4
     """
-    for family in NAMED:
-        if name in family.names():
-            return family.node(name)
-    raise KeyError(name)
+    return _NODES[name](name)
 
 
 def complete_env(node: Mapping[str, Any]) -> dict[str, Any]:
