@@ -57,7 +57,7 @@ class Served:
         make = safety_gymnasium.make
         self._envs = [make(header["id"], **kwargs) for _ in range(header["num_envs"])]
         self._kinds: list[str] = []
-        self._num_steps = header["num_steps"] or _length(self._envs[0])
+        self._num_steps = header["num_steps"] or episode_length(self._envs[0])
 
     def describe(self) -> tuple[dict[str, Any], dict[str, Any]]:
         """Spaces, length of episodes and kinds of costs; these are found by taking a step."""
@@ -102,8 +102,8 @@ class Served:
         return np.array(rows, np.float32).reshape(len(rows), self._spaces.flatdim(space))
 
 
-def _length(env: Any) -> int | None:
-    """What is registered, or what the innermost environment says."""
+def episode_length(env: Any) -> int | None:
+    """Return what is registered, or what the innermost environment says of its episodes."""
     spec = getattr(env, "spec", None)
     return getattr(spec, "max_episode_steps", None) or getattr(env.unwrapped, "num_steps", None)
 

@@ -9,6 +9,7 @@ import gymnasium
 
 from safe_rl.envs.errors import ConfigError
 from safe_rl.envs.safety_gymnasium.other_python import Server, open_server
+from safe_rl.envs.safety_gymnasium.serve import episode_length
 from safe_rl.envs.safety_gymnasium.six_values import SixValues, kinds_of
 from safe_rl.envs.safety_gymnasium.where import missing, other_python
 
@@ -76,9 +77,3 @@ def probe_kinds(env: gymnasium.Env) -> list[str]:
         return kinds_of(env.step(env.action_space.sample())[-1])
     finally:
         env.close()
-
-
-def episode_length(env: Any) -> int | None:
-    """Return what is registered, or what the innermost environment says of its episodes."""
-    registered = getattr(getattr(env, "spec", None), "max_episode_steps", None)
-    return registered or getattr(env.unwrapped, "num_steps", None)

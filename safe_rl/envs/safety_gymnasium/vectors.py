@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 from gymnasium.spaces import Box, Discrete, MultiDiscrete
-from gymnasium.vector import AutoresetMode, VectorEnv
+from gymnasium.vector import AutoresetMode, VectorEnv, VectorWrapper
 from gymnasium.vector.utils import batch_space
 
 from safe_rl.envs.costs import COST
@@ -86,7 +86,7 @@ class DeferredResets(VectorEnv):
         self.env.close()
 
 
-class PlainVectorEnv(VectorEnv):
+class PlainVectorEnv(VectorWrapper):
     """A batch as networks take it: one float32 vector is observed, actions are in [-1, 1].
 
     They are cut to that and stretched to the bounds; choices stay as they are.
@@ -108,12 +108,11 @@ class PlainVectorEnv(VectorEnv):
             actions = Box(-1.0, 1.0, actions.shape, np.float32)
         elif not isinstance(actions, Discrete | MultiDiscrete):
             raise ValueError(f"Actions must be continuous and bounded, or choices, got {actions}.")
-        self.env, self.num_envs = env, env.num_envs
+        super().__init__(env)
         self.single_observation_space = Box(-np.inf, np.inf, (int(np.prod(seen.shape)),))
         self.single_action_space = actions
         self.observation_space = batch_space(self.single_observation_space, env.num_envs)
         self.action_space = batch_space(actions, env.num_envs)
-        self.metadata, self.render_mode = env.metadata, env.render_mode
         self.autoreset_mode = AutoresetMode.DISABLED
 
     def reset(self, **kwargs: Any) -> tuple[np.ndarray, dict[str, Any]]:
@@ -130,14 +129,6 @@ class PlainVectorEnv(VectorEnv):
             actions = low + (np.clip(actions, -1, 1) + 1) / 2 * (high - low)
         observation, *others = self.env.step(actions)
         return self._vector(observation), *others
-
-    def render(self) -> tuple[Any, ...] | None:
-        """Return a frame of every environment, where they draw."""
-        return self.env.render()
-
-    def close_extras(self, **kwargs: Any) -> None:
-        """Close the batch."""
-        self.env.close()
 
     def _vector(self, observation: np.ndarray) -> np.ndarray:
         return np.asarray(observation, np.float32).reshape(self.num_envs, -1)
