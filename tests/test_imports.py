@@ -140,7 +140,7 @@ FLOORS = {
     "models": (
         ("activations", "distributions", "memory", "normalising", "scaling"),
         ("heads",),
-        ("networks", "q_networks"),
+        ("bounded_actors", "networks", "q_networks"),
         ("behaviour", "encoders"),
         ("exploring",),
         ("building",),

@@ -45,8 +45,8 @@ class GatedMemory(TensorDictModuleBase):
         self.recurrent = GRUModule(
             num_features,
             size,
-            in_keys=[FEATURES, MEMORY, FIRST],
-            out_keys=[FEATURES, ("next", MEMORY)],
+            in_keys=self.in_keys,
+            out_keys=self.out_keys,
             device=device,
         )
 

@@ -10,6 +10,8 @@ from torch import Tensor, nn
 
 __all__ = ["RunningScale", "take_in"]
 
+_CONSTANT = 1e-12  # variance up to which a column never changes
+
 
 class RunningScale(nn.Module):
     """Subtract a running mean and divide by a running standard deviation, cut at ±``clip``.
@@ -52,7 +54,7 @@ class RunningScale(nn.Module):
     def forward(self, inputs: Tensor) -> Tensor:
         """Normalise ``inputs``, shape [..., n]."""
         variance = self.squares / self.count.clamp_min(1)
-        # a column that never changes is left in its unit
+        # what never changes is left in its unit
         width = torch.where(variance > _CONSTANT, variance.sqrt(), 1.0)
         normalised = (inputs - self.mean.to(inputs)) / width.to(inputs)
         return normalised.clamp(-self.clip, self.clip)
@@ -68,9 +70,6 @@ class RunningScale(nn.Module):
         self.squares += shift.square() * (self.count * number / total)
         self.mean += shift * (number / total)
         self.count.copy_(total)
-
-
-_CONSTANT = 1e-12
 
 
 def take_in(networks: Iterable[nn.Module], batch: TensorDictBase) -> None:

@@ -1,4 +1,4 @@
-"""Networks of algorithms that learn from memory: ensembles of Q functions, and bounded actors."""
+"""Ensembles of Q functions, of algorithms that learn from memory."""
 
 from __future__ import annotations
 
@@ -7,22 +7,12 @@ from itertools import pairwise
 
 import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase
-from tensordict.nn import (
-    ProbabilisticTensorDictModule,
-    ProbabilisticTensorDictSequential,
-    TensorDictModule,
-    TensorDictModuleBase,
-)
+from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
-from torchrl.envs.utils import ExplorationType
-from torchrl.modules import MLP, NormalParamExtractor
 
-from safe_rl.models.distributions import SquashedNormal
 from safe_rl.models.scaling import InputScale
 
-__all__ = ["EnsembleMLP", "QEnsemble", "make_bounded_actor", "make_squashed_actor"]
-
-_SCALE_FLOOR = 1e-3
+__all__ = ["EnsembleMLP", "QEnsemble"]
 
 
 class EnsembleMLP(nn.Module):
@@ -129,122 +119,3 @@ class QEnsemble(TensorDictModuleBase):
         given = None if params is None else params.get("network")
         values = self.network(torch.cat([self.scale(observation), action], -1), given)
         return TensorDict({self.out_keys[0]: values}, batch_size=values.shape[:-1])
-
-
-def _perceptron(
-    sizes: tuple[int, int],
-    hidden_sizes: Sequence[int],
-    input_scale: Tensor | None,
-    device: torch.device | None,
-) -> list[nn.Module]:
-    perceptron = MLP(
-        *sizes,
-        num_cells=list(hidden_sizes),
-        activation_class=nn.ReLU,
-        activation_kwargs={"inplace": True},
-        device=device,
-    )
-    scaling = [] if input_scale is None else [InputScale(input_scale.to(device))]
-    return [*scaling, perceptron]
-
-
-def make_squashed_actor(
-    observation_size: int,
-    low: Tensor,
-    high: Tensor,
-    *,
-    hidden_sizes: Sequence[int],
-    input_scale: Tensor | None = None,
-    device: torch.device | None = None,
-    in_key: NestedKey = "observation",
-    action_key: NestedKey = "action",
-) -> ProbabilisticTensorDictSequential:
-    """Build a policy whose actions are the tanh of a Gaussian, within bounds (SAC's).
-
-    Args:
-        observation_size: Length of the flat observation.
-        low: Lower bounds of the action, [A].
-        high: Upper bounds of the action, [A].
-        hidden_sizes: Width of every hidden layer.
-        input_scale: Fixed factors of the observation, or None.
-        device: Device of the parameters.
-        in_key: Key of the observation.
-        action_key: Key of the action.
-
-    Examples:
-        >>> bounds = -torch.ones(2), torch.ones(2)
-        >>> actor = make_squashed_actor(3, *bounds, hidden_sizes=[8])
-        >>> actor(TensorDict({"observation": torch.zeros(5, 3)}, [5]))["action"].abs().max() < 1
-        tensor(True)
-    """
-    layers = _perceptron((observation_size, 2 * len(low)), hidden_sizes, input_scale, device)
-    extractor = NormalParamExtractor("biased_softplus_1.0", scale_lb=_SCALE_FLOOR)
-    return ProbabilisticTensorDictSequential(
-        _GaussianParameters(nn.Sequential(*layers, extractor), in_key),
-        ProbabilisticTensorDictModule(
-            in_keys=["loc", "scale"],
-            out_keys=[action_key],
-            distribution_class=SquashedNormal,
-            distribution_kwargs={"low": low.to(device), "high": high.to(device)},
-            return_log_prob=True,
-            log_prob_key="action_log_prob",
-            default_interaction_type=ExplorationType.RANDOM,
-        ),
-    )
-
-
-def make_bounded_actor(
-    observation_size: int,
-    low: Tensor,
-    high: Tensor,
-    *,
-    hidden_sizes: Sequence[int],
-    input_scale: Tensor | None = None,
-    device: torch.device | None = None,
-    in_key: NestedKey = "observation",
-    action_key: NestedKey = "action",
-) -> TensorDictModule:
-    """Build a deterministic policy whose actions are the tanh of a network, within bounds (TD3's).
-
-    Arguments are those of :func:`make_squashed_actor`.
-
-    Examples:
-        >>> actor = make_bounded_actor(3, torch.zeros(1), torch.ones(1), hidden_sizes=[8])
-        >>> action = actor(TensorDict({"observation": torch.randn(5, 3)}, [5]))["action"]
-        >>> bool(((action > 0) & (action < 1)).all())
-        True
-    """
-    layers = _perceptron((observation_size, len(low)), hidden_sizes, input_scale, device)
-    squash = _Squash(low, high, device)
-    return TensorDictModule(nn.Sequential(*layers, squash), in_keys=[in_key], out_keys=[action_key])
-
-
-class _GaussianParameters(TensorDictModuleBase):
-    """Writes ``loc`` and ``scale``: a `TensorDictModule` in a fifth of its time."""
-
-    def __init__(self, module: nn.Module, in_key: NestedKey) -> None:
-        super().__init__()
-        self.module = module
-        self.in_keys, self.out_keys = [in_key], ["loc", "scale"]
-
-    def forward(
-        self, tensordict: TensorDictBase, tensordict_out: TensorDictBase | None = None
-    ) -> TensorDictBase:
-        loc, scale = self.module(tensordict.get(self.in_keys[0]))
-        written = tensordict if tensordict_out is None else tensordict_out
-        return written.set("loc", loc).set("scale", scale)
-
-
-class _Squash(nn.Module):
-    """The tanh of the input, stretched to bounds."""
-
-    low: Tensor
-    reach: Tensor
-
-    def __init__(self, low: Tensor, high: Tensor, device: torch.device | None) -> None:
-        super().__init__()
-        self.register_buffer("low", low.to(device), persistent=False)
-        self.register_buffer("reach", (high - low).to(device) / 2, persistent=False)
-
-    def forward(self, inputs: Tensor) -> Tensor:
-        return self.low + self.reach * (1 + inputs.tanh())
