@@ -94,8 +94,9 @@ class Recording:
 
     def _store(self, number: int, steps: TensorDictBase) -> None:
         place = self._place(number)
+        self.folder.mkdir(parents=True, exist_ok=True)
         # whole or not at all: a run may end at any moment
-        with tempfile.TemporaryDirectory(prefix=".", dir=_made(self.folder)) as unfinished:
+        with tempfile.TemporaryDirectory(prefix=".", dir=self.folder) as unfinished:
             written = Path(unfinished) / place.name
             steps.memmap(str(written), copy_existing=True)
             if place.exists():
@@ -170,8 +171,3 @@ def read_recording(folder: Path | str) -> TensorDict:
 def _pieces(folder: Path) -> list[Path]:
     """Folders of the batches, in order of their numbers."""
     return sorted(path for path in folder.glob("[0-9]*") if path.is_dir())
-
-
-def _made(folder: Path) -> Path:
-    folder.mkdir(parents=True, exist_ok=True)
-    return folder

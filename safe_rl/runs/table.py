@@ -80,8 +80,7 @@ class TableWriter:
 
 def _first_rows(path: Path, number: int) -> list[str]:
     """Lines of a table: the header and as many rows."""
-    lines = path.read_text().splitlines(keepends=True) if path.exists() else []
-    complete = [line for line in lines if line.endswith("\n")]
+    complete = _complete_lines(path) if path.exists() else []
     if len(complete) < number + 1:
         raise ValueError(
             f"{path} holds {max(0, len(complete) - 1)} complete rows, but the run that is to be "
@@ -90,10 +89,20 @@ def _first_rows(path: Path, number: int) -> list[str]:
     return complete[: number + 1]
 
 
+def _complete_lines(path: Path) -> list[str]:
+    """Lines of a table; the last one has no end yet while it is written."""
+    lines = path.read_text().splitlines(keepends=True)
+    return [line for line in lines if line.endswith("\n")]
+
+
 def _field(value: float) -> str:
     if math.isnan(value):
         return ""
     return str(int(value)) if float(value).is_integer() else repr(float(value))
+
+
+def _number(field: str) -> float:
+    return float(field) if field else math.nan
 
 
 def read_table(path: Path) -> dict[str, list[float]]:
@@ -109,10 +118,7 @@ def read_table(path: Path) -> dict[str, list[float]]:
     if not rows:
         raise ValueError(f"{path} is empty: the run has not finished an epoch.")
     columns = zip(*rows[1:], strict=True) if len(rows) > 1 else ([] for _ in rows[0])
-    return {
-        name: [float(field) if field else math.nan for field in column]
-        for name, column in zip(rows[0], columns, strict=True)
-    }
+    return {name: list(map(_number, column)) for name, column in zip(rows[0], columns, strict=True)}
 
 
 def last_row(path: Path) -> dict[str, float]:
@@ -122,14 +128,11 @@ def last_row(path: Path) -> dict[str, float]:
         ValueError: If no epoch is finished.
         OSError: If the file cannot be read.
     """
-    lines = path.read_text().splitlines(keepends=True)
-    complete = [line for line in lines if line.endswith("\n")]
+    complete = _complete_lines(path)
     if len(complete) < 2:
         raise ValueError(f"{path} has no row: the run has not finished an epoch.")
     names, values = csv.reader([complete[0], complete[-1]])
-    return {
-        name: float(field) if field else math.nan for name, field in zip(names, values, strict=True)
-    }
+    return dict(zip(names, map(_number, values), strict=True))
 
 
 def _text(path: Path) -> str:

@@ -66,9 +66,7 @@ def _place(plan: PlacementPlan, item: int, key: Tensor, placed: Tensor) -> tuple
         pending = pending[~found]
         if not len(pending):
             break
-    ok = torch.ones(len(key), dtype=torch.bool)
-    ok[pending] = False
-    return position, ok
+    return position, torch.ones(len(key), dtype=torch.bool).index_fill(0, pending, False)
 
 
 def _try_layouts(plan: PlacementPlan, key: Tensor) -> tuple[Tensor, Tensor]:
@@ -171,6 +169,4 @@ def resample_goal(plan: PlacementPlan, key: Tensor, layouts: Tensor) -> tuple[Te
         pending = pending[~found]
         if not len(pending):
             break
-    ok = torch.ones(len(key), dtype=torch.bool)
-    ok[pending] = False
-    return position, ok
+    return position, torch.ones(len(key), dtype=torch.bool).index_fill(0, pending, False)
