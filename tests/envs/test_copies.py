@@ -7,6 +7,7 @@ import gymnasium
 import numpy as np
 import pytest
 import torch
+from playing import assert_same
 from torchrl.envs import Compose, RewardSum, StepCounter, TransformedEnv
 
 from safe_rl.envs import SUITE, SafetyGymEnv
@@ -45,12 +46,6 @@ def play(env, tensordict, num_steps, seed=0):
         following, tensordict = env.step_and_maybe_reset(tensordict.set("action", action))
         steps.append(following["next"].clone())
     return torch.stack(steps, 1), tensordict
-
-
-def assert_same(a, b):
-    assert set(a.keys(True, True)) == set(b.keys(True, True))
-    for key, value in a.items(True, True):
-        assert torch.equal(value, b[key]), key
 
 
 @pytest.mark.parametrize("how", COPY)

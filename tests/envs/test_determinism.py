@@ -2,9 +2,11 @@
 
 import pytest
 import torch
+from playing import assert_same, play
 from tensordict import TensorDict
 
 from safe_rl.envs import SUITE, SafetyGymEnv
+from safe_rl.envs.velocity import VELOCITY_SUITE, VelocityEnv
 
 # Short episodes and large goals, so that resets and new goals are among the compared steps.
 BUSY = {"num_steps": 20}
@@ -16,61 +18,37 @@ CONFIGS = {
 }
 # Met goals are rare with random actions, but for these tasks.
 MEETS_GOALS = ("goal", "push")
+NAMES = [*CONFIGS, *VELOCITY_SUITE]
 
 
-def make(name: str, num_envs: int, seed: int | None = 0, **kwargs) -> SafetyGymEnv:
-    return SafetyGymEnv(CONFIGS[name], num_envs=num_envs, seed=seed, **{"num_threads": 1, **kwargs})
+def make(name: str, num_envs: int, seed: int | None = 0, num_threads: int = 1, **sleep: bool):
+    """Of either family; robots of the velocity family do not sleep."""
+    settings = {"num_envs": num_envs, "seed": seed, "num_threads": num_threads}
+    if name in VELOCITY_SUITE:
+        return VelocityEnv(VELOCITY_SUITE[name].replace(num_steps=12), **settings)
+    return SafetyGymEnv(CONFIGS[name], **settings, **sleep)
 
 
-def random_actions(num_steps: int, num_envs: int, size: int) -> torch.Tensor:
-    """The same for row k, however many rows there are."""
-    rows = [
-        2 * torch.rand(num_steps, size, generator=torch.Generator().manual_seed(row)) - 1
-        for row in range(num_envs)
-    ]
-    return torch.stack(rows, 1)
-
-
-def play(env: SafetyGymEnv, start: TensorDict, num_steps: int) -> TensorDict:
-    """All outputs of a run with resets [N, T]."""
-    *shape, size = env.action_spec.shape
-    steps, tensordict = [], start
-    for action in random_actions(num_steps, *shape, size):
-        following, tensordict = env.step_and_maybe_reset(tensordict.set("action", action))
-        steps.append(following["next"].clone().set("action", action))
-    return torch.stack(steps, 1)
-
-
-def assert_same(a: TensorDict, b: TensorDict) -> None:
-    assert set(a.keys()) == set(b.keys())
-    for key, value in a.items():
-        assert torch.equal(value, b[key]), key
-
-
-@pytest.mark.parametrize("name", CONFIGS)
-def test_threads_do_not_matter(name):
-    runs = [play(env, env.reset(), 50) for env in (make(name, 6), make(name, 6, num_threads=2))]
-    assert_same(*runs)
-    assert runs[0]["truncated"].any()
+@pytest.mark.parametrize("name", NAMES)
+def test_threads_and_batch_size_do_not_matter(name):
+    few, many = make(name, 3), make(name, 8, num_threads=2)
+    run, larger = play(few, few.reset(), 50), play(many, many.reset(), 50)
+    assert_same(run, larger[:3])
+    assert run["done"].any()
     if name in MEETS_GOALS:
-        assert runs[0]["goal_met"].any()
+        assert larger["goal_met"].any()
 
 
-@pytest.mark.parametrize("name", CONFIGS)
-def test_rows_do_not_depend_on_the_batch_size(name):
-    few, many = (play(env, env.reset(), 50) for env in (make(name, 3), make(name, 8)))
-    assert_same(few, many[:3])
+@pytest.mark.parametrize("name", NAMES)
+def test_seeds_rows_and_episodes_differ(name):
+    envs = [make(name, 4, seed=seed) for seed in (0, 1)]
+    starts = [env.reset()["observation"] for env in envs for _ in range(2)]
+    assert len(torch.cat(starts).unique(dim=0)) == 16
 
 
-@pytest.mark.parametrize("name", CONFIGS)
-def test_seeds_and_rows_differ(name):
-    one, other = (make(name, 4, seed=seed).reset()["observation"] for seed in (0, 1))
-    starts = torch.cat([one, other])
-    assert len(starts.unique(dim=0)) == 8
-
-
-def test_seeding_starts_over():
-    env = make("goal", 3, seed=5)
+@pytest.mark.parametrize("name", ["goal", "SafeHopperVelocity"])
+def test_seeding_starts_over(name):
+    env = make(name, 3, seed=5)
     runs = [play(env, env.reset(), 30)]
     env.set_seed(5)
     runs.append(play(env, env.reset(), 30))
@@ -79,11 +57,12 @@ def test_seeding_starts_over():
     assert not torch.equal(env.reset()["observation"], runs[0]["observation"][:, 0])
 
 
-def test_without_a_seed_torch_decides():
+@pytest.mark.parametrize("name", ["goal", "SafeHopperVelocity"])
+def test_without_a_seed_torch_decides(name):
     starts = []
     for seed in (0, 0, 1):
         torch.manual_seed(seed)
-        starts.append(make("goal", 2, seed=None).reset()["observation"])
+        starts.append(make(name, 2, seed=None).reset()["observation"])
     assert torch.equal(starts[0], starts[1])
     assert not torch.equal(starts[0], starts[2])
 
@@ -114,24 +93,26 @@ def test_one_layout_for_all_episodes_where_asked_for():
     assert not torch.equal(starts(1)[0]["layout"], first["layout"])
 
 
-@pytest.mark.parametrize("name", CONFIGS)
+@pytest.mark.parametrize("name", NAMES)
 def test_a_state_determines_the_future(name):
     """Branch, go on, come back, go on: through new goals and resets; also in another instance."""
     env = make(name, 4, sleep=False)
     play(env, env.reset(), 8)
     state = env.get_state()
+    kept = state.clone()
     runs = [play(env, env.set_state(state), 45)]
     runs.append(play(env, env.set_state(state), 45))
-    elsewhere = make(name, 4, seed=99, sleep=False, num_threads=2)
+    elsewhere = make(name, 4, seed=99, num_threads=2, sleep=False)
     runs.append(play(elsewhere, elsewhere.set_state(state), 45))
     assert_same(runs[0], runs[1])
     assert_same(runs[0], runs[2])
-    assert runs[0]["truncated"].sum() >= 8
+    assert_same(state, kept)
+    assert runs[0]["done"].sum() >= 8
     if name in MEETS_GOALS:
         assert runs[0]["goal_met"].any()
 
 
-@pytest.mark.parametrize("name", CONFIGS)
+@pytest.mark.parametrize("name", NAMES)
 def test_setting_the_present_state_interrupts_nothing(name):
     plain, interrupted = make(name, 4, sleep=False), make(name, 4, sleep=False)
     first = play(plain, plain.reset(), 8)
@@ -139,7 +120,9 @@ def test_setting_the_present_state_interrupts_nothing(name):
     state = interrupted.get_state()
     tensordict = interrupted.set_state(state)
     assert_same(interrupted.get_state(), state)
-    assert torch.equal(tensordict["observation"], first["observation"][:, -1])
+    going = ~first["done"][:, -1, 0]
+    assert going.any()
+    assert torch.equal(tensordict["observation"][going], first["observation"][going, -1])
     run = play(plain, tensordict.clone(), 30)
     assert_same(run, play(interrupted, tensordict, 30))
 
