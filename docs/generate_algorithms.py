@@ -21,6 +21,7 @@ from omegaconf import DictConfig, OmegaConf
 from setting_tables import own_parts, setting_table
 from velocity_results import velocity_page
 
+from safe_rl.cli.conf import CONF
 from safe_rl.targets import accepted_names, locate
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -132,7 +133,7 @@ def _page(name: str) -> str:
 
 
 def _compose(algo: str, preset: str) -> DictConfig:
-    with initialize_config_dir(str(ROOT / "conf"), version_base="1.3"):
+    with initialize_config_dir(str(CONF), version_base="1.3"):
         return compose("config", [f"algo={algo}", f"preset={preset}", "env=gymnasium"])
 
 

@@ -6,7 +6,8 @@ from hydra import compose, initialize_config_dir
 from hydra.core.config_store import ConfigStore
 from omegaconf import DictConfig
 
-CONF = Path(__file__).parents[1] / "conf"
+from safe_rl.cli.conf import CONF
+
 # what the benchmark's environments have and the point mass lacks, a configuration by name
 ConfigStore.instance().store(
     group="env", name="PointMass", node={"name": "PointMass", "robot_base": "point"}

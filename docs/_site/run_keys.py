@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Iterator, Mapping
-from pathlib import Path
 from typing import Any
 
 import yaml
@@ -12,12 +11,12 @@ from hydra import compose, initialize_config_dir
 from omegaconf import DictConfig, OmegaConf
 from tables import table
 
+from safe_rl.cli.conf import CONF
 from safe_rl.cli.keys import KEYS
 from safe_rl.cli.part_keys import PARTS
 from safe_rl.cli.values import Values, anything, mapping_of
 from safe_rl.envs import store_configs
 
-CONF = Path(__file__).resolve().parents[2] / "conf"
 _HEAD = ("key", "may be", "default", "meaning")
 # an algorithm of either kind: between them they have every key that is no part's
 _ALGORITHMS = ("ppo_lagrangian", "sac_lagrangian")

@@ -33,12 +33,6 @@ def trained(tmp_path_factory):
     return safe_rl.train("PointGoal1", directory=folder, **SMALL, **keys).directory
 
 
-@pytest.fixture
-def run(trained, tmp_path):
-    """A copy to write into."""
-    return Path(shutil.copytree(trained, tmp_path / "run"))
-
-
 def rows_of(folder, name="variations"):
     with (folder / f"{name}.csv").open(newline="") as file:
         return {row["variation"]: row for row in csv.DictReader(file)}
