@@ -15,7 +15,7 @@ The first takes about a minute on two cores.
 import torch
 
 from safe_rl.envs import store_config
-from safe_rl.envs.safety_gym.extending import (
+from safe_rl.envs.extending import (
     CYLINDER,
     Cost,
     Element,
