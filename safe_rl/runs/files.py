@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -12,10 +12,12 @@ import yaml
 from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-__all__ = ["check_place", "read_config", "read_yaml", "replacing"]
+__all__ = ["check_place", "read_config", "read_notes", "read_yaml", "replacing"]
 
 # of a configuration; that of a run has about six thousand
 _MOST_LETTERS = 1_000_000
+# of libyaml, where PyYAML has it
+_Loader: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 
 
 def read_yaml(path: Path) -> Any:
@@ -25,6 +27,24 @@ def read_yaml(path: Path) -> Any:
         ValueError: If it is none, or has aliases, which could grow without end.
         OSError: If it cannot be read.
     """
+    # which reads numbers as runs write them, such as 1e-4
+    return _read(path, lambda text: OmegaConf.to_container(OmegaConf.create(text), resolve=False))
+
+
+def read_notes(path: Path) -> Any:
+    """Read what Hydra has noted of a run, of which texts and whole numbers are needed.
+
+    As :func:`read_yaml`, but in a tenth of the time, which is most of a report's on many runs: no
+    number such as 1e-4 is looked for, and later ones of equal keys count.
+
+    Raises:
+        ValueError: As by `read_yaml`.
+        OSError: If it cannot be read.
+    """
+    return _read(path, lambda text: yaml.load(text, Loader=_Loader))
+
+
+def _read(path: Path, parse: Callable[[str], Any]) -> Any:
     try:
         text = path.read_text(encoding="utf-8")
         if len(text) > _MOST_LETTERS:
@@ -32,8 +52,7 @@ def read_yaml(path: Path) -> Any:
         # without a star there is none, and reading hundreds of runs takes a fifth less
         if "*" in text and any(isinstance(token, yaml.AliasToken) for token in yaml.scan(text)):
             raise ValueError(f"{path.name} has YAML aliases, which no run writes")
-        # which reads numbers as runs write them, such as 1e-4
-        return OmegaConf.to_container(OmegaConf.create(text), resolve=False)
+        return parse(text)
     except (yaml.YAMLError, OmegaConfBaseException, UnicodeDecodeError, RecursionError) as error:
         reason = (str(error) or type(error).__name__).splitlines()[0]
         raise ValueError(f"{path.name} cannot be read ({reason})") from error

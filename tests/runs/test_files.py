@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from omegaconf import OmegaConf
 
-from safe_rl.runs.files import read_config, read_yaml, replacing
+from safe_rl.runs.files import read_config, read_notes, read_yaml, replacing
 from safe_rl.runs.folder import paths_below, runs_below
 
 VALUES = st.recursive(
@@ -57,6 +57,23 @@ def test_what_is_not_resolved_can_be_read_and_stays_so(tmp_path, monkeypatch):
     path = tmp_path / "hydra.yaml"
     path.write_text("a: [1e-4, '${oc.env:SECRET}', '???']")
     assert read_yaml(path) == {"a": [1e-4, "${oc.env:SECRET}", "???"]}
+
+
+@pytest.mark.parametrize(
+    "text", ["frames: 1_000", "- a=${b}\n- 'c=*'", "a: {b: [{c: null}]}", "x: '???'"]
+)
+def test_notes_are_read_as_configurations_are(text, tmp_path):
+    path = tmp_path / "hydra.yaml"
+    path.write_text(text)
+    assert read_notes(path) == read_yaml(path)
+
+
+@pytest.mark.parametrize("text", ["{", BOMB, "a: !!python/object/apply:os.system [true]"])
+def test_odd_notes_are_refused(text, tmp_path):
+    path = tmp_path / "hydra.yaml"
+    path.write_text(text)
+    with pytest.raises(ValueError, match=r"hydra\.yaml"):
+        read_notes(path)
 
 
 def test_a_file_is_replaced_when_it_is_complete(tmp_path):
