@@ -131,10 +131,11 @@ def _order(experiment: Experiment) -> tuple[Hashable, ...]:
 def _without_repetitions(runs: Sequence[Run], skipped: dict[Path, str]) -> list[Run]:
     """Runs by ascending seed, the same seed once: twice it would be one sample, not two.
 
-    The one that has come further is kept, among equals the newer; the others are noted.
+    The one that has come further is kept, among equals the last by their folders, which have dates
+    for names: when files were written a copy or a clone does not tell. The others are noted.
     """
     kept: dict[int, Run] = {}
-    for run in sorted(runs, key=lambda run: (run.steps, run.modified)):
+    for run in sorted(runs, key=lambda run: (run.steps, run.directory)):
         if run.seed in kept:
             reason = f"{run.directory} is the same run with the same seed"
             skipped[kept[run.seed].directory] = reason

@@ -45,7 +45,6 @@ class Run:
         certificate: Which of its checkpoints surely keeps the limits, or by how much none does.
         code: By which version and commit it was carried out, in words, if that is recorded.
         videos: Videos in its folder.
-        modified: When its table was last written [s since 1970].
     """
 
     directory: Path
@@ -59,7 +58,6 @@ class Run:
     certificate: Mapping[str, Any] | None = None
     code: str | None = None
     videos: tuple[Path, ...] = ()
-    modified: float = 0.0
 
     @property
     def seed(self) -> int:
@@ -204,7 +202,6 @@ def _read_run(folder: RunFolder, root: Path, unfinished: bool, skipped: dict[Pat
         next(iter(read(there(folder.certificate), read_certificate)), None),
         next(iter(read(there(folder.code), read_code)), None),
         tuple(read(_films(folder), lambda path: path)),
-        recorded.stat().st_mtime,
     )
 
 

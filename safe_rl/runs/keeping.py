@@ -66,8 +66,6 @@ def _keep(run: RunFolder, kept: RunFolder) -> None:
             unfinished.write_bytes(gzip.compress(table.read_bytes(), mtime=0))
         else:
             shutil.copyfile(table, unfinished)
-    times = table.stat()
-    os.utime(kept.packed_table, (times.st_atime, times.st_mtime))
 
 
 def _small_files(run: RunFolder) -> Iterator[Path]:

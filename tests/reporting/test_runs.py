@@ -1,7 +1,6 @@
 """Which folders count as runs, how they are grouped, and what they are called."""
 
 import json
-import os
 
 import pytest
 from synthetic import grouped, write_run
@@ -97,9 +96,9 @@ def test_of_the_same_run_twice_the_one_that_came_further_is_kept(tmp_path):
     rows = {"returns": (1.0, 2.0), "costs": (1, 1), "rates": (0, 0)}
     longer = write_run(tmp_path, **rows, frames=2000, folder="longer")
     shorter = write_run(tmp_path, frames=2000, folder="shorter")
-    newer = write_run(tmp_path, seed=1, frames=2000, folder="newer")
-    older = write_run(tmp_path, seed=1, frames=2000, folder="older")
-    os.utime(older / "progress.csv", (1.0, 1.0))
+    newer = write_run(tmp_path, seed=1, frames=2000, folder="2026-02-01_12-00-00_seed1")
+    # written last, as files of a clone are in any order
+    older = write_run(tmp_path, seed=1, frames=2000, folder="2026-01-31_12-00-00_seed1")
     (experiment,), skipped = grouped(tmp_path)
     assert [run.directory for run in experiment.runs] == [longer, newer]
     assert skipped == {
