@@ -36,6 +36,9 @@ class SimulatedEnv(EnvBase):
     #: What a copy has beside the state: attributes that are tensors.
     copied: ClassVar[tuple[str, ...]] = ("_row_seed", "_has_cost", "_begun")
 
+    #: What a step takes in the world's own time [s].
+    seconds_per_step: float
+
     config: Any
     cost_keys: list[str]
     _physics: BatchPhysics

@@ -26,7 +26,7 @@ from safe_rl.evaluation.loading import (
 )
 from safe_rl.evaluation.settings import EvaluationOptions, check_options
 from safe_rl.evaluation.summary import check_places, summarise, write_episodes, write_summary
-from safe_rl.evaluation.video import check_camera, record_episode, write_video
+from safe_rl.evaluation.video import check_camera, manner_of, record_episode, write_video
 from safe_rl.runs.folder import RunFolder, checkpoint_steps
 from safe_rl.scores.benchmark import Suite
 from safe_rl.scores.intervals import LEVEL, Estimate
@@ -99,7 +99,6 @@ def evaluate(
     for film in films:
         with closing(make(1, **drawing)) as single:
             check_camera(single, options.camera, film.suffix[1:])
-    manner = {"deterministic": options.deterministic}
     with closing(make(min(options.num_envs, options.episodes))) as env:
         cost_keys = env.cost_keys
         limits = limits_of(config, options.cost_limits, cost_keys)
@@ -115,10 +114,12 @@ def evaluate(
         torch.manual_seed(seed)
         # the first world draws the same layouts whatever the number of worlds; actions are others
         with closing(make(1, **drawing)) as single:
+            manner = manner_of(single, film.suffix[1:])
             frames = record_episode(
-                single, policy, cost_keys, **manner, camera=options.camera, suffix=film.suffix[1:]
-            )
-            write_video(film, frames)
+                single, policy, cost_keys, deterministic=options.deterministic, manner=manner,
+                camera=options.camera,
+            )  # fmt: skip
+            write_video(film, frames, manner)
     kept = [places["transitions"]] if options.record else []
     return Evaluation(facts, estimates, (places["json"], places["csv"], *kept, *films))
 

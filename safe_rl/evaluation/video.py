@@ -17,7 +17,7 @@ from safe_rl.evaluation.episodes import exploration
 from safe_rl.extras import import_extra
 from safe_rl.runs.files import replacing
 
-__all__ = ["MANNERS", "Manner", "check_camera", "record_episode", "write_video"]
+__all__ = ["MANNERS", "Manner", "check_camera", "manner_of", "record_episode", "write_video"]
 
 
 class Manner(NamedTuple):
@@ -34,15 +34,29 @@ class Manner(NamedTuple):
     width: int
     height: int
     steps_per_frame: int
-    frames_per_second: int
-    write: Callable[[Path, Iterator[np.ndarray], str, int], None]
+    frames_per_second: float
+    write: Callable[[Path, Iterator[np.ndarray], str, float], None]
 
 
 DEFAULT_CAMERA = "free"
 # of the line below the picture, and what its text takes of a width at least [pixels]
 _CAPTION_HEIGHT, _CAPTION_WIDTH = 20, 280
+# of a film's frame, in the time of what is filmed [s]
+_FRAME = 0.04
 # of a GIF's palette; and how long its last frame stays [ms]
 _COLOURS, _LAST = 64, 1500
+
+
+def manner_of(env: EnvBase, suffix: str) -> Manner:
+    """How an episode of an environment is recorded into a file of a suffix of :data:`MANNERS`.
+
+    A film runs as fast as what it shows, where the environment has ``seconds_per_step``.
+    """
+    manner, seconds = MANNERS[suffix], getattr(env, "seconds_per_step", None)
+    if suffix != "mp4" or not seconds:
+        return manner
+    steps = max(1, round(_FRAME / seconds))
+    return manner._replace(steps_per_frame=steps, frames_per_second=1 / (steps * seconds))
 
 
 def check_camera(env: EnvBase, camera: str, suffix: str = "mp4") -> None:
@@ -106,8 +120,8 @@ def record_episode(
     cost_keys: Sequence[str],
     *,
     deterministic: bool,
+    manner: Manner,
     camera: str = DEFAULT_CAMERA,
-    suffix: str = "mp4",
 ) -> Iterator[np.ndarray]:
     """Run one episode and yield its frames, uint8 [height, width, 3].
 
@@ -118,10 +132,9 @@ def record_episode(
         policy: What acts.
         cost_keys: Keys of its costs; the first is counted below the picture.
         deterministic: Whether it acts with its mean.
+        manner: How it is recorded.
         camera: A name that ``env.render`` knows.
-        suffix: Of the file that the frames are for, see :data:`MANNERS`.
     """
-    manner = MANNERS[suffix]
     state = env.reset()
     total = dict.fromkeys(("reward", *cost_keys[:1]), 0.0)
     step = 0
@@ -159,19 +172,17 @@ def _frame(
     return np.asarray(canvas)
 
 
-def write_video(path: Path, frames: Iterator[np.ndarray]) -> None:
-    """Encode frames, replaced in one go; the file's suffix says how, see :data:`MANNERS`.
+def write_video(path: Path, frames: Iterator[np.ndarray], manner: Manner) -> None:
+    """Encode frames in the manner in which they were recorded; the file is replaced in one go.
 
     Raises:
         ModuleNotFoundError: If the encoder is missing; the message names the extra.
     """
-    suffix = path.suffix.lstrip(".")
-    manner = MANNERS[suffix]
     with replacing(path) as unfinished:
-        manner.write(unfinished, frames, suffix, manner.frames_per_second)
+        manner.write(unfinished, frames, path.suffix.lstrip("."), manner.frames_per_second)
 
 
-def _write_film(path: Path, frames: Iterator[np.ndarray], suffix: str, rate: int) -> None:
+def _write_film(path: Path, frames: Iterator[np.ndarray], suffix: str, rate: float) -> None:
     import_extra("imageio_ffmpeg", "video")
     imageio = import_extra("imageio.v2", "video")
     # pixel format and index at the front: what browsers ask of a video
@@ -189,23 +200,24 @@ def _write_film(path: Path, frames: Iterator[np.ndarray], suffix: str, rate: int
             writer.append_data(frame)
 
 
-def _write_animation(path: Path, frames: Iterator[np.ndarray], suffix: str, rate: int) -> None:
+def _write_animation(path: Path, frames: Iterator[np.ndarray], suffix: str, rate: float) -> None:
     pictures = [Image.fromarray(frame) for frame in frames]
     if suffix == "gif":
         # one palette for all, and no dither, so that what stands still is stored once
         few = np.concatenate([np.asarray(one) for one in pictures[:: len(pictures) // 8 + 1]])
         palette = Image.fromarray(few).quantize(_COLOURS)
         pictures = [p.quantize(palette=palette, dither=Image.Dither.NONE) for p in pictures]
-    durations = [1000 // rate] * (len(pictures) - 1) + [_LAST]
+    durations = [round(1000 / rate)] * (len(pictures) - 1) + [_LAST]
     pictures[0].save(
         path, format=suffix, save_all=True, append_images=pictures[1:], duration=durations,
         loop=0, optimize=True, quality=60, method=6,
     )  # fmt: skip
 
 
-# an episode of 1000 steps lasts 20 s as a film, Point's own time, and half as long as a picture
+# of 1000 steps: 10 s, whatever is shown, so that no picture gets too large for a page
 _ANIMATION = Manner(400, 300, 5, 20, _write_animation)
 MANNERS = {
+    # of what does not say how long its steps are; 1000 last 20 s
     "mp4": Manner(640, 480, 2, 25, _write_film),
     "gif": _ANIMATION,
     "webp": _ANIMATION,

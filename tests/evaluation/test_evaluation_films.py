@@ -9,8 +9,39 @@ from PIL import Image
 
 from safe_rl.cli.evaluate import evaluate_run as evaluate
 from safe_rl.collectors import read_recording
+from safe_rl.envs import from_gymnasium, make_env
+from safe_rl.envs.velocity import VelocityEnv
 from safe_rl.evaluation import video
-from safe_rl.evaluation.video import MANNERS
+from safe_rl.evaluation.video import MANNERS, manner_of
+
+
+@pytest.mark.parametrize(
+    ("make", "steps_per_frame", "rate"),
+    [
+        (lambda: make_env("PointGoal1", seed=0), 2, 25.0),
+        (lambda: make_env("CarGoal1", seed=0), 1, 25.0),
+        (lambda: make_env("DoggoGoal1", seed=0), 1, 10.0),
+        (lambda: VelocityEnv("SafeHopperVelocity", seed=0), 5, 25.0),
+        (lambda: VelocityEnv("SafeHalfCheetahVelocity", seed=0), 1, 20.0),
+        (lambda: from_gymnasium("Safexp-CarGoal1-v0", num_steps=10, seed=0), 1, 25.0),
+        (object, 2, 25.0),
+    ],
+)
+def test_a_film_runs_as_fast_as_what_it_shows(make, steps_per_frame, rate):
+    """Robots are controlled at different rates; a Doggo would seem to run five times as fast."""
+    film = manner_of(make(), "mp4")
+    assert (film.steps_per_frame, film.frames_per_second) == pytest.approx((steps_per_frame, rate))
+    assert manner_of(make(), "gif") == MANNERS["gif"]
+
+
+def test_slow_steps_have_a_frame_each(run):
+    imageio = pytest.importorskip("imageio.v2", reason="needs the extra 'video'")
+    pytest.importorskip("imageio_ffmpeg", reason="needs the extra 'video'")
+    skip_without_opengl()
+    evaluate(run, options(episodes=1, video=True, env={"frameskip_binom_n": 40}))
+    with imageio.get_reader(run / "evaluation.mp4") as reader:
+        assert reader.get_meta_data()["fps"] == 12.5
+        assert len([frame for frame in reader]) == NUM_STEPS + 1  # noqa: C416
 
 
 def test_the_video_shows_an_episode(run):

@@ -80,6 +80,12 @@ class GymnasiumEnv(TransformedEnv):
         self.observation_layout = columns_of(base_env.observation_spec["observation"])
         self.max_episode_steps = num_steps
 
+    @property
+    def seconds_per_step(self) -> float | None:
+        """What a step takes in the environment's own time [s], if it says that."""
+        rate = (getattr(self.base_env._env, "metadata", None) or {}).get("render_fps")
+        return 1 / rate if rate else None
+
     def render(
         self,
         rows: int | Sequence[int] | None = None,

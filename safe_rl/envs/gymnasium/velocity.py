@@ -57,7 +57,7 @@ class VelocityGymnasiumEnv(gymnasium.Env[np.ndarray, np.ndarray]):
             raise ValueError(f"render_mode must be rgb_array or None, got {render_mode!r}.")
         self.robot = VelocityEnv(resolve_velocity(name).replace(**(config or {})), 1, "cpu", 0, 1)
         # in real time, as Gymnasium's
-        rate = max(1, round(1 / self.robot._duration))
+        rate = max(1, round(1 / self.robot.seconds_per_step))
         self.metadata = {**self.metadata, "render_fps": rate}
         self.render_mode, self._size = render_mode, {"width": width, "height": height}
         size = self.robot.observation_spec["observation"].shape[-1]

@@ -18,7 +18,6 @@ from safe_rl.envs.opengl import OpenGLError, has_screen
 from safe_rl.envs.safety_gym.env import SafetyGymEnv
 from safe_rl.envs.safety_gym.records.config import SafetyGymConfig
 from safe_rl.envs.safety_gym.suite import resolve
-from safe_rl.envs.safety_gym.world.building import build_scene
 
 RENDER_MODES = ("human", "rgb_array")
 NUM_SEEDS = 2**62
@@ -126,9 +125,7 @@ class Worlds:
         self.env = SafetyGymEnv(config, num_envs, "cpu", 0, num_threads, sleep)
         self.observation_space = observation_space(self.env)
         self.action_space = action_space(self.env)
-        config = self.env.config
-        timestep = build_scene(config, sleep).model.opt.timestep
-        self.seconds_per_step = timestep * config.frameskip_binom_n
+        self.seconds_per_step = self.env.seconds_per_step
         self._with_positions = with_positions
         self._is_seeded = False
         self._shown_at = 0.0

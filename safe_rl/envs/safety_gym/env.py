@@ -95,6 +95,7 @@ class SafetyGymEnv(SimulatedEnv):
         self.config = resolve(env)
         scene = build_scene(self.config, sleep)
         self._physics = BatchPhysics(scene.model, num_envs, num_threads)
+        self.seconds_per_step = self._physics.timestep * self.config.frameskip_binom_n
         self._world = make_world(scene, self._physics)
         self._plan = plan_placements(self.config, scene.slots, len(scene.names))
         self._layouts = LayoutsAhead(

@@ -81,7 +81,7 @@ class VelocityEnv(SimulatedEnv):
         self._physics = BatchPhysics(self._model, num_envs, num_threads, outputs)
         self._has_forces = needs_forces(self.config)
         self._no_forces = torch.zeros(num_envs, 0, 6, dtype=torch.float64)
-        self._duration = self._physics.timestep * self.config.frame_skip
+        self.seconds_per_step = self._physics.timestep * self.config.frame_skip
         self._observer = Observer(self.config, self._model)
         self._place = PLACES[self._robot.place].reading(self._model, self._physics)
         self._last_place = self._place()
@@ -127,7 +127,7 @@ class VelocityEnv(SimulatedEnv):
         physics.ctrl.copy_(control)
         failed = self._advance()
         place = self._place()
-        velocity = (place - self._last_place) / self._duration
+        velocity = (place - self._last_place) / self.seconds_per_step
         self._last_place.copy_(place)
         healthy = self._healthy()
         forces = physics.outputs[FORCES] if self._has_forces else self._no_forces
