@@ -262,11 +262,14 @@ def _middles_and_profiles(
 ) -> list[Block]:
     """What can be seen of a slate's runs as a whole, of algorithms that were trained equally long.
 
-    A single run has no middle and no profile.
+    A single run has no middle and no profile, and of what has finished no episode there is none to
+    draw.
     """
     if max(one.num_runs for one in aggregates) == 1:
         return []
     middle = middle_table(slate, aggregates, after)
+    if not any(one.is_measured for one in aggregates):
+        return [middle]
     iqm, profiles = draw_middles(middle.records, styles), draw_profiles(aggregates, styles)
     says = ", ".join([title_of(slate) + after, *(one.algorithm for one in aggregates)])
     return [

@@ -102,7 +102,7 @@ def _draw_front(
     there = {r.get("limit_cost") for r in records}
     for limit, marker in markers.items():
         if limit in there:
-            name = "no limit" if limit is None else f"limit {limit:g}"
+            name = "no limit of cost" if limit is None else f"limit {limit:g}"
             axis.plot([], [], color="0.3", linestyle="", marker=marker, markersize=7, label=name)
         if limit in there and limit is not None:
             axis.axvline(limit, **LIMIT_STYLE)

@@ -101,7 +101,7 @@ def evaluation_table(experiments: Sequence[Experiment]) -> Table:
         Column("$d$", ("{:g}", "limit")),
         # of many episodes a few are not none
         Column("P($C$ > $d$)", ("{:.1%}", "over")),
-        Column("CVaR", ("{:.0%}: {:.1f}", "cvar_alpha", "cvar"), interval("cvar", 1)[1]),
+        Column("CVaR", ("{:.1%}: {:.1f}", "cvar_alpha", "cvar"), interval("cvar", 1)[1]),
     ]
     fields = {"limit": "limit_{}", "over": "over_limit_{}"}
     for end in ("", "_low", "_high"):
@@ -158,7 +158,8 @@ def _is_missing(record: Record) -> str:
 def _evaluation_record(
     experiment: Experiment, run: Run, evaluation: Mapping[str, Any]
 ) -> dict[str, Any]:
-    manner = ["mean actions" if evaluation["deterministic"] else "sampled actions"]
+    manner = [evaluation["name"]] if evaluation["name"] else []
+    manner += ["mean actions" if evaluation["deterministic"] else "sampled actions"]
     manner += [f"{key}={value}" for key, value in evaluation["env"].items()]
     manner.append(f"{evaluation['layouts_trained_on']:.0%} known layouts")
     record = {
@@ -189,4 +190,7 @@ def videos(experiments: Sequence[Experiment]) -> Iterator[tuple[str, Path]]:
         found = [(run, path) for run in experiment.runs for path in run.videos]
         if found:
             run, path = found[0]
-            yield f"{experiment.environment}, {experiment.algorithm}, seed {run.seed}", path
+            # of an evaluation with a name, as of another environment, its name
+            words = [experiment.environment, experiment.algorithm, f"seed {run.seed}"]
+            words += filter(None, [path.stem.removeprefix("evaluation").lstrip("_")])
+            yield ", ".join(words), path

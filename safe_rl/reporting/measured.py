@@ -27,6 +27,7 @@ def read_evaluation(path: Path) -> dict[str, Any] | None:
         if "estimates" not in content:
             return None
         return {
+            "name": clean(content.get("name") or "", 60),
             "checkpoint": clean(content["checkpoint"]),
             "steps": content["steps"],
             "episodes": int(content["episodes"]),

@@ -24,8 +24,9 @@ _MANY_KEYS = 3
 _ALWAYS_NAMED = ("preset", "init_from", "frames", "cost_limits", "risk")
 # of those that the paper does not name; where there is none, the file in conf/algo is its name
 _TITLES = {
-    **{name: name.upper() for name in ("crpo", "cup", "focops", "ipo", "p3o", "pcpo", "rcpo")},
-    **{"c_trpo": "C-TRPO", "sac": "SAC", "td3": "TD3"},
+    **{name: name.upper() for name in ("bc", "cal", "crpo", "cup", "focops", "ipo")},
+    **{name: name.upper() for name in ("p3o", "pcpo", "rcpo", "sac", "td3", "wcsac")},
+    "c_trpo": "C-TRPO",
     **{"sac_lagrangian": "SAC-Lagrangian", "td3_lagrangian": "TD3-Lagrangian"},
 }
 

@@ -86,8 +86,8 @@ def draw_learning_curves(experiments: Sequence[Experiment], styles: Mapping[str,
     """Draw return, episode cost and cost rate over steps, a row per environment.
 
     Lines are means over seeds and bands their 95 % intervals; return and episode cost are means of
-    an epoch and the four before it. Limits d are dashed, and so is d / T_ep beside the cost rate.
-    Runs that have not come to their end are drawn one by one, thin.
+    an epoch and those before it, as many as final figures have. Limits d are dashed, and so is
+    d / T_ep beside the cost rate. Runs that have not come to their end are drawn one by one, thin.
 
     Args:
         experiments: Any environments and algorithms.

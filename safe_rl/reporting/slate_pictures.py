@@ -54,14 +54,14 @@ def draw_profiles(aggregates: Sequence[Aggregate], styles: Mapping[str, Style]) 
     Bands are 95 % intervals of a bootstrap that resamples every environment's seeds.
 
     Args:
-        aggregates: One per algorithm.
+        aggregates: One per algorithm; at least of one every run has finished an episode.
         styles: Name of an algorithm -> how it is drawn.
     """
     figure = Figure(figsize=(WIDTH, 3.0), layout="constrained")
     panels = figure.subplots(1, 3, sharey=True)
     # where a run has finished no episode there is no share of runs
-    known = [one for one in aggregates if np.isfinite(one.mean).all()]
-    for axis, (name, symbol) in zip(panels, SYMBOLS.items() if known else (), strict=False):
+    known = [one for one in aggregates if one.is_measured]
+    for axis, (name, symbol) in zip(panels, SYMBOLS.items(), strict=True):
         values = np.concatenate([v for one in known for v in one.strata[name]])
         # from where all runs are above to where none is
         margin = 0.05 * float(np.ptp(values)) + 1e-3

@@ -67,6 +67,11 @@ class Aggregate:
         )
 
     @property
+    def is_measured(self) -> bool:
+        """Whether every run has finished an episode."""
+        return bool(np.isfinite(self.mean).all())
+
+    @property
     def num_runs(self) -> int:
         """Runs that went into it."""
         return sum(map(len, self.strata["episode_return"]))
@@ -198,7 +203,7 @@ def _relations(aggregates: Sequence[Aggregate]) -> str:
             (a.steps, a.limits),
         )
         for a in aggregates
-        if np.isfinite(a.mean).all()  # without an episode nothing is kept, and nothing violated
+        if a.is_measured  # without an episode nothing is kept, and nothing violated
     }
     failing = [name for name, agent in agents.items() if not agent.is_satisfying]
     pairs = [f"{a} ≻ {b}" for a, b, reason in compare(agents) if reason == "dominates"]

@@ -56,7 +56,7 @@ def bootstrap(
 
     Returns:
         Lower and upper ends, of the shape of the statistic; NaN where there is one observation
-        per stratum, which says nothing about the spread.
+        per stratum, which says nothing about the spread, or an observation is no number.
 
     Examples:
         >>> low, high = bootstrap([np.arange(100.0)], np.mean)
@@ -64,7 +64,8 @@ def bootstrap(
         (True, True)
     """
     samples = [np.asarray(sample, dtype=float) for sample in samples]
-    if max(sample.shape[-1] for sample in samples) < 2:
+    are_known = all(np.isfinite(sample).all() for sample in samples)
+    if max(sample.shape[-1] for sample in samples) < 2 or not are_known:
         shape = np.shape(statistic(*samples, axis=-1))
         return np.full(shape, math.nan), np.full(shape, math.nan)
     result = scipy.stats.bootstrap(

@@ -13,7 +13,8 @@ from matplotlib.image import imread
 from synthetic import experiments_in, write_run
 
 from safe_rl.cli.report import main
-from safe_rl.reporting.inventory import duration, evaluation_table
+from safe_rl.reporting.inventory import duration, evaluation_table, videos
+from safe_rl.runs.folder import RunFolder
 
 CHROMIUM = next(
     filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None
@@ -120,7 +121,7 @@ def test_page_and_markdown_say_the_same(report):
         "21.0 [20.0, 22.0]",
         "25",
         "25.0%",
-        "10%: 70.0 [69.0, 71.0]",
+        "10.0%: 70.0 [69.0, 71.0]",
     ]
     assert [
         "PointGoal1",
@@ -190,15 +191,34 @@ def test_an_evaluation_shows_every_limit(tmp_path):
         assert cells["$J_c$"].mark == mark
         assert cells["$d$"].text == limit
         assert cells["P($C$ > $d$)"].text == "25.0%"
-        assert cells["CVaR"].text.startswith(f"10%: {cost + 10}.0 [")
+        assert cells["CVaR"].text.startswith(f"10.0%: {cost + 10}.0 [")
 
 
 def test_a_few_of_many_episodes_are_not_none(tmp_path):
     directory = write_run(tmp_path)
     estimates = {**EVALUATION["estimates"], "over_limit_cost": _estimate(0.004)}
-    (directory / "evaluation.json").write_text(json.dumps({**EVALUATION, "estimates": estimates}))
+    evaluation = {**EVALUATION, "estimates": estimates, "cvar_alpha": 0.005}
+    (directory / "evaluation.json").write_text(json.dumps(evaluation))
     (row,) = evaluation_table(experiments_in(tmp_path)).rows()
-    assert {cell.title: cell.text for cell in row}["P($C$ > $d$)"] == "0.4%"
+    cells = {cell.title: cell.text for cell in row}
+    assert cells["P($C$ > $d$)"] == "0.4%"
+    assert cells["CVaR"].startswith("0.5%: 70.0")
+
+
+def test_evaluations_and_films_are_told_apart_by_their_names(tmp_path):
+    directory = write_run(tmp_path)
+    for name in ("", "many"):
+        evaluation = {**EVALUATION, "name": name}
+        path = RunFolder(directory).evaluation(name, "json")
+        path.write_text(json.dumps(evaluation))
+    RunFolder(directory).evaluation("many", "mp4").write_bytes(VIDEO)
+    experiments = experiments_in(tmp_path)
+    rows = evaluation_table(experiments).rows()
+    shown = [{cell.title: cell.text for cell in row}["what"] for row in rows]
+    assert shown == [f"{name}mean actions, x=1, 0% known layouts" for name in ("", "many, ")]
+    assert [caption for caption, _ in videos(experiments)] == ["PointGoal1, PPO, seed 0, many"]
+    (directory / "evaluation.mp4").write_bytes(VIDEO)
+    assert next(videos(experiments_in(tmp_path)))[0] == "PointGoal1, PPO, seed 0"
 
 
 def test_an_evaluation_is_not_judged_by_the_mean_if_training_was_not(tmp_path):

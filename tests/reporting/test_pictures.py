@@ -147,7 +147,7 @@ def test_fronts_join_nothing_that_was_trained_for_longer(tmp_path):
     assert list(shown) == ["PointGoal1, 1,000 steps", "PointGoal1, 3,000 steps"]
     assert len(shown["PointGoal1, 1,000 steps"].containers) == 2
     labels = shown["PointGoal1, 1,000 steps"].get_legend_handles_labels()[1]
-    assert labels == ["PPO", "CPO", "no limit", "limit 25"]
+    assert labels == ["PPO", "CPO", "no limit of cost", "limit 25"]
 
 
 def test_a_single_epoch_is_drawn_as_a_point(tmp_path):

@@ -5,13 +5,21 @@ import json
 import pytest
 from synthetic import grouped, write_run
 
+from safe_rl.cli.conf import CONF
 from safe_rl.reporting.inventory import variant_table
-from safe_rl.reporting.naming import distinguishing_keys
+from safe_rl.reporting.naming import distinguishing_keys, title_of
 from safe_rl.reporting.recorded import find_runs
 
 
 def names(experiments):
     return [(e.environment, e.algorithm, [run.seed for run in e.runs]) for e in experiments]
+
+
+@pytest.mark.parametrize("name", sorted(path.stem for path in (CONF / "algo").glob("*.yaml")))
+def test_every_algorithm_has_the_name_that_the_field_gives_it(name):
+    title = title_of(name)
+    assert title.lower().replace("-", "_") == name
+    assert title != name
 
 
 def test_seeds_of_one_configuration_are_one_experiment(tmp_path):

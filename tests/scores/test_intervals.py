@@ -41,6 +41,12 @@ def test_one_value_per_stratum_has_no_interval_and_equal_values_a_narrow_one():
     assert mean([4.0, 4.0, 4.0]) == (4.0, 4.0, 4.0)
 
 
+def test_what_is_no_number_has_no_interval_and_no_warning(recwarn):
+    assert np.isnan(mean([1.0, math.nan, 2.0])).all()
+    assert np.isnan(interquartile_mean([[1.0, math.nan], [2.0, 3.0]])).all()
+    assert not recwarn.list
+
+
 def test_many_curves_at_once_are_many_curves():
     values = np.random.default_rng(2).normal(size=(5, 3))
     low, high = bootstrap([values], np.mean)
