@@ -29,6 +29,7 @@ from safe_rl.cli.interrupting import say_if_heard
 from safe_rl.cli.options import take_options
 from safe_rl.cli.python_settings import compose_new, compose_resumed, overrides_of, search_path
 from safe_rl.cli.robots import maker_of
+from safe_rl.cli.run_folders import write_notes
 from safe_rl.cli.running import complete, prepare
 from safe_rl.cli.user_code import check_imports, import_modules, note_imports, several
 from safe_rl.cli.variations import evaluate_varied
@@ -81,7 +82,7 @@ class Run:
 
         Costs of an epoch in which no episode ended are NaN.
         """
-        return read_table(RunFolder(self.directory).table)
+        return read_table(RunFolder(self.directory).recorded_table)
 
     @property
     def final(self) -> dict[str, float]:
@@ -206,8 +207,8 @@ def train(
     config = compose_new(overrides)
     folder = Path(config.hydra.run.dir if directory is None else directory)
     with open_dict(config):
-        del config["hydra"]
-    return _carry_out(config, folder, continues=False)
+        hydra = config.pop("hydra")
+    return _carry_out(config, folder, hydra)
 
 
 def resume(
@@ -239,20 +240,23 @@ def resume(
     if imports is not None:
         overrides = note_imports(modules, overrides)
     folder = Path(directory).expanduser()
-    return _carry_out(compose_resumed(folder, overrides), folder, continues=True)
+    return _carry_out(compose_resumed(folder, overrides), folder)
 
 
-def _carry_out(config: DictConfig, folder: Path, *, continues: bool) -> Run:
+def _carry_out(config: DictConfig, folder: Path, hydra: DictConfig | None = None) -> Run:
+    """Train or, without Hydra's own configuration, go on training."""
     complete(config, RunFolder(folder))
     is_new, has_begun = not folder.exists(), False
     try:
         with held(RunFolder(folder)):
-            trainer = prepare(config, folder, continues)
+            trainer = prepare(config, folder, continues=hydra is None)
             has_begun = True
             if trainer is None:
                 if RunFolder(folder).certifying.exists():
                     certify_ended(folder)
                 return Run(folder)
+            if hydra is not None:
+                write_notes(RunFolder(folder), config, hydra)
             trainer.run()
     finally:
         if is_new and not has_begun:

@@ -125,7 +125,7 @@ def _check_name(name: str, schema: type[DataclassInstance]) -> None:
 def _merged(schema: type[Schema], read: Callable[[], DictConfig], shown: str) -> Schema:
     try:
         given = read()
-        _check_switches(given, schema)
+        _check_kinds(given, schema)
         merged = OmegaConf.merge(OmegaConf.structured(schema), given)
         return OmegaConf.to_object(merged)  # type: ignore[return-value]
     except OmegaConfBaseException as error:
@@ -135,10 +135,15 @@ def _merged(schema: type[Schema], read: Callable[[], DictConfig], shown: str) ->
         raise OptionError(f"{shown}: a value cannot be read: {words}") from error
 
 
-def _check_switches(given: DictConfig, schema: type[DataclassInstance]) -> None:
-    """OmegaConf takes every number for a boolean."""
+def _check_kinds(given: DictConfig, schema: type[DataclassInstance]) -> None:
+    """OmegaConf takes every number for a boolean, and says of a mapping that it is a Dict."""
     for field in fields(schema):
         value = given.get(field.name)
+        if field.default_factory is dict and not isinstance(value, Mapping | None):
+            raise OptionError(
+                f"{field.name}={value}: it takes keys with values, {field.name}.KEY=VALUE: "
+                f"{field.metadata['help']}."
+            )
         is_number = isinstance(value, int | float) and not isinstance(value, bool)
         if isinstance(field.default, bool) and is_number:
             raise OptionError(f"{field.name}={value}: it must be true or false.")

@@ -7,7 +7,7 @@ from itertools import count
 from pathlib import Path
 from typing import Any
 
-from hydra.core.hydra_config import HydraConfig
+from hydra.conf import HydraConf
 from hydra.experimental.callback import Callback
 from omegaconf import DictConfig, OmegaConf, read_write
 
@@ -48,13 +48,17 @@ def _make(path: Path) -> bool:
     return True
 
 
-def write_notes(folder: RunFolder, config: DictConfig) -> None:
-    """Write what Hydra would have written before it was known whether the run may begin here."""
-    surroundings: Any = HydraConfig.instance().cfg
+def write_notes(folder: RunFolder, config: DictConfig, hydra: HydraConf | DictConfig) -> None:
+    """Write what Hydra would have written before it was known whether the run may begin here.
+
+    Args:
+        folder: Of the run.
+        config: Its configuration.
+        hydra: Hydra's own.
+    """
     folder.notes.mkdir(exist_ok=True)
-    overrides = surroundings.hydra.overrides.task
-    notes = ((folder.composed, config), (folder.surroundings, surroundings),
-             (folder.overrides, overrides))  # fmt: skip
+    notes = ((folder.composed, config), (folder.surroundings, OmegaConf.create({"hydra": hydra})),
+             (folder.overrides, hydra.overrides.task))  # fmt: skip
     for path, content in notes:
         with replacing(path) as unfinished:
             OmegaConf.save(content, unfinished)

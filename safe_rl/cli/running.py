@@ -138,7 +138,7 @@ def run(config: DictConfig) -> None:
         # the last is what is not finite: where it stands says less than the message
         with in_a_line(OSError, ConfigError, FloatingPointError):
             if not continues or (is_job and not folder.notes.exists()):
-                write_notes(folder, config)
+                write_notes(folder, config, HydraConfig.get())
             outcome = trainer.run()
     if trainer.interrupted_by is not None:
         again = f"{_this_command()} resume={folder.directory}"

@@ -273,7 +273,8 @@ def _command(
     """The command line, with what it did not say in its overrides."""
     words = ["python", "train.py"]
     for source in _select(hydra, "hydra", "runtime", "config_sources") or ():
-        if _select(source, "provider") == "command-line":
+        # of --config-dir, and of Python's config_dir
+        if str(_select(source, "provider")).endswith("command-line"):
             words.append(f"--config-dir={clean(_select(source, 'path'))}")
     frames = config["frames"]
     # a run that was continued for longer

@@ -96,7 +96,7 @@ def _evaluation_kept(path: Path) -> str:
 def _surroundings_kept(path: Path) -> str:
     """Of Hydra's configuration its version, and the folders that the command line has named."""
     runtime = read_yaml(path)["hydra"]["runtime"]
-    sources = [s for s in runtime["config_sources"] if s["provider"] == "command-line"]
+    sources = [s for s in runtime["config_sources"] if s["provider"].endswith("command-line")]
     if start := runtime.get("cwd"):  # an archive's has none
         # as a person would type them where the run was started
         sources = [{**s, "path": os.path.relpath(s["path"], start)} for s in sources]

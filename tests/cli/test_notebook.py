@@ -20,6 +20,8 @@ import safe_rl
 from safe_rl.cli.python_settings import compose_new, overrides_of, search_path
 from safe_rl.envs import ConfigError, store_configs
 from safe_rl.evaluation.loading import find_checkpoint
+from safe_rl.reporting.recorded import find_runs
+from safe_rl.runs.keeping import keep_runs
 from safe_rl.runs.table import read_table
 from safe_rl.training.trainer import Trainer
 
@@ -66,6 +68,34 @@ def test_a_run_is_opened_again(run):
         safe_rl.load(run.directory, checkpoint="newest")
     with pytest.raises(FileNotFoundError, match="not the folder of a run"):
         safe_rl.load(run.directory / "nowhere")
+
+
+def test_an_archived_run_has_its_figures_and_says_why_it_has_no_policy(run, tmp_path):
+    keep_runs([run.directory], run.directory, tmp_path)
+    assert safe_rl.Run(tmp_path).final == run.final
+    with pytest.raises(FileNotFoundError, match="no last checkpoint: it is of an archive"):
+        safe_rl.load(tmp_path)
+
+
+def test_the_report_has_the_command_of_a_run_from_python(tmp_path):
+    folder = tmp_path / "mine"
+    folder.mkdir()
+    safe_rl.train(
+        "PointGoal1", algo="cpo", frames=40, directory=tmp_path / "runs" / "a", config_dir=folder,
+        cost_limits={"cost": 10}, **SMALL,
+    )  # fmt: skip
+    safe_rl.resume(tmp_path / "runs" / "a", frames=80)
+    keep_runs([tmp_path / "runs" / "a"], tmp_path / "runs", tmp_path / "kept")
+    for root in ("runs", "kept"):
+        (found,), skipped = find_runs(tmp_path / root)
+        assert not skipped
+        begin, *words = found.command.split(" env=PointGoal1 algo=cpo ")
+        assert begin.startswith("python train.py --config-dir=")
+        assert begin.endswith("mine")
+        assert "'cost_limits={cost:10}' num_envs=2" in words[0]
+        assert words[0].endswith(" frames=80")
+        # as a plan or a slate compares it
+        assert "env.num_steps=20" in found.overrides
 
 
 def test_a_run_with_modules_is_opened_without_them_if_that_is_said(run, tmp_path):

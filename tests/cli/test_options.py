@@ -38,6 +38,10 @@ def test_mappings_are_read_as_training_reads_them():
 @pytest.mark.parametrize(
     ("argument", "message"),
     [
+        (
+            "env=CarGoal2",
+            r"env=CarGoal2: it takes keys with values, env\.KEY=VALUE: .*hazards_num=12",
+        ),
         ("epsiodes=3", "Unknown option 'epsiodes'. Did you mean 'episodes'?"),
         ("episodes", "'episodes' is not an option: options are written key=value"),
         ("episodes=many", "'many'.*option 'episodes'"),
