@@ -55,7 +55,7 @@ def lacking_table(experiments: Sequence[Experiment], needed: int) -> Table:
                         "slate": slate,
                         "algorithm": algorithm,
                         "runs": sum(map(len, missing.values())),
-                        "commands": "\n".join(_commands(own[0], missing)),
+                        "commands": "\n".join(_commands(own, missing)) or "not recorded",
                     }
                 )
     columns = [Column(name, ("{}", name)) for name in ("slate", "algorithm")]
@@ -64,9 +64,14 @@ def lacking_table(experiments: Sequence[Experiment], needed: int) -> Table:
     return Table("missing", "What slates still lack", columns, records, note)
 
 
-def _commands(example: Experiment, missing: Mapping[str, tuple[int, ...]]) -> Iterator[str]:
-    """Command lines for missing runs: a sweep for every set of seeds."""
-    run = example.runs[0]
+def _commands(
+    experiments: Sequence[Experiment], missing: Mapping[str, tuple[int, ...]]
+) -> Iterator[str]:
+    """Command lines for missing runs: a sweep for every set of seeds; none if none is recorded."""
+    known = [run for e in experiments for run in e.runs if run.overrides is not None]
+    if not known:
+        return
+    run = known[0]
     kept = [override for override in run.overrides or () if _is_of_the_algorithm(override)]
     for seeds in dict.fromkeys(missing.values()):
         environments = ",".join(name for name, own in missing.items() if own == seeds)

@@ -285,6 +285,18 @@ def test_an_incomplete_slate_says_which_runs_it_lacks(tmp_path):
     assert "PointPush1" not in more
 
 
+def test_commands_of_missing_runs_are_made_of_recorded_ones_only(tmp_path):
+    said = ["algo=ppo", "frames=1_000", "+note=x"]
+    runs = [write_run(tmp_path, env, overrides=said) for env in ("PointGoal1", "PointGoal2")]
+    (runs[0] / ".hydra" / "overrides.yaml").unlink()
+    commands = [r["commands"] for r in lacking_table(experiments_in(tmp_path), 1).records]
+    assert commands
+    assert all("algo=ppo frames=1_000 +note=x seed=" in command for command in commands)
+    (runs[1] / ".hydra" / "overrides.yaml").unlink()
+    records = lacking_table(experiments_in(tmp_path), 1).records
+    assert {record["commands"] for record in records} == {"not recorded"}
+
+
 def test_the_missing_runs_of_a_variant_are_those_of_the_variant(tmp_path):
     said = [
         *("env=PointGoal1", "env.num_steps=1000", "algo=cpo", "preset=paper", "+seed=0"),
