@@ -167,7 +167,7 @@ def _is_of(run: Run, chosen: Mapping[str, Any]) -> bool:
     settings |= {"env": run.config["env"].get("name"), "algo": run.algorithm}
     # what else a command line has chosen makes it another experiment
     words = (override.lstrip("+~").partition("=") for override in run.overrides or ())
-    said = {key: value for key, _, value in words}
+    said = {key: value.strip("'") for key, _, value in words}  # Python's have quotes
     others = [key for key in said if role_of(key).names_experiment and key not in chosen]
     limits = chosen.get("cost_limits")
     # a limit that the plan does not name makes it another one, too

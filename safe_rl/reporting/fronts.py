@@ -60,10 +60,10 @@ def draw_fronts(records: Sequence[Record], styles: Mapping[str, Style]) -> Figur
     figure = Figure(figsize=(WIDTH, 3.4 * rows + 0.3), layout="constrained")
     panels = figure.subplots(rows, columns, squeeze=False).ravel()
     # a family's is that of the first of its experiments
-    colours = {r["family"]: styles[r["algorithm"]].colour for r in reversed(records)}
+    looks = {r["family"]: styles[r["algorithm"]] for r in reversed(records)}
     markers = _markers(records)
     for axis, (title, own) in zip(panels, groups.items(), strict=False):
-        _draw_front(axis, own, colours, markers)
+        _draw_front(axis, own, looks, markers)
         axis.set_title(literal(fill(title, 44)), fontsize=10, fontweight="bold")
         axis.set(xlabel="final episode cost", ylabel="final return")
         set_grid(axis)
@@ -82,7 +82,7 @@ def _markers(records: Sequence[Record]) -> dict[float | None, str]:
 def _draw_front(
     axis: Axes,
     records: Sequence[Record],
-    colours: Mapping[str, str],
+    looks: Mapping[str, Style],
     markers: Mapping[float | None, str],
 ) -> None:
     points = np.array([(r["episode_cost"], r["episode_return"]) for r in records])
@@ -92,11 +92,14 @@ def _draw_front(
         own = [r for r in records if r["family"] == family]
         own.sort(key=lambda r: r.get("limit_cost", np.inf))
         joined = np.array([(r["episode_cost"], r["episode_return"]) for r in own]).T
-        axis.plot(*joined, color=colours[family], linewidth=1.5, alpha=0.7, label=literal(family))
+        colour, line, _ = looks[family]
+        axis.plot(
+            *joined, color=colour, linestyle=line, linewidth=1.5, alpha=0.7, label=literal(family)
+        )
         for record, cost, value in zip(own, *joined, strict=True):
             axis.errorbar(
                 cost, value, xerr=record["episode_cost_std"], yerr=record["episode_return_std"],
-                color=colours[family], linestyle="", elinewidth=1, markersize=7,
+                color=colour, linestyle="", elinewidth=1, markersize=7,
                 marker=markers[record.get("limit_cost")],
             )  # fmt: skip
     there = {r.get("limit_cost") for r in records}

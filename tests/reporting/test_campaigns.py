@@ -114,9 +114,10 @@ def test_a_run_with_a_further_limit_is_another_one(tmp_path):
     assert states(tables) == [("—", "—", "0"), ("0", "—", "—")]
 
 
-def test_a_plan_can_choose_from_a_group(tmp_path):
+@pytest.mark.parametrize("chosen", ["+risk=cvar", "risk='cvar'"])
+def test_a_plan_can_choose_from_a_group(chosen, tmp_path):
     plan(tmp_path, {**ONE, "risk": ["cvar", "chance"]})
-    said = ["env=PointGoal1", "algo=cpo", "+risk=cvar"]
+    said = ["env=PointGoal1", "algo=cpo", chosen]
     write_run(tmp_path, algo="cpo", risk={"_target_": "a.CVaR"}, overrides=said, **ROWS)
     (tables,) = tables_of(tmp_path)[0].values()
     assert states(tables) == [("0", "—", "—"), ("—", "—", "0")]
