@@ -1,16 +1,19 @@
 """Environments that are not ours, with costs in `info`, in TorchRL and under our algorithms."""
 
+import copy
+import pickle
 import warnings
 
 import gymnasium
 import numpy as np
 import pytest
 import torch
+from gymnasium_envs import Walk
 from run_configs import compose_config
 from torchrl.envs import RewardSum, TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
-from safe_rl.envs import ConfigError, SafetyGymEnv, from_gymnasium, store_configs
+from safe_rl.envs import ConfigError, SafetyGymEnv, from_gymnasium, make_env, store_configs
 from safe_rl.runs.table import read_table
 from safe_rl.training.building import build_trainer, seed_everything
 
@@ -73,21 +76,50 @@ def test_costs_stand_beside_the_reward_and_are_those_of_the_environment():
 
 
 @pytest.mark.parametrize("workers", [0, 2])
-def test_a_cost_that_no_info_has_is_told_with_the_nearest_that_there_is(workers):
-    keys = ["cost_upright", "cost_spede"]
+def test_a_cost_that_no_info_has_is_told_after_an_episode(workers):
+    keys = ["cost_upright", "cost_power"]
     env = from_gymnasium(
         make_pendulum, num_envs=2, num_steps=5, cost_keys=keys, seed=0, workers=workers
     )
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         env.rollout(5)
-    told = r"'cost_spede' is in no info of the first 5 steps.*Did you mean 'cost_speed'\?.*torque"
+    told = r"'cost_power' is in no info of the first 5 steps.*infos have cost_speed, torque"
     with pytest.warns(UserWarning, match=told) as caught:
         step = env.rollout(20, break_when_any_done=False)["next"]
     assert len(caught) == 1
-    assert step["cost_spede"].eq(0).all()
+    assert step["cost_power"].eq(0).all()
     assert step["cost_upright"].gt(0).any()
     env.close()
+
+
+@pytest.mark.parametrize("workers", [0, 2])
+def test_a_misspelt_cost_is_an_error_that_names_the_right_one(workers):
+    env = from_gymnasium(
+        make_pendulum, num_envs=2, num_steps=5, cost_keys=["cost_spede"], seed=0, workers=workers
+    )
+    with pytest.raises(ConfigError, match=r"'cost_spede'. Did you mean 'cost_speed'\?"):
+        env.rollout(1)
+    env.close()
+
+
+def test_a_cost_that_the_first_step_did_not_report_and_nobody_counts_is_told():
+    class Crash(Counter):
+        costs = ("cost_energy",)
+
+        def step(self, action):
+            *values, _ = super().step(action)
+            names = [*self.costs, "cost_crash"] if self.count == 3 else self.costs
+            return *values, dict.fromkeys(names, 1.0)
+
+    env = from_gymnasium(Crash, num_steps=4, seed=4)
+    with pytest.warns(UserWarning, match="'cost_crash'.*counts nowhere.*cost_energy") as caught:
+        assert env.rollout(12, break_when_any_done=False)["next", "cost"].sum() == 12
+    assert len(caught) == 1
+    Crash.costs = ("cost",)  # which has all in it
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        from_gymnasium(Crash, num_steps=4, seed=4).rollout(4)
 
 
 @pytest.mark.parametrize("cost", [np.ones(3), "hot", None])
@@ -233,6 +265,70 @@ def test_our_algorithms_train_on_it(tmp_path):
     assert table["episode_length"] == [200, 200]
     assert all(cost > 0 for cost in table["episode_cost_speed"])
     assert table["multiplier_cost_speed"][0] != table["multiplier_cost_speed"][1]
+
+
+def moving(tensordict):
+    """Actions that are as different as what is seen."""
+    action = torch.sin(40 * tensordict["observation"].sum(-1, keepdim=True))
+    return tensordict.set("action", action)
+
+
+@pytest.mark.parametrize(
+    "copied", [copy.deepcopy, lambda env: pickle.loads(pickle.dumps(env))], ids=["copy", "pickle"]
+)
+def test_a_copy_goes_on_as_the_original_does(copied):
+    env = from_gymnasium(lambda: Walk(), num_envs=3, num_steps=7, cost_keys=["fast", "far"], seed=1)
+    before = env.rollout(3, moving)[:, -1]["next"]
+    go_on = {"auto_reset": False, "break_when_any_done": False}
+    expected, got = (
+        one.rollout(20, moving, tensordict=before.clone(), **go_on) for one in (env, copied(env))
+    )
+    assert expected["next", "done"].sum() > 3
+    for key in ("observation", "reward", "cost", "done"):
+        assert torch.equal(got["next", key], expected["next", key])
+
+
+def test_a_copy_with_workers_begins_where_the_seed_does():
+    env = from_gymnasium(
+        "Walk-v0", num_envs=3, num_steps=7, cost_keys=["fast", "far"], seed=1, workers=2
+    )
+    env.rollout(3, moving)
+    other = pickle.loads(pickle.dumps(env))
+    env.set_seed(1)
+    expected, got = env.rollout(9, moving), other.rollout(9, moving)
+    env.close()
+    other.close()
+    assert torch.equal(got["observation"], expected["observation"])
+
+
+def test_the_length_of_episodes_that_is_asked_for_takes_the_place_of_the_registered_one():
+    node = {"_target_": "safe_rl.envs.gymnasium.make_gymnasium", "id": "Walk-v0"}
+    node |= {"cost_keys": ["far"], "num_steps": 40, "kwargs": {"border": 99.0}}
+    ours = from_gymnasium("Walk-v0", cost_keys=["far"], num_steps=40, seed=0, border=99.0)
+    for env in (ours, make_env(node, seed=0)):
+        assert env.rollout(60).shape == (1, env.max_episode_steps) == (1, 40)
+
+
+class WholeNumbers(Counter):
+    action_space = gymnasium.spaces.Box(0, 5, (2,), np.int64)
+
+
+@pytest.mark.parametrize(
+    ("given", "arguments", "told"),
+    [
+        (Counter(), {}, "an id, or a function that makes an environment; got <.*Counter"),
+        (lambda: 3, {}, "makes no environment of Gymnasium.*but 3"),
+        (WholeNumbers, {}, "whole numbers in a Box.*Discrete or MultiDiscrete"),
+        (Counter, {"worker": 2}, "'worker' is for gymnasium.make.*Did you mean 'workers'"),
+        (Counter, {"workers": -1}, "'workers' must be an integer of at least 0"),
+        (Counter, {"num_envs": 0}, "'num_envs' must be an integer of at least 1"),
+        (Counter, {"num_steps": 0}, "'num_steps' must be an integer of at least 1"),
+        (Counter, {"highest_costs": {"cots": 1.0}}, "'cots', which is no cost. .*'cost'"),
+    ],
+)
+def test_arguments_that_are_none_are_said(given, arguments, told):
+    with pytest.raises(ValueError, match=told):
+        from_gymnasium(given, **{"num_steps": 5, **arguments})
 
 
 def test_errors_say_what_to_change():

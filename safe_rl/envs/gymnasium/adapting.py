@@ -58,10 +58,11 @@ def columns_of(spec: TensorSpec) -> dict[str, slice]:
     return {name: slice(end - sizes[name], end) for name, end in zip(sizes, ends, strict=True)}
 
 
+# Not by the wrappers that Gymnasium has for both: they keep lambdas, which no pickle takes.
 def _flat(env: gymnasium.Env) -> gymnasium.Env:
-    env = gymnasium.wrappers.FlattenObservation(env)
-    vectors = Box(-np.inf, np.inf, env.observation_space.shape, np.float32)
-    return gymnasium.wrappers.TransformObservation(env, _single_precision, vectors)
+    space = env.observation_space
+    vectors = Box(-np.inf, np.inf, (gymnasium.spaces.flatdim(space),), np.float32)
+    return gymnasium.wrappers.TransformObservation(env, partial(_vector, space), vectors)
 
 
 def _by_entry(env: gymnasium.Env) -> gymnasium.Env:
@@ -91,9 +92,7 @@ def _entry_space(space: gymnasium.Space) -> gymnasium.Space:
 def _entries(space: Dict, observation: dict[str, Any]) -> dict[str, dict[str, np.ndarray]]:
     """Pictures as they are, all others as vectors, below one name."""
     entries = {
-        name: observation[name]
-        if _is_picture(part)
-        else _single_precision(np.asarray(gymnasium.spaces.flatten(part, observation[name])))
+        name: observation[name] if _is_picture(part) else _vector(part, observation[name])
         for name, part in space.items()
     }
     return {_OBSERVATION: entries}
@@ -101,12 +100,17 @@ def _entries(space: Dict, observation: dict[str, Any]) -> dict[str, dict[str, np
 
 def _with_plain_actions(env: gymnasium.Env) -> gymnasium.Env:
     actions = env.action_space
+    if isinstance(actions, Box) and not np.issubdtype(actions.dtype, np.floating):
+        raise ValueError(
+            f"{env.unwrapped} has actions that are whole numbers in a Box, {actions}: a choice of "
+            "one of several is Discrete or MultiDiscrete."
+        )
     if isinstance(actions, Box) and actions.is_bounded():
-        env = gymnasium.wrappers.RescaleAction(env, np.float32(-1.0), np.float32(1.0))
-        return gymnasium.wrappers.TransformAction(env, _within_bounds, env.action_space)
+        plain: gymnasium.Space = Box(-1.0, 1.0, actions.shape, actions.dtype.type)
+        return gymnasium.wrappers.TransformAction(env, partial(_stretched, actions), plain)
     start = getattr(actions, "start", None)
     if isinstance(actions, Discrete):
-        plain: gymnasium.Space = Discrete(int(actions.n))
+        plain = Discrete(int(actions.n))
     elif isinstance(actions, MultiDiscrete) and actions.nvec.ndim == 1:
         plain = MultiDiscrete(actions.nvec)
     else:
@@ -119,9 +123,11 @@ def _with_plain_actions(env: gymnasium.Env) -> gymnasium.Env:
     return gymnasium.wrappers.TransformAction(env, partial(np.add, start), plain)
 
 
-def _single_precision(observation: np.ndarray) -> np.ndarray:
-    return observation.astype(np.float32)
+def _vector(space: gymnasium.Space, observation: Any) -> np.ndarray:
+    return np.asarray(gymnasium.spaces.flatten(space, observation)).astype(np.float32)
 
 
-def _within_bounds(action: np.ndarray) -> np.ndarray:
-    return np.clip(action, -1, 1)
+def _stretched(space: Box, action: np.ndarray) -> np.ndarray:
+    """From [-1, 1], and what is beyond, to the bounds."""
+    middle, half = space.high / 2 + space.low / 2, space.high / 2 - space.low / 2
+    return np.clip(middle + half * action, space.low, space.high)

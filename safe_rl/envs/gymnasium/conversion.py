@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
+from inspect import signature
 from multiprocessing import current_process
 from typing import Any
 
@@ -17,7 +18,7 @@ from torchrl.envs import GymWrapper, Transform, TransformedEnv
 
 from safe_rl.envs.cost_specs import cost_spec
 from safe_rl.envs.costs import COST, is_cost
-from safe_rl.envs.errors import require_names
+from safe_rl.envs.errors import ConfigError, nearest, require_integer, require_names
 from safe_rl.envs.gymnasium.adapting import adapt, check_workers, columns_of
 from safe_rl.envs.gymnasium.processes import ProcessVectorEnv
 from safe_rl.envs.gymnasium.reading import CostReader, FloatCosts
@@ -158,22 +159,25 @@ def from_gymnasium(
 
     Returns:
         An environment [N], with the costs in its reward spec. Without a cost called `cost` it gets
-        one, the sum of the others.
+        one, the sum of the others. A copy (`copy`, `pickle`) goes on as far as copies of what is
+        within do; with workers it begins where its seed does.
 
     Raises:
         ValueError: if no costs are reported, the actions are neither continuous and bounded nor
-            choices, the observations are no arrays and not to be flattened, or the length of
-            episodes is not known.
+            choices, the observations are no arrays and not to be flattened, the length of
+            episodes is not known, or an argument is none.
 
     Examples:
         >>> env = from_gymnasium("Safexp-PointGoal1-v0", num_envs=2, num_steps=1000, seed=0)
         >>> env.rollout(3)["next", "cost_hazards"].shape
         torch.Size([2, 3, 1])
     """
+    require_integer("num_envs", num_envs, lowest=1)
+    require_integer("workers", workers, lowest=0)
     require_names("cost_keys", cost_keys)
-    make: MakeEnv = partial(gymnasium.make, env, **kwargs) if isinstance(env, str) else env
+    make = _maker(env, kwargs, num_steps)
     keys, length = describe(make, cost_keys, num_steps, flatten)
-    _check_keys(keys)
+    _check_keys(keys, highest_costs or {})
     make_adapted = partial(_make_adapted, make, length, flatten, keys)
     worlds: VectorEnv
     if workers and not current_process().daemon:
@@ -182,6 +186,7 @@ def from_gymnasium(
         worlds = ProcessVectorEnv(make_adapted, num_envs, min(workers, num_envs), keys)
     else:
         worlds = SyncVectorEnv([make_adapted] * num_envs, autoreset_mode=AutoresetMode.DISABLED)
+        worlds.env_fns = ()  # not asked again: functions of one's own might not be pickled
     return from_vector(worlds, keys, length, seed=seed, device=device, highest_costs=highest_costs)
 
 
@@ -220,7 +225,11 @@ def describe(
     Raises:
         ValueError: if the environment does not tell, or cannot be used.
     """
+    if num_steps is not None:
+        require_integer("num_steps", num_steps, lowest=1)
     probe = make()
+    if not isinstance(probe, gymnasium.Env):
+        raise ConfigError(f"It makes no environment of Gymnasium (gymnasium.Env), but {probe!r}.")
     try:
         adapted = adapt(probe, flatten=flatten)
         keys = _find_costs(adapted) if cost_keys is None else [*dict.fromkeys(cost_keys)]
@@ -252,11 +261,26 @@ def _fit(picture: np.ndarray, width: int, height: int) -> np.ndarray:
     return canvas
 
 
-def _check_keys(keys: Sequence[str]) -> None:
+def _maker(env: Any, kwargs: Mapping[str, Any], num_steps: int | None) -> MakeEnv:
+    if isinstance(env, str):
+        length = {} if num_steps is None else {"max_episode_steps": num_steps}
+        # what is registered here goes with it to other processes
+        return partial(gymnasium.make, gymnasium.registry.get(env, env), **{**length, **kwargs})
+    if isinstance(env, gymnasium.Env) or not callable(env):
+        raise ConfigError(f"Give an id, or a function that makes an environment; got {env!r}.")
+    for key in kwargs:
+        hint = nearest(key, signature(from_gymnasium).parameters)
+        raise ConfigError(f"'{key}' is for gymnasium.make, and a function makes these.{hint}")
+    return env
+
+
+def _check_keys(keys: Sequence[str], highest_costs: Mapping[str, float]) -> None:
     if not keys:
         raise ValueError("'cost_keys' is empty: name costs in info, or leave it away (null).")
     for key in _NO_COSTS.intersection(keys):
         raise ValueError(f"'cost_keys' are names of numbers in info, and '{key}' is none of them.")
+    for key in set(highest_costs).difference(keys):
+        raise ValueError(f"'highest_costs' has '{key}', which is no cost.{nearest(key, keys)}")
 
 
 def _find_costs(probe: gymnasium.Env) -> list[str]:
@@ -274,7 +298,7 @@ def _find_costs(probe: gymnasium.Env) -> list[str]:
 
 def _episode_length(probe: gymnasium.Env, num_steps: int | None) -> int:
     known = None if probe.spec is None else probe.spec.max_episode_steps
-    length = num_steps or known
+    length = known if num_steps is None else num_steps
     if length is None:
         raise ValueError(f"{probe} does not say how long episodes are: give 'num_steps'.")
     return length

@@ -91,6 +91,8 @@ def maker(config: Mapping[str, Any]) -> Callable[[], gymnasium.Env]:
             "registers an environment is imported by import=my_module."
         ) from error
     kwargs = dict(config["kwargs"] or {})
+    if config["num_steps"] is not None:
+        kwargs.setdefault("max_episode_steps", config["num_steps"])
     if config["render_mode"] is not None:
         kwargs["render_mode"] = config["render_mode"]
     make = partial(gymnasium.make, spec, **kwargs)

@@ -26,6 +26,8 @@ SECONDS_TO_END = 5.0
 class ProcessVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
     """N environments in W processes, with array observations; ended ones are reset by a mask.
 
+    A copy (`copy`, `pickle`) has processes of its own, and begins where its last seed does.
+
     Args:
         make: makes one environment, in a process of its own.
         num_envs: N.
@@ -55,6 +57,8 @@ class ProcessVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         shares = [len(share) for share in np.array_split(np.arange(num_envs), workers)]
         self._bounds = np.cumsum(shares)[:-1]
         self._info_keys = list(info_keys)
+        self._make = make
+        self._seed: int | Sequence[int] | None = None
         self._workers: list[tuple[Any, Connection]] = []
         # Forked processes could inherit locks that a thread of torch's holds.
         context = get_context("spawn")
@@ -82,6 +86,7 @@ class ProcessVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         self, *, seed: int | Sequence[int] | None = None, options: dict[str, Any] | None = None
     ) -> tuple[np.ndarray, dict[str, Any]]:
         """Start new episodes, everywhere or where `options["reset_mask"]` [N] says."""
+        self._seed = self._seed if seed is None else seed
         if isinstance(seed, int):
             seed = [seed + row for row in range(self.num_envs)]
         others = dict(options or {})
@@ -132,6 +137,10 @@ class ProcessVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
                 process.kill()
         self._workers = []
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        made_of = CloudpickleWrapper(self._make), self.num_envs, len(self._workers)
+        return _begun, (*made_of, self._info_keys, self._seed)
+
     def _send(self, worker: int, method: str, *args: Any, **kwargs: Any) -> None:
         with suppress(BrokenPipeError):  # that it has died is told when its answer is missing
             self._workers[worker][1].send((method, args, kwargs))
@@ -151,6 +160,18 @@ class ProcessVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
                 raise RuntimeError(f"An environment failed in its process:\n{failure}")
             answers.append(answer)
         return answers
+
+
+def _begun(
+    make: CloudpickleWrapper,
+    num_envs: int,
+    workers: int,
+    info_keys: Sequence[str],
+    seed: int | Sequence[int] | None,
+) -> ProcessVectorEnv:
+    envs = ProcessVectorEnv(make.fn, num_envs, workers, info_keys)
+    envs.reset(seed=seed)
+    return envs
 
 
 def _serve(connection: Connection, make: CloudpickleWrapper, number: int) -> None:

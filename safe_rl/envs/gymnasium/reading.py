@@ -5,7 +5,8 @@ from __future__ import annotations
 import math
 import reprlib
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from difflib import get_close_matches
 from typing import Any
 
 import gymnasium
@@ -17,9 +18,13 @@ from torchrl.data import Composite
 from torchrl.envs.gym_like import BaseInfoDictReader
 
 from safe_rl.envs.cost_specs import cost_spec
+from safe_rl.envs.costs import COST, is_cost
 from safe_rl.envs.errors import ConfigError, nearest
 
 __all__ = ["CostReader", "FloatCosts"]
+
+_MISSPELT = 0.85
+"""Ratio of difflib's above which two names are thought to be one."""
 
 
 class FloatCosts(gymnasium.Wrapper):
@@ -59,8 +64,9 @@ class FloatCosts(gymnasium.Wrapper):
 class CostReader(BaseInfoDictReader):
     """Reads costs from `info` into the TensorDict, float32 [N, 1]; 0 where none is reported.
 
-    Some environments report a cost only where it occurs. A name that no info has had for as long as
-    an episode lasts may be a wrong one: a warning says so, once, with the nearest that there is.
+    Some environments report a cost only where it occurs. So a warning says, once, which name no
+    info has had for as long as an episode lasts, and which cost nobody counts because it was first
+    reported later; a name that is missing beside one that is nearly the same is an error.
 
     Args:
         cost_keys: names in `info`.
@@ -75,7 +81,7 @@ class CostReader(BaseInfoDictReader):
         tensor([0., 0.])
 
     Raises:
-        ConfigError: by the call, if a cost is not one number per step.
+        ConfigError: by the call, if a cost is not one number per step, or its name is misspelt.
     """
 
     def __init__(
@@ -94,8 +100,8 @@ class CostReader(BaseInfoDictReader):
 
     def __call__(self, info_dict: dict[str, Any], tensordict: TensorDictBase) -> TensorDictBase:
         """Write the costs of a step."""
-        if self._unseen:
-            self._look_for_unseen(info_dict, is_step="reward" in tensordict)
+        if "reward" in tensordict:
+            self._look_at_names(info_dict)
         for key in self._cost_keys:
             tensordict[key] = self._one_each(key, info_dict.get(key, np.zeros(self._shape)))
         return tensordict
@@ -109,26 +115,47 @@ class CostReader(BaseInfoDictReader):
                 f"{math.prod(self._shape)} environments brought {reprlib.repr(value)}."
             ) from None
 
-    def _look_for_unseen(self, info_dict: Mapping[str, Any], is_step: bool) -> None:
-        self._unseen.difference_update(info_dict)
+    def _look_at_names(self, info_dict: Mapping[str, Any]) -> None:
+        """Take note of the names that a step brings."""
         # names that begin so are Gymnasium's masks
-        self._names.update(name for name in info_dict if not name.startswith("_"))
-        self._num_steps += is_step
-        if not self._unseen or self._patience is None or self._num_steps <= self._patience:
-            return
+        new = {name for name in info_dict if not name.startswith("_")} - self._names
+        self._names |= new
+        self._unseen -= new
         others = self._names.difference(self._cost_keys)
-        for key in sorted(self._unseen):
-            warnings.warn(
-                f"The cost '{key}' is in no info of the first {self._patience} steps, and counts "
-                f"as 0.{nearest(key, others)} The infos have "
-                f"{', '.join(sorted(others)) or 'no other'}. If it is reported only where it "
-                "occurs, it may not have occurred yet.",
-                stacklevel=2,
-            )
-        self._unseen.clear()
+        if new and self._num_steps and COST not in self._cost_keys:
+            _warn_of_uncounted(filter(is_cost, new & others), self._cost_keys)
+        for key in self._unseen if new else ():
+            if alike := get_close_matches(key, others, n=1, cutoff=_MISSPELT):
+                raise ConfigError(
+                    f"No info has the cost '{key}'. Did you mean '{alike[0]}'? If there are both, "
+                    f"let every step report '{key}', or name both in 'cost_keys'."
+                )
+        self._num_steps += 1
+        if self._patience is not None and self._num_steps > self._patience:
+            _warn_of_unseen(self._unseen, others, self._patience)
+            self._unseen.clear()
 
     @property
     def info_spec(self) -> Composite:
         """Shapes and types of the costs."""
         costs = {key: cost_spec(self._highest.get(key), self._shape) for key in self._cost_keys}
         return Composite(costs, shape=self._shape[:-1])
+
+
+def _warn_of_uncounted(keys: Iterable[str], named: Sequence[str]) -> None:
+    for key in keys:
+        warnings.warn(
+            f"A step reports the cost '{key}', which the first one did not, and which counts "
+            f"nowhere: 'cost_keys' are {', '.join(named)}. Name it there, too.",
+            stacklevel=4,
+        )
+
+
+def _warn_of_unseen(keys: Iterable[str], others: Collection[str], patience: int) -> None:
+    for key in sorted(keys):
+        warnings.warn(
+            f"The cost '{key}' is in no info of the first {patience} steps, and counts as 0."
+            f"{nearest(key, others)} The infos have {', '.join(sorted(others)) or 'no other'}. If "
+            "it is reported only where it occurs, it may not have occurred yet.",
+            stacklevel=4,
+        )
