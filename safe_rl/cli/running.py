@@ -35,7 +35,7 @@ from safe_rl.runs.folder import RunFolder
 from safe_rl.runs.lock import held
 from safe_rl.runs.resuming import is_finished, may_continue
 from safe_rl.training.building import build_trainer, physics_threads, seed_everything
-from safe_rl.training.trainer import Trainer
+from safe_rl.training.trainer import EpisodeError, Trainer
 from safe_rl.training.transfer import begin_from
 
 __all__ = ["complete", "prepare", "run"]
@@ -135,8 +135,8 @@ def run(config: DictConfig) -> None:
             if folder.certifying.exists():
                 _say_certificate(config, folder)
             return
-        # the last is what is not finite: where it stands says less than the message
-        with in_a_line(OSError, ConfigError, FloatingPointError):
+        # the last two are about the environment: where they stand says less than the message
+        with in_a_line(OSError, ConfigError, EpisodeError, FloatingPointError):
             if not continues or (is_job and not folder.notes.exists()):
                 write_notes(folder, config, HydraConfig.get())
             outcome = trainer.run()

@@ -1,6 +1,6 @@
 """Data collection with cost accounting, and transitions on disk."""
 
-from safe_rl.collectors.accounting import EpisodeAccounting, EpisodeStatistics
+from safe_rl.collectors.accounting import EpisodeAccounting, EpisodeError, EpisodeStatistics
 from safe_rl.collectors.datasets import read_dataset, safe_episodes
 from safe_rl.collectors.factory import make_collector
 from safe_rl.collectors.hdf5 import read_hdf5
@@ -13,6 +13,7 @@ from safe_rl.collectors.workers import (
 
 __all__ = [
     "EpisodeAccounting",
+    "EpisodeError",
     "EpisodeStatistics",
     "Recording",
     "StepRecorder",

@@ -12,7 +12,11 @@ from torch import Tensor
 
 from safe_rl.naming import key_name
 
-__all__ = ["EpisodeAccounting", "EpisodeStatistics"]
+__all__ = ["EpisodeAccounting", "EpisodeError", "EpisodeStatistics"]
+
+
+class EpisodeError(ValueError):
+    """Steps that a constrained problem does not have; the message says what the environment did."""
 
 
 @dataclass(frozen=True)
@@ -86,9 +90,11 @@ class EpisodeAccounting:
         reward_key: Key of the reward below ``"next"``.
         done_key: Key of the end of an episode below ``"next"``.
         device: Device of the batches.
+        longest: Largest number of steps of an episode, where that is known.
 
     Raises:
         KeyError: By :meth:`update`, if a key is not in the batch.
+        EpisodeError: By :meth:`update`, if a cost is below 0, or an episode too long.
         ValueError: By :meth:`update`, if the batch does not have the shape [N, T], or [T] with
             N = 1.
 
@@ -113,7 +119,9 @@ class EpisodeAccounting:
         reward_key: NestedKey = "reward",
         done_key: NestedKey = "done",
         device: torch.device | str | None = None,
+        longest: int | None = None,
     ) -> None:
+        self.longest = longest
         self.cost_keys = list(cost_keys)
         self.done_key = done_key
         self._signal_keys = [reward_key, *self.cost_keys]
@@ -137,10 +145,12 @@ class EpisodeAccounting:
                 f"environments: it needs [{num_envs}, T], as the collector returns it."
             )
         signals = torch.stack([self._column(batch, key) for key in self._signal_keys], -1)
+        self._require_costs(signals[..., 1:])
         signals = torch.cat([torch.ones_like(signals[..., :1]), signals], -1)
         before = self._open_sums[:, 2:]
         finished = self._close_episodes(signals, self._column(batch, self.done_key).long())
         finished = finished[finished[:, 0].isfinite()]
+        self._require_ends(finished[:, 0])
         self._totals += signals.sum((0, 1))
         names = [key_name(key) for key in self.cost_keys]
         rates = self._totals[2:] / self._totals[0]
@@ -165,6 +175,25 @@ class EpisodeAccounting:
         last = num_done.view(-1, 1, 1).expand(-1, 1, num_sums)
         self._open_sums = sums.gather(1, last).squeeze(1)
         return sums[is_finished]
+
+    def _require_costs(self, costs: Tensor) -> None:
+        """Refuse costs [N, T, k] below 0; those that are NaN are for others to name."""
+        for key, below in zip(self.cost_keys, (costs < 0).sum((0, 1)).tolist(), strict=True):
+            if below:
+                raise EpisodeError(
+                    f"The cost '{key_name(key)}' is below 0 in {below} of {costs[..., 0].numel()} "
+                    "steps, and nothing has been learnt from them. Costs are 0 or more: let the "
+                    "environment clamp them, or add the same to every step and to the limit."
+                )
+
+    def _require_ends(self, lengths: Tensor) -> None:
+        """Refuse episodes, ended with lengths [E] or open, that are longer than they may be."""
+        steps = torch.cat([lengths, self._open_sums[:, 0]]).nan_to_num().max().item()
+        if self.longest is not None and steps > self.longest:
+            raise EpisodeError(
+                f"An episode has {steps:g} steps, but the environment's 'max_episode_steps' is "
+                f"{self.longest}: it has to end episodes itself ('done' and 'truncated')."
+            )
 
     @staticmethod
     def _column(batch: TensorDictBase, key: NestedKey) -> Tensor:

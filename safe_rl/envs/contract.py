@@ -24,9 +24,11 @@ ACTIONS = (Bounded, Categorical, OneHot)
 class ConstrainedEnv(Protocol):
     """N environments that are stepped together: an `EnvBase` of batch size [N], and more.
 
-    It reads `action`: [N, A] bounded, or choices, [N] or [N, A] integers or [N, C] one-hot. It
-    writes `observation`, `reward` [N, 1], every one of `cost_keys` [N, 1], `done`, `terminated` and
-    `truncated`. Costs stand in the reward spec.
+    It reads `action`: [N, A] bounded, or choices, [N] or [N, A] integers or [N, C] one-hot.
+    Continuous ones come as policies draw them, from about -1 to 1 at first: it cuts them to its
+    bounds. It writes `observation`, vectors of float32 or pictures, `reward` [N, 1], every one of
+    `cost_keys` [N, 1], 0 or more, `done`, `terminated` and `truncated`. Costs stand in the reward
+    spec.
 
     Attributes:
         cost_keys: names of the costs; the aggregate `cost` is one of them.
@@ -159,6 +161,15 @@ def _shape_problems(env: EnvBase) -> Iterator[str]:
     if not isinstance(env.action_spec, ACTIONS):
         kind = type(env.action_spec).__name__
         yield f"its actions must be continuous and bounded, or choices, got {kind}."
+    for key, part in env.observation_spec.items(True, True):
+        is_seen = (key if isinstance(key, str) else key[0]) == "observation"
+        if is_seen and len(part.shape) == 2 and part.dtype != torch.float32:
+            name = key if isinstance(key, str) else ".".join(key)
+            yield f"'{name}' must be of float32, which networks take, got {part.dtype}."
+    ends = [str(key) for key in env.full_done_spec.keys(True, True)]
+    for key in ("done", "terminated", "truncated"):
+        if key not in ends:
+            yield f"its done spec must have '{key}', got {sorted(ends)}."
     steps = getattr(env, "max_episode_steps", None)
     if isinstance(steps, bool) or not isinstance(steps, int) or steps < 1:
         yield f"'max_episode_steps' must be the largest number of steps of an episode, got {steps}."
@@ -188,3 +199,9 @@ def _layout_problems(env: EnvBase) -> Iterator[str]:
             "'observation_layout' must map names to columns of 'observation', such as "
             f"{{'observation': slice(0, n)}}, got {layout}."
         )
+        return
+    seen = env.observation_spec.get("observation", None)
+    width = 0 if seen is None or isinstance(seen, Composite) else seen.shape[-1]
+    for name, columns in layout.items():
+        if width and len(seen.shape) == 2 and (columns.stop or 0) > width:
+            yield f"'observation_layout' has {columns} for '{name}', beyond the {width} columns."

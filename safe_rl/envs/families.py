@@ -12,7 +12,7 @@ from typing import Any
 
 import torch
 
-from safe_rl.envs.contract import ConstrainedEnv, check_constrained_env
+from safe_rl.envs.contract import ConstrainedEnv, ContractError, check_constrained_env
 from safe_rl.envs.errors import ConfigError, nearest
 from safe_rl.envs.names import env_names, env_node, known_names, stored_node
 from safe_rl.envs.safety_gym.env import SafetyGymEnv
@@ -63,6 +63,11 @@ def make_env(
         made = transform_env(made, transforms, evaluating=evaluating, seed=seed)
     if target is not None or transforms:
         check_constrained_env(made)
+    if list(made.batch_size) != [num_envs]:
+        raise ContractError(
+            f"{target} was asked for {num_envs} environments and made {made.batch_size[0]}: it has "
+            "to heed 'num_envs'."
+        )
     return made
 
 

@@ -18,7 +18,7 @@ from torchrl.envs import EnvBase
 from safe_rl.algorithms.contract import Algorithm, Stateful
 from safe_rl.algorithms.matrix_products import fast_products
 from safe_rl.algorithms.side_by_side import torch_threads
-from safe_rl.collectors import EpisodeAccounting, Recording, WorkerCollector
+from safe_rl.collectors import EpisodeAccounting, EpisodeError, Recording, WorkerCollector
 from safe_rl.runs.checkpoints import CheckpointStore
 from safe_rl.runs.lock import held
 from safe_rl.runs.record import RunRecord
@@ -26,7 +26,7 @@ from safe_rl.training.candidates import Candidates, Judged, epochs_until_judged
 from safe_rl.training.interrupts import StopRequest
 from safe_rl.training.state import Progress, WorldSnapshot
 
-__all__ = ["Evaluation", "Trainer"]
+__all__ = ["EpisodeError", "Evaluation", "Trainer"]
 
 # what only going on takes, which the last checkpoints have: several times what a policy is, and a
 # memory fills gigabytes
@@ -73,6 +73,7 @@ class Trainer:
             env.cost_keys,
             reward_key=getattr(env, "return_key", "reward"),
             device=collector.storing_device,
+            longest=env.max_episode_steps,
         )
         self.progress = Progress()
         self.folder = folder

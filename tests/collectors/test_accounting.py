@@ -1,10 +1,12 @@
 """Episode accounting against a plain loop over environments and steps."""
 
+import math
+
 import pytest
 import torch
 from tensordict import TensorDict
 
-from safe_rl.collectors import EpisodeAccounting
+from safe_rl.collectors import EpisodeAccounting, EpisodeError
 
 COST_KEYS = ["cost", ("agent", "cost_speed")]
 
@@ -153,3 +155,27 @@ def test_episodes_that_are_open_can_be_left_out_of_the_statistics_of_episodes():
     assert partial._open_sums.isfinite().all()
     batch = random_batch(generator, 3, 40, 0.1)
     assert torch.equal(whole.update(batch).returns, partial.update(batch).returns)
+
+
+def steps_of(costs, done):
+    """A batch of one row, [1, T]."""
+    columns = torch.tensor(costs).view(1, -1, 1), torch.tensor(done).view(1, -1, 1)
+    step = {"reward": torch.ones_like(columns[0]), "cost": columns[0], "done": columns[1]}
+    return TensorDict({"next": step}, [1, len(costs)])
+
+
+def test_costs_below_0_are_refused_with_their_name():
+    accounting = EpisodeAccounting(1, ["cost"])
+    with pytest.raises(EpisodeError, match=r"'cost' is below 0 in 2 of 3 steps.*0 or more"):
+        accounting.update(steps_of([-1.0, 0.0, -0.5], [False, False, True]))
+    accounting.update(steps_of([0.0, math.nan], [False, True]))
+
+
+@pytest.mark.parametrize("ends", [True, False])
+def test_episodes_that_are_too_long_are_refused_open_or_ended(ends):
+    accounting = EpisodeAccounting(1, ["cost"], longest=3)
+    accounting.ignore_open_episodes()  # which nobody knows the length of
+    accounting.update(steps_of([0.0] * 9, [False] * 8 + [True]))
+    accounting.update(steps_of([0.0] * 3, [False] * 3))
+    with pytest.raises(EpisodeError, match=r"has 4 steps.*'max_episode_steps' is 3"):
+        accounting.update(steps_of([0.0], [ends]))

@@ -1,9 +1,10 @@
 """Environments of every family fulfil the contract, and what lacks something is told what."""
 
 import pytest
+import torch
 from gymnasium_envs import Walk
 from point_mass import PointMass
-from torchrl.data import Unbounded
+from torchrl.data import Binary, Composite, Unbounded
 from torchrl.envs import PendulumEnv
 
 from safe_rl.envs import (
@@ -57,6 +58,26 @@ def with_unbounded_actions():
     return env
 
 
+def with_numbers(dtype):
+    env = PointMass(2)
+    shape = env.observation_spec["observation"].shape
+    env.observation_spec = Composite(observation=Unbounded(shape, dtype=dtype), shape=(2,))
+    return env
+
+
+def with_layout(**layout):
+    env = PointMass(2)
+    env.observation_layout = layout
+    return env
+
+
+def without_truncations():
+    env = PointMass(2)
+    flag = Binary(1, shape=(2, 1), dtype=torch.bool)
+    env.done_spec = Composite(done=flag, terminated=flag.clone(), shape=(2,))
+    return env
+
+
 def with_costs(keys):
     env = PointMass(2)
     env.cost_keys = keys
@@ -72,6 +93,9 @@ def with_costs(keys):
         (lambda: without("cost_keys"), "'cost_keys' must be a list of names with 'cost'"),
         (lambda: without("observation_layout"), "'observation_layout' must map names"),
         (lambda: without("set_state"), "it has 'get_state', so it needs 'set_state'"),
+        (lambda: with_numbers(torch.float64), "'observation' must be of float32.*float64"),
+        (lambda: with_layout(place=slice(0, 99)), r"slice\(0, 99, None\) for 'place', beyond the"),
+        (without_truncations, "its done spec must have 'truncated', got"),
         (with_unbounded_actions, "continuous and bounded, or choices, got Unbounded"),
         (
             lambda: with_costs(["cost", "cost_south"]),
@@ -103,3 +127,14 @@ def test_a_family_of_ones_own_is_made_once_its_module_is_trusted():
     assert (env.max_episode_steps, env.batch_size[0]) == (9, 3)
     with pytest.raises(ContractError, match="'cost' among them"):
         make_env({"_target_": f"{__name__}.make_lacking"}, num_envs=2)
+
+
+def make_one(config, **_):
+    """A family that does not heed how many it is asked for."""
+    return PointMass(1)
+
+
+def test_a_family_that_makes_another_number_is_told():
+    allow(__name__)
+    with pytest.raises(ContractError, match=r"asked for 3 environments and made 1.*'num_envs'"):
+        make_env({"_target_": f"{__name__}.make_one"}, num_envs=3)

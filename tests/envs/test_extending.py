@@ -107,6 +107,18 @@ def test_contacts_that_nothing_counts_are_an_error_that_says_so():
         make({"walls_num": 1}).rollout(1)
 
 
+@pytest.mark.parametrize("read", ["at", "start_of", "velocity_of", "contacts_with"])
+def test_a_misspelt_kind_is_an_error_and_one_without_objects_is_not(read):
+    def touched(kind):
+        return lambda config, world: getattr(world, read)(kind).flatten(1).sum(-1)
+
+    register_cost(Cost("cost_touch", lambda c: True, touched("vases")))
+    assert make({}).rollout(1)["next", "cost_touch"].item() == 0
+    register_cost(Cost("cost_touch", lambda c: True, touched("vase")))
+    with pytest.raises(ConfigError, match=r"no kind 'vase' of objects. Did you mean 'vases'\?"):
+        make({}).rollout(1)
+
+
 @pytest.mark.parametrize(
     ("magnitude", "told"),
     [

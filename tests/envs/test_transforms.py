@@ -307,6 +307,12 @@ def test_without_the_contract_a_single_environment_is_transformed_too():
     check_env_specs(env)
 
 
+def test_without_the_contract_a_cost_that_there_is_not_is_named_all_the_same():
+    env = TransformedEnv(SafetyGymEnv("PointGoal1", seed=0), EarlyTermination({"cost_hazard": 1.0}))
+    with pytest.raises(ValueError, match=r"'cost_hazard'.*Did you mean 'cost_hazards'\?"):
+        env.rollout(1)
+
+
 def test_nodes_are_built_and_their_keys_named():
     node = {
         "_target_": "safe_rl.envs.transforms.ActionFilter",

@@ -11,6 +11,7 @@ from torch import Tensor
 from torchrl.data import Composite, TensorSpec, Unbounded
 from torchrl.envs.transforms import Transform
 
+from safe_rl.envs.costs import is_cost
 from safe_rl.naming import did_you_mean
 
 OWN_REWARD = "task_reward"
@@ -106,12 +107,19 @@ def check_known(budgets: Collection[str], cost_keys: Collection[str]) -> None:
         if key not in cost_keys:
             raise ValueError(
                 f"budgets names '{key}', but there is no such cost.{did_you_mean(key, cost_keys)} "
-                f"There are {', '.join(cost_keys)}."
+                f"There are {', '.join(cost_keys) or 'none'}."
             )
 
 
 def costs_of(step: TensorDictBase, keys: Collection[str]) -> Tensor:
-    """Return costs of a step side by side as float64, [..., k]."""
+    """Return costs of a step side by side as float64, [..., k].
+
+    Raises:
+        ValueError: for a cost that there is not, where no contract has been checked before.
+    """
+    known = step.keys()
+    if any(key not in known for key in keys):
+        check_known(keys, [str(key) for key in known if is_cost(key)])
     return torch.cat([step.get(key) for key in keys], -1).double()
 
 

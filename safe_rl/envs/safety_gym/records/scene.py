@@ -19,6 +19,7 @@ class Scene:
         model: the compiled model.
         names: name of every object, by slot; slots are the M of `[N, M, …]` tensors.
         slots: slots of each kind that has objects.
+        kinds: names of all kinds, also of those without.
         heights: z of every object's centre [m], by slot.
         num_free: slots below this are free bodies, 7 `qpos` and 6 `qvel` each after the robot's.
         num_mocap_slots: that many slots from `num_free` on are mocap bodies (after the targets').
@@ -38,6 +39,7 @@ class Scene:
     model: mujoco.MjModel
     names: tuple[str, ...]
     slots: Mapping[str, slice]
+    kinds: tuple[str, ...]
     heights: tuple[float, ...]
     num_free: int
     num_mocap_slots: int

@@ -9,6 +9,7 @@ from typing import NamedTuple
 
 from torch import Tensor
 
+from safe_rl.envs.errors import ConfigError, nearest
 from safe_rl.envs.physics.base import Physics
 from safe_rl.envs.safety_gym.records.scene import Scene
 
@@ -68,8 +69,14 @@ class World:
     step_count: Tensor
 
     def at(self, kind: str) -> Tensor:
-        """Return the positions of one kind's objects [N, K, 3], a view; K may be 0."""
-        return self.objects[kind] if kind in self.objects else self.positions[:, :0]
+        """Return the positions of one kind's objects [N, K, 3], a view; K may be 0.
+
+        Raises:
+            ConfigError: here and below, if there is no such kind.
+        """
+        if kind in self.objects:
+            return self.objects[kind]
+        return self.positions[:, self._slots(kind)]
 
     def start_of(self, kind: str) -> Tensor:
         """Return where they were at the start of the episode [N, K, 2], a view."""
@@ -91,9 +98,16 @@ class World:
                 f"Contacts with '{kind}' are not counted: list it in 'touches' of the task, cost "
                 "or observation that reads them."
             )
-        return self.contacts.get(kind, self.sensordata[:, :0])
+        if kind in self.contacts:
+            return self.contacts[kind]
+        return self.sensordata[:, self._slots(kind)]
 
     def _slots(self, kind: str) -> slice:
+        if kind not in self.scene.slots and kind not in self.scene.kinds:
+            raise ConfigError(
+                f"There is no kind '{kind}' of objects.{nearest(kind, self.scene.kinds)} There are "
+                f"{', '.join(self.scene.kinds)}."
+            )
         return self.scene.slots.get(kind, slice(0, 0))
 
 

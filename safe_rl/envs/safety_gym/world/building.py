@@ -168,6 +168,7 @@ def _index(
         model=model,
         names=tuple(names),
         slots=slots,
+        kinds=tuple(element.kind for element in ELEMENTS),
         heights=tuple(heights),
         num_free=num_free,
         num_mocap_slots=count(*in_physics),
