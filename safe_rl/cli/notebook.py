@@ -196,12 +196,8 @@ def train(
     """
     modules = import_modules(imports)
     store_configs()
-    overrides = [
-        f"env={env}",
-        f"algo={algo}",
-        *overrides_of(settings),
-        *search_path(config_dir or ()),
-    ]
+    overrides = [f"env={env}", f"algo={algo}", *overrides_of(settings)]
+    overrides += search_path(config_dir or ())
     if modules:
         overrides = note_imports(modules, overrides)
     config = compose_new(overrides)
