@@ -65,6 +65,8 @@ ROLES: dict[str, Role] = {
     "collector.ray_init": Role.MACHINE,
     "default_cost_limits": Role.MANNER,
     "evaluation": Role.MANNER,
+    "memory.keep": Role.MANNER,
+    "memory.storage": Role.MANNER,
     "certificate": Role.MACHINE,  # what is found out about a run, not what it is
     "checkpoint": Role.MACHINE,
     "compile": Role.MACHINE,
