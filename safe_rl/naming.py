@@ -9,7 +9,6 @@ from typing import Any
 __all__ = ["did_you_mean", "key_name", "nearest"]
 
 _LIKENESS = 0.5
-"""Ratio of difflib's below which two names have nothing to do with each other."""
 
 
 def key_name(key: str | tuple[Any, ...]) -> str:
@@ -22,8 +21,13 @@ def key_name(key: str | tuple[Any, ...]) -> str:
     return key if isinstance(key, str) else "/".join(key)
 
 
-def nearest(name: str, known: Iterable[str]) -> str | None:
+def nearest(name: str, known: Iterable[str], likeness: float = _LIKENESS) -> str | None:
     """Return the known name most like `name`, or None if none is like it.
+
+    Args:
+        name: The wrong one.
+        known: The right ones.
+        likeness: Ratio of difflib's below which two names have nothing to do with each other.
 
     Examples:
         >>> nearest("hazard_num", ["hazards_num", "vases_num"])
@@ -31,7 +35,7 @@ def nearest(name: str, known: Iterable[str]) -> str | None:
         >>> nearest("zzz", ["hazards_num"]) is None
         True
     """
-    close = get_close_matches(name, list(known), n=5, cutoff=_LIKENESS)
+    close = get_close_matches(name, list(known), n=5, cutoff=likeness)
     # of equally close ones, one of the same letters, then the one of the most similar length
     return max(close, key=lambda found: _likeness(name, found), default=None)
 

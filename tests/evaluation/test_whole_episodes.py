@@ -12,11 +12,12 @@ from torchrl.envs import EnvBase
 from safe_rl.evaluation.during import PeriodicEvaluation
 from safe_rl.evaluation.episodes import collect_episodes
 from safe_rl.evaluation.layouts import default_seed, shared_layouts
-from safe_rl.evaluation.video import check_camera, record_episode
+from safe_rl.evaluation.video import MANNERS, check_camera, record_episode
 from safe_rl.models import BehaviourPolicy, make_actor
 
 # steps of every world's episodes, in turn
 LENGTHS = [[30, 1], [2, 3], [1, 1]]
+FILM = {"deterministic": True, "manner": MANNERS["mp4"]}
 
 
 class KnownLengths(EnvBase):
@@ -90,13 +91,13 @@ class Drawn(KnownLengths):
 def test_a_film_takes_the_pictures_that_an_environment_has():
     env, policy = Drawn(), BehaviourPolicy(make_actor(1, 1, hidden_sizes=[4], initial_log_std=0.0))
     check_camera(env, "free")
-    frames = list(record_episode(env, policy, ["cost"], deterministic=True))
+    frames = list(record_episode(env, policy, ["cost"], **FILM))
     # every other step of six, and the end; what the encoder cannot halve twice is cut off
     assert [frame[0, 0, 0] for frame in frames] == [0, 20, 40, 60]
     # beside the narrow picture there is room for what stands below it
     assert {frame.shape for frame in frames} == {(48 + 20, 280, 3)}
     assert {int(frame[:48, 68:].min()) for frame in frames} == {255}
-    without_costs = list(record_episode(env, policy, [], deterministic=True))
+    without_costs = list(record_episode(env, policy, [], **FILM))
     assert len(without_costs) == 4
     assert len({frame[48:].tobytes() for frame in (*frames, *without_costs)}) == 8
 
@@ -106,7 +107,7 @@ def test_a_film_takes_grey_pictures_batches_and_fourth_channels(shape):
     env, policy = Drawn(), BehaviourPolicy(make_actor(1, 1, hidden_sizes=[4], initial_log_std=0.0))
     env.render = lambda: np.full(shape, 200, np.uint8)
     check_camera(env, "free")
-    frames = list(record_episode(env, policy, ["cost"], deterministic=True))
+    frames = list(record_episode(env, policy, ["cost"], **FILM))
     assert {(frame.shape, int(frame[0, 0, 0])) for frame in frames} == {((68, 280, 3), 200)}
 
 

@@ -6,7 +6,6 @@ import math
 import reprlib
 import warnings
 from collections.abc import Collection, Iterable, Mapping, Sequence
-from difflib import get_close_matches
 from typing import Any
 
 import gymnasium
@@ -17,6 +16,7 @@ from torch import Tensor
 from torchrl.data import Composite
 from torchrl.envs.gym_like import BaseInfoDictReader
 
+from safe_rl import naming
 from safe_rl.envs.cost_specs import cost_spec
 from safe_rl.envs.costs import COST, is_cost
 from safe_rl.envs.errors import ConfigError, nearest
@@ -24,7 +24,7 @@ from safe_rl.envs.errors import ConfigError, nearest
 __all__ = ["CostReader", "FloatCosts"]
 
 _MISSPELT = 0.85
-"""Ratio of difflib's above which two names are thought to be one."""
+"""Likeness above which two names are thought to be one."""
 
 
 class FloatCosts(gymnasium.Wrapper):
@@ -125,9 +125,9 @@ class CostReader(BaseInfoDictReader):
         if new and self._num_steps and COST not in self._cost_keys:
             _warn_of_uncounted(filter(is_cost, new & others), self._cost_keys)
         for key in self._unseen if new else ():
-            if alike := get_close_matches(key, others, n=1, cutoff=_MISSPELT):
+            if alike := naming.nearest(key, others, _MISSPELT):
                 raise ConfigError(
-                    f"No info has the cost '{key}'. Did you mean '{alike[0]}'? If there are both, "
+                    f"No info has the cost '{key}'. Did you mean '{alike}'? If there are both, "
                     f"let every step report '{key}', or name both in 'cost_keys'."
                 )
         self._num_steps += 1
