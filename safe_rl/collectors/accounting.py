@@ -183,13 +183,16 @@ class EpisodeAccounting:
                 raise EpisodeError(
                     f"The cost '{key_name(key)}' is below 0 in {below} of {costs[..., 0].numel()} "
                     "steps, and nothing has been learnt from them. Costs are 0 or more: let the "
-                    "environment clamp them, or add the same to every step and to the limit."
+                    "environment clamp them, or add the same to every step and, times the steps of "
+                    "an episode, to the limit."
                 )
 
     def _require_ends(self, lengths: Tensor) -> None:
         """Refuse episodes, ended with lengths [E] or open, that are longer than they may be."""
+        if self.longest is None:
+            return
         steps = torch.cat([lengths, self._open_sums[:, 0]]).nan_to_num().max().item()
-        if self.longest is not None and steps > self.longest:
+        if steps > self.longest:
             raise EpisodeError(
                 f"An episode has {steps:g} steps, but the environment's 'max_episode_steps' is "
                 f"{self.longest}: it has to end episodes itself ('done' and 'truncated')."

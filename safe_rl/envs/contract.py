@@ -15,6 +15,7 @@ from torchrl.data import Bounded, Categorical, Composite, OneHot, TensorSpec
 from torchrl.envs import EnvBase
 
 from safe_rl.envs.costs import COST
+from safe_rl.naming import key_name
 
 #: Continuous or integers within bounds, choices as integers, choices as one-hot vectors.
 ACTIONS = (Bounded, Categorical, OneHot)
@@ -162,9 +163,9 @@ def _shape_problems(env: EnvBase) -> Iterator[str]:
         kind = type(env.action_spec).__name__
         yield f"its actions must be continuous and bounded, or choices, got {kind}."
     for key, part in env.observation_spec.items(True, True):
-        is_seen = (key if isinstance(key, str) else key[0]) == "observation"
+        name = key_name(key)
+        is_seen = name.partition("/")[0] == "observation"
         if is_seen and len(part.shape) == 2 and part.dtype != torch.float32:
-            name = key if isinstance(key, str) else ".".join(key)
             yield f"'{name}' must be of float32, which networks take, got {part.dtype}."
     ends = [str(key) for key in env.full_done_spec.keys(True, True)]
     for key in ("done", "terminated", "truncated"):

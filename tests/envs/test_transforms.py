@@ -29,6 +29,7 @@ from safe_rl.envs.transforms import (
     Simmer,
     transform_env,
 )
+from safe_rl.envs.transforms.base import costs_of
 from safe_rl.targets import TargetError, allow
 
 allow("test_transforms")
@@ -311,6 +312,13 @@ def test_without_the_contract_a_cost_that_there_is_not_is_named_all_the_same():
     env = TransformedEnv(SafetyGymEnv("PointGoal1", seed=0), EarlyTermination({"cost_hazard": 1.0}))
     with pytest.raises(ValueError, match=r"'cost_hazard'.*Did you mean 'cost_hazards'\?"):
         env.rollout(1)
+
+
+def test_costs_may_be_nested():
+    step = TensorDict({"agents": {"cost": torch.full((2, 1), 3.0)}}, [2])
+    assert costs_of(step, [("agents", "cost")]).tolist() == [[3.0], [3.0]]
+    with pytest.raises(ValueError, match=r"'agents/costs'.*Did you mean 'agents/cost'\?"):
+        costs_of(step, [("agents", "costs")])
 
 
 def test_nodes_are_built_and_their_keys_named():

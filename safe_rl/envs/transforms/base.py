@@ -12,7 +12,7 @@ from torchrl.data import Composite, TensorSpec, Unbounded
 from torchrl.envs.transforms import Transform
 
 from safe_rl.envs.costs import is_cost
-from safe_rl.naming import did_you_mean
+from safe_rl.naming import did_you_mean, key_name
 
 OWN_REWARD = "task_reward"
 """Where transforms that change the reward leave the environment's own one."""
@@ -117,10 +117,12 @@ def costs_of(step: TensorDictBase, keys: Collection[str]) -> Tensor:
     Raises:
         ValueError: for a cost that there is not, where no contract has been checked before.
     """
-    known = step.keys()
-    if any(key not in known for key in keys):
-        check_known(keys, [str(key) for key in known if is_cost(key)])
-    return torch.cat([step.get(key) for key in keys], -1).double()
+    costs = [step.get(key, None) for key in keys]
+    lacking = [key_name(key) for key, cost in zip(keys, costs, strict=True) if cost is None]
+    if lacking:
+        names = [key_name(key) for key in step.keys(True, True)]
+        check_known(lacking, [name for name in names if is_cost(name.rpartition("/")[2])])
+    return torch.cat(costs, -1).double()
 
 
 def keep_reward(step: TensorDictBase, key: str) -> Tensor:
