@@ -30,7 +30,7 @@ TEXTS: dict[str, dict[str, Any]] = yaml.safe_load((PAGES / "pages.yaml").read_te
 GENERATED = "<!-- made by docs/generate_algorithms.py: change pages.yaml, conf/ or results/ -->"
 # what the live arguments are called here
 LIVE = ("actor_network", "multiplier", "constraints", "cost_limits")
-OPTIONAL = ("columns", "loop", "problem")  # of a page, that no blank of the template stands for
+OPTIONAL = ("columns", "loop", "problem", "measured")  # of a page, that others can stand for
 SHOWN = {"actor_network": "actor", "cost_limits": "limits"}
 
 TEMPLATE = """{mark}
@@ -101,7 +101,9 @@ REPLAY = {
 def pages() -> dict[str, str]:
     """All pages by file, below docs/."""
     written = {f"algorithms/{name}.md": _page(name) for name in TEXTS}
-    written["algorithms/comparison.md"] = f"{GENERATED}\n{comparison(TEXTS)}"
+    # what has a text of its own learns from something else, and is not compared
+    compared = [name for name, texts in TEXTS.items() if "measured" not in texts]
+    written["algorithms/comparison.md"] = f"{GENERATED}\n{comparison(compared)}"
     return written | {"environments/velocity.md": velocity_page()}
 
 
@@ -127,7 +129,7 @@ def _page(name: str) -> str:
         limits=", [holding the limit](holding_the_limit.md)" if constrained else "",
         columns=_columns(texts["columns"]),
         snippet=snippet,
-        measured=measured(name),
+        measured=str(texts.get("measured") or measured(name)).strip(),
         **{key: str(texts[key]).strip() for key in texts if key not in OPTIONAL},
     )
 
