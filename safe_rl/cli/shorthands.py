@@ -5,6 +5,7 @@ They are written out before Hydra sees the command line.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Sequence
 from importlib.util import find_spec
 from pathlib import Path
@@ -115,7 +116,7 @@ def _expand_resume(value: str, others: list[str]) -> list[str]:
         config = OmegaConf.create(read_config(run.config))
     except (OSError, ValueError) as error:
         raise CommandLineError(f"resume={value}: {error}") from None
-    _refuse_hydras_own(config, run.config)
+    _refuse_hydras_own(config, run, others)
     _refuse_foreign_cluster(config, others, run.config)
     check_imports(config, split_imports(others)[0], Path(value))
     for argument in others:
@@ -138,14 +139,23 @@ def _expand_resume(value: str, others: list[str]) -> list[str]:
     ]
 
 
-def _refuse_hydras_own(config: DictConfig, path: Path) -> None:
-    """Runs write settings only; what else Hydra reads in a file can name code to run."""
+def _refuse_hydras_own(config: DictConfig, run: RunFolder, others: list[str]) -> None:
+    """Runs write settings only; what else Hydra reads in a folder can name code to run."""
     keys = [key for key in ("hydra", "defaults") if key in config]
-    if keys or "@package" in path.read_text():
+    found = keys if "@package" not in run.config.read_text() else [*keys, "@package"]
+    if found:
         raise CommandLineError(
-            f"{path} holds '{(keys or ['@package'])[0]}', which runs never write and which could "
+            f"{run.config} holds '{found[0]}', which runs never write and which could "
             "make code run: delete it there to resume."
         )
+    # it looks for files of its own, and of what is overridden, beside the configuration
+    groups = ("hydra", *(re.split("[=@]", argument.lstrip("+~"))[0] for argument in others))
+    for group in groups:
+        if group and (run.directory / group).is_dir():
+            raise CommandLineError(
+                f"{run.directory / group} is a folder that runs never write. Hydra would read "
+                "settings there, which could make code run: delete it to resume."
+            )
 
 
 def _refuse_foreign_cluster(config: DictConfig, others: list[str], path: Path) -> None:

@@ -96,6 +96,13 @@ def test_a_broken_configuration_is_named(run):
         expand_arguments([f"resume={run}"])
 
 
+@pytest.mark.parametrize("folder", ["hydra", "frames"])
+def test_files_that_hydra_would_read_beside_the_configuration_are_refused(run, folder):
+    (run / folder / "launcher").mkdir(parents=True)
+    with pytest.raises(CommandLineError, match=f"/{folder} is a folder that runs never write"):
+        expand_arguments([f"resume={run}", "--info", "++frames=500"])
+
+
 @pytest.mark.parametrize(
     "override",
     [
