@@ -25,12 +25,20 @@ __all__ = [
     "takes_any",
 ]
 
-# Rooms whose public classes and functions are parts of a run. Others hold commands, which write
-# files and import modules.
-_ROOMS = tuple(
-    f"safe_rl.{room}"
-    for room in ("algorithms", "collectors", "envs", "models", "objectives", "runs.loggers")
-)
+# Rooms whose classes and functions are parts of a run, and of some those that are: the others there
+# start programs, import modules, write files and remove them.
+_ROOMS: dict[str, tuple[str, ...] | None] = {
+    "safe_rl.algorithms": None,
+    "safe_rl.collectors": ("make_process_collector", "make_ray_collector"),
+    "safe_rl.envs.gymnasium": ("make_gymnasium",),
+    "safe_rl.envs.safety_gymnasium": ("make_safety_gymnasium",),
+    "safe_rl.envs.torchrl": ("make_torchrl",),
+    "safe_rl.envs.transforms": None,
+    "safe_rl.envs.velocity": ("VelocityEnv",),
+    "safe_rl.models": None,
+    "safe_rl.objectives": None,
+    "safe_rl.runs.loggers": ("MLflowLogger", "TensorboardLogger", "WandbLogger"),
+}
 _OPTIMISERS = "torch.optim"
 _users_modules: set[str] = set()
 
@@ -137,11 +145,18 @@ def locate(target: Any, key: str = "") -> Callable[..., Any]:
             f"{shown}: configurations reach only parts of safe_rl, {_OPTIMISERS} and modules of "
             f"yours. If you trust '{module}', add import={module} to the command."
         )
+    known, part = _known(root), name.removeprefix(f"{root}.")
+    if known is not None and part not in known:
+        raise TargetError(
+            f"{shown}: of '{root}' configurations reach only {', '.join(known)}."
+            f"{did_you_mean(part, known)}"
+        )
     found = _walk(root, name, shown)
     home = getattr(found, "__module__", None) or ""
     if not (inspect.isclass(found) or inspect.isroutine(found)):
         raise TargetError(f"{shown} is neither a class nor a function.")
-    if not any(_is_inside(home, root) for root in _roots()):
+    whole = [room for room in _roots() if _known(room) is None]
+    if not any(_is_inside(home, room) for room in (root, *whole)):
         raise TargetError(
             f"{shown}: '{root}' only borrows it from '{home}', which is out of reach of "
             f"configurations. If you trust '{home}', add import={home} to the command and write "
@@ -228,7 +243,12 @@ def _public(found: Any) -> Iterator[str]:
 
 
 def _roots() -> tuple[str, ...]:
-    return (*_ROOMS, _OPTIMISERS, *sorted(_users_modules))
+    return (*sorted(_users_modules), *_ROOMS, _OPTIMISERS)
+
+
+def _known(root: str) -> tuple[str, ...] | None:
+    """All that configurations reach there; None where that is every class and function."""
+    return None if root in _users_modules else _ROOMS.get(root)
 
 
 def _is_inside(name: str, module: str) -> bool:
