@@ -111,6 +111,20 @@ def test_another_python_steps_what_this_one_does(workers, elsewhere, monkeypatch
     assert_same(rollout(here), expected)
 
 
+def test_modules_are_imported_by_name_of_the_user_only(elsewhere, tmp_path, monkeypatch):
+    (tmp_path / "my_ice.py").write_text(
+        "import safety_gymnasium\nsafety_gymnasium.KNOWN['SafetyMine-v0'] = safety_gymnasium.Ice\n"
+    )
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join([STAND_IN, str(tmp_path)]))
+    with pytest.raises(ConfigError, match=r"import nothing.*SAFETY_GYMNASIUM_IMPORT=my_ice"):
+        complete_env({**NODE, "id": "my_ice:SafetyMine-v0"})
+    node = {**NODE, "id": "SafetyMine-v0"}
+    with pytest.raises(ConfigError, match="not registered"):
+        complete_env(node)
+    monkeypatch.setenv("SAFETY_GYMNASIUM_IMPORT", "my_ice")
+    assert complete_env(node)["num_steps"] == 12
+
+
 def test_a_batch_that_begins_by_itself_is_as_one_that_is_asked(package):
     batch = package.vector.make("SafetyIce1-v0", num_envs=4, asynchronous=False, border=1.5)
     eager = from_six_values(batch, num_steps=12, seed=5)

@@ -13,6 +13,7 @@ from safe_rl.envs.errors import (
     require_mapping,
     require_names,
 )
+from safe_rl.envs.safety_gymnasium.serve import MODULES
 
 SAFETY_GYMNASIUM_TARGET = "safe_rl.envs.safety_gymnasium.make_safety_gymnasium"
 DEFAULTS: dict[str, Any] = {
@@ -36,6 +37,12 @@ def complete_safety_gymnasium(node: Mapping[str, Any]) -> dict[str, Any]:
             )
     if not isinstance(node.get("id"), str):
         raise ConfigError("Which environment? env.id=SafetyPointGoal1-v0, for example.")
+    module, _, name = node["id"].rpartition(":")
+    if module:  # which safety_gymnasium.make imports
+        raise ConfigError(
+            f"env.id={node['id']}: configurations import nothing. If you trust '{module}', use "
+            f"env.id={name} and import={module}; for another Python, {MODULES}={module}."
+        )
     full = {"name": node["id"], **DEFAULTS, **node}
     require_integer("workers", full["workers"], lowest=0)
     require_mapping("kwargs", full["kwargs"])

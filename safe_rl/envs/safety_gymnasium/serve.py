@@ -11,9 +11,13 @@ import json
 import os
 import sys
 import traceback
+from importlib import import_module
 from typing import Any, BinaryIO
 
 import numpy as np
+
+MODULES = "SAFETY_GYMNASIUM_IMPORT"
+"""Environment variable with modules that register more of them, by commas."""
 
 
 def send(stream: BinaryIO, header: dict[str, Any], **arrays: Any) -> None:
@@ -50,6 +54,8 @@ class Served:
         import safety_gymnasium
         from gymnasium import spaces
 
+        for module in filter(None, os.environ.get(MODULES, "").split(",")):
+            import_module(module)
         self._spaces = spaces
         kwargs = dict(header["kwargs"])
         if header["num_steps"] is not None:
