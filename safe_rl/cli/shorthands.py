@@ -168,6 +168,8 @@ def _refuse_foreign_cluster(config: DictConfig, others: list[str], path: Path) -
             f"{path} names a Ray cluster, which is not taken from a file: say again "
             "collector.ray_init.address=… (null for Ray on this machine)."
         )
+    if "runtime_env" in (OmegaConf.select(config, "collector.resources") or {}):
+        stored["runtime_env"] = None  # actors can be started with it, too
     if stored:
         raise CommandLineError(
             f"{path} starts Ray with {', '.join(stored)}, which could make code run: delete that "

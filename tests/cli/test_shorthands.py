@@ -150,9 +150,11 @@ def test_what_ray_is_started_with_is_not_taken_from_a_file(run):
     with pytest.raises(CommandLineError, match=r"say again collector\.ray_init\.address="):
         expand_arguments([f"resume={run}"])
     assert expand_arguments([f"resume={run}", "collector.ray_init.address=far"])
-    path.write_text(local.replace("null}", "null, runtime_env: {pip: [theirs]}}"))
-    with pytest.raises(CommandLineError, match="starts Ray with runtime_env"):
-        expand_arguments([f"resume={run}"])
+    actors = "null}\n  resources: {runtime_env: {pip: [theirs]}}"
+    for started in ("null, runtime_env: {pip: [theirs]}}", actors):
+        path.write_text(local.replace("null}", started))
+        with pytest.raises(CommandLineError, match="starts Ray with runtime_env"):
+            expand_arguments([f"resume={run}"])
 
 
 def test_several_folders_of_configurations_are_not_taken_for_the_last():
