@@ -83,7 +83,7 @@ class Recording:
         """Note that what follows a batch begins anew: episodes that are open there stay partial."""
         if not self._place(number).exists():
             return
-        steps = TensorDict.load_memmap(str(self._place(number))).clone()
+        steps = _read(self._place(number))
         is_open = ~steps["next", "done"][:, -1]
         for key in (PARTIAL, ("next", "done"), ("next", "truncated")):
             steps[key][:, -1] |= is_open
@@ -157,15 +157,24 @@ def read_recording(folder: Path | str) -> TensorDict:
 
     Raises:
         FileNotFoundError: If there are none.
+        ValueError: If a batch cannot be read, or holds more than tensors.
     """
     pieces = _pieces(Path(folder))
     if not pieces:
         raise FileNotFoundError(f"{folder} holds no transitions: is it the folder of a recording?")
-    batches = [TensorDict.load_memmap(str(path)).clone() for path in pieces]
+    batches = [_read(path) for path in pieces]
     for batch in batches:
         if PARTIAL not in batch:  # of an earlier version
             batch[PARTIAL] = torch.zeros_like(batch["next", "done"])
     return torch.cat(batches, -1)
+
+
+def _read(place: Path) -> TensorDict:
+    """A batch in main memory: its tensors, because other objects could make code run."""
+    try:
+        return TensorDict.load_memmap(str(place), allow_pickle=False).clone()
+    except RuntimeError as error:
+        raise ValueError(f"{place} cannot be read as steps of a run: {error}") from error
 
 
 def _pieces(folder: Path) -> list[Path]:

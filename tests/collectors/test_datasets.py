@@ -1,10 +1,12 @@
 """Transitions come back from disk as they were collected, and safe episodes are whole ones."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 import torch
 from point_mass import PointMass
-from tensordict import TensorDict
+from tensordict import NonTensorData, TensorDict
 from torchrl.modules import RandomPolicy
 
 from safe_rl.collectors import (
@@ -38,6 +40,25 @@ def test_a_recording_is_what_was_collected(tmp_path):
     assert torch.equal(found["next", "truncated"], expected["next", "done"])
     with pytest.raises(FileNotFoundError, match="holds no transitions"):
         read_recording(tmp_path / "elsewhere")
+
+
+def test_a_recording_of_somebody_else_makes_no_code_run(tmp_path):
+    theirs = NonTensorData(Touching(tmp_path / "trace"), batch_size=[4, 25])
+    collected(1)[0].set("theirs", theirs).memmap(str(tmp_path / "00000000"))
+    (tmp_path / "trace").unlink(missing_ok=True)
+    with pytest.raises(ValueError, match=r"cannot be read as steps of a run.*pickle"):
+        read_recording(tmp_path)
+    assert not (tmp_path / "trace").exists()
+
+
+class Touching:
+    """Leaves a file where it is unpickled."""
+
+    def __init__(self, path):
+        self.path = path
+
+    def __reduce__(self):
+        return Path.touch, (self.path,)
 
 
 def test_episodes_end_where_batches_are_missing(tmp_path):
