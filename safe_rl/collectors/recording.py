@@ -53,10 +53,11 @@ class Recording:
         following = ("observation", "reward", *cost_keys, *_FLAGS)
         self._keys = ["observation", "action", *(("next", key) for key in following)]
 
-    def begin(self) -> None:
-        """Remove what is there of an earlier recording."""
+    def begin(self, number: int = 0) -> None:
+        """Remove what is there of an earlier recording, from a batch on."""
         for path in _pieces(self.folder):
-            shutil.rmtree(path)
+            if int(path.name) >= number:
+                shutil.rmtree(path)
 
     def write(self, number: int, batch: TensorDictBase, *, begun: Tensor | None = None) -> None:
         """Write a batch [N, T] under its number; one that is there already is replaced.

@@ -212,6 +212,9 @@ class Trainer:
         with StopRequest() as stop, self.folder.writing(behind, self.progress.steps):
             if not self.progress.epoch:
                 self._checkpoints.begin()
+            if self._recording is not None:
+                # as of the table, what came after the checkpoint is another continuation's
+                self._recording.begin(self.progress.epoch)
             self._candidates.go_on_after(self.folder.rows())
             # a shorter run that had come to its end has judged them by fewer epochs
             self._checkpoints.forget_best(self._candidates.waiting)

@@ -118,14 +118,15 @@ def test_a_run_that_goes_on_records_what_it_does_again(tmp_path):
     keys += ["num_envs=4", "frames_per_batch=160", "model.hidden_sizes=[16]"]
     make_trainer(compose_config(*keys), tmp_path / "whole").run()
     make_trainer(compose_config(*keys, "frames=160"), tmp_path / "halves").run()
-    # of a process that was killed before it could write a checkpoint
+    # of a process that was killed before it could write a checkpoint, and was to be a longer run
     ahead = tmp_path / "halves" / "transitions"
-    Recording(ahead, []).write(1, TensorDict(
-        observation=torch.zeros(4, 1), action=torch.zeros(4, 1), batch_size=[4, 1],
-        next={key: torch.zeros(4, 1, 1) for key in (
-            "observation", "reward", "done", "terminated", "truncated",
-        )},
-    ))  # fmt: skip
+    for number in (1, 2, 3):
+        Recording(ahead, []).write(number, TensorDict(
+            observation=torch.zeros(4, 1), action=torch.zeros(4, 1), batch_size=[4, 1],
+            next={key: torch.zeros(4, 1, 1) for key in (
+                "observation", "reward", "done", "terminated", "truncated",
+            )},
+        ))  # fmt: skip
     resumed = make_trainer(compose_config(*keys), tmp_path / "halves")
     assert resumed.resume()
     resumed.run()
