@@ -50,6 +50,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 0 if arguments else 2
     try:
         modules, arguments = split_imports(arguments)
+        if not arguments:
+            raise OptionError(f"{COMMAND} takes the folder of a run first.")
         directory, options = Path(arguments[0]), parse_options(arguments[1:], EvaluationOptions)
         check_imports(load_config(directory), modules, directory)
         import_modules(modules or ())

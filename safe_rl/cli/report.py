@@ -92,6 +92,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 0 if arguments else 2
     try:
         modules, arguments = split_imports(arguments)
+        if not arguments:
+            raise OptionError(f"{COMMAND} takes a folder of runs first.")
         import_modules(modules or ())
         options = parse_options(arguments[1:], ReportOptions)
         root = Path(arguments[0])

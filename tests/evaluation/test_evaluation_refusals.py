@@ -9,6 +9,7 @@ from evaluated_runs import skip_without_opengl, train
 from omegaconf import OmegaConf
 
 from safe_rl.cli.evaluate import main
+from safe_rl.cli.report import main as report_main
 from safe_rl.envs import make_env
 from safe_rl.evaluation.loading import override_env
 from safe_rl.evaluation.variations import Variation, varied
@@ -97,6 +98,12 @@ def test_a_run_that_others_may_only_read_is_evaluated_as_a_copy(run, capsys, mon
     assert main([str(run)]) == 1
     error = capsys.readouterr().err.splitlines()[-1]
     assert f"{run} is read-only. A run's evaluations lie in its folder: evaluate a copy" in error
+
+
+@pytest.mark.parametrize(("command", "what"), [(main, "a run"), (report_main, "runs")])
+def test_a_command_without_a_folder_asks_for_it(command, what, capsys):
+    assert command(["import=json"]) == 1
+    assert f"{what} first." in capsys.readouterr().err
 
 
 def test_a_folder_above_runs_names_them(run, capsys):
