@@ -44,14 +44,25 @@ def load_config(directory: Path) -> DictConfig:
 
 
 def override_env(config: DictConfig, overrides: Mapping[str, Any]) -> dict[str, Any]:
-    """The run's environment with some keys changed.
+    """The run's environment with some keys changed; of mappings, as in training, what is named.
 
     Raises:
         ValueError: As by `check_env_keys`; the package's families look at their keys themselves.
     """
     env = OmegaConf.to_container(config.env)
     check_env_keys(env, overrides)  # type: ignore[arg-type]
-    return {**env, **overrides}  # type: ignore[dict-item]
+    return _changed(env, overrides)  # type: ignore[arg-type]
+
+
+def _changed(node: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
+    """A node with changes; what has a ``_target_`` of its own stands for itself."""
+    changed = dict(node)
+    for key, value in changes.items():
+        before = node.get(key)
+        is_within = isinstance(before, Mapping) and isinstance(value, Mapping)
+        is_whole = not is_within or "_target_" in value
+        changed[key] = value if is_whole else _changed(before, value)  # type: ignore[arg-type]
+    return changed
 
 
 def limits_of(

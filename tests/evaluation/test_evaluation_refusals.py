@@ -160,6 +160,18 @@ def test_a_checkpoint_runs_no_code(run, bare, tmp_path, capsys):
     assert not sprung.exists()
 
 
+def test_of_mappings_only_what_is_named_changes():
+    """The others would go back to the environment's own, without a word."""
+    cost = {"_target_": "mine.cost", "limit": 1.0}
+    kwargs = {"gravity": 1, "size": {"width": 2, "height": 3}}
+    config = OmegaConf.create({"env": {"name": "mine", "kwargs": kwargs, "cost": cost}})
+    env = override_env(config, {"kwargs": {"gravity": 5, "size": {"width": 7}}})
+    assert env["kwargs"] == {"gravity": 5, "size": {"width": 7, "height": 3}}
+    assert override_env(config, {"cost": {"limit": 2.0}})["cost"] == {**cost, "limit": 2.0}
+    other = {"_target_": "mine.other"}
+    assert override_env(config, {"cost": other})["cost"] == other
+
+
 def test_keys_that_an_environment_of_ones_own_does_not_have_are_refused(run, capsys):
     """It would leave them alone, and what was not changed would be measured as if it were."""
     config = OmegaConf.load(run / "config.yaml")
