@@ -13,7 +13,7 @@ from pathlib import Path
 from omegaconf import DictConfig, OmegaConf
 
 from safe_rl.cli.overrides import CommandLineError
-from safe_rl.cli.user_code import check_imports, split_imports
+from safe_rl.cli.user_code import KEY, check_imports
 from safe_rl.naming import did_you_mean
 from safe_rl.runs.files import read_config
 from safe_rl.runs.folder import RunFolder
@@ -118,7 +118,8 @@ def _expand_resume(value: str, others: list[str]) -> list[str]:
         raise CommandLineError(f"resume={value}: {error}") from None
     _refuse_hydras_own(config, run, others)
     _refuse_foreign_cluster(config, others, run.config)
-    check_imports(config, split_imports(others)[0], Path(value))
+    imports = [argument for argument in others if argument.lstrip("+").startswith(f"{KEY}=")]
+    check_imports(config, imports or None, Path(value))
     for argument in others:
         key = argument.lstrip("+~").partition("=")[0]
         is_flag = key.startswith("-")

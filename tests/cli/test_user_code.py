@@ -114,7 +114,7 @@ def test_opening_a_run_imports_nothing(folder):
     with pytest.raises(targets.TargetError, match=r"^loss\._target_=users_own\.Loss.*import=users"):
         build_trainer(config, PointMass(config.num_envs, 20), folder / "run")
     assert not (folder / "users_own.trace").exists()
-    for given in ([], ["users_own"], ["moved_since.py"]):
+    for given in ([], ["users_own"], ["moved_since.py"], ["/home/o'brien/moved.py"]):
         check_imports(config, given, folder)
         assert expand_arguments([f"resume={folder / 'run'}", *note_imports(given, [])])
 
