@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import shlex
 import sys
 from contextlib import AbstractContextManager, ExitStack, nullcontext
 from functools import partial
@@ -141,8 +142,7 @@ def run(config: DictConfig) -> None:
                 write_notes(folder, config, HydraConfig.get())
             outcome = trainer.run()
     if trainer.interrupted_by is not None:
-        again = f"{_this_command()} resume={folder.directory}"
-        say_if_heard(outcome, f"Interrupted. Continue with: {again}")
+        say_if_heard(outcome, f"Interrupted. Continue with: {_again(folder)}")
         raise SystemExit(128 + trainer.interrupted_by)
     print(outcome)
     if not is_to_keep_limits(config, trainer.algorithm.cost_keys):
@@ -158,12 +158,15 @@ def _this_command() -> str:
     return sys.argv[0] if sys.argv[0].startswith("safe-rl") else "python train.py"
 
 
+def _again(folder: RunFolder) -> str:
+    return f"{_this_command()} resume={shlex.quote(str(folder.directory))}"
+
+
 def _say_certificate(config: DictConfig, folder: RunFolder) -> None:
     try:
         certificate = certify_ended(folder.directory, config.num_threads or 0)
     except KeyboardInterrupt:
-        again = f"{_this_command()} resume={folder.directory}"
-        print(f"Interrupted before it was certified. To do so: {again}")
+        print(f"Interrupted before it was certified. To do so: {_again(folder)}")
         raise SystemExit(128 + SIGINT) from None
     print(certificate)
     if certificate is not None and certificate.checkpoint is None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import re
+import shlex
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
 from pathlib import Path
@@ -196,8 +197,9 @@ class RunFolder:
         """
         if self.has_begun:
             raise FileExistsError(
-                f"{self.directory} already holds a run. Continue it with 'python train.py "
-                f"resume={self.directory}', or give this one another folder with hydra.run.dir=..."
+                f"{self.directory} already holds a run. Continue it with: python train.py "
+                f"resume={shlex.quote(str(self.directory))}; or give this one another folder with "
+                "hydra.run.dir=..."
             )
 
     def check_is_run(self) -> None:

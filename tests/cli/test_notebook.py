@@ -237,10 +237,10 @@ def test_an_interrupted_run_says_how_to_go_on(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(Trainer, "epoch", epoch_that_is_stopped)
     small = {**SMALL, "certificate.episodes": 1}
     with pytest.raises(KeyboardInterrupt):
-        safe_rl.train("PointGoal0", algo="cpo", frames=400, directory=tmp_path / "run", **small)
-    assert f"resume={tmp_path / 'run'}" in capsys.readouterr().out
-    assert not (tmp_path / "run" / "certificate.json").exists()
-    assert len(read_table(tmp_path / "run" / "progress.csv")["steps"]) == 1
+        safe_rl.train("PointGoal0", algo="cpo", frames=400, directory=tmp_path / "a run", **small)
+    assert f"resume='{tmp_path / 'a run'}'" in capsys.readouterr().out
+    assert not (tmp_path / "a run" / "certificate.json").exists()
+    assert len(read_table(tmp_path / "a run" / "progress.csv")["steps"]) == 1
 
 
 def test_mappings_that_go_together_and_numbers_of_numpy_are_written_as_hydra_takes_them():

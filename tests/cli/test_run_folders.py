@@ -66,7 +66,7 @@ def test_a_refused_run_changes_nothing_of_the_one_that_is_there(tmp_path):
     assert tmp_path / "run" / ".hydra" / "overrides.yaml" in before
     refused = train(*TINY, where, "frames=240", "seed=3")
     assert refused.returncode == 1
-    assert "already holds a run. Continue it with 'python train.py resume=" in refused.stderr
+    assert "already holds a run. Continue it with: python train.py resume=" in refused.stderr
     broken = train(f"resume={tmp_path / 'run'}", "frames=240", "policy_update.max_kl=abc")
     assert broken.returncode == 1
     elsewhere = train(f"resume={tmp_path / 'run'}", f"hydra.run.dir={tmp_path / 'other'}")
