@@ -33,8 +33,14 @@ def overrides_of(settings: Mapping[str, Any], prefix: str = "") -> Iterator[str]
         key = f"{prefix}{name}"
         if isinstance(value, Mapping) and key not in _WHOLE:
             yield from overrides_of(value, f"{key}.")
-        else:
+            continue
+        try:
             yield f"{key}={_literal(value)}"
+        except TypeError:
+            raise CommandLineError(
+                f"{key}={value!r}: a setting takes numbers, texts, lists, dictionaries and None. "
+                "What is of your own is named as a _target_, or by a file that config_dir finds."
+            ) from None
 
 
 def _literal(value: Any) -> str:
@@ -44,8 +50,8 @@ def _literal(value: Any) -> str:
         return "[" + ",".join(map(_literal, value)) + "]"
     if isinstance(value, str | Path):
         return quote(str(value))
-    # numbers of NumPy and torch are not JSON's
-    return json.dumps(value.item() if hasattr(value, "item") else value)
+    # numbers and arrays of NumPy and torch are not JSON's
+    return _literal(value.tolist()) if hasattr(value, "tolist") else json.dumps(value)
 
 
 def search_path(folders: str | Path | Sequence[str | Path]) -> list[str]:

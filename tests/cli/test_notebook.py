@@ -246,6 +246,12 @@ def test_an_interrupted_run_says_how_to_go_on(tmp_path, monkeypatch, capsys):
 def test_mappings_that_go_together_and_numbers_of_numpy_are_written_as_hydra_takes_them():
     given = {"env.outside": {"cost_a": [0, -1, 1]}, "seed": np.int64(3)}
     assert list(overrides_of(given)) == ["env.outside={cost_a:[0,-1,1]}", "seed=3"]
+    assert list(overrides_of({"layers": np.array([8, 4])})) == ["layers=[8,4]"]
+
+
+def test_what_is_no_setting_is_named():
+    with pytest.raises(ValueError, match=r"^loss\._target_=<class .*: a setting takes numbers"):
+        list(overrides_of({"loss": {"_target_": Trainer}}))
 
 
 @pytest.mark.parametrize(
