@@ -202,7 +202,7 @@ def train(
     if modules:
         overrides = note_imports(modules, overrides)
     config = compose_new(overrides)
-    folder = Path(config.hydra.run.dir if directory is None else directory)
+    folder = Path(config.hydra.run.dir if directory is None else directory).expanduser()
     with open_dict(config):
         hydra = config.pop("hydra")
     return _carry_out(config, folder, hydra)
@@ -294,7 +294,7 @@ def load(
         >>> run.policy(run.env.reset())["action"].shape
         torch.Size([1, 2])
     """
-    run = Run(Path(directory), checkpoint)
+    run = Run(Path(directory).expanduser(), checkpoint)
     check_imports(run.config, imports if imports is None else several(imports), run.directory)
     import_modules(imports or ())
     find_checkpoint(run.directory, checkpoint)

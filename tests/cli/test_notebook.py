@@ -254,6 +254,16 @@ def test_what_is_no_setting_is_named():
         list(overrides_of({"loss": {"_target_": Trainer}}))
 
 
+def test_folders_in_the_home_are_found_however_they_are_named(run, tmp_path, monkeypatch):
+    monkeypatch.setenv("HOME", str(run.directory.parent))
+    assert safe_rl.load(f"~/{run.directory.name}").directory == run.directory
+    monkeypatch.setenv("HOME", str(tmp_path))
+    (tmp_path / "taken").mkdir()
+    (tmp_path / "taken" / "progress.csv").touch()
+    with pytest.raises(FileExistsError, match=f"{tmp_path}/taken already holds a run"):
+        safe_rl.train("PointGoal0", algo="cpo", frames=40, directory="~/taken", **SMALL)
+
+
 @pytest.mark.parametrize(
     ("algo", "key", "value"),
     [
