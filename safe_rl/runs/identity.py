@@ -67,6 +67,7 @@ ROLES: dict[str, Role] = {
     "evaluation": Role.MANNER,
     "memory.keep": Role.MANNER,
     "memory.storage": Role.MANNER,
+    "note": Role.MANNER,
     "certificate": Role.MACHINE,  # what is found out about a run, not what it is
     "checkpoint": Role.MACHINE,
     "compile": Role.MACHINE,

@@ -29,7 +29,7 @@ def all_keys():
     for (algo, logger), preset in itertools.product(pairs, ("default", "paper")):
         config = compose_config("env=PointMass", f"algo={algo}", f"logger={logger}", f"preset={preset}")  # fmt: skip  # noqa: E501
         found |= set(nodes(OmegaConf.to_container(config)))
-    return found
+    return found | {"note"}  # which no file has
 
 
 def test_every_row_is_about_a_key_that_exists(all_keys):
@@ -61,6 +61,7 @@ def test_folders_of_a_sweep_name_all_but_the_machine_and_what_is_in_the_path(all
         ("loss.alpha_init", Role.EXPERIMENT),
         ("policy_update.compile", Role.MACHINE),
         ("logger._target_", Role.MACHINE),
+        ("note", Role.MANNER),
         ("collector._target_", Role.MANNER),
         ("collector.ahead", Role.EXPERIMENT),
         ("hydra.verbose", Role.MACHINE),
