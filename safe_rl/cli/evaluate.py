@@ -16,7 +16,7 @@ from safe_rl.cli.options import OptionError, parse_options, usage
 from safe_rl.cli.robots import maker_of
 from safe_rl.cli.user_code import check_imports, import_modules, split_imports
 from safe_rl.cli.variations import evaluate_varied, table_of
-from safe_rl.envs import ConfigError, LayoutError, OpenGLError
+from safe_rl.envs import ConfigError, ContractError, LayoutError, OpenGLError
 from safe_rl.evaluation import Evaluation, EvaluationOptions, evaluate
 from safe_rl.evaluation.loading import load_config
 from safe_rl.evaluation.summary import format_estimates
@@ -68,7 +68,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             return 0
         result = evaluate_run(directory, options, progress=True)
     except (
-        *(OptionError, ConfigError, CheckpointError, LayoutError, OpenGLError),
+        *(OptionError, ConfigError, ContractError, CheckpointError, LayoutError, OpenGLError),
         *(OSError, ModuleNotFoundError, ValueError),
     ) as error:
         print(f"error: {error}", file=sys.stderr)

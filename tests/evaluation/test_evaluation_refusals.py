@@ -10,7 +10,7 @@ from omegaconf import OmegaConf
 
 from safe_rl.cli.evaluate import main
 from safe_rl.cli.report import main as report_main
-from safe_rl.envs import make_env
+from safe_rl.envs import ContractError, make_env
 from safe_rl.evaluation.loading import override_env
 from safe_rl.evaluation.variations import Variation, varied
 
@@ -104,6 +104,17 @@ def test_a_run_that_others_may_only_read_is_evaluated_as_a_copy(run, capsys, mon
 def test_a_command_without_a_folder_asks_for_it(command, what, capsys):
     assert command(["import=json"]) == 1
     assert f"{what} first." in capsys.readouterr().err
+
+
+def test_an_environment_that_breaks_its_contract_ends_in_one_line(run, capsys, monkeypatch):
+    """A family of one's own that makes 20 environments, say, however many it is asked for."""
+
+    def make(*node, **options):
+        raise ContractError("mine was asked for 25 environments and made 20")
+
+    monkeypatch.setattr("safe_rl.cli.robots.envs.make_env", make)
+    assert main([str(run)]) == 1
+    assert "error: mine was asked for 25" in capsys.readouterr().err
 
 
 def test_a_folder_above_runs_names_them(run, capsys):
