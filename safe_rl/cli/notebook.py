@@ -250,7 +250,7 @@ def _carry_out(config: DictConfig, folder: Path, hydra: DictConfig | None = None
             has_begun = True
             if trainer is None:
                 if RunFolder(folder).certifying.exists():
-                    certify_ended(folder)
+                    certify_ended(folder, config.num_threads or 0)
                 return Run(folder)
             if hydra is not None:
                 write_notes(RunFolder(folder), config, hydra)
@@ -269,7 +269,7 @@ def _carry_out(config: DictConfig, folder: Path, hydra: DictConfig | None = None
     if is_to_keep_limits(config, trainer.algorithm.cost_keys) and is_worth_a_certificate(
         config, trainer.episode_length
     ):
-        certify_ended(folder)
+        certify_ended(folder, config.num_threads or 0)
     return Run(folder)
 
 
