@@ -27,7 +27,8 @@ class Tanh(nn.Tanh):
         quick = input.device.type == "cpu" and input.dtype == torch.float32
         if not quick or torch.compiler.is_compiling():
             return torch.tanh(input)
-        if not (torch.is_grad_enabled() and input.requires_grad):
+        # what is mapped over a batch does not tell whether a gradient will be asked for
+        if not torch.is_grad_enabled():
             return _tanh(input)
         result: Tensor = _TanhFunction.apply(input)
         return result

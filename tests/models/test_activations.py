@@ -41,6 +41,16 @@ def test_it_can_be_mapped_and_differentiated_forwards():
     torch.testing.assert_close(pushed, x * (1 - x.tanh().square()), atol=2e-6, rtol=0)
 
 
+def test_gradients_of_what_is_mapped_are_the_tangents():
+    """So TorchRL's losses evaluate several networks of a kind: gradients are taken outside."""
+    weights, x = torch.randn(2, 4, 3, requires_grad=True), torch.randn(5, 3)
+    found = [
+        torch.autograd.grad(torch.vmap(lambda w, f=f: f(x @ w.T))(weights).square().sum(), weights)
+        for f in (QUICK, torch.tanh)
+    ]
+    torch.testing.assert_close(*found, atol=2e-6, rtol=1e-5)
+
+
 @pytest.mark.parametrize("dtype", [torch.float64, torch.bfloat16])
 def test_other_precisions_are_torchs_own(dtype):
     x = torch.randn(100, dtype=dtype)
