@@ -34,7 +34,7 @@ def bounded_actions(env: EnvBase) -> TensorSpec:
     """Spec of one environment's action, [A], which has bounds.
 
     Raises:
-        ValueError: If it has none.
+        ValueError: If it has none, or another shape.
     """
     spec = env.action_spec_unbatched
     is_continuous = hasattr(spec, "low") and spec.dtype.is_floating_point
@@ -42,6 +42,11 @@ def bounded_actions(env: EnvBase) -> TensorSpec:
         raise ValueError(
             "This algorithm's actions lie within bounds, and those of this environment have none: "
             f"its action_spec is {type(spec).__name__}. Use algo=ppo_lagrangian, or bound them."
+        )
+    if len(spec.shape) != 1:
+        raise ValueError(
+            f"An action of this environment has the shape {list(spec.shape)}: policies act by "
+            "vectors [A]. Let the environment take them, and give them their shape itself."
         )
     return spec
 

@@ -180,17 +180,19 @@ def _choices(spec: TensorSpec) -> Iterator[int]:
 
 
 def _is_continuous(spec: TensorSpec) -> bool:
-    return isinstance(spec, Bounded) and spec.dtype.is_floating_point
+    return isinstance(spec, Bounded) and spec.dtype.is_floating_point and len(spec.shape) == 2
 
 
 def _is_choice(spec: TensorSpec) -> bool:
+    if len(spec.shape) > 2:
+        return False
     if isinstance(spec, Bounded) and not spec.dtype.is_floating_point:
         return not spec.space.low.any()  # Gymnasium's MultiDiscrete of several environments
     return isinstance(spec, Categorical) and not isinstance(spec, Binary)
 
 
 def _is_one_hot(spec: TensorSpec) -> bool:
-    return isinstance(spec, OneHot) and not isinstance(spec, MultiOneHot)
+    return isinstance(spec, OneHot) and not isinstance(spec, MultiOneHot) and len(spec.shape) == 2
 
 
 HEADS: Mapping[str, _Row] = {

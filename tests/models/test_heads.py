@@ -137,6 +137,10 @@ def test_gradients_reach_every_output_of_a_tanh_policy():
         ("categorical", SPECS["gaussian"], "auto or gaussian or tanh or beta"),
         ("auto", Binary(3, shape=(7, 3)), "No policy can act in Binary"),
         ("auto", MultiOneHot([2, 3], shape=(7, 5)), "No policy can act in MultiOneHot"),
+        ("auto", Bounded(-1, 1, (7, 2, 3)), r"act in BoundedContinuous\[7, 2, 3\]"),
+        ("auto", Bounded(-1, 1, (7,)), r"act in BoundedContinuous\[7\]"),
+        ("auto", CategoricalSpec(4, shape=(7, 2, 3)), r"act in Categorical\[7, 2, 3\]"),
+        ("auto", OneHot(4, shape=(7, 2, 4)), r"act in OneHot\[7, 2, 4\]"),
     ],
 )
 def test_heads_for_other_actions_are_refused(kind, spec, message):

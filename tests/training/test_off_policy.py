@@ -7,7 +7,6 @@ import pytest
 import torch
 from point_mass import PointMass
 from run_configs import compose_config, without_times
-from torchrl.data import Unbounded
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from safe_rl.algorithms import OffPolicy
@@ -222,16 +221,6 @@ def test_it_is_evaluated_in_between_without_noise_and_without_consequences(tmp_p
     expected = collect_episodes(env, policy, 6, ["cost"], deterministic=True)
     assert evaluated["evaluation_return"][-1] == pytest.approx(expected.returns.mean().item())
     assert evaluated["evaluation_cost"][-1] == expected.costs["cost"].mean().item()
-
-
-def test_actions_without_bounds_are_refused():
-    class Free(PointMass):
-        def __init__(self):
-            super().__init__(2)
-            self.action_spec = Unbounded((2, 2))
-
-    with pytest.raises(ValueError, match=r"actions lie within bounds.*Unbounded"):
-        OffPolicy.build(off_policy_config("algo=sac"), Free())
 
 
 def test_a_memory_that_never_holds_enough_is_refused():
