@@ -31,7 +31,7 @@ def setting(config: DictConfig, key: str) -> Any:
 
 
 def bounded_actions(env: EnvBase) -> TensorSpec:
-    """Spec of one environment's action, [A], which has bounds.
+    """Spec of one environment's action, [A], which has bounds; in single precision, as networks.
 
     Raises:
         ValueError: If it has none, or another shape.
@@ -48,7 +48,7 @@ def bounded_actions(env: EnvBase) -> TensorSpec:
             f"An action of this environment has the shape {list(spec.shape)}: policies act by "
             "vectors [A]. Let the environment take them, and give them their shape itself."
         )
-    return spec
+    return spec.to(torch.float32)
 
 
 def exploring(actor: TensorDictModuleBase, env: EnvBase, noise: float) -> ExploringPolicy:

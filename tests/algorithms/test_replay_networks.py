@@ -7,6 +7,8 @@ from run_configs import compose_config
 from torchrl.data import Bounded, Unbounded
 
 from safe_rl.algorithms import OffPolicy
+from safe_rl.runs.table import read_table
+from safe_rl.training.building import build_trainer
 
 
 def config_of(algo):
@@ -36,3 +38,12 @@ class Acting(PointMass):
 def test_other_actions_than_vectors_within_bounds_are_refused(spec, message):
     with pytest.raises(ValueError, match=message):
         OffPolicy.build(config_of("sac"), Acting(spec))
+
+
+@pytest.mark.parametrize("algo", ["sac_lagrangian", "td3_lagrangian"])
+def test_bounds_of_double_precision_are_for_networks_of_single_precision(algo, tmp_path):
+    env = Acting(Bounded(-1, 1, (4, 2), dtype=torch.float64))
+    trainer = build_trainer(config_of(algo), env, tmp_path)
+    trainer.run()
+    assert read_table(tmp_path / "progress.csv")["policy_num_updates"] == [8, 8, 8]
+    assert trainer.algorithm.policy(env.reset())["action"].dtype == torch.float32
