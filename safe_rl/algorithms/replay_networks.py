@@ -12,6 +12,7 @@ from torchrl.envs import EnvBase
 
 from safe_rl.algorithms.parts import build_part
 from safe_rl.models import ExploringPolicy, QEnsemble, input_scale_vector
+from safe_rl.models.encoders import TO_FLATTEN, observed_entries
 
 __all__ = ["bounded_actions", "build_networks", "exploring", "setting"]
 
@@ -73,7 +74,8 @@ def build_networks(
         and ``cost_critic``.
 
     Raises:
-        ValueError: If actions have no bounds, or the model is one for on-policy algorithms.
+        ValueError: If actions have no bounds, the observation is no vector, or the model is one for
+            on-policy algorithms.
     """
     model, spec = config.model, bounded_actions(env)
     if others := [key for key in _ON_POLICY_ONLY if model.get(key)]:
@@ -81,7 +83,14 @@ def build_networks(
             f"algo={config.algo.name} learns with perceptrons on a vector as it is; model."
             f"{others[0]} is for on-policy algorithms. Use model=mlp without it."
         )
-    size = env.observation_spec["observation"].shape[-1]
+    observed = observed_entries(env.observation_spec)
+    if observed[0].key != "observation" or len(observed[0].shape) != 1:
+        raise ValueError(
+            f"algo={config.algo.name} learns with perceptrons on one vector, and this environment "
+            f"observes {', '.join(map(str, observed))}: {TO_FLATTEN}, or use algo=ppo_lagrangian "
+            "with model=dict or model=cnn."
+        )
+    (size,) = observed[0].shape
     common: dict[str, Any] = {
         "hidden_sizes": list(model.hidden_sizes),
         "input_scale": input_scale_vector(model.input_scale, env.observation_layout),

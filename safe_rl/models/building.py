@@ -15,7 +15,7 @@ from torch import nn
 from torchrl.data import Composite, TensorSpec
 
 from safe_rl.models.activations import Tanh
-from safe_rl.models.encoders import Body, Observed, observed_entries
+from safe_rl.models.encoders import TO_FLATTEN, Body, Observed, observed_entries
 from safe_rl.models.heads import AUTO, Head, make_head
 from safe_rl.models.memory import FEATURES, MEMORY, GatedMemory
 from safe_rl.models.networks import Chain, assemble_actor, perceptron
@@ -123,11 +123,9 @@ def _body(
     first = observed.entries[0]
     is_vector = len(observed.entries) == 1 and len(first.shape) == 1
     if observed.encoders is None and not is_vector:
-        shapes = ", ".join(f"{entry.name} {list(entry.shape)}" for entry in observed.entries)
         raise ValueError(
-            f"This environment observes {shapes}, and model=mlp takes one vector: use model=dict, "
-            "which has an encoder for each, or make the environment flatten them: with "
-            "env.observation_flatten=true in Safety Gym, else with env.flatten=true."
+            f"This environment observes {', '.join(map(str, observed.entries))}, and model=mlp "
+            f"takes one vector: use model=dict, which has an encoder for each, or {TO_FLATTEN}."
         )
     if observed.encoders is not None or remembered:
         plain = observed._replace(encoders=observed.encoders or _AS_IT_IS)

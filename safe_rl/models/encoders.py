@@ -16,7 +16,12 @@ from safe_rl.models.networks import perceptron
 from safe_rl.models.normalising import RunningScale
 from safe_rl.models.scaling import InputScale, input_scale_vector
 
-__all__ = ["Body", "Entry", "Observed", "observed_entries"]
+__all__ = ["TO_FLATTEN", "Body", "Entry", "Observed", "observed_entries"]
+
+TO_FLATTEN = (
+    "make the environment flatten them: with env.observation_flatten=true in Safety Gym, else with "
+    "env.flatten=true"
+)
 
 
 class Entry(NamedTuple):
@@ -33,6 +38,9 @@ class Entry(NamedTuple):
     name: str
     shape: tuple[int, ...]
     is_bytes: bool
+
+    def __str__(self) -> str:
+        return f"{self.name} {list(self.shape)}"
 
 
 def observed_entries(observation_spec: Composite) -> list[Entry]:

@@ -4,7 +4,7 @@ import pytest
 import torch
 from point_mass import PointMass
 from run_configs import compose_config
-from torchrl.data import Bounded, Unbounded
+from torchrl.data import Bounded, Composite, Unbounded
 
 from safe_rl.algorithms import OffPolicy
 from safe_rl.runs.table import read_table
@@ -38,6 +38,21 @@ class Acting(PointMass):
 def test_other_actions_than_vectors_within_bounds_are_refused(spec, message):
     with pytest.raises(ValueError, match=message):
         OffPolicy.build(config_of("sac"), Acting(spec))
+
+
+@pytest.mark.parametrize(
+    ("observation", "message"),
+    [
+        (Composite(b=Unbounded((2, 3)), a=Unbounded((2, 4)), shape=[2]), r"a \[4\], b \[3\]: make"),
+        (Composite(a=Unbounded((2, 4)), shape=[2]), r"observes a \[4\]: make"),
+        (Unbounded((2, 9, 9, 3), dtype=torch.uint8), r"observes observation \[9, 9, 3\]: make"),
+    ],
+)
+def test_other_observations_than_a_vector_are_refused(observation, message):
+    env = PointMass(2)
+    env.observation_spec = Composite(observation=observation, shape=[2])
+    with pytest.raises(ValueError, match=message):
+        OffPolicy.build(config_of("sac"), env)
 
 
 @pytest.mark.parametrize("algo", ["sac_lagrangian", "td3_lagrangian"])
