@@ -150,7 +150,8 @@ class Pixels(nn.Module):
 
 def _vector(entry: Entry, observed: Observed, device: torch.device | None) -> nn.Module:
     size, widths = entry.shape[0], list(observed.encoders["vector"])  # type: ignore[index]
-    layout = observed.layout if entry.name == "observation" else {entry.name: slice(0, size)}
+    # of a dictionary an entry may be called that, too
+    layout = observed.layout if entry.key == "observation" else {entry.name: slice(0, size)}
     scale = input_scale_vector(observed.input_scale, layout)
     layers: list[nn.Module] = []
     if observed.clip is not None:  # then the units make no difference

@@ -60,6 +60,18 @@ def test_every_entry_has_its_encoder():
     torch.testing.assert_close(value, last(torch.tanh(first(codes))))
 
 
+def test_entries_are_scaled_by_their_names():
+    """Gymnasium's goals stand beside an entry that is called `observation`."""
+    sizes = {"desired_goal": 2, "observation": 3}
+    observed = spec(**{name: Unbounded((3, size)) for name, size in sizes.items()})
+    layout = {"desired_goal": slice(0, 2), "observation": slice(2, 5)}
+    scales = {"desired_goal": 0.5, "observation": 0.1}
+    critic = build(observed, layout=layout, encoders=ENCODERS, input_scale=scales)["critic"]
+    for encoder, (name, size) in zip(critic.module.encoders, sizes.items(), strict=True):
+        assert encoder[0].scale.tolist() == pytest.approx([scales[name]] * size)
+    assert critic(observed.rand())["state_value"].shape == (3, 1)
+
+
 def test_pictures_may_be_bytes_and_have_their_colours_first():
     observed = Composite(observation=Unbounded((3, 12, 15, 3)), shape=(3,))
     picture = torch.randint(256, (3, 12, 15, 3), dtype=torch.uint8)
