@@ -177,7 +177,8 @@ class Memory:
             self._buffer.sampler.load_state_dict(state_dict["sampler"])
         self.end_rows()
         if self._multi_step is not None and "tail" in state_dict:
-            tail = TensorDict(state_dict["tail"], batch_size=state_dict["tail_shape"])
+            # of the run before, which may have been on another device
+            tail = TensorDict(state_dict["tail"], state_dict["tail_shape"], device=self._device)
             self._multi_step._buffer = tail.unflatten_keys("/")
 
 

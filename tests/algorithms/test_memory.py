@@ -116,6 +116,14 @@ def test_a_copy_goes_on_in_the_same_way(storage, n_steps, batches, tmp_path):
     assert torch.equal(*drawn)
 
 
+def test_a_copy_on_another_device_goes_on_there():
+    memory, copy = (make_memory(n_steps=3, device=device) for device in ("cpu", "meta"))
+    memory.extend(make_batch(0, 2))
+    copy.load_state_dict(memory.state_dict())
+    copy.extend(make_batch(2, 1).to("meta"))
+    assert copy.state_dict()["tail"]["observation"].is_meta
+
+
 EXPONENTS = {"alpha": 0.7, "beta": 0.4}
 
 
