@@ -25,6 +25,12 @@ from safe_rl.objectives.samples import learning_samples, require_finite
 
 __all__ = ["MinibatchUpdate"]
 
+_ESTIMATES = ("advantage", "value_target", "value")
+"""Names of keys that losses of TorchRL's read where they are, and have not among their `in_keys`.
+
+Without them they would estimate advantages themselves, of samples that are in no order.
+"""
+
 
 class MinibatchUpdate:
     """Several passes of gradient steps over one batch, minimising the sum of all ``loss_*``.
@@ -45,7 +51,8 @@ class MinibatchUpdate:
     the present one collected it, teaches nothing; a warning says so.
 
     Args:
-        loss: Loss module whose ``in_keys`` name what it needs of the batch.
+        loss: Loss module whose ``in_keys`` name what it needs of the batch; advantages, value
+            targets and values that are there go by the keys that it has for them.
         optimizer: Function of the parameters that builds the optimiser, for example
             ``functools.partial(torch.optim.Adam, lr=3e-4, fused=True)``.
         num_passes: Passes over the batch.
@@ -140,7 +147,10 @@ class MinibatchUpdate:
             anchor(batch)
         require_finite(batch, self.loss.in_keys)
         mask_keys = [key for key in AUTO_LOSS_MASK_KEYS if batch.get(key, None) is not None]
+        keys = getattr(self.loss, "tensor_keys", None)
+        estimates = [getattr(keys, name) for name in _ESTIMATES if hasattr(keys, name)]
         selected = batch.select(*self.loss.in_keys, *mask_keys)
+        selected.update(batch.select(*estimates, strict=False))
         samples = learning_samples(selected, self.loss.in_keys)
         for minibatch in self._minibatches(samples):
             total, losses = self._evaluate(minibatch)

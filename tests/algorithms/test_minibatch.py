@@ -8,10 +8,11 @@ import torch
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 from torch import nn
+from torchrl.objectives import A2CLoss, ClipPPOLoss
 
 from safe_rl.algorithms.learning_rate import KLAdaptiveRate
 from safe_rl.algorithms.minibatch import MinibatchUpdate
-from safe_rl.models import BehaviourPolicy, make_actor
+from safe_rl.models import BehaviourPolicy, make_actor, make_critic
 from safe_rl.objectives import CriticLoss, PPOLoss
 
 adam = functools.partial(torch.optim.Adam, lr=1e-2)
@@ -121,6 +122,24 @@ def test_the_policy_that_collects_is_the_one_that_is_updated():
     # the first action's advantage grows with the action itself, the second one's does not count
     assert (loc - batch["loc"])[..., 0].mean() > 0.05
     torch.testing.assert_close(actor.get_dist(batch.select("observation")).mean, loc)
+
+
+@pytest.mark.parametrize(("kind", "settings"), [(A2CLoss, {}), (ClipPPOLoss, {"clip_value": 0.1})])
+def test_losses_of_torchrls_get_the_advantages_of_the_batch(kind, settings):
+    """Theirs would be of shuffled samples, as if one followed the other."""
+    actor = make_actor(5, 2, hidden_sizes=[16], initial_log_std=-0.5)
+    critic = make_critic(5, hidden_sizes=[16])
+    batch = ppo_batch(actor)
+    value, flags = torch.randn(8, 16, 1), torch.zeros(8, 16, 1, dtype=torch.bool)
+    batch["state_value"], batch["value_target"] = value, value + batch["advantage"]
+    following = {"reward": value, "done": flags, "terminated": flags}
+    batch["next"] = {**following, "observation": torch.randn(8, 16, 5)}
+    loss = kind(actor, critic, **settings)
+    expected = loss(batch.reshape(-1).clone())
+    still = functools.partial(torch.optim.SGD, lr=0.0)
+    found = MinibatchUpdate(loss, optimizer=still, num_passes=2, minibatch_size=32)(batch)
+    for name in ("loss_objective", "loss_critic"):
+        torch.testing.assert_close(found[name], expected[name].detach())
 
 
 def test_compiled_and_plain_updates_agree():
