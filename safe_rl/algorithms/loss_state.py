@@ -11,7 +11,7 @@ from torch import Tensor, nn
 
 from safe_rl.algorithms.losses import ESTIMATOR
 
-__all__ = ["LossState"]
+__all__ = ["LossState", "losses_of"]
 
 
 class LossState:
@@ -35,7 +35,7 @@ class LossState:
     """
 
     def __init__(self, update: Any, besides: Iterable[nn.Module]) -> None:
-        self._losses = list(_losses(update))
+        self._losses = list(losses_of(update))
         self._besides = list(besides)
 
     def __bool__(self) -> bool:
@@ -63,13 +63,14 @@ class LossState:
         }
 
 
-def _losses(update: Any, place: str = "loss") -> Iterator[tuple[str, nn.Module]]:
+def losses_of(update: Any, place: str = "loss") -> Iterator[tuple[str, nn.Module]]:
+    """Losses that are modules, of an update or of `UpdatesInTurn`, each with its place."""
     if isinstance(getattr(update, "loss", None), nn.Module):
         yield place, update.loss
     if hasattr(update, "first"):
-        yield from _losses(update.first, place)
+        yield from losses_of(update.first, place)
     for name, other in getattr(update, "then", {}).items():
-        yield from _losses(other, f"{place}.{name}")
+        yield from losses_of(other, f"{place}.{name}")
 
 
 def _tensors(module: nn.Module) -> Iterator[tuple[str, Tensor]]:

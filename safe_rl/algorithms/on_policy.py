@@ -17,7 +17,7 @@ from safe_rl.algorithms.building import build_constraints, constrained_limits
 from safe_rl.algorithms.constraints import Constraints
 from safe_rl.algorithms.contract import PolicyUpdate, Stateful
 from safe_rl.algorithms.in_turn import UpdatesInTurn
-from safe_rl.algorithms.loss_state import LossState
+from safe_rl.algorithms.loss_state import LossState, losses_of
 from safe_rl.algorithms.minibatch import MinibatchUpdate
 from safe_rl.algorithms.parts import build_part
 from safe_rl.algorithms.side_by_side import side_by_side
@@ -156,10 +156,21 @@ class OnPolicy:
         """Improve the policy and fit the critics: neither needs what the other does."""
         constraints = self.constraints
         given = (batch, constraints.violation, constraints.episode_length)
-        policy, critic = side_by_side(
-            lambda: self.policy_update(*given), lambda: self.critic_update(batch)
-        )
-        return {"policy": policy, "critic": critic}
+
+        def improve() -> Mapping[str, Tensor]:
+            return self.policy_update(*given)
+
+        def fit() -> Mapping[str, Tensor]:
+            return self.critic_update(batch)
+
+        both = (improve(), fit()) if self._shares_critics() else side_by_side(improve, fit)
+        return dict(zip(("policy", "critic"), both, strict=True))
+
+    def _shares_critics(self) -> bool:
+        """Whether a loss of one's own moves a critic, which two threads must not do at once."""
+        fitted = {parameter.data_ptr() for parameter in self.critic_update.loss.parameters()}
+        losses = (loss for _, loss in losses_of(self.policy_update))
+        return any(p.data_ptr() in fitted for loss in losses for p in loss.parameters())
 
     def checkpoint_components(self) -> dict[str, Stateful]:
         """Parts with a ``state_dict``, by name: together they are all that learning depends on."""

@@ -4,8 +4,22 @@ import threading
 
 import pytest
 import torch
+from point_mass_runs import point_mass_trainer
 
+from safe_rl.algorithms import on_policy
 from safe_rl.algorithms.side_by_side import side_by_side, torch_threads
+from safe_rl.objectives import PPOLoss
+from safe_rl.targets import allow
+
+allow(__name__)
+
+
+class WithCritic(PPOLoss):
+    """A loss of one's own that has the critic among its parameters."""
+
+    def __init__(self, actor_network, critic_network, **settings):
+        super().__init__(actor_network, **settings)
+        self.critic = critic_network
 
 
 @pytest.fixture
@@ -50,3 +64,18 @@ def test_the_other_ends_before_an_error_is_raised(two_threads, fails):
         side_by_side(*calls)
     assert ended.is_set()
     assert torch.get_num_threads() == 2
+
+
+@pytest.mark.parametrize(
+    ("loss", "number"), [("safe_rl.objectives.PPOLoss", 1), (f"{__name__}.WithCritic", 0)]
+)
+def test_a_loss_that_moves_the_critic_comes_before_its_fit(loss, number, tmp_path, monkeypatch):
+    calls = []
+    monkeypatch.setattr(
+        on_policy, "side_by_side", lambda *both: calls.append(both) or [call() for call in both]
+    )
+    trainer = point_mass_trainer(tmp_path, "algo=ppo", f"loss._target_={loss}")
+    row = trainer.epoch(trainer.batches())
+    assert len(calls) == number
+    assert row["policy_num_steps"] > 0
+    assert row["critic_num_steps"] == 12
