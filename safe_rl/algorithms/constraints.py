@@ -115,12 +115,22 @@ class Constraints:
     def column(self, name: str, value: Tensor) -> dict[str, float]:
         """One column for a scalar, one per constraint for a vector [k].
 
+        A single number that is no constraint's, as losses of TorchRL's report them, is a scalar.
+
+        Raises:
+            ValueError: For any other shape.
+
         Examples:
             >>> Constraints({("agents", "cost"): 25.0}).column("violation", torch.tensor([5.0]))
             {'violation_agents/cost': 5.0}
         """
-        if value.ndim == 0:
+        if value.numel() == 1 and (value.ndim == 0 or len(self.keys) != 1):
             return {name: value.item()}
+        if value.shape != (len(self.keys),):
+            raise ValueError(
+                f"'{name}' has the shape {list(value.shape)}: what is logged is one number, or one "
+                f"for each of {len(self.keys)} constraints."
+            )
         names = map(key_name, self.keys)
         return {f"{name}_{key}": v for key, v in zip(names, value.tolist(), strict=True)}
 

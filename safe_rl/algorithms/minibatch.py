@@ -155,7 +155,7 @@ class MinibatchUpdate:
         for minibatch in self._minibatches(samples):
             total, losses = self._evaluate(minibatch)
             history.append(losses.detach())
-            if self.max_kl is not None and losses["kl"] > self.max_kl:
+            if self.max_kl is not None and _divergence(losses) > self.max_kl:
                 break
             if not total.isfinite():
                 raise divergence(losses)
@@ -232,3 +232,15 @@ class MinibatchUpdate:
         self.optimizer.load_state_dict(state_dict["optimizer"])
         if "shuffles" in state_dict:  # checkpoints of earlier versions lack it
             self._generator.set_state(state_dict["shuffles"].cpu())
+
+
+def _divergence(losses: TensorDictBase) -> Tensor:
+    """The KL divergence by which updates are ended, as the loss reports it."""
+    kl = losses.get("kl", None)
+    if kl is None or kl.numel() != 1:
+        raise ValueError(
+            "max_kl ends an update by the scalar 'kl' that its loss reports, and this one reports "
+            f"{'none' if kl is None else f'one of shape {list(kl.shape)}'}: use max_kl=null and "
+            "adapt_rate=null."
+        )
+    return kl

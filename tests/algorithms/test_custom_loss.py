@@ -1,5 +1,6 @@
 """The example of a loss and a risk measure of one's own: definitions, and whole runs."""
 
+import math
 import re
 import shlex
 import subprocess
@@ -8,9 +9,11 @@ import sys
 import pytest
 import torch
 from point_mass import PointMass
+from point_mass_runs import point_mass_trainer
 from run_configs import CONF, point_mass_config
 from tensordict import TensorDict
 
+from safe_rl import targets
 from safe_rl.algorithms import Constraints
 from safe_rl.cli.user_code import import_modules
 from safe_rl.models import make_actor
@@ -85,3 +88,22 @@ def test_the_command_of_the_example(tmp_path):
         check=False,
     )
     assert result.returncode == 0, result.stderr
+
+
+@pytest.mark.parametrize("name", ["A2CLoss", "ClipPPOLoss"])
+def test_a_run_learns_with_a_loss_of_torchrls(name, tmp_path, monkeypatch):
+    """What is not one number for each of its constraints is logged as a scalar."""
+    monkeypatch.setattr(targets, "_users_modules", {"torchrl.objectives"})
+    keys = ("algo=ppo", f"loss._target_=torchrl.objectives.{name}")
+    with pytest.raises(ValueError, match="this one reports none: use max_kl=null and adapt"):
+        point_mass_trainer(tmp_path / "kl", *keys).run()
+    free = ("policy_update.max_kl=null", "policy_update.adapt_rate=null")
+    trainer = point_mass_trainer(tmp_path, *keys, *free)
+    row = trainer.epoch(trainer.batches())
+    assert math.isfinite(row["policy_loss_critic"])
+    assert ("policy_explained_variance" in row) == (name != "A2CLoss")
+
+
+def test_what_is_neither_a_number_nor_one_for_each_constraint_is_named():
+    with pytest.raises(ValueError, match=r"'policy_own' has the shape \[3\].*each of 2"):
+        Constraints({"cost_a": 1.0, "cost_b": 1.0}).column("policy_own", torch.zeros(3))
