@@ -111,7 +111,7 @@ def test_the_limit_while_learning_from_memory(algo):
 
 def test_the_tables_are_found():
     assert len(HELD_OUT) >= 16
-    assert len(THREE_MILLION) >= 11
+    assert len(THREE_MILLION) >= 13
     assert len(ONE_MILLION) >= 12
 
 
