@@ -148,7 +148,8 @@ class MinibatchUpdate:
         require_finite(batch, self.loss.in_keys)
         mask_keys = [key for key in AUTO_LOSS_MASK_KEYS if batch.get(key, None) is not None]
         keys = getattr(self.loss, "tensor_keys", None)
-        estimates = [getattr(keys, name) for name in _ESTIMATES if hasattr(keys, name)]
+        names = _ESTIMATES if hasattr(keys, "advantage") else ()
+        estimates = [getattr(keys, name) for name in names if hasattr(keys, name)]
         selected = batch.select(*self.loss.in_keys, *mask_keys)
         selected.update(batch.select(*estimates, strict=False))
         samples = learning_samples(selected, self.loss.in_keys)

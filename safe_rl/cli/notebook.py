@@ -5,7 +5,6 @@ They do what the commands do, from the same configurations; Hydra stays inside.
 
 from __future__ import annotations
 
-import shlex
 import shutil
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -260,7 +259,7 @@ def _carry_out(config: DictConfig, folder: Path, hydra: DictConfig | None = None
             shutil.rmtree(folder, ignore_errors=True)
     if trainer.interrupted_by is not None:
         say_if_heard(
-            f"Interrupted. Continue with: python train.py resume={shlex.quote(str(folder))}, or "
+            f"Interrupted. Continue with: python train.py {RunFolder(folder).resuming}, or "
             f"safe_rl.resume({str(folder)!r})"
         )
         if trainer.interrupted_by is Signals.SIGINT:

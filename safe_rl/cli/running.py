@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import shlex
 import sys
 from contextlib import AbstractContextManager, ExitStack, nullcontext
 from functools import partial
@@ -159,7 +158,7 @@ def _this_command() -> str:
 
 
 def _again(folder: RunFolder) -> str:
-    return f"{_this_command()} resume={shlex.quote(str(folder.directory))}"
+    return f"{_this_command()} {folder.resuming}"
 
 
 def _say_certificate(config: DictConfig, folder: RunFolder) -> None:

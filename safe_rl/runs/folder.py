@@ -198,9 +198,13 @@ class RunFolder:
         if self.has_begun:
             raise FileExistsError(
                 f"{self.directory} already holds a run. Continue it with: python train.py "
-                f"resume={shlex.quote(str(self.directory))}; or give this one another folder with "
-                "hydra.run.dir=..."
+                f"{self.resuming}; or give this one another folder with hydra.run.dir=..."
             )
+
+    @property
+    def resuming(self) -> str:
+        """What goes on with the run, as a shell takes it."""
+        return f"resume={shlex.quote(str(self.directory))}"
 
     def check_is_run(self) -> None:
         """Refuse a folder that is not a run's.
