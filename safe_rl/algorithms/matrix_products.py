@@ -5,13 +5,12 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import cache
-from pathlib import Path
 
 import torch
 
-__all__ = ["fast_products", "prefers_onednn"]
+from safe_rl.processor import cpuinfo
 
-_PROCESSOR = Path("/proc/cpuinfo")
+__all__ = ["fast_products", "prefers_onednn"]
 
 
 def prefers_onednn(cpuinfo: str) -> bool:
@@ -37,9 +36,7 @@ def prefers_onednn(cpuinfo: str) -> bool:
 
 @cache
 def _is_of_use() -> bool:
-    if not (torch.backends.mkldnn.is_available() and _PROCESSOR.is_file()):
-        return False
-    return prefers_onednn(_PROCESSOR.read_text())
+    return torch.backends.mkldnn.is_available() and prefers_onednn(cpuinfo())
 
 
 @contextmanager

@@ -7,15 +7,22 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from safe_rl.processor import cpuinfo
+
 __all__ = ["Tanh"]
+
+_MKL_IS_QUICK = "GenuineIntel" in cpuinfo()
+"""Whether torch takes its tangents from MKL's vectors, which only Intel's processors go through
+in full width: a third of the time of what is below."""
 
 
 class Tanh(nn.Tanh):
-    """The hyperbolic tangent, five times as fast in single precision on a processor.
+    """The hyperbolic tangent, five times as fast in single precision on an AMD processor.
 
     There it is computed as 2σ(2x) − 1: torch's logistic function takes a tenth of the time of its
     tangent, which was a third of an update's. The absolute error is below 2e-7, as large as that
-    of the sums which are put in. Elsewhere, and where compiled, it is :func:`torch.tanh`.
+    of the sums which are put in. On Intel's processors, on other devices, and where compiled, it
+    is :func:`torch.tanh`.
 
     Examples:
         >>> Tanh()(torch.tensor([0.0, 0.5])).round(decimals=6)
@@ -25,7 +32,7 @@ class Tanh(nn.Tanh):
     def forward(self, input: Tensor) -> Tensor:
         """Return tanh of every element."""
         quick = input.device.type == "cpu" and input.dtype == torch.float32
-        if not quick or torch.compiler.is_compiling():
+        if _MKL_IS_QUICK or not quick or torch.compiler.is_compiling():
             return torch.tanh(input)
         # what is mapped over a batch does not tell whether a gradient will be asked for
         if not torch.is_grad_enabled():

@@ -3,9 +3,15 @@
 import pytest
 import torch
 
+from safe_rl.models import activations
 from safe_rl.models.activations import Tanh
 
 QUICK = Tanh()
+
+
+@pytest.fixture(autouse=True)
+def a_processor_that_mkl_does_not_suit(monkeypatch):
+    monkeypatch.setattr(activations, "_MKL_IS_QUICK", False)
 
 
 def inputs(**options):
@@ -49,6 +55,13 @@ def test_gradients_of_what_is_mapped_are_the_tangents():
         for f in (QUICK, torch.tanh)
     ]
     torch.testing.assert_close(*found, atol=2e-6, rtol=1e-5)
+
+
+def test_where_torchs_own_is_quick_it_is_taken(monkeypatch):
+    x = torch.randn(1000)
+    assert not torch.equal(QUICK(x), x.tanh())
+    monkeypatch.setattr(activations, "_MKL_IS_QUICK", True)
+    assert torch.equal(QUICK(x), x.tanh())
 
 
 @pytest.mark.parametrize("dtype", [torch.float64, torch.bfloat16])
