@@ -5,11 +5,9 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
 
-import gymnasium
-
 from safe_rl.naming import nearest
 
-__all__ = ["choice_with", "family_of", "keys_meant", "paths_of"]
+__all__ = ["choice_with", "keys_meant", "paths_of"]
 
 _LIKENESS = 0.6
 _WHOLE = ("cost_limits", "default_cost_limits", "model.input_scale", "paper")
@@ -117,21 +115,6 @@ def choice_with(
         if any(f"{path}.".startswith(f"{key}.") for path in paths_of(values_with(choice))):
             return choice
     return None
-
-
-def family_of(env_id: str) -> str:
-    """A sentence on how to choose what is no name, but Gymnasium's id of an environment; or none.
-
-    Examples:
-        >>> family_of("CartPole-v1")
-        " It is one of Gymnasium's: env=gymnasium env.id=CartPole-v1."
-        >>> family_of("Safexp-PointGoal1-v0"), family_of("PointGaol1")
-        ('', '')
-    """
-    spec = gymnasium.registry.get(env_id)
-    if spec is None or str(spec.entry_point).startswith("safe_rl."):
-        return ""
-    return f" It is one of Gymnasium's: env=gymnasium env.id={env_id}."
 
 
 def paths_of(values: Mapping[str, Any], prefix: str = "") -> Iterator[str]:

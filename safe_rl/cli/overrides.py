@@ -18,8 +18,9 @@ from omegaconf.errors import OmegaConfBaseException
 from yaml import YAMLError
 
 from safe_rl.cli.keys import KEYS
-from safe_rl.cli.meant import choice_with, family_of, keys_meant, paths_of
+from safe_rl.cli.meant import choice_with, keys_meant, paths_of
 from safe_rl.cli.settings import SettingError, optional_keys, plain
+from safe_rl.envs.gymnasium.nodes import hint_of_gymnasium
 from safe_rl.naming import did_you_mean, nearest
 from safe_rl.targets import locate
 
@@ -82,7 +83,7 @@ def check_choices(overrides: Sequence[Override], loader: ConfigLoader) -> None:
         # of some groups several are chosen, or none: transforms=[saute,action_filter]
         for name in chosen if chosen or isinstance(value, list) else [""]:
             if name not in known:
-                family = family_of(name) if group == "env" else ""
+                family = hint_of_gymnasium(name) if group == "env" else ""
                 raise CommandLineError(
                     f"'{override.input_line}': there is no {group} '{name}'."
                     f"{family or did_you_mean(name, known) or _listed(known)}"

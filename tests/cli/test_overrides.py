@@ -77,7 +77,7 @@ WRONG = {
     "algo=": r"no algo ''\. There are bc, ",
     "risk=null": r"no risk 'null'\. There are chance, cvar, mean\.$",
     "algo=[cpo,ppo]": r"a run has one algo; for a run with each of them: -m algo=cpo,ppo$",
-    "env=CartPole-v1": r"no env 'CartPole-v1'\. It is one of Gymnasium's: env=gymnasium env\.id=Car",
+    "env=CartPole-v1": r"no env 'CartPole-v1'\. It is one of Gymnasium's: env=gymnasium env\.id",
     "env=Safexp-CarGoal1-v0": r"Did you mean 'CarGoal1'\?$",
     "env=gymnasium": r"^env\.id has to be given: env\.id=…$",
     "+name=first": r"nothing reads 'name'\. Did you mean 'env\.name' or 'algo\.name'",
