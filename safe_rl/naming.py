@@ -46,12 +46,16 @@ def nearest(name: str, known: Iterable[str], likeness: float = _LIKENESS) -> str
     return max(close, key=lambda found: _likeness(name, found), default=None)
 
 
-def _likeness(name: str, found: str) -> tuple[bool, float, bool, int]:
-    """First what the name is the beginning of, as PPOLag is; then by letters, by length last."""
+def _likeness(name: str, found: str) -> tuple[bool, float, bool, bool, int]:
+    """First what the name is the beginning of, as PPOLag is; then by letters, by length last.
+
+    Of equally close ones, the one that stands whole in the name, then one of the same letters.
+    """
     wanted, there = _plain(name), _plain(found)
     begun = len(name) >= _BEGINNING and _letters(there).startswith(_letters(wanted))
     likeness = round(_ratio(wanted, there), 6)
-    return begun, likeness, sorted(there) == sorted(wanted), -abs(len(found) - len(name))
+    is_within, is_mixed = there in wanted, sorted(there) == sorted(wanted)
+    return begun, likeness, is_within, is_mixed, -abs(len(found) - len(name))
 
 
 def _ratio(name: str, found: str) -> float:

@@ -17,6 +17,7 @@ PACKAGE = Path(__file__).parents[1] / "safe_rl"
         ("CPO", ["ppo", "cpo"], "cpo"),
         ("TRPO_Lagrangian", ["td3_lagrangian", "trpo_lagrangian"], "trpo_lagrangian"),
         ("ppo-lag", ["ppo", "p3o", "ppo_lagrangian"], "ppo_lagrangian"),
+        ("Safexp-CarGoal1-v0", ["CarGoal0", "CarGoal1", "CarGoal2"], "CarGoal1"),
         ("pp", ["ppo", "p3o", "ppo_lagrangian"], "ppo"),
         ("zzz", ["hazards_num"], None),
         ("anything", [], None),
