@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from difflib import SequenceMatcher, get_close_matches
+from difflib import SequenceMatcher
 from typing import Any
 
 __all__ = ["did_you_mean", "key_name", "nearest"]
 
 _LIKENESS = 0.5
+_BEGINNING = 4
+"""Letters from which on a name may be the beginning of the one that was meant."""
 
 
 def key_name(key: str | tuple[Any, ...]) -> str:
@@ -24,6 +26,8 @@ def key_name(key: str | tuple[Any, ...]) -> str:
 def nearest(name: str, known: Iterable[str], likeness: float = _LIKENESS) -> str | None:
     """Return the known name most like `name`, or None if none is like it.
 
+    Capitals and hyphens make no difference.
+
     Args:
         name: The wrong one.
         known: The right ones.
@@ -32,17 +36,38 @@ def nearest(name: str, known: Iterable[str], likeness: float = _LIKENESS) -> str
     Examples:
         >>> nearest("hazard_num", ["hazards_num", "vases_num"])
         'hazards_num'
+        >>> nearest("PPOLag", ["ppo", "ppo_lagrangian", "p3o"])
+        'ppo_lagrangian'
         >>> nearest("zzz", ["hazards_num"]) is None
         True
     """
-    close = get_close_matches(name, list(known), n=5, cutoff=likeness)
-    # of equally close ones, one of the same letters, then the one of the most similar length
+    wanted = _plain(name)
+    close = [found for found in known if _ratio(wanted, _plain(found)) >= likeness]
     return max(close, key=lambda found: _likeness(name, found), default=None)
 
 
-def _likeness(name: str, found: str) -> tuple[float, bool, int]:
-    ratio = SequenceMatcher(None, found, name).ratio()
-    return round(ratio, 6), sorted(found) == sorted(name), -abs(len(found) - len(name))
+def _likeness(name: str, found: str) -> tuple[bool, float, bool, bool, int]:
+    """First what the name is the beginning of, as PPOLag is; then by letters, by length last.
+
+    Of equally close ones, the one that stands whole in the name, then one of the same letters.
+    """
+    wanted, there = _plain(name), _plain(found)
+    begun = len(name) >= _BEGINNING and _letters(there).startswith(_letters(wanted))
+    likeness = round(_ratio(wanted, there), 6)
+    is_within, is_mixed = there in wanted, sorted(there) == sorted(wanted)
+    return begun, likeness, is_within, is_mixed, -abs(len(found) - len(name))
+
+
+def _ratio(name: str, found: str) -> float:
+    return SequenceMatcher(None, found, name).ratio()
+
+
+def _plain(name: str) -> str:
+    return name.lower().replace("-", "_")
+
+
+def _letters(plain: str) -> str:
+    return plain.replace("_", "")
 
 
 def did_you_mean(name: str, known: Iterable[str]) -> str:

@@ -180,7 +180,7 @@ FLOORS = {
         ("",),
     ),
     "cli": (
-        ("benchmark", "conf", "interrupting", "options", "robots", "run_folders"),
+        ("benchmark", "conf", "interrupting", "meant", "options", "robots", "run_folders"),
         ("sweep_display", "values"),
         ("keys",),
         ("loss_keys",),

@@ -14,6 +14,11 @@ PACKAGE = Path(__file__).parents[1] / "safe_rl"
     [
         ("hazard_num", ["vases_num", "hazards_num"], "hazards_num"),
         ("cop", ["ppo", "cpo"], "cpo"),
+        ("CPO", ["ppo", "cpo"], "cpo"),
+        ("TRPO_Lagrangian", ["td3_lagrangian", "trpo_lagrangian"], "trpo_lagrangian"),
+        ("ppo-lag", ["ppo", "p3o", "ppo_lagrangian"], "ppo_lagrangian"),
+        ("Safexp-CarGoal1-v0", ["CarGoal0", "CarGoal1", "CarGoal2"], "CarGoal1"),
+        ("pp", ["ppo", "p3o", "ppo_lagrangian"], "ppo"),
         ("zzz", ["hazards_num"], None),
         ("anything", [], None),
     ],

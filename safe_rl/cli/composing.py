@@ -6,10 +6,12 @@ makes the folder of a run before the run can look at its configuration.
 
 from __future__ import annotations
 
+import re
 import tempfile
 from argparse import Namespace
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 
 from hydra._internal.hydra import Hydra
@@ -60,7 +62,9 @@ def check_command(arguments: Sequence[str], conf: Path) -> None:
     Examples:
         >>> check_command(["--hydra-help"], Path("conf"))
     """
-    flags = get_args_parser().parse_args(list(arguments))
+    flags, unknown = get_args_parser().parse_known_args(list(arguments))
+    if unknown:
+        raise CommandLineError(_without_dashes(unknown[0]))
     if flags.help or flags.hydra_help or flags.shell_completion or flags.experimental_rerun:
         return
     overrides = [_parse(text) for text in flags.overrides]
@@ -76,11 +80,25 @@ def check_command(arguments: Sequence[str], conf: Path) -> None:
                 check_added(overrides, config)
 
 
+def _without_dashes(flag: str) -> str:
+    """What to write instead of a flag that Hydra does not have."""
+    name, _, value = flag.lstrip("-").partition("=")
+    written = f"{name.replace('-', '_')}={value or '…'}"
+    return (
+        f"'{flag}': there is no such flag. A key is written without dashes, {written}; "
+        "'python train.py --hydra-help' names the flags."
+    )
+
+
 def _parse(text: str) -> Override:
     try:
         return OverridesParser.create().parse_override(text)
     except HydraException as error:
-        raise CommandLineError(f"'{text}' cannot be read: {str(error).splitlines()[0]}.") from None
+        quoted = re.search(r"\{\s*['\"]", text)
+        hint = " Names within braces have no quotes: '{cost: 10}'." if quoted else ""
+        raise CommandLineError(
+            f"'{text}' cannot be read: {str(error).splitlines()[0]}.{hint}"
+        ) from None
 
 
 def _is_sweep(flags: Namespace) -> bool:
@@ -130,7 +148,8 @@ def _compose(hydra: Hydra, name: str, overrides: list[str]) -> DictConfig:
         return compose(overrides)
     except COMPOSING_ERRORS as error:
         choices = [text for text in overrides if _chooses(text, hydra)]
-        raise CommandLineError(explain(error, overrides, choices, compose)) from None
+        options = partial(hydra.config_loader.get_group_options, results_filter=ObjectType.CONFIG)
+        raise CommandLineError(explain(error, overrides, choices, compose, options)) from None
 
 
 def _chooses(override: str, hydra: Hydra) -> bool:
@@ -141,7 +160,8 @@ def _chooses(override: str, hydra: Hydra) -> bool:
 
 def _check_package(config: DictConfig) -> None:
     """An algorithm's file that does not say so ends up below ``algo``, with all its keys."""
-    misplaced = [str(key) for key in config.get("algo") or () if key in config]
+    own = ("name", "_target_")
+    misplaced = [str(key) for key in config.get("algo") or () if key in config and key not in own]
     if misplaced:
         raise CommandLineError(
             f"algo={config.hydra.runtime.choices.get('algo')}: {', '.join(misplaced)} would stand "
@@ -161,7 +181,10 @@ def _check_run(config: DictConfig, folder_key: str) -> None:
         check_settings(config, RunFolder(folder))
         _check_writable(folder, folder_key)
     except OmegaConfBaseException as error:
-        raise CommandLineError(" ".join(str(error).split())) from None
+        words = " ".join(str(error).split())
+        if missing := re.search(r"Missing mandatory value: (\S+)", words):
+            words = f"{missing[1]} has to be given: {missing[1]}=…"
+        raise CommandLineError(words) from None
     finally:
         HydraConfig.instance().cfg = before
 

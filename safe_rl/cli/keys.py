@@ -92,7 +92,11 @@ KEYS = {
     "checkpoint.keep_last": Key(count(1, 10_000), "checkpoints that are kept besides the best"),
     "checkpoint.keep_best": Key(count(1, 10_000), "best checkpoints kept", may_lack=True),
     "checkpoint.best_over": Key(count(1, 10_000), "epochs that judge the best", may_lack=True),
-    "certificate": Key(_SECTION, "what is certified at a run's end", may_lack=True),
+    "certificate": Key(
+        _SECTION,
+        "what is certified at a run's end; certificate.episodes=0 for nothing",
+        may_lack=True,
+    ),
     "certificate.ranking": Key(count(2, 10**6), "episodes that order candidates", may_lack=True),
     "certificate.episodes": Key(count(0, 10**6), "episodes of a test; 0: none", may_lack=True),
     "certificate.tests": Key(count(1, 1000), "candidates tested at most", may_lack=True),

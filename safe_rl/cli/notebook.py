@@ -27,7 +27,7 @@ from safe_rl.cli.certificates import (
 from safe_rl.cli.evaluate import evaluate_run
 from safe_rl.cli.interrupting import say_if_heard
 from safe_rl.cli.options import take_options
-from safe_rl.cli.python_settings import compose_new, compose_resumed, overrides_of, search_path
+from safe_rl.cli.python_settings import compose_new, compose_resumed, new_run, overrides_of
 from safe_rl.cli.robots import maker_of
 from safe_rl.cli.run_folders import write_notes
 from safe_rl.cli.running import complete, prepare
@@ -196,8 +196,7 @@ def train(
     """
     modules = import_modules(imports)
     store_configs()
-    overrides = [f"env={env}", f"algo={algo}", *overrides_of(settings)]
-    overrides += search_path(config_dir or ())
+    overrides = new_run(env, algo, settings, config_dir)
     if modules:
         overrides = note_imports(modules, overrides)
     config = compose_new(overrides)

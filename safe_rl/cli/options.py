@@ -68,7 +68,7 @@ def parse_options(arguments: Sequence[str], schema: type[Schema]) -> Schema:
 
 
 def take_options(given: Mapping[str, Any], schema: type[Schema]) -> Schema:
-    """Check keyword arguments, as :func:`parse_options` checks texts.
+    """Check keyword arguments, as :func:`parse_options` checks texts; nested keys may have dots.
 
     Raises:
         OptionError: For an option that is unknown, or of another type than the schema's.
@@ -82,8 +82,15 @@ def take_options(given: Mapping[str, Any], schema: type[Schema]) -> Schema:
         Options(episodes=7)
     """
     for name in given:
-        _check_name(name, schema)
-    return _merged(schema, lambda: OmegaConf.create(_plain(given)), str(dict(given)))
+        _check_name(name.partition(".")[0], schema)
+
+    def read() -> DictConfig:
+        read = OmegaConf.create()
+        for key, value in given.items():
+            OmegaConf.update(read, key, _plain(value))
+        return read
+
+    return _merged(schema, read, str(dict(given)))
 
 
 def _with_values(value: Any) -> Any:

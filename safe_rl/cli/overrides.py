@@ -18,7 +18,9 @@ from omegaconf.errors import OmegaConfBaseException
 from yaml import YAMLError
 
 from safe_rl.cli.keys import KEYS
-from safe_rl.cli.settings import optional_keys, plain
+from safe_rl.cli.meant import choice_with, keys_meant, paths_of
+from safe_rl.cli.settings import SettingError, optional_keys, plain
+from safe_rl.envs.gymnasium.nodes import hint_of_gymnasium
 from safe_rl.naming import did_you_mean, nearest
 from safe_rl.targets import locate
 
@@ -42,6 +44,7 @@ GIVEN_WHOLE = {
     **{f"transforms.{name}.budgets": "budgets" for name in _BUDGETED},
 }
 _MOST_LISTED = 40
+_ONE_EACH = ("env", "algo", "preset", "model", "risk", "collector", "logger", "lagrangian")
 _DEFAULT_RECIPE = "safe_rl.algorithms.OnPolicy"
 
 
@@ -64,18 +67,26 @@ def check_choices(overrides: Sequence[Override], loader: ConfigLoader) -> None:
         >>> check_choices(OverridesParser.create().parse_overrides(["frames=9"]), loader=None)
     """
     for override in overrides:
-        group = override.key_or_group
-        is_named = override.is_discrete_sweep() or isinstance(override.value(), str | list)
-        known = loader.get_group_options(group, ObjectType.CONFIG) if is_named else []
+        group, value = override.key_or_group, override.value()
+        may_choose = value is None or isinstance(value, bool | str | list)
+        is_choice = may_choose or override.is_discrete_sweep()
+        known = loader.get_group_options(group, ObjectType.CONFIG) if is_choice else []
         if not known or override.is_delete():
             continue
-        chosen = override.sweep_string_iterator() if override.is_sweep_override() else None
-        # of some groups several are chosen: transforms=[saute,action_filter]
-        for name in _names(chosen or [override.get_value_element_as_str()]):
+        sweep = override.sweep_string_iterator() if override.is_sweep_override() else None
+        chosen = list(_names(sweep or [override.get_value_element_as_str()]))
+        if isinstance(value, list) and chosen and group in _ONE_EACH:
+            raise CommandLineError(
+                f"'{override.input_line}': a run has one {group}; for a run with each of them: "
+                f"-m {group}={','.join(chosen)}"
+            )
+        # of some groups several are chosen, or none: transforms=[saute,action_filter]
+        for name in chosen if chosen or isinstance(value, list) else [""]:
             if name not in known:
+                family = hint_of_gymnasium(name) if group == "env" else ""
                 raise CommandLineError(
                     f"'{override.input_line}': there is no {group} '{name}'."
-                    f"{did_you_mean(name, known) or _listed(known)}"
+                    f"{family or did_you_mean(name, known) or _listed(known)}"
                 )
 
 
@@ -169,6 +180,7 @@ def explain(
     overrides: Sequence[str],
     choices: list[str],
     compose: Callable[[list[str]], DictConfig],
+    options: Callable[[str], Sequence[str]],
 ) -> str:
     """Say what is wrong with overrides, or files, that Hydra could not compose, in one line.
 
@@ -177,6 +189,7 @@ def explain(
         overrides: The overrides.
         choices: Those among them that choose files.
         compose: Composes what some of these choose.
+        options: Names of the files in a group.
     """
     words = " ".join(str(error.__cause__ or error if not str(error) else error).split())
     if (place := re.match(r"In '([^']+)': (.*)", words)) is not None:  # said of files alone
@@ -193,18 +206,29 @@ def explain(
     try:
         values = plain(compose(right))
     except COMPOSING_ERRORS as another:
-        return explain(another, right, others, compose)
+        return explain(another, right, others, compose, options)
     inner = _quoted(r"full_key: (\S+)", str(error.__cause__))
     if inner is not None and inner.startswith(f"{key}."):
         section, _, name = inner.rpartition(".")
         head = f"{section}."
-        inside = [path.removeprefix(head) for path in _paths(values) if path.startswith(head)]
+        inside = [path.removeprefix(head) for path in paths_of(values) if path.startswith(head)]
         meant = nearest(name, inside)
         advice = f"add +{inner}=…" if meant is None else f"did you mean '{meant}'?"
         return f"'{given}': '{section}' has no '{name}', {advice}"
     section = key.partition(".")[0]
-    if section not in values and any(path.partition(".")[0] == section for path in KEYS):
+    is_known = section in KEYS and section != "note"  # which is nobody's until it is added
+    if section not in values and is_known:
         return f"'{given}': algo={values['algo']['name']} has no '{section}'."
+
+    def values_with(choice: str) -> Mapping[str, Any]:
+        try:
+            return plain(compose([*right, choice]))
+        except (*COMPOSING_ERRORS, SettingError):
+            return {}
+
+    choice = choice_with(key, options(section), values_with)
+    if choice is not None:
+        return f"'{given}': nothing reads '{key}' without {choice}."
     return _unread(given, key, values)
 
 
@@ -251,42 +275,20 @@ def _quoted(pattern: str, words: str) -> str | None:
 
 def _unread(given: str | None, key: str, values: Mapping[str, Any]) -> str:
     """That nothing reads a key, and the full paths of those that were meant."""
-    written = {path: path for path in _paths(values)}
-    written |= {path: f"+{path}" for path in optional_keys(values)}
-    meant = _meant(key, list(written))
-    refused = _unread_by(values.get("algo") or {})
-    reasons = [
-        next((why for head, why in refused.items() if f"{path}.".startswith(f"{head}.")), None)
-        for path in meant
-    ]
-    read = [f"'{written[path]}'" for path, why in zip(meant, reasons, strict=True) if why is None]
-    if meant and not read:
-        return f"'{given}': algo={values['algo']['name']} does not read '{meant[0]}'. {reasons[0]}"
+    algo = values.get("algo") or {}
+    unread = _unread_by(algo)
+
+    def reason(path: str) -> str | None:
+        heads = [head for head in unread if f"{path}.".startswith(f"{head}.")]
+        return unread[heads[0]] if heads else None
+
+    optional = {path: f"+{path}" for path in optional_keys(values) if reason(path) is None}
+    held = list(paths_of(values))
+    refused = [path for path in held if reason(path) is not None]
+    meant = keys_meant(key, [path for path in held if path not in refused], [*optional], refused)
+    if meant and meant[0] in refused:
+        why = reason(meant[0])
+        return f"'{given}': algo={algo['name']} does not read '{meant[0]}'. {why}"
+    read = [f"'{optional.get(path, path)}'" for path in meant]
     hint = f" Did you mean {' or '.join(read)}?" if read else ""
     return f"'{given}': nothing reads '{key}'.{hint}"
-
-
-def _meant(key: str, paths: Sequence[str]) -> list[str]:
-    """Paths that end like the key, or else the nearest one, or those whose end is nearest."""
-    name = key.rpartition(".")[2]
-    by_end = [path for path in paths if path.rpartition(".")[2] == name]
-    if by_end:
-        return by_end
-    whole = nearest(key, paths)
-    end = nearest(name, [path.rpartition(".")[2] for path in paths])
-    if whole is not None or end is None:
-        return [] if whole is None else [whole]
-    return [path for path in paths if path.rpartition(".")[2] == end]
-
-
-def _paths(values: Mapping[str, Any], prefix: str = "") -> Iterator[str]:
-    """Full paths of everything that can be overridden."""
-    for key, value in values.items():
-        path = f"{prefix}{key}"
-        if isinstance(value, Mapping) and path not in _WHOLE:
-            yield from _paths(value, f"{path}.")
-        elif not str(key).startswith("_"):
-            yield path
-
-
-_WHOLE = ("cost_limits", "default_cost_limits", "model.input_scale", "paper")

@@ -18,13 +18,37 @@ from safe_rl.cli.overrides import GIVEN_WHOLE, CommandLineError
 from safe_rl.cli.shorthands import expand_arguments
 from safe_rl.cli.user_code import quote
 
-__all__ = ["compose_new", "compose_resumed", "overrides_of", "search_path"]
+__all__ = ["compose_new", "compose_resumed", "new_run", "overrides_of", "search_path"]
 
 # mappings that are given all at once
 _WHOLE = (
     *GIVEN_WHOLE,
     *("env.outside", "env.kwargs", "env.cost", "memory.prioritised", "policy_update.rates"),
 )
+_OF_YOUR_OWN = {
+    "env": "safe_rl.envs.store_config(name, {…}) gives one to keys, and what Gymnasium has "
+    "registered is 'gymnasium' with **{'env.id': …}.",
+    "algo": "One of your own is a YAML, which config_dir=… finds.",
+}
+
+
+def new_run(
+    env: Any,
+    algo: Any,
+    settings: Mapping[str, Any],
+    folders: str | Path | Sequence[str | Path] | None,
+) -> list[str]:
+    """Overrides of a new run: environment and algorithm by their names, settings, YAMLs' folders.
+
+    Raises:
+        CommandLineError: If one is no name, a setting nothing that can be written, a folder not
+            there.
+    """
+    for key, value in {"env": env, "algo": algo}.items():
+        if not isinstance(value, str):
+            what = " ".join(repr(value).split())[:80]
+            raise CommandLineError(f"{key}={what}: it must be a name. {_OF_YOUR_OWN[key]}")
+    return [f"env={env}", f"algo={algo}", *overrides_of(settings), *search_path(folders or ())]
 
 
 def overrides_of(settings: Mapping[str, Any], prefix: str = "") -> Iterator[str]:

@@ -94,6 +94,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
         modules, arguments = split_imports(arguments)
         if not arguments:
             raise OptionError(f"{COMMAND} takes a folder of runs first.")
+        for other in (argument for argument in arguments[1:] if "=" not in argument):
+            raise OptionError(
+                f"'{other}': a report is of one folder and all runs below it. Name a folder above "
+                "them, or copy them into one; options are written key=value."
+            )
         import_modules(modules or ())
         options = parse_options(arguments[1:], ReportOptions)
         root = Path(arguments[0])

@@ -12,6 +12,8 @@ from pathlib import Path
 
 from omegaconf import DictConfig, OmegaConf
 
+from safe_rl.cli.keys import KEYS
+from safe_rl.cli.meant import keys_meant, paths_of
 from safe_rl.cli.overrides import CommandLineError
 from safe_rl.cli.user_code import KEY, check_imports
 from safe_rl.naming import did_you_mean
@@ -124,10 +126,16 @@ def _expand_resume(value: str, others: list[str]) -> list[str]:
         key = argument.lstrip("+~").partition("=")[0]
         is_flag = key.startswith("-")
         stays = not (is_flag or role_of(key.replace("/", ".")).may_change)
+        section = key.partition(".")[0].partition("/")[0]
+        is_plain = argument.startswith(section) and not is_flag
+        if is_plain and section not in (*config, *KEYS, "hydra", ""):
+            meant = keys_meant(key, list(paths_of(config)))
+            hint = f" Did you mean {' or '.join(map(repr, meant))}?" if meant else ""
+            raise CommandLineError(f"'{argument}': the run has no '{key}'.{hint}")
         if stays or key in _OTHER_CONFIGURATIONS or isinstance(config.get(key), DictConfig):
             raise CommandLineError(
                 f"'{argument}' cannot change in a run that is continued. Single numbers can "
-                "(frames=…, policy_update.max_kl=…). For a new run from trained networks use "
+                "(frames=…, checkpoint.interval=…). For a new run from trained networks use "
                 f"init_from={value}."
             )
     folder = str(directory).replace("'", "\\'")

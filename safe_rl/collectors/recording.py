@@ -162,7 +162,9 @@ def read_recording(folder: Path | str) -> TensorDict:
     """
     pieces = _pieces(Path(folder))
     if not pieces:
-        raise FileNotFoundError(f"{folder} holds no transitions: is it the folder of a recording?")
+        below = sorted(path for path in Path(folder).glob("*transitions*") if _pieces(path))
+        hint = f"that is {below[0]}." if below else "is it the folder of a recording?"
+        raise FileNotFoundError(f"{folder} holds no transitions: {hint}")
     batches = [_read(path) for path in pieces]
     for batch in batches:
         if PARTIAL not in batch:  # of an earlier version

@@ -140,7 +140,8 @@ def load_policy(
 ) -> TensorDictModuleBase:
     """Build the run's policy and give it the weights of a checkpoint.
 
-    Only weights are read: neither the checkpoint nor the configuration can make code run.
+    Only weights are read: neither the checkpoint nor the configuration can make code run. Nothing
+    keeps track of gradients, so that rollouts of it become arrays of NumPy's as they are.
 
     Raises:
         CheckpointError: If the file is no checkpoint, or its policy does not fit the environment.
@@ -159,4 +160,4 @@ def load_policy(
             f"environment's ({sizes[0]} numbers, {sizes[1]} actions): undo the env.… "
             "override that changes them."
         ) from error
-    return policy.eval()
+    return policy.eval().requires_grad_(False)

@@ -123,9 +123,11 @@ def _body(
     first = observed.entries[0]
     is_vector = len(observed.entries) == 1 and len(first.shape) == 1
     if observed.encoders is None and not is_vector:
+        pictures = any(len(entry.shape) == 3 for entry in observed.entries)
+        advice = "model=cnn for the pictures" if pictures else "model=dict, an encoder for each"
         raise ValueError(
             f"This environment observes {', '.join(map(str, observed.entries))}, and model=mlp "
-            f"takes one vector: use model=dict, which has an encoder for each, or {TO_FLATTEN}."
+            f"takes one vector: use {advice}, or {TO_FLATTEN}."
         )
     if observed.encoders is not None or remembered:
         plain = observed._replace(encoders=observed.encoders or _AS_IT_IS)

@@ -201,6 +201,34 @@ def test_an_evaluation_cannot_be_asked_for_what_there_is_not(run, options, messa
         run.vary({"few": {"env.hazards_num": 2}}, **options)
 
 
+def test_keys_of_an_evaluation_may_be_written_with_dots(run):
+    dotted, nested = (
+        run.evaluate(episodes=2, name=name, **keys)
+        for name, keys in (("a", {"env.hazards_num": 3}), ("b", {"env": {"hazards_num": 3}}))
+    )
+    assert dotted.facts["env"] == nested.facts["env"] == {"hazards_num": 3}
+    assert dotted.estimates == nested.estimates
+
+
+def test_rollouts_of_a_trained_policy_are_arrays(run):
+    action = run.env.rollout(2, run.policy)["action"]
+    assert action.numpy().shape == (1, 2, 2)
+
+
+@pytest.mark.parametrize(
+    ("choice", "message"),
+    [
+        ({"env": {"hazards_num": 3}}, r"env=.*'hazards_num'.*must be a name\. .*store_config"),
+        ({"env": object()}, r"env=<object object.* must be a name\. .*'gymnasium' with .*env\.id"),
+        ({"algo": None}, r"algo=None: it must be a name\. .*config_dir"),
+    ],
+)
+def test_environments_and_algorithms_are_names(choice, message, tmp_path):
+    with pytest.raises(ValueError, match=message) as caught:
+        safe_rl.train(directory=tmp_path / "run", **choice)
+    assert len(str(caught.value).splitlines()) == 1
+
+
 def test_a_run_is_measured_against_other_limits(run):
     path = find_checkpoint(run.directory, "last")
     own, none = (

@@ -56,6 +56,31 @@ WRONG = {
     "frames=[1": r"frames=\[1",
     "seed=0,1": "--multirun",
     "frames=${nowhere}": "frames: .*nowhere",
+    # what other libraries call it
+    "total_timesteps=10": r"Did you mean 'frames'\?$",
+    "epochs=10": r"Did you mean 'frames'\?$",
+    "learning_rate=1": r"Did you mean 'policy_update\.optimizer\.lr' or 'critic_update\.opt",
+    "batch_size=64": r"Did you mean 'policy_update\.minibatch_size' or 'critic_update",
+    "target_kl=0.1": r"Did you mean 'policy_update\.max_kl'\?$",
+    "env_id=PointGoal1": r"Did you mean 'env'\?$",
+    "logdir=x": r"Did you mean 'hydra\.run\.dir'\?$",
+    "note=x": r"Did you mean '\+note'\?$",
+    "algo=CPO": r"no algo 'CPO'\. Did you mean 'cpo'",
+    "algo=PPOLag": r"Did you mean 'ppo_lagrangian'",
+    "--algo=cpo": r"'--algo=cpo': there is no such flag\. .* without dashes, algo=cpo",
+    'cost_limits={"cost": 3}': r"cannot be read.*have no quotes: '\{cost: 10\}'\.$",
+    # what another choice would read
+    "risk.tail=0.2": r"nothing reads 'risk\.tail' without risk=cvar\.$",
+    "model.memory.size=8": r"without model=gru\.$",
+    "transforms.saute.budgets={cost: 3}": r"without transforms=\[saute\]\.$",
+    # choices that are none, or too many
+    "algo=": r"no algo ''\. There are bc, ",
+    "risk=null": r"no risk 'null'\. There are chance, cvar, mean\.$",
+    "algo=[cpo,ppo]": r"a run has one algo; for a run with each of them: -m algo=cpo,ppo$",
+    "env=CartPole-v1": r"no env 'CartPole-v1'\. It is one of Gymnasium's: env=gymnasium env\.id",
+    "env=Safexp-CarGoal1-v0": r"Did you mean 'CarGoal1'\?$",
+    "env=gymnasium": r"^env\.id has to be given: env\.id=…$",
+    "+name=first": r"nothing reads 'name'\. Did you mean 'env\.name' or 'algo\.name'",
 }
 
 
@@ -124,11 +149,18 @@ def test_what_only_other_algorithms_read_is_refused_with_the_reason(argument):
         "gamma=0.9": r"Did you mean 'loss.gamma'\?$",
         "lmbda=0.9": "algo=sac does not read 'advantage.lmbda'. .*memory.n_steps",
         "initial_log_std=0": "does not read 'model.initial_log_std'. Its network tells",
+        "policy_update.minibatch_size=9": r"Did you mean 'memory.batch_size'\?$",
     }.items(),
 )
 def test_only_keys_that_the_algorithm_reads_are_proposed(argument, message):
     with pytest.raises(CommandLineError, match=message):
         check_command(["algo=sac", argument], CONF)
+
+
+@pytest.mark.parametrize("argument", ["max_kl=0.1", "policy_update.max_kl=0.1"])
+def test_the_bound_of_a_trust_region_has_another_name(argument):
+    with pytest.raises(CommandLineError, match=r"Did you mean 'policy_update\.target_kl'\?$"):
+        check_command(["algo=cpo", argument], CONF)
 
 
 def test_what_is_proposed_is_taken():

@@ -164,3 +164,13 @@ def test_several_folders_of_configurations_are_not_taken_for_the_last():
     ):
         expand_arguments(both)
     assert expand_arguments(both[:3]) == ["--config-dir=first", "algo=mine"]
+
+
+@pytest.mark.parametrize(
+    ("override", "meant"), [("framse=9", "frames"), ("total_timesteps=9", "frames"), ("zzz=1", "")]
+)
+def test_what_a_run_does_not_have_is_no_setting_that_stays(run, override, meant):
+    key, hint = override.partition("=")[0], f" Did you mean '{meant}'?" if meant else ""
+    with pytest.raises(CommandLineError) as caught:
+        expand_arguments([f"resume={run}", override])
+    assert str(caught.value) == f"'{override}': the run has no '{key}'.{hint}"

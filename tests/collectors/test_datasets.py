@@ -38,8 +38,11 @@ def test_a_recording_is_what_was_collected(tmp_path):
     for key in ("observation", "action", ("next", "observation"), ("next", "cost_north")):
         assert torch.equal(found[key], expected[key])
     assert torch.equal(found["next", "truncated"], expected["next", "done"])
-    with pytest.raises(FileNotFoundError, match="holds no transitions"):
+    with pytest.raises(FileNotFoundError, match=r"holds no transitions: is it the folder of a rec"):
         read_recording(tmp_path / "elsewhere")
+    Recording(tmp_path / "run" / "transitions", PointMass.cost_keys).write(0, batches[0])
+    with pytest.raises(FileNotFoundError, match=r"that is .*/run/transitions"):
+        read_recording(tmp_path / "run")
 
 
 def test_a_recording_of_somebody_else_makes_no_code_run(tmp_path):

@@ -34,8 +34,10 @@ def test_one_vector_needs_no_encoder():
     flat = Composite(observation=Unbounded((3, 7)), shape=(3,))
     networks = build(flat)
     assert [tuple(p.shape) for p in networks["critic"].parameters()] == [(8, 7), (8,), (1, 8), (1,)]
-    with pytest.raises(ValueError, match=r"gyro \[3\], sight \[9, 9, 3\].*use model=dict"):
+    with pytest.raises(ValueError, match=r"gyro \[3\], sight \[9, 9, 3\].*use model=cnn"):
         build(spec(gyro=Unbounded((3, 3)), sight=Unbounded((3, 9, 9, 3))))
+    with pytest.raises(ValueError, match=r"gyro \[3\], lidar \[9\].*use model=dict"):
+        build(spec(gyro=Unbounded((3, 3)), lidar=Unbounded((3, 9))))
 
 
 def test_every_entry_has_its_encoder():

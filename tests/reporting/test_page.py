@@ -273,6 +273,7 @@ def test_slates_that_all_share_are_averaged(tmp_path, capsys):
         (["seeds=0"], "at least one run"),
         (["seeds=two"], "'seeds'"),
         (["good=0"], "for half"),
+        (["other/runs"], "'other/runs': a report is of one folder and all runs below it."),
     ],
 )
 def test_what_cannot_be_done_ends_in_one_line(tmp_path, arguments, message, capsys):

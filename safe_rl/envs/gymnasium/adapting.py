@@ -73,8 +73,9 @@ def _by_entry(env: gymnasium.Env) -> gymnasium.Env:
         return gymnasium.wrappers.TransformObservation(env, partial(_entries, space), nested)
     if not isinstance(space, Box):
         raise ValueError(
-            f"Policies take observations that are arrays (a Box) or dictionaries, but {env} has "
-            f"{space}. flatten=true makes one vector of it: kinds (Discrete) become one-hot."
+            "Policies take observations that are arrays (a Box) or dictionaries, but "
+            f"{env.unwrapped} has {space}. flatten=true makes one vector of it: kinds (Discrete) "
+            "become one-hot."
         )
     return env if _is_picture(space) else _flat(env)
 

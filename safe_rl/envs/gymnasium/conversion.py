@@ -289,9 +289,10 @@ def _find_costs(probe: gymnasium.Env) -> list[str]:
     keys = [key for key in info if is_cost(key)]
     if not keys:
         raise ValueError(
-            f"{probe} reports no costs: there is no 'cost' or 'cost_<kind>' in its info, which has "
-            f"{sorted(info)}. If a cost is called otherwise, or is not reported at every step, "
-            "name it in 'cost_keys'; 'outside' makes a cost of leaving a range."
+            f"{probe.unwrapped} reports no costs: there is no 'cost' or 'cost_<kind>' in its info, "
+            f"which has {', '.join(sorted(info)) or 'nothing'}. If a cost is called otherwise, or "
+            "is not reported at every step, name it in 'cost_keys'; 'outside' makes a cost of "
+            "leaving a range: env.outside='{cost_position: [0, -0.5, 0.5]}'."
         )
     return keys
 

@@ -68,6 +68,21 @@ def complete_gymnasium(node: Mapping[str, Any]) -> dict[str, Any]:
     return full
 
 
+def hint_of_gymnasium(name: str) -> str:
+    """A sentence on how to choose what is no name, but Gymnasium's id of an environment; or none.
+
+    Examples:
+        >>> hint_of_gymnasium("CartPole-v1")
+        " It is one of Gymnasium's: env=gymnasium env.id=CartPole-v1."
+        >>> hint_of_gymnasium("Safexp-PointGoal1-v0"), hint_of_gymnasium("PointGaol1")
+        ('', '')
+    """
+    spec = gymnasium.registry.get(name)
+    if spec is None or str(spec.entry_point).startswith("safe_rl."):
+        return ""
+    return f" It is one of Gymnasium's: env=gymnasium env.id={name}."
+
+
 def maker(config: Mapping[str, Any]) -> Callable[[], gymnasium.Env]:
     """Return a function that makes one environment.
 

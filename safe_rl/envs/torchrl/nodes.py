@@ -45,9 +45,10 @@ def complete_torchrl(node: Mapping[str, Any]) -> dict[str, Any]:
         raise ConfigError(f"Which environment? env.id=…, one of {', '.join(ROWS)}, or your own.")
     if "." not in env_id and env_id not in ROWS:
         raise ConfigError(
-            f"env.id={env_id}: there is no such row.{nearest(env_id, ROWS)} There are "
-            f"{', '.join(ROWS)}. Any other class of TorchRL's comes with import=torchrl.envs "
-            f"env.id=torchrl.envs.{env_id}, one of yours with import=my_module env.id=my_module.…"
+            f"env.id={env_id} is not among {', '.join(ROWS)}.{nearest(env_id, ROWS)} Any other "
+            "class of TorchRL's comes with import=torchrl.envs env.id=torchrl.envs.NAME, one of "
+            "yours with import=my_module env.id=my_module.NAME, and one of Gymnasium's by its id "
+            "with env=gymnasium."
         )
     full = {"name": env_id, **DEFAULTS, **node}
     _check(full)
