@@ -150,8 +150,10 @@ def test_sums_over_steps_end_where_a_resumed_run_begins_new_episodes(tmp_path):
     resumed = build()
     assert resumed.resume()
     resumed.epoch(resumed.batches())
-    # TorchRL keeps the last three of 40 steps in a row back, before and after
-    assert len(resumed.algorithm.memory) == 4 * (37 + 37)
+    # the last three of the first 40 steps in a row end there, the last three of all are kept back
+    assert len(resumed.algorithm.memory) == 4 * (40 + 37)
+    spanned = resumed.algorithm.memory.state_dict()["steps"]["steps_to_next_obs"].flatten()
+    assert spanned[4 * 37 : 4 * 40].tolist() == [3, 2, 1] * 4
 
 
 def test_another_run_starts_from_its_networks(make_trainer, tmp_path):
