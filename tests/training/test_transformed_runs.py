@@ -9,6 +9,7 @@ import torch
 from commands import status_of
 from point_mass import PointMass
 from run_configs import point_mass_config, without_times
+from torchrl.envs.transforms import StepCounter
 
 from safe_rl.cli import evaluate
 from safe_rl.cli.evaluate import EvaluationOptions, evaluate_run
@@ -47,6 +48,17 @@ def test_an_interrupted_run_goes_on_exactly(tmp_path, transforms):
     assert resumed.resume()
     resumed.run()
     assert without_times(halves / "progress.csv") == without_times(whole / "progress.csv")
+
+
+def test_what_transforms_of_torchrl_remember_goes_on_from_batch_to_batch(tmp_path):
+    config = point_mass_config("algo=ppo", "frames_per_batch=40", "staggered_starts=null")
+    changes = {"count": StepCounter(max_steps=15)}
+    env = transform_env(PointMass(config.num_envs), changes, evaluating=False)
+    trainer = build_trainer(config, env, tmp_path)
+    batches = trainer.batches()
+    rows = [trainer.epoch(batches) for _ in range(4)]
+    assert [row["episodes"] for row in rows] == [0, 4, 4, 0]
+    assert rows[1]["episode_length"] == rows[2]["episode_length"] == 15
 
 
 def test_returns_are_those_of_the_own_reward(tmp_path, monkeypatch):
