@@ -50,6 +50,25 @@ def test_an_interrupted_run_goes_on_exactly(tmp_path, transforms):
     assert without_times(halves / "progress.csv") == without_times(whole / "progress.csv")
 
 
+class Forgetful(PointMass):
+    get_state = property()  # raises AttributeError: its worlds cannot be stored
+
+
+def test_where_worlds_cannot_be_stored_schedules_go_on_in_other_episodes(tmp_path, monkeypatch):
+    monkeypatch.setattr(f"{__name__}.PointMass", Forgetful)
+    options = ["algo=ppo", "transforms=[simmer]", "transforms.simmer.steps=80"]
+    begun = make_trainer(tmp_path, *options, "transforms.simmer.first=0.25", "frames=160")
+    seen = next(begun.batches())["observation"]
+    begun.run()
+    resumed = make_trainer(tmp_path, *options, "transforms.simmer.first=0.25", "frames=320")
+    assert resumed.resume()
+    start = next(resumed.batches())["observation"][:, :1]
+    # after 40 of 80 steps
+    assert seen[:, 0, -1].tolist() == [0.25] * 4
+    assert start[:, 0, -1].tolist() == [0.625] * 4
+    assert (seen[..., :2] != start[..., :2]).any(-1).all()
+
+
 def test_what_transforms_of_torchrl_remember_goes_on_from_batch_to_batch(tmp_path):
     config = point_mass_config("algo=ppo", "frames_per_batch=40", "staggered_starts=null")
     changes = {"count": StepCounter(max_steps=15)}
