@@ -46,7 +46,7 @@ class Forgetful(PointMass):
     get_state = property()  # raises AttributeError: its worlds cannot be stored
 
 
-def test_workers_take_up_a_schedule_also_where_worlds_cannot_be_stored():
+def test_workers_have_seeds_and_a_schedule_also_where_worlds_cannot_be_stored():
     simmer = {
         "_target_": "safe_rl.envs.transforms.Simmer", "budgets": {"cost": 2.0}, "first": 0.25,
         "steps": 16, "discount": 1.0, "unsafe_reward": -1.0, "rescale_budgets": False,
@@ -57,8 +57,10 @@ def test_workers_take_up_a_schedule_also_where_worlds_cannot_be_stored():
 
     whole = make(num_envs=4)
     whole.continue_from(8)
-    for share in share_rows(whole, make, num_collectors=2):
-        assert share().reset()["observation"][:, -1].tolist() == pytest.approx([0.625] * 2)
+    starts = [make().reset()["observation"] for make in share_rows(whole, make, num_collectors=2)]
+    assert not torch.isclose(*(start[:, :2] for start in starts)).all(-1).any()
+    for start in starts:
+        assert start[:, -1].tolist() == pytest.approx([0.625] * 2)
 
 
 @pytest.mark.parametrize(("num_collectors", "frames"), [(4, 60), (2, 63), (0, 60)])

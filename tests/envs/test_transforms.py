@@ -143,6 +143,15 @@ def test_a_spent_budget_replaces_the_reward_and_the_own_one_is_kept():
     assert torch.equal(batch["next", "reward"], expected)
 
 
+@pytest.mark.parametrize("budget", [3, 10, 25])
+def test_a_budget_is_spent_by_as_many_steps_as_it_has_costs(budget):
+    """A tenth, taken ten times from one, leaves more than nothing in binary numbers."""
+    saute = Saute({"cost": budget}, discount=1.0, unsafe_reward=-3.0, rescale_budgets=False)
+    env = transform_env(Priced([[1.0] * 30]), {"saute": saute}, evaluating=False)
+    spent = still(env, 30)["next", "reward"][0, :, 0] == -3.0
+    assert spent.nonzero()[:, 0].tolist() == list(range(budget - 1, 30))
+
+
 def test_evaluation_observes_the_budget_and_leaves_the_reward_alone():
     costs = [[1.0, 1.5, 0.0, 0.0]]
     env = transformed(Priced(costs), "saute", evaluating=True)
