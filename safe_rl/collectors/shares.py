@@ -43,8 +43,8 @@ def share_rows(env: EnvBase, make_env: MakeEnv, num_collectors: int) -> list[Cal
     """Functions that make every worker's environment, with its share of the rows of ``env``.
 
     An environment with ``get_state`` and ``set_state`` has its rows continued by the workers, from
-    their next reset; any other one is made anew, and seeded apart from the other workers'. Schedules
-    of an environment with ``continue_from`` go on after its ``steps_before``.
+    their next reset; any other one is made anew, and seeded apart from the other workers'. If
+    it has ``continue_from``, its schedules go on after the ``steps_before`` of ``env``.
     """
     states: list[TensorDictBase | None]
     if not hasattr(env, "get_state"):
