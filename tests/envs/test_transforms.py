@@ -304,6 +304,16 @@ def test_a_snapshot_goes_on_exactly(env):
     assert begun["observation"].shape == first["observation"][:, 0].shape
 
 
+def test_what_is_transformed_twice_goes_on_with_both():
+    env = transformed(transformed(Priced([[0.5] * 9]), "saute"), "early_termination")
+    last = still(env, 3)["next", "observation"][:, -1]
+    begun = env.set_state(env.get_state())
+    assert torch.equal(begun["observation"], last)
+    # of a budget of 2.0 as much is left to spend
+    steps = env.rollout(9, auto_reset=False, tensordict=begun)
+    assert steps["next", "terminated"].squeeze().tolist() == [False, True]
+
+
 def test_transforms_of_torchrl_can_stand_among_ours():
     counted = {"count": StepCounter(), "saute": TRANSFORMS["saute"]()}
     env = transform_env(PointMass(2), counted, evaluating=False)

@@ -107,8 +107,11 @@ class TransformedSnapshotEnv(TransformedConstrainedEnv):
         Returns:
             What a reset returns, for that state.
         """
-        reset = self.base_env.set_state(state.exclude(_STATE))
-        for name, transform in self._ours().items():
+        ours = self._ours()
+        # the environment inside may have transforms of its own
+        inside = state.exclude(*((_STATE, name) for name in ours)).filter_empty_()
+        reset = self.base_env.set_state(inside)
+        for name, transform in ours.items():
             rows = state.get((_STATE, name), None)
             if rows is not None:
                 transform.put_rows(dict(rows.items()))
