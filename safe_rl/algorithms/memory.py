@@ -104,7 +104,9 @@ class Memory:
 
     def extend(self, batch: TensorDictBase) -> None:
         """Take in the steps [N, T] that follow those of the last call."""
-        pieces = [batch] if self._multi_step is None else self._summed(batch, self._multi_step)
+        self._keep([batch] if self._multi_step is None else self._summed(batch, self._multi_step))
+
+    def _keep(self, pieces: list[TensorDictBase]) -> None:
         if not pieces:  # fewer than n steps so far
             return
         pieces = [piece.select(*self._in_keys) for piece in pieces]
@@ -118,10 +120,17 @@ class Memory:
         return [piece for piece in found if piece is not None]
 
     def end_rows(self) -> None:
-        """What comes next does not follow what came last: sums over n steps begin anew."""
-        if self._multi_step is not None:
-            # the transform has no public way to its last steps
-            self._multi_step._buffer = None
+        """What comes next does not follow what came last: sums over n steps end with that."""
+        transform = self._multi_step
+        # the transform has no public way to the steps that wait for what follows them
+        if transform is None or transform._buffer is None:
+            return
+        waiting = transform._buffer.clone()
+        waiting["next", "done"][..., -1, :] = True
+        transform._buffer = waiting
+        beyond = waiting[..., -1:].expand(*waiting.shape[:-1], transform.n_steps)
+        self._keep([transform.inv(beyond)])
+        transform._buffer = None
 
     @property
     def in_keys(self) -> list[NestedKey]:
@@ -161,7 +170,7 @@ class Memory:
             state["steps"] = {key: v.as_subclass(torch.Tensor) for key, v in steps.items()}
         tail = None if self._multi_step is None else self._multi_step._buffer
         if tail is not None:
-            state["tail"] = tail.flatten_keys("/").to_dict()
+            state["tail"] = tail.clone().flatten_keys("/").to_dict()
             state["tail_shape"] = list(tail.batch_size)
         return state
 
@@ -175,11 +184,12 @@ class Memory:
         self._buffer.writer.load_state_dict(state_dict["writer"])
         if self._is_prioritised:
             self._buffer.sampler.load_state_dict(state_dict["sampler"])
-        self.end_rows()
-        if self._multi_step is not None and "tail" in state_dict:
-            # of the run before, which may have been on another device
-            tail = TensorDict(state_dict["tail"], state_dict["tail_shape"], device=self._device)
-            self._multi_step._buffer = tail.unflatten_keys("/")
+        if self._multi_step is not None:
+            self._multi_step._buffer = None
+            if "tail" in state_dict:
+                # of the run before, which may have been on another device
+                tail = TensorDict(state_dict["tail"], state_dict["tail_shape"], device=self._device)
+                self._multi_step._buffer = tail.unflatten_keys("/")
 
 
 def _sampler(capacity: int, prioritised: Mapping[str, float] | None) -> Sampler:

@@ -58,7 +58,7 @@ class OffPolicy:
         memory: The transitions.
         policy_update: Trains all networks on minibatches.
         random_steps: Steps of environments that are taken at random in the beginning. Learning
-            begins when the memory holds as many.
+            begins when the memory holds as many. There are none where nothing is collected.
         collects: Whether what is collected goes into the memory.
         learns_from: What was in it from the beginning, in a sentence, or that nothing will be.
         unread: Keys and choices of configurations that are for other recipes, and why.
@@ -119,7 +119,8 @@ class OffPolicy:
             device=device,
         )
         learns_from, collects = _fill(config, memory, env)
-        random_steps = setting(config, "exploration.random_steps")
+        # what is not learned from explores nothing
+        random_steps = setting(config, "exploration.random_steps") if collects else 0
         _check_room(memory, random_steps, collects)
         return cls(
             policy=exploring(networks["actor"], env, setting(config, "exploration.noise")),
@@ -246,17 +247,17 @@ def _nothing_learned(config: DictConfig) -> str:
 
 def _check_room(memory: Memory, random_steps: int, collects: bool) -> None:
     """Refuse a memory that never comes to hold what learning begins with."""
-    needed = (
-        f"exploration.random_steps={random_steps} transitions and a minibatch of "
-        f"{memory.batch_size} (memory.batch_size), or nothing is ever learned."
-    )
-    least = max(random_steps, memory.batch_size)
-    if least > memory.capacity:
-        raise ValueError(f"memory.capacity={memory.capacity}: it must hold {needed}")
-    if not collects and least > len(memory):
+    size = memory.batch_size
+    needed = f"a minibatch of {size} (memory.batch_size), or nothing is ever learned."
+    if not collects and size > len(memory):
         raise ValueError(
             f"dataset.alone=true: the memory holds {len(memory):,} transitions of the dataset and "
             f"gets no others. It must hold {needed}"
+        )
+    if max(random_steps, size) > memory.capacity:
+        raise ValueError(
+            f"memory.capacity={memory.capacity}: it must hold "
+            f"exploration.random_steps={random_steps} transitions and {needed}"
         )
 
 

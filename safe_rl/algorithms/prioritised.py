@@ -53,12 +53,10 @@ class ProportionalSampler(Sampler):
         self._largest = 1.0
 
     def add(self, index: int | Tensor) -> None:
-        """Give a new transition the largest priority so far."""
-        self._priorities[index] = self._largest
-
-    def extend(self, index: Tensor) -> None:
         """Give new transitions the largest priority so far."""
-        self._priorities[index] = self._largest
+        self._priorities[torch.as_tensor(index).cpu()] = self._largest
+
+    extend = add
 
     def sample(self, storage: Storage, batch_size: int) -> tuple[Tensor, dict[str, Tensor]]:
         """Draw with replacement.

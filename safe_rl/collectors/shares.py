@@ -43,7 +43,8 @@ def share_rows(env: EnvBase, make_env: MakeEnv, num_collectors: int) -> list[Cal
     """Functions that make every worker's environment, with its share of the rows of ``env``.
 
     An environment with ``get_state`` and ``set_state`` has its rows continued by the workers, from
-    their next reset; any other one is made anew, and seeded apart from the other workers'.
+    their next reset; any other one is made anew, and seeded apart from the other workers'. If
+    it has ``continue_from``, its schedules go on after the ``steps_before`` of ``env``.
     """
     states: list[TensorDictBase | None]
     if not hasattr(env, "get_state"):
@@ -53,14 +54,15 @@ def share_rows(env: EnvBase, make_env: MakeEnv, num_collectors: int) -> list[Cal
         states = list(env.get_state().chunk(num_collectors))
     seeds = torch.randint(2**62, (num_collectors,)).tolist()
     rows = env.batch_size.numel() // num_collectors
+    before = getattr(env, "steps_before", 0)
     return [
-        partial(_make_share, make_env, rows, state, seed)
+        partial(_make_share, make_env, rows, state, seed, before)
         for state, seed in zip(states, seeds, strict=True)
     ]
 
 
 def _make_share(
-    make_env: MakeEnv, num_envs: int, state: TensorDictBase | None, seed: int
+    make_env: MakeEnv, num_envs: int, state: TensorDictBase | None, seed: int, steps_before: int
 ) -> EnvBase:
     # of the policy's noise: every worker needs its own
     torch.manual_seed(seed)
@@ -70,6 +72,8 @@ def _make_share(
     env = make_env(num_envs=num_envs)
     if state is not None:
         env.set_state(state)
-    else:
-        env.set_seed(seed % 2**31)
+        return env
+    env.set_seed(seed % 2**31)
+    if hasattr(env, "continue_from"):
+        env.continue_from(steps_before)
     return env

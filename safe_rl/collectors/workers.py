@@ -77,8 +77,7 @@ class WorkerCollector:
         while True:
             batch = self._wait_for(asked).reshape(self._num_envs, -1).to(self.storing_device)
             if self._refresh is not None:
-                # the workers write the next one where this one lies
-                batch = self._refresh(batch.clone())
+                batch = self._refresh(batch)
             else:
                 yield batch
             self._wait_for(_begin(self._workers.update_policy_weights_))

@@ -154,7 +154,8 @@ class Trainer:
         self._is_continued = True
         with held(self.folder.files):
             restored = self._checkpoints.resume(self.folder.files.num_rows)
-        self._begin_episodes()
+        if restored is not None:  # one that starts over meets the episodes that it would have met
+            self._begin_episodes()
         return restored is not None
 
     @property

@@ -116,6 +116,32 @@ def test_a_copy_goes_on_in_the_same_way(storage, n_steps, batches, tmp_path):
     assert torch.equal(*drawn)
 
 
+@pytest.mark.parametrize(("length", "ends"), [(2, [1]), (8, [2, 7]), (8, [2])])
+def test_rows_that_end_keep_no_step_back(length, ends):
+    """The last episode of a dataset's row may be the only one that it has."""
+    memory = make_memory(n_steps=3)
+    memory.extend(make_batch(0, length, ends=ends))
+    memory.end_rows()
+    memory.extend(make_batch(50, 4))
+    found = {o: step for o, step in all_of(memory).items() if o % 1000 < 50}
+    assert sorted(found) == [row + time for row in (0, 1000) for time in range(length)]
+    for observation, step in found.items():
+        time = int(observation % 1000)
+        last = min([time + 2, length - 1, *(end for end in ends if end >= time)])
+        assert step["steps_to_next_obs"] == last + 1 - time
+        assert step["next", "observation"] == observation + last + 1 - time
+        reward = sum(0.5 ** (then - time) * then for then in range(time, last + 1))
+        assert step["next", "reward"].item() == pytest.approx(reward)
+        assert step["next", "terminated"].item() is (last in ends)
+
+
+def test_steps_that_wait_are_stored_alone():
+    memory = make_memory(n_steps=3)
+    memory.extend(make_batch(0, 500))
+    tail = memory.state_dict()["tail"]["observation"]
+    assert tail.untyped_storage().nbytes() == tail.numel() * tail.element_size()
+
+
 def test_a_copy_on_another_device_goes_on_there():
     memory, copy = (make_memory(n_steps=3, device=device) for device in ("cpu", "meta"))
     memory.extend(make_batch(0, 2))

@@ -11,10 +11,12 @@ from threading import Thread
 
 import pytest
 import torch
+from point_mass import PointMass
 
 from safe_rl.collectors import WorkerCollector, make_process_collector, make_ray_collector
 from safe_rl.collectors.shares import share_rows
 from safe_rl.envs import SafetyGymEnv, make_env
+from safe_rl.envs.transforms import transform_env
 from safe_rl.models import BehaviourPolicy, make_actor
 
 CONFIG = {"robot_base": "point", "task": "goal", "num_steps": 30, "observe_goal_lidar": True}
@@ -38,6 +40,27 @@ def test_workers_have_the_noise_that_the_rows_of_one_process_would():
     expected = whole.reset()["observation"]
     rows = torch.cat([share.reset()["observation"] for share in shares])
     assert torch.equal(rows, expected)
+
+
+class Forgetful(PointMass):
+    get_state = property()  # raises AttributeError: its worlds cannot be stored
+
+
+def test_workers_have_seeds_and_a_schedule_also_where_worlds_cannot_be_stored():
+    simmer = {
+        "_target_": "safe_rl.envs.transforms.Simmer", "budgets": {"cost": 2.0}, "first": 0.25,
+        "steps": 16, "discount": 1.0, "unsafe_reward": -1.0, "rescale_budgets": False,
+    }  # fmt: skip
+
+    def make(num_envs):
+        return transform_env(Forgetful(num_envs), {"simmer": simmer}, evaluating=False)
+
+    whole = make(num_envs=4)
+    whole.continue_from(8)
+    starts = [make().reset()["observation"] for make in share_rows(whole, make, num_collectors=2)]
+    assert not torch.isclose(*(start[:, :2] for start in starts)).all(-1).any()
+    for start in starts:
+        assert start[:, -1].tolist() == pytest.approx([0.625] * 2)
 
 
 @pytest.mark.parametrize(("num_collectors", "frames"), [(4, 60), (2, 63), (0, 60)])

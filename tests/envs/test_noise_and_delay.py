@@ -1,5 +1,7 @@
 """Noisy observations and delayed actions: distributions, shifted rollouts, exact snapshots."""
 
+import gymnasium
+import numpy as np
 import pytest
 import torch
 from scipy.stats import kstest
@@ -62,6 +64,30 @@ def test_only_what_is_named_is_noisy_flat_or_not():
         differs = (was[:, columns] != now[:, columns]).all()
         assert differs == (name in ("gyro", "hazards_lidar")), name
         assert torch.equal(entries[name].flatten(1), now[:, columns]), name
+
+
+class Film(gymnasium.Env):
+    """Observes a picture and nothing else."""
+
+    observation_space = gymnasium.spaces.Box(0, 255, (4, 4, 3), np.uint8)
+    action_space = gymnasium.spaces.Box(-1, 1, (2,))
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        return np.full((4, 4, 3), 100, np.uint8), {}
+
+    def step(self, action):
+        return np.full((4, 4, 3), 100, np.uint8), 1.0, False, False, {"cost": 1.0}
+
+
+def test_pictures_have_no_noise_and_no_room_for_budgets():
+    film = from_gymnasium(Film, num_envs=2, cost_keys=["cost"], num_steps=4, flatten=False)
+    env = transform_env(film, {"noise": SensorNoise(30.0)}, evaluating=False)
+    check_env_specs(env)
+    assert (env.rollout(6, break_when_any_done=False)["observation"] == 100).all()
+    saute = Saute({"cost": 2.0}, discount=0.9, unsafe_reward=-1.0, rescale_budgets=False)
+    with pytest.raises(ValueError, match=r"the shape \[2, 4, 4, 3\]: let the environment make"):
+        check_constrained_env(transform_env(film, {"saute": saute}, evaluating=False))
 
 
 @pytest.mark.parametrize("env", ["point_mass", "safety_gym"])

@@ -143,6 +143,15 @@ def test_a_spent_budget_replaces_the_reward_and_the_own_one_is_kept():
     assert torch.equal(batch["next", "reward"], expected)
 
 
+@pytest.mark.parametrize("budget", [3, 10, 25])
+def test_a_budget_is_spent_by_as_many_steps_as_it_has_costs(budget):
+    """A tenth, taken ten times from one, leaves more than nothing in binary numbers."""
+    saute = Saute({"cost": budget}, discount=1.0, unsafe_reward=-3.0, rescale_budgets=False)
+    env = transform_env(Priced([[1.0] * 30]), {"saute": saute}, evaluating=False)
+    spent = still(env, 30)["next", "reward"][0, :, 0] == -3.0
+    assert spent.nonzero()[:, 0].tolist() == list(range(budget - 1, 30))
+
+
 def test_evaluation_observes_the_budget_and_leaves_the_reward_alone():
     costs = [[1.0, 1.5, 0.0, 0.0]]
     env = transformed(Priced(costs), "saute", evaluating=True)
@@ -295,12 +304,22 @@ def test_a_snapshot_goes_on_exactly(env):
     assert begun["observation"].shape == first["observation"][:, 0].shape
 
 
+def test_what_is_transformed_twice_goes_on_with_both():
+    env = transformed(transformed(Priced([[0.5] * 9]), "saute"), "early_termination")
+    last = still(env, 3)["next", "observation"][:, -1]
+    begun = env.set_state(env.get_state())
+    assert torch.equal(begun["observation"], last)
+    # of a budget of 2.0 as much is left to spend
+    steps = env.rollout(9, auto_reset=False, tensordict=begun)
+    assert steps["next", "terminated"].squeeze().tolist() == [False, True]
+
+
 def test_transforms_of_torchrl_can_stand_among_ours():
     counted = {"count": StepCounter(), "saute": TRANSFORMS["saute"]()}
     env = transform_env(PointMass(2), counted, evaluating=False)
     check_env_specs(env)
-    env.rollout(3)
-    assert env.set_state(env.get_state())["observation"].shape == (2, 5)
+    # what they remember is in no snapshot
+    assert not isinstance(env, SnapshotEnv)
 
 
 def test_without_the_contract_a_single_environment_is_transformed_too():

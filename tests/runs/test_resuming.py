@@ -14,6 +14,7 @@ from types import SimpleNamespace
 import pytest
 from hydra.types import RunMode
 from omegaconf import OmegaConf
+from point_mass import PointMass
 from point_mass_runs import point_mass_trainer as trainer_of_point_mass
 from run_configs import compose_config, point_mass_config, without_times
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
@@ -132,7 +133,13 @@ def test_checkpoints_change_nothing(tmp_path):
 point_mass_trainer = partial(trainer_of_point_mass, num_steps=27)
 
 
-def test_a_run_without_a_checkpoint_starts_over(tmp_path):
+class Forgetful(PointMass):
+    get_state = property()  # raises AttributeError: its worlds cannot be stored
+
+
+@pytest.mark.parametrize("kind", [PointMass, Forgetful])
+def test_a_run_without_a_checkpoint_starts_over(kind, tmp_path, monkeypatch):
+    monkeypatch.setattr("point_mass_runs.PointMass", kind)
     whole = point_mass_trainer(tmp_path / "whole")
     whole.run()
     begun = point_mass_trainer(tmp_path / "begun")

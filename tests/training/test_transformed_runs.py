@@ -9,6 +9,7 @@ import torch
 from commands import status_of
 from point_mass import PointMass
 from run_configs import point_mass_config, without_times
+from torchrl.envs.transforms import StepCounter
 
 from safe_rl.cli import evaluate
 from safe_rl.cli.evaluate import EvaluationOptions, evaluate_run
@@ -47,6 +48,36 @@ def test_an_interrupted_run_goes_on_exactly(tmp_path, transforms):
     assert resumed.resume()
     resumed.run()
     assert without_times(halves / "progress.csv") == without_times(whole / "progress.csv")
+
+
+class Forgetful(PointMass):
+    get_state = property()  # raises AttributeError: its worlds cannot be stored
+
+
+def test_where_worlds_cannot_be_stored_schedules_go_on_in_other_episodes(tmp_path, monkeypatch):
+    monkeypatch.setattr(f"{__name__}.PointMass", Forgetful)
+    options = ["algo=ppo", "transforms=[simmer]", "transforms.simmer.steps=80"]
+    begun = make_trainer(tmp_path, *options, "transforms.simmer.first=0.25", "frames=160")
+    seen = next(begun.batches())["observation"]
+    begun.run()
+    resumed = make_trainer(tmp_path, *options, "transforms.simmer.first=0.25", "frames=320")
+    assert resumed.resume()
+    start = next(resumed.batches())["observation"][:, :1]
+    # after 40 of 80 steps
+    assert seen[:, 0, -1].tolist() == [0.25] * 4
+    assert start[:, 0, -1].tolist() == [0.625] * 4
+    assert (seen[..., :2] != start[..., :2]).any(-1).all()
+
+
+def test_what_transforms_of_torchrl_remember_goes_on_from_batch_to_batch(tmp_path):
+    config = point_mass_config("algo=ppo", "frames_per_batch=40", "staggered_starts=null")
+    changes = {"count": StepCounter(max_steps=15)}
+    env = transform_env(PointMass(config.num_envs), changes, evaluating=False)
+    trainer = build_trainer(config, env, tmp_path)
+    batches = trainer.batches()
+    rows = [trainer.epoch(batches) for _ in range(4)]
+    assert [row["episodes"] for row in rows] == [0, 4, 4, 0]
+    assert rows[1]["episode_length"] == rows[2]["episode_length"] == 15
 
 
 def test_returns_are_those_of_the_own_reward(tmp_path, monkeypatch):

@@ -28,10 +28,13 @@ class TransformedConstrainedEnv(TransformedEnv):
         cost_keys: the environment's, then those of the transforms.
         return_key: the entry below "next" that returns are made of, `reward` unless that is
             changed.
+        steps_before: steps of every row in the part of the run before.
 
     Raises:
         ValueError: if the transforms do not fit the environment, or one another.
     """
+
+    steps_before = 0
 
     def __init__(
         self, base_env: EnvBase, transforms: Mapping[str, Transform], seed: int | None = None
@@ -53,10 +56,14 @@ class TransformedConstrainedEnv(TransformedEnv):
         self._seed_transforms(seed)
 
     def _ours(self) -> dict[str, ConstraintTransform]:
-        return {n: t for n, t in self._named().items() if isinstance(t, ConstraintTransform)}
+        named = zip(self._names, self.transform.transforms, strict=True)
+        return {name: t for name, t in named if isinstance(t, ConstraintTransform)}
 
-    def _named(self) -> dict[str, Transform]:
-        return dict(zip(self._names, self.transform.transforms, strict=True))
+    def __getattr__(self, name: str) -> Any:
+        """Leave to the environment inside what is not here, but not its snapshots."""
+        if name in ("get_state", "set_state"):
+            raise AttributeError(f"{type(self).__name__} has no '{name}'.")
+        return super().__getattr__(name)
 
     @property
     def max_episode_steps(self) -> int:
@@ -78,6 +85,7 @@ class TransformedConstrainedEnv(TransformedEnv):
 
     def continue_from(self, steps: int) -> None:
         """Go on with schedules after so many steps of every row; the next reset heeds it."""
+        self.steps_before = steps
         for transform in self._ours().values():
             transform.continue_from(steps)
 
@@ -99,10 +107,13 @@ class TransformedSnapshotEnv(TransformedConstrainedEnv):
         Returns:
             What a reset returns, for that state.
         """
-        reset = self.base_env.set_state(state.exclude(_STATE))
-        for name, transform in self._named().items():
+        ours = self._ours()
+        # the environment inside may have transforms of its own
+        inside = state.exclude(*((_STATE, name) for name in ours)).filter_empty_()
+        reset = self.base_env.set_state(inside)
+        for name, transform in ours.items():
             rows = state.get((_STATE, name), None)
-            if rows is not None and isinstance(transform, ConstraintTransform):
+            if rows is not None:
                 transform.put_rows(dict(rows.items()))
                 reset = transform._call(reset)
             else:
@@ -118,6 +129,9 @@ def transform_env(
     seed: int | None = None,
 ) -> TransformedConstrainedEnv:
     """Change a constrained problem from outside.
+
+    What transforms remember that are no `ConstraintTransform` cannot be stored: with one, worlds
+    cannot either.
 
     Args:
         env: keeps the contract `ConstrainedEnv`.
@@ -142,7 +156,9 @@ def transform_env(
     for transform in made.values():
         if isinstance(transform, ConstraintTransform):
             transform.evaluating = evaluating
-    stores = callable(getattr(env, "get_state", None))
+    stores = callable(getattr(env, "get_state", None)) and all(
+        isinstance(transform, ConstraintTransform) for transform in made.values()
+    )
     return (TransformedSnapshotEnv if stores else TransformedConstrainedEnv)(env, made, seed)
 
 

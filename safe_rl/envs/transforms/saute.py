@@ -129,12 +129,22 @@ class Saute(ConstraintTransform):
         return next_tensordict.set(("observation", BUDGET), budget.float())
 
     def transform_observation_spec(self, observation_spec: TensorSpec) -> TensorSpec:
-        """Add the columns."""
+        """Add the columns.
+
+        Raises:
+            ValueError: for pictures, which have no room for them.
+        """
         observed = observation_spec["observation"]
         if isinstance(observed, Composite):
             shape = (*observation_spec.shape, len(self._budgets))
             observed[BUDGET] = Unbounded(shape=shape, device=observed.device)
             return observation_spec
+        if len(observed.shape) != len(observation_spec.shape) + 1:
+            raise ValueError(
+                "The budget is observed as columns of a vector or as an entry of a dictionary, and "
+                f"this observation has the shape {list(observed.shape)}: let the environment make "
+                "one vector of it, or a dictionary."
+            )
         shape = (*observed.shape[:-1], observed.shape[-1] + len(self._budgets))
         observation_spec["observation"] = Unbounded(
             shape=shape, dtype=observed.dtype, device=observed.device

@@ -98,18 +98,19 @@ class SensorNoise(ConstraintTransform):
         first = 0
         for name in sorted(observation.keys()):
             value = observation.get(name)
-            if self._is_noisy(name, value.dtype):
+            if self._is_noisy(name):
                 path = ("observation", name)
                 next_tensordict.set(path, self._with_noise(value, first, whole=True))
             first += value.shape[observation.ndim :].numel()
         return next_tensordict
 
-    def _is_noisy(self, name: str, dtype: torch.dtype) -> bool:
-        is_named = self._components is None or name in self._components
-        return is_named and dtype.is_floating_point
+    def _is_noisy(self, name: str) -> bool:
+        return self._components is None or name in self._components
 
     def _with_noise(self, value: Tensor, first: int, *, whole: bool = False) -> Tensor:
-        """Values with noise, whose columns are counted from `first`."""
+        """Values with noise, whose columns are counted from `first`; integers as they are."""
+        if not value.dtype.is_floating_point:
+            return value
         key, step = self._rows["key"], self._rows["step"]
         flat = value.reshape(*key.shape[:-1], -1)
         columns = torch.arange(flat.shape[-1], device=flat.device)
@@ -126,10 +127,12 @@ class SensorNoise(ConstraintTransform):
             observation_spec["observation"] = _unbounded(observed)
             return observation_spec
         for name in list(observed.keys()):
-            if self._is_noisy(name, observed[name].dtype):
+            if self._is_noisy(name):
                 observed[name] = _unbounded(observed[name])
         return observation_spec
 
 
 def _unbounded(spec: TensorSpec) -> TensorSpec:
+    if not spec.dtype.is_floating_point:
+        return spec
     return Unbounded(shape=spec.shape, dtype=spec.dtype, device=spec.device)
