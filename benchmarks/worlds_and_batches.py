@@ -6,7 +6,7 @@ measures whole training epochs for every number of environments and every batch,
 steps as fit into the seconds, with the command of a run that takes them. The integral gain grows
 with the batch, so that λ moves as fast per step. With `--table` the runs are told of instead:
 
-    python benchmarks/worlds_and_batches.py --table results/worlds/epochs.csv.gz
+    python benchmarks/worlds_and_batches.py --table results/worlds/equal_seconds.csv.gz
 """
 
 import argparse
@@ -72,14 +72,14 @@ def outcomes(path):
 
 
 def table(path):
-    """Print a row per number of environments and a column per batch, for every environment."""
+    """Rows of a number of environments, with a column per batch: return / cost of every seed."""
     found = outcomes(path)
-    for env in dict.fromkeys(key[0] for key in found):
-        print(f"\n| {env} | {' | '.join(f'{batch:,}' for batch in BATCHES)} |\n|---|---|---|---|")
-        for num_envs in NUM_ENVS:
-            cells = (found.get((env, num_envs, batch), []) for batch in BATCHES)
+    batches = sorted({batch for _, _, batch in found})
+    for env in dict.fromkeys(env for env, _, _ in found):
+        for num_envs in sorted({n for name, n, _ in found if name == env}):
+            cells = (found.get((env, num_envs, batch), []) for batch in batches)
             told = ("; ".join(f"{r:.1f} / {c:.0f}" for r, c in seeds) for seeds in cells)
-            print(f"| {num_envs} | {' | '.join(told)} |")
+            yield f"| {env} | {num_envs} | {' | '.join(told)} |"
 
 
 def main():
@@ -90,7 +90,7 @@ def main():
     parser.add_argument("--table", help="epochs of runs, to print the table of")
     options = parser.parse_args()
     if options.table:
-        table(options.table)
+        print(*table(options.table), sep="\n")
     else:
         plan(options.overrides, options.seconds, options.epochs)
 

@@ -1,5 +1,7 @@
 """Figures that README and the pages name are those of the archived runs."""
 
+import csv
+import gzip
 import json
 import re
 from pathlib import Path
@@ -164,3 +166,36 @@ def test_what_readme_says_of_pushing():
         "TRPO's {} and {};".format(*("{:.1f} / {:.0f}".format(*last(r, 1 / 6)) for r in starts))
         in README
     )
+
+
+@pytest.mark.parametrize("name", ["equal_seconds", "equal_steps"])
+def test_worlds_and_batches(name):
+    """Every cell that the page has, from the epochs of the archive; and it has all of them."""
+    page = (ROOT / "docs" / "algorithms" / "holding_the_limit.md").read_text()
+    table = page.partition(f"<!-- table: {name} -->\n")[2].partition("\n\n")[0].splitlines()[2:]
+    with gzip.open(RESULTS / "worlds" / f"{name}.csv.gz", "rt") as file:
+        rows = list(csv.DictReader(file))
+    batches = sorted({int(row["frames_per_batch"]) for row in rows})
+    told = 0
+    for env, worlds, *cells in (line.strip("| ").split(" | ") for line in table):
+        for batch, cell in zip(batches, "|".join(cells).split("|"), strict=False):
+            of_cell = [
+                row
+                for row in rows
+                if (row["env"], row["num_envs"], row["frames_per_batch"])
+                == (env, worlds, str(batch))
+            ]
+            ends = []
+            for seed in sorted({row["seed"] for row in of_cell}):
+                run = np.array(
+                    [
+                        [float(row[k]) for k in ("steps", "episode_return", "episode_cost")]
+                        for row in of_cell
+                        if row["seed"] == seed
+                    ]
+                )
+                late = run[run[:, 0] > 0.8 * run[-1, 0]]
+                ends.append("{:.1f} / {:.0f}".format(*np.nanmean(late[:, 1:], axis=0)))
+            assert cell.strip() == "; ".join(ends)
+            told += len(ends)
+    assert told == len({(r["env"], r["num_envs"], r["frames_per_batch"], r["seed"]) for r in rows})
