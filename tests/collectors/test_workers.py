@@ -9,6 +9,7 @@ import time
 from functools import partial
 from threading import Thread
 
+import point_mass
 import pytest
 import torch
 from point_mass import PointMass
@@ -206,7 +207,8 @@ def test_a_worker_in_trouble_while_it_starts_ends_the_run_with_the_reason(
     tmp_path, trouble, reason
 ):
     script = tmp_path / "script.py"
-    script.write_text(SCRIPT.format(path=[os.path.dirname(__file__)], trouble=trouble.__name__))
+    path = [os.path.dirname(file) for file in (__file__, point_mass.__file__)]
+    script.write_text(SCRIPT.format(path=path, trouble=trouble.__name__))
     ended = subprocess.run(
         [sys.executable, str(script)], capture_output=True, text=True, timeout=900
     )
