@@ -11,7 +11,7 @@ from safe_rl.processor import cpuinfo
 
 __all__ = ["Tanh"]
 
-_MKL_IS_QUICK = "GenuineIntel" in cpuinfo()
+_MKL_IS_QUICK = torch.backends.mkl.is_available() and "GenuineIntel" in cpuinfo()
 """Whether torch takes its tangents from MKL's vectors, which only Intel's processors go through
 in full width: a third of the time of what is below."""
 
