@@ -23,7 +23,8 @@ class CostTerms(TypedDict):
     """Keyword arguments of every loss with cost critics.
 
     Attributes:
-        multiplier: λ; read at every call.
+        multiplier: λ; read at every call, and no part of the loss or its ``state_dict``: whoever
+            moves it saves it.
         cost_keys: costs below ``next``, [..., 1] each.
         pessimism: κ, standard deviations among the cost critics that are added to their mean.
         target_pessimism: the same for what critics bootstrap on, which all then have in common;
