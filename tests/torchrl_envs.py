@@ -41,6 +41,20 @@ class Runner(EnvBase):
         torch.manual_seed(seed)
 
 
+class Charged(Runner):
+    """The same, with its cost beside the reward."""
+
+    def __init__(self, **kwargs):
+        super().__init__(**kwargs)
+        cost = self.observation_spec["cost_effort"]
+        del self.observation_spec["cost_effort"]
+        rewards = Composite(reward=Unbounded(cost.shape), cost_effort=cost, shape=self.batch_size)
+        self.reward_spec = rewards
+
+    def _reset(self, tensordict=None, **_):
+        return super()._reset(tensordict).exclude("cost_effort")
+
+
 def upright(step, limit=1.0):
     """A cost for being within a range of the top, [N]."""
     return step["next", "th"].abs() < limit

@@ -167,10 +167,10 @@ class OnPolicy:
         return dict(zip(("policy", "critic"), both, strict=True))
 
     def _shares_critics(self) -> bool:
-        """Whether a loss of one's own moves a critic, which two threads must not do at once."""
+        """Whether the policy's update moves a critic, which two threads must not do at once."""
         fitted = {parameter.data_ptr() for parameter in self.critic_update.loss.parameters()}
-        losses = (loss for _, loss in losses_of(self.policy_update))
-        return any(p.data_ptr() in fitted for loss in losses for p in loss.parameters())
+        moved = [self.actor, *(loss for _, loss in losses_of(self.policy_update))]
+        return any(p.data_ptr() in fitted for module in moved for p in module.parameters())
 
     def checkpoint_components(self) -> dict[str, Stateful]:
         """Parts with a ``state_dict``, by name: together they are all that learning depends on."""

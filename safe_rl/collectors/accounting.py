@@ -96,7 +96,7 @@ class EpisodeAccounting:
         KeyError: By :meth:`update`, if a key is not in the batch.
         EpisodeError: By :meth:`update`, if a cost is below 0, or an episode too long.
         ValueError: By :meth:`update`, if the batch does not have the shape [N, T], or [T] with
-            N = 1.
+            N = 1, or an entry is not one number per step.
 
     Examples:
         >>> import torch
@@ -205,7 +205,12 @@ class EpisodeAccounting:
         if entry is None:
             known = sorted(map(str, batch.get("next").keys(True, True)))
             raise KeyError(f"The batch has no ('next', {key!r}). What it has there: {known}.")
-        return entry.squeeze(-1).double()
+        if entry.numel() != batch.numel():
+            raise ValueError(
+                f"('next', {key!r}) has the shape {list(entry.shape)}, expected "
+                f"{[*batch.shape, 1]}: one number per step. Of several agents, sum them up."
+            )
+        return entry.reshape(batch.shape).double()
 
     @property
     def have_begun(self) -> Tensor:

@@ -6,7 +6,11 @@ import math
 
 import torch
 from tensordict import TensorDictBase
-from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModuleBase
+from tensordict.nn import (
+    ProbabilisticTensorDictSequential,
+    TensorDictModule,
+    TensorDictModuleBase,
+)
 from torchrl.envs.utils import ExplorationType, exploration_type
 from torchrl.modules import IndependentNormal
 
@@ -14,7 +18,7 @@ __all__ = ["WITHOUT_NOISE", "BehaviourPolicy", "make_behaviour"]
 
 
 def make_behaviour(actor: ProbabilisticTensorDictSequential) -> TensorDictModuleBase:
-    """The fastest module that samples an actor: a `BehaviourPolicy` if it is a plain Gaussian."""
+    """The fastest module that samples an actor: a `BehaviourPolicy` of it, or the actor itself."""
     try:
         return BehaviourPolicy(actor)
     except TypeError:
@@ -35,12 +39,12 @@ class BehaviourPolicy(TensorDictModuleBase):
     ``loc``, which is all of these of a Gaussian.
 
     Args:
-        actor: Policy made by :func:`make_actor`, or any ``ProbabilisticTensorDictSequential``
-            whose first module maps its keys to ``loc`` and ``scale`` and whose distribution is a
-            diagonal Gaussian.
+        actor: Policy made by :func:`make_actor`, or any ``ProbabilisticTensorDictSequential`` of a
+            plain ``TensorDictModule`` that writes a mean and a standard deviation, and of an
+            ``IndependentNormal`` of these that writes an action and its log-probability.
 
     Raises:
-        TypeError: If the actor's distribution is not ``IndependentNormal``.
+        TypeError: If the actor is another.
 
     Examples:
         >>> import torch
@@ -54,11 +58,21 @@ class BehaviourPolicy(TensorDictModuleBase):
     def __init__(self, actor: ProbabilisticTensorDictSequential) -> None:
         super().__init__()
         parameters, sampler = actor.module[0], actor.module[-1]
-        if len(actor.module) != 2 or sampler.distribution_class is not IndependentNormal:
+        if not (
+            len(actor.module) == 2
+            and type(parameters) is TensorDictModule  # others may call their network otherwise
+            and sampler.distribution_class is IndependentNormal
+            and not sampler.distribution_kwargs
+            and list(sampler.dist_keys) == ["loc", "scale"]
+            and list(parameters.out_keys) == list(sampler.in_keys)
+            and len(sampler.out_keys) == 2
+        ):
             raise TypeError(
-                "BehaviourPolicy samples a network followed by an IndependentNormal, got "
-                f"{len(actor.module)} modules and {sampler.distribution_class}. Hand the "
-                "actor itself to the collector instead."
+                "BehaviourPolicy samples one TensorDictModule that writes loc and scale, followed "
+                "by an IndependentNormal of them with return_log_prob=True, got "
+                f"{len(actor.module)} modules, the first a {type(parameters).__name__} that writes "
+                f"{parameters.out_keys}, and {sampler.distribution_class}. Hand the actor itself "
+                "to the collector instead."
             )
         self.network = parameters.module
         self.in_keys = list(parameters.in_keys)

@@ -137,7 +137,8 @@ class VectorGAE(ValueEstimatorBase):
 
         Raises:
             KeyError: if an entry is missing.
-            ValueError: if values and signals do not match in shape, or `target_params` is given.
+            ValueError: if values, signals and ends do not match in shape, something stands between
+                time and the signals, or `target_params` is given.
             FloatingPointError: if a signal, an observation or a value is not finite.
         """
         if target_params is not None:
@@ -183,6 +184,12 @@ class VectorGAE(ValueEstimatorBase):
         done, terminated = (
             require(tensordict, ("next", key)) for key in (keys.done, keys.terminated)
         )
+        if reward.shape[:-1] != done.shape[:-1] or done.ndim > tensordict.ndim + 1:
+            raise ValueError(
+                f"In a rollout {list(tensordict.batch_size)}, the signals {self.reward_keys} have "
+                f"shape {tuple(reward.shape)} and {keys.done!r} {tuple(done.shape)}: both have to "
+                "be [..., T, 1]. Of several agents, make rows: [..., agents, T]."
+            )
         mask = sample_mask(tensordict)
         ends = trajectory_ends(done, mask)
         value, following = self._values(tensordict, ends, params)

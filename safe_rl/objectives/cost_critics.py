@@ -23,8 +23,10 @@ class CostTerms(TypedDict):
     """Keyword arguments of every loss with cost critics.
 
     Attributes:
-        multiplier: λ; read at every call.
-        cost_keys: costs below ``next``, [..., 1] each.
+        multiplier: λ; read at every call, and no part of the loss or its ``state_dict``: whoever
+            moves it saves it.
+        cost_keys: costs below ``next``, [..., 1] each; of transitions over n steps their discounted
+            sums, which TorchRL's `MultiStepTransform` makes of no more than its ``reward_keys``.
         pessimism: κ, standard deviations among the cost critics that are added to their mean.
         target_pessimism: the same for what critics bootstrap on, which all then have in common;
             null: every critic bootstraps on its own target network.

@@ -247,10 +247,13 @@ class SurrogateLoss(LossModule):
         key = self.tensor_keys.cost_advantage
         advantage = require(tensordict, key, "CostGAE writes it.")
         num_costs = advantage.shape[-1] if self.multiplier is None else self.multiplier.num_costs
-        if advantage.shape != (*tensordict.batch_size, num_costs):
+        # of several agents in a state each has its own, as it has its own log-probability
+        is_composite = self._composite_keys is not None
+        samples = tensordict if is_composite else tensordict[self.tensor_keys.sample_log_prob]
+        if advantage.shape != (*samples.shape, num_costs):
             raise ValueError(
                 f"{key!r} has shape {tuple(advantage.shape)}, expected "
-                f"{(*tensordict.batch_size, num_costs)}: one column per cost limit."
+                f"{(*samples.shape, num_costs)}: one column per cost limit."
             )
         return advantage
 

@@ -179,3 +179,16 @@ def test_episodes_that_are_too_long_are_refused_open_or_ended(ends):
     accounting.update(steps_of([0.0] * 3, [False] * 3))
     with pytest.raises(EpisodeError, match=r"has 4 steps.*'max_episode_steps' is 3"):
         accounting.update(steps_of([0.0], [ends]))
+
+
+def test_numbers_of_several_agents_are_no_cost_of_a_step():
+    step = {"reward": torch.ones(2, 5, 1), "cost": torch.ones(2, 5, 3, 1)}
+    step["done"] = torch.zeros(2, 5, 1, dtype=torch.bool)
+    accounting = EpisodeAccounting(2, ["cost"])
+    with pytest.raises(ValueError, match=r"'cost'\) has the shape \[2, 5, 3, 1\], .*\[2, 5, 1\]"):
+        accounting.update(TensorDict({"next": step}, [2, 5]))
+
+
+def test_steps_come_one_at_a_time_without_a_last_dimension():
+    step = {"reward": torch.ones(2, 1), "done": torch.ones(2, 1, dtype=torch.bool)}
+    assert EpisodeAccounting(2, []).update(TensorDict({"next": step}, [2, 1])).num_episodes == 2

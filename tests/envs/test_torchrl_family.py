@@ -269,6 +269,18 @@ def test_only_what_was_imported_is_reached(trusted):
     assert complete_env(RUNNER)["cost_keys"] == ["cost_effort"]
 
 
+@pytest.mark.parametrize("named", [None, ["cost_effort"]])
+def test_costs_may_stand_beside_the_reward_already(trusted, named):
+    node = RUNNER | {"id": "torchrl_envs.Charged", "cost_keys": named}
+    env = make_env(node, num_envs=3, seed=0)
+    check_env_specs(env)
+    assert env.cost_keys == ["cost", "cost_effort"]
+    after = env.rollout(5)["next"]
+    assert after["reward"].any()
+    assert torch.equal(after["cost_effort"], after["reward"].square())
+    assert torch.equal(after["cost"], after["cost_effort"])
+
+
 def test_costs_of_ranges_are_bounded_in_the_spec_and_others_are_not():
     env = make_env(PENDULUM, num_envs=2, seed=0)
     bounds = {key: env.full_reward_spec[key].high.max().item() for key in env.cost_keys}

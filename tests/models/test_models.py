@@ -5,12 +5,24 @@ import math
 import pytest
 import torch
 from tensordict import TensorDict
-from tensordict.nn import TensorDictModule
+from tensordict.nn import (
+    NormalParamExtractor,
+    TensorDictModule,
+    TensorDictModuleBase,
+    TensorDictSequential,
+)
 from torch import nn
 from torchrl.envs.utils import ExplorationType, set_exploration_type
-from torchrl.modules import ProbabilisticActor, TanhNormal
+from torchrl.modules import IndependentNormal, ProbabilisticActor, TanhNormal
 
-from safe_rl.models import BehaviourPolicy, InputScale, input_scale_vector, make_actor, make_critic
+from safe_rl.models import (
+    BehaviourPolicy,
+    InputScale,
+    input_scale_vector,
+    make_actor,
+    make_behaviour,
+    make_critic,
+)
 
 
 def observations(*shape):
@@ -94,6 +106,77 @@ def test_behaviour_policy_refuses_other_distributions():
     squashed = ProbabilisticActor(network, in_keys=["loc", "scale"], distribution_class=TanhNormal)
     with pytest.raises(TypeError, match="TanhNormal"):
         BehaviourPolicy(squashed)
+
+
+class Swapped(nn.Sequential):
+    """Puts out a standard deviation, then a mean."""
+
+    def forward(self, observation):
+        return super().forward(observation)[::-1]
+
+
+class Direct(TensorDictModuleBase):
+    """Parameters of a Gaussian, written without a `TensorDictModule`."""
+
+    def __init__(self):
+        super().__init__()
+        self.in_keys, self.out_keys = ["observation"], ["loc", "scale"]
+        self.layers = nn.Sequential(nn.Linear(5, 4), NormalParamExtractor())
+
+    def forward(self, tensordict):
+        loc, scale = self.layers(tensordict["observation"])
+        return tensordict.set("loc", loc).set("scale", scale)
+
+
+def with_features(observation, layers=nn.Sequential(nn.Linear(5, 4), NormalParamExtractor())):  # noqa: B008
+    return *layers(observation), observation
+
+
+def gaussian(make, *out_keys):
+    layers = make(nn.Linear(5, 4), NormalParamExtractor())
+    return TensorDictModule(layers, in_keys=["observation"], out_keys=list(out_keys))
+
+
+GAUSSIANS = {
+    "trunk_and_head": lambda: TensorDictSequential(
+        TensorDictModule(nn.Linear(5, 5), in_keys=["observation"], out_keys=["hidden"]),
+        TensorDictModule(
+            nn.Sequential(nn.Linear(5, 4), NormalParamExtractor()),
+            in_keys=["hidden"],
+            out_keys=["loc", "scale"],
+        ),
+    ),
+    "own_module": Direct,
+    "scale_first": lambda: gaussian(Swapped, "scale", "loc"),
+    "three_outputs": lambda: TensorDictModule(
+        with_features, in_keys=["observation"], out_keys=["loc", "scale", "features"]
+    ),
+    "matrices": lambda: gaussian(
+        lambda *layers: nn.Sequential(layers[0], nn.Unflatten(-1, (2, 2)), layers[1]),
+        "loc",
+        "scale",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", GAUSSIANS)
+def test_gaussians_of_ones_own_are_sampled_with_their_own_log_probability(name):
+    settings = {"distribution_kwargs": {"event_dim": 2}} if name == "matrices" else {}
+    actor = ProbabilisticActor(
+        GAUSSIANS[name](), in_keys=["loc", "scale"], distribution_class=IndependentNormal,
+        return_log_prob=True, default_interaction_type=ExplorationType.RANDOM, **settings,
+    )  # fmt: skip
+    sample = make_behaviour(actor)(observations(4))
+    expected = actor.get_dist(observations(4).update(sample)).log_prob(sample["action"])
+    torch.testing.assert_close(sample["action_log_prob"], expected)
+
+
+def test_a_gaussian_that_writes_no_log_probability_is_left_alone():
+    network = gaussian(nn.Sequential, "loc", "scale")
+    actor = ProbabilisticActor(
+        network, in_keys=["loc", "scale"], distribution_class=IndependentNormal
+    )
+    assert make_behaviour(actor) is actor
 
 
 def test_input_scale_is_fixed_saved_and_applied():

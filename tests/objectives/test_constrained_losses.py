@@ -225,3 +225,21 @@ def test_before_any_batch_the_policy_counts_as_at_its_limit(gamma):
     actor, _, batch = one_state(GAIN, COST)
     losses = P3OLoss(actor, Constraints({"cost": 25.0}), kappa=20.0, gamma=gamma, **FREE)(batch)
     assert losses["loss_penalty"].abs() < 1e-5
+
+
+@pytest.mark.parametrize("agents", [1, 5])
+@pytest.mark.parametrize("name", LOSSES)
+def test_every_agent_of_a_state_has_cost_advantages_of_its_own(name, agents):
+    """As many states as agents: nothing else would tell that one were taken for the other."""
+    actor = make_actor()
+    batch = make_batch(actor, [5, agents], 2)
+    perturb(actor, 0.1)
+    loss = LOSSES[name](actor)
+    expected = loss(batch.flatten())
+    batch.batch_size = [5]
+    losses = loss(batch)
+    for key in losses.keys():  # noqa: SIM118
+        torch.testing.assert_close(losses[key], expected[key])
+    batch["cost_advantage"] = torch.randn(5, 2)
+    with pytest.raises(ValueError, match=rf"expected \(5, {agents}, 2\)"):
+        loss(batch)

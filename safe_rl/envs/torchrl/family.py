@@ -85,9 +85,10 @@ def make_torchrl(
 
 def _check_entries(env: EnvBase, names: Sequence[str]) -> None:
     """Refuse costs that a step cannot do without: what is a cost is nothing else any more."""
-    needed = [env.full_state_spec, env.full_action_spec, env.full_reward_spec, env.full_done_spec]
+    needed = [env.full_state_spec, env.full_action_spec, env.full_done_spec]
+    kept = {"reward", *(key for spec in needed for key in spec.keys(True, True))}
     for name in names:
-        if any(entry_key(name) in spec.keys(True, True) for spec in needed):
+        if entry_key(name) in kept:
             raise ConfigError(
                 f"env.cost_keys: '{name}' is a state, an action, a reward or an end, and stays "
                 "one. Make a cost of it by env.outside, or by a function of yours (env.cost)."
