@@ -46,8 +46,8 @@ PARTS = {
 # Inside a package a module may import those of the floors below its own.
 FLOORS = {
     "envs": (
-        ("errors", "opengl", "rng", "states", "physics", "physics.base"),
-        ("costs", "physics.cpu", "physics.dynamics"),
+        ("errors", "opengl", "rng", "states", "physics"),
+        ("costs", "physics.batch", "physics.dynamics"),
         ("contract", "cost_specs"),
         ("simulated",),
         # Safety Gym: records, then rules, then worlds, and what is seen of them.

@@ -16,7 +16,7 @@ from torchrl.envs import EnvBase
 
 from safe_rl.envs import rng
 from safe_rl.envs.errors import require_integer
-from safe_rl.envs.physics.cpu import BatchPhysics
+from safe_rl.envs.physics.batch import BatchPhysics
 
 
 class SimulatedEnv(EnvBase):

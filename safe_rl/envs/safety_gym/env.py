@@ -13,7 +13,7 @@ from torch import Tensor
 
 from safe_rl.envs import rng
 from safe_rl.envs.errors import require_integer
-from safe_rl.envs.physics.cpu import BatchPhysics
+from safe_rl.envs.physics.batch import BatchPhysics
 from safe_rl.envs.safety_gym.observing.lidar_blocks import lidar_blocks
 from safe_rl.envs.safety_gym.observing.observations import make_observer
 from safe_rl.envs.safety_gym.records.config import SafetyGymConfig

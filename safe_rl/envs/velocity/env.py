@@ -11,7 +11,7 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.data import Unbounded
 
-from safe_rl.envs.physics.cpu import BatchPhysics
+from safe_rl.envs.physics.batch import BatchPhysics
 from safe_rl.envs.physics.runge_kutta import runge_kutta_substep
 from safe_rl.envs.simulated import SimulatedEnv
 from safe_rl.envs.states import check_state, require_episodes
