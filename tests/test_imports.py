@@ -91,7 +91,7 @@ FLOORS = {
         ("gymnasium.family",),
         ("gymnasium",),
         # TorchRL's environments, with costs made by a rule.
-        ("torchrl.outside", "torchrl.reshaping", "torchrl.rows"),
+        ("torchrl.outside", "torchrl.rows"),
         ("torchrl.batching", "torchrl.costing"),
         ("torchrl.nodes", "torchrl.observing"),
         ("torchrl.family",),
