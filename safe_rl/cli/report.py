@@ -12,7 +12,7 @@ from safe_rl.cli.interrupting import say_interruptions
 from safe_rl.cli.options import OptionError, parse_options, usage
 from safe_rl.cli.user_code import import_modules, split_imports
 from safe_rl.reporting import Report, build_report, write_report
-from safe_rl.reporting.recorded import clean
+from safe_rl.reporting.cleaning import clean
 from safe_rl.runs.files import check_place
 from safe_rl.runs.keeping import keep_runs
 from safe_rl.scores.published import SEEDS
