@@ -125,7 +125,7 @@ def _maker(config: Mapping[str, Any]) -> MakeEnv:
     if "." in name:
         made: MakeEnv = partial(locate(name, key="env.id"), **kwargs)
     else:
-        made = partial(getattr(torchrl.envs, name), **{**ROWS[name].kwargs, **kwargs})
+        made = partial(getattr(torchrl.envs, name), **{**ROWS[name], **kwargs})
     return partial(_with_infos, made, config["cost_keys"] or [], config["num_steps"])
 
 
