@@ -24,7 +24,7 @@ import torch
 from omegaconf import OmegaConf
 
 from safe_rl.envs import SUITE, SafetyGymConfig, SafetyGymEnv
-from safe_rl.envs.physics.cpu import BatchPhysics
+from safe_rl.envs.physics.batch import BatchPhysics
 from safe_rl.envs.safety_gym.suite import resolve
 from safe_rl.envs.safety_gym.world.building import build_scene
 from safe_rl.envs.safety_gym.world.draws import gremlin_path

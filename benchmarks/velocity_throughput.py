@@ -18,7 +18,7 @@ import time
 import gymnasium
 import torch
 
-from safe_rl.envs.physics.cpu import BatchPhysics
+from safe_rl.envs.physics.batch import BatchPhysics
 from safe_rl.envs.velocity import VELOCITY_SUITE, VelocityEnv
 from safe_rl.envs.velocity.robots import ROBOTS
 

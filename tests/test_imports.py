@@ -46,8 +46,8 @@ PARTS = {
 # Inside a package a module may import those of the floors below its own.
 FLOORS = {
     "envs": (
-        ("errors", "opengl", "rng", "states", "physics", "physics.base"),
-        ("costs", "physics.cpu", "physics.dynamics"),
+        ("errors", "opengl", "rng", "states", "physics"),
+        ("costs", "physics.batch", "physics.dynamics"),
         ("contract", "cost_specs"),
         ("simulated",),
         # Safety Gym: records, then rules, then worlds, and what is seen of them.
@@ -91,7 +91,7 @@ FLOORS = {
         ("gymnasium.family",),
         ("gymnasium",),
         # TorchRL's environments, with costs made by a rule.
-        ("torchrl.outside", "torchrl.reshaping", "torchrl.rows"),
+        ("torchrl.outside", "torchrl.rows"),
         ("torchrl.batching", "torchrl.costing"),
         ("torchrl.nodes", "torchrl.observing"),
         ("torchrl.family",),

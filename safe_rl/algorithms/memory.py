@@ -7,12 +7,7 @@ from typing import Any
 
 import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase
-from torchrl.data import (
-    LazyMemmapStorage,
-    LazyTensorStorage,
-    RandomSampler,
-    TensorDictReplayBuffer,
-)
+from torchrl.data import LazyMemmapStorage, LazyTensorStorage, RandomSampler, TensorDictReplayBuffer
 from torchrl.data.replay_buffers.samplers import Sampler
 from torchrl.envs import MultiStepTransform
 

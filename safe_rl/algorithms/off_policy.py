@@ -20,12 +20,7 @@ from safe_rl.algorithms.contract import Stateful
 from safe_rl.algorithms.dataset import fill_memory
 from safe_rl.algorithms.memory import Memory
 from safe_rl.algorithms.parts import build_part
-from safe_rl.algorithms.replay_networks import (
-    bounded_actions,
-    build_networks,
-    exploring,
-    setting,
-)
+from safe_rl.algorithms.replay_networks import bounded_actions, build_networks, exploring, setting
 from safe_rl.algorithms.replay_update import ReplayUpdate
 from safe_rl.collectors import EpisodeStatistics
 from safe_rl.models import ExploringPolicy

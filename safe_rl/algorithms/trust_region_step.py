@@ -98,16 +98,9 @@ class TRPOStep:
 
     Examples:
         >>> from tensordict import TensorDict
-        >>> from tensordict.nn import AddStateIndependentNormalScale, TensorDictModule
-        >>> from torchrl.modules import IndependentNormal, ProbabilisticActor
+        >>> from safe_rl.models import make_actor
         >>> from safe_rl.objectives import TRPOLoss
-        >>> net = torch.nn.Sequential(torch.nn.Linear(3, 2), AddStateIndependentNormalScale(2))
-        >>> actor = ProbabilisticActor(
-        ...     TensorDictModule(net, in_keys=["observation"], out_keys=["loc", "scale"]),
-        ...     in_keys=["loc", "scale"],
-        ...     distribution_class=IndependentNormal,
-        ...     return_log_prob=True,
-        ... )
+        >>> actor = make_actor(3, 2, hidden_sizes=[8], initial_log_std=-0.5)
         >>> with torch.no_grad():
         ...     batch = actor(TensorDict(observation=torch.randn(8, 3), batch_size=[8]))
         >>> batch["advantage"] = torch.randn(8, 1)

@@ -4,15 +4,16 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 
 from safe_rl.cli.benchmark import suite
 from safe_rl.cli.interrupting import say_interruptions
 from safe_rl.cli.options import OptionError, parse_options, usage
 from safe_rl.cli.user_code import import_modules, split_imports
+from safe_rl.evaluation.settings import option
 from safe_rl.reporting import Report, build_report, write_report
-from safe_rl.reporting.recorded import clean
+from safe_rl.reporting.cleaning import clean
 from safe_rl.runs.files import check_place
 from safe_rl.runs.keeping import keep_runs
 from safe_rl.scores.published import SEEDS
@@ -31,27 +32,18 @@ class ReportOptions:
         False
     """
 
-    out: str | None = field(
-        default=None, metadata={"help": "folder of the report; null: RUNS_DIR/report"}
+    out: str | None = option(None, "folder of the report; null: RUNS_DIR/report")
+    seeds: int = option(len(SEEDS), "runs that a slate takes per environment")
+    unfinished: bool = option(False, "count runs that have not come to their end")
+    archive: str | None = option(
+        None, "folder to keep the runs in for others, tables compressed; null: none"
     )
-    seeds: int = field(
-        default=len(SEEDS), metadata={"help": "runs that a slate takes per environment"}
+    good: float = option(
+        0.5,
+        "x of the first step with J_r >= x and J_c <= d: share of the published PPO's return, "
+        "elsewhere of the best one here",
     )
-    unfinished: bool = field(
-        default=False, metadata={"help": "count runs that have not come to their end"}
-    )
-    archive: str | None = field(
-        default=None,
-        metadata={"help": "folder to keep the runs in for others, tables compressed; null: none"},
-    )
-    good: float = field(
-        default=0.5,
-        metadata={
-            "help": "x of the first step with J_r >= x and J_c <= d: share of the published PPO's "
-            "return, elsewhere of the best one here"
-        },
-    )
-    title: str | None = field(default=None, metadata={"help": "heading; null: the folder's name"})
+    title: str | None = option(None, "heading; null: the folder's name")
 
 
 def report(root: Path, options: ReportOptions) -> tuple[Report, Path]:

@@ -5,11 +5,7 @@ from safe_rl.collectors.datasets import read_dataset, safe_episodes
 from safe_rl.collectors.factory import make_collector
 from safe_rl.collectors.hdf5 import read_hdf5
 from safe_rl.collectors.recording import Recording, StepRecorder, read_recording
-from safe_rl.collectors.workers import (
-    WorkerCollector,
-    make_process_collector,
-    make_ray_collector,
-)
+from safe_rl.collectors.workers import WorkerCollector, make_process_collector, make_ray_collector
 
 __all__ = [
     "EpisodeAccounting",

@@ -16,7 +16,7 @@ from torchrl.envs import EnvBase
 
 from safe_rl.envs import rng
 from safe_rl.envs.errors import require_integer
-from safe_rl.envs.physics.cpu import BatchPhysics
+from safe_rl.envs.physics.batch import BatchPhysics
 
 
 class SimulatedEnv(EnvBase):
@@ -33,6 +33,8 @@ class SimulatedEnv(EnvBase):
 
     #: Flags that are written beside the numbers, all of them False after a reset.
     flags: ClassVar[tuple[str, ...]] = ("done", "terminated", "truncated")
+    #: Camera of pictures where none is named.
+    first_camera: ClassVar[str]
     #: What a copy has beside the state: attributes that are tensors.
     copied: ClassVar[tuple[str, ...]] = ("_row_seed", "_has_cost", "_begun")
 
@@ -201,12 +203,32 @@ class SimulatedEnv(EnvBase):
         for name, tensor in tensors.items():
             setattr(self, name, tensor)
 
-    def _frames(
-        self, rows: int | Sequence[int] | None, camera: Any, width: int, height: int
+    def render(
+        self,
+        rows: int | Sequence[int] | None = None,
+        *,
+        camera: str | mujoco.MjvCamera | None = None,
+        width: int = 480,
+        height: int = 360,
     ) -> np.ndarray:
-        """One frame for an integer, else frames of some worlds, or of all."""
+        """Draw worlds as they are, with a red sphere where a cost is incurred.
+
+        Args:
+            rows: which worlds; None is all of them.
+            camera: one of those that the class names, or a `mujoco.MjvCamera`; None is the first.
+            width: of a frame [pixels].
+            height: of a frame [pixels].
+
+        Returns:
+            RGB, uint8: one frame [height, width, 3] for an integer, else [R, height, width, 3].
+
+        Raises:
+            OpenGLError: if OpenGL is missing; the message names the package to install.
+            ValueError: for an unknown camera.
+        """
         everyone = range(self.batch_size[0])
         chosen = [rows] if isinstance(rows, int) else list(everyone if rows is None else rows)
+        camera = self.first_camera if camera is None else camera
         frames = self._renderer.frames(chosen, self._has_cost, camera, width, height)
         return frames[0] if isinstance(rows, int) else frames
 

@@ -11,7 +11,7 @@ import torch
 
 from safe_rl.scores.intervals import check_share
 
-__all__ = ["EvaluationOptions", "check_device", "check_options"]
+__all__ = ["EvaluationOptions", "check_device", "check_options", "option"]
 
 # Threads beyond it are not to be had, and worlds fill the memory.
 _RANGES = {
@@ -25,8 +25,10 @@ _RANGES = {
 _PICTURES = (".gif", ".webp")
 
 
-def _option(default: Any, help: str) -> Any:
-    return field(default=default, metadata={"help": help})
+def option(default: Any, help: str) -> Any:
+    """A field of a command's options; a default that changes is given by what makes it."""
+    kind = "default_factory" if callable(default) else "default"
+    return field(metadata={"help": help}, **{kind: default})
 
 
 @dataclass
@@ -38,46 +40,42 @@ class EvaluationOptions:
         'last'
     """
 
-    episodes: int = _option(100, "whole episodes to run")
-    checkpoint: str = _option(
+    episodes: int = option(100, "whole episodes to run")
+    checkpoint: str = option(
         "last", "last, best (highest return that kept every limit), certified, or a path"
     )
-    deterministic: bool = _option(False, "act with the policy's mean instead of sampling from it")
-    seed: int | None = _option(
+    deterministic: bool = option(False, "act with the policy's mean instead of sampling from it")
+    seed: int | None = option(
         None, "of layouts and actions; null: one that training never used, see docs/protocol.md"
     )
-    num_envs: int = _option(25, "worlds that are stepped together")
-    num_threads: int = _option(0, "threads that step them; 0: one per core")
-    device: str = _option("cpu", "of the policy")
-    cvar_alpha: float = _option(0.1, "share of the costliest episodes in the CVaR")
-    video: bool = _option(
+    num_envs: int = option(25, "worlds that are stepped together")
+    num_threads: int = option(0, "threads that step them; 0: one per core")
+    device: str = option("cpu", "of the policy")
+    cvar_alpha: float = option(0.1, "share of the costliest episodes in the CVaR")
+    video: bool = option(
         False,
         "write an MP4 of an episode on the first layout; num_envs=1: the first (extra 'video')",
     )
-    picture: str | None = _option(
+    picture: str | None = option(
         None, "file for an animated picture of the same episode, .gif or .webp"
     )
-    camera: str = _option("free", "of these: free, fixednear, fixedfar, track or vision")
-    record: bool = _option(False, "write every transition to disk, for dataset.path=…")
-    certify: bool = _option(
+    camera: str = option("free", "of these: free, fixednear, fixedfar, track or vision")
+    record: bool = option(False, "write every transition to disk, for dataset.path=…")
+    certify: bool = option(
         False, "find the best checkpoint that surely keeps the limits, instead of evaluating one"
     )
-    certificate: dict[str, Any] = field(
-        default_factory=dict,
-        metadata={"help": "with certify=true: certificate.episodes=2000, as in training"},
+    certificate: dict[str, Any] = option(
+        dict, "with certify=true: certificate.episodes=2000, as in training"
     )
-    cost_limits: dict[str, float] = field(
-        default_factory=dict,
-        metadata={"help": "to measure against in place of the run's own, such as '{cost: 10}'"},
+    cost_limits: dict[str, float] = option(
+        dict, "to measure against in place of the run's own, such as '{cost: 10}'"
     )
-    name: str = _option("", "told apart by it, several evaluations of a run can stand side by side")
-    variations: Any = field(
-        default=None,
-        metadata={"help": "run it in these too: dynamics, sensing, layout, a list, a YAML, keys"},
+    name: str = option("", "told apart by it, several evaluations of a run can stand side by side")
+    variations: Any = option(
+        None, "run it in these too: dynamics, sensing, layout, a list, a YAML, keys"
     )
-    env: dict[str, Any] = field(
-        default_factory=dict,
-        metadata={"help": "keys of the environment, as in training: env.hazards_num=12"},
+    env: dict[str, Any] = option(
+        dict, "keys of the environment, as in training: env.hazards_num=12"
     )
 
 

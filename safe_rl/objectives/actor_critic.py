@@ -30,19 +30,10 @@ class ActorCriticLoss(LossModule):
         critic_coeff: factor of the critics' losses.
 
     Examples:
-        >>> import torch
+        >>> from safe_rl.models import make_actor, make_critic
         >>> from safe_rl.objectives import PPOLoss
-        >>> from tensordict.nn import AddStateIndependentNormalScale, TensorDictModule
-        >>> from torchrl.modules import IndependentNormal, ProbabilisticActor
-        >>> net = torch.nn.Sequential(torch.nn.Linear(3, 2), AddStateIndependentNormalScale(2))
-        >>> actor = ProbabilisticActor(
-        ...     TensorDictModule(net, in_keys=["observation"], out_keys=["loc", "scale"]),
-        ...     in_keys=["loc", "scale"],
-        ...     distribution_class=IndependentNormal,
-        ... )
-        >>> critic = TensorDictModule(
-        ...     torch.nn.Linear(3, 1), in_keys=["observation"], out_keys=["state_value"]
-        ... )
+        >>> actor = make_actor(3, 2, hidden_sizes=[8], initial_log_std=-0.5)
+        >>> critic = make_critic(3, hidden_sizes=[8])
         >>> policy_loss = PPOLoss(actor, clip_epsilon=0.2, entropy_coeff=0.0)
         >>> loss = ActorCriticLoss(policy_loss, CriticLoss(critic), critic_coeff=1.0)
         >>> [key for key in loss.out_keys if key.startswith("loss_")]

@@ -48,10 +48,8 @@ class VectorGAE(ValueEstimatorBase):
     Examples:
         >>> import torch
         >>> from tensordict import TensorDict
-        >>> from tensordict.nn import TensorDictModule
-        >>> critic = TensorDictModule(
-        ...     torch.nn.Linear(3, 1), in_keys=["observation"], out_keys=["state_value"]
-        ... )
+        >>> from safe_rl.models import make_critic
+        >>> critic = make_critic(3, hidden_sizes=[8])
         >>> estimator = VectorGAE(critic, gamma=0.99, lmbda=0.97, value_target="lambda_return")
         >>> next = TensorDict(
         ...     observation=torch.randn(2, 10, 3),

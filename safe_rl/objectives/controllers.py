@@ -50,7 +50,6 @@ class PIMultiplier(Multiplier):
     """
 
     scale: Tensor
-    penalty: Tensor
     integral: Tensor
 
     def __init__(
@@ -76,11 +75,6 @@ class PIMultiplier(Multiplier):
         self.register_buffer("scale", torch.where(self.limits > 0, self.limits, 1.0))
         self.register_buffer("penalty", initial)
         self.register_buffer("integral", initial.clone())
-
-    @property
-    def value(self) -> Tensor:
-        """The multipliers λ ≥ 0, [k], detached."""
-        return self.penalty.detach()
 
     def set_scale(self, scale: Tensor) -> None:
         """Set the units of violations, [k] > 0: until then the limits, or 1 for a limit of 0."""

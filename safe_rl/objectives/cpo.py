@@ -23,14 +23,8 @@ class CPOLoss(SurrogateLoss):
         reduction: ``"mean"``, ``"sum"`` or ``"none"`` over the samples; a `CPOStep` needs the mean.
 
     Examples:
-        >>> from tensordict.nn import AddStateIndependentNormalScale, TensorDictModule
-        >>> from torchrl.modules import IndependentNormal, ProbabilisticActor
-        >>> net = torch.nn.Sequential(torch.nn.Linear(3, 2), AddStateIndependentNormalScale(2))
-        >>> actor = ProbabilisticActor(
-        ...     TensorDictModule(net, in_keys=["observation"], out_keys=["loc", "scale"]),
-        ...     in_keys=["loc", "scale"],
-        ...     distribution_class=IndependentNormal,
-        ... )
+        >>> from safe_rl.models import make_actor
+        >>> actor = make_actor(3, 2, hidden_sizes=[8], initial_log_std=-0.5)
         >>> CPOLoss(actor, entropy_coeff=0.0).out_keys
         ['loss_objective', 'loss_entropy', 'cost_surrogate', 'kl', 'entropy', 'ESS']
     """

@@ -43,13 +43,9 @@ class CriticLoss(LossModule):
     Examples:
         >>> import torch
         >>> from tensordict import TensorDict
-        >>> from tensordict.nn import TensorDictModule
-        >>> critic = TensorDictModule(
-        ...     torch.nn.Linear(3, 1), in_keys=["observation"], out_keys=["state_value"]
-        ... )
-        >>> cost_critic = TensorDictModule(
-        ...     torch.nn.Linear(3, 2), in_keys=["observation"], out_keys=["cost_value"]
-        ... )
+        >>> from safe_rl.models import make_critic
+        >>> critic = make_critic(3, hidden_sizes=[8])
+        >>> cost_critic = make_critic(3, hidden_sizes=[8], num_outputs=2, out_key="cost_value")
         >>> batch = TensorDict(
         ...     observation=torch.randn(8, 3),
         ...     value_target=torch.randn(8, 1),

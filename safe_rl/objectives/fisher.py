@@ -106,14 +106,8 @@ class FisherProduct:
 
     Examples:
         >>> from tensordict import TensorDict
-        >>> from tensordict.nn import AddStateIndependentNormalScale, TensorDictModule
-        >>> from torchrl.modules import IndependentNormal, ProbabilisticActor
-        >>> net = nn.Sequential(nn.Linear(3, 2), AddStateIndependentNormalScale(2))
-        >>> actor = ProbabilisticActor(
-        ...     TensorDictModule(net, in_keys=["observation"], out_keys=["loc", "scale"]),
-        ...     in_keys=["loc", "scale"],
-        ...     distribution_class=IndependentNormal,
-        ... )
+        >>> from safe_rl.models import make_actor
+        >>> actor = make_actor(3, 2, hidden_sizes=[], initial_log_std=-0.5)
         >>> batch = TensorDict(observation=torch.randn(8, 3), batch_size=[8])
         >>> fisher = FisherProduct(actor, batch, list(actor.parameters()), damping=0.1)
         >>> fisher(torch.ones(10)).shape

@@ -69,7 +69,8 @@ def per_cost(name: str, value: float | Sequence[float] | Tensor, num_costs: int)
 class Multiplier(nn.Module):
     """What losses and training loops rely on: limits, `value` and `update`.
 
-    Subclasses keep their state in buffers and implement `value` and `_step`.
+    Subclasses keep their state in buffers and implement `_step`; and `value`, unless λ is the
+    buffer `penalty`.
 
     Args:
         cost_limits: mapping from cost key to limit, or limits alone; see `parse_cost_limits`.
@@ -80,6 +81,7 @@ class Multiplier(nn.Module):
     """
 
     limits: Tensor
+    penalty: Tensor
 
     def __init__(self, cost_limits: CostLimits) -> None:
         super().__init__()
@@ -94,7 +96,7 @@ class Multiplier(nn.Module):
     @property
     def value(self) -> Tensor:
         """The multipliers λ ≥ 0, [k], detached."""
-        raise NotImplementedError
+        return self.penalty.detach()
 
     @torch.no_grad()
     def update(self, mean_costs: Tensor | Sequence[float] | float) -> None:

@@ -57,7 +57,6 @@ class PIDMultiplier(Multiplier):
     """
 
     scale: Tensor
-    penalty: Tensor
     integral: Tensor
     smoothed_error: Tensor
     smoothed_cost: Tensor
@@ -103,11 +102,6 @@ class PIDMultiplier(Multiplier):
         self.register_buffer("smoothed_error", torch.zeros(self.num_costs))
         self.register_buffer("smoothed_cost", torch.zeros(self.num_costs))
         self.register_buffer("past_costs", torch.zeros(derivative_delay, self.num_costs))
-
-    @property
-    def value(self) -> Tensor:
-        """The multipliers λ ≥ 0, [k], detached."""
-        return self.penalty.detach()
 
     def _step(self, mean_costs: Tensor) -> dict[str, Tensor]:
         error = (mean_costs - self.limits) / self.scale

@@ -138,16 +138,9 @@ class PPOLagrangianLoss(PPOLoss):
         ValueError: if `cost_clipping` is none of the three.
 
     Examples:
-        >>> import torch
-        >>> from tensordict.nn import AddStateIndependentNormalScale, TensorDictModule
-        >>> from torchrl.modules import IndependentNormal, ProbabilisticActor
+        >>> from safe_rl.models import make_actor
         >>> from safe_rl.objectives.multipliers import LagrangeMultiplier
-        >>> net = torch.nn.Sequential(torch.nn.Linear(3, 2), AddStateIndependentNormalScale(2))
-        >>> actor = ProbabilisticActor(
-        ...     TensorDictModule(net, in_keys=["observation"], out_keys=["loc", "scale"]),
-        ...     in_keys=["loc", "scale"],
-        ...     distribution_class=IndependentNormal,
-        ... )
+        >>> actor = make_actor(3, 2, hidden_sizes=[8], initial_log_std=-0.5)
         >>> multiplier = LagrangeMultiplier({"cost": 25.0}, init=1.0, lr=0.05)
         >>> loss = PPOLagrangianLoss(actor, multiplier, clip_epsilon=0.2, entropy_coeff=0.0)
         >>> loss.out_keys

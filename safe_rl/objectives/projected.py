@@ -36,7 +36,6 @@ class ProjectedMultiplier(Multiplier):
         tensor([2.])
     """
 
-    penalty: Tensor
     unit: Tensor
 
     def __init__(
@@ -55,11 +54,6 @@ class ProjectedMultiplier(Multiplier):
         self.register_buffer("penalty", initial)
         # told anew before every update, and unknown to checkpoints of earlier versions
         self.register_buffer("unit", torch.ones_like(initial), persistent=False)
-
-    @property
-    def value(self) -> Tensor:
-        """The multipliers λ ≥ 0, [k], detached."""
-        return self.penalty.detach()
 
     def set_unit(self, unit: Tensor) -> None:
         """Set u, [k] > 0."""

@@ -23,15 +23,8 @@ class TRPOLoss(SurrogateLoss):
         reduction: ``"mean"``, ``"sum"`` or ``"none"``.
 
     Examples:
-        >>> import torch
-        >>> from tensordict.nn import AddStateIndependentNormalScale, TensorDictModule
-        >>> from torchrl.modules import IndependentNormal, ProbabilisticActor
-        >>> net = torch.nn.Sequential(torch.nn.Linear(3, 2), AddStateIndependentNormalScale(2))
-        >>> actor = ProbabilisticActor(
-        ...     TensorDictModule(net, in_keys=["observation"], out_keys=["loc", "scale"]),
-        ...     in_keys=["loc", "scale"],
-        ...     distribution_class=IndependentNormal,
-        ... )
+        >>> from safe_rl.models import make_actor
+        >>> actor = make_actor(3, 2, hidden_sizes=[8], initial_log_std=-0.5)
         >>> TRPOLoss(actor, entropy_coeff=0.0).out_keys
         ['loss_objective', 'loss_entropy', 'kl', 'entropy', 'ESS']
     """
@@ -65,15 +58,8 @@ class TRPOLagrangianLoss(TRPOLoss):
 
     Examples:
         >>> from safe_rl.objectives.multipliers import LagrangeMultiplier
-        >>> import torch
-        >>> from tensordict.nn import AddStateIndependentNormalScale, TensorDictModule
-        >>> from torchrl.modules import IndependentNormal, ProbabilisticActor
-        >>> net = torch.nn.Sequential(torch.nn.Linear(3, 2), AddStateIndependentNormalScale(2))
-        >>> actor = ProbabilisticActor(
-        ...     TensorDictModule(net, in_keys=["observation"], out_keys=["loc", "scale"]),
-        ...     in_keys=["loc", "scale"],
-        ...     distribution_class=IndependentNormal,
-        ... )
+        >>> from safe_rl.models import make_actor
+        >>> actor = make_actor(3, 2, hidden_sizes=[8], initial_log_std=-0.5)
         >>> multiplier = LagrangeMultiplier({"cost": 25.0}, init=1.0, lr=0.05)
         >>> "cost_advantage" in TRPOLagrangianLoss(actor, multiplier, entropy_coeff=0.0).in_keys
         True

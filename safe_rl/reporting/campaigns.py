@@ -127,12 +127,12 @@ def _tables(name: str, cells: Sequence[Cell], runs: Sequence[Run]) -> list[Table
         Column("algorithm", ("{}", "algo")),
         Column("steps", ("{:,}", "frames")),
         *([Column("with", ("{}", "further"))] if any(r["further"] for r in records) else []),
-        *(Column(state, ("{}", state)) for state in ("done", "begun", "missing")),
+        *(Column(state) for state in ("done", "begun", "missing")),
     ]
     shown = [Table(f"campaign_{name}", name, columns, records, note)]
     commands = _commands(cells, [record["seeds_missing"] for record in records])
     if commands:
-        columns = [Column("runs", ("{:d}", "runs")), Column("command", ("{}", "command"))]
+        columns = [Column("runs", ("{:d}", "runs")), Column("command")]
         shown.append(Table(f"campaign_{name}_missing", f"{name}: missing", columns, commands))
     return shown
 

@@ -50,7 +50,7 @@ class Column:
         title: Its head.
         parts: A template each, and the fields that fill it, as in
             ``("{:.1f}", "x"), (" ± {:.1f}", "x_std")``; a part is left out where one of its fields
-            is missing or NaN, the entry where the first part is.
+            is missing or NaN, the entry where the first part is. Without any: the field ``title``.
         mark: Record -> "best" (bold), "bad" (over a limit), or nothing.
 
     Examples:
@@ -63,9 +63,9 @@ class Column:
         self, title: str, *parts: tuple[str, ...], mark: Callable[[Record], str] | None = None
     ) -> None:
         self.title = title
-        self.parts = parts
+        self.parts = parts or (("{}", title),)
         self.mark = mark or (lambda record: "")
-        self.is_number = ":" in parts[0][0]
+        self.is_number = ":" in self.parts[0][0]
 
     def text(self, record: Record) -> str:
         """The entry of a record."""

@@ -13,6 +13,7 @@ import yaml
 from matplotlib.figure import Figure
 
 from safe_rl.reporting.campaigns import campaign_tables
+from safe_rl.reporting.cleaning import clean
 from safe_rl.reporting.columns import Column, Record, Table
 from safe_rl.reporting.experiments import Experiment, group_runs
 from safe_rl.reporting.fronts import compared, draw_fronts
@@ -25,12 +26,8 @@ from safe_rl.reporting.inventory import (
 )
 from safe_rl.reporting.lacking import lacking_table, missing_seeds
 from safe_rl.reporting.origins import Origin, find_origins
-from safe_rl.reporting.pictures import (
-    Style,
-    algorithm_styles,
-    draw_learning_curves,
-)
-from safe_rl.reporting.recorded import Run, clean, find_runs
+from safe_rl.reporting.pictures import Style, algorithm_styles, draw_learning_curves
+from safe_rl.reporting.recorded import Run, find_runs
 from safe_rl.reporting.scoring import dominance_table, final_table, learning_table
 from safe_rl.reporting.slate_pictures import draw_middles, draw_profiles
 from safe_rl.reporting.slate_scores import (
@@ -173,7 +170,7 @@ def _if_any(table: Table) -> list[Table]:
 
 def _left_out(skipped: Mapping[Path, str]) -> Table:
     records = [{"what": clean(path), "why": clean(why, 500)} for path, why in skipped.items()]
-    columns = [Column(name, ("{}", name)) for name in ("what", "why")]
+    columns = [Column(name) for name in ("what", "why")]
     return Table("left_out", "Left out", columns, records)
 
 

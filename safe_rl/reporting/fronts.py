@@ -12,14 +12,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from safe_rl.reporting.columns import Record, span
-from safe_rl.reporting.pictures import (
-    LIMIT_STYLE,
-    WIDTH,
-    Style,
-    add_legend,
-    literal,
-    set_grid,
-)
+from safe_rl.reporting.pictures import LIMIT_STYLE, WIDTH, Style, add_legend, literal, set_grid
 from safe_rl.scores.comparisons import pareto_front
 
 __all__ = ["compared", "draw_fronts"]

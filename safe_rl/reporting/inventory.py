@@ -7,15 +7,16 @@ from math import inf
 from pathlib import Path
 from typing import Any
 
+from safe_rl.reporting.cleaning import clean
 from safe_rl.reporting.columns import Column, Record, Table, each_cost, interval
 from safe_rl.reporting.experiments import Experiment
-from safe_rl.reporting.recorded import Run, clean
+from safe_rl.reporting.recorded import Run
 
 __all__ = [
     *("certificate_table", "duration", "evaluation_table", "run_table", "variant_table", "videos"),
 ]
 
-_WHERE = tuple(Column(name, ("{}", name)) for name in ("environment", "algorithm"))
+_WHERE = (Column("environment"), Column("algorithm"))
 _SEED = Column("seed", ("{:d}", "seed"))
 
 
@@ -42,14 +43,14 @@ def run_table(experiments: Sequence[Experiment]) -> Table:
         *_WHERE,
         _SEED,
         Column("steps", ("{:,}", "steps")),
-        Column("state", ("{}", "state")),
+        Column("state"),
         Column("time", ("{:}", "time")),
         Column("steps/s", ("{:,.0f}", "steps_per_second")),
         Column("$J_r$", ("{:.2f}", "episode_return")),
         Column("$J_c$", ("{:.1f}", "episode_cost")),
         Column(r"$\rho_c$", ("{:.4f}", "cost_rate")),
-        *([Column("code", ("{}", "code"))] if any(r["code"] for r in records) else []),
-        Column("command", ("{}", "command")),
+        *([Column("code")] if any(r["code"] for r in records) else []),
+        Column("command"),
     ]
     return Table("runs", "Runs", columns, records)
 
@@ -64,7 +65,7 @@ def variant_table(experiments: Sequence[Experiment]) -> Table:
     """In what namesakes differ beyond what their names say."""
     settings = {e.algorithm: e.settings for e in experiments if e.settings}
     records = [{"algorithm": name, "settings": text} for name, text in settings.items()]
-    columns = [Column("algorithm", ("{}", "algorithm")), Column("all of it", ("{}", "settings"))]
+    columns = [Column("algorithm"), Column("all of it", ("{}", "settings"))]
     return Table("variants", "What differs between runs of one algorithm", columns, records)
 
 
@@ -92,7 +93,7 @@ def evaluation_table(experiments: Sequence[Experiment]) -> Table:
     columns = [
         *_WHERE,
         _SEED,
-        Column("checkpoint", ("{}", "checkpoint")),
+        Column("checkpoint"),
         Column("episodes", ("{:d}", "episodes")),
         Column("what", ("{}", "manner")),
         Column("$J_r$", *interval("episode_return", 2)),

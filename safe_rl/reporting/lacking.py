@@ -58,8 +58,8 @@ def lacking_table(experiments: Sequence[Experiment], needed: int) -> Table:
                         "commands": "\n".join(_commands(own, missing)) or "not recorded",
                     }
                 )
-    columns = [Column(name, ("{}", name)) for name in ("slate", "algorithm")]
-    columns += [Column("runs", ("{:d}", "runs")), Column("commands", ("{}", "commands"))]
+    columns = [Column(name) for name in ("slate", "algorithm")]
+    columns += [Column("runs", ("{:d}", "runs")), Column("commands")]
     note = "Slates of which an algorithm has runs on less than a third are not listed."
     return Table("missing", "What slates still lack", columns, records, note)
 

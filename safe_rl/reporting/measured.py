@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import math
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -22,8 +24,7 @@ def read_evaluation(path: Path) -> dict[str, Any] | None:
         ValueError: If it is none.
         OSError: If it cannot be read.
     """
-    try:
-        content = json.loads(path.read_text(encoding="utf-8"))
+    with _content(path, "it is no evaluation") as content:
         if "estimates" not in content:
             return None
         return {
@@ -37,14 +38,10 @@ def read_evaluation(path: Path) -> dict[str, Any] | None:
             "cvar_alpha": float(content["cvar_alpha"]),
             "cost_limits": {str(k): float(d) for k, d in content["cost_limits"].items()},
             "estimates": {
-                name: {
-                    p: math.nan if e[p] is None else float(e[p]) for p in ("value", "low", "high")
-                }
-                for name, e in content["estimates"].items()
+                name: {part: _number(estimate[part]) for part in ("value", "low", "high")}
+                for name, estimate in content["estimates"].items()
             },
         }
-    except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
-        raise ValueError(f"it is no evaluation ({type(error).__name__}: {error})") from error
 
 
 def read_certificate(path: Path) -> dict[str, Any]:
@@ -54,8 +51,7 @@ def read_certificate(path: Path) -> dict[str, Any]:
         ValueError: If it is none.
         OSError: If it cannot be read.
     """
-    try:
-        content = json.loads(path.read_text(encoding="utf-8"))
+    with _content(path, "it is no certificate") as content:
         checkpoint = content["checkpoint"]
         return {
             "checkpoint": None if checkpoint is None else checkpoint_steps(Path(str(checkpoint))),
@@ -67,8 +63,6 @@ def read_certificate(path: Path) -> dict[str, Any]:
             "episodes": int(content["episodes"]),
             "level": float(content["level"]),
         }
-    except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
-        raise ValueError(f"it is no certificate ({type(error).__name__}: {error})") from error
 
 
 def read_code(path: Path) -> str:
@@ -78,13 +72,17 @@ def read_code(path: Path) -> str:
         ValueError: If the file does not say it.
         OSError: If it cannot be read.
     """
-    try:
-        entries = json.loads(path.read_text(encoding="utf-8"))
+    with _content(path, "it says nothing of the code") as entries:
         return "; ".join(map(_code, entries[:9]))
+
+
+@contextmanager
+def _content(path: Path, otherwise: str) -> Iterator[Any]:
+    """What a JSON file holds; whatever goes wrong with it, also in the block, is said in words."""
+    try:
+        yield json.loads(path.read_text(encoding="utf-8"))
     except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
-        raise ValueError(
-            f"it says nothing of the code ({type(error).__name__}: {error})"
-        ) from error
+        raise ValueError(f"{otherwise} ({type(error).__name__}: {error})") from error
 
 
 def _code(entry: dict[str, Any]) -> str:

@@ -7,8 +7,9 @@ from collections.abc import Hashable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
+from safe_rl.reporting.cleaning import clean
 from safe_rl.reporting.origins import Origin, source_of_seeds
-from safe_rl.reporting.recorded import Run, clean
+from safe_rl.reporting.recorded import Run
 from safe_rl.runs.identity import Role, experiment_of, flatten, role_of
 from safe_rl.scores.benchmark import Suite
 from safe_rl.scores.published import ALGORITHMS

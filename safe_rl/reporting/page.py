@@ -10,11 +10,11 @@ from pathlib import Path
 from typing import Any
 
 from safe_rl.extras import import_extra
+from safe_rl.reporting.cleaning import clean
 from safe_rl.reporting.columns import SYMBOL, Table, escaped
 from safe_rl.reporting.contents import Block, Drawing, Film, Report
 from safe_rl.reporting.inventory import duration
 from safe_rl.reporting.pictures import save
-from safe_rl.reporting.recorded import clean
 from safe_rl.runs.files import replacing
 
 __all__ = ["write_report"]

@@ -14,8 +14,8 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter, MaxNLocator
 
 from safe_rl.reporting.averages import average
+from safe_rl.reporting.cleaning import clean
 from safe_rl.reporting.experiments import Experiment, cost_keys_of
-from safe_rl.reporting.recorded import clean
 from safe_rl.runs.curves import point_marker
 from safe_rl.runs.files import replacing
 from safe_rl.scores.published import ALGORITHMS
@@ -108,12 +108,8 @@ def draw_learning_curves(experiments: Sequence[Experiment], styles: Mapping[str,
         axes[0].set_ylabel(
             name if key == "cost" else f"{name}\n{literal(clean(key, 40))}", fontweight="bold"
         )
-        for limit, length in {
-            (e.limits[key], e.runs[0].episode_length) for e in shown if key in e.limits
-        }:
-            axes[1].axhline(limit, **LIMIT_STYLE)
-            if length is not None:
-                axes[2].axhline(limit / length, **LIMIT_STYLE)
+        for axis, height in limits_of(shown, key, axes):
+            axis.axhline(height, **LIMIT_STYLE)
         set_axes(axes)
     for axis, title in zip(panels[0], ("Return", "Episode cost", "Cost rate"), strict=True):
         axis.set_title(title, fontweight="bold")

@@ -23,7 +23,7 @@ from safe_rl.runs.folder import RunFolder, paths_below, runs_below
 from safe_rl.runs.outcome import final_figures, judges_another_measure, violation
 from safe_rl.runs.table import read_table
 
-__all__ = ["Run", "clean", "find_runs"]
+__all__ = ["Run", "find_runs"]
 
 # a number that has left all bounds says as little as NaN, and fits no picture
 _EXPLODED = 1e30

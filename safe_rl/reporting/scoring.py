@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from safe_rl.reporting.cleaning import clean
 from safe_rl.reporting.columns import (
     Column,
     Record,
@@ -20,7 +21,7 @@ from safe_rl.reporting.columns import (
     spread,
 )
 from safe_rl.reporting.experiments import Experiment, cost_keys_of
-from safe_rl.reporting.recorded import Run, clean
+from safe_rl.reporting.recorded import Run
 from safe_rl.runs.curves import moving_mean
 from safe_rl.runs.outcome import FINAL_EPOCHS, final_width
 from safe_rl.scores.dominance import Agent, compare
@@ -40,7 +41,6 @@ from safe_rl.scores.published import (
 
 __all__ = ["dominance_table", "final_record", "final_table", "learning_table", "stem"]
 
-Records = list[dict[str, Any]]
 # of a cost: field of a row -> that of a record
 _FIGURES = {
     **{"mean": "episode_{}", "mean_std": "episode_{}_std", "limit": "limit_{}"},
@@ -50,7 +50,7 @@ _COURSE = {
     **{"regret": "regret_{}", "regret_std": "regret_{}_std"},
     **{"share_over": "share_over_{}", "streak": "streak_{}"},
 }
-IDENTITY = (Column("algorithm", ("{}", "algorithm")), Column("seeds", ("{:d}", "seeds")))
+IDENTITY = (Column("algorithm"), Column("seeds", ("{:d}", "seeds")))
 
 
 def final_record(experiment: Experiment, cost_keys: Sequence[str]) -> dict[str, Any]:
@@ -284,12 +284,7 @@ def dominance_table(records: Iterable[Record]) -> Table:
                 }
             )  # fmt: skip
     names = ("environment", "better", "worse", "why")
-    return Table(
-        "dominance",
-        "Which is better",
-        [Column(name, ("{}", name)) for name in names],
-        relations,
-    )
+    return Table("dominance", "Which is better", [Column(name) for name in names], relations)
 
 
 def _is_measured(record: Record) -> bool:

@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
 from safe_rl.reporting.columns import Record
-from safe_rl.reporting.pictures import WIDTH, Style, add_legend, literal
+from safe_rl.reporting.pictures import WIDTH, Style, add_legend, literal, set_grid
 from safe_rl.reporting.slate_scores import SYMBOLS, Aggregate
 from safe_rl.scores.comparisons import performance_profile
 
@@ -73,8 +73,7 @@ def draw_profiles(aggregates: Sequence[Aggregate], styles: Mapping[str, Style]) 
             axis.plot(thresholds, share, color=style.colour, linestyle=style.line, label=label)
             axis.fill_between(thresholds, low, high, color=style.colour, alpha=0.2, linewidth=0)
         axis.set(xlabel=f"τ of {symbol}", ylim=(0, 1.02))
-        axis.grid(alpha=0.25)
-        axis.spines[["top", "right"]].set_visible(False)
+        set_grid(axis)
     panels[0].set_ylabel("share of runs above τ")
     add_legend(figure, panels[:1])
     return figure

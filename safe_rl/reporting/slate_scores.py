@@ -9,23 +9,12 @@ from typing import Any
 
 import numpy as np
 
-from safe_rl.reporting.columns import (
-    Column,
-    Table,
-    interval,
-    mark_best,
-    power_of_ten,
-    span,
-)
+from safe_rl.reporting.columns import Column, Table, interval, mark_best, power_of_ten, span
 from safe_rl.reporting.experiments import Experiment
 from safe_rl.scores.comparisons import probability_of_improvement
 from safe_rl.scores.dominance import NOISE_OF_ZERO, Agent, compare
 from safe_rl.scores.intervals import Estimate, interquartile_mean
-from safe_rl.scores.normalised import (
-    normalised_cost_rate,
-    normalised_return,
-    normalised_violation,
-)
+from safe_rl.scores.normalised import normalised_cost_rate, normalised_return, normalised_violation
 from safe_rl.scores.published import PUBLISHED, PUBLISHED_STEPS, Normalised
 from safe_rl.scores.slates import SLATES
 
@@ -146,7 +135,7 @@ def slate_table(slate: str, environments: Sequence[str], aggregates: Sequence[Ag
     marks = {"episode_return": best("episode_return", max), "cost_rate": best("cost_rate", min)}
     marks["violation"] = lambda r: "bad" if r["violation"] > NOISE_OF_ZERO else ""
     columns = [
-        Column("algorithm", ("{}", "algorithm")),
+        Column("algorithm"),
         Column("runs", ("{:d}", "runs")),
         Column("steps", ("{:,}", "fewest_steps"), (" to {:,}", "most_steps")),
         *(Column(s, ("{:.3f}", name), mark=marks[name]) for name, s in SYMBOLS.items()),
@@ -249,7 +238,7 @@ def middle_table(slate: str, aggregates: Sequence[Aggregate], after: str = "") -
             value, low, high = one.middle(name)
             record |= {name: value, f"{name}_low": low, f"{name}_high": high}
         records.append(record)
-    columns = [Column("algorithm", ("{}", "algorithm"))]
+    columns = [Column("algorithm")]
     columns += [Column(f"IQM {s}", *interval(name, 3)) for name, s in SYMBOLS.items()]
     title = f"{title_of(slate)}, interquartile means{after}"
     return Table(f"slate_{slate}_iqm", title, columns, records)
@@ -272,7 +261,7 @@ def improvement_table(slate: str, aggregates: Sequence[Aggregate]) -> Table:
             value, low, high = probability_of_improvement(*(one.strata[name] for one in pair))
             record |= {name: value, f"{name}_low": low, f"{name}_high": high}
         records.append(record)
-    columns = [Column(name, ("{}", name)) for name in ("algorithm", "other")]
+    columns = [Column(name) for name in ("algorithm", "other")]
     titles = zip(SYMBOLS, ("higher", "lower", "lower"), strict=True)
     columns += [Column(f"{how} {SYMBOLS[name]}", *interval(name, 2)) for name, how in titles]
     title = f"{title_of(slate)}, probability of improvement"

@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 
 from matplotlib.figure import Figure
 
+from safe_rl.reporting.cleaning import clean
 from safe_rl.reporting.experiments import Experiment
 from safe_rl.reporting.origins import Origin
 from safe_rl.reporting.pictures import (
@@ -25,7 +26,7 @@ from safe_rl.reporting.pictures import (
     literal,
     set_axes,
 )
-from safe_rl.reporting.recorded import Run, clean
+from safe_rl.reporting.recorded import Run
 
 __all__ = ["Transfer", "draw_transfer", "find_transfers"]
 

@@ -26,6 +26,16 @@ KINDS = ("last", "best", "certified")
 """Folders of checkpoints: the newest few, the best that kept every limit, the certified one."""
 
 
+class _Below:
+    """A file or folder of a run: read of a `RunFolder`, its path; of the class, that within any."""
+
+    def __init__(self, name: str) -> None:
+        self._name = name
+
+    def __get__(self, run: RunFolder | None, kind: type[RunFolder]) -> Path:
+        return Path(self._name) if run is None else run.directory / self._name
+
+
 @dataclass(frozen=True)
 class RunFolder:
     """Where the files of one run are.
@@ -43,86 +53,30 @@ class RunFolder:
 
     directory: Path
 
-    @property
-    def config(self) -> Path:
-        """The resolved configuration."""
-        return self.directory / "config.yaml"
-
-    @property
-    def table(self) -> Path:
-        """A row per epoch."""
-        return self.directory / "progress.csv"
-
-    @property
-    def packed_table(self) -> Path:
-        """The table of a run that is kept without what it takes to go on, compressed."""
-        return self.directory / "progress.csv.gz"
+    config = _Below("config.yaml")  # resolved
+    table = _Below("progress.csv")  # a row per epoch
+    packed_table = _Below("progress.csv.gz")  # the table of a run kept for others, compressed
+    curves = _Below("curves.png")  # the picture of its learning curves
+    failure = _Below("failure.txt")  # what a job of a sweep has failed of
+    lock = _Below(".lock")  # keeps a second process from writing here
+    writer = _Below(".writer.json")  # who holds the lock
+    robot = _Below("robot")  # copies of the robot's files, where it is one of the user's own
+    robot_note = _Below("robot.json")  # which robot that is, and its SHA-256
+    notes = _Below(".hydra")  # Hydra's notes
+    overrides = _Below(".hydra/overrides.yaml")  # what the command line said
+    surroundings = _Below(".hydra/hydra.yaml")  # Hydra's own, and where the run was started
+    composed = _Below(".hydra/config.yaml")  # the configuration before it was resolved
+    code = _Below("code.json")  # by which code it was carried out
+    checkpoints = _Below("checkpoints")  # a folder for each of `KINDS`
+    transitions = _Below("transitions")  # what was collected, if it was recorded
+    certificate = _Below("certificate.json")  # which checkpoint surely keeps the limits
+    certifying = _Below(".certifying")  # there from the end of training until it is certified
 
     @property
     def recorded_table(self) -> Path:
         """The table as it is there: plain, or else compressed."""
         is_packed = self.packed_table.is_file() and not self.table.is_file()
         return self.packed_table if is_packed else self.table
-
-    @property
-    def curves(self) -> Path:
-        """The picture of its learning curves."""
-        return self.directory / "curves.png"
-
-    @property
-    def failure(self) -> Path:
-        """What a job of a sweep has failed of."""
-        return self.directory / "failure.txt"
-
-    @property
-    def lock(self) -> Path:
-        """What keeps a second process from writing here."""
-        return self.directory / ".lock"
-
-    @property
-    def writer(self) -> Path:
-        """Who holds the lock."""
-        return self.directory / ".writer.json"
-
-    @property
-    def robot(self) -> Path:
-        """Folder with copies of the robot's files, where the robot is one of the user's own."""
-        return self.directory / "robot"
-
-    @property
-    def robot_note(self) -> Path:
-        """Which robot that is, and its SHA-256."""
-        return self.directory / "robot.json"
-
-    @property
-    def notes(self) -> Path:
-        """Folder of Hydra's notes."""
-        return self.directory / ".hydra"
-
-    @property
-    def overrides(self) -> Path:
-        """What the command line said."""
-        return self.notes / "overrides.yaml"
-
-    @property
-    def surroundings(self) -> Path:
-        """Hydra's own configuration, with the folder that the run was started in."""
-        return self.notes / "hydra.yaml"
-
-    @property
-    def composed(self) -> Path:
-        """The configuration before it was resolved."""
-        return self.notes / "config.yaml"
-
-    @property
-    def code(self) -> Path:
-        """By which code it was carried out."""
-        return self.directory / "code.json"
-
-    @property
-    def checkpoints(self) -> Path:
-        """Folder of the checkpoints."""
-        return self.directory / "checkpoints"
 
     def checkpoint(self, kind: str, steps: int) -> Path:
         """The checkpoint of a kind after so many environment steps."""
@@ -132,21 +86,6 @@ class RunFolder:
         """The checkpoint after most steps, readable or not, if there is one of that kind."""
         found = checkpoints_in(self.checkpoints / kind)
         return found[-1] if found else None
-
-    @property
-    def transitions(self) -> Path:
-        """Folder of what was collected, if it was recorded."""
-        return self.directory / "transitions"
-
-    @property
-    def certificate(self) -> Path:
-        """Which checkpoint surely keeps the limits."""
-        return self.directory / "certificate.json"
-
-    @property
-    def certifying(self) -> Path:
-        """What is there from the end of training until it is found out what the run comes to."""
-        return self.directory / ".certifying"
 
     def evaluation(self, name: str, suffix: str) -> Path:
         """What an evaluation leaves: ``json`` for estimates, ``csv``, ``mp4``, ``transitions``."""
@@ -223,9 +162,8 @@ class RunFolder:
 
 def runs_below(root: Path) -> list[RunFolder]:
     """Folders of runs below a folder, itself included, in the order of their paths."""
-    found = paths_below(root, RunFolder(root).config.name)
-    notes = RunFolder(root).notes.name
-    return [RunFolder(path.parent) for path in found if path.parent.name != notes]
+    found = paths_below(root, RunFolder.config.name)
+    return [RunFolder(path.parent) for path in found if path.parent.name != RunFolder.notes.name]
 
 
 def paths_below(root: Path, pattern: str) -> list[Path]:

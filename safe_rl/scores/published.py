@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import yaml
 
 __all__ = [
-    *("ALGORITHMS", "COST_LIMIT", "EPISODE_LENGTH", "PUBLISHED", "PUBLISHED_STEPS", "REFERENCE"),
+    *("ALGORITHMS", "COST_LIMIT", "PUBLISHED", "PUBLISHED_STEPS", "REFERENCE"),
     *("REIMPLEMENTATIONS", "REIMPLEMENTATION_STEPS", "SEEDS", "Normalised", "Scores"),
 ]
 
@@ -39,8 +39,6 @@ ALGORITHMS: dict[str, str] = _DATA["algorithms"]
 """Algorithm -> its name in the paper, in the order of the paper's tables."""
 COST_LIMIT: float = _DATA["cost_limit"]
 """d, undiscounted cost per episode."""
-EPISODE_LENGTH: int = _DATA["episode_length"]
-"""T_ep in steps."""
 SEEDS: tuple[int, ...] = tuple(_DATA["seeds"])
 """Seeds of the published runs: three per environment."""
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from safe_rl.envs.physics.cpu import BatchPhysics
+from safe_rl.envs.physics.batch import BatchPhysics
 from safe_rl.envs.physics.runge_kutta import runge_kutta_substep
 
 BODY = """

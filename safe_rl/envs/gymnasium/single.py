@@ -7,23 +7,22 @@ from typing import Any
 
 import gymnasium
 import numpy as np
-from gymnasium.envs.registration import EnvSpec
 
 from safe_rl.envs.gymnasium.worlds import (
     RENDER_MODES,
     Observation,
+    SpecWithLength,
     Worlds,
     arrays_of,
     configure,
     take,
-    with_length,
 )
 from safe_rl.envs.safety_gym.env import SafetyGymEnv
 from safe_rl.envs.safety_gym.records.config import SafetyGymConfig
 from safe_rl.envs.safety_gym.rendering.display import Camera
 
 
-class SafetyGymnasiumEnv(gymnasium.Env[Any, np.ndarray]):
+class SafetyGymnasiumEnv(SpecWithLength, gymnasium.Env[Any, np.ndarray]):
     """One world in Gymnasium's interface.
 
     Args:
@@ -52,8 +51,6 @@ class SafetyGymnasiumEnv(gymnasium.Env[Any, np.ndarray]):
 
     metadata: dict[str, Any] = {"render_modes": list(RENDER_MODES), "render_fps": 50}  # noqa: RUF012
 
-    _spec: EnvSpec | None = None
-
     def __init__(
         self,
         name: str | None = None,
@@ -67,20 +64,12 @@ class SafetyGymnasiumEnv(gymnasium.Env[Any, np.ndarray]):
         positions: bool = False,
     ) -> None:
         self._worlds = Worlds(configure(name, config), 1, 1, sleep, render_mode, positions)
+        self._num_steps = self.safety_gym.max_episode_steps
         self._view: dict[str, Any] = {"camera": camera, "width": width, "height": height}
         self.render_mode = render_mode
         self.metadata = self._worlds.metadata()
         self.observation_space = self._worlds.observation_space
         self.action_space = self._worlds.action_space
-
-    @property
-    def spec(self) -> EnvSpec | None:
-        """What it was made from; `max_episode_steps` is the configuration's `num_steps`."""
-        return with_length(self._spec, self.safety_gym.max_episode_steps)
-
-    @spec.setter
-    def spec(self, spec: EnvSpec | None) -> None:
-        self._spec = spec
 
     @property
     def safety_gym(self) -> SafetyGymEnv:
@@ -94,14 +83,14 @@ class SafetyGymnasiumEnv(gymnasium.Env[Any, np.ndarray]):
         super().reset(seed=seed)
         self._worlds.seed(seed, self.np_random)
         observation = take(self._worlds.reset(), 0)
-        self._show()
+        self._worlds.show()
         return observation, self._positions()
 
     def step(self, action: np.ndarray) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
         """Take one action [nu]."""
         step = self._worlds.step(np.asarray(action)[None])
         infos = {key: values[0].item() for key, values in self._worlds.infos(step).items()}
-        self._show()
+        self._worlds.show()
         return (
             take(arrays_of(step["observation"]), 0),
             step["reward"].item(),
@@ -114,7 +103,7 @@ class SafetyGymnasiumEnv(gymnasium.Env[Any, np.ndarray]):
         """Return a frame, uint8 [height, width, 3], in the mode "rgb_array"."""
         if self.render_mode == "rgb_array":
             return self.safety_gym.render(0, **self._view)
-        self._show()
+        self._worlds.show()
         return None
 
     def close(self) -> None:
@@ -123,7 +112,3 @@ class SafetyGymnasiumEnv(gymnasium.Env[Any, np.ndarray]):
 
     def _positions(self) -> dict[str, Any]:
         return {key: take(values, 0) for key, values in self._worlds.positions().items()}
-
-    def _show(self) -> None:
-        if self.render_mode == "human":
-            self._worlds.show()

@@ -6,7 +6,6 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-from gymnasium.envs.registration import EnvSpec
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
@@ -14,18 +13,18 @@ from safe_rl.envs.gymnasium.worlds import (
     RENDER_MODES,
     Observation,
     Seeds,
+    SpecWithLength,
     Worlds,
     arrays_of,
     configure,
     take,
-    with_length,
 )
 from safe_rl.envs.safety_gym.env import SafetyGymEnv
 from safe_rl.envs.safety_gym.records.config import SafetyGymConfig
 from safe_rl.envs.safety_gym.rendering.display import Camera
 
 
-class SafetyGymnasiumVectorEnv(VectorEnv[Any, np.ndarray, np.ndarray]):
+class SafetyGymnasiumVectorEnv(SpecWithLength, VectorEnv[Any, np.ndarray, np.ndarray]):
     """A batch of worlds in Gymnasium's vector interface, stepped together on a thread pool.
 
     Row k of a seed has the same episodes whatever `num_envs` is; row 0 has those of
@@ -67,8 +66,6 @@ class SafetyGymnasiumVectorEnv(VectorEnv[Any, np.ndarray, np.ndarray]):
         "autoreset_mode": AutoresetMode.NEXT_STEP,
     }
 
-    _spec: EnvSpec | None = None
-
     def __init__(
         self,
         num_envs: int = 1,
@@ -89,6 +86,7 @@ class SafetyGymnasiumVectorEnv(VectorEnv[Any, np.ndarray, np.ndarray]):
         if max_episode_steps is not None:
             config = config.replace(num_steps=max_episode_steps)
         self._worlds = Worlds(config, num_envs, num_threads, sleep, render_mode, positions)
+        self._num_steps = self.safety_gym.max_episode_steps
         self._view: dict[str, Any] = {"camera": camera, "width": width, "height": height}
         self.num_envs, self.render_mode = num_envs, render_mode
         self.autoreset_mode = AutoresetMode(autoreset_mode)
@@ -98,15 +96,6 @@ class SafetyGymnasiumVectorEnv(VectorEnv[Any, np.ndarray, np.ndarray]):
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
         self._ended = np.zeros(num_envs, dtype=bool)
-
-    @property
-    def spec(self) -> EnvSpec | None:
-        """What it was made from; `max_episode_steps` is the configuration's `num_steps`."""
-        return with_length(self._spec, self.safety_gym.max_episode_steps)
-
-    @spec.setter
-    def spec(self, spec: EnvSpec | None) -> None:
-        self._spec = spec
 
     @property
     def safety_gym(self) -> SafetyGymEnv:
@@ -134,7 +123,7 @@ class SafetyGymnasiumVectorEnv(VectorEnv[Any, np.ndarray, np.ndarray]):
         self._worlds.seed(seed, self.np_random)
         observation = self._worlds.reset(mask)
         self._ended = self._ended & ~mask if mask is not None else np.zeros_like(self._ended)
-        self._show()
+        self._worlds.show()
         new = np.ones(self.num_envs, dtype=bool) if mask is None else mask
         return observation, with_masks(self._worlds.positions(), new)
 
@@ -167,14 +156,14 @@ class SafetyGymnasiumVectorEnv(VectorEnv[Any, np.ndarray, np.ndarray]):
             observation = choose(begins, self._worlds.reset(begins), observation)
         # Those of a world that begins are of its new episode.
         reported |= with_masks(self._worlds.positions(), np.ones_like(begins))
-        self._show()
+        self._worlds.show()
         return observation, reward, terminated, truncated, reported
 
     def render(self) -> tuple[np.ndarray, ...] | None:
         """Return a frame of every world, uint8 [height, width, 3], in the mode "rgb_array"."""
         if self.render_mode == "rgb_array":
             return tuple(self.safety_gym.render(**self._view))
-        self._show()
+        self._worlds.show()
         return None
 
     def close_extras(self, **kwargs: Any) -> None:
@@ -195,10 +184,6 @@ class SafetyGymnasiumVectorEnv(VectorEnv[Any, np.ndarray, np.ndarray]):
             )
         if seed is not None:
             raise ValueError("A seed is for all worlds: give either a seed or a 'reset_mask'.")
-
-    def _show(self) -> None:
-        if self.render_mode == "human":
-            self._worlds.show()
 
 
 def with_masks(infos: Mapping[str, Any], mask: np.ndarray) -> dict[str, Any]:

@@ -3,22 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import replace
 from typing import Any
 
 import gymnasium
 import numpy as np
 import torch
-from gymnasium.envs.registration import EnvSpec
 from tensordict import TensorDict
 
+from safe_rl.envs.gymnasium.worlds import SpecWithLength
 from safe_rl.envs.velocity.env import VelocityEnv
 from safe_rl.envs.velocity.suite import resolve_velocity
 
 __all__ = ["VelocityGymnasiumEnv"]
 
 
-class VelocityGymnasiumEnv(gymnasium.Env[np.ndarray, np.ndarray]):
+class VelocityGymnasiumEnv(SpecWithLength, gymnasium.Env[np.ndarray, np.ndarray]):
     """One robot with a speed limit, under ids such as `SafeHopperVelocity-v0`.
 
     Args:
@@ -42,8 +41,6 @@ class VelocityGymnasiumEnv(gymnasium.Env[np.ndarray, np.ndarray]):
 
     metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 50}  # noqa: RUF012
 
-    _spec: EnvSpec | None = None
-
     def __init__(
         self,
         name: str,
@@ -56,6 +53,7 @@ class VelocityGymnasiumEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         if render_mode not in (None, *self.metadata["render_modes"]):
             raise ValueError(f"render_mode must be rgb_array or None, got {render_mode!r}.")
         self.robot = VelocityEnv(resolve_velocity(name).replace(**(config or {})), 1, "cpu", 0, 1)
+        self._num_steps = self.robot.max_episode_steps
         # in real time, as Gymnasium's
         rate = max(1, round(1 / self.robot.seconds_per_step))
         self.metadata = {**self.metadata, "render_fps": rate}
@@ -67,16 +65,6 @@ class VelocityGymnasiumEnv(gymnasium.Env[np.ndarray, np.ndarray]):
             bounds.low[0].numpy(), bounds.high[0].numpy(), dtype=np.float32
         )
         self._is_seeded = False
-
-    @property
-    def spec(self) -> EnvSpec | None:
-        """What it was made from; `max_episode_steps` is the configuration's `num_steps`."""
-        steps = self.robot.max_episode_steps
-        return None if self._spec is None else replace(self._spec, max_episode_steps=steps)
-
-    @spec.setter
-    def spec(self, spec: EnvSpec | None) -> None:
-        self._spec = spec
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None

@@ -67,13 +67,24 @@ def observation_space(env: SafetyGymEnv) -> gymnasium.Space:
     return gymnasium.spaces.Box(low, high, dtype=np.float32)
 
 
-def with_length(spec: EnvSpec | None, num_steps: int) -> EnvSpec | None:
-    """Return a spec that says how long episodes are, for wrappers and tools that ask it.
+class SpecWithLength:
+    """An environment whose spec says how long episodes are, for wrappers and tools that ask it.
 
     The registered one does not: Gymnasium would add a time-out of its own to the environment's,
     and it would stand where a configuration has another `num_steps`.
     """
-    return None if spec is None else replace(spec, max_episode_steps=num_steps)
+
+    _spec: EnvSpec | None = None
+    _num_steps: int
+
+    @property
+    def spec(self) -> EnvSpec | None:
+        """What it was made from; `max_episode_steps` is the configuration's `num_steps`."""
+        return self._spec and replace(self._spec, max_episode_steps=self._num_steps)
+
+    @spec.setter
+    def spec(self, spec: EnvSpec | None) -> None:
+        self._spec = spec
 
 
 def arrays_of(observation: torch.Tensor | TensorDictBase) -> Observation:
@@ -127,6 +138,7 @@ class Worlds:
         self.action_space = action_space(self.env)
         self.seconds_per_step = self.env.seconds_per_step
         self._with_positions = with_positions
+        self._is_shown = render_mode == "human"
         self._is_seeded = False
         self._shown_at = 0.0
 
@@ -178,7 +190,9 @@ class Worlds:
         return {"positions": arrays_of(self.env.get_positions())}
 
     def show(self) -> None:
-        """Bring the viewer up to date, no faster than real time."""
+        """Bring the viewer, if there is to be one, up to date, no faster than real time."""
+        if not self._is_shown:
+            return
         left = self._shown_at + self.seconds_per_step - time.monotonic()
         time.sleep(max(0.0, left))
         self.env.show()

@@ -1,1 +1,1 @@
-"""Physics backends."""
+"""MuJoCo, a batch of worlds at a time."""

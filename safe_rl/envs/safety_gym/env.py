@@ -6,18 +6,16 @@ from collections.abc import Mapping, Sequence
 from functools import partial
 from typing import Any, ClassVar
 
-import numpy as np
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
 from safe_rl.envs import rng
 from safe_rl.envs.errors import require_integer
-from safe_rl.envs.physics.cpu import BatchPhysics
+from safe_rl.envs.physics.batch import BatchPhysics
 from safe_rl.envs.safety_gym.observing.lidar_blocks import lidar_blocks
 from safe_rl.envs.safety_gym.observing.observations import make_observer
 from safe_rl.envs.safety_gym.records.config import SafetyGymConfig
-from safe_rl.envs.safety_gym.rendering.display import Camera
 from safe_rl.envs.safety_gym.rendering.renderer import WorldRenderer
 from safe_rl.envs.safety_gym.rules.costs import active_costs, compute_costs, cost_keys
 from safe_rl.envs.safety_gym.rules.tasks import TASKS, dense_reward, goals_met
@@ -57,6 +55,9 @@ class SafetyGymEnv(SimulatedEnv):
     and seeds, which may be left out where one is set. What sleeps then wakes up; with `sleep` False
     what follows is the same to the last digit.
 
+    Cameras of pictures, which show lidar halos, too, are "fixedfar", "fixednear", "track" (behind
+    the robot), "vision" (the robot's) and "free" (above).
+
     Args:
         env: name in the suite ("PointGoal1", "Safexp-PointGoal1-v0"), mapping of configuration
             keys, or `SafetyGymConfig`.
@@ -79,6 +80,7 @@ class SafetyGymEnv(SimulatedEnv):
     """
 
     flags: ClassVar = ("goal_met", *SimulatedEnv.flags)
+    first_camera: ClassVar = "fixedfar"
     copied: ClassVar = ("_fixed_layout", *SimulatedEnv.copied)
 
     def __init__(
@@ -247,32 +249,6 @@ class SafetyGymEnv(SimulatedEnv):
             self.reset()
         write_state(self._world, state)
         self._measured.copy_(self._task.measure(self._world))
-
-    def render(
-        self,
-        rows: int | Sequence[int] | None = None,
-        *,
-        camera: Camera = "fixedfar",
-        width: int = 480,
-        height: int = 360,
-    ) -> np.ndarray:
-        """Draw worlds as they are, with lidar halos, and a red sphere where a cost is incurred.
-
-        Args:
-            rows: which worlds; None is all of them.
-            camera: "fixednear", "fixedfar", "track" (behind the robot), "vision" (the robot's),
-                "free" (above), or a `mujoco.MjvCamera`.
-            width: of a frame [pixels].
-            height: of a frame [pixels].
-
-        Returns:
-            RGB, uint8: one frame [height, width, 3] for an integer, else [R, height, width, 3].
-
-        Raises:
-            OpenGLError: if OpenGL is missing; the message names the package to install.
-            ValueError: for an unknown camera.
-        """
-        return self._frames(rows, camera, width, height)
 
     def show(self, row: int = 0) -> None:
         """Show one world as it is in MuJoCo's viewer, opened by the first call.

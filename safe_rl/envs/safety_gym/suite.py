@@ -46,6 +46,14 @@ def _extents(half: float) -> Values:
     return {"placements_extents": (-half, -half, half, half)}
 
 
+def _level(half: float, constrained: str, observed: str, **numbers: int) -> Values:
+    """How far placements reach, kinds that cost something, kinds with a lidar, and how many."""
+    flags = [f"constrain_{kind}" for kind in constrained.split()]
+    flags += [f"observe_{kind}" for kind in observed.split()]
+    return {**_extents(half), **numbers, **dict.fromkeys(flags, True)}
+
+
+_BUTTON_COSTS = "hazards buttons gremlins"
 # For each task: what all levels share, then what each level has.
 _TASKS: dict[str, tuple[Values, tuple[Values, Values, Values]]] = {
     "Goal": (
@@ -58,23 +66,8 @@ _TASKS: dict[str, tuple[Values, tuple[Values, Values, Values]]] = {
         },
         (
             _extents(1.0),
-            {
-                **_extents(1.5),
-                "hazards_num": 8,
-                "vases_num": 1,
-                "constrain_hazards": True,
-                "observe_hazards": True,
-                "observe_vases": True,
-            },
-            {
-                **_extents(2.0),
-                "hazards_num": 10,
-                "vases_num": 10,
-                "constrain_hazards": True,
-                "constrain_vases": True,
-                "observe_hazards": True,
-                "observe_vases": True,
-            },
+            _level(1.5, "hazards", "hazards vases", hazards_num=8, vases_num=1),
+            _level(2.0, "hazards vases", "hazards vases", hazards_num=10, vases_num=10),
         ),
     ),
     "Button": (
@@ -91,49 +84,16 @@ _TASKS: dict[str, tuple[Values, tuple[Values, Values, Values]]] = {
         },
         (
             _extents(1.0),
-            {
-                **_extents(1.5),
-                "hazards_num": 4,
-                "gremlins_num": 4,
-                "constrain_hazards": True,
-                "constrain_buttons": True,
-                "constrain_gremlins": True,
-                "observe_hazards": True,
-                "observe_gremlins": True,
-            },
-            {
-                **_extents(1.8),
-                "hazards_num": 8,
-                "gremlins_num": 6,
-                "constrain_hazards": True,
-                "constrain_buttons": True,
-                "constrain_gremlins": True,
-                "observe_hazards": True,
-                "observe_gremlins": True,
-            },
+            _level(1.5, _BUTTON_COSTS, "hazards gremlins", hazards_num=4, gremlins_num=4),
+            _level(1.8, _BUTTON_COSTS, "hazards gremlins", hazards_num=8, gremlins_num=6),
         ),
     ),
     "Push": (
         {"task": "push", "box_size": 0.2, "box_null_dist": 0.0, "hazards_size": 0.3},
         (
             _extents(1.0),
-            {
-                **_extents(1.5),
-                "hazards_num": 2,
-                "pillars_num": 1,
-                "constrain_hazards": True,
-                "observe_hazards": True,
-                "observe_pillars": True,
-            },
-            {
-                **_extents(2.0),
-                "hazards_num": 4,
-                "pillars_num": 4,
-                "constrain_hazards": True,
-                "constrain_pillars": True,
-                "observe_hazards": True,
-                "observe_pillars": True,
-            },
+            _level(1.5, "hazards", "hazards pillars", hazards_num=2, pillars_num=1),
+            _level(2.0, "hazards pillars", "hazards pillars", hazards_num=4, pillars_num=4),
         ),
     ),
 }

@@ -5,24 +5,57 @@ from __future__ import annotations
 import inspect
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
+from operator import methodcaller
 from typing import Any
 
 import gymnasium
 import torchrl.envs
-from tensordict import TensorDict
-from torchrl.envs import EnvBase, GymLikeEnv, SerialEnv
+from tensordict import TensorDict, TensorDictBase
+from torchrl.envs import BatchSizeTransform, EnvBase, GymLikeEnv, SerialEnv, TransformedEnv
 
 from safe_rl.envs.costs import is_cost
 from safe_rl.envs.errors import ConfigError
 from safe_rl.envs.gymnasium.reading import CostReader
 from safe_rl.envs.opengl import load_backend
-from safe_rl.envs.torchrl.reshaping import Alone, Rows
 from safe_rl.envs.torchrl.rows import ROWS
 from safe_rl.targets import locate
 
 MakeEnv = Callable[..., EnvBase]
 # of constructors that cannot do with their arguments, or lack a package
 _FAILURES = (ImportError, TypeError, ValueError, LookupError, gymnasium.error.Error)
+
+
+class Rows(EnvBase):
+    """N copies of an environment without a state of its own, stepped at once.
+
+    Args:
+        env: Its step is a function of the TensorDict, of any batch size (`batch_locked` is False).
+        num_envs: N.
+
+    Examples:
+        >>> from torchrl.envs import PendulumEnv
+        >>> Rows(PendulumEnv(), 3).rollout(2)["th"].shape
+        torch.Size([3, 2])
+    """
+
+    def __init__(self, env: EnvBase, num_envs: int) -> None:
+        super().__init__(device=env.device, batch_size=[num_envs])
+        self.env = env
+        self.observation_spec = env.observation_spec.expand(num_envs)
+        self.state_spec = env.state_spec.expand(num_envs)
+        self.action_spec = env.full_action_spec.expand(num_envs)
+        self.reward_spec = env.full_reward_spec.expand(num_envs)
+        self.done_spec = env.full_done_spec.expand(num_envs)
+
+    def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDictBase:
+        """Start all rows; TorchRL puts those that go on back in their places."""
+        return self.env.reset(TensorDict(batch_size=self.batch_size, device=self.device), **kwargs)
+
+    def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
+        return self.env.step(tensordict)["next"]
+
+    def _set_seed(self, seed: int | None) -> None:
+        self.env.set_seed(seed)
 
 
 def make_batch(config: Mapping[str, Any], num_envs: int) -> EnvBase:
@@ -92,7 +125,7 @@ def _maker(config: Mapping[str, Any]) -> MakeEnv:
     if "." in name:
         made: MakeEnv = partial(locate(name, key="env.id"), **kwargs)
     else:
-        made = partial(getattr(torchrl.envs, name), **{**ROWS[name].kwargs, **kwargs})
+        made = partial(getattr(torchrl.envs, name), **{**ROWS[name], **kwargs})
     return partial(_with_infos, made, config["cost_keys"] or [], config["num_steps"])
 
 
@@ -133,7 +166,8 @@ def _batch(make: MakeEnv, num_envs: int) -> EnvBase:
 
 
 def _alone(make: MakeEnv) -> EnvBase:
-    return Alone(_one(make))
+    """One of batch size [1] without that dimension, for others to put in line."""
+    return TransformedEnv(_one(make), BatchSizeTransform(reshape_fn=methodcaller("squeeze", 0)))
 
 
 def _parameters(make: MakeEnv) -> Mapping[str, Any]:

@@ -13,12 +13,7 @@ from torchrl.envs.transforms import Transform
 from safe_rl.envs.errors import ConfigError
 from safe_rl.envs.rng import spread_seed
 from safe_rl.envs.torchrl.batching import make_batch
-from safe_rl.envs.torchrl.costing import (
-    CostsBesideRewards,
-    StepCosts,
-    cost_function,
-    entry_key,
-)
+from safe_rl.envs.torchrl.costing import CostsBesideRewards, StepCosts, cost_function, entry_key
 from safe_rl.envs.torchrl.nodes import complete_torchrl
 from safe_rl.envs.torchrl.observing import Observe, choose_entries
 

@@ -8,12 +8,7 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from safe_rl.envs.transforms.base import (
-    ConstraintTransform,
-    check_budgets,
-    check_known,
-    costs_of,
-)
+from safe_rl.envs.transforms.base import ConstraintTransform, check_budgets, check_known, costs_of
 
 
 class EarlyTermination(ConstraintTransform):

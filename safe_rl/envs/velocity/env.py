@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from typing import Any
+from collections.abc import Mapping
+from typing import Any, ClassVar
 
-import numpy as np
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.data import Unbounded
 
-from safe_rl.envs.physics.cpu import BatchPhysics
+from safe_rl.envs.physics.batch import BatchPhysics
 from safe_rl.envs.physics.runge_kutta import runge_kutta_substep
 from safe_rl.envs.simulated import SimulatedEnv
 from safe_rl.envs.states import check_state, require_episodes
@@ -20,7 +19,7 @@ from safe_rl.envs.velocity.health import HEALTH
 from safe_rl.envs.velocity.measuring import PLACES, limited_speed
 from safe_rl.envs.velocity.model import FORCES, load_model, needed_outputs, needs_forces
 from safe_rl.envs.velocity.observing import Observer
-from safe_rl.envs.velocity.rendering import Camera, RobotRenderer
+from safe_rl.envs.velocity.rendering import RobotRenderer
 from safe_rl.envs.velocity.rewarding import locomotion_reward
 from safe_rl.envs.velocity.robots import ROBOTS
 from safe_rl.envs.velocity.starting import Starts
@@ -46,6 +45,8 @@ class VelocityEnv(SimulatedEnv):
     which belong to the last substep; and the seeds. Without `place` and `observation` both are
     computed anew, as at the start of an episode.
 
+    Cameras of pictures are "track" (the model's own) and "free" (beside the robot).
+
     Args:
         env: name ("SafeHopperVelocity"), mapping with `robot` and configuration keys, or
             `VelocityConfig`.
@@ -64,6 +65,8 @@ class VelocityEnv(SimulatedEnv):
         >>> rollout["next", "cost_velocity"].shape
         torch.Size([4, 5, 1])
     """
+
+    first_camera: ClassVar = "track"
 
     def __init__(
         self,
@@ -166,28 +169,3 @@ class VelocityEnv(SimulatedEnv):
         self._start(everyone.nonzero()[:, 0])
         self._last_place.copy_(state.get("place", self._last_place))
         self._observation.copy_(state.get("observation", self._observation))
-
-    def render(
-        self,
-        rows: int | Sequence[int] | None = None,
-        *,
-        camera: Camera = "track",
-        width: int = 480,
-        height: int = 360,
-    ) -> np.ndarray:
-        """Draw robots as they are, and a red sphere where a cost is incurred.
-
-        Args:
-            rows: which robots; None is all of them.
-            camera: "track" (the model's own), "free" (beside the robot), or a `mujoco.MjvCamera`.
-            width: of a frame [pixels].
-            height: of a frame [pixels].
-
-        Returns:
-            RGB, uint8: one frame [height, width, 3] for an integer, else [R, height, width, 3].
-
-        Raises:
-            OpenGLError: if OpenGL is missing; the message names the package to install.
-            ValueError: for an unknown camera.
-        """
-        return self._frames(rows, camera, width, height)

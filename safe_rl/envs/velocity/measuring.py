@@ -13,7 +13,7 @@ import mujoco
 import torch
 from torch import Tensor
 
-from safe_rl.envs.physics.base import Physics
+from safe_rl.envs.physics.batch import BatchPhysics
 
 TORSO = 1  # id of its body: every robot's first
 
@@ -22,18 +22,18 @@ class Place(NamedTuple):
     """A place: the outputs it needs, and how to make its reading of physics [N, D] (m)."""
 
     outputs: tuple[str, ...]
-    reading: Callable[[mujoco.MjModel, Physics], Callable[[], Tensor]]
+    reading: Callable[[mujoco.MjModel, BatchPhysics], Callable[[], Tensor]]
 
 
-def _x(model: mujoco.MjModel, physics: Physics) -> Callable[[], Tensor]:
+def _x(model: mujoco.MjModel, physics: BatchPhysics) -> Callable[[], Tensor]:
     return lambda: physics.qpos[:, :1].clone()
 
 
-def _torso(model: mujoco.MjModel, physics: Physics) -> Callable[[], Tensor]:
+def _torso(model: mujoco.MjModel, physics: BatchPhysics) -> Callable[[], Tensor]:
     return lambda: physics.outputs["xpos"][:, TORSO, :2].clone()
 
 
-def _centre_of_mass(model: mujoco.MjModel, physics: Physics) -> Callable[[], Tensor]:
+def _centre_of_mass(model: mujoco.MjModel, physics: BatchPhysics) -> Callable[[], Tensor]:
     shares = torch.from_numpy(model.body_mass / model.body_mass.sum())[:, None]
     return lambda: (physics.outputs["xipos"][..., :2] * shares).sum(1)
 

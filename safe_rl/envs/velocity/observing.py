@@ -9,7 +9,7 @@ import mujoco
 import torch
 from torch import Tensor
 
-from safe_rl.envs.physics.base import Physics
+from safe_rl.envs.physics.batch import BatchPhysics
 from safe_rl.envs.velocity.config import VelocityConfig
 from safe_rl.envs.velocity.model import FORCES, observed_parts
 from safe_rl.envs.velocity.robots import ROBOTS
@@ -20,7 +20,7 @@ class Part(NamedTuple):
 
     name: str
     size: int
-    read: Callable[[Physics], Tensor]
+    read: Callable[[BatchPhysics], Tensor]
 
 
 class Observer:
@@ -43,12 +43,12 @@ class Observer:
             self.columns[part.name] = slice(self.size, self.size + part.size)
             self.size += part.size
 
-    def write(self, physics: Physics, observation: Tensor) -> None:
+    def write(self, physics: BatchPhysics, observation: Tensor) -> None:
         """Write what all robots observe after a step into [N, size]."""
         for part in self._parts:
             observation[:, self.columns[part.name]] = part.read(physics)
 
-    def write_start(self, physics: Physics, observation: Tensor, rows: Tensor) -> None:
+    def write_start(self, physics: BatchPhysics, observation: Tensor, rows: Tensor) -> None:
         """Write what some robots (int64 [R]) observe where no step was taken: no contact forces.
 
         Gymnasium computes contact forces after steps only.

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from safe_rl.envs.errors import nearest
 from safe_rl.envs.opengl import open_renderer
-from safe_rl.envs.physics.base import Physics
+from safe_rl.envs.physics.batch import BatchPhysics
 from safe_rl.envs.velocity.config import VelocityConfig
 from safe_rl.envs.velocity.measuring import TORSO
 from safe_rl.envs.velocity.model import load_model
@@ -30,7 +30,7 @@ class RobotRenderer:
         physics: the robots, drawn as they are at the time.
     """
 
-    def __init__(self, config: VelocityConfig, physics: Physics) -> None:
+    def __init__(self, config: VelocityConfig, physics: BatchPhysics) -> None:
         self._config, self._physics = config, physics
         self._renderers: dict[tuple[int, int], mujoco.Renderer] = {}
         self._model: mujoco.MjModel | None = None

@@ -10,7 +10,7 @@ from typing import NamedTuple
 from torch import Tensor
 
 from safe_rl.envs.errors import ConfigError, nearest
-from safe_rl.envs.physics.base import Physics
+from safe_rl.envs.physics.batch import BatchPhysics
 from safe_rl.envs.safety_gym.records.scene import Scene
 
 NO_BUTTON = -1
@@ -45,7 +45,7 @@ class World:
     """
 
     scene: Scene
-    physics: Physics
+    physics: BatchPhysics
     robot_pos: Tensor
     robot_xy: Tensor
     robot_mat: Tensor

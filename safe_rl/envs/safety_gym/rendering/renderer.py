@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator
 
 import numpy as np
@@ -115,17 +114,6 @@ class WorldRenderer:
         scale = min(1.0, largest_width / width, largest_height / height)
         inset = _resize(seen, max(1, round(scale * width)), max(1, round(scale * height)))
         frame[: inset.shape[0], : inset.shape[1]] = inset
-
-
-def tile(frames: np.ndarray) -> np.ndarray:
-    """Lay frames [R, H, W, 3] out as one picture, near to a square of frames."""
-    number, height, width, _ = frames.shape
-    columns = math.ceil(math.sqrt(number))
-    lines = math.ceil(number / columns)
-    grid = np.zeros((lines * columns, *frames.shape[1:]), dtype=frames.dtype)
-    grid[:number] = frames
-    grid = grid.reshape(lines, columns, height, width, 3).swapaxes(1, 2)
-    return grid.reshape(lines * height, columns * width, 3)
 
 
 def _resize(picture: np.ndarray, width: int, height: int) -> np.ndarray:

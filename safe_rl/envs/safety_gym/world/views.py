@@ -8,13 +8,13 @@ from __future__ import annotations
 
 import torch
 
-from safe_rl.envs.physics.base import Physics
+from safe_rl.envs.physics.batch import BatchPhysics
 from safe_rl.envs.safety_gym.records.scene import Scene
 from safe_rl.envs.safety_gym.records.world import NO_BUTTON, World
 from safe_rl.envs.safety_gym.rules.tasks import TASKS
 
 
-def make_world(scene: Scene, physics: Physics) -> World:
+def make_world(scene: Scene, physics: BatchPhysics) -> World:
     """Bind the views of a scene to the tensors of a physics backend."""
     num_envs, num_objects = physics.qpos.shape[0], len(scene.names)
     robot, model = scene.robot_body, scene.model

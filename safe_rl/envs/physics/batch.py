@@ -1,4 +1,4 @@
-"""The CPU backend: `mujoco.batch.Batch`, a C++ thread pool over rows of state."""
+"""N simulations on `mujoco.batch.Batch`, a C++ thread pool over rows of state."""
 
 from __future__ import annotations
 
@@ -35,16 +35,20 @@ def _share(array: np.ndarray) -> Tensor:
 
 
 class BatchPhysics:
-    """`Physics` on the CPU.
+    """N simulations of one model, advanced together.
+
+    The tensors, float64 on the CPU, keep their addresses: what is written into them in place takes
+    effect at the next call, outputs are refreshed by every call for the simulations it ran. Shapes
+    have the sizes of the model (nq, nv, nu, nbody, nmocap).
+
+    Threads do not survive a fork: simulations with several of them are made in the process that
+    steps them, or that process is spawned.
 
     Args:
         model: the compiled model; sleeping follows its options.
         num_envs: number of simulations, N.
         num_threads: threads that step them, 0 for one per core.
         outputs: names of the fields of `MjData` that are read; every call copies them out.
-
-    Threads do not survive a fork: simulations with several of them are made in the process that
-    steps them, or that process is spawned.
 
     Examples:
         >>> from safe_rl.envs.safety_gym.records.config import SafetyGymConfig
@@ -54,10 +58,23 @@ class BatchPhysics:
         [False, False]
     """
 
-    xpos: Tensor
-    xmat: Tensor
-    sensordata: Tensor
-    subtree_com: Tensor
+    # state
+    time: Tensor  # [N] s
+    qpos: Tensor  # [N, nq]
+    qvel: Tensor  # [N, nv]
+    qacc_warmstart: Tensor  # [N, nv]
+    ctrl: Tensor  # [N, nu]
+    mocap_pos: Tensor  # [N, nmocap, 3] m
+    mocap_quat: Tensor  # [N, nmocap, 4]
+    # of actuators and sensors that remember: `act` [N, na], `history` [N, nhistory]; else empty
+    memory: Mapping[str, Tensor]
+    # outputs that are there unless others were asked for
+    xpos: Tensor  # [N, nbody, 3] m
+    xmat: Tensor  # [N, nbody, 3, 3]
+    sensordata: Tensor  # [N, nsensordata]
+    subtree_com: Tensor  # [N, nbody, 3] m
+    # all outputs that were asked for, by their names in MjData
+    outputs: Mapping[str, Tensor]
 
     def __init__(
         self,
@@ -72,17 +89,15 @@ class BatchPhysics:
         self._process = os.getpid() if has_threads else None
         self._batch = Batch(model, num_envs, num_threads, persistent=sleeps)
         # Every field is bound before the first call: later ones would be zero until the next.
-        state = {name: _share(self._batch.bind(name)) for name in _STATE}
+        for name in _STATE:
+            setattr(self, name, _share(self._batch.bind(name)))
         sizes = dict(zip(_MEMORY, (model.na, model.nhistory), strict=True))
         remembered = [name for name in _MEMORY if sizes[name]]
-        self.memory: Mapping[str, Tensor] = {n: _share(self._batch.bind(n)) for n in remembered}
+        self.memory = {name: _share(self._batch.bind(name)) for name in remembered}
         read = {name: _share(self._batch.bind(name)) for name in outputs}
         if "xmat" in read:
             read["xmat"] = read["xmat"].view(num_envs, model.nbody, 3, 3)
-        self.outputs: Mapping[str, Tensor] = read
-        self.time, self.qpos, self.qvel = state["time"], state["qpos"], state["qvel"]
-        self.qacc_warmstart, self.ctrl = state["qacc_warmstart"], state["ctrl"]
-        self.mocap_pos, self.mocap_quat = state["mocap_pos"], state["mocap_quat"]
+        self.outputs = read
         for name in set(_OUTPUTS).intersection(outputs):
             setattr(self, name, self.outputs[name])
         self._disableflags = self._batch.expand("opt.disableflags")
@@ -95,13 +110,16 @@ class BatchPhysics:
         return float(self._batch.model.opt.timestep)
 
     def reset(self, mask: Tensor) -> None:
-        """See `Physics.reset`."""
+        """Set the simulations in `mask` (bool [N]) to the model's initial state, awake."""
         self._check_process()
         self._batch.reset(mask.numpy(), stage=_NO_STAGE)
         self._warnings[:] = self._batch.warning
 
     def forward(self, mask: Tensor | None = None, sensors: bool = True) -> None:
-        """See `Physics.forward`."""
+        """Bring the outputs up to date with the state, for all simulations or those in `mask`.
+
+        Without `sensors`, the readings and what is computed for them alone stay as they are.
+        """
         self._check_process()
         self._disableflags[:] = self._with_sensors | (0 if sensors else _NO_SENSORS)
         self._batch.forward(None if mask is None else mask.numpy())
@@ -110,7 +128,19 @@ class BatchPhysics:
     def step(
         self, num_substeps: Tensor | int, mocap_path: Tensor | None = None, refresh: bool = True
     ) -> Tensor:
-        """See `Physics.step`."""
+        """Advance by substeps under constant `ctrl`, then bring the outputs up to date.
+
+        Args:
+            num_substeps: one number for all, or int64 [N].
+            mocap_path: mocap positions before each substep [N, S, nmocap, 3], or None where
+                nothing moves.
+            refresh: False leaves the outputs as `mj_step` does: of the state that the last
+                substep evaluated last, which with the Runge-Kutta integrator is its fourth stage.
+
+        Returns:
+            bool [N]: simulations that failed (non-finite or huge state); their state is finite
+            again but meaningless until reset.
+        """
         self._check_process()
         # Nobody reads sensors between substeps; without them the result is the same to the bit.
         self._disableflags[:] = self._with_sensors | _NO_SENSORS
@@ -125,7 +155,7 @@ class BatchPhysics:
         return self.failed()
 
     def failed(self) -> Tensor:
-        """See `Physics.failed`."""
+        """Return the simulations that failed since the last call of this or `step`, bool [N]."""
         # Their warning counters rose: MuJoCo resets a bad state by itself, silently.
         counts = self._batch.warning
         if np.array_equal(counts, self._warnings):
@@ -137,7 +167,17 @@ class BatchPhysics:
         return torch.from_numpy(failed)
 
     def rays(self, origin: Tensor, directions: Tensor, group: int, exclude_body: int) -> Tensor:
-        """See `Physics.rays`."""
+        """Cast rays into the simulations as their state is now.
+
+        Args:
+            origin: where the rays of each simulation start [N, 3] (m).
+            directions: unit vectors [N, R, 3].
+            group: the geom group that is seen, 0 to 5.
+            exclude_body: id of a body whose own geoms are not seen.
+
+        Returns:
+            Distance to the first surface [N, R] (m), -1 where there is none.
+        """
         seen = np.zeros(mujoco.mjNGROUP, dtype=np.uint8)
         seen[group] = 1
         distance, _ = self._batch.ray(
