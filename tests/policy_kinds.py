@@ -7,7 +7,15 @@ from samples import NUM_OBS
 from tensordict import TensorDict
 from tensordict.nn import CompositeDistribution, NormalParamExtractor, TensorDictModule
 from torch import nn
-from torch.distributions import Beta, Categorical, Distribution, Independent, Normal
+from torch.distributions import (
+    AffineTransform,
+    Beta,
+    Categorical,
+    Distribution,
+    Independent,
+    Normal,
+    TransformedDistribution,
+)
 from torchrl.envs.utils import ExplorationType
 from torchrl.modules import IndependentNormal, OneHotCategorical, ProbabilisticActor, TanhNormal
 from torchrl.modules import TruncatedNormal as TorchRLTruncatedNormal
@@ -63,6 +71,14 @@ class Unreparametrised(Anonymous):
 
     def sample(self, sample_shape=()):
         return self.hidden.sample(sample_shape)
+
+
+class LearnedTransform(TransformedDistribution):
+    """The same standard normal for every policy, shifted and stretched as each has learned."""
+
+    def __init__(self, loc, scale):
+        standard = IndependentNormal(torch.zeros_like(loc), torch.ones_like(scale))
+        super().__init__(standard, AffineTransform(loc, scale, event_dim=1))
 
 
 class Positive(nn.Module):
@@ -121,6 +137,7 @@ KINDS = {
         4, NormalParamExtractor(), ["loc", "scale"],
         functools.partial(TanhNormal, low=-2.0, high=3.0),
     ),
+    "learned_transform": (4, NormalParamExtractor(), ["loc", "scale"], LearnedTransform),
     "truncated_normal": (4, NormalParamExtractor(), ["loc", "scale"], TorchRLTruncatedNormal),
     "beta": (4, Positive(), ["alpha", "beta"], IndependentBeta),
     "categorical": (5, nn.Identity(), ["logits"], Categorical),
@@ -133,7 +150,7 @@ KINDS = {
     "anonymous": (4, NormalParamExtractor(), ["loc", "scale"], Anonymous),
     "unreparametrised": (4, NormalParamExtractor(), ["loc", "scale"], Unreparametrised),
 }  # fmt: skip
-SAMPLED_KL = {"truncated_normal", "anonymous", "unreparametrised"}
+SAMPLED_KL = {"learned_transform", "truncated_normal", "anonymous", "unreparametrised"}
 COMPOSITE = {kind for kind in KINDS if "composite" in kind}
 ACTIONS = [("hand", "throttle"), ("hand", "wheel"), "gear"]
 

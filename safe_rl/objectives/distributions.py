@@ -1,9 +1,9 @@
 """What losses and trust regions ask of a policy's distribution, whatever its kind.
 
-Closed forms where there are any: of Normals (also under a transform, such as a tanh-Normal's, which
-changes neither KL divergence nor Fisher information), of everything registered with
-`torch.distributions.kl_divergence`. From samples otherwise. A composite distribution's parts are
-independent: everything is the sum over them, each in its own way.
+Closed forms where there are any: of Normals (also under a tanh-Normal's transform, which is the
+same for every policy, so that it changes neither KL divergence nor Fisher information), of
+everything registered with `torch.distributions.kl_divergence`. From samples otherwise. A composite
+distribution's parts are independent: everything is the sum over them, each in its own way.
 """
 
 from __future__ import annotations
@@ -18,7 +18,14 @@ from tensordict.nn import (
     ProbabilisticTensorDictSequential,
 )
 from torch import Tensor
-from torch.distributions import Categorical, Distribution, Normal, kl_divergence
+from torch.distributions import (
+    Categorical,
+    Distribution,
+    Normal,
+    TransformedDistribution,
+    kl_divergence,
+)
+from torchrl.modules import TanhNormal
 from torchrl.modules.distributions import has_analytic_entropy, has_analytic_kl
 from torchrl.modules.distributions.utils import sample_and_log_prob
 
@@ -51,17 +58,26 @@ def categorical_kl(p: Categorical, q: Categorical) -> Tensor:
 
 
 def root(distribution: Distribution) -> Distribution:
-    """The distribution underneath independent and transformed ones."""
-    while hasattr(distribution, "base_dist"):
+    """The distribution underneath independent ones and transforms that no policy learns."""
+    while hasattr(distribution, "base_dist") and not _may_learn_its_transform(distribution):
         distribution = distribution.base_dist
     return distribution
+
+
+def _may_learn_its_transform(distribution: Distribution) -> bool:
+    is_transformed = isinstance(distribution, TransformedDistribution)
+    return is_transformed and not isinstance(distribution, TanhNormal)
 
 
 def has_closed_kl(distribution: Distribution) -> bool:
     """Whether the divergence between two distributions of this kind needs no samples."""
     if isinstance(distribution, CompositeDistribution):
         return all(map(has_closed_kl, distribution.dists.values()))
-    return isinstance(root(distribution), Normal) or has_analytic_kl(distribution, distribution)
+    under = root(distribution)
+    if isinstance(under, TransformedDistribution):
+        # where both transforms are equal it is closed, and says nothing of what is learned in them
+        return False
+    return isinstance(under, Normal) or has_analytic_kl(distribution, distribution)
 
 
 def _total(numbers: Iterable[Tensor], states: torch.Size) -> Tensor:
@@ -126,7 +142,7 @@ def kl(
         return divergence.flatten(len(p.batch_shape)).sum(-1) if several else divergence
     if isinstance(p, Categorical) and isinstance(q, Categorical):
         return categorical_kl(p, q)
-    if has_analytic_kl(p, q):
+    if has_closed_kl(p) and has_analytic_kl(p, q):
         return kl_divergence(p, q)
     ratio = log_weight.exp()
     return ratio * log_weight - ratio + 1
