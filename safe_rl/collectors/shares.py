@@ -72,8 +72,10 @@ def _make_share(
     env = make_env(num_envs=num_envs)
     if state is not None:
         env.set_state(state)
-        return env
-    env.set_seed(seed % 2**31)
-    if hasattr(env, "continue_from"):
-        env.continue_from(steps_before)
+    else:
+        env.set_seed(seed % 2**31)
+        if hasattr(env, "continue_from"):
+            env.continue_from(steps_before)
+    # again: an environment that is seeded may have seeded all that torch draws
+    torch.manual_seed(seed)
     return env

@@ -78,8 +78,9 @@ class PeriodicEvaluation:
         fresh = (self._seed + after) % 2**62
         seed = self._seed if self._fixed_layout else fresh
         with (
-            closing(self._make_env(num_envs=worlds, seed=seed)) as env,
+            # first: environments that are made, and seeded, may draw from torch's generator
             torch.random.fork_rng(devices=self._devices()),
+            closing(self._make_env(num_envs=worlds, seed=seed)) as env,
         ):
             torch.manual_seed(fresh)
             found = collect_episodes(

@@ -71,7 +71,7 @@ def collect_episodes(
         >>> collect_episodes(env, policy, 3, env.cost_keys, deterministic=True).lengths
         tensor([5., 5., 5.], dtype=torch.float64)
     """
-    num_envs = env.batch_size.numel()
+    num_envs, return_key = env.batch_size.numel(), getattr(env, "return_key", "reward")
     quota = num_episodes // num_envs + (torch.arange(num_envs) < num_episodes % num_envs).long()
     finished = torch.zeros(num_envs, dtype=torch.long)
     # float64: sums of indicator costs are exact
@@ -87,7 +87,7 @@ def collect_episodes(
             if record is not None:
                 record(step)
             after = step["next"]
-            signals = [torch.ones_like(after["reward"]), after["reward"]]
+            signals = [torch.ones_like(after[return_key]), after[return_key]]
             signals += [after[key] for key in cost_keys]
             sums += torch.cat(signals, -1).to(sums)
             done = after["done"].squeeze(-1).cpu()

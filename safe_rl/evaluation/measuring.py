@@ -111,9 +111,9 @@ def evaluate(
     write_summary(places["json"], facts, estimates)
     write_episodes(places["csv"], episodes)
     for film in films:
-        torch.manual_seed(seed)
         # the first world draws the same layouts whatever the number of worlds; actions are others
         with closing(make(1, **drawing)) as single:
+            torch.manual_seed(seed)
             manner = manner_of(single, film.suffix[1:])
             frames = record_episode(
                 single, policy, cost_keys, deterministic=options.deterministic, manner=manner,

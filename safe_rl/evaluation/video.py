@@ -136,7 +136,7 @@ def record_episode(
         camera: A name that ``env.render`` knows.
     """
     state = env.reset()
-    total = dict.fromkeys(("reward", *cost_keys[:1]), 0.0)
+    total = dict.fromkeys((getattr(env, "return_key", "reward"), *cost_keys[:1]), 0.0)
     step = 0
     with exploration(deterministic):
         while True:

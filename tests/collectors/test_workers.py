@@ -64,6 +64,18 @@ def test_workers_have_seeds_and_a_schedule_also_where_worlds_cannot_be_stored():
         assert start[:, -1].tolist() == pytest.approx([0.625] * 2)
 
 
+class Seeding(PointMass):
+    def _set_seed(self, seed):
+        super()._set_seed(seed)
+        torch.manual_seed(seed)  # as TorchRL's tutorials have it
+
+
+def test_workers_have_noise_of_their_own_whatever_seeding_does():
+    shares = share_rows(Seeding(4), Seeding, num_collectors=2)
+    drawn = [(make(), torch.rand(3).tolist())[1] for make in shares]
+    assert drawn[0] != drawn[1]
+
+
 @pytest.mark.parametrize(("num_collectors", "frames"), [(4, 60), (2, 63), (0, 60)])
 def test_numbers_that_cannot_be_shared(num_collectors, frames):
     with pytest.raises(ValueError, match="num_envs must be a multiple"):

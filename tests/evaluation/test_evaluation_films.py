@@ -4,9 +4,11 @@ import csv
 
 import numpy as np
 import pytest
+import torch
 from evaluated_runs import NUM_STEPS, options, skip_without_opengl
 from PIL import Image
 
+from safe_rl.cli import evaluate as command
 from safe_rl.cli.evaluate import evaluate_run as evaluate
 from safe_rl.collectors import read_recording
 from safe_rl.envs import from_gymnasium, make_env
@@ -123,7 +125,12 @@ def test_of_one_world_it_is_the_first_episode_to_its_end(run, deterministic, tmp
         shown.append(counts)
         return draw(env, camera, manner, *counts)
 
+    def drawing(*given, **keys):  # as environments of one's own may, from torch's generator
+        torch.rand(3)
+        return make_env(*given, **keys)
+
     monkeypatch.setattr(video, "_frame", note)
+    monkeypatch.setattr(command, "maker_of", lambda directory: drawing)
     picture = str(tmp_path / "episode.webp")
     changes = {"num_envs": 1, "deterministic": deterministic}
     result = evaluate(run, options(episodes=2, picture=picture, **changes))

@@ -9,6 +9,8 @@ from tensordict import TensorDict
 from torchrl.data import Bounded, Categorical, Composite, Unbounded
 from torchrl.envs import EnvBase
 
+from safe_rl.envs.transforms import RewardScale, transform_env
+from safe_rl.evaluation import video
 from safe_rl.evaluation.during import PeriodicEvaluation
 from safe_rl.evaluation.episodes import collect_episodes
 from safe_rl.evaluation.layouts import default_seed, shared_layouts
@@ -76,6 +78,41 @@ def test_every_world_contributes_its_first_episodes(number, expected):
     assert episodes.lengths.tolist() == expected
     assert episodes.returns.tolist() == expected
     assert episodes.costs["cost"].tolist() == [0.5 * length for length in expected]
+
+
+class Shaped(KnownLengths):
+    """Learning sees another reward than the one that returns are made of."""
+
+    cost_keys = ["cost"]  # noqa: RUF012
+    max_episode_steps = 2
+    observation_layout = {"observation": slice(0, 1)}  # noqa: RUF012
+    return_key = "score"
+
+    def __init__(self, lengths):
+        super().__init__(lengths)
+        self.full_reward_spec["score"] = self.full_reward_spec["reward"].clone()
+
+    def _step(self, tensordict):
+        step = super()._step(tensordict)
+        return step.update({"score": step["reward"], "reward": 10 * step["reward"]})
+
+    def render(self):
+        return np.zeros((40, 300, 3), np.uint8)
+
+
+@pytest.mark.parametrize("transforms", [{}, {"scale": RewardScale(0.5)}])
+def test_returns_are_of_the_entry_that_the_environment_names(transforms, monkeypatch):
+    def make():
+        return transform_env(Shaped([[2, 2]]), transforms, evaluating=True)
+
+    policy = BehaviourPolicy(make_actor(1, 1, hidden_sizes=[4], initial_log_std=0.0))
+    episodes = collect_episodes(make(), policy, 2, ["cost"], deterministic=True)
+    assert make().return_key == "score"
+    assert episodes.returns.tolist() == [2.0, 2.0]
+    shown = []
+    monkeypatch.setattr(video, "_frame", lambda *given: shown.append(given[3:]))
+    list(record_episode(make(), policy, ["cost"], **FILM))
+    assert shown == [(0, 0.0, 0.0), (2, 2.0, 1.0)]
 
 
 class Drawn(KnownLengths):
@@ -192,6 +229,22 @@ def test_evaluations_in_between_keep_to_a_fixed_layout(fixed, seeds):
     evaluate = make_evaluation(make, fixed_layout=fixed)
     assert [evaluate(after - 100, after)["evaluation_cost"] for after in (100, 200)] == [1.0, 1.0]
     assert met == seeds
+
+
+def test_evaluations_in_between_leave_the_draws_of_training_alone_whatever_seeding_does():
+    class Seeding(KnownLengths):  # as TorchRL's tutorials have it: torch's generator is seeded
+        def _set_seed(self, seed):
+            torch.manual_seed(seed)
+
+    def make(*, num_envs, seed):
+        env = Seeding([[2, 2]] * num_envs)
+        env.set_seed(seed)
+        return env
+
+    evaluate = make_evaluation(make, fixed_layout=False)
+    before = torch.get_rng_state()
+    assert evaluate(0, 100)["evaluation_cost"] == 1.0
+    assert torch.equal(torch.get_rng_state(), before)
 
 
 @pytest.mark.gpu

@@ -51,7 +51,8 @@ class TransformedConstrainedEnv(TransformedEnv):
             except ValueError as error:
                 raise ValueError(f"transforms.{name}: {error}") from error
             self.cost_keys += transform.added_costs
-            self.return_key = transform.return_key or self.return_key
+            if self.return_key == "reward":  # what is kept first is the environment's own
+                self.return_key = transform.return_key or "reward"
         self.observation_layout = layout
         self._seed_transforms(seed)
 
