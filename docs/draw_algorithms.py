@@ -1,16 +1,31 @@
-"""Learning curves for the pages of the algorithms, from results/algorithms/.
+"""Learning curves for README and for the pages of the algorithms, from results/.
 
-``python docs/draw_algorithms.py`` draws docs/algorithms/<name>.png: every environment a row, with
-mean and 95 % interval over seeds; seeds of other settings have curves of their own.
+``python docs/draw_algorithms.py`` draws means and 95 % intervals over seeds:
+docs/algorithms/<name>.png, every environment a row, where seeds of other settings have curves of
+their own, and docs/holding_the_limit.png, every environment a column.
 """
 
 from __future__ import annotations
 
+from itertools import chain
 from pathlib import Path
 
+from matplotlib.figure import Figure
+from matplotlib.ticker import MultipleLocator
+from PIL import Image
+
 from safe_rl.cli.benchmark import suite
-from safe_rl.reporting.experiments import group_runs
-from safe_rl.reporting.pictures import algorithm_styles, draw_learning_curves, save
+from safe_rl.reporting.experiments import Experiment, group_runs
+from safe_rl.reporting.pictures import (
+    LIMIT_STYLE,
+    add_legend,
+    algorithm_styles,
+    draw_experiment,
+    draw_learning_curves,
+    limits_of,
+    save,
+    set_axes,
+)
 from safe_rl.reporting.recorded import find_runs
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -18,14 +33,49 @@ ROOT = Path(__file__).resolve().parents[1]
 
 def main() -> None:
     """Draw all of them."""
-    results = ROOT / "results" / "algorithms"
-    runs, _ = find_runs(results)
-    experiments, _ = group_runs(runs, suite(), {}, results)
+    experiments = archived("algorithms")
     styles = algorithm_styles(experiments)
-    for algorithm in dict.fromkeys(run.algorithm for run in runs):
+    for algorithm in dict.fromkeys(e.runs[0].algorithm for e in experiments):
         shown = [e for e in experiments if e.runs[0].algorithm == algorithm]
         figure = draw_learning_curves(shown, styles)
         save(figure, ROOT / "docs" / "algorithms" / f"{algorithm}.png")
+    held = archived("holding_the_limit", "off_policy", steps=3_000_000)
+    picture = save(draw_columns(held), ROOT / "docs" / "holding_the_limit.png")
+    # a third of the bytes: so many bands over one another have no more colours than fit a palette
+    Image.open(picture).convert("RGB").quantize(256).save(picture, optimize=True)
+
+
+def archived(*campaigns: str, steps: int = 0) -> list[Experiment]:
+    """What campaigns in results/ have of runs of so many steps and more."""
+    results = ROOT / "results"
+    runs = chain.from_iterable(find_runs(results / campaign)[0] for campaign in campaigns)
+    return group_runs([run for run in runs if run.steps >= steps], suite(), {}, results)[0]
+
+
+def draw_columns(experiments: list[Experiment]) -> Figure:
+    """Return, episode cost and cost rate below one another, an environment beside the other.
+
+    Where costs begin, at ten times the limit, is cut off: it is by the limit that they are judged.
+    """
+    names = list(dict.fromkeys(e.environment for e in experiments))
+    figure = Figure(figsize=(12.0, 6.2), layout="constrained")
+    panels = figure.subplots(3, len(names), sharex=True)
+    styles = algorithm_styles(experiments)
+    for axes, name in zip(panels.T, names, strict=True):
+        shown = [e for e in experiments if e.environment == name]
+        for experiment in shown:
+            draw_experiment(experiment, "cost", axes, styles[experiment.algorithm])
+        set_axes(axes)
+        for axis, height in limits_of(shown, "cost", axes):
+            axis.axhline(height, **LIMIT_STYLE)
+            axis.set_ylim(0, 4 * height)
+        axes[0].set_title(name, fontweight="bold")
+        axes[2].set_xlabel("environment steps")
+        axes[2].xaxis.set_major_locator(MultipleLocator(1_000_000))
+    for axis, title in zip(panels[:, 0], ("Return", "Episode cost", "Cost rate"), strict=True):
+        axis.set_ylabel(title, fontweight="bold")
+    add_legend(figure, panels[0])
+    return figure
 
 
 if __name__ == "__main__":
