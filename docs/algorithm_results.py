@@ -116,8 +116,8 @@ none was tested.
 
 Return / episode cost after so many seconds of collecting and learning (`time_total`), means over
 the last tenth of the steps until then; in brackets millions of steps; —: one of the runs had ended,
-or had not finished an episode. Limits come down by steps, not by time: after few steps costs are still
-free.
+or had not finished an episode. Limits come down by steps, not by time: after few steps costs are
+still free.
 
 Every run had one thread, but not the machine to itself: seeds of one algorithm took
 up to {factor:.1f} times as long as each other, so differences of that size mean nothing. An epoch
