@@ -97,31 +97,32 @@ def comparison(algorithms: Iterable[str]) -> str:
     factor = _spread_of_times(names)
     return f"""# The algorithms compared
 
-Limit 25, one million steps, with the defaults of the commit of each run. Seeds that were run with
-different settings have a row for each, which names what differs. A single seed is a direction, not
-a verdict. The constrained on-policy runs on CarGoal1 are of before the
-[estimate of the cost](holding_the_limit.md) was mended and of before the
-[present defaults](holding_the_limit.md#settings-tried).
+All algorithms with a limit of 25, after one million steps and after equal time, with the defaults
+of the commit of each run. Three seeds show a direction, not a verdict. The constrained on-policy
+runs on CarGoal1 are older: from before the [estimate of the cost](holding_the_limit.md) was
+mended, and with [earlier defaults](holding_the_limit.md#settings-tried). Seeds with different
+settings have a row for each, which names what differs. [Which algorithm to choose](index.md).
 
 ## At equal steps
 
 Means over the last quarter million steps of training, ± the standard deviation among seeds where
 there are several. $\\rho_c$ is the cost per step of the whole run. *Certified*: how many of the
-runs that were tested have a checkpoint that [surely keeps the limit](../guides/certificate.md);
-—: none was tested.
+tested runs have a checkpoint that is [certified](../guides/certificate.md) to keep the limit; —:
+none was tested.
 
 {tables}
 
 ## At equal wall-clock
 
-Return / episode cost after as many seconds of collecting and learning (`time_total`), means over
-the last tenth of the steps until then, and in brackets how many steps these were [million]; —: one
-of the runs had come to its end, or had not finished an episode. Every run had one thread but not
-the machine to itself: seeds of one algorithm took up to {factor:.1f} times as long as each other,
-and that much says nothing between algorithms, either. Times by which more than half of the rows
-would be empty are left out. An epoch that took {PAUSE} times the median of its run's, as if the
-machine had stood still, counts as the median. Limits come down by steps,
-not by time: after few steps costs are still free.
+Return / episode cost after so many seconds of collecting and learning (`time_total`), means over
+the last tenth of the steps until then; in brackets millions of steps; —: one of the runs had ended,
+or had not finished an episode. Limits come down by steps, not by time: after few steps costs are
+still free.
+
+Every run had one thread, but not the machine to itself: seeds of one algorithm took
+up to {factor:.1f} times as long as each other, so differences of that size mean nothing. An epoch
+that took {PAUSE} times the median of its run, as if the machine had stood still, counts as the
+median. Times at which more than half of the rows would be empty are left out.
 
 {timed}
 

@@ -82,19 +82,18 @@ Besides the columns that [all algorithms](index.md#what-is-logged) have:
 """
 
 LOSS = {
-    "notation": "The notation is that of [the overview](index.md), as are batches, advantages and "
-    "critics.",
+    "notation": "Notation, batches, advantages and critics: [overview](index.md#one-epoch).",
     "shared": "Shared by all algorithms: [presets](index.md#presets)",
-    "parts": "The loss applies to any TorchRL policy and to any batch that has advantages, which "
-    "`VectorGAE` and\n`CostGAE` write, or whatever you have.",
+    "parts": "The loss takes any TorchRL policy and any batch with advantages, such as those of "
+    "`VectorGAE` and\n`CostGAE`.",
 }
-STEP = LOSS | {"parts": LOSS["parts"].replace("loss applies", "loss and the step apply")}
+STEP = LOSS | {"parts": LOSS["parts"].replace("loss takes", "loss and the step take")}
 REPLAY = {
-    "notation": "The notation is that of [off-policy algorithms](../off_policy.md), as are targets,"
-    " time-outs and multipliers.",
+    "notation": "Notation, targets, time-outs and multipliers: "
+    "[off-policy algorithms](../off_policy.md#what-is-learned).",
     "shared": "Shared by all off-policy algorithms: [keys](../off_policy.md#keys)",
-    "parts": "The loss applies to any steps, a replay buffer's or a dataset's; networks may be "
-    "yours.",
+    "parts": "The loss takes any transitions, from a replay buffer or a dataset, and networks of "
+    "your own.",
 }
 
 

@@ -66,16 +66,16 @@ KEYS = {
     # evaluations add to a seed, and environments count in 64 bits
     "seed": Key(count(0, 2**62), "seed of the run"),
     "init_from": Key(optional(text), "folder or checkpoint of the run to start from"),
-    "cost_limits": Key(_LIMITS, "cost per episode allowed by cost, '{cost: 25}'"),
+    "cost_limits": Key(_LIMITS, "cost allowed per episode, by cost: '{cost: 25}'"),
     "default_cost_limits": Key(optional(_LIMITS), "cost_limits unless given", may_lack=True),
     "device": Key(text, "where networks are trained: cpu or cuda"),
     # torch starts all of them at once, and crashes where the system gives it no more
     "num_threads": Key(optional(count(1, 1024)), "threads of physics and torch; null: all cores"),
     "record": Key(boolean, "whether transitions are written to disk", may_lack=True),
     "compile": Key(boolean, "whether to compile the losses"),
-    "preset": Key(text, "set of numbers"),
-    "note": Key(anything, "free words about the run, for its config.yaml", may_lack=True),
-    "import": Key(anything, "modules of one's own", may_lack=True),
+    "preset": Key(text, "set of defaults: default or paper"),
+    "note": Key(anything, "a note on the run, kept in its config.yaml", may_lack=True),
+    "import": Key(anything, "modules of your own, imported first", may_lack=True),
     "paper": Key(anything, "numbers that preset=paper chooses from", may_lack=True),
     "env": Key(_SECTION, "the environment: env=PointGoal1"),
     "algo": Key(_SECTION, "the algorithm: algo=cpo"),
@@ -85,59 +85,69 @@ KEYS = {
     "transforms": Key(
         mapping_of(component), "what changes the problem: transforms=[saute]", may_lack=True
     ),
-    "logger": Key(_SECTION, "what is logged besides the table: logger=none for nothing"),
+    "logger": Key(_SECTION, "where columns go besides progress.csv: logger=wandb; none: nowhere"),
     "env.name": Key(_FOLDER_OF_ENV, "name of the environment"),
     "algo.name": Key(folder_name, "name of the algorithm"),
     "checkpoint.interval": Key(number(0), "seconds between checkpoints"),
     "checkpoint.keep_last": Key(count(1, 10_000), "checkpoints that are kept besides the best"),
     "checkpoint.keep_best": Key(count(1, 10_000), "best checkpoints kept", may_lack=True),
-    "checkpoint.best_over": Key(count(1, 10_000), "epochs that judge the best", may_lack=True),
+    "checkpoint.best_over": Key(
+        count(1, 10_000), "epochs that the best are averaged over", may_lack=True
+    ),
     "certificate": Key(
         _SECTION,
-        "what is certified at a run's end; certificate.episodes=0 for nothing",
+        "the test at a run's end; certificate.episodes=0 for none",
         may_lack=True,
     ),
-    "certificate.ranking": Key(count(2, 10**6), "episodes that order candidates", may_lack=True),
-    "certificate.episodes": Key(count(0, 10**6), "episodes of a test; 0: none", may_lack=True),
+    "certificate.ranking": Key(
+        count(2, 10**6), "episodes per candidate that rank them", may_lack=True
+    ),
+    "certificate.episodes": Key(count(0, 10**6), "new episodes of a test; 0: none", may_lack=True),
     "certificate.tests": Key(count(1, 1000), "candidates tested at most", may_lack=True),
     "certificate.level": Key(
         number(0.5, 1, above=True, below=True), "confidence of a certificate", may_lack=True
     ),
-    "certificate.most_over": Key(SHARE, "share of episodes over a limit", may_lack=True),
+    "certificate.most_over": Key(SHARE, "share of episodes that may exceed a limit", may_lack=True),
     "collector.num_collectors": Key(count(1, 1024), "processes that step environments"),
     "model.hidden_sizes": Key(_WIDTHS, "widths of layers, such as [64, 64]"),
     "model.initial_log_std": Key(number(-20, 10), "log of the policy's first standard deviation"),
     "model.input_scale": Key(mapping_of(POSITIVE), "factors by observation component"),
     "model.head": Key(_HEADS, "distribution of the actions", may_lack=True),
     "model.normalise": Key(
-        optional(POSITIVE), "where normalised observations are cut; null: not", may_lack=True
+        optional(POSITIVE), "bound of normalised observations; null: not normalised", may_lack=True
     ),
-    "model.encoders": Key(optional(_SECTION), "what encodes every entry observed", may_lack=True),
-    "model.encoders.vector": Key(_WIDTHS, "layers for a vector"),
-    "model.encoders.channels": Key(_WIDTHS, "layers for a picture"),
-    "model.encoders.kernels": Key(_WIDTHS, "their sizes [pixels]"),
+    "model.encoders": Key(
+        optional(_SECTION), "encoders of observed entries: model=dict, model=cnn", may_lack=True
+    ),
+    "model.encoders.vector": Key(_WIDTHS, "widths of layers for a vector"),
+    "model.encoders.channels": Key(_WIDTHS, "channels of convolutions for an image"),
+    "model.encoders.kernels": Key(_WIDTHS, "sizes of their kernels [pixels]"),
     "model.encoders.strides": Key(_WIDTHS, "their strides [pixels]"),
-    "model.memory": Key(optional(_SECTION), "what the policy remembers", may_lack=True),
-    "model.memory.size": Key(_WIDTH, "numbers that are remembered"),
+    "model.memory": Key(optional(_SECTION), "recurrence: model=gru", may_lack=True),
+    "model.memory.size": Key(_WIDTH, "size of the recurrent state"),
     "advantage": Key(component, "estimator of the reward's advantages", may_lack=True),
     "cost_advantage": Key(optional(component), "estimator of the costs' advantages", may_lack=True),
     "lagrangian": Key(optional(component), "the multiplier", may_lack=True),
     "risk": Key(optional(_SECTION), "what is limited: risk=mean, cvar or chance", may_lack=True),
-    "limits": Key(optional(_SECTION), "from the costs of a batch to violations", may_lack=True),
-    "staggered_starts": Key(
-        optional(boolean), "whether first episodes begin at different points", may_lack=True
+    "limits": Key(
+        optional(_SECTION), "how the limit is approached: limits=default or paper", may_lack=True
     ),
-    "replay": Key(anything, "numbers that preset=default takes instead of its own", may_lack=True),
-    "memory": Key(component, "what is learned from, off policy", may_lack=True),
+    "staggered_starts": Key(
+        optional(boolean), "whether first episodes are cut to different lengths", may_lack=True
+    ),
+    "replay": Key(anything, "off-policy defaults, which preset=default reads", may_lack=True),
+    "memory": Key(component, "the replay buffer, off policy", may_lack=True),
     "actor": Key(component, "the policy's network, off policy", may_lack=True),
     "critics": Key(_SECTION, "sizes of the ensembles of Q functions", may_lack=True),
     "critics.rewards": Key(count(0, 1000), "Q functions of the reward"),
     "critics.costs": Key(count(0, 1000), "Q functions of the costs"),
-    "dataset": Key(_SECTION, "transitions that a memory begins with", may_lack=True),
+    "dataset": Key(
+        _SECTION, "recorded transitions that the replay buffer begins with", may_lack=True
+    ),
     "dataset.path": Key(optional(text), "folder of a recording, or an HDF5 file"),
     "dataset.safe_episodes": Key(boolean, "whether only episodes within cost_limits are taken"),
-    "dataset.alone": Key(boolean, "whether what is collected is not learned from"),
-    "exploration": Key(_SECTION, "how a memory is filled", may_lack=True),
+    "dataset.alone": Key(boolean, "whether to learn from the dataset only"),
+    "exploration": Key(_SECTION, "exploration, off policy", may_lack=True),
     "exploration.random_steps": Key(count(0), "steps taken at random first"),
     "exploration.noise": Key(
         NOT_NEGATIVE, "standard deviation of a deterministic actor's noise", may_lack=True

@@ -24,33 +24,33 @@ _LOSS = {
 }
 _CLIPPED_LOSS = {
     **_LOSS,
-    "clip_epsilon": Key(number(0, 1000, above=True), "half-width of the ratios that earn"),
+    "clip_epsilon": Key(number(0, 1000, above=True), "ε, half-width of the clipping range"),
 }
 _Q_FUNCTIONS = {
     "gamma": Key(SHARE, "discount per step"),
-    "loss_function": Key(choice("l2", "smooth_l1", "l1"), "of the TD errors"),
+    "loss_function": Key(choice("l2", "smooth_l1", "l1"), "loss of the TD errors"),
 }
 _SAC = {
     **_Q_FUNCTIONS,
-    "alpha_init": Key(_STRENGTH, "first weight of the entropy"),
+    "alpha_init": Key(_STRENGTH, "first entropy coefficient"),
     "target_entropy": Key(
         Values(lambda v: v == "auto" or number().hold(v), f"auto, or {number().words}"),
-        "entropy to which its weight is adapted; auto: minus the number of actions",
+        "entropy that its coefficient adapts to; auto: minus the number of actions",
     ),
-    "fixed_alpha": Key(boolean, "whether the weight of the entropy stays as it is"),
+    "fixed_alpha": Key(boolean, "whether the entropy coefficient is fixed"),
 }
 _TD3 = {
     **_Q_FUNCTIONS,
-    "policy_noise": Key(NOT_NEGATIVE, "deviation of the noise on the target policy's actions"),
+    "policy_noise": Key(NOT_NEGATIVE, "standard deviation of the target actions' noise"),
     "noise_clip": Key(NOT_NEGATIVE, "bound of that noise"),
 }
 _COST_CRITICS = {
-    "pessimism": Key(number(), "standard deviations among cost critics on top of their mean"),
+    "pessimism": Key(number(), "standard deviations of the cost critics added to their mean"),
     "target_pessimism": Key(
-        optional(number()), "the same for what they bootstrap on; null: each on its own target"
+        optional(number()), "the same in bootstrap targets; null: each its own target"
     ),
     "lowest_cost_value": Key(
-        optional(number()), "lower bound of what they bootstrap on, if no cost is below it"
+        optional(number()), "lower bound of bootstrap targets, if no cost is below it"
     ),
 }
 
@@ -58,7 +58,9 @@ LOSSES = {
     "PPOLoss": _CLIPPED_LOSS,
     "PPOLagrangianLoss": {
         **_CLIPPED_LOSS,
-        "cost_clipping": Key(choice("none", "pessimistic", "joint"), "how cost surrogates are cut"),
+        "cost_clipping": Key(
+            choice("none", "pessimistic", "joint"), "how cost surrogates are clipped"
+        ),
     },
     "SACLoss": _SAC,
     "SACLagrangianLoss": {**_SAC, **_COST_CRITICS},
@@ -73,7 +75,7 @@ LOSSES = {
     "WCSACLoss": {
         **_SAC,
         **_COST_CRITICS,
-        "tail": Key(number(0, 1, above=True), "share of the worst cost-returns"),
+        "tail": Key(number(0, 1, above=True), "share of the worst cost returns"),
     },
     "TD3Loss": _TD3,
     "TD3LagrangianLoss": {**_TD3, **_COST_CRITICS},
@@ -84,7 +86,7 @@ LOSSES = {
     "P3OLoss": {
         **_CLIPPED_LOSS,
         "kappa": Key(NOT_NEGATIVE, "penalty factor κ"),
-        "gamma": Key(optional(SHARE), "discount that weighs the violation; null: 1/T̄ does"),
+        "gamma": Key(optional(SHARE), "discount: violations weigh 1 - gamma; null: 1/T̄"),
     },
     "IPOLoss": {
         **_CLIPPED_LOSS,
@@ -94,12 +96,12 @@ LOSSES = {
     "FOCOPSLoss": {
         **_LOSS,
         "temperature": Key(_STRENGTH, "β, the trust region's multiplier"),
-        "max_state_kl": Key(POSITIVE, "KL divergence beyond which a state teaches nothing"),
+        "max_state_kl": Key(POSITIVE, "KL divergence beyond which a state is ignored"),
     },
     "CUPLoss": {
         **_LOSS,
         "gamma": Key(number(0, 1, below=True), "discount of the cost advantages"),
-        "lmbda": Key(SHARE, "decay of their TD errors"),
+        "lmbda": Key(SHARE, "λ of their generalised advantage estimation"),
     },
 }
 """Of the package's losses by class; `PARTS` holds them, too."""

@@ -54,7 +54,7 @@ __all__ = ["Run", "load", "resume", "train"]
 
 @dataclass(frozen=True)
 class Run:
-    """A run in its folder: figures, environment and trained policy.
+    """A run in its folder: table, environment and trained policy.
 
     Attributes:
         directory: Its folder.
@@ -78,7 +78,7 @@ class Run:
 
     @cached_property
     def table(self) -> dict[str, list[float]]:
-        """Its figures by epoch: the columns of ``progress.csv``, as `pandas.DataFrame` takes them.
+        """Its table by epoch: the columns of ``progress.csv``, as `pandas.DataFrame` takes them.
 
         Costs of an epoch in which no episode ended are NaN.
         """
@@ -94,7 +94,7 @@ class Run:
 
     @cached_property
     def env(self) -> EnvBase:
-        """One world of its environment, with layouts that training has not met."""
+        """One instance of its environment, with layouts that training has not met."""
         return self.make_env()
 
     @cached_property
@@ -133,7 +133,7 @@ class Run:
         return evaluate_run(self.directory, take_options(given, EvaluationOptions))
 
     def certify(self, **changes: Any) -> Certificate | None:
-        """Find its best checkpoint that surely keeps the limits, as at the end of training.
+        """Find and certify its best checkpoint that keeps the limits, as at the end of training.
 
         Args:
             changes: Keys of the section ``certificate`` to replace, such as ``episodes=2000``.
@@ -182,10 +182,10 @@ def train(
             ``policy_update={"max_kl": 0.02}``, or written with dots, ``**{"env.hazards_num": 12}``.
 
     Raises:
-        ValueError: If a setting cannot be; the message names it.
+        ValueError: If a setting is invalid; the message names it.
         FileExistsError: If the folder holds a run.
-        KeyboardInterrupt: After Ctrl-C, when the epoch at hand has its checkpoint; :func:`resume`
-            goes on from there.
+        KeyboardInterrupt: After Ctrl-C, once the current epoch has its checkpoint, from which
+            :func:`resume` continues.
 
     Examples:
         >>> small = {"num_envs": 2, "frames_per_batch": 40, "env.num_steps": 20, "logger": "none"}
@@ -209,12 +209,12 @@ def train(
 def resume(
     directory: str | Path, *, imports: str | Sequence[str] | None = None, **settings: Any
 ) -> Run:
-    """Go on with a run, as ``python train.py resume=…`` does; a finished one stays as it is.
+    """Continue a run, as ``python train.py resume=…`` does; a finished one stays as it is.
 
     Args:
         directory: Folder of the run.
         imports: Modules that it needs; as in :func:`load`.
-        settings: What is to be different from now on: ``frames=500_000``,
+        settings: What to change from now on: ``frames=500_000``,
             ``policy_update={"max_kl": 0.01}``.
 
     Raises:
@@ -274,12 +274,12 @@ def _carry_out(config: DictConfig, folder: Path, hydra: DictConfig | None = None
 def load(
     directory: str | Path, checkpoint: str = "last", imports: str | Sequence[str] | None = None
 ) -> Run:
-    """Open a run: its figures, environment and policy.
+    """Open a run: its table, environment and policy.
 
     Args:
         directory: Folder of the run.
-        checkpoint: "last", "best" (highest return that kept every limit), "certified" (surely keeps
-            them), or a path.
+        checkpoint: "last", "best" (highest return that kept every limit), "certified" (to
+            keep them), or a path.
         imports: Modules that its environment or policy needs; none is imported unless named here.
             ``[]`` goes without those that the run has used.
 

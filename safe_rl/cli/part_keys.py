@@ -31,7 +31,7 @@ __all__ = ["EXTRAS", "FLAGS", "PARTS"]
 _OPTIMIZER = {
     "lr": Key(number(0, 1000, above=True), "learning rate"),
     "betas": Key(list_of(number(0, 1, below=True), 3), "decay rates of the moments"),
-    "eps": Key(NOT_NEGATIVE, "what denominators are kept above"),
+    "eps": Key(NOT_NEGATIVE, "added to denominators"),
     "weight_decay": Key(NOT_NEGATIVE, "decay of the weights"),
     "momentum": Key(number(0, 1, below=True), "weight of past gradients"),
     "fused": Key(optional(boolean), "whether to step in one kernel"),
@@ -41,7 +41,7 @@ _OPTIMIZER = {
 }
 _ESTIMATOR = {
     "gamma": Key(SHARE, "discount per step"),
-    "lmbda": Key(SHARE, "decay of the TD errors"),
+    "lmbda": Key(SHARE, "λ of generalised advantage estimation"),
     "value_target": Key(choice("lambda_return", "return_to_go"), "what critics learn"),
 }
 _TRUST_REGION = {
@@ -57,11 +57,11 @@ _TRUST_REGION = {
 _CONSTRAINED = {
     "rescale_violation": Key(boolean, "whether violations are divided by the episode length"),
     "largest_demand": Key(
-        optional(POSITIVE), "bound of a violation, as a share of what a step can mend"
+        optional(POSITIVE), "bound of a violation, as a share of what a step can correct"
     ),
 }
 _SAUTE = {
-    "budgets": Key(mapping_of(POSITIVE), "cost per episode allowed by cost"),
+    "budgets": Key(mapping_of(POSITIVE), "cost allowed per episode, by cost"),
     "discount": Key(number(0, 1, above=True), "discount of the costs that a budget is for"),
     "unsafe_reward": Key(number(), "reward of a step once a budget is spent"),
     "rescale_budgets": Key(boolean, "whether budgets are undiscounted"),
@@ -83,32 +83,32 @@ PARTS = {
         "factor": Key(number(1, above=True), "by which the rate is divided or multiplied"),
         "lowest": Key(number(0, 1000, above=True), "lower bound of the rate"),
         "highest": Key(number(0, 1000, above=True), "upper bound of the rate"),
-        "few_steps": Key(SHARE, "share of the steps below which an update ended early"),
-        "low_kl": Key(SHARE, "share of the KL limit below which an update fell short"),
+        "few_steps": Key(SHARE, "an update with a smaller share of its steps ended early"),
+        "low_kl": Key(SHARE, "an update with a smaller share of max_kl fell short"),
     },
     "TRPOStep": _TRUST_REGION,
     "CPOStep": {**_TRUST_REGION, **_CONSTRAINED},
     "PCPOStep": {
         **_TRUST_REGION,
         **_CONSTRAINED,
-        "projection": Key(choice("kl", "l2"), "distance that the projection keeps small"),
+        "projection": Key(choice("kl", "l2"), "metric of the projection"),
     },
     "CRPOStep": {
         **_TRUST_REGION,
-        "tolerance": Key(NOT_NEGATIVE, "η, violation of an episode's cost that is let pass"),
+        "tolerance": Key(NOT_NEGATIVE, "η, tolerated violation per episode"),
     },
     "CTRPOStep": {
         **_TRUST_REGION,
         "beta": Key(NOT_NEGATIVE, "β, weight of the barrier, per unit of an episode's cost"),
         "gamma": Key(
-            optional(number(0, 1, below=True)), "discount that makes sums of averages; null: T̄ does"
+            optional(number(0, 1, below=True)), "from averages to sums: 1 / (1 - gamma); null: T̄"
         ),
         "hysteresis": Key(number(0, 1, above=True), "share of a limit at which a recovery ends"),
     },
     "Memory": {
         "capacity": Key(count(), "transitions that are kept", bytes_each=50),
         "batch_size": Key(count(), "transitions in a minibatch"),
-        "n_steps": Key(count(1, 1000), "steps that a transition spans"),
+        "n_steps": Key(count(1, 1000), "steps of n-step returns"),
         "storage": Key(choice("tensor", "memmap"), "where transitions are kept"),
         "prioritised": Key(optional(mapping_of(SHARE)), "{alpha: …, beta: …}; null: uniform"),
         "keep": Key(boolean, "whether checkpoints hold the transitions"),
@@ -118,10 +118,10 @@ PARTS = {
         "updates_per_step": Key(POSITIVE, "gradient steps per step of an environment"),
         "tau": Key(
             optional(number(0, 0.5, above=True)),
-            "share of the way that target networks go; null: there are none",
+            "Polyak averaging: share of the way that targets move; null: no targets",
         ),
         "policy_delay": Key(count(1, 10_000), "steps of the critics per step of the policy"),
-        "rates": Key(optional(mapping_of(POSITIVE)), "learning rates by name of parameters"),
+        "rates": Key(optional(mapping_of(POSITIVE)), "learning rates by prefix of parameter names"),
         "max_grad_norm": Key(optional(POSITIVE), "norm to which the gradient is clipped"),
         "compile": Key(boolean, "whether to compile the loss"),
     },
@@ -156,14 +156,14 @@ PARTS = {
         "frames": Key(count(), "steps of the whole run"),
         "latest_end": Key(number(0, 1, above=True), "share of a run by which the descent is over"),
         "smallest_scale": Key(POSITIVE, "unit of violations of limits near 0, costs per step"),
-        "drift": Key(optional(POSITIVE), "share by which J_c changes per update"),
-        "memory": Key(number(0, 1, below=True), "weight of the past"),
-        "lowest_trust": Key(number(0, 1, above=True), "share of a promise believed at least"),
-        "integral": Key(NOT_NEGATIVE, "share of a violation that is asked for again"),
-        "largest_integral": Key(NOT_NEGATIVE, "bound of that, in units of violations"),
+        "drift": Key(optional(POSITIVE), "share by which J_c is expected to change per update"),
+        "memory": Key(number(0, 1, below=True), "weight of the past in estimates"),
+        "lowest_trust": Key(number(0, 1, above=True), "lower bound of trust_<cost>"),
+        "integral": Key(NOT_NEGATIVE, "gain of the integral of violations"),
+        "largest_integral": Key(NOT_NEGATIVE, "bound of that integral, in units of violations"),
     },
     "CVaR": {
-        "tail": Key(number(0, 1, above=True), "share of the episodes, the worst"),
+        "tail": Key(number(0, 1, above=True), "share of the worst episodes"),
         "window": Key(count(1, 10**6), "episodes from which the value at risk is taken"),
         "ramp_start": Key(count(0), "steps in which the mean is limited"),
         "ramp_steps": Key(count(0), "steps in which the tail then takes its place"),
@@ -211,12 +211,10 @@ PARTS = {
     "RewardScale": {"factor": Key(POSITIVE, "what rewards are multiplied by")},
     "SensorNoise": {
         "std": Key(NOT_NEGATIVE, "standard deviation of the noise"),
-        "components": Key(
-            optional(list_of(text, 1000)), "what is noisy; null: all that is observed"
-        ),
+        "components": Key(optional(list_of(text, 1000)), "components with noise; null: all"),
     },
     "ActionDelay": {"steps": Key(count(1, 1000), "steps from an action to its effect")},
-    "PolicyMemory": {"size": Key(count(1, 16_384), "numbers that are remembered")},
+    "PolicyMemory": {"size": Key(count(1, 16_384), "size of the recurrent state")},
     "TensorboardLogger": {"exp_name": Key(text, "folder of the event files")},
     "MLflowLogger": {
         "exp_name": Key(text, "name of the experiment"),
@@ -233,7 +231,7 @@ PARTS = {
 
 FLAGS = {
     "_target_": Key(optional(text), "what is built"),
-    "_partial_": Key(boolean, "whether other arguments follow"),
+    "_partial_": Key(boolean, "whether it is called later with more arguments"),
 }
 """Keys of any part that are Hydra's."""
 

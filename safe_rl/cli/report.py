@@ -33,15 +33,15 @@ class ReportOptions:
     """
 
     out: str | None = option(None, "folder of the report; null: RUNS_DIR/report")
-    seeds: int = option(len(SEEDS), "runs that a slate takes per environment")
-    unfinished: bool = option(False, "count runs that have not come to their end")
+    seeds: int = option(len(SEEDS), "finished runs per environment that a slate needs")
+    unfinished: bool = option(False, "include unfinished runs in scores")
     archive: str | None = option(
-        None, "folder to keep the runs in for others, tables compressed; null: none"
+        None, "folder to copy the runs to, for others, tables compressed; null: none"
     )
     good: float = option(
         0.5,
-        "x of the first step with J_r >= x and J_c <= d: share of the published PPO's return, "
-        "elsewhere of the best one here",
+        "a policy is good if J_c <= d and J_r is at least this share of the published PPO's, "
+        "elsewhere of the best here",
     )
     title: str | None = option(None, "heading; null: the folder's name")
 

@@ -121,7 +121,7 @@ class PositionedEnv(Protocol):
 
 
 class ContractError(TypeError):
-    """An environment that nothing else can work with; the message lists what it lacks."""
+    """An environment that does not fulfil the contract; the message lists what it lacks."""
 
 
 def check_constrained_env(env: Any) -> None:

@@ -49,7 +49,7 @@ class CertificateOptions:
 
 @dataclass(frozen=True)
 class Certificate:
-    """What was found.
+    """The result of certifying a run.
 
     Attributes:
         checkpoint: The policy that is certified, or None.
@@ -100,7 +100,7 @@ def certify(
     num_threads: int = 0,
     progress: bool = False,
 ) -> Certificate | None:
-    """Find the best checkpoint of a run of which it can be said that it keeps its limits.
+    """Find and certify the best checkpoint of a run that keeps its limits.
 
     All checkpoints are ranked by episodes of their own; the first of them are tested on fresh ones.
     The result is written to ``certificate.json``, the policy kept as ``checkpoint=certified``.

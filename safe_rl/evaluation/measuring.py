@@ -39,7 +39,7 @@ _LAYOUTS = ("layout_seeds", "layout_seeds_first")
 
 @dataclass(frozen=True)
 class Evaluation:
-    """What an evaluation found.
+    """The result of an evaluation.
 
     Attributes:
         facts: What was evaluated, and how: JSON-compatible.

@@ -46,33 +46,31 @@ class EvaluationOptions:
     )
     deterministic: bool = option(False, "act with the policy's mean instead of sampling from it")
     seed: int | None = option(
-        None, "of layouts and actions; null: one that training never used, see docs/protocol.md"
+        None, "seed of layouts and actions; null: one that training never used"
     )
-    num_envs: int = option(25, "worlds that are stepped together")
+    num_envs: int = option(25, "environments that are stepped together")
     num_threads: int = option(0, "threads that step them; 0: one per core")
-    device: str = option("cpu", "of the policy")
+    device: str = option("cpu", "where the policy acts: cpu or cuda")
     cvar_alpha: float = option(0.1, "share of the costliest episodes in the CVaR")
     video: bool = option(
         False,
-        "write an MP4 of an episode on the first layout; num_envs=1: the first (extra 'video')",
+        "write an MP4 of an episode from the first layout (extra 'video')",
     )
     picture: str | None = option(
-        None, "file for an animated picture of the same episode, .gif or .webp"
+        None, "file for an animated picture of that episode, .gif or .webp"
     )
-    camera: str = option("free", "of these: free, fixednear, fixedfar, track or vision")
+    camera: str = option("free", "of the video: free, fixednear, fixedfar, track or vision")
     record: bool = option(False, "write every transition to disk, for dataset.path=…")
-    certify: bool = option(
-        False, "find the best checkpoint that surely keeps the limits, instead of evaluating one"
-    )
+    certify: bool = option(False, "find and certify the best checkpoint that keeps the limits")
     certificate: dict[str, Any] = option(
         dict, "with certify=true: certificate.episodes=2000, as in training"
     )
     cost_limits: dict[str, float] = option(
-        dict, "to measure against in place of the run's own, such as '{cost: 10}'"
+        dict, "limits to use instead of the run's own, such as '{cost: 10}'"
     )
-    name: str = option("", "told apart by it, several evaluations of a run can stand side by side")
+    name: str = option("", "suffix of the files, to keep several evaluations of a run")
     variations: Any = option(
-        None, "run it in these too: dynamics, sensing, layout, a list, a YAML, keys"
+        None, "evaluate in changed environments: dynamics, sensing, layout, a YAML, keys"
     )
     env: dict[str, Any] = option(
         dict, "keys of the environment, as in training: env.hazards_num=12"

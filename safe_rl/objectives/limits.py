@@ -134,7 +134,7 @@ class PromisedChange:
 
 
 class LimitTracker:
-    """Turns the costs of every batch into violations of where J_c should be by now.
+    """Turns the costs of every batch into violations of a limit that comes down over time.
 
     Args:
         cost_limits: d, undiscounted cost per episode, [k].

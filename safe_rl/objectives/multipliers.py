@@ -67,7 +67,7 @@ def per_cost(name: str, value: float | Sequence[float] | Tensor, num_costs: int)
 
 
 class Multiplier(nn.Module):
-    """What losses and training loops rely on: limits, `value` and `update`.
+    """Base of the multipliers: limits, `value` and `update`.
 
     Subclasses keep their state in buffers and implement `_step`; and `value`, unless λ is the
     buffer `penalty`.

@@ -35,7 +35,7 @@ class Charges(NamedTuple):
 
 
 class RiskMeasure(Protocol):
-    """What of the episode costs is limited, if not their mean."""
+    """A measure of episode costs that is limited instead of their mean."""
 
     def __call__(self, costs: Tensor, ends: Tensor, before: Tensor, finished: Tensor) -> Charges:
         """Charge the steps of a batch.

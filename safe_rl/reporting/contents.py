@@ -86,7 +86,7 @@ class Section(NamedTuple):
 
 @dataclass(frozen=True)
 class Report:
-    """What there is to say about a folder of runs.
+    """The contents of a report on a folder of runs.
 
     Attributes:
         experiments: Runs, grouped.

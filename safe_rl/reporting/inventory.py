@@ -112,7 +112,7 @@ def evaluation_table(experiments: Sequence[Experiment]) -> Table:
 
 
 def certificate_table(experiments: Sequence[Experiment]) -> Table:
-    """Which runs have a checkpoint that surely keeps the limits."""
+    """Which runs have a checkpoint that is certified to keep the limits."""
     records = [
         _certificate_record(experiment, run, run.certificate)
         for experiment in experiments

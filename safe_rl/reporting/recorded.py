@@ -42,7 +42,7 @@ class Run:
         overrides: What its command line said.
         cwd: Where it was started, if Hydra has recorded it.
         evaluations: What ``safe_rl.evaluate`` has written into its folder.
-        certificate: Which of its checkpoints surely keeps the limits, or by how much none does.
+        certificate: Which of its checkpoints is certified, or by how much none is.
         code: By which version and commit it was carried out, in words, if that is recorded.
         videos: Videos in its folder.
     """

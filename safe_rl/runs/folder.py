@@ -69,7 +69,7 @@ class RunFolder:
     code = _Below("code.json")  # by which code it was carried out
     checkpoints = _Below("checkpoints")  # a folder for each of `KINDS`
     transitions = _Below("transitions")  # what was collected, if it was recorded
-    certificate = _Below("certificate.json")  # which checkpoint surely keeps the limits
+    certificate = _Below("certificate.json")  # which checkpoint is certified
     certifying = _Below(".certifying")  # there from the end of training until it is certified
 
     @property

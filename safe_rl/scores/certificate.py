@@ -139,7 +139,7 @@ class Claim:
 
 @dataclass(frozen=True)
 class Verdict:
-    """What became of the candidates.
+    """The result of testing candidates.
 
     Attributes:
         certified: Number of the policy that is certified, or None.

@@ -1,4 +1,4 @@
-"""What changes a constrained problem from outside: TorchRL's transforms, for any algorithm."""
+"""Transforms of TorchRL that change a constrained problem, for any environment and algorithm."""
 
 from safe_rl.envs.transforms.action_delay import ActionDelay
 from safe_rl.envs.transforms.action_filter import ActionFilter

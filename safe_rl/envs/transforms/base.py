@@ -19,7 +19,7 @@ OWN_REWARD = "task_reward"
 
 
 class ConstraintTransform(Transform):
-    """A transform that the environment's contract and a run's snapshots know of.
+    """Base of transforms that keep the environment's contract and are saved in snapshots.
 
     What it remembers of every row's episode stands in one dictionary of tensors [..., m]: `start`
     says what that is when an episode begins, `_step` of a subclass moves it.

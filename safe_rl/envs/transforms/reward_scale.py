@@ -18,7 +18,7 @@ __all__ = ["RewardScale"]
 
 
 class RewardScale(ConstraintTransform):
-    """What is learned from is the reward times a number.
+    """Multiply the rewards that are learned from by a number.
 
     Critics begin with values near 0 and go by steps of a learning rate. Towards values of hundreds
     all weights move one way until the hidden layers are saturated and tell states apart no more:
