@@ -100,7 +100,7 @@ def comparison(algorithms: Iterable[str]) -> str:
 All algorithms with a limit of 25, after one million steps and after equal time, with the defaults
 of the commit of each run. Three seeds show a direction, not a verdict. The constrained on-policy
 runs on CarGoal1 are older: from before the [estimate of the cost](holding_the_limit.md) was
-mended, and with [earlier defaults](holding_the_limit.md#settings-tried). Seeds with different
+mended, and with [earlier defaults](limits_measured.md#settings-tried). Seeds with different
 settings have a row for each, which names what differs. [Which algorithm to choose](index.md).
 
 ## At equal steps

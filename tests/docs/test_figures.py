@@ -209,7 +209,7 @@ def test_what_readme_says_of_pushing():
 @pytest.mark.parametrize("name", ["equal_seconds", "equal_steps"])
 def test_worlds_and_batches(name):
     """Every cell that the page has, from the epochs of the archive; and it has all of them."""
-    page = (ROOT / "docs" / "algorithms" / "holding_the_limit.md").read_text()
+    page = (ROOT / "docs" / "algorithms" / "limits_measured.md").read_text()
     table = page.partition(f"<!-- table: {name} -->\n")[2].partition("\n\n")[0].splitlines()[2:]
     with gzip.open(RESULTS / "worlds" / f"{name}.csv.gz", "rt") as file:
         rows = list(csv.DictReader(file))
