@@ -1,5 +1,7 @@
 """Losses of first-order methods, against what their own articles say of their optimum."""
 
+import math
+
 import pytest
 import torch
 from one_state import best_on_a_grid, minimise, one_state, total
@@ -220,11 +222,16 @@ def test_a_violation_is_needed_for_every_cost(name):
         LOSSES[name](actor)(make_batch(actor, [8], 1))
 
 
-@pytest.mark.parametrize("gamma", [0.99, None])
-def test_before_any_batch_the_policy_counts_as_at_its_limit(gamma):
+def test_before_any_batch_the_policy_counts_as_at_its_limit():
     actor, _, batch = one_state(GAIN, COST)
-    losses = P3OLoss(actor, Constraints({"cost": 25.0}), kappa=20.0, gamma=gamma, **FREE)(batch)
-    assert losses["loss_penalty"].abs() < 1e-5
+    nothing_seen = Constraints({"cost": 25.0})
+    for gamma in (0.99, None):
+        loss = P3OLoss(actor, nothing_seen, kappa=20.0, gamma=gamma, **FREE)
+        assert loss(batch)["loss_penalty"].abs() < 1e-5
+    loss = IPOLoss(actor, nothing_seen, kappa=0.5, max_weight=10.0, **FREE)
+    # the barrier's tangent at κ / w, extended to 0
+    expected = -0.5 * math.log(0.5 / 10.0) + 0.5
+    assert loss(batch)["loss_barrier"].item() == pytest.approx(expected, abs=1e-5)
 
 
 @pytest.mark.parametrize("agents", [1, 5])

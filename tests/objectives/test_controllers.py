@@ -38,6 +38,10 @@ def test_two_updates_by_hand():
     # a cost of six times the limit counts as one of twice
     multiplier.update(60.0)
     assert multiplier.value.item() == pytest.approx(2.0 + 0.3)
+    # and one of nothing as half of the limit, where that is the saturation
+    multiplier = PIMultiplier(10.0, **(GAINS | {"init": 4.0, "saturation": 0.5}))
+    multiplier.update(0.0)
+    assert multiplier.value.item() == pytest.approx(4.0 - 0.1 - 1.0)
 
 
 def test_it_follows_a_ramp_where_the_pid_swings_about():

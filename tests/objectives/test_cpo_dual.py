@@ -156,6 +156,8 @@ TRPO = -RADIUS * np.array(G) / np.sqrt(2)
         (G, [[0, 0, 0]], [0.0], 4, TRPO),
         (G, [[0, 0, 0]], [0.1], 0, [0, 0, 0]),
         (G, [[0, 0, 0], [0, 0, 0]], [-0.1, -0.2], 4, TRPO),
+        # One boundary crosses the trust region, another one lies beyond it.
+        (G, [E1, E2], [-0.05, -1.0], 2, TRPO),
         # A vanishing constraint next to a usable one.
         (G, [[0, 0, 0], E1], [-0.1, -1.0], 3, TRPO),
         (G, [[0, 0, 0], [-1, 0, 0]], [-0.1, 0.0], 1, [0, -RADIUS, 0]),
