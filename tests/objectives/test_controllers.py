@@ -84,21 +84,6 @@ def test_a_limit_of_0_takes_its_unit_from_outside():
     assert multiplier.value.tolist() == pytest.approx([1.1, 1.1])
 
 
-def test_nan_leaves_everything_unchanged_and_resume_is_exact():
-    multiplier = PIMultiplier([10.0, 5.0], **GAINS)
-    multiplier.set_scale(torch.tensor([12.0, 5.0]))
-    multiplier.update([14.0, 3.0])
-    before = {name: buffer.clone() for name, buffer in multiplier.state_dict().items()}
-    multiplier.update([float("nan")] * 2)
-    for name, buffer in multiplier.state_dict().items():
-        assert torch.equal(buffer, before[name])
-    resumed = PIMultiplier([1.0, 1.0], **GAINS)
-    resumed.load_state_dict(before)
-    for each in (multiplier, resumed):
-        each.update([20.0, 9.0])
-    assert torch.equal(multiplier.value, resumed.value)
-
-
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
