@@ -126,10 +126,26 @@ def test_plain_dual_ascent_weighs_costs_of_any_size_alike(size):
             multiplier=ProjectedMultiplier(limits, init=0.0, lr=0.01, highest=None),
         )
         for costs in batches(5, 0.05, unit=unit):
-            constraints.observe(episodes, TensorDict({"next": {"cost": costs}}, [20, 100]))
+            batch = TensorDict({"next": {"cost": costs}}, [20, 100])
+            batch["cost_advantage"] = 3 * costs
+            constraints.observe(episodes, batch)
+            torch.testing.assert_close(batch["cost_advantage"], 3 * costs / unit)
         found.append(constraints.multiplier.value)
     assert found[0] > 1.0
     torch.testing.assert_close(*found)
+
+
+def test_promises_per_step_are_held_against_the_costs_of_episodes():
+    """Of 20 per episode half has come true, beside a first promise of half of the limit."""
+    constraints = TrackedConstraints({"cost": 25.0}, tracker=tracker())
+    episodes = EpisodeStatistics(NO_EPISODES, {}, NO_EPISODES, {})
+    for rate in (0.05, 0.04):
+        costs = torch.full((20, 100, 1), rate)
+        constraints.observe(episodes, TensorDict({"next": {"cost": costs}}, [20, 100]))
+        constraints.expect({"cost_surrogate": torch.tensor([-20 / 1000])})
+    prior = 0.9 * 12.5**2
+    share = (prior + 20 * 10) / (prior + 20**2)
+    assert constraints.columns()["trust_cost"] == pytest.approx(share)
 
 
 @pytest.mark.parametrize(("kept", "share"), [(-0.5, 0.1), (0.2, 0.2), (0.7, 0.7), (1.5, 1.0)])
