@@ -48,3 +48,15 @@ def perturb(actor, size=0.05):
     with torch.no_grad():
         for parameter in actor.parameters():
             parameter.add_(size * torch.randn_like(parameter))
+
+
+def assert_gradients_are_differences(evaluate, actor):
+    """The gradient of `evaluate()` by each parameter, in double precision, along some direction."""
+    for parameter in list(actor.parameters()):
+        direction, values = torch.randn_like(parameter), []
+        slope = (torch.autograd.grad(evaluate(), parameter)[0] * direction).sum()
+        for size in (1e-6, -2e-6):
+            parameter.data += size * direction
+            values.append(evaluate().detach())
+        parameter.data += 1e-6 * direction
+        torch.testing.assert_close(slope, (values[0] - values[1]) / 2e-6, rtol=1e-4, atol=1e-7)

@@ -130,6 +130,17 @@ def test_of_several_costs_the_worst_is_recovered_within_the_limits_of_the_others
     assert change[2] < 0.2
 
 
+def test_a_cost_within_its_limit_is_not_recovered_however_large_its_hysteresis():
+    actor, batch = make_case(2)
+    batch["cost_advantage"] = batch["cost_advantage"] * torch.tensor([1.0, -1.0])
+    settings = {"beta": BETA, "gamma": 0.99, "hysteresis": 0.8, **SETTINGS}
+    step = CTRPOStep(CPOLoss(actor, entropy_coeff=0.0), [5.0, 500.0], **settings)
+    before = step.loss(batch)["cost_surrogate"].detach()
+    metrics = step(batch, torch.tensor([1.0, -20.0]))
+    assert metrics["recovers"].tolist() == [1.0, 0.0]
+    assert step.loss(batch)["cost_surrogate"][0] < before[0]
+
+
 def test_at_a_limit_of_nothing_a_policy_without_costs_learns_from_its_rewards():
     actor, batch = make_case(2)
     batch["cost_advantage"] = batch["cost_advantage"] * torch.tensor([0.0, 1.0])

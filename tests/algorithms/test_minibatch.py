@@ -91,8 +91,9 @@ def test_critics_converge_to_least_squares():
         TensorDictModule(nn.Linear(3, 1), in_keys=["observation"], out_keys=[key])
         for key in ("state_value", "cost_value")
     ]
+    sgd = functools.partial(torch.optim.SGD, lr=0.3)
     update = MinibatchUpdate(
-        CriticLoss(*critics), optimizer=adam, num_passes=2000, minibatch_size=None
+        CriticLoss(*critics), optimizer=sgd, num_passes=100, minibatch_size=None
     )
     batch = TensorDict(
         observation=inputs,
@@ -280,5 +281,7 @@ def test_an_update_that_ends_early_lowers_the_next_rate():
     assert ended.optimizer.param_groups[0]["lr"] == pytest.approx(5e-3)
     short = MinibatchUpdate(RecordingLoss(), max_kl=1.0, **common)
     assert short(samples(4, 5))["lr"] == pytest.approx(2e-2)
+    nearly = MinibatchUpdate(RecordingLoss(), max_kl=0.05, **common)  # of which the last is 0.88
+    assert nearly(samples(4, 5))["lr"] == pytest.approx(1e-2)
     with pytest.raises(ValueError, match="max_kl"):
         MinibatchUpdate(RecordingLoss(), **common)

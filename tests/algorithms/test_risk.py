@@ -113,6 +113,13 @@ def test_the_tail_is_ramped_in():
     assert weights == [0, 0, 0.5, 1, 1, 1]
 
 
+def test_the_value_at_risk_is_that_of_the_last_episodes():
+    risk, ends = cvar_of([5.0], tail=0.5, window=2), torch.zeros(1, 4, dtype=torch.bool)
+    for finished in ([[9.0], [9.0]], [[1.0], [2.0]]):
+        charges = risk(torch.ones(1, 4, 1), ends, torch.zeros(1, 1), torch.tensor(finished))
+    assert charges.offset == 1
+
+
 def test_the_accounting_knows_what_open_episodes_have_cost():
     costs, ends = random_episodes()
     accounting = EpisodeAccounting(4, ["a", "b"])

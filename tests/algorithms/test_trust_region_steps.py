@@ -1,5 +1,7 @@
 """TRPO and CPO: losses against finite differences, steps against their own optimality."""
 
+from functools import partial
+
 import pytest
 import torch
 from samples import make_actor, make_batch, perturb
@@ -164,16 +166,19 @@ def test_without_a_gradient_there_is_no_step():
     assert torch.equal(flatten(actor.parameters()), before)
 
 
-def test_rejected_step_leaves_the_policy_exactly_as_it_was():
+@pytest.mark.parametrize("kind", [TRPOStep, partial(CPOStep, rescale_violation=True)])
+def test_rejected_step_leaves_the_policy_exactly_as_it_was(kind):
     actor, batch = make_case(0)
     before = flatten(actor.parameters()).detach().clone()
 
     def worse_everywhere(batch):
         value = sum(parameter.sum() for parameter in actor.parameters())
         moved = (flatten(actor.parameters()).detach() - before).norm()
-        return TensorDict(loss_objective=value - value.detach() + moved)
+        costs = (0 * value).unsqueeze(0)
+        return TensorDict(loss_objective=value - value.detach() + moved, cost_surrogate=costs)
 
-    metrics = TRPOStep(worse_everywhere, actor_network=actor, **SETTINGS)(batch)
+    step = kind(worse_everywhere, actor_network=actor, **SETTINGS)
+    metrics = step(batch, torch.tensor([-5.0]), LENGTH)
     assert metrics["step_fraction"] == 0
     assert metrics["backtracks"] == 10
     assert metrics["kl"] == 0
@@ -209,6 +214,16 @@ def test_cpo_cases_move_the_cost_as_they_should(violation, case):
         assert reward > 0
     if case < 2:
         assert after < before
+
+
+def test_cpo_gives_up_reward_for_costs_that_come_down_with_it():
+    actor, batch = make_case(1)
+    batch["cost_advantage"] = batch["advantage"].clone()
+    metrics = cpo_step(actor)(batch, torch.tensor([5.0]), LENGTH)
+    _, reward, cost = kl_and_surrogates(actor, batch)
+    assert metrics["case"] == 1
+    assert reward < -0.02
+    assert cost < -0.02
 
 
 def test_cpo_diagnostics_are_the_definitions():

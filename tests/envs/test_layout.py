@@ -92,6 +92,8 @@ def test_a_single_object_is_uniform_in_its_rectangle():
 def test_rectangles_are_chosen_in_proportion_to_their_areas():
     rectangles = [[-2, -2, -1, -1], [0, 0, 2, 1], [-2, 1, -1.5, 1.5]]
     config = {**POINT, "robot_placements": rectangles, "robot_keepout": 0.1}
+    # others may have more of them, and are far away
+    config |= {"hazards_num": 1, "hazards_placements": [[8, 8, 9, 9]] * 5}
     x, y = fresh_places(config, 4000)["robot"].T
     inside = [(x > a) & (x < c) & (y > b) & (y < d) for a, b, c, d in rectangles]
     counts = np.sum(inside, axis=1)

@@ -150,10 +150,11 @@ def test_circling_by_hand():
     torch.testing.assert_close(circle_speed(com, velocity, 1.5), want)
 
 
-def test_the_reward_for_circling_is_scaled():
+def test_the_reward_for_circling_is_scaled_and_that_for_standing_upright_added():
     # A Car turned by half a turn; its centre of mass is near its body's.
     config = {**FROZEN, "robot_base": "car", "task": "circle", "reward_circle": 0.5}
-    env = make({**config, "observe_com": True})
+    upright = {"reward_orientation": True, "reward_orientation_scale": 0.25}
+    env = make({**config, **upright, "observe_com": True})
     state = arrange(env, robot=(1.2, 0.0, math.pi))
     state["qvel"][:, :2] = torch.tensor([0.3, 0.8])
     got = step_from(env, state, 0, 0)
@@ -161,7 +162,7 @@ def test_the_reward_for_circling_is_scaled():
     assert abs(x - 1.2) < 0.05
     radius = math.hypot(x, y)
     speed = (-0.3 * y + 0.8 * x) / radius / (1 + abs(radius - 1.5))
-    assert math.isclose(float(got["reward"]), 0.5 * speed, rel_tol=1e-5)
+    assert math.isclose(float(got["reward"]), 0.5 * speed + 0.25, rel_tol=1e-5)
 
 
 def test_upright_bodies_are_rewarded():

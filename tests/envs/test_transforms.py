@@ -133,7 +133,8 @@ def test_rows_that_go_on_keep_their_budget_when_others_begin():
 def test_a_spent_budget_replaces_the_reward_and_the_own_one_is_kept():
     costs = [[1.0, 1.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.9]]
     plain = still(Priced(costs), 4)
-    saute = Saute({"cost": 2.0}, discount=1.0, unsafe_reward=-3.0, rescale_budgets=False)
+    budgets = {"cost": 2.0, "cost_north": 40.0}  # one that is spent is enough
+    saute = Saute(budgets, discount=1.0, unsafe_reward=-3.0, rescale_budgets=False)
     env = transform_env(Priced(costs), {"saute": saute}, evaluating=False)
     batch = still(env, 4)
     assert env.return_key == "task_reward"
@@ -219,7 +220,8 @@ def test_the_schedule_goes_on_where_workers_take_it_up():
 
 def test_the_episode_ends_when_more_than_the_budget_is_spent():
     costs = [[1.0, 1.0, 0.5, 0.0, 0.0, 0.0], [0.0, 0.0, 0.0, 0.0, 0.0, 2.1], [0.0] * 6]
-    batch = still(transformed(Priced(costs), "early_termination"), 6)["next"]
+    end = EarlyTermination({"cost": 2.0, "cost_north": 40.0})  # one that is spent is enough
+    batch = still(transform_env(Priced(costs), {"end": end}, evaluating=False), 6)["next"]
     terminated, truncated = batch["terminated"].squeeze(-1), batch["truncated"].squeeze(-1)
     # the first row begins anew, with its own costs, and ends again
     assert terminated.nonzero().tolist() == [[0, 2], [0, 5], [1, 5]]

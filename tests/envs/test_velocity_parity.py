@@ -5,7 +5,7 @@ import mujoco
 import numpy as np
 import pytest
 import torch
-from scipy.stats import ks_2samp
+from scipy.stats import ks_2samp, kstest, uniform
 from tensordict import TensorDict
 
 from safe_rl.envs.velocity import VELOCITY_SUITE, VelocityEnv
@@ -138,6 +138,10 @@ def test_starts_are_distributed_as_gymnasiums(name):
         assert ks_2samp(mine, its).pvalue > 1e-4
         assert abs(mine.std() / its.std() - 1) < 0.15
     assert abs(np.corrcoef(ours.T) - np.eye(ours.shape[1])).max() < 0.2
+    # all positions at once: by single columns a scale that is a tenth smaller is not told
+    noise = ours[:, : len(other.init_qpos)] - other.init_qpos
+    scale = VELOCITY_SUITE[name].reset_noise_scale
+    assert kstest(noise.ravel() / scale, uniform(-1, 2).cdf).pvalue > 1e-3
 
 
 @pytest.mark.parametrize("name", FAMILY)

@@ -119,14 +119,14 @@ def test_the_limit_is_where_critics_say_that_episodes_are_at_theirs():
 
 
 def test_the_limit_follows_what_batches_say_and_not_too_far():
-    loss = make_loss(gamma=0.99)
-    rows = [([40.0, 0.0], (2.0, 9.0)), ([20.0, 0.0], (2.0, 9.0)), ([60.0, 0.0], (9.0, 9.0))]
+    loss = make_loss(gamma=0.99, ratio_memory=0.75)
+    rows = [([40.0, 0.0], (1.0, 9.0)), ([20.0, 0.0], (4.0, 9.0)), ([60.0, 0.0], (30.0, 9.0))]
     said = spent = 0.0
     for costs, values in rows:
         loss.cost_weights(torch.tensor(values).expand(4, 6, 2))
         loss.calibrate(known(costs, [costs[0] - 25.0, -10.0]))
-        said, spent = 0.5 * said + 0.5 * values[0], 0.5 * spent + 0.5 * costs[0]
-        ratio = min(max(said / spent, 0.05), 0.2)
+        said, spent = 0.75 * said + 0.25 * values[0], 0.75 * spent + 0.25 * costs[0]
+        ratio = min(max(said / spent, 0.05), 0.2)  # one below, one within, one above
         assert loss.discounted_limit[0].item() == pytest.approx(25 * ratio, rel=1e-3)
         # critics that say that there is a cost where there is none
         assert loss.discounted_limit[1].item() == pytest.approx(1.0, rel=1e-3)

@@ -61,7 +61,8 @@ def test_adam_fits_linear_targets_and_explains_their_variance():
 
 def test_explained_variance_by_hand():
     target = torch.tensor([[0.0, 1.0, 5.0], [2.0, 3.0, 5.0]])
-    prediction = torch.tensor([[0.0, 2.0, 4.0], [2.0, 2.0, 6.0]])
+    # the first is off by the same everywhere, which is no variance
+    prediction = torch.tensor([[3.0, 2.0, 4.0], [5.0, 2.0, 6.0]])
     # Residual variances 0, 1 and 1 against target variances 1, 1 and 0.
     torch.testing.assert_close(
         explained_variance(prediction, target), torch.tensor([1.0, 0.0, 0.0])

@@ -49,6 +49,14 @@ def test_before_an_episode_has_finished_its_length_is_the_limit_of_steps():
     torch.testing.assert_close(estimate.mean, torch.tensor([30.0]))
 
 
+def test_the_length_of_an_episode_is_that_of_the_last_ones_above_all():
+    estimator = EpisodeCosts(1, max_length=1000, drift=None, memory=0.5)
+    for lengths in ([100.0, 100.0], [40.0]):
+        estimator.update(torch.zeros(2, 10, 1), torch.tensor(lengths))
+    # the two of the first batch count for one by now
+    assert estimator.length == 70
+
+
 @pytest.mark.parametrize("rows", [1, 2, 50])
 def test_the_standard_error_is_that_of_the_mean_over_many_batches(rows):
     torch.manual_seed(rows)

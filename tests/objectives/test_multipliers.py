@@ -1,10 +1,12 @@
 """Multipliers against hand-computed numbers and against torch's own Adam."""
 
 import math
+from functools import partial
 
 import pytest
 import torch
 
+from safe_rl.objectives import PIDMultiplier, PIMultiplier, ProjectedMultiplier
 from safe_rl.objectives.multipliers import LagrangeMultiplier, parse_cost_limits
 
 NU_OF_ONE = math.log(math.e - 1)
@@ -63,15 +65,29 @@ def test_nan_leaves_only_that_cost_unchanged():
     torch.testing.assert_close(multiplier.step, torch.tensor([3.0, 1.0]))
 
 
-def test_resume_is_exact():
-    one, other = lagrange([25.0, 5.0]), lagrange([1.0, 1.0], init=0.3)
-    for costs in ([40.0, 1.0], [33.0, 9.0]):
-        one.update(costs)
-    other.load_state_dict(one.state_dict())
-    one.update([10.0, 10.0])
-    other.update([10.0, 10.0])
-    assert torch.equal(one.value, other.value)
-    assert torch.equal(one.limits, other.limits)
+PID = {"kp": 0.1, "ki": 0.1, "kd": 0.1, "proportional_ema": 0.9, "derivative_ema": 0.8}
+KINDS = {
+    "lagrange": lagrange,
+    "pid": partial(PIDMultiplier, init=0.0, derivative_delay=3, scale="limit", **PID),
+    "pi": partial(PIMultiplier, init=0.0, kp=2.0, ki=0.2, saturation=1.0, highest=5.0),
+    "projected": partial(ProjectedMultiplier, init=0.0, lr=0.01, highest=2.0),
+}
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_nan_leaves_everything_unchanged_and_resume_is_exact(kind):
+    multiplier, resumed = (KINDS[kind]([limit, 5.0]) for limit in (10.0, 1.0))
+    for costs in ([14.0, 3.0], [33.0, 9.0]):
+        multiplier.update(costs)
+    before = {name: buffer.clone() for name, buffer in multiplier.state_dict().items()}
+    multiplier.update([math.nan] * 2)
+    for name, buffer in multiplier.state_dict().items():
+        assert torch.equal(buffer, before[name])
+    resumed.load_state_dict(before)
+    for each in (multiplier, resumed):
+        each.update([20.0, 9.0])
+    assert torch.equal(multiplier.value, resumed.value)
+    assert multiplier.value[0] > 0
 
 
 def test_moves_and_has_nothing_to_train():

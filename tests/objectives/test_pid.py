@@ -59,22 +59,6 @@ def test_integral_control_settles_where_the_plant_meets_the_limit():
     torch.testing.assert_close(multiplier.value, torch.tensor([2.0]), atol=1e-3, rtol=0)
 
 
-def test_nan_leaves_everything_unchanged_and_resume_is_exact():
-    settings = PLAIN | {"kp": 0.1, "ki": 0.1, "kd": 0.1, "derivative_delay": 3, "scale": "limit"}
-    settings |= {"proportional_ema": 0.9, "derivative_ema": 0.8}
-    multiplier = PIDMultiplier([10.0, 5.0], **settings)
-    multiplier.update([14.0, 3.0])
-    before = {name: buffer.clone() for name, buffer in multiplier.state_dict().items()}
-    multiplier.update([float("nan")] * 2)
-    for name, buffer in multiplier.state_dict().items():
-        assert torch.equal(buffer, before[name])
-    resumed = PIDMultiplier([1.0, 1.0], **settings)
-    resumed.load_state_dict(before)
-    for each in (multiplier, resumed):
-        each.update([20.0, 9.0])
-    assert torch.equal(multiplier.value, resumed.value)
-
-
 @pytest.mark.parametrize(
     ("settings", "message"),
     [

@@ -185,6 +185,20 @@ def test_costs_bootstrap_on_the_larger_of_two_networks_and_never_on_less_than_ca
     torch.testing.assert_close(found, error.square().sum((0, 2)).mean())
 
 
+@pytest.mark.parametrize("clip", [0.5, 3.0])
+def test_td3_learns_costs_for_actions_with_noise_that_is_cut_within_their_bounds(clip, monkeypatch):
+    loss, steps, given = make_loss("td3", lagrange(1.0, 1.0)), make_steps(), []
+    loss.policy_noise, loss.noise_clip = 1e9, clip
+    monkeypatch.setattr(
+        loss, "cost_qvalue_loss", lambda _, action: given.append(action) or torch.zeros(())
+    )
+    loss.critic_losses(steps)
+    without = loss.actor_network(steps["next"].clone())["action"].detach()
+    sides = torch.stack([(without + change).clamp(-1, 1) for change in (-clip, clip)])
+    assert (given[0] == sides).any(0).all()
+    assert (without.abs() < 0.5).all()  # so that one of the two is cut by the bounds
+
+
 @pytest.mark.parametrize("kind", ["sac", "td3"])
 def test_nothing_follows_an_end_but_something_a_time_out(kind):
     """Moving the target networks moves the losses of all steps but terminated ones."""

@@ -155,6 +155,18 @@ def test_the_actor_pays_the_tail_and_its_gradient_is_that_of_finite_differences(
         assert gradient[place].item() == pytest.approx(slope, abs=1e-6)
 
 
+@pytest.mark.parametrize(("lowest", "later"), [(None, 3.0), (4.0, 4.0)])
+def test_means_bootstrap_on_the_larger_of_two_and_never_on_less_than_can_be(lowest, later):
+    loss = make_loss(networks=4, target_pessimism=1.0, lowest_cost_value=lowest)
+    found, following = torch.tensor([[5.0, 6.0, 1.0, 1.0], [1.0, 3.0, 1.0, 1.0]]).view(2, 4, 1, 1)
+    errors = loss.cost_errors(found, torch.tensor([[6.0]]), torch.tensor([[0.5]]), following)
+    variance, target = np.log1p(np.e), 6.0 + 0.5 * later
+    for mean, error in zip((5.0, 6.0), errors.flatten().tolist(), strict=True):
+        wanted = target**2 + 0.25 * variance - mean**2
+        distance = (mean - target) ** 2 + (np.sqrt(variance) - np.sqrt(wanted)) ** 2
+        assert error == pytest.approx(distance, rel=1e-5)
+
+
 def test_the_whole_tail_is_the_mean():
     loss, plain = make_loss(tail=1.0, costs=("cost", "b")), make_loss(
         kind=SACLagrangianLoss, networks=1, costs=("cost", "b")

@@ -27,12 +27,12 @@ def test_bounds_of_means_are_below_them_in_one_case_of_twenty(name, number):
 
 
 def test_the_correction_is_for_skewed_costs_only():
-    symmetric = np.array([10.0, 20.0, 30.0, 40.0])
-    student = symmetric.mean() + stats.t.ppf(LEVEL, 3) * symmetric.std(ddof=1) / 2
-    assert mean_bound(symmetric, LEVEL) == pytest.approx(student)
-    skewed = np.array([0.0, 0.0, 0.0, 100.0])
-    student = skewed.mean() + stats.t.ppf(LEVEL, 3) * skewed.std(ddof=1) / 2
-    assert mean_bound(skewed, LEVEL) > student
+    # even, with a tail to the left, with one to the right
+    costs = np.array([[10.0, 20.0, 30.0, 40.0], [0.0, 100.0, 100.0, 100.0], [0.0, 0.0, 0.0, 100.0]])
+    student = costs.mean(1) + stats.t.ppf(LEVEL, 3) * costs.std(1, ddof=1) / 2
+    bounds = mean_bound(costs, LEVEL)
+    assert bounds[:2] == pytest.approx(student[:2])
+    assert bounds[2] > student[2]
 
 
 def test_students_bound_alone_would_be_wrong_too_often():
@@ -64,6 +64,31 @@ def test_of_many_policies_above_the_limit_hardly_ever_one_is_certified():
     rng, claim = np.random.default_rng(0), Claim({"cost": 25.0}, level=LEVEL)
     wrong = np.mean([certify(rng, [25.5] * 8, claim).certified is not None for _ in range(600)])
     assert wrong < 0.05
+
+
+@pytest.mark.parametrize(("most_over", "bounds"), [(1.0, 6), (0.3, 12)])
+def test_the_error_is_shared_out_among_all_bounds_of_all_tests(most_over, bounds):
+    costs = {"cost": np.arange(50.0), "cost_hazards": np.arange(50.0) % 7}
+    limits = {"cost": 25.0, "cost_hazards": 5.0}
+    found = Claim(limits, most_over=most_over, level=0.9).bounds(costs, tests=3)
+    level = 1 - 0.1 / bounds
+    expected = {f"mean_{key}": float(mean_bound(costs[key], level)) for key in limits}
+    if most_over < 1:
+        for key, limit in limits.items():
+            expected[f"over_limit_{key}"] = share_bound(costs[key], limit, level)
+    assert {name: bound for name, (bound, _) in found.items()} == pytest.approx(expected)
+
+
+def test_candidates_go_in_the_order_of_what_the_tests_will_ask_for():
+    rng, claim = np.random.default_rng(0), Claim({"cost": 100.0, "cost_hazards": 5.0})
+    means = [(99.0, 4.0), (90.0, 4.0), (110.0, 4.0), (90.0, 7.0)]
+    costs = [
+        {"cost": np.full(50, first), "cost_hazards": np.full(50, second)} for first, second in means
+    ]
+    # on average within its limit, but not by enough standard errors
+    costs[0]["cost"] += 20 * stats.zscore(rng.normal(size=50))
+    # then a tenth of a limit too much, and two fifths of another one
+    assert rank([[9.0], [5.0], [9.0], [9.0]], costs, claim) == [1, 0, 2, 3]
 
 
 def test_the_best_policy_that_keeps_the_limit_is_named():

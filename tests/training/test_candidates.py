@@ -5,6 +5,7 @@ import functools
 import pytest
 import torch
 
+from safe_rl.runs.outcome import keeps
 from safe_rl.training.candidates import Candidates, epochs_until_judged
 
 EPISODE = 1000
@@ -83,6 +84,15 @@ def test_limits_are_held_against_the_mean_of_the_epochs():
     # means of 24, 29, 23, 13, of which each judges the policy of the epoch before
     assert kept == [1, 3, 4]
     assert [one.steps for one in candidates.judge_all()] == candidates.waiting == [5]
+
+
+@pytest.mark.parametrize(
+    ("estimate", "target", "is_kept"),
+    [(24.0, 22.0, False), (24.0, 30.0, True), (28.0, 30.0, False)],
+)
+def test_an_estimate_has_to_be_at_its_target_and_within_the_limit(estimate, target, is_kept):
+    row = {"episode_cost": 20.0, "estimate_cost": estimate, "target_cost": target}
+    assert keeps(row, "cost", 25.0) is is_kept
 
 
 def test_who_was_judged_at_the_end_is_judged_again_by_epochs_that_come_later():
