@@ -61,7 +61,7 @@ def parse_options(arguments: Sequence[str], schema: type[Schema]) -> Schema:
         _check_name(key.partition(".")[0], schema)
 
     def read() -> DictConfig:
-        given = OmegaConf.to_container(OmegaConf.from_dotlist(list(arguments)))
+        given: Any = OmegaConf.to_container(OmegaConf.from_dotlist(list(arguments)))
         return OmegaConf.create(_with_values({**given, **_texts(arguments, given, schema)}))
 
     return _merged(schema, read, " ".join(arguments))
