@@ -116,8 +116,8 @@ FLOORS = {
         ("",),
     ),
     "objectives": (
-        ("keys", "distributions", "samples", "gae", "cpo_dual", "risk", "violation"),
-        ("episode_costs",),
+        ("keys", "distributions", "samples", "cpo_dual", "risk", "violation"),
+        ("episode_costs", "gae"),
         (
             "advantages",
             "critics",

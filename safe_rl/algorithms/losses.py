@@ -20,13 +20,23 @@ _PREFIX = "loss_"
 def sum_of_losses(losses: TensorDictBase) -> Tensor:
     """Sum of the entries that are named ``loss_…``, a scalar.
 
+    Raises:
+        ValueError: If one of them is not a single number.
+
     Examples:
         >>> from tensordict import TensorDict
         >>> losses = TensorDict(loss_actor=torch.tensor(1.0), loss_alpha=torch.tensor(2.0))
         >>> sum_of_losses(losses.set("entropy", torch.tensor(5.0)))
         tensor(3.)
     """
-    return torch.stack([v for k, v in losses.items() if k.startswith(_PREFIX)]).sum()
+    terms = {name: value for name, value in losses.items() if name.startswith(_PREFIX)}
+    for name, value in terms.items():
+        if value.numel() != 1:
+            raise ValueError(
+                f"{name!r} has shape {list(value.shape)}, and what is minimised is one number: "
+                "let the loss return the mean over its samples."
+            )
+    return torch.stack([value.reshape(()) for value in terms.values()]).sum()
 
 
 def divergence(losses: TensorDictBase) -> FloatingPointError:

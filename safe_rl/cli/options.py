@@ -61,10 +61,23 @@ def parse_options(arguments: Sequence[str], schema: type[Schema]) -> Schema:
         _check_name(key.partition(".")[0], schema)
 
     def read() -> DictConfig:
-        given = OmegaConf.to_container(OmegaConf.from_dotlist(list(arguments)))
-        return OmegaConf.create(_with_values(given))
+        given: Any = OmegaConf.to_container(OmegaConf.from_dotlist(list(arguments)))
+        return OmegaConf.create(_with_values({**given, **_texts(arguments, given, schema)}))
 
     return _merged(schema, read, " ".join(arguments))
+
+
+def _texts(
+    arguments: Sequence[str], given: Mapping[str, Any], schema: type[DataclassInstance]
+) -> dict[str, str]:
+    """Options that are texts as they were written, where YAML reads ``off``, ``007`` or ``1e3``."""
+    names = {field.name for field in fields(schema) if isinstance(field.default, str)}
+    written = dict(argument.split("=", 1) for argument in arguments)
+    return {
+        name: written[name]
+        for name in names & written.keys()
+        if not isinstance(given[name], str | None)
+    }
 
 
 def take_options(given: Mapping[str, Any], schema: type[Schema]) -> Schema:

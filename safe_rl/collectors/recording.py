@@ -163,7 +163,8 @@ def read_recording(folder: Path | str) -> TensorDict:
     pieces = _pieces(Path(folder))
     if not pieces:
         below = sorted(path for path in Path(folder).glob("*transitions*") if _pieces(path))
-        hint = f"that is {below[0]}." if below else "is it the folder of a recording?"
+        places = " or ".join(map(str, below))
+        hint = f"give {places}." if below else "is it the folder of a recording?"
         raise FileNotFoundError(f"{folder} holds no transitions: {hint}")
     batches = [_read(path) for path in pieces]
     for batch in batches:

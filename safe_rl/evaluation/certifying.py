@@ -88,7 +88,8 @@ def _unseen(verdict: Verdict) -> str:
         )
     return said + (
         "what unseen ones may cost at most, and the environment's spec does not say what that is. "
-        "Give the cost's spec an upper bound (Bounded instead of Unbounded)."
+        "Give the cost's spec an upper bound (Bounded instead of Unbounded); in Safety Gym's "
+        "environments env.constrain_indicator=true makes it 1 a step."
     )
 
 

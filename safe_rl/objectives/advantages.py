@@ -36,7 +36,9 @@ class VectorGAE(ValueEstimatorBase):
 
     Args:
         value_network: writes the value key, [..., T, F], one output per signal; None if the
-            values are in the TensorDict already, at the root and under ``"next"``.
+            values are in the TensorDict already, at the root and under ``"next"``. One with a
+            memory of its own, such as an ``LSTMModule``, is stepped with the policy: what it
+            remembers where trajectories end is read from the rollout.
         gamma: discount per step.
         lmbda: decay of the TD errors.
         value_target: ``"lambda_return"`` (advantage + value) or ``"return_to_go"`` (discounted

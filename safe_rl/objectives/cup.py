@@ -7,6 +7,7 @@ from tensordict import NestedKey, TensorDictBase
 from tensordict.nn import ProbabilisticTensorDictSequential
 from torch import Tensor
 from torch.distributions import Distribution
+from torchrl.modules import set_recurrent_mode
 
 from safe_rl.objectives.distributions import has_closed_kl
 from safe_rl.objectives.multipliers import Multiplier
@@ -93,8 +94,9 @@ class CUPLoss(SurrogateLoss):
     def anchor(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write the present policy's parameters into a batch, as π½, and return the batch."""
         observed = tensordict.select(*self.actor_network.in_keys)
-        with self.actor_network_params.to_module(self.actor_network, preserve_module_state=False):
-            parameters = self.actor_network.get_dist_params(observed)
+        actor, weights = self.actor_network, self.actor_network_params
+        with weights.to_module(actor, preserve_module_state=False), set_recurrent_mode(True):
+            parameters = actor.get_dist_params(observed)
         for name, key in self._parameter_keys.items():
             tensordict[ANCHOR, str(name)] = parameters.get(key).clone()
         return tensordict

@@ -9,6 +9,7 @@ from tensordict import TensorDictBase
 from tensordict.nn import ProbabilisticTensorDictSequential
 from torch import Tensor, nn
 from torch.distributions import Categorical, Distribution, Normal
+from torchrl.modules import set_recurrent_mode
 
 from safe_rl.objectives.distributions import ReferencePolicy, root, sampler_of
 from safe_rl.objectives.trust_region import flatten, policy_in, unflatten
@@ -123,7 +124,7 @@ class FisherProduct:
     ) -> None:
         self.parameters, self.damping = list(parameters), damping
         # cuDNN's recurrent networks cannot be differentiated twice
-        with torch.backends.cudnn.flags(enabled=False):
+        with torch.backends.cudnn.flags(enabled=False), set_recurrent_mode(True):
             self._outputs, self._metric = policy_geometry(actor_network, batch)
         self._dummies = [torch.zeros_like(output, requires_grad=True) for output in self._outputs]
         self._vjp = torch.autograd.grad(

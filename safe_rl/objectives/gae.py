@@ -5,7 +5,10 @@ from __future__ import annotations
 from tensordict import NestedKey, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
+from torchrl.modules import set_recurrent_mode
 from torchrl.objectives.value.functional import vec_generalized_advantage_estimate
+
+from safe_rl.objectives.samples import FIRST
 
 
 def trajectory_ends(done: Tensor, mask: Tensor | None) -> Tensor:
@@ -26,7 +29,9 @@ def one_pass_values(
     """Value every observation of a rollout once.
 
     Inside a trajectory the next observation of step t is the root observation of step t + 1,
-    so that only the observations at which trajectories end are valued in addition.
+    so that only the observations at which trajectories end are valued in addition. A network with
+    a memory reads the rollout as sequences, and those observations as sequences of one step, with
+    what it remembered there.
 
     Args:
         tensordict: rollout [..., T] with the network's in_keys, also under ``"next"``.
@@ -37,10 +42,15 @@ def one_pass_values(
     Returns:
         Values of the root observations and of the next observations, both [..., T, F].
     """
-    value = value_network(tensordict.select(*value_network.in_keys)).get(key)
-    last = tensordict.get("next").select(*value_network.in_keys)[ends]
+    in_keys = value_network.in_keys
+    last = tensordict.get("next").select(*in_keys)[ends]
+    if FIRST in in_keys:
+        last = last.unsqueeze(-1)
+    with set_recurrent_mode(True):
+        value = value_network(tensordict.select(*in_keys)).get(key)
+        value_at_ends = value_network(last).get(key)
     next_value = value.roll(-1, dims=-2)
-    next_value[ends] = value_network(last).get(key)
+    next_value[ends] = value_at_ends.reshape(-1, value.shape[-1])
     return value, next_value
 
 

@@ -288,7 +288,7 @@ def require_multiplier(multiplier: Multiplier, plain_loss: str) -> Multiplier:
     """
     if not isinstance(multiplier, Multiplier):
         raise TypeError(
-            f"A Lagrangian loss needs a LagrangeMultiplier or a PIDMultiplier, got {multiplier!r}: "
-            f"without constraints use {plain_loss}."
+            f"A Lagrangian loss needs a Multiplier, such as a LagrangeMultiplier, got "
+            f"{multiplier!r}: without constraints use {plain_loss}."
         )
     return multiplier

@@ -10,6 +10,7 @@ from tensordict import TensorDictBase
 from tensordict.nn import ProbabilisticTensorDictSequential
 from torch import Tensor, nn
 from torch.distributions import Distribution
+from torchrl.modules import set_recurrent_mode
 
 from safe_rl.objectives.distributions import ReferencePolicy
 
@@ -49,8 +50,9 @@ def flat_gradient(
 def policy_in(
     actor_network: ProbabilisticTensorDictSequential, batch: TensorDictBase
 ) -> Distribution:
-    """Distribution of the policy in the states of a batch."""
-    return actor_network.get_dist(batch.select(*actor_network.in_keys))
+    """Distribution of the policy in the states of a batch; one with a memory reads sequences."""
+    with set_recurrent_mode(True):
+        return actor_network.get_dist(batch.select(*actor_network.in_keys))
 
 
 @torch.no_grad()

@@ -111,8 +111,9 @@ def _check_sizes(
         )
     if set(own) != set(given):
         raise CheckpointError(
-            f"The {name} of {checkpoint} scales its inputs and this run's does not, or the other "
-            "way round: set model.input_scale as in the other run's config.yaml."
+            f"The {name} of {checkpoint} scales or normalises its inputs and this run's does not, "
+            "or the other way round: set model.input_scale and model.normalise as in the other "
+            "run's config.yaml."
         )
     shapes = [_shapes(weights) for weights in (own, given)]
     if other := next((key for key in own if shapes[0][key] != shapes[1][key]), None):

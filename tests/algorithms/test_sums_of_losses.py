@@ -1,5 +1,6 @@
 """The sum that updates minimise, and what they say when it is no number."""
 
+import pytest
 import torch
 from tensordict import TensorDict
 
@@ -17,6 +18,16 @@ def test_what_is_no_loss_is_neither_summed_nor_blamed():
     said = str(divergence(LOSSES))
     assert said.startswith("'loss_qvalue' is inf: training has diverged.")
     assert "cost_weight" not in said
+
+
+@pytest.mark.parametrize("shape", [(40, 1), (40,)])
+def test_a_loss_of_every_sample_is_named(shape):
+    """Alone it would be summed instead of averaged, beside others it cannot be stacked."""
+    losses = TensorDict(loss_more=torch.ones(shape))
+    for given in (losses, losses.clone().set("loss_objective", torch.tensor(1.0))):
+        with pytest.raises(ValueError, match=r"'loss_more' has shape \[40.*mean"):
+            sum_of_losses(given)
+    assert sum_of_losses(TensorDict(loss_a=torch.ones(1), loss_b=torch.tensor(2.0))) == 3
 
 
 def test_a_sum_beyond_all_numbers_is_said_to_be_one():

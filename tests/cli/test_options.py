@@ -35,6 +35,12 @@ def test_mappings_are_read_as_training_reads_them():
     assert options.env == {"kwargs": {"a": {"b": 1.5}, "c": [1, 2]}}
 
 
+@pytest.mark.parametrize("name", ["off", "yes", "007", "1e3", "2.50", "'a b'", "x=y"])
+def test_names_stay_as_they_are_written(name):
+    """Evaluations of other names are not to be written over one another."""
+    assert parse_options([f"name={name}"], EvaluationOptions).name == name.strip("'")
+
+
 @pytest.mark.parametrize(
     ("argument", "message"),
     [

@@ -41,7 +41,9 @@ def test_a_recording_is_what_was_collected(tmp_path):
     with pytest.raises(FileNotFoundError, match=r"holds no transitions: is it the folder of a rec"):
         read_recording(tmp_path / "elsewhere")
     Recording(tmp_path / "run" / "transitions", PointMass.cost_keys).write(0, batches[0])
-    with pytest.raises(FileNotFoundError, match=r"that is .*/run/transitions"):
+    Recording(tmp_path / "run" / "evaluation.transitions", ["cost"]).write(0, batches[0])
+    both = r"give .*/run/evaluation\.transitions or .*/run/transitions\.$"
+    with pytest.raises(FileNotFoundError, match=both):
         read_recording(tmp_path / "run")
 
 

@@ -133,6 +133,8 @@ def test_their_sensors_are_found_by_type_and_name(make):
     assert sizes == {"elbow_pos": 2, "elbow_vel": 1, "goal_lidar": 10, "speed": 3}
     without = make(DISC, sensors_obs=["speed"], sensors_hinge_joints=False)
     assert list(without.observation_layout) == ["speed"]
+    listed = make(DISC, sensors_obs=["elbow_vel", "speed", "elbow_pos"], observe_goal_lidar=True)
+    assert listed.observation_layout == env.observation_layout
     assert list(make(BALL).observation_layout) == ["gyro"]
 
 

@@ -1,6 +1,7 @@
 """Keys registered from outside the package: validation, pickling, Hydra, and refused rows."""
 
 import pickle
+from dataclasses import replace
 
 import pytest
 import torch
@@ -92,6 +93,18 @@ WRONG = {
     "contacts with nothing known": (
         lambda: register_cost(Cost("cost_mines", bool, follow, touches=("pilars",))),
         "'pilars'.*'pillars'",
+    ),
+    "a kind without its tuple": (
+        lambda: register_cost(Cost("cost_mines", bool, follow, touches="pillars")),
+        r"'pillars' is a text: .*\('pillars',\)",
+    ),
+    "an unknown element at the origin": (
+        lambda: register_task("follow", Task(follow, at_origin=("gaol",))),
+        "'gaol'.*'goal'",
+    ),
+    "a motion by its name": (
+        lambda: register_element(replace(disc("mines", "mine"), motion="virtual")),
+        r"'mines': motion='virtual'.*Motion\.VIRTUAL",
     ),
     "a built-in observation": (
         lambda: register_observation(Reading("com", bool, len, len)),

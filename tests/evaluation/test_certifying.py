@@ -162,6 +162,7 @@ def test_a_cost_without_a_largest_is_said_in_words_and_written_as_json(tmp_path)
     verdict = Verdict(None, [0], {"mean_cost": (math.inf, 25.0)}, {"mean_cost": math.inf}, ["cost"])
     certificate = Certificate(None, math.nan, verdict, OPTIONS)
     assert "the environment's spec does not say" in str(certificate)
+    assert "env.constrain_indicator=true" in str(certificate)
 
     def refuse(constant):
         raise AssertionError(f"{constant} is no JSON")

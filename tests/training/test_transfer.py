@@ -72,6 +72,7 @@ def test_a_checkpoint_can_be_named(trained):
     [
         ("model.hidden_sizes=[8, 8]", r"4 → 16 → 2 numbers, this run's has 4 → 8 → 8 → 2"),
         ("model.input_scale={position: 0.5}", "set model.input_scale"),
+        ("model.normalise=10", "set .*model.normalise as in the other"),
     ],
 )
 def test_other_sizes_are_named_and_nothing_changes(trained, override, message):

@@ -102,6 +102,9 @@ def register_element(element: Element, keys: Mapping[str, Any] | None = None) ->
         0.1
     """
     _refuse_taken("element", element.kind)
+    if not isinstance(element.motion, Motion):
+        names = ", ".join(f"Motion.{motion.name}" for motion in Motion)
+        raise ConfigError(f"'{element.kind}': motion={element.motion!r} must be one of {names}.")
     others = [row for row in ELEMENTS if row.kind != element.kind]
     if element.label in {"robot", "floor", *(row.label for row in others)}:
         raise ConfigError(f"Another object is called '{element.label}': choose another label.")
@@ -131,7 +134,8 @@ def register_task(name: str, task: Task, keys: Mapping[str, Any] | None = None) 
         >>> register_task("away", away, keys={"reward_away": 0.5})
     """
     _refuse_taken("task", name)
-    _refuse_unknown_kinds((*task.elements, *task.touches))
+    for kinds in (task.elements, task.touches, task.at_origin):
+        _refuse_unknown_kinds(kinds)
     if task.met is not None and "goal" not in task.elements:
         raise ConfigError(f"Task '{name}' meets goals: add 'goal' to its elements.")
     _add_keys(keys)
@@ -210,6 +214,8 @@ def _refuse_taken(what: str, name: str) -> None:
 
 
 def _refuse_unknown_kinds(kinds: Iterable[str]) -> None:
+    if isinstance(kinds, str):
+        raise ConfigError(f"'{kinds}' is a text: kinds are given in a tuple, ('{kinds}',).")
     for kind in kinds:
         if kind not in BY_KIND:
             raise ConfigError(

@@ -63,7 +63,8 @@ def sensor_blocks(config: SafetyGymConfig, scene: Scene) -> list[Block]:
     if config.sensors_ball_joints:
         raw += _joint_sensors(scene, sensor.mjSENS_BALLANGVEL, joint.mjJNT_BALL)
         quaternions += _joint_sensors(scene, sensor.mjSENS_BALLQUAT, joint.mjJNT_BALL)
-    raw = list(dict.fromkeys(raw))
+    # as in 2019, a sensor that is listed and of a joint is observed once, and as one of a joint
+    raw = [i for i in dict.fromkeys(raw) if i not in (*angles, *quaternions)]
     if not config.sensors_angle_components:
         raw, angles, quaternions = raw + angles + quaternions, [], []
     readers = ((raw, _read_raw), (angles, _read_angles), (quaternions, _read_rotations))
