@@ -39,7 +39,7 @@ WRONG = {
     "+checkpoint.kept=1": "checkpoint.kept: nothing reads.*'checkpoint.keep_last'",
     "+lagrangian.kpp=1": "Did you mean 'lagrangian.kp'",
     "+logger.path=x": "logger.path: nothing reads",
-    "~logger": "logger is missing: .*logger=none for nothing",
+    "~logger": "logger is missing: .*logger=none: nowhere",
     "~frames": "'frames' not found",
     "transforms.saute.budgets.cost=1": r"budgets are given all at once, as .*='\{cost: 1\}'",
     "model.input_scale.gyro=1": r"factors are given all at once, as .*='\{gyro: 1\}'",

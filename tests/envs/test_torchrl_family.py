@@ -281,7 +281,7 @@ def test_costs_may_stand_beside_the_reward_already(trusted, named):
     assert torch.equal(after["cost"], after["cost_effort"])
 
 
-def test_costs_of_ranges_are_bounded_in_the_spec_and_others_are_not():
+def test_costs_of_ranges_are_bounded_in_the_spec_and_others_are_not(trusted):
     env = make_env(PENDULUM, num_envs=2, seed=0)
     bounds = {key: env.full_reward_spec[key].high.max().item() for key in env.cost_keys}
     assert bounds == dict.fromkeys(["cost", *OUTSIDE], 1.0)

@@ -142,7 +142,7 @@ def test_errors_say_what_to_change():
         cup_loss(actor, 1.0)(batch)
     with pytest.raises(ValueError, match="below 1"):
         cup_loss(actor, 1.0, gamma=1.0)
-    with pytest.raises(TypeError, match="needs a LagrangeMultiplier"):
+    with pytest.raises(TypeError, match="needs a Multiplier, such as a LagrangeMultiplier"):
         CUPLoss(actor, None, gamma=0.99, lmbda=0.97, entropy_coeff=0.0)
     actor, sampled = truncated_case()
     loss = cup_loss(actor, 1.0)
