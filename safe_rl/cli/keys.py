@@ -85,7 +85,7 @@ KEYS = {
     "transforms": Key(
         mapping_of(component), "what changes the problem: transforms=[saute]", may_lack=True
     ),
-    "logger": Key(_SECTION, "where columns go besides progress.csv: logger=wandb; logger=none: nowhere"),
+    "logger": Key(_SECTION, "where else columns go: logger=wandb; logger=none: nowhere"),
     "env.name": Key(_FOLDER_OF_ENV, "name of the environment"),
     "algo.name": Key(folder_name, "name of the algorithm"),
     "checkpoint.interval": Key(number(0), "seconds between checkpoints"),
