@@ -42,9 +42,7 @@ def run(*words):
 
 
 def test_it_is_trained_resumed_and_evaluated_by_the_ordinary_commands(tmp_path):
-    # with workers, which have to import it too
-    status, printed = run("train.py", IMPORT, *MINES, *SHORT, "collector=process",
-                          f"hydra.run.dir={tmp_path}")  # fmt: skip
+    status, printed = run("train.py", IMPORT, *MINES, *SHORT, f"hydra.run.dir={tmp_path}")
     assert status == 0, printed
     assert "estimate_cost_mines" in read_table(tmp_path / "progress.csv")
     status, printed = run("train.py", f"resume={tmp_path}", "frames=160")
@@ -66,7 +64,8 @@ def test_it_is_trained_resumed_and_evaluated_by_the_ordinary_commands(tmp_path):
 
 @pytest.mark.slow
 def test_it_is_swept_and_reported(tmp_path):
-    status, printed = run("train.py", "-m", IMPORT, *MINES, *SHORT, "seed=0,1",
+    # with workers, which have to import it too
+    status, printed = run("train.py", "-m", IMPORT, *MINES, *SHORT, "seed=0,1", "collector=process",
                           "hydra.launcher.n_jobs=2", f"hydra.sweep.dir={tmp_path}")  # fmt: skip
     assert status == 0, printed
     assert "2 of 2 runs are finished" in printed
