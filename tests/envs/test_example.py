@@ -41,6 +41,7 @@ def run(*words):
     return result.returncode, result.stdout + result.stderr
 
 
+@pytest.mark.slow  # docs/test_walk.py does as much with the guide's environment
 def test_it_is_trained_resumed_and_evaluated_by_the_ordinary_commands(tmp_path):
     status, printed = run("train.py", IMPORT, *MINES, *SHORT, f"hydra.run.dir={tmp_path}")
     assert status == 0, printed

@@ -288,6 +288,7 @@ def test_a_copy_goes_on_as_the_original_does(copied):
         assert torch.equal(got["next", key], expected["next", key])
 
 
+@pytest.mark.slow
 def test_a_copy_with_workers_begins_where_the_seed_does():
     env = from_gymnasium(
         "Walk-v0", num_envs=3, num_steps=7, cost_keys=["fast", "far"], seed=1, workers=1
