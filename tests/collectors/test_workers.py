@@ -211,8 +211,8 @@ if __name__ == "__main__":
     ("trouble", "reason"),
     [
         (end, r"has died \(exit code 9"),
-        pytest.param(stop, "stands still .* stopped by a signal", marks=pytest.mark.slow),
-        pytest.param(fail, "too many worlds", marks=pytest.mark.slow),
+        (stop, "stands still .* stopped by a signal"),
+        (fail, "too many worlds"),
     ],
 )
 def test_a_worker_in_trouble_while_it_starts_ends_the_run_with_the_reason(

@@ -41,9 +41,10 @@ def run(*words):
     return result.returncode, result.stdout + result.stderr
 
 
-@pytest.mark.slow  # docs/test_walk.py does as much with the guide's environment
 def test_it_is_trained_resumed_and_evaluated_by_the_ordinary_commands(tmp_path):
-    status, printed = run("train.py", IMPORT, *MINES, *SHORT, f"hydra.run.dir={tmp_path}")
+    # with workers, which have to import it too
+    status, printed = run("train.py", IMPORT, *MINES, *SHORT, "collector=process",
+                          f"hydra.run.dir={tmp_path}")  # fmt: skip
     assert status == 0, printed
     assert "estimate_cost_mines" in read_table(tmp_path / "progress.csv")
     status, printed = run("train.py", f"resume={tmp_path}", "frames=160")
@@ -65,8 +66,7 @@ def test_it_is_trained_resumed_and_evaluated_by_the_ordinary_commands(tmp_path):
 
 @pytest.mark.slow
 def test_it_is_swept_and_reported(tmp_path):
-    # with workers, which have to import it too
-    status, printed = run("train.py", "-m", IMPORT, *MINES, *SHORT, "seed=0,1", "collector=process",
+    status, printed = run("train.py", "-m", IMPORT, *MINES, *SHORT, "seed=0,1",
                           "hydra.launcher.n_jobs=2", f"hydra.sweep.dir={tmp_path}")  # fmt: skip
     assert status == 0, printed
     assert "2 of 2 runs are finished" in printed

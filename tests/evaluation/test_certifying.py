@@ -89,7 +89,6 @@ def test_an_interrupted_certificate_leaves_the_policy_of_before(train, monkeypat
     assert list(before.parent.iterdir()) == [before]
 
 
-@pytest.mark.slow
 def test_a_new_certificate_takes_the_place_of_the_one_before(train):
     directory = train("{cost: 1000}")
     before = certify(directory, OPTIONS, make_env=make_env).checkpoint

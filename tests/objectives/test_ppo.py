@@ -170,7 +170,7 @@ def test_multiplier_update_reaches_the_loss_and_is_not_trained_by_it():
     assert loss(batch)["loss_objective"] != before
 
 
-@pytest.mark.parametrize("backend", ["eager", pytest.param("aot_eager", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("backend", ["eager", "aot_eager"])
 def test_compiles_in_one_graph_that_is_never_recompiled(backend):
     torch._dynamo.reset()
     actor = make_actor()

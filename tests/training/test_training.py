@@ -43,7 +43,6 @@ LEARNING = [
 ]
 
 
-@pytest.mark.slow
 def test_ppo_learns_and_pays_the_cost(tmp_path):
     _, table = train(tmp_path, *LEARNING, "algo=ppo", "cost_limits={cost_hazards: 1.0}")
     assert table["episode_return"][-1] > table["episode_return"][0] + 0.5
