@@ -18,7 +18,7 @@ import numpy as np
 
 from safe_rl.reporting.cleaning import clean
 from safe_rl.reporting.measured import read_certificate, read_code, read_evaluation
-from safe_rl.runs.files import read_config, read_notes
+from safe_rl.runs.files import read_config, read_yaml
 from safe_rl.runs.folder import RunFolder, paths_below, runs_below
 from safe_rl.runs.outcome import final_figures, judges_another_measure, violation
 from safe_rl.runs.table import read_table
@@ -187,7 +187,7 @@ def _read_run(folder: RunFolder, root: Path, unfinished: bool, skipped: dict[Pat
         return [path] if os.path.lexists(path) else []
 
     notes = (folder.surroundings, folder.overrides, folder.composed)
-    hydra, said, begun_with = (next(iter(read(there(n), read_notes)), None) for n in notes)
+    hydra, said, begun_with = (next(iter(read(there(n), read_yaml)), None) for n in notes)
     overrides = tuple(map(clean, said)) if isinstance(said, list) else None
     cwd = _select(hydra, "hydra", "runtime", "cwd")
     return Run(

@@ -3,21 +3,44 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterator
+import re
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import yaml
-from omegaconf import OmegaConf
-from omegaconf.errors import OmegaConfBaseException
 
-__all__ = ["check_place", "read_config", "read_notes", "read_yaml", "replacing"]
+__all__ = ["check_place", "read_config", "read_yaml", "replacing"]
 
 # of a configuration; that of a run has about six thousand
 _MOST_LETTERS = 1_000_000
-# of libyaml, where PyYAML has it
-_Loader: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
+
+
+class _Loader(getattr(yaml, "CSafeLoader", yaml.SafeLoader)):  # type: ignore[misc]
+    """Reads YAML as OmegaConf does, which writes runs' files, in a tenth of its time.
+
+    1e-4 is a number, a date is a text, and equal keys are an error.
+    """
+
+    # texts to PyYAML, whose floats have a point, and whose exponents have a sign
+    _WITH_EXPONENT = re.compile(r"[-+]?\d+(_\d+)*(\.[\d_]*)?[eE][-+]?\d+$")
+
+    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
+        names = [key.value for key, _ in node.value if isinstance(key, yaml.ScalarNode)]
+        if len(set(names)) < len(names):
+            twice = next(name for name in names if names.count(name) > 1)
+            raise yaml.constructor.ConstructorError(
+                None, None, f"{twice} is there twice", node.start_mark
+            )
+        return super().construct_mapping(node, deep)
+
+
+_Loader.yaml_implicit_resolvers = {
+    letter: [(tag, form) for tag, form in resolvers if not tag.endswith(":timestamp")]
+    for letter, resolvers in _Loader.yaml_implicit_resolvers.items()
+}
+_Loader.add_implicit_resolver("tag:yaml.org,2002:float", _Loader._WITH_EXPONENT, [*"-+0123456789"])
 
 
 def read_yaml(path: Path) -> Any:
@@ -27,33 +50,16 @@ def read_yaml(path: Path) -> Any:
         ValueError: If it is none, or has aliases, which could grow without end.
         OSError: If it cannot be read.
     """
-    # which reads numbers as runs write them, such as 1e-4
-    return _read(path, lambda text: OmegaConf.to_container(OmegaConf.create(text), resolve=False))
-
-
-def read_notes(path: Path) -> Any:
-    """Read what Hydra has noted of a run, of which texts and whole numbers are needed.
-
-    As :func:`read_yaml`, but in a tenth of the time, which is most of a report's on many runs: no
-    number such as 1e-4 is looked for, and later ones of equal keys count.
-
-    Raises:
-        ValueError: As by `read_yaml`.
-        OSError: If it cannot be read.
-    """
-    return _read(path, lambda text: yaml.load(text, Loader=_Loader))
-
-
-def _read(path: Path, parse: Callable[[str], Any]) -> Any:
     try:
         text = path.read_text(encoding="utf-8")
         if len(text) > _MOST_LETTERS:
-            raise ValueError(f"{path.name} is longer than any configuration of a run")
+            raise ValueError("it is longer than any configuration of a run")
         # without a star there is none, and reading hundreds of runs takes a fifth less
         if "*" in text and any(isinstance(token, yaml.AliasToken) for token in yaml.scan(text)):
-            raise ValueError(f"{path.name} has YAML aliases, which no run writes")
-        return parse(text)
-    except (yaml.YAMLError, OmegaConfBaseException, UnicodeDecodeError, RecursionError) as error:
+            raise ValueError("it has YAML aliases, which no run writes")
+        return yaml.load(text, Loader=_Loader)
+    # PyYAML looks a value such as `!!bool perhaps` up, and reports what that raises
+    except (yaml.YAMLError, ValueError, LookupError, RecursionError) as error:
         reason = (str(error) or type(error).__name__).splitlines()[0]
         raise ValueError(f"{path.name} cannot be read ({reason})") from error
 
