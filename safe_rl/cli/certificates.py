@@ -76,6 +76,8 @@ def certificate_options(
     own = dict(config.get("certificate") or {})
     if not own.get("episodes", 1):  # the run was to end without a certificate
         del own["episodes"]
+    if own:
+        options["retest"] = 0  # of runs of before there was one
     options |= own
     for name, value in (changes or {}).items():
         _check_change(name, value, options)

@@ -104,6 +104,9 @@ KEYS = {
     ),
     "certificate.episodes": Key(count(0, 10**6), "new episodes of a test; 0: none", may_lack=True),
     "certificate.tests": Key(count(1, 1000), "candidates tested at most", may_lack=True),
+    "certificate.retest": Key(
+        count(0, 1000), "if none passes: times the episodes of one more test", may_lack=True
+    ),
     "certificate.level": Key(
         number(0.5, 1, above=True, below=True), "confidence of a certificate", may_lack=True
     ),

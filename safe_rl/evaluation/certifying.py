@@ -7,6 +7,7 @@ import math
 import shutil
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -36,6 +37,8 @@ class CertificateOptions:
         ranking: Episodes of every candidate by which candidates are put in order.
         episodes: Fresh episodes of every candidate that is tested.
         tests: Candidates tested at most.
+        retest: Where all of them fall short, one is tested once more, on so many times the
+            episodes; 0 for no such test.
         level: Confidence of the statement, in (0.5, 1).
         most_over: Largest share of episodes that may cost more than a limit; 1 asks for nothing.
     """
@@ -45,6 +48,7 @@ class CertificateOptions:
     tests: int
     level: float
     most_over: float
+    retest: int = 0
 
 
 @dataclass(frozen=True)
@@ -103,7 +107,8 @@ def certify(
 ) -> Certificate | None:
     """Find and certify the best checkpoint of a run that keeps its limits.
 
-    All checkpoints are ranked by episodes of their own; the first of them are tested on fresh ones.
+    All checkpoints are ranked by episodes of their own; the first of them are tested on fresh ones,
+    and the one that falls short least, if all do, on more.
     The result is written to ``certificate.json``, the policy kept as ``checkpoint=certified``.
 
     Args:
@@ -128,12 +133,20 @@ def certify(
     order = rank([e.returns.numpy() for e in first], [_costs(e) for e in first], claim)
     returns: dict[int, float] = {}
 
-    def collect(number: int) -> dict[str, np.ndarray]:
-        episodes = runner.run(candidates[number], options.episodes, purpose=1)
-        returns[number] = episodes.returns.mean().item()
-        return _costs(episodes)
+    def collect(number: int, episodes: int, purpose: int) -> dict[str, np.ndarray]:
+        found = runner.run(candidates[number], episodes, purpose)
+        returns[number] = found.returns.mean().item()
+        return _costs(found)
 
-    verdict = first_certified(order, collect, claim, options.tests)
+    verdict = first_certified(
+        order,
+        partial(collect, episodes=options.episodes, purpose=1),
+        claim,
+        options.tests,
+        partial(collect, episodes=options.retest * options.episodes, purpose=2)
+        if options.retest
+        else None,
+    )
     kept = None if verdict.certified is None else candidates[verdict.certified]
     episode_return = math.nan if verdict.certified is None else returns[verdict.certified]
     certificate = Certificate(_keep(folder, kept), episode_return, verdict, options)

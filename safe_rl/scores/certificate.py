@@ -132,6 +132,14 @@ class Claim:
         bounds = self.bounds(costs, tests)
         return {name: bound - most for name, (bound, most) in bounds.items() if bound > most}
 
+    def may_hold(self, costs: Mapping[str, ArrayLike]) -> bool:
+        """Whether the claim holds of these episodes themselves, so that more might show it."""
+        return all(
+            np.mean(values) < limit and np.mean(~(values <= limit)) <= self.most_over
+            for key, limit in self.limits.items()
+            for values in [np.asarray(costs[key], dtype=float)]
+        )
+
     def alike(self, costs: Mapping[str, ArrayLike]) -> list[str]:
         """Names of costs that were the same in all episodes, [E] each."""
         return [key for key in self.limits if _are_alike(costs[key])]
@@ -143,7 +151,8 @@ class Verdict:
 
     Attributes:
         certified: Number of the policy that is certified, or None.
-        tested: Numbers of the policies that were tested, in this order.
+        tested: Numbers of the policies that were tested, in this order: twice that of one whose
+            second test was on more episodes.
         bounds: Of the policy that is certified, or else of the one that fell short least: name ->
             (bound, what it has to keep).
         shortfalls: Of the same policy, if none is certified.
@@ -203,6 +212,7 @@ def first_certified(
     collect: Callable[[int], Mapping[str, ArrayLike]],
     claim: Claim,
     tests: int,
+    collect_more: Callable[[int], Mapping[str, ArrayLike]] | None = None,
 ) -> Verdict:
     """Test candidates in order on fresh episodes until one is certified.
 
@@ -211,6 +221,9 @@ def first_certified(
         collect: Episode costs of a candidate that had no part in the order.
         claim: What is to be certified.
         tests: Candidates tested at most: the fewer, the sharper each test.
+        collect_more: Costs of more episodes, none of which was in another test. If no candidate is
+            certified, the one that fell short least has one more test on these, where its episodes
+            so far keep the limits; it shares the error of all tests. None for none.
 
     Examples:
         >>> costs = [[26.0, 30.0, 31.0], [15.0, 16.0, 14.0]]
@@ -218,16 +231,33 @@ def first_certified(
         >>> first_certified([0, 1], collect, Claim({"cost": 25.0}), tests=2).certified
         1
     """
+    in_all = tests + (collect_more is not None)
     tested: list[int] = []
-    fell_short: list[Verdict] = []
-    for candidate in order[:tests]:
-        costs = collect(candidate)
+
+    def test(candidate: int, costs: Mapping[str, ArrayLike]) -> Verdict:
         tested.append(candidate)
-        bounds = claim.bounds(costs, tests)
-        missing = claim.shortfalls(costs, tests)
+        bounds, missing = claim.bounds(costs, in_all), claim.shortfalls(costs, in_all)
         if not missing:
             return Verdict(candidate, tested, bounds)
-        fell_short.append(Verdict(None, tested, bounds, missing, claim.alike(costs)))
-    return min(
-        fell_short, key=lambda one: max(one.shortfalls.values()), default=Verdict(None, tested)
-    )
+        return Verdict(None, tested, bounds, missing, claim.alike(costs))
+
+    fell_short: dict[int, Verdict] = {}
+    hopeful: list[int] = []
+    for candidate in order[:tests]:
+        costs = collect(candidate)
+        verdict = test(candidate, costs)
+        if verdict.certified is not None:
+            return verdict
+        fell_short[candidate] = verdict
+        if claim.may_hold(costs):
+            hopeful.append(candidate)
+    verdicts = list(fell_short.values())
+    if collect_more is not None and hopeful:
+        nearest = min(hopeful, key=lambda number: _furthest(fell_short[number]))
+        verdicts.append(test(nearest, collect_more(nearest)))
+    return min(verdicts, key=_furthest, default=Verdict(None, tested))
+
+
+def _furthest(verdict: Verdict) -> float:
+    """By how much the worst bound exceeds what it has to keep; 0 of what is certified."""
+    return max(verdict.shortfalls.values(), default=0.0)

@@ -28,6 +28,14 @@ def test_runs_of_before_certificates_and_measures_get_the_packages_options():
     assert certificate_options(old) == certificate_options(compose_config())
 
 
+def test_a_run_of_before_second_tests_has_none_unless_asked_for():
+    section = dict(compose_config().certificate)
+    del section["retest"]
+    old = OmegaConf.create({"cost_limits": {"cost": 25.0}, "certificate": section})
+    assert certificate_options(old).retest == 0
+    assert certificate_options(old, {"retest": 2}).retest == 2
+
+
 @pytest.mark.parametrize(
     ("overrides", "cost_keys", "is_to"),
     [

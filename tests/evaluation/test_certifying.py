@@ -134,6 +134,28 @@ def test_a_fixed_layout_is_certified_as_it_was_learned(train):
     assert 3 not in met
 
 
+def test_the_second_test_of_the_nearest_is_on_more_episodes_of_other_worlds(train):
+    met = []
+
+    def make(node, *, num_envs, seed, **keys):
+        met.append((num_envs, seed))
+        return make_env(node, num_envs=num_envs, seed=seed, **keys)
+
+    directory = train("{cost: 1000}")
+    once = replace(OPTIONS, tests=1, retest=3)
+    bound = certify(directory, once, make_env=make).verdict.bounds["mean_cost"][0]
+    config = directory / "config.yaml"
+    config.write_text(config.read_text().replace("cost: 1000", f"cost: {bound - 1e-3}"))
+    met.clear()
+    certificate = certify(directory, once, make_env=make)
+    first, again = certificate.verdict.tested
+    assert first == again
+    (*_, tested, retested) = met
+    assert [num_envs for num_envs, _ in (tested, retested)] == [12, 36]
+    assert len({seed for _, seed in met}) == 3
+    assert certificate.verdict.bounds["mean_cost"][0] != bound
+
+
 def test_what_an_episode_can_cost_is_known_from_the_environment():
     def largest(name, **keys):
         return _largest_cost(envs.make_env({**name, **keys}, num_envs=1, seed=0), "cost")

@@ -51,19 +51,62 @@ def test_bounds_of_shares_are_those_of_the_exact_test():
     assert share_bound(np.full(5, 30.0), 25.0, LEVEL) == 1.0
 
 
-def certify(rng, means, claim, number=250, tests=3):
-    """The whole procedure on policies with geometric costs; returns the one that is certified."""
-    draw = lambda mean: rng.geometric(1 / mean, number).astype(float)  # noqa: E731
+def certify(rng, means, claim, number=250, tests=3, more=0):
+    """The whole procedure on policies with geometric costs; `more` are a second test's episodes."""
+    draw = lambda mean, n=number: rng.geometric(1 / mean, n).astype(float)  # noqa: E731
     first = [{"cost": draw(mean)} for mean in means]
     returns = [np.full(number, mean) for mean in means]  # who costs more gets more
     order = rank(returns, first, claim)
-    return first_certified(order, lambda k: {"cost": draw(means[k])}, claim, tests)
+    collect_more = (lambda k: {"cost": draw(means[k], more)}) if more else None
+    return first_certified(order, lambda k: {"cost": draw(means[k])}, claim, tests, collect_more)
 
 
-def test_of_many_policies_above_the_limit_hardly_ever_one_is_certified():
+@pytest.mark.parametrize("more", [0, 1000])
+def test_of_many_policies_above_the_limit_hardly_ever_one_is_certified(more):
     rng, claim = np.random.default_rng(0), Claim({"cost": 25.0}, level=LEVEL)
-    wrong = np.mean([certify(rng, [25.5] * 8, claim).certified is not None for _ in range(600)])
-    assert wrong < 0.05
+    verdicts = [certify(rng, [25.1] * 8, claim, more=more) for _ in range(600)]
+    assert np.mean([verdict.certified is not None for verdict in verdicts]) < 0.05
+    # second tests are had
+    assert any(len(verdict.tested) > 3 for verdict in verdicts) is bool(more)
+
+
+def test_more_episodes_certify_the_policy_that_fell_short_least():
+    rng, claim = np.random.default_rng(0), Claim({"cost": 25.0}, level=LEVEL)
+    means = [24.9, 22.5, 24.9]
+    found = {more: [certify(rng, means, claim, more=more) for _ in range(60)] for more in (0, 2000)}
+    certified = {more: [v.certified for v in verdicts] for more, verdicts in found.items()}
+    assert certified[0].count(1) < 20
+    assert certified[2000].count(1) > 40
+    again = next(v for v in found[2000] if v.certified == 1 and len(v.tested) == 4)
+    assert again.tested[-1] == 1
+    assert again.bounds["mean_cost"][0] < 25
+
+
+@pytest.mark.parametrize(
+    ("costs", "most_over"),
+    [
+        ([20.0, 31.0], 1.0),
+        ([25.0, 25.0], 1.0),  # as those of a limit of 0 that is kept
+        ([0.0, 0.0, 30.0], 0.2),
+        ([np.nan, 1.0], 1.0),
+    ],
+)
+def test_no_more_episodes_are_had_where_those_so_far_break_the_limit(costs, most_over):
+    def collect_more(candidate):
+        raise AssertionError(f"{candidate} is not to be tested again")
+
+    claim = Claim({"cost": 25.0}, most_over=most_over)
+    verdict = first_certified([0], lambda _: {"cost": costs}, claim, 1, collect_more)
+    assert verdict.certified is None
+    assert verdict.tested == [0]
+
+
+def test_all_tests_share_the_error_the_second_one_too():
+    costs = {"cost": np.tile([10.0, 30.0], 5)}
+    claim = Claim({"cost": 25.0})
+    verdict = first_certified([0], lambda _: costs, claim, 1, lambda _: costs)
+    assert verdict.tested == [0, 0]
+    assert verdict.bounds["mean_cost"][0] == float(mean_bound(costs["cost"], 1 - 0.05 / 2))
 
 
 @pytest.mark.parametrize(("most_over", "bounds"), [(1.0, 6), (0.3, 12)])
