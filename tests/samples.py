@@ -7,6 +7,8 @@ from torch import nn
 from torchrl.envs.utils import ExplorationType
 from torchrl.modules import IndependentNormal, ProbabilisticActor
 
+from safe_rl.objectives.trust_region import flatten, set_parameters
+
 NUM_OBS, NUM_ACTIONS = 3, 2
 
 
@@ -41,6 +43,16 @@ def make_batch(actor, batch_size, num_costs=1):
     if num_costs:
         batch["cost_advantage"] = 3 * torch.randn(*batch_size, num_costs)
     return batch
+
+
+def whole_step(step, batch, *given):
+    """The step of which a line search takes a fraction, and its metrics; the policy stays."""
+    before = flatten(step.parameters).detach().clone()
+    metrics = step(batch, *given)
+    assert metrics["step_fraction"] > 0
+    moved = flatten(step.parameters).detach() - before
+    set_parameters(step.parameters, before)
+    return moved / metrics["step_fraction"], metrics
 
 
 def perturb(actor, size=0.05):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from inspect import isclass
 from typing import Any, ClassVar
 
 import torch
@@ -19,12 +20,14 @@ from safe_rl.algorithms.constraints import Constraints, check_cost_limits
 from safe_rl.algorithms.contract import Stateful
 from safe_rl.algorithms.dataset import fill_memory
 from safe_rl.algorithms.memory import Memory
-from safe_rl.algorithms.parts import build_part
+from safe_rl.algorithms.parts import build_part, build_update
 from safe_rl.algorithms.replay_networks import bounded_actions, build_networks, exploring, setting
 from safe_rl.algorithms.replay_update import ReplayUpdate
 from safe_rl.collectors import EpisodeStatistics
 from safe_rl.models import ExploringPolicy
 from safe_rl.objectives.cost_critics import CostCritics
+from safe_rl.objectives.q_functions import QFunctionLoss
+from safe_rl.targets import locate
 
 __all__ = ["OffPolicy"]
 
@@ -93,6 +96,7 @@ class OffPolicy:
             config, env, is_constrained=config.get("limits") is not None, otherwise="sac"
         )
         device = torch.device(config.device)
+        _check_critics(config)
         networks = build_networks(config, env, len(limits), device)
         constraints = build_constraints(config, limits, env.max_episode_steps, device)
         loss = build_part(
@@ -122,7 +126,7 @@ class OffPolicy:
             networks=networks,
             constraints=constraints,
             memory=memory,
-            policy_update=build_part(config.policy_update, loss=loss),
+            policy_update=build_update(config.policy_update, loss=loss),
             random_steps=random_steps,
             collects=collects,
             learns_from=learns_from,
@@ -238,6 +242,17 @@ def _nothing_learned(config: DictConfig) -> str:
         f"Nothing will be learned: exploration.random_steps={random_steps} come first, and the run "
         f"has {config.frames:,}."
     )
+
+
+def _check_critics(config: DictConfig) -> None:
+    """Refuse to be without the Q functions that a loss learns."""
+    loss = locate(config.loss.get("_target_"), "loss._target_")
+    for key, kind in (("critics.rewards", QFunctionLoss), ("critics.costs", CostCritics)):
+        if not setting(config, key) and isclass(loss) and issubclass(loss, kind):
+            raise ValueError(
+                f"{key}=0: algo={config.algo.name} learns such Q functions ({loss.__name__}). Give "
+                f"it at least one, as {key}=2."
+            )
 
 
 def _check_room(memory: Memory, random_steps: int, collects: bool) -> None:

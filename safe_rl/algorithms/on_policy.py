@@ -19,7 +19,7 @@ from safe_rl.algorithms.contract import PolicyUpdate, Stateful
 from safe_rl.algorithms.in_turn import UpdatesInTurn
 from safe_rl.algorithms.loss_state import LossState, losses_of
 from safe_rl.algorithms.minibatch import MinibatchUpdate
-from safe_rl.algorithms.parts import build_part
+from safe_rl.algorithms.parts import build_part, build_update
 from safe_rl.algorithms.side_by_side import side_by_side
 from safe_rl.algorithms.tracked_constraints import CHARGES, TrackedConstraints
 from safe_rl.collectors import EpisodeStatistics
@@ -97,7 +97,7 @@ class OnPolicy:
             advantage=build_part(config.advantage, value_network=critic, **parts),
             cost_advantage=cost_advantage,
             policy_update=policy_update,
-            critic_update=build_part(config.critic_update, loss=CriticLoss(critic, cost_critic)),
+            critic_update=build_update(config.critic_update, loss=CriticLoss(critic, cost_critic)),
         )
 
     @classmethod
@@ -203,7 +203,7 @@ def _build_update(config: DictConfig, **parts: Any) -> PolicyUpdate:
             "'- /cost_advantage: ${preset}' among the defaults."
         )
     others = {name: part for name, part in parts.items() if name != "actor_network"}
-    update = build_part(config.policy_update, loss=loss, **others)  # asks its loss for the actor
+    update = build_update(config.policy_update, loss=loss, **others)  # asks its loss for the actor
     then = config.get("then") or {}
     for name, pair in then.items():
         if set(pair) != {"loss", "policy_update"}:

@@ -13,7 +13,7 @@ from omegaconf import DictConfig
 from safe_rl.algorithms.contract import Recipe
 from safe_rl.targets import TargetError, accepted_names, build, locate
 
-__all__ = ["build_part", "find_recipe"]
+__all__ = ["build_part", "build_update", "find_recipe"]
 
 _DEFAULT_RECIPE = "safe_rl.algorithms.OnPolicy"
 
@@ -44,3 +44,17 @@ def build_part(node: DictConfig, **objects: Any) -> Any:
         return build(node)
     names = accepted_names(locate(node.get("_target_"), f"{node._get_full_key(None)}._target_"))
     return build(node, **{k: v for k, v in objects.items() if v is not None and k in names})
+
+
+def build_update(node: DictConfig, **objects: Any) -> Any:
+    """Build, as `build_part` does, what improves networks: checkpoints ask for its state later.
+
+    Raises:
+        TargetError: As by `build_part`, or if it is no update.
+    """
+    update = build_part(node, **objects)
+    for name in ("__call__", "state_dict", "load_state_dict"):
+        if not hasattr(update, name):
+            target = f"{node._get_full_key(None)}._target_={node._target_}"
+            raise TargetError(f"{target} is no update: it has no {name}().")
+    return update

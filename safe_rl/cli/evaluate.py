@@ -19,7 +19,7 @@ from safe_rl.cli.variations import evaluate_varied, table_of
 from safe_rl.envs import ConfigError, ContractError, LayoutError, OpenGLError
 from safe_rl.evaluation import Evaluation, EvaluationOptions, evaluate
 from safe_rl.evaluation.loading import load_config
-from safe_rl.evaluation.summary import format_estimates
+from safe_rl.evaluation.summary import format_estimates, format_unjudged
 
 __all__ = ["evaluate_run", "main"]
 
@@ -97,6 +97,7 @@ def _report(result: Evaluation) -> str:
         f"{facts['algorithm']} on {facts['environment']}{steps}: {facts['episodes']} episodes with "
         f"{manner}, {facts['layouts_trained_on']:.0%} of the layouts known from training",
         *format_estimates(result.estimates, facts["cost_limits"]),
+        *format_unjudged(facts["limits_without_cost"]),
         *(f"wrote {path}" for path in result.files),
     ]
     return "\n".join(lines)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import shutil
 from collections.abc import Collection, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -11,6 +10,7 @@ from pathlib import Path
 from omegaconf.errors import OmegaConfBaseException
 from torchrl.checkpoint import CheckpointError
 
+from safe_rl.cli.run_folders import remove_new
 from safe_rl.envs import ContractError
 from safe_rl.runs.folder import RunFolder
 
@@ -41,5 +41,5 @@ def errors_in_a_line(directory: Path, is_new: bool, *errors: type[Exception]) ->
         if os.environ.get("HYDRA_FULL_ERROR") == "1":
             raise
         if is_new and directory.is_dir() and RunFolder(directory).is_untouched:
-            shutil.rmtree(directory)
+            remove_new(directory)
         raise SystemExit(" ".join(str(error).split())) from None

@@ -5,7 +5,6 @@ They do what the commands do, from the same configurations; Hydra stays inside.
 
 from __future__ import annotations
 
-import shutil
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -29,7 +28,7 @@ from safe_rl.cli.interrupting import say_if_heard
 from safe_rl.cli.options import take_options
 from safe_rl.cli.python_settings import compose_new, compose_resumed, new_run, overrides_of
 from safe_rl.cli.robots import maker_of
-from safe_rl.cli.run_folders import write_notes
+from safe_rl.cli.run_folders import note_missing, remove_new, write_notes
 from safe_rl.cli.running import complete, prepare
 from safe_rl.cli.user_code import check_imports, import_modules, note_imports, several
 from safe_rl.cli.variations import evaluate_varied
@@ -241,6 +240,7 @@ def resume(
 def _carry_out(config: DictConfig, folder: Path, hydra: DictConfig | None = None) -> Run:
     """Train or, without Hydra's own configuration, go on training."""
     complete(config, RunFolder(folder))
+    note_missing(folder)
     is_new, has_begun = not folder.exists(), False
     try:
         with held(RunFolder(folder)):
@@ -255,7 +255,7 @@ def _carry_out(config: DictConfig, folder: Path, hydra: DictConfig | None = None
             trainer.run()
     finally:
         if is_new and not has_begun:
-            shutil.rmtree(folder, ignore_errors=True)
+            remove_new(folder)
     if trainer.interrupted_by is not None:
         say_if_heard(
             f"Interrupted. Continue with: python train.py {RunFolder(folder).resuming}, or "

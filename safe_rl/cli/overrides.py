@@ -104,13 +104,17 @@ def _listed(choices: Sequence[str]) -> str:
 
 
 def check_whole(overrides: Sequence[Override]) -> None:
-    """Refuse single limits and factors, which would take the place of all default ones.
+    """Refuse single limits and factors, and two mappings of them, which Hydra would merge.
 
     Raises:
-        CommandLineError: If there is one.
+        CommandLineError: If there are any.
     """
-    for override in overrides:
-        for section, what in GIVEN_WHOLE.items():
+    for section, what in GIVEN_WHOLE.items():
+        whole = [o for o in overrides if o.key_or_group == section and not o.is_delete()]
+        if whole[1:]:
+            given = ", ".join(str(override.input_line) for override in whole)
+            raise CommandLineError(f"'{section}' is given more than once: {given}.")
+        for override in overrides:
             name = override.key_or_group.removeprefix(f"{section}.")
             if name != override.key_or_group:
                 raise CommandLineError(

@@ -1,7 +1,9 @@
-"""New runs get folders of their own, and note there how they were begun."""
+"""New runs get folders of their own, note there how they were begun, and take them back."""
 
 from __future__ import annotations
 
+import os
+import shutil
 from collections.abc import Iterator
 from itertools import count
 from pathlib import Path
@@ -14,7 +16,9 @@ from omegaconf import DictConfig, OmegaConf, read_write
 from safe_rl.runs.files import replacing
 from safe_rl.runs.folder import RunFolder
 
-__all__ = ["NewFolder", "write_notes"]
+__all__ = ["NewFolder", "note_missing", "remove_new", "write_notes"]
+
+_missing: set[Path] = set()  # before this process made folders of runs
 
 
 class NewFolder(Callback):
@@ -26,12 +30,39 @@ class NewFolder(Callback):
 
     def on_run_start(self, config: DictConfig, **kwargs: Any) -> None:
         """Make the folder and tell Hydra."""
+        note_missing(Path(config.hydra.run.dir))
         if any(o.lstrip("+").startswith("hydra.run.dir=") for o in config.hydra.overrides.hydra):
             return
         wanted = Path(config.hydra.run.dir)
         made = next(path for path in _names(wanted) if _make(path))
         with read_write(config.hydra.run):
             config.hydra.run.dir = str(made)
+
+
+def note_missing(folder: Path) -> None:
+    """Note which folders are not there yet, of one that will be made and of those above it."""
+    place = Path(os.path.abspath(folder))
+    _missing.update(path for path in (place, *place.parents) if not path.exists())
+
+
+def remove_new(folder: Path) -> None:
+    """Remove the folder of a run that could not begin, and empty ones above that were missing.
+
+    Examples:
+        >>> above = getfixture("tmp_path")
+        >>> note_missing(above / "PointGoal1" / "cpo" / "seed0")
+        >>> (above / "PointGoal1" / "cpo" / "seed0").mkdir(parents=True)
+        >>> remove_new(above / "PointGoal1" / "cpo" / "seed0")
+        >>> above.exists(), (above / "PointGoal1").exists()
+        (True, False)
+    """
+    shutil.rmtree(folder, ignore_errors=True)
+    for above in Path(os.path.abspath(folder)).parents:
+        try:
+            if above in _missing:
+                above.rmdir()
+        except OSError:  # other runs have come into it
+            return
 
 
 def _names(path: Path) -> Iterator[Path]:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import logging
 import math
+import os
 import sys
 from contextlib import AbstractContextManager, ExitStack, nullcontext
 from functools import partial
@@ -43,6 +45,8 @@ __all__ = ["complete", "prepare", "run"]
 
 def prepare(config: DictConfig, directory: Path, continues: bool) -> Trainer | None:
     """Build a run, or go on with the one in the folder; None if that is finished."""
+    if "RL_LOGGING_LEVEL" not in os.environ:  # by which users let TorchRL say more
+        logging.getLogger("torchrl").setLevel(logging.WARNING)
     folder = RunFolder(directory)
     if not continues:
         folder.check_is_free()

@@ -134,8 +134,10 @@ def _expand_resume(value: str, others: list[str]) -> list[str]:
             raise CommandLineError(f"'{argument}': the run has no '{key}'.{hint}")
         if stays or key in _OTHER_CONFIGURATIONS or isinstance(config.get(key), DictConfig):
             raise CommandLineError(
-                f"'{argument}' cannot change in a run that is continued. Single numbers can "
-                "(frames=…, checkpoint.interval=…). For a new run from trained networks use "
+                f"'{argument}' cannot change in a run that is continued. What can: its length "
+                "(frames=…), what belongs to the machine (checkpoint.interval=…), and numbers "
+                "below loss, limits, policy_update and the like, except those that a checkpoint "
+                "brings along, such as an optimiser's lr. For a new run from trained networks use "
                 f"init_from={value}."
             )
     folder = str(directory).replace("'", "\\'")

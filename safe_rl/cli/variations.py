@@ -12,6 +12,7 @@ from safe_rl.cli.conf import CONF
 from safe_rl.cli.robots import maker_of
 from safe_rl.envs import LayoutError
 from safe_rl.evaluation import EvaluationOptions
+from safe_rl.evaluation.summary import format_unjudged
 from safe_rl.evaluation.variations import Variation, expand
 from safe_rl.evaluation.varying import Varied, evaluate_variations
 from safe_rl.naming import did_you_mean
@@ -109,6 +110,7 @@ def table_of(found: Varied) -> str:
         "  ".join(cell.ljust(width) for cell, width in zip(line, widths, strict=True)).rstrip()
         for line in (heads, *lines)
     ]
+    text += format_unjudged(facts["limits_without_cost"])
     reasons: dict[str, list[str]] = {}
     for variation, reason in found.left_out:
         reasons.setdefault(reason, []).append(str(variation))

@@ -18,6 +18,7 @@ PARTIAL = "partial"
 
 # of a step and of what follows it; what a policy writes besides is not recorded
 _FLAGS = ("done", "terminated", "truncated")
+_UNFINISHED = ".unfinished-"
 
 
 class Recording:
@@ -55,6 +56,8 @@ class Recording:
 
     def begin(self, number: int = 0) -> None:
         """Remove what is there of an earlier recording, from a batch on."""
+        for path in self.folder.glob(f"{_UNFINISHED}*"):  # of a run that was killed
+            shutil.rmtree(path)
         for path in _pieces(self.folder):
             if int(path.name) >= number:
                 shutil.rmtree(path)
@@ -97,7 +100,7 @@ class Recording:
         place = self._place(number)
         self.folder.mkdir(parents=True, exist_ok=True)
         # whole or not at all: a run may end at any moment
-        with tempfile.TemporaryDirectory(prefix=".", dir=self.folder) as unfinished:
+        with tempfile.TemporaryDirectory(prefix=_UNFINISHED, dir=self.folder) as unfinished:
             written = Path(unfinished) / place.name
             steps.memmap(str(written), copy_existing=True)
             if place.exists():

@@ -22,7 +22,7 @@ from safe_rl.runs.folder import KINDS, RunFolder
 
 __all__ = [
     *("evaluated", "find_checkpoint", "limits_of", "load_config", "load_policy"),
-    *("override_env", "transforms_of"),
+    *("override_env", "transforms_of", "without_cost"),
 ]
 
 
@@ -86,6 +86,11 @@ def limits_of(
             )
     limits = {**config.cost_limits, **others}
     return {key: float(limit) for key, limit in limits.items() if key in cost_keys}
+
+
+def without_cost(config: DictConfig, cost_keys: Collection[str]) -> dict[str, float]:
+    """Limits of the run, cost key -> d, on costs that a changed environment does not have."""
+    return {k: float(limit) for k, limit in config.cost_limits.items() if k not in cost_keys}
 
 
 def transforms_of(config: DictConfig) -> dict[str, Any]:

@@ -23,6 +23,7 @@ from safe_rl.evaluation.loading import (
     load_config,
     load_policy,
     override_env,
+    without_cost,
 )
 from safe_rl.evaluation.settings import EvaluationOptions, check_options
 from safe_rl.evaluation.summary import check_places, summarise, write_episodes, write_summary
@@ -107,7 +108,10 @@ def evaluate(
         episodes = _collect(env, policy, options, places["transitions"], progress)
     reference = suite.reference(node, but_for=_LAYOUTS)
     estimates = summarise(episodes, limits, reference, options.cvar_alpha)
-    facts = _facts(directory, config, checkpoint, options, node, seed) | {"cost_limits": limits}
+    facts = _facts(directory, config, checkpoint, options, node, seed) | {
+        "cost_limits": limits,
+        "limits_without_cost": without_cost(config, cost_keys),
+    }
     write_summary(places["json"], facts, estimates)
     write_episodes(places["csv"], episodes)
     for film in films:

@@ -15,7 +15,10 @@ from safe_rl.scores.intervals import Estimate, cvar, mean, share_over
 from safe_rl.scores.normalised import normalised_return, normalised_violation
 from safe_rl.scores.published import Scores
 
-__all__ = ["check_places", "format_estimates", "summarise", "write_episodes", "write_summary"]
+__all__ = [
+    *("check_places", "format_estimates", "format_unjudged", "summarise", "write_episodes"),
+    "write_summary",
+]
 
 
 def check_places(places: Iterable[Path]) -> None:
@@ -88,6 +91,19 @@ def format_estimates(
         interval = f"[{_number(estimate.low)}, {_number(estimate.high)}]"
         lines.append(f"{name:{width}} {_number(estimate.value):>10}   {interval}{limit}")
     return lines
+
+
+def format_unjudged(limits: Mapping[str, float]) -> list[str]:
+    """A line for each limit of the run on a cost that its changed environment does not have.
+
+    Examples:
+        >>> format_unjudged({"cost_hazards": 20.0})
+        ["the run's limit 20 on cost_hazards is not judged: this environment has no such cost"]
+    """
+    return [
+        f"the run's limit {limit:g} on {key} is not judged: this environment has no such cost"
+        for key, limit in limits.items()
+    ]
 
 
 def _number(value: float) -> str:

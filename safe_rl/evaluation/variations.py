@@ -84,7 +84,8 @@ def varied(
         transform_node: Name of a transform -> its node, for those that the run lacks.
 
     Returns:
-        The configuration; None if the run has these values itself.
+        The configuration; None if its environment is that of the run: if that has these values
+        itself, or none of the elements that they are about.
 
     Raises:
         ValueError: For a factor of what the environment lacks, or of no number; for a key that an
@@ -106,7 +107,17 @@ def varied(
         if part == "transforms" and path[0] not in changed[part]:
             changed = _with(changed, [part, path[0]], dict(transform_node(path[0])))
         changed = _with(changed, [part, *path], _resolved(value, changed[part], key))
-    return None if changed == before else OmegaConf.create({**values, **changed})
+    is_same = _present(changed) == _present(before)
+    return None if is_same else OmegaConf.create({**values, **changed})
+
+
+def _present(parts: Mapping[str, Any]) -> dict[str, Any]:
+    """Parts but for what a Safety Gym environment says of elements of which it has none."""
+    env = parts["env"]
+    absent = tuple(k.removesuffix("num") for k in env if k.endswith("_num") and env[k] == 0)
+    if "_target_" in env:  # another family's
+        absent = ()
+    return {**parts, "env": {key: env[key] for key in env if not key.startswith(absent)}}
 
 
 def _with(node: Mapping[str, Any], path: list[str], value: Any) -> dict[str, Any]:

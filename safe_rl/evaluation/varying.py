@@ -22,6 +22,7 @@ from safe_rl.evaluation.loading import (
     load_config,
     load_policy,
     override_env,
+    without_cost,
 )
 from safe_rl.evaluation.settings import EvaluationOptions, check_options
 from safe_rl.evaluation.summary import check_places, summarise
@@ -105,13 +106,14 @@ def evaluate_variations(
     check_places([file, RunFolder(directory).variations(options.name, "png")])
     rows: list[VariedRow] = []
     trained_limits: dict[str, float] = {}
+    lost: dict[str, float] = {}
     left_out: list[tuple[Variation, str]] = []
     cannot: tuple[type[Exception], ...] = (ValueError, *refusals)
     for variation in (AS_TRAINED, *variations):
         try:
             changed = varied(config, variation, transform_node) if variation.keys else config
             if changed is None:
-                left_out.append((variation, "that is how it was trained"))
+                left_out.append((variation, "it would be as it was trained"))
                 continue
             progress(variation)
             episodes = _episodes(changed, checkpoint, options, make_env)
@@ -121,11 +123,13 @@ def evaluate_variations(
             left_out.append((variation, str(error)))
             continue
         limits = limits_of(config, options.cost_limits, episodes.costs)
-        trained_limits = trained_limits if rows else limits
+        if not rows:
+            trained_limits, lost = limits, without_cost(config, episodes.costs)
         rows.append(VariedRow(variation, summarise(episodes, limits, None, options.cvar_alpha)))
     _write(file, rows)
     facts = {"algorithm": config.algo.name, "environment": config.env.get("name", "")}
     facts |= {"steps": checkpoint_steps(checkpoint), "episodes": options.episodes}
+    facts["limits_without_cost"] = lost
     return Varied(tuple(rows), tuple(left_out), trained_limits, facts, file)
 
 

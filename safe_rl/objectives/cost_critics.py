@@ -11,7 +11,6 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torchrl.objectives.utils import distance_loss
 
-from safe_rl.objectives.keys import require
 from safe_rl.objectives.multipliers import Multiplier
 from safe_rl.objectives.q_functions import QFunctionLoss, discount_of, is_ensemble
 from safe_rl.objectives.violation import KnownCosts
@@ -151,12 +150,12 @@ class CostCritics(QFunctionLoss):
     def cost_qvalue_loss(self, tensordict: TensorDictBase, next_action: Tensor) -> Tensor:
         """Loss of the cost critics, summed over networks and costs."""
         following = tensordict.get("next")
-        costs = torch.cat([require(tensordict, ("next", key)) for key in self.cost_keys], -1)
+        costs = torch.cat([self.column(tensordict, key) for key in self.cost_keys], -1)
         with torch.no_grad():
             values = self.cost_values(
                 following, next_action, self.target_cost_qvalue_network_params
             )
-            ends = require(tensordict, ("next", self.tensor_keys.terminated))
+            ends = self.column(tensordict, self.tensor_keys.terminated)
             spanned = self.value_estimator.tensor_keys.steps_to_next_obs
             discount = discount_of(tensordict, self.gamma, spanned) * ends.logical_not()
         found = self.cost_values(

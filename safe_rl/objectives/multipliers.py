@@ -8,6 +8,7 @@ resumes them exactly and `.to(device)` moves them.
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 
 import torch
@@ -66,7 +67,7 @@ def per_cost(name: str, value: float | Sequence[float] | Tensor, num_costs: int)
     return tensor.expand(num_costs).clone()
 
 
-class Multiplier(nn.Module):
+class Multiplier(nn.Module, ABC):
     """Base of the multipliers: limits, `value` and `update`.
 
     Subclasses keep their state in buffers and implement `_step`; and `value`, unless λ is the
@@ -74,6 +75,9 @@ class Multiplier(nn.Module):
 
     Args:
         cost_limits: mapping from cost key to limit, or limits alone; see `parse_cost_limits`.
+
+    Raises:
+        TypeError: if a subclass has no `_step`.
 
     Attributes:
         cost_keys: one key per cost, in the order of every [k] tensor.
@@ -130,9 +134,9 @@ class Multiplier(nn.Module):
     def set_unit(self, unit: Tensor) -> None:
         """Take note of the size of one cost, [k] > 0, in which what λ weighs is measured."""
 
+    @abstractmethod
     def _step(self, mean_costs: Tensor) -> dict[str, Tensor]:
         """Return the new value of every state buffer ([..., k]) given finite J_c [k]."""
-        raise NotImplementedError
 
     def named_values(self) -> dict[str, Tensor]:
         """λ per cost as scalars, named by cost key (nested keys joined by ``/``)."""

@@ -10,6 +10,8 @@ from torch import Tensor
 from torchrl.objectives import LossModule
 from torchrl.objectives.value import ValueEstimatorBase
 
+from safe_rl.objectives.keys import require
+
 __all__ = [
     "InOneCall",
     "QFunctionLoss",
@@ -75,6 +77,22 @@ class QFunctionLoss(LossModule):
     def actor_losses(self, tensordict: TensorDictBase) -> TensorDict:
         """Losses of the policy, and what is reported of it."""
         raise NotImplementedError
+
+    def column(self, tensordict: TensorDictBase, key: NestedKey) -> Tensor:
+        """An entry below ``next`` that holds one number per step, [..., 1].
+
+        Raises:
+            KeyError: if there is no such entry.
+            ValueError: if it has another shape.
+        """
+        value = require(tensordict, ("next", key))
+        expected = [*require(tensordict, self.tensor_keys.action).shape[:-1], 1]
+        if list(value.shape) != expected:
+            raise ValueError(
+                f"The entry {('next', key)} has the shape {list(value.shape)}, and must have "
+                f"{expected}: one number per step, [..., 1]."
+            )
+        return value
 
     def make_value_estimator(self, value_type: Any = None, **hyperparams: Any) -> LossModule | None:
         """As TorchRL's; its ``gamma`` holds for the critics of the costs as well."""

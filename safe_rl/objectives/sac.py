@@ -16,7 +16,6 @@ from torchrl.objectives import ValueEstimators
 from torchrl.objectives.value import TD0Estimator
 
 from safe_rl.objectives.cost_critics import CostCritics, CostTerms
-from safe_rl.objectives.keys import require
 from safe_rl.objectives.q_functions import (
     InOneCall,
     QFunctionLoss,
@@ -135,10 +134,10 @@ class SACLoss(QFunctionLoss, objectives.SACLoss):
             if type(estimator) is not TD0Estimator or estimator.average_rewards:
                 steps = tensordict.clone(False).set(("next", estimator.tensor_keys.value), soft)
                 return estimator.value_estimate(steps).squeeze(-1)
-            goes_on = require(tensordict, ("next", keys.terminated)).logical_not()
+            goes_on = self.column(tensordict, keys.terminated).logical_not()
             spanned = estimator.tensor_keys.steps_to_next_obs
             discount = discount_of(tensordict, self.gamma, spanned)
-            reward = require(tensordict, ("next", keys.reward))
+            reward = self.column(tensordict, keys.reward)
             return (reward + discount * goes_on * soft).squeeze(-1)
 
     def _act(self, steps: TensorDictBase) -> tuple[Tensor, Tensor]:

@@ -110,6 +110,8 @@ class TD3Loss(QFunctionLoss, objectives.TD3Loss):
 
     def critic_losses(self, tensordict: TensorDictBase) -> TensorDict:
         """Losses of the Q functions."""
+        for key in (self.tensor_keys.reward, self.tensor_keys.terminated):
+            self.column(tensordict, key)  # TorchRL's code tells neither which it is nor its shape
         loss, metadata = self.value_loss(tensordict)
         # TorchRL's errors are squared
         td_error = metadata["td_error"].detach().max(0).values.sqrt()

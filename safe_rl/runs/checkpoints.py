@@ -80,6 +80,8 @@ class CheckpointStore:
         self._none_yet = self.last / "none-yet"
         self._keep_last, self._keep_best = keep_last, keep_best
         self._run = dict(run or {})
+        # best ones that are so again if the run goes on from its last checkpoint
+        self._displaced: set[Path] = set()
 
     def begin(self) -> None:
         """Note that a run begins, which has no checkpoint yet."""
@@ -98,6 +100,9 @@ class CheckpointStore:
         for old in others[: max(0, len(others) + 1 - self._keep_last)]:
             old.unlink()
         self._none_yet.unlink(missing_ok=True)
+        for displaced in self._displaced:
+            displaced.unlink(missing_ok=True)
+        self._displaced.clear()
         return path
 
     def save_best(
@@ -109,6 +114,8 @@ class CheckpointStore:
         states: Mapping[str, Any] | None = None,
     ) -> bool:
         """Write a checkpoint if there is room, or if ``score`` is higher than that of a kept one.
+
+        That stays until the next `save`: a run that is resumed from before forgets the new one.
 
         Args:
             steps: Environment steps then.
@@ -126,8 +133,12 @@ class CheckpointStore:
         path = self._write(self.best, steps, {**(facts or {}), "score": score}, saver)
         others = [other for other in checkpoints_in(self.best) if other != path]
         others.sort(key=_score, reverse=True)
+        newest = max((saved.name for saved in checkpoints_in(self.last)), default="")
         for worse in others[self._keep_best - 1 :]:
-            worse.unlink()
+            if worse.name > newest:
+                worse.unlink()
+            else:
+                self._displaced.add(worse)
         return True
 
     def forget_best(self, steps: Iterable[int]) -> None:

@@ -6,14 +6,13 @@ import pytest
 import torch
 from point_mass import PointMass
 from run_configs import point_mass_config
-from samples import make_actor, make_batch
+from samples import make_actor, make_batch, whole_step
 
 from safe_rl.algorithms import CTRPOStep, OnPolicy
 from safe_rl.algorithms.c_trpo_step import barrier_divergence
 from safe_rl.objectives import CPOLoss
 from safe_rl.objectives.distributions import gaussian_kl
-from safe_rl.objectives.fisher import FisherProduct
-from safe_rl.objectives.trust_region import flatten, policy_in
+from safe_rl.objectives.trust_region import flatten, policy_in, set_parameters
 
 DELTA, HORIZON, BETA = 0.01, 100.0, 0.5
 SETTINGS = {
@@ -74,10 +73,9 @@ def test_the_step_is_the_natural_one_of_the_divergence():
     g = flatten(torch.autograd.grad(objective, parameters, retain_graph=True)).double()
     h_g = torch.linalg.solve(matrix, g)
     expected = -(2 * DELTA / (g @ h_g)).sqrt() * h_g
-    fisher = FisherProduct(actor, batch, parameters, damping=0.1)
-    proposal = step._propose(losses, fisher, violation, None)
+    taken, _ = whole_step(step, batch, violation)
     torch.testing.assert_close(
-        proposal.step.double(), expected, atol=5e-3 * expected.abs().max().item(), rtol=2e-2
+        taken.double(), expected, atol=5e-3 * expected.abs().max().item(), rtol=2e-2
     )
 
 
@@ -100,6 +98,25 @@ def test_a_step_stays_in_its_region_and_within_the_limits(violation):
         assert change > 1.0  # what the limit is there to prevent
     if violation == -0.01:
         assert change < 0.02
+
+
+@pytest.mark.parametrize("violation", [-25.0, -5.0, -0.1])
+def test_the_first_fraction_within_the_divergence_is_taken(violation):
+    """Not within another weight of the barrier: the one tried before is outside of this one."""
+    actor, batch = make_case(1)
+    step = c_trpo(actor, 1)
+    start = flatten(actor.parameters()).detach().clone()
+    before = step.loss(batch)["cost_surrogate"].detach()
+    whole, metrics = whole_step(step, batch, torch.tensor([violation]))
+    assert metrics["backtracks"] > 0
+    divergences = []
+    for fraction in (metrics["step_fraction"], metrics["step_fraction"] / 0.8):
+        set_parameters(list(actor.parameters()), start + fraction * whole)
+        after = step.loss(batch)
+        change = HORIZON * (after["cost_surrogate"].detach() - before)
+        barrier = barrier_divergence(change, torch.tensor([-violation])).sum()
+        divergences.append((after["kl"] + BETA * barrier).item())
+    assert divergences[0] <= DELTA < divergences[1]
 
 
 def test_recoveries_begin_at_a_limit_and_end_below_it():

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 import torch
-from samples import make_actor, make_batch
+from samples import make_actor, make_batch, whole_step
 from scipy.optimize import minimize
 
 from safe_rl.algorithms import CRPOStep, PCPOStep
@@ -70,14 +70,14 @@ def test_pcpo_is_the_equation_of_its_article(projection, violation):
         flatten(torch.autograd.grad(value, parameters, retain_graph=True)).double()
         for value in (losses["loss_objective"], losses["cost_surrogate"][0])
     )
-    proposal = step._propose(losses, fisher, torch.tensor([violation]), LENGTH)
+    taken, _ = whole_step(step, batch, torch.tensor([violation]), LENGTH)
     h_g = torch.linalg.solve(matrix, g)
     first = -(2 * DELTA / (g @ h_g)).sqrt() * h_g
     back = torch.linalg.solve(matrix, b) if projection == "kl" else b
     expected = first - max(0.0, ((b @ first + violation / 100) / (b @ back)).item()) * back
     radius = (2 * DELTA / (expected @ matrix @ expected)).sqrt().clamp_max(1.0)
     torch.testing.assert_close(
-        proposal.step.double(), radius * expected, atol=2e-3 * expected.abs().max(), rtol=1e-2
+        taken.double(), radius * expected, atol=2e-3 * expected.abs().max(), rtol=1e-2
     )
 
 
@@ -88,17 +88,17 @@ def test_a_bounded_demand_is_a_smaller_violation():
     fisher = FisherProduct(actor, batch, parameters, SETTINGS["damping"])
     matrix = torch.stack([fisher(row) for row in torch.eye(flatten(parameters).numel())]).double()
 
-    def proposed(violation, **settings):
+    def taken(violation, **settings):
         loss = CPOLoss(actor, entropy_coeff=0.0)
         step = PCPOStep(loss, projection="kl", rescale_violation=True, **settings, **SETTINGS)
-        return step._propose(step.loss(batch), fisher, torch.tensor([violation]), LENGTH).step
+        return whole_step(step, batch, torch.tensor([violation]), LENGTH)[0]
 
     cost = CPOLoss(actor, entropy_coeff=0.0)(batch)["cost_surrogate"][0]
     b = flatten(torch.autograd.grad(cost, parameters)).double()
     reach = (2 * DELTA * b @ torch.linalg.solve(matrix, b)).sqrt().item()
-    bounded = proposed(1e4, largest_demand=0.5)
-    torch.testing.assert_close(bounded, proposed(50 * reach), atol=1e-4, rtol=1e-2)
-    assert not torch.allclose(bounded, proposed(1e4), atol=1e-4, rtol=1e-2)
+    bounded = taken(1e4, largest_demand=0.5)
+    torch.testing.assert_close(bounded, taken(50 * reach), atol=1e-4, rtol=1e-2)
+    assert not torch.allclose(bounded, taken(1e4), atol=1e-4, rtol=1e-2)
 
 
 @pytest.mark.parametrize("projection", ["kl", "l2"])

@@ -1,6 +1,7 @@
 """Names on the command line: what nothing reads is refused with what was meant, before a run."""
 
 import os
+import re
 
 import pytest
 from omegaconf import OmegaConf
@@ -281,3 +282,14 @@ def test_every_key_of_the_files_can_be_overridden_by_its_own_value():
 def test_a_wrong_key_beside_a_name_that_others_refer_to():
     with pytest.raises(CommandLineError, match=r"nothing reads 'env\.cost_kyes'.*env\.cost_keys"):
         check_command(["env=gymnasium", "env.id=CartPole-v1", "env.cost_kyes=[cost_a]"], CONF)
+
+
+@pytest.mark.parametrize("second", ["{cost: 20}", "{cost_vases_contact: 20}"])
+def test_mappings_that_are_given_whole_are_given_once(second):
+    """Hydra merges them: limits of the first would stay, or what the second adds is an error."""
+    first = "cost_limits={cost: 10, cost_hazards: 5}"
+    arguments = ["env=PointGoal2", first, f"cost_limits={second}"]
+    said = rf"'cost_limits' is given more than once: {re.escape(first)}, cost_limits="
+    with pytest.raises(CommandLineError, match=said):
+        check_command(arguments, CONF)
+    check_command([arguments[0], "~cost_limits", f"+cost_limits={second}"], CONF)

@@ -58,6 +58,11 @@ def test_what_cannot_change_in_a_continued_run(run, override):
         expand_arguments([override, f"resume={run}"])
 
 
+def test_a_number_that_cannot_change_is_not_told_that_numbers_can(run):
+    with pytest.raises(CommandLineError, match="a checkpoint brings along, such as an optimiser's"):
+        expand_arguments([f"resume={run}", "policy_update.optimizer.lr=1e-4"])
+
+
 def test_only_a_run_can_be_resumed(run):
     with pytest.raises(CommandLineError, match=r"no config.yaml. Runs below it: .*it's frames"):
         expand_arguments([f"resume={run.parent}"])

@@ -1,5 +1,7 @@
 """The command train.py as a whole: what Hydra is asked passes, what is wrong leaves nothing."""
 
+import logging
+import logging.handlers
 import signal
 import subprocess
 import sys
@@ -63,6 +65,28 @@ def test_the_whole_error_is_there_for_those_who_ask(command, monkeypatch):
     monkeypatch.setenv("HYDRA_FULL_ERROR", "1")
     with pytest.raises(ValueError, match="nothing reads 'lr'"):
         command("lr=1e-4")
+
+
+def test_a_run_that_cannot_be_built_leaves_only_folders_that_were_there(command):
+    refused = ("env=PointGoal1", "algo=cpo", "cost_limits={}", "logger=none", "num_envs=1")
+    Path("mine").mkdir()
+    for where in ((), ("hydra.run.dir=mine/runs/first",)):
+        assert "algo=cpo needs at least one entry" in command(*refused, *where)[0]
+        assert [path.name for path in Path.cwd().rglob("*")] == ["mine"]
+
+
+def test_torchrls_notes_are_kept_off_the_terminal_but_not_its_warnings(command, monkeypatch):
+    monkeypatch.delenv("RL_LOGGING_LEVEL", raising=False)
+    logger = logging.getLogger("torchrl")
+    monkeypatch.setattr(logger, "handlers", [kept := logging.handlers.BufferingHandler(9)])
+    logger.setLevel(logging.INFO)
+    status, *_ = command(
+        *["env=PointGoal1", "env.num_steps=20", "num_envs=2", "frames=40", "frames_per_batch=40"],
+        *["algo=sac", "model.hidden_sizes=[8]", "logger=none", "hydra.run.dir=runs/quiet"],
+    )
+    logger.warning("of something that is wrong")
+    assert not status
+    assert [record.levelname for record in kept.buffer] == ["WARNING"]
 
 
 @pytest.mark.parametrize(

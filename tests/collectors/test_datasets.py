@@ -38,6 +38,9 @@ def test_a_recording_is_what_was_collected(tmp_path):
     for key in ("observation", "action", ("next", "observation"), ("next", "cost_north")):
         assert torch.equal(found[key], expected[key])
     assert torch.equal(found["next", "truncated"], expected["next", "done"])
+    (tmp_path / "00000002").rename(tmp_path / ".unfinished-2")  # as of a run that is killed there
+    recording.begin(2)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["00000000", "00000001"]
     with pytest.raises(FileNotFoundError, match=r"holds no transitions: is it the folder of a rec"):
         read_recording(tmp_path / "elsewhere")
     Recording(tmp_path / "run" / "transitions", PointMass.cost_keys).write(0, batches[0])

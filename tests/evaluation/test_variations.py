@@ -82,6 +82,10 @@ def test_variations_may_have_other_costs(run, capsys):
     lines = {line.split()[0]: line for line in capsys.readouterr().out.splitlines() if line}
     assert (lines["free"].count("—"), lines["more"].count("—")) == (2, 0)
     assert "over 20" in lines["return"]
+    # without the cost in all of them, the table has no place where its limit would be missed
+    named = ("name=free", "env.constrain_hazards=false")
+    assert main([str(run), "variations={more: {env.constrain_vases: true}}", *named, *QUICK]) == 0
+    assert "limit 20 on cost_hazards is not judged: this env" in capsys.readouterr().out
 
 
 def test_transforms_are_those_of_a_run_that_has_them(run, tmp_path):
@@ -190,3 +194,15 @@ def test_rows_with_a_list_are_several():
         {"env.mass_scale": 0.5, "env.friction_scale": 0.9},
         {"env.mass_scale": 2, "env.friction_scale": 0.9},
     ]
+
+
+def test_what_concerns_elements_that_are_not_there_is_left_out():
+    config = OmegaConf.create({"env": {"hazards_num": 0, "hazards_size": 0.2, "vases_num": 2}})
+    named, _ = read_variations("layout")
+    kept = [str(v) for v in named if varied(config, v, dict) is not None]
+    assert kept == ["vases x0.5", "vases x2"]
+    more = {"env.hazards_num": 4, "env.hazards_size": 0.3}
+    assert varied(config, Variation("more", None, more), dict).env.hazards_size == 0.3
+    config.env._target_ = "mine.make"  # what its keys mean is its own business
+    size = Variation("size", None, {"env.hazards_size": 0.3})
+    assert varied(config, size, dict).env.hazards_size == 0.3

@@ -6,7 +6,7 @@ from functools import partial
 import pytest
 import torch
 
-from safe_rl.objectives import PIDMultiplier, PIMultiplier, ProjectedMultiplier
+from safe_rl.objectives import Multiplier, PIDMultiplier, PIMultiplier, ProjectedMultiplier
 from safe_rl.objectives.multipliers import LagrangeMultiplier, parse_cost_limits
 
 NU_OF_ONE = math.log(math.e - 1)
@@ -130,3 +130,11 @@ def test_named_values_join_nested_keys():
 def test_errors_say_what_to_change(build, message):
     with pytest.raises(ValueError, match=message):
         build()
+
+
+def test_one_that_cannot_move_is_not_built():
+    class Still(Multiplier):
+        pass
+
+    with pytest.raises(TypeError, match=r"Still.* _step"):
+        Still({"cost": 25.0})

@@ -361,10 +361,19 @@ def test_losses_may_be_asked_for_one_entry(kind, multiplier):
     [
         *(("sac", key) for key in ("observation", "action", ("next", "reward"))),
         *((kind, ("next", key)) for kind in ("sac", "td3") for key in ("terminated", "cost")),
-        ("td3", "observation"),  # its actions and rewards are read by TorchRL's own code
+        *(("td3", key) for key in ("observation", "action", ("next", "reward"))),
     ],
 )
 def test_an_entry_that_is_missing_is_named(kind, key):
     name = key if isinstance(key, str) else key[1]
     with pytest.raises(KeyError, match=name):
         make_loss(kind, lagrange(1.0, 1.0))(make_steps().exclude(key))
+
+
+@pytest.mark.parametrize("kind", ["sac", "td3"])
+@pytest.mark.parametrize("key", ["reward", "terminated", "cost"])
+def test_an_entry_of_another_shape_is_named_with_the_shape_that_it_must_have(kind, key):
+    steps = make_steps(6)
+    steps["next", key] = steps["next", key].squeeze(-1)
+    with pytest.raises(ValueError, match=rf"'{key}'\) has the shape \[6\], and must have \[6, 1\]"):
+        make_loss(kind, lagrange(1.0, 1.0))(steps)

@@ -41,6 +41,16 @@ def test_curves_are_means_over_seeds_on_common_steps(tmp_path):
     assert average(runs, "no_such_column", smooth=False) is None
 
 
+def test_a_curve_begins_where_all_of_its_runs_have(tmp_path):
+    nan, alike = float("nan"), {"costs": [1, 1, 1, 1], "rates": [0.1] * 4}
+    write_run(tmp_path, seed=0, returns=[0.0, 2.0, 4.0, 6.0], **alike)
+    write_run(tmp_path, seed=1, returns=[nan, nan, 14.0, 16.0], **alike)
+    curve = average(find_runs(tmp_path)[0], "episode_return", smooth=False)
+    # what comes before is of one seed alone, and no mean over seeds
+    np.testing.assert_allclose(curve.steps[[0, -1]], [3000, 4000])
+    np.testing.assert_allclose(curve.mean[[0, -1]], [9.0, 11.0])
+
+
 def test_a_curve_ends_at_the_final_score(tmp_path):
     returns = [1.0, 2.0, 4.0, 8.0, 16.0, 32.0, 65.0]
     write_run(tmp_path, returns=returns, costs=returns, rates=returns)

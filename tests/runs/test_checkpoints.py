@@ -74,6 +74,22 @@ def test_several_best_ones_are_those_with_the_highest_scores(tmp_path):
     assert best_checkpoint(tmp_path / "none") is None
 
 
+def test_a_best_one_that_was_displaced_is_the_best_again_after_resuming_from_before(tmp_path):
+    store = CheckpointStore(tmp_path, parts(1), keep_last=1)
+    assert store.save_best(1, 5.0)
+    store.save(2)
+    for steps, score in ((3, 6.0), (4, 7.0)):
+        assert store.save_best(steps, score)
+    assert [checkpoint_steps(path) for path in checkpoints_in(store.best)] == [1, 4]
+    assert checkpoint_steps(best_checkpoint(store.best)) == 4
+    again = CheckpointStore(tmp_path, parts(1), keep_last=1)
+    assert again.resume()
+    assert [checkpoint_steps(path) for path in checkpoints_in(store.best)] == [1]
+    assert again.save_best(4, 7.0)
+    again.save(4)
+    assert [checkpoint_steps(path) for path in checkpoints_in(store.best)] == [4]
+
+
 def test_a_part_can_be_restored_alone(tmp_path):
     store = CheckpointStore(tmp_path, parts(1), keep_last=1)
     counter = Counter()

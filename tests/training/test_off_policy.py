@@ -233,6 +233,15 @@ def test_a_memory_that_never_holds_enough_is_refused():
         OffPolicy.build(off_policy_config("algo=sac_lagrangian", "risk=cvar"), PointMass(2))
 
 
+@pytest.mark.parametrize("key", ["critics.rewards", "critics.costs"])
+def test_q_functions_that_are_learned_are_there(key):
+    both = "cost_limits={cost: 25, cost_north: 5}"
+    config = off_policy_config("algo=sac_lagrangian", f"{key}=0", both)
+    with pytest.raises(ValueError, match=rf"^{key}=0: algo=sac_lagrangian.*, as {key}=2\.$"):
+        OffPolicy.build(config, PointMass(2))
+    OffPolicy.build(off_policy_config("algo=sac", "critics.costs=0"), PointMass(2))
+
+
 def test_what_is_held_against_the_limit_is_the_mean_of_the_worst_episodes(make_trainer):
     config = ["algo=wcsac", "frames=8000", "frames_per_batch=1600", "exploration.random_steps=8000"]
     trainer = make_trainer("run", *config, "risk.tail=0.25")

@@ -230,6 +230,15 @@ class ReportingUpdate:
         pass
 
 
+class ForgetfulUpdate:
+    """An update of one's own that no checkpoint can hold."""
+
+    def __init__(self, loss): ...
+
+    def __call__(self, batch, cost_violation, episode_length):
+        return {}
+
+
 class PenalisedLoss(PPOLagrangianLoss):
     """A loss of one's own, with a hyper-parameter of its own."""
 
@@ -289,6 +298,14 @@ def test_a_policy_update_from_outside_the_package(tmp_path):
         rates = [(new - old) / 160 for old, new in itertools.pairwise(sums)]
         expected = [100 * rate - limit for rate in rates]
         assert table[f"policy_violation_{key}"] == pytest.approx(expected, abs=1e-3)
+
+
+def test_a_policy_update_without_a_state_is_refused_when_it_is_built(tmp_path):
+    own = own_algorithm(tmp_path, OWN_UPDATE.replace("Reporting", "Forgetful"))
+    config = point_mass_config(*own, minibatch_size=None)
+    said = r"^policy_update\._target_=test_training\.ForgetfulUpdate is no.* has no state_dict\(\)"
+    with pytest.raises(ValueError, match=said):
+        build_trainer(config, PointMass(config.num_envs, 40), tmp_path / "run")
 
 
 def test_batches_of_whole_episodes_are_judged_by_those(tmp_path):
