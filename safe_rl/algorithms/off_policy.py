@@ -151,7 +151,7 @@ class OffPolicy:
         if self.memory.keeps or not self.collects:
             return ""
         goes_on = f"goes on when it holds {self.random_steps:,} new ones"
-        if self.learns_from:
+        if len(self.memory):
             goes_on = "goes on from those of the dataset alone"
         return (
             "The transitions in its memory are not stored, by memory.keep=false: learning "

@@ -18,7 +18,7 @@ from torchrl.checkpoint import Checkpoint, CheckpointError, StateDictCheckpointA
 
 from safe_rl.algorithms.contract import Stateful
 
-__all__ = ["as_parts", "read_facts", "read_states", "restore", "writer"]
+__all__ = ["as_parts", "part_names", "read_facts", "read_states", "restore", "writer"]
 
 # parts that checkpoints of earlier versions lack: they begin anew
 _ADDED_LATER = {"candidates", "losses"}
@@ -111,7 +111,7 @@ def restore(path: Path, components: Mapping[str, Stateful]) -> None:
     Raises:
         CheckpointError: If the file is no checkpoint, or does not fit the parts.
     """
-    absent = _ADDED_LATER - _part_names(path) if _ADDED_LATER & components.keys() else set()
+    absent = _ADDED_LATER - part_names(path) if _ADDED_LATER & components.keys() else set()
     states = read_states(path, components.keys() - absent)
     for name in sorted(states):
         try:
@@ -120,7 +120,7 @@ def restore(path: Path, components: Mapping[str, Stateful]) -> None:
             raise _cannot_use(path, error, f"its {name!r} does not fit: ") from error
 
 
-def _part_names(path: Path) -> set[str]:
+def part_names(path: Path) -> set[str]:
     """Names of the parts in a file; none of one that cannot be read."""
     try:
         _check_kind(path)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +10,7 @@ from torch import Tensor, nn
 from torchrl.checkpoint import CheckpointError
 
 from safe_rl.algorithms.contract import Algorithm
-from safe_rl.runs.archive import read_states
+from safe_rl.runs.archive import part_names, read_states
 from safe_rl.runs.files import read_config
 from safe_rl.runs.folder import RunFolder, run_of
 
@@ -49,8 +49,8 @@ def initialise_networks(
         Names of the networks that were taken over.
 
     Raises:
-        CheckpointError: If there is no checkpoint, or its networks have other sizes; nothing has
-            been changed then.
+        CheckpointError: If there is no checkpoint, it lacks a network, or its networks have other
+            sizes; nothing has been changed then.
     """
     if not source.exists():
         raise CheckpointError(f"init_from={source}: there is no such folder or file.")
@@ -61,6 +61,7 @@ def initialise_networks(
         for name, network in networks.items()
         if same_costs or not name.startswith("cost_")
     }
+    _check_parts(taken, checkpoint)
     weights = read_states(checkpoint, taken)
     for name, network in taken.items():
         _check_sizes(name, network.state_dict(), weights[name], checkpoint)
@@ -91,6 +92,15 @@ def _cost_critics(checkpoint: Path) -> tuple[list[str], str | None]:
 def _cost_loss(config: Mapping[str, Any]) -> str | None:
     """Loss of critics that learn from a memory: of two alike, one may be a mean, one a variance."""
     return (config.get("loss") or {}).get("_target_") if config.get("critics") else None
+
+
+def _check_parts(networks: Collection[str], checkpoint: Path) -> None:
+    known = part_names(checkpoint)
+    if known and (absent := [name for name in networks if name not in known]):
+        raise CheckpointError(
+            f"{checkpoint} has no {' and no '.join(absent)}, which this run begins with, too: "
+            "init_from needs a run whose algorithm has learned all of them, as algo=bc does not."
+        )
 
 
 def _check_sizes(

@@ -80,6 +80,44 @@ def test_pictures_follow_the_state():
     assert redness(colour_at(env, -1.0, 1.0)) > 0.5
 
 
+# What files of robots often have, too.
+OF_THE_ROBOT = """
+<mujoco>
+  <asset>
+    <texture name="sky" type="skybox" builtin="flat" rgb1="1 0 0" width="8" height="8"/>
+    <texture name="floor" type="2d" builtin="flat" rgb1="1 0 0" width="8" height="8"/>
+    <material name="floor" texture="floor"/>
+  </asset>
+  <worldbody>
+    <body name="robot" pos="0 0 0.1">
+      <freejoint/>
+      <geom size="0.1"/>
+      <site name="middle"/>
+      <camera name="track" mode="trackcom" pos="0 0 3" xyaxes="1 0 0 0 1 0"/>
+      <camera pos="0 0 1"/>
+    </body>
+  </worldbody>
+  <actuator><general site="middle" gear="0 0 0 0 0 1"/></actuator>
+</mujoco>
+"""
+
+
+@needs_opengl
+def test_a_robots_own_names_do_not_clash_with_those_of_pictures(tmp_path):
+    path = tmp_path / "robot.xml"
+    path.write_text(OF_THE_ROBOT)
+    config, rgb = KINDS["goal"]
+    observed = {"observe_sensors": False, "observe_goal_lidar": True}
+    env = make_env({**config, **observed, "robot_base": str(path)})
+    assert np.ptp(colour_at(env, -PLACE[0], PLACE[1])) < 0.02
+    seen = env.render(0, camera="track", width=101, height=101)  # straight down, x to the right
+    height = 101 / (2 * 3.1 * math.tan(math.radians(45 / 2)))  # pixels per metre
+    line, column = round(50 - PLACE[1] * height), round(50 + PLACE[0] * height)
+    assert likeness(seen[line, column] / 255, rgb) > 0.95
+    with pytest.raises(ValueError, match=r"\['fixednear', 'fixedfar', 'track', 'free'\]"):
+        env.render(0, camera="eye")
+
+
 @needs_opengl
 def test_rows_are_drawn_apart():
     env = SafetyGymEnv("PointGoal1", num_envs=3, seed=0)

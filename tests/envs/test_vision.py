@@ -132,6 +132,9 @@ def test_a_robot_without_a_camera_is_an_error(tmp_path):
     blind.write_text("\n".join(line for line in text if "<camera" not in line))
     with pytest.raises(ConfigError, match=r"observe_vision.*no camera named 'vision'"):
         SafetyGymEnv({"robot_base": str(blind), "observe_vision": True})
+    blind.write_text("\n".join(text).replace('camera name="vision"', 'camera name="eye"'))
+    with pytest.raises(ConfigError, match=r"Its cameras are \['eye'\]: give one that name"):
+        SafetyGymEnv({"robot_base": str(blind), "observe_vision": True})
 
 
 def test_every_environment_has_a_variant_with_vision():

@@ -97,6 +97,15 @@ def test_without_its_memory_it_says_so_and_fills_it_anew(make_trainer, tmp_path)
     assert table["policy_num_updates"] == [0, 8, 8, 8, 0, 8, 8, 8]
 
 
+def test_one_that_is_too_short_to_learn_does_not_go_on_from_a_dataset(make_trainer):
+    short = ["algo=sac", "memory.keep=false", "exploration.random_steps=2000"]
+    make_trainer("run", *short, "frames=160").run()
+    resumed = make_trainer("run", *short, "frames=320")
+    assert resumed.resume()
+    assert "Nothing will be learned" in resumed.algorithm.learns_from
+    assert "when it holds 2,000 new ones" in resumed.algorithm.lost_on_resume
+
+
 def test_the_update_to_data_ratio_holds_for_fractions(make_trainer, tmp_path):
     make_trainer("run", "algo=sac", "policy_update.updates_per_step=0.021").run()
     table = read_table(tmp_path / "run" / "progress.csv")

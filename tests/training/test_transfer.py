@@ -109,6 +109,15 @@ def test_an_actor_of_another_kind_is_not_one_of_other_sizes(tmp_path):
             initialise_networks({"actor": second}, store.save(10), [])
 
 
+def test_what_a_run_has_not_learned_is_named(tmp_path):
+    """Behaviour cloning has an actor alone."""
+    actor = make_bounded_actor(3, -torch.ones(2), torch.ones(2), hidden_sizes=[8])
+    clone = CheckpointStore(tmp_path, {"actor": actor}, keep_last=1).save(10)
+    networks = {"actor": actor, "critic": QEnsemble(3, 2, hidden_sizes=[8], num_networks=2)}
+    with pytest.raises(CheckpointError, match=r"torchrl has no critic, which this run begins with"):
+        initialise_networks(networks, clone, [])
+
+
 def test_an_actor_without_matrices_has_no_sizes_that_could_differ(tmp_path):
     first, second = (torch.nn.LayerNorm(3) for _ in range(2))
     torch.nn.init.uniform_(first.weight)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import mujoco
 import torch
 from torch import Tensor
 
@@ -22,9 +21,11 @@ def vision_blocks(config: SafetyGymConfig, scene: Scene) -> list[Block]:
     """
     if not config.observe_vision:
         return []
-    if mujoco.mj_name2id(scene.model, mujoco.mjtObj.mjOBJ_CAMERA, VISION) < 0:
+    cameras = [scene.model.camera(i).name for i in range(scene.model.ncam)]
+    if VISION not in cameras:
+        others = f" Its cameras are {cameras}: give one that name." if cameras else ""
         raise ConfigError(
-            f"'observe_vision': robot {config.robot_base!r} has no camera named '{VISION}'."
+            f"'observe_vision': robot {config.robot_base!r} has no camera named '{VISION}'.{others}"
         )
     width, height = config.vision_size
     display = Display(config)

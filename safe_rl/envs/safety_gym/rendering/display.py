@@ -60,7 +60,8 @@ class Display:
     def cameras(self) -> list[str]:
         """Names that `frame` takes."""
         model = self.scene.model
-        return [model.camera(i).name for i in range(model.ncam)] + [FREE]
+        named = [name for i in range(model.ncam) if (name := model.camera(i).name)]
+        return [*named, FREE]
 
     def pose(self, world: World, row: int) -> None:
         """Put everything where it is in one of the worlds."""
@@ -135,10 +136,12 @@ class Display:
         return camera
 
     def _follow(self) -> None:
-        """Place the tracking camera behind the robot, looking down at it."""
+        """Place the tracking camera behind the robot, looking down at it; not one of its own."""
         model, data = self.scene.model, self.data
-        forward = self._heading()
         camera = model.camera(TRACK).id
+        if model.cam_bodyid[camera] != 0:
+            return
+        forward = self._heading()
         behind = -TRACK_BEHIND * forward + [0.0, 0.0, TRACK_ABOVE]
         data.cam_xpos[camera] = data.xpos[self.scene.robot_body] + behind
         right = np.cross(forward, [0.0, 0.0, 1.0])

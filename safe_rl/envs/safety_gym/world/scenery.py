@@ -14,6 +14,8 @@ _NORTH_DOWN = (math.cos(math.pi / 8), math.sin(math.pi / 8), 0.0, 0.0)
 FIXED_CAMERAS = {"fixednear": (0.0, -2.0, 2.0), "fixedfar": (0.0, -5.0, 5.0)}
 TRACK = "track"  # behind the robot, see `rendering.display`
 VISION = "vision"  # the robot's own, part of the robot file
+# Textures and materials of the robot file may have any other name.
+_FLOOR, _SKY = "safe_rl_floor", "safe_rl_sky"
 
 SKY_RGB = ((0.7, 0.78, 0.92), (0.42, 0.5, 0.68))  # overhead and underfoot
 FLOOR_RGB = ((0.74, 0.74, 0.74), (0.82, 0.82, 0.82))
@@ -38,18 +40,14 @@ def decorate(spec: mujoco.MjSpec, config: SafetyGymConfig) -> None:
     spec.visual.quality.numslices, spec.visual.quality.numstacks = SLICES, STACKS
     _add_sky(spec)
     _add_light(spec)
-    for name, position in FIXED_CAMERAS.items():
-        _add_camera(spec.worldbody, name, position)
-    _add_camera(spec.worldbody, TRACK, FIXED_CAMERAS["fixednear"])
-
-
-def _add_camera(body: mujoco.MjsBody, name: str, position: tuple[float, float, float]) -> None:
-    body.add_camera(name=name, pos=position, quat=_NORTH_DOWN)
+    for name, position in {**FIXED_CAMERAS, TRACK: FIXED_CAMERAS["fixednear"]}.items():
+        if spec.camera(name) is None:  # those of the robot file are preferred
+            spec.worldbody.add_camera(name=name, pos=position, quat=_NORTH_DOWN)
 
 
 def _floor_material(spec: mujoco.MjSpec) -> str:
     texture = spec.add_texture(
-        name="floor",
+        name=_FLOOR,
         type=mujoco.mjtTexture.mjTEXTURE_2D,
         builtin=mujoco.mjtBuiltin.mjBUILTIN_CHECKER,
         rgb1=FLOOR_RGB[0],
@@ -58,7 +56,7 @@ def _floor_material(spec: mujoco.MjSpec) -> str:
         height=256,
     )
     material = spec.add_material(
-        name="floor", texuniform=True, texrepeat=[0.5 / FLOOR_TILE, 0.5 / FLOOR_TILE]
+        name=_FLOOR, texuniform=True, texrepeat=[0.5 / FLOOR_TILE, 0.5 / FLOOR_TILE]
     )
     material.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = texture.name
     return material.name
@@ -66,7 +64,7 @@ def _floor_material(spec: mujoco.MjSpec) -> str:
 
 def _add_sky(spec: mujoco.MjSpec) -> None:
     spec.add_texture(
-        name="sky",
+        name=_SKY,
         type=mujoco.mjtTexture.mjTEXTURE_SKYBOX,
         builtin=mujoco.mjtBuiltin.mjBUILTIN_GRADIENT,
         rgb1=SKY_RGB[0],
