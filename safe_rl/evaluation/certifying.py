@@ -18,7 +18,7 @@ from torchrl.envs import EnvBase
 from safe_rl.evaluation.episodes import Episodes, collect_episodes
 from safe_rl.evaluation.layouts import default_seed, has_fixed_layout
 from safe_rl.evaluation.loading import evaluated, load_config, load_policy, override_env
-from safe_rl.runs.files import replacing
+from safe_rl.runs.files import replace_text, replacing
 from safe_rl.runs.folder import RunFolder, checkpoint_steps, checkpoints_in
 from safe_rl.scores.certificate import Claim, Verdict, first_certified, rank
 
@@ -241,5 +241,4 @@ def _write(folder: RunFolder, certificate: Certificate, candidates: list[int | N
         "tested": [candidates[number] for number in verdict.tested],
         **asdict(certificate.options),
     }
-    with replacing(folder.certificate) as path:
-        path.write_text(json.dumps(content, indent=2) + "\n")
+    replace_text(folder.certificate, json.dumps(content, indent=2) + "\n")

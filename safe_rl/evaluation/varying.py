@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass
@@ -26,7 +25,7 @@ from safe_rl.evaluation.loading import (
 from safe_rl.evaluation.settings import EvaluationOptions, check_options
 from safe_rl.evaluation.summary import check_places, summarise
 from safe_rl.evaluation.variations import TransformNode, Variation, varied
-from safe_rl.runs.files import replacing
+from safe_rl.runs.files import replace_csv
 from safe_rl.runs.folder import RunFolder, checkpoint_steps
 from safe_rl.scores.intervals import Estimate
 
@@ -156,11 +155,10 @@ def _write(path: Path, rows: Sequence[VariedRow]) -> None:
     """
     names = list(dict.fromkeys(name for row in rows for name in row.estimates))
     columns = [f"{name}{end}" for name in names for end in ("", "_low", "_high")]
-    with replacing(path) as unfinished, unfinished.open("w", newline="") as file:
-        writer = csv.writer(file, lineterminator="\n")
-        writer.writerow(["variation", "row", "value", "keys", *columns])
-        for (row, value, keys), estimates in rows:
-            changes = " ".join(f"{key}={changed}" for key, changed in keys.items())
-            found = [number for name in names for number in estimates.get(name, ("", "", ""))]
-            label = str(Variation(row, value, keys))
-            writer.writerow([label, row, "" if value is None else value, changes, *found])
+    table = [["variation", "row", "value", "keys", *columns]]
+    for variation, estimates in rows:
+        row, value, keys = variation
+        changes = " ".join(f"{key}={changed}" for key, changed in keys.items())
+        found = [number for name in names for number in estimates.get(name, ("", "", ""))]
+        table.append([str(variation), row, "" if value is None else value, changes, *found])
+    replace_csv(path, table)

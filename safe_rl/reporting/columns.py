@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import math
 import re
 from collections.abc import Callable, Hashable, Mapping, Sequence
@@ -12,7 +11,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from safe_rl.reporting.cleaning import clean
-from safe_rl.runs.files import replacing
+from safe_rl.runs.files import replace_csv
 
 __all__ = [
     *("MISSING", "SYMBOL", "Cell", "Column", "Record", "Table", "each_cost", "escaped", "interval"),
@@ -177,13 +176,7 @@ class Table:
     def write_csv(self, path: Path) -> None:
         """Write the records; what is not a number becomes an empty field."""
         names = dict.fromkeys(name for record in self.records for name in record)
-        with (
-            replacing(path) as unfinished,
-            unfinished.open("w", newline="", encoding="utf-8") as file,
-        ):
-            writer = csv.DictWriter(file, list(names), restval="", lineterminator="\n")
-            writer.writeheader()
-            writer.writerows([{k: _field(v) for k, v in r.items()} for r in self.records])
+        replace_csv(path, [names, *([_field(r.get(name)) for name in names] for r in self.records)])
 
 
 def _field(value: Any) -> Any:

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import csv
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -12,7 +13,10 @@ import yaml
 from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-__all__ = ["check_place", "read_config", "read_notes", "read_yaml", "replacing"]
+__all__ = [
+    *("check_place", "read_config", "read_notes", "read_yaml", "replace_csv", "replace_text"),
+    "replacing",
+]
 
 # of a configuration; that of a run has about six thousand
 _MOST_LETTERS = 1_000_000
@@ -111,6 +115,18 @@ def replacing(path: Path) -> Iterator[Path]:
         unfinished.replace(path)
     finally:
         unfinished.unlink(missing_ok=True)
+
+
+def replace_text(path: Path, text: str) -> None:
+    """Write a text file by :func:`replacing`."""
+    with replacing(path) as unfinished:
+        unfinished.write_text(text, encoding="utf-8")
+
+
+def replace_csv(path: Path, rows: Iterable[Iterable[Any]]) -> None:
+    """Write a CSV file, its header being the first of the rows, by :func:`replacing`."""
+    with replacing(path) as unfinished, unfinished.open("w", newline="", encoding="utf-8") as file:
+        csv.writer(file, lineterminator="\n").writerows(rows)
 
 
 def check_place(path: Path, otherwise: str) -> None:

@@ -17,7 +17,7 @@ from typing import Any
 
 from filelock import FileLock, Timeout
 
-from safe_rl.runs.files import replacing
+from safe_rl.runs.files import replace_text
 from safe_rl.runs.folder import RunFolder
 
 __all__ = ["RunInUseError", "held"]
@@ -62,8 +62,7 @@ def held(folder: RunFolder) -> Iterator[None]:
     try:
         _check_writer(folder, is_locked=lock is not None)
         _held[place] = os.getpid()
-        with replacing(folder.writer) as unfinished:
-            unfinished.write_text(json.dumps(_present_writer()))
+        replace_text(folder.writer, json.dumps(_present_writer()))
         try:
             with _beating(folder.writer):
                 yield
