@@ -6,7 +6,6 @@ import math
 import re
 from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import dataclass
-from itertools import chain, zip_longest
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -193,11 +192,8 @@ def escaped(text: str) -> str:
         >>> print(escaped("<b> a|b $x_y$"))
         \<b\> a\|b $x_y$
     """
-    symbols = [match.group() for match in SYMBOL.finditer(text)]
-    ends = [0, *chain.from_iterable(match.span() for match in SYMBOL.finditer(text)), len(text)]
-    pieces = [text[start:stop] for start, stop in zip(ends[::2], ends[1::2], strict=True)]
-    plain = [re.sub(r"([\\`*_{}\[\]<>|#$~&])", r"\\\1", piece) for piece in pieces]
-    return "".join(chain.from_iterable(zip_longest(plain, symbols, fillvalue="")))
+    special = rf"({SYMBOL.pattern})|[\\`*_{{}}\[\]<>|#$~&]"
+    return re.sub(special, lambda match: match[0] if match[1] else rf"\{match[0]}", text)
 
 
 def mark_best(
