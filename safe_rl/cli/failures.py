@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import shutil
-from collections.abc import Collection, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -16,11 +16,11 @@ from safe_rl.runs.folder import RunFolder
 
 __all__ = ["SETTING_ERRORS", "errors_in_a_line"]
 
-SETTING_ERRORS: Collection[type[Exception]] = (
+SETTING_ERRORS: tuple[type[Exception], ...] = (
     *(ValueError, CheckpointError, OmegaConfBaseException, OSError),
     *(ModuleNotFoundError, ContractError),
 )
-"""What goes wrong for the sake of settings and files while a run is built."""
+"""What is raised about settings and files, when a run is built or evaluated."""
 
 
 @contextmanager
