@@ -74,7 +74,7 @@ def evaluate_variations(
     transform_node: TransformNode,
     refusals: tuple[type[Exception], ...],
     may_lack: Callable[[Variation], bool],
-    progress: Callable[[Variation], None] = lambda variation: None,
+    progress: bool = False,
 ) -> Varied:
     """Run a trained policy in its own environment and in variations of it.
 
@@ -88,7 +88,7 @@ def evaluate_variations(
         transform_node: Name of a transform -> its node, for those that the run lacks.
         refusals: What an environment raises that cannot have a variation, beside ValueError.
         may_lack: Whether a variation is left out where the environment cannot have it.
-        progress: Is told what is next.
+        progress: Whether to say what is next.
 
     Raises:
         FileNotFoundError: If the folder is not a run's, or has no such checkpoint.
@@ -112,7 +112,8 @@ def evaluate_variations(
             if changed is None:
                 left_out.append((variation, "that is how it was trained"))
                 continue
-            progress(variation)
+            if progress:
+                print(f"… {variation}", flush=True)
             episodes = _episodes(changed, checkpoint, options, make_env)
         except cannot as error:
             if variation is AS_TRAINED or not may_lack(variation):
