@@ -90,7 +90,7 @@ def evaluate(
         )
 
     # environments that draw nothing unless they are told have a key for it
-    drawing = {key: "rgb_array" for key in ("render_mode",) if key in node}
+    drawing = {"render_mode": "rgb_array"} if "render_mode" in node else {}
     run = RunFolder(directory)
     places = {kind: run.evaluation(options.name, kind) for kind in ("json", "csv", "transitions")}
     films = [run.evaluation(options.name, "mp4")] if options.video else []
