@@ -59,7 +59,7 @@ class RunFolder:
     curves = _Below("curves.png")  # the picture of its learning curves
     failure = _Below("failure.txt")  # what a job of a sweep has failed of
     lock = _Below(".lock")  # keeps a second process from writing here
-    writer = _Below(".writer.json")  # who holds the lock
+    lease = _Below(".lease")  # who holds it, for machines that share no locks
     robot = _Below("robot")  # copies of the robot's files, where it is one of the user's own
     robot_note = _Below("robot.json")  # which robot that is, and its SHA-256
     notes = _Below(".hydra")  # Hydra's notes
@@ -116,7 +116,7 @@ class RunFolder:
     @property
     def is_untouched(self) -> bool:
         """Whether nothing has been written here but what shows who would."""
-        lock = (self.lock.name, self.writer.name)
+        lock = (self.lock.name, self.lease.name)
         return all(path.name in lock for path in self.directory.iterdir())
 
     @property
