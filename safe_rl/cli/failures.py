@@ -1,4 +1,4 @@
-"""What is wrong with settings and files ends a command with one line."""
+"""Errors about settings and files end a command with one line."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ SETTING_ERRORS: tuple[type[Exception], ...] = (
 
 @contextmanager
 def errors_in_a_line(directory: Path, is_new: bool, *errors: type[Exception]) -> Iterator[None]:
-    """End with what is wrong instead of the way to it, which ``HYDRA_FULL_ERROR=1`` shows.
+    """End with the message of an error; ``HYDRA_FULL_ERROR=1`` shows its traceback, too.
 
     Args:
         directory: Folder of the run.

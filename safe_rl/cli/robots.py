@@ -86,7 +86,7 @@ def robot_of(folder: RunFolder, env: Mapping[str, Any]) -> tuple[dict[str, Any],
 def maker_of(directory: Path) -> Callable[..., envs.ConstrainedEnv]:
     """:func:`safe_rl.envs.make_env` for environments of a run, with the robot that it began with.
 
-    Where that is the run's copy, this is printed, once.
+    Where that is the run's own copy, it says so once.
     """
     said: set[str | None] = {None}
 

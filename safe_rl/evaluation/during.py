@@ -19,7 +19,7 @@ _MOST_WORLDS = 50
 
 
 class PeriodicEvaluation:
-    """Every so many steps, whole episodes of the policy without what explores.
+    """Runs whole episodes of the policy, without exploration, every so many steps.
 
     The worlds of an evaluation are drawn from the seed and the number of steps alone: it neither
     changes what training draws nor depends on whether the run was interrupted.
@@ -31,7 +31,7 @@ class PeriodicEvaluation:
         interval: Steps of training from one evaluation to the next.
         episodes: Episodes of each.
         seed: Of the worlds, to which the steps of training are added, and of what the policy draws.
-        fixed_layout: Whether worlds have one layout, that of ``seed``: then it is no other.
+        fixed_layout: Whether all worlds have one layout, drawn from ``seed`` alone.
 
     Examples:
         >>> from safe_rl.envs import make_env

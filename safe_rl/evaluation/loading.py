@@ -44,7 +44,7 @@ def load_config(directory: Path) -> DictConfig:
 
 
 def override_env(config: DictConfig, overrides: Mapping[str, Any]) -> dict[str, Any]:
-    """The run's environment with some keys changed; of mappings, as in training, what is named.
+    """The run's environment with some keys changed; in mappings only what is named, as in training.
 
     Raises:
         ValueError: As by `check_env_keys`; the package's families look at their keys themselves.
@@ -68,7 +68,7 @@ def _changed(node: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, A
 def limits_of(
     config: DictConfig, others: Mapping[str, float], cost_keys: Collection[str]
 ) -> dict[str, float]:
-    """Cost key -> d, of the run, and in their place others that are asked for.
+    """Cost key -> d: the run's limits, with others in their place where these are asked for.
 
     Raises:
         ValueError: If others name a cost that the environment does not have.

@@ -94,9 +94,9 @@ def interval(name: str, decimals: int) -> tuple[tuple[str, ...], ...]:
 def each_cost(
     keys: Sequence[str], fields: Mapping[str, str]
 ) -> Callable[[Record], Sequence[Record]]:
-    """How a record is shown that has figures of several costs: as a row of each.
+    """Show a record with figures of several costs as a row per cost.
 
-    A column of each cost would make tables as wide as there are costs.
+    A column per cost would make tables as wide as there are costs.
 
     Args:
         keys: Keys of the costs.
@@ -204,9 +204,9 @@ def mark_best(
     is_able: Callable[[Record], bool],
     steps: Callable[[Record], Hashable],
 ) -> Callable[[Record], str]:
-    """Mark of a column: "best" for the best value, and all equal to it, after equally many steps.
+    """Mark the best value of a column, and all equal to it, among records of equally many steps.
 
-    What nothing else has had as many steps as is not compared, and not marked.
+    A record that no other one was trained as long as is not marked.
 
     Args:
         records: Rows of the table.

@@ -21,7 +21,7 @@ _PATIENCE = 5.0  # seconds
 
 
 def note_code(path: Path, steps: int) -> None:
-    """Write which code goes on with a run, below what has gone on with it before.
+    """Add the code that carries a run on from here to the file that lists them.
 
     Args:
         path: The file, a list of JSON objects with ``steps``, ``version``, ``commit`` and

@@ -27,7 +27,7 @@ KINDS = ("last", "best", "certified")
 
 
 class _Below:
-    """A file or folder of a run: read of a `RunFolder`, its path; of the class, that within any."""
+    """A file or folder of a run: ``folder.table`` is its path, ``RunFolder.table`` its name."""
 
     def __init__(self, name: str) -> None:
         self._name = name
@@ -74,7 +74,7 @@ class RunFolder:
 
     @property
     def recorded_table(self) -> Path:
-        """The table as it is there: plain, or else compressed."""
+        """The file of the table: the plain one if it is there, else the compressed one."""
         is_packed = self.packed_table.is_file() and not self.table.is_file()
         return self.packed_table if is_packed else self.table
 
@@ -115,7 +115,7 @@ class RunFolder:
 
     @property
     def is_untouched(self) -> bool:
-        """Whether nothing has been written here but what shows who would."""
+        """Whether nothing is here but the files of the lock."""
         lock = (self.lock.name, self.lease.name)
         return all(path.name in lock for path in self.directory.iterdir())
 
@@ -167,7 +167,7 @@ def runs_below(root: Path) -> list[RunFolder]:
 
 
 def paths_below(root: Path, pattern: str) -> list[Path]:
-    """Files and folders of such names below a folder, sorted; links to folders are not followed.
+    """Files and folders below a folder whose names match, sorted; links to folders stay closed.
 
     Folders may vanish meanwhile, as those of a checkpoint that is being written do, at which
     `Path.rglob` fails.
@@ -218,7 +218,7 @@ def run_of(source: Path) -> tuple[Path, int | None]:
 
 
 def common_source(source: str) -> str:
-    """What ``init_from`` is alike in over seeds, each of which starts from a run of its own.
+    """The part of ``init_from`` that all seeds share, each of which starts from its own run.
 
     Examples:
         >>> common_source("runs/small/seed3")
