@@ -17,7 +17,7 @@ from torchrl.envs import EnvBase
 
 from safe_rl.evaluation.episodes import Episodes, collect_episodes
 from safe_rl.evaluation.layouts import default_seed, has_fixed_layout
-from safe_rl.evaluation.loading import evaluated, load_config, load_policy, override_env
+from safe_rl.evaluation.loading import for_evaluation, load_config, load_policy, override_env
 from safe_rl.runs.files import replace_text, replacing
 from safe_rl.runs.folder import RunFolder, checkpoint_steps, checkpoints_in
 from safe_rl.scores.certificate import Claim, Verdict, first_certified, rank
@@ -161,7 +161,7 @@ class _Runner:
     def __init__(
         self, config: DictConfig, make_env: Callable[..., EnvBase], threads: int, progress: bool
     ) -> None:
-        self._config, self._make_env = config, evaluated(make_env, config)
+        self._config, self._make_env = config, for_evaluation(make_env, config)
         self._threads, self._progress = threads, progress
         self.largest: dict[str, float] = {}
 

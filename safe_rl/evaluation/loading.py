@@ -21,7 +21,7 @@ from safe_rl.runs.files import read_config
 from safe_rl.runs.folder import KINDS, RunFolder
 
 __all__ = [
-    *("evaluated", "find_checkpoint", "limits_of", "load_config", "load_policy"),
+    *("find_checkpoint", "for_evaluation", "limits_of", "load_config", "load_policy"),
     *("override_env", "transforms_of"),
 ]
 
@@ -93,8 +93,8 @@ def transforms_of(config: DictConfig) -> dict[str, Any]:
     return OmegaConf.to_container(config.get("transforms") or OmegaConf.create(), resolve=True)  # type: ignore[return-value]
 
 
-def evaluated(make_env: Callable[..., EnvBase], config: DictConfig) -> Callable[..., EnvBase]:
-    """What makes the run's environments for evaluation, with its transforms if it has any."""
+def for_evaluation(make_env: Callable[..., EnvBase], config: DictConfig) -> Callable[..., EnvBase]:
+    """`make_env` for evaluations of a run, with the transforms of the run if it has any."""
     transforms = transforms_of(config)
     return partial(make_env, transforms=transforms, evaluating=True) if transforms else make_env
 

@@ -15,8 +15,8 @@ from torchrl.envs import EnvBase
 from safe_rl.evaluation.episodes import Episodes, collect_episodes
 from safe_rl.evaluation.layouts import default_seed
 from safe_rl.evaluation.loading import (
-    evaluated,
     find_checkpoint,
+    for_evaluation,
     limits_of,
     load_config,
     load_policy,
@@ -134,7 +134,7 @@ def _episodes(
 ) -> Episodes:
     node = override_env(config, {})
     seed = default_seed(node, config.seed) if options.seed is None else options.seed
-    env = evaluated(make_env, config)(
+    env = for_evaluation(make_env, config)(
         node,
         num_envs=min(options.num_envs, options.episodes),
         device=options.device,
@@ -156,7 +156,7 @@ def _write(path: Path, rows: Sequence[VariedRow]) -> None:
     """
     names = list(dict.fromkeys(name for row in rows for name in row.estimates))
     columns = [f"{name}{end}" for name in names for end in ("", "_low", "_high")]
-    table = [["variation", "row", "value", "keys", *columns]]
+    table: list[list[Any]] = [["variation", "row", "value", "keys", *columns]]
     for variation, estimates in rows:
         row, value, keys = variation
         changes = " ".join(f"{key}={changed}" for key, changed in keys.items())

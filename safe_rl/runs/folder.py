@@ -167,10 +167,10 @@ def runs_below(root: Path) -> list[RunFolder]:
 
 
 def paths_below(root: Path, pattern: str) -> list[Path]:
-    """Files and folders below a folder whose names match, sorted; links to folders stay closed.
+    """Files and folders below a folder whose names match, sorted.
 
-    Folders may vanish meanwhile, as those of a checkpoint that is being written do, at which
-    `Path.rglob` fails.
+    Links to folders are not followed. Folders may vanish meanwhile, as those of a checkpoint that
+    is being written do, at which `Path.rglob` fails.
     """
     return sorted(
         Path(folder, name)
