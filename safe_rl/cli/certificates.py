@@ -49,7 +49,7 @@ def certify_run(
 
 
 def certify_ended(directory: Path, num_threads: int = 0) -> Certificate | None:
-    """:func:`certify_run` for one that has come to its end; interrupted, it leaves a note of that.
+    """:func:`certify_run` at the end of a run; if interrupted, it leaves a note to do it later.
 
     Args:
         directory: Folder of the run, into which nobody else writes meanwhile.

@@ -7,16 +7,15 @@ from collections.abc import Sequence
 from dataclasses import fields
 from pathlib import Path
 
-from torchrl.checkpoint import CheckpointError
-
 from safe_rl.cli.benchmark import suite
 from safe_rl.cli.certificates import certify_run
+from safe_rl.cli.failures import SETTING_ERRORS
 from safe_rl.cli.interrupting import say_interruptions
 from safe_rl.cli.options import OptionError, parse_options, usage
 from safe_rl.cli.robots import maker_of
 from safe_rl.cli.user_code import check_imports, import_modules, split_imports
 from safe_rl.cli.variations import evaluate_varied, table_of
-from safe_rl.envs import ConfigError, ContractError, LayoutError, OpenGLError
+from safe_rl.envs import LayoutError, OpenGLError
 from safe_rl.evaluation import Evaluation, EvaluationOptions, evaluate
 from safe_rl.evaluation.loading import load_config
 from safe_rl.evaluation.summary import format_estimates, format_unjudged
@@ -24,6 +23,7 @@ from safe_rl.evaluation.summary import format_estimates, format_unjudged
 __all__ = ["evaluate_run", "main"]
 
 COMMAND = "python -m safe_rl.evaluate"
+_ERRORS: tuple[type[Exception], ...] = (*SETTING_ERRORS, LayoutError, OpenGLError)
 
 
 def evaluate_run(
@@ -67,10 +67,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             print(table_of(found), f"wrote {found.file}", f"wrote {picture}", sep="\n")
             return 0
         result = evaluate_run(directory, options, progress=True)
-    except (
-        *(OptionError, ConfigError, ContractError, CheckpointError, LayoutError, OpenGLError),
-        *(OSError, ModuleNotFoundError, ValueError),
-    ) as error:
+    except _ERRORS as error:
         print(f"error: {error}", file=sys.stderr)
         return 1
     print(_report(result))

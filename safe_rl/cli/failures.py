@@ -1,9 +1,9 @@
-"""What is wrong with settings and files ends a command with one line."""
+"""Errors about settings and files end a command with one line."""
 
 from __future__ import annotations
 
 import os
-from collections.abc import Collection, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -16,16 +16,16 @@ from safe_rl.runs.folder import RunFolder
 
 __all__ = ["SETTING_ERRORS", "errors_in_a_line"]
 
-SETTING_ERRORS: Collection[type[Exception]] = (
+SETTING_ERRORS: tuple[type[Exception], ...] = (
     *(ValueError, CheckpointError, OmegaConfBaseException, OSError),
     *(ModuleNotFoundError, ContractError),
 )
-"""What goes wrong for the sake of settings and files while a run is built."""
+"""What is raised about settings and files, when a run is built or evaluated."""
 
 
 @contextmanager
 def errors_in_a_line(directory: Path, is_new: bool, *errors: type[Exception]) -> Iterator[None]:
-    """End with what is wrong instead of the way to it, which ``HYDRA_FULL_ERROR=1`` shows.
+    """End with the message of an error; ``HYDRA_FULL_ERROR=1`` shows its traceback, too.
 
     Args:
         directory: Folder of the run.

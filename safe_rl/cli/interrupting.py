@@ -1,4 +1,4 @@
-"""What ends a run before its time is said in a line."""
+"""A command that is interrupted says so in a line."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def say_if_heard(*lines: str) -> None:
 
 
 def say_interruptions() -> None:
-    """Let Ctrl-C say so instead of where it came; ``HYDRA_FULL_ERROR=1`` shows that.
+    """Let Ctrl-C print a word instead of a traceback, which ``HYDRA_FULL_ERROR=1`` shows.
 
     The process still ends by the signal, as shells want it that run commands in a loop.
     """

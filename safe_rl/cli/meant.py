@@ -46,7 +46,7 @@ _ALWAYS = ("env", "algo", "logger", "hydra.run.dir", "+note")
 def keys_meant(
     key: str, written: Sequence[str], optional: Sequence[str] = (), refused: Sequence[str] = ()
 ) -> list[str]:
-    """Keys that end like a wrong one, or mean the same elsewhere, or else those most like it.
+    """Keys with the last name of a wrong one, or its meaning elsewhere, or else those most like it.
 
     Args:
         key: The wrong one.
@@ -95,7 +95,7 @@ def _end(path: str) -> str:
 def choice_with(
     key: str, options: Sequence[str], values_with: Callable[[str], Mapping[str, Any]]
 ) -> str | None:
-    """The choice with which there would be a key: ``risk=cvar`` of ``risk.tail``; None for none.
+    """The choice that would bring a key, as ``risk=cvar`` brings ``risk.tail``, or None.
 
     Args:
         key: Full path.

@@ -36,8 +36,8 @@ from safe_rl.envs import store_configs
 from safe_rl.evaluation import Certificate, Evaluation, EvaluationOptions
 from safe_rl.evaluation.layouts import default_seed
 from safe_rl.evaluation.loading import (
-    evaluated,
     find_checkpoint,
+    for_evaluation,
     load_config,
     load_policy,
     override_env,
@@ -116,7 +116,8 @@ class Run:
         node = override_env(self.config, keys)
         if seed is None:
             seed = default_seed(node, self.config.seed)
-        return evaluated(maker_of(self.directory), self.config)(node, num_envs=num_envs, seed=seed)
+        make = for_evaluation(maker_of(self.directory), self.config)
+        return make(node, num_envs=num_envs, seed=seed)
 
     def evaluate(self, **options: Any) -> Evaluation:
         """Run the policy for whole episodes; writes into the folder what the command writes.

@@ -104,7 +104,7 @@ def _listed(choices: Sequence[str]) -> str:
 
 
 def check_whole(overrides: Sequence[Override]) -> None:
-    """Refuse single limits and factors, and two mappings of them, which Hydra would merge.
+    """Refuse a single limit or factor, and two mappings of them: a mapping is given as a whole.
 
     Raises:
         CommandLineError: If there are any.
@@ -124,9 +124,9 @@ def check_whole(overrides: Sequence[Override]) -> None:
 
 
 def check_added(overrides: Sequence[Override], config: DictConfig) -> None:
-    """Refuse keys that are added at the top, where no table knows them, and that nothing reads.
+    """Refuse keys that are added at the top level, ``+key=…``, and that nothing reads.
 
-    What sections and parts do not take is refused with their values.
+    Keys below sections and parts are checked with their values.
 
     Args:
         overrides: Overrides of a command line.

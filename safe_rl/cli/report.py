@@ -98,7 +98,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if options.archive is not None:
             keep_runs((run.directory for run in result.runs), root, Path(options.archive))
             print(f"kept {len(result.runs)} runs in {options.archive}")
-    except (OptionError, OSError, ModuleNotFoundError, ValueError) as error:
+    except (OSError, ModuleNotFoundError, ValueError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 1
     for path, reason in result.skipped.items():

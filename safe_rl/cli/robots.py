@@ -17,7 +17,7 @@ from safe_rl import envs
 from safe_rl.envs import ConfigError
 from safe_rl.envs.safety_gym.rules.robot_copies import copy_robot, is_robot, own_robot
 from safe_rl.envs.safety_gym.rules.robot_files import fingerprint
-from safe_rl.runs.files import replacing
+from safe_rl.runs.files import replace_text
 from safe_rl.runs.folder import RunFolder
 
 __all__ = ["keep_robot", "maker_of", "robot_of"]
@@ -49,8 +49,7 @@ def keep_robot(folder: RunFolder, env: Mapping[str, Any]) -> None:
     except OSError:
         shutil.rmtree(folder.robot, ignore_errors=True)
         raise
-    with replacing(folder.robot_note) as unfinished:
-        unfinished.write_text(json.dumps(note, indent=1) + "\n")
+    replace_text(folder.robot_note, json.dumps(note, indent=1) + "\n")
 
 
 def robot_of(folder: RunFolder, env: Mapping[str, Any]) -> tuple[dict[str, Any], str | None]:
@@ -87,7 +86,7 @@ def robot_of(folder: RunFolder, env: Mapping[str, Any]) -> tuple[dict[str, Any],
 def maker_of(directory: Path) -> Callable[..., envs.ConstrainedEnv]:
     """:func:`safe_rl.envs.make_env` for environments of a run, with the robot that it began with.
 
-    Where that is the run's copy, this is printed, once.
+    Where that is the run's own copy, it says so once.
     """
     said: set[str | None] = {None}
 

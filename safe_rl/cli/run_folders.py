@@ -80,7 +80,7 @@ def _make(path: Path) -> bool:
 
 
 def write_notes(folder: RunFolder, config: DictConfig, hydra: HydraConf | DictConfig) -> None:
-    """Write what Hydra would have written before it was known whether the run may begin here.
+    """Write Hydra's notes, which it would write before it is known whether a run may begin here.
 
     Args:
         folder: Of the run.

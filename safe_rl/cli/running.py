@@ -97,7 +97,7 @@ def prepare(config: DictConfig, directory: Path, continues: bool) -> Trainer | N
         if lost := getattr(trainer.algorithm, "lost_on_resume", ""):
             print(lost)
         return trainer
-    if continues and trainer.folder.files.num_rows:
+    if continues and trainer.record.folder.num_rows:
         print("No checkpoint was written yet: starting over, with a new progress.csv.")
     if config.init_from is not None:
         begin_from(trainer.algorithm, config)

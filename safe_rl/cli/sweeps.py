@@ -20,7 +20,7 @@ from omegaconf import DictConfig
 from safe_rl.cli.sweep_display import SweepDisplay, last_notes
 from safe_rl.cli.user_code import import_modules, imported
 from safe_rl.processes import end_with_parent
-from safe_rl.runs.files import replacing
+from safe_rl.runs.files import replace_text
 from safe_rl.runs.folder import RunFolder
 from safe_rl.runs.lock import RunInUseError
 
@@ -117,8 +117,7 @@ class SweepReport(Callback):
         if not isinstance(error, RunInUseError):  # the folder is somebody else's
             failure.unlink(missing_ok=True)
             if error is not None:
-                with replacing(failure) as unfinished:
-                    unfinished.write_text("".join(traceback.format_exception(error)))
+                replace_text(failure, "".join(traceback.format_exception(error)))
         if error is None:
             self._note(config, "done")
             return

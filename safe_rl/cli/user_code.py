@@ -135,7 +135,7 @@ def import_modules(modules: str | Sequence[str]) -> list[str]:
 
 
 def several(given: str | Sequence[str]) -> list[str]:
-    """What may be given alone or in a list; a text, which is a sequence itself, is given alone.
+    """A list of what may be given as one text or as several.
 
     Examples:
         >>> several("losses.py"), several(("losses.py", "my.envs")), several(())

@@ -47,7 +47,7 @@ def number(
 ) -> Values:
     """Finite numbers between two bounds; ``above`` and ``below`` leave the bounds themselves out.
 
-    The bounds of a number without natural ones keep it within what float32 can square.
+    The default bounds keep a number within what float32 can square.
     """
     low = f"above {lowest:g}" if above else f"from {lowest:g}"
     high = f"below {highest:g}" if below else f"{'at most' if above else 'to'} {highest:g}"

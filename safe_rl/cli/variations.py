@@ -49,7 +49,7 @@ def evaluate_varied(
         transform_node=_transform_node,
         refusals=(LayoutError,),
         may_lack=lambda variation: variation in named,
-        progress=(lambda variation: print(f"… {variation}", flush=True)) if progress else _nothing,
+        progress=progress,
     )
     picture = RunFolder(directory).variations(options.name, "png")
     draw_variations(found.rows, found.cost_limits, picture)
@@ -144,7 +144,3 @@ def _transform_node(name: str) -> Mapping[str, Any]:
             f"{', '.join(known)}."
         )
     return _read(path)[name]
-
-
-def _nothing(variation: Variation) -> None:
-    """Say nothing."""

@@ -16,7 +16,7 @@ __all__ = ["EpisodeAccounting", "EpisodeError", "EpisodeStatistics"]
 
 
 class EpisodeError(ValueError):
-    """Steps that a constrained problem does not have; the message says what the environment did."""
+    """Steps that break the rules of a constrained problem; the message says which."""
 
 
 @dataclass(frozen=True)

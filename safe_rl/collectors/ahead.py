@@ -18,16 +18,16 @@ __all__ = ["behind", "measured_from"]
 def behind(
     policy: TensorDictModuleBase, sampled: Collection[NestedKey]
 ) -> tuple[TensorDictModuleBase, Callable[[], None], Callable[[TensorDictBase], TensorDictBase]]:
-    """What collects ahead of a policy's updates.
+    """Let a copy of a policy collect while the policy itself learns.
 
     Args:
         policy: the policy that learns.
         sampled: keys of its actions.
 
     Returns:
-        A copy of the policy; what gives it the present weights, before anything is collected; and
-        what every batch is put through while nothing is collected: the copy gets the present
-        weights, and the batch is `measured_from` the present policy.
+        The copy; a function that gives it the present weights, to be called before anything is
+        collected; and one for every batch, to be called while nothing is collected: the copy gets
+        the present weights, and the batch is `measured_from` the present policy.
 
     Raises:
         ValueError: if the policy has a memory, which would be of older weights.

@@ -38,8 +38,8 @@ class WorkerCollector:
     The workers get the policy's weights before every batch but the first, with which they start.
 
     Args:
-        start: Starts TorchRL's collector, whose batches are [W, n, T] or [N, T]; as soon as that
-            has processes it is given to the function that ``start`` gets.
+        start: Starts TorchRL's collector, whose batches are [W, n, T] or [N, T], and hands it, as
+            soon as it has processes, to the function that ``start`` is given.
         num_envs: Rows of all workers together, N.
         device: Device of the batches.
         refresh: None, or what a batch is put through if the workers are to collect the next one

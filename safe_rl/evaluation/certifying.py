@@ -18,8 +18,8 @@ from torchrl.envs import EnvBase
 
 from safe_rl.evaluation.episodes import Episodes, collect_episodes
 from safe_rl.evaluation.layouts import default_seed, has_fixed_layout
-from safe_rl.evaluation.loading import evaluated, load_config, load_policy, override_env
-from safe_rl.runs.files import replacing
+from safe_rl.evaluation.loading import for_evaluation, load_config, load_policy, override_env
+from safe_rl.runs.files import replace_text, replacing
 from safe_rl.runs.folder import RunFolder, checkpoint_steps, checkpoints_in
 from safe_rl.scores.certificate import Claim, Verdict, first_certified, rank
 
@@ -174,7 +174,7 @@ class _Runner:
     def __init__(
         self, config: DictConfig, make_env: Callable[..., EnvBase], threads: int, progress: bool
     ) -> None:
-        self._config, self._make_env = config, evaluated(make_env, config)
+        self._config, self._make_env = config, for_evaluation(make_env, config)
         self._threads, self._progress = threads, progress
         self.largest: dict[str, float] = {}
 
@@ -254,5 +254,4 @@ def _write(folder: RunFolder, certificate: Certificate, candidates: list[int | N
         "tested": [candidates[number] for number in verdict.tested],
         **asdict(certificate.options),
     }
-    with replacing(folder.certificate) as path:
-        path.write_text(json.dumps(content, indent=2) + "\n")
+    replace_text(folder.certificate, json.dumps(content, indent=2) + "\n")

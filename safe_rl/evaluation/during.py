@@ -19,7 +19,7 @@ _MOST_WORLDS = 50
 
 
 class PeriodicEvaluation:
-    """Every so many steps, whole episodes of the policy without what explores.
+    """Runs whole episodes of the policy, without exploration, every so many steps.
 
     The worlds of an evaluation are drawn from the seed and the number of steps alone: it neither
     changes what training draws nor depends on whether the run was interrupted.
@@ -31,7 +31,7 @@ class PeriodicEvaluation:
         interval: Steps of training from one evaluation to the next.
         episodes: Episodes of each.
         seed: Of the worlds, to which the steps of training are added, and of what the policy draws.
-        fixed_layout: Whether worlds have one layout, that of ``seed``: then it is no other.
+        fixed_layout: Whether all worlds have one layout, drawn from ``seed`` alone.
 
     Examples:
         >>> from safe_rl.envs import make_env
@@ -64,10 +64,6 @@ class PeriodicEvaluation:
         self._interval, self._episodes, self._seed = interval, episodes, seed
         self._fixed_layout = fixed_layout
 
-    def _devices(self) -> set[torch.device]:
-        """Devices, besides the CPU, that the policy draws on."""
-        return {parameter.device for parameter in self._policy.parameters() if parameter.is_cuda}
-
     def __call__(self, before: int, after: int) -> dict[str, float]:
         """Means over episodes, if one is due between two numbers of steps; otherwise NaN."""
         names = ["return", *self._cost_keys]
@@ -77,9 +73,10 @@ class PeriodicEvaluation:
         worlds = min(self._episodes, _MOST_WORLDS)
         fresh = (self._seed + after) % 2**62
         seed = self._seed if self._fixed_layout else fresh
+        devices = {parameter.device for parameter in self._policy.parameters() if parameter.is_cuda}
         with (
             # first: environments that are made, and seeded, may draw from torch's generator
-            torch.random.fork_rng(devices=self._devices()),
+            torch.random.fork_rng(devices=devices),
             closing(self._make_env(num_envs=worlds, seed=seed)) as env,
         ):
             torch.manual_seed(fresh)

@@ -13,8 +13,8 @@ __all__ = ["check_env_keys"]
 def check_env_keys(env: Mapping[str, Any], keys: Iterable[str]) -> None:
     """Refuse keys that an environment of one's own family does not have.
 
-    What such a family is given beyond its own keys it leaves alone, so that what was measured would
-    be called something that it is not.
+    Such a family ignores other keys, and the result would be said to be of another environment
+    than it is.
 
     Args:
         env: Node of a run's environment.

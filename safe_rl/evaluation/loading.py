@@ -21,7 +21,7 @@ from safe_rl.runs.files import read_config
 from safe_rl.runs.folder import KINDS, RunFolder
 
 __all__ = [
-    *("evaluated", "find_checkpoint", "limits_of", "load_config", "load_policy"),
+    *("find_checkpoint", "for_evaluation", "limits_of", "load_config", "load_policy"),
     *("override_env", "transforms_of", "without_cost"),
 ]
 
@@ -44,7 +44,7 @@ def load_config(directory: Path) -> DictConfig:
 
 
 def override_env(config: DictConfig, overrides: Mapping[str, Any]) -> dict[str, Any]:
-    """The run's environment with some keys changed; of mappings, as in training, what is named.
+    """The run's environment with some keys changed; in mappings only what is named, as in training.
 
     Raises:
         ValueError: As by `check_env_keys`; the package's families look at their keys themselves.
@@ -68,7 +68,7 @@ def _changed(node: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, A
 def limits_of(
     config: DictConfig, others: Mapping[str, float], cost_keys: Collection[str]
 ) -> dict[str, float]:
-    """Cost key -> d, of the run, and in their place others that are asked for.
+    """Cost key -> d: the run's limits, with others in their place where these are asked for.
 
     Raises:
         ValueError: If others name a cost that the environment does not have.
@@ -98,8 +98,8 @@ def transforms_of(config: DictConfig) -> dict[str, Any]:
     return OmegaConf.to_container(config.get("transforms") or OmegaConf.create(), resolve=True)  # type: ignore[return-value]
 
 
-def evaluated(make_env: Callable[..., EnvBase], config: DictConfig) -> Callable[..., EnvBase]:
-    """What makes the run's environments for evaluation, with its transforms if it has any."""
+def for_evaluation(make_env: Callable[..., EnvBase], config: DictConfig) -> Callable[..., EnvBase]:
+    """`make_env` for evaluations of a run, with the transforms of the run if it has any."""
     transforms = transforms_of(config)
     return partial(make_env, transforms=transforms, evaluating=True) if transforms else make_env
 

@@ -17,8 +17,8 @@ from safe_rl.collectors import Recording, StepRecorder
 from safe_rl.evaluation.episodes import Episodes, collect_episodes
 from safe_rl.evaluation.layouts import default_seed, shared_layouts
 from safe_rl.evaluation.loading import (
-    evaluated,
     find_checkpoint,
+    for_evaluation,
     limits_of,
     load_config,
     load_policy,
@@ -86,12 +86,12 @@ def evaluate(
 
     def make(num_envs: int, **keys: Any) -> EnvBase:
         threads = options.num_threads
-        return evaluated(make_env, config)(
+        return for_evaluation(make_env, config)(
             node | keys, num_envs=num_envs, device=options.device, seed=seed, num_threads=threads
         )
 
     # environments that draw nothing unless they are told have a key for it
-    drawing = {key: "rgb_array" for key in ("render_mode",) if key in node}
+    drawing = {"render_mode": "rgb_array"} if "render_mode" in node else {}
     run = RunFolder(directory)
     places = {kind: run.evaluation(options.name, kind) for kind in ("json", "csv", "transitions")}
     films = [run.evaluation(options.name, "mp4")] if options.video else []

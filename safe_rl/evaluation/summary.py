@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import json
 import math
 from collections.abc import Iterable, Mapping
@@ -10,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from safe_rl.evaluation.episodes import Episodes
-from safe_rl.runs.files import check_place, replacing
+from safe_rl.runs.files import check_place, replace_csv, replace_text
 from safe_rl.scores.intervals import Estimate, cvar, mean, share_over
 from safe_rl.scores.normalised import normalised_return, normalised_violation
 from safe_rl.scores.published import Scores
@@ -123,14 +122,11 @@ def write_summary(path: Path, facts: Mapping[str, Any], estimates: Mapping[str, 
         },
     }
     text = json.dumps(content, indent=2, ensure_ascii=False, allow_nan=False) + "\n"
-    with replacing(path) as unfinished:
-        unfinished.write_text(text, encoding="utf-8")
+    replace_text(path, text)
 
 
 def write_episodes(path: Path, episodes: Episodes) -> None:
     """Write one row per episode as CSV, in one go."""
     columns = {"return": episodes.returns, "length": episodes.lengths, **episodes.costs}
-    with replacing(path) as unfinished, unfinished.open("w", newline="") as file:
-        writer = csv.writer(file, lineterminator="\n")
-        writer.writerow(columns)
-        writer.writerows(zip(*(column.tolist() for column in columns.values()), strict=True))
+    rows = zip(*(column.tolist() for column in columns.values()), strict=True)
+    replace_csv(path, [columns, *rows])

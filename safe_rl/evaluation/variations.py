@@ -35,7 +35,7 @@ class Variation(NamedTuple):
 
 
 def expand(rows: Mapping[str, Any]) -> list[Variation]:
-    """Rows of a set as variations: of a list of values every one is a variation of its own.
+    """Turn the rows of a set into variations, one for each value of a list.
 
     Args:
         rows: Name -> keys with their values; one of the keys of a row may have a list.
@@ -76,7 +76,7 @@ def _expand_row(row: str, keys: Any) -> Iterator[Variation]:
 def varied(
     config: DictConfig, variation: Variation, transform_node: TransformNode
 ) -> DictConfig | None:
-    """A run's configuration with another environment.
+    """A run's configuration with a variation of its environment.
 
     Args:
         config: Of the run.

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass
@@ -16,8 +15,8 @@ from torchrl.envs import EnvBase
 from safe_rl.evaluation.episodes import Episodes, collect_episodes
 from safe_rl.evaluation.layouts import default_seed
 from safe_rl.evaluation.loading import (
-    evaluated,
     find_checkpoint,
+    for_evaluation,
     limits_of,
     load_config,
     load_policy,
@@ -27,7 +26,7 @@ from safe_rl.evaluation.loading import (
 from safe_rl.evaluation.settings import EvaluationOptions, check_options
 from safe_rl.evaluation.summary import check_places, summarise
 from safe_rl.evaluation.variations import TransformNode, Variation, varied
-from safe_rl.runs.files import replacing
+from safe_rl.runs.files import replace_csv
 from safe_rl.runs.folder import RunFolder, checkpoint_steps
 from safe_rl.scores.intervals import Estimate
 
@@ -76,7 +75,7 @@ def evaluate_variations(
     transform_node: TransformNode,
     refusals: tuple[type[Exception], ...],
     may_lack: Callable[[Variation], bool],
-    progress: Callable[[Variation], None] = lambda variation: None,
+    progress: bool = False,
 ) -> Varied:
     """Run a trained policy in its own environment and in variations of it.
 
@@ -90,7 +89,7 @@ def evaluate_variations(
         transform_node: Name of a transform -> its node, for those that the run lacks.
         refusals: What an environment raises that cannot have a variation, beside ValueError.
         may_lack: Whether a variation is left out where the environment cannot have it.
-        progress: Is told what is next.
+        progress: Whether to say what is next.
 
     Raises:
         FileNotFoundError: If the folder is not a run's, or has no such checkpoint.
@@ -115,7 +114,8 @@ def evaluate_variations(
             if changed is None:
                 left_out.append((variation, "it would be as it was trained"))
                 continue
-            progress(variation)
+            if progress:
+                print(f"… {variation}", flush=True)
             episodes = _episodes(changed, checkpoint, options, make_env)
         except cannot as error:
             if variation is AS_TRAINED or not may_lack(variation):
@@ -138,7 +138,7 @@ def _episodes(
 ) -> Episodes:
     node = override_env(config, {})
     seed = default_seed(node, config.seed) if options.seed is None else options.seed
-    env = evaluated(make_env, config)(
+    env = for_evaluation(make_env, config)(
         node,
         num_envs=min(options.num_envs, options.episodes),
         device=options.device,
@@ -160,11 +160,10 @@ def _write(path: Path, rows: Sequence[VariedRow]) -> None:
     """
     names = list(dict.fromkeys(name for row in rows for name in row.estimates))
     columns = [f"{name}{end}" for name in names for end in ("", "_low", "_high")]
-    with replacing(path) as unfinished, unfinished.open("w", newline="") as file:
-        writer = csv.writer(file, lineterminator="\n")
-        writer.writerow(["variation", "row", "value", "keys", *columns])
-        for (row, value, keys), estimates in rows:
-            changes = " ".join(f"{key}={changed}" for key, changed in keys.items())
-            found = [number for name in names for number in estimates.get(name, ("", "", ""))]
-            label = str(Variation(row, value, keys))
-            writer.writerow([label, row, "" if value is None else value, changes, *found])
+    table: list[list[Any]] = [["variation", "row", "value", "keys", *columns]]
+    for variation, estimates in rows:
+        row, value, keys = variation
+        changes = " ".join(f"{key}={changed}" for key, changed in keys.items())
+        found = [number for name in names for number in estimates.get(name, ("", "", ""))]
+        table.append([str(variation), row, "" if value is None else value, changes, *found])
+    replace_csv(path, table)

@@ -31,7 +31,7 @@ _NEEDED = ("env", "algo", "seed", "frames")
 _MOST_RUNS = 10_000
 
 
-class Cell(NamedTuple):
+class Planned(NamedTuple):
     """Runs that differ in the seed alone.
 
     Attributes:
@@ -43,7 +43,7 @@ class Cell(NamedTuple):
     seeds: tuple[int, ...]
 
 
-def read_plan(path: Path) -> list[Cell]:
+def read_plan(path: Path) -> list[Planned]:
     """Read what a campaign is to hold.
 
     Raises:
@@ -67,7 +67,7 @@ def read_plan(path: Path) -> list[Cell]:
     return cells
 
 
-def _cells(sweep: Mapping[str, Any], name: str) -> Iterator[Cell]:
+def _cells(sweep: Mapping[str, Any], name: str) -> Iterator[Planned]:
     missing = [key for key in _NEEDED if key not in sweep]
     if missing:
         raise ValueError(f"{name}: a sweep says {', '.join(_NEEDED)}, and here is no {missing[0]}")
@@ -77,7 +77,7 @@ def _cells(sweep: Mapping[str, Any], name: str) -> Iterator[Cell]:
         if not all(isinstance(n, int) and n >= 0 for n in numbers):
             raise ValueError(f"{name}: {key} takes whole numbers")
     for combination in product(*values.values()):
-        yield Cell(dict(zip(values, combination, strict=True)), tuple(seeds))
+        yield Planned(dict(zip(values, combination, strict=True)), tuple(seeds))
 
 
 def campaign_tables(
@@ -116,7 +116,7 @@ def _names(root: Path) -> dict[Path, str]:
     }
 
 
-def _tables(name: str, cells: Sequence[Cell], runs: Sequence[Run]) -> list[Table]:
+def _tables(name: str, cells: Sequence[Planned], runs: Sequence[Run]) -> list[Table]:
     records = [_record(name, cell, runs) for cell in cells]
     planned = sum(len(cell.seeds) for cell in cells)
     done, begun = (sum(record[key] for record in records) for key in ("num_done", "num_begun"))
@@ -137,7 +137,7 @@ def _tables(name: str, cells: Sequence[Cell], runs: Sequence[Run]) -> list[Table
     return shown
 
 
-def _record(name: str, cell: Cell, runs: Sequence[Run]) -> dict[str, Any]:
+def _record(name: str, cell: Planned, runs: Sequence[Run]) -> dict[str, Any]:
     found = [run for run in runs if run.seed in cell.seeds and _is_of(run, cell.chosen)]
     # of one seed the run that has come furthest
     own = {run.seed: run for run in sorted(found, key=lambda run: run.steps)}
@@ -181,7 +181,7 @@ def _is_of(run: Run, chosen: Mapping[str, Any]) -> bool:
     return not others and all(has(key, value) for key, value in flatten(chosen).items())
 
 
-def _commands(cells: Sequence[Cell], missing: Sequence[tuple[int, ...]]) -> list[dict[str, Any]]:
+def _commands(cells: Sequence[Planned], missing: Sequence[tuple[int, ...]]) -> list[dict[str, Any]]:
     """A sweep for all algorithms that lack the same seeds of what is alike otherwise."""
     groups: dict[tuple[tuple[str, ...], tuple[int, ...]], list[str]] = {}
     for cell, seeds in zip(cells, missing, strict=True):

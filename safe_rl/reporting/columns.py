@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-import csv
 import math
 import re
 from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import dataclass
-from itertools import chain, zip_longest
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from safe_rl.reporting.cleaning import clean
-from safe_rl.runs.files import replacing
+from safe_rl.runs.files import replace_csv
 
 __all__ = [
     *("MISSING", "SYMBOL", "Cell", "Column", "Record", "Table", "each_cost", "escaped", "interval"),
@@ -96,9 +94,9 @@ def interval(name: str, decimals: int) -> tuple[tuple[str, ...], ...]:
 def each_cost(
     keys: Sequence[str], fields: Mapping[str, str]
 ) -> Callable[[Record], Sequence[Record]]:
-    """How a record is shown that has figures of several costs: as a row of each.
+    """Show a record with figures of several costs as a row per cost.
 
-    A column of each cost would make tables as wide as there are costs.
+    A column per cost would make tables as wide as there are costs.
 
     Args:
         keys: Keys of the costs.
@@ -177,13 +175,7 @@ class Table:
     def write_csv(self, path: Path) -> None:
         """Write the records; what is not a number becomes an empty field."""
         names = dict.fromkeys(name for record in self.records for name in record)
-        with (
-            replacing(path) as unfinished,
-            unfinished.open("w", newline="", encoding="utf-8") as file,
-        ):
-            writer = csv.DictWriter(file, list(names), restval="", lineterminator="\n")
-            writer.writeheader()
-            writer.writerows([{k: _field(v) for k, v in r.items()} for r in self.records])
+        replace_csv(path, [names, *([_field(r.get(name)) for name in names] for r in self.records)])
 
 
 def _field(value: Any) -> Any:
@@ -200,11 +192,8 @@ def escaped(text: str) -> str:
         >>> print(escaped("<b> a|b $x_y$"))
         \<b\> a\|b $x_y$
     """
-    symbols = [match.group() for match in SYMBOL.finditer(text)]
-    ends = [0, *chain.from_iterable(match.span() for match in SYMBOL.finditer(text)), len(text)]
-    pieces = [text[start:stop] for start, stop in zip(ends[::2], ends[1::2], strict=True)]
-    plain = [re.sub(r"([\\`*_{}\[\]<>|#$~&])", r"\\\1", piece) for piece in pieces]
-    return "".join(chain.from_iterable(zip_longest(plain, symbols, fillvalue="")))
+    special = rf"({SYMBOL.pattern})|[\\`*_{{}}\[\]<>|#$~&]"
+    return re.sub(special, lambda match: match[0] if match[1] else rf"\{match[0]}", text)
 
 
 def mark_best(
@@ -215,9 +204,9 @@ def mark_best(
     is_able: Callable[[Record], bool],
     steps: Callable[[Record], Hashable],
 ) -> Callable[[Record], str]:
-    """Mark of a column: "best" for the best value, and all equal to it, after equally many steps.
+    """Mark the best value of a column, and all equal to it, among records of equally many steps.
 
-    What nothing else has had as many steps as is not compared, and not marked.
+    A record that no other one was trained as long as is not marked.
 
     Args:
         records: Rows of the table.

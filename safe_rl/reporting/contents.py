@@ -33,9 +33,9 @@ from safe_rl.reporting.slate_pictures import draw_middles, draw_profiles
 from safe_rl.reporting.slate_scores import (
     Aggregate,
     aggregate,
+    by_length,
     can_be_normalised,
     improvement_table,
-    lengths,
     middle_table,
     slate_table,
     title_of,
@@ -248,7 +248,7 @@ def _slates(
         ]
         if aggregates:
             blocks.append(slate_table(name, slate, aggregates))
-            for after, group in lengths(aggregates).items():
+            for after, group in by_length(aggregates).items():
                 blocks += _middles_and_profiles(name, group, after, styles)
             blocks += _if_any(improvement_table(name, aggregates))
     return blocks

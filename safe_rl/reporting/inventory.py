@@ -62,7 +62,7 @@ def _state(run: Run) -> str:
 
 
 def variant_table(experiments: Sequence[Experiment]) -> Table:
-    """In what namesakes differ beyond what their names say."""
+    """Settings that experiments of one algorithm differ in and that their names leave out."""
     settings = {e.algorithm: e.settings for e in experiments if e.settings}
     records = [{"algorithm": name, "settings": text} for name, text in settings.items()]
     columns = [Column("algorithm"), Column("all of it", ("{}", "settings"))]

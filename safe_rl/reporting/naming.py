@@ -153,10 +153,10 @@ def _learning_settings(run: Run, origin: Origin | None, root: Path) -> Settings:
 
 
 def distinguishing_keys(cells: Iterable[Sequence[Settings]]) -> list[str]:
-    """Keys that differ within a cell, but for those that follow from another one.
+    """Keys that differ within a cell, except those whose values follow from another key.
 
-    What follows from ``preset``, or from the ``_target_`` of the group that a key belongs to, is
-    not named: it is told by these.
+    Those that follow from ``preset``, or from the ``_target_`` of the group that a key belongs to,
+    are told by these.
 
     Args:
         cells: Groups of settings that have to be told apart within the group, not across groups.

@@ -43,9 +43,9 @@ def find_origins(runs: Sequence[Run]) -> dict[Path, Origin]:
 
 
 def source_of_seeds(run: Run, origin: Origin | None, root: Path) -> str:
-    """What ``init_from`` is alike in over seeds, each of which starts from a run of its own.
+    """The part of ``init_from`` that all seeds share, each of which starts from its own run.
 
-    It is said from the folder of all runs, where it is below that.
+    Below the folder of all runs it is relative to that.
     """
     assert run.init_from is not None
     folder, _ = run_of(run.init_from)

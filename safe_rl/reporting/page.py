@@ -15,7 +15,7 @@ from safe_rl.reporting.columns import SYMBOL, Table, escaped
 from safe_rl.reporting.contents import Block, Drawing, Film, Report
 from safe_rl.reporting.inventory import duration
 from safe_rl.reporting.pictures import save
-from safe_rl.runs.files import replacing
+from safe_rl.runs.files import replace_text
 
 __all__ = ["write_report"]
 
@@ -58,8 +58,7 @@ def write_report(report: Report, out: Path, title: str) -> Path:
     environment.filters |= {"symbols": _symbols, "words": _words, "md": _markdown}
     for name in ("report.md", "report.html"):
         text = environment.get_template(f"{name}.jinja").render(context)
-        with replacing(out / name) as unfinished:
-            unfinished.write_text(text, encoding="utf-8")
+        replace_text(out / name, text)
     return out / "report.html"
 
 

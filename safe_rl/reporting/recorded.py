@@ -194,14 +194,14 @@ def _read_run(folder: RunFolder, root: Path, unfinished: bool, skipped: dict[Pat
         folder.directory,
         config,
         table,
-        0 if unfinished else config["frames"],
-        overrides,
-        None if overrides is None else _command(overrides, hydra, begun_with, config),
-        Path(cwd) if isinstance(cwd, str) else None,
-        tuple(filter(None, read(folder.evaluations(), read_evaluation))),
-        next(iter(read(there(folder.certificate), read_certificate)), None),
-        next(iter(read(there(folder.code), read_code)), None),
-        tuple(read(_films(folder), lambda path: path)),
+        frames=0 if unfinished else config["frames"],
+        overrides=overrides,
+        command=None if overrides is None else _command(overrides, hydra, begun_with, config),
+        cwd=Path(cwd) if isinstance(cwd, str) else None,
+        evaluations=tuple(filter(None, read(folder.evaluations(), read_evaluation))),
+        certificate=next(iter(read(there(folder.certificate), read_certificate)), None),
+        code=next(iter(read(there(folder.code), read_code)), None),
+        videos=tuple(read(_films(folder), lambda path: path)),
     )
 
 

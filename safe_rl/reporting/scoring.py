@@ -172,7 +172,7 @@ def _measure_note(record: Record, key: str) -> str:
 
 
 def learning_table(experiments: Sequence[Experiment], good: float = 0.5) -> Table | None:
-    """What learning has cost on one environment, and when it came to something.
+    """What learning has cost on one environment, and when policies became good.
 
     Args:
         experiments: All on the environment.

@@ -19,7 +19,7 @@ from safe_rl.scores.published import PUBLISHED, PUBLISHED_STEPS, Normalised
 from safe_rl.scores.slates import SLATES
 
 __all__ = [
-    *("SYMBOLS", "Aggregate", "aggregate", "can_be_normalised", "improvement_table", "lengths"),
+    *("SYMBOLS", "Aggregate", "aggregate", "by_length", "can_be_normalised", "improvement_table"),
     *("middle_table", "normalised_scores", "slate_table", "title_of"),
 ]
 
@@ -207,8 +207,8 @@ def _relations(aggregates: Sequence[Aggregate]) -> str:
     return " ".join(parts)
 
 
-def lengths(aggregates: Sequence[Aggregate]) -> dict[str, list[Aggregate]]:
-    """What can be compared: aggregates by how long they were trained, in words.
+def by_length(aggregates: Sequence[Aggregate]) -> dict[str, list[Aggregate]]:
+    """Aggregates by how long they were trained, in words: only equally long training compares.
 
     The words are empty where all were trained for equally many steps.
     """
@@ -226,7 +226,7 @@ def middle_table(slate: str, aggregates: Sequence[Aggregate], after: str = "") -
     Args:
         slate: Its name.
         aggregates: One per algorithm.
-        after: How long they were trained, see :func:`lengths`.
+        after: How long they were trained, see :func:`by_length`.
     """
     records = []
     for one in aggregates:

@@ -1,4 +1,4 @@
-"""One checkpoint file: what is written into it, and what is believed of one from elsewhere.
+"""One checkpoint file: what is written into it, and what is trusted in one from elsewhere.
 
 A file is an archive of :class:`torchrl.checkpoint.Checkpoint` that holds, for every part of a run,
 tensors, numbers and plain containers. Reading runs no code of the file's: TorchRL would also take
@@ -59,7 +59,7 @@ class _State:
 
 
 def writer(components: Mapping[str, Stateful]) -> Checkpoint:
-    """What writes the present state of parts, by name, into a file in one go."""
+    """The checkpoint of TorchRL's that writes the present states of parts, by name, into a file."""
     checkpoint = Checkpoint(format="archive")
     adapter = _WeightsOnly()
     for name, component in components.items():

@@ -11,7 +11,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any
 
-from safe_rl.runs.files import replacing
+from safe_rl.runs.files import replace_text
 
 __all__ = ["code_of", "commit_of", "note_code"]
 
@@ -21,7 +21,7 @@ _PATIENCE = 5.0  # seconds
 
 
 def note_code(path: Path, steps: int) -> None:
-    """Write which code goes on with a run, below what has gone on with it before.
+    """Add the code that carries a run on from here to the file that lists them.
 
     Args:
         path: The file, a list of JSON objects with ``steps``, ``version``, ``commit`` and
@@ -32,8 +32,7 @@ def note_code(path: Path, steps: int) -> None:
     code = code_of()
     if not entries or any(entries[-1].get(name) != value for name, value in code.items()):
         entries.append({"steps": steps, **code})
-    with replacing(path) as unfinished:
-        unfinished.write_text(json.dumps(entries, indent=2) + "\n")
+    replace_text(path, json.dumps(entries, indent=2) + "\n")
 
 
 @cache

@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+import csv
 import os
 import re
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import yaml
 
-__all__ = ["check_place", "read_config", "read_yaml", "replacing"]
+__all__ = [
+    *("check_place", "read_config", "read_yaml", "replace_csv", "replace_text", "replacing"),
+]
 
 # of a configuration; that of a run has about six thousand
 _MOST_LETTERS = 1_000_000
@@ -117,6 +120,18 @@ def replacing(path: Path) -> Iterator[Path]:
         unfinished.replace(path)
     finally:
         unfinished.unlink(missing_ok=True)
+
+
+def replace_text(path: Path, text: str) -> None:
+    """Write a text file by :func:`replacing`."""
+    with replacing(path) as unfinished:
+        unfinished.write_text(text, encoding="utf-8")
+
+
+def replace_csv(path: Path, rows: Iterable[Iterable[Any]]) -> None:
+    """Write a CSV file, its header being the first of the rows, by :func:`replacing`."""
+    with replacing(path) as unfinished, unfinished.open("w", newline="", encoding="utf-8") as file:
+        csv.writer(file, lineterminator="\n").writerows(rows)
 
 
 def check_place(path: Path, otherwise: str) -> None:

@@ -27,7 +27,7 @@ KINDS = ("last", "best", "certified")
 
 
 class _Below:
-    """A file or folder of a run: read of a `RunFolder`, its path; of the class, that within any."""
+    """A file or folder of a run: ``folder.table`` is its path, ``RunFolder.table`` its name."""
 
     def __init__(self, name: str) -> None:
         self._name = name
@@ -59,7 +59,7 @@ class RunFolder:
     curves = _Below("curves.png")  # the picture of its learning curves
     failure = _Below("failure.txt")  # what a job of a sweep has failed of
     lock = _Below(".lock")  # keeps a second process from writing here
-    writer = _Below(".writer.json")  # who holds the lock
+    lease = _Below(".lease")  # who holds it, for machines that share no locks
     robot = _Below("robot")  # copies of the robot's files, where it is one of the user's own
     robot_note = _Below("robot.json")  # which robot that is, and its SHA-256
     notes = _Below(".hydra")  # Hydra's notes
@@ -74,7 +74,7 @@ class RunFolder:
 
     @property
     def recorded_table(self) -> Path:
-        """The table as it is there: plain, or else compressed."""
+        """The file of the table: the plain one if it is there, else the compressed one."""
         is_packed = self.packed_table.is_file() and not self.table.is_file()
         return self.packed_table if is_packed else self.table
 
@@ -115,8 +115,8 @@ class RunFolder:
 
     @property
     def is_untouched(self) -> bool:
-        """Whether nothing has been written here but what shows who would."""
-        lock = (self.lock.name, self.writer.name)
+        """Whether nothing is here but the files of the lock."""
+        lock = (self.lock.name, self.lease.name)
         return all(path.name in lock for path in self.directory.iterdir())
 
     @property
@@ -167,10 +167,10 @@ def runs_below(root: Path) -> list[RunFolder]:
 
 
 def paths_below(root: Path, pattern: str) -> list[Path]:
-    """Files and folders of such names below a folder, sorted; links to folders are not followed.
+    """Files and folders below a folder whose names match, sorted.
 
-    Folders may vanish meanwhile, as those of a checkpoint that is being written do, at which
-    `Path.rglob` fails.
+    Links to folders are not followed. Folders may vanish meanwhile, as those of a checkpoint that
+    is being written do, at which `Path.rglob` fails.
     """
     return sorted(
         Path(folder, name)
@@ -218,7 +218,7 @@ def run_of(source: Path) -> tuple[Path, int | None]:
 
 
 def common_source(source: str) -> str:
-    """What ``init_from`` is alike in over seeds, each of which starts from a run of its own.
+    """The part of ``init_from`` that all seeds share, each of which starts from its own run.
 
     Examples:
         >>> common_source("runs/small/seed3")

@@ -1,7 +1,7 @@
 """What a configuration's keys are for: which name the experiment, and which may change on resume.
 
-One table, that everything reads that tells runs apart or holds one against another: ``resume=``,
-sweeps and the folders of their jobs, the report.
+One table for all that tells runs apart or compares them: ``resume=``, sweeps and the folders of
+their jobs, the report.
 """
 
 from __future__ import annotations

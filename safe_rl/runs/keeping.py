@@ -16,7 +16,7 @@ from pathlib import Path
 
 from omegaconf import OmegaConf
 
-from safe_rl.runs.files import read_yaml, replacing
+from safe_rl.runs.files import read_yaml, replace_text, replacing
 from safe_rl.runs.folder import RunFolder
 
 __all__ = ["keep_runs"]
@@ -57,8 +57,7 @@ def _keep(run: RunFolder, kept: RunFolder) -> None:
             with replacing(kept.directory / path.relative_to(run.directory)) as unfinished:
                 shutil.copyfile(path, unfinished)
     for path, text in _shortened(run):
-        with replacing(kept.directory / path.relative_to(run.directory)) as unfinished:
-            unfinished.write_text(text, encoding="utf-8")
+        replace_text(kept.directory / path.relative_to(run.directory), text)
     table = run.recorded_table
     with replacing(kept.packed_table) as unfinished:
         if table == run.table:

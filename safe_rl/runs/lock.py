@@ -3,27 +3,19 @@
 from __future__ import annotations
 
 import errno
-import json
 import os
-import socket
-import time
-import warnings
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
-from datetime import datetime
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
-from threading import Event, Thread
-from typing import Any
 
-from filelock import FileLock, Timeout
+from filelock import FileLock, SoftFileLease, Timeout
 
-from safe_rl.runs.files import replacing
 from safe_rl.runs.folder import RunFolder
 
 __all__ = ["RunInUseError", "held"]
 
-BEAT = 5.0
-"""Seconds after which a writer shows again that it is there."""
+LEASE = 15.0
+"""Seconds after which a writer on another machine that has not renewed its lease is gone."""
 
 _NO_LOCKS = (errno.ENOSYS, errno.ENOLCK, errno.EOPNOTSUPP)
 _held: dict[Path, int] = {}  # folder -> the process that holds it: not one forked from it
@@ -37,10 +29,10 @@ class RunInUseError(ValueError):
 def held(folder: RunFolder) -> Iterator[None]:
     """Keep others from writing into a folder; inside another such block of this process, go on.
 
-    The lock is the kernel's (``flock``, which Linux passes on to NFS servers), so that nothing has
-    to be tidied up after a process that was killed. A network file system may keep such locks to
-    each machine, or have none. Therefore the holder also shows every few seconds that it is there,
-    and one that is found on another machine is watched before its place is taken.
+    Two locks of `filelock`'s: the kernel's (``flock``), which nobody has to tidy up after a process
+    that was killed, and a lease, because network file systems may keep the kernel's to each machine
+    or have none. The lease of a writer on another machine counts until it has not been renewed for
+    `LEASE` seconds.
 
     Raises:
         RunInUseError: If another process holds it.
@@ -49,106 +41,45 @@ def held(folder: RunFolder) -> Iterator[None]:
         >>> import tempfile
         >>> folder = RunFolder(Path(tempfile.mkdtemp()))
         >>> with held(folder):
-        ...     folder.writer.exists()
+        ...     folder.lease.exists()
         True
-        >>> folder.writer.exists()
+        >>> folder.lease.exists()
         False
     """
     place = folder.directory.resolve()
     if _held.get(place) == os.getpid():
         yield
         return
-    lock = _lock(folder)
-    try:
-        _check_writer(folder, is_locked=lock is not None)
-        _held[place] = os.getpid()
-        with replacing(folder.writer) as unfinished:
-            unfinished.write_text(json.dumps(_present_writer()))
+    lease = SoftFileLease(folder.lease, lease_duration=LEASE, thread_local=False)
+    with ExitStack() as stack:
         try:
-            with _beating(folder.writer):
-                yield
-        finally:
-            folder.writer.unlink(missing_ok=True)
-    finally:
-        _held.pop(place, None)
-        if lock is not None:
-            lock.release()
+            _lock(folder, lease, stack)
+            stack.enter_context(lease.acquire(timeout=2 * LEASE))
+        except Timeout:
+            raise _in_use(folder, lease) from None
+        _held[place] = os.getpid()
+        stack.callback(_held.pop, place)
+        yield
 
 
-def _lock(folder: RunFolder) -> FileLock | None:
-    """The kernel's lock on a folder; none where the file system has no locks."""
-    lock = FileLock(folder.lock, blocking=False, thread_local=False)
+def _lock(folder: RunFolder, lease: SoftFileLease, stack: ExitStack) -> None:
+    """Take the kernel's lock, where the file system has locks."""
     try:
-        lock.acquire()
-    except Timeout:
-        raise _in_use(folder) from None
+        stack.enter_context(FileLock(folder.lock, blocking=False, thread_local=False))
     except OSError as error:
         if error.errno not in _NO_LOCKS:
             raise
-        warnings.warn(
-            f"The file system of {folder.directory} has no locks ({error.strerror}): a second "
-            "process that begins to write there at the same moment is not noticed.",
-            stacklevel=4,
-        )
-        return None
-    return lock
+        return
+    if lease.owner is None:  # of a machine that went down while it was written
+        folder.lease.unlink(missing_ok=True)
 
 
-def _present_writer() -> dict[str, Any]:
-    since = datetime.now().isoformat(" ", "seconds")
-    return {"host": socket.gethostname(), "pid": os.getpid(), "since": since}
-
-
-def _writer(folder: RunFolder) -> dict[str, Any]:
-    """Who holds, or held, a folder; empty if that is not known."""
-    with suppress(OSError, ValueError):
-        writer = json.loads(folder.writer.read_text())
-        return writer if isinstance(writer, dict) else {}
-    return {}
-
-
-def _in_use(folder: RunFolder) -> RunInUseError:
-    writer = _writer(folder)
-    who = "another process" if not writer else (
-        f"process {writer.get('pid')} on {writer.get('host')}, since {writer.get('since')}"
-    )  # fmt: skip
+def _in_use(folder: RunFolder, lease: SoftFileLease) -> RunInUseError:
+    owner = lease.owner
+    # behind the name of the machine is that of the container
+    machine = "" if owner is None else owner.hostname.partition("?")[0]
+    who = "another process" if owner is None else f"process {owner.pid} on {machine}"
     return RunInUseError(
         f"{folder.directory} is being written by {who}. Wait for it, or end it; a run that was "
         "ended goes on with resume=."
     )
-
-
-def _check_writer(folder: RunFolder, *, is_locked: bool) -> None:
-    """Watch a writer that the lock says nothing about: does it still show that it is there?"""
-    writer = _writer(folder)
-    if not writer or (is_locked and writer.get("host") == socket.gethostname()):
-        return
-    seen = _shown(folder.writer)
-    until = time.monotonic() + 3 * BEAT
-    while time.monotonic() < until:
-        time.sleep(BEAT / 10)
-        if _shown(folder.writer) != seen and _writer(folder):
-            raise _in_use(folder)
-
-
-def _shown(path: Path) -> int:
-    """When a file was touched last; opened for it, because network file systems remember names."""
-    with suppress(OSError), path.open("rb") as file:
-        return os.fstat(file.fileno()).st_mtime_ns
-    return 0
-
-
-@contextmanager
-def _beating(path: Path) -> Iterator[None]:
-    end = Event()
-
-    def beat() -> None:
-        while not end.wait(BEAT):
-            with suppress(OSError):
-                os.utime(path)
-
-    Thread(target=beat, name="writer of a run", daemon=True).start()
-    try:
-        yield
-    finally:
-        end.set()

@@ -15,7 +15,7 @@ from torchrl.record.loggers.tensorboard import TensorboardLogger as TorchRLTenso
 from torchrl.record.loggers.wandb import WandbLogger as TorchRLWandbLogger
 
 from safe_rl.extras import import_extra
-from safe_rl.runs.files import replacing
+from safe_rl.runs.files import replace_text
 from safe_rl.runs.folder import RunFolder
 
 __all__ = ["MLflowLogger", "TensorboardLogger", "WandbLogger"]
@@ -74,8 +74,7 @@ class MLflowLogger(MLFlowLogger):
             experiment_id=self.id,
             run_name=str(self._directory),
         )
-        with replacing(path) as unfinished:
-            unfinished.write_text(run.info.run_id)
+        replace_text(path, run.info.run_id)
         return run
 
     def close(self) -> None:
@@ -98,8 +97,7 @@ class WandbLogger(TorchRLWandbLogger):
         wandb = import_extra("wandb", extra="wandb")
         path = RunFolder(Path(log_dir)).logger_id("wandb")
         run_id = path.read_text() if path.exists() else wandb.util.generate_id()
-        with replacing(path) as unfinished:
-            unfinished.write_text(run_id)
+        replace_text(path, run_id)
         super().__init__(log_dir=log_dir, id=run_id, **kwargs)
 
     def close(self) -> None:

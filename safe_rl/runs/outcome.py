@@ -18,14 +18,14 @@ FINAL_EPOCHS = 5
 """Epochs over which the final J_r and J_c are averaged (Ray et al. 2019, section 5.1)."""
 
 FINAL_STEPS = 100_000
-"""Steps that these epochs have at least: five of SAC's are 25 episodes, five of PPO's a hundred."""
+"""Steps to cover at least: five epochs of SAC are 25 episodes, five of PPO a hundred."""
 
 
 def violation(row: Mapping[str, float], key: str, limit: float) -> float:
-    """What is held against a limit, minus the limit: above 0 it is broken.
+    """By how much a limit is exceeded: above 0 it is broken.
 
-    That is J_c − d unless there is a column ``violation_<key>``, in which an algorithm that limits
-    another measure than the mean cost of an episode says what it holds against d.
+    That is J_c − d, or the column ``violation_<key>`` where there is one: an algorithm that limits
+    something else than the mean cost of an episode writes its own violation there.
 
     Args:
         row: Of a run's table, or its final figures, by column.
@@ -46,7 +46,7 @@ def violation(row: Mapping[str, float], key: str, limit: float) -> float:
 
 
 def measured(row: Mapping[str, float], key: str, limit: float | None) -> float:
-    """What is held against a limit; the mean episode cost where there is none.
+    """What is compared with a limit; the mean episode cost where there is none.
 
     Examples:
         >>> measured({"episode_cost": 30.0, "violation_cost": 62.0}, "cost", 25.0)
@@ -166,8 +166,8 @@ def judges_another_measure(table: Mapping[str, Sequence[float]], key: str, limit
 def final_width(steps: Iterable[float]) -> int:
     """Over how many epochs final figures, and the moving means of curves, are taken.
 
-    ``FINAL_EPOCHS``; more where epochs are so short that these have not ``FINAL_STEPS``, nor a
-    fifth of the run.
+    At least ``FINAL_EPOCHS``, and enough to cover ``FINAL_STEPS`` or, if that is less, a fifth of
+    the run.
 
     Args:
         steps: Steps at the end of every epoch in which an episode finished.

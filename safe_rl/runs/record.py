@@ -40,7 +40,7 @@ class RunRecord:
         >>> record = RunRecord(Path(tempfile.mkdtemp()), config, {"cost": 25.0}, 1000)
         >>> row = {"steps": 200, "episode_return": 1.0, "episode_cost": 30.0, "cost_rate": 0.03}
         >>> with record.writing():
-        ...     record.record(row | {"time_total": 2.0})
+        ...     record.add(row | {"time_total": 2.0})
         ...     record.draw_curves()
         >>> record.summary().split(" in ")[0]
         'J_r 1.00, J_c 30.0 (limit 25), ρ_c 0.0300, 100 steps/s'
@@ -54,7 +54,7 @@ class RunRecord:
         episode_length: int,
     ) -> None:
         self.directory = directory
-        self.files = RunFolder(directory)
+        self.folder = RunFolder(directory)
         self._config = config
         self._cost_limits = dict(cost_limits)
         self._episode_length = episode_length
@@ -73,16 +73,16 @@ class RunRecord:
             ValueError: If the table lacks epochs of the run that is to be continued.
         """
         self.directory.mkdir(parents=True, exist_ok=True)
-        with held(self.files):
+        with held(self.folder):
             if epoch is None:
-                self.files.check_is_free()
+                self.folder.check_is_free()
             self._steps_before = steps
             # that of a continued run is replaced when it has proved to be one that trains
             self._is_config_saved = False
             # before the table: one that is killed in between is no run yet, or one to go on with
-            if epoch is None or not self.files.is_run:
+            if epoch is None or not self.folder.is_run:
                 self._save_config()
-            self._table = TableWriter(self.files.table, keep_rows=epoch or 0)
+            self._table = TableWriter(self.folder.table, keep_rows=epoch or 0)
             self._logger = build(self._config.logger, log_dir=str(self.directory))
             if epoch is not None and hasattr(self._logger, "continue_from"):
                 self._logger.continue_from(steps)
@@ -104,12 +104,12 @@ class RunRecord:
     def _save_config(self) -> None:
         if not self._is_config_saved:
             # replaced in one go: a run killed here can still be continued
-            with replacing(self.files.config) as unfinished:
+            with replacing(self.folder.config) as unfinished:
                 OmegaConf.save(self._config, unfinished, resolve=True)
-            note_code(self.files.code, self._steps_before)
+            note_code(self.folder.code, self._steps_before)
             self._is_config_saved = True
 
-    def record(self, row: Mapping[str, float]) -> None:
+    def add(self, row: Mapping[str, float]) -> None:
         """Write one epoch to table and logger and show it."""
         self._save_config()
         self._table.write(row)
@@ -123,25 +123,25 @@ class RunRecord:
 
     def rows(self) -> list[dict[str, float]]:
         """Return the epochs that are in the table, by column."""
-        if not self.files.num_rows:
+        if not self.folder.num_rows:
             return []
-        table = read_table(self.files.table)
+        table = read_table(self.folder.table)
         return [dict(zip(table, row, strict=True)) for row in zip(*table.values(), strict=True)]
 
     def draw_curves(self) -> None:
         """Write ``curves.png`` from the table."""
-        table = read_table(self.files.table)
+        table = read_table(self.folder.table)
         config = self._config
         seed = f"seed {config.seed}" if "seed" in config else ""
         title = f"{config.get('env', {}).get('name', '')} {config.algo.name} {seed}".strip()
         draw_learning_curves(
-            table, self._cost_limits, self._episode_length, self.files.curves, title
+            table, self._cost_limits, self._episode_length, self.folder.curves, title
         )
 
     def summary(self) -> str:
         """One line on how the run ended."""
         keys = list(self._cost_limits) or ["cost"]
-        final = final_figures(read_table(self.files.table), keys)
+        final = final_figures(read_table(self.folder.table), keys)
         parts = [f"J_r {final['episode_return']:.2f}"]
         several = len(self._cost_limits) > 1
         for key in keys:

@@ -10,7 +10,7 @@ import zlib
 from collections.abc import Mapping
 from pathlib import Path
 
-from safe_rl.runs.files import replacing
+from safe_rl.runs.files import replace_text
 
 __all__ = ["TableWriter", "last_row", "read_table"]
 
@@ -47,8 +47,7 @@ class TableWriter:
         kept = _first_rows(path, keep_rows) if keep_rows else []
         self._columns = next(csv.reader(kept)) if kept else None
         # replaced in one go: a run killed here still has its table
-        with replacing(path) as rewritten:
-            rewritten.write_text("".join(kept))
+        replace_text(path, "".join(kept))
         self._file = path.open("a", newline="")
         self._writer = csv.writer(self._file, lineterminator="\n")
 

@@ -156,7 +156,7 @@ class Verdict:
         bounds: Of the policy that is certified, or else of the one that fell short least: name ->
             (bound, what it has to keep).
         shortfalls: Of the same policy, if none is certified.
-        alike: Costs that were the same in all its episodes, of which a bound is about those that
+        alike: Costs that were the same in all its episodes: bounds on them are about episodes that
             nobody has seen.
     """
 

@@ -45,14 +45,15 @@ class Estimate(NamedTuple):
 
 
 def bootstrap(
-    samples: Sequence[np.ndarray], statistic: Callable[..., Any], seed: int = 0
+    samples: Sequence[np.ndarray], statistic: Callable[..., Any]
 ) -> tuple[np.ndarray, np.ndarray]:
     """Percentile bootstrap interval, each sample being resampled on its own (stratified).
+
+    The same samples give the same interval.
 
     Args:
         samples: Strata, each of shape [..., n_i] with the observations along the last axis.
         statistic: Vectorised function ``statistic(*samples, axis)``.
-        seed: Of the resampling, so that the same samples give the same interval.
 
     Returns:
         Lower and upper ends, of the shape of the statistic; NaN where there is one observation
@@ -77,7 +78,7 @@ def bootstrap(
         vectorized=True,
         confidence_level=LEVEL,
         method="percentile",
-        rng=np.random.default_rng(seed),
+        rng=np.random.default_rng(0),
     )
     return result.confidence_interval.low, result.confidence_interval.high
 

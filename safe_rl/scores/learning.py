@@ -12,7 +12,7 @@ __all__ = ["first_good_epoch", "joined", "longest_streak", "regret", "share_of_e
 
 
 def joined(values: ArrayLike, number: int) -> np.ndarray:
-    """Means of `number` epochs after each other, of fewer at the beginning.
+    """Means of `number` consecutive epochs, of fewer at the beginning.
 
     The mean of few episodes is above a limit more often, so that algorithms whose epochs are
     shorter than others' would seem to break it more.
@@ -29,7 +29,7 @@ def joined(values: ArrayLike, number: int) -> np.ndarray:
 def regret(costs: ArrayLike, limit: float) -> float:
     """Cost per episode above the limit, averaged over training: mean of max(0, J_c − d).
 
-    What an epoch stays below the limit makes up for no other.
+    An epoch below the limit does not make up for another one above it.
 
     Examples:
         >>> regret([45.0, 35.0, 5.0, 15.0], limit=25.0)

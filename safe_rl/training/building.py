@@ -19,11 +19,11 @@ from safe_rl.collectors import Recording, WorkerCollector, make_collector
 from safe_rl.collectors.shares import MakeEnv
 from safe_rl.runs.record import RunRecord
 from safe_rl.targets import build
-from safe_rl.training.trainer import Evaluation, Trainer
+from safe_rl.training.trainer import Evaluator, Trainer
 
 __all__ = ["build_trainer", "physics_threads", "seed_everything"]
 
-MakeEvaluation = Callable[[TensorDictModuleBase], Evaluation]
+MakeEvaluation = Callable[[TensorDictModuleBase], Evaluator]
 """Makes an evaluation of a policy that goes on learning."""
 
 
@@ -65,14 +65,14 @@ def build_trainer(
     """
     cost_limits = check_cost_limits(config.cost_limits, env.cost_keys)
     algorithm = find_recipe(config).build(config, env)
-    folder = RunRecord(directory, config, cost_limits, env.max_episode_steps)
-    recording = Recording(folder.files.transitions, env.cost_keys)
+    record = RunRecord(directory, config, cost_limits, env.max_episode_steps)
+    recording = Recording(record.folder.transitions, env.cost_keys)
     return Trainer(
         env=env,
         algorithm=algorithm,
         collector=_build_collector(config, env, make_env, algorithm),
         cost_limits=cost_limits,
-        folder=folder,
+        record=record,
         config=config,
         evaluation=None if make_evaluation is None else make_evaluation(algorithm.policy),
         recording=recording if config.get("record") else None,

@@ -18,7 +18,7 @@ _LONGEST = 10
 
 
 def epochs_until_judged(over: int, length: float, steps_per_epoch: float) -> int:
-    """Epochs from an update until the episodes that end were played, on average, by its policy.
+    """Epochs after an update until finished episodes were, on average, played by its policy.
 
     The batch that a policy collects comes an epoch after the update. Where batches are shorter than
     episodes, what ends in it began before; half an episode later it is in the middle.
@@ -61,9 +61,9 @@ class Candidates:
         components: Parts of the run, by name, that a checkpoint of a policy holds.
         limits: Cost key -> d, undiscounted cost per episode.
         over: Epochs by whose mean a policy is judged.
-        delay: Of the mean length of the episodes that end, epochs from a policy's update until the
-            last of those by which it is judged.
-        longest: Steps after which an episode is over: the length until one has ended.
+        delay: Mean length of episodes -> epochs from a policy's update until the last of those by
+            which it is judged.
+        longest: Most steps of an episode, taken for the mean length until one has ended.
 
     Examples:
         >>> import functools
@@ -127,7 +127,7 @@ class Candidates:
         return [policy["steps"] for policy in self._waiting]
 
     def judge_all(self) -> list[Judged]:
-        """Judge those that wait by the epochs that there are: so far, none come after them.
+        """Judge all that wait by the epochs that there are, at the end of a run.
 
         They go on waiting: a run that is trained on has later epochs to judge them by.
         """

@@ -65,7 +65,7 @@ class WorldSnapshot:
         self._go_on_from(self._env.get_state())
 
     def stagger(self, max_steps: int) -> bool:
-        """Put row i of N at step i · max_steps / N of its first episode, which ends the earlier.
+        """Put row i of N at step i · max_steps / N of its first episode: not all end at once.
 
         Returns:
             Whether that could be done: the environment's state holds its ``step_count``.

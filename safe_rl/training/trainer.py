@@ -26,14 +26,14 @@ from safe_rl.training.candidates import Candidates, Judged, epochs_until_judged
 from safe_rl.training.interrupts import StopRequest
 from safe_rl.training.state import Progress, WorldSnapshot
 
-__all__ = ["EpisodeError", "Evaluation", "Trainer"]
+__all__ = ["EpisodeError", "Evaluator", "Trainer"]
 
 # what only going on takes, which the last checkpoints have: several times what a policy is, and a
 # memory fills gigabytes
 _TO_GO_ON = {"memory", "policy_update", "critic_update", "env", "accounting", "rng"}
 
 
-class Evaluation(Protocol):
+class Evaluator(Protocol):
     """What evaluates a policy while it is trained."""
 
     def __call__(self, before: int, after: int) -> dict[str, float]:
@@ -49,7 +49,7 @@ class Trainer:
         algorithm: What learns.
         collector: Endless collector of [N, T] batches, running the algorithm's policy.
         cost_limits: Cost key -> d, undiscounted cost per episode: what counts as feasible.
-        folder: Where the run writes.
+        record: What the run writes into its folder.
         config: Configuration of the run, for ``frames`` and ``checkpoint``.
         evaluation: Evaluates the policy after every epoch in which that is due, or None.
         recording: Where every batch is written, or None.
@@ -62,9 +62,9 @@ class Trainer:
         collector: Collector | WorkerCollector,
         *,
         cost_limits: Mapping[str, float],
-        folder: RunRecord,
+        record: RunRecord,
         config: DictConfig,
-        evaluation: Evaluation | None = None,
+        evaluation: Evaluator | None = None,
         recording: Recording | None = None,
     ) -> None:
         self.algorithm = algorithm
@@ -76,7 +76,7 @@ class Trainer:
             longest=env.max_episode_steps,
         )
         self.progress = Progress()
-        self.folder = folder
+        self.record = record
         self.episode_length = env.max_episode_steps
         self.interrupted_by: Signals | None = None
         self._collector = collector
@@ -94,7 +94,7 @@ class Trainer:
         self._checkpoint_interval = config.checkpoint.interval
         self._candidates = self._find_candidates(config.checkpoint.get("best_over", 1), cost_limits)
         self._checkpoints = CheckpointStore(
-            folder.files.checkpoints,
+            record.folder.checkpoints,
             self.components(),
             keep_last=config.checkpoint.keep_last,
             keep_best=config.checkpoint.get("keep_best", 1),
@@ -152,8 +152,8 @@ class Trainer:
             CheckpointError: If no checkpoint can be read, or they do not fit this run.
         """
         self._is_continued = True
-        with held(self.folder.files):
-            restored = self._checkpoints.resume(self.folder.files.num_rows)
+        with held(self.record.folder):
+            restored = self._checkpoints.resume(self.record.folder.num_rows)
         if restored is not None:  # one that starts over meets the episodes that it would have met
             self._begin_episodes()
         return restored is not None
@@ -195,7 +195,7 @@ class Trainer:
             raise
         if isinstance(self._collector, WorkerCollector):
             self._collector.shutdown()
-        return self.folder.summary()
+        return self.record.summary()
 
     def close(self) -> None:
         """End what collects, whatever it is at: workers, if there are any, and the environment."""
@@ -210,18 +210,18 @@ class Trainer:
         batches = self.batches()
         saved_at = time.monotonic()
         behind = self.progress.epoch if self._is_continued else None
-        with StopRequest() as stop, self.folder.writing(behind, self.progress.steps):
+        with StopRequest() as stop, self.record.writing(behind, self.progress.steps):
             if not self.progress.epoch:
                 self._checkpoints.begin()
             if self._recording is not None:
                 # as of the table, what came after the checkpoint is another continuation's
                 self._recording.begin(self.progress.epoch)
-            self._candidates.go_on_after(self.folder.rows())
+            self._candidates.go_on_after(self.record.rows())
             # a shorter run that had come to its end has judged them by fewer epochs
             self._checkpoints.forget_best(self._candidates.waiting)
             while self.progress.steps < self._frames:
                 row = self.epoch(batches)
-                self.folder.record(row)
+                self.record.add(row)
                 self._keep(self._candidates.add(row))
                 if stop.received:  # not before the first: a run has an epoch to show
                     break
@@ -276,7 +276,7 @@ class Trainer:
 
     def _save(self) -> None:
         self._checkpoints.save(self.progress.steps, {"epoch": self.progress.epoch})
-        self.folder.draw_curves()
+        self.record.draw_curves()
 
     def _keep(self, judged: Iterable[Judged]) -> None:
         """Keep those of the policies that are among the best so far."""

@@ -1,6 +1,5 @@
 """Sweeps: how many jobs and threads, failing jobs, and a whole sweep started again."""
 
-import contextlib
 import json
 import subprocess
 import sys
@@ -8,6 +7,7 @@ import time
 from pathlib import Path
 
 import pytest
+from filelock import SoftFileLease
 from hydra.core.utils import JobReturn, JobStatus
 from omegaconf import OmegaConf
 
@@ -140,11 +140,8 @@ def test_a_sweep_end_to_end(tmp_path, launcher):
 
 def writers(directory):
     """Folder -> process that writes it, of the runs below a folder."""
-    found = {}
-    for run in runs_below(directory):
-        with contextlib.suppress(OSError, ValueError):
-            found[run.directory] = json.loads(run.writer.read_text())["pid"]
-    return found
+    found = {run.directory: SoftFileLease(run.lease).pid for run in runs_below(directory)}
+    return {folder: pid for folder, pid in found.items() if pid is not None}
 
 
 def wait_until(condition, seconds):

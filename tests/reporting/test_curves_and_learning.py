@@ -16,8 +16,8 @@ from safe_rl.reporting.scoring import (
 )
 from safe_rl.reporting.slate_scores import (
     aggregate,
+    by_length,
     improvement_table,
-    lengths,
 )
 from safe_rl.scores.published import REFERENCE
 
@@ -179,9 +179,9 @@ def test_what_was_trained_for_longer_is_compared_apart(tmp_path):
                     (("returns", 3.0), ("costs", 20.0), ("rates", 0.1))}  # fmt: skip
             write_run(tmp_path, algo=algo, seed=seed, **rows)
     everything = [aggregate([e]) for e in experiments_in(tmp_path)]
-    groups = {after: [a.algorithm for a in own] for after, own in lengths(everything).items()}
+    groups = {after: [a.algorithm for a in own] for after, own in by_length(everything).items()}
     assert groups == {", 1,000 steps": ["PPO", "CPO"], ", 30,000 steps": ["TRPO", "mine"]}
-    assert list(lengths(everything[:1])) == [""]
+    assert list(by_length(everything[:1])) == [""]
     pairs = [(r["algorithm"], r["other"]) for r in improvement_table("x", everything).records]
     assert pairs == [("PPO", "CPO"), ("TRPO", "mine")]
     report = build_report(tmp_path, SUITE, seeds_needed=2, unfinished=False)

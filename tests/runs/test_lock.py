@@ -1,14 +1,15 @@
 """One writer per run: between processes, after they were killed, and where locks do not reach."""
 
 import errno
-import json
 import multiprocessing
 import os
 import signal
 import time
+from contextlib import contextmanager
+from threading import Event, Thread
 
 import pytest
-from filelock import FileLock
+from filelock import FileLock, SoftFileLease
 
 from safe_rl.runs import lock
 from safe_rl.runs.folder import RunFolder
@@ -43,26 +44,26 @@ def holder(folder):
 
 
 def test_the_second_is_told_who_the_first_is(folder, holder):
-    with pytest.raises(RunInUseError, match=rf"process {holder.pid} on .*, since 20\d\d-"):
+    with pytest.raises(RunInUseError, match=rf"process {holder.pid} on [^?]+\. Wait"):
         held(folder).__enter__()
 
 
 def test_the_lock_dies_with_its_process(folder, holder):
     os.kill(holder.pid, signal.SIGKILL)
     holder.join(PATIENCE)
-    assert json.loads(folder.writer.read_text())["pid"] == holder.pid
+    assert SoftFileLease(folder.lease).pid == holder.pid
     start = time.monotonic()
     with held(folder):
-        assert json.loads(folder.writer.read_text())["pid"] == os.getpid()
-    assert time.monotonic() - start < 3 * lock.BEAT  # for which one elsewhere is watched
-    assert not folder.writer.exists()
+        assert SoftFileLease(folder.lease).pid == os.getpid()
+    assert time.monotonic() - start < lock.LEASE  # for which one elsewhere is waited for
+    assert not folder.lease.exists()
 
 
 def test_the_same_process_goes_on_and_the_outermost_lets_go(folder):
     with held(folder):
         with held(folder):
             pass
-        assert folder.writer.exists()
+        assert folder.lease.exists()
     with held(folder):
         pass
 
@@ -70,7 +71,7 @@ def test_the_same_process_goes_on_and_the_outermost_lets_go(folder):
 def test_one_that_fails_lets_go_as_well(folder):
     with pytest.raises(FloatingPointError), held(folder):
         raise FloatingPointError
-    assert not folder.writer.exists()
+    assert not folder.lease.exists()
 
 
 def outcome_of(folder, outcome):
@@ -118,23 +119,35 @@ def test_a_forked_process_that_outlives_the_holder_holds_nothing(folder):
 
 @pytest.fixture
 def quick(monkeypatch):
-    # not so quick that a busy machine leaves a beat out
-    monkeypatch.setattr(lock, "BEAT", 1.0)
+    # not so quick that a busy machine renews a lease too late
+    monkeypatch.setattr(lock, "LEASE", 3.0)
 
 
-def write_as_elsewhere(folder):
-    writer = {"host": "elsewhere", "pid": 1, "since": "2026-01-01 00:00:00"}
-    folder.writer.write_text(json.dumps(writer))
+@contextmanager
+def renewing(path):
+    """As the holder of a lease does, wherever it is."""
+    end = Event()
+
+    def renew():
+        while not end.wait(0.3):
+            os.utime(path)
+
+    thread = Thread(target=renew)
+    thread.start()
+    yield
+    end.set()
+    thread.join()
 
 
 def test_a_writer_on_another_machine_that_shows_itself_is_left_alone(folder, quick):
     """As on a network file system whose locks stay on each machine."""
-    write_as_elsewhere(folder)
-    with lock._beating(folder.writer), pytest.raises(RunInUseError, match="process 1 on elsewhere"):
+    lines = ("filelock/2", "pid=1", "host=elsewhere", "mode=lease", "token=a", "duration=3.0", "")
+    folder.lease.write_text("\n".join(lines))
+    with renewing(folder.lease), pytest.raises(RunInUseError, match="process 1 on elsewhere"):
         held(folder).__enter__()
     # and its place is taken when it does so no more
     with held(folder):
-        assert json.loads(folder.writer.read_text())["pid"] == os.getpid()
+        assert SoftFileLease(folder.lease).pid == os.getpid()
 
 
 @pytest.mark.parametrize("code", [errno.ENOLCK, errno.EOPNOTSUPP])
@@ -143,19 +156,16 @@ def test_without_locks_the_writer_is_still_seen(folder, quick, monkeypatch, code
         raise OSError(code, os.strerror(code))
 
     monkeypatch.setattr(FileLock, "acquire", refuse)
-    with pytest.warns(UserWarning, match="has no locks"), held(folder):
-        written = folder.writer.read_text()
-    folder.writer.write_text(written)
-    with (
-        lock._beating(folder.writer),
-        pytest.warns(UserWarning, match="has no locks"),
-        pytest.raises(RunInUseError),
-    ):
-        held(folder).__enter__()
+    outcome = FORK.Queue()
+    with held(folder):
+        process = FORK.Process(target=outcome_of, args=(folder, outcome), daemon=True)
+        process.start()
+        assert outcome.get(timeout=PATIENCE) == "in use"
+        process.join(PATIENCE)
 
 
 @pytest.mark.parametrize("content", ["", "{", "[]", "null"])
 def test_a_damaged_note_of_the_writer_stops_nobody(folder, content):
-    folder.writer.write_text(content)
+    folder.lease.write_text(content)
     with held(folder):
         pass

@@ -15,7 +15,7 @@ def train(directory, *overrides):
     config = point_mass_config(*overrides)
     seed_everything(config.seed, 1)
     trainer = build_trainer(config, PointMass(config.num_envs, 20), directory)
-    if trainer.folder.files.has_begun:
+    if trainer.record.folder.has_begun:
         trainer.resume()
     trainer.run()
 

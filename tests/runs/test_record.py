@@ -67,18 +67,18 @@ def test_final_figures_without_any_episode_are_nan():
 
 def test_the_folder_has_configuration_table_and_tensorboard(tmp_path, capsys):
     config = compose_config("env=PointMass", "cost_limits={cost: 25, cost_north: 5}", "frames=2000")
-    folder = RunRecord(tmp_path / "run", config, {"cost": 25.0, "cost_north": 5.0}, 1000)
-    with folder.writing():
-        folder.record(row(1, NAN, NAN, NAN))
-        folder.record(row(2, 1.5, 30.0, 4.0))
-    folder.draw_curves()
+    record = RunRecord(tmp_path / "run", config, {"cost": 25.0, "cost_north": 5.0}, 1000)
+    with record.writing():
+        record.add(row(1, NAN, NAN, NAN))
+        record.add(row(2, 1.5, 30.0, 4.0))
+    record.draw_curves()
     saved = OmegaConf.load(tmp_path / "run" / "config.yaml")
     assert saved == OmegaConf.create(OmegaConf.to_container(config, resolve=True))
     events = EventAccumulator(str(tmp_path / "run" / "tensorboard")).Reload()
     costs = [(event.step, event.value) for event in events.Scalars("episode_cost")]
     assert costs == [(2000, 30.0)]
     assert {event.step for event in events.Scalars("multiplier_cost")} == {1000, 2000}
-    assert folder.summary() == (
+    assert record.summary() == (
         "J_r 1.50, J_c[cost] 30.0 (limit 25), ρ_c[cost] 0.0020, "  # noqa: RUF001
         "J_c[cost_north] 4.0 (limit 5), ρ_c[cost_north] 0.0020, "  # noqa: RUF001
         f"500 steps/s in {tmp_path / 'run'}"
@@ -92,26 +92,26 @@ def test_the_folder_has_configuration_table_and_tensorboard(tmp_path, capsys):
 
 def test_a_measure_of_ones_own_is_what_is_held_against_the_limit(tmp_path, capsys):
     config = compose_config("env=PointMass", "logger=none")
-    folder = RunRecord(tmp_path, config, {"cost": 25.0}, 1000)
-    with folder.writing():
-        folder.record(row(1, 1.0, 20.0) | {"violation_cost": 62.0})
-        folder.record(row(2, 1.0, 30.0) | {"violation_cost": 64.0})
-    assert "J_c 25.0, measured 88.0 (limit 25)" in folder.summary()
-    with folder.writing(0):
-        folder.record(row(1, NAN, NAN) | {"violation_cost": NAN})
-    assert "J_c nan (limit 25)" in folder.summary()
+    record = RunRecord(tmp_path, config, {"cost": 25.0}, 1000)
+    with record.writing():
+        record.add(row(1, 1.0, 20.0) | {"violation_cost": 62.0})
+        record.add(row(2, 1.0, 30.0) | {"violation_cost": 64.0})
+    assert "J_c 25.0, measured 88.0 (limit 25)" in record.summary()
+    with record.writing(0):
+        record.add(row(1, NAN, NAN) | {"violation_cost": NAN})
+    assert "J_c nan (limit 25)" in record.summary()
     assert "cost=89.0/25" in capsys.readouterr().err
 
 
 def test_a_continued_table_goes_on_after_its_epoch(tmp_path):
     config = compose_config("env=PointMass", "logger=none")
-    folder = RunRecord(tmp_path, config, {"cost": 25.0}, 1000)
-    with folder.writing():
+    record = RunRecord(tmp_path, config, {"cost": 25.0}, 1000)
+    with record.writing():
         for epoch in (1, 2, 3):
-            folder.record(row(epoch, 0.0, 0.0))
-    with folder.writing(epoch=2, steps=2000):
-        folder.record(row(3, 7.0, 7.0))
-    lines = folder.files.table.read_text().splitlines()
+            record.add(row(epoch, 0.0, 0.0))
+    with record.writing(epoch=2, steps=2000):
+        record.add(row(3, 7.0, 7.0))
+    lines = record.folder.table.read_text().splitlines()
     assert [line.split(",")[0] for line in lines] == ["epoch", "1", "2", "3"]
     assert lines[3].startswith("3,3000,7,7")
 
@@ -142,13 +142,13 @@ def test_what_is_killed_while_it_begins_leaves_no_table_without_a_configuration(
 
 def test_writing_ends_cleanly_when_training_fails(tmp_path):
     config = compose_config("env=PointMass", "logger=none")
-    folder = RunRecord(tmp_path, config, {}, 1000)
+    record = RunRecord(tmp_path, config, {}, 1000)
 
     def fail():
-        with folder.writing():
-            folder.record(row(1, 0.0, 0.0))
+        with record.writing():
+            record.add(row(1, 0.0, 0.0))
             raise FloatingPointError
 
     with pytest.raises(FloatingPointError):
         fail()
-    assert len(folder.files.table.read_text().splitlines()) == 2
+    assert len(record.folder.table.read_text().splitlines()) == 2

@@ -52,7 +52,7 @@ def make_trainer(directory, *overrides, **options):
 def train(directory, *overrides, **options):
     """What the command line does: start, or continue what is there."""
     trainer = make_trainer(directory, *overrides, **options)
-    if trainer.folder.files.has_begun:
+    if trainer.record.folder.has_begun:
         trainer.resume()
     trainer.run()
 
@@ -143,11 +143,11 @@ def test_a_run_without_a_checkpoint_starts_over(kind, tmp_path, monkeypatch):
     whole = point_mass_trainer(tmp_path / "whole")
     whole.run()
     begun = point_mass_trainer(tmp_path / "begun")
-    with begun.folder.writing():
+    with begun.record.writing():
         begun._checkpoints.begin()
-        begun.folder.record(begun.epoch(begun.batches()))
+        begun.record.add(begun.epoch(begun.batches()))
     again = point_mass_trainer(tmp_path / "begun")
-    assert again.folder.files.has_begun
+    assert again.record.folder.has_begun
     again.resume()
     again.run()
     tables = [without_times(tmp_path / name / "progress.csv") for name in ("begun", "whole")]
@@ -275,10 +275,10 @@ def test_tensorboard_forgets_what_is_done_again(tmp_path):
     trainer = point_mass_trainer(tmp_path, *overrides)
     trainer.run()
     # as if it had been killed in the sixth epoch, after a checkpoint in the fourth
-    with trainer.folder.writing(trainer.progress.epoch, trainer.progress.steps):
+    with trainer.record.writing(trainer.progress.epoch, trainer.progress.steps):
         for epoch in (5, 6):
             lost = dict.fromkeys(read_table(tmp_path / "progress.csv"), -1.0)
-            trainer.folder.record(lost | {"epoch": epoch, "steps": 160 * epoch})
+            trainer.record.add(lost | {"epoch": epoch, "steps": 160 * epoch})
     resumed = point_mass_trainer(tmp_path, "logger=tensorboard")
     resumed.resume()
     resumed.run()

@@ -12,14 +12,14 @@ from safe_rl.training.interrupts import StopRequest
 
 def test_a_signal_ends_the_run_after_the_epoch_with_a_checkpoint(tmp_path):
     trainer = point_mass_trainer(tmp_path, "frames=100_000_000")
-    record = trainer.folder.record
+    record = trainer.record.add
 
     def record_and_signal(row):
         record(row)
         if row["epoch"] == 3:
             signal.raise_signal(signal.SIGTERM)
 
-    trainer.folder.record = record_and_signal
+    trainer.record.add = record_and_signal
     handler = signal.getsignal(signal.SIGTERM)
     trainer.run()
     assert signal.getsignal(signal.SIGTERM) is handler
@@ -31,8 +31,8 @@ def test_a_signal_ends_the_run_after_the_epoch_with_a_checkpoint(tmp_path):
 
 def test_a_signal_before_the_first_epoch_lets_it_end(tmp_path):
     trainer = point_mass_trainer(tmp_path, "frames=100_000_000")
-    rows = trainer.folder.rows
-    trainer.folder.rows = lambda: signal.raise_signal(signal.SIGTERM) or rows()
+    rows = trainer.record.rows
+    trainer.record.rows = lambda: signal.raise_signal(signal.SIGTERM) or rows()
     trainer.run()
     assert trainer.interrupted_by is signal.SIGTERM
     assert read_table(tmp_path / "progress.csv")["epoch"] == [1]
@@ -40,13 +40,13 @@ def test_a_signal_before_the_first_epoch_lets_it_end(tmp_path):
 
 def test_a_signal_in_the_last_epoch_interrupts_nothing(tmp_path):
     trainer = point_mass_trainer(tmp_path, "frames=160")
-    record = trainer.folder.record
+    record = trainer.record.add
 
     def record_and_signal(row):
         record(row)
         signal.raise_signal(signal.SIGTERM)
 
-    trainer.folder.record = record_and_signal
+    trainer.record.add = record_and_signal
     trainer.run()
     assert trainer.progress.steps == 160
     assert trainer.interrupted_by is None

@@ -26,10 +26,10 @@ def same(first, second):
 
 
 def take_over(trained, *overrides):
-    fresh = point_mass_trainer(trained.folder.directory.parent / "second", "seed=1", *overrides)
+    fresh = point_mass_trainer(trained.record.directory.parent / "second", "seed=1", *overrides)
     networks, algorithm = fresh.algorithm.networks, fresh.algorithm
     assert not same(networks["actor"], trained.algorithm.actor)
-    taken = initialise_networks(networks, trained.folder.directory, list(algorithm.cost_keys))
+    taken = initialise_networks(networks, trained.record.directory, list(algorithm.cost_keys))
     return fresh, taken
 
 
@@ -61,8 +61,8 @@ def test_the_cost_critic_stays_new_where_the_costs_are_others(trained, overrides
 
 
 def test_a_checkpoint_can_be_named(trained):
-    path = trained.folder.files.newest_checkpoint()
-    fresh = point_mass_trainer(trained.folder.directory.parent / "second", "seed=1")
+    path = trained.record.folder.newest_checkpoint()
+    fresh = point_mass_trainer(trained.record.directory.parent / "second", "seed=1")
     initialise_networks(fresh.algorithm.networks, path, ["cost"])
     assert same(fresh.algorithm.networks["actor"], trained.algorithm.actor)
 
@@ -76,10 +76,10 @@ def test_a_checkpoint_can_be_named(trained):
     ],
 )
 def test_other_sizes_are_named_and_nothing_changes(trained, override, message):
-    fresh = point_mass_trainer(trained.folder.directory.parent / "second", "seed=1", override)
+    fresh = point_mass_trainer(trained.record.directory.parent / "second", "seed=1", override)
     before = {k: v.clone() for k, v in fresh.algorithm.actor.state_dict().items()}
     with pytest.raises(CheckpointError, match=message):
-        initialise_networks(fresh.algorithm.networks, trained.folder.directory, ["cost"])
+        initialise_networks(fresh.algorithm.networks, trained.record.directory, ["cost"])
     after = fresh.algorithm.actor.state_dict()
     assert all(torch.equal(after[key], value) for key, value in before.items())
 
