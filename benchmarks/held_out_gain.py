@@ -1,19 +1,22 @@
 """How much of what a policy step gains on its own batch it gains on batches it has not seen.
 
 Batches of one policy, that of a run's last checkpoint; a TRPO step on each, and its surrogate
-gain there and on all others. What is gained on its own batch only is noise of the advantages, and
-λ_GAE says how much of it there is: of the cost's advantages most.
+gain there and on all others. What is gained on its own batch only is noise of the advantages.
+λ_GAE says how much of it there is, of the cost's advantages most, and the number of conjugate
+gradients how much of it a step follows.
 
-    python benchmarks/held_out_gain.py RUN_DIR --lmbda 0.97,0.97 0.95,0.9 0.9,0.9
+    python benchmarks/held_out_gain.py RUN_DIR --lmbda 0.97,0.97 0.95,0.9 --cg-iterations 3 5 10
 
 Pairs are λ_GAE of rewards and of costs. Gains on other batches are always measured by the
-run's own estimators, so that columns can be compared down a table. A row per pair; a column per
-Lagrange multiplier: gain on its own batch / on the others ± standard error, in thousandths.
+run's own estimators, so that columns can be compared down a table. A row per pair and number; a
+column per Lagrange multiplier: gain on its own batch / on the others ± standard error, in
+thousandths.
 """
 
 from __future__ import annotations
 
 import argparse
+import itertools
 import math
 import statistics
 import tempfile
@@ -32,7 +35,6 @@ from safe_rl.training.building import build_trainer, seed_everything
 STEP = {
     "target_kl": 0.01,
     "damping": 0.1,
-    "cg_iterations": 10,
     "backtrack_coeff": 0.9,
     "max_backtracks": 30,
 }
@@ -69,12 +71,14 @@ def estimated(algorithm, batch, lmbdas: tuple[float, ...] | None):
     return normalise_advantages(batch)
 
 
-def gains(algorithm, batches, references, multiplier) -> tuple[list[float], list[float]]:
+def gains(
+    algorithm, batches, references, multiplier, cg_iterations
+) -> tuple[list[float], list[float]]:
     """Surrogate gain of a step on every batch: there, and on average over all other references."""
     actor = algorithm.actor
     start = {name: tensor.clone() for name, tensor in actor.state_dict().items()}
     loss = TRPOLagrangianLoss(actor, multiplier, entropy_coeff=0.0)
-    step = TRPOStep(loss, **STEP)
+    step = TRPOStep(loss, cg_iterations=cg_iterations, **STEP)
 
     @torch.no_grad()
     def value(batch) -> float:
@@ -101,6 +105,7 @@ def main():
     parser.add_argument("run", type=Path)
     parser.add_argument("--batches", type=int, default=8)
     parser.add_argument("--lmbda", nargs="+", default=["0.97,0.97", "0.95,0.9", "0.9,0.9"])
+    parser.add_argument("--cg-iterations", nargs="+", type=int, default=[10])
     parser.add_argument("--multipliers", nargs="+", type=float, default=[0.0, 1.0, 2.5])
     options = parser.parse_args()
     with tempfile.TemporaryDirectory() as directory:
@@ -109,21 +114,25 @@ def main():
     algorithm = trainer.algorithm
     limits = dict.fromkeys(algorithm.cost_keys, 0.0)
     references = [estimated(algorithm, batch, None) for batch in collected]
-    print("| λ_GAE | " + " | ".join(f"multiplier {m:g}" for m in options.multipliers) + " |")
-    print("|---|" + "---|" * len(options.multipliers))
-    for pair in options.lmbda:
+    print(
+        "| λ_GAE | conjugate gradients | "
+        + " | ".join(f"multiplier {m:g}" for m in options.multipliers)
+        + " |"
+    )
+    print("|---|---|" + "---|" * len(options.multipliers))
+    for pair, number in itertools.product(options.lmbda, options.cg_iterations):
         lmbdas = tuple(map(float, pair.split(",")))
         batches = [estimated(algorithm, batch, lmbdas) for batch in collected]
         cells = []
         for value in options.multipliers:
             fixed = LagrangeMultiplier(limits, init=max(value, 1e-6), lr=0.0)
-            own, others = gains(algorithm, batches, references, fixed)
+            own, others = gains(algorithm, batches, references, fixed, number)
             error = statistics.stdev(others) / math.sqrt(len(others))
             cells.append(
                 f"{1e3 * statistics.fmean(own):.1f} / "
                 f"{1e3 * statistics.fmean(others):.2f} ± {1e3 * error:.2f}"
             )
-        print(f"| {pair} | {' | '.join(cells)} |", flush=True)
+        print(f"| {pair} | {number} | {' | '.join(cells)} |", flush=True)
 
 
 if __name__ == "__main__":
