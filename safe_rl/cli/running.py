@@ -36,6 +36,7 @@ from safe_rl.evaluation.loading import transforms_of
 from safe_rl.runs.folder import RunFolder
 from safe_rl.runs.lock import held
 from safe_rl.runs.resuming import is_finished, may_continue
+from safe_rl.runs.table import TableError
 from safe_rl.training.building import build_trainer, physics_threads, seed_everything
 from safe_rl.training.trainer import EpisodeError, Trainer
 from safe_rl.training.transfer import begin_from
@@ -140,7 +141,7 @@ def run(config: DictConfig) -> None:
                 _say_certificate(config, folder)
             return
         # the last two are about the environment: where they stand says less than the message
-        with in_a_line(OSError, ConfigError, EpisodeError, FloatingPointError):
+        with in_a_line(OSError, TableError, ConfigError, EpisodeError, FloatingPointError):
             if not continues or (is_job and not folder.notes.exists()):
                 write_notes(folder, config, HydraConfig.get())
             outcome = trainer.run()

@@ -12,10 +12,14 @@ from pathlib import Path
 
 from safe_rl.runs.files import replace_text
 
-__all__ = ["TableWriter", "last_row", "read_table"]
+__all__ = ["TableError", "TableWriter", "last_row", "read_table"]
 
 # of a table that is unpacked; ten thousand epochs with a hundred columns have about 20 million
 _MOST_BYTES = 100_000_000
+
+
+class TableError(ValueError):
+    """A table lacks rows that its run has written."""
 
 
 class TableWriter:
@@ -30,8 +34,8 @@ class TableWriter:
             afresh.
 
     Raises:
-        ValueError: If there are fewer rows than are to be kept; by :meth:`write`, if a row's
-            columns differ from the first one's.
+        TableError: If there are fewer rows than are to be kept.
+        ValueError: By :meth:`write`, if a row's columns differ from the first one's.
 
     Examples:
         >>> import tempfile
@@ -81,9 +85,10 @@ def _first_rows(path: Path, number: int) -> list[str]:
     """Lines of a table: the header and as many rows."""
     complete = _complete_lines(path) if path.exists() else []
     if len(complete) < number + 1:
-        raise ValueError(
+        raise TableError(
             f"{path} holds {max(0, len(complete) - 1)} complete rows, but the run that is to be "
-            f"continued has finished {number} epochs: the table has been changed or cut off."
+            f"continued has finished {number} epochs: the table has been changed or cut off. "
+            "Put it back to go on, or begin a new run from the networks with init_from=."
         )
     return complete[: number + 1]
 

@@ -200,6 +200,16 @@ def test_what_is_wrong_with_a_cost_ends_training_in_a_line(command, cost, words)
     assert len(status.splitlines()) == 1
 
 
+def test_a_run_whose_table_was_cut_off_is_refused_in_a_line(command):
+    keys = ["env=PointGoal1", "env.num_steps=20", "num_envs=2", "frames=40", "frames_per_batch=40"]
+    assert command(*keys, "algo=ppo", "logger=none", "hydra.run.dir=cut")[0] == 0
+    Path("cut/progress.csv").write_text("epoch,steps\n1,")
+    status, _, _ = command("resume=cut", "frames=80")
+    assert "holds 0 complete rows" in status
+    assert "init_from=" in status
+    assert len(status.splitlines()) == 1
+
+
 @pytest.mark.parametrize("room", ["safe_rl.training", "safe_rl.cli"])
 def test_rooms_are_no_commands(room):
     result = subprocess.run([sys.executable, "-m", room], cwd=ROOT, capture_output=True, text=True)
