@@ -360,6 +360,15 @@ def test_tables_have_no_circles_and_no_ruins():
         assert set(modules) <= set(PATHS), "modules that are no more"
 
 
+def test_a_run_begins_without_what_only_draws_or_projects():
+    """Matplotlib and SciPy's optimisers are a fifth of the seconds in which a run begins."""
+    said = in_a_process(
+        "import sys, safe_rl.training.building\n"
+        "print({'matplotlib', 'scipy.optimize', 'scipy.stats'} & sys.modules.keys())"
+    )
+    assert said == "set()\n"
+
+
 @pytest.mark.parametrize("flags", [("--help",), ("--cfg", "job")])
 def test_help_and_configurations_are_shown_without_importing_what_trains(flags):
     """Which takes longer than all the rest of it."""

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Literal, Unpack, get_args
 
+import scipy  # which loads its parts when they are asked for: half a second
 import torch
-from scipy.optimize import nnls
 from tensordict import TensorDictBase
 from torch import Tensor
 
@@ -44,7 +44,7 @@ def nearest_feasible(excess: Tensor, gram: Tensor) -> Tensor:
     inverse = torch.where(roots > 1e-6, 1 / roots, 0.0)
     factor = roots[:, None] * vectors.T
     target = inverse * (vectors.T @ (scale * excess.double()))
-    solution, _ = nnls(factor.cpu().numpy(), target.cpu().numpy())
+    solution, _ = scipy.optimize.nnls(factor.cpu().numpy(), target.cpu().numpy())
     return (torch.from_numpy(solution).to(scale) * scale).to(excess)
 
 

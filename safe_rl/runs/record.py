@@ -11,7 +11,6 @@ from omegaconf import DictConfig, OmegaConf
 from tqdm import tqdm
 
 from safe_rl.runs.code import note_code
-from safe_rl.runs.curves import draw_learning_curves
 from safe_rl.runs.files import replacing
 from safe_rl.runs.folder import RunFolder
 from safe_rl.runs.lock import held
@@ -130,6 +129,9 @@ class RunRecord:
 
     def draw_curves(self) -> None:
         """Write ``curves.png`` from the table."""
+        # here, because it imports matplotlib, half a second that no run begins with
+        from safe_rl.runs.curves import draw_learning_curves
+
         table = read_table(self.folder.table)
         config = self._config
         seed = f"seed {config.seed}" if "seed" in config else ""
