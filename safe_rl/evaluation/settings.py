@@ -7,8 +7,6 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-import torch
-
 from safe_rl.scores.intervals import check_share
 
 __all__ = ["EvaluationOptions", "check_device", "check_options", "option"]
@@ -123,6 +121,8 @@ def check_device(device: str) -> None:
     Examples:
         >>> check_device("cpu")
     """
+    import torch  # here, because commands that run nothing need none of it
+
     try:
         kind, index = torch.device(device).type, torch.device(device).index or 0
     except RuntimeError:

@@ -2,21 +2,24 @@
 
 Dense rewards are differences of measurements between two steps; the environment keeps the earlier
 one and measures again when a new goal is drawn, so that changing goals costs nothing.
+
+Commands that only compose a configuration read the table too. They need no torch, which takes more
+than a second to import: functions here import it themselves, where tensors' methods do not do.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from enum import Enum
-from typing import NamedTuple
-
-import torch
-from torch import Tensor
+from typing import TYPE_CHECKING, NamedTuple
 
 from safe_rl.envs.errors import ConfigError
-from safe_rl.envs.safety_gym.geometry import distance
 from safe_rl.envs.safety_gym.records.config import SafetyGymConfig
-from safe_rl.envs.safety_gym.records.world import World
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from safe_rl.envs.safety_gym.records.world import World
 
 _CENTRE = 1e-12  # [m]
 
@@ -30,9 +33,9 @@ def circle_speed(com_xy: Tensor, velocity_xy: Tensor, radius: float) -> Tensor:
         radius: of the circle [m].
     """
     (x, y), (u, v) = com_xy.unbind(-1), velocity_xy.unbind(-1)
-    r = torch.sqrt(x**2 + y**2)
+    r = (x**2 + y**2).sqrt()
     # at the very centre, where a round robot may start, there is no motion about it
-    return ((-u * y + v * x) / r.clamp_min(_CENTRE)) / (1 + torch.abs(r - radius))
+    return ((-u * y + v * x) / r.clamp_min(_CENTRE)) / (1 + (r - radius).abs())
 
 
 class NextGoal(Enum):
@@ -69,6 +72,8 @@ class Task(NamedTuple):
 
 
 def _to_goal(world: World) -> Tensor:
+    from safe_rl.envs.safety_gym.geometry import distance
+
     return distance(world.robot_xy.unsqueeze(1), world.at("goal")[..., :2])
 
 
@@ -86,6 +91,10 @@ def _presses_goal(config: SafetyGymConfig, world: World, now: Tensor) -> Tensor:
 
 
 def _to_box_and_goal(world: World) -> Tensor:
+    import torch
+
+    from safe_rl.envs.safety_gym.geometry import distance
+
     box = world.at("box")
     return torch.cat(
         [distance(world.robot_pos[:, None], box), distance(box, world.at("goal"))], dim=-1
@@ -95,7 +104,7 @@ def _to_box_and_goal(world: World) -> Tensor:
 def _push(config: SafetyGymConfig, world: World, before: Tensor, now: Tensor) -> Tensor:
     gained = before - now
     far = before[:, 0] > config.box_null_dist * config.box_size
-    to_box = torch.where(far, config.reward_box_dist * gained[:, 0], 0.0)
+    to_box = (config.reward_box_dist * gained[:, 0]).where(far, 0.0)
     return to_box + config.reward_box_goal * gained[:, 1]
 
 
@@ -123,7 +132,7 @@ TASKS: dict[str, Task] = {
         at_origin=("goal",),
     ),
     "none": Task(
-        lambda c, w, before, now: torch.zeros_like(w.robot_pos[:, 0]), at_origin=("goal",)
+        lambda c, w, before, now: w.robot_pos.new_zeros(len(w.robot_pos)), at_origin=("goal",)
     ),
 }
 
@@ -187,6 +196,8 @@ def goals_met(task: Task, config: SafetyGymConfig, world: World, now: Tensor) ->
 
 
 def _check_values(what: str, values: Tensor, config: SafetyGymConfig, world: World) -> None:
+    from torch import Tensor
+
     shape = world.robot_xy.shape[:1]
     if not isinstance(values, Tensor) or values.shape not in (shape, ()):
         got = list(values.shape) if isinstance(values, Tensor) else f"a {type(values).__name__}"
