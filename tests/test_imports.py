@@ -360,11 +360,19 @@ def test_tables_have_no_circles_and_no_ruins():
         assert set(modules) <= set(PATHS), "modules that are no more"
 
 
-def test_a_run_begins_without_what_only_draws_or_projects():
-    """Matplotlib and SciPy's optimisers are a fifth of the seconds in which a run begins."""
+@pytest.mark.parametrize(
+    ("modules", "unneeded"),
+    [
+        # a fifth of the seconds in which a run begins
+        (("training.building",), {"matplotlib", "scipy.optimize", "scipy.stats"}),
+        # which every process that steps Gymnasium's environments would load: 290 MB
+        (("envs.gymnasium.adapting", "envs.gymnasium.processes"), {"torch"}),
+    ],
+)
+def test_what_is_not_needed_yet_is_not_imported(modules, unneeded):
     said = in_a_process(
-        "import sys, safe_rl.training.building\n"
-        "print({'matplotlib', 'scipy.optimize', 'scipy.stats'} & sys.modules.keys())"
+        f"import sys, {', '.join(f'safe_rl.{module}' for module in modules)}\n"
+        f"print({unneeded} & sys.modules.keys())"
     )
     assert said == "set()\n"
 

@@ -1,20 +1,28 @@
-"""Gymnasium's spaces as networks take them: vectors and pictures, actions in [-1, 1] or choices."""
+"""Gymnasium's spaces as networks take them: vectors and pictures, actions in [-1, 1] or choices.
+
+Processes that step environments import this, and no torch: they start in a second, and are small.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
-from itertools import accumulate
 from typing import Any
 
 import gymnasium
 import numpy as np
 from gymnasium.spaces import Box, Dict, Discrete, MultiDiscrete
-from torchrl.data import Composite, TensorSpec
 
-__all__ = ["adapt", "check_workers", "columns_of"]
+__all__ = ["FloatCosts", "adapt", "check_workers", "make_adapted"]
 
 _OBSERVATION = "observation"
+
+
+def make_adapted(
+    make: Callable[[], gymnasium.Env], num_steps: int, flatten: bool, cost_keys: Sequence[str]
+) -> gymnasium.Env:
+    """Make an environment, :func:`adapt` it, and have its costs reported as floats."""
+    return FloatCosts(adapt(make(), num_steps, flatten=flatten), cost_keys)
 
 
 def adapt(
@@ -50,12 +58,38 @@ def check_workers(make: Callable[[], gymnasium.Env]) -> None:
         probe.close()
 
 
-def columns_of(spec: TensorSpec) -> dict[str, slice]:
-    """Columns of every component of N observations, of entries as if they were one vector."""
-    parts = dict(spec.items()) if isinstance(spec, Composite) else {_OBSERVATION: spec}
-    sizes = {str(name): part.shape[1:].numel() for name, part in sorted(parts.items())}
-    ends = accumulate(sizes.values())
-    return {name: slice(end - sizes[name], end) for name, end in zip(sizes, ends, strict=True)}
+class FloatCosts(gymnasium.Wrapper):
+    """Makes costs in `info` floats.
+
+    Gymnasium puts those of a batch into an array of the type that the first row reports: beside an
+    integer 0 all costs would be rounded down, and booleans of NumPy's would be no numbers at all.
+
+    Args:
+        env: the environment.
+        cost_keys: names in `info`; what is no single number stays as it is.
+
+    Examples:
+        >>> class Push(gymnasium.Env):
+        ...     def step(self, action):
+        ...         return 0, 0.0, False, False, {"cost": 0, "pushes": 3}
+        >>> FloatCosts(Push(), ["cost"]).step(None)[-1]
+        {'cost': 0.0, 'pushes': 3}
+    """
+
+    def __init__(self, env: gymnasium.Env, cost_keys: Sequence[str]) -> None:
+        super().__init__(env)
+        self._cost_keys = list(cost_keys)
+
+    def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
+        """Step, and convert what is reported."""
+        observation, reward, terminated, truncated, info = self.env.step(action)
+        costs = {
+            key: float(info[key])
+            for key in self._cost_keys
+            if isinstance(info.get(key), bool | int | float | np.generic)
+            and not isinstance(info[key], np.flexible)
+        }
+        return observation, reward, terminated, truncated, {**info, **costs}
 
 
 # Not by the wrappers that Gymnasium has for both: they keep lambdas, which no pickle takes.

@@ -19,9 +19,9 @@ from torchrl.envs import GymWrapper, Transform, TransformedEnv
 from safe_rl.envs.cost_specs import cost_spec
 from safe_rl.envs.costs import COST, is_cost
 from safe_rl.envs.errors import ConfigError, nearest, require_integer, require_names
-from safe_rl.envs.gymnasium.adapting import adapt, check_workers, columns_of
+from safe_rl.envs.gymnasium.adapting import adapt, check_workers, make_adapted
 from safe_rl.envs.gymnasium.processes import ProcessVectorEnv
-from safe_rl.envs.gymnasium.reading import CostReader, FloatCosts
+from safe_rl.envs.gymnasium.reading import CostReader, columns_of
 
 MakeEnv = Callable[[], gymnasium.Env]
 _NO_COSTS = {"observation", "action", "reward", "done", "terminated", "truncated"}
@@ -178,14 +178,14 @@ def from_gymnasium(
     make = _maker(env, kwargs, num_steps)
     keys, length = describe(make, cost_keys, num_steps, flatten)
     _check_keys(keys, highest_costs or {})
-    make_adapted = partial(_make_adapted, make, length, flatten, keys)
+    make_one = partial(make_adapted, make, length, flatten, keys)
     worlds: VectorEnv
     if workers and not current_process().daemon:
         if not flatten:
             check_workers(make)
-        worlds = ProcessVectorEnv(make_adapted, num_envs, min(workers, num_envs), keys)
+        worlds = ProcessVectorEnv(make_one, num_envs, min(workers, num_envs), keys)
     else:
-        worlds = SyncVectorEnv([make_adapted] * num_envs, autoreset_mode=AutoresetMode.DISABLED)
+        worlds = SyncVectorEnv([make_one] * num_envs, autoreset_mode=AutoresetMode.DISABLED)
         worlds.env_fns = ()  # not asked again: functions of one's own might not be pickled
     return from_vector(worlds, keys, length, seed=seed, device=device, highest_costs=highest_costs)
 
@@ -242,12 +242,6 @@ def _spec_of_sum(specs: Sequence[TensorSpec]) -> TensorSpec:
     highest = [float(spec.high.max()) for spec in specs if isinstance(spec, Bounded)]
     is_known = len(highest) == len(specs)
     return cost_spec(sum(highest) if is_known else None, specs[0].shape, specs[0].device)
-
-
-def _make_adapted(
-    make: MakeEnv, num_steps: int, flatten: bool, cost_keys: Sequence[str]
-) -> gymnasium.Env:
-    return FloatCosts(adapt(make(), num_steps, flatten=flatten), cost_keys)
 
 
 def _fit(picture: np.ndarray, width: int, height: int) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""Costs that stand in the `info` of Gymnasium's environments, in TorchRL's data."""
+"""What Gymnasium's environments say, as TorchRL's data: costs in `info`, parts of observations."""
 
 from __future__ import annotations
 
@@ -6,14 +6,14 @@ import math
 import reprlib
 import warnings
 from collections.abc import Collection, Iterable, Mapping, Sequence
+from itertools import accumulate
 from typing import Any
 
-import gymnasium
 import numpy as np
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
-from torchrl.data import Composite
+from torchrl.data import Composite, TensorSpec
 from torchrl.envs.gym_like import BaseInfoDictReader
 
 from safe_rl import naming
@@ -21,44 +21,10 @@ from safe_rl.envs.cost_specs import cost_spec
 from safe_rl.envs.costs import COST, is_cost
 from safe_rl.envs.errors import ConfigError, nearest
 
-__all__ = ["CostReader", "FloatCosts"]
+__all__ = ["CostReader", "columns_of"]
 
 _MISSPELT = 0.85
 """Likeness above which two names are thought to be one."""
-
-
-class FloatCosts(gymnasium.Wrapper):
-    """Makes costs in `info` floats.
-
-    Gymnasium puts those of a batch into an array of the type that the first row reports: beside an
-    integer 0 all costs would be rounded down, and booleans of NumPy's would be no numbers at all.
-
-    Args:
-        env: the environment.
-        cost_keys: names in `info`; what is no single number stays as it is.
-
-    Examples:
-        >>> class Push(gymnasium.Env):
-        ...     def step(self, action):
-        ...         return 0, 0.0, False, False, {"cost": 0, "pushes": 3}
-        >>> FloatCosts(Push(), ["cost"]).step(None)[-1]
-        {'cost': 0.0, 'pushes': 3}
-    """
-
-    def __init__(self, env: gymnasium.Env, cost_keys: Sequence[str]) -> None:
-        super().__init__(env)
-        self._cost_keys = list(cost_keys)
-
-    def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
-        """Step, and convert what is reported."""
-        observation, reward, terminated, truncated, info = self.env.step(action)
-        costs = {
-            key: float(info[key])
-            for key in self._cost_keys
-            if isinstance(info.get(key), bool | int | float | np.generic)
-            and not isinstance(info[key], np.flexible)
-        }
-        return observation, reward, terminated, truncated, {**info, **costs}
 
 
 class CostReader(BaseInfoDictReader):
@@ -140,6 +106,14 @@ class CostReader(BaseInfoDictReader):
         """Shapes and types of the costs."""
         costs = {key: cost_spec(self._highest.get(key), self._shape) for key in self._cost_keys}
         return Composite(costs, shape=self._shape[:-1])
+
+
+def columns_of(spec: TensorSpec) -> dict[str, slice]:
+    """Columns of every component of N observations, of entries as if they were one vector."""
+    parts = dict(spec.items()) if isinstance(spec, Composite) else {"observation": spec}
+    sizes = {str(name): part.shape[1:].numel() for name, part in sorted(parts.items())}
+    ends = accumulate(sizes.values())
+    return {name: slice(end - sizes[name], end) for name, end in zip(sizes, ends, strict=True)}
 
 
 def _warn_of_uncounted(keys: Iterable[str], named: Sequence[str]) -> None:
