@@ -1,4 +1,7 @@
-"""Small environments that are registered with Gymnasium, as somebody else's would be."""
+"""Small environments of Gymnasium, as somebody else's would be; some are registered.
+
+Nothing here imports torch, so that processes that step them start at once.
+"""
 
 import gymnasium
 import numpy as np
@@ -112,6 +115,37 @@ class Recall(gymnasium.Env):
     def step(self, action):
         earned = float(action == self.side)
         return np.zeros(1, np.float32), earned, False, False, {"cost": 1 - earned}
+
+
+class Costly(gymnasium.Wrapper):
+    """The pendulum with costs for being fast and for being upright."""
+
+    def step(self, action):
+        observation, reward, terminated, truncated, info = self.env.step(action)
+        info["cost_speed"] = float(abs(observation[2]) > 1.0)
+        info["cost_upright"] = max(0.0, float(observation[0]))
+        info["torque"] = float(action[0])
+        return observation, reward, terminated, truncated, info
+
+
+def make_pendulum(**kwargs):
+    return Costly(gymnasium.make("Pendulum-v1", **kwargs))
+
+
+class Toll(gymnasium.Env):
+    """A step costs what the seed says in a list, where the types are as they come."""
+
+    observation_space = gymnasium.spaces.Box(0, 9, (1,), np.float32)
+    action_space = gymnasium.spaces.Box(-1, 1, (1,), np.float32)
+    costs = (0, 0.5, np.True_, np.float32(0.25), True, np.int64(2))
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.cost = self.cost if seed is None else self.costs[seed % len(self.costs)]
+        return np.zeros(1, np.float32), {}
+
+    def step(self, action):
+        return np.zeros(1, np.float32), 0.0, False, False, {"cost": self.cost}
 
 
 gymnasium.register("Recall-v0", entry_point=f"{__name__}:Recall", max_episode_steps=8)

@@ -8,7 +8,7 @@ import gymnasium
 import numpy as np
 import pytest
 import torch
-from gymnasium_envs import Walk
+from gymnasium_envs import Toll, Walk, make_pendulum
 from run_configs import compose_config
 from torchrl.envs import RewardSum, TransformedEnv
 from torchrl.envs.utils import check_env_specs
@@ -18,21 +18,6 @@ from safe_rl.runs.table import read_table
 from safe_rl.training.building import build_trainer, seed_everything
 
 store_configs()
-
-
-class Costly(gymnasium.Wrapper):
-    """The pendulum with costs for being fast and for being upright."""
-
-    def step(self, action):
-        observation, reward, terminated, truncated, info = self.env.step(action)
-        info["cost_speed"] = float(abs(observation[2]) > 1.0)
-        info["cost_upright"] = max(0.0, float(observation[0]))
-        info["torque"] = float(action[0])
-        return observation, reward, terminated, truncated, info
-
-
-def make_pendulum(**kwargs):
-    return Costly(gymnasium.make("Pendulum-v1", **kwargs))
 
 
 class Switches(gymnasium.Env):
@@ -133,22 +118,6 @@ def test_a_cost_that_is_no_number_is_told_with_its_name(cost, num_envs):
     env = from_gymnasium(Odd, num_envs=num_envs, num_steps=4, cost_keys=["cost_odd"], seed=3)
     with pytest.raises(ConfigError, match=r"info\['cost_odd'\] must be one number per step"):
         env.rollout(2)
-
-
-class Toll(gymnasium.Env):
-    """A step costs what the seed says in a list, where the types are as they come."""
-
-    observation_space = gymnasium.spaces.Box(0, 9, (1,), np.float32)
-    action_space = gymnasium.spaces.Box(-1, 1, (1,), np.float32)
-    costs = (0, 0.5, np.True_, np.float32(0.25), True, np.int64(2))
-
-    def reset(self, *, seed=None, options=None):
-        super().reset(seed=seed)
-        self.cost = self.cost if seed is None else self.costs[seed % len(self.costs)]
-        return np.zeros(1, np.float32), {}
-
-    def step(self, action):
-        return np.zeros(1, np.float32), 0.0, False, False, {"cost": self.cost}
 
 
 @pytest.mark.parametrize("workers", [0, 2])
