@@ -190,7 +190,7 @@ FLOORS = {
         ("user_code",),
         ("composing", "shorthands", "sweeps"),
         ("certificates",),
-        ("running",),
+        ("evaluating", "running"),
         ("evaluate", "report", "train"),
         ("python_settings",),
         ("notebook",),
@@ -377,13 +377,22 @@ def test_what_is_not_needed_yet_is_not_imported(modules, unneeded):
     assert said == "set()\n"
 
 
-@pytest.mark.parametrize("flags", [("--help",), ("--cfg", "job")])
-def test_help_and_configurations_are_shown_without_importing_what_trains(flags):
+@pytest.mark.parametrize(
+    ("command", "arguments", "words"),
+    [
+        ("train", ("--help",), "PointGoal1"),
+        ("train", ("--cfg", "job"), "PointGoal1"),
+        ("evaluate", ("--help",), "episodes=100"),
+        ("evaluate", ("runs/0", "episode=3"), "episodes"),
+    ],
+)
+def test_help_and_configurations_are_shown_without_importing_what_trains(command, arguments, words):
     """Which takes longer than all the rest of it."""
     said = in_a_process(
-        f"import sys; from safe_rl.cli.train import main; sys.argv[1:] = {flags}\n"
+        "import sys; sys.stderr = sys.stdout\n"
+        f"from safe_rl.cli.{command} import main; sys.argv[1:] = {arguments}\n"
         "try: main()\n"
         "finally: print('slow:', {'torch', 'matplotlib'} & sys.modules.keys())"
     )
-    assert "PointGoal1" in said
+    assert words in said
     assert said.splitlines()[-1] == "slow: set()"

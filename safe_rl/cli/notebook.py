@@ -23,7 +23,7 @@ from safe_rl.cli.certificates import (
     is_to_keep_limits,
     is_worth_a_certificate,
 )
-from safe_rl.cli.evaluate import evaluate_run
+from safe_rl.cli.evaluating import evaluate_run
 from safe_rl.cli.interrupting import say_if_heard
 from safe_rl.cli.options import take_options
 from safe_rl.cli.python_settings import compose_new, compose_resumed, new_run, overrides_of

@@ -121,7 +121,7 @@ def check_device(device: str) -> None:
     Examples:
         >>> check_device("cpu")
     """
-    import torch  # here, because commands that run nothing need none of it
+    import torch  # here, because help and configurations are shown without it
 
     try:
         kind, index = torch.device(device).type, torch.device(device).index or 0

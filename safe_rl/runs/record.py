@@ -33,6 +33,9 @@ class RunRecord:
         cost_limits: Cost key -> d, undiscounted cost per episode.
         episode_length: T_ep, steps of a full episode.
 
+    Raises:
+        ValueError: If Matplotlib is told to use what it has not (``MPLBACKEND``).
+
     Examples:
         >>> import tempfile
         >>> config = OmegaConf.create({"frames": 200, "logger": None, "algo": {"name": "ppo"}})
@@ -52,6 +55,9 @@ class RunRecord:
         cost_limits: Mapping[str, float],
         episode_length: int,
     ) -> None:
+        # which draws the curves, and knows all backends: a wrong one is said before the run begins
+        import matplotlib  # noqa: F401
+
         self.directory = directory
         self.folder = RunFolder(directory)
         self._config = config

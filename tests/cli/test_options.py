@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from safe_rl.cli.evaluate import evaluate_run
+from safe_rl.cli.evaluating import evaluate_run
 from safe_rl.cli.options import OptionError, parse_options, take_options, usage
 from safe_rl.evaluation.settings import EvaluationOptions
 from safe_rl.extras import import_extra

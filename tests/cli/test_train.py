@@ -2,6 +2,7 @@
 
 import logging
 import logging.handlers
+import os
 import signal
 import subprocess
 import sys
@@ -163,6 +164,19 @@ def test_an_interruption_is_said_in_a_line_and_ends_by_the_signal():
         cwd=ROOT, capture_output=True, text=True, timeout=300,
     )  # fmt: skip
     assert (ended.returncode, ended.stderr) == (-signal.SIGINT, "Interrupted.\n")
+
+
+def test_a_backend_that_matplotlib_does_not_know_is_said_before_the_run_begins(tmp_path):
+    where, small = f"hydra.run.dir={tmp_path / 'run'}", "frames=20_000"
+    ended = subprocess.run(
+        [sys.executable, "train.py", "env=PointGoal0", "algo=ppo", small, where],
+        cwd=ROOT, env=os.environ | {"MPLBACKEND": "nonsense"},
+        capture_output=True, text=True, timeout=300,
+    )  # fmt: skip
+    assert ended.returncode == 1
+    assert "'nonsense' is not a valid value for backend" in ended.stderr.splitlines()[-1]
+    assert "Traceback" not in ended.stderr
+    assert not (tmp_path / "run").exists()
 
 
 class OddCost(gymnasium.Env):

@@ -19,12 +19,12 @@ from safe_rl import targets
 from safe_rl.cli import user_code
 from safe_rl.cli.composing import check_command
 from safe_rl.cli.conf import CONF
-from safe_rl.cli.evaluate import EvaluationOptions
 from safe_rl.cli.options import parse_options
 from safe_rl.cli.report import ReportOptions
 from safe_rl.cli.shorthands import expand_arguments
 from safe_rl.cli.user_code import import_modules, note_imports, split_imports
 from safe_rl.cli.variations import read_variations
+from safe_rl.evaluation import EvaluationOptions
 from safe_rl.evaluation.settings import check_options
 
 ROOT = Path(__file__).resolve().parents[2]

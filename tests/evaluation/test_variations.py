@@ -15,7 +15,8 @@ from PIL import Image
 import safe_rl
 from safe_rl.cli.composing import check_command
 from safe_rl.cli.conf import CONF
-from safe_rl.cli.evaluate import evaluate_run, main
+from safe_rl.cli.evaluate import main
+from safe_rl.cli.evaluating import evaluate_run
 from safe_rl.cli.shorthands import expand_arguments
 from safe_rl.cli.variations import read_variations
 from safe_rl.evaluation import EvaluationOptions

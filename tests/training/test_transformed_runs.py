@@ -12,8 +12,9 @@ from run_configs import point_mass_config, without_times
 from torchrl.envs.transforms import StepCounter
 
 from safe_rl.cli import evaluate
-from safe_rl.cli.evaluate import EvaluationOptions, evaluate_run
+from safe_rl.cli.evaluating import evaluate_run
 from safe_rl.envs.transforms import transform_env
+from safe_rl.evaluation import EvaluationOptions
 from safe_rl.evaluation.loading import transforms_of
 from safe_rl.runs.identity import experiment_of
 from safe_rl.runs.table import read_table

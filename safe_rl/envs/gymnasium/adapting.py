@@ -1,6 +1,7 @@
-"""Gymnasium's spaces as networks take them: vectors and pictures, actions in [-1, 1] or choices.
+"""Gymnasium's environments as networks and tables take them: their spaces, and costs as floats.
 
-Processes that step environments import this, and no torch: they start in a second, and are small.
+Observations become vectors and pictures, actions lie in [-1, 1] or are choices. Processes that step
+environments import this, and by themselves no torch: they start in a second, and are small.
 """
 
 from __future__ import annotations
