@@ -237,3 +237,25 @@ def test_worlds_and_batches(name):
             assert cell.strip() == "; ".join(ends)
             told += len(ends)
     assert told == len({(r["env"], r["num_envs"], r["frames_per_batch"], r["seed"]) for r in rows})
+
+
+def test_what_each_part_contributes():
+    """Every row of the page, from the epochs of the archive; and it has all of them."""
+    page = (ROOT / "docs" / "algorithms" / "limits_measured.md").read_text()
+    table = page.partition("<!-- table: parts -->\n")[2].partition("\n\n")[0].splitlines()[2:]
+    runs = {}
+    with gzip.open(RESULTS / "parts" / "three_million.csv.gz", "rt") as file:
+        for row in csv.DictReader(file):
+            epoch = [float(row[k] or "nan") for k in ("steps", "episode_return", "episode_cost")]
+            by_seed = runs.setdefault((row["without"], row["env"]), {})
+            by_seed.setdefault(row["seed"], []).append(epoch)
+    for line in table:
+        what, *cells = (cell.strip() for cell in line.strip("|").split("|"))
+        for env, *told in (("PointGoal1", *cells[:2]), ("CarGoal1", *cells[2:])):
+            found = [np.array(run) for run in runs.pop((what.partition(":")[0], env)).values()]
+            late = [np.nanmean(run[run[:, 0] > 2e6], axis=0) for run in found]
+            costs = [run[run[:, 0] > 1e6][:, 2] for run in found]
+            mean, above = np.mean([(np.nanmean(c), np.mean(c > 25)) for c in costs], axis=0)
+            ends = ", ".join(f"{end[1]:.1f} / {end[2]:.0f}" for end in late)
+            assert told == [ends, f"{mean:.1f}, {percent(above)}"]
+    assert not runs
