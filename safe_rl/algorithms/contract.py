@@ -113,7 +113,8 @@ class PolicyUpdate(Protocol):
 
         Args:
             batch: On-policy data with advantages, any batch shape.
-            cost_violation: J_c − d of every constraint, shape [k].
+            cost_violation: By how much J_c is to fall, of every constraint, shape [k]: J_c − d, or
+                J_c less the column ``target_…`` where the limit comes down to d.
             episode_length: Mean episode length T̄ in steps, a scalar.
         """
         ...

@@ -107,6 +107,8 @@ class OffPolicy:
             action_spec=bounded_actions(env).to(device),
             multiplier=constraints.multiplier,
             cost_keys=constraints.keys,
+            constraints=constraints,
+            cost_limits=limits,
         )
         _check_risk(config, constraints, loss)
         _check_memory(config, loss)

@@ -8,6 +8,7 @@ from contextlib import contextmanager
 from typing import Any
 
 import torch
+from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 __all__ = ["side_by_side", "torch_threads"]
 
@@ -41,13 +42,17 @@ def side_by_side(first: Callable[[], Any], second: Callable[[], Any]) -> tuple[A
         (1, 2)
     """
     threads = torch.get_num_threads()
-    if threads == 1:
-        return first(), second()
+    # losses set the process's one exploration type, and put back what they have found: by turns,
+    # each finds the other's, unless it is the same
+    with set_exploration_type(ExplorationType.DETERMINISTIC):
+        return (first(), second()) if threads == 1 else _beside(first, second, threads // 2)
 
+
+def _beside(first: Callable[[], Any], second: Callable[[], Any], threads: int) -> tuple[Any, Any]:
     def beside() -> Any:
-        torch.set_num_threads(threads // 2)  # a setting of each thread's own
+        torch.set_num_threads(threads)  # a setting of each thread's own
         return second()
 
-    with torch_threads(threads // 2), ThreadPoolExecutor(max_workers=1) as pool:
+    with torch_threads(threads), ThreadPoolExecutor(max_workers=1) as pool:
         other = pool.submit(beside)
         return first(), other.result()

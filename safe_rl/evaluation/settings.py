@@ -94,9 +94,10 @@ def check_options(options: EvaluationOptions) -> None:
     if "/" in options.name or not options.name.isprintable():
         raise ValueError(f"name={options.name}: it is part of the files' names, without /.")
     films = options.video or options.picture
-    if options.variations is not None and (films or options.certify):
+    if options.variations is not None and (films or options.record or options.certify):
         raise ValueError(
-            "variations=… stands for itself: leave video=true, picture=… and certify=true away."
+            "variations=… stands for itself: leave video=true, picture=…, record=true and "
+            "certify=true away."
         )
     if not films and options.camera != EvaluationOptions.camera:
         raise ValueError(f"camera={options.camera}: it is the video's: add video=true.")

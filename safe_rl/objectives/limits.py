@@ -248,7 +248,8 @@ class LimitTracker:
     def _target(self, estimate: CostEstimate, scale: Tensor, num_steps: int) -> Tensor:
         """What J_c is to be at most after an update, which came with `num_steps` steps, [k]."""
         self._steps += num_steps
-        if self._steps <= self.free_steps:
+        # a descent that has begun goes on, also if the run was made longer meanwhile
+        if self._steps <= self.free_steps and not self._reached.isfinite().any():
             return estimate.mean + scale
         margin = torch.minimum(self.margin * self._noise, self.largest_margin * self.limits)
         left = self.free_steps + self.descent_steps - self._steps + num_steps

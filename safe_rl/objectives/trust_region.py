@@ -158,7 +158,8 @@ def backtracking_search(
     """Move parameters along a step, shortening it until it is accepted.
 
     Args:
-        parameters: moved in place; left at their old values if no step is accepted.
+        parameters: moved in place; left at their old values if no step is accepted, or
+            `accept` raises.
         step: full step, [P].
         accept: called with the parameters moved.
         coeff: factor in (0, 1) between one try and the next.
@@ -167,11 +168,15 @@ def backtracking_search(
     Returns:
         The accepted fraction of the step: a power of `coeff`, or 0 if none was accepted.
     """
-    start = flatten(parameters).detach()
-    for tries in range(max_tries):
-        fraction = coeff**tries
-        set_parameters(parameters, start + fraction * step)
-        if accept():
-            return fraction
-    set_parameters(parameters, start)
-    return 0.0
+    start, accepted = flatten(parameters).detach(), 0.0
+    try:
+        for tries in range(max_tries):
+            fraction = coeff**tries
+            set_parameters(parameters, start + fraction * step)
+            if accept():
+                accepted = fraction
+                break
+    finally:
+        if not accepted:
+            set_parameters(parameters, start)
+    return accepted

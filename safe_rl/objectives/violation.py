@@ -20,7 +20,8 @@ class Violations(Protocol):
     """What a loss reads at every call; a `safe_rl.algorithms.Constraints` is one.
 
     Attributes:
-        violation: J_c − d of every constraint, undiscounted cost per episode, [k].
+        violation: by how much J_c is to fall, undiscounted cost per episode, [k]: J_c − d, or with
+            `safe_rl.objectives.LimitTracker` J_c less what it is to be by now, its target.
         episode_length: T̄, mean number of steps of an episode, scalar.
     """
 

@@ -5,6 +5,7 @@ import threading
 import pytest
 import torch
 from point_mass_runs import point_mass_trainer
+from torchrl.envs.utils import ExplorationType, exploration_type, set_exploration_type
 
 from safe_rl.algorithms import on_policy
 from safe_rl.algorithms.side_by_side import side_by_side, torch_threads
@@ -31,6 +32,27 @@ def two_threads():
 def test_both_are_under_way_at_once(two_threads):
     meeting = threading.Barrier(2, timeout=10)  # breaks unless both come
     assert side_by_side(meeting.wait, meeting.wait) in {(0, 1), (1, 0)}
+
+
+def test_the_exploration_type_is_afterwards_what_it_was(two_threads):
+    """Every loss sets that of the process and puts it back: A in, B in, A out, B out."""
+    steps = [threading.Event() for _ in range(3)]
+
+    def first():
+        with set_exploration_type(ExplorationType.DETERMINISTIC):
+            steps[0].set()
+            steps[1].wait(10)
+        steps[2].set()
+
+    def second():
+        steps[0].wait(10)
+        with set_exploration_type(ExplorationType.DETERMINISTIC):
+            steps[1].set()
+            steps[2].wait(10)
+
+    before = exploration_type()
+    side_by_side(first, second)
+    assert exploration_type() == before
 
 
 def test_one_thread_calls_them_in_turn():

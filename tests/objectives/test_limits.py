@@ -60,6 +60,17 @@ def test_in_a_short_run_the_descent_is_over_in_time():
     assert [bool(state.target == 25) for state in states] == [False] * 13 + [True] * 7
 
 
+def test_a_run_that_is_made_longer_during_its_descent_has_no_free_steps_again():
+    costs = torch.full((20, 25, 1), 0.1)
+    short = tracker(margin=0.0, drift=None, frames=10_000)
+    before = [short.update(costs, NO_EPISODES).target for _ in range(6)][-1]
+    longer = tracker(margin=0.0, drift=None)
+    longer.load_state_dict(short.state_dict())
+    after = [longer.update(costs, NO_EPISODES).target for _ in range(3)]
+    assert longer.free_steps == 4_000  # of which 4,500 are over by the last
+    assert before > after[0] > after[1] > after[2] > 25
+
+
 def test_the_descent_goes_on_from_the_cost_where_that_came_down_faster():
     limits = tracker(margin=0.0, free_steps=0, drift=None)
     limits.update(torch.full((20, 100, 1), 0.1), NO_EPISODES)

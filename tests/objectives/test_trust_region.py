@@ -262,6 +262,17 @@ def test_backtracking_takes_the_first_acceptable_fraction(limit, fraction):
     torch.testing.assert_close(parameter.data, torch.tensor([1.0, -1.0]) + found)
 
 
+def test_a_loss_that_fails_in_the_search_leaves_the_parameters():
+    parameter = nn.Parameter(torch.tensor([1.0, -1.0]))
+
+    def fails():
+        raise FloatingPointError("the loss is nan")
+
+    with pytest.raises(FloatingPointError):
+        backtracking_search([parameter], torch.ones(2), fails, coeff=0.8, max_tries=5)
+    assert parameter.tolist() == [1.0, -1.0]
+
+
 def test_subsample_is_spread_over_the_batch():
     batch = TensorDict(index=torch.arange(100), batch_size=[100])
     assert subsample(batch, 0.1)["index"].tolist() == list(range(0, 100, 10))

@@ -13,7 +13,9 @@ from safe_rl.algorithms import OffPolicy
 from safe_rl.evaluation.during import PeriodicEvaluation
 from safe_rl.evaluation.episodes import collect_episodes
 from safe_rl.evaluation.loading import find_checkpoint, load_config, load_policy
+from safe_rl.objectives import SACLagrangianLoss
 from safe_rl.runs.table import read_table
+from safe_rl.targets import allow
 from safe_rl.training.building import build_trainer, seed_everything
 from safe_rl.training.transfer import begin_from
 
@@ -186,6 +188,24 @@ def test_another_run_starts_from_its_networks(make_trainer, tmp_path):
     # critics of other costs do not, and no mean becomes the variance that is as large
     assert start("third", "algo=sac_lagrangian", "cost_limits={cost_north: 1}")[1] == taken[:2]
     assert start("fourth", "algo=wcsac")[1] == taken[:2]
+
+
+class ToldOfCosts(SACLagrangianLoss):
+    """A loss of one's own that reads what is known of the costs."""
+
+    def __init__(self, *networks, constraints, cost_limits, **settings):
+        super().__init__(*networks, **settings)
+        self.constraints, self.limits = constraints, dict(cost_limits)
+
+
+def test_a_loss_of_ones_own_is_passed_the_constraints_it_names(make_trainer):
+    allow(__name__)
+    own = f"loss._target_={__name__}.ToldOfCosts"
+    trainer = make_trainer("run", "algo=sac_lagrangian", own, "frames=320")
+    trainer.run()
+    loss = trainer.algorithm.policy_update.loss
+    assert loss.constraints is trainer.algorithm.constraints
+    assert loss.limits == {"cost": 25.0}
 
 
 @pytest.mark.parametrize("algo", ["sac", "td3"])
