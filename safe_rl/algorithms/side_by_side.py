@@ -28,7 +28,8 @@ def side_by_side(first: Callable[[], Any], second: Callable[[], Any]) -> tuple[A
     """Call two functions that share nothing they change, each with half of torch's threads.
 
     Minibatches of narrow networks are too small to be worth two threads each: two of them side by
-    side are. With one thread, the second function follows the first.
+    side are. With one thread, the second function follows the first. TorchRL's exploration type is
+    DETERMINISTIC meanwhile, as in its losses.
 
     Args:
         first: Called in this thread.
@@ -42,8 +43,8 @@ def side_by_side(first: Callable[[], Any], second: Callable[[], Any]) -> tuple[A
         (1, 2)
     """
     threads = torch.get_num_threads()
-    # losses set the process's one exploration type, and put back what they have found: by turns,
-    # each finds the other's, unless it is the same
+    # Losses set the process's one exploration type, and put back what they have found: in two
+    # threads that is the other's. So it is the same before, and only this block restores it.
     with set_exploration_type(ExplorationType.DETERMINISTIC):
         return (first(), second()) if threads == 1 else _beside(first, second, threads // 2)
 
