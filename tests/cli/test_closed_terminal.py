@@ -12,7 +12,9 @@ from pathlib import Path
 from safe_rl.runs.table import read_table
 
 IN_A_TERMINAL = """
-import fcntl, sys, termios
+import fcntl, signal, sys, termios
+# what ran the tests may ignore it, as nohup does, and a process inherits that
+signal.signal(signal.SIGHUP, signal.SIG_DFL)
 from safe_rl.cli.train import main
 fcntl.ioctl(0, termios.TIOCSCTTY, 0)
 sys.exit(main())
