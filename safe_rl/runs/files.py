@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import json
 import os
 import re
 from collections.abc import Iterable, Iterator
@@ -13,11 +14,14 @@ from typing import Any
 import yaml
 
 __all__ = [
-    *("check_place", "read_config", "read_yaml", "replace_csv", "replace_text", "replacing"),
+    *("check_place", "read_bounded", "read_config", "read_json", "read_yaml", "replace_csv"),
+    *("replace_text", "replacing"),
 ]
 
-# of a configuration; that of a run has about six thousand
-_MOST_LETTERS = 1_000_000
+# Bytes of a configuration or of notes; those of a run have about ten thousand.
+_MOST_BYTES = 1_000_000
+# Levels of a configuration; a run's has six. The C parser overflows the stack at some ten thousand.
+_MOST_LEVELS = 100
 
 
 class _Loader(getattr(yaml, "CSafeLoader", yaml.SafeLoader)):  # type: ignore[misc]
@@ -46,17 +50,60 @@ _Loader.yaml_implicit_resolvers = {
 _Loader.add_implicit_resolver("tag:yaml.org,2002:float", _Loader._WITH_EXPONENT, [*"-+0123456789"])
 
 
+def read_bounded(path: Path, most: int = _MOST_BYTES) -> bytes:
+    """Read a regular file of bounded size, whoever wrote it.
+
+    Args:
+        path: The file.
+        most: Largest size to read, bytes.
+
+    Raises:
+        ValueError: If it is larger, or no regular file: a pipe would be waited for without end.
+        OSError: If it cannot be read.
+
+    Examples:
+        >>> path = getfixture("tmp_path") / "note.txt"
+        >>> _ = path.write_text("abc")
+        >>> read_bounded(path)
+        b'abc'
+        >>> read_bounded(path, most=2)
+        Traceback (most recent call last):
+        ...
+        ValueError: note.txt has more than 2 bytes
+    """
+    if not path.is_file() and path.exists():
+        raise ValueError(f"{path.name} is no regular file")
+    with path.open("rb") as file:
+        content = file.read(most + 1)
+    if len(content) > most:
+        raise ValueError(f"{path.name} has more than {most:,} bytes")
+    return content
+
+
+def read_json(path: Path, most: int = _MOST_BYTES) -> Any:
+    """Read a JSON file of bounded size.
+
+    Raises:
+        ValueError: If it is none, larger, or nested too deeply.
+        OSError: If it cannot be read.
+    """
+    try:
+        return json.loads(read_bounded(path, most))
+    except (ValueError, RecursionError) as error:
+        raise ValueError(f"{path.name} cannot be read ({error})") from error
+
+
 def read_yaml(path: Path) -> Any:
     """Read a YAML file as plain dictionaries, lists and values; nothing in it is followed.
 
     Raises:
-        ValueError: If it is none, or has aliases, which could grow without end.
+        ValueError: If it is none, is too large or nested too deeply, or has aliases, which could
+            grow without end.
         OSError: If it cannot be read.
     """
     try:
-        text = path.read_text(encoding="utf-8")
-        if len(text) > _MOST_LETTERS:
-            raise ValueError("it is longer than any configuration of a run")
+        text = read_bounded(path).decode("utf-8")
+        _check_levels(text)
         # without a star there is none, and reading hundreds of runs takes a fifth less
         if "*" in text and any(isinstance(token, yaml.AliasToken) for token in yaml.scan(text)):
             raise ValueError("it has YAML aliases, which no run writes")
@@ -65,6 +112,16 @@ def read_yaml(path: Path) -> Any:
     except (yaml.YAMLError, ValueError, LookupError, RecursionError) as error:
         reason = (str(error) or type(error).__name__).splitlines()[0]
         raise ValueError(f"{path.name} cannot be read ({reason})") from error
+
+
+def _check_levels(text: str) -> None:
+    """Refuse what is nested too deeply, by the parser's events, which need no stack."""
+    level = 0
+    for event in yaml.parse(text, Loader=_Loader):
+        level += isinstance(event, yaml.CollectionStartEvent)
+        level -= isinstance(event, yaml.CollectionEndEvent)
+        if level > _MOST_LEVELS:
+            raise ValueError(f"it is nested in more than {_MOST_LEVELS} levels")
 
 
 def read_config(path: Path) -> dict[str, Any]:

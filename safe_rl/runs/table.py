@@ -10,11 +10,11 @@ import zlib
 from collections.abc import Mapping
 from pathlib import Path
 
-from safe_rl.runs.files import replace_text
+from safe_rl.runs.files import read_bounded, replace_text
 
 __all__ = ["TableError", "TableWriter", "last_row", "read_table"]
 
-# of a table that is unpacked; ten thousand epochs with a hundred columns have about 20 million
+# Of a table, unpacked; ten thousand epochs with a hundred columns have about 20 million
 _MOST_BYTES = 100_000_000
 
 
@@ -141,7 +141,7 @@ def last_row(path: Path) -> dict[str, float]:
 
 def _text(path: Path) -> str:
     if path.suffix != ".gz":
-        return path.read_text()
+        return read_bounded(path, _MOST_BYTES).decode()
     try:
         with gzip.open(path, "rb") as file:
             content = file.read(_MOST_BYTES + 1)  # a small file can unpack to any size

@@ -7,7 +7,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from omegaconf import OmegaConf
 
-from safe_rl.runs.files import read_config, read_yaml, replacing
+from safe_rl.runs import table
+from safe_rl.runs.files import read_bounded, read_config, read_json, read_yaml, replacing
 from safe_rl.runs.folder import paths_below, runs_below
 
 VALUES = st.recursive(
@@ -47,8 +48,8 @@ BOMB = "a: &a [x, x]\n" + "".join(
         ("a: !!bool perhaps", "cannot be read"),
         ("[a]: b", "cannot be read"),
         (BOMB, "aliases"),
-        ("[" * 5000, "cannot be read"),
-        ("a: " + "x" * 1_000_001, "longer"),
+        ("[" * 5000, "more than 100 levels"),
+        ("a: " + "x" * 1_000_001, "more than 1,000,000 bytes"),
         (b"\xff\xfe\x00", "cannot be read"),
     ],
 )
@@ -91,6 +92,27 @@ def test_a_file_is_replaced_when_it_is_complete(tmp_path):
         unfinished.write_text("half \udc80")
     assert [file.name for file in tmp_path.iterdir()] == ["table.csv"]
     assert path.read_text() == "aft"
+
+
+@pytest.mark.parametrize("text", ["[" * 200_000, "- " * 200_000, "{a: " * 900, "x" * 2_000_000])
+@pytest.mark.parametrize("reader", [read_yaml, read_json])
+def test_what_is_too_deep_or_too_large_is_refused_before_it_is_parsed(reader, text, tmp_path):
+    """The C parser of YAML overflows the stack at some ten thousand levels."""
+    path = tmp_path / "config.yaml"
+    path.write_text(text)
+    with pytest.raises(ValueError, match=r"config\.yaml cannot be read"):
+        reader(path)
+
+
+def test_a_table_of_any_size_and_a_pipe_are_not_read(tmp_path):
+    sparse = tmp_path / "progress.csv"
+    with sparse.open("wb") as file:
+        file.truncate(3_000_000_000)
+    with pytest.raises(ValueError, match="more than 100,000,000 bytes"):
+        table.read_table(sparse)
+    os.mkfifo(tmp_path / "pipe")
+    with pytest.raises(ValueError, match="pipe is no regular file"):
+        read_bounded(tmp_path / "pipe")
 
 
 def test_runs_are_found_while_folders_of_a_checkpoint_come_and_go(tmp_path, monkeypatch):
