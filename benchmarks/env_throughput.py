@@ -25,9 +25,9 @@ from omegaconf import OmegaConf
 
 from safe_rl.envs import SUITE, SafetyGymConfig, SafetyGymEnv
 from safe_rl.envs.physics.batch import BatchPhysics
+from safe_rl.envs.safety_gym.building import build_scene
+from safe_rl.envs.safety_gym.state import gremlin_path
 from safe_rl.envs.safety_gym.suite import resolve
-from safe_rl.envs.safety_gym.world.building import build_scene
-from safe_rl.envs.safety_gym.world.draws import gremlin_path
 
 COLUMNS = ("env", "num_envs", "threads", "env steps/s", "bare steps/s", "ratio", "reset ms", "MB")
 

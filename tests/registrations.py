@@ -5,6 +5,10 @@ from contextlib import contextmanager
 
 import torch
 
+from safe_rl.envs.safety_gym.building import forget_scenes
+from safe_rl.envs.safety_gym.config import registered_keys, set_registered_keys
+from safe_rl.envs.safety_gym.costs import COSTS
+from safe_rl.envs.safety_gym.elements import BY_KIND, ELEMENTS, PLACEMENT_ORDER
 from safe_rl.envs.safety_gym.extending import (
     BOX,
     CYLINDER,
@@ -15,13 +19,9 @@ from safe_rl.envs.safety_gym.extending import (
     register_cost,
     register_element,
 )
-from safe_rl.envs.safety_gym.records.config import registered_keys, set_registered_keys
-from safe_rl.envs.safety_gym.rules.costs import COSTS
-from safe_rl.envs.safety_gym.rules.elements import BY_KIND, ELEMENTS, PLACEMENT_ORDER
-from safe_rl.envs.safety_gym.rules.readings import READINGS
-from safe_rl.envs.safety_gym.rules.robots import ROBOTS
-from safe_rl.envs.safety_gym.rules.tasks import TASKS
-from safe_rl.envs.safety_gym.world.building import forget_scenes
+from safe_rl.envs.safety_gym.readings import READINGS
+from safe_rl.envs.safety_gym.robots import ROBOTS
+from safe_rl.envs.safety_gym.tasks import TASKS
 
 LISTS = (COSTS, ELEMENTS, PLACEMENT_ORDER, READINGS)
 MAPPINGS = (BY_KIND, ROBOTS, TASKS)

@@ -15,9 +15,9 @@ from run_keys import run_keys
 from tables import table as _table
 
 from safe_rl.envs import EXTRAS, SUITE, SafetyGymConfig, SafetyGymEnv, key_table
-from safe_rl.envs.safety_gym.records.vocabulary import Vocabulary
-from safe_rl.envs.safety_gym.rules.costs import COSTS, EXCEPTION_KEY
-from safe_rl.envs.safety_gym.rules.elements import ELEMENTS
+from safe_rl.envs.safety_gym.config_keys import Vocabulary
+from safe_rl.envs.safety_gym.costs import COSTS, EXCEPTION_KEY
+from safe_rl.envs.safety_gym.elements import ELEMENTS
 from safe_rl.envs.velocity import VELOCITY_SUITE, VelocityEnv
 from safe_rl.envs.velocity.config import VelocityConfig
 

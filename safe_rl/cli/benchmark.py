@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from safe_rl.envs.safety_gym.nodes import group_node
-from safe_rl.envs.safety_gym.suite import SUITE, resolve
+from safe_rl.envs.safety_gym.suite import SUITE, group_node, resolve
 from safe_rl.scores.benchmark import Suite
 
 __all__ = ["suite"]

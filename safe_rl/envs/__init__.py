@@ -13,7 +13,7 @@ from safe_rl.envs.opengl import OpenGLError
 from safe_rl.envs.errors import ConfigError
 from safe_rl.envs.names import complete_env, env_names, env_node
 from safe_rl.envs.registration import register_gymnasium, store_config, store_configs
-from safe_rl.envs.safety_gym.records.config import SafetyGymConfig, key_table
+from safe_rl.envs.safety_gym.config import SafetyGymConfig, key_table
 from safe_rl.envs.safety_gym.suite import EXTRAS, SUITE, resolve
 from safe_rl.lazy import import_later
 
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from safe_rl.envs.families import make_env
     from safe_rl.envs.gymnasium.conversion import from_gymnasium
     from safe_rl.envs.safety_gym.env import SafetyGymEnv
-    from safe_rl.envs.safety_gym.world.layout import LayoutError
+    from safe_rl.envs.safety_gym.layouts import LayoutError
 
 _CONTRACT = ("ConstrainedEnv", "ContractError", "PositionedEnv", "SnapshotEnv")
 
@@ -60,7 +60,7 @@ __getattr__, __dir__ = import_later(
     __name__,
     {
         **dict.fromkeys((*_CONTRACT, "check_constrained_env"), "safe_rl.envs.contract"),
-        "LayoutError": "safe_rl.envs.safety_gym.world.layout",
+        "LayoutError": "safe_rl.envs.safety_gym.layouts",
         "SafetyGymEnv": "safe_rl.envs.safety_gym.env",
         "from_gymnasium": "safe_rl.envs.gymnasium.conversion",
         "make_env": "safe_rl.envs.families",

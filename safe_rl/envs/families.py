@@ -15,8 +15,8 @@ import torch
 from safe_rl.envs.contract import ConstrainedEnv, ContractError, check_constrained_env
 from safe_rl.envs.errors import ConfigError, nearest
 from safe_rl.envs.names import env_names, env_node, known_names, stored_node
+from safe_rl.envs.safety_gym.config import SafetyGymConfig
 from safe_rl.envs.safety_gym.env import SafetyGymEnv
-from safe_rl.envs.safety_gym.records.config import SafetyGymConfig
 from safe_rl.envs.safety_gym.suite import resolve
 from safe_rl.envs.transforms.environment import transform_env
 from safe_rl.targets import locate

@@ -12,8 +12,7 @@ from hydra.core.config_store import ConfigStore
 from omegaconf import OmegaConf
 
 from safe_rl.envs.gymnasium.nodes import GYMNASIUM_TARGET, complete_gymnasium
-from safe_rl.envs.safety_gym.nodes import complete_safety_gym, safety_gym_node
-from safe_rl.envs.safety_gym.suite import EXTRAS, SUITE
+from safe_rl.envs.safety_gym.suite import EXTRAS, SUITE, complete_safety_gym, safety_gym_node
 from safe_rl.envs.safety_gymnasium.nodes import SAFETY_GYMNASIUM_TARGET, complete_safety_gymnasium
 from safe_rl.envs.torchrl.nodes import TORCHRL_TARGET, complete_torchrl
 from safe_rl.envs.velocity.nodes import VELOCITY_TARGET, complete_velocity, velocity_node

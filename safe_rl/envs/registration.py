@@ -15,9 +15,8 @@ from hydra.plugins.search_path_plugin import SearchPathPlugin
 from omegaconf import OmegaConf
 
 from safe_rl.envs.names import GROUP, env_names, env_node
-from safe_rl.envs.safety_gym.nodes import group_node
-from safe_rl.envs.safety_gym.records.config import SafetyGymConfig
-from safe_rl.envs.safety_gym.suite import EXTRAS, SUITE, TESTING, resolve
+from safe_rl.envs.safety_gym.config import SafetyGymConfig
+from safe_rl.envs.safety_gym.suite import EXTRAS, SUITE, TESTING, group_node, resolve
 from safe_rl.envs.velocity.suite import VELOCITY_SUITE
 from safe_rl.targets import allow
 

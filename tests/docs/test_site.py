@@ -12,7 +12,7 @@ import yaml
 from safe_rl.cli.keys import KEYS
 from safe_rl.cli.part_keys import PARTS
 from safe_rl.envs import SUITE, key_table
-from safe_rl.envs.safety_gym.rules.costs import COSTS
+from safe_rl.envs.safety_gym.costs import COSTS
 
 ROOT = Path(__file__).resolve().parents[2]
 

@@ -9,7 +9,7 @@ from crafting import arrange, step_from
 from torchrl.envs.utils import check_env_specs
 
 from safe_rl.envs import EXTRAS, ConfigError, SafetyGymEnv
-from safe_rl.envs.safety_gym.rules.costs import boundary_cost, excess_speed
+from safe_rl.envs.safety_gym.costs import boundary_cost, excess_speed
 
 ROBOTS = ("Point", "Car", "Doggo")
 NAMES = [f"{robot}{task}" for robot in ROBOTS for task in ("Run1", "Circle1", "Circle2")]

@@ -10,7 +10,7 @@ from torchrl.envs.utils import check_env_specs
 
 from safe_rl.envs import ConfigError, SafetyGymEnv, env_node, make_env
 from safe_rl.envs.physics.dynamics import SCALES, scale_dynamics
-from safe_rl.envs.safety_gym.rules.robots import ROBOTS
+from safe_rl.envs.safety_gym.robots import ROBOTS
 from safe_rl.envs.velocity import VELOCITY_SUITE, VelocityEnv
 from safe_rl.envs.velocity.model import ASSETS
 from safe_rl.envs.velocity.robots import ROBOTS as RUNNERS

@@ -23,7 +23,7 @@ from safe_rl.envs.safety_gym.extending import (
     register_robot,
     register_task,
 )
-from safe_rl.envs.safety_gym.rules.robots import ROBOTS
+from safe_rl.envs.safety_gym.robots import ROBOTS
 
 POINT = {"robot_base": "point", "task": "none", "sensors_obs": ["gyro"]}
 MINES = {"mines_num": 2, "observe_mines": True, "constrain_mines": True}

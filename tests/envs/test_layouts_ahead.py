@@ -7,9 +7,9 @@ import torch
 from tensordict import TensorDict
 
 from safe_rl.envs import SafetyGymEnv
+from safe_rl.envs.safety_gym.draws import LayoutsAhead
+from safe_rl.envs.safety_gym.layouts import LayoutError
 from safe_rl.envs.safety_gym.suite import resolve
-from safe_rl.envs.safety_gym.world.ahead import LayoutsAhead
-from safe_rl.envs.safety_gym.world.layout import LayoutError
 
 
 class Drawing:

@@ -9,7 +9,7 @@ from crafting import after_random_steps, arrange, places, position_columns
 
 from safe_rl.envs import SafetyGymEnv
 from safe_rl.envs.safety_gym.geometry import circling_targets, floor_to_ego, to_ego
-from safe_rl.envs.safety_gym.observing.lidar import lidar_cells, pseudo_lidar
+from safe_rl.envs.safety_gym.lidar import lidar_cells, pseudo_lidar
 
 BARE = {"robot_base": "point", "task": "none", "sensors_obs": [], "lidar_num_bins": 8}
 HAZARDS = {**BARE, "observe_hazards": True, "lidar_max_dist": 2.0}

@@ -15,7 +15,7 @@ from torchrl.envs import TransformedEnv
 from torchrl.record import CSVLogger, PixelRenderTransform, VideoRecorder
 
 from safe_rl.envs import SUITE, OpenGLError, SafetyGymConfig, SafetyGymEnv
-from safe_rl.envs.safety_gym.rendering.markers import lidar_halos
+from safe_rl.envs.safety_gym.renderer import lidar_halos
 
 PLACE = (1.0, 0.5)
 # One object of every kind at PLACE, and the colour that the benchmark gives it.

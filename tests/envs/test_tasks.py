@@ -8,7 +8,7 @@ import torch
 from crafting import after_random_steps, arrange, meet, places, position_columns, step_from
 
 from safe_rl.envs import SUITE, SafetyGymEnv
-from safe_rl.envs.safety_gym.rules.tasks import circle_speed
+from safe_rl.envs.safety_gym.tasks import circle_speed
 
 POINT = {"robot_base": "point", "placements_extents": [-4, -4, 4, 4]}
 FROZEN = {**POINT, "frameskip_binom_p": 0.0}

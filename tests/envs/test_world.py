@@ -7,7 +7,7 @@ import torch
 from crafting import arrange
 
 from safe_rl.envs import SafetyGymConfig, SafetyGymEnv
-from safe_rl.envs.safety_gym.world.building import build_scene
+from safe_rl.envs.safety_gym.building import build_scene
 
 BOX, CYLINDER, SPHERE = (int(getattr(mujoco.mjtGeom, f"mjGEOM_{name}"))
                          for name in ("BOX", "CYLINDER", "SPHERE"))  # fmt: skip

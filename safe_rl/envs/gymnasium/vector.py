@@ -19,9 +19,9 @@ from safe_rl.envs.gymnasium.worlds import (
     configure,
     take,
 )
+from safe_rl.envs.safety_gym.config import SafetyGymConfig
+from safe_rl.envs.safety_gym.display import Camera
 from safe_rl.envs.safety_gym.env import SafetyGymEnv
-from safe_rl.envs.safety_gym.records.config import SafetyGymConfig
-from safe_rl.envs.safety_gym.rendering.display import Camera
 
 
 class SafetyGymnasiumVectorEnv(SpecWithLength, VectorEnv[Any, np.ndarray, np.ndarray]):

@@ -15,8 +15,8 @@ from tensordict import TensorDict, TensorDictBase
 from torchrl.data import Composite
 
 from safe_rl.envs.opengl import OpenGLError, has_screen
+from safe_rl.envs.safety_gym.config import SafetyGymConfig
 from safe_rl.envs.safety_gym.env import SafetyGymEnv
-from safe_rl.envs.safety_gym.records.config import SafetyGymConfig
 from safe_rl.envs.safety_gym.suite import resolve
 
 RENDER_MODES = ("human", "rgb_array")

@@ -51,8 +51,8 @@ class BatchPhysics:
         outputs: names of the fields of `MjData` that are read; every call copies them out.
 
     Examples:
-        >>> from safe_rl.envs.safety_gym.records.config import SafetyGymConfig
-        >>> from safe_rl.envs.safety_gym.world.building import build_scene
+        >>> from safe_rl.envs.safety_gym.config import SafetyGymConfig
+        >>> from safe_rl.envs.safety_gym.building import build_scene
         >>> physics = BatchPhysics(build_scene(SafetyGymConfig()).model, num_envs=2, num_threads=1)
         >>> physics.step(num_substeps=10).tolist()
         [False, False]

@@ -13,29 +13,33 @@ from torch import Tensor
 from safe_rl.envs import rng
 from safe_rl.envs.errors import require_integer
 from safe_rl.envs.physics.batch import BatchPhysics
-from safe_rl.envs.safety_gym.observing.lidar_blocks import lidar_blocks
-from safe_rl.envs.safety_gym.observing.observations import make_observer
-from safe_rl.envs.safety_gym.records.config import SafetyGymConfig
-from safe_rl.envs.safety_gym.rendering.renderer import WorldRenderer
-from safe_rl.envs.safety_gym.rules.costs import active_costs, compute_costs, cost_keys
-from safe_rl.envs.safety_gym.rules.tasks import TASKS, dense_reward, goals_met
-from safe_rl.envs.safety_gym.specs import observation_spec
-from safe_rl.envs.safety_gym.suite import resolve
-from safe_rl.envs.safety_gym.world.ahead import LayoutsAhead
-from safe_rl.envs.safety_gym.world.building import build_scene
-from safe_rl.envs.safety_gym.world.draws import (
+from safe_rl.envs.safety_gym.building import build_scene
+from safe_rl.envs.safety_gym.config import SafetyGymConfig
+from safe_rl.envs.safety_gym.costs import active_costs, compute_costs, cost_keys
+from safe_rl.envs.safety_gym.draws import (
+    LayoutsAhead,
     Purpose,
     control_noise,
     draw_layouts,
     draw_substeps,
-    gremlin_path,
     next_goals,
     pick_layouts,
     start_episodes,
 )
-from safe_rl.envs.safety_gym.world.placements import plan_placements
-from safe_rl.envs.safety_gym.world.snapshot import check_worlds, read_state, write_state
-from safe_rl.envs.safety_gym.world.views import make_world, refresh
+from safe_rl.envs.safety_gym.layouts import plan_placements
+from safe_rl.envs.safety_gym.lidar import lidar_blocks
+from safe_rl.envs.safety_gym.observations import make_observer, observation_spec
+from safe_rl.envs.safety_gym.renderer import WorldRenderer
+from safe_rl.envs.safety_gym.state import (
+    check_worlds,
+    gremlin_path,
+    make_world,
+    read_state,
+    refresh,
+    write_state,
+)
+from safe_rl.envs.safety_gym.suite import resolve
+from safe_rl.envs.safety_gym.tasks import TASKS, dense_reward, goals_met
 from safe_rl.envs.simulated import SimulatedEnv
 from safe_rl.envs.states import require_episodes
 

@@ -12,17 +12,17 @@ from pathlib import Path
 from typing import Any
 
 from safe_rl.envs.errors import ConfigError, nearest
-from safe_rl.envs.safety_gym.records.config import Key, registered_keys, set_registered_keys
-from safe_rl.envs.safety_gym.records.values import infer_annotation
-from safe_rl.envs.safety_gym.records.world import World
-from safe_rl.envs.safety_gym.rules.costs import (
+from safe_rl.envs.safety_gym.building import forget_scenes
+from safe_rl.envs.safety_gym.config import Key, registered_keys, set_registered_keys
+from safe_rl.envs.safety_gym.config_values import infer_annotation
+from safe_rl.envs.safety_gym.costs import (
     COSTS,
     EXCEPTION_KEY,
     Cost,
     contact_cost,
     hazard_cost,
 )
-from safe_rl.envs.safety_gym.rules.elements import (
+from safe_rl.envs.safety_gym.elements import (
     BOX,
     BY_KIND,
     CYLINDER,
@@ -33,10 +33,10 @@ from safe_rl.envs.safety_gym.rules.elements import (
     Geom,
     Motion,
 )
-from safe_rl.envs.safety_gym.rules.readings import READINGS, Reading
-from safe_rl.envs.safety_gym.rules.robots import ROBOTS, load_robot
-from safe_rl.envs.safety_gym.rules.tasks import TASKS, NextGoal, Task
-from safe_rl.envs.safety_gym.world.building import forget_scenes
+from safe_rl.envs.safety_gym.readings import READINGS, Reading
+from safe_rl.envs.safety_gym.robots import ROBOTS, load_robot
+from safe_rl.envs.safety_gym.tasks import TASKS, NextGoal, Task
+from safe_rl.envs.safety_gym.world import World
 
 __all__ = [
     "BOX",
@@ -200,7 +200,7 @@ def register_robot(name: str, path: str | Path) -> None:
     """Give an MJCF file a name that `robot_base` accepts.
 
     Raises:
-        ConfigError: if the name is taken, or the file lacks what `rules.robots` asks for.
+        ConfigError: if the name is taken, or the file lacks what `robots` asks for.
     """
     _refuse_taken("robot", name)
     load_robot(str(path))

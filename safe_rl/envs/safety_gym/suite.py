@@ -9,11 +9,14 @@ a nested observation, {name}Vision.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 from safe_rl.envs.errors import ConfigError, nearest
-from safe_rl.envs.safety_gym.records.config import SafetyGymConfig
-from safe_rl.envs.safety_gym.rules.checks import check
+from safe_rl.envs.safety_gym.config import SafetyGymConfig
+from safe_rl.envs.safety_gym.config_values import LARGEST_SEED, check_choice
+from safe_rl.envs.safety_gym.robots import PATHS_OF_2019, ROBOTS
+from safe_rl.envs.safety_gym.tasks import TASKS, goal_is_button
 
 Values = dict[str, Any]
 
@@ -218,3 +221,64 @@ def resolve(env: str | Mapping[str, Any] | SafetyGymConfig) -> SafetyGymConfig:
             "{name}Vision of every one; for tests, {Point, Car, Doggo}Grid{0, 1, 2, 4, Wall}."
         )
     return named[name]
+
+
+def _plain(value: Any) -> Any:
+    """Turn tuples into lists: Hydra knows no tuples."""
+    return [_plain(item) for item in value] if isinstance(value, tuple) else value
+
+
+def group_node(name: str, config: SafetyGymConfig) -> dict[str, Any]:
+    """Return a configuration as a node of Hydra's group `env`: every key, and `name`."""
+    return {"name": name, **{key: _plain(value) for key, value in config.to_dict().items()}}
+
+
+def safety_gym_node(name: str) -> dict[str, Any]:
+    """Return the node of a name in the suite, or beside it."""
+    return group_node(name, (SUITE | EXTRAS)[name])
+
+
+def complete_safety_gym(node: Mapping[str, Any]) -> dict[str, Any]:
+    """Add the defaults of the keys that a node lacks; those it has stay as they are written.
+
+    Raises:
+        ConfigError: for an unknown key or a value that cannot be used.
+    """
+    config = resolve({key: value for key, value in node.items() if key not in ("name", "_target_")})
+    return {**group_node(node.get("name", "custom"), config), **node}
+
+
+def check(config: SafetyGymConfig) -> SafetyGymConfig:
+    """Return a configuration that an environment can be made of.
+
+    Raises:
+        ConfigError: naming the first key that is wrong.
+    """
+    check_choice("task", config.task, TASKS)
+    name = PATHS_OF_2019.get(config.robot_base)
+    if name is not None and not Path(config.robot_base).is_file():
+        config = config.replace(robot_base=name)
+    _check_robot(config.robot_base)
+    if config.layout_seeds_first + (config.layout_seeds or 0) > LARGEST_SEED:
+        raise ConfigError(
+            f"'layout_seeds_first' and 'layout_seeds' together must be at most {LARGEST_SEED}, got "
+            f"{config.layout_seeds_first} and {config.layout_seeds}."
+        )
+    if goal_is_button(config.task) and config.buttons_num < 1:
+        raise ConfigError(f"'task' {config.task} needs at least one button: set 'buttons_num'.")
+    if config.constrain_boundary and config.boundary_x is None and config.boundary_y is None:
+        raise ConfigError("'constrain_boundary' needs 'boundary_x', 'boundary_y' or both [m].")
+    if config.constrain_velocity and config.velocity_limit is None:
+        raise ConfigError("'constrain_velocity' needs 'velocity_limit' [m/s].")
+    return config
+
+
+def _check_robot(robot: str) -> None:
+    if robot.endswith(".xml"):
+        if not Path(robot).is_file():
+            raise ConfigError(f"'robot_base': there is no file {robot!r}.")
+    elif robot not in ROBOTS:
+        raise ConfigError(
+            f"'robot_base' must be one of {tuple(ROBOTS)} or the path of an MJCF (.xml) file, "
+            f"got {robot!r}.{nearest(robot, ROBOTS)}"
+        )

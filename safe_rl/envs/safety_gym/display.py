@@ -1,29 +1,37 @@
-"""Drawing single worlds: a decorated model that is posed like a world and rendered."""
+"""Drawing single worlds: for frames, for MuJoCo's viewer and as what a robot's camera sees."""
 
 from __future__ import annotations
 
 import functools
 import math
 from collections.abc import Iterable
-from typing import TypeAlias
+from typing import NamedTuple, TypeAlias
 
 import mujoco
 import numpy as np
 import torch
+from torch import Tensor
 
-from safe_rl.envs.errors import nearest
-from safe_rl.envs.opengl import open_renderer
-from safe_rl.envs.safety_gym.records.config import SafetyGymConfig
-from safe_rl.envs.safety_gym.records.scene import Scene
-from safe_rl.envs.safety_gym.records.world import World
-from safe_rl.envs.safety_gym.rendering.markers import Marker
-from safe_rl.envs.safety_gym.world.building import build_scene
-from safe_rl.envs.safety_gym.world.scenery import TRACK, VISION
+from safe_rl.envs.errors import ConfigError, nearest
+from safe_rl.envs.opengl import PACKAGES, OpenGLError, has_screen, open_renderer
+from safe_rl.envs.safety_gym.bodies import TRACK, VISION
+from safe_rl.envs.safety_gym.building import build_scene
+from safe_rl.envs.safety_gym.config import SafetyGymConfig
+from safe_rl.envs.safety_gym.world import Block, Scene, World
 
 FREE = "free"
 TRACK_BEHIND, TRACK_ABOVE = 2.0, 2.0  # where the tracking camera is, from the robot [m]
 
 Camera: TypeAlias = str | mujoco.MjvCamera
+
+
+class Marker(NamedTuple):
+    """One shape: MuJoCo type, size as MJCF has it, centre [m], colour."""
+
+    type: mujoco.mjtGeom
+    size: tuple[float, float, float]
+    pos: np.ndarray
+    rgba: tuple[float, float, float, float]
 
 
 class Display:
@@ -186,3 +194,86 @@ def add_markers(drawn: mujoco.MjvScene, markers: Iterable[Marker]) -> None:
 
 def _numbers(values: torch.Tensor, row: int) -> np.ndarray:
     return values[row].cpu().numpy()
+
+
+class Viewer:
+    """A window onto a display; the mouse moves its camera.
+
+    Args:
+        display: what is shown, as it was posed last.
+
+    Raises:
+        OpenGLError: if there is no screen, or no OpenGL.
+    """
+
+    def __init__(self, display: Display) -> None:
+        if not has_screen():
+            raise OpenGLError(
+                "MuJoCo's viewer needs a screen, and there is none here (neither DISPLAY nor "
+                "WAYLAND_DISPLAY is set). Use render_mode='rgb_array', which needs none."
+            )
+        # Its import opens a connection to the screen.
+        import mujoco.viewer
+
+        try:
+            self._window = mujoco.viewer.launch_passive(
+                display.scene.model, display.data, show_left_ui=False, show_right_ui=False
+            )
+        except Exception as error:  # GLFW raises what it likes
+            raise OpenGLError(
+                f"MuJoCo's viewer cannot be opened ({error}). It needs OpenGL: on Debian or "
+                f"Ubuntu 'apt-get install {PACKAGES['glfw']}'."
+            ) from error
+        camera = display.free_camera()
+        with self._window.lock():
+            self._window.cam.lookat[:] = camera.lookat
+            self._window.cam.distance = camera.distance
+            self._window.cam.azimuth, self._window.cam.elevation = camera.azimuth, camera.elevation
+            self._window.opt.geomgroup[:] = 1
+
+    @property
+    def is_open(self) -> bool:
+        """Whether nobody closed the window."""
+        return self._window.is_running()
+
+    def show(self, markers: Iterable[Marker]) -> None:
+        """Bring the window up to date with the display, and draw markers in it."""
+        if not self.is_open:
+            return
+        with self._window.lock():
+            drawn = self._window.user_scn
+            drawn.ngeom = 0
+            add_markers(drawn, markers)
+        self._window.sync()
+
+    def close(self) -> None:
+        """Close the window."""
+        self._window.close()
+
+
+def vision_blocks(config: SafetyGymConfig, scene: Scene) -> list[Block]:
+    """The component `vision`: RGB in [0, 1], lines from top to bottom, [height, width, 3].
+
+    Raises:
+        ConfigError: if the robot has no camera.
+    """
+    if not config.observe_vision:
+        return []
+    cameras = [scene.model.camera(i).name for i in range(scene.model.ncam)]
+    if VISION not in cameras:
+        others = f" Its cameras are {cameras}: give one that name." if cameras else ""
+        raise ConfigError(
+            f"'observe_vision': robot {config.robot_base!r} has no camera named '{VISION}'.{others}"
+        )
+    width, height = config.vision_size
+    display = Display(config)
+
+    def read(world: World) -> Tensor:
+        pixels = torch.empty(len(world.step_count), height, width, 3, dtype=torch.uint8)
+        # OpenGL draws one picture after the other.
+        for row, picture in enumerate(pixels):
+            display.pose(world, row)
+            picture.copy_(torch.from_numpy(display.frame(VISION, width, height)))
+        return pixels.flatten(1).to(torch.float64) / 255
+
+    return [Block({"vision": (height, width, 3)}, read, (0.0, 1.0))]

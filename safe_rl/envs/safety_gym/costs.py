@@ -14,8 +14,8 @@ import torch
 from torch import Tensor
 
 from safe_rl.envs.errors import ConfigError
-from safe_rl.envs.safety_gym.records.config import SafetyGymConfig
-from safe_rl.envs.safety_gym.records.world import World
+from safe_rl.envs.safety_gym.config import SafetyGymConfig
+from safe_rl.envs.safety_gym.world import World
 
 
 def hazard_cost(robot_xy: Tensor, hazard_xy: Tensor, size: float) -> Tensor:

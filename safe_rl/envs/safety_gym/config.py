@@ -1,4 +1,4 @@
-"""One environment is one flat, frozen `SafetyGymConfig`; see `vocabulary` for its keys.
+"""One environment is one flat, frozen `SafetyGymConfig`; see `config_keys` for its keys.
 
 Lengths are metres, angles radians, times environment steps unless said otherwise.
 """
@@ -11,9 +11,9 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 from safe_rl.envs.errors import ConfigError, nearest
-from safe_rl.envs.safety_gym.records.values import Range, check_retired, coerce, infer_range
-from safe_rl.envs.safety_gym.records.values import key as declare
-from safe_rl.envs.safety_gym.records.vocabulary import RETIRED, Vocabulary
+from safe_rl.envs.safety_gym.config_keys import RETIRED, Vocabulary
+from safe_rl.envs.safety_gym.config_values import Range, check_retired, coerce, infer_range
+from safe_rl.envs.safety_gym.config_values import key as declare
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

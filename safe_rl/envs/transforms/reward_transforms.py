@@ -1,7 +1,8 @@
-"""The budget as a part of the state: Sauté RL, and Simmer, which lets the budget grow."""
+"""Transforms of rewards and ends: scaled rewards, early termination, Sauté RL and Simmer."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Collection, Mapping
 
 import torch
@@ -18,6 +19,101 @@ from safe_rl.envs.transforms.base import (
     keep_reward,
     kept_reward_spec,
 )
+
+
+class RewardScale(ConstraintTransform):
+    """Multiply the rewards that are learned from by a number.
+
+    Critics begin with values near 0 and go by steps of a learning rate. Towards values of hundreds
+    all weights move one way until the hidden layers are saturated and tell states apart no more:
+    discounted returns should be of the order of 1 to 10. Returns stay those of the environment's
+    own reward, which is kept in `task_reward`; in evaluation `reward` stays as it is.
+
+    Args:
+        factor: what rewards are multiplied by.
+
+    Raises:
+        ValueError: for a factor that is not positive.
+
+    Examples:
+        >>> from safe_rl.envs import make_env
+        >>> env = make_env("SafeHopperVelocity", seed=0, transforms={"s": RewardScale(0.01)})
+        >>> step = env.rollout(2)["next"]
+        >>> bool((step["reward"] == 0.01 * step[env.return_key]).all())
+        True
+    """
+
+    return_key = OWN_REWARD
+
+    def __init__(self, factor: float) -> None:
+        super().__init__()
+        if not (math.isfinite(factor) and factor > 0):
+            raise ValueError(f"factor={factor:g} must be a number above 0.")
+        self._factor = factor
+
+    def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
+        reward = keep_reward(next_tensordict, self.return_key)
+        if not self.evaluating:
+            next_tensordict.set("reward", self._factor * reward)
+        return next_tensordict
+
+    def transform_reward_spec(self, reward_spec: TensorSpec) -> TensorSpec:
+        """Add the environment's own reward."""
+        return kept_reward_spec(reward_spec, self.return_key)
+
+
+class EarlyTermination(ConstraintTransform):
+    """The episode terminates with the step at which it has cost more than it may.
+
+    So no reward is to be had beyond the budget, and an algorithm without constraints keeps it: the
+    early terminated MDP of Sun et al. 2021, "Safe Exploration by Solving Early Terminated MDP".
+    How much is left is not observed; with `saute` before it, it is. Episodes of an
+    evaluation go on, as in the paper: there the cost of the whole episode counts. With
+    `in_evaluation` they end, too: then what is evaluated is the policy with its switch, which
+    surely costs no more than the budget and the last step.
+
+    Args:
+        budgets: cost key -> undiscounted cost per episode; an episode that costs exactly this much
+            goes on.
+        in_evaluation: whether episodes of an evaluation end in the same way.
+
+    Raises:
+        ValueError: for a budget below 0.
+
+    Examples:
+        >>> from torchrl.envs import TransformedEnv
+        >>> from safe_rl.envs import SafetyGymEnv
+        >>> env = SafetyGymEnv("PointGoal1", num_envs=2, seed=0)
+        >>> TransformedEnv(env, EarlyTermination({"cost": 25.0})).rollout(3).shape
+        torch.Size([2, 3])
+    """
+
+    def __init__(self, budgets: Mapping[str, float], in_evaluation: bool = False) -> None:
+        super().__init__()
+        self.in_evaluation = in_evaluation
+        self._budgets = check_budgets(budgets, above_zero=False)
+
+    def check(self, cost_keys: Collection[str]) -> None:
+        """Raise ValueError if a budget's cost is not among these."""
+        check_known(self._budgets, cost_keys)
+
+    def start(self, done: Tensor) -> dict[str, Tensor]:
+        """Return that nothing is spent."""
+        shape = (*done.shape[:-1], len(self._budgets))
+        return {"spent": torch.zeros(shape, dtype=torch.float64, device=done.device)}
+
+    def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
+        spent = self._rows["spent"] + costs_of(next_tensordict, self._budgets)
+        self._rows = {"spent": spent}
+        if self.evaluating and not self.in_evaluation:
+            return next_tensordict
+        over = (spent > spent.new_tensor(list(self._budgets.values()))).any(-1, keepdim=True)
+        for key in ("done", "terminated"):
+            next_tensordict.set(key, next_tensordict.get(key) | over)
+        # an end that is both would be bootstrapped from by some and not by others
+        next_tensordict.set("truncated", next_tensordict.get("truncated") & ~over)
+        return next_tensordict
+
 
 BUDGET = "budget"
 _ROUNDING = 1e-9  # of shares of a budget that are taken one by one

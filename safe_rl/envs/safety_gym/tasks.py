@@ -14,12 +14,13 @@ from enum import Enum
 from typing import TYPE_CHECKING, NamedTuple
 
 from safe_rl.envs.errors import ConfigError
-from safe_rl.envs.safety_gym.records.config import SafetyGymConfig
+from safe_rl.envs.safety_gym.config import SafetyGymConfig
 
 if TYPE_CHECKING:
     from torch import Tensor
 
-    from safe_rl.envs.safety_gym.records.world import World
+    from safe_rl.envs.safety_gym.world import World
+
 
 _CENTRE = 1e-12  # [m]
 

@@ -1,23 +1,116 @@
-"""Robots: loading an MJCF file, and what an environment needs of it.
+"""Robots: reading an MJCF file, what an environment needs of it, and copies that runs keep.
 
 A robot file describes a body named "robot" at the top level of its world, which stands upright and
 is placed by its root joint: a free joint, or slides along x and y and a hinge about z. Its geom
 defaults hold for the whole world. An actuator without a `ctrlrange` gets [-1, 1].
+
+A file is read before MuJoCo sees it, because somebody else's file must not stop the process: what
+would take MuJoCo hours or all memory is refused from its text.
 """
 
 from __future__ import annotations
 
+import hashlib
 import math
+import os
+import shutil
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree
 
 import mujoco
 import numpy as np
 
 from safe_rl.envs.errors import ConfigError, nearest
-from safe_rl.envs.safety_gym.rules.robot_files import robot_files
 
-BUNDLED = Path(__file__).parents[1] / "robots"
+MOST_ELEMENTS = 100_000  # with all copies that are asked for
+MOST_CELLS = 1 << 24  # of a height field or a texture
+_FOLDERS = ("assetdir", "meshdir", "texturedir")
+_CELLS = (("nrow", "ncol"), ("width", "height"))
+
+
+def fingerprint(path: Path) -> str:
+    """Return a hash of the contents of a robot's files.
+
+    Raises:
+        ConfigError: if one cannot be read, or asks for too much.
+    """
+    digest = hashlib.sha256()
+    for file in robot_files(path):
+        content = file.read_bytes()
+        digest.update(f"{len(content)} ".encode() + content)
+    return digest.hexdigest()
+
+
+def robot_files(path: Path) -> list[Path]:
+    """Return an MJCF file and all files that it names and that exist, each once.
+
+    Raises:
+        ConfigError: if one cannot be read, or asks for too much.
+    """
+    found: dict[Path, int] = {}
+    if _weigh(path, [path.parent], found) > MOST_ELEMENTS:
+        raise _refused(path, f"describes more than {MOST_ELEMENTS:,} elements: 'count' is too high")
+    return list(found)
+
+
+def _refused(path: Path, what: str) -> ConfigError:
+    return ConfigError(f"'robot_base': {path} {what}.")
+
+
+def _weigh(path: Path, folders: list[Path], found: dict[Path, int]) -> float:
+    """Number of elements of a file with its copies; notes the files that it names.
+
+    The first folder is that of the robot's own file, from which all paths go.
+    """
+    if path in found:
+        return 0
+    found[path] = 1
+    try:
+        root = ElementTree.fromstring(path.read_bytes())
+    except (ElementTree.ParseError, OSError, ValueError, RecursionError) as error:
+        message = f"'robot_base': MuJoCo cannot load {path}: {error}"
+        raise ConfigError(message) from error
+    # what is included finds its files where those that include it do
+    folders = list(dict.fromkeys([*folders, *_asset_folders(root, folders[0])]))
+    return _weight(root, path, folders, found)
+
+
+def _asset_folders(root: ElementTree.Element, home: Path) -> Iterator[Path]:
+    for compiler in root.iter("compiler"):
+        for key in _FOLDERS:
+            if key in compiler.attrib:
+                yield home / compiler.attrib[key]
+
+
+def _weight(
+    element: ElementTree.Element, path: Path, folders: list[Path], found: dict[Path, int]
+) -> float:
+    """Number of elements that one stands for, itself and copies included."""
+    for pair in _CELLS:
+        if math.prod(_number(element.get(key, "1")) for key in pair) > MOST_CELLS:
+            raise _refused(path, f"has a '{element.tag}' with too large {' and '.join(pair)}")
+    inside = 1 + sum(_weight(child, path, folders, found) for child in element)
+    for file in [folder / element.get("file", "") for folder in folders if element.get("file")]:
+        if file.is_file() and file.suffix == ".xml":
+            inside += _weigh(file, folders, found)
+        elif file.is_file():
+            found.setdefault(file, 1)
+    return inside * max(1.0, math.prod(map(_number, element.get("count", "1").split())))
+
+
+def _number(text: str) -> float:
+    """An attribute as a number; what is none is left to MuJoCo to complain about."""
+    try:
+        number = float(text)
+    except ValueError:
+        return 1.0
+    return math.inf if math.isnan(number) else abs(number)
+
+
+BUNDLED = Path(__file__).parent / "robots"
 ROBOTS: dict[str, Path] = {path.stem: path for path in sorted(BUNDLED.glob("*.xml"))}
 # As the dictionaries of 2019 name them, from the folder of that package.
 PATHS_OF_2019 = {f"xmls/{name}.xml": name for name in ROBOTS}
@@ -155,3 +248,67 @@ def _is_planar(model: mujoco.MjModel, path: Path) -> bool:
             "joints, and their 'ref', must be 0, so that the joints are the robot's coordinates.",
         )
     return True
+
+
+MOST_BYTES = 1 << 28  # of one robot's files
+
+
+def own_robot(keys: Mapping[str, Any]) -> Path | None:
+    """Return the file of the robot that an environment's keys name, if it is none of the bundled.
+
+    Examples:
+        >>> own_robot({"robot_base": "mine.xml"})
+        PosixPath('mine.xml')
+        >>> own_robot({"robot_base": "doggo"})
+    """
+    base = str(keys.get("robot_base", "car"))
+    path = robot_path(base)
+    is_bundled = path.parent == BUNDLED or (base in PATHS_OF_2019 and not path.is_file())
+    return None if is_bundled else path
+
+
+def copy_robot(path: Path, folder: Path) -> Path:
+    """Copy a robot's file and all files that it names; they stay where they are to each other.
+
+    Args:
+        path: its MJCF file.
+        folder: where to, made if it is not there.
+
+    Returns:
+        The MJCF file of the copy.
+
+    Raises:
+        ConfigError: if the copy is another robot, or none, because it finds its files by absolute
+            paths for instance; or if the files are too large.
+        OSError: if they cannot be copied.
+    """
+    files = [_absolute(file) for file in robot_files(path)]
+    size = sum(file.stat().st_size for file in files)
+    if size > MOST_BYTES:
+        raise ConfigError(f"'robot_base': the files of {path} have {size / 1e6:,.0f} MB.")
+    home = Path(os.path.commonpath([file.parent for file in files]))
+    for file in files:
+        copy = folder / file.relative_to(home)
+        copy.parent.mkdir(parents=True, exist_ok=True)
+        shutil.copyfile(file, copy)
+    copy = folder / _absolute(path).relative_to(home)
+    if not is_robot(copy, folder, fingerprint(path)):
+        raise ConfigError(f"'robot_base': {path} names files by absolute paths.")
+    load_robot(str(copy))
+    return copy
+
+
+def is_robot(path: Path, folder: Path, content: str) -> bool:
+    """Whether a robot's files have a fingerprint, and all of them are in a folder.
+
+    Raises:
+        ConfigError: if one cannot be read.
+    """
+    inside = folder.resolve()
+    return fingerprint(path) == content and all(
+        file.resolve().is_relative_to(inside) for file in robot_files(path)
+    )
+
+
+def _absolute(path: Path) -> Path:
+    return Path(os.path.abspath(path))  # links stay what they are

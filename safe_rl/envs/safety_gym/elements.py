@@ -13,8 +13,8 @@ from typing import NamedTuple
 
 import mujoco
 
-from safe_rl.envs.safety_gym.records.config import SafetyGymConfig
-from safe_rl.envs.safety_gym.rules.tasks import TASKS
+from safe_rl.envs.safety_gym.config import SafetyGymConfig
+from safe_rl.envs.safety_gym.tasks import TASKS
 
 BOX, CYLINDER, SPHERE = (
     mujoco.mjtGeom.mjGEOM_BOX,

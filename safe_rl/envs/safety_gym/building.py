@@ -13,16 +13,14 @@ import mujoco
 
 from safe_rl.envs.errors import ConfigError, nearest
 from safe_rl.envs.physics.dynamics import SCALES, scale_dynamics
-from safe_rl.envs.safety_gym.records.config import SafetyGymConfig
-from safe_rl.envs.safety_gym.records.scene import Scene
-from safe_rl.envs.safety_gym.rules.costs import COSTS
-from safe_rl.envs.safety_gym.rules.elements import ELEMENTS, Element, Motion
-from safe_rl.envs.safety_gym.rules.readings import READINGS
-from safe_rl.envs.safety_gym.rules.robot_files import fingerprint
-from safe_rl.envs.safety_gym.rules.robots import Robot, load_robot, robot_path
-from safe_rl.envs.safety_gym.rules.tasks import TASKS
-from safe_rl.envs.safety_gym.world.bodies import add_bodies, add_floor, add_targets
-from safe_rl.envs.safety_gym.world.scenery import decorate
+from safe_rl.envs.safety_gym.bodies import add_bodies, add_floor, add_targets, decorate
+from safe_rl.envs.safety_gym.config import SafetyGymConfig
+from safe_rl.envs.safety_gym.costs import COSTS
+from safe_rl.envs.safety_gym.elements import ELEMENTS, Element, Motion
+from safe_rl.envs.safety_gym.readings import READINGS
+from safe_rl.envs.safety_gym.robots import Robot, fingerprint, load_robot, robot_path
+from safe_rl.envs.safety_gym.tasks import TASKS
+from safe_rl.envs.safety_gym.world import Scene
 
 # The robot files' stack and contact sizes would reserve hundreds of MB for every environment.
 ARENA_BYTES = 8 << 20

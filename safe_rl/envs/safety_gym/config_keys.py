@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from safe_rl.envs.safety_gym.records.values import (
+from safe_rl.envs.safety_gym.config_values import (
     FREE_OBJECTS,
     LARGEST_SEED,
     NOT_NEGATIVE,

@@ -6,20 +6,23 @@ Every draw is addressed by its row's seed, the episode, its purpose and the step
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from enum import IntEnum
 
 import torch
 from torch import Tensor
 
 from safe_rl.envs import rng
-from safe_rl.envs.safety_gym.geometry import circling_targets, yaw_quaternion
-from safe_rl.envs.safety_gym.records.config import SafetyGymConfig
-from safe_rl.envs.safety_gym.records.scene import Scene
-from safe_rl.envs.safety_gym.records.world import World
-from safe_rl.envs.safety_gym.rules.tasks import goal_is_button
-from safe_rl.envs.safety_gym.world.layout import LayoutError, resample_goal, sample_layouts
-from safe_rl.envs.safety_gym.world.placements import PlacementPlan
-from safe_rl.envs.safety_gym.world.views import refresh
+from safe_rl.envs.safety_gym.config import SafetyGymConfig
+from safe_rl.envs.safety_gym.layouts import (
+    LayoutError,
+    PlacementPlan,
+    resample_goal,
+    sample_layouts,
+)
+from safe_rl.envs.safety_gym.state import place_mocaps, point_goal_at_button, pose_bodies, refresh
+from safe_rl.envs.safety_gym.tasks import goal_is_button
+from safe_rl.envs.safety_gym.world import Scene, World
 
 
 class Purpose(IntEnum):
@@ -101,7 +104,7 @@ def start_episodes(world: World, layouts: Tensor, key: Tensor, mask: Tensor) -> 
     pinned = pinned_yaws(scene)
     yaws = torch.where(pinned.isnan(), drawn, pinned)
     world.physics.reset(mask)
-    _pose_bodies(world, rows, yaws)
+    pose_bodies(world, rows, yaws)
     world.positions[rows, scene.num_free :, :2] = world.layout[rows, 1 + scene.num_free :]
     if goal_is_button(scene.config.task):
         _choose_button(world, rows, rng.fold(key, Purpose.BUTTON))
@@ -122,70 +125,12 @@ def _redraw_goals(plan: PlacementPlan, key: Tensor, layouts: Tensor) -> None:
     layouts[ok, plan.goal_column] = position[ok]
 
 
-def _pose_bodies(world: World, rows: Tensor, yaws: Tensor) -> None:
-    """Write the robot's and the free bodies' poses into the state."""
-    scene, physics = world.scene, world.physics
-    start = world.layout[rows, 0]
-    world.start_pose[rows] = torch.cat([start, yaws[:, :1]], -1)
-    physics.qpos[rows, :2] = start
-    if scene.planar:
-        physics.qpos[rows, 2] = yaws[:, 0]
-    else:
-        physics.qpos[rows, 3:7] = yaw_quaternion(yaws[:, 0])
-    free = physics.qpos[:, scene.robot_nq :].unflatten(1, (scene.num_free, 7))
-    free[rows, :, :2] = world.layout[rows, 1 : 1 + scene.num_free]
-    free[rows, :, 3:] = yaw_quaternion(yaws[:, 1:])
-    if scene.num_targets:
-        quaternion = yaw_quaternion(yaws[:, 1 + scene.guided.start : 1 + scene.guided.stop])
-        physics.mocap_quat[rows, : scene.num_targets] = quaternion
-
-
-def gremlin_path(world: World, time: Tensor, num_substeps: int) -> Tensor:
-    """Mocap positions before each of the coming substeps [N, S, nmocap, 3]."""
-    scene = world.scene
-    guided = slice(1 + scene.guided.start, 1 + scene.guided.stop)
-    targets = circling_targets(
-        world.layout[:, guided],
-        time,
-        world.target_travel,
-        world.target_height,
-        world.physics.timestep,
-        num_substeps,
-    )
-    static = world.physics.mocap_pos[:, None, scene.num_targets :].expand(-1, num_substeps, -1, -1)
-    return torch.cat([targets, static], 2)
-
-
-def place_mocaps(world: World) -> None:
-    """Write the positions of static bodies and of the gremlins' targets into the state."""
-    scene, physics = world.scene, world.physics
-    if scene.num_mocap_slots:
-        span = slice(scene.num_free, scene.num_free + scene.num_mocap_slots)
-        physics.mocap_pos[:, scene.num_targets :] = world.positions[:, span]
-    if scene.num_targets:
-        # Where they were before the last substep, which is what the state was computed with; at
-        # the start they stand where their objects do.
-        last = (physics.time - physics.timestep).clamp(min=0.0)
-        targets = gremlin_path(world, last, 1)[:, 0, : scene.num_targets]
-        centres = world.layout[:, 1 + scene.guided.start : 1 + scene.guided.stop]
-        height = (0.5 * world.target_height).expand(len(centres), -1)
-        started = (physics.time > 0.0).view(-1, 1, 1)
-        at_start = torch.cat([centres, height.unsqueeze(-1)], -1)
-        physics.mocap_pos[:, : scene.num_targets] = torch.where(started, targets, at_start)
-
-
 def _choose_button(world: World, rows: Tensor, key: Tensor) -> None:
     """Choose goal buttons uniformly; the same one may come again."""
     number = world.scene.config.buttons_num
     button = (rng.uniform(key) * number).to(torch.int64)
     world.goal_button[rows] = button
     point_goal_at_button(world, rows)
-
-
-def point_goal_at_button(world: World, rows: Tensor) -> None:
-    """Let the goal be where the goal button is."""
-    goal, buttons = world.scene.slots["goal"], world.at("buttons")
-    world.positions[rows, goal.start] = buttons[rows, world.goal_button[rows]]
 
 
 def next_goals(world: World, plan: PlacementPlan, key: Tensor, mask: Tensor) -> Tensor:
@@ -245,3 +190,66 @@ def draw_substeps(config: SafetyGymConfig, key: Tensor) -> Tensor:
     trials = torch.arange(config.frameskip_binom_n)
     draws = rng.uniform(key[:, None], Purpose.FRAMESKIP, trials)
     return (draws < config.frameskip_binom_p).sum(-1)
+
+
+class LayoutsAhead:
+    """Layouts by their keys, remembered until they are asked for.
+
+    A layout is a function of its key alone, and to draw one takes about as long as to draw a
+    hundred: where rows begin their episodes one by one, what the others will ask for next is drawn
+    along. A snapshot of the worlds needs nothing of it.
+
+    Args:
+        draw: draws layouts of keys, int64 [B] -> [B, 1 + M, 2]; raises `LayoutError` if there is
+            none for one of them.
+        num_envs: number of rows, N.
+        num_columns: 1 + M.
+
+    Examples:
+        >>> asked = []
+        >>> def draw(key):
+        ...     asked.append(key.tolist())
+        ...     return key.view(-1, 1, 1).expand(-1, 1, 2).double()
+        >>> layouts = LayoutsAhead(draw, num_envs=2, num_columns=1)
+        >>> layouts(torch.tensor([1, 2]), torch.tensor([3, 4]), torch.tensor([True, False]))
+        tensor([[[1., 1.]]], dtype=torch.float64)
+        >>> asked  # of the second row, what comes next
+        [[1, 4]]
+    """
+
+    def __init__(self, draw: Callable[[Tensor], Tensor], num_envs: int, num_columns: int) -> None:
+        self._draw = draw
+        self._known = torch.zeros(num_envs, dtype=torch.bool)
+        self._keys = torch.zeros(num_envs, dtype=torch.int64)
+        self._layouts = torch.zeros(num_envs, num_columns, 2, dtype=torch.float64)
+
+    def __call__(self, key: Tensor, following: Tensor, mask: Tensor) -> Tensor:
+        """Layouts of the rows of a mask.
+
+        Args:
+            key: keys of the episodes that begin, int64 [N].
+            following: keys of the episodes after the present ones, int64 [N].
+            mask: rows whose episodes begin, bool [N].
+
+        Returns:
+            Positions [B, 1 + M, 2] of the B rows of `mask`.
+
+        Raises:
+            LayoutError: naming the object that did not fit.
+        """
+        if self._lacks(key)[mask].any():
+            wanted = torch.where(mask, key, following)
+            missing = self._lacks(wanted)
+            try:
+                self._remember(wanted, missing)
+            except LayoutError:
+                # perhaps there is none for an episode that never comes
+                self._remember(wanted, missing & mask)
+        return self._layouts[mask]
+
+    def _lacks(self, key: Tensor) -> Tensor:
+        return (self._keys != key) | ~self._known
+
+    def _remember(self, key: Tensor, rows: Tensor) -> None:
+        self._layouts[rows] = self._draw(key[rows])
+        self._keys[rows], self._known[rows] = key[rows], True

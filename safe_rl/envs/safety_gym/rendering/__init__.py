@@ -1,1 +1,0 @@
-"""Pictures of the worlds: for people, for videos, and as what a robot sees."""

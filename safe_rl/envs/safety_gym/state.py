@@ -1,0 +1,190 @@
+"""State of the worlds: named views of it, poses, reading and writing it for resuming and tests."""
+
+from __future__ import annotations
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
+
+from safe_rl.envs.physics.batch import BatchPhysics
+from safe_rl.envs.safety_gym.geometry import circling_targets, yaw_quaternion
+from safe_rl.envs.safety_gym.tasks import TASKS, goal_is_button
+from safe_rl.envs.safety_gym.world import NO_BUTTON, Scene, World
+from safe_rl.envs.states import check_state
+
+
+def make_world(scene: Scene, physics: BatchPhysics) -> World:
+    """Bind the views of a scene to the tensors of a physics backend."""
+    num_envs, num_objects = physics.qpos.shape[0], len(scene.names)
+    robot, model = scene.robot_body, scene.model
+    # In memory all x, then all y, then all z: passes over one coordinate are over one piece.
+    positions = torch.zeros(3, num_envs, num_objects, dtype=torch.float64).movedim(0, -1)
+    positions[..., 2] = torch.tensor(scene.heights, dtype=torch.float64)
+    velocities = physics.qvel[:, scene.robot_nv :].view(num_envs, scene.num_free, 6)[..., :3]
+    robot_pos = physics.xpos[:, robot]
+    velocity = int(model.sensor("robot_vel").adr[0])
+    return World(
+        scene=scene,
+        physics=physics,
+        robot_pos=robot_pos,
+        robot_xy=physics.xpos[:, robot, :2],
+        robot_mat=physics.xmat[:, robot],
+        com=physics.subtree_com[:, robot],
+        up=physics.xmat[:, scene.oriented_body, 2, 2],
+        robot_vel=physics.sensordata[:, velocity : velocity + 3],
+        positions=positions,
+        objects={kind: positions[:, span] for kind, span in scene.slots.items()}
+        | dict.fromkeys(TASKS[scene.config.task].at_origin, torch.zeros_like(robot_pos[:, None])),
+        velocities=velocities,
+        contacts={kind: physics.sensordata[:, cols] for kind, cols in scene.contacts.items()},
+        qpos=physics.qpos,
+        qvel=physics.qvel,
+        ctrl=physics.ctrl,
+        sensordata=physics.sensordata,
+        target_travel=torch.tensor(scene.travel, dtype=torch.float64),
+        # Guided objects float at twice the height they start at, see `bodies.add_targets`.
+        target_height=2 * positions[0, scene.guided, 2],
+        layout=torch.zeros(num_envs, 1 + num_objects, 2, dtype=torch.float64),
+        start_pose=torch.zeros(num_envs, 3, dtype=torch.float64),
+        goal_button=torch.full((num_envs,), NO_BUTTON),
+        buttons_timer=torch.zeros(num_envs, dtype=torch.int64),
+        step_count=torch.zeros(num_envs, dtype=torch.int64),
+    )
+
+
+def refresh(world: World) -> None:
+    """Copy the positions of the free bodies from the physics."""
+    scene = world.scene
+    if scene.num_free:
+        world.positions[:, : scene.num_free] = world.physics.xpos[:, scene.free_bodies]
+
+
+def pose_bodies(world: World, rows: Tensor, yaws: Tensor) -> None:
+    """Write the robot's and the free bodies' poses into the state."""
+    scene, physics = world.scene, world.physics
+    start = world.layout[rows, 0]
+    world.start_pose[rows] = torch.cat([start, yaws[:, :1]], -1)
+    physics.qpos[rows, :2] = start
+    if scene.planar:
+        physics.qpos[rows, 2] = yaws[:, 0]
+    else:
+        physics.qpos[rows, 3:7] = yaw_quaternion(yaws[:, 0])
+    free = physics.qpos[:, scene.robot_nq :].unflatten(1, (scene.num_free, 7))
+    free[rows, :, :2] = world.layout[rows, 1 : 1 + scene.num_free]
+    free[rows, :, 3:] = yaw_quaternion(yaws[:, 1:])
+    if scene.num_targets:
+        quaternion = yaw_quaternion(yaws[:, 1 + scene.guided.start : 1 + scene.guided.stop])
+        physics.mocap_quat[rows, : scene.num_targets] = quaternion
+
+
+def gremlin_path(world: World, time: Tensor, num_substeps: int) -> Tensor:
+    """Mocap positions before each of the coming substeps [N, S, nmocap, 3]."""
+    scene = world.scene
+    guided = slice(1 + scene.guided.start, 1 + scene.guided.stop)
+    targets = circling_targets(
+        world.layout[:, guided],
+        time,
+        world.target_travel,
+        world.target_height,
+        world.physics.timestep,
+        num_substeps,
+    )
+    static = world.physics.mocap_pos[:, None, scene.num_targets :].expand(-1, num_substeps, -1, -1)
+    return torch.cat([targets, static], 2)
+
+
+def place_mocaps(world: World) -> None:
+    """Write the positions of static bodies and of the gremlins' targets into the state."""
+    scene, physics = world.scene, world.physics
+    if scene.num_mocap_slots:
+        span = slice(scene.num_free, scene.num_free + scene.num_mocap_slots)
+        physics.mocap_pos[:, scene.num_targets :] = world.positions[:, span]
+    if scene.num_targets:
+        # Where they were before the last substep, which is what the state was computed with; at
+        # the start they stand where their objects do.
+        last = (physics.time - physics.timestep).clamp(min=0.0)
+        targets = gremlin_path(world, last, 1)[:, 0, : scene.num_targets]
+        centres = world.layout[:, 1 + scene.guided.start : 1 + scene.guided.stop]
+        height = (0.5 * world.target_height).expand(len(centres), -1)
+        started = (physics.time > 0.0).view(-1, 1, 1)
+        at_start = torch.cat([centres, height.unsqueeze(-1)], -1)
+        physics.mocap_pos[:, : scene.num_targets] = torch.where(started, targets, at_start)
+
+
+def point_goal_at_button(world: World, rows: Tensor) -> None:
+    """Let the goal be where the goal button is."""
+    goal, buttons = world.scene.slots["goal"], world.at("buttons")
+    world.positions[rows, goal.start] = buttons[rows, world.goal_button[rows]]
+
+
+PHYSICS_KEYS = ("qpos", "qvel", "qacc_warmstart", "time")
+TASK_KEYS = ("goal_button", "buttons_timer", "step_count")
+LAYOUT_KEYS = ("layout", "start_pose")
+# Without the last control, sensors that feel the actuators differ until the next step.
+OPTIONAL_KEYS = (*LAYOUT_KEYS, "target_quat", "ctrl", "act", "history", "seed", "episode")
+# What is not part of the physics, whose failures are noticed by themselves.
+FINITE_KEYS = (*LAYOUT_KEYS, "goal_pos", "target_quat")
+
+
+def read_state(world: World) -> TensorDict:
+    """Return copies of the state of N worlds, a TensorDict [N]."""
+    state = {key: getattr(world.physics, key).clone() for key in (*PHYSICS_KEYS, "ctrl")}
+    state |= {key: getattr(world, key).clone() for key in (*TASK_KEYS, *LAYOUT_KEYS)}
+    goal = world.at("goal")[:, 0] if "goal" in world.scene.slots else torch.zeros_like(world.com)
+    state["goal_pos"] = goal.clone()
+    state |= {key: memory.clone() for key, memory in world.physics.memory.items()}
+    state["target_quat"] = world.physics.mocap_quat[:, : world.scene.num_targets].clone()
+    return TensorDict(state, batch_size=[len(world.step_count)])
+
+
+def write_state(world: World, state: TensorDictBase) -> None:
+    """Set N worlds to a state and bring everything derived from it up to date.
+
+    Args:
+        world: the worlds.
+        state: TensorDict [N] as `read_state` returns it, which `check_worlds` has passed; `layout`,
+            `start_pose`, `target_quat` and `ctrl` may be missing, and then actuators remember
+            nothing where `act` and `history` are.
+    """
+    scene, physics = world.scene, world.physics
+    target_quat = state.get("target_quat", physics.mocap_quat[:, : scene.num_targets].clone())
+    physics.reset(torch.ones_like(world.step_count, dtype=torch.bool))
+    for key in PHYSICS_KEYS:
+        getattr(physics, key).copy_(state[key])
+    for key in (*TASK_KEYS, *LAYOUT_KEYS):
+        if key in state:
+            getattr(world, key).copy_(state[key])
+    for key, memory in physics.memory.items():
+        if key in state:
+            memory.copy_(state[key])
+    if "ctrl" in state:
+        physics.ctrl.copy_(state["ctrl"])
+    physics.mocap_quat[:, : scene.num_targets] = target_quat
+    world.positions[:, scene.num_free :, :2] = world.layout[:, 1 + scene.num_free :]
+    if goal_is_button(scene.config.task):
+        point_goal_at_button(world, torch.arange(len(world.step_count)))
+    elif "goal" in scene.slots:
+        goal = scene.slots["goal"].start
+        world.positions[:, goal] = state["goal_pos"]
+        world.layout[:, 1 + goal] = state["goal_pos"][:, :2]
+    place_mocaps(world)
+    physics.forward()
+    refresh(world)
+
+
+def check_worlds(world: World, expected: TensorDictBase, state: TensorDictBase) -> None:
+    """Check a state before it is set.
+
+    Args:
+        world: the worlds that it is for.
+        expected: their present state, with seeds.
+        state: what is about to be set.
+
+    Raises:
+        KeyError: if a key is missing.
+        ValueError: if it does not fit, or there is no such goal button.
+    """
+    check_state(expected, state, OPTIONAL_KEYS, FINITE_KEYS)
+    button, number = state["goal_button"], world.scene.config.buttons_num
+    if goal_is_button(world.scene.config.task) and not ((button >= 0) & (button < number)).all():
+        raise ValueError(f"State 'goal_button' must be between 0 and {number - 1}: {button}.")

@@ -1,1 +1,0 @@
-"""Building worlds, starting episodes in them, and taking and setting their state."""
