@@ -18,7 +18,6 @@ from safe_rl.envs.velocity.robots import ROBOTS as RUNNERS
 FILES = {name: str(path) for name, path in ROBOTS.items()} | {
     name: str(ASSETS / row.mjcf) for name, row in RUNNERS.items()
 }
-pytestmark = pytest.mark.filterwarnings("ignore:compiler attribute")
 
 
 def heavier(spec, factor):

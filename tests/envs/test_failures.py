@@ -257,7 +257,6 @@ def _step_forked(env: SafetyGymEnv, answers) -> None:
         answers.put(str(error))
 
 
-@pytest.mark.filterwarnings("ignore:.*multi-threaded.*fork")
 def test_a_fork_with_threads_is_an_error_instead_of_a_hang():
     context = multiprocessing.get_context("fork")
     env, answers = SafetyGymEnv("PointGoal0", num_envs=4, num_threads=2), context.Queue()
