@@ -15,6 +15,7 @@ from safe_rl.runs.table import read_table
 ROOT = Path(__file__).resolve().parents[2]
 RESULTS = ROOT / "results"
 README = (ROOT / "README.md").read_text()
+PAGE = (ROOT / "docs" / "results.md").read_text()
 OFF_POLICY = (ROOT / "docs" / "off_policy.md").read_text()
 
 
@@ -24,7 +25,7 @@ def sentences(page):
 
 
 SEEDS = r"^\| (\w+) \| `(\w+)` \| (\d+(?:\W\d+)?) \| (.+) \|$"
-HELD_OUT = re.findall(SEEDS, README, re.MULTILINE)
+HELD_OUT = re.findall(SEEDS, PAGE, re.MULTILINE)
 THREE_MILLION = re.findall(SEEDS, OFF_POLICY, re.MULTILINE)
 ONE_MILLION = [
     (env, algo, seed, cells)
@@ -34,6 +35,9 @@ ONE_MILLION = [
     for algo, rows in re.findall(r"^\| `(\w+)` (\|.*\n(?:\|  ?\|.*\n)*)", table, re.MULTILINE)
     for seed, cells in re.findall(r"\| (30\d) \| (.+) \|$", rows, re.MULTILINE)
 ]
+
+
+OFF_POLICY_ONES = ("cal", "sac_lagrangian", "td3_lagrangian")
 
 
 def figures(folder):
@@ -124,7 +128,7 @@ def test_one_million_steps_from_memory(env, algo, seed, cells):
     ]
 
 
-@pytest.mark.parametrize("algo", ["cal", "sac_lagrangian", "td3_lagrangian"])
+@pytest.mark.parametrize("algo", OFF_POLICY_ONES)
 def test_the_limit_while_learning_from_memory(algo):
     cells = []
     for env in ("PointGoal1", "CarGoal1"):
@@ -169,36 +173,68 @@ def means(folders, share, form="{:.1f} / {:.1f}"):
 
 
 @pytest.mark.parametrize(
-    ("page", "env", "algo", "form"),
+    "form",
     [
-        (README, "PointGoal1", "sac_lagrangian", "last quarter of training: {:.1f} / {:.1f} and"),
-        (README, "PointGoal1", "td3_lagrangian", "and {:.1f} / {:.1f};"),
-        (README, "CarGoal1", "sac_lagrangian", "on CarGoal1 {:.1f} / {:.1f} and"),
-        (README, "CarGoal1", "td3_lagrangian", "and {:.1f} / {:.1f}; ten of the twelve"),
-        (README, "PointGoal1", "cal", "from 200,000 steps on: {:.1f} / {:.1f} on PointGoal1"),
-        (README, "CarGoal1", "cal", "and {:.1f} / {:.1f} on CarGoal1 over the last quarter"),
+        "{sac_lagrangian} and {td3_lagrangian} on PointGoal1",
+        "{sac_lagrangian} and {td3_lagrangian} on CarGoal1; ten of the twelve",
+        "{cal} on PointGoal1 and",
+        "{cal} on CarGoal1 over the last quarter",
     ],
 )
-def test_means_of_a_million_steps(page, env, algo, form):
-    assert means((RESULTS / "algorithms" / env / algo).glob("seed*"), 0.25, form) in sentences(page)
+def test_means_of_a_million_steps(form):
+    env = re.search(r"on (\w+)", form)[1]
+    runs = {algo: (RESULTS / "algorithms" / env / algo).glob("seed*") for algo in OFF_POLICY_ONES}
+    said = form.format(**{algo: means(folders, 0.25) for algo, folders in runs.items()})
+    assert said in sentences(PAGE)
 
 
 @pytest.mark.parametrize(
     "env", ["PointGoal1", "CarGoal1", "PointGoal2", "PointButton1", "PointPush1"]
 )
-def test_means_without_a_limit_in_readme(env):
+def test_means_without_a_limit(env):
     form = "{:.1f} / {:.0f}"
     ends = [
         means((RESULTS / "reference" / env / a).glob("seed*"), 1 / 6, form) for a in ("ppo", "trpo")
     ]
-    assert " and ".join(ends) in sentences(README)
+    assert " and ".join(ends) in sentences(PAGE)
+    assert f"| {env} | {ends[0]} |" in README
 
 
-def test_what_readme_says_of_pushing():
+def test_the_table_of_readme_is_a_part_of_the_full_one():
+    full = {(env, algo): (seeds, cells.split(" | ")) for env, algo, seeds, cells in HELD_OUT}
+    rows = re.findall(r"^\| (\w+) \| .* \| `(\w+)` \| (\d) \| (.+) \|$", README, re.M)
+    assert len(rows) == 7
+    for env, algo, count, cells in rows:
+        seeds, (end, _, above, certified) = full[env, algo]
+        first, last_one = map(int, re.findall(r"\d+", seeds))
+        assert int(count) == last_one - first + 1
+        assert cells.split(" | ") == [end, above, certified.partition(",")[0]]
+
+
+def test_how_many_runs_are_within_the_limit():
+    within = []
+    for env, algo, seeds, _ in HELD_OUT:
+        first, *final = map(int, re.findall(r"\d+", seeds))
+        for number in range(first, (final or [first])[0] + 1):
+            folder = three_million(env, algo, number)
+            within.append((*held(folder), last(folder, 1 / 6)[1]))
+    from_one_million, above, end = np.array(within).T
+    kept_limits = sum(from_one_million <= 25), sum(end <= 25)
+    said = "Of these {} runs, {} have a mean cost of at most 25 from one million steps on, and {} "
+    assert said.format(len(within), *kept_limits) in sentences(PAGE)
+    shares = "In each run {:.0f} to {:.0f} % of the epochs".format(
+        *100 * above[[above.argmin(), above.argmax()]]
+    )
+    assert shares in sentences(PAGE)
+    assert f"{len(within)} runs of five" in sentences(README)
+    assert f"In {kept_limits[0]} of them" in sentences(README)
+
+
+def test_what_is_said_of_pushing():
     runs = [RESULTS / "push" / "PointPush1" / "after_trpo" / f"seed{n}" for n in (401, 402, 403)]
     ends = ["{:.1f} / {:.0f}".format(*last(run, 0.25)) for run in runs]
     returns = [certificate(run, "{1:.1f}") for run in runs]
-    said = sentences(README)
+    said = sentences(PAGE)
     assert "{}, {} and {} over the last half million".format(*ends) in said
     assert "certified at returns of {}, {} and {} ".format(*returns) in said
     starts = [RESULTS / "reference" / "PointPush1" / "trpo" / f"seed{n}" for n in (0, 20)]

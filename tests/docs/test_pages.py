@@ -162,7 +162,7 @@ def test_a_wrong_command_is_found(wrong, workplace, run_folder):
 def test_there_are_commands_and_snippets():
     """The pattern finds them: pages that teach have both."""
     found = {page: blocks(page) for page in PAGES}
-    assert ["train.py", "env=CarPush2"] in inline("README.md")
+    assert ["train.py", "env=CarPush2"] in inline("docs/environments/suite.md")
     for page in ("docs/start.md", "docs/guides/environment.md", "docs/guides/gymnasium.md"):
         assert any(block.language == "python" for block in found[page]), page
         assert sum(len(commands(block.text)) for block in found[page] if not block.file), page
