@@ -8,7 +8,8 @@ from typing import Any
 import replay_pages
 from omegaconf import DictConfig, OmegaConf
 
-from safe_rl.cli.part_keys import PARTS
+from safe_rl.cli.settings import keys_of_part
+from safe_rl.targets import locate
 
 # nodes of a configuration that are an algorithm's own
 NODES = ("loss", "policy_update", "lagrangian", "then.projection.loss")
@@ -42,7 +43,8 @@ def _settings(config: DictConfig, paper: DictConfig) -> Iterator[tuple[str, str,
         other = str(OmegaConf.select(paper, f"{path}._target_"))
         yield f"`{path}._target_`", f"`{name}`", f"`{other.rpartition('.')[2]}`", "the class"
         lacking = _cell(None) if other == target else "—"
-        known = PARTS.get(other.rpartition(".")[2], {}) | PARTS.get(name, {})
+        known = keys_of_part(locate(target))
+        known |= {} if other == "None" else keys_of_part(locate(other))
         node = OmegaConf.to_container(
             OmegaConf.select(paper, path) or OmegaConf.create(), resolve=True
         )

@@ -13,12 +13,16 @@ from tables import table
 
 from safe_rl.cli.conf import CONF
 from safe_rl.cli.keys import KEYS
-from safe_rl.cli.part_keys import PARTS
-from safe_rl.cli.values import Values, anything, mapping_of
+from safe_rl.cli.settings import keys_of_part
+from safe_rl.cli.values import anything, mapping_of
 from safe_rl.envs import store_configs
+from safe_rl.parameters import Parameter
+from safe_rl.ranges import Values
+from safe_rl.targets import locate
 
 _HEAD = ("key", "may be", "default", "meaning")
 # an algorithm of either kind: between them they have every key that is no part's
+_OPTIMISER = "torch.optim.Adam"
 _ALGORITHMS = ("ppo_lagrangian", "sac_lagrangian")
 Defaults = Mapping[str, Mapping[str, Any]]
 
@@ -34,9 +38,9 @@ def run_keys() -> str:
     ]
     found = _part_defaults()
     parts = [
-        f"### {name}\n\n" + table(_HEAD, _part_rows(name, found[name]))
-        for name, keys in PARTS.items()
-        if keys
+        f"### {_title(target)}\n\n" + table(_HEAD, _part_rows(keys, found[target]))
+        for target in sorted(found, key=_title)
+        if (keys := keys_of_part(locate(target)))
     ]
     return "\n".join([table(_HEAD, general), "## Parts\n", *parts])
 
@@ -58,8 +62,14 @@ def _default(configs: list[DictConfig], path: str) -> str:
     return ""
 
 
-def _part_rows(name: str, defaults: Defaults) -> Iterator[tuple[str, str, str, str]]:
-    for key, row in PARTS[name].items():
+def _title(target: str) -> str:
+    return "torch.optim" if target == _OPTIMISER else target.rpartition(".")[2]
+
+
+def _part_rows(
+    keys: Mapping[str, Parameter], defaults: Defaults
+) -> Iterator[tuple[str, str, str, str]]:
+    for key, row in keys.items():
         files: dict[str, list[str]] = defaultdict(list)
         for file, node in defaults.items():
             if key in node:
@@ -72,21 +82,21 @@ def _part_rows(name: str, defaults: Defaults) -> Iterator[tuple[str, str, str, s
 
 
 def _part_defaults() -> Mapping[str, dict[str, Mapping[str, Any]]]:
-    """Class -> file of conf/, without its end -> the node that names the class."""
+    """Target -> file of conf/, without its end -> the node that names it; optimisers as one."""
     found: dict[str, dict[str, Mapping[str, Any]]] = defaultdict(dict)
     for path in sorted(CONF.rglob("*.yaml")):
         file = path.relative_to(CONF).with_suffix("").as_posix()
         for node in _nodes(yaml.safe_load(path.read_text())):
             target = str(node["_target_"])
-            name = "torch.optim" if target.startswith("torch.optim.") else target.rpartition(".")[2]
-            found[name].setdefault(file, node)
+            found[_OPTIMISER if target.startswith("torch.optim.") else target][file] = node
+    found.pop("safe_rl.cli.run_folders.NewFolder"), found.pop("safe_rl.cli.sweeps.SweepReport")
     return found
 
 
 def _nodes(tree: Any) -> Iterator[Mapping[str, Any]]:
     """All that name a class, from outside to inside."""
     if isinstance(tree, Mapping):
-        if "_target_" in tree:
+        if tree.get("_target_") not in (None, "???"):
             yield tree
         for value in tree.values():
             yield from _nodes(value)

@@ -6,8 +6,6 @@ the environments' own business.
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 from safe_rl.cli.values import (
     NOT_NEGATIVE,
     POSITIVE,
@@ -25,28 +23,14 @@ from safe_rl.cli.values import (
     optional,
     text,
 )
+from safe_rl.parameters import Parameter
 
 __all__ = ["KEYS", "Key"]
 
 
-class Key(NamedTuple):
-    """A row of the tables.
-
-    Attributes:
-        values: What the key may hold.
-        meaning: What it is, in a few words.
-        bytes_each: Memory that every unit of a count takes at least; 0 if it takes none.
-        may_lack: Whether a configuration without the key is whole.
-
-    Examples:
-        >>> KEYS["checkpoint.keep_last"].meaning
-        'checkpoints that are kept besides the best'
-    """
-
-    values: Values
-    meaning: str
-    bytes_each: int = 0
-    may_lack: bool = False
+def Key(values: Values, meaning: str, bytes_each: int = 0, may_lack: bool = False) -> Parameter:
+    """A row of the tables."""
+    return Parameter(values, meaning, bytes_each, is_required=not may_lack)
 
 
 _LIMITS = mapping_of(number(0))

@@ -11,7 +11,6 @@ from safe_rl.cli.values import (
     NOT_NEGATIVE,
     POSITIVE,
     SHARE,
-    Values,
     anything,
     boolean,
     choice,
@@ -20,7 +19,6 @@ from safe_rl.cli.values import (
     list_of,
     mapping_of,
     number,
-    one_or_per_cost,
     optional,
     text,
 )
@@ -129,24 +127,6 @@ PARTS = {
     "make_bounded_actor": {},
     "VectorGAE": _ESTIMATOR,
     "CostGAE": _ESTIMATOR,
-    "LagrangeMultiplier": {
-        "init": Key(one_or_per_cost(number(0, 1e6, above=True)), "first λ"),
-        "lr": Key(POSITIVE, "step size of Adam"),
-        "betas": _OPTIMIZER["betas"],
-        "eps": _OPTIMIZER["eps"],
-    },
-    "ProjectedMultiplier": {
-        "init": Key(one_or_per_cost(number(0, 1e6)), "first λ"),
-        "lr": Key(POSITIVE, "change of λ per unit of violation"),
-        "highest": Key(optional(POSITIVE), "upper bound of λ; null: none"),
-    },
-    "PIMultiplier": {
-        "init": Key(one_or_per_cost(number(0, 1e6)), "first λ"),
-        "kp": Key(NOT_NEGATIVE, "proportional gain"),
-        "ki": Key(NOT_NEGATIVE, "integral gain"),
-        "saturation": Key(POSITIVE, "bound of the error, in units of the limit"),
-        "highest": Key(POSITIVE, "upper bound of λ"),
-    },
     "LimitTracker": {
         "margin": Key(NOT_NEGATIVE, "standard errors of a batch's J_c below the limit"),
         "largest_margin": Key(SHARE, "bound of the margin, as a share of the limit"),
@@ -169,22 +149,6 @@ PARTS = {
         "ramp_steps": Key(count(0), "steps in which the tail then takes its place"),
     },
     "Chance": {"most_over": Key(number(0, 1, below=True), "share of episodes over the limit")},
-    "PIDMultiplier": {
-        "init": Key(one_or_per_cost(number(0, 1e6)), "first λ"),
-        "kp": Key(NOT_NEGATIVE, "proportional gain"),
-        "ki": Key(NOT_NEGATIVE, "integral gain"),
-        "kd": Key(NOT_NEGATIVE, "derivative gain"),
-        "proportional_ema": Key(number(0, 1, below=True), "weight of the past in the error"),
-        "derivative_ema": Key(number(0, 1, below=True), "weight of the past in the cost"),
-        "derivative_delay": Key(count(1, 100_000), "updates over which growth is measured"),
-        "scale": Key(
-            Values(
-                lambda v: v == "limit" or one_or_per_cost(POSITIVE).hold(v),
-                f"limit, or {one_or_per_cost(POSITIVE).words}",
-            ),
-            "unit of the errors",
-        ),
-    },
     "make_process_collector": {
         **_WORKERS,
         "ahead": Key(boolean, "whether the next batch is collected while one is learned from"),

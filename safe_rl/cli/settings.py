@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Iterator, Mapping
 from itertools import chain
 from typing import Any, NamedTuple
@@ -10,17 +9,18 @@ from typing import Any, NamedTuple
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from safe_rl.cli.keys import KEYS, Key
+from safe_rl.cli.keys import KEYS
 from safe_rl.cli.part_keys import EXTRAS, FLAGS, PARTS
 from safe_rl.cli.robots import robot_of
 from safe_rl.envs import complete_env
 from safe_rl.evaluation.settings import check_device
 from safe_rl.extras import require_extra
 from safe_rl.naming import did_you_mean
+from safe_rl.parameters import Parameter, SettingError, parameters_of
 from safe_rl.runs.folder import RunFolder
 from safe_rl.targets import accepted_names, constructors, locate, takes_any
 
-__all__ = ["SettingError", "check_settings", "optional_keys", "plain"]
+__all__ = ["SettingError", "check_settings", "keys_of_part", "optional_keys", "plain"]
 
 _MISSING = object()
 _SECTIONS = (
@@ -29,15 +29,11 @@ _SECTIONS = (
 )
 
 
-class SettingError(ValueError):
-    """A value that a run cannot have; the message names the key."""
-
-
 class _Entry(NamedTuple):
     """A key of a configuration that has a row."""
 
     path: str
-    row: Key
+    row: Parameter
     value: Any
 
 
@@ -66,7 +62,7 @@ def check_settings(config: DictConfig, folder: RunFolder | None = None) -> None:
     """
     values = plain(config)
     for entry in chain(_entries_of_keys(values), _entries_of_parts(values)):
-        _check(entry)
+        entry.row.check(entry.path, entry.value)
         if entry.row.values.whole:
             OmegaConf.update(config, entry.path, _whole(entry.value), merge=False)
     for part in _parts(values):
@@ -100,7 +96,12 @@ def plain(config: DictConfig) -> dict[str, Any]:
 def optional_keys(values: Mapping[str, Any]) -> Iterator[str]:
     """Full paths of what a configuration does not hold and its parts would read."""
     for path, node, found in _parts(values):
-        yield from (f"{path}.{name}" for name in _rows(found) if name not in node)
+        yield from (f"{path}.{name}" for name in keys_of_part(found) if name not in node)
+
+
+def keys_of_part(found: Callable[..., Any]) -> dict[str, Parameter]:
+    """Hyper-parameters of what a configuration can build, by name."""
+    return {name: row for name, row in _rows(found).items() if row.is_described}
 
 
 def _unread_keys(values: Mapping[str, Any]) -> Iterator[tuple[str, list[str]]]:
@@ -130,13 +131,13 @@ def _entries_of_keys(values: Mapping[str, Any]) -> Iterator[_Entry]:
     for path, row in KEYS.items():
         above, _, name = path.rpartition(".")
         section = _at(values, above)
-        if section is None or (section is _MISSING and KEYS[above].may_lack):
+        if section is None or (section is _MISSING and not KEYS[above].is_required):
             continue  # switched off, or of another kind of algorithm
         value = section.get(name, _MISSING) if isinstance(section, Mapping) else _MISSING
         is_part = path.startswith("collector.") and values["collector"].get("_target_")
         if value is not _MISSING and not is_part:
             yield _Entry(path, row, value)
-        elif value is _MISSING and not row.may_lack:
+        elif value is _MISSING and row.is_required:
             raise SettingError(f"{path} is missing: {row.meaning}.")
 
 
@@ -163,18 +164,25 @@ def _parts(values: Mapping[str, Any], prefix: str = "") -> Iterator[_Part]:
             path = f"{prefix}{name}"
             target = node.get("_target_")
             if target is not None:
-                _check(_Entry(f"{path}._target_", FLAGS["_target_"], target))
+                FLAGS["_target_"].check(f"{path}._target_", target)
                 yield _Part(path, node, locate(target, f"{path}._target_"))
             yield from _parts(node, f"{path}.")
 
 
-def _rows(found: Callable[..., Any]) -> Mapping[str, Key]:
-    """Rows of a part, or of the package's part that it inherits from."""
+def _rows(found: Callable[..., Any]) -> Mapping[str, Parameter]:
+    """What a part's signature says of its arguments, and tables of the package's part."""
     if found.__module__.startswith("torch.optim"):
         return PARTS["torch.optim"]
     bases = getattr(found, "__mro__", (found,))
     names = [base.__name__ for base in bases if base.__module__.startswith("safe_rl.")]
-    return next((PARTS[name] for name in names if name in PARTS), {})
+    return {**_read(found), **next((PARTS[name] for name in names if name in PARTS), {})}
+
+
+def _read(found: Callable[..., Any]) -> Mapping[str, Parameter]:
+    try:
+        return parameters_of(found)
+    except (AttributeError, TypeError, ValueError):
+        return {}
 
 
 def _names(found: Callable[..., Any]) -> list[str] | None:
@@ -187,33 +195,6 @@ def _names(found: Callable[..., Any]) -> list[str] | None:
         return None if takes_any(last) else sorted(accepted_names(found))
     except (AttributeError, TypeError, ValueError):
         return None
-
-
-def _check(entry: _Entry) -> None:
-    path, row, value = entry
-    if not row.values.hold(value):
-        raise SettingError(
-            f"{path}={_shown(value)}: it must be {row.values.words} ({row.meaning})."
-        )
-    needed, present = row.bytes_each * (value if row.bytes_each else 0), _memory()
-    if needed > present:
-        raise SettingError(
-            f"{path}={_shown(value)}: this takes {needed / 1e9:,.0f} GB of memory at least, and "
-            f"the machine has {present / 1e9:,.0f}, room for {present // row.bytes_each:,}."
-        )
-
-
-def _memory() -> int:
-    """Bytes of this machine."""
-    return os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
-
-
-def _shown(value: Any) -> str:
-    """A value as it is written on a command line, cut if it is long."""
-    written = {None: "null", True: "true", False: "false"}
-    is_word = value is None or isinstance(value, bool)
-    shown = written[value] if is_word else " ".join(str(value).split())
-    return shown if len(shown) <= 80 else f"{shown[:80]}…"
 
 
 def _whole(value: Any) -> Any:

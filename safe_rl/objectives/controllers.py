@@ -19,7 +19,8 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from safe_rl.objectives.multipliers import CostLimits, Multiplier, per_cost
+from safe_rl.objectives.multipliers import CostLimits, FromZero, Multiplier, per_cost
+from safe_rl.ranges import NotNegative, Positive
 
 
 class PIMultiplier(Multiplier):
@@ -30,11 +31,11 @@ class PIMultiplier(Multiplier):
 
     Args:
         cost_limits: mapping from cost key to limit d, or limits alone; see `parse_cost_limits`.
-        init: initial λ ≥ 0, for all costs or one per cost.
-        kp: proportional gain K_P ≥ 0.
-        ki: integral gain K_I ≥ 0.
-        saturation: bound of |Δ|.
-        highest: bound of λ. The reward keeps at least the weight 1 / (1 + highest) in a
+        init: First λ, for all costs or one per cost.
+        kp: Proportional gain K_P.
+        ki: Integral gain K_I.
+        saturation: Bound of the error |Δ|, in units of the limit.
+        highest: Upper bound of λ. The reward keeps at least the weight 1 / (1 + highest) in a
             Lagrangian loss with one cost.
 
     Raises:
@@ -56,11 +57,11 @@ class PIMultiplier(Multiplier):
         self,
         cost_limits: CostLimits,
         *,
-        init: float | Sequence[float],
-        kp: float,
-        ki: float,
-        saturation: float,
-        highest: float,
+        init: FromZero | Sequence[FromZero],
+        kp: NotNegative,
+        ki: NotNegative,
+        saturation: Positive,
+        highest: Positive,
     ) -> None:
         super().__init__(cost_limits)
         if min(kp, ki) < 0 or not saturation > 0 or not highest > 0:

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
+from typing import Annotated
 
 import torch
 from tensordict import NestedKey
@@ -17,8 +18,11 @@ from torch import Tensor, nn
 from torch.nn.functional import softplus
 
 from safe_rl.naming import key_name
+from safe_rl.ranges import NotNegative, Positive, Range, Weight
 
 CostLimits = Mapping[NestedKey, float] | Sequence[float] | float
+AboveZero = Annotated[float, Range(0, 1e6, above=True)]
+FromZero = Annotated[float, Range(0, 1e6)]
 
 
 def parse_cost_limits(cost_limits: CostLimits) -> tuple[list[NestedKey], Tensor]:
@@ -159,10 +163,10 @@ class LagrangeMultiplier(Multiplier):
 
     Args:
         cost_limits: mapping from cost key to limit d, or limits alone; see `parse_cost_limits`.
-        init: initial λ > 0, for all costs or one per cost.
-        lr: Adam's step size.
-        betas: Adam's decay rates.
-        eps: Adam's ε.
+        init: First λ, for all costs or one per cost.
+        lr: Step size of Adam.
+        betas: Decay rates of Adam's moments.
+        eps: Adam's ε, added to denominators.
 
     Raises:
         ValueError: if an initial λ is not positive.
@@ -183,10 +187,10 @@ class LagrangeMultiplier(Multiplier):
         self,
         cost_limits: CostLimits,
         *,
-        init: float | Sequence[float],
-        lr: float,
-        betas: tuple[float, float] = (0.9, 0.999),
-        eps: float = 1e-8,
+        init: AboveZero | Sequence[AboveZero],
+        lr: Positive,
+        betas: tuple[Weight, Weight] = (0.9, 0.999),
+        eps: NotNegative = 1e-8,
     ) -> None:
         super().__init__(cost_limits)
         initial = per_cost("init", init, self.num_costs)

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Literal
+from typing import Annotated, Literal
 
 import torch
 from torch import Tensor
 
-from safe_rl.objectives.multipliers import CostLimits, Multiplier, per_cost
+from safe_rl.objectives.multipliers import CostLimits, FromZero, Multiplier, per_cost
+from safe_rl.ranges import NotNegative, Positive, Range, Weight
 
 
 class PIDMultiplier(Multiplier):
@@ -26,14 +27,14 @@ class PIDMultiplier(Multiplier):
 
     Args:
         cost_limits: mapping from cost key to limit d, or limits alone; see `parse_cost_limits`.
-        init: initial λ ≥ 0, for all costs or one per cost.
-        kp: proportional gain K_P ≥ 0.
-        ki: integral gain K_I ≥ 0.
-        kd: derivative gain K_D ≥ 0.
-        proportional_ema: weight in [0, 1) of the past in the smoothed Δ; 0 is no smoothing.
-        derivative_ema: weight in [0, 1) of the past in the smoothed J; 0 is no smoothing.
-        derivative_delay: number of updates ≥ 1 over which growth is measured.
-        scale: what errors are divided by: one number, one per cost, or ``"limit"`` for the limits
+        init: First λ, for all costs or one per cost.
+        kp: Proportional gain K_P.
+        ki: Integral gain K_I.
+        kd: Derivative gain K_D.
+        proportional_ema: Weight of the past in the smoothed error Δ; 0 is no smoothing.
+        derivative_ema: Weight of the past in the smoothed cost J; 0 is no smoothing.
+        derivative_delay: Updates over which the growth of the cost is measured.
+        scale: Unit of the errors: one number, one per cost, or ``"limit"`` for the limits
             themselves, which makes the gains independent of the units of a cost. The paper's is 1.
 
     Raises:
@@ -66,14 +67,14 @@ class PIDMultiplier(Multiplier):
         self,
         cost_limits: CostLimits,
         *,
-        init: float | Sequence[float],
-        kp: float,
-        ki: float,
-        kd: float,
-        proportional_ema: float,
-        derivative_ema: float,
-        derivative_delay: int,
-        scale: float | Sequence[float] | Literal["limit"],
+        init: FromZero | Sequence[FromZero],
+        kp: NotNegative,
+        ki: NotNegative,
+        kd: NotNegative,
+        proportional_ema: Weight,
+        derivative_ema: Weight,
+        derivative_delay: Annotated[int, Range(1, 100_000)],
+        scale: Positive | Sequence[Positive] | Literal["limit"],
     ) -> None:
         super().__init__(cost_limits)
         if min(kp, ki, kd) < 0:

@@ -7,7 +7,8 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from safe_rl.objectives.multipliers import CostLimits, Multiplier, per_cost
+from safe_rl.objectives.multipliers import CostLimits, FromZero, Multiplier, per_cost
+from safe_rl.ranges import Positive
 
 
 class ProjectedMultiplier(Multiplier):
@@ -19,9 +20,9 @@ class ProjectedMultiplier(Multiplier):
 
     Args:
         cost_limits: mapping from cost key to limit d, or limits alone; see `parse_cost_limits`.
-        init: initial λ in [0, `highest`], for all costs or one per cost.
-        lr: α, λ per cost of size u in an episode.
-        highest: λ_max, or None for no bound.
+        init: First λ, at most `highest`, for all costs or one per cost.
+        lr: Step size α, change of λ per cost of size u in an episode.
+        highest: Upper bound λ_max; None for none.
 
     Raises:
         ValueError: if an initial λ is outside the bounds.
@@ -42,9 +43,9 @@ class ProjectedMultiplier(Multiplier):
         self,
         cost_limits: CostLimits,
         *,
-        init: float | Sequence[float],
-        lr: float,
-        highest: float | None,
+        init: FromZero | Sequence[FromZero],
+        lr: Positive,
+        highest: Positive | None,
     ) -> None:
         super().__init__(cost_limits)
         self.lr, self.highest = lr, highest

@@ -1,0 +1,161 @@
+"""What a function or class takes, read from its signature and its docstring."""
+
+from __future__ import annotations
+
+import inspect
+import os
+import re
+from collections.abc import Callable, Mapping
+from functools import cache
+from typing import Any, NamedTuple, NotRequired, get_args, get_origin, get_type_hints, is_typeddict
+
+from safe_rl.ranges import Values, bytes_each, is_described, values_of
+from safe_rl.targets import constructors
+
+__all__ = ["Parameter", "SettingError", "parameters_of"]
+
+
+class SettingError(ValueError):
+    """A value that a run cannot have; the message names the key."""
+
+
+class Parameter(NamedTuple):
+    """One argument of a function or class, or one key of a `TypedDict`.
+
+    Attributes:
+        values: What it may be.
+        meaning: What its docstring says of it, a sentence without its full stop.
+        bytes_each: Memory that every unit of a count takes at least; 0 if it takes none.
+        is_described: Whether its annotation says more than a type: a hyper-parameter.
+        is_required: Whether it has to be given.
+
+    Examples:
+        >>> from safe_rl.ranges import Share
+        >>> def discounted(rewards, gamma: Share = 0.99):
+        ...     '''Sum rewards.
+        ...
+        ...     Args:
+        ...         gamma: Discount per step.
+        ...     '''
+        >>> parameters_of(discounted)["gamma"].check("gamma", 2)
+        Traceback (most recent call last):
+        ...
+        safe_rl.parameters.SettingError: gamma=2: it must be a number from 0 to 1 (discount per step).
+    """  # noqa: E501
+
+    values: Values
+    meaning: str
+    bytes_each: int = 0
+    is_described: bool = True
+    is_required: bool = True
+
+    def check(self, path: str, value: Any) -> None:
+        """Refuse a value that it cannot be.
+
+        Args:
+            path: Full path of the key, for the message.
+            value: The value, as a YAML file has it.
+
+        Raises:
+            SettingError: If it is none of its values, or needs more memory than the machine has.
+        """
+        if not self.values.hold(value):
+            meaning = f" ({self.meaning})" if self.meaning else ""
+            raise SettingError(f"{path}={_shown(value)}: it must be {self.values.words}{meaning}.")
+        each = self.bytes_each
+        needed, present = each * (value if each else 0), _memory()
+        if needed > present:
+            raise SettingError(
+                f"{path}={_shown(value)}: this takes {needed / 1e9:,.0f} GB of memory at least, "
+                f"and the machine has {present / 1e9:,.0f}, room for {present // each:,}."
+            )
+
+
+@cache
+def parameters_of(target: Callable[..., Any]) -> Mapping[str, Parameter]:
+    """Arguments of a function or class by name, those of its bases included; keys of a `TypedDict`.
+
+    As `targets.accepted_names`, this follows ``**kwargs`` to the next constructor. An annotation
+    that cannot be read, such as a name imported for type checkers only, allows anything.
+    """
+    meanings = _meanings(target)
+    found: dict[str, Parameter] = {}
+    for name, annotation, is_required in _annotations(target):
+        if name not in found:
+            found[name] = Parameter(
+                values_of(annotation),
+                meanings.get(name, ""),
+                bytes_each(annotation),
+                is_described(annotation),
+                is_required,
+            )
+    return found
+
+
+def _annotations(target: Callable[..., Any]) -> list[tuple[str, Any, bool]]:
+    """Name, annotation and whether it is required, the class's own arguments first."""
+    if is_typeddict(target):
+        hints = get_type_hints(target, include_extras=True)
+        return [(k, _bare(hint), get_origin(hint) is not NotRequired) for k, hint in hints.items()]
+    rows = []
+    for function in constructors(target):
+        names = getattr(inspect.unwrap(function), "__globals__", {})
+        for name, parameter in inspect.signature(function).parameters.items():
+            if name != "self" and parameter.kind in (
+                parameter.POSITIONAL_OR_KEYWORD,
+                parameter.KEYWORD_ONLY,
+            ):
+                annotation = _evaluated(parameter.annotation, names)
+                rows.append((name, annotation, parameter.default is parameter.empty))
+    return rows
+
+
+def _bare(hint: Any) -> Any:
+    return get_args(hint)[0] if get_origin(hint) is NotRequired else hint
+
+
+def _evaluated(annotation: Any, names: dict[str, Any]) -> Any:
+    """An annotation that is written as text, in the module that wrote it."""
+    if annotation is inspect.Parameter.empty:
+        return Any
+    try:
+        return eval(annotation, names) if isinstance(annotation, str) else annotation
+    except (NameError, AttributeError, TypeError):
+        return Any
+
+
+def _meanings(target: Callable[..., Any]) -> dict[str, str]:
+    """First sentence on every argument: of a function, or of a class and then of its bases."""
+    meanings: dict[str, str] = {}
+    for owner in getattr(target, "__mro__", (target,)):
+        for names, text in _entries(owner.__doc__ or ""):
+            for name in names.split(","):
+                meanings.setdefault(name.strip(), _sentence(text))
+    return meanings
+
+
+def _entries(doc: str) -> list[tuple[str, str]]:
+    """Names and texts in the sections ``Args`` and ``Attributes`` of a docstring."""
+    lines = f"{inspect.cleandoc(doc)}\n"
+    sections = re.findall(r"^(?:Args|Attributes):\n((?:(?: .*)?\n)*)", lines, re.M)
+    return re.findall(r"^ {4}([\w, ]+): ((?:.*\n)(?: {5,}.*\n)*)", "".join(sections), re.M)
+
+
+def _sentence(text: str) -> str:
+    """The first sentence, to stand in a message: without capital, full stop and code marks."""
+    plain = " ".join(text.replace("`", "").split())
+    first = re.split(r"\.(?:\s|$)", plain, maxsplit=1)[0]
+    return first[:1].lower() + first[1:] if first[1:2].islower() else first
+
+
+def _memory() -> int:
+    """Bytes of this machine."""
+    return os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+
+
+def _shown(value: Any) -> str:
+    """A value as it is written on a command line, cut if it is long."""
+    written = {None: "null", True: "true", False: "false"}
+    is_word = value is None or isinstance(value, bool)
+    shown = written[value] if is_word else " ".join(str(value).split())
+    return shown if len(shown) <= 80 else f"{shown[:80]}…"

@@ -1,0 +1,241 @@
+"""What a parameter may be: annotations for signatures, and the sets of values that they stand for.
+
+A constructor says what it takes, ``gamma: Share`` or ``size: Annotated[int, Range(1, 100)]``, and
+`values_of` turns this into a check with words for a message.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import reduce
+from types import NoneType, UnionType
+from typing import Annotated, Any, Literal, NamedTuple, NotRequired, Required, Union
+from typing import get_args as arguments_of
+from typing import get_origin as origin_of
+
+__all__ = [
+    *("ANYTHING", "PART", "Bytes", "Count", "Fraction", "MaxLength", "NotNegative", "Number"),
+    *("Positive", "Range", "Share", "Text", "Values", "Weight", "bytes_each", "is_described"),
+    "values_of",
+]
+
+
+class Values(NamedTuple):
+    """A set of values; as metadata of `Annotated` it says which ones a parameter may have.
+
+    Attributes:
+        hold: Whether a value is one of them.
+        words: What they are, to follow "it must be".
+        whole: Whether they are whole numbers, for which YAML's 3e5 is one too.
+
+    Examples:
+        >>> even = Values(lambda value: value in (2, 4), "2 or 4")
+        >>> values_of(Annotated[int, even] | None).words
+        '2 or 4, or null'
+    """
+
+    hold: Callable[[Any], bool]
+    words: str
+    whole: bool = False
+
+
+@dataclass(frozen=True)
+class Range:
+    """Bounds of a number, finite in any case.
+
+    Args:
+        low: Lower bound; None for the least number that there may be, -1e9 or -10¹⁵ if whole.
+        high: Upper bound; None for the largest.
+        above: Whether the lower bound itself is left out.
+        below: Whether the upper bound itself is left out.
+
+    Examples:
+        >>> values_of(Annotated[float, Range(0, 1, above=True)]).words
+        'a number above 0 and at most 1'
+        >>> values_of(Annotated[int, Range(1, 9)]).hold(1.5)
+        False
+    """
+
+    low: float | None = None
+    high: float | None = None
+    above: bool = False
+    below: bool = False
+
+
+@dataclass(frozen=True)
+class MaxLength:
+    """Most items of a list."""
+
+    items: int
+
+
+@dataclass(frozen=True)
+class Bytes:
+    """Memory that every unit of a count takes at least."""
+
+    each: int
+
+
+def is_number(value: Any) -> bool:
+    """Whether a value is a finite number; True and False are none."""
+    is_real = isinstance(value, int | float) and not isinstance(value, bool)
+    # a whole number may be too large to be a float
+    return is_real and (isinstance(value, int) or math.isfinite(value))
+
+
+def is_text(value: Any) -> bool:
+    """Whether a value is a text of one line that is not empty."""
+    return isinstance(value, str) and bool(value.strip()) and value.isprintable()
+
+
+ANYTHING = Values(lambda value: True, "anything")
+_BOOLEAN = Values(lambda value: isinstance(value, bool), "true or false")
+_NULL = Values(lambda value: value is None, "null")
+_TEXT = Values(is_text, "a text that is not empty")
+PART = Values(
+    lambda value: isinstance(value, Mapping) and is_text(value.get("_target_")),
+    "a part with a _target_, as the files in conf/ have it",
+)
+"""Of a parameter that gets what another node of the configuration builds."""
+
+Number = Annotated[float, Range()]
+Positive = Annotated[float, Range(0, above=True)]
+NotNegative = Annotated[float, Range(0)]
+Share = Annotated[float, Range(0, 1)]
+Fraction = Annotated[float, Range(0, 1, above=True)]
+"""A share above 0."""
+Weight = Annotated[float, Range(0, 1, below=True)]
+"""A share below 1, such as the weight of the past in a moving average."""
+Count = Annotated[int, Range(1)]
+Text = Annotated[str, _TEXT]
+
+
+def values_of(annotation: Any) -> Values:
+    """Which values an annotation stands for; anything where it does not say.
+
+    Floats have to be finite. `Literal` names choices, ``X | None`` allows null; lists, tuples and
+    mappings are checked item by item.
+
+    Examples:
+        >>> size = values_of(list[Annotated[int, Range(1, 64)]])
+        >>> size.hold([8, 64]), size.hold([65]), size.hold(8)
+        (True, False, False)
+        >>> values_of(Literal["kl", "l2"]).words
+        'one of kl, l2'
+        >>> values_of(float | Literal["auto"]).words
+        'a number from -1e+09 to 1e+09, or auto'
+    """
+    origin, inner = origin_of(annotation), arguments_of(annotation)
+    if origin is Annotated:
+        return _narrowed(inner[0], inner[1:])
+    if origin in (Required, NotRequired):
+        return values_of(inner[0])
+    if origin is Literal:
+        return _choice(inner)
+    if origin in (Union, UnionType):
+        return reduce(_either, sorted(map(values_of, inner), key=lambda v: v is _NULL))
+    if origin is tuple and Ellipsis not in inner:
+        return _items(reduce(_either, map(values_of, dict.fromkeys(inner))), len(inner), exact=True)
+    kind = origin or annotation
+    if isinstance(kind, type) and inner and issubclass(kind, Mapping):
+        return _mapping(values_of(inner[1]))
+    if isinstance(kind, type) and inner and issubclass(kind, Iterable):
+        return _items(values_of(inner[0]), 1000)
+    return _PLAIN.get(kind, ANYTHING) if isinstance(kind, type | NoneType) else ANYTHING
+
+
+def is_described(annotation: Any) -> bool:
+    """Whether an annotation describes a hyper-parameter: by a range, choices, or as a bool.
+
+    What it does not describe is handed over by the program, such as ``device: str``.
+
+    Examples:
+        >>> is_described(Share | None), is_described(bool), is_described(float)
+        (True, True, False)
+    """
+    if annotation is bool or origin_of(annotation) in (Annotated, Literal):
+        return True
+    return any(map(is_described, arguments_of(annotation)))
+
+
+def bytes_each(annotation: Any) -> int:
+    """Memory that every unit of a count takes at least; 0 if its annotation has no `Bytes`."""
+    found = (item.each for item in getattr(annotation, "__metadata__", ()) if type(item) is Bytes)
+    return next(found, 0)
+
+
+def _narrowed(kind: Any, metadata: Collection[Any]) -> Values:
+    """The values of a type that its metadata leaves; unknown metadata leaves all."""
+    for item in metadata:
+        if isinstance(item, Values):
+            return item
+        if isinstance(item, Range):
+            return _whole(item) if kind is int else _number(item)
+        if isinstance(item, MaxLength):
+            return _items(values_of(arguments_of(kind)[0]), item.items)
+    return values_of(kind)
+
+
+def _number(range: Range) -> Values:
+    lowest = -1e9 if range.low is None else range.low
+    # what float32 can square
+    highest = 1e9 if range.high is None else range.high
+    low = f"above {lowest:g}" if range.above else f"from {lowest:g}"
+    high = f"{'at most' if range.above else 'to'} {highest:g}"
+    if range.below:
+        high = f"below {highest:g}"
+
+    def hold(value: Any) -> bool:
+        if not is_number(value) or not lowest <= value <= highest:
+            return False
+        return not (range.above and value == lowest) and not (range.below and value == highest)
+
+    join = " and " if range.above or range.below else " "
+    return Values(hold, f"a number {low}{join}{high}")
+
+
+def _whole(range: Range) -> Values:
+    lowest = -(10**15) if range.low is None else int(range.low)
+    highest = 10**15 if range.high is None else int(range.high)
+
+    def hold(value: Any) -> bool:
+        return is_number(value) and lowest <= value <= highest and value == int(value)
+
+    return Values(hold, f"a whole number from {lowest} to {highest:,}", whole=True)
+
+
+def _choice(names: Sequence[Any]) -> Values:
+    words = f"one of {', '.join(map(str, names))}" if names[1:] else str(names[0])
+    return Values(lambda value: any(type(n) is type(value) and n == value for n in names), words)
+
+
+def _either(first: Values, second: Values) -> Values:
+    words = f"{first.words}, or {second.words.replace(first.words, 'of these')}"
+    return Values(lambda v: first.hold(v) or second.hold(v), words, first.whole or second.whole)
+
+
+def _items(item: Values, number: int, exact: bool = False) -> Values:
+    def hold(value: Any) -> bool:
+        is_list = isinstance(value, list | tuple) and len(value) <= number
+        return is_list and all(map(item.hold, value)) and not (exact and len(value) < number)
+
+    length = f"{number}" if exact else f"at most {number}"
+    return Values(hold, f"a list of {length} items, each {item.words}", item.whole)
+
+
+def _mapping(item: Values) -> Values:
+    return Values(
+        lambda v: (
+            isinstance(v, Mapping) and all(map(is_text, v)) and all(map(item.hold, v.values()))
+        ),
+        f"a mapping from names to values, such as '{{name: …}}', each {item.words}",
+        item.whole,
+    )
+
+
+_PLAIN: dict[Any, Values] = {
+    **{bool: _BOOLEAN, str: _TEXT, None: _NULL, NoneType: _NULL},
+    **{int: _whole(Range()), float: _number(Range())},
+}
