@@ -125,9 +125,8 @@ FLOORS = {
         ("",),
     ),
     "collectors": (
-        ("accounting", "ahead", "ending", "factory", "hdf5", "recording", "shares"),
-        ("workers",),
-        ("datasets",),
+        ("accounting", "recording", "worker_rows", "workers"),
+        ("datasets", "factory"),
         ("",),
     ),
     "models": (

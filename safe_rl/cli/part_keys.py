@@ -149,10 +149,7 @@ PARTS = {
         "ramp_steps": Key(count(0), "steps in which the tail then takes its place"),
     },
     "Chance": {"most_over": Key(number(0, 1, below=True), "share of episodes over the limit")},
-    "make_process_collector": {
-        **_WORKERS,
-        "ahead": Key(boolean, "whether the next batch is collected while one is learned from"),
-    },
+    "make_process_collector": _WORKERS,
     "make_ray_collector": {
         **_WORKERS,
         "ray_init": Key(mapping_of(anything), "arguments of ray.init"),

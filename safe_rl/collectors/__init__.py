@@ -1,11 +1,10 @@
 """Data collection with cost accounting, and transitions on disk."""
 
 from safe_rl.collectors.accounting import EpisodeAccounting, EpisodeError, EpisodeStatistics
-from safe_rl.collectors.datasets import read_dataset, safe_episodes
-from safe_rl.collectors.factory import make_collector
-from safe_rl.collectors.hdf5 import read_hdf5
+from safe_rl.collectors.datasets import read_dataset, read_hdf5, safe_episodes
+from safe_rl.collectors.factory import make_collector, make_process_collector, make_ray_collector
 from safe_rl.collectors.recording import Recording, StepRecorder, read_recording
-from safe_rl.collectors.workers import WorkerCollector, make_process_collector, make_ray_collector
+from safe_rl.collectors.workers import WorkerCollector
 
 __all__ = [
     "EpisodeAccounting",

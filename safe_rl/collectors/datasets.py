@@ -1,17 +1,45 @@
-"""Transitions from disk: recordings, files of offline benchmarks, and the safe episodes of them."""
+"""Transitions from disk: recordings, HDF5 files as of DSRL or Minari, and their safe episodes."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
+from re import fullmatch
+from typing import Any
 
+import numpy as np
 import torch
-from tensordict import TensorDictBase
+from tensordict import NestedKey, TensorDict, TensorDictBase
 
-from safe_rl.collectors.hdf5 import read_hdf5
 from safe_rl.collectors.recording import PARTIAL, read_recording
+from safe_rl.extras import import_extra
 
-__all__ = ["read_dataset", "safe_episodes"]
+__all__ = ["read_dataset", "read_hdf5", "safe_episodes"]
+
+Arrays = dict[NestedKey, np.ndarray]
+
+# DSRL's (Liu et al. 2024), which are those of D4RL, and `costs`
+_FLAT: dict[NestedKey, str] = {
+    "observation": "observations",
+    "action": "actions",
+    ("next", "reward"): "rewards",
+    ("next", "cost"): "costs",
+    ("next", "terminated"): "terminals",
+    ("next", "truncated"): "timeouts",
+}
+# of each of Minari's episodes; costs are among the `infos`
+_OF_AN_EPISODE: dict[NestedKey, str] = {
+    "observation": "observations",
+    "action": "actions",
+    ("next", "reward"): "rewards",
+    ("next", "terminated"): "terminations",
+    ("next", "truncated"): "truncations",
+}
+_EPISODE = r"episode_(\d+)"
+_NUMBERS = "biuf"  # kinds of NumPy's types
+_FLAGS = (("next", "terminated"), ("next", "truncated"))
+_VECTORS = ("observation", "action", ("next", "observation"))
+"""What may be several numbers in a step."""
 
 
 def read_dataset(path: Path | str) -> TensorDictBase:
@@ -55,3 +83,139 @@ def safe_episodes(steps: TensorDictBase, limits: Mapping[str, float]) -> TensorD
         total = torch.zeros(done.shape[0], number, dtype=torch.float64)
         is_kept = is_kept & (total.scatter_add_(1, episode, cost) <= limit)
     return steps.reshape(1, -1)[:, is_kept.gather(1, episode).reshape(-1)]
+
+
+def read_hdf5(path: Path | str) -> TensorDict:
+    """Transitions [1, M] of an HDF5 file, one episode after the other; needs the extra `hdf5`.
+
+    Files are those of
+
+    - DSRL and D4RL: flat arrays over all episodes, ``observations``, ``actions``, ``rewards``,
+      ``costs``, ``terminals``, ``timeouts``, and ``next_observations``. Without the last, what
+      follows a step is the observation of the next one, and that of the step itself where an
+      episode ends;
+    - Minari: a group ``episode_<i>`` for each episode, with ``observations`` (one more than steps),
+      ``actions``, ``rewards``, ``terminations``, ``truncations``, and ``infos`` with ``cost`` and
+      any ``cost_<kind>``. An episode that was cut off counts as truncated.
+
+    Raises:
+        ValueError: If the file is no HDF5 file, or damaged; if an array is missing, of another
+            length than the actions, not of numbers, or of more of them for a step than there should
+            be. The message names what is there.
+        ModuleNotFoundError: If h5py is not installed.
+    """
+    h5py = import_extra("h5py", "hdf5")
+    if not h5py.is_hdf5(path):
+        raise ValueError(f"{path} is neither the folder of a recording nor an HDF5 file.")
+    try:
+        with h5py.File(path, "r") as file:
+            names = [n for n in file if fullmatch(_EPISODE, n)]
+            arrays = _read_episodes(path, file, names) if names else _read_flat(path, file)
+    except OSError as error:
+        raise ValueError(f"{path} cannot be read, is it whole? {error}") from error
+    if not len(arrays["action"]):
+        raise ValueError(f"{path} holds no transitions.")
+    steps = TensorDict(batch_size=[1, len(arrays["action"])])
+    for key, column in _columns(arrays):
+        steps[key] = column
+    steps["next", "done"] = steps["next", "terminated"] | steps["next", "truncated"]
+    return steps
+
+
+def _read_episodes(path: Path | str, file: Any, names: list[str]) -> Arrays:
+    names.sort(key=lambda name: int(name.rpartition("_")[2]))
+    episodes = [_read_episode(path, file[name]) for name in names]
+    costs = [sorted(key[1] for key in e if key[1].startswith("cost")) for e in episodes]
+    for name, those in zip(names, costs, strict=True):
+        if those != costs[0]:
+            raise ValueError(
+                f"{path}: the costs of {name} are {', '.join(those)}, those of {names[0]} "
+                f"{', '.join(costs[0])}."
+            )
+    return {key: np.concatenate([e[key] for e in episodes]) for key in episodes[0]}
+
+
+def _read_flat(path: Path | str, file: Any) -> Arrays:
+    arrays = _arrays(path, file, _FLAT)
+    if "next_observations" in file:
+        following = file["next_observations"][:]
+    else:
+        _check_lengths(path, arrays)
+        here = arrays["observation"]
+        ends = arrays["next", "terminated"] | arrays["next", "truncated"]
+        ends = np.append(ends[:-1], True).reshape(-1, *[1] * (here.ndim - 1))
+        following = np.where(ends, here, np.roll(here, -1, 0))
+    return _check_lengths(path, {**arrays, ("next", "observation"): following})
+
+
+def _read_episode(path: Path | str, group: Any) -> Arrays:
+    arrays = _arrays(path, group, _OF_AN_EPISODE)
+    observed, number = arrays["observation"], len(arrays["action"])
+    infos = group.get("infos", {})
+    # infos of the reset come first, if they were stored
+    named = [name for name in infos if name.startswith("cost") and _is_array(infos[name])]
+    costs = {("next", name): _last(infos[name][:], number) for name in named}
+    if ("next", "cost") not in costs:
+        raise _lacking(path, ["infos/cost"], [f"infos/{name}" for name in infos] or list(group))
+    here, following = observed[:number], observed[1 : number + 1]
+    arrays = {**arrays, **costs, "observation": here, ("next", "observation"): following}
+    _check_lengths(f"{path}, {group.name[1:]}", arrays)
+    arrays["next", "truncated"][-1:] |= ~arrays["next", "terminated"][-1:]
+    return arrays
+
+
+def _last(array: np.ndarray, number: int) -> np.ndarray:
+    return array[max(0, len(array) - number) :]
+
+
+def _is_array(node: Any) -> bool:
+    """Whether a node of a file is an array with a row for each step, not a number or a group."""
+    return bool(getattr(node, "shape", ()))
+
+
+def _check_lengths(where: Path | str, arrays: Arrays) -> Arrays:
+    """Refuse arrays that are not of the same steps, not of numbers, or of too many of them."""
+    number = len(arrays["action"])
+    for key, array in arrays.items():
+        name = " ".join(key) if isinstance(key, tuple) else key
+        if len(array) != number:
+            raise ValueError(
+                f"{where}: the {name} is given for {len(array):,} steps, the action for {number:,}."
+            )
+        if array.dtype.kind not in _NUMBERS:
+            raise ValueError(f"{where}: the {name} must be numbers, got {array.dtype}.")
+        if key not in _VECTORS and array.size != number:
+            raise ValueError(
+                f"{where}: the {name} must be one number a step, its shape is {array.shape}."
+            )
+    here, following = (arrays.get(key) for key in ("observation", ("next", "observation")))
+    if here is not None and following is not None and here.shape != following.shape:
+        raise ValueError(
+            f"{where}: the next observation must be like the observation, whose shape is "
+            f"{here.shape}, got {following.shape}."
+        )
+    return arrays
+
+
+def _arrays(path: Path | str, group: Any, names: Mapping[NestedKey, str]) -> Arrays:
+    found = [name for name in group if _is_array(group[name])]
+    if missing := sorted(set(names.values()) - set(found)):
+        raise _lacking(path, missing, found)
+    return {
+        key: group[name][:].astype(bool) if key in _FLAGS else group[name][:]
+        for key, name in names.items()
+    }
+
+
+def _lacking(path: Path | str, missing: Sequence[str], found: Sequence[str]) -> ValueError:
+    return ValueError(
+        f"{path} has no {', '.join(missing)}: transitions are read from files like those of DSRL "
+        f"or Minari. What it has: {', '.join(sorted(found)) or 'nothing'}."
+    )
+
+
+def _columns(arrays: Arrays) -> Iterator[tuple[NestedKey, torch.Tensor]]:
+    """Tensors [1, M, n], numbers as float32 and flags as bool."""
+    for key, array in arrays.items():
+        column = torch.from_numpy(array.reshape(len(array), -1)).unsqueeze(0)
+        yield key, column if key in _FLAGS else column.float()

@@ -1,15 +1,23 @@
-"""TorchRL collectors with the settings that on-policy training on batched environments needs."""
+"""The collectors that a configuration can name, with the settings that training needs."""
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable
+from typing import Any
 
 import torch
 from tensordict import TensorDictBase
-from torchrl.collectors import Collector
+from tensordict.nn import TensorDictModuleBase
+from torchrl.collectors import Collector, MultiSyncCollector
+from torchrl.collectors.distributed import RayCollector
 from torchrl.envs import EnvBase
 
-__all__ = ["make_collector"]
+from safe_rl.collectors.worker_rows import MakeEnv, check_rows, split_rows
+from safe_rl.collectors.workers import Known, WorkerCollector
+from safe_rl.processes import starting_processes
+
+__all__ = ["make_collector", "make_process_collector", "make_ray_collector"]
 
 
 def make_collector(
@@ -66,3 +74,100 @@ def make_collector(
         track_traj_ids=False,
         auto_register_policy_transforms=False,
     )
+
+
+class _ProcessCollector(MultiSyncCollector):
+    """TorchRL's, known while it starts: its processes are what it may for ever wait for."""
+
+    def __init__(self, known: Known, *args: Any, **options: Any) -> None:
+        known(self)
+        super().__init__(*args, **options)
+
+
+def make_process_collector(
+    env: EnvBase,
+    make_env: MakeEnv,
+    policy: TensorDictModuleBase,
+    *,
+    frames_per_batch: int,
+    num_collectors: int,
+    device: torch.device | str,
+) -> WorkerCollector:
+    """Collect in processes of this machine.
+
+    Args:
+        env: The run's environment; its rows are shared out, itself it is not stepped.
+        make_env: Makes an environment like it with fewer rows, in the worker.
+        policy: Policy, whose weights are sent to the workers.
+        frames_per_batch: Steps of all rows together in one batch, N·T.
+        num_collectors: Number of processes, W, that divides N.
+        device: Device of policy and batches.
+
+    Raises:
+        ValueError: If N is not a multiple of W, or ``frames_per_batch`` of N.
+    """
+    check_rows(env, num_collectors, frames_per_batch)
+
+    def start(known: Known) -> None:
+        makers = split_rows(env, make_env, num_collectors)
+        with starting_processes():
+            _ProcessCollector(
+                known,
+                makers,
+                policy,
+                frames_per_batch=frames_per_batch,
+                total_frames=-1,
+                policy_device="cpu",
+                env_device="cpu",
+                storing_device="cpu",
+                cat_results=0,
+                use_buffers=True,
+                auto_register_policy_transforms=False,
+            )
+
+    return WorkerCollector(start, env.batch_size.numel(), torch.device(device))
+
+
+def make_ray_collector(
+    env: EnvBase,
+    make_env: MakeEnv,
+    policy: TensorDictModuleBase,
+    *,
+    frames_per_batch: int,
+    num_collectors: int,
+    device: torch.device | str,
+    ray_init: dict[str, Any],
+    resources: dict[str, Any],
+) -> WorkerCollector:
+    """Collect in actors of a Ray cluster.
+
+    Args:
+        env: The run's environment; its rows are shared out, itself it is not stepped.
+        make_env: Makes an environment like it with fewer rows, in the worker.
+        policy: Policy, whose weights are sent to the workers.
+        frames_per_batch: Steps of all rows together in one batch, N·T.
+        num_collectors: Number of actors, W, that divides N.
+        device: Device of policy and batches.
+        ray_init: Arguments of ``ray.init``, such as ``address``.
+        resources: Of every actor: ``num_cpus``, ``num_gpus``, ``memory``.
+
+    Raises:
+        ValueError: If N is not a multiple of W, or ``frames_per_batch`` of N.
+    """
+    check_rows(env, num_collectors, frames_per_batch)
+
+    def start(known: Known) -> None:
+        known(
+            RayCollector(
+                split_rows(env, make_env, num_collectors),
+                policy,
+                frames_per_batch=frames_per_batch,
+                total_frames=sys.maxsize,
+                sync=True,
+                ray_init_config=ray_init,
+                remote_configs=resources,
+                num_collectors=num_collectors,
+            )
+        )
+
+    return WorkerCollector(start, env.batch_size.numel(), torch.device(device))

@@ -1,29 +1,19 @@
-"""Collection by several processes, on this machine or on others.
-
-Every worker steps a share of the rows of one batched environment, see `safe_rl.collectors.shares`.
-"""
+"""Batches from workers, on this machine or on others, and the end of workers that do not end."""
 
 from __future__ import annotations
 
-import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, wait
+from multiprocessing.queues import Queue
 from threading import Thread
 from typing import Any
 
 import torch
 from tensordict import TensorDictBase
-from tensordict.nn import TensorDictModuleBase
-from torchrl.collectors import MultiSyncCollector
-from torchrl.collectors.distributed import RayCollector
-from torchrl.envs import EnvBase
 
-from safe_rl.collectors.ahead import behind
-from safe_rl.collectors.ending import end_processes
-from safe_rl.collectors.shares import MakeEnv, check_shares, share_rows
-from safe_rl.processes import is_stopped, starting_processes
+from safe_rl.processes import is_stopped
 
-__all__ = ["WorkerCollector", "make_process_collector", "make_ray_collector"]
+__all__ = ["Known", "WorkerCollector", "kill_workers"]
 
 Known = Callable[[Any], None]
 """Takes note of a collector of TorchRL's."""
@@ -42,8 +32,6 @@ class WorkerCollector:
             soon as it has processes, to the function that ``start`` is given.
         num_envs: Rows of all workers together, N.
         device: Device of the batches.
-        refresh: None, or what a batch is put through if the workers are to collect the next one
-            while it is learned from: it is then of the policy before the last update.
     """
 
     def __init__(
@@ -51,19 +39,12 @@ class WorkerCollector:
         start: Callable[[Known], Any],
         num_envs: int,
         device: torch.device,
-        refresh: Callable[[TensorDictBase], TensorDictBase] | None = None,
     ) -> None:
         self.storing_device = device
         self._start = start
         self._workers: Any = None
         self._num_envs = num_envs
-        self._refresh = refresh
         self._looks = 0
-
-    @property
-    def updates_behind(self) -> int:
-        """Updates of the policy that a batch comes too early for: 1 if it is collected ahead."""
-        return int(self._refresh is not None)
 
     def __iter__(self) -> Iterator[TensorDictBase]:
         """Start the workers and collect without end.
@@ -75,15 +56,9 @@ class WorkerCollector:
         batches = iter(self._workers)
         asked = _begin(lambda: next(batches))
         while True:
-            batch = self._wait_for(asked).reshape(self._num_envs, -1).to(self.storing_device)
-            if self._refresh is not None:
-                batch = self._refresh(batch)
-            else:
-                yield batch
+            yield self._wait_for(asked).reshape(self._num_envs, -1).to(self.storing_device)
             self._wait_for(_begin(self._workers.update_policy_weights_))
             asked = _begin(lambda: next(batches))
-            if self._refresh is not None:
-                yield batch
 
     def _known(self, workers: Any) -> None:
         """Take note of TorchRL's collector, which is told while it still starts its processes."""
@@ -97,7 +72,7 @@ class WorkerCollector:
         if failure is None:
             return asked.result()
         self._check_workers()
-        end_processes(self._workers)
+        kill_workers(self._workers)
         raise failure
 
     def _check_workers(self) -> None:
@@ -115,7 +90,7 @@ class WorkerCollector:
             if ended
             else f"stands still (process {stopped[0]} was stopped by a signal)"
         )
-        end_processes(self._workers)
+        kill_workers(self._workers)
         raise RuntimeError(
             f"A worker of the collector {reason}. The last checkpoint is whole: continue with "
             "resume=."
@@ -124,7 +99,7 @@ class WorkerCollector:
     def kill(self) -> None:
         """End the workers at once, whatever they are at; those on other machines as they end."""
         if getattr(self._workers, "procs", None):
-            end_processes(self._workers)
+            kill_workers(self._workers)
         else:
             self.shutdown()
 
@@ -148,106 +123,33 @@ def _begin(call: Callable[[], Any]) -> Future[Any]:
     return asked
 
 
-class _ProcessCollector(MultiSyncCollector):
-    """TorchRL's, known while it starts: its processes are what it may for ever wait for."""
-
-    def __init__(self, known: Known, *args: Any, **options: Any) -> None:
-        known(self)
-        super().__init__(*args, **options)
-
-
-def make_process_collector(
-    env: EnvBase,
-    make_env: MakeEnv,
-    policy: TensorDictModuleBase,
-    *,
-    frames_per_batch: int,
-    num_collectors: int,
-    device: torch.device | str,
-    ahead: bool = False,
-) -> WorkerCollector:
-    """Collect in processes of this machine.
+def kill_workers(collector: Any) -> None:
+    """Kill the processes of a collector, and let go of all that this one would wait for.
 
     Args:
-        env: The run's environment; its rows are shared out, itself it is not stepped.
-        make_env: Makes an environment like it with fewer rows, in the worker.
-        policy: Policy, whose weights are sent to the workers.
-        frames_per_batch: Steps of all rows together in one batch, N·T.
-        num_collectors: Number of processes, W, that divides N.
-        device: Device of policy and batches.
-        ahead: Whether every batch is collected while the one before is learned from: the cores
-            have more to do, and a batch is of the policy before the last update.
-
-    Raises:
-        ValueError: If N is not a multiple of W, or ``frames_per_batch`` of N, or the policy has a
-            memory and is to collect ahead.
+        collector: TorchRL's; None if it has failed before it came to have any.
     """
-    check_shares(env, num_collectors, frames_per_batch)
-    # the weights of a policy lie where the workers read them, also while they step
-    is_present = policy, lambda: None, None
-    acting, catch_up, refresh = behind(policy, env.action_keys) if ahead else is_present
-
-    def start(known: Known) -> None:
-        catch_up()  # since it was built, the policy may have got the weights of a checkpoint
-        shares = share_rows(env, make_env, num_collectors)
-        with starting_processes():
-            _ProcessCollector(
-                known,
-                shares,
-                acting,
-                frames_per_batch=frames_per_batch,
-                total_frames=-1,
-                policy_device="cpu",
-                env_device="cpu",
-                storing_device="cpu",
-                cat_results=0,
-                use_buffers=True,
-                auto_register_policy_transforms=False,
-            )
-
-    return WorkerCollector(start, env.batch_size.numel(), torch.device(device), refresh)
+    if collector is None:
+        return
+    processes = [p for p in getattr(collector, "procs", []) if not p._closed]
+    for process in processes:
+        process.kill()
+    for process in processes:
+        process.join(timeout=5.0)
+    # weights on their way to a process that is no more: Python would wait for them at exit, and for
+    # a thread that the schemes begin when they are deleted then
+    schemes = (getattr(collector, "_weight_sync_schemes", None) or {}).values()
+    for holder in (collector, *schemes):
+        for queue in _queues(vars(holder).values()):
+            queue.cancel_join_thread()
+    for scheme in schemes:
+        scheme.shutdown()
+    collector.closed = True
 
 
-def make_ray_collector(
-    env: EnvBase,
-    make_env: MakeEnv,
-    policy: TensorDictModuleBase,
-    *,
-    frames_per_batch: int,
-    num_collectors: int,
-    device: torch.device | str,
-    ray_init: dict[str, Any],
-    resources: dict[str, Any],
-) -> WorkerCollector:
-    """Collect in actors of a Ray cluster.
-
-    Args:
-        env: The run's environment; its rows are shared out, itself it is not stepped.
-        make_env: Makes an environment like it with fewer rows, in the worker.
-        policy: Policy, whose weights are sent to the workers.
-        frames_per_batch: Steps of all rows together in one batch, N·T.
-        num_collectors: Number of actors, W, that divides N.
-        device: Device of policy and batches.
-        ray_init: Arguments of ``ray.init``, such as ``address``.
-        resources: Of every actor: ``num_cpus``, ``num_gpus``, ``memory``.
-
-    Raises:
-        ValueError: If N is not a multiple of W, or ``frames_per_batch`` of N.
-    """
-    check_shares(env, num_collectors, frames_per_batch)
-
-    def start(known: Known) -> None:
-        known(
-            RayCollector(
-                share_rows(env, make_env, num_collectors),
-                policy,
-                frames_per_batch=frames_per_batch,
-                total_frames=sys.maxsize,
-                sync=True,
-                ray_init_config=ray_init,
-                remote_configs=resources,
-                num_collectors=num_collectors,
-            )
-        )
-
-    return WorkerCollector(start, env.batch_size.numel(), torch.device(device))
+def _queues(values: Iterable[Any]) -> Iterator[Queue]:
+    for value in values:
+        if isinstance(value, Queue):
+            yield value
+        elif isinstance(value, dict):
+            yield from _queues(value.values())

@@ -61,7 +61,6 @@ ROLES: dict[str, Role] = {
     "loss.alpha_init": Role.EXPERIMENT,
     "*._target_": Role.EXPERIMENT,
     "collector": Role.MANNER,
-    "collector.ahead": Role.EXPERIMENT,  # learns from batches of the policy before the last update
     "collector.ray_init": Role.MACHINE,
     "default_cost_limits": Role.MANNER,
     "evaluation": Role.MANNER,
@@ -88,7 +87,6 @@ ROLES: dict[str, Role] = {
 _ABSENT = {"algo._target_": "safe_rl.algorithms.OnPolicy"}
 # likewise; they say nothing where they have these values
 _SILENT: dict[str, Hashable] = {
-    "collector.ahead": False,
     "env.outside": None,
     **dict.fromkeys(
         [f"env.{part}_scale" for part in ("mass", "friction", "damping", "strength")], 1.0

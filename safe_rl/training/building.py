@@ -16,7 +16,7 @@ from safe_rl.algorithms.constraints import check_cost_limits
 from safe_rl.algorithms.contract import Algorithm
 from safe_rl.algorithms.parts import find_recipe
 from safe_rl.collectors import Recording, WorkerCollector, make_collector
-from safe_rl.collectors.shares import MakeEnv
+from safe_rl.collectors.worker_rows import MakeEnv
 from safe_rl.runs.record import RunRecord
 from safe_rl.targets import build
 from safe_rl.training.trainer import Evaluator, Trainer

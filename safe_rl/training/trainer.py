@@ -107,13 +107,11 @@ class Trainer:
 
     def _find_candidates(self, over: int, limits: Mapping[str, float]) -> Candidates:
         steps = self._frames_per_batch / self._env.batch_size.numel()
-        # a batch that is collected ahead is of the policy before
-        behind = getattr(self._collector, "updates_behind", 0)
         return Candidates(
             {name: part for name, part in self._parts().items() if name not in _TO_GO_ON},
             limits,
             over=over,
-            delay=lambda length: behind + epochs_until_judged(over, length, steps),
+            delay=lambda length: epochs_until_judged(over, length, steps),
             longest=self.episode_length,
         )
 

@@ -15,7 +15,7 @@ import torch
 from point_mass import PointMass
 
 from safe_rl.collectors import WorkerCollector, make_process_collector, make_ray_collector
-from safe_rl.collectors.shares import share_rows
+from safe_rl.collectors.worker_rows import split_rows
 from safe_rl.envs import SafetyGymEnv, make_env
 from safe_rl.envs.transforms import transform_env
 from safe_rl.models import BehaviourPolicy, make_actor
@@ -26,7 +26,7 @@ MAKE = partial(SafetyGymEnv, CONFIG, seed=3, num_threads=1)
 
 def test_workers_step_the_rows_that_one_process_would():
     whole = MAKE(num_envs=6)
-    shares = [make() for make in share_rows(whole, MAKE, num_collectors=3)]
+    shares = [make() for make in split_rows(whole, MAKE, num_collectors=3)]
     expected = whole.reset()["observation"]
     rows = torch.cat([share.reset()["observation"] for share in shares])
     assert torch.equal(rows, expected)
@@ -37,7 +37,7 @@ def test_workers_have_the_noise_that_the_rows_of_one_process_would():
     noise = {"noise": {"_target_": "safe_rl.envs.transforms.SensorNoise", "std": 0.5}}
     make = partial(make_env, CONFIG, seed=3, num_threads=1, transforms=noise)
     whole = make(num_envs=4)
-    shares = [make() for make in share_rows(whole, make, num_collectors=2)]
+    shares = [make() for make in split_rows(whole, make, num_collectors=2)]
     expected = whole.reset()["observation"]
     rows = torch.cat([share.reset()["observation"] for share in shares])
     assert torch.equal(rows, expected)
@@ -58,7 +58,7 @@ def test_workers_have_seeds_and_a_schedule_also_where_worlds_cannot_be_stored():
 
     whole = make(num_envs=4)
     whole.continue_from(8)
-    starts = [make().reset()["observation"] for make in share_rows(whole, make, num_collectors=2)]
+    starts = [make().reset()["observation"] for make in split_rows(whole, make, num_collectors=2)]
     assert not torch.isclose(*(start[:, :2] for start in starts)).all(-1).any()
     for start in starts:
         assert start[:, -1].tolist() == pytest.approx([0.625] * 2)
@@ -71,7 +71,7 @@ class Seeding(PointMass):
 
 
 def test_workers_have_noise_of_their_own_whatever_seeding_does():
-    shares = share_rows(Seeding(4), Seeding, num_collectors=2)
+    shares = split_rows(Seeding(4), Seeding, num_collectors=2)
     drawn = [(make(), torch.rand(3).tolist())[1] for make in shares]
     assert drawn[0] != drawn[1]
 

@@ -16,7 +16,7 @@ from commands import run_train
 from torchrl.envs.utils import check_env_specs
 
 from safe_rl.cli import evaluate, report
-from safe_rl.collectors.shares import share_rows
+from safe_rl.collectors.worker_rows import split_rows
 from safe_rl.envs import ConfigError, complete_env, make_env
 from safe_rl.runs.table import read_table
 
@@ -140,7 +140,7 @@ def test_seeds_determine_rows_and_share_none():
 
 def test_workers_without_a_state_to_go_on_from_have_rows_of_their_own():
     make = partial(make_env, NODE, seed=0)
-    shares = [make() for make in share_rows(make(num_envs=4), make, num_collectors=2)]
+    shares = [make() for make in split_rows(make(num_envs=4), make, num_collectors=2)]
     rows = [share.reset()["observation"][:, 0].tolist() for share in shares]
     assert len({*rows[0], *rows[1]}) == 4
 

@@ -17,7 +17,7 @@ from torchrl.envs.utils import check_env_specs
 
 from safe_rl import targets
 from safe_rl.cli import evaluate, report
-from safe_rl.collectors.shares import share_rows
+from safe_rl.collectors.worker_rows import split_rows
 from safe_rl.envs import ConfigError, complete_env, make_env
 from safe_rl.envs.torchrl.nodes import ROWS
 from safe_rl.runs.table import read_table
@@ -221,7 +221,7 @@ def test_workers_have_rows_of_their_own():
     def make(num_envs=1, seed=0):
         return make_env(PENDULUM, num_envs=num_envs, seed=seed)
 
-    shares = [share() for share in share_rows(make(num_envs=4), make, num_collectors=2)]
+    shares = [share() for share in split_rows(make(num_envs=4), make, num_collectors=2)]
     rows = [share.reset()["th"].tolist() for share in shares]
     assert len({*rows[0], *rows[1]}) == 4
 

@@ -63,7 +63,6 @@ def test_folders_of_a_sweep_name_all_but_the_machine_and_what_is_in_the_path(all
         ("logger._target_", Role.MACHINE),
         ("note", Role.MANNER),
         ("collector._target_", Role.MANNER),
-        ("collector.ahead", Role.EXPERIMENT),
         ("hydra.verbose", Role.MACHINE),
         ("hydra.run.dir", Role.MANNER),
         ("env.hazards_num", Role.EXPERIMENT),
@@ -94,10 +93,7 @@ def test_where_transitions_are_kept_makes_no_other_experiment(override):
 
 @pytest.mark.parametrize(
     "override",
-    [
-        *("frames=7", "policy_update.max_kl=0.1", "cost_limits={cost: 3}", "env.name=Other"),
-        "collector=ahead",  # batches are of an older policy
-    ],
+    ["frames=7", "policy_update.max_kl=0.1", "cost_limits={cost: 3}", "env.name=Other"],
 )
 def test_everything_else_does(override):
     assert experiment_of(as_saved(override)) != experiment_of(as_saved())

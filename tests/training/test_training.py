@@ -139,19 +139,6 @@ def test_what_the_end_of_a_shorter_run_said_of_the_best_is_forgotten(tmp_path, m
     assert best_of(tmp_path / "halves") == best_of(tmp_path / "whole") == expected
 
 
-def test_a_policy_that_collects_an_epoch_later_is_judged_an_epoch_later(tmp_path):
-    row = {"epoch": 1, "steps": 160, "episode_return": 1.0, "episode_cost": 0.0}
-    epochs = {}
-    for collector in ("local", "ahead"):
-        config = point_mass_config("algo=ppo", f"collector={collector}")
-        env = PointMass(config.num_envs, 20, config.seed)
-        trainer = build_trainer(config, env, tmp_path / collector, PointMass)
-        candidates = trainer.components()["candidates"]
-        epochs[collector] = next(count for count in itertools.count(1) if candidates.add(row))
-        trainer.close()
-    assert epochs["ahead"] == epochs["local"] + 1
-
-
 def test_the_last_checkpoint_comes_after_the_best_ones(tmp_path, monkeypatch):
     # a run that is killed in between is not finished, and resumes
     found = []

@@ -1,4 +1,4 @@
-"""The shares of a batched environment's rows that workers step.
+"""The rows of a batched environment that each worker steps.
 
 Every worker has the seeds that its rows have in a single process, so that a run meets the same kind
 of episodes however it is spread.
@@ -17,7 +17,7 @@ from torchrl.envs import EnvBase
 
 from safe_rl.processes import leave_signals_to_parent
 
-__all__ = ["MakeEnv", "check_shares", "share_rows"]
+__all__ = ["MakeEnv", "check_rows", "split_rows"]
 
 
 class MakeEnv(Protocol):
@@ -28,7 +28,7 @@ class MakeEnv(Protocol):
         ...
 
 
-def check_shares(env: EnvBase, num_collectors: int, frames_per_batch: int) -> None:
+def check_rows(env: EnvBase, num_collectors: int, frames_per_batch: int) -> None:
     """Refuse numbers that cannot be shared equally."""
     num_envs = env.batch_size.numel()
     if num_collectors < 1 or num_envs % num_collectors or frames_per_batch % num_envs:
@@ -39,7 +39,7 @@ def check_shares(env: EnvBase, num_collectors: int, frames_per_batch: int) -> No
         )
 
 
-def share_rows(env: EnvBase, make_env: MakeEnv, num_collectors: int) -> list[Callable[[], EnvBase]]:
+def split_rows(env: EnvBase, make_env: MakeEnv, num_collectors: int) -> list[Callable[[], EnvBase]]:
     """Functions that make every worker's environment, with its share of the rows of ``env``.
 
     An environment with ``get_state`` and ``set_state`` has its rows continued by the workers, from
@@ -56,12 +56,12 @@ def share_rows(env: EnvBase, make_env: MakeEnv, num_collectors: int) -> list[Cal
     rows = env.batch_size.numel() // num_collectors
     before = getattr(env, "steps_before", 0)
     return [
-        partial(_make_share, make_env, rows, state, seed, before)
+        partial(_make_rows, make_env, rows, state, seed, before)
         for state, seed in zip(states, seeds, strict=True)
     ]
 
 
-def _make_share(
+def _make_rows(
     make_env: MakeEnv, num_envs: int, state: TensorDictBase | None, seed: int, steps_before: int
 ) -> EnvBase:
     # of the policy's noise: every worker needs its own
