@@ -9,12 +9,16 @@ from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import algorithm_pages
+import algorithm_results
+import curves
 import mujoco
 from campaigns import campaigns
 from run_keys import run_keys
 from tables import table as _table
+from velocity_tables import velocity_runs
 
-from safe_rl.envs import EXTRAS, SUITE, SafetyGymConfig, SafetyGymEnv, key_table
+from safe_rl.envs import EXTRAS, SUITE, SafetyGymEnv, key_table
 from safe_rl.envs.safety_gym.config_keys import Vocabulary
 from safe_rl.envs.safety_gym.costs import COSTS, EXCEPTION_KEY
 from safe_rl.envs.safety_gym.elements import ELEMENTS
@@ -22,7 +26,7 @@ from safe_rl.envs.velocity import VELOCITY_SUITE, VelocityEnv
 from safe_rl.envs.velocity.config import VelocityConfig
 
 _NAMES = ("Point", "Car", "Doggo")
-_ROBOTS = Path(inspect.getfile(SafetyGymConfig)).parents[1] / "robots"
+_ROBOTS = Path(inspect.getfile(SafetyGymEnv)).parent / "robots"
 
 
 class Component(NamedTuple):
@@ -86,7 +90,7 @@ _UNITS = {
     "touch": "N",
 }
 _SUITE_HEADS = ("`env=`", "observation", "actions", "costs", "objects")
-_MARK = re.compile(r"<!-- made: (\w+) -->")
+_MARK = re.compile(r"<!-- made: (\w+) ?(.*?) -->")
 
 
 def benchmark() -> str:
@@ -175,12 +179,15 @@ def robots() -> str:
     return "\n".join(text)
 
 
-# what a page has where it says `<!-- made: name -->`
-TABLES: dict[str, Callable[[], str]] = {
+# what a page has where it says `<!-- made: name -->`, or `<!-- made: name words -->`
+TABLES: dict[str, Callable[..., str]] = {
     table.__name__: table
     for table in (
         *(benchmark, debug, velocity, keys, observations, lidars, costs, robots),
-        *(campaigns, run_keys),
+        *(campaigns, run_keys, velocity_runs, curves.curves),
+        *(algorithm_pages.settings, algorithm_pages.columns, algorithm_pages.loop),
+        *(algorithm_results.measured, algorithm_results.compared, algorithm_results.timed),
+        algorithm_results.spread_of_times,
     )
 }
 
@@ -191,7 +198,7 @@ def fill(markdown: str) -> str:
     Raises:
         KeyError: If there is no such table.
     """
-    return _MARK.sub(lambda match: TABLES[match[1]](), markdown)
+    return _MARK.sub(lambda match: TABLES[match[1]](*filter(None, [match[2]])), markdown)
 
 
 def component_of(name: str) -> Component:

@@ -7,6 +7,7 @@ from pathlib import Path
 import api
 import campaigns
 import catalogue
+import curves
 import equations
 import links
 import navigation
@@ -28,8 +29,9 @@ def on_config(config: MkDocsConfig) -> None:
 def on_files(files: Files, config: MkDocsConfig) -> None:
     """Add the pages that are made, and those of files that pages link to."""
     made = api.pages() | {page: (ROOT / source).read_text() for page, source in links.PAGES.items()}
-    for uri, text in (made | {"report.html": campaigns.report()}).items():
-        files.append(File.generated(config, uri, content=text))
+    drawn = {f"algorithms/{algo}.png": picture for algo, picture in curves.pictures().items()}
+    for uri, content in (made | drawn | {"report.html": campaigns.report()}).items():
+        files.append(File.generated(config, uri, content=content))
     texts = {page.src_uri: page.content_string for page in files.documentation_pages()}
     for uri, text in links.linked_files(texts, ROOT).items():
         page = File.generated(config, uri, content=text, inclusion=InclusionLevel.NOT_IN_NAV)

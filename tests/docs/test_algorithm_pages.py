@@ -1,29 +1,27 @@
-"""Pages that are made are what their sources make of them; loops of the algorithms run."""
+"""Pages of the algorithms: what each begins with, its settings; its training loop runs."""
 
 import re
-import sys
-from pathlib import Path
 
+import algorithm_pages
 import pytest
-
-DOCS = Path(__file__).resolve().parents[2] / "docs"
-sys.path.insert(0, str(DOCS))
-
-import generate_algorithms  # noqa: E402
-
-PAGES = generate_algorithms.pages()
-PPO_LAGRANGIAN = PAGES["algorithms/ppo_lagrangian.md"]
-WITH_LOOP = [name for name in PAGES if Path(name).stem in generate_algorithms.TEXTS]
+from made import ALGORITHMS, made, page_of
 
 
-@pytest.mark.parametrize("name", PAGES)
-def test_pages_are_up_to_date(name):
-    advice = "run python docs/generate_algorithms.py"
-    assert (DOCS / name).read_text() == PAGES[name], advice
+@pytest.mark.parametrize("algo", ALGORITHMS)
+def test_a_page_begins_with_what_it_is_for_and_a_command(algo):
+    page = page_of(algo)
+    places = [page.find(f"\n{words}") for words in ("**What it is for.**", "**When to use it.**")]
+    places.append(page.find(f"```\npython train.py env=PointGoal1 algo={algo}"))
+    places.append(page.find("\n$$"))
+    assert places == sorted(places)
+    assert places[0] > 0
+    assert made(page, "settings") == algo
+    assert algo == "bc" or made(page, "curves") == made(page, "measured") == algo
 
 
 def test_settings_of_both_presets_have_rows_where_their_classes_differ():
-    rows = re.findall(r"^\| `(lagrangian\.\w+)` \| (\S+) \| (\S+) \|", PPO_LAGRANGIAN, re.MULTILINE)
+    table = algorithm_pages.settings("ppo_lagrangian")
+    rows = re.findall(r"^\| `(lagrangian\.\w+)` \| (\S+) \| (\S+) \|", table, re.MULTILINE)
     found = {key: (default, paper) for key, default, paper in rows}
     assert found["lagrangian._target_"] == ("`PIMultiplier`", "`LagrangeMultiplier`")
     assert found["lagrangian.init"] == ("`0.0`", "`1.0`")
@@ -31,14 +29,9 @@ def test_settings_of_both_presets_have_rows_where_their_classes_differ():
     assert found["lagrangian.saturation"][1] == "—"
 
 
-@pytest.mark.parametrize("name", WITH_LOOP)
-def test_the_loop_of_ones_own_runs(name):
-    snippets = re.findall(r"```python\n(.*?)```", PAGES[name], re.DOTALL)
-    assert len(snippets) == 1
-    exec(snippets[0], {})
-
-
-@pytest.mark.parametrize("name", PAGES)
-def test_links_lead_somewhere(name):
-    for target in re.findall(r"\]\(([^)#<]+)[)#]", PAGES[name]):
-        assert target.startswith("http") or (DOCS / name).parent.joinpath(target).exists(), target
+@pytest.mark.parametrize("algo", ALGORITHMS)
+def test_the_loop_of_ones_own_runs(algo):
+    (loop,) = re.findall(
+        r"```python\n(.*?)```", algorithm_pages.loop(made(page_of(algo), "loop")), re.S
+    )
+    exec(loop, {})

@@ -3,7 +3,7 @@
 import re
 
 import pytest
-import yaml
+from made import ALGORITHMS, columns_of
 from omegaconf import OmegaConf
 from point_mass import PointMass
 from run_configs import CONF, compose_config, point_mass_config
@@ -16,20 +16,18 @@ from safe_rl.training.building import build_trainer
 FOLDER = CONF.parent / "docs" / "algorithms"
 PAGE = (FOLDER / "index.md").read_text()
 COSTS, LIMITED = PointMass.cost_keys, ["cost_hazards", "cost_north"]
-TEXTS = yaml.safe_load((FOLDER / "pages.yaml").read_text())
 
 
 def composed(algo):
     return compose_config(f"algo={algo}", "env=PointMass")
 
 
-FROM_MEMORY = {algo for algo in TEXTS if find_recipe(composed(algo)) is OffPolicy}
-TABLES = {algo: texts["columns"] for algo, texts in TEXTS.items() if algo not in FROM_MEMORY}
+FROM_MEMORY = {algo for algo in ALGORITHMS if find_recipe(composed(algo)) is OffPolicy}
+TABLES = {algo: columns_of(algo) for algo in ALGORITHMS if algo not in FROM_MEMORY}
 
 
 def test_every_algorithm_has_a_page_and_is_in_the_lists():
-    assert set(TEXTS) == {path.stem for path in (CONF / "algo").glob("*.yaml")}
-    assert all(f"| [`{algo}`]({algo}.md) |" in PAGE for algo in TEXTS)
+    assert all(f"| [`{algo}`]({algo}.md) |" in PAGE for algo in ALGORITHMS)
     page = (FOLDER.parent / "off_policy.md").read_text()
     assert all(f"| [`{algo}`](algorithms/{algo}.md) |" in page for algo in FROM_MEMORY)
 

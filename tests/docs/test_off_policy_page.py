@@ -3,7 +3,7 @@
 import re
 
 import pytest
-import yaml
+from made import ALGORITHMS, columns_of
 from omegaconf import OmegaConf
 from point_mass import PointMass
 from run_configs import CONF, compose_config
@@ -14,8 +14,8 @@ from safe_rl.training.building import build_trainer
 
 PAGE = (CONF.parent / "docs" / "off_policy.md").read_text()
 ALL = (CONF.parent / "docs" / "algorithms" / "index.md").read_text()
-TEXTS = yaml.safe_load((CONF.parent / "docs" / "algorithms" / "pages.yaml").read_text())
-TABLES = {algo: t["columns"] for algo, t in TEXTS.items() if "memory" in t["columns"]}
+COLUMNS = {algo: columns_of(algo) for algo in ALGORITHMS}
+TABLES = {algo: names for algo, names in COLUMNS.items() if "memory" in names}
 
 
 def columns(page, name, cost):

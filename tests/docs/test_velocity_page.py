@@ -1,35 +1,37 @@
 """The table of the velocity campaign: of all runs that there are, and none that there are not."""
 
-import csv
-import gzip
 import re
-import sys
-from pathlib import Path
 
+import archived_runs
 import numpy as np
 import pytest
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "docs"))
-
-from velocity_results import ARCHIVE, PUBLISHED, velocity_page
+from velocity_tables import ARCHIVE, PUBLISHED, velocity_runs
 
 from safe_rl.envs.velocity import VELOCITY_SUITE
 from safe_rl.reporting.campaigns import PLAN, read_plan
+from safe_rl.reporting.recorded import Run
 
 STEPS = np.arange(20_000, 1_000_001, 20_000)
 
 
-def write_run(archive, env, seed, frames=1_000_000):
-    """A table with a number of its own in every epoch; returns what its last quarter comes to."""
+@pytest.fixture
+def runs(monkeypatch):
+    """Runs by environment and algorithm, and then by seed, as those of an archive."""
+    found = {}
+    monkeypatch.setattr(archived_runs, "runs_of", lambda _: found)
+    return found
+
+
+def add_run(runs, env, seed, frames=1_000_000):
+    """A run with a number of its own in every epoch; returns what its last quarter comes to."""
     rng = np.random.default_rng(seed)
     returns, costs = rng.uniform(900, 3000, STEPS.size), rng.uniform(10, 40, STEPS.size)
-    folder = archive / env / "ppo_lagrangian" / f"seed{seed}"
-    folder.mkdir(parents=True)
-    with gzip.open(folder / "progress.csv.gz", "wt") as file:
-        table = csv.writer(file)
-        table.writerow(["steps", "episode_return", "episode_cost", "cost_rate"])
-        rows = zip(STEPS, returns, costs, costs / 1000, strict=True)
-        table.writerows(row for row in rows if row[0] <= frames)
+    columns = {"steps": STEPS, "episode_return": returns, "episode_cost": costs}
+    columns["cost_rate"] = costs / 1000
+    epochs = frames // 20_000
+    table = {name: column[:epochs].tolist() for name, column in columns.items()}
+    run = Run(ARCHIVE, {}, table, frames=1_000_000)
+    runs.setdefault((env, "ppo_lagrangian"), {})[seed] = run
     late = STEPS > 750_000
     return returns[late].mean(), costs[late].mean(), (costs[late] > 25).mean()
 
@@ -39,17 +41,11 @@ def row_of(page, env):
     return row.split(" | ")
 
 
-@pytest.fixture
-def archive(tmp_path):
-    (tmp_path / PLAN).write_text((ARCHIVE / PLAN).read_text())
-    return tmp_path
-
-
-def test_runs_are_averaged_over_the_last_quarter_and_missing_ones_named(archive):
-    measured = np.array([write_run(archive, "SafeHopperVelocity", seed) for seed in (300, 302)])
-    alone = write_run(archive, "SafeAntVelocity", 301)
-    write_run(archive, "SafeAntVelocity", 302, frames=600_000)  # interrupted
-    page = velocity_page(archive)
+def test_runs_are_averaged_over_the_last_quarter_and_missing_ones_named(runs):
+    measured = np.array([add_run(runs, "SafeHopperVelocity", seed) for seed in (300, 302)])
+    alone = add_run(runs, "SafeAntVelocity", 301)
+    add_run(runs, "SafeAntVelocity", 302, frames=600_000)  # interrupted
+    page = velocity_runs()
     mean, deviation = measured.mean(0), measured.std(0, ddof=1)
     assert row_of(page, "SafeHopperVelocity")[:4] == [
         "2",
@@ -65,13 +61,13 @@ def test_runs_are_averaged_over_the_last_quarter_and_missing_ones_named(archive)
     assert "`SafeHopperVelocity` (301)" in missing
 
 
-def test_nothing_is_missing_where_all_is_done(archive):
-    for cell in read_plan(archive / PLAN):
+def test_nothing_is_missing_where_all_is_done(runs):
+    for cell in read_plan(ARCHIVE / PLAN):
         for seed in cell.seeds:
-            write_run(archive, cell.chosen["env"], seed)
-    page = velocity_page(archive)
-    assert "All runs are done." in page
+            add_run(runs, cell.chosen["env"], seed)
+    page = velocity_runs()
     assert "none yet" not in page
+    assert "Not run yet" not in page
 
 
 def test_the_campaign_is_of_the_whole_family():

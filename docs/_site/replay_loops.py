@@ -1,4 +1,4 @@
-"""What the pages of algorithms that learn from memory have of their own: settings, and a loop."""
+"""What the pages of off-policy algorithms have of their own: settings, and a loop."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _SECTIONS = ("critics", "exploration", "dataset")
 _SIZES = "hidden_sizes=[64, 64]"
 
 
-def learns_from_memory(config: DictConfig) -> bool:
+def is_off_policy(config: DictConfig) -> bool:
     """Whether a configuration is that of an off-policy algorithm."""
     return OmegaConf.select(config, "algo._target_") == "safe_rl.algorithms.OffPolicy"
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
-import replay_pages
+import replay_loops
 from omegaconf import DictConfig, OmegaConf
 
 from safe_rl.cli.settings import keys_of_part
@@ -13,7 +13,7 @@ from safe_rl.targets import locate
 
 # nodes of a configuration that are an algorithm's own
 NODES = ("loss", "policy_update", "lagrangian", "then.projection.loss")
-NODES += ("then.projection.policy_update", *replay_pages.NODES)
+NODES += ("then.projection.policy_update", *replay_loops.NODES)
 
 
 def own_parts(config: DictConfig) -> Iterator[tuple[str, str, dict[str, Any]]]:
@@ -27,12 +27,12 @@ def own_parts(config: DictConfig) -> Iterator[tuple[str, str, dict[str, Any]]]:
 
 
 def setting_table(config: DictConfig, paper: DictConfig) -> str:
-    """Table of an algorithm's settings; the paper has none for those that learn from memory."""
-    if not replay_pages.learns_from_memory(config):
+    """Table of an algorithm's settings; the paper has none for off-policy ones."""
+    if not replay_loops.is_off_policy(config):
         head = ("key", "`preset=default`", "`preset=paper`", "meaning")
         return _table(head, _settings(config, paper))
     rows = [(path, own, meaning) for path, own, _, meaning in _settings(config, config)]
-    rows += [(f"`{key}`", _cell(own), what) for key, own, what in replay_pages.settings(config)]
+    rows += [(f"`{key}`", _cell(own), what) for key, own, what in replay_loops.settings(config)]
     return _table(("key", "default", "meaning"), rows)
 
 

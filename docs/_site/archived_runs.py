@@ -2,34 +2,41 @@
 
 from __future__ import annotations
 
-import csv
-import gzip
-import json
+import math
 from collections.abc import Hashable, Mapping
 from functools import cache
 from pathlib import Path
 from typing import Any
 
-import yaml
-
+from safe_rl.reporting.recorded import Run, find_runs
 from safe_rl.runs.identity import experiment_of
 
 Rows = list[dict[str, float]]
 Settings = Mapping[str, Hashable]
 
 
+@cache
+def runs_of(archive: Path) -> dict[tuple[str, str], dict[int, Run]]:
+    """Runs of a campaign by environment and algorithm, and then by seed."""
+    found: dict[tuple[str, str], dict[int, Run]] = {}
+    for run in sorted(find_runs(archive)[0], key=lambda run: run.seed):
+        env, algo, *_ = run.directory.relative_to(archive).parts
+        found.setdefault((env, algo), {})[run.seed] = run
+    return found
+
+
 def finished_runs(archive: Path, algo: str, env: str, frames: int) -> dict[int, Rows]:
     """Rows of the recorded tables by seed, numbers only, of runs that came to their end."""
-    found = {}
-    for path in sorted((archive / env / algo).glob("seed*/progress.csv.gz")):
-        with gzip.open(path, "rt") as table:
-            rows = [
-                {key: float(value) for key, value in row.items() if value}
-                for row in csv.DictReader(table)
-            ]
-        if rows[-1]["steps"] >= frames:
-            found[int(path.parent.name.removeprefix("seed"))] = rows
-    return found
+    runs = runs_of(archive).get((env, algo), {})
+    return {seed: _rows(run.table) for seed, run in runs.items() if run.steps >= frames}
+
+
+def _rows(table: Mapping[str, list[float]]) -> Rows:
+    lines = zip(*table.values(), strict=True)
+    return [
+        {key: value for key, value in zip(table, line, strict=True) if not math.isnan(value)}
+        for line in lines
+    ]
 
 
 def groups(archive: Path, algo: str, env: str, seeds: list[int]) -> list[tuple[str, list[int]]]:
@@ -39,7 +46,7 @@ def groups(archive: Path, algo: str, env: str, seeds: list[int]) -> list[tuple[s
         Overrides that tell a group from the others, "" if there is one group, and its seeds. A
         setting that one of two runs lacks, because it came later, tells them not apart.
     """
-    settings = {seed: _settings(archive / env / algo / f"seed{seed}") for seed in seeds}
+    settings = {seed: _settings(archive, env, algo, seed) for seed in seeds}
     found: list[list[int]] = []
     for seed in seeds:
         alike = (g for g in found if not _differing(settings[g[0]], settings[seed]))
@@ -59,8 +66,9 @@ def groups(archive: Path, algo: str, env: str, seeds: list[int]) -> list[tuple[s
 
 def certificates(archive: Path, algo: str, env: str, seeds: list[int]) -> str:
     """How many of the runs that were tested are certified: "1 of 2"; a dash if none was."""
-    paths = (archive / env / algo / f"seed{seed}" / "certificate.json" for seed in seeds)
-    tested = [json.loads(path.read_text())["certified"] for path in paths if path.exists()]
+    runs = runs_of(archive)[env, algo]
+    told = [runs[seed].certificate for seed in seeds]
+    tested = [each["checkpoint"] is not None for each in told if each is not None]
     return f"{sum(tested)} of {len(tested)}" if tested else "—"
 
 
@@ -69,7 +77,6 @@ def _differing(some: Settings, others: Settings) -> set[str]:
 
 
 @cache
-def _settings(folder: Path) -> dict[str, Any]:
-    """What names a run's experiment; nothing for one without a configuration."""
-    file = folder / "config.yaml"
-    return experiment_of(yaml.safe_load(file.read_text())) if file.exists() else {}
+def _settings(archive: Path, env: str, algo: str, seed: int) -> dict[str, Any]:
+    """What names a run's experiment."""
+    return experiment_of(runs_of(archive)[env, algo][seed].config)

@@ -1,9 +1,6 @@
-"""Makes the pages of the algorithms, and of results, from what the program itself says.
+"""What the pages of the algorithms show of the program itself: settings, columns, a loop.
 
-``python docs/generate_algorithms.py`` writes docs/algorithms/<name>.md and comparison.md: settings
-from conf/, their meanings from the table of keys, what is logged from docs/algorithms/index.md,
-figures from results/, the rest from docs/algorithms/pages.yaml; and docs/environments/velocity.md.
-Runs get into results/algorithms/ by ``python -m safe_rl.report RUNS archive=results/algorithms``.
+A page is written by hand and has marks where these go: `<!-- made: settings cpo -->`.
 """
 
 from __future__ import annotations
@@ -13,124 +10,47 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-import replay_pages
-import yaml
-from algorithm_results import comparison, measured
+import replay_loops
 from hydra import compose, initialize_config_dir
 from omegaconf import DictConfig, OmegaConf
 from setting_tables import own_parts, setting_table
-from velocity_results import velocity_page
 
 from safe_rl.cli.conf import CONF
 from safe_rl.targets import accepted_names, locate
 
-ROOT = Path(__file__).resolve().parents[1]
-PAGES = ROOT / "docs" / "algorithms"
-TEXTS: dict[str, dict[str, Any]] = yaml.safe_load((PAGES / "pages.yaml").read_text())
-GENERATED = "<!-- made by docs/generate_algorithms.py: change pages.yaml, conf/ or results/ -->"
+DOCS = Path(__file__).resolve().parents[1]
 # what the live arguments are called here
 LIVE = ("actor_network", "multiplier", "constraints", "cost_limits")
-OPTIONAL = ("columns", "loop", "problem", "measured")  # of a page, that others can stand for
 SHOWN = {"actor_network": "actor", "cost_limits": "limits"}
 
-TEMPLATE = """{mark}
-# {title}
 
-`algo={name}` · {source}
-
-**Problem.** {problem}
-
-$$
-{equation}
-$$
-
-{how}
-
-{notation}
-
-## Settings
-
-{keys}
-
-{shared}{limits}.
-
-## What is logged
-
-Besides the columns that [all algorithms](index.md#what-is-logged) have:
-
-{columns}
-
-## In a loop of your own
-
-{parts}
-
-```python
-{snippet}
-```
-
-## Measured
-
-{measured}
-
-## Deviations from the article and from published code
-
-{deviations}
-
-## Known weaknesses
-
-{weaknesses}
-"""
-
-LOSS = {
-    "notation": "Notation, batches, advantages and critics: [overview](index.md#one-epoch).",
-    "shared": "Shared by all algorithms: [presets](index.md#presets)",
-    "parts": "The loss takes any TorchRL policy and any batch with advantages, such as those of "
-    "`VectorGAE` and\n`CostGAE`.",
-}
-STEP = LOSS | {"parts": LOSS["parts"].replace("loss takes", "loss and the step take")}
-REPLAY = {
-    "notation": "Notation, targets, time-outs and multipliers: "
-    "[off-policy algorithms](../off_policy.md#what-is-learned).",
-    "shared": "Shared by all off-policy algorithms: [keys](../off_policy.md#keys)",
-    "parts": "The loss takes any transitions, from a replay buffer or a dataset, and networks of "
-    "your own.",
-}
+def settings(algo: str) -> str:
+    """Keys of the algorithm's own parts, their values in the presets and their meanings."""
+    return setting_table(*(_compose(algo, preset) for preset in ("default", "paper")))
 
 
-def pages() -> dict[str, str]:
-    """All pages by file, below docs/."""
-    written = {f"algorithms/{name}.md": _page(name) for name in TEXTS}
-    # what has a text of its own learns from something else, and is not compared
-    compared = [name for name, texts in TEXTS.items() if "measured" not in texts]
-    written["algorithms/comparison.md"] = f"{GENERATED}\n{comparison(compared)}"
-    return written | {"environments/velocity.md": velocity_page()}
+def columns(names: str) -> str:
+    """Rows of tables of index.md and off_policy.md, named by `<!-- table: columns of … -->`."""
+    pages = ("algorithms/index.md", "off_policy.md")
+    text = "".join((DOCS / page).read_text() for page in pages)
+    tables = [
+        re.search(rf"<!-- table: columns of {name} -->\n(.*?)\n\n", text, re.DOTALL)[1]  # type: ignore[index]
+        for name in names.split()
+    ]
+    rows = [row for table in tables for row in table.splitlines()[2:]]
+    made = "\n".join(["| column | meaning |", "|---|---|", *rows])
+    return made.replace("(#", "(index.md#").replace("(algorithms/", "(")
 
 
-def _page(name: str) -> str:
-    texts = TEXTS[name]
-    config, paper = (_compose(name, preset) for preset in ("default", "paper"))
-    constrained = bool({"constrained", "costs"} & set(texts["columns"]))
-    within = r" subject to $J_{c_i}(\pi) \le d_i$, $i = 1 \dots k$, undiscounted costs per episode"
-    problem = r"$\max_\pi J_r(\pi)$" + (within if constrained else "")
-    is_step = "lr" not in OmegaConf.to_yaml(config.policy_update)
-    if replay_pages.learns_from_memory(config):
-        snippet = replay_pages.loop(config, _by_path(config), _call, texts.get("loop", ""))
-        frame = REPLAY
+def loop(told: str) -> str:
+    """A training loop of one's own: the algorithm's name, then a line that its loss needs."""
+    algo, _, line = told.partition(": ")
+    config = _compose(algo, "default")
+    if replay_loops.is_off_policy(config):
+        made = replay_loops.loop(config, _by_path(config), _call, line)
     else:
-        snippet = _snippet(config, is_step, constrained)
-        frame = STEP if is_step else LOSS
-    return TEMPLATE.format(
-        **frame,
-        mark=GENERATED,
-        name=name,
-        problem=f"{texts.get('problem', problem).strip()}.",
-        keys=setting_table(config, paper),
-        limits=", [holding the limit](holding_the_limit.md)" if constrained else "",
-        columns=_columns(texts["columns"]),
-        snippet=snippet,
-        measured=str(texts.get("measured") or measured(name)).strip(),
-        **{key: str(texts[key]).strip() for key in texts if key not in OPTIONAL},
-    )
+        made = _snippet(config)
+    return f"```python\n{made}\n```"
 
 
 def _compose(algo: str, preset: str) -> DictConfig:
@@ -140,19 +60,6 @@ def _compose(algo: str, preset: str) -> DictConfig:
 
 def _by_path(config: DictConfig) -> dict[str, tuple[str, dict[str, Any]]]:
     return {path: (target, arguments) for path, target, arguments in own_parts(config)}
-
-
-def _columns(names: list[str]) -> str:
-    index = (PAGES / "index.md").read_text() + (PAGES.parent / "off_policy.md").read_text()
-    tables = [
-        re.search(rf"<!-- table: columns of {name} -->\n(.*?)\n\n", index, re.DOTALL)[1]  # type: ignore[index]
-        for name in names
-    ]
-    rows = [row for table in tables for row in table.splitlines()[2:]]
-    text = "\n".join(["| column | meaning |", "|---|---|", *rows])
-    return (
-        text.replace("(#", "(index.md#").replace("(algorithms/", "(").replace("(../../", "(../../")
-    )
 
 
 def _call(target: str, arguments: Mapping[str, Any], first: tuple[str, ...] = ()) -> str:
@@ -169,7 +76,9 @@ def _call(target: str, arguments: Mapping[str, Any], first: tuple[str, ...] = ()
     return f"{target.rpartition('.')[2]}(\n{cut}\n)"
 
 
-def _snippet(config: DictConfig, is_step: bool, constrained: bool) -> str:
+def _snippet(config: DictConfig) -> str:
+    constrained = config.get("cost_advantage") is not None
+    is_step = "lr" not in OmegaConf.to_yaml(config.policy_update)
     parts = _by_path(config)
     targets = [parts["loss"][0]]
     lines = ['limits = {"cost": 25.0}'] if constrained else []
@@ -253,8 +162,3 @@ def _imports(targets: list[str]) -> str:
     return "\n".join(
         f"from {room} import {', '.join(sorted(rooms[room]))}" for room in sorted(rooms)
     )
-
-
-if __name__ == "__main__":
-    for file, text in pages().items():
-        (ROOT / "docs" / file).write_text(text)

@@ -1,4 +1,4 @@
-"""What PPO-Lagrangian comes to below limits of speed: the page made from results/velocity/."""
+"""What PPO-Lagrangian comes to below limits of speed, from results/velocity/."""
 
 from __future__ import annotations
 
@@ -10,7 +10,6 @@ from algorithm_results import RESULTS, end_cells, finished_runs, last_quarter, s
 from safe_rl.reporting.campaigns import PLAN, read_plan
 
 ARCHIVE = RESULTS / "velocity"
-MARK = "<!-- made by docs/generate_algorithms.py: change docs/velocity_results.py or results/ -->"
 
 
 class Published(NamedTuple):
@@ -29,38 +28,10 @@ PUBLISHED = {
     "SafeSwimmerVelocity": Published((64.74, 17.67), (28.02, 4.09)),
     "SafeWalker2dVelocity": Published((2982.27, 681.55), (13.49, 14.55)),
 }
-TEMPLATE = """# Velocity limits, measured
-
-PPO-Lagrangian with its defaults and normalised observations, as OmniSafe has them, on
-[Gymnasium's robots](suite.md#velocity-limits), limit 25, one million steps: means over the last
-quarter million steps of training, ± the standard deviation among seeds. Beside them what OmniSafe
-publishes of its PPO-Lagrangian (`PPOLag`), evaluated after **ten million** steps, also with a limit
-of 25 ([table 2 of its
-benchmark](https://github.com/PKU-Alignment/omnisafe/blob/main/benchmarks/on-policy/README.md), as
-it stood at commit 005e482; ± as given there).
-
-{table}
-
-{missing}
-
-A million steps are fifty updates of the default preset: robots that are hard to keep upright have
-hardly begun to walk by then, and Hopper, whose episodes end early, has only begun to slow down.
-Ten times the steps is one difference, another one the robots: ours are Gymnasium's of version 5,
-those of Safety-Gymnasium, on which OmniSafe trains, of version 4, whose rewards differ for some of
-them. Thresholds are the same. So compare orders of magnitude, and costs with the limit.
-
-```
-python train.py -m env=SafeHopperVelocity algo=ppo_lagrangian model.normalise=10 \\
-    seed=300,301,302 frames=1_000_000
-```
-
-Observations are normalised because seed 300 without it had earned less on HalfCheetah and Hopper.
-Tables of all epochs and the commits are in [`results/velocity/`](../../results/README.md).
-"""
 
 
-def velocity_page(archive: Path = ARCHIVE) -> str:
-    """The page, of whatever runs there are."""
+def velocity_runs(archive: Path = ARCHIVE) -> str:
+    """The table, of whatever runs there are, and which are missing."""
     rows = [
         "| `env=` | seeds | return | episode cost | epochs above 25 "
         "| OmniSafe, 10M steps: return | episode cost |",
@@ -76,12 +47,8 @@ def velocity_page(archive: Path = ARCHIVE) -> str:
         lacking = [str(seed) for seed in cell.seeds if seed not in runs]
         if lacking:
             missing.append(f"`{env}` ({', '.join(lacking)})")
-    said = (
-        f"Not run yet, or not to the end: {', '.join(missing)}."
-        if missing
-        else "All runs are done."
-    )
-    return f"{MARK}\n" + TEMPLATE.format(table="\n".join(rows), missing=said)
+    said = [f"Not run yet, or not to the end: {', '.join(missing)}."] if missing else []
+    return "\n".join([*rows, "", *said])
 
 
 def _published(env: str) -> tuple[str, str]:

@@ -1,12 +1,13 @@
-"""Learning curves for README and for the pages of the algorithms, from results/.
+"""Learning curves from results/: of an algorithm for its page, of five environments for README.
 
-``python docs/draw_algorithms.py`` draws means and 95 % intervals over seeds:
-docs/algorithms/<name>.png, every environment a row, where seeds of other settings have curves of
-their own, and docs/holding_the_limit.png, every environment a column.
+Pages get theirs when the site is built. ``python docs/_site/curves.py`` draws those of README,
+docs/holding_the_limit.png, again.
 """
 
 from __future__ import annotations
 
+import tempfile
+from functools import cache
 from itertools import chain
 from pathlib import Path
 
@@ -28,17 +29,34 @@ from safe_rl.reporting.pictures import (
 )
 from safe_rl.reporting.recorded import find_runs
 
-ROOT = Path(__file__).resolve().parents[1]
+ROOT = Path(__file__).resolve().parents[2]
 
 
-def main() -> None:
-    """Draw all of them."""
+@cache
+def pictures() -> dict[str, bytes]:
+    """Algorithm -> its learning curves, every environment a row, with 95 % intervals over seeds.
+
+    Seeds of other settings have curves of their own.
+    """
     experiments = archived("algorithms")
     styles = algorithm_styles(experiments)
-    for algorithm in dict.fromkeys(e.runs[0].algorithm for e in experiments):
-        shown = [e for e in experiments if e.runs[0].algorithm == algorithm]
-        figure = draw_learning_curves(shown, styles)
-        save(figure, ROOT / "docs" / "algorithms" / f"{algorithm}.png")
+    made = {}
+    with tempfile.TemporaryDirectory() as folder:
+        for algo in dict.fromkeys(e.runs[0].algorithm for e in experiments):
+            shown = [e for e in experiments if e.runs[0].algorithm == algo]
+            figure = draw_learning_curves(shown, styles)
+            made[algo] = save(figure, Path(folder) / f"{algo}.png").read_bytes()
+    return made
+
+
+def curves(algo: str) -> str:
+    """The picture of an algorithm; nothing for one that has not run."""
+    said = f"Return, episode cost and cost rate of {algo} on PointGoal1 and CarGoal1"
+    return f"![{said}]({algo}.png)" if algo in pictures() else ""
+
+
+def draw_readme() -> None:
+    """Draw what README shows."""
     held = archived("holding_the_limit", "off_policy", steps=3_000_000)
     picture = save(draw_columns(held), ROOT / "docs" / "holding_the_limit.png")
     # a third of the bytes: so many bands over one another have no more colours than fit a palette
@@ -79,4 +97,4 @@ def draw_columns(experiments: list[Experiment]) -> Figure:
 
 
 if __name__ == "__main__":
-    main()
+    draw_readme()

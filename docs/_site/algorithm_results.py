@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import statistics
 from collections.abc import Iterable, Sequence
 from itertools import accumulate, pairwise, product
@@ -10,8 +11,8 @@ from pathlib import Path
 import archived_runs
 from archived_runs import Rows
 
-ROOT = Path(__file__).resolve().parents[1]
-PAGES, RESULTS = ROOT / "docs" / "algorithms", ROOT / "results"
+PAGES = Path(__file__).resolve().parents[1] / "algorithms"
+RESULTS = Path(__file__).resolve().parents[2] / "results"
 LIMIT, FRAMES, QUARTER = 25.0, 1_000_000, 250_000
 ENVIRONMENTS = ("PointGoal1", "CarGoal1")
 ARCHIVE = RESULTS / "algorithms"
@@ -62,12 +63,10 @@ def measured(algo: str) -> str:
         command = _command(algo, "300,301,302", ENVIRONMENTS[0])
         return f"Not yet: {command} is what the comparison is made of."
     tables = "\n\n".join(_quarters(algo, env, found) for env, found in runs.items())
-    picture = PAGES / f"{algo}.png"
-    shown = f"\n\n![Learning curves]({picture.name})" if picture.exists() else ""
     return f"""Limit 25, defaults of the commit of each run unless a setting is named; return /
 episode cost by quarters of the run ([all algorithms](comparison.md)):
 
-{tables}{shown}"""
+{tables}"""
 
 
 def _quarters(algo: str, env: str, runs: dict[int, Rows]) -> str:
@@ -89,46 +88,25 @@ def _quarters(algo: str, env: str, runs: dict[int, Rows]) -> str:
     return "\n".join(rows) + "\n\n" + "\n\n".join(commands)
 
 
-def comparison(algorithms: Iterable[str]) -> str:
-    """The page that compares all algorithms, a row each."""
-    names = list(algorithms)
-    tables = "\n\n".join(_compared(names, env) for env in ENVIRONMENTS)
-    timed = "\n\n".join(filter(None, (_timed(names, env) for env in ENVIRONMENTS)))
-    factor = _spread_of_times(names)
-    return f"""# The algorithms compared
+def algorithms() -> list[str]:
+    """Those whose pages have measurements of a million steps, in the order of index.md."""
+    listed = re.findall(r"^\| \[`(\w+)`\]\(\1\.md\)", (PAGES / "index.md").read_text(), re.M)
+    return [a for a in listed if f"<!-- made: measured {a} -->" in (PAGES / f"{a}.md").read_text()]
 
-All algorithms with a limit of 25, after one million steps and after equal time, with the defaults
-of the commit of each run. Three seeds show a direction, not a verdict. The constrained on-policy
-runs on CarGoal1 are older: from before the [estimate of the cost](holding_the_limit.md) was
-mended, and with [earlier defaults](limits_measured.md#settings-tried). Seeds with different
-settings have a row for each, which names what differs. [Which algorithm to choose](index.md).
 
-## At equal steps
+def compared(env: str) -> str:
+    """Table of the algorithms in one environment, a row each."""
+    return _compared(algorithms(), env)
 
-Means over the last quarter million steps of training, ± the standard deviation among seeds where
-there are several. $\\rho_c$ is the cost per step of the whole run. *Certified*: how many of the
-tested runs have a checkpoint that is [certified](../guides/certificate.md) to keep the limit; —:
-none was tested.
 
-{tables}
+def timed(env: str) -> str:
+    """What they came to in equal times; empty where no time is shared by most of them."""
+    return _timed(algorithms(), env)
 
-## At equal wall-clock
 
-Return / episode cost after so many seconds of collecting and learning (`time_total`), means over
-the last tenth of the steps until then; in brackets millions of steps; —: one of the runs had ended,
-or had not finished an episode. Limits come down by steps, not by time: after few steps costs are
-still free.
-
-Every run had one thread, but not the machine to itself: seeds of one algorithm took
-up to {factor:.1f} times as long as each other, so differences of that size mean nothing. An epoch
-that took {PAUSE} times the median of its run, as if the machine had stood still, counts as the
-median. Times at which more than half of the rows would be empty are left out.
-
-{timed}
-
-Commands are on the page of each algorithm; tables of all epochs and the commits in
-[`results/algorithms/`](../../results/README.md).
-"""
+def spread_of_times() -> str:
+    """Largest factor between the times that seeds of one algorithm took, in any environment."""
+    return f"{_spread_of_times(algorithms()):.1f}"
 
 
 def _compared(algorithms: Iterable[str], env: str) -> str:

@@ -1,0 +1,24 @@
+"""What pages ask the site to make: `<!-- made: columns ppo -->`, and the algorithms' pages."""
+
+import re
+from pathlib import Path
+
+from run_configs import CONF
+
+DOCS = Path(__file__).resolve().parents[2] / "docs"
+ALGORITHMS = sorted(path.stem for path in (CONF / "algo").glob("*.yaml"))
+
+
+def page_of(algo):
+    return (DOCS / "algorithms" / f"{algo}.md").read_text()
+
+
+def made(page, name):
+    """What stands behind the mark's name, None without one."""
+    found = re.search(rf"<!-- made: {name} (.*?) -->", page)
+    return found and found[1]
+
+
+def columns_of(algo):
+    """Tables of the columns that an algorithm logs."""
+    return made(page_of(algo), "columns").split()
