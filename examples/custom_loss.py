@@ -23,7 +23,7 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from safe_rl.objectives import PPOLoss
+from safe_rl.objectives import PPOLoss, RiskMeasure
 from safe_rl.objectives.risk import Charges, cost_so_far
 from safe_rl.objectives.violation import violation_of
 
@@ -47,7 +47,7 @@ class QuadraticPenaltyLoss(PPOLoss):
         return super()._surrogates(tensordict, log_weight) | {"loss_penalty": penalty}
 
 
-class UpperSemideviation:
+class UpperSemideviation(RiskMeasure):
     """Charges whose mean over episodes is E[C] + w E[(C − m)₊], m the running mean of C."""
 
     def __init__(self, cost_limits: Tensor, *, weight: float, memory: float) -> None:

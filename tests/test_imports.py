@@ -39,7 +39,8 @@ PARTS = {
     ),
     "reporting": ("extras", "runs", "scores"),
     "cli": (
-        *("envs", "evaluation", "extras", "naming", "openmp", "parameters", "processes", "ranges"),
+        *("algorithms", "envs", "evaluation", "extras", "naming", "openmp", "parameters"),
+        *("processes", "ranges"),
         *("reporting", "runs", "scores", "targets", "training"),
     ),
     "evaluate": ("cli",),

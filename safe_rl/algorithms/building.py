@@ -13,23 +13,25 @@ from safe_rl.algorithms.tracked_constraints import TrackedConstraints
 __all__ = ["build_constraints", "constrained_limits"]
 
 
-def constrained_limits(
-    config: DictConfig, env: EnvBase, *, is_constrained: bool, otherwise: str
-) -> dict[str, float]:
+def constrained_limits(config: DictConfig, env: EnvBase, *, otherwise: str) -> dict[str, float]:
     """Limits of a constrained algorithm; one without constraints has none.
 
     Args:
         config: Configuration as composed from ``conf/``.
         env: Environment that has the costs.
-        is_constrained: Whether the algorithm is.
         otherwise: Its like without constraints, for the message.
 
     Raises:
-        ValueError: If a limit names no cost of the environment, or a constrained algorithm has no
-            limit.
+        ValueError: If a limit names no cost of the environment, a constrained algorithm has no
+            limit, or the configuration does not say whether it is constrained.
     """
     limits = check_cost_limits(config.cost_limits, env.cost_keys)
-    if not is_constrained:
+    if config.algo.get("constrained") is None:
+        raise ValueError(
+            f"algo.constrained is missing: the YAML file of algo={config.algo.name} says true if "
+            "it keeps cost_limits, and false if it only counts costs."
+        )
+    if not config.algo.constrained:
         return {}
     if not limits:
         raise ValueError(

@@ -12,6 +12,7 @@ from torch import Tensor
 from safe_rl.collectors import EpisodeStatistics
 from safe_rl.naming import did_you_mean, key_name
 from safe_rl.objectives.multipliers import Multiplier
+from safe_rl.objectives.risk import RiskMeasure
 
 __all__ = ["Constraints", "check_cost_limits"]
 
@@ -36,6 +37,8 @@ class Constraints:
         violation: J_c − d, [k], as of the last batch.
         episode_length: T̄, mean number of steps of an episode, scalar.
         unit: Size of one cost, by which losses divide the costs that they weigh, [k].
+        risk: What is limited instead of the mean cost of an episode, or None.
+        cost_advantage: Key of the cost advantages that the multiplier weighs.
 
     Examples:
         >>> from tensordict import TensorDict
@@ -62,6 +65,8 @@ class Constraints:
         self.keys = list(limits)
         self.limits = torch.tensor(list(limits.values()), dtype=torch.float32, device=device)
         self.multiplier = multiplier
+        self.risk: RiskMeasure | None = None
+        self.cost_advantage: NestedKey = "cost_advantage"
         self._max_length = max_length
         self.costs = torch.full_like(self.limits, torch.nan)
         self.violation = torch.full_like(self.limits, torch.nan)
@@ -69,6 +74,12 @@ class Constraints:
         self.unit = torch.ones_like(self.limits)
         self._finished = torch.full_like(self.limits, torch.nan)
         self._mean_length = torch.full((), torch.nan, device=device)
+
+    @property
+    def held_limits(self) -> dict[NestedKey, float]:
+        """What violations are differences from, by cost: d, or a limit of the risk measure's."""
+        held = self.limits if self.risk is None else self.risk.held_limits
+        return dict(zip(self.keys, held.tolist(), strict=True))
 
     def charge(self, episodes: EpisodeStatistics, batch: TensorDictBase) -> None:
         """Write into a batch what stands for its costs, before advantages are estimated."""

@@ -1,9 +1,13 @@
-"""What the training loop asks of an algorithm, and a configuration of a recipe for one."""
+"""What the training loop asks of an algorithm, and a configuration of a recipe for one.
+
+Each class here is a base to derive from: what is optional has a default.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from typing import Any, Protocol
+from abc import ABC, abstractmethod
+from collections.abc import Collection, Mapping, Sequence
+from typing import Any, ClassVar, Protocol
 
 import torch
 from omegaconf import DictConfig
@@ -29,32 +33,33 @@ class Stateful(Protocol):
         ...
 
 
-class Algorithm(Protocol):
+class Algorithm(ABC):
     """What learns: all that the loop, checkpoints, transfer and evaluation know of it.
 
     Attributes:
         cost_keys: Keys of the constrained costs; empty for an unconstrained algorithm.
         policy: What explores, for the collector: it shares the networks' parameters.
-        networks: What is trained, by name. Another run can start from them; those whose names
-            begin with ``cost_`` are then taken over only if both runs constrain the same costs.
-
-    If something else has to follow when the networks begin with the weights of another run, such as
-    target networks, a method ``networks_were_given`` sees to it. Where a run that is resumed begins
-    new episodes, ``forget_open_episodes`` ends what goes from step to step, such as n-step sums.
-
-    If checkpoints do not hold all that learning depends on, ``lost_on_resume`` is a sentence on
-    what a run that is resumed has lost.
+        networks: What is trained, by name. Another run can start from them.
+        cost_networks: Names of the networks that are about the constrained costs: a run takes them
+            over only from one with the same costs.
     """
 
-    @property
-    def cost_keys(self) -> Sequence[str]: ...  # noqa: D102
+    cost_keys: Sequence[str] = ()
+    policy: TensorDictModuleBase
+    networks: Mapping[str, nn.Module]
+    cost_networks: Collection[str] = ()
 
     @property
-    def policy(self) -> TensorDictModuleBase: ...  # noqa: D102
+    def learns_from(self) -> str:
+        """A sentence on what it learns from besides the run's own steps; empty if nothing."""
+        return ""
 
     @property
-    def networks(self) -> Mapping[str, nn.Module]: ...  # noqa: D102
+    def lost_on_resume(self) -> str:
+        """A sentence on what checkpoints do not hold of it; empty if they hold all."""
+        return ""
 
+    @abstractmethod
     def learn(self, batch: TensorDictBase, episodes: EpisodeStatistics) -> dict[str, float]:
         """Learn from what the policy has just collected.
 
@@ -66,31 +71,42 @@ class Algorithm(Protocol):
             What is worth a column of the table, by name: the same names at every call, NaN where
             there is no value.
         """
-        ...
 
+    @abstractmethod
     def checkpoint_components(self) -> Mapping[str, Stateful]:
         """Parts with a state, by name: together they are all that learning depends on."""
-        ...
+
+    def networks_replaced(self) -> None:
+        """Follow the networks, which have got another run's weights, with target networks."""
+
+    def forget_open_episodes(self) -> None:
+        """End what goes from step to step, such as n-step sums: new episodes begin."""
 
 
-class Recipe(Protocol):
+class Recipe(ABC):
     """How an algorithm is put together; a configuration names it as ``algo._target_``.
 
-    ``unread``, if it has one, holds keys that presets bring along and that it makes no use of, and
-    choices that are not for it (``preset=paper``), each with the reason: on a command line they are
-    refused.
+    Attributes:
+        off_policy: Whether it learns from a replay buffer, with Q functions for critics.
+        unused_keys: Keys that presets bring along and that it makes no use of, and choices that
+            are not for it (``preset=paper``), each with the reason: a command line that gives one
+            is refused.
     """
 
+    off_policy: ClassVar[bool] = False
+    unused_keys: ClassVar[Mapping[str, str]] = {}
+
     @classmethod
+    @abstractmethod
     def build(cls, config: DictConfig, env: EnvBase) -> Algorithm:
         """Build everything from a configuration as composed from ``conf/``.
 
         Raises:
             ValueError: If parts of the configuration do not fit together or the environment.
         """
-        ...
 
     @classmethod
+    @abstractmethod
     def build_policy(
         cls, config: DictConfig, env: EnvBase, device: torch.device
     ) -> tuple[TensorDictModuleBase, Mapping[str, nn.Module]]:
@@ -100,14 +116,17 @@ class Recipe(Protocol):
             The policy, and the networks that it consists of, by the names that they have in
             checkpoints.
         """
-        ...
 
 
-class PolicyUpdate(Protocol):
+class PolicyUpdate(ABC):
     """What a recipe asks of an update: gradient steps, a trust-region step, or one of your own."""
 
+    @abstractmethod
     def __call__(
-        self, batch: TensorDictBase, cost_violation: Tensor, episode_length: Tensor
+        self,
+        batch: TensorDictBase,
+        cost_violation: Tensor | None = None,
+        episode_length: Tensor | None = None,
     ) -> Mapping[str, Tensor]:
         """Improve the policy on ``batch`` and return diagnostics.
 
@@ -117,12 +136,14 @@ class PolicyUpdate(Protocol):
                 J_c less the column ``target_…`` where the limit comes down to d.
             episode_length: Mean episode length T̄ in steps, a scalar.
         """
-        ...
+
+    def loss_modules(self) -> Mapping[str, nn.Module]:
+        """Losses that are modules, by place, of which checkpoints keep what networks do not."""
+        return {}
 
     def state_dict(self) -> Mapping[str, Any]:
         """State beyond the network's parameters, for an exact continuation."""
-        ...
+        return {}
 
     def load_state_dict(self, state_dict: Mapping[str, Any]) -> Any:
         """Continue from :meth:`state_dict`."""
-        ...

@@ -6,14 +6,14 @@ from collections.abc import Mapping
 from typing import Any
 
 from tensordict import TensorDictBase
-from torch import Tensor
+from torch import Tensor, nn
 
 from safe_rl.algorithms.contract import PolicyUpdate
 
 __all__ = ["UpdatesInTurn"]
 
 
-class UpdatesInTurn:
+class UpdatesInTurn(PolicyUpdate):
     """A `PolicyUpdate` of several, each going on from where the one before has left the policy.
 
     In a configuration, ``then`` names what comes after ``policy_update``: a loss and an update for
@@ -27,7 +27,7 @@ class UpdatesInTurn:
     Examples:
         >>> import torch
         >>> from tensordict import TensorDict
-        >>> class Fixed:
+        >>> class Fixed(PolicyUpdate):
         ...     def __init__(self, kl):
         ...         self.kl = torch.tensor(kl)
         ...     def __call__(self, batch, cost_violation, episode_length):
@@ -48,14 +48,22 @@ class UpdatesInTurn:
     ) -> dict[str, Tensor]:
         """Take all updates on one batch; see `PolicyUpdate`."""
         given = (batch, cost_violation, episode_length)
-        metrics = dict(self.first(*given))  # type: ignore[arg-type]
+        metrics = dict(self.first(*given))
         for name, update in self.then.items():
-            reported = dict(update(*given))  # type: ignore[arg-type]
+            reported = dict(update(*given))
             promised = reported.pop("cost_surrogate", None)
             metrics |= {f"{name}_{key}": value for key, value in reported.items()}
             if promised is not None:
                 metrics["cost_surrogate"] = promised
         return metrics
+
+    def loss_modules(self) -> dict[str, nn.Module]:
+        """Losses of all; those of the others are called ``loss.<name>``."""
+        found = dict(self.first.loss_modules())
+        for name, update in self.then.items():
+            for place, loss in update.loss_modules().items():
+                found[f"loss.{name}{place.removeprefix('loss')}"] = loss
+        return found
 
     def state_dict(self) -> dict[str, Any]:
         """State of each, by its name; that of the first by ``first``."""

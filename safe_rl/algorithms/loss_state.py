@@ -11,7 +11,7 @@ from torch import Tensor, nn
 
 from safe_rl.algorithms.losses import ESTIMATOR
 
-__all__ = ["LossState", "losses_of"]
+__all__ = ["LossState"]
 
 
 class LossState:
@@ -21,21 +21,19 @@ class LossState:
     estimators are settings, and left out: a run that goes on may be given others.
 
     Args:
-        update: What moves the policy: an update with a ``loss``, or `UpdatesInTurn`. Losses that
-            are plain functions hold nothing.
+        losses: Losses that are modules, by place: `PolicyUpdate.loss_modules`.
         besides: Modules whose state is kept elsewhere; losses share their tensors.
 
     Examples:
-        >>> import types
         >>> network, loss = torch.nn.Linear(2, 1), torch.nn.Module()
         >>> loss.network = network
         >>> loss.register_buffer("weight", torch.tensor(0.5))
-        >>> LossState(types.SimpleNamespace(loss=loss), besides=[network]).state_dict()
+        >>> LossState({"loss": loss}, besides=[network]).state_dict()
         {'loss.weight': tensor(0.5000)}
     """
 
-    def __init__(self, update: Any, besides: Iterable[nn.Module]) -> None:
-        self._losses = list(losses_of(update))
+    def __init__(self, losses: Mapping[str, nn.Module], besides: Iterable[nn.Module]) -> None:
+        self._losses = dict(losses)
         self._besides = list(besides)
 
     def __bool__(self) -> bool:
@@ -57,20 +55,10 @@ class LossState:
         known = {tensor.data_ptr() for module in self._besides for _, tensor in _tensors(module)}
         return {
             f"{place}.{name}": tensor
-            for place, loss in self._losses
+            for place, loss in self._losses.items()
             for name, tensor in _tensors(loss)
             if tensor.data_ptr() not in known and not _is_setting(name, loss)
         }
-
-
-def losses_of(update: Any, place: str = "loss") -> Iterator[tuple[str, nn.Module]]:
-    """Losses that are modules, of an update or of `UpdatesInTurn`, each with its place."""
-    if isinstance(getattr(update, "loss", None), nn.Module):
-        yield place, update.loss
-    if hasattr(update, "first"):
-        yield from losses_of(update.first, place)
-    for name, other in getattr(update, "then", {}).items():
-        yield from losses_of(other, f"{place}.{name}")
 
 
 def _tensors(module: nn.Module) -> Iterator[tuple[str, Tensor]]:

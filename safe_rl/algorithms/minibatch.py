@@ -9,19 +9,22 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import fields
 from functools import partial
 from typing import Any
 
 import torch
-from tensordict import TensorDict, TensorDictBase
+from tensordict import NestedKey, TensorDict, TensorDictBase
 from torch import Tensor, nn
 from torch.optim import Optimizer
 from torchrl.objectives import LossModule
 from torchrl.objectives.common import AUTO_LOSS_MASK_KEYS
 
+from safe_rl.algorithms.contract import PolicyUpdate
 from safe_rl.algorithms.learning_rate import KLAdaptiveRate
 from safe_rl.algorithms.losses import divergence, sum_of_losses
 from safe_rl.objectives.samples import learning_samples, require_finite
+from safe_rl.objectives.surrogate import SurrogateLoss
 
 __all__ = ["MinibatchUpdate"]
 
@@ -32,7 +35,7 @@ Without them they would estimate advantages themselves, of samples that are in n
 """
 
 
-class MinibatchUpdate:
+class MinibatchUpdate(PolicyUpdate):
     """Several passes of gradient steps over one batch, minimising the sum of all ``loss_*``.
 
     Every pass shuffles the batch once and cuts it into contiguous minibatches of equal size: as
@@ -44,8 +47,7 @@ class MinibatchUpdate:
     that of the minibatch at hand at the parameters before its step, so the check costs nothing and
     the step that would follow is not taken; with the full batch as minibatch this is the rule of
     Ray, Achiam, Amodei (2019). With minibatches of thousands of states its error is a few percent.
-    A loss that measures from the policy as it is when the update begins has a method ``anchor``,
-    which is called with the batch before the first step.
+    The method ``anchor`` of a `SurrogateLoss` is called with the batch before the first step.
 
     A batch that is beyond ``max_kl`` before the first step, because a policy too different from
     the present one collected it, teaches nothing; a warning says so.
@@ -142,16 +144,12 @@ class MinibatchUpdate:
         del cost_violation, episode_length
         history: list[TensorDictBase] = []
         num_steps = 0
-        anchor = getattr(self.loss, "anchor", None)
-        if anchor is not None:
-            anchor(batch)
+        if isinstance(self.loss, SurrogateLoss):
+            self.loss.anchor(batch)
         require_finite(batch, self.loss.in_keys)
         mask_keys = [key for key in AUTO_LOSS_MASK_KEYS if batch.get(key, None) is not None]
-        keys = getattr(self.loss, "tensor_keys", None)
-        names = _ESTIMATES if hasattr(keys, "advantage") else ()
-        estimates = [getattr(keys, name) for name in names if hasattr(keys, name)]
         selected = batch.select(*self.loss.in_keys, *mask_keys)
-        selected.update(batch.select(*estimates, strict=False))
+        selected.update(batch.select(*_estimates(self.loss), strict=False))
         samples = learning_samples(selected, self.loss.in_keys)
         for minibatch in self._minibatches(samples):
             total, losses = self._evaluate(minibatch)
@@ -221,6 +219,10 @@ class MinibatchUpdate:
             means["kl"] = steps["kl"][-1]
         return means | {"num_steps": torch.tensor(num_steps)}
 
+    def loss_modules(self) -> dict[str, nn.Module]:
+        """The loss."""
+        return {"loss": self.loss}
+
     def state_dict(self) -> dict[str, Any]:
         """State of the optimiser and of the shuffles; the parameters belong to the network."""
         return {
@@ -231,8 +233,15 @@ class MinibatchUpdate:
     def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
         """Continue from :meth:`state_dict`."""
         self.optimizer.load_state_dict(state_dict["optimizer"])
-        if "shuffles" in state_dict:  # checkpoints of earlier versions lack it
-            self._generator.set_state(state_dict["shuffles"].cpu())
+        self._generator.set_state(state_dict["shuffles"].cpu())
+
+
+def _estimates(loss: nn.Module) -> list[NestedKey]:
+    """Where advantages and value targets are, for a loss that reads an advantage."""
+    if not isinstance(loss, LossModule):
+        return []
+    keys = {key.name: getattr(loss.tensor_keys, key.name) for key in fields(loss.tensor_keys)}
+    return [keys[name] for name in _ESTIMATES if name in keys] if "advantage" in keys else []
 
 
 def _divergence(losses: TensorDictBase) -> Tensor:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from inspect import isclass
 from typing import Any, ClassVar
@@ -13,11 +13,10 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import nn
 from torchrl.envs import EnvBase
-from torchrl.objectives import LossModule
 
 from safe_rl.algorithms.building import build_constraints, constrained_limits
 from safe_rl.algorithms.constraints import Constraints, check_cost_limits
-from safe_rl.algorithms.contract import Stateful
+from safe_rl.algorithms.contract import Algorithm, Recipe, Stateful
 from safe_rl.algorithms.dataset import fill_memory
 from safe_rl.algorithms.memory import Memory
 from safe_rl.algorithms.parts import build_part, build_update
@@ -26,12 +25,12 @@ from safe_rl.algorithms.replay_update import ReplayUpdate
 from safe_rl.collectors import EpisodeStatistics
 from safe_rl.models import ExploringPolicy
 from safe_rl.objectives.cost_critics import CostCritics
-from safe_rl.objectives.q_functions import QFunctionLoss
+from safe_rl.objectives.q_functions import QFunctionLoss, ReplayLoss
 from safe_rl.targets import locate
 
 __all__ = ["OffPolicy"]
 
-_UNREAD = {
+_UNUSED = {
     "advantage": "It learns values of single transitions, not advantages of batches: the discount "
     "is loss.gamma, and memory.n_steps says how many steps a transition spans.",
     "cost_advantage": "It learns values of single transitions, not advantages of batches.",
@@ -45,7 +44,7 @@ _UNREAD = {
 
 
 @dataclass
-class OffPolicy:
+class OffPolicy(Algorithm, Recipe):
     """SAC, TD3 and their like: an algorithm, and the recipe that builds it.
 
     Attributes:
@@ -59,10 +58,10 @@ class OffPolicy:
             begins when the memory holds as many. There are none where nothing is collected.
         collects: Whether what is collected goes into the memory.
         learns_from: What was in it from the beginning, in a sentence, or that nothing will be.
-        unread: Keys and choices of configurations that are for other recipes, and why.
     """
 
-    unread: ClassVar[Mapping[str, str]] = _UNREAD
+    off_policy: ClassVar[bool] = True
+    unused_keys: ClassVar[Mapping[str, str]] = _UNUSED
 
     policy: ExploringPolicy
     networks: Mapping[str, nn.Module]
@@ -75,6 +74,8 @@ class OffPolicy:
     _counts: dict[str, int] = field(default_factory=lambda: {"steps": 0})
 
     def __post_init__(self) -> None:
+        self.cost_keys = self.constraints.keys
+        self.cost_networks = [name for name in self.networks if name == "cost_critic"]
         self._count_steps(0)
 
     @classmethod
@@ -92,9 +93,7 @@ class OffPolicy:
                 begins with; or if a dataset does not fit.
             FileNotFoundError: If there is no such dataset.
         """
-        limits = constrained_limits(
-            config, env, is_constrained=config.get("limits") is not None, otherwise="sac"
-        )
+        limits = constrained_limits(config, env, otherwise="sac")
         device = torch.device(config.device)
         _check_critics(config)
         networks = build_networks(config, env, len(limits), device)
@@ -128,7 +127,7 @@ class OffPolicy:
             networks=networks,
             constraints=constraints,
             memory=memory,
-            policy_update=build_update(config.policy_update, loss=loss),
+            policy_update=build_update(config.policy_update, ReplayUpdate, loss=loss),
             random_steps=random_steps,
             collects=collects,
             learns_from=learns_from,
@@ -141,11 +140,6 @@ class OffPolicy:
         """Build what acts; the noise that explores with a deterministic actor is no part of it."""
         actor = build_networks(config, env, 0, device)["actor"]
         return exploring(actor, env, 0.0), {"actor": actor}
-
-    @property
-    def cost_keys(self) -> Sequence[str]:
-        """Keys of the constrained costs."""
-        return self.constraints.keys
 
     @property
     def lost_on_resume(self) -> str:
@@ -174,9 +168,8 @@ class OffPolicy:
         if constraints.keys:
             constraints.charge(episodes, batch)
             constraints.observe(episodes, batch)
-            if isinstance(self.policy_update.loss, CostCritics):
-                self.policy_update.loss.calibrate(constraints)
-                self.policy_update.loss.measure(batch["next", "reward"])
+            self.policy_update.loss.calibrate(constraints)
+            self.policy_update.loss.measure(batch["next", "reward"])
         if self.collects:
             self.memory.extend(batch)
         self._count_steps(batch.numel())
@@ -187,7 +180,7 @@ class OffPolicy:
             row |= constraints.column(f"policy_{name}", value)
         return row
 
-    def networks_were_given(self) -> None:
+    def networks_replaced(self) -> None:
         """Let target networks begin where the networks do, which have got another run's weights."""
         self.policy_update.equate_targets()
 
@@ -273,9 +266,9 @@ def _check_room(memory: Memory, random_steps: int, collects: bool) -> None:
         )
 
 
-def _check_memory(config: DictConfig, loss: LossModule) -> None:
+def _check_memory(config: DictConfig, loss: ReplayLoss) -> None:
     """Refuse what makes sense of values only for a loss that learns none."""
-    if ("next", "reward") in loss.in_keys:
+    if loss.learns_values:
         return
     for key, off in (("n_steps", 1), ("prioritised", None)):
         if config.memory[key] != off:
@@ -285,9 +278,9 @@ def _check_memory(config: DictConfig, loss: LossModule) -> None:
             )
 
 
-def _check_risk(config: DictConfig, constraints: Constraints, loss: LossModule) -> None:
+def _check_risk(config: DictConfig, constraints: Constraints, loss: ReplayLoss) -> None:
     """Refuse a risk measure that the cost critics do not know."""
-    risk, known = getattr(constraints, "risk", None), getattr(loss, "risk_measure", None)
+    risk, known = constraints.risk, loss.risk_measure
     if risk is None or (known is not None and isinstance(risk, known)):
         return
     limited = "mean costs" if known is None else f"mean costs or {known.__name__}"

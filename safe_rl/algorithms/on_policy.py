@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -15,24 +15,24 @@ from torchrl.envs import EnvBase
 
 from safe_rl.algorithms.building import build_constraints, constrained_limits
 from safe_rl.algorithms.constraints import Constraints
-from safe_rl.algorithms.contract import PolicyUpdate, Stateful
+from safe_rl.algorithms.contract import Algorithm, PolicyUpdate, Recipe, Stateful
 from safe_rl.algorithms.in_turn import UpdatesInTurn
-from safe_rl.algorithms.loss_state import LossState, losses_of
-from safe_rl.algorithms.minibatch import MinibatchUpdate
+from safe_rl.algorithms.loss_state import LossState
 from safe_rl.algorithms.parts import build_part, build_update
 from safe_rl.algorithms.side_by_side import side_by_side
-from safe_rl.algorithms.tracked_constraints import CHARGES, TrackedConstraints
+from safe_rl.algorithms.tracked_constraints import CHARGES
 from safe_rl.collectors import EpisodeStatistics
 from safe_rl.models import build_networks, make_behaviour, take_in
 from safe_rl.objectives import CriticLoss
 from safe_rl.objectives.advantages import CostGAE, VectorGAE
 from safe_rl.objectives.normalisation import normalise_advantages
+from safe_rl.objectives.surrogate import SurrogateLoss
 
 __all__ = ["OnPolicy"]
 
 
 @dataclass
-class OnPolicy:
+class OnPolicy(Algorithm, Recipe):
     """PPO, TRPO, CPO and their like: an algorithm, and the recipe that builds it.
 
     Attributes:
@@ -53,7 +53,15 @@ class OnPolicy:
     advantage: VectorGAE
     cost_advantage: CostGAE | None
     policy_update: PolicyUpdate
-    critic_update: MinibatchUpdate
+    critic_update: PolicyUpdate
+
+    def __post_init__(self) -> None:
+        self.cost_keys = self.constraints.keys
+        self.policy = make_behaviour(self.actor)
+        self.networks = {"actor": self.actor, "critic": self.critic}
+        if self.cost_critic is not None:
+            self.networks["cost_critic"] = self.cost_critic
+            self.cost_networks = ["cost_critic"]
 
     @classmethod
     def build(cls, config: DictConfig, env: EnvBase) -> OnPolicy:
@@ -67,10 +75,12 @@ class OnPolicy:
             ValueError: If a cost limit names a cost that the environment does not have, or a
                 constrained algorithm gets no limit.
         """
-        # without an estimator of cost advantages an algorithm has no constraints
-        limits = constrained_limits(
-            config, env, is_constrained=config.get("cost_advantage") is not None, otherwise="ppo"
-        )
+        limits = constrained_limits(config, env, otherwise="ppo")
+        if limits and config.get("cost_advantage") is None:
+            raise ValueError(
+                f"algo={config.algo.name} is constrained and has no cost_advantage: add "
+                "'- /cost_advantage: ${preset}' to its defaults, or say algo.constrained=false."
+            )
         device = torch.device(config.device)
         networks = _build_networks(config, env, len(limits), device)
         constraints = build_constraints(config, limits, env.max_episode_steps, device)
@@ -79,16 +89,15 @@ class OnPolicy:
             "constraints": constraints,
             "multiplier": constraints.multiplier,
             "cost_keys": constraints.keys,
-            "cost_limits": _held_limits(limits, constraints),
+            "cost_limits": constraints.held_limits,
         }
         critic, cost_critic = networks["critic"], networks.get("cost_critic")
         cost_advantage = None
         if limits:
             cost_advantage = build_part(config.cost_advantage, value_network=cost_critic, **parts)
-            if isinstance(constraints, TrackedConstraints):
-                constraints.cost_advantage = cost_advantage.tensor_keys.advantage
-                if constraints.risk is not None:
-                    cost_advantage.set_keys(reward=[CHARGES])
+            constraints.cost_advantage = cost_advantage.tensor_keys.advantage
+            if constraints.risk is not None:
+                cost_advantage.set_keys(reward=[CHARGES])
         policy_update = _build_update(config, critic_network=critic, **parts)
         del parts["actor_network"]
         return cls(
@@ -97,7 +106,9 @@ class OnPolicy:
             advantage=build_part(config.advantage, value_network=critic, **parts),
             cost_advantage=cost_advantage,
             policy_update=policy_update,
-            critic_update=build_update(config.critic_update, loss=CriticLoss(critic, cost_critic)),
+            critic_update=build_update(
+                config.critic_update, PolicyUpdate, loss=CriticLoss(critic, cost_critic)
+            ),
         )
 
     @classmethod
@@ -107,22 +118,6 @@ class OnPolicy:
         """Build what acts, and the networks that it consists of."""
         actor = _build_networks(config, env, 0, device)["actor"]
         return make_behaviour(actor), {"actor": actor}
-
-    @property
-    def cost_keys(self) -> Sequence[str]:
-        """Keys of the constrained costs."""
-        return self.constraints.keys
-
-    @property
-    def policy(self) -> TensorDictModuleBase:
-        """What explores."""
-        return make_behaviour(self.actor)
-
-    @property
-    def networks(self) -> dict[str, nn.Module]:
-        """What is trained, by name."""
-        named = {"actor": self.actor, "critic": self.critic, "cost_critic": self.cost_critic}
-        return {name: network for name, network in named.items() if network is not None}
 
     def learn(self, batch: TensorDictBase, episodes: EpisodeStatistics) -> dict[str, float]:
         """Train on one batch.
@@ -168,8 +163,9 @@ class OnPolicy:
 
     def _shares_critics(self) -> bool:
         """Whether the policy's update moves a critic, which two threads must not do at once."""
-        fitted = {parameter.data_ptr() for parameter in self.critic_update.loss.parameters()}
-        moved = [self.actor, *(loss for _, loss in losses_of(self.policy_update))]
+        fitting = self.critic_update.loss_modules().values()
+        fitted = {p.data_ptr() for module in fitting for p in module.parameters()}
+        moved = [self.actor, *self.policy_update.loss_modules().values()]
         return any(p.data_ptr() in fitted for module in moved for p in module.parameters())
 
     def checkpoint_components(self) -> dict[str, Stateful]:
@@ -180,7 +176,7 @@ class OnPolicy:
             **self.networks,
             "multiplier": multiplier,
             # None where losses hold nothing, as all of the package's do
-            "losses": LossState(self.policy_update, besides=kept) or None,
+            "losses": LossState(self.policy_update.loss_modules(), besides=kept) or None,
             "policy_update": self.policy_update,
             "critic_update": self.critic_update,
             "algorithm": self.constraints,
@@ -188,22 +184,17 @@ class OnPolicy:
         return {name: part for name, part in parts.items() if part is not None}
 
 
-def _held_limits(limits: Mapping[str, float], constraints: Constraints) -> dict[str, float]:
-    """What violations are differences from: not d where a risk measure has a limit of its own."""
-    held = getattr(getattr(constraints, "risk", None), "held_limits", None)
-    return dict(limits) if held is None else dict(zip(limits, held.tolist(), strict=True))
-
-
 def _build_update(config: DictConfig, **parts: Any) -> PolicyUpdate:
     """What moves the policy: ``policy_update`` on ``loss``, and the pairs of ``then`` after it."""
     loss = build_part(config.loss, **parts)
-    if getattr(loss, "has_costs", False) and not parts["cost_limits"]:
+    if isinstance(loss, SurrogateLoss) and loss.has_costs and not parts["cost_limits"]:
         raise ValueError(
-            f"{type(loss).__name__} needs cost_advantage (has_costs): its algorithm lacks "
-            "'- /cost_advantage: ${preset}' among the defaults."
+            f"{type(loss).__name__} reads cost advantages (has_costs), and its algorithm is not "
+            "constrained: write algo.constrained=true and '- /cost_advantage: ${preset}' among "
+            "its defaults."
         )
     others = {name: part for name, part in parts.items() if name != "actor_network"}
-    update = build_update(config.policy_update, loss=loss, **others)  # asks its loss for the actor
+    update = build_update(config.policy_update, PolicyUpdate, loss=loss, **others)
     then = config.get("then") or {}
     for name, pair in then.items():
         if set(pair) != {"loss", "policy_update"}:

@@ -6,7 +6,8 @@ your own: each gets those live objects that its constructor names.
 
 from __future__ import annotations
 
-from typing import Any, cast
+from inspect import isclass
+from typing import Any, TypeVar
 
 from omegaconf import DictConfig
 
@@ -15,21 +16,22 @@ from safe_rl.targets import TargetError, accepted_names, build, locate
 
 __all__ = ["build_part", "build_update", "find_recipe"]
 
-_DEFAULT_RECIPE = "safe_rl.algorithms.OnPolicy"
+Update = TypeVar("Update")
 
 
 def find_recipe(config: DictConfig) -> type[Recipe]:
-    """The recipe that a configuration names as ``algo._target_``; on-policy unless told otherwise.
+    """The recipe that a configuration names as ``algo._target_``.
 
     Raises:
         TargetError: If there is no such class, or it is no recipe.
     """
-    target = config.algo.get("_target_", _DEFAULT_RECIPE)
+    target = config.algo.get("_target_")
     recipe = locate(target, "algo._target_")
-    missing = [name for name in ("build", "build_policy") if not hasattr(recipe, name)]
-    if missing:
-        raise TargetError(f"algo._target_={target} is no recipe: it has no {missing[0]}().")
-    return cast(type[Recipe], recipe)
+    if not (isclass(recipe) and issubclass(recipe, Recipe)):
+        raise TargetError(
+            f"algo._target_={target} is no recipe: derive it from safe_rl.algorithms.Recipe."
+        )
+    return recipe
 
 
 def build_part(node: DictConfig, **objects: Any) -> Any:
@@ -46,15 +48,16 @@ def build_part(node: DictConfig, **objects: Any) -> Any:
     return build(node, **{k: v for k, v in objects.items() if v is not None and k in names})
 
 
-def build_update(node: DictConfig, **objects: Any) -> Any:
-    """Build, as `build_part` does, what improves networks: checkpoints ask for its state later.
+def build_update(node: DictConfig, kind: type[Update], **objects: Any) -> Update:
+    """Build, as `build_part` does, what improves networks.
 
     Raises:
-        TargetError: As by `build_part`, or if it is no update.
+        TargetError: As by `build_part`, or if it is no update of this kind.
     """
     update = build_part(node, **objects)
-    for name in ("__call__", "state_dict", "load_state_dict"):
-        if not hasattr(update, name):
-            target = f"{node._get_full_key(None)}._target_={node._target_}"
-            raise TargetError(f"{target} is no update: it has no {name}().")
+    if not isinstance(update, kind):
+        raise TargetError(
+            f"{node._get_full_key(None)}._target_={node._target_} is no update: derive it from "
+            f"safe_rl.algorithms.{kind.__name__}."
+        )
     return update

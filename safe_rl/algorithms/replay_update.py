@@ -10,11 +10,12 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor, nn
 from torch.optim import Optimizer
-from torchrl.objectives import LossModule, SoftUpdate
+from torchrl.objectives import SoftUpdate
 
 from safe_rl.algorithms.losses import ESTIMATOR, divergence, sum_of_losses
 from safe_rl.algorithms.memory import Memory
 from safe_rl.naming import did_you_mean
+from safe_rl.objectives.q_functions import ReplayLoss
 
 __all__ = ["ReplayUpdate"]
 
@@ -23,9 +24,7 @@ class ReplayUpdate:
     """Minimise the sum of all ``loss_*`` on minibatches, and let target networks follow.
 
     Args:
-        loss: Loss module, with target parameters unless ``tau`` is None. For a ``policy_delay``
-            above 1 it has ``critic_losses`` and ``actor_losses``, which together are what it
-            returns.
+        loss: Loss on steps of the buffer, with target networks unless ``tau`` is None.
         optimizer: Function of the parameters that builds the optimiser, for example
             ``functools.partial(torch.optim.Adam, lr=3e-4, fused=True)``.
         updates_per_step: Gradient steps per step of an environment, the update-to-data ratio.
@@ -60,7 +59,7 @@ class ReplayUpdate:
 
     def __init__(
         self,
-        loss: LossModule,
+        loss: ReplayLoss,
         *,
         optimizer: Callable[[Iterable[Any]], Optimizer],
         updates_per_step: float,
@@ -76,11 +75,10 @@ class ReplayUpdate:
         self._device = next(loss.parameters()).device
         # makes them equal, and refuses a loss that has none; its steps cost three times as much
         self._share = 0.0 if tau is None else 1 - SoftUpdate(loss, tau=tau).eps
-        tensors = dict(self._tensors())
-        names = [name for name in tensors if name.startswith("target_")]
-        self._targets = [tensors[name].data for name in names]
-        self._sources = [tensors[name.removeprefix("target_")].data for name in names]
-        if names and tau is None:
+        pairs = loss.target_pairs()
+        self._targets = [target.data for target, _ in pairs]
+        self._sources = [source.data for _, source in pairs]
+        if pairs and tau is None:
             raise ValueError(
                 f"tau is null, but {type(loss).__name__} has target networks: they would stay as "
                 "they are at first. Give the share of the way that they go, such as tau=0.01."
@@ -117,8 +115,7 @@ class ReplayUpdate:
             if not total.isfinite():
                 raise divergence(losses)
             self._step(total, with_actor)
-            # a loss that learns no values has no key for it, and its memory no priorities
-            memory.learned(minibatch, getattr(self.loss.tensor_keys, "priority", "td_error"))
+            memory.learned(minibatch, self.loss.priority_key)
             with torch.no_grad():
                 values = dict(losses.items())
                 sums += torch.stack([_mean(values.get(name, nothing)) for name in names])
@@ -169,7 +166,7 @@ def _mean(value: Tensor) -> Tensor:
     return value.mean() if value.ndim else value
 
 
-def _groups(loss: LossModule, rates: Mapping[str, float]) -> list[dict[str, Any]]:
+def _groups(loss: ReplayLoss, rates: Mapping[str, float]) -> list[dict[str, Any]]:
     """Groups of parameters for an optimiser: one per rate, and the others."""
     groups: dict[str, list[Tensor]] = {"": [], **{prefix: [] for prefix in rates}}
     for name, parameter in loss.named_parameters():

@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable
 from typing import Any, NamedTuple, NotRequired, TypedDict
 
 import torch
 from tensordict import TensorDictBase
 from tensordict.nn import ProbabilisticTensorDictSequential
-from torch import Tensor
+from torch import Tensor, nn
+from torchrl.objectives import LossModule
 
+from safe_rl.algorithms.contract import PolicyUpdate
 from safe_rl.algorithms.losses import sum_of_losses
 from safe_rl.objectives.distributions import ReferencePolicy
 from safe_rl.objectives.fisher import FisherProduct
@@ -82,7 +84,7 @@ def total_loss(losses: TensorDictBase) -> Tensor:
     return total
 
 
-class TRPOStep:
+class TRPOStep(PolicyUpdate):
     """Natural-gradient step on a loss, within a trust region (Schulman et al. 2015, appendix C).
 
     The step is √(2δ / xᵀHx)·x with H x = −g solved by conjugate gradients, H the Fisher matrix of
@@ -129,11 +131,10 @@ class TRPOStep:
         actor_network: ProbabilisticTensorDictSequential | None = None,
     ) -> None:
         self.loss = loss
-        actor = actor_network or getattr(loss, "actor_network", None)
-        if actor is None:
-            raise ValueError(
-                "The loss has no attribute `actor_network`: pass the policy as actor_network."
-            )
+        if actor_network is None:
+            if not isinstance(loss, LossModule):
+                raise ValueError("The loss is no LossModule: pass the policy as actor_network.")
+            actor_network = loss.actor_network
         if not (target_kl > 0 and 0 < backtrack_coeff < 1 and 0 < fisher_subsample <= 1):
             raise ValueError(
                 "target_kl must be positive, backtrack_coeff in (0, 1) and fisher_subsample in "
@@ -142,7 +143,7 @@ class TRPOStep:
         self.target_kl, self.damping, self.cg_iterations = target_kl, damping, cg_iterations
         self.backtrack_coeff, self.max_backtracks = backtrack_coeff, max_backtracks
         self.fisher_subsample = fisher_subsample
-        self.actor_network = actor
+        self.actor_network = actor_network
         self.parameters = [p for p in self.actor_network.parameters() if p.requires_grad]
 
     def __call__(
@@ -167,7 +168,8 @@ class TRPOStep:
             FloatingPointError: if an entry of the batch, the loss or the step is not finite; the
                 policy is as it was then.
         """
-        require_finite(batch, getattr(self.loss, "in_keys", ()))
+        if isinstance(self.loss, LossModule):
+            require_finite(batch, self.loss.in_keys)
         batch = learning_samples(batch, self.actor_network.in_keys)
         with torch.no_grad():
             reference = ReferencePolicy(policy_in(self.actor_network, batch))
@@ -259,9 +261,6 @@ class TRPOStep:
             "backtracks": torch.tensor(round(tries)),
         }
 
-    def state_dict(self) -> dict[str, Any]:
-        """Empty: a step has no state beyond the policy."""
-        return {}
-
-    def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
-        """Nothing to load."""
+    def loss_modules(self) -> dict[str, nn.Module]:
+        """The loss, if it is a module."""
+        return {"loss": self.loss} if isinstance(self.loss, nn.Module) else {}

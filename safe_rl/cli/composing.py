@@ -160,7 +160,7 @@ def _chooses(override: str, hydra: Hydra) -> bool:
 
 def _check_package(config: DictConfig) -> None:
     """An algorithm's file that does not say so ends up below ``algo``, with all its keys."""
-    own = ("name", "_target_")
+    own = ("name", "_target_", "constrained")
     misplaced = [str(key) for key in config.get("algo") or () if key in config and key not in own]
     if misplaced:
         raise CommandLineError(

@@ -72,6 +72,9 @@ KEYS = {
     "logger": Key(_SECTION, "where else columns go: logger=wandb; logger=none: nowhere"),
     "env.name": Key(_FOLDER_OF_ENV, "name of the environment"),
     "algo.name": Key(folder_name, "name of the algorithm"),
+    "algo.constrained": Key(
+        boolean, "whether cost_limits are kept, or costs only counted", may_lack=True
+    ),
     "checkpoint.interval": Key(number(0), "seconds between checkpoints"),
     "checkpoint.keep_last": Key(count(1, 10_000), "checkpoints that are kept besides the best"),
     "checkpoint.keep_best": Key(count(1, 10_000), "best checkpoints kept", may_lack=True),

@@ -22,7 +22,6 @@ from safe_rl.cli.meant import choice_with, keys_meant, paths_of
 from safe_rl.cli.settings import SettingError, optional_keys, plain
 from safe_rl.envs.gymnasium.nodes import hint_of_gymnasium
 from safe_rl.naming import did_you_mean, nearest
-from safe_rl.targets import locate
 
 __all__ = [
     "COMPOSING_ERRORS",
@@ -45,7 +44,6 @@ GIVEN_WHOLE = {
 }
 _MOST_LISTED = 40
 _ONE_EACH = ("env", "algo", "preset", "model", "risk", "collector", "logger", "lagrangian")
-_DEFAULT_RECIPE = "safe_rl.algorithms.OnPolicy"
 
 
 class CommandLineError(ValueError):
@@ -175,8 +173,9 @@ def check_read(overrides: Sequence[Override], config: DictConfig) -> None:
 
 def _unread_by(algo: Mapping[str, Any]) -> Mapping[str, str]:
     """Keys that an algorithm does not read, choices that are not for it, and the reasons."""
-    recipe = locate(algo.get("_target_", _DEFAULT_RECIPE), "algo._target_")
-    return getattr(recipe, "unread", {})
+    from safe_rl.algorithms.parts import find_recipe  # with torch: not for help and --cfg
+
+    return find_recipe(OmegaConf.create({"algo": dict(algo)})).unused_keys
 
 
 def explain(

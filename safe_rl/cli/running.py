@@ -89,14 +89,14 @@ def prepare(config: DictConfig, directory: Path, continues: bool) -> Trainer | N
             episodes=config.evaluation.episodes,
         )
     trainer = build_trainer(config, training, directory, in_workers, evaluation)
-    if learns_from := getattr(trainer.algorithm, "learns_from", ""):
-        print(learns_from)
+    if trainer.algorithm.learns_from:
+        print(trainer.algorithm.learns_from)
     if continues and trainer.resume():
         print(f"Going on after {trainer.progress.steps:,} of {config.frames:,} frames.")
         if trainer.begins_anew:
             print("The state of its environments is not stored: they begin new episodes.")
-        if lost := getattr(trainer.algorithm, "lost_on_resume", ""):
-            print(lost)
+        if trainer.algorithm.lost_on_resume:
+            print(trainer.algorithm.lost_on_resume)
         return trainer
     if continues and trainer.record.folder.num_rows:
         print("No checkpoint was written yet: starting over, with a new progress.csv.")

@@ -4,15 +4,15 @@ from __future__ import annotations
 
 from tensordict import TensorDict, TensorDictBase, TensorDictParams
 from tensordict.nn import TensorDictModuleBase, dispatch
-from torchrl.objectives import LossModule
 from torchrl.objectives.utils import distance_loss
 
 from safe_rl.objectives.keys import require
+from safe_rl.objectives.q_functions import ReplayLoss
 
 __all__ = ["BCLoss"]
 
 
-class BCLoss(LossModule):
+class BCLoss(ReplayLoss):
     """Distance of a deterministic policy's actions from those that were taken.
 
     Liu et al., *Datasets and Benchmarks for Offline Safe Reinforcement Learning* (2024), where the
@@ -32,6 +32,8 @@ class BCLoss(LossModule):
         >>> loss(steps.detach())["loss_actor"]
         tensor(0., grad_fn=<MeanBackward0>)
     """
+
+    learns_values = False
 
     actor_network: TensorDictModuleBase
     actor_network_params: TensorDictParams

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, ClassVar
 
 from tensordict import NestedKey, TensorDict, TensorDictBase
 from tensordict.nn import dispatch
@@ -11,10 +11,12 @@ from torchrl.objectives import LossModule
 from torchrl.objectives.value import ValueEstimatorBase
 
 from safe_rl.objectives.keys import require
+from safe_rl.objectives.violation import KnownCosts
 
 __all__ = [
     "InOneCall",
     "QFunctionLoss",
+    "ReplayLoss",
     "discount_of",
     "is_ensemble",
     "scalars",
@@ -48,7 +50,47 @@ class InOneCall:
         return self.network(steps[0] if self.of_copies else steps, params)
 
 
-class QFunctionLoss(LossModule):
+class ReplayLoss(LossModule):
+    """What the off-policy recipe and its update ask of a loss on steps from a replay buffer.
+
+    Attributes:
+        learns_values: whether it learns Q functions, so that n-step sums and priorities are of use.
+        risk_measure: kind of risk measure that its cost critics estimate, or None for means only.
+    """
+
+    learns_values: ClassVar[bool] = True
+    risk_measure: ClassVar[type | None] = None
+
+    @property
+    def priority_key(self) -> NestedKey:
+        """Where it writes the TD errors, [...], by which a buffer draws."""
+        return "td_error"
+
+    def target_pairs(self) -> list[tuple[Tensor, Tensor]]:
+        """Tensors of target networks, each with that of the network that it follows.
+
+        TorchRL's losses call those of the network ``x`` ``target_x``.
+        """
+        tensors = {**dict(self.named_parameters()), **dict(self.named_buffers())}
+        prefix = "target_"
+        return [
+            (tensor, tensors[name.removeprefix(prefix)])
+            for name, tensor in tensors.items()
+            if name.startswith(prefix)
+        ]
+
+    def critic_losses(self, tensordict: TensorDictBase) -> TensorDict:
+        """Losses of the Q functions alone, for steps that leave the policy as it is."""
+        raise NotImplementedError
+
+    def calibrate(self, episodes: KnownCosts) -> None:
+        """Take in what a batch says about the costs of episodes, before its updates."""
+
+    def measure(self, rewards: Tensor) -> None:
+        """Take in the rewards of new steps, [...]."""
+
+
+class QFunctionLoss(ReplayLoss):
     """What a loss on Q functions has besides TorchRL's: halves, one discount, copies of their own.
 
     Classes put it before TorchRL's loss that they inherit from.
@@ -70,9 +112,10 @@ class QFunctionLoss(LossModule):
         """
         return self.critic_losses(tensordict).update(self.actor_losses(tensordict))
 
-    def critic_losses(self, tensordict: TensorDictBase) -> TensorDict:
-        """Losses of the Q functions."""
-        raise NotImplementedError
+    @property
+    def priority_key(self) -> NestedKey:
+        """Where it writes the TD errors, [...]."""
+        return self.tensor_keys.priority
 
     def actor_losses(self, tensordict: TensorDictBase) -> TensorDict:
         """Losses of the policy, and what is reported of it."""

@@ -11,8 +11,9 @@ what it had cost when the batch began, and batches need not hold whole episodes.
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Mapping
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -34,9 +35,21 @@ class Charges(NamedTuple):
     limit: Tensor
 
 
-class RiskMeasure(Protocol):
-    """A measure of episode costs that is limited instead of their mean."""
+class RiskMeasure(ABC):
+    """A measure of episode costs that is limited instead of their mean.
 
+    Attributes:
+        limits: d, [k].
+    """
+
+    limits: Tensor
+
+    @property
+    def held_limits(self) -> Tensor:
+        """What an episode's charges are held against on average, [k]."""
+        return self.limits
+
+    @abstractmethod
     def __call__(self, costs: Tensor, ends: Tensor, before: Tensor, finished: Tensor) -> Charges:
         """Charge the steps of a batch.
 
@@ -46,15 +59,13 @@ class RiskMeasure(Protocol):
             before: cost of the open episodes before the first step, [N, k].
             finished: costs of the episodes that finished, [E, k].
         """
-        ...
 
     def state_dict(self) -> dict[str, Any]:
-        """Everything the next charges depend on."""
-        ...
+        """Everything the next charges depend on, if not on the batch alone."""
+        return {}
 
     def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
         """Continue from :meth:`state_dict`."""
-        ...
 
 
 def value_at_risk(costs: Tensor, tail: float) -> Tensor:
@@ -83,7 +94,7 @@ def cost_so_far(costs: Tensor, ends: Tensor, before: Tensor) -> Tensor:
     return (total - closed.cummax(1).values).to(costs)
 
 
-class CVaR:
+class CVaR(RiskMeasure):
     """CVaR_α ≤ d: the mean cost of the worst fraction α of the episodes.
 
     CVaR = ν + E[(C − ν)₊] / α with ν, the value at risk, the cost that a fraction α of the episodes
@@ -156,7 +167,7 @@ class CVaR:
         self._steps = int(state_dict["steps"])
 
 
-class Chance:
+class Chance(RiskMeasure):
     """P(C > d) ≤ ε: at most a fraction ε of the episodes costs more than d.
 
     The step with which an episode's cost passes d is charged w = max(d, 1) and no other, so that an
@@ -196,10 +207,3 @@ class Chance:
         was_over[:, 0] = before > self.limits
         charged = torch.where(over & ~was_over, self.weight, 0.0).to(costs)
         return Charges(charged, torch.zeros_like(self.limits), self.held_limits)
-
-    def state_dict(self) -> dict[str, Any]:
-        """Nothing: charges depend on the batch alone."""
-        return {}
-
-    def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
-        """Nothing to go on with."""

@@ -136,6 +136,13 @@ class SurrogateLoss(LossModule):
         """Whether cost advantages are read."""
         return self.multiplier is not None
 
+    def anchor(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Prepare a batch before the first step of an update on it, and return it.
+
+        A loss that measures from the policy as it is then keeps what it needs of it.
+        """
+        return tensordict
+
     @property
     def behaviour_keys(self) -> dict[NestedKey, NestedKey]:
         """Where the batch holds the behaviour policy's parameters, by where the actor writes them.

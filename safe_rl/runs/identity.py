@@ -60,6 +60,7 @@ ROLES: dict[str, Role] = {
     "lagrangian.derivative_delay": Role.EXPERIMENT,
     "loss.alpha_init": Role.EXPERIMENT,
     "*._target_": Role.EXPERIMENT,
+    "algo.constrained": Role.MANNER,  # told by the rest of the algorithm
     "collector": Role.MANNER,
     "collector.ray_init": Role.MACHINE,
     "default_cost_limits": Role.MANNER,

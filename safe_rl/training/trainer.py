@@ -168,7 +168,7 @@ class Trainer:
         self.accounting.forget_open_episodes()
         if self._recording is not None:
             self._recording.cut_after(self.progress.epoch - 1)
-        getattr(self.algorithm, "forget_open_episodes", lambda: None)()
+        self.algorithm.forget_open_episodes()
         if hasattr(self._env, "continue_from"):
             self._env.continue_from(self.progress.steps // self._env.batch_size.numel())
         # otherwise it would meet the episodes again that the run began with; workers, which have

@@ -20,11 +20,13 @@ __all__ = ["begin_from", "initialise_networks"]
 def begin_from(algorithm: Algorithm, config: Mapping[str, Any]) -> list[str]:
     """Let an algorithm begin with the networks of ``init_from``; see `initialise_networks`."""
     taken = initialise_networks(
-        algorithm.networks, Path(config["init_from"]), algorithm.cost_keys, _cost_loss(config)
+        algorithm.networks,
+        Path(config["init_from"]),
+        algorithm.cost_keys,
+        _cost_loss(config),
+        algorithm.cost_networks,
     )
-    follow = getattr(algorithm, "networks_were_given", None)
-    if follow is not None:
-        follow()
+    algorithm.networks_replaced()
     return taken
 
 
@@ -33,17 +35,19 @@ def initialise_networks(
     source: Path,
     cost_keys: Sequence[str],
     cost_loss: str | None = None,
+    cost_networks: Collection[str] = ("cost_critic",),
 ) -> list[str]:
     """Give networks the weights that a run has learned.
 
-    Optimisers, multipliers and counters start anew. Networks whose names begin with ``cost_`` are
-    taken over if the run constrained the same costs, and had the same loss say what they are.
+    Optimisers, multipliers and counters start anew. Networks about costs are taken over if the run
+    constrained the same costs, and had the same loss say what they are.
 
     Args:
         networks: The new run's by name, changed in place.
         source: Folder of the run, of which the newest checkpoint is read, or a checkpoint.
         cost_keys: Keys of the new run's constrained costs.
         cost_loss: Loss of the new run's cost critics if they learn from a memory.
+        cost_networks: Names of the networks that are about costs.
 
     Returns:
         Names of the networks that were taken over.
@@ -59,7 +63,7 @@ def initialise_networks(
     taken = {
         name: network
         for name, network in networks.items()
-        if same_costs or not name.startswith("cost_")
+        if same_costs or name not in cost_networks
     }
     _check_parts(taken, checkpoint)
     weights = read_states(checkpoint, taken)
@@ -84,7 +88,7 @@ def _cost_critics(checkpoint: Path) -> tuple[list[str], str | None]:
     """Costs that the cost critic of a checkpoint's run is for, none if not known; and its loss."""
     run = RunFolder(run_of(checkpoint)[0])
     config = read_config(run.config) if run.is_run else {}
-    is_constrained = config.get("cost_advantage") or config.get("limits") is not None
+    is_constrained = (config.get("algo") or {}).get("constrained", False)
     costs = list(config.get("cost_limits", {})) if is_constrained else []
     return costs, _cost_loss(config)
 

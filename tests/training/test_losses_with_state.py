@@ -1,7 +1,5 @@
 """What a loss of one's own keeps from batch to batch is part of a checkpoint."""
 
-import types
-
 import pytest
 import torch
 from point_mass_runs import point_mass_trainer
@@ -85,7 +83,7 @@ def test_losses_of_torchrl_s_keep_no_settings_of_their_value_estimators(kind):
     critic = TensorDictModule(torch.nn.Linear(3, 1), ["observation"], ["state_value"])
     loss = kind(actor, critic)
     loss.make_value_estimator(gamma=0.9, lmbda=0.8)
-    assert not LossState(types.SimpleNamespace(loss=loss), besides=[actor, critic])
+    assert not LossState({"loss": loss}, besides=[actor, critic])
 
 
 @pytest.mark.parametrize("algo", ["ppo", "cpo", "focops", "cup", "ipo", "ppo_lagrangian"])

@@ -13,6 +13,7 @@ from torch import nn
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 from torchrl.modules import RandomPolicy
 
+from safe_rl.algorithms import Algorithm, Recipe
 from safe_rl.evaluation.episodes import collect_episodes
 from safe_rl.evaluation.loading import find_checkpoint, load_config, load_policy
 from safe_rl.runs.table import read_table
@@ -45,7 +46,7 @@ class RandomExploration(TensorDictModuleBase):
         return tensordict
 
 
-class OneStepQ:
+class OneStepQ(Algorithm, Recipe):
     """Fits Q(s, a) to the reward of one step, from a replay buffer."""
 
     cost_keys = ()
