@@ -155,13 +155,13 @@ FLOORS = {
         ("",),
     ),
     "runs": (
-        ("archive", "files", "folder", "outcome"),
-        ("checkpoints", "code", "curves", "identity", "keeping", "lock", "loggers", "table"),
-        ("record", "resuming"),
+        ("checkpoint_file", "files", "folder", "outcome"),
+        ("checkpoints", "curves", "identity", "loggers", "run_archive", "table"),
+        ("record",),
         ("",),
     ),
     "training": (
-        ("candidates", "interrupts", "state", "transfer"),
+        ("candidates", "state"),
         ("trainer",),
         ("building",),
         ("",),
