@@ -20,7 +20,7 @@ import torch
 
 from safe_rl.envs.physics.batch import BatchPhysics
 from safe_rl.envs.velocity import VELOCITY_SUITE, VelocityEnv
-from safe_rl.envs.velocity.robots import ROBOTS
+from safe_rl.envs.velocity.runners import RUNNERS
 
 COLUMNS = (
     *("env", "num_envs", "threads", "env steps/s", "bare steps/s", "ratio"),
@@ -81,7 +81,7 @@ def measure(name, num_envs, threads, steps, repeats):
         {"robot": env.config.robot, **_without_contacts(env.config)}, num_threads=threads
     )
     physics = BatchPhysics(plain._model, num_envs, threads, outputs=())
-    gymnasium_id = ROBOTS[env.config.robot].gymnasium_id
+    gymnasium_id = RUNNERS[env.config.robot].gymnasium_id
     vector = gymnasium.make_vec(gymnasium_id, num_envs=num_envs, vectorization_mode="sync")
     vector.reset(seed=0)
     tensordict, turns = env.reset(), []

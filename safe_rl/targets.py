@@ -30,8 +30,7 @@ __all__ = [
 _ROOMS: dict[str, tuple[str, ...] | None] = {
     "safe_rl.algorithms": None,
     "safe_rl.collectors": ("make_process_collector", "make_ray_collector"),
-    "safe_rl.envs.gymnasium": ("make_gymnasium",),
-    "safe_rl.envs.safety_gymnasium": ("make_safety_gymnasium",),
+    "safe_rl.envs.gymnasium": ("make_gymnasium", "make_safety_gymnasium"),
     "safe_rl.envs.torchrl": ("make_torchrl",),
     "safe_rl.envs.transforms": None,
     "safe_rl.envs.velocity": ("VelocityEnv",),

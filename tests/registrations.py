@@ -5,11 +5,7 @@ from contextlib import contextmanager
 
 import torch
 
-from safe_rl.envs.safety_gym.building import forget_scenes
-from safe_rl.envs.safety_gym.config import registered_keys, set_registered_keys
-from safe_rl.envs.safety_gym.costs import COSTS
-from safe_rl.envs.safety_gym.elements import BY_KIND, ELEMENTS, PLACEMENT_ORDER
-from safe_rl.envs.safety_gym.extending import (
+from safe_rl.envs.extending import (
     BOX,
     CYLINDER,
     Cost,
@@ -19,6 +15,10 @@ from safe_rl.envs.safety_gym.extending import (
     register_cost,
     register_element,
 )
+from safe_rl.envs.safety_gym.building import forget_scenes
+from safe_rl.envs.safety_gym.config import registered_keys, set_registered_keys
+from safe_rl.envs.safety_gym.costs import COSTS
+from safe_rl.envs.safety_gym.elements import BY_KIND, ELEMENTS, PLACEMENT_ORDER
 from safe_rl.envs.safety_gym.readings import READINGS
 from safe_rl.envs.safety_gym.robots import ROBOTS
 from safe_rl.envs.safety_gym.tasks import TASKS

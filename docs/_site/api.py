@@ -23,18 +23,13 @@ MODULES = {
     "safe_rl.reporting": "Reports",
     "safe_rl.runs.table": "Tables of runs",
 }
-# a module whose rows stand elsewhere -> where its names are read from
-_SOURCES = {"safe_rl.envs.extending": "safe_rl.envs.safety_gym.extending"}
 # page -> its name in the navigation
 PAGES = {f"api/{module}.md": module for module in MODULES}
 
 
 def pages() -> dict[str, str]:
     """Page, relative to `docs/` -> its Markdown."""
-    made = {
-        page: f"# {module}\n\n::: {_SOURCES.get(module, module)}\n"
-        for page, module in PAGES.items()
-    }
+    made = {page: f"# {module}\n\n::: {module}\n" for page, module in PAGES.items()}
     rows = "".join(f"| [`{m}`]({m}.md) | {what} |\n" for m, what in MODULES.items())
     made["api/index.md"] = (
         "# API\n\nWhat is public, from the docstrings; every example in them is run by a test.\n\n"

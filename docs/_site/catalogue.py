@@ -23,7 +23,7 @@ from safe_rl.envs.safety_gym.config_keys import Vocabulary
 from safe_rl.envs.safety_gym.costs import COSTS, EXCEPTION_KEY
 from safe_rl.envs.safety_gym.elements import ELEMENTS
 from safe_rl.envs.velocity import VELOCITY_SUITE, VelocityEnv
-from safe_rl.envs.velocity.config import VelocityConfig
+from safe_rl.envs.velocity.velocity_config import VelocityConfig
 
 _NAMES = ("Point", "Car", "Doggo")
 _ROBOTS = Path(inspect.getfile(SafetyGymEnv)).parent / "robots"

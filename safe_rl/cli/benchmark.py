@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from safe_rl.envs.safety_gym.suite import SUITE, group_node, resolve
+from safe_rl.envs.families import config_node
+from safe_rl.envs.safety_gym.suite import SUITE, resolve
 from safe_rl.scores.benchmark import Suite
 
 __all__ = ["suite"]
@@ -10,5 +11,5 @@ __all__ = ["suite"]
 
 def suite() -> Suite:
     """All environments of the suite, every key of each."""
-    nodes = {name: group_node(name, config) for name, config in SUITE.items()}
-    return Suite(nodes, group_node("", resolve({})))
+    nodes = {name: config_node(name, config) for name, config in SUITE.items()}
+    return Suite(nodes, config_node("", resolve({})))

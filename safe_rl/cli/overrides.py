@@ -20,7 +20,7 @@ from yaml import YAMLError
 from safe_rl.cli.keys import KEYS
 from safe_rl.cli.meant import choice_with, keys_meant, paths_of
 from safe_rl.cli.settings import SettingError, optional_keys, plain
-from safe_rl.envs.gymnasium.nodes import hint_of_gymnasium
+from safe_rl.envs.foreign import hint_of_gymnasium
 from safe_rl.naming import did_you_mean, nearest
 
 __all__ = [

@@ -15,7 +15,7 @@ from safe_rl.evaluation.settings import option
 from safe_rl.reporting import Report, build_report, write_report
 from safe_rl.reporting.cleaning import clean
 from safe_rl.runs.files import check_place
-from safe_rl.runs.run_archive import keep_runs
+from safe_rl.runs.keeping import keep_runs
 from safe_rl.scores.published import SEEDS
 
 __all__ = ["ReportOptions", "main", "report"]

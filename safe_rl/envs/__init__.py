@@ -11,7 +11,7 @@ from safe_rl.envs.opengl import OpenGLError
 
 # isort: split
 from safe_rl.envs.errors import ConfigError
-from safe_rl.envs.names import complete_env, env_names, env_node
+from safe_rl.envs.families import complete_env, env_names, env_node
 from safe_rl.envs.registration import register_gymnasium, store_config, store_configs
 from safe_rl.envs.safety_gym.config import SafetyGymConfig, key_table
 from safe_rl.envs.safety_gym.suite import EXTRAS, SUITE, resolve
@@ -25,8 +25,9 @@ if TYPE_CHECKING:
         SnapshotEnv,
         check_constrained_env,
     )
-    from safe_rl.envs.families import make_env
     from safe_rl.envs.gymnasium.conversion import from_gymnasium
+    from safe_rl.envs.gymnasium.six_values import from_six_values
+    from safe_rl.envs.making import make_env
     from safe_rl.envs.safety_gym.env import SafetyGymEnv
     from safe_rl.envs.safety_gym.layouts import LayoutError
 
@@ -49,6 +50,7 @@ __all__ = [
     "env_names",
     "env_node",
     "from_gymnasium",
+    "from_six_values",
     "key_table",
     "make_env",
     "resolve",
@@ -63,7 +65,8 @@ __getattr__, __dir__ = import_later(
         "LayoutError": "safe_rl.envs.safety_gym.layouts",
         "SafetyGymEnv": "safe_rl.envs.safety_gym.env",
         "from_gymnasium": "safe_rl.envs.gymnasium.conversion",
-        "make_env": "safe_rl.envs.families",
+        "make_env": "safe_rl.envs.making",
+        "from_six_values": "safe_rl.envs.gymnasium.six_values",
     },
 )
 

@@ -1,4 +1,254 @@
-"""Adding to Safety Gym's vocabulary from outside the package, see `safety_gym.extending`."""
+"""Adding to the vocabulary from outside the package: elements, tasks, costs, observations, robots.
 
-from safe_rl.envs.safety_gym.extending import *  # noqa: F403
-from safe_rl.envs.safety_gym.extending import __all__ as __all__
+Each function puts one row into the table that the built-in ones stand in, and its configuration
+keys beside the built-in keys, with the same validation. Registering a name again replaces the row,
+so that a notebook cell can run twice; environments made before keep what they were made with.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any
+
+from safe_rl.envs.errors import ConfigError, nearest
+from safe_rl.envs.safety_gym.building import forget_scenes
+from safe_rl.envs.safety_gym.config import Key, registered_keys, set_registered_keys
+from safe_rl.envs.safety_gym.config_values import infer_annotation
+from safe_rl.envs.safety_gym.costs import (
+    COSTS,
+    EXCEPTION_KEY,
+    Cost,
+    contact_cost,
+    hazard_cost,
+)
+from safe_rl.envs.safety_gym.elements import (
+    BOX,
+    BY_KIND,
+    CYLINDER,
+    ELEMENTS,
+    PLACEMENT_ORDER,
+    SPHERE,
+    Element,
+    Geom,
+    Motion,
+)
+from safe_rl.envs.safety_gym.readings import READINGS, Reading
+from safe_rl.envs.safety_gym.robots import ROBOTS, load_robot
+from safe_rl.envs.safety_gym.tasks import TASKS, NextGoal, Task
+from safe_rl.envs.safety_gym.world import World
+
+__all__ = [
+    "BOX",
+    "CYLINDER",
+    "SPHERE",
+    "Cost",
+    "Element",
+    "Geom",
+    "Key",
+    "Motion",
+    "NextGoal",
+    "Reading",
+    "Task",
+    "World",
+    "contact_cost",
+    "hazard_cost",
+    "register_cost",
+    "register_element",
+    "register_observation",
+    "register_robot",
+    "register_task",
+]
+
+_BUILT_IN = {
+    "element": frozenset(BY_KIND),
+    "task": frozenset(TASKS),
+    "cost": frozenset(["cost", EXCEPTION_KEY, *(row.key for row in COSTS)]),
+    "observation": frozenset(row.name for row in READINGS),
+    "robot": frozenset(ROBOTS),
+}
+
+
+def register_element(element: Element, keys: Mapping[str, Any] | None = None) -> None:
+    """Add a kind of object.
+
+    It comes with the configuration keys `<kind>_placements`, `<kind>_locations`, `<kind>_keepout`
+    and `<kind>_size`; with `<kind>_num`, unless it belongs to a task (a kind that is its own
+    label); with `observe_<kind>`, unless the row names another flag; with `<kind>_density` and
+    `<kind>_rots` if it can be pushed, and with `<kind>_travel` if it is guided. It is placed after
+    the built-in kinds.
+
+    Args:
+        element: the row.
+        keys: further keys with their defaults, and other defaults of the keys above. A default that
+            does not tell its type (None, an empty tuple) is given as `Key(default, annotation)`.
+
+    Raises:
+        ConfigError: if the kind, its label or a key is taken, or a default cannot be used.
+
+    Examples:
+        >>> puddle = Element(
+        ...     kind="puddles",
+        ...     label="puddle",
+        ...     motion=Motion.VIRTUAL,
+        ...     height=lambda c: 0.01,
+        ...     geoms=lambda c: (Geom(CYLINDER, (c.puddles_size, 0.005)),),
+        ...     rgb=(0.2, 0.4, 0.6),
+        ...     group=3,
+        ... )
+        >>> register_element(puddle, keys={"puddles_keepout": 0.3, "puddles_depth": 0.1})
+        >>> from safe_rl.envs import SafetyGymConfig
+        >>> SafetyGymConfig(puddles_num=2).puddles_depth
+        0.1
+    """
+    _refuse_taken("element", element.kind)
+    if not isinstance(element.motion, Motion):
+        names = ", ".join(f"Motion.{motion.name}" for motion in Motion)
+        raise ConfigError(f"'{element.kind}': motion={element.motion!r} must be one of {names}.")
+    others = [row for row in ELEMENTS if row.kind != element.kind]
+    if element.label in {"robot", "floor", *(row.label for row in others)}:
+        raise ConfigError(f"Another object is called '{element.label}': choose another label.")
+    _add_keys(keys, _keys_of(element))
+    # Rows of one motion stand together, because slots, bodies and `qpos` are in their order.
+    place = 1 + max(i for i, row in enumerate(others) if row.motion is element.motion)
+    ELEMENTS[:] = [*others[:place], element, *others[place:]]
+    BY_KIND[element.kind] = element
+    if element.kind not in PLACEMENT_ORDER:
+        PLACEMENT_ORDER.append(element.kind)
+    forget_scenes()
+
+
+def register_task(name: str, task: Task, keys: Mapping[str, Any] | None = None) -> None:
+    """Add a task.
+
+    Args:
+        name: value of the configuration key `task`.
+        task: the row.
+        keys: its configuration keys with their defaults.
+
+    Raises:
+        ConfigError: if the name or a key is taken, or the row names unknown elements.
+
+    Examples:
+        >>> away = Task(lambda c, w, before, now: c.reward_away * w.robot_vel[:, 0].abs())
+        >>> register_task("away", away, keys={"reward_away": 0.5})
+    """
+    _refuse_taken("task", name)
+    for kinds in (task.elements, task.touches, task.at_origin):
+        _refuse_unknown_kinds(kinds)
+    if task.met is not None and "goal" not in task.elements:
+        raise ConfigError(f"Task '{name}' meets goals: add 'goal' to its elements.")
+    _add_keys(keys)
+    TASKS[name] = task
+    forget_scenes()
+
+
+def register_cost(cost: Cost, keys: Mapping[str, Any] | None = None) -> None:
+    """Add a cost key.
+
+    Args:
+        cost: the row; its key starts with "cost_".
+        keys: its configuration keys with their defaults.
+
+    Raises:
+        ConfigError: if the key is taken or badly named, or the row names unknown elements.
+
+    Examples:
+        >>> speeding = Cost(
+        ...     "cost_speeding",
+        ...     active=lambda c: c.constrain_speed,
+        ...     magnitude=lambda c, w: (w.robot_vel.norm(dim=-1) - c.speed_limit).clamp(min=0.0),
+        ... )
+        >>> register_cost(speeding, keys={"constrain_speed": False, "speed_limit": 1.0})
+    """
+    _refuse_taken("cost", cost.key)
+    if not cost.key.startswith("cost_"):
+        raise ConfigError(f"The cost key '{cost.key}' must start with 'cost_'.")
+    _refuse_unknown_kinds(cost.touches)
+    _add_keys(keys)
+    COSTS[:] = [*(row for row in COSTS if row.key != cost.key), cost]
+    forget_scenes()
+
+
+def register_observation(reading: Reading, keys: Mapping[str, Any] | None = None) -> None:
+    """Add a component of the observation.
+
+    Args:
+        reading: the row.
+        keys: its configuration keys with their defaults.
+
+    Raises:
+        ConfigError: if the name or a key is taken, or the row names unknown elements.
+
+    Examples:
+        >>> height = Reading(
+        ...     "height",
+        ...     present=lambda c: c.observe_height,
+        ...     size=lambda c, scene: 1,
+        ...     read=lambda w: w.robot_pos[:, 2:],
+        ... )
+        >>> register_observation(height, keys={"observe_height": False})
+    """
+    _refuse_taken("observation", reading.name)
+    _refuse_unknown_kinds(reading.touches)
+    _add_keys(keys)
+    READINGS[:] = [*(row for row in READINGS if row.name != reading.name), reading]
+    forget_scenes()
+
+
+def register_robot(name: str, path: str | Path) -> None:
+    """Give an MJCF file a name that `robot_base` accepts.
+
+    Raises:
+        ConfigError: if the name is taken, or the file lacks what `robots` asks for.
+    """
+    _refuse_taken("robot", name)
+    load_robot(str(path))
+    ROBOTS[name] = Path(path)
+    forget_scenes()
+
+
+def _refuse_taken(what: str, name: str) -> None:
+    if name in _BUILT_IN[what]:
+        raise ConfigError(f"'{name}' is a built-in {what}: choose another name.")
+
+
+def _refuse_unknown_kinds(kinds: Iterable[str]) -> None:
+    if isinstance(kinds, str):
+        raise ConfigError(f"'{kinds}' is a text: kinds are given in a tuple, ('{kinds}',).")
+    for kind in kinds:
+        if kind not in BY_KIND:
+            raise ConfigError(
+                f"There is no element '{kind}'.{nearest(kind, BY_KIND)} Register the element first."
+            )
+
+
+def _keys_of(element: Element) -> dict[str, Key]:
+    """Keys that every element of this sort has."""
+    keys = {
+        "placements": Key(None, "Placements"),
+        "locations": Key((), "Locations"),
+        "keepout": Key(0.4, "float"),
+        "size": Key(0.1, "float"),
+    }
+    if not element.singular:
+        keys["num"] = Key(0, "int")
+    if element.motion in (Motion.FREE, Motion.GUIDED):
+        keys |= {"density": Key(0.001, "float"), "rots": Key((), "tuple[float, ...]")}
+    if element.motion is Motion.GUIDED:
+        keys["travel"] = Key(0.3, "float")
+    named = {f"{element.kind}_{suffix}": key for suffix, key in keys.items()}
+    return named if element.flag else {**named, f"observe_{element.kind}": Key(False, "bool")}
+
+
+def _add_keys(given: Mapping[str, Any] | None, standard: Mapping[str, Key] | None = None) -> None:
+    """Extend the vocabulary by standard keys and by those that were given, defaults or `Key`."""
+    keys = dict(standard or {})
+    for name, value in (given or {}).items():
+        if isinstance(value, Key):
+            keys[name] = value
+        elif name in keys:
+            keys[name] = keys[name]._replace(default=value)
+        else:
+            keys[name] = Key(value, infer_annotation(name, value))
+    set_registered_keys({**registered_keys(), **keys})

@@ -14,10 +14,10 @@ from hydra.plugins.config_source import ConfigLoadError, ConfigResult, ConfigSou
 from hydra.plugins.search_path_plugin import SearchPathPlugin
 from omegaconf import OmegaConf
 
-from safe_rl.envs.names import GROUP, env_names, env_node
+from safe_rl.envs.families import GROUP, config_node, env_names, env_node
 from safe_rl.envs.safety_gym.config import SafetyGymConfig
-from safe_rl.envs.safety_gym.suite import EXTRAS, SUITE, TESTING, group_node, resolve
-from safe_rl.envs.velocity.suite import VELOCITY_SUITE
+from safe_rl.envs.safety_gym.suite import EXTRAS, SUITE, TESTING, resolve
+from safe_rl.envs.velocity.velocity_config import VELOCITY_SUITE
 from safe_rl.targets import allow
 
 SCHEME = "safe-rl-environments"
@@ -101,7 +101,7 @@ def store_config(name: str, config: Mapping[str, Any] | SafetyGymConfig) -> None
         if module.partition(".")[0] not in ("safe_rl", "torch"):
             allow(module)
     else:
-        node = group_node(name, resolve(config))
+        node = config_node(name, resolve(config))
     ConfigStore.instance().store(group=GROUP, name=name, node=node)
 
 
@@ -114,26 +114,19 @@ def store_configs() -> None:
 def register_gymnasium() -> None:
     """Give Gymnasium an id `Safexp-{name}-v0` for every name, and `Safexp-Custom-v0`.
 
-    The original's environments for tests are `Testing-{name}-v0`, as there.
-
-    The custom one has the defaults of every configuration key; all of them take a `config` with
-    keys to change. The velocity family has `SafeHopperVelocity-v0` and so on. What the ids stand
-    for is imported when an environment is made.
+    The original's environments for tests are `Testing-{name}-v0`, as there. The custom one has the
+    defaults of every configuration key; all of them take a `config` with keys to change. The
+    velocity family has `SafeHopperVelocity-v0` and so on. What the ids stand for is imported when
+    an environment is made.
     """
-    prefixes = dict.fromkeys((*SUITE, *EXTRAS, None), "Safexp") | dict.fromkeys(TESTING, "Testing")
-    for name, prefix in prefixes.items():
-        env_id = f"{prefix}-{name or 'Custom'}-v0"
+    ids = {f"Safexp-{name}-v0": name for name in (*SUITE, *EXTRAS)} | {"Safexp-Custom-v0": None}
+    ids |= {f"Testing-{name}-v0": name for name in TESTING}
+    ids |= {f"{name}-v0": name for name in VELOCITY_SUITE}
+    for env_id, name in ids.items():
         if env_id not in gymnasium.registry:
             gymnasium.register(
                 env_id,
-                entry_point="safe_rl.envs.gymnasium.single:SafetyGymnasiumEnv",
-                vector_entry_point="safe_rl.envs.gymnasium.vector:SafetyGymnasiumVectorEnv",
-                kwargs={"name": name},
-            )
-    for name in VELOCITY_SUITE:
-        if f"{name}-v0" not in gymnasium.registry:
-            gymnasium.register(
-                f"{name}-v0",
-                entry_point="safe_rl.envs.gymnasium.velocity:VelocityGymnasiumEnv",
+                entry_point="safe_rl.envs.gymnasium.gymnasium_interfaces:WorldEnv",
+                vector_entry_point="safe_rl.envs.gymnasium.gymnasium_interfaces:WorldVectorEnv",
                 kwargs={"name": name},
             )

@@ -1,9 +1,9 @@
-"""What environments that simulate their worlds here have in common, whatever is simulated."""
+"""What environments that simulate their worlds here have in common: seeds, states, pictures."""
 
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from typing import Any, ClassVar
 
 import mujoco
@@ -35,6 +35,8 @@ class SimulatedEnv(EnvBase):
     flags: ClassVar[tuple[str, ...]] = ("done", "terminated", "truncated")
     #: Camera of pictures where none is named.
     first_camera: ClassVar[str]
+    #: Modes of Gymnasium's interface that the family can be shown in.
+    render_modes: ClassVar[tuple[str, ...]] = ("rgb_array",)
     #: What a copy has beside the state: attributes that are tensors.
     copied: ClassVar[tuple[str, ...]] = ("_row_seed", "_has_cost", "_begun")
 
@@ -91,6 +93,31 @@ class SimulatedEnv(EnvBase):
     def observation_layout(self) -> dict[str, slice]:
         """Columns of every named component in `observation`."""
         return dict(self._observer.columns)
+
+    @property
+    def observation_bounds(self) -> dict[str, tuple[float, float]]:
+        """Lowest and highest value of named components in `observation`; others have none."""
+        return {}
+
+    def get_positions(self) -> TensorDict:
+        """Return where things are, a TensorDict [N] of [N, K, 3] by kind (m); here of nothing."""
+        return TensorDict(batch_size=self.batch_size)
+
+    def set_row_seeds(self, seeds: Sequence[int | None]) -> None:
+        """Seed every world on its own, [N]: with the episodes of row 0 of its seed.
+
+        None leaves a world as it was seeded.
+
+        Raises:
+            ValueError: If there are not as many seeds as worlds.
+        """
+        if len(seeds) != self.batch_size[0]:
+            raise ValueError(f"{self.batch_size[0]} worlds need as many seeds, got {len(seeds)}.")
+        for row, seed in enumerate(seeds):
+            if seed is not None:
+                require_integer("seed", seed, lowest=-(2**63))
+                self._row_seed[row] = rng.row_seeds(seed, 1)[0]
+                self._episode[row] = 0
 
     def _set_seed(self, seed: int | None) -> None:
         if seed is None:
@@ -236,3 +263,58 @@ class SimulatedEnv(EnvBase):
         """Free what OpenGL holds, and close the viewer if there is one."""
         self._renderer.close()
         super().close(raise_if_closed=raise_if_closed)
+
+
+class ResetNeededError(RuntimeError):
+    """A step before the first reset: there is no episode that it could be one of."""
+
+
+def require_episodes(begun: Tensor) -> None:
+    """Check that every environment is in an episode.
+
+    Args:
+        begun: Environments that were reset or put into a state, bool [N].
+
+    Raises:
+        ResetNeededError: If some were not.
+    """
+    if not begun.all():
+        rows = (~begun).nonzero()[:, 0].tolist()
+        which = "" if not begun.any() else f" of rows {rows}"
+        raise ResetNeededError(f"No episode has begun{which}: call reset() before the first step.")
+
+
+def check_state(
+    expected: TensorDictBase,
+    state: TensorDictBase,
+    optional: Collection[str],
+    finite: Collection[str] = (),
+) -> None:
+    """Compare a state with one that the environment made.
+
+    Args:
+        expected: The environment's own.
+        state: What is about to be set.
+        optional: Keys that may be missing.
+        finite: Keys that may hold no NaN or infinity; elsewhere they are failures of the physics.
+
+    Raises:
+        KeyError: If another key is missing.
+        ValueError: If a shape or a type does not fit, or a number is not finite.
+    """
+    for key, value in expected.items():
+        if key not in state:
+            if key not in optional:
+                needed = sorted(set(expected.keys()) - set(optional))
+                raise KeyError(f"The state lacks '{key}'; it needs {needed}.")
+            continue
+        given = state[key]
+        if given.shape != value.shape:
+            raise ValueError(
+                f"State '{key}' must have shape {tuple(value.shape)} in this environment, got "
+                f"{tuple(given.shape)}."
+            )
+        if not value.dtype.is_floating_point and given.dtype != value.dtype:
+            raise ValueError(f"State '{key}' must be {value.dtype}, got {given.dtype}.")
+        if key in finite and not given.isfinite().all():
+            raise ValueError(f"State '{key}' has numbers that are not finite.")

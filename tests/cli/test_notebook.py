@@ -21,7 +21,7 @@ from safe_rl.cli.python_settings import compose_new, overrides_of, search_path
 from safe_rl.envs import ConfigError, store_configs
 from safe_rl.evaluation.loading import find_checkpoint
 from safe_rl.reporting.recorded import find_runs
-from safe_rl.runs.run_archive import keep_runs
+from safe_rl.runs.keeping import keep_runs
 from safe_rl.runs.table import read_table
 from safe_rl.training.trainer import Trainer
 

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from PIL import Image
 
-from safe_rl.envs.names import env_names
+from safe_rl.envs.families import env_names
 
 ROOT = Path(__file__).resolve().parents[2]
 README = (ROOT / "README.md").read_text()

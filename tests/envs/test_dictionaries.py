@@ -9,7 +9,7 @@ import torch
 from reference import ReferenceWorld
 
 from safe_rl.envs import SUITE, ConfigError, SafetyGymConfig, SafetyGymEnv, resolve
-from safe_rl.envs.gymnasium.single import SafetyGymnasiumEnv
+from safe_rl.envs.gymnasium.gymnasium_interfaces import WorldEnv
 
 # By hand from section 9 of the benchmark's description, in the style of its suite.
 ROBOTS = {
@@ -94,7 +94,7 @@ def test_the_dictionaries_of_the_suite_are_its_environments(robot, level):
 
 
 def test_gymnasium_takes_them_too():
-    env = SafetyGymnasiumEnv(config=dictionary("Car", "Push1"))
+    env = WorldEnv(config=dictionary("Car", "Push1"))
     assert env.reset(seed=0)[0].shape == env.observation_space.shape
 
 

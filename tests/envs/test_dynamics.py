@@ -12,8 +12,8 @@ from safe_rl.envs import ConfigError, SafetyGymEnv, env_node, make_env
 from safe_rl.envs.physics.dynamics import SCALES, scale_dynamics
 from safe_rl.envs.safety_gym.robots import ROBOTS
 from safe_rl.envs.velocity import VELOCITY_SUITE, VelocityEnv
-from safe_rl.envs.velocity.model import ASSETS
-from safe_rl.envs.velocity.robots import ROBOTS as RUNNERS
+from safe_rl.envs.velocity.runner_model import ASSETS
+from safe_rl.envs.velocity.runners import RUNNERS
 
 FILES = {name: str(path) for name, path in ROBOTS.items()} | {
     name: str(ASSETS / row.mjcf) for name, row in RUNNERS.items()

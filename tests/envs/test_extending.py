@@ -10,7 +10,7 @@ from registrations import cube, disc, inside, register_mines, undone
 from torchrl.envs.utils import check_env_specs
 
 from safe_rl.envs import SUITE, ConfigError, SafetyGymEnv
-from safe_rl.envs.safety_gym.extending import (
+from safe_rl.envs.extending import (
     Cost,
     Motion,
     NextGoal,

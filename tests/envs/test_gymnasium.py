@@ -344,7 +344,7 @@ def test_specs_say_how_long_episodes_are_and_time_is_up_once():
     assert gymnasium.make(env.spec).spec.max_episode_steps == 1200
     envs = gymnasium.make_vec(**make, num_envs=2)
     assert envs.spec.max_episode_steps == 1200
-    assert gymnasium.make_vec(envs.spec).unwrapped.safety_gym.max_episode_steps == 1200
+    assert gymnasium.make_vec(envs.spec).unwrapped.batch.max_episode_steps == 1200
     short = gymnasium.make_vec(**make, num_envs=2, max_episode_steps=3)
     short.reset(seed=0)
     ends = [short.step(np.zeros((2, 2), np.float32))[3].all() for _ in range(3)]
@@ -383,7 +383,7 @@ def test_bounds_are_true(flatten):
     envs = gymnasium.make_vec("Safexp-CarGoal2-v0", num_envs=20, config=config)
     bounds = {"goal_compass": (-1, 1), "goal_dist": (0, 1)}
     bounds |= {f"{kind}_lidar": (0, 1) for kind in ("goal", "hazards", "vases")}
-    env, space = envs.safety_gym, envs.single_observation_space
+    env, space = envs.batch, envs.single_observation_space
     observation, _ = envs.reset(seed=0)
     for name, columns in env.observation_layout.items():
         box = space if flatten else space[name]

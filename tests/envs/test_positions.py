@@ -72,7 +72,7 @@ def test_infos_have_them_on_request():
         for kind, places in info["positions"].items():
             np.testing.assert_array_equal(infos["positions"][kind][0], places)
         assert infos["_positions"].all()
-        expected = env.unwrapped.safety_gym.get_positions()["robot"][0]
+        expected = env.unwrapped.batch.get_positions()["robot"][0]
         np.testing.assert_array_equal(info["positions"]["robot"], expected)
         action = np.ones(2, np.float32)
         info, infos = env.step(action)[-1], envs.step(np.stack([action, action]))[-1]

@@ -12,7 +12,7 @@ from registrations import disc, register_mines, undone
 from run_configs import CONF
 
 from safe_rl.envs import ConfigError, SafetyGymConfig, SafetyGymEnv, make_env, store_config
-from safe_rl.envs.safety_gym.extending import (
+from safe_rl.envs.extending import (
     Cost,
     Key,
     Reading,

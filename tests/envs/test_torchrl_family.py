@@ -19,7 +19,7 @@ from safe_rl import targets
 from safe_rl.cli import evaluate, report
 from safe_rl.collectors.worker_rows import split_rows
 from safe_rl.envs import ConfigError, complete_env, make_env
-from safe_rl.envs.torchrl.nodes import ROWS
+from safe_rl.envs.foreign import TORCHRL_CLASSES
 from safe_rl.runs.table import read_table
 from safe_rl.targets import TargetError
 
@@ -77,7 +77,7 @@ def test_it_resumes_is_evaluated_and_reported(run, tmp_path, capsys):
     assert "PendulumEnv" in (folder.parent / "report" / "report.md").read_text()
 
 
-@pytest.mark.parametrize("name", sorted(set(ROWS) - {"GymEnv"}))
+@pytest.mark.parametrize("name", sorted(set(TORCHRL_CLASSES) - {"GymEnv"}))
 def test_specs_hold_for_every_row(name):
     entry = {"PendulumEnv": "thdot", "FinancialRegimeEnv": "entry_price"}.get(name, "observation")
     node = {"_target_": TARGET, "id": name, "outside": {"cost_far": [entry, -1, 1]}}
@@ -233,7 +233,7 @@ def test_workers_have_rows_of_their_own():
         ({"id": "PendulunEnv"}, "Did you mean 'PendulumEnv'.*import=torchrl.envs"),
         ({"speed": 3}, "no key 'speed'.*env.kwargs"),
         ({"num_step": 3}, "Did you mean 'num_steps'"),
-        ({"num_steps": 0}, "'num_steps' must be an integer of at least 1"),
+        ({"num_steps": 0}, "'num_steps' must be a whole number from 1"),
         ({"num_steps": None}, "does not say how long"),
         ({"outside": None}, "what does a step cost"),
         ({"outside": {"speed": ["thdot", -4, 4]}}, "called cost or cost_<kind>, not 'speed'"),
@@ -244,7 +244,7 @@ def test_workers_have_rows_of_their_own():
         ({"observe": ["thdto"]}, "Did you mean 'thdot'"),
         ({"observe": "th"}, "must be a list"),
         ({"outside": {"cost_speed": ["thdot", float("inf"), -4, 4]}}, "must be as"),
-        ({"kwargs": 3}, "'kwargs' must be arguments by name"),
+        ({"kwargs": 3}, "'kwargs' must be a mapping"),
         ({"flatten": "ture"}, "'flatten' must be true or false"),
         ({"cost_keys": ["cost_none"]}, "no entry 'cost_none'"),
         *(({"cost_keys": [key]}, f"'{key}' is a state.*env.outside") for key in ("th", "reward")),

@@ -9,7 +9,7 @@ from tensordict import TensorDict
 
 from safe_rl.collectors import make_process_collector
 from safe_rl.envs import ConfigError, make_env
-from safe_rl.envs.velocity.suite import VELOCITY_SUITE
+from safe_rl.envs.velocity import VELOCITY_SUITE
 from safe_rl.models import BehaviourPolicy, make_actor
 
 
@@ -18,7 +18,7 @@ def test_ids_make_what_gymnasium_checks(name):
     env = gymnasium.make(f"safe_rl.envs:{name}-v0")
     check_env(env.unwrapped, skip_render_check=True)
     assert env.spec.max_episode_steps == 1000
-    theirs = gymnasium.make(env.unwrapped.robot._robot.gymnasium_id)
+    theirs = gymnasium.make(env.unwrapped.batch._robot.gymnasium_id)
     assert env.metadata["render_fps"] == theirs.unwrapped.metadata["render_fps"]
     assert env.observation_space.shape == theirs.observation_space.shape
     assert np.array_equal(env.action_space.low, theirs.action_space.low)
@@ -52,7 +52,7 @@ def test_episodes_are_those_of_the_batched_environment():
 def test_wrong_arguments_are_refused():
     with pytest.raises(ConfigError, match="Did you mean 'velocity_threshold'"):
         gymnasium.make("SafeHopperVelocity-v0", config={"velocity_treshold": 1.0})
-    with pytest.raises(ValueError, match="render_mode must be rgb_array"):
+    with pytest.raises(ValueError, match="render_mode must be one of"):
         gymnasium.make("SafeHopperVelocity-v0", render_mode="ansi", disable_env_checker=True)
 
 

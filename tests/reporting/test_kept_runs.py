@@ -10,7 +10,7 @@ from synthetic import write_run
 from safe_rl.cli.report import main
 from safe_rl.reporting.recorded import find_runs
 from safe_rl.runs import table as tables
-from safe_rl.runs.run_archive import keep_runs
+from safe_rl.runs.keeping import keep_runs
 from safe_rl.runs.table import read_table
 
 EPOCHS = {"returns": (1.0, 2.0, 2.5), "costs": (40.0, 30.0, 20.0), "rates": (0.04, 0.035, 0.03)}

@@ -12,114 +12,20 @@ import gymnasium
 import numpy as np
 import torch
 from gymnasium.vector import AutoresetMode, SyncVectorEnv, VectorEnv
-from tensordict import TensorDictBase
-from torchrl.data import Bounded, Composite, TensorSpec
-from torchrl.envs import GymWrapper, Transform, TransformedEnv
 
-from safe_rl.envs.cost_specs import cost_spec
-from safe_rl.envs.costs import COST, is_cost
+from safe_rl.envs.costs import CostRange, is_cost, parse_columns
 from safe_rl.envs.errors import ConfigError, nearest, require_integer, require_names
-from safe_rl.envs.gymnasium.adapting import adapt, check_workers, make_adapted
-from safe_rl.envs.gymnasium.processes import ProcessVectorEnv
-from safe_rl.envs.gymnasium.reading import CostReader, columns_of
+from safe_rl.envs.foreign import GYMNASIUM, complete_foreign
+from safe_rl.envs.gymnasium.env_wrappers import CostsOutside, adapt, make_adapted
+from safe_rl.envs.gymnasium.gymnasium_env import GymnasiumEnv, from_vector
+from safe_rl.envs.gymnasium.worker_processes import ProcessVectorEnv
+from safe_rl.envs.rng import spread_seed
+
+__all__ = ["describe_node", "from_gymnasium", "make_gymnasium"]
 
 MakeEnv = Callable[[], gymnasium.Env]
+_FAILURES = (gymnasium.error.Error, TypeError, ValueError)
 _NO_COSTS = {"observation", "action", "reward", "done", "terminated", "truncated"}
-
-
-class CostsAsRewards(Transform):
-    """Puts costs beside the reward instead of among the observations, and adds their sum.
-
-    Args:
-        cost_keys: costs that the environment writes; where `cost` is not one of them, it is added
-            as the sum of all.
-    """
-
-    def __init__(self, cost_keys: Sequence[str]) -> None:
-        super().__init__()
-        self._cost_keys = list(cost_keys)
-        self._sums = COST not in self._cost_keys
-
-    def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:
-        if self._sums:
-            costs = torch.stack([next_tensordict[key] for key in self._cost_keys])
-            next_tensordict[COST] = costs.sum(0)
-        return next_tensordict
-
-    def _reset(
-        self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
-    ) -> TensorDictBase:
-        return tensordict_reset.exclude(*self._cost_keys)
-
-    def transform_output_spec(self, output_spec: Composite) -> Composite:
-        """Move the specs accordingly."""
-        output_spec = super().transform_output_spec(output_spec)
-        observations, rewards = (
-            output_spec["full_observation_spec"],
-            output_spec["full_reward_spec"],
-        )
-        for key in self._cost_keys:
-            rewards[key] = observations[key]
-            del observations[key]
-        if self._sums:
-            rewards[COST] = _spec_of_sum([rewards[key] for key in self._cost_keys])
-        return output_spec
-
-
-class GymnasiumEnv(TransformedEnv):
-    """N environments of Gymnasium as one of TorchRL, made by `from_gymnasium`.
-
-    Attributes:
-        cost_keys: the aggregate `cost`, then one key per kind.
-        observation_layout: one component, the whole observation; of a dictionary, its entries.
-        max_episode_steps: the largest number of steps of an episode.
-    """
-
-    def __init__(self, base_env: GymWrapper, cost_keys: Sequence[str], num_steps: int) -> None:
-        super().__init__(base_env, CostsAsRewards(cost_keys))
-        self.cost_keys = [COST, *(key for key in cost_keys if key != COST)]
-        self.observation_layout = columns_of(base_env.observation_spec["observation"])
-        self.max_episode_steps = num_steps
-
-    @property
-    def seconds_per_step(self) -> float | None:
-        """What a step takes in the environment's own time [s], if it says that."""
-        rate = (getattr(self.base_env._env, "metadata", None) or {}).get("render_fps")
-        return 1 / rate if rate else None
-
-    def render(
-        self,
-        rows: int | Sequence[int] | None = None,
-        *,
-        camera: str = "free",
-        width: int = 480,
-        height: int = 360,
-    ) -> np.ndarray:
-        """Draw environments as they draw themselves, within a picture of the asked size.
-
-        Args:
-            rows: which of them; None is all.
-            camera: "free"; others are arguments of the environment's own.
-            width: of a frame [pixels].
-            height: of a frame [pixels].
-
-        Returns:
-            RGB, uint8: one frame [height, width, 3] for an integer, else [R, height, width, 3].
-
-        Raises:
-            ValueError: for another camera, or if the environments were made without pictures.
-        """
-        if camera != "free":
-            raise ValueError(
-                f"There is no camera '{camera}': an environment of Gymnasium has its own, which "
-                "its arguments may change (env.kwargs)."
-            )
-        frames = self.base_env._env.render()
-        if frames is None or frames[0] is None:
-            raise ValueError("It was made without pictures: env.render_mode=rgb_array.")
-        chosen = range(len(frames)) if rows is None else [rows] if isinstance(rows, int) else rows
-        drawn = np.stack([_fit(np.asarray(frames[row]), width, height) for row in chosen])
-        return drawn[0] if isinstance(rows, int) else drawn
 
 
 def from_gymnasium(
@@ -176,13 +82,11 @@ def from_gymnasium(
     require_integer("workers", workers, lowest=0)
     require_names("cost_keys", cost_keys)
     make = _maker(env, kwargs, num_steps)
-    keys, length = describe(make, cost_keys, num_steps, flatten)
+    keys, length = _describe(make, cost_keys, num_steps, flatten, workers)
     _check_keys(keys, highest_costs or {})
     make_one = partial(make_adapted, make, length, flatten, keys)
     worlds: VectorEnv
     if workers and not current_process().daemon:
-        if not flatten:
-            check_workers(make)
         worlds = ProcessVectorEnv(make_one, num_envs, min(workers, num_envs), keys)
     else:
         worlds = SyncVectorEnv([make_one] * num_envs, autoreset_mode=AutoresetMode.DISABLED)
@@ -190,41 +94,70 @@ def from_gymnasium(
     return from_vector(worlds, keys, length, seed=seed, device=device, highest_costs=highest_costs)
 
 
-def from_vector(
-    worlds: VectorEnv,
-    cost_keys: Sequence[str],
-    num_steps: int,
+def make_gymnasium(
+    config: Mapping[str, Any],
     *,
-    seed: int | None = None,
+    num_envs: int,
     device: torch.device | str = "cpu",
-    highest_costs: Mapping[str, float] | None = None,
+    seed: int | None = None,
+    num_threads: int = 0,
 ) -> GymnasiumEnv:
-    """Make a TorchRL environment of a batch whose observations and actions suit networks.
+    """Make environments of an id that is registered with Gymnasium: `env=gymnasium env.id=…`.
 
     Args:
-        worlds: N environments that are reset by a mask, and only then.
-        cost_keys: names of the costs in `info`.
-        num_steps: the largest number of steps of an episode.
-        seed: of all environments.
-        device: where the TensorDicts live.
-        highest_costs: cost key -> the most that a step can cost, where that is known.
-    """
-    base = GymWrapper(worlds, device=torch.device(device), categorical_action_encoding=True)
-    reader = CostReader(cost_keys, [worlds.num_envs], highest_costs, patience=num_steps)
-    base.set_info_dict_reader(reader)
-    batch = GymnasiumEnv(base, cost_keys, num_steps)
-    batch.set_seed(int(torch.randint(2**31, ())) if seed is None else seed)
-    return batch
-
-
-def describe(
-    make: MakeEnv, cost_keys: Sequence[str] | None, num_steps: int | None, flatten: bool
-) -> tuple[list[str], int]:
-    """Return the names of the costs and the length of episodes, found out where they are None.
+        config: `id` and any other key of conf/env/gymnasium.yaml.
+        num_envs: Number of environments, N.
+        device: Where the TensorDicts live.
+        seed: Determines every row; rows of different seeds have nothing in common.
+        num_threads: Taken as by any family; Gymnasium's environments do not use it.
 
     Raises:
-        ValueError: if the environment does not tell, or cannot be used.
+        ConfigError: For an unknown key or id, or an environment that the algorithms cannot use.
+
+    Examples:
+        >>> config = {"id": "Safexp-PointGoal1-v0", "num_steps": 100}
+        >>> make_gymnasium(config, num_envs=2, seed=0).cost_keys
+        ['cost', 'cost_hazards', 'cost_exception']
     """
+    config = complete_foreign(GYMNASIUM, config)
+    outside = list(config["outside"] or {})
+    try:
+        return from_gymnasium(
+            _maker_of_node(config),
+            num_envs=num_envs,
+            cost_keys=[*dict.fromkeys([*config["cost_keys"], *outside])],
+            num_steps=config["num_steps"],
+            seed=None if seed is None else spread_seed(seed),
+            workers=config["workers"],
+            flatten=config["flatten"],
+            device=device,
+            highest_costs=dict.fromkeys(outside, 1.0),
+        )
+    except _FAILURES as error:
+        raise ConfigError(f"env.id={config['id']}: {error}") from error
+
+
+def describe_node(config: Mapping[str, Any]) -> tuple[list[str], int]:
+    """Return the cost keys and the length of episodes of a node, found out where they are None.
+
+    Raises:
+        ConfigError: If there is no such environment, or the algorithms cannot use it.
+    """
+    make = _maker_of_node(config)
+    try:
+        return _describe(make, config["cost_keys"], config["num_steps"], config["flatten"])
+    except _FAILURES as error:
+        raise ConfigError(f"env.id={config['id']}: {error}") from error
+
+
+def _describe(
+    make: MakeEnv,
+    cost_keys: Sequence[str] | None,
+    num_steps: int | None,
+    flatten: bool,
+    workers: int = 0,
+) -> tuple[list[str], int]:
+    """Names of the costs and the length of episodes, found out where they are None."""
     if num_steps is not None:
         require_integer("num_steps", num_steps, lowest=1)
     probe = make()
@@ -232,27 +165,16 @@ def describe(
         raise ConfigError(f"It makes no environment of Gymnasium (gymnasium.Env), but {probe!r}.")
     try:
         adapted = adapt(probe, flatten=flatten)
+        if workers and isinstance(adapted.observation_space, gymnasium.spaces.Dict):
+            raise ValueError("workers are for observations that are arrays: use workers=0.")
         keys = _find_costs(adapted) if cost_keys is None else [*dict.fromkeys(cost_keys)]
-        return keys, _episode_length(adapted, num_steps)
+        known = None if adapted.spec is None else adapted.spec.max_episode_steps
+        length = known if num_steps is None else num_steps
+        if length is None:
+            raise ValueError(f"{adapted} does not say how long episodes are: give 'num_steps'.")
+        return keys, length
     finally:
         probe.close()
-
-
-def _spec_of_sum(specs: Sequence[TensorSpec]) -> TensorSpec:
-    highest = [float(spec.high.max()) for spec in specs if isinstance(spec, Bounded)]
-    is_known = len(highest) == len(specs)
-    return cost_spec(sum(highest) if is_known else None, specs[0].shape, specs[0].device)
-
-
-def _fit(picture: np.ndarray, width: int, height: int) -> np.ndarray:
-    """Resize to the largest picture that keeps its form, in the corner of [height, width, 3]."""
-    scale = min(width / picture.shape[1], height / picture.shape[0])
-    lines, columns = (
-        (np.arange(max(1, int(scale * size))) / scale).astype(int) for size in picture.shape[:2]
-    )
-    canvas = np.zeros((height, width, 3), dtype=np.uint8)
-    canvas[: len(lines), : len(columns)] = picture[lines[:, None], columns]
-    return canvas
 
 
 def _maker(env: Any, kwargs: Mapping[str, Any], num_steps: int | None) -> MakeEnv:
@@ -291,9 +213,25 @@ def _find_costs(probe: gymnasium.Env) -> list[str]:
     return keys
 
 
-def _episode_length(probe: gymnasium.Env, num_steps: int | None) -> int:
-    known = None if probe.spec is None else probe.spec.max_episode_steps
-    length = known if num_steps is None else num_steps
-    if length is None:
-        raise ValueError(f"{probe} does not say how long episodes are: give 'num_steps'.")
-    return length
+def _maker_of_node(config: Mapping[str, Any]) -> MakeEnv:
+    """Return a function that makes one environment; what is registered goes with it to workers."""
+    env_id = config["id"]
+    try:
+        spec = gymnasium.spec(env_id)
+    except gymnasium.error.Error as error:
+        raise ConfigError(
+            f"env.id={env_id}: {error} {nearest(env_id, gymnasium.registry)} A module that "
+            "registers an environment is imported by import=my_module."
+        ) from error
+    kwargs = dict(config["kwargs"] or {})
+    if config["num_steps"] is not None:
+        kwargs.setdefault("max_episode_steps", config["num_steps"])
+    if config["render_mode"] is not None:
+        kwargs["render_mode"] = config["render_mode"]
+    make = partial(gymnasium.make, spec, **kwargs)
+    ranges = parse_columns("outside", config["outside"])
+    return partial(_with_costs, make, ranges) if ranges else make
+
+
+def _with_costs(make: MakeEnv, ranges: dict[str, CostRange]) -> gymnasium.Env:
+    return CostsOutside(make(), ranges)

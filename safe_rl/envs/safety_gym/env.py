@@ -11,7 +11,6 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
 from safe_rl.envs import rng
-from safe_rl.envs.errors import require_integer
 from safe_rl.envs.physics.batch import BatchPhysics
 from safe_rl.envs.safety_gym.building import build_scene
 from safe_rl.envs.safety_gym.config import SafetyGymConfig
@@ -40,8 +39,7 @@ from safe_rl.envs.safety_gym.state import (
 )
 from safe_rl.envs.safety_gym.suite import resolve
 from safe_rl.envs.safety_gym.tasks import TASKS, dense_reward, goals_met
-from safe_rl.envs.simulated import SimulatedEnv
-from safe_rl.envs.states import require_episodes
+from safe_rl.envs.simulated import SimulatedEnv, require_episodes
 
 
 class SafetyGymEnv(SimulatedEnv):
@@ -85,6 +83,7 @@ class SafetyGymEnv(SimulatedEnv):
 
     flags: ClassVar = ("goal_met", *SimulatedEnv.flags)
     first_camera: ClassVar = "fixedfar"
+    render_modes: ClassVar = ("human", "rgb_array")
     copied: ClassVar = ("_fixed_layout", *SimulatedEnv.copied)
 
     def __init__(
@@ -134,22 +133,12 @@ class SafetyGymEnv(SimulatedEnv):
             self._fixed_layout = rng.fold(torch.tensor(seed), Purpose.LAYOUT)
 
     def set_row_seeds(self, seeds: Sequence[int | None]) -> None:
-        """Seed every world on its own, [N]: with the episodes of row 0 of its seed.
-
-        None leaves a world as it was seeded.
-
-        Raises:
-            ValueError: if there are not as many seeds as worlds.
-        """
-        if len(seeds) != self.batch_size[0]:
-            raise ValueError(f"{self.batch_size[0]} worlds need as many seeds, got {len(seeds)}.")
+        """Seed every world on its own, [N], its layout too; None leaves one as it was seeded."""
+        super().set_row_seeds(seeds)
         self._fixed_layout = self._fixed_layout.expand(self.batch_size).clone()
         for row, seed in enumerate(seeds):
             if seed is not None:
-                require_integer("seed", seed, lowest=-(2**63))
-                self._row_seed[row] = rng.row_seeds(seed, 1)[0]
                 self._fixed_layout[row] = rng.fold(torch.tensor(seed), Purpose.LAYOUT)
-                self._episode[row] = 0
 
     def _layout_key(self, ahead: int = 0) -> Tensor:
         """Random key of the layouts of so many episodes after the present ones, [N]."""

@@ -10,7 +10,7 @@ from safe_rl.envs.physics.batch import BatchPhysics
 from safe_rl.envs.safety_gym.geometry import circling_targets, yaw_quaternion
 from safe_rl.envs.safety_gym.tasks import TASKS, goal_is_button
 from safe_rl.envs.safety_gym.world import NO_BUTTON, Scene, World
-from safe_rl.envs.states import check_state
+from safe_rl.envs.simulated import check_state
 
 
 def make_world(scene: Scene, physics: BatchPhysics) -> World:

@@ -1,12 +1,12 @@
-"""TorchRL's environments, and those that one has written for it, with costs made by a rule."""
+"""TorchRL's environments, and those that users have written for it, with costs made by a rule."""
 
 from typing import TYPE_CHECKING
 
 from safe_rl.lazy import import_later
 
 if TYPE_CHECKING:
-    from safe_rl.envs.torchrl.family import make_torchrl
+    from safe_rl.envs.torchrl.torchrl_env import make_torchrl
 
 __all__ = ["make_torchrl"]
 
-__getattr__, __dir__ = import_later(__name__, {"make_torchrl": "safe_rl.envs.torchrl.family"})
+__getattr__, __dir__ = import_later(__name__, {"make_torchrl": "safe_rl.envs.torchrl.torchrl_env"})

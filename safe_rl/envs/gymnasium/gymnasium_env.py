@@ -1,0 +1,284 @@
+"""N environments of Gymnasium as one of TorchRL, with their costs beside the reward."""
+
+from __future__ import annotations
+
+import math
+import reprlib
+import warnings
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from itertools import accumulate
+from typing import Any
+
+import numpy as np
+import torch
+from gymnasium.vector import VectorEnv
+from tensordict import TensorDictBase
+from torch import Tensor
+from torchrl.data import Bounded, Composite, TensorSpec, Unbounded
+from torchrl.envs import GymWrapper, Transform, TransformedEnv
+from torchrl.envs.gym_like import BaseInfoDictReader
+
+from safe_rl import naming
+from safe_rl.envs.costs import COST, is_cost
+from safe_rl.envs.errors import ConfigError, nearest
+
+__all__ = ["CostReader", "GymnasiumEnv", "cost_spec", "from_vector"]
+
+_MISSPELT = 0.85
+"""Likeness above which two names are thought to be one."""
+
+
+class CostReader(BaseInfoDictReader):
+    """Reads costs from `info` into the TensorDict, float32 [N, 1]; 0 where none is reported.
+
+    Some environments report a cost only where it occurs. So a warning says, once, which name no
+    info has had for as long as an episode lasts, and which cost nobody counts because it was first
+    reported later; a name that is missing beside one that is nearly the same is an error.
+
+    Args:
+        cost_keys: names in `info`.
+        batch_size: [N], or [] of a single environment.
+        highest: name -> the most that a step can cost, where that is known.
+        patience: steps until the warning; None: never.
+
+    Examples:
+        >>> from tensordict import TensorDict
+        >>> reader = CostReader(["cost_crash"], [2])
+        >>> reader({"speed": np.ones(2)}, TensorDict(batch_size=[2]))["cost_crash"].flatten()
+        tensor([0., 0.])
+
+    Raises:
+        ConfigError: by the call, if a cost is not one number per step, or its name is misspelt.
+    """
+
+    def __init__(
+        self,
+        cost_keys: Sequence[str],
+        batch_size: Sequence[int],
+        highest: Mapping[str, float] | None = None,
+        patience: int | None = None,
+    ) -> None:
+        self._cost_keys = list(cost_keys)
+        self._shape = (*batch_size, 1)
+        self._highest = dict(highest or {})
+        self._patience = patience
+        self._unseen, self._names = set(self._cost_keys), set[str]()
+        self._num_steps = 0
+
+    def __call__(self, info_dict: dict[str, Any], tensordict: TensorDictBase) -> TensorDictBase:
+        """Write the costs of a step."""
+        if "reward" in tensordict:
+            self._look_at_names(info_dict)
+        for key in self._cost_keys:
+            tensordict[key] = self._one_each(key, info_dict.get(key, np.zeros(self._shape)))
+        return tensordict
+
+    def _one_each(self, key: str, value: Any) -> Tensor:
+        try:
+            return torch.as_tensor(value, dtype=torch.float32).reshape(self._shape)
+        except (TypeError, ValueError, RuntimeError):
+            raise ConfigError(
+                f"info['{key}'] must be one number per step, as a cost is; the steps of "
+                f"{math.prod(self._shape)} environments brought {reprlib.repr(value)}."
+            ) from None
+
+    def _look_at_names(self, info_dict: Mapping[str, Any]) -> None:
+        """Take note of the names that a step brings."""
+        # names that begin so are Gymnasium's masks
+        new = {name for name in info_dict if not name.startswith("_")} - self._names
+        self._names |= new
+        self._unseen -= new
+        others = self._names.difference(self._cost_keys)
+        if new and self._num_steps and COST not in self._cost_keys:
+            _warn_of_uncounted(filter(is_cost, new & others), self._cost_keys)
+        for key in self._unseen if new else ():
+            if alike := naming.nearest(key, others, _MISSPELT):
+                raise ConfigError(
+                    f"No info has the cost '{key}'. Did you mean '{alike}'? If there are both, "
+                    f"let every step report '{key}', or name both in 'cost_keys'."
+                )
+        self._num_steps += 1
+        if self._patience is not None and self._num_steps > self._patience:
+            _warn_of_unseen(self._unseen, others, self._patience)
+            self._unseen.clear()
+
+    @property
+    def info_spec(self) -> Composite:
+        """Shapes and types of the costs."""
+        costs = {key: cost_spec(self._highest.get(key), self._shape) for key in self._cost_keys}
+        return Composite(costs, shape=self._shape[:-1])
+
+
+class CostsAsRewards(Transform):
+    """Puts costs beside the reward instead of among the observations, and adds their sum.
+
+    Args:
+        cost_keys: costs that the environment writes; where `cost` is not one of them, it is added
+            as the sum of all.
+    """
+
+    def __init__(self, cost_keys: Sequence[str]) -> None:
+        super().__init__()
+        self._cost_keys = list(cost_keys)
+        self._sums = COST not in self._cost_keys
+
+    def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:
+        if self._sums:
+            costs = torch.stack([next_tensordict[key] for key in self._cost_keys])
+            next_tensordict[COST] = costs.sum(0)
+        return next_tensordict
+
+    def _reset(
+        self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
+    ) -> TensorDictBase:
+        return tensordict_reset.exclude(*self._cost_keys)
+
+    def transform_output_spec(self, output_spec: Composite) -> Composite:
+        """Move the specs accordingly."""
+        output_spec = super().transform_output_spec(output_spec)
+        observations, rewards = (
+            output_spec["full_observation_spec"],
+            output_spec["full_reward_spec"],
+        )
+        for key in self._cost_keys:
+            rewards[key] = observations[key]
+            del observations[key]
+        if self._sums:
+            rewards[COST] = _spec_of_sum([rewards[key] for key in self._cost_keys])
+        return output_spec
+
+
+class GymnasiumEnv(TransformedEnv):
+    """N environments of Gymnasium as one of TorchRL, made by `from_gymnasium`.
+
+    Attributes:
+        cost_keys: the aggregate `cost`, then one key per kind.
+        observation_layout: one component, the whole observation; of a dictionary, its entries.
+        max_episode_steps: the largest number of steps of an episode.
+    """
+
+    def __init__(self, base_env: GymWrapper, cost_keys: Sequence[str], num_steps: int) -> None:
+        super().__init__(base_env, CostsAsRewards(cost_keys))
+        self.cost_keys = [COST, *(key for key in cost_keys if key != COST)]
+        self.observation_layout = _columns(base_env.observation_spec["observation"])
+        self.max_episode_steps = num_steps
+
+    @property
+    def seconds_per_step(self) -> float | None:
+        """What a step takes in the environment's own time [s], if it says that."""
+        rate = (getattr(self.base_env._env, "metadata", None) or {}).get("render_fps")
+        return 1 / rate if rate else None
+
+    def render(
+        self,
+        rows: int | Sequence[int] | None = None,
+        *,
+        camera: str = "free",
+        width: int = 480,
+        height: int = 360,
+    ) -> np.ndarray:
+        """Draw environments as they draw themselves, within a picture of the asked size.
+
+        Args:
+            rows: which of them; None is all.
+            camera: "free"; others are arguments of the environment's own.
+            width: of a frame [pixels].
+            height: of a frame [pixels].
+
+        Returns:
+            RGB, uint8: one frame [height, width, 3] for an integer, else [R, height, width, 3].
+
+        Raises:
+            ValueError: for another camera, or if the environments were made without pictures.
+        """
+        if camera != "free":
+            raise ValueError(
+                f"There is no camera '{camera}': an environment of Gymnasium has its own, which "
+                "its arguments may change (env.kwargs)."
+            )
+        frames = self.base_env._env.render()
+        if frames is None or frames[0] is None:
+            raise ValueError("It was made without pictures: env.render_mode=rgb_array.")
+        chosen = range(len(frames)) if rows is None else [rows] if isinstance(rows, int) else rows
+        drawn = np.stack([_fit(np.asarray(frames[row]), width, height) for row in chosen])
+        return drawn[0] if isinstance(rows, int) else drawn
+
+
+def from_vector(
+    worlds: VectorEnv,
+    cost_keys: Sequence[str],
+    num_steps: int,
+    *,
+    seed: int | None = None,
+    device: torch.device | str = "cpu",
+    highest_costs: Mapping[str, float] | None = None,
+) -> GymnasiumEnv:
+    """Make a TorchRL environment of a batch whose observations and actions suit networks.
+
+    Args:
+        worlds: N environments that are reset by a mask, and only then.
+        cost_keys: names of the costs in `info`.
+        num_steps: the largest number of steps of an episode.
+        seed: of all environments.
+        device: where the TensorDicts live.
+        highest_costs: cost key -> the most that a step can cost, where that is known.
+    """
+    base = GymWrapper(worlds, device=torch.device(device), categorical_action_encoding=True)
+    reader = CostReader(cost_keys, [worlds.num_envs], highest_costs, patience=num_steps)
+    base.set_info_dict_reader(reader)
+    batch = GymnasiumEnv(base, cost_keys, num_steps)
+    batch.set_seed(int(torch.randint(2**31, ())) if seed is None else seed)
+    return batch
+
+
+def cost_spec(
+    highest: float | None, shape: Sequence[int], device: torch.device | None = None
+) -> TensorSpec:
+    """Spec of a step's cost, float32, from 0 to the most that is known of it, if anything is."""
+    if highest is None:
+        return Unbounded(shape=shape, device=device)
+    return Bounded(0.0, highest, shape=shape, device=device, dtype=torch.float32)
+
+
+def _columns(spec: TensorSpec) -> dict[str, slice]:
+    """Columns of every component of N observations, of entries as if they were one vector."""
+    parts = dict(spec.items()) if isinstance(spec, Composite) else {"observation": spec}
+    sizes = {str(name): part.shape[1:].numel() for name, part in sorted(parts.items())}
+    ends = accumulate(sizes.values())
+    return {name: slice(end - sizes[name], end) for name, end in zip(sizes, ends, strict=True)}
+
+
+def _warn_of_uncounted(keys: Iterable[str], named: Sequence[str]) -> None:
+    for key in keys:
+        warnings.warn(
+            f"A step reports the cost '{key}', which the first one did not, and which counts "
+            f"nowhere: 'cost_keys' are {', '.join(named)}. Name it there, too.",
+            stacklevel=4,
+        )
+
+
+def _warn_of_unseen(keys: Iterable[str], others: Collection[str], patience: int) -> None:
+    for key in sorted(keys):
+        warnings.warn(
+            f"The cost '{key}' is in no info of the first {patience} steps, and counts as 0."
+            f"{nearest(key, others)} The infos have {', '.join(sorted(others)) or 'no other'}. If "
+            "it is reported only where it occurs, it may not have occurred yet.",
+            stacklevel=4,
+        )
+
+
+def _spec_of_sum(specs: Sequence[TensorSpec]) -> TensorSpec:
+    highest = [float(spec.high.max()) for spec in specs if isinstance(spec, Bounded)]
+    is_known = len(highest) == len(specs)
+    return cost_spec(sum(highest) if is_known else None, specs[0].shape, specs[0].device)
+
+
+def _fit(picture: np.ndarray, width: int, height: int) -> np.ndarray:
+    """Resize to the largest picture that keeps its form, in the corner of [height, width, 3]."""
+    scale = min(width / picture.shape[1], height / picture.shape[0])
+    lines, columns = (
+        (np.arange(max(1, int(scale * size))) / scale).astype(int) for size in picture.shape[:2]
+    )
+    canvas = np.zeros((height, width, 3), dtype=np.uint8)
+    canvas[: len(lines), : len(columns)] = picture[lines[:, None], columns]
+    return canvas

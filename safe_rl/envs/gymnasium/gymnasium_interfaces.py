@@ -1,0 +1,239 @@
+"""Our simulated environments in Gymnasium's two interfaces: one world, and a batch of worlds."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import gymnasium
+import numpy as np
+from gymnasium.vector import AutoresetMode, VectorEnv
+from gymnasium.vector.utils import batch_space
+
+from safe_rl.envs.gymnasium.world_arrays import (
+    Config,
+    Observation,
+    Worlds,
+    batch_of,
+    choose,
+    final_infos,
+    take,
+    with_masks,
+)
+
+__all__ = ["WorldEnv", "WorldVectorEnv"]
+
+
+class WorldEnv(Worlds, gymnasium.Env[Any, np.ndarray]):
+    """One world in Gymnasium's interface.
+
+    Args:
+        name: Of the environment; None for the defaults of every key of Safety Gym's.
+        config: Keys to change, or a whole `SafetyGymConfig`.
+        render_mode: "rgb_array" for frames, "human" for MuJoCo's viewer (Safety Gym only), or None.
+        camera: Of the frames, as the environment's `render` takes it; None is its first.
+        width: Of a frame [pixels].
+        height: Of a frame [pixels].
+        sleep: As `SafetyGymEnv` takes it.
+        positions: Put `info["positions"]` into every info: float64 [K, 3] by kind (m), as
+            `SafetyGymEnv.get_positions` has them.
+
+    Raises:
+        ConfigError: For a configuration that cannot be used.
+        ValueError: For another render mode.
+        OpenGLError: For the mode "human" where there is no screen.
+
+    Examples:
+        >>> import gymnasium
+        >>> env = gymnasium.make("Safexp-PointGoal1-v0", config={"hazards_num": 3})
+        >>> _, _ = env.reset(seed=0)
+        >>> _, reward, terminated, truncated, info = env.step(env.action_space.sample())
+        >>> sorted(info)
+        ['cost', 'cost_exception', 'cost_hazards', 'goal_met']
+    """
+
+    metadata: dict[str, Any] = {"render_modes": ["human", "rgb_array"]}  # noqa: RUF012
+
+    def __init__(
+        self,
+        name: str | None = None,
+        config: Config = None,
+        *,
+        render_mode: str | None = None,
+        camera: Any = None,
+        width: int = 480,
+        height: int = 360,
+        sleep: bool = True,
+        positions: bool = False,
+    ) -> None:
+        self._open(batch_of(name, config, 1, 1, sleep), render_mode, positions)
+        self._view: dict[str, Any] = {"camera": camera, "width": width, "height": height}
+        self.observation_space, self.action_space = self.spaces()
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Observation, dict[str, Any]]:
+        """Start an episode; a seed determines it and all that follow."""
+        super().reset(seed=seed)
+        self._seed(seed, self.np_random)
+        observation = take(self._reset(), 0)
+        self._show()
+        return observation, self._position()
+
+    def step(self, action: np.ndarray) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
+        """Take one action [nu]."""
+        observation, values, infos = self._step(np.asarray(action)[None])
+        self._show()
+        reward, terminated, truncated = (value[0].item() for value in values)
+        info = {key: value[0].item() for key, value in infos.items()} | self._position()
+        return take(observation, 0), reward, terminated, truncated, info
+
+    def render(self) -> np.ndarray | None:
+        """Return a frame, uint8 [height, width, 3], in the mode "rgb_array"."""
+        self._show()
+        return self.batch.render(0, **self._view) if self.render_mode == "rgb_array" else None
+
+    def close(self) -> None:
+        """Close the viewer and free what OpenGL holds."""
+        self.batch.close()
+
+    def _position(self) -> dict[str, Any]:
+        return {key: take(values, 0) for key, values in self._positions().items()}
+
+
+class WorldVectorEnv(Worlds, VectorEnv[Any, np.ndarray, np.ndarray]):
+    """A batch of worlds in Gymnasium's vector interface, stepped together on a thread pool.
+
+    Row k of a seed has the same episodes whatever `num_envs` is; row 0 has those of `WorldEnv` with
+    that seed.
+
+    Args:
+        num_envs: Number of worlds, N.
+        name: As `WorldEnv` takes it.
+        config: As `WorldEnv` takes it.
+        autoreset_mode: When an ended episode is followed by a new one: with the next step, within
+            the same step (what ended is then in `infos["final_obs"]` and `infos["final_info"]`), or
+            by `reset(options={"reset_mask": mask})`.
+        render_mode: "rgb_array" for frames, "human" for a viewer of row 0, None for neither.
+        camera: As `WorldEnv` takes it.
+        width: Of a frame [pixels].
+        height: Of a frame [pixels].
+        num_threads: Threads that step the physics; 0 for one per core.
+        sleep: As `SafetyGymEnv` takes it.
+        positions: Put `infos["positions"]` into all infos: float64 [N, K, 3] by kind (m), as
+            `SafetyGymEnv.get_positions` has them.
+        max_episode_steps: Takes the place of `num_steps`; `gymnasium.make_vec` passes it on.
+
+    Raises:
+        ConfigError: For a configuration that cannot be used.
+        OpenGLError: For the mode "human" where there is no screen.
+
+    Examples:
+        >>> import gymnasium
+        >>> envs = gymnasium.make_vec("Safexp-PointGoal1-v0", num_envs=3)
+        >>> _, _ = envs.reset(seed=0)
+        >>> _, _, _, _, infos = envs.step(envs.action_space.sample())
+        >>> infos["cost"].shape
+        (3,)
+    """
+
+    metadata: dict[str, Any] = {  # noqa: RUF012
+        "render_modes": ["human", "rgb_array"],
+        "autoreset_mode": AutoresetMode.NEXT_STEP,
+    }
+
+    def __init__(
+        self,
+        num_envs: int = 1,
+        name: str | None = None,
+        config: Config = None,
+        *,
+        autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
+        render_mode: str | None = None,
+        camera: Any = None,
+        width: int = 480,
+        height: int = 360,
+        num_threads: int = 0,
+        sleep: bool = True,
+        positions: bool = False,
+        max_episode_steps: int | None = None,
+    ) -> None:
+        batch = batch_of(name, config, num_envs, num_threads, sleep, max_episode_steps)
+        self._open(batch, render_mode, positions)
+        self._view: dict[str, Any] = {"camera": camera, "width": width, "height": height}
+        self.num_envs, self.autoreset_mode = num_envs, AutoresetMode(autoreset_mode)
+        self.metadata = {**self.metadata, "autoreset_mode": self.autoreset_mode}
+        self.single_observation_space, self.single_action_space = self.spaces()
+        self.observation_space = batch_space(self.single_observation_space, num_envs)
+        self.action_space = batch_space(self.single_action_space, num_envs)
+        self._ended = np.zeros(num_envs, dtype=bool)
+
+    def reset(
+        self, *, seed: Any = None, options: dict[str, Any] | None = None
+    ) -> tuple[Observation, dict[str, Any]]:
+        """Start new episodes.
+
+        Args:
+            seed: Determines the episodes of all worlds; or one for every world [N], which then has
+                those of `WorldEnv` with that seed, and None goes on as it was seeded.
+            options: `reset_mask`, bool [N], restricts the reset to some worlds.
+
+        Raises:
+            ValueError: For a mask of another shape or type, or a seed for a part of the worlds,
+                or seeds of another number.
+        """
+        super().reset(seed=seed if isinstance(seed, int) else None)
+        mask = (options or {}).get("reset_mask")
+        if mask is not None:
+            self._check_mask(mask, seed)
+        self._seed(seed, self.np_random)
+        observation = self._reset(mask)
+        new = np.ones(self.num_envs, dtype=bool) if mask is None else mask
+        self._ended = self._ended & ~new
+        self._show()
+        return observation, with_masks(self._positions(), new)
+
+    def step(
+        self, actions: np.ndarray
+    ) -> tuple[Observation, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
+        """Take an action [N, nu] in every world, see `autoreset_mode` for those that ended."""
+        if self.autoreset_mode is AutoresetMode.DISABLED and self._ended.any():
+            raise RuntimeError(
+                f"Worlds {np.flatnonzero(self._ended).tolist()} have ended: call "
+                "reset(options={'reset_mask': terminations | truncations}) before the next step."
+            )
+        observation, (reward, terminated, truncated), infos = self._step(actions)
+        within = self.autoreset_mode is AutoresetMode.SAME_STEP
+        # Worlds that start an episode in this step.
+        begins = terminated | truncated if within else self._ended
+        reported = with_masks(infos, ~begins)
+        if within:
+            reported |= final_infos(observation, infos | self._positions(), begins)
+        else:
+            # The step of a world that had already ended counts for nothing.
+            reward = np.where(begins, 0.0, reward)
+            terminated, truncated = terminated & ~begins, truncated & ~begins
+            self._ended = terminated | truncated
+        if begins.any():
+            observation = choose(begins, self._reset(begins), observation)
+        # Those of a world that begins are of its new episode.
+        reported |= with_masks(self._positions(), np.ones_like(begins))
+        self._show()
+        return observation, reward, terminated, truncated, reported
+
+    def render(self) -> tuple[np.ndarray, ...] | None:
+        """Return a frame of every world, uint8 [height, width, 3], in the mode "rgb_array"."""
+        self._show()
+        return tuple(self.batch.render(**self._view)) if self.render_mode == "rgb_array" else None
+
+    def close_extras(self, **kwargs: Any) -> None:
+        """Close the viewer and free what OpenGL holds."""
+        self.batch.close()
+
+    def _check_mask(self, mask: np.ndarray, seed: Any) -> None:
+        if getattr(mask, "shape", None) != (self.num_envs,) or mask.dtype != bool or not mask.any():
+            raise ValueError(
+                f"options['reset_mask'] must be a boolean array of shape ({self.num_envs},) with "
+                f"at least one True, got {mask!r}."
+            )
+        if seed is not None:
+            raise ValueError("A seed is for all worlds: give either a seed or a 'reset_mask'.")

@@ -1,0 +1,269 @@
+"""Environments whose step returns six values, as Safety-Gymnasium's do: the cost stands by itself.
+
+They are made in this process, or in worker processes of the same Python.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
+from typing import Any
+
+import gymnasium
+import numpy as np
+import torch
+from gymnasium.spaces import Box
+from gymnasium.vector import AutoresetMode, VectorEnv
+from gymnasium.vector.utils import batch_space
+from gymnasium.wrappers import vector
+
+from safe_rl.envs.costs import COST
+from safe_rl.envs.errors import ConfigError
+from safe_rl.envs.foreign import SAFETY_GYMNASIUM, complete_foreign
+from safe_rl.envs.gymnasium.conversion import from_gymnasium
+from safe_rl.envs.gymnasium.env_wrappers import SixValues, kinds_of, plain_actions, stretch
+from safe_rl.envs.gymnasium.gymnasium_env import GymnasiumEnv, from_vector
+from safe_rl.envs.rng import spread_seed
+
+__all__ = ["from_six_values", "make_safety_gymnasium"]
+
+
+def make_safety_gymnasium(
+    config: Mapping[str, Any],
+    *,
+    num_envs: int,
+    device: torch.device | str = "cpu",
+    seed: int | None = None,
+    num_threads: int = 0,
+) -> GymnasiumEnv:
+    """Make environments of an id that `safety_gymnasium.make` knows.
+
+    Args:
+        config: `id` and any other key of conf/env/safety_gymnasium.yaml.
+        num_envs: Number of environments, N.
+        device: Where the TensorDicts live.
+        seed: Determines every row; rows of different seeds have nothing in common.
+        num_threads: Taken as by any family; these environments do not use it.
+
+    Raises:
+        ConfigError: For an unknown key or id, or if the package cannot be imported.
+
+    Examples:
+        >>> make_safety_gymnasium({"id": "SafetyPointGoal1-v0", "worker": 2}, num_envs=1)
+        Traceback (most recent call last):
+        ...
+        safe_rl.envs.errors.ConfigError: An environment of Safety-Gymnasium has no key 'worker'. ...
+    """
+    config = complete_foreign(SAFETY_GYMNASIUM, config)
+    return from_gymnasium(
+        partial(_make_single, config),
+        num_envs=num_envs,
+        cost_keys=config["cost_keys"],
+        num_steps=config["num_steps"],
+        seed=None if seed is None else spread_seed(seed),
+        workers=config["workers"],
+        device=device,
+    )
+
+
+def describe_node(config: Mapping[str, Any]) -> tuple[list[str], int]:
+    """Return the cost keys and the length of episodes of a node, found out where they are None.
+
+    Raises:
+        ConfigError: If there is no such environment, or it does not say how long episodes are.
+    """
+    try:
+        env = _make_single(config)
+    except ConfigError:
+        raise
+    except (AssertionError, gymnasium.error.Error, TypeError, ValueError) as error:
+        raise ConfigError(f"env.id={config['id']}: {error}") from error
+    registered = None if env.spec is None else env.spec.max_episode_steps
+    steps = config["num_steps"] or registered or getattr(env.unwrapped, "num_steps", None)
+    keys = config["cost_keys"] or [COST, *_probe_kinds(env)]
+    env.close()
+    if steps is None:
+        raise ConfigError(
+            f"env.id={config['id']} does not say how long episodes are: give env.num_steps=…"
+        )
+    return keys, steps
+
+
+def from_six_values(
+    env: Callable[[], gymnasium.Env] | Any,
+    *,
+    num_envs: int | None = None,
+    cost_keys: Sequence[str] | None = None,
+    num_steps: int | None = None,
+    seed: int | None = None,
+    device: torch.device | str = "cpu",
+) -> GymnasiumEnv:
+    """Make a TorchRL environment of environments whose step returns six values.
+
+    Args:
+        env: A function that makes one environment; or a batch of them, as
+            `safety_gymnasium.vector.make` returns it, that starts new episodes by itself.
+        num_envs: Number of environments, N; a batch has its own.
+        cost_keys: Kinds of costs that are taken from `info` beside the step's own cost; None takes
+            all that are called `cost_<kind>`, found by taking a step.
+        num_steps: The largest number of steps of an episode; None takes what the environment says,
+            which a batch does not.
+        seed: Of all environments.
+        device: Where the TensorDicts live.
+
+    Returns:
+        An environment [N]; `cost` is what a step returns.
+
+    Raises:
+        ValueError: If a step has another number of values, or the length of episodes is not known.
+
+    Examples:
+        >>> class Slide(gymnasium.Env):
+        ...     observation_space = gymnasium.spaces.Box(-1, 1, (1,), np.float32)
+        ...     action_space = gymnasium.spaces.Box(-1, 1, (1,), np.float32)
+        ...     def reset(self, seed=None, options=None):
+        ...         return np.zeros(1, np.float32), {}
+        ...     def step(self, action):
+        ...         return action, 1.0, float(action[0] > 0), False, False, {}
+        >>> from_six_values(Slide, num_envs=2, num_steps=5).rollout(9)["next", "cost"].shape
+        torch.Size([2, 5, 1])
+    """
+    where: dict[str, Any] = {"seed": seed, "device": device}
+    if not hasattr(env, "single_action_space"):
+        make = partial(_six, env)
+        kinds = _kinds(_probe_kinds(make()) if cost_keys is None else cost_keys)
+        keys = [COST, *kinds]
+        return from_gymnasium(
+            make, num_envs=num_envs or 1, cost_keys=keys, num_steps=num_steps, **where
+        )
+    batch: Any = env
+    if num_envs not in (None, batch.num_envs):
+        raise ValueError(f"num_envs={num_envs}: the batch has {batch.num_envs} environments.")
+    if num_steps is None:
+        raise ValueError("A batch does not say how long its episodes are: give 'num_steps'.")
+    batch.reset(seed=0)
+    found = kinds_of(batch.step(batch.action_space.sample())[-1])
+    kinds = _kinds(found if cost_keys is None else cost_keys)
+    worlds = _as_networks_take_it(DeferredResets(batch, kinds))
+    return from_vector(worlds, [COST, *kinds], num_steps, **where)
+
+
+class DeferredResets(VectorEnv):
+    """A batch that starts a new episode within the step that ends one, as if it waited.
+
+    The observation of that step is the one that `info["final_observation"]` holds; the new one is
+    what the reset that is asked for afterwards returns.
+
+    Args:
+        env: Its step returns six arrays.
+        kinds: Names in `info` of kinds of costs; 0 where it reports none.
+    """
+
+    def __init__(self, env: Any, kinds: Sequence[str]) -> None:
+        self._batch, self._kinds = env, list(kinds)
+        self.num_envs = int(env.num_envs)
+        self.single_observation_space = env.single_observation_space
+        self.single_action_space = env.single_action_space
+        self.observation_space, self.action_space = env.observation_space, env.action_space
+        self.render_mode = getattr(env, "render_mode", None)
+        given = getattr(env, "metadata", None) or {}
+        self.metadata = {**given, "autoreset_mode": AutoresetMode.DISABLED}
+        self._begun: np.ndarray | None = None
+
+    def reset(
+        self, *, seed: int | Sequence[int] | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[np.ndarray, dict[str, Any]]:
+        """Start new episodes everywhere; or show those that have begun, by `reset_mask` [N]."""
+        others = dict(options or {})
+        mask = others.pop("reset_mask", None)
+        if mask is None or self._begun is None:
+            given = {"options": others} if others else {}
+            self._begun = np.array(self._batch.reset(seed=seed, **given)[0])
+        return self._begun.copy(), {}
+
+    def step(
+        self, actions: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
+        """Take an action [N, A] in every environment."""
+        values: tuple[Any, ...] = self._batch.step(actions)
+        if len(values) != 6:
+            raise ValueError(
+                f"A step of {self._batch} returned {len(values)} values instead of six "
+                "(observations, rewards, costs, terminated, truncated, infos)."
+            )
+        begun, rewards, costs, terminated, truncated, infos = values
+        self._begun = np.array(begun)
+        ends = np.asarray(terminated) | np.asarray(truncated)
+        seen, reported = self._begun.copy(), {COST: np.array(costs, np.float64)}
+        for key in self._kinds:
+            reported[key] = np.asarray(infos.get(key, 0.0), np.float64) * ~ends
+        for row in np.flatnonzero(ends):  # whose `info` is that of the reset
+            seen[row] = infos["final_observation"][row]
+            for key in self._kinds:
+                reported[key][row] = infos["final_info"][row].get(key, 0.0)
+        return seen, np.array(rewards), np.array(terminated), np.array(truncated), reported
+
+    def render(self) -> tuple[Any, ...] | None:
+        """Return a frame of every environment, where they draw."""
+        frames = self._batch.render()
+        return None if frames is None else tuple(frames)
+
+    def close_extras(self, **kwargs: Any) -> None:
+        """Close the batch."""
+        self._batch.close()
+
+
+def _as_networks_take_it(batch: VectorEnv) -> VectorEnv:
+    """One float32 vector is observed, and actions are in [-1, 1] or choices."""
+    seen, actions = batch.single_observation_space, batch.single_action_space
+    if not isinstance(seen, Box):
+        raise ValueError(f"A batch has to observe arrays (a Box), not {seen}.")
+    number, plain = batch.num_envs, plain_actions(actions, str(batch))
+    vectors = Box(-np.inf, np.inf, (int(np.prod(seen.shape)),), np.float32)
+    batch = vector.TransformObservation(
+        batch, partial(_vectors, number), batch_space(vectors, number), vectors
+    )
+    if isinstance(actions, Box):
+        batch = vector.TransformAction(
+            batch, partial(stretch, actions), batch_space(plain, number), plain
+        )
+    # TorchRL asks for it, and Gymnasium's wrappers do not have it.
+    setattr(batch, "autoreset_mode", AutoresetMode.DISABLED)  # noqa: B010
+    return batch
+
+
+def _vectors(number: int, observation: np.ndarray) -> np.ndarray:
+    return np.asarray(observation, np.float32).reshape(number, -1)
+
+
+def _make_single(config: Mapping[str, Any]) -> gymnasium.Env:
+    """Make one environment, with its cost in `info`."""
+    try:
+        import safety_gymnasium
+    except ImportError as error:
+        raise ConfigError(
+            f"Safety-Gymnasium cannot be imported in this Python ({error}). Its release 1.0 wants "
+            "an older Gymnasium and MuJoCo than safe_rl; install a release that can be imported "
+            "beside it. Environments of yours with six values need no package: from_six_values."
+        ) from error
+    kwargs = dict(config["kwargs"] or {})
+    named = {"render_mode": config["render_mode"], "max_episode_steps": config["num_steps"]}
+    kwargs |= {key: value for key, value in named.items() if value is not None}
+    return SixValues(safety_gymnasium.make(config["id"], **kwargs))
+
+
+def _six(make: Callable[[], gymnasium.Env]) -> gymnasium.Env:
+    return SixValues(make())
+
+
+def _kinds(keys: Sequence[str]) -> list[str]:
+    return [key for key in keys if key != COST]
+
+
+def _probe_kinds(env: gymnasium.Env) -> list[str]:
+    """Return the kinds of costs that a step reports, and close the environment."""
+    try:
+        env.reset(seed=0)
+        return kinds_of(env.step(env.action_space.sample())[-1])
+    finally:
+        env.close()

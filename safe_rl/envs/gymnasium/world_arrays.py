@@ -1,0 +1,207 @@
+"""A batched simulated environment as arrays: what Gymnasium's two interfaces have in common."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import Any
+
+import gymnasium
+import numpy as np
+import torch
+from gymnasium.envs.registration import EnvSpec
+from gymnasium.spaces import Box, Dict
+from tensordict import TensorDict, TensorDictBase
+from torchrl.data import Composite
+
+from safe_rl.envs.opengl import OpenGLError, has_screen
+from safe_rl.envs.safety_gym.config import SafetyGymConfig
+from safe_rl.envs.safety_gym.env import SafetyGymEnv
+from safe_rl.envs.safety_gym.suite import resolve
+from safe_rl.envs.simulated import SimulatedEnv
+from safe_rl.envs.velocity.velocity_config import VELOCITY_SUITE
+from safe_rl.envs.velocity.velocity_env import VelocityEnv
+
+__all__ = [
+    "Config",
+    "Observation",
+    "Worlds",
+    "batch_of",
+    "choose",
+    "final_infos",
+    "take",
+    "with_masks",
+]
+
+NUM_SEEDS = 2**62
+
+Observation = np.ndarray | dict[str, np.ndarray]
+Config = Mapping[str, Any] | SafetyGymConfig | None
+
+
+class Worlds:
+    """A batched environment as arrays: what both interfaces have in common.
+
+    The environment's spec says how long episodes are, for wrappers and tools that ask it. The
+    registered one does not: Gymnasium would add a time-out of its own to the environment's.
+
+    Attributes:
+        batch: The batched environment inside.
+    """
+
+    batch: SimulatedEnv
+    _spec: EnvSpec | None = None
+    _is_seeded = False
+    _shown_at = 0.0
+
+    def _open(self, batch: SimulatedEnv, mode: str | None, positions: bool) -> None:
+        if mode not in (None, *batch.render_modes):
+            raise ValueError(f"render_mode must be one of {batch.render_modes}, got {mode!r}.")
+        if mode == "human" and not has_screen():
+            raise OpenGLError(
+                "render_mode='human' opens a window, and there is no screen here (neither DISPLAY "
+                "nor WAYLAND_DISPLAY is set). Use render_mode='rgb_array', which needs none."
+            )
+        self.batch, self.render_mode, self._has_positions = batch, mode, positions
+        self._events = [name for name in batch.flags if name not in SimulatedEnv.flags]
+        modes = [name for name in batch.render_modes if name != "human" or has_screen()]
+        rate = max(1, round(1 / batch.seconds_per_step))  # in real time, as Gymnasium's
+        self.metadata: dict[str, Any] = {"render_modes": modes, "render_fps": rate}
+
+    @property
+    def spec(self) -> EnvSpec | None:
+        """What it was made from; `max_episode_steps` is the configuration's `num_steps`."""
+        return self._spec and replace(self._spec, max_episode_steps=self.batch.max_episode_steps)
+
+    @spec.setter
+    def spec(self, spec: EnvSpec | None) -> None:
+        self._spec = spec
+
+    def spaces(self) -> tuple[gymnasium.Space, Box]:
+        """What one world observes, by name where it is nested, and its actions."""
+        seen, bounds = self.batch.observation_spec["observation"], self.batch.observation_bounds
+        ends = self.batch.action_spec.space
+        actions = Box(ends.low[0].cpu().numpy(), ends.high[0].cpu().numpy(), dtype=np.float32)
+        if isinstance(seen, Composite):
+            parts: dict[str, gymnasium.Space] = {
+                n: Box(*bounds[n], part.shape[1:], np.float32) for n, part in seen.items()
+            }
+            return Dict(parts), actions
+        low, high = np.empty((2, seen.shape[-1]), np.float32)
+        for name, columns in self.batch.observation_layout.items():
+            low[columns], high[columns] = bounds.get(name, (-np.inf, np.inf))
+        return Box(low, high, dtype=np.float32), actions
+
+    def _seed(self, seed: Any, generator: np.random.Generator) -> None:
+        """Seed all episodes to come; without a seed, once, with one that is drawn."""
+        seed = seed.tolist() if isinstance(seed, np.ndarray) else seed
+        if isinstance(seed, str) or not isinstance(seed, int | np.integer | Sequence | None):
+            raise TypeError(f"A seed is an integer, or one for every world, got {seed!r}.")
+        if isinstance(seed, int | np.integer):
+            self.batch.set_seed(int(seed) % NUM_SEEDS)
+        elif not self._is_seeded:
+            self.batch.set_seed(int(generator.integers(NUM_SEEDS)))
+        if isinstance(seed, Sequence):
+            self.batch.set_row_seeds([None if s is None else s % NUM_SEEDS for s in seed])
+        self._is_seeded = True
+
+    def _reset(self, mask: np.ndarray | None = None) -> Observation:
+        """Start new episodes, everywhere or where the mask [N] says; all worlds' observation."""
+        ask = None
+        if mask is not None:
+            ask = TensorDict({"_reset": torch.from_numpy(mask).unsqueeze(-1)}, len(mask))
+        return arrays_of(self.batch.reset(ask)["observation"])
+
+    def _step(
+        self, actions: np.ndarray
+    ) -> tuple[Observation, tuple[Any, Any, Any], dict[str, Any]]:
+        """Observation, (reward, terminated, truncated) [N] each, and infos of a step."""
+        action = torch.as_tensor(actions, dtype=torch.float32, device=self.batch.device)
+        step = self.batch.step(TensorDict({"action": action}, self.batch.batch_size))["next"]
+        column = {
+            name: step[name].squeeze(-1).cpu().numpy()
+            for name in ("reward", "terminated", "truncated", *self.batch.cost_keys, *self._events)
+        }
+        infos = {key: column[key].astype(np.float64) for key in self.batch.cost_keys}
+        infos |= {key: column[key] for key in self._events}
+        values = (column["reward"].astype(np.float64), column["terminated"], column["truncated"])
+        return arrays_of(step["observation"]), values, infos
+
+    def _positions(self) -> dict[str, Any]:
+        """Where everything is now, by kind [N, K, 3] (m), under `positions`; or nothing."""
+        return {"positions": arrays_of(self.batch.get_positions())} if self._has_positions else {}
+
+    def _show(self) -> None:
+        """Bring the viewer, if there is to be one, up to date, no faster than real time."""
+        if self.render_mode == "human":
+            time.sleep(max(0.0, self._shown_at + self.batch.seconds_per_step - time.monotonic()))
+            self.batch.show()
+            self._shown_at = time.monotonic()
+
+
+def batch_of(
+    name: str | None,
+    config: Config,
+    num_envs: int,
+    num_threads: int,
+    sleep: bool,
+    num_steps: int | None = None,
+) -> SimulatedEnv:
+    """Make the environment of a name, with some keys changed, or of a whole configuration."""
+    base = VELOCITY_SUITE.get(name or "") or (resolve(name) if name else SafetyGymConfig())
+    whole = config if isinstance(config, SafetyGymConfig) else base.replace(**(config or {}))
+    if num_steps is not None:
+        whole = whole.replace(num_steps=num_steps)
+    if isinstance(whole, SafetyGymConfig):
+        return SafetyGymEnv(whole, num_envs, "cpu", 0, num_threads, sleep)
+    return VelocityEnv(whole, num_envs, "cpu", 0, num_threads)
+
+
+def arrays_of(observation: torch.Tensor | TensorDictBase) -> Observation:
+    """An observation of N worlds as arrays, by name where it is nested."""
+    if isinstance(observation, TensorDictBase):
+        return {str(key): value.cpu().numpy() for key, value in observation.items()}
+    return observation.cpu().numpy()
+
+
+def take(observation: Observation, row: int) -> Observation:
+    """One world's observation."""
+    if isinstance(observation, dict):
+        return {key: value[row] for key, value in observation.items()}
+    return observation[row]
+
+
+def choose(mask: np.ndarray, chosen: Any, other: Any) -> Any:
+    """The rows of `chosen` where the mask [N] says, of `other` elsewhere."""
+    if isinstance(other, dict):
+        return {key: choose(mask, chosen[key], other[key]) for key in other}
+    return np.where(mask.reshape(-1, *[1] * (other.ndim - 1)), chosen, other)
+
+
+def with_masks(infos: Mapping[str, Any], mask: np.ndarray) -> dict[str, Any]:
+    """Add to every array [N, …] the mask `_<key>` of the worlds that it speaks of; 0 elsewhere."""
+    masked = {
+        key: with_masks(values, mask)
+        if isinstance(values, dict)
+        else choose(mask, values, np.zeros_like(values))
+        for key, values in infos.items()
+    }
+    return masked | {f"_{key}": mask.copy() for key in infos}
+
+
+def final_infos(
+    observation: Observation, infos: Mapping[str, Any], ends: np.ndarray
+) -> dict[str, Any]:
+    """Describe what ended, as Gymnasium does for episodes that are followed within the step."""
+    if not ends.any():
+        return {}
+    observations = np.full(len(ends), None, dtype=object)
+    for row in np.flatnonzero(ends).tolist():
+        observations[row] = take(observation, row)
+    return {
+        "final_obs": observations,
+        "_final_obs": ends.copy(),
+        "final_info": with_masks(infos, ends),
+        "_final_info": ends.copy(),
+    }

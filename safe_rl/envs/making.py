@@ -1,0 +1,83 @@
+"""From a name, or a node of the configuration, to a batch of environments of any family."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import torch
+
+from safe_rl.envs.contract import ConstrainedEnv, ContractError, check_constrained_env
+from safe_rl.envs.errors import ConfigError, nearest
+from safe_rl.envs.families import env_names, env_node, known_names, stored_node
+from safe_rl.envs.safety_gym.config import SafetyGymConfig
+from safe_rl.envs.safety_gym.env import SafetyGymEnv
+from safe_rl.envs.safety_gym.suite import resolve
+from safe_rl.envs.transforms.environment import transform_env
+from safe_rl.targets import locate
+
+
+def make_env(
+    env: str | Mapping[str, Any] | SafetyGymConfig,
+    *,
+    num_envs: int = 1,
+    device: torch.device | str = "cpu",
+    seed: int | None = None,
+    num_threads: int = 0,
+    transforms: Mapping[str, Any] | None = None,
+    evaluating: bool = False,
+) -> ConstrainedEnv:
+    """Make a batch of environments of any family.
+
+    Args:
+        env: A name, also one that `store_config` has given; a configuration of Safety Gym; or a
+            node of the group `env`: `name`, `_target_` and the family's keys.
+        num_envs: Number of environments, N.
+        device: Where the TensorDicts live.
+        seed: Determines every draw; None takes one from torch's generator.
+        num_threads: Threads that may step them; 0 for one per core.
+        transforms: Name -> transform, or its node, as `transform_env` takes them.
+        evaluating: Whether the transforms undo what only serves learning.
+
+    Raises:
+        ConfigError: For an unknown name or key, or a value that cannot be used.
+        TargetError: For a family that configurations must not reach.
+        ContractError: For a family of the user's whose environments lack something.
+
+    Examples:
+        >>> make_env({"name": "mine", "robot_base": "point"}, num_envs=2).batch_size
+        torch.Size([2])
+    """
+    env = _named(env) if isinstance(env, str) else env
+    target = env.get("_target_") if isinstance(env, Mapping) else None
+    build = SafetyGymEnv if target is None else locate(target, key="env._target_")
+    if isinstance(env, Mapping):
+        env = {key: value for key, value in env.items() if key not in ("_target_", "name")}
+    made = build(env, num_envs=num_envs, device=device, seed=seed, num_threads=num_threads)
+    if transforms:
+        made = transform_env(made, transforms, evaluating=evaluating, seed=seed)
+    if target is not None or transforms:
+        check_constrained_env(made)
+    if list(made.batch_size) != [num_envs]:
+        raise ContractError(
+            f"{target} was asked for {num_envs} environments and made {made.batch_size[0]}: it "
+            "must make 'num_envs' of them."
+        )
+    return made
+
+
+def _named(name: str) -> str | dict[str, Any]:
+    """A name's node; what the 2019 engine calls it is for its family to understand."""
+    if name in env_names():
+        return env_node(name)
+    stored = stored_node(name)
+    if stored is not None:
+        return stored
+    try:
+        resolve(name)
+    except ConfigError:
+        raise ConfigError(
+            f"Unknown environment '{name}'.{nearest(name, known_names())} A module of yours that "
+            "stores it by that name (store_config) has to be imported before."
+        ) from None
+    return name

@@ -1,0 +1,134 @@
+"""Where a robot is, when it stands as it should, and what it earns: functions over tensors.
+
+Places, health and reward are those of Gymnasium's environments of version 5 (Towers et al. 2024),
+bounds included or not as there; what the limit applies to is Safety-Gymnasium's (Ji et al. 2023).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import NamedTuple
+
+import mujoco
+import torch
+from torch import Tensor
+
+from safe_rl.envs.physics.batch import BatchPhysics
+from safe_rl.envs.velocity.velocity_config import Interval, VelocityConfig
+
+TORSO = 1  # id of its body: every robot's first
+
+
+class Place(NamedTuple):
+    """What is watched for the velocity: the outputs it needs, and how to make its reading [N, D].
+
+    Derived places (`torso`, `centre_of_mass`) are those that `mj_step` leaves behind, of the state
+    that the last substep evaluated last. D is 1 where the velocity along x is limited, 2 where the
+    speed in the plane is (m).
+    """
+
+    outputs: tuple[str, ...]
+    reading: Callable[[mujoco.MjModel, BatchPhysics], Callable[[], Tensor]]
+
+
+def _x(model: mujoco.MjModel, physics: BatchPhysics) -> Callable[[], Tensor]:
+    return lambda: physics.qpos[:, :1].clone()
+
+
+def _torso(model: mujoco.MjModel, physics: BatchPhysics) -> Callable[[], Tensor]:
+    return lambda: physics.outputs["xpos"][:, TORSO, :2].clone()
+
+
+def _centre_of_mass(model: mujoco.MjModel, physics: BatchPhysics) -> Callable[[], Tensor]:
+    shares = torch.from_numpy(model.body_mass / model.body_mass.sum())[:, None]
+    return lambda: (physics.outputs["xipos"][..., :2] * shares).sum(1)
+
+
+PLACES: Mapping[str, Place] = {
+    "x": Place((), _x),
+    "torso": Place(("xpos",), _torso),
+    "centre_of_mass": Place(("xipos",), _centre_of_mass),
+}
+
+
+def limited_speed(velocity: Tensor) -> Tensor:
+    """What the threshold applies to: x velocity, or the speed in the plane; [N, D] -> [N].
+
+    As in Safety-Gymnasium: driving backwards along x costs nothing, in the plane it does.
+
+    Examples:
+        >>> limited_speed(torch.tensor([[-3.0]])).item()
+        -3.0
+        >>> limited_speed(torch.tensor([[-3.0, 4.0]])).item()
+        5.0
+    """
+    return velocity[:, 0] if velocity.shape[-1] == 1 else velocity.square().sum(-1).sqrt()
+
+
+def _inside(value: Tensor, interval: Interval | None) -> Tensor:
+    assert interval is not None
+    low, high = interval
+    return (low < value) & (value < high)
+
+
+def hopper(config: VelocityConfig, qpos: Tensor, qvel: Tensor) -> Tensor:
+    """Torso high and upright, everything else within bounds: [N, nq], [N, nv] -> bool [N]."""
+    state = torch.cat([qpos[:, 2:], qvel], -1)
+    return walker2d(config, qpos, qvel) & _inside(state, config.healthy_state_range).all(-1)
+
+
+def walker2d(config: VelocityConfig, qpos: Tensor, qvel: Tensor) -> Tensor:
+    """Torso high and upright: [N, nq], [N, nv] -> bool [N]."""
+    upright = _inside(qpos[:, 2], config.healthy_angle_range)
+    return _inside(qpos[:, 1], config.healthy_z_range) & upright
+
+
+def ant(config: VelocityConfig, qpos: Tensor, qvel: Tensor) -> Tensor:
+    """Torso neither on the ground nor in the air, bounds included: -> bool [N]."""
+    assert config.healthy_z_range is not None
+    low, high = config.healthy_z_range
+    finite = qpos.isfinite().all(-1) & qvel.isfinite().all(-1)
+    return finite & (low <= qpos[:, 2]) & (qpos[:, 2] <= high)
+
+
+def humanoid(config: VelocityConfig, qpos: Tensor, qvel: Tensor) -> Tensor:
+    """Torso high: [N, nq], [N, nv] -> bool [N]."""
+    return _inside(qpos[:, 2], config.healthy_z_range)
+
+
+HEALTH: Mapping[str, Callable[[VelocityConfig, Tensor, Tensor], Tensor]] = {
+    "hopper": hopper,
+    "walker2d": walker2d,
+    "ant": ant,
+    "humanoid": humanoid,
+}
+
+
+def locomotion_reward(
+    config: VelocityConfig, velocity_x: Tensor, control: Tensor, healthy: Tensor, forces: Tensor
+) -> Tensor:
+    """Reward running forward and being healthy, not control and contact.
+
+    Args:
+        config: Weights and ranges.
+        velocity_x: [N] (m/s).
+        control: [N, nu].
+        healthy: bool [N].
+        forces: On all bodies [N, nbody, 6] (N, N m), `cfrc_ext`; may be empty where the weight of
+            contacts is 0 or None.
+
+    Returns:
+        [N].
+    """
+    reward = config.forward_reward_weight * velocity_x
+    if config.healthy_reward is not None:
+        reward = reward + config.healthy_reward * healthy
+    reward = reward - config.ctrl_cost_weight * control.square().sum(-1)
+    if config.contact_cost_weight:
+        if config.contact_force_range is not None:
+            forces = forces.clamp(*config.contact_force_range)
+        cost = config.contact_cost_weight * forces.square().sum((-2, -1))
+        if config.contact_cost_range is not None:
+            cost = cost.clamp(*config.contact_cost_range)
+        reward = reward - cost
+    return reward

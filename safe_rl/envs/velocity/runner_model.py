@@ -1,0 +1,133 @@
+"""The simulated model of a robot, Gymnasium's own MJCF file, and what is observed of it."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable
+from pathlib import Path
+from typing import NamedTuple
+
+import gymnasium
+import mujoco
+import torch
+from torch import Tensor
+
+from safe_rl.envs.physics.batch import BatchPhysics
+from safe_rl.envs.physics.dynamics import SCALES, scale_dynamics
+from safe_rl.envs.velocity.locomotion import PLACES, TORSO
+from safe_rl.envs.velocity.runners import RUNNERS
+from safe_rl.envs.velocity.velocity_config import VelocityConfig
+
+ASSETS = Path(gymnasium.__file__).parent / "envs" / "mujoco" / "assets"
+FORCES = "cfrc_ext"
+
+
+def load_model(config: VelocityConfig) -> mujoco.MjModel:
+    """Compile a robot's file, with a sensor that asks for contact forces where they are needed.
+
+    The sensor changes nothing but `sensordata`.
+    """
+    spec = mujoco.MjSpec.from_file(str(ASSETS / RUNNERS[config.robot].mjcf))
+    if needs_forces(config):
+        torso = spec.bodies[TORSO]
+        spec.add_sensor(
+            name="forces",
+            type=mujoco.mjtSensor.mjSENS_FRAMELINACC,
+            objtype=mujoco.mjtObj.mjOBJ_XBODY,
+            objname=torso.name,
+        )
+    with warnings.catch_warnings():
+        # Nobody who trains can change Gymnasium's files.
+        warnings.filterwarnings("ignore", message="compiler attribute")
+        model = spec.compile()
+    scale_dynamics(model, {key: getattr(config, key) for key in SCALES}, slice(1, model.nbody))
+    return model
+
+
+def observed_parts(config: VelocityConfig) -> list[str]:
+    """Fields of `MjData` that are observed beyond positions and velocities, in order."""
+    parts = RUNNERS[config.robot].parts
+    return [part for part in parts if getattr(config, f"include_{part}_in_observation")]
+
+
+def needs_forces(config: VelocityConfig) -> bool:
+    """Whether contact forces are observed or cost something."""
+    return FORCES in observed_parts(config) or bool(config.contact_cost_weight)
+
+
+def needed_outputs(config: VelocityConfig) -> list[str]:
+    """Fields that the physics has to copy out, each once."""
+    forces = [FORCES, "qacc"] if needs_forces(config) else []
+    place = PLACES[RUNNERS[config.robot].place]
+    return list(dict.fromkeys([*observed_parts(config), *place.outputs, *forces]))
+
+
+class Part(NamedTuple):
+    """A named component: how many numbers, and how to read them, float64 [N, size]."""
+
+    name: str
+    size: int
+    read: Callable[[BatchPhysics], Tensor]
+
+
+class Observer:
+    """Reads the observation, a flat vector of named components.
+
+    Args:
+        config: The environment.
+        model: Its compiled model.
+
+    Attributes:
+        columns: Columns of every component.
+        size: Number of columns.
+    """
+
+    def __init__(self, config: VelocityConfig, model: mujoco.MjModel) -> None:
+        self._parts = [*_joints(config, model), *_bodies(config, model)]
+        self.columns: dict[str, slice] = {}
+        self.size = 0
+        for part in self._parts:
+            self.columns[part.name] = slice(self.size, self.size + part.size)
+            self.size += part.size
+
+    def write(self, physics: BatchPhysics, observation: Tensor) -> None:
+        """Write what all robots observe after a step into [N, size]."""
+        for part in self._parts:
+            observation[:, self.columns[part.name]] = part.read(physics)
+
+    def write_start(self, physics: BatchPhysics, observation: Tensor, rows: Tensor) -> None:
+        """Write what some robots (int64 [R]) observe where no step was taken: no contact forces.
+
+        Gymnasium computes contact forces after steps only.
+        """
+        for part in self._parts:
+            columns = self.columns[part.name]
+            start = 0.0 if part.name == FORCES else part.read(physics)[rows].to(observation.dtype)
+            observation[rows, columns] = start
+
+
+def _joints(config: VelocityConfig, model: mujoco.MjModel) -> list[Part]:
+    robot = RUNNERS[config.robot]
+    first = robot.num_hidden if config.exclude_current_positions_from_observation else 0
+    limit = robot.velocity_limit
+    return [
+        Part("qpos", model.nq - first, lambda physics: physics.qpos[:, first:]),
+        Part("qvel", model.nv, lambda physics: physics.qvel.clamp(-limit, limit)),
+    ]
+
+
+def _bodies(config: VelocityConfig, model: mujoco.MjModel) -> list[Part]:
+    """Components about bodies, without the world's, and forces of all joints but the root."""
+    low, high = config.contact_force_range or (-torch.inf, torch.inf)
+    moving = model.nbody - 1
+    known = {
+        "cinert": Part("cinert", 10 * moving, lambda p: p.outputs["cinert"][:, 1:].flatten(1)),
+        "cvel": Part("cvel", 6 * moving, lambda p: p.outputs["cvel"][:, 1:].flatten(1)),
+        "qfrc_actuator": Part(
+            "qfrc_actuator", model.nv - 6, lambda p: p.outputs["qfrc_actuator"][:, 6:]
+        ),
+        FORCES: Part(
+            FORCES, 6 * moving, lambda p: p.outputs[FORCES][:, 1:].flatten(1).clamp(low, high)
+        ),
+    }
+    return [known[name] for name in observed_parts(config)]

@@ -1,0 +1,172 @@
+"""Velocity-limited locomotion as one batched TorchRL environment."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, ClassVar
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
+from torchrl.data import Unbounded
+
+from safe_rl.envs.physics.batch import BatchPhysics
+from safe_rl.envs.physics.runge_kutta import runge_kutta_substep
+from safe_rl.envs.simulated import SimulatedEnv, check_state, require_episodes
+from safe_rl.envs.velocity.episode_starts import Starts
+from safe_rl.envs.velocity.locomotion import HEALTH, PLACES, limited_speed, locomotion_reward
+from safe_rl.envs.velocity.runner_model import (
+    FORCES,
+    Observer,
+    load_model,
+    needed_outputs,
+    needs_forces,
+)
+from safe_rl.envs.velocity.runner_pictures import RobotRenderer
+from safe_rl.envs.velocity.runners import RUNNERS
+from safe_rl.envs.velocity.velocity_config import VelocityConfig, resolve_velocity
+
+_PHYSICS_KEYS = ("qpos", "qvel", "qacc_warmstart", "time")
+_OPTIONAL_KEYS = ("place", "observation", "seed", "episode")
+
+
+class VelocityEnv(SimulatedEnv):
+    """N parallel robots of one configuration that are to run, but not too fast.
+
+    Dynamics, observation, reward and termination are those of Gymnasium's environment of version 5
+    (Towers et al. 2024) with the robot's own MJCF file; a step costs 1 where the velocity exceeds
+    the threshold, as in Safety-Gymnasium 1.0 (Ji et al. 2023).
+
+    Reads `action` [N, nu], clipped to the actuators' control range. Writes `observation` [N, n],
+    and each [N, 1]: `reward`, `cost`, `cost_velocity` (the same), `done`, `terminated` (the robot
+    fell), `truncated` (time is up). A robot whose physics fails gets reward and cost 0 and
+    terminates.
+
+    A state holds `qpos`, `qvel`, `qacc_warmstart`, `time`, `step_count`; `place` and `observation`,
+    which belong to the last substep; and the seeds. Without `place` and `observation` both are
+    computed anew, as at the start of an episode.
+
+    Cameras of pictures are "track" (the model's own) and "free" (beside the robot).
+
+    Args:
+        env: name ("SafeHopperVelocity"), mapping with `robot` and configuration keys, or
+            `VelocityConfig`.
+        num_envs: number of robots, N.
+        device: where the TensorDicts live; the physics runs on the CPU.
+        seed: integer that determines every draw; None takes one from torch's generator. Row k gets
+            the same episodes whatever N and the number of threads are.
+        num_threads: threads that step the physics; 0 for one per core.
+
+    Raises:
+        ConfigError: for an unknown name or key, or a value that cannot be used.
+
+    Examples:
+        >>> env = VelocityEnv("SafeHopperVelocity", num_envs=4, seed=0)
+        >>> rollout = env.rollout(max_steps=5)
+        >>> rollout["next", "cost_velocity"].shape
+        torch.Size([4, 5, 1])
+    """
+
+    first_camera: ClassVar = "track"
+
+    def __init__(
+        self,
+        env: str | Mapping[str, Any] | VelocityConfig,
+        num_envs: int = 1,
+        device: torch.device | str = "cpu",
+        seed: int | None = None,
+        num_threads: int = 0,
+    ) -> None:
+        super().__init__(num_envs, device, num_threads)
+        self.config = resolve_velocity(env)
+        self.cost_keys = ["cost", "cost_velocity"]
+        self._robot, self._model = RUNNERS[self.config.robot], load_model(self.config)
+        outputs = needed_outputs(self.config)
+        self._physics = BatchPhysics(self._model, num_envs, num_threads, outputs)
+        self._has_forces = needs_forces(self.config)
+        self._no_forces = torch.zeros(num_envs, 0, 6, dtype=torch.float64)
+        self.seconds_per_step = self._physics.timestep * self.config.frame_skip
+        self._observer = Observer(self.config, self._model)
+        self._place = PLACES[self._robot.place].reading(self._model, self._physics)
+        self._last_place = self._place()
+        self._observation = torch.zeros(num_envs, self._observer.size)
+        self._step_count = torch.zeros(num_envs, dtype=torch.int64)
+        self._starts = Starts(self.config, self._model, num_envs)
+        self._renderer = RobotRenderer(self.config, self._physics)
+        observed = Unbounded(self._observation.shape, dtype=torch.float32, device=self.device)
+        self._announce(self._model, observed, highest=1.0, seed=seed)
+
+    def _begin(self, mask: Tensor) -> None:
+        physics, rows = self._physics, mask.nonzero()[:, 0]
+        physics.reset(mask)
+        start = self._starts.take(self._row_seed, self._episode, rows)
+        physics.qpos[rows], physics.qvel[rows] = start
+        physics.forward(mask)
+        self._start(rows)
+        self._step_count[rows] = 0
+
+    def _start(self, rows: Tensor) -> None:
+        """Write what is derived from states that no step has led to, of robots int64 [R]."""
+        self._last_place[rows] = self._place()[rows]
+        self._observer.write_start(self._physics, self._observation, rows)
+
+    def _observe(self) -> Tensor:
+        return self._observation.clone().to(self.device)
+
+    @torch.no_grad()
+    def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
+        action = self._checked_action(tensordict).to(torch.float64)
+        require_episodes(self._begun)
+        reward, terminated = self._move(action.clamp(*self._control_range))
+        self._observer.write(self._physics, self._observation)
+        self._step_count += 1
+        truncated = (self._step_count >= self.config.num_steps) & ~terminated
+        cost = self._has_cost.to(torch.float64)
+        flags = torch.stack([terminated | truncated, terminated, truncated])
+        return self._step_output(torch.stack([reward, cost, cost]), flags)
+
+    def _move(self, control: Tensor) -> tuple[Tensor, Tensor]:
+        """Take one step; returns reward and termination, float64 and bool [N]."""
+        config, physics = self.config, self._physics
+        physics.ctrl.copy_(control)
+        failed = self._advance()
+        place = self._place()
+        velocity = (place - self._last_place) / self.seconds_per_step
+        self._last_place.copy_(place)
+        healthy = self._healthy()
+        forces = physics.outputs[FORCES] if self._has_forces else self._no_forces
+        reward = locomotion_reward(config, velocity[:, 0], control, healthy, forces)
+        self._has_cost = (limited_speed(velocity) > config.velocity_threshold) & ~failed
+        terminated = failed | ~healthy if config.terminate_when_unhealthy else failed
+        return reward.masked_fill_(failed, 0.0), terminated
+
+    def _advance(self) -> Tensor:
+        """Run the substeps of one step; returns the robots whose physics failed [N]."""
+        if not self._has_forces:
+            return self._physics.step(self.config.frame_skip, refresh=False)
+        failed = self._physics.step(self.config.frame_skip - 1, refresh=False)
+        return failed | runge_kutta_substep(self._physics)
+
+    def _healthy(self) -> Tensor:
+        """Which robots stand as they should, bool [N]."""
+        if self._robot.health is None:
+            return torch.ones(self.batch_size, dtype=torch.bool)
+        return HEALTH[self._robot.health](self.config, self._physics.qpos, self._physics.qvel)
+
+    def _read_state(self) -> TensorDict:
+        state = {key: getattr(self._physics, key).clone() for key in _PHYSICS_KEYS}
+        state |= {"step_count": self._step_count.clone(), "place": self._last_place.clone()}
+        state["observation"] = self._observation.clone()
+        return TensorDict(state, batch_size=self.batch_size)
+
+    def _write_state(self, state: TensorDictBase) -> None:
+        check_state(self.get_state(), state, _OPTIONAL_KEYS)
+        everyone = torch.ones(self.batch_size, dtype=torch.bool)
+        self._physics.reset(everyone)
+        for key in _PHYSICS_KEYS:
+            getattr(self._physics, key).copy_(state[key])
+        self._step_count.copy_(state["step_count"])
+        self._physics.forward()
+        self._start(everyone.nonzero()[:, 0])
+        self._last_place.copy_(state.get("place", self._last_place))
+        self._observation.copy_(state.get("observation", self._observation))

@@ -1,0 +1,127 @@
+"""Environments whose step returns six values: by id, from a function, and in batches."""
+
+import sys
+from pathlib import Path
+
+import gymnasium
+import pytest
+import torch
+from commands import run_train
+from torchrl.envs.utils import check_env_specs
+
+from safe_rl.envs import ConfigError, complete_env, from_six_values, make_env
+from safe_rl.runs.table import read_table
+
+NODE = {
+    "_target_": "safe_rl.envs.gymnasium.make_safety_gymnasium",
+    "id": "SafetyIce1-v0",
+    "kwargs": {"border": 1.5},
+}
+
+
+@pytest.fixture(autouse=True)
+def package(monkeypatch):
+    """The stand-in, as if it were installed."""
+    monkeypatch.syspath_prepend(str(Path(__file__).parents[1] / "stand_in"))
+    import safety_gymnasium
+
+    yield safety_gymnasium
+    del sys.modules["safety_gymnasium"]
+
+
+def rollout(env, steps=40):
+    """Random actions, of which the type of the spec would otherwise make other numbers."""
+    torch.manual_seed(0)
+
+    def act(tensordict):
+        if env.action_spec.dtype == torch.int64:
+            return env.rand_action(tensordict)
+        return tensordict.set("action", 2.2 * torch.rand(env.action_spec.shape) - 1.1)
+
+    return env.rollout(steps, act, break_when_any_done=False)
+
+
+def test_a_step_has_its_cost_beside_the_reward():
+    env = make_env(NODE, num_envs=5, seed=0)
+    assert env.cost_keys == ["cost", "cost_right", "cost_fast"]
+    assert env.max_episode_steps == 12
+    check_env_specs(env)
+    taken = rollout(env)
+    place, speed = taken["next", "observation"].split(1, -1)
+    torch.testing.assert_close(taken["next", "reward"], speed)
+    torch.testing.assert_close(speed, 3 * taken["action"].clamp(-1, 1) + 1)  # from -2 to 4
+    torch.testing.assert_close(taken["next", "cost_right"], (place > 0).float())
+    torch.testing.assert_close(taken["next", "cost_fast"], speed.abs())
+    torch.testing.assert_close(taken["next", "cost"], (place > 0) + speed.abs())
+    torch.testing.assert_close(taken["next", "terminated"], place.abs() > 1.5)
+    assert 0 < taken["next", "terminated"].sum() < 200
+
+
+def test_a_batch_that_begins_by_itself_is_as_one_that_is_asked(package):
+    makers = [lambda: package.make("SafetyIce1-v0", border=1.5)] * 4
+    eager = from_six_values(package.SafetySyncVectorEnv(makers), num_steps=12, seed=5)
+    patient = from_six_values(makers[0], num_envs=4, seed=5)
+    assert eager.cost_keys == patient.cost_keys == ["cost", "cost_right", "cost_fast"]
+    first, second = rollout(eager), rollout(patient)
+    assert first["next", "done"].sum() > 8
+    for key in ("observation", "reward", *eager.cost_keys, "terminated", "done"):
+        assert torch.equal(first["next", key], second["next", key])
+    assert torch.equal(first["observation"], second["observation"])
+    check_env_specs(eager)
+
+
+def test_choices_and_dictionaries_become_integers_and_vectors():
+    node = {**NODE, "id": "SafetyButtons0-v0", "kwargs": None, "num_steps": 6}
+    env = make_env(node, num_envs=3, seed=0)
+    taken = rollout(env, 9)
+    assert env.cost_keys == ["cost"]
+    torch.testing.assert_close(taken["next", "cost"].squeeze(-1), taken["action"].float())
+    seen = taken["next", "observation"]
+    torch.testing.assert_close(seen[..., :4].argmax(-1), taken["action"])
+    torch.testing.assert_close(seen[..., 4:], torch.ones(3, 9, 2))
+    assert taken["next", "truncated"][:, 5].all()
+
+
+def test_it_is_trained_on(tmp_path):
+    run_train(
+        *("env=safety_gymnasium", "env.id=SafetyIce1-v0", "num_envs=4", "num_threads=1"),
+        *("frames_per_batch=80", "frames=160", "logger=none", "model.hidden_sizes=[8]"),
+        *("cost_limits={cost_right: 3}", "env.kwargs={border: 1.5}"),
+        *("policy_update.minibatch_size=40", "critic_update.minibatch_size=40"),
+        f"hydra.run.dir={tmp_path / 'ice'}",
+    )
+    table = read_table(tmp_path / "ice" / "progress.csv")
+    assert table["steps"] == [80, 160]
+    assert all(cost > 0 for cost in table["episode_cost_right"])
+
+
+def test_pictures():
+    env = make_env({**complete_env(NODE), "render_mode": "rgb_array"}, num_envs=2, seed=0)
+    env.reset()
+    picture = env.render(width=60, height=20)
+    assert picture.shape == (2, 20, 60, 3)
+    assert picture.any()
+
+
+@pytest.mark.parametrize(
+    ("keys", "message"),
+    [
+        ({"id": None}, r"env\.id=Safety"),
+        ({"id": "SafetyIce2-v0"}, "SafetyIce2-v0 is not registered"),
+        ({"id": "my_ice:SafetyMine-v0"}, r"import nothing.*import=my_ice env.id=SafetyMine-v0"),
+        ({"border": 3}, "no key 'border'.*env.kwargs"),
+        ({"kwargs": {"speed": 3}}, "SafetyIce1-v0.*speed"),
+    ],
+)
+def test_what_cannot_be_made_is_said(keys, message):
+    with pytest.raises(ConfigError, match=message):
+        make_env({**NODE, **keys})
+
+
+def test_a_missing_package_and_five_values_are_said(monkeypatch):
+    monkeypatch.setitem(sys.modules, "safety_gymnasium", None)
+    with pytest.raises(ConfigError, match=r"cannot be imported.*from_six_values"):
+        make_env(NODE)
+    with pytest.raises(ValueError, match=r"returned 5 values.*env=gymnasium"):
+        from_six_values(lambda: gymnasium.make("Pendulum-v1"))
+    monkeypatch.undo()

@@ -1,0 +1,129 @@
+"""Stands in for the package: environments whose step returns six values, one and several.
+
+What is imitated is its release 1.0 on Gymnasium 0.28: `make`, the limit of time, kinds of costs and
+their sum in `info`, and batches that start a new episode within the step that ends one.
+"""
+
+import gymnasium
+import numpy as np
+from gymnasium.envs.registration import EnvSpec
+from gymnasium.vector.utils import batch_space
+
+
+class Ice(gymnasium.Env):
+    """A point slides; right of 0 a step costs 1, and speed costs itself; far out it ends."""
+
+    metadata = {"render_modes": ["rgb_array"]}  # noqa: RUF012
+    observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (2,), np.float64)
+    action_space = gymnasium.spaces.Box(-2.0, 4.0, (1,), np.float64)
+
+    def __init__(self, border=2.0, render_mode=None):
+        self.border, self.render_mode = border, render_mode
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.place, self.speed = self.np_random.uniform(-1, 1), 0.0
+        return np.array([self.place, self.speed]), {}
+
+    def step(self, action):
+        assert -2 - 1e-6 <= action[0] <= 4 + 1e-6, action
+        self.speed = float(action[0])
+        self.place += 0.3 * self.speed
+        kinds = {"cost_right": float(self.place > 0), "cost_fast": abs(self.speed)}
+        cost = sum(kinds.values())
+        info = {**kinds, "cost_sum": cost, "goal_met": False}
+        seen = np.array([self.place, self.speed])
+        return seen, self.speed, cost, abs(self.place) > self.border, False, info
+
+    def render(self):
+        picture = np.zeros((20, 60, 3), dtype=np.uint8)
+        picture[:, int(np.clip(30 + 9 * self.place, 0, 59))] = 255
+        return picture
+
+
+class Buttons(gymnasium.Env):
+    """Choices, and an observation of several entries; no kinds of costs."""
+
+    observation_space = gymnasium.spaces.Dict(
+        count=gymnasium.spaces.Discrete(4), place=gymnasium.spaces.Box(-1, 1, (2,), np.float32)
+    )
+    action_space = gymnasium.spaces.Discrete(3)
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        return {"count": 0, "place": np.zeros(2, np.float32)}, {}
+
+    def step(self, action):
+        seen = {"count": int(action), "place": np.ones(2, np.float32)}
+        return seen, 1.0, float(action), False, False, {}
+
+
+class Limited(gymnasium.Wrapper):
+    """The package's own limit of time, for six values."""
+
+    def __init__(self, env, steps):
+        super().__init__(env)
+        self.steps = steps
+
+    @property
+    def spec(self):
+        return EnvSpec("SafetyStandIn-v0", max_episode_steps=self.steps)
+
+    def reset(self, **kwargs):
+        self.taken = 0
+        return self.env.reset(**kwargs)
+
+    def step(self, action):
+        *values, _, info = self.env.step(action)
+        self.taken += 1
+        return (*values, self.taken >= self.steps, info)
+
+
+class SafetySyncVectorEnv:
+    """A batch as Gymnasium 0.28 had them: an episode that ends is followed within the step."""
+
+    def __init__(self, makers):
+        self.envs = [make() for make in makers]
+        self.num_envs = len(self.envs)
+        self.single_observation_space = self.envs[0].observation_space
+        self.single_action_space = self.envs[0].action_space
+        self.observation_space = batch_space(self.single_observation_space, self.num_envs)
+        self.action_space = batch_space(self.single_action_space, self.num_envs)
+
+    def reset(self, *, seed=None, options=None):
+        seeds = [None if seed is None else seed + i for i in range(self.num_envs)]
+        seen = [env.reset(seed=s)[0] for env, s in zip(self.envs, seeds, strict=True)]
+        return np.stack(seen), {}
+
+    def step(self, actions):
+        seen, numbers, infos = [], [], {}
+        for row, (env, action) in enumerate(zip(self.envs, actions, strict=True)):
+            observation, *values, info = env.step(action)
+            if values[2] or values[3]:
+                last = {"final_observation": observation, "final_info": info}
+                observation, info = env.reset()
+                info = {**info, **last}
+            seen.append(observation)
+            numbers.append(values)
+            self._note(infos, info, row)
+        rewards, costs, terminated, truncated = map(np.array, zip(*numbers, strict=True))
+        return np.stack(seen), rewards, costs, terminated, truncated, infos
+
+    def _note(self, infos, info, row):
+        for key, value in info.items():
+            kind = float if isinstance(value, float) else object
+            array = infos.setdefault(key, np.zeros(self.num_envs, dtype=kind))
+            array[row] = value
+            infos.setdefault(f"_{key}", np.zeros(self.num_envs, dtype=bool))[row] = True
+
+    def close(self):
+        for env in self.envs:
+            env.close()
+
+
+KNOWN = {"SafetyIce1-v0": Ice, "SafetyButtons0-v0": Buttons}
+
+
+def make(id, max_episode_steps=None, **kwargs):
+    assert id in KNOWN, f"Environment {id} is not registered in safety-gymnasium."
+    return Limited(KNOWN[id](**kwargs), max_episode_steps or 12)

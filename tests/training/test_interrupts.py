@@ -1,0 +1,92 @@
+"""Signals: what they end, when, and what they leave alone."""
+
+import signal
+import threading
+
+import pytest
+from point_mass_runs import point_mass_trainer
+
+from safe_rl.runs.table import read_table
+from safe_rl.training.interrupts import StopRequest
+
+
+def test_a_signal_ends_the_run_after_the_epoch_with_a_checkpoint(tmp_path):
+    trainer = point_mass_trainer(tmp_path, "frames=100_000_000")
+    record = trainer.record.add
+
+    def record_and_signal(row):
+        record(row)
+        if row["epoch"] == 3:
+            signal.raise_signal(signal.SIGTERM)
+
+    trainer.record.add = record_and_signal
+    handler = signal.getsignal(signal.SIGTERM)
+    trainer.run()
+    assert signal.getsignal(signal.SIGTERM) is handler
+    assert read_table(tmp_path / "progress.csv")["epoch"] == [1, 2, 3]
+    assert [path.name for path in (tmp_path / "checkpoints" / "last").iterdir()] == [
+        "checkpoint-000000000480.torchrl"
+    ]
+
+
+def test_a_signal_before_the_first_epoch_lets_it_end(tmp_path):
+    trainer = point_mass_trainer(tmp_path, "frames=100_000_000")
+    rows = trainer.record.rows
+    trainer.record.rows = lambda: signal.raise_signal(signal.SIGTERM) or rows()
+    trainer.run()
+    assert trainer.interrupted_by is signal.SIGTERM
+    assert read_table(tmp_path / "progress.csv")["epoch"] == [1]
+
+
+def test_a_signal_in_the_last_epoch_interrupts_nothing(tmp_path):
+    trainer = point_mass_trainer(tmp_path, "frames=160")
+    record = trainer.record.add
+
+    def record_and_signal(row):
+        record(row)
+        signal.raise_signal(signal.SIGTERM)
+
+    trainer.record.add = record_and_signal
+    trainer.run()
+    assert trainer.progress.steps == 160
+    assert trainer.interrupted_by is None
+
+
+@pytest.fixture
+def heeding_interrupts():
+    """What a shell runs in the background ignores them."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
+@pytest.mark.usefixtures("heeding_interrupts")
+def test_a_second_interrupt_acts_at_once():
+    with StopRequest() as stop:
+        signal.raise_signal(signal.SIGINT)
+        assert stop.received
+        with pytest.raises(KeyboardInterrupt):
+            signal.raise_signal(signal.SIGINT)
+
+
+def test_signals_are_left_alone_outside_the_main_thread():
+    received = []
+
+    def request():
+        with StopRequest() as stop:
+            received.append(stop.received)
+
+    thread = threading.Thread(target=request)
+    thread.start()
+    thread.join()
+    assert received == [None]
+
+
+def test_a_run_that_a_terminal_must_not_end_goes_on():
+    before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    try:
+        with StopRequest() as stop:
+            signal.raise_signal(signal.SIGHUP)
+        assert not stop.received
+    finally:
+        signal.signal(signal.SIGHUP, before)
