@@ -1,12 +1,11 @@
 """The keys of the parts that a run is built from, by class: what each may hold, and what it means.
 
-They hold whatever node of the configuration a part stands in. Those of losses are in `loss_keys`.
+They hold whatever node of the configuration a part stands in.
 """
 
 from __future__ import annotations
 
 from safe_rl.cli.keys import KEYS, Key
-from safe_rl.cli.loss_keys import LOSSES
 from safe_rl.cli.values import (
     NOT_NEGATIVE,
     POSITIVE,
@@ -37,11 +36,6 @@ _OPTIMIZER = {
     "amsgrad": Key(boolean, "whether to keep the maximum of second moments"),
     "nesterov": Key(boolean, "whether to look ahead"),
 }
-_ESTIMATOR = {
-    "gamma": Key(SHARE, "discount per step"),
-    "lmbda": Key(SHARE, "λ of generalised advantage estimation"),
-    "value_target": Key(choice("lambda_return", "return_to_go"), "what critics learn"),
-}
 _TRUST_REGION = {
     "target_kl": Key(POSITIVE, "radius δ of the trust region, a mean KL divergence"),
     "damping": Key(NOT_NEGATIVE, "multiple of the identity added to the Fisher matrix"),
@@ -67,7 +61,6 @@ _SAUTE = {
 _WORKERS = {"num_collectors": KEYS["collector.num_collectors"]}
 
 PARTS = {
-    **LOSSES,
     "MinibatchUpdate": {
         "optimizer": Key(component, "the optimiser"),
         "num_passes": Key(count(1, 10**9), "passes over the batch"),
@@ -125,31 +118,10 @@ PARTS = {
     },
     "make_squashed_actor": {},
     "make_bounded_actor": {},
-    "VectorGAE": _ESTIMATOR,
-    "CostGAE": _ESTIMATOR,
-    "LimitTracker": {
-        "margin": Key(NOT_NEGATIVE, "standard errors of a batch's J_c below the limit"),
-        "largest_margin": Key(SHARE, "bound of the margin, as a share of the limit"),
-        "free_steps": Key(count(0), "steps for which costs are free"),
-        "descent_steps": Key(count(0), "steps in which the limit then comes down"),
-        "recovery": Key(SHARE, "share of a limit to come down to, once above it"),
-        "frames": Key(count(), "steps of the whole run"),
-        "latest_end": Key(number(0, 1, above=True), "share of a run by which the descent is over"),
-        "smallest_scale": Key(POSITIVE, "unit of violations of limits near 0, costs per step"),
-        "drift": Key(optional(POSITIVE), "share by which J_c is expected to change per update"),
-        "memory": Key(number(0, 1, below=True), "weight of the past in estimates"),
-        "lowest_trust": Key(number(0, 1, above=True), "lower bound of trust_<cost>"),
-        "integral": Key(NOT_NEGATIVE, "gain of the integral of violations"),
-        "largest_integral": Key(NOT_NEGATIVE, "bound of that integral, in units of violations"),
+    "make_process_collector": {
+        **_WORKERS,
+        "ahead": Key(boolean, "whether the next batch is collected while one is learned from"),
     },
-    "CVaR": {
-        "tail": Key(number(0, 1, above=True), "share of the worst episodes"),
-        "window": Key(count(1, 10**6), "episodes from which the value at risk is taken"),
-        "ramp_start": Key(count(0), "steps in which the mean is limited"),
-        "ramp_steps": Key(count(0), "steps in which the tail then takes its place"),
-    },
-    "Chance": {"most_over": Key(number(0, 1, below=True), "share of episodes over the limit")},
-    "make_process_collector": _WORKERS,
     "make_ray_collector": {
         **_WORKERS,
         "ray_init": Key(mapping_of(anything), "arguments of ray.init"),

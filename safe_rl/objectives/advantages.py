@@ -24,6 +24,7 @@ from torchrl.objectives.value import ValueEstimatorBase
 from safe_rl.objectives.gae import gae, one_pass_values, trajectory_ends
 from safe_rl.objectives.keys import require
 from safe_rl.objectives.samples import require_finite, sample_mask
+from safe_rl.ranges import Share
 
 ValueTarget = Literal["lambda_return", "return_to_go"]
 
@@ -39,10 +40,11 @@ class VectorGAE(ValueEstimatorBase):
             values are in the TensorDict already, at the root and under ``"next"``. One with a
             memory of its own, such as an ``LSTMModule``, is stepped with the policy: what it
             remembers where trajectories end is read from the rollout.
-        gamma: discount per step.
-        lmbda: decay of the TD errors.
-        value_target: ``"lambda_return"`` (advantage + value) or ``"return_to_go"`` (discounted
-            sum of the signal to the trajectory's end, bootstrapped there unless it terminated).
+        gamma: Discount per step.
+        lmbda: Decay λ of the TD errors in generalised advantage estimation.
+        value_target: What critics learn: ``"lambda_return"`` (advantage + value) or
+            ``"return_to_go"`` (discounted sum of the signal to the trajectory's end, bootstrapped
+            there unless it terminated).
 
     Raises:
         ValueError: if `value_target` is neither of the two.
@@ -90,8 +92,8 @@ class VectorGAE(ValueEstimatorBase):
         self,
         value_network: TensorDictModuleBase | None,
         *,
-        gamma: float,
-        lmbda: float,
+        gamma: Share,
+        lmbda: Share,
         value_target: ValueTarget,
     ) -> None:
         if value_target not in get_args(ValueTarget):
@@ -237,9 +239,9 @@ class CostGAE(VectorGAE):
     Args:
         cost_keys: keys of the costs under ``"next"``, in the order of the k outputs.
         value_network: cost critic, writes ``cost_value`` [..., T, k]; or None.
-        gamma: discount per step.
-        lmbda: decay of the TD errors.
-        value_target: as in `VectorGAE`.
+        gamma: Discount per step.
+        lmbda: Decay λ of the TD errors in generalised advantage estimation.
+        value_target: What critics learn, see `VectorGAE`.
 
     Examples:
         >>> estimator = CostGAE(
@@ -271,8 +273,8 @@ class CostGAE(VectorGAE):
         cost_keys: Sequence[NestedKey],
         value_network: TensorDictModuleBase | None,
         *,
-        gamma: float,
-        lmbda: float,
+        gamma: Share,
+        lmbda: Share,
         value_target: ValueTarget,
     ) -> None:
         super().__init__(value_network, gamma=gamma, lmbda=lmbda, value_target=value_target)

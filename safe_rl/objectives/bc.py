@@ -7,7 +7,7 @@ from tensordict.nn import TensorDictModuleBase, dispatch
 from torchrl.objectives.utils import distance_loss
 
 from safe_rl.objectives.keys import require
-from safe_rl.objectives.q_functions import ReplayLoss
+from safe_rl.objectives.q_functions import Distance, ReplayLoss
 
 __all__ = ["BCLoss"]
 
@@ -21,7 +21,7 @@ class BCLoss(ReplayLoss):
 
     Args:
         actor_network: deterministic policy.
-        loss_function: of the errors: ``"l2"``, ``"smooth_l1"`` or ``"l1"``.
+        loss_function: Loss of the errors of actions.
 
     Examples:
         >>> import torch
@@ -39,7 +39,9 @@ class BCLoss(ReplayLoss):
     actor_network_params: TensorDictParams
     target_actor_network_params: TensorDictParams
 
-    def __init__(self, actor_network: TensorDictModuleBase, *, loss_function: str = "l2") -> None:
+    def __init__(
+        self, actor_network: TensorDictModuleBase, *, loss_function: Distance = "l2"
+    ) -> None:
         super().__init__()
         self.convert_to_functional(actor_network, "actor_network")
         self.loss_function = loss_function

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from typing import Unpack
+from typing import Annotated, Any
 
 import torch
 from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModuleBase
 from torch import Tensor
 
-from safe_rl.objectives.sac import ConstrainedSoftActorCritic, SACLagrangianLoss
+from safe_rl.objectives.sac import SACLagrangianLoss
 from safe_rl.objectives.violation import KnownCosts
+from safe_rl.ranges import NotNegative, Range, Weight
 
 __all__ = ["CALLoss", "discounted_share"]
 
@@ -56,12 +57,11 @@ class CALLoss(SACLagrangianLoss):
         cost_qvalue_network: a `safe_rl.models.QEnsemble` with one output per cost.
         multiplier: λ; read at every call.
         cost_keys: costs below ``next``, [..., 1] each.
-        convexity: c, per unit of discounted cost.
-        ratio_memory: weight in [0, 1) of the past batches in ρ.
-        largest_ratio: factor by which ρ may differ from `discounted_share`, up or down; 1 for the
+        convexity: Weight c per unit of discounted cost beyond the limit.
+        ratio_memory: Weight of the past batches in ρ, the unit of the limit.
+        largest_ratio: Factor by which ρ may differ from `discounted_share`, up or down; 1 for the
             article's conversion.
-        pessimism, target_pessimism, lowest_cost_value: of the cost critics, see `CostTerms`.
-        settings: those of every soft actor-critic, see `SoftActorCritic`.
+        settings: Those of every loss with cost critics, see `CostCritics`, and of `SACLoss`.
 
     Attributes:
         discounted_limit: d', [k]; a buffer of infinities, which let λ̂ be 0, until `calibrate` or
@@ -101,10 +101,10 @@ class CALLoss(SACLagrangianLoss):
         qvalue_network: TensorDictModuleBase,
         cost_qvalue_network: TensorDictModuleBase,
         *,
-        convexity: float,
-        ratio_memory: float,
-        largest_ratio: float,
-        **settings: Unpack[ConstrainedSoftActorCritic],
+        convexity: NotNegative,
+        ratio_memory: Weight,
+        largest_ratio: Annotated[float, Range(1)],
+        **settings: Any,
     ) -> None:
         super().__init__(actor_network, qvalue_network, cost_qvalue_network, **settings)
         self.convexity = convexity

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, NotRequired, TypedDict
+from typing import Any
 
 import torch
 from tensordict import NestedKey, TensorDictBase, TensorDictParams
@@ -14,30 +14,9 @@ from torchrl.objectives.utils import distance_loss
 from safe_rl.objectives.multipliers import Multiplier
 from safe_rl.objectives.q_functions import QFunctionLoss, discount_of, is_ensemble
 from safe_rl.objectives.violation import KnownCosts
+from safe_rl.ranges import Number
 
-__all__ = ["CostCritics", "CostTerms"]
-
-
-class CostTerms(TypedDict):
-    """Keyword arguments of every loss with cost critics.
-
-    Attributes:
-        multiplier: λ; read at every call, and no part of the loss or its ``state_dict``: whoever
-            moves it saves it.
-        cost_keys: costs below ``next``, [..., 1] each; of transitions over n steps their discounted
-            sums, which TorchRL's `MultiStepTransform` makes of no more than its ``reward_keys``.
-        pessimism: κ, standard deviations among the cost critics that are added to their mean.
-        target_pessimism: the same for what critics bootstrap on, which all then have in common;
-            null: every critic bootstraps on its own target network.
-        lowest_cost_value: lower bound of what critics bootstrap on, e.g. 0 where no cost is
-            negative; null: none.
-    """
-
-    multiplier: Multiplier
-    cost_keys: Sequence[NestedKey]
-    pessimism: NotRequired[float]
-    target_pessimism: NotRequired[float | None]
-    lowest_cost_value: NotRequired[float | None]
+__all__ = ["CostCritics"]
 
 
 class CostCritics(QFunctionLoss):
@@ -58,8 +37,16 @@ class CostCritics(QFunctionLoss):
     Args:
         actor_network, qvalue_network: of the loss without costs.
         cost_qvalue_network: a `safe_rl.models.QEnsemble` with one output per cost.
-        multiplier: this and the next: see `CostTerms`.
-        settings: of the loss without costs.
+        multiplier: λ; read at every call, and no part of the loss or its ``state_dict``: whoever
+            moves it saves it.
+        cost_keys: Costs below ``next``, [..., 1] each; of transitions over n steps their discounted
+            sums, which TorchRL's `MultiStepTransform` makes of no more than its ``reward_keys``.
+        pessimism: Standard deviations κ among the cost critics that are added to their mean.
+        target_pessimism: The same for what critics bootstrap on, which all then have in common;
+            None: every critic bootstraps on its own target network.
+        lowest_cost_value: Lower bound of what critics bootstrap on, such as 0 where no cost is
+            negative; None: none.
+        settings: Those of the loss without costs.
 
     Raises:
         ValueError: if the cost critic is no ensemble, or keys and multipliers differ in number.
@@ -92,9 +79,9 @@ class CostCritics(QFunctionLoss):
         *,
         multiplier: Multiplier,
         cost_keys: Sequence[NestedKey],
-        pessimism: float = 0.0,
-        target_pessimism: float | None = None,
-        lowest_cost_value: float | None = None,
+        pessimism: Number = 0.0,
+        target_pessimism: Number | None = None,
+        lowest_cost_value: Number | None = None,
         **settings: Any,
     ) -> None:
         if not is_ensemble(cost_qvalue_network):

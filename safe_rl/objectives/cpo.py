@@ -7,7 +7,8 @@ from tensordict import TensorDictBase
 from tensordict.nn import ProbabilisticTensorDictSequential
 from torch import Tensor
 
-from safe_rl.objectives.surrogate import SurrogateLoss
+from safe_rl.objectives.surrogate import Reduction, SurrogateLoss
+from safe_rl.ranges import NotNegative
 
 
 class CPOLoss(SurrogateLoss):
@@ -19,7 +20,7 @@ class CPOLoss(SurrogateLoss):
 
     Args:
         actor_network: policy with `get_dist`; see `SurrogateLoss`.
-        entropy_coeff: factor of the entropy bonus.
+        entropy_coeff: Factor of the entropy bonus.
         reduction: ``"mean"``, ``"sum"`` or ``"none"`` over the samples; a `CPOStep` needs the mean.
 
     Examples:
@@ -36,8 +37,8 @@ class CPOLoss(SurrogateLoss):
         self,
         actor_network: ProbabilisticTensorDictSequential,
         *,
-        entropy_coeff: float,
-        reduction: str = "mean",
+        entropy_coeff: NotNegative,
+        reduction: Reduction = "mean",
     ) -> None:
         super().__init__(actor_network, entropy_coeff=entropy_coeff, reduction=reduction)
 

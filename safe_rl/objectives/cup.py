@@ -11,7 +11,8 @@ from torchrl.modules import set_recurrent_mode
 
 from safe_rl.objectives.distributions import has_closed_kl
 from safe_rl.objectives.multipliers import Multiplier
-from safe_rl.objectives.surrogate import SurrogateLoss, require_multiplier
+from safe_rl.objectives.surrogate import Reduction, SurrogateLoss, require_multiplier
+from safe_rl.ranges import NotNegative, Share, Weight
 
 #: Where a batch holds the policy that a projection starts from.
 ANCHOR = "anchor"
@@ -37,10 +38,10 @@ class CUPLoss(SurrogateLoss):
     Args:
         actor_network: policy with `get_dist`, of a distribution whose KL has a closed form.
         multiplier: one ν per column of ``cost_advantage``; a `ProjectedMultiplier` in the article.
-        gamma: γ, the discount of the cost advantages.
-        lmbda: λ_GAE, the decay of their TD errors.
-        entropy_coeff: factor of the entropy bonus.
-        reduction: ``"mean"``, ``"sum"`` or ``"none"``.
+        gamma: Discount γ of the cost advantages.
+        lmbda: Decay λ_GAE of their TD errors.
+        entropy_coeff: Factor of the entropy bonus.
+        reduction: How samples are reduced; ``"none"`` keeps them, which no update takes.
 
     Raises:
         TypeError: if there is no multiplier; by the call, if a KL has no closed form.
@@ -68,10 +69,10 @@ class CUPLoss(SurrogateLoss):
         actor_network: ProbabilisticTensorDictSequential,
         multiplier: Multiplier,
         *,
-        gamma: float,
-        lmbda: float,
-        entropy_coeff: float,
-        reduction: str = "mean",
+        gamma: Weight,
+        lmbda: Share,
+        entropy_coeff: NotNegative,
+        reduction: Reduction = "mean",
     ) -> None:
         super().__init__(
             actor_network,

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from typing import Annotated
+
 from tensordict import TensorDictBase
 from tensordict.nn import ProbabilisticTensorDictSequential
 from torch import Tensor
 
 from safe_rl.objectives.multipliers import Multiplier
-from safe_rl.objectives.surrogate import SurrogateLoss, require_multiplier
+from safe_rl.objectives.surrogate import Reduction, SurrogateLoss, require_multiplier
+from safe_rl.ranges import NotNegative, Positive, Range
 
 
 class FOCOPSLoss(SurrogateLoss):
@@ -24,10 +27,10 @@ class FOCOPSLoss(SurrogateLoss):
     Args:
         actor_network: policy with `get_dist`; see `SurrogateLoss`.
         multiplier: one ν per column of ``cost_advantage``; a `ProjectedMultiplier` in the article.
-        temperature: β, named λ in the article.
-        max_state_kl: δ, for every state.
-        entropy_coeff: factor of the entropy bonus.
-        reduction: ``"mean"``, ``"sum"`` or ``"none"``.
+        temperature: Multiplier β of the trust region, named λ in the article.
+        max_state_kl: KL divergence δ beyond which a state is ignored.
+        entropy_coeff: Factor of the entropy bonus.
+        reduction: How samples are reduced; ``"none"`` keeps them, which no update takes.
 
     Raises:
         TypeError: if there is no multiplier.
@@ -49,10 +52,10 @@ class FOCOPSLoss(SurrogateLoss):
         actor_network: ProbabilisticTensorDictSequential,
         multiplier: Multiplier,
         *,
-        temperature: float,
-        max_state_kl: float,
-        entropy_coeff: float,
-        reduction: str = "mean",
+        temperature: Annotated[float, Range(1e-9, 1e9)],
+        max_state_kl: Positive,
+        entropy_coeff: NotNegative,
+        reduction: Reduction = "mean",
     ) -> None:
         super().__init__(
             actor_network,

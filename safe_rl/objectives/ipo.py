@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-from typing import Unpack
+from typing import Annotated, Any
 
 import torch
 from tensordict import TensorDictBase
 from tensordict.nn import ProbabilisticTensorDictSequential
 from torch import Tensor
 
-from safe_rl.objectives.ppo import ClippedLoss, PPOLoss
+from safe_rl.objectives.ppo import PPOLoss
 from safe_rl.objectives.violation import Violations, constraint_value, violation_of
+from safe_rl.ranges import Range
 
 
 def log_barrier(slack: Tensor, kappa: Tensor | float, max_weight: float) -> Tensor:
@@ -21,7 +22,7 @@ def log_barrier(slack: Tensor, kappa: Tensor | float, max_weight: float) -> Tens
 
     Args:
         slack: how far inside the limits, any shape.
-        kappa: strength κ > 0 of the barrier, a scalar.
+        kappa: Strength κ > 0 of the barrier, a scalar.
         max_weight: largest slope > 0.
 
     Returns:
@@ -57,9 +58,10 @@ class IPOLoss(PPOLoss):
     Args:
         actor_network: policy with `get_dist`; see `SurrogateLoss`.
         constraints: where J_c − d and T̄ stand at every call.
-        kappa: strength κ = 1/t of the barrier, of the costs of an episode.
-        max_weight: largest weight of a cost, in units of the standardised reward advantage.
-        settings: those of every clipped loss, see `ClippedLoss`; costs are always averaged.
+        kappa: Strength κ = 1/t of the barrier, of the costs of an episode.
+        max_weight: Weight of a cost at the limit and beyond, in units of the standardised reward
+            advantage.
+        settings: Those of every clipped loss, see `PPOLoss`; costs are always averaged.
 
     Examples:
         >>> from safe_rl.algorithms import Constraints
@@ -80,9 +82,9 @@ class IPOLoss(PPOLoss):
         actor_network: ProbabilisticTensorDictSequential,
         constraints: Violations,
         *,
-        kappa: float,
-        max_weight: float,
-        **settings: Unpack[ClippedLoss],
+        kappa: Annotated[float, Range(1e-9, 1e9)],
+        max_weight: Annotated[float, Range(1e-9, 1e9)],
+        **settings: Any,
     ) -> None:
         super().__init__(actor_network, **settings)
         self.constraints, self.kappa, self.max_weight = constraints, kappa, max_weight

@@ -16,13 +16,14 @@ Between the costs of a batch and the violation that an update sees lie four deci
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import torch
 from torch import Tensor
 
 from safe_rl.objectives.episode_costs import CostEstimate, EpisodeCosts
 from safe_rl.objectives.risk import Charges
+from safe_rl.ranges import Count, Fraction, NotNegative, Positive, Range, Share, Weight
 
 
 class LimitState(NamedTuple):
@@ -139,24 +140,25 @@ class LimitTracker:
     Args:
         cost_limits: d, undiscounted cost per episode, [k].
         max_length: steps after which an episode is over.
-        margin: z: the aim is z standard errors of a batch's J_c below the limit.
-        largest_margin: bound of the margin, as a share of d.
-        free_steps: environment steps for which costs are free.
-        descent_steps: environment steps in which the limit then comes down.
-        recovery: hysteresis: once J_c is above d, the aim is this share of d until J_c is there, as
+        margin: Standard errors of a batch's J_c by which the aim is below the limit.
+        largest_margin: Bound of the margin, as a share of d.
+        free_steps: Environment steps for which costs are free.
+        descent_steps: Environment steps in which the limit then comes down.
+        recovery: Share of d that is the aim once J_c is above d, until J_c is there: hysteresis, as
             in the published C-TRPO and CPO with hysteresis; 1 for none.
-        frames: environment steps of the whole run.
-        latest_end: share of the run by which the descent is over: in a run too short for that, both
+        frames: Environment steps of the whole run.
+        latest_end: Share of the run by which the descent is over: in a run too short for that, both
             numbers of steps are shortened in proportion.
-        smallest_scale: lower bound of the unit of violations, in costs per step: that of a limit
+        smallest_scale: Lower bound of the unit of violations, in costs per step: that of a limit
             near 0.
-        drift: share by which J_c changes per update, about; see `EpisodeCosts`.
-        memory: weight in [0, 1) of the past in T̄, in the standard error and in the trust.
-        lowest_trust: lower bound of the share of a promise that is believed; 1 believes all.
-        integral: share of every violation that is asked for again in all updates to come (the
+        drift: Share by which J_c changes per update, about; see `EpisodeCosts`.
+        memory: Weight of the past in T̄, in the standard error and in the trust.
+        lowest_trust: Lower bound of trust_<cost>, the share of a promise that is believed; 1
+            believes all.
+        integral: Share of every violation that is asked for again in all updates to come (the
             learned margin of the code of Ray, Achiam and Amodei 2019); 0 for multipliers, which
             integrate themselves.
-        largest_integral: bound of what is asked for in this way, in units of violations.
+        largest_integral: Bound of what is asked for in this way, in units of violations.
 
     Examples:
         >>> tracker = LimitTracker(
@@ -176,19 +178,19 @@ class LimitTracker:
         cost_limits: Tensor,
         *,
         max_length: float,
-        margin: float,
-        largest_margin: float,
-        free_steps: int,
-        descent_steps: int,
-        frames: int,
-        latest_end: float,
-        smallest_scale: float,
-        drift: float | None,
-        memory: float,
-        lowest_trust: float,
-        integral: float,
-        largest_integral: float,
-        recovery: float = 1.0,  # configurations of earlier runs lack it
+        margin: NotNegative,
+        largest_margin: Share,
+        free_steps: Annotated[int, Range(0)],
+        descent_steps: Annotated[int, Range(0)],
+        frames: Count,
+        latest_end: Fraction,
+        smallest_scale: Positive,
+        drift: Positive | None,
+        memory: Weight,
+        lowest_trust: Fraction,
+        integral: NotNegative,
+        largest_integral: NotNegative,
+        recovery: Share = 1.0,  # configurations of earlier runs lack it
     ) -> None:
         self.limits = cost_limits.detach().cpu().float()
         num_costs = len(self.limits)

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from typing import Unpack
+from typing import Any
 
 from tensordict import TensorDictBase
 from tensordict.nn import ProbabilisticTensorDictSequential
 from torch import Tensor
 
-from safe_rl.objectives.ppo import ClippedLoss, PPOLoss, clipped_gain
+from safe_rl.objectives.ppo import PPOLoss, clipped_gain
 from safe_rl.objectives.violation import Violations, violation_of
+from safe_rl.ranges import NotNegative, Share
 
 
 class P3OLoss(PPOLoss):
@@ -30,9 +31,9 @@ class P3OLoss(PPOLoss):
     Args:
         actor_network: policy with `get_dist`; see `SurrogateLoss`.
         constraints: where J_c − d and T̄ stand at every call.
-        kappa: penalty factor κ, for every cost, in units of the standardised reward advantage.
-        gamma: γ in the factor 1 − γ of the violation; None takes 1/T̄ in its place.
-        settings: those of every clipped loss, see `ClippedLoss`; costs are always averaged.
+        kappa: Penalty factor κ, for every cost, in units of the standardised reward advantage.
+        gamma: Discount γ in the factor 1 − γ of the violation; None takes 1/T̄ in its place.
+        settings: Those of every clipped loss, see `PPOLoss`; costs are always averaged.
 
     Examples:
         >>> import torch
@@ -60,9 +61,9 @@ class P3OLoss(PPOLoss):
         actor_network: ProbabilisticTensorDictSequential,
         constraints: Violations,
         *,
-        kappa: float,
-        gamma: float | None,
-        **settings: Unpack[ClippedLoss],
+        kappa: NotNegative,
+        gamma: Share | None,
+        **settings: Any,
     ) -> None:
         super().__init__(actor_network, **settings)
         self.constraints, self.kappa, self.gamma = constraints, kappa, gamma

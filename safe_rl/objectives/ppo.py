@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Literal, NotRequired, TypedDict, Unpack, get_args
+from typing import Annotated, Any, Literal, get_args
 
 import torch
 from tensordict import TensorDictBase
@@ -10,24 +10,11 @@ from tensordict.nn import ProbabilisticTensorDictSequential
 from torch import Tensor
 
 from safe_rl.objectives.multipliers import Multiplier
-from safe_rl.objectives.surrogate import SurrogateLoss, lagrangian, require_multiplier
+from safe_rl.objectives.surrogate import Reduction, SurrogateLoss, lagrangian, require_multiplier
+from safe_rl.ranges import NotNegative, Range
 
 #: How PPO bounds the gain of lowering costs; see `PPOLagrangianLoss`.
 CostClipping = Literal["none", "pessimistic", "joint"]
-
-
-class ClippedLoss(TypedDict):
-    """Keyword arguments of every loss with PPO's clipped objective.
-
-    Attributes:
-        clip_epsilon: half-width ε of the interval within which a ratio earns.
-        entropy_coeff: factor of the entropy bonus.
-        reduction: ``"mean"``, ``"sum"`` or ``"none"``.
-    """
-
-    clip_epsilon: float
-    entropy_coeff: float
-    reduction: NotRequired[str]
 
 
 def clipped_gain(log_weight: Tensor, advantage: Tensor, clip_epsilon: Tensor) -> Tensor:
@@ -56,9 +43,9 @@ class PPOLoss(SurrogateLoss):
 
     Args:
         actor_network: policy with `get_dist`; see `SurrogateLoss`.
-        clip_epsilon: half-width ε of the interval within which a ratio earns.
-        entropy_coeff: factor of the entropy bonus.
-        reduction: ``"mean"``, ``"sum"`` or ``"none"``.
+        clip_epsilon: Half-width ε of the clipping range, within which a ratio earns.
+        entropy_coeff: Factor of the entropy bonus.
+        reduction: How samples are reduced; ``"none"`` keeps them, which no update takes.
 
     Examples:
         >>> import torch
@@ -89,9 +76,9 @@ class PPOLoss(SurrogateLoss):
         self,
         actor_network: ProbabilisticTensorDictSequential,
         *,
-        clip_epsilon: float,
-        entropy_coeff: float,
-        reduction: str = "mean",
+        clip_epsilon: Annotated[float, Range(0, 1000, above=True)],
+        entropy_coeff: NotNegative,
+        reduction: Reduction = "mean",
     ) -> None:
         super().__init__(actor_network, entropy_coeff=entropy_coeff, reduction=reduction)
         self.register_coeff_buffer("clip_epsilon", clip_epsilon, device=self._default_device)
@@ -130,8 +117,8 @@ class PPOLagrangianLoss(PPOLoss):
     Args:
         actor_network: policy with `get_dist`; see `SurrogateLoss`.
         multiplier: one λ per column of ``cost_advantage``.
-        cost_clipping: ``"none"``, ``"pessimistic"`` or ``"joint"``.
-        settings: those of every clipped loss, see `ClippedLoss`.
+        cost_clipping: How cost surrogates are clipped, see above.
+        settings: Those of every clipped loss, see `PPOLoss`.
 
     Raises:
         TypeError: if there is no multiplier.
@@ -153,7 +140,7 @@ class PPOLagrangianLoss(PPOLoss):
         multiplier: Multiplier,
         *,
         cost_clipping: CostClipping = "none",
-        **settings: Unpack[ClippedLoss],
+        **settings: Any,
     ) -> None:
         super().__init__(actor_network, **settings)
         self.multiplier = require_multiplier(multiplier, "PPOLoss")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Literal
 
 from tensordict import NestedKey, TensorDict, TensorDictBase
 from tensordict.nn import dispatch
@@ -29,6 +29,10 @@ def is_ensemble(network: Any) -> bool:
     It has ``num_networks``, and takes steps [...] and parameters to values [E, ...].
     """
     return hasattr(network, "num_networks")
+
+
+Distance = Literal["l2", "smooth_l1", "l1"]
+"""How far a prediction is from its target, see `torchrl.objectives.utils.distance_loss`."""
 
 
 class InOneCall:

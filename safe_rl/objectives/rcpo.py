@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from typing import Unpack
+from typing import Any
 
 from tensordict import TensorDictBase
 from tensordict.nn import ProbabilisticTensorDictSequential
 from torch import Tensor
 
 from safe_rl.objectives.multipliers import Multiplier
-from safe_rl.objectives.ppo import ClippedLoss, PPOLoss
+from safe_rl.objectives.ppo import PPOLoss
 from safe_rl.objectives.surrogate import require_multiplier
 
 
@@ -24,7 +24,7 @@ class RCPOLoss(PPOLoss):
     Args:
         actor_network: policy with `get_dist`; see `SurrogateLoss`.
         multiplier: one λ per column of ``cost_advantage``, read at every call.
-        settings: those of every clipped loss, see `ClippedLoss`.
+        settings: Those of every clipped loss, see `PPOLoss`.
 
     Raises:
         TypeError: if there is no multiplier.
@@ -43,7 +43,7 @@ class RCPOLoss(PPOLoss):
         self,
         actor_network: ProbabilisticTensorDictSequential,
         multiplier: Multiplier,
-        **settings: Unpack[ClippedLoss],
+        **settings: Any,
     ) -> None:
         super().__init__(actor_network, **settings)
         self.multiplier = require_multiplier(multiplier, "PPOLoss")

@@ -13,10 +13,12 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
-from typing import Any, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import torch
 from torch import Tensor
+
+from safe_rl.ranges import Fraction, Range, Weight
 
 __all__ = ["CVaR", "Chance", "Charges", "RiskMeasure", "cost_so_far", "value_at_risk"]
 
@@ -108,10 +110,10 @@ class CVaR(RiskMeasure):
 
     Args:
         cost_limits: d, [k].
-        tail: α in (0, 1].
-        window: episodes of the past from which ν is taken.
-        ramp_start: environment steps before which κ = 0.
-        ramp_steps: environment steps in which κ then goes to 1.
+        tail: Share α of the worst episodes.
+        window: Episodes of the past from which ν, the value at risk, is taken.
+        ramp_start: Environment steps before which κ = 0: the mean is limited.
+        ramp_steps: Environment steps in which κ then goes to 1.
 
     Raises:
         ValueError: if an argument is outside its range.
@@ -126,7 +128,13 @@ class CVaR(RiskMeasure):
     """
 
     def __init__(
-        self, cost_limits: Tensor, *, tail: float, window: int, ramp_start: int, ramp_steps: int
+        self,
+        cost_limits: Tensor,
+        *,
+        tail: Fraction,
+        window: Annotated[int, Range(1, 10**6)],
+        ramp_start: Annotated[int, Range(0)],
+        ramp_steps: Annotated[int, Range(0)],
     ) -> None:
         if not 0 < tail <= 1 or window < 1:
             raise ValueError(
@@ -176,7 +184,7 @@ class Chance(RiskMeasure):
 
     Args:
         cost_limits: d, [k].
-        most_over: ε in [0, 1).
+        most_over: Share ε of episodes that may exceed the limit.
 
     Raises:
         ValueError: if an argument is outside its range.
@@ -188,7 +196,7 @@ class Chance(RiskMeasure):
         tensor([0., 0., 2., 0.])
     """
 
-    def __init__(self, cost_limits: Tensor, *, most_over: float) -> None:
+    def __init__(self, cost_limits: Tensor, *, most_over: Weight) -> None:
         if not 0 <= most_over < 1:
             raise ValueError(f"most_over must lie in [0, 1), got {most_over}.")
         self.limits = cost_limits.detach().cpu().float()

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import NotRequired, TypedDict
+from typing import Annotated, Literal
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -15,41 +15,18 @@ from torchrl.modules.distributions.utils import rsample_and_log_prob
 from torchrl.objectives import ValueEstimators
 from torchrl.objectives.value import TD0Estimator
 
-from safe_rl.objectives.cost_critics import CostCritics, CostTerms
+from safe_rl.objectives.cost_critics import CostCritics
 from safe_rl.objectives.q_functions import (
+    Distance,
     InOneCall,
     QFunctionLoss,
     discount_of,
     is_ensemble,
     scalars,
 )
+from safe_rl.ranges import Number, Range, Share
 
-__all__ = ["ConstrainedSoftActorCritic", "SACLagrangianLoss", "SACLoss", "SoftActorCritic"]
-
-
-class SoftActorCritic(TypedDict):
-    """Keyword arguments of every soft actor-critic.
-
-    Attributes:
-        gamma: discount per step, of reward and costs.
-        alpha_init: first temperature α, the weight of the entropy.
-        target_entropy: of the policy, to which α is adapted; ``"auto"`` is minus the number of
-            actions.
-        fixed_alpha: whether α stays as it is.
-        loss_function: of the TD errors: ``"l2"``, ``"smooth_l1"`` or ``"l1"``.
-        action_spec: of one action [A]; needed for ``target_entropy="auto"``.
-    """
-
-    gamma: float
-    alpha_init: float
-    target_entropy: NotRequired[float | str]
-    fixed_alpha: NotRequired[bool]
-    loss_function: NotRequired[str]
-    action_spec: NotRequired[TensorSpec | None]
-
-
-class ConstrainedSoftActorCritic(SoftActorCritic, CostTerms):
-    """Keyword arguments of every soft actor-critic with cost limits."""
+__all__ = ["SACLagrangianLoss", "SACLoss"]
 
 
 class SACLoss(QFunctionLoss, objectives.SACLoss):
@@ -61,7 +38,13 @@ class SACLoss(QFunctionLoss, objectives.SACLoss):
     Args:
         actor_network: policy with ``get_dist``.
         qvalue_network: a `safe_rl.models.QEnsemble`, or what TorchRL takes, of which two are made.
-        gamma: this and all others: see `SoftActorCritic`.
+        gamma: Discount per step, of reward and costs.
+        alpha_init: First temperature α, the weight of the entropy.
+        target_entropy: Entropy of the policy, to which α is adapted; ``"auto"`` is minus the number
+            of actions.
+        fixed_alpha: Whether α stays as it is.
+        loss_function: Loss of the TD errors.
+        action_spec: Spec of one action [A]; needed for ``target_entropy="auto"``.
 
     Examples:
         >>> import torch
@@ -92,11 +75,11 @@ class SACLoss(QFunctionLoss, objectives.SACLoss):
         actor_network: ProbabilisticTensorDictSequential,
         qvalue_network: TensorDictModuleBase,
         *,
-        gamma: float,
-        alpha_init: float,
-        target_entropy: float | str = "auto",
+        gamma: Share,
+        alpha_init: Annotated[float, Range(1e-9, 1e9)],
+        target_entropy: Number | Literal["auto"] = "auto",
         fixed_alpha: bool = False,
-        loss_function: str = "l2",
+        loss_function: Distance = "l2",
         action_spec: TensorSpec | None = None,
     ) -> None:
         super().__init__(
@@ -187,8 +170,7 @@ class SACLagrangianLoss(CostCritics, SACLoss):
         cost_qvalue_network: a `safe_rl.models.QEnsemble` with one output per cost.
         multiplier: λ; read at every call.
         cost_keys: costs below ``next``, [..., 1] each.
-        pessimism, target_pessimism, lowest_cost_value: of the cost critics, see `CostTerms`.
-        settings: those of every soft actor-critic, see `SoftActorCritic`.
+        settings: Those of every loss with cost critics, see `CostCritics`, and of `SACLoss`.
 
     Raises:
         ValueError: if the cost critic is no ensemble, or keys and multipliers differ in number.

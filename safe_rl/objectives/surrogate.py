@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Literal
 
 import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase, TensorDictParams
@@ -22,6 +23,7 @@ from safe_rl.objectives.distributions import (
 from safe_rl.objectives.keys import require
 from safe_rl.objectives.multipliers import Multiplier
 from safe_rl.objectives.samples import sample_mask
+from safe_rl.ranges import NotNegative
 
 
 def lagrangian(reward_gain: Tensor, cost_gain: Tensor, multipliers: Tensor) -> Tensor:
@@ -56,6 +58,9 @@ def effective_sample_size(log_weight: Tensor, mask: Tensor | None = None) -> Ten
     return log_size.exp() / (log_weight.numel() if mask is None else mask.sum())
 
 
+Reduction = Literal["mean", "sum"]
+
+
 class SurrogateLoss(LossModule):
     """Base of the policy losses: subclasses turn log-ratios into surrogates.
 
@@ -68,10 +73,10 @@ class SurrogateLoss(LossModule):
 
     Args:
         actor_network: policy with `get_dist`, such as a `torchrl.modules.ProbabilisticActor`.
-        entropy_coeff: factor of the entropy bonus; a buffer, so that it can be scheduled, also up
+        entropy_coeff: Factor of the entropy bonus; a buffer, so that it can be scheduled, also up
             from 0.
         multiplier: weighs the costs; None if there is none to weigh.
-        reduction: how samples are reduced: ``"mean"``, ``"sum"`` or ``"none"``.
+        reduction: How samples are reduced; ``"none"`` keeps them, which no update takes.
     """
 
     @dataclass
@@ -113,9 +118,9 @@ class SurrogateLoss(LossModule):
         self,
         actor_network: ProbabilisticTensorDictSequential,
         *,
-        entropy_coeff: float,
+        entropy_coeff: NotNegative,
         multiplier: Multiplier | None = None,
-        reduction: str = "mean",
+        reduction: Reduction = "mean",
     ) -> None:
         super().__init__()
         self.convert_to_functional(actor_network, "actor_network")

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import NotRequired, TypedDict
-
 import torch
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
@@ -13,28 +11,10 @@ from torchrl.data import TensorSpec
 from torchrl.objectives import ValueEstimators
 
 from safe_rl.objectives.cost_critics import CostCritics
-from safe_rl.objectives.q_functions import InOneCall, QFunctionLoss, is_ensemble, scalars
+from safe_rl.objectives.q_functions import Distance, InOneCall, QFunctionLoss, is_ensemble, scalars
+from safe_rl.ranges import NotNegative, Share
 
-__all__ = ["TD3LagrangianLoss", "TD3Loss", "TwinDelayed"]
-
-
-class TwinDelayed(TypedDict):
-    """Keyword arguments of every TD3.
-
-    Attributes:
-        action_spec: of one action [A], bounded.
-        gamma: discount per step, of reward and costs.
-        policy_noise: standard deviation of the noise on the target policy's actions, of half the
-            range of each.
-        noise_clip: bound of that noise, likewise.
-        loss_function: of the TD errors: ``"l2"``, ``"smooth_l1"`` or ``"l1"``.
-    """
-
-    action_spec: TensorSpec
-    gamma: float
-    policy_noise: float
-    noise_clip: float
-    loss_function: NotRequired[str]
+__all__ = ["TD3LagrangianLoss", "TD3Loss"]
 
 
 class TD3Loss(QFunctionLoss, objectives.TD3Loss):
@@ -43,7 +23,12 @@ class TD3Loss(QFunctionLoss, objectives.TD3Loss):
     Args:
         actor_network: deterministic policy.
         qvalue_network: a `safe_rl.models.QEnsemble`, or what TorchRL takes, of which two are made.
-        action_spec: this and all others: see `TwinDelayed`.
+        action_spec: Spec of one action [A], bounded.
+        gamma: Discount per step, of reward and costs.
+        policy_noise: Standard deviation of the noise on the target policy's actions, in halves of
+            the range of each.
+        noise_clip: Bound of that noise, likewise.
+        loss_function: Loss of the TD errors.
 
     Examples:
         >>> from safe_rl.models import QEnsemble, make_bounded_actor
@@ -61,10 +46,10 @@ class TD3Loss(QFunctionLoss, objectives.TD3Loss):
         qvalue_network: TensorDictModuleBase,
         *,
         action_spec: TensorSpec,
-        gamma: float,
-        policy_noise: float,
-        noise_clip: float,
-        loss_function: str = "l2",
+        gamma: Share,
+        policy_noise: NotNegative,
+        noise_clip: NotNegative,
+        loss_function: Distance = "l2",
     ) -> None:
         joint = is_ensemble(qvalue_network)
         super().__init__(
@@ -136,8 +121,7 @@ class TD3LagrangianLoss(CostCritics, TD3Loss):
         cost_qvalue_network: a `safe_rl.models.QEnsemble` with one output per cost.
         multiplier: λ; read at every call.
         cost_keys: costs below ``next``, [..., 1] each.
-        pessimism, target_pessimism, lowest_cost_value: of the cost critics, see `CostTerms`.
-        settings: those of every TD3, see `TwinDelayed`.
+        settings: Those of every loss with cost critics, see `CostCritics`, and of `TD3Loss`.
 
     Raises:
         ValueError: if the cost critic is no ensemble, or keys and multipliers differ in number.

@@ -7,7 +7,8 @@ from tensordict.nn import ProbabilisticTensorDictSequential
 from torch import Tensor
 
 from safe_rl.objectives.multipliers import Multiplier
-from safe_rl.objectives.surrogate import SurrogateLoss, require_multiplier
+from safe_rl.objectives.surrogate import Reduction, SurrogateLoss, require_multiplier
+from safe_rl.ranges import NotNegative
 
 
 class TRPOLoss(SurrogateLoss):
@@ -19,8 +20,8 @@ class TRPOLoss(SurrogateLoss):
 
     Args:
         actor_network: policy with `get_dist`; see `SurrogateLoss`.
-        entropy_coeff: factor of the entropy bonus.
-        reduction: ``"mean"``, ``"sum"`` or ``"none"``.
+        entropy_coeff: Factor of the entropy bonus.
+        reduction: How samples are reduced; ``"none"`` keeps them, which no update takes.
 
     Examples:
         >>> from safe_rl.models import make_actor
@@ -33,8 +34,8 @@ class TRPOLoss(SurrogateLoss):
         self,
         actor_network: ProbabilisticTensorDictSequential,
         *,
-        entropy_coeff: float,
-        reduction: str = "mean",
+        entropy_coeff: NotNegative,
+        reduction: Reduction = "mean",
     ) -> None:
         super().__init__(actor_network, entropy_coeff=entropy_coeff, reduction=reduction)
 
@@ -50,8 +51,8 @@ class TRPOLagrangianLoss(TRPOLoss):
     Args:
         actor_network: policy with `get_dist`; see `SurrogateLoss`.
         multiplier: one λ per column of ``cost_advantage``, read at every call.
-        entropy_coeff: factor of the entropy bonus.
-        reduction: ``"mean"``, ``"sum"`` or ``"none"``.
+        entropy_coeff: Factor of the entropy bonus.
+        reduction: How samples are reduced; ``"none"`` keeps them, which no update takes.
 
     Raises:
         TypeError: if there is no multiplier.
@@ -70,8 +71,8 @@ class TRPOLagrangianLoss(TRPOLoss):
         actor_network: ProbabilisticTensorDictSequential,
         multiplier: Multiplier,
         *,
-        entropy_coeff: float,
-        reduction: str = "mean",
+        entropy_coeff: NotNegative,
+        reduction: Reduction = "mean",
     ) -> None:
         super().__init__(
             actor_network,

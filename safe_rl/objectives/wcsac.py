@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from statistics import NormalDist
-from typing import Unpack
+from typing import Any
 
 from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModuleBase
 from torch import Tensor
@@ -11,7 +11,8 @@ from torch.nn.functional import softplus
 from torchrl.objectives.utils import distance_loss
 
 from safe_rl.objectives.risk import CVaR
-from safe_rl.objectives.sac import ConstrainedSoftActorCritic, SACLagrangianLoss
+from safe_rl.objectives.sac import SACLagrangianLoss
+from safe_rl.ranges import Fraction
 
 __all__ = ["WCSACLoss", "gaussian_tail"]
 
@@ -59,12 +60,10 @@ class WCSACLoss(SACLagrangianLoss):
             number of networks: the first half are means, the second variances before a softplus.
         multiplier: λ; read at every call.
         cost_keys: costs below ``next``, [..., 1] each.
-        tail: α, the share of the worst returns.
-        pessimism: κ, standard deviations among the CVaR of several pairs of critics that are added
+        tail: Share α of the worst cost returns.
+        pessimism: Standard deviations κ among the CVaR of several pairs of critics that are added
             to their mean.
-        target_pessimism, lowest_cost_value: of the means that critics bootstrap on, see
-            `CostTerms`.
-        settings: those of every soft actor-critic, see `SoftActorCritic`.
+        settings: Those of every loss with cost critics, see `CostCritics`, and of `SACLoss`.
 
     Raises:
         ValueError: if α is outside (0, 1], or the number of networks is odd.
@@ -99,8 +98,8 @@ class WCSACLoss(SACLagrangianLoss):
         qvalue_network: TensorDictModuleBase,
         cost_qvalue_network: TensorDictModuleBase,
         *,
-        tail: float,
-        **settings: Unpack[ConstrainedSoftActorCritic],
+        tail: Fraction,
+        **settings: Any,
     ) -> None:
         self._factor = gaussian_tail(tail)
         super().__init__(actor_network, qvalue_network, cost_qvalue_network, **settings)
