@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 import importlib
+from collections.abc import Callable
 from importlib.util import find_spec
-from typing import Any
+from typing import Any, TypeVar
 
-__all__ = ["import_extra", "require_extra"]
+__all__ = ["check_extra", "import_extra", "needs_extra", "require_extra"]
+
+T = TypeVar("T")
+_NEEDED: dict[Any, tuple[str, str]] = {}
 
 
 def require_extra(module: str, extra: str) -> None:
@@ -47,3 +51,32 @@ def import_extra(module: str, extra: str) -> Any:
     """
     require_extra(module, extra)
     return importlib.import_module(module)
+
+
+def needs_extra(module: str, extra: str) -> Callable[[T], T]:
+    """Say of a class or function that it needs a package of an extra, for `check_extra`.
+
+    Args:
+        module: Name of the package's module.
+        extra: The extra that installs it.
+    """
+
+    def note(part: T) -> T:
+        _NEEDED[part] = (module, extra)
+        return part
+
+    return note
+
+
+def check_extra(part: Any) -> None:
+    """Check that the package is there which a class, or one of its bases, or a function needs.
+
+    Raises:
+        ModuleNotFoundError: If it is not installed; the message says how to install it.
+
+    Examples:
+        >>> check_extra(needs_extra("json", extra="report")(Any))
+    """
+    for owner in getattr(part, "__mro__", (part,)):
+        if owner in _NEEDED:
+            require_extra(*_NEEDED[owner])

@@ -7,9 +7,19 @@ import os
 import re
 from collections.abc import Callable, Mapping
 from functools import cache
-from typing import Any, NamedTuple, NotRequired, get_args, get_origin, get_type_hints, is_typeddict
+from typing import (
+    Annotated,
+    Any,
+    NamedTuple,
+    NotRequired,
+    TypedDict,
+    get_args,
+    get_origin,
+    get_type_hints,
+    is_typeddict,
+)
 
-from safe_rl.ranges import Values, bytes_each, is_described, values_of
+from safe_rl.ranges import NotNegative, Range, Values, Weight, bytes_each, is_described, values_of
 from safe_rl.targets import constructors
 
 __all__ = ["Parameter", "SettingError", "parameters_of"]
@@ -71,6 +81,32 @@ class Parameter(NamedTuple):
             )
 
 
+class Optimiser(TypedDict, total=False):
+    """Arguments of torch's optimisers, whose annotations do not say what they may be.
+
+    Attributes:
+        lr: Learning rate.
+        betas: Decay rates of the moments.
+        eps: What is added to denominators.
+        weight_decay: Decay of the weights.
+        momentum: Weight of past gradients.
+        fused: Whether to step in one kernel.
+        foreach: Whether to step all tensors together.
+        amsgrad: Whether to keep the maximum of second moments.
+        nesterov: Whether to use Nesterov momentum.
+    """
+
+    lr: Annotated[float, Range(0, 1000, above=True)]
+    betas: tuple[Weight, Weight]
+    eps: NotNegative
+    weight_decay: NotNegative
+    momentum: Weight
+    fused: bool | None
+    foreach: bool | None
+    amsgrad: bool
+    nesterov: bool
+
+
 @cache
 def parameters_of(target: Callable[..., Any]) -> Mapping[str, Parameter]:
     """Arguments of a function or class by name, those of its bases included; keys of a `TypedDict`.
@@ -78,6 +114,8 @@ def parameters_of(target: Callable[..., Any]) -> Mapping[str, Parameter]:
     As `targets.accepted_names`, this follows ``**kwargs`` to the next constructor. An annotation
     that cannot be read, such as a name imported for type checkers only, allows anything.
     """
+    if target.__module__.startswith("torch.optim"):
+        return parameters_of(Optimiser)
     meanings = _meanings(target)
     found: dict[str, Parameter] = {}
     for name, annotation, is_required in _annotations(target):

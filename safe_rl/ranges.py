@@ -17,8 +17,8 @@ from typing import get_origin as origin_of
 
 __all__ = [
     *("ANYTHING", "PART", "Bytes", "Count", "Fraction", "MaxLength", "NotNegative", "Number"),
-    *("Positive", "Range", "Share", "Text", "Values", "Weight", "bytes_each", "is_described"),
-    "values_of",
+    *("Options", "Positive", "Range", "Share", "Text", "Values", "Weight", "bytes_each"),
+    *("is_described", "values_of"),
 ]
 
 
@@ -239,3 +239,6 @@ _PLAIN: dict[Any, Values] = {
     **{bool: _BOOLEAN, str: _TEXT, None: _NULL, NoneType: _NULL},
     **{int: _whole(Range()), float: _number(Range())},
 }
+
+Options = Annotated[dict[str, Any], _mapping(ANYTHING)]
+"""Of a parameter that is handed on to another library."""

@@ -166,7 +166,6 @@ FLOORS = {
         ("benchmark", "conf", "interrupting", "meant", "options", "robots", "run_folders"),
         ("sweep_display", "values"),
         ("keys",),
-        ("part_keys",),
         ("failures", "settings", "variations"),
         ("overrides",),
         ("user_code",),

@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from typing import Any, Unpack
+from typing import Any
 
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from safe_rl.algorithms.trust_region_step import Proposal, TRPOStep, TrustRegion, total_loss
+from safe_rl.algorithms.trust_region_step import Proposal, TRPOStep, total_loss
 from safe_rl.objectives.fisher import FisherProduct
 from safe_rl.objectives.multipliers import CostLimits, parse_cost_limits
 from safe_rl.objectives.trust_region import flat_gradient
 from safe_rl.objectives.violation import matched_violation
+from safe_rl.ranges import Fraction, NotNegative, Weight
 
 __all__ = ["CTRPOStep", "barrier_divergence"]
 
@@ -64,10 +65,11 @@ class CTRPOStep(TRPOStep):
         loss: a `CPOLoss`, or a callable of your own that returns a TensorDict with scalars
             ``loss_…`` and the differentiable ``cost_surrogate``, [k].
         cost_limits: d, as of a multiplier; see `parse_cost_limits`.
-        beta: β, per unit of an episode's cost, for every cost.
-        gamma: γ in the factor h = 1/(1 − γ); None takes T̄ in its place, that of undiscounted sums.
-        hysteresis: share of d in (0, 1] at which a recovery ends; 1 ends it at the limit.
-        settings: those of every step, see `TrustRegion`.
+        beta: Weight β of the barrier, per unit of an episode's cost, for every cost.
+        gamma: Discount γ in the factor h = 1/(1 − γ); None takes T̄ in its place, that of
+            undiscounted sums.
+        hysteresis: Share of d at which a recovery ends; 1 ends it at the limit.
+        settings: Those of every step, see `TRPOStep`.
 
     Raises:
         ValueError: if `hysteresis` or `gamma` is outside its range.
@@ -94,10 +96,10 @@ class CTRPOStep(TRPOStep):
         loss: Callable[[TensorDictBase], TensorDictBase],
         cost_limits: CostLimits,
         *,
-        beta: float,
-        gamma: float | None,
-        hysteresis: float,
-        **settings: Unpack[TrustRegion],
+        beta: NotNegative,
+        gamma: Weight | None,
+        hysteresis: Fraction,
+        **settings: Any,
     ) -> None:
         super().__init__(loss, **settings)
         if not 0 < hysteresis <= 1 or (gamma is not None and not 0 <= gamma < 1):

@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Unpack
+from typing import Any
 
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from safe_rl.algorithms.trust_region_step import Proposal, TRPOStep, TrustRegion, total_loss
+from safe_rl.algorithms.trust_region_step import Proposal, TRPOStep, total_loss
 from safe_rl.objectives.cpo_dual import DualSolution, solve_dual
 from safe_rl.objectives.fisher import FisherProduct
 from safe_rl.objectives.trust_region import flat_gradient
 from safe_rl.objectives.violation import constraint_value, matched_violation
+from safe_rl.ranges import Positive
 
 __all__ = ["CPOStep"]
 
@@ -36,14 +37,14 @@ class CPOStep(TRPOStep):
     Args:
         loss: a `CPOLoss`, or a callable of your own that returns a TensorDict with scalars
             ``loss_…`` and the differentiable ``cost_surrogate``, [k].
-        rescale_violation: whether to divide the violations by the episode length; see
+        rescale_violation: Whether to divide the violations by the episode length; see
             `constraint_value`.
-        largest_demand: bound of every c, as a share of √(2δ bᵀH⁻¹b), the most that a step within
+        largest_demand: Bound of every c, as a share of √(2δ bᵀH⁻¹b), the most that a step within
             the trust region lowers its surrogate by; None for none. A policy that is further
             above its limit than one step mends takes recoveries (case 0), which do not look at the
             reward, until the limit is reached: a return learned in 20 updates is forgotten in as
             many. With 0.8, one constraint leaves √(1 − 0.8²) = 0.6 of the step to the reward.
-        settings: those of every step, see `TrustRegion`.
+        settings: Those of every step, see `TRPOStep`.
 
     Raises:
         ValueError: if `largest_demand` is not positive.
@@ -76,8 +77,8 @@ class CPOStep(TRPOStep):
         loss: Callable[[TensorDictBase], TensorDictBase],
         *,
         rescale_violation: bool,
-        largest_demand: float | None = None,
-        **settings: Unpack[TrustRegion],
+        largest_demand: Positive | None = None,
+        **settings: Any,
     ) -> None:
         super().__init__(loss, **settings)
         if largest_demand is not None and not largest_demand > 0:

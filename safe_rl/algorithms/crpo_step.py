@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Unpack
+from typing import Any
 
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from safe_rl.algorithms.trust_region_step import Proposal, TRPOStep, TrustRegion
+from safe_rl.algorithms.trust_region_step import Proposal, TRPOStep
 from safe_rl.objectives.fisher import FisherProduct
 from safe_rl.objectives.violation import matched_violation
+from safe_rl.ranges import NotNegative
 
 __all__ = ["CRPOStep"]
 
@@ -29,8 +30,8 @@ class CRPOStep(TRPOStep):
     Args:
         loss: a `CPOLoss`, or a callable of your own that returns a TensorDict with scalars
             ``loss_…`` and the differentiable ``cost_surrogate``, [k].
-        tolerance: η ≥ 0, undiscounted cost per episode.
-        settings: those of every step, see `TrustRegion`.
+        tolerance: Tolerated violation η, undiscounted cost per episode.
+        settings: Those of every step, see `TRPOStep`.
 
     Examples:
         >>> from tensordict import TensorDict
@@ -51,8 +52,8 @@ class CRPOStep(TRPOStep):
         self,
         loss: Callable[[TensorDictBase], TensorDictBase],
         *,
-        tolerance: float,
-        **settings: Unpack[TrustRegion],
+        tolerance: NotNegative,
+        **settings: Any,
     ) -> None:
         super().__init__(loss, **settings)
         self.tolerance = tolerance

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Annotated
+
+from safe_rl.ranges import Range, Share
 
 __all__ = ["KLAdaptiveRate"]
 
@@ -17,11 +20,11 @@ class KLAdaptiveRate:
     idea is the adaptive penalty of PPO (Schulman et al. 2017, section 4), applied to the rate.
 
     Attributes:
-        factor: by which the rate is divided or multiplied, above 1.
-        lowest: bound of the rate.
-        highest: bound of the rate.
-        few_steps: share of the planned steps below which an update has ended early.
-        low_kl: share of the KL limit below which a whole update has fallen short.
+        factor: Factor by which the rate is divided or multiplied.
+        lowest: Lower bound of the rate.
+        highest: Upper bound of the rate.
+        few_steps: Share of the planned steps below which an update has ended early.
+        low_kl: Share of the KL limit below which a whole update has fallen short.
 
     Raises:
         ValueError: if the factor is not above 1 or the bounds are not positive and in order.
@@ -36,11 +39,11 @@ class KLAdaptiveRate:
         0.0008
     """
 
-    factor: float
-    lowest: float
-    highest: float
-    few_steps: float
-    low_kl: float
+    factor: Annotated[float, Range(1, above=True)]
+    lowest: Annotated[float, Range(0, 1000, above=True)]
+    highest: Annotated[float, Range(0, 1000, above=True)]
+    few_steps: Share
+    low_kl: Share
 
     def __post_init__(self) -> None:
         if not self.factor > 1 or not 0 < self.lowest <= self.highest:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from typing import Any
+from typing import Annotated, Any, Literal
 
 import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase
@@ -13,6 +13,7 @@ from torchrl.envs import MultiStepTransform
 
 from safe_rl.algorithms.contract import Stateful
 from safe_rl.algorithms.prioritised import ProportionalSampler
+from safe_rl.ranges import Bytes, Count, Range, Share
 
 __all__ = ["Memory"]
 
@@ -37,8 +38,9 @@ class Memory:
             ``reward_keys``.
         reward_keys: Entries below ``next`` that are summed over n steps.
         reward_gamma: Discount per step of these sums.
-        n_steps: n.
-        storage: ``"tensor"`` keeps transitions in main memory, ``"memmap"`` in temporary files.
+        n_steps: Steps n of n-step returns.
+        storage: Where transitions are kept: ``"tensor"`` in main memory, ``"memmap"`` in temporary
+            files.
         prioritised: Exponents ``alpha`` and ``beta`` of prioritised replay (Schaul et al. 2016,
             sections 3.3 and 3.4), or None for uniform draws.
         keep: Whether checkpoints hold the transitions, so that a run goes on exactly.
@@ -62,14 +64,14 @@ class Memory:
     def __init__(
         self,
         *,
-        capacity: int,
-        batch_size: int,
+        capacity: Annotated[int, Range(1), Bytes(50)],
+        batch_size: Count,
         in_keys: Sequence[NestedKey],
         reward_keys: Sequence[NestedKey],
         reward_gamma: float,
-        n_steps: int,
-        storage: str,
-        prioritised: Mapping[str, float] | None = None,
+        n_steps: Annotated[int, Range(1, 1000)],
+        storage: Literal["tensor", "memmap"],
+        prioritised: Mapping[str, Share] | None = None,
         keep: bool,
         device: torch.device | str | None = None,
     ) -> None:

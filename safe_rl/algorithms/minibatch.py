@@ -11,7 +11,7 @@ import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import fields
 from functools import partial
-from typing import Any
+from typing import Annotated, Any
 
 import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase
@@ -25,6 +25,7 @@ from safe_rl.algorithms.learning_rate import KLAdaptiveRate
 from safe_rl.algorithms.losses import divergence, sum_of_losses
 from safe_rl.objectives.samples import learning_samples, require_finite
 from safe_rl.objectives.surrogate import SurrogateLoss
+from safe_rl.ranges import PART, Count, Positive, Range
 
 __all__ = ["MinibatchUpdate"]
 
@@ -95,12 +96,12 @@ class MinibatchUpdate(PolicyUpdate):
         self,
         loss: LossModule,
         *,
-        optimizer: Callable[[Iterable[nn.Parameter]], Optimizer],
-        num_passes: int,
-        minibatch_size: int | None,
-        max_kl: float | None = None,
-        max_grad_norm: float | None = None,
-        adapt_rate: KLAdaptiveRate | None = None,
+        optimizer: Annotated[Callable[[Iterable[nn.Parameter]], Optimizer], PART],
+        num_passes: Annotated[int, Range(1, 10**9)],
+        minibatch_size: Count | None,
+        max_kl: Positive | None = None,
+        max_grad_norm: Positive | None = None,
+        adapt_rate: Annotated[KLAdaptiveRate, PART] | None = None,
         compile: bool = False,
     ) -> None:
         if num_passes < 1 or (minibatch_size is not None and minibatch_size < 1):

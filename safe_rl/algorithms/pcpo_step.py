@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Literal, Unpack, get_args
+from typing import Any, Literal, get_args
 
 import scipy  # which loads its parts when they are asked for: half a second
 import torch
@@ -11,9 +11,10 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from safe_rl.algorithms.cpo_step import CPOStep
-from safe_rl.algorithms.trust_region_step import Proposal, TrustRegion, total_loss
+from safe_rl.algorithms.trust_region_step import Proposal, total_loss
 from safe_rl.objectives.fisher import FisherProduct
 from safe_rl.objectives.trust_region import flat_gradient
+from safe_rl.ranges import Positive
 
 __all__ = ["PCPOStep", "nearest_feasible"]
 
@@ -65,10 +66,10 @@ class PCPOStep(CPOStep):
 
     Args:
         loss: as of a `CPOStep`.
-        projection: ``"kl"`` or ``"l2"``, the distance that the projection keeps small.
-        rescale_violation: whether to divide the violations by the episode length.
-        largest_demand: bound of every c, as of a `CPOStep`; None for none.
-        settings: those of every step, see `TrustRegion`.
+        projection: Distance that the projection keeps small.
+        rescale_violation: Whether to divide the violations by the episode length.
+        largest_demand: Bound of every c, see `CPOStep`; None for none.
+        settings: Those of every step, see `TRPOStep`.
 
     Raises:
         ValueError: if `projection` is neither of the two.
@@ -95,8 +96,8 @@ class PCPOStep(CPOStep):
         *,
         projection: Projection,
         rescale_violation: bool,
-        largest_demand: float | None = None,
-        **settings: Unpack[TrustRegion],
+        largest_demand: Positive | None = None,
+        **settings: Any,
     ) -> None:
         super().__init__(
             loss, rescale_violation=rescale_violation, largest_demand=largest_demand, **settings

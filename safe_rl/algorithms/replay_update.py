@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from itertools import chain
-from typing import Any
+from typing import Annotated, Any
 
 import torch
 from tensordict import TensorDictBase
@@ -16,6 +16,7 @@ from safe_rl.algorithms.losses import ESTIMATOR, divergence, sum_of_losses
 from safe_rl.algorithms.memory import Memory
 from safe_rl.naming import did_you_mean
 from safe_rl.objectives.q_functions import ReplayLoss
+from safe_rl.ranges import PART, Positive, Range
 
 __all__ = ["ReplayUpdate"]
 
@@ -61,12 +62,12 @@ class ReplayUpdate:
         self,
         loss: ReplayLoss,
         *,
-        optimizer: Callable[[Iterable[Any]], Optimizer],
-        updates_per_step: float,
-        tau: float | None,
-        policy_delay: int = 1,
-        rates: Mapping[str, float] | None = None,
-        max_grad_norm: float | None = None,
+        optimizer: Annotated[Callable[[Iterable[Any]], Optimizer], PART],
+        updates_per_step: Positive,
+        tau: Annotated[float, Range(0, 0.5, above=True)] | None,
+        policy_delay: Annotated[int, Range(1, 10_000)] = 1,
+        rates: Mapping[str, Positive] | None = None,
+        max_grad_norm: Positive | None = None,
         compile: bool = False,
     ) -> None:
         self.loss, self.policy_delay = loss, policy_delay

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable
-from typing import Any, NamedTuple, NotRequired, TypedDict
+from typing import Annotated, Any, NamedTuple
 
 import torch
 from tensordict import TensorDictBase
@@ -28,30 +28,9 @@ from safe_rl.objectives.trust_region import (
     solve_with_image,
     subsample,
 )
+from safe_rl.ranges import Fraction, NotNegative, Positive, Range
 
-__all__ = ["Proposal", "TRPOStep", "TrustRegion", "total_loss"]
-
-
-class TrustRegion(TypedDict):
-    """Keyword arguments of every trust-region step.
-
-    Attributes:
-        target_kl: radius δ of the trust region, mean KL over the states of the batch.
-        damping: multiple of the identity added to the Fisher matrix.
-        cg_iterations: iterations of the conjugate gradient method, for every system solved.
-        backtrack_coeff: factor between one try of the line search and the next.
-        max_backtracks: tries of the line search.
-        fisher_subsample: fraction of the batch that the Fisher matrix is averaged over.
-        actor_network: policy to step; by default ``loss.actor_network``.
-    """
-
-    target_kl: float
-    damping: float
-    cg_iterations: int
-    backtrack_coeff: float
-    max_backtracks: int
-    fisher_subsample: NotRequired[float]
-    actor_network: NotRequired[ProbabilisticTensorDictSequential | None]
+__all__ = ["Proposal", "TRPOStep", "total_loss"]
 
 
 class Proposal(NamedTuple):
@@ -96,7 +75,13 @@ class TRPOStep(PolicyUpdate):
 
     Args:
         loss: the loss; a `TRPOLoss`, a `TRPOLagrangianLoss` or your own.
-        target_kl: this and all others: see `TrustRegion`.
+        target_kl: Radius δ of the trust region, mean KL divergence over the states of the batch.
+        damping: Multiple of the identity added to the Fisher matrix.
+        cg_iterations: Iterations of the conjugate gradient method, for every system solved.
+        backtrack_coeff: Factor from one try of the line search to the next.
+        max_backtracks: Tries of the line search.
+        fisher_subsample: Share of the batch that the Fisher matrix is averaged over.
+        actor_network: Policy to step; by default ``loss.actor_network``.
 
     Examples:
         >>> from tensordict import TensorDict
@@ -122,12 +107,12 @@ class TRPOStep(PolicyUpdate):
         self,
         loss: Callable[[TensorDictBase], TensorDictBase],
         *,
-        target_kl: float,
-        damping: float,
-        cg_iterations: int,
-        backtrack_coeff: float,
-        max_backtracks: int,
-        fisher_subsample: float = 1.0,
+        target_kl: Positive,
+        damping: NotNegative,
+        cg_iterations: Annotated[int, Range(1, 10_000)],
+        backtrack_coeff: Annotated[float, Range(0, 1, above=True, below=True)],
+        max_backtracks: Annotated[int, Range(1, 10_000)],
+        fisher_subsample: Fraction = 1.0,
         actor_network: ProbabilisticTensorDictSequential | None = None,
     ) -> None:
         self.loss = loss

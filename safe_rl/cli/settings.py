@@ -4,19 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
 from itertools import chain
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypedDict
 
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from safe_rl.cli.keys import KEYS
-from safe_rl.cli.part_keys import EXTRAS, FLAGS, PARTS
 from safe_rl.cli.robots import robot_of
 from safe_rl.envs import complete_env
 from safe_rl.evaluation.settings import check_device
-from safe_rl.extras import require_extra
+from safe_rl.extras import check_extra
 from safe_rl.naming import did_you_mean
 from safe_rl.parameters import Parameter, SettingError, parameters_of
+from safe_rl.ranges import Text
 from safe_rl.runs.folder import RunFolder
 from safe_rl.targets import accepted_names, constructors, locate, takes_any
 
@@ -27,6 +27,21 @@ _SECTIONS = (
     *("algo", "certificate", "checkpoint", "collector", "critics", "dataset", "evaluation"),
     *("exploration", "logger", "model"),
 )
+
+
+class _Node(TypedDict, total=False):
+    """Keys of any part that are Hydra's.
+
+    Attributes:
+        _target_: What is built.
+        _partial_: Whether it is called later with more arguments.
+    """
+
+    _target_: Text | None
+    _partial_: bool
+
+
+_OF_HYDRA = parameters_of(_Node)
 
 
 class _Entry(NamedTuple):
@@ -46,10 +61,10 @@ class _Part(NamedTuple):
 
 
 def check_settings(config: DictConfig, folder: RunFolder | None = None) -> None:
-    """Check every key of a configuration by the tables `KEYS` and `PARTS`.
+    """Check every key of a configuration: the run's by `KEYS`, those of parts by their signatures.
 
-    Parts of one's own are checked by what they inherit from the package's, and for names that they
-    do not take. Whole numbers that are written as 3e5 become integers.
+    Parts of one's own are checked like the package's. Whole numbers that are written as 3e5 become
+    integers.
 
     Args:
         config: Configuration as composed from ``conf/``.
@@ -66,7 +81,10 @@ def check_settings(config: DictConfig, folder: RunFolder | None = None) -> None:
         if entry.row.values.whole:
             OmegaConf.update(config, entry.path, _whole(entry.value), merge=False)
     for part in _parts(values):
-        _check_extra(part)
+        try:
+            check_extra(part.found)
+        except ModuleNotFoundError as error:
+            raise SettingError(f"{part.path}: {error}") from None
     for path, known in _unread_keys(values):
         raise SettingError(f"{path}: nothing reads this key.{did_you_mean(path, known)}")
     try:
@@ -151,7 +169,7 @@ def _at(values: Mapping[str, Any], path: str) -> Any:
 
 def _entries_of_parts(values: Mapping[str, Any]) -> Iterator[_Entry]:
     for path, node, found in _parts(values):
-        rows = {**FLAGS, **_rows(found)}
+        rows = {**_OF_HYDRA, **_rows(found)}
         for name in node:
             if name in rows:
                 yield _Entry(f"{path}.{name}", rows[name], node[name])
@@ -164,21 +182,13 @@ def _parts(values: Mapping[str, Any], prefix: str = "") -> Iterator[_Part]:
             path = f"{prefix}{name}"
             target = node.get("_target_")
             if target is not None:
-                FLAGS["_target_"].check(f"{path}._target_", target)
+                _OF_HYDRA["_target_"].check(f"{path}._target_", target)
                 yield _Part(path, node, locate(target, f"{path}._target_"))
             yield from _parts(node, f"{path}.")
 
 
 def _rows(found: Callable[..., Any]) -> Mapping[str, Parameter]:
-    """What a part's signature says of its arguments, and tables of the package's part."""
-    if found.__module__.startswith("torch.optim"):
-        return PARTS["torch.optim"]
-    bases = getattr(found, "__mro__", (found,))
-    names = [base.__name__ for base in bases if base.__module__.startswith("safe_rl.")]
-    return {**_read(found), **next((PARTS[name] for name in names if name in PARTS), {})}
-
-
-def _read(found: Callable[..., Any]) -> Mapping[str, Parameter]:
+    """What the signature of a part says of its arguments; nothing if it has none to read."""
     try:
         return parameters_of(found)
     except (AttributeError, TypeError, ValueError):
@@ -210,12 +220,3 @@ def _check_collector(node: Mapping[str, Any]) -> None:
             f"collector.num_collectors={number}: collector=local is one process; for more use "
             "collector=process or collector=ray."
         )
-
-
-def _check_extra(part: _Part) -> None:
-    extra = EXTRAS.get(part.found.__name__)
-    if extra is not None and part.found.__module__.startswith("safe_rl."):
-        try:
-            require_extra(*extra)
-        except ModuleNotFoundError as error:
-            raise SettingError(f"{part.path}: {error}") from None

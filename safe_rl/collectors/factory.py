@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable
-from typing import Any
+from typing import Annotated, Any
 
 import torch
 from tensordict import TensorDictBase
@@ -15,7 +15,9 @@ from torchrl.envs import EnvBase
 
 from safe_rl.collectors.worker_rows import MakeEnv, check_rows, split_rows
 from safe_rl.collectors.workers import Known, WorkerCollector
+from safe_rl.extras import needs_extra
 from safe_rl.processes import starting_processes
+from safe_rl.ranges import Options, Range
 
 __all__ = ["make_collector", "make_process_collector", "make_ray_collector"]
 
@@ -90,7 +92,7 @@ def make_process_collector(
     policy: TensorDictModuleBase,
     *,
     frames_per_batch: int,
-    num_collectors: int,
+    num_collectors: Annotated[int, Range(1, 1024)],
     device: torch.device | str,
 ) -> WorkerCollector:
     """Collect in processes of this machine.
@@ -100,7 +102,7 @@ def make_process_collector(
         make_env: Makes an environment like it with fewer rows, in the worker.
         policy: Policy, whose weights are sent to the workers.
         frames_per_batch: Steps of all rows together in one batch, N·T.
-        num_collectors: Number of processes, W, that divides N.
+        num_collectors: Number of processes W, which divides N.
         device: Device of policy and batches.
 
     Raises:
@@ -128,16 +130,17 @@ def make_process_collector(
     return WorkerCollector(start, env.batch_size.numel(), torch.device(device))
 
 
+@needs_extra("ray", "ray")
 def make_ray_collector(
     env: EnvBase,
     make_env: MakeEnv,
     policy: TensorDictModuleBase,
     *,
     frames_per_batch: int,
-    num_collectors: int,
+    num_collectors: Annotated[int, Range(1, 1024)],
     device: torch.device | str,
-    ray_init: dict[str, Any],
-    resources: dict[str, Any],
+    ray_init: Options,
+    resources: Options,
 ) -> WorkerCollector:
     """Collect in actors of a Ray cluster.
 
@@ -146,10 +149,10 @@ def make_ray_collector(
         make_env: Makes an environment like it with fewer rows, in the worker.
         policy: Policy, whose weights are sent to the workers.
         frames_per_batch: Steps of all rows together in one batch, N·T.
-        num_collectors: Number of actors, W, that divides N.
+        num_collectors: Number of actors W, which divides N.
         device: Device of policy and batches.
         ray_init: Arguments of ``ray.init``, such as ``address``.
-        resources: Of every actor: ``num_cpus``, ``num_gpus``, ``memory``.
+        resources: Resources of every actor: ``num_cpus``, ``num_gpus``, ``memory``.
 
     Raises:
         ValueError: If N is not a multiple of W, or ``frames_per_batch`` of N.

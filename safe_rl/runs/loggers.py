@@ -14,7 +14,8 @@ from torchrl.record.loggers.mlflow import MLFlowLogger
 from torchrl.record.loggers.tensorboard import TensorboardLogger as TorchRLTensorboardLogger
 from torchrl.record.loggers.wandb import WandbLogger as TorchRLWandbLogger
 
-from safe_rl.extras import import_extra
+from safe_rl.extras import import_extra, needs_extra
+from safe_rl.ranges import Text
 from safe_rl.runs.files import replace_text
 from safe_rl.runs.folder import RunFolder
 
@@ -36,6 +37,9 @@ class TensorboardLogger(TorchRLTensorboardLogger):
         >>> logger.close()
     """
 
+    def __init__(self, exp_name: Text, log_dir: str) -> None:
+        super().__init__(exp_name, log_dir)
+
     def continue_from(self, step: int) -> None:
         """Let TensorBoard forget what was logged after a step."""
         writer = self.experiment._get_file_writer()
@@ -47,6 +51,7 @@ class TensorboardLogger(TorchRLTensorboardLogger):
         self.experiment.close()
 
 
+@needs_extra("mlflow", "mlflow")
 class MLflowLogger(MLFlowLogger):
     """A run of an MLflow experiment; a run that is continued goes on in the same one.
 
@@ -61,7 +66,7 @@ class MLflowLogger(MLFlowLogger):
         ModuleNotFoundError: If MLflow is not installed.
     """
 
-    def __init__(self, exp_name: str, tracking_uri: str, log_dir: str) -> None:
+    def __init__(self, exp_name: Text, tracking_uri: Text, log_dir: str) -> None:
         self._mlflow = import_extra("mlflow", extra="mlflow")
         self._directory = Path(log_dir)
         super().__init__(exp_name=exp_name, tracking_uri=tracking_uri)
@@ -82,23 +87,31 @@ class MLflowLogger(MLFlowLogger):
         self._mlflow.end_run()
 
 
+@needs_extra("wandb", "wandb")
 class WandbLogger(TorchRLWandbLogger):
     """A run of Weights & Biases; a run that is continued goes on in the same one.
 
     Args:
+        exp_name: Name of the run.
+        project: Name of the project.
+        offline: Whether to keep everything in the folder of the run.
         log_dir: Folder of the run, where the id of the run is kept.
-        kwargs: Arguments of TorchRL's logger and of ``wandb.init``.
+        kwargs: Other arguments of TorchRL's logger and of ``wandb.init``.
 
     Raises:
         ModuleNotFoundError: If wandb is not installed.
     """
 
-    def __init__(self, log_dir: str, **kwargs: Any) -> None:
+    def __init__(
+        self, exp_name: Text, project: Text, offline: bool, log_dir: str, **kwargs: Any
+    ) -> None:
         wandb = import_extra("wandb", extra="wandb")
         path = RunFolder(Path(log_dir)).logger_id("wandb")
         run_id = path.read_text() if path.exists() else wandb.util.generate_id()
         replace_text(path, run_id)
-        super().__init__(log_dir=log_dir, id=run_id, **kwargs)
+        super().__init__(
+            exp_name, offline=offline, project=project, log_dir=log_dir, id=run_id, **kwargs
+        )
 
     def close(self) -> None:
         """End the run, so that another one can begin in this process."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Annotated
 
 import torch
 from tensordict import TensorDictBase
@@ -10,6 +11,7 @@ from torch import Tensor
 from torchrl.data import Bounded, OneHot, TensorSpec
 
 from safe_rl.envs.transforms.base import ConstraintTransform, reward_like
+from safe_rl.ranges import PART, Range, Text
 
 
 class ActionFilter(ConstraintTransform):
@@ -23,9 +25,10 @@ class ActionFilter(ConstraintTransform):
     too.
 
     Args:
-        filter: gets a TensorDict [N] with `observation` and `action` [N, A], returns the actions to
-            take [N, A]. Where it returns what it got, it did not intervene.
-        cost_key: name of the cost.
+        filter: Function that replaces actions: gets a TensorDict [N] with `observation` and
+            `action` [N, A], returns the actions to take [N, A]. Where it returns what it got, it
+            did not intervene.
+        cost_key: Name of the cost of interventions.
 
     Raises:
         ValueError: at a step, if the function returns something else.
@@ -45,9 +48,9 @@ class ActionFilter(ConstraintTransform):
 
     def __init__(
         self,
-        filter: Callable[[TensorDictBase], Tensor],
+        filter: Annotated[Callable[[TensorDictBase], Tensor], PART],
         *,
-        cost_key: str = "cost_interventions",
+        cost_key: Text = "cost_interventions",
     ) -> None:
         super().__init__()
         self._filter = filter
@@ -86,7 +89,7 @@ class ActionDelay(ConstraintTransform):
     too.
 
     Args:
-        steps: from an action to its effect.
+        steps: Steps from an action to its effect.
 
     Raises:
         ValueError: for fewer than one.
@@ -101,7 +104,7 @@ class ActionDelay(ConstraintTransform):
         [False, False, True, True]
     """
 
-    def __init__(self, steps: int) -> None:
+    def __init__(self, steps: Annotated[int, Range(1, 1000)]) -> None:
         super().__init__()
         if steps < 1:
             raise ValueError(f"steps={steps} must be at least 1.")

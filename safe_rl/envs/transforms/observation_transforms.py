@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from typing import Annotated
 
 import torch
 from tensordict import TensorDictBase
@@ -13,6 +14,7 @@ from torchrl.data import Binary, Composite, TensorSpec, Unbounded
 from safe_rl.envs import rng
 from safe_rl.envs.transforms.base import ConstraintTransform
 from safe_rl.naming import did_you_mean
+from safe_rl.ranges import NotNegative, Range, Text
 
 
 class SensorNoise(ConstraintTransform):
@@ -23,8 +25,8 @@ class SensorNoise(ConstraintTransform):
     Pictures of integers stay as they are.
 
     Args:
-        std: standard deviation, in the units of what is observed.
-        components: names of those that are noisy, as in `observation_layout`; None: all.
+        std: Standard deviation of the noise, in the units of what is observed.
+        components: Names of those that are noisy, as in `observation_layout`; None: all.
 
     Raises:
         ValueError: for a deviation below 0, or a component that there is not.
@@ -41,7 +43,7 @@ class SensorNoise(ConstraintTransform):
         (slice(22, 38, None), [22, 37])
     """
 
-    def __init__(self, std: float, components: Sequence[str] | None = None) -> None:
+    def __init__(self, std: NotNegative, components: Sequence[Text] | None = None) -> None:
         super().__init__()
         if not (math.isfinite(std) and std >= 0):
             raise ValueError(f"std={std:g} must be a number of at least 0.")
@@ -147,7 +149,7 @@ class PolicyMemory(ConstraintTransform):
     the worlds go on. A policy that leaves nothing remembers what it did before.
 
     Args:
-        size: numbers that are remembered.
+        size: Numbers that are remembered.
 
     Examples:
         >>> from torchrl.envs import TransformedEnv
@@ -158,7 +160,7 @@ class PolicyMemory(ConstraintTransform):
         (torch.Size([2, 4]), True)
     """
 
-    def __init__(self, size: int) -> None:
+    def __init__(self, size: Annotated[int, Range(1, 16_384)]) -> None:
         super().__init__()
         self._size = size
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Collection, Mapping
+from typing import Any
 
 import torch
 from tensordict import TensorDictBase
@@ -19,6 +20,7 @@ from safe_rl.envs.transforms.base import (
     keep_reward,
     kept_reward_spec,
 )
+from safe_rl.ranges import Count, Fraction, NotNegative, Number, Positive
 
 
 class RewardScale(ConstraintTransform):
@@ -30,7 +32,7 @@ class RewardScale(ConstraintTransform):
     own reward, which is kept in `task_reward`; in evaluation `reward` stays as it is.
 
     Args:
-        factor: what rewards are multiplied by.
+        factor: What rewards are multiplied by.
 
     Raises:
         ValueError: for a factor that is not positive.
@@ -45,7 +47,7 @@ class RewardScale(ConstraintTransform):
 
     return_key = OWN_REWARD
 
-    def __init__(self, factor: float) -> None:
+    def __init__(self, factor: Positive) -> None:
         super().__init__()
         if not (math.isfinite(factor) and factor > 0):
             raise ValueError(f"factor={factor:g} must be a number above 0.")
@@ -73,9 +75,9 @@ class EarlyTermination(ConstraintTransform):
     surely costs no more than the budget and the last step.
 
     Args:
-        budgets: cost key -> undiscounted cost per episode; an episode that costs exactly this much
+        budgets: Cost key -> undiscounted cost per episode; an episode that costs exactly this much
             goes on.
-        in_evaluation: whether episodes of an evaluation end in the same way.
+        in_evaluation: Whether episodes of an evaluation end in the same way.
 
     Raises:
         ValueError: for a budget below 0.
@@ -88,7 +90,7 @@ class EarlyTermination(ConstraintTransform):
         torch.Size([2, 3])
     """
 
-    def __init__(self, budgets: Mapping[str, float], in_evaluation: bool = False) -> None:
+    def __init__(self, budgets: Mapping[str, NotNegative], in_evaluation: bool = False) -> None:
         super().__init__()
         self.in_evaluation = in_evaluation
         self._budgets = check_budgets(budgets, above_zero=False)
@@ -134,10 +136,10 @@ class Saute(ConstraintTransform):
     is.
 
     Args:
-        budgets: cost key -> undiscounted cost per episode, d.
-        discount: γ_s, in (0, 1].
-        unsafe_reward: reward of every step when a budget is spent.
-        rescale_budgets: whether d, which is undiscounted, becomes d (1 - γ_s^T) / ((1 - γ_s) T), to
+        budgets: Cost key -> undiscounted cost per episode, d.
+        discount: Discount γ_s of the costs that a budget is for.
+        unsafe_reward: Reward of every step when a budget is spent.
+        rescale_budgets: Whether d, which is undiscounted, becomes d (1 - γ_s^T) / ((1 - γ_s) T), to
             which a cost that is spread evenly over T = `max_episode_steps` steps sums with the
             discount, as in the published code.
 
@@ -157,10 +159,10 @@ class Saute(ConstraintTransform):
 
     def __init__(
         self,
-        budgets: Mapping[str, float],
+        budgets: Mapping[str, Positive],
         *,
-        discount: float,
-        unsafe_reward: float,
+        discount: Fraction,
+        unsafe_reward: Number,
         rescale_budgets: bool,
     ) -> None:
         super().__init__()
@@ -262,12 +264,10 @@ class Simmer(Saute):
     Episodes of an evaluation begin with the whole budget.
 
     Args:
-        budgets: as `Saute` takes them: d.
-        first: share of d with which training begins, in (0, 1].
-        steps: steps of each environment after which the budget is the whole d.
-        discount: as `Saute` takes it.
-        unsafe_reward: as `Saute` takes it.
-        rescale_budgets: as `Saute` takes it.
+        budgets: Cost key -> undiscounted cost per episode, d.
+        first: Share of d with which training begins.
+        steps: Steps of each environment after which the budget is the whole d.
+        settings: Those of `Saute`.
 
     Raises:
         ValueError: for a value out of range.
@@ -284,17 +284,13 @@ class Simmer(Saute):
 
     def __init__(
         self,
-        budgets: Mapping[str, float],
+        budgets: Mapping[str, Positive],
         *,
-        first: float,
-        steps: int,
-        discount: float,
-        unsafe_reward: float,
-        rescale_budgets: bool,
+        first: Fraction,
+        steps: Count,
+        **settings: Any,
     ) -> None:
-        super().__init__(
-            budgets, discount=discount, unsafe_reward=unsafe_reward, rescale_budgets=rescale_budgets
-        )
+        super().__init__(budgets, **settings)
         if not 0 < first <= 1:
             raise ValueError(f"first={first:g} must be above 0 and at most 1.")
         if steps < 1:
