@@ -1,8 +1,5 @@
 """What holds for every test."""
 
-import sys
-from importlib.util import find_spec
-
 import pytest
 
 import safe_rl  # noqa: F401, has to come before torch
@@ -12,10 +9,6 @@ import torch
 
 # as many processes as cores run tests: a second thread in each would only be in the way
 torch.set_num_threads(1)
-# TensorDict looks for pandas at every value that a module writes: where there is none, Python would
-# search all of its path each time, a fifth of the seconds of small updates
-if find_spec("pandas") is None:
-    sys.modules["pandas"] = None  # type: ignore[assignment]
 
 
 @pytest.fixture(autouse=True)

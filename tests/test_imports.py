@@ -147,7 +147,7 @@ FLOORS = {
     ),
     "runs": (
         ("archive", "files", "folder", "outcome"),
-        ("checkpoints", "code", "curves", "identity", "keeping", "lock", "loggers", "table"),
+        ("checkpoints", "code", "curves", "identity", "lock", "loggers", "table"),
         ("record", "resuming"),
         ("",),
     ),
@@ -185,8 +185,8 @@ FLOORS = {
         ("",),
     ),
     "reporting": (
-        ("cleaning",),
-        ("columns", "measured"),
+        ("archive", "cleaning"),
+        ("columns",),
         ("recorded",),
         ("averages", "origins"),
         ("naming",),

@@ -81,7 +81,7 @@ class Run:
 
         Costs of an epoch in which no episode ended are NaN.
         """
-        return read_table(RunFolder(self.directory).recorded_table)
+        return read_table(RunFolder(self.directory).table)
 
     @property
     def final(self) -> dict[str, float]:

@@ -14,8 +14,8 @@ from safe_rl.cli.user_code import import_modules, split_imports
 from safe_rl.evaluation.settings import option
 from safe_rl.reporting import Report, build_report, write_report
 from safe_rl.reporting.cleaning import clean
+from safe_rl.reporting.recorded import archive_runs
 from safe_rl.runs.files import check_place
-from safe_rl.runs.keeping import keep_runs
 from safe_rl.scores.published import SEEDS
 
 __all__ = ["ReportOptions", "main", "report"]
@@ -36,7 +36,7 @@ class ReportOptions:
     seeds: int = option(len(SEEDS), "finished runs per environment that a slate needs")
     unfinished: bool = option(False, "include unfinished runs in scores")
     archive: str | None = option(
-        None, "folder to copy the runs to, for others, tables compressed; null: none"
+        None, "campaign archive to add the runs to, for others; null: none"
     )
     good: float = option(
         0.5,
@@ -96,7 +96,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         root = Path(arguments[0])
         result, page = report(root, options)
         if options.archive is not None:
-            keep_runs((run.directory for run in result.runs), root, Path(options.archive))
+            archive_runs(result.runs, root, Path(options.archive))
             print(f"kept {len(result.runs)} runs in {options.archive}")
     except (OSError, ModuleNotFoundError, ValueError) as error:
         print(f"error: {error}", file=sys.stderr)

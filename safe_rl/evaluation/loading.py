@@ -132,8 +132,6 @@ def find_checkpoint(directory: Path, which: str) -> Path:
             "best": "no epoch kept every cost limit",
             "certified": "none of its policies has been certified",
         }
-        if folder.recorded_table == folder.packed_table:
-            reason[which] = "it is of an archive, which keeps none"
         others = [f"checkpoint={kind}" for kind, other in found.items() if other is not None]
         hint = f" Use {others[0]}." if others else ""
         raise FileNotFoundError(f"{directory} has no {which} checkpoint: {reason[which]}.{hint}")

@@ -1,6 +1,6 @@
-"""Runs as their folders record them, whoever wrote these: configuration, table, command, films.
+"""Runs as their folders and archives record them: configuration, table, command, films.
 
-Whatever is odd in a folder becomes a sentence on why it, or a file of it, is left out. Nothing is
+Whatever is wrong with a run becomes a sentence on why it, or a file of it, is left out. Nothing is
 read that a link in the folder names outside of it, and nothing that a file says is followed.
 """
 
@@ -9,24 +9,26 @@ from __future__ import annotations
 import math
 import os
 import shlex
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from safe_rl.reporting.archive import ROWS, RUNS, Recorded, read_archive, write_archive
 from safe_rl.reporting.cleaning import clean
-from safe_rl.reporting.measured import read_certificate, read_code, read_evaluation
-from safe_rl.runs.files import read_config, read_yaml
-from safe_rl.runs.folder import RunFolder, paths_below, runs_below
+from safe_rl.runs.files import read_config, read_json, read_yaml
+from safe_rl.runs.folder import RunFolder, checkpoint_steps, paths_below, runs_below
 from safe_rl.runs.outcome import final_figures, judges_another_measure, violation
 from safe_rl.runs.table import read_table
 
-__all__ = ["Run", "find_runs"]
+__all__ = ["Run", "archive_runs", "find_runs"]
 
-# a number that has left all bounds says as little as NaN, and fits no picture
+# A number that has left all bounds says as little as NaN, and fits no picture.
 _EXPLODED = 1e30
+_COMMIT_LETTERS = 10
 
 
 @dataclass(frozen=True)
@@ -34,7 +36,7 @@ class Run:
     """One training run.
 
     Attributes:
-        directory: Its folder.
+        directory: Its folder; of an archived run the folder that it would have in the archive.
         config: Its configuration.
         table: Columns of its table; a row per epoch, NaN where there is no number.
         frames: Environment steps after which it counts as finished.
@@ -45,6 +47,7 @@ class Run:
         certificate: Which of its checkpoints is certified, or by how much none is.
         code: By which version and commit it was carried out, in words, if that is recorded.
         videos: Videos in its folder.
+        recorded: What all of this was made of.
     """
 
     directory: Path
@@ -58,6 +61,7 @@ class Run:
     certificate: Mapping[str, Any] | None = None
     code: str | None = None
     videos: tuple[Path, ...] = ()
+    recorded: Recorded | None = None
 
     @property
     def seed(self) -> int:
@@ -131,7 +135,7 @@ class Run:
 
 
 def find_runs(root: Path, *, unfinished: bool = False) -> tuple[list[Run], dict[Path, str]]:
-    """Find every run below a folder.
+    """Find every run below a folder, in folders of their own and in archives.
 
     Args:
         root: The folder.
@@ -149,60 +153,219 @@ def find_runs(root: Path, *, unfinished: bool = False) -> tuple[list[Run], dict[
         )
     runs: list[Run] = []
     skipped: dict[Path, str] = {}
+    resolved = root.resolve()
+    for archive in paths_below(root, RUNS):
+        with _noted(archive, skipped):
+            for path in (archive, archive.with_name(ROWS)):
+                _own(path, resolved)
+            for name, recorded in read_archive(archive.parent).items():
+                directory = archive.parent / name
+                with _noted(directory, skipped):
+                    runs.append(_run(directory, recorded, unfinished))
     for folder in runs_below(root):
-        try:
-            runs.append(_read_run(folder, root.resolve(), unfinished, skipped))
-        except Exception as error:  # whatever is wrong with it, the others are reported
-            skipped[folder.directory] = clean(error) or type(error).__name__
+        with _noted(folder.directory, skipped):
+            recorded, films = _recorded(folder, resolved, skipped), []
+            for path in _films(folder):
+                with _noted(path, skipped):
+                    films.append(_own(path, resolved))
+            run = _run(folder.directory, recorded, unfinished)
+            runs.append(replace(run, videos=tuple(films)))
     if not runs:
         reasons = "".join(f"\n  {clean(path)}: {reason}" for path, reason in skipped.items())
         raise FileNotFoundError(
             f"There is no run to report below '{root}': a run is a folder with config.yaml and "
             f"progress.csv, as train.py writes it.{reasons}"
         )
-    return runs, skipped
+    return sorted(runs, key=lambda run: run.directory), skipped
 
 
-def _read_run(folder: RunFolder, root: Path, unfinished: bool, skipped: dict[Path, str]) -> Run:
+def archive_runs(runs: Iterable[Run], root: Path, archive: Path) -> None:
+    """Add runs to an archive, or bring them up to date in it, each by its path below a folder.
+
+    Args:
+        runs: Runs of :func:`find_runs`.
+        root: Folder above all of them.
+        archive: Folder of the archive, made if need be.
+
+    Raises:
+        ValueError: If the archive is among the runs or they in it, or is no archive.
+        OSError: If it cannot be read or written.
+    """
+    here, there = root.resolve(), archive.resolve()
+    if here.is_relative_to(there) or there.is_relative_to(here):
+        raise ValueError(f"archive={archive}: it takes a folder beside {root}, not one within.")
+    kept = read_archive(archive) if (archive / RUNS).exists() else {}
+    for run in runs:
+        if run.recorded is not None:
+            name = run.directory.resolve().relative_to(here).as_posix()
+            kept[name] = run.recorded._replace(notes=_without_places(run.recorded.notes))
+    write_archive(kept, archive)
+
+
+def _without_places(notes: Mapping[str, Any]) -> dict[str, Any]:
+    """Notes without the folders of this machine, but for what command lines said."""
+    kept = dict(notes)
+    start = kept.pop("cwd", None)
+    if start and "config_dirs" in kept:
+        # as a person would type them where the run was started
+        kept["config_dirs"] = [os.path.relpath(path, start) for path in kept["config_dirs"]]
+    if "evaluations" in kept:
+        kept["evaluations"] = [
+            {k: Path(v).name if k == "checkpoint_file" else v for k, v in e.items() if k != "run"}
+            for e in kept["evaluations"]
+        ]
+    return kept
+
+
+@contextmanager
+def _noted(path: Path, skipped: dict[Path, str]) -> Iterator[None]:
+    """Note why something is left out, and go on: all else is reported."""
+    try:
+        yield
+    except Exception as error:
+        skipped[path] = clean(error) or type(error).__name__
+
+
+def _recorded(folder: RunFolder, root: Path, skipped: dict[Path, str]) -> Recorded:
+    """What a run's folder holds; notes that cannot be read are left out."""
     config = read_config(_own(folder.config, root))
+    if not folder.table.exists():
+        raise ValueError("it has not begun: no progress.csv")
+    try:
+        table = read_table(_own(folder.table, root))
+    except ValueError as error:
+        raise ValueError(f"progress.csv cannot be read ({error})") from error
+    found: dict[Path, Any] = {}
+    for path in (folder.surroundings, folder.overrides, folder.composed):
+        if os.path.lexists(path):
+            with _noted(path, skipped):
+                found[path] = read_yaml(_own(path, root))
+    for path in (folder.certificate, folder.code, *folder.evaluations()):
+        if os.path.lexists(path):
+            with _noted(path, skipped):
+                content = read_json(_own(path, root))
+                if path == folder.certificate:
+                    read_certificate(content)
+                elif path == folder.code:
+                    read_code(content)
+                elif not isinstance(content, dict) or "estimates" in content:
+                    read_evaluation(content)
+                found[path] = content
+    runtime = _select(found.get(folder.surroundings), "hydra", "runtime")
+    before = _select(found.get(folder.composed), "frames")
+    notes = {
+        "overrides": found.get(folder.overrides),
+        "cwd": _select(runtime, "cwd"),
+        # of --config-dir, and of Python's config_dir
+        "config_dirs": [
+            str(_select(source, "path"))
+            for source in _select(runtime, "config_sources") or ()
+            if str(_select(source, "provider")).endswith("command-line")
+        ],
+        "frames_before": before if before != config.get("frames") else None,
+        "certificate": found.get(folder.certificate),
+        "code": found.get(folder.code),
+        "evaluations": [
+            found[path]
+            for path in folder.evaluations()
+            if isinstance(found.get(path), dict) and "estimates" in found[path]
+        ],
+    }
+    return Recorded(config, table, {name: value for name, value in notes.items() if value})
+
+
+def _run(directory: Path, recorded: Recorded, unfinished: bool) -> Run:
+    config, notes = recorded.config, recorded.notes
     for key, is_right, wanted in _NEEDED:
         if not is_right(config.get(key)):
             raise ValueError(f"config.yaml is not that of a run: its '{key}' is not {wanted}")
-    recorded = folder.recorded_table
-    if not recorded.is_file():
-        raise ValueError("it has not begun: no progress.csv")
-    table = _read_numbers(_own(recorded, root), config["cost_limits"] or {})
-
-    def read(paths: Iterable[Path], reader: Callable[[Path], Any]) -> list[Any]:
-        """What files of the run hold; those that cannot be read are noted."""
-        contents = []
-        for path in paths:
-            try:
-                contents.append(reader(_own(path, root)))
-            except Exception as error:
-                skipped[path] = clean(error) or type(error).__name__
-        return contents
-
-    def there(path: Path) -> list[Path]:
-        return [path] if os.path.lexists(path) else []
-
-    notes = (folder.surroundings, folder.overrides, folder.composed)
-    hydra, said, begun_with = (next(iter(read(there(n), read_yaml)), None) for n in notes)
-    overrides = tuple(map(clean, said)) if isinstance(said, list) else None
-    cwd = _select(hydra, "hydra", "runtime", "cwd")
+    overrides, cwd = notes.get("overrides"), notes.get("cwd")
+    overrides = tuple(map(clean, overrides)) if isinstance(overrides, list) else None
     return Run(
-        folder.directory,
+        directory,
         config,
-        table,
+        _checked(recorded.table, config.get("cost_limits") or {}),
         frames=0 if unfinished else config["frames"],
         overrides=overrides,
-        command=None if overrides is None else _command(overrides, hydra, begun_with, config),
+        command=None if overrides is None else _command(overrides, notes, config),
         cwd=Path(cwd) if isinstance(cwd, str) else None,
-        evaluations=tuple(filter(None, read(folder.evaluations(), read_evaluation))),
-        certificate=next(iter(read(there(folder.certificate), read_certificate)), None),
-        code=next(iter(read(there(folder.code), read_code)), None),
-        videos=tuple(read(_films(folder), lambda path: path)),
+        evaluations=tuple(map(read_evaluation, notes.get("evaluations", ()))),
+        certificate=read_certificate(notes["certificate"]) if "certificate" in notes else None,
+        code=read_code(notes["code"]) if "code" in notes else None,
+        recorded=recorded,
     )
+
+
+def read_evaluation(content: Any) -> dict[str, Any]:
+    """An evaluation with the types that tables need.
+
+    Raises:
+        ValueError: If it is none.
+    """
+    with _in_words("it is no evaluation"):
+        return {
+            "name": clean(content.get("name") or "", 60),
+            "checkpoint": clean(content["checkpoint"]),
+            "steps": content["steps"],
+            "episodes": int(content["episodes"]),
+            "deterministic": bool(content["deterministic"]),
+            "env": {clean(key): clean(value) for key, value in content["env"].items()},
+            "layouts_trained_on": float(content["layouts_trained_on"]),
+            "cvar_alpha": float(content["cvar_alpha"]),
+            "cost_limits": {str(k): float(d) for k, d in content["cost_limits"].items()},
+            "estimates": {
+                name: {part: _number(estimate[part]) for part in ("value", "low", "high")}
+                for name, estimate in content["estimates"].items()
+            },
+        }
+
+
+def read_certificate(content: Any) -> dict[str, Any]:
+    """A certificate with the types that tables need; its ``checkpoint`` is None if it has none.
+
+    Raises:
+        ValueError: If it is none.
+    """
+    with _in_words("it is no certificate"):
+        checkpoint = content["checkpoint"]
+        return {
+            "checkpoint": None if checkpoint is None else checkpoint_steps(Path(str(checkpoint))),
+            "certified_return": _number(content["episode_return"]),
+            "bounds": {
+                clean(name): (_number(bound["bound"]), _number(bound["most"]))
+                for name, bound in content["bounds"].items()
+            },
+            "episodes": int(content["episodes"]),
+            "level": float(content["level"]),
+        }
+
+
+def read_code(content: Any) -> str:
+    """By which code a run was carried out, and from which step on by which other one.
+
+    Raises:
+        ValueError: If it does not say so.
+    """
+    parts = []
+    with _in_words("it says nothing of the code"):
+        for entry in content[:9]:
+            words = [clean(entry["version"], 20), clean(entry["commit"] or "")[:_COMMIT_LETTERS]]
+            words += ["with changes"] if entry["changed"] else []
+            words += [f"from {int(entry['steps']):,} steps on"] if entry["steps"] else []
+            parts.append(" ".join(filter(None, words)))
+    return "; ".join(parts)
+
+
+@contextmanager
+def _in_words(otherwise: str) -> Iterator[None]:
+    try:
+        yield
+    except (ValueError, KeyError, TypeError, AttributeError) as error:
+        raise ValueError(f"{otherwise} ({type(error).__name__}: {error})") from error
+
+
+def _number(value: float | None) -> float:
+    return math.nan if value is None else float(value)
 
 
 def _films(run: RunFolder) -> list[Path]:
@@ -245,11 +408,8 @@ _NEEDED: tuple[tuple[str, Callable[[Any], bool], str], ...] = (
 )
 
 
-def _read_numbers(path: Path, limits: Mapping[str, Any]) -> dict[str, list[float]]:
-    try:
-        table = read_table(path)
-    except ValueError as error:
-        raise ValueError(f"progress.csv cannot be read ({error})") from error
+def _checked(table: Mapping[str, list[float]], limits: Mapping[str, Any]) -> dict[str, list[float]]:
+    """A table with the columns and the growing steps that a report needs."""
     if not table.get("steps"):
         raise ValueError("it has not finished an epoch")
     needed = ["episode_return", "time_total"]
@@ -267,19 +427,14 @@ def _read_numbers(path: Path, limits: Mapping[str, Any]) -> dict[str, list[float
     return bounded
 
 
-def _command(
-    overrides: Sequence[str], hydra: Any, begun_with: Any, config: Mapping[str, Any]
-) -> str:
+def _command(overrides: Sequence[str], notes: Mapping[str, Any], config: Mapping[str, Any]) -> str:
     """The command line, with what it did not say in its overrides."""
     words = ["python", "train.py"]
-    for source in _select(hydra, "hydra", "runtime", "config_sources") or ():
-        # of --config-dir, and of Python's config_dir
-        if str(_select(source, "provider")).endswith("command-line"):
-            words.append(f"--config-dir={clean(_select(source, 'path'))}")
-    frames = config["frames"]
+    words += [f"--config-dir={clean(path)}" for path in notes.get("config_dirs", ())]
     # a run that was continued for longer
-    if isinstance(before := _select(begun_with, "frames"), int) and before != frames:
-        overrides = [o for o in overrides if not o.startswith("frames=")] + [f"frames={frames}"]
+    if isinstance(notes.get("frames_before"), int):
+        frames = f"frames={config['frames']}"
+        overrides = [o for o in overrides if not o.startswith("frames=")] + [frames]
     return shlex.join([*words, *overrides])
 
 

@@ -55,7 +55,6 @@ class RunFolder:
 
     config = _Below("config.yaml")  # resolved
     table = _Below("progress.csv")  # a row per epoch
-    packed_table = _Below("progress.csv.gz")  # the table of a run kept for others, compressed
     curves = _Below("curves.png")  # the picture of its learning curves
     failure = _Below("failure.txt")  # what a job of a sweep has failed of
     lock = _Below(".lock")  # keeps a second process from writing here
@@ -71,12 +70,6 @@ class RunFolder:
     transitions = _Below("transitions")  # what was collected, if it was recorded
     certificate = _Below("certificate.json")  # which checkpoint is certified
     certifying = _Below(".certifying")  # there from the end of training until it is certified
-
-    @property
-    def recorded_table(self) -> Path:
-        """The file of the table: the plain one if it is there, else the compressed one."""
-        is_packed = self.packed_table.is_file() and not self.table.is_file()
-        return self.packed_table if is_packed else self.table
 
     def checkpoint(self, kind: str, steps: int) -> Path:
         """The checkpoint of a kind after so many environment steps."""

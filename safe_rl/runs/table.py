@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import csv
-import gzip
 import io
 import math
-import zlib
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -14,7 +12,7 @@ from safe_rl.runs.files import read_bounded, replace_text
 
 __all__ = ["TableError", "TableWriter", "last_row", "read_table"]
 
-# Of a table, unpacked; ten thousand epochs with a hundred columns have about 20 million
+# Of a table; ten thousand epochs with a hundred columns have about 20 million
 _MOST_BYTES = 100_000_000
 
 
@@ -110,14 +108,14 @@ def _number(field: str) -> float:
 
 
 def read_table(path: Path) -> dict[str, list[float]]:
-    """Read a table by columns, also a compressed one (``.gz``); empty fields are NaN.
+    """Read a table by columns; empty fields are NaN.
 
     A last line without its end, as a run that was killed leaves it, is no row.
 
     Raises:
         ValueError: If the file has no header, or holds more than any table of a run.
     """
-    whole = _text(path).rpartition("\n")[0]
+    whole = read_bounded(path, _MOST_BYTES).decode().rpartition("\n")[0]
     rows = list(csv.reader(io.StringIO(whole, newline="")))
     if not rows:
         raise ValueError(f"{path} is empty: the run has not finished an epoch.")
@@ -137,16 +135,3 @@ def last_row(path: Path) -> dict[str, float]:
         raise ValueError(f"{path} has no row: the run has not finished an epoch.")
     names, values = csv.reader([complete[0], complete[-1]])
     return dict(zip(names, map(_number, values), strict=True))
-
-
-def _text(path: Path) -> str:
-    if path.suffix != ".gz":
-        return read_bounded(path, _MOST_BYTES).decode()
-    try:
-        with gzip.open(path, "rb") as file:
-            content = file.read(_MOST_BYTES + 1)  # a small file can unpack to any size
-    except (EOFError, zlib.error, gzip.BadGzipFile) as error:
-        raise ValueError(f"{path} is damaged: {error}") from error
-    if len(content) > _MOST_BYTES:
-        raise ValueError(f"{path} unpacks to more than {_MOST_BYTES:,} bytes.")
-    return content.decode()

@@ -20,8 +20,7 @@ import safe_rl
 from safe_rl.cli.python_settings import compose_new, overrides_of, search_path
 from safe_rl.envs import ConfigError, store_configs
 from safe_rl.evaluation.loading import find_checkpoint
-from safe_rl.reporting.recorded import find_runs
-from safe_rl.runs.keeping import keep_runs
+from safe_rl.reporting.recorded import archive_runs, find_runs
 from safe_rl.runs.table import read_table
 from safe_rl.training.trainer import Trainer
 
@@ -70,13 +69,6 @@ def test_a_run_is_opened_again(run):
         safe_rl.load(run.directory / "nowhere")
 
 
-def test_an_archived_run_has_its_figures_and_says_why_it_has_no_policy(run, tmp_path):
-    keep_runs([run.directory], run.directory, tmp_path)
-    assert safe_rl.Run(tmp_path).final == run.final
-    with pytest.raises(FileNotFoundError, match="no last checkpoint: it is of an archive"):
-        safe_rl.load(tmp_path)
-
-
 def test_the_report_has_the_command_of_a_run_from_python(tmp_path):
     folder = tmp_path / "mine"
     folder.mkdir()
@@ -85,7 +77,7 @@ def test_the_report_has_the_command_of_a_run_from_python(tmp_path):
         cost_limits={"cost": 10}, **SMALL,
     )  # fmt: skip
     safe_rl.resume(tmp_path / "runs" / "a", frames=80)
-    keep_runs([tmp_path / "runs" / "a"], tmp_path / "runs", tmp_path / "kept")
+    archive_runs(find_runs(tmp_path / "runs")[0], tmp_path / "runs", tmp_path / "kept")
     for root in ("runs", "kept"):
         (found,), skipped = find_runs(tmp_path / root)
         assert not skipped

@@ -3,14 +3,14 @@
 import csv
 import gzip
 import itertools
-import json
 import re
+from functools import cache
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from safe_rl.runs.table import read_table
+from safe_rl.reporting.archive import read_archive
 
 ROOT = Path(__file__).resolve().parents[2]
 RESULTS = ROOT / "results"
@@ -40,8 +40,25 @@ ONE_MILLION = [
 OFF_POLICY_ONES = ("cal", "sac_lagrangian", "td3_lagrangian")
 
 
+@cache
+def campaign(name):
+    return read_archive(RESULTS / name)
+
+
+def run_at(path):
+    """The archived run whose path this is, if there is one."""
+    name, *below = path.relative_to(RESULTS).parts
+    return campaign(name).get("/".join(below))
+
+
+def seeds_of(folder):
+    """Paths of the archived runs of an environment and an algorithm."""
+    name, env, algo = folder.relative_to(RESULTS).parts
+    return [RESULTS / name / p for p in campaign(name) if p.startswith(f"{env}/{algo}/seed")]
+
+
 def figures(folder):
-    columns = read_table(folder / "progress.csv.gz")
+    columns = run_at(folder).table
     names = ("steps", "episode_return", "episode_cost")
     return [np.array(columns[name]) for name in names], columns
 
@@ -64,7 +81,7 @@ def held(folder, start=1_000_000):
 
 
 def certificate(folder, what="≤ {:.1f} at {:.1f}"):
-    told = json.loads((folder / "certificate.json").read_text())
+    told = run_at(folder).notes["certificate"]
     if told["certified"]:
         return what.format(told["bounds"]["mean_cost"]["bound"], told["episode_return"])
     return f"no, by {told['shortfalls']['mean_cost']:.1f}"
@@ -72,7 +89,7 @@ def certificate(folder, what="≤ {:.1f} at {:.1f}"):
 
 def kept(folders):
     """How many runs ended with a certificate, and at which returns."""
-    told = [json.loads((folder / "certificate.json").read_text()) for folder in folders]
+    told = [run_at(folder).notes["certificate"] for folder in folders]
     returns = sorted(run["episode_return"] for run in told if run["certified"])
     ends = dict.fromkeys(f"{value:.1f}" for value in returns[:1] + returns[-1:])
     return f"{len(returns)} of {len(told)}" + f", at {' to '.join(ends)}" * bool(ends)
@@ -86,7 +103,7 @@ def three_million(env, algo, seed):
     """The run of the campaign that has it."""
     campaigns = (RESULTS / name for name in ("holding_the_limit", "off_policy"))
     folders = [campaign / env / algo / f"seed{seed}" for campaign in campaigns]
-    return next(folder for folder in folders if folder.exists())
+    return next(folder for folder in folders if run_at(folder))
 
 
 @pytest.mark.parametrize(
@@ -132,7 +149,7 @@ def test_one_million_steps_from_memory(env, algo, seed, cells):
 def test_the_limit_while_learning_from_memory(algo):
     cells = []
     for env in ("PointGoal1", "CarGoal1"):
-        runs = (RESULTS / "algorithms" / env / algo).glob("seed*")
+        runs = seeds_of(RESULTS / "algorithms" / env / algo)
         cost, above = np.mean([held(run, 200_000) for run in runs], axis=0)
         cells.append(f"{cost:.1f}, {percent(above)}")
     assert f"| `{algo}` | {' | '.join(cells)} |\n" in OFF_POLICY
@@ -141,7 +158,7 @@ def test_the_limit_while_learning_from_memory(algo):
 @pytest.mark.parametrize("algo", ["sac", "td3", "wcsac"])
 def test_a_million_steps_of_the_others_from_memory(algo):
     ends = [
-        means((RESULTS / "algorithms" / env / algo).glob("seed*"), 0.25)
+        means(seeds_of(RESULTS / "algorithms" / env / algo), 0.25)
         for env in ("PointGoal1", "CarGoal1")
     ]
     assert f"| `{algo}` | {' | '.join(ends)} |\n" in OFF_POLICY
@@ -183,7 +200,7 @@ def means(folders, share, form="{:.1f} / {:.1f}"):
 )
 def test_means_of_a_million_steps(form):
     env = re.search(r"on (\w+)", form)[1]
-    runs = {algo: (RESULTS / "algorithms" / env / algo).glob("seed*") for algo in OFF_POLICY_ONES}
+    runs = {algo: seeds_of(RESULTS / "algorithms" / env / algo) for algo in OFF_POLICY_ONES}
     said = form.format(**{algo: means(folders, 0.25) for algo, folders in runs.items()})
     assert said in sentences(PAGE)
 
@@ -193,9 +210,7 @@ def test_means_of_a_million_steps(form):
 )
 def test_means_without_a_limit(env):
     form = "{:.1f} / {:.0f}"
-    ends = [
-        means((RESULTS / "reference" / env / a).glob("seed*"), 1 / 6, form) for a in ("ppo", "trpo")
-    ]
+    ends = [means(seeds_of(RESULTS / "reference" / env / a), 1 / 6, form) for a in ("ppo", "trpo")]
     assert " and ".join(ends) in sentences(PAGE)
     assert f"| {env} | {ends[0]} |" in README
 

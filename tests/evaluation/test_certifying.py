@@ -13,7 +13,7 @@ from safe_rl import envs
 from safe_rl.evaluation import Certificate, CertificateOptions, certify
 from safe_rl.evaluation.certifying import _largest_cost, _write
 from safe_rl.evaluation.loading import find_checkpoint
-from safe_rl.reporting.measured import read_certificate
+from safe_rl.reporting.recorded import read_certificate
 from safe_rl.runs.folder import RunFolder
 from safe_rl.scores.certificate import Verdict
 from safe_rl.training.building import build_trainer, seed_everything
@@ -192,4 +192,4 @@ def test_a_cost_without_a_largest_is_said_in_words_and_written_as_json(tmp_path)
     _write(RunFolder(tmp_path), certificate, [100])
     content = json.loads((tmp_path / "certificate.json").read_text(), parse_constant=refuse)
     assert content["bounds"] == {"mean_cost": {"bound": None, "most": 25.0}}
-    assert read_certificate(tmp_path / "certificate.json")["bounds"]["mean_cost"][1] == 25.0
+    assert read_certificate(content)["bounds"]["mean_cost"][1] == 25.0

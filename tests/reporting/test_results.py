@@ -1,20 +1,20 @@
 """The results in the repository: complete, readable, and what is said of them is what they hold."""
 
-import json
 import re
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from safe_rl.reporting.archive import read_archive
 from safe_rl.reporting.recorded import find_runs
-from safe_rl.runs.table import read_table
 
 RESULTS = Path(__file__).parents[2] / "results"
 PAGE = (RESULTS / "README.md").read_text()
 ALL_ROWS = re.findall(r"^\| `(\S+/seed\d+)` \| (.*) \|$", PAGE, re.MULTILINE)
 QUARTERS = [(run, row) for run, row in ALL_ROWS if "/limit" in run]
 ROWS = [row for row in ALL_ROWS if row not in QUARTERS]
+RUNS = {path.parent.name: read_archive(path.parent) for path in RESULTS.glob("*/runs.json")}
 WIDTHS = {"doggo": 2_000_000}  # steps that a column is of, where it is not half a million
 
 
@@ -29,19 +29,19 @@ def test_every_run_can_be_reported_and_every_campaign_is_listed():
     # what a repository can carry, and nothing that a report does not read
     files = [path for path in RESULTS.rglob("*") if path.is_file()]
     assert sum(path.stat().st_size for path in files) < 10_000_000
-    assert not [p for p in files if p.suffix in (".torchrl", ".png") or p.name == "progress.csv"]
+    assert len(files) <= 60
 
 
 @pytest.mark.parametrize(("run", "row"), ROWS)
 def test_the_figures_are_those_of_the_tables(run, row):
-    folder = next(RESULTS.glob(f"*/{run}"))
-    width = WIDTHS.get(folder.relative_to(RESULTS).parts[0], 500_000)
-    columns = read_table(folder / "progress.csv.gz")
+    campaign, found = next((c, runs[run]) for c, runs in RUNS.items() if run in runs)
+    width = WIDTHS.get(campaign, 500_000)
+    columns = found.table
     steps, returns, costs = (
         np.array(columns[name]) for name in ("steps", "episode_return", "episode_cost")
     )
     cells, above, certificate = re.fullmatch(r"(.*) \|\s+(\d+ %)(?: \| (.*))?", row).groups()
-    assert certificate is None or certificate == certified(folder)
+    assert certificate is None or certificate == certified(found)
     means = [cell.strip() for cell in cells.split(" |") if cell.strip()]
     assert len(means) == np.ceil(steps[-1] / width)
     for number, said in enumerate(means):
@@ -52,8 +52,8 @@ def test_the_figures_are_those_of_the_tables(run, row):
 
 @pytest.mark.parametrize(("run", "row"), QUARTERS)
 def test_the_figures_under_other_limits_are_those_of_tables_and_certificates(run, row):
-    folder = RESULTS / "limits" / run
-    columns = read_table(folder / "progress.csv.gz")
+    found = RUNS["limits"][run]
+    columns = found.table
     steps, returns, costs = (
         np.array(columns[name]) for name in ("steps", "episode_return", "episode_cost")
     )
@@ -62,12 +62,12 @@ def test_the_figures_under_other_limits_are_those_of_tables_and_certificates(run
     for number, said in enumerate(quarters):
         known = np.ceil(4 * steps / steps[-1]) == number + 1
         assert f"{np.nanmean(returns[known]):.1f} / {np.nanmean(costs[known]):.0f}" == said
-    assert certificate == certified(folder)
+    assert certificate == certified(found)
 
 
-def certified(folder):
+def certified(run):
     """What the certificate of a run says: the bound and the return, or by how much it is missed."""
-    told = json.loads((folder / "certificate.json").read_text())
+    told = run.notes["certificate"]
     if not told["certified"]:
         return f"no, by {told['shortfalls']['mean_cost']:.1f}"
     bound = told["bounds"].get("mean_cost", {}).get("bound", np.nan)

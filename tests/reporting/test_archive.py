@@ -1,0 +1,187 @@
+"""Runs archived for others: the same report from a hundredth of the bytes, in two files."""
+
+import gzip
+import json
+
+import pytest
+import yaml
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from synthetic import write_run
+
+from safe_rl.cli.report import main
+from safe_rl.reporting import archive as archives
+from safe_rl.reporting.archive import ROWS, RUNS, Recorded, read_archive, write_archive
+from safe_rl.reporting.recorded import archive_runs, find_runs
+
+EPOCHS = {"returns": (1.0, 2.0, 2.5), "costs": (40.0, 30.0, 20.0), "rates": (0.04, 0.035, 0.03)}
+CERTIFICATE = {
+    "checkpoint": None,
+    "episode_return": None,
+    "bounds": {},
+    "episodes": 4,
+    "level": 0.9,
+}
+
+
+@pytest.fixture
+def runs(tmp_path):
+    """Two algorithms with two seeds each, with checkpoints that nobody else needs."""
+    root = tmp_path / "runs"
+    for algo in ("ppo", "cpo"):
+        for seed in (0, 1):
+            run = write_run(root, algo=algo, seed=seed, columns={algo: (1, "", 3)}, **EPOCHS)
+            (run / "checkpoints").mkdir()
+            (run / "checkpoints" / "big.torchrl").write_bytes(b"0" * 10_000)
+            (run / "certificate.json").write_text(json.dumps(CERTIFICATE))
+    return root
+
+
+def keep(root, archive):
+    archive_runs(find_runs(root)[0], root, archive)
+
+
+def contents(folder):
+    return {path.name: path.read_text() for path in folder.glob("*.csv")}
+
+
+def test_every_table_is_made_again_from_an_archive(runs, tmp_path, capsys):
+    kept = tmp_path / "kept"
+    assert main([str(runs), f"archive={kept}"]) == 0
+    assert "kept 4 runs" in capsys.readouterr().out
+    assert {path.name for path in kept.iterdir()} == {RUNS, ROWS}
+    assert main([str(kept), f"out={tmp_path / 'again'}"]) == 0
+    # the folders of runs differ, and nothing else
+    before, after = contents(runs / "report"), contents(tmp_path / "again")
+    assert before.keys() == after.keys()
+    assert {n: t.replace(str(kept), str(runs)) for n, t in after.items()} == before
+
+
+def test_an_archive_follows_runs_that_go_on_and_is_the_same_bytes_otherwise(runs, tmp_path):
+    run, kept = runs / "PointGoal1" / "ppo" / "seed0", tmp_path / "kept"
+    keep(runs, kept)
+    first = [path.read_bytes() for path in sorted(kept.iterdir())]
+    keep(runs, kept)
+    keep(kept, tmp_path / "copy")
+    for folder in (kept, tmp_path / "copy"):
+        assert [path.read_bytes() for path in sorted(folder.iterdir())] == first
+    with (run / "progress.csv").open("a") as file:
+        file.write("4,4000,1,3.0,10.0,0.02,14.4,7\n")
+    # one of them alone: the others stay
+    archive_runs([r for r in find_runs(runs)[0] if r.directory == run], runs, kept)
+    again = read_archive(kept)
+    assert len(again) == 4
+    assert again["PointGoal1/ppo/seed0"].table["steps"][-1] == 4000
+    assert "cpo" not in again["PointGoal1/ppo/seed0"].table
+
+
+VALUES = st.none() | st.booleans() | st.integers(-3, 3) | st.sampled_from([1.0, 1e-5, "1", "", []])
+NODES = st.dictionaries(st.text("abc", min_size=1, max_size=2), VALUES | st.just({}), max_size=4)
+CONFIGS = st.dictionaries(st.text("abc", min_size=1, max_size=2), VALUES | NODES, max_size=30)
+
+
+@settings(deadline=None, max_examples=40)
+@given(configs=st.lists(CONFIGS, min_size=1, max_size=4))
+def test_configurations_are_read_back_as_they_were(configs, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("kept")
+    table = {"steps": [1.0, 2.0], "episode_return": [0.1 + 0.2, 1e300]}
+    runs = {f"run{n}": Recorded(config, table, {"n": n}) for n, config in enumerate(configs)}
+    write_archive(runs, folder)
+    found = read_archive(folder)
+    assert {name: repr(run.table) for name, run in found.items()} == {
+        name: repr(table) for name in runs
+    }
+    for name, run in runs.items():
+        assert found[name].notes == run.notes
+        same = json.dumps(found[name].config, sort_keys=True)
+        assert same == json.dumps(run.config, sort_keys=True)
+
+
+def test_nothing_says_where_the_runs_were_but_their_commands(runs, tmp_path):
+    run, kept = runs / "PointGoal1" / "ppo" / "seed0", tmp_path / "kept"
+    sources = [
+        {"path": "hydra.conf", "schema": "pkg", "provider": "hydra"},
+        {"path": f"{tmp_path}/conf", "schema": "file", "provider": "main"},
+        {"path": f"{tmp_path}/mine/conf", "schema": "file", "provider": "command-line"},
+    ]
+    runtime = {"version": "1.3.8", "cwd": str(tmp_path), "config_sources": sources}
+    notes = {"hydra": {"runtime": {**runtime, "output_dir": str(run)}, "job": {"name": "train"}}}
+    (run / ".hydra" / "hydra.yaml").write_text(yaml.safe_dump(notes))
+    evaluation = {
+        "run": str(run), "checkpoint_file": f"{run}/checkpoints/last/checkpoint-1.torchrl",
+        "checkpoint": "last", "steps": 3, "episodes": 3, "name": "", "deterministic": True,
+        "env": {}, "layouts_trained_on": 0.0, "cvar_alpha": 0.1, "cost_limits": {},
+        "estimates": {},
+    }  # fmt: skip
+    (run / "evaluation.json").write_text(json.dumps(evaluation))
+    (run / "evaluation_odd.json").write_text("no evaluation")
+    code = [{"steps": 0, "version": "0.1.0", "commit": "0123456789abcdef", "changed": True}]
+    (run / "code.json").write_text(json.dumps(code))
+    keep(runs, kept)
+    assert str(tmp_path) not in (kept / RUNS).read_text()
+    (kept_evaluation,) = read_archive(kept)["PointGoal1/ppo/seed0"].notes["evaluations"]
+    del evaluation["run"]
+    assert kept_evaluation == {**evaluation, "checkpoint_file": "checkpoint-1.torchrl"}
+    # of what is kept, a copy, whose report has the command and the code
+    keep(kept, tmp_path / "copy")
+    assert main([str(tmp_path / "copy"), f"out={tmp_path / 'again'}"]) == 0
+    page = (tmp_path / "again" / "report.md").read_text()
+    assert "--config-dir=mine/conf" in page.replace("\\", "")
+    assert "0.1.0 0123456789 with changes" in page
+
+
+def test_of_what_a_run_was_to_be_at_first_only_its_length_is_kept(runs, tmp_path):
+    first = runs / "PointGoal1" / "ppo" / "seed0"
+    (first / ".hydra" / "config.yaml").write_text("env: {name: PointGoal1}\nframes: 500\n")
+    keep(runs, tmp_path / "kept")
+    found = {r.directory.name: r for r in find_runs(tmp_path / "kept")[0] if r.algorithm == "ppo"}
+    assert found["seed0"].recorded.notes["frames_before"] == 500
+    assert ["frames=3000" in found[seed].command for seed in ("seed0", "seed1")] == [True, False]
+
+
+def test_an_archive_is_not_among_the_runs(runs, capsys):
+    assert main([str(runs), f"archive={runs / 'kept'}"]) == 1
+    assert "beside" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "message"),
+    [
+        (ROWS, b"no gzip", "gzip"),
+        (ROWS, gzip.compress(b"run,steps\na,1\n" * 9)[:20], "no archive"),
+        (ROWS, gzip.compress(b"run,steps\na,many\n"), "many"),
+        (RUNS, b"{", "cannot be read"),
+        (RUNS, b"[" * 200_000, "cannot be read"),
+        (RUNS, b"[]", "no archive"),
+        (RUNS, b'{"shared": {}, "a": {"like": "b", "config": {}}}', "no archive"),
+    ],
+)
+def test_a_damaged_archive_is_left_out_with_its_reason(name, content, message, runs, tmp_path):
+    keep(runs, tmp_path / "all" / "kept")
+    (tmp_path / "all" / "kept" / name).write_bytes(content)
+    write_run(tmp_path / "all", **EPOCHS)
+    found, skipped = find_runs(tmp_path / "all")
+    assert len(found) == 1
+    assert message in skipped[tmp_path / "all" / "kept" / RUNS]
+
+
+def test_a_run_of_an_archive_that_cannot_be_read_is_left_out_alone(runs, tmp_path):
+    kept = tmp_path / "kept"
+    keep(runs, kept)
+    text = (
+        (kept / RUNS)
+        .read_text()
+        .replace('"certificate": {', '"certificate": {"level": "a"}, "x": {', 1)
+    )
+    (kept / RUNS).write_text(text)
+    found, skipped = find_runs(kept)
+    assert len(found) == 3
+    assert "it is no certificate" in skipped[kept / "PointGoal1" / "cpo" / "seed0"]
+
+
+def test_a_small_file_that_unpacks_to_any_size_is_refused(runs, tmp_path, monkeypatch):
+    keep(runs, tmp_path / "kept")
+    (tmp_path / "kept" / ROWS).write_bytes(gzip.compress(b"0" * 100_000))
+    monkeypatch.setattr(archives, "_MOST_BYTES", 50_000)
+    with pytest.raises(ValueError, match="unpacks to more than 50,000 bytes"):
+        read_archive(tmp_path / "kept")
