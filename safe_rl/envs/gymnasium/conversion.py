@@ -15,16 +15,16 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv, VectorEnv
 
 from safe_rl.envs.costs import CostRange, is_cost, parse_columns
 from safe_rl.envs.errors import ConfigError, nearest, require_integer, require_names
-from safe_rl.envs.foreign import GYMNASIUM, complete_foreign
+from safe_rl.envs.foreign import GYMNASIUM, ForeignFamily, complete_foreign
 from safe_rl.envs.gymnasium.env_wrappers import CostsOutside, adapt, make_adapted
 from safe_rl.envs.gymnasium.gymnasium_env import GymnasiumEnv, from_vector
 from safe_rl.envs.gymnasium.worker_processes import ProcessVectorEnv
 from safe_rl.envs.rng import spread_seed
 
-__all__ = ["describe_node", "from_gymnasium", "make_gymnasium"]
+__all__ = ["describe_node", "from_gymnasium", "make_gymnasium", "make_node"]
 
 MakeEnv = Callable[[], gymnasium.Env]
-_FAILURES = (gymnasium.error.Error, TypeError, ValueError)
+_FAILURES = (AssertionError, gymnasium.error.Error, TypeError, ValueError)
 _NO_COSTS = {"observation", "action", "reward", "done", "terminated", "truncated"}
 
 
@@ -119,17 +119,34 @@ def make_gymnasium(
         >>> make_gymnasium(config, num_envs=2, seed=0).cost_keys
         ['cost', 'cost_hazards', 'cost_exception']
     """
-    config = complete_foreign(GYMNASIUM, config)
-    outside = list(config["outside"] or {})
+    return make_node(GYMNASIUM, _maker_of_node, config, num_envs, device, seed)
+
+
+def make_node(
+    family: ForeignFamily,
+    maker: Callable[[Mapping[str, Any]], MakeEnv],
+    config: Mapping[str, Any],
+    num_envs: int,
+    device: torch.device | str,
+    seed: int | None,
+) -> GymnasiumEnv:
+    """Make the environments of a node; `maker` returns a function that makes one of them.
+
+    Raises:
+        ConfigError: For an unknown key or id, or an environment that the algorithms cannot use.
+    """
+    config = complete_foreign(family, config)
+    outside = list(config.get("outside") or {})
+    make = maker(config)
     try:
         return from_gymnasium(
-            _maker_of_node(config),
+            make,
             num_envs=num_envs,
             cost_keys=[*dict.fromkeys([*config["cost_keys"], *outside])],
             num_steps=config["num_steps"],
             seed=None if seed is None else spread_seed(seed),
             workers=config["workers"],
-            flatten=config["flatten"],
+            flatten=config.get("flatten", True),
             device=device,
             highest_costs=dict.fromkeys(outside, 1.0),
         )
@@ -137,15 +154,18 @@ def make_gymnasium(
         raise ConfigError(f"env.id={config['id']}: {error}") from error
 
 
-def describe_node(config: Mapping[str, Any]) -> tuple[list[str], int]:
+def describe_node(
+    config: Mapping[str, Any], maker: Callable[[Mapping[str, Any]], MakeEnv] | None = None
+) -> tuple[list[str], int]:
     """Return the cost keys and the length of episodes of a node, found out where they are None.
 
     Raises:
         ConfigError: If there is no such environment, or the algorithms cannot use it.
     """
-    make = _maker_of_node(config)
+    make = (maker or _maker_of_node)(config)
     try:
-        return _describe(make, config["cost_keys"], config["num_steps"], config["flatten"])
+        flatten = config.get("flatten", True)
+        return _describe(make, config["cost_keys"], config["num_steps"], flatten)
     except _FAILURES as error:
         raise ConfigError(f"env.id={config['id']}: {error}") from error
 

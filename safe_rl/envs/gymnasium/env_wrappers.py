@@ -17,9 +17,17 @@ from gymnasium.wrappers import TransformAction, TransformObservation
 
 from safe_rl.envs.costs import COST, CostRange
 
-__all__ = ["CostsOutside", "FloatCosts", "SixValues", "adapt", "kinds_of", "make_adapted"]
+__all__ = [
+    "CostsOutside",
+    "FloatCosts",
+    "SixValues",
+    "adapt",
+    "make_adapted",
+    "plain_actions",
+    "stretch",
+]
 
-_SUM = "cost_sum"  # Safety-Gymnasium's name for the sum of all kinds
+COST_SUM = "cost_sum"  # Safety-Gymnasium's name for the sum of all kinds
 
 
 def make_adapted(
@@ -152,18 +160,8 @@ class SixValues(gymnasium.Wrapper):
                 "env=gymnasium."
             )
         observation, reward, cost, terminated, truncated, info = values
-        others = {key: value for key, value in info.items() if key != _SUM}
+        others = {key: value for key, value in info.items() if key != COST_SUM}
         return observation, reward, terminated, truncated, {**others, COST: float(cost)}
-
-
-def kinds_of(info: dict[str, Any]) -> list[str]:
-    """Names of the kinds of costs that an `info` of Safety-Gymnasium's reports.
-
-    Examples:
-        >>> kinds_of({"cost_hazards": 1.0, "cost_sum": 1.0, "goal_met": True})
-        ['cost_hazards']
-    """
-    return [key for key in info if key.startswith(f"{COST}_") and key != _SUM]
 
 
 # Not by the wrappers that Gymnasium has for these: they keep lambdas, which cannot be pickled.

@@ -17,15 +17,15 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from gymnasium.wrappers import vector
 
-from safe_rl.envs.costs import COST
+from safe_rl.envs.costs import COST, is_cost
 from safe_rl.envs.errors import ConfigError
-from safe_rl.envs.foreign import SAFETY_GYMNASIUM, complete_foreign
-from safe_rl.envs.gymnasium.conversion import from_gymnasium
-from safe_rl.envs.gymnasium.env_wrappers import SixValues, kinds_of, plain_actions, stretch
+from safe_rl.envs.foreign import SAFETY_GYMNASIUM
+from safe_rl.envs.gymnasium import conversion
+from safe_rl.envs.gymnasium.conversion import from_gymnasium, make_node
+from safe_rl.envs.gymnasium.env_wrappers import COST_SUM, SixValues, plain_actions, stretch
 from safe_rl.envs.gymnasium.gymnasium_env import GymnasiumEnv, from_vector
-from safe_rl.envs.rng import spread_seed
 
-__all__ = ["from_six_values", "make_safety_gymnasium"]
+__all__ = ["describe_node", "from_six_values", "make_safety_gymnasium"]
 
 
 def make_safety_gymnasium(
@@ -54,39 +54,12 @@ def make_safety_gymnasium(
         ...
         safe_rl.envs.errors.ConfigError: An environment of Safety-Gymnasium has no key 'worker'. ...
     """
-    config = complete_foreign(SAFETY_GYMNASIUM, config)
-    return from_gymnasium(
-        partial(_make_single, config),
-        num_envs=num_envs,
-        cost_keys=config["cost_keys"],
-        num_steps=config["num_steps"],
-        seed=None if seed is None else spread_seed(seed),
-        workers=config["workers"],
-        device=device,
-    )
+    return make_node(SAFETY_GYMNASIUM, _maker_of_node, config, num_envs, device, seed)
 
 
 def describe_node(config: Mapping[str, Any]) -> tuple[list[str], int]:
-    """Return the cost keys and the length of episodes of a node, found out where they are None.
-
-    Raises:
-        ConfigError: If there is no such environment, or it does not say how long episodes are.
-    """
-    try:
-        env = _make_single(config)
-    except ConfigError:
-        raise
-    except (AssertionError, gymnasium.error.Error, TypeError, ValueError) as error:
-        raise ConfigError(f"env.id={config['id']}: {error}") from error
-    registered = None if env.spec is None else env.spec.max_episode_steps
-    steps = config["num_steps"] or registered or getattr(env.unwrapped, "num_steps", None)
-    keys = config["cost_keys"] or [COST, *_probe_kinds(env)]
-    env.close()
-    if steps is None:
-        raise ConfigError(
-            f"env.id={config['id']} does not say how long episodes are: give env.num_steps=…"
-        )
-    return keys, steps
+    """Return the cost keys and the length of episodes of a node, found out where they are None."""
+    return conversion.describe_node(config, _maker_of_node)
 
 
 def from_six_values(
@@ -128,24 +101,27 @@ def from_six_values(
         >>> from_six_values(Slide, num_envs=2, num_steps=5).rollout(9)["next", "cost"].shape
         torch.Size([2, 5, 1])
     """
-    where: dict[str, Any] = {"seed": seed, "device": device}
+    kinds = None if cost_keys is None else [key for key in cost_keys if key != COST]
     if not hasattr(env, "single_action_space"):
-        make = partial(_six, env)
-        kinds = _kinds(_probe_kinds(make()) if cost_keys is None else cost_keys)
-        keys = [COST, *kinds]
         return from_gymnasium(
-            make, num_envs=num_envs or 1, cost_keys=keys, num_steps=num_steps, **where
+            partial(_six, env),
+            num_envs=num_envs or 1,
+            cost_keys=None if kinds is None else [COST, *kinds],
+            num_steps=num_steps,
+            seed=seed,
+            device=device,
         )
     batch: Any = env
     if num_envs not in (None, batch.num_envs):
         raise ValueError(f"num_envs={num_envs}: the batch has {batch.num_envs} environments.")
     if num_steps is None:
         raise ValueError("A batch does not say how long its episodes are: give 'num_steps'.")
-    batch.reset(seed=0)
-    found = kinds_of(batch.step(batch.action_space.sample())[-1])
-    kinds = _kinds(found if cost_keys is None else cost_keys)
+    if kinds is None:
+        batch.reset(seed=0)
+        infos = batch.step(batch.action_space.sample())[-1]
+        kinds = [key for key in infos if is_cost(key) and key not in (COST, COST_SUM)]
     worlds = _as_networks_take_it(DeferredResets(batch, kinds))
-    return from_vector(worlds, [COST, *kinds], num_steps, **where)
+    return from_vector(worlds, [COST, *kinds], num_steps, seed=seed, device=device)
 
 
 class DeferredResets(VectorEnv):
@@ -236,8 +212,8 @@ def _vectors(number: int, observation: np.ndarray) -> np.ndarray:
     return np.asarray(observation, np.float32).reshape(number, -1)
 
 
-def _make_single(config: Mapping[str, Any]) -> gymnasium.Env:
-    """Make one environment, with its cost in `info`."""
+def _maker_of_node(config: Mapping[str, Any]) -> Callable[[], gymnasium.Env]:
+    """Return a function that makes one environment, with its cost in `info`."""
     try:
         import safety_gymnasium
     except ImportError as error:
@@ -249,21 +225,8 @@ def _make_single(config: Mapping[str, Any]) -> gymnasium.Env:
     kwargs = dict(config["kwargs"] or {})
     named = {"render_mode": config["render_mode"], "max_episode_steps": config["num_steps"]}
     kwargs |= {key: value for key, value in named.items() if value is not None}
-    return SixValues(safety_gymnasium.make(config["id"], **kwargs))
+    return partial(_six, partial(safety_gymnasium.make, config["id"], **kwargs))
 
 
 def _six(make: Callable[[], gymnasium.Env]) -> gymnasium.Env:
     return SixValues(make())
-
-
-def _kinds(keys: Sequence[str]) -> list[str]:
-    return [key for key in keys if key != COST]
-
-
-def _probe_kinds(env: gymnasium.Env) -> list[str]:
-    """Return the kinds of costs that a step reports, and close the environment."""
-    try:
-        env.reset(seed=0)
-        return kinds_of(env.step(env.action_space.sample())[-1])
-    finally:
-        env.close()
