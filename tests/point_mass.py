@@ -11,7 +11,8 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.data import Bounded, Categorical, Composite, Unbounded
-from torchrl.envs import EnvBase
+
+from safe_rl.envs import ConstrainedEnv
 
 HAZARD = torch.tensor([0.6, 0.0])
 HAZARD_RADIUS = 0.3
@@ -19,7 +20,7 @@ NORTH = 0.3
 ARENA = 2.0
 
 
-class PointMass(EnvBase):
+class PointMass(ConstrainedEnv):
     """Observation: position and last displacement, shape [N, 4]; action: displacement, [N, 2].
 
     ``cost`` is 1 where ``cost_hazards`` (inside the hazard) or ``cost_north`` (beyond a border) is.

@@ -42,19 +42,19 @@ def check_rows(env: EnvBase, num_collectors: int, frames_per_batch: int) -> None
 def split_rows(env: EnvBase, make_env: MakeEnv, num_collectors: int) -> list[Callable[[], EnvBase]]:
     """Functions that make every worker's environment, with its share of the rows of ``env``.
 
-    An environment with ``get_state`` and ``set_state`` has its rows continued by the workers, from
-    their next reset; any other one is made anew, and seeded apart from the other workers'. If
-    it has ``continue_from``, its schedules go on after the ``steps_before`` of ``env``.
+    An environment whose ``get_state`` is not None has its rows continued by the workers, from their
+    next reset; any other one is made anew, and seeded apart from the other workers'. Its schedules
+    go on after the ``steps_before`` of ``env``.
     """
     states: list[TensorDictBase | None]
-    if not hasattr(env, "get_state"):
+    if env.get_state() is None:
         states = [None] * num_collectors
     else:
         env.reset()
         states = list(env.get_state().chunk(num_collectors))
     seeds = torch.randint(2**62, (num_collectors,)).tolist()
     rows = env.batch_size.numel() // num_collectors
-    before = getattr(env, "steps_before", 0)
+    before = env.steps_before
     return [
         partial(_make_rows, make_env, rows, state, seed, before)
         for state, seed in zip(states, seeds, strict=True)
@@ -74,8 +74,7 @@ def _make_rows(
         env.set_state(state)
     else:
         env.set_seed(seed % 2**31)
-        if hasattr(env, "continue_from"):
-            env.continue_from(steps_before)
+        env.continue_from(steps_before)
     # again: an environment that is seeded may have seeded all that torch draws
     torch.manual_seed(seed)
     return env

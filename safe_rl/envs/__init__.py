@@ -21,8 +21,6 @@ if TYPE_CHECKING:
     from safe_rl.envs.contract import (
         ConstrainedEnv,
         ContractError,
-        PositionedEnv,
-        SnapshotEnv,
         check_constrained_env,
     )
     from safe_rl.envs.gymnasium.conversion import from_gymnasium
@@ -31,7 +29,7 @@ if TYPE_CHECKING:
     from safe_rl.envs.safety_gym.env import SafetyGymEnv
     from safe_rl.envs.safety_gym.layouts import LayoutError
 
-_CONTRACT = ("ConstrainedEnv", "ContractError", "PositionedEnv", "SnapshotEnv")
+_CONTRACT = ("ConstrainedEnv", "ContractError")
 
 __all__ = [
     "EXTRAS",
@@ -41,10 +39,8 @@ __all__ = [
     "ContractError",
     "LayoutError",
     "OpenGLError",
-    "PositionedEnv",
     "SafetyGymConfig",
     "SafetyGymEnv",
-    "SnapshotEnv",
     "check_constrained_env",
     "complete_env",
     "env_names",

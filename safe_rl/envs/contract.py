@@ -1,17 +1,16 @@
 """What a batch of constrained environments has to be for everything else to work with it.
 
-There is no base class: any `EnvBase` that has these members will do, whatever it simulates.
 Training, evaluation and the command line know nothing else about an environment.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from typing import Any, Protocol, runtime_checkable
+from typing import Any
 
 import torch
-from tensordict import TensorDictBase
-from torchrl.data import Bounded, Categorical, Composite, OneHot, TensorSpec
+from tensordict import TensorDict, TensorDictBase
+from torchrl.data import Bounded, Categorical, Composite, OneHot
 from torchrl.envs import EnvBase
 
 from safe_rl.envs.costs import COST
@@ -21,8 +20,7 @@ from safe_rl.naming import key_name
 ACTIONS = (Bounded, Categorical, OneHot)
 
 
-@runtime_checkable
-class ConstrainedEnv(Protocol):
+class ConstrainedEnv(EnvBase):
     """N environments that are stepped together: an `EnvBase` of batch size [N], and more.
 
     It reads `action`: [N, A] bounded, or choices, [N] or [N, A] integers or [N, C] one-hot.
@@ -32,12 +30,15 @@ class ConstrainedEnv(Protocol):
     spec.
 
     Attributes:
-        cost_keys: names of the costs; the aggregate `cost` is one of them.
-        max_episode_steps: the largest number of steps of an episode.
-        observation_layout: columns of every named component of a flat `observation`; a nested one
-            may say what its columns were if it were flat.
-
-    If `reward` is not what returns are made of, `return_key` names what is, below "next".
+        cost_keys: Names of the costs; the aggregate `cost` is one of them. Every environment has
+            its own.
+        max_episode_steps: The largest number of steps of an episode. Every environment has its own.
+        observation_layout: Columns of every named component of a flat `observation`; a nested one
+            may say what its columns were if it were flat. Every environment has its own.
+        return_key: The entry below "next" that returns are made of.
+        seconds_per_step: What a step takes in the environment's own time [s]; None if unknown.
+        steps_before: Steps of every row in the part of the run before this one.
+        render: Draws environments as `SimulatedEnv.render` does; None if there are no pictures.
 
     Examples:
         >>> from safe_rl.envs import SafetyGymEnv
@@ -47,77 +48,37 @@ class ConstrainedEnv(Protocol):
     """
 
     cost_keys: list[str]
+    max_episode_steps: Any
+    observation_layout: Any
+    return_key: str = "reward"
+    seconds_per_step: Any = None
+    steps_before: int = 0
+    render: Any = None
 
-    @property
-    def max_episode_steps(self) -> int:
-        """The largest number of steps of an episode."""
-        ...
+    def get_state(self) -> Any:
+        """Return a copy of everything that determines what happens next, a TensorDict [N].
 
-    @property
-    def observation_layout(self) -> Mapping[str, slice]:
-        """Columns of every component of the observation."""
-        ...
-
-    @property
-    def batch_size(self) -> torch.Size:
-        """[N]."""
-        ...
-
-    @property
-    def device(self) -> torch.device:
-        """Where the TensorDicts live."""
-        ...
-
-    @property
-    def observation_spec(self) -> Composite:
-        """Shapes and types of what is observed."""
-        ...
-
-    @property
-    def action_spec(self) -> TensorSpec:
-        """Bounds, or numbers of choices, of the actions."""
-        ...
-
-    def reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDictBase:
-        """Start new episodes, everywhere or where `_reset` says."""
-        ...
-
-    def step(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Take `action` in every environment."""
-        ...
-
-    def set_seed(self, seed: int | None = None, static_seed: bool = False) -> int | None:
-        """Determine every draw to come; rows draw differently."""
-        ...
-
-    def close(self, *, raise_if_closed: bool = True) -> None:
-        """Free what it holds."""
-        ...
-
-
-@runtime_checkable
-class SnapshotEnv(Protocol):
-    """An environment whose worlds can be stored and put back, so that runs resume in the middle.
-
-    Without it a resumed run begins new episodes.
-    """
-
-    def get_state(self) -> TensorDictBase:
-        """Return a copy of everything that determines what happens next, a TensorDict [N]."""
-        ...
+        None, as here, if the worlds cannot be stored: a resumed run then begins new episodes.
+        """
+        return None
 
     def set_state(self, state: TensorDictBase) -> TensorDictBase:
-        """Put the worlds into a state; returns what a reset returns."""
-        ...
-
-
-@runtime_checkable
-class PositionedEnv(Protocol):
-    """An environment that tells where things are; nothing in training asks for it."""
+        """Put the worlds into a state of `get_state`; returns what a reset returns."""
+        raise NotImplementedError(f"{type(self).__name__} cannot store its worlds.")
 
     def get_positions(self) -> TensorDictBase:
-        """Return copies of positions by kind, a TensorDict [N] of [N, K, 3] (m)."""
-        ...
+        """Return where things are, a TensorDict [N] of [N, K, 3] by kind (m); here of nothing."""
+        return TensorDict(batch_size=self.batch_size)
+
+    def continue_from(self, steps: int) -> None:
+        """Go on with schedules after so many steps of every row."""
+        self.steps_before = steps
+
+
+_DEFAULTS = (
+    *("return_key", "seconds_per_step", "steps_before", "render", "get_state", "get_positions"),
+    "continue_from",
+)
 
 
 class ContractError(TypeError):
@@ -130,7 +91,7 @@ def check_constrained_env(env: Any) -> None:
     TorchRL's `check_env_specs` finds out whether the specs are true.
 
     Raises:
-        ContractError: naming everything that is missing or wrong.
+        ContractError: Naming everything that is missing or wrong.
 
     Examples:
         >>> from torchrl.envs import PendulumEnv
@@ -146,6 +107,12 @@ def check_constrained_env(env: Any) -> None:
             "wrapped by `safe_rl.envs.from_gymnasium`."
         )
     problems = [*_shape_problems(env), *_cost_problems(env), *_layout_problems(env)]
+    missing = [name for name in _DEFAULTS if not hasattr(env, name)]
+    if missing:
+        problems.append(
+            f"it has no {', '.join(missing)}: derive it from safe_rl.envs.ConstrainedEnv, which "
+            "has defaults for them."
+        )
     if problems:
         lines = "".join(f"\n- {problem}" for problem in problems)
         raise ContractError(f"{type(env).__name__} is no constrained environment:{lines}")
@@ -174,9 +141,10 @@ def _shape_problems(env: EnvBase) -> Iterator[str]:
     steps = getattr(env, "max_episode_steps", None)
     if isinstance(steps, bool) or not isinstance(steps, int) or steps < 1:
         yield f"'max_episode_steps' must be the largest number of steps of an episode, got {steps}."
-    for first, second in (("get_state", "set_state"),):
-        if callable(getattr(env, first, None)) and not callable(getattr(env, second, None)):
-            yield f"it has '{first}', so it needs '{second}' too."
+    own, default = type(env), ConstrainedEnv
+    stores = isinstance(env, default) and own.get_state is not default.get_state
+    if stores and own.set_state in (None, default.set_state):
+        yield "it has 'get_state', so it needs 'set_state' too."
 
 
 def _cost_problems(env: EnvBase) -> Iterator[str]:

@@ -12,14 +12,14 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.data import Binary, Bounded, Composite, TensorSpec, Unbounded
-from torchrl.envs import EnvBase
 
 from safe_rl.envs import rng
+from safe_rl.envs.contract import ConstrainedEnv
 from safe_rl.envs.errors import require_integer
 from safe_rl.envs.physics.batch import BatchPhysics
 
 
-class SimulatedEnv(EnvBase):
+class SimulatedEnv(ConstrainedEnv):
     """N worlds on a thread pool: seeds, episodes, states and copies, of any family.
 
     A family builds its physics, observer and renderer, and says how a world is begun, stepped,
@@ -98,10 +98,6 @@ class SimulatedEnv(EnvBase):
     def observation_bounds(self) -> dict[str, tuple[float, float]]:
         """Lowest and highest value of named components in `observation`; others have none."""
         return {}
-
-    def get_positions(self) -> TensorDict:
-        """Return where things are, a TensorDict [N] of [N, K, 3] by kind (m); here of nothing."""
-        return TensorDict(batch_size=self.batch_size)
 
     def set_row_seeds(self, seeds: Sequence[int | None]) -> None:
         """Seed every world on its own, [N]: with the episodes of row 0 of its seed.

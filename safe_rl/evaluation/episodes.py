@@ -71,7 +71,7 @@ def collect_episodes(
         >>> collect_episodes(env, policy, 3, env.cost_keys, deterministic=True).lengths
         tensor([5., 5., 5.], dtype=torch.float64)
     """
-    num_envs, return_key = env.batch_size.numel(), getattr(env, "return_key", "reward")
+    num_envs, return_key = env.batch_size.numel(), env.return_key
     quota = num_episodes // num_envs + (torch.arange(num_envs) < num_episodes % num_envs).long()
     finished = torch.zeros(num_envs, dtype=torch.long)
     # float64: sums of indicator costs are exact

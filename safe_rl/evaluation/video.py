@@ -52,7 +52,7 @@ def manner_of(env: EnvBase, suffix: str) -> Manner:
 
     A film runs as fast as what it shows, where the environment has ``seconds_per_step``.
     """
-    manner, seconds = MANNERS[suffix], getattr(env, "seconds_per_step", None)
+    manner, seconds = MANNERS[suffix], env.seconds_per_step
     if suffix != "mp4" or not seconds:
         return manner
     steps = max(1, round(_FRAME / seconds))
@@ -76,7 +76,7 @@ def check_camera(env: EnvBase, camera: str, suffix: str = "mp4") -> None:
     if suffix == "mp4":
         for package in ("imageio", "imageio_ffmpeg"):
             import_extra(package, "video")
-    if not callable(getattr(env, "render", None)):
+    if env.render is None:
         raise ValueError(f"{asked}: this environment draws no pictures, it has no 'render'.")
     if camera != DEFAULT_CAMERA and "camera" not in _parameters(env):
         raise ValueError(f"camera={camera}: this environment has no cameras to choose from.")
@@ -136,7 +136,7 @@ def record_episode(
         camera: A name that ``env.render`` knows.
     """
     state = env.reset()
-    total = dict.fromkeys((getattr(env, "return_key", "reward"), *cost_keys[:1]), 0.0)
+    total = dict.fromkeys((env.return_key, *cost_keys[:1]), 0.0)
     step = 0
     with exploration(deterministic):
         while True:

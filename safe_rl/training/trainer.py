@@ -71,7 +71,7 @@ class Trainer:
         self.accounting = EpisodeAccounting(
             env.batch_size.numel(),
             env.cost_keys,
-            reward_key=getattr(env, "return_key", "reward"),
+            reward_key=env.return_key,
             device=collector.storing_device,
             longest=env.max_episode_steps,
         )
@@ -84,7 +84,7 @@ class Trainer:
         self._evaluation, self._recording = evaluation, recording
         # the worlds of workers are out of reach
         self._worlds = None
-        if isinstance(collector, Collector) and hasattr(env, "get_state"):
+        if isinstance(collector, Collector) and env.get_state() is not None:
             self._worlds = WorldSnapshot(env, collector)
         self._is_continued = False
         wanted = config.get("staggered_starts")
@@ -169,8 +169,7 @@ class Trainer:
         if self._recording is not None:
             self._recording.cut_after(self.progress.epoch - 1)
         self.algorithm.forget_open_episodes()
-        if hasattr(self._env, "continue_from"):
-            self._env.continue_from(self.progress.steps // self._env.batch_size.numel())
+        self._env.continue_from(self.progress.steps // self._env.batch_size.numel())
         # otherwise it would meet the episodes again that the run began with; workers, which have
         # not begun, go on from its state
         self._env.set_seed(int(torch.randint(2**31, ())))

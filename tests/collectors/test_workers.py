@@ -44,7 +44,8 @@ def test_workers_have_the_noise_that_the_rows_of_one_process_would():
 
 
 class Forgetful(PointMass):
-    get_state = property()  # raises AttributeError: its worlds cannot be stored
+    def get_state(self):
+        """Its worlds cannot be stored."""
 
 
 def test_workers_have_seeds_and_a_schedule_also_where_worlds_cannot_be_stored():

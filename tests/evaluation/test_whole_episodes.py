@@ -7,8 +7,8 @@ import pytest
 import torch
 from tensordict import TensorDict
 from torchrl.data import Bounded, Categorical, Composite, Unbounded
-from torchrl.envs import EnvBase
 
+from safe_rl.envs import ConstrainedEnv
 from safe_rl.envs.transforms import RewardScale, transform_env
 from safe_rl.evaluation import video
 from safe_rl.evaluation.during import PeriodicEvaluation
@@ -22,7 +22,7 @@ LENGTHS = [[30, 1], [2, 3], [1, 1]]
 FILM = {"deterministic": True, "manner": MANNERS["mp4"]}
 
 
-class KnownLengths(EnvBase):
+class KnownLengths(ConstrainedEnv):
     """The reward of a step is 1, its cost 0.5."""
 
     def __init__(self, lengths=LENGTHS):

@@ -134,7 +134,8 @@ point_mass_trainer = partial(trainer_of_point_mass, num_steps=27)
 
 
 class Forgetful(PointMass):
-    get_state = property()  # raises AttributeError: its worlds cannot be stored
+    def get_state(self):
+        """Its worlds cannot be stored."""
 
 
 @pytest.mark.parametrize("kind", [PointMass, Forgetful])

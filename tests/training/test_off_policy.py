@@ -149,7 +149,8 @@ def test_multipliers_go_by_the_costs_of_episodes(make_trainer, tmp_path):
 
 def test_sums_over_steps_end_where_a_resumed_run_begins_new_episodes(tmp_path):
     class Forgetful(PointMass):
-        get_state = property()  # raises AttributeError: its worlds cannot be stored
+        def get_state(self):
+            """Its worlds cannot be stored."""
 
     def build():
         config = off_policy_config("algo=sac", "memory.n_steps=3", "frames=160")

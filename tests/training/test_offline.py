@@ -136,7 +136,8 @@ def test_a_run_that_goes_on_records_what_it_does_again(tmp_path):
 
 
 class Forgetful(PointMass):
-    get_state = property()  # raises AttributeError: its worlds cannot be stored
+    def get_state(self):
+        """Its worlds cannot be stored."""
 
 
 @pytest.mark.parametrize(("kind", "staggered"), [(PointMass, "true"), (Forgetful, "null")])

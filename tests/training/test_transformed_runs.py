@@ -52,7 +52,8 @@ def test_an_interrupted_run_goes_on_exactly(tmp_path, transforms):
 
 
 class Forgetful(PointMass):
-    get_state = property()  # raises AttributeError: its worlds cannot be stored
+    def get_state(self):
+        """Its worlds cannot be stored."""
 
 
 def test_where_worlds_cannot_be_stored_schedules_go_on_in_other_episodes(tmp_path, monkeypatch):

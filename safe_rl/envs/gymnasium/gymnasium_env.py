@@ -19,6 +19,7 @@ from torchrl.envs import GymWrapper, Transform, TransformedEnv
 from torchrl.envs.gym_like import BaseInfoDictReader
 
 from safe_rl import naming
+from safe_rl.envs.contract import ConstrainedEnv
 from safe_rl.envs.costs import COST, is_cost
 from safe_rl.envs.errors import ConfigError, nearest
 
@@ -148,7 +149,7 @@ class CostsAsRewards(Transform):
         return output_spec
 
 
-class GymnasiumEnv(TransformedEnv):
+class GymnasiumEnv(ConstrainedEnv, TransformedEnv):
     """N environments of Gymnasium as one of TorchRL, made by `from_gymnasium`.
 
     Attributes:

@@ -10,6 +10,7 @@ from torchrl.data import Bounded
 from torchrl.envs import ActionScaling, ClipTransform, Compose, EnvBase, StepCounter, TransformedEnv
 from torchrl.envs.transforms import Transform
 
+from safe_rl.envs.contract import ConstrainedEnv
 from safe_rl.envs.errors import ConfigError
 from safe_rl.envs.foreign import TORCHRL, complete_foreign
 from safe_rl.envs.rng import spread_seed
@@ -22,7 +23,7 @@ __all__ = ["TorchRLEnv", "make_torchrl"]
 _STEP = "episode_step"  # not the name that environments themselves may have for it
 
 
-class TorchRLEnv(TransformedEnv):
+class TorchRLEnv(ConstrainedEnv, TransformedEnv):
     """N environments of TorchRL with costs, made by `make_torchrl`.
 
     Attributes:

@@ -6,17 +6,18 @@ from collections.abc import Mapping
 from typing import Any
 
 from tensordict import TensorDict, TensorDictBase
-from torchrl.envs import EnvBase, TransformedEnv
+from torchrl.envs import TransformedEnv
 from torchrl.envs.transforms import Compose, Transform
 
 from safe_rl.envs import rng
+from safe_rl.envs.contract import ConstrainedEnv
 from safe_rl.envs.transforms.base import ConstraintTransform
 from safe_rl.targets import TargetError, build
 
 _STATE = "transforms"
 
 
-class TransformedConstrainedEnv(TransformedEnv):
+class TransformedConstrainedEnv(ConstrainedEnv, TransformedEnv):
     """N environments and what changes them from outside, made by `transform_env`.
 
     Args:
@@ -28,21 +29,19 @@ class TransformedConstrainedEnv(TransformedEnv):
         cost_keys: the environment's, then those of the transforms.
         return_key: the entry below "next" that returns are made of, `reward` unless that is
             changed.
-        steps_before: steps of every row in the part of the run before.
 
     Raises:
         ValueError: if the transforms do not fit the environment, or one another.
     """
 
-    steps_before = 0
-
     def __init__(
-        self, base_env: EnvBase, transforms: Mapping[str, Transform], seed: int | None = None
+        self, base_env: ConstrainedEnv, transforms: Mapping[str, Transform], seed: int | None = None
     ) -> None:
         super().__init__(base_env, Compose(*transforms.values()))
         self._names = list(transforms)
         self.cost_keys = list(base_env.cost_keys)
-        self.return_key = getattr(base_env, "return_key", "reward")
+        self.return_key = base_env.return_key
+        self._stores = all(isinstance(t, ConstraintTransform) for t in transforms.values())
         layout = dict(base_env.observation_layout)
         for name, transform in self._ours().items():
             try:
@@ -60,16 +59,24 @@ class TransformedConstrainedEnv(TransformedEnv):
         named = zip(self._names, self.transform.transforms, strict=True)
         return {name: t for name, t in named if isinstance(t, ConstraintTransform)}
 
-    def __getattr__(self, name: str) -> Any:
-        """Leave to the environment inside what is not here, but not its snapshots."""
-        if name in ("get_state", "set_state"):
-            raise AttributeError(f"{type(self).__name__} has no '{name}'.")
-        return super().__getattr__(name)
-
     @property
     def max_episode_steps(self) -> int:
         """The largest number of steps of an episode."""
         return self.base_env.max_episode_steps
+
+    @property
+    def seconds_per_step(self) -> float | None:
+        """What a step takes in the environment's own time [s], if it says that."""
+        return self.base_env.seconds_per_step
+
+    @property
+    def render(self) -> Any:
+        """Draws the environment inside; None if that draws no pictures."""
+        return self.base_env.render
+
+    def get_positions(self) -> TensorDictBase:
+        """Return where things are in the environment inside."""
+        return self.base_env.get_positions()
 
     def set_seed(self, seed: int | None = None, static_seed: bool = False) -> int | None:
         """Determine every draw to come, of the environment and of its transforms."""
@@ -90,13 +97,14 @@ class TransformedConstrainedEnv(TransformedEnv):
         for transform in self._ours().values():
             transform.continue_from(steps)
 
+    def get_state(self) -> TensorDictBase | None:
+        """Return a copy of everything that determines what happens next, a TensorDict [N].
 
-class TransformedSnapshotEnv(TransformedConstrainedEnv):
-    """One whose worlds can be stored and put back, with what the transforms remember of them."""
-
-    def get_state(self) -> TensorDictBase:
-        """Return a copy of everything that determines what happens next, a TensorDict [N]."""
-        state = self.base_env.get_state()
+        None if the environment inside, or one of the transforms, cannot be stored.
+        """
+        state = self.base_env.get_state() if self._stores else None
+        if state is None:
+            return None
         for name, transform in self._ours().items():
             if rows := transform.rows():
                 state.set((_STATE, name), TensorDict(rows, batch_size=self.batch_size))
@@ -123,7 +131,7 @@ class TransformedSnapshotEnv(TransformedConstrainedEnv):
 
 
 def transform_env(
-    env: EnvBase,
+    env: ConstrainedEnv,
     transforms: Mapping[str, Transform | Mapping[str, Any]],
     *,
     evaluating: bool,
@@ -157,10 +165,7 @@ def transform_env(
     for transform in made.values():
         if isinstance(transform, ConstraintTransform):
             transform.evaluating = evaluating
-    stores = callable(getattr(env, "get_state", None)) and all(
-        isinstance(transform, ConstraintTransform) for transform in made.values()
-    )
-    return (TransformedSnapshotEnv if stores else TransformedConstrainedEnv)(env, made, seed)
+    return TransformedConstrainedEnv(env, made, seed)
 
 
 def _transform(name: str, given: Transform | Mapping[str, Any]) -> Transform:
