@@ -1,48 +1,40 @@
-"""The page on the algorithms says what is so: its snippets run, its tables are the program's."""
+"""What the pages on all algorithms say: snippets run, columns and defaults are the program's."""
 
 import re
 
 import pytest
-from made import ALGORITHMS, columns_of
+from made import ALGORITHMS, DOCS, columns_of
 from omegaconf import OmegaConf
 from point_mass import PointMass
-from run_configs import CONF, compose_config, point_mass_config
+from run_configs import compose_config, point_mass_config
 
-from safe_rl.algorithms import OffPolicy
-from safe_rl.algorithms.parts import find_recipe
+from safe_rl.collectors import Recording
 from safe_rl.runs.table import read_table
 from safe_rl.training.building import build_trainer
 
-FOLDER = CONF.parent / "docs" / "algorithms"
-PAGE = (FOLDER / "index.md").read_text()
-COSTS, LIMITED = PointMass.cost_keys, ["cost_hazards", "cost_north"]
+PAGE = (DOCS / "algorithms" / "index.md").read_text()
+OFF_POLICY_PAGE = (DOCS / "off_policy.md").read_text()
+LIMITED = ["cost_hazards", "cost_north"]
+OFF_POLICY = [algo for algo in ALGORITHMS if "memory" in columns_of(algo)]
 
 
-def composed(algo):
-    return compose_config(f"algo={algo}", "env=PointMass")
-
-
-FROM_MEMORY = {algo for algo in ALGORITHMS if find_recipe(composed(algo)) is OffPolicy}
-TABLES = {algo: columns_of(algo) for algo in ALGORITHMS if algo not in FROM_MEMORY}
-
-
-def test_every_algorithm_has_a_page_and_is_in_the_lists():
+def test_every_algorithm_is_in_the_lists():
     assert all(f"| [`{algo}`]({algo}.md) |" in PAGE for algo in ALGORITHMS)
-    page = (FOLDER.parent / "off_policy.md").read_text()
-    assert all(f"| [`{algo}`](algorithms/{algo}.md) |" in page for algo in FROM_MEMORY)
+    assert all(f"| [`{algo}`](algorithms/{algo}.md) |" in OFF_POLICY_PAGE for algo in OFF_POLICY)
 
 
 def rows(name):
     """Cells of the table below its mark, without the heading."""
-    table = re.search(rf"<!-- table: {name} -->\n(.*?)\n\n", PAGE, re.DOTALL)[1]
+    text = PAGE + OFF_POLICY_PAGE
+    table = re.search(rf"<!-- table: {name} -->\n(.*?)\n\n", text, re.DOTALL)[1]
     return [re.split(r" ?\| ?", line)[1:-1] for line in table.splitlines()[2:]]
 
 
-def columns(name, costs):
-    """Names of the columns that a table explains, one per cost where it says so."""
-    names = [found for first, *_ in rows(name) for found in re.findall(r"`([^`]+)`", first)]
-    found = [entry.replace("<cost>", cost) for entry in names for cost in costs]
-    return set(found)
+def columns(names, costs):
+    """Names of the columns that tables explain, one per cost where they say so."""
+    cells = [first for name in names for first, *_ in rows(f"columns of {name}")]
+    found = [entry for cell in cells for entry in re.findall(r"`([^`]+)`", cell)]
+    return {entry.replace("<cost>", cost) for entry in found for cost in costs}
 
 
 def test_snippets_run_one_after_the_other():
@@ -51,19 +43,37 @@ def test_snippets_run_one_after_the_other():
     exec("\n".join(snippets), {})
 
 
-@pytest.mark.parametrize("algo", TABLES)
+def columns_of_a_run(config, folder):
+    build_trainer(config, PointMass(config.num_envs), folder).run()
+    return set(read_table(folder / "progress.csv"))
+
+
+@pytest.mark.parametrize("algo", [algo for algo in ALGORITHMS if algo not in OFF_POLICY])
 def test_the_columns_are_those_of_a_run(algo, tmp_path):
     config = point_mass_config(
         f"algo={algo}",
         "frames=480",
         "cost_limits={cost_hazards: 1, cost_north: 1}",
-        minibatch_size=None if "trpo" in TABLES[algo] else 40,
+        minibatch_size=None if "trpo" in columns_of(algo) else 40,
     )
-    build_trainer(config, PointMass(config.num_envs), tmp_path).run()
-    documented = columns("columns of all", COSTS)
-    for table in TABLES[algo]:
-        documented |= columns(f"columns of {table}", LIMITED)
-    assert set(read_table(tmp_path / "progress.csv")) == documented
+    documented = columns(["all"], PointMass.cost_keys) | columns(columns_of(algo), LIMITED)
+    assert columns_of_a_run(config, tmp_path) == documented
+
+
+@pytest.mark.parametrize("algo", OFF_POLICY)
+def test_the_columns_are_those_of_an_off_policy_run(algo, tmp_path):
+    sizes = ["frames=160", "num_envs=4", "frames_per_batch=80", "memory.batch_size=8"]
+    keys = [f"algo={algo}", "env=PointMass", "logger=none", "policy_update.updates_per_step=0.05"]
+    if algo == "bc":
+        env = PointMass(4)
+        Recording(tmp_path / "data", env.cost_keys).write(0, env.rollout(20))
+        keys += [f"dataset.path={tmp_path / 'data'}"]
+    config = compose_config(*keys, "exploration.random_steps=80", *sizes)
+    documented = columns(["all"], PointMass.cost_keys)
+    # those of its table that begin so are of PPO
+    documented = {name for name in documented if not name.startswith(("policy_", "critic_"))}
+    documented |= columns(columns_of(algo), ["cost"])
+    assert columns_of_a_run(config, tmp_path) == documented
 
 
 @pytest.mark.parametrize("preset", ["default", "paper"])
@@ -88,3 +98,17 @@ def test_costs_are_estimated_as_rewards_are_but_for_what_the_table_says():
         config = compose_config(f"preset={preset}", "algo=cpo", "env=PointMass")
         same = ("gamma", "value_target", *own)
         assert all(config.cost_advantage[key] == config.advantage[key] for key in same)
+
+
+def test_the_defaults_of_off_policy_algorithms_are_those_of_the_files():
+    config = compose_config("algo=sac_lagrangian", "env=PointMass")
+    known = {}
+    for keys, default in re.findall(r"^\| (`.+?) \| ([^|]+) \|", OFF_POLICY_PAGE, re.MULTILINE):
+        names = re.findall(r"`([^`]+)`", keys)
+        if "." in names[0]:
+            known |= dict(zip(names, re.split(r", (?!0)", default), strict=False))
+    assert len(known) > 12
+    for key, default in known.items():
+        shown = default.partition(";")[0].strip("` ").replace(",", "")
+        if "TD3" not in default or ";" in default:
+            assert OmegaConf.select(config, key) == OmegaConf.create(f"value: {shown}").value, key
