@@ -70,9 +70,10 @@ def normal(key: Tensor, *counters: Tensor | int) -> Tensor:
     return radius * torch.cos(2.0 * math.pi * uniform(key, *counters, 1))
 
 
-def row_seeds(seed: int, num_rows: int) -> Tensor:
+def row_seeds(seed: int, num_rows: int, device: torch.device | None = None) -> Tensor:
     """Return one seed per row, int64 [num_rows]; row k is the same for every `num_rows`."""
-    return fold(torch.full((num_rows,), seed, dtype=torch.int64), torch.arange(num_rows))
+    rows = torch.arange(num_rows, device=device)
+    return fold(torch.full_like(rows, seed), rows)
 
 
 def spread_seed(seed: int) -> int:

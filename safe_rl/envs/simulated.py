@@ -16,7 +16,7 @@ from torchrl.data import Binary, Bounded, Composite, TensorSpec, Unbounded
 from safe_rl.envs import rng
 from safe_rl.envs.contract import ConstrainedEnv
 from safe_rl.envs.errors import require_integer
-from safe_rl.envs.physics.batch import BatchPhysics
+from safe_rl.envs.physics import Physics
 
 
 class SimulatedEnv(ConstrainedEnv):
@@ -43,9 +43,12 @@ class SimulatedEnv(ConstrainedEnv):
     #: What a step takes in the world's own time [s].
     seconds_per_step: float
 
+    #: Whether every world is in an episode, which then is so for ever.
+    _all_begun = False
+
     config: Any
     cost_keys: list[str]
-    _physics: BatchPhysics
+    _physics: Physics
     _observer: Any
     _renderer: Any
 
@@ -53,9 +56,6 @@ class SimulatedEnv(ConstrainedEnv):
         require_integer("num_envs", num_envs, lowest=1)
         require_integer("num_threads", num_threads, lowest=0)
         super().__init__(device=torch.device(device), batch_size=torch.Size([num_envs]))
-        self._episode = torch.zeros(num_envs, dtype=torch.int64)
-        self._has_cost = torch.zeros(num_envs, dtype=torch.bool)
-        self._begun = torch.zeros(num_envs, dtype=torch.bool)
         self._physics_settings: tuple[Any, ...] = (num_threads,)
 
     def _announce(
@@ -69,8 +69,12 @@ class SimulatedEnv(ConstrainedEnv):
             highest: the most that a step can cost.
             seed: of the environment; None takes one from torch's generator.
         """
+        physics = self._physics
+        self._episode = torch.zeros(self.batch_size, dtype=torch.int64, device=physics.device)
+        self._has_cost = torch.zeros_like(self._episode, dtype=torch.bool)
+        self._begun = self._has_cost.clone()
         low, high = torch.from_numpy(model.actuator_ctrlrange.T.copy())
-        self._control_range = (low, high)
+        self._control_range = (low.to(physics.ctrl), high.to(physics.ctrl))
         batch, scalar = self.batch_size, (*self.batch_size, 1)
         kind: dict[str, Any] = {"dtype": torch.float32, "device": self.device}
         flag = Binary(1, shape=scalar, dtype=torch.bool, device=self.device)
@@ -119,24 +123,25 @@ class SimulatedEnv(ConstrainedEnv):
         if seed is None:
             return
         require_integer("seed", seed, lowest=-(2**63))
-        self._row_seed = rng.row_seeds(seed, self.batch_size[0])
+        self._row_seed = rng.row_seeds(seed, self.batch_size[0], self._physics.device)
         self._episode.zero_()
 
     @torch.no_grad()
     def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDictBase:
         mask = None if tensordict is None else tensordict.get("_reset", None)
         if mask is None:
-            mask = torch.ones(self.batch_size, dtype=torch.bool)
-        mask = mask.reshape(self.batch_size).cpu()
+            mask = torch.ones_like(self._begun)
+        mask = mask.reshape(self.batch_size).to(self._physics.device)
         self._episode += mask
         self._begin(mask)
         self._has_cost &= ~mask
         self._begun |= mask
+        self._all_begun = self._all_begun or bool(self._begun.all())
         return self._reset_output()
 
     def _reset_output(self) -> TensorDict:
         """What a reset returns, for the worlds as they are."""
-        none = torch.zeros(len(self.flags), *self.batch_size, 1, dtype=torch.bool)
+        none = torch.zeros_like(self._begun).expand(len(self.flags), -1).unsqueeze(-1).clone()
         return self._pack(dict(zip(self.flags, none, strict=True)))
 
     def _step_output(self, numbers: Tensor, flags: Tensor) -> TensorDict:
@@ -147,7 +152,7 @@ class SimulatedEnv(ConstrainedEnv):
 
     def _pack(self, outputs: dict[str, Any]) -> TensorDict:
         """Move outputs to the device, and add the observation."""
-        if self.device.type != "cpu":
+        if self.device != self._physics.device:
             outputs = {key: value.to(self.device) for key, value in outputs.items()}
         outputs["observation"] = self._observe()
         # As TorchRL's own environments do: every shape and device is right by construction.
@@ -164,7 +169,7 @@ class SimulatedEnv(ConstrainedEnv):
                 f"'action' must be a floating-point tensor of shape {tuple(needed)} (num_envs, "
                 f"number of actuators), got {action.dtype} {tuple(action.shape)}."
             )
-        return action.detach().cpu()
+        return action.detach().to(self._physics.device)
 
     @abstractmethod
     def _begin(self, mask: Tensor) -> None:
@@ -211,6 +216,7 @@ class SimulatedEnv(ConstrainedEnv):
         self._episode = state.get("episode", self._episode).clone()
         self._has_cost.zero_()
         self._begun.fill_(True)
+        self._all_begun = True
         return self._reset_output()
 
     def __reduce__(self) -> tuple[Any, ...]:
@@ -225,6 +231,7 @@ class SimulatedEnv(ConstrainedEnv):
             self.set_state(state)
         for name, tensor in tensors.items():
             setattr(self, name, tensor)
+        self._all_begun = bool(self._begun.all())
 
     def render(
         self,

@@ -37,7 +37,7 @@ def test_rows_that_begin_one_by_one_are_drawn_together():
         mask = mask_of(*rows)
         episode += mask
         key = 10 * torch.arange(3) + episode
-        assert layouts(key, key + 1, mask)[:, 0, 0].tolist() == key[mask].tolist()
+        assert layouts(key, key + 1, mask)[mask, 0, 0].tolist() == key[mask].tolist()
     # all at first, and whenever one is not known yet; in the end the others' next ones are
     assert draw.asked == [[1, 11, 21], [2, 12, 22], [3, 13, 23], [4, 14, 24], [25]]
 
@@ -46,11 +46,11 @@ def test_an_episode_that_may_never_come_has_no_say():
     draw = Drawing()
     layouts = LayoutsAhead(draw, num_envs=3, num_columns=1)
     key = torch.tensor([1, 2, 3])
-    assert layouts(key, torch.tensor([4, 5, 500]), mask_of(0)).flatten().tolist() == [1, 1]
-    assert layouts(key, key, mask_of(1)).flatten().tolist() == [2, 2]
+    assert layouts(key, torch.tensor([4, 5, 500]), mask_of(0))[0].tolist() == [[1, 1]]
+    assert layouts(key, key, mask_of(1))[1].tolist() == [[2, 2]]
     with pytest.raises(LayoutError, match="hazard0"):
         layouts(torch.tensor([6, 7, 500]), key, mask_of(2))
-    assert layouts(key, key, mask_of(2)).flatten().tolist() == [3, 3]
+    assert layouts(key, key, mask_of(2))[2].tolist() == [[3, 3]]
 
 
 @pytest.mark.parametrize("env", ["PointGoal1", "PointButton2", "PointPush2"])

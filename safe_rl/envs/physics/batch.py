@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import os
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Sequence
 
 import mujoco
 import numpy as np
 import torch
 from mujoco.batch import Batch
 from torch import Tensor
+
+from safe_rl.envs.physics import Physics
 
 _STATE = ("time", "qpos", "qvel", "qacc_warmstart", "ctrl", "mocap_pos", "mocap_quat")
 _MEMORY = ("act", "history")
@@ -34,47 +36,40 @@ def _share(array: np.ndarray) -> Tensor:
         return torch.from_numpy(array)
 
 
-class BatchPhysics:
-    """N simulations of one model, advanced together.
-
-    The tensors, float64 on the CPU, keep their addresses: what is written into them in place takes
-    effect at the next call, outputs are refreshed by every call for the simulations it ran. Shapes
-    have the sizes of the model (nq, nv, nu, nbody, nmocap).
+class BatchPhysics(Physics):
+    """N simulations on the CPU, in float64.
 
     Threads do not survive a fork: simulations with several of them are made in the process that
     steps them, or that process is spawned.
 
     Args:
-        model: the compiled model; sleeping follows its options.
-        num_envs: number of simulations, N.
-        num_threads: threads that step them, 0 for one per core.
-        outputs: names of the fields of `MjData` that are read; every call copies them out.
+        model: The compiled model; sleeping follows its options.
+        num_envs: Number of simulations, N.
+        num_threads: Threads that step them, 0 for one per core.
+        outputs: Names of the fields of `MjData` that are read; every call copies them out.
 
     Examples:
-        >>> from safe_rl.envs.safety_gym.config import SafetyGymConfig
         >>> from safe_rl.envs.safety_gym.building import build_scene
+        >>> from safe_rl.envs.safety_gym.config import SafetyGymConfig
         >>> physics = BatchPhysics(build_scene(SafetyGymConfig()).model, num_envs=2, num_threads=1)
         >>> physics.step(num_substeps=10).tolist()
         [False, False]
     """
 
-    # state
-    time: Tensor  # [N] s
-    qpos: Tensor  # [N, nq]
-    qvel: Tensor  # [N, nv]
-    qacc_warmstart: Tensor  # [N, nv]
-    ctrl: Tensor  # [N, nu]
-    mocap_pos: Tensor  # [N, nmocap, 3] m
-    mocap_quat: Tensor  # [N, nmocap, 4]
-    # of actuators and sensors that remember: `act` [N, na], `history` [N, nhistory]; else empty
-    memory: Mapping[str, Tensor]
-    # outputs that are there unless others were asked for
-    xpos: Tensor  # [N, nbody, 3] m
-    xmat: Tensor  # [N, nbody, 3, 3]
-    sensordata: Tensor  # [N, nsensordata]
-    subtree_com: Tensor  # [N, nbody, 3] m
-    # all outputs that were asked for, by their names in MjData
-    outputs: Mapping[str, Tensor]
+    device = torch.device("cpu")
+    dtype = torch.float64
+    waits = False
+    time: Tensor
+    qpos: Tensor
+    qvel: Tensor
+    qacc_warmstart: Tensor
+    ctrl: Tensor
+    mocap_pos: Tensor
+    mocap_quat: Tensor
+    xpos: Tensor
+    xmat: Tensor
+    sensordata: Tensor
+    subtree_com: Tensor
 
     def __init__(
         self,
@@ -87,6 +82,7 @@ class BatchPhysics:
         sleeps = bool(model.opt.enableflags & mujoco.mjtEnableBit.mjENBL_SLEEP)
         has_threads = (num_threads or os.cpu_count() or 1) > 1
         self._process = os.getpid() if has_threads else None
+        self.timestep = float(model.opt.timestep)
         self._batch = Batch(model, num_envs, num_threads, persistent=sleeps)
         # Every field is bound before the first call: later ones would be zero until the next.
         for name in _STATE:
@@ -104,22 +100,14 @@ class BatchPhysics:
         self._with_sensors = int(model.opt.disableflags)
         self._warnings = np.zeros_like(self._batch.warning)
 
-    @property
-    def timestep(self) -> float:
-        """Length of one substep [s]."""
-        return float(self._batch.model.opt.timestep)
-
     def reset(self, mask: Tensor) -> None:
-        """Set the simulations in `mask` (bool [N]) to the model's initial state, awake."""
+        """Set the simulations in `mask` to the model's initial state, see `Physics`."""
         self._check_process()
         self._batch.reset(mask.numpy(), stage=_NO_STAGE)
         self._warnings[:] = self._batch.warning
 
     def forward(self, mask: Tensor | None = None, sensors: bool = True) -> None:
-        """Bring the outputs up to date with the state, for all simulations or those in `mask`.
-
-        Without `sensors`, the readings and what is computed for them alone stay as they are.
-        """
+        """Bring the outputs up to date with the state, see `Physics`."""
         self._check_process()
         self._disableflags[:] = self._with_sensors | (0 if sensors else _NO_SENSORS)
         self._batch.forward(None if mask is None else mask.numpy())
@@ -128,19 +116,7 @@ class BatchPhysics:
     def step(
         self, num_substeps: Tensor | int, mocap_path: Tensor | None = None, refresh: bool = True
     ) -> Tensor:
-        """Advance by substeps under constant `ctrl`, then bring the outputs up to date.
-
-        Args:
-            num_substeps: one number for all, or int64 [N].
-            mocap_path: mocap positions before each substep [N, S, nmocap, 3], or None where
-                nothing moves.
-            refresh: False leaves the outputs as `mj_step` does: of the state that the last
-                substep evaluated last, which with the Runge-Kutta integrator is its fourth stage.
-
-        Returns:
-            bool [N]: simulations that failed (non-finite or huge state); their state is finite
-            again but meaningless until reset.
-        """
+        """Advance by substeps and bring the outputs up to date, see `Physics`."""
         self._check_process()
         # Nobody reads sensors between substeps; without them the result is the same to the bit.
         self._disableflags[:] = self._with_sensors | _NO_SENSORS
@@ -155,11 +131,11 @@ class BatchPhysics:
         return self.failed()
 
     def failed(self) -> Tensor:
-        """Return the simulations that failed since the last call of this or `step`, bool [N]."""
+        """Return the simulations that failed since the last call, bool [N]."""
         # Their warning counters rose: MuJoCo resets a bad state by itself, silently.
         counts = self._batch.warning
         if np.array_equal(counts, self._warnings):
-            return torch.zeros(len(counts), dtype=torch.bool)
+            return torch.zeros(len(counts), dtype=torch.bool, device=self.device)
         failed = (counts[..., 1] > self._warnings[..., 1]).any(-1)
         counts[failed] = 0  # so that they rise again if these fail again
         self._warnings[:] = counts
@@ -167,23 +143,26 @@ class BatchPhysics:
         return torch.from_numpy(failed)
 
     def rays(self, origin: Tensor, directions: Tensor, group: int, exclude_body: int) -> Tensor:
-        """Cast rays into the simulations as their state is now.
-
-        Args:
-            origin: where the rays of each simulation start [N, 3] (m).
-            directions: unit vectors [N, R, 3].
-            group: the geom group that is seen, 0 to 5.
-            exclude_body: id of a body whose own geoms are not seen.
-
-        Returns:
-            Distance to the first surface [N, R] (m), -1 where there is none.
-        """
+        """Cast rays into the simulations as their state is now, see `Physics`."""
         seen = np.zeros(mujoco.mjNGROUP, dtype=np.uint8)
         seen[group] = 1
         distance, _ = self._batch.ray(
             origin.numpy()[:, None], directions.numpy(), geomgroup=seen, bodyexclude=exclude_body
         )
         return torch.from_numpy(distance)
+
+    def maybe_any(self, mask: Tensor) -> bool:
+        """Whether a mask holds anywhere."""
+        return bool(mask.any())
+
+    def rows(self, mask: Tensor) -> Tensor:
+        """Return the indices of the rows of a mask, int64."""
+        return mask.nonzero()[:, 0]
+
+    def check(self, wrong: Tensor, error: Callable[[], Exception]) -> None:
+        """Raise an error if `wrong` holds anywhere."""
+        if wrong.any():
+            raise error()
 
     def _check_process(self) -> None:
         """Raise in a forked process, which has no threads and would wait for them for ever."""

@@ -16,7 +16,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from safe_rl.envs.physics.batch import BatchPhysics
+from safe_rl.envs.physics import Physics
 
 _STAGES = (0.5, 0.5, 1.0)  # how far into the substep the second, third and fourth stage look
 _HUGE = 1e10  # MuJoCo's mjMAXVAL: larger numbers are a simulation that failed
@@ -33,7 +33,7 @@ _LEFT = torch.tensor(
 )
 
 
-def runge_kutta_substep(physics: BatchPhysics) -> Tensor:
+def runge_kutta_substep(physics: Physics) -> Tensor:
     """Advance by one substep; outputs are those of the fourth stage, also what sensors make.
 
     Args:
@@ -109,7 +109,7 @@ class _Root:
         angular.addcmul_(factor, torch.linalg.cross(self._rotation, once))
 
 
-def _reset_failed(physics: BatchPhysics) -> Tensor:
+def _reset_failed(physics: Physics) -> Tensor:
     """Set simulations that failed to the model's initial state: warned of, not finite or huge."""
     largest = torch.maximum(physics.qpos.abs().amax(-1), physics.qvel.abs().amax(-1))
     failed = physics.failed() | ~(largest < _HUGE)  # also where it is not a number

@@ -184,7 +184,7 @@ class Vocabulary:
     hazards_locations: Locations = key((), _PINNED)
     hazards_keepout: float = key(0.4, _KEEPOUT, NOT_NEGATIVE)
     hazards_size: float = key(0.3, "radius [m]", POSITIVE)
-    hazards_cost: float = key(1.0, "per metre that the robot is inside")
+    hazards_cost: float = key(1.0, "per metre that the robot is inside", NOT_NEGATIVE)
 
     # vases
     vases_num: int = key(0, _NUMBER, FREE_OBJECTS)
@@ -195,10 +195,12 @@ class Vocabulary:
     vases_size: float = key(0.1, "half side [m]", POSITIVE)
     vases_density: float = key(0.001, "of vases", POSITIVE)
     vases_sink: float = key(4e-5, "how deep they stand in the floor at the start [m]")
-    vases_contact_cost: float = key(1.0, "per contact point with the robot")
-    vases_displace_cost: float = key(0.0, "per metre from where one stood; 0: no such cost")
+    vases_contact_cost: float = key(1.0, "per contact point with the robot", NOT_NEGATIVE)
+    vases_displace_cost: float = key(
+        0.0, "per metre from where one stood; 0: no such cost", NOT_NEGATIVE
+    )
     vases_displace_threshold: float = key(1e-3, "displacement that is free [m]", NOT_NEGATIVE)
-    vases_velocity_cost: float = key(1.0, "per m/s of a vase; 0: no such cost")
+    vases_velocity_cost: float = key(1.0, "per m/s of a vase; 0: no such cost", NOT_NEGATIVE)
     vases_velocity_threshold: float = key(1e-4, "speed below which it is free [m/s]", NOT_NEGATIVE)
 
     # pillars
@@ -208,7 +210,7 @@ class Vocabulary:
     pillars_keepout: float = key(0.3, _KEEPOUT, NOT_NEGATIVE)
     pillars_size: float = key(0.2, "radius [m]", POSITIVE)
     pillars_height: float = key(0.5, "half height [m]", POSITIVE)
-    pillars_cost: float = key(1.0, "per contact point with the robot")
+    pillars_cost: float = key(1.0, "per contact point with the robot", NOT_NEGATIVE)
 
     # buttons
     buttons_num: int = key(0, _NUMBER, OBJECTS)
@@ -216,7 +218,7 @@ class Vocabulary:
     buttons_locations: Locations = key((), _PINNED)
     buttons_keepout: float = key(0.3, _KEEPOUT, NOT_NEGATIVE)
     buttons_size: float = key(0.1, "radius [m]", POSITIVE)
-    buttons_cost: float = key(1.0, "per contact point of the robot with a wrong one")
+    buttons_cost: float = key(1.0, "per contact point of the robot with a wrong one", NOT_NEGATIVE)
     buttons_resampling_delay: int = key(
         10, "steps for which buttons sleep after one was pressed", NOT_NEGATIVE
     )
@@ -230,7 +232,7 @@ class Vocabulary:
     gremlins_travel: float = key(0.3, "radius of the circle that they run [m]", NOT_NEGATIVE)
     gremlins_size: float = key(0.1, "half side [m]", POSITIVE)
     gremlins_density: float = key(0.001, "of gremlins", POSITIVE)
-    gremlins_contact_cost: float = key(1.0, "per contact point with the robot")
+    gremlins_contact_cost: float = key(1.0, "per contact point with the robot", NOT_NEGATIVE)
     gremlins_dist_threshold: float = key(0.2, _UNUSED, NOT_NEGATIVE)
     gremlins_dist_cost: float = key(1.0, _UNUSED)
 

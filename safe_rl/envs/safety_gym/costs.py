@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import NamedTuple
 
 import torch
@@ -61,7 +62,8 @@ def wrong_button_cost(contacts: Tensor, goal_button: Tensor, timer: Tensor) -> T
         goal_button: index of the goal button or -1, int64 [N].
         timer: steps until the buttons wake up, int64 [N].
     """
-    wrong = torch.arange(contacts.shape[-1]) != goal_button.unsqueeze(-1)
+    number = torch.arange(contacts.shape[-1], device=contacts.device)
+    wrong = number != goal_button.unsqueeze(-1)
     return (contacts * wrong).sum(-1) * (timer == 0)
 
 
@@ -75,14 +77,18 @@ def boundary_cost(xy: Tensor, half_x: float | None, half_y: float | None) -> Ten
         half_x: None is no boundary.
         half_y: likewise.
     """
-    halves = xy.new_tensor([math.inf if half is None else half for half in (half_x, half_y)])
-    return (xy.abs() - halves).clamp_(min=0.0).sum(-1)
+    (x, y), (most_x, most_y) = xy.abs().unbind(-1), map(_or_infinite, (half_x, half_y))
+    return (x - most_x).clamp_(min=0.0).add_((y - most_y).clamp_(min=0.0))
 
 
 def excess_speed(velocity: Tensor, limit: float | None) -> Tensor:
     """How much faster [m/s] than the limit the robot moves in the plane: [N, 3] -> [N]."""
     speed = torch.hypot(velocity[:, 0], velocity[:, 1])
-    return (speed - (math.inf if limit is None else limit)).clamp_(min=0.0)
+    return (speed - _or_infinite(limit)).clamp_(min=0.0)
+
+
+def _or_infinite(bound: float | None) -> float:
+    return math.inf if bound is None else bound
 
 
 class Cost(NamedTuple):
@@ -166,6 +172,7 @@ COSTS: list[Cost] = [
     ),
 ]
 EXCEPTION_KEY = "cost_exception"
+BUILT_IN = frozenset(row.key for row in COSTS)
 
 
 def active_costs(config: SafetyGymConfig) -> list[Cost]:
@@ -206,15 +213,20 @@ def compute_costs(
         ConfigError: if a registered cost is not one number of at least 0 per world.
     """
     magnitudes = [_magnitude(row, config, world) for row in rows]
-    if failed.any():
-        magnitudes = [torch.where(failed, 0.0, magnitude) for magnitude in magnitudes]
-    exceptions = failed.to(torch.float64)  # the sum has this type, whatever a registered cost has
+    if world.physics.maybe_any(failed):
+        magnitudes = [magnitude.masked_fill(failed, 0.0) for magnitude in magnitudes]
+    exceptions = failed.to(world.physics.dtype)  # the sum has this type, whatever a cost has
     costs = torch.stack([sum(magnitudes, start=exceptions), *magnitudes, exceptions])
-    lowest = costs.amin(-1)
-    if not (lowest >= 0.0).all():  # NaN is not: an indicator would make 0 of it
-        # after the sum, which may be lower still
-        number = 1 + int((~(lowest[1:] >= 0.0)).nonzero()[0])
-        wrong = float(lowest[number])
-        hint = "give every world a number" if math.isnan(wrong) else "clamp(min=0) it"
-        raise ConfigError(f"{cost_keys(rows)[number]} must be 0 or more, got {wrong:.4g}: {hint}.")
+    if any(row.key not in BUILT_IN for row in rows):
+        # NaN is not, either: an indicator would make 0 of it
+        world.physics.check(~(costs >= 0.0), partial(_wrong_cost, rows, costs))
     return costs.gt_(0.0) if config.constrain_indicator else costs
+
+
+def _wrong_cost(rows: Sequence[Cost], costs: Tensor) -> ConfigError:
+    """Name the first cost that is negative or NaN; the sum is the first row, and says less."""
+    lowest = costs.amin(-1)
+    number = 1 + int((~(lowest[1:] >= 0.0)).nonzero()[0])
+    wrong = float(lowest[number])
+    hint = "give every world a number" if math.isnan(wrong) else "clamp(min=0) it"
+    return ConfigError(f"{cost_keys(rows)[number]} must be 0 or more, got {wrong:.4g}: {hint}.")

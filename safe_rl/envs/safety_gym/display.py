@@ -251,7 +251,7 @@ class Viewer:
         self._window.close()
 
 
-def vision_blocks(config: SafetyGymConfig, scene: Scene) -> list[Block]:
+def vision_blocks(config: SafetyGymConfig, scene: Scene, device: torch.device) -> list[Block]:
     """The component `vision`: RGB in [0, 1], lines from top to bottom, [height, width, 3].
 
     Raises:
@@ -274,6 +274,6 @@ def vision_blocks(config: SafetyGymConfig, scene: Scene) -> list[Block]:
         for row, picture in enumerate(pixels):
             display.pose(world, row)
             picture.copy_(torch.from_numpy(display.frame(VISION, width, height)))
-        return pixels.flatten(1).to(torch.float64) / 255
+        return pixels.flatten(1).to(world.robot_pos) / 255
 
     return [Block({"vision": (height, width, 3)}, read, (0.0, 1.0))]

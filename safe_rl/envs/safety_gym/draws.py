@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from safe_rl.envs import rng
+from safe_rl.envs.physics import Physics
 from safe_rl.envs.safety_gym.config import SafetyGymConfig
 from safe_rl.envs.safety_gym.layouts import (
     LayoutError,
@@ -20,7 +21,13 @@ from safe_rl.envs.safety_gym.layouts import (
     resample_goal,
     sample_layouts,
 )
-from safe_rl.envs.safety_gym.state import place_mocaps, point_goal_at_button, pose_bodies, refresh
+from safe_rl.envs.safety_gym.state import (
+    place_mocaps,
+    point_goal_at_button,
+    pose_bodies,
+    put,
+    refresh,
+)
 from safe_rl.envs.safety_gym.tasks import goal_is_button
 from safe_rl.envs.safety_gym.world import Scene, World
 
@@ -68,11 +75,12 @@ def pinned_yaws(scene: Scene) -> Tensor:
     return yaws
 
 
-def draw_layouts(plan: PlacementPlan, key: Tensor) -> Tensor:
+def draw_layouts(plan: PlacementPlan, physics: Physics, key: Tensor) -> Tensor:
     """Draw where everything stands when episodes begin.
 
     Args:
         plan: what is placed where.
+        physics: the backend that it is for.
         key: random key of each episode, int64 [B].
 
     Returns:
@@ -83,7 +91,10 @@ def draw_layouts(plan: PlacementPlan, key: Tensor) -> Tensor:
     """
     layouts = sample_layouts(plan, rng.fold(key, Purpose.LAYOUT))
     if "goal" in plan.names:
-        _redraw_goals(plan, rng.fold(key, Purpose.FIRST_GOAL), layouts)
+        # The benchmark's first goals are second draws, which keep clear of objects that were placed
+        # to keep clear of the first. Where there is no other place, the first one stays.
+        position, found = resample_goal(plan, physics, rng.fold(key, Purpose.FIRST_GOAL), layouts)
+        put(layouts[:, plan.goal_column], found, position)
     return layouts
 
 
@@ -92,45 +103,33 @@ def start_episodes(world: World, layouts: Tensor, key: Tensor, mask: Tensor) -> 
 
     Args:
         world: the worlds; those in `mask` are brought up to date.
-        layouts: where everything stands in the B worlds of `mask`, [B, 1 + M, 2].
+        layouts: where everything stands [N, 1 + M, 2].
         key: random key of each world's episode, int64 [N].
         mask: worlds to start anew, bool [N].
     """
     scene = world.scene
-    rows = mask.nonzero()[:, 0]
-    key = key[rows]
-    world.layout[rows] = layouts
-    drawn = 2 * math.pi * rng.uniform(key[:, None], Purpose.YAW, torch.arange(1 + scene.num_free))
-    pinned = pinned_yaws(scene)
-    yaws = torch.where(pinned.isnan(), drawn, pinned)
+    put(world.layout, mask, layouts)
+    pinned = pinned_yaws(scene).to(key.device)
+    body = torch.arange(len(pinned), device=key.device)
+    drawn = 2 * math.pi * rng.uniform(key[:, None], Purpose.YAW, body)
     world.physics.reset(mask)
-    pose_bodies(world, rows, yaws)
-    world.positions[rows, scene.num_free :, :2] = world.layout[rows, 1 + scene.num_free :]
+    pose_bodies(world, mask, torch.where(pinned.isnan(), drawn, pinned))
+    static = world.positions[:, scene.num_free :, :2]
+    put(static, mask, world.layout[:, 1 + scene.num_free :])
     if goal_is_button(scene.config.task):
-        _choose_button(world, rows, rng.fold(key, Purpose.BUTTON))
-    world.step_count[rows] = 0
-    world.buttons_timer[rows] = 0
+        _choose_button(world, rng.fold(key, Purpose.BUTTON), mask)
+    world.step_count.masked_fill_(mask, 0)
+    world.buttons_timer.masked_fill_(mask, 0)
     place_mocaps(world)
     world.physics.forward(mask)
     refresh(world)
 
 
-def _redraw_goals(plan: PlacementPlan, key: Tensor, layouts: Tensor) -> None:
-    """Draw the goals of layouts [B, 1 + M, 2] once more, when everything stands, in place.
-
-    The benchmark's first goals are second draws, which keep clear of objects that were placed to
-    keep clear of the first. Where 10,000 draws find no other place, the first one stays.
-    """
-    position, ok = resample_goal(plan, key, layouts)
-    layouts[ok, plan.goal_column] = position[ok]
-
-
-def _choose_button(world: World, rows: Tensor, key: Tensor) -> None:
-    """Choose goal buttons uniformly; the same one may come again."""
-    number = world.scene.config.buttons_num
-    button = (rng.uniform(key) * number).to(torch.int64)
-    world.goal_button[rows] = button
-    point_goal_at_button(world, rows)
+def _choose_button(world: World, key: Tensor, mask: Tensor) -> None:
+    """Choose goal buttons uniformly in some worlds; the same one may come again."""
+    button = (rng.uniform(key) * world.scene.config.buttons_num).to(torch.int64)
+    put(world.goal_button, mask, button)
+    point_goal_at_button(world, mask)
 
 
 def next_goals(world: World, plan: PlacementPlan, key: Tensor, mask: Tensor) -> Tensor:
@@ -148,26 +147,28 @@ def next_goals(world: World, plan: PlacementPlan, key: Tensor, mask: Tensor) -> 
     Raises:
         LayoutError: for those, if `terminate_resample_failure` is False.
     """
-    config = world.scene.config
-    rows = mask.nonzero()[:, 0]
-    world.buttons_timer[rows] = config.buttons_resampling_delay
-    stuck = torch.zeros_like(mask)
+    config, physics = world.scene.config, world.physics
+    world.buttons_timer.masked_fill_(mask, config.buttons_resampling_delay)
     if goal_is_button(config.task):
-        _choose_button(world, rows, rng.fold(key[rows], Purpose.BUTTON))
-        return stuck
-    position, ok = resample_goal(plan, rng.fold(key[rows], Purpose.GOAL), _current(world)[rows])
-    found, column = rows[ok], plan.goal_column
-    world.positions[found, column - 1, :2] = position[ok]
-    world.layout[found, column] = position[ok]
-    stuck[rows[~ok]] = True
-    if stuck.any() and not config.terminate_resample_failure:
-        raise LayoutError(
-            "No place for a new goal was found. Use fewer objects or smaller keepouts, or set "
-            "'terminate_resample_failure' to end such episodes."
-        )
+        _choose_button(world, rng.fold(key, Purpose.BUTTON), mask)
+        return torch.zeros_like(mask)
+    goal_key, column = rng.fold(key, Purpose.GOAL), plan.goal_column
+    position, found = resample_goal(plan, physics, goal_key, _current(world), mask)
+    put(world.positions[:, column - 1, :2], found, position)
+    put(world.layout[:, column], found, position)
+    stuck = mask & ~found
+    if not config.terminate_resample_failure:
+        physics.check(stuck, _no_place)
     if world.scene.num_mocap_slots:
         place_mocaps(world)
     return stuck
+
+
+def _no_place() -> LayoutError:
+    return LayoutError(
+        "No place for a new goal was found. Use fewer objects or smaller keepouts, or set "
+        "'terminate_resample_failure' to end such episodes."
+    )
 
 
 def _current(world: World) -> Tensor:
@@ -181,13 +182,13 @@ def _current(world: World) -> Tensor:
 
 def control_noise(config: SafetyGymConfig, key: Tensor, num_controls: int) -> Tensor:
     """Draw the configured Gaussian noise on the controls: keys [N] -> [N, nu]."""
-    columns = torch.arange(num_controls)
+    columns = torch.arange(num_controls, device=key.device)
     return config.action_noise * rng.normal(key[:, None], Purpose.NOISE, columns)
 
 
 def draw_substeps(config: SafetyGymConfig, key: Tensor) -> Tensor:
     """Draw numbers of substeps, Binomial(n, p): keys [N] -> int64 [N]."""
-    trials = torch.arange(config.frameskip_binom_n)
+    trials = torch.arange(config.frameskip_binom_n, device=key.device)
     draws = rng.uniform(key[:, None], Purpose.FRAMESKIP, trials)
     return (draws < config.frameskip_binom_p).sum(-1)
 
@@ -204,6 +205,7 @@ class LayoutsAhead:
             none for one of them.
         num_envs: number of rows, N.
         num_columns: 1 + M.
+        device: where the keys are.
 
     Examples:
         >>> asked = []
@@ -212,16 +214,24 @@ class LayoutsAhead:
         ...     return key.view(-1, 1, 1).expand(-1, 1, 2).double()
         >>> layouts = LayoutsAhead(draw, num_envs=2, num_columns=1)
         >>> layouts(torch.tensor([1, 2]), torch.tensor([3, 4]), torch.tensor([True, False]))
-        tensor([[[1., 1.]]], dtype=torch.float64)
+        tensor([[[1., 1.]],
+        <BLANKLINE>
+                [[4., 4.]]], dtype=torch.float64)
         >>> asked  # of the second row, what comes next
         [[1, 4]]
     """
 
-    def __init__(self, draw: Callable[[Tensor], Tensor], num_envs: int, num_columns: int) -> None:
+    def __init__(
+        self,
+        draw: Callable[[Tensor], Tensor],
+        num_envs: int,
+        num_columns: int,
+        device: torch.device | None = None,
+    ) -> None:
         self._draw = draw
-        self._known = torch.zeros(num_envs, dtype=torch.bool)
-        self._keys = torch.zeros(num_envs, dtype=torch.int64)
-        self._layouts = torch.zeros(num_envs, num_columns, 2, dtype=torch.float64)
+        self._known = torch.zeros(num_envs, dtype=torch.bool, device=device)
+        self._keys = torch.zeros(num_envs, dtype=torch.int64, device=device)
+        self._layouts = torch.zeros(num_envs, num_columns, 2, dtype=torch.float64, device=device)
 
     def __call__(self, key: Tensor, following: Tensor, mask: Tensor) -> Tensor:
         """Layouts of the rows of a mask.
@@ -232,12 +242,12 @@ class LayoutsAhead:
             mask: rows whose episodes begin, bool [N].
 
         Returns:
-            Positions [B, 1 + M, 2] of the B rows of `mask`.
+            Positions [N, 1 + M, 2], those of the rows of `mask` up to date.
 
         Raises:
             LayoutError: naming the object that did not fit.
         """
-        if self._lacks(key)[mask].any():
+        if (self._lacks(key) & mask).any():
             wanted = torch.where(mask, key, following)
             missing = self._lacks(wanted)
             try:
@@ -245,7 +255,7 @@ class LayoutsAhead:
             except LayoutError:
                 # perhaps there is none for an episode that never comes
                 self._remember(wanted, missing & mask)
-        return self._layouts[mask]
+        return self._layouts
 
     def _lacks(self, key: Tensor) -> Tensor:
         return (self._keys != key) | ~self._known

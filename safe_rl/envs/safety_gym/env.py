@@ -6,11 +6,13 @@ from collections.abc import Mapping, Sequence
 from functools import partial
 from typing import Any, ClassVar
 
+import mujoco
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
 from safe_rl.envs import rng
+from safe_rl.envs.physics import Physics
 from safe_rl.envs.physics.batch import BatchPhysics
 from safe_rl.envs.safety_gym.building import build_scene
 from safe_rl.envs.safety_gym.config import SafetyGymConfig
@@ -33,6 +35,7 @@ from safe_rl.envs.safety_gym.state import (
     check_worlds,
     gremlin_path,
     make_world,
+    put,
     read_state,
     refresh,
     write_state,
@@ -99,22 +102,26 @@ class SafetyGymEnv(SimulatedEnv):
         self._physics_settings += (sleep,)
         self.config = resolve(env)
         scene = build_scene(self.config, sleep)
-        self._physics = BatchPhysics(scene.model, num_envs, num_threads)
+        self._physics = physics = self._make_physics(scene.model, num_threads)
         self.seconds_per_step = self._physics.timestep * self.config.frameskip_binom_n
         self._world = make_world(scene, self._physics)
-        self._plan = plan_placements(self.config, scene.slots, len(scene.names))
-        self._layouts = LayoutsAhead(
-            partial(draw_layouts, self._plan), num_envs, self._plan.num_columns
-        )
-        self._observer = make_observer(scene)
+        self._plan = plan_placements(self.config, scene.slots, len(scene.names), physics.device)
+        draw = partial(draw_layouts, self._plan, physics)
+        self._layouts = LayoutsAhead(draw, num_envs, self._plan.num_columns, physics.device)
+        self._observer = make_observer(scene, physics.device)
         self._task = TASKS[self.config.task]
         self._measured = self._task.measure(self._world).detach().clone()
-        self._renderer = WorldRenderer(self._world, lidar_blocks(self.config, scene))
+        self._renderer = WorldRenderer(
+            self._world, lidar_blocks(self.config, scene, physics.device)
+        )
         self._costs = active_costs(self.config)
         self.cost_keys = cost_keys(self._costs)
         observed = observation_spec(self.config, self._observer, num_envs, self.device)
         highest = 1.0 if self.config.constrain_indicator else torch.finfo(torch.float32).max
         self._announce(scene.model, observed, highest, seed)
+
+    def _make_physics(self, model: mujoco.MjModel, num_threads: int) -> Physics:
+        return BatchPhysics(model, self.batch_size[0], num_threads)
 
     @property
     def object_names(self) -> tuple[str, ...]:
@@ -130,7 +137,11 @@ class SafetyGymEnv(SimulatedEnv):
         super()._set_seed(seed)
         if seed is not None:
             # One layout for all rows where the configuration wants a single one.
-            self._fixed_layout = rng.fold(torch.tensor(seed), Purpose.LAYOUT)
+            self._fixed_layout = self._layout_of(seed)
+
+    def _layout_of(self, seed: int) -> Tensor:
+        """Random key of the single layout of a seed."""
+        return rng.fold(torch.tensor(seed, device=self._physics.device), Purpose.LAYOUT)
 
     def set_row_seeds(self, seeds: Sequence[int | None]) -> None:
         """Seed every world on its own, [N], its layout too; None leaves one as it was seeded."""
@@ -138,7 +149,7 @@ class SafetyGymEnv(SimulatedEnv):
         self._fixed_layout = self._fixed_layout.expand(self.batch_size).clone()
         for row, seed in enumerate(seeds):
             if seed is not None:
-                self._fixed_layout[row] = rng.fold(torch.tensor(seed), Purpose.LAYOUT)
+                self._fixed_layout[row] = self._layout_of(seed)
 
     def _layout_key(self, ahead: int = 0) -> Tensor:
         """Random key of the layouts of so many episodes after the present ones, [N]."""
@@ -155,7 +166,7 @@ class SafetyGymEnv(SimulatedEnv):
         key = self._layout_key()
         layouts = self._layouts(key, self._layout_key(ahead=1), mask)
         start_episodes(self._world, layouts, key, mask)
-        self._measured[mask] = self._task.measure(self._world)[mask]
+        put(self._measured, mask, self._task.measure(self._world))
 
     def _observe(self) -> Tensor | TensorDict:
         flat = self._observer.read(self._world).to(self.device)
@@ -169,7 +180,8 @@ class SafetyGymEnv(SimulatedEnv):
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         world, config = self._world, self.config
         action = self._checked_action(tensordict)
-        require_episodes(self._begun)
+        if not self._all_begun:
+            require_episodes(self._begun)
         failed = self._advance(action)
         now = self._task.measure(world)
         reward = dense_reward(self._task, config, world, self._measured, now, failed)
@@ -208,8 +220,8 @@ class SafetyGymEnv(SimulatedEnv):
         self._measured.copy_(now)
         if self._task.met is None:
             return torch.zeros_like(failed), None
-        met = goals_met(self._task, self.config, self._world, now) & ~failed
-        if not (self.config.continue_goal and met.any()):
+        met = goals_met(self._task, self.config, self._world, now, failed)
+        if not (self.config.continue_goal and self._physics.maybe_any(met)):
             return met, None
         stuck = next_goals(self._world, self._plan, self._step_key(), met)
         self._measured.copy_(self._task.measure(self._world))

@@ -80,10 +80,10 @@ def circling_targets(
     Returns:
         [N, S, K, 3]; at time 0 a target stands at +travel along y.
     """
-    steps = torch.arange(num_substeps, dtype=time.dtype)
+    steps = torch.arange(num_substeps, dtype=time.dtype, device=time.device)
     phase = (time.unsqueeze(-1) + timestep * steps)[..., None]
-    radius = torch.as_tensor(travel, dtype=time.dtype).unsqueeze(-1)
+    radius = torch.as_tensor(travel, dtype=time.dtype, device=time.device).unsqueeze(-1)
     offset = radius * torch.stack([torch.sin(phase), torch.cos(phase)], -1)
     targets = centres.unsqueeze(1) + offset
-    z = torch.as_tensor(height, dtype=time.dtype).expand(targets.shape[:-1])
+    z = torch.as_tensor(height, dtype=time.dtype, device=time.device).expand(targets.shape[:-1])
     return torch.cat([targets, z.unsqueeze(-1)], -1)

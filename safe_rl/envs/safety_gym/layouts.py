@@ -16,6 +16,7 @@ from torch import Tensor
 
 from safe_rl.envs import rng
 from safe_rl.envs.errors import ConfigError
+from safe_rl.envs.physics import Physics
 from safe_rl.envs.safety_gym.config import SafetyGymConfig
 from safe_rl.envs.safety_gym.elements import BY_KIND, PLACEMENT_ORDER
 from safe_rl.envs.safety_gym.tasks import goal_is_button
@@ -57,7 +58,7 @@ class PlacementPlan:
         """The goal's place in the order, the others' columns [P - 1], and clearances [P - 1]."""
         item = self.names.index("goal")
         others = [i for i in range(len(self.names)) if i != item]
-        columns = torch.tensor([self.columns[i] for i in others])
+        columns = torch.tensor([self.columns[i] for i in others], device=self.keepouts.device)
         return item, columns, self.clearance(item, others)
 
     def clearance(self, item: int, others: slice | list[int]) -> Tensor:
@@ -66,7 +67,10 @@ class PlacementPlan:
 
 
 def plan_placements(
-    config: SafetyGymConfig, slots: Mapping[str, slice], num_slots: int
+    config: SafetyGymConfig,
+    slots: Mapping[str, slice],
+    num_slots: int,
+    device: torch.device | None = None,
 ) -> PlacementPlan:
     """Build the plan of a configuration.
 
@@ -74,6 +78,7 @@ def plan_placements(
         config: the environment.
         slots: slots of each kind that has objects.
         num_slots: M.
+        device: where layouts are drawn.
 
     Raises:
         ConfigError: if a placement leaves no room for its object's keepout.
@@ -98,9 +103,9 @@ def plan_placements(
         kinds=tuple(kinds),
         columns=tuple(columns),
         num_columns=1 + num_slots,
-        rectangles=stacked,
-        thresholds=thresholds,
-        keepouts=torch.tensor(keepouts, dtype=torch.float64),
+        rectangles=stacked.to(device),
+        thresholds=thresholds.to(device),
+        keepouts=torch.tensor(keepouts, dtype=torch.float64, device=device),
         margin=config.placements_margin,
     )
 
@@ -149,6 +154,8 @@ def _stack(rectangles: list[list[tuple[float, ...]]]) -> tuple[Tensor, Tensor]:
 TRIES_PER_OBJECT = 100
 TRIES_PER_LAYOUT = 10_000
 TRIES_PER_GOAL = 10_000
+# Where the host does not look whether all have a place, always as many: as good as enough.
+TRIES_UNSEEN = 200
 _BLOCK = 10  # candidates for an object that are tested at once
 _GOAL_BLOCK = 40  # and for a new goal: mostly enough, and a second round takes as long again
 _MAX_ROWS = 4096  # layouts, or candidates for new goals, at once: a bound on memory
@@ -165,7 +172,7 @@ class LayoutError(RuntimeError):
 def _draw(plan: PlacementPlan, item: int, key: Tensor) -> Tensor:
     """One candidate position of an object per key: [...] -> [..., 2]."""
     rectangles, thresholds = plan.rectangles[item], plan.thresholds[item]
-    uniform = rng.uniform(key.unsqueeze(-1), torch.arange(3))
+    uniform = rng.uniform(key.unsqueeze(-1), torch.arange(3, device=key.device))
     if len(rectangles) == 1:
         chosen = rectangles[0]
     else:
@@ -186,9 +193,10 @@ def _place(plan: PlacementPlan, item: int, key: Tensor, placed: Tensor) -> tuple
     """Place one object beside those placed before: keys [B], placed [B, K, 2] -> [B, 2], ok [B]."""
     clearance = plan.clearance(item, slice(item))
     position = placed.new_zeros(len(key), 2)
-    pending = torch.arange(len(key))
+    pending = torch.arange(len(key), device=key.device)
     for start in range(0, TRIES_PER_OBJECT, _BLOCK):
-        tries = rng.fold(key[pending, None], torch.arange(start, start + _BLOCK))
+        numbers = torch.arange(start, start + _BLOCK, device=key.device)
+        tries = rng.fold(key[pending, None], numbers)
         candidates = _draw(plan, item, tries)
         fits = _fits(candidates, placed[pending], clearance)
         found, first = fits.any(-1), fits.to(torch.uint8).argmax(-1)
@@ -197,14 +205,14 @@ def _place(plan: PlacementPlan, item: int, key: Tensor, placed: Tensor) -> tuple
         pending = pending[~found]
         if not len(pending):
             break
-    return position, torch.ones(len(key), dtype=torch.bool).index_fill(0, pending, False)
+    return position, torch.ones_like(key, dtype=torch.bool).index_fill(0, pending, False)
 
 
 def _try_layouts(plan: PlacementPlan, key: Tensor) -> tuple[Tensor, Tensor]:
     """Try one layout per key [B]: positions [B, P, 2], and the object that did not fit or -1."""
-    positions = torch.zeros(len(key), len(plan.names), 2, dtype=torch.float64)
-    misfit = torch.full((len(key),), -1)
-    alive = torch.arange(len(key))
+    positions = plan.keepouts.new_zeros(len(key), len(plan.names), 2)
+    misfit = torch.full_like(key, -1)
+    alive = torch.arange(len(key), device=key.device)
     for item in range(len(plan.names)):
         placed = positions[alive, :item]
         positions[alive, item], ok = _place(plan, item, rng.fold(key[alive], item), placed)
@@ -215,10 +223,10 @@ def _try_layouts(plan: PlacementPlan, key: Tensor) -> tuple[Tensor, Tensor]:
     return positions, misfit
 
 
-def _rounds(total: int, rows: int, first: int = 1) -> Iterator[tuple[int, int]]:
+def _rounds(total: int, rows: int) -> Iterator[tuple[int, int]]:
     """Ranges of attempts that grow, so that a few stubborn rows don't take thousands of rounds."""
     start, most = 0, max(1, _MAX_ROWS // max(1, rows))
-    size = min(first, most)
+    size = 1
     while start < total:
         stop = min(start + size, total)
         yield start, stop
@@ -241,17 +249,18 @@ def sample_layouts(plan: PlacementPlan, key: Tensor) -> Tensor:
     Raises:
         LayoutError: naming the object that did not fit, and the keys that it depends on.
     """
-    layouts = torch.zeros(len(key), plan.num_columns, 2, dtype=torch.float64)
-    misfits = torch.zeros(len(plan.names), dtype=torch.int64)
-    pending = torch.arange(len(key))
+    layouts = plan.keepouts.new_zeros(len(key), plan.num_columns, 2)
+    misfits = key.new_zeros(len(plan.names))
+    columns = torch.tensor(plan.columns, device=key.device)
+    pending = torch.arange(len(key), device=key.device)
     for start, stop in _rounds(TRIES_PER_LAYOUT, len(key)):
-        attempts = rng.fold(key[pending, None], torch.arange(start, stop))
+        attempts = rng.fold(key[pending, None], torch.arange(start, stop, device=key.device))
         positions, misfit = _try_layouts(plan, attempts.flatten())
         misfits += torch.bincount(misfit[misfit >= 0], minlength=len(misfits))
         good = (misfit < 0).view(len(pending), stop - start)
         found, first = good.any(-1), good.to(torch.uint8).argmax(-1)
         chosen = positions.view(*good.shape, len(plan.names), 2)[found, first[found]]
-        layouts[pending[found].unsqueeze(1), torch.tensor(plan.columns)] = chosen
+        layouts[pending[found].unsqueeze(1), columns] = chosen
         pending = pending[~found]
         if not len(pending):
             return layouts
@@ -263,7 +272,8 @@ def sample_layouts(plan: PlacementPlan, key: Tensor) -> Tensor:
 def _is_hopeless(misfits: Tensor) -> bool:
     """Whether enough layouts have failed, by the number of those that failed at each object."""
     failed = int(misfits.sum())
-    pairs = int((misfits * torch.arange(1, 1 + len(misfits)).square()).sum())
+    numbers = torch.arange(1, 1 + len(misfits), device=misfits.device)
+    pairs = int((misfits * numbers.square()).sum())
     return failed >= _HOPELESS_LAYOUTS[pairs < _HOPELESS_PAIRS]
 
 
@@ -278,26 +288,43 @@ def _no_layout(plan: PlacementPlan, misfits: Tensor) -> LayoutError:
     )
 
 
-def resample_goal(plan: PlacementPlan, key: Tensor, layouts: Tensor) -> tuple[Tensor, Tensor]:
+def resample_goal(
+    plan: PlacementPlan,
+    physics: Physics,
+    key: Tensor,
+    layouts: Tensor,
+    wanted: Tensor | None = None,
+) -> tuple[Tensor, Tensor]:
     """Draw a new goal position beside everything else where it is now.
 
     Args:
         plan: the plan, with a goal in it.
+        physics: the backend that it is for, which says whether the host looks at results.
         key: random keys, int64 [B].
         layouts: current positions [B, 1 + M, 2].
+        wanted: layouts that get a new goal, bool [B]; None: all.
 
     Returns:
-        The new positions [B, 2], and whether one was found within 10,000 draws [B].
+        The new positions [B, 2], and whether one was wanted and found within 10,000 draws [B],
+        or within 200 where the host does not look.
     """
     item, columns, clearance = plan.beside_goal
-    placed = layouts.index_select(1, columns)
-    position, pending = layouts.new_zeros(len(key), 2), torch.arange(len(key))
-    for start, stop in _rounds(TRIES_PER_GOAL, len(key), first=_GOAL_BLOCK):
-        candidates = _draw(plan, item, rng.fold(key[pending, None], torch.arange(start, stop)))
-        fits = _fits(candidates, placed[pending], clearance)
-        found, first = fits.any(-1), fits.to(torch.uint8).argmax(-1)
-        position[pending[found]] = candidates[found, first[found]]
-        pending = pending[~found]
-        if not len(pending):
-            break
-    return position, torch.ones(len(key), dtype=torch.bool).index_fill(0, pending, False)
+    position = layouts.new_zeros(len(key), 2)
+    missing = torch.ones_like(key, dtype=torch.bool) if wanted is None else wanted
+    placed, wanted = layouts.index_select(1, columns), missing
+    start, block = 0, _GOAL_BLOCK
+    most = TRIES_UNSEEN if physics.waits else TRIES_PER_GOAL
+    while start < most and physics.maybe_any(missing):
+        rows = physics.rows(missing)
+        at_once = block if physics.waits else max(1, _MAX_ROWS // len(rows))
+        stop = min(start + block, start + at_once, most)
+        tries = torch.arange(start, stop, device=key.device)
+        candidates = _draw(plan, item, rng.fold(key[rows, None], tries))
+        fits = _fits(candidates, placed[rows], clearance)
+        first = fits.to(torch.uint8).argmax(-1)
+        chosen = candidates.gather(1, first.view(-1, 1, 1).expand(-1, 1, 2))[:, 0]
+        found = fits.any(-1) & missing[rows]
+        position[rows] = torch.where(found.unsqueeze(-1), chosen.to(position), position[rows])
+        missing = missing.index_put((rows,), missing[rows] & ~found)
+        start, block = stop, 4 * block
+    return position, wanted & ~missing

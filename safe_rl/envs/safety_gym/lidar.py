@@ -10,7 +10,6 @@ import math
 from collections.abc import Callable
 from functools import cache, partial, reduce
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -36,11 +35,13 @@ def lidar_cells(group: Tensor, num_groups: int, num_bins: int, num_robots: int) 
         num_robots: N.
 
     Returns:
-        int64 [N, M]; robot after robot, lidar after lidar, each of several turns of the circle.
+        int64 [3, N, M], for the bin before, that of the object and the one after; robot after
+        robot, lidar after lidar, each of several turns of the circle.
     """
     laps = _num_laps(num_bins)
-    lidar = num_groups * torch.arange(num_robots).unsqueeze(1) + group
-    return (laps * lidar + laps // 2) * num_bins
+    robot = torch.arange(num_robots, device=group.device).unsqueeze(1)
+    cells = (laps * (num_groups * robot + group) + laps // 2) * num_bins
+    return torch.stack([cells, cells + 1, cells + 2])
 
 
 def pseudo_lidar(
@@ -54,11 +55,9 @@ def pseudo_lidar(
 ) -> Tensor:
     """Closeness of the nearest object in every direction, for several kinds of object at once.
 
-    On the CPU, where the worlds are.
-
     Args:
         ego_xy: objects in the robot's frame [N, M, 2] (m).
-        cells: of the objects, from `lidar_cells` [N, M].
+        cells: of the objects, from `lidar_cells` [3, N, M].
         num_groups: number of lidars, G.
         num_bins: bins over the full circle, counter-clockwise from the robot's x axis.
         max_dist: readings fall linearly to 0 at this distance [m]; None: they fall as exp(-gain d).
@@ -77,25 +76,25 @@ def pseudo_lidar(
     # In two steps: then straight behind, either way round, is half of the bins to the last digit.
     turn = torch.atan2(y, x).div_(2 * math.pi).mul_(num_bins)
     bins = turn.floor()
-    index = bins.to(torch.int64).add_(cells).flatten().numpy()
-    shifted = {1: reading}
+    values = reading.unsqueeze(0)
     if alias:
-        ahead = turn.sub_(bins).mul_(reading)
-        shifted |= {2: ahead, 0: reading - ahead}
-    shape = (len(reading), num_groups, _num_laps(num_bins), num_bins)
+        after = turn.sub_(bins).mul_(reading)
+        values = torch.stack([reading - after, reading, after])
+    else:
+        cells = cells[1:2]
+    index = (bins.to(torch.int64) + cells).flatten()
+    shape = (len(x), num_groups, _num_laps(num_bins), num_bins)
     turns = reading.new_zeros(math.prod(shape) + 2)
-    for shift, values in shifted.items():
-        # Half the time of torch's scatter_reduce, which branches on every value.
-        np.maximum.at(turns.numpy()[shift:], index, values.flatten().numpy())
+    turns.scatter_reduce_(0, index, values.flatten(), "amax")
     return reduce(torch.maximum, turns[1:-1].view(shape).unbind(2)).flatten(1)
 
 
-def lidar_blocks(config: SafetyGymConfig, scene: Scene) -> list[Block]:
+def lidar_blocks(config: SafetyGymConfig, scene: Scene, device: torch.device) -> list[Block]:
     """All lidars of a configuration, as one block."""
     elements = [element for element in ELEMENTS if element.observed(config)]
     if not elements:
         return []
-    read = _LIDARS[config.lidar_type](config, scene, elements)
+    read = _LIDARS[config.lidar_type](config, scene, elements, device)
     bins, kinds = config.lidar_num_bins, [element.kind for element in elements]
     if "buttons" in kinds:
         first = kinds.index("buttons") * bins
@@ -115,7 +114,7 @@ def _while_awake(read: Callable[[World], Tensor], columns: slice) -> Callable[[W
 
 
 def _pseudo(
-    config: SafetyGymConfig, scene: Scene, elements: list[Element]
+    config: SafetyGymConfig, scene: Scene, elements: list[Element], device: torch.device
 ) -> Callable[[World], Tensor]:
     """Every object that any lidar sees, in one pass."""
     kinds = [element.kind for element in elements]
@@ -125,9 +124,10 @@ def _pseudo(
         for slot in range(span.start, span.stop)
         if kind in kinds
     )
-    slots, group = torch.tensor(seen, dtype=torch.int64).view(-1, 2).T.contiguous()
+    pairs = torch.tensor(seen, dtype=torch.int64, device=device)
+    slots, group = pairs.view(-1, 2).T.contiguous()
     at_origin = [kinds.index(kind) for kind in TASKS[config.task].at_origin if kind in kinds]
-    group = torch.cat([group, torch.tensor(at_origin, dtype=torch.int64)])
+    group = torch.cat([group, group.new_tensor(at_origin)])
     # The same at every step, but how many robots there are is known at the first.
     cells = cache(partial(lidar_cells, group, len(kinds), config.lidar_num_bins))
     all_seen = len(slots) == len(scene.names)
@@ -158,7 +158,7 @@ def ray_directions(num_rays: int) -> Tensor:
 
 
 def _natural(
-    config: SafetyGymConfig, scene: Scene, elements: list[Element]
+    config: SafetyGymConfig, scene: Scene, elements: list[Element], device: torch.device
 ) -> Callable[[World], Tensor]:
     """Rays that see one geom group each: exp(-distance), 0 for a miss.
 
@@ -166,9 +166,9 @@ def _natural(
     quirks are kept: the goal's group is the floor's and the robot's limbs' too, and groups beyond
     MuJoCo's six (the circle's) are never seen.
     """
-    rays = ray_directions(config.lidar_num_bins)
+    rays = ray_directions(config.lidar_num_bins).to(device)
     groups = list(dict.fromkeys(element.group for element in elements))
-    column = torch.tensor([groups.index(element.group) for element in elements])
+    column = torch.tensor([groups.index(element.group) for element in elements], device=device)
 
     def read_group(world: World, group: int, directions: Tensor) -> Tensor:
         if group >= NUM_RAY_GROUPS:
@@ -177,7 +177,7 @@ def _natural(
         return torch.where(distance >= 0, torch.exp(-distance), 0.0)
 
     def read(world: World) -> Tensor:
-        directions = rays @ world.robot_mat.transpose(-1, -2)
+        directions = rays.to(world.robot_mat.dtype) @ world.robot_mat.transpose(-1, -2)
         seen = torch.stack([read_group(world, group, directions) for group in groups], 1)
         return seen.index_select(1, column).flatten(1)
 

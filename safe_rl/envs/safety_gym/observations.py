@@ -23,7 +23,7 @@ from safe_rl.envs.safety_gym.readings import READINGS, Reading, sensor_blocks
 from safe_rl.envs.safety_gym.world import Block, Bounds, Scene, Shapes, World
 
 
-def _plain(config: SafetyGymConfig, scene: Scene) -> list[Block]:
+def _plain(config: SafetyGymConfig, scene: Scene, device: torch.device) -> list[Block]:
     return [
         Block({row.name: (size,)}, partial(_read, row, size), row.bounds)
         for row in READINGS
@@ -44,7 +44,7 @@ def _read(row: Reading, size: int, world: World) -> Tensor:
     return values
 
 
-SOURCES: tuple[Callable[[SafetyGymConfig, Scene], list[Block]], ...] = (
+SOURCES: tuple[Callable[[SafetyGymConfig, Scene, torch.device], list[Block]], ...] = (
     sensor_blocks,
     lidar_blocks,
     _plain,
@@ -80,14 +80,14 @@ class Observer(NamedTuple):
         }
 
 
-def make_observer(scene: Scene) -> Observer:
-    """Resolve what a configuration observes.
+def make_observer(scene: Scene, device: torch.device) -> Observer:
+    """Resolve what a configuration observes, with indices on the device of the worlds.
 
     Raises:
         ConfigError: for sensors the robot does not have, if two components have one name, or if
             nothing is observed.
     """
-    blocks = [block for source in SOURCES for block in source(scene.config, scene)]
+    blocks = [block for source in SOURCES for block in source(scene.config, scene, device)]
     names = [name for block in blocks for name in block.shapes]
     if not names:
         raise ConfigError("Nothing is observed: set at least one 'observe_*' key.")
@@ -108,7 +108,7 @@ def make_observer(scene: Scene) -> Observer:
         size = math.prod(shape)
         columns[name], first = slice(first, first + size), first + size
         order += range(starts[name], starts[name] + size)
-    permutation = torch.tensor(order)
+    permutation = torch.tensor(order, device=device)
 
     def read(world: World) -> Tensor:
         values = torch.cat([block.read(world) for block in blocks], -1)

@@ -127,10 +127,11 @@ READINGS: list[Reading] = [
 ]
 
 
-def _columns(model: mujoco.MjModel, sensors: list[int]) -> Tensor:
+def _columns(model: mujoco.MjModel, sensors: list[int], device: torch.device) -> Tensor:
     """`sensordata` columns of sensors, in their order."""
     spans = [(model.sensor_adr[i], model.sensor_adr[i] + model.sensor_dim[i]) for i in sensors]
-    return torch.tensor([column for span in spans for column in range(*span)], dtype=torch.int64)
+    columns = [column for span in spans for column in range(*span)]
+    return torch.tensor(columns, dtype=torch.int64, device=device)
 
 
 def _joint_sensors(scene: Scene, kind: mujoco.mjtSensor, joint: mujoco.mjtJoint) -> list[int]:
@@ -155,7 +156,7 @@ def _named_sensors(config: SafetyGymConfig, scene: Scene) -> list[int]:
     return [known[name] for name in config.sensors_obs]
 
 
-def sensor_blocks(config: SafetyGymConfig, scene: Scene) -> list[Block]:
+def sensor_blocks(config: SafetyGymConfig, scene: Scene, device: torch.device) -> list[Block]:
     """Robot sensors: raw ones, hinge angles as (sin, cos), ball joints as rotation matrices.
 
     Raises:
@@ -183,18 +184,18 @@ def sensor_blocks(config: SafetyGymConfig, scene: Scene) -> list[Block]:
     if not config.sensors_angle_components:
         raw, angles, quaternions = raw + angles + quaternions, [], []
     readers = ((raw, _read_raw), (angles, _read_angles), (quaternions, _read_rotations))
-    return [reader(scene.model, group) for group, reader in readers if group]
+    return [reader(scene.model, group, device) for group, reader in readers if group]
 
 
-def _read_raw(model: mujoco.MjModel, sensors: list[int]) -> Block:
+def _read_raw(model: mujoco.MjModel, sensors: list[int], device: torch.device) -> Block:
     shapes: Shapes = {model.sensor(i).name: (int(model.sensor_dim[i]),) for i in sensors}
-    columns = _columns(model, sensors)
+    columns = _columns(model, sensors, device)
     return Block(shapes, lambda w: w.sensordata.index_select(1, columns))
 
 
-def _read_angles(model: mujoco.MjModel, sensors: list[int]) -> Block:
+def _read_angles(model: mujoco.MjModel, sensors: list[int], device: torch.device) -> Block:
     shapes: Shapes = {model.sensor(i).name: (2,) for i in sensors}
-    columns = _columns(model, sensors)
+    columns = _columns(model, sensors, device)
 
     def read(world: World) -> Tensor:
         angle = world.sensordata.index_select(1, columns)
@@ -203,9 +204,9 @@ def _read_angles(model: mujoco.MjModel, sensors: list[int]) -> Block:
     return Block(shapes, read)
 
 
-def _read_rotations(model: mujoco.MjModel, sensors: list[int]) -> Block:
+def _read_rotations(model: mujoco.MjModel, sensors: list[int], device: torch.device) -> Block:
     shapes: Shapes = {model.sensor(i).name: (3, 3) for i in sensors}
-    columns = _columns(model, sensors)
+    columns = _columns(model, sensors, device)
 
     def read(world: World) -> Tensor:
         quaternion = world.sensordata.index_select(1, columns).unflatten(1, (-1, 4))

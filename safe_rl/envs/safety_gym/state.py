@@ -2,24 +2,28 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
-from safe_rl.envs.physics.batch import BatchPhysics
+from safe_rl.envs.physics import Physics
 from safe_rl.envs.safety_gym.geometry import circling_targets, yaw_quaternion
 from safe_rl.envs.safety_gym.tasks import TASKS, goal_is_button
 from safe_rl.envs.safety_gym.world import NO_BUTTON, Scene, World
 from safe_rl.envs.simulated import check_state
 
 
-def make_world(scene: Scene, physics: BatchPhysics) -> World:
+def make_world(scene: Scene, physics: Physics) -> World:
     """Bind the views of a scene to the tensors of a physics backend."""
     num_envs, num_objects = physics.qpos.shape[0], len(scene.names)
+    real: dict[str, Any] = {"dtype": physics.dtype, "device": physics.device}
+    whole: dict[str, Any] = {"dtype": torch.int64, "device": physics.device}
     robot, model = scene.robot_body, scene.model
     # In memory all x, then all y, then all z: passes over one coordinate are over one piece.
-    positions = torch.zeros(3, num_envs, num_objects, dtype=torch.float64).movedim(0, -1)
-    positions[..., 2] = torch.tensor(scene.heights, dtype=torch.float64)
+    positions = torch.zeros(3, num_envs, num_objects, **real).movedim(0, -1)
+    positions[..., 2] = torch.tensor(scene.heights, **real)
     velocities = physics.qvel[:, scene.robot_nv :].view(num_envs, scene.num_free, 6)[..., :3]
     robot_pos = physics.xpos[:, robot]
     velocity = int(model.sensor("robot_vel").adr[0])
@@ -41,14 +45,14 @@ def make_world(scene: Scene, physics: BatchPhysics) -> World:
         qvel=physics.qvel,
         ctrl=physics.ctrl,
         sensordata=physics.sensordata,
-        target_travel=torch.tensor(scene.travel, dtype=torch.float64),
+        target_travel=torch.tensor(scene.travel, **real),
         # Guided objects float at twice the height they start at, see `bodies.add_targets`.
         target_height=2 * positions[0, scene.guided, 2],
-        layout=torch.zeros(num_envs, 1 + num_objects, 2, dtype=torch.float64),
-        start_pose=torch.zeros(num_envs, 3, dtype=torch.float64),
-        goal_button=torch.full((num_envs,), NO_BUTTON),
-        buttons_timer=torch.zeros(num_envs, dtype=torch.int64),
-        step_count=torch.zeros(num_envs, dtype=torch.int64),
+        layout=torch.zeros(num_envs, 1 + num_objects, 2, **real),
+        start_pose=torch.zeros(num_envs, 3, **real),
+        goal_button=torch.full((num_envs,), NO_BUTTON, **whole),
+        buttons_timer=torch.zeros(num_envs, **whole),
+        step_count=torch.zeros(num_envs, **whole),
     )
 
 
@@ -59,22 +63,27 @@ def refresh(world: World) -> None:
         world.positions[:, : scene.num_free] = world.physics.xpos[:, scene.free_bodies]
 
 
-def pose_bodies(world: World, rows: Tensor, yaws: Tensor) -> None:
-    """Write the robot's and the free bodies' poses into the state."""
+def put(target: Tensor, mask: Tensor, values: Tensor) -> None:
+    """Write values [N, ...] into a tensor [N, ...] where a mask [N] holds."""
+    target.copy_(torch.where(mask.view(-1, *[1] * (target.ndim - 1)), values, target))
+
+
+def pose_bodies(world: World, mask: Tensor, yaws: Tensor) -> None:
+    """Write the robot's and the free bodies' poses [N, 1 + F] into the state of some worlds."""
     scene, physics = world.scene, world.physics
-    start = world.layout[rows, 0]
-    world.start_pose[rows] = torch.cat([start, yaws[:, :1]], -1)
-    physics.qpos[rows, :2] = start
+    pose = torch.cat([world.layout[:, 0], yaws[:, :1]], -1)
+    put(world.start_pose, mask, pose)
+    put(physics.qpos[:, :2], mask, pose[:, :2])
     if scene.planar:
-        physics.qpos[rows, 2] = yaws[:, 0]
+        put(physics.qpos[:, 2], mask, yaws[:, 0])
     else:
-        physics.qpos[rows, 3:7] = yaw_quaternion(yaws[:, 0])
+        put(physics.qpos[:, 3:7], mask, yaw_quaternion(yaws[:, 0]))
     free = physics.qpos[:, scene.robot_nq :].unflatten(1, (scene.num_free, 7))
-    free[rows, :, :2] = world.layout[rows, 1 : 1 + scene.num_free]
-    free[rows, :, 3:] = yaw_quaternion(yaws[:, 1:])
+    put(free[..., :2], mask, world.layout[:, 1 : 1 + scene.num_free])
+    put(free[..., 3:], mask, yaw_quaternion(yaws[:, 1:]))
     if scene.num_targets:
         quaternion = yaw_quaternion(yaws[:, 1 + scene.guided.start : 1 + scene.guided.stop])
-        physics.mocap_quat[rows, : scene.num_targets] = quaternion
+        put(physics.mocap_quat[:, : scene.num_targets], mask, quaternion)
 
 
 def gremlin_path(world: World, time: Tensor, num_substeps: int) -> Tensor:
@@ -111,10 +120,11 @@ def place_mocaps(world: World) -> None:
         physics.mocap_pos[:, : scene.num_targets] = torch.where(started, targets, at_start)
 
 
-def point_goal_at_button(world: World, rows: Tensor) -> None:
-    """Let the goal be where the goal button is."""
-    goal, buttons = world.scene.slots["goal"], world.at("buttons")
-    world.positions[rows, goal.start] = buttons[rows, world.goal_button[rows]]
+def point_goal_at_button(world: World, mask: Tensor) -> None:
+    """Let the goal be where the goal button is, in some worlds."""
+    number = world.goal_button.clamp(min=0).view(-1, 1, 1).expand(-1, 1, 3)
+    button = world.at("buttons").gather(1, number)[:, 0]
+    put(world.positions[:, world.scene.slots["goal"].start], mask, button)
 
 
 PHYSICS_KEYS = ("qpos", "qvel", "qacc_warmstart", "time")
@@ -148,7 +158,8 @@ def write_state(world: World, state: TensorDictBase) -> None:
     """
     scene, physics = world.scene, world.physics
     target_quat = state.get("target_quat", physics.mocap_quat[:, : scene.num_targets].clone())
-    physics.reset(torch.ones_like(world.step_count, dtype=torch.bool))
+    everywhere = torch.ones_like(world.step_count, dtype=torch.bool)
+    physics.reset(everywhere)
     for key in PHYSICS_KEYS:
         getattr(physics, key).copy_(state[key])
     for key in (*TASK_KEYS, *LAYOUT_KEYS):
@@ -162,7 +173,7 @@ def write_state(world: World, state: TensorDictBase) -> None:
     physics.mocap_quat[:, : scene.num_targets] = target_quat
     world.positions[:, scene.num_free :, :2] = world.layout[:, 1 + scene.num_free :]
     if goal_is_button(scene.config.task):
-        point_goal_at_button(world, torch.arange(len(world.step_count)))
+        point_goal_at_button(world, everywhere)
     elif "goal" in scene.slots:
         goal = scene.slots["goal"].start
         world.positions[:, goal] = state["goal_pos"]

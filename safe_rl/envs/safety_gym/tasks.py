@@ -138,6 +138,9 @@ TASKS: dict[str, Task] = {
 }
 
 
+BUILT_IN = frozenset(TASKS)
+
+
 def goal_is_button(task: str) -> bool:
     """Whether the goal of a task is wherever its goal button is."""
     return TASKS[task].next_goal is NextGoal.BUTTON
@@ -166,11 +169,12 @@ def dense_reward(
     """
     reward = task.reward(config, world, before, now)
     _check_values("reward", reward, config, world)
-    if (reward.isnan() & ~failed).any():
-        raise ConfigError(
+    if config.task not in BUILT_IN:
+        error = ConfigError(
             f"'reward' of task '{config.task}' is NaN, which nothing can be learned from: give "
             "every world a number."
         )
+        world.physics.check(reward.isnan() & ~failed, lambda: error)
     if config.reward_orientation:
         reward = reward + config.reward_orientation_scale * world.up
     if config.reward_clip:
@@ -178,14 +182,17 @@ def dense_reward(
     return reward
 
 
-def goals_met(task: Task, config: SafetyGymConfig, world: World, now: Tensor) -> Tensor:
-    """Which worlds meet their goals: bool [N], for tasks with goals.
+def goals_met(
+    task: Task, config: SafetyGymConfig, world: World, now: Tensor, failed: Tensor
+) -> Tensor:
+    """Which worlds meet their goals: bool [N], for tasks with goals; failed ones do not.
 
     Args:
         task: what the environment was made with.
         config: the environment.
         world: the worlds after the step.
         now: the task's measurements [N, D].
+        failed: worlds whose physics failed [N].
 
     Raises:
         ConfigError: if a registered task does not say so of every world.
@@ -193,7 +200,7 @@ def goals_met(task: Task, config: SafetyGymConfig, world: World, now: Tensor) ->
     assert task.met is not None
     met = task.met(config, world, now)
     _check_values("met", met, config, world)
-    return met > 0
+    return (met > 0) & ~failed
 
 
 def _check_values(what: str, values: Tensor, config: SafetyGymConfig, world: World) -> None:

@@ -11,7 +11,7 @@ import mujoco
 from torch import Tensor
 
 from safe_rl.envs.errors import ConfigError, nearest
-from safe_rl.envs.physics.batch import BatchPhysics
+from safe_rl.envs.physics import Physics
 from safe_rl.envs.safety_gym.config import SafetyGymConfig
 
 
@@ -93,7 +93,7 @@ class World:
     """
 
     scene: Scene
-    physics: BatchPhysics
+    physics: Physics
     robot_pos: Tensor
     robot_xy: Tensor
     robot_mat: Tensor

@@ -1,0 +1,173 @@
+"""A step on any backend: on its device, in its numbers, and without waiting for it."""
+
+from contextlib import contextmanager
+
+import pytest
+import torch
+from torch.utils._python_dispatch import TorchDispatchMode
+
+from safe_rl.envs import SafetyGymEnv
+from safe_rl.envs.physics.batch import BatchPhysics
+
+BATCH = ("time", "qpos", "qvel", "qacc_warmstart", "ctrl", "mocap_pos", "mocap_quat")
+OUTPUTS = ("xpos", "xmat", "sensordata", "subtree_com")
+EVERYTHING = {
+    **{"robot_base": "point", "task": "goal", "goal_size": 3.0, "action_noise": 0.1},
+    **{"hazards_num": 3, "vases_num": 2, "gremlins_num": 2, "pillars_num": 1, "buttons_num": 2},
+    **{f"constrain_{kind}": True for kind in ("hazards", "vases", "gremlins", "pillars")},
+    **{f"observe_{kind}": True for kind in ("hazards", "vases", "gremlins", "pillars", "qpos")},
+    **{"observe_goal_lidar": True, "observe_remaining": True, "vases_displace_cost": 1.0},
+    **{"constrain_boundary": True, "boundary_x": 0.5, "frameskip_binom_p": 0.9},
+    **{"constrain_buttons": True, "constrain_velocity": True, "velocity_limit": 0.1},
+}
+CASES = {
+    "everything": EVERYTHING,
+    "natural lidar": {**EVERYTHING, "lidar_type": "natural"},
+    **{name: name for name in ("PointGoal1", "CarButton2", "CarPush2", "DoggoRun1", "CarCircle2")},
+}
+
+
+class WaitingPhysics:
+    """A backend that computes in another type, and whose values nobody can look at for nothing."""
+
+    device, waits = torch.device("cpu"), True
+
+    def __init__(self, model, num_envs, dtype):
+        self.dtype, self._batch = dtype, BatchPhysics(model, num_envs, 1)
+        self.timestep, self.memory = self._batch.timestep, self._batch.memory
+        self.inside, self.wrong = False, []
+        for name in BATCH + OUTPUTS:
+            setattr(self, name, getattr(self._batch, name).to(dtype, copy=True))
+
+    def _call(self, method, *arguments):
+        self.inside = True
+        for name in BATCH:
+            getattr(self._batch, name).copy_(getattr(self, name))
+        result = getattr(self._batch, method)(*arguments)
+        for name in BATCH + OUTPUTS:
+            getattr(self, name).copy_(getattr(self._batch, name))
+        self.inside = False
+        return result
+
+    def reset(self, mask):
+        return self._call("reset", mask)
+
+    def forward(self, mask=None, sensors=True):
+        return self._call("forward", mask, sensors)
+
+    def step(self, num_substeps, mocap_path=None, refresh=True):
+        path = None if mocap_path is None else mocap_path.double()
+        return self._call("step", num_substeps, path, refresh)
+
+    def rays(self, origin, directions, group, exclude_body):
+        distance = self._call("rays", origin.double(), directions.double(), group, exclude_body)
+        return distance.to(self.dtype)
+
+    def maybe_any(self, mask):
+        return True
+
+    def rows(self, mask):
+        return torch.arange(len(mask), device=mask.device)
+
+    def check(self, wrong, error):
+        self.wrong.append((wrong, error))
+
+
+def waiting(config, dtype=torch.float64, **arguments):
+    class Env(SafetyGymEnv):
+        def _make_physics(self, model, num_threads):
+            return WaitingPhysics(model, self.batch_size[0], dtype)
+
+    return Env(config, **arguments)
+
+
+LOOKS = ("aten._local_scalar_dense", "aten.nonzero", "aten._unique", "aten.masked_select")
+
+
+class RefuseLooks(TorchDispatchMode):
+    """Raises where the host would wait for values of tensors, outside of the physics."""
+
+    def __init__(self, physics):
+        super().__init__()
+        self.physics, self.num_calls = physics, 0
+
+    def __torch_dispatch__(self, func, types, args=(), kwargs=None):
+        self.num_calls += 1
+        if not self.physics.inside:
+            assert not str(func).startswith(LOOKS), f"{func} waits for the device"
+            if str(func).startswith(("aten.index.", "aten.index_put")):
+                masks = [i for i in args[1] if i is not None and i.dtype == torch.bool]
+                assert not masks, f"{func} with a mask waits for the device"
+        return func(*args, **(kwargs or {}))
+
+
+@contextmanager
+def no_looks(physics, monkeypatch):
+    """Nothing looks at values, copies to the host or makes tensors on no particular device."""
+
+    def refuse(name):
+        original = getattr(torch.Tensor, name)
+
+        def method(tensor, *arguments, **keywords):
+            assert physics.inside, f"Tensor.{name} in a step"
+            return original(tensor, *arguments, **keywords)
+
+        monkeypatch.setattr(torch.Tensor, name, method)
+
+    with monkeypatch.context() as monkeypatch:
+        for name in ("numpy", "cpu", "item", "tolist", "__array__"):
+            refuse(name)
+        # what is made without a device then has no values, and cannot be computed with
+        with RefuseLooks(physics) as mode, torch.device("meta"):
+            yield mode
+
+
+def rollouts(*envs, steps, monkeypatch):
+    """Steps of environments under the same actions; a waiting one must not look."""
+    states = [env.reset() for env in envs]
+    torch.manual_seed(0)
+    for _ in range(steps):
+        action = envs[0].action_spec.rand()
+        for number, env in enumerate(envs):
+            states[number].set("action", action)
+            if isinstance(env._physics, WaitingPhysics):
+                with no_looks(env._physics, monkeypatch) as mode:
+                    following = env._step(states[number])
+                assert mode.num_calls > 50
+            else:
+                following = env._step(states[number])
+            states[number] = following
+        yield states
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_a_step_looks_at_nothing_and_gives_the_same_numbers(case, monkeypatch):
+    envs = [make(CASES[case], num_envs=3, seed=1) for make in (SafetyGymEnv, waiting)]
+    met = 0
+    for looking, not_looking in rollouts(*envs, steps=12, monkeypatch=monkeypatch):
+        assert looking.keys() == not_looking.keys()
+        for key, value in looking.items():
+            assert torch.equal(value, not_looking[key]), key
+        met += int(looking["goal_met"].sum())
+    assert (met > 0) == (case in ("everything", "natural lidar"))
+
+
+@pytest.mark.parametrize("case", ["everything", "CarButton2", "CarPush2"])
+def test_a_step_may_be_computed_in_single_precision(case, monkeypatch):
+    exact = SafetyGymEnv(CASES[case], num_envs=3, seed=1)
+    rough = waiting(CASES[case], torch.float32, num_envs=3, seed=1)
+    for double, single in rollouts(exact, rough, steps=3, monkeypatch=monkeypatch):
+        for key, value in double.items():
+            if key != "observation":
+                torch.testing.assert_close(value, single[key], atol=1e-3, rtol=1e-3)
+    assert {value.dtype for key, value in rough.get_state().items() if key == "qpos"} == {
+        torch.float32
+    }
+
+
+def test_what_is_wrong_may_be_said_later():
+    env = waiting({**EVERYTHING, "terminate_resample_failure": False}, num_envs=2, seed=0)
+    env.rollout(3)
+    wrong, error = env._physics.wrong[-1]
+    assert not wrong.any()
+    assert "terminate_resample_failure" in str(error())
