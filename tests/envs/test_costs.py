@@ -64,16 +64,6 @@ def test_running_into_things_costs_what_it_should_and_nothing_else(name):
     assert seen == expected
 
 
-def test_hazards_cost_the_depth_in_each():
-    env = make({**FROZEN, "hazards_num": 3, "hazards_size": 0.3, "hazards_cost": 2.0})
-    state = arrange(env, robot=(0, 0, 0), hazard0=(0.1, 0), hazard1=(0, -0.25), hazard2=(0.2, 0.23))
-    got = step_from(env, state, 0, 0)
-    assert math.isclose(costs(got)["cost_hazards"], 2 * (0.2 + 0.05), rel_tol=1e-6)
-    assert math.isclose(costs(got)["cost"], costs(got)["cost_hazards"])
-    state = arrange(env, robot=(0, 0, 0), hazard0=(0.31, 0), hazard1=(0, 1), hazard2=(1, 1))
-    assert not positive(step_from(env, state, 0, 0))
-
-
 VASES = {**FROZEN, "vases_num": 2, "vases_displace_cost": 2.0, "vases_velocity_cost": 3.0}
 
 
@@ -185,12 +175,3 @@ def test_a_met_goal_puts_buttons_to_sleep_in_goal_tasks_too():
     got = step_from(env, touching_two_buttons(env, -1, 0), 0, 0)
     assert got["goal_met"]
     assert env.get_state()["buttons_timer"] == 10
-
-
-def test_indicators_are_ones_and_so_is_their_aggregate():
-    config = {**FROZEN, "hazards_num": 2, "pillars_num": 1, "constrain_indicator": True}
-    env = make(config)
-    poses = {"hazard0": (0, 0), "hazard1": (0.1, 0), "pillar0": (0.29, 0)}
-    got = costs(step_from(env, arrange(env, robot=(0, 0, math.pi), **poses), 0, 0))
-    assert got["cost_hazards"] == got["cost_pillars"] == got["cost"] == 1.0
-    assert got["cost_buttons"] == got["cost_gremlins"] == 0.0

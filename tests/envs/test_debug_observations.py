@@ -1,18 +1,16 @@
 """Observations for debugging: the raw state, as far as it does not tell where the origin is."""
 
 import cmath
-import math
 
 import mujoco
 import numpy as np
 import pytest
 import torch
-from crafting import after_random_steps, arrange
+from crafting import after_random_steps
 
 from safe_rl.envs import ConfigError, SafetyGymEnv
 
 ROBOTS = ("point", "car", "doggo")
-DEBUG = ("observe_qpos", "observe_qvel", "observe_ctrl", "observe_com")
 
 
 def make(robot: str, **keys) -> SafetyGymEnv:
@@ -22,19 +20,6 @@ def make(robot: str, **keys) -> SafetyGymEnv:
 
 def observed(env, observation: torch.Tensor, name: str) -> np.ndarray:
     return observation[:, env.observation_layout[name]].double().numpy()
-
-
-@pytest.mark.parametrize("robot", ["car", "doggo"])
-def test_free_robots_show_their_state_as_it_is(robot):
-    keys = dict.fromkeys((*DEBUG, "observe_freejoint"), True)
-    env = make(robot, vases_num=1, **keys)
-    state = after_random_steps(env, num_steps=7)
-    observation = env.set_state(state)["observation"]
-    for name in ("qpos", "qvel", "ctrl"):
-        np.testing.assert_allclose(observed(env, observation, name), state[name], atol=1e-6)
-    np.testing.assert_allclose(
-        observed(env, observation, "freejoint"), state["qpos"][:, :7], atol=1e-6
-    )
 
 
 def test_the_point_counts_from_where_it_started():
@@ -52,17 +37,6 @@ def test_the_point_counts_from_where_it_started():
         np.testing.assert_allclose(observed(env, observation, "qvel")[row], want, atol=1e-6)
     start = observed(env, env.reset()["observation"], "qpos")
     np.testing.assert_allclose(start[:, :3], 0.0, atol=1e-12)
-
-
-def test_the_centre_of_mass_is_that_of_the_shapes():
-    env = make("point", observe_com=True)
-    env.reset()
-    yaw = 0.8
-    observation = env.set_state(arrange(env, robot=(0.4, -0.3, yaw)))["observation"]
-    sphere, box = 4 / 3 * math.pi * 0.1**3, 0.1**3  # a box of 10 cm, 0.1 m ahead
-    ahead = 0.1 * box / (sphere + box)
-    want = [0.4 + ahead * math.cos(yaw), -0.3 + ahead * math.sin(yaw), 0.1]
-    np.testing.assert_allclose(observed(env, observation, "com")[0], want, atol=1e-6)
 
 
 @pytest.mark.parametrize("robot", ROBOTS)

@@ -32,53 +32,12 @@ def observe(env, **poses) -> dict[str, np.ndarray]:
     return {name: flat[columns] for name, columns in env.observation_layout.items()}
 
 
-def hazard_readings(config: dict, yaw: float, *hazards: tuple[float, float]) -> np.ndarray:
-    """The lidar of a robot in the origin; hazards by their (bearing in degrees, distance)."""
-    env = make({**HAZARDS, **config, "hazards_num": len(hazards)})
-    poses = {f"hazard{i}": polar(*hazard) for i, hazard in enumerate(hazards)}
-    return observe(env, robot=(0, 0, yaw), **poses)["hazards_lidar"]
-
-
 def assert_reads(readings: np.ndarray, expected: dict[int, float]) -> None:
     """Assert what some bins read, and that the others read nothing."""
     want = np.zeros(len(readings))
     for index, value in expected.items():
         want[index] = value
     np.testing.assert_allclose(readings, want, atol=1e-6)
-
-
-def test_readings_fall_linearly_to_the_largest_distance():
-    without_alias = {"lidar_alias": False}
-    assert_reads(hazard_readings(without_alias, 0.0, (100, 0.5)), {2: 0.75})
-    assert_reads(hazard_readings(without_alias, 0.0, (100, 1.99)), {2: 0.005})
-    assert_reads(hazard_readings(without_alias, 0.0, (100, 2.01)), {})
-
-
-def test_readings_fall_exponentially_without_a_largest_distance():
-    config = {"lidar_alias": False, "lidar_max_dist": None, "lidar_exp_gain": 0.5}
-    assert_reads(hazard_readings(config, 0.0, (200, 3.0)), {4: math.exp(-1.5)})
-
-
-def test_bins_turn_with_the_robot_and_run_counter_clockwise():
-    config = {"lidar_alias": False}
-    for bearing, index in ((10, 0), (50, 1), (170, 3), (190, 4), (350, 7)):
-        assert_reads(hazard_readings(config, 0.0, (bearing, 1.0)), {index: 0.5})
-        yaw = math.radians(75)
-        assert_reads(hazard_readings(config, yaw, (bearing + 75, 1.0)), {index: 0.5})
-
-
-def test_alias_lights_both_neighbours_by_the_place_in_the_bin():
-    # 45° a bin: 99° is 0.2 into bin 2; 342° is 0.6 into the last one.
-    expected = {2: 0.75, 3: 0.2 * 0.75, 1: 0.8 * 0.75}
-    assert_reads(hazard_readings({}, 0.0, (99, 0.5)), expected)
-    assert_reads(hazard_readings({}, 0.0, (342, 1.0)), {7: 0.5, 0: 0.3, 6: 0.2})
-
-
-def test_every_bin_keeps_its_largest_reading():
-    assert_reads(hazard_readings({"lidar_alias": False}, 0.0, (100, 1.5), (120, 0.5)), {2: 0.75})
-    # 99°, 0.75 away from nothing; 162° is 0.6 into bin 3.
-    expected = {1: 0.8 * 0.25, 2: max(0.25, 0.4 * 0.75), 3: 0.75, 4: 0.6 * 0.75}
-    assert_reads(hazard_readings({}, 0.0, (99, 1.5), (162, 0.5)), expected)
 
 
 @pytest.mark.parametrize("y", [-1e-20, -1e-17, 0.0])
@@ -91,43 +50,11 @@ def test_a_bearing_at_the_seam_is_in_the_first_or_last_bin(y):
     assert readings[1:7].max() <= 1e-6
 
 
-def test_tilted_robots_see_the_ground_tilted():
-    """Pitched by φ about y, what is at height 0 and d ahead is at d cos φ + z sin φ."""
-    env = make({**HAZARDS, "robot_base": "car", "hazards_num": 1, "lidar_alias": False})
-    state, pitch, height = arrange(env, robot=(0, 0), hazard0=(1.0, 0.3)), 0.4, 0.25
-    quat = [height, math.cos(pitch / 2), 0.0, math.sin(pitch / 2), 0.0]
-    state["qpos"][:, 2:7] = torch.tensor(quat, dtype=torch.float64)
-    columns = env.observation_layout["hazards_lidar"]
-    readings = env.set_state(state)["observation"][0, columns].numpy()
-    distance = math.hypot(math.cos(pitch) + height * math.sin(pitch), 0.3)
-    assert_reads(readings, {0: 1 - distance / 2})
-
-
 def test_lidars_are_there_without_objects_for_hazards_and_vases_only():
     kinds = ("hazards", "vases", "pillars", "buttons", "gremlins", "walls")
     env = make({**BARE, **{f"observe_{kind}": True for kind in kinds}})
     assert list(env.observation_layout) == ["hazards_lidar", "vases_lidar"]
     assert not env.reset()["observation"].any()
-
-
-def test_every_kind_has_its_own_lidar():
-    kinds = ("hazards", "vases", "pillars", "buttons", "gremlins")
-    flags = {f"observe_{kind}": True for kind in kinds} | {f"{kind}_num": 1 for kind in kinds}
-    env = make({**HAZARDS, **flags, "lidar_alias": False})
-    bearings = {f"{kind[:-1]}0": 10 + 50 * i for i, kind in enumerate(kinds)}
-    parts = observe(env, robot=(0, 0, 0), **{k: polar(b, 1.0) for k, b in bearings.items()})
-    for kind in kinds:
-        index = bearings[f"{kind[:-1]}0"] // 45
-        assert_reads(parts[f"{kind}_lidar"], {index: 0.5})
-
-
-@pytest.mark.parametrize("unseen", ["vases", "pillars"])
-def test_kinds_that_are_not_observed_light_up_nothing(unseen):
-    env = make({**HAZARDS, "hazards_num": 1, f"{unseen}_num": 3, "lidar_alias": False})
-    others = {f"{unseen[:-1]}{i}": polar(100 + 90 * i, 0.8) for i in range(3)}
-    parts = observe(env, robot=(0, 0, 0), hazard0=polar(10, 1.0), **others)
-    assert list(parts) == ["hazards_lidar"]
-    assert_reads(parts["hazards_lidar"], {0: 0.5})
 
 
 @pytest.mark.parametrize("num_bins", [*range(1, 30), 56, 122, 220])

@@ -50,14 +50,6 @@ def ray_angles(yaw: float) -> np.ndarray:
     return yaw + 2 * np.pi * np.arange(BINS) / BINS
 
 
-def circle_distances(angles: np.ndarray, centre: tuple[float, float], radius: float) -> np.ndarray:
-    """Distance from the origin to a circle along rays, infinite for a miss: |t·u - c| = r."""
-    along = centre[0] * np.cos(angles) + centre[1] * np.sin(angles)
-    root = along**2 - (centre[0] ** 2 + centre[1] ** 2 - radius**2)
-    nearer = along - np.sqrt(np.maximum(root, 0.0))
-    return np.where((root >= 0) & (nearer > 0), nearer, np.inf)
-
-
 def square_distances(angles: np.ndarray, centre: tuple[float, float], half: float) -> np.ndarray:
     """Distance from the origin to an upright square along rays: the slab method."""
     ways = np.stack([np.cos(angles), np.sin(angles)])
@@ -66,32 +58,6 @@ def square_distances(angles: np.ndarray, centre: tuple[float, float], half: floa
         bounds = np.stack([(middle - half) / ways, (middle + half) / ways])
     near, far = bounds.min(0).max(0), bounds.max(0).min(0)
     return np.where((near <= far) & (near > 0), near, np.inf)
-
-
-@pytest.mark.parametrize("yaw", [0.0, 0.3, 2.0, -1.7])
-def test_rays_end_on_pillars(yaw):
-    env = make({**BARE, "pillars_num": 2, "observe_pillars": True})
-    near, far = (0.5, 0.4), (-1.5, 0.2)
-    got = observe(env, robot=(0, 0, yaw), pillar0=near, pillar1=far)["pillars_lidar"]
-    distances = [circle_distances(ray_angles(yaw), place, 0.2) for place in (near, far)]
-    assert np.isfinite(distances).sum(1).min() >= 1
-    np.testing.assert_allclose(got, np.exp(-np.min(distances, axis=0)), atol=1e-6)
-
-
-def test_rays_end_on_the_faces_of_walls_however_large():
-    env = make({**BARE, "walls_num": 1, "observe_walls": True, "walls_size": 0.7})
-    got = observe(env, robot=(0.3, -0.2, 0.1), wall0=(1.5, 0.1))["walls_lidar"]
-    expected = np.exp(-square_distances(ray_angles(0.1), (1.2, 0.3), 0.7))
-    assert (expected > 0).sum() >= 3
-    np.testing.assert_allclose(got, expected, atol=1e-6)
-
-
-def test_kinds_of_one_group_look_the_same():
-    config = {"walls_num": 1, "pillars_num": 1, "observe_walls": True, "observe_pillars": True}
-    got = observe(make({**BARE, **config, "walls_size": 0.3}), robot=(0, 0, 0), wall0=(1, 0),
-                  pillar0=(-1, 0))  # fmt: skip
-    np.testing.assert_array_equal(got["walls_lidar"], got["pillars_lidar"])
-    np.testing.assert_allclose(got["walls_lidar"][[0, BINS // 2]], np.exp([-0.7, -0.8]), atol=1e-6)
 
 
 def test_rays_pass_over_hazards_and_a_tilted_robot_sees_them():
