@@ -146,13 +146,13 @@ FLOORS = {
         ("",),
     ),
     "runs": (
-        ("archive", "files", "folder", "outcome"),
-        ("checkpoints", "code", "curves", "identity", "lock", "loggers", "table"),
-        ("record", "resuming"),
+        ("checkpoint_file", "files", "folder", "outcome"),
+        ("checkpoints", "curves", "identity", "loggers", "table"),
+        ("record",),
         ("",),
     ),
     "training": (
-        ("candidates", "interrupts", "state", "transfer"),
+        ("candidates", "state"),
         ("trainer",),
         ("building",),
         ("",),

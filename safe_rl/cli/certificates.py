@@ -15,8 +15,7 @@ from safe_rl.cli.robots import maker_of
 from safe_rl.evaluation import Certificate, CertificateOptions, certify
 from safe_rl.evaluation.loading import load_config
 from safe_rl.naming import did_you_mean
-from safe_rl.runs.folder import RunFolder
-from safe_rl.runs.lock import held
+from safe_rl.runs.folder import RunFolder, lock_folder
 
 __all__ = [
     *("certificate_options", "certify_ended", "certify_run", "is_to_keep_limits"),
@@ -59,7 +58,7 @@ def certify_ended(directory: Path, num_threads: int = 0) -> Certificate | None:
         RunInUseError: If another process writes there.
     """
     folder = RunFolder(directory)
-    with held(folder):
+    with lock_folder(folder):
         folder.certifying.touch()
         return certify_run(directory, num_threads=num_threads)
 

@@ -43,8 +43,7 @@ from safe_rl.evaluation.loading import (
     override_env,
 )
 from safe_rl.evaluation.varying import Varied
-from safe_rl.runs.folder import RunFolder
-from safe_rl.runs.lock import held
+from safe_rl.runs.folder import RunFolder, lock_folder
 from safe_rl.runs.outcome import final_figures
 from safe_rl.runs.table import read_table
 
@@ -244,7 +243,7 @@ def _carry_out(config: DictConfig, folder: Path, hydra: DictConfig | None = None
     note_missing(folder)
     is_new, has_begun = not folder.exists(), False
     try:
-        with held(RunFolder(folder)):
+        with lock_folder(RunFolder(folder)):
             trainer = prepare(config, folder, continues=hydra is None)
             has_begun = True
             if trainer is None:

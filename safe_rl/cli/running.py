@@ -33,13 +33,12 @@ from safe_rl.envs import ConfigError, LayoutError, complete_env, make_env
 from safe_rl.evaluation.during import PeriodicEvaluation
 from safe_rl.evaluation.layouts import default_seed, has_fixed_layout
 from safe_rl.evaluation.loading import transforms_of
-from safe_rl.runs.folder import RunFolder
-from safe_rl.runs.lock import held
-from safe_rl.runs.resuming import is_finished, may_continue
+from safe_rl.runs.checkpoints import is_finished
+from safe_rl.runs.folder import RunFolder, lock_folder
+from safe_rl.runs.identity import may_continue
 from safe_rl.runs.table import TableError
-from safe_rl.training.building import build_trainer, physics_threads, seed_everything
+from safe_rl.training.building import begin_from, build_trainer, physics_threads, seed_everything
 from safe_rl.training.trainer import EpisodeError, Trainer
-from safe_rl.training.transfer import begin_from
 
 __all__ = ["complete", "prepare", "run"]
 
@@ -134,7 +133,7 @@ def run(config: DictConfig) -> None:
 
     with ExitStack() as stack:
         with in_a_line(*SETTING_ERRORS, LayoutError, FileExistsError):
-            stack.enter_context(held(folder))
+            stack.enter_context(lock_folder(folder))
             trainer = prepare(config, folder.directory, continues)
         if trainer is None:
             if folder.certifying.exists():

@@ -21,8 +21,7 @@ from safe_rl.cli.sweep_display import SweepDisplay, last_notes
 from safe_rl.cli.user_code import import_modules, imported
 from safe_rl.processes import end_with_parent
 from safe_rl.runs.files import replace_text
-from safe_rl.runs.folder import RunFolder
-from safe_rl.runs.lock import RunInUseError
+from safe_rl.runs.folder import RunFolder, RunInUseError
 
 __all__ = ["SweepReport", "count_jobs", "threads_per_job"]
 

@@ -12,10 +12,10 @@ from typing import Any
 from torchrl.checkpoint import Checkpoint, CheckpointError
 
 from safe_rl.algorithms.contract import Stateful
-from safe_rl.runs.archive import as_parts, read_facts, restore, writer
-from safe_rl.runs.folder import checkpoint_name, checkpoint_steps, checkpoints_in
+from safe_rl.runs.checkpoint_file import as_parts, read_facts, restore, writer
+from safe_rl.runs.folder import RunFolder, checkpoint_name, checkpoint_steps, checkpoints_in
 
-__all__ = ["CheckpointStore", "best_checkpoint"]
+__all__ = ["CheckpointStore", "best_checkpoint", "is_finished"]
 
 
 def best_checkpoint(directory: Path) -> Path | None:
@@ -233,6 +233,11 @@ class CheckpointStore:
                     f"run's is {expected}. For a new run from its networks use init_from=."
                 )
         restore(path, components)
+
+
+def is_finished(directory: Path, frames: int) -> bool:
+    """Whether the run in a folder has come to its end."""
+    return CheckpointStore.newest_step(RunFolder(directory).checkpoints) >= frames
 
 
 def _clear_beginnings(directory: Path) -> None:

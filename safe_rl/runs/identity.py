@@ -8,12 +8,22 @@ from __future__ import annotations
 
 from collections.abc import Hashable, Iterator, Mapping
 from enum import Enum
-from typing import Any
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
-from safe_rl.runs.folder import common_source
+from omegaconf import DictConfig, OmegaConf
+
+from safe_rl.runs.files import read_config
+from safe_rl.runs.folder import RunFolder, common_source
 from safe_rl.targets import present_name
 
-__all__ = ["ROLES", "Role", "differences", "experiment_of", "flatten", "role_of"]
+if TYPE_CHECKING:
+    from hydra.conf import HydraConf  # which a report need not import
+
+__all__ = [
+    *("ROLES", "Role", "check_same_run", "differences", "experiment_of", "flatten", "may_continue"),
+    "role_of",
+]
 
 
 class Role(Enum):
@@ -189,3 +199,40 @@ def _hashable(value: Any) -> Hashable:
     if isinstance(value, Mapping):
         return tuple((key, _hashable(item)) for key, item in value.items())
     return tuple(map(_hashable, value)) if isinstance(value, list | tuple) else value
+
+
+def may_continue(hydra: HydraConf, config: DictConfig) -> bool:
+    """Whether a run that is in the output folder already is to be continued.
+
+    That is so where the configuration comes from the folder itself, which is how ``resume=`` calls
+    Hydra, and for the jobs of a sweep, whose folders follow from their overrides.
+
+    Raises:
+        ValueError: If the folder of a sweep's job holds a run with other settings.
+    """
+    output = Path(hydra.runtime.output_dir).resolve()
+    if hydra.mode is not None and hydra.mode.name == "MULTIRUN":
+        check_same_run(output, config)
+        return True
+    sources = {Path(s.path).resolve() for s in hydra.runtime.config_sources if s.provider == "main"}
+    return output in sources
+
+
+def check_same_run(directory: Path, config: DictConfig) -> None:
+    """Refuse to continue a run under another configuration; how long and where may change.
+
+    Raises:
+        ValueError: Naming every key that differs.
+    """
+    run = RunFolder(directory)
+    if not run.is_run:
+        return
+    given = OmegaConf.to_container(config, resolve=True)
+    assert isinstance(given, dict)
+    found = differences(read_config(run.config), given)  # type: ignore[arg-type]
+    if found:
+        changes = ", ".join(f"{key}: {before} -> {now}" for key, (before, now) in found.items())
+        raise ValueError(
+            f"{directory} holds a run with other settings ({changes}). Move it away, or give the "
+            "sweep another folder with hydra.sweep.dir=..."
+        )

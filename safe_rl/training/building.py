@@ -1,14 +1,20 @@
-"""From a configuration and an environment to a run that is ready to begin."""
+"""From a configuration and an environment to a run that is ready to begin.
+
+A run can start from the networks of another one (Ray, Achiam, Amodei 2019, section 6).
+"""
 
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Collection, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import torch
 from omegaconf import DictConfig
 from tensordict.nn import TensorDictModuleBase
+from torch import Tensor, nn
+from torchrl.checkpoint import CheckpointError
 from torchrl.collectors import Collector
 from torchrl.envs import EnvBase
 
@@ -17,11 +23,17 @@ from safe_rl.algorithms.contract import Algorithm
 from safe_rl.algorithms.parts import find_recipe
 from safe_rl.collectors import Recording, WorkerCollector, make_collector
 from safe_rl.collectors.worker_rows import MakeEnv
+from safe_rl.runs.checkpoint_file import part_names, read_states
+from safe_rl.runs.files import read_config
+from safe_rl.runs.folder import RunFolder, run_of
 from safe_rl.runs.record import RunRecord
 from safe_rl.targets import build
 from safe_rl.training.trainer import Evaluator, Trainer
 
-__all__ = ["build_trainer", "physics_threads", "seed_everything"]
+__all__ = [
+    *("begin_from", "build_trainer", "initialise_networks", "physics_threads"),
+    "seed_everything",
+]
 
 MakeEvaluation = Callable[[TensorDictModuleBase], Evaluator]
 """Makes an evaluation of a policy that goes on learning."""
@@ -87,3 +99,147 @@ def _build_collector(
     if config.collector.get("_target_") is None:
         return make_collector(env, policy, **numbers)
     return build(config.collector, env=env, make_env=make_env, policy=policy, **numbers)
+
+
+def begin_from(algorithm: Algorithm, config: Mapping[str, Any]) -> list[str]:
+    """Let an algorithm begin with the networks of ``init_from``; see `initialise_networks`."""
+    taken = initialise_networks(
+        algorithm.networks,
+        Path(config["init_from"]),
+        algorithm.cost_keys,
+        _cost_loss(config),
+        algorithm.cost_networks,
+    )
+    algorithm.networks_replaced()
+    return taken
+
+
+def initialise_networks(
+    networks: Mapping[str, nn.Module],
+    source: Path,
+    cost_keys: Sequence[str],
+    cost_loss: str | None = None,
+    cost_networks: Collection[str] = ("cost_critic",),
+) -> list[str]:
+    """Give networks the weights that a run has learned.
+
+    Optimisers, multipliers and counters start anew. Networks about costs are taken over if the run
+    constrained the same costs, and had the same loss say what they are.
+
+    Args:
+        networks: The new run's by name, changed in place.
+        source: Folder of the run, of which the newest checkpoint is read, or a checkpoint.
+        cost_keys: Keys of the new run's constrained costs.
+        cost_loss: Loss of the new run's cost critics if they learn from a memory.
+        cost_networks: Names of the networks that are about costs.
+
+    Returns:
+        Names of the networks that were taken over.
+
+    Raises:
+        CheckpointError: If there is no checkpoint, it lacks a network, or its networks have other
+            sizes; nothing has been changed then.
+    """
+    if not source.exists():
+        raise CheckpointError(f"init_from={source}: there is no such folder or file.")
+    checkpoint = _newest(source) if source.is_dir() else source
+    same_costs = _cost_critics(checkpoint) == (list(cost_keys), cost_loss)
+    taken = {
+        name: network
+        for name, network in networks.items()
+        if same_costs or name not in cost_networks
+    }
+    _check_parts(taken, checkpoint)
+    weights = read_states(checkpoint, taken)
+    for name, network in taken.items():
+        _check_sizes(name, network.state_dict(), weights[name], checkpoint)
+    for name, network in taken.items():
+        network.load_state_dict(weights[name])
+    return list(taken)
+
+
+def _newest(directory: Path) -> Path:
+    newest = RunFolder(directory).newest_checkpoint()
+    if newest is None:
+        raise CheckpointError(
+            f"init_from={directory}: there is no checkpoint. Give the folder of a run, or a file "
+            "in its folder 'checkpoints'."
+        )
+    return newest
+
+
+def _cost_critics(checkpoint: Path) -> tuple[list[str], str | None]:
+    """Costs that the cost critic of a checkpoint's run is for, none if not known; and its loss."""
+    run = RunFolder(run_of(checkpoint)[0])
+    config = read_config(run.config) if run.is_run else {}
+    is_constrained = (config.get("algo") or {}).get("constrained", False)
+    costs = list(config.get("cost_limits", {})) if is_constrained else []
+    return costs, _cost_loss(config)
+
+
+def _cost_loss(config: Mapping[str, Any]) -> str | None:
+    """Loss of critics that learn from a memory: of two alike, one may be a mean, one a variance."""
+    return (config.get("loss") or {}).get("_target_") if config.get("critics") else None
+
+
+def _check_parts(networks: Collection[str], checkpoint: Path) -> None:
+    known = part_names(checkpoint)
+    if known and (absent := [name for name in networks if name not in known]):
+        raise CheckpointError(
+            f"{checkpoint} has no {' and no '.join(absent)}, which this run begins with, too: "
+            "init_from needs a run whose algorithm has learned all of them, as algo=bc does not."
+        )
+
+
+def _check_sizes(
+    name: str, own: Mapping[str, Any], given: Mapping[str, Any], checkpoint: Path
+) -> None:
+    sizes = [_layer_sizes(weights) for weights in (own, given)]
+    if name == "actor" and _gives_spread_too(*sizes):
+        raise CheckpointError(
+            f"The actor of {checkpoint} has {sizes[1][-1]} outputs, this run's has {sizes[0][-1]}: "
+            "of as many actions one gives the mean, the other their spread, too, as SAC's does and "
+            "PPO's does not. init_from needs a run with these actions and this kind of actor."
+        )
+    if sizes[0] != sizes[1]:
+        raise CheckpointError(
+            f"The {name} of {checkpoint} has layers of {_arrows(sizes[1])} numbers, this run's has "
+            f"{_arrows(sizes[0])}: the first is the observation, the last the output. Observations "
+            "and actions must be those of the other run; for the others set model.hidden_sizes."
+        )
+    if set(own) != set(given):
+        raise CheckpointError(
+            f"The {name} of {checkpoint} scales or normalises its inputs and this run's does not, "
+            "or the other way round: set model.input_scale and model.normalise as in the other "
+            "run's config.yaml."
+        )
+    shapes = [_shapes(weights) for weights in (own, given)]
+    if other := next((key for key in own if shapes[0][key] != shapes[1][key]), None):
+        raise CheckpointError(
+            f"The {name} of {checkpoint} has a {other} of shape {shapes[1][other]}, this run's has "
+            f"{shapes[0][other]}: set model.… and critics.… as in the other run's config.yaml."
+        )
+
+
+def _gives_spread_too(own: list[int], given: list[int]) -> bool:
+    """Whether of two networks of the same observations one has twice the other's outputs."""
+    if not own or not given or own[0] != given[0]:
+        return False
+    few, many = sorted((own[-1], given[-1]))
+    return 2 * few == many
+
+
+def _shapes(weights: Mapping[str, Any]) -> dict[str, tuple[int, ...]]:
+    return {key: tuple(getattr(value, "shape", ())) for key, value in weights.items()}
+
+
+def _layer_sizes(weights: Mapping[str, Any]) -> list[int]:
+    """Numbers that go into a perceptron and come out of each of its layers."""
+    matrices = [
+        value for value in weights.values() if isinstance(value, Tensor) and value.ndim == 2
+    ]
+    return [matrices[0].shape[1], *(matrix.shape[0] for matrix in matrices)] if matrices else []
+
+
+def _arrows(sizes: list[int]) -> str:
+    return " → ".join(map(str, sizes))

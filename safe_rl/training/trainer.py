@@ -20,11 +20,10 @@ from safe_rl.algorithms.matrix_products import fast_products
 from safe_rl.algorithms.side_by_side import torch_threads
 from safe_rl.collectors import EpisodeAccounting, EpisodeError, Recording, WorkerCollector
 from safe_rl.runs.checkpoints import CheckpointStore
-from safe_rl.runs.lock import held
+from safe_rl.runs.folder import lock_folder
 from safe_rl.runs.record import RunRecord
 from safe_rl.training.candidates import Candidates, Judged, epochs_until_judged
-from safe_rl.training.interrupts import StopRequest
-from safe_rl.training.state import Progress, WorldSnapshot
+from safe_rl.training.state import Progress, StopRequest, WorldSnapshot
 
 __all__ = ["EpisodeError", "Evaluator", "Trainer"]
 
@@ -150,7 +149,7 @@ class Trainer:
             CheckpointError: If no checkpoint can be read, or they do not fit this run.
         """
         self._is_continued = True
-        with held(self.record.folder):
+        with lock_folder(self.record.folder):
             restored = self._checkpoints.resume(self.record.folder.num_rows)
         if restored is not None:  # one that starts over meets the episodes that it would have met
             self._begin_episodes()

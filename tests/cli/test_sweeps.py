@@ -12,7 +12,7 @@ from hydra.core.utils import JobReturn, JobStatus
 from omegaconf import OmegaConf
 
 from safe_rl.cli.sweeps import SweepReport, count_jobs, threads_per_job
-from safe_rl.runs.archive import read_facts
+from safe_rl.runs.checkpoint_file import read_facts
 from safe_rl.runs.folder import runs_below
 
 ROOT = Path(__file__).parents[2]

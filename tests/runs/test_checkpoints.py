@@ -12,7 +12,7 @@ from tensordict import NonTensorData, TensorDict
 from torch import nn
 from torchrl.checkpoint import Checkpoint, CheckpointError, StateDictCheckpointAdapter
 
-from safe_rl.runs.archive import read_facts, writer
+from safe_rl.runs.checkpoint_file import read_facts, writer
 from safe_rl.runs.checkpoints import CheckpointStore, best_checkpoint
 from safe_rl.runs.folder import checkpoint_steps, checkpoints_in
 

@@ -6,8 +6,8 @@ import subprocess
 import pytest
 
 import safe_rl
-from safe_rl.runs import code
-from safe_rl.runs.code import code_of, commit_of, note_code
+from safe_rl.runs import record
+from safe_rl.runs.record import code_of, commit_of, note_code
 
 
 @pytest.fixture
@@ -81,7 +81,7 @@ def test_code_that_goes_on_with_a_run_stands_below_what_began_it(tmp_path, monke
 
     def noted(commit, steps):
         known = {"version": "1", "commit": commit, "changed": False}
-        monkeypatch.setattr(code, "code_of", lambda: known)
+        monkeypatch.setattr(record, "code_of", lambda: known)
         note_code(path, steps)
         return [(entry["steps"], entry["commit"]) for entry in json.loads(path.read_text())]
 

@@ -21,10 +21,9 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from torchrl.checkpoint import Checkpoint, CheckpointError
 
 from safe_rl.envs import SafetyGymEnv, store_configs
-from safe_rl.runs.checkpoints import CheckpointStore
-from safe_rl.runs.folder import RunFolder
-from safe_rl.runs.lock import RunInUseError
-from safe_rl.runs.resuming import check_same_run, is_finished, may_continue
+from safe_rl.runs.checkpoints import CheckpointStore, is_finished
+from safe_rl.runs.folder import RunFolder, RunInUseError
+from safe_rl.runs.identity import check_same_run, may_continue
 from safe_rl.runs.table import read_table
 from safe_rl.training.building import build_trainer, seed_everything
 

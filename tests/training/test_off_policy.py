@@ -16,8 +16,7 @@ from safe_rl.evaluation.loading import find_checkpoint, load_config, load_policy
 from safe_rl.objectives import SACLagrangianLoss
 from safe_rl.runs.table import read_table
 from safe_rl.targets import allow
-from safe_rl.training.building import build_trainer, seed_everything
-from safe_rl.training.transfer import begin_from
+from safe_rl.training.building import begin_from, build_trainer, seed_everything
 
 NAMES = ["sac", "sac_lagrangian", "td3", "td3_lagrangian", "wcsac", "cal"]
 

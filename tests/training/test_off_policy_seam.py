@@ -18,8 +18,7 @@ from safe_rl.evaluation.episodes import collect_episodes
 from safe_rl.evaluation.loading import find_checkpoint, load_config, load_policy
 from safe_rl.runs.table import read_table
 from safe_rl.targets import allow
-from safe_rl.training.building import build_trainer, seed_everything
-from safe_rl.training.transfer import initialise_networks
+from safe_rl.training.building import build_trainer, initialise_networks, seed_everything
 
 
 class QNetwork(nn.Module):

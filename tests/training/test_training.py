@@ -12,7 +12,7 @@ from run_configs import point_mass_config, without_times
 from torchrl.checkpoint import Checkpoint
 
 from safe_rl.objectives import PPOLagrangianLoss
-from safe_rl.runs.archive import read_facts
+from safe_rl.runs.checkpoint_file import read_facts
 from safe_rl.runs.checkpoints import CheckpointStore
 from safe_rl.runs.folder import checkpoints_in
 from safe_rl.runs.table import read_table

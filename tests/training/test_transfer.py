@@ -10,7 +10,7 @@ from torchrl.checkpoint import CheckpointError
 
 from safe_rl.models import QEnsemble, make_actor, make_bounded_actor, make_squashed_actor
 from safe_rl.runs.checkpoints import CheckpointStore
-from safe_rl.training.transfer import initialise_networks
+from safe_rl.training.building import initialise_networks
 
 
 @pytest.fixture

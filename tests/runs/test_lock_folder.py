@@ -11,9 +11,8 @@ from threading import Event, Thread
 import pytest
 from filelock import FileLock, SoftFileLease
 
-from safe_rl.runs import lock
-from safe_rl.runs.folder import RunFolder
-from safe_rl.runs.lock import RunInUseError, held
+from safe_rl.runs import folder as folder_module
+from safe_rl.runs.folder import RunFolder, RunInUseError, lock_folder
 
 FORK = multiprocessing.get_context("fork")
 PATIENCE = 300
@@ -26,7 +25,7 @@ def folder(tmp_path):
 
 
 def hold(folder, ready):
-    with held(folder):
+    with lock_folder(folder):
         ready.set()
         time.sleep(2 * PATIENCE)
 
@@ -45,7 +44,7 @@ def holder(folder):
 
 def test_the_second_is_told_who_the_first_is(folder, holder):
     with pytest.raises(RunInUseError, match=rf"process {holder.pid} on [^?]+\. Wait"):
-        held(folder).__enter__()
+        lock_folder(folder).__enter__()
 
 
 def test_the_lock_dies_with_its_process(folder, holder):
@@ -53,30 +52,30 @@ def test_the_lock_dies_with_its_process(folder, holder):
     holder.join(PATIENCE)
     assert SoftFileLease(folder.lease).pid == holder.pid
     start = time.monotonic()
-    with held(folder):
+    with lock_folder(folder):
         assert SoftFileLease(folder.lease).pid == os.getpid()
-    assert time.monotonic() - start < lock.LEASE  # for which one elsewhere is waited for
+    assert time.monotonic() - start < folder_module.LEASE  # for which one elsewhere is waited for
     assert not folder.lease.exists()
 
 
 def test_the_same_process_goes_on_and_the_outermost_lets_go(folder):
-    with held(folder):
-        with held(folder):
+    with lock_folder(folder):
+        with lock_folder(folder):
             pass
         assert folder.lease.exists()
-    with held(folder):
+    with lock_folder(folder):
         pass
 
 
 def test_one_that_fails_lets_go_as_well(folder):
-    with pytest.raises(FloatingPointError), held(folder):
+    with pytest.raises(FloatingPointError), lock_folder(folder):
         raise FloatingPointError
     assert not folder.lease.exists()
 
 
 def outcome_of(folder, outcome):
     try:
-        with held(folder):
+        with lock_folder(folder):
             outcome.put("held")
     except RunInUseError:
         outcome.put("in use")
@@ -84,7 +83,7 @@ def outcome_of(folder, outcome):
 
 def test_a_forked_process_does_not_hold_what_its_parent_holds(folder):
     outcome = FORK.Queue()
-    with held(folder):
+    with lock_folder(folder):
         process = FORK.Process(target=outcome_of, args=(folder, outcome), daemon=True)
         process.start()
         assert outcome.get(timeout=PATIENCE) == "in use"
@@ -95,7 +94,7 @@ def test_a_forked_process_that_outlives_the_holder_holds_nothing(folder):
     """The kernel's lock would go on in it: workers of a run that was killed."""
 
     def hold_and_fork(ready, child):
-        with held(folder):
+        with lock_folder(folder):
             grandchild = FORK.Process(target=time.sleep, args=(2 * PATIENCE,))
             grandchild.start()
             child.value = grandchild.pid
@@ -109,7 +108,7 @@ def test_a_forked_process_that_outlives_the_holder_holds_nothing(folder):
         assert ready.wait(PATIENCE)
         process.kill()
         process.join()  # with a time limit, it would wait for the other one as well
-        with held(folder):
+        with lock_folder(folder):
             pass
     finally:
         process.kill()
@@ -120,7 +119,7 @@ def test_a_forked_process_that_outlives_the_holder_holds_nothing(folder):
 @pytest.fixture
 def quick(monkeypatch):
     # not so quick that a busy machine renews a lease too late
-    monkeypatch.setattr(lock, "LEASE", 3.0)
+    monkeypatch.setattr(folder_module, "LEASE", 3.0)
 
 
 @contextmanager
@@ -144,9 +143,9 @@ def test_a_writer_on_another_machine_that_shows_itself_is_left_alone(folder, qui
     lines = ("filelock/2", "pid=1", "host=elsewhere", "mode=lease", "token=a", "duration=3.0", "")
     folder.lease.write_text("\n".join(lines))
     with renewing(folder.lease), pytest.raises(RunInUseError, match="process 1 on elsewhere"):
-        held(folder).__enter__()
+        lock_folder(folder).__enter__()
     # and its place is taken when it does so no more
-    with held(folder):
+    with lock_folder(folder):
         assert SoftFileLease(folder.lease).pid == os.getpid()
 
 
@@ -157,7 +156,7 @@ def test_without_locks_the_writer_is_still_seen(folder, quick, monkeypatch, code
 
     monkeypatch.setattr(FileLock, "acquire", refuse)
     outcome = FORK.Queue()
-    with held(folder):
+    with lock_folder(folder):
         process = FORK.Process(target=outcome_of, args=(folder, outcome), daemon=True)
         process.start()
         assert outcome.get(timeout=PATIENCE) == "in use"
@@ -167,5 +166,5 @@ def test_without_locks_the_writer_is_still_seen(folder, quick, monkeypatch, code
 @pytest.mark.parametrize("content", ["", "{", "[]", "null"])
 def test_a_damaged_note_of_the_writer_stops_nobody(folder, content):
     folder.lease.write_text(content)
-    with held(folder):
+    with lock_folder(folder):
         pass

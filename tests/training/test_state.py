@@ -7,7 +7,7 @@ import pytest
 from point_mass_runs import point_mass_trainer
 
 from safe_rl.runs.table import read_table
-from safe_rl.training.interrupts import StopRequest
+from safe_rl.training.state import StopRequest
 
 
 def test_a_signal_ends_the_run_after_the_epoch_with_a_checkpoint(tmp_path):
