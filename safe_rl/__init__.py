@@ -12,10 +12,10 @@ import safe_rl.openmp  # noqa: F401, whatever is imported first, this comes befo
 from safe_rl.lazy import import_later
 
 if TYPE_CHECKING:
-    from safe_rl.cli.notebook import Run, load, resume, train
+    from safe_rl.cli.python_api import Run, load, resume, train
 
 __all__ = ["Run", "load", "resume", "train"]
 __version__ = "0.1.0"
 
 
-__getattr__, __dir__ = import_later(__name__, dict.fromkeys(__all__, "safe_rl.cli.notebook"))
+__getattr__, __dir__ = import_later(__name__, dict.fromkeys(__all__, "safe_rl.cli.python_api"))

@@ -26,7 +26,7 @@ USAGE = "\n".join(
 )
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
+def main(arguments: Sequence[str] | None = None) -> int | str:
     """Hand the rest of the command line over to a command; returns its exit status.
 
     Examples:
@@ -35,8 +35,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """
     name, *others = [*(sys.argv[1:] if arguments is None else arguments), ""]
     if name in COMMANDS:
-        sys.argv = [f"safe-rl {name}", *others[:-1]]  # where Hydra looks
-        return import_module(f"safe_rl.cli.{name}").main() or 0
+        return import_module(f"safe_rl.cli.{name}").main(others[:-1], f"safe-rl {name}")
     if name in ("", "-h", "--help"):
         print(USAGE)
         return 0 if name else 2

@@ -1,20 +1,14 @@
 """The command train.py, in this process."""
 
-import sys
-
 from safe_rl.cli import train
 
 
 def status_of(*arguments: str) -> object:
     """Its exit status, or the line that it ends with."""
-    before = sys.argv
-    sys.argv = ["train.py", *arguments]
     try:
-        return train.main()
+        return train.main(arguments)
     except SystemExit as end:
         return end.code
-    finally:
-        sys.argv = before
 
 
 def run_train(*arguments: str) -> None:

@@ -163,18 +163,16 @@ FLOORS = {
         ("",),
     ),
     "cli": (
-        ("benchmark", "conf", "interrupting", "meant", "options", "robots", "run_folders"),
-        ("sweep_display", "values"),
+        ("benchmark", "grammar", "interrupting", "robots", "sweep_display", "values"),
         ("keys",),
-        ("failures", "settings", "variations"),
-        ("overrides",),
-        ("user_code",),
-        ("composing", "shorthands", "sweeps"),
-        ("certificates",),
-        ("evaluating", "running"),
-        ("evaluate", "report", "train"),
-        ("python_settings",),
-        ("notebook",),
+        ("settings", "user_code"),
+        ("suggestions", "sweeps"),
+        ("composing",),
+        ("certificates", "resuming", "variations"),
+        ("session",),
+        ("evaluating", "train"),
+        ("evaluate", "report"),
+        ("python_api",),
         ("",),
     ),
     "evaluation": (
@@ -285,7 +283,7 @@ def test_the_package_itself_imports_what_comes_before_torch_and_no_part():
     ]
     at_hand = {"typing", "safe_rl.openmp", "safe_rl.lazy"}
     later = {found.imported for found in imports_of("safe_rl")} - at_hand
-    assert later == {"safe_rl.cli.notebook"}
+    assert later == {"safe_rl.cli.python_api"}
 
 
 def in_a_process(code, **environment):

@@ -15,7 +15,7 @@ from hydra import compose, initialize_config_dir
 from omegaconf import DictConfig, OmegaConf
 from setting_tables import own_parts, setting_table
 
-from safe_rl.cli.conf import CONF
+from safe_rl.cli.composing import CONF
 from safe_rl.targets import accepted_names, locate
 
 DOCS = Path(__file__).resolve().parents[1]

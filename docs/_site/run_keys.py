@@ -11,7 +11,7 @@ from hydra import compose, initialize_config_dir
 from omegaconf import DictConfig, OmegaConf
 from tables import table
 
-from safe_rl.cli.conf import CONF
+from safe_rl.cli.composing import CONF
 from safe_rl.cli.keys import KEYS
 from safe_rl.cli.settings import keys_of_part
 from safe_rl.cli.values import anything, mapping_of
@@ -89,7 +89,7 @@ def _part_defaults() -> Mapping[str, dict[str, Mapping[str, Any]]]:
         for node in _nodes(yaml.safe_load(path.read_text())):
             target = str(node["_target_"])
             found[_OPTIMISER if target.startswith("torch.optim.") else target][file] = node
-    found.pop("safe_rl.cli.run_folders.NewFolder"), found.pop("safe_rl.cli.sweeps.SweepReport")
+    found.pop("safe_rl.cli.sweeps.SweepReport")
     return found
 
 

@@ -9,7 +9,7 @@ from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
 
-from safe_rl.cli.conf import CONF
+from safe_rl.cli.composing import CONF
 from safe_rl.cli.keys import KEYS
 from safe_rl.cli.robots import maker_of
 from safe_rl.evaluation import Certificate, CertificateOptions, certify

@@ -1,58 +1,74 @@
-"""Command lines of ``train.py``, checked by composing what they ask for before Hydra does.
-
-Hydra answers a name that does not exist with advice to add it, after which it has no effect, and
-makes the folder of a run before the run can look at its configuration.
-"""
+"""From overrides to the configuration of a new run, checked before anything is written."""
 
 from __future__ import annotations
 
 import re
-import tempfile
-from argparse import Namespace
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
 
-from hydra._internal.hydra import Hydra
-from hydra._internal.utils import create_automatic_config_search_path, get_args_parser
-from hydra.core.config_search_path import SearchPathQuery
+from hydra import compose, initialize_config_dir
+from hydra.core.config_loader import ConfigLoader
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.hydra_config import HydraConfig
 from hydra.core.object_type import ObjectType
-from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Override
-from hydra.errors import HydraException
-from hydra.types import RunMode
-from omegaconf import DictConfig, OmegaConf, open_dict, read_write
+from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from safe_rl.cli.overrides import (
+from safe_rl.cli.grammar import CommandLineError, parse
+from safe_rl.cli.keys import KEYS
+from safe_rl.cli.settings import check_settings, plain
+from safe_rl.cli.suggestions import (
     COMPOSING_ERRORS,
-    CommandLineError,
-    check_added,
-    check_choices,
-    check_read,
-    check_whole,
+    Composing,
     explain,
+    nobody_reads,
+    unread_by,
 )
-from safe_rl.cli.settings import check_settings
-from safe_rl.runs.folder import RunFolder
+from safe_rl.envs import store_configs
+from safe_rl.envs.foreign import hint_of_gymnasium
+from safe_rl.naming import did_you_mean
 
-__all__ = ["check_command"]
+__all__ = [
+    *("CONF", "GIVEN_WHOLE", "check_once", "check_read", "compose_jobs", "hydras_own", "resolving"),
+]
 
-_MODULE = "safe_rl.cli.train"  # where a relative --config-path starts from, as in Hydra
+_PACKAGED = Path(__file__).parents[1] / "conf"
+CONF = _PACKAGED if _PACKAGED.is_dir() else Path(__file__).parents[2] / "conf"
+"""Folder of ``config.yaml`` and the groups: of a checkout, or the copy in an installed package."""
+
+_BUDGETED = ("saute", "simmer", "early_termination")
+GIVEN_WHOLE = {
+    **{"cost_limits": "limits", "model.input_scale": "factors"},
+    **{f"transforms.{name}.budgets": "budgets" for name in _BUDGETED},
+}
+"""Mappings that are given all at once, and what is in them."""
+_MOST_LISTED = 40
+_ONE_EACH = ("env", "algo", "preset", "model", "risk", "collector", "logger", "lagrangian")
 
 
-def check_command(arguments: Sequence[str], conf: Path) -> None:
-    """Check what a command line of ``train.py`` asks for, before anything is written.
-
-    Of a sweep, every value is checked once, with the first of the other values. Command lines that
-    only ask Hydra for help are left alone; those that show a configuration are checked for names.
+def compose_jobs(
+    texts: Sequence[str],
+    *,
+    sweep: bool = False,
+    shown: bool = False,
+    folder: Path = CONF,
+    name: str = "config",
+) -> list[DictConfig]:
+    """Compose what overrides ask for, and check it.
 
     Args:
-        arguments: Arguments of ``train.py``, with shorthands written out.
-        conf: Folder of the configurations; ``--config-dir`` and the like add theirs.
+        texts: The overrides.
+        sweep: Whether they may have several values each. Every value is checked once, with the
+            first of the other values.
+        shown: Whether the configuration is only shown: it may hold any values.
+        folder: Folder of the configurations; ``hydra.searchpath`` adds others.
+        name: Of the main file there.
+
+    Returns:
+        Configurations with Hydra's own node: one, or of a sweep those that were checked.
 
     Raises:
         CommandLineError: For a name that does not exist or is not read; right ones are named.
@@ -60,70 +76,66 @@ def check_command(arguments: Sequence[str], conf: Path) -> None:
         ConfigError: For a value that the environment cannot have.
 
     Examples:
-        >>> check_command(["--hydra-help"], Path("conf"))
+        >>> compose_jobs(["env=CarGoal1", "seed=3"])[0].seed
+        3
     """
-    flags, unknown = get_args_parser().parse_known_args(list(arguments))
-    if unknown:
-        raise CommandLineError(_without_dashes(unknown[0]))
-    if flags.help or flags.hydra_help or flags.shell_completion or flags.experimental_rerun:
-        return
-    overrides = [_parse(text) for text in flags.overrides]
-    with _open_hydra(flags, overrides, conf) as hydra:
-        check_choices(overrides, hydra.config_loader)
-        check_whole(overrides)
-        for job in _jobs(overrides) if _is_sweep(flags) else [flags.overrides]:
-            config = _compose(hydra, flags.config_name or "config", job)
-            if flags.cfg is None and flags.info is None:
-                _check_package(config)
-                check_read(overrides, config)
-                _check_run(config, "hydra.sweep.dir" if _is_sweep(flags) else "hydra.run.dir")
-                check_added(overrides, config)
+    store_configs()
+    overrides = [parse(text) for text in texts]
+    with _hydra(folder) as loader:
+        check_once(overrides)
+        _check_choices(overrides, partial(_options, loader, name, texts))
+        jobs = list(_jobs(overrides)) if sweep else [list(texts)]
+        configs = [_compose(job, name, partial(_options, loader, name, texts)) for job in jobs]
+    for config in [] if shown else configs:
+        _check_package(config)
+        check_read(overrides, config)
+        _check_values(config, overrides)
+    return configs
 
 
-def _without_dashes(flag: str) -> str:
-    """What to write instead of a flag that Hydra does not have."""
-    name, _, value = flag.lstrip("-").partition("=")
-    written = f"{name.replace('-', '_')}={value or '…'}"
-    return (
-        f"'{flag}': there is no such flag. A key is written without dashes, {written}; "
-        "'python train.py --hydra-help' names the flags."
-    )
-
-
-def _parse(text: str) -> Override:
-    try:
-        return OverridesParser.create().parse_override(text)
-    except HydraException as error:
-        quoted = re.search(r"\{\s*['\"]", text)
-        hint = " Names within braces have no quotes: '{cost: 10}'." if quoted else ""
-        raise CommandLineError(
-            f"'{text}' cannot be read: {str(error).splitlines()[0]}.{hint}"
-        ) from None
-
-
-def _is_sweep(flags: Namespace) -> bool:
-    return flags.multirun or "hydra.mode=MULTIRUN" in flags.overrides
+def hydras_own(texts: Sequence[str] = ()) -> DictConfig:
+    """Hydra's own node with some overrides of it."""
+    with _hydra(CONF):
+        return compose("config", list(texts), return_hydra_config=True).hydra
 
 
 @contextmanager
-def _open_hydra(flags: Namespace, overrides: Sequence[Override], conf: Path) -> Iterator[Hydra]:
-    """Hydra with the folders that the command line names."""
-    path = create_automatic_config_search_path(None, _MODULE, flags.config_path or str(conf))
-    schema = SearchPathQuery(provider="schema")
-    if flags.config_dir is not None:
-        folder = Path(flags.config_dir).absolute()
-        if not folder.is_dir():
-            raise CommandLineError(f"--config-dir {flags.config_dir}: there is no such folder.")
-        path.prepend("command-line", f"file://{folder}", schema)
-    for override in overrides:
-        if override.get_key_element() == "hydra.searchpath":
-            for searched in override.value():  # type: ignore[union-attr]
-                path.prepend("command-line", str(searched), schema)
-    hydra = Hydra.create_main_hydra2("train", path)
+def resolving(config: DictConfig) -> Iterator[None]:
+    """Let ``${hydra:…}`` find Hydra's node of a configuration."""
+    before = HydraConfig.instance().cfg
+    HydraConfig.instance().set_config(config)
     try:
-        yield hydra
+        yield
     finally:
-        GlobalHydra.instance().clear()
+        HydraConfig.instance().cfg = before
+
+
+@contextmanager
+def _hydra(folder: Path) -> Iterator[ConfigLoader]:
+    """Hydra on a folder; whoever has initialised it elsewhere finds it as it was."""
+    before = GlobalHydra.instance().hydra
+    GlobalHydra.instance().clear()
+    try:
+        with initialize_config_dir(str(folder.absolute()), job_name="train", version_base="1.3"):
+            yield GlobalHydra.instance().config_loader()
+    finally:
+        GlobalHydra.instance().hydra = before
+
+
+def _options(loader: ConfigLoader, name: str, texts: Sequence[str], group: str) -> list[str]:
+    """Names of the files in a group, also in the folders that overrides add."""
+    searched = [text for text in texts if text.startswith("hydra.searchpath=")]
+    return loader.get_group_options(group, ObjectType.CONFIG, name, searched)
+
+
+def _compose(texts: list[str], name: str, options: partial[list[str]]) -> DictConfig:
+    def composed(texts: list[str]) -> DictConfig:
+        return compose(name, texts, return_hydra_config=True)
+
+    try:
+        return composed(texts)
+    except COMPOSING_ERRORS as error:
+        raise CommandLineError(explain(error, texts, Composing(composed, options))) from None
 
 
 def _jobs(overrides: Sequence[Override]) -> Iterator[list[str]]:
@@ -140,22 +152,63 @@ def _jobs(overrides: Sequence[Override]) -> Iterator[list[str]]:
         yield from ([*first[:place], value, *first[place + 1 :]] for value in of_one[1:])
 
 
-def _compose(hydra: Hydra, name: str, overrides: list[str]) -> DictConfig:
-    def compose(overrides: list[str]) -> DictConfig:
-        return hydra.compose_config(name, overrides, RunMode.RUN)
+def check_once(overrides: Sequence[Override]) -> None:
+    """Refuse keys that are given twice, and parts of mappings that are given as a whole."""
+    given: dict[str, list[str]] = {}
+    for override in overrides:
+        if not override.is_delete():
+            key = f"{override.key_or_group}@{override.package or ''}"
+            given.setdefault(key, []).append(str(override.input_line))
+    for key, lines in given.items():
+        if lines[1:]:
+            name = key.removesuffix("@")
+            raise CommandLineError(f"'{name}' is given more than once: {', '.join(lines)}.")
+    for override in overrides:
+        for section, what in GIVEN_WHOLE.items():
+            name = override.key_or_group.removeprefix(f"{section}.")
+            if name != override.key_or_group:
+                raise CommandLineError(
+                    f"'{override.input_line}': {what} are given all at once, as "
+                    f"{section}='{{{name}: {override.get_value_element_as_str()}}}'."
+                )
 
-    try:
-        return compose(overrides)
-    except COMPOSING_ERRORS as error:
-        choices = [text for text in overrides if _chooses(text, hydra)]
-        options = partial(hydra.config_loader.get_group_options, results_filter=ObjectType.CONFIG)
-        raise CommandLineError(explain(error, overrides, choices, compose, options)) from None
+
+def _check_choices(overrides: Sequence[Override], options: partial[list[str]]) -> None:
+    """Check what is chosen of groups, such as ``env=CarGoal1`` or ``algo=ppo,cpo``."""
+    for override in overrides:
+        group, value = override.key_or_group, override.value()
+        may_choose = value is None or isinstance(value, bool | str | list)
+        known = options(group) if may_choose or override.is_discrete_sweep() else []
+        if not known or override.is_delete():
+            continue
+        sweep = override.sweep_string_iterator() if override.is_sweep_override() else None
+        chosen = list(_names(sweep or [override.get_value_element_as_str()]))
+        if isinstance(value, list) and chosen and group in _ONE_EACH:
+            raise CommandLineError(
+                f"'{override.input_line}': a run has one {group}; for a run with each of them: "
+                f"-m {group}={','.join(chosen)}"
+            )
+        # of some groups several are chosen, or none: transforms=[saute,action_filter]
+        for name in chosen if chosen or isinstance(value, list) else [""]:
+            if name not in known:
+                family = hint_of_gymnasium(name) if group == "env" else ""
+                raise CommandLineError(
+                    f"'{override.input_line}': there is no {group} '{name}'."
+                    f"{family or did_you_mean(name, known) or _listed(known)}"
+                )
 
 
-def _chooses(override: str, hydra: Hydra) -> bool:
-    """Whether an override chooses a file of a group."""
-    group = override.partition("=")[0].lstrip("+").partition("@")[0]
-    return bool(hydra.config_loader.get_group_options(group, ObjectType.CONFIG))
+def _names(choices: Iterable[str]) -> Iterator[str]:
+    """Single names of choices that are names or lists of them."""
+    for choice in choices:
+        yield from filter(None, re.split(r"[\[\],\s'\"]+", choice))
+
+
+def _listed(choices: Sequence[str]) -> str:
+    """What there is to choose from, or where that is told if a line cannot hold it."""
+    if len(choices) > _MOST_LISTED:
+        return " 'python train.py --help' names all there are."
+    return f" There are {', '.join(choices)}."
 
 
 def _check_package(config: DictConfig) -> None:
@@ -169,32 +222,48 @@ def _check_package(config: DictConfig) -> None:
         )
 
 
-def _check_run(config: DictConfig, folder_key: str) -> None:
-    """Check a configuration with Hydra's node set up as it will be in the run."""
-    before = HydraConfig.instance().cfg
-    HydraConfig.instance().set_config(config)
+def check_read(overrides: Sequence[Override], config: DictConfig) -> None:
+    """Refuse keys that a configuration holds and its algorithm does not read."""
+    algo = config.get("algo") or {}
+    refused = unread_by(algo)
+    for override in overrides:
+        key = override.key_or_group.replace("/", ".")
+        for unread, reason in refused.items():
+            path, _, choice = unread.partition("=")
+            is_chosen = not choice or OmegaConf.select(config, path) == choice
+            if is_chosen and f"{key}.".startswith(f"{path}."):
+                verb = "has no" if choice else "does not read"
+                raise CommandLineError(
+                    f"'{override.input_line}': algo={algo.get('name')} {verb} '{unread}'. {reason}"
+                )
+
+
+def _check_values(config: DictConfig, overrides: Sequence[Override]) -> None:
     try:
-        with read_write(config.hydra.runtime), open_dict(config.hydra.runtime):
-            config.hydra.runtime.output_dir = ""
-        HydraConfig.instance().set_config(config)
-        folder = Path(str(OmegaConf.select(config, folder_key)))
-        check_settings(config, RunFolder(folder))
-        _check_writable(folder, folder_key)
+        with resolving(config):
+            OmegaConf.select(config, "hydra.run.dir")  # which names what every run has
+            check_settings(config)
+            _check_added(overrides, config)
     except OmegaConfBaseException as error:
         words = " ".join(str(error).split())
         if missing := re.search(r"Missing mandatory value: (\S+)", words):
             words = f"{missing[1]} has to be given: {missing[1]}=…"
         raise CommandLineError(words) from None
-    finally:
-        HydraConfig.instance().cfg = before
 
 
-def _check_writable(folder: Path, key: str) -> None:
-    try:
-        existing = next(path for path in (folder, *folder.absolute().parents) if path.exists())
-        with tempfile.TemporaryFile(dir=existing):
-            pass
-    except OSError as error:
-        raise CommandLineError(
-            f"{key}={folder}: nothing can be written there: {error.strerror}."
-        ) from None
+def _check_added(overrides: Sequence[Override], config: DictConfig) -> None:
+    """Refuse keys that are added at the top level, ``+key=…``, and that nothing reads.
+
+    Keys below sections and parts are checked with their values.
+    """
+    text = OmegaConf.to_yaml(config)
+    for override in overrides:
+        head = override.key_or_group.partition(".")[0]
+        is_added = override.is_add() or override.is_force_add()
+        is_known = any(path.partition(".")[0] == head for path in KEYS)
+        if not is_added or is_known or head not in config or "/" in override.key_or_group:
+            continue
+        # ${head}, ${head.key}, ${resolver:head.key}
+        if not re.search(rf"\$\{{(?:[^${{}}]*[:,])?{re.escape(head)}[.,}}]", text):
+            others = {key: node for key, node in plain(config).items() if key != head}
+            raise CommandLineError(nobody_reads(override.input_line, override.key_or_group, others))

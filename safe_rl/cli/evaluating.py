@@ -9,9 +9,9 @@ from pathlib import Path
 
 from safe_rl.cli.benchmark import suite
 from safe_rl.cli.certificates import certify_run
-from safe_rl.cli.failures import SETTING_ERRORS
-from safe_rl.cli.options import OptionError
+from safe_rl.cli.grammar import CommandLineError
 from safe_rl.cli.robots import maker_of
+from safe_rl.cli.session import SETTING_ERRORS
 from safe_rl.cli.user_code import check_imports, import_modules
 from safe_rl.cli.variations import evaluate_varied, table_of
 from safe_rl.envs import LayoutError, OpenGLError
@@ -80,7 +80,7 @@ def _refuse_beside_certify(options: EvaluationOptions) -> None:
     plain = EvaluationOptions()
     for field in fields(options):
         if field.name not in heeded and getattr(options, field.name) != getattr(plain, field.name):
-            raise OptionError(
+            raise CommandLineError(
                 f"{field.name}: certify=true does not heed it. A certificate is of the run's own "
                 "environment, and takes certificate.episodes=… and the like, and num_threads=…"
             )

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from safe_rl.cli.benchmark import suite
+from safe_rl.cli.grammar import CommandLineError, parse_options, usage
 from safe_rl.cli.interrupting import say_interruptions
-from safe_rl.cli.options import OptionError, parse_options, usage
 from safe_rl.cli.user_code import import_modules, split_imports
 from safe_rl.evaluation.settings import option
 from safe_rl.reporting import Report, build_report, write_report
@@ -75,19 +75,19 @@ def report(root: Path, options: ReportOptions) -> tuple[Report, Path]:
     return result, write_report(result, out, options.title or root.resolve().name)
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
+def main(arguments: Sequence[str] | None = None, program: str = COMMAND) -> int:
     """The command; returns its exit status."""
     say_interruptions()
     arguments = sys.argv[1:] if arguments is None else list(arguments)
     if not arguments or arguments[0] in ("-h", "--help"):
-        print(usage(f"{COMMAND} RUNS_DIR", ReportOptions))
+        print(usage(f"{program} RUNS_DIR", ReportOptions))
         return 0 if arguments else 2
     try:
         modules, arguments = split_imports(arguments)
         if not arguments:
-            raise OptionError(f"{COMMAND} takes a folder of runs first.")
+            raise CommandLineError(f"{program} takes a folder of runs first.")
         for other in (argument for argument in arguments[1:] if "=" not in argument):
-            raise OptionError(
+            raise CommandLineError(
                 f"'{other}': a report is of one folder and all runs below it. Name a folder above "
                 "them, or copy them into one; options are written key=value."
             )

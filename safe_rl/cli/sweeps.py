@@ -81,6 +81,11 @@ class SweepReport(Callback):
         """What jobs in other processes get: all but what shows them."""
         return {**vars(self), "_display": None}
 
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """Import the user's modules in a job's process, which gets this before it composes."""
+        vars(self).update(state)
+        import_modules(self._modules)
+
     def on_multirun_start(self, config: DictConfig, **kwargs: Any) -> None:
         """Share the cores out among the jobs and begin the journal."""
         self._num_jobs = count_jobs(config.hydra.overrides.task)
@@ -100,9 +105,8 @@ class SweepReport(Callback):
         atexit.register(self._print_summary)
 
     def on_job_start(self, config: DictConfig, **kwargs: Any) -> None:
-        """Note that a job has begun, and import the user's modules where it runs."""
+        """Note that a job has begun."""
         self._note(config, "begun")
-        import_modules(self._modules)
         if os.getppid() == self._process:
             # else it would train on, or wait for ever, when the sweep was killed
             end_with_parent(_GRACE)

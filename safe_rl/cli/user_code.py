@@ -7,18 +7,15 @@ makes them run: opening somebody's run executes nothing of theirs.
 
 from __future__ import annotations
 
-import re
 import sys
 import traceback
 from collections.abc import Callable, Mapping, Sequence
 from importlib import import_module
 from pathlib import Path
-from typing import Any
-
-import yaml
+from typing import Any, cast
 
 from safe_rl import targets
-from safe_rl.cli.overrides import CommandLineError
+from safe_rl.cli.grammar import CommandLineError, parse, quote
 
 __all__ = [
     "KEY",
@@ -27,7 +24,6 @@ __all__ = [
     "imported",
     "make_after_imports",
     "note_imports",
-    "quote",
     "several",
     "split_imports",
 ]
@@ -58,42 +54,18 @@ def split_imports(arguments: Sequence[str]) -> tuple[list[str] | None, list[str]
     modules: list[str] = []
     for argument in given:
         text = argument.partition("=")[2]
-        value = _read_list(argument, text) if text.startswith("[") else text
-        modules += map(str, value) if isinstance(value, list) else [value]
+        modules += cast(list[str], parse(argument).value()) if text.startswith("[") else [text]
     return (list(dict.fromkeys(modules)) if given else None), others
 
 
-def _read_list(argument: str, text: str) -> Any:
-    try:
-        return yaml.safe_load(text)
-    except yaml.YAMLError:
-        raise CommandLineError(
-            f"'{argument}' is no list: write {KEY}=[my_module,other_module]."
-        ) from None
-
-
-def note_imports(modules: Sequence[str], arguments: Sequence[str]) -> list[str]:
-    """Add the override by which a run notes its modules.
+def note_imports(modules: Sequence[str] | None) -> list[str]:
+    """The override by which a run notes its modules; none for None.
 
     Examples:
-        >>> note_imports(["mine", "examples/other.py"], ["-m", "seed=1,2"])
-        ['-m', "++import=['mine','examples/other.py']", 'seed=1,2']
+        >>> note_imports(["mine", "examples/other.py"])
+        ["++import=['mine','examples/other.py']"]
     """
-    is_override = ["=" in argument and not argument.startswith("-") for argument in arguments]
-    # beside the others: Hydra takes overrides on one side of a flag only
-    place = is_override.index(True) if any(is_override) else len(arguments)
-    return [*arguments[:place], f"++{KEY}=[{','.join(map(quote, modules))}]", *arguments[place:]]
-
-
-def quote(text: str) -> str:
-    r"""A text as Hydra's grammar has it, whatever is in it.
-
-    Examples:
-        >>> print(quote(r"it's a\b"))
-        'it\'s a\b'
-    """
-    # backslashes are doubled before a quote only
-    return "'" + re.sub(r"(\\*)('|$)", lambda m: m[1] * 2 + ("\\'" if m[2] else ""), text) + "'"
+    return [] if modules is None else [f"++{KEY}=[{','.join(map(quote, modules))}]"]
 
 
 def import_modules(modules: str | Sequence[str]) -> list[str]:

@@ -8,7 +8,7 @@ from typing import Any
 
 import yaml
 
-from safe_rl.cli.conf import CONF
+from safe_rl.cli.composing import CONF
 from safe_rl.cli.robots import maker_of
 from safe_rl.envs import LayoutError
 from safe_rl.evaluation import EvaluationOptions

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Hashable, Iterator, Mapping
 from enum import Enum
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
 
@@ -17,11 +17,8 @@ from safe_rl.runs.files import read_config
 from safe_rl.runs.folder import RunFolder, common_source
 from safe_rl.targets import present_name
 
-if TYPE_CHECKING:
-    from hydra.conf import HydraConf  # which a report need not import
-
 __all__ = [
-    *("ROLES", "Role", "check_same_run", "differences", "experiment_of", "flatten", "may_continue"),
+    *("ROLES", "Role", "check_same_run", "differences", "experiment_of", "flatten"),
     "role_of",
 ]
 
@@ -199,23 +196,6 @@ def _hashable(value: Any) -> Hashable:
     if isinstance(value, Mapping):
         return tuple((key, _hashable(item)) for key, item in value.items())
     return tuple(map(_hashable, value)) if isinstance(value, list | tuple) else value
-
-
-def may_continue(hydra: HydraConf, config: DictConfig) -> bool:
-    """Whether a run that is in the output folder already is to be continued.
-
-    That is so where the configuration comes from the folder itself, which is how ``resume=`` calls
-    Hydra, and for the jobs of a sweep, whose folders follow from their overrides.
-
-    Raises:
-        ValueError: If the folder of a sweep's job holds a run with other settings.
-    """
-    output = Path(hydra.runtime.output_dir).resolve()
-    if hydra.mode is not None and hydra.mode.name == "MULTIRUN":
-        check_same_run(output, config)
-        return True
-    sources = {Path(s.path).resolve() for s in hydra.runtime.config_sources if s.provider == "main"}
-    return output in sources
 
 
 def check_same_run(directory: Path, config: DictConfig) -> None:

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from safe_rl.cli.evaluating import evaluate_run
-from safe_rl.cli.options import OptionError, parse_options, take_options, usage
+from safe_rl.cli.grammar import CommandLineError, parse_options, take_options, usage
 from safe_rl.evaluation.settings import EvaluationOptions
 from safe_rl.extras import import_extra
 
@@ -54,12 +54,12 @@ def test_names_stay_as_they_are_written(name):
         ("video=7.5", "video=7.5: it must be true or false"),
         ("deterministic=2", "deterministic=2: it must be true or false"),
         ("episodes=nan", "'nan'.*option 'episodes'"),
-        ("episodes=[1", "a value cannot be read"),
+        ("episodes=[1", "cannot be read"),
         ("cost_limits={cost: low}", "'low'.*option 'cost_limits.cost'"),
     ],
 )
 def test_errors_say_what_to_write(argument, message):
-    with pytest.raises(OptionError, match=message):
+    with pytest.raises(CommandLineError, match=message):
         parse_options([argument], EvaluationOptions)
 
 
@@ -75,7 +75,7 @@ def test_errors_say_what_to_write(argument, message):
         ("device=meta", "device=meta: it must be cpu, cuda or"),
         ("cvar_alpha=nan", "nan"),
         ("cost_limits={cost: -1}", r"cost_limits.cost=-1.0: it must be a number from 0"),
-        ("cost_limits={cost: .nan}", r"cost_limits.cost=nan: it must be a number from 0"),
+        ("cost_limits={cost: nan}", r"cost_limits.cost=nan: it must be a number from 0"),
     ],
 )
 def test_options_are_checked_before_anything_is_done(tmp_path, argument, message):

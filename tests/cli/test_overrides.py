@@ -7,9 +7,10 @@ import pytest
 from omegaconf import OmegaConf
 from run_configs import CONF
 
-from safe_rl.cli.composing import check_command
-from safe_rl.cli.overrides import CommandLineError
+from safe_rl.cli.grammar import CommandLineError
+from safe_rl.cli.session import check_writable
 from safe_rl.cli.settings import SettingError
+from safe_rl.cli.train import read_command
 
 MINE = """
 # @package _global_
@@ -99,14 +100,14 @@ def own_conf(tmp_path):
 
 @pytest.mark.parametrize("arguments", RIGHT, ids=" ".join)
 def test_right_names_pass(arguments):
-    check_command(arguments, CONF)
+    read_command(arguments)
 
 
 @pytest.mark.parametrize("argument", WRONG)
 def test_wrong_names_name_the_right_ones(argument):
     flags = ["-m"] if argument == "env=CarGoal2,CarGaol2" else []
     with pytest.raises((CommandLineError, SettingError), match=WRONG[argument]) as caught:
-        check_command([*flags, "logger=none", argument], CONF)
+        read_command([*flags, "logger=none", argument])
     assert len(str(caught.value).splitlines()) == 1
 
 
@@ -116,7 +117,7 @@ def test_wrong_names_name_the_right_ones(argument):
 def test_multipliers_go_with_algorithms_that_have_them(override):
     part = override.partition("=")[0].partition(".")[0]
     with pytest.raises(CommandLineError, match=f"algo=ppo has no '{part}'"):
-        check_command(["algo=ppo", override], CONF)
+        read_command(["algo=ppo", override])
 
 
 UNREAD = {
@@ -133,13 +134,13 @@ UNREAD = {
 @pytest.mark.parametrize("argument", UNREAD)
 def test_what_only_other_algorithms_read_is_refused_with_the_reason(argument):
     with pytest.raises(CommandLineError, match=UNREAD[argument]):
-        check_command(["algo=td3", argument], CONF)
+        read_command(["algo=td3", argument])
     if "+" not in argument:
-        check_command(["algo=ppo", argument], CONF)
+        read_command(["algo=ppo", argument])
         with pytest.raises(CommandLineError, match="algo=sac does not"):
-            check_command(["-m", "algo=ppo,sac", argument], CONF)
+            read_command(["-m", "algo=ppo,sac", argument])
         with pytest.raises(CommandLineError, match=f"'{argument}': algo=bc does not read"):
-            check_command(["algo=bc", argument], CONF)
+            read_command(["algo=bc", argument])
 
 
 @pytest.mark.parametrize(
@@ -155,37 +156,37 @@ def test_what_only_other_algorithms_read_is_refused_with_the_reason(argument):
 )
 def test_only_keys_that_the_algorithm_reads_are_proposed(argument, message):
     with pytest.raises(CommandLineError, match=message):
-        check_command(["algo=sac", argument], CONF)
+        read_command(["algo=sac", argument])
 
 
 @pytest.mark.parametrize("argument", ["max_kl=0.1", "policy_update.max_kl=0.1"])
 def test_the_bound_of_a_trust_region_has_another_name(argument):
     with pytest.raises(CommandLineError, match=r"Did you mean 'policy_update\.target_kl'\?$"):
-        check_command(["algo=cpo", argument], CONF)
+        read_command(["algo=cpo", argument])
 
 
 def test_what_is_proposed_is_taken():
-    check_command(["algo=sac", "policy_update.optimizer.lr=1e-3", "loss.gamma=0.9"], CONF)
+    read_command(["algo=sac", "policy_update.optimizer.lr=1e-3", "loss.gamma=0.9"])
 
 
 def test_the_paper_s_setting_is_refused_where_the_paper_has_none():
-    check_command(["algo=cpo", "preset=paper"], CONF)
-    check_command(["-m", "algo=cpo,sac", "preset=default"], CONF)
+    read_command(["algo=cpo", "preset=paper"])
+    read_command(["-m", "algo=cpo,sac", "preset=default"])
     for choices in (["algo=sac"], ["algo=bc"], ["-m", "algo=cpo,sac"]):
         with pytest.raises(CommandLineError, match=r"has no 'preset=paper'\. It is the setting of"):
-            check_command([*choices, "preset=paper"], CONF)
+            read_command([*choices, "preset=paper"])
     with pytest.raises(CommandLineError, match="algo=sac has no 'preset=paper'"):
-        check_command(["-m", "algo=sac", "preset=default,paper"], CONF)
+        read_command(["-m", "algo=sac", "preset=default,paper"])
 
 
 def test_what_a_mapping_lacks_is_added_with_a_plus():
     with pytest.raises(CommandLineError, match=r"no 'num_gpus', add \+collector\.ray_init"):
-        check_command(["collector=ray", "collector.ray_init={num_gpus: 3}"], CONF)
+        read_command(["collector=ray", "collector.ray_init={num_gpus: 3}"])
 
 
 def test_of_two_choices_that_an_algorithm_lacks_one_is_named():
     with pytest.raises(CommandLineError, match=r"algo=ppo has no '(lagrangian|cost_advantage)'"):
-        check_command(["algo=ppo", "lagrangian=adam", "cost_advantage=paper"], CONF)
+        read_command(["algo=ppo", "lagrangian=adam", "cost_advantage=paper"])
 
 
 # files of one's own, each with what the line about it must name: the file, and the key or the place
@@ -214,7 +215,7 @@ FAULTY = {
 def test_faults_of_files_are_told_by_the_file(own_conf, text):
     (own_conf / "algo" / "mine.yaml").write_text(f"# @package _global_\n{text}\n")
     with pytest.raises(CommandLineError, match=FAULTY[text]) as caught:
-        check_command([f"--config-dir={own_conf}", "algo=mine"], CONF)
+        read_command([f"--config-dir={own_conf}", "algo=mine"])
     assert len(str(caught.value).splitlines()) == 1
 
 
@@ -222,13 +223,13 @@ def test_an_algorithm_below_its_own_name_is_told_its_first_line(own_conf):
     file = own_conf / "algo" / "mine.yaml"
     file.write_text(file.read_text().partition("\n")[2])
     with pytest.raises(CommandLineError, match=r"algo=mine: .*with the line '# @package _gl"):
-        check_command([f"--config-dir={own_conf}", "algo=mine"], CONF)
+        read_command([f"--config-dir={own_conf}", "algo=mine"])
 
 
 @pytest.mark.parametrize("flag", ["--config-dir=", "hydra.searchpath=[file://"])
 def test_folders_of_ones_own_are_searched_too(own_conf, flag):
     folder = f"{flag}{own_conf}{']' if '[' in flag else ''}"
-    check_command([folder, "algo=mine", "env=Nearby", "mine.tail=0.1", "+mine.more=1"], CONF)
+    read_command([folder, "algo=mine", "env=Nearby", "mine.tail=0.1", "+mine.more=1"])
     for wrong, meant in {
         "algo=mime": "Did you mean 'mine'",
         "env=Nearbye": "Did you mean 'Nearby'",
@@ -239,49 +240,49 @@ def test_folders_of_ones_own_are_searched_too(own_conf, flag):
     }.items():
         choice = [] if wrong.startswith("algo") else ["algo=mine"]
         with pytest.raises((CommandLineError, SettingError), match=meant):
-            check_command([folder, *choice, wrong], CONF)
+            read_command([folder, *choice, wrong])
 
 
 def test_a_folder_that_is_not_there():
     with pytest.raises(CommandLineError, match="no such folder"):
-        check_command(["--config-dir", "nowhere"], CONF)
+        read_command(["--config-dir", "nowhere"])
 
 
 def test_every_value_of_a_sweep_is_checked():
     for wrong in ("lagrangian.kp=0.1,nan", "+lr=1,2"):
         with pytest.raises((CommandLineError, SettingError), match=r"kp=nan|nothing reads 'lr'"):
-            check_command(["-m", "seed=0,1", wrong], CONF)
+            read_command(["-m", "seed=0,1", wrong])
 
 
 @pytest.mark.parametrize("flags", [["-sc", "install=bash"], ["--help"], ["--hydra-help"]])
 def test_questions_to_hydra_pass_untouched(flags):
-    check_command([*flags, "no_such=key"], CONF)
+    read_command([*flags, "no_such=key"])
 
 
 def test_configurations_are_shown_with_wrong_values_but_not_with_wrong_names():
-    check_command(["--cfg", "job", "seed=abc"], CONF)
-    check_command(["--info", "defaults"], CONF)
+    read_command(["--cfg", "job", "seed=abc"])
+    read_command(["--info", "defaults"])
     with pytest.raises(CommandLineError, match="Did you mean 'frames'"):
-        check_command(["--cfg", "job", "frmaes=3"], CONF)
+        read_command(["--cfg", "job", "frmaes=3"])
 
 
 @pytest.mark.parametrize("place", ["a_file/run", "x" * 300])
 def test_folders_that_cannot_be_written(tmp_path, place):
     (tmp_path / "a_file").write_text("")
     with pytest.raises(CommandLineError, match=r"hydra\.run\.dir=.*nothing can be written there"):
-        check_command([f"hydra.run.dir={tmp_path / place}"], CONF)
+        check_writable(tmp_path / place, "hydra.run.dir")
     assert os.listdir(tmp_path) == ["a_file"]
 
 
 def test_every_key_of_the_files_can_be_overridden_by_its_own_value():
     config = OmegaConf.load(CONF / "policy_update" / "ppo" / "default.yaml")
     keys = {"optimizer.lr": config.optimizer.lr, "adapt_rate.factor": config.adapt_rate.factor}
-    check_command([f"policy_update.{key}={value}" for key, value in keys.items()], CONF)
+    read_command([f"policy_update.{key}={value}" for key, value in keys.items()])
 
 
 def test_a_wrong_key_beside_a_name_that_others_refer_to():
     with pytest.raises(CommandLineError, match=r"nothing reads 'env\.cost_kyes'.*env\.cost_keys"):
-        check_command(["env=gymnasium", "env.id=CartPole-v1", "env.cost_kyes=[cost_a]"], CONF)
+        read_command(["env=gymnasium", "env.id=CartPole-v1", "env.cost_kyes=[cost_a]"])
 
 
 @pytest.mark.parametrize("second", ["{cost: 20}", "{cost_vases_contact: 20}"])
@@ -291,5 +292,5 @@ def test_mappings_that_are_given_whole_are_given_once(second):
     arguments = ["env=PointGoal2", first, f"cost_limits={second}"]
     said = rf"'cost_limits' is given more than once: {re.escape(first)}, cost_limits="
     with pytest.raises(CommandLineError, match=said):
-        check_command(arguments, CONF)
-    check_command([arguments[0], "~cost_limits", f"+cost_limits={second}"], CONF)
+        read_command(arguments)
+    read_command([arguments[0], "~cost_limits", f"+cost_limits={second}"])

@@ -2,7 +2,6 @@
 
 import json
 import struct
-import sys
 
 import pytest
 import yaml
@@ -58,7 +57,6 @@ def run(tmp_path, monkeypatch):
     """A run on a robot file that the command line names from the folder it is in."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.delenv("HYDRA_FULL_ERROR", raising=False)
-    monkeypatch.setattr(sys, "argv", ["train.py"])
 
     def begin(name="run", frames=40, base="robot/ball.xml", **robot):
         write_robot(tmp_path, **robot)
@@ -114,8 +112,7 @@ def test_another_robot_than_the_runs_is_never_taken(run, tmp_path, capsys):
     for words in ("and so has the run's own copy", "has no copy of it"):
         assert evaluate.main([str(folder), "episodes=2", "num_threads=1"]) == 1
         assert words in capsys.readouterr().err
-        assert train.main([f"resume={folder}", "frames=80"]) == 1
-        assert words in capsys.readouterr().err
+        assert words in train.main([f"resume={folder}", "frames=80"])
         note = json.loads((folder / "robot.json").read_text()) | {"file": None}
         (folder / "robot.json").write_text(json.dumps(note))
     note["file"] = "../../robot/ball.xml"

@@ -8,40 +8,34 @@ from pathlib import Path
 import pytest
 from omegaconf import OmegaConf
 
-from safe_rl.cli.run_folders import NewFolder
+from safe_rl.cli.session import new_folder
 
 ROOT = Path(__file__).parents[2]
 
 
 def hydra_config(directory, *overrides):
-    config = OmegaConf.create(
-        {"hydra": {"run": {"dir": str(directory)}, "overrides": {"hydra": list(overrides)}}}
+    return OmegaConf.create(
+        {"run": {"dir": str(directory)}, "overrides": {"hydra": list(overrides)}}
     )
-    OmegaConf.set_struct(config, True)
-    OmegaConf.set_readonly(config, True)
-    return config
 
 
 def claim(directory):
-    config = hydra_config(directory)
-    NewFolder().on_run_start(config)
-    return config.hydra.run.dir
+    return new_folder(hydra_config(directory))[0]
 
 
 def test_runs_that_begin_in_the_same_second_get_folders_of_their_own(tmp_path):
     wanted = tmp_path / "PointGoal1" / "ppo" / "2026-01-31_12-00-00_seed0"
     with multiprocessing.get_context("fork").Pool(4) as pool:
         made = pool.map_async(claim, [wanted] * 12).get(timeout=300)
-    assert sorted(made) == sorted(str(path) for path in wanted.parent.iterdir())
-    assert str(wanted) in made
+    assert sorted(made) == sorted(wanted.parent.iterdir())
+    assert wanted in made
     assert len(set(made)) == 12
 
 
 @pytest.mark.parametrize("override", ["hydra.run.dir", "+hydra.run.dir"])
 def test_a_folder_that_was_named_stays(tmp_path, override):
     config = hydra_config(tmp_path, f"{override}={tmp_path}")
-    NewFolder().on_run_start(config)
-    assert config.hydra.run.dir == str(tmp_path)
+    assert new_folder(config) == (tmp_path, [])
     assert not list(tmp_path.iterdir())
 
 

@@ -7,7 +7,6 @@ from pathlib import Path
 import pytest
 from run_configs import point_mass_config
 
-from safe_rl.cli.failures import errors_in_a_line
 from safe_rl.cli.settings import SettingError, check_settings
 
 ROOT = Path(__file__).parents[2]
@@ -36,26 +35,6 @@ def test_wrong_values_are_named(override):
 @pytest.mark.parametrize("override", ["frames=3e5", "num_threads=null", "checkpoint.interval=0"])
 def test_right_values_pass(override):
     check_settings(point_mass_config(override))
-
-
-def test_only_folders_of_runs_that_did_not_begin_are_removed(tmp_path, monkeypatch):
-    monkeypatch.delenv("HYDRA_FULL_ERROR", raising=False)
-    for name, is_new, stays in (("a", True, False), ("b", False, True), ("c", True, True)):
-        (tmp_path / name).mkdir()
-        if name == "c":
-            (tmp_path / name / "progress.csv").write_text("steps")
-        stops = pytest.raises(SystemExit, match="what is wrong")
-        with stops, errors_in_a_line(tmp_path / name, is_new, SettingError):
-            raise SettingError("what is wrong")
-        assert (tmp_path / name).exists() == stays
-
-
-def test_other_errors_and_full_ones_pass(tmp_path, monkeypatch):
-    with pytest.raises(RuntimeError), errors_in_a_line(tmp_path, False, SettingError):
-        raise RuntimeError
-    monkeypatch.setenv("HYDRA_FULL_ERROR", "1")
-    with pytest.raises(SettingError), errors_in_a_line(tmp_path, False, SettingError):
-        raise SettingError
 
 
 @pytest.mark.slow

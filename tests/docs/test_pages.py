@@ -17,12 +17,10 @@ from registrations import undone
 import safe_rl
 from safe_rl import targets
 from safe_rl.cli import user_code
-from safe_rl.cli.composing import check_command
-from safe_rl.cli.conf import CONF
-from safe_rl.cli.options import parse_options
+from safe_rl.cli.grammar import parse_options
 from safe_rl.cli.report import ReportOptions
-from safe_rl.cli.shorthands import expand_arguments
-from safe_rl.cli.user_code import import_modules, note_imports, split_imports
+from safe_rl.cli.train import read_command
+from safe_rl.cli.user_code import split_imports
 from safe_rl.cli.variations import read_variations
 from safe_rl.evaluation import EvaluationOptions
 from safe_rl.evaluation.settings import check_options
@@ -116,13 +114,11 @@ def check(words: list[str], run: Path) -> None:
             if parsed.variations is not None and "my_" not in str(parsed.variations):
                 assert any(read_variations(parsed.variations))
         return
-    modules, given = split_imports(arguments)
-    if modules is not None:
-        import_modules(modules)
-        given = note_imports(modules, given)
     # Hydra does not say of which extra a launcher is
-    given = [word for word in given if not word.startswith(("hydra/launcher=", "hydra.launcher."))]
-    check_command(expand_arguments(given), CONF)
+    given = [
+        word for word in arguments if not word.startswith(("hydra/launcher=", "hydra.launcher."))
+    ]
+    read_command(given)
 
 
 def check_all(found: list[list[str]], run: Path, page: str) -> None:

@@ -13,11 +13,10 @@ from omegaconf import OmegaConf
 from PIL import Image
 
 import safe_rl
-from safe_rl.cli.composing import check_command
-from safe_rl.cli.conf import CONF
+from safe_rl.cli.composing import CONF
 from safe_rl.cli.evaluate import main
 from safe_rl.cli.evaluating import evaluate_run
-from safe_rl.cli.shorthands import expand_arguments
+from safe_rl.cli.train import read_command
 from safe_rl.cli.variations import read_variations
 from safe_rl.evaluation import EvaluationOptions
 from safe_rl.evaluation.variations import Variation, expand, varied
@@ -165,7 +164,7 @@ def test_keys_of_sets_are_taken_by_training(name):
         transforms = {key.split(".")[1] for key in keys if key.startswith("transforms.")}
         chosen = [f"transforms=[{','.join(transforms)}]"] if transforms else []
         changes = [f"{key}={value}" for key, value in keys.items()]
-        check_command(expand_arguments(["env=PointGoal1", *chosen, *changes]), CONF)
+        read_command(["env=PointGoal1", *chosen, *changes])
 
 
 @pytest.mark.parametrize(

@@ -7,10 +7,9 @@ import pytest
 import yaml
 from synthetic import SUITE, write_run
 
-from safe_rl.cli.composing import check_command
-from safe_rl.cli.conf import CONF
+from safe_rl.cli.composing import CONF
 from safe_rl.cli.report import main
-from safe_rl.cli.shorthands import expand_arguments
+from safe_rl.cli.train import read_command
 from safe_rl.envs import store_configs
 from safe_rl.reporting.campaigns import PLAN, campaign_tables, read_plan
 from safe_rl.reporting.contents import build_report
@@ -166,7 +165,7 @@ def test_the_commands_of_what_is_missing_are_taken(path):
         len(cell.seeds) for cell in read_plan(path)
     )
     for record in commands.records:
-        check_command(expand_arguments(shlex.split(record["command"])[2:]), CONF)
+        read_command(shlex.split(record["command"])[2:])
 
 
 def test_every_run_of_the_comparison_is_planned():

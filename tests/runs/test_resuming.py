@@ -9,10 +9,8 @@ import signal
 import time
 from functools import partial
 from threading import Thread
-from types import SimpleNamespace
 
 import pytest
-from hydra.types import RunMode
 from omegaconf import OmegaConf
 from point_mass import PointMass
 from point_mass_runs import point_mass_trainer as trainer_of_point_mass
@@ -23,7 +21,7 @@ from torchrl.checkpoint import Checkpoint, CheckpointError
 from safe_rl.envs import SafetyGymEnv, store_configs
 from safe_rl.runs.checkpoints import CheckpointStore, is_finished
 from safe_rl.runs.folder import RunFolder, RunInUseError
-from safe_rl.runs.identity import check_same_run, may_continue
+from safe_rl.runs.identity import check_same_run
 from safe_rl.runs.table import read_table
 from safe_rl.training.building import build_trainer, seed_everything
 
@@ -288,24 +286,10 @@ def test_tensorboard_forgets_what_is_done_again(tmp_path):
     assert [event.value for event in events] == pytest.approx(table["policy_kl"])
 
 
-def hydra_conf(mode, output_dir, *sources):
-    sources = [SimpleNamespace(path=str(path), provider="main") for path in sources]
-    runtime = SimpleNamespace(output_dir=str(output_dir), config_sources=sources)
-    return SimpleNamespace(mode=mode, runtime=runtime)
-
-
-def test_a_single_run_continues_only_from_its_own_configuration(tmp_path):
-    config = point_mass_config()
-    own = hydra_conf(RunMode.RUN, tmp_path, tmp_path)
-    assert may_continue(own, config)
-    assert not may_continue(hydra_conf(RunMode.RUN, tmp_path, tmp_path / "conf"), config)
-
-
 def test_jobs_of_a_sweep_continue_with_the_same_settings_only(tmp_path):
-    sweep = hydra_conf(RunMode.MULTIRUN, tmp_path)
-    assert may_continue(sweep, point_mass_config())
+    check_same_run(tmp_path, point_mass_config())
     point_mass_trainer(tmp_path).run()
-    assert may_continue(sweep, point_mass_config("frames=9000", "num_threads=2"))
+    check_same_run(tmp_path, point_mass_config("frames=9000", "num_threads=2"))
     with pytest.raises(ValueError, match=r"seed: 0 -> 1.*hydra.sweep.dir"):
         check_same_run(tmp_path, point_mass_config("seed=1"))
 

@@ -5,7 +5,7 @@ They do what the commands do, from the same configurations; Hydra stays inside.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -17,22 +17,15 @@ from omegaconf import DictConfig, open_dict
 from tensordict.nn import TensorDictModuleBase
 from torchrl.envs import EnvBase
 
-from safe_rl.cli.certificates import (
-    certify_ended,
-    certify_run,
-    is_to_keep_limits,
-    is_worth_a_certificate,
-)
+from safe_rl.cli.certificates import certify_run
+from safe_rl.cli.composing import GIVEN_WHOLE, compose_jobs, resolving
 from safe_rl.cli.evaluating import evaluate_run
-from safe_rl.cli.interrupting import say_if_heard
-from safe_rl.cli.options import take_options
-from safe_rl.cli.python_settings import compose_new, compose_resumed, new_run, overrides_of
+from safe_rl.cli.grammar import CommandLineError, overrides_of, take_options
+from safe_rl.cli.resuming import compose_resumed
 from safe_rl.cli.robots import maker_of
-from safe_rl.cli.run_folders import note_missing, remove_new, write_notes
-from safe_rl.cli.running import complete, prepare
+from safe_rl.cli.session import Session, missing_folders, new_folder
 from safe_rl.cli.user_code import check_imports, import_modules, note_imports, several
 from safe_rl.cli.variations import evaluate_varied
-from safe_rl.envs import store_configs
 from safe_rl.evaluation import Certificate, Evaluation, EvaluationOptions
 from safe_rl.evaluation.layouts import default_seed
 from safe_rl.evaluation.loading import (
@@ -43,11 +36,22 @@ from safe_rl.evaluation.loading import (
     override_env,
 )
 from safe_rl.evaluation.varying import Varied
-from safe_rl.runs.folder import RunFolder, lock_folder
+from safe_rl.runs.folder import RunFolder
 from safe_rl.runs.outcome import final_figures
 from safe_rl.runs.table import read_table
 
 __all__ = ["Run", "load", "resume", "train"]
+
+# mappings that are given all at once
+_WHOLE = (
+    *GIVEN_WHOLE,
+    *("env.outside", "env.kwargs", "env.cost", "memory.prioritised", "policy_update.rates"),
+)
+_OF_YOUR_OWN = {
+    "env": "safe_rl.envs.store_config(name, {…}) gives one to keys, and what Gymnasium has "
+    "registered is 'gymnasium' with **{'env.id': …}.",
+    "algo": "One of your own is a YAML, which config_dir=… finds.",
+}
 
 
 @dataclass(frozen=True)
@@ -194,15 +198,19 @@ def train(
         [40.0, 80.0]
     """
     modules = import_modules(imports)
-    store_configs()
-    overrides = new_run(env, algo, settings, config_dir)
-    if modules:
-        overrides = note_imports(modules, overrides)
-    config = compose_new(overrides)
-    folder = Path(config.hydra.run.dir if directory is None else directory).expanduser()
+    overrides = [*_new_run(env, algo, settings, config_dir), *note_imports(modules or None)]
+    (config,) = compose_jobs(overrides)
+    if directory is None:
+        with resolving(config):
+            folder, missing = new_folder(config.hydra)
+    else:
+        folder = Path(directory).expanduser()
+        missing = missing_folders(folder)
     with open_dict(config):
-        hydra = config.pop("hydra")
-    return _carry_out(config, folder, hydra)
+        own = config.pop("hydra")
+    return _carry_out(
+        Session(config, folder, own, missing=missing, otherwise=_otherwise(folder), quiet=True)
+    )
 
 
 def resume(
@@ -228,47 +236,51 @@ def resume(
         Going on after 40 of 80 frames.
         [40.0, 80.0]
     """
-    modules = import_modules(imports or ())
-    store_configs()
-    overrides = list(overrides_of(settings))
-    if imports is not None:
-        overrides = note_imports(modules, overrides)
+    modules = None if imports is None else import_modules(imports)
     folder = Path(directory).expanduser()
-    return _carry_out(compose_resumed(folder, overrides), folder)
+    config = compose_resumed(folder, overrides_of(settings, _WHOLE), modules)
+    return _carry_out(
+        Session(config, folder, continues=True, otherwise=_otherwise(folder), quiet=True)
+    )
 
 
-def _carry_out(config: DictConfig, folder: Path, hydra: DictConfig | None = None) -> Run:
-    """Train or, without Hydra's own configuration, go on training."""
-    complete(config, RunFolder(folder))
-    note_missing(folder)
-    is_new, has_begun = not folder.exists(), False
-    try:
-        with lock_folder(RunFolder(folder)):
-            trainer = prepare(config, folder, continues=hydra is None)
-            has_begun = True
-            if trainer is None:
-                if RunFolder(folder).certifying.exists():
-                    certify_ended(folder, config.num_threads or 0)
-                return Run(folder)
-            if hydra is not None:
-                write_notes(RunFolder(folder), config, hydra)
-            trainer.run()
-    finally:
-        if is_new and not has_begun:
-            remove_new(folder)
-    if trainer.interrupted_by is not None:
-        say_if_heard(
-            f"Interrupted. Continue with: python train.py {RunFolder(folder).resuming}, or "
-            f"safe_rl.resume({str(folder)!r})"
-        )
-        if trainer.interrupted_by is Signals.SIGINT:
-            raise KeyboardInterrupt
-        raise SystemExit(128 + trainer.interrupted_by)
-    if is_to_keep_limits(config, trainer.algorithm.cost_keys) and is_worth_a_certificate(
-        config, trainer.episode_length
-    ):
-        certify_ended(folder, config.num_threads or 0)
-    return Run(folder)
+def _carry_out(session: Session) -> Run:
+    session.run()
+    if session.interrupted_by is Signals.SIGINT:
+        raise KeyboardInterrupt
+    if session.interrupted_by is not None:
+        raise SystemExit(128 + session.interrupted_by)
+    return Run(session.folder.directory)
+
+
+def _otherwise(folder: Path) -> str:
+    """What continues a run beside the command."""
+    return f", or safe_rl.resume({str(folder)!r})"
+
+
+def _new_run(
+    env: Any,
+    algo: Any,
+    settings: Mapping[str, Any],
+    folders: str | Path | Sequence[str | Path] | None,
+) -> list[str]:
+    """Overrides of a new run: environment and algorithm by their names, settings, YAMLs' folders.
+
+    Raises:
+        CommandLineError: If one is no name, a setting nothing that can be written, a folder not
+            there.
+    """
+    for key, value in {"env": env, "algo": algo}.items():
+        if not isinstance(value, str):
+            what = " ".join(repr(value).split())[:80]
+            raise CommandLineError(f"{key}={what}: it must be a name. {_OF_YOUR_OWN[key]}")
+    given = [folders] if isinstance(folders, str | Path) else folders or ()
+    found = [Path(folder).expanduser().absolute() for folder in given]
+    if missing := next((folder for folder in found if not folder.is_dir()), None):
+        raise CommandLineError(f"config_dir={missing}: there is no such folder.")
+    if found:
+        settings = {**settings, "hydra.searchpath": [f"file://{folder}" for folder in found]}
+    return [f"env={env}", f"algo={algo}", *overrides_of(settings, _WHOLE)]
 
 
 def load(

@@ -17,7 +17,9 @@ from omegaconf import OmegaConf
 from run_configs import CONF, without_times
 
 import safe_rl
-from safe_rl.cli.python_settings import compose_new, overrides_of, search_path
+from safe_rl.cli.composing import compose_jobs
+from safe_rl.cli.grammar import overrides_of
+from safe_rl.cli.python_api import _WHOLE, _new_run
 from safe_rl.envs import ConfigError, store_configs
 from safe_rl.evaluation.loading import find_checkpoint
 from safe_rl.reporting.recorded import archive_runs, find_runs
@@ -154,9 +156,8 @@ def test_folders_of_ones_own_one_or_several(tmp_path):
         text = f"{head}lagrangian: {{init: {place + 1}}}\n"
         (folder / "algo" / f"mine{place}.yaml").write_text(text)
     for given in (folders, folders[1], str(folders[1])):
-        config = compose_new(["algo=mine1", *search_path(given)])
+        (config,) = compose_jobs(_new_run("PointGoal1", "mine1", {}, given))
         assert config.lagrangian.init == 2
-    assert compose_new(["algo=mine0", *search_path(folders)]).lagrangian.init == 1
     (tmp_path / "mine.py").write_text("imported = True\n")
     run = safe_rl.train(
         algo="mine0", frames=40, directory=tmp_path / "run", config_dir=folders[0],
@@ -250,7 +251,7 @@ def test_a_run_is_certified_and_what_is_no_evaluation_refused(run):
 
 def test_a_certificate_takes_the_threads_of_its_run(run, monkeypatch):
     given = []
-    monkeypatch.setattr("safe_rl.cli.notebook.certify_ended", lambda *said: given.append(said))
+    monkeypatch.setattr("safe_rl.cli.session.certify_ended", lambda *said: given.append(said))
     note = run.directory / ".certifying"
     note.touch()
     safe_rl.resume(run.directory)
@@ -275,7 +276,7 @@ def test_an_interrupted_run_says_how_to_go_on(tmp_path, monkeypatch, capsys):
 
 def test_mappings_that_go_together_and_numbers_of_numpy_are_written_as_hydra_takes_them():
     given = {"env.outside": {"cost_a": [0, -1, 1]}, "seed": np.int64(3)}
-    assert list(overrides_of(given)) == ["env.outside={cost_a:[0,-1,1]}", "seed=3"]
+    assert list(overrides_of(given, _WHOLE)) == ["env.outside={cost_a:[0,-1,1]}", "seed=3"]
     assert list(overrides_of({"layers": np.array([8, 4])})) == ["layers=[8,4]"]
 
 
@@ -305,7 +306,7 @@ def test_folders_in_the_home_are_found_however_they_are_named(run, tmp_path, mon
 def test_mappings_take_the_place_of_what_is_none(algo, key, value):
     store_configs()
     given = {"algo": algo, "transforms": ["saute"], key: value}
-    config = compose_new(list(overrides_of(given)))
+    (config,) = compose_jobs(list(overrides_of(given, _WHOLE)))
     assert OmegaConf.select(config, key) == value
 
 

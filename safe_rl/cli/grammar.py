@@ -1,0 +1,225 @@
+"""The grammar of all commands, which is Hydra's: ``key=value``, read, written and checked.
+
+Training is given overrides of a configuration. Evaluations and reports are given options: fields of
+a dataclass, whose metadata holds their help.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import MISSING, fields
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypeVar, get_type_hints
+
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.core.override_parser.types import Override
+from hydra.errors import HydraException
+from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+
+from safe_rl.naming import did_you_mean
+
+__all__ = [
+    *("CommandLineError", "overrides_of", "parse", "parse_options", "quote", "take_options"),
+    "usage",
+]
+
+if TYPE_CHECKING:
+    from _typeshed import DataclassInstance
+
+Schema = TypeVar("Schema", bound="DataclassInstance")
+
+
+class CommandLineError(ValueError):
+    """A command line that cannot be used; the message says what to write instead."""
+
+
+def parse(text: str) -> Override:
+    """Read one override.
+
+    Raises:
+        CommandLineError: If it is none.
+
+    Examples:
+        >>> parse("env.hazards_num=3").value()
+        3
+    """
+    try:
+        return OverridesParser.create().parse_override(text)
+    except HydraException as error:
+        quoted = re.search(r"\{\s*['\"]", text)
+        hint = " Names within braces have no quotes: '{cost: 10}'." if quoted else ""
+        raise CommandLineError(
+            f"'{text}' cannot be read: {str(error).splitlines()[0]}.{hint}"
+        ) from None
+
+
+def quote(text: str) -> str:
+    r"""Write a text so that the grammar reads it as it is.
+
+    Examples:
+        >>> print(quote(r"it's a\b"))
+        'it\'s a\b'
+    """
+    # backslashes are doubled before a quote only
+    return "'" + re.sub(r"(\\*)('|$)", lambda m: m[1] * 2 + ("\\'" if m[2] else ""), text) + "'"
+
+
+def overrides_of(
+    settings: Mapping[str, Any], whole: Sequence[str] = (), prefix: str = ""
+) -> Iterator[str]:
+    """Write settings from Python as overrides, nested ones with dots.
+
+    Args:
+        settings: Key -> value.
+        whole: Keys whose mappings are one value.
+        prefix: Key above, with its dot.
+
+    Raises:
+        CommandLineError: For a value that cannot be written.
+
+    Examples:
+        >>> list(overrides_of({"model": {"hidden_sizes": [8]}, "cost_limits": {"cost": 3}}, ["cost_limits"]))
+        ['model.hidden_sizes=[8]', 'cost_limits={cost:3}']
+    """  # noqa: E501
+    for name, value in settings.items():
+        key = f"{prefix}{name}"
+        if isinstance(value, Mapping) and key not in whole:
+            yield from overrides_of(value, whole, f"{key}.")
+            continue
+        try:
+            yield f"{key}={_written(value)}"
+        except TypeError:
+            raise CommandLineError(
+                f"{key}={value!r}: a setting takes numbers, texts, lists, dictionaries and None. "
+                "What is of your own is named as a _target_, or by a file that config_dir finds."
+            ) from None
+
+
+def _written(value: Any) -> str:
+    if isinstance(value, Mapping):
+        return "{" + ",".join(f"{key}:{_written(item)}" for key, item in value.items()) + "}"
+    if isinstance(value, list | tuple):
+        return "[" + ",".join(map(_written, value)) + "]"
+    if isinstance(value, str | Path):
+        return quote(str(value))
+    # numbers and arrays of NumPy and torch are not JSON's
+    return _written(value.tolist()) if hasattr(value, "tolist") else json.dumps(value)
+
+
+def parse_options(arguments: Sequence[str], schema: type[Schema]) -> Schema:
+    """Read the options of a command.
+
+    Args:
+        arguments: Texts of the form ``key=value``; nested keys have dots.
+        schema: Dataclass with a default for every field.
+
+    Raises:
+        CommandLineError: For an option that is unknown (the nearest is named), without a value, or
+            of another type than the schema's.
+
+    Examples:
+        >>> from dataclasses import dataclass
+        >>> @dataclass
+        ... class Options:
+        ...     episodes: int = 100
+        ...     video: bool = False
+        >>> parse_options(["episodes=7", "video=true"], Options)
+        Options(episodes=7, video=True)
+        >>> parse_options(["episode=7"], Options)
+        Traceback (most recent call last):
+        ...
+        safe_rl.cli.grammar.CommandLineError: Unknown option 'episode'. Did you mean 'episodes'? Options are: episodes, video.
+    """  # noqa: E501
+    kinds = get_type_hints(schema)
+    given: dict[str, Any] = {}
+    for argument in arguments:
+        key, equals, written = argument.partition("=")
+        if not equals:
+            raise CommandLineError(
+                f"'{argument}' is not an option: options are written key=value, for example "
+                f"{fields(schema)[0].name}=…"
+            )
+        _check_name(key, schema)
+        if key in given:
+            raise CommandLineError(f"'{key}' is given more than once.")
+        # names and paths are what was written, where the grammar reads `off`, `007` or `it's`
+        is_text = kinds.get(key) in (str, str | None)
+        given[key] = _text(written) if is_text else parse(argument).value()
+    return take_options(given, schema)
+
+
+def _text(written: str) -> str | None:
+    """A text without the quotes around it."""
+    inner = re.fullmatch(r"(['\"])(.*)\1", written)
+    return None if written == "null" else inner[2] if inner else written
+
+
+def take_options(given: Mapping[str, Any], schema: type[Schema]) -> Schema:
+    """Check options that are given as keyword arguments; nested keys may have dots.
+
+    Raises:
+        CommandLineError: For an option that is unknown, or of another type than the schema's.
+
+    Examples:
+        >>> from dataclasses import dataclass
+        >>> @dataclass
+        ... class Options:
+        ...     episodes: int = 100
+        >>> take_options({"episodes": 7}, Options)
+        Options(episodes=7)
+    """
+    read = OmegaConf.create()
+    for key, value in given.items():
+        _check_name(key, schema)
+        OmegaConf.update(read, key, _plain(value))
+    try:
+        _check_kinds(read, schema)
+        return OmegaConf.to_object(OmegaConf.merge(OmegaConf.structured(schema), read))  # type: ignore[return-value]
+    except OmegaConfBaseException as error:
+        line = str(error).splitlines()[0]
+        raise CommandLineError(f"{line} (option '{error.full_key}')") from error
+
+
+def _plain(value: Any) -> Any:
+    """Numbers and arrays of NumPy and torch are none of OmegaConf's."""
+    if isinstance(value, Mapping):
+        return {key: _plain(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(item) for item in value]
+    return value.tolist() if hasattr(value, "tolist") else value
+
+
+def _check_name(key: str, schema: type[DataclassInstance]) -> None:
+    name, known = key.partition(".")[0], [field.name for field in fields(schema)]
+    if name not in known:
+        raise CommandLineError(
+            f"Unknown option '{name}'.{did_you_mean(name, known)} Options are: {', '.join(known)}."
+        )
+
+
+def _check_kinds(given: DictConfig, schema: type[DataclassInstance]) -> None:
+    """OmegaConf takes every number for a boolean, and says of a mapping that it is a Dict."""
+    for field in fields(schema):
+        value = given.get(field.name)
+        if field.default_factory is dict and not isinstance(value, Mapping | None):
+            raise CommandLineError(
+                f"{field.name}={value}: it takes keys with values, {field.name}.KEY=VALUE: "
+                f"{field.metadata['help']}."
+            )
+        is_number = isinstance(value, int | float) and not isinstance(value, bool)
+        if isinstance(field.default, bool) and is_number:
+            raise CommandLineError(f"{field.name}={value}: it must be true or false.")
+
+
+def usage(command: str, schema: type[DataclassInstance]) -> str:
+    """How a command is called: its options, their defaults and what they mean."""
+    lines = [f"usage: {command} [option=value ...]", ""]
+    for field in fields(schema):
+        default = "null" if field.default is None else str(field.default).lower()
+        shown = f"{field.name}.…" if field.default is MISSING else f"{field.name}={default}"
+        lines.append(f"  {shown:<24} {field.metadata['help']}")
+    lines.append(f"  {'import=…':<24} a module or file of yours to import before; may be repeated")
+    return "\n".join(lines)

@@ -1,0 +1,337 @@
+"""One run from its configuration to its certificate, for the command, for sweeps and for Python."""
+
+from __future__ import annotations
+
+import logging
+import math
+import os
+import shutil
+import sys
+import tempfile
+from collections.abc import Sequence
+from functools import partial
+from itertools import count
+from pathlib import Path
+from signal import SIGINT, Signals
+from typing import Any, cast
+
+from hydra.core.hydra_config import HydraConfig
+from omegaconf import DictConfig, OmegaConf, open_dict
+from omegaconf.errors import OmegaConfBaseException
+from torchrl.checkpoint import CheckpointError
+
+from safe_rl.cli.certificates import (
+    certify_ended,
+    is_to_keep_limits,
+    is_worth_a_certificate,
+    train_on,
+    why_not_certified,
+)
+from safe_rl.cli.grammar import CommandLineError
+from safe_rl.cli.robots import keep_robot, robot_of
+from safe_rl.cli.settings import check_settings
+from safe_rl.cli.user_code import imported, make_after_imports
+from safe_rl.envs import ConfigError, ContractError, LayoutError, complete_env, make_env
+from safe_rl.evaluation.during import PeriodicEvaluation
+from safe_rl.evaluation.layouts import default_seed, has_fixed_layout
+from safe_rl.evaluation.loading import transforms_of
+from safe_rl.runs.checkpoints import is_finished
+from safe_rl.runs.files import replacing
+from safe_rl.runs.folder import RunFolder, lock_folder
+from safe_rl.runs.identity import check_same_run
+from safe_rl.runs.table import TableError
+from safe_rl.training.building import begin_from, build_trainer, physics_threads, seed_everything
+from safe_rl.training.trainer import EpisodeError, Trainer
+
+__all__ = [
+    *("SETTING_ERRORS", "Session", "check_writable", "missing_folders", "new_folder", "run_job"),
+]
+
+SETTING_ERRORS: tuple[type[Exception], ...] = (
+    *(ValueError, CheckpointError, OmegaConfBaseException, OSError, LayoutError),
+    *(ModuleNotFoundError, ContractError),
+)
+"""What is raised about settings and files, when a run is built or evaluated."""
+# the last two are about the environment: where they stand says less than the message
+_TRAINING_ERRORS = (OSError, TableError, ConfigError, EpisodeError, FloatingPointError)
+
+
+class Session:
+    """One run in its folder: begun or continued, trained, certified.
+
+    Args:
+        config: Its configuration, checked.
+        folder: Its folder.
+        hydra: Hydra's own configuration, which a new run notes.
+        continues: Whether a run that is in the folder goes on.
+        missing: Folders that were not there before, the run's own first: they go again if it
+            cannot begin.
+        program: What trains, as the user has called it.
+        otherwise: What continues the run beside the command.
+        quiet: Whether to leave out what came of it.
+
+    Attributes:
+        interrupted_by: The signal that has ended it, if one has.
+    """
+
+    def __init__(
+        self,
+        config: DictConfig,
+        folder: Path,
+        hydra: DictConfig | None = None,
+        *,
+        continues: bool = False,
+        missing: Sequence[Path] = (),
+        program: str = "python train.py",
+        otherwise: str = "",
+        quiet: bool = False,
+    ) -> None:
+        self.config, self.folder, self.hydra = config, RunFolder(folder), hydra
+        self.interrupted_by: Signals | None = None
+        self._continues, self._missing, self._quiet = continues, missing, quiet
+        self._program, self._again = program, f"{program} {self.folder.resuming}{otherwise}"
+        self._has_begun = False
+
+    def run(self) -> None:
+        """Train, or go on training, and certify at the end what is to keep limits.
+
+        Ctrl-C, SIGTERM or a closed terminal ends it after the epoch at hand.
+
+        Raises:
+            Exception: As `refuses` tells them apart.
+        """
+        try:
+            self._complete()
+            if self._continues and self.hydra is not None:  # a job, whose folder has its settings
+                check_same_run(self.folder.directory, self.config)
+            with lock_folder(self.folder):
+                trainer = self._prepare()
+                self._has_begun = True
+                if trainer is not None:
+                    if self.hydra is not None and not (
+                        self._continues and self.folder.notes.exists()
+                    ):
+                        self._write_notes(self.hydra)
+                    outcome = trainer.run()
+        finally:
+            if not self._has_begun:
+                _remove(self._missing)
+        if trainer is None:
+            if self.folder.certifying.exists():
+                self._certify()
+        elif trainer.interrupted_by is not None:
+            self.interrupted_by = trainer.interrupted_by
+            self._say(outcome)
+            _print(f"Interrupted. Continue with: {self._again}")
+        else:
+            self._say(outcome)
+            if is_to_keep_limits(self.config, trainer.algorithm.cost_keys):
+                self._certify_if_long(trainer.episode_length)
+
+    def refuses(self, error: Exception) -> bool:
+        """Whether an error is about settings, files or the environment: its message says enough."""
+        return isinstance(error, _TRAINING_ERRORS if self._has_begun else SETTING_ERRORS)
+
+    def _say(self, line: str) -> None:
+        if not self._quiet:
+            _print(line)
+
+    def _complete(self) -> None:
+        """Fill the environment's keys up, so that the run's folder tells all of them."""
+        given = self._env_node()
+        with open_dict(self.config):
+            full = complete_env(robot_of(self.folder, given)[0])
+            # what is given as null has been found out
+            known = {key: value for key, value in given.items() if value is not None}
+            self.config.env = full | known
+
+    def _env_node(self) -> dict[str, Any]:
+        return cast(dict[str, Any], OmegaConf.to_container(self.config.env, resolve=True))
+
+    def _prepare(self) -> Trainer | None:
+        """Build the run, or go on with the one in the folder; None if that is finished."""
+        if "RL_LOGGING_LEVEL" not in os.environ:  # by which users let TorchRL say more
+            logging.getLogger("torchrl").setLevel(logging.WARNING)
+        config, folder = self.config, self.folder
+        if not self._continues:
+            folder.check_is_free()
+        elif is_finished(folder.directory, config.frames):
+            was_interrupted = folder.certifying.exists()  # before it was certified
+            what = (
+                "; certifying it, as was begun"
+                if was_interrupted
+                else ": raise 'frames' to train on"
+            )
+            print(f"{folder.directory} has its {config.frames:,} frames already{what}.")
+            return None
+        if config.frames % config.frames_per_batch:
+            whole = math.ceil(config.frames / config.frames_per_batch) * config.frames_per_batch
+            print(f"Training for {whole:,} frames: whole batches of {config.frames_per_batch:,}.")
+        seed_everything(config.seed, config.num_threads)
+        trainer = self._build()
+        if trainer.algorithm.learns_from:
+            print(trainer.algorithm.learns_from)
+        if self._continues and trainer.resume():
+            self._say_continued(trainer)
+            return trainer
+        if self._continues and folder.num_rows:
+            print("No checkpoint was written yet: starting over, with a new progress.csv.")
+        if config.init_from is not None:
+            begin_from(trainer.algorithm, config)
+        if not (self._continues and folder.robot_note.exists()):
+            keep_robot(folder, self._env_node())
+        return trainer
+
+    def _build(self) -> Trainer:
+        config, env = self.config, self._env_node()
+        if self._continues:
+            env, notice = robot_of(self.folder, env)
+            if notice:
+                print(notice)
+        make = partial(
+            make_env,
+            env,
+            device=config.device,
+            seed=config.seed,
+            num_threads=physics_threads(config),
+            transforms=transforms_of(config),
+        )
+        in_workers = partial(make_after_imports, imported(), make)
+        training = make(num_envs=config.num_envs)
+        evaluation = None
+        if config.get("evaluation") is not None:
+            evaluation = partial(
+                PeriodicEvaluation,
+                partial(make, evaluating=True),
+                cost_keys=training.cost_keys,
+                seed=default_seed(env, config.seed),
+                fixed_layout=has_fixed_layout(env),
+                interval=config.evaluation.interval,
+                episodes=config.evaluation.episodes,
+            )
+        return build_trainer(config, training, self.folder.directory, in_workers, evaluation)
+
+    def _say_continued(self, trainer: Trainer) -> None:
+        print(f"Going on after {trainer.progress.steps:,} of {self.config.frames:,} frames.")
+        if trainer.begins_anew:
+            print("The state of its environments is not stored: they begin new episodes.")
+        if trainer.algorithm.lost_on_resume:
+            print(trainer.algorithm.lost_on_resume)
+
+    def _write_notes(self, hydra: DictConfig) -> None:
+        """Write Hydra's notes, which it would write before it is known whether a run may begin."""
+        folder = self.folder
+        folder.notes.mkdir(exist_ok=True)
+        notes = ((folder.composed, self.config), (folder.overrides, hydra.overrides.task),
+                 (folder.surroundings, OmegaConf.create({"hydra": hydra})))  # fmt: skip
+        for path, content in notes:
+            with replacing(path) as unfinished:
+                OmegaConf.save(content, unfinished)
+
+    def _certify_if_long(self, episode_length: int) -> None:
+        directory = self.folder.directory
+        if is_worth_a_certificate(self.config, episode_length):
+            self._certify()
+        elif reason := why_not_certified(self.config, episode_length, directory):
+            self._say(reason)
+
+    def _certify(self) -> None:
+        directory = self.folder.directory
+        try:
+            certificate = certify_ended(directory, self.config.num_threads or 0)
+        except KeyboardInterrupt:
+            self._say(f"Interrupted before it was certified. To do so: {self._again}")
+            self.interrupted_by = SIGINT
+            return
+        self._say(str(certificate))
+        if certificate is not None and certificate.checkpoint is None:
+            self._say(f"To train on: {self._program} {train_on(self.config, directory)}")
+
+
+def run_job(config: DictConfig) -> None:
+    """Carry out one job of a sweep, whose configuration Hydra has composed where it runs.
+
+    Raises:
+        SystemExit: If it is interrupted.
+        ValueError: If its folder holds a run with other settings.
+    """
+    hydra = cast(DictConfig, HydraConfig.instance().cfg).hydra
+    folder = Path(hydra.runtime.output_dir).resolve()
+    check_settings(config, RunFolder(folder))
+    session = Session(config, folder, hydra, continues=True)
+    session.run()
+    if session.interrupted_by is not None:
+        raise SystemExit(128 + session.interrupted_by)
+
+
+def new_folder(hydra: DictConfig) -> tuple[Path, list[Path]]:
+    """The folder of a new run, and which folders were missing before.
+
+    It is made, so that it is nobody else's. Where the name is taken, by a run that began in the
+    same second say, it gets a number. A folder that the command line names is left as it is.
+
+    Args:
+        hydra: Hydra's own configuration.
+
+    Raises:
+        CommandLineError: If nothing can be written there.
+    """
+    wanted = Path(os.path.abspath(Path(hydra.run.dir).expanduser()))
+    check_writable(wanted, "hydra.run.dir")
+    missing = missing_folders(wanted)
+    if any(text.lstrip("+").startswith("hydra.run.dir=") for text in hydra.overrides.hydra):
+        return wanted, missing
+    path = wanted
+    for number in count(2):
+        try:
+            path.mkdir(parents=True)
+            break
+        except FileExistsError:
+            path = wanted.with_name(f"{wanted.name}_{number}")
+    return path, [path, *missing[1:]]
+
+
+def missing_folders(folder: Path) -> list[Path]:
+    """A folder and those above it, as far as they are not there."""
+    place = Path(os.path.abspath(folder))
+    return [path for path in (place, *place.parents) if not path.exists()]
+
+
+def check_writable(folder: Path, key: str) -> None:
+    """Refuse a folder in which nothing can be written, before it is made.
+
+    Args:
+        folder: The folder.
+        key: What names it, for the message.
+
+    Raises:
+        CommandLineError: If so.
+    """
+    try:
+        existing = next(path for path in (folder, *folder.absolute().parents) if path.exists())
+        with tempfile.TemporaryFile(dir=existing):
+            pass
+    except OSError as error:
+        raise CommandLineError(
+            f"{key}={folder}: nothing can be written there: {error.strerror}."
+        ) from None
+
+
+def _remove(missing: Sequence[Path]) -> None:
+    """Remove the folder of a run that could not begin, and those above it that are empty."""
+    for path in missing[:1]:
+        shutil.rmtree(path, ignore_errors=True)
+    for path in missing[1:]:
+        try:
+            path.rmdir()
+        except OSError:  # other runs have come into it
+            return
+
+
+def _print(line: str) -> None:
+    """Print a line, unless the terminal was closed, which may be what has ended the run."""
+    try:
+        print(line, flush=True)
+    except OSError:
+        # what is left unsaid would be tried again at the very end, and change the exit status
+        sys.stdout = open(os.devnull, "w")  # noqa: SIM115
