@@ -163,7 +163,7 @@ FLOORS = {
         ("",),
     ),
     "cli": (
-        ("benchmark", "grammar", "interrupting", "robots", "sweep_display", "values"),
+        ("benchmark", "grammar", "interrupting", "robots", "values"),
         ("keys",),
         ("settings", "user_code"),
         ("suggestions", "sweeps"),

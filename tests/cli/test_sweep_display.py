@@ -4,12 +4,12 @@ import io
 import json
 import pickle
 import re
+import sys
 
 import pytest
 from omegaconf import OmegaConf
 
-from safe_rl.cli.sweep_display import SweepDisplay, progress_of
-from safe_rl.cli.sweeps import SweepReport
+from safe_rl.cli.sweeps import SweepReport, _Display, progress_of
 from safe_rl.runs.table import TableWriter
 
 ROW = {"steps": 250, "episode_return": 1.5, "episode_cost": 30.0, "multiplier_cost": 0.5}
@@ -57,7 +57,7 @@ def test_progress_is_the_last_row_that_is_complete(tmp_path):
 def test_a_log_gets_a_line_for_each_run_at_hand(sweep, tmp_path):
     journal, note = sweep
     stream = io.StringIO()
-    display = SweepDisplay(journal, 3, stream)
+    display = _Display(journal, 3, stream)
     display.show()
     for job in range(3):
         note(job, "begun")
@@ -76,7 +76,7 @@ def test_a_log_gets_a_line_for_each_run_at_hand(sweep, tmp_path):
 def test_a_terminal_gets_bars_which_end_with_their_runs(sweep, tmp_path):
     journal, note = sweep
     stream = Terminal()
-    display = SweepDisplay(journal, 2, stream)
+    display = _Display(journal, 2, stream)
     for job in range(2):
         note(job, "begun")
     display.show()
@@ -96,6 +96,17 @@ def test_a_terminal_gets_bars_which_end_with_their_runs(sweep, tmp_path):
     assert "750/1.00k" in later
     assert "seed0: " not in later
     display.stop()
+
+
+def test_a_process_imports_the_users_modules_before_it_composes(tmp_path, monkeypatch):
+    monkeypatch.setattr(sys, "path", list(sys.path))
+    (tmp_path / "module_of_a_sweep.py").write_text("")
+    report = SweepReport()
+    report._modules = [str(tmp_path / "module_of_a_sweep.py")]
+    sent = pickle.dumps(report)
+    assert "module_of_a_sweep" not in sys.modules
+    pickle.loads(sent)
+    assert "module_of_a_sweep" in sys.modules
 
 
 def test_jobs_get_the_report_without_what_shows_them(sweep, tmp_path):

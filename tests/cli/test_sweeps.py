@@ -138,6 +138,14 @@ def test_a_sweep_end_to_end(tmp_path, launcher):
     assert sorted(note["event"] for note in notes) == ["begun"] * 4 + ["done"] * 2 + ["failed"] * 2
 
 
+@pytest.mark.slow
+def test_jobs_in_other_processes_know_the_keys_of_a_users_module(tmp_path):
+    pytest.importorskip("hydra_plugins.hydra_joblib_launcher")
+    keys = ["env=PointGoal1", "env.constrain_mines=true", "env.mines_num=1", "algo=ppo"]
+    said = sweep(tmp_path, "import=examples/custom_environment.py", *keys, "seed=0,1")
+    assert "Sweep: 2 of 2 runs are finished." in said.stdout, said.stderr
+
+
 def writers(directory):
     """Folder -> process that writes it, of the runs below a folder."""
     found = {run.directory: SoftFileLease(run.lease).pid for run in runs_below(directory)}
