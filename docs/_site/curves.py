@@ -16,17 +16,9 @@ from matplotlib.ticker import MultipleLocator
 from PIL import Image
 
 from safe_rl.cli.benchmark import suite
+from safe_rl.reporting.curves import draw_experiment, draw_learning_curves, limits_of, set_axes
 from safe_rl.reporting.experiments import Experiment, group_runs
-from safe_rl.reporting.pictures import (
-    LIMIT_STYLE,
-    add_legend,
-    algorithm_styles,
-    draw_experiment,
-    draw_learning_curves,
-    limits_of,
-    save,
-    set_axes,
-)
+from safe_rl.reporting.figures import LIMIT_STYLE, add_legend, algorithm_styles, save
 from safe_rl.reporting.recorded import find_runs
 
 ROOT = Path(__file__).resolve().parents[2]

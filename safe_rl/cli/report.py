@@ -13,8 +13,8 @@ from safe_rl.cli.interrupting import say_interruptions
 from safe_rl.cli.user_code import import_modules, split_imports
 from safe_rl.evaluation.settings import option
 from safe_rl.reporting import Report, build_report, write_report
-from safe_rl.reporting.cleaning import clean
 from safe_rl.reporting.recorded import archive_runs
+from safe_rl.reporting.tables import clean
 from safe_rl.runs.files import check_place
 from safe_rl.scores.published import SEEDS
 
@@ -103,7 +103,7 @@ def main(arguments: Sequence[str] | None = None, program: str = COMMAND) -> int:
         return 1
     for path, reason in result.skipped.items():
         print(f"left out {clean(path)}: {reason}", file=sys.stderr)
-    for gap in result.lacking.records:
+    for gap in result.missing_runs.records:
         print(f"{gap['slate']} lacks {gap['runs']} runs of {gap['algorithm']}")
     for name, (plan, *_) in result.campaigns.items():
         print(f"{name}: {plan.note}")

@@ -2,7 +2,8 @@
 
 ``runs.json`` has a line per run. Settings that all runs share stand once, under ``shared``; those
 of a run are its differences from them, or from the run that it is ``like``. ``rows.csv.gz`` has
-the epochs of all runs, with the run in the first column.
+the epochs of all runs, with the run in the first column. The notes of a run are read with the types
+that tables need.
 """
 
 from __future__ import annotations
@@ -10,19 +11,28 @@ from __future__ import annotations
 import gzip
 import io
 import json
+import math
+import os
 import zlib
 from collections import defaultdict
 from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from safe_rl.extras import import_extra
+from safe_rl.reporting.tables import clean
 from safe_rl.runs.files import read_bounded, read_json, replace_text, replacing
+from safe_rl.runs.folder import checkpoint_steps
 
-__all__ = ["ROWS", "RUNS", "Recorded", "read_archive", "write_archive"]
+__all__ = [
+    *("ROWS", "RUNS", "Recorded", "read_archive", "read_certificate", "read_code"),
+    *("read_evaluation", "without_places", "write_archive"),
+]
 
 RUNS, ROWS = "runs.json", "rows.csv.gz"
 _MOST_BYTES = 300_000_000  # of each file, unpacked; a hundred runs have about ten million
+_COMMIT_LETTERS = 10
 _MOST_DIFFERENCES = 12  # up to which a run is described as like another one
 
 
@@ -175,3 +185,90 @@ def _unflatten(flat: Mapping[str, Any]) -> dict[str, Any]:
             node = node.setdefault(group, {})
         node[key] = value
     return tree
+
+
+def without_places(notes: Mapping[str, Any]) -> dict[str, Any]:
+    """Notes without the folders of this machine, but for what command lines said."""
+    kept = dict(notes)
+    start = kept.pop("cwd", None)
+    if start and "config_dirs" in kept:
+        # as a person would type them where the run was started
+        kept["config_dirs"] = [os.path.relpath(path, start) for path in kept["config_dirs"]]
+    if "evaluations" in kept:
+        kept["evaluations"] = [
+            {k: Path(v).name if k == "checkpoint_file" else v for k, v in e.items() if k != "run"}
+            for e in kept["evaluations"]
+        ]
+    return kept
+
+
+def read_evaluation(content: Any) -> dict[str, Any]:
+    """An evaluation with the types that tables need.
+
+    Raises:
+        ValueError: If it is none.
+    """
+    with _in_words("it is no evaluation"):
+        return {
+            "name": clean(content.get("name") or "", 60),
+            "checkpoint": clean(content["checkpoint"]),
+            "steps": content["steps"],
+            "episodes": int(content["episodes"]),
+            "deterministic": bool(content["deterministic"]),
+            "env": {clean(key): clean(value) for key, value in content["env"].items()},
+            "layouts_trained_on": float(content["layouts_trained_on"]),
+            "cvar_alpha": float(content["cvar_alpha"]),
+            "cost_limits": {str(k): float(d) for k, d in content["cost_limits"].items()},
+            "estimates": {
+                name: {part: _number(estimate[part]) for part in ("value", "low", "high")}
+                for name, estimate in content["estimates"].items()
+            },
+        }
+
+
+def read_certificate(content: Any) -> dict[str, Any]:
+    """A certificate with the types that tables need; its ``checkpoint`` is None if it has none.
+
+    Raises:
+        ValueError: If it is none.
+    """
+    with _in_words("it is no certificate"):
+        checkpoint = content["checkpoint"]
+        return {
+            "checkpoint": None if checkpoint is None else checkpoint_steps(Path(str(checkpoint))),
+            "certified_return": _number(content["episode_return"]),
+            "bounds": {
+                clean(name): (_number(bound["bound"]), _number(bound["most"]))
+                for name, bound in content["bounds"].items()
+            },
+            "episodes": int(content["episodes"]),
+            "level": float(content["level"]),
+        }
+
+
+def read_code(content: Any) -> str:
+    """By which code a run was carried out, and from which step on by which other one.
+
+    Raises:
+        ValueError: If it does not say so.
+    """
+    parts = []
+    with _in_words("it says nothing of the code"):
+        for entry in content[:9]:
+            words = [clean(entry["version"], 20), clean(entry["commit"] or "")[:_COMMIT_LETTERS]]
+            words += ["with changes"] if entry["changed"] else []
+            words += [f"from {int(entry['steps']):,} steps on"] if entry["steps"] else []
+            parts.append(" ".join(filter(None, words)))
+    return "; ".join(parts)
+
+
+@contextmanager
+def _in_words(otherwise: str) -> Iterator[None]:
+    try:
+        yield
+    except (ValueError, KeyError, TypeError, AttributeError) as error:
+        raise ValueError(f"{otherwise} ({type(error).__name__}: {error})") from error
+
+
+def _number(value: float | None) -> float:
+    return math.nan if value is None else float(value)

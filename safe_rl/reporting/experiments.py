@@ -1,4 +1,4 @@
-"""Experiments: runs that differ in nothing but the seed."""
+"""Runs that differ in nothing but the seed: their names, and what they started from."""
 
 from __future__ import annotations
 
@@ -6,14 +6,33 @@ from collections import defaultdict
 from collections.abc import Hashable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
-from safe_rl.reporting.naming import algorithm_names, environment_names
-from safe_rl.reporting.origins import Origin
 from safe_rl.reporting.recorded import Run
+from safe_rl.reporting.tables import clean
+from safe_rl.runs.folder import RunFolder, checkpoint_steps, common_source, run_of
+from safe_rl.runs.identity import Role, experiment_of, flatten, role_of
 from safe_rl.scores.benchmark import Suite
 from safe_rl.scores.published import ALGORITHMS, COST_LIMIT, REFERENCE, Scores
 
-__all__ = ["Experiment", "cost_keys_of", "group_runs"]
+__all__ = [
+    *("Experiment", "Source", "cost_keys_of", "distinguishing_keys", "group_runs"),
+    *("init_sources", "title_of"),
+]
+
+Settings = dict[str, Hashable]
+
+# keys in a name, and letters of a name: beyond, a name is cut off and numbered
+_MOST_KEYS, _LONGEST_NAME, _LONGEST_VALUE = 12, 240, 60
+# from how many differing keys on a name has only as many as it takes, and these
+_MANY_KEYS = 3
+_ALWAYS_NAMED = ("preset", "init_from", "frames", "cost_limits", "risk")
+# of those that the paper does not name; where there is none, the file in conf/algo is its name
+_TITLES = {
+    **{name: name.upper() for name in ("bc", "cal", "crpo", "cup", "focops", "ipo")},
+    **{name: name.upper() for name in ("p3o", "pcpo", "rcpo", "sac", "td3", "wcsac")},
+    **{"sac_lagrangian": "SAC-Lagrangian", "td3_lagrangian": "TD3-Lagrangian", "c_trpo": "C-TRPO"},
+}
 
 
 @dataclass(frozen=True)
@@ -69,10 +88,7 @@ class Experiment:
 
     @property
     def lengths(self) -> tuple[int, ...]:
-        """Environment steps of its finished runs, ascending, each number once.
-
-        It is one number, unless unfinished runs count as finished.
-        """
+        """Environment steps of its finished runs, ascending, each number once."""
         return tuple(sorted({run.length for run in self.finished}))
 
 
@@ -84,35 +100,71 @@ def cost_keys_of(experiments: Iterable[Experiment]) -> list[str]:
     return list(dict.fromkeys([*(["cost"] if has_cost else []), *limited]))
 
 
+class Source(NamedTuple):
+    """A run that another one started from, and the environment steps of the checkpoint."""
+
+    run: Run
+    steps: int
+
+
+def init_sources(runs: Sequence[Run]) -> dict[Path, Source]:
+    """Folder of a run -> what it started from, where that is one of the runs.
+
+    A relative path counts from where the run was started, if that is recorded. Where nothing is
+    there, as when all has been moved since, it is sought from the folders above the run upwards.
+    """
+    known = {run.directory.resolve(): run for run in runs}
+    sources = {}
+    for run in runs:
+        if run.init_from is None:
+            continue
+        folder, steps = run_of(run.init_from)
+        places = [] if run.cwd is None else [(run.cwd / folder).resolve()]
+        if not any(path.exists() for path in places):
+            places = [(above / folder).resolve() for above in run.directory.resolve().parents]
+        first = next(filter(None, map(known.get, places)), None)
+        if first is not None:
+            newest = RunFolder(first.directory).newest_checkpoint()
+            steps = steps or (newest and checkpoint_steps(newest)) or first.steps
+            # a table that begins after the checkpoint is another run's
+            if first is not run and first.table["steps"][0] <= steps:
+                sources[run.directory] = Source(first, steps)
+    return sources
+
+
 def group_runs(
-    runs: Sequence[Run], suite: Suite, origins: Mapping[Path, Origin], root: Path
+    runs: Sequence[Run], suite: Suite, sources: Mapping[Path, Source], root: Path
 ) -> tuple[list[Experiment], dict[Path, str]]:
-    """Group runs into experiments.
+    """Group runs into experiments, in the order of the benchmark and of the paper's tables.
 
     Args:
         runs: Runs of any environments and algorithms.
         suite: The benchmark.
-        origins: Folder of a run -> what it started from.
+        sources: Folder of a run -> what it started from, see :func:`init_sources`.
         root: Folder of all runs.
 
     Returns:
-        Experiments in the order of the benchmark and of the paper's tables, and folder -> why a
-        run was left out.
+        Experiments, and folder -> why a run was left out.
     """
-    environments = environment_names(runs, suite)
-    algorithms = algorithm_names(runs, environments, origins, root)
-    families = algorithm_names(runs, environments, origins, root, but_for="cost_limits")
+    environments = _environment_names(runs, suite)
+    settings = {r.directory: _settings(r, sources.get(r.directory), root) for r in runs}
+    algorithms, differing = _algorithm_names(runs, environments, settings)
+    without_limits = {
+        place: {k: v for k, v in own.items() if k.partition(".")[0] != "cost_limits"}
+        for place, own in settings.items()
+    }
+    families, _ = _algorithm_names(runs, environments, without_limits)
     cells: dict[tuple[str, str], list[Run]] = defaultdict(list)
     for run in runs:
-        cells[environments[run.directory], algorithms[run.directory].name].append(run)
+        cells[environments[run.directory], algorithms[run.directory]].append(run)
     skipped: dict[Path, str] = {}
     experiments = []
-    for (environment, algorithm), members in cells.items():
+    for names, members in cells.items():
         kept = _without_repetitions(members, skipped)
-        benchmark = suite.name_of(kept[0].config["env"])
         first = kept[0].directory
-        further = (families[first].name, algorithms[first].settings)
-        experiments.append(Experiment(environment, algorithm, benchmark, tuple(kept), *further))
+        benchmark = suite.name_of(kept[0].config["env"])
+        further = (families[first], differing[first])
+        experiments.append(Experiment(*names, benchmark, tuple(kept), *further))
     return sorted(experiments, key=_order), skipped
 
 
@@ -129,15 +181,180 @@ def _order(experiment: Experiment) -> tuple[Hashable, ...]:
 
 
 def _without_repetitions(runs: Sequence[Run], skipped: dict[Path, str]) -> list[Run]:
-    """Runs by ascending seed, the same seed once: twice it would be one sample, not two.
-
-    The one that has come further is kept, among equals the last by their folders, which have dates
-    for names: when files were written a copy or a clone does not tell. The others are noted.
-    """
+    """Runs by seed, each once: the one that has come further, then the last by folder name."""
     kept: dict[int, Run] = {}
     for run in sorted(runs, key=lambda run: (run.steps, run.directory)):
         if run.seed in kept:
-            reason = f"{run.directory} is the same run with the same seed"
-            skipped[kept[run.seed].directory] = reason
+            skipped[kept[run.seed].directory] = (
+                f"{run.directory} is the same run with the same seed"
+            )
         kept[run.seed] = run
     return [kept[seed] for seed in sorted(kept)]
+
+
+def _environment_names(runs: Sequence[Run], suite: Suite) -> dict[Path, str]:
+    """Folder -> name of the environment, with the keys that differ from the suite's, or first's."""
+    firsts: dict[str, Settings] = {}
+    titles, keys = {}, {}
+    for run in runs:
+        node = run.config["env"]
+        name = str(node.get("name", "environment"))
+        shown = settings = flatten(node)
+        changes = suite.changes(node)
+        if changes is None:
+            first = firsts.setdefault(name, settings)
+            shown = {k: v for k, v in settings.items() if k not in first or v != first[k]}
+        else:
+            shown = settings = flatten(changes)
+        keys[run.directory] = settings
+        titles[run.directory] = clean(name, 80) + _in_brackets(shown)
+    return _unique(titles, keys)
+
+
+def _algorithm_names(
+    runs: Sequence[Run], environments: Mapping[Path, str], settings: Mapping[Path, Settings]
+) -> tuple[dict[Path, str], dict[Path, str]]:
+    """Folder -> name of the algorithm, with what tells it from its namesakes; and all of that."""
+    titles, identities, differing = {}, {}, {}
+    for algorithm in {run.algorithm for run in runs}:
+        members = [run.directory for run in runs if run.algorithm == algorithm]
+        cells: dict[str, list[Settings]] = defaultdict(list)
+        for member in members:
+            cells[environments[member]].append(settings[member])
+        # an experiment may train longer on one environment than on another
+        anywhere = [{**settings[member], "frames": None} for member in members]
+        keys = distinguishing_keys([*cells.values(), anywhere])
+        short = _enough(keys, [settings[member] for member in members])
+        for member in members:
+            own = {key: settings[member].get(key) for key in keys}
+            known = {key: value for key, value in own.items() if value is not None}
+            named = {key: value for key, value in known.items() if key in short}
+            identities[member] = {"algo": algorithm, **own}
+            titles[member] = clean(title_of(algorithm), 80) + _in_brackets(named)
+            differing[member] = _in_brackets(known)[2:-1] if len(known) > len(named) else ""
+    ordered = {run.directory: titles[run.directory] for run in runs}
+    return _unique(ordered, identities), differing
+
+
+def _enough(keys: Sequence[str], members: Sequence[Settings]) -> set[str]:
+    """As few of the keys as tell all apart that differ in any, where it would be many."""
+    kept = [k for k in keys if k.partition(".")[0] in _ALWAYS_NAMED]
+
+    def groups(names: Sequence[str]) -> int:
+        return len({tuple(member.get(name) for name in names) for member in members})
+
+    while len(keys) > _MANY_KEYS and groups(kept) < groups(keys):
+        left = [key for key in keys if key not in kept]
+        kept.append(max(left, key=lambda key: groups([*kept, key])))
+    return set(keys) if len(keys) <= _MANY_KEYS else set(kept)
+
+
+def title_of(algorithm: str) -> str:
+    """How the field writes the name of an algorithm.
+
+    Examples:
+        >>> title_of("c_trpo"), title_of("sac_lagrangian"), title_of("mine")
+        ('C-TRPO', 'SAC-Lagrangian', 'mine')
+    """
+    return ALGORITHMS.get(algorithm) or _TITLES.get(algorithm, algorithm)
+
+
+def _settings(run: Run, source: Source | None, root: Path) -> Settings:
+    """What tells a run's algorithm from others of the same name."""
+    named = experiment_of(run.config).items()
+    settings = {key: value for key, value in named if key.partition(".")[0] != "env"}
+    for key in [key for key in settings if role_of(key) is Role.LENGTH and key != "frames"]:
+        if settings[key] == settings.get("frames"):
+            del settings[key]  # it only says again how long the run is
+    if run.init_from is not None:
+        settings["init_from"] = _source_of_seeds(run, source, root)
+    # what is as the preset has it for the robot, and so as on another robot, tells nothing apart
+    robots = (Path(str(run.config["env"].get("robot_base"))).stem, "point")
+
+    def of_robot(key: str) -> Hashable:
+        found = (settings.get(f"paper.{key}.{robot}") for robot in robots)
+        return next((value for value in found if value is not None), None)
+
+    return {key: value for key, value in settings.items() if value != of_robot(key)}
+
+
+def _source_of_seeds(run: Run, source: Source | None, root: Path) -> str:
+    """The part of ``init_from`` that all seeds share, relative to the folder of all runs."""
+    assert run.init_from is not None
+    folder, _ = run_of(run.init_from)
+    place = folder if source is None else source.run.directory
+    below = next(
+        (place.relative_to(r) for r in (root, root.resolve()) if r in place.parents), place
+    )
+    common = common_source(str(below / run.init_from.relative_to(folder)))
+    # all runs in one folder: the name of the environment says more than a dot
+    name = folder if source is None else source.run.config["env"].get("name")
+    return str(name) if common == "." else common
+
+
+def distinguishing_keys(cells: Iterable[Sequence[Settings]]) -> list[str]:
+    """Keys that differ within a cell, except those whose values follow from another key.
+
+    Those that follow from ``preset``, or from the ``_target_`` of the group that a key belongs to,
+    are told by these. Settings are told apart within a cell, not across cells.
+
+    Examples:
+        >>> small, large = {"preset": "a", "model.width": 1}, {"preset": "b", "model.width": 2}
+        >>> distinguishing_keys([[small, large, small]])
+        ['preset']
+    """
+    cells = [list(cell) for cell in cells]
+    keys = {key for cell in cells for settings in cell for key in settings}
+    order = sorted(keys, key=lambda key: (key != "preset", key.count("."), key))
+    return [key for key in order if any(not _follows(key, cell) for cell in cells)]
+
+
+def _follows(key: str, cell: Sequence[Settings]) -> bool:
+    """Whether a key's value is settled by those of the keys that stand for it."""
+    names = key.split(".")
+    groups = [".".join([*names[:depth], "_target_"]) for depth in range(1, len(names))]
+    above = [other for other in ("preset", *groups) if other != key]
+    values: dict[tuple[Hashable, ...], Hashable] = {}
+    return all(
+        values.setdefault(tuple(s.get(other) for other in above), s.get(key)) == s.get(key)
+        for s in cell
+    )
+
+
+def _unique(titles: Mapping[Path, str], settings: Mapping[Path, Settings]) -> dict[Path, str]:
+    """Titles of bounded length that are alike only where settings are."""
+    taken: dict[str, list[Settings]] = defaultdict(list)
+    names = {}
+    for place, title in titles.items():
+        short = clean(title, _LONGEST_NAME)
+        own = taken[short]
+        if settings[place] not in own:
+            own.append(settings[place])
+        number = own.index(settings[place]) + 1
+        names[place] = short if number == 1 else f"{short} #{number}"
+    return names
+
+
+def _in_brackets(settings: Mapping[str, Hashable]) -> str:
+    """Settings as on the command line, ``" (frames=1000)"``, or nothing."""
+    texts = []
+    for key, value in settings.items():
+        if key.endswith("._target_"):
+            key, value = key.removesuffix("._target_"), str(value).rpartition(".")[2]
+        relation = " ≤ " if key.startswith("cost_limits.") else "="
+        shown = clean(_text(value), _LONGEST_VALUE)
+        texts.append(f"{clean(key.removeprefix('cost_limits.'))}{relation}{shown}")
+    if len(texts) > _MOST_KEYS:
+        texts[_MOST_KEYS:] = ["…"]
+    return f" ({', '.join(texts)})" if texts else ""
+
+
+def _text(value: Hashable) -> str:
+    """A value as Hydra takes it, too."""
+    if isinstance(value, bool) or value is None:
+        return {True: "true", False: "false", None: "null"}[value]
+    if isinstance(value, tuple):
+        return f"[{','.join(map(_text, value))}]"
+    if isinstance(value, float):
+        return f"{value:g}"
+    return f"{value:_}" if isinstance(value, int) else str(value)

@@ -7,10 +7,9 @@ from math import inf
 from pathlib import Path
 from typing import Any
 
-from safe_rl.reporting.cleaning import clean
-from safe_rl.reporting.columns import Column, Record, Table, each_cost, interval
 from safe_rl.reporting.experiments import Experiment
 from safe_rl.reporting.recorded import Run
+from safe_rl.reporting.tables import Column, Record, Table, clean, each_cost, interval
 
 __all__ = [
     *("certificate_table", "duration", "evaluation_table", "run_table", "variant_table", "videos"),

@@ -1,40 +1,263 @@
-"""The report as files: pictures, tables, Markdown, and one page of HTML that holds everything."""
+"""Everything a report says, in its order: figures, tables, Markdown, and one page of HTML."""
 
 from __future__ import annotations
 
 import base64
 import datetime
 import re
-from collections.abc import Callable
+from collections import defaultdict
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from importlib.resources import files
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
+
+import yaml
+from matplotlib.figure import Figure
 
 from safe_rl.extras import import_extra
-from safe_rl.reporting.cleaning import clean
-from safe_rl.reporting.columns import SYMBOL, Table, escaped
-from safe_rl.reporting.contents import Block, Drawing, Film, Report
-from safe_rl.reporting.inventory import duration
-from safe_rl.reporting.pictures import save
+from safe_rl.reporting.campaigns import campaign_tables
+from safe_rl.reporting.curves import draw_learning_curves, draw_transfer, find_transfers
+from safe_rl.reporting.experiments import Experiment, Source, group_runs, init_sources
+from safe_rl.reporting.figures import (
+    Style,
+    algorithm_styles,
+    compared,
+    draw_fronts,
+    draw_middles,
+    draw_profiles,
+    save,
+)
+from safe_rl.reporting.inventory import (
+    certificate_table,
+    duration,
+    evaluation_table,
+    run_table,
+    variant_table,
+    videos,
+)
+from safe_rl.reporting.recorded import Run, find_runs
+from safe_rl.reporting.scoring import dominance_table, final_table, learning_table
+from safe_rl.reporting.slates import (
+    Aggregate,
+    by_length,
+    complete_slates,
+    improvement_table,
+    middle_table,
+    missing_runs_table,
+    slate_table,
+    title_of_slate,
+)
+from safe_rl.reporting.tables import SYMBOL, Column, Record, Table, clean, escaped
 from safe_rl.runs.files import replace_text
+from safe_rl.scores.benchmark import Suite
 
-__all__ = ["write_report"]
+__all__ = ["Block", "Drawing", "Film", "Report", "Section", "build_report", "write_report"]
+
+# rows of a picture of learning curves, in environments: what a printed page holds
+_MOST_ROWS = 6
+_TEXTS = yaml.safe_load(files(__package__).joinpath("texts.yaml").read_text(encoding="utf-8"))
 
 _MIME_TYPES = {".png": "image/png", ".mp4": "video/mp4"}
 # of a film, above which it is named instead of embedded [bytes]
 _LARGEST = 50_000_000
 
 
+class Drawing(NamedTuple):
+    """A picture: stem of its file, heading, and what it shows, for those who cannot see it."""
+
+    name: str
+    title: str
+    figure: Figure
+    shows: str
+
+
+class Film(NamedTuple):
+    """A video, and its caption."""
+
+    title: str
+    path: Path
+
+
+Block = Table | Drawing | Film | str
+
+
+class Section(NamedTuple):
+    """A part of the report: its key in ``texts.yaml``, its heading, what is in it."""
+
+    name: str
+    title: str
+    blocks: Sequence[Block]
+
+    @property
+    def text(self) -> str:
+        """What a reader has to know."""
+        return _TEXTS.get(self.name, "")
+
+
+@dataclass(frozen=True)
+class Report:
+    """The contents of a report on a folder of runs.
+
+    Attributes:
+        experiments: Runs, grouped.
+        sections: What is said of them; none is empty.
+        missing_runs: Which runs slates still lack.
+        campaigns: Name -> tables of what was planned, and what of it is done.
+        skipped: Folder or file -> why it was left out.
+    """
+
+    experiments: Sequence[Experiment]
+    sections: Sequence[Section]
+    missing_runs: Table
+    campaigns: Mapping[str, Sequence[Table]]
+    skipped: Mapping[Path, str]
+
+    @property
+    def runs(self) -> list[Run]:
+        """All runs in it."""
+        return [run for experiment in self.experiments for run in experiment.runs]
+
+
+def build_report(
+    root: Path, suite: Suite, *, seeds_needed: int, unfinished: bool, good: float = 0.5
+) -> Report:
+    """Find the runs below a folder and put everything together.
+
+    Args:
+        root: The folder.
+        suite: The benchmark.
+        seeds_needed: Finished runs that a slate takes per environment.
+        unfinished: Whether unfinished runs count as finished ones.
+        good: Share of a return that a good policy has, see
+            :func:`safe_rl.reporting.scoring.learning_table`.
+
+    Raises:
+        FileNotFoundError: If there is no run.
+    """
+    runs, skipped = find_runs(root, unfinished=unfinished)
+    sources = init_sources(runs)
+    experiments, repeated = group_runs(runs, suite, sources, root)
+    campaigns, no_plans = campaign_tables(root, runs)
+    skipped |= repeated | no_plans
+    styles = algorithm_styles(experiments)
+    groups = _by_environment([e for e in experiments if e.finished])
+    finals = [final_table(group) for group in groups]
+    records = [record for table in finals for record in table.records]
+    missing = missing_runs_table(experiments, seeds_needed)
+    learning = [learning_table(group, good) for group in groups]
+    slates = _slates(experiments, styles, seeds_needed)
+    runs_tables = (run_table(experiments), variant_table(experiments), _left_out(skipped))
+    sections = [
+        Section("final", "Final scores", finals or ["No run is finished."]),
+        Section("learning", "What learning cost", list(filter(None, learning))),
+        Section("curves", "Learning curves", _curves(experiments, styles)),
+        Section("fronts", "Return against cost", _fronts(records, styles)),
+        Section("transfer", "Transfer", _transfers(experiments, sources, styles)),
+        Section("normalised", "Normalised scores", [*slates, *_if_any(missing)]),
+        Section("dominance", "Which is better", _if_any(dominance_table(records))),
+        Section("certificates", "Certificates", _if_any(certificate_table(experiments))),
+        Section("evaluations", "Evaluations", _if_any(evaluation_table(experiments))),
+        Section("videos", "Videos", [Film(clean(c), path) for c, path in videos(experiments)]),
+        Section("campaigns", "Campaigns", [t for own in campaigns.values() for t in own]),
+        Section("runs", "Runs", [table for table in runs_tables if table.records]),
+    ]
+    return Report(experiments, [s for s in sections if s.blocks], missing, campaigns, skipped)
+
+
+def _if_any(table: Table) -> list[Table]:
+    return [table] if table.records else []
+
+
+def _left_out(skipped: Mapping[Path, str]) -> Table:
+    records = [{"what": clean(path), "why": clean(why, 500)} for path, why in skipped.items()]
+    return Table("left_out", "Left out", [Column("what"), Column("why")], records)
+
+
+def _by_environment(experiments: Sequence[Experiment]) -> list[list[Experiment]]:
+    names = dict.fromkeys(e.environment for e in experiments)
+    return [[e for e in experiments if e.environment == name] for name in names]
+
+
+def _fronts(records: Sequence[Record], styles: Mapping[str, Style]) -> list[Drawing]:
+    groups = compared(records)
+    if not groups:
+        return []
+    panels = [f"{what}: {', '.join(r['algorithm'] for r in own)}" for what, own in groups.items()]
+    says = f"Final return against final episode cost. {'; '.join(panels)}"
+    return [Drawing("fronts", "", draw_fronts(records, styles), says)]
+
+
+def _curves(experiments: Sequence[Experiment], styles: Mapping[str, Style]) -> list[Drawing]:
+    """A picture per robot, where environments have one; several if it would get too long."""
+    robots: dict[str, list[list[Experiment]]] = defaultdict(list)
+    for group in _by_environment(experiments):
+        robot = Path(str(group[0].runs[0].config["env"].get("robot_base", "other"))).stem
+        robots[clean(robot, 40)].append(group)
+    drawings = []
+    for robot, groups in robots.items():
+        for start in range(0, len(groups), _MOST_ROWS):
+            shown = groups[start : start + _MOST_ROWS]
+            names = ", ".join(group[0].environment for group in shown)
+            says = f"Return, episode cost and cost rate over environment steps: {names}"
+            figure = draw_learning_curves([e for group in shown for e in group], styles)
+            drawings.append(Drawing(f"curves_{robot}", "", figure, says))
+    return drawings
+
+
+def _transfers(
+    experiments: Sequence[Experiment],
+    sources: Mapping[Path, Source],
+    styles: Mapping[str, Style],
+) -> list[Block]:
+    blocks: list[Block] = []
+    for number, transfer in enumerate(find_transfers(experiments, sources), start=1):
+        says = f"Return, episode cost and cost rate of both phases, {transfer.title}"
+        figure = draw_transfer(transfer, styles)
+        blocks += [Drawing(f"transfer_{number}", transfer.title, figure, says), *transfer.notes]
+    return blocks
+
+
+def _slates(
+    experiments: Sequence[Experiment], styles: Mapping[str, Style], seeds_needed: int
+) -> list[Block]:
+    blocks: list[Block] = []
+    for name, environments, aggregates in complete_slates(experiments, seeds_needed):
+        blocks.append(slate_table(name, environments, aggregates))
+        for after, group in by_length(aggregates).items():
+            blocks += _middles_and_profiles(name, group, after, styles)
+        blocks += _if_any(improvement_table(name, aggregates))
+    return blocks
+
+
+def _middles_and_profiles(
+    slate: str, aggregates: Sequence[Aggregate], after: str, styles: Mapping[str, Style]
+) -> list[Block]:
+    """What can be seen of a slate's runs as a whole, if there are several that ended an episode."""
+    if max(one.num_runs for one in aggregates) == 1:
+        return []
+    middle = middle_table(slate, aggregates, after)
+    if not any(one.is_measured for one in aggregates):
+        return [middle]
+    iqm, profiles = draw_middles(middle.records, styles), draw_profiles(aggregates, styles)
+    says = ", ".join([title_of_slate(slate) + after, *(one.algorithm for one in aggregates)])
+    return [
+        middle,
+        Drawing(f"slate_{slate}", "", iqm, f"Interquartile means with 95 % intervals: {says}"),
+        Drawing(f"profiles_{slate}", "", profiles, f"Share of runs above every score: {says}"),
+    ]
+
+
 def write_report(report: Report, out: Path, title: str) -> Path:
-    """Write everything into a folder.
+    """Write a report into a folder, made if need be: a page, Markdown, a PNG per figure, CSVs.
 
     Args:
         report: What there is to say.
-        out: Folder, made if need be; files of an earlier report in it are replaced.
+        out: The folder; files of an earlier report in it are replaced.
         title: Heading of the page.
 
     Returns:
-        The page, ``report.html``. Beside it are ``report.md``, a PNG for every figure and a CSV
-        for every table.
+        The page, ``report.html``.
 
     Raises:
         ModuleNotFoundError: If Jinja is missing; the message names the extra.

@@ -1,7 +1,6 @@
-"""Runs as their folders and archives record them: configuration, table, command, films.
+"""Runs as their folders and archives record them; what cannot be read is left out with a reason.
 
-Whatever is wrong with a run becomes a sentence on why it, or a file of it, is left out. Nothing is
-read that a link in the folder names outside of it, and nothing that a file says is followed.
+Nothing is read that a link names outside of the folder, and nothing that a file says is followed.
 """
 
 from __future__ import annotations
@@ -17,10 +16,20 @@ from typing import Any
 
 import numpy as np
 
-from safe_rl.reporting.archive import ROWS, RUNS, Recorded, read_archive, write_archive
-from safe_rl.reporting.cleaning import clean
+from safe_rl.reporting.archive import (
+    ROWS,
+    RUNS,
+    Recorded,
+    read_archive,
+    read_certificate,
+    read_code,
+    read_evaluation,
+    without_places,
+    write_archive,
+)
+from safe_rl.reporting.tables import clean
 from safe_rl.runs.files import read_config, read_json, read_yaml
-from safe_rl.runs.folder import RunFolder, checkpoint_steps, paths_below, runs_below
+from safe_rl.runs.folder import RunFolder, paths_below, runs_below
 from safe_rl.runs.outcome import final_figures, judges_another_measure, violation
 from safe_rl.runs.table import read_table
 
@@ -28,7 +37,6 @@ __all__ = ["Run", "archive_runs", "find_runs"]
 
 # A number that has left all bounds says as little as NaN, and fits no picture.
 _EXPLODED = 1e30
-_COMMIT_LETTERS = 10
 
 
 @dataclass(frozen=True)
@@ -91,11 +99,7 @@ class Run:
 
     @property
     def length(self) -> int:
-        """Environment steps that it was meant to take; of an unfinished run, those it has taken.
-
-        A run ends with a whole batch, some steps later, which is no longer training than that of
-        another one with smaller batches.
-        """
+        """Environment steps that it was meant to take; of an unfinished run, those it has taken."""
         meant = self.config["frames"]
         return int(meant) if 0 < meant <= self.steps else self.steps
 
@@ -198,23 +202,8 @@ def archive_runs(runs: Iterable[Run], root: Path, archive: Path) -> None:
     for run in runs:
         if run.recorded is not None:
             name = run.directory.resolve().relative_to(here).as_posix()
-            kept[name] = run.recorded._replace(notes=_without_places(run.recorded.notes))
+            kept[name] = run.recorded._replace(notes=without_places(run.recorded.notes))
     write_archive(kept, archive)
-
-
-def _without_places(notes: Mapping[str, Any]) -> dict[str, Any]:
-    """Notes without the folders of this machine, but for what command lines said."""
-    kept = dict(notes)
-    start = kept.pop("cwd", None)
-    if start and "config_dirs" in kept:
-        # as a person would type them where the run was started
-        kept["config_dirs"] = [os.path.relpath(path, start) for path in kept["config_dirs"]]
-    if "evaluations" in kept:
-        kept["evaluations"] = [
-            {k: Path(v).name if k == "checkpoint_file" else v for k, v in e.items() if k != "run"}
-            for e in kept["evaluations"]
-        ]
-    return kept
 
 
 @contextmanager
@@ -294,78 +283,6 @@ def _run(directory: Path, recorded: Recorded, unfinished: bool) -> Run:
         code=read_code(notes["code"]) if "code" in notes else None,
         recorded=recorded,
     )
-
-
-def read_evaluation(content: Any) -> dict[str, Any]:
-    """An evaluation with the types that tables need.
-
-    Raises:
-        ValueError: If it is none.
-    """
-    with _in_words("it is no evaluation"):
-        return {
-            "name": clean(content.get("name") or "", 60),
-            "checkpoint": clean(content["checkpoint"]),
-            "steps": content["steps"],
-            "episodes": int(content["episodes"]),
-            "deterministic": bool(content["deterministic"]),
-            "env": {clean(key): clean(value) for key, value in content["env"].items()},
-            "layouts_trained_on": float(content["layouts_trained_on"]),
-            "cvar_alpha": float(content["cvar_alpha"]),
-            "cost_limits": {str(k): float(d) for k, d in content["cost_limits"].items()},
-            "estimates": {
-                name: {part: _number(estimate[part]) for part in ("value", "low", "high")}
-                for name, estimate in content["estimates"].items()
-            },
-        }
-
-
-def read_certificate(content: Any) -> dict[str, Any]:
-    """A certificate with the types that tables need; its ``checkpoint`` is None if it has none.
-
-    Raises:
-        ValueError: If it is none.
-    """
-    with _in_words("it is no certificate"):
-        checkpoint = content["checkpoint"]
-        return {
-            "checkpoint": None if checkpoint is None else checkpoint_steps(Path(str(checkpoint))),
-            "certified_return": _number(content["episode_return"]),
-            "bounds": {
-                clean(name): (_number(bound["bound"]), _number(bound["most"]))
-                for name, bound in content["bounds"].items()
-            },
-            "episodes": int(content["episodes"]),
-            "level": float(content["level"]),
-        }
-
-
-def read_code(content: Any) -> str:
-    """By which code a run was carried out, and from which step on by which other one.
-
-    Raises:
-        ValueError: If it does not say so.
-    """
-    parts = []
-    with _in_words("it says nothing of the code"):
-        for entry in content[:9]:
-            words = [clean(entry["version"], 20), clean(entry["commit"] or "")[:_COMMIT_LETTERS]]
-            words += ["with changes"] if entry["changed"] else []
-            words += [f"from {int(entry['steps']):,} steps on"] if entry["steps"] else []
-            parts.append(" ".join(filter(None, words)))
-    return "; ".join(parts)
-
-
-@contextmanager
-def _in_words(otherwise: str) -> Iterator[None]:
-    try:
-        yield
-    except (ValueError, KeyError, TypeError, AttributeError) as error:
-        raise ValueError(f"{otherwise} ({type(error).__name__}: {error})") from error
-
-
-def _number(value: float | None) -> float:
-    return math.nan if value is None else float(value)
 
 
 def _films(run: RunFolder) -> list[Path]:

@@ -10,18 +10,18 @@ from typing import Any
 
 import numpy as np
 
-from safe_rl.reporting.cleaning import clean
-from safe_rl.reporting.columns import (
+from safe_rl.reporting.experiments import Experiment, cost_keys_of
+from safe_rl.reporting.recorded import Run
+from safe_rl.reporting.tables import (
     Column,
     Record,
     Table,
+    clean,
     each_cost,
     mark_best,
     power_of_ten,
     spread,
 )
-from safe_rl.reporting.experiments import Experiment, cost_keys_of
-from safe_rl.reporting.recorded import Run
 from safe_rl.runs.curves import moving_mean
 from safe_rl.runs.outcome import FINAL_EPOCHS, final_width
 from safe_rl.scores.dominance import Agent, compare
@@ -150,7 +150,7 @@ def _best(
     records: Sequence[Record], name: str, best: Callable[..., float]
 ) -> Callable[[Record], str]:
     """Mark of the best among those that satisfy the same constraints after equally many steps."""
-    mark = mark_best(records, name, best, is_able=lambda r: r["satisfies"], steps=rivals)
+    mark = mark_best(records, name, best, is_able=lambda r: r["satisfies"], rivals=rivals)
     # what single costs cost is not ranked
     return lambda row: mark(row) if name == "episode_return" or row["of"] == "cost" else ""
 

@@ -12,7 +12,7 @@ from safe_rl.cli.report import main
 from safe_rl.cli.train import read_command
 from safe_rl.envs import store_configs
 from safe_rl.reporting.campaigns import PLAN, campaign_tables, read_plan
-from safe_rl.reporting.contents import build_report
+from safe_rl.reporting.page import build_report
 from safe_rl.reporting.recorded import find_runs
 
 store_configs()

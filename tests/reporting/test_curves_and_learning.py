@@ -6,19 +6,19 @@ import numpy as np
 import pytest
 from synthetic import SUITE, experiments_in, write_run
 
-from safe_rl.reporting.averages import average
-from safe_rl.reporting.columns import Column, Table, spread
-from safe_rl.reporting.contents import build_report
+from safe_rl.reporting.curves import average
+from safe_rl.reporting.page import build_report
 from safe_rl.reporting.recorded import find_runs
 from safe_rl.reporting.scoring import (
     final_record,
     learning_table,
 )
-from safe_rl.reporting.slate_scores import (
+from safe_rl.reporting.slates import (
     aggregate,
     by_length,
     improvement_table,
 )
+from safe_rl.reporting.tables import Column, Table, spread
 from safe_rl.scores.published import REFERENCE
 
 

@@ -5,13 +5,8 @@ import pytest
 from matplotlib.figure import Figure
 from synthetic import experiments_in, write_run
 
-from safe_rl.reporting.fronts import draw_fronts
-from safe_rl.reporting.pictures import (
-    add_legend,
-    algorithm_styles,
-    draw_learning_curves,
-    save,
-)
+from safe_rl.reporting.curves import draw_learning_curves
+from safe_rl.reporting.figures import add_legend, algorithm_styles, draw_fronts, save
 from safe_rl.reporting.scoring import final_table
 
 ROWS = {"returns": (1.0, 2.0, 3.0), "rates": (0.06, 0.05, 0.04)}

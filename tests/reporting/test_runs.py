@@ -6,8 +6,8 @@ import pytest
 from synthetic import grouped, write_run
 
 from safe_rl.cli.composing import CONF
+from safe_rl.reporting.experiments import distinguishing_keys, title_of
 from safe_rl.reporting.inventory import variant_table
-from safe_rl.reporting.naming import distinguishing_keys, title_of
 from safe_rl.reporting.recorded import find_runs
 
 
@@ -176,7 +176,7 @@ def test_what_differs_between_environments_is_said_in_full(tmp_path):
         "DoggoGoal1": "frames_per_batch=40, init_from=runs/x, num_envs=4, tail=0.1, "
                       f"cost ≤ 25, {pid}, lagrangian.ki=0.2",
     }  # fmt: skip
-    # in names, limits and origins, which tell all of these apart
+    # in names, limits and sources, which tell all of these apart
     assert {e.environment: e.algorithm for e in experiments} == {
         "PointGoal1": "PPO (cost ≤ 25)",
         "CarGoal1": "PPO (cost_hazards ≤ 10)",

@@ -4,22 +4,22 @@ import numpy as np
 import pytest
 from synthetic import SUITE, experiments_in, write_run
 
-from safe_rl.reporting.columns import Table
-from safe_rl.reporting.contents import Drawing, build_report
-from safe_rl.reporting.lacking import lacking_table, missing_seeds
-from safe_rl.reporting.pictures import algorithm_styles
+from safe_rl.reporting.figures import algorithm_styles, draw_profiles
+from safe_rl.reporting.page import Drawing, build_report
 from safe_rl.reporting.scoring import (
     dominance_table,
     final_record,
     final_table,
 )
-from safe_rl.reporting.slate_pictures import draw_profiles
-from safe_rl.reporting.slate_scores import (
+from safe_rl.reporting.slates import (
     aggregate,
     can_be_normalised,
     middle_table,
+    missing_runs_table,
+    missing_seeds,
     slate_table,
 )
+from safe_rl.reporting.tables import Table
 from safe_rl.scores.published import PUBLISHED_STEPS, REFERENCE
 from safe_rl.scores.slates import SLATES
 
@@ -272,7 +272,7 @@ def test_an_incomplete_slate_says_which_runs_it_lacks(tmp_path):
     write_run(tmp_path, "PointPush1", "cpo", 7)
     write_run(tmp_path, "DoggoGoal1", "cpo", 20, frames=10**8)
     experiments = experiments_in(tmp_path)
-    (record,) = [r for r in lacking_table(experiments, 3).records if r["slate"] == "SG6"]
+    (record,) = [r for r in missing_runs_table(experiments, 3).records if r["slate"] == "SG6"]
     assert (record["algorithm"], record["runs"]) == ("CPO", 4)
     assert record["commands"].splitlines() == [
         "python train.py -m env=CarGoal1 algo=cpo seed=10",
@@ -289,11 +289,11 @@ def test_commands_of_missing_runs_are_made_of_recorded_ones_only(tmp_path):
     said = ["algo=ppo", "frames=1_000", "+note=x"]
     runs = [write_run(tmp_path, env, overrides=said) for env in ("PointGoal1", "PointGoal2")]
     (runs[0] / ".hydra" / "overrides.yaml").unlink()
-    commands = [r["commands"] for r in lacking_table(experiments_in(tmp_path), 1).records]
+    commands = [r["commands"] for r in missing_runs_table(experiments_in(tmp_path), 1).records]
     assert commands
     assert all("algo=ppo frames=1_000 +note=x seed=" in command for command in commands)
     (runs[1] / ".hydra" / "overrides.yaml").unlink()
-    records = lacking_table(experiments_in(tmp_path), 1).records
+    records = missing_runs_table(experiments_in(tmp_path), 1).records
     assert {record["commands"] for record in records} == {"not recorded"}
 
 
@@ -305,7 +305,7 @@ def test_the_missing_runs_of_a_variant_are_those_of_the_variant(tmp_path):
     ]
     for env in ("DoggoPush1", "DoggoPush2"):
         write_run(tmp_path, env, algo="cpo", overrides=said)
-    (record,) = lacking_table(experiments_in(tmp_path), 1).records
+    (record,) = missing_runs_table(experiments_in(tmp_path), 1).records
     assert record["slate"] == "SGDoggo"
     assert record["commands"] == (
         "python train.py -m env=DoggoGoal1,DoggoGoal2,DoggoButton1,DoggoButton2 algo=cpo "
@@ -323,9 +323,9 @@ def test_a_slate_takes_environments_as_they_are_and_a_limit_of_the_cost(tmp_path
     assert {"PointGoal1", "PointGoal2", "PointPush2"} <= set(missing)
     assert "PointPush1" not in missing
     # one of six environments has a run of it, which is not worth a word; then two of them
-    assert not lacking_table(experiments, 1).records
+    assert not missing_runs_table(experiments, 1).records
     write_run(tmp_path, "PointButton1", "cpo", 0, frames=10**6)
-    records = lacking_table(experiments_in(tmp_path), 1).records
+    records = missing_runs_table(experiments_in(tmp_path), 1).records
     assert {r["slate"]: r["runs"] for r in records} == {"SG6": 5, "SGPoint": 5}
 
 

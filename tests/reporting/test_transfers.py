@@ -10,11 +10,10 @@ from matplotlib.image import imread
 from synthetic import SUITE, write_run
 
 from safe_rl.cli.report import main
-from safe_rl.reporting.experiments import group_runs
-from safe_rl.reporting.origins import find_origins
-from safe_rl.reporting.pictures import algorithm_styles
+from safe_rl.reporting.curves import draw_transfer, find_transfers
+from safe_rl.reporting.experiments import group_runs, init_sources
+from safe_rl.reporting.figures import algorithm_styles
 from safe_rl.reporting.recorded import find_runs
-from safe_rl.reporting.transfers import draw_transfer, find_transfers
 from safe_rl.runs.checkpoints import CheckpointStore
 
 FIRST = {"returns": (4.0, 4.0, 4.0), "rates": (0.06, 0.05, 0.04)}
@@ -34,9 +33,9 @@ def write_second(root, source, seed=0, **settings):
 
 def transfers_in(root):
     runs, _ = find_runs(root)
-    origins = find_origins(runs)
-    experiments, _ = group_runs(runs, SUITE, origins, root)
-    return find_transfers(experiments, origins), algorithm_styles(experiments)
+    sources = init_sources(runs)
+    experiments, _ = group_runs(runs, SUITE, sources, root)
+    return find_transfers(experiments, sources), algorithm_styles(experiments)
 
 
 def only_transfer_in(root):

@@ -1,32 +1,38 @@
-"""Normalised scores over slates of environments (paper section 5.1)."""
+"""Normalised scores over slates of environments (paper section 5.1), and the runs they lack."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import shlex
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations
 from typing import Any
 
 import numpy as np
 
-from safe_rl.reporting.columns import Column, Table, interval, mark_best, power_of_ten, span
 from safe_rl.reporting.experiments import Experiment
+from safe_rl.reporting.tables import Column, Table, interval, mark_best, power_of_ten, span
+from safe_rl.runs.identity import Role, role_of
 from safe_rl.scores.comparisons import probability_of_improvement
 from safe_rl.scores.dominance import NOISE_OF_ZERO, Agent, compare
 from safe_rl.scores.intervals import Estimate, interquartile_mean
 from safe_rl.scores.normalised import normalised_cost_rate, normalised_return, normalised_violation
-from safe_rl.scores.published import PUBLISHED, PUBLISHED_STEPS, Normalised
+from safe_rl.scores.published import PUBLISHED, PUBLISHED_STEPS, REFERENCE, SEEDS, Normalised
 from safe_rl.scores.slates import SLATES
 
 __all__ = [
-    *("SYMBOLS", "Aggregate", "aggregate", "by_length", "can_be_normalised", "improvement_table"),
-    *("middle_table", "normalised_scores", "slate_table", "title_of"),
+    *("SYMBOLS", "Aggregate", "aggregate", "by_length", "can_be_normalised", "complete_slates"),
+    *("improvement_table", "middle_table", "missing_runs_table", "missing_seeds"),
+    *("normalised_scores", "slate_table", "title_of_slate"),
 ]
 
 SYMBOLS = dict(
     zip(Normalised._fields, (r"$\bar J_r$", r"$\bar M_c$", r"$\bar \rho_c$"), strict=True)
 )
 """Score -> its symbol."""
+# groups that a command for missing runs chooses itself
+_MISSING = ("slate", "algorithm", "runs", "commands")
+_CHOSEN = {"env", "algo", "slate", "init_from", "hydra"}
 
 
 @dataclass(frozen=True)
@@ -71,11 +77,7 @@ class Aggregate:
 
 
 def can_be_normalised(experiment: Experiment) -> bool:
-    """Whether there is something to normalise, and something to normalise it by.
-
-    Runs that started from other runs' networks had more training than their steps say, and do not
-    count.
-    """
+    """Whether there is something to normalise, and a reference; continued runs do not count."""
     return (
         experiment.reference is not None
         and "cost" in experiment.limits
@@ -120,16 +122,41 @@ def aggregate(experiments: Sequence[Experiment]) -> Aggregate:
     )
 
 
+def complete_slates(
+    experiments: Sequence[Experiment], needed: int
+) -> Iterator[tuple[str, tuple[str, ...], list[Aggregate]]]:
+    """Slates that are complete for an algorithm or more, and what all have in common.
+
+    Yields:
+        Name of a slate, its environments, and an aggregate of each algorithm.
+    """
+    begun = [e for e in experiments if e.benchmark in REFERENCE and not e.is_continued]
+    algorithms = list(dict.fromkeys(e.algorithm for e in begun))
+    usable = [e for e in experiments if can_be_normalised(e)]
+    on = {name: {e.algorithm for e in usable if e.benchmark == name} for name in REFERENCE}
+    shared = tuple(n for n in REFERENCE if algorithms and on[n] == set(algorithms))
+    slates = [
+        (name, slate, [a for a in algorithms if not missing_seeds(name, a, experiments, needed)])
+        for name, slate in SLATES.items()
+    ]
+    if shared and shared not in [slate for _, slate, members in slates if members]:
+        slates.append(("shared", shared, algorithms))
+    for name, slate, members in slates:
+        own = [[e for e in usable if e.algorithm == a and e.benchmark in slate] for a in members]
+        if own:
+            yield name, slate, list(map(aggregate, own))
+
+
 def slate_table(slate: str, environments: Sequence[str], aggregates: Sequence[Aggregate]) -> Table:
     """One of the paper's Tables 1 and 2, the published values beside ours."""
     records = [_record(slate, aggregate) for aggregate in aggregates]
-    rivals = {one.algorithm: (one.steps, one.limits) for one in aggregates}
+    lengths = {one.algorithm: (one.steps, one.limits) for one in aggregates}
 
     def best(name: str, of: Any) -> Any:
         return mark_best(
             records, name, of,
             is_able=lambda r: r["violation"] <= NOISE_OF_ZERO,
-            steps=lambda r: rivals[r["algorithm"]],
+            rivals=lambda r: lengths[r["algorithm"]],
         )  # fmt: skip
 
     marks = {"episode_return": best("episode_return", max), "cost_rate": best("cost_rate", min)}
@@ -140,18 +167,22 @@ def slate_table(slate: str, environments: Sequence[str], aggregates: Sequence[Ag
         Column("steps", ("{:,}", "fewest_steps"), (" to {:,}", "most_steps")),
         *(Column(s, ("{:.3f}", name), mark=marks[name]) for name, s in SYMBOLS.items()),
     ]
+    notes = [f"On {', '.join(environments)}.", _relations(aggregates)]
     if slate in PUBLISHED:
         columns += [Column(f"paper {s}", ("{:.3f}", f"paper_{n}")) for n, s in SYMBOLS.items()]
-    notes = [f"On {', '.join(environments)}.", _relations(aggregates)]
-    notes += [_published_steps(slate)] if slate in PUBLISHED else []
-    return Table(f"slate_{slate}", title_of(slate), columns, records, " ".join(filter(None, notes)))
+        steps = sorted({PUBLISHED_STEPS[environment] for environment in SLATES[slate]})
+        doggo = " (Doggo)" if len(steps) > 1 else ""
+        after = " and ".join(map(power_of_ten, steps))
+        notes.append(f"The paper's values are those after {after}{doggo} steps.")
+    note = " ".join(filter(None, notes))
+    return Table(f"slate_{slate}", title_of_slate(slate), columns, records, note)
 
 
-def title_of(slate: str) -> str:
+def title_of_slate(slate: str) -> str:
     """What a slate is called on the page.
 
     Examples:
-        >>> title_of("SG6"), title_of("shared")
+        >>> title_of_slate("SG6"), title_of_slate("shared")
         ('SG6', 'What all algorithms were trained on')
     """
     return {"shared": "What all algorithms were trained on"}.get(slate, slate)
@@ -159,27 +190,16 @@ def title_of(slate: str) -> str:
 
 def _record(slate: str, aggregate: Aggregate) -> dict[str, Any]:
     fewest, most = min(aggregate.steps), max(aggregate.steps)
-    record: dict[str, Any] = {
+    published = PUBLISHED.get(slate, {}).get(aggregate.published)
+    return {
         "slate": slate,
         "algorithm": aggregate.algorithm,
         "runs": aggregate.num_runs,
         "fewest_steps": fewest,
         "most_steps": None if most == fewest else most,
         **aggregate.mean._asdict(),
+        **{f"paper_{n}": value for n, value in (published._asdict() if published else {}).items()},
     }
-    published = PUBLISHED.get(slate, {}).get(aggregate.published)
-    if published is not None:
-        record |= {f"paper_{name}": value for name, value in published._asdict().items()}
-    return record
-
-
-def _published_steps(slate: str) -> str:
-    """After how many steps the published values were measured."""
-    steps = sorted({PUBLISHED_STEPS[environment] for environment in SLATES[slate]})
-    doggo = " (Doggo)" if len(steps) > 1 else ""
-    return (
-        f"The paper's values are those after {' and '.join(map(power_of_ten, steps))}{doggo} steps."
-    )
 
 
 def _relations(aggregates: Sequence[Aggregate]) -> str:
@@ -220,14 +240,12 @@ def by_length(aggregates: Sequence[Aggregate]) -> dict[str, list[Aggregate]]:
     return {f", {span(steps)} steps": members for steps, members in groups.items()}
 
 
-def middle_table(slate: str, aggregates: Sequence[Aggregate], after: str = "") -> Table:
-    """Interquartile means over all runs with their intervals.
+def _with_interval(name: str, estimate: Estimate) -> dict[str, float]:
+    return dict(zip((name, f"{name}_low", f"{name}_high"), estimate, strict=True))
 
-    Args:
-        slate: Its name.
-        aggregates: One per algorithm.
-        after: How long they were trained, see :func:`by_length`.
-    """
+
+def middle_table(slate: str, aggregates: Sequence[Aggregate], after: str = "") -> Table:
+    """Interquartile means over all runs with their intervals, of one group of :func:`by_length`."""
     records = []
     for one in aggregates:
         record: dict[str, Any] = {
@@ -235,12 +253,11 @@ def middle_table(slate: str, aggregates: Sequence[Aggregate], after: str = "") -
             "fewest_steps": min(one.steps), "most_steps": max(one.steps),
         }  # fmt: skip
         for name in SYMBOLS:
-            value, low, high = one.middle(name)
-            record |= {name: value, f"{name}_low": low, f"{name}_high": high}
+            record |= _with_interval(name, one.middle(name))
         records.append(record)
     columns = [Column("algorithm")]
     columns += [Column(f"IQM {s}", *interval(name, 3)) for name, s in SYMBOLS.items()]
-    title = f"{title_of(slate)}, interquartile means{after}"
+    title = f"{title_of_slate(slate)}, interquartile means{after}"
     return Table(f"slate_{slate}_iqm", title, columns, records)
 
 
@@ -258,12 +275,74 @@ def improvement_table(slate: str, aggregates: Sequence[Aggregate]) -> Table:
         }  # fmt: skip
         for name in SYMBOLS:
             pair = (first, second) if name == "episode_return" else (second, first)
-            value, low, high = probability_of_improvement(*(one.strata[name] for one in pair))
-            record |= {name: value, f"{name}_low": low, f"{name}_high": high}
+            estimate = probability_of_improvement(*(one.strata[name] for one in pair))
+            record |= _with_interval(name, estimate)
         records.append(record)
     columns = [Column(name) for name in ("algorithm", "other")]
     titles = zip(SYMBOLS, ("higher", "lower", "lower"), strict=True)
     columns += [Column(f"{how} {SYMBOLS[name]}", *interval(name, 2)) for name, how in titles]
-    title = f"{title_of(slate)}, probability of improvement"
+    title = f"{title_of_slate(slate)}, probability of improvement"
     note = "Each pair once: the other way round it is one minus the number."
     return Table(f"slate_{slate}_improvement", title, columns, records, note)
+
+
+def missing_seeds(
+    slate: str, algorithm: str, experiments: Sequence[Experiment], needed: int
+) -> dict[str, tuple[int, ...]]:
+    """Environment of a slate -> seeds that an algorithm still lacks on it.
+
+    The published seeds come first, then further multiples of ten.
+    """
+    own = [e for e in experiments if e.algorithm == algorithm and can_be_normalised(e)]
+    done = {e.benchmark: {run.seed for run in e.finished} for e in own}
+    missing = {}
+    for environment in SLATES[slate]:
+        seeds = done.get(environment, set())
+        further = range(max(SEEDS) + 10, max(SEEDS) + 10 * (needed + len(seeds) + 1), 10)
+        left = [seed for seed in (*SEEDS, *further) if seed not in seeds]
+        if len(seeds) < needed:
+            missing[environment] = tuple(left[: needed - len(seeds)])
+    return missing
+
+
+def missing_runs_table(experiments: Sequence[Experiment], needed: int) -> Table:
+    """What slates lack of algorithms with runs on a third of their environments, and commands."""
+    records = []
+    afresh = [e for e in experiments if not e.is_continued]
+    for slate, environments in SLATES.items():
+        begun = [e for e in afresh if e.benchmark in environments]
+        for algorithm in dict.fromkeys(e.algorithm for e in begun):
+            own = [e for e in begun if e.algorithm == algorithm]
+            missing = missing_seeds(slate, algorithm, experiments, needed)
+            if missing and 3 * len({e.benchmark for e in own}) >= len(environments):
+                commands = "\n".join(_commands(own, missing)) or "not recorded"
+                number = sum(map(len, missing.values()))
+                words = (slate, algorithm, number, commands)
+                records.append(dict(zip(_MISSING, words, strict=True)))
+    columns = [Column(name, *([("{:d}", name)] if name == "runs" else [])) for name in _MISSING]
+    note = "Slates of which an algorithm has runs on less than a third are not listed."
+    return Table("missing", "What slates still lack", columns, records, note)
+
+
+def _commands(
+    experiments: Sequence[Experiment], missing: Mapping[str, tuple[int, ...]]
+) -> Iterator[str]:
+    """Command lines for missing runs: a sweep for every set of seeds; none if none is recorded."""
+    known = [run for e in experiments for run in e.runs if run.overrides is not None]
+    if not known:
+        return
+    run = known[0]
+    kept = [override for override in run.overrides or () if _is_of_the_algorithm(override)]
+    for seeds in dict.fromkeys(missing.values()):
+        environments = ",".join(name for name, own in missing.items() if own == seeds)
+        words = ["python", "train.py", "-m", f"env={environments}", f"algo={run.algorithm}", *kept]
+        yield shlex.join([*words, f"seed={','.join(map(str, seeds))}"])
+
+
+def _is_of_the_algorithm(override: str) -> bool:
+    """Whether it may change results: the way in which environments are stepped may, too."""
+    key = override.lstrip("+~").partition("=")[0]
+    group = key.partition(".")[0].partition("@")[0]
+    if group == "import":
+        return True
+    return group not in _CHOSEN and role_of(key) not in (Role.SEED, Role.MACHINE)

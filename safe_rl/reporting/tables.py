@@ -1,4 +1,4 @@
-"""Tables that are written as CSV, Markdown and HTML from one description."""
+"""Tables of a report: numbers for CSV, and what a reader sees as Markdown and HTML."""
 
 from __future__ import annotations
 
@@ -9,31 +9,34 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from safe_rl.reporting.cleaning import clean
-from safe_rl.runs.files import replace_csv
+from safe_rl.extras import import_extra
+from safe_rl.runs.files import replace_text
 
 __all__ = [
-    *("MISSING", "SYMBOL", "Cell", "Column", "Record", "Table", "each_cost", "escaped", "interval"),
-    *("mark_best", "power_of_ten", "span", "spread"),
+    *("MISSING", "SYMBOL", "Cell", "Column", "Record", "Table", "clean", "each_cost", "escaped"),
+    *("interval", "mark_best", "power_of_ten", "span", "spread"),
 ]
 
 MISSING = "—"
 """Shown where there is no value."""
 SYMBOL = re.compile(r"\$(\\bar )?(\\rho|\w)(?:_(\w))?\$")
 r"""A symbol in a title or a sentence, such as ``$\bar J_r$``."""
-
 Record = Mapping[str, Any]
 
 
-class Cell(NamedTuple):
-    """What a reader sees of one entry.
+def clean(text: Any, most: int = 200) -> str:
+    r"""Text as a page can show it: one line, printable, of bounded length.
 
-    Attributes:
-        title: Head of its column.
-        text: The entry.
-        mark: "best", "bad", or nothing.
-        is_number: Whether it is set flush right.
+    Examples:
+        >>> clean("a\nb\x07"), clean("x" * 10, most=4)
+        ('a b�', 'xxx…')
     """
+    shown = "".join(c if c.isprintable() else " " if c.isspace() else "�" for c in str(text))
+    return shown if len(shown) <= most else f"{shown[: most - 1]}…"
+
+
+class Cell(NamedTuple):
+    """What a reader sees of one entry; its mark is "best", "bad", or nothing."""
 
     title: str
     text: str
@@ -46,9 +49,9 @@ class Column:
 
     Args:
         title: Its head.
-        parts: A template each, and the fields that fill it, as in
-            ``("{:.1f}", "x"), (" ± {:.1f}", "x_std")``; a part is left out where one of its fields
-            is missing or NaN, the entry where the first part is. Without any: the field ``title``.
+        parts: A template each, and the fields that fill it; a part is left out where one of its
+            fields is missing or NaN, the entry where the first part is. Without any: the field
+            ``title``.
         mark: Record -> "best" (bold), "bad" (over a limit), or nothing.
 
     Examples:
@@ -96,8 +99,6 @@ def each_cost(
 ) -> Callable[[Record], Sequence[Record]]:
     """Show a record with figures of several costs as a row per cost.
 
-    A column per cost would make tables as wide as there are costs.
-
     Args:
         keys: Keys of the costs.
         fields: Field of a row -> that of the record, with braces in place of the cost's key.
@@ -120,10 +121,6 @@ def each_cost(
         return shown or [record]
 
     return rows
-
-
-def _as_it_is(record: Record) -> Sequence[Record]:
-    return [record]
 
 
 @dataclass(frozen=True)
@@ -151,7 +148,7 @@ class Table:
     columns: Sequence[Column]
     records: Sequence[Record]
     note: str = ""
-    shown_as: Callable[[Record], Sequence[Record]] = _as_it_is
+    shown_as: Callable[[Record], Sequence[Record]] = lambda record: [record]
 
     def rows(self) -> list[list[Cell]]:
         """What a reader sees."""
@@ -166,22 +163,20 @@ class Table:
         looks = {"best": "**{}**", "bad": "{} ▲", "": "{}"}
         head = [escaped(column.title) for column in self.columns]
         rule = ["---:" if column.is_number else "---" for column in self.columns]
-        rows = [
-            [looks[cell.mark].format(escaped(cell.text)) for cell in row] for row in self.rows()
-        ]
+        rows = [[looks[cell.mark].format(escaped(cell.text)) for cell in r] for r in self.rows()]
         lines = [f"| {' | '.join(row)} |" for row in (head, *rows)]
         return "\n".join([lines[0], f"|{'|'.join(rule)}|", *lines[1:]])
 
     def write_csv(self, path: Path) -> None:
         """Write the records; what is not a number becomes an empty field."""
-        names = dict.fromkeys(name for record in self.records for name in record)
-        replace_csv(path, [names, *([_field(r.get(name)) for name in names] for r in self.records)])
+        pandas = import_extra("pandas", "report")
+        rows = [{name: _field(v) for name, v in record.items()} for record in self.records]
+        frame = pandas.DataFrame(rows, dtype=object)
+        replace_text(path, frame.to_csv(index=False, lineterminator="\n"))
 
 
 def _field(value: Any) -> Any:
-    if not _is_there(value):
-        return ""
-    # a spreadsheet would take it for a formula
+    # a spreadsheet would take such a text for a formula
     return f"'{value}" if isinstance(value, str) and value[:1] in {*"=+-@"} else value
 
 
@@ -202,35 +197,30 @@ def mark_best(
     best: Callable[..., float],
     *,
     is_able: Callable[[Record], bool],
-    steps: Callable[[Record], Hashable],
+    rivals: Callable[[Record], Hashable],
 ) -> Callable[[Record], str]:
-    """Mark the best value of a column, and all equal to it, among records of equally many steps.
-
-    A record that no other one was trained as long as is not marked.
+    """Mark the best value of a column, and all equal to it, among records that are comparable.
 
     Args:
         records: Rows of the table.
         name: Field of the value.
         best: ``max`` or ``min``.
         is_able: Which of them can be the best.
-        steps: Environment steps of training of a record.
+        rivals: What is equal in records that can be compared; a record without any is not marked.
 
     Examples:
         >>> rows = [{"x": x, "steps": steps} for x, steps in ((1, 5), (2, 5), (2, 5), (9, 6))]
-        >>> mark = mark_best(rows, "x", max, is_able=lambda r: True, steps=lambda r: r["steps"])
+        >>> mark = mark_best(rows, "x", max, is_able=lambda r: True, rivals=lambda r: r["steps"])
         >>> [mark(row) for row in rows]
         ['', 'best', 'best', '']
     """
 
     def mark(record: Record) -> str:
-        rivals = [other for other in records if steps(other) == steps(record)]
-        if len(rivals) < 2 or name not in record or not is_able(record):
+        group = [other for other in records if rivals(other) == rivals(record)]
+        if len(group) < 2 or name not in record or not is_able(record):
             return ""
-        values = [other[name] for other in rivals if name in other and is_able(other)]
-        # NaN is neither above nor below, and would be the best of all if it came first
-        known = [value for value in values if not math.isnan(value)]
-        is_best = bool(known) and math.isclose(record[name], best(known), rel_tol=1e-9)
-        return "best" if is_best else ""
+        known = [r[name] for r in group if is_able(r) and _is_there(r.get(name))]
+        return "best" if known and math.isclose(record[name], best(known), rel_tol=1e-9) else ""
 
     return mark
 
