@@ -22,10 +22,8 @@ __all__ = [
 
 Settings = dict[str, Hashable]
 
-# keys in a name, and letters of a name: beyond, a name is cut off and numbered
-_MOST_KEYS, _LONGEST_NAME, _LONGEST_VALUE = 12, 240, 60
-# from how many differing keys on a name has only as many as it takes, and these
-_MANY_KEYS = 3
+# longer names are cut off and numbered; above _MANY_KEYS they have as few keys as it takes
+_MOST_KEYS, _LONGEST_NAME, _LONGEST_VALUE, _MANY_KEYS = 12, 240, 60, 3
 _ALWAYS_NAMED = ("preset", "init_from", "frames", "cost_limits", "risk")
 # of those that the paper does not name; where there is none, the file in conf/algo is its name
 _TITLES = {
@@ -95,9 +93,8 @@ class Experiment:
 def cost_keys_of(experiments: Iterable[Experiment]) -> list[str]:
     """The aggregate cost if there is one, and every cost key that an experiment limits."""
     experiments = list(experiments)
-    has_cost = any("cost_rate" in run.table for e in experiments for run in e.runs)
-    limited = [key for experiment in experiments for key in experiment.limits]
-    return list(dict.fromkeys([*(["cost"] if has_cost else []), *limited]))
+    keys = ["cost"] if any("cost_rate" in run.table for e in experiments for run in e.runs) else []
+    return list(dict.fromkeys([*keys, *(key for e in experiments for key in e.limits)]))
 
 
 class Source(NamedTuple):
@@ -110,8 +107,7 @@ class Source(NamedTuple):
 def init_sources(runs: Sequence[Run]) -> dict[Path, Source]:
     """Folder of a run -> what it started from, where that is one of the runs.
 
-    A relative path counts from where the run was started, if that is recorded. Where nothing is
-    there, as when all has been moved since, it is sought from the folders above the run upwards.
+    A relative path counts from where the run was started, or from a folder above the run.
     """
     known = {run.directory.resolve(): run for run in runs}
     sources = {}
@@ -123,12 +119,12 @@ def init_sources(runs: Sequence[Run]) -> dict[Path, Source]:
         if not any(path.exists() for path in places):
             places = [(above / folder).resolve() for above in run.directory.resolve().parents]
         first = next(filter(None, map(known.get, places)), None)
-        if first is not None:
-            newest = RunFolder(first.directory).newest_checkpoint()
-            steps = steps or (newest and checkpoint_steps(newest)) or first.steps
-            # a table that begins after the checkpoint is another run's
-            if first is not run and first.table["steps"][0] <= steps:
-                sources[run.directory] = Source(first, steps)
+        if first is None or first is run:
+            continue
+        newest = RunFolder(first.directory).newest_checkpoint()
+        steps = steps or (newest and checkpoint_steps(newest)) or first.steps
+        if first.table["steps"][0] <= steps:  # or the table is another run's
+            sources[run.directory] = Source(first, steps)
     return sources
 
 
@@ -150,7 +146,7 @@ def group_runs(
     settings = {r.directory: _settings(r, sources.get(r.directory), root) for r in runs}
     algorithms, differing = _algorithm_names(runs, environments, settings)
     without_limits = {
-        place: {k: v for k, v in own.items() if k.partition(".")[0] != "cost_limits"}
+        place: {key: value for key, value in own.items() if not key.startswith("cost_limits.")}
         for place, own in settings.items()
     }
     families, _ = _algorithm_names(runs, environments, without_limits)
@@ -161,23 +157,18 @@ def group_runs(
     experiments = []
     for names, members in cells.items():
         kept = _without_repetitions(members, skipped)
-        first = kept[0].directory
-        benchmark = suite.name_of(kept[0].config["env"])
-        further = (families[first], differing[first])
-        experiments.append(Experiment(*names, benchmark, tuple(kept), *further))
+        first, benchmark = kept[0].directory, suite.name_of(kept[0].config["env"])
+        own = (*names, benchmark, tuple(kept), families[first], differing[first])
+        experiments.append(Experiment(*own))
     return sorted(experiments, key=_order), skipped
 
 
 def _order(experiment: Experiment) -> tuple[Hashable, ...]:
     """Benchmark environments first, algorithms as in the paper, variants behind each other."""
-    benchmarks, names = list(REFERENCE), list(ALGORITHMS)
-    name = experiment.runs[0].algorithm
-    return (
-        benchmarks.index(experiment.benchmark) if experiment.benchmark in benchmarks else 99,
-        experiment.environment,
-        names.index(name) if name in names else 99,
-        experiment.algorithm,
-    )
+    benchmarks = {name: place for place, name in enumerate(REFERENCE)}
+    algorithms = {name: place for place, name in enumerate(ALGORITHMS)}
+    places = benchmarks.get(experiment.benchmark or "", 99), experiment.environment
+    return *places, algorithms.get(experiment.runs[0].algorithm, 99), experiment.algorithm
 
 
 def _without_repetitions(runs: Sequence[Run], skipped: dict[Path, str]) -> list[Run]:
@@ -238,15 +229,17 @@ def _algorithm_names(
 
 def _enough(keys: Sequence[str], members: Sequence[Settings]) -> set[str]:
     """As few of the keys as tell all apart that differ in any, where it would be many."""
+    if len(keys) <= _MANY_KEYS:
+        return set(keys)
     kept = [k for k in keys if k.partition(".")[0] in _ALWAYS_NAMED]
 
     def groups(names: Sequence[str]) -> int:
         return len({tuple(member.get(name) for name in names) for member in members})
 
-    while len(keys) > _MANY_KEYS and groups(kept) < groups(keys):
+    while groups(kept) < groups(keys):
         left = [key for key in keys if key not in kept]
         kept.append(max(left, key=lambda key: groups([*kept, key])))
-    return set(keys) if len(keys) <= _MANY_KEYS else set(kept)
+    return set(kept)
 
 
 def title_of(algorithm: str) -> str:
@@ -292,7 +285,7 @@ def _source_of_seeds(run: Run, source: Source | None, root: Path) -> str:
     return str(name) if common == "." else common
 
 
-def distinguishing_keys(cells: Iterable[Sequence[Settings]]) -> list[str]:
+def distinguishing_keys(cells: Sequence[Sequence[Settings]]) -> list[str]:
     """Keys that differ within a cell, except those whose values follow from another key.
 
     Those that follow from ``preset``, or from the ``_target_`` of the group that a key belongs to,
@@ -303,7 +296,6 @@ def distinguishing_keys(cells: Iterable[Sequence[Settings]]) -> list[str]:
         >>> distinguishing_keys([[small, large, small]])
         ['preset']
     """
-    cells = [list(cell) for cell in cells]
     keys = {key for cell in cells for settings in cell for key in settings}
     order = sorted(keys, key=lambda key: (key != "preset", key.count("."), key))
     return [key for key in order if any(not _follows(key, cell) for cell in cells)]
@@ -350,11 +342,9 @@ def _in_brackets(settings: Mapping[str, Hashable]) -> str:
 
 
 def _text(value: Hashable) -> str:
-    """A value as Hydra takes it, too."""
     if isinstance(value, bool) or value is None:
         return {True: "true", False: "false", None: "null"}[value]
     if isinstance(value, tuple):
         return f"[{','.join(map(_text, value))}]"
-    if isinstance(value, float):
-        return f"{value:g}"
-    return f"{value:_}" if isinstance(value, int) else str(value)
+    form = {float: "g", int: "_"}.get(type(value), "")
+    return f"{value:{form}}" if form else str(value)

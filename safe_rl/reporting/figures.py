@@ -133,8 +133,7 @@ def save(figure: Figure, path: Path) -> Path:
 def compared(records: Sequence[Record]) -> dict[str, list[Record]]:
     """Experiments that can be held against each other, by what stands above their panel.
 
-    They have a return and a cost on the same environment after equally many steps, and there are
-    at least two of them.
+    At least two with a return and a cost on the same environment after equally many steps.
     """
     groups: dict[tuple[str, int, int], list[Record]] = {}
     for record in records:
@@ -290,13 +289,8 @@ def draw_variations(
         True
     """
     (_, trained), *varied = rows
-    groups: dict[str, list[tuple[str, Mapping[str, Estimate]]]] = {}
-    for variation, estimates in varied:
-        single = variation.value is None
-        label = variation.row if single else f"{variation.value}"
-        groups.setdefault(_OTHERS if single else variation.row, []).append((label, estimates))
+    groups = _rows_of(varied) or {_OTHERS: [("as trained", trained)]}
     names = ["episode_return", *(f"episode_{key}" for key in cost_limits or ["cost"])]
-    groups = groups or {_OTHERS: [("as trained", trained)]}
     columns = min(len(groups), _MOST_COLUMNS)
     bands = math.ceil(len(groups) / columns)
     lines = bands * len(names)
@@ -327,6 +321,18 @@ def draw_variations(
         axis.set_visible(axis.has_data())
     figure.supxlabel("grey: as trained; dashed: the limit", fontsize="small", color="0.3")
     save(figure, path)
+
+
+def _rows_of(
+    varied: Sequence[tuple[Any, Mapping[str, Estimate]]],
+) -> dict[str, list[tuple[str, Mapping[str, Estimate]]]]:
+    """Row -> label and estimates of its values; what has a single value is in a row of all such."""
+    groups: dict[str, list[tuple[str, Mapping[str, Estimate]]]] = {}
+    for variation, estimates in varied:
+        single = variation.value is None
+        label = variation.row if single else f"{variation.value}"
+        groups.setdefault(_OTHERS if single else variation.row, []).append((label, estimates))
+    return groups
 
 
 def _draw(

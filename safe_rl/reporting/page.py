@@ -129,8 +129,7 @@ def build_report(
         suite: The benchmark.
         seeds_needed: Finished runs that a slate takes per environment.
         unfinished: Whether unfinished runs count as finished ones.
-        good: Share of a return that a good policy has, see
-            :func:`safe_rl.reporting.scoring.learning_table`.
+        good: Share of a return that a good policy has, see :func:`learning_table`.
 
     Raises:
         FileNotFoundError: If there is no run.
@@ -147,31 +146,29 @@ def build_report(
     missing = missing_runs_table(experiments, seeds_needed)
     learning = [learning_table(group, good) for group in groups]
     slates = _slates(experiments, styles, seeds_needed)
-    runs_tables = (run_table(experiments), variant_table(experiments), _left_out(skipped))
+    reasons = [{"what": clean(path), "why": clean(why, 500)} for path, why in skipped.items()]
+    left_out = Table("left_out", "Left out", [Column("what"), Column("why")], reasons)
+    runs_tables = (run_table(experiments), variant_table(experiments), left_out)
+    parts: list[tuple[str, str, Sequence[Block]]] = [
+        ("final", "Final scores", finals or ["No run is finished."]),
+        ("learning", "What learning cost", list(filter(None, learning))),
+        ("curves", "Learning curves", _curves(experiments, styles)),
+        ("fronts", "Return against cost", _fronts(records, styles)),
+        ("transfer", "Transfer", _transfers(experiments, sources, styles)),
+        ("normalised", "Normalised scores", [*slates, missing]),
+        ("dominance", "Which is better", [dominance_table(records)]),
+        ("certificates", "Certificates", [certificate_table(experiments)]),
+        ("evaluations", "Evaluations", [evaluation_table(experiments)]),
+        ("videos", "Videos", [Film(clean(c), path) for c, path in videos(experiments)]),
+        ("campaigns", "Campaigns", [t for own in campaigns.values() for t in own]),
+        ("runs", "Runs", runs_tables),
+    ]
+    # a table without a row says nothing
     sections = [
-        Section("final", "Final scores", finals or ["No run is finished."]),
-        Section("learning", "What learning cost", list(filter(None, learning))),
-        Section("curves", "Learning curves", _curves(experiments, styles)),
-        Section("fronts", "Return against cost", _fronts(records, styles)),
-        Section("transfer", "Transfer", _transfers(experiments, sources, styles)),
-        Section("normalised", "Normalised scores", [*slates, *_if_any(missing)]),
-        Section("dominance", "Which is better", _if_any(dominance_table(records))),
-        Section("certificates", "Certificates", _if_any(certificate_table(experiments))),
-        Section("evaluations", "Evaluations", _if_any(evaluation_table(experiments))),
-        Section("videos", "Videos", [Film(clean(c), path) for c, path in videos(experiments)]),
-        Section("campaigns", "Campaigns", [t for own in campaigns.values() for t in own]),
-        Section("runs", "Runs", [table for table in runs_tables if table.records]),
+        Section(name, title, [b for b in blocks if not isinstance(b, Table) or b.records])
+        for name, title, blocks in parts
     ]
     return Report(experiments, [s for s in sections if s.blocks], missing, campaigns, skipped)
-
-
-def _if_any(table: Table) -> list[Table]:
-    return [table] if table.records else []
-
-
-def _left_out(skipped: Mapping[Path, str]) -> Table:
-    records = [{"what": clean(path), "why": clean(why, 500)} for path, why in skipped.items()]
-    return Table("left_out", "Left out", [Column("what"), Column("why")], records)
 
 
 def _by_environment(experiments: Sequence[Experiment]) -> list[list[Experiment]]:
@@ -181,11 +178,9 @@ def _by_environment(experiments: Sequence[Experiment]) -> list[list[Experiment]]
 
 def _fronts(records: Sequence[Record], styles: Mapping[str, Style]) -> list[Drawing]:
     groups = compared(records)
-    if not groups:
-        return []
     panels = [f"{what}: {', '.join(r['algorithm'] for r in own)}" for what, own in groups.items()]
     says = f"Final return against final episode cost. {'; '.join(panels)}"
-    return [Drawing("fronts", "", draw_fronts(records, styles), says)]
+    return [Drawing("fronts", "", draw_fronts(records, styles), says)] if groups else []
 
 
 def _curves(experiments: Sequence[Experiment], styles: Mapping[str, Style]) -> list[Drawing]:
@@ -206,9 +201,7 @@ def _curves(experiments: Sequence[Experiment], styles: Mapping[str, Style]) -> l
 
 
 def _transfers(
-    experiments: Sequence[Experiment],
-    sources: Mapping[Path, Source],
-    styles: Mapping[str, Style],
+    experiments: Sequence[Experiment], sources: Mapping[Path, Source], styles: Mapping[str, Style]
 ) -> list[Block]:
     blocks: list[Block] = []
     for number, transfer in enumerate(find_transfers(experiments, sources), start=1):
@@ -226,7 +219,7 @@ def _slates(
         blocks.append(slate_table(name, environments, aggregates))
         for after, group in by_length(aggregates).items():
             blocks += _middles_and_profiles(name, group, after, styles)
-        blocks += _if_any(improvement_table(name, aggregates))
+        blocks.append(improvement_table(name, aggregates))
     return blocks
 
 
@@ -278,7 +271,8 @@ def write_report(report: Report, out: Path, title: str) -> Path:
         lstrip_blocks=True,
         undefined=jinja2.StrictUndefined,
     )
-    environment.filters |= {"symbols": _symbols, "words": _words, "md": _markdown}
+    environment.filters |= {"symbols": _symbols, "words": _words}
+    environment.filters["md"] = lambda text: escaped(clean(text, most=10_000))
     for name in ("report.md", "report.html"):
         text = environment.get_template(f"{name}.jinja").render(context)
         replace_text(out / name, text)
@@ -352,11 +346,5 @@ def _symbols(text: str) -> Any:
 
 def _words(text: str) -> str:
     """Symbols as plain letters, for where a page takes no markup: ``J_r``."""
-    return SYMBOL.sub(
-        lambda match: match.group().strip("$").replace(r"\bar ", "").replace(r"\rho", "ρ"),  # noqa: RUF001
-        text,
-    )
-
-
-def _markdown(text: str) -> str:
-    return escaped(clean(text, most=10_000))
+    plain = SYMBOL.sub(lambda match: match.group().strip("$").replace(r"\bar ", ""), text)
+    return plain.replace(r"\rho", "ρ")  # noqa: RUF001

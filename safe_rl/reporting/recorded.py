@@ -16,17 +16,8 @@ from typing import Any
 
 import numpy as np
 
-from safe_rl.reporting.archive import (
-    ROWS,
-    RUNS,
-    Recorded,
-    read_archive,
-    read_certificate,
-    read_code,
-    read_evaluation,
-    without_places,
-    write_archive,
-)
+from safe_rl.reporting import archive as archives
+from safe_rl.reporting.archive import Recorded, read_certificate, read_code, read_evaluation
 from safe_rl.reporting.tables import clean
 from safe_rl.runs.files import read_config, read_json, read_yaml
 from safe_rl.runs.folder import RunFolder, paths_below, runs_below
@@ -116,8 +107,7 @@ class Run:
     @property
     def init_from(self) -> Path | None:
         """The run or checkpoint whose networks it started from, as its command line named it."""
-        source = self.config.get("init_from")
-        return None if source is None else Path(source)
+        return Path(self.config["init_from"]) if self.config.get("init_from") is not None else None
 
     def column(self, name: str) -> np.ndarray:
         """A column in the epochs in which an episode finished, shape [epochs]; NaN without one."""
@@ -158,11 +148,11 @@ def find_runs(root: Path, *, unfinished: bool = False) -> tuple[list[Run], dict[
     runs: list[Run] = []
     skipped: dict[Path, str] = {}
     resolved = root.resolve()
-    for archive in paths_below(root, RUNS):
+    for archive in paths_below(root, archives.RUNS):
         with _noted(archive, skipped):
-            for path in (archive, archive.with_name(ROWS)):
+            for path in (archive, archive.with_name(archives.ROWS)):
                 _own(path, resolved)
-            for name, recorded in read_archive(archive.parent).items():
+            for name, recorded in archives.read_archive(archive.parent).items():
                 directory = archive.parent / name
                 with _noted(directory, skipped):
                     runs.append(_run(directory, recorded, unfinished))
@@ -198,12 +188,12 @@ def archive_runs(runs: Iterable[Run], root: Path, archive: Path) -> None:
     here, there = root.resolve(), archive.resolve()
     if here.is_relative_to(there) or there.is_relative_to(here):
         raise ValueError(f"archive={archive}: it takes a folder beside {root}, not one within.")
-    kept = read_archive(archive) if (archive / RUNS).exists() else {}
+    kept = archives.read_archive(archive) if (archive / archives.RUNS).exists() else {}
     for run in runs:
         if run.recorded is not None:
             name = run.directory.resolve().relative_to(here).as_posix()
-            kept[name] = run.recorded._replace(notes=without_places(run.recorded.notes))
-    write_archive(kept, archive)
+            kept[name] = run.recorded._replace(notes=archives.without_places(run.recorded.notes))
+    archives.write_archive(kept, archive)
 
 
 @contextmanager
@@ -287,12 +277,12 @@ def _run(directory: Path, recorded: Recorded, unfinished: bool) -> Run:
 
 def _films(run: RunFolder) -> list[Path]:
     """Videos in a run's folder: neither those of runs below it, nor what a killed one has left."""
-
-    def is_own(path: Path) -> bool:
-        nearest = next(folder for folder in path.parents if RunFolder(folder).is_run)
-        return nearest == run.directory and not path.name.startswith(".")
-
-    return list(filter(is_own, paths_below(run.directory, "*.mp4")))
+    return [
+        path
+        for path in paths_below(run.directory, "*.mp4")
+        if next(above for above in path.parents if RunFolder(above).is_run) == run.directory
+        and not path.name.startswith(".")
+    ]
 
 
 def _own(path: Path, root: Path) -> Path:
@@ -331,9 +321,9 @@ def _checked(table: Mapping[str, list[float]], limits: Mapping[str, Any]) -> dic
         raise ValueError("it has not finished an epoch")
     needed = ["episode_return", "time_total"]
     needed += [name for key in limits for name in (f"episode_{key}", f"{key}_rate")]
-    missing = [name for name in needed if name not in table]
-    if missing:
-        raise ValueError(f"progress.csv has no column {missing[0]}")
+    for name in needed:
+        if name not in table:
+            raise ValueError(f"progress.csv has no column {name}")
     bounded = {
         name: [value if abs(value) < _EXPLODED else math.nan for value in values]
         for name, values in table.items()
@@ -346,13 +336,11 @@ def _checked(table: Mapping[str, list[float]], limits: Mapping[str, Any]) -> dic
 
 def _command(overrides: Sequence[str], notes: Mapping[str, Any], config: Mapping[str, Any]) -> str:
     """The command line, with what it did not say in its overrides."""
-    words = ["python", "train.py"]
-    words += [f"--config-dir={clean(path)}" for path in notes.get("config_dirs", ())]
-    # a run that was continued for longer
-    if isinstance(notes.get("frames_before"), int):
-        frames = f"frames={config['frames']}"
-        overrides = [o for o in overrides if not o.startswith("frames=")] + [frames]
-    return shlex.join([*words, *overrides])
+    if isinstance(notes.get("frames_before"), int):  # it was continued for longer
+        kept = [override for override in overrides if not override.startswith("frames=")]
+        overrides = [*kept, f"frames={config['frames']}"]
+    folders = [f"--config-dir={clean(path)}" for path in notes.get("config_dirs", ())]
+    return shlex.join(["python", "train.py", *folders, *overrides])
 
 
 def _select(node: Any, *keys: str) -> Any:

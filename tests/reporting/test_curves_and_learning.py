@@ -4,10 +4,9 @@ import csv
 
 import numpy as np
 import pytest
-from synthetic import SUITE, experiments_in, write_run
+from synthetic import experiments_in, write_run
 
 from safe_rl.reporting.curves import average
-from safe_rl.reporting.page import build_report
 from safe_rl.reporting.recorded import find_runs
 from safe_rl.reporting.scoring import (
     final_record,
@@ -15,7 +14,6 @@ from safe_rl.reporting.scoring import (
 )
 from safe_rl.reporting.slates import (
     aggregate,
-    by_length,
     improvement_table,
 )
 from safe_rl.reporting.tables import Column, Table, spread
@@ -170,26 +168,6 @@ def test_improvement_is_a_probability_per_score(tmp_path):
     # each pair once; the cost rates are equal
     assert found == {"PPO": (1.0, 0.0)}
     assert {r["cost_rate"] for r in table.records} == {0.5}
-
-
-def test_what_was_trained_for_longer_is_compared_apart(tmp_path):
-    for algo, epochs in (("ppo", 1), ("cpo", 1), ("trpo", 30), ("mine", 30)):
-        for seed in (0, 10):
-            rows = {name: [value + seed] * epochs for name, value in
-                    (("returns", 3.0), ("costs", 20.0), ("rates", 0.1))}  # fmt: skip
-            write_run(tmp_path, algo=algo, seed=seed, **rows)
-    everything = [aggregate([e]) for e in experiments_in(tmp_path)]
-    groups = {after: [a.algorithm for a in own] for after, own in by_length(everything).items()}
-    assert groups == {", 1,000 steps": ["PPO", "CPO"], ", 30,000 steps": ["TRPO", "mine"]}
-    assert list(by_length(everything[:1])) == [""]
-    pairs = [(r["algorithm"], r["other"]) for r in improvement_table("x", everything).records]
-    assert pairs == [("PPO", "CPO"), ("TRPO", "mine")]
-    report = build_report(tmp_path, SUITE, seeds_needed=2, unfinished=False)
-    shown = {b.shows for s in report.sections for b in s.blocks if hasattr(b, "shows")}
-    for steps, names in (("1,000", "PPO, CPO"), ("30,000", "TRPO, mine")):
-        whole = f"What all algorithms were trained on, {steps} steps, {names}"
-        assert f"Share of runs above every score: {whole}" in shown
-    assert any("PointGoal1, 1,000 steps: PPO, CPO; PointGoal1, 30,000" in says for says in shown)
 
 
 def test_steps_beyond_the_end_of_training_are_no_longer_training(tmp_path):

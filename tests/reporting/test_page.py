@@ -13,7 +13,7 @@ from matplotlib.image import imread
 from synthetic import experiments_in, write_run
 
 from safe_rl.cli.report import main
-from safe_rl.reporting.inventory import duration, evaluation_table, videos
+from safe_rl.reporting.inventory import evaluation_table, videos
 from safe_rl.runs.folder import RunFolder
 
 CHROMIUM = next(
@@ -157,12 +157,6 @@ def test_the_page_is_for_everybody(report):
         assert query in css
 
 
-def test_the_page_explains_its_words(report):
-    words = " ".join(Page(report / "report.html").words)
-    assert "A slate is a set of environments" in words
-    assert "Regret: cost per episode above the limit" in words
-
-
 def test_an_evaluation_shows_every_limit(tmp_path):
     limits = {"cost_hazards": 5.0, "cost_vases": 30.0}
     columns = {"episode_cost_hazards": [4.0], "cost_hazards_rate": [0.1], "violation_cost": [-9.0]}
@@ -227,10 +221,6 @@ def test_an_evaluation_is_not_judged_by_the_mean_if_training_was_not(tmp_path):
     (directory / "evaluation.json").write_text(json.dumps({**EVALUATION, "estimates": estimates}))
     table = evaluation_table(experiments_in(tmp_path))
     assert "bad" not in [cell.mark for cell in table.rows()[0]]
-
-
-def test_times_are_in_minutes_or_hours():
-    assert [duration(hours) for hours in (0.0, 0.21, 2.5)] == ["0 min", "13 min", "2.5 h"]
 
 
 def test_the_page_holds_everything_itself(report):
@@ -346,15 +336,6 @@ def test_a_browser_shows_the_page(report, tmp_path, width):
     # nothing sticks out of the window, nor a table out of its box
     assert facts["page"] <= facts["window"]
     assert all(table <= box for table, box in facts["tables"])
-
-
-@pytest.mark.skipif(CHROMIUM is None, reason="Chromium is not installed")
-def test_long_words_stay_on_their_cards(tmp_path):
-    for folder in ("first", "second"):  # why one is left out names the other
-        write_run(tmp_path, folder=f"{folder}_{'x' * 120}", **ROWS, costs=(30.0, 20.0, 20.0))
-    assert main([str(tmp_path)]) == 0
-    facts = facts_in_a_browser(tmp_path / "report", tmp_path, 500)
-    assert facts["entries"] <= facts["window"]
 
 
 @pytest.mark.skipif(CHROMIUM is None, reason="Chromium is not installed")

@@ -132,17 +132,6 @@ def test_a_limit_has_one_mark_in_all_panels(tmp_path):
     assert marks[0]["limit 25"] == marks[1]["limit 25"] != marks[1]["limit 10"]
 
 
-def test_fronts_have_the_lines_that_tell_equal_colours_apart(tmp_path):
-    for number in range(9):
-        write_run(tmp_path, algo=f"mine{number}")
-    experiments = experiments_in(tmp_path)
-    styles = algorithm_styles(experiments)
-    figure = draw_fronts(final_table(experiments).records, styles)
-    lines = {line.get_label(): line.get_linestyle() for line in figure.axes[0].lines}
-    assert {lines[name] for name in styles} == {style.line for style in styles.values()}
-    assert len({style.line for style in styles.values()}) == 2
-
-
 def test_fronts_join_nothing_that_was_trained_for_longer(tmp_path):
     for algo, epochs in (("ppo", 1), ("cpo", 1), ("trpo", 3), ("ppo_lagrangian", 3), ("mine", 9)):
         rows = {name: [1.0] * epochs for name in ("returns", "costs", "rates")}

@@ -133,16 +133,6 @@ def test_variants_are_told_apart_by_what_differs(tmp_path):
     ]
 
 
-def test_seeds_that_start_from_seeds_are_one_experiment(tmp_path):
-    for seed in (0, 10):
-        write_run(tmp_path, "PointGoal2", "cpo", seed, init_from=f"runs/PointGoal1/cpo/seed{seed}")
-        write_run(tmp_path, "PointGoal2", "cpo", seed, init_from=None, folder=f"afresh{seed}")
-    assert names(grouped(tmp_path)[0]) == [
-        ("PointGoal2", "CPO", [0, 10]),
-        ("PointGoal2", "CPO (init_from=runs/PointGoal1/cpo)", [0, 10]),
-    ]
-
-
 def test_seeds_that_start_from_checkpoints_of_seeds_are_one_experiment(tmp_path):
     for seed in (0, 10):
         for kind, steps in (("best", 1000 + seed), ("last", 3000), ("last", 4000)):

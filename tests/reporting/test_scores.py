@@ -95,20 +95,6 @@ def test_the_best_is_sought_among_those_that_keep_their_limits(tmp_path):
     assert marks(table, r"$\rho_c$") == ["", "best", "", ""]
 
 
-def test_the_best_is_sought_among_runs_of_equal_steps_and_may_be_several(tmp_path):
-    for algo, value, epochs in (("a", 9.0, 1), ("b", 5.0, 2), ("c", 5.0, 2), ("d", 4.0, 2)):
-        write_run(tmp_path, algo=algo, returns=[value] * epochs, costs=[1.0] * epochs,
-                  rates=[1 / value] * epochs)  # fmt: skip
-    experiments = experiments_in(tmp_path)
-    table = final_table(experiments)
-    # the first one has the highest return, after fewer steps than any other
-    assert marks(table, "$J_r$") == ["", "best", "best", ""]
-    assert marks(table, r"$\rho_c$") == ["", "best", "best", ""]
-    slate = slate_table("SG6", SLATES["SG6"], [aggregate([e]) for e in experiments])
-    assert marks(slate, r"$\bar J_r$") == ["", "best", "best", ""]
-    assert marks(slate, r"$\bar \rho_c$") == ["", "best", "best", ""]
-
-
 def test_only_what_was_trained_for_equally_many_steps_is_ranked(tmp_path):
     write_run(tmp_path, algo="a", costs=[1.0])
     write_run(tmp_path, algo="b", returns=[1, 1], costs=[90, 90], rates=[1, 1])
@@ -252,17 +238,6 @@ def test_a_complete_slate_is_averaged_over_environments_and_seeds(tmp_path):
     assert "worse than any that does not after equally many steps: CPO" in table.note
     (row,) = middle_table("SG6", [result]).rows()
     assert row[1].text.startswith("0.700 [0.")
-
-
-def test_unequal_numbers_of_seeds_weigh_environments_equally(tmp_path):
-    half, double = ((0.5, REFERENCE["PointGoal1"]), (2.0, REFERENCE["CarGoal1"]))
-    for env, seeds, (factor, reference) in (
-        ("PointGoal1", (0,), half),
-        ("CarGoal1", (0, 1, 2), double),
-    ):
-        for seed in seeds:
-            write_run(tmp_path, env, "ppo", seed, returns=[factor * reference.episode_return])
-    assert aggregate(experiments_in(tmp_path)).mean.episode_return == pytest.approx(1.25)
 
 
 def test_an_incomplete_slate_says_which_runs_it_lacks(tmp_path):

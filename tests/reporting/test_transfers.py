@@ -167,15 +167,6 @@ def test_some_first_runs_that_are_gone(tmp_path):
     assert [run.seed for run in transfer.second.runs] == [0, 10]
 
 
-def test_seeds_that_start_from_one_run_are_one_sample_of_it(tmp_path):
-    first = write_first(tmp_path)
-    for seed in (0, 10):
-        write_second(tmp_path, first, seed)
-    transfer, _ = only_transfer_in(tmp_path)
-    assert [run.directory for run in transfer.first[0].runs] == [first]
-    assert len(transfer.second.runs) == 2
-
-
 def test_a_second_phase_of_one_epoch_is_a_whole_point(tmp_path):
     second = {"returns": (1.0,), "costs": (50.0,), "rates": (0.09,)}
     write_second(tmp_path, write_first(tmp_path), **second)
