@@ -72,23 +72,22 @@ FLOORS = {
         # The velocity family: rows, configurations, then functions over tensors, the environment.
         ("physics.runge_kutta", "velocity.runners"),
         ("velocity.velocity_config",),
-        ("velocity.episode_starts", "velocity.locomotion"),
+        ("velocity.locomotion",),
         ("velocity.runner_model",),
         ("velocity.runner_pictures",),
         ("velocity.velocity_env",),
         ("velocity",),
-        # Environments of other libraries, with what their nodes have in common.
-        ("foreign",),
+        # The table of families, and environments of other libraries.
+        ("families",),
         ("gymnasium.env_wrappers", "gymnasium.worker_processes", "gymnasium.world_arrays"),
         ("gymnasium.gymnasium_env", "gymnasium.gymnasium_interfaces"),
         ("gymnasium.conversion",),
         ("gymnasium.six_values",),
         ("gymnasium",),
-        ("torchrl.step_costs", "torchrl.torchrl_batches"),
+        ("torchrl.step_costs",),
         ("torchrl.observed_entries",),
         ("torchrl.torchrl_env",),
         ("torchrl",),
-        ("families",),
         # What changes any of them from outside.
         ("transforms.base",),
         ("transforms.action_transforms", "transforms.observation_transforms"),

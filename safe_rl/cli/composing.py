@@ -28,7 +28,7 @@ from safe_rl.cli.suggestions import (
     unread_by,
 )
 from safe_rl.envs import store_configs
-from safe_rl.envs.foreign import hint_of_gymnasium
+from safe_rl.envs.families import hint_of_gymnasium
 from safe_rl.naming import did_you_mean
 
 __all__ = [

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import Any
 
 from safe_rl.naming import did_you_mean as nearest
@@ -10,9 +9,7 @@ from safe_rl.naming import did_you_mean as nearest
 __all__ = [
     "ConfigError",
     "nearest",
-    "require_boolean",
     "require_integer",
-    "require_mapping",
     "require_names",
 ]
 
@@ -25,37 +22,17 @@ def require_integer(name: str, value: Any, lowest: int, highest: int = 2**63 - 1
     """Check an argument that counts or seeds.
 
     Raises:
-        ConfigError: if it is no integer between the bounds.
+        ConfigError: If it is no integer between the bounds.
     """
     if isinstance(value, bool) or not isinstance(value, int) or not lowest <= value <= highest:
         raise ConfigError(f"'{name}' must be an integer of at least {lowest}, got {value!r}.")
-
-
-def require_boolean(name: str, value: Any) -> None:
-    """Check a switch.
-
-    Raises:
-        ConfigError: if it is neither True nor False.
-    """
-    if not isinstance(value, bool):
-        raise ConfigError(f"'{name}' must be true or false, got {value!r}.")
-
-
-def require_mapping(name: str, value: Any) -> None:
-    """Check arguments by name, which may be None.
-
-    Raises:
-        ConfigError: if it is no mapping.
-    """
-    if value is not None and not isinstance(value, Mapping):
-        raise ConfigError(f"'{name}' must be arguments by name, '{{name: value}}'; got {value!r}.")
 
 
 def require_names(name: str, value: Any) -> None:
     """Check a list of names, which may be None.
 
     Raises:
-        ConfigError: if it is no list, or something in it no name; one name alone is none either.
+        ConfigError: If it is no list, or something in it no name; one name alone is none either.
     """
     is_list = isinstance(value, list | tuple) and all(isinstance(item, str) for item in value)
     if value is not None and not is_list:

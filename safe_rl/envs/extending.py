@@ -79,12 +79,12 @@ def register_element(element: Element, keys: Mapping[str, Any] | None = None) ->
     the built-in kinds.
 
     Args:
-        element: the row.
-        keys: further keys with their defaults, and other defaults of the keys above. A default that
+        element: The row.
+        keys: Further keys with their defaults, and other defaults of the keys above. A default that
             does not tell its type (None, an empty tuple) is given as `Key(default, annotation)`.
 
     Raises:
-        ConfigError: if the kind, its label or a key is taken, or a default cannot be used.
+        ConfigError: If the kind, its label or a key is taken, or a default cannot be used.
 
     Examples:
         >>> puddle = Element(
@@ -122,12 +122,12 @@ def register_task(name: str, task: Task, keys: Mapping[str, Any] | None = None) 
     """Add a task.
 
     Args:
-        name: value of the configuration key `task`.
-        task: the row.
-        keys: its configuration keys with their defaults.
+        name: Value of the configuration key `task`.
+        task: The row.
+        keys: Its configuration keys with their defaults.
 
     Raises:
-        ConfigError: if the name or a key is taken, or the row names unknown elements.
+        ConfigError: If the name or a key is taken, or the row names unknown elements.
 
     Examples:
         >>> away = Task(lambda c, w, before, now: c.reward_away * w.robot_vel[:, 0].abs())
@@ -147,11 +147,11 @@ def register_cost(cost: Cost, keys: Mapping[str, Any] | None = None) -> None:
     """Add a cost key.
 
     Args:
-        cost: the row; its key starts with "cost_".
-        keys: its configuration keys with their defaults.
+        cost: The row; its key starts with "cost_".
+        keys: Its configuration keys with their defaults.
 
     Raises:
-        ConfigError: if the key is taken or badly named, or the row names unknown elements.
+        ConfigError: If the key is taken or badly named, or the row names unknown elements.
 
     Examples:
         >>> speeding = Cost(
@@ -174,11 +174,11 @@ def register_observation(reading: Reading, keys: Mapping[str, Any] | None = None
     """Add a component of the observation.
 
     Args:
-        reading: the row.
-        keys: its configuration keys with their defaults.
+        reading: The row.
+        keys: Its configuration keys with their defaults.
 
     Raises:
-        ConfigError: if the name or a key is taken, or the row names unknown elements.
+        ConfigError: If the name or a key is taken, or the row names unknown elements.
 
     Examples:
         >>> height = Reading(
@@ -200,7 +200,7 @@ def register_robot(name: str, path: str | Path) -> None:
     """Give an MJCF file a name that `robot_base` accepts.
 
     Raises:
-        ConfigError: if the name is taken, or the file lacks what `robots` asks for.
+        ConfigError: If the name is taken, or the file lacks what `robots` asks for.
     """
     _refuse_taken("robot", name)
     load_robot(str(path))

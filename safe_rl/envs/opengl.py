@@ -48,12 +48,12 @@ def open_renderer(model: mujoco.MjModel, width: int, height: int) -> mujoco.Rend
     The backend is the one that MUJOCO_GL names, or EGL where there is neither that nor a screen.
 
     Args:
-        model: what is drawn; its offscreen buffer is set to the size.
-        width: of the pictures [pixels].
-        height: of the pictures [pixels].
+        model: What is drawn; its offscreen buffer is set to the size.
+        width: Of the pictures [pixels].
+        height: Of the pictures [pixels].
 
     Raises:
-        OpenGLError: if OpenGL is missing or cannot be started.
+        OpenGLError: If OpenGL is missing or cannot be started.
     """
     model.vis.global_.offwidth, model.vis.global_.offheight = width, height
     try:

@@ -79,13 +79,13 @@ def store_config(name: str, config: Mapping[str, Any] | SafetyGymConfig) -> None
     """Give a configuration a name, by which `env=<name>` and `make_env(name)` find it.
 
     Args:
-        name: of the environment.
-        config: a configuration of Safety Gym, whole or what differs from the defaults, or a node
+        name: Of the environment.
+        config: A configuration of Safety Gym, whole or what differs from the defaults, or a node
             with the `_target_` of another family; code that names one is trusted with its module,
             as `import=` is.
 
     Raises:
-        ConfigError: for an unknown key, or a value that cannot be used.
+        ConfigError: For an unknown key, or a value that cannot be used.
 
     Examples:
         >>> from safe_rl.envs import make_env

@@ -44,8 +44,8 @@ def fold(key: Tensor, *counters: Tensor | int) -> Tensor:
     """Hash `key` with counters, one after the other, into new keys.
 
     Args:
-        key: int64 of any shape.
-        counters: integers or int64 tensors that broadcast with `key`.
+        key: Int64 of any shape.
+        counters: Integers or int64 tensors that broadcast with `key`.
 
     Returns:
         int64 keys of the broadcast shape, uniform over all 64-bit values.

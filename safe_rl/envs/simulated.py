@@ -26,9 +26,9 @@ class SimulatedEnv(ConstrainedEnv):
     read and written.
 
     Args:
-        num_envs: number of worlds, N.
-        device: where the TensorDicts live; the physics runs on the CPU.
-        num_threads: threads that step the physics; 0 for one per core.
+        num_envs: Number of worlds, N.
+        device: Where the TensorDicts live; the physics runs on the CPU.
+        num_threads: Threads that step the physics; 0 for one per core.
     """
 
     #: Flags that are written beside the numbers, all of them False after a reset.
@@ -64,10 +64,10 @@ class SimulatedEnv(ConstrainedEnv):
         """Say what is read and written, and take the first seed, when everything else is built.
 
         Args:
-            model: whose actuators are controlled.
-            observation: spec of what is observed in N worlds.
-            highest: the most that a step can cost.
-            seed: of the environment; None takes one from torch's generator.
+            model: Whose actuators are controlled.
+            observation: Spec of what is observed in N worlds.
+            highest: The most that a step can cost.
+            seed: Of the environment; None takes one from torch's generator.
         """
         physics = self._physics
         self._episode = torch.zeros(self.batch_size, dtype=torch.int64, device=physics.device)
@@ -208,8 +208,8 @@ class SimulatedEnv(ConstrainedEnv):
             What a reset returns, for that state.
 
         Raises:
-            KeyError: if a key is missing.
-            ValueError: if a shape, a type or a value does not fit.
+            KeyError: If a key is missing.
+            ValueError: If a shape, a type or a value does not fit.
         """
         self._write_state(state)
         self._row_seed = state.get("seed", self._row_seed).clone()
@@ -244,17 +244,17 @@ class SimulatedEnv(ConstrainedEnv):
         """Draw worlds as they are, with a red sphere where a cost is incurred.
 
         Args:
-            rows: which worlds; None is all of them.
-            camera: one of those that the class names, or a `mujoco.MjvCamera`; None is the first.
-            width: of a frame [pixels].
-            height: of a frame [pixels].
+            rows: Which worlds; None is all of them.
+            camera: One of those that the class names, or a `mujoco.MjvCamera`; None is the first.
+            width: Of a frame [pixels].
+            height: Of a frame [pixels].
 
         Returns:
             RGB, uint8: one frame [height, width, 3] for an integer, else [R, height, width, 3].
 
         Raises:
-            OpenGLError: if OpenGL is missing; the message names the package to install.
-            ValueError: for an unknown camera.
+            OpenGLError: If OpenGL is missing; the message names the package to install.
+            ValueError: For an unknown camera.
         """
         everyone = range(self.batch_size[0])
         chosen = [rows] if isinstance(rows, int) else list(everyone if rows is None else rows)

@@ -5,6 +5,7 @@ import os
 import signal
 import subprocess
 from functools import partial
+from itertools import product
 from pathlib import Path
 
 import gymnasium
@@ -78,55 +79,33 @@ def test_it_is_reported_and_starts_others(run, tmp_path):
     assert "Walk-v0" in (folder.parent / "report" / "report.md").read_text()
 
 
-def test_it_is_swept(tmp_path, capsys):
-    sweep = ("-m", "seed=0,1", f"hydra.sweep.dir={tmp_path}", "hydra/launcher=basic")
-    run_train(*sweep, *SMALL, "frames=200")
-    run_train(*sweep, *SMALL, "frames=200")
-    assert capsys.readouterr().out.count("has its 200 frames already") == 2
-    tables = sorted(tmp_path.glob("Walk-v0/**/progress.csv"))
-    assert [read_table(path)["steps"] for path in tables] == [[200]] * 2
-    returns = [read_table(path)["episode_return"] for path in tables]
-    assert returns[0] != returns[1]
-
-
-def test_processes_step_what_one_process_would():
+def test_processes_step_what_one_process_would_and_ignore_signals():
+    """Ctrl-C and what ends a cluster's job reach all; the first one ends its epoch with them."""
     inline, shared = (
         make_env({**NODE, "workers": workers, "kwargs": {"border": 1.5}}, num_envs=5, seed=3)
         for workers in (0, 2)
     )
+    processes = [process for process, _ in shared.base_env._env._workers]
+    for process, name in product(processes, ("INT", "TERM")):
+        subprocess.run(["kill", f"-{name}", str(process.pid)], check=True)
     rollouts = []
     for env in (inline, shared):
         torch.manual_seed(0)
         rollouts.append(env.rollout(40, break_when_any_done=False))
-        env.close()
     assert rollouts[0]["next", "terminated"].sum() > 5
     for key in ("observation", "reward", "cost", "fast", "far", "done", "terminated"):
-        torch.testing.assert_close(
-            rollouts[1]["next", key], rollouts[0]["next", key], rtol=0, atol=0
-        )
+        assert torch.equal(rollouts[1]["next", key], rollouts[0]["next", key])
     step = rollouts[0]["next"]
     torch.testing.assert_close(step["cost"], step["fast"] + step["far"])
+    os.kill(processes[1].pid, signal.SIGKILL)
+    processes[1].join(300)
+    with pytest.raises(RuntimeError, match=r"died \(exit code -9\)"):
+        shared.rollout(2)
 
 
 def test_what_fails_in_a_process_is_told():
     with pytest.raises(RuntimeError, match="the line is broken"):
         make_env({**NODE, "workers": 1, "kwargs": {"broken": True}}, seed=0).rollout(2)
-    env = make_env({**NODE, "workers": 2}, num_envs=2, seed=0)
-    process = env.base_env._env._workers[1][0]
-    os.kill(process.pid, signal.SIGKILL)
-    process.join(300)
-    with pytest.raises(RuntimeError, match=r"died \(exit code -9\)"):
-        env.rollout(2)
-
-
-def test_signals_pass_over_processes_of_environments():
-    """Ctrl-C and what ends a cluster's job reach all; the first one ends its epoch with them."""
-    env = make_env({**NODE, "workers": 2}, num_envs=2, seed=0)
-    for process, _ in env.base_env._env._workers:
-        for name in ("INT", "TERM"):
-            subprocess.run(["kill", f"-{name}", str(process.pid)], check=True)
-    assert env.rollout(2).shape == (2, 2)
-    env.close()
 
 
 def starts(seed: int, num_envs: int = 4) -> list[float]:
@@ -226,18 +205,18 @@ def test_registered_arguments_and_limits_are_kept():
     assert make_env({**NODE, "num_steps": 2}, seed=0).rollout(10).shape == (1, 2)
 
 
-def test_costs_of_ranges_are_bounded_in_the_spec():
-    node = {"id": "CartPole-v1", "num_steps": 10, "outside": {"cost_a": [0, -1, 1]}}
-    env = make_env({"_target_": "safe_rl.envs.gymnasium.make_gymnasium"} | node, num_envs=2, seed=0)
-    assert [env.full_reward_spec[key].high.max().item() for key in env.cost_keys] == [1.0, 1.0]
-    node["outside"] |= {"cost_b": [2, -0.1, 0.1]}
-    env = make_env({"_target_": "safe_rl.envs.gymnasium.make_gymnasium"} | node, num_envs=2, seed=0)
-    assert [env.full_reward_spec[key].high.max().item() for key in env.cost_keys] == [2.0, 1.0, 1.0]
-    check_env_specs(env)
-
-
-def test_costs_that_are_reported_and_costs_of_ranges_stand_together():
-    outside = {"cost_far": [0, -1, 1]}
-    node = {"_target_": "safe_rl.envs.gymnasium.make_gymnasium", "id": "CartPole-v1"}
-    node |= {"num_steps": 10, "cost_keys": ["cost_told"], "outside": outside}
-    assert make_env(node, num_envs=2, seed=0).cost_keys == ["cost", "cost_told", "cost_far"]
+@pytest.mark.parametrize(
+    ("outside", "reported", "bounds"),
+    [
+        ({"cost_a": [0, -1, 1]}, None, [1.0, 1.0]),
+        ({"cost_a": [0, -1, 1], "cost_b": [2, -0.1, 0.1]}, None, [2.0, 1.0, 1.0]),
+        ({"cost_a": [0, -1, 1]}, ["cost_told"], None),
+    ],
+)
+def test_costs_of_ranges_are_bounded_in_the_spec_and_stand_beside_others(outside, reported, bounds):
+    node = {**NODE, "id": "CartPole-v1", "num_steps": 10, "outside": outside}
+    env = make_env(node | {"cost_keys": reported}, num_envs=2, seed=0)
+    assert env.cost_keys == ["cost", *(reported or []), *outside]
+    if bounds:
+        assert [env.full_reward_spec[k].high.max().item() for k in env.cost_keys] == bounds
+        check_env_specs(env)

@@ -5,12 +5,9 @@ import numpy as np
 import pytest
 import torch
 from gymnasium.utils.env_checker import check_env
-from tensordict import TensorDict
 
-from safe_rl.collectors import make_process_collector
 from safe_rl.envs import ConfigError, make_env
 from safe_rl.envs.velocity import VELOCITY_SUITE
-from safe_rl.models import BehaviourPolicy, make_actor
 
 
 @pytest.mark.parametrize("name", VELOCITY_SUITE)
@@ -56,26 +53,13 @@ def test_wrong_arguments_are_refused():
         gymnasium.make("SafeHopperVelocity-v0", render_mode="ansi", disable_env_checker=True)
 
 
-def test_processes_collect_it():
-    """Rows go on from the states that one process would have begun with."""
-    env = make_env("SafeHopperVelocity", num_envs=4, seed=0)
-    size = env.observation_spec["observation"].shape[-1]
-    policy = BehaviourPolicy(make_actor(size, 3, hidden_sizes=[8], initial_log_std=-0.5))
-
-    def make(*, num_envs):
-        return make_env("SafeHopperVelocity", num_envs=num_envs, seed=0)
-
-    expected = make(num_envs=4)
-    expected.reset()  # the collector's first reset follows the one that the rows are shared out at
-    expected = expected.reset()["observation"]
-    collector = make_process_collector(
-        env, make, policy, frames_per_batch=40, num_collectors=2, device="cpu"
-    )
-    try:
-        batch = next(iter(collector))
-    finally:
-        collector.shutdown()
-    assert batch.shape == (4, 10)
-    torch.testing.assert_close(batch["observation"][:, 0], expected)
-    step = TensorDict({"action": batch["action"][:, 0]}, [4])
-    assert step["action"].std() > 0.1
+def test_a_batch_in_gymnasiums_vector_interface():
+    envs = gymnasium.make_vec("SafeHopperVelocity-v0", num_envs=3, config={"num_steps": 5})
+    single = gymnasium.make("SafeHopperVelocity-v0", config={"num_steps": 5})
+    observation, _ = envs.reset(seed=[7, 4, 7])
+    assert np.array_equal(observation[1], single.reset(seed=4)[0])
+    assert np.array_equal(observation[0], observation[2])
+    for _ in range(5):
+        *_, truncated, infos = envs.step(np.zeros((3, 3), np.float32))
+    assert truncated.all()
+    assert infos["cost_velocity"].shape == (3,)

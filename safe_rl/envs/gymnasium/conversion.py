@@ -15,7 +15,7 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv, VectorEnv
 
 from safe_rl.envs.costs import CostRange, is_cost, parse_columns
 from safe_rl.envs.errors import ConfigError, nearest, require_integer, require_names
-from safe_rl.envs.foreign import GYMNASIUM, ForeignFamily, complete_foreign
+from safe_rl.envs.families import GYMNASIUM, ForeignFamily, complete_foreign
 from safe_rl.envs.gymnasium.env_wrappers import CostsOutside, adapt, make_adapted
 from safe_rl.envs.gymnasium.gymnasium_env import GymnasiumEnv, from_vector
 from safe_rl.envs.gymnasium.worker_processes import ProcessVectorEnv
@@ -49,19 +49,19 @@ def from_gymnasium(
 
     Args:
         env: Gymnasium id, or a function that makes an environment.
-        num_envs: number of environments, N.
-        cost_keys: names of the costs in `info`; None finds those called `cost` or `cost_<kind>` by
+        num_envs: Number of environments, N.
+        cost_keys: Names of the costs in `info`; None finds those called `cost` or `cost_<kind>` by
             taking one step.
-        num_steps: the largest number of steps of an episode; None takes what the id says.
-        seed: of all environments; row k has this one plus k.
-        workers: processes that step them; 0 steps them here, one after the other, as is done in a
+        num_steps: The largest number of steps of an episode; None takes what the id says.
+        seed: Of all environments; row k has this one plus k.
+        workers: Processes that step them; 0 steps them here, one after the other, as is done in a
             process that is itself a worker.
-        device: where the TensorDicts live.
-        flatten: make one vector of every observation; False leaves pictures and dictionaries of
+        device: Where the TensorDicts live.
+        flatten: Make one vector of every observation; False leaves pictures and dictionaries of
             vectors and pictures as they are, and refuses other observations that are no arrays.
-        highest_costs: cost key -> the most that a step can cost, where that is known; the specs
+        highest_costs: Cost key -> the most that a step can cost, where that is known; the specs
             say so then, and certificates use it.
-        kwargs: for `gymnasium.make`, with an id.
+        kwargs: For `gymnasium.make`, with an id.
 
     Returns:
         An environment [N], with the costs in its reward spec. Without a cost called `cost` it gets
@@ -69,7 +69,7 @@ def from_gymnasium(
         within do; with workers it begins where its seed does.
 
     Raises:
-        ValueError: if no costs are reported, the actions are neither continuous and bounded nor
+        ValueError: If no costs are reported, the actions are neither continuous and bounded nor
             choices, the observations are no arrays and not to be flattened, the length of
             episodes is not known, or an argument is none.
 

@@ -37,10 +37,10 @@ class CostReader(BaseInfoDictReader):
     reported later; a name that is missing beside one that is nearly the same is an error.
 
     Args:
-        cost_keys: names in `info`.
+        cost_keys: Names in `info`.
         batch_size: [N], or [] of a single environment.
-        highest: name -> the most that a step can cost, where that is known.
-        patience: steps until the warning; None: never.
+        highest: Name -> the most that a step can cost, where that is known.
+        patience: Steps until the warning; None: never.
 
     Examples:
         >>> from tensordict import TensorDict
@@ -49,7 +49,7 @@ class CostReader(BaseInfoDictReader):
         tensor([0., 0.])
 
     Raises:
-        ConfigError: by the call, if a cost is not one number per step, or its name is misspelt.
+        ConfigError: By the call, if a cost is not one number per step, or its name is misspelt.
     """
 
     def __init__(
@@ -114,7 +114,7 @@ class CostsAsRewards(Transform):
     """Puts costs beside the reward instead of among the observations, and adds their sum.
 
     Args:
-        cost_keys: costs that the environment writes; where `cost` is not one of them, it is added
+        cost_keys: Costs that the environment writes; where `cost` is not one of them, it is added
             as the sum of all.
     """
 
@@ -153,9 +153,9 @@ class GymnasiumEnv(ConstrainedEnv, TransformedEnv):
     """N environments of Gymnasium as one of TorchRL, made by `from_gymnasium`.
 
     Attributes:
-        cost_keys: the aggregate `cost`, then one key per kind.
-        observation_layout: one component, the whole observation; of a dictionary, its entries.
-        max_episode_steps: the largest number of steps of an episode.
+        cost_keys: The aggregate `cost`, then one key per kind.
+        observation_layout: One component, the whole observation; of a dictionary, its entries.
+        max_episode_steps: The largest number of steps of an episode.
     """
 
     def __init__(self, base_env: GymWrapper, cost_keys: Sequence[str], num_steps: int) -> None:
@@ -181,16 +181,16 @@ class GymnasiumEnv(ConstrainedEnv, TransformedEnv):
         """Draw environments as they draw themselves, within a picture of the asked size.
 
         Args:
-            rows: which of them; None is all.
+            rows: Which of them; None is all.
             camera: "free"; others are arguments of the environment's own.
-            width: of a frame [pixels].
-            height: of a frame [pixels].
+            width: Of a frame [pixels].
+            height: Of a frame [pixels].
 
         Returns:
             RGB, uint8: one frame [height, width, 3] for an integer, else [R, height, width, 3].
 
         Raises:
-            ValueError: for another camera, or if the environments were made without pictures.
+            ValueError: For another camera, or if the environments were made without pictures.
         """
         if camera != "free":
             raise ValueError(
@@ -218,11 +218,11 @@ def from_vector(
 
     Args:
         worlds: N environments that are reset by a mask, and only then.
-        cost_keys: names of the costs in `info`.
-        num_steps: the largest number of steps of an episode.
-        seed: of all environments.
-        device: where the TensorDicts live.
-        highest_costs: cost key -> the most that a step can cost, where that is known.
+        cost_keys: Names of the costs in `info`.
+        num_steps: The largest number of steps of an episode.
+        seed: Of all environments.
+        device: Where the TensorDicts live.
+        highest_costs: Cost key -> the most that a step can cost, where that is known.
     """
     base = GymWrapper(worlds, device=torch.device(device), categorical_action_encoding=True)
     reader = CostReader(cost_keys, [worlds.num_envs], highest_costs, patience=num_steps)

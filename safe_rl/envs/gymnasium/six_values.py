@@ -19,7 +19,7 @@ from gymnasium.wrappers import vector
 
 from safe_rl.envs.costs import COST, is_cost
 from safe_rl.envs.errors import ConfigError
-from safe_rl.envs.foreign import SAFETY_GYMNASIUM
+from safe_rl.envs.families import SAFETY_GYMNASIUM
 from safe_rl.envs.gymnasium import conversion
 from safe_rl.envs.gymnasium.conversion import from_gymnasium, make_node
 from safe_rl.envs.gymnasium.env_wrappers import COST_SUM, SixValues, plain_actions, stretch

@@ -29,14 +29,14 @@ class ProcessVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
     A copy (`copy`, `pickle`) has processes of its own, and begins where its last seed does.
 
     Args:
-        make: makes one environment, in a process of its own.
+        make: Makes one environment, in a process of its own.
         num_envs: N.
         workers: W, at most N.
-        info_keys: numbers that are taken over from `info`; 0 in processes that have none. Others
+        info_keys: Numbers that are taken over from `info`; 0 in processes that have none. Others
             are there by name only, and what no process has is not.
 
     Raises:
-        RuntimeError: if an environment fails; the message is that of its process.
+        RuntimeError: If an environment fails; the message is that of its process.
 
     Examples:
         >>> from functools import partial

@@ -26,8 +26,8 @@ class RobotRenderer:
     """Draws the robots of one environment; nothing is opened before the first picture.
 
     Args:
-        config: the environment.
-        physics: the robots, drawn as they are at the time.
+        config: The environment.
+        physics: The robots, drawn as they are at the time.
     """
 
     def __init__(self, config: VelocityConfig, physics: BatchPhysics) -> None:
@@ -41,19 +41,19 @@ class RobotRenderer:
         """Draw some robots as they are now.
 
         Args:
-            rows: which, R of them.
-            has_cost: which of all incurred a cost in the last step, bool [N].
+            rows: Which, R of them.
+            has_cost: Which of all incurred a cost in the last step, bool [N].
             camera: "free" (beside the robot and moving with it), a name in the model, or a camera
                 of one's own.
-            width: of a frame [pixels].
-            height: of a frame [pixels].
+            width: Of a frame [pixels].
+            height: Of a frame [pixels].
 
         Returns:
             RGB, uint8 [R, height, width, 3].
 
         Raises:
-            ValueError: for an unknown camera.
-            OpenGLError: if OpenGL is missing or cannot be started.
+            ValueError: For an unknown camera.
+            OpenGLError: If OpenGL is missing or cannot be started.
         """
         model = self._load()
         chosen = _choose(model, camera)

@@ -23,15 +23,15 @@ class Runner:
     """What is known of a robot before any configuration.
 
     Attributes:
-        gymnasium_id: the environment whose dynamics, observation and reward it has.
-        mjcf: its file among Gymnasium's assets.
-        place: what is watched for the velocity, a key of `locomotion.PLACES`.
-        health: when it stands as it should, a key of `locomotion.HEALTH`; None: always.
-        num_hidden: leading positions that `exclude_current_positions_from_observation` hides.
-        velocity_limit: joint velocities are observed within plus and minus this [m/s, rad/s].
-        normal_velocities: initial velocities are normally distributed instead of uniformly.
-        parts: what is observed beyond positions and velocities, where the configuration wants it.
-        defaults: its configuration keys and their values.
+        gymnasium_id: The environment whose dynamics, observation and reward it has.
+        mjcf: Its file among Gymnasium's assets.
+        place: What is watched for the velocity, a key of `locomotion.PLACES`.
+        health: When it stands as it should, a key of `locomotion.HEALTH`; None: always.
+        num_hidden: Leading positions that `exclude_current_positions_from_observation` hides.
+        velocity_limit: Joint velocities are observed within plus and minus this [m/s, rad/s].
+        normal_velocities: Initial velocities are normally distributed instead of uniformly.
+        parts: What is observed beyond positions and velocities, where the configuration wants it.
+        defaults: Its configuration keys and their values.
     """
 
     gymnasium_id: str

@@ -5,15 +5,16 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any, ClassVar
 
+import mujoco
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.data import Unbounded
 
+from safe_rl.envs import rng
 from safe_rl.envs.physics.batch import BatchPhysics
 from safe_rl.envs.physics.runge_kutta import runge_kutta_substep
 from safe_rl.envs.simulated import SimulatedEnv, check_state, require_episodes
-from safe_rl.envs.velocity.episode_starts import Starts
 from safe_rl.envs.velocity.locomotion import HEALTH, PLACES, limited_speed, locomotion_reward
 from safe_rl.envs.velocity.runner_model import (
     FORCES,
@@ -49,16 +50,16 @@ class VelocityEnv(SimulatedEnv):
     Cameras of pictures are "track" (the model's own) and "free" (beside the robot).
 
     Args:
-        env: name ("SafeHopperVelocity"), mapping with `robot` and configuration keys, or
+        env: Name ("SafeHopperVelocity"), mapping with `robot` and configuration keys, or
             `VelocityConfig`.
-        num_envs: number of robots, N.
-        device: where the TensorDicts live; the physics runs on the CPU.
-        seed: integer that determines every draw; None takes one from torch's generator. Row k gets
+        num_envs: Number of robots, N.
+        device: Where the TensorDicts live; the physics runs on the CPU.
+        seed: Integer that determines every draw; None takes one from torch's generator. Row k gets
             the same episodes whatever N and the number of threads are.
-        num_threads: threads that step the physics; 0 for one per core.
+        num_threads: Threads that step the physics; 0 for one per core.
 
     Raises:
-        ConfigError: for an unknown name or key, or a value that cannot be used.
+        ConfigError: For an unknown name or key, or a value that cannot be used.
 
     Examples:
         >>> env = VelocityEnv("SafeHopperVelocity", num_envs=4, seed=0)
@@ -170,3 +171,69 @@ class VelocityEnv(SimulatedEnv):
         self._start(everyone.nonzero()[:, 0])
         self._last_place.copy_(state.get("place", self._last_place))
         self._observation.copy_(state.get("observation", self._observation))
+
+
+class Starts:
+    """Starts of episodes, noise around the model's initial state, drawn for all rows at once.
+
+    Few rows at a time start an episode, and a draw for few costs as much as one for many. What is
+    handed out depends on the row's seed and episode alone: every draw is addressed by them and the
+    column of the state, see `rng`.
+
+    Args:
+        config: The environment.
+        model: Its compiled model.
+        num_envs: Number of rows, N.
+    """
+
+    def __init__(self, config: VelocityConfig, model: mujoco.MjModel, num_envs: int) -> None:
+        self._config, self._model = config, model
+        self._seeds = self._episodes = torch.full((num_envs,), -1)
+        self._qpos = torch.zeros(num_envs, model.nq, dtype=torch.float64)
+        self._qvel = torch.zeros(num_envs, model.nv, dtype=torch.float64)
+
+    def take(self, seeds: Tensor, episodes: Tensor, rows: Tensor) -> tuple[Tensor, Tensor]:
+        """Return positions [R, nq] and velocities [R, nv] of episodes that start.
+
+        Args:
+            seeds: Of all rows, int64 [N].
+            episodes: That all rows are in, or start, int64 [N].
+            rows: Which of them start, int64 [R].
+        """
+        known = torch.equal(self._episodes[rows], episodes[rows])
+        if not (known and torch.equal(self._seeds, seeds)):
+            self._seeds, self._episodes = seeds.clone(), episodes + 1
+            self._episodes[rows] = episodes[rows]
+            key = rng.fold(self._seeds, self._episodes)
+            self._qpos, self._qvel = draw_start(self._config, self._model, key)
+        return self._qpos[rows], self._qvel[rows]
+
+
+def draw_start(config: VelocityConfig, model: mujoco.MjModel, key: Tensor) -> tuple[Tensor, Tensor]:
+    """Draw initial positions and velocities, distributed as Gymnasium's.
+
+    Positions are uniform within the noise scale around the model's, velocities uniform within it,
+    or normal with it as standard deviation, around 0.
+
+    Args:
+        config: The environment.
+        model: Its compiled model.
+        key: Random keys, int64 [R].
+
+    Returns:
+        Positions [R, nq] and velocities [R, nv], float64.
+    """
+    columns = torch.arange(model.nq + model.nv)
+    if RUNNERS[config.robot].normal_velocities:
+        positions = _symmetric(key[:, None], columns[: model.nq])
+        velocities = rng.normal(key[:, None], columns[model.nq :])
+    else:
+        draws = _symmetric(key[:, None], columns)
+        positions, velocities = draws.split([model.nq, model.nv], -1)
+    initial, scale = torch.from_numpy(model.qpos0.copy()), config.reset_noise_scale
+    return initial + scale * positions, scale * velocities
+
+
+def _symmetric(keys: Tensor, columns: Tensor) -> Tensor:
+    """Uniform in [-1, 1): [R, 1], [C] -> [R, C]."""
+    return rng.uniform(keys, columns).mul_(2.0).sub_(1.0)
