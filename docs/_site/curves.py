@@ -15,7 +15,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MultipleLocator
 from PIL import Image
 
-from safe_rl.cli.benchmark import suite
+from safe_rl.cli.report import suite
 from safe_rl.reporting.curves import draw_experiment, draw_learning_curves, limits_of, set_axes
 from safe_rl.reporting.experiments import Experiment, group_runs
 from safe_rl.reporting.figures import LIMIT_STYLE, add_legend, algorithm_styles, save

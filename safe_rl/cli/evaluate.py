@@ -6,8 +6,8 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
+from safe_rl.cli import say_interruptions
 from safe_rl.cli.grammar import CommandLineError, parse_options, usage
-from safe_rl.cli.interrupting import say_interruptions
 from safe_rl.cli.user_code import split_imports
 from safe_rl.evaluation.settings import EvaluationOptions
 

@@ -19,13 +19,12 @@ from torchrl.envs import EnvBase
 
 from safe_rl.cli.certificates import certify_run
 from safe_rl.cli.composing import GIVEN_WHOLE, compose_jobs, resolving
-from safe_rl.cli.evaluating import evaluate_run
+from safe_rl.cli.evaluating import evaluate_run, evaluate_varied
 from safe_rl.cli.grammar import CommandLineError, overrides_of, take_options
 from safe_rl.cli.resuming import compose_resumed
 from safe_rl.cli.robots import maker_of
 from safe_rl.cli.session import Session, missing_folders, new_folder
 from safe_rl.cli.user_code import check_imports, import_modules, note_imports, several
-from safe_rl.cli.variations import evaluate_varied
 from safe_rl.evaluation import Certificate, Evaluation, EvaluationOptions
 from safe_rl.evaluation.layouts import default_seed
 from safe_rl.evaluation.loading import (

@@ -7,18 +7,20 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from safe_rl.cli.benchmark import suite
+from safe_rl.cli import say_interruptions
 from safe_rl.cli.grammar import CommandLineError, parse_options, usage
-from safe_rl.cli.interrupting import say_interruptions
 from safe_rl.cli.user_code import import_modules, split_imports
+from safe_rl.envs.families import config_node
+from safe_rl.envs.safety_gym.suite import SUITE, resolve
 from safe_rl.evaluation.settings import option
 from safe_rl.reporting import Report, build_report, write_report
 from safe_rl.reporting.recorded import archive_runs
 from safe_rl.reporting.tables import clean
 from safe_rl.runs.files import check_place
+from safe_rl.scores.benchmark import Suite
 from safe_rl.scores.published import SEEDS
 
-__all__ = ["ReportOptions", "main", "report"]
+__all__ = ["ReportOptions", "main", "report", "suite"]
 
 COMMAND = "python -m safe_rl.report"
 
@@ -44,6 +46,12 @@ class ReportOptions:
         "elsewhere of the best here",
     )
     title: str | None = option(None, "heading; null: the folder's name")
+
+
+def suite() -> Suite:
+    """All environments of the suite, every key of each."""
+    nodes = {name: config_node(name, config) for name, config in SUITE.items()}
+    return Suite(nodes, config_node("", resolve({})))
 
 
 def report(root: Path, options: ReportOptions) -> tuple[Report, Path]:

@@ -16,9 +16,9 @@ import hydra
 from hydra.core.utils import configure_log
 from omegaconf import DictConfig, open_dict
 
+from safe_rl.cli import say_interruptions
 from safe_rl.cli.composing import CONF, compose_jobs, hydras_own, resolving
 from safe_rl.cli.grammar import CommandLineError, overrides_of, parse
-from safe_rl.cli.interrupting import say_interruptions
 from safe_rl.cli.resuming import compose_resumed
 from safe_rl.cli.user_code import import_modules, note_imports, split_imports
 from safe_rl.envs import store_configs

@@ -158,7 +158,7 @@ def test_a_run_interrupted_while_it_is_certified_is_certified_when_it_is_resumed
 
 
 def test_an_interruption_is_said_in_a_line_and_ends_by_the_signal():
-    source = "from safe_rl.cli.interrupting import say_interruptions as say\nsay()\n"
+    source = "from safe_rl.cli import say_interruptions as say\nsay()\n"
     ended = subprocess.run(
         [sys.executable, "-c", f"{source}raise KeyboardInterrupt"],
         cwd=ROOT, capture_output=True, text=True, timeout=300,

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import yaml
 
-from safe_rl.cli.benchmark import suite
+from safe_rl.cli.report import suite
 from safe_rl.reporting.experiments import group_runs, init_sources
 from safe_rl.reporting.recorded import find_runs
 

@@ -2,7 +2,7 @@
 
 import pytest
 
-from safe_rl.cli.benchmark import suite
+from safe_rl.cli.report import suite
 from safe_rl.scores.published import REFERENCE
 
 SUITE = suite()
