@@ -4,12 +4,11 @@ import csv
 import math
 import shutil
 import signal
-import subprocess
-import sys
 
 import numpy as np
 import pytest
 import torch
+from commands import run_train
 from hydra import compose, initialize_config_dir
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.override_parser.overrides_parser import OverridesParser
@@ -105,10 +104,7 @@ def test_it_is_the_run_of_the_command(run, tmp_path):
     words = ["env=CarGoal1", "algo=cpo", "frames=120", "seed=4", "num_envs=2", "num_threads=1"]
     words += ["frames_per_batch=40", "env.num_steps=20", "logger=none", "model.hidden_sizes=[8]"]
     words += ["critic_update.minibatch_size=20", "cost_limits={cost_hazards: 3, cost: 5.5}"]
-    subprocess.run(
-        [sys.executable, "train.py", *words, f"hydra.run.dir={tmp_path}"],
-        cwd=CONF.parent, capture_output=True, timeout=300, check=True,
-    )  # fmt: skip
+    run_train(*words, f"hydra.run.dir={tmp_path}")
     files = (folder / "progress.csv" for folder in (run.directory, tmp_path))
     first, second = map(without_times, files)
     assert first == second
