@@ -59,7 +59,7 @@ def archived(*campaigns: str, steps: int = 0) -> list[Experiment]:
     """What campaigns in results/ have of runs of so many steps and more."""
     results = ROOT / "results"
     runs = chain.from_iterable(find_runs(results / campaign)[0] for campaign in campaigns)
-    return group_runs([run for run in runs if run.steps >= steps], suite(), {}, results)[0]
+    return group_runs([run for run in runs if run.steps >= steps], suite())[0]
 
 
 def draw_columns(experiments: list[Experiment]) -> Figure:

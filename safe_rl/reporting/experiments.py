@@ -1,4 +1,4 @@
-"""Runs that differ in nothing but the seed: their names, and what they started from."""
+"""Runs that differ in nothing but the seed: their names."""
 
 from __future__ import annotations
 
@@ -6,18 +6,16 @@ from collections import defaultdict
 from collections.abc import Hashable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple
 
 from safe_rl.reporting.recorded import Run
 from safe_rl.reporting.tables import clean
-from safe_rl.runs.folder import RunFolder, checkpoint_steps, common_source, run_of
 from safe_rl.runs.identity import Role, experiment_of, flatten, role_of
 from safe_rl.scores.benchmark import Suite
 from safe_rl.scores.published import ALGORITHMS, COST_LIMIT, REFERENCE, Scores
 
 __all__ = [
-    *("Experiment", "Source", "cost_keys_of", "distinguishing_keys", "group_runs"),
-    *("init_sources", "title_of"),
+    *("Experiment", "cost_keys_of", "distinguishing_keys", "group_runs"),
+    "title_of",
 ]
 
 Settings = dict[str, Hashable]
@@ -97,53 +95,18 @@ def cost_keys_of(experiments: Iterable[Experiment]) -> list[str]:
     return list(dict.fromkeys([*keys, *(key for e in experiments for key in e.limits)]))
 
 
-class Source(NamedTuple):
-    """A run that another one started from, and the environment steps of the checkpoint."""
-
-    run: Run
-    steps: int
-
-
-def init_sources(runs: Sequence[Run]) -> dict[Path, Source]:
-    """Folder of a run -> what it started from, where that is one of the runs.
-
-    A relative path counts from where the run was started, or from a folder above the run.
-    """
-    known = {run.directory.resolve(): run for run in runs}
-    sources = {}
-    for run in runs:
-        if run.init_from is None:
-            continue
-        folder, steps = run_of(run.init_from)
-        places = [] if run.cwd is None else [(run.cwd / folder).resolve()]
-        if not any(path.exists() for path in places):
-            places = [(above / folder).resolve() for above in run.directory.resolve().parents]
-        first = next(filter(None, map(known.get, places)), None)
-        if first is None or first is run:
-            continue
-        newest = RunFolder(first.directory).newest_checkpoint()
-        steps = steps or (newest and checkpoint_steps(newest)) or first.steps
-        if first.table["steps"][0] <= steps:  # or the table is another run's
-            sources[run.directory] = Source(first, steps)
-    return sources
-
-
-def group_runs(
-    runs: Sequence[Run], suite: Suite, sources: Mapping[Path, Source], root: Path
-) -> tuple[list[Experiment], dict[Path, str]]:
+def group_runs(runs: Sequence[Run], suite: Suite) -> tuple[list[Experiment], dict[Path, str]]:
     """Group runs into experiments, in the order of the benchmark and of the paper's tables.
 
     Args:
         runs: Runs of any environments and algorithms.
         suite: The benchmark.
-        sources: Folder of a run -> what it started from, see :func:`init_sources`.
-        root: Folder of all runs.
 
     Returns:
         Experiments, and folder -> why a run was left out.
     """
     environments = _environment_names(runs, suite)
-    settings = {r.directory: _settings(r, sources.get(r.directory), root) for r in runs}
+    settings = {r.directory: _settings(r) for r in runs}
     algorithms, differing = _algorithm_names(runs, environments, settings)
     without_limits = {
         place: {key: value for key, value in own.items() if not key.startswith("cost_limits.")}
@@ -252,15 +215,13 @@ def title_of(algorithm: str) -> str:
     return ALGORITHMS.get(algorithm) or _TITLES.get(algorithm, algorithm)
 
 
-def _settings(run: Run, source: Source | None, root: Path) -> Settings:
+def _settings(run: Run) -> Settings:
     """What tells a run's algorithm from others of the same name."""
     named = experiment_of(run.config).items()
     settings = {key: value for key, value in named if key.partition(".")[0] != "env"}
     for key in [key for key in settings if role_of(key) is Role.LENGTH and key != "frames"]:
         if settings[key] == settings.get("frames"):
             del settings[key]  # it only says again how long the run is
-    if run.init_from is not None:
-        settings["init_from"] = _source_of_seeds(run, source, root)
     # what is as the preset has it for the robot, and so as on another robot, tells nothing apart
     robots = (Path(str(run.config["env"].get("robot_base"))).stem, "point")
 
@@ -269,20 +230,6 @@ def _settings(run: Run, source: Source | None, root: Path) -> Settings:
         return next((value for value in found if value is not None), None)
 
     return {key: value for key, value in settings.items() if value != of_robot(key)}
-
-
-def _source_of_seeds(run: Run, source: Source | None, root: Path) -> str:
-    """The part of ``init_from`` that all seeds share, relative to the folder of all runs."""
-    assert run.init_from is not None
-    folder, _ = run_of(run.init_from)
-    place = folder if source is None else source.run.directory
-    below = next(
-        (place.relative_to(r) for r in (root, root.resolve()) if r in place.parents), place
-    )
-    common = common_source(str(below / run.init_from.relative_to(folder)))
-    # all runs in one folder: the name of the environment says more than a dot
-    name = folder if source is None else source.run.config["env"].get("name")
-    return str(name) if common == "." else common
 
 
 def distinguishing_keys(cells: Sequence[Sequence[Settings]]) -> list[str]:

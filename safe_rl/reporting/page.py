@@ -17,8 +17,8 @@ from matplotlib.figure import Figure
 
 from safe_rl.extras import import_extra
 from safe_rl.reporting.campaigns import campaign_tables
-from safe_rl.reporting.curves import draw_learning_curves, draw_transfer, find_transfers
-from safe_rl.reporting.experiments import Experiment, Source, group_runs, init_sources
+from safe_rl.reporting.curves import draw_learning_curves
+from safe_rl.reporting.experiments import Experiment, group_runs
 from safe_rl.reporting.figures import (
     Style,
     algorithm_styles,
@@ -135,8 +135,7 @@ def build_report(
         FileNotFoundError: If there is no run.
     """
     runs, skipped = find_runs(root, unfinished=unfinished)
-    sources = init_sources(runs)
-    experiments, repeated = group_runs(runs, suite, sources, root)
+    experiments, repeated = group_runs(runs, suite)
     campaigns, no_plans = campaign_tables(root, runs)
     skipped |= repeated | no_plans
     styles = algorithm_styles(experiments)
@@ -154,7 +153,6 @@ def build_report(
         ("learning", "What learning cost", list(filter(None, learning))),
         ("curves", "Learning curves", _curves(experiments, styles)),
         ("fronts", "Return against cost", _fronts(records, styles)),
-        ("transfer", "Transfer", _transfers(experiments, sources, styles)),
         ("normalised", "Normalised scores", [*slates, missing]),
         ("dominance", "Which is better", [dominance_table(records)]),
         ("certificates", "Certificates", [certificate_table(experiments)]),
@@ -198,17 +196,6 @@ def _curves(experiments: Sequence[Experiment], styles: Mapping[str, Style]) -> l
             figure = draw_learning_curves([e for group in shown for e in group], styles)
             drawings.append(Drawing(f"curves_{robot}", "", figure, says))
     return drawings
-
-
-def _transfers(
-    experiments: Sequence[Experiment], sources: Mapping[Path, Source], styles: Mapping[str, Style]
-) -> list[Block]:
-    blocks: list[Block] = []
-    for number, transfer in enumerate(find_transfers(experiments, sources), start=1):
-        says = f"Return, episode cost and cost rate of both phases, {transfer.title}"
-        figure = draw_transfer(transfer, styles)
-        blocks += [Drawing(f"transfer_{number}", transfer.title, figure, says), *transfer.notes]
-    return blocks
 
 
 def _slates(

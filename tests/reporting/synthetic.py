@@ -8,7 +8,7 @@ from pathlib import Path
 import yaml
 
 from safe_rl.cli.report import suite
-from safe_rl.reporting.experiments import group_runs, init_sources
+from safe_rl.reporting.experiments import group_runs
 from safe_rl.reporting.recorded import find_runs
 
 COLUMNS = [
@@ -20,7 +20,7 @@ SUITE = suite()
 def grouped(root: Path):
     """Experiments below a folder, and what was left out for being a repetition."""
     runs, _ = find_runs(root)
-    return group_runs(runs, SUITE, init_sources(runs), root)
+    return group_runs(runs, SUITE)
 
 
 def experiments_in(root: Path):
