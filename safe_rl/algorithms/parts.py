@@ -18,14 +18,16 @@ __all__ = ["build_part", "build_update", "find_recipe"]
 
 Update = TypeVar("Update")
 
+_DEFAULT_RECIPE = "safe_rl.algorithms.OnPolicy"
+
 
 def find_recipe(config: DictConfig) -> type[Recipe]:
-    """The recipe that a configuration names as ``algo._target_``.
+    """The recipe that a configuration names as ``algo._target_``; on-policy unless it says so.
 
     Raises:
         TargetError: If there is no such class, or it is no recipe.
     """
-    target = config.algo.get("_target_")
+    target = config.algo.get("_target_", _DEFAULT_RECIPE)
     recipe = locate(target, "algo._target_")
     if not (isclass(recipe) and issubclass(recipe, Recipe)):
         raise TargetError(

@@ -130,10 +130,10 @@ def test_scales_are_keys_of_an_environment(name):
 
 
 WRONG = [
-    ("mass_scale", 0.0, "greater than 0"),
-    ("friction_scale", 0.0, "greater than 0"),
-    ("strength_scale", math.inf, "finite"),
-    ("damping_scale", -1.0, "0 or more"),
+    ("mass_scale", 0.0, "(greater than|above) 0"),
+    ("friction_scale", 0.0, "(greater than|above) 0"),
+    ("strength_scale", math.inf, "(finite|number from 0 to)"),
+    ("damping_scale", -1.0, "(0 or more|from 0)"),
     ("damping_scale", "much", "number"),
 ]
 

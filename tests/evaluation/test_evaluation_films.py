@@ -26,7 +26,6 @@ from safe_rl.evaluation.video import MANNERS, manner_of
         (lambda: VelocityEnv("SafeHopperVelocity", seed=0), 5, 25.0),
         (lambda: VelocityEnv("SafeHalfCheetahVelocity", seed=0), 1, 20.0),
         (lambda: from_gymnasium("Safexp-CarGoal1-v0", num_steps=10, seed=0), 1, 25.0),
-        (object, 2, 25.0),
     ],
 )
 def test_a_film_runs_as_fast_as_what_it_shows(make, steps_per_frame, rate):

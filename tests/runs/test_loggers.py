@@ -44,4 +44,4 @@ def test_mlflow_holds_the_table_and_goes_on_in_the_same_run(tmp_path):
 def test_what_is_not_installed_is_named(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "wandb", None)
     with pytest.raises(ModuleNotFoundError, match=r"pip install -e '\.\[wandb\]'"):
-        WandbLogger(log_dir=str(tmp_path))
+        WandbLogger(exp_name="", project="p", offline=True, log_dir=str(tmp_path))

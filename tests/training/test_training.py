@@ -11,6 +11,7 @@ from point_mass_runs import point_mass_trainer
 from run_configs import point_mass_config, without_times
 from torchrl.checkpoint import Checkpoint
 
+from safe_rl.algorithms import PolicyUpdate
 from safe_rl.objectives import PPOLagrangianLoss
 from safe_rl.runs.checkpoint_file import read_facts
 from safe_rl.runs.checkpoints import CheckpointStore
@@ -201,7 +202,7 @@ def test_epochs_without_a_finished_episode(tmp_path):
     assert not any(math.isnan(value) for value in table["cost_rate"])
 
 
-class ReportingUpdate:
+class ReportingUpdate(PolicyUpdate):
     """A policy update of one's own: changes nothing, reports what it was given."""
 
     def __init__(self, loss):
@@ -217,8 +218,8 @@ class ReportingUpdate:
         pass
 
 
-class ForgetfulUpdate:
-    """An update of one's own that no checkpoint can hold."""
+class ForeignUpdate:
+    """What is called like an update and does not fulfil its contract."""
 
     def __init__(self, loss): ...
 
@@ -247,7 +248,7 @@ OWN_UPDATE = """
 # @package _global_
 defaults:
   - /cost_advantage: ${preset}
-algo: {name: mine}
+algo: {name: mine, constrained: true}
 loss: {_target_: safe_rl.objectives.PPOLoss, clip_epsilon: 0.2, entropy_coeff: 0.0}
 policy_update: {_target_: test_training.ReportingUpdate}
 """
@@ -287,10 +288,10 @@ def test_a_policy_update_from_outside_the_package(tmp_path):
         assert table[f"policy_violation_{key}"] == pytest.approx(expected, abs=1e-3)
 
 
-def test_a_policy_update_without_a_state_is_refused_when_it_is_built(tmp_path):
-    own = own_algorithm(tmp_path, OWN_UPDATE.replace("Reporting", "Forgetful"))
+def test_an_update_of_another_kind_is_refused_when_it_is_built(tmp_path):
+    own = own_algorithm(tmp_path, OWN_UPDATE.replace("Reporting", "Foreign"))
     config = point_mass_config(*own, minibatch_size=None)
-    said = r"^policy_update\._target_=test_training\.ForgetfulUpdate is no.* has no state_dict\(\)"
+    said = r"ForeignUpdate is no update: derive it from safe_rl\.algorithms\.PolicyUpdate"
     with pytest.raises(ValueError, match=said):
         build_trainer(config, PointMass(config.num_envs, 40), tmp_path / "run")
 
