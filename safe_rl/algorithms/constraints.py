@@ -81,6 +81,11 @@ class Constraints:
         held = self.limits if self.risk is None else self.risk.held_limits
         return dict(zip(self.keys, held.tolist(), strict=True))
 
+    @property
+    def schedule(self) -> str:
+        """When the limits begin to hold, in a sentence; empty if they do from the start."""
+        return ""
+
     def charge(self, episodes: EpisodeStatistics, batch: TensorDictBase) -> None:
         """Write into a batch what stands for its costs, before advantages are estimated."""
 

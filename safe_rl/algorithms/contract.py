@@ -55,6 +55,11 @@ class Algorithm(ABC):
         return ""
 
     @property
+    def schedule(self) -> str:
+        """A sentence on when the limits begin to hold; empty if they do from the start."""
+        return ""
+
+    @property
     def lost_on_resume(self) -> str:
         """A sentence on what checkpoints do not hold of it; empty if they hold all."""
         return ""

@@ -154,6 +154,11 @@ class OffPolicy(Algorithm, Recipe):
             f"{goes_on}, and differs from a run that was not interrupted."
         )
 
+    @property
+    def schedule(self) -> str:
+        """When the limits begin to hold."""
+        return self.constraints.schedule
+
     def learn(self, batch: TensorDictBase, episodes: EpisodeStatistics) -> dict[str, float]:
         """Take in a batch [N, T], and learn as much as it allows from all that is remembered.
 

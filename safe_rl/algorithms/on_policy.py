@@ -119,6 +119,11 @@ class OnPolicy(Algorithm, Recipe):
         actor = _build_networks(config, env, 0, device)["actor"]
         return make_behaviour(actor), {"actor": actor}
 
+    @property
+    def schedule(self) -> str:
+        """When the limits begin to hold."""
+        return self.constraints.schedule
+
     def learn(self, batch: TensorDictBase, episodes: EpisodeStatistics) -> dict[str, float]:
         """Train on one batch.
 

@@ -53,6 +53,11 @@ class TrackedConstraints(Constraints):
         self._charges: Charges | None = None
         self._row: dict[str, float] = {}
 
+    @property
+    def schedule(self) -> str:
+        """When costs are free, when the limits come down, and when they hold."""
+        return self.tracker.schedule if self.keys else ""
+
     def charge(self, episodes: EpisodeStatistics, batch: TensorDictBase) -> None:
         """Let the risk measure put its charges below ``"next"``, for advantages and violations."""
         if self.risk is None:

@@ -171,6 +171,8 @@ class Session:
         trainer = self._build()
         if trainer.algorithm.learns_from:
             print(trainer.algorithm.learns_from)
+        if trainer.algorithm.schedule:
+            print(trainer.algorithm.schedule)
         if self._continues and trainer.resume():
             self._say_continued(trainer)
             return trainer

@@ -29,6 +29,7 @@ class EpisodeStatistics:
             nested keys are joined by ``/``.
         lengths: Steps of every finished episode, shape [E].
         cost_rates: Cost key -> all cost so far divided by all steps so far, ρ_c, scalar tensors.
+        reward_rate: All reward so far divided by all steps so far, a scalar tensor.
         open_costs: Cost key -> what the open episode of every row had cost before the batch, shape
             [N]; NaN where it is left out of the statistics.
 
@@ -48,6 +49,7 @@ class EpisodeStatistics:
     costs: dict[str, Tensor]
     lengths: Tensor
     cost_rates: dict[str, Tensor]
+    reward_rate: Tensor = field(default_factory=lambda: torch.tensor(torch.nan))
     open_costs: dict[str, Tensor] = field(default_factory=dict)
 
     @property
@@ -73,6 +75,7 @@ class EpisodeStatistics:
             "episode_length": self.lengths.mean().item(),
         }
         rows |= {f"episode_{key}": costs.mean().item() for key, costs in self.costs.items()}
+        rows["reward_rate"] = self.reward_rate.item()
         rows |= {f"{key}_rate": rate.item() for key, rate in self.cost_rates.items()}
         return rows
 
@@ -153,12 +156,13 @@ class EpisodeAccounting:
         self._require_ends(finished[:, 0])
         self._totals += signals.sum((0, 1))
         names = [key_name(key) for key in self.cost_keys]
-        rates = self._totals[2:] / self._totals[0]
+        reward_rate, *rates = self._totals[1:] / self._totals[0]
         return EpisodeStatistics(
             returns=finished[:, 1],
             costs=dict(zip(names, finished[:, 2:].unbind(-1), strict=True)),
             lengths=finished[:, 0],
-            cost_rates=dict(zip(names, rates.unbind(), strict=True)),
+            cost_rates=dict(zip(names, rates, strict=True)),
+            reward_rate=reward_rate,
             open_costs=dict(zip(names, before.unbind(-1), strict=True)),
         )
 

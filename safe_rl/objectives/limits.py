@@ -198,6 +198,7 @@ class LimitTracker:
         shrinkage = min(1.0, latest_end * frames / max(free_steps + descent_steps, 1))
         self.free_steps = round(free_steps * shrinkage)
         self.descent_steps = round(descent_steps * shrinkage)
+        self._is_shortened = shrinkage < 1
         self.smallest_scale, self.memory, self.recovery = smallest_scale, memory, recovery
         self.costs = EpisodeCosts(
             num_costs,
@@ -213,6 +214,18 @@ class LimitTracker:
         self._reached = torch.full((num_costs,), torch.inf)
         self._recovers = torch.zeros(num_costs, dtype=torch.bool)
         self._noise = torch.full((num_costs,), torch.nan)
+
+    @property
+    def schedule(self) -> str:
+        """When costs are free, when the limits come down, and when they hold, in a sentence."""
+        end = self.free_steps + self.descent_steps
+        if not end:
+            return ""
+        free = f"Costs are free until step {self.free_steps:,}; the " if self.free_steps else "The "
+        line = f"{free}limits come down until step {end:,} and hold from there."
+        if self._is_shortened:
+            line += " (limits.free_steps and limits.descent_steps are shortened to fit frames=…)"
+        return line
 
     @torch.no_grad()
     def update(self, costs: Tensor, lengths: Tensor, charges: Charges | None = None) -> LimitState:

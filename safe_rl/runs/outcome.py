@@ -10,8 +10,15 @@ from collections.abc import Iterable, Mapping, Sequence
 from statistics import fmean
 
 __all__ = [
-    *("FINAL_EPOCHS", "FINAL_STEPS", "feasible_return", "final_figures", "final_width"),
-    *("judges_another_measure", "keeps", "mean_row", "measured", "shown", "violation"),
+    *(
+        "FINAL_EPOCHS",
+        "FINAL_STEPS",
+        "feasible_return",
+        "final_figures",
+        "final_rows",
+        "final_width",
+    ),
+    *("judges_another_measure", "keeps", "mean_row", "measured", "violation"),
 ]
 
 FINAL_EPOCHS = 5
@@ -53,31 +60,6 @@ def measured(row: Mapping[str, float], key: str, limit: float | None) -> float:
         87.0
     """
     return row[f"episode_{key}"] if limit is None else limit + violation(row, key, limit)
-
-
-def shown(row: Mapping[str, float], limits: Mapping[str, float]) -> dict[str, str]:
-    """What a bar shows of an epoch: return, costs against their limits, and λ, where known.
-
-    Args:
-        row: Of a run's table, by column.
-        limits: Cost key -> d, undiscounted cost per episode.
-
-    Examples:
-        >>> row = {"episode_return": 1.25, "episode_cost": 30.0, "multiplier_cost": 0.5}
-        >>> shown(row, {"cost": 25.0})
-        {'return': '1.25', 'cost': '30.0/25', 'λ': '0.5'}
-    """
-    figures = {}
-    if not math.isnan(row["episode_return"]):
-        figures["return"] = f"{row['episode_return']:.2f}"
-        for key in limits or ["cost"]:
-            limit = limits.get(key)
-            against = "" if limit is None else f"/{limit:g}"
-            figures[key] = f"{measured(row, key, limit):.1f}{against}"
-    multipliers = [value for name, value in row.items() if name.startswith("multiplier_")]
-    if multipliers:
-        figures["λ"] = " ".join(f"{value:.3g}" for value in multipliers)
-    return figures
 
 
 def keeps(row: Mapping[str, float], key: str, limit: float) -> bool:
@@ -182,6 +164,12 @@ def final_width(steps: Iterable[float]) -> int:
     return max(FINAL_EPOCHS, sum(end > begin for end in ends))
 
 
+def final_rows(table: Mapping[str, Sequence[float]]) -> list[int]:
+    """The last rows of a run's table in which an episode finished, `final_width` of them."""
+    known = [row for row, value in enumerate(table["episode_return"]) if not math.isnan(value)]
+    return known[-final_width([table["steps"][row] for row in known]) :]
+
+
 def final_figures(
     table: Mapping[str, Sequence[float]], cost_keys: Sequence[str]
 ) -> dict[str, float]:
@@ -194,9 +182,8 @@ def final_figures(
         table: Columns of the run's table.
         cost_keys: Keys of the costs to report.
     """
-    known = [row for row, value in enumerate(table["episode_return"]) if not math.isnan(value)]
     costs = [f"{kind}_{key}" for key in cost_keys for kind in ("episode", "violation")]
-    last = known[-final_width([table["steps"][row] for row in known]) :]
+    last = final_rows(table)
     final = {}
     for name in ("episode_return", *(name for name in costs if name in table)):
         values = [table[name][row] for row in last]

@@ -14,11 +14,10 @@ from pathlib import Path
 from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
-from tqdm import tqdm
 
+from safe_rl.runs.display import ProgressBar, outcome_line
 from safe_rl.runs.files import read_json, replace_text, replacing
 from safe_rl.runs.folder import RunFolder, lock_folder
-from safe_rl.runs.outcome import final_figures, measured, shown
 from safe_rl.runs.table import TableWriter, read_table
 from safe_rl.targets import build
 
@@ -52,8 +51,8 @@ class RunRecord:
         >>> with record.writing():
         ...     record.add(row | {"time_total": 2.0})
         ...     record.draw_curves()
-        >>> record.summary().split(" in ")[0]
-        'J_r 1.00, J_c 30.0 (limit 25), ρ_c 0.0300, 100 steps/s'
+        >>> record.summary().split(" per ")[0]
+        'Return 1.00, cost 30.0 (limit 25)'
     """
 
     def __init__(
@@ -99,11 +98,10 @@ class RunRecord:
             self._logger = build(self._config.logger, log_dir=str(self.directory))
             if epoch is not None and hasattr(self._logger, "continue_from"):
                 self._logger.continue_from(steps)
-            self._bar = tqdm(
-                total=self._config.frames, initial=steps, unit=" steps", unit_scale=True,
-                dynamic_ncols=True, smoothing=0.1,
-            )  # fmt: skip
-            self._shown: dict[str, str] = {}
+            # whole batches, so that the last one does not go beyond the bar
+            batch = self._config.get("frames_per_batch", 1)
+            total = math.ceil(self._config.frames / batch) * batch
+            self._bar = ProgressBar(total, steps, self._cost_limits, self._episode_length)
             try:
                 yield
                 self._save_config()
@@ -130,9 +128,7 @@ class RunRecord:
             for name, value in row.items():
                 if not math.isnan(value):
                     self._logger.log_scalar(name, value, step=int(row["steps"]))
-        self._shown |= shown(row, self._cost_limits)
-        self._bar.set_postfix(self._shown, refresh=False)
-        self._bar.update(int(row["steps"]) - self._bar.n)
+        self._bar.add(row)
 
     def rows(self) -> list[dict[str, float]]:
         """Return the epochs that are in the table, by column."""
@@ -156,20 +152,9 @@ class RunRecord:
 
     def summary(self) -> str:
         """One line on how the run ended."""
-        keys = list(self._cost_limits) or ["cost"]
-        final = final_figures(read_table(self.folder.table), keys)
-        parts = [f"J_r {final['episode_return']:.2f}"]
-        several = len(self._cost_limits) > 1
-        for key in keys:
-            name = f"[{key}]" if several else ""
-            limit = f" (limit {self._cost_limits[key]:g})" if key in self._cost_limits else ""
-            mean, held = final[f"episode_{key}"], measured(final, key, self._cost_limits.get(key))
-            differs = abs(held - mean) > 0.05  # false without any episode
-            own = f", measured {held:.1f}" if differs else ""
-            parts.append(f"J_c{name} {mean:.1f}{own}{limit}")
-            parts.append(f"ρ_c{name} {final[f'{key}_rate']:.4f}")  # noqa: RUF001
-        parts.append(f"{final['steps_per_second']:,.0f} steps/s")
-        return f"{', '.join(parts)} in {self.directory}"
+        table = read_table(self.folder.table)
+        line = outcome_line(table, self._cost_limits, self._episode_length)
+        return f"{line}; {self.directory}"
 
 
 def note_code(path: Path, steps: int) -> None:

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import os
 import signal
 import threading
 from collections.abc import Mapping
+from contextlib import suppress
 from types import FrameType
 from typing import Any
 
@@ -130,6 +132,9 @@ class StopRequest:
     def _stop(self, number: int, frame: FrameType | None) -> None:
         self.received = signal.Signals(number)
         self._restore()
+        # not by print(), which the signal may have interrupted; the terminal may be gone
+        with suppress(OSError):
+            os.write(2, b"\nStopping after this epoch. Once more stops at once.\n")
 
     def _restore(self) -> None:
         for number, handler in self._previous.items():

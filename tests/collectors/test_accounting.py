@@ -100,7 +100,8 @@ def test_means_are_nan_and_rates_are_known_before_an_episode_finishes():
     assert scalars["cost_rate"] == pytest.approx(batch["next", "cost"].mean().item())
     assert list(scalars) == [
         "episodes", "episode_return", "episode_length",
-        "episode_cost", "episode_agent/cost_speed", "cost_rate", "agent/cost_speed_rate",
+        "episode_cost", "episode_agent/cost_speed", "reward_rate", "cost_rate",
+        "agent/cost_speed_rate",
     ]  # fmt: skip
 
 

@@ -66,7 +66,8 @@ def test_final_figures_without_any_episode_are_nan():
 
 
 def test_the_folder_has_configuration_table_and_tensorboard(tmp_path, capsys):
-    config = compose_config("env=PointMass", "cost_limits={cost: 25, cost_north: 5}", "frames=2000")
+    config = compose_config("env=PointMass", "cost_limits={cost: 25, cost_north: 5}", "frames=1500",
+                            "frames_per_batch=1000")  # fmt: skip
     record = RunRecord(tmp_path / "run", config, {"cost": 25.0, "cost_north": 5.0}, 1000)
     with record.writing():
         record.add(row(1, NAN, NAN, NAN))
@@ -79,9 +80,8 @@ def test_the_folder_has_configuration_table_and_tensorboard(tmp_path, capsys):
     assert costs == [(2000, 30.0)]
     assert {event.step for event in events.Scalars("multiplier_cost")} == {1000, 2000}
     assert record.summary() == (
-        "J_r 1.50, J_c[cost] 30.0 (limit 25), ρ_c[cost] 0.0020, "  # noqa: RUF001
-        "J_c[cost_north] 4.0 (limit 5), ρ_c[cost_north] 0.0020, "  # noqa: RUF001
-        f"500 steps/s in {tmp_path / 'run'}"
+        "Return 1.50, cost 30.0 (limit 25), cost_north 4.0 (limit 5) per episode, mean of steps "
+        f"1,001 to 2,000; 500 steps/s; {tmp_path / 'run'}"
     )
     bar = capsys.readouterr().err
     assert "return=1.50, cost=30.0/25, cost_north=4.0/5" in bar
@@ -96,10 +96,10 @@ def test_a_measure_of_ones_own_is_what_is_held_against_the_limit(tmp_path, capsy
     with record.writing():
         record.add(row(1, 1.0, 20.0) | {"violation_cost": 62.0})
         record.add(row(2, 1.0, 30.0) | {"violation_cost": 64.0})
-    assert "J_c 25.0, measured 88.0 (limit 25)" in record.summary()
+    assert "cost 25.0, what is limited 88.0 (limit 25)" in record.summary()
     with record.writing(0):
         record.add(row(1, NAN, NAN) | {"violation_cost": NAN})
-    assert "J_c nan (limit 25)" in record.summary()
+    assert "No episode of 1,000 steps has ended, cost 1.0 (limit 25) per 1,000" in record.summary()
     assert "cost=89.0/25" in capsys.readouterr().err
 
 

@@ -181,7 +181,7 @@ def test_the_folder_of_a_run(tmp_path):
     )
     assert {"actor", "critic", "cost_critic", "multiplier"} <= kept
     assert last - kept >= {"policy_update", "critic_update", "env", "accounting", "rng"}
-    assert line.startswith("J_r ")
+    assert line.startswith("Return ")
     assert line.endswith(str(tmp_path))
 
 

@@ -1,0 +1,168 @@
+"""What a run shows on the terminal: a progress bar while it trains, a line when it has ended."""
+
+from __future__ import annotations
+
+import math
+import sys
+from collections.abc import Mapping, Sequence
+from threading import Event, Thread
+
+from tqdm import tqdm
+
+from safe_rl.runs.outcome import final_figures, final_rows, measured
+
+__all__ = ["ProgressBar", "outcome_line", "shown"]
+
+_RATE_STEPS = 1000
+_REDRAW = 1.0  # seconds
+
+
+class ProgressBar:
+    """Steps done, steps per second, return and costs against their present limits.
+
+    On a terminal it is redrawn every second, also within an epoch.
+
+    Args:
+        total: Environment steps of the whole run.
+        begun: Steps that a continued run has behind it.
+        limits: Cost key -> d, undiscounted cost per episode.
+        episode_length: Largest number of steps of an episode.
+    """
+
+    def __init__(
+        self, total: int, begun: int, limits: Mapping[str, float], episode_length: int
+    ) -> None:
+        self._bar = tqdm(
+            total=total, initial=begun, unit=" steps", unit_scale=True, dynamic_ncols=True,
+            smoothing=0.1,
+        )  # fmt: skip
+        self._limits, self._episode_length = limits, episode_length
+        self._before: Mapping[str, float] | None = None
+        self._closed = Event()
+        if not self._bar.disable and sys.stderr.isatty():
+            Thread(target=self._redraw, daemon=True).start()
+
+    def add(self, row: Mapping[str, float]) -> None:
+        """Show an epoch, by columns of the table."""
+        figures = shown(row, self._limits, self._before, self._episode_length)
+        self._bar.set_postfix(figures, refresh=False)
+        self._bar.update(int(row["steps"]) - self._bar.n)
+        self._before = row
+
+    def close(self) -> None:
+        """Leave the bar as it is."""
+        self._closed.set()
+        self._bar.close()
+
+    def _redraw(self) -> None:
+        while not self._closed.wait(_REDRAW):
+            self._bar.refresh()
+
+
+def shown(
+    row: Mapping[str, float],
+    limits: Mapping[str, float],
+    before: Mapping[str, float] | None = None,
+    episode_length: int = _RATE_STEPS,
+) -> dict[str, str]:
+    """What a bar shows of an epoch: return, costs against their present limits, and λ.
+
+    Means of the episodes that ended in the epoch; if none did, the epoch's return and costs per
+    1,000 steps. While the limit comes down, its present value stands behind "target".
+
+    Args:
+        row: Of a run's table, by column.
+        limits: Cost key -> d, undiscounted cost per episode.
+        before: The row of the epoch before; None takes rates over all steps so far.
+        episode_length: Largest number of steps of an episode, by which a limit is a rate.
+
+    Examples:
+        >>> row = {"episode_return": 1.25, "episode_cost": 30.0, "multiplier_cost": 0.5}
+        >>> shown(row, {"cost": 25.0})
+        {'return': '1.25', 'cost': '30.0/25', 'λ': '0.5'}
+        >>> shown(row | {"estimate_cost": 31.0, "target_cost": 29.0}, {"cost": 25.0})["cost"]
+        '30.0/target 29'
+        >>> shown({"episode_return": math.nan, "steps": 400, "cost_rate": 0.06}, {"cost": 25.0})
+        {'cost per 1,000 steps': '60.0/25'}
+    """
+    figures = {}
+    costs = list(limits) or [key for key in ("cost",) if f"{key}_rate" in row]
+    if math.isnan(row["episode_return"]):
+        unit, scale = f" per {_RATE_STEPS:,} steps", _RATE_STEPS / episode_length
+        if "reward_rate" in row:
+            figures[f"return{unit}"] = f"{_rate(row, before, 'reward'):.2f}"
+        values = {key: _rate(row, before, key) for key in costs}
+    else:
+        unit, scale = "", 1.0
+        figures["return"] = f"{row['episode_return']:.2f}"
+        values = {key: measured(row, key, limits.get(key)) for key in limits or ["cost"]}
+    for key, value in values.items():
+        figures[f"{key}{unit}"] = f"{value:.1f}{_present_limit(row, key, limits, scale)}"
+    multipliers = [value for name, value in row.items() if name.startswith("multiplier_")]
+    if multipliers:
+        figures["λ"] = " ".join(f"{value:.3g}" for value in multipliers)
+    return figures
+
+
+def _rate(row: Mapping[str, float], before: Mapping[str, float] | None, key: str) -> float:
+    """What an epoch has brought per 1,000 steps, from the means over all steps so far."""
+    total, steps = row[f"{key}_rate"] * row["steps"], row["steps"]
+    if before is not None:
+        total, steps = total - before[f"{key}_rate"] * before["steps"], steps - before["steps"]
+    return _RATE_STEPS * total / steps
+
+
+def _present_limit(
+    row: Mapping[str, float], key: str, limits: Mapping[str, float], scale: float
+) -> str:
+    """What a cost is compared with in an epoch, as the end of its figure."""
+    if key not in limits:
+        return ""
+    target, limit = row.get(f"target_{key}", -math.inf), limits[key]
+    if target <= limit:
+        return f"/{limit * scale:g}"
+    if target > row.get(f"estimate_{key}", math.inf):
+        return " (no limit yet)"
+    return f"/target {target * scale:.3g}"
+
+
+def outcome_line(
+    table: Mapping[str, Sequence[float]], limits: Mapping[str, float], episode_length: int
+) -> str:
+    """One line on how a run ended: return and costs over its last epochs.
+
+    Args:
+        table: Columns of the run's table.
+        limits: Cost key -> d, undiscounted cost per episode.
+        episode_length: Largest number of steps of an episode.
+
+    Examples:
+        >>> table = {"steps": [1000, 2000], "time_total": [2.0, 4.0], "cost_rate": [0.03, 0.03]}
+        >>> table |= {"episode_return": [1.0, 2.0], "episode_cost": [30.0, 20.0]}
+        >>> outcome_line(table, {"cost": 25.0}, 1000)
+        'Return 1.50, cost 25.0 (limit 25) per episode, mean of steps 1 to 2,000; 500 steps/s'
+    """
+    keys = list(limits) or ["cost"]
+    final = final_figures(table, keys)
+    rows = final_rows(table)
+    if rows:
+        begin = 0 if rows[0] == 0 else table["steps"][rows[0] - 1]
+        what = f"Return {final['episode_return']:.2f}"
+        values = {key: _final_cost(final, key, limits.get(key)) for key in keys}
+        over = f"per episode, mean of steps {begin + 1:,.0f} to {table['steps'][rows[-1]]:,.0f}"
+        scale = 1.0
+    else:
+        scale = _RATE_STEPS / episode_length
+        what = f"No episode of {episode_length:,} steps has ended"
+        values = {key: f"{_RATE_STEPS * final[f'{key}_rate']:.1f}" for key in keys}
+        over = f"per {_RATE_STEPS:,} steps"
+    for key, value in values.items():
+        limit = f" (limit {limits[key] * scale:g})" if key in limits else ""
+        what += f", {key} {value}{limit}"
+    return f"{what} {over}; {final['steps_per_second']:,.0f} steps/s"
+
+
+def _final_cost(final: Mapping[str, float], key: str, limit: float | None) -> str:
+    mean, own = final[f"episode_{key}"], measured(final, key, limit)
+    differs = abs(own - mean) > 0.05
+    return f"{mean:.1f}" + (f", what is limited {own:.1f}" if differs else "")
