@@ -17,7 +17,7 @@ from safe_rl.cli.grammar import CommandLineError, parse
 from safe_rl.cli.settings import check_settings, plain
 from safe_rl.cli.suggestions import nobody_reads
 from safe_rl.cli.user_code import check_imports, note_imports
-from safe_rl.runs.files import read_config, read_yaml
+from safe_rl.files import read_config, read_yaml
 from safe_rl.runs.folder import RunFolder
 from safe_rl.runs.identity import role_of
 

@@ -16,7 +16,7 @@ from typing import Any
 from safe_rl import envs
 from safe_rl.envs import ConfigError
 from safe_rl.envs.safety_gym.robots import copy_robot, fingerprint, is_robot, own_robot
-from safe_rl.runs.files import replace_text
+from safe_rl.files import replace_text
 from safe_rl.runs.folder import RunFolder
 
 __all__ = ["keep_robot", "maker_of", "robot_of"]

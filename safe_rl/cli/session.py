@@ -35,8 +35,8 @@ from safe_rl.envs import ConfigError, ContractError, LayoutError, complete_env, 
 from safe_rl.evaluation.during import PeriodicEvaluation
 from safe_rl.evaluation.layouts import default_seed, has_fixed_layout
 from safe_rl.evaluation.loading import transforms_of
+from safe_rl.files import replacing
 from safe_rl.runs.checkpoints import is_finished
-from safe_rl.runs.files import replacing
 from safe_rl.runs.folder import RunFolder, lock_folder
 from safe_rl.runs.identity import check_same_run
 from safe_rl.runs.table import TableError

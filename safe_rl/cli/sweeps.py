@@ -23,9 +23,9 @@ from omegaconf import DictConfig
 from tqdm import tqdm
 
 from safe_rl.cli.user_code import import_modules, imported
+from safe_rl.files import read_config, replace_text
 from safe_rl.processes import end_with_parent
 from safe_rl.runs.display import shown
-from safe_rl.runs.files import read_config, replace_text
 from safe_rl.runs.folder import RunFolder, RunInUseError
 from safe_rl.runs.table import last_row
 

@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import shutil
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
+
+from safe_rl.files import check_no_links, read_bounded, read_json
 
 __all__ = ["PARTIAL", "Recording", "StepRecorder", "read_recording"]
 
@@ -55,7 +58,14 @@ class Recording:
         self._keys = ["observation", "action", *(("next", key) for key in following)]
 
     def begin(self, number: int = 0) -> None:
-        """Remove what is there of an earlier recording, from a batch on."""
+        """Remove what is there of an earlier recording, from a batch on.
+
+        Raises:
+            ValueError: If the folder is a link, or holds links: others' files could be removed.
+        """
+        if self.folder.is_symlink():
+            raise ValueError(f"{self.folder} is a link: a recording is written to a folder.")
+        check_no_links(self.folder)
         for path in self.folder.glob(f"{_UNFINISHED}*"):  # of a run that was killed
             shutil.rmtree(path)
         for path in _pieces(self.folder):
@@ -177,11 +187,42 @@ def read_recording(folder: Path | str) -> TensorDict:
 
 
 def _read(place: Path) -> TensorDict:
-    """A batch in main memory: its tensors, because other objects could make code run."""
+    """A batch in main memory, read from what `TensorDict.memmap` has written.
+
+    Not by `TensorDict.load_memmap`, which opens files for writing and lengthens one that is too
+    short, with zeros.
+    """
     try:
-        return TensorDict.load_memmap(str(place), allow_pickle=False).clone()
-    except RuntimeError as error:
-        raise ValueError(f"{place} cannot be read as steps of a run: {error}") from error
+        check_no_links(place)
+        return _read_entries(place)
+    except (AttributeError, KeyError, TypeError, ValueError, OSError, RuntimeError) as error:
+        reason = f"{type(error).__name__} {error}" if isinstance(error, KeyError) else error
+        raise ValueError(f"{place} cannot be read as steps of a run: {reason}") from error
+
+
+def _read_entries(place: Path) -> TensorDict:
+    notes = read_json(place / "meta.json")
+    entries: dict[str, Any] = {}
+    for name, note in notes.items():
+        if Path(name).name != name:
+            raise ValueError(f"meta.json names an entry {name!r}")
+        if isinstance(note, dict) and note.get("type") == "TensorDict":
+            entries[name] = _read_entries(place / name)
+        elif isinstance(note, dict) and "type" in note:
+            raise ValueError(f"its entry {name!r} is no tensor")
+        elif isinstance(note, dict):
+            entries[name] = _read_tensor(place / f"{name}.memmap", note)
+    return TensorDict(entries, batch_size=notes["shape"])
+
+
+def _read_tensor(path: Path, note: Mapping[str, Any]) -> Tensor:
+    dtype = getattr(torch, str(note["dtype"]).removeprefix("torch."))
+    shape = torch.Size(note["shape"])
+    size = shape.numel() * dtype.itemsize
+    content = read_bounded(path, size)
+    if len(content) < size:
+        raise ValueError(f"{path.name} has {len(content):,} bytes of {size:,}")
+    return torch.frombuffer(bytearray(content), dtype=dtype).reshape(shape)
 
 
 def _pieces(folder: Path) -> list[Path]:

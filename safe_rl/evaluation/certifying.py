@@ -19,7 +19,7 @@ from torchrl.envs import EnvBase
 from safe_rl.evaluation.episodes import Episodes, collect_episodes
 from safe_rl.evaluation.layouts import default_seed, has_fixed_layout
 from safe_rl.evaluation.loading import for_evaluation, load_config, load_policy, override_env
-from safe_rl.runs.files import replace_text, replacing
+from safe_rl.files import check_no_links, replace_text, replacing
 from safe_rl.runs.folder import RunFolder, checkpoint_steps, checkpoints_in
 from safe_rl.scores.certificate import Claim, Verdict, first_certified, rank
 
@@ -123,6 +123,7 @@ def certify(
     """
     config = load_config(directory)
     folder = RunFolder(directory)
+    check_no_links(directory)
     candidates = _candidates(folder)
     limits = {key: float(limit) for key, limit in config.cost_limits.items()}
     if not limits or not candidates:

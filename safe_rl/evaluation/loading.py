@@ -15,9 +15,9 @@ from torchrl.envs import EnvBase
 
 from safe_rl.algorithms.parts import find_recipe
 from safe_rl.evaluation.env_keys import check_env_keys
+from safe_rl.files import read_config
 from safe_rl.naming import did_you_mean
 from safe_rl.runs.checkpoints import CheckpointStore, best_checkpoint
-from safe_rl.runs.files import read_config
 from safe_rl.runs.folder import KINDS, RunFolder
 
 __all__ = [

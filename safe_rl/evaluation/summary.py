@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from safe_rl.evaluation.episodes import Episodes
-from safe_rl.runs.files import check_place, replace_csv, replace_text
+from safe_rl.files import check_no_links, check_place, replace_csv, replace_text
 from safe_rl.scores.intervals import Estimate, cvar, mean, share_over
 from safe_rl.scores.normalised import normalised_return, normalised_violation
 from safe_rl.scores.published import Scores
@@ -21,12 +21,14 @@ __all__ = [
 
 
 def check_places(places: Iterable[Path]) -> None:
-    """Refuse files that cannot be written, before any episode.
+    """Refuse files in a run's folder that cannot be written, before any episode.
 
     Raises:
         OSError: If one cannot be.
+        ValueError: If the folder holds links.
     """
     for place in places:
+        check_no_links(place.parent)
         check_place(place, "A run's evaluations lie in its folder: evaluate a copy of that.")
 
 

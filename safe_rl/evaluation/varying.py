@@ -26,7 +26,7 @@ from safe_rl.evaluation.loading import (
 from safe_rl.evaluation.settings import EvaluationOptions, check_options
 from safe_rl.evaluation.summary import check_places, summarise
 from safe_rl.evaluation.variations import TransformNode, Variation, varied
-from safe_rl.runs.files import replace_csv
+from safe_rl.files import replace_csv
 from safe_rl.runs.folder import RunFolder, checkpoint_steps
 from safe_rl.scores.intervals import Estimate
 

@@ -15,7 +15,7 @@ from torchrl.envs import EnvBase
 
 from safe_rl.evaluation.episodes import exploration
 from safe_rl.extras import import_extra
-from safe_rl.runs.files import replacing
+from safe_rl.files import replacing
 
 __all__ = ["MANNERS", "Manner", "check_camera", "manner_of", "record_episode", "write_video"]
 

@@ -21,8 +21,8 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from safe_rl.extras import import_extra
+from safe_rl.files import read_bounded, read_json, replace_text, replacing
 from safe_rl.reporting.tables import clean
-from safe_rl.runs.files import read_bounded, read_json, replace_text, replacing
 from safe_rl.runs.folder import checkpoint_steps
 
 __all__ = [

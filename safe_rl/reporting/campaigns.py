@@ -15,9 +15,9 @@ from itertools import product
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from safe_rl.files import read_yaml
 from safe_rl.reporting.recorded import Run
 from safe_rl.reporting.tables import MISSING, Column, Table, clean
-from safe_rl.runs.files import read_yaml
 from safe_rl.runs.folder import paths_below
 from safe_rl.runs.identity import flatten, role_of
 

@@ -15,10 +15,10 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
+from safe_rl.files import replacing
 from safe_rl.reporting.experiments import Experiment
 from safe_rl.reporting.slates import SYMBOLS, Aggregate
 from safe_rl.reporting.tables import Record, span
-from safe_rl.runs.files import replacing
 from safe_rl.scores.comparisons import pareto_front, performance_profile
 from safe_rl.scores.intervals import Estimate
 from safe_rl.scores.published import ALGORITHMS

@@ -16,6 +16,7 @@ import yaml
 from matplotlib.figure import Figure
 
 from safe_rl.extras import import_extra
+from safe_rl.files import check_no_links, replace_text
 from safe_rl.reporting.campaigns import campaign_tables
 from safe_rl.reporting.curves import draw_learning_curves
 from safe_rl.reporting.experiments import Experiment, group_runs
@@ -49,7 +50,6 @@ from safe_rl.reporting.slates import (
     title_of_slate,
 )
 from safe_rl.reporting.tables import SYMBOL, Column, Record, Table, clean, escaped
-from safe_rl.runs.files import replace_text
 from safe_rl.scores.benchmark import Suite
 
 __all__ = ["Block", "Drawing", "Film", "Report", "Section", "build_report", "write_report"]
@@ -244,6 +244,7 @@ def write_report(report: Report, out: Path, title: str) -> Path:
     """
     jinja2 = import_extra("jinja2", "report")
     out.mkdir(parents=True, exist_ok=True)
+    check_no_links(out)
     place = _places(out)
     context = {
         "title": clean(title),

@@ -16,10 +16,10 @@ from typing import Any
 
 import numpy as np
 
+from safe_rl.files import read_config, read_json, read_yaml
 from safe_rl.reporting import archive as archives
 from safe_rl.reporting.archive import Recorded, read_certificate, read_code, read_evaluation
 from safe_rl.reporting.tables import clean
-from safe_rl.runs.files import read_config, read_json, read_yaml
 from safe_rl.runs.folder import RunFolder, paths_below, runs_below
 from safe_rl.runs.outcome import final_figures, judges_another_measure, violation
 from safe_rl.runs.table import read_table

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from safe_rl.extras import import_extra
-from safe_rl.runs.files import replace_text
+from safe_rl.files import replace_text
 
 __all__ = [
     *("MISSING", "SYMBOL", "Cell", "Column", "Record", "Table", "clean", "each_cost", "escaped"),

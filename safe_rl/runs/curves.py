@@ -12,7 +12,7 @@ from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.ticker import EngFormatter
 from matplotlib.transforms import ScaledTranslation
 
-from safe_rl.runs.files import replacing
+from safe_rl.files import replacing
 from safe_rl.runs.outcome import final_width, judges_another_measure
 
 __all__ = ["draw_learning_curves", "moving_mean", "point_marker"]

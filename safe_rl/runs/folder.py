@@ -17,6 +17,8 @@ from pathlib import Path
 
 from filelock import FileLock, SoftFileLease, Timeout
 
+from safe_rl.files import check_no_links
+
 __all__ = [
     "KINDS",
     "RunFolder",
@@ -260,6 +262,7 @@ def lock_folder(folder: RunFolder) -> Iterator[None]:
 
     Raises:
         RunInUseError: If another process holds it.
+        ValueError: If the folder holds links, by which others could have chosen what is written.
 
     Examples:
         >>> import tempfile
@@ -274,6 +277,7 @@ def lock_folder(folder: RunFolder) -> Iterator[None]:
     if _held.get(place) == os.getpid():
         yield
         return
+    check_no_links(folder.directory)
     lease = SoftFileLease(folder.lease, lease_duration=LEASE, thread_local=False)
     with ExitStack() as stack:
         try:

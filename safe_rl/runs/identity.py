@@ -13,7 +13,7 @@ from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
 
-from safe_rl.runs.files import read_config
+from safe_rl.files import read_config
 from safe_rl.runs.folder import RunFolder, common_source
 from safe_rl.targets import present_name
 

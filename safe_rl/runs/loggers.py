@@ -15,8 +15,8 @@ from torchrl.record.loggers.tensorboard import TensorboardLogger as TorchRLTenso
 from torchrl.record.loggers.wandb import WandbLogger as TorchRLWandbLogger
 
 from safe_rl.extras import import_extra, needs_extra
+from safe_rl.files import replace_text
 from safe_rl.ranges import Text
-from safe_rl.runs.files import replace_text
 from safe_rl.runs.folder import RunFolder
 
 __all__ = ["MLflowLogger", "TensorboardLogger", "WandbLogger"]
@@ -29,6 +29,9 @@ class TensorboardLogger(TorchRLTensorboardLogger):
         exp_name: Folder of the event files, below ``log_dir``.
         log_dir: Folder of the run.
 
+    Raises:
+        ValueError: If ``exp_name`` leads elsewhere.
+
     Examples:
         >>> import tempfile
         >>> logger = TensorboardLogger(exp_name="tensorboard", log_dir=tempfile.mkdtemp())
@@ -38,6 +41,8 @@ class TensorboardLogger(TorchRLTensorboardLogger):
     """
 
     def __init__(self, exp_name: Text, log_dir: str) -> None:
+        if Path(exp_name).name != exp_name:
+            raise ValueError(f"logger.exp_name={exp_name}: it names a folder in that of the run.")
         super().__init__(exp_name, log_dir)
 
     def continue_from(self, step: int) -> None:

@@ -15,8 +15,8 @@ from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
 
+from safe_rl.files import read_json, replace_text, replacing
 from safe_rl.runs.display import ProgressBar, outcome_line
-from safe_rl.runs.files import read_json, replace_text, replacing
 from safe_rl.runs.folder import RunFolder, lock_folder
 from safe_rl.runs.table import TableWriter, read_table
 from safe_rl.targets import build

@@ -8,7 +8,7 @@ import math
 from collections.abc import Mapping
 from pathlib import Path
 
-from safe_rl.runs.files import read_bounded, replace_text
+from safe_rl.files import read_bounded, replace_text
 
 __all__ = ["TableError", "TableWriter", "last_row", "read_table"]
 

@@ -23,8 +23,8 @@ from safe_rl.algorithms.contract import Algorithm
 from safe_rl.algorithms.parts import find_recipe
 from safe_rl.collectors import Recording, WorkerCollector, make_collector
 from safe_rl.collectors.worker_rows import MakeEnv
+from safe_rl.files import read_config
 from safe_rl.runs.checkpoint_file import part_names, read_states
-from safe_rl.runs.files import read_config
 from safe_rl.runs.folder import RunFolder, run_of
 from safe_rl.runs.record import RunRecord
 from safe_rl.targets import build

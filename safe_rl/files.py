@@ -1,4 +1,8 @@
-"""Files of a run: read without trusting them, written in one go."""
+"""Files of a run: read without trusting them, written in one go.
+
+Directly in `safe_rl`, because collectors write recordings and runs, evaluation and reporting all
+else.
+"""
 
 from __future__ import annotations
 
@@ -6,16 +10,17 @@ import csv
 import json
 import os
 import re
+import secrets
 from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
 import yaml
 
 __all__ = [
-    *("check_place", "read_bounded", "read_config", "read_json", "read_yaml", "replace_csv"),
-    *("replace_text", "replacing"),
+    *("check_no_links", "check_place", "read_bounded", "read_config", "read_json", "read_yaml"),
+    *("replace_csv", "replace_text", "replacing"),
 ]
 
 # Bytes of a configuration or of notes; those of a run have about ten thousand.
@@ -74,7 +79,7 @@ def read_bounded(path: Path, most: int = _MOST_BYTES) -> bytes:
     if not path.is_file() and path.exists():
         raise ValueError(f"{path.name} is no regular file")
     with path.open("rb") as file:
-        content = file.read(most + 1)
+        content = file.read(min(most, os.fstat(file.fileno()).st_size) + 1)
     if len(content) > most:
         raise ValueError(f"{path.name} has more than {most:,} bytes")
     return content
@@ -171,12 +176,15 @@ def replacing(path: Path) -> Iterator[Path]:
         >>> path.read_text()
         '1,2'
     """
-    unfinished = path.with_name(f".{path.stem}.unfinished{path.suffix}")
+    unfinished = path.with_name(f".{path.stem}.{secrets.token_hex(8)}{path.suffix}")
+    # a new file: nobody could have put a link in its place, to have another one overwritten
+    os.close(os.open(unfinished, os.O_CREAT | os.O_EXCL | os.O_WRONLY | os.O_NOFOLLOW, 0o666))
     try:
         yield unfinished
         unfinished.replace(path)
     finally:
-        unfinished.unlink(missing_ok=True)
+        with suppress(OSError):  # where its folder is gone, that is the error to report
+            unfinished.unlink(missing_ok=True)
 
 
 def replace_text(path: Path, text: str) -> None:
@@ -189,6 +197,34 @@ def replace_csv(path: Path, rows: Iterable[Iterable[Any]]) -> None:
     """Write a CSV file, its header being the first of the rows, by :func:`replacing`."""
     with replacing(path) as unfinished, unfinished.open("w", newline="", encoding="utf-8") as file:
         csv.writer(file, lineterminator="\n").writerows(rows)
+
+
+def check_no_links(folder: Path) -> None:
+    """Refuse a folder that holds links: what is written or removed there could lie anywhere.
+
+    The folder itself may be reached by a link. ``wandb/`` may hold links, which Weights & Biases
+    makes itself; nothing else writes there.
+
+    Raises:
+        ValueError: Naming the first link.
+
+    Examples:
+        >>> folder = getfixture("tmp_path")
+        >>> (folder / "transitions").symlink_to("/etc")
+        >>> check_no_links(folder)  # doctest: +ELLIPSIS
+        Traceback (most recent call last):
+        ...
+        ValueError: .../transitions is a link: nothing is written or removed where links could ...
+    """
+    for place, folders, files in os.walk(folder):
+        link = next((n for n in (*folders, *files) if os.path.islink(Path(place, n))), None)
+        if link is not None:
+            raise ValueError(
+                f"{Path(place, link)} is a link: nothing is written or removed where links could "
+                "lead out of the folder. Replace it by what it points to, or remove it."
+            )
+        if "wandb" in folders and Path(place) == folder:
+            folders.remove("wandb")
 
 
 def check_place(path: Path, otherwise: str) -> None:

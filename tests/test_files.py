@@ -7,8 +7,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from omegaconf import OmegaConf
 
+from safe_rl.files import read_bounded, read_config, read_json, read_yaml, replacing
 from safe_rl.runs import table
-from safe_rl.runs.files import read_bounded, read_config, read_json, read_yaml, replacing
 from safe_rl.runs.folder import paths_below, runs_below
 
 VALUES = st.recursive(
