@@ -14,20 +14,21 @@ from safe_rl.runs.table import read_table
 IN_A_TERMINAL = """
 import fcntl, signal, sys, termios
 # what ran the tests may ignore it, as nohup does, and a process inherits that
-signal.signal(signal.SIGHUP, signal.SIG_DFL)
+signal.signal(signal.SIGHUP, getattr(signal, sys.argv.pop(1)))
 from safe_rl.cli.train import main
 fcntl.ioctl(0, termios.TIOCSCTTY, 0)
 sys.exit(main())
 """
-SMALL = ["env=PointGoal1", "algo=ppo_lagrangian", "frames=1_000_000", "logger=none", "num_envs=2",
+SMALL = ["env=PointGoal1", "algo=ppo_lagrangian", "logger=none", "num_envs=2",
          "frames_per_batch=200", "env.num_steps=50", "model.hidden_sizes=[8]"]  # fmt: skip
 
 
-def test_training_ends_after_the_epoch_with_a_checkpoint(tmp_path):
+def close_terminal(run, manner, *settings):
+    """Start a run in a terminal, close that after the first epoch; returns the exit status."""
     near, far = pty.openpty()
     termios.tcsetwinsize(near, (24, 160))
     process = subprocess.Popen(
-        [sys.executable, "-c", IN_A_TERMINAL, *SMALL, f"hydra.run.dir={tmp_path / 'run'}"],
+        [sys.executable, "-c", IN_A_TERMINAL, manner, *SMALL, *settings, f"hydra.run.dir={run}"],
         stdin=far, stdout=far, stderr=far, start_new_session=True, cwd=Path(__file__).parents[2],
     )  # fmt: skip
     os.close(far)
@@ -37,10 +38,25 @@ def test_training_ends_after_the_epoch_with_a_checkpoint(tmp_path):
             assert select.select([near], [], [], 300)[0], shown
             shown += os.read(near, 4096)
         os.close(near)
-        assert process.wait(300) == 128 + signal.SIGHUP
+        return process.wait(300)
     finally:
         process.kill()
         process.wait()
+
+
+def test_training_ends_after_the_epoch_with_a_checkpoint(tmp_path):
+    status = close_terminal(tmp_path / "run", "SIG_DFL", "frames=1_000_000")
+    assert status == 128 + signal.SIGHUP
     epochs = len(read_table(tmp_path / "run" / "progress.csv")["epoch"])
     *_, last = sorted((tmp_path / "run" / "checkpoints" / "last").iterdir())
     assert last.name == f"checkpoint-{200 * epochs:012d}.torchrl"
+
+
+def test_a_run_that_ignores_the_signal_is_certified(tmp_path):
+    """Printing the outcome into the terminal that is gone ended it with status 1."""
+    test = ["certificate.episodes=2", "certificate.ranking=2", "certificate.tests=1"]
+    run = tmp_path / "run"
+    limit = "cost_limits={cost: 1000}"
+    assert close_terminal(run, "SIG_IGN", "frames=2_000", limit, *test) == 0
+    assert len(read_table(run / "progress.csv")["epoch"]) == 10
+    assert (run / "certificate.json").is_file()
