@@ -42,13 +42,14 @@ def stl() -> bytes:
     return bytes(80) + struct.pack("<I", len(rows)) + b"".join(rows)
 
 
-def write_robot(folder, meshes="../meshes", density=1):
-    for name in ("robot/parts", "meshes"):
+def write_robot(folder, meshes="meshes", density=1):
+    for name in ("robot/parts", "robot/meshes", "meshes"):
         (folder / name).mkdir(parents=True, exist_ok=True)
     path = folder / "robot" / "ball.xml"
     path.write_text(ROBOT.format(meshes=meshes, density=density))
     (folder / "robot" / "parts" / "hat.xml").write_text(HAT)
-    (folder / "meshes" / "hat.stl").write_bytes(stl())
+    for place in (folder / "meshes", folder / "robot" / "meshes"):
+        (place / "hat.stl").write_bytes(stl())
     return path
 
 
@@ -76,7 +77,7 @@ def test_a_changed_robot_changes_neither_the_run_nor_its_evaluation(run, tmp_pat
     assert evaluate.main([str(folder), "episodes=2", "num_threads=1", "name=after"]) == 0
     said = capsys.readouterr().out
     notice = "robot/ball.xml has changed since the run began: using the run's copy, "
-    assert said.count(f"{notice}{folder}/robot/robot/ball.xml") == 1
+    assert said.count(f"{notice}{folder}/robot/ball.xml") == 1
     rows = [(folder / f"evaluation_{name}.csv").read_text() for name in ("before", "after")]
     assert rows[0] == rows[1]
     assert train.main([f"resume={folder}", "frames=80"]) == 0
@@ -120,15 +121,30 @@ def test_another_robot_than_the_runs_is_never_taken(run, tmp_path, capsys):
     assert evaluate.main([str(folder), "episodes=2", "num_threads=1"]) == 1
 
 
-def test_what_cannot_be_copied_is_said(run, tmp_path, capsys):
-    folder = run(meshes=tmp_path / "meshes")
+@pytest.mark.parametrize("place", ["../meshes", "{}/meshes", "linked"])
+def test_what_lies_outside_of_its_folder_is_not_copied(place, run, tmp_path, capsys):
+    """A robot of somebody else's could copy a secret into a run that is then published."""
+    (tmp_path / "robot").mkdir()
+    (tmp_path / "robot" / "linked").symlink_to(tmp_path / "meshes")
+    meshes = place.format(tmp_path)
+    folder = run(meshes=meshes)
     said = capsys.readouterr().out
-    assert "names files by absolute paths. The run keeps no copy of its robot" in said
+    assert f"{tmp_path}/meshes/hat.stl, which is outside of its own folder" in said
+    assert "The run keeps no copy of its robot" in said
     assert not (folder / "robot").exists()
     assert evaluate.main([str(folder), "episodes=2", "num_threads=1"]) == 0
-    write_robot(tmp_path, meshes=tmp_path / "meshes", density=30)
+    write_robot(tmp_path, meshes=meshes, density=30)
     assert evaluate.main([str(folder), "episodes=2", "num_threads=1"]) == 1
     assert "has changed since the run began, and" in capsys.readouterr().err
+
+
+def test_only_what_mujoco_loads_is_copied(run, tmp_path):
+    """Names were looked for in every folder of assets, where a secret of that name could lie."""
+    (tmp_path / "robot" / "textures").mkdir(parents=True)
+    (tmp_path / "robot" / "textures" / "hat.stl").write_text("secret")
+    folder = run(meshes='meshes" texturedir="textures')
+    copied = {str(path.relative_to(folder)) for path in folder.glob("robot/**/*.*")}
+    assert copied == {"robot/ball.xml", "robot/meshes/hat.stl", "robot/parts/hat.xml"}
 
 
 def test_bundled_robots_need_no_copy(run):

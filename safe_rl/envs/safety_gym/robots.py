@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import hashlib
 import math
-import os
 import shutil
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
@@ -27,7 +26,6 @@ from safe_rl.envs.errors import ConfigError, nearest
 
 MOST_ELEMENTS = 100_000  # with all copies that are asked for
 MOST_CELLS = 1 << 24  # of a height field or a texture
-_FOLDERS = ("assetdir", "meshdir", "texturedir")
 _CELLS = (("nrow", "ncol"), ("width", "height"))
 
 
@@ -51,7 +49,8 @@ def robot_files(path: Path) -> list[Path]:
         ConfigError: if one cannot be read, or asks for too much.
     """
     found: dict[Path, int] = {}
-    if _weigh(path, [path.parent], found) > MOST_ELEMENTS:
+    folders = dict.fromkeys(("mesh", "texture"), path.parent)
+    if _weigh(path, path.parent, folders, found) > MOST_ELEMENTS:
         raise _refused(path, f"describes more than {MOST_ELEMENTS:,} elements: 'count' is too high")
     return list(found)
 
@@ -60,10 +59,15 @@ def _refused(path: Path, what: str) -> ConfigError:
     return ConfigError(f"'robot_base': {path} {what}.")
 
 
-def _weigh(path: Path, folders: list[Path], found: dict[Path, int]) -> float:
+def _weigh(path: Path, home: Path, folders: dict[str, Path], found: dict[Path, int]) -> float:
     """Number of elements of a file with its copies; notes the files that it names.
 
-    The first folder is that of the robot's own file, from which all paths go.
+    Args:
+        path: the file.
+        home: folder of the robot's own file, from which all paths go.
+        folders: where MuJoCo looks for textures, and for meshes and the like; what is included
+            finds its files where those that include it do.
+        found: the files, in which those of this one are noted.
     """
     if path in found:
         return 0
@@ -73,32 +77,34 @@ def _weigh(path: Path, folders: list[Path], found: dict[Path, int]) -> float:
     except (ElementTree.ParseError, OSError, ValueError, RecursionError) as error:
         message = f"'robot_base': MuJoCo cannot load {path}: {error}"
         raise ConfigError(message) from error
-    # what is included finds its files where those that include it do
-    folders = list(dict.fromkeys([*folders, *_asset_folders(root, folders[0])]))
-    return _weight(root, path, folders, found)
-
-
-def _asset_folders(root: ElementTree.Element, home: Path) -> Iterator[Path]:
     for compiler in root.iter("compiler"):
-        for key in _FOLDERS:
-            if key in compiler.attrib:
-                yield home / compiler.attrib[key]
+        for kind in folders:
+            place = compiler.get(f"{kind}dir", compiler.get("assetdir"))
+            folders = folders if place is None else {**folders, kind: home / place}
+
+    def weight(element: ElementTree.Element) -> float:
+        """Number of elements that one stands for, itself and copies included."""
+        for pair in _CELLS:
+            if math.prod(_number(element.get(key, "1")) for key in pair) > MOST_CELLS:
+                raise _refused(path, f"has a '{element.tag}' with too large {' and '.join(pair)}")
+        inside = 1 + sum(map(weight, element))
+        for file in _files(element, home, folders):
+            if file.suffix == ".xml":
+                inside += _weigh(file, home, folders, found)
+            else:
+                found.setdefault(file, 1)
+        return inside * max(1.0, math.prod(map(_number, element.get("count", "1").split())))
+
+    return weight(root)
 
 
-def _weight(
-    element: ElementTree.Element, path: Path, folders: list[Path], found: dict[Path, int]
-) -> float:
-    """Number of elements that one stands for, itself and copies included."""
-    for pair in _CELLS:
-        if math.prod(_number(element.get(key, "1")) for key in pair) > MOST_CELLS:
-            raise _refused(path, f"has a '{element.tag}' with too large {' and '.join(pair)}")
-    inside = 1 + sum(_weight(child, path, folders, found) for child in element)
-    for file in [folder / element.get("file", "") for folder in folders if element.get("file")]:
-        if file.is_file() and file.suffix == ".xml":
-            inside += _weigh(file, folders, found)
-        elif file.is_file():
-            found.setdefault(file, 1)
-    return inside * max(1.0, math.prod(map(_number, element.get("count", "1").split())))
+def _files(element: ElementTree.Element, home: Path, folders: Mapping[str, Path]) -> Iterator[Path]:
+    """The files that an element names, where MuJoCo looks for them."""
+    is_xml = element.tag in ("include", "model")
+    folder = home if is_xml else folders["texture" if element.tag == "texture" else "mesh"]
+    for name, value in element.attrib.items():
+        if name.startswith("file") and (folder / value).is_file():
+            yield folder / value
 
 
 def _number(text: str) -> float:
@@ -278,22 +284,27 @@ def copy_robot(path: Path, folder: Path) -> Path:
         The MJCF file of the copy.
 
     Raises:
-        ConfigError: if the copy is another robot, or none, because it finds its files by absolute
-            paths for instance; or if the files are too large.
+        ConfigError: if it names files that do not lie in its own folder or below, or the files are
+            too large.
         OSError: if they cannot be copied.
     """
-    files = [_absolute(file) for file in robot_files(path)]
+    home = path.parent.resolve()
+    # the robot's own file may be reached by a link, others only where they are
+    files = {home / path.name, *(file.resolve() for file in robot_files(path) if file != path)}
+    for outside in (file for file in files if not file.is_relative_to(home)):
+        raise ConfigError(
+            f"'robot_base': {path} names {outside}, which is outside of its own folder, {home}."
+        )
     size = sum(file.stat().st_size for file in files)
     if size > MOST_BYTES:
         raise ConfigError(f"'robot_base': the files of {path} have {size / 1e6:,.0f} MB.")
-    home = Path(os.path.commonpath([file.parent for file in files]))
     for file in files:
         copy = folder / file.relative_to(home)
         copy.parent.mkdir(parents=True, exist_ok=True)
         shutil.copyfile(file, copy)
-    copy = folder / _absolute(path).relative_to(home)
+    copy = folder / path.name
     if not is_robot(copy, folder, fingerprint(path)):
-        raise ConfigError(f"'robot_base': {path} names files by absolute paths.")
+        raise ConfigError(f"'robot_base': a copy of {path} is another robot.")
     load_robot(str(copy))
     return copy
 
@@ -308,7 +319,3 @@ def is_robot(path: Path, folder: Path, content: str) -> bool:
     return fingerprint(path) == content and all(
         file.resolve().is_relative_to(inside) for file in robot_files(path)
     )
-
-
-def _absolute(path: Path) -> Path:
-    return Path(os.path.abspath(path))  # links stay what they are
