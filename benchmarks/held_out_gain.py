@@ -29,7 +29,7 @@ from train_throughput import new_env
 from safe_rl.algorithms import TRPOStep
 from safe_rl.evaluation.loading import find_checkpoint
 from safe_rl.objectives import LagrangeMultiplier, TRPOLagrangianLoss
-from safe_rl.objectives.normalisation import normalise_advantages
+from safe_rl.objectives.gae import normalise_advantages
 from safe_rl.training.building import build_trainer, seed_everything
 
 STEP = {
@@ -54,7 +54,7 @@ def collect(trainer, number: int) -> list:
     batches, found = trainer.batches(), []
     for _ in range(number):
         batch = next(batches).clone()
-        trainer.algorithm.constraints.charge(trainer.accounting.update(batch), batch)
+        trainer.algorithm.constraints.apply_risk(trainer.accounting.update(batch), batch)
         found.append(batch)
     return found
 

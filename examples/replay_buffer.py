@@ -72,7 +72,7 @@ def main(arguments: list[str] | None = None) -> list[dict[str, float]]:
     for batch in collector:
         episodes = accounting.update(batch)
         if episodes.num_episodes:
-            multiplier.update(episodes.mean_costs(["cost"]))
+            multiplier.update(episodes.mean_costs(["cost"]) - multiplier.limits)
         buffer.extend(batch.reshape(-1))
         for _ in range(args.updates_per_batch):
             losses = loss(buffer.sample())

@@ -20,7 +20,7 @@ from torchrl.envs.utils import ExplorationType
 from torchrl.modules import IndependentNormal, OneHotCategorical, ProbabilisticActor, TanhNormal
 from torchrl.modules import TruncatedNormal as TorchRLTruncatedNormal
 
-from safe_rl.models.distributions import Choices
+from safe_rl.models.action_distributions import Choices
 from safe_rl.models.heads import _Components
 
 

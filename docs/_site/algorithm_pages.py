@@ -91,7 +91,7 @@ def _snippet(config: DictConfig) -> str:
         target, arguments = parts["lagrangian"]
         targets.append(target)
         lines.append(f"multiplier = {_call(target, arguments, ('limits',))}")
-        known = "    multiplier.update(mean_costs)\n"
+        known = "    multiplier.update(mean_costs - multiplier.limits)\n"
     elif "constraints" in names:
         targets.append("safe_rl.algorithms.Constraints")
         lines.append("constraints = Constraints(limits)")

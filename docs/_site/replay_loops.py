@@ -73,7 +73,8 @@ def loop(
         targets="" if tau is None else f"targets = SoftUpdate(loss, tau={tau})\n",
         lr=lr,
         given=", mean_costs" if "multiplier=multiplier" in first else "",
-        moved="    multiplier.update(mean_costs)  # undiscounted, of the episodes that ended\n"
+        moved="    # undiscounted, of the episodes that ended\n"
+        "    multiplier.update(mean_costs - multiplier.limits)\n"
         if "multiplier=multiplier" in first
         else "",
         follow="" if tau is None else "\n        targets.step()",

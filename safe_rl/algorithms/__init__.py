@@ -1,19 +1,17 @@
 """What moves parameters: recipes, updates, trust-region steps, and building them."""
 
+from safe_rl.algorithms.algorithm_contract import Algorithm, PolicyUpdate, Recipe
 from safe_rl.algorithms.c_trpo_step import CTRPOStep
 from safe_rl.algorithms.constraints import Constraints
-from safe_rl.algorithms.contract import Algorithm, PolicyUpdate, Recipe
-from safe_rl.algorithms.cpo_step import CPOStep
+from safe_rl.algorithms.cpo_step import CPOStep, PCPOStep
 from safe_rl.algorithms.crpo_step import CRPOStep
-from safe_rl.algorithms.in_turn import UpdatesInTurn
-from safe_rl.algorithms.learning_rate import KLAdaptiveRate
 from safe_rl.algorithms.matrix_products import fast_products
-from safe_rl.algorithms.memory import Memory
-from safe_rl.algorithms.minibatch import MinibatchUpdate
+from safe_rl.algorithms.minibatch import KLAdaptiveRate, MinibatchUpdate
 from safe_rl.algorithms.off_policy import OffPolicy
 from safe_rl.algorithms.on_policy import OnPolicy
-from safe_rl.algorithms.pcpo_step import PCPOStep
+from safe_rl.algorithms.replay_buffer import Memory
 from safe_rl.algorithms.replay_update import ReplayUpdate
+from safe_rl.algorithms.sequential_updates import SequentialUpdates
 from safe_rl.algorithms.trust_region_step import TRPOStep
 
 __all__ = [
@@ -31,7 +29,7 @@ __all__ = [
     "PolicyUpdate",
     "Recipe",
     "ReplayUpdate",
+    "SequentialUpdates",
     "TRPOStep",
-    "UpdatesInTurn",
     "fast_products",
 ]

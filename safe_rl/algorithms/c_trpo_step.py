@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import Any
 
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from safe_rl.algorithms.trust_region_step import Proposal, TRPOStep, total_loss
+from safe_rl.algorithms.trust_region_step import Loss, Proposal, TRPOStep, total_loss
 from safe_rl.objectives.fisher import FisherProduct
 from safe_rl.objectives.multipliers import CostLimits, parse_cost_limits
 from safe_rl.objectives.trust_region import flat_gradient
@@ -93,7 +93,7 @@ class CTRPOStep(TRPOStep):
 
     def __init__(
         self,
-        loss: Callable[[TensorDictBase], TensorDictBase],
+        loss: Loss,
         cost_limits: CostLimits,
         *,
         beta: NotNegative,

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any
 
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from safe_rl.algorithms.trust_region_step import Proposal, TRPOStep
+from safe_rl.algorithms.trust_region_step import Loss, Proposal, TRPOStep
 from safe_rl.objectives.fisher import FisherProduct
 from safe_rl.objectives.violation import matched_violation
 from safe_rl.ranges import NotNegative
@@ -50,7 +49,7 @@ class CRPOStep(TRPOStep):
 
     def __init__(
         self,
-        loss: Callable[[TensorDictBase], TensorDictBase],
+        loss: Loss,
         *,
         tolerance: NotNegative,
         **settings: Any,

@@ -9,7 +9,7 @@ from tensordict import NestedKey, TensorDictBase
 from torchrl.data import TensorSpec
 from torchrl.envs import EnvBase
 
-from safe_rl.algorithms.memory import Memory
+from safe_rl.algorithms.replay_buffer import Memory
 from safe_rl.collectors import read_dataset, safe_episodes
 
 __all__ = ["fill_memory"]

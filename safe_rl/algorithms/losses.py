@@ -1,15 +1,19 @@
-"""What a loss module returns, as updates take it: the sum that is minimised, or why there is none.
+"""What a loss module returns and holds, as updates take it.
 
 TorchRL means all entries that are named ``loss_…`` to be minimised; others are diagnostics.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Iterator, Mapping
+from itertools import chain
+from typing import Any
+
 import torch
 from tensordict import TensorDictBase
-from torch import Tensor
+from torch import Tensor, nn
 
-__all__ = ["ESTIMATOR", "divergence", "sum_of_losses"]
+__all__ = ["ESTIMATOR", "LossState", "divergence", "sum_of_losses"]
 
 ESTIMATOR = "_value_estimator."
 """Where losses keep numbers of their value estimators, which a run that is resumed may change."""
@@ -58,3 +62,60 @@ def divergence(losses: TensorDictBase) -> FloatingPointError:
         "The step that would follow is not taken. Lower the learning rate, or look for a policy "
         "that has collapsed."
     )
+
+
+class LossState:
+    """Buffers and parameters of losses that no network and no multiplier holds.
+
+    Coefficients that TorchRL schedules (``register_coeff_buffer``) and numbers of its value
+    estimators are settings, and left out: a run that goes on may be given others.
+
+    Args:
+        losses: Losses that are modules, by place: `PolicyUpdate.loss_modules`.
+        besides: Modules whose state is kept elsewhere; losses share their tensors.
+
+    Examples:
+        >>> network, loss = torch.nn.Linear(2, 1), torch.nn.Module()
+        >>> loss.network = network
+        >>> loss.register_buffer("weight", torch.tensor(0.5))
+        >>> LossState({"loss": loss}, besides=[network]).state_dict()
+        {'loss.weight': tensor(0.5000)}
+    """
+
+    def __init__(self, losses: Mapping[str, nn.Module], besides: Iterable[nn.Module]) -> None:
+        self._losses = dict(losses)
+        self._besides = list(besides)
+
+    def __bool__(self) -> bool:
+        """Whether there is anything to keep."""
+        return bool(self._own())
+
+    def state_dict(self) -> dict[str, Tensor]:
+        """Copies, by the place of the loss and the name that it has for them."""
+        return {name: tensor.detach().clone() for name, tensor in self._own().items()}
+
+    @torch.no_grad()
+    def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
+        """Continue from :meth:`state_dict`, in place: an optimiser holds the same tensors."""
+        for name, tensor in self._own().items():
+            tensor.copy_(state_dict[name])
+
+    def _own(self) -> dict[str, Tensor]:
+        # looked up anew: a loss may put another tensor in the place of a buffer
+        known = {tensor.data_ptr() for module in self._besides for _, tensor in _tensors(module)}
+        return {
+            f"{place}.{name}": tensor
+            for place, loss in self._losses.items()
+            for name, tensor in _tensors(loss)
+            if tensor.data_ptr() not in known and not _is_setting(name, loss)
+        }
+
+
+def _tensors(module: nn.Module) -> Iterator[tuple[str, Tensor]]:
+    return chain(module.named_parameters(), module.named_buffers())
+
+
+def _is_setting(name: str, loss: nn.Module) -> bool:
+    """Whether TorchRL schedules it, by any class of the loss, or it is an estimator's."""
+    declared = (vars(kind).get("_schedulable_buffers", ()) for kind in type(loss).__mro__)
+    return name.startswith(ESTIMATOR) or name in chain.from_iterable(declared)

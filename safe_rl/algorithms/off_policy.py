@@ -14,13 +14,22 @@ from tensordict.nn import TensorDictModuleBase
 from torch import nn
 from torchrl.envs import EnvBase
 
-from safe_rl.algorithms.building import build_constraints, constrained_limits
+from safe_rl.algorithms.algorithm_contract import Algorithm, Recipe, Stateful
+from safe_rl.algorithms.build_part import (
+    build_constraints,
+    build_part,
+    build_update,
+    constrained_limits,
+)
 from safe_rl.algorithms.constraints import Constraints, check_cost_limits
-from safe_rl.algorithms.contract import Algorithm, Recipe, Stateful
 from safe_rl.algorithms.dataset import fill_memory
-from safe_rl.algorithms.memory import Memory
-from safe_rl.algorithms.parts import build_part, build_update
-from safe_rl.algorithms.replay_networks import bounded_actions, build_networks, exploring, setting
+from safe_rl.algorithms.off_policy_networks import (
+    bounded_actions,
+    build_networks,
+    exploring,
+    setting,
+)
+from safe_rl.algorithms.replay_buffer import Memory
 from safe_rl.algorithms.replay_update import ReplayUpdate
 from safe_rl.collectors import EpisodeStatistics
 from safe_rl.models import ExploringPolicy
@@ -171,8 +180,8 @@ class OffPolicy(Algorithm, Recipe):
         """
         constraints = self.constraints
         if constraints.keys:
-            constraints.charge(episodes, batch)
-            constraints.observe(episodes, batch)
+            constraints.apply_risk(episodes, batch)
+            constraints.update(episodes, batch)
             self.policy_update.loss.calibrate(constraints)
             self.policy_update.loss.measure(batch["next", "reward"])
         if self.collects:

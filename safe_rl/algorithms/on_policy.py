@@ -13,19 +13,22 @@ from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModule, T
 from torch import Tensor, nn
 from torchrl.envs import EnvBase
 
-from safe_rl.algorithms.building import build_constraints, constrained_limits
-from safe_rl.algorithms.constraints import Constraints
-from safe_rl.algorithms.contract import Algorithm, PolicyUpdate, Recipe, Stateful
-from safe_rl.algorithms.in_turn import UpdatesInTurn
-from safe_rl.algorithms.loss_state import LossState
-from safe_rl.algorithms.parts import build_part, build_update
-from safe_rl.algorithms.side_by_side import side_by_side
-from safe_rl.algorithms.tracked_constraints import CHARGES
+from safe_rl.algorithms.algorithm_contract import Algorithm, PolicyUpdate, Recipe, Stateful
+from safe_rl.algorithms.build_part import (
+    build_constraints,
+    build_part,
+    build_update,
+    constrained_limits,
+)
+from safe_rl.algorithms.constraints import CHARGES, Constraints
+from safe_rl.algorithms.losses import LossState
+from safe_rl.algorithms.parallel_updates import in_parallel
+from safe_rl.algorithms.sequential_updates import SequentialUpdates
 from safe_rl.collectors import EpisodeStatistics
 from safe_rl.models import build_networks, make_behaviour, take_in
 from safe_rl.objectives import CriticLoss
 from safe_rl.objectives.advantages import CostGAE, VectorGAE
-from safe_rl.objectives.normalisation import normalise_advantages
+from safe_rl.objectives.gae import normalise_advantages
 from safe_rl.objectives.surrogate import SurrogateLoss
 
 __all__ = ["OnPolicy"]
@@ -134,7 +137,7 @@ class OnPolicy(Algorithm, Recipe):
         Returns:
             Everything that is worth a column of the log, by column name.
         """
-        self.constraints.charge(episodes, batch)
+        self.constraints.apply_risk(episodes, batch)
         self.advantage(batch)
         keys = {"advantage": self.advantage.tensor_keys.advantage}
         if self.cost_advantage is not None:
@@ -142,9 +145,9 @@ class OnPolicy(Algorithm, Recipe):
             keys["cost_advantage"] = self.cost_advantage.tensor_keys.advantage
         normalise_advantages(batch, **keys)
         constraints = self.constraints
-        constraints.observe(episodes, batch)
+        constraints.update(episodes, batch)
         metrics = self._update(batch)
-        constraints.expect(metrics["policy"])
+        constraints.record_prediction(metrics["policy"])
         take_in(self.networks.values(), batch)
         row = constraints.columns()
         for part, values in metrics.items():
@@ -163,7 +166,7 @@ class OnPolicy(Algorithm, Recipe):
         def fit() -> Mapping[str, Tensor]:
             return self.critic_update(batch)
 
-        both = (improve(), fit()) if self._shares_critics() else side_by_side(improve, fit)
+        both = (improve(), fit()) if self._shares_critics() else in_parallel(improve, fit)
         return dict(zip(("policy", "critic"), both, strict=True))
 
     def _shares_critics(self) -> bool:
@@ -207,7 +210,7 @@ def _build_update(config: DictConfig, **parts: Any) -> PolicyUpdate:
                 f"then.{name} holds {sorted(pair)}: it needs a loss and a policy_update."
             )
     built = {str(name): _build_update(pair, **parts) for name, pair in then.items()}
-    return UpdatesInTurn(update, built) if built else update
+    return SequentialUpdates(update, built) if built else update
 
 
 def _build_networks(

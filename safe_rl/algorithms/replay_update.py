@@ -13,7 +13,7 @@ from torch.optim import Optimizer
 from torchrl.objectives import SoftUpdate
 
 from safe_rl.algorithms.losses import ESTIMATOR, divergence, sum_of_losses
-from safe_rl.algorithms.memory import Memory
+from safe_rl.algorithms.replay_buffer import Memory
 from safe_rl.naming import did_you_mean
 from safe_rl.objectives.q_functions import ReplayLoss
 from safe_rl.ranges import PART, Positive, Range

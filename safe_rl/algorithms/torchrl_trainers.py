@@ -13,8 +13,8 @@ from tensordict import TensorDict, TensorDictBase
 from torchrl.trainers import Trainer
 from torchrl.trainers.trainers import OptimizationStepper, TrainerHookBase
 
+from safe_rl.algorithms.algorithm_contract import PolicyUpdate
 from safe_rl.algorithms.constraints import Constraints
-from safe_rl.algorithms.contract import PolicyUpdate
 from safe_rl.algorithms.minibatch import MinibatchUpdate
 from safe_rl.collectors import EpisodeAccounting
 
@@ -45,7 +45,7 @@ class ConstraintHook(TrainerHookBase):
     """
 
     def __init__(self, constraints: Constraints, accounting: EpisodeAccounting) -> None:
-        if type(constraints).charge is not Constraints.charge:
+        if type(constraints).apply_risk is not Constraints.apply_risk:
             raise TypeError(
                 f"ConstraintHook takes plain Constraints, not {type(constraints).__name__}: these "
                 "put charges of their own in the place of costs before advantages are estimated, "
@@ -58,7 +58,7 @@ class ConstraintHook(TrainerHookBase):
     def __call__(self, batch: TensorDictBase) -> TensorDictBase:
         """Account for a batch [N, T] or [T]; it stays as it is."""
         episodes = self.accounting.update(batch)
-        self.constraints.observe(episodes, batch)
+        self.constraints.update(episodes, batch)
         self._row = episodes.scalars() | self.constraints.columns()
         return batch
 

@@ -12,7 +12,7 @@ from tensordict.nn import ProbabilisticTensorDictSequential
 from torch import Tensor, nn
 from torchrl.objectives import LossModule
 
-from safe_rl.algorithms.contract import PolicyUpdate
+from safe_rl.algorithms.algorithm_contract import PolicyUpdate
 from safe_rl.algorithms.losses import sum_of_losses
 from safe_rl.objectives.distributions import ReferencePolicy
 from safe_rl.objectives.fisher import FisherProduct
@@ -30,7 +30,10 @@ from safe_rl.objectives.trust_region import (
 )
 from safe_rl.ranges import Fraction, NotNegative, Positive, Range
 
-__all__ = ["Proposal", "TRPOStep", "total_loss"]
+__all__ = ["Loss", "Proposal", "TRPOStep", "total_loss"]
+
+Loss = Callable[[TensorDictBase], TensorDictBase]
+"""A loss module, or a function of your own from a batch to scalars ``loss_…``."""
 
 
 class Proposal(NamedTuple):
@@ -105,7 +108,7 @@ class TRPOStep(PolicyUpdate):
 
     def __init__(
         self,
-        loss: Callable[[TensorDictBase], TensorDictBase],
+        loss: Loss,
         *,
         target_kl: Positive,
         damping: NotNegative,

@@ -124,7 +124,7 @@ def unread_by(algo: Mapping[str, Any]) -> Mapping[str, str]:
     Args:
         algo: The node ``algo`` of a configuration.
     """
-    from safe_rl.algorithms.parts import find_recipe  # with torch: not for help and --cfg
+    from safe_rl.algorithms.build_part import find_recipe  # with torch: not for help and --cfg
 
     return find_recipe(OmegaConf.create({"algo": dict(algo)})).unused_keys
 

@@ -13,7 +13,7 @@ from tensordict.nn import TensorDictModuleBase
 from torchrl.checkpoint import CheckpointError
 from torchrl.envs import EnvBase
 
-from safe_rl.algorithms.parts import find_recipe
+from safe_rl.algorithms.build_part import find_recipe
 from safe_rl.evaluation.env_keys import check_env_keys
 from safe_rl.files import read_config
 from safe_rl.naming import did_you_mean

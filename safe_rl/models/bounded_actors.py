@@ -16,8 +16,8 @@ from torch import Tensor, nn
 from torchrl.envs.utils import ExplorationType
 from torchrl.modules import MLP, NormalParamExtractor
 
-from safe_rl.models.distributions import SquashedNormal
-from safe_rl.models.scaling import InputScale
+from safe_rl.models.action_distributions import SquashedNormal
+from safe_rl.models.input_scales import InputScale
 
 __all__ = ["make_bounded_actor", "make_squashed_actor"]
 

@@ -12,9 +12,8 @@ from torchrl.data import Composite, TensorSpec
 from torchrl.modules import ConvNet
 
 from safe_rl.models.activations import Tanh
+from safe_rl.models.input_scales import InputScale, RunningScale, input_scale_vector
 from safe_rl.models.networks import perceptron
-from safe_rl.models.normalising import RunningScale
-from safe_rl.models.scaling import InputScale, input_scale_vector
 
 __all__ = ["TO_FLATTEN", "Body", "Entry", "Observed", "observed_entries"]
 

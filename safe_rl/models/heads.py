@@ -25,7 +25,7 @@ from torchrl.data import (
 )
 from torchrl.modules import IndependentNormal, OneHotCategorical, TanhNormal
 
-from safe_rl.models.distributions import BoundedBeta, Choices, OneChoice
+from safe_rl.models.action_distributions import BoundedBeta, Choices, OneChoice
 
 __all__ = ["AUTO", "HEADS", "Head", "gaussian_head", "make_head"]
 

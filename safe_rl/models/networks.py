@@ -22,7 +22,7 @@ from torchrl.modules import MLP
 
 from safe_rl.models.activations import Tanh
 from safe_rl.models.heads import Head, gaussian_head
-from safe_rl.models.scaling import InputScale
+from safe_rl.models.input_scales import InputScale
 
 __all__ = ["Chain", "assemble_actor", "make_actor", "make_critic", "perceptron"]
 

@@ -10,7 +10,7 @@ from tensordict import NestedKey, TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 
-from safe_rl.models.scaling import InputScale
+from safe_rl.models.input_scales import InputScale
 
 __all__ = ["EnsembleMLP", "QEnsemble"]
 

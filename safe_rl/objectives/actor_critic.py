@@ -11,7 +11,7 @@ from torchrl.objectives import LossModule
 from safe_rl.naming import did_you_mean
 from safe_rl.objectives.advantages import CostGAE, VectorGAE
 from safe_rl.objectives.critics import CriticLoss
-from safe_rl.objectives.normalisation import normalise_advantages
+from safe_rl.objectives.gae import normalise_advantages
 from safe_rl.objectives.surrogate import SurrogateLoss
 
 #: Keys that TorchRL's trainers hand to every loss, and that the estimators read, not the losses.

@@ -22,8 +22,7 @@ from torch import Tensor
 from torchrl.objectives.value import ValueEstimatorBase
 
 from safe_rl.objectives.gae import gae, one_pass_values, trajectory_ends
-from safe_rl.objectives.keys import require
-from safe_rl.objectives.samples import require_finite, sample_mask
+from safe_rl.objectives.samples import require, require_finite, sample_mask
 from safe_rl.ranges import Share
 
 ValueTarget = Literal["lambda_return", "return_to_go"]

@@ -6,8 +6,8 @@ from tensordict import TensorDict, TensorDictBase, TensorDictParams
 from tensordict.nn import TensorDictModuleBase, dispatch
 from torchrl.objectives.utils import distance_loss
 
-from safe_rl.objectives.keys import require
 from safe_rl.objectives.q_functions import Distance, ReplayLoss
+from safe_rl.objectives.samples import require
 
 __all__ = ["BCLoss"]
 

@@ -1,33 +1,33 @@
-"""A controller of Lagrange multipliers whose gains have no units.
-
-Violations are measured in units of the limit and bounded, so that a cost of six times the limit
-does not charge the integral six times as fast as a cost of 0 empties it. Together with cost
-advantages in units of one cost, λ does not depend on the scale of rewards or costs.
-
-Why these two terms. To the multiplier a policy is an integrator: per update, J_c moves by about
-β (λ* − λ) limits, λ* being the multiplier that keeps J_c where it is, β ≈ ¼ or less, and no faster
-than the trust region lets it. Proportional plus integral control of an integrator has the natural
-frequency √(β K_I) and the damping ½ K_P √(β / K_I). An integral alone is undamped: it overshoots
-by as much as it was late. K_P = 4 and K_I = 0.4 give a period of 20 updates at a damping of 1.6,
-and of 1 where β is a tenth.
-"""
+"""Controllers of Lagrange multipliers: proportional and integral, and with a derivative."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Annotated, Literal
 
 import torch
 from torch import Tensor
 
 from safe_rl.objectives.multipliers import CostLimits, FromZero, Multiplier, per_cost
-from safe_rl.ranges import NotNegative, Positive
+from safe_rl.ranges import NotNegative, Positive, Range, Weight
 
 
 class PIMultiplier(Multiplier):
     """λ = clip(K_P Δ + I, 0, highest), I ← clip(I + K_I Δ, 0, highest), |Δ| ≤ saturation.
 
-    Δ = (J_c − d) / scale. The integral stops at the bounds of λ, so that it is not wound up beyond
+    Δ = (J_c − d) / scale. The integral stops at the bounds of λ, so that it does not grow beyond
     what it could ever put out (anti-windup by clamping).
+
+    Violations are measured in units of the limit and bounded, so that a cost of six times the limit
+    does not charge the integral six times as fast as a cost of 0 empties it. Together with cost
+    advantages in units of one cost, λ does not depend on the scale of rewards or costs.
+
+    Why these two terms. To the multiplier a policy is an integrator: per update, J_c moves by about
+    β (λ* − λ) limits, λ* being the multiplier that keeps J_c where it is, β ≈ ¼ or less, and no
+    faster than the trust region lets it. Proportional plus integral control of an integrator has
+    the natural frequency √(β K_I) and the damping ½ K_P √(β / K_I). An integral alone is undamped:
+    it overshoots by as much as it was late. K_P = 4 and K_I = 0.4 give a period of 20 updates at a
+    damping of 1.6, and of 1 where β is a tenth.
 
     Args:
         cost_limits: mapping from cost key to limit d, or limits alone; see `parse_cost_limits`.
@@ -45,7 +45,7 @@ class PIMultiplier(Multiplier):
         >>> multiplier = PIMultiplier(
         ...     {"cost": 25.0}, init=0.0, kp=1.0, ki=0.1, saturation=1.0, highest=5.0
         ... )
-        >>> multiplier.update([37.5])
+        >>> multiplier.update([12.5])  # J_c = 37.5
         >>> multiplier.value
         tensor([0.5500])
     """
@@ -81,9 +81,119 @@ class PIMultiplier(Multiplier):
         """Set the units of violations, [k] > 0: until then the limits, or 1 for a limit of 0."""
         self.scale.copy_(scale)
 
-    def _step(self, mean_costs: Tensor) -> dict[str, Tensor]:
-        error = (mean_costs - self.limits) / self.scale
+    def _step(self, violation: Tensor) -> dict[str, Tensor]:
+        error = violation / self.scale
         error = error.clamp(-self.saturation, self.saturation)
         integral = (self.integral + self.ki * error).clamp(0, self.highest)
         penalty = (self.kp * error + integral).clamp(0, self.highest)
         return {"penalty": penalty, "integral": integral}
+
+
+class PIDMultiplier(Multiplier):
+    """λ = (K_P Δ + I + K_D ∂)₊ (Stooke, Achiam and Abbeel 2020, algorithm 2).
+
+    With the error Δ = (J_c − d) / scale, one update is
+
+    - proportional: Δ, smoothed by an exponential moving average;
+    - integral: I ← (I + K_I Δ)₊, unsmoothed. The gain is applied before the sum, so that I is in
+      units of λ and starts at `init`; the algorithm is the same, and a gain may change on the way;
+    - derivative: ∂ = (J − J')₊, the growth of the smoothed J = J_c / scale over the last
+      `derivative_delay` updates. Costs before the first update count as 0, as in the paper.
+
+    A purely integral controller (K_P = K_D = 0) is the ordinary dual gradient ascent on λ.
+
+    Args:
+        cost_limits: mapping from cost key to limit d, or limits alone; see `parse_cost_limits`.
+        init: First λ, for all costs or one per cost.
+        kp: Proportional gain K_P.
+        ki: Integral gain K_I.
+        kd: Derivative gain K_D.
+        proportional_ema: Weight of the past in the smoothed error Δ; 0 is no smoothing.
+        derivative_ema: Weight of the past in the smoothed cost J; 0 is no smoothing.
+        derivative_delay: Updates over which the growth of the cost is measured.
+        scale: Unit of the errors: one number, one per cost, or ``"limit"`` for the limits
+            themselves, which makes the gains independent of the units of a cost. The paper's is 1.
+
+    Raises:
+        ValueError: if an argument is outside its range.
+
+    Examples:
+        >>> multiplier = PIDMultiplier(
+        ...     {"cost": 25.0},
+        ...     init=0.0,
+        ...     kp=0.1,
+        ...     ki=0.01,
+        ...     kd=0.0,
+        ...     proportional_ema=0.0,
+        ...     derivative_ema=0.0,
+        ...     derivative_delay=1,
+        ...     scale=1.0,
+        ... )
+        >>> multiplier.update([10.0])  # J_c = 35
+        >>> multiplier.value
+        tensor([1.1000])
+    """
+
+    scale: Tensor
+    integral: Tensor
+    smoothed_error: Tensor
+    smoothed_cost: Tensor
+    past_costs: Tensor
+
+    def __init__(
+        self,
+        cost_limits: CostLimits,
+        *,
+        init: FromZero | Sequence[FromZero],
+        kp: NotNegative,
+        ki: NotNegative,
+        kd: NotNegative,
+        proportional_ema: Weight,
+        derivative_ema: Weight,
+        derivative_delay: Annotated[int, Range(1, 100_000)],
+        scale: Positive | Sequence[Positive] | Literal["limit"],
+    ) -> None:
+        super().__init__(cost_limits)
+        if min(kp, ki, kd) < 0:
+            raise ValueError(f"Gains must not be negative, got kp={kp}, ki={ki}, kd={kd}.")
+        if not (0 <= proportional_ema < 1 and 0 <= derivative_ema < 1):
+            raise ValueError(
+                "proportional_ema and derivative_ema are weights of the past in [0, 1), got "
+                f"{proportional_ema} and {derivative_ema}."
+            )
+        if derivative_delay < 1:
+            raise ValueError(f"derivative_delay must be at least 1, got {derivative_delay}.")
+        initial = per_cost("init", init, self.num_costs)
+        scales = self.limits if scale == "limit" else per_cost("scale", scale, self.num_costs)
+        if not (initial >= 0).all():
+            raise ValueError(f"init must not be negative, got {initial.tolist()}.")
+        if not (scales > 0).all():
+            raise ValueError(
+                f"scale must be positive, got {scales.tolist()}: a limit of 0 cannot be the unit "
+                "of its violations. Set scale to a cost, for example scale=1."
+            )
+        self.kp, self.ki, self.kd = kp, ki, kd
+        self.proportional_ema, self.derivative_ema = proportional_ema, derivative_ema
+        self.register_buffer("scale", scales.clone())
+        self.register_buffer("penalty", initial)
+        self.register_buffer("integral", initial.clone())
+        self.register_buffer("smoothed_error", torch.zeros(self.num_costs))
+        self.register_buffer("smoothed_cost", torch.zeros(self.num_costs))
+        self.register_buffer("past_costs", torch.zeros(derivative_delay, self.num_costs))
+
+    def _step(self, violation: Tensor) -> dict[str, Tensor]:
+        error = violation / self.scale
+        smoothed_error = torch.lerp(error, self.smoothed_error, self.proportional_ema)
+        integral = (self.integral + self.ki * error).clamp_min(0)
+        cost = torch.lerp(
+            (violation + self.limits) / self.scale, self.smoothed_cost, self.derivative_ema
+        )
+        growth = (cost - self.past_costs[0]).clamp_min(0)
+        penalty = self.kp * smoothed_error + integral + self.kd * growth
+        return {
+            "penalty": penalty.clamp_min(0),
+            "integral": integral,
+            "smoothed_error": smoothed_error,
+            "smoothed_cost": cost,
+            "past_costs": torch.cat([self.past_costs[1:], cost.unsqueeze(0)]),
+        }

@@ -12,7 +12,7 @@ from torch import Tensor
 from torchrl.objectives.utils import distance_loss
 
 from safe_rl.objectives.multipliers import Multiplier
-from safe_rl.objectives.q_functions import QFunctionLoss, discount_of, is_ensemble
+from safe_rl.objectives.q_functions import Ensemble, QFunctionLoss, discount_of
 from safe_rl.objectives.violation import KnownCosts
 from safe_rl.ranges import Number
 
@@ -84,7 +84,7 @@ class CostCritics(QFunctionLoss):
         lowest_cost_value: Number | None = None,
         **settings: Any,
     ) -> None:
-        if not is_ensemble(cost_qvalue_network):
+        if not isinstance(cost_qvalue_network, Ensemble):
             raise ValueError(
                 "The cost critic has to be a safe_rl.models.QEnsemble with one output per cost, "
                 f"not a {type(cost_qvalue_network).__name__}."

@@ -9,8 +9,7 @@ from tensordict.nn import TensorDictModuleBase, dispatch
 from torch import Tensor
 from torchrl.objectives import LossModule
 
-from safe_rl.objectives.keys import require
-from safe_rl.objectives.samples import sample_mask
+from safe_rl.objectives.samples import require, sample_mask
 
 
 def explained_variance(prediction: Tensor, target: Tensor) -> Tensor:

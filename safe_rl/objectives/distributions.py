@@ -9,6 +9,7 @@ distribution's parts are independent: everything is the sum over them, each in i
 from __future__ import annotations
 
 from collections.abc import Iterable
+from functools import partial
 
 import torch
 from tensordict import NestedKey, TensorDictBase
@@ -21,6 +22,7 @@ from torch import Tensor
 from torch.distributions import (
     Categorical,
     Distribution,
+    Independent,
     Normal,
     TransformedDistribution,
     kl_divergence,
@@ -59,7 +61,9 @@ def categorical_kl(p: Categorical, q: Categorical) -> Tensor:
 
 def root(distribution: Distribution) -> Distribution:
     """The distribution underneath independent ones and transforms that no policy learns."""
-    while hasattr(distribution, "base_dist") and not _may_learn_its_transform(distribution):
+    while isinstance(distribution, Independent | TransformedDistribution):
+        if _may_learn_its_transform(distribution):
+            break
         distribution = distribution.base_dist
     return distribution
 
@@ -185,7 +189,8 @@ def composite_keys(
 ) -> tuple[list[NestedKey], list[NestedKey]] | None:
     """Where the parts' actions and log-probabilities are written; None if there are no parts."""
     made = sampler.distribution_class
-    if getattr(made, "func", made) is not CompositeDistribution:
+    made = made.func if isinstance(made, partial) else made
+    if made is not CompositeDistribution:
         return None
     return list(sampler.dist_sample_keys), list(sampler.log_prob_keys)
 

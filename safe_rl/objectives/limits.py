@@ -87,8 +87,8 @@ class PromisedChange:
     Examples:
         >>> kept = PromisedChange(1, memory=0.9, lowest=0.1)
         >>> for cost in (100.0, 95.0, 90.0, 85.0):  # each time, 10 were promised
-        ...     kept.observe(torch.tensor([cost]), prior=torch.tensor([1.0]))
-        ...     kept.promise(torch.tensor([-10.0]))
+        ...     kept.update(torch.tensor([cost]), prior=torch.tensor([1.0]))
+        ...     kept.record_prediction(torch.tensor([-10.0]))
         >>> kept.share
         tensor([0.5013])
     """
@@ -108,7 +108,7 @@ class PromisedChange:
         share = torch.where(promised > 0, realised / promised, 1.0)
         return share.clamp(self.lowest, 1.0)
 
-    def observe(self, cost: Tensor, prior: Tensor) -> None:
+    def update(self, cost: Tensor, prior: Tensor) -> None:
         """Compare the new J_c with the last one and what was promised since; all [k]."""
         if not self._state["products"].any():
             self._state["products"] = prior.square().expand(2, -1).clone()
@@ -120,7 +120,7 @@ class PromisedChange:
         self._state["cost"] = cost.clone()
         self._state["promised"] = torch.full_like(promised, torch.nan)
 
-    def promise(self, change: Tensor) -> None:
+    def record_prediction(self, change: Tensor) -> None:
         """Note the change of J_c that an update's surrogate predicts, [k]."""
         self._state["promised"] = change.detach().to(self._state["promised"])
 
@@ -243,7 +243,7 @@ class LimitTracker:
         batch = self.costs.batch
         smallest = self.smallest_scale * self.costs.length * self.costs.unit
         scale = torch.maximum(self.limits, smallest)
-        self.promises.observe(batch.mean, prior=0.5 * scale)
+        self.promises.update(batch.mean, prior=0.5 * scale)
         noise = torch.lerp(batch.error, self._noise, self.memory)
         self._noise = torch.where(noise.isfinite(), noise, batch.error)
         target = self._target(estimate, scale, costs.shape[0] * costs.shape[1])

@@ -1,9 +1,10 @@
 """Lagrange multipliers: how strongly each cost is weighed against the return.
 
-Once per epoch a multiplier receives J_c, the mean undiscounted cost of the episodes that
-finished in the epoch, and moves λ up where J_c exceeds its limit d and down where it does not.
-Multipliers hold one λ per cost; their whole state lives in buffers, so that `state_dict`
-resumes them exactly and `.to(device)` moves them.
+Once per epoch a multiplier receives the violations J_c − d, J_c being the mean undiscounted cost of
+an episode, and moves λ up where J_c exceeds its limit d and down where it does not. Multipliers
+hold one λ per cost; their whole state is in buffers, so that `state_dict` resumes them exactly and
+`.to(device)` moves them. Here are dual ascent by Adam and by plain steps; controllers are in
+`safe_rl.objectives.controllers`.
 """
 
 from __future__ import annotations
@@ -107,28 +108,28 @@ class Multiplier(nn.Module, ABC):
         return self.penalty.detach()
 
     @torch.no_grad()
-    def update(self, mean_costs: Tensor | Sequence[float] | float) -> None:
+    def update(self, violation: Tensor | Sequence[float] | float) -> None:
         """Move λ after an epoch.
 
-        A cost whose J_c is not finite (NaN: no episode finished in the epoch) keeps its
+        A cost whose violation is not finite (NaN: no episode finished in the epoch) keeps its
         multiplier and its state as they are.
 
         Args:
-            mean_costs: J_c, [k] (or a scalar if k = 1): mean undiscounted cost of the episodes
-                that finished in this epoch.
+            violation: J_c − d, [k] (or a scalar if k = 1): mean undiscounted cost of an episode
+                less what it is held against.
 
         Raises:
             ValueError: if there is not one number per cost.
         """
-        costs = torch.as_tensor(mean_costs, dtype=self.limits.dtype, device=self.limits.device)
-        if costs.numel() != self.num_costs:
+        given = torch.as_tensor(violation, dtype=self.limits.dtype, device=self.limits.device)
+        if given.numel() != self.num_costs:
             raise ValueError(
-                f"update() needs one mean cost for each of {self.cost_keys}, "
-                f"got shape {tuple(costs.shape)}."
+                f"update() needs one violation for each of {self.cost_keys}, "
+                f"got shape {tuple(given.shape)}."
             )
-        costs = costs.reshape(self.num_costs)
-        known = costs.isfinite()
-        for name, new in self._step(torch.where(known, costs, self.limits)).items():
+        given = given.reshape(self.num_costs)
+        known = given.isfinite()
+        for name, new in self._step(torch.where(known, given, 0.0)).items():
             buffer = self.get_buffer(name)
             buffer.copy_(torch.where(known, new, buffer))
 
@@ -139,8 +140,8 @@ class Multiplier(nn.Module, ABC):
         """Take note of the size of one cost, [k] > 0, in which what λ weighs is measured."""
 
     @abstractmethod
-    def _step(self, mean_costs: Tensor) -> dict[str, Tensor]:
-        """Return the new value of every state buffer ([..., k]) given finite J_c [k]."""
+    def _step(self, violation: Tensor) -> dict[str, Tensor]:
+        """Return the new value of every state buffer ([..., k]) given finite J_c − d, [k]."""
 
     def named_values(self) -> dict[str, Tensor]:
         """λ per cost as scalars, named by cost key (nested keys joined by ``/``)."""
@@ -173,7 +174,7 @@ class LagrangeMultiplier(Multiplier):
 
     Examples:
         >>> multiplier = LagrangeMultiplier({"cost": 25.0}, init=1.0, lr=0.05)
-        >>> multiplier.update(torch.tensor([60.0]))
+        >>> multiplier.update(torch.tensor([35.0]))  # J_c = 60
         >>> multiplier.value
         tensor([1.0319])
     """
@@ -210,12 +211,66 @@ class LagrangeMultiplier(Multiplier):
         """The multipliers λ = softplus(ν) > 0, [k], detached."""
         return softplus(self.nu).detach()
 
-    def _step(self, mean_costs: Tensor) -> dict[str, Tensor]:
+    def _step(self, violation: Tensor) -> dict[str, Tensor]:
         beta1, beta2 = self.betas
-        grad = self.limits - mean_costs
+        grad = -violation
         step = self.step + 1
         exp_avg = torch.lerp(grad, self.exp_avg, beta1)
         exp_avg_sq = torch.lerp(grad.square(), self.exp_avg_sq, beta2)
         denominator = (exp_avg_sq / (1 - beta2**step)).sqrt() + self.eps
         nu = self.nu - self.lr * exp_avg / (1 - beta1**step) / denominator
         return {"nu": nu, "step": step, "exp_avg": exp_avg, "exp_avg_sq": exp_avg_sq}
+
+
+class ProjectedMultiplier(Multiplier):
+    """λ ← clip(λ + α (J_c − d) / u, 0, λ_max), the plain dual ascent.
+
+    Of FOCOPS (Zhang, Vuong and Ross 2020), CUP (Yang et al. 2022) and,
+    slow and without λ_max, RCPO (Tessler et al. 2019, algorithm 1). u is the size of one cost: 1,
+    as in the articles, unless what λ weighs is in other units (`set_unit`).
+
+    Args:
+        cost_limits: mapping from cost key to limit d, or limits alone; see `parse_cost_limits`.
+        init: First λ, at most `highest`, for all costs or one per cost.
+        lr: Step size α, change of λ per cost of size u in an episode.
+        highest: Upper bound λ_max; None for none.
+
+    Raises:
+        ValueError: if an initial λ is outside the bounds.
+
+    Examples:
+        >>> multiplier = ProjectedMultiplier({"cost": 25.0}, init=0.0, lr=0.01, highest=2.0)
+        >>> multiplier.update([35.0])  # J_c = 60
+        >>> multiplier.value
+        tensor([0.3500])
+        >>> multiplier.update([975.0])
+        >>> multiplier.value
+        tensor([2.])
+    """
+
+    unit: Tensor
+
+    def __init__(
+        self,
+        cost_limits: CostLimits,
+        *,
+        init: FromZero | Sequence[FromZero],
+        lr: Positive,
+        highest: Positive | None,
+    ) -> None:
+        super().__init__(cost_limits)
+        self.lr, self.highest = lr, highest
+        initial = per_cost("init", init, self.num_costs)
+        if not torch.equal(initial.clamp(0, highest), initial):
+            raise ValueError(f"init must be between 0 and highest={highest}, got {init}.")
+        self.register_buffer("penalty", initial)
+        # told anew before every update, and unknown to checkpoints of earlier versions
+        self.register_buffer("unit", torch.ones_like(initial), persistent=False)
+
+    def set_unit(self, unit: Tensor) -> None:
+        """Set u, [k] > 0."""
+        self.unit.copy_(unit)
+
+    def _step(self, violation: Tensor) -> dict[str, Tensor]:
+        moved = self.penalty + self.lr * violation / self.unit
+        return {"penalty": moved.clamp(0, self.highest)}

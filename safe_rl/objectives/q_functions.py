@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, ClassVar, Literal
+from typing import Any, ClassVar, Literal, Protocol, runtime_checkable
 
 from tensordict import NestedKey, TensorDict, TensorDictBase
 from tensordict.nn import dispatch
@@ -10,25 +10,32 @@ from torch import Tensor
 from torchrl.objectives import LossModule
 from torchrl.objectives.value import ValueEstimatorBase
 
-from safe_rl.objectives.keys import require
+from safe_rl.objectives.samples import require
 from safe_rl.objectives.violation import KnownCosts
 
 __all__ = [
+    "Ensemble",
     "InOneCall",
     "QFunctionLoss",
     "ReplayLoss",
     "discount_of",
-    "is_ensemble",
     "scalars",
 ]
 
 
-def is_ensemble(network: Any) -> bool:
-    """Whether a network evaluates several Q functions by itself, such as a `QEnsemble`.
+@runtime_checkable
+class Ensemble(Protocol):
+    """A network that evaluates several Q functions by itself, such as a `QEnsemble`.
 
-    It has ``num_networks``, and takes steps [...] and parameters to values [E, ...].
+    Attributes:
+        num_networks: E.
     """
-    return hasattr(network, "num_networks")
+
+    num_networks: int
+
+    def __call__(self, tensordict: TensorDictBase, params: TensorDictBase) -> TensorDictBase:
+        """Values [E, ...] of steps [...], with parameters that are given."""
+        ...
 
 
 Distance = Literal["l2", "smooth_l1", "l1"]
@@ -46,7 +53,7 @@ class InOneCall:
         of_copies: whether steps come once per network: of one copy then, the first is taken.
     """
 
-    def __init__(self, network: Any, *, of_copies: bool = False) -> None:
+    def __init__(self, network: Ensemble, *, of_copies: bool = False) -> None:
         self.network, self.of_copies = network, of_copies
 
     def __call__(self, steps: TensorDictBase, params: TensorDictBase) -> TensorDictBase:

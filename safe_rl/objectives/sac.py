@@ -18,10 +18,10 @@ from torchrl.objectives.value import TD0Estimator
 from safe_rl.objectives.cost_critics import CostCritics
 from safe_rl.objectives.q_functions import (
     Distance,
+    Ensemble,
     InOneCall,
     QFunctionLoss,
     discount_of,
-    is_ensemble,
     scalars,
 )
 from safe_rl.ranges import Number, Range, Share
@@ -86,7 +86,7 @@ class SACLoss(QFunctionLoss, objectives.SACLoss):
             actor_network,
             qvalue_network,
             # an ensemble has its networks already
-            num_qvalue_nets=0 if is_ensemble(qvalue_network) else 2,
+            num_qvalue_nets=0 if isinstance(qvalue_network, Ensemble) else 2,
             loss_function=loss_function,
             alpha_init=alpha_init,
             target_entropy=target_entropy,
@@ -98,7 +98,7 @@ class SACLoss(QFunctionLoss, objectives.SACLoss):
         self.out_keys = ["loss_qvalue", "loss_actor", "loss_alpha", "alpha", "entropy"]
 
     def _make_vmap(self) -> None:
-        if is_ensemble(self.qvalue_network):
+        if isinstance(self.qvalue_network, Ensemble):
             self._vmap_qnetworkN0 = InOneCall(self.qvalue_network)
         else:
             super()._make_vmap()

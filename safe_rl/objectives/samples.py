@@ -1,4 +1,4 @@
-"""The samples of a batch: which are padding, and whether all are finite."""
+"""Reading a batch: entries by key, which samples are padding, and whether all are finite."""
 
 from __future__ import annotations
 
@@ -9,6 +9,29 @@ from tensordict import NestedKey, TensorDictBase, is_tensor_collection
 from tensordict.utils import unravel_key
 from torch import Tensor
 from torchrl.objectives.common import AUTO_LOSS_MASK_KEYS
+
+from safe_rl.naming import key_name, nearest
+
+
+def require(tensordict: TensorDictBase, key: NestedKey, hint: str = "") -> Tensor:
+    """Get an entry, or raise an error that names the nearest key present.
+
+    Args:
+        tensordict: the batch to read.
+        key: entry to get.
+        hint: what writes this entry, for the error message.
+
+    Raises:
+        KeyError: if there is no such entry.
+    """
+    value = tensordict.get(key, None)
+    if value is not None:
+        return value
+    present = {key_name(found): found for found in tensordict.keys(True, True)}
+    near = nearest(key_name(unravel_key(key)), present)
+    meant = "" if near is None else f" Did you mean {present[near]!r}?"
+    raise KeyError(f"No entry {key!r} in the batch.{meant} Keys: {sorted(present)}. {hint}".strip())
+
 
 FIRST = "is_init"
 

@@ -20,9 +20,8 @@ from safe_rl.objectives.distributions import (
     kl,
     sampler_of,
 )
-from safe_rl.objectives.keys import require
 from safe_rl.objectives.multipliers import Multiplier
-from safe_rl.objectives.samples import sample_mask
+from safe_rl.objectives.samples import require, sample_mask
 from safe_rl.ranges import NotNegative
 
 

@@ -11,7 +11,7 @@ from torchrl.data import TensorSpec
 from torchrl.objectives import ValueEstimators
 
 from safe_rl.objectives.cost_critics import CostCritics
-from safe_rl.objectives.q_functions import Distance, InOneCall, QFunctionLoss, is_ensemble, scalars
+from safe_rl.objectives.q_functions import Distance, Ensemble, InOneCall, QFunctionLoss, scalars
 from safe_rl.ranges import NotNegative, Share
 
 __all__ = ["TD3LagrangianLoss", "TD3Loss"]
@@ -51,7 +51,7 @@ class TD3Loss(QFunctionLoss, objectives.TD3Loss):
         noise_clip: NotNegative,
         loss_function: Distance = "l2",
     ) -> None:
-        joint = is_ensemble(qvalue_network)
+        joint = isinstance(qvalue_network, Ensemble)
         super().__init__(
             actor_network,
             qvalue_network,
@@ -88,7 +88,7 @@ class TD3Loss(QFunctionLoss, objectives.TD3Loss):
         self._noise_clip = share
 
     def _make_vmap(self) -> None:
-        if is_ensemble(self.qvalue_network):
+        if isinstance(self.qvalue_network, Ensemble):
             self._vmap_qvalue_network00 = InOneCall(self.qvalue_network, of_copies=True)
         else:
             super()._make_vmap()

@@ -1,7 +1,8 @@
-"""Losses of trust region policy optimisation, with and without constraints."""
+"""Losses of trust-region steps: TRPO, its Lagrangian, and CPO."""
 
 from __future__ import annotations
 
+import torch
 from tensordict import TensorDictBase
 from tensordict.nn import ProbabilisticTensorDictSequential
 from torch import Tensor
@@ -80,3 +81,43 @@ class TRPOLagrangianLoss(TRPOLoss):
             reduction=reduction,
         )
         self.multiplier = require_multiplier(multiplier, "TRPOLoss")
+
+
+class CPOLoss(SurrogateLoss):
+    """Surrogates of CPO: ``loss_objective`` = −E[ρ A] and ``cost_surrogate`` = E[ρ A_c], [k].
+
+    Both carry gradients. The cost surrogates are constraints, not losses: a
+    `safe_rl.algorithms.CPOStep` keeps them within their limits; with an optimiser of your own,
+    combine them as you see fit. See `SurrogateLoss` for what it reads and writes.
+
+    Args:
+        actor_network: policy with `get_dist`; see `SurrogateLoss`.
+        entropy_coeff: Factor of the entropy bonus.
+        reduction: ``"mean"``, ``"sum"`` or ``"none"`` over the samples; a `CPOStep` needs the mean.
+
+    Examples:
+        >>> from safe_rl.models import make_actor
+        >>> actor = make_actor(3, 2, hidden_sizes=[8], initial_log_std=-0.5)
+        >>> CPOLoss(actor, entropy_coeff=0.0).out_keys
+        ['loss_objective', 'loss_entropy', 'cost_surrogate', 'kl', 'entropy', 'ESS']
+    """
+
+    extra_out_keys = ("cost_surrogate",)
+    has_costs = True
+
+    def __init__(
+        self,
+        actor_network: ProbabilisticTensorDictSequential,
+        *,
+        entropy_coeff: NotNegative,
+        reduction: Reduction = "mean",
+    ) -> None:
+        super().__init__(actor_network, entropy_coeff=entropy_coeff, reduction=reduction)
+
+    def _surrogates(self, tensordict: TensorDictBase, log_weight: Tensor) -> dict[str, Tensor]:
+        ratio = log_weight.exp()
+        costs = (ratio * self._cost_advantage(tensordict)).unbind(-1)
+        return {
+            "loss_objective": -ratio * self._advantage(tensordict, log_weight),
+            "cost_surrogate": torch.stack([self._reduce_loss(cost, tensordict) for cost in costs]),
+        }

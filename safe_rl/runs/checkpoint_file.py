@@ -16,7 +16,7 @@ from typing import Any
 import torch
 from torchrl.checkpoint import Checkpoint, CheckpointError, StateDictCheckpointAdapter
 
-from safe_rl.algorithms.contract import Stateful
+from safe_rl.algorithms.algorithm_contract import Stateful
 
 __all__ = ["as_parts", "part_names", "read_facts", "read_states", "restore", "writer"]
 

@@ -11,7 +11,7 @@ from typing import Any
 
 from torchrl.checkpoint import Checkpoint, CheckpointError
 
-from safe_rl.algorithms.contract import Stateful
+from safe_rl.algorithms.algorithm_contract import Stateful
 from safe_rl.runs.checkpoint_file import as_parts, read_facts, restore, writer
 from safe_rl.runs.folder import RunFolder, checkpoint_name, checkpoint_steps, checkpoints_in
 

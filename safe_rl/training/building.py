@@ -18,9 +18,9 @@ from torchrl.checkpoint import CheckpointError
 from torchrl.collectors import Collector
 from torchrl.envs import EnvBase
 
+from safe_rl.algorithms.algorithm_contract import Algorithm
+from safe_rl.algorithms.build_part import find_recipe
 from safe_rl.algorithms.constraints import check_cost_limits
-from safe_rl.algorithms.contract import Algorithm
-from safe_rl.algorithms.parts import find_recipe
 from safe_rl.collectors import Recording, WorkerCollector, make_collector
 from safe_rl.collectors.worker_rows import MakeEnv
 from safe_rl.files import read_config

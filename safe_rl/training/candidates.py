@@ -8,7 +8,7 @@ from collections import deque
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any, NamedTuple
 
-from safe_rl.algorithms.contract import Stateful
+from safe_rl.algorithms.algorithm_contract import Stateful
 from safe_rl.runs.outcome import feasible_return
 
 __all__ = ["Candidates", "Judged", "epochs_until_judged"]

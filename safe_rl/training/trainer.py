@@ -15,9 +15,9 @@ from torchrl.checkpoint import GlobalRNGState
 from torchrl.collectors import Collector
 from torchrl.envs import EnvBase
 
-from safe_rl.algorithms.contract import Algorithm, Stateful
+from safe_rl.algorithms.algorithm_contract import Algorithm, Stateful
 from safe_rl.algorithms.matrix_products import fast_products
-from safe_rl.algorithms.side_by_side import torch_threads
+from safe_rl.algorithms.parallel_updates import torch_threads
 from safe_rl.collectors import EpisodeAccounting, EpisodeError, Recording, WorkerCollector
 from safe_rl.runs.checkpoints import CheckpointStore
 from safe_rl.runs.folder import lock_folder

@@ -50,7 +50,7 @@ def ppo_update(loss, actor):
 
 def multiplier_first(multiplier, update):
     def update_both(batch, mean_costs):
-        multiplier.update(mean_costs)
+        multiplier.update(mean_costs - multiplier.limits)
         update(batch)
 
     return update_both

@@ -10,8 +10,7 @@ from tensordict.nn import TensorDictModule
 from torch import nn
 from torchrl.objectives import A2CLoss, ClipPPOLoss
 
-from safe_rl.algorithms.learning_rate import KLAdaptiveRate
-from safe_rl.algorithms.minibatch import MinibatchUpdate
+from safe_rl.algorithms.minibatch import KLAdaptiveRate, MinibatchUpdate
 from safe_rl.models import BehaviourPolicy, make_actor, make_critic
 from safe_rl.objectives import CriticLoss, PPOLoss
 

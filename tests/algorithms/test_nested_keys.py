@@ -10,8 +10,7 @@ from run_configs import point_mass_config
 from tensordict import NestedKey, TensorDict
 
 from safe_rl.algorithms import MinibatchUpdate, OnPolicy
-from safe_rl.algorithms.constraints import Constraints
-from safe_rl.algorithms.tracked_constraints import TrackedConstraints
+from safe_rl.algorithms.constraints import Constraints, TrackedConstraints
 from safe_rl.collectors import EpisodeAccounting
 from safe_rl.models import make_actor, make_critic
 from safe_rl.objectives import (

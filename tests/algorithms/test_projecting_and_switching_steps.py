@@ -7,7 +7,7 @@ from samples import make_actor, make_batch, whole_step
 from scipy.optimize import minimize
 
 from safe_rl.algorithms import CRPOStep, PCPOStep
-from safe_rl.algorithms.pcpo_step import nearest_feasible
+from safe_rl.algorithms.cpo_step import nearest_feasible
 from safe_rl.objectives import CPOLoss
 from safe_rl.objectives.fisher import FisherProduct
 from safe_rl.objectives.trust_region import flatten

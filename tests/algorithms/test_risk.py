@@ -11,7 +11,7 @@ from tensordict.nn import AddStateIndependentNormalScale, TensorDictModule
 from torch import nn
 from torchrl.modules import IndependentNormal, ProbabilisticActor
 
-from safe_rl.algorithms.tracked_constraints import CHARGES
+from safe_rl.algorithms.constraints import CHARGES
 from safe_rl.collectors import EpisodeAccounting
 from safe_rl.objectives import Chance, CostGAE, CVaR, TRPOLoss
 from safe_rl.objectives.risk import cost_so_far, value_at_risk

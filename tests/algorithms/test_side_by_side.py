@@ -8,7 +8,7 @@ from point_mass_runs import point_mass_trainer
 from torchrl.envs.utils import ExplorationType, exploration_type, set_exploration_type
 
 from safe_rl.algorithms import on_policy
-from safe_rl.algorithms.side_by_side import side_by_side, torch_threads
+from safe_rl.algorithms.parallel_updates import in_parallel, torch_threads
 from safe_rl.objectives import PPOLoss
 from safe_rl.targets import allow
 
@@ -31,7 +31,7 @@ def two_threads():
 
 def test_both_are_under_way_at_once(two_threads):
     meeting = threading.Barrier(2, timeout=10)  # breaks unless both come
-    assert side_by_side(meeting.wait, meeting.wait) in {(0, 1), (1, 0)}
+    assert in_parallel(meeting.wait, meeting.wait) in {(0, 1), (1, 0)}
 
 
 def test_the_exploration_type_is_afterwards_what_it_was(two_threads):
@@ -51,19 +51,19 @@ def test_the_exploration_type_is_afterwards_what_it_was(two_threads):
             steps[2].wait(10)
 
     before = exploration_type()
-    side_by_side(first, second)
+    in_parallel(first, second)
     assert exploration_type() == before
 
 
 def test_one_thread_calls_them_in_turn():
     order = []
     with torch_threads(1):
-        side_by_side(lambda: order.append("first"), lambda: order.append("second"))
+        in_parallel(lambda: order.append("first"), lambda: order.append("second"))
     assert order == ["first", "second"]
 
 
 def test_threads_are_shared_and_given_back(two_threads):
-    assert side_by_side(torch.get_num_threads, torch.get_num_threads) == (1, 1)
+    assert in_parallel(torch.get_num_threads, torch.get_num_threads) == (1, 1)
     assert torch.get_num_threads() == 2
 
 
@@ -83,7 +83,7 @@ def test_the_other_ends_before_an_error_is_raised(two_threads, fails):
     calls = [end, end]
     calls[fails] = fail
     with pytest.raises(FloatingPointError, match="diverged"):
-        side_by_side(*calls)
+        in_parallel(*calls)
     assert ended.is_set()
     assert torch.get_num_threads() == 2
 
@@ -94,7 +94,7 @@ def test_the_other_ends_before_an_error_is_raised(two_threads, fails):
 def test_a_loss_that_moves_the_critic_comes_before_its_fit(loss, number, tmp_path, monkeypatch):
     calls = []
     monkeypatch.setattr(
-        on_policy, "side_by_side", lambda *both: calls.append(both) or [call() for call in both]
+        on_policy, "in_parallel", lambda *both: calls.append(both) or [call() for call in both]
     )
     trainer = point_mass_trainer(tmp_path, "algo=ppo", f"loss._target_={loss}")
     row = trainer.epoch(trainer.batches())

@@ -14,8 +14,8 @@ from torchrl.trainers.algorithms import PPOTrainer
 
 from safe_rl import models
 from safe_rl.algorithms import Constraints
+from safe_rl.algorithms.constraints import TrackedConstraints
 from safe_rl.algorithms.torchrl_trainers import ConstraintHook
-from safe_rl.algorithms.tracked_constraints import TrackedConstraints
 from safe_rl.collectors import EpisodeAccounting, make_collector
 from safe_rl.objectives import (
     ActorCriticLoss,

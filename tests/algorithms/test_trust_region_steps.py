@@ -17,7 +17,7 @@ from safe_rl.objectives import (
 )
 from safe_rl.objectives.distributions import gaussian_kl
 from safe_rl.objectives.fisher import FisherProduct
-from safe_rl.objectives.normalisation import normalise_advantages
+from safe_rl.objectives.gae import normalise_advantages
 from safe_rl.objectives.trust_region import conjugate_gradient, flatten, policy_in
 from safe_rl.objectives.violation import constraint_value
 

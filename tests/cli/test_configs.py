@@ -12,8 +12,8 @@ from point_mass import PointMass
 from run_configs import CONF, compose_config
 
 from safe_rl.algorithms import OffPolicy, OnPolicy
+from safe_rl.algorithms.build_part import find_recipe
 from safe_rl.algorithms.constraints import check_cost_limits
-from safe_rl.algorithms.parts import find_recipe
 from safe_rl.cli import train
 from safe_rl.envs import EXTRAS, SUITE, env_names, env_node, make_env, registration, store_configs
 

@@ -11,7 +11,7 @@ from point_mass import PointMass
 from run_configs import CONF
 
 import safe_rl.objectives
-from safe_rl.algorithms.parts import find_recipe
+from safe_rl.algorithms.build_part import find_recipe
 from safe_rl.cli.keys import KEYS
 from safe_rl.cli.settings import SettingError, check_settings, keys_of_part, plain
 from safe_rl.cli.values import anything

@@ -9,7 +9,7 @@ from tensordict import TensorDict
 from torchrl.objectives.value import GAE
 
 from safe_rl.objectives.advantages import CostGAE, VectorGAE
-from safe_rl.objectives.normalisation import normalise_advantages
+from safe_rl.objectives.gae import normalise_advantages
 
 N, T = 4, 37
 

@@ -20,7 +20,7 @@ from safe_rl.objectives import (
     RCPOLoss,
     VectorGAE,
 )
-from safe_rl.objectives.ipo import log_barrier
+from safe_rl.objectives.penalties import log_barrier
 
 CLIP = {"clip_epsilon": 0.2, "entropy_coeff": 0.01}
 FREE = {"clip_epsilon": 1e6, "entropy_coeff": 0.0}
@@ -193,11 +193,11 @@ def test_rcpo_is_ppo_on_the_penalised_reward():
 
 def test_projected_multipliers_move_by_the_violation_and_stop_at_their_bounds():
     multiplier = ProjectedMultiplier([25.0, 5.0], init=[0.0, 1.9], lr=0.01, highest=2.0)
-    multiplier.update([20.0, 10.0])
+    multiplier.update([-5.0, 5.0])
     assert multiplier.value.tolist() == pytest.approx([0.0, 1.95])
-    multiplier.update([60.0, 60.0])
+    multiplier.update([35.0, 55.0])
     assert multiplier.value.tolist() == pytest.approx([0.35, 2.0])
-    multiplier.update([torch.nan, 0.0])
+    multiplier.update([torch.nan, -5.0])
     assert multiplier.value.tolist() == pytest.approx([0.35, 1.95])
     with pytest.raises(ValueError, match="between 0 and highest=2"):
         ProjectedMultiplier(25.0, init=3.0, lr=0.01, highest=2.0)

@@ -1,10 +1,9 @@
-"""The PI multiplier by hand, and against a simulated policy beside the PID it replaces."""
+"""PI and PID multipliers by hand, PID by Stooke et al. (algorithm 2), and a simulated policy."""
 
 import pytest
 import torch
 
-from safe_rl.objectives.controllers import PIMultiplier
-from safe_rl.objectives.pid import PIDMultiplier
+from safe_rl.objectives.controllers import PIDMultiplier, PIMultiplier
 
 GAINS = {"init": 0.0, "kp": 2.0, "ki": 0.2, "saturation": 1.0, "highest": 5.0}
 # what lagrangian=pid says
@@ -23,7 +22,7 @@ def follow(multiplier, epochs=300, noise=5.0, seed=0):
     generator = torch.Generator().manual_seed(seed)
     cost, costs, limit = torch.tensor([60.0]), [], multiplier.limits
     for epoch in range(epochs):
-        multiplier.update(cost + noise * torch.randn(1, generator=generator))
+        multiplier.update(cost - limit + noise * torch.randn(1, generator=generator))
         balance = 0.9 + 0.5 * min(epoch / 100, 1.0)
         cost = cost + limit * (0.25 * (balance - multiplier.value)).clamp(-0.2, 0.2)
         cost = cost.clamp_min(0)
@@ -33,14 +32,14 @@ def follow(multiplier, epochs=300, noise=5.0, seed=0):
 
 def test_two_updates_by_hand():
     multiplier = PIMultiplier(10.0, **GAINS)
-    multiplier.update(15.0)
+    multiplier.update(5.0)
     assert multiplier.value.item() == pytest.approx(1.0 + 0.1)
     # a cost of six times the limit counts as one of twice
-    multiplier.update(60.0)
+    multiplier.update(50.0)
     assert multiplier.value.item() == pytest.approx(2.0 + 0.3)
     # and one of nothing as half of the limit, where that is the saturation
     multiplier = PIMultiplier(10.0, **(GAINS | {"init": 4.0, "saturation": 0.5}))
-    multiplier.update(0.0)
+    multiplier.update(-10.0)
     assert multiplier.value.item() == pytest.approx(4.0 - 0.1 - 1.0)
 
 
@@ -62,37 +61,94 @@ def test_it_is_well_damped():
 def test_the_integral_is_not_wound_up_beyond_what_it_can_put_out():
     multiplier = PIMultiplier(25.0, **GAINS)
     for _ in range(200):
-        multiplier.update(100.0)
+        multiplier.update(75.0)
     assert multiplier.value == 5.0
     for _ in range(6):
-        multiplier.update(0.0)
+        multiplier.update(-25.0)
     assert multiplier.value == pytest.approx(5.0 - 6 * 0.2 - 2.0)
 
 
 def test_ten_times_the_cost_and_the_limit_give_the_same_multiplier():
     small, large = PIMultiplier(25.0, **GAINS), PIMultiplier(250.0, **GAINS)
-    for cost in (60.0, 31.0, 12.0, 44.0):
-        small.update(cost)
-        large.update(10 * cost)
+    for violation in (35.0, 6.0, -13.0, 19.0):
+        small.update(violation)
+        large.update(10 * violation)
         torch.testing.assert_close(small.value, large.value)
 
 
 def test_a_limit_of_0_takes_its_unit_from_outside():
     multiplier = PIMultiplier([0.0, 25.0], **GAINS)
     multiplier.set_scale(torch.tensor([10.0, 25.0]))
-    multiplier.update([5.0, 37.5])
+    multiplier.update([5.0, 12.5])
     assert multiplier.value.tolist() == pytest.approx([1.1, 1.1])
 
 
+PLAIN = {
+    "init": 0.0, "kp": 0.0, "ki": 0.0, "kd": 0.0,
+    "proportional_ema": 0.0, "derivative_ema": 0.0, "derivative_delay": 1, "scale": 1.0,
+}  # fmt: skip
+
+
+def run(costs, limits=10.0, **settings):
+    multiplier = PIDMultiplier(limits, **(PLAIN | settings))
+    values = []
+    for cost in costs:
+        multiplier.update(torch.as_tensor(cost) - multiplier.limits)
+        values.append(multiplier.value.squeeze().tolist())
+    return values
+
+
 @pytest.mark.parametrize(
-    ("settings", "message"),
+    ("settings", "expected"),
     [
-        ({"kp": -1.0}, "kp and ki"),
-        ({"saturation": 0.0}, "saturation"),
-        ({"highest": -1.0}, "highest"),
-        ({"init": 6.0}, "init must lie"),
+        ({"kp": 0.1}, [0.4, 0.0, 0.2]),
+        # The integral is clamped at 0, so that it answers at once when the cost returns.
+        ({"ki": 0.1}, [0.4, 0.0, 0.2]),
+        ({"ki": 0.1, "init": 1.0}, [1.4, 0.4, 0.6]),
+        # Growth from 0 to 14, none from 14 to 0, from 0 to 12.
+        ({"kd": 0.1}, [1.4, 0.0, 1.2]),
+        # Growth over two updates: since before the first one, since then, from 14 to 12.
+        ({"kd": 0.1, "derivative_delay": 2}, [1.4, 0.0, 0.0]),
+        ({"kp": 0.1, "ki": 0.01, "kd": 0.1}, [0.4 + 0.04 + 1.4, 0.0, 0.2 + 0.02 + 1.2]),
+        # Smoothed errors: 2, then 1 − 5 = −4, then −2 + 1 = −1.
+        ({"kp": 0.1, "proportional_ema": 0.5}, [0.2, 0.0, 0.0]),
+        # Smoothed costs: 7, 3.5, 7.75.
+        ({"kd": 0.1, "derivative_ema": 0.5}, [0.7, 0.0, 0.425]),
+        ({"kp": 0.1, "scale": "limit"}, [0.04, 0.0, 0.02]),
+        ({"kp": 0.1, "scale": 2.0}, [0.2, 0.0, 0.1]),
     ],
 )
-def test_settings_out_of_range(settings, message):
+def test_three_updates_of_a_pid_by_hand(settings, expected):
+    assert run([14.0, 0.0, 12.0], **settings) == pytest.approx(expected, abs=1e-6)
+
+
+def test_costs_are_controlled_separately():
+    both = run([[14.0, 1.0], [11.0, 9.0]], limits=[10.0, 4.0], kp=0.1, ki=0.05, kd=0.02)
+    first = run([14.0, 11.0], limits=10.0, kp=0.1, ki=0.05, kd=0.02)
+    second = run([1.0, 9.0], limits=4.0, kp=0.1, ki=0.05, kd=0.02)
+    torch.testing.assert_close(torch.tensor(both).T, torch.tensor([first, second]))
+
+
+def test_integral_control_settles_where_the_plant_meets_the_limit():
+    # A plant whose cost falls with λ: J_c = 30 − 10 λ meets the limit 10 at λ = 2.
+    multiplier = PIDMultiplier(10.0, **(PLAIN | {"kp": 0.02, "ki": 0.02}))
+    for _ in range(200):
+        multiplier.update(30 - 10 * multiplier.value - 10.0)
+    torch.testing.assert_close(multiplier.value, torch.tensor([2.0]), atol=1e-3, rtol=0)
+
+
+@pytest.mark.parametrize(
+    ("build", "message"),
+    [
+        (lambda: PIMultiplier(25.0, **(GAINS | {"kp": -1.0})), "kp and ki"),
+        (lambda: PIMultiplier(25.0, **(GAINS | {"init": 6.0})), "init must lie"),
+        (lambda: run([], kp=-1.0), "Gains"),
+        (lambda: run([], proportional_ema=1.0), r"\[0, 1\)"),
+        (lambda: run([], derivative_delay=0), "at least 1"),
+        (lambda: run([], init=-1.0), "init must not be negative"),
+        (lambda: run([], limits=0.0, scale="limit"), "limit of 0"),
+    ],
+)
+def test_settings_out_of_range(build, message):
     with pytest.raises(ValueError, match=message):
-        PIMultiplier(25.0, **(GAINS | settings))
+        build()

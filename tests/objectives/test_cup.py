@@ -11,7 +11,7 @@ from tensordict.nn import NormalParamExtractor, TensorDictModule
 from torch.distributions import kl_divergence
 from torchrl.modules import ProbabilisticActor, TruncatedNormal
 
-from safe_rl.algorithms import MinibatchUpdate, OnPolicy, UpdatesInTurn
+from safe_rl.algorithms import MinibatchUpdate, OnPolicy, SequentialUpdates
 from safe_rl.objectives import CUPLoss, PPOLoss, ProjectedMultiplier
 
 FACTOR = (1 - 0.99 * 0.97) / (1 - 0.99)
@@ -81,7 +81,7 @@ def test_without_a_weight_the_projection_stays_where_the_first_step_has_led():
     seen = {}
     for weight in (0.0, 1.0):
         loss = cup_loss(actor, weight, entropy_coeff=0.0)
-        update = UpdatesInTurn(first, {"projection": MinibatchUpdate(loss, **settings)})
+        update = SequentialUpdates(first, {"projection": MinibatchUpdate(loss, **settings)})
         seen[weight] = update(batch)
     assert seen[0.0]["kl"] > 0
     assert seen[0.0]["projection_kl"] < 1e-6 < seen[1.0]["projection_kl"]
@@ -111,7 +111,7 @@ def test_updates_in_turn_resume_by_name():
     def both():
         loss = PPOLoss(actor, clip_epsilon=0.2, entropy_coeff=0.0)
         second = MinibatchUpdate(cup_loss(actor, 1.0), **settings)
-        return UpdatesInTurn(MinibatchUpdate(loss, **settings), {"projection": second})
+        return SequentialUpdates(MinibatchUpdate(loss, **settings), {"projection": second})
 
     update, twin = both(), both()
     update(batch)

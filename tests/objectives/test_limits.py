@@ -4,7 +4,7 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from safe_rl.algorithms.tracked_constraints import TrackedConstraints
+from safe_rl.algorithms.constraints import TrackedConstraints
 from safe_rl.collectors import EpisodeStatistics
 from safe_rl.objectives import ProjectedMultiplier
 from safe_rl.objectives.limits import LimitTracker, PromisedChange, descend
@@ -139,7 +139,7 @@ def test_plain_dual_ascent_weighs_costs_of_any_size_alike(size):
         for costs in batches(5, 0.05, unit=unit):
             batch = TensorDict({"next": {"cost": costs}}, [20, 100])
             batch["cost_advantage"] = 3 * costs
-            constraints.observe(episodes, batch)
+            constraints.update(episodes, batch)
             torch.testing.assert_close(batch["cost_advantage"], 3 * costs / unit)
         found.append(constraints.multiplier.value)
     assert found[0] > 1.0
@@ -152,8 +152,8 @@ def test_promises_per_step_are_held_against_the_costs_of_episodes():
     episodes = EpisodeStatistics(NO_EPISODES, {}, NO_EPISODES, {})
     for rate in (0.05, 0.04):
         costs = torch.full((20, 100, 1), rate)
-        constraints.observe(episodes, TensorDict({"next": {"cost": costs}}, [20, 100]))
-        constraints.expect({"cost_surrogate": torch.tensor([-20 / 1000])})
+        constraints.update(episodes, TensorDict({"next": {"cost": costs}}, [20, 100]))
+        constraints.record_prediction({"cost_surrogate": torch.tensor([-20 / 1000])})
     prior = 0.9 * 12.5**2
     share = (prior + 20 * 10) / (prior + 20**2)
     assert constraints.columns()["trust_cost"] == pytest.approx(share)
@@ -166,8 +166,8 @@ def test_trust_finds_the_share_of_promises_that_come_true(kept, share):
     cost, shares = torch.tensor([400.0]), []
     for step in range(400):
         promised = -20 * torch.rand(1, generator=generator) * (1 if step % 20 else -15)
-        promises.observe(cost + 5 * torch.randn(1, generator=generator), torch.tensor([10.0]))
-        promises.promise(promised)
+        promises.update(cost + 5 * torch.randn(1, generator=generator), torch.tensor([10.0]))
+        promises.record_prediction(promised)
         shares.append(promises.share)
         cost = cost + kept * promised
     assert torch.stack(shares[100:]).mean() == pytest.approx(share, abs=0.05)
@@ -213,7 +213,7 @@ def test_with_hysteresis_a_violation_is_made_up_for_by_more_than_itself():
 def test_without_promises_every_promise_is_believed():
     promises = PromisedChange(2, memory=0.9, lowest=0.1)
     for _ in range(5):
-        promises.observe(torch.rand(2), torch.ones(2))
+        promises.update(torch.rand(2), torch.ones(2))
     assert promises.share.tolist() == [1.0, 1.0]
 
 
@@ -222,7 +222,7 @@ def test_a_saved_state_goes_on_as_if_it_had_never_stopped():
     *before, last = batches(6, 0.06)
     for costs in before:
         whole.update(costs, torch.tensor([90.0]))
-        whole.promises.promise(torch.tensor([-3.0]))
+        whole.promises.record_prediction(torch.tensor([-3.0]))
     second.load_state_dict(whole.state_dict())
     states = [each.update(last, NO_EPISODES) for each in (whole, second)]
     assert all(torch.equal(ours, theirs) for ours, theirs in zip(*states, strict=True))

@@ -25,15 +25,15 @@ def test_first_adam_step_moves_nu_by_the_learning_rate():
     # Bias correction makes Adam's first step lr·sign(gradient), whatever its size.
     for cost, sign in ((60.0, 1), (26.0, 1), (3.0, -1)):
         multiplier = lagrange()
-        multiplier.update(torch.tensor([cost]))
+        multiplier.update(torch.tensor([cost - 25.0]))
         expected = math.log1p(math.exp(NU_OF_ONE + sign * 0.05))
         assert multiplier.value.item() == pytest.approx(expected, rel=1e-6)
 
 
 def test_second_adam_step_by_hand():
     multiplier = lagrange()
-    multiplier.update([35.0])  # gradient −10: m = −1, v = .1
-    multiplier.update([20.0])  # gradient +5: m = −.9 + .5 = −.4, v = .0999 + .025 = .1249
+    multiplier.update([10.0])  # gradient −10: m = −1, v = .1
+    multiplier.update([-5.0])  # gradient +5: m = −.9 + .5 = −.4, v = .0999 + .025 = .1249
     first = 0.05
     second = 0.05 * (0.4 / (1 - 0.81)) / math.sqrt(0.1249 / (1 - 0.998001))
     assert multiplier.nu.item() == pytest.approx(NU_OF_ONE + first + second, rel=1e-5)
@@ -45,21 +45,21 @@ def test_matches_torch_adam_on_the_dual_loss():
     adam = torch.optim.Adam([nu], lr=0.03)
     generator = torch.Generator().manual_seed(0)
     for _ in range(50):
-        costs = 40 * torch.rand(2, generator=generator)
+        violation = 40 * torch.rand(2, generator=generator) - torch.tensor([25.0, 5.0])
         adam.zero_grad()
-        (-nu * (costs - torch.tensor([25.0, 5.0]))).sum().backward()
+        (-nu * violation).sum().backward()
         adam.step()
-        multiplier.update(costs)
+        multiplier.update(violation)
     torch.testing.assert_close(multiplier.nu, nu.detach())
 
 
 def test_nan_leaves_only_that_cost_unchanged():
     multiplier, single = lagrange([25.0, 5.0]), lagrange([25.0])
-    for known, unknown in ((40.0, 9.0), (30.0, math.nan), (10.0, math.nan)):
+    for known, unknown in ((15.0, 4.0), (5.0, math.nan), (-15.0, math.nan)):
         multiplier.update([known, unknown])
         single.update([known])
     after_one = lagrange([5.0])
-    after_one.update([9.0])
+    after_one.update([4.0])
     expected = torch.cat([single.nu, after_one.nu])
     torch.testing.assert_close(multiplier.nu, expected)
     torch.testing.assert_close(multiplier.step, torch.tensor([3.0, 1.0]))
@@ -77,15 +77,15 @@ KINDS = {
 @pytest.mark.parametrize("kind", KINDS)
 def test_nan_leaves_everything_unchanged_and_resume_is_exact(kind):
     multiplier, resumed = (KINDS[kind]([limit, 5.0]) for limit in (10.0, 1.0))
-    for costs in ([14.0, 3.0], [33.0, 9.0]):
-        multiplier.update(costs)
+    for violation in ([4.0, 2.0], [23.0, 8.0]):
+        multiplier.update(violation)
     before = {name: buffer.clone() for name, buffer in multiplier.state_dict().items()}
     multiplier.update([math.nan] * 2)
     for name, buffer in multiplier.state_dict().items():
         assert torch.equal(buffer, before[name])
     resumed.load_state_dict(before)
     for each in (multiplier, resumed):
-        each.update([20.0, 9.0])
+        each.update([10.0, 8.0])
     assert torch.equal(multiplier.value, resumed.value)
     assert multiplier.value[0] > 0
 

@@ -166,7 +166,7 @@ def test_multiplier_update_reaches_the_loss_and_is_not_trained_by_it():
     assert names
     assert all(name.startswith("actor_network_params") for name in names)
     before = loss(batch)["loss_objective"]
-    loss.multiplier.update([60.0, 60.0])
+    loss.multiplier.update([35.0, 35.0])
     assert loss(batch)["loss_objective"] != before
 
 
@@ -186,7 +186,7 @@ def test_compiles_in_one_graph_that_is_never_recompiled(backend):
             torch.testing.assert_close(losses[key], expected[key])
         compiled_gradient = gradient(losses["loss_objective"], actor)
         torch.testing.assert_close(compiled_gradient, gradient(expected["loss_objective"], actor))
-        loss.multiplier.update([60.0 + epoch, 1.0])
+        loss.multiplier.update([35.0 + epoch, -4.0])
         loss.clip_epsilon, loss.entropy_coeff = 0.1 / (epoch + 1), 0.02 / (epoch + 1)
         perturb(actor)
         batch = make_batch(actor, [64], 2)

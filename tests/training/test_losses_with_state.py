@@ -7,7 +7,7 @@ from tensordict.nn import TensorDictModule
 from torchrl.objectives import A2CLoss, ClipPPOLoss, KLPENPPOLoss
 
 from safe_rl import targets
-from safe_rl.algorithms.loss_state import LossState
+from safe_rl.algorithms.losses import LossState
 from safe_rl.models import make_actor
 from safe_rl.objectives import PPOLagrangianLoss, TRPOLagrangianLoss
 from safe_rl.runs.table import read_table

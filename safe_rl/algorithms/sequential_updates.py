@@ -8,12 +8,12 @@ from typing import Any
 from tensordict import TensorDictBase
 from torch import Tensor, nn
 
-from safe_rl.algorithms.contract import PolicyUpdate
+from safe_rl.algorithms.algorithm_contract import PolicyUpdate
 
-__all__ = ["UpdatesInTurn"]
+__all__ = ["SequentialUpdates"]
 
 
-class UpdatesInTurn(PolicyUpdate):
+class SequentialUpdates(PolicyUpdate):
     """A `PolicyUpdate` of several, each going on from where the one before has left the policy.
 
     In a configuration, ``then`` names what comes after ``policy_update``: a loss and an update for
@@ -32,7 +32,7 @@ class UpdatesInTurn(PolicyUpdate):
         ...         self.kl = torch.tensor(kl)
         ...     def __call__(self, batch, cost_violation, episode_length):
         ...         return {"kl": self.kl}
-        >>> update = UpdatesInTurn(Fixed(0.01), {"projection": Fixed(0.02)})
+        >>> update = SequentialUpdates(Fixed(0.01), {"projection": Fixed(0.02)})
         >>> update(TensorDict(), torch.zeros(1), torch.ones(()))
         {'kl': tensor(0.0100), 'projection_kl': tensor(0.0200)}
     """

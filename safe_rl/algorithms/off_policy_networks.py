@@ -7,10 +7,10 @@ from typing import Any
 import torch
 from omegaconf import DictConfig, OmegaConf
 from tensordict.nn import TensorDictModuleBase
-from torchrl.data import TensorSpec
+from torchrl.data import Bounded, TensorSpec
 from torchrl.envs import EnvBase
 
-from safe_rl.algorithms.parts import build_part
+from safe_rl.algorithms.build_part import build_part
 from safe_rl.models import ExploringPolicy, QEnsemble, input_scale_vector
 from safe_rl.models.encoders import TO_FLATTEN, observed_entries
 
@@ -38,7 +38,7 @@ def bounded_actions(env: EnvBase) -> TensorSpec:
         ValueError: If it has none, or another shape.
     """
     spec = env.action_spec_unbatched
-    is_continuous = hasattr(spec, "low") and spec.dtype.is_floating_point
+    is_continuous = isinstance(spec, Bounded) and spec.dtype.is_floating_point
     if not is_continuous or not (spec.low.isfinite() & spec.high.isfinite()).all():
         raise ValueError(
             "This algorithm's actions lie within bounds, and those of this environment have none: "

@@ -10,7 +10,7 @@ from typing import Any
 import torch
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-__all__ = ["side_by_side", "torch_threads"]
+__all__ = ["in_parallel", "torch_threads"]
 
 
 @contextmanager
@@ -24,7 +24,7 @@ def torch_threads(number: int) -> Iterator[None]:
         torch.set_num_threads(before)
 
 
-def side_by_side(first: Callable[[], Any], second: Callable[[], Any]) -> tuple[Any, Any]:
+def in_parallel(first: Callable[[], Any], second: Callable[[], Any]) -> tuple[Any, Any]:
     """Call two functions that share nothing they change, each with half of torch's threads.
 
     Minibatches of narrow networks are too small to be worth two threads each: two of them side by
@@ -39,7 +39,7 @@ def side_by_side(first: Callable[[], Any], second: Callable[[], Any]) -> tuple[A
         What they return. Both have ended, also if one of them raises.
 
     Examples:
-        >>> side_by_side(lambda: 1, lambda: 2)
+        >>> in_parallel(lambda: 1, lambda: 2)
         (1, 2)
     """
     threads = torch.get_num_threads()

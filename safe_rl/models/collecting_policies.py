@@ -1,0 +1,183 @@
+"""Policies that a collector steps, without distribution objects: on-policy and off-policy ones."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.nn import (
+    ProbabilisticTensorDictSequential,
+    TensorDictModule,
+    TensorDictModuleBase,
+)
+from torch import Tensor
+from torchrl.envs.utils import ExplorationType, exploration_type
+from torchrl.modules import IndependentNormal, TanhNormal
+
+__all__ = ["WITHOUT_NOISE", "BehaviourPolicy", "ExploringPolicy", "make_behaviour"]
+
+
+def make_behaviour(actor: ProbabilisticTensorDictSequential) -> TensorDictModuleBase:
+    """The fastest module that samples an actor: a `BehaviourPolicy` of it, or the actor itself."""
+    try:
+        return BehaviourPolicy(actor)
+    except TypeError:
+        return actor
+
+
+WITHOUT_NOISE = (ExplorationType.DETERMINISTIC, ExplorationType.MODE, ExplorationType.MEAN)
+"""Kinds of exploration under which policies act without what they draw."""
+
+
+class BehaviourPolicy(TensorDictModuleBase):
+    """Sample a Gaussian actor in one module, without distribution objects.
+
+    It shares the actor's parameters and writes what the actor writes: ``loc``, ``scale``, the
+    action and its log-probability. While an environment is stepped with small batches, most of the
+    actor's time goes into building distributions and nesting modules, which this class leaves out.
+    Under ``set_exploration_type`` with ``DETERMINISTIC``, ``MODE`` or ``MEAN`` the action is
+    ``loc``, which is all of these of a Gaussian.
+
+    Args:
+        actor: Policy made by :func:`make_actor`, or any ``ProbabilisticTensorDictSequential`` of a
+            plain ``TensorDictModule`` that writes a mean and a standard deviation, and of an
+            ``IndependentNormal`` of these that writes an action and its log-probability.
+
+    Raises:
+        TypeError: If the actor is another.
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from safe_rl.models import make_actor
+        >>> policy = BehaviourPolicy(make_actor(3, 2, hidden_sizes=[8], initial_log_std=-0.5))
+        >>> policy(TensorDict({"observation": torch.zeros(5, 3)}, [5]))["scale"][0]
+        tensor([0.6065, 0.6065], grad_fn=<SelectBackward0>)
+    """
+
+    def __init__(self, actor: ProbabilisticTensorDictSequential) -> None:
+        super().__init__()
+        parameters, sampler = actor.module[0], actor.module[-1]
+        if not (
+            len(actor.module) == 2
+            and type(parameters) is TensorDictModule  # others may call their network otherwise
+            and sampler.distribution_class is IndependentNormal
+            and not sampler.distribution_kwargs
+            and list(sampler.dist_keys) == ["loc", "scale"]
+            and list(parameters.out_keys) == list(sampler.in_keys)
+            and len(sampler.out_keys) == 2
+        ):
+            raise TypeError(
+                "BehaviourPolicy samples one TensorDictModule that writes loc and scale, followed "
+                "by an IndependentNormal of them with return_log_prob=True, got "
+                f"{len(actor.module)} modules, the first a {type(parameters).__name__} that writes "
+                f"{parameters.out_keys}, and {sampler.distribution_class}. Hand the actor itself "
+                "to the collector instead."
+            )
+        self.network = parameters.module
+        self.in_keys = list(parameters.in_keys)
+        self.out_keys = [*parameters.out_keys, *sampler.out_keys]
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Write the distribution's parameters, the action and its log-probability."""
+        loc, scale = self.network(*(tensordict.get(key) for key in self.in_keys))
+        if exploration_type() in WITHOUT_NOISE:
+            noise = torch.zeros_like(loc)
+        else:
+            noise = torch.randn_like(loc)
+        # log N(loc + scale * noise; loc, scale) in terms of the noise alone
+        log_prob = -0.5 * noise.square().sum(-1) - scale.log().sum(-1)
+        log_prob = log_prob - 0.5 * math.log(2 * math.pi) * loc.shape[-1]
+        outputs = (loc, scale, torch.addcmul(loc, scale, noise), log_prob)
+        for key, value in zip(self.out_keys, outputs, strict=True):
+            tensordict.set(key, value)
+        return tensordict
+
+
+class ExploringPolicy(TensorDictModuleBase):
+    """What a collector steps with: the actor's actions, or uniformly random ones in the beginning.
+
+    It shares the actor's parameters and writes nothing but the action, without distribution
+    objects. Of a squashed Gaussian it samples; to the actions of a deterministic actor it adds
+    Gaussian noise. Under ``set_exploration_type`` with ``DETERMINISTIC``, ``MODE`` or ``MEAN`` the
+    action is the actor's own: the tanh of the Gaussian's mean.
+
+    Args:
+        actor: What :func:`~safe_rl.models.make_squashed_actor` or
+            :func:`~safe_rl.models.make_bounded_actor` makes.
+        low: Lower bounds of the action, [A].
+        high: Upper bounds of the action, [A].
+        noise: Standard deviation of the noise that is added to a deterministic actor's actions, in
+            halves of the range of an action.
+
+    Attributes:
+        is_random: Whether actions are uniformly random; a buffer, that collectors' workers get with
+            the weights.
+
+    Raises:
+        TypeError: If the actor is neither kind.
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from safe_rl.models import make_squashed_actor
+        >>> bounds = -torch.ones(2), torch.ones(2)
+        >>> policy = ExploringPolicy(make_squashed_actor(3, *bounds, hidden_sizes=[8]), *bounds)
+        >>> policy.is_random.fill_(True)
+        tensor(True)
+        >>> policy(TensorDict({"observation": torch.zeros(5, 3)}, [5]))["action"].shape
+        torch.Size([5, 2])
+    """
+
+    low: Tensor
+    high: Tensor
+    is_random: Tensor
+
+    def __init__(
+        self,
+        actor: ProbabilisticTensorDictSequential | TensorDictModule,
+        low: Tensor,
+        high: Tensor,
+        *,
+        noise: float = 0.0,
+    ) -> None:
+        super().__init__()
+        parameters, self._samples = actor, False
+        if isinstance(actor, ProbabilisticTensorDictSequential):
+            parameters, sampler = actor.module[0], actor.module[-1]
+            self._samples = True
+            is_squashed = issubclass(sampler.distribution_class, TanhNormal)
+            if len(actor.module) != 2 or not is_squashed:
+                raise TypeError(
+                    "ExploringPolicy samples a network followed by a TanhNormal, got "
+                    f"{len(actor.module)} modules and {sampler.distribution_class.__name__}."
+                )
+        self.network, self.noise = parameters.module, noise
+        self.in_keys = list(parameters.in_keys)
+        self.out_keys = list(actor.out_keys[-1:] if not self._samples else sampler.out_keys[:1])
+        device = next(actor.parameters()).device
+        self.register_buffer("low", low.to(device), persistent=False)
+        self.register_buffer("high", high.to(device), persistent=False)
+        self.register_buffer(
+            "is_random", torch.zeros((), dtype=torch.bool, device=device), persistent=False
+        )
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Write the action."""
+        outputs = self.network(tensordict.get(self.in_keys[0]))
+        is_noisy = exploration_type() not in WITHOUT_NOISE
+        half = (self.high - self.low) / 2
+        if self._samples:
+            loc, scale = outputs
+            inner = torch.addcmul(loc, scale, torch.randn_like(loc)) if is_noisy else loc
+            action = self.low + half * (1 + inner.tanh())
+        elif is_noisy and self.noise:
+            action = outputs + self.noise * half * torch.randn_like(outputs)
+            action = action.clamp(self.low, self.high)
+        else:
+            action = outputs
+        if is_noisy:
+            uniform = self.low + 2 * half * torch.rand_like(action)
+            action = torch.where(self.is_random, uniform, action)
+        return tensordict.set(self.out_keys[0], action)
