@@ -59,7 +59,7 @@ def test_ppo_lagrangian_in_torchrls_ppo_trainer(example):
     assert history["optim_steps"][-1] >= 60
     twin = LagrangeMultiplier(LIMITS, init=1.0, lr=0.05)
     for index in range(3):
-        twin.update([history[f"episode_{key}"][index] for key in LIMITS])
+        twin.update([history[f"episode_{key}"][index] - LIMITS[key] for key in LIMITS])
         for key, value in twin.named_values().items():
             assert history[f"multiplier_{key}"][index] == pytest.approx(value.item(), rel=1e-5)
             violation = history[f"episode_{key}"][index] - LIMITS[key]
