@@ -2,10 +2,13 @@
 
 The cost rate of a batch times the mean length of an episode, J_c = (Σ c / steps) · T̄, uses every
 step that was taken. By the renewal-reward theorem it tends to E[C] even where the length and the
-cost of an episode depend on each other, if rows are at independent points of their episodes (see
-`stagger` of the accounting); while all rows are in the same part of an episode, it is the rate of
-that part. For a batch of whole episodes it *is* their mean cost, as long as T̄ is their length: T̄ is
-a mean over past batches too, and lags where episodes become longer or shorter.
+cost of an episode depend on each other, if rows are at independent points of their episodes
+(``staggered_starts``) and the policy stays as it is; while all rows are in the same part of an
+episode, it is the rate of that part. For a batch of many whole episodes it *is* their mean cost.
+
+T̄ is the number of steps per end of an episode in the last batches. A mean over the episodes that
+have ended would be too low while episodes grow longer, by a factor of two to five: the long ones
+are those that have not ended yet, and the many short ones of before outnumber them.
 """
 
 from __future__ import annotations
@@ -18,6 +21,8 @@ from torch import Tensor
 
 from safe_rl.objectives.risk import Charges
 
+#: Ends of episodes from which the mean length is taken.
+_ENDS = 100
 #: Pieces into which a batch of few rows is cut, so that a spread can be told.
 _FEWEST_PIECES = 8
 
@@ -85,15 +90,59 @@ def shrink(past: CostEstimate, present: CostEstimate, drift: Tensor) -> CostEsti
     )
 
 
+class EpisodeLengths:
+    """Mean episode length T̄: steps per end of an episode, over the last 100 ends or a few more.
+
+    The steps are counted from a batch on that follows one with ends, so that a batch without any
+    adds to T̄. T̄ is at most the longest possible length, and exactly that where no episode has
+    ended before it.
+
+    Args:
+        longest: steps after which an episode is over: T̄ until one has ended.
+
+    Examples:
+        >>> lengths = EpisodeLengths(1000)
+        >>> lengths.update(20_000, torch.full((400,), 50.0))
+        >>> lengths.mean
+        tensor(50.)
+        >>> lengths.update(20_000, torch.full((20,), 50.0))  # the others go on: 40,000 / 420
+        >>> lengths.mean.round()
+        tensor(95.)
+    """
+
+    def __init__(self, longest: float) -> None:
+        self.longest = longest
+        #: Steps, ends and early ends since the last batch with ends, in order of time.
+        self.counts = torch.zeros(0, 3, dtype=torch.float64)
+
+    def update(self, num_steps: int, lengths: Tensor) -> None:
+        """Take in a batch of so many steps, and the steps [E] of the episodes that ended in it."""
+        early = int((lengths < self.longest).sum())
+        row = torch.tensor([[num_steps, lengths.numel(), early]], dtype=torch.float64)
+        if len(self.counts) and not self.counts[-1, 1]:
+            row += self.counts[-1:]
+            self.counts = self.counts[:-1]
+        self.counts = torch.cat([self.counts, row])
+        ends_since = self.counts[:, 1].flip(0).cumsum(0).flip(0)
+        first = int((ends_since >= _ENDS).sum()) - 1
+        self.counts = self.counts[max(first, 0) :]
+
+    @property
+    def mean(self) -> Tensor:
+        """T̄ in steps, scalar."""
+        steps, ends, early = self.counts.sum(0).tolist()
+        return torch.tensor(min(steps / ends, self.longest) if early else float(self.longest))
+
+
 class EpisodeCosts:
     """Estimator of J_c, of the mean episode length T̄ and of the size of one cost, over a run.
 
     Args:
         num_costs: k.
-        max_length: steps after which an episode is over: T̄ until an episode has finished.
+        max_length: steps after which an episode is over; see `EpisodeLengths`.
         drift: share by which J_c changes from one policy to the next, about; it weighs the past
             against the batch. None uses the batch alone.
-        memory: weight in [0, 1) of the past in T̄ and in how much costs scatter.
+        memory: weight in [0, 1) of the past in how much costs scatter.
         smallest: costs per step that count as J_c's size where it is smaller, for the drift: from
             batches without any cost nothing else would lead away.
 
@@ -115,9 +164,8 @@ class EpisodeCosts:
         smallest: float = 0.0,
     ) -> None:
         self.drift, self.memory, self.smallest = drift, memory, smallest
+        self.lengths = EpisodeLengths(max_length)
         self._state = {
-            "length": torch.tensor(float(max_length)),
-            "length_weight": torch.zeros(()),
             "mean": torch.full((num_costs,), torch.nan),
             "error": torch.full((num_costs,), torch.nan),
             "sums": torch.zeros(2, num_costs, dtype=torch.float64),
@@ -127,7 +175,7 @@ class EpisodeCosts:
     @property
     def length(self) -> Tensor:
         """Mean episode length T̄ in steps, scalar."""
-        return self._state["length"]
+        return self.lengths.mean
 
     @property
     def unit(self) -> Tensor:
@@ -152,8 +200,7 @@ class EpisodeCosts:
         """
         costs = costs.to(self._state["sums"])
         self._state["sums"] += torch.stack([costs.sum((0, 1)), costs.square().sum((0, 1))])
-        if lengths.numel():
-            self._add_lengths(lengths)
+        self.lengths.update(costs.shape[0] * costs.shape[1], lengths)
         charged = costs if charges is None else charges.costs.to(costs)
         batch = CostEstimate(*(part.float() for part in rate_estimate(charged, self.length)))
         if charges is not None:
@@ -183,19 +230,14 @@ class EpisodeCosts:
         error = (squared / sizes * size).sqrt()
         return torch.where(error.isfinite(), error, batch.error)
 
-    def _add_lengths(self, lengths: Tensor) -> None:
-        kept = self._state["length_weight"] * self.memory
-        total = kept + lengths.numel()
-        self._state["length"] = (kept * self.length + lengths.sum().to(self.length)) / total
-        self._state["length_weight"] = total
-
     def state_dict(self) -> dict[str, Tensor]:
         """Everything the next estimate depends on."""
-        return {name: value.clone() for name, value in self._state.items()}
+        state = {name: value.clone() for name, value in self._state.items()}
+        return state | {"counts": self.lengths.counts.clone()}
 
     def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
         """Continue from :meth:`state_dict`."""
         for name, value in self._state.items():
-            # checkpoints of earlier versions lack what batches scatter: it is learned again
             # a copy, because sums are added to in place
-            self._state[name] = state_dict.get(name, value).to(value, copy=True)
+            self._state[name] = state_dict[name].to(value, copy=True)
+        self.lengths.counts = state_dict["counts"].to(self.lengths.counts)

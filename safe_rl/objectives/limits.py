@@ -152,7 +152,7 @@ class LimitTracker:
         smallest_scale: Lower bound of the unit of violations, in costs per step: that of a limit
             near 0.
         drift: Share by which J_c changes per update, about; see `EpisodeCosts`.
-        memory: Weight of the past in T̄, in the standard error and in the trust.
+        memory: Weight of the past in the standard error of a batch and in the trust.
         lowest_trust: Lower bound of trust_<cost>, the share of a promise that is believed; 1
             believes all.
         integral: Share of every violation that is asked for again in all updates to come (the
