@@ -14,7 +14,7 @@ from safe_rl.objectives.fisher import FisherProduct
 from safe_rl.objectives.multipliers import CostLimits, parse_cost_limits
 from safe_rl.objectives.trust_region import flat_gradient
 from safe_rl.objectives.violation import matched_violation
-from safe_rl.ranges import Fraction, NotNegative, Weight
+from safe_rl.ranges import Fraction, NotNegative
 
 __all__ = ["CTRPOStep", "barrier_divergence"]
 
@@ -49,10 +49,11 @@ class CTRPOStep(TRPOStep):
 
         D_C(π_θ ‖ π_k) = KL(π_θ ‖ π_k) + β Σᵢ D_φ(dᵢ − J_cᵢ(θ), dᵢ − J_cᵢ(θ_k)) ≤ δ
 
-    with `barrier_divergence` as D_φ and J_c(θ) − J_c(θ_k) = h E[(ρ − 1) A_c], where h = 1/(1 − γ)
-    makes a sum of an average per step. Its Hessian at θ_k is H + β h² Σᵢ bᵢbᵢᵀ / (dᵢ − J_cᵢ): where
-    a limit is near, the natural gradient turns along it. The line search takes the first fraction
-    with D_C ≤ δ that does not worsen the loss.
+    with `barrier_divergence` as D_φ and J_c(θ) − J_c(θ_k) = T̄ E[(ρ − 1) A_c]: the mean length of
+    an episode makes an undiscounted sum of an average per step, as 1/(1 − γ) makes the article's
+    discounted one. Its Hessian at θ_k is H + β T̄² Σᵢ bᵢbᵢᵀ / (dᵢ − J_cᵢ): where a limit is near,
+    the natural gradient turns along it. The line search takes the first fraction with D_C ≤ δ that
+    does not worsen the loss.
 
     A policy beyond a limit recovers: `TRPOStep`'s step against E[ρ A_c] until J_c is (1 −
     `hysteresis`) d below what it is held against, which is d or, by a margin, less. The barriers
@@ -65,14 +66,12 @@ class CTRPOStep(TRPOStep):
         loss: a `CPOLoss`, or a callable of your own that returns a TensorDict with scalars
             ``loss_…`` and the differentiable ``cost_surrogate``, [k].
         cost_limits: d, as of a multiplier; see `parse_cost_limits`.
-        beta: Weight β of the barrier, per unit of an episode's cost, for every cost.
-        gamma: Discount γ in the factor h = 1/(1 − γ); None takes T̄ in its place, that of
-            undiscounted sums.
+        beta: Weight β of the barrier, per unit of an episode's undiscounted cost, for every cost.
         hysteresis: Share of d at which a recovery ends; 1 ends it at the limit.
         settings: Those of every step, see `TRPOStep`.
 
     Raises:
-        ValueError: if `hysteresis` or `gamma` is outside its range.
+        ValueError: if `hysteresis` is outside its range.
 
     Examples:
         >>> from tensordict import TensorDict
@@ -84,10 +83,12 @@ class CTRPOStep(TRPOStep):
         >>> batch["advantage"], batch["cost_advantage"] = torch.randn(8, 1), torch.randn(8, 1)
         >>> region = {"target_kl": 0.01, "damping": 0.1, "cg_iterations": 10}
         >>> search = {"backtrack_coeff": 0.8, "max_backtracks": 10}
-        >>> barrier = {"beta": 1.0, "gamma": 0.99, "hysteresis": 0.8}
+        >>> barrier = {"beta": 0.1, "hysteresis": 0.8}
         >>> loss = CPOLoss(actor, entropy_coeff=0.0)
         >>> step = CTRPOStep(loss, {"cost": 25.0}, **barrier, **region, **search)
-        >>> [step(batch, torch.tensor([violation]))["recovers"].item() for violation in (1, -1, -6)]
+        >>> length = torch.tensor(1000.0)
+        >>> violations = [torch.tensor([violation]) for violation in (1, -1, -6)]
+        >>> [step(batch, violation, length)["recovers"].item() for violation in violations]
         [1.0, 1.0, 0.0]
     """
 
@@ -97,18 +98,14 @@ class CTRPOStep(TRPOStep):
         cost_limits: CostLimits,
         *,
         beta: NotNegative,
-        gamma: Weight | None,
         hysteresis: Fraction,
         **settings: Any,
     ) -> None:
         super().__init__(loss, **settings)
-        if not 0 < hysteresis <= 1 or (gamma is not None and not 0 <= gamma < 1):
-            raise ValueError(
-                f"hysteresis must be in (0, 1] and gamma in [0, 1) or null, got {hysteresis} and "
-                f"{gamma}."
-            )
+        if not 0 < hysteresis <= 1:
+            raise ValueError(f"hysteresis must be in (0, 1], got {hysteresis}.")
         self.limits = parse_cost_limits(cost_limits)[1]
-        self.beta, self.gamma = beta, gamma
+        self.beta = beta
         self.recovered = -(1 - hysteresis) * self.limits
         self.recovering = torch.zeros_like(self.limits, dtype=torch.bool)
 
@@ -119,14 +116,17 @@ class CTRPOStep(TRPOStep):
         cost_violation: Tensor | None,
         episode_length: Tensor | None,
     ) -> Proposal:
+        if episode_length is None:
+            raise ValueError("A C-TRPO step needs the mean episode_length.")
+        length = torch.as_tensor(episode_length).to(losses["cost_surrogate"])
         surrogates = losses["cost_surrogate"]
         violation = matched_violation(cost_violation, surrogates)
         above = violation - self.recovered.to(violation)
         was_recovering = self.recovering.to(violation.device) & (above >= 0)
         costs_anything = violation > -self.limits.to(violation)
         self.recovering = ((violation >= 0) | was_recovering) & costs_anything
-        inside, horizon = ~self.recovering & (violation < 0), self._horizon(episode_length)
-        slack, start = -violation[inside], horizon * surrogates[inside].detach()
+        inside = ~self.recovering & (violation < 0)
+        slack, start = -violation[inside], length * surrogates[inside].detach()
         worst = int(above.masked_fill(~self.recovering, -torch.inf).argmax())
         recovers = self.recovering.any()
         objective = (lambda of: of["cost_surrogate"][worst]) if recovers else total_loss
@@ -135,29 +135,21 @@ class CTRPOStep(TRPOStep):
         b = self._gradients(surrogates[inside])
         v, w = self._solve_all(fisher, g, b)
         # Woodbury's identity for the inverse of H + Σ κᵢbᵢbᵢᵀ, whatever the size of κ
-        root = (self.beta * horizon**2 / slack).sqrt()
+        root = (self.beta * length**2 / slack).sqrt()
         gram = torch.eye(len(root), dtype=root.dtype, device=root.device)
         gram = gram + root[:, None] * (b @ w.T) * root
         direction = v - (root * torch.linalg.solve(gram, root * (b @ v))) @ w
         squared = (g @ direction).clamp_min(0)
-        length = torch.where(squared > 0, (2 * self.target_kl / squared).sqrt(), 0.0)
+        scale = torch.where(squared > 0, (2 * self.target_kl / squared).sqrt(), 0.0)
         before = loss.detach()
 
         def is_acceptable(after: TensorDictBase, kl: Tensor) -> bool:
-            change = horizon * after["cost_surrogate"][inside] - start
+            change = length * after["cost_surrogate"][inside] - start
             divergence = kl + self.beta * barrier_divergence(change, slack).sum()
             return bool((divergence <= self.target_kl) & (objective(after) <= before))
 
         diagnostics = {"recovers": self.recovering.to(surrogates.dtype)}
-        return Proposal(-length * direction, is_acceptable, diagnostics)
-
-    def _horizon(self, episode_length: Tensor | None) -> Tensor | float:
-        """h, what makes a sum over an episode of an average per step."""
-        if self.gamma is not None:
-            return 1 / (1 - self.gamma)
-        if episode_length is None:
-            raise ValueError("With gamma=null a C-TRPO step needs the mean episode_length.")
-        return episode_length
+        return Proposal(-scale * direction, is_acceptable, diagnostics)
 
     def state_dict(self) -> dict[str, Any]:
         """Which costs are being recovered."""

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from safe_rl.objectives.ppo import PPOLoss, clipped_gain
 from safe_rl.objectives.violation import Violations, constraint_value, violation_of
-from safe_rl.ranges import NotNegative, Range, Share
+from safe_rl.ranges import NotNegative, Range
 
 
 class P3OLoss(PPOLoss):
@@ -19,12 +19,12 @@ class P3OLoss(PPOLoss):
 
     Minimises (Zhang et al. 2022, their clipped surrogates with an exact penalty)
 
-        E[−min(ρA, clip(ρ)A)] + κ Σᵢ relu(E[max(ρA_cᵢ, clip(ρ)A_cᵢ)] + (1 − γ)(J_cᵢ − dᵢ)).
+        E[−min(ρA, clip(ρ)A)] + κ Σᵢ relu(E[max(ρA_cᵢ, clip(ρ)A_cᵢ)] + (J_cᵢ − dᵢ) / T̄).
 
     With κ at least as large as the largest multiplier of the constrained problem, both have the
-    same solution. The expectation is taken before the relu. 1 − γ turns a sum that is discounted
-    by γ into an average per step, which is what the surrogate is; the limits here are on
-    undiscounted sums, whose average is reached by 1/T̄: ``gamma=None``.
+    same solution. The expectation is taken before the relu. The surrogate is an average per step.
+    The article's costs and limits are discounted sums, of which 1 − γ makes such an average; those
+    here are undiscounted, of which 1/T̄ does.
 
     Reads and writes what `PPOLoss` does, reads ``cost_advantage`` [..., k], and adds
     ``loss_penalty`` and the detached ``cost_surrogate`` [k], E[max(ρA_c, clip(ρ)A_c)].
@@ -33,7 +33,6 @@ class P3OLoss(PPOLoss):
         actor_network: policy with `get_dist`; see `SurrogateLoss`.
         constraints: where J_c − d and T̄ stand at every call.
         kappa: Penalty factor κ, for every cost, in units of the standardised reward advantage.
-        gamma: Discount γ in the factor 1 − γ of the violation; None takes 1/T̄ in its place.
         settings: Those of every clipped loss, see `PPOLoss`; costs are always averaged.
 
     Examples:
@@ -45,12 +44,14 @@ class P3OLoss(PPOLoss):
         >>> constraints = Constraints({"cost": 25.0})
         >>> constraints.violation.fill_(10.0)  # a recipe's constraints observe their episodes
         tensor([10.])
+        >>> constraints.episode_length.fill_(100.0)
+        tensor(100.)
         >>> settings = {"clip_epsilon": 0.2, "entropy_coeff": 0.0}
-        >>> loss = P3OLoss(actor, constraints, kappa=20.0, gamma=0.99, **settings)
+        >>> loss = P3OLoss(actor, constraints, kappa=20.0, **settings)
         >>> with torch.no_grad():
         ...     batch = actor(TensorDict(observation=torch.randn(8, 3), batch_size=[8]))
         >>> batch["advantage"], batch["cost_advantage"] = torch.randn(8, 1), torch.zeros(8, 1)
-        >>> round(loss(batch)["loss_penalty"].item(), 3)  # 20 (1 - 0.99) 10
+        >>> round(loss(batch)["loss_penalty"].item(), 3)  # 20 · 10 / 100
         2.0
     """
 
@@ -63,11 +64,10 @@ class P3OLoss(PPOLoss):
         constraints: Violations,
         *,
         kappa: NotNegative,
-        gamma: Share | None,
         **settings: Any,
     ) -> None:
         super().__init__(actor_network, **settings)
-        self.constraints, self.kappa, self.gamma = constraints, kappa, gamma
+        self.constraints, self.kappa = constraints, kappa
 
     def _surrogates(self, tensordict: TensorDictBase, log_weight: Tensor) -> dict[str, Tensor]:
         cost_advantage = self._cost_advantage(tensordict)
@@ -75,10 +75,7 @@ class P3OLoss(PPOLoss):
         gain = -clipped_gain(log_weight, -cost_advantage, self.clip_epsilon)
         surrogates = self._cost_surrogates(tensordict, gain)
         violation = violation_of(self.constraints, surrogates)
-        # no episode has a length before the first batch, when the violation counts as 0
-        inverse = (1 / self.constraints.episode_length).nan_to_num(0.0)
-        per_step = inverse if self.gamma is None else 1 - self.gamma
-        excess = surrogates + per_step * violation
+        excess = surrogates + constraint_value(violation, self.constraints.episode_length, True)
         return {
             **super()._surrogates(tensordict, log_weight),
             "loss_penalty": self.kappa * excess.relu().sum(),

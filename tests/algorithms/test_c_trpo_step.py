@@ -14,7 +14,8 @@ from safe_rl.objectives import CPOLoss
 from safe_rl.objectives.distributions import gaussian_kl
 from safe_rl.objectives.trust_region import flatten, policy_in, set_parameters
 
-DELTA, HORIZON, BETA = 0.01, 100.0, 0.5
+DELTA, BETA = 0.01, 0.5
+LENGTH = torch.tensor(100.0)
 SETTINGS = {
     "target_kl": DELTA, "damping": 0.1, "cg_iterations": 60, "backtrack_coeff": 0.8,
     "max_backtracks": 20,
@@ -33,7 +34,7 @@ def make_case(num_costs=2):
 
 def c_trpo(actor, num_costs=2, **changed):
     loss = CPOLoss(actor, entropy_coeff=0.0)
-    settings = {"beta": BETA, "gamma": 0.99, "hysteresis": 0.8, **SETTINGS, **changed}
+    settings = {"beta": BETA, "hysteresis": 0.8, **SETTINGS, **changed}
     return CTRPOStep(loss, [25.0] * num_costs, **settings)
 
 
@@ -62,7 +63,7 @@ def test_the_step_is_the_natural_one_of_the_divergence():
     surrogates = losses["cost_surrogate"]
     policy, loc, scale = policy_in(actor, batch), batch["loc"], batch["scale"]
     base = policy.base_dist
-    change = HORIZON * (surrogates - surrogates.detach())
+    change = LENGTH * (surrogates - surrogates.detach())
     barrier = change + (-violation - change) * ((-violation - change) / -violation).log()
     divergence = gaussian_kl(base.loc, base.scale, loc, scale).mean() + BETA * barrier.sum()
     slope = flatten(torch.autograd.grad(divergence, parameters, create_graph=True))
@@ -73,7 +74,7 @@ def test_the_step_is_the_natural_one_of_the_divergence():
     g = flatten(torch.autograd.grad(objective, parameters, retain_graph=True)).double()
     h_g = torch.linalg.solve(matrix, g)
     expected = -(2 * DELTA / (g @ h_g)).sqrt() * h_g
-    taken, _ = whole_step(step, batch, violation)
+    taken, _ = whole_step(step, batch, violation, LENGTH)
     torch.testing.assert_close(
         taken.double(), expected, atol=5e-3 * expected.abs().max().item(), rtol=2e-2
     )
@@ -84,9 +85,9 @@ def test_a_step_stays_in_its_region_and_within_the_limits(violation):
     actor, batch = make_case(1)
     step = c_trpo(actor, 1)
     before = step.loss(batch)
-    metrics = step(batch, torch.tensor([violation]))
+    metrics = step(batch, torch.tensor([violation]), LENGTH)
     after = step.loss(batch)
-    change = HORIZON * (after["cost_surrogate"] - before["cost_surrogate"]).detach()
+    change = LENGTH * (after["cost_surrogate"] - before["cost_surrogate"]).detach()
     barrier = barrier_divergence(change, torch.tensor([-violation])).sum()
     assert metrics["step_fraction"] > 0
     divergence = after["kl"] + BETA * barrier
@@ -107,13 +108,13 @@ def test_the_first_fraction_within_the_divergence_is_taken(violation):
     step = c_trpo(actor, 1)
     start = flatten(actor.parameters()).detach().clone()
     before = step.loss(batch)["cost_surrogate"].detach()
-    whole, metrics = whole_step(step, batch, torch.tensor([violation]))
+    whole, metrics = whole_step(step, batch, torch.tensor([violation]), LENGTH)
     assert metrics["backtracks"] > 0
     divergences = []
     for fraction in (metrics["step_fraction"], metrics["step_fraction"] / 0.8):
         set_parameters(list(actor.parameters()), start + fraction * whole)
         after = step.loss(batch)
-        change = HORIZON * (after["cost_surrogate"].detach() - before)
+        change = LENGTH * (after["cost_surrogate"].detach() - before)
         barrier = barrier_divergence(change, torch.tensor([-violation])).sum()
         divergences.append((after["kl"] + BETA * barrier).item())
     assert divergences[0] <= DELTA < divergences[1]
@@ -125,7 +126,7 @@ def test_recoveries_begin_at_a_limit_and_end_below_it():
     seen = []
     for violation in (-1.0, 0.5, -1.0, -4.9, -5.1, -1.0, torch.nan):
         before = step.loss(batch)["cost_surrogate"]
-        recovers = bool(step(batch, torch.tensor([violation]))["recovers"])
+        recovers = bool(step(batch, torch.tensor([violation]), LENGTH)["recovers"])
         seen.append(recovers)
         assert not recovers or step.loss(batch)["cost_surrogate"] < before
         twin = c_trpo(actor, 1)
@@ -140,8 +141,8 @@ def test_of_several_costs_the_worst_is_recovered_within_the_limits_of_the_others
     batch["cost_advantage"] = batch["cost_advantage"] * torch.tensor([1.0, 1.0, -1.0])
     step = c_trpo(actor, 3)
     before = step.loss(batch)["cost_surrogate"].detach()
-    metrics = step(batch, torch.tensor([3.0, 9.0, -0.2]))
-    change = HORIZON * (step.loss(batch)["cost_surrogate"].detach() - before)
+    metrics = step(batch, torch.tensor([3.0, 9.0, -0.2]), LENGTH)
+    change = LENGTH * (step.loss(batch)["cost_surrogate"].detach() - before)
     assert metrics["recovers"].tolist() == [1.0, 1.0, 0.0]
     assert change[1] < 0
     assert change[2] < 0.2
@@ -150,10 +151,10 @@ def test_of_several_costs_the_worst_is_recovered_within_the_limits_of_the_others
 def test_a_cost_within_its_limit_is_not_recovered_however_large_its_hysteresis():
     actor, batch = make_case(2)
     batch["cost_advantage"] = batch["cost_advantage"] * torch.tensor([1.0, -1.0])
-    settings = {"beta": BETA, "gamma": 0.99, "hysteresis": 0.8, **SETTINGS}
+    settings = {"beta": BETA, "hysteresis": 0.8, **SETTINGS}
     step = CTRPOStep(CPOLoss(actor, entropy_coeff=0.0), [5.0, 500.0], **settings)
     before = step.loss(batch)["cost_surrogate"].detach()
-    metrics = step(batch, torch.tensor([1.0, -20.0]))
+    metrics = step(batch, torch.tensor([1.0, -20.0]), LENGTH)
     assert metrics["recovers"].tolist() == [1.0, 0.0]
     assert step.loss(batch)["cost_surrogate"][0] < before[0]
 
@@ -161,23 +162,25 @@ def test_a_cost_within_its_limit_is_not_recovered_however_large_its_hysteresis()
 def test_at_a_limit_of_nothing_a_policy_without_costs_learns_from_its_rewards():
     actor, batch = make_case(2)
     batch["cost_advantage"] = batch["cost_advantage"] * torch.tensor([0.0, 1.0])
-    settings = {"beta": BETA, "gamma": 0.99, "hysteresis": 0.8, **SETTINGS}
+    settings = {"beta": BETA, "hysteresis": 0.8, **SETTINGS}
     step = CTRPOStep(CPOLoss(actor, entropy_coeff=0.0), [0.0, 25.0], **settings)
     recovers = []
     for violation in (2.0, 0.0, 0.0):
         before = step.loss(batch)["loss_objective"]
-        recovers.append(step(batch, torch.tensor([violation, -10.0]))["recovers"].tolist())
+        metrics = step(batch, torch.tensor([violation, -10.0]), LENGTH)
+        recovers.append(metrics["recovers"].tolist())
     assert recovers == [[1.0, 0.0], [0.0, 0.0], [0.0, 0.0]]
     assert step.loss(batch)["loss_objective"] < before
 
 
-def test_undiscounted_sums_take_the_length_of_an_episode():
+def test_ten_times_the_cost_of_an_episode_is_ten_times_the_barrier():
+    """Costs, limits and T̄ ten times as large, at a tenth of β: the same step."""
     actor, batch = make_case(1)
     state = {name: value.clone() for name, value in actor.state_dict().items()}
     changed = []
-    for gamma, length in ((0.99, None), (None, torch.tensor(100.0))):
+    for times in (1.0, 10.0):
         actor.load_state_dict(state)
-        c_trpo(actor, 1, gamma=gamma)(batch, torch.tensor([-1.0]), length)
+        c_trpo(actor, 1, beta=BETA / times)(batch, torch.tensor([-times]), times * LENGTH)
         changed.append(flatten(actor.parameters()).detach())
     torch.testing.assert_close(*changed)
 
@@ -187,9 +190,9 @@ def test_errors_say_what_to_change():
     with pytest.raises(ValueError, match="hysteresis must be in"):
         c_trpo(actor, hysteresis=0.0)
     with pytest.raises(ValueError, match="needs the mean episode_length"):
-        c_trpo(actor, 1, gamma=None)(batch, torch.tensor([-1.0]))
+        c_trpo(actor, 1)(batch, torch.tensor([-1.0]))
     with pytest.raises(ValueError, match="one per cost surrogate"):
-        c_trpo(actor, 1)(batch, torch.zeros(2))
+        c_trpo(actor, 1)(batch, torch.zeros(2), LENGTH)
 
 
 def test_the_limit_of_a_share_of_episodes_is_what_recoveries_go_by():

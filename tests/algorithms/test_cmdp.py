@@ -123,7 +123,7 @@ def observed_first(constraints, cmdp, update):
 
 def p3o(actor, cmdp):
     constraints = Constraints(cmdp.cost_limits)
-    loss = P3OLoss(actor, constraints, kappa=20.0, gamma=1 - 1 / STEPS, **PPO)
+    loss = P3OLoss(actor, constraints, kappa=20.0, **PPO)
     return observed_first(constraints, cmdp, ppo_update(loss, actor))
 
 
@@ -164,11 +164,11 @@ def pcpo(actor, cmdp):
 
 
 def c_trpo(actor, cmdp):
-    barrier = {"beta": 0.1, "gamma": 1 - 1 / STEPS, "hysteresis": 1.0}
+    barrier = {"beta": 0.1, "hysteresis": 1.0}
     loss = CPOLoss(actor, entropy_coeff=0.0)
     region = {**TRUST_REGION, "target_kl": 0.01}  # the size of a recovery is one step
     step = CTRPOStep(loss, cmdp.cost_limits, **barrier, **region)
-    return lambda batch, mean_costs: step(batch, mean_costs - cmdp.limits)
+    return lambda batch, mean_costs: step(batch, mean_costs - cmdp.limits, torch.tensor(STEPS))
 
 
 def cup(actor, cmdp):

@@ -173,7 +173,7 @@ PCPO = {
 }  # fmt: skip
 C_TRPO = {
     "policy_update": TRPO["policy_update"]
-    | {"_target_": "safe_rl.algorithms.CTRPOStep", "beta": 1.0, "gamma": 0.99, "hysteresis": 0.8}
+    | {"_target_": "safe_rl.algorithms.CTRPOStep", "beta": 0.1, "hysteresis": 0.8}
 }
 # of the methods' own articles, within the setting that all share
 PROJECTED = {"_target_": "safe_rl.objectives.ProjectedMultiplier", "init": 0.0}
@@ -210,7 +210,7 @@ LOSSES = {
     "trpo_lagrangian": {"_target_": "safe_rl.objectives.TRPOLagrangianLoss"},
     "cpo": {"_target_": "safe_rl.objectives.CPOLoss"},
     "p3o": {
-        "_target_": "safe_rl.objectives.P3OLoss", "kappa": 20.0, "gamma": 0.99, "clip_epsilon": 0.2
+        "_target_": "safe_rl.objectives.P3OLoss", "kappa": 20.0, "clip_epsilon": 0.2
     },
     "ipo": {
         "_target_": "safe_rl.objectives.IPOLoss", "kappa": 0.01, "max_weight": 3.0,

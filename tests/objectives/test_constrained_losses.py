@@ -39,7 +39,7 @@ def projected(*values):
 
 
 LOSSES = {
-    "p3o": lambda actor: P3OLoss(actor, held(60.0, -90.0), kappa=3.0, gamma=0.99, **CLIP),
+    "p3o": lambda actor: P3OLoss(actor, held(60.0, -90.0), kappa=3.0, **CLIP),
     "ipo": lambda actor: IPOLoss(actor, held(-200.0, 30.0), kappa=10.0, max_weight=2.0, **CLIP),
     "focops": lambda actor: FOCOPSLoss(
         actor, projected(0.5, 2.0), temperature=1.5, max_state_kl=0.05, entropy_coeff=0.01
@@ -86,19 +86,20 @@ def best_within(bound):
     return torch.tensor(found.x, dtype=torch.float32), -found.fun
 
 
-@pytest.mark.parametrize(("gamma", "violation"), [(0.99, -20.0), (0.98, 2.5), (None, -20.0)])
-def test_p3o_has_the_optimum_of_the_constrained_problem(gamma, violation):
+@pytest.mark.parametrize(("length", "violation"), [(100.0, -20.0), (1000.0, -200.0), (50.0, 2.5)])
+def test_p3o_has_the_optimum_of_the_constrained_problem(length, violation):
+    # of an undiscounted limit: ten times the steps, at the same costs per step, change nothing
     actor, logits, batch = one_state(GAIN, COST)
-    loss = P3OLoss(actor, held(violation), kappa=20.0, gamma=gamma, **FREE)
-    per_step = 1 / 100 if gamma is None else 1 - gamma
-    expected, _ = best_within(-per_step * violation)
+    constraints = held(violation, episode_length=length)
+    loss = P3OLoss(actor, constraints, kappa=20.0, **FREE)
+    expected, _ = best_within(-violation / length)
     found = best_on_a_grid(loss, logits, batch)
     torch.testing.assert_close(found, expected, atol=0.03, rtol=0)
 
 
 def test_p3o_with_too_small_a_penalty_violates():
     actor, logits, batch = one_state(GAIN, COST)
-    loss = P3OLoss(actor, held(2.5), kappa=0.1, gamma=0.99, **FREE)
+    loss = P3OLoss(actor, held(2.5), kappa=0.1, **FREE)
     found = best_on_a_grid(loss, logits, batch)
     assert found @ torch.tensor(COST) > 0.5
 
@@ -111,7 +112,7 @@ def test_p3o_clips_costs_to_their_pessimistic_side():
     expected = 0.0
     for r, cost in zip(ratio.tolist(), COST, strict=True):
         expected += max(r * cost, min(max(r, 0.8), 1.2) * cost) / 3
-    losses = P3OLoss(actor, held(2.5), kappa=20.0, gamma=0.99, **CLIP)(batch)
+    losses = P3OLoss(actor, held(2.5), kappa=20.0, **CLIP)(batch)
     assert losses["cost_surrogate"].item() == pytest.approx(expected, abs=1e-6)
     assert losses["loss_penalty"].item() == pytest.approx(20 * max(expected + 0.025, 0), abs=1e-5)
 
@@ -213,9 +214,8 @@ def test_a_violation_is_needed_for_every_cost(name):
 def test_before_any_batch_the_policy_counts_as_at_its_limit():
     actor, _, batch = one_state(GAIN, COST)
     nothing_seen = Constraints({"cost": 25.0})
-    for gamma in (0.99, None):
-        loss = P3OLoss(actor, nothing_seen, kappa=20.0, gamma=gamma, **FREE)
-        assert loss(batch)["loss_penalty"].abs() < 1e-5
+    loss = P3OLoss(actor, nothing_seen, kappa=20.0, **FREE)
+    assert loss(batch)["loss_penalty"].abs() < 1e-5
     loss = IPOLoss(actor, nothing_seen, kappa=0.5, max_weight=10.0, **FREE)
     # the barrier's tangent at κ / w, extended to 0
     expected = -0.5 * math.log(0.5 / 10.0) + 0.5
