@@ -103,10 +103,17 @@ class OnPolicy(Algorithm, Recipe):
                 cost_advantage.set_keys(reward=[CHARGES])
         policy_update = _build_update(config, critic_network=critic, **parts)
         del parts["actor_network"]
+        advantage = build_part(config.advantage, value_network=critic, **parts)
+        if advantage.tensor_keys.value not in critic.out_keys:
+            raise ValueError(
+                f"advantage._target_={config.advantage._target_} estimates from "
+                f"'{advantage.tensor_keys.value}', and the critic writes {critic.out_keys}: that "
+                "of costs is cost_advantage."
+            )
         return cls(
             **{"cost_critic": None, **networks},
             constraints=constraints,
-            advantage=build_part(config.advantage, value_network=critic, **parts),
+            advantage=advantage,
             cost_advantage=cost_advantage,
             policy_update=policy_update,
             critic_update=build_update(

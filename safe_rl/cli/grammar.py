@@ -47,13 +47,30 @@ def parse(text: str) -> Override:
         3
     """
     try:
-        return OverridesParser.create().parse_override(text)
+        override = OverridesParser.create().parse_override(text)
     except HydraException as error:
         quoted = re.search(r"\{\s*['\"]", text)
         hint = " Names within braces have no quotes: '{cost: 10}'." if quoted else ""
         raise CommandLineError(
             f"'{text}' cannot be read: {str(error).splitlines()[0]}.{hint}"
         ) from None
+    if isinstance(override.value(), dict):  # of which the last of equal names would count
+        plain = re.sub(r"\$\{[^}]*\}|'[^']*'|\"[^\"]*\"", "_", text)
+        names = re.findall(r"[{,]\s*([^\s{}\[\],:]+)\s*:", plain)
+        held = _names_in(override.value())
+        if len(names) > len(held):
+            twice = next(name for name in names if names.count(name) > held.count(name))
+            raise CommandLineError(f"'{text}': {twice} is given twice.")
+    return override
+
+
+def _names_in(value: Any) -> list[str]:
+    """Names in a mapping and in mappings within it."""
+    if isinstance(value, list):
+        return [name for item in value for name in _names_in(item)]
+    if not isinstance(value, dict):
+        return []
+    return [*map(str, value), *(name for item in value.values() for name in _names_in(item))]
 
 
 def quote(text: str) -> str:

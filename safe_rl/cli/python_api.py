@@ -5,6 +5,7 @@ They do what the commands do, from the same configurations; Hydra stays inside.
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -196,6 +197,7 @@ def train(
         >>> run.table["steps"]
         [40.0, 80.0]
     """
+    _check_kinds(imports, directory)
     modules = import_modules(imports)
     overrides = [*_new_run(env, algo, settings, config_dir), *note_imports(modules or None)]
     (config,) = compose_jobs(overrides)
@@ -235,12 +237,26 @@ def resume(
         Going on after 40 of 80 frames.
         [40.0, 80.0]
     """
+    _check_kinds(imports, directory)
     modules = None if imports is None else import_modules(imports)
     folder = Path(directory).expanduser()
     config = compose_resumed(folder, overrides_of(settings, _WHOLE), modules)
     return _carry_out(
         Session(config, folder, continues=True, otherwise=_otherwise(folder), quiet=True)
     )
+
+
+def _check_kinds(imports: Any, directory: Any) -> None:
+    """Refuse what names neither modules nor a folder.
+
+    Raises:
+        CommandLineError: If so.
+    """
+    names = [imports] if isinstance(imports, str | None) else imports
+    if not isinstance(names, Sequence) or not all(isinstance(n, str | None) for n in names):
+        raise CommandLineError(f"imports={imports!r}: it must be names of modules.")
+    if not isinstance(directory, str | os.PathLike | None):
+        raise CommandLineError(f"directory={directory!r}: it must be the path of a folder.")
 
 
 def _carry_out(session: Session) -> Run:

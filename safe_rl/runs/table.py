@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import csv
-import io
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from safe_rl.files import read_bounded, replace_text
@@ -17,7 +16,7 @@ _MOST_BYTES = 100_000_000
 
 
 class TableError(ValueError):
-    """A table lacks rows that its run has written."""
+    """A table is not as its run has written it."""
 
 
 class TableWriter:
@@ -32,8 +31,8 @@ class TableWriter:
             afresh.
 
     Raises:
-        TableError: If there are fewer rows than are to be kept.
-        ValueError: By :meth:`write`, if a row's columns differ from the first one's.
+        TableError: If there are fewer rows than are to be kept, or one cannot be read; by
+            :meth:`write`, if a row's columns differ from the first one's.
 
     Examples:
         >>> import tempfile
@@ -47,6 +46,7 @@ class TableWriter:
 
     def __init__(self, path: Path, keep_rows: int = 0) -> None:
         kept = _first_rows(path, keep_rows) if keep_rows else []
+        _columns_of(path, kept)
         self._columns = next(csv.reader(kept)) if kept else None
         # replaced in one go: a run killed here still has its table
         replace_text(path, "".join(kept))
@@ -60,10 +60,11 @@ class TableWriter:
             self._writer.writerow(self._columns)
         if list(row) != self._columns:
             unexpected = sorted(set(row).symmetric_difference(self._columns))
-            raise ValueError(
-                f"Every row of the table must have the columns of the first, in the same order; "
-                f"these are in one of the two only: {unexpected}. Report a diagnostic in every "
-                "epoch, as NaN where it does not exist."
+            raise TableError(
+                f"Every row of progress.csv must have the columns of the first, in the same order; "
+                f"these are in one of the two only: {unexpected}. If the file has been changed, "
+                "put it back; a diagnostic is reported in every epoch, as NaN where it does not "
+                "exist."
             )
         self._writer.writerow([_field(value) for value in row.values()])
         self._file.flush()
@@ -93,7 +94,10 @@ def _first_rows(path: Path, number: int) -> list[str]:
 
 def _complete_lines(path: Path) -> list[str]:
     """Lines of a table; the last one has no end yet while it is written."""
-    lines = path.read_text().splitlines(keepends=True)
+    try:
+        lines = read_bounded(path, _MOST_BYTES).decode().splitlines(keepends=True)
+    except UnicodeDecodeError:
+        raise TableError(f"{path} is no table: it is not text.") from None
     return [line for line in lines if line.endswith("\n")]
 
 
@@ -101,6 +105,26 @@ def _field(value: float) -> str:
     if math.isnan(value):
         return ""
     return str(int(value)) if float(value).is_integer() else repr(float(value))
+
+
+def _columns_of(path: Path, lines: Sequence[str]) -> dict[str, list[float]]:
+    """Numbers of a table by columns.
+
+    Raises:
+        TableError: If a row has more or fewer fields than the header, or one that is no number.
+    """
+    names, *rows = csv.reader(lines) if lines else [[]]
+    for number, row in enumerate(rows, 2):
+        if len(row) != len(names):
+            raise TableError(
+                f"{path}, line {number} has {len(row)} fields and the header {len(names)}: the "
+                "table has been changed. Put it back."
+            )
+    try:
+        columns = zip(*rows, strict=True) if rows else ([] for _ in names)
+        return {name: list(map(_number, c)) for name, c in zip(names, columns, strict=True)}
+    except ValueError as error:
+        raise TableError(f"{path} holds what is no number: {error}.") from None
 
 
 def _number(field: str) -> float:
@@ -113,14 +137,13 @@ def read_table(path: Path) -> dict[str, list[float]]:
     A last line without its end, as a run that was killed leaves it, is no row.
 
     Raises:
-        ValueError: If the file has no header, or holds more than any table of a run.
+        ValueError: If the file has no header, or holds more than any table of a run; as
+            `TableError`, if it has been changed.
     """
-    whole = read_bounded(path, _MOST_BYTES).decode().rpartition("\n")[0]
-    rows = list(csv.reader(io.StringIO(whole, newline="")))
-    if not rows:
+    lines = _complete_lines(path)
+    if not lines:
         raise ValueError(f"{path} is empty: the run has not finished an epoch.")
-    columns = zip(*rows[1:], strict=True) if len(rows) > 1 else ([] for _ in rows[0])
-    return {name: list(map(_number, column)) for name, column in zip(rows[0], columns, strict=True)}
+    return _columns_of(path, lines)
 
 
 def last_row(path: Path) -> dict[str, float]:

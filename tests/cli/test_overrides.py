@@ -294,3 +294,10 @@ def test_mappings_that_are_given_whole_are_given_once(second):
     with pytest.raises(CommandLineError, match=said):
         read_command(arguments)
     read_command([arguments[0], "~cost_limits", f"+cost_limits={second}"])
+
+
+def test_equal_names_within_braces_are_refused():
+    with pytest.raises(CommandLineError, match="cost is given twice"):
+        read_command(["cost_limits={cost: 25, cost: 3}"])
+    (config,) = read_command(["cost_limits={cost: 25, cost_hazards: 3}"]).configs
+    assert dict(config.cost_limits) == {"cost": 25, "cost_hazards": 3}

@@ -5,7 +5,7 @@ import math
 
 import pytest
 
-from safe_rl.runs.table import TableWriter, read_table
+from safe_rl.runs.table import TableError, TableWriter, read_table
 
 
 def test_rows_are_on_disk_at_once_and_read_back_exactly(tmp_path):
@@ -62,3 +62,28 @@ def test_a_row_that_is_cut_off_is_no_row(tmp_path):
     path.write_text("epoch,st")
     with pytest.raises(ValueError, match="has not finished an epoch"):
         read_table(path)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda b: b"\xef\xbb\xbf" + b, "have the columns of the first"),
+        (lambda b: b.replace(b"steps", b"stepz", 1), "have the columns of the first"),
+        (lambda b: b.replace(b"\n", b"\n\n", 1), "line 2 has 0 fields and the header"),
+        (lambda b: b"\x80\x81" + b, "is no table: it is not text"),
+        (lambda b: b.replace(b"\n1,", b"\none,", 1), "holds what is no number"),
+    ],
+)
+def test_a_table_that_was_changed_is_told_in_a_line(change, message, tmp_path):
+    path = tmp_path / "progress.csv"
+    with TableWriter(path) as table:
+        for epoch in (1, 2):
+            table.write({"epoch": epoch, "steps": 10 * epoch})
+    path.write_bytes(change(path.read_bytes()))
+
+    def go_on():
+        with TableWriter(path, keep_rows=2) as table:
+            table.write({"epoch": 3, "steps": 30})
+
+    with pytest.raises(TableError, match=message):
+        go_on()
