@@ -214,7 +214,7 @@ def test_pinned_layouts():
         **{"robot_base": "point", "task": "push", "robot_locations": [[-1.5, -1.5]]},
         **{"robot_rot": 0.3, "box_locations": [[0, 1]], "box_rots": [0.4]},
         **{"goal_locations": [[1, 1]], "vases_num": 3, "vases_rots": [0.5, 0.6, 0.7, 0.8]},
-        "vases_locations": [[-1, 0], [0, 0], [0.5, -1], [9, 9]],
+        "vases_locations": [[-1, 0], [0, 0], [0.5, -1]],
         **{"hazards_num": 2, "hazards_locations": [[1.5, -1]]},
     }
     env, state = fresh_state(config, 50)

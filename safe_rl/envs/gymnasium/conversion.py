@@ -220,8 +220,11 @@ def _check_keys(keys: Sequence[str], highest_costs: Mapping[str, float]) -> None
 
 
 def _find_costs(probe: gymnasium.Env) -> list[str]:
-    probe.reset(seed=0)
-    *_, info = probe.step(np.zeros(probe.action_space.shape, dtype=probe.action_space.dtype))
+    try:
+        probe.reset(seed=0)
+        *_, info = probe.step(np.zeros(probe.action_space.shape, dtype=probe.action_space.dtype))
+    except SystemExit as error:
+        raise ValueError(f"{probe.unwrapped} called sys.exit({error.code}).") from error
     keys = [key for key in info if is_cost(key)]
     if not keys:
         raise ValueError(

@@ -6,7 +6,8 @@ import this module, and it does not import torch: so they start within a second,
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import warnings
+from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from typing import Any
 
@@ -16,10 +17,11 @@ from gymnasium.spaces import Box, Dict, Discrete, MultiDiscrete
 from gymnasium.wrappers import TransformAction, TransformObservation
 
 from safe_rl.envs.costs import COST, CostRange
+from safe_rl.envs.errors import ConfigError
 
 __all__ = [
+    "CheckedSteps",
     "CostsOutside",
-    "FloatCosts",
     "SixValues",
     "adapt",
     "make_adapted",
@@ -27,6 +29,7 @@ __all__ = [
     "stretch",
 ]
 
+_ALWAYS = 10  # steps in a row after which a cost is expected at every step
 COST_SUM = "cost_sum"  # Safety-Gymnasium's name for the sum of all kinds
 
 
@@ -34,7 +37,7 @@ def make_adapted(
     make: Callable[[], gymnasium.Env], num_steps: int, flatten: bool, cost_keys: Sequence[str]
 ) -> gymnasium.Env:
     """Make an environment, :func:`adapt` it, and have its costs reported as floats."""
-    return FloatCosts(adapt(make(), num_steps, flatten=flatten), cost_keys)
+    return CheckedSteps(adapt(make(), num_steps, flatten=flatten), cost_keys)
 
 
 def adapt(
@@ -56,31 +59,45 @@ def adapt(
     return env if num_steps is None else gymnasium.wrappers.TimeLimit(env, num_steps)
 
 
-class FloatCosts(gymnasium.Wrapper):
-    """Makes costs in `info` floats.
+class CheckedSteps(gymnasium.Wrapper):
+    """Checks what an environment of somebody's returns, and makes costs in `info` floats.
 
-    Gymnasium puts those of a batch into an array of the type that the first row reports: beside an
-    integer 0 all costs would be rounded down, and NumPy's booleans would be no numbers at all.
+    Gymnasium puts the costs of a batch into an array of the type that the first row reports: beside
+    an integer 0 all costs would be rounded down, and NumPy's booleans would be no numbers at all.
 
     Args:
         env: The environment.
         cost_keys: Names in `info`; what is no single number stays as it is.
 
+    Raises:
+        ConfigError: By :meth:`step`, if what it returns breaks Gymnasium's rules.
+
     Examples:
         >>> class Push(gymnasium.Env):
+        ...     observation_space = gymnasium.spaces.Box(-1, 1, (1,))
         ...     def step(self, action):
-        ...         return 0, 0.0, False, False, {"cost": 0, "pushes": 3}
-        >>> FloatCosts(Push(), ["cost"]).step(None)[-1]
+        ...         return np.zeros(1), 0.0, False, False, {"cost": 0, "pushes": 3}
+        >>> CheckedSteps(Push(), ["cost"]).step(None)[-1]
         {'cost': 0.0, 'pushes': 3}
     """
 
     def __init__(self, env: gymnasium.Env, cost_keys: Sequence[str]) -> None:
         super().__init__(env)
         self._cost_keys = list(cost_keys)
+        # steps in a row, from the first, of which each has reported a cost; None: one has not
+        self._reported: dict[str, int | None] = dict.fromkeys(cost_keys, 0)
 
     def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
-        """Step, and convert what is reported."""
-        *values, info = self.env.step(action)
+        """Step, check, and convert what is reported."""
+        try:
+            step = self.env.step(action)
+        except SystemExit as error:
+            what = f"sys.exit({error.code})"
+            raise ConfigError(f"A step of {self.unwrapped} called {what}.") from error
+        for fault in _faults(step, self.observation_space):
+            raise ConfigError(f"A step of {self.unwrapped} returned {fault}.")
+        *values, info = step
+        self._watch(info)
         costs = {
             key: float(info[key])
             for key in self._cost_keys
@@ -88,6 +105,36 @@ class FloatCosts(gymnasium.Wrapper):
             and not isinstance(info[key], np.flexible)
         }
         return *values, {**info, **costs}
+
+    def _watch(self, info: dict[str, Any]) -> None:
+        """Warn of a cost that has been in every `info`, and is in no more."""
+        for key, steps in self._reported.items():
+            if steps is None:
+                continue
+            if key in info:
+                self._reported[key] = steps + 1
+                continue
+            self._reported[key] = None
+            if steps >= _ALWAYS:
+                warnings.warn(
+                    f"The cost '{key}' was in the info of each of the first {steps} steps and is "
+                    "missing now: it counts as 0 wherever it is missing.",
+                    stacklevel=2,
+                )
+
+
+def _faults(step: tuple[Any, ...], space: gymnasium.Space) -> Iterator[str]:
+    """What breaks Gymnasium's rules in what a step has returned, to follow "it returned"."""
+    observation, reward, *ends, info = step
+    if isinstance(space, Box) and np.shape(observation) != space.shape:
+        yield f"an observation of shape {np.shape(observation)}, where its space is {space.shape}"
+    if np.asarray(reward).size != 1 or np.asarray(reward).dtype.kind not in "bif":
+        yield f"the reward {reward!r}, which is no number"
+    for name, end in zip(("terminated", "truncated"), ends, strict=True):
+        if not isinstance(end, bool | np.bool_) and not (isinstance(end, int) and end in (0, 1)):
+            yield f"{name}={end!r}, which is neither True nor False"
+    if not isinstance(info, dict):
+        yield f"the info {info!r}, which is no dictionary"
 
 
 class CostsOutside(gymnasium.Wrapper):
