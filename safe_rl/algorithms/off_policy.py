@@ -184,12 +184,14 @@ class OffPolicy(Algorithm, Recipe):
             constraints.update(episodes, batch)
             self.policy_update.loss.calibrate(constraints)
             self.policy_update.loss.measure(batch["next", "reward"])
+        bias = self.policy_update.loss.cost_bias(batch)
         if self.collects:
             self.memory.extend(batch)
         self._count_steps(batch.numel())
         may_learn = len(self.memory) >= max(self.random_steps, self.memory.batch_size)
         number = self.policy_update.due(batch.numel()) if may_learn else 0
         row = constraints.columns()
+        row |= {} if bias is None else constraints.column("critic_bias", bias)
         for name, value in self.policy_update(self.memory, number).items():
             row |= constraints.column(f"policy_{name}", value)
         return row

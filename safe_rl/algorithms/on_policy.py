@@ -28,6 +28,7 @@ from safe_rl.collectors import EpisodeStatistics
 from safe_rl.models import build_networks, make_behaviour, take_in
 from safe_rl.objectives import CriticLoss
 from safe_rl.objectives.advantages import CostGAE, VectorGAE
+from safe_rl.objectives.critics import critic_bias
 from safe_rl.objectives.gae import normalise_advantages
 from safe_rl.objectives.surrogate import SurrogateLoss
 
@@ -150,17 +151,30 @@ class OnPolicy(Algorithm, Recipe):
         if self.cost_advantage is not None:
             self.cost_advantage(batch)
             keys["cost_advantage"] = self.cost_advantage.tensor_keys.advantage
+        bias = self._critic_bias(batch)
         normalise_advantages(batch, **keys)
         constraints = self.constraints
         constraints.update(episodes, batch)
         metrics = self._update(batch)
         constraints.record_prediction(metrics["policy"])
         take_in(self.networks.values(), batch)
-        row = constraints.columns()
+        row = constraints.columns() | bias
         for part, values in metrics.items():
             for name, value in values.items():
                 row |= constraints.column(f"{part}_{name}", torch.as_tensor(value))
         return row
+
+    def _critic_bias(self, batch: TensorDictBase) -> dict[str, float]:
+        """By how much the cost critic's predictions exceed the discounted costs then paid."""
+        if self.cost_advantage is None:
+            return {}
+        estimator, following = self.cost_advantage, batch["next"]
+        costs = torch.cat([following[key] for key in estimator.reward_keys], -1)
+        values = batch[estimator.tensor_keys.value]
+        ends = following["done"], following["terminated"]
+        return self.constraints.column(
+            "critic_bias", critic_bias(values, costs, *ends, estimator.gamma)
+        )
 
     def _update(self, batch: TensorDictBase) -> dict[str, Mapping[str, Tensor]]:
         """Improve the policy and fit the critics: neither needs what the other does."""

@@ -11,6 +11,7 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torchrl.objectives.utils import distance_loss
 
+from safe_rl.objectives.critics import critic_bias
 from safe_rl.objectives.multipliers import Multiplier
 from safe_rl.objectives.q_functions import Ensemble, QFunctionLoss, discount_of
 from safe_rl.objectives.violation import KnownCosts
@@ -119,6 +120,25 @@ class CostCritics(QFunctionLoss):
         inputs = steps.select(*network.in_keys, strict=False)
         inputs.set(self.tensor_keys.action, action)
         return network(inputs, params).get(network.out_keys[0])
+
+    def expected(self, values: Tensor) -> Tensor:
+        """What the critics expect actions to cost, [..., k], from their outputs [E, ..., k]."""
+        return values.mean(0)
+
+    @torch.no_grad()
+    def cost_bias(self, batch: TensorDictBase) -> Tensor:
+        """By how much predictions exceed the discounted costs then paid, [k]; see `critic_bias`.
+
+        Args:
+            batch: steps [N, T] of the present policy, in order of time.
+        """
+        keys = self.tensor_keys
+        steps = batch.select(*self.in_keys, ("next", keys.done), strict=False)
+        steps = steps.to(self.cost_unit.device)
+        values = self.cost_values(steps, steps.get(keys.action), self.cost_qvalue_network_params)
+        costs = torch.cat([self.column(steps, key) for key in self.cost_keys], -1)
+        ends = self.column(steps, keys.done), self.column(steps, keys.terminated)
+        return critic_bias(self.expected(values), costs, *ends, self.gamma)
 
     def calibrate(self, episodes: KnownCosts) -> None:
         """Take in what a batch says about the costs of episodes, before its updates."""

@@ -1,14 +1,16 @@
-"""Losses of the reward critic and the cost critic."""
+"""Losses of the reward critic and the cost critic, and how well they predict."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
+import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase, TensorDictParams
 from tensordict.nn import TensorDictModuleBase, dispatch
 from torch import Tensor
 from torchrl.objectives import LossModule
 
+from safe_rl.objectives.gae import gae
 from safe_rl.objectives.samples import require, sample_mask
 
 
@@ -25,6 +27,45 @@ def explained_variance(prediction: Tensor, target: Tensor) -> Tensor:
     residual = (target - prediction).flatten(0, -2).var(0, correction=0)
     total = target.flatten(0, -2).var(0, correction=0)
     return (1 - residual / total).where(total > 0, 0.0)
+
+
+def critic_bias(
+    value: Tensor, cost: Tensor, done: Tensor, terminated: Tensor, gamma: float
+) -> Tensor:
+    """Mean of what a critic predicts less the discounted sum of costs that was then paid, [F].
+
+    Costs are summed to the end of the episode. Where a row ends before, or a time-out cuts an
+    episode, what follows is unknown: the critic's own value of the last step stands for it, and the
+    share γⁿ that this has in the sum is left out of the mean. A critic that is off by the same
+    number everywhere has exactly this number for its bias.
+
+    Args:
+        value: predictions for the steps of N rows, in order of time, [N, T, F].
+        cost: costs of these steps, [N, T, F].
+        done: whether an episode ends with a step, [N, T, 1] bool.
+        terminated: whether nothing can follow, [N, T, 1] bool.
+        gamma: discount γ per step.
+
+    Returns:
+        The bias, NaN where no sum says anything.
+
+    Examples:
+        >>> value, cost = torch.full((1, 3, 1), 5.0), torch.ones(1, 3, 1)
+        >>> ends = torch.tensor([[[False], [False], [True]]])
+        >>> critic_bias(value, cost, ends, ends, gamma=1.0)  # 5 - 3, 5 - 2 and 5 - 1
+        tensor([3.])
+    """
+    ends = done.clone()
+    ends[:, -1] = True
+    cut = ends & ~terminated
+    sums = []
+    for signal, prediction in ((cost, value), (torch.zeros_like(value), torch.ones_like(value))):
+        # of the last step before a cut, whatever follows agrees with the prediction
+        signal = torch.where(cut, prediction, signal)
+        following = torch.where(cut, 0.0, prediction.roll(-1, 1))
+        sums.append(-gae(signal, prediction, following, ends, terminated, gamma=gamma, lmbda=1.0))
+    difference, weight = (total.flatten(0, 1).sum(0) for total in sums)
+    return difference / torch.where(weight > 0, weight, torch.nan)
 
 
 class CriticLoss(LossModule):

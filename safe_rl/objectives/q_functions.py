@@ -100,6 +100,9 @@ class ReplayLoss(LossModule):
     def measure(self, rewards: Tensor) -> None:
         """Take in the rewards of new steps, [...]."""
 
+    def cost_bias(self, batch: TensorDictBase) -> Tensor | None:
+        """Bias of the critics of k costs on new steps [N, T], [k]; None without such critics."""
+
 
 class QFunctionLoss(ReplayLoss):
     """What a loss on Q functions has besides TorchRL's: halves, one discount, copies of their own.

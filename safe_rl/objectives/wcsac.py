@@ -116,6 +116,10 @@ class WCSACLoss(SACLagrangianLoss):
         mean, variance = values.chunk(2)
         return mean, softplus(variance).clamp_min(_SMALLEST)
 
+    def expected(self, values: Tensor) -> Tensor:
+        """Mean of the cost-return of actions, [..., k]."""
+        return self.moments(values)[0].mean(0)
+
     def charged(self, values: Tensor) -> Tensor:
         """CVaR_α of the cost-return of actions, [..., k]."""
         mean, variance = self.moments(values)

@@ -1,12 +1,13 @@
 """Critic losses against torch's own regression loss and numbers worked out by hand."""
 
+import cmdp
 import pytest
 import torch
 from samples import NUM_OBS, make_critic
 from tensordict import TensorDict
 from torch.nn.functional import mse_loss
 
-from safe_rl.objectives.critics import CriticLoss, explained_variance
+from safe_rl.objectives.critics import CriticLoss, critic_bias, explained_variance
 
 
 def make_targets(batch_size, num_costs):
@@ -100,3 +101,45 @@ def test_errors_say_what_to_change():
         loss(make_targets([8], 3))
     with pytest.raises(KeyError, match="value targets"):
         loss(make_targets([8], 2).exclude("value_target"))
+
+
+def sums_of_costs(costs, terminated, gamma):
+    """Discounted costs from every step on, of rows that are followed to their ends."""
+    sums, following = torch.zeros_like(costs), torch.zeros_like(costs[:, 0])
+    for step in reversed(range(costs.shape[1])):
+        following = costs[:, step] + gamma * following * ~terminated[:, step]
+        sums[:, step] = following
+    return sums
+
+
+@pytest.mark.parametrize("gamma", [0.9, 1.0, 0.0])
+def test_the_bias_is_by_how_much_predictions_exceed_what_was_paid(gamma):
+    costs = torch.rand(6, 40, 2)
+    terminated = torch.rand(6, 40, 1) < 0.1
+    terminated[:, -1] = True
+    truth = sums_of_costs(costs, terminated, gamma)
+    error = torch.randn(6, 40, 2) + torch.tensor([5.0, -1.0])
+    found = critic_bias(truth + error, costs, terminated, terminated, gamma)
+    torch.testing.assert_close(found, error.mean((0, 1)), atol=1e-4, rtol=1e-4)
+
+
+def test_rows_that_are_cut_show_the_bias_of_a_critic_that_is_off_everywhere():
+    costs, terminated = torch.rand(6, 400, 2), torch.rand(6, 400, 1) < 0.01
+    truth = sums_of_costs(costs, terminated, 0.9)
+    done = terminated | (torch.rand(6, 400, 1) < 0.1)  # time-outs, after which costs go on
+    for steps in (200, 7):
+        given = (x[:, :steps] for x in (truth + torch.tensor([3.0, -0.5]), costs, done, terminated))
+        found = critic_bias(*given, 0.9)
+        torch.testing.assert_close(found, torch.tensor([3.0, -0.5]), atol=1e-3, rtol=0)
+    nothing = torch.zeros(1, 1, 1, dtype=torch.bool)
+    assert critic_bias(torch.ones(1, 1, 1), torch.ones(1, 1, 1), nothing, nothing, 0.9).isnan()
+
+
+def test_the_bias_in_a_problem_whose_values_are_known():
+    """Of one state, where a policy of mean μ pays Wμ per step: its costs are worth Wμ / (1 − γ)."""
+    data, _ = cmdp.rollout(cmdp.TWO, cmdp.make_actor())
+    costs = torch.cat([data["next", key] for key in cmdp.TWO.cost_keys], -1)
+    ends = data["next", "done"], data["next", "terminated"]
+    worth = cmdp.TWO.weights @ torch.zeros(2) / (1 - 0.9)
+    found = critic_bias((worth + torch.tensor([3.0, -2.0])).expand_as(costs), costs, *ends, 0.9)
+    torch.testing.assert_close(found, torch.tensor([3.0, -2.0]), atol=0.4, rtol=0)

@@ -377,3 +377,16 @@ def test_an_entry_of_another_shape_is_named_with_the_shape_that_it_must_have(kin
     steps["next", key] = steps["next", key].squeeze(-1)
     with pytest.raises(ValueError, match=rf"'{key}'\) has the shape \[6\], and must have \[6, 1\]"):
         make_loss(kind, lagrange(1.0, 1.0))(steps)
+
+
+@pytest.mark.parametrize("kind", ["sac", "td3"])
+def test_the_bias_of_critics_of_costs_that_never_end(kind):
+    loss, steps = make_loss(kind, lagrange(1.0, 1.0)), make_steps(100)
+    params = loss.cost_qvalue_network_params["network"]
+    params["weights", "1"].data.zero_()
+    params["biases", "1"].data.copy_(torch.tensor([[[4.0, 1.0]], [[8.0, 3.0]]]))
+    for key in COSTS:
+        steps["next", key] = torch.full((100, 1), 0.5)
+    # half a cost per step is worth 5 at a discount of 0.9; the critics say 6 and 2
+    found = loss.cost_bias(steps.reshape(2, 50))
+    torch.testing.assert_close(found, torch.tensor([1.0, -3.0]))
