@@ -40,6 +40,7 @@ BOMB = "a: &a [x, x]\n" + "".join(
         ("a: ${oc.env:HOME}", "interpolations"),
         ("a: {b: [1, 'x${a}']}", "interpolations"),
         ("- a", "mapping"),
+        ('a: "\\e[2Jgone"', "control characters"),
         ("1: a", "mapping"),
         ("{", "cannot be read"),
         ("a: !!python/object/apply:os.system [true]", "cannot be read"),

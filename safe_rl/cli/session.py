@@ -41,7 +41,7 @@ from safe_rl.runs.folder import RunFolder, lock_folder
 from safe_rl.runs.identity import check_same_run
 from safe_rl.runs.table import TableError
 from safe_rl.training.building import begin_from, build_trainer, physics_threads, seed_everything
-from safe_rl.training.trainer import EpisodeError, Trainer
+from safe_rl.training.trainer import EpisodeError, Trainer, WorkerError
 
 __all__ = [
     *("SETTING_ERRORS", "Session", "check_writable", "missing_folders", "new_folder", "run_job"),
@@ -53,7 +53,9 @@ SETTING_ERRORS: tuple[type[Exception], ...] = (
 )
 """What is raised about settings and files, when a run is built or evaluated."""
 # the last two are about the environment: where they stand says less than the message
-_TRAINING_ERRORS = (OSError, TableError, ConfigError, EpisodeError, FloatingPointError)
+_TRAINING_ERRORS = (
+    *(OSError, TableError, ConfigError, EpisodeError, FloatingPointError, WorkerError),
+)
 
 
 class Session:

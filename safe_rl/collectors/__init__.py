@@ -4,7 +4,7 @@ from safe_rl.collectors.accounting import EpisodeAccounting, EpisodeError, Episo
 from safe_rl.collectors.datasets import read_dataset, read_hdf5, safe_episodes
 from safe_rl.collectors.factory import make_collector, make_process_collector, make_ray_collector
 from safe_rl.collectors.recording import Recording, StepRecorder, read_recording
-from safe_rl.collectors.workers import WorkerCollector
+from safe_rl.collectors.workers import WorkerCollector, WorkerError
 
 __all__ = [
     "EpisodeAccounting",
@@ -13,6 +13,7 @@ __all__ = [
     "Recording",
     "StepRecorder",
     "WorkerCollector",
+    "WorkerError",
     "make_collector",
     "make_process_collector",
     "make_ray_collector",

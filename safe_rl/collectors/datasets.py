@@ -36,6 +36,7 @@ _OF_AN_EPISODE: dict[NestedKey, str] = {
     ("next", "truncated"): "truncations",
 }
 _EPISODE = r"episode_(\d+)"
+_MOST_LEVELS = 4  # of groups; Minari's files have three
 _NUMBERS = "biuf"  # kinds of NumPy's types
 _FLAGS = (("next", "terminated"), ("next", "truncated"))
 _VECTORS = ("observation", "action", ("next", "observation"))
@@ -109,6 +110,7 @@ def read_hdf5(path: Path | str) -> TensorDict:
         raise ValueError(f"{path} is neither the folder of a recording nor an HDF5 file.")
     try:
         with h5py.File(path, "r") as file:
+            _check_tree(path, file, h5py)
             names = [n for n in file if fullmatch(_EPISODE, n)]
             arrays = _read_episodes(path, file, names) if names else _read_flat(path, file)
     except OSError as error:
@@ -120,6 +122,28 @@ def read_hdf5(path: Path | str) -> TensorDict:
         steps[key] = column
     steps["next", "done"] = steps["next", "terminated"] | steps["next", "truncated"]
     return steps
+
+
+def _check_tree(path: Path | str, file: Any, h5py: Any) -> None:
+    """Refuse a file that leads to other files, or that declares far more than it can hold.
+
+    Raises:
+        ValueError: If so.
+    """
+    left = 1000 * Path(path).stat().st_size  # more than any compression of HDF5's makes of it
+    groups = [(file, 0)]
+    while groups:
+        group, level = groups.pop()
+        for name in group:
+            if not isinstance(group.get(name, getlink=True), h5py.HardLink):
+                raise ValueError(f"{path}: {name} is a link, and only arrays are read.")
+            node = group[name]
+            if isinstance(node, h5py.Group) and level < _MOST_LEVELS:
+                groups.append((node, level + 1))
+            elif isinstance(node, h5py.Dataset):
+                left -= node.nbytes
+        if left < 0:
+            raise ValueError(f"{path} declares a thousand times more numbers than fit into it.")
 
 
 def _read_episodes(path: Path | str, file: Any, names: list[str]) -> Arrays:

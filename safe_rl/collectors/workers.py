@@ -22,6 +22,10 @@ _MOST_LOOKS = 5
 """Seconds for which a worker may be missing: a job that is put to sleep as a whole wakes so."""
 
 
+class WorkerError(RuntimeError):
+    """A worker has died, or stands still."""
+
+
 class WorkerCollector:
     """Batches [N, T] of the present policy, collected by workers that wait for one another.
 
@@ -50,7 +54,7 @@ class WorkerCollector:
         """Start the workers and collect without end.
 
         Raises:
-            RuntimeError: If a worker has died or stands still.
+            WorkerError: If a worker has died or stands still.
         """
         self._wait_for(_begin(lambda: self._start(self._known)))
         batches = iter(self._workers)
@@ -91,7 +95,7 @@ class WorkerCollector:
             else f"stands still (process {stopped[0]} was stopped by a signal)"
         )
         kill_workers(self._workers)
-        raise RuntimeError(
+        raise WorkerError(
             f"A worker of the collector {reason}. The last checkpoint is whole: continue with "
             "resume=."
         )

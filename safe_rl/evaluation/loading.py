@@ -147,7 +147,8 @@ def load_policy(
     keeps track of gradients, so that rollouts of it become arrays of NumPy's as they are.
 
     Raises:
-        CheckpointError: If the file is no checkpoint, or its policy does not fit the environment.
+        CheckpointError: If the file is no checkpoint, its policy does not fit the environment, or
+            has weights that are not finite.
     """
     policy, networks = find_recipe(config).build_policy(config, env, device)
     try:
@@ -163,4 +164,10 @@ def load_policy(
             f"environment's ({sizes[0]} numbers, {sizes[1]} actions): undo the env.… "
             "override that changes them."
         ) from error
+    for network in networks.values():
+        if not all(weight.isfinite().all() for weight in network.parameters()):
+            raise CheckpointError(
+                f"The policy in {checkpoint} has weights that are NaN or infinite: its training "
+                "has diverged."
+            )
     return policy.eval().requires_grad_(False)

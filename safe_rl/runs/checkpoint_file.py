@@ -10,10 +10,13 @@ from __future__ import annotations
 
 import stat
 from collections.abc import Collection, Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
+from zipfile import ZIP_STORED, BadZipFile, ZipFile
 
 import torch
+from torch import Tensor, nn
 from torchrl.checkpoint import Checkpoint, CheckpointError, StateDictCheckpointAdapter
 
 from safe_rl.algorithms.algorithm_contract import Stateful
@@ -115,9 +118,20 @@ def restore(path: Path, components: Mapping[str, Stateful]) -> None:
     states = read_states(path, components.keys() - absent)
     for name in sorted(states):
         try:
+            _check_types(components[name], states[name])
             components[name].load_state_dict(states[name])
         except Exception as error:
             raise _cannot_use(path, error, f"its {name!r} does not fit: ") from error
+
+
+def _check_types(component: Stateful, state: Mapping[str, Any]) -> None:
+    """Refuse weights of another kind than a network's, which would be rounded or cut in silence."""
+    if not isinstance(component, nn.Module):
+        return
+    for name, tensor in component.state_dict().items():
+        given = state.get(name) if isinstance(tensor, Tensor) else None
+        if isinstance(given, Tensor) and given.dtype != tensor.dtype:
+            raise ValueError(f"'{name}' is {given.dtype}, where the network has {tensor.dtype}.")
 
 
 def part_names(path: Path) -> set[str]:
@@ -130,11 +144,22 @@ def part_names(path: Path) -> set[str]:
 
 
 def _check_kind(path: Path) -> None:
+    """Refuse what is no file, or has compressed parts, which could fill the memory."""
     if path.is_dir():
         raise CheckpointError("it is a folder, and a checkpoint is one file.")
+    with ZipFile(path) as archive:
+        infos = archive.infolist()
+        for info in infos:
+            if info.filename.endswith(".pt") and info.compress_type == ZIP_STORED:
+                with archive.open(info) as part, suppress(BadZipFile), ZipFile(part) as inner:
+                    infos = [*infos, *inner.infolist()]
+    if any(info.compress_type or info.file_size > info.compress_size for info in infos):
+        raise CheckpointError("it has compressed parts, and no run writes such.")
 
 
 def _cannot_use(path: Path, error: Exception, part: str = "") -> CheckpointError:
     says_it = isinstance(error, OSError | RuntimeError | ValueError)
-    words = str(error) if says_it else f"{type(error).__name__}: {error}"
+    words = " ".join(str(error).split()) if says_it else f"{type(error).__name__}: {error}"
+    if "weights_only" in words:  # torch would advise to run what is in it
+        words = "it holds more than tensors, numbers and plain containers, and is not read."
     return CheckpointError(f"Cannot use the checkpoint {path}: {part}{words}")

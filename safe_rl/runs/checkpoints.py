@@ -151,7 +151,11 @@ class CheckpointStore:
     ) -> Path:
         path = directory / checkpoint_name(steps)
         facts = {**(facts or {}), **({"run": self._run} if self._run else {})}
-        saver.save(path, metadata=facts)
+        try:
+            saver.save(path, metadata=facts)
+        except RuntimeError as error:  # torch's, for whatever it could not write
+            reason = str(error).splitlines()[0]
+            raise OSError(f"{path} cannot be written; is the disk full? ({reason})") from error
         return path
 
     def resume(self, epochs: int = 0) -> Path | None:

@@ -144,5 +144,16 @@ class Candidates:
         return {"waiting": list(self._waiting)}
 
     def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
-        """Continue from :meth:`state_dict`."""
-        self._waiting = deque(state_dict["waiting"])
+        """Continue from :meth:`state_dict`.
+
+        Raises:
+            ValueError: If those that wait are no policies of a run.
+        """
+        waiting = list(state_dict["waiting"])
+        for policy in waiting:
+            counters = (policy["steps"], policy["epoch"])
+            if not all(type(n) is int and 0 <= n < 10**15 for n in counters):
+                raise ValueError(f"a policy waits that was there after {counters[0]!r:.40} steps.")
+            if policy["states"].keys() != self._components.keys():
+                raise ValueError("a policy waits that consists of other parts.")
+        self._waiting = deque(waiting)

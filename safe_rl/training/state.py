@@ -18,6 +18,9 @@ from torchrl.envs import EnvBase
 __all__ = ["Progress", "StopRequest", "WorldSnapshot"]
 
 
+_MOST = 10**15  # of steps
+
+
 class Progress:
     """Counters of a run: epochs, environment steps, seconds of training.
 
@@ -44,8 +47,16 @@ class Progress:
         return dict(vars(self))
 
     def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
-        """Continue from :meth:`state_dict`."""
-        vars(self).update(state_dict)
+        """Continue from :meth:`state_dict`.
+
+        Raises:
+            ValueError: If these are no counters.
+        """
+        for name, value in self.state_dict().items():
+            given = state_dict[name]
+            if type(given) is not type(value) or not 0 <= given < _MOST:
+                raise ValueError(f"'{name}' is {str(given)[:40]!r}, which is no counter of a run.")
+        vars(self).update({name: state_dict[name] for name in vars(self)})
 
 
 class WorldSnapshot:

@@ -18,14 +18,20 @@ from torchrl.envs import EnvBase
 from safe_rl.algorithms.algorithm_contract import Algorithm, Stateful
 from safe_rl.algorithms.matrix_products import fast_products
 from safe_rl.algorithms.parallel_updates import torch_threads
-from safe_rl.collectors import EpisodeAccounting, EpisodeError, Recording, WorkerCollector
+from safe_rl.collectors import (
+    EpisodeAccounting,
+    EpisodeError,
+    Recording,
+    WorkerCollector,
+    WorkerError,
+)
 from safe_rl.runs.checkpoints import CheckpointStore
 from safe_rl.runs.folder import lock_folder
 from safe_rl.runs.record import RunRecord
 from safe_rl.training.candidates import Candidates, Judged, epochs_until_judged
 from safe_rl.training.state import Progress, StopRequest, WorldSnapshot
 
-__all__ = ["EpisodeError", "Evaluator", "Trainer"]
+__all__ = ["EpisodeError", "Evaluator", "Trainer", "WorkerError"]
 
 # what only going on takes, which the last checkpoints have: several times what a policy is, and a
 # memory fills gigabytes

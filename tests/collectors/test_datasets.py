@@ -289,3 +289,22 @@ def test_without_h5py_the_extra_is_named(tmp_path, monkeypatch):
     monkeypatch.setattr("safe_rl.extras.find_spec", lambda name: None)
     with pytest.raises(ModuleNotFoundError, match=r"\[hdf5\]"):
         read_hdf5(tmp_path / "data.hdf5")
+
+
+@pytest.mark.parametrize(
+    ("make", "words"),
+    [
+        (lambda h5py, file: h5py.ExternalLink("/etc/passwd", "/"), "rewards is a link"),
+        (lambda h5py, file: h5py.SoftLink("/nowhere"), "rewards is a link"),
+        (
+            lambda h5py, file: file.create_dataset("more", (3 * 10**11,), "f8"),
+            "a thousand times more numbers than fit",
+        ),
+    ],
+)
+def test_a_file_that_leads_elsewhere_or_declares_too_much_is_refused(make, words, tmp_path):
+    h5py = pytest.importorskip("h5py", reason="needs the extra 'hdf5'")
+    with h5py.File(tmp_path / "data.hdf5", "w") as file:
+        file["rewards"] = make(h5py, file)
+    with pytest.raises(ValueError, match=words):
+        read_hdf5(tmp_path / "data.hdf5")
