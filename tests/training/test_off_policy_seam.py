@@ -111,7 +111,7 @@ def test_it_trains_and_writes_a_run(make_trainer, tmp_path):
     table = read_table(tmp_path / "run" / "progress.csv")
     assert table["steps"] == [160 * epoch for epoch in range(1, 9)]
     assert table["q_loss"][-1] < table["q_loss"][0]
-    assert "J_c" in line
+    assert "cost" in line
 
 
 def test_it_goes_on_with_its_buffer_as_if_it_had_never_stopped(make_trainer, tmp_path):
