@@ -238,9 +238,7 @@ class CostGAE(VectorGAE):
     Args:
         cost_keys: keys of the costs under ``"next"``, in the order of the k outputs.
         value_network: cost critic, writes ``cost_value`` [..., T, k]; or None.
-        gamma: Discount per step.
-        lmbda: Decay λ of the TD errors in generalised advantage estimation.
-        value_target: What critics learn, see `VectorGAE`.
+        settings: ``gamma``, ``lmbda`` and ``value_target``, see `VectorGAE`.
 
     Examples:
         >>> estimator = CostGAE(
@@ -271,10 +269,7 @@ class CostGAE(VectorGAE):
         self,
         cost_keys: Sequence[NestedKey],
         value_network: TensorDictModuleBase | None,
-        *,
-        gamma: Share,
-        lmbda: Share,
-        value_target: ValueTarget,
+        **settings: Any,
     ) -> None:
-        super().__init__(value_network, gamma=gamma, lmbda=lmbda, value_target=value_target)
+        super().__init__(value_network, **settings)
         self.set_keys(reward=list(cost_keys))

@@ -190,7 +190,7 @@ class LimitTracker:
         lowest_trust: Fraction,
         integral: NotNegative,
         largest_integral: NotNegative,
-        recovery: Share = 1.0,  # configurations of earlier runs lack it
+        recovery: Share = 1.0,
     ) -> None:
         self.limits = cost_limits.detach().cpu().float()
         num_costs = len(self.limits)
@@ -300,4 +300,4 @@ class LimitTracker:
         self._reached = state_dict["reached"].to(self._reached)
         self._noise = state_dict["noise"].to(self._noise)
         self._owed = state_dict["owed"].to(self._owed)
-        self._recovers = state_dict.get("recovers", self._recovers).to(self._recovers)
+        self._recovers = state_dict["recovers"].to(self._recovers)

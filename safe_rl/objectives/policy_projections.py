@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated
+from typing import Annotated, Any
 
 import torch
 from tensordict import NestedKey, TensorDictBase
@@ -13,8 +13,8 @@ from torchrl.modules import set_recurrent_mode
 
 from safe_rl.objectives.distributions import has_closed_kl
 from safe_rl.objectives.multipliers import Multiplier
-from safe_rl.objectives.surrogate import Reduction, SurrogateLoss, require_multiplier
-from safe_rl.ranges import NotNegative, Positive, Range, Share, Weight
+from safe_rl.objectives.surrogate import SurrogateLoss, require_multiplier
+from safe_rl.ranges import Positive, Range, Share, Weight
 
 
 class FOCOPSLoss(SurrogateLoss):
@@ -33,8 +33,7 @@ class FOCOPSLoss(SurrogateLoss):
         multiplier: one ν per column of ``cost_advantage``; a `ProjectedMultiplier` in the article.
         temperature: Multiplier β of the trust region, named λ in the article.
         max_state_kl: KL divergence δ beyond which a state is ignored.
-        entropy_coeff: Factor of the entropy bonus.
-        reduction: How samples are reduced; ``"none"`` keeps them, which no update takes.
+        settings: Those of every policy loss, see `SurrogateLoss`.
 
     Raises:
         TypeError: if there is no multiplier.
@@ -58,15 +57,10 @@ class FOCOPSLoss(SurrogateLoss):
         *,
         temperature: Annotated[float, Range(1e-9, 1e9)],
         max_state_kl: Positive,
-        entropy_coeff: NotNegative,
-        reduction: Reduction = "mean",
+        **settings: Any,
     ) -> None:
-        super().__init__(
-            actor_network,
-            entropy_coeff=entropy_coeff,
-            reduction=reduction,
-            multiplier=require_multiplier(multiplier, "PPOLoss"),
-        )
+        super().__init__(actor_network, **settings)
+        self.multiplier = require_multiplier(multiplier, "PPOLoss")
         self.temperature, self.max_state_kl = temperature, max_state_kl
 
     def _evaluate(
@@ -106,8 +100,7 @@ class CUPLoss(SurrogateLoss):
         multiplier: one ν per column of ``cost_advantage``; a `ProjectedMultiplier` in the article.
         gamma: Discount γ of the cost advantages.
         lmbda: Decay λ_GAE of their TD errors.
-        entropy_coeff: Factor of the entropy bonus.
-        reduction: How samples are reduced; ``"none"`` keeps them, which no update takes.
+        settings: Those of every policy loss, see `SurrogateLoss`.
 
     Raises:
         TypeError: if there is no multiplier; by the call, if a KL has no closed form.
@@ -137,15 +130,10 @@ class CUPLoss(SurrogateLoss):
         *,
         gamma: Weight,
         lmbda: Share,
-        entropy_coeff: NotNegative,
-        reduction: Reduction = "mean",
+        **settings: Any,
     ) -> None:
-        super().__init__(
-            actor_network,
-            entropy_coeff=entropy_coeff,
-            reduction=reduction,
-            multiplier=require_multiplier(multiplier, "PPOLoss"),
-        )
+        super().__init__(actor_network, **settings)
+        self.multiplier = require_multiplier(multiplier, "PPOLoss")
         if not gamma < 1:
             raise ValueError(
                 f"gamma={gamma}: it must be below 1, the projection divides by 1 - gamma."

@@ -10,8 +10,8 @@ from tensordict.nn import ProbabilisticTensorDictSequential
 from torch import Tensor
 
 from safe_rl.objectives.multipliers import Multiplier
-from safe_rl.objectives.surrogate import Reduction, SurrogateLoss, lagrangian, require_multiplier
-from safe_rl.ranges import NotNegative, Range
+from safe_rl.objectives.surrogate import SurrogateLoss, lagrangian, require_multiplier
+from safe_rl.ranges import Range
 
 #: How PPO bounds the gain of lowering costs; see `PPOLagrangianLoss`.
 CostClipping = Literal["none", "pessimistic", "joint"]
@@ -44,8 +44,7 @@ class PPOLoss(SurrogateLoss):
     Args:
         actor_network: policy with `get_dist`; see `SurrogateLoss`.
         clip_epsilon: Half-width ε of the clipping range, within which a ratio earns.
-        entropy_coeff: Factor of the entropy bonus.
-        reduction: How samples are reduced; ``"none"`` keeps them, which no update takes.
+        settings: Those of every policy loss, see `SurrogateLoss`.
 
     Examples:
         >>> import torch
@@ -77,10 +76,9 @@ class PPOLoss(SurrogateLoss):
         actor_network: ProbabilisticTensorDictSequential,
         *,
         clip_epsilon: Annotated[float, Range(0, 1000, above=True)],
-        entropy_coeff: NotNegative,
-        reduction: Reduction = "mean",
+        **settings: Any,
     ) -> None:
-        super().__init__(actor_network, entropy_coeff=entropy_coeff, reduction=reduction)
+        super().__init__(actor_network, **settings)
         self.register_coeff_buffer("clip_epsilon", clip_epsilon, device=self._default_device)
 
     def _surrogates(self, tensordict: TensorDictBase, log_weight: Tensor) -> dict[str, Tensor]:

@@ -68,13 +68,13 @@ class SurrogateLoss(LossModule):
     (to minimise), and the detached scalars ``kl`` (mean over states of KL(π_θ ‖ π_k), π_k the
     policy whose parameters the batch holds), ``entropy`` and ``ESS``. Policies may have any
     distribution; its divergence and entropy are closed forms where there are any, and are
-    estimated from samples elsewhere (see `safe_rl.objectives.distributions`).
+    estimated from samples elsewhere (see `safe_rl.objectives.distributions`). A loss that weighs
+    costs sets ``multiplier``, for which `require_multiplier` is there.
 
     Args:
         actor_network: policy with `get_dist`, such as a `torchrl.modules.ProbabilisticActor`.
         entropy_coeff: Factor of the entropy bonus; a buffer, so that it can be scheduled, also up
             from 0.
-        multiplier: weighs the costs; None if there is none to weigh.
         reduction: How samples are reduced; ``"none"`` keeps them, which no update takes.
     """
 
@@ -118,12 +118,11 @@ class SurrogateLoss(LossModule):
         actor_network: ProbabilisticTensorDictSequential,
         *,
         entropy_coeff: NotNegative,
-        multiplier: Multiplier | None = None,
         reduction: Reduction = "mean",
     ) -> None:
         super().__init__()
         self.convert_to_functional(actor_network, "actor_network")
-        self.multiplier = multiplier
+        self.multiplier: Multiplier | None = None
         self.reduction = reduction
         self.register_coeff_buffer("entropy_coeff", entropy_coeff, device=self._default_device)
         sampler = sampler_of(actor_network)

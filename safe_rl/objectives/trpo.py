@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import torch
 from tensordict import TensorDictBase
 from tensordict.nn import ProbabilisticTensorDictSequential
 from torch import Tensor
 
 from safe_rl.objectives.multipliers import Multiplier
-from safe_rl.objectives.surrogate import Reduction, SurrogateLoss, require_multiplier
-from safe_rl.ranges import NotNegative
+from safe_rl.objectives.surrogate import SurrogateLoss, require_multiplier
 
 
 class TRPOLoss(SurrogateLoss):
@@ -31,15 +32,6 @@ class TRPOLoss(SurrogateLoss):
         ['loss_objective', 'loss_entropy', 'kl', 'entropy', 'ESS']
     """
 
-    def __init__(
-        self,
-        actor_network: ProbabilisticTensorDictSequential,
-        *,
-        entropy_coeff: NotNegative,
-        reduction: Reduction = "mean",
-    ) -> None:
-        super().__init__(actor_network, entropy_coeff=entropy_coeff, reduction=reduction)
-
     def _surrogates(self, tensordict: TensorDictBase, log_weight: Tensor) -> dict[str, Tensor]:
         ratio = log_weight.exp()
         gain = ratio * self._advantage(tensordict, log_weight)
@@ -52,8 +44,7 @@ class TRPOLagrangianLoss(TRPOLoss):
     Args:
         actor_network: policy with `get_dist`; see `SurrogateLoss`.
         multiplier: one λ per column of ``cost_advantage``, read at every call.
-        entropy_coeff: Factor of the entropy bonus.
-        reduction: How samples are reduced; ``"none"`` keeps them, which no update takes.
+        settings: Those of every policy loss, see `SurrogateLoss`.
 
     Raises:
         TypeError: if there is no multiplier.
@@ -71,15 +62,9 @@ class TRPOLagrangianLoss(TRPOLoss):
         self,
         actor_network: ProbabilisticTensorDictSequential,
         multiplier: Multiplier,
-        *,
-        entropy_coeff: NotNegative,
-        reduction: Reduction = "mean",
+        **settings: Any,
     ) -> None:
-        super().__init__(
-            actor_network,
-            entropy_coeff=entropy_coeff,
-            reduction=reduction,
-        )
+        super().__init__(actor_network, **settings)
         self.multiplier = require_multiplier(multiplier, "TRPOLoss")
 
 
@@ -104,15 +89,6 @@ class CPOLoss(SurrogateLoss):
 
     extra_out_keys = ("cost_surrogate",)
     has_costs = True
-
-    def __init__(
-        self,
-        actor_network: ProbabilisticTensorDictSequential,
-        *,
-        entropy_coeff: NotNegative,
-        reduction: Reduction = "mean",
-    ) -> None:
-        super().__init__(actor_network, entropy_coeff=entropy_coeff, reduction=reduction)
 
     def _surrogates(self, tensordict: TensorDictBase, log_weight: Tensor) -> dict[str, Tensor]:
         ratio = log_weight.exp()
