@@ -169,12 +169,11 @@ class OnPolicy(Algorithm, Recipe):
         if self.cost_advantage is None:
             return {}
         estimator, following = self.cost_advantage, batch["next"]
+        keys = estimator.tensor_keys
         costs = torch.cat([following[key] for key in estimator.reward_keys], -1)
-        values = batch[estimator.tensor_keys.value]
-        ends = following["done"], following["terminated"]
-        return self.constraints.column(
-            "critic_bias", critic_bias(values, costs, *ends, estimator.gamma)
-        )
+        ends = following[keys.done], following[keys.terminated]
+        bias = critic_bias(batch[keys.value], costs, *ends, estimator.gamma)
+        return self.constraints.column("critic_bias", bias)
 
     def _update(self, batch: TensorDictBase) -> dict[str, Mapping[str, Tensor]]:
         """Improve the policy and fit the critics: neither needs what the other does."""

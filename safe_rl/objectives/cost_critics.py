@@ -85,6 +85,7 @@ class CostCritics(QFunctionLoss):
         lowest_cost_value: Number | None = None,
         **settings: Any,
     ) -> None:
+        device = next(cost_qvalue_network.parameters()).device
         if not isinstance(cost_qvalue_network, Ensemble):
             raise ValueError(
                 "The cost critic has to be a safe_rl.models.QEnsemble with one output per cost, "
@@ -104,7 +105,6 @@ class CostCritics(QFunctionLoss):
         self.lowest_cost_value = lowest_cost_value
         # not a part of the loss: whoever moves it saves it
         self.__dict__["multiplier"] = multiplier
-        device = next(cost_qvalue_network.parameters()).device
         self.register_buffer("cost_unit", torch.ones(len(cost_keys), device=device))
         self.register_buffer("reward_unit", torch.ones((), device=device))
         # number, sum and sum of squares

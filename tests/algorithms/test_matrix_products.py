@@ -72,12 +72,6 @@ def test_a_precision_of_the_users_is_kept(of_use):
         assert of_use.fp32_precision == "ieee"
 
 
-def test_elsewhere_nothing_changes(of_use, monkeypatch):
-    monkeypatch.setattr(matrix_products, "_is_of_use", lambda: False)
-    with fast_products():
-        assert of_use.fp32_precision == "none"
-
-
 def test_training_has_it_for_updates_alone(of_use, tmp_path):
     config = point_mass_config("algo=ppo")
     trainer = build_trainer(config, PointMass(config.num_envs, 20, config.seed), tmp_path)

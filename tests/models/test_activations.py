@@ -57,13 +57,6 @@ def test_gradients_of_what_is_mapped_are_the_tangents():
     torch.testing.assert_close(*found, atol=2e-6, rtol=1e-5)
 
 
-def test_where_torchs_own_is_quick_it_is_taken(monkeypatch):
-    x = torch.randn(1000)
-    assert not torch.equal(QUICK(x), x.tanh())
-    monkeypatch.setattr(activations, "_MKL_IS_QUICK", True)
-    assert torch.equal(QUICK(x), x.tanh())
-
-
 @pytest.mark.parametrize("dtype", [torch.float64, torch.bfloat16])
 def test_other_precisions_are_torchs_own(dtype):
     x = torch.randn(100, dtype=dtype)

@@ -10,9 +10,7 @@ from torchrl.envs.utils import check_env_specs
 
 from safe_rl.collectors import make_collector
 from safe_rl.envs import make_env
-from safe_rl.models import BehaviourPolicy, build_networks, make_behaviour
-from safe_rl.objectives.distributions import kl
-from safe_rl.objectives.fisher import FisherProduct
+from safe_rl.models import build_networks
 
 CPU = torch.device("cpu")
 ENCODERS = {"vector": [5], "channels": [4, 6], "kernels": [4, 3], "strides": [2, 1]}
@@ -92,22 +90,6 @@ def test_pictures_may_be_bytes_and_have_their_colours_first():
         torch.testing.assert_close(found["state_value"], expected["state_value"])
 
 
-def test_batches_may_have_any_shape():
-    observed = spec(gyro=Unbounded((3, 3)), sight=Unbounded((3, 12, 15, 3)))
-    critic = build(observed, encoders=ENCODERS)["critic"]
-    batch = torch.stack([observed.rand() for _ in range(4)])
-    found = critic(batch.clone())["state_value"]
-    torch.testing.assert_close(found[2], critic(batch[2].clone())["state_value"])
-
-
-def test_behaviour_policies_read_every_entry():
-    observed = spec(gyro=Unbounded((3, 3)), rays=Unbounded((3, 4)))
-    actor = build(observed, encoders={**ENCODERS, "vector": []}, normalise=10.0)["actor"]
-    policy, batch = make_behaviour(actor), observed.rand()
-    assert isinstance(policy, BehaviourPolicy)
-    torch.testing.assert_close(policy(batch.clone())["loc"], actor(batch.clone())["loc"])
-
-
 @pytest.mark.parametrize(
     ("observed", "model", "message"),
     [
@@ -175,28 +157,3 @@ def test_memories_are_those_of_a_loop_over_steps():
         torch.testing.assert_close(batch["memory"][:, step], state)
         state = cell(features[:, step], state)
         torch.testing.assert_close(batch["next", "memory"][:, step], state)
-
-
-def test_critics_see_what_is_remembered():
-    networks, batch = remembering()
-    first = networks["critic"](batch.clone())["state_value"]
-    batch["memory"] = batch["memory"] + 1
-    assert (networks["critic"](batch)["state_value"] != first).all()
-
-
-def test_fisher_products_go_through_the_memory():
-    networks, batch = remembering()
-    actor = networks["actor"]
-    parameters, states = list(actor.parameters()), batch.select(*actor.in_keys)
-    with torch.no_grad():
-        fixed = actor.get_dist(states.clone())
-    divergence = kl(actor.get_dist(states.clone()), fixed, torch.empty(0)).mean()
-    slopes = torch.autograd.grad(divergence, parameters, create_graph=True)
-    vectors = [torch.randn_like(parameter) for parameter in parameters]
-    expected = torch.autograd.grad(slopes, parameters, vectors)
-    found = FisherProduct(actor, states, parameters, damping=0.0)(
-        torch.cat([vector.flatten() for vector in vectors])
-    )
-    expected = torch.cat([product.flatten() for product in expected])
-    torch.testing.assert_close(found, expected, rtol=1e-3, atol=1e-5)
-    assert found.abs().max() > 1e-3

@@ -8,7 +8,7 @@ from tensordict import TensorDict
 from torchrl.data import Bounded
 
 from safe_rl.models import QEnsemble, make_squashed_actor
-from safe_rl.objectives import CALLoss, LagrangeMultiplier, SACLagrangianLoss
+from safe_rl.objectives import CALLoss, LagrangeMultiplier
 from safe_rl.objectives.cal import discounted_share
 
 COSTS = ["cost", "cost_other"]
@@ -81,20 +81,6 @@ def test_its_gradient_is_that_of_the_augmented_lagrangian(away, is_active):
         flat[place] += 1e-6
         slope = (sides[0] - sides[1]) / 2e-6
         assert gradient[place].item() == pytest.approx(slope, abs=1e-6)
-
-
-def test_without_convexity_it_is_the_lagrangian():
-    loss, plain = make_loss(convexity=0.0), make_loss(SACLagrangianLoss)
-    for name in ("actor", "qvalue", "cost_qvalue"):
-        name = f"{name}_network_params"
-        getattr(plain, name).data.update_(getattr(loss, name).data)
-    loss.discounted_limit.fill_(1.0)
-    steps = TensorDict(observation=torch.randn(5, 3), batch_size=[5])
-    losses = []
-    for each in (loss, plain):
-        torch.manual_seed(0)
-        losses.append(each.actor_losses(steps)["loss_actor"])
-    torch.testing.assert_close(*losses)
 
 
 def test_costs_are_free_until_the_limit_is_known():

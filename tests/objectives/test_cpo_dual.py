@@ -107,16 +107,6 @@ def test_one_constraint_against_the_two_branches_of_the_dual():
     np.testing.assert_allclose(solution.nu[:, 0], nu, rtol=1e-6, atol=1e-8)
 
 
-def test_step_is_minus_natural_gradient_plus_multipliers_over_lambda():
-    g, b, c = random_problems(200, 3, seed=3)
-    solution, step = solve(g, b, c)
-    rows = (solution.case > 0).numpy()
-    lam, nu = solution.lam.numpy()[rows, None], solution.nu.numpy()[rows]
-    expected = -(g[rows] + np.einsum("nk,nki->ni", nu, b[rows])) / lam
-    np.testing.assert_allclose(step[rows], expected, rtol=1e-5, atol=1e-8)
-    assert (nu >= 0).all()
-
-
 def one_problem(g, b, c):
     to_array = np.atleast_2d
     solution, step = solve(to_array(np.array(g, float)), np.array([b], float), to_array(c))

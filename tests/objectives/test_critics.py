@@ -42,24 +42,6 @@ def test_one_critic_alone():
     assert set(loss.in_keys) == {"observation", "value_target"}
 
 
-def test_adam_fits_linear_targets_and_explains_their_variance():
-    critic, cost_critic = make_critic(), make_critic("cost_value", 2)
-    batch = make_targets([256], 2)
-    weights = torch.randn(NUM_OBS, 3)
-    targets = batch["observation"] @ weights + 1
-    batch["value_target"], batch["cost_value_target"] = targets.split([1, 2], -1)
-    loss = CriticLoss(critic, cost_critic)
-    adam = torch.optim.Adam(loss.parameters(), lr=0.1)
-    for _ in range(300):
-        adam.zero_grad()
-        losses = loss(batch)
-        (losses["loss_critic"] + losses["loss_cost_critic"]).backward()
-        adam.step()
-    assert losses["explained_variance"] > 0.999
-    assert (losses["cost_explained_variance"] > 0.999).all()
-    torch.testing.assert_close(critic.module.weight.T, weights[:, :1], atol=1e-2, rtol=0)
-
-
 def test_explained_variance_by_hand():
     target = torch.tensor([[0.0, 1.0, 5.0], [2.0, 3.0, 5.0]])
     # the first is off by the same everywhere, which is no variance
@@ -87,12 +69,6 @@ def test_nested_keys_and_compile():
     compiled = torch.compile(loss, fullgraph=True, backend="aot_eager")(batch)
     for key in loss.out_keys:
         torch.testing.assert_close(compiled[key], expected[key])
-
-
-def test_moves_across_devices():
-    critic, cost_critic = make_critic().to("meta"), make_critic("cost_value", 2).to("meta")
-    losses = CriticLoss(critic, cost_critic)(make_targets([8], 2).to("meta"))
-    assert all(value.device.type == "meta" for value in losses.values())
 
 
 def test_errors_say_what_to_change():

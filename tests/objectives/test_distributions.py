@@ -104,7 +104,7 @@ def test_a_nan_within_a_part_is_found_before_anything_is_learnt():
         TRPOStep(TRPOLoss(actor, entropy_coeff=0.0), **SETTINGS)(batch)
 
 
-@pytest.mark.parametrize("kind", [*sorted(SAMPLED_KL), "normal", "beta"])
+@pytest.mark.parametrize("kind", sorted(SAMPLED_KL))
 def test_sampled_kl_is_the_divergence_on_average(kind):
     """Against the mean of log p − log q over samples of p, both with a hundred thousand samples."""
     actor = make_actor(kind)
@@ -119,8 +119,7 @@ def test_sampled_kl_is_the_divergence_on_average(kind):
         found = (ratio * log_weight - ratio + 1).mean()
         own = present.sample()
         expected = (present.log_prob(own) - past.log_prob(own)).mean()
-        if kind in SAMPLED_KL:
-            torch.testing.assert_close(kl(present, past, log_weight).mean(), found)
+        torch.testing.assert_close(kl(present, past, log_weight).mean(), found)
     assert found.item() == pytest.approx(expected.item(), rel=0.1, abs=1e-3)
 
 
@@ -216,16 +215,6 @@ def test_parameters_are_read_where_the_actor_writes_them():
     del batch["pi", "logits"]
     with pytest.raises(KeyError, match="behaviour policy's"):
         loss(batch)
-
-
-def test_the_entropy_bonus_can_be_scheduled_up_from_zero():
-    actor, batch = make_case("normal")
-    loss = PPOLoss(actor, clip_epsilon=0.2, entropy_coeff=0.0)
-    assert loss(batch)["loss_entropy"] == 0
-    loss.entropy_coeff = 0.5
-    expected = -0.5 * policy_in(actor, batch).entropy().mean()
-    torch.testing.assert_close(loss(batch)["loss_entropy"], expected)
-    assert set(loss(batch).keys()) == set(loss.out_keys)
 
 
 def test_an_actor_without_a_sampler_is_refused():

@@ -8,7 +8,7 @@ from tensordict import TensorDict
 from torchrl.data import Bounded
 
 from safe_rl.models import QEnsemble, make_squashed_actor
-from safe_rl.objectives import LagrangeMultiplier, SACLagrangianLoss, WCSACLoss
+from safe_rl.objectives import LagrangeMultiplier, WCSACLoss
 from safe_rl.objectives.wcsac import gaussian_tail
 
 BOUNDS = -torch.ones(2), torch.ones(2)
@@ -165,24 +165,6 @@ def test_means_bootstrap_on_the_larger_of_two_and_never_on_less_than_can_be(lowe
         wanted = target**2 + 0.25 * variance - mean**2
         distance = (mean - target) ** 2 + (np.sqrt(variance) - np.sqrt(wanted)) ** 2
         assert error == pytest.approx(distance, rel=1e-5)
-
-
-def test_the_whole_tail_is_the_mean():
-    loss, plain = make_loss(tail=1.0, costs=("cost", "b")), make_loss(
-        kind=SACLagrangianLoss, networks=1, costs=("cost", "b")
-    )  # fmt: skip
-    for name in ("actor_network_params", "qvalue_network_params"):
-        getattr(plain, name).data.update_(getattr(loss, name).data)
-    means = loss.cost_qvalue_network_params.data.apply(lambda value: value[:1].clone())
-    plain.cost_qvalue_network_params.data.update_(means)
-    steps = TensorDict(observation=torch.randn(5, 3), batch_size=[5])
-    found = []
-    for each in (loss, plain):
-        torch.manual_seed(0)
-        found.append(each.actor_losses(steps))
-    torch.testing.assert_close(found[0]["loss_actor"], found[1]["loss_actor"])
-    torch.testing.assert_close(found[0]["cost_qvalue"], found[1]["cost_qvalue"])
-    assert (found[0]["cost_deviation"] > 0).all()
 
 
 def test_what_does_not_fit_is_refused():
