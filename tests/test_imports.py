@@ -142,8 +142,8 @@ FLOORS = {
         ("",),
     ),
     "scores": (
-        ("certificate", "dominance", "intervals", "learning", "published"),
-        ("benchmark", "comparisons", "normalised", "slates"),
+        ("certificate", "comparisons", "published"),
+        ("benchmark", "measures"),
         ("",),
     ),
     "cli": (
@@ -159,9 +159,8 @@ FLOORS = {
         ("python_api",),
     ),
     "evaluation": (
-        ("env_keys",),
-        ("episodes", "layouts", "loading", "settings", "variations"),
-        ("certifying", "during", "summary", "video"),
+        ("episodes", "loading", "settings", "variations"),
+        ("certifying", "periodic_evaluation", "summary", "video"),
         ("measuring", "varying"),
         ("",),
     ),

@@ -18,8 +18,8 @@ MODULES = {
     "safe_rl.collectors": "Collection and accounting",
     "safe_rl.evaluation": "Evaluation and certificates",
     "safe_rl.scores.certificate": "Claims and their bounds",
-    "safe_rl.scores.intervals": "Intervals",
-    "safe_rl.scores.normalised": "Normalised scores",
+    "safe_rl.scores.comparisons": "Intervals",
+    "safe_rl.scores.measures": "Normalised scores",
     "safe_rl.reporting": "Reports",
     "safe_rl.runs.table": "Tables of runs",
 }

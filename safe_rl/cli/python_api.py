@@ -27,7 +27,7 @@ from safe_rl.cli.robots import maker_of
 from safe_rl.cli.session import Session, missing_folders, new_folder
 from safe_rl.cli.user_code import check_imports, import_modules, note_imports, several
 from safe_rl.evaluation import Certificate, Evaluation, EvaluationOptions
-from safe_rl.evaluation.layouts import default_seed
+from safe_rl.evaluation.episodes import default_seed
 from safe_rl.evaluation.loading import (
     find_checkpoint,
     for_evaluation,

@@ -23,7 +23,7 @@ from safe_rl.cli.resuming import compose_resumed
 from safe_rl.cli.user_code import import_modules, note_imports, split_imports
 from safe_rl.envs import store_configs
 from safe_rl.naming import did_you_mean
-from safe_rl.scores.slates import SLATES
+from safe_rl.scores.benchmark import SLATES
 
 __all__ = ["Command", "expand_slate", "job", "main", "read_command", "read_flags"]
 

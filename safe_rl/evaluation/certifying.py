@@ -16,8 +16,7 @@ import torch
 from omegaconf import DictConfig
 from torchrl.envs import EnvBase
 
-from safe_rl.evaluation.episodes import Episodes, collect_episodes
-from safe_rl.evaluation.layouts import default_seed, has_fixed_layout
+from safe_rl.evaluation.episodes import Episodes, collect_episodes, default_seed, has_fixed_layout
 from safe_rl.evaluation.loading import for_evaluation, load_config, load_policy, override_env
 from safe_rl.files import check_no_links, replace_text, replacing
 from safe_rl.runs.folder import RunFolder, checkpoint_steps, checkpoints_in

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -14,15 +14,21 @@ from torchrl.checkpoint import CheckpointError
 from torchrl.envs import EnvBase
 
 from safe_rl.algorithms.build_part import find_recipe
-from safe_rl.evaluation.env_keys import check_env_keys
 from safe_rl.files import read_config
 from safe_rl.naming import did_you_mean
 from safe_rl.runs.checkpoints import CheckpointStore, best_checkpoint
 from safe_rl.runs.folder import KINDS, RunFolder
 
 __all__ = [
-    *("find_checkpoint", "for_evaluation", "limits_of", "load_config", "load_policy"),
-    *("override_env", "transforms_of", "without_cost"),
+    "check_env_keys",
+    "find_checkpoint",
+    "for_evaluation",
+    "limits_of",
+    "load_config",
+    "load_policy",
+    "override_env",
+    "transforms_of",
+    "without_cost",
 ]
 
 
@@ -171,3 +177,33 @@ def load_policy(
                 "has diverged."
             )
     return policy.eval().requires_grad_(False)
+
+
+def check_env_keys(env: Mapping[str, Any], keys: Iterable[str]) -> None:
+    """Refuse keys that an environment of one's own family does not have.
+
+    Such a family ignores other keys, and the result would be said to be of another environment
+    than it is.
+
+    Args:
+        env: Node of a run's environment.
+        keys: Which of its keys are to be changed.
+
+    Raises:
+        ValueError: If the run's environment has no such key.
+
+    Examples:
+        >>> check_env_keys({"_target_": "mine.make", "edge": 1.0}, ["edgy"])
+        Traceback (most recent call last):
+        ValueError: env.edgy: mine.make has no such key. Did you mean 'edge'? The run has edge.
+    """
+    target = str(env.get("_target_", "safe_rl."))
+    if target.startswith("safe_rl."):
+        return
+    own = [key for key in env if key not in ("_target_", "name")]
+    for key in keys:
+        if key not in env:
+            known = f"The run has {', '.join(own)}." if own else "The run has none."
+            raise ValueError(
+                f"env.{key}: {target} has no such key.{did_you_mean(key, own)} {known}"
+            )

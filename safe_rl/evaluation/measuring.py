@@ -14,8 +14,7 @@ from tensordict.nn import TensorDictModuleBase
 from torchrl.envs import EnvBase
 
 from safe_rl.collectors import Recording, StepRecorder
-from safe_rl.evaluation.episodes import Episodes, collect_episodes
-from safe_rl.evaluation.layouts import default_seed, shared_layouts
+from safe_rl.evaluation.episodes import Episodes, collect_episodes, default_seed, shared_layouts
 from safe_rl.evaluation.loading import (
     find_checkpoint,
     for_evaluation,
@@ -30,7 +29,7 @@ from safe_rl.evaluation.summary import check_places, summarise, write_episodes, 
 from safe_rl.evaluation.video import check_camera, manner_of, record_episode, write_video
 from safe_rl.runs.folder import RunFolder, checkpoint_steps
 from safe_rl.scores.benchmark import Suite
-from safe_rl.scores.intervals import LEVEL, Estimate
+from safe_rl.scores.comparisons import LEVEL, Estimate
 
 __all__ = ["Evaluation", "evaluate"]
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from safe_rl.scores.intervals import check_share
+from safe_rl.scores.comparisons import check_share
 
 __all__ = ["EvaluationOptions", "check_device", "check_options", "option"]
 

@@ -10,8 +10,8 @@ from typing import Any
 
 from safe_rl.evaluation.episodes import Episodes
 from safe_rl.files import check_no_links, check_place, replace_csv, replace_text
-from safe_rl.scores.intervals import Estimate, cvar, mean, share_over
-from safe_rl.scores.normalised import normalised_return, normalised_violation
+from safe_rl.scores.comparisons import Estimate, cvar, mean, share_over
+from safe_rl.scores.measures import normalised_return, normalised_violation
 from safe_rl.scores.published import Scores
 
 __all__ = [

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 
 from omegaconf import DictConfig, OmegaConf
 
-from safe_rl.evaluation.env_keys import check_env_keys
+from safe_rl.evaluation.loading import check_env_keys
 
 __all__ = ["Variation", "expand", "varied"]
 

@@ -12,8 +12,7 @@ import torch
 from omegaconf import DictConfig
 from torchrl.envs import EnvBase
 
-from safe_rl.evaluation.episodes import Episodes, collect_episodes
-from safe_rl.evaluation.layouts import default_seed
+from safe_rl.evaluation.episodes import Episodes, collect_episodes, default_seed
 from safe_rl.evaluation.loading import (
     find_checkpoint,
     for_evaluation,
@@ -28,7 +27,7 @@ from safe_rl.evaluation.summary import check_places, summarise
 from safe_rl.evaluation.variations import TransformNode, Variation, varied
 from safe_rl.files import replace_csv
 from safe_rl.runs.folder import RunFolder, checkpoint_steps
-from safe_rl.scores.intervals import Estimate
+from safe_rl.scores.comparisons import Estimate
 
 __all__ = ["AS_TRAINED", "Varied", "VariedRow", "evaluate_variations"]
 

@@ -24,7 +24,7 @@ from safe_rl.reporting.recorded import Run
 from safe_rl.reporting.tables import clean
 from safe_rl.runs.curves import moving_mean, point_marker
 from safe_rl.runs.outcome import final_width
-from safe_rl.scores.intervals import bootstrap
+from safe_rl.scores.comparisons import bootstrap
 
 __all__ = [
     *("Average", "average", "draw_experiment", "draw_learning_curves", "limits_of", "set_axes"),

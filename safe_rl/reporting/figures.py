@@ -19,8 +19,7 @@ from safe_rl.files import replacing
 from safe_rl.reporting.experiments import Experiment
 from safe_rl.reporting.slates import SYMBOLS, Aggregate
 from safe_rl.reporting.tables import Record, span
-from safe_rl.scores.comparisons import pareto_front, performance_profile
-from safe_rl.scores.intervals import Estimate
+from safe_rl.scores.comparisons import Estimate, pareto_front, performance_profile
 from safe_rl.scores.published import ALGORITHMS
 
 __all__ = [

@@ -24,8 +24,9 @@ from safe_rl.reporting.tables import (
 )
 from safe_rl.runs.curves import moving_mean
 from safe_rl.runs.outcome import FINAL_EPOCHS, final_width
-from safe_rl.scores.dominance import Agent, compare
-from safe_rl.scores.learning import (
+from safe_rl.scores.measures import (
+    Agent,
+    compare,
     first_good_epoch,
     joined,
     longest_streak,

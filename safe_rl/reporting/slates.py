@@ -13,12 +13,17 @@ import numpy as np
 from safe_rl.reporting.experiments import Experiment
 from safe_rl.reporting.tables import Column, Table, interval, mark_best, power_of_ten, span
 from safe_rl.runs.identity import Role, role_of
-from safe_rl.scores.comparisons import probability_of_improvement
-from safe_rl.scores.dominance import NOISE_OF_ZERO, Agent, compare
-from safe_rl.scores.intervals import Estimate, interquartile_mean
-from safe_rl.scores.normalised import normalised_cost_rate, normalised_return, normalised_violation
+from safe_rl.scores.benchmark import SLATES
+from safe_rl.scores.comparisons import Estimate, interquartile_mean, probability_of_improvement
+from safe_rl.scores.measures import (
+    NOISE_OF_ZERO,
+    Agent,
+    compare,
+    normalised_cost_rate,
+    normalised_return,
+    normalised_violation,
+)
 from safe_rl.scores.published import PUBLISHED, PUBLISHED_STEPS, REFERENCE, SEEDS, Normalised
-from safe_rl.scores.slates import SLATES
 
 __all__ = [
     *("SYMBOLS", "Aggregate", "aggregate", "by_length", "can_be_normalised", "complete_slates"),

@@ -8,7 +8,7 @@ from typing import Any
 
 from safe_rl.scores.published import REFERENCE, Scores
 
-__all__ = ["Suite"]
+__all__ = ["SLATES", "Suite"]
 
 Node = Mapping[str, Any]
 
@@ -72,3 +72,17 @@ def _differ(key: str, own: Node, standard: Node) -> bool:
 
 def _plain(value: Any) -> Any:
     return [_plain(item) for item in value] if isinstance(value, list | tuple) else value
+
+
+SLATES: dict[str, tuple[str, ...]] = {
+    "SG1": tuple(name for name in REFERENCE if name.endswith("1")),
+    "SG2": tuple(name for name in REFERENCE if name.endswith("2")),
+    "SG6": ("PointGoal1", "PointGoal2", "PointButton1", "PointPush1", "CarGoal1", "DoggoGoal1"),
+    "SG18": tuple(REFERENCE),
+    "SGPoint": tuple(name for name in REFERENCE if name.startswith("Point")),
+    "SGCar": tuple(name for name in REFERENCE if name.startswith("Car")),
+    "SGDoggo": tuple(name for name in REFERENCE if name.startswith("Doggo")),
+}
+
+
+"""Slate -> its environments."""

@@ -1,4 +1,4 @@
-"""How samples of scores compare as wholes: more than one number each.
+"""Intervals of single figures, and comparisons of whole samples of scores.
 
 As in Agarwal et al., "Deep Reinforcement Learning at the Edge of the Statistical Precipice" (2021),
 with SciPy's bootstrap.
@@ -6,15 +6,27 @@ with SciPy's bootstrap.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import Any
+import math
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
+import scipy  # which loads its parts when they are asked for: half a second
 from numpy.typing import ArrayLike
 
-from safe_rl.scores.intervals import Estimate, bootstrap
-
-__all__ = ["pareto_front", "performance_profile", "probability_of_improvement"]
+__all__ = [
+    "LEVEL",
+    "Estimate",
+    "bootstrap",
+    "check_share",
+    "cvar",
+    "interquartile_mean",
+    "mean",
+    "pareto_front",
+    "performance_profile",
+    "probability_of_improvement",
+    "share_over",
+]
 
 
 def probability_of_improvement(first: Sequence[ArrayLike], second: Sequence[ArrayLike]) -> Estimate:
@@ -91,3 +103,169 @@ def pareto_front(returns: ArrayLike, costs: ArrayLike) -> np.ndarray:
     order = np.lexsort((-returns, costs))
     best = np.maximum.accumulate(np.concatenate([[-np.inf], returns[order]]))[:-1]
     return order[returns[order] > best]
+
+
+LEVEL = 0.95
+
+
+"""Confidence level of all intervals."""
+
+
+NUM_RESAMPLES = 2000
+
+
+"""Of the bootstrap: moves the ends of an interval by about a fiftieth of its width."""
+
+
+# resamples are drawn in portions of about so many numbers
+_PORTION = 2_000_000
+
+
+class Estimate(NamedTuple):
+    """An estimate and the interval in which the estimated quantity lies with confidence 95 %.
+
+    Examples:
+        >>> print(Estimate(12.3456, 11.0, 14.0))
+        12.35 [11, 14]
+    """
+
+    value: float
+    low: float
+    high: float
+
+    def __str__(self) -> str:
+        """The estimate and its interval, to four digits."""
+        return f"{self.value:.4g} [{self.low:.4g}, {self.high:.4g}]"
+
+
+def bootstrap(
+    samples: Sequence[np.ndarray], statistic: Callable[..., Any]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Percentile bootstrap interval, each sample being resampled on its own (stratified).
+
+    The same samples give the same interval.
+
+    Args:
+        samples: Strata, each of shape [..., n_i] with the observations along the last axis.
+        statistic: Vectorised function ``statistic(*samples, axis)``.
+
+    Returns:
+        Lower and upper ends, of the shape of the statistic; NaN where there is one observation
+        per stratum, which says nothing about the spread, or an observation is no number.
+
+    Examples:
+        >>> low, high = bootstrap([np.arange(100.0)], np.mean)
+        >>> bool(43 < low < 46), bool(53 < high < 56)
+        (True, True)
+    """
+    samples = [np.asarray(sample, dtype=float) for sample in samples]
+    are_known = all(np.isfinite(sample).all() for sample in samples)
+    if max(sample.shape[-1] for sample in samples) < 2 or not are_known:
+        shape = np.shape(statistic(*samples, axis=-1))
+        return np.full(shape, math.nan), np.full(shape, math.nan)
+    result = scipy.stats.bootstrap(
+        [sample for sample in samples if sample.shape[-1] > 1],
+        _with_constants(samples, statistic),
+        n_resamples=NUM_RESAMPLES,
+        batch=max(1, _PORTION // sum(sample.size for sample in samples)),
+        axis=-1,
+        vectorized=True,
+        confidence_level=LEVEL,
+        method="percentile",
+        rng=np.random.default_rng(0),
+    )
+    return result.confidence_interval.low, result.confidence_interval.high
+
+
+def _with_constants(
+    samples: Sequence[np.ndarray], statistic: Callable[..., Any]
+) -> Callable[..., Any]:
+    """The statistic as a function of the strata with several observations.
+
+    SciPy refuses to resample a single observation, which can only ever be drawn itself.
+    """
+
+    def of_resampled(*resampled: np.ndarray, axis: int = -1) -> Any:
+        left = iter(resampled)
+        num_draws = resampled[0].shape[-2]
+        return statistic(
+            *(
+                next(left)
+                if sample.shape[-1] > 1
+                else np.repeat(sample[..., np.newaxis, :], num_draws, axis=-2)
+                for sample in samples
+            ),
+            axis=axis,
+        )
+
+    return of_resampled
+
+
+def mean(values: ArrayLike) -> Estimate:
+    """Mean of independent values, shape [n]."""
+    values = np.asarray(values, dtype=float)
+    low, high = bootstrap([values], np.mean)
+    return Estimate(float(values.mean()), float(low), float(high))
+
+
+def interquartile_mean(strata: Sequence[ArrayLike]) -> Estimate:
+    """Mean of the middle half of all values, with an interval from a stratified bootstrap.
+
+    Args:
+        strata: Values per stratum, for example one list of scores per environment.
+
+    Examples:
+        >>> interquartile_mean([[0.0, 1.0], [2.0, 99.0]]).value
+        1.5
+    """
+    samples = [np.asarray(stratum, dtype=float) for stratum in strata]
+    low, high = bootstrap(samples, _trimmed_mean)
+    return Estimate(float(_trimmed_mean(*samples)), float(low), float(high))
+
+
+def _trimmed_mean(*samples: np.ndarray, axis: int = -1) -> np.ndarray:
+    return scipy.stats.trim_mean(np.concatenate(samples, axis=axis), 0.25, axis=axis)
+
+
+def cvar(values: ArrayLike, alpha: float) -> Estimate:
+    """Conditional value at risk: the mean of the largest share ``alpha`` of values, shape [n].
+
+    A value that falls into that share in part counts in part (Rockafellar, Uryasev 2000).
+
+    Raises:
+        ValueError: If ``alpha`` is not in (0, 1].
+
+    Examples:
+        >>> cvar([1.0, 2.0, 3.0, 4.0], alpha=0.5).value
+        3.5
+    """
+    check_share(alpha)
+    values = np.asarray(values, dtype=float)
+    size = alpha * len(values)
+
+    def tail_mean(sample: np.ndarray, axis: int = -1) -> np.ndarray:
+        largest = -np.sort(-sample, axis=axis)
+        weights = np.clip(size - np.arange(len(values)), 0.0, 1.0)
+        return (largest * weights).sum(axis) / size
+
+    low, high = bootstrap([values], tail_mean)
+    return Estimate(float(tail_mean(values)), float(low), float(high))
+
+
+def check_share(alpha: float) -> None:
+    """Refuse what is no share of episodes that a CVaR can be the mean of.
+
+    Raises:
+        ValueError: If ``alpha`` is not in (0, 1].
+    """
+    if not 0.0 < alpha <= 1.0:
+        raise ValueError(f"cvar_alpha={alpha} must be a share of episodes, in (0, 1].")
+
+
+def share_over(values: ArrayLike, limit: float) -> Estimate:
+    """Share of values above a limit, with Wilson's interval of a proportion."""
+    values = np.asarray(values, dtype=float)
+    over = int((values > limit).sum())
+    test = scipy.stats.binomtest(over, len(values))
+    interval = test.proportion_ci(LEVEL, method="wilson")
+    return Estimate(over / len(values), float(interval.low), float(interval.high))

@@ -20,8 +20,8 @@ from safe_rl.reporting.slates import (
     slate_table,
 )
 from safe_rl.reporting.tables import Table
+from safe_rl.scores.benchmark import SLATES
 from safe_rl.scores.published import PUBLISHED_STEPS, REFERENCE
-from safe_rl.scores.slates import SLATES
 
 
 def table_of(root):

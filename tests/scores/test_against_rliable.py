@@ -8,8 +8,11 @@ be imported.
 import numpy as np
 import pytest
 
-from safe_rl.scores.comparisons import performance_profile, probability_of_improvement
-from safe_rl.scores.intervals import interquartile_mean
+from safe_rl.scores.comparisons import (
+    interquartile_mean,
+    performance_profile,
+    probability_of_improvement,
+)
 
 # five runs of two algorithms on three environments
 GENERATOR = np.random.default_rng(7)

@@ -13,7 +13,7 @@ from safe_rl.scores.comparisons import (
     performance_profile,
     probability_of_improvement,
 )
-from safe_rl.scores.learning import (
+from safe_rl.scores.measures import (
     first_good_epoch,
     longest_streak,
     regret,

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy.optimize import linprog
 
-from safe_rl.scores.intervals import bootstrap, cvar, interquartile_mean, mean, share_over
+from safe_rl.scores.comparisons import bootstrap, cvar, interquartile_mean, mean, share_over
 
 
 def test_the_interval_of_a_mean_is_the_normal_one_for_many_values():

@@ -6,10 +6,16 @@ import numpy as np
 import pytest
 
 from safe_rl.envs import SUITE
-from safe_rl.scores.dominance import Agent, compare, dominates
-from safe_rl.scores.normalised import normalised_cost_rate, normalised_return, normalised_violation
+from safe_rl.scores.benchmark import SLATES
+from safe_rl.scores.measures import (
+    Agent,
+    compare,
+    dominates,
+    normalised_cost_rate,
+    normalised_return,
+    normalised_violation,
+)
 from safe_rl.scores.published import ALGORITHMS, PUBLISHED, REFERENCE, REIMPLEMENTATIONS, Scores
-from safe_rl.scores.slates import SLATES
 
 
 def test_the_slates_are_made_of_the_suites_constrained_environments():
