@@ -159,7 +159,8 @@ FLOORS = {
         ("python_api",),
     ),
     "evaluation": (
-        ("episodes", "loading", "settings", "variations"),
+        ("episodes", "loading", "settings"),
+        ("variations",),
         ("certifying", "periodic_evaluation", "summary", "video"),
         ("measuring", "varying"),
         ("",),
