@@ -58,18 +58,10 @@ class CPOStep(TRPOStep):
         >>> with torch.no_grad():
         ...     batch = actor(TensorDict(observation=torch.randn(8, 3), batch_size=[8]))
         >>> batch["advantage"], batch["cost_advantage"] = torch.randn(8, 1), torch.randn(8, 1)
-        >>> step = CPOStep(
-        ...     CPOLoss(actor, entropy_coeff=0.0),
-        ...     rescale_violation=True,
-        ...     target_kl=0.01,
-        ...     damping=0.1,
-        ...     cg_iterations=10,
-        ...     backtrack_coeff=0.8,
-        ...     max_backtracks=10,
-        ... )
-        >>> step(batch, cost_violation=torch.tensor([-25.0]), episode_length=torch.tensor(50.0))[
-        ...     "case"
-        ... ]
+        >>> search = {"cg_iterations": 10, "backtrack_coeff": 0.8, "max_backtracks": 10}
+        >>> settings = {"rescale_violation": True, "damping": 0.1, **search}
+        >>> step = CPOStep(CPOLoss(actor, entropy_coeff=0.0), target_kl=0.01, **settings)
+        >>> step(batch, torch.tensor([-25.0]), torch.tensor(50.0))["case"]
         tensor(3)
     """
 

@@ -131,19 +131,11 @@ class MinibatchUpdate(PolicyUpdate):
             or if a loss is not, before the step that would follow it.
 
     Examples:
-        >>> import functools
-        >>> import torch
-        >>> from tensordict import TensorDict
-        >>> from tensordict.nn import TensorDictModule
-        >>> from safe_rl.objectives.critics import CriticLoss
-        >>> linear = torch.nn.Linear(3, 1)
-        >>> critic = TensorDictModule(linear, in_keys=["observation"], out_keys=["state_value"])
-        >>> update = MinibatchUpdate(
-        ...     CriticLoss(critic),
-        ...     optimizer=functools.partial(torch.optim.Adam, lr=0.1),
-        ...     num_passes=2,
-        ...     minibatch_size=5,
-        ... )
+        >>> from functools import partial
+        >>> from safe_rl.models import make_critic
+        >>> from safe_rl.objectives import CriticLoss
+        >>> loss, adam = CriticLoss(make_critic(3, hidden_sizes=[8])), partial(torch.optim.Adam)
+        >>> update = MinibatchUpdate(loss, optimizer=adam, num_passes=2, minibatch_size=5)
         >>> batch = TensorDict(observation=torch.ones(4, 5, 3), value_target=torch.ones(4, 5, 1))
         >>> update(batch.auto_batch_size_(2))["num_steps"]
         tensor(8)

@@ -94,14 +94,9 @@ class TRPOStep(PolicyUpdate):
         >>> with torch.no_grad():
         ...     batch = actor(TensorDict(observation=torch.randn(8, 3), batch_size=[8]))
         >>> batch["advantage"] = torch.randn(8, 1)
-        >>> step = TRPOStep(
-        ...     TRPOLoss(actor, entropy_coeff=0.01),
-        ...     target_kl=0.01,
-        ...     damping=0.1,
-        ...     cg_iterations=10,
-        ...     backtrack_coeff=0.8,
-        ...     max_backtracks=10,
-        ... )
+        >>> search = {"cg_iterations": 10, "backtrack_coeff": 0.8, "max_backtracks": 10}
+        >>> loss = TRPOLoss(actor, entropy_coeff=0.01)
+        >>> step = TRPOStep(loss, target_kl=0.01, damping=0.1, **search)
         >>> bool(step(batch)["kl"] <= 0.01)
         True
     """

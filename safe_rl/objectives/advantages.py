@@ -241,13 +241,8 @@ class CostGAE(VectorGAE):
         settings: ``gamma``, ``lmbda`` and ``value_target``, see `VectorGAE`.
 
     Examples:
-        >>> estimator = CostGAE(
-        ...     ["cost_hazards", "cost_vases_contact"],
-        ...     None,
-        ...     gamma=0.99,
-        ...     lmbda=0.97,
-        ...     value_target="return_to_go",
-        ... )
+        >>> settings = {"gamma": 0.99, "lmbda": 0.97, "value_target": "return_to_go"}
+        >>> estimator = CostGAE(["cost_hazards", "cost_vases_contact"], None, **settings)
         >>> estimator.out_keys
         ['cost_advantage', 'cost_value_target']
     """

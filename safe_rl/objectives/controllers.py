@@ -118,17 +118,9 @@ class PIDMultiplier(Multiplier):
         ValueError: if an argument is outside its range.
 
     Examples:
-        >>> multiplier = PIDMultiplier(
-        ...     {"cost": 25.0},
-        ...     init=0.0,
-        ...     kp=0.1,
-        ...     ki=0.01,
-        ...     kd=0.0,
-        ...     proportional_ema=0.0,
-        ...     derivative_ema=0.0,
-        ...     derivative_delay=1,
-        ...     scale=1.0,
-        ... )
+        >>> gains = {"kp": 0.1, "ki": 0.01, "kd": 0.0, "init": 0.0, "scale": 1.0}
+        >>> smoothing = {"proportional_ema": 0.0, "derivative_ema": 0.0, "derivative_delay": 1}
+        >>> multiplier = PIDMultiplier({"cost": 25.0}, **gains, **smoothing)
         >>> multiplier.update([10.0])  # J_c = 35
         >>> multiplier.value
         tensor([1.1000])

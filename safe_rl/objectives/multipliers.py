@@ -18,7 +18,6 @@ from tensordict import NestedKey
 from torch import Tensor, nn
 from torch.nn.functional import softplus
 
-from safe_rl.naming import key_name
 from safe_rl.ranges import NotNegative, Positive, Range, Weight
 
 CostLimits = Mapping[NestedKey, float] | Sequence[float] | float
@@ -142,16 +141,6 @@ class Multiplier(nn.Module, ABC):
     @abstractmethod
     def _step(self, violation: Tensor) -> dict[str, Tensor]:
         """Return the new value of every state buffer ([..., k]) given finite J_c − d, [k]."""
-
-    def named_values(self) -> dict[str, Tensor]:
-        """λ per cost as scalars, named by cost key (nested keys joined by ``/``)."""
-        names = map(key_name, self.cost_keys)
-        return dict(zip(names, self.value.unbind(), strict=True))
-
-    def extra_repr(self) -> str:
-        """Limits and multipliers by cost key."""
-        limits = dict(zip(self.cost_keys, self.limits.tolist(), strict=True))
-        return f"cost_limits={limits}"
 
 
 class LagrangeMultiplier(Multiplier):

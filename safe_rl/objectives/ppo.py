@@ -48,16 +48,9 @@ class PPOLoss(SurrogateLoss):
 
     Examples:
         >>> import torch
-        >>> from tensordict.nn import AddStateIndependentNormalScale, TensorDictModule
-        >>> from torchrl.modules import IndependentNormal, ProbabilisticActor
         >>> from tensordict import TensorDict
-        >>> net = torch.nn.Sequential(torch.nn.Linear(3, 2), AddStateIndependentNormalScale(2))
-        >>> actor = ProbabilisticActor(
-        ...     TensorDictModule(net, in_keys=["observation"], out_keys=["loc", "scale"]),
-        ...     in_keys=["loc", "scale"],
-        ...     distribution_class=IndependentNormal,
-        ...     return_log_prob=True,
-        ... )
+        >>> from safe_rl.models import make_actor
+        >>> actor = make_actor(3, 2, hidden_sizes=[8], initial_log_std=-0.5)
         >>> with torch.no_grad():
         ...     batch = actor(TensorDict(observation=torch.randn(8, 3), batch_size=[8]))
         >>> batch["advantage"] = torch.randn(8, 1)

@@ -181,15 +181,12 @@ class SACLagrangianLoss(CostCritics, SACLoss):
         >>> from safe_rl.models import QEnsemble, make_squashed_actor
         >>> from safe_rl.objectives import LagrangeMultiplier
         >>> actor = make_squashed_actor(3, -torch.ones(2), torch.ones(2), hidden_sizes=[8])
+        >>> q = QEnsemble(3, 2, hidden_sizes=[8], num_networks=2)
+        >>> cost_q = QEnsemble(3, 2, hidden_sizes=[8], num_networks=1, out_key="cost_value")
+        >>> multiplier = LagrangeMultiplier({"cost": 25.0}, init=1.0, lr=0.05)
+        >>> settings = {"gamma": 0.99, "alpha_init": 0.1, "target_entropy": -2.0}
         >>> loss = SACLagrangianLoss(
-        ...     actor,
-        ...     QEnsemble(3, 2, hidden_sizes=[8], num_networks=2),
-        ...     QEnsemble(3, 2, hidden_sizes=[8], num_networks=1, out_key="cost_value"),
-        ...     multiplier=LagrangeMultiplier({"cost": 25.0}, init=1.0, lr=0.05),
-        ...     cost_keys=["cost"],
-        ...     gamma=0.99,
-        ...     alpha_init=0.1,
-        ...     target_entropy=-2.0,
+        ...     actor, q, cost_q, multiplier=multiplier, cost_keys=["cost"], **settings
         ... )
         >>> ("next", "cost") in loss.in_keys, "loss_cost_qvalue" in loss.out_keys
         (True, True)

@@ -12,7 +12,6 @@ from torch import Tensor
 from torch.distributions import Distribution
 from torchrl.objectives import LossModule
 
-from safe_rl.naming import key_name
 from safe_rl.objectives.distributions import (
     composite_keys,
     composite_log_probs,
@@ -284,10 +283,6 @@ class SurrogateLoss(LossModule):
         advantage = SurrogateLoss._advantage(self, tensordict, log_weight)
         weighed = self._cost_advantage(tensordict) * self.multiplier.value
         return advantage - weighed.sum(-1, keepdim=True)
-
-    def extra_repr(self) -> str:
-        """Keys that are read."""
-        return f"in_keys={[key_name(key) for key in self.in_keys]}"
 
 
 def require_multiplier(multiplier: Multiplier, plain_loss: str) -> Multiplier:

@@ -60,8 +60,8 @@ def test_ppo_lagrangian_in_torchrls_ppo_trainer(example):
     twin = LagrangeMultiplier(LIMITS, init=1.0, lr=0.05)
     for index in range(3):
         twin.update([history[f"episode_{key}"][index] - LIMITS[key] for key in LIMITS])
-        for key, value in twin.named_values().items():
-            assert history[f"multiplier_{key}"][index] == pytest.approx(value.item(), rel=1e-5)
+        for key, value in zip(LIMITS, twin.value.tolist(), strict=True):
+            assert history[f"multiplier_{key}"][index] == pytest.approx(value, rel=1e-5)
             violation = history[f"episode_{key}"][index] - LIMITS[key]
             assert history[f"violation_{key}"][index] == pytest.approx(violation, abs=1e-5)
     torch.testing.assert_close(loss.policy_loss.multiplier.value, twin.value)

@@ -91,12 +91,6 @@ def test_limits_keep_their_keys(limits, keys):
     assert parse_cost_limits(limits)[0] == keys
 
 
-def test_named_values_join_nested_keys():
-    multiplier = lagrange({"cost_hazards": 10.0, ("costs", "vases"): 5.0}, init=[2.0, 3.0])
-    named = {name: value.item() for name, value in multiplier.named_values().items()}
-    assert named == pytest.approx({"cost_hazards": 2.0, "costs/vases": 3.0})
-
-
 @pytest.mark.parametrize(
     ("build", "message"),
     [
