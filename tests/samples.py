@@ -72,3 +72,26 @@ def assert_gradients_are_differences(evaluate, actor):
             values.append(evaluate().detach())
         parameter.data += 1e-6 * direction
         torch.testing.assert_close(slope, (values[0] - values[1]) / 2e-6, rtol=1e-4, atol=1e-7)
+
+
+def make_rollout(critics, n=4, steps=37, p_end=0.12, costs=("cost",), done=None):
+    """Rollout whose next observation is the following root one, except where it ends."""
+    done = torch.rand(n, steps, 1) < p_end if done is None else done
+    terminated = done & (torch.rand(n, steps, 1) < 0.5)
+    observation = torch.randn(n, steps + 1, NUM_OBS)
+    final = torch.randn(n, steps, NUM_OBS)
+    following = TensorDict(
+        observation=torch.where(done, final, observation[:, 1:]),
+        reward=torch.randn(n, steps, 1),
+        done=done,
+        terminated=terminated,
+        batch_size=[n, steps],
+    )
+    for key in costs:
+        following[key] = torch.rand(n, steps, 1)
+    rollout = TensorDict(observation=observation[:, :-1], next=following, batch_size=[n, steps])
+    with torch.no_grad():
+        for critic in critics:
+            critic(rollout)
+            critic(rollout["next"])
+    return rollout

@@ -1,10 +1,6 @@
 """The example of a loss and a risk measure of one's own: definitions, and whole runs."""
 
 import math
-import re
-import shlex
-import subprocess
-import sys
 
 import pytest
 import torch
@@ -68,26 +64,6 @@ def test_it_trains_with_several_costs(tmp_path, algo):
     for key, limit in (("cost_hazards", 1), ("cost_north", 0.5)):
         expected = [estimate - limit for estimate in table[f"estimate_{key}"]]
         assert table[f"violation_{key}"] == pytest.approx(expected, abs=1e-5)
-
-
-def test_the_command_of_the_example(tmp_path):
-    command = re.search(r"python train.py .*?\n\n", custom_loss.__doc__, re.DOTALL)
-    words = [word for word in shlex.split(command[0]) if not word.startswith("frames=")]
-    assert words[0] == "python"
-    short = [
-        *("frames=80", "env.num_steps=20", "num_envs=2", "frames_per_batch=40", "logger=none"),
-        *("model.hidden_sizes=[8]", "policy_update.minibatch_size=20"),
-        *("critic_update.minibatch_size=20", "num_threads=1", f"hydra.run.dir={tmp_path}"),
-    ]
-    result = subprocess.run(
-        [sys.executable, *words[1:], *short],
-        cwd=ROOT,
-        capture_output=True,
-        text=True,
-        timeout=300,
-        check=False,
-    )
-    assert result.returncode == 0, result.stderr
 
 
 @pytest.mark.parametrize("name", ["A2CLoss", "ClipPPOLoss"])

@@ -1,7 +1,6 @@
 """TorchRL's trainers with our parts: the example trains, and the parts do what they say."""
 
 import importlib.util
-import warnings
 from pathlib import Path
 
 import pytest
@@ -9,14 +8,11 @@ import torch
 from point_mass import PointMass
 from samples import make_actor, make_batch, make_critic, perturb
 from tensordict import TensorDict
-from torchrl.data import LazyTensorStorage, ReplayBuffer, SamplerWithoutReplacement
-from torchrl.trainers.algorithms import PPOTrainer
 
-from safe_rl import models
 from safe_rl.algorithms import Constraints
 from safe_rl.algorithms.constraints import TrackedConstraints
 from safe_rl.algorithms.torchrl_trainers import ConstraintHook
-from safe_rl.collectors import EpisodeAccounting, make_collector
+from safe_rl.collectors import EpisodeAccounting
 from safe_rl.objectives import (
     ActorCriticLoss,
     CostGAE,
@@ -25,7 +21,6 @@ from safe_rl.objectives import (
     JointAdvantages,
     LagrangeMultiplier,
     PPOLagrangianLoss,
-    PPOLoss,
     VectorGAE,
 )
 
@@ -87,31 +82,6 @@ def test_cpo_steps_in_torchrls_trainer(example):
     collecting = dict(trainer.collector.policy.named_parameters())
     trained = [p for name, p in collecting.items() if "module" in name]
     assert all(map(torch.equal, trained, weights(actor)))
-
-
-def test_the_trainers_own_gae_and_an_unconstrained_loss():
-    env = PointMass(num_envs=2, num_steps=20)
-    actor = models.make_actor(4, 2, hidden_sizes=[8], initial_log_std=-0.5)
-    critic = models.make_critic(4, hidden_sizes=[8])
-    policy_loss = PPOLoss(actor, clip_epsilon=0.2, entropy_coeff=0.01)
-    loss = ActorCriticLoss(policy_loss, CriticLoss(critic), critic_coeff=0.5)
-    before = weights(loss)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        trainer = PPOTrainer(
-            collector=make_collector(env, actor, frames_per_batch=80),
-            total_frames=160,
-            frame_skip=1,
-            optim_steps_per_batch=None,
-            loss_module=loss,
-            optimizer=torch.optim.Adam(loss.parameters(), lr=1e-3),
-            replay_buffer=ReplayBuffer(
-                storage=LazyTensorStorage(80), sampler=SamplerWithoutReplacement(), batch_size=40
-            ),
-            progress_bar=False,
-        )
-    trainer.train()
-    assert all(not torch.equal(a, b) for a, b in zip(before, weights(loss), strict=True))
 
 
 def make_pair(critic_coeff=0.5):

@@ -4,7 +4,14 @@ from functools import partial
 
 import pytest
 import torch
-from samples import make_actor, make_batch, perturb, whole_step
+from one_state import total
+from samples import (
+    assert_gradients_are_differences,
+    make_actor,
+    make_batch,
+    perturb,
+    whole_step,
+)
 from tensordict import TensorDict
 
 from safe_rl.algorithms import CPOStep, TRPOStep
@@ -71,32 +78,17 @@ def all_losses(actor):
 
 
 @pytest.mark.parametrize("index", range(3))
-@pytest.mark.parametrize("batch_size", [(32,), (4, 8)])
-def test_surrogate_gradients_against_finite_differences(index, batch_size):
+@pytest.mark.parametrize("entry", [0, 1, "losses"])
+def test_surrogate_gradients_against_finite_differences(index, entry):
     actor = make_actor(width=4)
-    batch = make_batch(actor, batch_size, 2).double()
+    batch = make_batch(actor, (4, 8), 2).double()
     actor.double()
     perturb(actor, 0.1)
     loss = all_losses(actor)[index].double()
-    parameters = list(actor.parameters())
-    direction = [torch.randn_like(parameter) for parameter in parameters]
-
-    def outputs():
-        losses = loss(batch)
-        values = [losses["loss_objective"] + losses["loss_entropy"]]
-        return values + list(losses.get("cost_surrogate", torch.empty(0)))
-
-    slopes = []
-    for value in outputs():
-        gradient = torch.autograd.grad(value, parameters, retain_graph=True)
-        slopes.append(sum((g * d).sum() for g, d in zip(gradient, direction, strict=True)))
-    moved = []
-    for size in (1e-6, -2e-6):
-        for parameter, d in zip(parameters, direction, strict=True):
-            parameter.data += size * d
-        moved.append(outputs())
-    for slope, up, down in zip(slopes, *moved, strict=True):
-        torch.testing.assert_close(slope, (up - down) / 2e-6, rtol=1e-4, atol=1e-7)
+    if entry == "losses":
+        assert_gradients_are_differences(lambda: total(loss(batch)), actor)
+    elif "cost_surrogate" in loss.out_keys:
+        assert_gradients_are_differences(lambda: loss(batch)["cost_surrogate"][entry], actor)
 
 
 def test_trpo_loss_is_the_definition():
@@ -115,7 +107,7 @@ def test_trpo_loss_is_the_definition():
 
 
 @pytest.mark.parametrize("index", range(3))
-def test_losses_compile_take_nested_keys_and_move(index):
+def test_losses_compile_and_take_nested_keys(index):
     torch._dynamo.reset()
     actor = make_actor(in_key=("agent", "obs"))
     batch = make_batch(make_actor(), [16], 2)
@@ -127,12 +119,6 @@ def test_losses_compile_take_nested_keys_and_move(index):
     compiled = torch.compile(loss, fullgraph=True, backend="aot_eager")(batch)
     for key in loss.out_keys:
         torch.testing.assert_close(compiled[key], expected[key])
-    double = all_losses(actor.double())[index].double()
-    double.set_keys(cost_advantage=("adv", "cost"))
-    assert double(batch.double())["loss_objective"].dtype == torch.float64
-    meta = all_losses(actor.to("meta"))[index].to("meta")
-    meta.set_keys(cost_advantage=("adv", "cost"))
-    assert all(value.device.type == "meta" for value in meta(batch.to("meta")).values())
 
 
 @pytest.mark.parametrize("batch_size", [(400,), (20, 20)])
@@ -345,10 +331,9 @@ def test_errors_say_what_to_change():
 
 
 @pytest.mark.parametrize("entry", ["advantage", "cost_advantage", "observation", "action"])
-@pytest.mark.parametrize("value", [torch.nan, torch.inf])
-def test_numbers_that_are_none_change_nothing(entry, value):
+def test_numbers_that_are_none_change_nothing(entry):
     actor, batch = make_case(1)
-    batch[entry].view(-1)[0] = value
+    batch[entry].view(-1)[0] = torch.inf if entry == "action" else torch.nan
     before = flatten(actor.parameters()).detach().clone()
     for step in (cpo_step(actor), TRPOStep(CPOLoss(actor, entropy_coeff=0.0), **SETTINGS)):
         read = entry in step.loss.in_keys

@@ -2,37 +2,14 @@
 
 import pytest
 import torch
-from samples import NUM_OBS, make_critic
+from samples import NUM_OBS, make_critic, make_rollout
 from tensordict import TensorDict
 from torchrl.objectives.value import GAE
 
 from safe_rl.objectives.advantages import CostGAE, VectorGAE
 from safe_rl.objectives.gae import normalise_advantages
 
-N, T = 4, 37
-
-
-def make_rollout(critics, n=N, steps=T, p_end=0.12, costs=("cost",)):
-    """Rollout whose next observation is the following root one, except where it ends."""
-    done = torch.rand(n, steps, 1) < p_end
-    terminated = done & (torch.rand(n, steps, 1) < 0.5)
-    observation = torch.randn(n, steps + 1, NUM_OBS)
-    final = torch.randn(n, steps, NUM_OBS)
-    following = TensorDict(
-        observation=torch.where(done, final, observation[:, 1:]),
-        reward=torch.randn(n, steps, 1),
-        done=done,
-        terminated=terminated,
-        batch_size=[n, steps],
-    )
-    for key in costs:
-        following[key] = torch.rand(n, steps, 1)
-    rollout = TensorDict(observation=observation[:, :-1], next=following, batch_size=[n, steps])
-    with torch.no_grad():
-        for critic in critics:
-            critic(rollout)
-            critic(rollout["next"])
-    return rollout
+N, T = 4, 37  # of rollouts
 
 
 def loop_gae(reward, value, next_value, done, terminated, gamma, lmbda):

@@ -4,7 +4,7 @@ import functools
 
 import pytest
 import torch
-from samples import NUM_OBS, make_actor, make_batch, make_critic, perturb
+from samples import make_actor, make_batch, make_critic, make_rollout, perturb
 from tensordict import TensorDict
 from torchrl.collectors.utils import split_trajectories
 from torchrl.objectives.value import GAE
@@ -25,22 +25,11 @@ N, T = 3, 20
 SETTINGS = {"gamma": 0.97, "lmbda": 0.9, "value_target": "lambda_return"}
 
 
-def make_rollout():
-    """Whole and cut episodes, also one that terminates with the batch."""
+def make_trajectories(critics=()):
+    """Whole and cut episodes, also one that ends with the batch."""
     done = torch.rand(N, T, 1) < 0.15
     done[0, 4], done[1, -1], done[2, -1] = True, True, False
-    terminated = done & (torch.rand(N, T, 1) < 0.5)
-    observation = torch.randn(N, T + 1, NUM_OBS)
-    following = TensorDict(
-        observation=torch.where(done, torch.randn(N, T, NUM_OBS), observation[:, 1:]),
-        reward=torch.randn(N, T, 1),
-        cost_a=torch.rand(N, T, 1),
-        cost_b=torch.rand(N, T, 1),
-        done=done,
-        terminated=terminated,
-        batch_size=[N, T],
-    )
-    rollout = TensorDict(observation=observation[:, :-1], next=following, batch_size=[N, T])
+    rollout = make_rollout(critics, N, T, costs=("cost_a", "cost_b"), done=done)
     starts = torch.nn.functional.pad(done.squeeze(-1)[:, :-1].long(), (1, 0))
     rollout["collector", "traj_ids"] = starts.cumsum(1) + 100 * torch.arange(N)[:, None]
     return rollout
@@ -55,12 +44,7 @@ def samples_of(padded, key):
 @pytest.mark.parametrize("precomputed", [False, True])
 def test_advantages_of_split_trajectories(lmbda, target, precomputed):
     critics = make_critic(), make_critic("cost_value", 2)
-    rollout = make_rollout()
-    if precomputed:
-        with torch.no_grad():
-            for critic in critics:
-                critic(rollout)
-                critic(rollout["next"])
+    rollout = make_trajectories(critics if precomputed else ())
     padded = split_trajectories(rollout.clone())
     assert not padded["collector", "mask"].all()
     settings = SETTINGS | {"lmbda": lmbda, "value_target": target}
@@ -83,7 +67,7 @@ def test_advantages_of_split_trajectories(lmbda, target, precomputed):
 
 def test_what_stands_in_the_padding_does_not_matter():
     critic = make_critic()
-    padded = split_trajectories(make_rollout())
+    padded = split_trajectories(make_trajectories())
     spoilt = padded.clone()
     for data in (spoilt, spoilt["next"]):
         data["observation"][~padded["collector", "mask"]] = torch.nan
