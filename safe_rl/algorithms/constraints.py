@@ -195,8 +195,8 @@ CHARGES = "charged_costs"
 class TrackedConstraints(Constraints):
     """`Constraints` whose violations come from a `LimitTracker`.
 
-    ``violation`` is what a step has to promise of J_c to come down by: J_c less its target, over
-    the share of promises that come true. Multipliers get J_c less its target, in its units.
+    ``violation`` is by how much a step's surrogate has to lower J_c: J_c less its target, over the
+    share of predicted changes that is realised. Multipliers get J_c less its target.
 
     Args:
         limits: Cost key -> d, undiscounted cost allowed per episode.
@@ -272,10 +272,10 @@ class TrackedConstraints(Constraints):
         """Note the change of J_c that an update's surrogates predict, if it reports them."""
         if "cost_surrogate" in metrics:
             change = metrics["cost_surrogate"] * self.episode_length
-            self.tracker.promises.record_prediction(change)
+            self.tracker.predictions.record_prediction(change)
 
     def columns(self) -> dict[str, float]:
-        """Estimates, targets, and multipliers or the trust in promises, by column of the table."""
+        """Estimates, targets, and multipliers or the share of predictions realised, by column."""
         row = dict(self._row)
         if self.multiplier is not None:
             row |= self.column("multiplier", self.multiplier.value)

@@ -51,10 +51,10 @@ class SequentialUpdates(PolicyUpdate):
         metrics = dict(self.first(*given))
         for name, update in self.then.items():
             reported = dict(update(*given))
-            promised = reported.pop("cost_surrogate", None)
+            predicted = reported.pop("cost_surrogate", None)
             metrics |= {f"{name}_{key}": value for key, value in reported.items()}
-            if promised is not None:
-                metrics["cost_surrogate"] = promised
+            if predicted is not None:
+                metrics["cost_surrogate"] = predicted
         return metrics
 
     def loss_modules(self) -> dict[str, nn.Module]:

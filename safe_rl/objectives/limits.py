@@ -8,9 +8,9 @@ Between the costs of a batch and the violation that an update sees lie four deci
   policy that has learned to ignore costs takes longest to unlearn it;
 - **a margin**: z standard errors of a batch's J_c below the limit, so that what one batch shows
   is above the limit with a chance of about Φ(−z);
-- **trust**: the surrogate of a step promises a change of J_c, of which only a share comes true. The
-  share is measured, and violations are divided by it, for steps that go by promises (CPO). What is
-  left of a violation from one update to the next is asked for in addition, as an integral.
+- **trust**: the surrogate of a step predicts a change of J_c, of which only a share is realised.
+  The share is measured, and violations are divided by it, for steps that act on predictions (CPO).
+  What is left of a violation from one update to the next is added, as an integral.
 """
 
 from __future__ import annotations
@@ -35,8 +35,8 @@ class LimitState(NamedTuple):
         length: mean episode length T̄ in steps, scalar.
         unit: size of one cost, [k]; see `EpisodeCosts.unit`.
         scale: unit of violations, [k]: the limit, or a small share of the steps if that is more.
-        trust: share of a promised change of J_c that comes true, [k].
-        owed: what is to be promised beyond the violation, [k].
+        trust: share of a predicted change of J_c that is realised, [k].
+        integrated: what is added to the violation, the sum of those before, [k].
     """
 
     cost: Tensor
@@ -45,7 +45,7 @@ class LimitState(NamedTuple):
     unit: Tensor
     scale: Tensor
     trust: Tensor
-    owed: Tensor
+    integrated: Tensor
 
     @property
     def violation(self) -> Tensor:
@@ -54,8 +54,8 @@ class LimitState(NamedTuple):
 
     @property
     def demand(self) -> Tensor:
-        """The change of J_c that a step has to promise, [k]: negative is how much it may add."""
-        change = self.violation + self.owed
+        """By how much a step's surrogate has to lower J_c, [k]; negative: how much it may add."""
+        change = self.violation + self.integrated
         return torch.where(change > 0, change / self.trust, change)
 
     def to(self, device: torch.device) -> LimitState:
@@ -73,30 +73,30 @@ def descend(start: Tensor, goal: Tensor, share: float) -> Tensor:
     return goal + (start - goal).clamp_min(0) * (1 - min(max(share, 0.0), 1.0))
 
 
-class PromisedChange:
-    """Share of the promised changes of J_c that came true: a regression through the origin.
+class PredictedChange:
+    """Share of the predicted changes of J_c that were realised: a regression through the origin.
 
-    The realised change of one update is mostly noise; over updates, Σ promised · realised /
-    Σ promised² is not. Early on it is 1, held there by the weight of one promise of size `prior`.
+    The realised change of one update is mostly noise; over updates, Σ predicted · realised /
+    Σ predicted² is not. It begins as 1, with the weight of one prediction of size `prior`.
 
     Args:
         num_costs: k.
         memory: weight in [0, 1) of the past.
-        lowest: lower bound of the share; 1 takes every promise at its word.
+        lowest: lower bound of the share; 1 relies on predictions as they are.
 
     Examples:
-        >>> kept = PromisedChange(1, memory=0.9, lowest=0.1)
-        >>> for cost in (100.0, 95.0, 90.0, 85.0):  # each time, 10 were promised
-        ...     kept.update(torch.tensor([cost]), prior=torch.tensor([1.0]))
-        ...     kept.record_prediction(torch.tensor([-10.0]))
-        >>> kept.share
+        >>> realised = PredictedChange(1, memory=0.9, lowest=0.1)
+        >>> for cost in (100.0, 95.0, 90.0, 85.0):  # each time, 10 were predicted
+        ...     realised.update(torch.tensor([cost]), prior=torch.tensor([1.0]))
+        ...     realised.record_prediction(torch.tensor([-10.0]))
+        >>> realised.share
         tensor([0.5013])
     """
 
     def __init__(self, num_costs: int, *, memory: float, lowest: float) -> None:
         self.memory, self.lowest = memory, lowest
         self._state = {
-            "promised": torch.full((num_costs,), torch.nan),
+            "predicted": torch.full((num_costs,), torch.nan),
             "cost": torch.full((num_costs,), torch.nan),
             "products": torch.zeros(2, num_costs),
         }
@@ -104,25 +104,25 @@ class PromisedChange:
     @property
     def share(self) -> Tensor:
         """The share, [k], in [lowest, 1]."""
-        realised, promised = self._state["products"]
-        share = torch.where(promised > 0, realised / promised, 1.0)
+        realised, predicted = self._state["products"]
+        share = torch.where(predicted > 0, realised / predicted, 1.0)
         return share.clamp(self.lowest, 1.0)
 
     def update(self, cost: Tensor, prior: Tensor) -> None:
-        """Compare the new J_c with the last one and what was promised since; all [k]."""
+        """Compare the new J_c with the last one and what was predicted since; all [k]."""
         if not self._state["products"].any():
             self._state["products"] = prior.square().expand(2, -1).clone()
-        promised = self._state["promised"]
-        products = promised * torch.stack([cost - self._state["cost"], promised])
+        predicted = self._state["predicted"]
+        products = predicted * torch.stack([cost - self._state["cost"], predicted])
         known = products.isfinite().all(0)
         updated = self.memory * self._state["products"] + products
         self._state["products"] = torch.where(known, updated, self._state["products"])
         self._state["cost"] = cost.clone()
-        self._state["promised"] = torch.full_like(promised, torch.nan)
+        self._state["predicted"] = torch.full_like(predicted, torch.nan)
 
     def record_prediction(self, change: Tensor) -> None:
         """Note the change of J_c that an update's surrogate predicts, [k]."""
-        self._state["promised"] = change.detach().to(self._state["promised"])
+        self._state["predicted"] = change.detach().to(self._state["predicted"])
 
     def state_dict(self) -> dict[str, Tensor]:
         """Everything the share depends on."""
@@ -153,8 +153,8 @@ class LimitTracker:
             near 0.
         drift: Share by which J_c changes per update, about; see `EpisodeCosts`.
         memory: Weight of the past in the standard error of a batch and in the trust.
-        lowest_trust: Lower bound of trust_<cost>, the share of a promise that is believed; 1
-            believes all.
+        lowest_trust: Lower bound of trust_<cost>, the share of a predicted change that is counted
+            on; 1 counts on all of it.
         integral: Share of every violation that is asked for again in all updates to come (the
             learned margin of the code of Ray, Achiam and Amodei 2019); 0 for multipliers, which
             integrate themselves.
@@ -207,10 +207,10 @@ class LimitTracker:
             memory=memory,
             smallest=smallest_scale,
         )
-        self.promises = PromisedChange(num_costs, memory=memory, lowest=lowest_trust)
+        self.predictions = PredictedChange(num_costs, memory=memory, lowest=lowest_trust)
         self.integral, self.largest_integral = integral, largest_integral
         self._steps = 0
-        self._owed = torch.zeros(num_costs)
+        self._integrated = torch.zeros(num_costs)
         self._reached = torch.full((num_costs,), torch.inf)
         self._recovers = torch.zeros(num_costs, dtype=torch.bool)
         self._noise = torch.full((num_costs,), torch.nan)
@@ -243,21 +243,21 @@ class LimitTracker:
         batch = self.costs.batch
         smallest = self.smallest_scale * self.costs.length * self.costs.unit
         scale = torch.maximum(self.limits, smallest)
-        self.promises.update(batch.mean, prior=0.5 * scale)
+        self.predictions.update(batch.mean, prior=0.5 * scale)
         noise = torch.lerp(batch.error, self._noise, self.memory)
         self._noise = torch.where(noise.isfinite(), noise, batch.error)
         target = self._target(estimate, scale, costs.shape[0] * costs.shape[1])
         error = (estimate.mean - target).clamp(-scale, scale)
-        owed = (self._owed + self.integral * error).clamp_min(0)
-        self._owed = torch.minimum(owed, self.largest_integral * scale)
+        integrated = (self._integrated + self.integral * error).clamp_min(0)
+        self._integrated = torch.minimum(integrated, self.largest_integral * scale)
         return LimitState(
             cost=estimate.mean,
             target=target,
             length=self.costs.length,
             unit=self.costs.unit,
             scale=scale,
-            trust=self.promises.share,
-            owed=self._owed,
+            trust=self.predictions.share,
+            integrated=self._integrated,
         )
 
     def _target(self, estimate: CostEstimate, scale: Tensor, num_steps: int) -> Tensor:
@@ -284,20 +284,20 @@ class LimitTracker:
         """Everything the next state depends on."""
         return {
             "costs": self.costs.state_dict(),
-            "promises": self.promises.state_dict(),
+            "predictions": self.predictions.state_dict(),
             "steps": self._steps,
             "reached": self._reached.clone(),
             "noise": self._noise.clone(),
-            "owed": self._owed.clone(),
+            "integrated": self._integrated.clone(),
             "recovers": self._recovers.clone(),
         }
 
     def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
         """Continue from :meth:`state_dict`."""
         self.costs.load_state_dict(state_dict["costs"])
-        self.promises.load_state_dict(state_dict["promises"])
+        self.predictions.load_state_dict(state_dict["predictions"])
         self._steps = int(state_dict["steps"])
         self._reached = state_dict["reached"].to(self._reached)
         self._noise = state_dict["noise"].to(self._noise)
-        self._owed = state_dict["owed"].to(self._owed)
+        self._integrated = state_dict["integrated"].to(self._integrated)
         self._recovers = state_dict["recovers"].to(self._recovers)

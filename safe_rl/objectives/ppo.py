@@ -96,7 +96,7 @@ class PPOLagrangianLoss(PPOLoss):
     The objective is (L_r − Σᵢ λᵢ L_cᵢ) / (1 + Σᵢ λᵢ). What of it is clipped is a choice:
 
     - ``"none"``: only the reward surrogate L_r, the costs stay E[ρA_c], as in the article. Nothing
-      bounds what a few samples promise, and at high λ updates end at their KL limit after a few
+      bounds what a few samples predict, and at high λ updates end at their KL limit after a few
       steps;
     - ``"pessimistic"``: each cost to its own pessimistic side, E[max(ρA_c, clip(ρ)A_c)] (Zhang et
       al. 2022, clipped costs);

@@ -1,4 +1,4 @@
-"""From costs to violations: the descent, the margin, trust in promises, exact continuation."""
+"""From costs to violations: the descent, the margin, trust in predictions, exact continuation."""
 
 import pytest
 import torch
@@ -7,7 +7,7 @@ from tensordict import TensorDict
 from safe_rl.algorithms.constraints import TrackedConstraints
 from safe_rl.collectors import EpisodeStatistics
 from safe_rl.objectives import ProjectedMultiplier
-from safe_rl.objectives.limits import LimitTracker, PromisedChange
+from safe_rl.objectives.limits import LimitTracker, PredictedChange
 
 SETTINGS = {
     "max_length": 1000,
@@ -132,8 +132,8 @@ def test_plain_dual_ascent_weighs_costs_of_any_size_alike(size):
     torch.testing.assert_close(*found)
 
 
-def test_promises_per_step_are_held_against_the_costs_of_episodes():
-    """Of 20 per episode half has come true, beside a first promise of half of the limit."""
+def test_predictions_per_step_are_held_against_the_costs_of_episodes():
+    """Of 20 per episode half was realised, beside a first prediction of half of the limit."""
     constraints = TrackedConstraints({"cost": 25.0}, tracker=tracker())
     episodes = EpisodeStatistics(NO_EPISODES, {}, NO_EPISODES, {})
     for rate in (0.05, 0.04):
@@ -146,16 +146,16 @@ def test_promises_per_step_are_held_against_the_costs_of_episodes():
 
 
 @pytest.mark.parametrize(("kept", "share"), [(-0.5, 0.1), (0.2, 0.2), (0.7, 0.7), (1.5, 1.0)])
-def test_trust_finds_the_share_of_promises_that_come_true(kept, share):
+def test_trust_finds_the_share_of_predictions_that_is_realised(kept, share):
     generator = torch.Generator().manual_seed(0)
-    promises = PromisedChange(1, memory=0.98, lowest=0.1)
+    predictions = PredictedChange(1, memory=0.98, lowest=0.1)
     cost, shares = torch.tensor([400.0]), []
     for step in range(400):
-        promised = -20 * torch.rand(1, generator=generator) * (1 if step % 20 else -15)
-        promises.update(cost + 5 * torch.randn(1, generator=generator), torch.tensor([10.0]))
-        promises.record_prediction(promised)
-        shares.append(promises.share)
-        cost = cost + kept * promised
+        predicted = -20 * torch.rand(1, generator=generator) * (1 if step % 20 else -15)
+        predictions.update(cost + 5 * torch.randn(1, generator=generator), torch.tensor([10.0]))
+        predictions.record_prediction(predicted)
+        shares.append(predictions.share)
+        cost = cost + kept * predicted
     assert torch.stack(shares[100:]).mean() == pytest.approx(share, abs=0.05)
 
 
@@ -170,7 +170,7 @@ def test_a_violation_that_stays_is_asked_for_more_and_more_up_to_a_bound():
     assert states[-1].demand == -15
     # of a violation no more counts than its unit
     limits = tracker(free_steps=0, descent_steps=0, margin=0.0, drift=None, integral=0.1)
-    assert limits.update(torch.full((20, 100, 1), 0.1), NO_EPISODES).owed == 2.5
+    assert limits.update(torch.full((20, 100, 1), 0.1), NO_EPISODES).integrated == 2.5
 
 
 def test_costs_that_come_late_are_seen():
@@ -201,7 +201,7 @@ def test_a_saved_state_goes_on_as_if_it_had_never_stopped():
     *before, last = batches(6, 0.06)
     for costs in before:
         whole.update(costs, torch.tensor([90.0]))
-        whole.promises.record_prediction(torch.tensor([-3.0]))
+        whole.predictions.record_prediction(torch.tensor([-3.0]))
     second.load_state_dict(whole.state_dict())
     states = [each.update(last, NO_EPISODES) for each in (whole, second)]
     assert all(torch.equal(ours, theirs) for ours, theirs in zip(*states, strict=True))
