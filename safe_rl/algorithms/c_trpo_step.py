@@ -9,11 +9,9 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from safe_rl.algorithms.trust_region_step import Loss, Proposal, TRPOStep, total_loss
-from safe_rl.objectives.fisher import FisherProduct
+from safe_rl.algorithms.trust_region_step import Loss, Proposal, StepProblem, TRPOStep, total_loss
 from safe_rl.objectives.multipliers import CostLimits, parse_cost_limits
 from safe_rl.objectives.trust_region import flat_gradient
-from safe_rl.objectives.violation import matched_violation
 from safe_rl.ranges import Fraction, NotNegative
 
 __all__ = ["CTRPOStep", "barrier_divergence"]
@@ -109,18 +107,8 @@ class CTRPOStep(TRPOStep):
         self.recovered = -(1 - hysteresis) * self.limits
         self.recovering = torch.zeros_like(self.limits, dtype=torch.bool)
 
-    def _propose(
-        self,
-        losses: TensorDictBase,
-        fisher: FisherProduct,
-        cost_violation: Tensor | None,
-        episode_length: Tensor | None,
-    ) -> Proposal:
-        if episode_length is None:
-            raise ValueError("A C-TRPO step needs the mean episode_length.")
-        length = torch.as_tensor(episode_length).to(losses["cost_surrogate"])
-        surrogates = losses["cost_surrogate"]
-        violation = matched_violation(cost_violation, surrogates)
+    def _propose(self, problem: StepProblem) -> Proposal:
+        surrogates, violation, length = problem.surrogates, problem.violation, problem.length
         above = violation - self.recovered.to(violation)
         was_recovering = self.recovering.to(violation.device) & (above >= 0)
         costs_anything = violation > -self.limits.to(violation)
@@ -130,10 +118,10 @@ class CTRPOStep(TRPOStep):
         worst = int(above.masked_fill(~self.recovering, -torch.inf).argmax())
         recovers = self.recovering.any()
         objective = (lambda of: of["cost_surrogate"][worst]) if recovers else total_loss
-        loss = objective(losses)
+        loss = objective(problem.losses)
         g = flat_gradient(loss, self.parameters, retain_graph=True)
         b = self._gradients(surrogates[inside])
-        v, w = self._solve_all(fisher, g, b)
+        v, w = self._solve_all(problem.fisher, g, b)
         # Woodbury's identity for the inverse of H + Σ κᵢbᵢbᵢᵀ, whatever the size of κ
         root = (self.beta * length**2 / slack).sqrt()
         gram = torch.eye(len(root), dtype=root.dtype, device=root.device)

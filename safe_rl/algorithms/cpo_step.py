@@ -10,11 +10,10 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from safe_rl.algorithms.trust_region_step import Loss, Proposal, TRPOStep, total_loss
+from safe_rl.algorithms.trust_region_step import Loss, Proposal, StepProblem, TRPOStep, total_loss
 from safe_rl.objectives.cpo_dual import DualSolution, solve_dual
-from safe_rl.objectives.fisher import FisherProduct
 from safe_rl.objectives.trust_region import flat_gradient
-from safe_rl.objectives.violation import constraint_value, matched_violation
+from safe_rl.objectives.violation import constraint_value
 from safe_rl.ranges import Positive
 
 __all__ = ["CPOStep", "PCPOStep", "nearest_feasible"]
@@ -78,25 +77,16 @@ class CPOStep(TRPOStep):
             raise ValueError(f"largest_demand must be positive or None: {largest_demand}.")
         self.rescale_violation, self.largest_demand = rescale_violation, largest_demand
 
-    def _propose(
-        self,
-        losses: TensorDictBase,
-        fisher: FisherProduct,
-        cost_violation: Tensor | None,
-        episode_length: Tensor | None,
-    ) -> Proposal:
-        surrogates = losses["cost_surrogate"]
-        c = self._constraint(surrogates, cost_violation, episode_length)
-        g = flat_gradient(total_loss(losses), self.parameters, retain_graph=True)
-        b = self._gradients(surrogates)
+    def _propose(self, problem: StepProblem) -> Proposal:
+        g, b, c = self._linearised(problem)
         # Left out by a zero gradient: the dual takes such constraints for case 4.
         b = b * ~((b.square().sum(-1, keepdim=True) <= _NO_GRADIENT) & (c[:, None] < 0))
-        v, w = self._solve_all(fisher, g, b)
+        v, w = self._solve_all(problem.fisher, g, b)
         q, r, s = g @ v, w @ g, b @ w.T
         c = self._bounded(c, s.diagonal())
         dual = solve_dual(q, r, s, c, self.target_kl)
         step = -(dual.reward_coefficient * v + dual.cost_coefficient @ w)
-        accepts = self._acceptance(losses, c, may_be_worse=dual.case < 2)
+        accepts = self._acceptance(problem.losses, c, may_be_worse=dual.case < 2)
         return Proposal(step, accepts, self._diagnostics(q, r, s.diagonal(), c, dual))
 
     def _bounded(self, c: Tensor, s: Tensor) -> Tensor:
@@ -121,14 +111,12 @@ class CPOStep(TRPOStep):
 
         return is_acceptable
 
-    def _constraint(
-        self, surrogates: Tensor, cost_violation: Tensor | None, episode_length: Tensor | None
-    ) -> Tensor:
-        violation = matched_violation(cost_violation, surrogates)
-        if episode_length is None:
-            raise ValueError("A step with linearised constraints needs the mean episode_length.")
-        length = torch.as_tensor(episode_length).to(surrogates)
-        return constraint_value(violation, length, self.rescale_violation)
+    def _linearised(self, problem: StepProblem) -> tuple[Tensor, Tensor, Tensor]:
+        """Gradients of the loss, [P], and of the surrogates, [k, P], and the violations c, [k]."""
+        c = constraint_value(problem.violation, problem.length, self.rescale_violation)
+        loss = total_loss(problem.losses)
+        g = flat_gradient(loss, self.parameters, retain_graph=True)
+        return g, self._gradients(problem.surrogates), c
 
     def _diagnostics(
         self, q: Tensor, r: Tensor, s: Tensor, c: Tensor, dual: DualSolution
@@ -230,24 +218,15 @@ class PCPOStep(CPOStep):
             raise ValueError(f"projection must be one of {get_args(Projection)}: {projection!r}.")
         self.projection = projection
 
-    def _propose(
-        self,
-        losses: TensorDictBase,
-        fisher: FisherProduct,
-        cost_violation: Tensor | None,
-        episode_length: Tensor | None,
-    ) -> Proposal:
-        surrogates = losses["cost_surrogate"]
-        c = self._constraint(surrogates, cost_violation, episode_length)
-        g = flat_gradient(total_loss(losses), self.parameters, retain_graph=True)
-        b = self._gradients(surrogates)
-        v, w = self._solve_all(fisher, g, b)
+    def _propose(self, problem: StepProblem) -> Proposal:
+        g, b, c = self._linearised(problem)
+        v, w = self._solve_all(problem.fisher, g, b)
         q, c = g @ v, self._bounded(c, (b * w).sum(-1))
         for_reward = torch.where(q > 0, (2 * self.target_kl / q).sqrt(), 0.0) * -v
         back = w if self.projection == "kl" else b
         nu = nearest_feasible(c + b @ for_reward, b @ back.T)
         step = for_reward - nu @ back
-        length = step @ fisher(step)
+        length = step @ problem.fisher(step)
         shortened = (2 * self.target_kl / length.clamp_min(1e-30)).sqrt().clamp_max(1.0)
-        accepts = self._acceptance(losses, c, may_be_worse=nu.any())
+        accepts = self._acceptance(problem.losses, c, may_be_worse=nu.any())
         return Proposal(shortened * step, accepts, {"c": c, "nu": nu, "shortened": shortened})

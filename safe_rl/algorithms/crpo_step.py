@@ -5,12 +5,8 @@ from __future__ import annotations
 from typing import Any
 
 import torch
-from tensordict import TensorDictBase
-from torch import Tensor
 
-from safe_rl.algorithms.trust_region_step import Loss, Proposal, TRPOStep
-from safe_rl.objectives.fisher import FisherProduct
-from safe_rl.objectives.violation import matched_violation
+from safe_rl.algorithms.trust_region_step import Loss, Proposal, StepProblem, TRPOStep
 from safe_rl.ranges import NotNegative
 
 __all__ = ["CRPOStep"]
@@ -47,30 +43,17 @@ class CRPOStep(TRPOStep):
         tensor([0., 1.])
     """
 
-    def __init__(
-        self,
-        loss: Loss,
-        *,
-        tolerance: NotNegative,
-        **settings: Any,
-    ) -> None:
+    def __init__(self, loss: Loss, *, tolerance: NotNegative, **settings: Any) -> None:
         super().__init__(loss, **settings)
         self.tolerance = tolerance
 
-    def _propose(
-        self,
-        losses: TensorDictBase,
-        fisher: FisherProduct,
-        cost_violation: Tensor | None,
-        episode_length: Tensor | None,
-    ) -> Proposal:
-        surrogates = losses["cost_surrogate"]
-        excess = matched_violation(cost_violation, surrogates) - self.tolerance
+    def _propose(self, problem: StepProblem) -> Proposal:
+        excess = problem.violation - self.tolerance
         worst = int(excess.argmax())
-        reduces = torch.zeros_like(surrogates).detach()
+        reduces = torch.zeros_like(excess)
         if excess[worst] > 0:
             reduces[worst] = 1.0
-            proposal = self._natural_step(losses, fisher, lambda of: of["cost_surrogate"][worst])
+            proposal = self._natural_step(problem, lambda of: of["cost_surrogate"][worst])
         else:
-            proposal = super()._propose(losses, fisher, cost_violation, episode_length)
+            proposal = super()._propose(problem)
         return proposal._replace(diagnostics={**proposal.diagnostics, "reduces": reduces})

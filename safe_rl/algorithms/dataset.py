@@ -9,10 +9,44 @@ from tensordict import NestedKey, TensorDictBase
 from torchrl.data import TensorSpec
 from torchrl.envs import EnvBase
 
+from safe_rl.algorithms.constraints import check_cost_limits
+from safe_rl.algorithms.off_policy_networks import bounded_actions, setting
 from safe_rl.algorithms.replay_buffer import Memory
 from safe_rl.collectors import read_dataset, safe_episodes
 
-__all__ = ["fill_memory"]
+__all__ = ["begin_memory", "fill_memory"]
+
+
+def _nothing_learned(config: DictConfig) -> str:
+    """That a run ends before it learns, whose figures look like those of one that has learned."""
+    random_steps = setting(config, "exploration.random_steps")
+    if config.frames >= random_steps:
+        return ""
+    return (
+        f"Nothing will be learned: exploration.random_steps={random_steps} come first, and the run "
+        f"has {config.frames:,}."
+    )
+
+
+def begin_memory(config: DictConfig, memory: Memory, env: EnvBase) -> tuple[str, bool]:
+    """Fill an empty memory with the dataset of a configuration, if it has one.
+
+    Returns:
+        What is learned from, in a sentence, and whether what is collected comes in addition.
+
+    Raises:
+        ValueError: As by `fill_memory`, or if nothing else is learned from and there is none.
+    """
+    node = config.get("dataset")
+    if node is None or node.path is None:
+        if node is not None and node.alone:
+            raise ValueError(
+                f"dataset.path is missing: algo={config.algo.name} with dataset.alone=true learns "
+                "from nothing else. Give the folder of a recording (record=true), or an HDF5 file."
+            )
+        return _nothing_learned(config), True
+    limits = check_cost_limits(config.cost_limits, env.cost_keys)
+    return fill_memory(memory, node, limits, env, bounded_actions(env)), not node.alone
 
 
 def fill_memory(

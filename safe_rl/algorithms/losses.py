@@ -6,14 +6,18 @@ TorchRL means all entries that are named ``loss_…`` to be minimised; others ar
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import fields
 from itertools import chain
 from typing import Any
 
 import torch
-from tensordict import TensorDictBase
+from tensordict import NestedKey, TensorDictBase
 from torch import Tensor, nn
+from torchrl.objectives import LossModule
 
-__all__ = ["ESTIMATOR", "LossState", "divergence", "sum_of_losses"]
+__all__ = [
+    *("ESTIMATOR", "LossState", "divergence", "estimates_read", "reported_kl", "sum_of_losses")
+]
 
 ESTIMATOR = "_value_estimator."
 """Where losses keep numbers of their value estimators, which a run that is resumed may change."""
@@ -62,6 +66,37 @@ def divergence(losses: TensorDictBase) -> FloatingPointError:
         "The step that would follow is not taken. Lower the learning rate, or look for a policy "
         "that has collapsed."
     )
+
+
+_ESTIMATES = ("advantage", "value_target", "value")
+"""Names of keys that losses of TorchRL's read where they are, and have not among their `in_keys`.
+
+Without them they would estimate advantages themselves, of samples that are in no order.
+"""
+
+
+def estimates_read(loss: nn.Module) -> list[NestedKey]:
+    """Where advantages and value targets are, for a loss that reads an advantage."""
+    if not isinstance(loss, LossModule):
+        return []
+    keys = {key.name: getattr(loss.tensor_keys, key.name) for key in fields(loss.tensor_keys)}
+    return [keys[name] for name in _ESTIMATES if name in keys] if "advantage" in keys else []
+
+
+def reported_kl(losses: TensorDictBase) -> Tensor:
+    """The KL divergence by which updates are ended, as the loss reports it.
+
+    Raises:
+        ValueError: If it reports none, or more than one number.
+    """
+    kl = losses.get("kl", None)
+    if kl is None or kl.numel() != 1:
+        raise ValueError(
+            "max_kl ends an update by the scalar 'kl' that its loss reports, and this one reports "
+            f"{'none' if kl is None else f'one of shape {list(kl.shape)}'}: use max_kl=null and "
+            "adapt_rate=null."
+        )
+    return kl
 
 
 class LossState:

@@ -9,19 +9,19 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from functools import partial
 from typing import Annotated, Any
 
 import torch
-from tensordict import NestedKey, TensorDict, TensorDictBase
+from tensordict import TensorDict, TensorDictBase
 from torch import Tensor, nn
 from torch.optim import Optimizer
 from torchrl.objectives import LossModule
 from torchrl.objectives.common import AUTO_LOSS_MASK_KEYS
 
 from safe_rl.algorithms.algorithm_contract import PolicyUpdate
-from safe_rl.algorithms.losses import divergence, sum_of_losses
+from safe_rl.algorithms.losses import divergence, estimates_read, reported_kl, sum_of_losses
 from safe_rl.objectives.samples import learning_samples, require_finite
 from safe_rl.objectives.surrogate import SurrogateLoss
 from safe_rl.ranges import PART, Count, Positive, Range, Share
@@ -84,13 +84,6 @@ class KLAdaptiveRate:
         elif share_of_steps >= 1 and share_of_kl < self.low_kl:
             rate = rate * self.factor
         return min(max(rate, self.lowest), self.highest)
-
-
-_ESTIMATES = ("advantage", "value_target", "value")
-"""Names of keys that losses of TorchRL's read where they are, and have not among their `in_keys`.
-
-Without them they would estimate advantages themselves, of samples that are in no order.
-"""
 
 
 class MinibatchUpdate(PolicyUpdate):
@@ -199,12 +192,12 @@ class MinibatchUpdate(PolicyUpdate):
         require_finite(batch, self.loss.in_keys)
         mask_keys = [key for key in AUTO_LOSS_MASK_KEYS if batch.get(key, None) is not None]
         selected = batch.select(*self.loss.in_keys, *mask_keys)
-        selected.update(batch.select(*_estimates(self.loss), strict=False))
+        selected.update(batch.select(*estimates_read(self.loss), strict=False))
         samples = learning_samples(selected, self.loss.in_keys)
         for minibatch in self._minibatches(samples):
             total, losses = self._evaluate(minibatch)
             history.append(losses.detach())
-            if self.max_kl is not None and _divergence(losses) > self.max_kl:
+            if self.max_kl is not None and reported_kl(losses) > self.max_kl:
                 break
             if not total.isfinite():
                 raise divergence(losses)
@@ -284,23 +277,3 @@ class MinibatchUpdate(PolicyUpdate):
         """Continue from :meth:`state_dict`."""
         self.optimizer.load_state_dict(state_dict["optimizer"])
         self._generator.set_state(state_dict["shuffles"].cpu())
-
-
-def _estimates(loss: nn.Module) -> list[NestedKey]:
-    """Where advantages and value targets are, for a loss that reads an advantage."""
-    if not isinstance(loss, LossModule):
-        return []
-    keys = {key.name: getattr(loss.tensor_keys, key.name) for key in fields(loss.tensor_keys)}
-    return [keys[name] for name in _ESTIMATES if name in keys] if "advantage" in keys else []
-
-
-def _divergence(losses: TensorDictBase) -> Tensor:
-    """The KL divergence by which updates are ended, as the loss reports it."""
-    kl = losses.get("kl", None)
-    if kl is None or kl.numel() != 1:
-        raise ValueError(
-            "max_kl ends an update by the scalar 'kl' that its loss reports, and this one reports "
-            f"{'none' if kl is None else f'one of shape {list(kl.shape)}'}: use max_kl=null and "
-            "adapt_rate=null."
-        )
-    return kl

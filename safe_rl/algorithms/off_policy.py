@@ -21,8 +21,8 @@ from safe_rl.algorithms.build_part import (
     build_update,
     constrained_limits,
 )
-from safe_rl.algorithms.constraints import Constraints, check_cost_limits
-from safe_rl.algorithms.dataset import fill_memory
+from safe_rl.algorithms.constraints import Constraints
+from safe_rl.algorithms.dataset import begin_memory
 from safe_rl.algorithms.off_policy_networks import (
     bounded_actions,
     build_networks,
@@ -127,7 +127,7 @@ class OffPolicy(Algorithm, Recipe):
             reward_gamma=config.loss.get("gamma", 1.0),
             device=device,
         )
-        learns_from, collects = _fill(config, memory, env)
+        learns_from, collects = begin_memory(config, memory, env)
         # what is not learned from explores nothing
         random_steps = setting(config, "exploration.random_steps") if collects else 0
         _check_room(memory, random_steps, collects)
@@ -228,31 +228,6 @@ class OffPolicy(Algorithm, Recipe):
             **self.memory.components(),
         }
         return {name: part for name, part in parts.items() if part is not None}
-
-
-def _fill(config: DictConfig, memory: Memory, env: EnvBase) -> tuple[str, bool]:
-    """Begin a memory with a dataset, if there is one; what is learned from, and if more comes."""
-    node = config.get("dataset")
-    if node is None or node.path is None:
-        if node is not None and node.alone:
-            raise ValueError(
-                f"dataset.path is missing: algo={config.algo.name} with dataset.alone=true learns "
-                "from nothing else. Give the folder of a recording (record=true), or an HDF5 file."
-            )
-        return _nothing_learned(config), True
-    limits = check_cost_limits(config.cost_limits, env.cost_keys)
-    return fill_memory(memory, node, limits, env, bounded_actions(env)), not node.alone
-
-
-def _nothing_learned(config: DictConfig) -> str:
-    """That a run ends before it learns, whose figures look like those of one that has learned."""
-    random_steps = setting(config, "exploration.random_steps")
-    if config.frames >= random_steps:
-        return ""
-    return (
-        f"Nothing will be learned: exploration.random_steps={random_steps} come first, and the run "
-        f"has {config.frames:,}."
-    )
 
 
 def _check_critics(config: DictConfig) -> None:

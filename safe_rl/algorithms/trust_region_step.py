@@ -28,12 +28,46 @@ from safe_rl.objectives.trust_region import (
     solve_with_image,
     subsample,
 )
+from safe_rl.objectives.violation import matched_violation
 from safe_rl.ranges import Fraction, NotNegative, Positive, Range
 
-__all__ = ["Loss", "Proposal", "TRPOStep", "total_loss"]
+__all__ = ["Loss", "Proposal", "StepProblem", "TRPOStep", "total_loss"]
 
 Loss = Callable[[TensorDictBase], TensorDictBase]
 """A loss module, or a function of your own from a batch to scalars ``loss_…``."""
+
+
+class StepProblem(NamedTuple):
+    """What a step is proposed from.
+
+    Attributes:
+        losses: entries of the loss before the step, with gradients.
+        fisher: Fisher matrix of the policy.
+        cost_violation: J_c − d, [k], if the caller knows it.
+        episode_length: T̄, scalar, if the caller knows it.
+    """
+
+    losses: TensorDictBase
+    fisher: FisherProduct
+    cost_violation: Tensor | None
+    episode_length: Tensor | None
+
+    @property
+    def surrogates(self) -> Tensor:
+        """The differentiable cost surrogates, [k]."""
+        return self.losses["cost_surrogate"]
+
+    @property
+    def violation(self) -> Tensor:
+        """J_c − d, one per surrogate, [k]."""
+        return matched_violation(self.cost_violation, self.surrogates)
+
+    @property
+    def length(self) -> Tensor:
+        """T̄, which a step with limits on the costs of episodes needs."""
+        if self.episode_length is None:
+            raise ValueError("A step with limits on episodes needs the mean episode_length.")
+        return torch.as_tensor(self.episode_length).to(self.surrogates)
 
 
 class Proposal(NamedTuple):
@@ -159,8 +193,9 @@ class TRPOStep(PolicyUpdate):
         losses = self.loss(batch)
         sample = subsample(batch, self.fisher_subsample)
         fisher = FisherProduct(self.actor_network, sample, self.parameters, self.damping)
-        proposal = self._propose(losses, fisher, cost_violation, episode_length)
-        del fisher
+        problem = StepProblem(losses, fisher, cost_violation, episode_length)
+        proposal = self._propose(problem)
+        del fisher, problem
         if not proposal.step.isfinite().all():
             raise FloatingPointError(
                 "The step of the policy is not finite, although the batch is; no parameter has "
@@ -170,25 +205,16 @@ class TRPOStep(PolicyUpdate):
         metrics = self._search(batch, reference, proposal)
         return metrics | proposal.diagnostics
 
-    def _propose(
-        self,
-        losses: TensorDictBase,
-        fisher: FisherProduct,
-        cost_violation: Tensor | None,
-        episode_length: Tensor | None,
-    ) -> Proposal:
-        return self._natural_step(losses, fisher, total_loss)
+    def _propose(self, problem: StepProblem) -> Proposal:
+        return self._natural_step(problem, total_loss)
 
     def _natural_step(
-        self,
-        losses: TensorDictBase,
-        fisher: FisherProduct,
-        objective: Callable[[TensorDictBase], Tensor],
+        self, problem: StepProblem, objective: Callable[[TensorDictBase], Tensor]
     ) -> Proposal:
         """The longest step along the natural gradient of an objective of the losses."""
-        loss = objective(losses)
+        loss = objective(problem.losses)
         gradient = flat_gradient(loss, self.parameters)
-        direction = conjugate_gradient(fisher, gradient, self.cg_iterations)
+        direction = conjugate_gradient(problem.fisher, gradient, self.cg_iterations)
         # Conjugate gradients leave a residual orthogonal to the solution x, so that xᵀHx = xᵀg.
         squared = (gradient @ direction).clamp_min(0)
         length = torch.where(squared > 0, (2 * self.target_kl / squared).sqrt(), 0.0)
