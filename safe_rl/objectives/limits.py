@@ -201,11 +201,7 @@ class LimitTracker:
         self._is_shortened = shrinkage < 1
         self.smallest_scale, self.memory, self.recovery = smallest_scale, memory, recovery
         self.costs = EpisodeCosts(
-            num_costs,
-            max_length=max_length,
-            drift=drift,
-            memory=memory,
-            smallest=smallest_scale,
+            num_costs, max_length=max_length, drift=drift, memory=memory, smallest=smallest_scale
         )
         self.predictions = PredictedChange(num_costs, memory=memory, lowest=lowest_trust)
         self.integral, self.largest_integral = integral, largest_integral

@@ -253,7 +253,7 @@ class ProjectedMultiplier(Multiplier):
         if not torch.equal(initial.clamp(0, highest), initial):
             raise ValueError(f"init must be between 0 and highest={highest}, got {init}.")
         self.register_buffer("penalty", initial)
-        # told anew before every update, and unknown to checkpoints of earlier versions
+        # set before every update: checkpoints need not hold it
         self.register_buffer("unit", torch.ones_like(initial), persistent=False)
 
     def set_unit(self, unit: Tensor) -> None:
