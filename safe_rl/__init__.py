@@ -1,7 +1,7 @@
 """Constrained reinforcement learning on TorchRL.
 
-`safe_rl.train`, `safe_rl.resume` and `safe_rl.load` are the way in from Python. `safe_rl.envs`
-holds the environments, `safe_rl.objectives` the constrained losses and solvers,
+`safe_rl.train`, `resume`, `load`, `evaluate`, `report` and `make_env` are the way in from Python.
+`safe_rl.envs` holds the environments, `safe_rl.objectives` the constrained losses and solvers,
 `safe_rl.algorithms` what learns with them, `safe_rl.collectors` data collection with cost
 accounting.
 """
@@ -12,10 +12,13 @@ import safe_rl.openmp  # noqa: F401, whatever is imported first, this comes befo
 from safe_rl.lazy import import_later
 
 if TYPE_CHECKING:
-    from safe_rl.cli.python_api import Run, load, resume, train
+    from safe_rl.cli.python_api import Run, evaluate, load, report, resume, train
+    from safe_rl.envs import make_env
 
-__all__ = ["Run", "load", "resume", "train"]
+__all__ = ["Run", "evaluate", "load", "make_env", "report", "resume", "train"]
 __version__ = "0.1.0"
 
 
-__getattr__, __dir__ = import_later(__name__, dict.fromkeys(__all__, "safe_rl.cli.python_api"))
+__getattr__, __dir__ = import_later(
+    __name__, dict.fromkeys(__all__, "safe_rl.cli.python_api") | {"make_env": "safe_rl.envs"}
+)

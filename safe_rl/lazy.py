@@ -40,6 +40,8 @@ def import_later(
         return getattr(import_module(homes[name]), name)
 
     def names() -> list[str]:
-        return sorted({*vars(sys.modules[package]), *homes})
+        own = vars(sys.modules[package])
+        special = {name for name in own if name.startswith("__")}
+        return sorted({*special, *own.get("__all__", ()), *homes})
 
     return find, names

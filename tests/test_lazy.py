@@ -14,7 +14,7 @@ LAZY = ["safe_rl", "safe_rl.envs", "safe_rl.envs.gymnasium", "safe_rl.envs.veloc
 def test_what_is_imported_later_is_listed_at_once(package):
     module = import_module(package)
     assert set(module.__all__) <= set(dir(module))
-    assert set(vars(module)) <= set(dir(module))
+    assert {name for name in dir(module) if not name.startswith("__")} == set(module.__all__)
 
 
 def test_tab_completion_offers_it_without_having_imported_it():

@@ -20,7 +20,7 @@ from safe_rl.cli.user_code import check_imports, import_modules
 from safe_rl.envs import LayoutError, OpenGLError
 from safe_rl.evaluation import Evaluation, EvaluationOptions, evaluate
 from safe_rl.evaluation.loading import load_config
-from safe_rl.evaluation.summary import format_estimates, format_unjudged
+from safe_rl.evaluation.summary import format_unjudged
 from safe_rl.evaluation.variations import Variation, expand
 from safe_rl.evaluation.varying import Varied, evaluate_variations
 from safe_rl.naming import did_you_mean
@@ -79,7 +79,7 @@ def carry_out(
     except _ERRORS as error:
         print(f"error: {error}", file=sys.stderr)
         return 1
-    print(_report(result))
+    print(result)
     return 0
 
 
@@ -93,20 +93,6 @@ def _refuse_beside_certify(options: EvaluationOptions) -> None:
                 f"{field.name}: certify=true does not heed it. A certificate is of the run's own "
                 "environment, and takes certificate.episodes=… and the like, and num_threads=…"
             )
-
-
-def _report(result: Evaluation) -> str:
-    facts = result.facts
-    steps = "" if facts["steps"] is None else f" at {facts['steps']:,} steps"
-    manner = "its mean actions" if facts["deterministic"] else "sampled actions"
-    lines = [
-        f"{facts['algorithm']} on {facts['environment']}{steps}: {facts['episodes']} episodes with "
-        f"{manner}, {facts['layouts_trained_on']:.0%} of the layouts known from training",
-        *format_estimates(result.estimates, facts["cost_limits"]),
-        *format_unjudged(facts["limits_without_cost"]),
-        *(f"wrote {path}" for path in result.files),
-    ]
-    return "\n".join(lines)
 
 
 def evaluate_varied(

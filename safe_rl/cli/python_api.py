@@ -1,4 +1,4 @@
-"""The way in from Python: ``safe_rl.train``, ``resume`` and ``load``, for notebooks and scripts.
+"""The way in from Python: ``safe_rl.train``, ``resume``, ``evaluate`` and ``report``.
 
 They do what the commands do, from the same configurations; Hydra stays inside.
 """
@@ -6,42 +6,24 @@ They do what the commands do, from the same configurations; Hydra stays inside.
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from functools import cached_property
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from signal import Signals
 from typing import Any
 
-import torch
-from omegaconf import DictConfig, open_dict
-from tensordict.nn import TensorDictModuleBase
-from torchrl.envs import EnvBase
+from omegaconf import open_dict
 
-from safe_rl.cli.certificates import certify_run
 from safe_rl.cli.composing import GIVEN_WHOLE, compose_jobs, resolving
-from safe_rl.cli.evaluating import evaluate_run, evaluate_varied
 from safe_rl.cli.grammar import CommandLineError, overrides_of, take_options
 from safe_rl.cli.resuming import compose_resumed
-from safe_rl.cli.robots import maker_of
 from safe_rl.cli.session import Session, missing_folders, new_folder
-from safe_rl.cli.user_code import check_imports, import_modules, note_imports, several
-from safe_rl.evaluation import Certificate, Evaluation, EvaluationOptions
-from safe_rl.evaluation.episodes import default_seed
-from safe_rl.evaluation.loading import (
-    find_checkpoint,
-    for_evaluation,
-    load_config,
-    load_policy,
-    override_env,
-)
-from safe_rl.evaluation.varying import Varied
-from safe_rl.runs.folder import RunFolder
-from safe_rl.runs.outcome import final_figures
-from safe_rl.runs.table import read_table
+from safe_rl.cli.trained_run import Run, load
+from safe_rl.cli.user_code import import_modules, note_imports
+from safe_rl.evaluation import Evaluation
 
-__all__ = ["Run", "load", "resume", "train"]
+__all__ = ["Run", "evaluate", "load", "report", "resume", "train"]
 
+Callback = Callable[[Mapping[str, float]], Any]
 # mappings that are given all at once
 _WHOLE = (
     *GIVEN_WHOLE,
@@ -54,119 +36,13 @@ _OF_YOUR_OWN = {
 }
 
 
-@dataclass(frozen=True)
-class Run:
-    """A run in its folder: table, environment and trained policy.
-
-    Attributes:
-        directory: Its folder.
-        checkpoint: Which checkpoint ``policy`` has: "last", "best", "certified", or a path.
-
-    Examples:
-        >>> run = getfixture("tiny_run")  # what `safe_rl.train` returns
-        >>> sorted(run.final)[:4]
-        ['cost_rate', 'episode_cost', 'episode_return', 'steps_per_second']
-        >>> run.env.rollout(5, run.policy).shape
-        torch.Size([1, 5])
-    """
-
-    directory: Path
-    checkpoint: str = "last"
-
-    @cached_property
-    def config(self) -> DictConfig:
-        """Its whole configuration."""
-        return load_config(self.directory)
-
-    @cached_property
-    def table(self) -> dict[str, list[float]]:
-        """Its table by epoch: the columns of ``progress.csv``, as `pandas.DataFrame` takes them.
-
-        Costs of an epoch in which no episode ended are NaN.
-        """
-        return read_table(RunFolder(self.directory).table)
-
-    @property
-    def final(self) -> dict[str, float]:
-        """Final J_r (``episode_return``), J_c (``episode_<cost>``) and ρ_c (``<cost>_rate``).
-
-        As :func:`safe_rl.runs.outcome.final_figures` takes them from the table.
-        """
-        return final_figures(self.table, list(self.config.cost_limits) or ["cost"])
-
-    @cached_property
-    def env(self) -> EnvBase:
-        """One instance of its environment, with layouts that training has not met."""
-        return self.make_env()
-
-    @cached_property
-    def policy(self) -> TensorDictModuleBase:
-        """Its trained policy; :func:`torchrl.envs.set_exploration_type` chooses mean or sample."""
-        path = find_checkpoint(self.directory, self.checkpoint)
-        return load_policy(self.config, self.env, path, torch.device("cpu"))
-
-    def make_env(self, num_envs: int = 1, seed: int | None = None, **keys: Any) -> EnvBase:
-        """Make its environment.
-
-        Args:
-            num_envs: Number of worlds, N.
-            seed: Of layouts and noise; None: as for evaluation, one that training never used.
-            keys: Keys of the environment to change, such as ``hazards_num=12``.
-
-        Raises:
-            ConfigError: If the environment does not accept a key.
-        """
-        node = override_env(self.config, keys)
-        if seed is None:
-            seed = default_seed(node, self.config.seed)
-        make = for_evaluation(maker_of(self.directory), self.config)
-        return make(node, num_envs=num_envs, seed=seed)
-
-    def evaluate(self, **options: Any) -> Evaluation:
-        """Run the policy for whole episodes; writes into the folder what the command writes.
-
-        Args:
-            options: Those of :class:`safe_rl.evaluation.EvaluationOptions`, such as
-                ``episodes=100``; keys of the environment as ``env={"hazards_num": 12}``.
-
-        Raises:
-            ValueError: If there is no such option, or it cannot have the value.
-        """
-        given = {"checkpoint": self.checkpoint, **options}
-        return evaluate_run(self.directory, take_options(given, EvaluationOptions))
-
-    def certify(self, **changes: Any) -> Certificate | None:
-        """Find and certify its best checkpoint that keeps the limits, as at the end of training.
-
-        Args:
-            changes: Keys of the section ``certificate`` to replace, such as ``episodes=2000``.
-
-        Returns:
-            The certificate; None if the run has no limits or no checkpoints.
-
-        Raises:
-            ValueError: If there is no such key, or it cannot have the value.
-        """
-        return certify_run(self.directory, changes=changes)
-
-    def vary(self, variations: Any, **options: Any) -> Varied:
-        """Run the policy under variations of its environment; writes what the command writes.
-
-        Args:
-            variations: As the command's ``variations=``: ``"dynamics"``, or rows of one's own,
-                ``{"mass": {"env.mass_scale": [0.5, 2.0]}}``.
-            options: Those of :class:`safe_rl.evaluation.EvaluationOptions`.
-        """
-        given = {"checkpoint": self.checkpoint, "variations": variations, **options}
-        return evaluate_varied(self.directory, take_options(given, EvaluationOptions))[0]
-
-
 def train(
     env: str = "PointGoal1",
     *,
     algo: str = "ppo_lagrangian",
     directory: str | Path | None = None,
     imports: str | Sequence[str] = (),
+    callbacks: Sequence[Callback] = (),
     config_dir: str | Path | Sequence[str | Path] | None = None,
     **settings: Any,
 ) -> Run:
@@ -179,6 +55,8 @@ def train(
         algo: Name of an algorithm.
         directory: Folder of the run; None: ``runs/<env>/<algo>/<date>_seed<seed>``.
         imports: Module of yours to import before, or several, as the command's ``import=``.
+        callbacks: Called after every epoch with its row of the table; where one returns False, the
+            run ends there, as one that has come to its end.
         config_dir: Folder with YAMLs of yours, or several, as the command's ``--config-dir``.
         settings: Any key of ``conf/``: ``frames=100_000``, ``preset="paper"``,
             ``cost_limits={"cost_hazards": 10}``. Keys below another one are dictionaries,
@@ -210,7 +88,13 @@ def train(
     with open_dict(config):
         own = config.pop("hydra")
     return _carry_out(
-        Session(config, folder, own, missing=missing, otherwise=_otherwise(folder), quiet=True)
+        Session(
+            *(config, folder, own),
+            missing=missing,
+            otherwise=_otherwise(folder),
+            quiet=True,
+            callbacks=callbacks,
+        )
     )
 
 
@@ -298,29 +182,31 @@ def _new_run(
     return [f"env={env}", f"algo={algo}", *overrides_of(settings, _WHOLE)]
 
 
-def load(
-    directory: str | Path, checkpoint: str = "last", imports: str | Sequence[str] | None = None
-) -> Run:
-    """Open a run: its table, environment and policy.
+def evaluate(run: Run | str | Path, **options: Any) -> Evaluation:
+    """Run a trained policy for whole episodes, as ``python -m safe_rl.evaluate`` does.
 
     Args:
-        directory: Folder of the run.
-        checkpoint: "last", "best" (highest return that kept every limit), "certified" (to
-            keep them), or a path.
-        imports: Modules that its environment or policy needs; none is imported unless named here.
-            ``[]`` goes without those that the run has used.
-
-    Raises:
-        FileNotFoundError: If the folder is not that of a run, or has no such checkpoint.
-        ValueError: If the run has used modules that ``imports`` lacks.
+        run: The run, or its folder.
+        options: As of :meth:`Run.evaluate`.
 
     Examples:
-        >>> run = load(getfixture("tiny_run").directory)
-        >>> run.policy(run.env.reset())["action"].shape
-        torch.Size([1, 2])
+        >>> print(evaluate(getfixture("tiny_run"), episodes=2))  # doctest: +ELLIPSIS
+        ppo_lagrangian on PointGoal1 at 80 steps: 2 episodes with sampled actions, ...
     """
-    run = Run(Path(directory).expanduser(), checkpoint)
-    check_imports(run.config, imports if imports is None else several(imports), run.directory)
-    import_modules(imports or ())
-    find_checkpoint(run.directory, checkpoint)
-    return run
+    return (run if isinstance(run, Run) else load(run)).evaluate(**options)
+
+
+def report(directory: str | Path, **options: Any) -> Path:
+    """Report the runs below a folder on one page, as ``python -m safe_rl.report`` does.
+
+    Args:
+        directory: The folder.
+        options: Those of the command, such as ``title="Mine"``.
+
+    Returns:
+        The page.
+    """
+    from safe_rl.cli.report import ReportOptions
+    from safe_rl.cli.report import report as report_runs  # with pandas and Jinja
+
+    return report_runs(Path(directory).expanduser(), take_options(options, ReportOptions))[1]

@@ -8,7 +8,7 @@ import os
 import shutil
 import sys
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from itertools import count
 from pathlib import Path
@@ -71,6 +71,7 @@ class Session:
         program: What trains, as the user has called it.
         otherwise: What continues the run beside the command.
         quiet: Whether to leave out what came of it.
+        callbacks: Called after every epoch with its row; one that returns False ends the run.
 
     Attributes:
         interrupted_by: The signal that has ended it, if one has.
@@ -87,11 +88,13 @@ class Session:
         program: str = "python train.py",
         otherwise: str = "",
         quiet: bool = False,
+        callbacks: Sequence[Callable[[Mapping[str, float]], Any]] = (),
     ) -> None:
         self.config, self.folder, self.hydra = config, RunFolder(folder), hydra
         self.interrupted_by: Signals | None = None
         self._continues, self._missing, self._quiet = continues, missing, quiet
         self._program, self._again = program, f"{program} {self.folder.resuming}{otherwise}"
+        self._callbacks = callbacks
         self._has_begun = False
 
     def run(self) -> None:
@@ -171,10 +174,11 @@ class Session:
             print(f"Training for {whole:,} frames: whole batches of {config.frames_per_batch:,}.")
         seed_everything(config.seed, config.num_threads)
         trainer = self._build()
+        trainer.callbacks = self._callbacks
         if trainer.algorithm.learns_from:
             print(trainer.algorithm.learns_from)
         if trainer.algorithm.schedule:
-            print(trainer.algorithm.schedule)
+            self._say(trainer.algorithm.schedule)
         if self._continues and trainer.resume():
             self._say_continued(trainer)
             return trainer

@@ -25,7 +25,14 @@ from safe_rl.evaluation.loading import (
     without_cost,
 )
 from safe_rl.evaluation.settings import EvaluationOptions, check_options
-from safe_rl.evaluation.summary import check_places, summarise, write_episodes, write_summary
+from safe_rl.evaluation.summary import (
+    check_places,
+    format_estimates,
+    format_unjudged,
+    summarise,
+    write_episodes,
+    write_summary,
+)
 from safe_rl.evaluation.video import check_camera, manner_of, record_episode, write_video
 from safe_rl.runs.folder import RunFolder, checkpoint_steps
 from safe_rl.scores.benchmark import Suite
@@ -50,6 +57,20 @@ class Evaluation:
     facts: dict[str, Any]
     estimates: dict[str, Estimate]
     files: tuple[Path, ...]
+
+    def __str__(self) -> str:
+        """A table for the terminal."""
+        facts = self.facts
+        steps = "" if facts["steps"] is None else f" at {facts['steps']:,} steps"
+        manner = "its mean actions" if facts["deterministic"] else "sampled actions"
+        lines = [
+            f"{facts['algorithm']} on {facts['environment']}{steps}: {facts['episodes']} episodes "
+            f"with {manner}, {facts['layouts_trained_on']:.0%} of the layouts known from training",
+            *format_estimates(self.estimates, facts["cost_limits"]),
+            *format_unjudged(facts["limits_without_cost"]),
+            *(f"wrote {path}" for path in self.files),
+        ]
+        return "\n".join(lines)
 
 
 def evaluate(

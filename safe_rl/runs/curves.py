@@ -27,18 +27,7 @@ def draw_learning_curves(
     path: Path,
     title: str = "",
 ) -> None:
-    """Draw return, episode cost and cost rate over environment steps (Ray et al. 2019, Figure 7).
-
-    Limits d are dashed in the second panel, d / T_ep in the third. There is a line for every cost
-    with a limit, or for the aggregate cost if there is none. Single epochs are drawn faint, their
-    moving mean strong. Where the table has multipliers, a fourth panel shows them.
-
-    Args:
-        table: Columns of a run's table, see :func:`safe_rl.runs.table.read_table`.
-        cost_limits: Cost key -> d, undiscounted cost per episode.
-        episode_length: T_ep, steps of a full episode.
-        path: Picture to write, replaced in one go.
-        title: Written above the panels.
+    """Write `learning_curves` into a picture, replaced in one go.
 
     Examples:
         >>> import tempfile
@@ -52,6 +41,30 @@ def draw_learning_curves(
         >>> draw_learning_curves(table, {"cost": 25.0}, 1000, path)
         >>> path.exists()
         True
+    """
+    figure = learning_curves(table, cost_limits, episode_length, title)
+    # a viewer that watches the file never sees half a picture
+    with replacing(path) as unfinished:
+        figure.savefig(unfinished, dpi=120)
+
+
+def learning_curves(
+    table: Mapping[str, Sequence[float]],
+    cost_limits: Mapping[str, float],
+    episode_length: int,
+    title: str = "",
+) -> Figure:
+    """Draw return, episode cost and cost rate over environment steps (Ray et al. 2019, Figure 7).
+
+    Limits d are dashed in the second panel, d / T_ep in the third. There is a line for every cost
+    with a limit, or for the aggregate cost if there is none. Single epochs are drawn faint, their
+    moving mean strong. Where the table has multipliers, a fourth panel shows them.
+
+    Args:
+        table: Columns of a run's table, see :func:`safe_rl.runs.table.read_table`.
+        cost_limits: Cost key -> d, undiscounted cost per episode.
+        episode_length: T_ep, steps of a full episode.
+        title: Written above the panels.
     """
     multipliers = {key: f"multiplier_{key}" for key in cost_limits if f"multiplier_{key}" in table}
     layout = ConstrainedLayoutEngine(h_pad=0.1)  # inch; it ends a pixel or two beside its aim
@@ -82,9 +95,7 @@ def draw_learning_curves(
     lines = max(len(axes.get_legend_handles_labels()[0]) for axes in figure.axes)
     figure.set_figheight(figure.get_figheight() + 0.2 * lines)
     figure.suptitle(title)
-    # a viewer that watches the file never sees half a picture
-    with replacing(path) as unfinished:
-        figure.savefig(unfinished, dpi=120)
+    return figure
 
 
 def _label(figure: Figure, axes: Axes, name: str, *, from_zero: bool) -> None:

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from signal import Signals
-from typing import Protocol
+from typing import Any, Protocol
 
 import torch
 from omegaconf import DictConfig
@@ -84,6 +84,7 @@ class Trainer:
         self.record = record
         self.episode_length = env.max_episode_steps
         self.interrupted_by: Signals | None = None
+        self.callbacks: Sequence[Callable[[Mapping[str, float]], Any]] = ()
         self._collector = collector
         self._env = env
         self._evaluation, self._recording = evaluation, recording
@@ -225,12 +226,15 @@ class Trainer:
                 row = self.epoch(batches)
                 self.record.add(row)
                 self._keep(self._candidates.add(row))
+                answers = [callback(row) for callback in self.callbacks]
+                if any(answer is False for answer in answers):
+                    break
                 if stop.received:  # not before the first: a run has an epoch to show
                     break
                 if time.monotonic() - saved_at > self._checkpoint_interval:
                     self._save()
                     saved_at = time.monotonic()
-            if self.progress.steps < self._frames:
+            if self.progress.steps < self._frames and stop.received:
                 self.interrupted_by = stop.received
             else:
                 # before the last checkpoint: with that, nobody would come back to them

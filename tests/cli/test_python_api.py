@@ -331,3 +331,41 @@ def test_an_interrupted_run_is_resumed_to_the_same_table(run, tmp_path, monkeypa
     with pytest.raises(ValueError, match="not the folder of a run"):
         safe_rl.resume(tmp_path / "nowhere")
     assert not (tmp_path / "nowhere").exists()
+
+
+def test_a_run_shows_itself(tmp_path):
+    run = safe_rl.train("PointGoal1", directory=tmp_path / "run", frames=80, **SMALL)
+    lines = repr(run).splitlines()
+    assert lines[0] == f"Run('{tmp_path / 'run'}'): ppo_lagrangian on PointGoal1"
+    assert lines[1].startswith("Return ")
+    assert run.certificate is None
+    frame = run.to_pandas()
+    assert list(frame["steps"]) == [40, 80]
+    assert list(frame.columns) == list(run.table)
+    titles = [axes.get_title() for axes in run.plot().axes]
+    assert titles == ["Return", "Episode cost", "Cost rate", "Multiplier"]
+    page = run._repr_html_()
+    assert page.startswith("<pre>Run(&#x27;")
+    assert 'src="data:image/png;base64,' in page
+    assert "episode_return" in str(safe_rl.evaluate(run, episodes=2))
+    assert safe_rl.report(tmp_path).is_file()
+
+
+def test_callbacks_see_every_epoch_and_may_end_the_run(tmp_path):
+    seen = []
+
+    def stop_early(row):
+        seen.append(row["steps"])
+        return row["steps"] < 80
+
+    run = safe_rl.train(
+        "PointGoal1", directory=tmp_path, frames=400, callbacks=[stop_early, len], **SMALL
+    )
+    assert seen == run.table["steps"] == [40, 80]
+    assert safe_rl.resume(tmp_path, frames=120).table["steps"] == [40, 80, 120]
+
+
+def test_the_package_lists_what_it_offers():
+    names = {name for name in dir(safe_rl) if not name.startswith("__")}
+    assert names == {"Run", "evaluate", "load", "make_env", "report", "resume", "train"}
+    assert safe_rl.make_env("PointGoal1", num_envs=2, seed=0).batch_size == torch.Size([2])

@@ -70,6 +70,7 @@ UNREADABLE = {
     "code": lambda run: (run / "config.yaml").write_text(
         "algo: !!python/object/apply:os.system ['touch trace']"
     ),
+    "terminal": lambda run: change(run, algo={"name": "a\x1b[31m"}),
     "binary": lambda run: (run / "config.yaml").write_bytes(b"\xff\xfe\x00"),
     "half a configuration": lambda run: (run / "config.yaml").write_text("env: {name: Poi"),
     "empty configuration": lambda run: (run / "config.yaml").write_text(""),
@@ -119,7 +120,7 @@ UNUSUAL = {
     "robot": lambda run: change_env(run, robot_base=["point"]),
     "name is a list": lambda run: change_env(run, name=["PointGoal1"]),
     "no name": lambda run: change(run, env={}),
-    "lines": lambda run: change(run, algo={"name": "a\nb\r\tc\x1b[31m\u202e"}),
+    "lines": lambda run: change(run, algo={"name": "a\nb\tc\u202e"}),
     "formula": lambda run: change(run, algo={"name": "=cmd()"}),
     "steps": lambda run: change_env(run, num_steps="many"),
     "init_from": lambda run: change(run, init_from="/etc"),
