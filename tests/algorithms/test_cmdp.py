@@ -24,6 +24,8 @@ from safe_rl.objectives import (
     TRPOLoss,
 )
 
+pytestmark = pytest.mark.long
+
 TARGET_KL = 0.1
 TRUST_REGION = {
     "target_kl": 0.03, "damping": 0.1, "cg_iterations": 10, "backtrack_coeff": 0.8,

@@ -9,7 +9,11 @@ import sys
 import termios
 from pathlib import Path
 
+import pytest
+
 from safe_rl.runs.table import read_table
+
+pytestmark = pytest.mark.long
 
 IN_A_TERMINAL = """
 import fcntl, signal, sys, termios

@@ -66,6 +66,7 @@ def leaves(node: Any, path: str = "") -> Iterator[str]:
                 yield from leaves(value, f"{path}{key}.")
 
 
+@pytest.mark.long
 def test_every_key_of_every_file_is_described(configs):
     targets = set()
     for config in configs.values():

@@ -20,6 +20,8 @@ from safe_rl.envs import SafetyGymEnv, make_env
 from safe_rl.envs.transforms import transform_env
 from safe_rl.models import BehaviourPolicy, make_actor
 
+pytestmark = pytest.mark.long
+
 CONFIG = {"robot_base": "point", "task": "goal", "num_steps": 30, "observe_goal_lidar": True}
 MAKE = partial(SafetyGymEnv, CONFIG, seed=3, num_threads=1)
 

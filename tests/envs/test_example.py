@@ -12,6 +12,8 @@ from run_configs import CONF
 from safe_rl.envs import SafetyGymEnv
 from safe_rl.runs.table import read_table
 
+pytestmark = pytest.mark.long
+
 ROOT = CONF.parent
 PATH = ROOT / "examples" / "custom_environment.py"
 IMPORT = f"import={PATH.relative_to(ROOT)}"

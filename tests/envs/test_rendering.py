@@ -316,6 +316,7 @@ def test_a_missing_library_is_an_error_that_names_its_package(monkeypatch, backe
         make_env({}).render(0)
 
 
+@pytest.mark.long
 @pytest.mark.skipif(bool(ctypes.util.find_library("OSMesa")), reason="OSMesa is installed here")
 def test_environments_work_where_opengl_is_missing():
     program = """

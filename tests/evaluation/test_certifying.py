@@ -18,6 +18,8 @@ from safe_rl.runs.folder import RunFolder
 from safe_rl.scores.certificate import Verdict
 from safe_rl.training.building import build_trainer, seed_everything
 
+pytestmark = pytest.mark.long
+
 OPTIONS = CertificateOptions(ranking=6, episodes=12, tests=2, level=0.95, most_over=1.0)
 
 

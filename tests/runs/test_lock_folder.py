@@ -138,6 +138,7 @@ def renewing(path):
     thread.join()
 
 
+@pytest.mark.long
 def test_a_writer_on_another_machine_that_shows_itself_is_left_alone(folder, quick):
     """As on a network file system whose locks stay on each machine."""
     lines = ("filelock/2", "pid=1", "host=elsewhere", "mode=lease", "token=a", "duration=3.0", "")
@@ -149,6 +150,7 @@ def test_a_writer_on_another_machine_that_shows_itself_is_left_alone(folder, qui
         assert SoftFileLease(folder.lease).pid == os.getpid()
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("code", [errno.ENOLCK, errno.EOPNOTSUPP])
 def test_without_locks_the_writer_is_still_seen(folder, quick, monkeypatch, code):
     def refuse(self):

@@ -25,6 +25,8 @@ from safe_rl.runs.identity import check_same_run
 from safe_rl.runs.table import read_table
 from safe_rl.training.building import build_trainer, seed_everything
 
+pytestmark = pytest.mark.long
+
 store_configs()
 
 # episodes of 45 steps are open at the end of epochs of 30

@@ -12,6 +12,8 @@ from safe_rl.cli import evaluate
 from safe_rl.envs import ConfigError, make_env
 from safe_rl.runs.table import read_table
 
+pytestmark = pytest.mark.long
+
 SMALL = (
     *("env=gymnasium", "logger=none", "num_threads=1", "certificate.episodes=0", "num_envs=4"),
     *("model.hidden_sizes=[8]", "frames_per_batch=200", "critic_update.minibatch_size=50"),

@@ -12,6 +12,8 @@ from safe_rl.models import make_actor
 from safe_rl.objectives import PPOLagrangianLoss, TRPOLagrangianLoss
 from safe_rl.runs.table import read_table
 
+pytestmark = pytest.mark.long
+
 
 class _Remembering:
     """Counts its calls in a buffer that it replaces, and learns a number and a layer."""

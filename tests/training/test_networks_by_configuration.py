@@ -16,6 +16,8 @@ from safe_rl.envs import make_env
 from safe_rl.runs.table import read_table
 from safe_rl.training.building import build_trainer, seed_everything
 
+pytestmark = pytest.mark.long
+
 SMALL = (
     *("logger=none", "num_threads=1", "certificate.episodes=0", "num_envs=4", "env.num_steps=25"),
     *("model.hidden_sizes=[8]", "frames_per_batch=160", "critic_update.minibatch_size=40"),

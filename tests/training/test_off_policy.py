@@ -18,6 +18,8 @@ from safe_rl.runs.table import read_table
 from safe_rl.targets import allow
 from safe_rl.training.building import begin_from, build_trainer, seed_everything
 
+pytestmark = pytest.mark.long
+
 NAMES = ["sac", "sac_lagrangian", "td3", "td3_lagrangian", "wcsac", "cal"]
 
 

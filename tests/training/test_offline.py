@@ -18,6 +18,8 @@ from safe_rl.objectives import BCLoss
 from safe_rl.runs.table import read_table
 from safe_rl.training.building import build_trainer, seed_everything
 
+pytestmark = pytest.mark.long
+
 
 def head_north(observation):
     """Around the hazard by the north, where it costs as well."""

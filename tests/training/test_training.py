@@ -44,6 +44,7 @@ LEARNING = [
 ]
 
 
+@pytest.mark.long
 def test_ppo_learns_and_pays_the_cost(tmp_path):
     _, table = train(tmp_path, *LEARNING, "algo=ppo", "cost_limits={cost_hazards: 1.0}")
     assert table["episode_return"][-1] > table["episode_return"][0] + 0.5
@@ -51,6 +52,7 @@ def test_ppo_learns_and_pays_the_cost(tmp_path):
     assert not any("multiplier" in name or "cost_critic" in name for name in table)
 
 
+@pytest.mark.long
 def test_ppo_lagrangian_keeps_the_limits(tmp_path):
     limits = {"cost_hazards": 1.0, "cost_north": 1.0}
     _, table = train(
