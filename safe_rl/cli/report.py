@@ -67,7 +67,8 @@ def report(root: Path, options: ReportOptions) -> tuple[Report, Path]:
     Raises:
         FileNotFoundError: If there is no run.
         OSError: If the page cannot be written, which is seen before any run is read.
-        ValueError: If a slate is to take less than one run per environment, or what is good is no
+        ValueError: If RUNS_DIR/report is a link, by which others would choose what is overwritten;
+            if a slate is to take less than one run per environment, or what is good is no
             share of a return.
     """
     if options.seeds < 1:
@@ -75,6 +76,8 @@ def report(root: Path, options: ReportOptions) -> tuple[Report, Path]:
     if not 0.0 < options.good <= 10.0:
         raise ValueError(f"good={options.good}: a share of a return, for example 0.5 for half.")
     out = root / "report" if options.out is None else Path(options.out)
+    if options.out is None and out.is_symlink():
+        raise ValueError(f"{out} is a link: remove it, or say out=FOLDER.")
     if root.is_dir():
         check_place(out / "report.html", "out=FOLDER writes the report elsewhere.")
     result = build_report(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import math
+import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -32,7 +33,8 @@ class TableWriter:
 
     Raises:
         TableError: If there are fewer rows than are to be kept, or one cannot be read; by
-            :meth:`write`, if a row's columns differ from the first one's.
+            :meth:`write`, if a row's columns differ from the first one's, or the file has been
+            changed meanwhile.
 
     Examples:
         >>> import tempfile
@@ -51,6 +53,7 @@ class TableWriter:
         # replaced in one go: a run killed here still has its table
         replace_text(path, "".join(kept))
         self._file = path.open("a", newline="")
+        self._path, self._size = path, self._file.tell()
         self._writer = csv.writer(self._file, lineterminator="\n")
 
     def write(self, row: Mapping[str, float]) -> None:
@@ -58,6 +61,8 @@ class TableWriter:
         if self._columns is None:
             self._columns = list(row)
             self._writer.writerow(self._columns)
+            self._file.flush()
+            self._size = self._file.tell()
         if list(row) != self._columns:
             unexpected = sorted(set(row).symmetric_difference(self._columns))
             raise TableError(
@@ -66,8 +71,14 @@ class TableWriter:
                 "put it back; a diagnostic is reported in every epoch, as NaN where it does not "
                 "exist."
             )
+        if os.fstat(self._file.fileno()).st_size != self._size:
+            raise TableError(
+                f"{self._path} has been changed by another program while the run was writing it: "
+                "put its rows back to continue the run."
+            )
         self._writer.writerow([_field(value) for value in row.values()])
         self._file.flush()
+        self._size = self._file.tell()
 
     def close(self) -> None:
         """Close the file."""

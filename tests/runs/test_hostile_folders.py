@@ -10,6 +10,7 @@ import torch
 from point_mass_runs import point_mass_trainer
 from tensordict import TensorDict
 
+from safe_rl.cli.report import ReportOptions, report
 from safe_rl.collectors import Recording, read_recording
 from safe_rl.files import replace_text
 from safe_rl.runs.folder import RunFolder, lock_folder
@@ -137,3 +138,13 @@ def test_a_recording_is_read_as_it_was_written(recording):
     assert read.batch_size == torch.Size([4, 20])
     expected = TensorDict.load_memmap(str(Path(recording, "00000000")))
     assert (read == expected).all()
+
+
+def test_a_linked_report_is_not_written(tmp_path):
+    mine = tmp_path / "mine"
+    mine.mkdir()
+    (tmp_path / "runs").mkdir()
+    (tmp_path / "runs" / "report").symlink_to(mine)
+    with pytest.raises(ValueError, match="report is a link"):
+        report(tmp_path / "runs", ReportOptions())
+    assert not listing(mine)
