@@ -50,7 +50,7 @@ def starting_processes() -> Iterator[None]:
     """Keep SIGINT, SIGTERM and SIGHUP from processes that this thread starts meanwhile.
 
     Ctrl-C, the end of a terminal, and what ends the jobs of a cluster, reach all processes of a
-    run; its first one heeds them. The others take seconds to start, in which they would be ended.
+    run; the first process reacts to them. The others, which take seconds to start, would be ended.
     They keep these signals waiting until they call :func:`leave_signals_to_parent`.
     """
     # which would let signals through again when it is started along with the first process

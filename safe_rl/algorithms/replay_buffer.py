@@ -45,7 +45,7 @@ class Memory:
             files.
         prioritised: Exponents ``alpha`` and ``beta`` of prioritised replay (Schaul et al. 2016,
             sections 3.3 and 3.4), or None for uniform draws.
-        keep: Whether checkpoints hold the transitions, so that a run goes on exactly.
+        keep: Whether checkpoints hold the transitions, so that a run continues exactly.
         device: Device of the minibatches.
 
     Raises:

@@ -127,7 +127,7 @@ def why_not_certified(config: DictConfig, episode_length: int, directory: Path) 
 
 
 def train_on(config: DictConfig, directory: Path) -> str:
-    """Arguments that go on with a run whose policies are not safe enough yet."""
+    """Arguments that continue a run whose policies are not safe enough yet."""
     return f"resume={shlex.quote(str(directory))} frames={2 * config.frames:_}"
 
 

@@ -85,12 +85,12 @@ def carry_out(
 
 def _refuse_beside_certify(options: EvaluationOptions) -> None:
     """A certificate is of the run's own problem: what else is asked for would have no effect."""
-    heeded = ("certify", "certificate", "num_threads")
+    used = ("certify", "certificate", "num_threads")
     plain = EvaluationOptions()
     for field in fields(options):
-        if field.name not in heeded and getattr(options, field.name) != getattr(plain, field.name):
+        if field.name not in used and getattr(options, field.name) != getattr(plain, field.name):
             raise CommandLineError(
-                f"{field.name}: certify=true does not heed it. A certificate is of the run's own "
+                f"{field.name}: it is ignored by certify=true. A certificate is of the run's own "
                 "environment, and takes certificate.episodes=… and the like, and num_threads=…"
             )
 

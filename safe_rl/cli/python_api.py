@@ -56,7 +56,7 @@ def train(
         directory: Folder of the run; None: ``runs/<env>/<algo>/<date>_seed<seed>``.
         imports: Module of yours to import before, or several, as the command's ``import=``.
         callbacks: Called after every epoch with its row of the table; where one returns False, the
-            run ends there, as one that has come to its end.
+            run ends there, like a finished one.
         config_dir: Folder with YAMLs of yours, or several, as the command's ``--config-dir``.
         settings: Any key of ``conf/``: ``frames=100_000``, ``preset="paper"``,
             ``cost_limits={"cost_hazards": 10}``. Keys below another one are dictionaries,

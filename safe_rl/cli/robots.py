@@ -1,4 +1,4 @@
-"""Robots of one's own: a run keeps a copy, and goes on with the robot that it began with.
+"""Custom robots: a run keeps a copy, and is continued with the robot that it began with.
 
 The configuration goes on naming the user's file, by which runs are told apart; where that is gone
 or has changed, the run's copy takes its place.

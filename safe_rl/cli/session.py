@@ -65,7 +65,7 @@ class Session:
         config: Its configuration, checked.
         folder: Its folder.
         hydra: Hydra's own configuration, which a new run notes.
-        continues: Whether a run that is in the folder goes on.
+        continues: Whether to continue the run in the folder.
         missing: Folders that were not there before, the run's own first: they go again if it
             cannot begin.
         program: What trains, as the user has called it.
@@ -154,7 +154,7 @@ class Session:
         return cast(dict[str, Any], OmegaConf.to_container(self.config.env, resolve=True))
 
     def _prepare(self) -> Trainer | None:
-        """Build the run, or go on with the one in the folder; None if that is finished."""
+        """Build the run, or continue the one in the folder; None if that is finished."""
         if "RL_LOGGING_LEVEL" not in os.environ:  # by which users let TorchRL say more
             logging.getLogger("torchrl").setLevel(logging.WARNING)
         config, folder = self.config, self.folder

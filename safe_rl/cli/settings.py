@@ -63,7 +63,7 @@ class _Part(NamedTuple):
 def check_settings(config: DictConfig, folder: RunFolder | None = None) -> None:
     """Check every key of a configuration: the run's by `KEYS`, those of parts by their signatures.
 
-    Parts of one's own are checked like the package's. Whole numbers that are written as 3e5 become
+    Custom parts are checked like the package's. Whole numbers that are written as 3e5 become
     integers.
 
     Args:

@@ -154,7 +154,7 @@ class SweepReport(Callback):
             file.write(f"{line}\n")
 
     def _print_summary(self) -> bool:
-        """Print what became of the jobs; returns whether one has not come to its end."""
+        """Print how the jobs ended; returns whether one is not finished."""
         assert self._journal is not None
         if self._display is not None:
             self._display.stop()

@@ -183,7 +183,7 @@ class Run:
         """Run the policy under variations of its environment; writes what the command writes.
 
         Args:
-            variations: As the command's ``variations=``: ``"dynamics"``, or rows of one's own,
+            variations: As the command's ``variations=``: ``"dynamics"``, or custom rows,
                 ``{"mass": {"env.mass_scale": [0.5, 2.0]}}``.
             options: Those of :class:`safe_rl.evaluation.EvaluationOptions`.
         """

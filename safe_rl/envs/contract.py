@@ -86,7 +86,7 @@ class ContractError(TypeError):
 
 
 def check_constrained_env(env: Any) -> None:
-    """Check an environment of one's own against the contract, without stepping it.
+    """Check a custom environment against the contract, without stepping it.
 
     TorchRL's `check_env_specs` finds out whether the specs are true.
 

@@ -180,7 +180,7 @@ def load_policy(
 
 
 def check_env_keys(env: Mapping[str, Any], keys: Iterable[str]) -> None:
-    """Refuse keys that an environment of one's own family does not have.
+    """Refuse keys that a custom environment does not have.
 
     Such a family ignores other keys, and the result would be said to be of another environment
     than it is.

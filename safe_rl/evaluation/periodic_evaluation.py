@@ -1,4 +1,4 @@
-"""Evaluation while a run goes on: deterministic actions, on layouts that training does not see."""
+"""Evaluation during training: deterministic actions, on layouts that training does not see."""
 
 from __future__ import annotations
 

@@ -79,8 +79,8 @@ class RunningScale(nn.Module):
     """Subtract a running mean and divide by a running standard deviation, cut at ±``clip``.
 
     The moments are buffers in double precision: a checkpoint holds them with the weights, and a run
-    that is resumed goes on to the last digit. They move only by :meth:`update`, which training
-    calls once per batch, after it has learned from it: the policy that a batch is collected by is
+    that is resumed has the same results. They change only by :meth:`update`, which training calls
+    once per batch, after it has learned from it: the policy that a batch is collected by is
     the one that its probabilities are compared to. Before the first batch nothing is changed.
 
     Args:

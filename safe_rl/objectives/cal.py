@@ -44,7 +44,7 @@ class CALLoss(SACLagrangianLoss):
     the objective is convex in E[Q_i], so that the policy comes to rest at the limit instead of
     swinging about it. The expectation is that over a minibatch.
 
-    λ is moved by whoever knows the costs of episodes, which are undiscounted, and so is the limit
+    λ is updated outside, from the costs of episodes, which are undiscounted, and so is the limit
     d; E[Q_i] is discounted. The article converts d by `discounted_share`, which is some 30 % off,
     because states in a memory are those of older policies, and costs are not spread evenly. With
     c = 10, λ̂ would then settle a distance from λ that no λ makes up for. So d' = ρ d, and ρ is

@@ -259,7 +259,7 @@ class LimitTracker:
     def _target(self, estimate: CostEstimate, scale: Tensor, num_steps: int) -> Tensor:
         """What J_c is to be at most after an update, which came with `num_steps` steps, [k]."""
         self._steps += num_steps
-        # a descent that has begun goes on, also if the run was made longer meanwhile
+        # a descent that has begun continues, also if the run was made longer meanwhile
         if self._steps <= self.free_steps and not self._reached.isfinite().any():
             return estimate.mean + scale
         margin = torch.minimum(self.margin * self._noise, self.largest_margin * self.limits)

@@ -118,7 +118,7 @@ class IPOLoss(PPOLoss):
     The argument is the distance to the limit that the surrogate predicts. All of it is an average
     per step, of an objective whose barrier is −κ log(d − J_c) in the units of an episode: a cost
     that the surrogate leaves at a distance Δ = d − J_c is weighed by κ / Δ. Near the limit and
-    beyond it, where the article has no value, the barrier goes on with the slope `max_weight`: a
+    beyond it, where the article has no value, the barrier continues with the slope `max_weight`: a
     violated cost is weighed by a constant, as by a multiplier of this size.
 
     Reads and writes what `PPOLoss` does, reads ``cost_advantage`` [..., k], and adds

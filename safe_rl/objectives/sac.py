@@ -161,7 +161,7 @@ class SACLagrangianLoss(CostCritics, SACLoss):
     The sizes r of rewards and u of costs are 1 until they are measured; see `CostCritics`.
 
     Ha et al., *Learning to Walk in the Real World with Minimal Human Effort* (2020); there as here
-    costs have critics of their own. λ is moved by whoever knows the costs of episodes, which
+    costs have critics of their own. λ is updated outside, from the costs of episodes, which
     discounted critics do not.
 
     Args:

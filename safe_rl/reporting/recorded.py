@@ -96,7 +96,7 @@ class Run:
 
     @property
     def is_finished(self) -> bool:
-        """Whether it has come to its end."""
+        """Whether it is finished."""
         return self.steps >= self.frames
 
     @property

@@ -80,7 +80,7 @@ class CheckpointStore:
         self._none_yet = self.last / "none-yet"
         self._keep_last, self._keep_best = keep_last, keep_best
         self._run = dict(run or {})
-        # best ones that are so again if the run goes on from its last checkpoint
+        # best ones that are so again if the run is resumed from its last checkpoint
         self._displaced: set[Path] = set()
 
     def begin(self) -> None:
@@ -240,7 +240,7 @@ class CheckpointStore:
 
 
 def is_finished(directory: Path, frames: int) -> bool:
-    """Whether the run in a folder has come to its end."""
+    """Whether the run in a folder is finished."""
     return CheckpointStore.newest_step(RunFolder(directory).checkpoints) >= frames
 
 

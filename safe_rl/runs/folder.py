@@ -143,7 +143,7 @@ class RunFolder:
         """Refuse a folder in which a run has begun.
 
         Raises:
-            FileExistsError: Saying how to go on with that run.
+            FileExistsError: Saying how to continue that run.
         """
         if self.has_begun:
             raise FileExistsError(
@@ -153,7 +153,7 @@ class RunFolder:
 
     @property
     def resuming(self) -> str:
-        """What goes on with the run, as a shell takes it."""
+        """The argument that continues the run, quoted for a shell."""
         return f"resume={shlex.quote(str(self.directory))}"
 
     def check_is_run(self) -> None:
@@ -309,5 +309,5 @@ def _in_use(folder: RunFolder, lease: SoftFileLease) -> RunInUseError:
     who = "another process" if owner is None else f"process {owner.pid} on {machine}"
     return RunInUseError(
         f"{folder.directory} is being written by {who}. Wait for it, or end it; a run that was "
-        "ended goes on with resume=."
+        "ended is continued by resume=."
     )

@@ -29,7 +29,7 @@ class Role(Enum):
     Attributes:
         names_experiment: Whether runs that differ in it are different experiments.
         may_change: Whether ``resume=`` may change it.
-        may_differ: Whether a job of a sweep goes on with a run that has another value.
+        may_differ: Whether a job of a sweep may continue a run that has another value.
     """
 
     EXPERIMENT = ("names the experiment: what is restored with a run depends on it", 1, 0, 0)

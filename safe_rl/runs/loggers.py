@@ -1,4 +1,4 @@
-"""Loggers that know how to go on with a run that was interrupted.
+"""Loggers that know how to continue an interrupted run.
 
 Each is TorchRL's, writes below or remembers its run in the folder ``log_dir``, and is chosen by
 ``logger=`` from ``conf/logger``.
@@ -58,7 +58,7 @@ class TensorboardLogger(TorchRLTensorboardLogger):
 
 @needs_extra("mlflow", "mlflow")
 class MLflowLogger(MLFlowLogger):
-    """A run of an MLflow experiment; a run that is continued goes on in the same one.
+    """A run of an MLflow experiment; a continued run uses the same one.
 
     Metrics that are logged again after an interruption have the same values as before.
 
@@ -94,7 +94,7 @@ class MLflowLogger(MLFlowLogger):
 
 @needs_extra("wandb", "wandb")
 class WandbLogger(TorchRLWandbLogger):
-    """A run of Weights & Biases; a run that is continued goes on in the same one.
+    """A run of Weights & Biases; a continued run uses the same one.
 
     Args:
         exp_name: Name of the run.

@@ -36,7 +36,7 @@ __all__ = [
 ]
 
 MakeEvaluation = Callable[[TensorDictModuleBase], Evaluator]
-"""Makes an evaluation of a policy that goes on learning."""
+"""Makes an evaluation of a policy that is still learning."""
 
 
 def physics_threads(config: DictConfig) -> int:

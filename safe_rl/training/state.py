@@ -60,7 +60,7 @@ class Progress:
 
 
 class WorldSnapshot:
-    """The worlds as the next epoch finds them, and the observation that the collector goes on from.
+    """The worlds as the next epoch finds them, and the observation to continue from.
 
     Every epoch starts from a snapshot, whether a checkpoint is written or not. Writing a state
     into a simulation forgets what no snapshot holds (it wakes sleeping bodies); were it done on
@@ -131,10 +131,10 @@ class StopRequest:
 
     def __enter__(self) -> StopRequest:
         if threading.current_thread() is threading.main_thread():
-            # what a shell runs in the background ignores SIGINT, too, but is to heed it when asked
-            is_kept_up = signal.getsignal(signal.SIGHUP) is signal.SIG_IGN
-            heeded = self._SIGNALS - {signal.SIGHUP} if is_kept_up else self._SIGNALS
-            self._previous = {number: signal.signal(number, self._stop) for number in heeded}
+            # a background job of a shell ignores SIGINT too, but must react to one that is sent
+            ignores_hangup = signal.getsignal(signal.SIGHUP) is signal.SIG_IGN
+            caught = self._SIGNALS - {signal.SIGHUP} if ignores_hangup else self._SIGNALS
+            self._previous = {number: signal.signal(number, self._stop) for number in caught}
         return self
 
     def __exit__(self, *exception: object) -> None:

@@ -33,9 +33,9 @@ from safe_rl.training.state import Progress, StopRequest, WorldSnapshot
 
 __all__ = ["EpisodeError", "Evaluator", "Trainer", "WorkerError"]
 
-# what only going on takes, which the last checkpoints have: several times what a policy is, and a
-# memory fills gigabytes
-_TO_GO_ON = {"memory", "policy_update", "critic_update", "env", "accounting", "rng"}
+# Parts that only resuming needs, and only the newest checkpoints hold: a replay buffer fills
+# gigabytes, the others several times what a policy does.
+_FOR_RESUMING = {"memory", "policy_update", "critic_update", "env", "accounting", "rng"}
 
 
 class Evaluator(Protocol):
@@ -114,7 +114,7 @@ class Trainer:
     def _find_candidates(self, over: int, limits: Mapping[str, float]) -> Candidates:
         steps = self._frames_per_batch / self._env.batch_size.numel()
         return Candidates(
-            {name: part for name, part in self._parts().items() if name not in _TO_GO_ON},
+            {name: part for name, part in self._parts().items() if name not in _FOR_RESUMING},
             limits,
             over=over,
             delay=lambda length: epochs_until_judged(over, length, steps),
@@ -168,7 +168,7 @@ class Trainer:
         return self._worlds is None
 
     def _begin_episodes(self) -> None:
-        """Without their state, the worlds cannot go on with the episodes that were open."""
+        """Without their state, the worlds cannot continue the episodes that were open."""
         if self._worlds is not None:
             return
         self.accounting.forget_open_episodes()
@@ -201,7 +201,7 @@ class Trainer:
         return self.record.summary()
 
     def close(self) -> None:
-        """End what collects, whatever it is at: workers, if there are any, and the environment."""
+        """Close the collector with its workers, if any, and the environment, at any moment."""
         if isinstance(self._collector, WorkerCollector):
             self._collector.kill()
         else:
@@ -220,7 +220,7 @@ class Trainer:
                 # as of the table, what came after the checkpoint is another continuation's
                 self._recording.begin(self.progress.epoch)
             self._candidates.go_on_after(self.record.rows())
-            # a shorter run that had come to its end has judged them by fewer epochs
+            # a shorter run that was finished has judged them by fewer epochs
             self._checkpoints.forget_best(self._candidates.waiting)
             while self.progress.steps < self._frames:
                 row = self.epoch(batches)

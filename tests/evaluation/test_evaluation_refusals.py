@@ -28,7 +28,7 @@ from safe_rl.evaluation.variations import Variation, varied
         (["camera=nowhere", "video=true"], "nowhere"),
         (["picture=there.png"], "must end in .gif or .webp"),
         (["picture=nowhere/there.gif"], "there is no folder nowhere"),
-        (["certify=true", "env.hazards_num=3"], "env: certify=true does not heed it"),
+        (["certify=true", "env.hazards_num=3"], "env: it is ignored by certify=true"),
         (["certificate.episodes=9"], "add certify=true"),
         (["certify=true", "certificate.episode=9"], "Did you mean 'episodes'?"),
         (["env.hazards_num=200", "episodes=1"], "hazards"),

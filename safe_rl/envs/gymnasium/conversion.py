@@ -90,7 +90,7 @@ def from_gymnasium(
         worlds = ProcessVectorEnv(make_one, num_envs, min(workers, num_envs), keys)
     else:
         worlds = SyncVectorEnv([make_one] * num_envs, autoreset_mode=AutoresetMode.DISABLED)
-        worlds.env_fns = ()  # not asked again: functions of one's own might not be pickled
+        worlds.env_fns = ()  # not asked again: custom functions might not be pickled
     return from_vector(worlds, keys, length, seed=seed, device=device, highest_costs=highest_costs)
 
 

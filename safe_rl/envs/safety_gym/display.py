@@ -97,7 +97,7 @@ class Display:
         """Draw the world that was posed last.
 
         Args:
-            camera: a name of `cameras`, or a camera of one's own.
+            camera: a name of `cameras`, or a custom camera.
             width: of the picture [pixels].
             height: of the picture [pixels].
             markers: drawn besides the world.

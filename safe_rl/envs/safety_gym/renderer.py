@@ -115,7 +115,7 @@ class WorldRenderer:
         Args:
             rows: which, R of them.
             has_cost: which of all worlds incurred a cost in the last step, bool [N].
-            camera: a name, or a camera of one's own.
+            camera: a name, or a custom camera.
             width: of a frame [pixels].
             height: of a frame [pixels].
 

@@ -44,7 +44,7 @@ class ConstraintTransform(Transform):
         self._rows: dict[str, Tensor] = {}
 
     def seed(self, seeds: Tensor) -> None:
-        """Determine every draw to come by keys of the rows, int64 [N]; resets heed it."""
+        """Seed all later draws by a key per row, int64 [N]; used from the next reset on."""
 
     def start(self, done: Tensor) -> dict[str, Tensor]:
         """Return what is remembered of episodes that begin, for all rows of `done` [..., 1]."""

@@ -92,7 +92,7 @@ class TransformedConstrainedEnv(ConstrainedEnv, TransformedEnv):
             transform.seed(rng.fold(rows, -number))
 
     def continue_from(self, steps: int) -> None:
-        """Go on with schedules after so many steps of every row; the next reset heeds it."""
+        """Continue schedules after so many steps of every row, from the next reset on."""
         self.steps_before = steps
         for transform in self._ours().values():
             transform.continue_from(steps)

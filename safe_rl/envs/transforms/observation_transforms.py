@@ -53,7 +53,7 @@ class SensorNoise(ConstraintTransform):
         self._seeds: Tensor | None = None
 
     def seed(self, seeds: Tensor) -> None:
-        """Determine every draw to come by keys of the rows, int64 [N]; resets heed it."""
+        """Seed all later draws by a key per row, int64 [N]; used from the next reset on."""
         self._seeds = seeds
 
     def put_rows(self, rows: Mapping[str, Tensor]) -> None:
@@ -145,7 +145,7 @@ class PolicyMemory(ConstraintTransform):
     """Carry what a policy leaves under ``("next", "memory")`` to its next step as ``memory``.
 
     It is 0 when an episode begins, and `is_init` says so. This is TorchRL's `TensorDictPrimer` and
-    `InitTracker` in one that snapshots and resumed runs know of: a policy goes on remembering where
+    `InitTracker` in one that snapshots and resumed runs know of: a policy keeps remembering where
     the worlds go on. A policy that leaves nothing remembers what it did before.
 
     Args:

@@ -43,8 +43,8 @@ class RobotRenderer:
         Args:
             rows: Which, R of them.
             has_cost: Which of all incurred a cost in the last step, bool [N].
-            camera: "free" (beside the robot and moving with it), a name in the model, or a camera
-                of one's own.
+            camera: "free" (beside the robot and moving with it), a name in the model, or a
+                custom camera.
             width: Of a frame [pixels].
             height: Of a frame [pixels].
 
