@@ -291,12 +291,14 @@ def test_the_package_is_imported_in_no_time_and_without_torch():
 OPENMP_SAYS = {"OMP_DISPLAY_ENV": "verbose"}  # libgomp prints its settings when it is loaded
 
 
+@pytest.mark.long
 def test_idle_threads_sleep_if_the_package_comes_first():
     said = in_a_process("import safe_rl, torch; torch.ones(9) + 1", **OPENMP_SAYS)
     assert "GOMP_SPINCOUNT = '0'" in said
     assert "import safe_rl first" not in said
 
 
+@pytest.mark.long
 def test_torch_first_is_said_to_be_too_late():
     said = in_a_process("import torch\nimport safe_rl", **OPENMP_SAYS)
     assert "GOMP_SPINCOUNT = '0'" not in said
@@ -304,6 +306,7 @@ def test_torch_first_is_said_to_be_too_late():
     assert said.count("import safe_rl first") == 1
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("setting", [{"OMP_WAIT_POLICY": "ACTIVE"}, {"GOMP_SPINCOUNT": "10"}])
 def test_a_setting_of_the_users_is_kept_without_a_word(setting):
     code = "import torch, safe_rl, os; print(os.environ.get('OMP_WAIT_POLICY'))"
@@ -321,6 +324,7 @@ def test_tables_have_no_circles_and_no_ruins():
         assert set(modules) <= set(PATHS), "modules that are no more"
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("modules", "unneeded"),
     [
@@ -338,6 +342,7 @@ def test_what_is_not_needed_yet_is_not_imported(modules, unneeded):
     assert said == "set()\n"
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("command", "arguments", "words"),
     [

@@ -10,6 +10,8 @@ import pytest
 
 from safe_rl.processes import is_stopped, starting_processes
 
+pytestmark = pytest.mark.long
+
 ROOT = Path(__file__).parents[1]
 
 # a parent that starts a child, which says when it watches and when it gets SIGTERM

@@ -16,6 +16,8 @@ from safe_rl.envs.velocity import VelocityEnv
 from safe_rl.evaluation import video
 from safe_rl.evaluation.video import MANNERS, manner_of
 
+pytestmark = pytest.mark.long
+
 
 @pytest.mark.parametrize(
     ("make", "steps_per_frame", "rate"),

@@ -20,6 +20,8 @@ from safe_rl.cli.train import read_command
 from safe_rl.evaluation import EvaluationOptions
 from safe_rl.evaluation.variations import Variation, expand, varied
 
+pytestmark = pytest.mark.long
+
 SMALL = {"num_envs": 4, "frames_per_batch": 160, "frames": 160, "logger": "none", "num_threads": 1}
 QUICK = ("episodes=6", "num_envs=3", "num_threads=1")
 SETS = sorted(path.stem for path in (CONF / "variations").glob("*.yaml"))

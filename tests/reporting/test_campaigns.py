@@ -158,6 +158,7 @@ def test_the_report_says_it(tmp_path, capsys):
     assert "| PointGoal1 | ppo | 3,000 | 0 | — | 10 |" in text
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("path", sorted(RESULTS.rglob(PLAN)), ids=lambda path: path.parent.name)
 def test_the_commands_of_what_is_missing_are_taken(path):
     ((_, commands),) = campaign_tables(path.parent, [])[0].values()

@@ -20,6 +20,8 @@ from safe_rl.runs.table import read_table
 from safe_rl.targets import allow
 from safe_rl.training.building import build_trainer, initialise_networks, seed_everything
 
+pytestmark = pytest.mark.long
+
 
 class QNetwork(nn.Module):
     def __init__(self, num_obs, num_actions):

@@ -12,6 +12,8 @@ from safe_rl.models import QEnsemble, make_actor, make_bounded_actor, make_squas
 from safe_rl.runs.checkpoints import CheckpointStore
 from safe_rl.training.building import initialise_networks
 
+pytestmark = pytest.mark.long
+
 
 @pytest.fixture
 def trained(tmp_path):

@@ -20,6 +20,8 @@ from safe_rl.runs.identity import experiment_of
 from safe_rl.runs.table import read_table
 from safe_rl.training.building import build_trainer, seed_everything
 
+pytestmark = pytest.mark.long
+
 SAUTE = ["algo=ppo", "transforms=[saute]", "cost_limits={cost: 0.5}"]
 
 
