@@ -20,6 +20,7 @@ import subprocess
 import sys
 import time
 
+import safe_rl  # isort: skip  # noqa: F401, before torch, for its settings of threads
 import torch
 from omegaconf import OmegaConf
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib
 from collections.abc import Callable
 from importlib.util import find_spec
+from pathlib import Path
 from typing import Any, TypeVar
 
 __all__ = ["check_extra", "import_extra", "needs_extra", "require_extra"]
@@ -29,10 +30,18 @@ def require_extra(module: str, extra: str) -> None:
     package = module.partition(".")[0]
     if find_spec(package) is None:
         raise ModuleNotFoundError(
-            f"This needs the package '{package}', which comes with the extra '{extra}': in the "
-            f"folder of safe_rl, pip install -e '.[{extra}]'",
+            f"This needs the package '{package}', which comes with the extra '{extra}': "
+            f"{_installing(extra)}",
             name=package,
         )
+
+
+def _installing(extra: str) -> str:
+    """The command that installs an extra: of the checkout that is imported, or of the package."""
+    checkout = Path(__file__).parents[1]
+    if (checkout / "pyproject.toml").is_file():
+        return f"in {checkout}, pip install -e '.[{extra}]'"
+    return f"pip install 'safe-rl-torch[{extra}]'"
 
 
 def import_extra(module: str, extra: str) -> Any:

@@ -23,6 +23,7 @@ from safe_rl.cli.settings import check_settings, plain
 from safe_rl.cli.suggestions import (
     COMPOSING_ERRORS,
     Composing,
+    algorithm_meant,
     explain,
     nobody_reads,
     unread_by,
@@ -191,10 +192,11 @@ def _check_choices(overrides: Sequence[Override], options: partial[list[str]]) -
         # of some groups several are chosen, or none: transforms=[saute,action_filter]
         for name in chosen if chosen or isinstance(value, list) else [""]:
             if name not in known:
+                hint = algorithm_meant if group == "algo" else did_you_mean
                 family = hint_of_gymnasium(name) if group == "env" else ""
                 raise CommandLineError(
                     f"'{override.input_line}': there is no {group} '{name}'."
-                    f"{family or did_you_mean(name, known) or _listed(known)}"
+                    f"{family or hint(name, known) or _listed(known)}"
                 )
 
 

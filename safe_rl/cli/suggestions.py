@@ -15,7 +15,10 @@ from safe_rl.cli.keys import KEYS
 from safe_rl.cli.settings import SettingError, optional_keys, plain
 from safe_rl.naming import did_you_mean, nearest
 
-__all__ = ["COMPOSING_ERRORS", "Composing", "explain", "nobody_reads", "paths_of", "unread_by"]
+__all__ = [
+    *("COMPOSING_ERRORS", "Composing", "algorithm_meant", "explain", "nobody_reads", "paths_of"),
+    "unread_by",
+]
 
 COMPOSING_ERRORS = (HydraException, OmegaConfBaseException, YAMLError, ValueError)
 """What Hydra raises about overrides and files."""
@@ -27,8 +30,8 @@ _LARGE = ("env", "algo", "preset")
 _LISTS = ("transforms",)
 
 _ELSEWHERE = {
-    "frames": "total_steps total_timesteps total_frames timesteps max_steps epoch epochs",
-    "frames_per_batch": "n_steps rollout_length step_per_epoch",
+    "frames": "total_steps total_timesteps total_frames timesteps max_steps epochs max_epochs",
+    "frames_per_batch": "n_steps rollout_length step_per_epoch steps_per_epoch",
     "num_passes": "n_epochs update_iters repeat_per_collect",
     "num_envs": "n_envs vector_env_nums training_num",
     "num_threads": "n_threads torch_threads",
@@ -51,6 +54,15 @@ _ELSEWHERE = {
     "+note": "note notes comment",
 }
 """Key, or its end -> what other libraries call it."""
+_ALGORITHMS_ELSEWHERE = {
+    "ppo_lagrangian": "cppo ppolag cppopid pdo ppolagrangian",
+    "trpo_lagrangian": "trpolag trpopid ctrpolag",
+    "sac_lagrangian": "saclag sacpid csac sacl",
+    "td3_lagrangian": "td3lag td3pid ctd3",
+    "crpo": "oncrpo",
+    "ppo": "ppoearlyterminated pposaute pposimmerpid",
+}
+"""Name of an algorithm -> what other libraries call it, without dashes."""
 _ALWAYS = ("env", "algo", "logger", "hydra.run.dir", "+note")
 
 
@@ -83,6 +95,19 @@ def keys_meant(
     if whole is not None or end is None:
         return [] if whole is None else [whole]
     return _ending(end, paths)
+
+
+def algorithm_meant(name: str, known: Sequence[str]) -> str:
+    """Say which algorithm a wrong name means: by its name elsewhere, or the most alike.
+
+    Examples:
+        >>> algorithm_meant("CPPO", ["ppo", "ppo_lagrangian"])
+        " Did you mean 'ppo_lagrangian'?"
+    """
+    word = name.lower().replace("-", "").replace("_", "")
+    found = (own for own, words in _ALGORITHMS_ELSEWHERE.items() if word in words.split())
+    own = next(found, None)
+    return did_you_mean(name, known) if own is None else f" Did you mean '{own}'?"
 
 
 def _elsewhere(name: str, written: Sequence[str]) -> list[str]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any, Literal, get_args
+from typing import Any, Literal, get_args
 
 import torch
 from tensordict import TensorDictBase
@@ -11,7 +11,7 @@ from torch import Tensor
 
 from safe_rl.objectives.multipliers import Multiplier
 from safe_rl.objectives.surrogate import SurrogateLoss, lagrangian, require_multiplier
-from safe_rl.ranges import Range
+from safe_rl.ranges import Fraction
 
 #: How PPO bounds the gain of lowering costs; see `PPOLagrangianLoss`.
 CostClipping = Literal["none", "pessimistic", "joint"]
@@ -68,7 +68,7 @@ class PPOLoss(SurrogateLoss):
         self,
         actor_network: ProbabilisticTensorDictSequential,
         *,
-        clip_epsilon: Annotated[float, Range(0, 1000, above=True)],
+        clip_epsilon: Fraction,
         **settings: Any,
     ) -> None:
         super().__init__(actor_network, **settings)
