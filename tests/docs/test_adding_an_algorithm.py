@@ -41,7 +41,7 @@ def test_a_loss_a_configuration_and_a_test_make_an_algorithm(folder):
     )
     build_trainer(config, PointMass(config.num_envs), folder / "run").run()
     config.cost_advantage = None
-    with pytest.raises(ValueError, match="QuadraticPenaltyLoss needs cost_advantage"):
+    with pytest.raises(ValueError, match="is constrained and has no cost_advantage"):
         build_trainer(config, PointMass(config.num_envs), folder / "without")
     penalties = read_table(folder / "run" / "progress.csv")["policy_loss_penalty"]
     assert len(penalties) == 3
