@@ -94,6 +94,8 @@ def read_command(words: Sequence[str]) -> Command:
     is_sweep = _is_sweep(flags, overrides)
     overrides = _with_folders(flags, expand_slate(overrides, is_sweep)) + note_imports(modules)
     is_shown = bool(_SHOWN & flags.keys())
+    if is_sweep and not is_shown:
+        overrides = _with_launcher(overrides)
     configs = compose_jobs(overrides, sweep=is_sweep, shown=is_shown, **_main_file(flags))
     return Command(flags, overrides, None, configs)
 
@@ -265,11 +267,14 @@ def _main_file(flags: Mapping[str, Sequence[str]]) -> dict[str, Any]:
     return {"folder": Path(folder).absolute(), "name": name}
 
 
-def _has_joblib() -> bool:
+def _with_launcher(words: Sequence[str]) -> list[str]:
+    """Overrides of a sweep with joblib's launcher, where it is installed and none is chosen."""
+    is_chosen = any(word.startswith("hydra/launcher=") for word in words)
     try:
-        return find_spec("hydra_plugins.hydra_joblib_launcher") is not None
+        has_joblib = find_spec("hydra_plugins.hydra_joblib_launcher") is not None
     except ModuleNotFoundError:
-        return False
+        has_joblib = False
+    return [*words, *(["hydra/launcher=joblib"] if has_joblib and not is_chosen else [])]
 
 
 def _is_sweep(flags: Mapping[str, Sequence[str]], overrides: Sequence[str]) -> bool:
@@ -288,8 +293,6 @@ def _ask_hydra(command: Command) -> int:
 
         with resolving(command.configs[0]):
             check_writable(Path(command.configs[0].hydra.sweep.dir), "hydra.sweep.dir")
-        is_told = any(word.startswith("hydra/launcher=") for word in words)
-        words = [*words, *(["hydra/launcher=joblib"] if _has_joblib() and not is_told else [])]
     # overrides hold the folders of what was composed
     known = {"--config-path", "--config-name", *(["--config-dir"] if command.configs else [])}
     given = [f"{k}={v[0]}" if v else k for k, v in flags.items() if k not in known]

@@ -12,6 +12,7 @@ from hydra.core.utils import JobReturn, JobStatus
 from omegaconf import OmegaConf
 
 from safe_rl.cli.sweeps import SweepReport, count_jobs, threads_per_job
+from safe_rl.cli.train import read_command
 from safe_rl.runs.checkpoint_file import read_facts
 from safe_rl.runs.folder import runs_below
 
@@ -194,3 +195,9 @@ def test_jobs_have_their_folders_for_themselves_and_end_with_the_sweep(tmp_path)
     for run in runs_below(tmp_path):
         epoch = read_facts(run.newest_checkpoint())["epoch"]
         assert epoch == run.num_rows
+
+
+def test_settings_of_the_launcher_are_known_without_choosing_it():
+    pytest.importorskip("hydra_plugins.hydra_joblib_launcher", reason="needs the extra 'sweep'")
+    command = read_command(["-m", "env=PointGoal1", "seed=0,1", "hydra.launcher.n_jobs=2"])
+    assert command.configs[0].hydra.launcher.n_jobs == 2

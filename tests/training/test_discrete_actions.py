@@ -97,7 +97,8 @@ def test_a_cliff_is_walked_along_or_kept_away_from(algo, tmp_path):
     """Optimal: a return of 4 at a cost of 5 without a limit, 2.67 at a cost of 3 with it."""
     cliff = ("env.id=Cliff-v0", "env.flatten=true", "num_envs=20", "frames_per_batch=2000")
     run_train(
-        *SMALL, *cliff, f"algo={algo}", "cost_limits={cost: 3}", "frames=80_000",
+        *SMALL[:4], "model.hidden_sizes=[8]", *cliff, f"algo={algo}",
+        "cost_limits={cost: 3}", "frames=80_000",
         *(() if algo == "cpo" else ("policy_update.minibatch_size=500",)),
         "critic_update.minibatch_size=500", f"hydra.run.dir={tmp_path}",
     )  # fmt: skip
