@@ -49,7 +49,7 @@ BOMB = "a: &a [x, x]\n" + "".join(
         ("a: !!bool perhaps", "cannot be read"),
         ("[a]: b", "cannot be read"),
         (BOMB, "aliases"),
-        ("[" * 5000, "more than 100 levels"),
+        ("[" * 5000, "more than 100 levels|increasing flow level"),
         ("a: " + "x" * 1_000_001, "more than 1,000,000 bytes"),
         (b"\xff\xfe\x00", "cannot be read"),
     ],
