@@ -116,13 +116,16 @@ def three_million(env, algo, seed):
 def test_the_tables_of_three_million_steps_are_those_of_the_archive(
     env, algo, seeds, cells, certified
 ):
-    first, *final = map(int, re.findall(r"\d+", seeds))
-    numbers = range(first, (final or [first])[0] + 1)
+    first, *others = map(int, re.findall(r"\d+", seeds))
+    numbers = range(first, (others or [first])[0] + 1)
     folders = [three_million(env, algo, number) for number in numbers]
-    returns, costs = np.mean([last(folder, 1 / 6) for folder in folders], axis=0)
+    of_runs = np.array([last(folder, 1 / 6) for folder in folders])
+    final = [f"{mean:.1f}" for mean in of_runs.mean(0)]
+    if "±" in cells:
+        final = [f"{m} ± {d:.1f}" for m, d in zip(final, of_runs.std(0, ddof=1), strict=True)]
     mean_cost, above = np.mean([held(folder) for folder in folders], axis=0)
     assert cells.split(" | ") == [
-        f"{returns:.1f} / {costs:.1f}",
+        " / ".join(final),
         f"{mean_cost:.1f}",
         percent(above),
         certified(folders),
