@@ -99,13 +99,18 @@ def train(
 
 
 def resume(
-    directory: str | Path, *, imports: str | Sequence[str] | None = None, **settings: Any
+    directory: str | Path,
+    *,
+    imports: str | Sequence[str] | None = None,
+    callbacks: Sequence[Callback] = (),
+    **settings: Any,
 ) -> Run:
     """Continue a run, as ``python train.py resume=…`` does; a finished one stays as it is.
 
     Args:
         directory: Folder of the run.
         imports: Modules that it needs; as in :func:`load`.
+        callbacks: As in :func:`train`.
         settings: What to change from now on: ``frames=500_000``,
             ``policy_update={"max_kl": 0.01}``.
 
@@ -126,7 +131,13 @@ def resume(
     folder = Path(directory).expanduser()
     config = compose_resumed(folder, overrides_of(settings, _WHOLE), modules)
     return _carry_out(
-        Session(config, folder, continues=True, otherwise=_otherwise(folder), quiet=True)
+        Session(
+            *(config, folder),
+            continues=True,
+            otherwise=_otherwise(folder),
+            quiet=True,
+            callbacks=callbacks,
+        )
     )
 
 

@@ -30,7 +30,9 @@ _LARGE = ("env", "algo", "preset")
 _LISTS = ("transforms",)
 
 _ELSEWHERE = {
-    "frames": "total_steps total_timesteps total_frames timesteps max_steps epochs max_epochs",
+    "frames": (
+        "total_steps total_timesteps total_frames timesteps max_steps epoch epochs max_epochs"
+    ),
     "frames_per_batch": "n_steps rollout_length step_per_epoch steps_per_epoch",
     "num_passes": "n_epochs update_iters repeat_per_collect",
     "num_envs": "n_envs vector_env_nums training_num",

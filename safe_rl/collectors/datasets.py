@@ -36,7 +36,6 @@ _OF_AN_EPISODE: dict[NestedKey, str] = {
     ("next", "truncated"): "truncations",
 }
 _EPISODE = r"episode_(\d+)"
-_MOST_LEVELS = 4  # of groups; Minari's files have three
 _NUMBERS = "biuf"  # kinds of NumPy's types
 _FLAGS = (("next", "terminated"), ("next", "truncated"))
 _VECTORS = ("observation", "action", ("next", "observation"))
@@ -131,16 +130,22 @@ def _check_tree(path: Path | str, file: Any, h5py: Any) -> None:
         ValueError: If so.
     """
     left = 1000 * Path(path).stat().st_size  # more than any compression of HDF5's makes of it
-    groups = [(file, 0)]
+    groups, seen = [file], set()
     while groups:
-        group, level = groups.pop()
+        group = groups.pop()
         for name in group:
             if not isinstance(group.get(name, getlink=True), h5py.HardLink):
                 raise ValueError(f"{path}: {name} is a link, and only arrays are read.")
             node = group[name]
-            if isinstance(node, h5py.Group) and level < _MOST_LEVELS:
-                groups.append((node, level + 1))
+            place = h5py.h5o.get_info(node.id).addr
+            if place in seen:  # a group may hold itself
+                continue
+            seen.add(place)
+            if isinstance(node, h5py.Group):
+                groups.append(node)
             elif isinstance(node, h5py.Dataset):
+                if node.external or node.is_virtual:
+                    raise ValueError(f"{path}: the numbers of {name} are in other files.")
                 left -= node.nbytes
         if left < 0:
             raise ValueError(f"{path} declares a thousand times more numbers than fit into it.")

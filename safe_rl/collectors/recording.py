@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import shutil
 import tempfile
 from collections.abc import Mapping, Sequence
@@ -217,8 +218,10 @@ def _read_entries(place: Path) -> TensorDict:
 
 def _read_tensor(path: Path, note: Mapping[str, Any]) -> Tensor:
     dtype = getattr(torch, str(note["dtype"]).removeprefix("torch."))
-    shape = torch.Size(note["shape"])
-    size = shape.numel() * dtype.itemsize
+    shape = [int(length) for length in note["shape"]]
+    if min(shape, default=0) < 0:
+        raise ValueError(f"{path.name} would have the shape {shape}")
+    size = math.prod(shape) * dtype.itemsize
     content = read_bounded(path, size)
     if len(content) < size:
         raise ValueError(f"{path.name} has {len(content):,} bytes of {size:,}")

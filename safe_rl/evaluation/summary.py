@@ -27,8 +27,10 @@ def check_places(places: Iterable[Path]) -> None:
         OSError: If one cannot be.
         ValueError: If the folder holds links.
     """
+    places = list(places)
+    for folder in {place.parent for place in places}:
+        check_no_links(folder)
     for place in places:
-        check_no_links(place.parent)
         check_place(place, "A run's evaluations lie in its folder: evaluate a copy of that.")
 
 

@@ -39,8 +39,9 @@ class ProgressBar:
         self._limits, self._episode_length = limits, episode_length
         self._before: Mapping[str, float] | None = None
         self._closed = Event()
+        self._redrawing = Thread(target=self._redraw, daemon=True)
         if not self._bar.disable and sys.stderr.isatty():
-            Thread(target=self._redraw, daemon=True).start()
+            self._redrawing.start()
 
     def add(self, row: Mapping[str, float]) -> None:
         """Show an epoch, by columns of the table."""
@@ -52,6 +53,8 @@ class ProgressBar:
     def close(self) -> None:
         """Leave the bar as it is."""
         self._closed.set()
+        if self._redrawing.is_alive():  # else it could draw a closed bar once more
+            self._redrawing.join()
         self._bar.close()
 
     def _redraw(self) -> None:
@@ -141,6 +144,9 @@ def outcome_line(
         >>> table |= {"episode_return": [1.0, 2.0], "episode_cost": [30.0, 20.0]}
         >>> outcome_line(table, {"cost": 25.0}, 1000)
         'Return 1.50, cost 25.0 (limit 25) per episode, mean of steps 1 to 2,000; 500 steps/s'
+        >>> table |= {"episode_return": [math.nan] * 2, "reward_rate": [0.001, 0.002]}
+        >>> outcome_line(table, {"cost": 25.0}, 1000).partition(";")[0]
+        'No episode of 1,000 steps has ended: return 2.00, cost 30.0 (limit 25) per 1,000 steps'
     """
     keys = list(limits) or ["cost"]
     final = final_figures(table, keys)
@@ -154,6 +160,8 @@ def outcome_line(
     else:
         scale = _RATE_STEPS / episode_length
         what = f"No episode of {episode_length:,} steps has ended"
+        if "reward_rate" in table:
+            what += f": return {_RATE_STEPS * table['reward_rate'][-1]:.2f}"
         values = {key: f"{_RATE_STEPS * final[f'{key}_rate']:.1f}" for key in keys}
         over = f"per {_RATE_STEPS:,} steps"
     for key, value in values.items():

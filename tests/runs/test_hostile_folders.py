@@ -113,6 +113,7 @@ def test_reading_follows_no_link_and_writes_to_none(recording, tmp_path):
     ("changes", "message"),
     [
         ({"shape": [10**9, 10**9]}, "action.memmap has 640 bytes"),
+        ({"shape": [-1, 20, 2]}, "would have the shape"),
         ({"dtype": "torch.load"}, "cannot be read as steps"),
         ({"shape": "many"}, "cannot be read as steps"),
     ],
