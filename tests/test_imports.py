@@ -148,9 +148,8 @@ FLOORS = {
         ("",),
     ),
     "cli": (
-        ("", "grammar", "robots", "values"),
-        ("keys",),
-        ("settings", "user_code"),
+        ("", "grammar", "robots"),
+        ("schema", "user_code"),
         ("suggestions", "sweeps"),
         ("composing",),
         ("certificates", "report", "resuming"),

@@ -7,7 +7,7 @@ from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
 
-from safe_rl.cli.keys import KEYS
+from safe_rl.cli.schema import KEYS
 from safe_rl.targets import accepted_names, locate
 
 NODES = ("memory",)

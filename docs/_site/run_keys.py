@@ -12,12 +12,10 @@ from omegaconf import DictConfig, OmegaConf
 from tables import table
 
 from safe_rl.cli.composing import CONF
-from safe_rl.cli.keys import KEYS
-from safe_rl.cli.settings import keys_of_part
-from safe_rl.cli.values import anything, mapping_of
+from safe_rl.cli.schema import KEYS, keys_of_part
 from safe_rl.envs import store_configs
 from safe_rl.parameters import Parameter
-from safe_rl.ranges import Values
+from safe_rl.ranges import Options, Values, values_of
 from safe_rl.targets import locate
 
 _HEAD = ("key", "may be", "default", "meaning")
@@ -46,7 +44,7 @@ def run_keys() -> str:
 
 
 def _words(values: Values) -> str:
-    return values.words.replace(mapping_of(anything).words, "further keys")
+    return values.words.replace(values_of(Options).words, "further keys")
 
 
 def _default(configs: list[DictConfig], path: str) -> str:

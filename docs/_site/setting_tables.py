@@ -8,7 +8,7 @@ from typing import Any
 import replay_loops
 from omegaconf import DictConfig, OmegaConf
 
-from safe_rl.cli.settings import keys_of_part
+from safe_rl.cli.schema import keys_of_part
 from safe_rl.targets import locate
 
 # nodes of a configuration that are an algorithm's own

@@ -10,8 +10,8 @@ from typing import Any
 from omegaconf import DictConfig, OmegaConf
 
 from safe_rl.cli.composing import CONF
-from safe_rl.cli.keys import KEYS
 from safe_rl.cli.robots import maker_of
+from safe_rl.cli.schema import KEYS
 from safe_rl.evaluation import Certificate, CertificateOptions, certify
 from safe_rl.evaluation.loading import load_config
 from safe_rl.naming import did_you_mean

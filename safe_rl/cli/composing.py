@@ -18,8 +18,7 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from safe_rl.cli.grammar import CommandLineError, parse
-from safe_rl.cli.keys import KEYS
-from safe_rl.cli.settings import check_settings, plain
+from safe_rl.cli.schema import KEYS, check_settings, plain
 from safe_rl.cli.suggestions import (
     COMPOSING_ERRORS,
     Composing,

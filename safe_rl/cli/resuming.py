@@ -14,7 +14,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from safe_rl.cli.composing import check_once, check_read
 from safe_rl.cli.grammar import CommandLineError, parse
-from safe_rl.cli.settings import check_settings, plain
+from safe_rl.cli.schema import check_settings, plain
 from safe_rl.cli.suggestions import nobody_reads
 from safe_rl.cli.user_code import check_imports, note_imports
 from safe_rl.files import read_config, read_yaml

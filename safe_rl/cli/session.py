@@ -29,7 +29,7 @@ from safe_rl.cli.certificates import (
 )
 from safe_rl.cli.grammar import CommandLineError
 from safe_rl.cli.robots import keep_robot, robot_of
-from safe_rl.cli.settings import check_settings
+from safe_rl.cli.schema import check_settings
 from safe_rl.cli.user_code import imported, make_after_imports
 from safe_rl.envs import ConfigError, ContractError, LayoutError, complete_env, make_env
 from safe_rl.evaluation.episodes import default_seed, has_fixed_layout

@@ -11,8 +11,7 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 from yaml import YAMLError
 
-from safe_rl.cli.keys import KEYS
-from safe_rl.cli.settings import SettingError, optional_keys, plain
+from safe_rl.cli.schema import KEYS, SettingError, optional_keys, plain
 from safe_rl.naming import did_you_mean, nearest
 
 __all__ = [

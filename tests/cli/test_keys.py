@@ -12,10 +12,9 @@ from run_configs import CONF
 
 import safe_rl.objectives
 from safe_rl.algorithms.build_part import find_recipe
-from safe_rl.cli.keys import KEYS
-from safe_rl.cli.settings import SettingError, check_settings, keys_of_part, plain
-from safe_rl.cli.values import anything
+from safe_rl.cli.schema import KEYS, SettingError, check_settings, keys_of_part, plain
 from safe_rl.envs import ConfigError, SafetyGymConfig, resolve
+from safe_rl.ranges import ANYTHING
 from safe_rl.targets import TargetError, accepted_names, locate
 
 ALGORITHMS = sorted(path.stem for path in (CONF / "algo").glob("*.yaml"))
@@ -28,7 +27,7 @@ LIVE = {
     *("env", "make_env", "policy", "frames_per_batch", "device", "log_dir", "kwargs"),
 }
 MAPPINGS = ("cost_limits", "default_cost_limits", "model.input_scale", "policy_update.rates")
-FREE = {path for path, row in KEYS.items() if row.values is anything}
+FREE = {path for path, row in KEYS.items() if row.values is ANYTHING}
 WRONG: list[Any] = [
     *("abc", "", "a\nb", None, True, math.nan, math.inf, -math.inf, -1, 0, 0.5, 1.5),
     *(1e9, 1e300, 10**30, [], {}, [math.nan], ["a"], {"a": math.nan}, {"_target_": "os.system"}),

@@ -8,8 +8,8 @@ from omegaconf import OmegaConf
 from run_configs import CONF
 
 from safe_rl.cli.grammar import CommandLineError
+from safe_rl.cli.schema import SettingError
 from safe_rl.cli.session import check_writable
-from safe_rl.cli.settings import SettingError
 from safe_rl.cli.train import read_command
 
 MINE = """

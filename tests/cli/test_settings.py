@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 from run_configs import point_mass_config
 
-from safe_rl.cli.settings import SettingError, check_settings
+from safe_rl.cli.schema import SettingError, check_settings
 
 ROOT = Path(__file__).parents[2]
 WRONG = {

@@ -9,7 +9,7 @@ import navigation
 import pytest
 import yaml
 
-from safe_rl.cli.keys import KEYS
+from safe_rl.cli.schema import KEYS
 from safe_rl.envs import SUITE, key_table
 from safe_rl.envs.safety_gym.costs import COSTS
 

@@ -9,7 +9,7 @@ from torchrl.data import Binary, Bounded, MultiCategorical, MultiOneHot, OneHot
 from torchrl.data import Categorical as CategoricalSpec
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-from safe_rl.cli.keys import KEYS
+from safe_rl.cli.schema import KEYS
 from safe_rl.models.heads import HEADS, make_head
 from safe_rl.models.networks import assemble_actor, perceptron
 from safe_rl.objectives.distributions import entropy, has_closed_kl, kl

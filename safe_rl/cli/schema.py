@@ -1,0 +1,299 @@
+"""The keys of a run: what each may hold and what it means, and the check of a configuration.
+
+Keys of parts are described by the signatures of these, keys of environments by the environments;
+defaults are in ``conf/``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from typing import Annotated, Any, Literal, NamedTuple
+
+from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+
+from safe_rl.cli.robots import robot_of
+from safe_rl.envs import complete_env
+from safe_rl.evaluation.settings import check_device
+from safe_rl.extras import check_extra
+from safe_rl.naming import did_you_mean
+from safe_rl.parameters import Parameter, SettingError, parameters_of
+from safe_rl.ranges import (
+    PART,
+    Bytes,
+    Count,
+    MaxLength,
+    NotNegative,
+    Options,
+    Positive,
+    Range,
+    Share,
+    Text,
+    Values,
+    bytes_each,
+    is_text,
+    values_of,
+)
+from safe_rl.runs.folder import RunFolder
+from safe_rl.targets import accepted_names, constructors, locate, takes_any
+
+__all__ = ["KEYS", "SettingError", "check_settings", "keys_of_part", "optional_keys", "plain"]
+
+_FOLDER = Values(lambda v: is_text(v) and "/" not in v, "a text that is not empty and has no /")
+_FOLDER_OF_ENV = f"{_FOLDER.words}: it names folders, and env.name=… gives another name"
+
+
+def _int(low: int, high: int | None = None, *more: Any) -> Any:
+    return Annotated[int, Range(low, high), *more]
+
+
+_Width = Annotated[int, Range(1, 16_384)]
+_Widths = Annotated[list[_Width], MaxLength(32)]
+_Limits = dict[str, NotNegative]
+_Part = Annotated[Any, PART]
+_Few = _int(0, 1000)
+_Kept = _int(1, 10_000)
+_Level = Annotated[float, Range(0.5, 1, above=True, below=True)]
+_Head = Literal["auto", "gaussian", "tanh", "beta", "categorical", "one_hot"]
+
+_REQUIRED: dict[str, tuple[Any, str]] = {
+    "frames": (Count, "steps to train for"),
+    # a world of the smallest robot, and a step with one number of observation
+    "num_envs": (_int(1, None, Bytes(20_000)), "environments that are stepped together"),
+    "frames_per_batch": (_int(1, None, Bytes(50)), "steps of all environments in one batch"),
+    # evaluations add to a seed, and environments count in 64 bits
+    "seed": (_int(0, 2**62), "seed of the run"),
+    "init_from": (Text | None, "folder or checkpoint of the run to start from"),
+    "cost_limits": (_Limits, "cost allowed per episode, by cost: '{cost: 25}'"),
+    "device": (Text, "where networks are trained: cpu or cuda"),
+    # torch starts all of them at once, and crashes where the system gives it no more
+    "num_threads": (_int(1, 1024) | None, "threads of physics and torch; null: all cores"),
+    "compile": (bool, "whether to compile the losses"),
+    "preset": (Text, "set of defaults: default or paper"),
+    "env": (Options, "the environment: env=PointGoal1"),
+    "env.name": (Annotated[str, _FOLDER._replace(words=_FOLDER_OF_ENV)], "name of the environment"),
+    "algo": (Options, "the algorithm: algo=cpo"),
+    "algo.name": (Annotated[str, _FOLDER], "name of the algorithm"),
+    "checkpoint": (Options, "when checkpoints are written"),
+    "checkpoint.interval": (NotNegative, "seconds between checkpoints"),
+    "checkpoint.keep_last": (_Kept, "checkpoints that are kept besides the best"),
+    "collector": (Options, "where environments are stepped: collector=local"),
+    "collector.num_collectors": (_int(1, 1024), "processes that step environments"),
+    "logger": (Options, "where else columns go: logger=wandb; logger=none: nowhere"),
+    "model": (Options, "the networks"),
+    "model.hidden_sizes": (_Widths, "widths of layers, such as [64, 64]"),
+    "model.initial_log_std": (
+        Annotated[float, Range(-20, 10)],
+        "log of the policy's first standard deviation",
+    ),
+    "model.input_scale": (dict[str, Positive], "factors by observation component"),
+    "model.encoders.vector": (_Widths, "widths of layers for a vector"),
+    "model.encoders.channels": (_Widths, "channels of convolutions for an image"),
+    "model.encoders.kernels": (_Widths, "sizes of their kernels [pixels]"),
+    "model.encoders.strides": (_Widths, "their strides [pixels]"),
+    "model.memory.size": (_Width, "size of the recurrent state"),
+    "critics.rewards": (_Few, "Q functions of the reward"),
+    "critics.costs": (_Few, "Q functions of the costs"),
+    "dataset.path": (Text | None, "folder of a recording, or an HDF5 file"),
+    "dataset.safe_episodes": (bool, "whether only episodes within cost_limits are taken"),
+    "dataset.alone": (bool, "whether to learn from the dataset only"),
+    "exploration.random_steps": (_int(0), "steps taken at random first"),
+}
+"""What every run has, and every section (``model`` and the like) that a run has."""
+_OPTIONAL: dict[str, tuple[Any, str]] = {
+    "default_cost_limits": (_Limits | None, "cost_limits unless given"),
+    "record": (bool, "whether transitions are written to disk"),
+    "note": (Any, "a note on the run, kept in its config.yaml"),
+    "import": (Any, "modules of your own, imported first"),
+    "paper": (Any, "numbers that preset=paper chooses from"),
+    "replay": (Any, "off-policy defaults, which preset=default reads"),
+    "transforms": (dict[str, _Part], "what changes the problem: transforms=[saute]"),
+    "staggered_starts": (bool | None, "whether first episodes are cut to different lengths"),
+    "algo.constrained": (bool, "whether cost_limits are kept, or costs only counted"),
+    "checkpoint.keep_best": (_Kept, "best checkpoints kept"),
+    "checkpoint.best_over": (_Kept, "epochs that the best are averaged over"),
+    "certificate": (Options, "the test at a run's end; certificate.episodes=0 for none"),
+    "certificate.ranking": (_int(2, 10**6), "episodes per candidate that rank them"),
+    "certificate.episodes": (_int(0, 10**6), "new episodes of a test; 0: none"),
+    "certificate.tests": (_int(1, 1000), "candidates tested at most"),
+    "certificate.retest": (_Few, "if none passes: times the episodes of one more test"),
+    "certificate.level": (_Level, "confidence of a certificate"),
+    "certificate.most_over": (Share, "share of episodes that may exceed a limit"),
+    "model.head": (_Head, "distribution of the actions"),
+    "model.normalise": (Positive | None, "bound of normalised observations; null: not normalised"),
+    "model.encoders": (Options | None, "encoders of observed entries: model=dict, model=cnn"),
+    "model.memory": (Options | None, "recurrence: model=gru"),
+    "advantage": (_Part, "estimator of the reward's advantages"),
+    "cost_advantage": (_Part | None, "estimator of the costs' advantages"),
+    "lagrangian": (_Part | None, "the multiplier"),
+    "risk": (Options | None, "what is limited: risk=mean, cvar or chance"),
+    "limits": (Options | None, "how the limit is approached: limits=default or paper"),
+    "memory": (_Part, "the replay buffer, off policy"),
+    "actor": (_Part, "the policy's network, off policy"),
+    "critics": (Options, "sizes of the ensembles of Q functions"),
+    "dataset": (Options, "recorded transitions that the replay buffer begins with"),
+    "exploration": (Options, "exploration, off policy"),
+    "exploration.noise": (NotNegative, "standard deviation of a deterministic actor's noise"),
+    "evaluation": (Options | None, "evaluation while training"),
+    "evaluation.interval": (Count, "steps between evaluations"),
+    "evaluation.episodes": (_int(1, 10**6), "episodes of an evaluation"),
+    "loss": (_Part, "the policy's loss"),
+    "policy_update": (_Part, "what moves the policy"),
+    "then": (dict[str, dict[str, _Part]], "losses and updates after policy_update"),
+    "critic_update": (_Part, "what moves the critics"),
+}
+
+KEYS = {
+    path: Parameter(values_of(kind), meaning, bytes_each(kind), is_required=rows is _REQUIRED)
+    for rows in (_REQUIRED, _OPTIONAL)
+    for path, (kind, meaning) in rows.items()
+}
+"""By full path: all keys but those of parts and environments."""
+_CLOSED = ("model", "model.encoders", "model.memory", "logger", "checkpoint", "certificate",
+           "collector", "critics", "dataset", "evaluation", "exploration")  # fmt: skip
+"""Sections whose keys are all in the table, unless they are a part."""
+_OF_PARTS = {"_partial_": Parameter(values_of(bool), "whether it is built later")}
+
+
+class _Node(NamedTuple):
+    """A mapping of a configuration that has keys with rows.
+
+    Attributes:
+        path: Its key.
+        values: What it holds.
+        rows: Its keys, as far as they are described.
+        names: All keys that are read there; None if others may be.
+        part: What is built from it, if something is.
+    """
+
+    path: str
+    values: Mapping[str, Any]
+    rows: Mapping[str, Parameter]
+    names: list[str] | None = None
+    part: Callable[..., Any] | None = None
+
+
+def check_settings(config: DictConfig, folder: RunFolder | None = None) -> None:
+    """Check every key of a configuration: the run's by `KEYS`, those of parts by their signatures.
+
+    Custom parts are checked like the package's. Whole numbers that are written as 3e5 become
+    integers.
+
+    Args:
+        config: Configuration as composed from ``conf/``.
+        folder: That of a run that is continued, if it is; its robot is checked.
+
+    Raises:
+        SettingError: For the first key that does not exist or holds what it cannot.
+        TargetError: For a part that cannot be built.
+        ConfigError: For one of the environment's.
+    """
+    values = plain(config)
+    for node in _nodes(values):
+        for name, row in node.rows.items():
+            path = _join(node.path, name)
+            if name in node.values:
+                row.check(path, node.values[name])
+                if row.values.whole:
+                    OmegaConf.update(config, path, _whole(node.values[name]), merge=False)
+            elif row.is_required and node.part is None:
+                raise SettingError(f"{path} is missing: {row.meaning}.")
+        _check_part(node)
+    try:
+        check_device(values["device"])
+    except ValueError as error:
+        raise SettingError(str(error)) from None
+    number = values["collector"]["num_collectors"]
+    if values["collector"].get("_target_") is None and number != 1:
+        raise SettingError(
+            f"collector.num_collectors={number}: collector=local is one process; for more use "
+            "collector=process or collector=ray."
+        )
+    complete_env(values["env"] if folder is None else robot_of(folder, values["env"])[0])
+
+
+def plain(config: DictConfig) -> dict[str, Any]:
+    """A configuration as dictionaries and lists, without Hydra's own node.
+
+    Raises:
+        SettingError: If a value refers to one that is not there.
+    """
+    try:
+        own = OmegaConf.masked_copy(config, [str(key) for key in config if key != "hydra"])
+        return OmegaConf.to_container(own, resolve=True)  # type: ignore[return-value]
+    except OmegaConfBaseException as error:
+        raise SettingError(f"{error.full_key}: {str(error).partition(chr(10))[0]}") from None
+
+
+def optional_keys(values: Mapping[str, Any]) -> Iterator[str]:
+    """Full paths of what a configuration does not hold and its parts would read."""
+    for node in _nodes(values):
+        if node.part is not None:
+            known = keys_of_part(node.part)
+            yield from (_join(node.path, name) for name in known if name not in node.values)
+
+
+def keys_of_part(found: Callable[..., Any]) -> dict[str, Parameter]:
+    """Hyper-parameters of what a configuration can build, by name."""
+    return {name: row for name, row in _rows(found).items() if row.is_described}
+
+
+def _nodes(values: Mapping[str, Any], path: str = "") -> Iterator[_Node]:
+    """What has keys with rows, each before what is within it; of environments only the name."""
+    target = values.get("_target_")
+    if target is not None and path != "algo":
+        part = locate(target, f"{path}._target_")
+        yield _Node(path, values, {**_OF_PARTS, **_rows(part)}, _names(part), part)
+    else:
+        head = f"{path}." if path else ""
+        rows = {key.removeprefix(head): row for key, row in KEYS.items() if key.startswith(head)}
+        own = {name: row for name, row in rows.items() if "." not in name}
+        yield _Node(path, values, own, list(own) if path in _CLOSED else None)
+    for name, value in values.items():
+        if (path, name) == ("", "env"):
+            yield _Node("env", value, {"name": KEYS["env.name"]})
+        elif isinstance(value, Mapping):
+            yield from _nodes(value, _join(path, name))
+
+
+def _check_part(node: _Node) -> None:
+    """Check that a part's packages are there, and that what a node holds is read."""
+    try:
+        check_extra(node.part)
+    except ModuleNotFoundError as error:
+        raise SettingError(f"{node.path}: {error}") from None
+    names = list(node.values) if node.names is None else node.names
+    for name in node.values:
+        if name not in names and not str(name).startswith("_"):
+            path, known = _join(node.path, name), [_join(node.path, key) for key in names]
+            raise SettingError(f"{path}: nothing reads this key.{did_you_mean(path, known)}")
+
+
+def _rows(found: Callable[..., Any]) -> Mapping[str, Parameter]:
+    """What the signature of a part says of its arguments; nothing if it has none to read."""
+    try:
+        return parameters_of(found)
+    except (AttributeError, TypeError, ValueError):
+        return {}
+
+
+def _names(found: Callable[..., Any]) -> list[str] | None:
+    """Arguments that a part takes; None if it takes any, or cannot be known."""
+    try:
+        known = constructors(found)
+        ours = all(function.__module__.startswith("safe_rl.") for function in known)
+        # the package's constructors hand on all that they do not name, others may use it
+        last = known[-1] if ours else known[0]
+        return None if takes_any(last) else sorted(accepted_names(found))
+    except (AttributeError, TypeError, ValueError):
+        return None
+
+
+def _whole(value: Any) -> Any:
+    if isinstance(value, list):
+        return [_whole(item) for item in value]
+    return int(value) if isinstance(value, float) else value
+
+
+def _join(path: str, name: str) -> str:
+    return f"{path}.{name}" if path else str(name)
