@@ -85,8 +85,7 @@ FLOORS = {
         ("gymnasium.conversion",),
         ("gymnasium.six_values",),
         ("gymnasium",),
-        ("torchrl.step_costs",),
-        ("torchrl.observed_entries",),
+        ("torchrl.step_entries",),
         ("torchrl.torchrl_env",),
         ("torchrl",),
         # What changes any of them from outside.

@@ -1,4 +1,4 @@
-"""Names of costs, and ranges that cost something to leave: what foreign families have in common."""
+"""Names of costs, and ranges that cost something to leave."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ _ENTRY_FORM = (
 
 
 class CostRange(NamedTuple):
-    """The numbers that cost nothing.
+    """A range of a number that costs nothing.
 
     Attributes:
-        entry: Name of an entry, with dots where it is nested.
-        column: Column of the entry's numbers, counted from 0.
+        entry: Name of the entry, with dots where it is nested.
+        column: Column of the entry, counted from 0.
         low: Lowest number that costs nothing.
         high: Highest one.
     """
@@ -37,68 +37,48 @@ def is_cost(name: Any) -> bool:
     return name == COST or str(name).startswith(f"{COST}_")
 
 
-def parse_columns(key: str, outside: Any) -> dict[str, CostRange]:
-    """Return ranges of columns of the observation, by the name of their cost.
+def parse_ranges(outside: Any, entry: str | None = None) -> dict[str, CostRange]:
+    """Return the ranges of the key `outside` by the name of their cost.
 
     Args:
-        key: The key that holds them, for messages.
-        outside: Name -> (column, lowest, highest); None is no range at all.
+        outside: Name -> (column, lowest, highest) of `entry`; without `entry`, name -> (entry,
+            lowest, highest) or (entry, column, lowest, highest). None is no range at all.
+        entry: The entry that all columns belong to.
 
     Raises:
         ConfigError: Naming what is wrong.
 
     Examples:
-        >>> parse_columns("outside", {"cost_position": [0, -0.5, 0.5]})
-        {'cost_position': CostRange(entry='observation', column=0, low=-0.5, high=0.5)}
-    """
-    rows = _rows(key, outside, _COLUMN_FORM)
-    return {
-        name: _range(key, name, ["observation", *row], row, _COLUMN_FORM)
-        for name, row in rows.items()
-    }
-
-
-def parse_entries(key: str, outside: Any) -> dict[str, CostRange]:
-    """Return ranges of entries by the name of their cost, as :func:`parse_columns`.
-
-    Args:
-        key: The key that holds them, for messages.
-        outside: Name -> (entry, lowest, highest) or (entry, column, lowest, highest), or None.
-
-    Raises:
-        ConfigError: Naming what is wrong.
-
-    Examples:
-        >>> parse_entries("outside", {"cost_speed": ["thdot", -4, 4]})
+        >>> parse_ranges({"cost_speed": ["thdot", -4, 4]})
         {'cost_speed': CostRange(entry='thdot', column=0, low=-4, high=4)}
+        >>> parse_ranges({"cost_position": [0, -0.5, 0.5]}, "observation")["cost_position"].entry
+        'observation'
     """
-    rows = _rows(key, outside, _ENTRY_FORM)
-    return {
-        name: _range(key, name, [row[0], 0, *row[1:]] if len(row) == 3 else row, row, _ENTRY_FORM)
-        for name, row in rows.items()
-    }
-
-
-def _rows(key: str, outside: Any, form: str) -> dict[str, list[Any]]:
+    form = _ENTRY_FORM if entry is None else _COLUMN_FORM
     if outside is not None and not isinstance(outside, Mapping):
-        raise ConfigError(f"'{key}' must be as {form}; got {outside!r}.")
-    rows = {str(name): row for name, row in (outside or {}).items()}
-    for name, row in rows.items():
-        if not isinstance(row, list | tuple) or not row:
-            raise ConfigError(f"'{key}' must be as {form}; got {name}: {row!r}.")
-    return {name: list(row) for name, row in rows.items()}
+        raise ConfigError(f"'outside' must be as {form}; got {outside!r}.")
+    ranges = {}
+    for name, row in (outside or {}).items():
+        full = list(row) if isinstance(row, list | tuple) else []
+        if entry is not None:
+            full = [entry, *full]
+        elif len(full) == 3:
+            full.insert(1, 0)
+        if not _is_range(full):
+            raise ConfigError(f"'outside' must be as {form}; got {name}: {row!r}.")
+        kept = CostRange(full[0], int(full[1]), *full[2:])
+        if not kept.low <= kept.high or (math.isinf(kept.low) and math.isinf(kept.high)):
+            raise ConfigError(f"'outside': {name} has the range {kept.low} to {kept.high}.")
+        if not is_cost(name):
+            raise ConfigError(f"'outside': costs are called cost or cost_<kind>, not '{name}'.")
+        ranges[name] = kept
+    return ranges
 
 
-def _range(key: str, name: str, full: list[Any], given: list[Any], form: str) -> CostRange:
-    entry, *numbers = full
+def _is_range(row: list[Any]) -> bool:
+    """Whether it is an entry, a column and two numbers."""
+    numbers = row[1:]
     are_numbers = all(isinstance(x, int | float) and not isinstance(x, bool) for x in numbers)
-    if not isinstance(entry, str) or len(numbers) != 3 or not are_numbers:
-        raise ConfigError(f"'{key}' must be as {form}; got {name}: {given!r}.")
-    column, low, high = numbers
-    if column % 1 or column < 0:
-        raise ConfigError(f"'{key}' must be as {form}; got {name}: {given!r}.")
-    if not low <= high or not any(map(math.isfinite, (low, high))):
-        raise ConfigError(f"'{key}': {name} has the range {low} to {high}.")
-    if not is_cost(name):
-        raise ConfigError(f"'{key}': costs are called cost or cost_<kind>, not '{name}'.")
-    return CostRange(entry, int(column), low, high)
+    if len(row) != 4 or not isinstance(row[0], str) or not are_numbers:
+        return False
+    return numbers[0] >= 0 and numbers[0] % 1 == 0

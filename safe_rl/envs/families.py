@@ -20,7 +20,7 @@ import gymnasium
 from hydra.core.config_store import ConfigStore
 from omegaconf import OmegaConf
 
-from safe_rl.envs.costs import parse_columns, parse_entries
+from safe_rl.envs.costs import parse_ranges
 from safe_rl.envs.errors import ConfigError, nearest
 from safe_rl.envs.safety_gym.suite import EXTRAS, SUITE, resolve
 from safe_rl.envs.velocity.velocity_config import VELOCITY_SUITE, resolve_velocity
@@ -116,7 +116,7 @@ def _refuse_module(key: str, name: str, instead: str) -> None:
 
 def _check_gymnasium(node: Mapping[str, Any]) -> None:
     _refuse_module("env.id", node["id"], "env.id=")
-    parse_columns("outside", node.get("outside"))
+    parse_ranges(node.get("outside"), "observation")
 
 
 def _check_torchrl(node: Mapping[str, Any]) -> None:
@@ -128,7 +128,7 @@ def _check_torchrl(node: Mapping[str, Any]) -> None:
             "import=torchrl.envs env.id=torchrl.envs.NAME, one of yours with import=my_module "
             "env.id=my_module.NAME, and one of Gymnasium's by its id with env=gymnasium."
         )
-    parse_entries("outside", node["outside"])
+    parse_ranges(node["outside"])
     known_name = (node["kwargs"] or {}).get("env_name", "")
     _refuse_module("env.kwargs.env_name", str(known_name), "and env_name: ")
 

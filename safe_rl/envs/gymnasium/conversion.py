@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from gymnasium.vector import AutoresetMode, SyncVectorEnv, VectorEnv
 
-from safe_rl.envs.costs import CostRange, is_cost, parse_columns
+from safe_rl.envs.costs import CostRange, is_cost, parse_ranges
 from safe_rl.envs.errors import ConfigError, nearest, require_integer, require_names
 from safe_rl.envs.families import GYMNASIUM, ForeignFamily, complete_foreign
 from safe_rl.envs.gymnasium.env_wrappers import CostsOutside, adapt, make_adapted
@@ -252,7 +252,7 @@ def _maker_of_node(config: Mapping[str, Any]) -> MakeEnv:
     if config["render_mode"] is not None:
         kwargs["render_mode"] = config["render_mode"]
     make = partial(gymnasium.make, spec, **kwargs)
-    ranges = parse_columns("outside", config["outside"])
+    ranges = parse_ranges(config["outside"], "observation")
     return partial(_with_costs, make, ranges) if ranges else make
 
 

@@ -148,8 +148,8 @@ class CostsOutside(gymnasium.Wrapper):
         ValueError: If the observation has no such column.
 
     Examples:
-        >>> from safe_rl.envs.costs import parse_columns
-        >>> ranges = parse_columns("outside", {"cost_position": [0, -0.5, 0.5]})
+        >>> from safe_rl.envs.costs import parse_ranges
+        >>> ranges = parse_ranges({"cost_position": [0, -0.5, 0.5]}, "observation")
         >>> env = CostsOutside(gymnasium.make("CartPole-v1"), ranges)
         >>> _ = env.reset(seed=0)
         >>> env.step(0)[-1]

@@ -1,0 +1,283 @@
+"""Entries of a step: those that are observed, and what it costs."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from functools import partial
+from itertools import accumulate
+from typing import Any
+
+import torch
+from tensordict import NestedKey, TensorDictBase
+from torch import Tensor
+from torch.nn.functional import one_hot
+from torchrl.data import Binary, Categorical, Composite, NonTensor, TensorSpec, Unbounded
+from torchrl.envs import EnvBase
+from torchrl.envs.transforms import Transform
+
+from safe_rl.envs.costs import COST, is_cost, parse_ranges
+from safe_rl.envs.errors import ConfigError, nearest
+from safe_rl.envs.gymnasium.gymnasium_env import cost_spec
+from safe_rl.targets import locate
+
+__all__ = ["Observe", "StepCosts"]
+
+_OBSERVATION = "observation"
+
+
+def entry_key(name: str) -> NestedKey:
+    """Return the key of an entry whose name has dots where it is nested."""
+    parts = tuple(name.split("."))
+    return parts[0] if len(parts) == 1 else parts
+
+
+def dotted(key: NestedKey) -> str:
+    """Return the name of a key, with dots where it is nested."""
+    return ".".join(key) if isinstance(key, tuple) else str(key)
+
+
+class StepCosts(Transform):
+    """Writes the costs of a step beside its reward, the sum first.
+
+    Args:
+        env: What is stepped, [N]. One step is taken: only that tells what a function returns.
+        config: A whole node: `cost_keys` (entries that are costs), `outside` (ranges), and `cost`,
+            a function of a step as TorchRL has it, [N] or [N, 1], of one cost or several by name.
+
+    Attributes:
+        names: Names of all costs, the sum first.
+
+    Raises:
+        ConfigError: If there are no costs, or one is no number per row.
+        TargetError: If the module of the function was not named by `import=`.
+
+    Examples:
+        >>> from torchrl.envs import SerialEnv, PendulumEnv
+        >>> node = {"cost_keys": [], "outside": {"cost_speed": ["thdot", -4, 4]}, "cost": None}
+        >>> StepCosts(SerialEnv(2, PendulumEnv), node).names
+        ['cost', 'cost_speed']
+    """
+
+    def __init__(self, env: EnvBase, config: Mapping[str, Any]) -> None:
+        super().__init__()
+        self._entries = {name: entry_key(name) for name in config["cost_keys"]}
+        self._ranges = parse_ranges(config["outside"])
+        self._function = None if config["cost"] is None else _located(config["cost"])
+        if not (self._entries or self._ranges or self._function):
+            raise ConfigError(
+                "what does a step cost? Name entries that are costs (env.cost_keys=[…]), the range "
+                "that one has to stay in (env.outside='{cost_speed: [thdot, -4, 4]}'), or a "
+                "function of yours (import=my_module env.cost=my_module:speed)."
+            )
+        needed = [env.full_state_spec, env.full_action_spec, env.full_done_spec]
+        kept = {"reward", *(key for spec in needed for key in spec.keys(True, True))}
+        for name, key in self._entries.items():
+            if key in kept:
+                raise ConfigError(
+                    f"env.cost_keys: '{name}' is a state, an action, a reward or an end, and stays "
+                    "one. Make a cost of it by env.outside, or by a function of yours (env.cost)."
+                )
+        self.names = list(self._costs(env.rand_step(env.reset())))
+
+    def _costs(self, step: TensorDictBase) -> dict[str, Tensor]:
+        """All costs [N, 1] of a step [N] by name."""
+        found = [(name.rpartition(".")[2], _entry(step, name)) for name in self._entries]
+        for name, kept in self._ranges.items():
+            values = _entry(step, kept.entry).reshape(*step.batch_size, -1)
+            if kept.column >= values.shape[-1]:
+                raise ConfigError(
+                    f"'outside': column {kept.column} of {kept.entry}, which has "
+                    f"{values.shape[-1]}, counted from 0."
+                )
+            value = values[..., kept.column]
+            found.append((name, (value < kept.low) | (value > kept.high)))
+        if self._function is not None:
+            returned = self._function(step)
+            found += returned.items() if isinstance(returned, Mapping) else [(COST, returned)]
+        costs: dict[str, Tensor] = {}
+        for name, cost in found:
+            if name in costs:
+                raise ConfigError(f"There are two costs called '{name}'.")
+            if not is_cost(name) and name not in {n.rpartition(".")[2] for n in self._entries}:
+                raise ConfigError(
+                    f"env.cost returns '{name}': costs are called cost or cost_<kind>."
+                )
+            if not isinstance(cost, Tensor) or cost.numel() != step.batch_size.numel():
+                shown = list(cost.shape) if isinstance(cost, Tensor) else type(cost).__name__
+                raise ConfigError(
+                    f"The cost '{name}' must be one number per row, [N], got {shown}."
+                )
+            costs[name] = cost.float().reshape(*step.batch_size, 1)
+        total = costs.pop(COST) if COST in costs else torch.stack(list(costs.values())).sum(0)
+        return {COST: total, **costs}
+
+    def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
+        costs = self._costs(tensordict.clone(False).set("next", next_tensordict))
+        return next_tensordict.exclude(*self._entries.values()).update(costs)
+
+    def _reset(
+        self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
+    ) -> TensorDictBase:
+        return tensordict_reset.exclude(*self._entries.values())
+
+    def transform_output_spec(self, output_spec: Composite) -> Composite:
+        """Add the costs to the rewards, and remove those that were observations."""
+        output_spec = super().transform_output_spec(output_spec)
+        rewards = output_spec["full_reward_spec"]
+        for spec in (output_spec["full_observation_spec"], rewards):
+            for key in self._entries.values():
+                if key in spec.keys(True):
+                    del spec[key]
+        highest = dict.fromkeys(self._ranges, 1.0)
+        # entries and functions may have a cost of their own that is called so
+        if COST not in highest and not self._entries and self._function is None:
+            highest[COST] = float(len(highest))
+        for name in self.names:
+            shape = (*rewards.shape, 1)
+            rewards[name] = cost_spec(highest.get(name), shape, rewards.device)
+        return output_spec
+
+
+def _located(given: Any) -> Callable[[TensorDictBase], Any]:
+    node = dict(given) if isinstance(given, Mapping) else {"_target_": given}
+    target = node.pop("_target_", None)
+    if not isinstance(target, str):
+        raise ConfigError(
+            f"'cost' names a function: my_module:speed, or '{{_target_: my_module.speed, limit: 4}}"
+            f"' with its arguments; got {given!r}."
+        )
+    return partial(locate(target.replace(":", "."), key="env.cost"), **node)
+
+
+def _entry(step: TensorDictBase, name: str) -> Tensor:
+    after = step["next"]
+    value = after.get(entry_key(name), None)
+    if value is None:
+        known = list(map(dotted, after.keys(True, True)))
+        raise ConfigError(
+            f"There is no entry '{name}'.{nearest(name, known)} A step writes {', '.join(known)}."
+        )
+    return value
+
+
+class Observe(Transform):
+    """Puts the entries that are observed where policies look for them: `observation`.
+
+    One entry is the observation itself; several become one vector, or a dictionary. Kinds become
+    one-hot, pictures stay as they are.
+
+    Args:
+        env: What is observed, [N].
+        config: A whole node: `observe`, names of entries (None takes `observation`, or where there
+            is none all that are not nested), and `flatten`, whether several become one vector.
+
+    Attributes:
+        layout: Columns of every entry, as if all of them were one vector.
+
+    Raises:
+        ConfigError: For a name that there is not, or pictures that are to be flattened.
+    """
+
+    def __init__(self, env: EnvBase, config: Mapping[str, Any]) -> None:
+        super().__init__()
+        self._specs = _choose_entries(env.observation_spec, config["observe"])
+        self._flatten = config["flatten"] and len(self._specs) > 1
+        pictures = [name for name, spec in self._specs.items() if _is_picture(spec)]
+        if self._flatten and pictures:
+            raise ConfigError(
+                f"{', '.join(pictures)}: pictures are no part of a vector. env.flatten=false makes "
+                "a dictionary, for model=cnn or model=dict; env.observe=[…] leaves some out."
+            )
+        # what the environment needs for its next step stays where it is
+        needed = {*map(dotted, env.state_spec.keys(True, True)), _OBSERVATION}
+        self._moved = [entry_key(name) for name in self._specs if name not in needed]
+        sizes = {_last(name): _size(spec) for name, spec in self._specs.items()}
+        ends = accumulate(sizes.values())
+        self.layout = {n: slice(e - sizes[n], e) for n, e in zip(sizes, ends, strict=True)}
+
+    def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:
+        values = {
+            _last(name): _numbers(next_tensordict[entry_key(name)], spec)
+            for name, spec in self._specs.items()
+        }
+        after = next_tensordict.exclude(*self._moved)
+        if self._flatten:
+            return after.set(_OBSERVATION, torch.cat(list(values.values()), -1))
+        if len(values) == 1:
+            return after.set(_OBSERVATION, next(iter(values.values())))
+        return after.set(_OBSERVATION, after.empty().update(values))
+
+    def _reset(
+        self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
+    ) -> TensorDictBase:
+        return self._call(tensordict_reset)
+
+    def transform_observation_spec(self, observation_spec: Composite) -> Composite:
+        """Describe what is written, and leave out what is moved."""
+        shape, device = observation_spec.shape, observation_spec.device
+        parts = {
+            _last(name): spec
+            if _is_picture(spec)
+            else Unbounded((*shape, _size(spec)), device=device)
+            for name, spec in self._specs.items()
+        }
+        for key in self._moved:
+            if key in observation_spec.keys(True):
+                del observation_spec[key]
+        if self._flatten:
+            size = sum(map(_size, self._specs.values()))
+            observation_spec[_OBSERVATION] = Unbounded((*shape, size), device=device)
+        elif len(parts) == 1:
+            observation_spec[_OBSERVATION] = next(iter(parts.values()))
+        else:
+            observation_spec[_OBSERVATION] = Composite(parts, shape=shape, device=device)
+        return observation_spec
+
+
+def _choose_entries(spec: Composite, wanted: list[str] | None) -> dict[str, TensorSpec]:
+    """The entries that are observed, by name, with dots where they are nested."""
+    known = {
+        dotted(key): part
+        for key, part in spec.items(True, True)
+        if not isinstance(part, Composite | NonTensor)
+    }
+    for name in wanted or ():
+        if name not in known:
+            raise ConfigError(
+                f"env.observe: there is no entry '{name}'.{nearest(name, known)} There are "
+                f"{', '.join(known)}."
+            )
+    below = [name for name in known if name.partition(".")[0] == _OBSERVATION]
+    chosen = wanted or below or [name for name in known if "." not in name]
+    if not chosen:
+        raise ConfigError(f"env.observe: name what is observed, of {', '.join(known) or 'nothing'}")
+    return {name: known[name] for name in chosen}
+
+
+def _last(name: str) -> str:
+    return name.rpartition(".")[2]
+
+
+def _is_picture(spec: TensorSpec) -> bool:
+    """Of N environments, height, width and colours in some order."""
+    return len(spec.shape) == 4
+
+
+def _choices(spec: TensorSpec) -> int | None:
+    """How many kinds there are, where a number stands for one of several."""
+    is_kind = isinstance(spec, Categorical) and not isinstance(spec, Binary)
+    return int(spec.space.n) if is_kind and spec.dtype != torch.bool else None
+
+
+def _size(spec: TensorSpec) -> int:
+    """Numbers of one environment."""
+    return spec.shape[1:].numel() * (_choices(spec) or 1)
+
+
+def _numbers(value: Tensor, spec: TensorSpec) -> Tensor:
+    """A picture as it is, anything else as float32 [N, n]."""
+    if _is_picture(spec):
+        return value
+    choices = _choices(spec)
+    value = value if choices is None else one_hot(value, choices)
+    return value.reshape(spec.shape[0], -1).float()
