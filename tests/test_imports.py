@@ -142,8 +142,8 @@ FLOORS = {
         ("",),
     ),
     "scores": (
-        ("certificate", "comparisons", "published"),
-        ("benchmark", "measures"),
+        ("bounds", "comparisons", "published"),
+        ("benchmark", "certificate", "measures"),
         ("",),
     ),
     "cli": (

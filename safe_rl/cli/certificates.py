@@ -68,21 +68,20 @@ def certificate_options(
 ) -> CertificateOptions:
     """What is certified of a run: what its section ``certificate`` says, and its limit on shares.
 
-    A run that was to keep a share of episodes (``risk=chance``) is not certified without it. Runs
-    of before there were certificates get the package's options.
+    What the run has limited is certified: with ``risk=chance`` the share of episodes above the
+    limit, too, with ``risk=cvar`` the mean of the costliest ones.
     """
     options = dict(OmegaConf.load(CONF / "config.yaml").certificate)
     own = dict(config.get("certificate") or {})
     if not own.get("episodes", 1):  # the run was to end without a certificate
         del own["episodes"]
-    if own:
-        options["retest"] = 0  # of runs of before there was one
-    options |= own
+    options |= {name: value for name, value in own.items() if name in options}
     for name, value in (changes or {}).items():
         _check_change(name, value, options)
     options |= changes or {}
-    share = (config.get("risk") or {}).get("most_over", 1.0)
-    return CertificateOptions(**options | {"most_over": min(options["most_over"], share)})
+    risk = config.get("risk") or {}
+    share = min(options["most_over"], risk.get("most_over", 1.0))
+    return CertificateOptions(**options | {"most_over": share}, tail=risk.get("tail", 1.0))
 
 
 def _check_change(name: str, value: Any, known: Collection[str]) -> None:
@@ -110,7 +109,7 @@ def is_to_keep_limits(config: DictConfig, cost_keys: Collection[str]) -> bool:
 
 
 def is_worth_a_certificate(config: DictConfig, episode_length: int) -> bool:
-    """Whether a run is longer than the test by which it would be certified."""
+    """Whether a run is longer than a short test by which it would be certified."""
     return 0 < _test_steps(config, episode_length) <= config.frames
 
 
@@ -120,8 +119,9 @@ def why_not_certified(config: DictConfig, episode_length: int, directory: Path) 
     if not steps:
         return None
     return (
-        f"Not certified: the run has {config.frames:,} steps, fewer than the {steps:,} of a test "
-        f"(certificate.episodes={config.certificate.episodes}). To test it all the same: "
+        f"Not certified: the run has {config.frames:,} steps, fewer than the {steps:,} of a short "
+        f"test (a fifth of certificate.episodes={config.certificate.episodes}). To test it all the "
+        f"same: "
         f"python -m safe_rl.evaluate {shlex.quote(str(directory))} certify=true"
     )
 
@@ -132,5 +132,5 @@ def train_on(config: DictConfig, directory: Path) -> str:
 
 
 def _test_steps(config: DictConfig, episode_length: int) -> int:
-    """Steps of one test at most; 0 if there is to be none."""
-    return int(config.certificate.episodes * episode_length) if "certificate" in config else 0
+    """Steps of a test that ends early, after a fifth of its episodes; 0 if there is to be none."""
+    return int(config.certificate.episodes * episode_length / 5) if "certificate" in config else 0

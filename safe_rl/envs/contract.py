@@ -5,6 +5,7 @@ Training, evaluation and the command line know nothing else about an environment
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Mapping
 from typing import Any
 
@@ -70,6 +71,17 @@ class ConstrainedEnv(EnvBase):
         """Return where things are, a TensorDict [N] of [N, K, 3] by kind (m); here of nothing."""
         return TensorDict(batch_size=self.batch_size)
 
+    def highest_cost(self, key: str) -> float:
+        """Return the most that an episode can cost: its steps times the upper bound in the spec.
+
+        Infinite if the spec has no bound.
+        """
+        spec = self.full_reward_spec[key]
+        highest = float(spec.high.max()) if hasattr(spec, "high") else math.inf
+        # the largest number of a spec stands for no bound
+        is_bounded = highest < torch.finfo(torch.float32).max
+        return highest * float(self.max_episode_steps) if is_bounded else math.inf
+
     def continue_from(self, steps: int) -> None:
         """Go on with schedules after so many steps of every row."""
         self.steps_before = steps
@@ -77,7 +89,7 @@ class ConstrainedEnv(EnvBase):
 
 _DEFAULTS = (
     *("return_key", "seconds_per_step", "steps_before", "render", "get_state", "get_positions"),
-    "continue_from",
+    *("continue_from", "highest_cost"),
 )
 
 

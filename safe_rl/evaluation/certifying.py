@@ -5,9 +5,9 @@ from __future__ import annotations
 import json
 import math
 import shutil
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import closing
 from dataclasses import asdict, dataclass
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +15,7 @@ import numpy as np
 import torch
 from omegaconf import DictConfig
 from torchrl.envs import EnvBase
+from tqdm import tqdm
 
 from safe_rl.evaluation.episodes import Episodes, collect_episodes, default_seed, has_fixed_layout
 from safe_rl.evaluation.loading import for_evaluation, load_config, load_policy, override_env
@@ -24,8 +25,10 @@ from safe_rl.scores.certificate import Claim, Verdict, first_certified, rank
 
 __all__ = ["Certificate", "CertificateOptions", "certify"]
 
-# worlds that are stepped together at most: more of them only take memory
-_MOST_WORLDS = 100
+# environments that are stepped together, and episodes between two looks at a test
+_BATCH = 100
+# seeds are so far apart that the tests of one run are not the ranking of the next seed's run
+_RANKING, _TEST = 100_000_000_003, 200_000_000_041
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -34,12 +37,14 @@ class CertificateOptions:
 
     Attributes:
         ranking: Episodes of every candidate by which candidates are put in order.
-        episodes: Fresh episodes of every candidate that is tested.
+        episodes: Fresh episodes of a test at most.
         tests: Candidates tested at most.
-        retest: Where all of them fall short, one is tested once more, on so many times the
-            episodes; 0 for no such test.
         level: Confidence of the statement, in (0.5, 1).
         most_over: Largest share of episodes that may cost more than a limit; 1 asks for nothing.
+        bound: "betting" or "student".
+        cap: Cost up to which an episode counts; None: all of it, if the environment has a highest.
+        most_beyond: Largest share of episodes that may cost more than the cap.
+        tail: Share of the costliest episodes whose mean is limited (CVaR); 1: all.
     """
 
     ranking: int
@@ -47,7 +52,10 @@ class CertificateOptions:
     tests: int
     level: float
     most_over: float
-    retest: int = 0
+    bound: str = "betting"
+    cap: float | None = None
+    most_beyond: float = 0.01
+    tail: float = 1.0
 
 
 @dataclass(frozen=True)
@@ -67,33 +75,36 @@ class Certificate:
     options: CertificateOptions
 
     def __str__(self) -> str:
-        """One line for the terminal."""
-        level = f"at {100 * self.options.level:.12g}%"
+        """What is certified, what that excludes and what it cannot see, in one line."""
+        level, verdict = f"at {100 * self.options.level:.12g}%", self.verdict
         if self.checkpoint is None:
-            missing = ", ".join(f"{n} by {v:.3g}" for n, v in self.verdict.shortfalls.items())
-            return (
-                f"Not certified {level}: no checkpoint's bound is within its limit ({missing})."
-                f"{_unseen(self.verdict)}"
+            missing = ", ".join(
+                f"{name} by {value:.3g}, {verdict.means.get(name, math.nan):.3g} on average"
+                for name, value in verdict.shortfalls.items()
             )
-        bounds = ", ".join(f"{n} ≤ {b:.3g}" for n, (b, _) in self.verdict.bounds.items())
-        steps = checkpoint_steps(self.checkpoint)
-        return f"Certified {level}: {bounds}, return {self.episode_return:.2f}, at {steps:,} steps."
-
-
-def _unseen(verdict: Verdict) -> str:
-    """What to say of a test all of whose episodes cost the same; nothing of another one."""
-    if not verdict.alike:
-        return ""
-    said = f" All tested episodes had the same {', '.join(verdict.alike)}: the bound is "
-    if all(math.isfinite(bound) for bound, _ in verdict.bounds.values()):
-        return said + (
-            "what unseen ones may cost at most, and no number of episodes brings it down to 0."
+            return (
+                f"Not certified {level}: no checkpoint's bound is within its limit ({missing} in "
+                f"{verdict.episodes:,} new episodes)."
+            )
+        bounds = ", ".join(f"{name} ≤ {b:.3g}" for name, (b, _) in verdict.bounds.items())
+        means = ", ".join(f"{mean:.3g}" for mean in verdict.means.values())
+        return (
+            f"Certified {level}: {bounds} ({means} in {verdict.episodes:,} new episodes), return "
+            f"{self.episode_return:.2f}, at {checkpoint_steps(self.checkpoint):,} steps. "
+            f"{self._excluded()} Not covered: single episodes, other environments."
         )
-    return said + (
-        "what unseen ones may cost at most, and the environment's spec does not say what that is. "
-        "Give the cost's spec an upper bound (Bounded instead of Unbounded); in Safety Gym's "
-        "environments env.constrain_indicator=true makes it 1 a step."
-    )
+
+    def _excluded(self) -> str:
+        """What the bounds say of rare episodes."""
+        if self.options.bound == "student":
+            return "The bound assumes that no rare episodes cost far more than those tested."
+        capped = [name for name in self.verdict.bounds if name.startswith("beyond_")]
+        if capped:
+            shares = ", ".join(capped)
+            return f"Costs beyond a cap are not counted ({shares}: the share of such episodes)."
+        most = ", ".join(f"{value:,.4g}" for name, value in self.verdict.highest.items()
+                         if not name.startswith("over_limit"))  # fmt: skip
+        return f"The bound includes rare episodes that cost up to {most}."
 
 
 def certify(
@@ -106,8 +117,7 @@ def certify(
 ) -> Certificate | None:
     """Find and certify the best checkpoint of a run that keeps its limits.
 
-    All checkpoints are ranked by episodes of their own; the first of them are tested on fresh ones,
-    and the one that falls short least, if all do, on more.
+    All checkpoints are ranked by episodes of their own; the first of them are tested on fresh ones.
     The result is written to ``certificate.json``, the policy kept as ``checkpoint=certified``.
 
     Args:
@@ -128,27 +138,25 @@ def certify(
     if not limits or not candidates:
         return None
     runner = _Runner(config, make_env, num_threads, progress)
-    first = [runner.run(path, options.ranking, purpose=0) for path in candidates]
-    claim = Claim(limits, options.most_over, options.level, runner.largest)
-    order = rank([e.returns.numpy() for e in first], [_costs(e) for e in first], claim)
-    returns: dict[int, float] = {}
+    first = [next(runner.run(path, _RANKING, options.ranking)) for path in candidates]
+    asked = ("most_over", "level", "bound", "cap", "most_beyond", "tail")
+    settings = {name: getattr(options, name) for name in asked}
+    claim = Claim(limits, highest=runner.highest, **settings)
+    costs = [_costs(episodes) for episodes in first]
+    claims = [claim.with_thresholds(found) for found in costs]
+    returns: dict[int, list[torch.Tensor]] = {}
 
-    def collect(number: int, episodes: int, purpose: int) -> dict[str, np.ndarray]:
-        found = runner.run(candidates[number], episodes, purpose)
-        returns[number] = found.returns.mean().item()
-        return _costs(found)
+    def collect(number: int) -> Iterator[dict[str, np.ndarray]]:
+        for episodes in runner.run(candidates[number], _TEST, options.episodes):
+            returns.setdefault(number, []).append(episodes.returns)
+            yield _costs(episodes)
 
-    verdict = first_certified(
-        order,
-        partial(collect, episodes=options.episodes, purpose=1),
-        claim,
-        options.tests,
-        partial(collect, episodes=options.retest * options.episodes, purpose=2)
-        if options.retest
-        else None,
-    )
-    kept = None if verdict.certified is None else candidates[verdict.certified]
-    episode_return = math.nan if verdict.certified is None else returns[verdict.certified]
+    order = rank([episodes.returns.numpy() for episodes in first], costs, claims)
+    verdict = first_certified(order, collect, claims, options.tests, options.episodes)
+    kept, episode_return = None, math.nan
+    if verdict.certified is not None:
+        kept = candidates[verdict.certified]
+        episode_return = torch.cat(returns[verdict.certified]).mean().item()
     certificate = Certificate(_keep(folder, kept), episode_return, verdict, options)
     _write(folder, certificate, [checkpoint_steps(path) for path in candidates])
     return certificate
@@ -176,41 +184,34 @@ class _Runner:
     ) -> None:
         self._config, self._make_env = config, for_evaluation(make_env, config)
         self._threads, self._progress = threads, progress
-        self.largest: dict[str, float] = {}
+        self.highest: dict[str, float] = {}
 
-    def run(self, checkpoint: Path, number: int, purpose: int) -> Episodes:
+    def run(self, checkpoint: Path, purpose: int, number: int) -> Iterator[Episodes]:
+        """Episodes in batches, of all candidates with the same layouts.
+
+        A ranking is one batch. Every environment contributes one episode to a batch of a test, so
+        that short episodes are not looked at before long ones.
+        """
         node = override_env(self._config, {})
-        # of all candidates the same layouts: what differs between them is not luck
         seed = default_seed(node, self._config.seed)
-        fresh = seed + 1 + purpose
+        batch = min(number, _BATCH)
         env = self._make_env(
             node,
-            num_envs=min(number, _MOST_WORLDS),
+            num_envs=batch,
             device="cpu",
-            seed=seed if has_fixed_layout(node) else fresh,
+            seed=seed if has_fixed_layout(node) else seed + purpose,
             num_threads=self._threads,
         )
-        policy = load_policy(self._config, env, checkpoint, torch.device("cpu"))
-        torch.manual_seed(fresh)
         keys = list(self._config.cost_limits)
-        self.largest = {key: _largest_cost(env, key) for key in keys}
-        try:
-            return collect_episodes(
-                env, policy, number, keys, deterministic=False, progress=self._progress
-            )
-        finally:
-            env.close()
-
-
-def _largest_cost(env: EnvBase, key: str) -> float:
-    """The most that an episode can cost: its steps times the upper bound of one in the spec."""
-    spec = env.full_reward_spec[key]
-    if not hasattr(spec, "high"):
-        return math.inf
-    highest = float(spec.high.max())
-    # the largest number that there is stands for no bound
-    is_bounded = highest < torch.finfo(torch.float32).max
-    return highest * float(env.max_episode_steps) if is_bounded else math.inf
+        self.highest = {key: env.highest_cost(key) for key in keys}
+        if purpose == _RANKING:
+            batch = number
+        with closing(env), tqdm(total=number, disable=None if self._progress else True) as bar:
+            policy = load_policy(self._config, env, checkpoint, torch.device("cpu"))
+            torch.manual_seed(seed + purpose)
+            for _ in range(math.ceil(number / batch)):
+                yield collect_episodes(env, policy, batch, keys, deterministic=False)
+                bar.update(batch)
 
 
 def _keep(folder: RunFolder, checkpoint: Path | None) -> Path | None:
@@ -249,9 +250,12 @@ def _write(folder: RunFolder, certificate: Certificate, candidates: list[int | N
             for name, (bound, most) in verdict.bounds.items()
         },
         "shortfalls": {name: _finite(value) for name, value in verdict.shortfalls.items()},
-        "alike": verdict.alike,
+        "means": {name: _finite(value) for name, value in verdict.means.items()},
+        "highest": {name: _finite(value) for name, value in verdict.highest.items()},
         "candidates": candidates,
         "tested": [candidates[number] for number in verdict.tested],
         **asdict(certificate.options),
+        "episodes": verdict.episodes,
+        "most_episodes": certificate.options.episodes,
     }
     replace_text(folder.certificate, json.dumps(content, indent=2) + "\n")

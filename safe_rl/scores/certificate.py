@@ -1,87 +1,77 @@
-"""Upper confidence bounds of what a policy costs, and which of several policies keeps its limits.
+"""Which of several policies keeps its limits: what is claimed, the order of tests, the tests.
 
 A mean below its limit on the episodes that a policy was chosen by says little: the luckiest of many
-was chosen. Here policies are ranked on one half of the episodes and tested on the other, at a level
-that is shared out among the tests.
+was chosen. So policies are ranked by some episodes and tested on others.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from statistics import NormalDist
 
 import numpy as np
-import scipy  # which loads its parts when they are asked for: half a second
 from numpy.typing import ArrayLike
 
-__all__ = ["Claim", "Verdict", "first_certified", "mean_bound", "rank", "share_bound"]
+from safe_rl.scores.bounds import (
+    best_growth,
+    betting_bound,
+    log_wealth,
+    share_bound,
+    student_bound,
+)
+
+__all__ = ["BOUNDS", "Claim", "Statement", "Verdict", "first_certified", "rank"]
+
+BOUNDS = ("betting", "student")
+"""Bounds of means: one that always holds, and one for costs without rare high ones."""
+
+Costs = Mapping[str, ArrayLike]
 
 
-def mean_bound(values: ArrayLike, level: float, largest: float = math.inf) -> np.ndarray:
-    """Upper confidence bound of the mean of a distribution that may have a heavy right tail.
+@dataclass(frozen=True)
+class Statement:
+    """That the mean of some values of episodes is at most a limit.
 
-    x̄ + (t + γ (1 + 2 t²) / (6 √n)) s / √n, with Student's quantile t and the skewness γ where it is
-    positive (Chen, "Testing the mean of skewed distributions", 1995): episode costs are skewed, and
-    Student's bound alone falls below their mean too often. A sample underestimates the skewness of
-    a heavy tail; γ is twice the sample's, with which lognormal costs (σ = 0.9) keep the level too.
-
-    A sample without any spread says nothing of that of its distribution. Then the bound is
-    x̄ + p (m − x̄), with the exact upper bound p of the share of values that are others
-    (`share_bound`) and the largest possible value m: it holds for every distribution.
-
-    Args:
-        values: Independent values, shape [..., n].
-        level: Confidence, in (0.5, 1).
-        largest: The largest possible value, m.
-
-    Returns:
-        The bound, shape [...]; infinite for fewer than two values, or where one is no number.
-
-    Examples:
-        >>> float(mean_bound([20.0, 22.0, 24.0, 26.0], level=0.95).round(2))
-        26.04
-        >>> float(mean_bound([0.0] * 59, level=0.95, largest=100.0).round(1))  # 5 % may cost 100
-        5.0
+    Attributes:
+        name: Of the mean.
+        limit: The most that it may be.
+        highest: The largest possible value.
+        values: Of every episode, [E].
+        is_share: Whether values are 0 or 1.
     """
-    values = np.asarray(values, dtype=float)
-    values = np.where(np.isfinite(values), values, np.nan)
-    number = values.shape[-1]
-    if number < 2:
-        return np.full(values.shape[:-1], np.inf)
-    mean, spread = values.mean(-1), values.std(-1, ddof=1)
-    cubes = ((values - mean[..., np.newaxis]) ** 3).mean(-1)
-    sample = np.divide(cubes, spread**3, out=np.zeros_like(mean), where=spread > 0)
-    quantile = scipy.stats.t.ppf(level, number - 1)
-    correction = 2 * sample.clip(0) * (1 + 2 * quantile**2) / (6 * np.sqrt(number))
-    bound = mean + (quantile + correction) * spread / np.sqrt(number)
-    others = share_bound(np.zeros(number), 0.0, level)
-    bound = np.where(_are_alike(values), mean + others * (largest - mean).clip(0), bound)
-    # NaN is above no limit, and would be taken for a bound that keeps all
-    return np.where(np.isnan(bound), np.inf, bound)
 
+    name: str
+    limit: float
+    highest: float
+    values: np.ndarray
+    is_share: bool = False
 
-def _are_alike(values: ArrayLike) -> np.ndarray:
-    """Whether all of n values [..., n] are the same, [...]."""
-    values = np.asarray(values, dtype=float)
-    return values.min(-1) == values.max(-1)
+    def bound(self, level: float, kind: str) -> float:
+        """Upper confidence bound of the mean; one of :data:`BOUNDS`."""
+        if kind == "student" and self.is_share:
+            return share_bound(int(self.values.sum()), len(self.values), level)
+        if kind == "student":
+            return min(student_bound(self.values, level), self.highest)
+        return betting_bound(self.values, level, self.highest)
 
+    def is_shown(self, level: float) -> bool:
+        """Whether the betting bound is within the limit, without computing it."""
+        if self.highest <= self.limit or not np.isfinite(self.values).all():
+            return self.bound(level, "betting") <= self.limit
+        return bool(log_wealth(self.values, self.limit, self.highest)[-1] >= -math.log(1 - level))
 
-def share_bound(values: ArrayLike, limit: float, level: float) -> float:
-    """Upper confidence bound of P(value > limit), exact (Clopper and Pearson 1934).
+    def is_hopeless(self, level: float, most: int) -> bool:
+        """Whether so many episodes in all would hardly exclude a mean above the limit.
 
-    A value that is no number counts as one above it.
-
-    Examples:
-        >>> round(share_bound([1.0] * 59, limit=2.0, level=0.95), 3)  # none of 59: below 5 %
-        0.05
-    """
-    values = np.asarray(values, dtype=float)
-    over, number = int((~(values <= limit)).sum()), len(values)
-    if over == number:
-        return 1.0
-    return float(scipy.stats.beta.ppf(level, over + 1, number - over))
+        That is so if the best bet has grown to less than a quarter of what it needs, pro rata.
+        It makes no certificate more likely: one may give up at any time.
+        """
+        if self.highest <= self.limit:
+            return False
+        needed = -math.log(1 - level) * len(self.values) / most
+        return best_growth(self.values, self.limit, self.highest) < needed / 4
 
 
 @dataclass(frozen=True)
@@ -92,57 +82,108 @@ class Claim:
         limits: Cost key -> d, of the mean cost per episode.
         most_over: Largest share of episodes that may cost more than d; 1 asks for nothing.
         level: Confidence of the whole statement.
-        largest: Cost key -> the most that an episode can cost; infinite where nothing is said.
+        highest: Cost key -> the most that an episode can cost; infinite where nothing is said.
+        bound: One of :data:`BOUNDS`.
+        cap: Costs of episodes count up to here, and at most a share ``most_beyond`` of them may
+            cost more; None: only where the highest cost is infinite, at ten times the limit.
+        most_beyond: Largest share of episodes that may cost more than a cap.
+        tail: The limits are on the mean cost of the costliest share α of the episodes (CVaR); 1: on
+            the mean of all.
+        thresholds: With a tail: cost key -> ν of the bound ν + E[(C − ν)₊] / α of the CVaR, which
+            is tight where a share α of the episodes costs more than ν. It holds for every ν that is
+            chosen before the test.
 
     Examples:
-        >>> Claim({"cost": 25.0}).shortfalls({"cost": [20.0, 21.0, 22.0, 20.0]}, tests=1)
+        >>> claim = Claim({"cost": 25.0}, highest={"cost": 50.0})
+        >>> claim.shortfalls({"cost": [20.0, 21.0, 22.0, 20.0] * 25}, tests=1)
         {}
     """
 
     limits: Mapping[str, float]
     most_over: float = 1.0
     level: float = 0.95
-    largest: Mapping[str, float] = field(default_factory=dict)
+    highest: Mapping[str, float] = field(default_factory=dict)
+    bound: str = "betting"
+    cap: float | None = None
+    most_beyond: float = 0.01
+    tail: float = 1.0
+    thresholds: Mapping[str, float] = field(default_factory=dict)
 
-    def bounds(self, costs: Mapping[str, ArrayLike], tests: int) -> dict[str, tuple[float, float]]:
+    def with_thresholds(self, costs: Costs) -> Claim:
+        """The claim with the value at risk of some episodes, which are in no test, as ν."""
+        if self.tail == 1:
+            return self
+        quantiles = {key: np.quantile(np.asarray(costs[key]), 1 - self.tail) for key in self.limits}
+        return replace(self, thresholds={key: float(q) for key, q in quantiles.items()})
+
+    def statements(self, costs: Costs) -> list[Statement]:
+        """Everything that has to be shown, with its values of some episodes, [E] each."""
+        return [
+            one for key in self.limits for one in self._about(key, np.asarray(costs[key], float))
+        ]
+
+    def _about(self, key: str, costs: np.ndarray) -> Iterator[Statement]:
+        limit, highest = self.limits[key], self.highest.get(key, math.inf)
+        needs_cap = math.isinf(highest) and self.bound == "betting"
+        cap = 10 * limit if self.cap is None and needs_cap else self.cap
+        capped = costs
+        if cap is not None and cap < highest:
+            capped, highest = np.where(np.isnan(costs), costs, costs.clip(max=cap)), cap
+            yield Statement(
+                f"beyond_{cap:g}_{key}", self.most_beyond, 1.0, _above(costs, cap), True
+            )
+        if self.tail < 1:
+            start = self.thresholds[key]
+            excess, highest = (
+                start + (capped - start).clip(0) / self.tail,
+                self._worst(key, highest),
+            )
+            yield Statement(f"cvar_{key}", limit, highest, excess)
+        else:
+            yield Statement(f"mean_{key}", limit, highest, capped)
+        if self.most_over < 1:
+            yield Statement(f"over_limit_{key}", self.most_over, 1.0, _above(costs, limit), True)
+
+    def _worst(self, key: str, highest: float) -> float:
+        start = self.thresholds[key]
+        return max(start, start + (highest - start) / self.tail)
+
+    def bounds(self, costs: Costs, tests: int) -> dict[str, tuple[float, float]]:
         """Every upper confidence bound beside what it has to keep, by name.
+
+        All of them have to be kept, so that each is at the level of the whole test: a policy that
+        breaks a limit has to pass that limit's own test (intersection–union test).
 
         Args:
             costs: Cost key -> episode costs, [E].
-            tests: Policies tested at most; together with the bounds of a policy they share the
-                error (Bonferroni).
+            tests: Policies tested at most, which share the error (Bonferroni).
         """
-        asks_for_shares = self.most_over < 1
-        number = tests * len(self.limits) * (2 if asks_for_shares else 1)
-        level = 1 - (1 - self.level) / max(1, number)
-        largest = dict.fromkeys(self.limits, math.inf) | {**self.largest}
-        bounds = {
-            f"mean_{key}": (float(mean_bound(costs[key], level, largest[key])), limit)
-            for key, limit in self.limits.items()
-        }
-        if asks_for_shares:
-            bounds |= {
-                f"over_limit_{key}": (share_bound(costs[key], limit, level), self.most_over)
-                for key, limit in self.limits.items()
-            }
-        return bounds
+        level = self._level(tests)
+        found = self.statements(costs)
+        return {one.name: (one.bound(level, self.bound), one.limit) for one in found}
 
-    def shortfalls(self, costs: Mapping[str, ArrayLike], tests: int) -> dict[str, float]:
+    def shortfalls(self, costs: Costs, tests: int) -> dict[str, float]:
         """By how much bounds exceed what they have to keep; empty if the claim is certified."""
         bounds = self.bounds(costs, tests)
         return {name: bound - most for name, (bound, most) in bounds.items() if bound > most}
 
-    def may_hold(self, costs: Mapping[str, ArrayLike]) -> bool:
-        """Whether the claim holds of these episodes themselves, so that more might show it."""
-        return all(
-            np.mean(values) < limit and np.mean(~(values <= limit)) <= self.most_over
-            for key, limit in self.limits.items()
-            for values in [np.asarray(costs[key], dtype=float)]
-        )
+    def is_shown(self, costs: Costs, tests: int) -> bool:
+        """Whether betting has shown everything, so that a test may end."""
+        level = self._level(tests)
+        return all(one.is_shown(level) for one in self.statements(costs))
 
-    def alike(self, costs: Mapping[str, ArrayLike]) -> list[str]:
-        """Names of costs that were the same in all episodes, [E] each."""
-        return [key for key in self.limits if _are_alike(costs[key])]
+    def is_hopeless(self, costs: Costs, tests: int, most: int) -> bool:
+        """Whether ``most`` episodes in all would hardly certify it, after those so far."""
+        level = self._level(tests)
+        return any(one.is_hopeless(level, most) for one in self.statements(costs))
+
+    def _level(self, tests: int) -> float:
+        return 1 - (1 - self.level) / max(1, tests)
+
+
+def _above(costs: np.ndarray, limit: float) -> np.ndarray:
+    """1 for every episode that costs more, or no number; else 0."""
+    return (~(costs <= limit)).astype(float)
 
 
 @dataclass(frozen=True)
@@ -151,111 +192,126 @@ class Verdict:
 
     Attributes:
         certified: Number of the policy that is certified, or None.
-        tested: Numbers of the policies that were tested, in this order: twice that of one whose
-            second test was on more episodes.
+        tested: Numbers of the policies that were tested, in this order.
         bounds: Of the policy that is certified, or else of the one that fell short least: name ->
             (bound, what it has to keep).
         shortfalls: Of the same policy, if none is certified.
-        alike: Costs that were the same in all its episodes: bounds on them are about episodes that
-            nobody has seen.
+        means: Of the same policy: name -> mean over the episodes of its test.
+        highest: Likewise: name -> the largest possible value.
+        episodes: Episodes of its test.
     """
 
     certified: int | None
     tested: list[int]
     bounds: dict[str, tuple[float, float]] = field(default_factory=dict)
     shortfalls: dict[str, float] = field(default_factory=dict)
-    alike: list[str] = field(default_factory=list)
+    means: dict[str, float] = field(default_factory=dict)
+    highest: dict[str, float] = field(default_factory=dict)
+    episodes: int = 0
 
 
 def rank(
-    returns: Sequence[ArrayLike], costs: Sequence[Mapping[str, ArrayLike]], claim: Claim
+    returns: Sequence[ArrayLike], costs: Sequence[Costs], claims: Sequence[Claim]
 ) -> list[int]:
     """Order candidates for the tests: those likely to pass by return, then the others by cost.
 
-    Likely is a policy whose mean costs on these episodes are within the limits by z standard
-    errors, with the normal distribution's quantile z of the claim's level: those that the test,
-    on other episodes, will ask for.
+    Likely is a policy whose means on these episodes are within the limits by z standard errors,
+    with the normal distribution's quantile z of the claim's level.
 
     Args:
         returns: Episode returns of every candidate.
         costs: Cost key -> episode costs, of every candidate.
-        claim: What is to be certified.
+        claims: What is to be certified of each.
     """
 
     def key(candidate: int) -> tuple[bool, float]:
-        excess = max(_expected_excess(costs[candidate], claim), default=0.0)
+        claim = claims[candidate]
+        statements = claim.statements(costs[candidate])
+        excess = max((_expected_excess(one, claim.level) for one in statements), default=0.0)
         loss = -float(np.asarray(returns[candidate], dtype=float).mean())
         return excess > 0, excess if excess > 0 else _or_infinite(loss)
 
     return sorted(range(len(returns)), key=key)
 
 
-def _expected_excess(costs: Mapping[str, ArrayLike], claim: Claim) -> list[float]:
-    """Mean cost plus z standard errors less the limit, in units of the limit, for every limit."""
-    excesses = []
-    for name, limit in claim.limits.items():
-        values = np.asarray(costs[name], dtype=float)
-        error = values.std(ddof=1) / np.sqrt(len(values)) if len(values) > 1 else 0.0
-        quantile = NormalDist().inv_cdf(claim.level)
-        expected = float(values.mean() + quantile * error)
-        excesses.append((_or_infinite(expected) - limit) / max(limit, 1.0))
-    return excesses
+def _expected_excess(statement: Statement, level: float) -> float:
+    """Mean plus z standard errors less the limit, in units of the limit."""
+    values = statement.values
+    error = values.std(ddof=1) / np.sqrt(len(values)) if len(values) > 1 else 0.0
+    expected = float(values.mean() + NormalDist().inv_cdf(level) * error)
+    # of shares, rare ones cannot be seen in so few episodes
+    return (_or_infinite(expected) - statement.limit) / max(statement.limit, 1.0)
 
 
 def _or_infinite(value: float) -> float:
-    """A number; infinity for what is none, which sorts it behind all others."""
+    """A number; infinity in place of NaN, so that it is sorted last."""
     return math.inf if math.isnan(value) else value
 
 
 def first_certified(
     order: Sequence[int],
-    collect: Callable[[int], Mapping[str, ArrayLike]],
-    claim: Claim,
+    collect: Callable[[int], Iterable[Costs]],
+    claims: Sequence[Claim],
     tests: int,
-    collect_more: Callable[[int], Mapping[str, ArrayLike]] | None = None,
+    episodes: int,
 ) -> Verdict:
     """Test candidates in order on fresh episodes until one is certified.
 
+    With the betting bound a test ends as soon as its bounds are within the limits, or as there is
+    no hope left; Student's bound may be looked at only once, after all episodes.
+
     Args:
         order: Numbers of the candidates, from :func:`rank`.
-        collect: Episode costs of a candidate that had no part in the order.
-        claim: What is to be certified.
-        tests: Candidates tested at most: the fewer, the sharper each test.
-        collect_more: Costs of more episodes, none of which was in another test. If no candidate is
-            certified, the one that fell short least has one more test on these, where its episodes
-            so far keep the limits; it shares the error of all tests. None for none.
+        collect: Costs of a candidate's fresh episodes, batch by batch.
+        claims: What is to be certified of each candidate.
+        tests: Candidates tested at most; they share the error.
+        episodes: Episodes of a test at most.
 
     Examples:
         >>> costs = [[26.0, 30.0, 31.0], [15.0, 16.0, 14.0]]
-        >>> collect = lambda number: {"cost": costs[number]}
-        >>> first_certified([0, 1], collect, Claim({"cost": 25.0}), tests=2).certified
+        >>> collect = lambda number: [{"cost": costs[number]}] * 20
+        >>> claim = Claim({"cost": 25.0}, highest={"cost": 50.0})
+        >>> first_certified([0, 1], collect, [claim] * 2, tests=2, episodes=60).certified
         1
     """
-    in_all = tests + (collect_more is not None)
+    verdicts: list[Verdict] = []
     tested: list[int] = []
-
-    def test(candidate: int, costs: Mapping[str, ArrayLike]) -> Verdict:
-        tested.append(candidate)
-        bounds, missing = claim.bounds(costs, in_all), claim.shortfalls(costs, in_all)
-        if not missing:
-            return Verdict(candidate, tested, bounds)
-        return Verdict(None, tested, bounds, missing, claim.alike(costs))
-
-    fell_short: dict[int, Verdict] = {}
-    hopeful: list[int] = []
     for candidate in order[:tests]:
-        costs = collect(candidate)
-        verdict = test(candidate, costs)
+        tested.append(candidate)
+        verdict = _test(candidate, collect(candidate), claims[candidate], tests, episodes)
+        verdicts.append(replace(verdict, tested=tested))
         if verdict.certified is not None:
-            return verdict
-        fell_short[candidate] = verdict
-        if claim.may_hold(costs):
-            hopeful.append(candidate)
-    verdicts = list(fell_short.values())
-    if collect_more is not None and hopeful:
-        nearest = min(hopeful, key=lambda number: _furthest(fell_short[number]))
-        verdicts.append(test(nearest, collect_more(nearest)))
+            return verdicts[-1]
     return min(verdicts, key=_furthest, default=Verdict(None, tested))
+
+
+def _test(
+    candidate: int, batches: Iterable[Costs], claim: Claim, tests: int, episodes: int
+) -> Verdict:
+    """The verdict on one candidate."""
+    costs: dict[str, np.ndarray] = {key: np.empty(0) for key in claim.limits}
+    number = 0
+    for batch in batches:
+        costs = {key: np.r_[costs[key], np.asarray(batch[key], float)][:episodes] for key in costs}
+        number = min((len(values) for values in costs.values()), default=episodes)
+        if number >= episodes:
+            break
+        if claim.bound == "betting":
+            if claim.is_shown(costs, tests):
+                break
+            if 5 * number >= episodes and claim.is_hopeless(costs, tests, episodes):
+                break
+    bounds, missing = claim.bounds(costs, tests), claim.shortfalls(costs, tests)
+    statements = claim.statements(costs)
+    return Verdict(
+        certified=None if missing else candidate,
+        tested=[],
+        bounds=bounds,
+        shortfalls=missing,
+        means={one.name: float(one.values.mean()) if number else math.nan for one in statements},
+        highest={one.name: one.highest for one in statements},
+        episodes=number,
+    )
 
 
 def _furthest(verdict: Verdict) -> float:

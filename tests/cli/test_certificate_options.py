@@ -23,17 +23,19 @@ def test_a_limit_on_the_share_of_episodes_is_certified_with_the_mean(overrides, 
     assert options.most_over == share
 
 
-def test_runs_of_before_certificates_and_measures_get_the_packages_options():
+@pytest.mark.parametrize(
+    ("overrides", "tail"), [(["algo=cpo"], 1.0), (["risk=cvar"], 0.1), (["algo=wcsac"], 0.5)]
+)
+def test_a_limit_on_the_costliest_episodes_is_certified_for_them(overrides, tail):
+    assert certificate_options(compose_config(*overrides)).tail == tail
+
+
+def test_runs_without_the_section_or_with_keys_of_earlier_versions_get_the_packages_options():
+    packages = certificate_options(compose_config())
     old = OmegaConf.create({"cost_limits": {"cost": 25.0}})
-    assert certificate_options(old) == certificate_options(compose_config())
-
-
-def test_a_run_of_before_second_tests_has_none_unless_asked_for():
-    section = dict(compose_config().certificate)
-    del section["retest"]
-    old = OmegaConf.create({"cost_limits": {"cost": 25.0}, "certificate": section})
-    assert certificate_options(old).retest == 0
-    assert certificate_options(old, {"retest": 2}).retest == 2
+    assert certificate_options(old) == packages
+    old.certificate = {**compose_config().certificate, "retest": 2}
+    assert certificate_options(old) == packages
 
 
 @pytest.mark.parametrize(

@@ -105,7 +105,7 @@ def test_a_run_too_short_for_its_certificate_says_so(command, overrides, lines):
     said = [line for line in out.splitlines() if line.startswith("Not certified: ")]
     assert len(said) == lines
     for line in said:
-        assert "40 steps, fewer than the 12,000 of a test (certificate.episodes=600)" in line
+        assert "40 steps, fewer than the 12,000 of a short test (a fifth of certificate.ep" in line
         assert line.endswith(
             f"python -m safe_rl.evaluate {Path('runs/short').resolve()} certify=true"
         )

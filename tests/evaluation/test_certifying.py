@@ -2,7 +2,9 @@
 
 import json
 import math
+import re
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 import torch
@@ -11,7 +13,7 @@ from run_configs import point_mass_config
 
 from safe_rl import envs
 from safe_rl.evaluation import Certificate, CertificateOptions, certify
-from safe_rl.evaluation.certifying import _largest_cost, _write
+from safe_rl.evaluation.certifying import _write
 from safe_rl.evaluation.loading import find_checkpoint
 from safe_rl.reporting.recorded import read_certificate
 from safe_rl.runs.folder import RunFolder
@@ -20,11 +22,18 @@ from safe_rl.training.building import build_trainer, seed_everything
 
 pytestmark = pytest.mark.long
 
-OPTIONS = CertificateOptions(ranking=6, episodes=12, tests=2, level=0.95, most_over=1.0)
+OPTIONS = CertificateOptions(ranking=6, episodes=120, tests=2, level=0.95, most_over=1.0)
+
+
+class Bounded(PointMass):
+    """An episode has 20 steps, each of which costs at most 1."""
+
+    def highest_cost(self, key):
+        return 20.0
 
 
 def make_env(node, *, num_envs, device, seed, num_threads):
-    return PointMass(num_envs, 20, seed % 1000)
+    return Bounded(num_envs, 20, seed % 1000)
 
 
 @pytest.fixture
@@ -40,16 +49,22 @@ def train(tmp_path):
 
 
 def test_a_policy_that_keeps_its_limit_is_certified_and_kept(train):
-    directory = train("{cost: 1000}")
+    directory = train("{cost: 19}")
     certificate = certify(directory, OPTIONS, make_env=make_env)
     written = json.loads((directory / "certificate.json").read_text())
     assert written["certified"]
-    assert written["bounds"]["mean_cost"]["bound"] < written["bounds"]["mean_cost"]["most"] == 1000
+    assert written["bounds"]["mean_cost"]["bound"] < written["bounds"]["mean_cost"]["most"] == 19
     # the last two epochs, and the best three: several files may be of the same epoch
     assert len(written["candidates"]) == len(set(written["candidates"])) >= 2
     assert find_checkpoint(directory, "certified") == certificate.checkpoint
     assert certificate.checkpoint.read_bytes()
-    assert str(certificate).startswith("Certified at 95%: mean_cost ≤ ")
+    line = str(certificate)
+    assert re.match(
+        r"Certified at 95%: mean_cost ≤ [\d.]+ \([\d.]+ in 1\d\d new episodes\), return ", line
+    )
+    assert "The bound includes rare episodes that cost up to 20." in line
+    student = certify(directory, replace(OPTIONS, bound="student"), make_env=make_env)
+    assert "assumes that no rare episodes cost far more" in str(student)
 
 
 def test_none_is_certified_where_limits_are_broken_and_it_says_by_how_much(train):
@@ -64,7 +79,7 @@ def test_none_is_certified_where_limits_are_broken_and_it_says_by_how_much(train
 
 
 def test_a_certificate_is_taken_back_with_its_policy(train):
-    directory = train("{cost: 1000}")
+    directory = train("{cost: 19}")
     certify(directory, OPTIONS, make_env=make_env)
     strict = CertificateOptions(ranking=6, episodes=12, tests=2, level=0.95, most_over=0.0)
     assert certify(directory, strict, make_env=make_env).checkpoint is None
@@ -74,7 +89,7 @@ def test_a_certificate_is_taken_back_with_its_policy(train):
 
 
 def test_an_interrupted_certificate_leaves_the_policy_of_before(train, monkeypatch):
-    directory = train("{cost: 1000}")
+    directory = train("{cost: 19}")
     before = certify(directory, OPTIONS, make_env=make_env).checkpoint
     content = before.read_bytes()
 
@@ -85,14 +100,14 @@ def test_an_interrupted_certificate_leaves_the_policy_of_before(train, monkeypat
 
     monkeypatch.setattr("shutil.copy2", interrupt)
     with pytest.raises(KeyboardInterrupt):
-        certify(directory, replace(OPTIONS, episodes=13), make_env=make_env)
+        certify(directory, replace(OPTIONS, episodes=121), make_env=make_env)
     assert find_checkpoint(directory, "certified") == before
     assert before.read_bytes() == content
     assert list(before.parent.iterdir()) == [before]
 
 
 def test_a_new_certificate_takes_the_place_of_the_one_before(train):
-    directory = train("{cost: 1000}")
+    directory = train("{cost: 19}")
     before = certify(directory, OPTIONS, make_env=make_env).checkpoint
     others = {path for kind in ("best", "last")
               for path in (directory / "checkpoints" / kind).glob("*.torchrl")}  # fmt: skip
@@ -105,7 +120,7 @@ def test_a_new_certificate_takes_the_place_of_the_one_before(train):
 
 
 def test_the_same_run_gets_the_same_certificate(train):
-    directory = train("{cost: 1000}")
+    directory = train("{cost: 19}")
     first = certify(directory, OPTIONS, make_env=make_env)
     torch.rand(3)
     assert certify(directory, OPTIONS, make_env=make_env) == first
@@ -123,7 +138,7 @@ def test_a_fixed_layout_is_certified_as_it_was_learned(train):
         met.append(seed)
         return make_env(node, seed=seed, **keys)
 
-    directory = train("{cost: 1000}", "+env.randomize_layout=false", "seed=3")
+    directory = train("{cost: 19}", "+env.randomize_layout=false", "seed=3")
     certify(directory, OPTIONS, make_env=make)
     assert set(met) == {3}
     # where layouts are drawn, neither training's nor the ranking's are tested
@@ -136,36 +151,44 @@ def test_a_fixed_layout_is_certified_as_it_was_learned(train):
     assert 3 not in met
 
 
-def test_the_second_test_of_the_nearest_is_on_more_episodes_of_other_worlds(train):
-    met = []
+def test_tests_of_a_seed_are_on_other_layouts_than_the_ranking_of_the_next(train):
+    met = {}
 
-    def make(node, *, num_envs, seed, **keys):
-        met.append((num_envs, seed))
-        return make_env(node, num_envs=num_envs, seed=seed, **keys)
+    def make(node, *, seed, **keys):
+        met[current].append(seed)
+        return make_env(node, seed=seed, **keys)
 
-    directory = train("{cost: 1000}")
-    once = replace(OPTIONS, tests=1, retest=3)
-    bound = certify(directory, once, make_env=make).verdict.bounds["mean_cost"][0]
-    config = directory / "config.yaml"
-    config.write_text(config.read_text().replace("cost: 1000", f"cost: {bound - 1e-3}"))
-    met.clear()
-    certificate = certify(directory, once, make_env=make)
-    first, again = certificate.verdict.tested
-    assert first == again
-    (*_, tested, retested) = met
-    assert [num_envs for num_envs, _ in (tested, retested)] == [12, 36]
-    assert len({seed for _, seed in met}) == 3
-    assert certificate.verdict.bounds["mean_cost"][0] != bound
+    directory = train("{cost: 19}", "seed=0")
+    config = (directory / "config.yaml").read_text()
+    for current in range(3):
+        met[current] = []
+        (directory / "config.yaml").write_text(config.replace("seed: 0", f"seed: {current}"))
+        certify(directory, OPTIONS, make_env=make)
+    assert [len(set(seeds)) for seeds in met.values()] == [2, 2, 2]
+    assert len({seed for seeds in met.values() for seed in seeds}) == 6
+
+
+def test_a_limit_on_the_costliest_episodes_is_certified_for_them(train):
+    directory = train("{cost: 19}")
+    certificate = certify(directory, replace(OPTIONS, tail=0.5), make_env=make_env)
+    ((name, (_, most)),) = certificate.verdict.bounds.items()
+    assert (name, most) == ("cvar_cost", 19.0)
+    plain = certify(directory, OPTIONS, make_env=make_env).verdict
+    assert certificate.verdict.means["cvar_cost"] > plain.means["mean_cost"]
 
 
 def test_what_an_episode_can_cost_is_known_from_the_environment():
-    def largest(name, **keys):
-        return _largest_cost(envs.make_env({**name, **keys}, num_envs=1, seed=0), "cost")
+    def highest(keys=(), **given):
+        node = {"robot_base": "point", "num_steps": 30, "hazards_num": 1, "constrain_hazards": True}
+        env = envs.make_env({**node, **dict(keys)}, num_envs=1, seed=0, **given)
+        return env.highest_cost("cost")
 
-    point = {"robot_base": "point", "num_steps": 30, "hazards_num": 1, "constrain_hazards": True}
-    assert largest(point) == 30.0
-    assert largest(point, constrain_indicator=False) == math.inf
-    assert _largest_cost(PointMass(2, 20), "cost") == math.inf
+    assert highest() == 30.0
+    assert highest({"constrain_indicator": False}) == math.inf
+    assert PointMass(2, 20).highest_cost("cost") == math.inf
+    stop = {"_target_": "safe_rl.envs.transforms.EarlyTermination", "budgets": {"cost": 4.0}}
+    assert highest(transforms={"stop": stop}, evaluating=True) == 30.0
+    assert highest(transforms={"stop": {**stop, "in_evaluation": True}}, evaluating=True) == 5.0
 
 
 @pytest.mark.parametrize(("level", "shown"), [(0.995, "99.5%"), (0.95, "95%"), (0.999, "99.9%")])
@@ -174,24 +197,17 @@ def test_levels_are_not_rounded(level, shown):
     assert f"at {shown}: " in str(certificate)
 
 
-def test_a_certificate_that_says_why_a_limit_of_nothing_is_not_kept():
-    verdict = Verdict(None, [0], {"mean_cost": (4.0, 0.0)}, {"mean_cost": 4.0}, ["cost"])
-    line = str(Certificate(None, math.nan, verdict, OPTIONS))
-    assert "by 4). All tested episodes had the same cost: the bound is what unseen ones" in line
-    verdict = Verdict(None, [0], {"mean_cost": (4.0, 0.0)}, {"mean_cost": 4.0})
-    assert str(Certificate(None, math.nan, verdict, OPTIONS)).endswith("(mean_cost by 4).")
-
-
-def test_a_cost_without_a_largest_is_said_in_words_and_written_as_json(tmp_path):
-    verdict = Verdict(None, [0], {"mean_cost": (math.inf, 25.0)}, {"mean_cost": math.inf}, ["cost"])
-    certificate = Certificate(None, math.nan, verdict, OPTIONS)
-    assert "the environment's spec does not say" in str(certificate)
-    assert "env.constrain_indicator=true" in str(certificate)
+def test_costs_without_a_highest_are_said_to_count_up_to_a_cap_and_written_as_json(tmp_path):
+    bounds = {"beyond_250_cost": (0.008, 0.01), "mean_cost": (math.inf, 25.0)}
+    verdict = Verdict(0, [0], bounds, {}, {"mean_cost": 9.0}, {"mean_cost": 250.0}, 700)
+    certificate = Certificate(Path("checkpoint-000000000100.torchrl"), 1.0, verdict, OPTIONS)
+    assert "beyond a cap are not counted (beyond_250_cost: the share" in str(certificate)
 
     def refuse(constant):
         raise AssertionError(f"{constant} is no JSON")
 
     _write(RunFolder(tmp_path), certificate, [100])
     content = json.loads((tmp_path / "certificate.json").read_text(), parse_constant=refuse)
-    assert content["bounds"] == {"mean_cost": {"bound": None, "most": 25.0}}
+    assert content["bounds"]["mean_cost"] == {"bound": None, "most": 25.0}
+    assert (content["episodes"], content["most_episodes"]) == (700, 120)
     assert read_certificate(content)["bounds"]["mean_cost"][1] == 25.0

@@ -64,6 +64,10 @@ class ConstraintTransform(Transform):
     def check(self, cost_keys: Collection[str]) -> None:
         """Raise ValueError if it needs a cost that is not among these."""
 
+    def highest_cost(self, key: str, highest: float, of_a_step: float) -> float:
+        """Return the most that an episode can cost, from what it can without the transform."""
+        return highest
+
     def extend_layout(self, layout: Mapping[str, slice]) -> dict[str, slice]:
         """Add what it observes to the columns of the observation."""
         return dict(layout)

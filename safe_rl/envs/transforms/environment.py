@@ -74,6 +74,16 @@ class TransformedConstrainedEnv(ConstrainedEnv, TransformedEnv):
         """Draws the environment inside; None if that draws no pictures."""
         return self.base_env.render
 
+    def highest_cost(self, key: str) -> float:
+        """Return the most that an episode can cost, with what transforms do about it."""
+        # transforms add costs of their own, which have specs
+        known = key in self.base_env.cost_keys
+        highest = self.base_env.highest_cost(key) if known else super().highest_cost(key)
+        of_a_step = super().highest_cost(key) / self.max_episode_steps
+        for transform in self._ours().values():
+            highest = transform.highest_cost(key, highest, of_a_step)
+        return highest
+
     def get_positions(self) -> TensorDictBase:
         """Return where things are in the environment inside."""
         return self.base_env.get_positions()

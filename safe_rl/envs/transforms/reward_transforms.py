@@ -99,6 +99,11 @@ class EarlyTermination(ConstraintTransform):
         """Raise ValueError if a budget's cost is not among these."""
         check_known(self._budgets, cost_keys)
 
+    def highest_cost(self, key: str, highest: float, of_a_step: float) -> float:
+        """Return the budget and the most that the last step can cost, where episodes end so."""
+        ends = key in self._budgets and (self.in_evaluation or not self.evaluating)
+        return min(highest, self._budgets[key] + of_a_step) if ends else highest
+
     def start(self, done: Tensor) -> dict[str, Tensor]:
         """Return that nothing is spent."""
         shape = (*done.shape[:-1], len(self._budgets))

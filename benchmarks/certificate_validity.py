@@ -1,0 +1,128 @@
+"""How often certificates are wrong, and how often they are given, by both bounds: a simulation.
+
+    python benchmarks/certificate_validity.py [repetitions=2000] [costs=FILE.csv] [write=FILE.csv]
+
+For every distribution of episode costs, policies whose true mean is exactly a limit are tested as
+`safe_rl.scores.certificate.first_certified` tests them, three candidates of a run on the same
+layouts: every certificate is a false one, and at most 5 % may be. Policies whose mean is below the
+limit are tested in the same way: that is the power. `costs=` adds distributions of your own: a CSV
+with a column per policy, an episode per row, as an evaluation writes them.
+"""
+
+from __future__ import annotations
+
+import csv
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+
+from safe_rl.scores.certificate import Claim, first_certified
+
+LIMIT, HIGHEST, EPISODES, TESTS, BATCH = 25.0, 1000.0, 3000, 3, 100
+COSTS = Path(__file__).with_name("episode_costs.csv")
+# what Student's bound is given: the two looks of earlier versions are not simulated
+STUDENT_EPISODES = 600
+
+Draw = Callable[[np.random.Generator, int], np.ndarray]
+
+
+def lognormal(rng: np.random.Generator, number: int) -> np.ndarray:
+    return rng.lognormal(0.0, 0.9, number)
+
+
+def zero_inflated(rng: np.random.Generator, number: int) -> np.ndarray:
+    return (rng.random(number) < 0.3) * rng.gamma(0.8, 1.0, number)
+
+
+def pareto(rng: np.random.Generator, number: int) -> np.ndarray:
+    return rng.pareto(1.5, number)
+
+
+def measured(path: Path) -> dict[str, Draw]:
+    """Draws with replacement from the episodes of policies."""
+    with path.open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    columns = {name: np.array([float(row[name]) for row in rows]) for name in rows[0]}
+    return {
+        name: lambda rng, number, costs=costs: rng.choice(costs, number)
+        for name, costs in columns.items()
+    }
+
+
+def scaled(draw: Draw, mean: float) -> Draw:
+    """The distribution, scaled and cut at the highest cost so that its mean is as given."""
+    sample = draw(np.random.default_rng(0), 1_000_000)
+    low, high = 0.0, 10 * HIGHEST / max(sample.mean(), 1e-9)
+    for _ in range(60):
+        factor = (low + high) / 2
+        reached = (factor * sample).clip(max=HIGHEST).mean()
+        low, high = (factor, high) if reached < mean else (low, factor)
+    return lambda rng, number: (high * draw(rng, number)).clip(max=HIGHEST)
+
+
+def with_catastrophes(draw: Draw, mean: float, one_in: int) -> Draw:
+    """One of so many layouts costs the most that there is; the mean is as given."""
+    usual = scaled(draw, (mean - HIGHEST / one_in) / (1 - 1 / one_in))
+    return lambda rng, number: np.where(
+        rng.random(number) < 1 / one_in, HIGHEST, usual(rng, number)
+    )
+
+
+def distributions(mean: float, own: dict[str, Draw]) -> Iterator[tuple[str, Draw]]:
+    shapes = {"lognormal": lognormal, "zero-inflated": zero_inflated, "Pareto 1.5": pareto, **own}
+    for name, draw in shapes.items():
+        yield name, scaled(draw, mean)
+    base = next(iter(own.values()), lognormal)
+    for one_in in (200, 500, 1000):
+        if mean > HIGHEST / one_in:
+            yield f"1 in {one_in} costs 1000", with_catastrophes(base, mean, one_in)
+
+
+def is_certified(draw: Draw, bound: str, rng: np.random.Generator) -> tuple[bool, int]:
+    """Whether one of three equal candidates is certified, and on how many episodes in all.
+
+    Their layouts are the same, and with them the catastrophes: a third of what their other episodes
+    cost is common to all of them, too.
+    """
+    number = EPISODES if bound == "betting" else STUDENT_EPISODES
+    shared = draw(rng, number)
+    used: list[int] = []
+
+    def collect(candidate: int) -> Iterator[dict[str, np.ndarray]]:
+        own = draw(rng, number)
+        alike = (shared >= HIGHEST) | ((own < HIGHEST) & (rng.random(number) < 1 / 3))
+        costs = np.where(alike, shared, np.where(own >= HIGHEST, shared, own))
+        for start in range(0, number, BATCH):
+            used.append(BATCH)
+            yield {"cost": costs[start : start + BATCH]}
+
+    claim = Claim({"cost": LIMIT}, highest={"cost": HIGHEST}, bound=bound)
+    verdict = first_certified(range(TESTS), collect, [claim] * TESTS, TESTS, number)
+    return verdict.certified is not None, sum(used)
+
+
+def main(repetitions: int = 2000, costs: str = str(COSTS), write: str = "") -> None:
+    own = measured(Path(costs)) if Path(costs).is_file() else {}
+    rows = []
+    for mean in (LIMIT, 22.0, 20.0, 18.0):
+        for name, draw in distributions(mean, own):
+            row = {"mean": mean, "costs": name}
+            for bound in ("betting", "student"):
+                rng = np.random.default_rng(1)
+                found = [is_certified(draw, bound, rng) for _ in range(repetitions)]
+                row[bound] = round(float(np.mean([certified for certified, _ in found])), 4)
+                row[f"{bound}_episodes"] = int(np.median([episodes for _, episodes in found]))
+            rows.append(row)
+            print(*row.values(), sep="\t", flush=True)
+    if write:
+        with Path(write).open("w", newline="") as file:
+            table = csv.DictWriter(file, list(rows[0]))
+            table.writeheader()
+            table.writerows(rows)
+
+
+if __name__ == "__main__":
+    given = dict(argument.split("=", 1) for argument in sys.argv[1:])
+    main(int(given.pop("repetitions", 2000)), **given)

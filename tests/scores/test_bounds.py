@@ -1,0 +1,92 @@
+"""Bounds of means: how often they are wrong, on distributions whose means are known."""
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from safe_rl.scores.bounds import betting_bound, log_wealth, share_bound, student_bound
+
+LEVEL = 0.95
+RNG = np.random.default_rng(1)
+
+
+def two_point(share, high):
+    return lambda shape: high * (RNG.random(shape) < share)
+
+
+# as episode costs are: counts, many zeros, tails of several times the limit, rare catastrophes
+DISTRIBUTIONS = {
+    "poisson": (lambda shape: RNG.poisson(25, shape), 25.0, 1000.0),
+    "geometric": (lambda shape: RNG.geometric(1 / 25, shape).clip(0, 1000), 25.0, 1000.0),
+    "one in 500": (two_point(0.002, 1000.0), 2.0, 1000.0),
+    "one in 20": (two_point(0.05, 1.0), 0.05, 1.0),
+    "even": (lambda shape: RNG.random(shape), 0.5, 1.0),
+}
+
+
+@pytest.mark.parametrize("name", DISTRIBUTIONS)
+def test_looked_at_after_every_episode_a_bet_is_won_wrongly_in_one_case_of_twenty(name):
+    draw, mean, highest = DISTRIBUTIONS[name]
+    won = [log_wealth(draw(1000), mean, highest).max() >= np.log(20) for _ in range(400)]
+    # three standard errors of 400 cases above 5 %
+    assert np.mean(won) < 0.05 + 3 * np.sqrt(0.05 * 0.95 / 400)
+
+
+def test_the_wealth_is_what_the_bets_win():
+    values, mean, highest = np.array([0.2, 0.9, 0.4]), 0.5, 1.0
+    bets, weights = [0.99, 0.7, 0.4, 0.2, 0.08, 0.03], [0.4, 0.2, 0.1, 0.1, 0.1, 0.1]
+    wealth = [
+        sum(
+            weight * np.prod([1 + bet * (mean - value) / (highest - mean) for value in values[:n]])
+            for bet, weight in zip(bets, weights, strict=True)
+        )
+        for n in (1, 2, 3)
+    ]
+    assert log_wealth(values, mean, highest) == pytest.approx(np.log(wealth))
+
+
+def test_the_bound_is_where_the_wealth_reaches_what_the_level_asks_for():
+    values = RNG.geometric(1 / 20, 900).astype(float).clip(0, 1000)
+    bound = betting_bound(values, LEVEL, 1000.0)
+    assert log_wealth(values, bound, 1000.0)[-1] == pytest.approx(np.log(20), abs=1e-4)
+    assert bound > betting_bound(values, 0.9, 1000.0) > values.mean()
+
+
+def test_the_bound_of_rare_events_is_little_above_the_exact_one():
+    exact = share_bound(0, 600, LEVEL)
+    assert exact < betting_bound(np.zeros(600), LEVEL, 1.0) < 1.5 * exact
+
+
+@pytest.mark.parametrize(("odd", "highest"), [(np.nan, 50.0), (np.inf, 50.0), (51.0, 50.0)])
+def test_values_that_cannot_be_have_no_bound(odd, highest):
+    assert betting_bound([1.0] * 99 + [odd], LEVEL, highest) == np.inf
+    assert student_bound([1.0, 2.0, odd if odd != 51 else np.nan], LEVEL) == np.inf
+
+
+def test_a_highest_value_has_to_be_known():
+    with pytest.raises(ValueError, match="must be finite"):
+        betting_bound([1.0], LEVEL, np.inf)
+    assert betting_bound([], LEVEL, 3.0) == betting_bound([3.0, 3.0], LEVEL, 3.0) == 3.0
+
+
+@pytest.mark.parametrize("name", ["poisson", "geometric", "even"])
+def test_students_bound_keeps_its_level_where_high_costs_are_not_rare(name):
+    draw, mean, _ = DISTRIBUTIONS[name]
+    wrong = np.mean([student_bound(draw(100), LEVEL) < mean for _ in range(1000)])
+    assert wrong < 0.05 + 3 * np.sqrt(0.05 * 0.95 / 1000)
+
+
+def test_students_correction_is_for_skewed_costs_only():
+    # even, with a tail to the left, with one to the right
+    costs = np.array([[10.0, 20.0, 30.0, 40.0], [0.0, 100.0, 100.0, 100.0], [0.0, 0.0, 0.0, 100.0]])
+    student = costs.mean(1) + stats.t.ppf(LEVEL, 3) * costs.std(1, ddof=1) / 2
+    bounds = [student_bound(row, LEVEL) for row in costs]
+    assert bounds[:2] == pytest.approx(student[:2])
+    assert bounds[2] > student[2]
+    assert student_bound([4.0] * 30, LEVEL) == np.inf
+
+
+def test_bounds_of_shares_are_those_of_the_exact_test():
+    exact = stats.binomtest(37, 200).proportion_ci(0.9, method="exact").high
+    assert share_bound(37, 200, LEVEL) == pytest.approx(exact)
+    assert share_bound(5, 5, LEVEL) == 1.0
