@@ -13,8 +13,8 @@ from typing import Any
 
 from safe_rl.envs.errors import ConfigError, nearest
 from safe_rl.envs.safety_gym.building import forget_scenes
-from safe_rl.envs.safety_gym.config import Key, registered_keys, set_registered_keys
-from safe_rl.envs.safety_gym.config_values import infer_annotation
+from safe_rl.envs.safety_gym.config import registered_keys, set_registered_keys
+from safe_rl.envs.safety_gym.config_values import Key, infer_key
 from safe_rl.envs.safety_gym.costs import (
     COSTS,
     EXCEPTION_KEY,
@@ -250,5 +250,5 @@ def _add_keys(given: Mapping[str, Any] | None, standard: Mapping[str, Key] | Non
         elif name in keys:
             keys[name] = keys[name]._replace(default=value)
         else:
-            keys[name] = Key(value, infer_annotation(name, value))
+            keys[name] = infer_key(name, value)
     set_registered_keys({**registered_keys(), **keys})

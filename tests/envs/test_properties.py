@@ -1,6 +1,5 @@
 """Any valid configuration makes a working environment; errors name the key that is wrong."""
 
-import dataclasses
 import math
 import string
 
@@ -9,6 +8,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from safe_rl.envs import ConfigError, SafetyGymConfig, SafetyGymEnv
+from safe_rl.envs.safety_gym.config_keys import Vocabulary
 
 # Deterministic, so that no run depends on luck; without deadlines, which depend on the machine.
 often = settings(
@@ -20,13 +20,9 @@ often = settings(
 
 COUNTED = ("walls", "hazards", "vases", "pillars", "buttons", "gremlins")
 PLACED = (*COUNTED, "robot", "goal", "box")
-FLAGS = [
-    field.name
-    for field in dataclasses.fields(SafetyGymConfig)
-    if field.type == "bool"
-    # Needs OpenGL; has its own tests.
-    and field.name != "observe_vision"
-]
+FIELDS = dict(Vocabulary.__annotations__)
+# vision needs OpenGL, and has its own tests
+FLAGS = [name for name, kind in FIELDS.items() if kind == "bool" and name != "observe_vision"]
 
 
 def between(low: float, high: float) -> st.SearchStrategy[float]:
@@ -154,7 +150,6 @@ WRONG = {
     "tuple[float, ...]": st.sampled_from([None, ("a",), 1.0, ((1.0,),), "12"]),
     "tuple[int, int]": st.sampled_from([None, (1,), (1.5, 2), 3, (0, 4), (60, -40)]),
 }
-FIELDS = {field.name: str(field.type) for field in dataclasses.fields(SafetyGymConfig)}
 
 
 @settings(often, max_examples=300)

@@ -5,76 +5,84 @@ Lengths are metres, angles radians, times environment steps unless said otherwis
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import Any, NamedTuple
+
+import numpy as np
 
 from safe_rl.envs.errors import ConfigError, nearest
 from safe_rl.envs.safety_gym.config_keys import RETIRED, Vocabulary
-from safe_rl.envs.safety_gym.config_values import Range, check_retired, coerce, infer_range
-from safe_rl.envs.safety_gym.config_values import key as declare
+from safe_rl.envs.safety_gym.config_values import TYPES, Key, coerce, infer_range
+
+_BUILT_IN: dict[str, Key] = {
+    name: vars(Vocabulary)[name]._replace(annotation=annotation)
+    for name, annotation in Vocabulary.__annotations__.items()
+}
+_keys = dict(_BUILT_IN)  # and those that are registered
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
 class SafetyGymConfig(Vocabulary):
     """Everything that defines one environment.
 
-    Keys that `safe_rl.envs.extending` registered are fields like the others. A record knows types
-    and ranges; whether there is such a task or robot, and what keys need of one another, is checked
-    where an environment is made or stored, see `suite.resolve`.
+    Keys that `safe_rl.envs.extending` registered are attributes like the others. Types and ranges
+    are checked here; whether there is such a task or robot, and what keys need of one another, is
+    checked where an environment is made or stored, see `suite.resolve`.
+
+    Args:
+        values: of the keys that differ from their defaults.
 
     Raises:
-        ConfigError: if a value has the wrong type or is out of range.
+        ConfigError: for an unknown key (the nearest one is named), a wrong type or a value out of
+            range.
 
     Examples:
-        >>> config = SafetyGymConfig.from_dict({"task": "goal", "hazards_num": 3})
+        >>> config = SafetyGymConfig(task="goal", hazards_num=3)
         >>> config.replace(hazards_num=5).hazards_num
         5
     """
 
-    def __new__(cls, **values: Any) -> SafetyGymConfig:
-        """Make an object of the present vocabulary, registered keys included."""
-        return object.__new__(_vocabulary)
+    def __init__(self, **values: Any) -> None:
+        for name, (harmless, instead) in RETIRED.items():
+            value = values.pop(name, harmless)
+            if (value.item() if isinstance(value, np.generic) else value) is not harmless:
+                raise ConfigError(
+                    f"Configuration key '{name}' does not exist any more: {instead}. Got {value!r}."
+                )
+        for name in values:
+            if name not in _keys:
+                raise ConfigError(
+                    f"Unknown configuration key '{name}'.{nearest(name, _keys)} "
+                    "SafetyGymConfig lists every key with its default."
+                )
+        for name, key in _keys.items():
+            vars(self)[name] = coerce(name, key, values.get(name, key.default))
+
+    def __getattr__(self, name: str) -> Any:
+        """Return the default of a key that was registered after this was made."""
+        if name in _keys:
+            return _keys[name].default
+        raise AttributeError(f"A SafetyGymConfig has no attribute '{name}'.")
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        raise AttributeError(f"A configuration does not change: use replace({name}=…).")
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Pickle as values: the class with registered keys has no name to be found by."""
         return SafetyGymConfig.from_dict, (self.to_dict(),)
 
     def __eq__(self, other: object) -> bool:
-        """Compare values: an object made before a key was registered has its default."""
         return isinstance(other, SafetyGymConfig) and self.to_dict() == other.to_dict()
 
     def __hash__(self) -> int:
-        """Hash what never changes, the built-in keys."""
         return hash(tuple(getattr(self, key) for key in _BUILT_IN))
 
-    def __post_init__(self) -> None:
-        for field in dataclasses.fields(self):
-            given, range = getattr(self, field.name), field.metadata["range"]
-            value = coerce(field.name, str(field.type), given, range)
-            object.__setattr__(self, field.name, value)
+    def __repr__(self) -> str:
+        values = (f"{k}={v!r}" for k, v in self.to_dict().items() if v != _keys[k].default)
+        return f"SafetyGymConfig({', '.join(values)})"
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> SafetyGymConfig:
-        """Build a configuration from a flat mapping.
-
-        Raises:
-            ConfigError: for a key that is not in the vocabulary (the nearest one is named), a
-                wrong type or a value out of range.
-        """
-        known, given = known_keys(), {}
-        for key, value in values.items():
-            if key in RETIRED:
-                check_retired(key, value, *RETIRED[key])
-                continue
-            if key not in known:
-                raise ConfigError(
-                    f"Unknown configuration key '{key}'.{nearest(str(key), known)} "
-                    "SafetyGymConfig lists every key with its default."
-                )
-            given[key] = value
-        return SafetyGymConfig(**given)
+        """Build a configuration from a flat mapping."""
+        return cls(**{str(key): value for key, value in values.items()})
 
     def replace(self, **changes: Any) -> SafetyGymConfig:
         """Return a copy with some keys changed, checked like a new one."""
@@ -82,23 +90,7 @@ class SafetyGymConfig(Vocabulary):
 
     def to_dict(self) -> dict[str, Any]:
         """Return the flat mapping of every key, as `from_dict` takes it."""
-        return {key: getattr(self, key) for key in known_keys()}
-
-
-class Key(NamedTuple):
-    """A key to register.
-
-    Attributes:
-        default: its value where none is given.
-        annotation: its type, as `Vocabulary` writes it.
-        meaning: what it is, for the table of keys.
-        range: which values it may have; None takes that of built-in keys which end alike.
-    """
-
-    default: Any
-    annotation: str
-    meaning: str = ""
-    range: Range | None = None
+        return {name: getattr(self, name) for name in _keys}
 
 
 class KeyRow(NamedTuple):
@@ -119,54 +111,24 @@ class KeyRow(NamedTuple):
     default: Any
 
 
-_TYPES = {
-    "bool": "True or False",
-    "int": "integer",
-    "float": "number",
-    "str": "text",
-    "int | None": "integer or None",
-    "float | None": "number or None",
-    "Rectangle": "(xmin, ymin, xmax, ymax)",
-    "Placements": "list of (xmin, ymin, xmax, ymax), or None",
-    "Locations": "list of (x, y)",
-    "tuple[str, ...]": "list of texts",
-    "tuple[float, ...]": "list of numbers",
-    "tuple[int, int]": "two integers",
-}
-
-
 def key_table() -> list[KeyRow]:
-    """Return what there is to know of every key, registered ones included.
+    """Return a row for every key, registered ones included.
 
     Examples:
         >>> {row.name: row for row in key_table()}["hazards_size"][1:]
         ('number', 'greater than 0', 'radius [m]', 0.3)
     """
-    return [
-        KeyRow(
-            name=field.name,
-            type=_TYPES[str(field.type)],
-            range=str(field.metadata["range"]),
-            meaning=field.metadata["meaning"],
-            default=field.default,
-        )
-        for field in dataclasses.fields(_vocabulary)
-    ]
-
-
-_BUILT_IN = frozenset(field.name for field in dataclasses.fields(SafetyGymConfig))
-_registered: dict[str, Key] = {}
-_vocabulary: type[SafetyGymConfig] = SafetyGymConfig
-
-
-def known_keys() -> list[str]:
-    """Return the names of all keys, registered ones included."""
-    return [field.name for field in dataclasses.fields(_vocabulary)]
+    rows = []
+    for name, key in _keys.items():
+        words = TYPES[key.annotation][0].removeprefix("an ").removeprefix("a ")
+        range = infer_range(name) if key.range is None else key.range
+        rows.append(KeyRow(name, words, str(range), key.meaning, key.default))
+    return rows
 
 
 def registered_keys() -> dict[str, Key]:
     """Return the keys that are not built in."""
-    return dict(_registered)
+    return {name: key for name, key in _keys.items() if name not in _BUILT_IN}
 
 
 def set_registered_keys(keys: Mapping[str, Key]) -> None:
@@ -175,32 +137,9 @@ def set_registered_keys(keys: Mapping[str, Key]) -> None:
     Raises:
         ConfigError: if a key is built in, or a default is not of its type.
     """
-    global _vocabulary
     for name, key in keys.items():
         if name in _BUILT_IN:
             raise ConfigError(f"The configuration key '{name}' is taken: choose another name.")
-        coerce(name, key.annotation, key.default, _range_of(name, key))
-    for name in _registered:
-        delattr(SafetyGymConfig, name)
-    # Configurations that were made earlier have the default of what they don't know.
-    for name, key in keys.items():
-        setattr(SafetyGymConfig, name, key.default)
-    _registered.clear()
-    _registered.update(keys)
-    _vocabulary = dataclasses.make_dataclass(
-        "SafetyGymConfig",
-        [(name, key.annotation, _field_of(name, key)) for name, key in keys.items()],
-        bases=(SafetyGymConfig,),
-        namespace={"__module__": __name__, "__doc__": SafetyGymConfig.__doc__},
-        frozen=True,
-        kw_only=True,
-        eq=False,
-    )
-
-
-def _range_of(name: str, key: Key) -> Range:
-    return infer_range(name) if key.range is None else key.range
-
-
-def _field_of(name: str, key: Key) -> Any:
-    return declare(key.default, key.meaning, _range_of(name, key))
+        coerce(name, key, key.default)
+    _keys.clear()
+    _keys.update({**_BUILT_IN, **keys})

@@ -8,8 +8,6 @@ boundaries and `velocity_limit`.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 from safe_rl.envs.safety_gym.config_values import (
     FREE_OBJECTS,
     LARGEST_SEED,
@@ -41,7 +39,6 @@ RETIRED = {
 }
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
 class Vocabulary:
     """The keys that are built in."""
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import math
 from collections.abc import Callable, Collection, Iterable, Mapping
 from typing import Any, NamedTuple
@@ -15,7 +14,6 @@ Rectangle = tuple[float, float, float, float]
 Point2 = tuple[float, float]
 Placements = tuple[Rectangle, ...] | None
 Locations = tuple[Point2, ...]
-
 
 LARGEST = 10**9  # of all numbers: float32 still holds its square
 LARGEST_SEED = 2**62  # of layouts, which are hashed as 64-bit integers
@@ -58,104 +56,130 @@ def one_of(*choices: Any) -> Range:
     return Range(f"one of {choices}", lambda x: x in choices, choices=choices)
 
 
+class Key(NamedTuple):
+    """A configuration key.
+
+    Attributes:
+        default: its value where none is given.
+        annotation: its type, as `Vocabulary` writes it.
+        meaning: what it is, for the table of keys.
+        range: which values it may have; None takes that of built-in keys which end alike.
+    """
+
+    default: Any
+    annotation: str
+    meaning: str = ""
+    range: Range | None = None
+
+
 def key(default: Any, meaning: str, range: Range = ANY) -> Any:
-    """Declare a key: the field of a dataclass, whose annotation is the key's type."""
-    return dataclasses.field(default=default, metadata={"meaning": meaning, "range": range})
+    """Declare a key of the vocabulary, whose annotation there is its type."""
+    return Key(default, "", meaning, range)
 
 
-def _wrong(key: str, wanted: str, value: Any) -> ConfigError:
-    return ConfigError(f"Configuration key '{key}' must be {wanted}, got {value!r}.")
-
-
-def _python(value: Any) -> Any:
-    """A number, truth value or text of NumPy's as one of Python's; all else as it is."""
-    return value.item() if isinstance(value, np.generic) else value
-
-
-def _boolean(key: str, value: Any) -> bool:
+def _boolean(value: Any) -> bool:
     if not isinstance(value, bool):
-        raise _wrong(key, "True or False", value)
+        raise TypeError
     return value
 
 
-def _integer(key: str, value: Any) -> int:
+def _integer(value: Any) -> int:
     is_whole = isinstance(value, int) or (isinstance(value, float) and value.is_integer())
     if isinstance(value, bool) or not is_whole:
-        raise _wrong(key, "an integer", value)
+        raise TypeError
     return int(value)
 
 
-def _number(key: str, value: Any) -> float:
-    try:
-        number = math.nan if isinstance(value, bool | str) else float(value)
-    except (TypeError, ValueError, OverflowError):
-        number = math.nan
-    if not math.isfinite(number):
-        raise _wrong(key, "a finite number", value)
+def _number(value: Any) -> float:
+    if isinstance(value, bool | str) or not math.isfinite(number := float(value)):
+        raise TypeError
     return number
 
 
-def _text(key: str, value: Any) -> str:
+def _text(value: Any) -> str:
     if not isinstance(value, str):
-        raise _wrong(key, "a string", value)
+        raise TypeError
     return value
 
 
-def _sequence(key: str, value: Any) -> list[Any]:
-    if isinstance(value, str | Mapping) or not isinstance(value, Iterable):
-        raise _wrong(key, "a list", value)
-    return list(value)
-
-
-def _tuple_of(parse: Any, length: int | None = None) -> Any:
-    def parse_all(key: str, value: Any) -> tuple[Any, ...]:
-        items = _sequence(key, value)
+def _tuple_of(parse: Callable[[Any], Any], length: int | None = None) -> Callable[[Any], Any]:
+    def parse_all(value: Any) -> tuple[Any, ...]:
+        if isinstance(value, str | Mapping) or not isinstance(value, Iterable):
+            raise TypeError
+        items = tuple(parse(_python(item)) for item in value)
         if length is not None and len(items) != length:
-            raise _wrong(key, f"a list of {length} values", value)
-        return tuple(parse(key, _python(item)) for item in items)
+            raise ValueError
+        return items
 
     return parse_all
 
 
-def _optional(parse: Any) -> Any:
-    return lambda key, value: None if value is None else parse(key, value)
+def _rectangle(value: Any) -> Rectangle:
+    xmin, ymin, xmax, ymax = _tuple_of(_number, 4)(value)
+    if xmin > xmax or ymin > ymax:
+        raise ValueError
+    return xmin, ymin, xmax, ymax
 
 
-_PARSERS = {
-    "bool": _boolean,
-    "int": _integer,
-    "float": _number,
-    "str": _text,
-    "int | None": _optional(_integer),
-    "float | None": _optional(_number),
-    "Rectangle": _tuple_of(_number, 4),
-    "Placements": _optional(_tuple_of(_tuple_of(_number, 4))),
-    "Locations": _tuple_of(_tuple_of(_number, 2)),
-    "tuple[str, ...]": _tuple_of(_text),
-    "tuple[float, ...]": _tuple_of(_number),
-    "tuple[int, int]": _tuple_of(_integer, 2),
+def _placements(value: Any) -> Placements:
+    if not (rectangles := _tuple_of(_rectangle)(value)):
+        raise ValueError
+    return rectangles
+
+
+def _or_none(parse: Callable[[Any], Any]) -> Callable[[Any], Any]:
+    return lambda value: None if value is None else parse(value)
+
+
+_RECTANGLE = "(xmin, ymin, xmax, ymax) with xmin <= xmax and ymin <= ymax"
+# annotation -> its name in words, to stand behind "must be", and how a value of it is read
+TYPES: dict[str, tuple[str, Callable[[Any], Any]]] = {
+    "bool": ("True or False", _boolean),
+    "int": ("an integer", _integer),
+    "float": ("a number", _number),
+    "str": ("a text", _text),
+    "int | None": ("an integer or None", _or_none(_integer)),
+    "float | None": ("a number or None", _or_none(_number)),
+    "Rectangle": (_RECTANGLE, _rectangle),
+    "Placements": (f"a list of at least one {_RECTANGLE}; or None", _or_none(_placements)),
+    "Locations": ("a list of (x, y)", _tuple_of(_tuple_of(_number, 2))),
+    "tuple[str, ...]": ("a list of texts", _tuple_of(_text)),
+    "tuple[float, ...]": ("a list of numbers", _tuple_of(_number)),
+    "tuple[int, int]": ("two integers", _tuple_of(_integer, 2)),
 }
 
 
-def coerce(key: str, annotation: str, value: Any, range: Range = ANY) -> Any:
-    """Return `value` as the type that the field's annotation names, within the key's range.
+def coerce(name: str, key: Key, value: Any) -> Any:
+    """Return `value` as the type of a key, within the key's range.
 
     Raises:
         ConfigError: if it is of another type, or out of range.
     """
-    if annotation not in _PARSERS:
-        raise ConfigError(f"The type of key '{key}' must be one of {tuple(_PARSERS)}.")
-    value = _PARSERS[annotation](key, _python(value))
+    if key.annotation not in TYPES:
+        raise ConfigError(f"The type of key '{name}' must be one of {tuple(TYPES)}.")
+    words, parse = TYPES[key.annotation]
+    try:
+        value = parse(_python(value))
+    except (TypeError, ValueError, OverflowError):
+        raise _wrong(name, words, value) from None
+    range = infer_range(name) if key.range is None else key.range
     if range.choices:
-        check_choice(key, value, range.choices)
+        check_choice(name, value, range.choices)
     numbers = _numbers(value)
     if not all(range.holds(number) for number in numbers):
-        raise _wrong(key, range.wanted, value)
+        raise _wrong(name, range.wanted, value)
     if not all(abs(number) <= range.largest for number in numbers):
-        raise _wrong(key, f"at most {range.largest:,}", value)
-    if annotation in ("Placements", "Rectangle"):
-        _check_rectangles(key, value if annotation == "Placements" else (value,), value)
+        raise _wrong(name, f"at most {range.largest:,}", value)
     return value
+
+
+def _wrong(name: str, wanted: str, value: Any) -> ConfigError:
+    return ConfigError(f"Configuration key '{name}' must be {wanted}, got {value!r}.")
+
+
+def _python(value: Any) -> Any:
+    """A number, truth value or text of NumPy as one of Python; anything else as it is."""
+    return value.item() if isinstance(value, np.generic) else value
 
 
 def _numbers(value: Any) -> list[float]:
@@ -165,23 +189,23 @@ def _numbers(value: Any) -> list[float]:
     return [value] if isinstance(value, int | float) and not isinstance(value, bool) else []
 
 
-def infer_annotation(key: str, default: Any) -> str:
-    """Return the annotation of the type that a default value has.
+def infer_key(name: str, default: Any) -> Key:
+    """Return the key of the type that a default value has.
 
     Raises:
         ConfigError: if the default alone does not tell.
     """
-    kinds = ("bool", "int", "float", "str")
-    if type(default).__name__ in kinds:
-        return type(default).__name__
-    if isinstance(default, tuple) and default and type(default[0]) in (int, float):
-        return "tuple[float, ...]"
-    if isinstance(default, tuple) and default and isinstance(default[0], str):
-        return "tuple[str, ...]"
-    raise ConfigError(
-        f"The type of key '{key}' does not follow from its default {default!r}: give "
-        f"Key(default, annotation) with one of {tuple(_PARSERS)}."
-    )
+    kind = type(default[0] if isinstance(default, tuple) and default else default)
+    name_of = {bool: "bool", int: "int", float: "float", str: "str"}.get(kind)
+    if isinstance(default, tuple):
+        name_of = {"int": "float", "float": "float", "str": "str"}.get(name_of or "")
+        name_of = name_of and f"tuple[{name_of}, ...]"
+    if name_of is None:
+        raise ConfigError(
+            f"The type of key '{name}' does not follow from its default {default!r}: give "
+            f"Key(default, annotation) with one of {tuple(TYPES)}."
+        )
+    return Key(default, name_of)
 
 
 # Of keys that are registered without a range, by how they end.
@@ -192,12 +216,12 @@ _RANGES = {
 }
 
 
-def infer_range(key: str) -> Range:
+def infer_range(name: str) -> Range:
     """Return the range that a key of this name has among the built-in ones."""
-    return next((range for ends, range in _RANGES.items() if key.endswith(ends)), ANY)
+    return next((range for ends, range in _RANGES.items() if name.endswith(ends)), ANY)
 
 
-def check_choice(key: str, value: Any, choices: Collection[Any]) -> None:
+def check_choice(name: str, value: Any, choices: Collection[Any]) -> None:
     """Check that a value is one of several.
 
     Raises:
@@ -205,22 +229,4 @@ def check_choice(key: str, value: Any, choices: Collection[Any]) -> None:
     """
     if value not in choices:
         hint = nearest(value, map(str, choices)) if isinstance(value, str) else ""
-        raise ConfigError(f"'{key}' must be one of {tuple(choices)}, got {value!r}.{hint}")
-
-
-def check_retired(key: str, value: Any, harmless: Any, instead: str) -> None:
-    """Check a key that has lost its meaning.
-
-    Raises:
-        ConfigError: if its value asks for something; the message says what to do instead.
-    """
-    if _python(value) is not harmless:
-        raise ConfigError(f"Configuration key '{key}' is no more: {instead}. Got {value!r}.")
-
-
-def _check_rectangles(key: str, rectangles: Placements, value: Any) -> None:
-    if rectangles == ():
-        raise _wrong(key, "None or a list of at least one rectangle", value)
-    for xmin, ymin, xmax, ymax in rectangles or ():
-        if xmin > xmax or ymin > ymax:
-            raise _wrong(key, "(xmin, ymin, xmax, ymax) with xmin <= xmax, ymin <= ymax", value)
+        raise ConfigError(f"'{name}' must be one of {tuple(choices)}, got {value!r}.{hint}")
