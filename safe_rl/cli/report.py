@@ -23,6 +23,7 @@ from safe_rl.scores.published import SEEDS
 __all__ = ["ReportOptions", "main", "report", "suite"]
 
 COMMAND = "python -m safe_rl.report"
+FORMATS = ("png", "svg", "pdf")
 
 
 @dataclass
@@ -36,6 +37,8 @@ class ReportOptions:
 
     out: str | None = option(None, "folder of the report; null: RUNS_DIR/report")
     seeds: int = option(len(SEEDS), "finished runs per environment that a slate needs")
+    algos: str | None = option(None, "algorithms to report, such as cpo,ppo_lagrangian; null: all")
+    formats: str = option("png", "of the pictures, such as png,svg,pdf")
     unfinished: bool = option(False, "include unfinished runs in scores")
     archive: str | None = option(
         None, "campaign archive to add the runs to, for others; null: none"
@@ -75,15 +78,25 @@ def report(root: Path, options: ReportOptions) -> tuple[Report, Path]:
         raise ValueError(f"seeds={options.seeds}: a slate takes at least one run per environment.")
     if not 0.0 < options.good <= 10.0:
         raise ValueError(f"good={options.good}: a share of a return, for example 0.5 for half.")
+    formats = [form.strip() for form in options.formats.split(",")]
+    for form in formats:
+        if form not in FORMATS:
+            raise ValueError(f"formats={form}: pictures are written as {', '.join(FORMATS)}.")
     out = root / "report" if options.out is None else Path(options.out)
     if options.out is None and out.is_symlink():
         raise ValueError(f"{out} is a link: remove it, or say out=FOLDER.")
     if root.is_dir():
         check_place(out / "report.html", "out=FOLDER writes the report elsewhere.")
+    algorithms = list(filter(None, map(str.strip, (options.algos or "").split(","))))
     result = build_report(
-        root, suite(), seeds_needed=options.seeds, unfinished=options.unfinished, good=options.good
+        root,
+        suite(),
+        seeds_needed=options.seeds,
+        unfinished=options.unfinished,
+        good=options.good,
+        algorithms=algorithms,
     )
-    return result, write_report(result, out, options.title or root.resolve().name)
+    return result, write_report(result, out, options.title or root.resolve().name, formats)
 
 
 def main(arguments: Sequence[str] | None = None, program: str = COMMAND) -> int:
@@ -114,8 +127,6 @@ def main(arguments: Sequence[str] | None = None, program: str = COMMAND) -> int:
         return 1
     for path, reason in result.skipped.items():
         print(f"left out {clean(path)}: {reason}", file=sys.stderr)
-    for gap in result.missing_runs.records:
-        print(f"{gap['slate']} lacks {gap['runs']} runs of {gap['algorithm']}")
     for name, (plan, *_) in result.campaigns.items():
         print(f"{name}: {plan.note}")
     print(f"wrote {page}")

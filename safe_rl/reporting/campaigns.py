@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 
 from safe_rl.files import read_yaml
 from safe_rl.reporting.recorded import Run
-from safe_rl.reporting.tables import MISSING, Column, Table, clean
+from safe_rl.reporting.tables import Table, clean
 from safe_rl.runs.folder import paths_below
 from safe_rl.runs.identity import flatten, role_of
 
@@ -121,17 +121,13 @@ def _tables(name: str, cells: Sequence[Planned], runs: Sequence[Run]) -> list[Ta
     done, begun = (sum(record[key] for record in records) for key in ("num_done", "num_begun"))
     note = f"{done} of {planned} runs are done"
     note += f", {begun} have begun." if begun else "."
-    columns = [
-        Column("environment", ("{}", "env")),
-        Column("algorithm", ("{}", "algo")),
-        Column("steps", ("{:,}", "frames")),
-        *([Column("with", ("{}", "further"))] if any(r["further"] for r in records) else []),
-        *(Column(state) for state in ("done", "begun", "missing")),
-    ]
+    columns = {"environment": "{env}", "algorithm": "{algo}", "steps": "{frames:,}"}
+    columns |= {"with": "{further}"} if any(record["further"] for record in records) else {}
+    columns |= {state: f"{{{state}}}" for state in ("done", "begun", "missing")}
     shown = [Table(f"campaign_{name}", name, columns, records, note)]
     commands = _commands(cells, [record["seeds_missing"] for record in records])
     if commands:
-        columns = [Column("runs", ("{:d}", "runs")), Column("command")]
+        columns = {"runs": "{runs:d}", "command": "{command}"}
         shown.append(Table(f"campaign_{name}_missing", f"{name}: missing", columns, commands))
     return shown
 
@@ -154,9 +150,9 @@ def _record(name: str, cell: Planned, runs: Sequence[Run]) -> dict[str, Any]:
         "num_begun": len(begun),
         "num_missing": len(missing),
         "seeds_missing": missing,
-        "done": ", ".join(map(str, done)) or MISSING,
-        "begun": ", ".join(shares) or MISSING,
-        "missing": ", ".join(map(str, missing)) or MISSING,
+        "done": ", ".join(map(str, done)) or "—",
+        "begun": ", ".join(shares) or "—",
+        "missing": ", ".join(map(str, missing)) or "—",
     }
 
 

@@ -1,4 +1,4 @@
-"""Learning curves (the paper's Figures 7 to 9)."""
+"""Learning curves (the paper's Figures 7 to 9): few in a panel, or a panel per algorithm."""
 
 from __future__ import annotations
 
@@ -12,27 +12,23 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter, MaxNLocator
 
 from safe_rl.reporting.experiments import Experiment, cost_keys_of
-from safe_rl.reporting.figures import (
-    LIMIT_STYLE,
-    WIDTH,
-    Style,
-    add_legend,
-    literal,
-    set_grid,
-)
+from safe_rl.reporting.figures import LIMIT_STYLE, WIDTH, Style, add_legend, literal, set_grid
 from safe_rl.reporting.recorded import Run
-from safe_rl.reporting.tables import clean
+from safe_rl.reporting.tables import clean, short_number
 from safe_rl.runs.curves import moving_mean, point_marker
 from safe_rl.runs.outcome import final_width
 from safe_rl.scores.comparisons import bootstrap
 
 __all__ = [
-    *("Average", "average", "draw_experiment", "draw_learning_curves", "limits_of", "set_axes"),
+    *("Average", "average", "drawn_keys", "draw_experiment", "draw_learning_curves"),
+    *("draw_small_multiples", "limits_of", "set_axes"),
 ]
 
 _NUM_POINTS = 200  # of a curve at most; a panel is not much wider in pixels
-_ROW_HEIGHT = 2.5  # of a row of panels [inch]
+_NUM_MARKERS = 6  # of a curve
+_ROW_HEIGHT = 2.4  # of a row of panels [inch]
 _TITLES = ("Return", "Episode cost", "Cost rate")
+_MULTIPLES = 6  # small panels beside each other
 
 
 class Average(NamedTuple):
@@ -47,7 +43,9 @@ class Average(NamedTuple):
     high: np.ndarray
 
 
-def average(runs: Sequence[Run], column: str, *, smooth: bool) -> Average | None:
+def average(
+    runs: Sequence[Run], column: str, *, smooth: bool, with_band: bool = True
+) -> Average | None:
     """Average a column of the runs' tables over seeds; None if one has no value, or there is none.
 
     The curve ends where the first of the runs does. Between epochs, and over those in which no
@@ -58,6 +56,7 @@ def average(runs: Sequence[Run], column: str, *, smooth: bool) -> Average | None
         column: Column of their tables.
         smooth: Whether to take :func:`safe_rl.runs.curves.moving_mean` first, which ends at the
             run's final figure.
+        with_band: Whether to compute the interval, which takes most of the time.
     """
     series = []
     for run in runs:
@@ -74,7 +73,9 @@ def average(runs: Sequence[Run], column: str, *, smooth: bool) -> Average | None
     longest = max(len(steps) for steps, _ in series)
     grid = np.linspace(start, stop, min(longest, _NUM_POINTS)) if stop > start else np.array([stop])
     heights = np.stack([np.interp(grid, steps, values) for steps, values in series], -1)
-    return Average(grid, heights.mean(-1), *bootstrap([heights], np.mean))
+    nothing = np.full(grid.shape, np.nan)
+    ends = bootstrap([heights], np.mean) if with_band else (nothing, nothing)
+    return Average(grid, heights.mean(-1), *ends)
 
 
 def draw_learning_curves(experiments: Sequence[Experiment], styles: Mapping[str, Style]) -> Figure:
@@ -82,26 +83,28 @@ def draw_learning_curves(experiments: Sequence[Experiment], styles: Mapping[str,
 
     Lines are means over seeds and bands their 95 % intervals; return and episode cost are means of
     an epoch and those before it, as many as final figures have. Limits d are dashed, and so is
-    d / T_ep beside the cost rate. Runs that have not come to their end are drawn one by one, thin.
+    d / T_ep beside the cost rate. Runs that have not come to their end are dotted, one by one.
+    An environment has a row for each number of steps, and for each cost with a limit.
 
     Args:
         experiments: Any environments and algorithms.
-        styles: Name of an algorithm -> how it is drawn.
+        styles: Label of an experiment -> how it is drawn.
     """
-    rows = [
-        (environment, key)
-        for environment in dict.fromkeys(e.environment for e in experiments)
-        for key in _drawn_keys([e for e in experiments if e.environment == environment])
-    ]
+    groups: dict[tuple[str, int], list[Experiment]] = {}
+    for e in experiments:
+        groups.setdefault((e.environment, e.planned_steps), []).append(e)
+    rows = [(*group, key) for group, own in groups.items() for key in drawn_keys(own)]
     figure = Figure(figsize=(WIDTH, _ROW_HEIGHT * len(rows) + 0.3), layout="constrained")
     panels = figure.subplots(len(rows), 3, squeeze=False)
-    for (environment, key), axes in zip(rows, panels, strict=True):
-        shown = [e for e in experiments if e.environment == environment]
+    several = len({name for name, _ in groups}) < len(groups)
+    for (environment, steps, key), axes in zip(rows, panels, strict=True):
+        shown = groups[environment, steps]
         for experiment in shown:
-            draw_experiment(experiment, key, axes, styles[experiment.algorithm])
-        name = literal(fill(environment.replace(" (", "\n("), 24, replace_whitespace=False))
-        label = name if key == "cost" else f"{name}\n{literal(clean(key, 40))}"
-        axes[0].set_ylabel(label, fontweight="bold")
+            draw_experiment(experiment, key, axes, styles[experiment.label])
+        words = [fill(environment.replace(" (", "\n("), 24, replace_whitespace=False)]
+        words += [f"{short_number(steps)} steps"] if several else []
+        words += [] if key == "cost" else [clean(key, 40)]
+        axes[0].set_ylabel(literal("\n".join(words)), fontweight="bold")
         for axis, height in limits_of(shown, key, axes):
             axis.axhline(height, **LIMIT_STYLE)
         set_axes(axes)
@@ -113,9 +116,71 @@ def draw_learning_curves(experiments: Sequence[Experiment], styles: Mapping[str,
     return figure
 
 
+def draw_small_multiples(
+    experiments: Sequence[Experiment], key: str, styles: Mapping[str, Style]
+) -> Figure:
+    """Draw return, episode cost and cost rate of many algorithms, a column of panels for each.
+
+    The other algorithms are grey in the background. Costs above four times the highest limit are
+    cut off, if all curves end below it.
+
+    Args:
+        experiments: Of one environment and one number of steps.
+        key: Cost key.
+        styles: Label of an experiment -> how it is drawn.
+    """
+    columns: dict[str, list[Experiment]] = {}
+    for experiment in experiments:
+        columns.setdefault(experiment.base, []).append(experiment)
+    means = {e.label: _curves(e.finished, key, with_band=False) for e in experiments}
+    width = min(_MULTIPLES, -(-len(columns) // -(-len(columns) // _MULTIPLES)))
+    bands = -(-len(columns) // width)
+    figure = Figure(figsize=(WIDTH, 0.3 + 4.2 * bands), layout="constrained")
+    panels = figure.subplots(3 * bands, width, squeeze=False)
+    for number, own in enumerate(columns.values()):
+        band, column = divmod(number, width)
+        axes = list(panels[3 * band : 3 * band + 3, column])
+        for label in means.keys() - {e.label for e in own}:
+            for axis, curve in zip(axes, means[label], strict=True):
+                if curve is not None:
+                    axis.plot(curve.steps, curve.mean, color="0.88", linewidth=0.8, zorder=0)
+        for experiment in own:
+            draw_experiment(experiment, key, axes, styles[experiment.label])
+        title, *settings = own[0].label.partition(" (")
+        colour = styles[own[0].label].colour
+        axes[0].set_title(literal(title), fontsize=10, fontweight="bold", color=colour)
+        if len(own) > 1 or any(settings):
+            handles, names = axes[0].get_legend_handles_labels()
+            shown = [name.partition(" (")[2].removesuffix(")") or "default" for name in names]
+            axes[0].legend(handles, shown, fontsize=6, frameon=False, handlelength=2.5)
+        for axis, height in limits_of(own, key, axes):
+            axis.axhline(height, **LIMIT_STYLE)
+        set_axes(axes, ticks=3)
+    for kind, title in enumerate(_TITLES):
+        finals = [c.mean[-1] for found in means.values() if (c := found[kind]) is not None]
+        limits = [height for axis, height in limits_of(experiments, key, [0, 1, 2]) if axis == kind]
+        _level(panels[kind::3].ravel(), finals, limits)
+        for axis in panels[kind::3, 0]:
+            axis.set_ylabel(title)
+    return figure
+
+
+def _level(panels: Iterable[Axes], finals: Sequence[float], limits: Sequence[float]) -> None:
+    """One scale for all panels of a quantity; those without a curve are hidden."""
+    panels = list(panels)
+    for axis in panels:
+        axis.set_visible(axis.has_data())
+        axis.tick_params(labelsize=8)
+    low, high = zip(*(axis.get_ylim() for axis in panels if axis.has_data()), strict=True)
+    cut = 4 * max(limits, default=0.0)
+    top = cut if cut > max(finals, default=np.inf) else max(high)
+    for axis in panels:
+        axis.set_ylim(min(low), min(top, max(high)))
+
+
 def limits_of(
-    experiments: Iterable[Experiment], key: str, axes: Sequence[Axes]
-) -> list[tuple[Axes, float]]:
+    experiments: Iterable[Experiment], key: str, axes: Sequence[Any]
+) -> list[tuple[Any, float]]:
     """Panels of episode cost and cost rate, and the heights of limits in them: d and d / T_ep."""
     limited = [e for e in experiments if key in e.limits]
     pairs = {(e.limits[key], e.runs[0].episode_length) for e in limited}
@@ -125,10 +190,16 @@ def limits_of(
     ]
 
 
-def _drawn_keys(experiments: Sequence[Experiment]) -> list[str]:
+def drawn_keys(experiments: Sequence[Experiment]) -> list[str]:
     """Cost keys with a limit, or the aggregate cost where none has one."""
     limited = {key for experiment in experiments for key in experiment.limits}
     return [key for key in cost_keys_of(experiments) if key in limited] or ["cost"]
+
+
+def _curves(runs: Sequence[Run], key: str, *, with_band: bool = True) -> list[Average | None]:
+    """Return, episode cost and cost rate of runs."""
+    columns = (("episode_return", True), (f"episode_{key}", True), (f"{key}_rate", False))
+    return [average(runs, name, smooth=s, with_band=with_band) for name, s in columns]
 
 
 def draw_experiment(experiment: Experiment, key: str, axes: Sequence[Axes], style: Style) -> None:
@@ -140,31 +211,30 @@ def draw_experiment(experiment: Experiment, key: str, axes: Sequence[Axes], styl
         axes: A panel for each of the three.
         style: Of everything.
     """
-    name = literal(experiment.algorithm)
-    unfinished = [[run] for run in experiment.runs if not run.is_finished]
+    name = literal(experiment.label)
     looks: list[tuple[Any, ...]] = [(experiment.finished, name, style.line, 1.5)]
-    looks += [(runs, f"{name} (unfinished)", style.unfinished, 1.2) for runs in unfinished]
-    columns = (("episode_return", True), (f"episode_{key}", True), (f"{key}_rate", False))
-    for axis, (column, smooth) in zip(axes, columns, strict=True):
-        for runs, label, line, width in looks:
-            curve = average(runs, column, smooth=smooth)
+    unfinished = [[run] for run in experiment.runs if not run.is_finished]
+    looks += [(runs, f"{name} (unfinished)", ":", 1.2) for runs in unfinished]
+    for runs, label, line, width in looks:
+        for axis, curve in zip(axes, _curves(runs, key), strict=True):
             if curve is None:
                 continue
-            steps, marker = curve.steps, point_marker(curve.steps)
+            every = max(1, len(curve.steps) // _NUM_MARKERS)
+            alone = bool(point_marker(curve.steps))
             axis.plot(
-                steps, curve.mean, color=style.colour, linestyle=line, linewidth=width,
-                label=label, marker=marker, markersize=5, clip_on=not marker,
+                curve.steps, curve.mean, **style.point, linestyle=line, linewidth=width,
+                label=label, markevery=every, markersize=4, clip_on=not alone,
             )  # fmt: skip
             if len(runs) > 1:
                 look: dict[str, Any] = {"color": style.colour, "alpha": 0.2, "linewidth": 0}
-                axis.fill_between(steps, curve.low, curve.high, **look)
+                axis.fill_between(curve.steps, curve.low, curve.high, **look)
 
 
-def set_axes(axes: Sequence[Axes]) -> None:
+def set_axes(axes: Sequence[Axes], ticks: int = 6) -> None:
     """Scales, ticks and grid of a row of panels: return, episode cost and cost rate."""
     for axis in axes:
         axis.xaxis.set_major_formatter(EngFormatter(sep=""))
-        axis.xaxis.set_major_locator(MaxNLocator(6))
+        axis.xaxis.set_major_locator(MaxNLocator(ticks))
         set_grid(axis)
         axis.set_xlim(left=0)
     for axis in axes[1:]:

@@ -1,4 +1,4 @@
-"""Runs that differ in nothing but the seed: their names."""
+"""Runs that differ in nothing but the seed: experiments, and their names."""
 
 from __future__ import annotations
 
@@ -8,20 +8,18 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from safe_rl.reporting.recorded import Run
-from safe_rl.reporting.tables import clean
+from safe_rl.reporting.tables import clean, short_number
 from safe_rl.runs.identity import Role, experiment_of, flatten, role_of
 from safe_rl.scores.benchmark import Suite
 from safe_rl.scores.published import ALGORITHMS, COST_LIMIT, REFERENCE, Scores
 
-__all__ = [
-    *("Experiment", "cost_keys_of", "distinguishing_keys", "group_runs"),
-    "title_of",
-]
+__all__ = ["Experiment", "cost_keys_of", "distinguishing_keys", "group_runs", "title_of"]
 
-Settings = dict[str, Hashable]
+Settings = Mapping[str, Hashable]
 
-# longer names are cut off and numbered; above _MANY_KEYS they have as few keys as it takes
-_MOST_KEYS, _LONGEST_NAME, _LONGEST_VALUE, _MANY_KEYS = 12, 240, 60, 3
+# longer names are cut off and numbered
+_MOST_KEYS, _LONGEST_NAME, _LONGEST_VALUE = 12, 240, 60
+# settings that a name has wherever they differ, whether or not a command line has them
 _ALWAYS_NAMED = ("preset", "init_from", "frames", "cost_limits", "risk")
 # of those that the paper does not name; where there is none, the file in conf/algo is its name
 _TITLES = {
@@ -33,28 +31,34 @@ _TITLES = {
 
 @dataclass(frozen=True)
 class Experiment:
-    """One algorithm on one environment.
+    """One algorithm with one set of settings on one environment.
 
     Attributes:
         environment: Name of the environment, with what was changed of it.
         algorithm: Name of the algorithm, with what tells it from others of that name.
         benchmark: Name in the suite if the environment is exactly that one, else None.
         runs: One per seed.
-        family: Name of the algorithm where limits are no difference, so that the same algorithm
-            under several limits has one; "" is a family of its own.
-        settings: All that differs from its namesakes, if that is more than its name says.
+        label: The name without the number of steps, for pictures of one number of steps.
+        family: The label without limits: the same for one algorithm under several limits.
+        settings: All settings that differ between the runs of this algorithm, its length aside.
     """
 
     environment: str
     algorithm: str
     benchmark: str | None
     runs: tuple[Run, ...]
-    family: str = ""
-    settings: str = ""
+    label: str
+    family: str
+    settings: Settings
+
+    @property
+    def base(self) -> str:
+        """Name of the file in ``conf/algo``."""
+        return self.runs[0].algorithm
 
     @property
     def reference(self) -> Scores | None:
-        """Characteristic metrics to normalise by, if the environment has them."""
+        """Scores of the published PPO to normalise by, if the environment has them."""
         return REFERENCE.get(self.benchmark or "")
 
     @property
@@ -87,6 +91,11 @@ class Experiment:
         """Environment steps of its finished runs, ascending, each number once."""
         return tuple(sorted({run.length for run in self.finished}))
 
+    @property
+    def planned_steps(self) -> int:
+        """Environment steps after which its runs end."""
+        return int(self.runs[0].config["frames"]) or max(run.steps for run in self.runs)
+
 
 def cost_keys_of(experiments: Iterable[Experiment]) -> list[str]:
     """The aggregate cost if there is one, and every cost key that an experiment limits."""
@@ -106,32 +115,33 @@ def group_runs(runs: Sequence[Run], suite: Suite) -> tuple[list[Experiment], dic
         Experiments, and folder -> why a run was left out.
     """
     environments = _environment_names(runs, suite)
-    settings = {r.directory: _settings(r) for r in runs}
-    algorithms, differing = _algorithm_names(runs, environments, settings)
-    without_limits = {
-        place: {key: value for key, value in own.items() if not key.startswith("cost_limits.")}
-        for place, own in settings.items()
-    }
-    families, _ = _algorithm_names(runs, environments, without_limits)
+    names = _settings_of_names(runs, environments)
+    titles = {run.directory: clean(title_of(run.algorithm), 80) for run in runs}
+    differing = {place: {**own, "algo": titles[place]} for place, (_, own) in names.items()}
+    long = {place: title + _in_brackets(names[place][0]) for place, title in titles.items()}
+    algorithms = _numbered(long, differing, environments)
     cells: dict[tuple[str, str], list[Run]] = defaultdict(list)
     for run in runs:
         cells[environments[run.directory], algorithms[run.directory]].append(run)
     skipped: dict[Path, str] = {}
     experiments = []
-    for names, members in cells.items():
+    for own, members in cells.items():
         kept = _without_repetitions(members, skipped)
-        first, benchmark = kept[0].directory, suite.name_of(kept[0].config["env"])
-        own = (*names, benchmark, tuple(kept), families[first], differing[first])
-        experiments.append(Experiment(*own))
+        first = kept[0].directory
+        named, settings = ({k: v for k, v in n.items() if k != "frames"} for n in names[first])
+        family = {k: v for k, v in named.items() if not k.startswith("cost_limits.")}
+        label, base = (titles[first] + _in_brackets(shown) for shown in (named, family))
+        benchmark = suite.name_of(kept[0].config["env"])
+        experiments.append(Experiment(*own, benchmark, tuple(kept), label, base, settings))
     return sorted(experiments, key=_order), skipped
 
 
 def _order(experiment: Experiment) -> tuple[Hashable, ...]:
-    """Benchmark environments first, algorithms as in the paper, variants behind each other."""
+    """Benchmark environments first, algorithms as in the paper, variants after each other."""
     benchmarks = {name: place for place, name in enumerate(REFERENCE)}
     algorithms = {name: place for place, name in enumerate(ALGORITHMS)}
     places = benchmarks.get(experiment.benchmark or "", 99), experiment.environment
-    return *places, algorithms.get(experiment.runs[0].algorithm, 99), experiment.algorithm
+    return *places, algorithms.get(experiment.base, 99), experiment.algorithm
 
 
 def _without_repetitions(runs: Sequence[Run], skipped: dict[Path, str]) -> list[Run]:
@@ -139,9 +149,8 @@ def _without_repetitions(runs: Sequence[Run], skipped: dict[Path, str]) -> list[
     kept: dict[int, Run] = {}
     for run in sorted(runs, key=lambda run: (run.steps, run.directory)):
         if run.seed in kept:
-            skipped[kept[run.seed].directory] = (
-                f"{run.directory} is the same run with the same seed"
-            )
+            reason = f"{run.directory} is the same run with the same seed"
+            skipped[kept[run.seed].directory] = reason
         kept[run.seed] = run
     return [kept[seed] for seed in sorted(kept)]
 
@@ -162,47 +171,69 @@ def _environment_names(runs: Sequence[Run], suite: Suite) -> dict[Path, str]:
             shown = settings = flatten(changes)
         keys[run.directory] = settings
         titles[run.directory] = clean(name, 80) + _in_brackets(shown)
-    return _unique(titles, keys)
+    return _numbered(titles, keys, {})
 
 
-def _algorithm_names(
-    runs: Sequence[Run], environments: Mapping[Path, str], settings: Mapping[Path, Settings]
-) -> tuple[dict[Path, str], dict[Path, str]]:
-    """Folder -> name of the algorithm, with what tells it from its namesakes; and all of that."""
-    titles, identities, differing = {}, {}, {}
+def _settings_of_names(
+    runs: Sequence[Run], environments: Mapping[Path, str]
+) -> dict[Path, tuple[Settings, Settings]]:
+    """Folder -> settings that its name has, and all that differ between runs of its algorithm.
+
+    A name has what a person has set and what differs; on an environment where this does not tell
+    all apart, as few of the other settings as do.
+    """
+    found: dict[Path, tuple[Settings, Settings]] = {}
     for algorithm in {run.algorithm for run in runs}:
-        members = [run.directory for run in runs if run.algorithm == algorithm]
-        cells: dict[str, list[Settings]] = defaultdict(list)
-        for member in members:
-            cells[environments[member]].append(settings[member])
+        members = [run for run in runs if run.algorithm == algorithm]
+        settings = {run.directory: _settings(run) for run in members}
+        cells: dict[str, list[Run]] = defaultdict(list)
+        for run in members:
+            cells[environments[run.directory]].append(run)
         # an experiment may train longer on one environment than on another
-        anywhere = [{**settings[member], "frames": None} for member in members]
-        keys = distinguishing_keys([*cells.values(), anywhere])
-        short = _enough(keys, [settings[member] for member in members])
-        for member in members:
-            own = {key: settings[member].get(key) for key in keys}
-            known = {key: value for key, value in own.items() if value is not None}
-            named = {key: value for key, value in known.items() if key in short}
-            identities[member] = {"algo": algorithm, **own}
-            titles[member] = clean(title_of(algorithm), 80) + _in_brackets(named)
-            differing[member] = _in_brackets(known)[2:-1] if len(known) > len(named) else ""
-    ordered = {run.directory: titles[run.directory] for run in runs}
-    return _unique(ordered, identities), differing
+        anywhere = [{**own, "frames": None} for own in settings.values()]
+        by_cell = [[settings[run.directory] for run in own] for own in cells.values()]
+        keys = distinguishing_keys([*by_cell, anywhere])
+        for own in cells.values():
+            given: dict[tuple[tuple[str, Hashable], ...], set[str]] = defaultdict(set)
+            whole = {run.directory: _known(settings[run.directory], keys) for run in own}
+            for run in own:
+                given[whole[run.directory]] |= {key for key in keys if _is_given(key, run)}
+            further = _further(keys, given)
+            for place, known in whole.items():
+                named = {k: v for k, v in known if k in given[known] or k in further}
+                found[place] = named, dict(known)
+    return found
 
 
-def _enough(keys: Sequence[str], members: Sequence[Settings]) -> set[str]:
-    """As few of the keys as tell all apart that differ in any, where it would be many."""
-    if len(keys) <= _MANY_KEYS:
-        return set(keys)
-    kept = [k for k in keys if k.partition(".")[0] in _ALWAYS_NAMED]
+def _known(settings: Settings, keys: Sequence[str]) -> tuple[tuple[str, Hashable], ...]:
+    return tuple((key, settings[key]) for key in keys if settings.get(key) is not None)
 
-    def groups(names: Sequence[str]) -> int:
-        return len({tuple(member.get(name) for name in names) for member in members})
 
-    while groups(kept) < groups(keys):
-        left = [key for key in keys if key not in kept]
-        kept.append(max(left, key=lambda key: groups([*kept, key])))
-    return set(kept)
+def _is_given(key: str, run: Run) -> bool:
+    """Whether a person has set a key, or chosen the group that it belongs to."""
+    said = {override.lstrip("+~").partition("=")[0] for override in run.overrides or ()}
+    return key.partition(".")[0] in _ALWAYS_NAMED or any(
+        key == one or key.startswith(f"{one.partition('@')[0]}.") for one in said
+    )
+
+
+def _further(
+    keys: Sequence[str], given: Mapping[tuple[tuple[str, Hashable], ...], set[str]]
+) -> list[str]:
+    """As few keys as tell settings apart that are alike in the given ones."""
+    further: list[str] = []
+
+    def count(others: Sequence[str]) -> int:
+        names = (
+            tuple(pair for pair in known if pair[0] in own or pair[0] in others)
+            for known, own in given.items()
+        )
+        return len(set(names))
+
+    while count(further) < len(given):
+        left = [key for key in keys if key not in further]
+        further.append(max(left, key=lambda key: count([*further, key])))
+    return further
 
 
 def title_of(algorithm: str) -> str:
@@ -215,14 +246,14 @@ def title_of(algorithm: str) -> str:
     return ALGORITHMS.get(algorithm) or _TITLES.get(algorithm, algorithm)
 
 
-def _settings(run: Run) -> Settings:
+def _settings(run: Run) -> dict[str, Hashable]:
     """What tells a run's algorithm from others of the same name."""
     named = experiment_of(run.config).items()
     settings = {key: value for key, value in named if key.partition(".")[0] != "env"}
     for key in [key for key in settings if role_of(key) is Role.LENGTH and key != "frames"]:
         if settings[key] == settings.get("frames"):
             del settings[key]  # it only says again how long the run is
-    # what is as the preset has it for the robot, and so as on another robot, tells nothing apart
+    # what the preset sets for the robot tells nothing apart
     robots = (Path(str(run.config["env"].get("robot_base"))).stem, "point")
 
     def of_robot(key: str) -> Hashable:
@@ -235,8 +266,8 @@ def _settings(run: Run) -> Settings:
 def distinguishing_keys(cells: Sequence[Sequence[Settings]]) -> list[str]:
     """Keys that differ within a cell, except those whose values follow from another key.
 
-    Those that follow from ``preset``, or from the ``_target_`` of the group that a key belongs to,
-    are told by these. Settings are told apart within a cell, not across cells.
+    A value may follow from ``preset``, or from the ``_target_`` of the group of its key. Settings
+    are told apart within a cell, not across cells.
 
     Examples:
         >>> small, large = {"preset": "a", "model.width": 1}, {"preset": "b", "model.width": 2}
@@ -260,13 +291,15 @@ def _follows(key: str, cell: Sequence[Settings]) -> bool:
     )
 
 
-def _unique(titles: Mapping[Path, str], settings: Mapping[Path, Settings]) -> dict[Path, str]:
-    """Titles of bounded length that are alike only where settings are."""
-    taken: dict[str, list[Settings]] = defaultdict(list)
+def _numbered(
+    titles: Mapping[Path, str], settings: Mapping[Path, Settings], cells: Mapping[Path, str]
+) -> dict[Path, str]:
+    """Titles of bounded length; within a cell they are alike only where settings are."""
+    taken: dict[tuple[str | None, str], list[Settings]] = defaultdict(list)
     names = {}
     for place, title in titles.items():
         short = clean(title, _LONGEST_NAME)
-        own = taken[short]
+        own = taken[cells.get(place), short]
         if settings[place] not in own:
             own.append(settings[place])
         number = own.index(settings[place]) + 1
@@ -274,15 +307,19 @@ def _unique(titles: Mapping[Path, str], settings: Mapping[Path, Settings]) -> di
     return names
 
 
-def _in_brackets(settings: Mapping[str, Hashable]) -> str:
-    """Settings as on the command line, ``" (frames=1000)"``, or nothing."""
+def _in_brackets(settings: Settings) -> str:
+    """Settings as on the command line, ``" (1M steps, cost ≤ 10)"``, or nothing."""
     texts = []
     for key, value in settings.items():
         if key.endswith("._target_"):
             key, value = key.removesuffix("._target_"), str(value).rpartition(".")[2]
-        relation = " ≤ " if key.startswith("cost_limits.") else "="
         shown = clean(_text(value), _LONGEST_VALUE)
-        texts.append(f"{clean(key.removeprefix('cost_limits.'))}{relation}{shown}")
+        if key == "frames" and isinstance(value, int | float):
+            texts.append(f"{short_number(value)} steps")
+        elif key.startswith("cost_limits."):
+            texts.append(f"{clean(key.removeprefix('cost_limits.'))} ≤ {shown}")
+        else:
+            texts.append(f"{clean(key)}={shown}")
     if len(texts) > _MOST_KEYS:
         texts[_MOST_KEYS:] = ["…"]
     return f" ({', '.join(texts)})" if texts else ""

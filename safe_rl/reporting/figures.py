@@ -1,88 +1,97 @@
-"""Pictures of final scores, slates and variations, and what all pictures share: styles, legends."""
+"""Pictures of final scores and slates, and what all pictures share: styles, legends, files."""
 
 from __future__ import annotations
 
 import math
+from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
-from itertools import chain, cycle, product
+from itertools import chain, cycle
 from pathlib import Path
 from textwrap import fill
 from typing import Any, NamedTuple
 
 import numpy as np
+from matplotlib import rc_context
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.colors import to_hex, to_rgb
 from matplotlib.figure import Figure
-from matplotlib.ticker import MaxNLocator
 
 from safe_rl.files import replacing
 from safe_rl.reporting.experiments import Experiment
 from safe_rl.reporting.slates import SYMBOLS, Aggregate
-from safe_rl.reporting.tables import Record, span
-from safe_rl.scores.comparisons import Estimate, pareto_front, performance_profile
-from safe_rl.scores.published import ALGORITHMS
+from safe_rl.reporting.tables import Record, short_number
+from safe_rl.scores.comparisons import pareto_front, performance_profile
 
 __all__ = [
     *("LIMIT_STYLE", "WIDTH", "Style", "add_legend", "algorithm_styles", "compared"),
-    *("draw_fronts", "draw_middles", "draw_profiles", "draw_variations", "literal", "save"),
-    "set_grid",
+    *("draw_fronts", "draw_profiles", "literal", "save", "set_grid"),
 ]
 
-# Okabe and Ito's palette, which people with colour-blindness can read.
-_OWN_COLOURS = {
-    **{"ppo": "#e69f00", "ppo_lagrangian": "#0072b2", "trpo": "#d55e00"},
-    **{"trpo_lagrangian": "#009e73", "cpo": "#cc79a7"},
+# colour and marker of every algorithm; the first ones are Okabe and Ito's, for colour-blind readers
+_LOOKS = {
+    **{"ppo": ("#e69f00", "o"), "ppo_lagrangian": ("#0072b2", "o")},
+    **{"trpo": ("#d55e00", "s"), "trpo_lagrangian": ("#009e73", "s")},
+    **{"cpo": ("#cc79a7", "D"), "pcpo": ("#8c564b", "d"), "rcpo": ("#56b4e9", "v")},
+    **{"focops": ("#9467bd", "^"), "cup": ("#bcbd22", "v"), "c_trpo": ("#17becf", "<")},
+    **{"crpo": ("#7f7f7f", ">"), "p3o": ("#aa4499", "P"), "ipo": ("#44aa99", "X")},
+    **{"sac": ("#b07c00", "*"), "sac_lagrangian": ("#117733", "p")},
+    **{"td3": ("#e31a1c", "h"), "td3_lagrangian": ("#332288", "H")},
+    **{"wcsac": ("#cc6677", "8"), "cal": ("#6699cc", "d"), "bc": ("#999933", "p")},
 }
-_FURTHER_COLOURS = ("#56b4e9", "#555555", "#8c564b", "#9467bd", "#bcbd22", "#17becf")
-# Of finished and of unfinished runs; those after the first tell apart what shares a colour.
-_LINES: tuple[tuple[Any, Any], ...] = (
-    ("-", ":"), ("-.", (0, (1, 4))), ((0, (8, 2)), (0, (3, 3))),
-    ((0, (8, 2, 1, 2, 1, 2)), (0, (1, 1, 1, 6))),
-)  # fmt: skip
-LIMIT_STYLE: dict[str, Any] = {"color": "#c00000", "linestyle": "--", "linewidth": 1.1}
+_FURTHER = (
+    *(("#1f78b4", "^"), ("#ff7f00", "D"), ("#33a02c", "v"), ("#6a3d9a", "X")),
+    *(("#b15928", "<"), ("#fb9a99", "P"), ("#a6cee3", "*"), ("#000000", ">")),
+)
+# of an algorithm's variants; when these are used up, in paler colours
+_LINES: tuple[Any, ...] = ("-", "-.", (0, (7, 2)), (0, (7, 2, 1, 2, 1, 2)))
+LIMIT_STYLE: dict[str, Any] = {"color": "#c00000", "linestyle": "--", "linewidth": 1.0}
 """How limits are drawn."""
 WIDTH = 12.0
 """Of a figure, in inches."""
-# of a line of the legend, in letters: as many as the width of a figure holds
-_LONGEST_LABEL = 130
-
-_MARKERS = "osD^vP"
-_UNLIMITED = "x"
-# of the thresholds of a profile
-_NUM_POINTS = 101
-# of a panel [inch]
-_WIDTH, _HEIGHT = 2.2, 2.0
-_MOST_COLUMNS = 5
-_COLOURS = ("#0072b2", "#d55e00", "#cc79a7", "#009e73")
-_OTHERS = "others"
-_NONE = Estimate(math.nan, math.nan, math.nan)  # of a cost that a variation has not
+_LONGEST_LABEL = 60  # of a line of the legend, in letters
+_NUM_POINTS = 101  # thresholds of a profile
 
 
 class Style(NamedTuple):
-    """How an algorithm is drawn: its colour, and its lines of finished and unfinished runs."""
+    """How an experiment is drawn; all of one algorithm have its colour and its marker.
+
+    Attributes:
+        colour: Of lines and markers.
+        marker: Matplotlib's sign of it.
+        line: Style of its line; variants of an algorithm have different ones.
+        is_filled: Whether markers are filled. Of variants in more than limits, those of the first.
+    """
 
     colour: str
+    marker: str
     line: Any
-    unfinished: Any
+    is_filled: bool
+
+    @property
+    def point(self) -> dict[str, Any]:
+        """Keywords of Matplotlib for a marker."""
+        face = self.colour if self.is_filled else "white"
+        return {"marker": self.marker, "color": self.colour, "markerfacecolor": face}
 
 
 def algorithm_styles(experiments: Iterable[Experiment]) -> dict[str, Style]:
-    """Name of an algorithm -> its style, the same in every figure and no other algorithm's."""
-    names = {e.algorithm: e.runs[0].algorithm for e in experiments}
-    first, *others = _LINES
-    everything = (*_OWN_COLOURS.values(), *_FURTHER_COLOURS)
-    further = cycle(
-        Style(colour, *lines)
-        for colours, several in ((_FURTHER_COLOURS, [first]), (everything, others))
-        for lines, colour in product(several, colours)
-    )
-    order = list(ALGORITHMS)
+    """Name and label of an experiment -> its style, the same in every picture."""
+    variants: dict[str, dict[tuple[int, str, str], list[str]]] = defaultdict(dict)
+    for e in experiments:
+        own = variants[e.base].setdefault((len(e.family), e.family, e.label), [e.label])
+        own.append(e.algorithm)
+    further = cycle(_FURTHER)
     styles: dict[str, Style] = {}
-    for name, algorithm in sorted(
-        names.items(), key=lambda pair: order.index(pair[1]) if pair[1] in order else len(order)
-    ):
-        own = Style(_OWN_COLOURS.get(algorithm, ""), *first)
-        styles[name] = own if own.colour and own not in styles.values() else next(further)
+    for base in sorted(variants):
+        colour, marker = _LOOKS.get(base) or next(further)
+        families = [family for _, family, _ in sorted(variants[base])]
+        for number, (key, names) in enumerate(sorted(variants[base].items())):
+            paler = 1 - 0.7 ** (number // len(_LINES))
+            red, green, blue = (part + (1 - part) * paler for part in to_rgb(colour))
+            shade = to_hex((red, green, blue))
+            line = _LINES[number % len(_LINES)]
+            styles |= dict.fromkeys(names, Style(shade, marker, line, key[1] == families[0]))
     return styles
 
 
@@ -92,7 +101,7 @@ def literal(text: str) -> str:
 
 
 def set_grid(axis: Axes) -> None:
-    """Faint lines behind a panel, and no frame above and to the right of it."""
+    """Faint lines in the background of a panel, and no frame above and to the right of it."""
     axis.grid(alpha=0.25)
     axis.spines[["top", "right"]].set_visible(False)
 
@@ -110,7 +119,7 @@ def add_legend(figure: Figure, axes: Iterable[Axes]) -> None:
     if not handles:
         return
     labels = [fill(label, _LONGEST_LABEL, break_on_hyphens=False) for label in handles]
-    for columns in range(min(5, len(handles)), 0, -1):
+    for columns in range(min(6, len(handles)), 0, -1):
         legend = figure.legend(
             handles.values(), labels, loc="outside lower center", ncols=columns,
             frameon=False, handlelength=3.0,
@@ -123,9 +132,11 @@ def add_legend(figure: Figure, axes: Iterable[Axes]) -> None:
 
 
 def save(figure: Figure, path: Path) -> Path:
-    """Write a figure as PNG."""
-    with replacing(path) as unfinished:
-        figure.savefig(unfinished, dpi=130)
+    """Write a figure as PNG, SVG or PDF, as its file is called; the same bytes each time."""
+    form = path.suffix.lstrip(".")
+    metadata = {"png": {}, "svg": {"Date": None}, "pdf": {"CreationDate": None}}[form]
+    with replacing(path) as unfinished, rc_context({"svg.hashsalt": "safe_rl"}):
+        figure.savefig(unfinished, dpi=120, format=form, metadata=metadata)
     return path
 
 
@@ -140,32 +151,36 @@ def compared(records: Sequence[Record]) -> dict[str, list[Record]]:
             key = (record["environment"], record["fewest_steps"], record["steps"])
             groups.setdefault(key, []).append(record)
     kept = {key: members for key, members in sorted(groups.items()) if len(members) > 1}
-    return {f"{name}, {span(steps)} steps": own for (name, *steps), own in kept.items()}
+    spans = {key: " to ".join(map(short_number, dict.fromkeys(key[1:]))) for key in kept}
+    return {f"{key[0]}, {spans[key]} steps": own for key, own in kept.items()}
 
 
-def draw_fronts(records: Sequence[Record], styles: Mapping[str, Style]) -> Figure:
+def draw_fronts(
+    records: Sequence[Record], experiments: Iterable[Experiment], styles: Mapping[str, Style]
+) -> Figure:
     """Draw final returns against final costs, a panel per environment and length of training.
 
-    A point is an experiment, with the standard deviations over its seeds; its marker says its
-    limit, which is a vertical line, too. A line in an algorithm's colour joins its experiments
-    under several limits. The grey line joins those that no other one beats in both.
+    A point is an experiment, with the standard deviations over its seeds. A line in an
+    algorithm's colour joins its experiments under several limits, which stand beside their points.
+    The grey line joins those that no other one beats in both.
 
     Args:
         records: Final scores, see :func:`safe_rl.reporting.scoring.final_record`.
-        styles: Name of an algorithm -> how it is drawn.
+        experiments: Those of the records.
+        styles: Label of an experiment -> how it is drawn.
     """
     groups = compared(records)
+    known = {(e.environment, e.algorithm): e for e in experiments}
     columns = min(3, len(groups))
     rows = -(-len(groups) // columns)
-    figure = Figure(figsize=(WIDTH, 3.4 * rows + 0.3), layout="constrained")
+    figure = Figure(figsize=(WIDTH, 3.3 * rows + 0.2), layout="constrained")
     panels = figure.subplots(rows, columns, squeeze=False).ravel()
-    # a family's is that of the first of its experiments
-    looks = {r["family"]: styles[r["algorithm"]] for r in reversed(records)}
-    markers = _markers(records)
-    for axis, (title, own) in zip(panels, groups.items(), strict=False):
-        _draw_front(axis, own, looks, markers)
+    for number, (axis, (title, own)) in enumerate(zip(panels, groups.items(), strict=False)):
+        pairs = [(record, known[record["environment"], record["algorithm"]]) for record in own]
+        _draw_front(axis, pairs, styles)
         axis.set_title(literal(fill(title, 44)), fontsize=10, fontweight="bold")
-        axis.set(xlabel="final episode cost", ylabel="final return")
+        axis.set_xlabel("episode cost")
+        axis.set_ylabel("return" if number % columns == 0 else "")
         set_grid(axis)
     for axis in panels[len(groups) :]:
         axis.set_axis_off()
@@ -173,178 +188,61 @@ def draw_fronts(records: Sequence[Record], styles: Mapping[str, Style]) -> Figur
     return figure
 
 
-def _markers(records: Sequence[Record]) -> dict[float | None, str]:
-    """Limit -> marker, the same in all panels."""
-    limits = sorted({r["limit_cost"] for r in records if "limit_cost" in r})
-    return {None: _UNLIMITED, **dict(zip(limits, cycle(_MARKERS), strict=False))}
-
-
 def _draw_front(
-    axis: Axes,
-    records: Sequence[Record],
-    looks: Mapping[str, Style],
-    markers: Mapping[float | None, str],
+    axis: Axes, pairs: Sequence[tuple[Record, Experiment]], styles: Mapping[str, Style]
 ) -> None:
-    points = np.array([(r["episode_cost"], r["episode_return"]) for r in records])
+    points = np.array([(r["episode_cost"], r["episode_return"]) for r, _ in pairs])
     front = points[pareto_front(points[:, 1], points[:, 0])]
-    axis.plot(*front.T, color="0.6", linewidth=1, zorder=1, drawstyle="steps-post")
-    for family in dict.fromkeys(r["family"] for r in records):
-        own = [r for r in records if r["family"] == family]
-        own.sort(key=lambda r: r.get("limit_cost", np.inf))
-        joined = np.array([(r["episode_cost"], r["episode_return"]) for r in own]).T
-        colour, line, _ = looks[family]
-        axis.plot(
-            *joined, color=colour, linestyle=line, linewidth=1.5, alpha=0.7, label=literal(family)
-        )
-        for record, cost, value in zip(own, *joined, strict=True):
+    axis.plot(*front.T, color="0.7", linewidth=1, zorder=1, drawstyle="steps-post")
+    limits = {e.limits["cost"] for _, e in pairs if "cost" in e.limits}
+    families: dict[str, list[tuple[Record, Experiment]]] = defaultdict(list)
+    for record, experiment in pairs:
+        families[experiment.family].append((record, experiment))
+    for family, own in families.items():
+        own.sort(key=lambda pair: pair[1].limits.get("cost", math.inf))
+        style = styles[own[0][1].label]
+        joined = np.array([(r["episode_cost"], r["episode_return"]) for r, _ in own]).T
+        axis.plot(*joined, color=style.colour, linewidth=1, alpha=0.6)
+        for (record, experiment), cost, value in zip(own, *joined, strict=True):
             axis.errorbar(
                 cost, value, xerr=record["episode_cost_std"], yerr=record["episode_return_std"],
-                color=colour, linestyle="", elinewidth=1, markersize=7,
-                marker=markers[record.get("limit_cost")],
+                **style.point, linestyle="", elinewidth=0.8, markersize=7, label=literal(family),
             )  # fmt: skip
-    there = {r.get("limit_cost") for r in records}
-    for limit, marker in markers.items():
-        if limit in there:
-            name = "no limit of cost" if limit is None else f"limit {limit:g}"
-            axis.plot([], [], color="0.3", linestyle="", marker=marker, markersize=7, label=name)
-        if limit in there and limit is not None:
-            axis.axvline(limit, **LIMIT_STYLE)
-
-
-def draw_middles(records: Sequence[Record], styles: Mapping[str, Style]) -> Figure:
-    """Draw interquartile means (of `middle_table`) and their intervals, a panel per score."""
-    figure = Figure(figsize=(WIDTH, 0.9 + 0.32 * len(records)), layout="constrained")
-    panels = figure.subplots(1, 3, sharey=True)
-    heights = range(len(records))
-    names = [literal(record["algorithm"][:60]) for record in records]
-    for axis, (name, symbol) in zip(panels, SYMBOLS.items(), strict=True):
-        for height, record in zip(heights, records, strict=True):
-            value, low, high = (record[f"{name}{end}"] for end in ("", "_low", "_high"))
-            colour = styles[record["algorithm"]].colour
-            axis.barh(height, high - low, left=low, height=0.55, color=colour, alpha=0.45)
-            axis.plot([value] * 2, [height - 0.33, height + 0.33], color="black")
-        axis.set_title(symbol)
-        axis.set_yticks(list(heights), names)
-        axis.tick_params(axis="y", length=0)
-        axis.grid(alpha=0.25, axis="x")
-        axis.spines[["top", "right", "left"]].set_visible(False)
-        axis.xaxis.set_major_locator(MaxNLocator(5))
-        left, right = axis.get_xlim()
-        axis.set_xlim(min(0.0, left), max(0.0, right))
-    panels[0].invert_yaxis()
-    return figure
+            if len(own) > 1 and "cost" in experiment.limits:
+                text = f"≤ {experiment.limits['cost']:g}"
+                axis.annotate(
+                    text, (cost, value), (5, 4), textcoords="offset points", fontsize=7, color="0.3"
+                )
+    for limit in limits:
+        axis.axvline(limit, **LIMIT_STYLE)
 
 
 def draw_profiles(aggregates: Sequence[Aggregate], styles: Mapping[str, Style]) -> Figure:
     """Draw the share of runs above every value of a normalised score, a panel per score.
 
-    Bands are 95 % intervals of a bootstrap that resamples every environment's seeds. At least of
-    one algorithm every run must have finished an episode.
+    Bands are 95 % intervals of a bootstrap that resamples every environment's seeds.
+
+    Args:
+        aggregates: Algorithms of which every run has finished an episode.
+        styles: Name of an algorithm -> how it is drawn.
     """
     figure = Figure(figsize=(WIDTH, 3.0), layout="constrained")
     panels = figure.subplots(1, 3, sharey=True)
-    # where a run has finished no episode there is no share of runs
-    known = [one for one in aggregates if one.is_measured]
     for axis, (name, symbol) in zip(panels, SYMBOLS.items(), strict=True):
-        values = np.concatenate([v for one in known for v in one.strata[name]])
+        values = np.concatenate([v for one in aggregates for v in one.strata[name]])
         # from where all runs are above to where none is
         margin = 0.05 * float(np.ptp(values)) + 1e-3
         thresholds = np.linspace(values.min() - margin, values.max() + margin, _NUM_POINTS)
-        for one in known:
+        for one in aggregates:
             share, low, high = performance_profile(one.strata[name], thresholds)
-            style = styles[one.algorithm]
-            label = literal(one.algorithm)
-            axis.plot(thresholds, share, color=style.colour, linestyle=style.line, label=label)
+            style, label = styles[one.algorithm], literal(one.algorithm)
+            axis.plot(
+                thresholds, share, **style.point, linestyle=style.line, label=label,
+                markevery=_NUM_POINTS // 5, markersize=5,
+            )  # fmt: skip
             axis.fill_between(thresholds, low, high, color=style.colour, alpha=0.2, linewidth=0)
         axis.set(xlabel=f"τ of {symbol}", ylim=(0, 1.02))
         set_grid(axis)
     panels[0].set_ylabel("share of runs above τ")
     add_legend(figure, panels[:1])
     return figure
-
-
-def draw_variations(
-    rows: Sequence[tuple[Any, Mapping[str, Estimate]]],
-    cost_limits: Mapping[str, float],
-    path: Path,
-) -> None:
-    """Draw return and costs with their intervals over the values of every row.
-
-    The band across a panel is the environment as trained on; limits are dashed.
-
-    Args:
-        rows: A variation (`row`, `value`) and its estimates, the first as trained on.
-        cost_limits: Cost key -> d; without any, ``cost`` is drawn.
-        path: Picture to write, replaced in one go.
-
-    Examples:
-        >>> from collections import namedtuple
-        >>> Changed = namedtuple("Changed", "row value")
-        >>> found = {"episode_return": Estimate(3, 2, 4), "episode_cost": Estimate(20, 15, 30)}
-        >>> rows = [(Changed("as trained", None), found), (Changed("mass", 0.5), found)]
-        >>> picture = getfixture("tmp_path") / "variations.png"
-        >>> draw_variations(rows, {"cost": 25.0}, picture)
-        >>> picture.exists()
-        True
-    """
-    (_, trained), *varied = rows
-    groups = _rows_of(varied) or {_OTHERS: [("as trained", trained)]}
-    names = ["episode_return", *(f"episode_{key}" for key in cost_limits or ["cost"])]
-    columns = min(len(groups), _MOST_COLUMNS)
-    bands = math.ceil(len(groups) / columns)
-    lines = bands * len(names)
-    figure = Figure(figsize=(0.8 + _WIDTH * columns, 0.5 + _HEIGHT * lines), layout="constrained")
-    panels = figure.subplots(lines, columns, squeeze=False)
-    for name, colour, line in zip(names, cycle(_COLOURS), range(len(names)), strict=False):
-        limit = cost_limits.get(name.removeprefix("episode_"))
-        drawn = []
-        for number, (row, group) in enumerate(groups.items()):
-            axis = panels[number // columns * len(names) + line][number % columns]
-            _draw(
-                axis,
-                [(label, found.get(name, _NONE)) for label, found in group],
-                trained[name],
-                colour,
-            )
-            if limit is not None:
-                axis.axhline(limit, **LIMIT_STYLE)
-            if line == 0:
-                axis.set_title(literal(row))
-            if number % columns == 0:
-                axis.set_ylabel(literal(name.removeprefix("episode_")))
-            drawn.append(axis)
-        low, high = zip(*(axis.get_ylim() for axis in drawn), strict=True)
-        for axis in drawn:
-            axis.set_ylim(min(low), max(high))
-    for axis in panels.flat:
-        axis.set_visible(axis.has_data())
-    figure.supxlabel("grey: as trained; dashed: the limit", fontsize="small", color="0.3")
-    save(figure, path)
-
-
-def _rows_of(
-    varied: Sequence[tuple[Any, Mapping[str, Estimate]]],
-) -> dict[str, list[tuple[str, Mapping[str, Estimate]]]]:
-    """Row -> label and estimates of its values; what has a single value is in a row of all such."""
-    groups: dict[str, list[tuple[str, Mapping[str, Estimate]]]] = {}
-    for variation, estimates in varied:
-        single = variation.value is None
-        label = variation.row if single else f"{variation.value}"
-        groups.setdefault(_OTHERS if single else variation.row, []).append((label, estimates))
-    return groups
-
-
-def _draw(
-    axis: Axes, values: Sequence[tuple[str, Estimate]], trained: Estimate, colour: str
-) -> None:
-    places = range(len(values))
-    axis.axhspan(trained.low, trained.high, color="0.85", zorder=0)
-    axis.axhline(trained.value, color="0.5", linewidth=1, zorder=1)
-    for place, (_, estimate) in zip(places, values, strict=True):
-        axis.plot([place] * 2, [estimate.low, estimate.high], color=colour, linewidth=2)
-        axis.plot(place, estimate.value, marker="o", color=colour)
-    long = any(len(label) > 5 for label, _ in values)
-    axis.set_xticks(list(places), [literal(label) for label, _ in values], rotation=25 * long)
-    axis.set_xlim(-0.6, len(values) - 0.4)
-    axis.grid(alpha=0.25, axis="y")
-    axis.spines[["top", "right"]].set_visible(False)

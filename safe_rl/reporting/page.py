@@ -18,14 +18,13 @@ from matplotlib.figure import Figure
 from safe_rl.extras import import_extra
 from safe_rl.files import check_no_links, replace_text
 from safe_rl.reporting.campaigns import campaign_tables
-from safe_rl.reporting.curves import draw_learning_curves
+from safe_rl.reporting.curves import draw_learning_curves, draw_small_multiples, drawn_keys
 from safe_rl.reporting.experiments import Experiment, group_runs
 from safe_rl.reporting.figures import (
     Style,
     algorithm_styles,
     compared,
     draw_fronts,
-    draw_middles,
     draw_profiles,
     save,
 )
@@ -34,28 +33,19 @@ from safe_rl.reporting.inventory import (
     duration,
     evaluation_table,
     run_table,
-    variant_table,
     videos,
 )
 from safe_rl.reporting.recorded import Run, find_runs
-from safe_rl.reporting.scoring import dominance_table, final_table, learning_table
-from safe_rl.reporting.slates import (
-    Aggregate,
-    by_length,
-    complete_slates,
-    improvement_table,
-    middle_table,
-    missing_runs_table,
-    slate_table,
-    title_of_slate,
-)
-from safe_rl.reporting.tables import SYMBOL, Column, Record, Table, clean, escaped
+from safe_rl.reporting.scoring import better_tables, final_table, learning_table
+from safe_rl.reporting.slates import complete_slates, improvement_tables, slate_table
+from safe_rl.reporting.tables import SYMBOL, Record, Table, clean, escaped, short_number
 from safe_rl.scores.benchmark import Suite
 
 __all__ = ["Block", "Drawing", "Film", "Report", "Section", "build_report", "write_report"]
 
 # rows of a picture of learning curves, in environments: what a printed page holds
 _MOST_ROWS = 6
+_MOST_CURVES = 6  # in one panel
 _TEXTS = yaml.safe_load(files(__package__).joinpath("texts.yaml").read_text(encoding="utf-8"))
 
 _MIME_TYPES = {".png": "image/png", ".mp4": "video/mp4"}
@@ -102,14 +92,12 @@ class Report:
     Attributes:
         experiments: Runs, grouped.
         sections: What is said of them; none is empty.
-        missing_runs: Which runs slates still lack.
         campaigns: Name -> tables of what was planned, and what of it is done.
         skipped: Folder or file -> why it was left out.
     """
 
     experiments: Sequence[Experiment]
     sections: Sequence[Section]
-    missing_runs: Table
     campaigns: Mapping[str, Sequence[Table]]
     skipped: Mapping[Path, str]
 
@@ -120,7 +108,13 @@ class Report:
 
 
 def build_report(
-    root: Path, suite: Suite, *, seeds_needed: int, unfinished: bool, good: float = 0.5
+    root: Path,
+    suite: Suite,
+    *,
+    seeds_needed: int,
+    unfinished: bool,
+    good: float = 0.5,
+    algorithms: Sequence[str] = (),
 ) -> Report:
     """Find the runs below a folder and put everything together.
 
@@ -130,43 +124,47 @@ def build_report(
         seeds_needed: Finished runs that a slate takes per environment.
         unfinished: Whether unfinished runs count as finished ones.
         good: Share of a return that a good policy has, see :func:`learning_table`.
+        algorithms: Names in ``conf/algo`` of those to report; empty: all.
 
     Raises:
         FileNotFoundError: If there is no run.
+        ValueError: If there is no run of one of the algorithms.
     """
     runs, skipped = find_runs(root, unfinished=unfinished)
-    experiments, repeated = group_runs(runs, suite)
+    known = sorted({run.algorithm for run in runs})
+    for name in algorithms:
+        if name not in known:
+            raise ValueError(f"algos={name}: there are runs of {', '.join(map(clean, known))}.")
     campaigns, no_plans = campaign_tables(root, runs)
+    chosen = [run for run in runs if run.algorithm in (algorithms or known)]
+    experiments, repeated = group_runs(chosen, suite)
     skipped |= repeated | no_plans
     styles = algorithm_styles(experiments)
     groups = _by_environment([e for e in experiments if e.finished])
     finals = [final_table(group) for group in groups]
     records = [record for table in finals for record in table.records]
-    missing = missing_runs_table(experiments, seeds_needed)
     learning = [learning_table(group, good) for group in groups]
-    slates = _slates(experiments, styles, seeds_needed)
     reasons = [{"what": clean(path), "why": clean(why, 500)} for path, why in skipped.items()]
-    left_out = Table("left_out", "Left out", [Column("what"), Column("why")], reasons)
-    runs_tables = (run_table(experiments), variant_table(experiments), left_out)
+    left_out = Table("left_out", "Left out", {"what": "{what}", "why": "{why}"}, reasons)
     parts: list[tuple[str, str, Sequence[Block]]] = [
         ("final", "Final scores", finals or ["No run is finished."]),
         ("learning", "What learning cost", list(filter(None, learning))),
         ("curves", "Learning curves", _curves(experiments, styles)),
-        ("fronts", "Return against cost", _fronts(records, styles)),
-        ("normalised", "Normalised scores", [*slates, missing]),
-        ("dominance", "Which is better", [dominance_table(records)]),
+        ("fronts", "Return against cost", _fronts(records, experiments, styles)),
+        ("normalised", "Normalised scores", _slates(experiments, styles, seeds_needed)),
+        ("better", "Which is better", better_tables(records)),
         ("certificates", "Certificates", [certificate_table(experiments)]),
         ("evaluations", "Evaluations", [evaluation_table(experiments)]),
         ("videos", "Videos", [Film(clean(c), path) for c, path in videos(experiments)]),
         ("campaigns", "Campaigns", [t for own in campaigns.values() for t in own]),
-        ("runs", "Runs", runs_tables),
+        ("runs", "Runs", [run_table(experiments), left_out]),
     ]
     # a table without a row says nothing
     sections = [
         Section(name, title, [b for b in blocks if not isinstance(b, Table) or b.records])
         for name, title, blocks in parts
     ]
-    return Report(experiments, [s for s in sections if s.blocks], missing, campaigns, skipped)
+    return Report(experiments, [s for s in sections if s.blocks], campaigns, skipped)
 
 
 def _by_environment(experiments: Sequence[Experiment]) -> list[list[Experiment]]:
@@ -174,24 +172,37 @@ def _by_environment(experiments: Sequence[Experiment]) -> list[list[Experiment]]
     return [[e for e in experiments if e.environment == name] for name in names]
 
 
-def _fronts(records: Sequence[Record], styles: Mapping[str, Style]) -> list[Drawing]:
+def _fronts(
+    records: Sequence[Record], experiments: Sequence[Experiment], styles: Mapping[str, Style]
+) -> list[Drawing]:
     groups = compared(records)
     panels = [f"{what}: {', '.join(r['algorithm'] for r in own)}" for what, own in groups.items()]
     says = f"Final return against final episode cost. {'; '.join(panels)}"
-    return [Drawing("fronts", "", draw_fronts(records, styles), says)] if groups else []
+    figure = draw_fronts(records, experiments, styles) if groups else None
+    return [Drawing("fronts", "", figure, says)] if figure else []
 
 
 def _curves(experiments: Sequence[Experiment], styles: Mapping[str, Style]) -> list[Drawing]:
-    """A picture per robot, where environments have one; several if it would get too long."""
+    """Small multiples where there are many curves; of the rest a picture per robot, or several."""
     robots: dict[str, list[list[Experiment]]] = defaultdict(list)
+    drawings = []
     for group in _by_environment(experiments):
         robot = Path(str(group[0].runs[0].config["env"].get("robot_base", "other"))).stem
-        robots[clean(robot, 40)].append(group)
-    drawings = []
+        for steps in sorted({e.planned_steps for e in group}):
+            own = [e for e in group if e.planned_steps == steps]
+            if len(own) <= _MOST_CURVES:
+                robots[clean(robot, 40)].append(own)
+                continue
+            for key in drawn_keys(own):
+                title = f"{group[0].environment}, {short_number(steps)} steps"
+                title += "" if key == "cost" else f", {clean(key, 40)}"
+                says = f"Return, episode cost and cost rate, a column per algorithm: {title}"
+                figure = draw_small_multiples(own, key, styles)
+                drawings.append(Drawing(f"curves_{title}", title, figure, says))
     for robot, groups in robots.items():
         for start in range(0, len(groups), _MOST_ROWS):
             shown = groups[start : start + _MOST_ROWS]
-            names = ", ".join(group[0].environment for group in shown)
+            names = ", ".join(dict.fromkeys(group[0].environment for group in shown))
             says = f"Return, episode cost and cost rate over environment steps: {names}"
             figure = draw_learning_curves([e for group in shown for e in group], styles)
             drawings.append(Drawing(f"curves_{robot}", "", figure, says))
@@ -203,38 +214,25 @@ def _slates(
 ) -> list[Block]:
     blocks: list[Block] = []
     for name, environments, aggregates in complete_slates(experiments, seeds_needed):
-        blocks.append(slate_table(name, environments, aggregates))
-        for after, group in by_length(aggregates).items():
-            blocks += _middles_and_profiles(name, group, after, styles)
-        blocks.append(improvement_table(name, aggregates))
+        blocks += [table := slate_table(name, environments, aggregates)]
+        # where a run has finished no episode there is no share of runs
+        known = [one for one in aggregates if one.is_measured]
+        if known and max(one.num_runs for one in known) > 1:
+            names = ", ".join(one.algorithm for one in known)
+            says = f"Share of runs above every score: {table.title}, {names}"
+            blocks += [Drawing(f"profiles_{name}", "", draw_profiles(known, styles), says)]
+        blocks += improvement_tables(name, aggregates)
     return blocks
 
 
-def _middles_and_profiles(
-    slate: str, aggregates: Sequence[Aggregate], after: str, styles: Mapping[str, Style]
-) -> list[Block]:
-    """What can be seen of a slate's runs as a whole, if there are several that ended an episode."""
-    if max(one.num_runs for one in aggregates) == 1:
-        return []
-    middle = middle_table(slate, aggregates, after)
-    if not any(one.is_measured for one in aggregates):
-        return [middle]
-    iqm, profiles = draw_middles(middle.records, styles), draw_profiles(aggregates, styles)
-    says = ", ".join([title_of_slate(slate) + after, *(one.algorithm for one in aggregates)])
-    return [
-        middle,
-        Drawing(f"slate_{slate}", "", iqm, f"Interquartile means with 95 % intervals: {says}"),
-        Drawing(f"profiles_{slate}", "", profiles, f"Share of runs above every score: {says}"),
-    ]
-
-
-def write_report(report: Report, out: Path, title: str) -> Path:
-    """Write a report into a folder, made if need be: a page, Markdown, a PNG per figure, CSVs.
+def write_report(report: Report, out: Path, title: str, formats: Sequence[str] = ("png",)) -> Path:
+    """Write a report into a folder, made if need be: a page, Markdown, pictures, a CSV per table.
 
     Args:
         report: What there is to say.
         out: The folder; files of an earlier report in it are replaced.
         title: Heading of the page.
+        formats: Of the pictures: png, svg, pdf. PNG is always among them, for the page.
 
     Returns:
         The page, ``report.html``.
@@ -250,7 +248,10 @@ def write_report(report: Report, out: Path, title: str) -> Path:
         "title": clean(title),
         "date": datetime.datetime.now().astimezone().strftime("%d %B %Y, %H:%M"),
         "facts": _facts(report),
-        "sections": [(s, [_written(b, place) for b in s.blocks]) for s in report.sections],
+        "sections": [
+            (s, list(filter(None, (_written(b, place, formats) for b in s.blocks))))
+            for s in report.sections
+        ],
     }
     environment = jinja2.Environment(
         loader=jinja2.FileSystemLoader(Path(__file__).parent),
@@ -281,13 +282,18 @@ def _places(out: Path) -> Callable[[str], Path]:
     return place
 
 
-def _written(block: Block, place: Callable[[str], Path]) -> dict[str, Any]:
+def _written(
+    block: Block, place: Callable[[str], Path], formats: Sequence[str]
+) -> dict[str, Any] | None:
     """A block as the templates see it; tables and pictures are written on the way."""
     if isinstance(block, Table):
-        block.write_csv(place(f"{block.name}.csv"))
-        return {"kind": "table", "title": block.title, "table": block}
+        if not block.is_matrix:  # whose table of pairs is a file already
+            block.write_csv(place(f"{block.name}.csv"))
+        return {"kind": "table", "title": block.title, "table": block} if block.columns else None
     if isinstance(block, Drawing):
         path = save(block.figure, place(f"{block.name}.png"))
+        for form in {*formats} - {"png"}:
+            save(block.figure, path.with_suffix(f".{form}"))
         return {
             "kind": "picture", "title": block.title, "file": path.name, "data": _embedded(path),
             "says": block.shows,

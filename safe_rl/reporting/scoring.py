@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Hashable, Mapping, Sequence
 from statistics import mean
 from typing import Any
 
@@ -12,18 +12,9 @@ import numpy as np
 
 from safe_rl.reporting.experiments import Experiment, cost_keys_of
 from safe_rl.reporting.recorded import Run
-from safe_rl.reporting.tables import (
-    Column,
-    Record,
-    Table,
-    clean,
-    each_cost,
-    mark_best,
-    power_of_ten,
-    spread,
-)
+from safe_rl.reporting.tables import Record, Table, each_cost, mark_best, short_number, spread
 from safe_rl.runs.curves import moving_mean
-from safe_rl.runs.outcome import FINAL_EPOCHS, final_width
+from safe_rl.runs.outcome import FINAL_EPOCHS, final_rows, final_width
 from safe_rl.scores.measures import (
     Agent,
     compare,
@@ -33,47 +24,37 @@ from safe_rl.scores.measures import (
     regret,
     share_of_epochs_over,
 )
-from safe_rl.scores.published import (
-    PUBLISHED_STEPS,
-    REFERENCE,
-    REIMPLEMENTATION_STEPS,
-    REIMPLEMENTATIONS,
-)
+from safe_rl.scores.published import PUBLISHED_STEPS, REIMPLEMENTATION_STEPS, REIMPLEMENTATIONS
 
-__all__ = ["dominance_table", "final_record", "final_table", "learning_table", "stem"]
-
-# of a cost: field of a row -> that of a record
-_FIGURES = {
-    **{"mean": "episode_{}", "mean_std": "episode_{}_std", "limit": "limit_{}"},
-    **{"rate": "{}_rate", "rate_std": "{}_rate_std", "excess": "excess_{}"},
-}
-_COURSE = {
-    **{"regret": "regret_{}", "regret_std": "regret_{}_std"},
-    **{"share_over": "share_over_{}", "streak": "streak_{}"},
-}
-IDENTITY = (Column("algorithm"), Column("seeds", ("{:d}", "seeds")))
+__all__ = ["better_tables", "final_record", "final_table", "learning_table", "matrix", "signs_of"]
 
 
 def final_record(experiment: Experiment, cost_keys: Sequence[str]) -> dict[str, Any]:
     """Final J_r, J_c and ρ_c of an experiment: mean and standard deviation over its seeds."""
-    runs, lengths = experiment.finished, experiment.lengths
-    record: dict[str, Any] = {
+    runs, lengths, limits = experiment.finished, experiment.lengths, experiment.limits
+    excesses = {f"excess_{k}": float(np.mean([run.excess(k) for run in runs])) for k in limits}
+    return {
         "environment": experiment.environment,
         "algorithm": experiment.algorithm,
-        "family": experiment.family or experiment.algorithm,
         "seeds": len(runs),
         "steps": lengths[-1],
         "fewest_steps": lengths[0],
         "most_steps": lengths[-1] if lengths[1:] else None,
         "hours": float(np.mean([run.hours for run in runs])),
+        **_over_seeds([{**run.final(cost_keys), **_critic_bias(run)} for run in runs]),
+        **{f"limit_{key}": limit for key, limit in limits.items()},
+        **excesses,
+        "satisfies": all(excess <= 0 for excess in excesses.values()),
+        **_published(experiment),
     }
-    record |= _over_seeds([run.final(cost_keys) for run in runs])
-    limits = experiment.limits
-    record |= {f"limit_{key}": limit for key, limit in limits.items()}
-    excesses = {k: float(np.mean([run.excess(k) for run in runs])) for k in limits}
-    record |= {f"excess_{key}": excess for key, excess in excesses.items()}
-    record["satisfies"] = all(excess <= 0 for excess in excesses.values())
-    return record | _published(experiment)
+
+
+def _critic_bias(run: Run) -> dict[str, float]:
+    """By how much cost critics predicted too much over the last epochs, of each cost with one."""
+    last = final_rows(run.table)
+    names = [name for name in run.table if name.startswith("critic_bias_")]
+    known = {name: np.array(run.table[name])[last] for name in names}
+    return {k: float(np.nanmean(v)) for k, v in known.items() if np.isfinite(v).any()}
 
 
 def _over_seeds(values: Sequence[Mapping[str, float | None]]) -> dict[str, float]:
@@ -83,7 +64,7 @@ def _over_seeds(values: Sequence[Mapping[str, float | None]]) -> dict[str, float
         known = np.array([one[name] for one in values if one.get(name) is not None], dtype=float)
         if known.size:
             record[name] = float(known.mean())
-            record[f"{name}_std"] = float(known.std(ddof=1)) if known.size > 1 else float("nan")
+            record[f"{name}_std"] = float(known.std(ddof=1)) if known.size > 1 else math.nan
     return record
 
 
@@ -91,85 +72,71 @@ def _published(experiment: Experiment) -> dict[str, Any]:
     """Values printed elsewhere for the same environment and algorithm."""
     if not (experiment.benchmark and experiment.has_published_limit) or experiment.is_continued:
         return {}
-    algorithm = experiment.runs[0].algorithm
+    later = REIMPLEMENTATIONS.get(experiment.benchmark, {}).get(experiment.base)
     fields: dict[str, Any] = {}
-    reference = REFERENCE.get(experiment.benchmark)
-    if algorithm == "ppo" and reference is not None:
-        fields |= {f"paper_{name}": value for name, value in reference._asdict().items()}
-    later = REIMPLEMENTATIONS.get(experiment.benchmark, {}).get(algorithm)
-    if later is not None:
-        fields |= {"later_return": later[0], "later_cost": later[1]}
-    return fields
+    if experiment.base == "ppo" and experiment.reference is not None:
+        fields |= {f"paper_{k}": v for k, v in experiment.reference._asdict().items()}
+    return fields | ({"later_return": later[0], "later_cost": later[1]} if later else {})
 
 
 def final_table(experiments: Sequence[Experiment]) -> Table:
     """Final scores on one environment, with what others have published beside them."""
-    environment = experiments[0].environment
-    cost_keys = cost_keys_of(experiments)
-    records = [final_record(experiment, cost_keys) for experiment in experiments]
-    columns = [
-        *IDENTITY,
-        Column("steps", ("{:,}", "fewest_steps"), (" to {:,}", "most_steps")),
-        Column("$J_r$", *spread("episode_return", 2), mark=_best(records, "episode_return", max)),
-        *_which(cost_keys),
-        Column("$J_c$", *spread("mean", 1), mark=_is_over),
-        Column("$d$", ("{:g}", "limit")),
-        Column(r"$\rho_c$", *spread("rate", 4), mark=_best(records, "cost_rate", min)),
-    ]
+    environment, keys = experiments[0].environment, cost_keys_of(experiments)
+    records = [final_record(experiment, keys) for experiment in experiments]
+    fields = {"mean": "episode_{}", "mean_std": "episode_{}_std", "limit": "limit_{}"}
+    fields |= {"rate": "{}_rate", "rate_std": "{}_rate_std", "excess": "excess_{}"}
+    rows = [dict(row) for row in each_cost(records, keys, **fields, bias="critic_bias_{}")]
+    others = {e.algorithm: e.limits_of_other_measures for e in experiments}
+    for row in rows:
+        if row.get("key") in others[row["algorithm"]]:
+            row["measure"] = row["limit"] + row["excess"]
+    shown = {"cost": len(keys) > 1, "limited measure": any("measure" in row for row in rows)}
+    shown["critics' bias"] = any("bias" in row for row in rows)
+    columns = {
+        "algorithm": "{algorithm}",
+        "seeds": "{seeds:d}",
+        "steps": "{fewest_steps:,}| to {most_steps:,}",
+        "$J_r$": spread("episode_return", 2),
+        "cost": "{cost}",
+        "$J_c$": spread("mean", 1),
+        "limited measure": "{measure:.1f}",
+        "$d$": "{limit:g}",
+        r"$\rho_c$": spread("rate", 4),
+        "critics' bias": "{bias:+.1f}",
+    }
+    columns = {title: text for title, text in columns.items() if shown.get(title, True)}
     if any("paper_episode_return" in record for record in records):
-        steps = power_of_ten(PUBLISHED_STEPS[experiments[0].benchmark or ""])
-        names = ("paper_episode_return", "paper_episode_cost", "paper_cost_rate")
-        title = rf"paper, {steps} steps: $J_r$ / $J_c$ / $\rho_c$"
-        columns.append(Column(title, ("{:g} / {:g} / {:g}", *names)))
+        title = f"paper, {short_number(PUBLISHED_STEPS[experiments[0].benchmark or ''])} steps"
+        columns[title] = "{paper_episode_return:g} / {paper_episode_cost:g} / {paper_cost_rate:g}"
     if any("later_return" in record for record in records):
-        title = f"later work, {power_of_ten(REIMPLEMENTATION_STEPS)} steps: $J_r$ / $J_c$"
-        columns.append(Column(title, ("{:g} / {:g}", "later_return", "later_cost")))
-    notes = [
-        _measure_note(record, key)
-        for record, experiment in zip(records, experiments, strict=True)
-        for key in experiment.limits_of_other_measures
-    ]
-    shown = each_cost(cost_keys, _FIGURES)
-    return Table(stem("final", environment), environment, columns, records, " ".join(notes), shown)
+        title = f"later work, {short_number(REIMPLEMENTATION_STEPS)} steps"
+        columns[title] = "{later_return:g} / {later_cost:g}"
+
+    def best(name: str, of: Callable[..., float]) -> Callable[[Record], str]:
+        mark = mark_best(records, name, of, lambda r: r["satisfies"], _rivals)
+        # what single costs cost is not ranked
+        return lambda row: mark(row) if name == "episode_return" or row["key"] == "cost" else ""
+
+    def over(row: Record) -> str:
+        return "bad" if row.get("excess", 0.0) > 0 else ""
+
+    marks = {
+        "$J_r$": best("episode_return", max),
+        r"$\rho_c$": best("cost_rate", min),
+        "$J_c$": lambda row: "" if "measure" in row else over(row),
+        "limited measure": lambda row: over(row) if "measure" in row else "",
+    }
+    return Table(_stem("final", environment), environment, columns, records, "", rows, marks)
 
 
-def _which(cost_keys: Sequence[str]) -> list[Column]:
-    """The column that says of which cost a row is, where there are several."""
-    return [Column("cost", ("{}", "named"))] if len(cost_keys) > 1 else []
-
-
-def stem(kind: str, environment: str) -> str:
-    """Name of an environment's file."""
+def _stem(kind: str, environment: str) -> str:
     return f"{kind}_{re.sub(r'[^A-Za-z0-9]+', '_', environment).strip('_')[:80]}"
 
 
-def _is_over(row: Record) -> str:
-    return "bad" if row.get("excess", 0.0) > 0 else ""
-
-
-def _best(
-    records: Sequence[Record], name: str, best: Callable[..., float]
-) -> Callable[[Record], str]:
-    """Mark of the best among those that satisfy the same constraints after equally many steps."""
-    mark = mark_best(records, name, best, is_able=lambda r: r["satisfies"], rivals=rivals)
-    # what single costs cost is not ranked
-    return lambda row: mark(row) if name == "episode_return" or row["of"] == "cost" else ""
-
-
-def rivals(record: Record) -> Hashable:
+def _rivals(record: Record) -> Hashable:
     """What is equal in experiments that can be ranked: the length of training, and the limits."""
     limits = {key: value for key, value in record.items() if key.startswith("limit_")}
     return record["fewest_steps"], record["steps"], frozenset(limits.items())
-
-
-def _measure_note(record: Record, key: str) -> str:
-    """Says that a limit is on something else than the mean that the table shows."""
-    excess = record[f"excess_{key}"]
-    verdict = f"{abs(excess):.1f} {'over' if excess > 0 else 'below'} $d$"
-    return (
-        f"{record['algorithm']}: the limit of {clean(key, 40)} is on another measure than the mean "
-        f"$J_c$; over the last epochs that measure was {verdict}, and this is what is judged."
-    )
 
 
 def learning_table(experiments: Sequence[Experiment], good: float = 0.5) -> Table | None:
@@ -189,53 +156,45 @@ def learning_table(experiments: Sequence[Experiment], good: float = 0.5) -> Tabl
     keys = [key for key in keys if any(key in e.limits for e in experiments)]
     least, definition = _good(experiments, good)
     records = []
-    for experiment in experiments:
-        figures = [_learning_figures(run, least) for run in experiment.finished]
+    for e in experiments:
+        figures = [_learning_figures(run, least) for run in e.finished]
         reached = sum(one["good_steps"] is not None for one in figures)
-        records.append(
-            {
-                "environment": environment,
-                "algorithm": experiment.algorithm,
-                "seeds": len(figures),
-                "hours": mean(run.hours for run in experiment.finished),
-                "seeds_good": None if least is None else reached,
-                **_over_seeds(figures),
-            }
-        )
-    columns = [
-        *IDENTITY,
-        *_which(keys),
-        Column("regret", *spread("regret", 1)),
-        Column("epochs over", ("{:.0%}", "share_over")),
-        Column("longest streak", ("{:.0f}", "streak")),
-        Column("steps until good", ("{:,.0f}", "good_steps")),
-        Column("hours until good", ("{:.2f}", "good_hours")),
-        Column("hours in all", ("{:.2f}", "hours")),
-        Column("good seeds", ("{:d} of {:d}", "seeds_good", "seeds")),
-    ]
-    shown = each_cost(keys, _COURSE)
-    return Table(stem("learning", environment), environment, columns, records, definition, shown)
+        record = {"environment": environment, "algorithm": e.algorithm, "seeds": len(figures)}
+        record["hours"] = mean(run.hours for run in e.finished)
+        record["seeds_good"] = None if least is None else reached
+        records.append(record | _over_seeds(figures))
+    columns = {
+        "algorithm": "{algorithm}",
+        "seeds": "{seeds:d}",
+        **({"cost": "{cost}"} if len(keys) > 1 else {}),
+        "regret": spread("regret", 1),
+        "epochs over": "{over:.0%}",
+        "longest streak": "{streak:.0f}",
+        "steps until good": "{good_steps:,.0f}",
+        "hours until good": "{good_hours:.2f}",
+        "hours in all": "{hours:.2f}",
+        "good seeds": "{seeds_good:d} of {seeds:d}",
+    }
+    fields = {"regret": "regret_{}", "regret_std": "regret_{}_std"}
+    rows = each_cost(records, keys, **fields, over="share_over_{}", streak="streak_{}")
+    return Table(_stem("learning", environment), environment, columns, records, definition, rows)
 
 
 def _good(experiments: Sequence[Experiment], share: float) -> tuple[float | None, str]:
-    """The least return of a good policy on an environment, and the definition in words.
-
-    None if the best final return is not above 0: a share of it would be more than all of it.
-    """
+    """The least return of a good policy on an environment, and the definition in words."""
     reference, whose = experiments[0].reference, "the published PPO's"
     if reference is not None:
         whole = reference.episode_return
     else:
         whose = "the final return of the best here"
         finals = [[run.final([])["episode_return"] for run in e.finished] for e in experiments]
-        known = [value for value in map(mean, finals) if math.isfinite(value)]
-        whole = max(known, default=0.0)
+        whole = max([value for value in map(mean, finals) if math.isfinite(value)], default=0.0)
     if whole <= 0:
-        return None, f"Good: not defined, as {whose} is not above 0, and has no share."
+        return None, f"Good: not defined, as {whose} is not above 0."
     return share * whole, (
         f"Good: $J_r$ at least {share * whole:.4g}, {share:.0%} of {whose}, and every $J_c$ within "
-        "its limit, over as many epochs as final figures; steps and hours are means over the seeds "
-        "that came to it."
+        "its limit, over as many epochs as final scores; steps and hours are means over the good "
+        "seeds."
     )
 
 
@@ -263,34 +222,57 @@ def _learning_figures(run: Run, least_return: float | None) -> dict[str, float |
     return figures
 
 
-def dominance_table(records: Iterable[Record]) -> Table:
-    """Which algorithm is better than which on each environment.
+def better_tables(records: Sequence[Record]) -> list[Table]:
+    """Which algorithm is better than which: a file of all pairs, and a matrix per environment.
 
     What has finished no episode neither keeps its limits nor breaks them, and is not ranked.
     """
-    records, relations = [record for record in records if _is_measured(record)], []
-    for environment in dict.fromkeys(record["environment"] for record in records):
+    groups: dict[Hashable, list[Record]] = {}
+    for record in records:
+        judged = [value for name, value in record.items() if name.startswith("excess_")]
+        if all(map(math.isfinite, [record["episode_return"], *judged])):
+            groups.setdefault((record["environment"], _rivals(record)), []).append(record)
+    pairs: list[Record] = []
+    matrices = []
+    for own in groups.values():
+        first, names = own[0], [record["algorithm"] for record in own]
         agents = {
-            r["algorithm"]: Agent(
-                r["episode_return"], r.get("cost_rate", 0.0), r["satisfies"], rivals(r)
-            )
-            for r in records
-            if r["environment"] == environment
+            r["algorithm"]: Agent(r["episode_return"], r.get("cost_rate", 0.0), r["satisfies"], 0)
+            for r in own
         }
-        for better, worse, reason in compare(agents):
-            relations.append(
-                {
-                    "environment": environment, "better": better, "worse": worse,
-                    "reason": reason, "why": _REASONS[reason],
-                }
-            )  # fmt: skip
-    names = ("environment", "better", "worse", "why")
-    return Table("dominance", "Which is better", [Column(name) for name in names], relations)
+        found = {(better, worse): reason for better, worse, reason in compare(agents)}
+        place = {"environment": first["environment"]}
+        pairs += [
+            {**place, "better": better, "worse": worse, "reason": reason}
+            for (better, worse), reason in found.items()
+        ]
+        words = [first["environment"], f"{short_number(first['steps'])} steps"]
+        words += [f"{name[6:]} ≤ {first[name]:g}" for name in first if name.startswith("limit_")]
+        matrices += [matrix(", ".join(words), names, signs_of(agents))] if found else []
+    return [Table("dominance", "", {}, pairs), *matrices]
 
 
-def _is_measured(record: Record) -> bool:
-    judged = [value for name, value in record.items() if name.startswith("excess_")]
-    return all(map(math.isfinite, [record["episode_return"], *judged]))
+def signs_of(agents: Mapping[str, Agent]) -> dict[tuple[str, str], str]:
+    """Pair of algorithms -> sign, if the first is better by the rules of the paper."""
+    signs = {"satisfies": "✓", "dominates": "≻"}
+    return {(better, worse): signs[reason] for better, worse, reason in compare(agents)}
 
 
-_REASONS = {"satisfies": "keeps its limits, the other does not", "dominates": "≻ dominates"}
+def matrix(title: str, names: Sequence[str], signs: Mapping[tuple[str, str], str]) -> Table:
+    """A table with a row and a column per algorithm.
+
+    Args:
+        title: Its heading.
+        names: Of the algorithms.
+        signs: Pair of algorithms, of the row and of the column -> what the cell says.
+    """
+    rows = [
+        {"algorithm": f"{row} {one}"}
+        | {
+            f"c{n}": "·" if n == row else signs.get((one, two), "")
+            for n, two in enumerate(names, 1)
+        }
+        for row, one in enumerate(names, 1)
+    ]
+    columns = {f"{n}": f"{{c{n}}}" for n in range(1, len(names) + 1)}
+    return Table("", title, {"better than …": "{algorithm}", **columns}, rows, is_matrix=True)

@@ -8,15 +8,9 @@ from synthetic import experiments_in, write_run
 
 from safe_rl.reporting.curves import average
 from safe_rl.reporting.recorded import find_runs
-from safe_rl.reporting.scoring import (
-    final_record,
-    learning_table,
-)
-from safe_rl.reporting.slates import (
-    aggregate,
-    improvement_table,
-)
-from safe_rl.reporting.tables import Column, Table, spread
+from safe_rl.reporting.scoring import final_record, learning_table
+from safe_rl.reporting.slates import aggregate, improvement_tables
+from safe_rl.reporting.tables import Table, spread
 from safe_rl.scores.published import REFERENCE
 
 
@@ -75,13 +69,13 @@ def test_tables_write_all_fields_and_show_the_chosen(tmp_path):
         {"name": "c", "x": 3.0},
     ]  # fmt: skip
     looks = {"a|b": "best", "c": "bad"}
-    columns = [
-        Column("name", ("{}", "name")),
-        Column("x", *spread("x", 1), mark=lambda r: looks.get(r["name"], "")),
-    ]
-    table = Table("scores", "Scores", columns, records)
+    columns, marks = (
+        {"name": "{name}", "x": spread("x", 1)},
+        {"x": lambda r: looks.get(r["name"], "")},
+    )
+    table = Table("scores", "Scores", columns, records, marks=marks)
     assert table.markdown().splitlines() == [
-        "| name | x |", "|---|---:|", r"| a\|b | **1.2 ± 0.5** |", "| =b | — |", "| c | 3.0 ▲ |",
+        "| name | x |", "|---|---:|", "| a\\|b | **1.2\xa0± 0.5** |", "| =b | — |", "| c | 3.0 ▲ |",
     ]  # fmt: skip
     table.write_csv(tmp_path / "scores.csv")
     with (tmp_path / "scores.csv").open(newline="") as file:
@@ -163,11 +157,14 @@ def test_improvement_is_a_probability_per_score(tmp_path):
     for algo, value, cost in (("ppo", 2.0, 60.0), ("cpo", 1.0, 20.0)):
         for seed in (0, 10):
             write_run(tmp_path, algo=algo, seed=seed, returns=[value], costs=[cost])
-    table = improvement_table("x", [aggregate([e]) for e in experiments_in(tmp_path)])
+    table, better = improvement_tables("x", [aggregate([e]) for e in experiments_in(tmp_path)])
     found = {r["algorithm"]: (r["episode_return"], r["violation"]) for r in table.records}
-    # each pair once; the cost rates are equal
-    assert found == {"PPO": (1.0, 0.0)}
+    assert found == {"PPO": (1.0, 0.0), "CPO": (0.0, 1.0)}
     assert {r["cost_rate"] for r in table.records} == {0.5}
+    # the matrix has the rules' sign and the probability of a higher return
+    assert [[cell.text for cell in row] for row in better.rows()] == [
+        ["1 PPO", "·", "1.00"], ["2 CPO", "✓ 0.00", "·"],
+    ]  # fmt: skip
 
 
 def test_steps_beyond_the_end_of_training_are_no_longer_training(tmp_path):

@@ -5,7 +5,8 @@ import pytest
 from matplotlib.figure import Figure
 from synthetic import experiments_in, write_run
 
-from safe_rl.reporting.curves import draw_learning_curves
+from safe_rl.cli.composing import CONF
+from safe_rl.reporting.curves import draw_learning_curves, draw_small_multiples
 from safe_rl.reporting.figures import add_legend, algorithm_styles, draw_fronts, save
 from safe_rl.reporting.scoring import final_table
 
@@ -50,15 +51,26 @@ def test_every_limited_cost_has_a_row(tmp_path):
     assert [list(line.get_ydata()) for line in panels[1, 1].lines] == [[4.0], [5.0, 5.0]]
 
 
-def test_colours_stay_with_the_algorithms(tmp_path):
+def test_an_algorithm_has_one_colour_and_one_marker_everywhere(tmp_path):
     for algo in ("ppo", "cpo", "mine", "yours"):
         write_run(tmp_path, algo=algo)
     write_run(tmp_path, algo="cpo", frames=500, folder="variant")
+    write_run(tmp_path, "CarGoal1", "cpo", limits={"cost": 9.0})
     everything = experiments_in(tmp_path)
-    colours = algorithm_styles(everything)
-    assert len(set(colours.values())) == 5
-    alone = algorithm_styles([e for e in everything if e.algorithm == "PPO"])
-    assert alone["PPO"] == colours["PPO"]
+    styles = algorithm_styles(everything)
+    looks = {
+        e.base: {styles[o.label][:2] for o in everything if o.base == e.base} for e in everything
+    }
+    assert all(len(own) == 1 for own in looks.values())
+    assert len(set.union(*looks.values())) == 4
+    assert algorithm_styles([e for e in everything if e.base == "ppo"])["PPO"] == styles["PPO"]
+
+
+def test_the_algorithms_of_the_package_are_told_apart(tmp_path):
+    for path in (CONF / "algo").glob("*.yaml"):
+        write_run(tmp_path, algo=path.stem)
+    styles = algorithm_styles(experiments_in(tmp_path)).values()
+    assert len({style.colour for style in styles}) == len({style[:2] for style in styles}) == 20
 
 
 def test_experiments_of_one_algorithm_are_told_apart(tmp_path):
@@ -67,11 +79,30 @@ def test_experiments_of_one_algorithm_are_told_apart(tmp_path):
         write_run(tmp_path, algo="cpo", **model, **ROWS, costs=(1, 1, 1), folder=f"w{width}")
         write_run(tmp_path, algo="cpo", **model, seed=1, folder=f"unfinished{width}")
     experiments = experiments_in(tmp_path)
-    styles = algorithm_styles(experiments)
-    assert len(set(styles.values())) == 15
-    figure = draw_learning_curves(experiments, styles)
-    looks = [(line.get_color(), str(line._unscaled_dash_pattern)) for line in figure.axes[0].lines]
-    assert len(set(looks)) == 30
+    figure = draw_learning_curves(experiments, algorithm_styles(experiments))
+    lines = figure.axes[0].lines
+    assert len({(line.get_color(), str(line._unscaled_dash_pattern)) for line in lines[::2]}) == 15
+    assert {line.get_linestyle() for line in lines[1::2]} == {":"}
+
+
+def test_many_algorithms_have_a_column_each(tmp_path):
+    for algo, cost in {"ppo": 30.0, "cpo": 20.0, "sac": 25.0}.items():
+        for limit in (10.0, 50.0):
+            folder = f"{algo}{limit}"
+            write_run(tmp_path, algo=algo, limits={"cost": limit}, **ROWS, costs=[500, cost, cost],
+                      folder=folder)  # fmt: skip
+    experiments = experiments_in(tmp_path)
+    figure = draw_small_multiples(experiments, "cost", algorithm_styles(experiments))
+    panels = np.array(figure.axes).reshape(3, 3)
+    assert [axis.get_title() for axis in panels[0]] == ["PPO", "CPO", "SAC"]
+    # its own two, the limits, and the four of the others, which are grey
+    for axis in panels[1]:
+        colours = [line.get_color() for line in axis.lines]
+        assert colours.count("0.88") == 4
+        assert len(set(colours) - {"0.88", "#c00000"}) == 1
+        assert axis.get_ylim() == (0, 200)
+    legend = [text.get_text() for text in panels[0, 0].get_legend().get_texts()]
+    assert legend == ["cost ≤ 10", "cost ≤ 50"]
 
 
 @pytest.mark.parametrize(
@@ -102,34 +133,20 @@ def test_the_front_joins_what_no_other_one_beats(tmp_path):
         write_run(tmp_path, algo=algo, returns=[value], costs=[cost])
     write_run(tmp_path, algo="cpo", returns=[3.0], costs=[8.0], limits={"cost": 9.0}, folder="9")
     experiments = experiments_in(tmp_path)
-    (axis,) = draw_fronts(final_table(experiments).records, algorithm_styles(experiments)).axes
-    front = next(line for line in axis.lines if line.get_color() == "0.6")
+    records, styles = final_table(experiments).records, algorithm_styles(experiments)
+    (axis,) = draw_fronts(records, experiments, styles).axes
+    front = next(line for line in axis.lines if line.get_color() == "0.7")
     assert list(zip(*front.get_data(), strict=True)) == [(8.0, 3.0), (20.0, 10.0), (60.0, 20.0)]
     limits = sorted(line.get_xdata()[0] for line in axis.lines if line.get_linestyle() == "--")
     assert limits == [9.0, 25.0]
-    # experiments of another limit have another sign, which is explained
-    points = [c[0] for c in axis.containers]
-    marks = {p.get_xdata()[0]: p.get_marker() for p in points}
-    assert len(marks) == 4
-    assert marks[20.0] == marks[40.0] == marks[60.0] != marks[8.0]
-    names = {line.get_label(): line.get_marker() for line in axis.lines}
-    assert (names["limit 25"], names["limit 9"]) == (marks[20.0], marks[8.0])
-    # one algorithm under two limits is one line, from the lower to the higher
-    (line,) = [line for line in axis.lines if line.get_label() == "CPO"]
+    points = {c[0].get_xdata()[0]: c[0] for c in axis.containers}
+    assert points[20.0].get_marker() == points[8.0].get_marker() != points[60.0].get_marker()
+    # one algorithm under two limits is one line, with the limits beside its points
+    line = next(line for line in axis.lines if len(line.get_xdata()) == 2 and line.get_alpha())
     assert list(zip(*line.get_data(), strict=True)) == [(8.0, 3.0), (20.0, 10.0)]
-
-
-def test_a_limit_has_one_mark_in_all_panels(tmp_path):
-    for env, limits in (("PointGoal1", (10.0, 25.0)), ("CarGoal1", (25.0, 25.0))):
-        for algo, limit in zip(("ppo", "cpo"), limits, strict=True):
-            write_run(tmp_path, env, algo, limits={"cost": limit})
-    experiments = experiments_in(tmp_path)
-    records = [final_table([e]).records[0] for e in experiments]
-    figure = draw_fronts(records, algorithm_styles(experiments))
-    labels = [axis.get_legend_handles_labels() for axis in figure.axes[:2]]
-    marks = [dict(zip(names, (h.get_marker() for h in handles), strict=True))
-             for handles, names in labels]  # fmt: skip
-    assert marks[0]["limit 25"] == marks[1]["limit 25"] != marks[1]["limit 10"]
+    assert {text.get_text(): text.xy for text in axis.texts} == {
+        "≤ 9": (8.0, 3.0), "≤ 25": (20.0, 10.0),
+    }  # fmt: skip
 
 
 def test_fronts_join_nothing_that_was_trained_for_longer(tmp_path):
@@ -137,21 +154,22 @@ def test_fronts_join_nothing_that_was_trained_for_longer(tmp_path):
         rows = {name: [1.0] * epochs for name in ("returns", "costs", "rates")}
         write_run(tmp_path, algo=algo, **rows, limits={} if algo == "ppo" else None)
     experiments = experiments_in(tmp_path)
-    figure = draw_fronts(final_table(experiments).records, algorithm_styles(experiments))
+    styles = algorithm_styles(experiments)
+    figure = draw_fronts(final_table(experiments).records, experiments, styles)
     shown = {axis.get_title(): axis for axis in figure.axes if axis.get_title()}
-    assert list(shown) == ["PointGoal1, 1,000 steps", "PointGoal1, 3,000 steps"]
-    assert len(shown["PointGoal1, 1,000 steps"].containers) == 2
-    labels = shown["PointGoal1, 1,000 steps"].get_legend_handles_labels()[1]
-    assert labels == ["PPO", "CPO", "no limit of cost", "limit 25"]
+    assert list(shown) == ["PointGoal1, 1k steps", "PointGoal1, 3k steps"]
+    assert len(shown["PointGoal1, 1k steps"].containers) == 2
+    labels = shown["PointGoal1, 1k steps"].get_legend_handles_labels()[1]
+    assert labels == ["PPO", "CPO"]
 
 
-def test_a_single_epoch_is_drawn_as_a_point(tmp_path):
-    write_run(tmp_path)
-    write_run(tmp_path, algo="cpo", frames=10**6)
-    write_run(tmp_path, algo="trpo", **ROWS, costs=(1, 1, 1))
+@pytest.mark.parametrize("form", ["png", "svg", "pdf"])
+def test_a_picture_is_the_same_bytes_each_time(form, tmp_path):
+    write_run(tmp_path, **ROWS, costs=(1, 1, 1))
     experiments = experiments_in(tmp_path)
-    figure = draw_learning_curves(experiments, algorithm_styles(experiments))
-    for axis in figure.axes:
-        drawn = {line.get_label(): line.get_marker() for line in axis.lines}
-        drawn = {name: marker for name, marker in drawn.items() if not name.startswith("_")}
-        assert drawn == {"PPO": "o", "TRPO": "", "CPO (unfinished)": "o"}
+    paths = [tmp_path / f"{name}.{form}" for name in "ab"]
+    for path in paths:
+        save(draw_learning_curves(experiments, algorithm_styles(experiments)), path)
+    first, second = (path.read_bytes() for path in paths)
+    assert first == second
+    assert first.startswith({"png": b"\x89PNG", "svg": b"<?xml", "pdf": b"%PDF"}[form])
