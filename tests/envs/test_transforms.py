@@ -2,6 +2,7 @@
 
 import math
 import re
+from functools import partial
 
 import gymnasium_envs  # noqa: F401, registers Walk-v0
 import pytest
@@ -273,6 +274,29 @@ def test_a_filter_that_returns_no_actions_is_refused():
     env = transform_env(PointMass(2), {"filter": broken}, evaluating=False)
     with pytest.raises(ValueError, match=re.escape("actions of shape (2, 2), got (2, 1)")):
         env.rollout(1)
+
+
+def test_a_filter_gets_the_positions_before_the_step_and_the_layout_if_it_asks_for_them():
+    seen = []
+
+    def shield(step, positions, layout, part="robot"):
+        seen.append((positions[part], step["observation"], layout))
+        return step["action"]
+
+    node = {"_target_": "safe_rl.envs.transforms.ActionFilter", "filter": partial(shield)}
+    env = make_env("PointGoal1", num_envs=2, seed=0, transforms={"f": node, "s": RewardScale(0.5)})
+    state = env.reset()
+    for _ in range(3):
+        # "robot" is the body's place, which the joints of a planar robot are
+        xy = env.get_state()["qpos"][:, :2]
+        state["action"] = torch.ones(2, 2)
+        state = env.step(state)["next"].exclude("reward")
+        torch.testing.assert_close(seen[-1][0][:, 0, :2], xy, rtol=0, atol=1e-9)
+    assert seen[-1][2] == env.observation_layout
+    assert not torch.equal(seen[0][0], seen[-1][0])
+    blind = transform_env(PointMass(2), {"f": ActionFilter(shield)}, evaluating=False)
+    with pytest.raises(ValueError, match="asks for 'positions'"):
+        blind.rollout(1)
 
 
 def test_interventions_can_have_a_budget():

@@ -120,7 +120,10 @@ FILTER = "transforms.action_filter.filter._target_=test_transforms_filters.slow"
 def command(tmp_path, monkeypatch, capsys):
     """Runs train.py in a folder of its own; returns its status and what it printed."""
     monkeypatch.chdir(tmp_path)
-    source = "def slow(step, speed=0.3):\n    return step['action'].clamp(-speed, speed)\n"
+    source = """def slow(step, positions, layout, speed=0.3):
+    assert positions["hazards"].shape[1:] == (8, 3) and "gyro" in layout
+    return step["action"].clamp(-speed, speed)
+"""
     Path("test_transforms_filters.py").write_text(source)
     monkeypatch.setitem(sys.modules, "test_transforms_filters", None)
     monkeypatch.delitem(sys.modules, "test_transforms_filters")

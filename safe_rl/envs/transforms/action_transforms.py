@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Annotated
+from inspect import signature
+from typing import Annotated, Any
 
 import torch
 from tensordict import TensorDictBase
@@ -12,6 +13,16 @@ from torchrl.data import Bounded, OneHot, TensorSpec
 
 from safe_rl.envs.transforms.base import ConstraintTransform, reward_like
 from safe_rl.ranges import PART, Range, Text
+
+_ASKED = frozenset({"positions", "layout"})
+
+
+def _parameters(function: Callable[..., Any]) -> set[str]:
+    """Names of a function's parameters; none of one that does not tell, such as `torch.clamp`."""
+    try:
+        return set(signature(function).parameters)
+    except ValueError:
+        return set()
 
 
 class ActionFilter(ConstraintTransform):
@@ -27,11 +38,14 @@ class ActionFilter(ConstraintTransform):
     Args:
         filter: Function that replaces actions: gets a TensorDict [N] with `observation` and
             `action` [N, A], returns the actions to take [N, A]. Where it returns what it got, it
-            did not intervene.
+            did not intervene. If it has a parameter `positions`, it gets where things are before
+            the step (`get_positions` of the environment); if it has one called `layout`, the
+            columns of the observation (`observation_layout`).
         cost_key: Name of the cost of interventions.
 
     Raises:
-        ValueError: at a step, if the function returns something else.
+        ValueError: at a step, if the function returns something else, or asks for positions of an
+            environment that has none.
 
     Examples:
         >>> import torch
@@ -48,19 +62,20 @@ class ActionFilter(ConstraintTransform):
 
     def __init__(
         self,
-        filter: Annotated[Callable[[TensorDictBase], Tensor], PART],
+        filter: Annotated[Callable[..., Tensor], PART],
         *,
         cost_key: Text = "cost_interventions",
     ) -> None:
         super().__init__()
         self._filter = filter
+        self._asks_for = _ASKED & _parameters(filter)
         self.added_costs = (cost_key,)
         self._intervened: Tensor | None = None
 
     def _inv_call(self, tensordict: TensorDictBase) -> TensorDictBase:
         action = tensordict.get("action")
         # a copy: what changes actions in place would change the one that is learned from
-        replaced = self._filter(tensordict.set("action", action.clone()))
+        replaced = self._filter(tensordict.set("action", action.clone()), **self._asked())
         if not isinstance(replaced, Tensor) or replaced.shape != action.shape:
             got = tuple(replaced.shape) if isinstance(replaced, Tensor) else type(replaced).__name__
             raise ValueError(
@@ -69,6 +84,20 @@ class ActionFilter(ConstraintTransform):
         differs = (replaced != action).reshape(*tensordict.batch_size, -1)
         self._intervened = differs.any(-1, keepdim=True)
         return tensordict.set("action", replaced)
+
+    def _asked(self) -> dict[str, Any]:
+        """What the filter asks for by the names of its parameters."""
+        given: dict[str, Any] = {}
+        if "layout" in self._asks_for:
+            given["layout"] = self.container.observation_layout
+        if "positions" in self._asks_for:
+            given["positions"] = self.container.get_positions()
+            if given["positions"].is_empty():
+                raise ValueError(
+                    "The action filter asks for 'positions', but this environment has none "
+                    "(get_positions)."
+                )
+        return given
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
         assert self._intervened is not None  # the action was given to the step before
