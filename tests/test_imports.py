@@ -54,7 +54,7 @@ PARTS = {
 FLOORS = {
     "envs": (
         ("errors", "opengl", "rng", "physics"),
-        ("costs", "physics.batch", "physics.dynamics"),
+        ("costs", "physics.batch", "physics.dynamics", "pictures"),
         ("contract",),
         ("simulated",),
         # Safety Gym: records, then tables of rules, then worlds, and what is seen of them.

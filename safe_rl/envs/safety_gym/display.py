@@ -5,36 +5,24 @@ from __future__ import annotations
 import functools
 import math
 from collections.abc import Iterable
-from typing import NamedTuple, TypeAlias
 
 import mujoco
 import numpy as np
 import torch
 from torch import Tensor
 
-from safe_rl.envs.errors import ConfigError, nearest
-from safe_rl.envs.opengl import PACKAGES, OpenGLError, has_screen, open_renderer
+from safe_rl.envs.errors import ConfigError
+from safe_rl.envs.opengl import PACKAGES, OpenGLError, has_screen
+from safe_rl.envs.pictures import Marker, Pictures, add_markers
 from safe_rl.envs.safety_gym.bodies import TRACK, VISION
 from safe_rl.envs.safety_gym.building import build_scene
 from safe_rl.envs.safety_gym.config import SafetyGymConfig
 from safe_rl.envs.safety_gym.world import Block, Scene, World
 
-FREE = "free"
 TRACK_BEHIND, TRACK_ABOVE = 2.0, 2.0  # where the tracking camera is, from the robot [m]
 
-Camera: TypeAlias = str | mujoco.MjvCamera
 
-
-class Marker(NamedTuple):
-    """One shape: MuJoCo type, size as MJCF has it, centre [m], colour."""
-
-    type: mujoco.mjtGeom
-    size: tuple[float, float, float]
-    pos: np.ndarray
-    rgba: tuple[float, float, float, float]
-
-
-class Display:
+class Display(Pictures):
     """Draws worlds of one configuration; nothing is built or opened before the first picture.
 
     Args:
@@ -49,27 +37,18 @@ class Display:
     """
 
     def __init__(self, config: SafetyGymConfig) -> None:
+        super().__init__()
         self._config = config
-        self._renderers: dict[tuple[int, int], mujoco.Renderer] = {}
-        self._options = mujoco.MjvOption()
-        self._options.geomgroup[:] = 1  # lidar's groups are no reason to hide anything
+        self.options = mujoco.MjvOption()
+        self.options.geomgroup[:] = 1  # lidar's groups are no reason to hide anything
+
+    def _load(self) -> mujoco.MjModel:
+        return self.scene.model
 
     @functools.cached_property
     def scene(self) -> Scene:
         """The world as it is drawn."""
         return build_scene(self._config, decorated=True)
-
-    @functools.cached_property
-    def data(self) -> mujoco.MjData:
-        """Where everything is in the world that was posed last."""
-        return mujoco.MjData(self.scene.model)
-
-    @property
-    def cameras(self) -> list[str]:
-        """Names that `frame` takes."""
-        model = self.scene.model
-        named = [name for i in range(model.ncam) if (name := model.camera(i).name)]
-        return [*named, FREE]
 
     def pose(self, world: World, row: int) -> None:
         """Put everything where it is in one of the worlds."""
@@ -81,66 +60,13 @@ class Display:
         areas = _numbers(world.positions, row)[len(self.scene.names) - num_areas :]
         data.mocap_pos[:] = np.concatenate([mocap_pos, areas])
         data.mocap_quat[: len(mocap_pos)] = _numbers(physics.mocap_quat, row)
-        mujoco.mj_kinematics(self.scene.model, data)
-        mujoco.mj_comPos(self.scene.model, data)
-        mujoco.mj_camlight(self.scene.model, data)
+        self.place()
         self._follow()
-
-    def frame(
-        self,
-        camera: Camera,
-        width: int,
-        height: int,
-        markers: Iterable[Marker] = (),
-        labels: bool = False,
-    ) -> np.ndarray:
-        """Draw the world that was posed last.
-
-        Args:
-            camera: a name of `cameras`, or a custom camera.
-            width: of the picture [pixels].
-            height: of the picture [pixels].
-            markers: drawn besides the world.
-            labels: write the names of objects at them.
-
-        Returns:
-            RGB, uint8 [height, width, 3].
-
-        Raises:
-            ValueError: for an unknown camera.
-            OpenGLError: if OpenGL is missing or cannot be started.
-        """
-        chosen = self._camera(camera)
-        renderer = self._renderers.get((width, height))
-        if renderer is None:
-            renderer = open_renderer(self.scene.model, width, height)
-            self._renderers[width, height] = renderer
-        renderer.update_scene(self.data, chosen, self._options)
-        if labels:
-            self._label(renderer.scene)
-        add_markers(renderer.scene, markers)
-        return renderer.render()
 
     def free_camera(self) -> mujoco.MjvCamera:
         """A camera in the south that has all placements in view and can be moved."""
         camera = mujoco.MjvCamera()
         camera.distance = 3 * max(abs(bound) for bound in self._config.placements_extents)
-        return camera
-
-    def close(self) -> None:
-        """Free what OpenGL holds; a later picture opens it again."""
-        for renderer in self._renderers.values():
-            renderer.close()
-        self._renderers.clear()
-
-    def _camera(self, camera: Camera) -> Camera:
-        if camera == FREE:
-            return self.free_camera()
-        if isinstance(camera, str) and camera not in self.cameras:
-            raise ValueError(
-                f"There is no camera '{camera}'.{nearest(camera, self.cameras)} "
-                f"Choose one of {self.cameras}, or give a mujoco.MjvCamera."
-            )
         return camera
 
     def _follow(self) -> None:
@@ -167,29 +93,6 @@ class Display:
             direction = data.xmat[self.scene.robot_body].reshape(3, 3)[:, 0]
         angle = math.atan2(direction[1], direction[0])
         return np.array([math.cos(angle), math.sin(angle), 0.0])
-
-    def _label(self, drawn: mujoco.MjvScene) -> None:
-        """Write every object's name at the first of its shapes."""
-        model, left = self.scene.model, set(self.scene.names)
-        for geom in drawn.geoms[: drawn.ngeom]:
-            if geom.objtype != mujoco.mjtObj.mjOBJ_GEOM:
-                continue
-            name = model.body(model.geom_bodyid[geom.objid]).name
-            if name in left:
-                geom.label = name
-                left.remove(name)
-
-
-def add_markers(drawn: mujoco.MjvScene, markers: Iterable[Marker]) -> None:
-    """Append markers to what MuJoCo draws; those beyond its capacity are left out."""
-    upright = np.eye(3).reshape(-1)
-    for marker in markers:
-        if drawn.ngeom == drawn.maxgeom:
-            return
-        geom = drawn.geoms[drawn.ngeom]
-        rgba = np.array(marker.rgba, dtype=np.float32)
-        mujoco.mjv_initGeom(geom, marker.type, np.array(marker.size), marker.pos, upright, rgba)
-        drawn.ngeom += 1
 
 
 def _numbers(values: torch.Tensor, row: int) -> np.ndarray:

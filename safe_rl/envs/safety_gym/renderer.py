@@ -11,9 +11,10 @@ from collections.abc import Iterator, Mapping
 import numpy as np
 from torch import Tensor
 
+from safe_rl.envs.pictures import Camera, Marker
 from safe_rl.envs.safety_gym.bodies import VISION
 from safe_rl.envs.safety_gym.config import SafetyGymConfig
-from safe_rl.envs.safety_gym.display import Camera, Display, Marker, Viewer
+from safe_rl.envs.safety_gym.display import Display, Viewer
 from safe_rl.envs.safety_gym.elements import BOX, CYLINDER, ELEMENTS, SPHERE
 from safe_rl.envs.safety_gym.world import NO_BUTTON, Block, World
 
@@ -123,7 +124,7 @@ class WorldRenderer:
             RGB, uint8 [R, height, width, 3].
         """
         readings = self._readings()
-        labels = self._config.render_labels
+        labels = self._world.scene.names if self._config.render_labels else ()
         frames = np.empty((len(rows), height, width, 3), dtype=np.uint8)
         for frame, row in zip(frames, rows, strict=True):
             self._display.pose(self._world, row)

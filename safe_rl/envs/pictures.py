@@ -1,0 +1,133 @@
+"""Pictures of one compiled model, of any family: cameras, markers, renderers of every size."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Collection, Iterable
+from functools import cached_property
+from typing import NamedTuple, TypeAlias
+
+import mujoco
+import numpy as np
+
+from safe_rl.envs.errors import nearest
+from safe_rl.envs.opengl import open_renderer
+
+FREE = "free"
+
+Camera: TypeAlias = str | mujoco.MjvCamera
+
+
+class Marker(NamedTuple):
+    """A shape that is drawn besides the model: MuJoCo type, size as in MJCF, centre [m], colour."""
+
+    type: mujoco.mjtGeom
+    size: tuple[float, float, float]
+    pos: np.ndarray
+    rgba: tuple[float, float, float, float]
+
+
+class Pictures(ABC):
+    """Draws one model; nothing is compiled or opened before the first picture."""
+
+    options: mujoco.MjvOption | None = None
+
+    def __init__(self) -> None:
+        self._renderers: dict[tuple[int, int], mujoco.Renderer] = {}
+
+    @abstractmethod
+    def _load(self) -> mujoco.MjModel:
+        """Compile the model."""
+
+    @abstractmethod
+    def free_camera(self) -> mujoco.MjvCamera:
+        """Return the camera "free"."""
+
+    @cached_property
+    def model(self) -> mujoco.MjModel:
+        """What is drawn."""
+        return self._load()
+
+    @cached_property
+    def data(self) -> mujoco.MjData:
+        """Where everything is; call `place` after a change of positions."""
+        return mujoco.MjData(self.model)
+
+    @property
+    def cameras(self) -> list[str]:
+        """Names that `frame` takes."""
+        named = [name for i in range(self.model.ncam) if (name := self.model.camera(i).name)]
+        return [*named, FREE]
+
+    def place(self) -> None:
+        """Compute where bodies, cameras and lights are from the positions in `data`."""
+        mujoco.mj_kinematics(self.model, self.data)
+        mujoco.mj_comPos(self.model, self.data)
+        mujoco.mj_camlight(self.model, self.data)
+
+    def frame(
+        self,
+        camera: Camera,
+        width: int,
+        height: int,
+        markers: Iterable[Marker] = (),
+        labels: Collection[str] = (),
+    ) -> np.ndarray:
+        """Draw what is in `data`.
+
+        Args:
+            camera: A name of `cameras`, or a custom camera.
+            width: Of the picture [pixels].
+            height: Of the picture [pixels].
+            markers: Drawn besides the model.
+            labels: Names of bodies that are written at them.
+
+        Returns:
+            RGB, uint8 [height, width, 3].
+
+        Raises:
+            ValueError: For an unknown camera.
+            OpenGLError: If OpenGL is missing or cannot be started.
+        """
+        if isinstance(camera, str) and camera not in self.cameras:
+            raise ValueError(
+                f"There is no camera '{camera}'.{nearest(camera, self.cameras)} "
+                f"Choose one of {self.cameras}, or give a mujoco.MjvCamera."
+            )
+        size = (width, height)
+        if size not in self._renderers:
+            self._renderers[size] = open_renderer(self.model, width, height)
+        renderer = self._renderers[size]
+        chosen = self.free_camera() if isinstance(camera, str) and camera == FREE else camera
+        renderer.update_scene(self.data, chosen, self.options)
+        self._label(renderer.scene, set(labels))
+        add_markers(renderer.scene, markers)
+        return renderer.render()
+
+    def close(self) -> None:
+        """Free what OpenGL holds; a later picture opens it again."""
+        for renderer in self._renderers.values():
+            renderer.close()
+        self._renderers.clear()
+
+    def _label(self, drawn: mujoco.MjvScene, left: set[str]) -> None:
+        """Write the name of every labelled body at the first of its shapes."""
+        for geom in drawn.geoms[: drawn.ngeom] if left else ():
+            if geom.objtype != mujoco.mjtObj.mjOBJ_GEOM:
+                continue
+            name = self.model.body(self.model.geom_bodyid[geom.objid]).name
+            if name in left:
+                geom.label = name
+                left.remove(name)
+
+
+def add_markers(drawn: mujoco.MjvScene, markers: Iterable[Marker]) -> None:
+    """Append markers to what MuJoCo draws; those beyond its capacity are left out."""
+    upright = np.eye(3).reshape(-1)
+    for marker in markers:
+        if drawn.ngeom == drawn.maxgeom:
+            return
+        geom = drawn.geoms[drawn.ngeom]
+        rgba = np.array(marker.rgba, dtype=np.float32)
+        mujoco.mjv_initGeom(geom, marker.type, np.array(marker.size), marker.pos, upright, rgba)
+        drawn.ngeom += 1
