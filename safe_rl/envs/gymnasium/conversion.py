@@ -54,24 +54,23 @@ def from_gymnasium(
             taking one step.
         num_steps: The largest number of steps of an episode; None takes what the id says.
         seed: Of all environments; row k has this one plus k.
-        workers: Processes that step them; 0 steps them here, one after the other, as is done in a
-            process that is itself a worker.
+        workers: Processes that step them; 0 steps them in this process, one after the other. A
+            process that is itself a worker always does.
         device: Where the TensorDicts live.
-        flatten: Make one vector of every observation; False leaves pictures and dictionaries of
-            vectors and pictures as they are, and refuses other observations that are no arrays.
-        highest_costs: Cost key -> the most that a step can cost, where that is known; the specs
-            say so then, and certificates use it.
+        flatten: Make one vector of every observation; False leaves pictures and dictionaries as
+            they are.
+        highest_costs: Cost key -> the most that a step can cost, if that is known, for the specs
+            and for certificates.
         kwargs: For `gymnasium.make`, with an id.
 
     Returns:
-        An environment [N], with the costs in its reward spec. Without a cost called `cost` it gets
-        one, the sum of the others. A copy (`copy`, `pickle`) goes on as far as copies of what is
-        within do; with workers it begins where its seed does.
+        An environment [N], with the costs in its reward spec; `cost` is the sum of the others if
+        there is none of that name. A copy (`copy`, `pickle`) continues where it was if copies of
+        the environments inside do; with workers it starts from its seed.
 
     Raises:
-        ValueError: If no costs are reported, the actions are neither continuous and bounded nor
-            choices, the observations are no arrays and not to be flattened, the length of
-            episodes is not known, or an argument is none.
+        ValueError: If no costs are reported, actions are neither continuous and bounded nor
+            choices, observations are no arrays, or the length of episodes is not known.
 
     Examples:
         >>> env = from_gymnasium("Safexp-PointGoal1-v0", num_envs=2, num_steps=1000, seed=0)
@@ -109,7 +108,7 @@ def make_gymnasium(
         num_envs: Number of environments, N.
         device: Where the TensorDicts live.
         seed: Determines every row; rows of different seeds have nothing in common.
-        num_threads: Taken as by any family; Gymnasium's environments do not use it.
+        num_threads: Not used by these environments.
 
     Raises:
         ConfigError: For an unknown key or id, or an environment that the algorithms cannot use.

@@ -1,7 +1,6 @@
-"""Wrappers of single Gymnasium environments: their spaces as networks take them, costs in `info`.
+"""Wrappers of single Gymnasium environments: spaces as policies take them, costs in `info`.
 
-Observations become vectors and pictures, actions lie in [-1, 1] or are choices. Worker processes
-import this module, and it does not import torch: so they start within a second, and stay small.
+Worker processes import this module, and it does not import torch: they start within a second.
 """
 
 from __future__ import annotations
@@ -60,10 +59,10 @@ def adapt(
 
 
 class CheckedSteps(gymnasium.Wrapper):
-    """Checks what an environment of somebody's returns, and makes costs in `info` floats.
+    """Checks what an environment returns, and makes the costs in `info` floats.
 
-    Gymnasium puts the costs of a batch into an array of the type that the first row reports: beside
-    an integer 0 all costs would be rounded down, and NumPy's booleans would be no numbers at all.
+    Gymnasium puts the costs of a batch into an array of the type of the first row: if that is an
+    integer, the costs of all rows would be rounded.
 
     Args:
         env: The environment.
@@ -107,7 +106,7 @@ class CheckedSteps(gymnasium.Wrapper):
         return *values, {**info, **costs}
 
     def _watch(self, info: dict[str, Any]) -> None:
-        """Warn of a cost that has been in every `info`, and is in no more."""
+        """Warn of a cost that was in every `info` so far, and is missing now."""
         for key, steps in self._reported.items():
             if steps is None:
                 continue
@@ -124,7 +123,7 @@ class CheckedSteps(gymnasium.Wrapper):
 
 
 def _faults(step: tuple[Any, ...], space: gymnasium.Space) -> Iterator[str]:
-    """What breaks Gymnasium's rules in what a step has returned, to follow "it returned"."""
+    """What breaks Gymnasium's rules, in words that follow "it returned"."""
     observation, reward, *ends, info = step
     if isinstance(space, Box) and np.shape(observation) != space.shape:
         yield f"an observation of shape {np.shape(observation)}, where its space is {space.shape}"
@@ -168,7 +167,7 @@ class CostsOutside(gymnasium.Wrapper):
                 )
 
     def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
-        """Step, and look at what is observed then."""
+        """Step, and compare the observation with the ranges."""
         observation, reward, terminated, truncated, info = self.env.step(action)
         flat = np.asarray(gymnasium.spaces.flatten(self.env.observation_space, observation))
         costs = {
@@ -285,6 +284,6 @@ def plain_actions(actions: gymnasium.Space, whose: str) -> gymnasium.Space:
 
 
 def stretch(space: Box, action: np.ndarray) -> np.ndarray:
-    """Map actions from [-1, 1] to the bounds of a space; those beyond are cut."""
+    """Map actions from [-1, 1] to the bounds of a space; clip those beyond."""
     middle, half = space.high / 2 + space.low / 2, space.high / 2 - space.low / 2
     return np.clip(middle + half * action, space.low, space.high)

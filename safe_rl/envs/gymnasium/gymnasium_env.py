@@ -32,9 +32,9 @@ _MISSPELT = 0.85
 class CostReader(BaseInfoDictReader):
     """Reads costs from `info` into the TensorDict, float32 [N, 1]; 0 where none is reported.
 
-    Some environments report a cost only where it occurs. So a warning says, once, which name no
-    info has had for as long as an episode lasts, and which cost nobody counts because it was first
-    reported later; a name that is missing beside one that is nearly the same is an error.
+    Some environments report a cost only where it occurs. A warning names, once, a cost that no
+    `info` has had for `patience` steps, and a cost that is reported but not in `cost_keys`. A name
+    that is missing while `info` has nearly the same one is an error.
 
     Args:
         cost_keys: Names in `info`.
@@ -84,7 +84,6 @@ class CostReader(BaseInfoDictReader):
             ) from None
 
     def _look_at_names(self, info_dict: Mapping[str, Any]) -> None:
-        """Take note of the names that a step brings."""
         # names that begin so are Gymnasium's masks
         new = {name for name in info_dict if not name.startswith("_")} - self._names
         self._names |= new
@@ -111,12 +110,7 @@ class CostReader(BaseInfoDictReader):
 
 
 class CostsAsRewards(Transform):
-    """Puts costs beside the reward instead of among the observations, and adds their sum.
-
-    Args:
-        cost_keys: Costs that the environment writes; where `cost` is not one of them, it is added
-            as the sum of all.
-    """
+    """Moves costs from the observations to the rewards; adds `cost`, the sum, if it is missing."""
 
     def __init__(self, cost_keys: Sequence[str]) -> None:
         super().__init__()
@@ -135,12 +129,10 @@ class CostsAsRewards(Transform):
         return tensordict_reset.exclude(*self._cost_keys)
 
     def transform_output_spec(self, output_spec: Composite) -> Composite:
-        """Move the specs accordingly."""
+        """Move the specs of the costs."""
         output_spec = super().transform_output_spec(output_spec)
-        observations, rewards = (
-            output_spec["full_observation_spec"],
-            output_spec["full_reward_spec"],
-        )
+        rewards = output_spec["full_reward_spec"]
+        observations = output_spec["full_observation_spec"]
         for key in self._cost_keys:
             rewards[key] = observations[key]
             del observations[key]
@@ -178,19 +170,10 @@ class GymnasiumEnv(ConstrainedEnv, TransformedEnv):
         width: int = 480,
         height: int = 360,
     ) -> np.ndarray:
-        """Draw environments as they draw themselves, within a picture of the asked size.
-
-        Args:
-            rows: Which of them; None is all.
-            camera: "free"; others are arguments of the environment's own.
-            width: Of a frame [pixels].
-            height: Of a frame [pixels].
-
-        Returns:
-            RGB, uint8: one frame [height, width, 3] for an integer, else [R, height, width, 3].
+        """Draw environments as they draw themselves, resized; as `SimulatedEnv.render`.
 
         Raises:
-            ValueError: For another camera, or if the environments were made without pictures.
+            ValueError: For a camera other than "free", or if they were made without pictures.
         """
         if camera != "free":
             raise ValueError(
@@ -214,15 +197,10 @@ def from_vector(
     device: torch.device | str = "cpu",
     highest_costs: Mapping[str, float] | None = None,
 ) -> GymnasiumEnv:
-    """Make a TorchRL environment of a batch whose observations and actions suit networks.
+    """Make a TorchRL environment of N environments that are reset by a mask only.
 
-    Args:
-        worlds: N environments that are reset by a mask, and only then.
-        cost_keys: Names of the costs in `info`.
-        num_steps: The largest number of steps of an episode.
-        seed: Of all environments.
-        device: Where the TensorDicts live.
-        highest_costs: Cost key -> the most that a step can cost, where that is known.
+    Their observations and actions are as policies take them; the other arguments are those of
+    `from_gymnasium`.
     """
     base = GymWrapper(worlds, device=torch.device(device), categorical_action_encoding=True)
     reader = CostReader(cost_keys, [worlds.num_envs], highest_costs, patience=num_steps)

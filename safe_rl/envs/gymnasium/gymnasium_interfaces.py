@@ -174,7 +174,7 @@ class WorldVectorEnv(Worlds, VectorEnv[Any, np.ndarray, np.ndarray]):
 
         Args:
             seed: Determines the episodes of all worlds; or one for every world [N], which then has
-                those of `WorldEnv` with that seed, and None goes on as it was seeded.
+                those of `WorldEnv` with that seed. None keeps the present seeds.
             options: `reset_mask`, bool [N], restricts the reset to some worlds.
 
         Raises:
@@ -209,7 +209,7 @@ class WorldVectorEnv(Worlds, VectorEnv[Any, np.ndarray, np.ndarray]):
         if within:
             reported |= final_infos(observation, infos | self._positions(), begins)
         else:
-            # The step of a world that had already ended counts for nothing.
+            # the step of a world that had already ended does not count
             reward = np.where(begins, 0.0, reward)
             terminated, truncated = terminated & ~begins, truncated & ~begins
             self._ended = terminated | truncated

@@ -1,7 +1,4 @@
-"""Environments whose step returns six values, as Safety-Gymnasium's do: the cost stands by itself.
-
-They are made in this process, or in worker processes of the same Python.
-"""
+"""Environments whose step returns six values, as those of Safety-Gymnasium: the cost is one."""
 
 from __future__ import annotations
 
@@ -43,7 +40,7 @@ def make_safety_gymnasium(
         num_envs: Number of environments, N.
         device: Where the TensorDicts live.
         seed: Determines every row; rows of different seeds have nothing in common.
-        num_threads: Taken as by any family; these environments do not use it.
+        num_threads: Not used by these environments.
 
     Raises:
         ConfigError: For an unknown key or id, or if the package cannot be imported.
@@ -125,10 +122,10 @@ def from_six_values(
 
 
 class DeferredResets(VectorEnv):
-    """A batch that starts a new episode within the step that ends one, as if it waited.
+    """Makes a batch that starts new episodes within a step look as if it waited for a reset.
 
-    The observation of that step is the one that `info["final_observation"]` holds; the new one is
-    what the reset that is asked for afterwards returns.
+    A step that ends an episode returns the observation in `info["final_observation"]`; the next
+    reset returns the first observation of the episode that has begun already.
 
     Args:
         env: Its step returns six arrays.

@@ -1,7 +1,6 @@
-"""Environments of Gymnasium in several processes, each of which steps a share of them in line.
+"""Environments of Gymnasium in several processes, each of which steps several of them.
 
-Gymnasium's own `AsyncVectorEnv` has one process per environment, and every one of them would take
-the memory and the start of an interpreter.
+Gymnasium's `AsyncVectorEnv` needs one process, with an interpreter, per environment.
 """
 
 from __future__ import annotations
@@ -26,14 +25,15 @@ SECONDS_TO_END = 5.0
 class ProcessVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
     """N environments in W processes, with array observations; ended ones are reset by a mask.
 
-    A copy (`copy`, `pickle`) has processes of its own, and begins where its last seed does.
+    A copy (`copy`, `pickle`) has processes of its own, and starts from the last seed.
 
     Args:
         make: Makes one environment, in a process of its own.
         num_envs: N.
         workers: W, at most N.
-        info_keys: Numbers that are taken over from `info`; 0 in processes that have none. Others
-            are there by name only, and what no process has is not.
+        info_keys: Numbers that are copied from `info`; 0 for processes that report none. Of other
+            entries only the names are passed on.
+        seed: What the first reset is seeded with; None leaves that to the caller.
 
     Raises:
         RuntimeError: If an environment fails; the message is that of its process.
@@ -53,12 +53,12 @@ class ProcessVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         num_envs: int,
         workers: int,
         info_keys: Sequence[str],
+        seed: int | Sequence[int] | None = None,
     ) -> None:
         shares = [len(share) for share in np.array_split(np.arange(num_envs), workers)]
         self._bounds = np.cumsum(shares)[:-1]
         self._info_keys = list(info_keys)
-        self._make = make
-        self._seed: int | Sequence[int] | None = None
+        self._make, self._seed = make, seed
         self._workers: list[tuple[Any, Connection]] = []
         # Forked processes could inherit locks that a thread of torch's holds.
         context = get_context("spawn")
@@ -81,6 +81,8 @@ class ProcessVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         self._observation: np.ndarray = np.stack(
             [self.single_observation_space.sample()] * num_envs
         )
+        if seed is not None:
+            self.reset(seed=seed)
 
     def reset(
         self, *, seed: int | Sequence[int] | None = None, options: dict[str, Any] | None = None
@@ -138,11 +140,11 @@ class ProcessVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         self._workers = []
 
     def __reduce__(self) -> tuple[Any, ...]:
-        made_of = CloudpickleWrapper(self._make), self.num_envs, len(self._workers)
-        return _begun, (*made_of, self._info_keys, self._seed)
+        make, workers = CloudpickleWrapper(self._make), len(self._workers)
+        return ProcessVectorEnv, (make, self.num_envs, workers, self._info_keys, self._seed)
 
     def _send(self, worker: int, method: str, *args: Any, **kwargs: Any) -> None:
-        with suppress(BrokenPipeError):  # that it has died is told when its answer is missing
+        with suppress(BrokenPipeError):  # a dead process is reported when its answer is read
             self._workers[worker][1].send((method, args, kwargs))
 
     def _receive(self, workers: Sequence[int] | None = None) -> list[Any]:
@@ -162,31 +164,19 @@ class ProcessVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         return answers
 
 
-def _begun(
-    make: CloudpickleWrapper,
-    num_envs: int,
-    workers: int,
-    info_keys: Sequence[str],
-    seed: int | Sequence[int] | None,
-) -> ProcessVectorEnv:
-    envs = ProcessVectorEnv(make.fn, num_envs, workers, info_keys)
-    envs.reset(seed=seed)
-    return envs
-
-
 def _serve(connection: Connection, make: CloudpickleWrapper, number: int) -> None:
-    """Do what the other side asks of this process's environments, until it closes."""
+    """Step this process's environments as the parent asks, until it closes the connection."""
     leave_signals_to_parent()
     worlds: SyncVectorEnv | None = None
     try:
-        worlds = SyncVectorEnv([make.fn] * number, autoreset_mode=AutoresetMode.DISABLED)
+        worlds = SyncVectorEnv([make] * number, autoreset_mode=AutoresetMode.DISABLED)
         spaces = worlds.single_observation_space, worlds.single_action_space
         connection.send(((*spaces, worlds.envs[0].metadata, worlds.render_mode), None))
         while True:
             method, args, kwargs = connection.recv()
             connection.send((getattr(worlds, method)(*args, **kwargs), None))
     except (EOFError, ConnectionError):
-        pass  # the other side has closed, or is no more
+        pass  # the parent has closed the connection, or has ended
     except Exception:
         connection.send((None, traceback.format_exc()))
     finally:
