@@ -22,6 +22,7 @@ import statistics
 import tempfile
 from pathlib import Path
 
+import safe_rl  # isort: skip  # noqa: F401, before torch, for its settings of threads
 import torch
 from omegaconf import OmegaConf
 from train_throughput import new_env

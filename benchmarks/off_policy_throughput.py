@@ -18,6 +18,7 @@ import time
 from collections.abc import Callable
 from itertools import pairwise
 
+import safe_rl  # isort: skip  # noqa: F401, before torch, for its settings of threads
 import torch
 from tensordict import TensorDict
 from torch import Tensor, nn

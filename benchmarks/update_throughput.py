@@ -16,6 +16,7 @@ import statistics
 import time
 from collections.abc import Callable
 
+import safe_rl  # isort: skip  # noqa: F401, before torch, for its settings of threads
 import torch
 from tensordict import TensorDict
 

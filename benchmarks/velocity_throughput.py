@@ -15,6 +15,7 @@ import itertools
 import statistics
 import time
 
+import safe_rl  # isort: skip  # noqa: F401, before torch, for its settings of threads
 import gymnasium
 import torch
 
