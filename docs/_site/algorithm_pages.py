@@ -30,16 +30,14 @@ def settings(algo: str) -> str:
 
 
 def columns(names: str) -> str:
-    """Rows of tables of index.md and off_policy.md, named by `<!-- table: columns of … -->`."""
-    pages = ("algorithms/index.md", "off_policy.md")
-    text = "".join((DOCS / page).read_text() for page in pages)
+    """Rows of the tables of columns.md, named by `<!-- table: columns of … -->`."""
+    text = (DOCS / "algorithms" / "columns.md").read_text() + "\n"
     tables = [
         re.search(rf"<!-- table: columns of {name} -->\n(.*?)\n\n", text, re.DOTALL)[1]  # type: ignore[index]
         for name in names.split()
     ]
     rows = [row for table in tables for row in table.splitlines()[2:]]
-    made = "\n".join(["| column | meaning |", "|---|---|", *rows])
-    return made.replace("(#", "(index.md#").replace("(algorithms/", "(")
+    return "\n".join(["| column | meaning |", "|---|---|", *rows])
 
 
 def loop(told: str) -> str:

@@ -258,7 +258,7 @@ def _suite_row(name: str) -> Sequence[str]:
     size = max(columns.stop for columns in env.observation_layout.values())
     kinds = [key for key in env.cost_keys if key not in ("cost", EXCEPTION_KEY)]
     objects = {e.kind: e.count(config) for e in ELEMENTS}
-    there = [f"{count} {kind}" for kind, count in objects.items() if count]
+    there = [f"{n} {kind if n > 1 else kind.removesuffix('s')}" for kind, n in objects.items() if n]
     return (
         f"`{name}`", str(size), str(env.action_spec.shape[-1]),
         ", ".join(f"`{kind}`" for kind in kinds) or "none", ", ".join(there),

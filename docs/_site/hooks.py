@@ -28,7 +28,8 @@ def on_config(config: MkDocsConfig) -> None:
 
 def on_files(files: Files, config: MkDocsConfig) -> None:
     """Add the pages that are made, and those of files that pages link to."""
-    made = api.pages() | {page: (ROOT / source).read_text() for page, source in links.PAGES.items()}
+    shown = {page: links.read_page(ROOT / source) for page, source in links.PAGES.items()}
+    made = api.pages() | shown
     drawn = {f"algorithms/{algo}.png": picture for algo, picture in curves.pictures().items()}
     for uri, content in (made | drawn | {"report.html": campaigns.report()}).items():
         files.append(File.generated(config, uri, content=content))

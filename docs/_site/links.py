@@ -6,17 +6,19 @@ that has gone makes the strict build fail.
 
 from __future__ import annotations
 
+import json
 import os
 import re
 from collections.abc import Mapping
 from pathlib import Path, PurePosixPath
 
-# page of the site -> Markdown elsewhere in the repository that is shown as it stands
+# page of the site -> Markdown, or a notebook, elsewhere in the repository that it shows
 PAGES = {
     "benchmarks.md": "benchmarks/README.md",
     "campaigns.md": "results/README.md",
     "changelog.md": "CHANGELOG.md",
     "contributing.md": "CONTRIBUTING.md",
+    "first_steps.md": "examples/first_steps.ipynb",
 }
 _LINK = re.compile(r"(?<=\]\()(?!\w+:|#|/)(?P<path>[^)\s#]+)(?P<rest>#[^)\s]*)?(?=\))")
 _LANGUAGES = {".py": "python", ".yaml": "yaml", ".sh": "bash", ".toml": "toml"}
@@ -97,3 +99,14 @@ def _page_of(path: str) -> str:
 def _shown(file: Path, path: str) -> str:
     language = _LANGUAGES.get(file.suffix, "text")
     return f"# {path}\n\n````{language}\n{file.read_text()}\n````\n"
+
+
+def read_page(file: Path) -> str:
+    """The Markdown of a file in `PAGES`; of a notebook its text, and its code in blocks."""
+    if file.suffix != ".ipynb":
+        return file.read_text()
+    cells = json.loads(file.read_text())["cells"]
+    texts = [("".join(cell["source"]), cell["cell_type"]) for cell in cells]
+    return "\n\n".join(
+        f"```python\n{text}\n```" if kind == "code" else text for text, kind in texts
+    )

@@ -114,7 +114,7 @@ class MinibatchUpdate(PolicyUpdate):
         max_grad_norm: Norm to which the gradient is clipped, or None.
         adapt_rate: Sets the learning rate of the next call by the steps and the KL of this one, or
             None for a constant rate; needs ``max_kl``.
-        compile: Whether to compile the loss and its gradient with :func:`torch.compile`.
+        compile: Whether to compile the loss and its gradient with torch.compile.
 
     Raises:
         ValueError: If ``num_passes`` or ``minibatch_size`` is below 1, or ``adapt_rate`` comes

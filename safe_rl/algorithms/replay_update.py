@@ -35,7 +35,7 @@ class ReplayUpdate:
         rates: Learning rates of parameters whose names begin with a key, such as ``log_alpha``;
             others have the optimiser's.
         max_grad_norm: Norm to which the gradient is clipped, or None.
-        compile: Whether to compile the losses with :func:`torch.compile`.
+        compile: Whether to compile the losses with torch.compile.
 
     Raises:
         ValueError: If a key of ``rates`` is the beginning of no parameter's name, or the loss has

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -18,6 +19,15 @@ from safe_rl.runs.outcome import final_width, judges_another_measure
 __all__ = ["draw_learning_curves", "moving_mean", "point_marker"]
 
 _TO_LEGEND = -0.45  # from a panel to its legend, past ticks and the label [inch]
+
+
+class NotebookFigure(Figure):
+    """A figure that notebooks show, also where pyplot was never imported."""
+
+    def _repr_png_(self) -> bytes:
+        picture = io.BytesIO()
+        self.savefig(picture, format="png")
+        return picture.getvalue()
 
 
 def draw_learning_curves(
@@ -68,7 +78,7 @@ def learning_curves(
     """
     multipliers = {key: f"multiplier_{key}" for key in cost_limits if f"multiplier_{key}" in table}
     layout = ConstrainedLayoutEngine(h_pad=0.1)  # inch; it ends a pixel or two beside its aim
-    figure = Figure(figsize=(16 if multipliers else 12, 3.7), layout=layout)
+    figure = NotebookFigure(figsize=(16 if multipliers else 12, 3.7), layout=layout)
     returns, costs, rates, *more = figure.subplots(1, 4 if multipliers else 3)
     steps = np.asarray(table["steps"], dtype=float)
     _draw(returns, steps, table["episode_return"], "C0", "return")

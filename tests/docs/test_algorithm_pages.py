@@ -11,7 +11,7 @@ from made import ALGORITHMS, made, page_of
 def test_a_page_begins_with_what_it_is_for_and_a_command(algo):
     page = page_of(algo)
     places = [page.find(f"\n{words}") for words in ("**What it is for.**", "**When to use it.**")]
-    places.append(page.find(f"```\npython train.py env=PointGoal1 algo={algo}"))
+    places.append(page.find(f"\npython train.py env=PointGoal1 algo={algo}"))
     places.append(page.find("\n$$"))
     assert places == sorted(places)
     assert places[0] > 0

@@ -47,15 +47,18 @@ def command(page, *words):
     return shlex.split(found[0], comments=True)[1:]
 
 
-def carry_out(words, place, *, seeds=False):
-    """Run a command of a page, a training as a tiny one; of a sweep over seeds two in a row."""
+def carry_out(words, place, *, seeds=False, fresh=False):
+    """Run a command of a page, a training as a tiny one; of a sweep over seeds two in a row.
+
+    A fresh one has the folder that it gets without being told.
+    """
     if words[0] == "train.py":
         given = {w.partition("=")[0] for w in words if "=" in w}
         tiny = [w for w in TINY if not w.startswith("env.") or "env=corridor" not in words]
         kept = [w for w in words if not w.startswith(("frames=", "cost_limits="))]
         limits = [re.sub(r"\d+", "1000", w) for w in words if w.startswith("cost_limits")]
         words = [*kept, *tiny, *(limits or ["cost_limits={cost: 1000}"])]
-        if not {"hydra.run.dir", "-m"} & {*given, *words}:
+        if not fresh and not {"hydra.run.dir", "-m"} & {*given, *words}:
             words.append("hydra.run.dir=runs/one")
     if seeds:
         words = [w.replace("seed=0,10,20", "seed=0,10") for w in words] + ["hydra/launcher=basic"]
@@ -112,3 +115,12 @@ def test_from_an_environment_and_an_algorithm_of_ones_own_to_the_table(place):
 def test_a_simulator_of_ones_own_is_trained_on(place):
     carry_out(command("guides/environment.md", "env=corridor"), place)
     assert (place / "runs/one/progress.csv").is_file()
+
+
+def test_from_nothing_to_a_dataset_and_to_policies_that_learn_from_it_alone(place):
+    page = "off_policy.md"
+    carry_out(command(page, "train.py", "runs/expert"), place)
+    recorded = command(page, "safe_rl.evaluate", "record=true")
+    carry_out([word.replace("episodes=200", "episodes=40") for word in recorded], place)
+    for words in (("algo=bc",), ("algo=sac_lagrangian", "dataset.alone=true")):
+        assert "Learning from" in carry_out(command(page, *words), place, fresh=True)
