@@ -26,6 +26,7 @@ def sentences(page):
 
 SEEDS = r"^\| (\w+) \| `(\w+)` \| (\d+(?:\W\d+)?) \| (.+) \|$"
 HELD_OUT = re.findall(SEEDS, PAGE, re.MULTILINE)
+ENVIRONMENTS = ("PointGoal1", "CarGoal1")
 OFF_POLICY_ONES = ("cal", "sac_lagrangian", "td3_lagrangian")
 
 
@@ -116,7 +117,7 @@ def test_the_table_of_three_million_steps_is_that_of_the_archive(env, algo, seed
 @pytest.mark.parametrize("algo", OFF_POLICY_ONES)
 def test_the_limit_from_200_000_steps_on(algo):
     cells = []
-    for env in ("PointGoal1", "CarGoal1"):
+    for env in ENVIRONMENTS:
         runs = seeds_of(RESULTS / "algorithms" / env / algo)
         cost, above = np.mean([held(run, 200_000) for run in runs], axis=0)
         cells.append(f"{cost:.1f}, {percent(above)}")
@@ -127,7 +128,7 @@ def test_the_limit_from_200_000_steps_on(algo):
 def test_a_million_steps_with_a_replay_buffer(algo):
     ends = [
         means(seeds_of(RESULTS / "algorithms" / env / algo), 0.25)
-        for env in ("PointGoal1", "CarGoal1")
+        for env in ENVIRONMENTS
     ]
     assert f"| `{algo}` | {' | '.join(ends)} |\n" in OFF_POLICY
 
@@ -225,7 +226,7 @@ def test_what_is_said_of_pushing():
 
 @pytest.mark.parametrize("name", ["equal_seconds", "equal_steps"])
 def test_worlds_and_batches(name):
-    """Every cell that the page has, from the epochs of the archive; and it has all of them."""
+    """Every cell that the page has, from the epochs of the archive; and all of two environments."""
     page = (ROOT / "docs" / "algorithms" / "limits_measured.md").read_text()
     table = page.partition(f"<!-- table: {name} -->\n")[2].partition("\n\n")[0].splitlines()[2:]
     with gzip.open(RESULTS / "worlds" / f"{name}.csv.gz", "rt") as file:
@@ -253,7 +254,8 @@ def test_worlds_and_batches(name):
                 ends.append("{:.1f} / {:.0f}".format(*np.nanmean(late[:, 1:], axis=0)))
             assert cell.strip() == "; ".join(ends)
             told += len(ends)
-    assert told == len({(r["env"], r["num_envs"], r["frames_per_batch"], r["seed"]) for r in rows})
+    keys = ("env", "num_envs", "frames_per_batch", "seed")
+    assert told == len({tuple(r[k] for k in keys) for r in rows if r["env"] in ENVIRONMENTS})
 
 
 def test_what_each_part_contributes():
