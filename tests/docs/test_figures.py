@@ -126,10 +126,7 @@ def test_the_limit_from_200_000_steps_on(algo):
 
 @pytest.mark.parametrize("algo", [*OFF_POLICY_ONES, "sac", "td3", "wcsac"])
 def test_a_million_steps_with_a_replay_buffer(algo):
-    ends = [
-        means(seeds_of(RESULTS / "algorithms" / env / algo), 0.25)
-        for env in ENVIRONMENTS
-    ]
+    ends = [means(seeds_of(RESULTS / "algorithms" / env / algo), 0.25) for env in ENVIRONMENTS]
     assert f"| `{algo}` | {' | '.join(ends)} |\n" in OFF_POLICY
 
 
