@@ -1,7 +1,6 @@
 """Environments of every family, the contract they fulfil, and their names.
 
-Safety Gym's configurations, the benchmark suite and the batched environment stand in `safety_gym`.
-Names and keys are there at once; what builds environments is imported when it is asked for.
+Names and keys are imported at once, what builds environments when it is used first.
 """
 
 from typing import TYPE_CHECKING

@@ -1,6 +1,6 @@
-"""What a batch of constrained environments has to be for everything else to work with it.
+"""The contract of a batch of constrained environments.
 
-Training, evaluation and the command line know nothing else about an environment.
+Training, evaluation and the command line use nothing else of an environment.
 """
 
 from __future__ import annotations
@@ -83,7 +83,7 @@ class ConstrainedEnv(EnvBase):
         return highest * float(self.max_episode_steps) if is_bounded else math.inf
 
     def continue_from(self, steps: int) -> None:
-        """Go on with schedules after so many steps of every row."""
+        """Continue schedules after so many steps of every row."""
         self.steps_before = steps
 
 

@@ -1,8 +1,8 @@
 """Adding to the vocabulary from outside the package: elements, tasks, costs, observations, robots.
 
-Each function puts one row into the table that the built-in ones stand in, and its configuration
-keys beside the built-in keys, with the same validation. Registering a name again replaces the row,
-so that a notebook cell can run twice; environments made before keep what they were made with.
+Each function adds one row to the table of the built-in ones, and its configuration keys to the
+built-in keys, with the same checks. Registering a name again replaces the row, so that a notebook
+cell can run twice; environments that exist already do not change.
 """
 
 from __future__ import annotations
@@ -80,8 +80,8 @@ def register_element(element: Element, keys: Mapping[str, Any] | None = None) ->
 
     Args:
         element: The row.
-        keys: Further keys with their defaults, and other defaults of the keys above. A default that
-            does not tell its type (None, an empty tuple) is given as `Key(default, annotation)`.
+        keys: Further keys with their defaults, and other defaults of the keys above. A default of
+            no clear type (None, an empty tuple) is given as `Key(default, annotation)`.
 
     Raises:
         ConfigError: If the kind, its label or a key is taken, or a default cannot be used.

@@ -1,8 +1,7 @@
 """OpenGL, which only pictures need: it is chosen and loaded when the first one is drawn.
 
-MuJoCo loads its OpenGL backend as soon as it is imported, the one that MUJOCO_GL names, and fails
-to import where the libraries of that backend are missing. Importing this module imports MuJoCo in
-any case.
+MuJoCo loads the OpenGL backend that MUJOCO_GL names when it is imported, and fails where its
+libraries are missing. Importing this module imports MuJoCo in any case.
 """
 
 from __future__ import annotations
@@ -64,7 +63,7 @@ def open_renderer(model: mujoco.MjModel, width: int, height: int) -> mujoco.Rend
 
 
 def load_backend() -> None:
-    """Choose and load MuJoCo's OpenGL backend, for those who open their contexts themselves."""
+    """Choose and load MuJoCo's OpenGL backend, for code that opens its own contexts."""
     if not os.environ.get("MUJOCO_GL") and not has_screen():
         os.environ["MUJOCO_GL"] = "egl"
     elif hasattr(gl_context, "GLContext"):
@@ -83,4 +82,4 @@ def _advice(error: Exception) -> str:
     )
     if name == "glfw":
         return f"{message}; without a screen, set MUJOCO_GL=egl."
-    return f"{message}, then start Python anew."
+    return f"{message}, then restart Python."

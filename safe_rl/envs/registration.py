@@ -68,7 +68,7 @@ class EnvironmentsSource(ConfigSource):
 
 
 class EnvironmentsSearchPath(SearchPathPlugin):
-    """Puts the source behind folders of files, which so can hold an environment of a known name."""
+    """Adds the source after folders of files: a file is found before an environment of its name."""
 
     def manipulate_search_path(self, search_path: ConfigSearchPath) -> None:
         """Add the source."""

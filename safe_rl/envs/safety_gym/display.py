@@ -122,7 +122,7 @@ class Viewer:
             self._window = mujoco.viewer.launch_passive(
                 display.scene.model, display.data, show_left_ui=False, show_right_ui=False
             )
-        except Exception as error:  # GLFW raises what it likes
+        except Exception as error:  # GLFW raises errors of any type
             raise OpenGLError(
                 f"MuJoCo's viewer cannot be opened ({error}). It needs OpenGL: on Debian or "
                 f"Ubuntu 'apt-get install {PACKAGES['glfw']}'."

@@ -4,8 +4,8 @@ A robot file describes a body named "robot" at the top level of its world, which
 is placed by its root joint: a free joint, or slides along x and y and a hinge about z. Its geom
 defaults hold for the whole world. An actuator without a `ctrlrange` gets [-1, 1].
 
-A file is read before MuJoCo sees it, because somebody else's file must not stop the process: what
-would take MuJoCo hours or all memory is refused from its text.
+A file is read before MuJoCo loads it: one that would take hours or all memory is refused, as it may
+come from somebody else.
 """
 
 from __future__ import annotations
@@ -60,14 +60,13 @@ def _refused(path: Path, what: str) -> ConfigError:
 
 
 def _weigh(path: Path, home: Path, folders: dict[str, Path], found: dict[Path, int]) -> float:
-    """Number of elements of a file with its copies; notes the files that it names.
+    """Number of elements of a file with its copies; adds the files that it names to `found`.
 
     Args:
         path: the file.
-        home: folder of the robot's own file, from which all paths go.
-        folders: where MuJoCo looks for textures, and for meshes and the like; what is included
-            finds its files where those that include it do.
-        found: the files, in which those of this one are noted.
+        home: folder of the robot's own file, to which all paths are relative.
+        folders: where MuJoCo looks for textures and meshes, also for included files.
+        found: the files so far.
     """
     if path in found:
         return 0
@@ -108,7 +107,7 @@ def _files(element: ElementTree.Element, home: Path, folders: Mapping[str, Path]
 
 
 def _number(text: str) -> float:
-    """An attribute as a number; what is none is left to MuJoCo to complain about."""
+    """An attribute as a number; 1 for what is none, which MuJoCo refuses itself."""
     try:
         number = float(text)
     except ValueError:
@@ -188,7 +187,7 @@ def _lacks(path: Path, what: str) -> ConfigError:
 
 
 def _check_numbers(model: mujoco.MjModel, path: Path) -> None:
-    """Refuse numbers that no simulation gets along with, and that MuJoCo takes."""
+    """Refuse numbers that MuJoCo accepts but cannot simulate."""
     if not 0.0 < model.opt.timestep < np.inf:
         raise _lacks(path, f"has the timestep {model.opt.timestep}: it must be greater than 0.")
     for name in (name for name in dir(model) if name.startswith(_OF_THE_ROBOT)):
@@ -274,7 +273,7 @@ def own_robot(keys: Mapping[str, Any]) -> Path | None:
 
 
 def copy_robot(path: Path, folder: Path) -> Path:
-    """Copy a robot's file and all files that it names; they stay where they are to each other.
+    """Copy a robot's file and all files that it names, with their relative paths.
 
     Args:
         path: its MJCF file.

@@ -28,12 +28,11 @@ def _parameters(function: Callable[..., Any]) -> set[str]:
 class ActionFilter(ConstraintTransform):
     """A function replaces unsafe actions, and every step at which it does costs 1.
 
-    A safety layer (Dalal et al. 2018, "Safe Exploration in Continuous Action Spaces"),
-    shield or projection, "action replacement" and "action projection" of Krasowski et al. 2023,
-    "Provably Safe Reinforcement Learning". What the algorithm learns from is the action that its
-    policy chose, of which it knows the probability; the environment takes the replaced one. The
-    cost can be limited: cost_limits='{cost: 25, cost_interventions: 10}'. It is on in evaluation
-    too.
+    A safety layer (Dalal et al. 2018, "Safe Exploration in Continuous Action Spaces"), shield or
+    projection ("action replacement" and "action projection" of Krasowski et al. 2023, "Provably
+    Safe Reinforcement Learning"), also in evaluation. The algorithm learns from the action that its
+    policy chose; the environment takes the replaced one. The cost can be limited:
+    cost_limits='{cost: 25, cost_interventions: 10}'.
 
     Args:
         filter: Function that replaces actions: gets a TensorDict [N] with `observation` and
@@ -113,9 +112,8 @@ class ActionFilter(ConstraintTransform):
 class ActionDelay(ConstraintTransform):
     """The environment takes the action of some steps before.
 
-    The first steps of an episode have the action nearest to 0, or the first choice. What is
-    pending is not observed, so a policy with a memory has the advantage. It is on in evaluation
-    too.
+    The first steps of an episode take the action nearest to 0, or the first choice. Pending actions
+    are not observed, so recurrent policies have an advantage. It is on in evaluation too.
 
     Args:
         steps: Steps from an action to its effect.
@@ -141,7 +139,7 @@ class ActionDelay(ConstraintTransform):
         self._pending: Tensor | None = None
 
     def start(self, done: Tensor) -> dict[str, Tensor]:
-        """Return that nothing is to be done."""
+        """Return as many actions that do nothing."""
         spec = self.container.action_spec
         nothing = spec.zero()
         if isinstance(spec, OneHot):

@@ -21,11 +21,11 @@ OWN_REWARD = "task_reward"
 class ConstraintTransform(Transform):
     """Base of transforms that keep the environment's contract and are saved in snapshots.
 
-    What it remembers of every row's episode stands in one dictionary of tensors [..., m]: `start`
-    says what that is when an episode begins, `_step` of a subclass moves it.
+    A subclass keeps what it needs of every row's episode in `_rows`, tensors [..., m] by name:
+    `start` returns their values at the start of an episode, and its `_step` updates them.
 
     Attributes:
-        evaluating: whether the problem is the one to be solved, not the one to learn on.
+        evaluating: whether policies are evaluated; changes that only help learning are then off.
         added_costs: names of costs that it writes beside the environment's.
         return_key: where it leaves the reward that returns are made of, if it changes the reward.
 
@@ -47,19 +47,19 @@ class ConstraintTransform(Transform):
         """Seed all later draws by a key per row, int64 [N]; used from the next reset on."""
 
     def start(self, done: Tensor) -> dict[str, Tensor]:
-        """Return what is remembered of episodes that begin, for all rows of `done` [..., 1]."""
+        """Return `_rows` at the start of an episode, for all rows of `done` [..., 1]."""
         return {}
 
     def rows(self) -> dict[str, Tensor]:
-        """Return a copy of what is remembered, [..., m] each."""
+        """Return a copy of `_rows`, for a snapshot."""
         return {name: value.clone() for name, value in self._rows.items()}
 
     def put_rows(self, rows: Mapping[str, Tensor]) -> None:
-        """Go on from what `rows` returned."""
+        """Continue from what `rows` returned."""
         self._rows = {name: value.clone() for name, value in rows.items()}
 
     def continue_from(self, steps: int) -> None:
-        """Take note that every row has made that many steps in a part of the run before."""
+        """Continue schedules after so many steps of every row in earlier parts of the run."""
 
     def check(self, cost_keys: Collection[str]) -> None:
         """Raise ValueError if it needs a cost that is not among these."""
@@ -86,14 +86,10 @@ class ConstraintTransform(Transform):
 
 
 def check_budgets(budgets: Mapping[str, float], *, above_zero: bool) -> dict[str, float]:
-    """Return budgets as a plain dictionary.
-
-    Args:
-        budgets: cost key -> cost per episode.
-        above_zero: whether 0 is too little.
+    """Return budgets, cost key -> cost per episode, as a plain dictionary.
 
     Raises:
-        ValueError: if there is none, or one is no number of the range.
+        ValueError: if there is none, or one is not finite, negative or, with `above_zero`, 0.
     """
     checked = {key: float(budget) for key, budget in budgets.items()}
     if not checked:
@@ -116,10 +112,10 @@ def check_known(budgets: Collection[str], cost_keys: Collection[str]) -> None:
 
 
 def costs_of(step: TensorDictBase, keys: Collection[str]) -> Tensor:
-    """Return costs of a step side by side as float64, [..., k].
+    """Return costs of a step as float64 [..., k].
 
     Raises:
-        ValueError: for a cost that there is not, where no contract has been checked before.
+        ValueError: for a missing cost, where no contract has been checked before.
     """
     costs = [step.get(key, None) for key in keys]
     lacking = [key_name(key) for key, cost in zip(keys, costs, strict=True) if cost is None]
@@ -130,24 +126,20 @@ def costs_of(step: TensorDictBase, keys: Collection[str]) -> Tensor:
 
 
 def keep_reward(step: TensorDictBase, key: str) -> Tensor:
-    """Leave the environment's own reward in `key`, where no other transform has, before a change.
-
-    Returns:
-        The reward as it is so far.
-    """
+    """Keep the environment's own reward in `key`, if no other transform has; return the reward."""
     reward = step.get("reward")
     step.set(key, step.get(key, reward))
     return reward
 
 
 def kept_reward_spec(spec: Composite, key: str) -> Composite:
-    """Say that the reward, and the own one in `key`, may be any number."""
+    """Add the environment's own reward `key` to the spec; both rewards are unbounded."""
     for name in (key, "reward"):
         spec[name] = reward_like(spec)
     return spec
 
 
 def reward_like(spec: Composite) -> TensorSpec:
-    """Return the spec of any number for each reward."""
+    """Return the spec of one unbounded number per reward."""
     reward = spec["reward"]
     return Unbounded(shape=reward.shape, dtype=reward.dtype, device=reward.device)

@@ -1,4 +1,4 @@
-"""An environment with transforms that keeps the contract of an environment without."""
+"""An environment with transforms, which fulfils the contract as the environment inside does."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ _STATE = "transforms"
 
 
 class TransformedConstrainedEnv(ConstrainedEnv, TransformedEnv):
-    """N environments and what changes them from outside, made by `transform_env`.
+    """N environments with transforms, made by `transform_env`.
 
     Args:
-        base_env: keeps the contract `ConstrainedEnv`.
+        base_env: fulfils the contract `ConstrainedEnv`.
         transforms: name -> transform, any of TorchRL's; the first is the innermost.
-        seed: of what transforms draw; the environment has its own. None: of torch's generator.
+        seed: of what transforms draw; the environment has its own. None takes torch's generator.
 
     Attributes:
         cost_keys: the environment's, then those of the transforms.
@@ -121,7 +121,7 @@ class TransformedConstrainedEnv(ConstrainedEnv, TransformedEnv):
         return state
 
     def set_state(self, state: TensorDictBase) -> TensorDictBase:
-        """Put the worlds into a state; what it does not say of transforms begins anew.
+        """Put the worlds into a state; transforms that are not in it start an episode.
 
         Returns:
             What a reset returns, for that state.
@@ -147,17 +147,16 @@ def transform_env(
     evaluating: bool,
     seed: int | None = None,
 ) -> TransformedConstrainedEnv:
-    """Change a constrained problem from outside.
+    """Apply transforms to a constrained environment.
 
-    What transforms remember that are no `ConstraintTransform` cannot be stored: with one, worlds
-    cannot either.
+    The environment can be saved (`get_state`) if all of them are a `ConstraintTransform`.
 
     Args:
-        env: keeps the contract `ConstrainedEnv`.
+        env: fulfils the contract `ConstrainedEnv`.
         transforms: name -> transform, or node of a configuration with its `_target_`; the first is
-            the innermost: it sees the environment's costs, and the actions last.
-        evaluating: whether the problem is the one to be solved, not the one to learn on: rewards
-            are the environment's, and episodes as long.
+            the innermost: it sees the environment's own costs, and actions last.
+        evaluating: whether policies are evaluated: rewards and lengths of episodes are then the
+            environment's own.
         seed: of what transforms draw; None takes it from torch's generator.
 
     Raises:

@@ -1,4 +1,4 @@
-"""Transforms of observations: noise of sensors, and what a policy remembers."""
+"""Transforms of observations: noise of sensors, and the memory of recurrent policies."""
 
 from __future__ import annotations
 
@@ -18,11 +18,10 @@ from safe_rl.ranges import NotNegative, Range, Text
 
 
 class SensorNoise(ConstraintTransform):
-    """Add normally distributed noise to what is observed, anew at every step.
+    """Add normally distributed noise to observations, also in evaluation.
 
-    Every draw is addressed by its row's seed, the episode, the step and the column, so that runs
-    resume to the last digit and rows do not depend on one another. It is on in evaluation too.
-    Pictures of integers stay as they are.
+    Every draw depends on its row's seed, the episode, the step and the column only, so that resumed
+    runs are identical and rows independent. Pictures of integers are not changed.
 
     Args:
         std: Standard deviation of the noise, in the units of what is observed.
@@ -57,12 +56,12 @@ class SensorNoise(ConstraintTransform):
         self._seeds = seeds
 
     def put_rows(self, rows: Mapping[str, Tensor]) -> None:
-        """Go on from what `rows` returned: with its keys, whatever was seeded before."""
+        """Continue from what `rows` returned, with its random keys."""
         super().put_rows(rows)
         self._seeds = None
 
     def extend_layout(self, layout: Mapping[str, slice]) -> dict[str, slice]:
-        """Take note of the columns.
+        """Keep the columns of components.
 
         Raises:
             ValueError: if a component is not among them.
@@ -77,7 +76,7 @@ class SensorNoise(ConstraintTransform):
         return dict(layout)
 
     def start(self, done: Tensor) -> dict[str, Tensor]:
-        """Return random keys of the episodes, and that no step was taken."""
+        """Return random keys of the episodes, and the number of steps, 0."""
         key = self._rows.get("key")
         if self._seeds is not None:
             key, self._seeds = self._seeds.reshape(done.shape).to(done.device), None
@@ -121,7 +120,7 @@ class SensorNoise(ConstraintTransform):
         return flat.index_add(-1, columns, noise.to(flat.dtype)).reshape(value.shape)
 
     def transform_observation_spec(self, observation_spec: TensorSpec) -> TensorSpec:
-        """Say that there are no bounds."""
+        """Remove the bounds."""
         observed = observation_spec["observation"]
         if not isinstance(observed, Composite):
             observation_spec["observation"] = _unbounded(observed)
@@ -144,12 +143,12 @@ MEMORY, FIRST = "memory", "is_init"
 class PolicyMemory(ConstraintTransform):
     """Carry what a policy leaves under ``("next", "memory")`` to its next step as ``memory``.
 
-    It is 0 when an episode begins, and `is_init` says so. This is TorchRL's `TensorDictPrimer` and
-    `InitTracker` in one that snapshots and resumed runs know of: a policy keeps remembering where
-    the worlds go on. A policy that leaves nothing remembers what it did before.
+    It is 0 at the start of an episode, which `is_init` marks. Like TorchRL's `TensorDictPrimer` and
+    `InitTracker`, but part of snapshots and resumed runs. A policy that leaves nothing keeps what
+    it had.
 
     Args:
-        size: Numbers that are remembered.
+        size: Numbers per row.
 
     Examples:
         >>> from torchrl.envs import TransformedEnv
@@ -165,7 +164,7 @@ class PolicyMemory(ConstraintTransform):
         self._size = size
 
     def start(self, done: Tensor) -> dict[str, Tensor]:
-        """Return no memories."""
+        """Return zeros, and that an episode starts."""
         nothing = torch.zeros(*done.shape[:-1], self._size, device=done.device)
         return {MEMORY: nothing, FIRST: torch.ones_like(done)}
 
@@ -178,7 +177,7 @@ class PolicyMemory(ConstraintTransform):
         return next_tensordict.update(self._rows)
 
     def transform_observation_spec(self, observation_spec: TensorSpec) -> TensorSpec:
-        """Add what is remembered, and whether an episode begins."""
+        """Add the memory, and whether an episode starts."""
         batch, device = observation_spec.shape, observation_spec.device
         observation_spec[MEMORY] = Unbounded(shape=(*batch, self._size), device=device)
         observation_spec[FIRST] = Binary(1, shape=(*batch, 1), dtype=torch.bool, device=device)

@@ -26,10 +26,10 @@ from safe_rl.ranges import Count, Fraction, NotNegative, Number, Positive
 class RewardScale(ConstraintTransform):
     """Multiply the rewards that are learned from by a number.
 
-    Critics begin with values near 0 and go by steps of a learning rate. Towards values of hundreds
-    all weights move one way until the hidden layers are saturated and tell states apart no more:
-    discounted returns should be of the order of 1 to 10. Returns stay those of the environment's
-    own reward, which is kept in `task_reward`; in evaluation `reward` stays as it is.
+    If discounted returns are in the hundreds, the hidden layers of critics saturate on the way to
+    such values and no longer distinguish states: they should be about 1 to 10. Logged returns are
+    those of the environment's own reward, which is kept in `task_reward`; evaluation changes
+    nothing.
 
     Args:
         factor: What rewards are multiplied by.
@@ -65,18 +65,16 @@ class RewardScale(ConstraintTransform):
 
 
 class EarlyTermination(ConstraintTransform):
-    """The episode terminates with the step at which it has cost more than it may.
+    """The episode terminates with the step at which it has cost more than its budget.
 
-    So no reward is to be had beyond the budget, and an algorithm without constraints keeps it: the
+    There is no reward beyond the budget, so an algorithm without constraints learns to keep it: the
     early terminated MDP of Sun et al. 2021, "Safe Exploration by Solving Early Terminated MDP".
-    How much is left is not observed; with `saute` before it, it is. Episodes of an
-    evaluation go on, as in the paper: there the cost of the whole episode counts. With
-    `in_evaluation` they end, too: then what is evaluated is the policy with its switch, which
-    surely costs no more than the budget and the last step.
+    What is left of the budget is observed only with `saute` before it. In evaluation episodes
+    continue, as in the paper, so that the cost of the whole episode counts. With `in_evaluation`
+    they end there too: no episode then costs more than the budget and one step.
 
     Args:
-        budgets: Cost key -> undiscounted cost per episode; an episode that costs exactly this much
-            goes on.
+        budgets: Cost key -> undiscounted cost per episode; one that costs exactly this continues.
         in_evaluation: Whether episodes of an evaluation end in the same way.
 
     Raises:
@@ -105,7 +103,7 @@ class EarlyTermination(ConstraintTransform):
         return min(highest, self._budgets[key] + of_a_step) if ends else highest
 
     def start(self, done: Tensor) -> dict[str, Tensor]:
-        """Return that nothing is spent."""
+        """Return what is spent: nothing."""
         shape = (*done.shape[:-1], len(self._budgets))
         return {"spent": torch.zeros(shape, dtype=torch.float64, device=done.device)}
 
@@ -117,7 +115,7 @@ class EarlyTermination(ConstraintTransform):
         over = (spent > spent.new_tensor(list(self._budgets.values()))).any(-1, keepdim=True)
         for key in ("done", "terminated"):
             next_tensordict.set(key, next_tensordict.get(key) | over)
-        # an end that is both would be bootstrapped from by some and not by others
+        # algorithms differ in what they make of an end that is both
         next_tensordict.set("truncated", next_tensordict.get("truncated") & ~over)
         return next_tensordict
 
@@ -127,26 +125,24 @@ _ROUNDING = 1e-9  # of shares of a budget that are taken one by one
 
 
 class Saute(ConstraintTransform):
-    """What is left of the budget is observed; once it is spent, every step earns the same.
+    """The share of the budget that is left is observed; once it is spent, rewards are constant.
 
     Of a budget d of each of k costs, the share z is left: z_0 = 1 and
 
         z_{t+1} = (z_t - c_t / d) / γ_s
 
     (Sootla et al. 2022, "Sauté RL: Almost Surely Safe Reinforcement Learning Using State
-    Augmentation", section 3), so that z_T >= 0 says that the discounted cost of the episode is
-    within d. `observation` gets k more columns, the component `budget`; in a dictionary it is an
-    entry. Where a share is 0 or less, `reward` becomes `unsafe_reward`. The environment's own
-    reward is kept in `task_reward`: returns are made of that. In evaluation `reward` stays as it
-    is.
+    Augmentation", section 3): z_T >= 0 means that the discounted cost of the episode is within d.
+    `observation` gets k more columns, the component `budget` (an entry of a dictionary). Where a
+    share is 0 or less, `reward` becomes `unsafe_reward`, except in evaluation. The environment's
+    own reward is kept in `task_reward`, of which logged returns are made.
 
     Args:
         budgets: Cost key -> undiscounted cost per episode, d.
         discount: Discount γ_s of the costs that a budget is for.
         unsafe_reward: Reward of every step when a budget is spent.
-        rescale_budgets: Whether d, which is undiscounted, becomes d (1 - γ_s^T) / ((1 - γ_s) T), to
-            which a cost that is spread evenly over T = `max_episode_steps` steps sums with the
-            discount, as in the published code.
+        rescale_budgets: Whether d becomes d (1 - γ_s^T) / ((1 - γ_s) T), as in the published code:
+            the discounted sum of a cost d that is spread evenly over T = `max_episode_steps` steps.
 
     Raises:
         ValueError: for a budget that is not positive, or a discount out of range.
@@ -262,11 +258,10 @@ class Saute(ConstraintTransform):
 class Simmer(Saute):
     """Sauté RL with budgets that grow during training, from a share of d to all of it.
 
-    An episode begins with z_0 = d_n / d, where d_n is the budget after n steps of its environment;
-    the share that is left stays one of the whole d, so that what was learned with a small budget
-    holds for a larger one (Sootla et al. 2022, "Enhancing Safe Exploration Using Safety State
-    Augmentation"). d_n grows in a straight line; the paper's schedules react to what is learned.
-    Episodes of an evaluation begin with the whole budget.
+    An episode starts with z_0 = d_n / d, where d_n is the budget after n steps of its environment
+    (Sootla et al. 2022, "Enhancing Safe Exploration Using Safety State Augmentation"). d_n grows
+    linearly here; the paper's schedules react to what is learned. Episodes of an evaluation start
+    with the whole budget.
 
     Args:
         budgets: Cost key -> undiscounted cost per episode, d.
@@ -304,12 +299,12 @@ class Simmer(Saute):
         self._steps_before = 0
 
     def continue_from(self, steps: int) -> None:
-        """Go on with the schedule after so many steps of every row."""
+        """Continue the schedule after so many steps of every row."""
         self._steps_before = steps
         self._rows.pop("age", None)
 
     def start(self, done: Tensor) -> dict[str, Tensor]:
-        """Return the budget of this part of training, and how far that is."""
+        """Return the share of the budget at this step of training, and that step."""
         before = torch.full_like(done, self._steps_before, dtype=torch.int64)
         age = self._rows.get("age", before)
         share = self._first + (1 - self._first) * (age / self._steps).clamp(max=1).double()

@@ -1,7 +1,7 @@
-"""Where a robot is, when it stands as it should, and what it earns: functions over tensors.
+"""Where a robot is, whether it is healthy, and its reward: functions over tensors.
 
-Places, health and reward are those of Gymnasium's environments of version 5 (Towers et al. 2024),
-bounds included or not as there; what the limit applies to is Safety-Gymnasium's (Ji et al. 2023).
+As in Gymnasium's environments of version 5 (Towers et al. 2024), bounds included or not as there;
+the speed that is limited is that of Safety-Gymnasium (Ji et al. 2023).
 """
 
 from __future__ import annotations
@@ -20,11 +20,10 @@ TORSO = 1  # id of its body: every robot's first
 
 
 class Place(NamedTuple):
-    """What is watched for the velocity: the outputs it needs, and how to make its reading [N, D].
+    """The place whose velocity is limited: the outputs it needs, and how it is read [N, D] (m).
 
-    Derived places (`torso`, `centre_of_mass`) are those that `mj_step` leaves behind, of the state
-    that the last substep evaluated last. D is 1 where the velocity along x is limited, 2 where the
-    speed in the plane is (m).
+    `torso` and `centre_of_mass` are read after `mj_step` as it leaves them, of the last state that
+    it evaluated. D is 1 where the velocity along x is limited, 2 where the speed in the plane is.
     """
 
     outputs: tuple[str, ...]
@@ -52,9 +51,9 @@ PLACES: Mapping[str, Place] = {
 
 
 def limited_speed(velocity: Tensor) -> Tensor:
-    """What the threshold applies to: x velocity, or the speed in the plane; [N, D] -> [N].
+    """The speed that is limited: x velocity, or the speed in the plane; [N, D] -> [N].
 
-    As in Safety-Gymnasium: driving backwards along x costs nothing, in the plane it does.
+    As in Safety-Gymnasium: moving backwards along x costs nothing, in the plane it does.
 
     Examples:
         >>> limited_speed(torch.tensor([[-3.0]])).item()

@@ -20,13 +20,13 @@ _PARTS = ("cinert", "cvel", "qfrc_actuator", "cfrc_ext")
 
 @dataclass(frozen=True, kw_only=True)
 class Runner:
-    """What is known of a robot before any configuration.
+    """One robot.
 
     Attributes:
         gymnasium_id: The environment whose dynamics, observation and reward it has.
         mjcf: Its file among Gymnasium's assets.
         place: What is watched for the velocity, a key of `locomotion.PLACES`.
-        health: When it stands as it should, a key of `locomotion.HEALTH`; None: always.
+        health: When it is healthy, a key of `locomotion.HEALTH`; None: always.
         num_hidden: Leading positions that `exclude_current_positions_from_observation` hides.
         velocity_limit: Joint velocities are observed within plus and minus this [m/s, rad/s].
         normal_velocities: Initial velocities are normally distributed instead of uniformly.

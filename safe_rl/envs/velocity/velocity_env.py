@@ -32,7 +32,7 @@ _OPTIONAL_KEYS = ("place", "observation", "seed", "episode")
 
 
 class VelocityEnv(SimulatedEnv):
-    """N parallel robots of one configuration that are to run, but not too fast.
+    """N parallel robots of one configuration that are rewarded for speed, up to a limit.
 
     Dynamics, observation, reward and termination are those of Gymnasium's environment of version 5
     (Towers et al. 2024) with the robot's own MJCF file; a step costs 1 where the velocity exceeds
@@ -43,9 +43,8 @@ class VelocityEnv(SimulatedEnv):
     fell), `truncated` (time is up). A robot whose physics fails gets reward and cost 0 and
     terminates.
 
-    A state holds `qpos`, `qvel`, `qacc_warmstart`, `time`, `step_count`; `place` and `observation`,
-    which belong to the last substep; and the seeds. Without `place` and `observation` both are
-    computed anew, as at the start of an episode.
+    A state holds `qpos`, `qvel`, `qacc_warmstart`, `time`, `step_count`, the seeds, and `place` and
+    `observation` of the last substep, which are computed if they are missing.
 
     Cameras of pictures are "track" (the model's own) and "free" (beside the robot).
 
@@ -107,7 +106,7 @@ class VelocityEnv(SimulatedEnv):
         self._step_count[rows] = 0
 
     def _start(self, rows: Tensor) -> None:
-        """Write what is derived from states that no step has led to, of robots int64 [R]."""
+        """Write place and observation of robots, int64 [R], whose state no step has led to."""
         self._last_place[rows] = self._place()[rows]
         self._observer.write_start(self._physics, self._observation, rows)
 
@@ -174,16 +173,9 @@ class VelocityEnv(SimulatedEnv):
 
 
 class Starts:
-    """Starts of episodes, noise around the model's initial state, drawn for all rows at once.
+    """Starts of episodes, drawn for all rows at once: a draw for few rows costs as much.
 
-    Few rows at a time start an episode, and a draw for few costs as much as one for many. What is
-    handed out depends on the row's seed and episode alone: every draw is addressed by them and the
-    column of the state, see `rng`.
-
-    Args:
-        config: The environment.
-        model: Its compiled model.
-        num_envs: Number of rows, N.
+    A start depends on the row's seed and episode only, see `rng`.
     """
 
     def __init__(self, config: VelocityConfig, model: mujoco.MjModel, num_envs: int) -> None:
@@ -212,16 +204,14 @@ class Starts:
 def draw_start(config: VelocityConfig, model: mujoco.MjModel, key: Tensor) -> tuple[Tensor, Tensor]:
     """Draw initial positions and velocities, distributed as Gymnasium's.
 
-    Positions are uniform within the noise scale around the model's, velocities uniform within it,
-    or normal with it as standard deviation, around 0.
-
     Args:
         config: The environment.
         model: Its compiled model.
         key: Random keys, int64 [R].
 
     Returns:
-        Positions [R, nq] and velocities [R, nv], float64.
+        Positions [R, nq], uniform within the noise scale around the model's, and velocities
+        [R, nv], uniform within it or normal with it as standard deviation, around 0; float64.
     """
     columns = torch.arange(model.nq + model.nv)
     if RUNNERS[config.robot].normal_velocities:
