@@ -41,6 +41,19 @@ def has_screen() -> bool:
     return bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
 
 
+def require_screen() -> None:
+    """Check that windows can be opened on this machine.
+
+    Raises:
+        OpenGLError: If they cannot.
+    """
+    if not has_screen():
+        raise OpenGLError(
+            "A window needs a screen, and there is no screen here (neither DISPLAY nor "
+            "WAYLAND_DISPLAY is set). Use render_mode='rgb_array', which needs none."
+        )
+
+
 def open_renderer(model: mujoco.MjModel, width: int, height: int) -> mujoco.Renderer:
     """Open an OpenGL context that draws pictures of one size.
 

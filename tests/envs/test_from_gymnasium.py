@@ -9,12 +9,9 @@ import numpy as np
 import pytest
 import torch
 from gymnasium_envs import Toll, Walk, make_pendulum
-from run_configs import compose_config
 from torchrl.envs.utils import check_env_specs
 
 from safe_rl.envs import ConfigError, SafetyGymEnv, from_gymnasium, store_configs
-from safe_rl.runs.table import read_table
-from safe_rl.training.building import build_trainer, seed_everything
 
 store_configs()
 
@@ -193,28 +190,6 @@ def test_a_seed_determines_everything():
     assert (starts[0] == starts[1]).all()
     assert (starts[0]["observation"] != starts[2]["observation"]).any()
     assert (starts[0]["observation"][0] != starts[0]["observation"][1]).any()
-
-
-def test_our_algorithms_train_on_it(tmp_path):
-    config = compose_config(
-        "algo=ppo_lagrangian",
-        "cost_limits={cost_speed: 50.0, cost: 60.0}",
-        "frames=1600",
-        "num_envs=4",
-        "frames_per_batch=800",
-        "model.hidden_sizes=[16]",
-        "policy_update.minibatch_size=200",
-        "critic_update.minibatch_size=200",
-        "logger=none",
-    )
-    seed_everything(0, None)
-    env = from_gymnasium(make_pendulum, num_envs=4, seed=0)
-    build_trainer(config, env, tmp_path).run()
-    table = read_table(tmp_path / "progress.csv")
-    assert table["episodes"] == [4, 4]
-    assert table["episode_length"] == [200, 200]
-    assert all(cost > 0 for cost in table["episode_cost_speed"])
-    assert table["multiplier_cost_speed"][0] != table["multiplier_cost_speed"][1]
 
 
 def moving(tensordict):

@@ -135,15 +135,6 @@ def test_nested_observations_are_dictionaries():
     np.testing.assert_array_equal(np.concatenate(joined), flat)
 
 
-def test_episode_statistics():
-    env = gymnasium.make("Safexp-PointGoal1-v0", config=SHORT)
-    env = gymnasium.wrappers.RecordEpisodeStatistics(env)
-    env.reset(seed=0)
-    steps = [env.step(env.action_space.sample()) for _ in range(3)]
-    assert steps[-1][-1]["episode"]["l"] == 3
-    assert steps[-1][-1]["episode"]["r"] == pytest.approx(sum(step[1] for step in steps))
-
-
 @needs_opengl
 def test_record_video(tmp_path):
     pytest.importorskip("moviepy", reason="RecordVideo writes films with moviepy")
@@ -258,18 +249,6 @@ def test_rows_of_a_batch_end_apart(mode):
         assert len(resets) == ends.any(1).sum()
 
 
-def test_the_first_row_does_not_depend_on_the_others():
-    config = {"continue_goal": False, "goal_size": 0.9, "num_steps": 10}
-    observations = []
-    for num_envs in (1, 4):
-        envs = gymnasium.make_vec("Safexp-PointGoal0-v0", num_envs=num_envs, config=config)
-        first, _ = envs.reset(seed=2)
-        actions = np.ones(envs.action_space.shape, np.float32)
-        rows = [first[0], *(envs.step(actions)[0][0] for _ in range(25))]
-        observations.append(np.array(rows))
-    np.testing.assert_array_equal(*observations)
-
-
 def test_a_batch_that_is_not_reset_says_so():
     envs = gymnasium.make_vec(
         "Safexp-PointGoal1-v0", num_envs=2, config=SHORT, autoreset_mode="Disabled"
@@ -287,18 +266,6 @@ def test_a_batch_that_is_not_reset_says_so():
     envs.reset(options={"reset_mask": np.array([True, False])})
     with pytest.raises(RuntimeError, match=r"Worlds \[1\] have ended"):
         envs.step(actions)
-
-
-def test_statistics_of_a_batch():
-    envs = gymnasium.make_vec("Safexp-PointGoal1-v0", num_envs=3, config=SHORT)
-    envs = gymnasium.wrappers.vector.RecordEpisodeStatistics(envs)
-    envs.reset(seed=0)
-    rewards = np.zeros(3)
-    for _ in range(3):
-        _, reward, _, _, infos = envs.step(envs.action_space.sample())
-        rewards += reward
-    np.testing.assert_allclose(infos["episode"]["r"], rewards)
-    assert infos["episode"]["l"].tolist() == [3, 3, 3]
 
 
 @pytest.mark.parametrize("keys", [{}, {"randomize_layout": False}])

@@ -15,7 +15,7 @@ from gymnasium.spaces import Box, Dict
 from tensordict import TensorDict, TensorDictBase
 from torchrl.data import Composite
 
-from safe_rl.envs.opengl import OpenGLError, has_screen
+from safe_rl.envs.opengl import has_screen, require_screen
 from safe_rl.envs.safety_gym.config import SafetyGymConfig
 from safe_rl.envs.safety_gym.env import SafetyGymEnv
 from safe_rl.envs.safety_gym.suite import resolve
@@ -58,11 +58,8 @@ class Worlds:
     def _open(self, batch: SimulatedEnv, mode: str | None, positions: bool) -> None:
         if mode not in (None, *batch.render_modes):
             raise ValueError(f"render_mode must be one of {batch.render_modes}, got {mode!r}.")
-        if mode == "human" and not has_screen():
-            raise OpenGLError(
-                "render_mode='human' opens a window, and there is no screen here (neither DISPLAY "
-                "nor WAYLAND_DISPLAY is set). Use render_mode='rgb_array', which needs none."
-            )
+        if mode == "human":
+            require_screen()
         self.batch, self.render_mode, self._has_positions = batch, mode, positions
         self._events = [name for name in batch.flags if name not in SimulatedEnv.flags]
         modes = [name for name in batch.render_modes if name != "human" or has_screen()]

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from safe_rl.envs.errors import ConfigError
-from safe_rl.envs.opengl import PACKAGES, OpenGLError, has_screen
+from safe_rl.envs.opengl import PACKAGES, OpenGLError, require_screen
 from safe_rl.envs.pictures import Marker, Pictures, add_markers
 from safe_rl.envs.safety_gym.bodies import TRACK, VISION
 from safe_rl.envs.safety_gym.building import build_scene
@@ -110,11 +110,7 @@ class Viewer:
     """
 
     def __init__(self, display: Display) -> None:
-        if not has_screen():
-            raise OpenGLError(
-                "MuJoCo's viewer needs a screen, and there is none here (neither DISPLAY nor "
-                "WAYLAND_DISPLAY is set). Use render_mode='rgb_array', which needs none."
-            )
+        require_screen()
         # Its import opens a connection to the screen.
         import mujoco.viewer
 
