@@ -6,7 +6,10 @@ from collections.abc import Iterable
 from difflib import SequenceMatcher
 from typing import Any
 
-__all__ = ["did_you_mean", "key_name", "nearest"]
+__all__ = ["STEPS_TAKEN", "did_you_mean", "key_name", "nearest"]
+
+STEPS_TAKEN = "steps_taken"
+"""Below "next": how many steps of the environment an action was held for, [..., 1] of integers."""
 
 _LIKENESS = 0.5
 _BEGINNING = 4

@@ -91,7 +91,7 @@ FLOORS = {
         # What changes any of them from outside.
         ("transforms.base",),
         ("transforms.action_transforms", "transforms.observation_transforms"),
-        ("transforms.reward_transforms",),
+        ("transforms.reward_transforms", "transforms.action_repeat", "transforms.observed_costs"),
         ("transforms.environment",),
         ("transforms",),
         ("making",),

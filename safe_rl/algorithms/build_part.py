@@ -6,6 +6,7 @@ your own: each gets those live objects that its constructor names.
 
 from __future__ import annotations
 
+import math
 from inspect import isclass
 from typing import Any, TypeVar
 
@@ -96,21 +97,30 @@ def constrained_limits(config: DictConfig, env: EnvBase, *, otherwise: str) -> d
 
 
 def build_constraints(
-    config: DictConfig, limits: dict[str, float], max_length: int, device: torch.device
+    config: DictConfig, limits: dict[str, float], env: EnvBase, device: torch.device
 ) -> Constraints:
     """Constraints with multiplier, tracker and risk measure as a configuration names them.
+
+    Lengths of episodes are in decisions, as batches are; schedules in steps of the environment.
 
     Raises:
         ValueError: If a risk measure is named without a tracker.
     """
     multiplier = risk = None
+    per_decision = env.steps_per_decision
+    max_length = math.ceil(env.max_episode_steps / per_decision)
     if config.get("lagrangian") is not None:
         multiplier = build_part(config.lagrangian, cost_limits=limits).to(device)
     values = torch.tensor(list(limits.values()))
     if limits and _names_a_part(config.get("risk")):
-        risk = build_part(config.risk, cost_limits=values)
+        risk = build_part(config.risk, cost_limits=values, steps_per_decision=per_decision)
     if limits and _names_a_part(config.get("limits")):
-        tracker = build_part(config.limits, cost_limits=values, max_length=max_length)
+        tracker = build_part(
+            config.limits,
+            cost_limits=values,
+            max_length=max_length,
+            steps_per_decision=per_decision,
+        )
         return TrackedConstraints(
             limits, tracker=tracker, multiplier=multiplier, risk=risk, device=device
         )

@@ -37,7 +37,7 @@ class Constraints:
         limits: d, [k].
         costs: J_c, undiscounted cost per episode, [k], as of the last batch.
         violation: J_c − d, [k], as of the last batch.
-        episode_length: T̄, mean number of steps of an episode, scalar.
+        episode_length: T̄, mean number of decisions of an episode, as in batches, scalar.
         unit: Size of one cost, by which losses divide the costs that they weigh, [k].
         risk: What is limited instead of the mean cost of an episode, or None.
         cost_advantage: Key of the cost advantages that the multiplier weighs.
@@ -104,7 +104,7 @@ class Constraints:
         """
         if episodes.num_episodes:
             self._finished = episodes.mean_costs(self.keys).to(self._finished)
-            self._mean_length = episodes.lengths.mean().to(self._mean_length)
+            self._mean_length = episodes.decisions.mean().to(self._mean_length)
         costs, length = self._finished, self._mean_length
         has_finished = bool(length.isfinite())
         if not has_finished:
@@ -248,7 +248,7 @@ class TrackedConstraints(Constraints):
         Cost advantages that are in the batch for a multiplier to weigh are divided by the size of
         one cost.
         """
-        state = self.tracker.update(self._costs_of(batch), episodes.lengths, self._charges)
+        state = self.tracker.update(self._costs_of(batch), episodes.decisions, self._charges)
         state = state.to(self.limits.device)
         self.costs.copy_(state.cost)
         self.violation.copy_(state.demand)

@@ -65,6 +65,7 @@ class OffPolicy(Algorithm, Recipe):
         policy_update: Trains all networks on minibatches.
         random_steps: Steps of environments that are taken at random in the beginning. Learning
             begins when the memory holds as many. There are none where nothing is collected.
+        steps_per_decision: Steps of an environment per transition.
         collects: Whether what is collected goes into the memory.
         learns_from: What was in it from the beginning, in a sentence, or that nothing will be.
     """
@@ -78,6 +79,7 @@ class OffPolicy(Algorithm, Recipe):
     memory: Memory
     policy_update: ReplayUpdate
     random_steps: int
+    steps_per_decision: int = 1
     collects: bool = True
     learns_from: str = ""
     _counts: dict[str, int] = field(default_factory=lambda: {"steps": 0})
@@ -106,7 +108,7 @@ class OffPolicy(Algorithm, Recipe):
         device = torch.device(config.device)
         _check_critics(config)
         networks = build_networks(config, env, len(limits), device)
-        constraints = build_constraints(config, limits, env.max_episode_steps, device)
+        constraints = build_constraints(config, limits, env, device)
         loss = build_part(
             config.loss,
             actor_network=networks["actor"],
@@ -130,7 +132,7 @@ class OffPolicy(Algorithm, Recipe):
         learns_from, collects = begin_memory(config, memory, env)
         # what is not learned from explores nothing
         random_steps = setting(config, "exploration.random_steps") if collects else 0
-        _check_room(memory, random_steps, collects)
+        _check_room(memory, random_steps // env.steps_per_decision, collects)
         return cls(
             policy=exploring(networks["actor"], env, setting(config, "exploration.noise")),
             networks=networks,
@@ -138,6 +140,7 @@ class OffPolicy(Algorithm, Recipe):
             memory=memory,
             policy_update=build_update(config.policy_update, ReplayUpdate, loss=loss),
             random_steps=random_steps,
+            steps_per_decision=env.steps_per_decision,
             collects=collects,
             learns_from=learns_from,
         )
@@ -187,9 +190,10 @@ class OffPolicy(Algorithm, Recipe):
         bias = self.policy_update.loss.cost_bias(batch)
         if self.collects:
             self.memory.extend(batch)
-        self._count_steps(batch.numel())
-        may_learn = len(self.memory) >= max(self.random_steps, self.memory.batch_size)
-        number = self.policy_update.due(batch.numel()) if may_learn else 0
+        steps = batch.numel() * self.steps_per_decision
+        self._count_steps(steps)
+        needed = max(self.random_steps // self.steps_per_decision, self.memory.batch_size)
+        number = self.policy_update.due(steps) if len(self.memory) >= needed else 0
         row = constraints.columns()
         row |= {} if bias is None else constraints.column("critic_bias", bias)
         for name, value in self.policy_update(self.memory, number).items():

@@ -87,7 +87,7 @@ class OnPolicy(Algorithm, Recipe):
             )
         device = torch.device(config.device)
         networks = _build_networks(config, env, len(limits), device)
-        constraints = build_constraints(config, limits, env.max_episode_steps, device)
+        constraints = build_constraints(config, limits, env, device)
         parts = {
             "actor_network": networks["actor"],
             "constraints": constraints,

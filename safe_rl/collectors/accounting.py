@@ -10,7 +10,7 @@ import torch
 from tensordict import NestedKey, TensorDictBase, unravel_key
 from torch import Tensor
 
-from safe_rl.naming import key_name
+from safe_rl.naming import STEPS_TAKEN, key_name
 
 __all__ = ["EpisodeAccounting", "EpisodeError", "EpisodeStatistics"]
 
@@ -28,6 +28,7 @@ class EpisodeStatistics:
         costs: Cost key -> undiscounted cost of every finished episode, shape [E]. Here and below,
             nested keys are joined by ``/``.
         lengths: Steps of every finished episode, shape [E].
+        steps_per_decision: Steps of the environment per row of time of a batch.
         cost_rates: Cost key -> all cost so far divided by all steps so far, ρ_c, scalar tensors.
         reward_rate: All reward so far divided by all steps so far, a scalar tensor.
         open_costs: Cost key -> what the open episode of every row had cost before the batch, shape
@@ -51,11 +52,17 @@ class EpisodeStatistics:
     cost_rates: dict[str, Tensor]
     reward_rate: Tensor = field(default_factory=lambda: torch.tensor(torch.nan))
     open_costs: dict[str, Tensor] = field(default_factory=dict)
+    steps_per_decision: int = 1
 
     @property
     def num_episodes(self) -> int:
         """Number of episodes that finished in the batch, E."""
         return self.returns.shape[0]
+
+    @property
+    def decisions(self) -> Tensor:
+        """Actions that were chosen in every finished episode, [E]; the last may be cut short."""
+        return (self.lengths / self.steps_per_decision).ceil()
 
     def episode_costs(self, cost_keys: Sequence[NestedKey]) -> Tensor:
         """Undiscounted costs of every finished episode, shape [E, len(cost_keys)]."""
@@ -94,6 +101,8 @@ class EpisodeAccounting:
         done_key: Key of the end of an episode below ``"next"``.
         device: Device of the batches.
         longest: Largest number of steps of an episode, where that is known.
+        steps_per_decision: Steps of the environment per row of time. If not 1, ``steps_taken``
+            below ``"next"`` says how many each took.
 
     Raises:
         KeyError: By :meth:`update`, if a key is not in the batch.
@@ -123,8 +132,9 @@ class EpisodeAccounting:
         done_key: NestedKey = "done",
         device: torch.device | str | None = None,
         longest: int | None = None,
+        steps_per_decision: int = 1,
     ) -> None:
-        self.longest = longest
+        self.longest, self.steps_per_decision = longest, steps_per_decision
         self.cost_keys = list(cost_keys)
         self.done_key = done_key
         self._signal_keys = [reward_key, *self.cost_keys]
@@ -149,7 +159,10 @@ class EpisodeAccounting:
             )
         signals = torch.stack([self._column(batch, key) for key in self._signal_keys], -1)
         self._require_costs(signals[..., 1:])
-        signals = torch.cat([torch.ones_like(signals[..., :1]), signals], -1)
+        steps = torch.ones_like(signals[..., 0])
+        if self.steps_per_decision != 1:
+            steps = self._column(batch, STEPS_TAKEN)
+        signals = torch.cat([steps.unsqueeze(-1), signals], -1)
         before = self._open_sums[:, 2:]
         finished = self._close_episodes(signals, self._column(batch, self.done_key).long())
         finished = finished[finished[:, 0].isfinite()]
@@ -164,6 +177,7 @@ class EpisodeAccounting:
             cost_rates=dict(zip(names, rates, strict=True)),
             reward_rate=reward_rate,
             open_costs=dict(zip(names, before.unbind(-1), strict=True)),
+            steps_per_decision=self.steps_per_decision,
         )
 
     def _close_episodes(self, signals: Tensor, done: Tensor) -> Tensor:

@@ -38,6 +38,8 @@ class ConstrainedEnv(EnvBase):
             may say what its columns were if it were flat. Every environment has its own.
         return_key: The entry below "next" that returns are made of.
         seconds_per_step: What a step takes in the environment's own time [s]; None if unknown.
+        steps_per_decision: Steps of the environment that one call of `step` takes. If it is not 1,
+            `steps_taken` [N, 1], an integer, says how many a call has taken: fewer at an end.
         steps_before: Steps of every row in the part of the run before this one.
         render: Draws environments as `SimulatedEnv.render` does; None if there are no pictures.
 
@@ -53,6 +55,7 @@ class ConstrainedEnv(EnvBase):
     observation_layout: Any
     return_key: str = "reward"
     seconds_per_step: Any = None
+    steps_per_decision: Any = 1
     steps_before: int = 0
     render: Any = None
 
@@ -80,7 +83,8 @@ class ConstrainedEnv(EnvBase):
         highest = float(spec.high.max()) if hasattr(spec, "high") else math.inf
         # the largest number of a spec stands for no bound
         is_bounded = highest < torch.finfo(torch.float32).max
-        return highest * float(self.max_episode_steps) if is_bounded else math.inf
+        calls = self.max_episode_steps / self.steps_per_decision
+        return highest * calls if is_bounded else math.inf
 
     def continue_from(self, steps: int) -> None:
         """Continue schedules after so many steps of every row."""
@@ -88,8 +92,8 @@ class ConstrainedEnv(EnvBase):
 
 
 _DEFAULTS = (
-    *("return_key", "seconds_per_step", "steps_before", "render", "get_state", "get_positions"),
-    *("continue_from", "highest_cost"),
+    *("return_key", "seconds_per_step", "steps_per_decision", "steps_before", "render"),
+    *("get_state", "get_positions", "continue_from", "highest_cost"),
 )
 
 

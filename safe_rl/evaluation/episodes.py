@@ -14,6 +14,8 @@ from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 from tqdm import tqdm
 
+from safe_rl.naming import STEPS_TAKEN
+
 __all__ = [
     "Episodes",
     "collect_episodes",
@@ -95,7 +97,9 @@ def collect_episodes(
             if record is not None:
                 record(step)
             after = step["next"]
-            signals = [torch.ones_like(after[return_key]), after[return_key]]
+            is_repeating = env.steps_per_decision != 1
+            taken = after[STEPS_TAKEN] if is_repeating else torch.ones_like(after[return_key])
+            signals = [taken, after[return_key]]
             signals += [after[key] for key in cost_keys]
             sums += torch.cat(signals, -1).to(sums)
             done = after["done"].squeeze(-1).cpu()

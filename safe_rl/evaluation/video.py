@@ -16,6 +16,7 @@ from torchrl.envs import EnvBase
 from safe_rl.evaluation.episodes import exploration
 from safe_rl.extras import import_extra
 from safe_rl.files import replacing
+from safe_rl.naming import STEPS_TAKEN
 
 __all__ = ["MANNERS", "Manner", "check_camera", "manner_of", "record_episode", "write_video"]
 
@@ -52,11 +53,13 @@ def manner_of(env: EnvBase, suffix: str) -> Manner:
 
     A film runs as fast as what it shows, where the environment has ``seconds_per_step``.
     """
-    manner, seconds = MANNERS[suffix], env.seconds_per_step
-    if suffix != "mp4" or not seconds:
-        return manner
-    steps = max(1, round(_FRAME / seconds))
-    return manner._replace(steps_per_frame=steps, frames_per_second=1 / (steps * seconds))
+    manner, seconds, together = MANNERS[suffix], env.seconds_per_step, env.steps_per_decision
+    rate = manner.steps_per_frame * manner.frames_per_second  # steps in a second of the film
+    frame = manner.steps_per_frame
+    if suffix == "mp4" and seconds:
+        rate, frame = 1 / seconds, _FRAME / seconds
+    steps = max(1, round(frame / together)) * together
+    return manner._replace(steps_per_frame=steps, frames_per_second=rate / steps)
 
 
 def check_camera(env: EnvBase, camera: str, suffix: str = "mp4") -> None:
@@ -143,7 +146,7 @@ def record_episode(
             if step % manner.steps_per_frame == 0:
                 yield _frame(env, camera, manner, step, *total.values())
             after = env.step(policy(state))["next"]
-            step += 1
+            step += int(after[STEPS_TAKEN]) if env.steps_per_decision != 1 else 1
             total = {key: value + float(after[key]) for key, value in total.items()}
             if after["done"].any():
                 yield _frame(env, camera, manner, step, *total.values())

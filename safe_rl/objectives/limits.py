@@ -139,13 +139,14 @@ class LimitTracker:
 
     Args:
         cost_limits: d, undiscounted cost per episode, [k].
-        max_length: steps after which an episode is over.
+        max_length: rows of time of a batch after which an episode is over.
         margin: Standard errors of a batch's J_c by which the aim is below the limit.
         largest_margin: Bound of the margin, as a share of d.
         free_steps: Environment steps for which costs are free.
         descent_steps: Environment steps in which the limit then comes down.
         recovery: Share of d that is the aim once J_c is above d, until J_c is there: hysteresis, as
             in the published C-TRPO and CPO with hysteresis; 1 for none.
+        steps_per_decision: Environment steps per row of time of a batch.
         frames: Environment steps of the whole run.
         latest_end: Share of the run by which the descent is over: in a run too short for that, both
             numbers of steps are shortened in proportion.
@@ -191,6 +192,7 @@ class LimitTracker:
         integral: NotNegative,
         largest_integral: NotNegative,
         recovery: Share = 1.0,
+        steps_per_decision: int = 1,
     ) -> None:
         self.limits = cost_limits.detach().cpu().float()
         num_costs = len(self.limits)
@@ -199,9 +201,14 @@ class LimitTracker:
         self.free_steps = round(free_steps * shrinkage)
         self.descent_steps = round(descent_steps * shrinkage)
         self._is_shortened = shrinkage < 1
-        self.smallest_scale, self.memory, self.recovery = smallest_scale, memory, recovery
+        self.memory, self.recovery, self.steps_per_decision = memory, recovery, steps_per_decision
+        self.smallest_scale = smallest_scale * steps_per_decision  # of a row of time
         self.costs = EpisodeCosts(
-            num_costs, max_length=max_length, drift=drift, memory=memory, smallest=smallest_scale
+            num_costs,
+            max_length=max_length,
+            drift=drift,
+            memory=memory,
+            smallest=self.smallest_scale,
         )
         self.predictions = PredictedChange(num_costs, memory=memory, lowest=lowest_trust)
         self.integral, self.largest_integral = integral, largest_integral
@@ -242,7 +249,8 @@ class LimitTracker:
         self.predictions.update(batch.mean, prior=0.5 * scale)
         noise = torch.lerp(batch.error, self._noise, self.memory)
         self._noise = torch.where(noise.isfinite(), noise, batch.error)
-        target = self._target(estimate, scale, costs.shape[0] * costs.shape[1])
+        num_steps = costs.shape[0] * costs.shape[1] * self.steps_per_decision
+        target = self._target(estimate, scale, num_steps)
         error = (estimate.mean - target).clamp(-scale, scale)
         integrated = (self._integrated + self.integral * error).clamp_min(0)
         self._integrated = torch.minimum(integrated, self.largest_integral * scale)

@@ -114,6 +114,7 @@ class CVaR(RiskMeasure):
         window: Episodes of the past from which ν, the value at risk, is taken.
         ramp_start: Environment steps before which κ = 0: the mean is limited.
         ramp_steps: Environment steps in which κ then goes to 1.
+        steps_per_decision: Environment steps per row of time of a batch.
 
     Raises:
         ValueError: if an argument is outside its range.
@@ -135,6 +136,7 @@ class CVaR(RiskMeasure):
         window: Annotated[int, Range(1, 10**6)],
         ramp_start: Annotated[int, Range(0)],
         ramp_steps: Annotated[int, Range(0)],
+        steps_per_decision: int = 1,
     ) -> None:
         if not 0 < tail <= 1 or window < 1:
             raise ValueError(
@@ -143,6 +145,7 @@ class CVaR(RiskMeasure):
         self.limits = cost_limits.detach().cpu().float()
         self.tail, self.window = tail, window
         self.ramp_start, self.ramp_steps = ramp_start, ramp_steps
+        self._steps_per_decision = steps_per_decision
         self._steps = 0
         self._finished = torch.empty(0, len(self.limits))
 
@@ -156,7 +159,7 @@ class CVaR(RiskMeasure):
     def __call__(self, costs: Tensor, ends: Tensor, before: Tensor, finished: Tensor) -> Charges:
         """Charge the steps of a batch: see `RiskMeasure`."""
         self._finished = torch.cat([self._finished, finished.float()])[-self.window :]
-        self._steps += ends.numel()
+        self._steps += ends.numel() * self._steps_per_decision
         weight = self.weight
         if not weight:
             return Charges(costs, torch.zeros_like(self.limits), self.limits)

@@ -95,10 +95,23 @@ def _build_collector(
     config: DictConfig, env: EnvBase, make_env: MakeEnv | None, algorithm: Algorithm
 ) -> Collector | WorkerCollector:
     policy = algorithm.policy
-    numbers = {"frames_per_batch": config.frames_per_batch, "device": config.device}
+    numbers = {"frames_per_batch": _decisions_per_batch(config, env), "device": config.device}
     if config.collector.get("_target_") is None:
         return make_collector(env, policy, **numbers)
     return build(config.collector, env=env, make_env=make_env, policy=policy, **numbers)
+
+
+def _decisions_per_batch(config: DictConfig, env: EnvBase) -> int:
+    """Rows of time of all environments together in a batch, ``frames_per_batch`` being steps."""
+    frames, together = config.frames_per_batch, env.batch_size.numel() * env.steps_per_decision
+    if env.steps_per_decision != 1 and frames % together:
+        below = frames // together * together
+        raise ValueError(
+            f"frames_per_batch={frames}: {env.batch_size.numel()} environments that take "
+            f"{env.steps_per_decision} steps at a time take {together} together. Use "
+            f"{below or together} or {below + together}, or another number of environments."
+        )
+    return frames // env.steps_per_decision
 
 
 def begin_from(algorithm: Algorithm, config: Mapping[str, Any]) -> list[str]:

@@ -80,8 +80,12 @@ class WorldSnapshot:
         """Take a snapshot and go on from it."""
         self._go_on_from(self._env.get_state())
 
-    def stagger(self, max_steps: int) -> bool:
+    def stagger(self, max_steps: int, multiple: int = 1) -> bool:
         """Put row i of N at step i · max_steps / N of its first episode: not all end at once.
+
+        Args:
+            max_steps: Steps of an episode.
+            multiple: Steps that are taken at a time, of which all begin at a multiple.
 
         Returns:
             Whether that could be done: the environment's state holds its ``step_count``.
@@ -91,6 +95,7 @@ class WorldSnapshot:
         if steps is None:
             return False
         offsets = torch.arange(steps.shape[0]) * max_steps // steps.shape[0]
+        offsets = offsets // multiple * multiple
         state["step_count"] = steps + offsets.reshape(-1, *[1] * (steps.ndim - 1)).to(steps)
         self._go_on_from(state)
         return True

@@ -79,6 +79,7 @@ class Trainer:
             reward_key=env.return_key,
             device=collector.storing_device,
             longest=env.max_episode_steps,
+            steps_per_decision=env.steps_per_decision,
         )
         self.progress = Progress()
         self.record = record
@@ -94,7 +95,11 @@ class Trainer:
             self._worlds = WorldSnapshot(env, collector)
         self._is_continued = False
         wanted = config.get("staggered_starts")
-        if wanted and self._worlds is not None and self._worlds.stagger(env.max_episode_steps):
+        if (
+            wanted
+            and self._worlds is not None
+            and self._worlds.stagger(env.max_episode_steps, env.steps_per_decision)
+        ):
             self.accounting.ignore_open_episodes()
         self._frames, self._frames_per_batch = config.frames, config.frames_per_batch
         self._checkpoint_interval = config.checkpoint.interval
@@ -263,7 +268,8 @@ class Trainer:
             learned = self.algorithm.learn(batch, episodes)
         end = time.perf_counter()
         before = self.progress.steps
-        self.progress.add(batch.numel(), end - start)
+        steps = batch.numel() * self._env.steps_per_decision
+        self.progress.add(steps, end - start)
         evaluated: dict[str, float] = {}
         if self._evaluation is not None:
             with torch_threads(1):
@@ -277,7 +283,7 @@ class Trainer:
             "time_collect": collected - start,
             "time_learn": end - collected,
             "time_total": self.progress.seconds,
-            "steps_per_second": batch.numel() / (end - start),
+            "steps_per_second": steps / (end - start),
         }
 
     def _save(self) -> None:

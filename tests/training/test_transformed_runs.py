@@ -25,8 +25,8 @@ pytestmark = pytest.mark.long
 SAUTE = ["algo=ppo", "transforms=[saute]", "cost_limits={cost: 0.5}"]
 
 
-def make_trainer(directory, *overrides):
-    config = point_mass_config(*overrides)
+def make_trainer(directory, *overrides, minibatch_size=40):
+    config = point_mass_config(*overrides, minibatch_size=minibatch_size)
     seed_everything(config.seed, None)
     env = transform_env(
         PointMass(config.num_envs, seed=config.seed), transforms_of(config), evaluating=False
@@ -36,14 +36,19 @@ def make_trainer(directory, *overrides):
 
 @pytest.mark.parametrize(
     "transforms",
-    ["simmer,early_termination", "sensor_noise,action_delay"],
-    ids=["budgets", "noise"],
+    [
+        "simmer,early_termination",
+        "sensor_noise,action_delay",
+        "simmer,observed_costs,action_repeat",
+    ],
+    ids=["budgets", "noise", "repeats"],
 )
 def test_an_interrupted_run_goes_on_exactly(tmp_path, transforms):
     # 50 steps a batch: episodes of 20 are open at every checkpoint
     options = ["algo=ppo", "cost_limits={cost: 2}", "frames_per_batch=200"]
     options += [f"transforms=[{transforms}]"]
     options += ["transforms.simmer.steps=150"] * ("simmer" in transforms)
+    options += ["transforms.action_repeat.k=5"] * ("action_repeat" in transforms)
     whole, halves = tmp_path / "whole", tmp_path / "halves"
     make_trainer(whole, *options, "frames=1200").run()
     make_trainer(halves, *options, "frames=600").run()
@@ -51,6 +56,40 @@ def test_an_interrupted_run_goes_on_exactly(tmp_path, transforms):
     assert resumed.resume()
     resumed.run()
     assert without_times(halves / "progress.csv") == without_times(whole / "progress.csv")
+
+
+def test_everything_counts_steps_of_the_environment_where_actions_are_held(tmp_path):
+    counts = ["frames_per_batch=160", "exploration.random_steps=320", "replay.num_envs=4"]
+    counts += ["policy_update.updates_per_step=0.1", "memory.batch_size=8", "memory.n_steps=1"]
+    counts += [
+        "frames=640",
+        "limits.free_steps=160",
+        "limits.descent_steps=160",
+        "cost_limits={cost: 1}",
+    ]
+    options = ["algo=sac_lagrangian", "preset=default", "transforms=[action_repeat]", *counts]
+    trainer = make_trainer(tmp_path, *options, minibatch_size=None)
+    starts = trainer._env.get_state()["step_count"][:, 0].tolist()
+    assert starts == [0, 4, 8, 12]  # of 20 steps: 0, 5, 10, 15 rounded down to decisions
+    batch = next(trainer.batches())
+    assert batch.shape == (4, 10)
+    trainer = make_trainer(tmp_path / "run", *options, minibatch_size=None)
+    trainer.run()
+    table = read_table(tmp_path / "run/progress.csv")
+    assert table["steps"] == [160, 320, 480, 640]
+    assert table["episode_length"] == [20.0] * 4
+    assert table["policy_num_updates"] == [0.0, 16.0, 16.0, 16.0]
+    # free until step 160, then down: there at 320
+    assert table["target_cost"][0] > table["estimate_cost"][0]
+    assert table["target_cost"][1] < 1.0
+    # of a policy that acts at random alone, the estimate is what episodes cost
+    rate, length = table["cost_rate"][0], table["episode_length"][0]
+    assert table["estimate_cost"][0] == pytest.approx(rate * length)
+
+
+def test_batches_that_cannot_be_shared_out_among_repeats_are_refused(tmp_path):
+    with pytest.raises(ValueError, match=r"4 environments that take 4 steps at a time.*144 or 160"):
+        make_trainer(tmp_path, "transforms=[action_repeat]", "frames_per_batch=150")
 
 
 class Forgetful(PointMass):
@@ -142,12 +181,13 @@ def command(tmp_path, monkeypatch, capsys):
             marks=pytest.mark.slow,
         ),
         ["algo=ppo", "transforms=[saute,early_termination]", "cost_limits={cost: 0.5}"],
+        ["algo=trpo", "transforms=[observed_costs,action_repeat]"],
         [
             *("algo=ppo_lagrangian", "transforms=[action_filter]", FILTER),
             *("import=test_transforms_filters.py", "cost_limits={cost_interventions: 3}"),
         ],
     ],
-    ids=["saute", "simmer", "processes", "early_termination", "action_filter"],
+    ids=["saute", "simmer", "processes", "early_termination", "repeats", "action_filter"],
 )
 def test_the_command_line_runs_them(command, arguments):
     status, _, said = command(*RUN, *arguments)

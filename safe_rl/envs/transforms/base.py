@@ -28,6 +28,8 @@ class ConstraintTransform(Transform):
         evaluating: whether policies are evaluated; changes that only help learning are then off.
         added_costs: names of costs that it writes beside the environment's.
         return_key: where it leaves the reward that returns are made of, if it changes the reward.
+        steps_per_decision: steps of the environment that a call of `step` takes. One that takes
+            several has to be the last: those before it then act at every step.
 
     Examples:
         >>> from torchrl.envs import PendulumEnv, TransformedEnv
@@ -38,6 +40,7 @@ class ConstraintTransform(Transform):
     evaluating = False
     added_costs: tuple[str, ...] = ()
     return_key: str | None = None
+    steps_per_decision: int = 1
 
     def __init__(self) -> None:
         super().__init__()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from typing import Any
 
@@ -70,6 +71,12 @@ class TransformedConstrainedEnv(ConstrainedEnv, TransformedEnv):
         return self.base_env.seconds_per_step
 
     @property
+    def steps_per_decision(self) -> int:
+        """Steps of the environment that one call of `step` takes."""
+        own = (transform.steps_per_decision for transform in self._ours().values())
+        return math.prod(own, start=self.base_env.steps_per_decision)
+
+    @property
     def render(self) -> Any:
         """Draws the environment inside; None if that draws no pictures."""
         return self.base_env.render
@@ -104,6 +111,7 @@ class TransformedConstrainedEnv(ConstrainedEnv, TransformedEnv):
     def continue_from(self, steps: int) -> None:
         """Continue schedules after so many steps of every row, from the next reset on."""
         self.steps_before = steps
+        self.base_env.continue_from(steps)
         for transform in self._ours().values():
             transform.continue_from(steps)
 
@@ -174,7 +182,28 @@ def transform_env(
     for transform in made.values():
         if isinstance(transform, ConstraintTransform):
             transform.evaluating = evaluating
+    repeating = _repeating(made)
+    if repeating and len(made) > 1:
+        # an environment of its own, of which the last transform takes several steps
+        last = {repeating: made.pop(repeating)}
+        return TransformedConstrainedEnv(TransformedConstrainedEnv(env, made, seed), last, seed)
     return TransformedConstrainedEnv(env, made, seed)
+
+
+def _repeating(transforms: Mapping[str, Transform]) -> str | None:
+    """Name of the transform that takes several steps per decision, which has to be the last."""
+    found = [
+        name
+        for name, transform in transforms.items()
+        if isinstance(transform, ConstraintTransform) and transform.steps_per_decision != 1
+    ]
+    if found and found != [list(transforms)[-1]]:
+        raise ValueError(
+            f"transforms: '{found[0]}' has to be the last one, for the others count steps of the "
+            f"environment: transforms=[{','.join([n for n in transforms if n != found[0]])},"
+            f"{found[0]}]."
+        )
+    return found[0] if found else None
 
 
 def _transform(name: str, given: Transform | Mapping[str, Any]) -> Transform:
