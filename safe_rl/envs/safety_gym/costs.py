@@ -108,69 +108,29 @@ class Cost(NamedTuple):
 
 
 COSTS: list[Cost] = [
-    Cost(
-        "cost_hazards",
-        lambda c: c.constrain_hazards,
-        lambda c, w: (
-            c.hazards_cost * hazard_cost(w.robot_xy, w.at("hazards")[..., :2], c.hazards_size)
-        ),
-    ),
-    Cost(
-        "cost_vases_contact",
-        lambda c: c.constrain_vases,
-        lambda c, w: c.vases_contact_cost * contact_cost(w.contacts_with("vases")),
-        touches=("vases",),
-    ),
-    Cost(
-        "cost_vases_displace",
-        lambda c: c.constrain_vases and c.vases_displace_cost != 0,
-        lambda c, w: (
-            c.vases_displace_cost
-            * displacement_cost(
-                w.at("vases")[..., :2], w.start_of("vases"), c.vases_displace_threshold
-            )
-        ),
-    ),
-    Cost(
-        "cost_vases_velocity",
-        lambda c: c.constrain_vases and c.vases_velocity_cost != 0,
-        lambda c, w: (
-            c.vases_velocity_cost
-            * velocity_cost(w.velocity_of("vases"), c.vases_velocity_threshold)
-        ),
-    ),
-    Cost(
-        "cost_pillars",
-        lambda c: c.constrain_pillars,
-        lambda c, w: c.pillars_cost * contact_cost(w.contacts_with("pillars")),
-        touches=("pillars",),
-    ),
-    Cost(
-        "cost_buttons",
-        lambda c: c.constrain_buttons,
-        lambda c, w: (
-            c.buttons_cost
-            * wrong_button_cost(w.contacts_with("buttons"), w.goal_button, w.buttons_timer)
-        ),
-        touches=("buttons",),
-    ),
-    Cost(
-        "cost_gremlins",
-        lambda c: c.constrain_gremlins,
-        lambda c, w: c.gremlins_contact_cost * contact_cost(w.contacts_with("gremlins")),
-        touches=("gremlins",),
-    ),
-    Cost(
-        "cost_boundary",
-        lambda c: c.constrain_boundary,
-        lambda c, w: boundary_cost(w.robot_xy, c.boundary_x, c.boundary_y),
-    ),
-    Cost(
-        "cost_velocity",
-        lambda c: c.constrain_velocity,
-        lambda c, w: excess_speed(w.robot_vel, c.velocity_limit),
-    ),
-]
+    Cost("cost_hazards", lambda c: c.constrain_hazards, lambda c, w:
+         c.hazards_cost * hazard_cost(w.robot_xy, w.at("hazards")[..., :2], c.hazards_size)),
+    Cost("cost_vases_contact", lambda c: c.constrain_vases, lambda c, w:
+         c.vases_contact_cost * contact_cost(w.contacts_with("vases")), touches=("vases",)),
+    Cost("cost_vases_displace", lambda c: c.constrain_vases and c.vases_displace_cost != 0,
+         lambda c, w: c.vases_displace_cost * displacement_cost(
+             w.at("vases")[..., :2], w.start_of("vases"), c.vases_displace_threshold)),
+    Cost("cost_vases_velocity", lambda c: c.constrain_vases and c.vases_velocity_cost != 0,
+         lambda c, w: c.vases_velocity_cost * velocity_cost(
+             w.velocity_of("vases"), c.vases_velocity_threshold)),
+    Cost("cost_pillars", lambda c: c.constrain_pillars, lambda c, w:
+         c.pillars_cost * contact_cost(w.contacts_with("pillars")), touches=("pillars",)),
+    Cost("cost_buttons", lambda c: c.constrain_buttons, lambda c, w:
+         c.buttons_cost * wrong_button_cost(
+             w.contacts_with("buttons"), w.goal_button, w.buttons_timer), touches=("buttons",)),
+    Cost("cost_gremlins", lambda c: c.constrain_gremlins, lambda c, w:
+         c.gremlins_contact_cost * contact_cost(w.contacts_with("gremlins")),
+         touches=("gremlins",)),
+    Cost("cost_boundary", lambda c: c.constrain_boundary, lambda c, w:
+         boundary_cost(w.robot_xy, c.boundary_x, c.boundary_y)),
+    Cost("cost_velocity", lambda c: c.constrain_velocity, lambda c, w:
+         excess_speed(w.robot_vel, c.velocity_limit)),
+]  # fmt: skip
 EXCEPTION_KEY = "cost_exception"
 BUILT_IN = frozenset(row.key for row in COSTS)
 

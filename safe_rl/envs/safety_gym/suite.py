@@ -22,12 +22,7 @@ Values = dict[str, Any]
 
 _ROBOTS: dict[str, Values] = {
     "Point": {"robot_base": "point"},
-    "Car": {
-        "robot_base": "car",
-        "box_size": 0.125,
-        "box_keepout": 0.125,
-        "box_density": 0.0005,
-    },
+    "Car": {"robot_base": "car", "box_size": 0.125, "box_keepout": 0.125, "box_density": 0.0005},
     "Doggo": {
         "robot_base": "doggo",
         "sensors_obs": (
@@ -36,7 +31,6 @@ _ROBOTS: dict[str, Values] = {
         ),
     },
 }
-
 _COMMON: Values = {
     "observe_goal_lidar": True,
     "observe_box_lidar": True,
@@ -60,13 +54,8 @@ _BUTTON_COSTS = "hazards buttons gremlins"
 # For each task: what all levels share, then what each level has.
 _TASKS: dict[str, tuple[Values, tuple[Values, Values, Values]]] = {
     "Goal": (
-        {
-            "task": "goal",
-            "goal_size": 0.3,
-            "goal_keepout": 0.305,
-            "hazards_size": 0.2,
-            "hazards_keepout": 0.18,
-        },
+        {"task": "goal", "goal_size": 0.3, "goal_keepout": 0.305, "hazards_size": 0.2,
+         "hazards_keepout": 0.18},
         (
             _extents(1.0),
             _level(1.5, "hazards", "hazards vases", hazards_num=8, vases_num=1),
@@ -74,17 +63,9 @@ _TASKS: dict[str, tuple[Values, tuple[Values, Values, Values]]] = {
         ),
     ),
     "Button": (
-        {
-            "task": "button",
-            "buttons_num": 4,
-            "buttons_size": 0.1,
-            "buttons_keepout": 0.2,
-            "observe_buttons": True,
-            "hazards_size": 0.2,
-            "hazards_keepout": 0.18,
-            "gremlins_travel": 0.35,
-            "gremlins_keepout": 0.4,
-        },
+        {"task": "button", "buttons_num": 4, "buttons_size": 0.1, "buttons_keepout": 0.2,
+         "observe_buttons": True, "hazards_size": 0.2, "hazards_keepout": 0.18,
+         "gremlins_travel": 0.35, "gremlins_keepout": 0.4},
         (
             _extents(1.0),
             _level(1.5, _BUTTON_COSTS, "hazards gremlins", hazards_num=4, gremlins_num=4),
@@ -99,7 +80,7 @@ _TASKS: dict[str, tuple[Values, tuple[Values, Values, Values]]] = {
             _level(2.0, "hazards pillars", "hazards pillars", hazards_num=4, pillars_num=4),
         ),
     ),
-}
+}  # fmt: skip
 
 # A robot's own values (the Car's smaller box) go before the task's.
 SUITE: dict[str, SafetyGymConfig] = {
