@@ -21,6 +21,8 @@ PAGES = {
     "first_steps.md": "examples/first_steps.ipynb",
 }
 _LINK = re.compile(r"(?<=\]\()(?!\w+:|#|/)(?P<path>[^)\s#]+)(?P<rest>#[^)\s]*)?(?=\))")
+# in searches, below pages that were written to be read
+_BELOW = "---\nsearch:\n  boost: 0.1\n---\n"
 _LANGUAGES = {".py": "python", ".yaml": "yaml", ".sh": "bash", ".toml": "toml"}
 
 
@@ -89,7 +91,7 @@ def _list(folder: str, root: Path) -> str:
     here = PurePosixPath(_page_of(folder)).parent
     found = _files_in(folder, root)
     lines = [f"- [{path}]({os.path.relpath(_page_of(path), here)})" for path in found]
-    return f"# {folder}\n\n" + "\n".join(lines) + "\n"
+    return f"{_BELOW}# {folder}\n\n" + "\n".join(lines) + "\n"
 
 
 def _page_of(path: str) -> str:
@@ -98,7 +100,7 @@ def _page_of(path: str) -> str:
 
 def _shown(file: Path, path: str) -> str:
     language = _LANGUAGES.get(file.suffix, "text")
-    return f"# {path}\n\n````{language}\n{file.read_text()}\n````\n"
+    return f"{_BELOW}# {path}\n\n````{language}\n{file.read_text()}\n````\n"
 
 
 def read_page(file: Path) -> str:
