@@ -1,13 +1,12 @@
 """Figures that README and the pages name are those of the archived runs."""
 
-import csv
-import gzip
 import itertools
 import re
 from functools import cache
 from pathlib import Path
 
 import numpy as np
+import pandas
 import pytest
 
 from safe_rl.reporting.archive import read_archive
@@ -221,57 +220,44 @@ def test_what_is_said_of_pushing():
     assert "TRPO's {} and {};".format(*ends) in said
 
 
+def rows_of(name):
+    """Cells of a table of the page on limits, by rows."""
+    page = (ROOT / "docs" / "algorithms" / "limits_measured.md").read_text()
+    table = page.partition(f"<!-- table: {name} -->\n")[2].partition("\n\n")[0]
+    return [line.strip("| ").split(" | ") for line in table.splitlines()[2:]]
+
+
+def ends_of_seeds(epochs, is_late):
+    """Return / cost of every seed over its late epochs."""
+    return [
+        "{:.1f} / {:.0f}".format(
+            *run[is_late(run.steps)][["episode_return", "episode_cost"]].mean()
+        )
+        for _, run in epochs.groupby("seed")
+    ]
+
+
 @pytest.mark.parametrize("name", ["equal_seconds", "equal_steps"])
 def test_worlds_and_batches(name):
-    """Every cell that the page has, from the epochs of the archive; and all of two environments."""
-    page = (ROOT / "docs" / "algorithms" / "limits_measured.md").read_text()
-    table = page.partition(f"<!-- table: {name} -->\n")[2].partition("\n\n")[0].splitlines()[2:]
-    with gzip.open(RESULTS / "worlds" / f"{name}.csv.gz", "rt") as file:
-        rows = list(csv.DictReader(file))
-    batches = sorted({int(row["frames_per_batch"]) for row in rows})
-    told = 0
-    for env, worlds, *cells in (line.strip("| ").split(" | ") for line in table):
-        for batch, cell in zip(batches, "|".join(cells).split("|"), strict=False):
-            of_cell = [
-                row
-                for row in rows
-                if (row["env"], row["num_envs"], row["frames_per_batch"])
-                == (env, worlds, str(batch))
-            ]
-            ends = []
-            for seed in sorted({row["seed"] for row in of_cell}):
-                run = np.array(
-                    [
-                        [float(row[k]) for k in ("steps", "episode_return", "episode_cost")]
-                        for row in of_cell
-                        if row["seed"] == seed
-                    ]
-                )
-                late = run[run[:, 0] > 0.8 * run[-1, 0]]
-                ends.append("{:.1f} / {:.0f}".format(*np.nanmean(late[:, 1:], axis=0)))
-            assert cell.strip() == "; ".join(ends)
-            told += len(ends)
-    keys = ("env", "num_envs", "frames_per_batch", "seed")
-    assert told == len({tuple(r[k] for k in keys) for r in rows if r["env"] in ENVIRONMENTS})
+    epochs = pandas.read_csv(RESULTS / "worlds" / f"{name}.csv.gz")
+    shown = rows_of(name)
+    assert {env for env, *_ in shown} == set(ENVIRONMENTS)
+    for env, worlds, *cells in shown:
+        row = epochs[(epochs.env == env) & (epochs.num_envs == int(worlds))]
+        assert cells == [
+            "; ".join(ends_of_seeds(cell, lambda steps: steps > 0.8 * steps.max()))
+            for _, cell in row.groupby("frames_per_batch")
+        ]
 
 
 def test_what_each_part_contributes():
-    """Every row of the page, from the epochs of the archive; and it has all of them."""
-    page = (ROOT / "docs" / "algorithms" / "limits_measured.md").read_text()
-    table = page.partition("<!-- table: parts -->\n")[2].partition("\n\n")[0].splitlines()[2:]
-    runs = {}
-    with gzip.open(RESULTS / "parts" / "three_million.csv.gz", "rt") as file:
-        for row in csv.DictReader(file):
-            epoch = [float(row[k] or "nan") for k in ("steps", "episode_return", "episode_cost")]
-            by_seed = runs.setdefault((row["without"], row["env"]), {})
-            by_seed.setdefault(row["seed"], []).append(epoch)
-    for line in table:
-        what, *cells = (cell.strip() for cell in line.strip("|").split("|"))
-        for env, *told in (("PointGoal1", *cells[:2]), ("CarGoal1", *cells[2:])):
-            found = [np.array(run) for run in runs.pop((what.partition(":")[0], env)).values()]
-            late = [np.nanmean(run[run[:, 0] > 2e6], axis=0) for run in found]
-            costs = [run[run[:, 0] > 1e6][:, 2] for run in found]
-            mean, above = np.mean([(np.nanmean(c), np.mean(c > 25)) for c in costs], axis=0)
-            ends = ", ".join(f"{end[1]:.1f} / {end[2]:.0f}" for end in late)
+    epochs = pandas.read_csv(RESULTS / "parts" / "three_million.csv.gz")
+    shown = rows_of("parts")
+    assert {what.partition(":")[0] for what, *_ in shown} == set(epochs["without"])
+    for what, *cells in shown:
+        for env, told in zip(ENVIRONMENTS, (cells[:2], cells[2:]), strict=True):
+            runs = epochs[(epochs["without"] == what.partition(":")[0]) & (epochs.env == env)]
+            costs = runs[runs.steps > 1e6].groupby("seed").episode_cost
+            mean, above = costs.mean().mean(), costs.agg(lambda c: (c > 25).mean()).mean()
+            ends = ", ".join(ends_of_seeds(runs, lambda steps: steps > 2e6))
             assert told == [ends, f"{mean:.1f}, {percent(above)}"]
-    assert not runs

@@ -28,7 +28,7 @@ from safe_rl.evaluation.settings import check_options
 ROOT = Path(__file__).resolve().parents[2]
 PAGES = ["README.md", *(str(p.relative_to(ROOT)) for p in sorted((ROOT / "docs").rglob("*.md")))]
 # snippets that have tests of their own, with more to say
-TESTED_ELSEWHERE = ("README.md", "docs/environments.md", "docs/algorithms")
+TESTED_ELSEWHERE = ("README.md", "docs/algorithms")
 # a package that not everybody has
 LACKING = ("comes with the extra", "cannot be imported in this Python")
 BLOCK = re.compile(
