@@ -27,7 +27,7 @@ class SimulatedEnv(ConstrainedEnv):
 
     Args:
         num_envs: Number of worlds, N.
-        device: Where the TensorDicts live; the physics runs on the CPU.
+        device: Where the TensorDicts live.
         num_threads: Threads that step the physics; 0 for one per core.
     """
 

@@ -78,6 +78,7 @@ ROLES: dict[str, Role] = {
     "certificate": Role.MACHINE,  # what is found out about a run, not what it is
     "checkpoint": Role.MACHINE,
     "compile": Role.MACHINE,
+    "env.physics_buffers": Role.MACHINE,
     "*.compile": Role.MACHINE,
     "device": Role.MACHINE,
     "import": Role.MACHINE,
@@ -96,6 +97,8 @@ _ABSENT = {"algo._target_": "safe_rl.algorithms.OnPolicy"}
 # likewise; they say nothing where they have these values
 _SILENT: dict[str, Hashable] = {
     "env.outside": None,
+    "env.physics": "cpu",
+    "env.physics_buffers": 2.0,
     **dict.fromkeys(
         [f"env.{part}_scale" for part in ("mass", "friction", "damping", "strength")], 1.0
     ),

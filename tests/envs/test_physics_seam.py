@@ -55,9 +55,9 @@ class WaitingPhysics:
     def forward(self, mask=None, sensors=True):
         return self._call("forward", mask, sensors)
 
-    def step(self, num_substeps, mocap_path=None, refresh=True):
+    def step(self, num_substeps, mocap_path=None, refresh=True, counts=None):
         path = None if mocap_path is None else mocap_path.double()
-        return self._call("step", num_substeps, path, refresh)
+        return self._call("step", num_substeps, path, refresh, counts)
 
     def rays(self, origin, directions, group, exclude_body):
         distance = self._call("rays", origin.double(), directions.double(), group, exclude_body)

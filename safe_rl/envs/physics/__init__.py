@@ -65,16 +65,21 @@ class Physics(Protocol):
         """
 
     def step(
-        self, num_substeps: Tensor | int, mocap_path: Tensor | None = None, refresh: bool = True
+        self,
+        num_substeps: int,
+        mocap_path: Tensor | None = None,
+        refresh: bool = True,
+        counts: Tensor | None = None,
     ) -> Tensor:
         """Advance by substeps under constant `ctrl`, then bring the outputs up to date.
 
         Args:
-            num_substeps: One number for all, or int64 [N].
+            num_substeps: S, how many.
             mocap_path: Mocap positions before each substep [N, S, nmocap, 3], or None where
                 nothing moves.
             refresh: False leaves the outputs as `mj_step` does: of the state that the last
                 substep evaluated last, which with the Runge-Kutta integrator is its fourth stage.
+            counts: How many each simulation takes instead, at most S, int64 [N].
 
         Returns:
             bool [N]: simulations that failed (non-finite or huge state); their state is finite

@@ -114,17 +114,21 @@ class BatchPhysics(Physics):
         self._disableflags[:] = self._with_sensors
 
     def step(
-        self, num_substeps: Tensor | int, mocap_path: Tensor | None = None, refresh: bool = True
+        self,
+        num_substeps: int,
+        mocap_path: Tensor | None = None,
+        refresh: bool = True,
+        counts: Tensor | None = None,
     ) -> Tensor:
         """Advance by substeps and bring the outputs up to date, see `Physics`."""
         self._check_process()
         # Nobody reads sensors between substeps; without them the result is the same to the bit.
         self._disableflags[:] = self._with_sensors | _NO_SENSORS
-        if isinstance(num_substeps, int):
+        if counts is None:
             self._substeps(num_substeps, mocap_path, None)
         else:
-            for count in num_substeps.unique().tolist():
-                self._substeps(count, mocap_path, (num_substeps == count).numpy())
+            for count in counts.unique().tolist():
+                self._substeps(count, mocap_path, (counts == count).numpy())
         self._disableflags[:] = self._with_sensors
         if refresh:
             self._batch.forward()

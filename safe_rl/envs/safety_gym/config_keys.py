@@ -3,7 +3,7 @@
 Names, defaults and meaning are those of the 2019 Safety Gym engine (paper, section 4.1), so that
 its dictionaries can be used as they are, see also `RETIRED`; `layout_seeds`, `layout_seeds_first`,
 `vases_rots`, `gremlins_rots` and `box_rots` are additions, and so are the scales of the dynamics,
-boundaries and `velocity_limit`.
+`physics`, boundaries and `velocity_limit`.
 """
 
 from __future__ import annotations
@@ -49,6 +49,14 @@ class Vocabulary:
         10, "substeps per step ~ Binomial(n, p): n", POSITIVE.up_to(10_000)
     )
     frameskip_binom_p: float = key(1.0, "and p", PROBABILITY)
+
+    # physics
+    physics: str = key(
+        "cpu", "MuJoCo on the CPU, or MuJoCo Warp on the device", one_of("cpu", "warp")
+    )
+    physics_buffers: float = key(
+        2.0, "room for contacts in Warp, in multiples of the most that a trial met", POSITIVE
+    )
 
     # placement
     placements_extents: Rectangle = key(

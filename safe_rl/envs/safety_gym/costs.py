@@ -179,7 +179,7 @@ def compute_costs(
     costs = torch.stack([sum(magnitudes, start=exceptions), *magnitudes, exceptions])
     if any(row.key not in BUILT_IN for row in rows):
         # NaN is not, either: an indicator would make 0 of it
-        world.physics.check(~(costs >= 0.0), partial(_wrong_cost, rows, costs))
+        world.physics.check(~(costs >= 0.0), partial(_wrong_cost, rows, costs.clone()))
     return costs.gt_(0.0) if config.constrain_indicator else costs
 
 

@@ -42,6 +42,7 @@ from safe_rl.envs.safety_gym.state import (
 )
 from safe_rl.envs.safety_gym.suite import resolve
 from safe_rl.envs.safety_gym.tasks import TASKS, dense_reward, goals_met
+from safe_rl.envs.safety_gym.warp_backend import make_warp_physics
 from safe_rl.envs.simulated import SimulatedEnv, require_episodes
 
 
@@ -67,11 +68,13 @@ class SafetyGymEnv(SimulatedEnv):
         env: name in the suite ("PointGoal1", "Safexp-PointGoal1-v0"), mapping of configuration
             keys, or `SafetyGymConfig`.
         num_envs: number of worlds, N.
-        device: where the TensorDicts live; the physics runs on the CPU.
+        device: where the TensorDicts live. The physics runs on the CPU, or with the key `physics`
+            "warp" there, too.
         seed: integer that determines every draw; None takes one from torch's generator. Row k gets
             the same episodes whatever N and the number of threads are.
         num_threads: threads that step the physics; 0 for one per core.
-        sleep: let resting objects sleep until touched, which is faster and changes no statistics.
+        sleep: let resting objects sleep until touched, which is faster and changes no statistics;
+            with `physics` "warp" they never do.
 
     Raises:
         ConfigError: for an unknown name or key, or a value that cannot be used.
@@ -101,7 +104,7 @@ class SafetyGymEnv(SimulatedEnv):
         super().__init__(num_envs, device, num_threads)
         self._physics_settings += (sleep,)
         self.config = resolve(env)
-        scene = build_scene(self.config, sleep)
+        scene = build_scene(self.config, sleep and self.config.physics == "cpu")
         self._physics = physics = self._make_physics(scene.model, num_threads)
         self.seconds_per_step = self._physics.timestep * self.config.frameskip_binom_n
         self._world = make_world(scene, self._physics)
@@ -121,7 +124,9 @@ class SafetyGymEnv(SimulatedEnv):
         self._announce(scene.model, observed, highest, seed)
 
     def _make_physics(self, model: mujoco.MjModel, num_threads: int) -> Physics:
-        return BatchPhysics(model, self.batch_size[0], num_threads)
+        if self.config.physics == "cpu":
+            return BatchPhysics(model, self.batch_size[0], num_threads)
+        return make_warp_physics(self.config, model, self.batch_size[0], self.device)
 
     @property
     def object_names(self) -> tuple[str, ...]:
@@ -202,16 +207,16 @@ class SafetyGymEnv(SimulatedEnv):
         """Run the substeps of one step; returns the worlds whose physics failed [N]."""
         config, physics = self.config, self._physics
         control = action.clamp(*self._control_range)
-        num_substeps: Tensor | int = config.frameskip_binom_n
+        counts = None
         if config.action_noise > 0.0:
             control = control + control_noise(config, self._step_key(), control.shape[-1])
         if config.frameskip_binom_p < 1.0:
-            num_substeps = draw_substeps(config, self._step_key())
+            counts = draw_substeps(config, self._step_key())
         physics.ctrl.copy_(control)
         path = None
         if self._world.scene.num_targets:
             path = gremlin_path(self._world, physics.time, config.frameskip_binom_n)
-        failed = physics.step(num_substeps, path)
+        failed = physics.step(config.frameskip_binom_n, path, counts=counts)
         refresh(self._world)
         return failed
 

@@ -1,0 +1,72 @@
+"""Kernels that a step needs beside those of MuJoCo Warp: one thread per world, or per number."""
+
+# Warp reads annotations as objects, so they are not deferred here.
+import warp as wp
+
+wp.set_module_options({"enable_backward": False})
+
+
+@wp.kernel
+def follow_path(
+    path: wp.array3d(dtype=float),
+    substep: int,
+    counts: wp.array(dtype=int),
+    live: wp.array2d(dtype=float),
+):
+    """Copy what belongs to a substep, in worlds that take it: path [N, S, K] -> live [N, K]."""
+    world, column = wp.tid()
+    if substep < counts[world]:
+        live[world, column] = path[world, substep, column]
+
+
+@wp.kernel
+def restore_rows(
+    counts: wp.array(dtype=int),
+    substep: int,
+    saved: wp.array2d(dtype=float),
+    live: wp.array2d(dtype=float),
+):
+    """Undo a substep in worlds that do not take it: saved [N, K] -> live [N, K]."""
+    world, column = wp.tid()
+    if substep >= counts[world]:
+        live[world, column] = saved[world, column]
+
+
+@wp.kernel
+def reset_rows(
+    mask: wp.array(dtype=wp.bool), start: wp.array(dtype=float), live: wp.array2d(dtype=float)
+):
+    """Write initial values [K] into the worlds of a mask [N]: live [N, K]."""
+    world, column = wp.tid()
+    if mask[world]:
+        live[world, column] = start[column]
+
+
+@wp.kernel
+def find_failures(live: wp.array2d(dtype=float), largest: float, failed: wp.array(dtype=wp.bool)):
+    """Mark worlds with a number that is larger, or is none."""
+    world, column = wp.tid()
+    if not (wp.abs(live[world, column]) < largest):
+        failed[world] = True
+
+
+@wp.kernel
+def note_overflow(
+    num_contacts: wp.array(dtype=int),
+    num_candidates: wp.array(dtype=int),
+    num_rows: wp.array(dtype=int),
+    contacts: int,
+    rows: int,
+    bits: wp.array(dtype=int),
+    contact_bits: int,
+    row_bits: int,
+    overflow: wp.array(dtype=int),
+):
+    """Set `overflow` [2] where contacts (0) or constraint rows (1) found no room in a world."""
+    world = wp.tid()
+    if num_contacts[0] > contacts or num_candidates[0] > contacts:
+        overflow[0] = 1
+    if (bits[world] & contact_bits) != 0:
+        overflow[0] = 1
+    if num_rows[world] > rows or (bits[world] & row_bits) != 0:
+        overflow[1] = 1

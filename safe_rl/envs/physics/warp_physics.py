@@ -1,0 +1,343 @@
+"""N simulations on MuJoCo Warp, on a CUDA device, or slowly on the CPU, in float32."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Callable, Hashable, Iterator, Sequence
+from contextlib import contextmanager
+from typing import Any
+
+import mujoco
+import mujoco_warp as mjw
+import torch
+import warp as wp
+from torch import Tensor
+
+from safe_rl.envs.physics import Physics
+from safe_rl.envs.physics.warp_kernels import (
+    find_failures,
+    follow_path,
+    note_overflow,
+    reset_rows,
+    restore_rows,
+)
+
+_VIEWS = ("time", "qpos", "qvel", "qacc_warmstart", "ctrl", "mocap_pos", "mocap_quat")
+_OUTPUTS = ("xpos", "xmat", "sensordata", "subtree_com")
+_MEMORY = ("act", "history")
+# What a substep changes, and what a simulation starts from.
+_INTEGRATED = ("time", "qpos", "qvel", "qacc_warmstart", *_MEMORY)
+_INITIAL = (*_INTEGRATED, "ctrl", "mocap_pos", "mocap_quat")
+_LARGEST = 1e10  # MuJoCo's mjMAXVAL: larger numbers are a simulation that failed
+_NO_SENSORS = int(mujoco.mjtDisableBit.mjDSBL_SENSOR)
+_LOST = mjw._src.types.OverflowType
+_LOST_CONTACTS = int(_LOST.BROADPHASE | _LOST.NARROWPHASE | _LOST.CCD | _LOST.CONTACT_MATCH)
+_LOST_ROWS = int(_LOST.NEFC | _LOST.NJMAX_NNZ)
+
+
+class BufferOverflowError(RuntimeError):
+    """More contacts or constraints at once than there is room for; some were left out."""
+
+
+class WarpPhysics(Physics):
+    """N simulations of one model on MuJoCo Warp, in float32.
+
+    Every call replays a graph that was recorded when it was first made: on CUDA one launch for all
+    substeps and the forward pass after them. Simulations do not sleep. What is computed for a mask
+    is computed for all of them, which changes nothing in the others.
+
+    On CUDA, nothing waits for the device: an error that `check` was told of, or an overflow of the
+    buffers, is raised by a later call.
+
+    Args:
+        model: The compiled model.
+        num_envs: Number of simulations, N.
+        device: Where they are.
+        contacts: Contacts that there is room for, per simulation; they share what there is.
+        constraints: Rows of constraints that there is room for in each simulation.
+        outputs: Names of the fields of `MjData` that are read.
+        use_graphs: False launches the kernels one by one, to find errors in them.
+
+    Raises:
+        NotImplementedError: If the model has something that MuJoCo Warp lacks.
+
+    Examples:
+        >>> from safe_rl.envs.safety_gym.building import build_scene
+        >>> from safe_rl.envs.safety_gym.config import SafetyGymConfig
+        >>> model = build_scene(SafetyGymConfig()).model
+        >>> physics = WarpPhysics(model, 2, "cpu", contacts=32, constraints=128)
+        >>> physics.step(num_substeps=10).tolist()
+        [False, False]
+    """
+
+    dtype = torch.float32
+    time: Tensor
+    qpos: Tensor
+    qvel: Tensor
+    qacc_warmstart: Tensor
+    ctrl: Tensor
+    mocap_pos: Tensor
+    mocap_quat: Tensor
+    xpos: Tensor
+    xmat: Tensor
+    sensordata: Tensor
+    subtree_com: Tensor
+
+    def __init__(
+        self,
+        model: mujoco.MjModel,
+        num_envs: int,
+        device: torch.device | str,
+        contacts: int,
+        constraints: int,
+        outputs: Sequence[str] = _OUTPUTS,
+        use_graphs: bool = True,
+    ) -> None:
+        self.device = torch.device(device)
+        self.waits = self.device.type == "cuda"
+        self.timestep = float(model.opt.timestep)
+        self.use_graphs = use_graphs
+        wp.config.log_level = wp.LOG_WARNING
+        wp.init()
+        self._warp_device = wp.device_from_torch(self.device)
+        self._rooms = {"contacts": contacts, "constraints": constraints}
+        self._graphs: dict[Hashable, wp.Graph] = {}
+        self._paths: dict[int, Tensor] = {}
+        self._late = _LateChecks(self.device)
+        with wp.ScopedDevice(self._warp_device):
+            self._model = mjw.put_model(model)
+            self._model.opt.warn_overflow = 0  # printed by a kernel; we raise instead
+            self._model.opt.contact_sensor_maxmatch = contacts
+            # Nobody reads sensors between substeps.
+            self._silent = copy.copy(self._model)
+            self._silent.opt = copy.copy(self._model.opt)
+            self._silent.opt.disableflags |= _NO_SENSORS
+            self._data = mjw.make_data(
+                model, num_envs, nconmax=contacts, njmax=constraints, nvmax=None
+            )
+        self._bind(model, outputs)
+        self._warm_up()
+
+    def _bind(self, model: mujoco.MjModel, outputs: Sequence[str]) -> None:
+        """Share memory with torch, and note what a simulation starts from."""
+        data, num_envs = self._data, self._data.nworld
+        shared = {name: wp.to_torch(getattr(data, name)) for name in (*_VIEWS, *_MEMORY, *outputs)}
+        for name in _VIEWS:
+            setattr(self, name, shared[name])
+        sizes = dict(zip(_MEMORY, (model.na, model.nhistory), strict=True))
+        self.memory = {name: shared[name] for name in _MEMORY if sizes[name]}
+        self.outputs = {name: shared[name] for name in outputs}
+        for name in set(_OUTPUTS).intersection(outputs):
+            setattr(self, name, shared[name])
+        flat = {name: shared[name].view(num_envs, -1) for name in _INITIAL if shared[name].numel()}
+        self._rows = {name: wp.from_torch(values) for name, values in flat.items()}
+        self._start = {name: wp.from_torch(values[0].clone()) for name, values in flat.items()}
+        self._saved = {name: wp.clone(self._rows[name]) for name in _INTEGRATED if name in flat}
+        self._sensors = wp.clone(data.sensordata)
+        whole: dict[str, Any] = {"dtype": torch.int32, "device": self.device}
+        self._counts = torch.zeros(num_envs, **whole)
+        self._overflow = torch.zeros(2, **whole)
+        self._mask = torch.zeros(num_envs, dtype=torch.bool, device=self.device)
+        self._failed = self._mask.clone()
+
+    def _warm_up(self) -> None:
+        """Compile and load all kernels, outside of a recording; nothing of it stays."""
+        self._mask.fill_(True)
+        with self._launching():
+            self._substeps(1, None, True)
+            self._forward(True)
+            self._reset(self._mask)
+        # everything stands in one place here, in contact with everything else
+        self._overflow.zero_()
+        wp.to_torch(self._data.overflow).zero_()
+
+    def reset(self, mask: Tensor) -> None:
+        """Set the simulations in `mask` to the model's initial state, see `Physics`."""
+        self._mask.copy_(mask)
+        self._run("reset", self._reset, self._mask)
+
+    def forward(self, mask: Tensor | None = None, sensors: bool = True) -> None:
+        """Bring the outputs of all simulations up to date with the state, see `Physics`."""
+        self._run(("forward", sensors), self._forward, sensors)
+        self._check_rooms()
+
+    def step(
+        self,
+        num_substeps: int,
+        mocap_path: Tensor | None = None,
+        refresh: bool = True,
+        counts: Tensor | None = None,
+    ) -> Tensor:
+        """Advance by substeps and bring the outputs up to date, see `Physics`."""
+        path = None
+        if counts is None:
+            self._counts.fill_(num_substeps)
+        else:
+            self._counts.copy_(counts)
+        if mocap_path is not None:
+            if num_substeps not in self._paths:
+                self._paths[num_substeps] = torch.empty_like(
+                    mocap_path.flatten(2), dtype=self.dtype
+                )
+            path = self._paths[num_substeps].copy_(mocap_path.flatten(2))
+        key = ("step", num_substeps, path is None, refresh, counts is None)
+        self._run(key, self._step, num_substeps, path, refresh, counts is not None)
+        self._check_rooms()
+        return self.failed()
+
+    def failed(self) -> Tensor:
+        """Return the simulations that failed since the last call, bool [N]."""
+        failed = self._failed.clone()
+        self._failed.zero_()
+        return failed
+
+    def rays(self, origin: Tensor, directions: Tensor, group: int, exclude_body: int) -> Tensor:
+        """Cast rays into the simulations as their state is now, see `Physics`."""
+        num_envs, num_rays = directions.shape[:2]
+        real: dict[str, Any] = {"dtype": self.dtype, "device": self.device}
+        start = origin.to(self.dtype).unsqueeze(1).expand(-1, num_rays, -1).contiguous()
+        distance = torch.empty(num_envs, num_rays, **real)
+        normal = torch.empty(num_envs, num_rays, 3, **real)
+        hit = torch.empty(num_envs, num_rays, dtype=torch.int32, device=self.device)
+        excluded = torch.full((num_rays,), exclude_body, dtype=torch.int32, device=self.device)
+        seen = [int(number == group) for number in range(mujoco.mjNGROUP)]
+        with self._launching():
+            mjw.rays(
+                *(self._model, self._data, wp.from_torch(start, dtype=wp.vec3)),
+                wp.from_torch(directions.to(self.dtype).contiguous(), dtype=wp.vec3),
+                *(mjw._src.types.vec6(*seen), True, wp.from_torch(excluded)),
+                *(
+                    wp.from_torch(distance),
+                    wp.from_torch(hit),
+                    wp.from_torch(normal, dtype=wp.vec3),
+                ),
+            )
+        return distance
+
+    def maybe_any(self, mask: Tensor) -> bool:
+        """Whether a mask may hold anywhere."""
+        return self.waits or bool(mask.any())
+
+    def rows(self, mask: Tensor) -> Tensor:
+        """Return the indices of the rows of a mask, or of all, int64."""
+        return torch.arange(len(mask), device=self.device) if self.waits else mask.nonzero()[:, 0]
+
+    def check(self, wrong: Tensor, error: Callable[[], Exception]) -> None:
+        """Raise an error if `wrong` holds anywhere, now or in a later call."""
+        if self.waits:
+            self._late.add(wrong.any(), error)
+        elif wrong.any():
+            raise error()
+
+    def _check_rooms(self) -> None:
+        self._late.look()
+        self.check(self._overflow > 0, self._no_room)
+
+    def _no_room(self) -> BufferOverflowError:
+        names = [name for name, lost in zip(self._rooms, self._overflow, strict=True) if lost]
+        room = " and ".join(f"{self._rooms[name]} {name}" for name in names or self._rooms)
+        return BufferOverflowError(
+            f"There is room for {room} in a world, and there were more: some were left out. Raise "
+            "env.physics_buffers."
+        )
+
+    @contextmanager
+    def _launching(self) -> Iterator[None]:
+        """Launch on torch's present stream."""
+        with wp.ScopedDevice(self._warp_device):
+            if self.device.type != "cuda":
+                yield
+                return
+            stream = wp.stream_from_torch(torch.cuda.current_stream(self.device))
+            with wp.ScopedStream(stream, sync_enter=False):
+                yield
+
+    def _run(self, key: Hashable, body: Callable[..., None], *arguments: Any) -> None:
+        """Launch kernels: by a graph, which the first call with a key records."""
+        if not self.use_graphs:
+            with self._launching():
+                body(*arguments)
+            return
+        if key not in self._graphs:
+            with wp.ScopedDevice(self._warp_device), wp.ScopedCapture() as capture:
+                body(*arguments)
+            self._graphs[key] = capture.graph
+        with self._launching():
+            wp.capture_launch(self._graphs[key])
+
+    def _step(self, num_substeps: int, path: Tensor | None, refresh: bool, differ: bool) -> None:
+        self._substeps(num_substeps, path, differ)
+        for name in ("qpos", "qvel", "qacc_warmstart"):
+            if name in self._rows:
+                row = self._rows[name]
+                wp.launch(find_failures, row.shape, [row, _LARGEST], [self._warp(self._failed)])
+        self._reset(self._failed)
+        if refresh:
+            self._forward(True)
+
+    def _substeps(self, num_substeps: int, path: Tensor | None, differ: bool) -> None:
+        counts = self._warp(self._counts)
+        for substep in range(num_substeps):
+            if path is not None:
+                live = self._rows["mocap_pos"]
+                wp.launch(follow_path, live.shape, [self._warp(path), substep, counts], [live])
+            if differ:
+                for name, saved in self._saved.items():
+                    wp.copy(saved, self._rows[name])
+            mjw.step(self._silent, self._data)
+            if differ:
+                for name, saved in self._saved.items():
+                    live = self._rows[name]
+                    wp.launch(restore_rows, live.shape, [counts, substep, saved], [live])
+
+    def _forward(self, sensors: bool) -> None:
+        data = self._data
+        if sensors:
+            mjw.forward(self._model, data)
+        else:
+            wp.copy(self._sensors, data.sensordata)
+            mjw.forward(self._silent, data)
+            wp.copy(data.sensordata, self._sensors)
+        lost = [data.overflow, _LOST_CONTACTS, _LOST_ROWS]
+        wp.launch(
+            note_overflow,
+            data.nworld,
+            [data.nacon, data.ncollision, data.nefc, data.naconmax, data.njmax, *lost],
+            [self._warp(self._overflow)],
+        )
+
+    def _reset(self, mask: Tensor) -> None:
+        for name, live in self._rows.items():
+            wp.launch(reset_rows, live.shape, [self._warp(mask), self._start[name]], [live])
+
+    def _warp(self, tensor: Tensor) -> wp.array:
+        return wp.from_torch(tensor)
+
+
+class _LateChecks:
+    """Conditions on a device that the host looks at when it need not wait for them."""
+
+    def __init__(self, device: torch.device) -> None:
+        self._device = device
+        self._pending: list[tuple[Tensor, Any, Callable[[], Exception]]] = []
+
+    def add(self, wrong: Tensor, error: Callable[[], Exception]) -> None:
+        """Note a condition, bool []; `look` raises the error if it holds."""
+        seen = torch.empty((), dtype=torch.bool, device="cpu", pin_memory=self._is_cuda)
+        seen.copy_(wrong, non_blocking=True)
+        done = None
+        if self._is_cuda:
+            done = torch.cuda.Event()
+            done.record(torch.cuda.current_stream(self._device))
+        self._pending.append((seen, done, error))
+
+    def look(self) -> None:
+        """Raise the first error whose condition is known to hold."""
+        while self._pending and (self._pending[0][1] is None or self._pending[0][1].query()):
+            seen, _, error = self._pending.pop(0)
+            if seen:
+                raise error()
+
+    @property
+    def _is_cuda(self) -> bool:
+        return self._device.type == "cuda"

@@ -1,0 +1,83 @@
+"""The worlds on MuJoCo Warp: what it needs to know beforehand, and what it cannot do."""
+
+from __future__ import annotations
+
+import copy
+import functools
+
+import mujoco
+import torch
+
+from safe_rl.envs.errors import ConfigError
+from safe_rl.envs.physics import Physics
+from safe_rl.envs.physics.batch import BatchPhysics
+from safe_rl.envs.safety_gym.config import SafetyGymConfig
+from safe_rl.extras import require_extra
+
+# The trial that finds out how many contacts there are.
+TRIAL_WORLDS, TRIAL_STEPS = 32, 50
+_FEWEST_CONTACTS, _FEWEST_CONSTRAINTS = 32, 128
+_NEARLY = 1e-3  # m: what just does not touch there may do so here
+
+
+def make_warp_physics(
+    config: SafetyGymConfig, model: mujoco.MjModel, num_envs: int, device: torch.device | None
+) -> Physics:
+    """Build the physics of `physics` "warp".
+
+    Args:
+        config: the environment.
+        model: its compiled world.
+        num_envs: number of worlds, N.
+        device: where they are; None is the CPU.
+
+    Raises:
+        ConfigError: if the robot has something that MuJoCo Warp lacks, or for another device.
+        ModuleNotFoundError: if it is not installed.
+    """
+    device = torch.device("cpu") if device is None else device
+    if device.type not in ("cpu", "cuda"):
+        raise ConfigError(f"'physics' warp runs on the devices cpu and cuda, got {device}.")
+    require_extra("mujoco_warp", extra="gpu")
+    from safe_rl.envs.physics.warp_physics import WarpPhysics
+
+    contacts, constraints = most_contacts(config)
+    rooms = (
+        _power_of_two(max(config.physics_buffers * most, fewest))
+        for most, fewest in ((contacts, _FEWEST_CONTACTS), (constraints, _FEWEST_CONSTRAINTS))
+    )
+    try:
+        return WarpPhysics(model, num_envs, device, *rooms)
+    except (NotImplementedError, ValueError) as error:
+        raise ConfigError(
+            f"'physics' warp does not take the robot {config.robot_base!r}: {error} Use 'physics' "
+            "cpu."
+        ) from error
+
+
+@functools.lru_cache(maxsize=64)
+def most_contacts(config: SafetyGymConfig) -> tuple[int, int]:
+    """Largest numbers of contacts and of rows of constraints in a trial of random actions."""
+    from safe_rl.envs.safety_gym.env import SafetyGymEnv
+
+    class Trial(SafetyGymEnv):
+        def _make_physics(self, model: mujoco.MjModel, num_threads: int) -> Physics:
+            outputs = ("xpos", "xmat", "sensordata", "subtree_com", "ncon", "nefc")
+            model = copy.copy(model)
+            model.geom_margin[:] += _NEARLY
+            return BatchPhysics(model, self.batch_size[0], num_threads, outputs)
+
+    env = Trial(config.replace(physics="cpu"), TRIAL_WORLDS, seed=0, sleep=False)
+    env._begin(torch.ones(TRIAL_WORLDS, dtype=torch.bool))
+    generator = torch.Generator().manual_seed(0)
+    counts = [env._physics.outputs[name] for name in ("ncon", "nefc")]
+    found = [int(count.max()) for count in counts]
+    for _ in range(TRIAL_STEPS):
+        env._advance(2 * torch.rand(env.action_spec.shape, generator=generator) - 1)
+        found = [max(most, int(count.max())) for most, count in zip(found, counts, strict=True)]
+    return found[0], found[1]
+
+
+def _power_of_two(number: float) -> int:
+    """The next one: kernels are compiled for sizes, of which there should be few."""
+    return 1 << (max(1, int(number)) - 1).bit_length()

@@ -1,0 +1,139 @@
+"""MuJoCo Warp beside MuJoCo, on Warp's CPU device."""
+
+import pickle
+
+import pytest
+import torch
+
+pytest.importorskip("mujoco_warp")
+
+from safe_rl.envs import ConfigError, SafetyGymEnv
+from safe_rl.envs.physics.batch import BatchPhysics
+from safe_rl.envs.physics.warp_physics import BufferOverflowError, WarpPhysics
+from safe_rl.envs.safety_gym.building import build_scene
+from safe_rl.envs.safety_gym.suite import resolve
+
+# kernels are compiled once for all tests, which takes a minute
+pytestmark = pytest.mark.long
+BUSY = {"robot_base": "point", "gremlins_num": 1, "vases_num": 1, "buttons_num": 1, "task": "goal"}
+BUSY |= {"constrain_gremlins": True, "constrain_vases": True, "observe_gremlins": True}
+
+
+def pair(name, num_envs=8, **keys):
+    """The same worlds on both backends."""
+    config = resolve(name).replace(**keys)
+    return (
+        SafetyGymEnv(config, num_envs, seed=0, sleep=False),
+        SafetyGymEnv(config.replace(physics="warp"), num_envs, seed=0),
+    )
+
+
+def steps_from_equal_states(cpu, warp, num_steps):
+    """Steps of both from the same states, [(output, state) of cpu, of warp]."""
+    start = cpu.reset()
+    warp.reset()
+    torch.manual_seed(0)
+    for _ in range(num_steps):
+        warp.set_state(cpu.get_state())
+        start.set("action", cpu.action_spec.rand())
+        yield [(env._step(start), env.get_state()) for env in (cpu, warp)]
+
+
+def largest_difference(cpu, warp, num_steps=10):
+    """How far positions are apart after one step, [worlds x steps]."""
+    apart = []
+    for (step, state), (other, following) in steps_from_equal_states(cpu, warp, num_steps):
+        assert step.keys() == other.keys()
+        apart.append((state["qpos"] - following["qpos"]).abs().amax(-1))
+        for key in ("cost", "goal_met", "terminated", "truncated"):
+            torch.testing.assert_close(step[key], other[key], atol=1e-4, rtol=1e-3)
+    return torch.cat(apart)
+
+
+@pytest.mark.parametrize(
+    ("name", "most"),
+    [
+        ("PointGoal1", 1e-5),
+        pytest.param("PointButton2", 1e-4, marks=pytest.mark.slow),
+        pytest.param("CarGoal1", 1e-3, marks=pytest.mark.slow),
+        pytest.param("CarPush2", 1e-3, marks=pytest.mark.slow),
+    ],
+)
+def test_one_step_is_that_of_mujoco(name, most):
+    assert largest_difference(*pair(name)).quantile(0.95) < most
+
+
+def test_rays_see_what_mujoco_sees():
+    cpu, warp = pair("PointGoal1", lidar_type="natural")
+    torch.testing.assert_close(
+        cpu.reset()["observation"], warp.reset()["observation"], atol=1e-4, rtol=1e-4
+    )
+
+
+def test_graphs_replay_what_is_launched_one_by_one():
+    graphs, eager = (pair("PointGoal1")[1] for _ in range(2))
+    eager._physics.use_graphs = False
+    for (step, state), (other, following) in steps_from_equal_states(graphs, eager, 3):
+        assert torch.equal(step["observation"], other["observation"])
+        assert all(torch.equal(value, following[key]) for key, value in state.items())
+
+
+def test_a_resumed_and_a_pickled_environment_continue_alike():
+    env = SafetyGymEnv(resolve(BUSY | {"physics": "warp"}), 4, seed=3)
+    env.rollout(5)
+    copied = pickle.loads(pickle.dumps(env))
+    action = env.action_spec.rand()
+    start = env.get_state()
+    first = env._step(env.fake_tensordict().set("action", action))
+    second = copied._step(env.fake_tensordict().set("action", action))
+    env.set_state(start)
+    third = env._step(env.fake_tensordict().set("action", action))
+    for key, value in first.items():
+        torch.testing.assert_close(value, second[key], atol=1e-4, rtol=1e-4)
+        torch.testing.assert_close(value, third[key], atol=1e-4, rtol=1e-4)
+    assert env.get_positions()["gremlins"].shape == (4, 1, 3)
+
+
+@pytest.fixture(scope="module")
+def two():
+    """Two simulations of a small model, and the model."""
+    model = build_scene(resolve(BUSY)).model
+    return model, WarpPhysics(model, 2, "cpu", contacts=64, constraints=256)
+
+
+def test_a_failure_is_reported_and_leaves_the_others_alone(two):
+    physics = two[1]
+    physics.reset(torch.ones(2, dtype=torch.bool))
+    physics.qvel[1, 0] = torch.nan
+    assert physics.step(3).tolist() == [False, True]
+    assert physics.qpos.isfinite().all()
+    assert physics.step(3).tolist() == [False, False]
+
+
+def test_each_simulation_takes_its_own_number_of_substeps(two):
+    model, physics = two
+    everywhere = torch.ones(2, dtype=torch.bool)
+    path = torch.linspace(0, 1, 4 * physics.mocap_pos[0].numel()).view(1, 4, -1, 3)
+    cpu = BatchPhysics(model, 2, 1)
+    for simulations in (cpu, physics):
+        simulations.reset(everywhere)
+        simulations.ctrl.fill_(0.5)
+        simulations.step(
+            4, path.expand(2, -1, -1, -1).to(simulations.dtype), counts=torch.tensor([4, 1])
+        )
+    for name in ("time", "qpos", "mocap_pos", "sensordata"):
+        got, wanted = getattr(physics, name).double(), getattr(cpu, name)
+        torch.testing.assert_close(got, wanted, atol=1e-3, rtol=1e-3)
+
+
+def test_a_lack_of_room_is_an_error_that_names_the_key(two):
+    with pytest.raises(BufferOverflowError, match=r"room for 1 contacts.*env\.physics_buffers"):
+        physics = WarpPhysics(two[0], 2, "cpu", contacts=1, constraints=256)
+        physics.step(5)
+
+
+def test_what_warp_lacks_is_refused(tmp_path):
+    with pytest.raises(ConfigError, match="'physics' warp runs on the devices cpu and cuda"):
+        SafetyGymEnv(resolve(BUSY | {"physics": "warp"}), device="meta")
+    with pytest.raises(ConfigError, match="'physics' must be one of"):
+        SafetyGymEnv({"physics": "jax"})
