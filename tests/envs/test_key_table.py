@@ -8,6 +8,7 @@ from registrations import register_mines, undone
 from safe_rl.envs import ConfigError, SafetyGymConfig, key_table
 
 OUTSIDE = {
+    "one of ('cpu', 'warp')": "jax",
     "greater than 0": 0,
     "0 or more": -1,
     "a probability between 0 and 1": 1.5,

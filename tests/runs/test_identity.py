@@ -39,7 +39,7 @@ def test_every_row_is_about_a_key_that_exists(all_keys):
         if row.startswith("*."):
             assert any(key.endswith(row[1:]) for key in keys)
         else:
-            assert row in keys or row.startswith("hydra")
+            assert row in keys or row.startswith(("hydra", "env."))
 
 
 def test_folders_of_a_sweep_name_all_but_the_machine_and_what_is_in_the_path(all_keys):

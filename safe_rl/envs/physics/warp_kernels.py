@@ -1,6 +1,7 @@
 """Kernels that a step needs beside those of MuJoCo Warp: one thread per world, or per number."""
 
-# Warp reads annotations as objects, so they are not deferred here.
+# Warp reads annotations as objects, which are no types for mypy.
+# mypy: ignore-errors
 import warp as wp
 
 wp.set_module_options({"enable_backward": False})

@@ -112,7 +112,7 @@ class WarpPhysics(Physics):
             self._silent = copy.copy(self._model)
             self._silent.opt = copy.copy(self._model.opt)
             self._silent.opt.disableflags |= _NO_SENSORS
-            self._data = mjw.make_data(
+            self._data: Any = mjw.make_data(
                 model, num_envs, nconmax=contacts, njmax=constraints, nvmax=None
             )
         self._bind(model, outputs)
@@ -130,10 +130,12 @@ class WarpPhysics(Physics):
         for name in set(_OUTPUTS).intersection(outputs):
             setattr(self, name, shared[name])
         flat = {name: shared[name].view(num_envs, -1) for name in _INITIAL if shared[name].numel()}
-        self._rows = {name: wp.from_torch(values) for name, values in flat.items()}
+        self._rows: dict[str, Any] = {name: wp.from_torch(values) for name, values in flat.items()}
         self._start = {name: wp.from_torch(values[0].clone()) for name, values in flat.items()}
-        self._saved = {name: wp.clone(self._rows[name]) for name in _INTEGRATED if name in flat}
-        self._sensors = wp.clone(data.sensordata)
+        self._saved: dict[str, Any] = {
+            name: wp.empty_like(self._rows[name]) for name in _INTEGRATED if name in flat
+        }
+        self._sensors: Any = wp.zeros_like(data.sensordata)
         whole: dict[str, Any] = {"dtype": torch.int32, "device": self.device}
         self._counts = torch.zeros(num_envs, **whole)
         self._overflow = torch.zeros(2, **whole)
@@ -175,11 +177,10 @@ class WarpPhysics(Physics):
         else:
             self._counts.copy_(counts)
         if mocap_path is not None:
+            columns = mocap_path.flatten(2)
             if num_substeps not in self._paths:
-                self._paths[num_substeps] = torch.empty_like(
-                    mocap_path.flatten(2), dtype=self.dtype
-                )
-            path = self._paths[num_substeps].copy_(mocap_path.flatten(2))
+                self._paths[num_substeps] = torch.empty_like(columns, dtype=self.dtype)
+            path = self._paths[num_substeps].copy_(columns)
         key = ("step", num_substeps, path is None, refresh, counts is None)
         self._run(key, self._step, num_substeps, path, refresh, counts is not None)
         self._check_rooms()
@@ -310,7 +311,7 @@ class WarpPhysics(Physics):
         for name, live in self._rows.items():
             wp.launch(reset_rows, live.shape, [self._warp(mask), self._start[name]], [live])
 
-    def _warp(self, tensor: Tensor) -> wp.array:
+    def _warp(self, tensor: Tensor) -> Any:
         return wp.from_torch(tensor)
 
 

@@ -42,12 +42,12 @@ def make_warp_physics(
     from safe_rl.envs.physics.warp_physics import WarpPhysics
 
     contacts, constraints = most_contacts(config)
-    rooms = (
+    room = [
         _power_of_two(max(config.physics_buffers * most, fewest))
         for most, fewest in ((contacts, _FEWEST_CONTACTS), (constraints, _FEWEST_CONSTRAINTS))
-    )
+    ]
     try:
-        return WarpPhysics(model, num_envs, device, *rooms)
+        return WarpPhysics(model, num_envs, device, contacts=room[0], constraints=room[1])
     except (NotImplementedError, ValueError) as error:
         raise ConfigError(
             f"'physics' warp does not take the robot {config.robot_base!r}: {error} Use 'physics' "
