@@ -4,6 +4,9 @@ import pickle
 
 import pytest
 import torch
+from commands import run_train
+from looking import no_looks
+from omegaconf import OmegaConf
 
 pytest.importorskip("mujoco_warp")
 
@@ -12,6 +15,7 @@ from safe_rl.envs.physics.batch import BatchPhysics
 from safe_rl.envs.physics.warp_physics import BufferOverflowError, WarpPhysics
 from safe_rl.envs.safety_gym.building import build_scene
 from safe_rl.envs.safety_gym.suite import resolve
+from safe_rl.runs.identity import experiment_of
 
 # kernels are compiled once for all tests, which takes a minute
 pytestmark = pytest.mark.long
@@ -92,6 +96,54 @@ def test_a_resumed_and_a_pickled_environment_continue_alike():
         torch.testing.assert_close(value, second[key], atol=1e-4, rtol=1e-4)
         torch.testing.assert_close(value, third[key], atol=1e-4, rtol=1e-4)
     assert env.get_positions()["gremlins"].shape == (4, 1, 3)
+
+
+@pytest.mark.parametrize(
+    "keys",
+    [
+        BUSY | {"action_noise": 0.1, "frameskip_binom_p": 0.9, "goal_size": 3.0},
+        BUSY | {"lidar_type": "natural", "terminate_resample_failure": False},
+    ],
+    ids=["noise", "natural lidar"],
+)
+def test_a_step_does_not_wait_for_the_device(keys, monkeypatch):
+    env = SafetyGymEnv(resolve(keys | {"physics": "warp"}), 2, seed=0)
+    state = env.reset()
+    env._step(state.set("action", env.action_spec.rand()))
+    # as on CUDA, where what may be wrong is looked at when that costs nothing
+    monkeypatch.setattr(env._physics, "waits", True)
+    monkeypatch.setattr(env._physics._late, "look", lambda: None)
+    state.set("action", env.action_spec.rand())
+    with no_looks(env._physics, monkeypatch) as mode:
+        following = env._step(state)
+    assert mode.num_calls > 50
+    assert following["observation"].isfinite().all()
+    monkeypatch.undo()
+    env._physics._late.look()
+
+
+def test_what_is_wrong_on_the_device_is_said_by_a_later_call(two):
+    physics = two[1]
+    physics.waits = True
+    physics.check(torch.tensor([False, True]), lambda: ValueError("late"))
+    with pytest.raises(ValueError, match="late"):
+        physics.step(3)
+    physics.waits = False
+
+
+@pytest.mark.parametrize("algo", ["ppo_lagrangian", "sac_lagrangian"])
+def test_training_with_the_preset_for_gpus(algo, tmp_path):
+    run_train(
+        *("env=PointGoal1", f"algo={algo}", "preset=gpu", "num_envs=4", "frames=64"),
+        *("frames_per_batch=32", "certificate.episodes=0", "logger=none", "num_threads=1"),
+        f"hydra.run.dir={tmp_path}",
+    )
+    config = OmegaConf.load(next(tmp_path.rglob("config.yaml")))
+    assert config.env.physics == "warp"
+    cpu = OmegaConf.merge(config, {"env": {"physics": "cpu"}})
+    named = [experiment_of(OmegaConf.to_container(each, resolve=True)) for each in (config, cpu)]
+    assert named[0] != named[1]
+    assert named[0]["env.physics"] == "warp"
 
 
 @pytest.fixture(scope="module")
