@@ -24,7 +24,7 @@ PARTS = {
     "ranges": (),
     "targets": ("naming",),
     "parameters": ("ranges", "targets"),
-    "envs": ("lazy", "naming", "processes", "ranges", "targets"),
+    "envs": ("extras", "lazy", "naming", "processes", "ranges", "targets"),
     "objectives": ("naming", "ranges"),
     "collectors": ("extras", "files", "naming", "processes", "ranges"),
     "models": ("processor", "ranges"),
@@ -54,7 +54,8 @@ PARTS = {
 FLOORS = {
     "envs": (
         ("errors", "opengl", "rng", "physics"),
-        ("costs", "physics.batch", "physics.dynamics", "pictures"),
+        ("costs", "physics.batch", "physics.dynamics", "physics.warp_kernels", "pictures"),
+        ("physics.warp_physics",),
         ("contract",),
         ("simulated",),
         # Safety Gym: records, then tables of rules, then worlds, and what is seen of them.
@@ -67,7 +68,7 @@ FLOORS = {
         ("safety_gym.bodies", "safety_gym.layouts", "safety_gym.state", "safety_gym.suite"),
         ("safety_gym.building", "safety_gym.draws"),
         ("safety_gym.display", "safety_gym.lidar"),
-        ("safety_gym.observations", "safety_gym.renderer"),
+        ("safety_gym.observations", "safety_gym.renderer", "safety_gym.warp_backend"),
         ("safety_gym.env",),
         ("safety_gym", "extending"),
         # The velocity family: rows, configurations, then functions over tensors, the environment.

@@ -126,7 +126,7 @@ class SafetyGymEnv(SimulatedEnv):
     def _make_physics(self, model: mujoco.MjModel, num_threads: int) -> Physics:
         if self.config.physics == "cpu":
             return BatchPhysics(model, self.batch_size[0], num_threads)
-        return make_warp_physics(self.config, model, self.batch_size[0], self.device)
+        return make_warp_physics(self.config, model, self.batch_size[0], self.device, SafetyGymEnv)
 
     @property
     def object_names(self) -> tuple[str, ...]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import functools
+from typing import Any
 
 import mujoco
 import torch
@@ -21,7 +22,11 @@ _NEARLY = 1e-3  # m: what just does not touch there may do so here
 
 
 def make_warp_physics(
-    config: SafetyGymConfig, model: mujoco.MjModel, num_envs: int, device: torch.device | None
+    config: SafetyGymConfig,
+    model: mujoco.MjModel,
+    num_envs: int,
+    device: torch.device | None,
+    env_class: Any,
 ) -> Physics:
     """Build the physics of `physics` "warp".
 
@@ -30,6 +35,7 @@ def make_warp_physics(
         model: its compiled world.
         num_envs: number of worlds, N.
         device: where they are; None is the CPU.
+        env_class: `SafetyGymEnv`, for a trial on the CPU.
 
     Raises:
         ConfigError: if the robot has something that MuJoCo Warp lacks, or for another device.
@@ -41,7 +47,7 @@ def make_warp_physics(
     require_extra("mujoco_warp", extra="gpu")
     from safe_rl.envs.physics.warp_physics import WarpPhysics
 
-    contacts, constraints = most_contacts(config)
+    contacts, constraints = most_contacts(config, env_class)
     room = [
         _power_of_two(max(config.physics_buffers * most, fewest))
         for most, fewest in ((contacts, _FEWEST_CONTACTS), (constraints, _FEWEST_CONSTRAINTS))
@@ -56,11 +62,10 @@ def make_warp_physics(
 
 
 @functools.lru_cache(maxsize=64)
-def most_contacts(config: SafetyGymConfig) -> tuple[int, int]:
+def most_contacts(config: SafetyGymConfig, env_class: Any) -> tuple[int, int]:
     """Largest numbers of contacts and of rows of constraints in a trial of random actions."""
-    from safe_rl.envs.safety_gym.env import SafetyGymEnv
 
-    class Trial(SafetyGymEnv):
+    class Trial(env_class):
         def _make_physics(self, model: mujoco.MjModel, num_threads: int) -> Physics:
             outputs = ("xpos", "xmat", "sensordata", "subtree_com", "ncon", "nefc")
             model = copy.copy(model)
