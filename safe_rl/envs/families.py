@@ -2,10 +2,10 @@
 
 The key `_target_` of a node names its family: a function or class that is called with a mapping of
 the node's other keys, and `num_envs=`, `device=`, `seed=` and `num_threads=`. A node without one is
-Safety Gym's. Nothing here imports what builds environments, so that names and keys are known fast.
+Safety Gym's. What builds environments is not imported here, so that start-up is quick.
 
-A configuration may come from somebody else. So an `id` that has a library import a module, or that
-names a class which is not listed here, is refused: the user names such a module by `import=`.
+A configuration may come from somebody else: an `id` that makes a library import a module, or names
+a class that is not listed here, is refused. The user names such a module by `import=`.
 """
 
 from __future__ import annotations
@@ -63,7 +63,7 @@ class ForeignFamily:
 
 
 def complete_foreign(family: ForeignFamily, node: Mapping[str, Any]) -> dict[str, Any]:
-    """Fill a node up: the costs and the length of episodes are found out where they are None.
+    """Complete a node: cost keys and the length of episodes are found out where they are None.
 
     Raises:
         ConfigError: For an unknown key or id, or an environment that the algorithms cannot use.
@@ -256,7 +256,7 @@ def env_node(name: str) -> dict[str, Any]:
 
 
 def complete_env(node: Mapping[str, Any]) -> dict[str, Any]:
-    """Fill up a node that holds only what differs from its family's defaults.
+    """Complete a node that has only what differs from the defaults of its family.
 
     Args:
         node: As `make_env` takes it; what it holds stays as it is.

@@ -18,16 +18,6 @@ from gymnasium.wrappers import TransformAction, TransformObservation
 from safe_rl.envs.costs import COST, CostRange
 from safe_rl.envs.errors import ConfigError
 
-__all__ = [
-    "CheckedSteps",
-    "CostsOutside",
-    "SixValues",
-    "adapt",
-    "make_adapted",
-    "plain_actions",
-    "stretch",
-]
-
 _ALWAYS = 10  # steps in a row after which a cost is expected at every step
 COST_SUM = "cost_sum"  # Safety-Gymnasium's name for the sum of all kinds
 

@@ -35,12 +35,7 @@ def make_safety_gymnasium(
 ) -> GymnasiumEnv:
     """Make environments of an id that `safety_gymnasium.make` knows.
 
-    Args:
-        config: `id` and any other key of conf/env/safety_gymnasium.yaml.
-        num_envs: Number of environments, N.
-        device: Where the TensorDicts live.
-        seed: Determines every row; rows of different seeds have nothing in common.
-        num_threads: Not used by these environments.
+    The arguments are those of `make_gymnasium`, with the keys of conf/env/safety_gymnasium.yaml.
 
     Raises:
         ConfigError: For an unknown key or id, or if the package cannot be imported.

@@ -23,17 +23,6 @@ from safe_rl.envs.simulated import SimulatedEnv
 from safe_rl.envs.velocity.velocity_config import VELOCITY_SUITE
 from safe_rl.envs.velocity.velocity_env import VelocityEnv
 
-__all__ = [
-    "Config",
-    "Observation",
-    "Worlds",
-    "batch_of",
-    "choose",
-    "final_infos",
-    "take",
-    "with_masks",
-]
-
 NUM_SEEDS = 2**62
 
 Observation = np.ndarray | dict[str, np.ndarray]

@@ -111,18 +111,7 @@ class WorldRenderer:
     def frames(
         self, rows: list[int], has_cost: Tensor, camera: Camera, width: int, height: int
     ) -> np.ndarray:
-        """Draw some of the worlds.
-
-        Args:
-            rows: which, R of them.
-            has_cost: which of all worlds incurred a cost in the last step, bool [N].
-            camera: a name, or a custom camera.
-            width: of a frame [pixels].
-            height: of a frame [pixels].
-
-        Returns:
-            RGB, uint8 [R, height, width, 3].
-        """
+        """Draw worlds `rows`, with a sphere where `has_cost` [N]: uint8 [R, height, width, 3]."""
         readings = self._readings()
         labels = self._world.scene.names if self._config.render_labels else ()
         frames = np.empty((len(rows), height, width, 3), dtype=np.uint8)

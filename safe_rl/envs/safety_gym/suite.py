@@ -1,9 +1,8 @@
-"""The benchmark suite: names, configurations, and the one way from a name to an environment.
+"""The benchmark suite: names and configurations.
 
-27 environments, {Point, Car, Doggo} x {Goal, Button, Push} x {0, 1, 2} (paper section 4.2). Beside
-them stand debug environments, {Point, Car, Doggo} x {Run, Circle}, the same tasks within
-boundaries, {Run1, Circle1, Circle2}, and a variant of every environment with the robot's camera in
-a nested observation, {name}Vision.
+27 environments, {Point, Car, Doggo} x {Goal, Button, Push} x {0, 1, 2} (paper section 4.2). There
+are also debug environments, {Point, Car, Doggo} x {Run, Circle}, the same tasks within boundaries,
+{Run1, Circle1, Circle2}, and {name}Vision, each with the robot's camera in a nested observation.
 """
 
 from __future__ import annotations

@@ -3,8 +3,8 @@
 Dense rewards are differences of measurements between two steps; the environment keeps the earlier
 one and measures again when a new goal is drawn, so that changing goals costs nothing.
 
-Commands that only compose a configuration read the table too. They need no torch, which takes more
-than a second to import: functions here import it themselves, where tensors' methods do not do.
+Commands that only compose a configuration read the table too and must start quickly: functions
+here import torch themselves, where methods of tensors are not enough.
 """
 
 from __future__ import annotations

@@ -70,20 +70,21 @@ def _inside(value: Tensor, interval: Interval | None) -> Tensor:
     return (low < value) & (value < high)
 
 
+# When a robot is healthy: configuration, positions [N, nq], velocities [N, nv] -> bool [N].
 def hopper(config: VelocityConfig, qpos: Tensor, qvel: Tensor) -> Tensor:
-    """Torso high and upright, everything else within bounds: [N, nq], [N, nv] -> bool [N]."""
+    """Torso high and upright, everything else within bounds."""
     state = torch.cat([qpos[:, 2:], qvel], -1)
     return walker2d(config, qpos, qvel) & _inside(state, config.healthy_state_range).all(-1)
 
 
 def walker2d(config: VelocityConfig, qpos: Tensor, qvel: Tensor) -> Tensor:
-    """Torso high and upright: [N, nq], [N, nv] -> bool [N]."""
+    """Torso high and upright."""
     upright = _inside(qpos[:, 2], config.healthy_angle_range)
     return _inside(qpos[:, 1], config.healthy_z_range) & upright
 
 
 def ant(config: VelocityConfig, qpos: Tensor, qvel: Tensor) -> Tensor:
-    """Torso neither on the ground nor in the air, bounds included: -> bool [N]."""
+    """Torso neither on the ground nor in the air, bounds included."""
     assert config.healthy_z_range is not None
     low, high = config.healthy_z_range
     finite = qpos.isfinite().all(-1) & qvel.isfinite().all(-1)
@@ -91,7 +92,7 @@ def ant(config: VelocityConfig, qpos: Tensor, qvel: Tensor) -> Tensor:
 
 
 def humanoid(config: VelocityConfig, qpos: Tensor, qvel: Tensor) -> Tensor:
-    """Torso high: [N, nq], [N, nv] -> bool [N]."""
+    """Torso high."""
     return _inside(qpos[:, 2], config.healthy_z_range)
 
 

@@ -26,16 +26,7 @@ class RobotRenderer(Pictures):
     def frames(
         self, rows: list[int], has_cost: Tensor, camera: Camera, width: int, height: int
     ) -> np.ndarray:
-        """Draw some robots: RGB, uint8 [R, height, width, 3].
-
-        Args:
-            rows: Which, R of them.
-            has_cost: Which of all incurred a cost in the last step, bool [N].
-            camera: "free" (beside the robot and moving with it), a name in the model, or a
-                custom camera.
-            width: Of a frame [pixels].
-            height: Of a frame [pixels].
-        """
+        """Draw robots `rows`, with a sphere where `has_cost` [N]: uint8 [R, height, width, 3]."""
         frames = np.empty((len(rows), height, width, 3), dtype=np.uint8)
         for frame, row in zip(frames, rows, strict=True):
             self.data.qpos[:] = self._physics.qpos[row].numpy()
