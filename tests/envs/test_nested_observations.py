@@ -2,7 +2,6 @@
 
 import pytest
 import torch
-from torchrl.collectors import Collector
 from torchrl.envs import TransformedEnv
 from torchrl.envs.transforms import CatTensors, FlattenObservation
 from torchrl.envs.utils import check_env_specs
@@ -64,12 +63,6 @@ def test_later_steps_leave_earlier_results_alone():
     assert all(torch.equal(first[key], kept[key]) for key in kept.keys(True, True))
 
 
-def test_partial_resets():
-    env = make("PointGoal1", observation_flatten=False, num_steps=2)
-    rollout = env.rollout(7, break_when_any_done=False)
-    assert rollout["next", "truncated"].sum() == 3 * 3
-
-
 def test_torchrl_can_put_it_together_again():
     nested = make("CarGoal1", observation_flatten=False)
     names = sorted(nested.observation_layout)
@@ -79,10 +72,3 @@ def test_torchrl_can_put_it_together_again():
     env.append_transform(CatTensors(keys, "flat", sort=False))
     flat = make("CarGoal1")
     assert torch.equal(env.reset()["flat"], flat.reset()["observation"])
-
-
-def test_collectors_gather_it():
-    env = make("CarGoal1", observation_flatten=False)
-    collector = Collector(env, frames_per_batch=12, total_frames=12)
-    (batch,) = list(collector)
-    assert batch["observation", "ballquat_rear"].shape == (3, 4, 3, 3)
