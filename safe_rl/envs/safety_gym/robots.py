@@ -51,12 +51,14 @@ def robot_files(path: Path) -> list[Path]:
     found: dict[Path, int] = {}
     folders = dict.fromkeys(("mesh", "texture"), path.parent)
     if _weigh(path, path.parent, folders, found) > MOST_ELEMENTS:
-        raise _refused(path, f"describes more than {MOST_ELEMENTS:,} elements: 'count' is too high")
+        raise _refused(
+            path, f"describes more than {MOST_ELEMENTS:,} elements: 'count' is too high."
+        )
     return list(found)
 
 
 def _refused(path: Path, what: str) -> ConfigError:
-    return ConfigError(f"'robot_base': {path} {what}.")
+    return ConfigError(f"'robot_base': {path} {what}")
 
 
 def _weigh(path: Path, home: Path, folders: dict[str, Path], found: dict[Path, int]) -> float:
@@ -85,7 +87,7 @@ def _weigh(path: Path, home: Path, folders: dict[str, Path], found: dict[Path, i
         """Number of elements that one stands for, itself and copies included."""
         for pair in _CELLS:
             if math.prod(_number(element.get(key, "1")) for key in pair) > MOST_CELLS:
-                raise _refused(path, f"has a '{element.tag}' with too large {' and '.join(pair)}")
+                raise _refused(path, f"has a '{element.tag}' with too large {' and '.join(pair)}.")
         inside = 1 + sum(map(weight, element))
         for file in _files(element, home, folders):
             if file.suffix == ".xml":
@@ -182,26 +184,22 @@ def load_robot(base: str) -> Robot:
     return Robot(spec, model.nbody - 1, model.nsensor, _is_planar(model, path))
 
 
-def _lacks(path: Path, what: str) -> ConfigError:
-    return ConfigError(f"'robot_base': {path} {what}")
-
-
 def _check_numbers(model: mujoco.MjModel, path: Path) -> None:
     """Refuse numbers that MuJoCo accepts but cannot simulate."""
     if not 0.0 < model.opt.timestep < np.inf:
-        raise _lacks(path, f"has the timestep {model.opt.timestep}: it must be greater than 0.")
+        raise _refused(path, f"has the timestep {model.opt.timestep}: it must be greater than 0.")
     for name in (name for name in dir(model) if name.startswith(_OF_THE_ROBOT)):
         values = getattr(model, name)
         if isinstance(values, np.ndarray) and values.dtype.kind == "f" and np.isnan(values).any():
-            raise _lacks(path, f"has NaN in '{name}': give every mass, size and gain a number.")
+            raise _refused(path, f"has NaN in '{name}': give every mass, size and gain a number.")
     if not (np.isfinite(model.body_mass).all() and np.isfinite(model.body_inertia).all()):
-        raise _lacks(path, "has a body of infinite mass or inertia.")
+        raise _refused(path, "has a body of infinite mass or inertia.")
     for (low, high), limited in zip(
         model.actuator_ctrlrange.tolist(), model.actuator_ctrllimited, strict=True
     ):
         # MuJoCo takes a reversed range for none.
         if not math.isfinite(high - low) or low > high or (limited and low == high):
-            raise _lacks(
+            raise _refused(
                 path,
                 f"has the control range [{low}, {high}]: every 'ctrlrange' must be finite, the "
                 "lower bound first.",
@@ -212,21 +210,23 @@ def _check_body(model: mujoco.MjModel, path: Path) -> None:
     names = [model.body(i).name for i in range(1, model.nbody)]
     if "robot" not in names:
         hint = nearest("robot", names) or f" Its bodies are {names}."
-        raise _lacks(path, f"has no body named 'robot'.{hint} Name the robot's root body so.")
+        raise _refused(path, f"has no body named 'robot'.{hint} Name the robot's root body so.")
     body = model.body("robot").id
     if model.body_parentid[body] != 0:
         parent = model.body(model.body_parentid[body]).name
-        raise _lacks(path, f"has its body 'robot' inside '{parent}': put it into the worldbody.")
+        raise _refused(path, f"has its body 'robot' inside '{parent}': put it into the worldbody.")
     if model.body_quat[body].tolist() != [1, 0, 0, 0]:
-        raise _lacks(
+        raise _refused(
             path,
             "turns its body 'robot': a reset sets the body upright with a random yaw, so give the "
             "rotation to geoms or child bodies instead.",
         )
     if model.nu == 0:
-        raise _lacks(path, "has no actuators: add at least one, for there is no action without.")
+        raise _refused(path, "has no actuators: add at least one, for there is no action without.")
     if model.nmocap:
-        raise _lacks(path, "has mocap bodies, which no robot can move: make them ordinary bodies.")
+        raise _refused(
+            path, "has mocap bodies, which no robot can move: make them ordinary bodies."
+        )
 
 
 def _is_planar(model: mujoco.MjModel, path: Path) -> bool:
@@ -236,18 +236,18 @@ def _is_planar(model: mujoco.MjModel, path: Path) -> bool:
     joints = slice(first, first + min(number, 3))
     types = tuple(model.jnt_type[joints])
     if first > 0:
-        raise _lacks(path, "has joints before those of the body 'robot': put that body first.")
+        raise _refused(path, "has joints before those of the body 'robot': put that body first.")
     if types[:1] == (mujoco.mjtJoint.mjJNT_FREE,):
         return False
     if types != _PLANAR_JOINTS or model.jnt_axis[joints].tolist() != _PLANAR_AXES:
-        raise _lacks(
+        raise _refused(
             path,
             "cannot be placed: the body 'robot' needs a free joint, or slides along x and y and a "
             "hinge about z in this order.",
         )
     origin = (*model.body_pos[body, :2], *model.jnt_pos[joints, :2].flat, *model.qpos0[:3])
     if any(origin):
-        raise _lacks(
+        raise _refused(
             path,
             "moves its planar root away from the origin: x and y of the body 'robot' and of its "
             "joints, and their 'ref', must be 0, so that the joints are the robot's coordinates.",
