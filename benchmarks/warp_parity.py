@@ -3,9 +3,9 @@
     python benchmarks/warp_parity.py PointGoal1 CarButton2 --device cpu
 
 prints the tables of docs/environments.md. The first: how far positions (m, rad) are apart after one
-step from identical states, in float32 and in float64, and in how many worlds by more than 1e-3,
-which is where a contact begins in one and not in the other. The second: z of the difference of
-means, of the return, every cost and the goals met by random actions.
+step from identical states, in float32 and in float64, and in how many steps by more than
+1e-3. The second: z of the difference of means, of the return, every cost and the goals met by
+random actions.
 """
 
 import argparse

@@ -122,6 +122,24 @@ def test_a_step_does_not_wait_for_the_device(keys, monkeypatch):
     env._physics._late.look()
 
 
+@pytest.mark.gpu
+@pytest.mark.parametrize("name", ["PointGoal1", "CarButton2", "DoggoPush1"])
+def test_steps_on_cuda_do_not_wait_and_are_those_of_the_cpu_device(name):
+    config = resolve(name).replace(physics="warp")
+    envs = [SafetyGymEnv(config, 16, device, seed=0) for device in ("cpu", "cuda")]
+    states = [env.reset() for env in envs]
+    for _ in range(3):
+        envs[1].set_state(envs[0].get_state().to("cuda"))
+        action = envs[0].action_spec.rand()
+        first = envs[0]._step(states[0].set("action", action))
+        states[1].set("action", action.to("cuda"))
+        torch.cuda.set_sync_debug_mode("error")
+        second = envs[1]._step(states[1])
+        torch.cuda.set_sync_debug_mode("default")
+        apart = (first["observation"] - second["observation"].cpu()).abs().amax(-1)
+        assert apart.median() < 1e-2
+
+
 def test_what_is_wrong_on_the_device_is_said_by_a_later_call(two):
     physics = two[1]
     physics.waits = True

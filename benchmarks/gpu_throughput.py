@@ -1,0 +1,96 @@
+"""Environment steps/s on MuJoCo Warp, with observations, beside the CPU backend.
+
+    python benchmarks/gpu_throughput.py --device cuda --worlds 1024 4096 8192 32768 --training
+
+It runs on Warp's CPU device too, slowly, to see that it works:
+
+    python benchmarks/gpu_throughput.py PointGoal1 --device cpu --worlds 8 --steps 3
+"""
+
+import argparse
+import csv
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+import torch
+
+import safe_rl  # noqa: F401  # before torch, so that idle threads sleep
+from safe_rl.envs import SafetyGymEnv
+from safe_rl.envs.safety_gym.suite import resolve
+
+IDS = ("PointGoal1", "CarGoal1", "DoggoGoal2", "PointButton2")
+TRAIN = Path(__file__).parents[1] / "train.py"
+
+
+def used_memory(device):
+    """Bytes in use on an accelerator; 0 on the CPU, where other things are in the way."""
+    if device.type != "cuda":
+        return 0
+    torch.cuda.synchronize(device)
+    free, total = torch.cuda.mem_get_info(device)
+    return total - free
+
+
+def rate(config, num_envs, steps, device):
+    """Environment steps/s within episodes, and bytes per world."""
+    before = used_memory(device)
+    env = SafetyGymEnv(config, num_envs, device, seed=0)
+    state = env.reset()
+    actions = env.action_spec.rand((steps + 1,))
+    env._step(state.set("action", actions[0]))
+    memory = (used_memory(device) - before) / num_envs
+    start = time.perf_counter()
+    for action in actions[1:]:
+        env._step(state.set("action", action))
+    if device.type == "cuda":
+        torch.cuda.synchronize(device)
+    return num_envs * steps / (time.perf_counter() - start), memory
+
+
+def training_rate(name, num_envs, device):
+    """Steps/s of the last of three epochs of PPO-Lagrangian with preset=gpu."""
+    frames = 32 * num_envs
+    with tempfile.TemporaryDirectory() as folder:
+        command = [sys.executable, str(TRAIN), f"env={name}", "preset=gpu", f"device={device}"]
+        command += [f"num_envs={num_envs}", f"frames_per_batch={frames}", f"frames={3 * frames}"]
+        command += ["certificate.episodes=0", "logger=none", f"hydra.run.dir={folder}"]
+        subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
+        with (Path(folder) / "progress.csv").open() as table:
+            return float(list(csv.DictReader(table))[-1]["steps_per_second"])
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("ids", nargs="*", default=IDS)
+    parser.add_argument("--device", type=torch.device, default="cuda")
+    parser.add_argument("--worlds", type=int, nargs="+", default=[1024, 4096, 8192, 32768])
+    parser.add_argument("--cpu-worlds", type=int, default=256)
+    parser.add_argument("--steps", type=int, default=100)
+    parser.add_argument("--training", action="store_true", help="whole training steps/s as well")
+    arguments = parser.parse_args()
+    print(
+        "| environment | worlds | warp, steps/s | kB a world | CPU, steps/s | training, steps/s |"
+    )
+    print("|---|---|---|---|---|---|")
+    for name in arguments.ids:
+        config = resolve(name)
+        steps = min(arguments.steps, config.num_steps - 1)
+        on_cpu, _ = rate(config, arguments.cpu_worlds, steps, torch.device("cpu"))
+        warp = config.replace(physics="warp")
+        for worlds in arguments.worlds:
+            on_warp, memory = rate(warp, worlds, steps, arguments.device)
+            trained = "—"
+            if arguments.training:
+                trained = f"{training_rate(name, worlds, arguments.device):,.0f}"
+            print(
+                f"| {name} | {worlds:,} | {on_warp:,.0f} | {memory / 1e3:,.0f} | {on_cpu:,.0f} "
+                f"| {trained} |",
+                flush=True,
+            )
+
+
+if __name__ == "__main__":
+    main()
