@@ -123,7 +123,7 @@ def resume(
         >>> small = {"num_envs": 2, "frames_per_batch": 40, "env.num_steps": 20, "logger": "none"}
         >>> run = train("PointGoal1", directory=getfixture("tmp_path") / "a", frames=40, **small)
         >>> resume(run.directory, frames=80).table["steps"]
-        Going on after 40 of 80 frames.
+        Resuming after 40 of 80 frames.
         [40.0, 80.0]
     """
     _check_kinds(imports, directory)

@@ -1,6 +1,6 @@
 """Custom robots: a run keeps a copy, and is continued with the robot that it began with.
 
-The configuration goes on naming the user's file, by which runs are told apart; where that is gone
+The configuration still names the user's file, by which runs are told apart; where that is gone
 or has changed, the run's copy takes its place.
 """
 

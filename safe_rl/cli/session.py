@@ -98,7 +98,7 @@ class Session:
         self._has_begun = False
 
     def run(self) -> None:
-        """Train, or go on training, and certify at the end what is to keep limits.
+        """Train, or continue to train, and certify at the end what is to keep limits.
 
         Ctrl-C, SIGTERM or a closed terminal ends it after the epoch at hand.
 
@@ -220,7 +220,7 @@ class Session:
         return build_trainer(config, training, self.folder.directory, in_workers, evaluation)
 
     def _say_continued(self, trainer: Trainer) -> None:
-        print(f"Going on after {trainer.progress.steps:,} of {self.config.frames:,} frames.")
+        print(f"Resuming after {trainer.progress.steps:,} of {self.config.frames:,} frames.")
         if trainer.begins_anew:
             print("The state of its environments is not stored: they begin new episodes.")
         if trainer.algorithm.lost_on_resume:

@@ -170,7 +170,7 @@ class SweepReport(Callback):
             if note["event"] == "begun":
                 print(f"  interrupted: {note['directory']}")
         if len(done) < self._num_jobs:
-            print("Start it again as it was: finished runs are skipped, the others go on.")
+            print("Start it again as it was: finished runs are skipped, the others continue.")
         return len(done) < self._num_jobs
 
 

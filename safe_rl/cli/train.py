@@ -203,7 +203,7 @@ def _check_flags(flags: Mapping[str, Sequence[str]]) -> None:
     if "--multirun" in flags:
         raise CommandLineError(
             "resume= continues one run. To continue a sweep, start it again as it was: finished "
-            "runs are skipped, interrupted ones go on."
+            "runs are skipped, interrupted ones continue."
         )
     for flag in flags.keys() - {"--config-dir", "--run"}:
         raise CommandLineError(

@@ -76,7 +76,7 @@ class EnvironmentsSearchPath(SearchPathPlugin):
 
 
 def store_config(name: str, config: Mapping[str, Any] | SafetyGymConfig) -> None:
-    """Give a configuration a name, by which `env=<name>` and `make_env(name)` find it.
+    """Give a configuration a name, with which `env=<name>` and `make_env(name)` find it.
 
     Args:
         name: Of the environment.

@@ -1,4 +1,4 @@
-"""The certificate of a run: which of its checkpoints keeps the limits, and how surely."""
+"""The certificate of a run: which of its checkpoints keeps the limits, with which confidence."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ class CertificateOptions:
     """What is certified and by how many episodes: the section ``certificate`` of a configuration.
 
     Attributes:
-        ranking: Episodes of every candidate by which candidates are put in order.
+        ranking: Episodes of every candidate for ranking the candidates.
         episodes: Fresh episodes of a test at most.
         tests: Candidates tested at most.
         level: Confidence of the statement, in (0.5, 1).

@@ -66,11 +66,11 @@ def collect_episodes(
     Args:
         env: Batched environment, batch_size [N].
         policy: What acts.
-        num_episodes: E; worlds whose share is done go on unobserved until the last one is.
+        num_episodes: E; worlds whose share is done continue unobserved until the last one is.
         cost_keys: Keys of the costs to sum, below "next".
         deterministic: Whether the policy acts with its mean.
         progress: Whether to show a bar.
-        record: Gets every step [N], also those of worlds that go on unobserved.
+        record: Gets every step [N], also those of worlds that continue unobserved.
 
     Examples:
         >>> from safe_rl.envs import make_env

@@ -96,8 +96,8 @@ def check_options(options: EvaluationOptions) -> None:
     films = options.video or options.picture
     if options.variations is not None and (films or options.record or options.certify):
         raise ValueError(
-            "variations=… stands for itself: leave video=true, picture=…, record=true and "
-            "certify=true away."
+            "variations=… cannot be combined with video=true, picture=…, record=true or "
+            "certify=true: leave them out."
         )
     if not films and options.camera != EvaluationOptions.camera:
         raise ValueError(f"camera={options.camera}: it is the video's: add video=true.")

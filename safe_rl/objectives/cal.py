@@ -42,7 +42,7 @@ class CALLoss(SACLagrangianLoss):
 
     which is the gradient of (1 / 2c) Σ_i max(0, λ_i + c (E[Q_i] − d'_i) / u_i)²: near the limit
     the objective is convex in E[Q_i], so that the policy comes to rest at the limit instead of
-    swinging about it. The expectation is that over a minibatch.
+    oscillating about it. The expectation is that over a minibatch.
 
     λ is updated outside, from the costs of episodes, which are undiscounted, and so is the limit
     d; E[Q_i] is discounted. The article converts d by `discounted_share`, which is some 30 % off,

@@ -24,7 +24,7 @@ class ProgressBar:
 
     Args:
         total: Environment steps of the whole run.
-        begun: Steps that a continued run has behind it.
+        begun: Steps that a continued run has made before.
         limits: Cost key -> d, undiscounted cost per episode.
         episode_length: Largest number of steps of an episode.
     """
@@ -71,7 +71,7 @@ def shown(
     """What a bar shows of an epoch: return, costs against their present limits, and λ.
 
     Means of the episodes that ended in the epoch; if none did, the epoch's return and costs per
-    1,000 steps. While the limit comes down, its present value stands behind "target".
+    1,000 steps. While the limit comes down, its present value follows "target".
 
     Args:
         row: Of a run's table, by column.

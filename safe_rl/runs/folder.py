@@ -83,7 +83,7 @@ class RunFolder:
     overrides = _Below(".hydra/overrides.yaml")  # what the command line said
     surroundings = _Below(".hydra/hydra.yaml")  # Hydra's own, and where the run was started
     composed = _Below(".hydra/config.yaml")  # the configuration before it was resolved
-    code = _Below("code.json")  # by which code it was carried out
+    code = _Below("code.json")  # which code carried it out
     checkpoints = _Below("checkpoints")  # a folder for each of `KINDS`
     transitions = _Below("transitions")  # what was collected, if it was recorded
     certificate = _Below("certificate.json")  # which checkpoint is certified
@@ -253,7 +253,7 @@ class RunInUseError(ValueError):
 
 @contextmanager
 def lock_folder(folder: RunFolder) -> Iterator[None]:
-    """Keep others from writing into a folder; inside another such block of this process, go on.
+    """Keep others from writing into a folder; inside another such block of this process, continue.
 
     Two locks of `filelock`'s: the kernel's (``flock``), which nobody has to tidy up after a process
     that was killed, and a lease, because network file systems may keep the kernel's to each machine

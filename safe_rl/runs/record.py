@@ -76,8 +76,8 @@ class RunRecord:
         """Keep the files open, and everybody else from writing them.
 
         Args:
-            epoch: Epochs that a continued run has behind it; None for a new run.
-            steps: Environment steps that it has behind it.
+            epoch: Epochs that a continued run has made before; None for a new run.
+            steps: Environment steps that it has made before.
 
         Raises:
             FileExistsError: If a new run would overwrite one that is there.
@@ -163,7 +163,7 @@ def note_code(path: Path, steps: int) -> None:
     Args:
         path: The file, a list of JSON objects with ``steps``, ``version``, ``commit`` and
             ``changed``; see :func:`code_of`.
-        steps: Environment steps that the run has behind it.
+        steps: Environment steps that the run has made.
     """
     entries = [entry for entry in _read_code(path) if entry["steps"] < steps]
     code = code_of()

@@ -98,7 +98,7 @@ def _first_rows(path: Path, number: int) -> list[str]:
         raise TableError(
             f"{path} holds {max(0, len(complete) - 1)} complete rows, but the run that is to be "
             f"continued has finished {number} epochs: the table has been changed or cut off. "
-            "Put it back to go on, or begin a new run from the networks with init_from=."
+            "Put it back to continue, or begin a new run from the networks with init_from=."
         )
     return complete[: number + 1]
 

@@ -77,7 +77,7 @@ class WorldSnapshot:
         self._snapshot: TensorDictBase = env.get_state()
 
     def take(self) -> None:
-        """Take a snapshot and go on from it."""
+        """Take a snapshot and continue from it."""
         self._go_on_from(self._env.get_state())
 
     def stagger(self, max_steps: int, multiple: int = 1) -> bool:

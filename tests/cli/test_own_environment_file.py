@@ -40,7 +40,7 @@ def test_it_trains_resumes_and_is_evaluated(run_with, capsys):
     assert env["randomize_layout"] is True
     assert env["hazards_num"] == 2
     assert train.main([f"resume={folder}", "frames=80"]) == 0
-    assert "Going on after 40 of 80 frames." in capsys.readouterr().out
+    assert "Resuming after 40 of 80 frames." in capsys.readouterr().out
     assert evaluate.main([str(folder), "episodes=2", "num_threads=1"]) == 0
     assert "0% of the layouts known" in capsys.readouterr().out
 

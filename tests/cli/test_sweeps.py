@@ -78,7 +78,7 @@ def test_a_failing_job_is_named_and_stops_nobody(tmp_path, capsys):
         "Sweep: 1 of 3 runs are finished.",
         f"  failed: {tmp_path}/seed1: ValueError: no such cost (see failure.txt there)",
         f"  interrupted: {tmp_path}/seed2",
-        "Start it again as it was: finished runs are skipped, the others go on.",
+        "Start it again as it was: finished runs are skipped, the others continue.",
     ]
     assert "ValueError: no such cost\nmore" in (tmp_path / "seed1" / "failure.txt").read_text()
 

@@ -24,7 +24,7 @@ from safe_rl.evaluation.variations import Variation, varied
         (["checkpoint=there.torchrl"], "checkpoint is last, best, certified or the path"),
         (["env.lidar_num_bins=8"], "trained on other observations"),
         (["cvar_alpha=2"], "cvar_alpha"),
-        (["variations=sensing", "record=true"], "leave video=true, picture=…, record=true"),
+        (["variations=sensing", "record=true"], "cannot be combined with video=true"),
         (["camera=nowhere", "video=true"], "nowhere"),
         (["picture=there.png"], "must end in .gif or .webp"),
         (["picture=nowhere/there.gif"], "there is no folder nowhere"),

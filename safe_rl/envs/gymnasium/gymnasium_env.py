@@ -231,7 +231,7 @@ def _warn_of_uncounted(keys: Iterable[str], named: Sequence[str]) -> None:
     for key in keys:
         warnings.warn(
             f"A step reports the cost '{key}', which the first one did not, and which counts "
-            f"nowhere: 'cost_keys' are {', '.join(named)}. Name it there, too.",
+            f"nowhere: 'cost_keys' are {', '.join(named)}. Add it there.",
             stacklevel=4,
         )
 

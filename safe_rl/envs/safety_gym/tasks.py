@@ -171,8 +171,8 @@ def dense_reward(
     _check_values("reward", reward, config, world)
     if config.task not in BUILT_IN:
         error = ConfigError(
-            f"'reward' of task '{config.task}' is NaN, which nothing can be learned from: give "
-            "every world a number."
+            f"'reward' of task '{config.task}' is NaN, from which nothing can be learned: return "
+            "a number for every world."
         )
         world.physics.check(reward.isnan() & ~failed, lambda: error)
     if config.reward_orientation:
