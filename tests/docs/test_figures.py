@@ -144,6 +144,22 @@ def test_quarters_of_harder_tasks():
         assert cells.split(" | ") == [*quarters, certificate(folder)]
 
 
+def test_quarters_of_what_was_tried_on_hard_tasks():
+    page = (ROOT / "docs" / "algorithms" / "hard_tasks.md").read_text()
+    rows = re.findall(r"^\| .+ \| `([\w.]+)` \| ((?:[^|]+ / [^|]+ \|)+)", page, re.MULTILINE)
+    assert len(rows) == len(campaign("hard_tasks"))
+    for name, cells in rows:
+        (steps, returns, costs), _ = figures(
+            RESULTS / "hard_tasks/PointGoal2/sac_lagrangian" / name / "seed110"
+        )
+        quarters = (4 * steps - 1) // 250_000  # its steps are decisions of four
+        told = [
+            f"{np.nanmean(returns[quarters == q]):.1f} / {np.nanmean(costs[quarters == q]):.0f}"
+            for q in np.unique(quarters)
+        ]
+        assert [cell.strip() for cell in cells.strip("|").split("|")] == told
+
+
 def test_the_table_is_found():
     assert len(HELD_OUT) >= 16
 
