@@ -9,15 +9,16 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import reduce
+from functools import cache, reduce, wraps
+from inspect import signature
 from types import NoneType, UnionType
 from typing import Annotated, Any, Literal, NamedTuple, NotRequired, Required, Union
 from typing import get_args as arguments_of
 from typing import get_origin as origin_of
 
 __all__ = [
-    *("ANYTHING", "PART", "Bytes", "Count", "Fraction", "MaxLength", "NotNegative", "Number"),
-    *("Options", "Positive", "Range", "Share", "Text", "Values", "Weight", "bytes_each"),
+    *("ANYTHING", "PART", "Bytes", "Checked", "Count", "Fraction", "MaxLength", "NotNegative"),
+    *("Number", "Options", "Positive", "Range", "Share", "Text", "Values", "Weight", "bytes_each"),
     *("is_described", "values_of"),
 ]
 
@@ -239,6 +240,45 @@ _PLAIN: dict[Any, Values] = {
     **{bool: _BOOLEAN, str: _TEXT, None: _NULL, NoneType: _NULL},
     **{int: _whole(Range()), float: _number(Range())},
 }
+
+
+class Checked:
+    """A base whose subclasses refuse keyword arguments outside what their constructors annotate.
+
+    Numbers, texts and lists are checked, live objects are not.
+
+    Examples:
+        >>> class Discount(Checked):
+        ...     def __init__(self, *, gamma: Share): ...
+        >>> Discount(gamma=2)
+        Traceback (most recent call last):
+        ...
+        ValueError: gamma=2: it must be a number from 0 to 1.
+    """
+
+    def __init_subclass__(cls, **kwargs: Any) -> None:
+        super().__init_subclass__(**kwargs)
+        if "__init__" in vars(cls):
+            cls.__init__ = _checked(vars(cls)["__init__"])  # type: ignore[method-assign]
+
+
+def _checked(init: Callable[..., None]) -> Callable[..., None]:
+    @cache
+    def allowed() -> dict[str, Values]:
+        parameters = signature(init, eval_str=True).parameters.values()
+        described = (p for p in parameters if is_described(p.annotation))
+        return {p.name: values_of(p.annotation) for p in described}
+
+    @wraps(init)
+    def checking(self: Any, *args: Any, **kwargs: Any) -> None:
+        for name, values in allowed().items():
+            value = kwargs.get(name)
+            if isinstance(value, int | float | str | list | tuple) and not values.hold(value):
+                raise ValueError(f"{name}={value}: it must be {values.words}.")
+        init(self, *args, **kwargs)
+
+    return checking
+
 
 Options = Annotated[dict[str, Any], _mapping(ANYTHING)]
 """Of a parameter that is handed on to another library."""

@@ -1,21 +1,6 @@
 """Constrained losses, advantages and multipliers.
 
-Everything here works on TensorDict keys alone and knows no environment:
-
-- `VectorGAE`, `CostGAE`, `normalise_advantages`: advantages of the reward and of k costs;
-- `LagrangeMultiplier`, `PIDMultiplier`, `PIMultiplier`, `ProjectedMultiplier`: one λ per cost,
-  moved by the mean episode costs;
-- `LimitTracker`: from the costs of a batch to how far J_c is from where it should be by now;
-- `CVaR`, `Chance`: limits on the worst episodes, or on how many cost too much;
-- `PPOLoss`, `PPOLagrangianLoss`, `RCPOLoss`, `P3OLoss`, `IPOLoss`, `FOCOPSLoss`, `CUPLoss`:
-  policy losses for an optimiser;
-- `TRPOLoss`, `TRPOLagrangianLoss`, `CPOLoss`: policy losses for the steps of `safe_rl.algorithms`,
-  whose mathematics is in `safe_rl.objectives.trust_region` and `safe_rl.objectives.cpo_dual`;
-- `SACLoss`, `SACLagrangianLoss`, `WCSACLoss`, `CALLoss`, `TD3Loss`, `TD3LagrangianLoss`: losses on
-  steps from a replay buffer;
-- `BCLoss`: behaviour cloning;
-- `CriticLoss`: squared errors of the reward and the cost critic;
-- `ActorCriticLoss`, `JointAdvantages`: all losses and estimators as one, for TorchRL's trainers.
+Everything here reads and writes TensorDict keys and knows no environment.
 """
 
 from safe_rl.objectives.actor_critic import ActorCriticLoss, JointAdvantages

@@ -19,10 +19,9 @@ _OF_ESTIMATORS = {"reward", "done", "terminated"}
 
 
 class ActorCriticLoss(LossModule):
-    """A policy loss and the loss of the critics as one `LossModule`.
+    """A policy loss and the critics' loss as one, for trainers with one optimiser for both.
 
-    For `torchrl.trainers.algorithms.PPOTrainer` and others that train policy and critics with one
-    optimiser: they find `actor_network` and `critic_network` here, and their `set_keys`.
+    Such as `torchrl.trainers.algorithms.PPOTrainer`.
 
     Args:
         policy_loss: a `PPOLoss`, a `PPOLagrangianLoss` or another `SurrogateLoss`.
@@ -66,9 +65,6 @@ class ActorCriticLoss(LossModule):
     def set_keys(self, **kwargs: NestedKey) -> None:
         """Name entries of the batch; each part takes the names that it knows.
 
-        ``reward``, ``done`` and ``terminated``, which trainers name to every loss, are read by
-        the advantage estimators alone.
-
         Raises:
             ValueError: if neither part knows a name.
         """
@@ -86,14 +82,7 @@ class ActorCriticLoss(LossModule):
 
     @dispatch
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Evaluate both losses.
-
-        Args:
-            tensordict: batch of any shape with `in_keys`; left as it is.
-
-        Returns:
-            TensorDict with `out_keys`, without batch dimension.
-        """
+        """Evaluate both losses on a batch of any shape."""
         critic = self.critic_loss(tensordict).items()
         weighed = {
             name: self.critic_coeff * value if name.startswith("loss_") else value
@@ -139,11 +128,7 @@ class JointAdvantages(TensorDictModuleBase):
         return [key for part in self._estimators for key in part.out_keys]
 
     def set_keys(self, **kwargs: Any) -> None:
-        """Name entries of the rollout: of the reward's estimator, and where episodes end of both.
-
-        Args:
-            kwargs: as for `VectorGAE`; ``done`` and ``terminated`` go to both estimators.
-        """
+        """Name entries of the reward's estimator; ``done`` and ``terminated`` go to both."""
         self.reward.set_keys(**kwargs)
         if self.cost is not None:
             ends = {name: kwargs[name] for name in ("done", "terminated") if name in kwargs}

@@ -1,9 +1,8 @@
 """Generalised advantage estimates for the reward and for k costs at once.
 
-Rollouts are [..., T] TensorDicts, time last (collectors give [N, T]); a trajectory ends where
-``("next", "done")`` is set and at the last step of the batch. Where it ends without
-``("next", "terminated")`` (time-out, or end of the batch) its last observation is bootstrapped.
-Padded trajectories (``split_trajs=True``) end where their mask does.
+Rollouts are [..., T] TensorDicts, time last. A trajectory ends where ``("next", "done")`` is set,
+at the last step of the batch, and where the mask of a padded one does. Unless it ends with
+``("next", "terminated")``, its last observation is bootstrapped.
 """
 
 from __future__ import annotations
@@ -12,7 +11,7 @@ from collections.abc import Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, Literal, get_args
+from typing import Any, Literal
 
 import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase
@@ -23,12 +22,13 @@ from torchrl.objectives.value import ValueEstimatorBase
 
 from safe_rl.objectives.gae import gae, one_pass_values, trajectory_ends
 from safe_rl.objectives.samples import require, require_finite, sample_mask
-from safe_rl.ranges import Share
+from safe_rl.ranges import Checked, Share
 
 ValueTarget = Literal["lambda_return", "return_to_go"]
+_ONE_PASS = "target_params needs two passes: use torchrl.objectives.value.GAE."
 
 
-class VectorGAE(ValueEstimatorBase):
+class VectorGAE(Checked, ValueEstimatorBase):
     """Advantages and value targets of one or several reward-like signals.
 
     Differs from `torchrl.objectives.value.GAE` in three points: several signals at once, every
@@ -36,17 +36,14 @@ class VectorGAE(ValueEstimatorBase):
 
     Args:
         value_network: writes the value key, [..., T, F], one output per signal; None if the
-            values are in the TensorDict already, at the root and under ``"next"``. One with a
-            memory of its own, such as an ``LSTMModule``, is stepped with the policy: what it
-            remembers where trajectories end is read from the rollout.
+            values are in the TensorDict already, at the root and under ``"next"``. The state of a
+            recurrent one, such as an ``LSTMModule``, is read from the rollout where trajectories
+            end.
         gamma: Discount per step.
         lmbda: Decay λ of the TD errors in generalised advantage estimation.
         value_target: What critics learn: ``"lambda_return"`` (advantage + value) or
             ``"return_to_go"`` (discounted sum of the signal to the trajectory's end, bootstrapped
             there unless it terminated).
-
-    Raises:
-        ValueError: if `value_target` is neither of the two.
 
     Examples:
         >>> import torch
@@ -67,23 +64,14 @@ class VectorGAE(ValueEstimatorBase):
 
     @dataclass
     class _AcceptedKeys:
-        """Keys that `set_keys` accepts.
+        """Keys that `set_keys` accepts: three outputs, and three entries under ``"next"``."""
 
-        Attributes:
-            advantage: output, [..., T, F].
-            value_target: output, [..., T, F].
-            value: value of an observation, [..., T, F].
-            reward: signal(s) under ``"next"``, [..., T, 1] each: one key or a list of keys.
-            done: under ``"next"``, [..., T, 1] bool.
-            terminated: under ``"next"``, [..., T, 1] bool.
-        """
-
-        advantage: NestedKey = "advantage"
-        value_target: NestedKey = "value_target"
-        value: NestedKey = "state_value"
-        reward: NestedKey | list[NestedKey] = "reward"
-        done: NestedKey = "done"
-        terminated: NestedKey = "terminated"
+        advantage: NestedKey = "advantage"  # [..., T, F]
+        value_target: NestedKey = "value_target"  # [..., T, F]
+        value: NestedKey = "state_value"  # of an observation, [..., T, F]
+        reward: NestedKey | list[NestedKey] = "reward"  # one key or several, [..., T, 1] each
+        done: NestedKey = "done"  # [..., T, 1] bool
+        terminated: NestedKey = "terminated"  # [..., T, 1] bool
 
     default_keys: type = _AcceptedKeys
 
@@ -95,10 +83,6 @@ class VectorGAE(ValueEstimatorBase):
         lmbda: Share,
         value_target: ValueTarget,
     ) -> None:
-        if value_target not in get_args(ValueTarget):
-            raise ValueError(
-                f"value_target must be one of {get_args(ValueTarget)}, got {value_target!r}."
-            )
         super().__init__(value_network=value_network)
         self.gamma, self.lmbda, self.value_target = gamma, lmbda, value_target
 
@@ -131,10 +115,7 @@ class VectorGAE(ValueEstimatorBase):
         Args:
             tensordict: rollout [..., T] with `in_keys`, or these entries as keyword arguments.
             params: parameters to run the value network with instead of its own.
-            target_params: must be None; a single pass knows a single set of parameters.
-
-        Returns:
-            The same TensorDict, with ``advantage``, ``value_target`` and ``value``.
+            target_params: must be None; a single pass has a single set of parameters.
 
         Raises:
             KeyError: if an entry is missing.
@@ -143,7 +124,7 @@ class VectorGAE(ValueEstimatorBase):
             FloatingPointError: if a signal, an observation or a value is not finite.
         """
         if target_params is not None:
-            raise ValueError("target_params needs two passes: use torchrl.objectives.value.GAE.")
+            raise ValueError(_ONE_PASS)
         keys = self.tensor_keys
         value, advantage, target = self._estimate(tensordict, params, None)
         tensordict.set(keys.value, value)
@@ -164,10 +145,10 @@ class VectorGAE(ValueEstimatorBase):
             tensordict: rollout [..., T] with `in_keys`.
             target_params: must be None, as in `forward`.
             next_value: values of the next observations, [..., T, F], instead of the network's.
-            kwargs: of other estimators; none is read.
+            kwargs: of other estimators, ignored.
         """
         if target_params is not None:
-            raise ValueError("target_params needs two passes: use torchrl.objectives.value.GAE.")
+            raise ValueError(_ONE_PASS)
         return self._estimate(tensordict, None, next_value)[-1]
 
     def _estimate(
@@ -231,9 +212,7 @@ class VectorGAE(ValueEstimatorBase):
 
 
 class CostGAE(VectorGAE):
-    """`VectorGAE` for k costs, with the cost keys as defaults.
-
-    Writes ``cost_advantage``, ``cost_value_target`` and ``cost_value``, [..., T, k].
+    """`VectorGAE` for k costs: writes ``cost_advantage``, ``cost_value_target``, ``cost_value``.
 
     Args:
         cost_keys: keys of the costs under ``"next"``, in the order of the k outputs.
@@ -248,15 +227,13 @@ class CostGAE(VectorGAE):
     """
 
     @dataclass
-    class _AcceptedKeys:
+    class _AcceptedKeys(VectorGAE._AcceptedKeys):
         """Keys that `set_keys` accepts: see `VectorGAE`."""
 
         advantage: NestedKey = "cost_advantage"
         value_target: NestedKey = "cost_value_target"
         value: NestedKey = "cost_value"
         reward: NestedKey | list[NestedKey] = "cost"
-        done: NestedKey = "done"
-        terminated: NestedKey = "terminated"
 
     default_keys = _AcceptedKeys
 

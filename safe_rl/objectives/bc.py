@@ -9,15 +9,12 @@ from torchrl.objectives.utils import distance_loss
 from safe_rl.objectives.q_functions import Distance, ReplayLoss
 from safe_rl.objectives.samples import require
 
-__all__ = ["BCLoss"]
-
 
 class BCLoss(ReplayLoss):
     """Distance of a deterministic policy's actions from those that were taken.
 
     Liu et al., *Datasets and Benchmarks for Offline Safe Reinforcement Learning* (2024), where the
-    steps are those of safe episodes (BC-Safe). Costs and rewards choose what is cloned, and are
-    not seen by the loss.
+    steps are those of safe episodes (BC-Safe). The loss reads neither costs nor rewards.
 
     Args:
         actor_network: deterministic policy.

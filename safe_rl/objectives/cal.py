@@ -5,14 +5,11 @@ from __future__ import annotations
 from typing import Annotated, Any
 
 import torch
-from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModuleBase
 from torch import Tensor
 
 from safe_rl.objectives.sac import SACLagrangianLoss
 from safe_rl.objectives.violation import KnownCosts
 from safe_rl.ranges import NotNegative, Range, Weight
-
-__all__ = ["CALLoss", "discounted_share"]
 
 
 def discounted_share(gamma: float, episode_length: Tensor) -> Tensor:
@@ -44,28 +41,22 @@ class CALLoss(SACLagrangianLoss):
     the objective is convex in E[Q_i], so that the policy comes to rest at the limit instead of
     oscillating about it. The expectation is that over a minibatch.
 
-    λ is updated outside, from the costs of episodes, which are undiscounted, and so is the limit
-    d; E[Q_i] is discounted. The article converts d by `discounted_share`, which is some 30 % off,
-    because states in a memory are those of older policies, and costs are not spread evenly. With
-    c = 10, λ̂ would then settle a distance from λ that no λ makes up for. So d' = ρ d, and ρ is
-    measured: what the critics (their mean, without κ) say that actions cost, over what episodes
-    cost, both averaged over the past batches; it stays near `discounted_share`.
+    λ and the limit d are about undiscounted costs of episodes, E[Q_i] is discounted. The article
+    converts d by `discounted_share`, which is some 30 % off: states in a replay buffer are those of
+    older policies, and costs are not spread evenly. With c = 10, λ̂ would then settle at a distance
+    from λ that no λ makes up for. So d' = ρ d with a measured ρ: the mean of the critics (without
+    κ) over what episodes cost, both averaged over the past batches.
 
     Args:
-        actor_network: policy with ``get_dist``.
-        qvalue_network: Q functions of the reward, see `SACLoss`.
-        cost_qvalue_network: a `safe_rl.models.QEnsemble` with one output per cost.
-        multiplier: λ; read at every call.
-        cost_keys: costs below ``next``, [..., 1] each.
+        networks: Actor, Q functions and cost Q functions, as of `SACLagrangianLoss`.
         convexity: Weight c per unit of discounted cost beyond the limit.
         ratio_memory: Weight of the past batches in ρ, the unit of the limit.
         largest_ratio: Factor by which ρ may differ from `discounted_share`, up or down; 1 for the
             article's conversion.
-        settings: Those of every loss with cost critics, see `CostCritics`, and of `SACLoss`.
+        settings: Those of a `SACLagrangianLoss`.
 
     Attributes:
-        discounted_limit: d', [k]; a buffer of infinities, which let λ̂ be 0, until `calibrate` or
-            somebody else sets it.
+        discounted_limit: d', [k]; infinite, so that λ̂ is 0, until `calibrate` sets it.
 
     Examples:
         >>> from safe_rl.models import QEnsemble, make_squashed_actor
@@ -91,28 +82,24 @@ class CALLoss(SACLagrangianLoss):
 
     def __init__(
         self,
-        actor_network: ProbabilisticTensorDictSequential,
-        qvalue_network: TensorDictModuleBase,
-        cost_qvalue_network: TensorDictModuleBase,
-        *,
+        *networks: Any,
         convexity: NotNegative,
         ratio_memory: Weight,
         largest_ratio: Annotated[float, Range(1)],
         **settings: Any,
     ) -> None:
-        super().__init__(actor_network, qvalue_network, cost_qvalue_network, **settings)
+        super().__init__(*networks, **settings)
         self.convexity = convexity
         self.ratio_memory, self.largest_ratio = ratio_memory, largest_ratio
         self.out_keys = [*self.out_keys, "cost_weight"]
         zeros = torch.zeros_like(self.cost_unit)
         self.register_buffer("discounted_limit", torch.full_like(zeros, torch.inf))
-        # sums over the past: of the critics' means and of J_c; and over the updates of a batch:
-        # of the critics' means, and their number
+        # averages of the critics' means and of J_c; sum and number of the critics' means since
         self.register_buffer("known_costs", torch.zeros(2, *zeros.shape, device=zeros.device))
         self.register_buffer("critics_say", torch.zeros(2, *zeros.shape, device=zeros.device))
 
     def cost_weights(self, values: Tensor) -> Tensor:
-        """λ̂ / u, [k]; what the critics say is remembered for `calibrate`."""
+        """λ̂ / u, [k]; the critics' means are summed for `calibrate`."""
         means = values.flatten(0, -2).mean(0).to(self.critics_say)
         self.critics_say.add_(torch.stack([means, torch.ones_like(means)]))
         charged = self.charged(values).flatten(0, -2).mean(0)
@@ -121,12 +108,7 @@ class CALLoss(SACLagrangianLoss):
         return weight.clamp_min(0) / self.cost_unit
 
     def calibrate(self, episodes: KnownCosts) -> None:
-        """Find d', the limit in the critics' terms, from the last updates and the new batch.
-
-        Args:
-            episodes: what is known of the costs of episodes; their limit is J_c less the violation,
-                so that one that comes down is followed.
-        """
+        """Find d' from the last updates and the new batch; the limit is J_c less the violation."""
         super().calibrate(episodes)
         said, number = self.critics_say
         expected = discounted_share(self.gamma, episodes.episode_length)

@@ -15,19 +15,15 @@ from safe_rl.ranges import NotNegative, Positive, Range, Weight
 class PIMultiplier(Multiplier):
     """λ = clip(K_P Δ + I, 0, highest), I ← clip(I + K_I Δ, 0, highest), |Δ| ≤ saturation.
 
-    Δ = (J_c − d) / scale. The integral stops at the bounds of λ, so that it does not grow beyond
-    what it could ever put out (anti-windup by clamping).
+    Δ = (J_c − d) / scale. The integral stops at the bounds of λ (anti-windup by clamping), and
+    violations are bounded: a cost of six times the limit does not charge the integral six times as
+    fast as a cost of 0 empties it.
 
-    Violations are measured in units of the limit and bounded, so that a cost of six times the limit
-    does not charge the integral six times as fast as a cost of 0 empties it. Together with cost
-    advantages in units of one cost, λ does not depend on the scale of rewards or costs.
-
-    Why these two terms. To the multiplier a policy is an integrator: per update, J_c moves by about
-    β (λ* − λ) limits, λ* being the multiplier that keeps J_c where it is, β ≈ ¼ or less, and no
-    faster than the trust region lets it. Proportional plus integral control of an integrator has
-    the natural frequency √(β K_I) and the damping ½ K_P √(β / K_I). An integral alone is undamped:
-    it overshoots by as much as it was late. K_P = 4 and K_I = 0.4 give a period of 20 updates at a
-    damping of 1.6, and of 1 where β is a tenth.
+    To the multiplier a policy is an integrator: per update, J_c moves by about β (λ* − λ) limits,
+    λ* being the multiplier that keeps J_c where it is, and β ≈ ¼ or less. Proportional plus
+    integral control of an integrator has the natural frequency √(β K_I) and the damping
+    ½ K_P √(β / K_I); an integral alone is undamped. K_P = 4 and K_I = 0.4 give a period of 20
+    updates at a damping of 1.6, and of 1 where β is a tenth.
 
     Args:
         cost_limits: mapping from cost key to limit d, or limits alone; see `parse_cost_limits`.
@@ -37,9 +33,6 @@ class PIMultiplier(Multiplier):
         saturation: Bound of the error |Δ|, in units of the limit.
         highest: Upper bound of λ. The reward keeps at least the weight 1 / (1 + highest) in a
             Lagrangian loss with one cost.
-
-    Raises:
-        ValueError: if an argument is outside its range.
 
     Examples:
         >>> multiplier = PIMultiplier(
@@ -64,11 +57,6 @@ class PIMultiplier(Multiplier):
         highest: Positive,
     ) -> None:
         super().__init__(cost_limits)
-        if min(kp, ki) < 0 or not saturation > 0 or not highest > 0:
-            raise ValueError(
-                "kp and ki must not be negative, saturation and highest must be positive; got "
-                f"{kp}, {ki}, {saturation} and {highest}."
-            )
         initial = per_cost("init", init, self.num_costs)
         if not ((initial >= 0) & (initial <= highest)).all():
             raise ValueError(f"init must lie in [0, highest={highest}], got {initial.tolist()}.")
@@ -95,12 +83,9 @@ class PIDMultiplier(Multiplier):
     With the error Δ = (J_c − d) / scale, one update is
 
     - proportional: Δ, smoothed by an exponential moving average;
-    - integral: I ← (I + K_I Δ)₊, unsmoothed. The gain is applied before the sum, so that I is in
-      units of λ and starts at `init`; the algorithm is the same, and a gain may change on the way;
+    - integral: I ← (I + K_I Δ)₊, unsmoothed, in units of λ: it starts at `init`;
     - derivative: ∂ = (J − J')₊, the growth of the smoothed J = J_c / scale over the last
       `derivative_delay` updates. Costs before the first update count as 0, as in the paper.
-
-    A purely integral controller (K_P = K_D = 0) is the ordinary dual gradient ascent on λ.
 
     Args:
         cost_limits: mapping from cost key to limit d, or limits alone; see `parse_cost_limits`.
@@ -113,9 +98,6 @@ class PIDMultiplier(Multiplier):
         derivative_delay: Updates over which the growth of the cost is measured.
         scale: Unit of the errors: one number, one per cost, or ``"limit"`` for the limits
             themselves, which makes the gains independent of the units of a cost. The paper's is 1.
-
-    Raises:
-        ValueError: if an argument is outside its range.
 
     Examples:
         >>> gains = {"kp": 0.1, "ki": 0.01, "kd": 0.0, "init": 0.0, "scale": 1.0}
@@ -146,19 +128,8 @@ class PIDMultiplier(Multiplier):
         scale: Positive | Sequence[Positive] | Literal["limit"],
     ) -> None:
         super().__init__(cost_limits)
-        if min(kp, ki, kd) < 0:
-            raise ValueError(f"Gains must not be negative, got kp={kp}, ki={ki}, kd={kd}.")
-        if not (0 <= proportional_ema < 1 and 0 <= derivative_ema < 1):
-            raise ValueError(
-                "proportional_ema and derivative_ema are weights of the past in [0, 1), got "
-                f"{proportional_ema} and {derivative_ema}."
-            )
-        if derivative_delay < 1:
-            raise ValueError(f"derivative_delay must be at least 1, got {derivative_delay}.")
         initial = per_cost("init", init, self.num_costs)
         scales = self.limits if scale == "limit" else per_cost("scale", scale, self.num_costs)
-        if not (initial >= 0).all():
-            raise ValueError(f"init must not be negative, got {initial.tolist()}.")
         if not (scales > 0).all():
             raise ValueError(
                 f"scale must be positive, got {scales.tolist()}: a limit of 0 cannot be the unit "
@@ -169,8 +140,8 @@ class PIDMultiplier(Multiplier):
         self.register_buffer("scale", scales.clone())
         self.register_buffer("penalty", initial)
         self.register_buffer("integral", initial.clone())
-        self.register_buffer("smoothed_error", torch.zeros(self.num_costs))
-        self.register_buffer("smoothed_cost", torch.zeros(self.num_costs))
+        for name in ("smoothed_error", "smoothed_cost"):
+            self.register_buffer(name, torch.zeros(self.num_costs))
         self.register_buffer("past_costs", torch.zeros(derivative_delay, self.num_costs))
 
     def _step(self, violation: Tensor) -> dict[str, Tensor]:

@@ -17,29 +17,25 @@ from safe_rl.objectives.q_functions import Ensemble, QFunctionLoss, discount_of
 from safe_rl.objectives.violation import KnownCosts
 from safe_rl.ranges import Number
 
-__all__ = ["CostCritics"]
-
 
 class CostCritics(QFunctionLoss):
     """k cost critics for a loss on Q functions: their TD(0) loss, and the penalty on the actor.
 
-    A policy that minimises Q_c seeks out what Q_c underestimates, and bootstrapping carries that on
-    from state to state: without a bound from above, found values of a cost that is never negative
-    fall below 0. As rewards bootstrap on the least of two networks, costs bootstrap on
-    mean_E Q' + κ' std_E Q', which is the largest of two networks for κ' = 1. The penalty on an
-    action is r Σ_i λ_i (mean_E Q_i + κ std_E Q_i) / u_i, with the multipliers λ, the pessimism κ,
-    the size u of one cost and the size r of rewards, so that λ has no unit: at λ = 1 one cost
-    weighs as much as a reward of one standard deviation. The sum of the actor's objective and this
-    is divided by 1 + Σ λ_i / u_i, so that the step size does not grow with λ.
+    A policy that minimises Q_c exploits its underestimates, which bootstrapping spreads. As rewards
+    bootstrap on the least of two networks, costs bootstrap on mean_E Q' + κ' std_E Q', which is the
+    largest of two networks for κ' = 1. The penalty on an action is
+    r Σ_i λ_i (mean_E Q_i + κ std_E Q_i) / u_i, with the size u of one cost and the size r of
+    rewards: at λ = 1 one cost weighs as much as a reward of one standard deviation. The sum of the
+    actor's objective and this is divided by 1 + Σ λ_i / u_i, so that the step size does not grow
+    with λ.
 
-    Classes put it before the loss without costs that they inherit from; both halves of that take
-    something from it: `cost_qvalue_loss` and `penalised`.
+    Classes put it before the loss without costs that they inherit from, whose two halves call
+    `cost_qvalue_loss` and `penalised`.
 
     Args:
         actor_network, qvalue_network: of the loss without costs.
         cost_qvalue_network: a `safe_rl.models.QEnsemble` with one output per cost.
-        multiplier: λ; read at every call, and no part of the loss or its ``state_dict``: whoever
-            moves it saves it.
+        multiplier: λ; read at every call, and no part of the loss or its ``state_dict``.
         cost_keys: Costs below ``next``, [..., 1] each; of transitions over n steps their discounted
             sums, which TorchRL's `MultiStepTransform` makes of no more than its ``reward_keys``.
         pessimism: Standard deviations κ among the cost critics that are added to their mean.
@@ -53,9 +49,8 @@ class CostCritics(QFunctionLoss):
         ValueError: if the cost critic is no ensemble, or keys and multipliers differ in number.
 
     Attributes:
-        cost_unit: u, the size of one cost, [k]; a buffer of ones unless somebody sets it.
-        reward_unit: r, the standard deviation of the rewards of single steps, a scalar; 1 until
-            `measure` has been called.
+        cost_unit: u, the size of one cost, [k]; 1 until `calibrate` is called.
+        reward_unit: r, the standard deviation of the rewards of single steps; 1 until `measure` is.
     """
 
     _in_keys: list[NestedKey]
@@ -68,9 +63,6 @@ class CostCritics(QFunctionLoss):
     reward_sums: Tensor
     gamma: float
     loss_function: str
-    pessimism: float
-    target_pessimism: float | None
-    lowest_cost_value: float | None
 
     def __init__(
         self,
@@ -95,7 +87,7 @@ class CostCritics(QFunctionLoss):
             raise ValueError(
                 f"There are {len(cost_keys)} cost_keys but {multiplier.num_costs} multipliers."
             )
-        self.cost_keys = list(cost_keys)  # of which keys are made
+        self.cost_keys = list(cost_keys)  # the base's constructor makes in_keys of them
         super().__init__(actor_network, qvalue_network, **settings)
         self.convert_to_functional(
             cost_qvalue_network, "cost_qvalue_network", create_target_params=True
@@ -127,11 +119,7 @@ class CostCritics(QFunctionLoss):
 
     @torch.no_grad()
     def cost_bias(self, batch: TensorDictBase) -> Tensor:
-        """By how much predictions exceed the discounted costs then paid, [k]; see `critic_bias`.
-
-        Args:
-            batch: steps [N, T] of the present policy, in order of time.
-        """
+        """Bias of the predictions on steps [N, T] of the present policy, [k]; see `critic_bias`."""
         keys = self.tensor_keys
         steps = batch.select(*self.in_keys, ("next", keys.done), strict=False)
         steps = steps.to(self.cost_unit.device)
@@ -151,7 +139,6 @@ class CostCritics(QFunctionLoss):
         self.reward_sums.add_(powers.sum(-1))
         number, total, squares = self.reward_sums
         variance = (squares / number - (total / number).square()).clamp_min(0)
-        # rewards that are all alike have no size, and their policy nothing to weigh
         self.reward_unit.copy_(torch.where(variance > 0, variance.sqrt(), 1.0))
 
     def cost_qvalue_loss(self, tensordict: TensorDictBase, next_action: Tensor) -> Tensor:
@@ -206,28 +193,20 @@ class CostCritics(QFunctionLoss):
     def penalised(
         self, objective: Tensor, tensordict: TensorDictBase, action: Tensor
     ) -> tuple[Tensor, dict[str, Tensor]]:
-        """The actor's objective [...] with the costs of its actions.
-
-        Returns:
-            The objective, and what is reported: `cost_figures`, and ``cost_weight``, what costs
-            were multiplied by, [k].
-        """
+        """The actor's objective [...] with the costs of its actions, and figures."""
         values = self.cost_values(tensordict, action, self._detached_cost_params)
         weights = self.cost_weights(values.detach()).to(values)
         charges = self.reward_unit * (self.charged(values) @ weights)
         objective = (objective + charges) / (1 + weights.sum())
-        return objective, {**self.cost_figures(values.detach()), "cost_weight": weights}
+        figures = {**self.cost_figures(values.detach()), "cost_weight": weights}
+        return objective, {name: x for name, x in figures.items() if name in self.out_keys}
 
     def charged(self, values: Tensor) -> Tensor:
         """What actions cost the actor, [..., k], from outputs [E, ..., k] of the cost critics."""
         return pessimistic(values, self.pessimism)
 
     def cost_weights(self, values: Tensor) -> Tensor:
-        """What the actor's costs are multiplied by, [k]: λ / u.
-
-        Args:
-            values: outputs of the cost critics for its actions, [E, ..., k].
-        """
+        """What the actor's costs are multiplied by, [k]: λ / u, whatever the critics' values."""
         return self.multiplier.value.to(self.cost_unit) / self.cost_unit
 
     def cost_figures(self, values: Tensor) -> dict[str, Tensor]:

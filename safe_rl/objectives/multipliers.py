@@ -1,10 +1,8 @@
-"""Lagrange multipliers: how strongly each cost is weighed against the return.
+"""Lagrange multipliers, one λ per cost: dual ascent by Adam and by plain steps.
 
 Once per epoch a multiplier receives the violations J_c − d, J_c being the mean undiscounted cost of
-an episode, and moves λ up where J_c exceeds its limit d and down where it does not. Multipliers
-hold one λ per cost; their whole state is in buffers, so that `state_dict` resumes them exactly and
-`.to(device)` moves them. Here are dual ascent by Adam and by plain steps; controllers are in
-`safe_rl.objectives.controllers`.
+an episode, and moves λ up where J_c exceeds its limit d and down where it does not. Its whole state
+is in buffers. Controllers are in `safe_rl.objectives.controllers`.
 """
 
 from __future__ import annotations
@@ -18,7 +16,7 @@ from tensordict import NestedKey
 from torch import Tensor, nn
 from torch.nn.functional import softplus
 
-from safe_rl.ranges import NotNegative, Positive, Range, Weight
+from safe_rl.ranges import Checked, NotNegative, Positive, Range, Weight
 
 CostLimits = Mapping[NestedKey, float] | Sequence[float] | float
 AboveZero = Annotated[float, Range(0, 1e6, above=True)]
@@ -71,7 +69,7 @@ def per_cost(name: str, value: float | Sequence[float] | Tensor, num_costs: int)
     return tensor.expand(num_costs).clone()
 
 
-class Multiplier(nn.Module, ABC):
+class Multiplier(Checked, nn.Module, ABC):
     """Base of the multipliers: limits, `value` and `update`.
 
     Subclasses keep their state in buffers and implement `_step`; and `value`, unless λ is the
@@ -157,9 +155,6 @@ class LagrangeMultiplier(Multiplier):
         lr: Step size of Adam.
         betas: Decay rates of Adam's moments.
         eps: Adam's ε, added to denominators.
-
-    Raises:
-        ValueError: if an initial λ is not positive.
 
     Examples:
         >>> multiplier = LagrangeMultiplier({"cost": 25.0}, init=1.0, lr=0.05)

@@ -14,7 +14,33 @@ from safe_rl.objectives.violation import Violations, constraint_value, violation
 from safe_rl.ranges import NotNegative, Range
 
 
-class P3OLoss(PPOLoss):
+class PenaltyLoss(PPOLoss):
+    """PPO with a penalty on what the cost surrogates predict, for k constraints.
+
+    Args:
+        actor_network: policy with `get_dist`; see `SurrogateLoss`.
+        constraints: where J_c − d and T̄ stand at every call.
+        settings: Those of every clipped loss, see `PPOLoss`; costs are always averaged.
+    """
+
+    has_costs = True
+
+    def __init__(
+        self,
+        actor_network: ProbabilisticTensorDictSequential,
+        constraints: Violations,
+        **settings: Any,
+    ) -> None:
+        super().__init__(actor_network, **settings)
+        self.constraints = constraints
+
+    def _excess(self, surrogates: Tensor) -> Tensor:
+        """(J_c − d) / T̄ plus the surrogates: how far a step leaves each cost above its limit."""
+        violation = violation_of(self.constraints, surrogates)
+        return surrogates + constraint_value(violation, self.constraints.episode_length, True)
+
+
+class P3OLoss(PenaltyLoss):
     """PPO with an exact penalty on the clipped cost surrogates, for k constraints.
 
     Minimises (Zhang et al. 2022, their clipped surrogates with an exact penalty)
@@ -26,12 +52,10 @@ class P3OLoss(PPOLoss):
     The article's costs and limits are discounted sums, of which 1 − γ makes such an average; those
     here are undiscounted, of which 1/T̄ does.
 
-    Reads and writes what `PPOLoss` does, reads ``cost_advantage`` [..., k], and adds
-    ``loss_penalty`` and the detached ``cost_surrogate`` [k], E[max(ρA_c, clip(ρ)A_c)].
+    Adds ``loss_penalty`` and the detached ``cost_surrogate`` [k], E[max(ρA_c, clip(ρ)A_c)].
 
     Args:
-        actor_network: policy with `get_dist`; see `SurrogateLoss`.
-        constraints: where J_c − d and T̄ stand at every call.
+        parts: Actor, and constraints, whose J_c − d and T̄ are read at every call.
         kappa: Penalty factor κ, for every cost, in units of the standardised reward advantage.
         settings: Those of every clipped loss, see `PPOLoss`; costs are always averaged.
 
@@ -56,29 +80,19 @@ class P3OLoss(PPOLoss):
     """
 
     extra_out_keys = ("loss_penalty", "clip_fraction", "cost_surrogate")
-    has_costs = True
 
-    def __init__(
-        self,
-        actor_network: ProbabilisticTensorDictSequential,
-        constraints: Violations,
-        *,
-        kappa: NotNegative,
-        **settings: Any,
-    ) -> None:
-        super().__init__(actor_network, **settings)
-        self.constraints, self.kappa = constraints, kappa
+    def __init__(self, *parts: Any, kappa: NotNegative, **settings: Any) -> None:
+        super().__init__(*parts, **settings)
+        self.kappa = kappa
 
     def _surrogates(self, tensordict: TensorDictBase, log_weight: Tensor) -> dict[str, Tensor]:
         cost_advantage = self._cost_advantage(tensordict)
         # max(ρA, clip(ρ)A) is −min of the negative advantage
         gain = -clipped_gain(log_weight, -cost_advantage, self.clip_epsilon)
         surrogates = self._cost_surrogates(tensordict, gain)
-        violation = violation_of(self.constraints, surrogates)
-        excess = surrogates + constraint_value(violation, self.constraints.episode_length, True)
         return {
             **super()._surrogates(tensordict, log_weight),
-            "loss_penalty": self.kappa * excess.relu().sum(),
+            "loss_penalty": self.kappa * self._excess(surrogates).relu().sum(),
             "cost_surrogate": surrogates.detach(),
         }
 
@@ -86,16 +100,12 @@ class P3OLoss(PPOLoss):
 def log_barrier(slack: Tensor, kappa: Tensor | float, max_weight: float) -> Tensor:
     """−κ log(slack), continued by its tangent where its slope is beyond ``max_weight``.
 
-    The tangent begins at slack = κ / max_weight, so that value and slope are continuous, and goes
-    on where the logarithm has no value.
+    The tangent begins at slack = κ / max_weight, so that value and slope are continuous.
 
     Args:
         slack: how far inside the limits, any shape.
         kappa: Strength κ > 0 of the barrier, a scalar.
         max_weight: largest slope > 0.
-
-    Returns:
-        The barrier, of the shape of `slack`.
 
     Examples:
         >>> log_barrier(torch.tensor([1.0, 0.0]), kappa=0.1, max_weight=1.0)
@@ -108,25 +118,21 @@ def log_barrier(slack: Tensor, kappa: Tensor | float, max_weight: float) -> Tens
     return torch.where(slack > turn, inside, outside)
 
 
-class IPOLoss(PPOLoss):
+class IPOLoss(PenaltyLoss):
     """PPO with a logarithmic barrier before every limit, for k constraints.
 
     Minimises (Liu, Ding and Liu 2020, their logarithmic barrier, with κ = 1/t)
 
         E[−min(ρA, clip(ρ)A)] − (κ / T̄) Σᵢ log(−cᵢ − E[ρA_cᵢ]),  cᵢ = (J_cᵢ − dᵢ) / T̄.
 
-    The argument is the distance to the limit that the surrogate predicts. All of it is an average
-    per step, of an objective whose barrier is −κ log(d − J_c) in the units of an episode: a cost
-    that the surrogate leaves at a distance Δ = d − J_c is weighed by κ / Δ. Near the limit and
-    beyond it, where the article has no value, the barrier continues with the slope `max_weight`: a
-    violated cost is weighed by a constant, as by a multiplier of this size.
+    The argument is the distance to the limit that the surrogate predicts, per step: a cost at a
+    distance Δ = d − J_c is weighed by κ / Δ. Near the limit and beyond it, where the article has no
+    value, the barrier continues with the slope `max_weight`, as a multiplier of this size.
 
-    Reads and writes what `PPOLoss` does, reads ``cost_advantage`` [..., k], and adds
-    ``loss_barrier`` and the detached ``cost_surrogate`` [k], E[ρA_c].
+    Adds ``loss_barrier`` and the detached ``cost_surrogate`` [k], E[ρA_c].
 
     Args:
-        actor_network: policy with `get_dist`; see `SurrogateLoss`.
-        constraints: where J_c − d and T̄ stand at every call.
+        parts: Actor, and constraints, whose J_c − d and T̄ are read at every call.
         kappa: Strength κ = 1/t of the barrier, of the costs of an episode.
         max_weight: Weight of a cost at the limit and beyond, in units of the standardised reward
             advantage.
@@ -144,29 +150,24 @@ class IPOLoss(PPOLoss):
     """
 
     extra_out_keys = ("loss_barrier", "clip_fraction", "cost_surrogate")
-    has_costs = True
 
     def __init__(
         self,
-        actor_network: ProbabilisticTensorDictSequential,
-        constraints: Violations,
-        *,
+        *parts: Any,
         kappa: Annotated[float, Range(1e-9, 1e9)],
         max_weight: Annotated[float, Range(1e-9, 1e9)],
         **settings: Any,
     ) -> None:
-        super().__init__(actor_network, **settings)
-        self.constraints, self.kappa, self.max_weight = constraints, kappa, max_weight
+        super().__init__(*parts, **settings)
+        self.kappa, self.max_weight = kappa, max_weight
 
     def _surrogates(self, tensordict: TensorDictBase, log_weight: Tensor) -> dict[str, Tensor]:
         gain = log_weight.exp() * self._cost_advantage(tensordict)
         surrogates = self._cost_surrogates(tensordict, gain)
-        violation = violation_of(self.constraints, surrogates)
-        slack = -constraint_value(violation, self.constraints.episode_length, True) - surrogates
         # before the first batch T̄ is not known
         kappa = (self.kappa / self.constraints.episode_length).nan_to_num(self.kappa)
         return {
             **super()._surrogates(tensordict, log_weight),
-            "loss_barrier": log_barrier(slack, kappa, self.max_weight).sum(),
+            "loss_barrier": log_barrier(-self._excess(surrogates), kappa, self.max_weight).sum(),
             "cost_surrogate": surrogates.detach(),
         }

@@ -6,18 +6,16 @@ from typing import Annotated, Any
 
 import torch
 from tensordict import NestedKey, TensorDictBase
-from tensordict.nn import ProbabilisticTensorDictSequential
 from torch import Tensor
 from torch.distributions import Distribution
 from torchrl.modules import set_recurrent_mode
 
 from safe_rl.objectives.distributions import has_closed_kl
-from safe_rl.objectives.multipliers import Multiplier
-from safe_rl.objectives.surrogate import SurrogateLoss, require_multiplier
+from safe_rl.objectives.surrogate import WeighsCosts
 from safe_rl.ranges import Positive, Range, Share, Weight
 
 
-class FOCOPSLoss(SurrogateLoss):
+class FOCOPSLoss(WeighsCosts):
     """Distance to the optimal policy of the trust region, projected on the networks'.
 
     Minimises (Zhang, Vuong and Ross 2020, the gradient of its projection)
@@ -25,18 +23,15 @@ class FOCOPSLoss(SurrogateLoss):
         E[1{KL(s) ≤ δ} (KL(s) − (1/β) ρ (A − Σᵢ νᵢ A_cᵢ))],  KL(s) = KL(π_θ ‖ π_k) in state s.
 
     Its minimum over all policies is π_k exp((A − Σᵢ νᵢ A_cᵢ)/β) / Z, the optimum within the
-    trust region of which β and ν are the multipliers. States that have gone further
-    than δ teach nothing. Adds ``trusted_fraction``, the share of the others.
+    trust region of which β and ν are the multipliers. States beyond δ are ignored. Adds
+    ``trusted_fraction``, the share of the others.
 
     Args:
-        actor_network: policy with `get_dist`; see `SurrogateLoss`.
-        multiplier: one ν per column of ``cost_advantage``; a `ProjectedMultiplier` in the article.
+        parts: Actor, and a multiplier with one ν per column of ``cost_advantage``; a
+            `ProjectedMultiplier` in the article.
         temperature: Multiplier β of the trust region, named λ in the article.
         max_state_kl: KL divergence δ beyond which a state is ignored.
         settings: Those of every policy loss, see `SurrogateLoss`.
-
-    Raises:
-        TypeError: if there is no multiplier.
 
     Examples:
         >>> from safe_rl.models import make_actor
@@ -52,15 +47,12 @@ class FOCOPSLoss(SurrogateLoss):
 
     def __init__(
         self,
-        actor_network: ProbabilisticTensorDictSequential,
-        multiplier: Multiplier,
-        *,
+        *parts: Any,
         temperature: Annotated[float, Range(1e-9, 1e9)],
         max_state_kl: Positive,
         **settings: Any,
     ) -> None:
-        super().__init__(actor_network, **settings)
-        self.multiplier = require_multiplier(multiplier, "PPOLoss")
+        super().__init__(*parts, **settings)
         self.temperature, self.max_state_kl = temperature, max_state_kl
 
     def _evaluate(
@@ -78,7 +70,7 @@ class FOCOPSLoss(SurrogateLoss):
 ANCHOR = "anchor"
 
 
-class CUPLoss(SurrogateLoss):
+class CUPLoss(WeighsCosts):
     """The second of CUP's two steps: from an improved policy back to where the costs are low.
 
     The first step improves the policy for the reward, by PPO's loss, to π½. Then this loss is
@@ -88,22 +80,20 @@ class CUPLoss(SurrogateLoss):
 
     with advantages of π_k, which collected the batch. h belongs to the article's bound for
     generalised advantage estimates. Here it is divided by 1 + h Σᵢ νᵢ, which leaves the minimum
-    where it is: otherwise gradients grow with ν, and Adam, which remembers smaller ones, takes
-    steps so large that an update ends at its KL limit after two of them. `anchor` fixes π½; a
-    `safe_rl.algorithms.MinibatchUpdate` calls it before its first step.
-
-    See `SurrogateLoss` for what it reads and writes; here ``kl`` is KL(π_θ ‖ π½). Adds the
-    detached ``cost_surrogate`` [k], E[ρA_c].
+    where it is: otherwise gradients grow with ν, and Adam takes steps so large that an update ends
+    at its KL limit after two of them. `anchor` fixes π½; a `safe_rl.algorithms.MinibatchUpdate`
+    calls it before its first step. ``kl`` is KL(π_θ ‖ π½). Adds the detached ``cost_surrogate``
+    [k], E[ρA_c].
 
     Args:
-        actor_network: policy with `get_dist`, of a distribution whose KL has a closed form.
-        multiplier: one ν per column of ``cost_advantage``; a `ProjectedMultiplier` in the article.
+        parts: Actor, of a distribution whose KL has a closed form, and a multiplier with one ν per
+            column of ``cost_advantage``; a `ProjectedMultiplier` in the article.
         gamma: Discount γ of the cost advantages.
         lmbda: Decay λ_GAE of their TD errors.
         settings: Those of every policy loss, see `SurrogateLoss`.
 
     Raises:
-        TypeError: if there is no multiplier; by the call, if a KL has no closed form.
+        TypeError: by the call, if a KL has no closed form.
         KeyError: by the call, if the batch has no anchor.
 
     Examples:
@@ -123,21 +113,8 @@ class CUPLoss(SurrogateLoss):
 
     extra_out_keys = ("cost_surrogate",)
 
-    def __init__(
-        self,
-        actor_network: ProbabilisticTensorDictSequential,
-        multiplier: Multiplier,
-        *,
-        gamma: Weight,
-        lmbda: Share,
-        **settings: Any,
-    ) -> None:
-        super().__init__(actor_network, **settings)
-        self.multiplier = require_multiplier(multiplier, "PPOLoss")
-        if not gamma < 1:
-            raise ValueError(
-                f"gamma={gamma}: it must be below 1, the projection divides by 1 - gamma."
-            )
+    def __init__(self, *parts: Any, gamma: Weight, lmbda: Share, **settings: Any) -> None:
+        super().__init__(*parts, **settings)
         self.cost_factor = (1 - gamma * lmbda) / (1 - gamma)
 
     @property

@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-from typing import Any, Literal, get_args
+from typing import Any, Literal
 
 import torch
 from tensordict import TensorDictBase
 from tensordict.nn import ProbabilisticTensorDictSequential
 from torch import Tensor
 
-from safe_rl.objectives.multipliers import Multiplier
-from safe_rl.objectives.surrogate import SurrogateLoss, lagrangian, require_multiplier
+from safe_rl.objectives.surrogate import SurrogateLoss, WeighsCosts, lagrangian
 from safe_rl.ranges import Fraction
 
 #: How PPO bounds the gain of lowering costs; see `PPOLagrangianLoss`.
@@ -18,16 +17,7 @@ CostClipping = Literal["none", "pessimistic", "joint"]
 
 
 def clipped_gain(log_weight: Tensor, advantage: Tensor, clip_epsilon: Tensor) -> Tensor:
-    """min(ρA, clip(ρ, 1 − ε, 1 + ε)A) (Schulman et al. 2017, equation 7).
-
-    Args:
-        log_weight: log ρ, [..., 1].
-        advantage: A, [..., 1].
-        clip_epsilon: ε, scalar.
-
-    Returns:
-        Per-sample gain, [..., 1].
-    """
+    """min(ρA, clip(ρ, 1 − ε, 1 + ε)A), [..., 1], of log ρ (Schulman et al. 2017, equation 7)."""
     ratio = log_weight.exp()
     return torch.minimum(
         ratio * advantage, ratio.clamp(1 - clip_epsilon, 1 + clip_epsilon) * advantage
@@ -37,9 +27,8 @@ def clipped_gain(log_weight: Tensor, advantage: Tensor, clip_epsilon: Tensor) ->
 class PPOLoss(SurrogateLoss):
     """Clipped policy loss of PPO (Schulman et al. 2017), without constraints.
 
-    Differs from `torchrl.objectives.ClipPPOLoss` in that critics are not its business (see
-    `CriticLoss`) and that ``kl`` is the exact mean KL(π_θ ‖ π_k), by which early stopping can
-    be decided. See `SurrogateLoss` for what it reads and writes; adds ``clip_fraction``.
+    Differs from `torchrl.objectives.ClipPPOLoss` in that critics have a `CriticLoss` of their own
+    and that ``kl`` is the exact mean KL(π_θ ‖ π_k), for early stopping. Adds ``clip_fraction``.
 
     Args:
         actor_network: policy with `get_dist`; see `SurrogateLoss`.
@@ -75,12 +64,10 @@ class PPOLoss(SurrogateLoss):
         self.register_coeff_buffer("clip_epsilon", clip_epsilon, device=self._default_device)
 
     def _surrogates(self, tensordict: TensorDictBase, log_weight: Tensor) -> dict[str, Tensor]:
-        clipped = (log_weight.detach().exp() - 1).abs() > self.clip_epsilon
+        clipped = ((log_weight.detach().exp() - 1).abs() > self.clip_epsilon).to(log_weight.dtype)
         return {
             "loss_objective": -self._objective(tensordict, log_weight),
-            "clip_fraction": self._reduce_loss(
-                clipped.to(log_weight.dtype), tensordict, reduction="mean"
-            ),
+            "clip_fraction": self._reduce_loss(clipped, tensordict, reduction="mean"),
         }
 
     def _objective(self, tensordict: TensorDictBase, log_weight: Tensor) -> Tensor:
@@ -90,7 +77,7 @@ class PPOLoss(SurrogateLoss):
         return self._lagrangian(tensordict, gain, log_weight.exp())
 
 
-class PPOLagrangianLoss(PPOLoss):
+class PPOLagrangianLoss(WeighsCosts, PPOLoss):
     """PPO on the Lagrangian (Ray, Achiam and Amodei 2019, section 5.1), for k constraints.
 
     The objective is (L_r − Σᵢ λᵢ L_cᵢ) / (1 + Σᵢ λᵢ). What of it is clipped is a choice:
@@ -102,18 +89,13 @@ class PPOLagrangianLoss(PPOLoss):
       al. 2022, clipped costs);
     - ``"joint"``: the objective as a whole, PPO on the advantage (A − Σᵢ λᵢ A_cᵢ) / (1 + Σᵢ λᵢ).
 
-    The multipliers are read at every call and never trained by this loss: call
-    ``multiplier.update(mean_costs - limits)`` once per epoch.
+    This loss never trains the multipliers: call ``multiplier.update(mean_costs - limits)`` once per
+    epoch.
 
     Args:
-        actor_network: policy with `get_dist`; see `SurrogateLoss`.
-        multiplier: one λ per column of ``cost_advantage``.
+        parts: Actor, and a multiplier with one λ per column of ``cost_advantage``.
         cost_clipping: How cost surrogates are clipped, see above.
         settings: Those of every clipped loss, see `PPOLoss`.
-
-    Raises:
-        TypeError: if there is no multiplier.
-        ValueError: if `cost_clipping` is none of the three.
 
     Examples:
         >>> from safe_rl.models import make_actor
@@ -125,20 +107,8 @@ class PPOLagrangianLoss(PPOLoss):
         ['loss_objective', 'loss_entropy', 'clip_fraction', 'kl', 'entropy', 'ESS']
     """
 
-    def __init__(
-        self,
-        actor_network: ProbabilisticTensorDictSequential,
-        multiplier: Multiplier,
-        *,
-        cost_clipping: CostClipping = "none",
-        **settings: Any,
-    ) -> None:
-        super().__init__(actor_network, **settings)
-        self.multiplier = require_multiplier(multiplier, "PPOLoss")
-        if cost_clipping not in get_args(CostClipping):
-            raise ValueError(
-                f"cost_clipping must be one of {get_args(CostClipping)}, got {cost_clipping!r}."
-            )
+    def __init__(self, *parts: Any, cost_clipping: CostClipping = "none", **settings: Any) -> None:
+        super().__init__(*parts, **settings)
         self.cost_clipping = cost_clipping
 
     def _cost_gain(self, tensordict: TensorDictBase, ratio: Tensor) -> Tensor:
@@ -160,21 +130,13 @@ class PPOLagrangianLoss(PPOLoss):
         return clipped_gain(log_weight, advantage, self.clip_epsilon)
 
 
-class RCPOLoss(PPOLoss):
+class RCPOLoss(WeighsCosts, PPOLoss):
     """PPO on the penalised reward r − Σᵢ λᵢ cᵢ (Tessler et al. 2019, definition 3).
 
-    Advantages are linear in what they are of: that of the penalised reward is A − Σᵢ λᵢ A_cᵢ, and
-    its value is told by the reward's and the costs' critics together, without the lag that a
-    critic of r − λc has behind λ. It is clipped as a whole, min(ρÂ, clip(ρ)Â). λ is a multiplier
-    that moves slowly, on the third time scale: policy and critics see it stand still.
-
-    Args:
-        actor_network: policy with `get_dist`; see `SurrogateLoss`.
-        multiplier: one λ per column of ``cost_advantage``, read at every call.
-        settings: Those of every clipped loss, see `PPOLoss`.
-
-    Raises:
-        TypeError: if there is no multiplier.
+    Its advantage is A − Σᵢ λᵢ A_cᵢ, from the reward's and the costs' critics, without the lag that
+    a critic of r − λc has behind λ. It is clipped as a whole, min(ρÂ, clip(ρ)Â). The multiplier
+    should move slowly, on the third time scale. Arguments are a multiplier, one λ per column of
+    ``cost_advantage``, and those of `PPOLoss`.
 
     Examples:
         >>> from safe_rl.models import make_actor
@@ -185,15 +147,6 @@ class RCPOLoss(PPOLoss):
         >>> "cost_advantage" in loss.in_keys
         True
     """
-
-    def __init__(
-        self,
-        actor_network: ProbabilisticTensorDictSequential,
-        multiplier: Multiplier,
-        **settings: Any,
-    ) -> None:
-        super().__init__(actor_network, **settings)
-        self.multiplier = require_multiplier(multiplier, "PPOLoss")
 
     def _advantage(self, tensordict: TensorDictBase, log_weight: Tensor) -> Tensor:
         return self._penalised_advantage(tensordict, log_weight)

@@ -12,29 +12,17 @@ from torchrl.objectives.value import ValueEstimatorBase
 
 from safe_rl.objectives.samples import require
 from safe_rl.objectives.violation import KnownCosts
-
-__all__ = [
-    "Ensemble",
-    "InOneCall",
-    "QFunctionLoss",
-    "ReplayLoss",
-    "discount_of",
-    "scalars",
-]
+from safe_rl.ranges import Checked
 
 
 @runtime_checkable
 class Ensemble(Protocol):
-    """A network that evaluates several Q functions by itself, such as a `QEnsemble`.
+    """A network that evaluates several Q functions by itself, such as a `QEnsemble`."""
 
-    Attributes:
-        num_networks: E.
-    """
-
-    num_networks: int
+    num_networks: int  # E
 
     def __call__(self, tensordict: TensorDictBase, params: TensorDictBase) -> TensorDictBase:
-        """Values [E, ...] of steps [...], with parameters that are given."""
+        """Values [E, ...] of steps [...], with these parameters."""
         ...
 
 
@@ -43,10 +31,10 @@ Distance = Literal["l2", "smooth_l1", "l1"]
 
 
 class InOneCall:
-    """An ensemble as TorchRL's losses call what they have vmapped, and as losses may keep it.
+    """An ensemble as TorchRL's losses call what they have vmapped.
 
-    It is no module, which would become a part of the loss, and no function, which could neither be
-    stored nor follow a copy of the loss to another device.
+    Not a module, which would become a part of the loss, and not a function, which cannot be pickled
+    or follow a copy of the loss to another device.
 
     Args:
         network: the ensemble.
@@ -61,7 +49,7 @@ class InOneCall:
         return self.network(steps[0] if self.of_copies else steps, params)
 
 
-class ReplayLoss(LossModule):
+class ReplayLoss(Checked, LossModule):
     """What the off-policy recipe and its update ask of a loss on steps from a replay buffer.
 
     Attributes:
@@ -105,16 +93,14 @@ class ReplayLoss(LossModule):
 
 
 class QFunctionLoss(ReplayLoss):
-    """What a loss on Q functions has besides TorchRL's: halves, one discount, copies of their own.
-
-    Classes put it before TorchRL's loss that they inherit from.
+    """What a loss on Q functions has besides TorchRL's loss, before which classes inherit it.
 
     Attributes:
         gamma: discount per step, of reward and costs; that of the value estimator.
     """
 
     gamma: float
-    # TorchRL's TD3 has a list in its place, of which those that inherit it cannot select
+    # TorchRL's TD3 has a list in its place, from which subclasses cannot select
     out_keys = LossModule.out_keys
 
     @dispatch

@@ -18,9 +18,7 @@ from typing import Annotated, Any, NamedTuple
 import torch
 from torch import Tensor
 
-from safe_rl.ranges import Fraction, Range, Weight
-
-__all__ = ["CVaR", "Chance", "Charges", "RiskMeasure", "cost_so_far", "value_at_risk"]
+from safe_rl.ranges import Checked, Fraction, Range, Weight
 
 
 class Charges(NamedTuple):
@@ -37,7 +35,7 @@ class Charges(NamedTuple):
     limit: Tensor
 
 
-class RiskMeasure(ABC):
+class RiskMeasure(Checked, ABC):
     """A measure of episode costs that is limited instead of their mean.
 
     Attributes:
@@ -116,9 +114,6 @@ class CVaR(RiskMeasure):
         ramp_steps: Environment steps in which κ then goes to 1.
         steps_per_decision: Environment steps per row of time of a batch.
 
-    Raises:
-        ValueError: if an argument is outside its range.
-
     Examples:
         >>> risk = CVaR(torch.tensor([50.0]), tail=0.5, window=100, ramp_start=0, ramp_steps=0)
         >>> costs, ends = torch.ones(2, 3, 1), torch.tensor([[False, False, True]] * 2)
@@ -138,10 +133,6 @@ class CVaR(RiskMeasure):
         ramp_steps: Annotated[int, Range(0)],
         steps_per_decision: int = 1,
     ) -> None:
-        if not 0 < tail <= 1 or window < 1:
-            raise ValueError(
-                f"tail must lie in (0, 1] and window be at least 1, got {tail} and {window}."
-            )
         self.limits = cost_limits.detach().cpu().float()
         self.tail, self.window = tail, window
         self.ramp_start, self.ramp_steps = ramp_start, ramp_steps
@@ -189,9 +180,6 @@ class Chance(RiskMeasure):
         cost_limits: d, [k].
         most_over: Share ε of episodes that may exceed the limit.
 
-    Raises:
-        ValueError: if an argument is outside its range.
-
     Examples:
         >>> risk = Chance(torch.tensor([2.0]), most_over=0.1)
         >>> costs, ends = torch.ones(1, 4, 1), torch.tensor([[False, False, False, True]])
@@ -200,8 +188,6 @@ class Chance(RiskMeasure):
     """
 
     def __init__(self, cost_limits: Tensor, *, most_over: Weight) -> None:
-        if not 0 <= most_over < 1:
-            raise ValueError(f"most_over must lie in [0, 1), got {most_over}.")
         self.limits = cost_limits.detach().cpu().float()
         self.weight = self.limits.clamp_min(1.0)
         self.most_over = most_over

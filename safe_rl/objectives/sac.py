@@ -26,14 +26,9 @@ from safe_rl.objectives.q_functions import (
 )
 from safe_rl.ranges import Number, Range, Share
 
-__all__ = ["SACLagrangianLoss", "SACLoss"]
-
 
 class SACLoss(QFunctionLoss, objectives.SACLoss):
-    """TorchRL's loss with an ensemble of Q functions that needs no vmap, in two halves.
-
-    `critic_losses` and `actor_losses` together are what a call returns, so that an update may take
-    the halves at different rates.
+    """TorchRL's loss in two halves, with an ensemble of Q functions that needs no vmap.
 
     Args:
         actor_network: policy with ``get_dist``.
@@ -85,7 +80,6 @@ class SACLoss(QFunctionLoss, objectives.SACLoss):
         super().__init__(
             actor_network,
             qvalue_network,
-            # an ensemble has its networks already
             num_qvalue_nets=0 if isinstance(qvalue_network, Ensemble) else 2,
             loss_function=loss_function,
             alpha_init=alpha_init,
@@ -146,38 +140,18 @@ class SACLoss(QFunctionLoss, objectives.SACLoss):
         log_prob = metadata.pop("log_prob")
         weights = self._maybe_get_priority_weight(tensordict)
         alpha = self._reduce_loss(self.alpha_loss(log_prob), tensordict=tensordict, weights=weights)
-        return scalars(
-            loss_actor=loss,
-            loss_alpha=alpha,
-            alpha=self._alpha,
-            entropy=-log_prob.mean(),
-            **metadata,
-        )
+        metadata |= {"alpha": self._alpha, "entropy": -log_prob.mean()}
+        return scalars(loss_actor=loss, loss_alpha=alpha, **metadata)
 
 
 class SACLagrangianLoss(CostCritics, SACLoss):
     """SAC on the Lagrangian: min_π E[α log π − min Q_r + r Σ_i w_i Q_i] / (1 + Σ_i w_i), w = λ / u.
 
-    The sizes r of rewards and u of costs are 1 until they are measured; see `CostCritics`.
-
-    Ha et al., *Learning to Walk in the Real World with Minimal Human Effort* (2020); there as here
-    costs have critics of their own. λ is updated outside, from the costs of episodes, which
-    discounted critics do not.
-
-    Args:
-        actor_network: policy with ``get_dist``.
-        qvalue_network: Q functions of the reward, see `SACLoss`.
-        cost_qvalue_network: a `safe_rl.models.QEnsemble` with one output per cost.
-        multiplier: λ; read at every call.
-        cost_keys: costs below ``next``, [..., 1] each.
-        settings: Those of every loss with cost critics, see `CostCritics`, and of `SACLoss`.
-
-    Raises:
-        ValueError: if the cost critic is no ensemble, or keys and multipliers differ in number.
+    Ha et al., *Learning to Walk in the Real World with Minimal Human Effort* (2020). λ is updated
+    outside, from the undiscounted costs of episodes. r and u are the sizes of rewards and costs.
+    Arguments are those of `CostCritics` and of `SACLoss`.
 
     Examples:
-        >>> import torch
-        >>> from tensordict import TensorDict
         >>> from safe_rl.models import QEnsemble, make_squashed_actor
         >>> from safe_rl.objectives import LagrangeMultiplier
         >>> actor = make_squashed_actor(3, -torch.ones(2), torch.ones(2), hidden_sizes=[8])
@@ -205,8 +179,7 @@ class SACLagrangianLoss(CostCritics, SACLoss):
         inputs.set(self.tensor_keys.action, action)
         values = self._vmap_qnetworkN0(inputs, self._cached_detached_qvalue_params)
         lowest = values.get(self.tensor_keys.state_action_value).min(0).values.squeeze(-1)
-        objective, found = self.penalised(self._alpha * log_prob - lowest, tensordict, action)
+        objective, reported = self.penalised(self._alpha * log_prob - lowest, tensordict, action)
         weights = self._maybe_get_priority_weight(tensordict)
         loss = self._reduce_loss(objective, tensordict=tensordict, weights=weights)
-        reported = {name: value for name, value in found.items() if name in self.out_keys}
         return loss, {"log_prob": log_prob.detach(), **reported}

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase, TensorDictParams
@@ -21,7 +21,7 @@ from safe_rl.objectives.distributions import (
 )
 from safe_rl.objectives.multipliers import Multiplier
 from safe_rl.objectives.samples import require, sample_mask
-from safe_rl.ranges import NotNegative
+from safe_rl.ranges import Checked, NotNegative
 
 
 def lagrangian(reward_gain: Tensor, cost_gain: Tensor, multipliers: Tensor) -> Tensor:
@@ -34,9 +34,6 @@ def lagrangian(reward_gain: Tensor, cost_gain: Tensor, multipliers: Tensor) -> T
         reward_gain: per-sample reward surrogate, [..., 1].
         cost_gain: per-sample cost surrogates, [..., k].
         multipliers: λ, [k].
-
-    Returns:
-        Per-sample objective to maximise, [..., 1].
     """
     penalty = (cost_gain * multipliers).sum(-1, keepdim=True)
     return (reward_gain - penalty) / (1 + multipliers.sum())
@@ -59,46 +56,36 @@ def effective_sample_size(log_weight: Tensor, mask: Tensor | None = None) -> Ten
 Reduction = Literal["mean", "sum"]
 
 
-class SurrogateLoss(LossModule):
+class SurrogateLoss(Checked, LossModule):
     """Base of the policy losses: subclasses turn log-ratios into surrogates.
 
-    Reads a batch of any shape, [B] or [N, T], with normalised advantages; padding, as TorchRL's
-    losses know it by its mask, counts for nothing. Writes ``loss_objective`` and ``loss_entropy``
-    (to minimise), and the detached scalars ``kl`` (mean over states of KL(π_θ ‖ π_k), π_k the
-    policy whose parameters the batch holds), ``entropy`` and ``ESS``. Policies may have any
-    distribution; its divergence and entropy are closed forms where there are any, and are
-    estimated from samples elsewhere (see `safe_rl.objectives.distributions`). A loss that weighs
-    costs sets ``multiplier``, for which `require_multiplier` is there.
+    Reads a batch of any shape, [B] or [N, T], with normalised advantages; masked padding counts for
+    nothing. Writes ``loss_objective`` and ``loss_entropy`` (to minimise), and the detached scalars
+    ``kl`` (mean over states of KL(π_θ ‖ π_k), π_k the policy whose parameters the batch holds),
+    ``entropy`` and ``ESS``. Policies may have any distribution; its divergence and entropy are
+    closed forms where there are any, and are estimated from samples elsewhere.
 
     Args:
         actor_network: policy with `get_dist`, such as a `torchrl.modules.ProbabilisticActor`.
         entropy_coeff: Factor of the entropy bonus; a buffer, so that it can be scheduled, also up
             from 0.
-        reduction: How samples are reduced; ``"none"`` keeps them, which no update takes.
+        reduction: How samples are reduced; the attribute may also be ``"none"``.
     """
 
     @dataclass
     class _AcceptedKeys:
         """Keys that `set_keys` accepts.
 
-        Attributes:
-            advantage: reward advantage, [..., 1].
-            cost_advantage: cost advantages, [..., k]; read if the loss has costs.
-            action: action taken, [..., n].
-            sample_log_prob: its log-probability under the behaviour policy, [...].
-            loc: mean of the behaviour policy, [..., n]. This and any other parameter of its
-                distribution are expected where the actor writes them.
-            scale: standard deviation of the behaviour policy, [..., n].
-
-        Actions and log-probabilities of a composite distribution stand where the actor writes them.
+        Other parameters of the behaviour policy, and actions and log-probabilities of a composite
+        distribution, are read where the actor writes them.
         """
 
-        advantage: NestedKey = "advantage"
-        cost_advantage: NestedKey = "cost_advantage"
-        action: NestedKey = "action"
-        sample_log_prob: NestedKey = "action_log_prob"
-        loc: NestedKey = "loc"
-        scale: NestedKey = "scale"
+        advantage: NestedKey = "advantage"  # of the reward, [..., 1]
+        cost_advantage: NestedKey = "cost_advantage"  # [..., k]; read if the loss has costs
+        action: NestedKey = "action"  # [..., n]
+        sample_log_prob: NestedKey = "action_log_prob"  # under the behaviour policy, [...]
+        loc: NestedKey = "loc"  # mean of the behaviour policy, [..., n]
+        scale: NestedKey = "scale"  # its standard deviation, [..., n]
 
     tensor_keys: _AcceptedKeys
     default_keys = _AcceptedKeys
@@ -165,13 +152,7 @@ class SurrogateLoss(LossModule):
 
     @dispatch
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Evaluate the loss.
-
-        Args:
-            tensordict: batch with `in_keys`; left as it is.
-
-        Returns:
-            TensorDict with `out_keys`, without batch dimension.
+        """Evaluate the loss on a batch, which stays as it is.
 
         Raises:
             KeyError: if an entry is missing.
@@ -196,8 +177,7 @@ class SurrogateLoss(LossModule):
     def _evaluate(
         self, tensordict: TensorDictBase, log_weight: Tensor, divergence: Tensor
     ) -> dict[str, Tensor]:
-        """`_surrogates`; what a loss overrides that needs the divergence itself, [..., 1]."""
-        del divergence
+        """`_surrogates`, for losses to override that need the divergence itself, [..., 1]."""
         return self._surrogates(tensordict, log_weight)
 
     def _surrogates(self, tensordict: TensorDictBase, log_weight: Tensor) -> dict[str, Tensor]:
@@ -285,15 +265,28 @@ class SurrogateLoss(LossModule):
         return advantage - weighed.sum(-1, keepdim=True)
 
 
-def require_multiplier(multiplier: Multiplier, plain_loss: str) -> Multiplier:
-    """Raise if a Lagrangian loss is built without a multiplier.
+class WeighsCosts(SurrogateLoss):
+    """A policy loss that a multiplier weighs costs in; classes put it before the loss without.
+
+    Args:
+        actor_network: policy with `get_dist`; see `SurrogateLoss`.
+        multiplier: one λ per column of ``cost_advantage``, read at every call.
+        settings: Those of the loss without costs.
 
     Raises:
-        TypeError: if `multiplier` is not a `Multiplier`.
+        TypeError: if there is no multiplier.
     """
-    if not isinstance(multiplier, Multiplier):
-        raise TypeError(
-            f"A Lagrangian loss needs a Multiplier, such as a LagrangeMultiplier, got "
-            f"{multiplier!r}: without constraints use {plain_loss}."
-        )
-    return multiplier
+
+    def __init__(
+        self,
+        actor_network: ProbabilisticTensorDictSequential,
+        multiplier: Multiplier,
+        **settings: Any,
+    ) -> None:
+        super().__init__(actor_network, **settings)
+        if not isinstance(multiplier, Multiplier):
+            raise TypeError(
+                f"{type(self).__name__} needs a Multiplier, such as a LagrangeMultiplier, got "
+                f"{multiplier!r}: without constraints use PPOLoss or TRPOLoss."
+            )
+        self.multiplier = multiplier

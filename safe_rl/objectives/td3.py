@@ -14,11 +14,9 @@ from safe_rl.objectives.cost_critics import CostCritics
 from safe_rl.objectives.q_functions import Distance, Ensemble, InOneCall, QFunctionLoss, scalars
 from safe_rl.ranges import NotNegative, Share
 
-__all__ = ["TD3LagrangianLoss", "TD3Loss"]
-
 
 class TD3Loss(QFunctionLoss, objectives.TD3Loss):
-    """TorchRL's loss with an ensemble of Q functions that needs no vmap, in two halves.
+    """TorchRL's loss in two halves, with an ensemble of Q functions that needs no vmap.
 
     Args:
         actor_network: deterministic policy.
@@ -67,8 +65,7 @@ class TD3Loss(QFunctionLoss, objectives.TD3Loss):
         self.make_value_estimator(ValueEstimators.TD0, gamma=gamma)
         self.out_keys = ["loss_qvalue", "loss_actor", "qvalue"]
 
-    # TorchRL sets and reads both; in units of each action, as the published code has them. No
-    # buffers: a run that is resumed may change the numbers
+    # TorchRL sets and reads both. No buffers: a resumed run may change the numbers
     @property
     def policy_noise(self) -> Tensor:
         """Standard deviation of the noise on the target policy's actions, [A]."""
@@ -113,18 +110,7 @@ class TD3Loss(QFunctionLoss, objectives.TD3Loss):
 class TD3LagrangianLoss(CostCritics, TD3Loss):
     """TD3 on the Lagrangian: max_π E[Q_1 − r Σ_i w_i Q_i] / (1 + Σ_i w_i), w = λ / u.
 
-    The sizes r of rewards and u of costs are 1 until they are measured; see `CostCritics`.
-
-    Args:
-        actor_network: see `TD3Loss`.
-        qvalue_network: Q functions of the reward, see `TD3Loss`.
-        cost_qvalue_network: a `safe_rl.models.QEnsemble` with one output per cost.
-        multiplier: λ; read at every call.
-        cost_keys: costs below ``next``, [..., 1] each.
-        settings: Those of every loss with cost critics, see `CostCritics`, and of `TD3Loss`.
-
-    Raises:
-        ValueError: if the cost critic is no ensemble, or keys and multipliers differ in number.
+    r and u are the sizes of rewards and costs. Arguments are those of `CostCritics` and `TD3Loss`.
 
     Examples:
         >>> from safe_rl.models import QEnsemble, make_bounded_actor
@@ -166,8 +152,7 @@ class TD3LagrangianLoss(CostCritics, TD3Loss):
         params = self._cached_detach_qvalue_network_params
         values = self._vmap_qvalue_network00(inputs, params)
         values = values.get(self.tensor_keys.state_action_value).squeeze(-1)
-        objective, found = self.penalised(-values[0], tensordict, action)
+        objective, reported = self.penalised(-values[0], tensordict, action)
         weights = self._maybe_get_priority_weight(tensordict)
         loss = self._reduce_loss(objective, tensordict=tensordict, weights=weights)
-        reported = {name: value for name, value in found.items() if name in self.out_keys}
         return loss, {"state_action_value_actor": values.detach(), **reported}

@@ -2,28 +2,18 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import torch
 from tensordict import TensorDictBase
-from tensordict.nn import ProbabilisticTensorDictSequential
 from torch import Tensor
 
-from safe_rl.objectives.multipliers import Multiplier
-from safe_rl.objectives.surrogate import SurrogateLoss, require_multiplier
+from safe_rl.objectives.surrogate import SurrogateLoss, WeighsCosts
 
 
 class TRPOLoss(SurrogateLoss):
     """Unclipped policy loss −E[ρ A] (Schulman et al. 2015, equation 14), without constraints.
 
-    See `SurrogateLoss` for what it reads and writes. A `safe_rl.algorithms.TRPOStep`
-    minimises it within a trust region; with an optimiser of your own it is the plain
-    importance-weighted policy gradient.
-
-    Args:
-        actor_network: policy with `get_dist`; see `SurrogateLoss`.
-        entropy_coeff: Factor of the entropy bonus.
-        reduction: How samples are reduced; ``"none"`` keeps them, which no update takes.
+    A `safe_rl.algorithms.TRPOStep` minimises it within a trust region; with an optimiser it is the
+    plain importance-weighted policy gradient. Arguments are those of `SurrogateLoss`.
 
     Examples:
         >>> from safe_rl.models import make_actor
@@ -38,16 +28,10 @@ class TRPOLoss(SurrogateLoss):
         return {"loss_objective": -self._lagrangian(tensordict, gain, ratio)}
 
 
-class TRPOLagrangianLoss(TRPOLoss):
+class TRPOLagrangianLoss(WeighsCosts, TRPOLoss):
     """`TRPOLoss` on the Lagrangian (L_r − Σᵢ λᵢ L_cᵢ) / (1 + Σᵢ λᵢ), for k constraints.
 
-    Args:
-        actor_network: policy with `get_dist`; see `SurrogateLoss`.
-        multiplier: one λ per column of ``cost_advantage``, read at every call.
-        settings: Those of every policy loss, see `SurrogateLoss`.
-
-    Raises:
-        TypeError: if there is no multiplier.
+    Arguments are a multiplier, one λ per column of ``cost_advantage``, and those of `TRPOLoss`.
 
     Examples:
         >>> from safe_rl.objectives.multipliers import LagrangeMultiplier
@@ -58,27 +42,13 @@ class TRPOLagrangianLoss(TRPOLoss):
         True
     """
 
-    def __init__(
-        self,
-        actor_network: ProbabilisticTensorDictSequential,
-        multiplier: Multiplier,
-        **settings: Any,
-    ) -> None:
-        super().__init__(actor_network, **settings)
-        self.multiplier = require_multiplier(multiplier, "TRPOLoss")
-
 
 class CPOLoss(SurrogateLoss):
     """Surrogates of CPO: ``loss_objective`` = −E[ρ A] and ``cost_surrogate`` = E[ρ A_c], [k].
 
     Both carry gradients. The cost surrogates are constraints, not losses: a
-    `safe_rl.algorithms.CPOStep` keeps them within their limits; with an optimiser of your own,
-    combine them as you see fit. See `SurrogateLoss` for what it reads and writes.
-
-    Args:
-        actor_network: policy with `get_dist`; see `SurrogateLoss`.
-        entropy_coeff: Factor of the entropy bonus.
-        reduction: ``"mean"``, ``"sum"`` or ``"none"`` over the samples; a `CPOStep` needs the mean.
+    `safe_rl.algorithms.CPOStep` keeps them within their limits. Arguments are those of
+    `SurrogateLoss`; a step needs the mean over the samples.
 
     Examples:
         >>> from safe_rl.models import make_actor

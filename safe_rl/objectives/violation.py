@@ -7,14 +7,6 @@ from typing import Protocol
 import torch
 from torch import Tensor
 
-__all__ = [
-    "KnownCosts",
-    "Violations",
-    "constraint_value",
-    "matched_violation",
-    "violation_of",
-]
-
 
 class Violations(Protocol):
     """What a loss reads at every call; a `safe_rl.algorithms.Constraints` is one.
@@ -80,17 +72,13 @@ def constraint_value(
     """c, the constraint violation in the units of the cost surrogate's gradient, [k].
 
     A cost surrogate is an average per step, so the violation of an episode's cost has to be
-    divided by the episode's length. Without the division c is some thousand times too large, and
-    the boundary of the feasible set almost never crosses the trust region.
+    divided by the episode's length.
 
     Args:
         cost_violation: J_c − d, [k]. NaN (no episode has finished) counts as 0: the policy is
             taken to be at the limit, and not allowed to raise the cost.
         episode_length: T̄, scalar.
         rescale_violation: whether to divide.
-
-    Returns:
-        c, [k].
     """
     divisor = episode_length if rescale_violation else torch.ones_like(episode_length)
     return (cost_violation / divisor).nan_to_num(nan=0.0)

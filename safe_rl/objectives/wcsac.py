@@ -5,7 +5,6 @@ from __future__ import annotations
 from statistics import NormalDist
 from typing import Any
 
-from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModuleBase
 from torch import Tensor
 from torch.nn.functional import softplus
 from torchrl.objectives.utils import distance_loss
@@ -13,8 +12,6 @@ from torchrl.objectives.utils import distance_loss
 from safe_rl.objectives.risk import CVaR
 from safe_rl.objectives.sac import SACLagrangianLoss
 from safe_rl.ranges import Fraction
-
-__all__ = ["WCSACLoss", "gaussian_tail"]
 
 _SMALLEST = 1e-8
 """Variance from which on its root is differentiated, as in the published code."""
@@ -54,16 +51,12 @@ class WCSACLoss(SACLagrangianLoss):
     (√V_c − √target)². α = 1 is `SACLagrangianLoss` with a critic of the variance that nobody asks.
 
     Args:
-        actor_network: policy with ``get_dist``.
-        qvalue_network: Q functions of the reward, see `SACLoss`.
-        cost_qvalue_network: a `safe_rl.models.QEnsemble` with one output per cost and an even
-            number of networks: the first half are means, the second variances before a softplus.
-        multiplier: λ; read at every call.
-        cost_keys: costs below ``next``, [..., 1] each.
+        networks: Actor, Q functions and cost Q functions, as of `SACLagrangianLoss`. The number of
+            the last is even: the first half are means, the second variances before a softplus.
         tail: Share α of the worst cost returns.
         pessimism: Standard deviations κ among the CVaR of several pairs of critics that are added
             to their mean.
-        settings: Those of every loss with cost critics, see `CostCritics`, and of `SACLoss`.
+        settings: Those of a `SACLagrangianLoss`.
 
     Raises:
         ValueError: if α is outside (0, 1], or the number of networks is odd.
@@ -90,16 +83,13 @@ class WCSACLoss(SACLagrangianLoss):
 
     def __init__(
         self,
-        actor_network: ProbabilisticTensorDictSequential,
-        qvalue_network: TensorDictModuleBase,
-        cost_qvalue_network: TensorDictModuleBase,
-        *,
+        *networks: Any,
         tail: Fraction,
         **settings: Any,
     ) -> None:
         self._factor = gaussian_tail(tail)
-        super().__init__(actor_network, qvalue_network, cost_qvalue_network, **settings)
-        if (number := cost_qvalue_network.num_networks) % 2:
+        super().__init__(*networks, **settings)
+        if (number := self.cost_qvalue_network.num_networks) % 2:
             raise ValueError(
                 f"There are {number} cost critics (critics.costs): their number has to be even, a "
                 "mean and a variance each."

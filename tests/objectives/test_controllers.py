@@ -140,12 +140,15 @@ def test_integral_control_settles_where_the_plant_meets_the_limit():
 @pytest.mark.parametrize(
     ("build", "message"),
     [
-        (lambda: PIMultiplier(25.0, **(GAINS | {"kp": -1.0})), "kp and ki"),
+        (
+            lambda: PIMultiplier(25.0, **(GAINS | {"kp": -1.0})),
+            "kp=-1.0: it must be a number from 0",
+        ),
         (lambda: PIMultiplier(25.0, **(GAINS | {"init": 6.0})), "init must lie"),
-        (lambda: run([], kp=-1.0), "Gains"),
-        (lambda: run([], proportional_ema=1.0), r"\[0, 1\)"),
-        (lambda: run([], derivative_delay=0), "at least 1"),
-        (lambda: run([], init=-1.0), "init must not be negative"),
+        (lambda: run([], kp=-1.0), "kp=-1.0"),
+        (lambda: run([], proportional_ema=1.0), "below 1"),
+        (lambda: run([], derivative_delay=0), "from 1"),
+        (lambda: run([], init=-1.0), "init=-1.0"),
         (lambda: run([], limits=0.0, scale="limit"), "limit of 0"),
     ],
 )

@@ -96,7 +96,7 @@ def test_limits_keep_their_keys(limits, keys):
     [
         (lambda: lagrange({}), "multiplier=None"),
         (lambda: lagrange([math.inf]), "finite"),
-        (lambda: lagrange(init=0.0), "positive"),
+        (lambda: lagrange(init=0.0), "above 0"),
         (lambda: lagrange([1.0, 2.0], init=[1.0, 1.0, 1.0]), "2 numbers"),
         (lambda: lagrange([1.0, 2.0]).update([1.0]), "each of"),
     ],

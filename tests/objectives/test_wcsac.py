@@ -168,7 +168,7 @@ def test_means_bootstrap_on_the_larger_of_two_and_never_on_less_than_can_be(lowe
 
 
 def test_what_does_not_fit_is_refused():
-    with pytest.raises(ValueError, match="tail=0: the share"):
+    with pytest.raises(ValueError, match="tail=0: it must be a number above 0"):
         make_loss(tail=0)
     with pytest.raises(ValueError, match=r"3 cost critics .* has to be even"):
         make_loss(networks=3)
