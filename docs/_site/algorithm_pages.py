@@ -15,6 +15,7 @@ from hydra import compose, initialize_config_dir
 from omegaconf import DictConfig, OmegaConf
 from setting_tables import own_parts, setting_table
 
+from safe_rl.algorithms.build_part import find_recipe
 from safe_rl.cli.composing import CONF
 from safe_rl.targets import accepted_names, locate
 
@@ -27,6 +28,19 @@ SHOWN = {"actor_network": "actor", "cost_limits": "limits"}
 def settings(algo: str) -> str:
     """Keys of the algorithm's own parts, their values in the presets and their meanings."""
     return setting_table(*(_compose(algo, preset) for preset in ("default", "paper")))
+
+
+def listed(recipe: str) -> str:
+    """Problem, policy step and source of the algorithms of a recipe, as their pages say."""
+    rows = []
+    for page in sorted((DOCS / "algorithms").glob("*.md")):
+        algo, text = page.stem, page.read_text()
+        short = re.search(r"^<!-- row: (.*) -->$", text, re.M)
+        if short and find_recipe(_compose(algo, "default")).__name__ == recipe:
+            source = re.search(r"^`algo=\w+` · (.*)$", text, re.M)[1]  # type: ignore[index]
+            rows.append(f"| [`{algo}`]({page.name}) | {short[1]} | {source} |")
+    heads = "| `algo=` | problem it solves | policy step | source |\n|---|---|---|---|"
+    return "\n".join([heads, *rows])
 
 
 def columns(names: str) -> str:

@@ -186,6 +186,7 @@ TABLES: dict[str, Callable[..., str]] = {
         *(benchmark, debug, velocity, keys, observations, lidars, costs, robots),
         *(campaigns, run_keys, velocity_runs, curves.curves),
         *(algorithm_pages.settings, algorithm_pages.columns, algorithm_pages.loop),
+        algorithm_pages.listed,
         *(algorithm_results.measured, algorithm_results.compared, algorithm_results.timed),
         algorithm_results.spread_of_times,
     )

@@ -21,12 +21,6 @@ Settings = Mapping[str, Hashable]
 _MOST_KEYS, _LONGEST_NAME, _LONGEST_VALUE = 12, 240, 60
 # settings that a name has wherever they differ, whether or not a command line has them
 _ALWAYS_NAMED = ("preset", "init_from", "frames", "cost_limits", "risk")
-# of those that the paper does not name; where there is none, the file in conf/algo is its name
-_TITLES = {
-    **{name: name.upper() for name in ("bc", "cal", "crpo", "cup", "focops", "ipo")},
-    **{name: name.upper() for name in ("p3o", "pcpo", "rcpo", "sac", "td3", "wcsac")},
-    **{"sac_lagrangian": "SAC-Lagrangian", "td3_lagrangian": "TD3-Lagrangian", "c_trpo": "C-TRPO"},
-}
 
 
 @dataclass(frozen=True)
@@ -237,13 +231,15 @@ def _further(
 
 
 def title_of(algorithm: str) -> str:
-    """How the field writes the name of an algorithm.
+    """How the field writes the name of an algorithm: the paper's, or capitals for abbreviations.
 
     Examples:
-        >>> title_of("c_trpo"), title_of("sac_lagrangian"), title_of("mine")
-        ('C-TRPO', 'SAC-Lagrangian', 'mine')
+        >>> title_of("c_trpo"), title_of("sac_lagrangian"), title_of("my_idea")
+        ('C-TRPO', 'SAC-Lagrangian', 'MY-IDEA')
     """
-    return ALGORITHMS.get(algorithm) or _TITLES.get(algorithm, algorithm)
+    words = algorithm.split("_")
+    written = (word.capitalize() if len(word) > 6 else word.upper() for word in words)
+    return ALGORITHMS.get(algorithm) or "-".join(written)
 
 
 def _settings(run: Run) -> dict[str, Hashable]:

@@ -139,15 +139,14 @@ def projected_multiplier(cmdp):
     return ProjectedMultiplier(cmdp.cost_limits, init=0.0, lr=0.1, highest=None)
 
 
-def focops(actor, cmdp):
-    multiplier = projected_multiplier(cmdp)
-    loss = FOCOPSLoss(actor, multiplier, temperature=1.5, max_state_kl=TARGET_KL, entropy_coeff=0.0)
-    return dual_ascent(multiplier, ppo_update(loss, actor))
+def weighed(kind, **settings):
+    """A loss that weighs costs by a multiplier."""
 
+    def build(actor, cmdp):
+        multiplier = projected_multiplier(cmdp)
+        return dual_ascent(multiplier, ppo_update(kind(actor, multiplier, **settings), actor))
 
-def rcpo(actor, cmdp):
-    multiplier = projected_multiplier(cmdp)
-    return dual_ascent(multiplier, ppo_update(RCPOLoss(actor, multiplier, **PPO), actor))
+    return build
 
 
 def crpo(actor, cmdp):
@@ -195,8 +194,8 @@ CONSTRAINED = [
     (cpo, 100),
     (p3o, 120),
     (ipo, 120),
-    (focops, 250),
-    (rcpo, 250),
+    (weighed(FOCOPSLoss, temperature=1.5, max_state_kl=TARGET_KL, entropy_coeff=0.0), 250),
+    (weighed(RCPOLoss, **PPO), 250),
     (crpo, 150),
     (pcpo, 120),
     (c_trpo, 200),

@@ -41,7 +41,7 @@ def projected(*values):
 LOSSES = {
     "p3o": lambda actor: P3OLoss(actor, held(60.0, -90.0), kappa=3.0, **CLIP),
     "ipo": lambda actor: IPOLoss(actor, held(-200.0, 30.0), kappa=10.0, max_weight=2.0, **CLIP),
-    "focops": lambda actor: FOCOPSLoss(
+    "divergence": lambda actor: FOCOPSLoss(
         actor, projected(0.5, 2.0), temperature=1.5, max_state_kl=0.05, entropy_coeff=0.01
     ),
     "rcpo": lambda actor: RCPOLoss(actor, projected(0.5, 2.0), **CLIP),
@@ -133,7 +133,7 @@ def test_the_barrier_goes_on_smoothly_beyond_its_domain():
     assert (barrier[2] - barrier[3]).abs() < 1e-4
 
 
-def test_focops_has_the_optimum_of_the_trust_region():
+def test_the_divergence_loss_has_the_optimum_of_the_trust_region():
     """π_k exp((A − ν A_c)/β) / Z, theorem 1 of its article."""
     advantage, costs = [1.0, 0.2, -1.2, 0.7], [0.8, -0.1, -0.7, 0.3]
     actor, logits, batch = one_state(advantage, costs)
@@ -143,7 +143,7 @@ def test_focops_has_the_optimum_of_the_trust_region():
     torch.testing.assert_close(logits.detach().softmax(0), expected, atol=1e-4, rtol=0)
 
 
-def test_focops_learns_nothing_from_states_that_have_gone_too_far():
+def test_the_divergence_loss_learns_nothing_from_states_that_have_gone_too_far():
     actor, logits, batch = one_state(GAIN, COST)
     loss = FOCOPSLoss(actor, projected(0.6), temperature=1.5, max_state_kl=0.02, entropy_coeff=0.0)
     near = loss(batch)

@@ -11,9 +11,14 @@ from torchrl.modules import MaskedCategorical, ProbabilisticActor
 from safe_rl.objectives import CUPLoss, FOCOPSLoss, LagrangeMultiplier
 from safe_rl.objectives.trust_region import flatten, set_parameters
 
+SETTINGS = {
+    CUPLoss: {"gamma": 0.99, "lmbda": 0.97},
+    FOCOPSLoss: {"temperature": 1.5, "max_state_kl": 9.0},
+}
 
-@pytest.mark.parametrize("name", ["focops", "cup"])
-def test_choices_that_are_masked_leave_the_gradient_of_a_divergence_a_number(name):
+
+@pytest.mark.parametrize("kind", SETTINGS)
+def test_choices_that_are_masked_leave_the_gradient_of_a_divergence_a_number(kind):
     """Against finite differences; the mask is part of the observation."""
     net = nn.Sequential(nn.Linear(NUM_OBS, 6), nn.Tanh(), nn.Linear(6, 4)).double()
     actor = ProbabilisticActor(
@@ -29,11 +34,8 @@ def test_choices_that_are_masked_leave_the_gradient_of_a_divergence_a_number(nam
         actor(batch)
     batch["advantage"], batch["cost_advantage"] = torch.randn(2, 32, 1).double()
     multiplier = LagrangeMultiplier([1.0], init=1.0, lr=0.1)
-    if name == "cup":
-        loss = CUPLoss(actor, multiplier, gamma=0.99, lmbda=0.97, entropy_coeff=0.1)
-        loss.anchor(batch)
-    else:
-        loss = FOCOPSLoss(actor, multiplier, temperature=1.5, max_state_kl=9.0, entropy_coeff=0.1)
+    loss = kind(actor, multiplier, **SETTINGS[kind], entropy_coeff=0.1)
+    loss.anchor(batch)
     perturb(actor, 0.3)
 
     def total():
