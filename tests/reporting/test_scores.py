@@ -42,6 +42,19 @@ def test_final_scores_are_means_and_deviations_over_seeds(tmp_path):
     ]  # fmt: skip
 
 
+def test_the_bias_of_critics_is_that_of_the_final_epochs(tmp_path):
+    biases = {"critic_bias_cost": [900.0, *[4.0, "", 6.0, 4.0, 6.0]]}
+    rows = {name: [1.0] * 6 for name in ("returns", "costs", "rates")}
+    write_run(tmp_path, algo="cpo", columns=biases, **rows)
+    biases = {"critic_bias_cost": [0.0] * 5 + [5.0]}
+    write_run(tmp_path, algo="cpo", seed=1, columns=biases, **rows)
+    write_run(tmp_path, algo="ppo", **rows)
+    table = table_of(tmp_path)
+    place = list(table.columns).index("critics' bias")
+    assert [row[place].text for row in table.rows()] == ["—", "+3.0"]  # of 5 and 1
+    assert table.records[1]["critic_bias_cost_std"] == pytest.approx(8**0.5)
+
+
 def test_published_values_stand_only_beside_what_they_are_values_of(tmp_path):
     write_run(tmp_path, algo="ppo_lagrangian", limits={"cost": 10.0}, folder="other limit")
     write_run(tmp_path, algo="ppo", env_changes={"hazards_num": 3}, folder="other environment")
