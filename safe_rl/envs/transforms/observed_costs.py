@@ -36,10 +36,10 @@ class ObservedCosts(ConstraintTransform):
     Examples:
         >>> from safe_rl.envs import make_env
         >>> env = make_env("PointGoal2", seed=0, transforms={"seen": ObservedCosts(decay=0.95)})
-        >>> env.cost_keys
-        ['cost', 'cost_vases_contact', 'cost_vases_velocity', 'cost_hazards']
+        >>> len(env.cost_keys)
+        5
         >>> env.observation_layout["last_costs"], env.observation_layout["cost_traces"]
-        (slice(60, 64, None), slice(64, 68, None))
+        (slice(60, 65, None), slice(65, 70, None))
     """
 
     def __init__(self, decay: Weight, costs: Sequence[Text] | None = None) -> None:
