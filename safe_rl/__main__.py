@@ -13,6 +13,7 @@ __all__ = ["main"]
 COMMANDS = {
     "train": "train an algorithm on an environment, as python train.py does",
     "evaluate": "measure a trained policy on whole episodes",
+    "export": "write a trained policy as ONNX, or as a small folder",
     "report": "put a folder of runs on one page",
 }
 USAGE = "\n".join(

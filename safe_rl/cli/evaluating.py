@@ -20,6 +20,7 @@ from safe_rl.cli.user_code import check_imports, import_modules
 from safe_rl.envs import LayoutError, OpenGLError
 from safe_rl.evaluation import Evaluation, EvaluationOptions, evaluate
 from safe_rl.evaluation.loading import load_config
+from safe_rl.evaluation.policies import find_run, writable_copy
 from safe_rl.evaluation.summary import format_unjudged
 from safe_rl.evaluation.variations import Variation, expand
 from safe_rl.evaluation.varying import Varied, evaluate_variations
@@ -41,6 +42,7 @@ def evaluate_run(
     Raises:
         ValueError: If the options ask for something else than an evaluation.
     """
+    directory = writable_copy(directory)
     if options.certify or options.variations is not None:
         raise ValueError("evaluate: certificates are made by certify(), variations by vary(…).")
     return evaluate(
@@ -62,6 +64,7 @@ def carry_out(
         Exit status of the command.
     """
     try:
+        directory = find_run(directory)
         check_imports(load_config(directory), modules, directory)
         import_modules(modules or ())
         if options.certify:
@@ -111,6 +114,7 @@ def evaluate_varied(
     Raises:
         ValueError: For variations that there are not, or that the environment cannot have.
     """
+    directory = writable_copy(directory)
     named, own = read_variations(options.variations)
     found = evaluate_variations(
         directory,

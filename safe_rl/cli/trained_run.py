@@ -29,6 +29,7 @@ from safe_rl.evaluation.loading import (
     load_policy,
     override_env,
 )
+from safe_rl.evaluation.policies import find_run
 from safe_rl.evaluation.varying import Varied
 from safe_rl.extras import import_extra
 from safe_rl.files import read_json
@@ -206,7 +207,8 @@ def load(
     """Open a run: its table, environment and policy.
 
     Args:
-        directory: Folder of the run.
+        directory: Folder of the run, or ``certified/<environment>`` for one of the package's
+            policies, such as ``certified/PointGoal1``.
         checkpoint: "last", "best" (highest return that kept every limit), "certified" (to
             keep them), or a path.
         imports: Modules that its environment or policy needs; none is imported unless named here.
@@ -221,7 +223,7 @@ def load(
         >>> run.policy(run.env.reset())["action"].shape
         torch.Size([1, 2])
     """
-    run = Run(Path(directory).expanduser(), checkpoint)
+    run = Run(find_run(directory), checkpoint)
     check_imports(run.config, imports if imports is None else several(imports), run.directory)
     import_modules(imports or ())
     find_checkpoint(run.directory, checkpoint)

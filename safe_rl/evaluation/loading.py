@@ -132,6 +132,8 @@ def find_checkpoint(directory: Path, which: str) -> Path:
     found = {kind: folder.newest_checkpoint(kind) for kind in KINDS}
     found["best"] = best_checkpoint(folder.checkpoints / "best")
     path = found.pop(which)
+    if which == "last" and not folder.has_begun:  # a policy without its run
+        path = path or found["certified"]
     if path is None:
         reason = {
             "last": "it has not saved one yet",

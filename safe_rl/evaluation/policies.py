@@ -1,0 +1,91 @@
+"""Trained policies as small folders: those that the package has, and how one is made from a run."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+
+from safe_rl.evaluation.loading import find_checkpoint, load_config
+from safe_rl.files import read_json, replace_text
+from safe_rl.naming import did_you_mean
+from safe_rl.runs.checkpoint_file import as_parts, read_facts, read_states, writer
+from safe_rl.runs.folder import RunFolder, checkpoint_steps
+
+__all__ = ["POLICIES", "find_run", "pack_policy", "writable_copy"]
+
+POLICIES = Path(__file__).parents[1] / "policies"
+"""A folder per environment, each with a configuration, a certificate and the policy's weights."""
+_PREFIX = "certified"
+
+
+def find_run(name: str | Path) -> Path:
+    """The folder of a run, or of one of the package's policies: ``certified/PointGoal1``.
+
+    Raises:
+        FileNotFoundError: If the package has no such policy.
+
+    Examples:
+        >>> find_run("runs/mine").as_posix()
+        'runs/mine'
+        >>> find_run("certified/PointGaol1")
+        Traceback (most recent call last):
+        FileNotFoundError: The package has no policy for PointGaol1. Did you mean 'PointGoal1'?
+    """
+    path = Path(name).expanduser()
+    if path.exists() or len(path.parts) != 2 or path.parts[0] != _PREFIX:
+        return path
+    known = sorted(folder.name for folder in POLICIES.iterdir() if folder.is_dir())
+    if path.name not in known:
+        hint = did_you_mean(path.name, known) or f" It has {', '.join(known)}."
+        raise FileNotFoundError(f"The package has no policy for {path.name}.{hint}")
+    return POLICIES / path.name
+
+
+def writable_copy(directory: Path) -> Path:
+    """The folder itself, or of one of the package's policies a copy in the working directory."""
+    if directory.parent != POLICIES:
+        return directory
+    copy = Path(_PREFIX, directory.name)
+    shutil.copytree(directory, copy, dirs_exist_ok=True)
+    return copy
+
+
+def pack_policy(run: Path, folder: Path, checkpoint: str = "certified") -> Path:
+    """Write what is needed to use a run's policy into a folder of a few dozen kB.
+
+    The configuration, the certificate, the command and the commit, and of the checkpoint the actor
+    alone, in the format of all checkpoints, which is read without unpickling objects.
+
+    Args:
+        run: Folder of the run.
+        folder: Where to write; made if there is none.
+        checkpoint: Which policy.
+
+    Returns:
+        The file of the weights.
+
+    Raises:
+        FileNotFoundError: If there is no such checkpoint.
+    """
+    source, target = RunFolder(run), RunFolder(folder)
+    path, config = find_checkpoint(run, checkpoint), load_config(run)
+    steps = checkpoint_steps(path)
+    kept = target.checkpoint("certified", steps or 0)
+    shutil.rmtree(target.checkpoints, ignore_errors=True)
+    kept.parent.mkdir(parents=True)
+    shutil.copyfile(source.config, target.config)
+    for file, copy in ((source.certificate, target.certificate), (source.code, target.code)):
+        if file.is_file():
+            shutil.copyfile(file, copy)
+    states = read_states(path, ["actor"])
+    facts = {name: value for name, value in read_facts(path).items() if name != "run"}
+    writer(as_parts(states)).save(kept, metadata=facts)
+    words = source.overrides.read_text().splitlines() if source.overrides.is_file() else []
+    command = " ".join(["python train.py", *(word.removeprefix("- ") for word in words)])
+    about = {"environment": config.env.get("name", ""), "algorithm": config.algo.name}
+    about |= {"steps": steps, "command": command}
+    if source.code.is_file():
+        about["commit"] = read_json(source.code)[-1]["commit"]
+    replace_text(folder / "policy.json", json.dumps(about, indent=2) + "\n")
+    return kept
