@@ -326,7 +326,7 @@ def test_errors_say_what_to_change():
         cpo_step(actor, fisher_subsample=2.0)
     with pytest.raises(ValueError, match="largest_demand must be positive"):
         cpo_step(actor, largest_demand=0.0)
-    with pytest.raises(TypeError, match="use TRPOLoss"):
+    with pytest.raises(TypeError, match="use PPOLoss or TRPOLoss"):
         TRPOLagrangianLoss(actor, None, entropy_coeff=0.0)
 
 
