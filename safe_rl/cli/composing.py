@@ -13,7 +13,7 @@ from hydra.core.config_loader import ConfigLoader
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.hydra_config import HydraConfig
 from hydra.core.object_type import ObjectType
-from hydra.core.override_parser.types import Override
+from hydra.core.override_parser.types import IntervalSweep, Override
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
@@ -140,16 +140,21 @@ def _compose(texts: list[str], name: str, options: partial[list[str]]) -> DictCo
 
 def _jobs(overrides: Sequence[Override]) -> Iterator[list[str]]:
     """Overrides of jobs in which every value of a sweep occurs."""
-    values = [
-        [f"{override.get_key_element()}={value}" for value in override.sweep_string_iterator()]
-        if override.is_discrete_sweep()
-        else [str(override.input_line)]
-        for override in overrides
-    ]
+    values = [_sweep_lines(override) for override in overrides]
     first = [of_one[0] for of_one in values]
     yield first
     for place, of_one in enumerate(values):
         yield from ([*first[:place], value, *first[place + 1 :]] for value in of_one[1:])
+
+
+def _sweep_lines(override: Override) -> list[str]:
+    """An override with each of its values; of an interval, from which sweepers draw, its ends."""
+    value, key = override.value(), override.get_key_element()
+    if isinstance(value, IntervalSweep):
+        return [f"{key}={value.start}", f"{key}={value.end}"]
+    if override.is_discrete_sweep():
+        return [f"{key}={item}" for item in override.sweep_string_iterator()]
+    return [str(override.input_line)]
 
 
 def check_once(overrides: Sequence[Override]) -> None:

@@ -39,7 +39,8 @@ from safe_rl.files import replacing
 from safe_rl.runs.checkpoints import is_finished
 from safe_rl.runs.folder import RunFolder, lock_folder
 from safe_rl.runs.identity import check_same_run
-from safe_rl.runs.table import TableError
+from safe_rl.runs.outcome import final_figures, violation
+from safe_rl.runs.table import TableError, read_table
 from safe_rl.training.building import begin_from, build_trainer, physics_threads, seed_everything
 from safe_rl.training.trainer import EpisodeError, Trainer, WorkerError
 
@@ -256,20 +257,29 @@ class Session:
             self._say(f"To train on: {self._program} {train_on(self.config, directory)}")
 
 
-def run_job(config: DictConfig) -> None:
+def run_job(config: DictConfig) -> float:
     """Carry out one job of a sweep, whose configuration Hydra has composed where it runs.
+
+    Returns:
+        What a sweeper that optimises maximises: the run's final return, −∞ if it ends above a
+        limit or no episode has ended.
 
     Raises:
         SystemExit: If it is interrupted.
         ValueError: If its folder holds a run with other settings.
     """
     hydra = cast(DictConfig, HydraConfig.instance().cfg).hydra
-    folder = Path(hydra.runtime.output_dir).resolve()
-    check_settings(config, RunFolder(folder))
-    session = Session(config, folder, hydra, continues=True)
+    folder = RunFolder(Path(hydra.runtime.output_dir).resolve())
+    check_settings(config, folder)
+    session = Session(config, folder.directory, hydra, continues=True)
     session.run()
     if session.interrupted_by is not None:
         raise SystemExit(128 + session.interrupted_by)
+    limits = dict(config.cost_limits)
+    figures = final_figures(read_table(folder.table), list(limits))
+    value = figures["episode_return"]
+    is_above = any(violation(figures, key, limit) > 0 for key, limit in limits.items())
+    return -math.inf if is_above or math.isnan(value) else value
 
 
 def new_folder(hydra: DictConfig) -> tuple[Path, list[Path]]:

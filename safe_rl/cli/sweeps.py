@@ -11,16 +11,14 @@ import traceback
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from datetime import datetime
-from itertools import count
 from pathlib import Path
 from threading import Event, Thread
-from typing import Any, NamedTuple, TextIO
+from typing import Any
 
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.utils import JobReturn, JobStatus
 from hydra.experimental.callback import Callback
 from omegaconf import DictConfig
-from tqdm import tqdm
 
 from safe_rl.cli.user_code import import_modules, imported
 from safe_rl.files import read_config, replace_text
@@ -35,9 +33,6 @@ _IN_TURN = "hydra._internal.core_plugins.basic_launcher.BasicLauncher"
 """The launcher whose jobs run in this process, with a bar of their own."""
 _GRACE = 30.0
 """Seconds in which a job whose sweep was killed may end its epoch and write a checkpoint."""
-_SECONDS = 1.0
-_SECONDS_OF_A_LOG = 60.0
-"""Between two looks at the runs: where lines can be drawn anew, and where they pile up."""
 
 
 def count_jobs(overrides: Sequence[str]) -> int:
@@ -51,7 +46,7 @@ def count_jobs(overrides: Sequence[str]) -> int:
     return math.prod(
         len(list(override.sweep_string_iterator()))
         for override in parsed
-        if override.is_sweep_override()
+        if override.is_discrete_sweep()
     )
 
 
@@ -97,7 +92,8 @@ class SweepReport(Callback):
 
     def on_multirun_start(self, config: DictConfig, **kwargs: Any) -> None:
         """Share the cores out among the jobs and begin the journal."""
-        self._num_jobs = count_jobs(config.hydra.overrides.task)
+        trials = config.hydra.sweeper.get("n_trials")  # of a sweeper that chooses the values
+        self._num_jobs = trials or count_jobs(config.hydra.overrides.task)
         self._modules = imported()
         self._journal = _journal_path(Path(config.hydra.sweep.dir))
         num_workers = config.hydra.launcher.get("n_jobs")
@@ -108,8 +104,7 @@ class SweepReport(Callback):
             # bars of several jobs would overwrite each other
             os.environ.setdefault("TQDM_DISABLE", "1")
         if config.hydra.launcher.get("_target_", _IN_TURN) != _IN_TURN:
-            self._display = _Display(self._journal, self._num_jobs)
-            self._display.start()
+            self._display = _Display(self._journal)
         # if the launcher itself fails, Hydra does not come to the end of the sweep
         atexit.register(self._print_summary)
 
@@ -135,7 +130,8 @@ class SweepReport(Callback):
             return
         summary = str(error).strip().partition("\n")[0]
         self._note(config, "failed", f"{type(error).__name__}: {summary}")
-        job_return.return_value, job_return.status = None, JobStatus.COMPLETED
+        # as a sweeper that optimises takes it
+        job_return.return_value, job_return.status = -math.inf, JobStatus.COMPLETED
 
     def on_multirun_end(self, config: DictConfig, **kwargs: Any) -> None:
         """Say what became of the jobs; exit with status 1 if one failed."""
@@ -180,46 +176,24 @@ def _journal_path(sweep_directory: Path) -> Path:
     return (folder / f"{datetime.now():%Y-%m-%d_%H-%M-%S}_{os.getpid()}.jsonl").absolute()
 
 
-class Progress(NamedTuple):
-    """How far a run is.
-
-    Attributes:
-        steps: Environment steps so far.
-        frames: Environment steps after which it ends.
-        speed: Steps per second of the last epoch.
-        figures: What its own bar would show: return, costs against their limits, λ.
-    """
-
-    steps: int
-    frames: int
-    speed: float
-    figures: Mapping[str, str]
-
-    def __str__(self) -> str:
-        """One line of a log."""
-        if not self.steps:
-            return "its first epoch"
-        figures = ", ".join(f"{name}={value}" for name, value in self.figures.items())
-        share = f"{self.steps / max(1, self.frames):.0%} of {self.frames:,} steps"
-        return ", ".join(filter(None, [share, f"{self.speed:,.0f} steps/s", figures]))
-
-
-def progress_of(directory: Path) -> Progress:
-    """How far the run in a folder is; 0 steps of 0 if it has not finished an epoch.
+def progress_of(directory: Path) -> str:
+    """How far the run in a folder is, in a line.
 
     Examples:
-        >>> progress_of(getfixture("tiny_run").directory)[:2]
-        (80, 80)
-        >>> progress_of(Path("/nowhere"))[:2]
-        (0, 0)
+        >>> progress_of(getfixture("tiny_run").directory)[:17]
+        '100% of 80 steps,'
+        >>> progress_of(Path("/nowhere"))
+        'its first epoch'
     """
     folder = RunFolder(directory)
     with suppress(OSError, ValueError, LookupError, TypeError):
         config, row = read_config(folder.config), last_row(folder.table)
         limits = {key: float(limit) for key, limit in (config["cost_limits"] or {}).items()}
-        speed, figures = row["steps_per_second"], shown(row, limits)
-        return Progress(int(row["steps"]), int(config["frames"]), speed, figures)
-    return Progress(0, 0, 0.0, {})
+        share, speed = row["steps"] / config["frames"], row["steps_per_second"]
+        figures = [f"{name}={value}" for name, value in shown(row, limits).items()]
+        done = f"{share:.0%} of {config['frames']:,} steps"
+        return ", ".join([done, f"{speed:,.0f} steps/s", *figures])
+    return "its first epoch"
 
 
 def _last_notes(journal: Path) -> dict[int, Mapping[str, str]]:
@@ -234,74 +208,23 @@ def _last_notes(journal: Path) -> dict[int, Mapping[str, str]]:
 
 
 class _Display:
-    """A bar for each run at hand; where no bar can be drawn, a line for each every minute.
+    """Prints every minute how far each run at hand is, beside what this process does."""
 
-    Args:
-        journal: The sweep's journal.
-        num_jobs: Jobs of the sweep.
-        stream: Where to show it.
-    """
-
-    def __init__(self, journal: Path, num_jobs: int, stream: TextIO | None = None) -> None:
-        self._journal, self._num_jobs = journal, num_jobs
-        self._stream = sys.stderr if stream is None else stream
-        self._draws = self._stream.isatty()
-        self._bars: dict[Path | None, tqdm] = {}  # of a run, None for the sweep
-        self._end = Event()
+    def __init__(self, journal: Path, seconds: float = 60.0) -> None:
+        self._journal, self._seconds, self._end = journal, seconds, Event()
         self._thread = Thread(target=self._watch, daemon=True)
-
-    def start(self) -> None:
-        """Begin to show, beside what this process does."""
         self._thread.start()
 
     def stop(self) -> None:
-        """Show no more, and leave the lines to others."""
+        """Print no more."""
         self._end.set()
-        if self._thread.is_alive():
-            self._thread.join()
-        for bar in self._bars.values():
-            bar.close()
-        self._bars = {}
+        self._thread.join()
 
     def _watch(self) -> None:
-        while not self._end.wait(_SECONDS if self._draws else _SECONDS_OF_A_LOG):
-            self.show()
-
-    def show(self) -> None:
-        """Show once how far everything is."""
-        notes = _last_notes(self._journal).values()
-        begun = [Path(note["directory"]) for note in notes if note["event"] == "begun"]
-        running = {directory: progress_of(directory) for directory in begun}
-        if not self._draws:
-            for directory, progress in running.items():
-                print(f"{self._name(directory)}: {progress}", file=self._stream, flush=True)
-            return
-        for gone in [d for d in self._bars if d is not None and d not in running]:
-            self._bars.pop(gone).close()
-        whole = self._bar(None, "sweep", total=self._num_jobs, unit=" runs")
-        whole.update(len(notes) - len(running) - whole.n)
-        whole.refresh()
-        for directory, progress in running.items():
-            bar = self._bar(directory, self._name(directory), unit=" steps", unit_scale=True)
-            if progress.steps and not bar.n:
-                # what was there before, of a run that is continued say, took none of this time
-                bar.reset(progress.frames)
-                bar.initial = bar.n = progress.steps
-            bar.set_postfix(progress.figures, refresh=False)
-            bar.update(progress.steps - bar.n)
-            bar.refresh()
-
-    def _bar(self, key: Path | None, name: str, **settings: Any) -> tqdm:
-        if key not in self._bars:
-            taken = {-bar.pos for bar in self._bars.values()}
-            place = next(number for number in count() if number not in taken)
-            self._bars[key] = tqdm(
-                desc=name, position=place, file=self._stream, leave=False, dynamic_ncols=True,
-                smoothing=0.1, disable=False, **settings,
-            )  # fmt: skip
-        return self._bars[key]
-
-    def _name(self, directory: Path) -> str:
-        """A run's folder, from that of the sweep on."""
-        above = self._journal.parent.parent
-        return str(directory.relative_to(above) if above in directory.parents else directory)
+        sweep = self._journal.parent.parent
+        while not self._end.wait(self._seconds):
+            for note in _last_notes(self._journal).values():
+                if note["event"] == "begun":
+                    path = Path(note["directory"])
+                    name = path.relative_to(sweep) if sweep in path.parents else path
+                    print(f"{name}: {progress_of(path)}", file=sys.stderr, flush=True)

@@ -7,10 +7,11 @@ from __future__ import annotations
 
 import os
 import sys
-from collections.abc import Mapping, Sequence
+from argparse import ArgumentParser
+from collections.abc import Sequence
 from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple, cast
+from typing import TYPE_CHECKING, Any, NamedTuple, NoReturn, cast
 
 import hydra
 from hydra.core.utils import configure_log
@@ -32,39 +33,52 @@ if TYPE_CHECKING:
 
 store_configs()
 
-_SHORT = {
-    **{"-m": "--multirun", "-r": "--run", "-h": "--help", "-sc": "--shell-completion"},
-    **{"-cd": "--config-dir", "-cp": "--config-path", "-cn": "--config-name"},
-    **{"-c": "--cfg", "-p": "--package", "-i": "--info"},
+_SWITCHES = {
+    **{"help": "-h", "hydra_help": "", "version": "", "shell_completion": "-sc"},
+    **{"multirun": "-m", "run": "-r", "resolve": ""},
 }
-_VALUED = {"--config-dir", "--config-path", "--config-name", "--cfg", "--package"}
-_QUESTIONS = {"--help", "--hydra-help", "--shell-completion", "--version"}
+_VALUED = {"config_path": "-cp", "config_name": "-cn", "cfg": "-c", "package": "-p", "info": "-i"}
+_QUESTIONS = ("help", "hydra_help", "version", "shell_completion")
 """What Hydra answers without a configuration being checked."""
-_SHOWN = {"--cfg", "--info"}
-_FLAGS = {*_SHORT.values(), *_QUESTIONS, "--resolve"}
+_SHOWN = ("cfg", "info")
 
 
 class Command(NamedTuple):
     """What a command line asks for.
 
     Attributes:
-        flags: Flags by their long names, with their values.
+        flags: Flags by their long names, with underscores, as far as they are given.
         overrides: Overrides, with shorthands written out.
         run: Folder of the run that is continued, if one is.
         configs: What was composed and checked, with Hydra's own node for a new run: one, or of a
             sweep the jobs in which every value occurs; none of a question to Hydra.
     """
 
-    flags: dict[str, list[str]]
+    flags: dict[str, Any]
     overrides: list[str]
-    run: Path | None
-    configs: list[DictConfig]
+    run: Path | None = None
+    configs: Sequence[DictConfig] = ()
 
     @property
-    def is_for_hydra(self) -> bool:
-        """Whether it is a sweep, or something to be shown."""
-        is_sweep = _is_sweep(self.flags, self.overrides)
-        return is_sweep or bool((_QUESTIONS | _SHOWN) & self.flags.keys())
+    def is_question(self) -> bool:
+        """Whether Hydra answers it, without a configuration being checked."""
+        return any(flag in self.flags for flag in _QUESTIONS)
+
+    @property
+    def is_shown(self) -> bool:
+        """Whether a configuration is shown."""
+        return any(flag in self.flags for flag in _SHOWN)
+
+    @property
+    def is_sweep(self) -> bool:
+        """Whether its overrides may have several values each."""
+        return "multirun" in self.flags or "hydra.mode=MULTIRUN" in self.overrides
+
+    @property
+    def place(self) -> dict[str, Any]:
+        """Folder and name of the main configuration."""
+        folder = Path(self.flags.get("config_path", CONF)).absolute()
+        return {"folder": folder, "name": self.flags.get("config_name", "config")}
 
 
 def read_command(words: Sequence[str]) -> Command:
@@ -81,23 +95,24 @@ def read_command(words: Sequence[str]) -> Command:
         >>> read_command(["slate=SGPoint", "-m", "seed=0"]).configs[0].env.name
         'PointGoal1'
     """
-    flags, overrides = read_flags(words)
-    if _QUESTIONS & flags.keys():
-        return Command(flags, overrides, None, [])
-    modules, overrides = split_imports(overrides)
+    command = Command(*read_flags(words))
+    if command.is_question:
+        return command
+    modules, overrides = split_imports(command.overrides)
     import_modules(modules or ())
     resume, overrides = _taken("resume", overrides)
     if resume is not None:
-        _check_flags(flags)
+        _check_flags(command)
         run = Path(resume).expanduser().absolute()
-        return Command(flags, overrides, run, [compose_resumed(run, overrides, modules)])
-    is_sweep = _is_sweep(flags, overrides)
-    overrides = _with_folders(flags, expand_slate(overrides, is_sweep)) + note_imports(modules)
-    is_shown = bool(_SHOWN & flags.keys())
-    if is_sweep and not is_shown:
+        return Command(command.flags, overrides, run, [compose_resumed(run, overrides, modules)])
+    overrides = _with_folders(command, expand_slate(overrides, command.is_sweep))
+    overrides += note_imports(modules)
+    if command.is_sweep and not command.is_shown:
         overrides = _with_launcher(overrides)
-    configs = compose_jobs(overrides, sweep=is_sweep, shown=is_shown, **_main_file(flags))
-    return Command(flags, overrides, None, configs)
+    configs = compose_jobs(
+        overrides, sweep=command.is_sweep, shown=command.is_shown, **command.place
+    )
+    return command._replace(overrides=overrides, configs=configs)
 
 
 def main(arguments: Sequence[str] | None = None, program: str = "python train.py") -> int | str:
@@ -111,7 +126,7 @@ def main(arguments: Sequence[str] | None = None, program: str = "python train.py
     session = None
     try:
         command = read_command(sys.argv[1:] if arguments is None else arguments)
-        if command.is_for_hydra:
+        if command.is_question or command.is_shown or command.is_sweep:
             return _ask_hydra(command)
         session = _session(command, program)
         session.run()
@@ -140,74 +155,61 @@ def _session(command: Command, program: str) -> Session:
     return session
 
 
-def job(config: DictConfig) -> None:
+def job(config: DictConfig) -> float:
     """One job of a sweep, in the process in which its launcher lets it run."""
     from safe_rl.cli.session import run_job
 
-    run_job(config)
+    return run_job(config)
 
 
-def read_flags(words: Sequence[str]) -> tuple[dict[str, list[str]], list[str]]:
+class _Parser(ArgumentParser):
+    def error(self, message: str) -> NoReturn:
+        raise CommandLineError(f"{message[:1].upper()}{message[1:]}.")
+
+
+def read_flags(words: Sequence[str]) -> tuple[dict[str, Any], list[str]]:
     """Tell flags, which may stand anywhere, from overrides.
 
-    Returns:
-        Flags by their long names, with their values; and the overrides.
-
     Raises:
-        CommandLineError: For a flag that there is not, is given twice, or lacks its value.
+        CommandLineError: For a flag that there is not, or that lacks its value.
 
     Examples:
         >>> read_flags(["seed=0,1", "-m", "--config-dir", "mine", "algo=cpo"])
-        ({'--multirun': [], '--config-dir': ['mine']}, ['seed=0,1', 'algo=cpo'])
+        ({'config_dir': ['mine'], 'multirun': True}, ['seed=0,1', 'algo=cpo'])
     """
-    flags: dict[str, list[str]] = {}
-    overrides: list[str] = []
-    last = ""
-    for word in words:
+    parser = _Parser(add_help=False, allow_abbrev=False)
+    parser.add_argument("-cd", "--config-dir", action="append")
+    for name, short in _SWITCHES.items():
+        parser.add_argument(*filter(None, (short, _flag(name))), action="store_true", default=None)
+    for name, short in _VALUED.items():
+        more: Any = {"nargs": "?", "const": "all"} if name == "info" else {}
+        parser.add_argument(short, _flag(name), **more)
+    given, overrides = parser.parse_known_args(words)
+    for word in overrides:
         if word.startswith("-"):
-            name, equals, value = word.partition("=")
-            last = _SHORT.get(name, name)
-            if last not in _FLAGS:
-                raise CommandLineError(_without_dashes(word))
-            if last in flags and last != "--config-dir":
-                raise CommandLineError(f"'{last}' is given more than once.")
-            flags.setdefault(last, []).extend([value] if equals else [])
-            last = "" if equals else last
-        elif last in _VALUED or (last == "--info" and "=" not in word):
-            flags[last].append(word)
-            last = ""
-        else:
-            overrides.append(word)
-            last = ""
-    for name in _VALUED & flags.keys():
-        if not flags[name]:
-            raise CommandLineError(f"'{name}' takes a value: {name}=…")
-    for name in {"--package", "--resolve"} & flags.keys():
-        if not {"--cfg", "--help"} & flags.keys():
-            raise CommandLineError(f"'{name}' says how a configuration is shown: add --cfg job.")
-    return flags, overrides
+            name, _, value = word.lstrip("-").partition("=")
+            raise CommandLineError(
+                f"'{word}': there is no such flag. A key is written without dashes, "
+                f"{name.replace('-', '_')}={value or '…'}; 'python train.py --hydra-help' names "
+                "the flags."
+            )
+    return {name: value for name, value in vars(given).items() if value is not None}, overrides
 
 
-def _without_dashes(flag: str) -> str:
-    """What to write instead of a flag that there is not."""
-    name, _, value = flag.lstrip("-").partition("=")
-    written = f"{name.replace('-', '_')}={value or '…'}"
-    return (
-        f"'{flag}': there is no such flag. A key is written without dashes, {written}; "
-        "'python train.py --hydra-help' names the flags."
-    )
+def _flag(name: str) -> str:
+    return f"--{name.replace('_', '-')}"
 
 
-def _check_flags(flags: Mapping[str, Sequence[str]]) -> None:
+def _check_flags(command: Command) -> None:
     """Refuse flags beside ``resume=``; folders of configurations are not needed again."""
-    if "--multirun" in flags:
+    if command.is_sweep:
         raise CommandLineError(
             "resume= continues one run. To continue a sweep, start it again as it was: finished "
             "runs are skipped, interrupted ones continue."
         )
-    for flag in flags.keys() - {"--config-dir", "--run"}:
+    for name in command.flags.keys() - {"config_dir", "run"}:
         raise CommandLineError(
-            f"'{flag}' does not go with resume=: a run has its configuration in config.yaml."
+            f"'{_flag(name)}' does not go with resume=: a run has its configuration in config.yaml."
         )
 
 
@@ -246,14 +248,15 @@ def expand_slate(words: Sequence[str], is_sweep: bool) -> list[str]:
     return [f"env={','.join(SLATES[name])}", *others]
 
 
-def _with_folders(flags: Mapping[str, Sequence[str]], words: Sequence[str]) -> list[str]:
+def _with_folders(command: Command, words: list[str]) -> list[str]:
     """Overrides with the folders of ``--config-dir`` among those that Hydra searches."""
-    folders = [Path(folder).expanduser().absolute() for folder in flags.get("--config-dir", ())]
-    for given, folder in zip(flags.get("--config-dir", ()), folders, strict=True):
-        if not folder.is_dir():
-            raise CommandLineError(f"--config-dir {given}: there is no such folder.")
+    folders = [
+        Path(folder).expanduser().absolute() for folder in command.flags.get("config_dir", ())
+    ]
+    if missing := next((folder for folder in folders if not folder.is_dir()), None):
+        raise CommandLineError(f"--config-dir {missing}: there is no such folder.")
     if not folders:
-        return list(words)
+        return words
     paths = [f"file://{folder}" for folder in folders]
     value, others = _taken("hydra.searchpath", words)
     if value is not None:
@@ -261,24 +264,14 @@ def _with_folders(flags: Mapping[str, Sequence[str]], words: Sequence[str]) -> l
     return [*others, *overrides_of({"hydra.searchpath": paths})]
 
 
-def _main_file(flags: Mapping[str, Sequence[str]]) -> dict[str, Any]:
-    (folder,) = flags.get("--config-path", [CONF])
-    (name,) = flags.get("--config-name", ["config"])
-    return {"folder": Path(folder).absolute(), "name": name}
-
-
-def _with_launcher(words: Sequence[str]) -> list[str]:
+def _with_launcher(words: list[str]) -> list[str]:
     """Overrides of a sweep with joblib's launcher, where it is installed and none is chosen."""
-    is_chosen = any(word.startswith("hydra/launcher=") for word in words)
     try:
         has_joblib = find_spec("hydra_plugins.hydra_joblib_launcher") is not None
     except ModuleNotFoundError:
         has_joblib = False
-    return [*words, *(["hydra/launcher=joblib"] if has_joblib and not is_chosen else [])]
-
-
-def _is_sweep(flags: Mapping[str, Sequence[str]], overrides: Sequence[str]) -> bool:
-    return "--multirun" in flags or "hydra.mode=MULTIRUN" in overrides
+    is_chosen = any(word.startswith("hydra/launcher=") for word in words)
+    return [*words, "hydra/launcher=joblib"] if has_joblib and not is_chosen else words
 
 
 def _ask_hydra(command: Command) -> int:
@@ -286,20 +279,20 @@ def _ask_hydra(command: Command) -> int:
 
     It takes its words from the process.
     """
-    flags, words = command.flags, command.overrides
-    place = _main_file(flags)
-    if not (_QUESTIONS | _SHOWN) & flags.keys():
+    if not (command.is_question or command.is_shown):
         from safe_rl.cli.session import check_writable
 
         with resolving(command.configs[0]):
             check_writable(Path(command.configs[0].hydra.sweep.dir), "hydra.sweep.dir")
     # overrides hold the folders of what was composed
-    known = {"--config-path", "--config-name", *(["--config-dir"] if command.configs else [])}
-    given = [f"{k}={v[0]}" if v else k for k, v in flags.items() if k not in known]
-    main = hydra.main(
-        version_base="1.3", config_path=str(place["folder"]), config_name=place["name"]
-    )
-    before, sys.argv = sys.argv, [sys.argv[0], *given, *words]
+    flags = {k: v for k, v in command.flags.items() if k not in ("config_path", "config_name")}
+    folders = flags.pop("config_dir", [])
+    if folders and not command.configs:
+        flags["config_dir"] = folders[0]
+    given = [_flag(k) if v is True else f"{_flag(k)}={v}" for k, v in flags.items()]
+    folder, name = command.place.values()
+    main = hydra.main(version_base="1.3", config_path=str(folder), config_name=name)
+    before, sys.argv = sys.argv, [sys.argv[0], *given, *command.overrides]
     try:
         main(job)()
     finally:

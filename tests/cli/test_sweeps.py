@@ -1,6 +1,7 @@
 """Sweeps: how many jobs and threads, failing jobs, and a whole sweep started again."""
 
 import json
+import math
 import subprocess
 import sys
 import time
@@ -49,6 +50,7 @@ def sweep_config(directory, job=0):
                 "overrides": {"task": ["seed=0,1,2"]},
                 "sweep": {"dir": str(directory)},
                 "launcher": {},
+                "sweeper": {},
                 "runtime": {"output_dir": str(directory / f"seed{job}")},
                 "job": {"num": job},
             }
@@ -70,7 +72,7 @@ def test_a_failing_job_is_named_and_stops_nobody(tmp_path, capsys):
     report.on_multirun_start(sweep_config(tmp_path))
     end_job(report, sweep_config(tmp_path, 0))
     failed = end_job(report, sweep_config(tmp_path, 1), ValueError("no such cost\nmore"))
-    assert failed.return_value is None
+    assert failed.return_value == -math.inf
     report.on_job_start(config=sweep_config(tmp_path, 2))
     with pytest.raises(SystemExit, match="1"):
         report.on_multirun_end(sweep_config(tmp_path))
