@@ -60,6 +60,8 @@ WRONG = {
     "frames=${nowhere}": "frames: .*nowhere",
     # what other libraries call it
     "total_timesteps=10": r"Did you mean 'frames'\?$",
+    "max_epochs=10": r"Did you mean 'frames'\?$",
+    "algo_cfgs.steps_per_epoch=10": r"Did you mean 'frames_per_batch'\?$",
     "epochs=10": r"Did you mean 'frames'\?$",
     "learning_rate=1": r"Did you mean 'policy_update\.optimizer\.lr' or 'critic_update\.opt",
     "batch_size=64": r"Did you mean 'policy_update\.minibatch_size' or 'critic_update",

@@ -16,6 +16,8 @@ from safe_rl.cli.sweeps import SweepReport, count_jobs, threads_per_job
 from safe_rl.cli.train import read_command
 from safe_rl.runs.checkpoint_file import read_facts
 from safe_rl.runs.folder import runs_below
+from safe_rl.runs.outcome import final_figures
+from safe_rl.runs.table import read_table
 
 ROOT = Path(__file__).parents[2]
 
@@ -197,6 +199,19 @@ def test_jobs_have_their_folders_for_themselves_and_end_with_the_sweep(tmp_path)
     for run in runs_below(tmp_path):
         epoch = read_facts(run.newest_checkpoint())["epoch"]
         assert epoch == run.num_rows
+
+
+@pytest.mark.long
+def test_optuna_takes_the_return_within_the_limits(tmp_path):
+    pytest.importorskip("hydra_plugins.hydra_optuna_sweeper", reason="needs 'sweep-optuna'")
+    search = ["hydra/sweeper=optuna", "hydra.sweeper.n_trials=2", "hydra.sweeper.n_jobs=1"]
+    search += ["hydra.sweeper.direction=maximize", "hydra/launcher=basic", "env=PointGoal1"]
+    said = sweep(tmp_path, *search, "lagrangian.kp=interval(0.1,1)")
+    assert "Sweep: 2 of 2 runs are finished." in said.stdout, said.stderr
+    best = OmegaConf.load(tmp_path / "optimization_results.yaml")
+    tables = [read_table(path) for path in tmp_path.rglob("progress.csv")]
+    returns = [max(final_figures(table, ["cost"])["episode_return"] for table in tables)]
+    assert best.best_value in (pytest.approx(returns[0]), -math.inf)
 
 
 def test_settings_of_the_launcher_are_known_without_choosing_it():
