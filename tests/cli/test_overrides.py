@@ -52,7 +52,7 @@ WRONG = {
     "env=CarGoal2,CarGaol2": "no env 'CarGaol2'. Did you mean 'CarGoal2'",
     "algo=cop": "no algo 'cop'. Did you mean 'cpo'",
     "preset=papers": "Did you mean 'paper'",
-    "limits=bad": r"no limits 'bad'\. There are default, paper\.$",
+    "limits=bad": r"no limits 'bad'\. There are default, ",
     "env=zzzzz": r"no env 'zzzzz'\. 'python train.py --help' names all there are\.$",
     "cost_limits.cost=10": r"cost_limits='\{cost: 10\}'",
     "frames=[1": r"frames=\[1",
