@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
@@ -14,38 +14,27 @@ from hydra.core.global_hydra import GlobalHydra
 from hydra.core.hydra_config import HydraConfig
 from hydra.core.object_type import ObjectType
 from hydra.core.override_parser.types import IntervalSweep, Override
+from hydra.errors import HydraException
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
+from yaml import YAMLError
 
 from safe_rl.cli.grammar import CommandLineError, parse
 from safe_rl.cli.schema import KEYS, check_settings, plain
 from safe_rl.cli.suggestions import (
-    COMPOSING_ERRORS,
-    Composing,
-    algorithm_meant,
+    CONF,
+    GIVEN_WHOLE,
+    Options,
     explain,
-    nobody_reads,
+    no_choice,
+    unknown_key,
     unread_by,
 )
 from safe_rl.envs import store_configs
-from safe_rl.envs.families import hint_of_gymnasium
 from safe_rl.naming import did_you_mean
 
-__all__ = [
-    *("CONF", "GIVEN_WHOLE", "check_once", "check_read", "compose_jobs", "hydras_own", "resolving"),
-]
+__all__ = ["CONF", "check_once", "check_read", "compose_jobs", "hydras_own", "resolving"]
 
-_PACKAGED = Path(__file__).parents[1] / "conf"
-CONF = _PACKAGED if _PACKAGED.is_dir() else Path(__file__).parents[2] / "conf"
-"""Folder of ``config.yaml`` and the groups: of a checkout, or the copy in an installed package."""
-
-_BUDGETED = ("saute", "simmer", "early_termination")
-GIVEN_WHOLE = {
-    **{"cost_limits": "limits", "model.input_scale": "factors"},
-    **{f"transforms.{name}.budgets": "budgets" for name in _BUDGETED},
-}
-"""Mappings that are given all at once, and what is in them."""
-_MOST_LISTED = 40
 _ONE_EACH = ("env", "algo", "preset", "model", "risk", "collector", "logger", "lagrangian")
 
 
@@ -81,11 +70,12 @@ def compose_jobs(
     """
     store_configs()
     overrides = [parse(text) for text in texts]
+    check_once(overrides)
     with _hydra(folder) as loader:
-        check_once(overrides)
-        _check_choices(overrides, partial(_options, loader, name, texts))
+        options = partial(_options, loader, name, texts)
+        _check_choices(overrides, options)
         jobs = list(_jobs(overrides)) if sweep else [list(texts)]
-        configs = [_compose(job, name, partial(_options, loader, name, texts)) for job in jobs]
+        configs = [_compose(job, name, options) for job in jobs]
     for config in [] if shown else configs:
         _check_package(config)
         check_read(overrides, config)
@@ -128,14 +118,26 @@ def _options(loader: ConfigLoader, name: str, texts: Sequence[str], group: str) 
     return loader.get_group_options(group, ObjectType.CONFIG, name, searched)
 
 
-def _compose(texts: list[str], name: str, options: partial[list[str]]) -> DictConfig:
-    def composed(texts: list[str]) -> DictConfig:
-        return compose(name, texts, return_hydra_config=True)
-
+def _compose(texts: list[str], name: str, options: Options) -> DictConfig:
     try:
-        return composed(texts)
-    except COMPOSING_ERRORS as error:
-        raise CommandLineError(explain(error, texts, Composing(composed, options))) from None
+        return compose(name, texts, return_hydra_config=True)
+    except (HydraException, OmegaConfBaseException, YAMLError, ValueError, OSError) as error:
+        key = re.match(r"Could not override '([^']+)'", str(error))
+        head = f"{key[1]}=" if key else ""
+        given = next((text for text in texts if head and text.lstrip("+").startswith(head)), None)
+        if key is None or given is None:
+            raise CommandLineError(explain(error, texts, options)) from None
+        # with all that is right, for what refers to it: the name of env=gymnasium is its env.id
+        values = plain(_compose([text for text in texts if text != given], name, options))
+        inner = re.search(r"full_key: (\S+)", str(error.__cause__))
+        section, _, last = inner[1].rpartition(".") if inner else ("", "", "")
+        if section and f"{section}.".startswith(f"{key[1]}."):
+            known = OmegaConf.select(OmegaConf.create(values), section) or {}
+            raise CommandLineError(
+                f"'{given}': '{section}' has no '{last}'.{did_you_mean(last, map(str, known))} "
+                f"A key that it lacks is added as +{section}.{last}=…"
+            ) from None
+        raise CommandLineError(unknown_key(given, key[1], values)) from None
 
 
 def _jobs(overrides: Sequence[Override]) -> Iterator[list[str]]:
@@ -161,60 +163,35 @@ def check_once(overrides: Sequence[Override]) -> None:
     """Refuse keys that are given twice, and parts of mappings that are given as a whole."""
     given: dict[str, list[str]] = {}
     for override in overrides:
+        key, line = override.key_or_group, str(override.input_line)
         if not override.is_delete():
-            key = f"{override.key_or_group}@{override.package or ''}"
-            given.setdefault(key, []).append(str(override.input_line))
-    for key, lines in given.items():
-        if lines[1:]:
-            name = key.removesuffix("@")
-            raise CommandLineError(f"'{name}' is given more than once: {', '.join(lines)}.")
-    for override in overrides:
+            given.setdefault("@".join(filter(None, (key, override.package))), []).append(line)
         for section, what in GIVEN_WHOLE.items():
-            name = override.key_or_group.removeprefix(f"{section}.")
-            if name != override.key_or_group:
+            name = key.removeprefix(f"{section}.")
+            if name != key:
                 raise CommandLineError(
-                    f"'{override.input_line}': {what} are given all at once, as "
+                    f"'{line}': {what} are given all at once, as "
                     f"{section}='{{{name}: {override.get_value_element_as_str()}}}'."
                 )
+    for key, lines in given.items():
+        if lines[1:]:
+            raise CommandLineError(f"'{key}' is given more than once: {', '.join(lines)}.")
 
 
-def _check_choices(overrides: Sequence[Override], options: partial[list[str]]) -> None:
-    """Check what is chosen of groups, such as ``env=CarGoal1`` or ``algo=ppo,cpo``."""
+def _check_choices(overrides: Sequence[Override], options: Options) -> None:
+    """Check what is chosen of groups, as far as Hydra's own words would not help."""
     for override in overrides:
-        group, value = override.key_or_group, override.value()
-        may_choose = value is None or isinstance(value, bool | str | list)
-        known = options(group) if may_choose or override.is_discrete_sweep() else []
-        if not known or override.is_delete():
+        group, value, line = override.key_or_group, override.value(), override.input_line
+        if override.is_delete() or override.is_sweep_override() or not (known := options(group)):
             continue
-        sweep = override.sweep_string_iterator() if override.is_sweep_override() else None
-        chosen = list(_names(sweep or [override.get_value_element_as_str()]))
-        if isinstance(value, list) and chosen and group in _ONE_EACH:
+        if isinstance(value, list) and value and group in _ONE_EACH:
             raise CommandLineError(
-                f"'{override.input_line}': a run has one {group}; for a run with each of them: "
-                f"-m {group}={','.join(chosen)}"
+                f"'{line}': a run has one {group}; for a run with each of them: "
+                f"-m {group}={','.join(map(str, value))}"
             )
-        # of some groups several are chosen, or none: transforms=[saute,action_filter]
-        for name in chosen if chosen or isinstance(value, list) else [""]:
-            if name not in known:
-                hint = algorithm_meant if group == "algo" else did_you_mean
-                family = hint_of_gymnasium(name) if group == "env" else ""
-                raise CommandLineError(
-                    f"'{override.input_line}': there is no {group} '{name}'."
-                    f"{family or hint(name, known) or _listed(known)}"
-                )
-
-
-def _names(choices: Iterable[str]) -> Iterator[str]:
-    """Single names of choices that are names or lists of them."""
-    for choice in choices:
-        yield from filter(None, re.split(r"[\[\],\s'\"]+", choice))
-
-
-def _listed(choices: Sequence[str]) -> str:
-    """What there is to choose from, or where that is told if a line cannot hold it."""
-    if len(choices) > _MOST_LISTED:
-        return " 'python train.py --help' names all there are."
-    return f" There are {', '.join(choices)}."
+        if value in ("", None) or isinstance(value, bool):
+            name = override.get_value_element_as_str()
+            raise CommandLineError(f"'{line}': {no_choice(group, name, known)}")
 
 
 def _check_package(config: DictConfig) -> None:
@@ -258,7 +235,7 @@ def _check_values(config: DictConfig, overrides: Sequence[Override]) -> None:
 
 
 def _check_added(overrides: Sequence[Override], config: DictConfig) -> None:
-    """Refuse keys that are added at the top level, ``+key=…``, and that nothing reads.
+    """Refuse keys that are added at the top level, ``+key=…``, and that nothing refers to.
 
     Keys below sections and parts are checked with their values.
     """
@@ -266,10 +243,10 @@ def _check_added(overrides: Sequence[Override], config: DictConfig) -> None:
     for override in overrides:
         head = override.key_or_group.partition(".")[0]
         is_added = override.is_add() or override.is_force_add()
-        is_known = any(path.partition(".")[0] == head for path in KEYS)
-        if not is_added or is_known or head not in config or "/" in override.key_or_group:
+        if not is_added or head in KEYS or head not in config or "/" in override.key_or_group:
             continue
         # ${head}, ${head.key}, ${resolver:head.key}
         if not re.search(rf"\$\{{(?:[^${{}}]*[:,])?{re.escape(head)}[.,}}]", text):
             others = {key: node for key, node in plain(config).items() if key != head}
-            raise CommandLineError(nobody_reads(override.input_line, override.key_or_group, others))
+            line = str(override.input_line)
+            raise CommandLineError(unknown_key(line, override.key_or_group, others))

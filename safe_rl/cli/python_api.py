@@ -13,10 +13,11 @@ from typing import Any
 
 from omegaconf import open_dict
 
-from safe_rl.cli.composing import GIVEN_WHOLE, compose_jobs, resolving
+from safe_rl.cli.composing import compose_jobs, resolving
 from safe_rl.cli.grammar import CommandLineError, overrides_of, take_options
 from safe_rl.cli.resuming import compose_resumed
 from safe_rl.cli.session import Session, missing_folders, new_folder
+from safe_rl.cli.suggestions import GIVEN_WHOLE
 from safe_rl.cli.trained_run import Run, load
 from safe_rl.cli.user_code import import_modules, note_imports
 from safe_rl.evaluation import Evaluation

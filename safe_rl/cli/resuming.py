@@ -15,7 +15,7 @@ from omegaconf import DictConfig, OmegaConf
 from safe_rl.cli.composing import check_once, check_read
 from safe_rl.cli.grammar import CommandLineError, parse
 from safe_rl.cli.schema import check_settings, plain
-from safe_rl.cli.suggestions import nobody_reads
+from safe_rl.cli.suggestions import unknown_key
 from safe_rl.cli.user_code import check_imports, note_imports
 from safe_rl.files import read_config, read_yaml
 from safe_rl.runs.folder import RunFolder
@@ -95,7 +95,7 @@ def _check_may_change(override: Override, config: DictConfig, directory: Path) -
     key, line = override.key_or_group, override.input_line
     is_plain = override.get_key_element() == key and not override.is_hydra_override()
     if is_plain and "/" not in key and OmegaConf.select(config, key, default=_MISSING) is _MISSING:
-        raise CommandLineError(nobody_reads(line, key, plain(config)))
+        raise CommandLineError(unknown_key(str(line), key, plain(config)))
     if override.is_sweep_override():
         raise CommandLineError(f"'{line}': a run has one value of it.")
     if not _is_number(override, config):

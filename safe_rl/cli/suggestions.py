@@ -1,37 +1,32 @@
-"""What a wrong name on the command line was meant to be, and what is wrong with a file."""
+"""What a wrong key or choice was meant to be, in one line."""
 
 from __future__ import annotations
 
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
-from hydra.errors import HydraException
-from omegaconf import DictConfig, OmegaConf
-from omegaconf.errors import OmegaConfBaseException
-from yaml import YAMLError
+from hydra.errors import MissingConfigException
+from omegaconf import OmegaConf
 
-from safe_rl.cli.schema import KEYS, SettingError, optional_keys, plain
+from safe_rl.cli.schema import KEYS, optional_keys
+from safe_rl.envs.families import hint_of_gymnasium
 from safe_rl.naming import did_you_mean, nearest
 
-__all__ = [
-    *("COMPOSING_ERRORS", "Composing", "algorithm_meant", "explain", "nobody_reads", "paths_of"),
-    "unread_by",
-]
+__all__ = ["CONF", "GIVEN_WHOLE", "explain", "unknown_key", "unread_by"]
 
-COMPOSING_ERRORS = (HydraException, OmegaConfBaseException, YAMLError, ValueError)
-"""What Hydra raises about overrides and files."""
-
-_LIKENESS = 0.6
-_WHOLE = ("cost_limits", "default_cost_limits", "model.input_scale", "paper")
-_LARGE = ("env", "algo", "preset")
-"""Groups whose files differ in more than a few keys."""
-_LISTS = ("transforms",)
+_PACKAGED = Path(__file__).parents[1] / "conf"
+CONF = _PACKAGED if _PACKAGED.is_dir() else Path(__file__).parents[2] / "conf"
+"""Folder of ``config.yaml`` and the groups: of a checkout, or the copy in an installed package."""
+GIVEN_WHOLE = {
+    **{"cost_limits": "limits", "model.input_scale": "factors"},
+    **{f"transforms.{t}.budgets": "budgets" for t in ("saute", "simmer", "early_termination")},
+}
+"""Mappings that are given all at once, and what is in them."""
 
 _ELSEWHERE = {
-    "frames": (
-        "total_steps total_timesteps total_frames timesteps max_steps epoch epochs max_epochs"
-    ),
+    "frames": "total_steps total_timesteps total_frames timesteps max_steps epochs max_epochs",
     "frames_per_batch": "n_steps rollout_length step_per_epoch steps_per_epoch",
     "num_passes": "n_epochs update_iters repeat_per_collect",
     "num_envs": "n_envs vector_env_nums training_num",
@@ -53,9 +48,6 @@ _ELSEWHERE = {
     "hydra.run.dir": "log_dir logdir output_dir directory out save_path",
     "logger": "wandb use_wandb use_tensorboard",
     "+note": "note notes comment",
-}
-"""Key, or its end -> what other libraries call it."""
-_ALGORITHMS_ELSEWHERE = {
     "ppo_lagrangian": "cppo ppolag cppopid pdo ppolagrangian",
     "trpo_lagrangian": "trpolag trpopid ctrpolag",
     "sac_lagrangian": "saclag sacpid csac sacl",
@@ -63,85 +55,74 @@ _ALGORITHMS_ELSEWHERE = {
     "crpo": "oncrpo",
     "ppo": "ppoearlyterminated pposaute pposimmerpid",
 }
-"""Name of an algorithm -> what other libraries call it, without dashes."""
+"""Key, its end, or an algorithm -> what other libraries call it; algorithms without dashes."""
 _ALWAYS = ("env", "algo", "logger", "hydra.run.dir", "+note")
+_LARGE = ("env", "algo", "preset")
+"""Groups whose files differ in more than a few keys."""
+_LIKENESS = 0.6
+_MOST_LISTED = 40
+
+Options = Callable[[str], Sequence[str]]
+"""Names of the files in a group."""
 
 
-def keys_meant(
-    key: str, written: Sequence[str], optional: Sequence[str] = (), refused: Sequence[str] = ()
-) -> list[str]:
-    """Keys with the last name of a wrong one, or its meaning elsewhere, or else those most like it.
+def explain(error: Exception, texts: Sequence[str], options: Options) -> str:
+    """Say in one line what is wrong with overrides, or files, that Hydra could not compose.
 
     Args:
-        key: The wrong one.
-        written: Full paths of all that a configuration holds and its algorithm reads.
-        optional: Full paths of what it lacks and its parts would read.
-        refused: Full paths of what it holds and its algorithm does not read.
-
-    Examples:
-        >>> keys_meant("lr", ["policy_update.optimizer.lr", "frames"])
-        ['policy_update.optimizer.lr']
-        >>> keys_meant("total_timesteps", ["frames", "env.num_steps"])
-        ['frames']
-        >>> keys_meant("frmaes", ["frames", "env.num_steps"])
-        ['frames']
+        error: What Hydra says.
+        texts: The overrides.
+        options: What there is to choose from.
     """
-    name = _end(key)
-    exact = (_ending(name, written), _elsewhere(name, written), _ending(name, optional))
-    if found := next(filter(None, (*exact, _ending(name, refused))), None):
-        return found
-    paths = [*written, *optional]
-    whole = nearest(key, paths, _LIKENESS)
-    end = nearest(name, map(_end, paths), _LIKENESS)
-    if whole is not None or end is None:
-        return [] if whole is None else [whole]
-    return _ending(end, paths)
+    words = " ".join(str(error.__cause__ or error if not str(error) else error).split())
+    file, _, said = words.removeprefix("In '").partition("': ")
+    if isinstance(error, MissingConfigException) and error.missing_cfg_file is not None:
+        group, _, name = error.missing_cfg_file.rpartition("/")
+        given = next(
+            (t for t in texts if re.match(rf"\+?{group}(@[\w.]+)?=.*{re.escape(name)}", t)), None
+        )
+        if given is not None:
+            return f"'{given}': {no_choice(group, name, options(group))}"
+        return f"{file}.yaml: {no_choice(group, name, options(group))}"
+    if there := re.search(r"An item is already at '([^']+)'", words):
+        return f"'{there[1]}' is there already: write it without +."
+    return f"{file}.yaml: {said}" if words.startswith("In '") else words
 
 
-def algorithm_meant(name: str, known: Sequence[str]) -> str:
-    """Say which algorithm a wrong name means: by its name elsewhere, or the most alike.
+def no_choice(group: str, name: str, known: Sequence[str]) -> str:
+    """Say that a group has no file of a name, and which was meant or which there are."""
+    listed = f" There are {', '.join(known)}."
+    if len(known) > _MOST_LISTED:
+        listed = " 'python train.py --help' names all there are."
+    own = _names_here(name.replace("-", "").replace("_", "")) if group == "algo" else ""
+    meant = f" Did you mean '{own}'?" if own in known else did_you_mean(name, known)
+    family = hint_of_gymnasium(name) if group == "env" else ""
+    return f"there is no {group} '{name}'.{family or meant or listed}"
 
-    Examples:
-        >>> algorithm_meant("CPPO", ["ppo", "ppo_lagrangian"])
-        " Did you mean 'ppo_lagrangian'?"
+
+def unknown_key(given: str, key: str, values: Mapping[str, Any]) -> str:
+    """Say that nothing reads a key, and what was meant: another key, or a choice that reads it.
+
+    Args:
+        given: The whole override.
+        key: Its key.
+        values: What the configuration holds without it.
     """
-    word = name.lower().replace("-", "").replace("_", "")
-    found = (own for own, words in _ALGORITHMS_ELSEWHERE.items() if word in words.split())
-    own = next(found, None)
-    return did_you_mean(name, known) if own is None else f" Did you mean '{own}'?"
-
-
-def _elsewhere(name: str, written: Sequence[str]) -> list[str]:
-    word = name.lower().replace("-", "_")
-    for key, words in _ELSEWHERE.items():
-        if word in words.split():
-            found = [key] if key in _ALWAYS or key in written else _ending(key, written)
-            if found:
-                return found
-    return []
-
-
-def _ending(name: str, paths: Sequence[str]) -> list[str]:
-    return [path for path in paths if _end(path) == name]
-
-
-def _end(path: str) -> str:
-    return path.rpartition(".")[2]
-
-
-def paths_of(values: Mapping[str, Any], prefix: str = "") -> Iterator[str]:
-    """Full paths of everything that can be overridden.
-
-    Examples:
-        >>> list(paths_of({"seed": 0, "risk": {"tail": 0.1, "_target_": "a.B"}}))
-        ['seed', 'risk.tail']
-    """
-    for key, value in values.items():
-        path = f"{prefix}{key}"
-        if isinstance(value, Mapping) and path not in _WHOLE:
-            yield from paths_of(value, f"{path}.")
-        elif not str(key).startswith("_"):
-            yield path
+    algo, section = values.get("algo") or {}, key.partition(".")[0]
+    if section not in values and section in KEYS and section != "note":  # which is added
+        return f"'{given}': algo={algo.get('name')} has no '{section}'."
+    if choice := _choice_with(key):
+        return f"'{given}': nothing reads '{key}' without {choice}."
+    unread, held = unread_by(algo), list(_paths(values))
+    refused = {
+        p: why for p in held for head, why in unread.items() if f"{p}.".startswith(f"{head}.")
+    }
+    optional = {p: f"+{p}" for p in optional_keys(values) if p.split(".")[0] not in unread}
+    meant = _meant(key, [p for p in held if p not in refused], list(optional), list(refused))
+    if meant and meant[0] in refused:
+        return f"'{given}': algo={algo['name']} does not read '{meant[0]}'. {refused[meant[0]]}"
+    names = " or ".join(f"'{optional.get(path, path)}'" for path in meant)
+    return f"'{given}': nothing reads '{key}'.{f' Did you mean {names}?' if names else ''}"
 
 
 def unread_by(algo: Mapping[str, Any]) -> Mapping[str, str]:
@@ -155,146 +136,61 @@ def unread_by(algo: Mapping[str, Any]) -> Mapping[str, str]:
     return find_recipe(OmegaConf.create({"algo": dict(algo)})).unused_keys
 
 
-def nobody_reads(given: str | None, key: str, values: Mapping[str, Any]) -> str:
-    """Say that nothing reads a key, and name those that were meant by their full paths.
+def _meant(
+    key: str, held: Sequence[str], optional: Sequence[str], refused: Sequence[str]
+) -> list[str]:
+    """Keys with the last name of a wrong one, or its name here, or else the one most like it.
 
-    Args:
-        given: The whole override.
-        key: Its key.
-        values: What the configuration holds without it.
+    Examples:
+        >>> _meant("lr", ["policy_update.optimizer.lr", "frames"], [], [])
+        ['policy_update.optimizer.lr']
+        >>> _meant("total_timesteps", ["frames", "env.num_steps"], [], [])
+        ['frames']
+        >>> _meant("frmaes", ["frames", "env.num_steps"], [], [])
+        ['frames']
     """
-    algo = values.get("algo") or {}
-    unread = unread_by(algo)
-
-    def reason(path: str) -> str | None:
-        heads = [head for head in unread if f"{path}.".startswith(f"{head}.")]
-        return unread[heads[0]] if heads else None
-
-    optional = {path: f"+{path}" for path in optional_keys(values) if reason(path) is None}
-    held = list(paths_of(values))
-    refused = [path for path in held if reason(path) is not None]
-    meant = keys_meant(key, [path for path in held if path not in refused], [*optional], refused)
-    if meant and meant[0] in refused:
-        why = reason(meant[0])
-        return f"'{given}': algo={algo['name']} does not read '{meant[0]}'. {why}"
-    read = [f"'{optional.get(path, path)}'" for path in meant]
-    hint = f" Did you mean {' or '.join(read)}?" if read else ""
-    return f"'{given}': nothing reads '{key}'.{hint}"
+    name = _end(key)
+    here = _names_here(name)
+    for word, paths in ((name, held), (here, [*_ALWAYS, *held]), (name, optional), (name, refused)):
+        if word is not None and word in paths:
+            return [word]
+        if found := [path for path in paths if path.endswith(f".{word}")]:
+            return found
+    paths = [*held, *optional]
+    if (whole := nearest(key, paths, _LIKENESS)) is not None:
+        return [whole]
+    end = nearest(name, map(_end, paths), _LIKENESS)
+    return [path for path in paths if _end(path) == end]
 
 
-class Composing:
-    """What composes configurations, asked again with fewer overrides to find the wrong one.
-
-    Args:
-        compose: Overrides -> configuration.
-        options: Group -> names of its files.
-    """
-
-    def __init__(
-        self,
-        compose: Callable[[list[str]], DictConfig],
-        options: Callable[[str], Sequence[str]],
-    ) -> None:
-        self.compose, self.options = compose, options
-
-    def works(self, overrides: list[str]) -> bool:
-        """Whether overrides can be composed."""
-        try:
-            self.compose(overrides)
-        except COMPOSING_ERRORS:
-            return False
-        return True
-
-    def chooses(self, override: str) -> bool:
-        """Whether an override chooses a file of a group."""
-        return bool(self.options(override.partition("=")[0].lstrip("+").partition("@")[0]))
-
-    def choice_with(self, key: str, right: list[str]) -> str | None:
-        """The choice that would bring a key, as ``risk=cvar`` brings ``risk.tail``, or None."""
-        section, _, rest = key.partition(".")
-        if section in _LARGE or not rest:
-            return None
-        for option in self.options(section):
-            choice = f"{section}=[{option}]" if section in _LISTS else f"{section}={option}"
-            try:
-                paths = paths_of(plain(self.compose([*right, choice])))
-            except (*COMPOSING_ERRORS, SettingError):
-                continue
-            if any(f"{path}.".startswith(f"{key}.") for path in paths):
-                return choice
-        return None
+def _names_here(name: str) -> str | None:
+    """What is called here what another library calls by a name."""
+    word = name.lower().replace("-", "_")
+    return next((own for own, words in _ELSEWHERE.items() if word in words.split()), None)
 
 
-def explain(error: Exception, overrides: list[str], composing: Composing) -> str:
-    """Say in one line what is wrong with overrides, or files, that Hydra could not compose.
-
-    Args:
-        error: What Hydra says.
-        overrides: The overrides.
-        composing: Composes what some of them choose.
-    """
-    words = " ".join(str(error.__cause__ or error if not str(error) else error).split())
-    if (place := re.match(r"In '([^']+)': (.*)", words)) is not None:  # said of files alone
-        return _in_file(place[1], place[2], getattr(error, "options", None))
-    if (there := _quoted(r"An item is already at '([^']+)'", words)) is not None:
-        return f"'{there}' is there already: write it without +."
-    key = _quoted(r"Could not override '([^']+)'", words)
-    given = next((text for text in overrides if text.lstrip("+").startswith(f"{key}=")), None)
-    if key is None or given is None:
-        return _of_a_choice(words, overrides, composing)
-    # with all that is right, for what refers to it: the name of env=gymnasium is its env.id
-    right = [text for text in overrides if text != given]
-    try:
-        values = plain(composing.compose(right))
-    except COMPOSING_ERRORS as another:
-        return explain(another, right, composing)
-    inner = _quoted(r"full_key: (\S+)", str(error.__cause__))
-    if inner is not None and inner.startswith(f"{key}."):
-        section, _, name = inner.rpartition(".")
-        head = f"{section}."
-        inside = [path.removeprefix(head) for path in paths_of(values) if path.startswith(head)]
-        meant = nearest(name, inside)
-        advice = f"add +{inner}=…" if meant is None else f"did you mean '{meant}'?"
-        return f"'{given}': '{section}' has no '{name}', {advice}"
-    section = key.partition(".")[0]
-    is_known = section in KEYS and section != "note"  # which is nobody's until it is added
-    if section not in values and is_known:
-        return f"'{given}': algo={values['algo']['name']} has no '{section}'."
-    if (choice := composing.choice_with(key, right)) is not None:
-        return f"'{given}': nothing reads '{key}' without {choice}."
-    return nobody_reads(given, key, values)
+def _choice_with(key: str) -> str | None:
+    """The choice that would bring a key, as ``risk=cvar`` brings ``risk.tail``, or None."""
+    section, _, rest = key.partition(".")
+    for file in sorted((CONF / section).glob("*.yaml")) if rest and section not in _LARGE else ():
+        # a file that begins with '@package _global_' has the whole key
+        held = _paths(OmegaConf.to_container(OmegaConf.load(file)))  # type: ignore[arg-type]
+        if any(f"{path}.".startswith((f"{rest}.", f"{key}.")) for path in held):
+            is_list = section == "transforms"
+            return f"{section}=[{file.stem}]" if is_list else f"{section}={file.stem}"
+    return None
 
 
-def _of_a_choice(words: str, overrides: list[str], composing: Composing) -> str:
-    """Words on what is wrong, after the choice without which the others compose, if it is one."""
-    choices = [text for text in overrides if composing.chooses(text)]
-    if not composing.works(choices):
-        for choice in choices:
-            if composing.works([other for other in choices if other != choice]):
-                return f"'{choice}': {words}"
-    return words
+def _paths(values: Mapping[str, Any], prefix: str = "") -> Iterator[str]:
+    """Full paths of everything that can be overridden."""
+    for key, value in values.items():
+        path = f"{prefix}{key}"
+        is_whole = path in (*GIVEN_WHOLE, "default_cost_limits", "paper")
+        if isinstance(value, Mapping) and not is_whole:
+            yield from _paths(value, f"{path}.")
+        elif not str(key).startswith("_"):
+            yield path
 
 
-def _in_file(file: str, words: str, options: Sequence[str] | None) -> str:
-    """What is wrong with a file of configurations, named by its path in their folder."""
-    choice = _quoted(r"Could not override '([^']+)'", words)
-    if choice is not None:
-        likely = _quoted(r"Did you mean to override (.+)\?$", words)
-        advice = "to choose it there, write it without 'override'"
-        return (
-            f"{file}.yaml: 'override /{choice}' in its defaults, but nothing before chooses "
-            f"'{choice}': {advice if likely is None else f'did you mean {likely!r}?'}"
-        )
-    missing = _quoted(r"Could not (?:find|load) '([^']+)'", words)
-    if missing is not None:
-        hint = did_you_mean(missing.rpartition("/")[2], options or ())
-        return (
-            f"{file}.yaml: there is no '{missing}', which its defaults name, or an override of "
-            f"them in a file that builds on it.{hint}"
-        )
-    return f"{file}.yaml: {words}"
-
-
-def _quoted(pattern: str, words: str) -> str | None:
-    found = re.search(pattern, words)
-    return None if found is None else found[1]
+def _end(path: str) -> str:
+    return path.rpartition(".")[2]

@@ -46,7 +46,7 @@ WRONG = {
     "transforms.saute.budgets.cost=1": r"budgets are given all at once, as .*='\{cost: 1\}'",
     "model.input_scale.gyro=1": r"factors are given all at once, as .*='\{gyro: 1\}'",
     "+model.input_scale.velocimeter=0.5": r"model.input_scale='\{velocimeter: 0.5\}'",
-    "certificate={episodez: 5}": "'certificate' has no 'episodez', did you mean 'episodes'",
+    "certificate={episodez: 5}": "'certificate' has no 'episodez'. Did you mean 'episodes'",
     "+seed=1": "'seed' is there already: write it without +",
     "env=PointGaol1": "no env 'PointGaol1'. Did you mean 'PointGoal1'",
     "env=CarGoal2,CarGaol2": "no env 'CarGaol2'. Did you mean 'CarGoal2'",
@@ -182,7 +182,7 @@ def test_the_paper_s_setting_is_refused_where_the_paper_has_none():
 
 
 def test_what_a_mapping_lacks_is_added_with_a_plus():
-    with pytest.raises(CommandLineError, match=r"no 'num_gpus', add \+collector\.ray_init"):
+    with pytest.raises(CommandLineError, match=r"no 'num_gpus'\. .* \+collector\.ray_init"):
         read_command(["collector=ray", "collector.ray_init={num_gpus: 3}"])
 
 
@@ -193,22 +193,20 @@ def test_of_two_choices_that_an_algorithm_lacks_one_is_named():
 
 # files of one's own, each with what the line about it must name: the file, and the key or the place
 FAULTY = {
-    "defaults: [ppo, {override /lagrangian: pid}]": (
-        r"algo/mine\.yaml: 'override /lagrangian'.*without 'override'"
-    ),
+    "defaults: [ppo, {override /lagrangian: pid}]": r"algo/mine\.yaml: .*override 'lagrangian'",
     "defaults: [sac_lagrangian, {override /limits/replay: default}]": (
-        r"algo/mine\.yaml: .*did you mean 'limits/replay@limits'"
+        r"algo/mine\.yaml: .*Did you mean to override limits/replay@limits"
     ),
-    "defaults: [ppo_lagrangien]": r"algo/mine\.yaml: there is no 'algo/ppo_lagrangien'",
+    "defaults: [ppo_lagrangien]": r"algo/mine\.yaml: there is no algo 'ppo_lagrangien'\. Did you",
     # Hydra says it of the file whose choice is overridden
     "defaults: [ppo_lagrangian, {override /lagrangian: pidd}]": (
-        r"algo/ppo_lagrangian\.yaml: there is no 'lagrangian/pidd'.* builds on it.*mean 'pid'\?"
+        r"algo/ppo_lagrangian\.yaml: there is no lagrangian 'pidd'\. Did you mean 'pid'\?"
     ),
-    "defaults: [ppo_lagrangian, {/lagrangian: pid}]": "'algo=mine': Multiple values for lagrangian",
-    "defaults: {ppo: null}": r"'algo=mine': Invalid defaults list in 'algo/mine'",
+    "defaults: [ppo_lagrangian, {/lagrangian: pid}]": "Multiple values for lagrangian",
+    "defaults: {ppo: null}": r"Invalid defaults list in 'algo/mine'",
     "- 1": r"algo/mine\.yaml: ",
-    "loss: {a: 1\nb: 2": r"'algo=mine': .*mine\.yaml\", line 3",
-    "frames: ${a": "'algo=mine': .*frames",
+    "loss: {a: 1\nb: 2": r"mine\.yaml\", line 3",
+    "frames: ${a": "full_key: frames",
     "frames: 3": r"algo\.name' not found",
 }
 
