@@ -82,6 +82,15 @@ def test_pauses_do_not_count(rows):
     assert rows["[`stopped`](stopped.md)"] == rows["[`slow`](slow.md)"]
 
 
+def test_the_limit_is_compared_with_costs_of_20000_steps():
+    short = [
+        {"steps": 5_000.0 * n, "episode_return": 0.0, "episode_cost": cost, "cost_rate": 0.0}
+        for n, cost in enumerate([30, 30, 30, 0, 0, 0, 90, 90], 1)
+    ]
+    # the means of four epochs are 22.5 and 45
+    assert algorithm_results._part_of(short, 0, 40_000)["above"] == 0.5
+
+
 def test_what_has_not_run_has_no_row(rows):
     assert len(rows) == 3
 
