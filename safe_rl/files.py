@@ -19,9 +19,21 @@ from typing import Any
 import yaml
 
 __all__ = [
-    *("check_no_links", "check_place", "read_bounded", "read_config", "read_json", "read_yaml"),
-    *("replace_csv", "replace_text", "replacing"),
+    *(
+        "CONF",
+        "check_no_links",
+        "check_place",
+        "read_bounded",
+        "read_config",
+        "read_json",
+        "read_yaml",
+    ),
+    *("read_yaml", "replace_csv", "replace_text", "replacing"),
 ]
+
+_PACKAGED = Path(__file__).parent / "conf"
+CONF = _PACKAGED if _PACKAGED.is_dir() else Path(__file__).parents[1] / "conf"
+"""Folder of ``config.yaml`` and the groups: of a checkout, or the copy in an installed package."""
 
 # Bytes of a configuration or of notes; those of a run have about ten thousand.
 _MOST_BYTES = 1_000_000

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from pathlib import Path
 from typing import Any
 
 from hydra.errors import MissingConfigException
@@ -12,13 +11,11 @@ from omegaconf import OmegaConf
 
 from safe_rl.cli.schema import KEYS, optional_keys
 from safe_rl.envs.families import hint_of_gymnasium
+from safe_rl.files import CONF
 from safe_rl.naming import did_you_mean, nearest
 
 __all__ = ["CONF", "GIVEN_WHOLE", "explain", "unknown_key", "unread_by"]
 
-_PACKAGED = Path(__file__).parents[1] / "conf"
-CONF = _PACKAGED if _PACKAGED.is_dir() else Path(__file__).parents[2] / "conf"
-"""Folder of ``config.yaml`` and the groups: of a checkout, or the copy in an installed package."""
 GIVEN_WHOLE = {
     **{"cost_limits": "limits", "model.input_scale": "factors"},
     **{f"transforms.{t}.budgets": "budgets" for t in ("saute", "simmer", "early_termination")},

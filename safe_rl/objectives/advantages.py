@@ -227,13 +227,15 @@ class CostGAE(VectorGAE):
     """
 
     @dataclass
-    class _AcceptedKeys(VectorGAE._AcceptedKeys):
+    class _AcceptedKeys:  # not inherited: TorchRL looks for names in the class itself
         """Keys that `set_keys` accepts: see `VectorGAE`."""
 
         advantage: NestedKey = "cost_advantage"
         value_target: NestedKey = "cost_value_target"
         value: NestedKey = "cost_value"
         reward: NestedKey | list[NestedKey] = "cost"
+        done: NestedKey = "done"
+        terminated: NestedKey = "terminated"
 
     default_keys = _AcceptedKeys
 

@@ -7,13 +7,19 @@ from collections.abc import Hashable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from safe_rl.files import CONF
 from safe_rl.reporting.recorded import Run
 from safe_rl.reporting.tables import clean, short_number
 from safe_rl.runs.identity import Role, experiment_of, flatten, role_of
 from safe_rl.scores.benchmark import Suite
 from safe_rl.scores.published import ALGORITHMS, COST_LIMIT, REFERENCE, Scores
 
-__all__ = ["Experiment", "cost_keys_of", "distinguishing_keys", "group_runs", "title_of"]
+__all__ = [
+    *("PACKAGED", "Experiment", "cost_keys_of", "distinguishing_keys", "group_runs", "title_of"),
+]
+
+PACKAGED = frozenset(file.stem for file in (CONF / "algo").glob("*.yaml"))
+"""Names of the package's algorithms."""
 
 Settings = Mapping[str, Hashable]
 
@@ -231,12 +237,14 @@ def _further(
 
 
 def title_of(algorithm: str) -> str:
-    """How the field writes the name of an algorithm: the paper's, or capitals for abbreviations.
+    """How the field writes the name of one of the package's algorithms; others stay as they are.
 
     Examples:
         >>> title_of("c_trpo"), title_of("sac_lagrangian"), title_of("my_idea")
-        ('C-TRPO', 'SAC-Lagrangian', 'MY-IDEA')
+        ('C-TRPO', 'SAC-Lagrangian', 'my_idea')
     """
+    if algorithm not in PACKAGED:
+        return algorithm
     words = algorithm.split("_")
     written = (word.capitalize() if len(word) > 6 else word.upper() for word in words)
     return ALGORITHMS.get(algorithm) or "-".join(written)

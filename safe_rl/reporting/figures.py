@@ -18,27 +18,26 @@ from matplotlib.colors import to_hex, to_rgb
 from matplotlib.figure import Figure
 
 from safe_rl.files import replacing
-from safe_rl.reporting.experiments import Experiment
+from safe_rl.reporting.experiments import PACKAGED, Experiment
 from safe_rl.reporting.slates import SYMBOLS, Aggregate
 from safe_rl.reporting.tables import Record, short_number
 from safe_rl.scores.comparisons import pareto_front, performance_profile
+from safe_rl.scores.published import ALGORITHMS
 
 __all__ = [
     *("LIMIT_STYLE", "WIDTH", "Style", "add_legend", "algorithm_styles", "compared"),
     *("draw_fronts", "draw_profiles", "literal", "save", "set_grid"),
 ]
 
-# colour and marker of every algorithm; the first ones are Okabe and Ito's, for colour-blind readers
-_LOOKS = {
-    **{"ppo": ("#e69f00", "o"), "ppo_lagrangian": ("#0072b2", "o")},
-    **{"trpo": ("#d55e00", "s"), "trpo_lagrangian": ("#009e73", "s")},
-    **{"cpo": ("#cc79a7", "D"), "pcpo": ("#8c564b", "d"), "rcpo": ("#56b4e9", "v")},
-    **{"focops": ("#9467bd", "^"), "cup": ("#bcbd22", "v"), "c_trpo": ("#17becf", "<")},
-    **{"crpo": ("#7f7f7f", ">"), "p3o": ("#aa4499", "P"), "ipo": ("#44aa99", "X")},
-    **{"sac": ("#b07c00", "*"), "sac_lagrangian": ("#117733", "p")},
-    **{"td3": ("#e31a1c", "h"), "td3_lagrangian": ("#332288", "H")},
-    **{"wcsac": ("#cc6677", "8"), "cal": ("#6699cc", "d"), "bc": ("#999933", "p")},
-}
+# colours and markers of the package's algorithms, those of the paper first, in colours of Okabe
+# and Ito that colour-blind readers can tell apart
+_LOOKS = (
+    *(("#e69f00", "o"), ("#0072b2", "o"), ("#d55e00", "s"), ("#009e73", "s"), ("#cc79a7", "D")),
+    *(("#999933", "p"), ("#17becf", "<"), ("#6699cc", "d"), ("#7f7f7f", ">"), ("#bcbd22", "v")),
+    *(("#9467bd", "^"), ("#44aa99", "X"), ("#aa4499", "P"), ("#8c564b", "d"), ("#56b4e9", "v")),
+    *(("#b07c00", "*"), ("#117733", "p"), ("#e31a1c", "h"), ("#332288", "H"), ("#cc6677", "8")),
+)
+# of other algorithms
 _FURTHER = (
     *(("#1f78b4", "^"), ("#ff7f00", "D"), ("#33a02c", "v"), ("#6a3d9a", "X")),
     *(("#b15928", "<"), ("#fb9a99", "P"), ("#a6cee3", "*"), ("#000000", ">")),
@@ -81,10 +80,11 @@ def algorithm_styles(experiments: Iterable[Experiment]) -> dict[str, Style]:
     for e in experiments:
         own = variants[e.base].setdefault((len(e.family), e.family, e.label), [e.label])
         own.append(e.algorithm)
+    looks = dict(zip((*ALGORITHMS, *sorted(PACKAGED - ALGORITHMS.keys())), _LOOKS, strict=False))
     further = cycle(_FURTHER)
     styles: dict[str, Style] = {}
     for base in sorted(variants):
-        colour, marker = _LOOKS.get(base) or next(further)
+        colour, marker = looks.get(base) or next(further)
         families = [family for _, family, _ in sorted(variants[base])]
         for number, (key, names) in enumerate(sorted(variants[base].items())):
             paler = 1 - 0.7 ** (number // len(_LINES))

@@ -1,7 +1,5 @@
 """Layouts that are drawn ahead are the ones that would have been drawn when they are needed."""
 
-from dataclasses import replace
-
 import pytest
 import torch
 from tensordict import TensorDict
@@ -56,7 +54,7 @@ def test_an_episode_that_may_never_come_has_no_say():
 @pytest.mark.parametrize("env", ["PointGoal1", "PointButton2", "PointPush2"])
 @pytest.mark.parametrize("layout_seeds", [None, 5])
 def test_episodes_are_the_same_whenever_rows_begin_them(env, layout_seeds):
-    config = replace(resolve(env), layout_seeds=layout_seeds)
+    config = resolve(env).replace(layout_seeds=layout_seeds)
     together, apart = (SafetyGymEnv(config, num_envs=3, seed=7, num_threads=1) for _ in range(2))
     positions = {}
     for number in (1, 2, 3):

@@ -108,7 +108,7 @@ _PLACED = ("robot", "goal", "box", "walls", "hazards", "vases", "pillars", "butt
 IGNORED = {
     *(f"{kind}_{suffix}" for kind in _PLACED for suffix in ("placements", "locations", "keepout")),
     *("placements_extents", "placements_margin", "randomize_layout", "terminate_resample_failure"),
-    *("layout_seeds", "layout_seeds_first"),
+    *("layout_seeds", "layout_seeds_first", "physics", "physics_buffers"),
     *("mass_scale", "friction_scale", "damping_scale", "strength_scale"),
     *("constrain_boundary", "boundary_x", "boundary_y", "constrain_velocity", "velocity_limit"),
     *("robot_rot", "vases_rots", "gremlins_rots", "box_rots", "gremlins_dist_threshold"),
