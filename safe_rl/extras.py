@@ -8,7 +8,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, TypeVar
 
-__all__ = ["check_extra", "import_extra", "needs_extra", "require_extra"]
+__all__ = ["check_extra", "import_extra", "installing", "needs_extra", "require_extra"]
 
 T = TypeVar("T")
 _NEEDED: dict[Any, tuple[str, str]] = {}
@@ -31,12 +31,12 @@ def require_extra(module: str, extra: str) -> None:
     if find_spec(package) is None:
         raise ModuleNotFoundError(
             f"This needs the package '{package}', which comes with the extra '{extra}': "
-            f"{_installing(extra)}",
+            f"{installing(extra)}",
             name=package,
         )
 
 
-def _installing(extra: str) -> str:
+def installing(extra: str) -> str:
     """The command that installs an extra: of the checkout that is imported, or of the package."""
     checkout = Path(__file__).parents[1]
     if (checkout / "pyproject.toml").is_file():

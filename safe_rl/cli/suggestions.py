@@ -11,11 +11,18 @@ from omegaconf import OmegaConf
 
 from safe_rl.cli.schema import KEYS, optional_keys
 from safe_rl.envs.families import hint_of_gymnasium
+from safe_rl.extras import installing
 from safe_rl.files import CONF
 from safe_rl.naming import did_you_mean, nearest
 
 __all__ = ["CONF", "GIVEN_WHOLE", "explain", "unknown_key", "unread_by"]
 
+_PLUGINS = {
+    "hydra/launcher=joblib": "sweep",
+    "hydra/launcher=ray": "sweep-ray",
+    **dict.fromkeys(("hydra/launcher=submitit_local", "hydra/launcher=submitit_slurm"), "submitit"),
+    "hydra/sweeper=optuna": "sweep-optuna",
+}
 GIVEN_WHOLE = {
     **{"cost_limits": "limits", "model.input_scale": "factors"},
     **{f"transforms.{t}.budgets": "budgets" for t in ("saute", "simmer", "early_termination")},
@@ -94,7 +101,9 @@ def no_choice(group: str, name: str, known: Sequence[str]) -> str:
     own = _names_here(name.replace("-", "").replace("_", "")) if group == "algo" else ""
     meant = f" Did you mean '{own}'?" if own in known else did_you_mean(name, known)
     family = hint_of_gymnasium(name) if group == "env" else ""
-    return f"there is no {group} '{name}'.{family or meant or listed}"
+    extra = _PLUGINS.get(f"{group}={name}")
+    install = f" It comes with the extra '{extra}': {installing(extra)}" if extra else ""
+    return f"there is no {group} '{name}'.{install or family or meant or listed}"
 
 
 def unknown_key(given: str, key: str, values: Mapping[str, Any]) -> str:

@@ -2,6 +2,7 @@
 
 import re
 
+import algorithm_pages
 import pytest
 from made import ALGORITHMS, DOCS, columns_of
 from omegaconf import OmegaConf
@@ -20,7 +21,8 @@ OFF_POLICY = [algo for algo in ALGORITHMS if "memory" in columns_of(algo)]
 
 
 def test_every_algorithm_is_in_the_lists():
-    assert all(f"| [`{algo}`]({algo}.md) |" in PAGE for algo in ALGORITHMS)
+    lists = "".join(algorithm_pages.listed(r) for r in re.findall(r"made: listed (\w+)", PAGE))
+    assert all(f"| [`{algo}`]({algo}.md) |" in lists for algo in ALGORITHMS)
     assert all(f"| [`{algo}`](algorithms/{algo}.md) |" in OFF_POLICY_PAGE for algo in OFF_POLICY)
 
 

@@ -18,6 +18,7 @@ import safe_rl
 from safe_rl import targets
 from safe_rl.cli import user_code
 from safe_rl.cli.evaluating import read_variations
+from safe_rl.cli.export import ExportOptions
 from safe_rl.cli.grammar import parse_options
 from safe_rl.cli.report import ReportOptions
 from safe_rl.cli.train import read_command
@@ -30,7 +31,13 @@ PAGES = ["README.md", *(str(p.relative_to(ROOT)) for p in sorted((ROOT / "docs")
 # snippets that have tests of their own, with more to say
 TESTED_ELSEWHERE = ("README.md", "docs/algorithms")
 # a package that not everybody has
-LACKING = ("comes with the extra", "cannot be imported in this Python")
+LACKING = ("comes with the extra", "cannot be imported in this Python", "0 CUDA devices")
+# options of our other commands, and what else stands after the folder
+SCHEMAS: dict[str, list] = {
+    "safe_rl.evaluate": [EvaluationOptions],
+    "safe_rl.export": [ExportOptions, "FILE"],
+    "safe_rl.report": [ReportOptions],
+}
 BLOCK = re.compile(
     r"^(?:<!-- file: (?P<file>\S+) -->\n)?```(?P<language>\w*)\n(?P<text>.*?)^```", re.M | re.S
 )
@@ -106,7 +113,8 @@ def check(words: list[str], run: Path) -> None:
     program, *arguments = [place.sub(lambda m: f"{m[1] or ''}{run}", word) for word in words]
     if program == "-m":
         module, _, *options = arguments
-        schema = {"safe_rl.evaluate": EvaluationOptions, "safe_rl.report": ReportOptions}[module]
+        schema, *others = SCHEMAS[module]
+        options = options[len(others) :]
         _, options = split_imports([o for o in options if o != "--help"])
         parsed = parse_options(options, schema)
         if isinstance(parsed, EvaluationOptions):

@@ -179,7 +179,7 @@ def test_keys_of_sets_are_taken_by_training(name):
         ("variations={noise: {transforms.sensor_nois.std: 2}}", "Did you mean 'sensor_noise'"),
         ("variations={heavy: {env.mas_scale: 2}}", "Did you mean 'mass_scale'"),
         ("variations={a: {env.mass_scale: [1], env.friction_scale: [2]}}", "several lists"),
-        ("variations=dynamics video=true", "leave video=true"),
+        ("variations=dynamics video=true", "combined with video=true"),
     ],
 )
 def test_what_cannot_be_varied_is_said(run, given, message, capsys):
