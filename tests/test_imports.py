@@ -144,8 +144,8 @@ FLOORS = {
         ("",),
     ),
     "scores": (
-        ("bounds", "comparisons", "published"),
-        ("benchmark", "certificate", "measures"),
+        ("benchmark", "bounds", "comparisons"),
+        ("certificate", "measures"),
         ("",),
     ),
     "cli": (
@@ -162,9 +162,9 @@ FLOORS = {
     ),
     "evaluation": (
         ("episodes", "loading", "settings"),
+        ("certifying", "policies", "video"),
+        ("measuring",),
         ("variations",),
-        ("certifying", "exporting", "periodic_evaluation", "policies", "summary", "video"),
-        ("measuring", "varying"),
         ("",),
     ),
     "reporting": (

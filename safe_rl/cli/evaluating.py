@@ -20,10 +20,9 @@ from safe_rl.cli.user_code import check_imports, import_modules
 from safe_rl.envs import LayoutError, OpenGLError
 from safe_rl.evaluation import Evaluation, EvaluationOptions, evaluate
 from safe_rl.evaluation.loading import load_config
+from safe_rl.evaluation.measuring import format_unjudged
 from safe_rl.evaluation.policies import find_run, writable_copy
-from safe_rl.evaluation.summary import format_unjudged
-from safe_rl.evaluation.variations import Variation, expand
-from safe_rl.evaluation.varying import Varied, evaluate_variations
+from safe_rl.evaluation.variations import Variation, Varied, evaluate_variations, expand
 from safe_rl.naming import did_you_mean
 from safe_rl.reporting.variations import draw_variations
 from safe_rl.runs.folder import RunFolder

@@ -45,9 +45,8 @@ def main(arguments: Sequence[str] | None = None, program: str = COMMAND) -> int:
 def _export(source: str, target: Path, which: str) -> Path:
     # here, because help and mistyped options need none of torch
     from safe_rl.cli.trained_run import Run
-    from safe_rl.evaluation.exporting import export_onnx
     from safe_rl.evaluation.loading import find_checkpoint
-    from safe_rl.evaluation.policies import find_run, pack_policy
+    from safe_rl.evaluation.policies import export_onnx, find_run, pack_policy
     from safe_rl.runs.folder import RunFolder
 
     run = Run(find_run(source))

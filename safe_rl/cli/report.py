@@ -17,8 +17,7 @@ from safe_rl.files import check_place
 from safe_rl.reporting import Report, build_report, write_report
 from safe_rl.reporting.recorded import archive_runs
 from safe_rl.reporting.tables import clean
-from safe_rl.scores.benchmark import Suite
-from safe_rl.scores.published import SEEDS
+from safe_rl.scores.benchmark import SEEDS, Suite
 
 __all__ = ["ReportOptions", "main", "report", "suite"]
 

@@ -32,9 +32,8 @@ from safe_rl.cli.robots import keep_robot, robot_of
 from safe_rl.cli.schema import check_settings
 from safe_rl.cli.user_code import imported, make_after_imports
 from safe_rl.envs import ConfigError, ContractError, LayoutError, complete_env, make_env
-from safe_rl.evaluation.episodes import default_seed, has_fixed_layout
+from safe_rl.evaluation.episodes import PeriodicEvaluation, default_seed, has_fixed_layout
 from safe_rl.evaluation.loading import transforms_of
-from safe_rl.evaluation.periodic_evaluation import PeriodicEvaluation
 from safe_rl.files import replacing
 from safe_rl.runs.checkpoints import is_finished
 from safe_rl.runs.folder import RunFolder, lock_folder

@@ -30,7 +30,7 @@ from safe_rl.evaluation.loading import (
     override_env,
 )
 from safe_rl.evaluation.policies import find_run
-from safe_rl.evaluation.varying import Varied
+from safe_rl.evaluation.variations import Varied
 from safe_rl.extras import import_extra
 from safe_rl.files import read_json
 from safe_rl.runs.curves import Figure, learning_curves

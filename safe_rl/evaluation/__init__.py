@@ -8,8 +8,7 @@ from safe_rl.lazy import import_later
 if TYPE_CHECKING:
     from safe_rl.evaluation.certifying import Certificate, CertificateOptions, certify
     from safe_rl.evaluation.episodes import Episodes, collect_episodes
-    from safe_rl.evaluation.measuring import Evaluation, evaluate
-    from safe_rl.evaluation.summary import summarise
+    from safe_rl.evaluation.measuring import Evaluation, evaluate, summarise
 
 __all__ = [
     "Certificate",
@@ -33,6 +32,6 @@ __getattr__, __dir__ = import_later(
         "certify": "safe_rl.evaluation.certifying",
         "collect_episodes": "safe_rl.evaluation.episodes",
         "evaluate": "safe_rl.evaluation.measuring",
-        "summarise": "safe_rl.evaluation.summary",
+        "summarise": "safe_rl.evaluation.measuring",
     },
 )

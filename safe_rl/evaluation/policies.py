@@ -1,18 +1,30 @@
-"""Trained policies as small folders: those that the package has, and how one is made from a run."""
+"""Trained policies for others: small folders, such as those of the package, and ONNX."""
 
 from __future__ import annotations
 
 import json
+import logging
 import shutil
+import warnings
 from pathlib import Path
 
-from safe_rl.evaluation.loading import find_checkpoint, load_config
-from safe_rl.files import read_json, replace_text
+import torch
+from omegaconf import DictConfig
+from tensordict import TensorDict
+from tensordict.nn import TensorDictModuleBase
+from torch import Tensor, nn
+from torchrl.data import Bounded
+from torchrl.envs import EnvBase
+
+from safe_rl.evaluation.episodes import exploration
+from safe_rl.evaluation.loading import find_checkpoint, load_config, load_policy
+from safe_rl.extras import import_extra
+from safe_rl.files import read_json, replace_text, replacing
 from safe_rl.naming import did_you_mean
 from safe_rl.runs.checkpoint_file import as_parts, read_facts, read_states, writer
 from safe_rl.runs.folder import RunFolder, checkpoint_steps
 
-__all__ = ["POLICIES", "find_run", "pack_policy", "writable_copy"]
+__all__ = ["POLICIES", "export_onnx", "find_run", "pack_policy", "writable_copy"]
 
 POLICIES = Path(__file__).parents[1] / "policies"
 """A folder per environment, each with a configuration, a certificate and the policy's weights."""
@@ -89,3 +101,69 @@ def pack_policy(run: Path, folder: Path, checkpoint: str = "certified") -> Path:
         about["commit"] = read_json(source.code)[-1]["commit"]
     replace_text(folder / "policy.json", json.dumps(about, indent=2) + "\n")
     return kept
+
+
+class _MeanAction(nn.Module):
+    """Observations [N, D] to actions within the environment's bounds, [N, A]."""
+
+    _low: Tensor
+    _high: Tensor
+
+    def __init__(self, policy: TensorDictModuleBase, low: Tensor, high: Tensor) -> None:
+        super().__init__()
+        self._policy = policy
+        self.register_buffer("_low", low)
+        self.register_buffer("_high", high)
+
+    def forward(self, observation: Tensor) -> Tensor:
+        given = TensorDict({"observation": observation}, batch_size=observation.shape[:1])
+        action: Tensor = self._policy(given)["action"]
+        return torch.minimum(torch.maximum(action, self._low), self._high)
+
+
+def export_onnx(config: DictConfig, env: EnvBase, checkpoint: Path, file: Path) -> None:
+    """Write a policy's mean action as a function of the observation, scaling of inputs included.
+
+    The input ``observation`` is float32 [N, D] for any N, the output ``action`` [N, A].
+
+    Args:
+        config: Of the run.
+        env: An environment like the run's, whose observations and actions are the policy's.
+        checkpoint: The file with the weights.
+        file: What is written.
+
+    Raises:
+        ModuleNotFoundError: If the extra ``onnx`` is not installed.
+        ValueError: If observations are no vectors, or actions no numbers within bounds, or the
+            policy remembers earlier observations.
+        CheckpointError: If the checkpoint does not fit the environment.
+    """
+    import_extra("onnx", "onnx")
+    observation, action = env.observation_spec["observation"], env.action_spec
+    if len(observation.shape) != 2 or not isinstance(action, Bounded):
+        raise ValueError(
+            "Only policies with a vector as observation and bounded numbers as action can be "
+            "exported."
+        )
+    policy = load_policy(config, env, checkpoint, torch.device("cpu"))
+    if len(policy.in_keys) != 1:
+        raise ValueError(f"Policies that read {policy.in_keys} cannot be exported, only vectors.")
+    low, high = action.space.low[0], action.space.high[0]
+    example = torch.zeros(2, observation.shape[-1])
+    with (
+        exploration(deterministic=True),
+        torch.no_grad(),
+        warnings.catch_warnings(),
+        replacing(file) as unfinished,
+    ):
+        warnings.simplefilter("ignore")
+        logging.getLogger("torch.onnx").setLevel(logging.ERROR)
+        torch.onnx.export(
+            _MeanAction(policy, low, high).eval(),
+            (example,),
+            str(unfinished),
+            input_names=["observation"],
+            output_names=["action"],
+            dynamic_axes={"observation": {0: "N"}, "action": {0: "N"}},
+            dynamo=False,
+        )

@@ -11,8 +11,7 @@ from safe_rl.files import CONF
 from safe_rl.reporting.recorded import Run
 from safe_rl.reporting.tables import clean, short_number
 from safe_rl.runs.identity import Role, experiment_of, flatten, role_of
-from safe_rl.scores.benchmark import Suite
-from safe_rl.scores.published import ALGORITHMS, COST_LIMIT, REFERENCE, Scores
+from safe_rl.scores.benchmark import ALGORITHMS, COST_LIMIT, REFERENCE, Scores, Suite
 
 __all__ = [
     *("PACKAGED", "Experiment", "cost_keys_of", "distinguishing_keys", "group_runs", "title_of"),

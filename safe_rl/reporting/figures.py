@@ -21,8 +21,8 @@ from safe_rl.files import replacing
 from safe_rl.reporting.experiments import PACKAGED, Experiment
 from safe_rl.reporting.slates import SYMBOLS, Aggregate
 from safe_rl.reporting.tables import Record, short_number
+from safe_rl.scores.benchmark import ALGORITHMS
 from safe_rl.scores.comparisons import pareto_front, performance_profile
-from safe_rl.scores.published import ALGORITHMS
 
 __all__ = [
     *("LIMIT_STYLE", "WIDTH", "Style", "add_legend", "algorithm_styles", "compared"),

@@ -15,6 +15,7 @@ from safe_rl.reporting.recorded import Run
 from safe_rl.reporting.tables import Record, Table, each_cost, mark_best, short_number, spread
 from safe_rl.runs.curves import moving_mean
 from safe_rl.runs.outcome import FINAL_EPOCHS, final_rows, final_width
+from safe_rl.scores.benchmark import PUBLISHED_STEPS, REIMPLEMENTATION_STEPS, REIMPLEMENTATIONS
 from safe_rl.scores.measures import (
     Agent,
     compare,
@@ -24,7 +25,6 @@ from safe_rl.scores.measures import (
     regret,
     share_of_epochs_over,
 )
-from safe_rl.scores.published import PUBLISHED_STEPS, REIMPLEMENTATION_STEPS, REIMPLEMENTATIONS
 
 __all__ = ["better_tables", "final_record", "final_table", "learning_table", "matrix", "signs_of"]
 

@@ -13,7 +13,7 @@ import numpy as np
 from safe_rl.reporting.experiments import Experiment
 from safe_rl.reporting.scoring import matrix, signs_of
 from safe_rl.reporting.tables import Table, interval, mark_best
-from safe_rl.scores.benchmark import SLATES
+from safe_rl.scores.benchmark import PUBLISHED, PUBLISHED_STEPS, REFERENCE, SLATES, Normalised
 from safe_rl.scores.comparisons import interquartile_mean, probability_of_improvement
 from safe_rl.scores.measures import (
     NOISE_OF_ZERO,
@@ -22,7 +22,6 @@ from safe_rl.scores.measures import (
     normalised_return,
     normalised_violation,
 )
-from safe_rl.scores.published import PUBLISHED, PUBLISHED_STEPS, REFERENCE, Normalised
 
 __all__ = [
     "SYMBOLS",

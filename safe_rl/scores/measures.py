@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from safe_rl.scores.published import Scores
+from safe_rl.scores.benchmark import Scores
 
 __all__ = [
     "NOISE_OF_ZERO",

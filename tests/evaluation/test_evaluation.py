@@ -15,7 +15,7 @@ from safe_rl.cli.evaluate import main
 from safe_rl.cli.evaluating import evaluate_run as evaluate
 from safe_rl.cli.report import suite
 from safe_rl.envs import make_env
-from safe_rl.scores.published import REFERENCE
+from safe_rl.scores.benchmark import REFERENCE
 
 
 def read_columns(path):

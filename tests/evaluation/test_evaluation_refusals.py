@@ -83,7 +83,7 @@ def test_what_cannot_be_written_is_said_before_any_episode(
     arguments, places, run, capsys, monkeypatch
 ):
     monkeypatch.chdir(run.parent)
-    for module in ("measuring", "varying"):
+    for module in ("measuring", "variations"):
         monkeypatch.setattr(f"safe_rl.evaluation.{module}.collect_episodes", None)
     for place in places:
         (run / place).mkdir()

@@ -11,8 +11,12 @@ from torchrl.data import Bounded, Categorical, Composite, Unbounded
 from safe_rl.envs import ConstrainedEnv
 from safe_rl.envs.transforms import RewardScale, transform_env
 from safe_rl.evaluation import video
-from safe_rl.evaluation.episodes import collect_episodes, default_seed, shared_layouts
-from safe_rl.evaluation.periodic_evaluation import PeriodicEvaluation
+from safe_rl.evaluation.episodes import (
+    PeriodicEvaluation,
+    collect_episodes,
+    default_seed,
+    shared_layouts,
+)
 from safe_rl.evaluation.video import MANNERS, check_camera, record_episode
 from safe_rl.models import BehaviourPolicy, make_actor
 

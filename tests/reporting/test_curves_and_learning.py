@@ -11,7 +11,7 @@ from safe_rl.reporting.recorded import find_runs
 from safe_rl.reporting.scoring import final_record, learning_table
 from safe_rl.reporting.slates import aggregate, improvement_tables
 from safe_rl.reporting.tables import Table, spread
-from safe_rl.scores.published import REFERENCE
+from safe_rl.scores.benchmark import REFERENCE
 
 
 def test_curves_are_means_over_seeds_on_common_steps(tmp_path):

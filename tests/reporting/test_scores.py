@@ -8,9 +8,8 @@ from safe_rl.reporting.page import Drawing, build_report
 from safe_rl.reporting.scoring import better_tables, final_record, final_table
 from safe_rl.reporting.slates import aggregate, complete_slates, improvement_tables, slate_table
 from safe_rl.reporting.tables import Table
-from safe_rl.scores.benchmark import SLATES
+from safe_rl.scores.benchmark import PUBLISHED_STEPS, REFERENCE, SLATES
 from safe_rl.scores.comparisons import interquartile_mean
-from safe_rl.scores.published import PUBLISHED_STEPS, REFERENCE
 
 
 def table_of(root):

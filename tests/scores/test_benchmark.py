@@ -3,7 +3,7 @@
 import pytest
 
 from safe_rl.cli.report import suite
-from safe_rl.scores.published import REFERENCE
+from safe_rl.scores.benchmark import REFERENCE
 
 SUITE = suite()
 NODE = SUITE.environments["PointGoal1"]

@@ -6,7 +6,14 @@ import numpy as np
 import pytest
 
 from safe_rl.envs import SUITE
-from safe_rl.scores.benchmark import SLATES
+from safe_rl.scores.benchmark import (
+    ALGORITHMS,
+    PUBLISHED,
+    REFERENCE,
+    REIMPLEMENTATIONS,
+    SLATES,
+    Scores,
+)
 from safe_rl.scores.measures import (
     Agent,
     compare,
@@ -15,7 +22,6 @@ from safe_rl.scores.measures import (
     normalised_return,
     normalised_violation,
 )
-from safe_rl.scores.published import ALGORITHMS, PUBLISHED, REFERENCE, REIMPLEMENTATIONS, Scores
 
 
 def test_the_slates_are_made_of_the_suites_constrained_environments():

@@ -10,9 +10,8 @@ from run_configs import compose_config, without_times
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from safe_rl.algorithms import OffPolicy
-from safe_rl.evaluation.episodes import collect_episodes
+from safe_rl.evaluation.episodes import PeriodicEvaluation, collect_episodes
 from safe_rl.evaluation.loading import find_checkpoint, load_config, load_policy
-from safe_rl.evaluation.periodic_evaluation import PeriodicEvaluation
 from safe_rl.objectives import SACLagrangianLoss
 from safe_rl.runs.table import read_table
 from safe_rl.targets import allow
