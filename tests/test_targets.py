@@ -111,7 +111,7 @@ def test_an_old_name_inside_a_node_is_built():
         *("safe_rl.envs.gymnasium.from_gymnasium", "safe_rl.algorithms.dataset.read_dataset"),
         # what classes have of others
         *("safe_rl.objectives.PPOLoss.load_state_dict", "safe_rl.objectives.PPOLoss.__class__"),
-        *("safe_rl.objectives.ppo.__builtins__.eval", "safe_rl.objectives.PPOLoss.mro"),
+        *("safe_rl.objectives.policy_losses.__builtins__.eval", "safe_rl.objectives.PPOLoss.mro"),
         *("torch.optim.Optimizer.load_state_dict", "torch.optim.swa_utils.update_bn"),
         *("safe_rl.objectives", "safe_rl", "torch.optim", "torch.optim.adam", "", ".", "..os"),
         *(3, True, "safe_rl.objectivesx.y", "safe_rl.envs..os", "torch.optimx.Adam"),

@@ -1,17 +1,15 @@
 """What moves parameters: recipes, updates, trust-region steps, and building them."""
 
-from safe_rl.algorithms.algorithm_contract import Algorithm, PolicyUpdate, Recipe
-from safe_rl.algorithms.c_trpo_step import CTRPOStep
+from safe_rl.algorithms.algorithm_contract import Algorithm, PolicyUpdate, Recipe, SequentialUpdates
 from safe_rl.algorithms.constraints import Constraints
 from safe_rl.algorithms.cpo_step import CPOStep, PCPOStep
-from safe_rl.algorithms.crpo_step import CRPOStep
-from safe_rl.algorithms.matrix_products import fast_products
 from safe_rl.algorithms.minibatch import KLAdaptiveRate, MinibatchUpdate
 from safe_rl.algorithms.off_policy import OffPolicy
 from safe_rl.algorithms.on_policy import OnPolicy
+from safe_rl.algorithms.processor_use import fast_products
+from safe_rl.algorithms.recovery_steps import CRPOStep, CTRPOStep
 from safe_rl.algorithms.replay_buffer import Memory
 from safe_rl.algorithms.replay_update import ReplayUpdate
-from safe_rl.algorithms.sequential_updates import SequentialUpdates
 from safe_rl.algorithms.trust_region_step import TRPOStep
 
 __all__ = [

@@ -13,7 +13,13 @@ from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModule, T
 from torch import Tensor, nn
 from torchrl.envs import EnvBase
 
-from safe_rl.algorithms.algorithm_contract import Algorithm, PolicyUpdate, Recipe, Stateful
+from safe_rl.algorithms.algorithm_contract import (
+    Algorithm,
+    PolicyUpdate,
+    Recipe,
+    SequentialUpdates,
+    Stateful,
+)
 from safe_rl.algorithms.build_part import (
     build_constraints,
     build_part,
@@ -22,8 +28,7 @@ from safe_rl.algorithms.build_part import (
 )
 from safe_rl.algorithms.constraints import CHARGES, Constraints
 from safe_rl.algorithms.losses import LossState
-from safe_rl.algorithms.parallel_updates import in_parallel
-from safe_rl.algorithms.sequential_updates import SequentialUpdates
+from safe_rl.algorithms.processor_use import in_parallel
 from safe_rl.collectors import EpisodeStatistics
 from safe_rl.models import build_networks, make_behaviour, take_in
 from safe_rl.objectives import CriticLoss

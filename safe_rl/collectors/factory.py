@@ -13,8 +13,7 @@ from torchrl.collectors import Collector, MultiSyncCollector
 from torchrl.collectors.distributed import RayCollector
 from torchrl.envs import EnvBase
 
-from safe_rl.collectors.worker_rows import MakeEnv, check_rows, split_rows
-from safe_rl.collectors.workers import Known, WorkerCollector
+from safe_rl.collectors.workers import Known, MakeEnv, WorkerCollector, check_rows, split_rows
 from safe_rl.extras import needs_extra
 from safe_rl.processes import starting_processes
 from safe_rl.ranges import Options, Range

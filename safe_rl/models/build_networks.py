@@ -10,12 +10,18 @@ from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModule, T
 from torch import nn
 from torchrl.data import Composite, TensorSpec
 
-from safe_rl.models.activations import Tanh
-from safe_rl.models.encoders import TO_FLATTEN, Body, Observed, observed_entries
+from safe_rl.models.encoders import (
+    FEATURES,
+    MEMORY,
+    TO_FLATTEN,
+    Body,
+    GatedMemory,
+    Observed,
+    observed_entries,
+)
 from safe_rl.models.heads import AUTO, Head, make_head
 from safe_rl.models.input_scales import RunningScale, input_scale_vector
-from safe_rl.models.networks import Chain, assemble_actor, perceptron
-from safe_rl.models.recurrent import FEATURES, MEMORY, GatedMemory
+from safe_rl.models.networks import Chain, Tanh, assemble_actor, perceptron
 
 __all__ = ["build_networks"]
 

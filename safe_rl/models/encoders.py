@@ -1,4 +1,4 @@
-"""Encoders: from an observation, a vector, a picture or several of both, to outputs."""
+"""From an observation, a vector, a picture or several of both, to features; the recurrent layer."""
 
 from __future__ import annotations
 
@@ -6,16 +6,20 @@ from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import torch
-from tensordict import NestedKey
+from tensordict import NestedKey, TensorDict, TensorDictBase
+from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 from torchrl.data import Composite, TensorSpec
-from torchrl.modules import ConvNet
+from torchrl.modules import ConvNet, GRUModule, set_recurrent_mode
 
-from safe_rl.models.activations import Tanh
 from safe_rl.models.input_scales import InputScale, RunningScale, input_scale_vector
-from safe_rl.models.networks import perceptron
+from safe_rl.models.networks import Tanh, perceptron
 
-__all__ = ["TO_FLATTEN", "Body", "Entry", "Observed", "observed_entries"]
+__all__ = [
+    *("FEATURES", "FIRST", "MEMORY", "TO_FLATTEN", "Body", "Entry", "GatedMemory", "Observed"),
+    "observed_entries",
+]
+
 
 TO_FLATTEN = (
     "make the environment flatten them: with env.observation_flatten=true in Safety Gym, else with "
@@ -190,3 +194,58 @@ def _picture(entry: Entry, observed: Observed, device: torch.device | None) -> n
 
 def _blank(entry: Entry, device: torch.device | None) -> Tensor:
     return torch.zeros(1, *entry.shape, device=device)
+
+
+FEATURES, MEMORY, FIRST = "features", "memory", "is_init"
+
+
+class GatedMemory(TensorDictModuleBase):
+    """Gated recurrent units (Cho et al. 2014) between the features of a network.
+
+    A batch [N] is a step of N environments: the state that it leaves goes to ``("next", "memory")``
+    and comes back with the next step. A batch [N, T] holds sequences in order of time, of which the
+    first steps' states are read, and 0 wherever ``is_init`` says that an episode begins.
+
+    Args:
+        num_features: Numbers that come in.
+        size: Numbers that are remembered, and go out.
+        device: Of the parameters.
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> memory = GatedMemory(3, 4)
+        >>> steps = TensorDict(
+        ...     features=torch.ones(2, 5, 3),
+        ...     memory=torch.zeros(2, 5, 4),
+        ...     is_init=torch.zeros(2, 5, 1, dtype=torch.bool),
+        ...     batch_size=[2, 5],
+        ... )
+        >>> memory(steps)["features"].shape
+        torch.Size([2, 5, 4])
+    """
+
+    def __init__(self, num_features: int, size: int, *, device: torch.device | None = None) -> None:
+        super().__init__()
+        self.in_keys = [FEATURES, MEMORY, FIRST]
+        self.out_keys = [FEATURES, ("next", MEMORY)]
+        self.recurrent = GRUModule(
+            num_features,
+            size,
+            in_keys=self.in_keys,
+            out_keys=self.out_keys,
+            device=device,
+        )
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Replace the features; after a step, also leave what is remembered."""
+        inputs = {key: tensordict.get(key) for key in self.in_keys}
+        inputs[MEMORY] = inputs[MEMORY].unsqueeze(-2)  # of its one layer
+        steps = TensorDict(inputs, batch_size=tensordict.batch_size)
+        is_sequence = tensordict.ndim > 1
+        with set_recurrent_mode(is_sequence):
+            self.recurrent(steps)
+        tensordict.set(FEATURES, steps.get(FEATURES))
+        if not is_sequence:
+            tensordict.set(("next", MEMORY), steps.get(("next", MEMORY)).squeeze(-2))
+        return tensordict

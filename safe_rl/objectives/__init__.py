@@ -5,21 +5,26 @@ Everything here reads and writes TensorDict keys and knows no environment.
 
 from safe_rl.objectives.actor_critic import ActorCriticLoss, JointAdvantages
 from safe_rl.objectives.advantages import CostGAE, VectorGAE
-from safe_rl.objectives.bc import BCLoss
 from safe_rl.objectives.cal import CALLoss
 from safe_rl.objectives.controllers import PIDMultiplier, PIMultiplier
 from safe_rl.objectives.critics import CriticLoss
+from safe_rl.objectives.deterministic_losses import BCLoss, TD3LagrangianLoss, TD3Loss
 from safe_rl.objectives.gae import normalise_advantages
 from safe_rl.objectives.limits import LimitTracker
 from safe_rl.objectives.multipliers import LagrangeMultiplier, Multiplier, ProjectedMultiplier
 from safe_rl.objectives.penalties import IPOLoss, P3OLoss
+from safe_rl.objectives.policy_losses import (
+    CPOLoss,
+    PPOLagrangianLoss,
+    PPOLoss,
+    RCPOLoss,
+    TRPOLagrangianLoss,
+    TRPOLoss,
+)
 from safe_rl.objectives.policy_projections import CUPLoss, FOCOPSLoss
-from safe_rl.objectives.ppo import PPOLagrangianLoss, PPOLoss, RCPOLoss
 from safe_rl.objectives.risk import Chance, CVaR, RiskMeasure
 from safe_rl.objectives.sac import SACLagrangianLoss, SACLoss
 from safe_rl.objectives.surrogate import SurrogateLoss
-from safe_rl.objectives.td3 import TD3LagrangianLoss, TD3Loss
-from safe_rl.objectives.trpo import CPOLoss, TRPOLagrangianLoss, TRPOLoss
 from safe_rl.objectives.wcsac import WCSACLoss
 
 __all__ = [

@@ -9,7 +9,7 @@ from tensordict import TensorDictBase
 from tensordict.nn import ProbabilisticTensorDictSequential
 from torch import Tensor
 
-from safe_rl.objectives.ppo import PPOLoss, clipped_gain
+from safe_rl.objectives.policy_losses import PPOLoss, clipped_gain
 from safe_rl.objectives.violation import Violations, constraint_value, violation_of
 from safe_rl.ranges import NotNegative, Range
 

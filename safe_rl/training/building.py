@@ -22,7 +22,7 @@ from safe_rl.algorithms.algorithm_contract import Algorithm
 from safe_rl.algorithms.build_part import find_recipe
 from safe_rl.algorithms.constraints import check_cost_limits
 from safe_rl.collectors import Recording, WorkerCollector, make_collector
-from safe_rl.collectors.worker_rows import MakeEnv
+from safe_rl.collectors.workers import MakeEnv
 from safe_rl.files import read_config
 from safe_rl.runs.checkpoint_file import part_names, read_states
 from safe_rl.runs.folder import RunFolder, run_of

@@ -16,8 +16,7 @@ from torchrl.collectors import Collector
 from torchrl.envs import EnvBase
 
 from safe_rl.algorithms.algorithm_contract import Algorithm, Stateful
-from safe_rl.algorithms.matrix_products import fast_products
-from safe_rl.algorithms.parallel_updates import torch_threads
+from safe_rl.algorithms.processor_use import fast_products, torch_threads
 from safe_rl.collectors import (
     EpisodeAccounting,
     EpisodeError,

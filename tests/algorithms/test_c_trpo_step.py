@@ -9,7 +9,7 @@ from run_configs import point_mass_config
 from samples import make_actor, make_batch, whole_step
 
 from safe_rl.algorithms import CTRPOStep, OnPolicy
-from safe_rl.algorithms.c_trpo_step import barrier_divergence
+from safe_rl.algorithms.recovery_steps import barrier_divergence
 from safe_rl.objectives import CPOLoss
 from safe_rl.objectives.distributions import gaussian_kl
 from safe_rl.objectives.trust_region import flatten, policy_in

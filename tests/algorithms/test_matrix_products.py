@@ -5,8 +5,8 @@ import torch
 from point_mass import PointMass
 from run_configs import point_mass_config
 
-from safe_rl.algorithms import matrix_products
-from safe_rl.algorithms.matrix_products import fast_products, prefers_onednn
+from safe_rl.algorithms import processor_use
+from safe_rl.algorithms.processor_use import fast_products, prefers_onednn
 from safe_rl.training.building import build_trainer
 
 ZEN = "vendor_id : AuthenticAMD\nmodel name : AMD EPYC\nflags : fpu avx2 avx512f avx512_bf16\n"
@@ -14,7 +14,7 @@ ZEN = "vendor_id : AuthenticAMD\nmodel name : AMD EPYC\nflags : fpu avx2 avx512f
 
 @pytest.fixture
 def of_use(monkeypatch):
-    monkeypatch.setattr(matrix_products, "_is_of_use", lambda: True)
+    monkeypatch.setattr(processor_use, "_is_of_use", lambda: True)
     products = torch.backends.mkldnn.matmul
     before = products.fp32_precision
     yield products
@@ -36,7 +36,7 @@ def test_only_where_it_is_faster_and_rounds_nothing(cpuinfo, expected):
     assert prefers_onednn(cpuinfo) is expected
 
 
-@pytest.mark.skipif(not matrix_products._is_of_use(), reason="a processor that MKL serves well")
+@pytest.mark.skipif(not processor_use._is_of_use(), reason="a processor that MKL serves well")
 @pytest.mark.parametrize("shape", [(4000, 60, 64), (4000, 64, 1), (256, 128, 128)])
 def test_products_are_those_of_single_precision(shape):
     rows, inner, columns = shape

@@ -8,7 +8,7 @@ from point_mass_runs import point_mass_trainer
 from torchrl.envs.utils import ExplorationType, exploration_type, set_exploration_type
 
 from safe_rl.algorithms import on_policy
-from safe_rl.algorithms.parallel_updates import in_parallel, torch_threads
+from safe_rl.algorithms.processor_use import in_parallel, torch_threads
 from safe_rl.objectives import PPOLoss
 from safe_rl.targets import allow
 

@@ -15,7 +15,7 @@ import torch
 from point_mass import PointMass
 
 from safe_rl.collectors import WorkerCollector, make_process_collector, make_ray_collector
-from safe_rl.collectors.worker_rows import split_rows
+from safe_rl.collectors.workers import split_rows
 from safe_rl.envs import SafetyGymEnv, make_env
 from safe_rl.envs.transforms import transform_env
 from safe_rl.models import BehaviourPolicy, make_actor

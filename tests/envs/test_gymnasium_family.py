@@ -17,7 +17,7 @@ from commands import run_train
 from torchrl.envs.utils import check_env_specs
 
 from safe_rl.cli import evaluate, report
-from safe_rl.collectors.worker_rows import split_rows
+from safe_rl.collectors.workers import split_rows
 from safe_rl.envs import ConfigError, complete_env, make_env
 from safe_rl.runs.table import read_table
 

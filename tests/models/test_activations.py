@@ -3,15 +3,15 @@
 import pytest
 import torch
 
-from safe_rl.models import activations
-from safe_rl.models.activations import Tanh
+from safe_rl.models import networks
+from safe_rl.models.networks import Tanh
 
 QUICK = Tanh()
 
 
 @pytest.fixture(autouse=True)
 def a_processor_that_mkl_does_not_suit(monkeypatch):
-    monkeypatch.setattr(activations, "_MKL_IS_QUICK", False)
+    monkeypatch.setattr(networks, "_MKL_IS_QUICK", False)
 
 
 def inputs(**options):

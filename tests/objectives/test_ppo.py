@@ -9,7 +9,7 @@ from torch.distributions import Independent, Normal, kl_divergence
 from torchrl.objectives import ClipPPOLoss
 
 from safe_rl.objectives.multipliers import LagrangeMultiplier
-from safe_rl.objectives.ppo import PPOLagrangianLoss, PPOLoss
+from safe_rl.objectives.policy_losses import PPOLagrangianLoss, PPOLoss
 
 SETTINGS = {"clip_epsilon": 0.2, "entropy_coeff": 0.01}
 LIMITS = {"a": 25.0, "b": 5.0}

@@ -1,17 +1,26 @@
-"""Losses of TD3 (Fujimoto et al. 2018), without and with cost limits."""
+"""Losses of deterministic policies: TD3, with and without costs, and behaviour cloning."""
 
 from __future__ import annotations
 
 import torch
-from tensordict import TensorDict, TensorDictBase
-from tensordict.nn import TensorDictModuleBase
+from tensordict import TensorDict, TensorDictBase, TensorDictParams
+from tensordict.nn import TensorDictModuleBase, dispatch
 from torch import Tensor
 from torchrl import objectives
 from torchrl.data import TensorSpec
 from torchrl.objectives import ValueEstimators
+from torchrl.objectives.utils import distance_loss
 
 from safe_rl.objectives.cost_critics import CostCritics
-from safe_rl.objectives.q_functions import Distance, Ensemble, InOneCall, QFunctionLoss, scalars
+from safe_rl.objectives.q_functions import (
+    Distance,
+    Ensemble,
+    InOneCall,
+    QFunctionLoss,
+    ReplayLoss,
+    scalars,
+)
+from safe_rl.objectives.samples import require
 from safe_rl.ranges import NotNegative, Share
 
 
@@ -156,3 +165,54 @@ class TD3LagrangianLoss(CostCritics, TD3Loss):
         weights = self._maybe_get_priority_weight(tensordict)
         loss = self._reduce_loss(objective, tensordict=tensordict, weights=weights)
         return loss, {"state_action_value_actor": values.detach(), **reported}
+
+
+class BCLoss(ReplayLoss):
+    """Distance of a deterministic policy's actions from those that were taken.
+
+    Liu et al., *Datasets and Benchmarks for Offline Safe Reinforcement Learning* (2024), where the
+    steps are those of safe episodes (BC-Safe). The loss reads neither costs nor rewards.
+
+    Args:
+        actor_network: deterministic policy.
+        loss_function: Loss of the errors of actions.
+
+    Examples:
+        >>> import torch
+        >>> from safe_rl.models import make_bounded_actor
+        >>> actor = make_bounded_actor(3, -torch.ones(2), torch.ones(2), hidden_sizes=[8])
+        >>> loss = BCLoss(actor)
+        >>> steps = actor(TensorDict(observation=torch.randn(4, 3), batch_size=[4]))
+        >>> loss(steps.detach())["loss_actor"]
+        tensor(0., grad_fn=<MeanBackward0>)
+    """
+
+    learns_values = False
+
+    actor_network: TensorDictModuleBase
+    actor_network_params: TensorDictParams
+    target_actor_network_params: TensorDictParams
+
+    def __init__(
+        self, actor_network: TensorDictModuleBase, *, loss_function: Distance = "l2"
+    ) -> None:
+        super().__init__()
+        self.convert_to_functional(actor_network, "actor_network")
+        self.loss_function = loss_function
+        self.in_keys = [*actor_network.in_keys, *actor_network.out_keys]
+        self.out_keys = ["loss_actor"]
+
+    @dispatch
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Evaluate the loss on steps [...]: a mean over steps and actions.
+
+        Raises:
+            KeyError: If an entry is missing; the message names it.
+        """
+        (key,) = self.actor_network.out_keys
+        taken = require(tensordict, key)
+        inputs = tensordict.select(*self.actor_network.in_keys)
+        with self.actor_network_params.to_module(self.actor_network):
+            chosen = self.actor_network(inputs).get(key)
+        error = distance_loss(chosen, taken, loss_function=self.loss_function)
+        return TensorDict(loss_actor=error.mean())

@@ -1,0 +1,114 @@
+"""How updates use the processor: kernels of matrix products, and two updates at the same time."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from functools import cache
+from typing import Any
+
+import torch
+from torchrl.envs.utils import ExplorationType, set_exploration_type
+
+from safe_rl.processor import cpuinfo
+
+__all__ = ["fast_products", "in_parallel", "prefers_onednn", "torch_threads"]
+
+
+def prefers_onednn(cpuinfo: str) -> bool:
+    """Whether oneDNN multiplies matrices faster than MKL on a processor, and as exactly.
+
+    MKL leaves half of the width of AMD's vector units unused: oneDNN takes about half as long there
+    for products of minibatches. torch asks it only if products may be rounded to bfloat16,
+    of which oneDNN makes use where there are tile registers (AMX), and nowhere else.
+
+    Args:
+        cpuinfo: What Linux says of the processor, the text of ``/proc/cpuinfo``.
+
+    Examples:
+        >>> prefers_onednn("vendor_id : AuthenticAMD flags : fpu avx2 avx512f")
+        True
+        >>> prefers_onednn("vendor_id : GenuineIntel flags : fpu avx2 avx512f amx_tile")
+        False
+    """
+    words = set(cpuinfo.split())
+    has_tiles = any(word.startswith("amx") for word in words)
+    return {"AuthenticAMD", "avx512f"} <= words and not has_tiles
+
+
+@cache
+def _is_of_use() -> bool:
+    return torch.backends.mkldnn.is_available() and prefers_onednn(cpuinfo())
+
+
+@contextmanager
+def fast_products() -> Iterator[None]:
+    """Let torch multiply matrices inside the block by oneDNN, on processors that it suits.
+
+    For updates, whose minibatches have thousands of rows: a call costs some ten microseconds
+    more, too many for the few rows that a policy acts on. Sums differ in their last digits.
+    What the caller has set (``torch.backends.mkldnn.matmul.fp32_precision``) is kept.
+
+    Examples:
+        >>> with fast_products():
+        ...     product = torch.ones(300, 64) @ torch.ones(64, 64)
+        >>> product[0, 0].item()
+        64.0
+    """
+    products = torch.backends.mkldnn.matmul  # type: ignore[attr-defined]  # made at run time
+    before = products.fp32_precision
+    if before != "none" or not _is_of_use():
+        yield
+        return
+    products.fp32_precision = "bf16"
+    try:
+        yield
+    finally:
+        products.fp32_precision = before
+
+
+@contextmanager
+def torch_threads(number: int) -> Iterator[None]:
+    """Let torch compute with `number` threads inside the block."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(number)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
+
+
+def in_parallel(first: Callable[[], Any], second: Callable[[], Any]) -> tuple[Any, Any]:
+    """Call two functions that share nothing they change, each with half of torch's threads.
+
+    Minibatches of narrow networks are too small to be worth two threads each: two of them side by
+    side are. With one thread, the second function follows the first. TorchRL's exploration type is
+    DETERMINISTIC meanwhile, as in its losses.
+
+    Args:
+        first: Called in this thread.
+        second: Called in a thread of its own.
+
+    Returns:
+        What they return. Both have ended, also if one of them raises.
+
+    Examples:
+        >>> in_parallel(lambda: 1, lambda: 2)
+        (1, 2)
+    """
+    threads = torch.get_num_threads()
+    # Losses set the process's one exploration type, and put back what they have found: in two
+    # threads that is the other's. So it is the same before, and only this block restores it.
+    with set_exploration_type(ExplorationType.DETERMINISTIC):
+        return (first(), second()) if threads == 1 else _beside(first, second, threads // 2)
+
+
+def _beside(first: Callable[[], Any], second: Callable[[], Any], threads: int) -> tuple[Any, Any]:
+    def beside() -> Any:
+        torch.set_num_threads(threads)  # a setting of each thread's own
+        return second()
+
+    with torch_threads(threads), ThreadPoolExecutor(max_workers=1) as pool:
+        other = pool.submit(beside)
+        return first(), other.result()
