@@ -77,7 +77,6 @@ FLOORS = {
         ("velocity.velocity_config",),
         ("velocity.locomotion",),
         ("velocity.runner_model",),
-        ("velocity.runner_pictures",),
         ("velocity.velocity_env",),
         ("velocity",),
         # The table of families, and environments of other libraries.
@@ -93,7 +92,7 @@ FLOORS = {
         # What changes any of them from outside.
         ("transforms.base",),
         ("transforms.action_transforms", "transforms.observation_transforms"),
-        ("transforms.reward_transforms", "transforms.action_repeat", "transforms.observed_costs"),
+        ("transforms.reward_transforms",),
         ("transforms.environment",),
         ("transforms",),
         ("making",),

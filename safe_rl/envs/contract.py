@@ -91,6 +91,19 @@ class ConstrainedEnv(EnvBase):
         self.steps_before = steps
 
 
+def add_columns(layout: Mapping[str, slice], sizes: Mapping[str, int]) -> dict[str, slice]:
+    """Add components to a layout, name -> number of columns, after its last column.
+
+    Examples:
+        >>> add_columns({"gyro": slice(0, 3)}, {"lidar": 16})
+        {'gyro': slice(0, 3, None), 'lidar': slice(3, 19, None)}
+    """
+    found, first = dict(layout), max((columns.stop for columns in layout.values()), default=0)
+    for name, size in sizes.items():
+        found[name], first = slice(first, first + size), first + size
+    return found
+
+
 _DEFAULTS = (
     *("return_key", "seconds_per_step", "steps_per_decision", "steps_before", "render"),
     *("get_state", "get_positions", "continue_from", "highest_cost"),

@@ -6,7 +6,6 @@ import math
 import reprlib
 import warnings
 from collections.abc import Collection, Iterable, Mapping, Sequence
-from itertools import accumulate
 from typing import Any
 
 import numpy as np
@@ -19,7 +18,7 @@ from torchrl.envs import GymWrapper, Transform, TransformedEnv
 from torchrl.envs.gym_like import BaseInfoDictReader
 
 from safe_rl import naming
-from safe_rl.envs.contract import ConstrainedEnv
+from safe_rl.envs.contract import ConstrainedEnv, add_columns
 from safe_rl.envs.costs import COST, is_cost
 from safe_rl.envs.errors import ConfigError, nearest
 
@@ -223,8 +222,7 @@ def _columns(spec: TensorSpec) -> dict[str, slice]:
     """Columns of every component of N observations, of entries as if they were one vector."""
     parts = dict(spec.items()) if isinstance(spec, Composite) else {"observation": spec}
     sizes = {str(name): part.shape[1:].numel() for name, part in sorted(parts.items())}
-    ends = accumulate(sizes.values())
-    return {name: slice(end - sizes[name], end) for name, end in zip(sizes, ends, strict=True)}
+    return add_columns({}, sizes)
 
 
 def _warn_of_uncounted(keys: Iterable[str], named: Sequence[str]) -> None:

@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 from torchrl.data import Bounded, Composite, TensorSpec, Unbounded
 
+from safe_rl.envs.contract import add_columns
 from safe_rl.envs.errors import ConfigError
 from safe_rl.envs.safety_gym.config import SafetyGymConfig
 from safe_rl.envs.safety_gym.display import vision_blocks
@@ -98,16 +99,12 @@ def make_observer(scene: Scene, device: torch.device) -> Observer:
                 "observation that was registered."
             )
     unordered: Shapes = {name: shape for block in blocks for name, shape in block.shapes.items()}
-    starts, start = {}, 0
-    for name, shape in unordered.items():
-        starts[name], start = start, start + math.prod(shape)
     shapes = {name: unordered[name] for name in sorted(unordered)}
-    columns: dict[str, slice] = {}
-    first, order = 0, list[int]()
-    for name, shape in shapes.items():
-        size = math.prod(shape)
-        columns[name], first = slice(first, first + size), first + size
-        order += range(starts[name], starts[name] + size)
+    read_at, columns = (
+        add_columns({}, {name: math.prod(shape) for name, shape in each.items()})
+        for each in (unordered, shapes)
+    )
+    order = [i for name in shapes for i in range(read_at[name].start, read_at[name].stop)]
     permutation = torch.tensor(order, device=device)
 
     def read(world: World) -> Tensor:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from functools import partial
-from itertools import accumulate
 from typing import Any
 
 import torch
@@ -15,6 +14,7 @@ from torchrl.data import Binary, Categorical, Composite, NonTensor, TensorSpec, 
 from torchrl.envs import EnvBase
 from torchrl.envs.transforms import Transform
 
+from safe_rl.envs.contract import add_columns
 from safe_rl.envs.costs import COST, is_cost, parse_ranges
 from safe_rl.envs.errors import ConfigError, nearest
 from safe_rl.envs.gymnasium.gymnasium_env import cost_spec
@@ -191,9 +191,7 @@ class Observe(Transform):
         # what the environment needs for its next step stays where it is
         needed = {*map(dotted, env.state_spec.keys(True, True)), _OBSERVATION}
         self._moved = [entry_key(name) for name in self._specs if name not in needed]
-        sizes = {_last(name): _size(spec) for name, spec in self._specs.items()}
-        ends = accumulate(sizes.values())
-        self.layout = {n: slice(e - sizes[n], e) for n, e in zip(sizes, ends, strict=True)}
+        self.layout = add_columns({}, {_last(name): _size(s) for name, s in self._specs.items()})
 
     def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:
         values = {

@@ -1,11 +1,13 @@
 """Transforms of TorchRL that change a constrained problem, for any environment and algorithm."""
 
-from safe_rl.envs.transforms.action_repeat import ActionRepeat
-from safe_rl.envs.transforms.action_transforms import ActionDelay, ActionFilter
+from safe_rl.envs.transforms.action_transforms import ActionDelay, ActionFilter, ActionRepeat
 from safe_rl.envs.transforms.base import ConstraintTransform
 from safe_rl.envs.transforms.environment import TransformedConstrainedEnv, transform_env
-from safe_rl.envs.transforms.observation_transforms import PolicyMemory, SensorNoise
-from safe_rl.envs.transforms.observed_costs import ObservedCosts
+from safe_rl.envs.transforms.observation_transforms import (
+    ObservedCosts,
+    PolicyMemory,
+    SensorNoise,
+)
 from safe_rl.envs.transforms.reward_transforms import EarlyTermination, RewardScale, Saute, Simmer
 
 __all__ = [

@@ -27,6 +27,7 @@ class ConstraintTransform(Transform):
     Attributes:
         evaluating: whether policies are evaluated; changes that only help learning are then off.
         added_costs: names of costs that it writes beside the environment's.
+        needed_costs: names of costs that the environment has to have.
         return_key: where it leaves the reward that returns are made of, if it changes the reward.
         steps_per_decision: steps of the environment that a call of `step` takes. One that takes
             several has to be the last: those before it then act at every step.
@@ -39,6 +40,7 @@ class ConstraintTransform(Transform):
 
     evaluating = False
     added_costs: tuple[str, ...] = ()
+    needed_costs: Collection[str] = ()
     return_key: str | None = None
     steps_per_decision: int = 1
 
@@ -66,6 +68,7 @@ class ConstraintTransform(Transform):
 
     def check(self, cost_keys: Collection[str]) -> None:
         """Raise ValueError if it needs a cost that is not among these."""
+        check_known(self.needed_costs, cost_keys)
 
     def highest_cost(self, key: str, highest: float, of_a_step: float) -> float:
         """Return the most that an episode can cost, from what it can without the transform."""
@@ -138,11 +141,29 @@ def keep_reward(step: TensorDictBase, key: str) -> Tensor:
 def kept_reward_spec(spec: Composite, key: str) -> Composite:
     """Add the environment's own reward `key` to the spec; both rewards are unbounded."""
     for name in (key, "reward"):
-        spec[name] = reward_like(spec)
+        spec[name] = unbounded_like(spec["reward"])
     return spec
 
 
-def reward_like(spec: Composite) -> TensorSpec:
-    """Return the spec of one unbounded number per reward."""
-    reward = spec["reward"]
-    return Unbounded(shape=reward.shape, dtype=reward.dtype, device=reward.device)
+def unbounded_like(spec: TensorSpec) -> TensorSpec:
+    """Return a spec without its bounds; one of integers stays as it is."""
+    if not spec.dtype.is_floating_point:
+        return spec
+    return Unbounded(shape=spec.shape, dtype=spec.dtype, device=spec.device)
+
+
+def widen(spec: Composite, number: int, who: str) -> Composite:
+    """Add so many columns to the observation, which has to be a vector.
+
+    Raises:
+        ValueError: for pictures and dictionaries; the message begins with `who`.
+    """
+    seen = spec["observation"]
+    if len(seen.shape) != len(spec.shape) + 1:
+        raise ValueError(
+            f"{who} adds columns to an observation that is one vector, and this one has the shape "
+            f"{list(seen.shape)}: let the environment make one vector of it."
+        )
+    shape = (*seen.shape[:-1], seen.shape[-1] + number)
+    spec["observation"] = Unbounded(shape, dtype=seen.dtype, device=seen.device)
+    return spec

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Mapping
+from collections.abc import Mapping
 from typing import Any
 
 import torch
@@ -11,14 +11,15 @@ from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.data import Composite, TensorSpec, Unbounded
 
+from safe_rl.envs.contract import add_columns
 from safe_rl.envs.transforms.base import (
     OWN_REWARD,
     ConstraintTransform,
     check_budgets,
-    check_known,
     costs_of,
     keep_reward,
     kept_reward_spec,
+    widen,
 )
 from safe_rl.ranges import Count, Fraction, NotNegative, Number, Positive
 
@@ -91,11 +92,7 @@ class EarlyTermination(ConstraintTransform):
     def __init__(self, budgets: Mapping[str, NotNegative], in_evaluation: bool = False) -> None:
         super().__init__()
         self.in_evaluation = in_evaluation
-        self._budgets = check_budgets(budgets, above_zero=False)
-
-    def check(self, cost_keys: Collection[str]) -> None:
-        """Raise ValueError if a budget's cost is not among these."""
-        check_known(self._budgets, cost_keys)
+        self.needed_costs = self._budgets = check_budgets(budgets, above_zero=False)
 
     def highest_cost(self, key: str, highest: float, of_a_step: float) -> float:
         """Return the budget and the most that the last step can cost, where episodes end so."""
@@ -169,14 +166,10 @@ class Saute(ConstraintTransform):
         super().__init__()
         if not 0 < discount <= 1:
             raise ValueError(f"discount={discount:g} must be above 0 and at most 1.")
-        self._budgets = check_budgets(budgets, above_zero=True)
+        self.needed_costs = self._budgets = check_budgets(budgets, above_zero=True)
         self._discount = discount
         self._unsafe_reward = unsafe_reward
         self._rescales = rescale_budgets
-
-    def check(self, cost_keys: Collection[str]) -> None:
-        """Raise ValueError if a budget's cost is not among these."""
-        check_known(self._budgets, cost_keys)
 
     def start(self, done: Tensor) -> dict[str, Tensor]:
         """Return the whole budget."""
@@ -193,8 +186,7 @@ class Saute(ConstraintTransform):
             raise ValueError(
                 f"The observation has a component '{BUDGET}' already: use one of saute and simmer."
             )
-        last = max((columns.stop for columns in layout.values()), default=0)
-        return {**layout, BUDGET: slice(last, last + len(self._budgets))}
+        return add_columns(layout, {BUDGET: len(self._budgets)})
 
     def _allowed(self, like: Tensor) -> Tensor:
         """Budgets in which costs are measured, [k]."""
@@ -238,17 +230,7 @@ class Saute(ConstraintTransform):
             shape = (*observation_spec.shape, len(self._budgets))
             observed[BUDGET] = Unbounded(shape=shape, device=observed.device)
             return observation_spec
-        if len(observed.shape) != len(observation_spec.shape) + 1:
-            raise ValueError(
-                "The budget is observed as columns of a vector or as an entry of a dictionary, and "
-                f"this observation has the shape {list(observed.shape)}: let the environment make "
-                "one vector of it, or a dictionary."
-            )
-        shape = (*observed.shape[:-1], observed.shape[-1] + len(self._budgets))
-        observation_spec["observation"] = Unbounded(
-            shape=shape, dtype=observed.dtype, device=observed.device
-        )
-        return observation_spec
+        return widen(observation_spec, len(self._budgets), "A budget")
 
     def transform_reward_spec(self, reward_spec: TensorSpec) -> TensorSpec:
         """Add the environment's own reward."""

@@ -1,4 +1,4 @@
-"""The simulated model of a robot, Gymnasium's own MJCF file, and what is observed of it."""
+"""A robot's model, from Gymnasium's own MJCF file: how it is loaded, observed and drawn."""
 
 from __future__ import annotations
 
@@ -9,17 +9,22 @@ from typing import NamedTuple
 
 import gymnasium
 import mujoco
+import numpy as np
 import torch
 from torch import Tensor
 
+from safe_rl.envs.contract import add_columns
 from safe_rl.envs.physics.batch import BatchPhysics
 from safe_rl.envs.physics.dynamics import SCALES, scale_dynamics
+from safe_rl.envs.pictures import Camera, Marker, Pictures
 from safe_rl.envs.velocity.locomotion import PLACES, TORSO
 from safe_rl.envs.velocity.runners import RUNNERS
 from safe_rl.envs.velocity.velocity_config import VelocityConfig
 
 ASSETS = Path(gymnasium.__file__).parent / "envs" / "mujoco" / "assets"
 FORCES = "cfrc_ext"
+DISTANCE, ELEVATION = 4.0, -20.0  # of the free camera from the robot [m, degrees], as Gymnasium's
+COST_RGBA, COST_RADIUS = (1.0, 0.0, 0.0, 0.35), 0.3
 
 
 def load_model(config: VelocityConfig) -> mujoco.MjModel:
@@ -84,11 +89,8 @@ class Observer:
 
     def __init__(self, config: VelocityConfig, model: mujoco.MjModel) -> None:
         self._parts = [*_joints(config, model), *_bodies(config, model)]
-        self.columns: dict[str, slice] = {}
-        self.size = 0
-        for part in self._parts:
-            self.columns[part.name] = slice(self.size, self.size + part.size)
-            self.size += part.size
+        self.columns = add_columns({}, {part.name: part.size for part in self._parts})
+        self.size = sum(part.size for part in self._parts)
 
     def write(self, physics: BatchPhysics, observation: Tensor) -> None:
         """Write what all robots observe after a step into [N, size]."""
@@ -131,3 +133,37 @@ def _bodies(config: VelocityConfig, model: mujoco.MjModel) -> list[Part]:
         ),
     }
     return [known[name] for name in observed_parts(config)]
+
+
+class RobotRenderer(Pictures):
+    """Draws the robots of one environment as they are at the time."""
+
+    def __init__(self, config: VelocityConfig, physics: BatchPhysics) -> None:
+        super().__init__()
+        self._config, self._physics = config, physics
+
+    def frames(
+        self, rows: list[int], has_cost: Tensor, camera: Camera, width: int, height: int
+    ) -> np.ndarray:
+        """Draw robots `rows`, with a sphere where `has_cost` [N]: uint8 [R, height, width, 3]."""
+        frames = np.empty((len(rows), height, width, 3), dtype=np.uint8)
+        for frame, row in zip(frames, rows, strict=True):
+            self.data.qpos[:] = self._physics.qpos[row].numpy()
+            self.place()
+            size, place = (COST_RADIUS,) * 3, self.data.xpos[TORSO]
+            sphere = Marker(mujoco.mjtGeom.mjGEOM_SPHERE, size, place, COST_RGBA)
+            frame[:] = self.frame(camera, width, height, [sphere] if has_cost[row] else [])
+        return frames
+
+    def free_camera(self) -> mujoco.MjvCamera:
+        """Return a camera beside the robot that moves with it."""
+        free = mujoco.MjvCamera()
+        free.type, free.trackbodyid = mujoco.mjtCamera.mjCAMERA_TRACKING, TORSO
+        free.distance, free.elevation = DISTANCE, ELEVATION
+        return free
+
+    def _load(self) -> mujoco.MjModel:
+        """The model without shadows, which take software OpenGL longer than all the rest."""
+        model = load_model(self._config)
+        model.light_castshadow[:] = 0
+        return model

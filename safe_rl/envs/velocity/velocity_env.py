@@ -19,11 +19,11 @@ from safe_rl.envs.velocity.locomotion import HEALTH, PLACES, limited_speed, loco
 from safe_rl.envs.velocity.runner_model import (
     FORCES,
     Observer,
+    RobotRenderer,
     load_model,
     needed_outputs,
     needs_forces,
 )
-from safe_rl.envs.velocity.runner_pictures import RobotRenderer
 from safe_rl.envs.velocity.runners import RUNNERS
 from safe_rl.envs.velocity.velocity_config import VelocityConfig, resolve_velocity
 
