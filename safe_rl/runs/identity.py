@@ -11,15 +11,16 @@ from enum import Enum
 from pathlib import Path
 from typing import Any
 
+from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import DictConfig, OmegaConf
 
-from safe_rl.files import read_config
+from safe_rl.files import read_config, read_yaml
 from safe_rl.runs.folder import RunFolder, common_source
 from safe_rl.targets import present_name
 
 __all__ = [
     *("ROLES", "Role", "check_same_run", "differences", "experiment_of", "flatten"),
-    "role_of",
+    *("given_settings", "role_of"),
 ]
 
 
@@ -199,6 +200,25 @@ def _hashable(value: Any) -> Hashable:
     if isinstance(value, Mapping):
         return tuple((key, _hashable(item)) for key, item in value.items())
     return tuple(map(_hashable, value)) if isinstance(value, list | tuple) else value
+
+
+def given_settings(directory: Path, config: DictConfig) -> dict[str, Any]:
+    """Environment, algorithm and seed of a run, and what a person set on its command line.
+
+    Keys that belong to the machine are left out. Lists and mappings are written as texts.
+
+    Args:
+        directory: Folder of the run, with Hydra's notes; without them nothing else was set.
+        config: Configuration of the run.
+    """
+    notes = RunFolder(directory).overrides
+    texts = read_yaml(notes) if notes.exists() else []
+    given = {}
+    for override in OverridesParser.create().parse_overrides(texts):
+        key, value = override.key_or_group, override.value()
+        if role_of(key) is not Role.MACHINE:
+            given[key] = value if isinstance(value, bool | int | float | str) else str(value)
+    return given | {"env": config.env.name, "algo": config.algo.name, "seed": config.seed}
 
 
 def check_same_run(directory: Path, config: DictConfig) -> None:

@@ -6,10 +6,12 @@ Each is TorchRL's, writes below or remembers its run in the folder ``log_dir``, 
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 from tensorboard.compat.proto.event_pb2 import Event, SessionLog
+from tensorboard.plugins.hparams.summary_v2 import hparams_pb
 from torchrl.record.loggers.mlflow import MLFlowLogger
 from torchrl.record.loggers.tensorboard import TensorboardLogger as TorchRLTensorboardLogger
 from torchrl.record.loggers.wandb import WandbLogger as TorchRLWandbLogger
@@ -50,6 +52,17 @@ class TensorboardLogger(TorchRLTensorboardLogger):
         writer = self.experiment._get_file_writer()
         event = Event(step=step + 1, session_log=SessionLog(status=SessionLog.START))
         writer.add_event(event, step=step + 1)
+
+    def log_hparams(self, cfg: Mapping[str, Any]) -> None:
+        """Write the settings by which TensorBoard's page HParams compares runs.
+
+        ``SummaryWriter.add_hparams`` would make a folder below, and a list of columns of which
+        TensorBoard takes only that of the first run. Without such a list it has those of all runs.
+
+        Args:
+            cfg: Name -> number, text or boolean.
+        """
+        self.experiment._get_file_writer().add_summary(hparams_pb(dict(cfg)))
 
     def close(self) -> None:
         """Write what is still held back."""

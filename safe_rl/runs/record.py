@@ -18,6 +18,8 @@ from omegaconf import DictConfig, OmegaConf
 from safe_rl.files import read_json, replace_text, replacing
 from safe_rl.runs.display import ProgressBar, outcome_line
 from safe_rl.runs.folder import RunFolder, lock_folder
+from safe_rl.runs.identity import given_settings
+from safe_rl.runs.outcome import final_figures
 from safe_rl.runs.table import TableWriter, read_table
 from safe_rl.targets import build
 
@@ -98,6 +100,8 @@ class RunRecord:
             self._logger = build(self._config.logger, log_dir=str(self.directory))
             if epoch is not None and hasattr(self._logger, "continue_from"):
                 self._logger.continue_from(steps)
+            if not epoch and self._logger is not None:
+                self._logger.log_hparams(given_settings(self.directory, self._config))
             # whole batches, so that the last one does not go beyond the bar
             batch = self._config.get("frames_per_batch", 1)
             total = math.ceil(self._config.frames / batch) * batch
@@ -105,6 +109,7 @@ class RunRecord:
             try:
                 yield
                 self._save_config()
+                self._log_final()
             finally:
                 self._bar.close()
                 self._table.close()
@@ -119,6 +124,18 @@ class RunRecord:
                 OmegaConf.save(self._config, unfinished, resolve=True)
             note_code(self.folder.code, self._steps_before)
             self._is_config_saved = True
+
+    def _log_final(self) -> None:
+        """Write the final figures to the logger, by which it compares runs."""
+        if self._logger is None or not self.folder.num_rows:
+            return
+        table = read_table(self.folder.table)
+        figures = final_figures(table, list(self._cost_limits))
+        for name in ("episode_return", *(f"episode_{key}" for key in self._cost_limits)):
+            if not math.isnan(figures[name]):
+                self._logger.log_scalar(
+                    f"Final/{name}", figures[name], step=int(table["steps"][-1])
+                )
 
     def add(self, row: Mapping[str, float]) -> None:
         """Write one epoch to table and logger and show it."""

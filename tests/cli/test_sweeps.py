@@ -12,6 +12,7 @@ from filelock import SoftFileLease
 from hydra.core.utils import JobReturn, JobStatus
 from omegaconf import OmegaConf
 
+from safe_rl.cli.composing import resolving
 from safe_rl.cli.sweeps import SweepReport, count_jobs, threads_per_job
 from safe_rl.cli.train import read_command
 from safe_rl.runs.checkpoint_file import read_facts
@@ -106,6 +107,23 @@ def test_single_runs_are_left_alone(tmp_path):
     assert [path.name for path in tmp_path.iterdir()] == ["seed0"]
 
 
+@pytest.mark.parametrize(
+    ("words", "between"),
+    [
+        ([], ""),
+        (["num_threads=2", "logger=none", "record=true", "certificate.episodes=0"], ""),
+        (["import=examples/custom_environment.py", "env.mines_num=1"], "env.mines_num=1"),
+        (["slate=SGPoint", "frames=300_000,600_000", "preset=paper"], "frames=300000,preset=paper"),
+    ],
+)
+def test_folders_of_a_sweep_name_what_a_person_overrode(words, between):
+    env = [] if any(word.startswith("slate=") for word in words) else ["env=PointGoal1"]
+    config = read_command(["-m", *env, "algo=cpo,ppo", "seed=0,1", *words]).configs[0]
+    with resolving(config):
+        folder = Path(config.hydra.sweep.subdir)
+    assert folder == Path("PointGoal1") / "cpo" / between / "seed0"
+
+
 TINY = [
     *("env.num_steps=40", "num_envs=2", "frames_per_batch=80", "frames=240", "logger=none"),
     *("model.hidden_sizes=[8]", "critic_update.num_passes=1", "policy_update.num_passes=1"),
@@ -143,11 +161,12 @@ def test_a_sweep_end_to_end(tmp_path, launcher):
     assert sorted(note["event"] for note in notes) == ["begun"] * 4 + ["done"] * 2 + ["failed"] * 2
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_jobs_in_other_processes_know_the_keys_of_a_users_module(tmp_path):
     pytest.importorskip("hydra_plugins.hydra_joblib_launcher")
     keys = ["env=PointGoal1", "env.constrain_mines=true", "env.mines_num=1", "algo=ppo"]
-    said = sweep(tmp_path, "import=examples/custom_environment.py", *keys, "seed=0,1")
+    keys += ["hydra/launcher=joblib", "import=examples/custom_environment.py"]
+    said = sweep(tmp_path, *keys, "seed=0,1")
     assert "Sweep: 2 of 2 runs are finished." in said.stdout, said.stderr
 
 
