@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 
 from safe_rl.files import read_yaml
 from safe_rl.reporting.recorded import Run
-from safe_rl.reporting.tables import Table, clean
+from safe_rl.reporting.tables import Table, as_override, clean
 from safe_rl.runs.folder import paths_below
 from safe_rl.runs.identity import flatten, role_of
 
@@ -25,7 +25,6 @@ __all__ = ["PLAN", "campaign_tables", "read_plan"]
 
 PLAN = "plan.yaml"
 """Name of the file, in a campaign's folder."""
-
 _NEEDED = ("env", "algo", "seed", "frames")
 _MOST_RUNS = 10_000
 
@@ -71,55 +70,42 @@ def _cells(sweep: Mapping[str, Any], name: str) -> Iterator[Planned]:
     if missing:
         raise ValueError(f"{name}: a sweep says {', '.join(_NEEDED)}, and here is no {missing[0]}")
     values = {key: value if isinstance(value, list) else [value] for key, value in sweep.items()}
-    seeds, lengths = values.pop("seed"), values["frames"]
-    for key, numbers in (("seed", seeds), ("frames", lengths)):
-        if not all(isinstance(n, int) and n >= 0 for n in numbers):
+    for key in ("seed", "frames"):
+        if not all(isinstance(n, int) and n >= 0 for n in values[key]):
             raise ValueError(f"{name}: {key} takes whole numbers")
+    seeds = tuple(values.pop("seed"))
     for combination in product(*values.values()):
-        yield Planned(dict(zip(values, combination, strict=True)), tuple(seeds))
+        yield Planned(dict(zip(values, combination, strict=True)), seeds)
 
 
 def campaign_tables(
     root: Path, runs: Sequence[Run]
 ) -> tuple[dict[str, list[Table]], dict[Path, str]]:
-    """Campaigns below a folder, and plan -> why it was left out.
+    """Name of a campaign below a folder -> its tables, and plan -> why it was left out.
 
-    Args:
-        root: The folder.
-        runs: Those below it.
-
-    Returns:
-        Name of a campaign -> its table, and one of the commands of what is missing if any is.
+    The second table, of the commands of what is missing, is there if anything is.
     """
+    plans = {path: path.parent.resolve().name for path in paths_below(root, PLAN)}
+    names = list(plans.values())
     tables, skipped = {}, {}
-    for path, name in _names(root).items():
+    for path, name in plans.items():
+        if names.count(name) > 1 and path.parent != root:  # then by the way there
+            name = path.parent.relative_to(root).as_posix()
         try:
             if not path.resolve().is_relative_to(root.resolve()):
                 raise ValueError(f"{path.name} is a link to outside of the folder")
             own = [run for run in runs if run.directory.is_relative_to(path.parent)]
+            name = clean(name)
             tables[name] = _tables(name, read_plan(path), own)
         except (ValueError, OSError) as error:
             skipped[path] = clean(error)
     return tables, skipped
 
 
-def _names(root: Path) -> dict[Path, str]:
-    """Plan -> name of its campaign: its folder's, with the way there if several are called so."""
-    plans = {path: path.parent.resolve().name for path in paths_below(root, PLAN)}
-    names = list(plans.values())
-    return {
-        path: clean(name, 60)
-        if names.count(name) == 1 or path.parent == root
-        else clean(path.parent.relative_to(root).as_posix())
-        for path, name in plans.items()
-    }
-
-
 def _tables(name: str, cells: Sequence[Planned], runs: Sequence[Run]) -> list[Table]:
     records = [_record(name, cell, runs) for cell in cells]
-    planned = sum(len(cell.seeds) for cell in cells)
     done, begun = (sum(record[key] for record in records) for key in ("num_done", "num_begun"))
-    note = f"{done} of {planned} runs are done"
+    note = f"{done} of {sum(len(cell.seeds) for cell in cells)} runs are done"
     note += f", {begun} have begun." if begun else "."
     columns = {"environment": "{env}", "algorithm": "{algo}", "steps": "{frames:,}"}
     columns |= {"with": "{further}"} if any(record["further"] for record in records) else {}
@@ -135,23 +121,23 @@ def _tables(name: str, cells: Sequence[Planned], runs: Sequence[Run]) -> list[Ta
 def _record(name: str, cell: Planned, runs: Sequence[Run]) -> dict[str, Any]:
     found = [run for run in runs if run.seed in cell.seeds and _is_of(run, cell.chosen)]
     # of one seed the run that has come furthest
-    own = {run.seed: run for run in sorted(found, key=lambda run: run.steps)}
-    done = [seed for seed, run in sorted(own.items()) if run.steps >= cell.chosen["frames"]]
-    begun = [seed for seed in sorted(own) if seed not in done]
-    missing = tuple(seed for seed in cell.seeds if seed not in own)
-    shares = [f"{seed} ({own[seed].steps / cell.chosen['frames']:.0%})" for seed in begun]
+    shares = {
+        run.seed: run.steps / max(1, cell.chosen["frames"])
+        for run in sorted(found, key=lambda run: run.steps)
+    }
+    done = [seed for seed, share in sorted(shares.items()) if share >= 1]
+    begun = {seed: share for seed, share in sorted(shares.items()) if share < 1}
+    missing = tuple(seed for seed in cell.seeds if seed not in shares)
     further = {key: value for key, value in cell.chosen.items() if key not in _NEEDED}
     return {
         "campaign": name,
         **{key: clean(cell.chosen[key], 80) for key in ("env", "algo")},
         "frames": cell.chosen["frames"],
         "further": clean(" ".join(_words(further))) or None,
-        "num_done": len(done),
-        "num_begun": len(begun),
-        "num_missing": len(missing),
+        **{"num_done": len(done), "num_begun": len(begun), "num_missing": len(missing)},
         "seeds_missing": missing,
         "done": ", ".join(map(str, done)) or "—",
-        "begun": ", ".join(shares) or "—",
+        "begun": ", ".join(f"{seed} ({share:.0%})" for seed, share in begun.items()) or "—",
         "missing": ", ".join(map(str, missing)) or "—",
     }
 
@@ -167,13 +153,11 @@ def _is_of(run: Run, chosen: Mapping[str, Any]) -> bool:
     limits = chosen.get("cost_limits")
     # a limit that the plan does not name makes it another one, too
     others += set(run.limits) - set(limits) if isinstance(limits, Mapping) else []
-
-    def has(key: str, value: Any) -> bool:
-        # what a group was chosen by, as in risk=cvar, only the command line says
-        chose = key not in settings and said.get(key) == value
-        return settings.get(key) == value or chose
-
-    return not others and all(has(key, value) for key, value in flatten(chosen).items())
+    # what a group was chosen by, as in risk=cvar, only the command line says
+    return not others and all(
+        settings.get(key) == value or (key not in settings and said.get(key) == value)
+        for key, value in flatten(chosen).items()
+    )
 
 
 def _commands(cells: Sequence[Planned], missing: Sequence[tuple[int, ...]]) -> list[dict[str, Any]]:
@@ -194,13 +178,4 @@ def _commands(cells: Sequence[Planned], missing: Sequence[tuple[int, ...]]) -> l
 
 
 def _words(chosen: Mapping[str, Any]) -> list[str]:
-    """Overrides of a command line."""
-    return [f"{key}={_text(value)}" for key, value in chosen.items()]
-
-
-def _text(value: Any) -> str:
-    if isinstance(value, dict):
-        return f"{{{', '.join(f'{key}: {_text(part)}' for key, part in value.items())}}}"
-    if isinstance(value, bool) or value is None:
-        return {True: "true", False: "false", None: "null"}[value]
-    return f"{value:_}" if isinstance(value, int) else str(value)
+    return [f"{key}={as_override(value)}" for key, value in chosen.items()]

@@ -49,20 +49,13 @@ def average(
     """Average a column of the runs' tables over seeds; None if one has no value, or there is none.
 
     The curve ends where the first of the runs does. Between epochs, and over those in which no
-    episode finished, values are interpolated.
-
-    Args:
-        runs: One per seed.
-        column: Column of their tables.
-        smooth: Whether to take :func:`safe_rl.runs.curves.moving_mean` first, which ends at the
-            run's final figure.
-        with_band: Whether to compute the interval, which takes most of the time.
+    episode finished, values are interpolated. With ``smooth`` values are moving means over as many
+    epochs as final figures; without the band, most of the time is saved.
     """
     series = []
     for run in runs:
-        steps = np.array(run.table["steps"])
-        values = np.array(run.table.get(column, np.full(steps.shape, np.nan)))
-        known = np.isfinite(values)
+        steps, values = (np.array(run.table.get(name, [])) for name in ("steps", column))
+        known = np.flatnonzero(np.isfinite(values))
         steps, values = steps[known], values[known]
         if not len(steps):
             return None
@@ -85,10 +78,6 @@ def draw_learning_curves(experiments: Sequence[Experiment], styles: Mapping[str,
     an epoch and those before it, as many as final figures have. Limits d are dashed, and so is
     d / T_ep beside the cost rate. Runs that have not come to their end are dotted, one by one.
     An environment has a row for each number of steps, and for each cost with a limit.
-
-    Args:
-        experiments: Any environments and algorithms.
-        styles: Label of an experiment -> how it is drawn.
     """
     groups: dict[tuple[str, int], list[Experiment]] = {}
     for e in experiments:
@@ -122,12 +111,7 @@ def draw_small_multiples(
     """Draw return, episode cost and cost rate of many algorithms, a column of panels for each.
 
     The other algorithms are grey in the background. Costs above four times the highest limit are
-    cut off, if all curves end below it.
-
-    Args:
-        experiments: Of one environment and one number of steps.
-        key: Cost key.
-        styles: Label of an experiment -> how it is drawn.
+    cut off, if all curves end below it. All experiments have one environment and number of steps.
     """
     columns: dict[str, list[Experiment]] = {}
     for experiment in experiments:
@@ -203,13 +187,9 @@ def _curves(runs: Sequence[Run], key: str, *, with_band: bool = True) -> list[Av
 
 
 def draw_experiment(experiment: Experiment, key: str, axes: Sequence[Axes], style: Style) -> None:
-    """Draw return, episode cost and cost rate of an experiment.
+    """Draw return, episode cost and cost rate of an experiment into a panel each.
 
-    Args:
-        experiment: The finished runs become a mean and its interval, others a line each.
-        key: Cost key.
-        axes: A panel for each of the three.
-        style: Of everything.
+    The finished runs become a mean and its interval, others a line each.
     """
     name = literal(experiment.label)
     looks: list[tuple[Any, ...]] = [(experiment.finished, name, style.line, 1.5)]

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from safe_rl.files import CONF
 from safe_rl.reporting.recorded import Run
-from safe_rl.reporting.tables import clean, short_number
+from safe_rl.reporting.tables import as_override, clean, short_number
 from safe_rl.runs.identity import Role, experiment_of, flatten, role_of
 from safe_rl.scores.benchmark import ALGORITHMS, COST_LIMIT, REFERENCE, Scores, Suite
 
@@ -21,6 +21,7 @@ PACKAGED = frozenset(file.stem for file in (CONF / "algo").glob("*.yaml"))
 """Names of the package's algorithms."""
 
 Settings = Mapping[str, Hashable]
+Known = tuple[tuple[str, Hashable], ...]
 
 # longer names are cut off and numbered
 _MOST_KEYS, _LONGEST_NAME, _LONGEST_VALUE = 12, 240, 60
@@ -78,7 +79,7 @@ class Experiment:
     @property
     def is_continued(self) -> bool:
         """Whether a run of it started from another run's networks."""
-        return any(run.init_from is not None for run in self.runs)
+        return any(run.config.get("init_from") is not None for run in self.runs)
 
     @property
     def finished(self) -> tuple[Run, ...]:
@@ -106,10 +107,6 @@ def cost_keys_of(experiments: Iterable[Experiment]) -> list[str]:
 def group_runs(runs: Sequence[Run], suite: Suite) -> tuple[list[Experiment], dict[Path, str]]:
     """Group runs into experiments, in the order of the benchmark and of the paper's tables.
 
-    Args:
-        runs: Runs of any environments and algorithms.
-        suite: The benchmark.
-
     Returns:
         Experiments, and folder -> why a run was left out.
     """
@@ -125,13 +122,19 @@ def group_runs(runs: Sequence[Run], suite: Suite) -> tuple[list[Experiment], dic
     skipped: dict[Path, str] = {}
     experiments = []
     for own, members in cells.items():
-        kept = _without_repetitions(members, skipped)
-        first = kept[0].directory
+        kept: dict[int, Run] = {}  # of a seed the one that has come further, then the last by name
+        for run in sorted(members, key=lambda run: (run.steps, run.directory)):
+            if run.seed in kept:
+                reason = f"{run.directory} is the same run with the same seed"
+                skipped[kept[run.seed].directory] = reason
+            kept[run.seed] = run
+        first = kept[min(kept)].directory
         named, settings = ({k: v for k, v in n.items() if k != "frames"} for n in names[first])
         family = {k: v for k, v in named.items() if not k.startswith("cost_limits.")}
         label, base = (titles[first] + _in_brackets(shown) for shown in (named, family))
-        benchmark = suite.name_of(kept[0].config["env"])
-        experiments.append(Experiment(*own, benchmark, tuple(kept), label, base, settings))
+        benchmark = suite.name_of(kept[min(kept)].config["env"])
+        ordered = tuple(kept[seed] for seed in sorted(kept))
+        experiments.append(Experiment(*own, benchmark, ordered, label, base, settings))
     return sorted(experiments, key=_order), skipped
 
 
@@ -141,17 +144,6 @@ def _order(experiment: Experiment) -> tuple[Hashable, ...]:
     algorithms = {name: place for place, name in enumerate(ALGORITHMS)}
     places = benchmarks.get(experiment.benchmark or "", 99), experiment.environment
     return *places, algorithms.get(experiment.base, 99), experiment.algorithm
-
-
-def _without_repetitions(runs: Sequence[Run], skipped: dict[Path, str]) -> list[Run]:
-    """Runs by seed, each once: the one that has come further, then the last by folder name."""
-    kept: dict[int, Run] = {}
-    for run in sorted(runs, key=lambda run: (run.steps, run.directory)):
-        if run.seed in kept:
-            reason = f"{run.directory} is the same run with the same seed"
-            skipped[kept[run.seed].directory] = reason
-        kept[run.seed] = run
-    return [kept[seed] for seed in sorted(kept)]
 
 
 def _environment_names(runs: Sequence[Run], suite: Suite) -> dict[Path, str]:
@@ -183,29 +175,28 @@ def _settings_of_names(
     """
     found: dict[Path, tuple[Settings, Settings]] = {}
     for algorithm in {run.algorithm for run in runs}:
-        members = [run for run in runs if run.algorithm == algorithm]
-        settings = {run.directory: _settings(run) for run in members}
+        settings = {run.directory: _settings(run) for run in runs if run.algorithm == algorithm}
         cells: dict[str, list[Run]] = defaultdict(list)
-        for run in members:
-            cells[environments[run.directory]].append(run)
+        for run in runs:
+            if run.algorithm == algorithm:
+                cells[environments[run.directory]].append(run)
         # an experiment may train longer on one environment than on another
         anywhere = [{**own, "frames": None} for own in settings.values()]
         by_cell = [[settings[run.directory] for run in own] for own in cells.values()]
         keys = distinguishing_keys([*by_cell, anywhere])
         for own in cells.values():
-            given: dict[tuple[tuple[str, Hashable], ...], set[str]] = defaultdict(set)
-            whole = {run.directory: _known(settings[run.directory], keys) for run in own}
+            given: dict[Known, set[str]] = defaultdict(set)
+            whole: dict[Path, Known] = {}
             for run in own:
-                given[whole[run.directory]] |= {key for key in keys if _is_given(key, run)}
+                of_run = settings[run.directory]
+                known = tuple((key, of_run[key]) for key in keys if of_run.get(key) is not None)
+                whole[run.directory] = known
+                given[known] |= {key for key in keys if _is_given(key, run)}
             further = _further(keys, given)
             for place, known in whole.items():
                 named = {k: v for k, v in known if k in given[known] or k in further}
                 found[place] = named, dict(known)
     return found
-
-
-def _known(settings: Settings, keys: Sequence[str]) -> tuple[tuple[str, Hashable], ...]:
-    return tuple((key, settings[key]) for key in keys if settings.get(key) is not None)
 
 
 def _is_given(key: str, run: Run) -> bool:
@@ -216,9 +207,7 @@ def _is_given(key: str, run: Run) -> bool:
     )
 
 
-def _further(
-    keys: Sequence[str], given: Mapping[tuple[tuple[str, Hashable], ...], set[str]]
-) -> list[str]:
+def _further(keys: Sequence[str], given: Mapping[Known, set[str]]) -> list[str]:
     """As few keys as tell settings apart that are alike in the given ones."""
     further: list[str] = []
 
@@ -269,8 +258,7 @@ def _settings(run: Run) -> dict[str, Hashable]:
 def distinguishing_keys(cells: Sequence[Sequence[Settings]]) -> list[str]:
     """Keys that differ within a cell, except those whose values follow from another key.
 
-    A value may follow from ``preset``, or from the ``_target_`` of the group of its key. Settings
-    are told apart within a cell, not across cells.
+    A value may follow from ``preset``, or from the ``_target_`` of the group of its key.
 
     Examples:
         >>> small, large = {"preset": "a", "model.width": 1}, {"preset": "b", "model.width": 2}
@@ -316,7 +304,7 @@ def _in_brackets(settings: Settings) -> str:
     for key, value in settings.items():
         if key.endswith("._target_"):
             key, value = key.removesuffix("._target_"), str(value).rpartition(".")[2]
-        shown = clean(_text(value), _LONGEST_VALUE)
+        shown = clean(as_override(value), _LONGEST_VALUE)
         if key == "frames" and isinstance(value, int | float):
             texts.append(f"{short_number(value)} steps")
         elif key.startswith("cost_limits."):
@@ -326,12 +314,3 @@ def _in_brackets(settings: Settings) -> str:
     if len(texts) > _MOST_KEYS:
         texts[_MOST_KEYS:] = ["…"]
     return f" ({', '.join(texts)})" if texts else ""
-
-
-def _text(value: Hashable) -> str:
-    if isinstance(value, bool) or value is None:
-        return {True: "true", False: "false", None: "null"}[value]
-    if isinstance(value, tuple):
-        return f"[{','.join(map(_text, value))}]"
-    form = {float: "g", int: "_"}.get(type(value), "")
-    return f"{value:{form}}" if form else str(value)

@@ -109,8 +109,7 @@ def set_grid(axis: Axes) -> None:
 def add_legend(figure: Figure, axes: Iterable[Axes]) -> None:
     """One legend for all panels, below the figure, which grows by its height.
 
-    It has as many columns as the figure is wide enough for; labels wider than the figure are
-    broken into lines.
+    It has as many columns as there is room for, and breaks long labels into lines.
     """
     pairs = chain.from_iterable(
         zip(*axis.get_legend_handles_labels(), strict=True) for axis in axes
@@ -156,20 +155,16 @@ def compared(records: Sequence[Record]) -> dict[str, list[Record]]:
 
 
 def draw_fronts(
-    records: Sequence[Record], experiments: Iterable[Experiment], styles: Mapping[str, Style]
+    groups: Mapping[str, Sequence[Record]],
+    experiments: Iterable[Experiment],
+    styles: Mapping[str, Style],
 ) -> Figure:
-    """Draw final returns against final costs, a panel per environment and length of training.
+    """Draw final returns against final costs, a panel per group of :func:`compared`.
 
     A point is an experiment, with the standard deviations over its seeds. A line in an
     algorithm's colour joins its experiments under several limits, which stand beside their points.
     The grey line joins those that no other one beats in both.
-
-    Args:
-        records: Final scores, see :func:`safe_rl.reporting.scoring.final_record`.
-        experiments: Those of the records.
-        styles: Label of an experiment -> how it is drawn.
     """
-    groups = compared(records)
     known = {(e.environment, e.algorithm): e for e in experiments}
     columns = min(3, len(groups))
     rows = -(-len(groups) // columns)
@@ -220,11 +215,8 @@ def _draw_front(
 def draw_profiles(aggregates: Sequence[Aggregate], styles: Mapping[str, Style]) -> Figure:
     """Draw the share of runs above every value of a normalised score, a panel per score.
 
-    Bands are 95 % intervals of a bootstrap that resamples every environment's seeds.
-
-    Args:
-        aggregates: Algorithms of which every run has finished an episode.
-        styles: Name of an algorithm -> how it is drawn.
+    Bands are 95 % intervals of a bootstrap that resamples every environment's seeds. Every run has
+    finished an episode.
     """
     figure = Figure(figsize=(WIDTH, 3.0), layout="constrained")
     panels = figure.subplots(1, 3, sharey=True)

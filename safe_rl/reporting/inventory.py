@@ -20,9 +20,8 @@ def _each_run(
     experiments: Sequence[Experiment],
 ) -> Iterator[tuple[dict[str, Any], Experiment, Run]]:
     for e in experiments:
-        for run in e.runs:
-            where = {"environment": e.environment, "algorithm": e.algorithm, "seed": run.seed}
-            yield where, e, run
+        place = {"environment": e.environment, "algorithm": e.algorithm}
+        yield from (({**place, "seed": run.seed}, e, run) for run in e.runs)
 
 
 def run_table(experiments: Sequence[Experiment]) -> Table:
@@ -31,10 +30,7 @@ def run_table(experiments: Sequence[Experiment]) -> Table:
         {
             **where,
             "steps": run.steps,
-            # of its own end, whether or not an unfinished run is to count as a finished one
-            "state": "finished"
-            if run.steps >= run.config["frames"]
-            else f"{run.steps / run.config['frames']:.0%}",
+            "state": run.state,
             "hours": run.hours,
             "time": duration(run.hours),
             **run.final(["cost"]),

@@ -17,24 +17,10 @@ from matplotlib.figure import Figure
 
 from safe_rl.extras import import_extra
 from safe_rl.files import check_no_links, replace_text
+from safe_rl.reporting import figures, inventory
 from safe_rl.reporting.campaigns import campaign_tables
 from safe_rl.reporting.curves import draw_learning_curves, draw_small_multiples, drawn_keys
 from safe_rl.reporting.experiments import Experiment, group_runs
-from safe_rl.reporting.figures import (
-    Style,
-    algorithm_styles,
-    compared,
-    draw_fronts,
-    draw_profiles,
-    save,
-)
-from safe_rl.reporting.inventory import (
-    certificate_table,
-    duration,
-    evaluation_table,
-    run_table,
-    videos,
-)
 from safe_rl.reporting.recorded import Run, find_runs
 from safe_rl.reporting.scoring import better_tables, final_table, learning_table
 from safe_rl.reporting.slates import complete_slates, improvement_tables, slate_table
@@ -70,6 +56,7 @@ class Film(NamedTuple):
 
 
 Block = Table | Drawing | Film | str
+Styles = Mapping[str, figures.Style]
 
 
 class Section(NamedTuple):
@@ -139,7 +126,7 @@ def build_report(
     chosen = [run for run in runs if run.algorithm in (algorithms or known)]
     experiments, repeated = group_runs(chosen, suite)
     skipped |= repeated | no_plans
-    styles = algorithm_styles(experiments)
+    styles = figures.algorithm_styles(experiments)
     groups = _by_environment([e for e in experiments if e.finished])
     finals = [final_table(group) for group in groups]
     records = [record for table in finals for record in table.records]
@@ -153,11 +140,11 @@ def build_report(
         ("fronts", "Return against cost", _fronts(records, experiments, styles)),
         ("normalised", "Normalised scores", _slates(experiments, styles, seeds_needed)),
         ("better", "Which is better", better_tables(records)),
-        ("certificates", "Certificates", [certificate_table(experiments)]),
-        ("evaluations", "Evaluations", [evaluation_table(experiments)]),
-        ("videos", "Videos", [Film(clean(c), path) for c, path in videos(experiments)]),
+        ("certificates", "Certificates", [inventory.certificate_table(experiments)]),
+        ("evaluations", "Evaluations", [inventory.evaluation_table(experiments)]),
+        ("videos", "Videos", [Film(clean(c), path) for c, path in inventory.videos(experiments)]),
         ("campaigns", "Campaigns", [t for own in campaigns.values() for t in own]),
-        ("runs", "Runs", [run_table(experiments), left_out]),
+        ("runs", "Runs", [inventory.run_table(experiments), left_out]),
     ]
     # a table without a row says nothing
     sections = [
@@ -173,17 +160,19 @@ def _by_environment(experiments: Sequence[Experiment]) -> list[list[Experiment]]
 
 
 def _fronts(
-    records: Sequence[Record], experiments: Sequence[Experiment], styles: Mapping[str, Style]
+    records: Sequence[Record], experiments: Sequence[Experiment], styles: Styles
 ) -> list[Drawing]:
-    groups = compared(records)
+    groups = figures.compared(records)
+    if not groups:
+        return []
     panels = [f"{what}: {', '.join(r['algorithm'] for r in own)}" for what, own in groups.items()]
     says = f"Final return against final episode cost. {'; '.join(panels)}"
-    figure = draw_fronts(records, experiments, styles) if groups else None
-    return [Drawing("fronts", "", figure, says)] if figure else []
+    return [Drawing("fronts", "", figures.draw_fronts(groups, experiments, styles), says)]
 
 
-def _curves(experiments: Sequence[Experiment], styles: Mapping[str, Style]) -> list[Drawing]:
+def _curves(experiments: Sequence[Experiment], styles: Styles) -> list[Drawing]:
     """Small multiples where there are many curves; of the rest a picture per robot, or several."""
+    what = "Return, episode cost and cost rate"
     robots: dict[str, list[list[Experiment]]] = defaultdict(list)
     drawings = []
     for group in _by_environment(experiments):
@@ -196,22 +185,19 @@ def _curves(experiments: Sequence[Experiment], styles: Mapping[str, Style]) -> l
             for key in drawn_keys(own):
                 title = f"{group[0].environment}, {short_number(steps)} steps"
                 title += "" if key == "cost" else f", {clean(key, 40)}"
-                says = f"Return, episode cost and cost rate, a column per algorithm: {title}"
                 figure = draw_small_multiples(own, key, styles)
+                says = f"{what}, a column per algorithm: {title}"
                 drawings.append(Drawing(f"curves_{title}", title, figure, says))
     for robot, groups in robots.items():
-        for start in range(0, len(groups), _MOST_ROWS):
-            shown = groups[start : start + _MOST_ROWS]
+        for shown in (groups[n : n + _MOST_ROWS] for n in range(0, len(groups), _MOST_ROWS)):
             names = ", ".join(dict.fromkeys(group[0].environment for group in shown))
-            says = f"Return, episode cost and cost rate over environment steps: {names}"
             figure = draw_learning_curves([e for group in shown for e in group], styles)
+            says = f"{what} over environment steps: {names}"
             drawings.append(Drawing(f"curves_{robot}", "", figure, says))
     return drawings
 
 
-def _slates(
-    experiments: Sequence[Experiment], styles: Mapping[str, Style], seeds_needed: int
-) -> list[Block]:
+def _slates(experiments: Sequence[Experiment], styles: Styles, seeds_needed: int) -> list[Block]:
     blocks: list[Block] = []
     for name, environments, aggregates in complete_slates(experiments, seeds_needed):
         blocks += [table := slate_table(name, environments, aggregates)]
@@ -220,7 +206,7 @@ def _slates(
         if known and max(one.num_runs for one in known) > 1:
             names = ", ".join(one.algorithm for one in known)
             says = f"Share of runs above every score: {table.title}, {names}"
-            blocks += [Drawing(f"profiles_{name}", "", draw_profiles(known, styles), says)]
+            blocks += [Drawing(f"profiles_{name}", "", figures.draw_profiles(known, styles), says)]
         blocks += improvement_tables(name, aggregates)
     return blocks
 
@@ -286,22 +272,20 @@ def _written(
     block: Block, place: Callable[[str], Path], formats: Sequence[str]
 ) -> dict[str, Any] | None:
     """A block as the templates see it; tables and pictures are written on the way."""
+    if isinstance(block, str):
+        return {"kind": "text", "title": "", "text": block}
     if isinstance(block, Table):
         if not block.is_matrix:  # whose table of pairs is a file already
             block.write_csv(place(f"{block.name}.csv"))
         return {"kind": "table", "title": block.title, "table": block} if block.columns else None
-    if isinstance(block, Drawing):
-        path = save(block.figure, place(f"{block.name}.png"))
-        for form in {*formats} - {"png"}:
-            save(block.figure, path.with_suffix(f".{form}"))
-        return {
-            "kind": "picture", "title": block.title, "file": path.name, "data": _embedded(path),
-            "says": block.shows,
-        }  # fmt: skip
     if isinstance(block, Film):
         data = _embedded(block.path)
         return {"kind": "film", "title": block.title, "file": clean(block.path), "data": data}
-    return {"kind": "text", "title": "", "text": block}
+    path = figures.save(block.figure, place(f"{block.name}.png"))
+    for form in {*formats} - {"png"}:
+        figures.save(block.figure, path.with_suffix(f".{form}"))
+    seen = {"kind": "picture", "title": block.title, "says": block.shows}
+    return seen | {"file": path.name, "data": _embedded(path)}
 
 
 def _embedded(path: Path) -> str:
@@ -312,7 +296,6 @@ def _embedded(path: Path) -> str:
 
 
 def _facts(report: Report) -> dict[str, str]:
-    """The page's first lines: name -> number."""
     runs = report.runs
     finished = sum(run.is_finished for run in runs)
     return {
@@ -321,7 +304,7 @@ def _facts(report: Report) -> dict[str, str]:
         "algorithms": str(len({run.algorithm for run in runs})),
         "experiments": str(len(report.experiments)),
         "environment steps": f"{sum(run.steps for run in runs):,}",
-        "training": duration(sum(run.hours for run in runs)),
+        "training": inventory.duration(sum(run.hours for run in runs)),
     }
 
 

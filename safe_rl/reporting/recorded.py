@@ -39,9 +39,8 @@ class Run:
         config: Its configuration.
         table: Columns of its table; a row per epoch, NaN where there is no number.
         frames: Environment steps after which it counts as finished.
-        command: The command line that does it again, if Hydra has recorded it.
         overrides: What its command line said.
-        cwd: Where it was started, if Hydra has recorded it.
+        command: The command line that does it again, if Hydra has recorded it.
         evaluations: What ``safe_rl.evaluate`` has written into its folder.
         certificate: Which of its checkpoints is certified, or by how much none is.
         code: By which version and commit it was carried out, in words, if that is recorded.
@@ -55,7 +54,6 @@ class Run:
     frames: int
     overrides: tuple[str, ...] | None = None
     command: str | None = None
-    cwd: Path | None = None
     evaluations: tuple[Mapping[str, Any], ...] = ()
     certificate: Mapping[str, Any] | None = None
     code: str | None = None
@@ -100,19 +98,20 @@ class Run:
         return self.steps >= self.frames
 
     @property
+    def state(self) -> str:
+        """How far it has come to its own end, whether or not it counts as finished."""
+        whole = self.config["frames"]
+        return "finished" if self.steps >= whole else f"{self.steps / whole:.0%}"
+
+    @property
     def hours(self) -> float:
         """Time of training so far [h]."""
         return self.table["time_total"][-1] / 3600
 
-    @property
-    def init_from(self) -> Path | None:
-        """The run or checkpoint whose networks it started from, as its command line named it."""
-        return Path(self.config["init_from"]) if self.config.get("init_from") is not None else None
-
     def column(self, name: str) -> np.ndarray:
         """A column in the epochs in which an episode finished, shape [epochs]; NaN without one."""
         known = np.isfinite(self.table["episode_return"])
-        return np.array(self.table.get(name, np.full(known.shape, math.nan)), dtype=float)[known]
+        return np.array(self.table.get(name, [math.nan] * known.size), dtype=float)[known]
 
     def final(self, cost_keys: Sequence[str]) -> dict[str, float]:
         """Final J_r, J_c and ρ_c by column name (section 5.1), of the costs that it has."""
@@ -142,9 +141,7 @@ def find_runs(root: Path, *, unfinished: bool = False) -> tuple[list[Run], dict[
         FileNotFoundError: If there is no such folder, or no run in it.
     """
     if not root.is_dir():
-        raise FileNotFoundError(
-            f"There is no folder '{root}': give the folder that holds the runs."
-        )
+        raise FileNotFoundError(f"There is no folder '{root}': give the folder of the runs.")
     runs: list[Run] = []
     skipped: dict[Path, str] = {}
     resolved = root.resolve()
@@ -158,11 +155,11 @@ def find_runs(root: Path, *, unfinished: bool = False) -> tuple[list[Run], dict[
                     runs.append(_run(directory, recorded, unfinished))
     for folder in runs_below(root):
         with _noted(folder.directory, skipped):
-            recorded, films = _recorded(folder, resolved, skipped), []
+            run = _run(folder.directory, _recorded(folder, resolved, skipped), unfinished)
+            films = []
             for path in _films(folder):
                 with _noted(path, skipped):
                     films.append(_own(path, resolved))
-            run = _run(folder.directory, recorded, unfinished)
             runs.append(replace(run, videos=tuple(films)))
     if not runs:
         reasons = "".join(f"\n  {clean(path)}: {reason}" for path, reason in skipped.items())
@@ -174,12 +171,7 @@ def find_runs(root: Path, *, unfinished: bool = False) -> tuple[list[Run], dict[
 
 
 def archive_runs(runs: Iterable[Run], root: Path, archive: Path) -> None:
-    """Add runs to an archive, or bring them up to date in it, each by its path below a folder.
-
-    Args:
-        runs: Runs of :func:`find_runs`.
-        root: Folder above all of them.
-        archive: Folder of the archive, made if need be.
+    """Add runs to an archive, or bring them up to date in it, each by its path below ``root``.
 
     Raises:
         ValueError: If the archive is among the runs or they in it, or is no archive.
@@ -207,6 +199,16 @@ def _noted(path: Path, skipped: dict[Path, str]) -> Iterator[None]:
 
 def _recorded(folder: RunFolder, root: Path, skipped: dict[Path, str]) -> Recorded:
     """What a run's folder holds; notes that cannot be read are left out."""
+
+    def read(path: Path, check: Callable[[Any], object] = bool) -> Any:
+        """What a file holds that passes a check; None of any other."""
+        with _noted(path, skipped):
+            if os.path.lexists(path):
+                content = (read_json if path.suffix == ".json" else read_yaml)(_own(path, root))
+                check(content)
+                return content
+        return None
+
     config = read_config(_own(folder.config, root))
     if not folder.table.exists():
         raise ValueError("it has not begun: no progress.csv")
@@ -214,26 +216,11 @@ def _recorded(folder: RunFolder, root: Path, skipped: dict[Path, str]) -> Record
         table = read_table(_own(folder.table, root))
     except ValueError as error:
         raise ValueError(f"progress.csv cannot be read ({error})") from error
-    found: dict[Path, Any] = {}
-    for path in (folder.surroundings, folder.overrides, folder.composed):
-        if os.path.lexists(path):
-            with _noted(path, skipped):
-                found[path] = read_yaml(_own(path, root))
-    for path in (folder.certificate, folder.code, *folder.evaluations()):
-        if os.path.lexists(path):
-            with _noted(path, skipped):
-                content = read_json(_own(path, root))
-                if path == folder.certificate:
-                    read_certificate(content)
-                elif path == folder.code:
-                    read_code(content)
-                elif not isinstance(content, dict) or "estimates" in content:
-                    read_evaluation(content)
-                found[path] = content
-    runtime = _select(found.get(folder.surroundings), "hydra", "runtime")
-    before = _select(found.get(folder.composed), "frames")
+    runtime = _select(read(folder.surroundings), "hydra", "runtime")
+    before = _select(read(folder.composed), "frames")
+    evaluations = [read(path, _check_evaluation) for path in folder.evaluations()]
     notes = {
-        "overrides": found.get(folder.overrides),
+        "overrides": read(folder.overrides),
         "cwd": _select(runtime, "cwd"),
         # of --config-dir, and of Python's config_dir
         "config_dirs": [
@@ -242,32 +229,32 @@ def _recorded(folder: RunFolder, root: Path, skipped: dict[Path, str]) -> Record
             if str(_select(source, "provider")).endswith("command-line")
         ],
         "frames_before": before if before != config.get("frames") else None,
-        "certificate": found.get(folder.certificate),
-        "code": found.get(folder.code),
-        "evaluations": [
-            found[path]
-            for path in folder.evaluations()
-            if isinstance(found.get(path), dict) and "estimates" in found[path]
-        ],
+        "certificate": read(folder.certificate, read_certificate),
+        "code": read(folder.code, read_code),
+        "evaluations": [found for found in evaluations if found and "estimates" in found],
     }
     return Recorded(config, table, {name: value for name, value in notes.items() if value})
 
 
+def _check_evaluation(content: Any) -> None:
+    if not isinstance(content, dict) or "estimates" in content:
+        read_evaluation(content)
+
+
 def _run(directory: Path, recorded: Recorded, unfinished: bool) -> Run:
-    config, notes = recorded.config, recorded.notes
-    for key, is_right, wanted in _NEEDED:
+    config, table, notes = recorded
+    for key, (is_right, wanted) in _NEEDED.items():
         if not is_right(config.get(key)):
             raise ValueError(f"config.yaml is not that of a run: its '{key}' is not {wanted}")
-    overrides, cwd = notes.get("overrides"), notes.get("cwd")
-    overrides = tuple(map(clean, overrides)) if isinstance(overrides, list) else None
+    said = notes.get("overrides")
+    overrides = tuple(map(clean, said)) if isinstance(said, list) else None
     return Run(
         directory,
         config,
-        _checked(recorded.table, config.get("cost_limits") or {}),
+        _checked(table, config.get("cost_limits") or {}),
         frames=0 if unfinished else config["frames"],
         overrides=overrides,
         command=None if overrides is None else _command(overrides, notes, config),
-        cwd=Path(cwd) if isinstance(cwd, str) else None,
         evaluations=tuple(map(read_evaluation, notes.get("evaluations", ()))),
         certificate=read_certificate(notes["certificate"]) if "certificate" in notes else None,
         code=read_code(notes["code"]) if "code" in notes else None,
@@ -297,22 +284,22 @@ def _is_number(value: Any) -> bool:
     return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
 
 
-def _is_named(value: Any) -> bool:
-    return isinstance(value, dict) and isinstance(value.get("name"), str) and bool(value["name"])
+def _is_name(value: Any) -> bool:
+    return isinstance(value, str) and value != ""
 
 
-def _are_limits(value: Any) -> bool:
-    return value is None or (isinstance(value, dict) and all(map(_is_number, value.values())))
-
-
-_NEEDED: tuple[tuple[str, Callable[[Any], bool], str], ...] = (
-    ("env", lambda v: isinstance(v, dict), "a mapping"),
-    ("algo", _is_named, "a mapping with a name"),
-    ("seed", lambda v: isinstance(v, int) and not isinstance(v, bool), "a whole number"),
-    ("frames", lambda v: _is_number(v) and v >= 0, "a number of steps"),
-    ("cost_limits", _are_limits, "a mapping of costs to numbers"),
-    ("init_from", lambda v: v is None or isinstance(v, str), "a path"),
-)
+# key -> what it has to be, and how that is called
+_NEEDED: dict[str, tuple[Callable[[Any], bool], str]] = {
+    "env": (lambda v: isinstance(v, dict), "a mapping"),
+    "algo": (lambda v: _is_name(_select(v, "name")), "a mapping with a name"),
+    "seed": (lambda v: _is_number(v) and isinstance(v, int), "a whole number"),
+    "frames": (lambda v: _is_number(v) and v >= 0, "a number of steps"),
+    "cost_limits": (
+        lambda v: v is None or (isinstance(v, dict) and all(map(_is_number, v.values()))),
+        "a mapping of costs to numbers",
+    ),
+    "init_from": (lambda v: v is None or isinstance(v, str), "a path"),
+}
 
 
 def _checked(table: Mapping[str, list[float]], limits: Mapping[str, Any]) -> dict[str, list[float]]:

@@ -41,7 +41,7 @@ def final_record(experiment: Experiment, cost_keys: Sequence[str]) -> dict[str, 
         "fewest_steps": lengths[0],
         "most_steps": lengths[-1] if lengths[1:] else None,
         "hours": float(np.mean([run.hours for run in runs])),
-        **_over_seeds([{**run.final(cost_keys), **_critic_bias(run)} for run in runs]),
+        **_over_seeds([run.final(cost_keys) | _critic_bias(run) for run in runs]),
         **{f"limit_{key}": limit for key, limit in limits.items()},
         **excesses,
         "satisfies": all(excess <= 0 for excess in excesses.values()),
@@ -51,9 +51,8 @@ def final_record(experiment: Experiment, cost_keys: Sequence[str]) -> dict[str, 
 
 def _critic_bias(run: Run) -> dict[str, float]:
     """By how much cost critics predicted too much over the last epochs, of each cost with one."""
-    last = final_rows(run.table)
     names = [name for name in run.table if name.startswith("critic_bias_")]
-    known = {name: np.array(run.table[name])[last] for name in names}
+    known = {name: np.array(run.table[name])[final_rows(run.table)] for name in names}
     return {k: float(np.nanmean(v)) for k, v in known.items() if np.isfinite(v).any()}
 
 
@@ -140,14 +139,9 @@ def _rivals(record: Record) -> Hashable:
 
 
 def learning_table(experiments: Sequence[Experiment], good: float = 0.5) -> Table | None:
-    """What learning has cost on one environment, and when policies became good.
+    """What learning has cost on one environment, if anything on it has a limit.
 
-    Args:
-        experiments: All on the environment.
-        good: Share of a return, the published PPO's or the best here, from which on one is good.
-
-    Returns:
-        The table, or None if nothing on it has a limit.
+    A policy is good from a share of a return on: the published PPO's, or the best here.
     """
     experiments = [e for e in experiments if e.limits]
     if not experiments:
@@ -164,8 +158,7 @@ def learning_table(experiments: Sequence[Experiment], good: float = 0.5) -> Tabl
         record["seeds_good"] = None if least is None else reached
         records.append(record | _over_seeds(figures))
     columns = {
-        "algorithm": "{algorithm}",
-        "seeds": "{seeds:d}",
+        **{"algorithm": "{algorithm}", "seeds": "{seeds:d}"},
         **({"cost": "{cost}"} if len(keys) > 1 else {}),
         "regret": spread("regret", 1),
         "epochs over": "{over:.0%}",
@@ -235,20 +228,17 @@ def better_tables(records: Sequence[Record]) -> list[Table]:
     pairs: list[Record] = []
     matrices = []
     for own in groups.values():
-        first, names = own[0], [record["algorithm"] for record in own]
+        first = own[0]
         agents = {
             r["algorithm"]: Agent(r["episode_return"], r.get("cost_rate", 0.0), r["satisfies"], 0)
             for r in own
         }
-        found = {(better, worse): reason for better, worse, reason in compare(agents)}
-        place = {"environment": first["environment"]}
-        pairs += [
-            {**place, "better": better, "worse": worse, "reason": reason}
-            for (better, worse), reason in found.items()
-        ]
-        words = [first["environment"], f"{short_number(first['steps'])} steps"]
+        place, fields = first["environment"], ("environment", "better", "worse", "reason")
+        found = [dict(zip(fields, (place, *pair), strict=True)) for pair in compare(agents)]
+        pairs += found
+        words = [place, f"{short_number(first['steps'])} steps"]
         words += [f"{name[6:]} ≤ {first[name]:g}" for name in first if name.startswith("limit_")]
-        matrices += [matrix(", ".join(words), names, signs_of(agents))] if found else []
+        matrices += [matrix(", ".join(words), [*agents], signs_of(agents))] if found else []
     return [Table("dominance", "", {}, pairs), *matrices]
 
 
@@ -259,20 +249,11 @@ def signs_of(agents: Mapping[str, Agent]) -> dict[tuple[str, str], str]:
 
 
 def matrix(title: str, names: Sequence[str], signs: Mapping[tuple[str, str], str]) -> Table:
-    """A table with a row and a column per algorithm.
-
-    Args:
-        title: Its heading.
-        names: Of the algorithms.
-        signs: Pair of algorithms, of the row and of the column -> what the cell says.
-    """
-    rows = [
-        {"algorithm": f"{row} {one}"}
-        | {
-            f"c{n}": "·" if n == row else signs.get((one, two), "")
-            for n, two in enumerate(names, 1)
-        }
-        for row, one in enumerate(names, 1)
-    ]
-    columns = {f"{n}": f"{{c{n}}}" for n in range(1, len(names) + 1)}
-    return Table("", title, {"better than …": "{algorithm}", **columns}, rows, is_matrix=True)
+    """A table with a row and a column per algorithm."""
+    numbers = range(1, len(names) + 1)
+    rows = []
+    for row, one in zip(numbers, names, strict=True):
+        cells = {f"c{n}": signs.get((one, names[n - 1]), "") for n in numbers} | {f"c{row}": "·"}
+        rows.append({"algorithm": f"{row} {one}", **cells})
+    columns = {"better than …": "{algorithm}"} | {f"{n}": f"{{c{n}}}" for n in numbers}
+    return Table("", title, columns, rows, is_matrix=True)

@@ -14,7 +14,7 @@ from safe_rl.reporting.experiments import Experiment
 from safe_rl.reporting.scoring import matrix, signs_of
 from safe_rl.reporting.tables import Table, interval, mark_best
 from safe_rl.scores.benchmark import PUBLISHED, PUBLISHED_STEPS, REFERENCE, SLATES, Normalised
-from safe_rl.scores.comparisons import interquartile_mean, probability_of_improvement
+from safe_rl.scores.comparisons import Estimate, interquartile_mean, probability_of_improvement
 from safe_rl.scores.measures import (
     NOISE_OF_ZERO,
     Agent,
@@ -24,12 +24,7 @@ from safe_rl.scores.measures import (
 )
 
 __all__ = [
-    "SYMBOLS",
-    "Aggregate",
-    "aggregate",
-    "complete_slates",
-    "improvement_tables",
-    "slate_table",
+    *("SYMBOLS", "Aggregate", "aggregate", "complete_slates", "improvement_tables", "slate_table"),
 ]
 
 SYMBOLS = dict(
@@ -99,14 +94,8 @@ def complete_slates(
 ) -> Iterator[tuple[str, tuple[str, ...], list[Aggregate]]]:
     """Slates that are complete for an algorithm or more, and what all have in common.
 
-    Runs that started from another run's networks do not count.
-
-    Args:
-        experiments: Experiments.
-        needed: Finished runs that a slate takes per environment.
-
-    Yields:
-        Title of a slate, its environments, and an aggregate of each algorithm.
+    Yields title, environments, and an aggregate of each algorithm with as many finished runs per
+    environment as are needed. Runs that started from another run's networks do not count.
     """
     begun = [e for e in experiments if e.reference is not None and not e.is_continued]
     usable = [e for e in begun if "cost" in e.limits and e.finished]
@@ -128,6 +117,10 @@ def complete_slates(
             yield name, SLATES.get(name, shared), list(map(aggregate, members))
 
 
+def _named(name: str, estimate: Estimate) -> dict[str, float]:
+    return dict(zip((name, f"{name}_low", f"{name}_high"), estimate, strict=True))
+
+
 def slate_table(slate: str, environments: Sequence[str], aggregates: Sequence[Aggregate]) -> Table:
     """One of the paper's Tables 1 and 2, the published values beside ours."""
     conditions = {one.algorithm: one.conditions for one in aggregates}
@@ -135,14 +128,12 @@ def slate_table(slate: str, environments: Sequence[str], aggregates: Sequence[Ag
     for one in aggregates:
         record: dict[str, Any] = {"slate": slate, "algorithm": one.algorithm, "runs": one.num_runs}
         steps = one.conditions[0]
-        record |= {"fewest_steps": min(steps)}
+        record["fewest_steps"] = min(steps)
         record["most_steps"] = max(steps) if max(steps) > min(steps) else None
         record |= one.mean._asdict()
         if one.num_runs > 1:
             for name in SYMBOLS:
-                middle = interquartile_mean(one.strata[name])
-                names = (f"iqm_{name}", f"iqm_{name}_low", f"iqm_{name}_high")
-                record |= dict(zip(names, middle, strict=True))
+                record |= _named(f"iqm_{name}", interquartile_mean(one.strata[name]))
         if all(e.has_published_limit for e in one.experiments):
             paper = PUBLISHED.get(slate, {}).get(one.experiments[0].base)
             record |= {f"paper_{n}": v for n, v in (paper._asdict() if paper else {}).items()}
@@ -183,30 +174,22 @@ def improvement_tables(slate: str, aggregates: Sequence[Aggregate]) -> list[Tabl
     paper's rules and the probability of a higher return. Pairs are those that were trained for
     equally many steps; two single runs have no probability.
     """
-    agents = {
-        one.algorithm: Agent(
-            one.mean.episode_return,
-            one.mean.cost_rate,
-            one.mean.violation <= NOISE_OF_ZERO,
-            one.conditions,
-        )
-        for one in aggregates
-        if one.is_measured  # without an episode nothing is kept, and nothing violated
-    }
+    agents = {}
+    for one in aggregates:
+        value, violation, rate = one.mean
+        if one.is_measured:  # without an episode nothing is kept, and nothing violated
+            agents[one.algorithm] = Agent(value, rate, violation <= NOISE_OF_ZERO, one.conditions)
     signs, records = signs_of(agents), []
     for first, second in permutations(aggregates, 2):
         alike = first.conditions[0] == second.conditions[0]
         if not alike or max(first.num_runs, second.num_runs) == 1:
             continue
         pair = (first.algorithm, second.algorithm)
-        record: dict[str, Any] = dict(
-            zip(("slate", "algorithm", "other"), (slate, *pair), strict=True)
-        )
+        record: dict[str, Any] = {"slate": slate, "algorithm": pair[0], "other": pair[1]}
         for name in SYMBOLS:
             both = [one.strata[name] for one in (first, second)]
             found = probability_of_improvement(*(both if name == "episode_return" else both[::-1]))
-            names = (name, f"{name}_low", f"{name}_high")
-            record |= dict(zip(names, found, strict=True))
+            record |= _named(name, found)
         records.append(record)
         if math.isfinite(share := record["episode_return"]):
             signs[pair] = f"{signs.get(pair, '')} {share:.2f}".strip()

@@ -14,8 +14,8 @@ from safe_rl.extras import import_extra
 from safe_rl.files import replace_text
 
 __all__ = [
-    *("SYMBOL", "Cell", "Record", "Table", "clean", "each_cost", "escaped", "filled", "mark_best"),
-    *("interval", "short_number", "spread"),
+    *("SYMBOL", "Cell", "Record", "Table", "as_override", "clean", "each_cost", "escaped"),
+    *("filled", "interval", "mark_best", "short_number", "spread"),
 ]
 
 SYMBOL = re.compile(r"\$(\\bar )?(\\rho|\w)(?:_(\w))?\$")
@@ -56,6 +56,24 @@ def short_number(value: float) -> str:
     return next((f"{value / size:g}{unit}" for size, unit in sizes if value >= size), f"{value:g}")
 
 
+def as_override(value: Any) -> str:
+    """A value as a command line has it.
+
+    Examples:
+        >>> as_override({"cost": 10.0, "names": ("a", None)}), as_override(True)
+        ('{cost: 10, names: [a,null]}', 'true')
+    """
+    if isinstance(value, Mapping):
+        return f"{{{', '.join(f'{key}: {as_override(part)}' for key, part in value.items())}}}"
+    if isinstance(value, tuple | list):
+        return f"[{','.join(map(as_override, value))}]"
+    if isinstance(value, bool) or value is None:
+        return {True: "true", False: "false", None: "null"}[value]
+    if isinstance(value, float):
+        return f"{value:g}" if float(f"{value:g}") == value else f"{value}"
+    return f"{value:_}" if isinstance(value, int) else str(value)
+
+
 def spread(name: str, decimals: int) -> str:
     """Template of a mean and the standard deviation over seeds, see `filled`."""
     return f"{{{name}:.{decimals}f}}|\N{NO-BREAK SPACE}± {{{name}_std:.{decimals}f}}"
@@ -70,10 +88,8 @@ def interval(name: str, decimals: int) -> str:
 def filled(template: str, record: Record) -> str:
     """A template with the fields of a record.
 
-    Args:
-        template: Parts separated by ``|``. A part is left out where one of its fields is missing
-            or NaN; without the first part there is a dash instead of all of them.
-        record: Field -> value.
+    A part of it, up to ``|``, is left out where one of its fields is missing or NaN; without the
+    first part there is a dash instead of all of them.
 
     Examples:
         >>> filled("{x:.1f}| ± {x_std:.1f}", {"x": 1.25}), filled("{x:.1f}", {"y": 1})
@@ -93,10 +109,7 @@ def _is_missing(value: Any) -> bool:
 def each_cost(records: Sequence[Record], keys: Sequence[str], **fields: str) -> list[Record]:
     """A row per cost of every record that has figures of several costs.
 
-    Args:
-        records: Records.
-        keys: Keys of the costs.
-        fields: Field of a row -> that of the record, with braces in place of the cost's key.
+    ``fields`` name a field of the rows -> that of the record, with braces for the cost's key.
 
     Examples:
         >>> each_cost([{"seed": 0, "rate_a": 1.0}], ["a", "b"], rate="rate_{}")
@@ -104,15 +117,12 @@ def each_cost(records: Sequence[Record], keys: Sequence[str], **fields: str) -> 
     """
     rows: list[Record] = []
     for record in records:
-        places = {key: {name: p.format(key) for name, p in fields.items()} for key in keys}
-        own = {
-            key: {name: record[place] for name, place in of_key.items() if place in record}
-            for key, of_key in places.items()
-        }
-        for key, figures in own.items():
-            if figures:
-                rows.append({**record, "key": key, "cost": clean(key, 40), **figures})
-        rows += [] if any(own.values()) else [record]
+        own: list[Record] = []
+        for key in keys:
+            places = {name: place.format(key) for name, place in fields.items()}
+            if found := {name: record[p] for name, p in places.items() if p in record}:
+                own.append({**record, "key": key, "cost": clean(key, 40), **found})
+        rows += own or [record]
     return rows
 
 
@@ -198,12 +208,8 @@ def mark_best(
 ) -> Callable[[Record], str]:
     """Mark the best value of a column, and all equal to it, among records that are comparable.
 
-    Args:
-        records: Rows of the table.
-        name: Field of the value.
-        best: ``max`` or ``min``.
-        is_able: Which of them can be the best.
-        rivals: What is equal in records that can be compared; a record without any is not marked.
+    Best is ``max`` or ``min`` of those that are able, with equal rivals. A record without any rival
+    is not marked.
     """
 
     def mark(record: Record) -> str:

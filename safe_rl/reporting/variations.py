@@ -29,12 +29,8 @@ def draw_variations(
 ) -> None:
     """Draw return and costs with their intervals over the values of every row.
 
-    The band across a panel is the environment as trained on; limits are dashed.
-
-    Args:
-        rows: A variation (`row`, `value`) and its estimates, the first as trained on.
-        cost_limits: Cost key -> d; without any, ``cost`` is drawn.
-        path: Picture to write, replaced in one go.
+    The band across a panel is the environment as trained on, which is the first of the rows; limits
+    are dashed. Without limits, ``cost`` is drawn.
     """
     (_, trained), *varied = rows
     groups = _rows_of(varied) or {_OTHERS: [("as trained", trained)]}

@@ -2,6 +2,7 @@
 
 import gzip
 import json
+from functools import partial
 
 import pytest
 import yaml
@@ -15,6 +16,7 @@ from safe_rl.reporting.archive import ROWS, RUNS, Recorded, read_archive, write_
 from safe_rl.reporting.recorded import archive_runs, find_runs
 
 EPOCHS = {"returns": (1.0, 2.0, 2.5), "costs": (40.0, 30.0, 20.0), "rates": (0.04, 0.035, 0.03)}
+pack = partial(gzip.compress, mtime=0)
 CERTIFICATE = {
     "checkpoint": None,
     "episode_return": None,
@@ -118,7 +120,7 @@ def test_nothing_says_where_the_runs_were_but_their_commands(runs, tmp_path):
     code = [{"steps": 0, "version": "0.1.0", "commit": "0123456789abcdef", "changed": True}]
     (run / "code.json").write_text(json.dumps(code))
     keep(runs, kept)
-    assert str(tmp_path) not in (kept / RUNS).read_text()
+    assert str(tmp_path) not in gzip.decompress((kept / RUNS).read_bytes()).decode()
     (kept_evaluation,) = read_archive(kept)["PointGoal1/ppo/seed0"].notes["evaluations"]
     del evaluation["run"]
     assert kept_evaluation == {**evaluation, "checkpoint_file": "checkpoint-1.torchrl"}
@@ -148,12 +150,13 @@ def test_an_archive_is_not_among_the_runs(runs, capsys):
     ("name", "content", "message"),
     [
         (ROWS, b"no gzip", "gzip"),
-        (ROWS, gzip.compress(b"run,steps\na,1\n" * 9, mtime=0)[:20], "no archive"),
-        (ROWS, gzip.compress(b"run,steps\na,many\n", mtime=0), "many"),
-        (RUNS, b"{", "cannot be read"),
-        (RUNS, b"[" * 200_000, "cannot be read"),
-        (RUNS, b"[]", "no archive"),
-        (RUNS, b'{"shared": {}, "a": {"like": "b", "config": {}}}', "no archive"),
+        (ROWS, pack(b"run,steps\na,1\n" * 9)[:20], "no archive"),
+        (ROWS, pack(b"run,steps\na,many\n"), "many"),
+        (RUNS, b"{}", "gzip"),
+        (RUNS, pack(b"{"), "no archive"),
+        (RUNS, pack(b"[" * 200_000), "no archive"),
+        (RUNS, pack(b"[]"), "no archive"),
+        (RUNS, pack(b'{"a": {}}'), "no archive"),
     ],
 )
 def test_a_damaged_archive_is_left_out_with_its_reason(name, content, message, runs, tmp_path):
@@ -168,12 +171,9 @@ def test_a_damaged_archive_is_left_out_with_its_reason(name, content, message, r
 def test_a_run_of_an_archive_that_cannot_be_read_is_left_out_alone(runs, tmp_path):
     kept = tmp_path / "kept"
     keep(runs, kept)
-    text = (
-        (kept / RUNS)
-        .read_text()
-        .replace('"certificate": {', '"certificate": {"level": "a"}, "x": {', 1)
-    )
-    (kept / RUNS).write_text(text)
+    text = gzip.decompress((kept / RUNS).read_bytes())
+    text = text.replace(b'"certificate": {', b'"certificate": {"level": "a"}, "x": {', 1)
+    (kept / RUNS).write_bytes(gzip.compress(text))
     found, skipped = find_runs(kept)
     assert len(found) == 3
     assert "it is no certificate" in skipped[kept / "PointGoal1" / "cpo" / "seed0"]

@@ -73,7 +73,7 @@ def test_other_keys_have_to_be_as_planned(tmp_path):
         ("cost_limits={cost: 10}", "0"),
         ("cost_limits={cost_hazards: 5, cost: 25}", "—"),
         ("loss.strength=1.5", "—"),
-        ("loss.strength=2.0", "0"),
+        ("loss.strength=2", "0"),
     ]
     (first, second) = [record["command"] for record in commands.records]
     assert "cost_limits={cost_hazards: 5, cost: 25}" in shlex.split(first)

@@ -7,7 +7,7 @@ from synthetic import experiments_in, write_run
 
 from safe_rl.cli.composing import CONF
 from safe_rl.reporting.curves import draw_learning_curves, draw_small_multiples
-from safe_rl.reporting.figures import add_legend, algorithm_styles, draw_fronts, save
+from safe_rl.reporting.figures import add_legend, algorithm_styles, compared, draw_fronts, save
 from safe_rl.reporting.scoring import final_table
 
 ROWS = {"returns": (1.0, 2.0, 3.0), "rates": (0.06, 0.05, 0.04)}
@@ -133,8 +133,8 @@ def test_the_front_joins_what_no_other_one_beats(tmp_path):
         write_run(tmp_path, algo=algo, returns=[value], costs=[cost])
     write_run(tmp_path, algo="cpo", returns=[3.0], costs=[8.0], limits={"cost": 9.0}, folder="9")
     experiments = experiments_in(tmp_path)
-    records, styles = final_table(experiments).records, algorithm_styles(experiments)
-    (axis,) = draw_fronts(records, experiments, styles).axes
+    groups, styles = compared(final_table(experiments).records), algorithm_styles(experiments)
+    (axis,) = draw_fronts(groups, experiments, styles).axes
     front = next(line for line in axis.lines if line.get_color() == "0.7")
     assert list(zip(*front.get_data(), strict=True)) == [(8.0, 3.0), (20.0, 10.0), (60.0, 20.0)]
     limits = sorted(line.get_xdata()[0] for line in axis.lines if line.get_linestyle() == "--")
@@ -155,7 +155,7 @@ def test_fronts_join_nothing_that_was_trained_for_longer(tmp_path):
         write_run(tmp_path, algo=algo, **rows, limits={} if algo == "ppo" else None)
     experiments = experiments_in(tmp_path)
     styles = algorithm_styles(experiments)
-    figure = draw_fronts(final_table(experiments).records, experiments, styles)
+    figure = draw_fronts(compared(final_table(experiments).records), experiments, styles)
     shown = {axis.get_title(): axis for axis in figure.axes if axis.get_title()}
     assert list(shown) == ["PointGoal1, 1k steps", "PointGoal1, 3k steps"]
     assert len(shown["PointGoal1, 1k steps"].containers) == 2

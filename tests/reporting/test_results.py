@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from safe_rl.reporting.archive import RUNS as FILE
 from safe_rl.reporting.archive import read_archive
 from safe_rl.reporting.recorded import find_runs
 
@@ -14,7 +15,7 @@ PAGE = (RESULTS / "README.md").read_text()
 ALL_ROWS = re.findall(r"^\| `(\S+/seed\d+)` \| (.*) \|$", PAGE, re.MULTILINE)
 QUARTERS = [(run, row) for run, row in ALL_ROWS if "/limit" in run]
 ROWS = [row for row in ALL_ROWS if row not in QUARTERS]
-RUNS = {path.parent.name: read_archive(path.parent) for path in RESULTS.glob("*/runs.json")}
+RUNS = {path.parent.name: read_archive(path.parent) for path in RESULTS.glob(f"*/{FILE}")}
 WIDTHS = {"doggo": 2_000_000}  # steps that a column is of, where it is not half a million
 
 
