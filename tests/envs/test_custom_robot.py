@@ -6,9 +6,12 @@ import math
 import numpy as np
 import pytest
 import torch
+from registrations import undone
 from torchrl.envs.utils import check_env_specs
 
 from safe_rl.envs import ConfigError, SafetyGymEnv
+from safe_rl.envs.extending import register_robot
+from safe_rl.envs.safety_gym.robots import ROBOTS
 
 # A planar disc with an arm on a hinge; the turning motor has no control range of its own.
 DISC = """
@@ -324,3 +327,21 @@ def test_what_actuators_remember_is_part_of_a_state(make, kind):
     assert not torch.equal(
         env.step(here.clone().set("action", idle))["next", "observation"], onward
     )
+
+
+def test_registered_robots_are_made_by_name(tmp_path):
+    source, slow = ROBOTS["point"].read_text(), 'gear=".3 0 0 0 0 0" site'
+    assert slow in source
+    path = tmp_path / "mine.xml"
+    path.write_text(source.replace(slow, slow.replace(".3", ".6")))
+    with undone():
+        register_robot("mine", path)
+        ways = []
+        for robot in ("point", "mine"):
+            keys = {"robot_base": robot, "robot_locations": [[0, 0]], "robot_rot": 0.0}
+            env = SafetyGymEnv({**keys, "task": "none"}, seed=0, num_threads=1)
+            env.step(env.reset().set("action", torch.tensor([[1.0, 0.0]])))
+            ways.append(float(env.get_state()["qpos"][0, 0]))
+    assert ways[1] == pytest.approx(2 * ways[0], rel=0.05)
+    with pytest.raises(ConfigError, match=r"built-in robot"):
+        register_robot("car", path)

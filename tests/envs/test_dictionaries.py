@@ -9,7 +9,6 @@ import torch
 from reference import ReferenceWorld
 
 from safe_rl.envs import SUITE, ConfigError, SafetyGymConfig, SafetyGymEnv, resolve
-from safe_rl.envs.gymnasium.gymnasium_interfaces import WorldEnv
 
 # By hand from section 9 of the benchmark's description, in the style of its suite.
 ROBOTS = {
@@ -91,11 +90,6 @@ def test_the_dictionaries_of_the_suite_are_its_environments(robot, level):
         SafetyGymEnv(source, num_envs=2, seed=0, num_threads=1) for source in (given, robot + level)
     )
     assert torch.equal(env.reset()["observation"], named.reset()["observation"])
-
-
-def test_gymnasium_takes_them_too():
-    env = WorldEnv(config=dictionary("Car", "Push1"))
-    assert env.reset(seed=0)[0].shape == env.observation_space.shape
 
 
 def test_a_file_of_ones_own_is_not_taken_for_the_bundled_one(tmp_path, monkeypatch):

@@ -20,10 +20,8 @@ from safe_rl.envs.extending import (
     register_cost,
     register_element,
     register_observation,
-    register_robot,
     register_task,
 )
-from safe_rl.envs.safety_gym.robots import ROBOTS
 
 POINT = {"robot_base": "point", "task": "none", "sensors_obs": ["gyro"]}
 MINES = {"mines_num": 2, "observe_mines": True, "constrain_mines": True}
@@ -164,13 +162,6 @@ def test_an_observation_of_another_width_than_it_says_is_named(given):
         SafetyGymEnv(POINT, num_envs=2, seed=0).reset()
 
 
-def test_of_several_costs_below_0_the_first_is_named_with_its_own_number():
-    for key, number in (("cost_odd", -2.0), ("cost_odder", -3.0)):
-        register_cost(Cost(key, lambda c: True, lambda c, w, n=number: torch.full((2,), n)))
-    with pytest.raises(ConfigError, match=r"cost_odd must be 0 or more, got -2:"):
-        SafetyGymEnv({"robot_base": "point"}, num_envs=2, seed=0).rollout(1)
-
-
 def test_free_bodies_are_pushed_and_have_a_density():
     register_element(cube("crates", "crate", Motion.FREE), keys={"crates_density": 0.5})
     env = make({"crates_num": 1, "crates_rots": [0.3], "vases_num": 1, "task": "push"})
@@ -291,10 +282,7 @@ def test_costs_of_any_type_add_up(values, indicator):
     kinds = {bool: torch.bool, int: torch.uint8, float: torch.float32}
     for index, value in enumerate(values):
         magnitude = torch.tensor([value], dtype=kinds[type(value)])
-        register_cost(
-            Cost(f"cost_{index}", lambda c: True, lambda c, w, m=magnitude: m),
-            keys={},
-        )
+        register_cost(Cost(f"cost_{index}", lambda c: True, lambda c, w, m=magnitude: m))
     env = make({"constrain_indicator": indicator})
     result = step_from(env, env.get_state(), 0.0, 0.0)
     assert float(result["cost"]) == (any(values) if indicator else sum(values))
@@ -319,22 +307,6 @@ def test_observations_are_sorted_in_and_may_feel_contacts():
         component(env, env.set_state(state)["observation"], "feel"), [0, 1]
     )
     check_env_specs(env)
-
-
-def test_robots_by_name(tmp_path):
-    source, slow = ROBOTS["point"].read_text(), 'gear=".3 0 0 0 0 0" site'
-    assert slow in source
-    path = tmp_path / "mine.xml"
-    path.write_text(source.replace(slow, slow.replace(".3", ".6")))
-    register_robot("mine", path)
-    ways = []
-    for robot in ("point", "mine"):
-        env = make({"robot_base": robot, "robot_locations": [[0, 0]], "robot_rot": 0.0})
-        env.step(env.reset().set("action", torch.tensor([[1.0, 0.0]])))
-        ways.append(float(env.get_state()["qpos"][0, 0]))
-    assert ways[1] == pytest.approx(2 * ways[0], rel=0.05)
-    with pytest.raises(ConfigError, match=r"built-in robot"):
-        register_robot("car", path)
 
 
 def test_the_suite_stays_what_it_was():

@@ -185,13 +185,6 @@ def test_our_own_environment_comes_back_as_it_was():
         torch.testing.assert_close(rollout["next", key], expected["next", key], rtol=0, atol=0)
 
 
-def test_a_seed_determines_everything():
-    starts = [from_gymnasium(make_pendulum, num_envs=2, seed=s).reset() for s in (1, 1, 2)]
-    assert (starts[0] == starts[1]).all()
-    assert (starts[0]["observation"] != starts[2]["observation"]).any()
-    assert (starts[0]["observation"][0] != starts[0]["observation"][1]).any()
-
-
 def moving(tensordict):
     """Actions that are as different as what is seen."""
     action = torch.sin(40 * tensordict["observation"].sum(-1, keepdim=True))
@@ -226,11 +219,6 @@ def test_a_copy_with_workers_begins_where_the_seed_does():
     assert torch.equal(got["observation"], expected["observation"])
 
 
-def test_the_length_of_episodes_that_is_asked_for_takes_the_place_of_the_registered_one():
-    env = from_gymnasium("Walk-v0", cost_keys=["far"], num_steps=40, seed=0, border=99.0)
-    assert env.rollout(60).shape == (1, env.max_episode_steps) == (1, 40)
-
-
 class WholeNumbers(Counter):
     action_space = gymnasium.spaces.Box(0, 5, (2,), np.int64)
 
@@ -238,6 +226,9 @@ class WholeNumbers(Counter):
 @pytest.mark.parametrize(
     ("given", "arguments", "told"),
     [
+        ("Pendulum-v1", {}, r"reports no costs.*name it in 'cost_keys'"),
+        (Switches, {}, r"or choices \(Discrete, MultiDiscrete\).*MultiBinary"),
+        (Counter, {"num_steps": None}, "give 'num_steps'"),
         (Counter(), {}, "an id, or a function that makes an environment; got <.*Counter"),
         (lambda: 3, {}, "makes no environment of Gymnasium.*but 3"),
         (WholeNumbers, {}, "whole numbers in a Box.*Discrete or MultiDiscrete"),
@@ -248,15 +239,70 @@ class WholeNumbers(Counter):
         (Counter, {"highest_costs": {"cots": 1.0}}, "'cots', which is no cost. .*'cost'"),
     ],
 )
-def test_arguments_that_are_none_are_said(given, arguments, told):
+def test_what_cannot_be_made_is_said(given, arguments, told):
     with pytest.raises(ValueError, match=told):
         from_gymnasium(given, **{"num_steps": 5, **arguments})
 
 
-def test_errors_say_what_to_change():
-    with pytest.raises(ValueError, match=r"reports no costs.*name it in 'cost_keys'"):
-        from_gymnasium("Pendulum-v1")
-    with pytest.raises(ValueError, match=r"or choices \(Discrete, MultiDiscrete\).*MultiBinary"):
-        from_gymnasium(Switches)
-    with pytest.raises(ValueError, match="give 'num_steps'"):
-        from_gymnasium(Counter)
+class Faulty(gymnasium.Env):
+    """Keeps the rules until its fault is due."""
+
+    observation_space = gymnasium.spaces.Box(-1, 1, (3,), np.float32)
+    action_space = gymnasium.spaces.Box(-1, 1, (1,), np.float32)
+
+    def __init__(self, fault, first=2):
+        self.fault, self.first, self.steps = fault, first, 0
+
+    def reset(self, *, seed=None, options=None):
+        return np.zeros(3, np.float32), {}
+
+    def step(self, action):
+        self.steps += 1
+        step = {"observation": np.zeros(3, np.float32), "reward": 1.0, "terminated": False,
+                "truncated": False, "info": {"cost": 1.0}}  # fmt: skip
+        if self.steps >= self.first:
+            if self.fault is SystemExit:
+                raise SystemExit(3)
+            step |= self.fault
+        return tuple(step.values())
+
+
+def roll(fault, first=2, steps=4, **options):
+    env = from_gymnasium(lambda: Faulty(fault, first), num_steps=50, seed=0, **options)
+    return env.rollout(steps, break_when_any_done=False)
+
+
+@pytest.mark.parametrize("num_envs", [1, 2])
+@pytest.mark.parametrize(
+    ("fault", "words"),
+    [
+        ({"observation": np.zeros(4)}, r"shape \(4,\), where its space is \(3,\)"),
+        ({"reward": "much"}, "the reward 'much', which is no number"),
+        ({"reward": 1j}, "the reward 1j, which is no number"),
+        ({"reward": np.zeros(2)}, "which is no number"),
+        ({"terminated": "no"}, "terminated='no', which is neither True nor False"),
+        ({"info": None}, "the info None, which is no dictionary"),
+        (SystemExit, r"called sys\.exit\(3\)"),
+    ],
+)
+def test_a_faulty_step_is_told_in_a_line(fault, words, num_envs):
+    with pytest.raises(ConfigError, match=f"A step of .*{words}"):
+        roll(fault, num_envs=num_envs)
+
+
+@pytest.mark.parametrize(
+    "kept", [{"reward": np.float32(1)}, {"reward": 1}, {"terminated": np.bool_(False)}, {}]
+)
+def test_what_gymnasium_allows_is_taken(kept):
+    assert roll(kept)["next", "cost"].sum() == 4
+
+
+def test_an_exit_at_the_first_step_does_not_end_the_program():
+    with pytest.raises(ValueError, match=r"called sys\.exit\(3\)"):
+        roll(SystemExit, first=1)
+
+
+def test_a_cost_that_is_reported_no_more_is_warned_of():
+    with pytest.warns(UserWarning, match="each of the first 20 steps and is missing now"):
+        steps = roll({"info": {}}, first=21, steps=25)
+    assert steps["next", "cost"].sum() == 20

@@ -16,7 +16,7 @@ import yaml
 from commands import run_train
 from torchrl.envs.utils import check_env_specs
 
-from safe_rl.cli import evaluate, report
+from safe_rl.cli import evaluate
 from safe_rl.collectors.workers import split_rows
 from safe_rl.envs import ConfigError, complete_env, make_env
 from safe_rl.runs.table import read_table
@@ -70,13 +70,6 @@ def test_it_is_evaluated_on_video(run, capsys):
     assert (run / "evaluation.mp4").stat().st_size > 1000
     assert evaluate.main([str(run), "env.borders=3"]) == 1
     assert "no key 'borders'" in capsys.readouterr().err
-
-
-def test_it_is_reported_and_starts_others(run, tmp_path):
-    folder = tmp_path / "runs" / "further"
-    run_train(*SMALL, "frames=200", f"init_from={run}", f"hydra.run.dir={folder}")
-    assert report.main([str(folder.parent)]) == 0
-    assert "Walk-v0" in (folder.parent / "report" / "report.md").read_text()
 
 
 def test_processes_step_what_one_process_would_and_ignore_signals():

@@ -44,10 +44,6 @@ def test_noise_is_new_in_every_step_and_belongs_to_the_seed():
     assert not np.array_equal(controls(other, (0.0, 0.0)), steps[0].double().numpy())
 
 
-def test_without_noise_controls_are_the_action():
-    assert np.unique(controls(make(num_envs=5), (0.25, -0.5)), axis=0).tolist() == [[0.25, -0.5]]
-
-
 def substeps(env) -> np.ndarray:
     """Substeps of a step, by the time that passed; a substep of the Point takes 2 ms."""
     env.step(env.reset().set("action", torch.zeros(env.batch_size[0], 2)))

@@ -1,7 +1,5 @@
 """Positions in public, against what rewards and costs say about them."""
 
-import gymnasium
-import numpy as np
 import pytest
 import torch
 
@@ -60,19 +58,3 @@ def test_costs_and_rewards_follow_from_them(name):
             )
         tensordict = following
     assert seen > 0
-
-
-def test_infos_have_them_on_request():
-    make = {"id": "Safexp-PointGoal1-v0", "positions": True}
-    env, envs = gymnasium.make(**make), gymnasium.make_vec(**make, num_envs=2)
-    (_, info), (_, infos) = env.reset(seed=3), envs.reset(seed=3)
-    assert info["positions"]["hazards"].shape == (8, 3)
-    for _ in range(3):
-        for kind, places in info["positions"].items():
-            np.testing.assert_array_equal(infos["positions"][kind][0], places)
-        assert infos["_positions"].all()
-        expected = env.unwrapped.batch.get_positions()["robot"][0]
-        np.testing.assert_array_equal(info["positions"]["robot"], expected)
-        action = np.ones(2, np.float32)
-        info, infos = env.step(action)[-1], envs.step(np.stack([action, action]))[-1]
-    assert "positions" not in gymnasium.make("Safexp-PointGoal1-v0").reset(seed=3)[1]

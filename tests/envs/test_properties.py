@@ -1,13 +1,14 @@
 """Any valid configuration makes a working environment; errors name the key that is wrong."""
 
 import math
+import re
 import string
 
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from safe_rl.envs import ConfigError, SafetyGymConfig, SafetyGymEnv
+from safe_rl.envs import ConfigError, SafetyGymConfig, SafetyGymEnv, key_table
 from safe_rl.envs.safety_gym.config_keys import Vocabulary
 
 # Deterministic, so that no run depends on luck; without deadlines, which depend on the machine.
@@ -194,3 +195,43 @@ def test_the_strategies_reach_everything():
         "observe_vision"
     }
     assert set(WRONG) == set(FIELDS.values())
+
+
+OUTSIDE = {
+    "one of ('cpu', 'warp')": "jax",
+    "greater than 0": 0,
+    "0 or more": -1,
+    "a probability between 0 and 1": 1.5,
+    "one of ('pseudo', 'natural')": "laser",
+    "one of (2, 3)": 4,
+}
+ROWS = {row.name: row for row in key_table()}
+
+
+def test_every_key_has_a_row_that_says_what_it_is():
+    assert {name: row.default for name, row in ROWS.items()} == SafetyGymConfig().to_dict()
+    assert all(row.type and len(row.meaning) > 4 for row in ROWS.values())
+    assert ROWS["num_steps"] == (
+        *("num_steps", "integer", "greater than 0"),
+        *("steps after which an episode is truncated", 1000),
+    )
+
+
+@pytest.mark.parametrize("name", [name for name, row in ROWS.items() if row.range])
+def test_the_range_it_names_is_the_range_that_is_checked(name):
+    row = ROWS[name]
+    wanted, _, bound = row.range.partition(", at most ")
+    outside = {wanted: OUTSIDE[wanted]}
+    if bound:
+        outside[f"at most {bound}"] = int(bound.replace(",", "")) + 1
+    for words, value in outside.items():
+        with pytest.raises(ConfigError, match=f"'{name}' must be {re.escape(words)}"):
+            SafetyGymConfig.from_dict({name: [value, 40] if row.type == "two integers" else value})
+    assert SafetyGymConfig.from_dict({name: row.default}) == SafetyGymConfig()
+
+
+def test_keys_without_a_range_take_any_number():
+    free = [row.name for row in ROWS.values() if row.type == "number" and not row.range]
+    assert {"reward_goal", "placements_margin", "vases_sink"} <= set(free)
+    config = SafetyGymConfig.from_dict(dict.fromkeys(free, -1e6))
+    assert config.reward_goal == -1e6

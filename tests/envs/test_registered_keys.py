@@ -11,7 +11,14 @@ from omegaconf import OmegaConf
 from registrations import disc, register_mines, undone
 from run_configs import CONF
 
-from safe_rl.envs import ConfigError, SafetyGymConfig, SafetyGymEnv, make_env, store_config
+from safe_rl.envs import (
+    ConfigError,
+    SafetyGymConfig,
+    SafetyGymEnv,
+    key_table,
+    make_env,
+    store_config,
+)
 from safe_rl.envs.extending import (
     Cost,
     Key,
@@ -42,6 +49,9 @@ FOLLOW = Task(reward=follow, elements=("beacon",))
 def test_registered_keys_are_keys_like_the_others():
     before = SafetyGymConfig(robot_base="point")
     register_mines()
+    rows = {row.name: row for row in key_table()}
+    assert rows["mines_num"].range == "0 or more, at most 1,000"
+    assert rows["mines_size"][1:3] == ("number", "greater than 0")
     config = SafetyGymConfig(**POINT, mines_num=2)
     assert (config.mines_size, config.mines_keepout, config.mines_cost) == (0.2, 0.3, 2.5)
     with pytest.raises(ConfigError, match=r"'mine_num'.*'mines_num'"):

@@ -109,7 +109,6 @@ def test_pictures():
         ({"id": None}, r"env\.id=Safety"),
         ({"id": "SafetyIce2-v0"}, "SafetyIce2-v0 is not registered"),
         ({"id": "my_ice:SafetyMine-v0"}, r"import nothing.*import=my_ice env.id=SafetyMine-v0"),
-        ({"border": 3}, "no key 'border'.*env.kwargs"),
         ({"kwargs": {"speed": 3}}, "SafetyIce1-v0.*speed"),
     ],
 )

@@ -174,14 +174,17 @@ def test_custom_configurations_need_only_what_differs():
     assert isinstance(env.reset(), TensorDict)
 
 
-@pytest.mark.parametrize("env_name", ["PointButton1", "SafeAntVelocity"])
-def test_nothing_that_is_returned_shares_memory(env_name):
+@pytest.mark.parametrize(
+    ("env_name", "keys"),
+    [("PointButton1", {}), ("SafeAntVelocity", {}), ("PointGoal1", {"observation_flatten": False})],
+)
+def test_nothing_that_is_returned_shares_memory(env_name, keys):
     """Also because TorchRL stacks the steps of a rollout at its end."""
-    env = make_env(env_name, num_envs=3, seed=0, num_threads=1)
+    env = make_env({**env_node(env_name), **keys}, num_envs=3, seed=0, num_threads=1)
     first = env.reset()
     second = env.step(first.clone().set("action", env.action_spec.rand()))["next"]
     third = env.set_state(env.get_state())
-    tensors = [value for result in (first, second, third) for value in result.values()]
+    tensors = [value for result in (first, second, third) for value in result.values(True, True)]
     wanted = [value.clone() for value in tensors]
     env.rollout(3)
     assert all(map(torch.equal, tensors, wanted))
@@ -220,3 +223,47 @@ def test_lidars_and_compasses_are_bounded_as_in_gymnasium():
         assert ((low <= value) & (value <= high)).all()
     unbounded = SafetyGymEnv({"robot_base": "point"}, num_envs=2, seed=0)
     assert unbounded.observation_spec["observation"].rand().isfinite().all()
+
+
+NESTED = ("PointGoal2", "CarButton1", "DoggoPush2")
+
+
+def make(name: str, **keys) -> SafetyGymEnv:
+    config = SUITE[name].replace(**keys)
+    return SafetyGymEnv(config, num_envs=3, seed=0, num_threads=1)
+
+
+@pytest.mark.parametrize("name", NESTED)
+def test_components_are_the_columns_of_the_flat_observation(name):
+    flat, nested = make(name), make(name, observation_flatten=False)
+    check_env_specs(nested)
+    nested = make(name, observation_flatten=False)
+    torch.manual_seed(0)
+    wanted = flat.rollout(6)
+    torch.manual_seed(0)
+    got = nested.rollout(6)
+    assert torch.equal(got["next", "reward"], wanted["next", "reward"])
+    assert set(got["observation"].keys()) == set(flat.observation_layout)
+    for name, columns in flat.observation_layout.items():
+        component = got["next", "observation", name]
+        assert torch.equal(component.flatten(2), wanted["next", "observation"][..., columns])
+
+
+def test_components_have_their_natural_shapes():
+    observation = make("CarGoal1", observation_flatten=False, observe_qpos=True).reset()
+    shapes = {name: tuple(value.shape[1:]) for name, value in observation["observation"].items()}
+    assert shapes == {
+        **dict.fromkeys(("accelerometer", "ballangvel_rear", "gyro", "velocimeter"), (3,)),
+        "magnetometer": (3,),
+        "ballquat_rear": (3, 3),
+        **dict.fromkeys(("goal_lidar", "hazards_lidar", "vases_lidar"), (16,)),
+        "qpos": (7 + 1 + 1 + 4 + 7,),
+    }
+
+
+def test_ball_joints_are_rotations():
+    rotation = make("CarGoal0", observation_flatten=False).rollout(20)["observation"]
+    rotation = rotation["ballquat_rear"]
+    product = rotation @ rotation.transpose(-1, -2)
+    torch.testing.assert_close(product, torch.eye(3).expand_as(product), atol=1e-5, rtol=0)
+    assert not torch.allclose(rotation[:, -1], torch.eye(3).expand(3, 3, 3), atol=1e-2)

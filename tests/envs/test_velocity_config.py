@@ -14,7 +14,6 @@ from safe_rl.envs.physics.dynamics import SCALES
 from safe_rl.envs.velocity import (
     VELOCITY_SUITE,
     VelocityConfig,
-    VelocityEnv,
     resolve_velocity,
 )
 from safe_rl.envs.velocity.runners import RUNNERS
@@ -89,10 +88,3 @@ def test_another_robot_brings_its_own_keys():
 def test_mistakes_are_named(given, message):
     with pytest.raises(ConfigError, match=message):
         resolve_velocity(given)
-
-
-def test_counts_are_checked():
-    with pytest.raises(ConfigError, match="'num_envs'"):
-        VelocityEnv("SafeHopperVelocity", num_envs=0)
-    with pytest.raises(ConfigError, match="'seed'"):
-        VelocityEnv("SafeHopperVelocity", seed=1.5)

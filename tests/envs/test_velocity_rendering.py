@@ -62,11 +62,3 @@ def test_too_fast_robots_are_marked():
     assert max(marked[0], marked[2]) < 5
     env.reset()
     assert is_red(env.render(1, width=64, height=48)).sum() < 5
-
-
-def test_some_rows_are_drawn():
-    env = VelocityEnv("SafeHopperVelocity", num_envs=3, seed=0, num_threads=1)
-    env.reset()
-    frames = env.render([2, 0], width=32, height=24)
-    assert np.array_equal(frames[1], env.render(0, width=32, height=24))
-    env.close()

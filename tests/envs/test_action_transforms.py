@@ -1,20 +1,127 @@
-"""Held actions and observed costs, against single steps of the same environment."""
+"""Filtered, delayed and held actions, against single steps of the same environment."""
+
+import re
+from functools import partial
 
 import pytest
 import torch
-from test_transforms import ENVIRONMENTS, Priced, still
+from point_mass import PointMass
+from torchrl.data import Bounded, Categorical, OneHot
 from torchrl.envs.utils import check_env_specs
+from transforming import ENVIRONMENTS, Priced, half_speed, still, transformed
 
 from safe_rl.envs import check_constrained_env, make_env
 from safe_rl.envs.transforms import (
+    ActionDelay,
+    ActionFilter,
     ActionRepeat,
     EarlyTermination,
     ObservedCosts,
+    RewardScale,
     Simmer,
     transform_env,
 )
 from safe_rl.evaluation.episodes import collect_episodes
 from safe_rl.evaluation.video import manner_of, record_episode
+
+
+def test_replaced_actions_are_taken_and_counted_and_the_chosen_ones_kept():
+    env = transformed(PointMass(2), "action_filter")
+    assert env.cost_keys == [*PointMass.cost_keys, "cost_interventions"]
+    chosen = torch.tensor([[0.2, -0.2], [0.2, 0.9]])
+    step = env.step(env.reset().set("action", chosen))
+    assert torch.equal(step["action"], chosen)
+    assert step["next", "cost_interventions"].squeeze(-1).tolist() == [0.0, 1.0]
+    moved = step["next", "observation"][:, 2:4]
+    torch.testing.assert_close(moved, 0.15 * torch.tensor([[0.2, -0.2], [0.2, 0.5]]))
+
+
+def test_a_filter_may_change_actions_in_place():
+    env = PointMass(2)
+    in_place = transformed(env, f=ActionFilter(lambda step: step["action"].mul_(0.5)))
+    chosen = torch.ones(2, *env.action_spec.shape[1:])
+    stepped = in_place.step(in_place.reset().set("action", chosen.clone()))
+    assert torch.equal(stepped["action"], chosen)
+    assert stepped["next", "cost_interventions"].flatten().tolist() == [1.0, 1.0]
+    other = transformed(PointMass(2), f=ActionFilter(half_speed))
+    wanted = other.step(other.reset().set("action", chosen.clone()))
+    for key in ("observation", "reward"):
+        assert torch.equal(stepped["next", key], wanted["next", key])
+
+
+def test_a_filter_that_returns_no_actions_is_refused():
+    broken = ActionFilter(lambda step: step["action"][:, :1])
+    env = transformed(PointMass(2), filter=broken)
+    with pytest.raises(ValueError, match=re.escape("actions of shape (2, 2), got (2, 1)")):
+        env.rollout(1)
+
+
+def test_a_filter_gets_the_positions_before_the_step_and_the_layout_if_it_asks_for_them():
+    seen = []
+
+    def shield(step, positions, layout, part="robot"):
+        seen.append((positions[part], step["observation"], layout))
+        return step["action"]
+
+    node = {"_target_": "safe_rl.envs.transforms.ActionFilter", "filter": partial(shield)}
+    env = make_env("PointGoal1", num_envs=2, seed=0, transforms={"f": node, "s": RewardScale(0.5)})
+    state = env.reset()
+    for _ in range(3):
+        # "robot" is the body's place, which the joints of a planar robot are
+        xy = env.get_state()["qpos"][:, :2]
+        state["action"] = torch.ones(2, 2)
+        state = env.step(state)["next"].exclude("reward")
+        torch.testing.assert_close(seen[-1][0][:, 0, :2], xy, rtol=0, atol=1e-9)
+    assert seen[-1][2] == env.observation_layout
+    assert not torch.equal(seen[0][0], seen[-1][0])
+    blind = transformed(PointMass(2), f=ActionFilter(shield))
+    with pytest.raises(ValueError, match="asks for 'positions'"):
+        blind.rollout(1)
+
+
+@pytest.mark.parametrize("env", ["point_mass", "safety_gym"])
+def test_a_delay_shifts_actions_and_nothing_else(env):
+    torch.manual_seed(1)
+    actions = torch.rand(3, 8, 2) * 2 - 1
+    early = torch.cat([torch.zeros(3, 2, 2), actions[:, :-2]], 1)
+
+    def play(env, actions):
+        left = iter(actions.unbind(1))
+        return env.rollout(8, lambda td: td.set("action", next(left)))
+
+    plain, late = play(ENVIRONMENTS[env](), early), play(transformed(env, "delay"), actions)
+    assert torch.equal(late["next", "observation"], plain["next", "observation"])
+    assert torch.equal(late["action"], actions)  # what is learned from
+
+
+def test_what_is_pending_ends_with_the_episode_of_its_row():
+    env = transformed("point_mass", delay=ActionDelay(1))
+    state = env.reset().set("action", torch.ones(3, 2))
+    state = env.step_mdp(env.step(state))
+    again = torch.tensor([[True], [False], [False]])
+    state = env.reset(state.set("_reset", again)).set("action", torch.zeros(3, 2))
+    speed = env.step(state)["next", "observation"][:, 2:4]
+    assert (speed[0] == 0).all()
+    assert (speed[1:] > 0).all()
+
+
+@pytest.mark.parametrize(
+    ("spec", "nothing"),
+    [
+        (Bounded(-1.0, 1.0, (3, 2)), [0.0, 0.0]),
+        (Bounded(0.5, 1.0, (3, 2)), [0.5, 0.5]),
+        (Categorical(4, shape=(3,)), [0]),
+        (OneHot(4, shape=(3, 4)), [1, 0, 0, 0]),
+    ],
+    ids=["around 0", "above 0", "choices", "one-hot"],
+)
+def test_nothing_is_the_allowed_action_next_to_zero(spec, nothing):
+    env = ENVIRONMENTS["point_mass"]()
+    env.action_spec = spec
+    env = transformed(env, delay=ActionDelay(3))
+    env.reset()
+    pending = env.transform[0].rows()["pending"]
+    assert pending.tolist() == [nothing * 3] * 3
 
 
 def repeating(env, k, *before, **named):
@@ -23,7 +130,7 @@ def repeating(env, k, *before, **named):
 
 
 @pytest.mark.parametrize("env", ENVIRONMENTS)
-def test_specs_are_true_and_the_contract_is_kept(env):
+def test_specs_of_repeats_are_true_and_the_contract_is_kept(env):
     env = repeating(ENVIRONMENTS[env](), 3, EarlyTermination({"cost": 2.0}))
     check_env_specs(env)
     check_constrained_env(env)
@@ -123,46 +230,3 @@ def test_a_film_shows_repeats_in_the_time_of_the_environment():
     policy = lambda td: td.set("action", torch.zeros(1, 2))  # noqa: E731
     frames = list(record_episode(env, policy, ["cost"], deterministic=True, manner=manner))
     assert len(frames) == 11
-
-
-def test_costs_and_their_traces_are_observed():
-    env = transform_env(
-        Priced([[1.0, 0.0, 4.0, 0.0]]), {"seen": ObservedCosts(0.5, ["cost"])}, evaluating=True
-    )
-    check_env_specs(env)
-    assert env.observation_layout["last_costs"] == slice(4, 5)
-    env.set_seed(0)
-    seen = still(env, 6)["next", "observation"][0, :, 4:]
-    assert seen.tolist() == [[1, 0.5], [0, 0.25], [4, 2.125], [0, 1.0625], [1, 0.5], [0, 0.25]]
-
-
-@pytest.mark.parametrize(
-    ("make", "words"),
-    [
-        (lambda: ActionRepeat(0), "k=0 must be at least 1"),
-        (lambda: ObservedCosts(1.0), r"decay=1 must be in \[0, 1\)"),
-        (
-            lambda: transform_env(
-                Priced([[0.0]]), {"r": ActionRepeat(2), "o": ObservedCosts(0.5)}, evaluating=True
-            ),
-            r"'r' has to be the last one.*transforms=\[o,r\]",
-        ),
-        (
-            lambda: transform_env(
-                Priced([[0.0]]), {"o": ObservedCosts(0.5, ["coast"])}, evaluating=True
-            ),
-            "transforms.o: .*no such cost. Did you mean 'cost'",
-        ),
-        (
-            lambda: (
-                transform_env(
-                    ENVIRONMENTS["dictionary"](), {"o": ObservedCosts(0.5)}, evaluating=True
-                ).observation_spec
-            ),
-            "observed_costs adds columns",
-        ),
-    ],
-)
-def test_what_cannot_be_is_refused(make, words):
-    with pytest.raises(ValueError, match=words):
-        make()

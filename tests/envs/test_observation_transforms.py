@@ -1,0 +1,101 @@
+"""Noisy observations and observed costs: distributions, values worked out by hand."""
+
+import gymnasium
+import numpy as np
+import pytest
+import torch
+from scipy.stats import kstest
+from torchrl.envs.utils import check_env_specs
+from transforming import ENVIRONMENTS, SAUTE, Priced, still, transformed
+
+from safe_rl.envs import check_constrained_env, from_gymnasium, make_env
+from safe_rl.envs.transforms import ObservedCosts, Saute, SensorNoise
+
+
+@pytest.mark.parametrize("env", ["point_mass", "safety_gym"])
+def test_noise_is_normal_independent_and_around_what_is_there(env):
+    exact, noisy = still(ENVIRONMENTS[env](), 200), still(transformed(env, "noise", seed=0), 200)
+    for end in ((), ("next",)):
+        draws = (noisy[*end, "observation"] - exact[*end, "observation"]) / 0.5
+        assert kstest(draws.flatten(), "norm").pvalue > 1e-3
+        rows = draws.flatten(1)
+        assert (torch.corrcoef(rows) - torch.eye(len(rows))).abs().max() < 0.1
+        assert (torch.corrcoef(draws.flatten(0, 1)[::7].T).fill_diagonal_(0)).abs().max() < 0.6
+    # what a step shows is what the next one begins with
+    inside = ~noisy["next", "done"][:, :-1, 0]
+    first, second = noisy["next", "observation"][:, :-1], noisy["observation"][:, 1:]
+    assert torch.equal(first[inside], second[inside])
+
+
+def test_only_what_is_named_is_noisy_flat_or_not():
+    keys = {"robot_base": "point", "hazards_num": 2, "observe_hazards": True}
+    exact, flat, nested = (
+        make_env(given, num_envs=2, seed=0, transforms=named)
+        for given, named in (
+            (keys, {}),
+            (keys, {"noise": SensorNoise(0.1, ["gyro", "hazards_lidar"])}),
+            (
+                keys | {"observation_flatten": False},
+                {"noise": SensorNoise(0.1, ["gyro", "hazards_lidar"])},
+            ),
+        )
+    )
+    check_env_specs(nested)
+    for env in (exact, flat, nested):
+        env.set_seed(0)
+    was, now, entries = (env.reset()["observation"] for env in (exact, flat, nested))
+    for name, columns in exact.observation_layout.items():
+        differs = (was[:, columns] != now[:, columns]).all()
+        assert differs == (name in ("gyro", "hazards_lidar")), name
+        assert torch.equal(entries[name].flatten(1), now[:, columns]), name
+
+
+class Film(gymnasium.Env):
+    """Observes a picture and nothing else."""
+
+    observation_space = gymnasium.spaces.Box(0, 255, (4, 4, 3), np.uint8)
+    action_space = gymnasium.spaces.Box(-1, 1, (2,))
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        return np.full((4, 4, 3), 100, np.uint8), {}
+
+    def step(self, action):
+        return np.full((4, 4, 3), 100, np.uint8), 1.0, False, False, {"cost": 1.0}
+
+
+def test_pictures_have_no_noise_and_no_room_for_budgets():
+    film = from_gymnasium(Film, num_envs=2, cost_keys=["cost"], num_steps=4, flatten=False)
+    env = transformed(film, noise=SensorNoise(30.0))
+    check_env_specs(env)
+    assert (env.rollout(6, break_when_any_done=False)["observation"] == 100).all()
+    with pytest.raises(ValueError, match=r"the shape \[2, 4, 4, 3\]: let the environment make"):
+        check_constrained_env(transformed(film, saute=Saute({"cost": 2.0}, **SAUTE)))
+
+
+@pytest.mark.parametrize("env", ["point_mass", "safety_gym"])
+def test_noise_comes_from_the_seed_and_rows_do_not_share_it(env):
+    first = still(transformed(env, "noise", seed=3), 12)["observation"]
+    for seed, same in ((3, True), (4, False)):
+        torch.manual_seed(9)  # nobody's draws but the row's
+        again = transformed(env, "noise", seed=seed)
+        assert torch.equal(still(again, 12)["observation"], first) == same
+    assert (first[0] != first[1]).any()
+
+
+def test_seeding_an_environment_seeds_its_noise():
+    env = transformed("safety_gym", "noise")
+    env.set_seed(3)
+    first = still(env, 12)["observation"]
+    env.set_seed(3)
+    assert torch.equal(still(env, 12)["observation"], first)
+
+
+def test_costs_and_their_traces_are_observed():
+    priced = Priced([[1.0, 0.0, 4.0, 0.0]])
+    env = transformed(priced, seen=ObservedCosts(0.5, ["cost"]), evaluating=True)
+    check_env_specs(env)
+    assert env.observation_layout["last_costs"] == slice(4, 5)
+    env.set_seed(0)
+    seen = still(env, 6)["next", "observation"][0, :, 4:]
+    assert seen.tolist() == [[1, 0.5], [0, 0.25], [4, 2.125], [0, 1.0625], [1, 0.5], [0, 0.25]]
