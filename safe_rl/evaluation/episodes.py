@@ -145,12 +145,6 @@ def shared_layouts(
 ) -> float:
     """Share of the evaluation's layouts that training could have met, in [0, 1].
 
-    Args:
-        trained: Environment of the training: `randomize_layout`, `layout_seeds` and
-            `layout_seeds_first` count here.
-        evaluated: That of the evaluation.
-        same_seed: Whether both draw from the same seed.
-
     Examples:
         >>> finite = {"randomize_layout": True, "layout_seeds": 10, "layout_seeds_first": 0}
         >>> shared_layouts(finite, {**finite, "layout_seeds_first": 8}, same_seed=False)

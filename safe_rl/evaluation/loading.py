@@ -182,17 +182,10 @@ def load_policy(
 
 
 def check_env_keys(env: Mapping[str, Any], keys: Iterable[str]) -> None:
-    """Refuse keys that a custom environment does not have.
+    """Refuse keys that a custom environment does not have, with a `ValueError`.
 
     Such a family ignores other keys, and the result would be said to be of another environment
     than it is.
-
-    Args:
-        env: Node of a run's environment.
-        keys: Which of its keys are to be changed.
-
-    Raises:
-        ValueError: If the run's environment has no such key.
 
     Examples:
         >>> check_env_keys({"_target_": "mine.make", "edge": 1.0}, ["edgy"])

@@ -196,12 +196,7 @@ def _facts(
 
 
 def check_places(places: Iterable[Path]) -> None:
-    """Refuse files in a run's folder that cannot be written, before any episode.
-
-    Raises:
-        OSError: If one cannot be.
-        ValueError: If the folder holds links.
-    """
+    """Refuse files in a run's folder that cannot be written, before any episode."""
     places = list(places)
     for folder in {place.parent for place in places}:
         check_no_links(folder)

@@ -67,18 +67,8 @@ def pack_policy(run: Path, folder: Path, checkpoint: str = "certified") -> Path:
     """Write what is needed to use a run's policy into a folder of a few dozen kB.
 
     The configuration, the certificate, the command and the commit, and of the checkpoint the actor
-    alone, in the format of all checkpoints, which is read without unpickling objects.
-
-    Args:
-        run: Folder of the run.
-        folder: Where to write; made if there is none.
-        checkpoint: Which policy.
-
-    Returns:
-        The file of the weights.
-
-    Raises:
-        FileNotFoundError: If there is no such checkpoint.
+    alone, in the format of all checkpoints, which is read without unpickling objects. Returns the
+    file of the weights; `FileNotFoundError` if there is no such checkpoint.
     """
     source, target = RunFolder(run), RunFolder(folder)
     path, config = find_checkpoint(run, checkpoint), load_config(run)
@@ -124,13 +114,8 @@ class _MeanAction(nn.Module):
 def export_onnx(config: DictConfig, env: EnvBase, checkpoint: Path, file: Path) -> None:
     """Write a policy's mean action as a function of the observation, scaling of inputs included.
 
-    The input ``observation`` is float32 [N, D] for any N, the output ``action`` [N, A].
-
-    Args:
-        config: Of the run.
-        env: An environment like the run's, whose observations and actions are the policy's.
-        checkpoint: The file with the weights.
-        file: What is written.
+    The input ``observation`` is float32 [N, D] for any N, the output ``action`` [N, A]. ``env`` is
+    one like the run's, whose observations and actions are the policy's.
 
     Raises:
         ModuleNotFoundError: If the extra ``onnx`` is not installed.

@@ -57,10 +57,7 @@ class Variation(NamedTuple):
 
 
 def expand(rows: Mapping[str, Any]) -> list[Variation]:
-    """Turn the rows of a set into variations, one for each value of a list.
-
-    Args:
-        rows: Name -> keys with their values; one of the keys of a row may have a list.
+    """Turn the rows of a set, keys with values, into variations, one for each value of a list.
 
     Raises:
         ValueError: For what is no such row, or keys of something else than the environment.
@@ -98,16 +95,11 @@ def _expand_row(row: str, keys: Any) -> Iterator[Variation]:
 def varied(
     config: DictConfig, variation: Variation, transform_node: TransformNode
 ) -> DictConfig | None:
-    """A run's configuration with a variation of its environment.
+    """A run's configuration with a variation of its environment; None if it would be as it is.
 
-    Args:
-        config: Of the run.
-        variation: What is changed. A text ``x1.5`` is 1.5 times the run's own value.
-        transform_node: Name of a transform -> its node, for those that the run lacks.
-
-    Returns:
-        The configuration; None if its environment is that of the run: if that has these values
-        itself, or none of the elements that they are about.
+    It is if that has these values itself, or none of the elements that they are about. A text
+    ``x1.5`` is 1.5 times the run's own value; ``transform_node`` has the nodes of transforms that
+    the run lacks.
 
     Raises:
         ValueError: For a factor of what the environment lacks, or of no number; for a key that an
@@ -118,44 +110,34 @@ def varied(
         >>> varied(config, Variation("dense", None, {"env.hazards_num": "x1.5"}), dict).env
         {'hazards_num': 12}
     """
-    values: Any = OmegaConf.to_container(config)
-    transforms = dict(values.get("transforms") or {})
-    before = {"env": values["env"], "transforms": transforms}
-    changed = before
+    before: Any = OmegaConf.to_container(config)
+    before["transforms"] = before.get("transforms") or {}
+    changed = OmegaConf.create(before)
     for key, value in variation.keys.items():
-        part, *path = key.split(".")
+        part, name, *_ = key.split(".")
         if part == "env":
-            check_env_keys(before[part], path[:1])
-        if part == "transforms" and path[0] not in changed[part]:
-            changed = _with(changed, [part, path[0]], dict(transform_node(path[0])))
-        changed = _with(changed, [part, *path], _resolved(value, changed[part], key))
-    is_same = _present(changed) == _present(before)
-    return None if is_same else OmegaConf.create({**values, **changed})
+            check_env_keys(changed.env, [name])
+        elif name not in changed.transforms:
+            changed.transforms[name] = dict(transform_node(name))
+        value = _resolved(value, OmegaConf.select(changed, key), key)
+        OmegaConf.update(changed, key, value, merge=False, force_add=True)
+    is_same = _present(OmegaConf.to_container(changed)) == _present(before)
+    return None if is_same else changed
 
 
-def _present(parts: Mapping[str, Any]) -> dict[str, Any]:
-    """Parts but for what a Safety Gym environment says of elements of which it has none."""
-    env = parts["env"]
+def _present(config: Any) -> dict[str, Any]:
+    """A configuration but for what a Safety Gym environment says of elements that it has not."""
+    env = config["env"]
     absent = tuple(k.removesuffix("num") for k in env if k.endswith("_num") and env[k] == 0)
     if "_target_" in env:  # another family's
         absent = ()
-    return {**parts, "env": {key: env[key] for key in env if not key.startswith(absent)}}
+    return {**config, "env": {key: env[key] for key in env if not key.startswith(absent)}}
 
 
-def _with(node: Mapping[str, Any], path: list[str], value: Any) -> dict[str, Any]:
-    first, *others = path
-    below = node.get(first)
-    inner = _with(below if isinstance(below, Mapping) else {}, others, value) if others else value
-    return {**node, first: inner}
-
-
-def _resolved(value: Any, part: Mapping[str, Any], key: str) -> Any:
+def _resolved(value: Any, own: Any, key: str) -> Any:
     """A value, of a factor the product with what the run has."""
     if not (isinstance(value, str) and value.startswith(_FACTOR)):
         return value
-    own: Any = part
-    for name in key.split(".")[1:]:
-        own = own.get(name) if isinstance(own, Mapping) else None
     try:
         product = float(value.removeprefix(_FACTOR)) * own
     except (TypeError, ValueError):

@@ -65,11 +65,6 @@ def manner_of(env: EnvBase, suffix: str) -> Manner:
 def check_camera(env: EnvBase, camera: str, suffix: str = "mp4") -> None:
     """Draw a picture, to notice before any episode what would prevent a video.
 
-    Args:
-        env: Environment with one world.
-        camera: A name that ``env.render`` knows.
-        suffix: Of the file that is to be written, see :data:`MANNERS`.
-
     Raises:
         ValueError: If the environment draws no pictures, whatever its ``render`` fails of, or has
             no such camera.
@@ -128,15 +123,8 @@ def record_episode(
 ) -> Iterator[np.ndarray]:
     """Run one episode and yield its frames, uint8 [height, width, 3].
 
-    The last one shows how it ended, and below that what it has come to.
-
-    Args:
-        env: Environment with one world and ``render``.
-        policy: What acts.
-        cost_keys: Keys of its costs; the first is counted below the picture.
-        deterministic: Whether it acts with its mean.
-        manner: How it is recorded.
-        camera: A name that ``env.render`` knows.
+    The last one shows how it ended, and below that what it has come to. The environment has one
+    world; the first of its costs is counted below the picture.
     """
     state = env.reset()
     total = dict.fromkeys((env.return_key, *cost_keys[:1]), 0.0)

@@ -124,7 +124,7 @@ def draw_small_multiples(
     for number, own in enumerate(columns.values()):
         band, column = divmod(number, width)
         axes = list(panels[3 * band : 3 * band + 3, column])
-        for label in means.keys() - {e.label for e in own}:
+        for label in [label for label in means if label not in {e.label for e in own}]:
             for axis, curve in zip(axes, means[label], strict=True):
                 if curve is not None:
                     axis.plot(curve.steps, curve.mean, color="0.88", linewidth=0.8, zorder=0)

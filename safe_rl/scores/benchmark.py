@@ -89,11 +89,7 @@ class Suite:
     defaults: Node
 
     def changes(self, node: Node) -> dict[str, Any] | None:
-        """Keys in which a configuration differs from the environment whose name it has.
-
-        Returns:
-            Key -> value, or None if the suite has no environment of that name.
-        """
+        """Keys that differ from the environment of a configuration's name; None if none has it."""
         name = node.get("name")
         standard = self.environments.get(name) if isinstance(name, str) else None
         if standard is None:
@@ -103,12 +99,7 @@ class Suite:
         return {key: own.get(key) for key in keys if key != "name" and _differ(key, own, standard)}
 
     def name_of(self, node: Node, *, but_for: Collection[str] = ()) -> str | None:
-        """Name of the environment that a configuration is exactly, or None.
-
-        Args:
-            node: A run's ``env``.
-            but_for: Keys that may differ.
-        """
+        """Name of the environment that a configuration is exactly, or None."""
         changes = self.changes(node)
         return None if changes is None or set(changes) - set(but_for) else node["name"]
 

@@ -106,17 +106,9 @@ def pareto_front(returns: ArrayLike, costs: ArrayLike) -> np.ndarray:
 
 
 LEVEL = 0.95
-
-
 """Confidence level of all intervals."""
-
-
 NUM_RESAMPLES = 2000
-
-
 """Of the bootstrap: moves the ends of an interval by about a fiftieth of its width."""
-
-
 # resamples are drawn in portions of about so many numbers
 _PORTION = 2_000_000
 

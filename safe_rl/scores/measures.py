@@ -29,8 +29,6 @@ __all__ = [
 ]
 
 SMALLEST_EXCESS = 1e-6
-
-
 """ε, keeps the normalised violation finite where the reference keeps the limit."""
 
 
@@ -131,8 +129,6 @@ def first_good_epoch(
 
 
 NOISE_OF_ZERO = 0.1
-
-
 """Normalised violation up to which a slate counts as constraint-satisfying.
 
 The paper asks for "zero (or within noise of zero)" and gives no number. In its tables what it calls

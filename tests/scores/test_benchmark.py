@@ -1,17 +1,128 @@
-"""Only what is exactly the benchmark's is measured by the benchmark's scores."""
+"""Only what is exactly the benchmark's is measured by its scores; tables agree with each other."""
 
+import itertools
+
+import numpy as np
 import pytest
 
 from safe_rl.cli.report import suite
-from safe_rl.scores.benchmark import REFERENCE
+from safe_rl.envs import SUITE
+from safe_rl.scores.benchmark import (
+    ALGORITHMS,
+    PUBLISHED,
+    REFERENCE,
+    REIMPLEMENTATIONS,
+    SLATES,
+    Scores,
+)
+from safe_rl.scores.measures import (
+    Agent,
+    compare,
+    dominates,
+    normalised_cost_rate,
+    normalised_return,
+    normalised_violation,
+)
 
-SUITE = suite()
-NODE = SUITE.environments["PointGoal1"]
+BENCHMARK = suite()
+NODE = BENCHMARK.environments["PointGoal1"]
+
+
+def test_the_slates_are_made_of_the_suites_constrained_environments():
+    constrained = {
+        name
+        for name, config in SUITE.items()
+        if any(value is True for key, value in config.to_dict().items() if _constrains(key))
+    }
+    assert set(SLATES["SG18"]) == constrained
+    assert {name: len(members) for name, members in SLATES.items()} == {
+        "SG1": 9, "SG2": 9, "SG6": 6, "SG18": 18, "SGPoint": 6, "SGCar": 6, "SGDoggo": 6,
+    }  # fmt: skip
+    for name, robot in (("SGPoint", "point"), ("SGCar", "car"), ("SGDoggo", "doggo")):
+        assert {SUITE[member].robot_base for member in SLATES[name]} == {robot}
+    parts = [set(SLATES[name]) for name in ("SG1", "SG2")]
+    assert parts[0] | parts[1] == constrained
+    assert not parts[0] & parts[1]
+    # at least one of each task, robot and level
+    assert {SUITE[name].task for name in SLATES["SG6"]} == {"goal", "button", "push"}
+    assert {SUITE[name].robot_base for name in SLATES["SG6"]} == {"point", "car", "doggo"}
+
+
+def _constrains(key):
+    return key.startswith("constrain_") and key != "constrain_indicator"
+
+
+@pytest.mark.parametrize("parts", [("SG1", "SG2"), ("SGPoint", "SGCar", "SGDoggo")])
+@pytest.mark.parametrize("algorithm", ALGORITHMS)
+def test_published_averages_of_parts_give_the_average_of_all(algorithm, parts):
+    average = np.mean([PUBLISHED[part][algorithm] for part in parts], axis=0)
+    np.testing.assert_allclose(PUBLISHED["SG18"][algorithm], average, atol=1.01e-3)
+
+
+def test_every_table_has_every_algorithm():
+    assert all(list(table) == list(ALGORITHMS) for table in PUBLISHED.values())
+    assert all(list(table) == list(ALGORITHMS) for table in REIMPLEMENTATIONS.values())
+    assert set(REIMPLEMENTATIONS) <= set(REFERENCE)
+    assert all(value > 0 for scores in REFERENCE.values() for value in scores)
+
+
+@pytest.mark.parametrize("environment", REFERENCE)
+def test_the_reference_is_one_in_its_own_measure(environment):
+    reference = REFERENCE[environment]
+    assert normalised_return(reference.episode_return, reference) == 1.0
+    assert normalised_violation(reference.episode_cost, 25.0, reference) == 1.0
+    assert normalised_cost_rate(reference.cost_rate, reference) == 1.0
+
+
+def test_normalisation_by_hand():
+    reference = Scores(20.0, 75.0, 0.08)
+    np.testing.assert_allclose(normalised_return([-10.0, 30.0], reference), [-0.5, 1.5])
+    # nothing for what stays below the limit; the excess over the limit, not over the reference
+    costs = [0.0, 25.0, 30.0, 125.0]
+    np.testing.assert_allclose(normalised_violation(costs, 25.0, reference), [0, 0, 0.1, 2.0])
+    np.testing.assert_allclose(normalised_cost_rate(0.02, reference), 0.25)
+
+
+def test_a_reference_within_the_limit_divides_by_epsilon():
+    reference = Scores(20.0, 10.0, 0.01)
+    np.testing.assert_allclose(normalised_violation(26.0, 25.0, reference), 1e6)
+    assert normalised_violation(25.0, 25.0, reference) == 0.0
+
+
+def test_dominance_is_the_papers_definition():
+    grid = [
+        Agent(*values, 1e6) for values in itertools.product((1.0, 2.0), (0.01, 0.02), (True, False))
+    ]
+    for a, b in itertools.product(grid, grid):
+        first = a.episode_return >= b.episode_return and a.cost_rate < b.cost_rate
+        second = a.episode_return > b.episode_return and a.cost_rate <= b.cost_rate
+        both_satisfy = a.is_satisfying and b.is_satisfying
+        assert dominates(a, b) == (both_satisfy and (first or second)), (a, b)
+
+
+def test_agents_that_were_trained_for_different_times_are_not_ranked():
+    longer, shorter = Agent(9.0, 0.01, True, 2e6), Agent(1.0, 0.02, True, 1e6)
+    assert list(compare({"longer": longer, "shorter": shorter})) == []
+
+
+def test_comparison_names_every_pair_once():
+    agents = {
+        "good": Agent(10.0, 0.02, True, 1),
+        "fair": Agent(8.0, 0.03, True, 1),
+        "odd": Agent(12.0, 0.04, True, 1),
+        "rash": Agent(99.0, 0.01, False, 1),
+    }
+    assert list(compare(agents)) == [
+        ("good", "fair", "dominates"),
+        ("good", "rash", "satisfies"),
+        ("fair", "rash", "satisfies"),
+        ("odd", "rash", "satisfies"),
+    ]
 
 
 @pytest.mark.parametrize("name", REFERENCE)
 def test_every_environment_with_scores_is_itself(name):
-    assert SUITE.reference(SUITE.environments[name]) == REFERENCE[name]
+    assert BENCHMARK.reference(BENCHMARK.environments[name]) == REFERENCE[name]
 
 
 @pytest.mark.parametrize(
@@ -31,19 +142,19 @@ def test_every_environment_with_scores_is_itself(name):
     ],
 )
 def test_another_environment_under_its_name_is_not_it(node):
-    assert SUITE.name_of(node) is None
-    assert SUITE.reference(node) is None
+    assert BENCHMARK.name_of(node) is None
+    assert BENCHMARK.reference(node) is None
 
 
 def test_keys_at_their_defaults_may_be_left_out():
-    changed = {k: v for k, v in NODE.items() if k == "name" or SUITE.defaults.get(k) != v}
+    changed = {k: v for k, v in NODE.items() if k == "name" or BENCHMARK.defaults.get(k) != v}
     assert len(changed) < len(NODE) / 2
-    assert SUITE.name_of(changed) == "PointGoal1"
+    assert BENCHMARK.name_of(changed) == "PointGoal1"
 
 
 def test_changes_are_named_and_may_be_allowed():
     node = {**NODE, "layout_seeds": 10, "hazards_size": 0.3}
-    assert SUITE.changes(node) == {"layout_seeds": 10, "hazards_size": 0.3}
-    assert SUITE.changes({**NODE, "name": "Mine"}) is None
-    assert SUITE.name_of({**NODE, "layout_seeds": 10}) is None
-    assert SUITE.name_of({**NODE, "layout_seeds": 10}, but_for=["layout_seeds"]) == "PointGoal1"
+    assert BENCHMARK.changes(node) == {"layout_seeds": 10, "hazards_size": 0.3}
+    assert BENCHMARK.changes({**NODE, "name": "Mine"}) is None
+    assert BENCHMARK.name_of({**NODE, "layout_seeds": 10}) is None
+    assert BENCHMARK.name_of({**NODE, "layout_seeds": 10}, but_for=["layout_seeds"]) == "PointGoal1"
