@@ -134,6 +134,62 @@ class EpisodeLengths:
         return torch.tensor(min(steps / ends, self.longest) if early else float(self.longest))
 
 
+class NoiseCorrelation:
+    """Correlation of the noise of a batch with that of the next one, from the rows of both.
+
+    An episode that spans several batches keeps its layout, so that a row that costs much in one
+    batch is likely to cost much in the next. Rows are independent of each other: the correlation
+    of their deviations from the batch's mean is that of the noise of means, and what a change of
+    the policy adds to all rows alike is not in it. It begins as 0, with the weight of one batch.
+
+    Args:
+        memory: weight in [0, 1) of the past.
+        largest: upper bound, below 1; 0 takes batches as independent.
+
+    Examples:
+        >>> noise = NoiseCorrelation(memory=0.9, largest=0.6)
+        >>> for _ in range(30):  # the rows never change
+        ...     noise.update(torch.tensor([[0.0], [1.0]]))
+        >>> noise.correlation, noise.variance_factor
+        (tensor([0.6000]), tensor([4.0000]))
+    """
+
+    def __init__(self, *, memory: float, largest: float) -> None:
+        self.memory, self.largest = memory, largest
+        self._last, self._products = torch.zeros(0, 1), torch.zeros(2, 1)
+
+    @property
+    def correlation(self) -> Tensor:
+        """From 0 to the largest, [k]."""
+        shared, whole = self._products
+        return torch.where(whole > 0, shared / whole, 0.0).clamp(0.0, self.largest)
+
+    @property
+    def variance_factor(self) -> Tensor:
+        """(1 + r) / (1 − r), [k]: by it the variance of a mean of many batches is larger."""
+        return (1 + self.correlation) / (1 - self.correlation)
+
+    def update(self, rates: Tensor) -> None:
+        """Take in the mean cost per step of every row of a batch, [N, k]."""
+        last, present = self._last, rates - rates.mean(0)
+        self._last = present
+        if last.shape != present.shape:
+            self._products = torch.stack([torch.zeros_like(rates[0]), present.square().mean(0)])
+            return
+        whole = (last.square() + present.square()).mean(0) / 2
+        seen = torch.stack([(last * present).mean(0), whole])
+        self._products = torch.lerp(seen, self._products, self.memory)
+
+    def state_dict(self) -> dict[str, Tensor]:
+        """Everything the next correlation depends on."""
+        return {"rows": self._last.clone(), "products": self._products.clone()}
+
+    def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
+        """Continue from :meth:`state_dict`."""
+        self._last = state_dict["rows"].to(self._last, copy=True)
+        self._products = state_dict["products"].to(self._products, copy=True)
+
+
 class EpisodeCosts:
     """Estimator of J_c, of the mean episode length T̄ and of the size of one cost, over a run.
 
@@ -145,6 +201,8 @@ class EpisodeCosts:
         memory: weight in [0, 1) of the past in how much costs scatter.
         smallest: costs per step that count as J_c's size where it is smaller, for the drift: from
             batches without any cost nothing else would lead away.
+        largest_correlation: bound of the correlation of batches by which errors are enlarged; see
+            `NoiseCorrelation`.
 
     Examples:
         >>> estimator = EpisodeCosts(1, max_length=1000, drift=None, memory=0.9)
@@ -162,9 +220,11 @@ class EpisodeCosts:
         drift: float | None,
         memory: float,
         smallest: float = 0.0,
+        largest_correlation: float = 0.0,
     ) -> None:
         self.drift, self.memory, self.smallest = drift, memory, smallest
         self.lengths = EpisodeLengths(max_length)
+        self.noise = NoiseCorrelation(memory=memory, largest=largest_correlation)
         self._state = {
             "mean": torch.full((num_costs,), torch.nan),
             "error": torch.full((num_costs,), torch.nan),
@@ -202,7 +262,9 @@ class EpisodeCosts:
         self._state["sums"] += torch.stack([costs.sum((0, 1)), costs.square().sum((0, 1))])
         self.lengths.update(costs.shape[0] * costs.shape[1], lengths)
         charged = costs if charges is None else charges.costs.to(costs)
-        batch = CostEstimate(*(part.float() for part in rate_estimate(charged, self.length)))
+        self.noise.update(charged.mean(1).float())
+        mean, error = (part.float() for part in rate_estimate(charged, self.length))
+        batch = CostEstimate(mean, error * self.noise.variance_factor.sqrt())
         if charges is not None:
             batch = batch._replace(mean=batch.mean + charges.offset)
         self.batch = batch
@@ -233,7 +295,7 @@ class EpisodeCosts:
     def state_dict(self) -> dict[str, Tensor]:
         """Everything the next estimate depends on."""
         state = {name: value.clone() for name, value in self._state.items()}
-        return state | {"counts": self.lengths.counts.clone()}
+        return state | self.noise.state_dict() | {"counts": self.lengths.counts.clone()}
 
     def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
         """Continue from :meth:`state_dict`."""
@@ -241,3 +303,4 @@ class EpisodeCosts:
             # a copy, because sums are added to in place
             self._state[name] = state_dict[name].to(value, copy=True)
         self.lengths.counts = state_dict["counts"].to(self.lengths.counts)
+        self.noise.load_state_dict(state_dict)

@@ -154,6 +154,12 @@ class LimitTracker:
             near 0.
         drift: Share by which J_c changes per update, about; see `EpisodeCosts`.
         memory: Weight of the past in the standard error of a batch and in the trust.
+        largest_correlation: Bound of the correlation r of a batch's noise with that of the next, as
+            the rows show it where episodes span batches; the variance of a batch is taken as
+            (1 + r) / (1 − r) times that of its rows. 0 takes batches as independent.
+        descent_errors: Standard errors that are added to J_c's estimate before the limit follows it
+            down. With 0 the limit follows the least of noisy estimates, and comes down faster than
+            the policy does.
         lowest_trust: Lower bound of trust_<cost>, the share of a predicted change that is counted
             on; 1 counts on all of it.
         integral: Share of every violation that is asked for again in all updates to come (the
@@ -192,11 +198,14 @@ class LimitTracker:
         integral: NotNegative,
         largest_integral: NotNegative,
         recovery: Share = 1.0,
+        largest_correlation: Weight = 0.0,
+        descent_errors: NotNegative = 0.0,
         steps_per_decision: int = 1,
     ) -> None:
         self.limits = cost_limits.detach().cpu().float()
         num_costs = len(self.limits)
         self.margin, self.largest_margin = margin, largest_margin
+        self.descent_errors = descent_errors
         shrinkage = min(1.0, latest_end * frames / max(free_steps + descent_steps, 1))
         self.free_steps = round(free_steps * shrinkage)
         self.descent_steps = round(descent_steps * shrinkage)
@@ -209,6 +218,7 @@ class LimitTracker:
             drift=drift,
             memory=memory,
             smallest=self.smallest_scale,
+            largest_correlation=largest_correlation,
         )
         self.predictions = PredictedChange(num_costs, memory=memory, lowest=lowest_trust)
         self.integral, self.largest_integral = integral, largest_integral
@@ -274,7 +284,8 @@ class LimitTracker:
         left = self.free_steps + self.descent_steps - self._steps + num_steps
         share = num_steps / left if left > num_steps else 1.0
         # from the present cost, where that has come down faster than the limit
-        self._reached = torch.minimum(self._reached, estimate.mean)
+        surely = estimate.mean + self.descent_errors * estimate.error
+        self._reached = torch.minimum(self._reached, surely)
         self._reached = descend(self._reached, self.limits - margin, share)
         if left > num_steps:
             return self._reached

@@ -51,6 +51,27 @@ def test_costs_are_free_then_the_limit_comes_down_from_what_the_policy_costs():
     assert (targets[5:] == 25).all()
 
 
+def halfway(descent_errors: float) -> float:
+    """The target in the middle of a descent from 60 to 25, if policies cost what is asked for."""
+    targets = []
+    for seed in range(10):
+        generator = torch.Generator().manual_seed(seed)
+        limits = tracker(
+            margin=0.0, free_steps=0, descent_steps=80_000, descent_errors=descent_errors
+        )
+        target = 60.0
+        for _ in range(20):
+            rates = target / 1000 + 0.06 * torch.randn(100, 1, 1, generator=generator)
+            target = limits.update(rates.expand(100, 20, 1), NO_EPISODES).target.item()
+        targets.append(target)
+    return sum(targets) / len(targets)
+
+
+def test_a_descent_that_allows_for_the_noise_of_estimates_is_not_faster_than_its_schedule():
+    assert halfway(descent_errors=1.0) == pytest.approx((60 + 25) / 2, abs=3)
+    assert halfway(descent_errors=0.0) < 35  # pulled down by the least of twenty estimates
+
+
 def test_in_a_short_run_the_descent_is_over_in_time():
     limits = tracker(margin=0.0, drift=None, frames=10_000)
     assert (limits.free_steps, limits.descent_steps) == (2_000, 5_000)
