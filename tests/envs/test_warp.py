@@ -37,6 +37,9 @@ def steps_from_equal_states(cpu, warp, num_steps):
     start = cpu.reset()
     warp.reset()
     torch.manual_seed(0)
+    # At a reset everything stands on the floor at a distance of 0, where rounding alone decides
+    # whether there is a contact.
+    cpu._step(start.set("action", cpu.action_spec.rand()))
     for _ in range(num_steps):
         warp.set_state(cpu.get_state())
         start.set("action", cpu.action_spec.rand())
@@ -58,13 +61,18 @@ def largest_difference(cpu, warp, num_steps=10):
     ("name", "most"),
     [
         ("PointGoal1", 1e-5),
-        pytest.param("PointButton2", 1e-4, marks=pytest.mark.slow),
+        ("DoggoGoal1", 1e-3),
+        pytest.param("PointButton2", 1e-5, marks=pytest.mark.slow),
         pytest.param("CarGoal1", 1e-3, marks=pytest.mark.slow),
         pytest.param("CarPush2", 1e-3, marks=pytest.mark.slow),
+        pytest.param("DoggoButton1", 1e-3, marks=pytest.mark.slow),
     ],
 )
 def test_one_step_is_that_of_mujoco(name, most):
-    assert largest_difference(*pair(name)).quantile(0.95) < most
+    apart = largest_difference(*pair(name))
+    assert apart.median() < 1e-5
+    # of 80 rows, those in which a contact switches may be beyond
+    assert (apart > most).sum() <= 2
 
 
 def test_rays_see_what_mujoco_sees():

@@ -15,6 +15,7 @@ from torch import Tensor
 
 from safe_rl.envs.physics import Physics
 from safe_rl.envs.physics.warp_kernels import (
+    align_capsules,
     find_failures,
     follow_path,
     note_overflow,
@@ -106,6 +107,8 @@ class WarpPhysics(Physics):
         self._late = _LateChecks(self.device)
         with wp.ScopedDevice(self._warp_device):
             self._model = mjw.put_model(model)
+            if (model.geom_type == mujoco.mjtGeom.mjGEOM_CAPSULE).any():
+                self._model.callback.contactfilter = _align_capsules
             self._model.opt.warn_overflow = 0  # printed by a kernel; we raise instead
             self._model.opt.contact_sensor_maxmatch = contacts
             # Nobody reads sensors between substeps.
@@ -313,6 +316,13 @@ class WarpPhysics(Physics):
 
     def _warp(self, tensor: Tensor) -> Any:
         return wp.from_torch(tensor)
+
+
+def _align_capsules(model: Any, data: Any) -> None:
+    """Give contacts of capsules on planes the frames that MuJoCo gives them."""
+    contact = data.contact
+    inputs = [data.nacon, model.geom_type, contact.geom, contact.worldid, data.geom_xmat]
+    wp.launch(align_capsules, data.naconmax, inputs, [contact.frame])
 
 
 class _LateChecks:
