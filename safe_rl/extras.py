@@ -1,4 +1,4 @@
-"""Packages that only a part of the work needs: installed as extras, imported on demand."""
+"""Optional packages: installed as extras, imported on demand."""
 
 from __future__ import annotations
 

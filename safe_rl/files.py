@@ -1,7 +1,6 @@
-"""Files of a run: read without trusting them, written in one go.
+"""Files of a run: read without trusting them, written atomically.
 
-Directly in `safe_rl`, because collectors write recordings and runs, evaluation and reporting all
-else.
+In `safe_rl` itself, because several rooms write files of a run.
 """
 
 from __future__ import annotations
@@ -147,8 +146,8 @@ def _check_levels(text: str) -> None:
 def read_config(path: Path) -> dict[str, Any]:
     r"""Read a run's configuration, which has been resolved before it was saved.
 
-    An interpolation in it is somebody's, and ``${oc.env:…}`` would put a secret of this machine
-    into what is made of it: it is refused.
+    Interpolations are refused: ``${oc.env:…}`` in a file of another person could copy a secret of
+    this machine into a report.
 
     Raises:
         ValueError: If it is no mapping with texts for keys, or has interpolations or aliases.
@@ -184,7 +183,7 @@ def _all_plain(value: Any) -> bool:
 def replacing(path: Path) -> Iterator[Path]:
     """Give the name of a file to write, which takes the place of ``path`` when it is complete.
 
-    Who reads ``path`` meanwhile, or after an interruption, finds the old content or the new one.
+    Readers see the old content or the new one, also after an interruption.
 
     Examples:
         >>> import tempfile
@@ -195,7 +194,7 @@ def replacing(path: Path) -> Iterator[Path]:
         '1,2'
     """
     unfinished = path.with_name(f".{path.stem}.{secrets.token_hex(8)}{path.suffix}")
-    # a new file: nobody could have put a link in its place, to have another one overwritten
+    # a new file, not a link that somebody prepared to have another file overwritten
     os.close(os.open(unfinished, os.O_CREAT | os.O_EXCL | os.O_WRONLY | os.O_NOFOLLOW, 0o666))
     try:
         yield unfinished
@@ -246,11 +245,11 @@ def check_no_links(folder: Path) -> None:
 
 
 def check_place(path: Path, otherwise: str) -> None:
-    """Refuse a place for a file that cannot be written there, before the work that makes it.
+    """Check that a file can be written, before the work that makes its content.
 
     Args:
         path: The file; folders above it may be missing.
-        otherwise: What to do then, a sentence.
+        otherwise: Advice for the error, a sentence.
 
     Raises:
         OSError: If it is a folder, or may not be made.

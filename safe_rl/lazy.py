@@ -1,7 +1,7 @@
-"""Names of a package that are imported when somebody asks for them (PEP 562).
+"""Names of a package that are imported at their first use (PEP 562).
 
-`train.py --help` and every refused command line need the names of environments and the tables of
-keys; torch, TorchRL and MuJoCo take some seconds to import and are needed to build something.
+`train.py --help` and error messages need only names of environments and tables of keys; torch,
+TorchRL and MuJoCo take seconds to import.
 """
 
 from __future__ import annotations

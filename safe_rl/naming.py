@@ -1,4 +1,4 @@
-"""Names: that of a nested key, and the known one most like a wrong one, with which errors end."""
+"""Names of nested keys, and the nearest known name for error messages."""
 
 from __future__ import annotations
 

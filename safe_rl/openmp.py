@@ -1,7 +1,7 @@
-"""How torch's idle threads wait: set before torch is loaded, which is when OpenMP reads it.
+"""How torch's idle threads wait: set before torch is loaded, because OpenMP reads it then.
 
 By default they spin for milliseconds after every operation and take the cores from the physics
-and from whatever else runs: two training runs on two cores then go ten times slower than one, not
+and other programs: two training runs on two cores then go ten times slower than one, not
 twice. Sleeping at once costs a few microseconds per operation. A setting of the user's is kept.
 """
 
@@ -9,11 +9,11 @@ import os
 import sys
 import warnings
 
-# GOMP_SPINCOUNT says the same more finely
+# GOMP_SPINCOUNT is a finer setting of the same
 _SETTINGS = ("OMP_WAIT_POLICY", "GOMP_SPINCOUNT")
 
 if not any(setting in os.environ for setting in _SETTINGS):
-    # for processes that are started from here, in any case
+    # also for processes that this one starts
     os.environ["OMP_WAIT_POLICY"] = "PASSIVE"
     if "torch" in sys.modules:
         warnings.warn(

@@ -1,7 +1,6 @@
-"""Processes that end with the one that has started them, and leave signals to it.
+"""Child processes that end with their parent, and leave signals to it.
 
-It stands on the top floor because sweeps, collectors and environments start processes, and these
-rooms may not know each other.
+In `safe_rl` itself, because sweeps, collectors and environments start processes.
 """
 
 from __future__ import annotations
@@ -17,12 +16,12 @@ from threading import Thread
 __all__ = ["end_with_parent", "is_stopped", "leave_signals_to_parent", "starting_processes"]
 
 _LOOK = 1.0
-"""Seconds between looks at the parent."""
-_watching: set[int] = set()  # processes that do, of this one and those it was forked from
+"""Seconds between checks of the parent."""
+_watching: set[int] = set()  # ids of this process and its ancestors that watch their parent
 
 
 def end_with_parent(grace: float = 0.0) -> None:
-    """End this process when its parent has ended, however that was ended.
+    """End this process when its parent has ended for any reason.
 
     Args:
         grace: Seconds for the run at hand, which gets SIGTERM, to write its checkpoint.
@@ -36,7 +35,7 @@ def end_with_parent(grace: float = 0.0) -> None:
         # an orphan gets another parent
         while os.getppid() == parent:
             time.sleep(_LOOK)
-        # a second one would end at once the run that is ending already
+        # a second SIGTERM would end at once a run that is ending already
         if grace and callable(signal.getsignal(signal.SIGTERM)):
             os.kill(os.getpid(), signal.SIGTERM)
         time.sleep(grace)
@@ -53,7 +52,7 @@ def starting_processes() -> Iterator[None]:
     run; the first process reacts to them. The others, which take seconds to start, would be ended.
     They keep these signals waiting until they call :func:`leave_signals_to_parent`.
     """
-    # which would let signals through again when it is started along with the first process
+    # started later, with the first process, it would unblock signals
     resource_tracker.ensure_running()
     before = signal.pthread_sigmask(
         signal.SIG_BLOCK, {signal.SIGINT, signal.SIGTERM, signal.SIGHUP}
@@ -68,7 +67,7 @@ def leave_signals_to_parent() -> None:
     """End with the parent, or by its SIGTERM; pass over SIGINT, SIGHUP and SIGTERM of others.
 
     To be called in the main thread of a process that was begun within :func:`starting_processes`.
-    Where the system does not tell who has sent a signal, as macOS, SIGTERM of anybody ends it.
+    Where the system does not tell the sender of a signal (macOS), any SIGTERM ends it.
     """
     for number in (signal.SIGINT, signal.SIGHUP):
         signal.signal(number, signal.SIG_IGN)
@@ -88,7 +87,7 @@ def leave_signals_to_parent() -> None:
 
 
 def is_stopped(pid: int) -> bool:
-    """Whether a process stands still (SIGSTOP); False where the system does not tell."""
+    """Whether a process was stopped (SIGSTOP); False where the system does not tell."""
     try:
         with open(f"/proc/{pid}/stat") as file:
             # the second field is a name in parentheses, which may hold anything

@@ -1,6 +1,6 @@
-"""What the processor is: which of torch's ways to compute the same thing is quick on it.
+"""The kind of processor, for choices between equivalent computations of torch.
 
-It stands on the top floor because networks and updates both ask, and know nothing of each other.
+In `safe_rl` itself, because networks and updates both use it.
 """
 
 from __future__ import annotations
@@ -15,5 +15,5 @@ _FILE = Path("/proc/cpuinfo")
 
 @cache
 def cpuinfo() -> str:
-    """Return what Linux says of the processor; nothing elsewhere."""
+    """Return Linux's description of the processor; an empty text elsewhere."""
     return _FILE.read_text() if _FILE.is_file() else ""

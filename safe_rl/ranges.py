@@ -265,7 +265,10 @@ class Checked:
 def _checked(init: Callable[..., None]) -> Callable[..., None]:
     @cache
     def allowed() -> dict[str, Values]:
-        parameters = signature(init, eval_str=True).parameters.values()
+        try:
+            parameters = signature(init, eval_str=True).parameters.values()
+        except NameError:  # a name that is imported for type checkers only
+            return {}
         described = (p for p in parameters if is_described(p.annotation))
         return {p.name: values_of(p.annotation) for p in described}
 

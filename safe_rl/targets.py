@@ -1,9 +1,8 @@
 """From a configuration's ``_target_`` to an object: the only place that does it.
 
-A configuration may come from somebody else, with a run that is resumed or evaluated. It therefore
-reaches only what a run is built of: this package's parts, torch's optimisers, and modules that the
-user has named by ``import=``. It stands on the top floor because every room below the command line
-builds something.
+A configuration may come with a run of another person. It therefore reaches only what a run is built
+of: parts of this package, torch's optimisers, and modules that the user has named by ``import=``.
+The module is in `safe_rl` itself because all rooms build something.
 """
 
 from __future__ import annotations
@@ -21,12 +20,11 @@ from omegaconf import DictConfig, ListConfig, OmegaConf
 from safe_rl.naming import did_you_mean
 
 __all__ = [
-    *("TargetError", "accepted_names", "allow", "build", "constructors", "locate", "present_name"),
-    "takes_any",
+    *("TargetError", "accepted_names", "allow", "build", "constructors", "locate", "takes_any"),
 ]
 
-# Rooms whose classes and functions are parts of a run, and of some those that are: the others there
-# start programs, import modules, write files and remove them.
+# Rooms with parts of a run; where only some of the classes and functions are, their names: others
+# start programs, import modules, or write and remove files.
 _ROOMS: dict[str, tuple[str, ...] | None] = {
     "safe_rl.algorithms": None,
     "safe_rl.collectors": ("make_process_collector", "make_ray_collector"),
@@ -40,17 +38,6 @@ _ROOMS: dict[str, tuple[str, ...] | None] = {
 }
 _OPTIMISERS = "torch.optim"
 _users_modules: set[str] = set()
-
-# What configurations of earlier runs call the parts that have moved since.
-_RENAMED = {
-    "safe_rl.updates.MinibatchUpdate": "safe_rl.algorithms.MinibatchUpdate",
-    "safe_rl.learning_rate.KLAdaptiveRate": "safe_rl.algorithms.KLAdaptiveRate",
-    "safe_rl.objectives.TRPOStep": "safe_rl.algorithms.TRPOStep",
-    "safe_rl.objectives.CPOStep": "safe_rl.algorithms.CPOStep",
-    "safe_rl.loggers.MLflowLogger": "safe_rl.runs.loggers.MLflowLogger",
-    "safe_rl.loggers.TensorboardLogger": "safe_rl.runs.loggers.TensorboardLogger",
-    "safe_rl.loggers.WandbLogger": "safe_rl.runs.loggers.WandbLogger",
-}
 
 
 class TargetError(ValueError):
@@ -66,16 +53,6 @@ def allow(module: str) -> None:
         Fraction(3, 4)
     """
     _users_modules.add(module)
-
-
-def present_name(target: str) -> str:
-    """What a target is called now, of which an earlier run may know another name.
-
-    Examples:
-        >>> present_name("safe_rl.objectives.CPOStep")
-        'safe_rl.algorithms.CPOStep'
-    """
-    return _RENAMED.get(target, target)
 
 
 def build(node: DictConfig | Mapping[str, Any] | None, /, **objects: Any) -> Any:
@@ -128,7 +105,7 @@ def locate(target: Any, key: str = "") -> Callable[..., Any]:
         TargetError: If it may not be named, or does not exist.
 
     Examples:
-        >>> locate("safe_rl.updates.MinibatchUpdate").__name__  # as runs of before call it
+        >>> locate("safe_rl.algorithms.MinibatchUpdate").__name__
         'MinibatchUpdate'
         >>> locate("torch.load", key="loss._target_")
         Traceback (most recent call last):
@@ -136,7 +113,7 @@ def locate(target: Any, key: str = "") -> Callable[..., Any]:
         safe_rl.targets.TargetError: loss._target_=torch.load: configurations reach only parts of safe_rl, torch.optim and modules of yours. If you trust 'torch', add import=torch to the command.
     """  # noqa: E501
     shown = f"{key}={target}" if key else f"{target}"
-    name = present_name(str(target))
+    name = str(target)
     root = next((root for root in _roots() if _is_inside(name, root) and name != root), None)
     if root is None:
         module = name.rpartition(".")[0] or name
@@ -202,7 +179,7 @@ def takes_any(function: Callable[..., Any]) -> bool:
 
 
 def _checked(node: Any, key: str) -> Any:
-    """Copy plain containers with the present names of their targets, each of which is allowed."""
+    """Copy plain containers after checking that every target in them is allowed."""
     if isinstance(node, list | tuple | ListConfig):
         return [_checked(item, f"{key}[{index}]") for index, item in enumerate(node)]
     if not isinstance(node, Mapping):
@@ -210,7 +187,6 @@ def _checked(node: Any, key: str) -> Any:
     copied = {name: _checked(value, _join(key, str(name))) for name, value in node.items()}
     if "_target_" in copied:
         locate(copied["_target_"], _join(key, "_target_"))
-        copied["_target_"] = present_name(copied["_target_"])
     return copied
 
 

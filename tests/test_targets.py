@@ -9,7 +9,7 @@ import torch
 from omegaconf import OmegaConf
 
 from safe_rl import targets
-from safe_rl.algorithms import KLAdaptiveRate, MinibatchUpdate
+from safe_rl.algorithms import MinibatchUpdate
 from safe_rl.objectives import LagrangeMultiplier
 from safe_rl.targets import TargetError, build, locate
 
@@ -70,24 +70,6 @@ def test_partial_nodes_wait_for_their_arguments():
     waiting = build(ADAM)
     assert isinstance(waiting, partial)
     assert waiting([torch.nn.Parameter(torch.zeros(1))]).defaults["lr"] == 0.1
-
-
-@pytest.mark.parametrize(
-    ("before", "now"),
-    [
-        ("safe_rl.updates.MinibatchUpdate", MinibatchUpdate),
-        ("safe_rl.learning_rate.KLAdaptiveRate", KLAdaptiveRate),
-        *((old, locate(new)) for old, new in targets._RENAMED.items()),
-    ],
-)
-def test_runs_of_before_find_what_has_moved(before, now):
-    assert locate(before) is now
-
-
-def test_an_old_name_inside_a_node_is_built():
-    parameters = {"factor": 1.1, "lowest": 1e-5, "highest": 1e-3, "few_steps": 0.7, "low_kl": 0.7}
-    node = {"_target_": "safe_rl.learning_rate.KLAdaptiveRate", **parameters}
-    assert isinstance(build(node), KLAdaptiveRate)
 
 
 @pytest.mark.parametrize(

@@ -17,8 +17,12 @@ from torch import Tensor, nn
 from torchrl.envs import EnvBase
 
 from safe_rl.collectors import EpisodeStatistics
+from safe_rl.ranges import Checked
 
-__all__ = ["Algorithm", "PolicyUpdate", "Recipe", "SequentialUpdates", "Stateful"]
+__all__ = [
+    *("Algorithm", "PolicyUpdate", "Recipe", "SequentialUpdates", "Stateful", "load_states"),
+    "states_of",
+]
 
 
 class Stateful(Protocol):
@@ -33,15 +37,26 @@ class Stateful(Protocol):
         ...
 
 
+def states_of(parts: Mapping[str, Stateful]) -> dict[str, Any]:
+    """State of every part, by name."""
+    return {name: part.state_dict() for name, part in parts.items()}
+
+
+def load_states(parts: Mapping[str, Stateful], states: Mapping[str, Any]) -> None:
+    """Let every part continue from its state in :func:`states_of`."""
+    for name, part in parts.items():
+        part.load_state_dict(states[name])
+
+
 class Algorithm(ABC):
-    """What learns: all that the loop, checkpoints, transfer and evaluation know of it.
+    """What learns, as the loop, checkpoints, transfer and evaluation see it.
 
     Attributes:
         cost_keys: Keys of the constrained costs; empty for an unconstrained algorithm.
-        policy: What explores, for the collector: it shares the networks' parameters.
+        policy: Exploring policy, for the collector; it shares the networks' parameters.
         networks: What is trained, by name. Another run can start from them.
-        cost_networks: Names of the networks that are about the constrained costs: a run takes them
-            over only from one with the same costs.
+        cost_networks: Names of the networks of the constrained costs: a run takes them over only
+            from one with the same costs.
     """
 
     cost_keys: Sequence[str] = ()
@@ -73,19 +88,19 @@ class Algorithm(ABC):
             episodes: What they say about episodes.
 
         Returns:
-            What is worth a column of the table, by name: the same names at every call, NaN where
-            there is no value.
+            Values for columns of the table, by name: The same names at every call, NaN where there
+            is no value.
         """
 
     @abstractmethod
     def checkpoint_components(self) -> Mapping[str, Stateful]:
-        """Parts with a state, by name: together they are all that learning depends on."""
+        """Parts with a state, by name; learning depends on nothing else."""
 
     def networks_replaced(self) -> None:
-        """Follow the networks, which have got another run's weights, with target networks."""
+        """Set target networks to the networks, which have received another run's weights."""
 
     def forget_open_episodes(self) -> None:
-        """End what goes from step to step, such as n-step sums: new episodes begin."""
+        """End what spans several steps, such as n-step sums: new episodes begin."""
 
 
 class Recipe(ABC):
@@ -93,9 +108,8 @@ class Recipe(ABC):
 
     Attributes:
         off_policy: Whether it learns from a replay buffer, with Q functions for critics.
-        unused_keys: Keys that presets bring along and that it makes no use of, and choices that
-            are not for it (``preset=paper``), each with the reason: a command line that gives one
-            is refused.
+        unused_keys: Keys that it ignores although presets contain them, and choices that do not
+            suit it (``preset=paper``), each with the reason: a command with one is refused.
     """
 
     off_policy: ClassVar[bool] = False
@@ -123,8 +137,8 @@ class Recipe(ABC):
         """
 
 
-class PolicyUpdate(ABC):
-    """What a recipe asks of an update: gradient steps, a trust-region step, or one of your own."""
+class PolicyUpdate(Checked, ABC):
+    """What a recipe asks of an update: gradient steps, a trust-region step, or your own."""
 
     @abstractmethod
     def __call__(
@@ -137,13 +151,13 @@ class PolicyUpdate(ABC):
 
         Args:
             batch: On-policy data with advantages, any batch shape.
-            cost_violation: By how much J_c is to fall, of every constraint, shape [k]: J_c − d, or
-                J_c less the column ``target_…`` where the limit comes down to d.
+            cost_violation: Amount by which J_c must fall, for every constraint, shape [k]: J_c − d,
+                or J_c minus the column ``target_…`` where the limit comes down to d.
             episode_length: Mean episode length T̄ in steps, a scalar.
         """
 
     def loss_modules(self) -> Mapping[str, nn.Module]:
-        """Losses that are modules, by place, of which checkpoints keep what networks do not."""
+        """Losses that are modules, by name: checkpoints keep what networks do not hold of them."""
         return {}
 
     def state_dict(self) -> Mapping[str, Any]:
@@ -155,14 +169,14 @@ class PolicyUpdate(ABC):
 
 
 class SequentialUpdates(PolicyUpdate):
-    """A `PolicyUpdate` of several, each going on from where the one before has left the policy.
+    """A `PolicyUpdate` of several, each of which starts from the policy that the previous one left.
 
     In a configuration, ``then`` names what comes after ``policy_update``: a loss and an update for
     each of any number of names (see ``conf/algo/cup.yaml``).
 
     Args:
-        first: the first update; what it reports keeps its names.
-        then: the others in their order; what they report is called ``<name>_…``. The
+        first: The first update; what it reports keeps its names.
+        then: The others in their order; what they report is called ``<name>_…``. The
             ``cost_surrogate`` of the last one that has any is that of all together.
 
     Examples:
@@ -208,12 +222,11 @@ class SequentialUpdates(PolicyUpdate):
 
     def state_dict(self) -> dict[str, Any]:
         """State of each, by its name; that of the first by ``first``."""
-        return {name: update.state_dict() for name, update in self._named.items()}
+        return states_of(self._named)
 
     def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
         """Continue from :meth:`state_dict`."""
-        for name, update in self._named.items():
-            update.load_state_dict(state_dict[name])
+        load_states(self._named, state_dict)
 
     @property
     def _named(self) -> dict[str, PolicyUpdate]:

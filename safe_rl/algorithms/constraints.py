@@ -1,4 +1,4 @@
-"""The constraints of a run: which costs, how much of them, and how far the policy is from that."""
+"""The constraints of a run: costs, limits, and the distance of the policy from them."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ __all__ = ["CHARGES", "Constraints", "TrackedConstraints", "check_cost_limits"]
 
 
 class Constraints:
-    """Keys, limits, how far J_c is from them, and the multiplier that weighs the costs.
+    """Keys, limits, the violations J_c − d, and the multiplier that weighs the costs.
 
     Every recipe has one, and updates it with every batch. Losses and updates that need the
     violation take the object itself and read ``violation`` and ``episode_length`` at every call.
@@ -38,7 +38,7 @@ class Constraints:
         costs: J_c, undiscounted cost per episode, [k], as of the last batch.
         violation: J_c − d, [k], as of the last batch.
         episode_length: T̄, mean number of decisions of an episode, as in batches, scalar.
-        unit: Size of one cost, by which losses divide the costs that they weigh, [k].
+        unit: Size of one cost; losses divide weighed costs by it, [k].
         risk: What is limited instead of the mean cost of an episode, or None.
         cost_advantage: Key of the cost advantages that the multiplier weighs.
 
@@ -94,9 +94,8 @@ class Constraints:
     def update(self, episodes: EpisodeStatistics, batch: TensorDictBase) -> None:
         """Take in what a batch says about episodes, and move the multiplier.
 
-        The length is that of the episodes of the last batch in which one finished. The cost is
-        theirs too, if batches are as long; shorter ones are judged by the cost rate of their own
-        steps times that length.
+        The length is the mean of the last batch in which an episode finished. So is the cost, if
+        batches are at least as long; in shorter batches it is the cost rate times that length.
 
         Args:
             episodes: Statistics of the batch.
@@ -121,7 +120,7 @@ class Constraints:
             self.multiplier.update(costs - self.limits)
 
     def record_prediction(self, metrics: Mapping[str, Tensor]) -> None:
-        """Take in what a policy update reports, before the next batch shows what came of it."""
+        """Store the change of J_c that an update predicts."""
 
     def columns(self) -> dict[str, float]:
         """Violations and multipliers, by column of the table."""
@@ -133,7 +132,7 @@ class Constraints:
     def column(self, name: str, value: Tensor) -> dict[str, float]:
         """One column for a scalar, one per constraint for a vector [k].
 
-        A single number that is no constraint's, as losses of TorchRL's report them, is a scalar.
+        A single number is a scalar unless there is one constraint and the value is a vector.
 
         Raises:
             ValueError: For any other shape.
@@ -189,18 +188,18 @@ def check_cost_limits(
 
 
 CHARGES = "charged_costs"
-"""Below ``"next"``, [N, T, k]: what a risk measure has put in the place of the costs."""
+"""Key below ``"next"``, [N, T, k]: what a risk measure charges instead of the costs."""
 
 
 class TrackedConstraints(Constraints):
     """`Constraints` whose violations come from a `LimitTracker`.
 
-    ``violation`` is by how much a step's surrogate has to lower J_c: J_c less its target, over the
-    share of predicted changes that is realised. Multipliers get J_c less its target.
+    ``violation`` is the change of J_c that a step's surrogate must predict: J_c minus its target,
+    over the share of predicted changes that is realised. Multipliers get J_c minus its target.
 
     Args:
         limits: Cost key -> d, undiscounted cost allowed per episode.
-        tracker: Estimates J_c and what it should be by now.
+        tracker: Estimates J_c and its present target.
         multiplier: Weighs the costs against the return, or None.
         risk: What is limited instead of the mean cost of an episode, or None.
         cost_advantage: Key of the cost advantages that the multiplier weighs.
@@ -229,7 +228,7 @@ class TrackedConstraints(Constraints):
         return self.tracker.schedule if self.keys else ""
 
     def apply_risk(self, episodes: EpisodeStatistics, batch: TensorDictBase) -> None:
-        """Let the risk measure put its charges below ``"next"``, for advantages and violations."""
+        """Write the charges of the risk measure below ``"next"``."""
         if self.risk is None:
             return
         costs = self._costs_of(batch).cpu()
@@ -245,8 +244,8 @@ class TrackedConstraints(Constraints):
     def update(self, episodes: EpisodeStatistics, batch: TensorDictBase) -> None:
         """Take in a batch [N, T] and move the multiplier.
 
-        Cost advantages that are in the batch for a multiplier to weigh are divided by the size of
-        one cost.
+        Cost advantages in the batch are divided by the size of one cost if there is a
+        multiplier.
         """
         state = self.tracker.update(self._costs_of(batch), episodes.decisions, self._charges)
         state = state.to(self.limits.device)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, Literal, get_args
+from typing import Any, Literal
 
 import scipy  # which loads its parts when they are asked for: half a second
 import torch
@@ -30,12 +30,11 @@ class CPOStep(TRPOStep):
     takes the first fraction with KL(π_θ ‖ π_k) ≤ δ and L_c(new) − L_c(old) ≤ max(−c, 0), and,
     unless the step is a recovery (cases 0 and 1), a loss that is not worse.
 
-    The violations are those that the caller hands to every call, of whatever estimate it has of
-    J_c: the mean over finished episodes, or, where a batch is shorter than its episodes, the cost
-    rate of the batch times T̄. Nothing of an earlier call is kept, so that none can be stale.
+    The violations are those of the call, from any estimate of J_c: the mean over finished episodes,
+    or, where a batch is shorter than its episodes, the cost rate of the batch times T̄.
 
     Args:
-        loss: a `CPOLoss`, or a callable of your own that returns a TensorDict with scalars
+        loss: A `CPOLoss`, or a callable of your own that returns a TensorDict with scalars
             ``loss_…`` and the differentiable ``cost_surrogate``, [k].
         rescale_violation: Whether to divide the violations by the episode length; see
             `constraint_value`.
@@ -45,9 +44,6 @@ class CPOStep(TRPOStep):
             reward, until the limit is reached: a return learned in 20 updates is forgotten in as
             many. With 0.8, one constraint leaves √(1 − 0.8²) = 0.6 of the step to the reward.
         settings: Those of every step, see `TRPOStep`.
-
-    Raises:
-        ValueError: if `largest_demand` is not positive.
 
     Examples:
         >>> from tensordict import TensorDict
@@ -73,8 +69,6 @@ class CPOStep(TRPOStep):
         **settings: Any,
     ) -> None:
         super().__init__(loss, **settings)
-        if largest_demand is not None and not largest_demand > 0:
-            raise ValueError(f"largest_demand must be positive or None: {largest_demand}.")
         self.rescale_violation, self.largest_demand = rescale_violation, largest_demand
 
     def _propose(self, problem: StepProblem) -> Proposal:
@@ -183,12 +177,9 @@ class PCPOStep(CPOStep):
     Adds to the diagnostics ``c`` and ``nu``, [k], and ``shortened``, the share of x that is left.
 
     Args:
-        loss: as of a `CPOStep`.
+        loss: As of a `CPOStep`.
         projection: Distance that the projection keeps small.
         settings: Those of a `CPOStep` and of every step, see `TRPOStep`.
-
-    Raises:
-        ValueError: if `projection` is neither of the two.
 
     Examples:
         >>> from tensordict import TensorDict
@@ -214,8 +205,6 @@ class PCPOStep(CPOStep):
         **settings: Any,
     ) -> None:
         super().__init__(loss, **settings)
-        if projection not in get_args(Projection):
-            raise ValueError(f"projection must be one of {get_args(Projection)}: {projection!r}.")
         self.projection = projection
 
     def _propose(self, problem: StepProblem) -> Proposal:

@@ -1,4 +1,4 @@
-"""Transitions of a dataset in a memory, before anything is collected or instead of it."""
+"""Transitions of a dataset in the replay buffer, before or instead of collected ones."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ __all__ = ["begin_memory", "fill_memory"]
 
 
 def _nothing_learned(config: DictConfig) -> str:
-    """That a run ends before it learns, whose figures look like those of one that has learned."""
+    """A warning if the run ends before learning begins; empty otherwise."""
     random_steps = setting(config, "exploration.random_steps")
     if config.frames >= random_steps:
         return ""
@@ -29,13 +29,13 @@ def _nothing_learned(config: DictConfig) -> str:
 
 
 def begin_memory(config: DictConfig, memory: Memory, env: EnvBase) -> tuple[str, bool]:
-    """Fill an empty memory with the dataset of a configuration, if it has one.
+    """Fill an empty replay buffer with the dataset of a configuration, if it has one.
 
     Returns:
-        What is learned from, in a sentence, and whether what is collected comes in addition.
+        What is learned from, in a sentence, and whether collected transitions are added.
 
     Raises:
-        ValueError: As by `fill_memory`, or if nothing else is learned from and there is none.
+        ValueError: As by `fill_memory`, or if ``dataset.alone`` is true without a path.
     """
     node = config.get("dataset")
     if node is None or node.path is None:
@@ -52,22 +52,22 @@ def begin_memory(config: DictConfig, memory: Memory, env: EnvBase) -> tuple[str,
 def fill_memory(
     memory: Memory, node: DictConfig, limits: Mapping[str, float], env: EnvBase, actions: TensorSpec
 ) -> str:
-    """Put the transitions of a dataset into a memory.
+    """Put the transitions of a dataset into a replay buffer.
 
     Args:
-        memory: An empty one.
-        node: ``path`` of a recording's folder or of an HDF5 file, and ``safe_episodes``: whether
-            only whole episodes count that keep the limits.
+        memory: An empty replay buffer.
+        node: ``path`` of a recording's folder or of an HDF5 file, and ``safe_episodes``: whether to
+            take only whole episodes within the limits.
         limits: Cost key -> undiscounted cost allowed per episode.
-        env: Environment that the transitions should be of.
-        actions: Spec of one of its actions, to the bounds of which actions are cut.
+        env: Environment, which the transitions must fit.
+        actions: Spec of one of its actions; actions are clipped to its bounds.
 
     Returns:
         What was taken, in a sentence.
 
     Raises:
-        ValueError: If they are not of this environment, lack what is learned from or are not finite
-            there, no episode keeps the limits, or the memory is too small.
+        ValueError: If they do not fit the environment, lack an entry or are not finite, if no
+            episode is within the limits, or the replay buffer is too small.
     """
     steps = read_dataset(node.path)
     _check(steps, node, memory, env, actions)
@@ -97,7 +97,7 @@ def fill_memory(
 def _check(
     steps: TensorDictBase, node: DictConfig, memory: Memory, env: EnvBase, actions: TensorSpec
 ) -> None:
-    """Refuse what is of another environment, or not enough to learn from."""
+    """Refuse transitions of another environment, or without an entry that the loss reads."""
     if missing := [key for key in memory.in_keys if key not in steps.keys(True)]:
         names = ", ".join(map(_name, missing))
         raise ValueError(f"dataset.path={node.path} has no {names}, which is learned from.")
@@ -114,12 +114,12 @@ def _check(
 
 
 def _check_finite(steps: TensorDictBase, node: DictConfig, keys: Sequence[NestedKey]) -> None:
-    """Refuse numbers that would end a run as if training had diverged, or pass for no cost."""
+    """Refuse numbers that would look like diverged training, or like a cost of 0."""
     for key in keys:
         if wrong := int((~steps[key].isfinite()).any(-1).sum()):
             raise ValueError(
                 f"dataset.path={node.path}: the {_name(key)} of {wrong:,} transitions is not "
-                "finite. Leave the episodes out that they are in, or mend the file."
+                "finite. Remove their episodes, or repair the file."
             )
 
 

@@ -1,6 +1,6 @@
-"""What a loss module returns and holds, as updates take it.
+"""Outputs and state of loss modules, as updates use them.
 
-TorchRL means all entries that are named ``loss_…`` to be minimised; others are diagnostics.
+In TorchRL all entries named ``loss_…`` are minimised; others are diagnostics.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ __all__ = [
 ]
 
 ESTIMATOR = "_value_estimator."
-"""Where losses keep numbers of their value estimators, which a run that is resumed may change."""
+"""Prefix of buffers of value estimators: settings that a resumed run may change."""
 
 _PREFIX = "loss_"
 
@@ -63,15 +63,14 @@ def divergence(losses: TensorDictBase) -> FloatingPointError:
     ]
     return FloatingPointError(
         f"{' and '.join(wrong) or 'The sum of the losses is not finite'}: training has diverged. "
-        "The step that would follow is not taken. Lower the learning rate, or look for a policy "
-        "that has collapsed."
+        "This step is not taken. Lower the learning rate, or look for a policy that has collapsed."
     )
 
 
 _ESTIMATES = ("advantage", "value_target", "value")
-"""Names of keys that losses of TorchRL's read where they are, and have not among their `in_keys`.
+"""Names of keys that TorchRL's losses read if present, and do not list in `in_keys`.
 
-Without them they would estimate advantages themselves, of samples that are in no order.
+Without them the losses would estimate advantages themselves, from shuffled samples.
 """
 
 
@@ -84,7 +83,7 @@ def estimates_read(loss: nn.Module) -> list[NestedKey]:
 
 
 def reported_kl(losses: TensorDictBase) -> Tensor:
-    """The KL divergence by which updates are ended, as the loss reports it.
+    """The KL divergence that the loss reports, for early stopping.
 
     Raises:
         ValueError: If it reports none, or more than one number.
@@ -100,33 +99,35 @@ def reported_kl(losses: TensorDictBase) -> Tensor:
 
 
 class LossState:
-    """Buffers and parameters of losses that no network and no multiplier holds.
+    """Buffers and parameters of losses that belong to no network and no multiplier.
 
-    Coefficients that TorchRL schedules (``register_coeff_buffer``) and numbers of its value
-    estimators are settings, and left out: a run that goes on may be given others.
+    Coefficients that TorchRL schedules (``register_coeff_buffer``) and those of its value
+    estimators are settings, and left out: a resumed run may have others.
 
     Args:
-        losses: Losses that are modules, by place: `PolicyUpdate.loss_modules`.
-        besides: Modules whose state is kept elsewhere; losses share their tensors.
+        losses: Losses by name: `PolicyUpdate.loss_modules`.
+        saved_elsewhere: Modules with a state of their own; losses share their tensors.
 
     Examples:
         >>> network, loss = torch.nn.Linear(2, 1), torch.nn.Module()
         >>> loss.network = network
         >>> loss.register_buffer("weight", torch.tensor(0.5))
-        >>> LossState({"loss": loss}, besides=[network]).state_dict()
+        >>> LossState({"loss": loss}, saved_elsewhere=[network]).state_dict()
         {'loss.weight': tensor(0.5000)}
     """
 
-    def __init__(self, losses: Mapping[str, nn.Module], besides: Iterable[nn.Module]) -> None:
+    def __init__(
+        self, losses: Mapping[str, nn.Module], saved_elsewhere: Iterable[nn.Module]
+    ) -> None:
         self._losses = dict(losses)
-        self._besides = list(besides)
+        self._saved_elsewhere = list(saved_elsewhere)
 
     def __bool__(self) -> bool:
         """Whether there is anything to keep."""
         return bool(self._own())
 
     def state_dict(self) -> dict[str, Tensor]:
-        """Copies, by the place of the loss and the name that it has for them."""
+        """Copies, by the name of the loss and the tensor's name in it."""
         return {name: tensor.detach().clone() for name, tensor in self._own().items()}
 
     @torch.no_grad()
@@ -136,8 +137,9 @@ class LossState:
             tensor.copy_(state_dict[name])
 
     def _own(self) -> dict[str, Tensor]:
-        # looked up anew: a loss may put another tensor in the place of a buffer
-        known = {tensor.data_ptr() for module in self._besides for _, tensor in _tensors(module)}
+        # at every call: a loss may replace a buffer
+        modules = self._saved_elsewhere
+        known = {tensor.data_ptr() for module in modules for _, tensor in _tensors(module)}
         return {
             f"{place}.{name}": tensor
             for place, loss in self._losses.items()

@@ -46,7 +46,7 @@ class KLAdaptiveRate:
         low_kl: Share of the KL limit below which a whole update has fallen short.
 
     Raises:
-        ValueError: if the factor is not above 1 or the bounds are not positive and in order.
+        ValueError: If the factor is not above 1 or the bounds are not positive and in order.
 
     Examples:
         >>> adapt = KLAdaptiveRate(
@@ -75,9 +75,9 @@ class KLAdaptiveRate:
         """Return the rate of the next update.
 
         Args:
-            rate: rate of this update.
-            share_of_steps: steps taken over steps planned.
-            share_of_kl: last KL divergence over its limit.
+            rate: Rate of this update.
+            share_of_steps: Steps taken over steps planned.
+            share_of_kl: Last KL divergence over its limit.
         """
         if share_of_steps < self.few_steps:
             rate = rate / self.factor
@@ -91,8 +91,8 @@ class MinibatchUpdate(PolicyUpdate):
 
     Every pass shuffles the batch once and cuts it into contiguous minibatches of equal size: as
     many as fit ``minibatch_size`` best. Samples that are left over (fewer than there are
-    minibatches) wait for the next pass's shuffle. Of a policy with a memory, whole sequences are
-    shuffled instead of samples.
+    minibatches) are left out of this pass. For a recurrent policy, whole sequences are shuffled
+    instead of samples.
 
     If the loss reports ``kl``, ``max_kl`` stops the update as soon as it is exceeded. The KL is
     that of the minibatch at hand at the parameters before its step, so the check costs nothing and
@@ -100,8 +100,8 @@ class MinibatchUpdate(PolicyUpdate):
     Ray, Achiam, Amodei (2019). With minibatches of thousands of states its error is a few percent.
     The method ``anchor`` of a `SurrogateLoss` is called with the batch before the first step.
 
-    A batch that is beyond ``max_kl`` before the first step, because a policy too different from
-    the present one collected it, teaches nothing; a warning says so.
+    If the KL exceeds ``max_kl`` before the first step, because a very different policy collected
+    the batch, no step is taken and a warning says so.
 
     Args:
         loss: Loss module whose ``in_keys`` name what it needs of the batch; advantages, value
@@ -117,7 +117,7 @@ class MinibatchUpdate(PolicyUpdate):
         compile: Whether to compile the loss and its gradient with torch.compile.
 
     Raises:
-        ValueError: If ``num_passes`` or ``minibatch_size`` is below 1, or ``adapt_rate`` comes
+        ValueError: If an argument is outside its range, or ``adapt_rate`` comes
             without ``max_kl``.
         KeyError: By the call, if ``max_kl`` is set and the loss does not report ``kl``.
         FloatingPointError: By the call, if an entry of the batch is not finite, before any step;
@@ -146,11 +146,6 @@ class MinibatchUpdate(PolicyUpdate):
         adapt_rate: Annotated[KLAdaptiveRate, PART] | None = None,
         compile: bool = False,
     ) -> None:
-        if num_passes < 1 or (minibatch_size is not None and minibatch_size < 1):
-            raise ValueError(
-                f"num_passes={num_passes} and minibatch_size={minibatch_size} must be at least 1; "
-                "minibatch_size=null takes the whole batch."
-            )
         if adapt_rate is not None and max_kl is None:
             raise ValueError("adapt_rate follows the KL divergence: it needs a max_kl.")
         self.loss = loss
@@ -162,7 +157,7 @@ class MinibatchUpdate(PolicyUpdate):
         self._parameters = [parameter for parameter in loss.parameters() if parameter.requires_grad]
         self.optimizer = optimizer(self._parameters)
         self._evaluate = torch.compile(self._total_loss) if compile else self._total_loss
-        # of its own, so that an update at the same time does not change what this one draws
+        # its own generator: an update in another thread must not change its draws
         self._generator = torch.Generator().manual_seed(torch.initial_seed())
 
     def __call__(
@@ -180,7 +175,7 @@ class MinibatchUpdate(PolicyUpdate):
 
         Returns:
             The mean over the steps of everything that the loss reports, save ``kl``, which is the
-            last one measured: after the last step if the limit ended the update, before it if the
+            last one measured: After the last step if the limit ended the update, before it if the
             passes were over; ``num_steps``, the gradient steps taken; and ``lr``, the next
             learning rate, if it is adapted.
         """

@@ -1,4 +1,4 @@
-"""The off-policy recipe: what is collected goes into a memory, minibatches of which are learned."""
+"""The off-policy recipe: a replay buffer, and gradient steps on its minibatches."""
 
 from __future__ import annotations
 
@@ -46,9 +46,9 @@ _UNUSED = {
     "critic_update": "Its Q functions are trained together with the policy: policy_update.",
     "then": "It has one update.",
     "model.head": "The distribution of its actions is the algorithm's own, within their bounds.",
-    "model.initial_log_std": "Its network tells the standard deviation state by state.",
+    "model.initial_log_std": "Its network gives the standard deviation in every state.",
     "preset=paper": "It is the setting of Ray, Achiam, Amodei (2019), none of whose algorithms "
-    "learns from memory: without it the algorithm has numbers of its own.",
+    "has a replay buffer: without it the algorithm has settings of its own.",
 }
 
 
@@ -57,17 +57,17 @@ class OffPolicy(Algorithm, Recipe):
     """SAC, TD3 and their like: an algorithm, and the recipe that builds it.
 
     Attributes:
-        policy: What explores, with the actor's parameters.
+        policy: Exploring policy, with the actor's parameters.
         networks: Actor, critic and, with constraints, cost critic.
-        constraints: Costs, limits and multiplier. Multipliers go by the undiscounted costs of
-            episodes, not by what the discounted critics say.
-        memory: The transitions.
+        constraints: Costs, limits and multiplier. Multipliers follow the undiscounted costs of
+            episodes, not the discounted critics.
+        memory: The replay buffer.
         policy_update: Trains all networks on minibatches.
-        random_steps: Steps of environments that are taken at random in the beginning. Learning
-            begins when the memory holds as many. There are none where nothing is collected.
+        random_steps: Steps of environments with random actions in the beginning. Learning begins
+            when the replay buffer holds as many; 0 if nothing is collected.
         steps_per_decision: Steps of an environment per transition.
-        collects: Whether what is collected goes into the memory.
-        learns_from: What was in it from the beginning, in a sentence, or that nothing will be.
+        collects: Whether collected transitions go into the replay buffer.
+        learns_from: The dataset in it, in a sentence, or a warning that nothing will be learned.
     """
 
     off_policy: ClassVar[bool] = True
@@ -91,7 +91,7 @@ class OffPolicy(Algorithm, Recipe):
 
     @classmethod
     def build(cls, config: DictConfig, env: EnvBase) -> OffPolicy:
-        """Build networks, memory, losses and updates.
+        """Build networks, replay buffer, losses and updates.
 
         Args:
             config: Configuration as composed from ``conf/``.
@@ -99,9 +99,9 @@ class OffPolicy(Algorithm, Recipe):
 
         Raises:
             ValueError: If a cost limit names a cost that the environment does not have, a
-                constrained algorithm gets no limit, actions have no bounds, a risk measure is
-                named that the critics do not know, or the memory is smaller than what learning
-                begins with; or if a dataset does not fit.
+                constrained algorithm gets no limit, actions have no bounds, the critics do not know
+                the risk measure, the replay buffer is too small for learning to begin, or a dataset
+                does not fit.
             FileNotFoundError: If there is no such dataset.
         """
         limits = constrained_limits(config, env, otherwise="sac")
@@ -130,7 +130,6 @@ class OffPolicy(Algorithm, Recipe):
             device=device,
         )
         learns_from, collects = begin_memory(config, memory, env)
-        # what is not learned from explores nothing
         random_steps = setting(config, "exploration.random_steps") if collects else 0
         _check_room(memory, random_steps // env.steps_per_decision, collects)
         return cls(
@@ -149,21 +148,21 @@ class OffPolicy(Algorithm, Recipe):
     def build_policy(
         cls, config: DictConfig, env: EnvBase, device: torch.device
     ) -> tuple[TensorDictModuleBase, Mapping[str, nn.Module]]:
-        """Build what acts; the noise that explores with a deterministic actor is no part of it."""
+        """Build the policy for evaluation, without exploration noise."""
         actor = build_networks(config, env, 0, device)["actor"]
         return exploring(actor, env, 0.0), {"actor": actor}
 
     @property
     def lost_on_resume(self) -> str:
-        """What a checkpoint does not hold, in a sentence; nothing if it holds all."""
+        """What a checkpoint does not hold, in a sentence; empty if it holds all."""
         if self.memory.keeps or not self.collects:
             return ""
-        goes_on = f"goes on when it holds {self.random_steps:,} new ones"
+        resumes = f"resumes when it holds {self.random_steps:,} new ones"
         if len(self.memory):
-            goes_on = "goes on from those of the dataset alone"
+            resumes = "resumes with those of the dataset alone"
         return (
-            "The transitions in its memory are not stored, by memory.keep=false: learning "
-            f"{goes_on}, and differs from a run that was not interrupted."
+            "The transitions in its replay buffer are not stored (memory.keep=false): learning "
+            f"{resumes}, and differs from a run that was not interrupted."
         )
 
     @property
@@ -172,14 +171,14 @@ class OffPolicy(Algorithm, Recipe):
         return self.constraints.schedule
 
     def learn(self, batch: TensorDictBase, episodes: EpisodeStatistics) -> dict[str, float]:
-        """Take in a batch [N, T], and learn as much as it allows from all that is remembered.
+        """Store a batch [N, T] and take the gradient steps that are due on the replay buffer.
 
         Args:
             batch: Steps of the present policy, in order of time.
             episodes: Its episodes.
 
         Returns:
-            Everything that is worth a column of the log, by column name.
+            Values for columns of the table, by name.
         """
         constraints = self.constraints
         if constraints.keys:
@@ -201,11 +200,11 @@ class OffPolicy(Algorithm, Recipe):
         return row
 
     def networks_replaced(self) -> None:
-        """Let target networks begin where the networks do, which have got another run's weights."""
+        """Set target networks to the networks, which have received another run's weights."""
         self.policy_update.equate_targets()
 
     def forget_open_episodes(self) -> None:
-        """Let no sum over n steps reach into what comes next, which belongs to new episodes."""
+        """End n-step sums: the next steps belong to new episodes."""
         self.memory.end_rows()
 
     def _count_steps(self, steps: int) -> None:
@@ -223,7 +222,7 @@ class OffPolicy(Algorithm, Recipe):
         self.constraints.load_state_dict(state_dict["constraints"])
 
     def checkpoint_components(self) -> dict[str, Stateful]:
-        """Parts with a ``state_dict``, by name; the memory only if it is to be kept."""
+        """Parts with a state, by name; the replay buffer only with ``memory.keep``."""
         parts: dict[str, Stateful | None] = {
             **self.networks,
             "multiplier": self.constraints.multiplier,
@@ -235,7 +234,7 @@ class OffPolicy(Algorithm, Recipe):
 
 
 def _check_critics(config: DictConfig) -> None:
-    """Refuse to be without the Q functions that a loss learns."""
+    """Refuse 0 Q functions of a kind that the loss learns."""
     loss = locate(config.loss.get("_target_"), "loss._target_")
     for key, kind in (("critics.rewards", QFunctionLoss), ("critics.costs", CostCritics)):
         if not setting(config, key) and isclass(loss) and issubclass(loss, kind):
@@ -246,13 +245,13 @@ def _check_critics(config: DictConfig) -> None:
 
 
 def _check_room(memory: Memory, random_steps: int, collects: bool) -> None:
-    """Refuse a memory that never comes to hold what learning begins with."""
+    """Refuse a replay buffer that is too small for learning to begin."""
     size = memory.batch_size
     needed = f"a minibatch of {size} (memory.batch_size), or nothing is ever learned."
     if not collects and size > len(memory):
         raise ValueError(
-            f"dataset.alone=true: the memory holds {len(memory):,} transitions of the dataset and "
-            f"gets no others. It must hold {needed}"
+            f"dataset.alone=true: the replay buffer holds {len(memory):,} transitions of the "
+            f"dataset and gets no others. It must hold {needed}"
         )
     if max(random_steps, size) > memory.capacity:
         raise ValueError(
@@ -262,14 +261,14 @@ def _check_room(memory: Memory, random_steps: int, collects: bool) -> None:
 
 
 def _check_memory(config: DictConfig, loss: ReplayLoss) -> None:
-    """Refuse what makes sense of values only for a loss that learns none."""
+    """Refuse settings of value learning for a loss that learns no values."""
     if loss.learns_values:
         return
     for key, off in (("n_steps", 1), ("prioritised", None)):
         if config.memory[key] != off:
             raise ValueError(
-                f"memory.{key}={config.memory[key]}: algo={config.algo.name} learns no values, of "
-                f"which this would be about. Use memory.{key}={'null' if off is None else off}."
+                f"memory.{key}={config.memory[key]}: algo={config.algo.name} learns no values, and "
+                f"ignores this. Use memory.{key}={'null' if off is None else off}."
             )
 
 
@@ -280,7 +279,7 @@ def _check_risk(config: DictConfig, constraints: Constraints, loss: ReplayLoss) 
         return
     limited = "mean costs" if known is None else f"mean costs or {known.__name__}"
     raise ValueError(
-        f"risk: algo={config.algo.name} limits {limited} only, for what a risk measure charges for "
-        "a step depends on the episode: use risk=mean, algo=wcsac with risk=cvar, or learn on "
-        "policy."
+        f"risk: algo={config.algo.name} limits {limited} only, because the charge of a step "
+        "depends on its episode: use risk=mean, algo=wcsac with risk=cvar, or an on-policy "
+        "algorithm."
     )

@@ -1,4 +1,4 @@
-"""Networks of algorithms that learn from memory, as a configuration describes them."""
+"""Networks of off-policy algorithms, as a configuration describes them."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def setting(config: DictConfig, key: str) -> Any:
 
 
 def bounded_actions(env: EnvBase) -> TensorSpec:
-    """Spec of one environment's action, [A], which has bounds; in single precision, as networks.
+    """Spec of one environment's bounded action, [A], in single precision as networks are.
 
     Raises:
         ValueError: If it has none, or another shape.

@@ -148,7 +148,7 @@ class OnPolicy(Algorithm, Recipe):
             episodes: Its episodes.
 
         Returns:
-            Everything that is worth a column of the log, by column name.
+            Values for columns of the table, by name.
         """
         self.constraints.apply_risk(episodes, batch)
         self.advantage(batch)
@@ -181,7 +181,7 @@ class OnPolicy(Algorithm, Recipe):
         return self.constraints.column("critic_bias", bias)
 
     def _update(self, batch: TensorDictBase) -> dict[str, Mapping[str, Tensor]]:
-        """Improve the policy and fit the critics: neither needs what the other does."""
+        """Improve the policy and fit the critics, in parallel where they are independent."""
         constraints = self.constraints
         given = (batch, constraints.violation, constraints.episode_length)
 
@@ -195,21 +195,21 @@ class OnPolicy(Algorithm, Recipe):
         return dict(zip(("policy", "critic"), both, strict=True))
 
     def _shares_critics(self) -> bool:
-        """Whether the policy's update moves a critic, which two threads must not do at once."""
+        """Whether the policy's update changes a critic: then the updates cannot run in parallel."""
         fitting = self.critic_update.loss_modules().values()
         fitted = {p.data_ptr() for module in fitting for p in module.parameters()}
         moved = [self.actor, *self.policy_update.loss_modules().values()]
         return any(p.data_ptr() in fitted for module in moved for p in module.parameters())
 
     def checkpoint_components(self) -> dict[str, Stateful]:
-        """Parts with a ``state_dict``, by name: together they are all that learning depends on."""
+        """Parts with a state, by name."""
         multiplier = self.constraints.multiplier
         kept = [*self.networks.values(), *([] if multiplier is None else [multiplier])]
         parts: dict[str, Stateful | None] = {
             **self.networks,
             "multiplier": multiplier,
-            # None where losses hold nothing, as all of the package's do
-            "losses": LossState(self.policy_update.loss_modules(), besides=kept) or None,
+            # None where losses hold nothing, as those of this package
+            "losses": LossState(self.policy_update.loss_modules(), saved_elsewhere=kept) or None,
             "policy_update": self.policy_update,
             "critic_update": self.critic_update,
             "algorithm": self.constraints,

@@ -61,15 +61,12 @@ class CTRPOStep(TRPOStep):
     Adds ``recovers`` to the diagnostics, [k]: 1 for the costs that are being recovered.
 
     Args:
-        loss: a `CPOLoss`, or a callable of your own that returns a TensorDict with scalars
+        loss: A `CPOLoss`, or a callable of your own that returns a TensorDict with scalars
             ``loss_…`` and the differentiable ``cost_surrogate``, [k].
         cost_limits: d, as of a multiplier; see `parse_cost_limits`.
         beta: Weight β of the barrier, per unit of an episode's undiscounted cost, for every cost.
         hysteresis: Share of d at which a recovery ends; 1 ends it at the limit.
         settings: Those of every step, see `TRPOStep`.
-
-    Raises:
-        ValueError: if `hysteresis` is outside its range.
 
     Examples:
         >>> from tensordict import TensorDict
@@ -100,8 +97,6 @@ class CTRPOStep(TRPOStep):
         **settings: Any,
     ) -> None:
         super().__init__(loss, **settings)
-        if not 0 < hysteresis <= 1:
-            raise ValueError(f"hysteresis must be in (0, 1], got {hysteresis}.")
         self.limits = parse_cost_limits(cost_limits)[1]
         self.beta = beta
         self.recovered = -(1 - hysteresis) * self.limits
@@ -159,7 +154,7 @@ class CRPOStep(TRPOStep):
     Adds ``reduces`` to the diagnostics, [k]: 1 for the cost that the step was against.
 
     Args:
-        loss: a `CPOLoss`, or a callable of your own that returns a TensorDict with scalars
+        loss: A `CPOLoss`, or a callable of your own that returns a TensorDict with scalars
             ``loss_…`` and the differentiable ``cost_surrogate``, [k].
         tolerance: Tolerated violation η, undiscounted cost per episode.
         settings: Those of every step, see `TRPOStep`.

@@ -1,4 +1,4 @@
-"""Transitions of a run that are kept and drawn again, uniformly or by priority."""
+"""The replay buffer: transitions drawn uniformly or by priority."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from torchrl.data.replay_buffers.storages import Storage
 from torchrl.envs import MultiStepTransform
 
 from safe_rl.algorithms.algorithm_contract import Stateful
-from safe_rl.ranges import Bytes, Count, Range, Share
+from safe_rl.ranges import Bytes, Checked, Count, Range, Share
 
 __all__ = ["Memory", "ProportionalSampler"]
 
@@ -26,18 +26,17 @@ _LONGEST_ROW = 1_000
 """Steps of a row that are summed at a time: TorchRL goes through all of them for every episode."""
 
 
-class Memory:
-    """A `TensorDictReplayBuffer` of single transitions, or of such that span n steps.
+class Memory(Checked):
+    """A `TensorDictReplayBuffer` of transitions over one step or over n steps.
 
     A transition over n steps holds the discounted sum of n rewards, and of n costs, and the n-th
     observation after its own. Where the episode ends before, it ends there; ``terminated`` is that
-    of its last step. Time-outs are truncations, after which values go on.
+    of its last step. Time-outs are truncations: values bootstrap after them.
 
     Args:
         capacity: Transitions that are kept; the oldest go first.
         batch_size: Transitions in a minibatch.
-        in_keys: Entries of a step that are kept; what rewards and costs are is said by
-            ``reward_keys``.
+        in_keys: Entries of a step that are kept.
         reward_keys: Entries below ``next`` that are summed over n steps.
         reward_gamma: Discount per step of these sums.
         n_steps: Steps n of n-step returns.
@@ -49,7 +48,7 @@ class Memory:
         device: Device of the minibatches.
 
     Raises:
-        ValueError: If there is no such storage, or priorities lack an exponent.
+        ValueError: If an argument is outside its range, or priorities lack an exponent.
 
     Examples:
         >>> memory = Memory(
@@ -77,8 +76,6 @@ class Memory:
         keep: bool,
         device: torch.device | str | None = None,
     ) -> None:
-        if storage not in _STORAGES:
-            raise ValueError(f"storage={storage}: it must be one of {', '.join(_STORAGES)}.")
         self.batch_size, self.keeps, self.capacity = batch_size, keep, capacity
         self._in_keys, self._device = list(in_keys), torch.device(device or "cpu")
         self._is_prioritised = prioritised is not None
@@ -90,8 +87,8 @@ class Memory:
         )
         self._multi_step: MultiStepTransform | None = None
         if n_steps > 1:
-            # by default it leaves `terminated` that of the first step, and values would go on
-            # after an end that lies within the n steps
+            # by default it keeps `terminated` of the first step: values would bootstrap beyond an
+            # end within the n steps
             self._multi_step = MultiStepTransform(
                 n_steps, reward_gamma, reward_keys=list(reward_keys), done_keys=[]
             )
@@ -119,9 +116,9 @@ class Memory:
         return [piece for piece in found if piece is not None]
 
     def end_rows(self) -> None:
-        """What comes next does not follow what came last: sums over n steps end with that."""
+        """End sums over n steps: the next batch does not follow the last one."""
         transform = self._multi_step
-        # the transform has no public way to the steps that wait for what follows them
+        # the transform has no public access to steps whose sums are not complete
         if transform is None or transform._buffer is None:
             return
         waiting = transform._buffer.clone()
@@ -164,7 +161,7 @@ class Memory:
             state["sampler"] = self._buffer.sampler.state_dict()
         if size:
             steps = self._buffer[:].exclude("index").flatten_keys("/")
-            # a file gets the whole of what a part of is saved
+            # torch saves the whole storage of a view
             steps = steps if size == self.capacity else steps.clone()
             state["steps"] = {key: v.as_subclass(torch.Tensor) for key, v in steps.items()}
         tail = None if self._multi_step is None else self._multi_step._buffer
@@ -186,7 +183,7 @@ class Memory:
         if self._multi_step is not None:
             self._multi_step._buffer = None
             if "tail" in state_dict:
-                # of the run before, which may have been on another device
+                # the saved run may have used another device
                 tail = TensorDict(state_dict["tail"], state_dict["tail_shape"], device=self._device)
                 self._multi_step._buffer = tail.unflatten_keys("/")
 
@@ -203,7 +200,7 @@ def _sampler(capacity: int, prioritised: Mapping[str, float] | None) -> Sampler:
 
 
 _SMALLEST = 1e-8
-"""What is added to an error, so that every transition can be drawn."""
+"""Added to errors, so that every transition can be drawn."""
 
 
 class ProportionalSampler(Sampler):

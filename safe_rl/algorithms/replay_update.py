@@ -1,4 +1,4 @@
-"""Gradient updates on minibatches from a memory, with target networks that follow."""
+"""Gradient updates on minibatches from a replay buffer, with target networks."""
 
 from __future__ import annotations
 
@@ -16,30 +16,30 @@ from safe_rl.algorithms.losses import ESTIMATOR, divergence, sum_of_losses
 from safe_rl.algorithms.replay_buffer import Memory
 from safe_rl.naming import did_you_mean
 from safe_rl.objectives.q_functions import ReplayLoss
-from safe_rl.ranges import PART, Positive, Range
+from safe_rl.ranges import PART, Checked, Positive, Range
 
 __all__ = ["ReplayUpdate"]
 
 
-class ReplayUpdate:
-    """Minimise the sum of all ``loss_*`` on minibatches, and let target networks follow.
+class ReplayUpdate(Checked):
+    """Minimise the sum of all ``loss_*`` on minibatches, and move target networks.
 
     Args:
         loss: Loss on steps of the buffer, with target networks unless ``tau`` is None.
         optimizer: Function of the parameters that builds the optimiser, for example
             ``functools.partial(torch.optim.Adam, lr=3e-4, fused=True)``.
         updates_per_step: Gradient steps per step of an environment, the update-to-data ratio.
-        tau: Share τ of the way that target networks go to the networks after every step; None
-            without any.
+        tau: Step τ of target networks towards the networks after every step; None without target
+            networks.
         policy_delay: Steps of the critics per step of the policy, and of the targets.
-        rates: Learning rates of parameters whose names begin with a key, such as ``log_alpha``;
-            others have the optimiser's.
+        rates: Learning rates of parameters whose names begin with a key, such as ``log_alpha``; for
+            others that of the optimiser.
         max_grad_norm: Norm to which the gradient is clipped, or None.
         compile: Whether to compile the losses with torch.compile.
 
     Raises:
-        ValueError: If a key of ``rates`` is the beginning of no parameter's name, or the loss has
-            target networks and there is no ``tau``.
+        ValueError: If an argument is outside its range, no parameter's name begins with a key of
+            ``rates``, or the loss has target networks and ``tau`` is None.
         FloatingPointError: By the call, if a loss is not finite, before the step that would follow.
 
     Examples:
@@ -71,15 +71,15 @@ class ReplayUpdate:
         self.updates_per_step, self.max_grad_norm = updates_per_step, max_grad_norm
         self.optimizer = optimizer(_groups(loss, rates or {}))
         self._device = next(loss.parameters()).device
-        # makes them equal, and refuses a loss that has none; its steps cost three times as much
+        # makes them equal, and refuses a loss without target networks; its steps are slow
         self._share = 0.0 if tau is None else 1 - SoftUpdate(loss, tau=tau).eps
         pairs = loss.target_pairs()
         self._targets = [target.data for target, _ in pairs]
         self._sources = [source.data for _, source in pairs]
         if pairs and tau is None:
             raise ValueError(
-                f"tau is null, but {type(loss).__name__} has target networks: they would stay as "
-                "they are at first. Give the share of the way that they go, such as tau=0.01."
+                f"tau is null, but {type(loss).__name__} has target networks: they would never "
+                "change. Set the step towards the networks, such as tau=0.01."
             )
         self._evaluate: Callable[..., tuple[Tensor, TensorDictBase]]
         self._evaluate = torch.compile(self._losses) if compile else self._losses
@@ -92,7 +92,7 @@ class ReplayUpdate:
             target.copy_(source)
 
     def due(self, steps: int) -> int:
-        """Gradient steps that have become due with as many steps of environments."""
+        """Gradient steps that are due after this number of environment steps."""
         owed = self._counts["owed"] + steps * self.updates_per_step
         self._counts["owed"] = owed - int(owed)
         return int(owed)
@@ -136,12 +136,12 @@ class ReplayUpdate:
         self._counts["updates"] += 1
 
     def _tensors(self) -> Iterator[tuple[str, Tensor]]:
-        """What the loss has come to hold, by name."""
+        """Parameters and buffers of the loss, by name."""
         named = chain(self.loss.named_parameters(), self.loss.named_buffers())
         return ((name, tensor) for name, tensor in named if not name.startswith(ESTIMATOR))
 
     def state_dict(self) -> dict[str, Any]:
-        """Optimiser, target networks and whatever else the loss holds."""
+        """Optimiser, target networks and all other tensors of the loss."""
         return {
             "optimizer": self.optimizer.state_dict(),
             "loss": {name: tensor.detach().clone() for name, tensor in self._tensors()},
@@ -154,7 +154,7 @@ class ReplayUpdate:
         self.optimizer.load_state_dict(state_dict["optimizer"])
         stored = state_dict["loss"]
         for name, tensor in self._tensors():
-            # a constant that TorchRL makes with the first loss: a run without one has not stored it
+            # a constant that TorchRL makes with the first loss: before an update it is not stored
             if name in stored or name != "_target_entropy":
                 tensor.copy_(stored[name])
         self._counts.update(state_dict["counts"])
@@ -169,7 +169,7 @@ def _groups(loss: ReplayLoss, rates: Mapping[str, float]) -> list[dict[str, Any]
     groups: dict[str, list[Tensor]] = {"": [], **{prefix: [] for prefix in rates}}
     for name, parameter in loss.named_parameters():
         if parameter.requires_grad:
-            # the longest, of which the others may be beginnings
+            # the longest matching prefix
             groups[max(filter(name.startswith, rates), key=len, default="")].append(parameter)
     empty = [prefix for prefix in rates if not groups[prefix]]
     if empty:

@@ -13,7 +13,7 @@ from tensordict import TensorDict, TensorDictBase
 from torchrl.trainers import Trainer
 from torchrl.trainers.trainers import OptimizationStepper, TrainerHookBase
 
-from safe_rl.algorithms.algorithm_contract import PolicyUpdate
+from safe_rl.algorithms.algorithm_contract import PolicyUpdate, Stateful, load_states, states_of
 from safe_rl.algorithms.constraints import Constraints
 from safe_rl.algorithms.minibatch import MinibatchUpdate
 from safe_rl.collectors import EpisodeAccounting
@@ -22,17 +22,17 @@ __all__ = ["ConstraintHook", "UpdateStepper"]
 
 
 class ConstraintHook(TrainerHookBase):
-    """Shows every collected batch to the constraints, which move their multiplier.
+    """Updates the constraints, and with them the multiplier, with every collected batch.
 
-    Registered with a trainer it runs before anything is learnt from a batch, and logs returns,
-    costs, violations and multipliers.
+    Registered with a trainer it runs before the losses, and logs returns, costs, violations and
+    multipliers.
 
     Args:
-        constraints: what is limited; its multiplier, if any, is the one that the loss reads.
-        accounting: sums costs and rewards of the collector's batches over episodes.
+        constraints: What is limited; its multiplier, if any, is the one that the loss reads.
+        accounting: Sums costs and rewards of the collector's batches over episodes.
 
     Raises:
-        TypeError: if the constraints charge steps, as `TrackedConstraints` do for a risk measure.
+        TypeError: If the constraints charge steps, as `TrackedConstraints` do for a risk measure.
 
     Examples:
         >>> accounting = EpisodeAccounting(num_envs=1, cost_keys=["cost"])
@@ -48,9 +48,8 @@ class ConstraintHook(TrainerHookBase):
         if type(constraints).apply_risk is not Constraints.apply_risk:
             raise TypeError(
                 f"ConstraintHook takes plain Constraints, not {type(constraints).__name__}: these "
-                "put charges of their own in the place of costs before advantages are estimated, "
-                "and estimates of TorchRL's trainers would not see them. Use Constraints(limits), "
-                "or train.py with risk=…."
+                "replace costs before advantages are estimated, which TorchRL's trainers do not "
+                "see. Use Constraints(limits), or train.py with risk=…."
             )
         self.constraints, self.accounting = constraints, accounting
         self._row: dict[str, float] = {}
@@ -69,15 +68,14 @@ class ConstraintHook(TrainerHookBase):
 
     def state_dict(self) -> dict[str, Any]:
         """Open episodes, last known costs and multiplier."""
-        return {name: part.state_dict() for name, part in self._parts().items()}
+        return states_of(self._parts())
 
     def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
         """Continue from :meth:`state_dict`."""
-        for name, part in self._parts().items():
-            part.load_state_dict(state_dict[name])
+        load_states(self._parts(), state_dict)
 
-    def _parts(self) -> dict[str, Any]:
-        parts = {
+    def _parts(self) -> dict[str, Stateful]:
+        parts: dict[str, Stateful | None] = {
             "accounting": self.accounting,
             "constraints": self.constraints,
             "multiplier": self.constraints.multiplier,
@@ -98,9 +96,9 @@ class UpdateStepper(OptimizationStepper):
     batch, to which a trust-region step belongs, with ``optim_steps_per_batch=1``.
 
     Args:
-        policy_update: a `TRPOStep`, a `CPOStep` or a `MinibatchUpdate`.
-        critic_update: fits the critics afterwards, or None.
-        constraints: what a constrained step has to keep, filled by a `ConstraintHook`; or None.
+        policy_update: A `TRPOStep`, a `CPOStep` or a `MinibatchUpdate`.
+        critic_update: Fits the critics afterwards, or None.
+        constraints: What a constrained step has to keep, filled by a `ConstraintHook`; or None.
 
     Examples:
         >>> from safe_rl.algorithms import TRPOStep
@@ -130,11 +128,11 @@ class UpdateStepper(OptimizationStepper):
         """Improve policy and critics on a batch.
 
         Args:
-            trainer: not asked for anything.
-            sub_batch: data with advantages and value targets, any shape.
+            trainer: Not asked for anything.
+            sub_batch: Data with advantages and value targets, any shape.
 
         Returns:
-            What the updates report, as scalars: one per constraint of what there is per constraint.
+            What the updates report, as scalars: One per constraint of what there is per constraint.
         """
         del trainer
         known = self.constraints
@@ -149,11 +147,12 @@ class UpdateStepper(OptimizationStepper):
 
     def state_dict(self) -> dict[str, Any]:
         """State of both updates."""
-        updates = {"policy_update": self.policy_update, "critic_update": self.critic_update}
-        return {name: part.state_dict() for name, part in updates.items() if part is not None}
+        return states_of(self._parts())
 
     def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
         """Continue from :meth:`state_dict`."""
-        self.policy_update.load_state_dict(state_dict["policy_update"])
-        if self.critic_update is not None:
-            self.critic_update.load_state_dict(state_dict["critic_update"])
+        load_states(self._parts(), state_dict)
+
+    def _parts(self) -> dict[str, Stateful]:
+        critic = {} if self.critic_update is None else {"critic_update": self.critic_update}
+        return {"policy_update": self.policy_update, **critic}

@@ -41,7 +41,7 @@ class StepProblem(NamedTuple):
     """What a step is proposed from.
 
     Attributes:
-        losses: entries of the loss before the step, with gradients.
+        losses: Entries of the loss before the step, with gradients.
         fisher: Fisher matrix of the policy.
         cost_violation: J_c − d, [k], if the caller knows it.
         episode_length: T̄, scalar, if the caller knows it.
@@ -74,10 +74,10 @@ class Proposal(NamedTuple):
     """A full step, and the conditions under which a line search may take it.
 
     Attributes:
-        step: change of the parameters, [P].
-        is_acceptable: judges the losses and the KL divergence after a step that is no further than
+        step: Change of the parameters, [P].
+        is_acceptable: Judges the losses and the KL divergence after a step that is no further than
             δ.
-        diagnostics: what is worth logging about the step.
+        diagnostics: What is worth logging about the step.
     """
 
     step: Tensor
@@ -89,7 +89,7 @@ def total_loss(losses: TensorDictBase) -> Tensor:
     """Sum of all entries that are named ``loss_…``: what TorchRL means to be minimised.
 
     Raises:
-        FloatingPointError: if it is not finite.
+        FloatingPointError: If it is not finite.
     """
     total = sum_of_losses(losses)
     if not total.isfinite():
@@ -111,7 +111,7 @@ class TRPOStep(PolicyUpdate):
     a surrogate of your own; their sum is minimised.
 
     Args:
-        loss: the loss; a `TRPOLoss`, a `TRPOLagrangianLoss` or your own.
+        loss: The loss; a `TRPOLoss`, a `TRPOLagrangianLoss` or your own.
         target_kl: Radius δ of the trust region, mean KL divergence over the states of the batch.
         damping: Multiple of the identity added to the Fisher matrix.
         cg_iterations: Iterations of the conjugate gradient method, for every system solved.
@@ -152,11 +152,6 @@ class TRPOStep(PolicyUpdate):
             if not isinstance(loss, LossModule):
                 raise ValueError("The loss is no LossModule: pass the policy as actor_network.")
             actor_network = loss.actor_network
-        if not (target_kl > 0 and 0 < backtrack_coeff < 1 and 0 < fisher_subsample <= 1):
-            raise ValueError(
-                "target_kl must be positive, backtrack_coeff in (0, 1) and fisher_subsample in "
-                f"(0, 1]; got {target_kl}, {backtrack_coeff} and {fisher_subsample}."
-            )
         self.target_kl, self.damping, self.cg_iterations = target_kl, damping, cg_iterations
         self.backtrack_coeff, self.max_backtracks = backtrack_coeff, max_backtracks
         self.fisher_subsample = fisher_subsample
@@ -172,7 +167,7 @@ class TRPOStep(PolicyUpdate):
         """Take one step.
 
         Args:
-            batch: on-policy data with what the loss reads, of any shape; padding is left out.
+            batch: On-policy data with what the loss reads, of any shape; padding is left out.
             cost_violation: J_c − d, [k]; read by constrained steps only.
             episode_length: T̄, scalar; read by constrained steps only.
 
@@ -182,7 +177,7 @@ class TRPOStep(PolicyUpdate):
             (tries before that one) and what the step itself reports.
 
         Raises:
-            FloatingPointError: if an entry of the batch, the loss or the step is not finite; the
+            FloatingPointError: If an entry of the batch, the loss or the step is not finite; the
                 policy is as it was then.
         """
         if isinstance(self.loss, LossModule):

@@ -195,12 +195,12 @@ class EpisodeAccounting:
         return sums[is_finished]
 
     def _require_costs(self, costs: Tensor) -> None:
-        """Refuse costs [N, T, k] below 0; those that are NaN are for others to name."""
+        """Refuse costs [N, T, k] below 0; NaN is refused later, by the loss."""
         for key, below in zip(self.cost_keys, (costs < 0).sum((0, 1)).tolist(), strict=True):
             if below:
                 raise EpisodeError(
                     f"The cost '{key_name(key)}' is below 0 in {below} of {costs[..., 0].numel()} "
-                    "steps, and nothing has been learnt from them. Costs are 0 or more: let the "
+                    "steps, and nothing has been learned from them. Costs are 0 or more: let the "
                     "environment clamp them, or add the same to every step and, times the steps of "
                     "an episode, to the limit."
                 )
@@ -236,11 +236,11 @@ class EpisodeAccounting:
         return self._open_sums[:, 0] != 0
 
     def forget_open_episodes(self) -> None:
-        """Drop the sums of episodes that will never be finished: the environment starts anew."""
+        """Drop the sums of open episodes: the environment starts new ones."""
         self._open_sums.zero_()
 
     def ignore_open_episodes(self) -> None:
-        """Leave the open episodes, which are cut short, out of all statistics of episodes."""
+        """Leave the open episodes, which started late, out of all statistics."""
         self._open_sums.fill_(torch.nan)
 
     def state_dict(self) -> dict[str, Tensor]:

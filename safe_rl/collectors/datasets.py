@@ -56,11 +56,11 @@ def read_dataset(path: Path | str) -> TensorDictBase:
 
 
 def safe_episodes(steps: TensorDictBase, limits: Mapping[str, float]) -> TensorDictBase:
-    """Steps [1, M] of the whole episodes that cost no more than limits allow, one after the other.
+    """Steps [1, M] of all complete episodes within the limits, one after the other.
 
     Args:
-        steps: Consecutive steps [N, T]; a row's last episode counts only if it is over, and none
-            that is ``partial`` in a step, where there is such an entry.
+        steps: Consecutive steps [N, T]; the last episode of a row counts only if finished, and none
+            with a ``partial`` step, where there is such an entry.
         limits: Cost key -> undiscounted cost allowed per episode.
 
     Examples:
@@ -124,12 +124,12 @@ def read_hdf5(path: Path | str) -> TensorDict:
 
 
 def _check_tree(path: Path | str, file: Any, h5py: Any) -> None:
-    """Refuse a file that leads to other files, or that declares far more than it can hold.
+    """Refuse a file with links to others, or with declared sizes far beyond its own.
 
     Raises:
         ValueError: If so.
     """
-    left = 1000 * Path(path).stat().st_size  # more than any compression of HDF5's makes of it
+    left = 1000 * Path(path).stat().st_size  # no compression of HDF5 reaches this
     groups, seen = [file], set()
     while groups:
         group = groups.pop()
@@ -138,7 +138,7 @@ def _check_tree(path: Path | str, file: Any, h5py: Any) -> None:
                 raise ValueError(f"{path}: {name} is a link, and only arrays are read.")
             node = group[name]
             place = h5py.h5o.get_info(node.id).addr
-            if place in seen:  # a group may hold itself
+            if place in seen:  # a group may contain itself
                 continue
             seen.add(place)
             if isinstance(node, h5py.Group):

@@ -13,7 +13,14 @@ from torchrl.collectors import Collector, MultiSyncCollector
 from torchrl.collectors.distributed import RayCollector
 from torchrl.envs import EnvBase
 
-from safe_rl.collectors.workers import Known, MakeEnv, WorkerCollector, check_rows, split_rows
+from safe_rl.collectors.workers import (
+    Known,
+    KnownWorkers,
+    MakeEnv,
+    WorkerCollector,
+    check_rows,
+    split_rows,
+)
 from safe_rl.extras import needs_extra
 from safe_rl.processes import starting_processes
 from safe_rl.ranges import Options, Range
@@ -77,8 +84,8 @@ def make_collector(
     )
 
 
-class _ProcessCollector(MultiSyncCollector):
-    """TorchRL's, known while it starts: its processes are what it may for ever wait for."""
+class _ProcessCollector(KnownWorkers, MultiSyncCollector):
+    """Known while it starts, because a worker may die before all have started."""
 
     def __init__(self, known: Known, *args: Any, **options: Any) -> None:
         known(self)
@@ -129,6 +136,12 @@ def make_process_collector(
     return WorkerCollector(start, env.batch_size.numel(), torch.device(device))
 
 
+class _RayCollector(KnownWorkers, RayCollector):
+    def __init__(self, *args: Any, **options: Any) -> None:
+        super().__init__(*args, **options)
+        self.closed = False
+
+
 @needs_extra("ray", "ray")
 def make_ray_collector(
     env: EnvBase,
@@ -160,7 +173,7 @@ def make_ray_collector(
 
     def start(known: Known) -> None:
         known(
-            RayCollector(
+            _RayCollector(
                 split_rows(env, make_env, num_collectors),
                 policy,
                 frames_per_batch=frames_per_batch,

@@ -18,9 +18,9 @@ from safe_rl.files import check_no_links, read_bounded, read_json
 __all__ = ["PARTIAL", "Recording", "StepRecorder", "read_recording"]
 
 PARTIAL = "partial"
-"""Entry [N, T, 1], true in an episode that the recording has not the whole of."""
+"""Entry [N, T, 1], true in some step of an episode that is not recorded completely."""
 
-# of a step and of what follows it; what a policy writes besides is not recorded
+# other entries, such as those that a policy writes, are not recorded
 _FLAGS = ("done", "terminated", "truncated")
 _UNFINISHED = ".unfinished-"
 
@@ -59,10 +59,10 @@ class Recording:
         self._keys = ["observation", "action", *(("next", key) for key in following)]
 
     def begin(self, number: int = 0) -> None:
-        """Remove what is there of an earlier recording, from a batch on.
+        """Remove the batches of an earlier recording, from a number on.
 
         Raises:
-            ValueError: If the folder is a link, or holds links: others' files could be removed.
+            ValueError: If the folder is a link or holds links: files elsewhere could be removed.
         """
         if self.folder.is_symlink():
             raise ValueError(f"{self.folder} is a link: a recording is written to a folder.")
@@ -76,14 +76,13 @@ class Recording:
     def write(self, number: int, batch: TensorDictBase, *, begun: Tensor | None = None) -> None:
         """Write a batch [N, T] under its number; one that is there already is replaced.
 
-        Episodes that are open in the last batch there is end there, as partial ones, if it is not
-        the one before this.
+        If the previous batch is missing, open episodes of the last recorded one end there and are
+        marked as partial.
 
         Args:
             number: Of the batch, which follows the one before it.
             batch: Consecutive steps.
-            begun: Rows [N] whose first step is not the first of its episode, for where the batch
-                before is not recorded.
+            begun: Rows [N] that start within an episode, for use if the previous batch is missing.
         """
         steps = batch.select(*self._keys).cpu()
         steps[PARTIAL] = torch.zeros_like(steps["next", "done"])
@@ -95,7 +94,7 @@ class Recording:
         self._store(number, steps)
 
     def cut_after(self, number: int) -> None:
-        """Note that what follows a batch begins anew: episodes that are open there stay partial."""
+        """End the open episodes of a batch as partial ones, because new episodes follow."""
         if not self._place(number).exists():
             return
         steps = _read(self._place(number))
@@ -110,7 +109,7 @@ class Recording:
     def _store(self, number: int, steps: TensorDictBase) -> None:
         place = self._place(number)
         self.folder.mkdir(parents=True, exist_ok=True)
-        # whole or not at all: a run may end at any moment
+        # written completely or not at all: a run may end at any moment
         with tempfile.TemporaryDirectory(prefix=_UNFINISHED, dir=self.folder) as unfinished:
             written = Path(unfinished) / place.name
             steps.memmap(str(written), copy_existing=True)
@@ -120,7 +119,7 @@ class Recording:
 
 
 class StepRecorder:
-    """Hands single steps [N] on to a recording, many at a time.
+    """Collects single steps [N] and writes many at a time to a recording.
 
     Args:
         recording: Where they go, as batches 0, 1, 2, …; what is there already is removed.
@@ -165,10 +164,9 @@ class StepRecorder:
 def read_recording(folder: Path | str) -> TensorDict:
     """Transitions [N, T] of a folder in order of time, in main memory.
 
-    Of an episode that is not all there ``partial`` is true in one step or more: where rows began
-    within their first episode (``staggered_starts``), and where a run went on without the state of
-    its worlds or without being recorded. The latter are the end of the episode as well, a
-    truncation.
+    ``partial`` is true in at least one step of an incomplete episode: where rows began within an
+    episode (``staggered_starts``), and where a run was resumed without the state of its worlds or
+    without recording. The latter episodes are truncated there.
 
     Raises:
         FileNotFoundError: If there are none.
@@ -180,18 +178,13 @@ def read_recording(folder: Path | str) -> TensorDict:
         places = " or ".join(map(str, below))
         hint = f"give {places}." if below else "is it the folder of a recording?"
         raise FileNotFoundError(f"{folder} holds no transitions: {hint}")
-    batches = [_read(path) for path in pieces]
-    for batch in batches:
-        if PARTIAL not in batch:  # of an earlier version
-            batch[PARTIAL] = torch.zeros_like(batch["next", "done"])
-    return torch.cat(batches, -1)
+    return torch.cat([_read(path) for path in pieces], -1)
 
 
 def _read(place: Path) -> TensorDict:
     """A batch in main memory, read from what `TensorDict.memmap` has written.
 
-    Not by `TensorDict.load_memmap`, which opens files for writing and lengthens one that is too
-    short, with zeros.
+    `TensorDict.load_memmap` would open files for writing and extend short ones with zeros.
     """
     try:
         check_no_links(place)

@@ -6,7 +6,7 @@ of episodes however many workers it has.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, wait
 from functools import partial
 from multiprocessing import parent_process
@@ -32,7 +32,7 @@ class MakeEnv(Protocol):
 
 
 def check_rows(env: EnvBase, num_collectors: int, frames_per_batch: int) -> None:
-    """Refuse numbers that cannot be shared equally."""
+    """Refuse numbers of rows and frames that workers cannot share equally."""
     num_envs = env.batch_size.numel()
     if num_collectors < 1 or num_envs % num_collectors or frames_per_batch % num_envs:
         raise ValueError(
@@ -45,9 +45,9 @@ def check_rows(env: EnvBase, num_collectors: int, frames_per_batch: int) -> None
 def split_rows(env: EnvBase, make_env: MakeEnv, num_collectors: int) -> list[Callable[[], EnvBase]]:
     """Functions that make every worker's environment, with its share of the rows of ``env``.
 
-    An environment whose ``get_state`` is not None has its rows continued by the workers, from their
-    next reset; any other one is made anew, and seeded apart from the other workers'. Its schedules
-    go on after the ``steps_before`` of ``env``.
+    Where ``get_state`` of the environment is not None, workers continue its rows from their next
+    reset. Otherwise every worker makes a new environment with a seed of its own, whose schedules
+    continue after the ``steps_before`` of ``env``.
     """
     states: list[TensorDictBase | None]
     if env.get_state() is None:
@@ -67,10 +67,9 @@ def split_rows(env: EnvBase, make_env: MakeEnv, num_collectors: int) -> list[Cal
 def _make_rows(
     make_env: MakeEnv, num_envs: int, state: TensorDictBase | None, seed: int, steps_before: int
 ) -> EnvBase:
-    # of the policy's noise: every worker needs its own
+    # for the policy's noise: every worker needs its own
     torch.manual_seed(seed)
     if parent_process() is not None:
-        # which ends the run, with a checkpoint
         leave_signals_to_parent()
     env = make_env(num_envs=num_envs)
     if state is not None:
@@ -83,19 +82,35 @@ def _make_rows(
     return env
 
 
-Known = Callable[[Any], None]
-"""Takes note of a collector of TorchRL's."""
+Known = Callable[["KnownWorkers"], None]
+"""Stores a collector of TorchRL's."""
+
+
+class KnownWorkers:
+    """Defaults of what TorchRL's collectors of workers have once they are running.
+
+    A base of collectors, before TorchRL's class: they are known while they still start.
+
+    Attributes:
+        procs: Processes on this machine; none where workers are actors elsewhere.
+        closed: Whether there is nothing to shut down.
+    """
+
+    procs: Sequence[Any] = ()
+    closed: bool = True
+    _weight_sync_schemes: Mapping[str, Any] | None = None
+
 
 _MOST_LOOKS = 5
-"""Seconds for which a worker may be missing: a job that is put to sleep as a whole wakes so."""
+"""Seconds for which a worker may be missing: a suspended job resumes all of its processes."""
 
 
 class WorkerError(RuntimeError):
-    """A worker has died, or stands still."""
+    """A worker has died or was stopped."""
 
 
 class WorkerCollector:
-    """Batches [N, T] of the present policy, collected by workers that wait for one another.
+    """Batches [N, T] of the present policy, collected by workers in step with each other.
 
     The workers get the policy's weights before every batch but the first, with which they start.
 
@@ -114,7 +129,7 @@ class WorkerCollector:
     ) -> None:
         self.storing_device = device
         self._start = start
-        self._workers: Any = None
+        self._workers: Any = KnownWorkers()
         self._num_envs = num_envs
         self._looks = 0
 
@@ -122,7 +137,7 @@ class WorkerCollector:
         """Start the workers and collect without end.
 
         Raises:
-            WorkerError: If a worker has died or stands still.
+            WorkerError: If a worker has died or was stopped.
         """
         self._wait_for(_begin(lambda: self._start(self._known)))
         batches = iter(self._workers)
@@ -133,11 +148,11 @@ class WorkerCollector:
             asked = _begin(lambda: next(batches))
 
     def _known(self, workers: Any) -> None:
-        """Take note of TorchRL's collector, which is told while it still starts its processes."""
+        """Store TorchRL's collector, which is passed while it still starts its processes."""
         self._workers = workers
 
     def _wait_for(self, asked: Future[Any]) -> Any:
-        """The result of a call that for ever waits for a worker that has died."""
+        """The result of a call that would wait without end for a worker that has died."""
         while not wait([asked], timeout=1.0).done:
             self._check_workers()
         failure = asked.exception()
@@ -148,19 +163,19 @@ class WorkerCollector:
         raise failure
 
     def _check_workers(self) -> None:
-        """Raise if a process was killed, or is missing for some time; all are ended then."""
-        processes = [p for p in getattr(self._workers, "procs", []) if not p._closed]
+        """Raise, and end all processes, if one was killed or is missing for some time."""
+        processes = [p for p in self._workers.procs if not p._closed]
         ended = [p.exitcode for p in processes if p.exitcode is not None]
         stopped = [p.pid for p in processes if p.pid is not None and is_stopped(p.pid)]
         self._looks = self._looks + 1 if ended or stopped else 0
-        # one that has failed by itself reports that, if it is given the time
+        # one that fails with an error reports it, given time
         if not set(ended) - {0, 1} and self._looks <= _MOST_LOOKS:
             return
         codes = ", ".join(map(str, ended))
         reason = (
             f"has died (exit code {codes}; -9 is mostly a lack of memory: use fewer environments)"
             if ended
-            else f"stands still (process {stopped[0]} was stopped by a signal)"
+            else f"was stopped by a signal (process {stopped[0]})"
         )
         kill_workers(self._workers)
         raise WorkerError(
@@ -169,15 +184,15 @@ class WorkerCollector:
         )
 
     def kill(self) -> None:
-        """End the workers at once, whatever they are at; those on other machines as they end."""
-        if getattr(self._workers, "procs", None):
+        """Kill the workers; those on other machines are shut down."""
+        if self._workers.procs:
             kill_workers(self._workers)
         else:
             self.shutdown()
 
     def shutdown(self) -> None:
         """End the workers, if there are any."""
-        if self._workers is not None and not getattr(self._workers, "closed", False):
+        if not self._workers.closed:
             self._workers.shutdown()
 
 
@@ -196,21 +211,18 @@ def _begin(call: Callable[[], Any]) -> Future[Any]:
 
 
 def kill_workers(collector: Any) -> None:
-    """Kill the processes of a collector, and let go of all that this one would wait for.
+    """Kill the processes of a collector, and release what this process would wait for at exit.
 
     Args:
-        collector: TorchRL's; None if it has failed before it came to have any.
+        collector: TorchRL's, started or not.
     """
-    if collector is None:
-        return
-    processes = [p for p in getattr(collector, "procs", []) if not p._closed]
+    processes = [p for p in collector.procs if not p._closed]
     for process in processes:
         process.kill()
     for process in processes:
         process.join(timeout=5.0)
-    # weights on their way to a process that is no more: Python would wait for them at exit, and for
-    # a thread that the schemes begin when they are deleted then
-    schemes = (getattr(collector, "_weight_sync_schemes", None) or {}).values()
+    # Python would wait at exit for weights sent to dead processes, and for a thread of the schemes
+    schemes = (collector._weight_sync_schemes or {}).values()
     for holder in (collector, *schemes):
         for queue in _queues(vars(holder).values()):
             queue.cancel_join_thread()

@@ -66,10 +66,10 @@ class BoundedBeta(Independent):
     Its divergence is that of the Beta distributions, which stretching does not change.
 
     Args:
-        alpha: first concentrations, [..., A].
-        beta: second ones, [..., A].
-        low: lower bounds, [A].
-        high: upper bounds, [A].
+        alpha: First concentrations, [..., A].
+        beta: Second ones, [..., A].
+        low: Lower bounds, [A].
+        high: Upper bounds, [A].
 
     Examples:
         >>> import torch
@@ -115,16 +115,16 @@ class BoundedBeta(Independent):
 
 
 class SquashedNormal(TanhNormal):
-    """A `TanhNormal` that is not built until somebody asks for more than samples that are scored.
+    """A `TanhNormal` that is built only if more than `rsample_and_log_prob` is called.
 
-    Those are all that soft actor-critics ask for, every update twice; building transforms and
-    checking bounds costs six times as much as they do.
+    Soft actor-critics need only that, twice per update; building the transforms and checking
+    bounds takes six times as long.
 
     Args:
-        loc: means before the tanh, [..., A].
-        scale: standard deviations, [..., A].
-        low: lower bounds, [A].
-        high: upper bounds, [A].
+        loc: Means before the tanh, [..., A].
+        scale: Standard deviations, [..., A].
+        low: Lower bounds, [A].
+        high: Upper bounds, [A].
 
     Examples:
         >>> bounds = torch.tensor([-1.0]), torch.tensor([3.0])

@@ -1,4 +1,4 @@
-"""Actors within bounds, of algorithms that learn from memory: SAC's and TD3's."""
+"""Actors with bounded actions, for off-policy algorithms: SAC's and TD3's."""
 
 from __future__ import annotations
 

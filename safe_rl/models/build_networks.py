@@ -39,8 +39,8 @@ def build_networks(
 ) -> dict[str, Any]:
     """Build an actor, a reward critic and, for ``num_costs`` > 0, a cost critic.
 
-    They share no weights. Where the actor has a memory, what it remembers is an input of the
-    critics, which need none of their own then.
+    They share no weights. The state of a recurrent actor is an input of the critics, which are not
+    recurrent.
 
     Args:
         model: Node ``model`` of a configuration as composed from ``conf/``; of earlier runs, with
@@ -68,7 +68,7 @@ def build_networks(
     remembered = model["memory"]["size"] if model.get("memory") else 0
     if remembered and MEMORY not in observation_spec.keys():  # noqa: SIM118, a spec is no mapping
         raise ValueError(
-            "A policy with a memory needs the transform that keeps it between steps: choose "
+            "A recurrent policy needs the transform that keeps its state between steps: choose "
             "model=gru instead of setting model.memory alone."
         )
     head = make_head(
@@ -101,9 +101,11 @@ def _recurrent_actor(
     remembered: int,
     device: torch.device,
 ) -> ProbabilisticTensorDictSequential:
-    """Hidden layers, the memory, and a linear layer to the head."""
+    """Hidden layers, the recurrent layer, and a linear layer to the head."""
     if not widths:
-        raise ValueError("model.hidden_sizes=[]: a memory needs at least one layer before it.")
+        raise ValueError(
+            "model.hidden_sizes=[]: a recurrent policy needs at least one hidden layer."
+        )
     encoder = Chain(_body(observed, widths[-1], widths[:-1], 0, device), Tanh())
     before: list[TensorDictModuleBase] = [
         TensorDictModule(encoder, in_keys=observed.keys, out_keys=[FEATURES]),

@@ -1,4 +1,4 @@
-"""Policies that a collector steps, without distribution objects: on-policy and off-policy ones."""
+"""Policies for collection, on-policy and off-policy, without distribution objects."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def make_behaviour(actor: ProbabilisticTensorDictSequential) -> TensorDictModule
 
 
 WITHOUT_NOISE = (ExplorationType.DETERMINISTIC, ExplorationType.MODE, ExplorationType.MEAN)
-"""Kinds of exploration under which policies act without what they draw."""
+"""Exploration types under which policies act without noise."""
 
 
 class BehaviourPolicy(TensorDictModuleBase):
@@ -96,7 +96,7 @@ class BehaviourPolicy(TensorDictModuleBase):
 
 
 class ExploringPolicy(TensorDictModuleBase):
-    """What a collector steps with: the actor's actions, or uniformly random ones in the beginning.
+    """Policy of off-policy collection: the actor's actions, or random ones in the beginning.
 
     It shares the actor's parameters and writes nothing but the action, without distribution
     objects. Of a squashed Gaussian it samples; to the actions of a deterministic actor it adds

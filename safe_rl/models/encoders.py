@@ -70,14 +70,13 @@ def _entry(key: NestedKey, name: str, spec: TensorSpec) -> Entry:
 
 
 class Observed(NamedTuple):
-    """What networks are told about observations.
+    """What networks need to know about observations.
 
     Attributes:
         entries: What is observed.
         layout: Component -> columns, of a flat observation.
         input_scale: Component -> factor.
-        clip: Where columns that are normalised by their running moments are cut; None: they are
-            not.
+        clip: Bound of columns normalised by running moments; None without normalisation.
         encoders: Of every entry before all are put together; None: there is one vector, which
             needs none.
     """
@@ -169,7 +168,7 @@ def _vector(entry: Entry, observed: Observed, device: torch.device | None) -> nn
 def _picture(entry: Entry, observed: Observed, device: torch.device | None) -> nn.Module:
     settings = observed.encoders
     assert settings is not None
-    # three colours, or a depth or grey; where both ends are that short, the last one counts
+    # up to three colours and a depth; if both ends are that short, colours are last
     colours_last = entry.shape[-1] <= 4
     colours = entry.shape[-1] if colours_last else entry.shape[0]
     convolutions = ConvNet(
@@ -202,13 +201,13 @@ FEATURES, MEMORY, FIRST = "features", "memory", "is_init"
 class GatedMemory(TensorDictModuleBase):
     """Gated recurrent units (Cho et al. 2014) between the features of a network.
 
-    A batch [N] is a step of N environments: the state that it leaves goes to ``("next", "memory")``
-    and comes back with the next step. A batch [N, T] holds sequences in order of time, of which the
+    A batch [N] is a step of N environments: the new state goes to ``("next", "memory")`` and
+    returns with the next step. A batch [N, T] holds sequences in order of time, of which the
     first steps' states are read, and 0 wherever ``is_init`` says that an episode begins.
 
     Args:
-        num_features: Numbers that come in.
-        size: Numbers that are remembered, and go out.
+        num_features: Number of inputs.
+        size: Size of the state, and number of outputs.
         device: Of the parameters.
 
     Examples:
@@ -238,7 +237,7 @@ class GatedMemory(TensorDictModuleBase):
         )
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Replace the features; after a step, also leave what is remembered."""
+        """Replace the features; after a single step also write the new state."""
         inputs = {key: tensordict.get(key) for key in self.in_keys}
         inputs[MEMORY] = inputs[MEMORY].unsqueeze(-2)  # of its one layer
         steps = TensorDict(inputs, batch_size=tensordict.batch_size)

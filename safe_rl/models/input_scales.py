@@ -80,8 +80,8 @@ class RunningScale(nn.Module):
 
     The moments are buffers in double precision: a checkpoint holds them with the weights, and a run
     that is resumed has the same results. They change only by :meth:`update`, which training calls
-    once per batch, after it has learned from it: the policy that a batch is collected by is
-    the one that its probabilities are compared to. Before the first batch nothing is changed.
+    once per batch after learning from it, so that probabilities of a batch stay those of the policy
+    that collected it. Before the first batch inputs are unchanged.
 
     Args:
         size: Number of columns, n.
@@ -116,7 +116,7 @@ class RunningScale(nn.Module):
     def forward(self, inputs: Tensor) -> Tensor:
         """Normalise ``inputs``, shape [..., n]."""
         variance = self.squares / self.count.clamp_min(1)
-        # what never changes is left in its unit
+        # constant columns keep their unit
         width = torch.where(variance > _CONSTANT, variance.sqrt(), 1.0)
         normalised = (inputs - self.mean.to(inputs)) / width.to(inputs)
         return normalised.clamp(-self.clip, self.clip)
@@ -135,7 +135,7 @@ class RunningScale(nn.Module):
 
 
 def take_in(networks: Iterable[nn.Module], batch: TensorDictBase) -> None:
-    """Show a batch to all running scales of some networks, each of which has its own."""
+    """Update all running scales of networks with a batch."""
     for network in networks:
         for module in network.modules():
             if isinstance(module, RunningScale):

@@ -1,4 +1,4 @@
-"""Ensembles of Q functions, of algorithms that learn from memory."""
+"""Ensembles of Q functions, for off-policy algorithms."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ __all__ = ["EnsembleMLP", "QEnsemble"]
 class EnsembleMLP(nn.Module):
     """E perceptrons with ReLUs, evaluated together: one batched matrix product per layer.
 
-    That is a fraction of what `torch.func.vmap` over modules costs in time besides arithmetic.
+    Its overhead is a fraction of that of `torch.func.vmap` over modules.
 
     Args:
         num_networks: E.
@@ -37,7 +37,7 @@ class EnsembleMLP(nn.Module):
         self.num_networks = num_networks
         self.weights, self.biases = nn.ParameterList(), nn.ParameterList()
         for fan_in, fan_out in pairwise(sizes):
-            # what torch.nn.Linear begins with
+            # the initial weights of torch.nn.Linear
             bound = fan_in**-0.5
             for shape, parameters in (
                 ((fan_in, fan_out), self.weights),

@@ -24,9 +24,9 @@ class ActorCriticLoss(LossModule):
     Such as `torchrl.trainers.algorithms.PPOTrainer`.
 
     Args:
-        policy_loss: a `PPOLoss`, a `PPOLagrangianLoss` or another `SurrogateLoss`.
-        critic_loss: of the reward critic and, for constraints, the cost critic.
-        critic_coeff: factor of the critics' losses.
+        policy_loss: A `PPOLoss`, a `PPOLagrangianLoss` or another `SurrogateLoss`.
+        critic_loss: Of the reward critic and, for constraints, the cost critic.
+        critic_coeff: Factor of the critics' losses.
 
     Examples:
         >>> from safe_rl.models import make_actor, make_critic
@@ -66,7 +66,7 @@ class ActorCriticLoss(LossModule):
         """Name entries of the batch; each part takes the names that it knows.
 
         Raises:
-            ValueError: if neither part knows a name.
+            ValueError: If neither part knows a name.
         """
         parts: tuple[LossModule, LossModule] = (self.policy_loss, self.critic_loss)
         accepted = [set(part._AcceptedKeys.__dataclass_fields__) for part in parts]
@@ -97,8 +97,8 @@ class JointAdvantages(TensorDictModuleBase):
     Stands where TorchRL's trainers expect a `GAE`.
 
     Args:
-        reward: estimator of the reward advantage.
-        cost: estimator of the cost advantages, or None.
+        reward: Estimator of the reward advantage.
+        cost: Estimator of the cost advantages, or None.
 
     Examples:
         >>> settings = {"gamma": 0.99, "lmbda": 0.97, "value_target": "lambda_return"}

@@ -35,7 +35,7 @@ class VectorGAE(Checked, ValueEstimatorBase):
     observation valued once, and a choice of value target.
 
     Args:
-        value_network: writes the value key, [..., T, F], one output per signal; None if the
+        value_network: Writes the value key, [..., T, F], one output per signal; None if the
             values are in the TensorDict already, at the root and under ``"next"``. The state of a
             recurrent one, such as an ``LSTMModule``, is read from the rollout where trajectories
             end.
@@ -113,15 +113,15 @@ class VectorGAE(Checked, ValueEstimatorBase):
         """Write advantages and value targets into a rollout; 0 where it is padded.
 
         Args:
-            tensordict: rollout [..., T] with `in_keys`, or these entries as keyword arguments.
-            params: parameters to run the value network with instead of its own.
-            target_params: must be None; a single pass has a single set of parameters.
+            tensordict: Rollout [..., T] with `in_keys`, or these entries as keyword arguments.
+            params: Parameters to run the value network with instead of its own.
+            target_params: Must be None; a single pass has a single set of parameters.
 
         Raises:
-            KeyError: if an entry is missing.
-            ValueError: if values, signals and ends do not match in shape, something stands between
+            KeyError: If an entry is missing.
+            ValueError: If values, signals and ends do not match in shape, something stands between
                 time and the signals, or `target_params` is given.
-            FloatingPointError: if a signal, an observation or a value is not finite.
+            FloatingPointError: If a signal, an observation or a value is not finite.
         """
         if target_params is not None:
             raise ValueError(_ONE_PASS)
@@ -142,10 +142,10 @@ class VectorGAE(Checked, ValueEstimatorBase):
         """The value targets alone, [..., T, F]; the rollout stays as it is.
 
         Args:
-            tensordict: rollout [..., T] with `in_keys`.
-            target_params: must be None, as in `forward`.
-            next_value: values of the next observations, [..., T, F], instead of the network's.
-            kwargs: of other estimators, ignored.
+            tensordict: Rollout [..., T] with `in_keys`.
+            target_params: Must be None, as in `forward`.
+            next_value: Values of the next observations, [..., T, F], instead of the network's.
+            kwargs: Of other estimators, ignored.
         """
         if target_params is not None:
             raise ValueError(_ONE_PASS)
@@ -215,8 +215,8 @@ class CostGAE(VectorGAE):
     """`VectorGAE` for k costs: writes ``cost_advantage``, ``cost_value_target``, ``cost_value``.
 
     Args:
-        cost_keys: keys of the costs under ``"next"``, in the order of the k outputs.
-        value_network: cost critic, writes ``cost_value`` [..., T, k]; or None.
+        cost_keys: Keys of the costs under ``"next"``, in the order of the k outputs.
+        value_network: Cost critic, writes ``cost_value`` [..., T, k]; or None.
         settings: ``gamma``, ``lmbda`` and ``value_target``, see `VectorGAE`.
 
     Examples:

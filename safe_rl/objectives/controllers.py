@@ -26,7 +26,7 @@ class PIMultiplier(Multiplier):
     updates at a damping of 1.6, and of 1 where β is a tenth.
 
     Args:
-        cost_limits: mapping from cost key to limit d, or limits alone; see `parse_cost_limits`.
+        cost_limits: Mapping from cost key to limit d, or limits alone; see `parse_cost_limits`.
         init: First λ, for all costs or one per cost.
         kp: Proportional gain K_P.
         ki: Integral gain K_I.
@@ -88,7 +88,7 @@ class PIDMultiplier(Multiplier):
       `derivative_delay` updates. Costs before the first update count as 0, as in the paper.
 
     Args:
-        cost_limits: mapping from cost key to limit d, or limits alone; see `parse_cost_limits`.
+        cost_limits: Mapping from cost key to limit d, or limits alone; see `parse_cost_limits`.
         init: First λ, for all costs or one per cost.
         kp: Proportional gain K_P.
         ki: Integral gain K_I.

@@ -33,8 +33,8 @@ class CostCritics(QFunctionLoss):
     `cost_qvalue_loss` and `penalised`.
 
     Args:
-        actor_network, qvalue_network: of the loss without costs.
-        cost_qvalue_network: a `safe_rl.models.QEnsemble` with one output per cost.
+        actor_network, qvalue_network: Of the loss without costs.
+        cost_qvalue_network: A `safe_rl.models.QEnsemble` with one output per cost.
         multiplier: λ; read at every call, and no part of the loss or its ``state_dict``.
         cost_keys: Costs below ``next``, [..., 1] each; of transitions over n steps their discounted
             sums, which TorchRL's `MultiStepTransform` makes of no more than its ``reward_keys``.
@@ -46,7 +46,7 @@ class CostCritics(QFunctionLoss):
         settings: Those of the loss without costs.
 
     Raises:
-        ValueError: if the cost critic is no ensemble, or keys and multipliers differ in number.
+        ValueError: If the cost critic is no ensemble, or keys and multipliers differ in number.
 
     Attributes:
         cost_unit: u, the size of one cost, [k]; 1 until `calibrate` is called.
@@ -165,10 +165,10 @@ class CostCritics(QFunctionLoss):
         """Distance of the critics from what they should say, for every step.
 
         Args:
-            found: outputs of the networks, [E, ..., k].
-            costs: of the steps, [..., k].
-            discount: of what follows, 0 after an end, [..., 1].
-            following: outputs of the target networks for what follows, [E, ..., k].
+            found: Outputs of the networks, [E, ..., k].
+            costs: Of the steps, [..., k].
+            discount: Of what follows, 0 after an end, [..., 1].
+            following: Outputs of the target networks for what follows, [E, ..., k].
 
         Returns:
             Distances from TD(0) targets, [E, ..., k].

@@ -78,8 +78,8 @@ def solve_dual(q: Tensor, r: Tensor, S: Tensor, c: Tensor, delta: Tensor | float
         q: gᵀH⁻¹g, [...].
         r: gᵀH⁻¹bᵢ, [..., k].
         S: bᵢᵀH⁻¹bⱼ, [..., k, k].
-        c: constraint violations, [..., k]; negative is satisfied.
-        delta: radius δ > 0 of the trust region in KL.
+        c: Constraint violations, [..., k]; negative is satisfied.
+        delta: Radius δ > 0 of the trust region in KL.
 
     Returns:
         A `DualSolution`, in the dtype of `q`. For k = 1 its cases and multipliers are those of

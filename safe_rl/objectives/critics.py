@@ -40,11 +40,11 @@ def critic_bias(
     number everywhere has exactly this number for its bias.
 
     Args:
-        value: predictions for the steps of N rows, in order of time, [N, T, F].
-        cost: costs of these steps, [N, T, F].
-        done: whether an episode ends with a step, [N, T, 1] bool.
-        terminated: whether nothing can follow, [N, T, 1] bool.
-        gamma: discount γ per step.
+        value: Predictions for the steps of N rows, in order of time, [N, T, F].
+        cost: Costs of these steps, [N, T, F].
+        done: Whether an episode ends with a step, [N, T, 1] bool.
+        terminated: Whether nothing can follow, [N, T, 1] bool.
+        gamma: Discount γ per step.
 
     Returns:
         The bias, NaN where no sum says anything.
@@ -76,8 +76,8 @@ class CriticLoss(LossModule):
     ``cost_explained_variance`` [k].
 
     Args:
-        critic: writes the value key, [..., 1].
-        cost_critic: writes the cost value key, [..., k].
+        critic: Writes the value key, [..., 1].
+        cost_critic: Writes the cost value key, [..., k].
         reduction: ``"mean"``, ``"sum"`` or ``"none"`` over the samples.
 
     Examples:
@@ -101,9 +101,9 @@ class CriticLoss(LossModule):
         """Keys that `set_keys` accepts.
 
         Attributes:
-            value: the critic's output, [..., 1].
+            value: The critic's output, [..., 1].
             value_target: [..., 1].
-            cost_value: the cost critic's output, [..., k].
+            cost_value: The cost critic's output, [..., k].
             cost_value_target: [..., k].
         """
 
@@ -151,14 +151,14 @@ class CriticLoss(LossModule):
         """Evaluate the losses.
 
         Args:
-            tensordict: batch of any shape with `in_keys`; left as it is.
+            tensordict: Batch of any shape with `in_keys`; left as it is.
 
         Returns:
             TensorDict with `out_keys`, without batch dimension.
 
         Raises:
-            KeyError: if an entry is missing.
-            ValueError: if a value and its target differ in shape.
+            KeyError: If an entry is missing.
+            ValueError: If a value and its target differ in shape.
         """
         keys = self.tensor_keys
         loss, variance = self._regression(tensordict, "critic", keys.value, keys.value_target)

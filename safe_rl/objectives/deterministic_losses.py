@@ -28,8 +28,8 @@ class TD3Loss(QFunctionLoss, objectives.TD3Loss):
     """TorchRL's loss in two halves, with an ensemble of Q functions that needs no vmap.
 
     Args:
-        actor_network: deterministic policy.
-        qvalue_network: a `safe_rl.models.QEnsemble`, or what TorchRL takes, of which two are made.
+        actor_network: Deterministic policy.
+        qvalue_network: A `safe_rl.models.QEnsemble`, or what TorchRL takes, of which two are made.
         action_spec: Spec of one action [A], bounded.
         gamma: Discount per step, of reward and costs.
         policy_noise: Standard deviation of the noise on the target policy's actions, in halves of
@@ -174,7 +174,7 @@ class BCLoss(ReplayLoss):
     steps are those of safe episodes (BC-Safe). The loss reads neither costs nor rewards.
 
     Args:
-        actor_network: deterministic policy.
+        actor_network: Deterministic policy.
         loss_function: Loss of the errors of actions.
 
     Examples:

@@ -36,10 +36,10 @@ def gaussian_kl(loc_p: Tensor, scale_p: Tensor, loc_q: Tensor, scale_q: Tensor) 
     """KL(p ‖ q) of diagonal Gaussians, summed over the last dimension.
 
     Args:
-        loc_p: mean of p, [..., n].
-        scale_p: standard deviation of p, [..., n].
-        loc_q: mean of q, [..., n].
-        scale_q: standard deviation of q, [..., n].
+        loc_p: Mean of p, [..., n].
+        scale_p: Standard deviation of p, [..., n].
+        loc_q: Mean of q, [..., n].
+        scale_q: Standard deviation of q, [..., n].
 
     Returns:
         Divergence in nats, [...].
@@ -95,9 +95,9 @@ def composite_log_probs(
     """Log-probability of all parts' actions together, and the one stored with them, [...] each.
 
     Args:
-        composite: distribution in the states of the batch.
-        batch: with the actions, by the keys of the parts.
-        stored: keys of the parts' stored log-probabilities.
+        composite: Distribution in the states of the batch.
+        batch: With the actions, by the keys of the parts.
+        stored: Keys of the parts' stored log-probabilities.
     """
     states, parts = composite.batch_shape, composite.dists.items()
     now = _total((part.log_prob(batch[key]) for key, part in parts), states)
@@ -126,10 +126,10 @@ def kl(
     where p = q (Schulman, *Approximating KL divergence*, 2020).
 
     Args:
-        p: distribution in the states [...].
-        q: distribution in the same states.
-        log_weight: log ρ of the sampled actions, [...].
-        batch: the sampled actions of composite distributions, by the keys of the parts.
+        p: Distribution in the states [...].
+        q: Distribution in the same states.
+        log_weight: Log ρ of the sampled actions, [...].
+        batch: The sampled actions of composite distributions, by the keys of the parts.
 
     Returns:
         Divergence in nats, [...].
@@ -173,7 +173,7 @@ def sampler_of(actor: ProbabilisticTensorDictSequential) -> ProbabilisticTensorD
     """The module of an actor that builds its distribution from parameters.
 
     Raises:
-        TypeError: if there is none.
+        TypeError: If there is none.
     """
     samplers = [m for m in actor.modules() if isinstance(m, ProbabilisticTensorDictModule)]
     if not samplers:
@@ -199,7 +199,7 @@ class ReferencePolicy:
     """A policy as it is now, in the states of a batch, to measure later ones against.
 
     Args:
-        distribution: of the policy, without gradients.
+        distribution: Of the policy, without gradients.
     """
 
     def __init__(self, distribution: Distribution) -> None:

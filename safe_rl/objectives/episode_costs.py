@@ -31,8 +31,8 @@ class CostEstimate(NamedTuple):
     """An estimate of J_c.
 
     Attributes:
-        mean: undiscounted cost per episode, [k].
-        error: its standard error, [k].
+        mean: Undiscounted cost per episode, [k].
+        error: Its standard error, [k].
     """
 
     mean: Tensor
@@ -43,8 +43,8 @@ def rate_estimate(costs: Tensor, length: Tensor) -> CostEstimate:
     """J_c as cost per step times steps per episode, with the standard error among rows.
 
     Args:
-        costs: costs of N rows of T consecutive steps, [N, T, k].
-        length: mean episode length T̄ in steps, scalar.
+        costs: Costs of N rows of T consecutive steps, [N, T, k].
+        length: Mean episode length T̄ in steps, scalar.
 
     Returns:
         The estimate. Few rows are cut into pieces, whose costs are then taken as independent.
@@ -66,9 +66,9 @@ def shrink(past: CostEstimate, present: CostEstimate, drift: Tensor) -> CostEsti
     """Weigh two estimates by their precision: one step of a Kalman filter on a random walk.
 
     Args:
-        past: estimate for the policies so far; NaN if there is none.
-        present: estimate of this batch alone.
-        drift: standard deviation of the change of J_c from one policy to the next, [k].
+        past: Estimate for the policies so far; NaN if there is none.
+        present: Estimate of this batch alone.
+        drift: Standard deviation of the change of J_c from one policy to the next, [k].
 
     Returns:
         The estimate for the present policy, with an error below both.
@@ -98,7 +98,7 @@ class EpisodeLengths:
     ended before it.
 
     Args:
-        longest: steps after which an episode is over: T̄ until one has ended.
+        longest: Steps after which an episode is over: T̄ until one has ended.
 
     Examples:
         >>> lengths = EpisodeLengths(1000)
@@ -195,11 +195,11 @@ class EpisodeCosts:
 
     Args:
         num_costs: k.
-        max_length: steps after which an episode is over; see `EpisodeLengths`.
-        drift: share by which J_c changes from one policy to the next, about; it weighs the past
+        max_length: Steps after which an episode is over; see `EpisodeLengths`.
+        drift: Share by which J_c changes from one policy to the next, about; it weighs the past
             against the batch. None uses the batch alone.
-        memory: weight in [0, 1) of the past in how much costs scatter.
-        smallest: costs per step that count as J_c's size where it is smaller, for the drift: from
+        memory: Weight in [0, 1) of the past in how much costs scatter.
+        smallest: Costs per step that count as J_c's size where it is smaller, for the drift: from
             batches without any cost nothing else would lead away.
         largest_correlation: bound of the correlation of batches by which errors are enlarged; see
             `NoiseCorrelation`.
@@ -254,9 +254,9 @@ class EpisodeCosts:
         """Take in a batch.
 
         Args:
-            costs: costs of its steps, [N, T, k].
-            lengths: steps of every episode that finished in it, [E].
-            charges: what is to be estimated in place of the mean cost; `unit` stays that of costs.
+            costs: Costs of its steps, [N, T, k].
+            lengths: Steps of every episode that finished in it, [E].
+            charges: What is to be estimated in place of the mean cost; `unit` stays that of costs.
         """
         costs = costs.to(self._state["sums"])
         self._state["sums"] += torch.stack([costs.sum((0, 1)), costs.square().sum((0, 1))])

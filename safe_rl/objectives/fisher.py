@@ -100,10 +100,10 @@ class FisherProduct:
     respect to u. Both graphs are built once, so that a product costs two backward passes.
 
     Args:
-        actor_network: policy with `get_dist`; any network that can be differentiated twice.
-        batch: states to average over, any batch shape.
+        actor_network: Policy with `get_dist`; any network that can be differentiated twice.
+        batch: States to average over, any batch shape.
         parameters: θ, the parameters of the actor to differentiate by.
-        damping: multiple of the identity that is added.
+        damping: Multiple of the identity that is added.
 
     Examples:
         >>> from tensordict import TensorDict

@@ -37,9 +37,9 @@ def one_pass_values(
     what it remembered there.
 
     Args:
-        tensordict: rollout [..., T] with the network's in_keys, also under ``"next"``.
-        value_network: writes `key`, [..., T, F].
-        key: the network's value key.
+        tensordict: Rollout [..., T] with the network's in_keys, also under ``"next"``.
+        value_network: Writes `key`, [..., T, F].
+        key: The network's value key.
         ends: [..., T] bool, see `trajectory_ends`.
 
     Returns:
@@ -75,8 +75,8 @@ def gae(
         next_value: [..., T, F], values of the next observations.
         done: [..., T, 1] bool, trajectory ends.
         terminated: [..., T, 1] bool, ends without bootstrap.
-        gamma: discount per step.
-        lmbda: decay of the TD errors.
+        gamma: Discount per step.
+        lmbda: Decay of the TD errors.
 
     Returns:
         Advantages, [..., T, F].
@@ -123,10 +123,10 @@ def normalise_advantages(
     mask of TorchRL's collectors, counts for nothing.
 
     Args:
-        tensordict: batch of any shape with `advantage` [..., 1] and, if there are costs,
+        tensordict: Batch of any shape with `advantage` [..., 1] and, if there are costs,
             `cost_advantage` [..., k].
-        advantage: key of the reward advantage.
-        cost_advantage: key of the cost advantages.
+        advantage: Key of the reward advantage.
+        cost_advantage: Key of the cost advantages.
 
     Returns:
         The same TensorDict.

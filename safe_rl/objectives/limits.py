@@ -1,16 +1,16 @@
-"""How far each cost is from where it should be by now: what multipliers and CPO steps act upon.
+"""The distance of each cost from its present target, for multipliers and CPO steps.
 
-Between the costs of a batch and the violation that an update sees lie four decisions, all here:
+Four decisions lead from the costs of a batch to the violation that an update sees:
 
 - **how J_c is estimated** from a batch (`safe_rl.objectives.episode_costs`);
 - **a descent**: costs are free until the policy has found its goal, then the limit comes down from
-  what the policy costs by then. Pressure before there is a goal keeps it from being found; a
-  policy that has learned to ignore costs takes longest to unlearn it;
+  the cost of the policy then. With pressure from the start the goal is not found; a policy that
+  has learned to ignore costs takes longest to reduce them;
 - **a margin**: z standard errors of a batch's J_c below the limit, so that what one batch shows
   is above the limit with a chance of about Φ(−z);
 - **trust**: the surrogate of a step predicts a change of J_c, of which only a share is realised.
   The share is measured, and violations are divided by it, for steps that act on predictions (CPO).
-  What is left of a violation from one update to the next is added, as an integral.
+  Violations that remain after an update are summed up and added, as an integral.
 """
 
 from __future__ import annotations
@@ -23,20 +23,20 @@ from torch import Tensor
 
 from safe_rl.objectives.episode_costs import CostEstimate, EpisodeCosts
 from safe_rl.objectives.risk import Charges
-from safe_rl.ranges import Count, Fraction, NotNegative, Positive, Range, Share, Weight
+from safe_rl.ranges import Checked, Count, Fraction, NotNegative, Positive, Range, Share, Weight
 
 
 class LimitState(NamedTuple):
     """What an update needs to know about k limits.
 
     Attributes:
-        cost: estimate of J_c, undiscounted cost per episode, [k].
-        target: what J_c is to be at most by now: limit, descent and margin together, [k].
-        length: mean episode length T̄ in steps, scalar.
-        unit: size of one cost, [k]; see `EpisodeCosts.unit`.
-        scale: unit of violations, [k]: the limit, or a small share of the steps if that is more.
-        trust: share of a predicted change of J_c that is realised, [k].
-        integrated: what is added to the violation, the sum of those before, [k].
+        cost: Estimate of J_c, undiscounted cost per episode, [k].
+        target: Present upper bound of J_c: limit, descent and margin together, [k].
+        length: Mean episode length T̄ in steps, scalar.
+        unit: Size of one cost, [k]; see `EpisodeCosts.unit`.
+        scale: Unit of violations, [k]: the limit, or a small share of the steps if that is more.
+        trust: Share of a predicted change of J_c that is realised, [k].
+        integrated: What is added to the violation, the sum of those before, [k].
     """
 
     cost: Tensor
@@ -54,7 +54,7 @@ class LimitState(NamedTuple):
 
     @property
     def demand(self) -> Tensor:
-        """By how much a step's surrogate has to lower J_c, [k]; negative: how much it may add."""
+        """Change by which a surrogate must lower J_c, [k]; if negative, J_c may rise by it."""
         change = self.violation + self.integrated
         return torch.where(change > 0, change / self.trust, change)
 
@@ -81,8 +81,8 @@ class PredictedChange:
 
     Args:
         num_costs: k.
-        memory: weight in [0, 1) of the past.
-        lowest: lower bound of the share; 1 relies on predictions as they are.
+        memory: Weight in [0, 1) of the past.
+        lowest: Lower bound of the share; 1 relies on predictions as they are.
 
     Examples:
         >>> realised = PredictedChange(1, memory=0.9, lowest=0.1)
@@ -134,12 +134,12 @@ class PredictedChange:
             self._state[name] = state_dict[name].to(value)
 
 
-class LimitTracker:
+class LimitTracker(Checked):
     """Turns the costs of every batch into violations of a limit that comes down over time.
 
     Args:
         cost_limits: d, undiscounted cost per episode, [k].
-        max_length: rows of time of a batch after which an episode is over.
+        max_length: Rows of time of a batch after which an episode is over.
         margin: Standard errors of a batch's J_c by which the aim is below the limit.
         largest_margin: Bound of the margin, as a share of d.
         free_steps: Environment steps for which costs are free.
@@ -245,9 +245,9 @@ class LimitTracker:
         """Take in a batch.
 
         Args:
-            costs: costs of its steps, [N, T, k].
-            lengths: steps of every episode that finished in it, [E].
-            charges: what stands for the costs, if the limits are not on their mean.
+            costs: Costs of its steps, [N, T, k].
+            lengths: Steps of every episode that finished in it, [E].
+            charges: What stands for the costs, if the limits are not on their mean.
         """
         costs, lengths = costs.detach().cpu(), lengths.detach().cpu()
         estimate = self.costs.update(costs, lengths, charges)

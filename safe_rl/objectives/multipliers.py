@@ -27,7 +27,7 @@ def parse_cost_limits(cost_limits: CostLimits) -> tuple[list[NestedKey], Tensor]
     """Split cost limits into keys and a tensor.
 
     Args:
-        cost_limits: a mapping from cost key to limit, a sequence of limits, or one limit. The
+        cost_limits: A mapping from cost key to limit, a sequence of limits, or one limit. The
             limits are undiscounted costs per episode.
 
     Returns:
@@ -35,7 +35,7 @@ def parse_cost_limits(cost_limits: CostLimits) -> tuple[list[NestedKey], Tensor]
         are named ``cost`` (one) or ``cost_0``, ``cost_1``, … (several).
 
     Raises:
-        ValueError: if there is no limit at all, or one that is not a finite number.
+        ValueError: If there is no limit at all, or one that is not a finite number.
     """
     keys: list[NestedKey]
     if isinstance(cost_limits, Mapping):
@@ -58,7 +58,7 @@ def per_cost(name: str, value: float | Sequence[float] | Tensor, num_costs: int)
     """Expand a scalar, or check a sequence, to one float32 value per cost, [k].
 
     Raises:
-        ValueError: if a sequence does not hold one value per cost.
+        ValueError: If a sequence does not hold one value per cost.
     """
     tensor = torch.as_tensor(value, dtype=torch.float32)
     if tensor.ndim and tensor.shape != (num_costs,):
@@ -76,13 +76,13 @@ class Multiplier(Checked, nn.Module, ABC):
     buffer `penalty`.
 
     Args:
-        cost_limits: mapping from cost key to limit, or limits alone; see `parse_cost_limits`.
+        cost_limits: Mapping from cost key to limit, or limits alone; see `parse_cost_limits`.
 
     Raises:
-        TypeError: if a subclass has no `_step`.
+        TypeError: If a subclass has no `_step`.
 
     Attributes:
-        cost_keys: one key per cost, in the order of every [k] tensor.
+        cost_keys: One key per cost, in the order of every [k] tensor.
         limits: [k] buffer, undiscounted cost per episode.
     """
 
@@ -116,7 +116,7 @@ class Multiplier(Checked, nn.Module, ABC):
                 less what it is held against.
 
         Raises:
-            ValueError: if there is not one number per cost.
+            ValueError: If there is not one number per cost.
         """
         given = torch.as_tensor(violation, dtype=self.limits.dtype, device=self.limits.device)
         if given.numel() != self.num_costs:
@@ -150,7 +150,7 @@ class LagrangeMultiplier(Multiplier):
     written out here, because its moments belong to the state that is moved and saved.
 
     Args:
-        cost_limits: mapping from cost key to limit d, or limits alone; see `parse_cost_limits`.
+        cost_limits: Mapping from cost key to limit d, or limits alone; see `parse_cost_limits`.
         init: First λ, for all costs or one per cost.
         lr: Step size of Adam.
         betas: Decay rates of Adam's moments.
@@ -214,13 +214,13 @@ class ProjectedMultiplier(Multiplier):
     as in the articles, unless what λ weighs is in other units (`set_unit`).
 
     Args:
-        cost_limits: mapping from cost key to limit d, or limits alone; see `parse_cost_limits`.
+        cost_limits: Mapping from cost key to limit d, or limits alone; see `parse_cost_limits`.
         init: First λ, at most `highest`, for all costs or one per cost.
         lr: Step size α, change of λ per cost of size u in an episode.
         highest: Upper bound λ_max; None for none.
 
     Raises:
-        ValueError: if an initial λ is outside the bounds.
+        ValueError: If an initial λ is outside the bounds.
 
     Examples:
         >>> multiplier = ProjectedMultiplier({"cost": 25.0}, init=0.0, lr=0.01, highest=2.0)

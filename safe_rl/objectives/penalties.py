@@ -18,8 +18,8 @@ class PenaltyLoss(PPOLoss):
     """PPO with a penalty on what the cost surrogates predict, for k constraints.
 
     Args:
-        actor_network: policy with `get_dist`; see `SurrogateLoss`.
-        constraints: where J_c − d and T̄ stand at every call.
+        actor_network: Policy with `get_dist`; see `SurrogateLoss`.
+        constraints: Where J_c − d and T̄ stand at every call.
         settings: Those of every clipped loss, see `PPOLoss`; costs are always averaged.
     """
 
@@ -103,9 +103,9 @@ def log_barrier(slack: Tensor, kappa: Tensor | float, max_weight: float) -> Tens
     The tangent begins at slack = κ / max_weight, so that value and slope are continuous.
 
     Args:
-        slack: how far inside the limits, any shape.
+        slack: How far inside the limits, any shape.
         kappa: Strength κ > 0 of the barrier, a scalar.
-        max_weight: largest slope > 0.
+        max_weight: Largest slope > 0.
 
     Examples:
         >>> log_barrier(torch.tensor([1.0, 0.0]), kappa=0.1, max_weight=1.0)

@@ -31,7 +31,7 @@ class PPOLoss(SurrogateLoss):
     and that ``kl`` is the exact mean KL(π_θ ‖ π_k), for early stopping. Adds ``clip_fraction``.
 
     Args:
-        actor_network: policy with `get_dist`; see `SurrogateLoss`.
+        actor_network: Policy with `get_dist`; see `SurrogateLoss`.
         clip_epsilon: Half-width ε of the clipping range, within which a ratio earns.
         settings: Those of every policy loss, see `SurrogateLoss`.
 

@@ -93,8 +93,8 @@ class CUPLoss(WeighsCosts):
         settings: Those of every policy loss, see `SurrogateLoss`.
 
     Raises:
-        TypeError: by the call, if a KL has no closed form.
-        KeyError: by the call, if the batch has no anchor.
+        TypeError: By the call, if a KL has no closed form.
+        KeyError: By the call, if the batch has no anchor.
 
     Examples:
         >>> from tensordict import TensorDict

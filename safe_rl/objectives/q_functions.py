@@ -37,8 +37,8 @@ class InOneCall:
     or follow a copy of the loss to another device.
 
     Args:
-        network: the ensemble.
-        of_copies: whether steps come once per network: of one copy then, the first is taken.
+        network: The ensemble.
+        of_copies: Whether steps come once per network: of one copy then, the first is taken.
     """
 
     def __init__(self, network: Ensemble, *, of_copies: bool = False) -> None:
@@ -53,8 +53,8 @@ class ReplayLoss(Checked, LossModule):
     """What the off-policy recipe and its update ask of a loss on steps from a replay buffer.
 
     Attributes:
-        learns_values: whether it learns Q functions, so that n-step sums and priorities are of use.
-        risk_measure: kind of risk measure that its cost critics estimate, or None for means only.
+        learns_values: Whether it learns Q functions, so that n-step sums and priorities are of use.
+        risk_measure: Kind of risk measure that its cost critics estimate, or None for means only.
     """
 
     learns_values: ClassVar[bool] = True
@@ -96,7 +96,7 @@ class QFunctionLoss(ReplayLoss):
     """What a loss on Q functions has besides TorchRL's loss, before which classes inherit it.
 
     Attributes:
-        gamma: discount per step, of reward and costs; that of the value estimator.
+        gamma: Discount per step, of reward and costs; that of the value estimator.
     """
 
     gamma: float
@@ -125,8 +125,8 @@ class QFunctionLoss(ReplayLoss):
         """An entry below ``next`` that holds one number per step, [..., 1].
 
         Raises:
-            KeyError: if there is no such entry.
-            ValueError: if it has another shape.
+            KeyError: If there is no such entry.
+            ValueError: If it has another shape.
         """
         value = require(tensordict, ("next", key))
         expected = [*require(tensordict, self.tensor_keys.action).shape[:-1], 1]

@@ -25,9 +25,9 @@ class Charges(NamedTuple):
     """What stands for the costs of a batch.
 
     Attributes:
-        costs: charges of its steps, [N, T, k].
-        offset: what is to be added to the charges of an episode, [k].
-        limit: what the sum is held against, [k].
+        costs: Charges of its steps, [N, T, k].
+        offset: What is to be added to the charges of an episode, [k].
+        limit: What the sum is held against, [k].
     """
 
     costs: Tensor
@@ -54,10 +54,10 @@ class RiskMeasure(Checked, ABC):
         """Charge the steps of a batch.
 
         Args:
-            costs: costs of its steps, [N, T, k], none negative.
-            ends: whether an episode ends with a step, [N, T] bool.
-            before: cost of the open episodes before the first step, [N, k].
-            finished: costs of the episodes that finished, [E, k].
+            costs: Costs of its steps, [N, T, k], none negative.
+            ends: Whether an episode ends with a step, [N, T] bool.
+            before: Cost of the open episodes before the first step, [N, k].
+            finished: Costs of the episodes that finished, [E, k].
         """
 
     def state_dict(self) -> dict[str, Any]:

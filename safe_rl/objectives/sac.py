@@ -31,8 +31,8 @@ class SACLoss(QFunctionLoss, objectives.SACLoss):
     """TorchRL's loss in two halves, with an ensemble of Q functions that needs no vmap.
 
     Args:
-        actor_network: policy with ``get_dist``.
-        qvalue_network: a `safe_rl.models.QEnsemble`, or what TorchRL takes, of which two are made.
+        actor_network: Policy with ``get_dist``.
+        qvalue_network: A `safe_rl.models.QEnsemble`, or what TorchRL takes, of which two are made.
         gamma: Discount per step, of reward and costs.
         alpha_init: First temperature α, the weight of the entropy.
         target_entropy: Entropy of the policy, to which α is adapted; ``"auto"`` is minus the number

@@ -17,12 +17,12 @@ def require(tensordict: TensorDictBase, key: NestedKey, hint: str = "") -> Tenso
     """Get an entry, or raise an error that names the nearest key present.
 
     Args:
-        tensordict: the batch to read.
-        key: entry to get.
-        hint: what writes this entry, for the error message.
+        tensordict: The batch to read.
+        key: Entry to get.
+        hint: What writes this entry, for the error message.
 
     Raises:
-        KeyError: if there is no such entry.
+        KeyError: If there is no such entry.
     """
     value = tensordict.get(key, None)
     if value is not None:
@@ -61,7 +61,7 @@ def learning_samples(batch: TensorDictBase, in_keys: Iterable[NestedKey]) -> Ten
     episodes begin.
 
     Raises:
-        ValueError: if sequences are padded.
+        ValueError: If sequences are padded.
     """
     if FIRST not in in_keys:
         return flat_samples(batch)
@@ -77,11 +77,11 @@ def require_finite(tensordict: TensorDictBase, keys: Iterable[NestedKey]) -> Non
     """Raise before anything is learnt from numbers that are not numbers.
 
     Args:
-        tensordict: batch of any shape; padding may hold anything.
-        keys: entries to check, those of floating point; missing ones are left to the reader.
+        tensordict: Batch of any shape; padding may hold anything.
+        keys: Entries to check, those of floating point; missing ones are left to the reader.
 
     Raises:
-        FloatingPointError: naming the entry and how many samples are concerned.
+        FloatingPointError: Naming the entry and how many samples are concerned.
     """
     mask = sample_mask(tensordict)
     for key, entry in _tensors(tensordict, keys):

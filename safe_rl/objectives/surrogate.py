@@ -31,8 +31,8 @@ def lagrangian(reward_gain: Tensor, cost_gain: Tensor, multipliers: Tensor) -> T
     Abbeel 2020, section 4.4).
 
     Args:
-        reward_gain: per-sample reward surrogate, [..., 1].
-        cost_gain: per-sample cost surrogates, [..., k].
+        reward_gain: Per-sample reward surrogate, [..., 1].
+        cost_gain: Per-sample cost surrogates, [..., k].
         multipliers: λ, [k].
     """
     penalty = (cost_gain * multipliers).sum(-1, keepdim=True)
@@ -43,8 +43,8 @@ def effective_sample_size(log_weight: Tensor, mask: Tensor | None = None) -> Ten
     """Kish's effective sample size of importance weights, as a fraction of the samples.
 
     Args:
-        log_weight: logarithms of the weights, any shape.
-        mask: which of them count, bool of the same number of elements; None: all.
+        log_weight: Logarithms of the weights, any shape.
+        mask: Which of them count, bool of the same number of elements; None: all.
     """
     log_weight = log_weight.flatten()
     if mask is not None:
@@ -66,7 +66,7 @@ class SurrogateLoss(Checked, LossModule):
     closed forms where there are any, and are estimated from samples elsewhere.
 
     Args:
-        actor_network: policy with `get_dist`, such as a `torchrl.modules.ProbabilisticActor`.
+        actor_network: Policy with `get_dist`, such as a `torchrl.modules.ProbabilisticActor`.
         entropy_coeff: Factor of the entropy bonus; a buffer, so that it can be scheduled, also up
             from 0.
         reduction: How samples are reduced; the attribute may also be ``"none"``.
@@ -155,8 +155,8 @@ class SurrogateLoss(Checked, LossModule):
         """Evaluate the loss on a batch, which stays as it is.
 
         Raises:
-            KeyError: if an entry is missing.
-            ValueError: if advantages do not match log-probabilities or multipliers in shape.
+            KeyError: If an entry is missing.
+            ValueError: If advantages do not match log-probabilities or multipliers in shape.
         """
         distribution = self._policy(tensordict)
         log_weight = self._log_weight(tensordict, distribution)
@@ -269,12 +269,12 @@ class WeighsCosts(SurrogateLoss):
     """A policy loss that a multiplier weighs costs in; classes put it before the loss without.
 
     Args:
-        actor_network: policy with `get_dist`; see `SurrogateLoss`.
-        multiplier: one λ per column of ``cost_advantage``, read at every call.
+        actor_network: Policy with `get_dist`; see `SurrogateLoss`.
+        multiplier: One λ per column of ``cost_advantage``, read at every call.
         settings: Those of the loss without costs.
 
     Raises:
-        TypeError: if there is no multiplier.
+        TypeError: If there is no multiplier.
     """
 
     def __init__(

@@ -69,7 +69,7 @@ def subsample(batch: TensorDictBase, fraction: float) -> TensorDictBase:
     """A fraction of a flat batch [B], at equal distances: over all episodes, no randomness.
 
     Raises:
-        ValueError: if `fraction` is not in (0, 1].
+        ValueError: If `fraction` is not in (0, 1].
     """
     if not 0 < fraction <= 1:
         raise ValueError(f"fisher_subsample must be in (0, 1], got {fraction}.")
@@ -87,10 +87,10 @@ def conjugate_gradient(
     """Solve A x = right for a symmetric positive definite A (Hestenes and Stiefel 1952).
 
     Args:
-        product: multiplies a vector [P] with A.
-        right: right-hand side, [P]; for 0 the solution is 0.
-        iterations: products at most.
-        tolerance: squared residual, relative to that of x = 0, at which to stop.
+        product: Multiplies a vector [P] with A.
+        right: Right-hand side, [P]; for 0 the solution is 0.
+        iterations: Products at most.
+        tolerance: Squared residual, relative to that of x = 0, at which to stop.
 
     Returns:
         x, [P].
@@ -129,9 +129,9 @@ def best_in_span(solutions: Tensor, images: Tensor, right: Tensor) -> Tensor:
     xᵢᵀ A xⱼ = rightᵢᵀ xⱼ = rightⱼᵀ xᵢ.
 
     Args:
-        solutions: approximate solutions xᵢ, [m, P]; any of them may depend on others or be 0.
+        solutions: Approximate solutions xᵢ, [m, P]; any of them may depend on others or be 0.
         images: A xᵢ, [m, P].
-        right: right-hand sides, [m, P].
+        right: Right-hand sides, [m, P].
 
     Returns:
         Solutions, [m, P].
@@ -158,15 +158,15 @@ def backtracking_search(
     """Move parameters along a step, shortening it until it is accepted.
 
     Args:
-        parameters: moved in place; left at their old values if no step is accepted, or
+        parameters: Moved in place; left at their old values if no step is accepted, or
             `accept` raises.
-        step: full step, [P].
-        accept: called with the parameters moved.
-        coeff: factor in (0, 1) between one try and the next.
-        max_tries: number of tries, the full step included.
+        step: Full step, [P].
+        accept: Called with the parameters moved.
+        coeff: Factor in (0, 1) between one try and the next.
+        max_tries: Number of tries, the full step included.
 
     Returns:
-        The accepted fraction of the step: a power of `coeff`, or 0 if none was accepted.
+        The accepted fraction of the step: A power of `coeff`, or 0 if none was accepted.
     """
     start, accepted = flatten(parameters).detach(), 0.0
     try:

@@ -12,7 +12,7 @@ class Violations(Protocol):
     """What a loss reads at every call; a `safe_rl.algorithms.Constraints` is one.
 
     Attributes:
-        violation: by how much J_c is to fall, undiscounted cost per episode, [k]: J_c − d, or with
+        violation: By how much J_c is to fall, undiscounted cost per episode, [k]: J_c − d, or with
             `safe_rl.objectives.LimitTracker` J_c less what it is to be by now, its target.
         episode_length: T̄, mean number of steps of an episode, scalar.
     """
@@ -26,7 +26,7 @@ class KnownCosts(Violations, Protocol):
 
     Attributes:
         costs: J_c, undiscounted cost per episode, [k].
-        unit: size of one cost, [k].
+        unit: Size of one cost, [k].
     """
 
     costs: Tensor
@@ -41,10 +41,10 @@ def matched_violation(violation: Tensor | None, surrogates: Tensor) -> Tensor:
 
     Args:
         violation: J_c − d of every constraint, [k].
-        surrogates: cost surrogates, [k].
+        surrogates: Cost surrogates, [k].
 
     Raises:
-        ValueError: if there is not one violation per surrogate.
+        ValueError: If there is not one violation per surrogate.
 
     Examples:
         >>> matched_violation(torch.tensor([-5.0, torch.nan]), surrogates=torch.zeros(2))
@@ -78,7 +78,7 @@ def constraint_value(
         cost_violation: J_c − d, [k]. NaN (no episode has finished) counts as 0: the policy is
             taken to be at the limit, and not allowed to raise the cost.
         episode_length: T̄, scalar.
-        rescale_violation: whether to divide.
+        rescale_violation: Whether to divide.
     """
     divisor = episode_length if rescale_violation else torch.ones_like(episode_length)
     return (cost_violation / divisor).nan_to_num(nan=0.0)

@@ -24,7 +24,7 @@ def gaussian_tail(tail: float) -> float:
         tail: α in (0, 1].
 
     Raises:
-        ValueError: if α is outside its range.
+        ValueError: If α is outside its range.
 
     Examples:
         >>> round(gaussian_tail(0.5), 4), gaussian_tail(1.0)
@@ -59,7 +59,7 @@ class WCSACLoss(SACLagrangianLoss):
         settings: Those of a `SACLagrangianLoss`.
 
     Raises:
-        ValueError: if α is outside (0, 1], or the number of networks is odd.
+        ValueError: If α is outside (0, 1], or the number of networks is odd.
 
     Examples:
         >>> import torch
@@ -119,9 +119,9 @@ class WCSACLoss(SACLagrangianLoss):
         Args:
             mean: Q_c of the steps, [E/2, ..., k]. The variance is about it, so that what differs
                 from one successor to the next is a part of the variance.
-            costs: of the steps, [..., k].
-            discount: of what follows, 0 after an end, [..., 1].
-            following: mean and variance of what follows, [E/2, ..., k] each.
+            costs: Of the steps, [..., k].
+            discount: Of what follows, 0 after an end, [..., 1].
+            following: Mean and variance of what follows, [E/2, ..., k] each.
         """
         target = costs + discount * following[0]
         second_moment = target.square() + discount.square() * following[1]

@@ -1,9 +1,8 @@
-"""One checkpoint file: what is written into it, and what is trusted in one from elsewhere.
+"""One checkpoint file: its content, and reading one that another person made.
 
 A file is an archive of :class:`torchrl.checkpoint.Checkpoint` that holds, for every part of a run,
-tensors, numbers and plain containers. Reading runs no code of the file's: TorchRL would also take
-other payloads, and unpickles some of them, so that all but the one that is written here are
-refused.
+tensors, numbers and plain containers. Reading a file runs no code in it: TorchRL also reads other
+payloads, some of them by unpickling, and all of those are refused.
 """
 
 from __future__ import annotations
@@ -23,9 +22,6 @@ from safe_rl.algorithms.algorithm_contract import Stateful
 
 __all__ = ["as_parts", "part_names", "read_facts", "read_states", "restore", "writer"]
 
-# parts that checkpoints of earlier versions lack: they begin anew
-_ADDED_LATER = {"candidates", "losses"}
-
 
 class _WeightsOnly(StateDictCheckpointAdapter):
     """A part's payload: exactly one file, written by `torch.save` and read weights-only."""
@@ -35,7 +31,7 @@ class _WeightsOnly(StateDictCheckpointAdapter):
         super().__init__(payload_format="torch")
 
     def load(self, component: Any, path: Path, **options: Any) -> Any:
-        # the adapter falls back on formats that unpickle where its own file is missing
+        # where its own file is missing, the adapter falls back to formats that unpickle
         found = sorted(path.iterdir())
         if [file.name for file in found] != [self.state_torch]:
             raise CheckpointError(
@@ -49,7 +45,7 @@ class _WeightsOnly(StateDictCheckpointAdapter):
 
 
 class _State:
-    """A part's state, without the part: on its way into a file, or out of one."""
+    """The state of a part, to be written or just read."""
 
     def __init__(self, state: Any = None) -> None:
         self.state = state
@@ -98,7 +94,7 @@ def read_states(path: Path, names: Collection[str]) -> dict[str, Any]:
         CheckpointError: If the file is no checkpoint, is damaged, or lacks a part.
     """
     received = {name: _State() for name in names}
-    # where there is no such device any more, tensors are read into main memory
+    # without a GPU, tensors of one are read into main memory
     device = None if torch.cuda.is_available() else "cpu"
     try:
         _check_kind(path)
@@ -114,8 +110,7 @@ def restore(path: Path, components: Mapping[str, Stateful]) -> None:
     Raises:
         CheckpointError: If the file is no checkpoint, or does not fit the parts.
     """
-    absent = _ADDED_LATER - part_names(path) if _ADDED_LATER & components.keys() else set()
-    states = read_states(path, components.keys() - absent)
+    states = read_states(path, components.keys())
     for name in sorted(states):
         try:
             _check_types(components[name], states[name])
@@ -125,7 +120,7 @@ def restore(path: Path, components: Mapping[str, Stateful]) -> None:
 
 
 def _check_types(component: Stateful, state: Mapping[str, Any]) -> None:
-    """Refuse weights of another kind than a network's, which would be rounded or cut in silence."""
+    """Refuse weights of another dtype than the network's, which would be converted silently."""
     if not isinstance(component, nn.Module):
         return
     for name, tensor in component.state_dict().items():
@@ -135,16 +130,16 @@ def _check_types(component: Stateful, state: Mapping[str, Any]) -> None:
 
 
 def part_names(path: Path) -> set[str]:
-    """Names of the parts in a file; none of one that cannot be read."""
+    """Names of the parts in a file; empty if it cannot be read."""
     try:
         _check_kind(path)
         return set(Checkpoint.manifest(path)["components"])
-    except Exception:  # who reads it says what is wrong
+    except Exception:  # reading the states raises the error
         return set()
 
 
 def _check_kind(path: Path) -> None:
-    """Refuse what is no file, or has compressed parts, which could fill the memory."""
+    """Refuse a folder, and compressed parts, which could fill the main memory."""
     if path.is_dir():
         raise CheckpointError("it is a folder, and a checkpoint is one file.")
     with ZipFile(path) as archive:
@@ -158,8 +153,8 @@ def _check_kind(path: Path) -> None:
 
 
 def _cannot_use(path: Path, error: Exception, part: str = "") -> CheckpointError:
-    says_it = isinstance(error, OSError | RuntimeError | ValueError)
-    words = " ".join(str(error).split()) if says_it else f"{type(error).__name__}: {error}"
-    if "weights_only" in words:  # torch would advise to run what is in it
+    has_words = isinstance(error, OSError | RuntimeError | ValueError)
+    words = " ".join(str(error).split()) if has_words else f"{type(error).__name__}: {error}"
+    if "weights_only" in words:  # torch's own message advises to turn this off
         words = "it holds more than tensors, numbers and plain containers, and is not read."
     return CheckpointError(f"Cannot use the checkpoint {path}: {part}{words}")

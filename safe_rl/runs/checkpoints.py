@@ -28,7 +28,7 @@ def best_checkpoint(directory: Path) -> Path | None:
 
 
 def _score(path: Path, otherwise: float = -math.inf) -> float:
-    """What a best checkpoint was kept for; something else of one that does not say."""
+    """The score of a best checkpoint; `otherwise` if it cannot be read."""
     try:
         return float(read_facts(path)["score"])
     except (CheckpointError, KeyError, TypeError, ValueError):
@@ -76,11 +76,11 @@ class CheckpointStore:
         self.best = Path(directory) / "best"
         self._components = dict(components)
         self._writer = writer(components)
-        # there until the first checkpoint is: who finds neither knows that something is missing
+        # exists until the first checkpoint does: with neither, checkpoints were removed
         self._none_yet = self.last / "none-yet"
         self._keep_last, self._keep_best = keep_last, keep_best
         self._run = dict(run or {})
-        # best ones that are so again if the run is resumed from its last checkpoint
+        # former best ones, which are the best again if the run is resumed from its last checkpoint
         self._displaced: set[Path] = set()
 
     def begin(self) -> None:
@@ -115,7 +115,7 @@ class CheckpointStore:
     ) -> bool:
         """Write a checkpoint if there is room, or if ``score`` is higher than that of a kept one.
 
-        That stays until the next `save`: a run that is resumed from before forgets the new one.
+        A replaced one stays until the next `save`: a run resumed from before it has no new one.
 
         Args:
             steps: Environment steps then.
@@ -153,7 +153,7 @@ class CheckpointStore:
         facts = {**(facts or {}), **({"run": self._run} if self._run else {})}
         try:
             saver.save(path, metadata=facts)
-        except RuntimeError as error:  # torch's, for whatever it could not write
+        except RuntimeError as error:  # of torch, for any failure to write
             reason = str(error).splitlines()[0]
             raise OSError(f"{path} cannot be written; is the disk full? ({reason})") from error
         return path
@@ -161,8 +161,8 @@ class CheckpointStore:
     def resume(self, epochs: int = 0) -> Path | None:
         """Restore the newest checkpoint, or with a warning the next older one if it is damaged.
 
-        Best ones go that are newer than the restored: what they were the best of is forgotten. So
-        do the beginnings of checkpoints during whose writing the run was killed.
+        Best ones newer than the restored one are removed, and so are unfinished checkpoints of a
+        run that was killed while writing.
 
         Args:
             epochs: Rows of the run's table.
@@ -190,12 +190,12 @@ class CheckpointStore:
         if restored is None and epochs and not self._none_yet.exists():
             raise CheckpointError(
                 f"The checkpoints of {self.last} are gone, and the run has finished {epochs} "
-                "epochs, which starting over would delete. Put the checkpoints back to go on, or "
-                "move the run's folder away to start over."
+                "epochs, which starting over would delete. Put the checkpoints back to continue, "
+                "or move the run's folder away to start over."
             )
         if restored is not None and failures:
             warnings.warn(
-                f"{failures[0]} Going on from the older {restored.name} instead.", stacklevel=2
+                f"{failures[0]} Continuing from the older {restored.name} instead.", stacklevel=2
             )
         _clear_beginnings(self.best)
         for best in checkpoints_in(self.best):
@@ -245,7 +245,7 @@ def is_finished(directory: Path, frames: int) -> bool:
 
 
 def _clear_beginnings(directory: Path) -> None:
-    """Remove what a run that was killed while it saved has left, but for a file put aside."""
+    """Remove unfinished checkpoints of a killed run, and restore files that it had put aside."""
     for remains in directory.glob(".checkpoint-*"):
         name, _, kind = remains.name[1:].rpartition(".")
         if kind.startswith("backup-") and not (directory / name).exists():

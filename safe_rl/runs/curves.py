@@ -37,7 +37,7 @@ def draw_learning_curves(
     path: Path,
     title: str = "",
 ) -> None:
-    """Write `learning_curves` into a picture, replaced in one go.
+    """Write `learning_curves` into a picture file, replaced atomically.
 
     Examples:
         >>> import tempfile
@@ -115,7 +115,7 @@ def _label(figure: Figure, axes: Axes, name: str, *, from_zero: bool) -> None:
     axes.grid(alpha=0.3)
     if from_zero:
         axes.set_ylim(bottom=0)
-    # one below the other: side by side, names of costs run into the next panel's
+    # stacked: side by side, names of costs would reach into the next panel
     below = ScaledTranslation(0, _TO_LEGEND, figure.dpi_scale_trans)
     axes.legend(
         fontsize="small", frameon=False, loc="upper center",
@@ -161,7 +161,7 @@ def moving_mean(values: np.ndarray, width: int) -> np.ndarray:
         >>> moving_mean(np.array([1.0, 3.0, 5.0, 7.0, 9.0, 11.0]), 5).tolist()
         [1.0, 2.0, 3.0, 4.0, 5.0, 7.0]
     """
-    # no differences of running sums: after one huge value nothing would be left of the others
+    # differences of running sums would lose precision after one huge value
     sums = np.zeros(len(values))
     for back in range(min(width, len(values))):
         sums[back:] += values[: len(values) - back]

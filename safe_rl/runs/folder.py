@@ -41,7 +41,7 @@ LEASE = 15.0
 """Seconds after which a writer on another machine that has not renewed its lease is gone."""
 
 _NO_LOCKS = (errno.ENOSYS, errno.ENOLCK, errno.EOPNOTSUPP)
-_held: dict[Path, int] = {}  # folder -> the process that holds it: not one forked from it
+_locked: dict[Path, int] = {}  # folder -> the process that locked it, not its forks
 
 
 class _Below:
@@ -255,14 +255,13 @@ class RunInUseError(ValueError):
 def lock_folder(folder: RunFolder) -> Iterator[None]:
     """Keep others from writing into a folder; inside another such block of this process, continue.
 
-    Two locks of `filelock`'s: the kernel's (``flock``), which nobody has to tidy up after a process
-    that was killed, and a lease, because network file systems may keep the kernel's to each machine
-    or have none. The lease of a writer on another machine counts until it has not been renewed for
-    `LEASE` seconds.
+    Two locks of `filelock`: that of the kernel (``flock``), which ends with a killed process, and a
+    lease, because network file systems may have no such lock, or one per machine. The lease of a
+    writer on another machine expires `LEASE` seconds after its last renewal.
 
     Raises:
         RunInUseError: If another process holds it.
-        ValueError: If the folder holds links, by which others could have chosen what is written.
+        ValueError: If the folder holds links, which could lead writing elsewhere.
 
     Examples:
         >>> import tempfile
@@ -274,7 +273,7 @@ def lock_folder(folder: RunFolder) -> Iterator[None]:
         False
     """
     place = folder.directory.resolve()
-    if _held.get(place) == os.getpid():
+    if _locked.get(place) == os.getpid():
         yield
         return
     check_no_links(folder.directory)
@@ -285,8 +284,8 @@ def lock_folder(folder: RunFolder) -> Iterator[None]:
             stack.enter_context(lease.acquire(timeout=2 * LEASE))
         except Timeout:
             raise _in_use(folder, lease) from None
-        _held[place] = os.getpid()
-        stack.callback(_held.pop, place)
+        _locked[place] = os.getpid()
+        stack.callback(_locked.pop, place)
         yield
 
 
@@ -304,7 +303,7 @@ def _lock(folder: RunFolder, lease: SoftFileLease, stack: ExitStack) -> None:
 
 def _in_use(folder: RunFolder, lease: SoftFileLease) -> RunInUseError:
     owner = lease.owner
-    # behind the name of the machine is that of the container
+    # the name of the container follows that of the machine
     machine = "" if owner is None else owner.hostname.partition("?")[0]
     who = "another process" if owner is None else f"process {owner.pid} on {machine}"
     return RunInUseError(

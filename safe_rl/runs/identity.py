@@ -16,7 +16,6 @@ from omegaconf import DictConfig, OmegaConf
 
 from safe_rl.files import read_config, read_yaml
 from safe_rl.runs.folder import RunFolder, common_source
-from safe_rl.targets import present_name
 
 __all__ = [
     *("ROLES", "Role", "check_same_run", "differences", "experiment_of", "flatten"),
@@ -93,9 +92,9 @@ ROLES: dict[str, Role] = {
 }
 """Key, all below it, or ``*.`` and the last name of any key -> role; all others are EXPERIMENT."""
 
-# keys that the configurations of earlier runs lack, and what they meant without
+# keys that configurations of archived runs lack, and their values there
 _ABSENT = {"algo._target_": "safe_rl.algorithms.OnPolicy"}
-# likewise; they say nothing where they have these values
+# likewise: with these values they are left out of comparisons
 _SILENT: dict[str, Hashable] = {
     "env.outside": None,
     "env.physics": "cpu",
@@ -133,7 +132,7 @@ def experiment_of(config: Mapping[str, Any]) -> dict[str, Hashable]:
     """Dotted key -> value of all that names a run's experiment.
 
     Runs of which this is equal differ in nothing but the seed, and in where and how they were
-    carried out. Targets have their present names; ``init_from`` is what the sources of all seeds
+    carried out. ``init_from`` is what the sources of all seeds
     have in common, see :func:`safe_rl.runs.folder.common_source`.
 
     Args:
@@ -172,10 +171,7 @@ def _comparable(config: Mapping[str, Any]) -> dict[str, Hashable]:
         if key not in _SILENT or value != _SILENT[key]
     }
     absent = {key: target for key, target in _ABSENT.items() if key.partition(".")[0] in config}
-    return absent | {
-        key: present_name(value) if key.endswith("_target_") and isinstance(value, str) else value
-        for key, value in flat.items()
-    }
+    return absent | flat
 
 
 def flatten(settings: Mapping[str, Any]) -> dict[str, Hashable]:

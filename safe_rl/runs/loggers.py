@@ -1,6 +1,6 @@
-"""Loggers that know how to continue an interrupted run.
+"""Loggers that continue an interrupted run.
 
-Each is TorchRL's, writes below or remembers its run in the folder ``log_dir``, and is chosen by
+Each is TorchRL's, keeps its files or the id of its run in the folder ``log_dir``, and is chosen by
 ``logger=`` from ``conf/logger``.
 """
 
@@ -21,10 +21,20 @@ from safe_rl.files import replace_text
 from safe_rl.ranges import Text
 from safe_rl.runs.folder import RunFolder
 
-__all__ = ["MLflowLogger", "TensorboardLogger", "WandbLogger"]
+__all__ = ["MLflowLogger", "ResumableLogger", "TensorboardLogger", "WandbLogger"]
 
 
-class TensorboardLogger(TorchRLTensorboardLogger):
+class ResumableLogger:
+    """What a run calls besides ``log_scalar``: a base of loggers, before TorchRL's class."""
+
+    def continue_from(self, step: int) -> None:
+        """Discard what was logged after a step; nothing to do where logging it again does that."""
+
+    def close(self) -> None:
+        """Write what is buffered and end the logger's run."""
+
+
+class TensorboardLogger(ResumableLogger, TorchRLTensorboardLogger):
     """Event files for TensorBoard.
 
     Args:
@@ -48,7 +58,7 @@ class TensorboardLogger(TorchRLTensorboardLogger):
         super().__init__(exp_name, log_dir)
 
     def continue_from(self, step: int) -> None:
-        """Let TensorBoard forget what was logged after a step."""
+        """Let TensorBoard discard what was logged after a step."""
         writer = self.experiment._get_file_writer()
         event = Event(step=step + 1, session_log=SessionLog(status=SessionLog.START))
         writer.add_event(event, step=step + 1)
@@ -65,12 +75,12 @@ class TensorboardLogger(TorchRLTensorboardLogger):
         self.experiment._get_file_writer().add_summary(hparams_pb(dict(cfg)))
 
     def close(self) -> None:
-        """Write what is still held back."""
+        """Write what is buffered."""
         self.experiment.close()
 
 
 @needs_extra("mlflow", "mlflow")
-class MLflowLogger(MLFlowLogger):
+class MLflowLogger(ResumableLogger, MLFlowLogger):
     """A run of an MLflow experiment; a continued run uses the same one.
 
     Metrics that are logged again after an interruption have the same values as before.
@@ -101,12 +111,12 @@ class MLflowLogger(MLFlowLogger):
         return run
 
     def close(self) -> None:
-        """End the MLflow run, so that another one can begin in this process."""
+        """End the MLflow run, so that this process can begin another one."""
         self._mlflow.end_run()
 
 
 @needs_extra("wandb", "wandb")
-class WandbLogger(TorchRLWandbLogger):
+class WandbLogger(ResumableLogger, TorchRLWandbLogger):
     """A run of Weights & Biases; a continued run uses the same one.
 
     Args:
@@ -132,5 +142,5 @@ class WandbLogger(TorchRLWandbLogger):
         )
 
     def close(self) -> None:
-        """End the run, so that another one can begin in this process."""
+        """End the run, so that this process can begin another one."""
         self.experiment.finish()

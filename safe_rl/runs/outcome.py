@@ -1,6 +1,6 @@
-"""What a run comes to: its final figures, and what a limit judges.
+"""Final figures of a run, and its violations of limits.
 
-The best checkpoint, the terminal, the curves and the report all ask here.
+Used by the best checkpoint, the terminal, the curves and the report.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ FINAL_STEPS = 100_000
 
 
 def violation(row: Mapping[str, float], key: str, limit: float) -> float:
-    """By how much a limit is exceeded: above 0 it is broken.
+    """Amount by which a limit is exceeded; negative within it.
 
     That is J_c − d, or the column ``violation_<key>`` where there is one: an algorithm that limits
     something else than the mean cost of an episode writes its own violation there.
@@ -65,7 +65,7 @@ def measured(row: Mapping[str, float], key: str, limit: float | None) -> float:
 def keeps(row: Mapping[str, float], key: str, limit: float) -> bool:
     """Whether an epoch keeps a limit, by its episodes and by what the algorithm estimates.
 
-    The few episodes of one epoch keep a limit by luck, too. An algorithm that tracks J_c has the
+    The few episodes of one epoch may keep a limit by chance. An algorithm that tracks J_c has the
     columns ``estimate_<key>`` and ``target_<key>``; then its estimate has to be at its target.
 
     Args:
@@ -116,7 +116,6 @@ def feasible_return(
         (5.0, None)
     """
     mean = mean_row(latest)
-    # a constrained algorithm says itself what it holds against the limits
     is_feasible = all(keeps(mean, key, limit) for key, limit in limits.items())
     score = mean["episode_return"]
     return score if is_feasible and not math.isnan(score) else None

@@ -25,7 +25,7 @@ from safe_rl.targets import build
 
 __all__ = ["RunRecord", "code_of", "commit_of", "note_code"]
 
-# not to be taken for another checkout's by what a hook has set, nor to write into anybody's index
+# a Git hook sets these: they would name another checkout, or an index to write into
 _CLEARED = ("GIT_DIR", "GIT_WORK_TREE", "GIT_INDEX_FILE")
 _PATIENCE = 5.0  # seconds
 
@@ -33,7 +33,7 @@ _PATIENCE = 5.0  # seconds
 class RunRecord:
     """Configuration, table, logger, learning curves and progress bar of one run.
 
-    The folder holds ``config.yaml`` (resolved), ``code.json`` (by which commit it was carried out),
+    The folder holds ``config.yaml`` (resolved), ``code.json`` (the commits that it ran with),
     ``progress.csv`` (a row per epoch), ``curves.png`` and what the configured logger writes.
 
     Args:
@@ -43,7 +43,7 @@ class RunRecord:
         episode_length: T_ep, steps of a full episode.
 
     Raises:
-        ValueError: If Matplotlib is told to use what it has not (``MPLBACKEND``).
+        ValueError: If ``MPLBACKEND`` names a backend that Matplotlib does not have.
 
     Examples:
         >>> import tempfile
@@ -64,7 +64,7 @@ class RunRecord:
         cost_limits: Mapping[str, float],
         episode_length: int,
     ) -> None:
-        # which draws the curves, and knows all backends: a wrong one is said before the run begins
+        # imported now, so that a wrong MPLBACKEND is an error before the run begins
         import matplotlib  # noqa: F401
 
         self.directory = directory
@@ -75,7 +75,7 @@ class RunRecord:
 
     @contextmanager
     def writing(self, epoch: int | None = None, steps: int = 0) -> Iterator[None]:
-        """Keep the files open, and everybody else from writing them.
+        """Keep the files open, and the folder locked.
 
         Args:
             epoch: Epochs that a continued run has made before; None for a new run.
@@ -91,14 +91,14 @@ class RunRecord:
             if epoch is None:
                 self.folder.check_is_free()
             self._steps_before = steps
-            # that of a continued run is replaced when it has proved to be one that trains
+            # of a continued run: replaced after the first epoch, before which wrong settings fail
             self._is_config_saved = False
-            # before the table: one that is killed in between is no run yet, or one to go on with
+            # before the table: a table without a configuration could not be continued
             if epoch is None or not self.folder.is_run:
                 self._save_config()
             self._table = TableWriter(self.folder.table, keep_rows=epoch or 0)
             self._logger = build(self._config.logger, log_dir=str(self.directory))
-            if epoch is not None and hasattr(self._logger, "continue_from"):
+            if epoch is not None and self._logger is not None:
                 self._logger.continue_from(steps)
             if not epoch and self._logger is not None:
                 self._logger.log_hparams(given_settings(self.directory, self._config))
@@ -113,13 +113,12 @@ class RunRecord:
             finally:
                 self._bar.close()
                 self._table.close()
-                close = getattr(self._logger, "close", None)
-                if close is not None:
-                    close()
+                if self._logger is not None:
+                    self._logger.close()
 
     def _save_config(self) -> None:
         if not self._is_config_saved:
-            # replaced in one go: a run killed here can still be continued
+            # replaced atomically: a run killed here can still be continued
             with replacing(self.folder.config) as unfinished:
                 OmegaConf.save(self._config, unfinished, resolve=True)
             note_code(self.folder.code, self._steps_before)
@@ -156,7 +155,7 @@ class RunRecord:
 
     def draw_curves(self) -> None:
         """Write ``curves.png`` from the table."""
-        # here, because it imports matplotlib, half a second that no run begins with
+        # imported here: matplotlib takes half a second
         from safe_rl.runs.curves import draw_learning_curves
 
         table = read_table(self.folder.table)
@@ -175,7 +174,7 @@ class RunRecord:
 
 
 def note_code(path: Path, steps: int) -> None:
-    """Add the code that carries a run on from here to the file that lists them.
+    """Add the code that continues a run to the file that lists its versions.
 
     Args:
         path: The file, a list of JSON objects with ``steps``, ``version``, ``commit`` and
@@ -207,7 +206,7 @@ def code_of() -> Mapping[str, Any]:
 def commit_of(file: Path) -> tuple[str | None, bool | None]:
     """The commit of the checkout that a file belongs to, and whether it has been changed since.
 
-    Both are None if Git does not know the file: an installed package may lie in somebody else's
+    Both are None if Git does not track the file: an installed package may lie in another project's
     checkout.
 
     Examples:
@@ -224,7 +223,7 @@ def commit_of(file: Path) -> tuple[str | None, bool | None]:
 
 
 def _git(directory: Path, *arguments: str) -> str:
-    """What Git answers, without the line's end; nothing if it does not, for whatever reason."""
+    """The answer of Git without its newline; empty if there is none."""
     environment = {name: value for name, value in os.environ.items() if name not in _CLEARED}
     try:
         result = subprocess.run(

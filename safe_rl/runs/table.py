@@ -50,7 +50,7 @@ class TableWriter:
         kept = _first_rows(path, keep_rows) if keep_rows else []
         _columns_of(path, kept)
         self._columns = next(csv.reader(kept)) if kept else None
-        # replaced in one go: a run killed here still has its table
+        # replaced atomically: a run killed here still has its table
         replace_text(path, "".join(kept))
         self._file = path.open("a", newline="")
         self._path, self._size = path, self._file.tell()

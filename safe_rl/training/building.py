@@ -70,7 +70,7 @@ def build_trainer(
         directory: Folder of the run.
         make_env: Makes an environment like ``env`` with another ``num_envs``, for collectors with
             workers.
-        make_evaluation: Makes, of the policy, what evaluates it in between.
+        make_evaluation: Makes the periodic evaluation of the policy.
 
     Raises:
         ValueError: If parts of the configuration do not fit together.
@@ -136,15 +136,15 @@ def initialise_networks(
 ) -> list[str]:
     """Give networks the weights that a run has learned.
 
-    Optimisers, multipliers and counters start anew. Networks about costs are taken over if the run
-    constrained the same costs, and had the same loss say what they are.
+    Optimisers, multipliers and counters start new. Networks of costs are taken over if the run had
+    the same constrained costs and, with Q functions, the same loss.
 
     Args:
         networks: The new run's by name, changed in place.
         source: Folder of the run, of which the newest checkpoint is read, or a checkpoint.
         cost_keys: Keys of the new run's constrained costs.
-        cost_loss: Loss of the new run's cost critics if they learn from a memory.
-        cost_networks: Names of the networks that are about costs.
+        cost_loss: Loss of the new run's cost critics if they are Q functions.
+        cost_networks: Names of the networks of costs.
 
     Returns:
         Names of the networks that were taken over.
@@ -182,7 +182,7 @@ def _newest(directory: Path) -> Path:
 
 
 def _cost_critics(checkpoint: Path) -> tuple[list[str], str | None]:
-    """Costs that the cost critic of a checkpoint's run is for, none if not known; and its loss."""
+    """Costs of the cost critic in a checkpoint, empty if not known; and its loss."""
     run = RunFolder(run_of(checkpoint)[0])
     config = read_config(run.config) if run.is_run else {}
     is_constrained = (config.get("algo") or {}).get("constrained", False)
@@ -191,7 +191,7 @@ def _cost_critics(checkpoint: Path) -> tuple[list[str], str | None]:
 
 
 def _cost_loss(config: Mapping[str, Any]) -> str | None:
-    """Loss of critics that learn from a memory: of two alike, one may be a mean, one a variance."""
+    """Loss of Q functions: equal networks may give a mean in one and a variance in another."""
     return (config.get("loss") or {}).get("_target_") if config.get("critics") else None
 
 

@@ -1,4 +1,4 @@
-"""Which policies of a run are its best: each is judged by the episodes that it played itself."""
+"""The best policies of a run: each is judged by the episodes that it played itself."""
 
 from __future__ import annotations
 
@@ -13,18 +13,18 @@ from safe_rl.runs.outcome import feasible_return
 
 __all__ = ["Candidates", "Judged", "epochs_until_judged"]
 
-# longer than this no policy waits: what waits is in memory, and in every checkpoint
+# upper bound of epochs to wait: waiting policies are in main memory and in every checkpoint
 _LONGEST = 10
 
 
 def epochs_until_judged(over: int, length: float, steps_per_epoch: float) -> int:
     """Epochs after an update until finished episodes were, on average, played by its policy.
 
-    The batch that a policy collects comes an epoch after the update. Where batches are shorter than
-    episodes, what ends in it began before; half an episode later it is in the middle.
+    A policy collects its batch in the epoch after its update. Episodes longer than a batch began
+    before it; half an episode later they lie around it.
 
     Args:
-        over: Epochs by whose mean a policy is judged, of which this is the last.
+        over: Number of epochs whose mean judges a policy.
         length: Steps of an episode.
         steps_per_epoch: Steps of every row in an epoch.
 
@@ -55,14 +55,14 @@ class Judged(NamedTuple):
 
 
 class Candidates:
-    """Policies that wait for the epochs by which they are judged.
+    """Policies that wait for the epochs that judge them.
 
     Args:
         components: Parts of the run, by name, that a checkpoint of a policy holds.
         limits: Cost key -> d, undiscounted cost per episode.
-        over: Epochs by whose mean a policy is judged.
-        delay: Mean length of episodes -> epochs from a policy's update until the last of those by
-            which it is judged.
+        over: Number of epochs whose mean judges a policy.
+        delay: Mean length of episodes -> epochs from a policy's update to the last one that judges
+            it.
         longest: Most steps of an episode, taken for the mean length until one has ended.
 
     Examples:
@@ -94,20 +94,20 @@ class Candidates:
         self._latest: deque[Mapping[str, float]] = deque(maxlen=over)
         self._waiting: deque[dict[str, Any]] = deque()
 
-    def go_on_after(self, rows: Iterable[Mapping[str, float]]) -> None:
+    def continue_after(self, rows: Iterable[Mapping[str, float]]) -> None:
         """Take in the epochs of a run that is continued."""
         for row in rows:
             self._take(row)
 
     def add(self, row: Mapping[str, float]) -> list[Judged]:
-        """Take in an epoch: its policy waits, and the one whose turn it is is judged.
+        """Add an epoch: its policy waits, and the policy that is due is judged.
 
         Args:
             row: Of the run's table, by column.
 
         Returns:
-            The judged policy, if it kept every limit. Where episodes have become shorter, those
-            before it, whose own episodes are over, are passed over.
+            The judged policy, if it kept every limit. If episodes have become shorter, several
+            are due, and only the latest is judged.
         """
         self._take(row)
         states = {name: copy.deepcopy(part.state_dict()) for name, part in self._components.items()}
@@ -123,13 +123,13 @@ class Candidates:
 
     @property
     def waiting(self) -> list[int]:
-        """Environment steps after which those that wait were the run's policies."""
+        """Environment steps of the waiting policies."""
         return [policy["steps"] for policy in self._waiting]
 
     def judge_all(self) -> list[Judged]:
         """Judge all that wait by the epochs that there are, at the end of a run.
 
-        They go on waiting: a run that is trained on has later epochs to judge them by.
+        They stay: a run that is continued has later epochs to judge them.
         """
         return [one for policy in self._waiting for one in self._judge(policy)]
 
@@ -140,14 +140,14 @@ class Candidates:
         return [Judged(policy["steps"], score, {"epoch": policy["epoch"]}, policy["states"])]
 
     def state_dict(self) -> dict[str, Any]:
-        """Those that wait."""
+        """The waiting policies."""
         return {"waiting": list(self._waiting)}
 
     def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
         """Continue from :meth:`state_dict`.
 
         Raises:
-            ValueError: If those that wait are no policies of a run.
+            ValueError: If they are no policies of a run.
         """
         waiting = list(state_dict["waiting"])
         for policy in waiting:

@@ -1,4 +1,4 @@
-"""What the loop keeps besides networks: counters, the worlds between epochs, a request to stop."""
+"""State of the loop: counters, the worlds between epochs, a request to stop."""
 
 from __future__ import annotations
 
@@ -62,9 +62,9 @@ class Progress:
 class WorldSnapshot:
     """The worlds as the next epoch finds them, and the observation to continue from.
 
-    Every epoch starts from a snapshot, whether a checkpoint is written or not. Writing a state
-    into a simulation forgets what no snapshot holds (it wakes sleeping bodies); were it done on
-    resuming alone, a run that was interrupted would differ from one that was not.
+    Every epoch starts from a snapshot, with or without a checkpoint. Writing a state into a
+    simulation changes what snapshots do not hold (it wakes sleeping bodies): done only on resuming,
+    it would make an interrupted run differ from an uninterrupted one.
 
     Args:
         env: Environment with ``get_state`` and ``set_state``.
@@ -88,7 +88,7 @@ class WorldSnapshot:
             multiple: Steps that are taken at a time, of which all begin at a multiple.
 
         Returns:
-            Whether that could be done: the environment's state holds its ``step_count``.
+            Whether that could be done: The environment's state holds its ``step_count``.
         """
         state = self._env.get_state()
         steps = state.get("step_count", None)

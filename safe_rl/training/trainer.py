@@ -32,8 +32,8 @@ from safe_rl.training.state import Progress, StopRequest, WorldSnapshot
 
 __all__ = ["EpisodeError", "Evaluator", "Trainer", "WorkerError"]
 
-# Parts that only resuming needs, and only the newest checkpoints hold: a replay buffer fills
-# gigabytes, the others several times what a policy does.
+# Parts that only the newest checkpoints hold, for resuming: a replay buffer has gigabytes, the
+# others are several times as large as a policy.
 _FOR_RESUMING = {"memory", "policy_update", "critic_update", "env", "accounting", "rng"}
 
 
@@ -52,7 +52,7 @@ class Trainer:
         env: Environment that the collector steps.
         algorithm: What learns.
         collector: Endless collector of [N, T] batches, running the algorithm's policy.
-        cost_limits: Cost key -> d, undiscounted cost per episode: what counts as feasible.
+        cost_limits: Cost key -> d, undiscounted cost per episode, for the best checkpoints.
         record: What the run writes into its folder.
         config: Configuration of the run, for ``frames`` and ``checkpoint``.
         evaluation: Evaluates the policy after every epoch in which that is due, or None.
@@ -162,13 +162,13 @@ class Trainer:
         self._is_continued = True
         with lock_folder(self.record.folder):
             restored = self._checkpoints.resume(self.record.folder.num_rows)
-        if restored is not None:  # one that starts over meets the episodes that it would have met
+        if restored is not None:  # a run that starts over keeps its first episodes
             self._begin_episodes()
         return restored is not None
 
     @property
     def begins_anew(self) -> bool:
-        """Whether a run that is continued begins new episodes, for want of the worlds' state."""
+        """Whether a resumed run begins new episodes, because worlds have no stored state."""
         return self._worlds is None
 
     def _begin_episodes(self) -> None:
@@ -180,8 +180,8 @@ class Trainer:
             self._recording.cut_after(self.progress.epoch - 1)
         self.algorithm.forget_open_episodes()
         self._env.continue_from(self.progress.steps // self._env.batch_size.numel())
-        # otherwise it would meet the episodes again that the run began with; workers, which have
-        # not begun, go on from its state
+        # with the old seed the first episodes of the run would come again; workers, which have not
+        # started yet, continue from the state of this environment
         self._env.set_seed(int(torch.randint(2**31, ())))
         if isinstance(self._collector, Collector):
             self._collector.reset()
@@ -216,15 +216,15 @@ class Trainer:
     def _train(self) -> None:
         batches = self.batches()
         saved_at = time.monotonic()
-        behind = self.progress.epoch if self._is_continued else None
-        with StopRequest() as stop, self.record.writing(behind, self.progress.steps):
+        epoch = self.progress.epoch if self._is_continued else None
+        with StopRequest() as stop, self.record.writing(epoch, self.progress.steps):
             if not self.progress.epoch:
                 self._checkpoints.begin()
             if self._recording is not None:
-                # as of the table, what came after the checkpoint is another continuation's
+                # batches after the checkpoint are removed, like rows of the table
                 self._recording.begin(self.progress.epoch)
-            self._candidates.go_on_after(self.record.rows())
-            # a shorter run that was finished has judged them by fewer epochs
+            self._candidates.continue_after(self.record.rows())
+            # at its end, the shorter run judged these by fewer epochs
             self._checkpoints.forget_best(self._candidates.waiting)
             while self.progress.steps < self._frames:
                 row = self.epoch(batches)
@@ -241,7 +241,7 @@ class Trainer:
             if self.progress.steps < self._frames and stop.received:
                 self.interrupted_by = stop.received
             else:
-                # before the last checkpoint: with that, nobody would come back to them
+                # before the last checkpoint, which marks the run as finished
                 self._keep(self._candidates.judge_all())
             self._save()
 

@@ -168,7 +168,7 @@ def test_ten_times_the_cost_of_an_episode_is_ten_times_the_barrier():
 
 def test_errors_say_what_to_change():
     actor, batch = make_case(1)
-    with pytest.raises(ValueError, match="hysteresis must be in"):
+    with pytest.raises(ValueError, match=r"hysteresis=0\.0: it must be"):
         c_trpo(actor, hysteresis=0.0)
     with pytest.raises(ValueError, match="needs the mean episode_length"):
         c_trpo(actor, 1)(batch, torch.tensor([-1.0]))

@@ -146,7 +146,7 @@ def test_errors_say_what_to_change():
     actor, batch = make_case()
     with pytest.raises(ValueError, match="one per cost surrogate"):
         crpo(actor)(batch, torch.zeros(1), LENGTH)
-    with pytest.raises(ValueError, match="projection must be one of"):
+    with pytest.raises(ValueError, match="projection=tv: it must be one of"):
         PCPOStep(
             CPOLoss(actor, entropy_coeff=0.0), projection="tv", rescale_violation=True, **SETTINGS
         )

@@ -78,8 +78,8 @@ def test_a_killed_run_without_its_memory_says_what_is_lost(tmp_path):
     kill_after_rows(command(*keys), tmp_path, 4)
     before = (tmp_path / "progress.csv").read_text().splitlines()[:4]
     words = said_by(f"resume={tmp_path}")
-    assert "The transitions in its memory are not stored, by memory.keep=false" in words
-    assert "learning goes on when it holds 120 new ones" in words
+    assert "replay buffer are not stored (memory.keep=false)" in words
+    assert "learning resumes when it holds 120 new ones" in words
     table = (tmp_path / "progress.csv").read_text().splitlines()
     assert len(table) == 1 + 15
     assert table[:4] == before

@@ -219,7 +219,7 @@ def test_the_loss_is_the_mean_squared_difference():
 
 def test_a_dataset_from_which_nothing_would_ever_be_learned_is_refused(tmp_path):
     data = record(tmp_path / "data", head_south)
-    with pytest.raises(ValueError, match="alone=true: the memory holds 160 transitions") as error:
+    with pytest.raises(ValueError, match="the replay buffer holds 160 transitions") as error:
         OffPolicy.build(offline_config(data, "memory.batch_size=512"), PointMass(4))
     assert "a minibatch of 512 (memory.batch_size)" in str(error.value)
 
