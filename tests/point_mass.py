@@ -110,3 +110,10 @@ class PointMass(ConstrainedEnv):
         self._position, self._velocity = state["position"].clone(), state["velocity"].clone()
         self._step_count, self._episode = state["step_count"].clone(), state["episode"].clone()
         return self._observe()
+
+
+class Forgetful(PointMass):
+    """Its worlds cannot be stored."""
+
+    def get_state(self) -> None:  # type: ignore[override]
+        return None

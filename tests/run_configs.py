@@ -1,7 +1,10 @@
 """Configurations composed as the command line composes them, for tests without it."""
 
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
+import torch
 from hydra import compose, initialize_config_dir
 from hydra.core.config_store import ConfigStore
 from omegaconf import DictConfig
@@ -46,3 +49,21 @@ def without_times(path: Path) -> list[list[str]]:
     times = {i for i, name in enumerate(lines[0]) if "time" in name or name == "steps_per_second"}
     assert len(times) == 4
     return [[field for i, field in enumerate(line) if i not in times] for line in lines]
+
+
+def assert_resumes_exactly(make: Callable[..., Any], folder: Path, *half: str) -> Any:
+    """Compare the tables of a run that is interrupted and of one that is not.
+
+    `make(name, *overrides)` makes a trainer of a run in ``folder / name``; `half` are overrides of
+    the first part alone. Returns the resumed trainer.
+    """
+    make("whole").run()
+    make("halves", *half).run()
+    torch.rand(7)
+    resumed = make("halves")
+    assert resumed.resume()
+    resumed.run()
+    table, expected = (without_times(folder / n / "progress.csv") for n in ("halves", "whole"))
+    assert len(expected) > 2
+    assert table == expected
+    return resumed

@@ -7,6 +7,7 @@ from torch import nn
 from torchrl.envs.utils import ExplorationType
 from torchrl.modules import IndependentNormal, ProbabilisticActor
 
+from safe_rl.objectives.fisher import FisherProduct
 from safe_rl.objectives.trust_region import flatten, set_parameters
 
 NUM_OBS, NUM_ACTIONS = 3, 2
@@ -53,6 +54,20 @@ def whole_step(step, batch, *given):
     moved = flatten(step.parameters).detach() - before
     set_parameters(step.parameters, before)
     return moved / metrics["step_fraction"], metrics
+
+
+def dense_fisher(actor, batch, damping=0.1):
+    """The Fisher matrix plus damping, [P, P], in double precision."""
+    parameters = list(actor.parameters())
+    product = FisherProduct(actor, batch, parameters, damping)
+    return torch.stack([product(row) for row in torch.eye(flatten(parameters).numel())]).double()
+
+
+def flat_gradients(actor, *values):
+    """Gradients of scalars by all parameters, [P] each, in double precision."""
+    parameters = list(actor.parameters())
+    rows = (torch.autograd.grad(value, parameters, retain_graph=True) for value in values)
+    return [flatten(row).double() for row in rows]
 
 
 def perturb(actor, size=0.05):

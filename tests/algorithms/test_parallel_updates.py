@@ -55,13 +55,6 @@ def test_the_exploration_type_is_afterwards_what_it_was(two_threads):
     assert exploration_type() == before
 
 
-def test_one_thread_calls_them_in_turn():
-    order = []
-    with torch_threads(1):
-        in_parallel(lambda: order.append("first"), lambda: order.append("second"))
-    assert order == ["first", "second"]
-
-
 def test_threads_are_shared_and_given_back(two_threads):
     assert in_parallel(torch.get_num_threads, torch.get_num_threads) == (1, 1)
     assert torch.get_num_threads() == 2

@@ -3,14 +3,12 @@
 import numpy as np
 import pytest
 import torch
-from samples import make_actor, make_batch, whole_step
+from samples import dense_fisher, flat_gradients, make_actor, make_batch, whole_step
 from scipy.optimize import minimize
 
 from safe_rl.algorithms import CRPOStep, PCPOStep
 from safe_rl.algorithms.cpo_step import nearest_feasible
 from safe_rl.objectives import CPOLoss
-from safe_rl.objectives.fisher import FisherProduct
-from safe_rl.objectives.trust_region import flatten
 
 DELTA = 0.01
 SETTINGS = {
@@ -58,18 +56,12 @@ def test_constraints_without_a_gradient_are_left_out():
 def test_pcpo_is_the_equation_of_its_article(projection, violation):
     actor, batch = make_case()
     batch["cost_advantage"] = batch["cost_advantage"][:, :1]
-    parameters = list(actor.parameters())
-    fisher = FisherProduct(actor, batch, parameters, SETTINGS["damping"])
-    size = flatten(parameters).numel()
-    matrix = torch.stack([fisher(row) for row in torch.eye(size)]).double()
+    matrix = dense_fisher(actor, batch)
     step = PCPOStep(
         CPOLoss(actor, entropy_coeff=0.0), projection=projection, rescale_violation=True, **SETTINGS
     )
     losses = step.loss(batch)
-    g, b = (
-        flatten(torch.autograd.grad(value, parameters, retain_graph=True)).double()
-        for value in (losses["loss_objective"], losses["cost_surrogate"][0])
-    )
+    g, b = flat_gradients(actor, losses["loss_objective"], losses["cost_surrogate"][0])
     taken, _ = whole_step(step, batch, torch.tensor([violation]), LENGTH)
     h_g = torch.linalg.solve(matrix, g)
     first = -(2 * DELTA / (g @ h_g)).sqrt() * h_g
@@ -84,9 +76,7 @@ def test_pcpo_is_the_equation_of_its_article(projection, violation):
 def test_a_bounded_demand_is_a_smaller_violation():
     actor, batch = make_case()
     batch["cost_advantage"] = batch["cost_advantage"][:, :1]
-    parameters = list(actor.parameters())
-    fisher = FisherProduct(actor, batch, parameters, SETTINGS["damping"])
-    matrix = torch.stack([fisher(row) for row in torch.eye(flatten(parameters).numel())]).double()
+    matrix = dense_fisher(actor, batch)
 
     def taken(violation, **settings):
         loss = CPOLoss(actor, entropy_coeff=0.0)
@@ -94,7 +84,7 @@ def test_a_bounded_demand_is_a_smaller_violation():
         return whole_step(step, batch, torch.tensor([violation]), LENGTH)[0]
 
     cost = CPOLoss(actor, entropy_coeff=0.0)(batch)["cost_surrogate"][0]
-    b = flatten(torch.autograd.grad(cost, parameters)).double()
+    (b,) = flat_gradients(actor, cost)
     reach = (2 * DELTA * b @ torch.linalg.solve(matrix, b)).sqrt().item()
     bounded = taken(1e4, largest_demand=0.5)
     torch.testing.assert_close(bounded, taken(50 * reach), atol=1e-4, rtol=1e-2)

@@ -247,16 +247,6 @@ def test_exponents_that_are_missing_or_too_many_are_named(exponents):
         make_memory(prioritised=exponents)
 
 
-def test_only_a_memory_that_is_kept_is_part_of_checkpoints():
-    assert set(make_memory().components()) == {"memory"}
-    assert not make_memory(keep=False).components()
-
-
-def test_a_storage_that_does_not_exist_is_named():
-    with pytest.raises(ValueError, match="storage=disk: it must be one of tensor, memmap"):
-        make_memory(storage="disk")
-
-
 def test_sums_over_long_rows_are_those_of_all_their_episodes():
     """A row of a dataset has all of its episodes; it is summed piece by piece."""
     memory, length = make_memory(n_steps=3, capacity=20_000), 6_000

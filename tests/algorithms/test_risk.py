@@ -14,7 +14,7 @@ from torchrl.modules import IndependentNormal, ProbabilisticActor
 from safe_rl.algorithms.constraints import CHARGES
 from safe_rl.collectors import EpisodeAccounting
 from safe_rl.objectives import Chance, CostGAE, CVaR, TRPOLoss
-from safe_rl.objectives.risk import cost_so_far, value_at_risk
+from safe_rl.objectives.risk import cost_so_far
 from safe_rl.runs.table import read_table
 from safe_rl.training.building import build_trainer
 
@@ -257,11 +257,3 @@ def test_a_resumed_run_charges_as_if_it_had_never_stopped():
     second.load_state_dict(whole.state_dict())
     ours, theirs = (risk(*batch, torch.ones(1, 1)) for risk in (whole, second))
     assert all(torch.equal(one, other) for one, other in zip(ours, theirs, strict=True))
-
-
-def test_wrong_settings():
-    with pytest.raises(ValueError, match="tail"):
-        cvar_of([1.0], tail=0.0)
-    with pytest.raises(ValueError, match="most_over"):
-        Chance(torch.ones(1), most_over=1.0)
-    assert value_at_risk(torch.arange(10.0).unsqueeze(-1), 0.1).item() == 8

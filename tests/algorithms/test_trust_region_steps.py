@@ -7,6 +7,8 @@ import torch
 from one_state import total
 from samples import (
     assert_gradients_are_differences,
+    dense_fisher,
+    flat_gradients,
     make_actor,
     make_batch,
     perturb,
@@ -60,12 +62,6 @@ def kl_and_surrogates(actor, batch):
         if "cost_advantage" in batch.keys():  # noqa: SIM118 (a TensorDict iterates over its rows)
             costs = CPOLoss(actor, entropy_coeff=0.0)(batch)["cost_surrogate"]
     return kl, reward, costs
-
-
-def dense_fisher(actor, batch):
-    parameters = list(actor.parameters())
-    product = FisherProduct(actor, batch, parameters, SETTINGS["damping"])
-    return torch.stack([product(row) for row in torch.eye(flatten(parameters).numel())])
 
 
 def all_losses(actor):
@@ -126,7 +122,7 @@ def test_trpo_step_fills_the_trust_region_along_the_natural_gradient(batch_size)
     actor, batch = make_case(0, batch_size)
     parameters = list(actor.parameters())
     start = flatten(parameters).detach()
-    matrix = dense_fisher(actor, batch)
+    matrix = dense_fisher(actor, batch).float()
     loss = TRPOLoss(actor, entropy_coeff=0.0)
     gradient = flatten(torch.autograd.grad(loss(batch)["loss_objective"], parameters))
     metrics = TRPOStep(loss, **SETTINGS)(batch)
@@ -202,14 +198,10 @@ def test_cpo_cases_move_the_cost_as_they_should(violation, case):
 
 def test_cpo_diagnostics_are_the_definitions():
     actor, batch = make_case(2)
-    parameters = list(actor.parameters())
-    matrix = dense_fisher(actor, batch).double()
+    matrix = dense_fisher(actor, batch)
     losses = CPOLoss(actor, entropy_coeff=0.0)(batch)
-    vectors = [
-        flatten(torch.autograd.grad(value, parameters, retain_graph=True)).double()
-        for value in (losses["loss_objective"], *losses["cost_surrogate"])
-    ]
-    g, b = vectors[0], torch.stack(vectors[1:])
+    g, *rows = flat_gradients(actor, losses["loss_objective"], *losses["cost_surrogate"])
+    b = torch.stack(rows)
     violation = torch.tensor([-5.0, 3.0])
     metrics = cpo_step(actor)(batch, violation, LENGTH)
     q, r = g @ torch.linalg.solve(matrix, g), b @ torch.linalg.solve(matrix, g)
@@ -229,15 +221,10 @@ def test_unconverged_cpo_steps_meet_the_linear_constraints_and_the_radius(violat
     """With ten iterations, against gradients and the dense Fisher matrix, not converged ones."""
     actor, batch = make_case(2, (2000,))
     parameters = list(actor.parameters())
-    matrix = dense_fisher(actor, batch).double()
+    matrix = dense_fisher(actor, batch)
     losses = CPOLoss(actor, entropy_coeff=0.0)(batch)
-    b = torch.stack(
-        [
-            flatten(torch.autograd.grad(cost, parameters, retain_graph=True))
-            for cost in losses["cost_surrogate"]
-        ]
-    ).double()
-    g = flatten(torch.autograd.grad(losses["loss_objective"], parameters)).double()
+    g, *rows = flat_gradients(actor, losses["loss_objective"], *losses["cost_surrogate"])
+    b = torch.stack(rows)
     step = cpo_step(actor, cg_iterations=3)
     violations = torch.tensor([violation, -1.0])
     fisher = FisherProduct(actor, batch, parameters, SETTINGS["damping"])
@@ -259,13 +246,9 @@ def test_unconverged_cpo_steps_meet_the_linear_constraints_and_the_radius(violat
 def test_a_bounded_demand_leaves_the_rest_of_the_step_to_the_reward():
     """In the metric of the dense Fisher matrix: 0.8 of the radius along b, 0.6 of it beside."""
     actor, batch = make_case(1, (2000,))
-    parameters = list(actor.parameters())
-    matrix = dense_fisher(actor, batch).double()
+    matrix = dense_fisher(actor, batch)
     losses = CPOLoss(actor, entropy_coeff=0.0)(batch)
-    g, b = (
-        flatten(torch.autograd.grad(value, parameters, retain_graph=True)).double()
-        for value in (losses["loss_objective"], losses["cost_surrogate"][0])
-    )
+    g, b = flat_gradients(actor, losses["loss_objective"], losses["cost_surrogate"][0])
 
     def taken(violation, **settings):
         step = cpo_step(actor, cg_iterations=60, **settings)

@@ -12,7 +12,7 @@ from threading import Thread
 import point_mass
 import pytest
 import torch
-from point_mass import PointMass
+from point_mass import Forgetful, PointMass
 
 from safe_rl.collectors import WorkerCollector, make_process_collector, make_ray_collector
 from safe_rl.collectors.workers import split_rows
@@ -43,11 +43,6 @@ def test_workers_have_the_noise_that_the_rows_of_one_process_would():
     expected = whole.reset()["observation"]
     rows = torch.cat([share.reset()["observation"] for share in shares])
     assert torch.equal(rows, expected)
-
-
-class Forgetful(PointMass):
-    def get_state(self):
-        """Its worlds cannot be stored."""
 
 
 def test_workers_have_seeds_and_a_schedule_also_where_worlds_cannot_be_stored():

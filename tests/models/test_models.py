@@ -59,11 +59,6 @@ def test_actor_is_a_tanh_perceptron_with_a_diagonal_gaussian():
     torch.testing.assert_close(distribution.entropy(), reference.entropy().sum(-1))
 
 
-def test_critic_has_one_output_per_cost():
-    critic = make_critic(5, hidden_sizes=[6], num_outputs=3, out_key="cost_value")
-    assert critic(observations(2, 7))["cost_value"].shape == (2, 7, 3)
-
-
 def test_behaviour_policy_writes_what_the_actor_writes():
     actor = make_actor(5, 2, hidden_sizes=[6], initial_log_std=-0.3)
     sample, expected = BehaviourPolicy(actor)(observations(4)), actor(observations(4))

@@ -162,15 +162,6 @@ def test_compiles_in_one_graph_that_is_never_recompiled(backend):
     assert counter.frame_count == 1
 
 
-def test_called_with_keywords():
-    actor = make_actor()
-    batch = make_batch(actor, [16])
-    loss = make_lagrangian(actor, init=1.0, limits=25.0)
-    values = loss(**{key: batch[key] for key in loss.in_keys})
-    torch.testing.assert_close(values[0], loss(batch)["loss_objective"])
-    assert len(values) == len(loss.out_keys)
-
-
 def test_moves_across_devices_and_types():
     actor = make_actor()
     batch = make_batch(actor, [16], 2)

@@ -73,46 +73,30 @@ def test_a_policy_of_nan_is_not_evaluated(trained, tmp_path):
         load_policy(config, env, path, torch.device("cpu"))
 
 
-def test_a_compressed_checkpoint_is_refused_before_it_fills_the_memory(trained, tmp_path):
-    path = RunFolder(trained[0]).newest_checkpoint()
-    with zipfile.ZipFile(path) as original:
-        contents = {name: original.read(name) for name in original.namelist()}
-    bomb = tmp_path / path.name
-    with zipfile.ZipFile(bomb, "w", zipfile.ZIP_DEFLATED) as archive:
-        for name, content in contents.items():
-            archive.writestr(name, content)
-    with pytest.raises(CheckpointError, match="compressed parts"):
-        read_states(bomb, PARTS)
+def copied(folder, place, actor=None, compression=zipfile.ZIP_STORED):
+    """The newest checkpoint written once more, compressed or with another file for the actor."""
+    path = RunFolder(folder).newest_checkpoint()
+    with zipfile.ZipFile(path) as old, zipfile.ZipFile(place / path.name, "w", compression) as new:
+        for name in old.namelist():
+            is_replaced = actor is not None and "actor" in name
+            new.writestr(name, actor.read_bytes() if is_replaced else old.read(name))
+    return place / path.name
 
 
-def test_a_compressed_part_is_refused_as_well(trained, tmp_path):
-    path = RunFolder(trained[0]).newest_checkpoint()
-    bomb = tmp_path / path.name
-    with zipfile.ZipFile(path) as original, zipfile.ZipFile(bomb, "w") as archive:
-        for name in original.namelist():
-            content = original.read(name)
-            if "actor" in name:
-                inner = tmp_path / "inner.pt"
-                with zipfile.ZipFile(inner, "w", zipfile.ZIP_DEFLATED) as part:
-                    part.writestr("archive/data/0", bytes(10**6))
-                content = inner.read_bytes()
-            archive.writestr(name, content)
-    with pytest.raises(CheckpointError, match="compressed parts"):
-        read_states(bomb, PARTS)
+def test_compressed_checkpoints_and_parts_are_refused_before_they_fill_the_memory(
+    trained, tmp_path
+):
+    with zipfile.ZipFile(tmp_path / "inner.pt", "w", zipfile.ZIP_DEFLATED) as part:
+        part.writestr("archive/data/0", bytes(10**6))
+    for options in ({"compression": zipfile.ZIP_DEFLATED}, {"actor": tmp_path / "inner.pt"}):
+        with pytest.raises(CheckpointError, match="compressed parts"):
+            read_states(copied(trained[0], tmp_path, **options), PARTS)
 
 
 def test_a_pickle_is_refused_in_a_line_without_advice(trained, tmp_path):
-    path = RunFolder(trained[0]).newest_checkpoint()
-    theirs = tmp_path / path.name
     torch.save({"weight": Touching()}, tmp_path / "state.pt")
-    with zipfile.ZipFile(path) as original, zipfile.ZipFile(theirs, "w") as archive:
-        for name in original.namelist():
-            content = original.read(name)
-            archive.writestr(
-                name, (tmp_path / "state.pt").read_bytes() if "actor" in name else content
-            )
     with pytest.raises(CheckpointError) as caught:
-        read_states(theirs, PARTS)
+        read_states(copied(trained[0], tmp_path, tmp_path / "state.pt"), PARTS)
     assert "\n" not in str(caught.value)
     assert "weights_only" not in str(caught.value)
 

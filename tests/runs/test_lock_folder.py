@@ -81,13 +81,17 @@ def outcome_of(folder, outcome):
         outcome.put("in use")
 
 
-def test_a_forked_process_does_not_hold_what_its_parent_holds(folder):
+def assert_locked_for_others(folder):
     outcome = FORK.Queue()
     with lock_folder(folder):
         process = FORK.Process(target=outcome_of, args=(folder, outcome), daemon=True)
         process.start()
         assert outcome.get(timeout=PATIENCE) == "in use"
         process.join(PATIENCE)
+
+
+def test_a_forked_process_does_not_hold_what_its_parent_holds(folder):
+    assert_locked_for_others(folder)
 
 
 def test_a_forked_process_that_outlives_the_holder_holds_nothing(folder):
@@ -157,12 +161,7 @@ def test_without_locks_the_writer_is_still_seen(folder, quick, monkeypatch, code
         raise OSError(code, os.strerror(code))
 
     monkeypatch.setattr(FileLock, "acquire", refuse)
-    outcome = FORK.Queue()
-    with lock_folder(folder):
-        process = FORK.Process(target=outcome_of, args=(folder, outcome), daemon=True)
-        process.start()
-        assert outcome.get(timeout=PATIENCE) == "in use"
-        process.join(PATIENCE)
+    assert_locked_for_others(folder)
 
 
 @pytest.mark.parametrize("content", ["", "{", "[]", "null"])

@@ -12,14 +12,14 @@ from threading import Thread
 
 import pytest
 from omegaconf import OmegaConf
-from point_mass import PointMass
+from point_mass import Forgetful, PointMass
 from point_mass_runs import point_mass_trainer as trainer_of_point_mass
 from run_configs import compose_config, point_mass_config, without_times
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from torchrl.checkpoint import Checkpoint, CheckpointError
 
 from safe_rl.envs import SafetyGymEnv, store_configs
-from safe_rl.runs.checkpoints import CheckpointStore, is_finished
+from safe_rl.runs.checkpoints import is_finished
 from safe_rl.runs.folder import RunFolder, RunInUseError
 from safe_rl.runs.identity import check_same_run
 from safe_rl.runs.table import read_table
@@ -130,11 +130,6 @@ def test_checkpoints_change_nothing(tmp_path):
 
 # episodes are open at the end of every epoch of 40 steps
 point_mass_trainer = partial(trainer_of_point_mass, num_steps=27)
-
-
-class Forgetful(PointMass):
-    def get_state(self):
-        """Its worlds cannot be stored."""
 
 
 @pytest.mark.parametrize("kind", [PointMass, Forgetful])
@@ -294,7 +289,3 @@ def test_jobs_of_a_sweep_continue_with_the_same_settings_only(tmp_path):
     check_same_run(tmp_path, point_mass_config("frames=9000", "num_threads=2"))
     with pytest.raises(ValueError, match=r"seed: 0 -> 1.*hydra.sweep.dir"):
         check_same_run(tmp_path, point_mass_config("seed=1"))
-
-
-def test_no_checkpoint_no_steps(tmp_path):
-    assert CheckpointStore.newest_step(tmp_path) == 0

@@ -3,6 +3,7 @@
 import pytest
 import torch
 from point_mass_runs import point_mass_trainer
+from run_configs import assert_resumes_exactly
 from tensordict.nn import TensorDictModule
 from torchrl.objectives import A2CLoss, ClipPPOLoss, KLPENPPOLoss
 
@@ -10,7 +11,6 @@ from safe_rl import targets
 from safe_rl.algorithms.losses import LossState
 from safe_rl.models import make_actor
 from safe_rl.objectives import PPOLagrangianLoss, TRPOLagrangianLoss
-from safe_rl.runs.table import read_table
 
 pytestmark = pytest.mark.long
 
@@ -58,15 +58,8 @@ def _trainer(folder, algo, loss, frames, *overrides):
     ("algo", "loss"), [("ppo_lagrangian", "RememberingPPO"), ("trpo_lagrangian", "RememberingTRPO")]
 )
 def test_a_resumed_run_goes_on_with_it(tmp_path, algo, loss):
-    _trainer(tmp_path / "whole", algo, loss, 640).run()
-    _trainer(tmp_path / "parts", algo, loss, 320).run()
-    resumed = _trainer(tmp_path / "parts", algo, loss, 640)
-    assert resumed.resume()
-    resumed.run()
-    whole, parts = (read_table(tmp_path / name / "progress.csv") for name in ("whole", "parts"))
-    assert len(whole["steps"]) > 2
-    for column in ("policy_calls", "policy_number", "policy_loss_own", "episode_return"):
-        assert parts[column] == whole[column]
+    make = lambda name, *first: _trainer(tmp_path / name, algo, loss, 640, *first)  # noqa: E731
+    assert_resumes_exactly(make, tmp_path, "frames=320")
 
 
 def test_coefficients_are_those_of_the_run_that_goes_on(tmp_path):
@@ -85,7 +78,7 @@ def test_losses_of_torchrl_s_keep_no_settings_of_their_value_estimators(kind):
     critic = TensorDictModule(torch.nn.Linear(3, 1), ["observation"], ["state_value"])
     loss = kind(actor, critic)
     loss.make_value_estimator(gamma=0.9, lmbda=0.8)
-    assert not LossState({"loss": loss}, besides=[actor, critic])
+    assert not LossState({"loss": loss}, saved_elsewhere=[actor, critic])
 
 
 @pytest.mark.parametrize("algo", ["cpo", "cup", "ipo", "ppo_lagrangian"])

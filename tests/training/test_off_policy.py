@@ -5,8 +5,8 @@ from functools import partial
 
 import pytest
 import torch
-from point_mass import PointMass
-from run_configs import compose_config, without_times
+from point_mass import Forgetful, PointMass
+from run_configs import assert_resumes_exactly, compose_config
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from safe_rl.algorithms import OffPolicy
@@ -60,9 +60,7 @@ def test_it_writes_a_run(algo, make_trainer, tmp_path):
         ["algo=sac_lagrangian"],
         ["algo=td3_lagrangian", "memory.n_steps=3", "lagrangian=adam"],
         [
-            "algo=sac_lagrangian",
-            "memory.storage=memmap",
-            "memory.capacity=300",
+            *("algo=sac_lagrangian", "memory.storage=memmap", "memory.capacity=300"),
             "limits/replay@limits=paper",
         ],
         ["algo=sac_lagrangian", "cost_limits={cost_hazards: 1, cost_north: 2}", "lagrangian=pid"],
@@ -72,17 +70,10 @@ def test_it_writes_a_run(algo, make_trainer, tmp_path):
     ],
 )
 def test_it_goes_on_with_its_memory_as_if_it_had_never_stopped(overrides, make_trainer, tmp_path):
-    make_trainer("whole", *overrides).run()
     half = [] if "limits/replay@limits=paper" in overrides else ["limits.frames=1280"]
-    make_trainer("halves", "frames=640", *half, *overrides).run()
-    torch.rand(7)
-    resumed = make_trainer("halves", *overrides)
-    assert resumed.resume()
+    make = lambda name, *first: make_trainer(name, *first, *overrides)  # noqa: E731
+    resumed = assert_resumes_exactly(make, tmp_path, "frames=640", *half)
     assert resumed.algorithm.lost_on_resume == ""
-    resumed.run()
-    table, expected = (without_times(tmp_path / n / "progress.csv") for n in ("halves", "whole"))
-    assert len(expected) == 9
-    assert table == expected
 
 
 def test_without_its_memory_it_says_so_and_fills_it_anew(make_trainer, tmp_path):
@@ -133,13 +124,8 @@ def test_a_delayed_policy_moves_every_other_step(make_trainer):
 
 def test_multipliers_go_by_the_costs_of_episodes(make_trainer, tmp_path):
     """Not by what the critics say, which are trained on discounted costs."""
-    keys = [
-        "algo=sac_lagrangian",
-        "lagrangian=projected",
-        "limits/replay@limits=paper",
-        "cost_limits={cost: 2}",
-    ]
-    make_trainer("run", *keys).run()
+    keys = ["lagrangian=projected", "limits/replay@limits=paper", "cost_limits={cost: 2}"]
+    make_trainer("run", "algo=sac_lagrangian", *keys).run()
     table = read_table(tmp_path / "run" / "progress.csv")
     penalty = 0.0
     for cost, found in zip(table["episode_cost"], table["multiplier_cost"], strict=True):
@@ -148,10 +134,6 @@ def test_multipliers_go_by_the_costs_of_episodes(make_trainer, tmp_path):
 
 
 def test_sums_over_steps_end_where_a_resumed_run_begins_new_episodes(tmp_path):
-    class Forgetful(PointMass):
-        def get_state(self):
-            """Its worlds cannot be stored."""
-
     def build():
         config = off_policy_config("algo=sac", "memory.n_steps=3", "frames=160")
         seed_everything(config.seed, None)

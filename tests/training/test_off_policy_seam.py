@@ -7,7 +7,7 @@ checkpoints, resuming, transfer and evaluation are those of every run.
 import pytest
 import torch
 from point_mass import PointMass
-from run_configs import point_mass_config, without_times
+from run_configs import assert_resumes_exactly, point_mass_config
 from tensordict.nn import TensorDictModule, TensorDictModuleBase
 from torch import nn
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
@@ -107,43 +107,24 @@ def make_trainer(tmp_path):
     return make
 
 
-def test_it_trains_and_writes_a_run(make_trainer, tmp_path):
+def test_its_run_is_written_transferred_and_evaluated(make_trainer, tmp_path):
     trainer = make_trainer("run", "checkpoint.interval=0")
     line = trainer.run()
     table = read_table(tmp_path / "run" / "progress.csv")
     assert table["steps"] == [160 * epoch for epoch in range(1, 9)]
     assert table["q_loss"][-1] < table["q_loss"][0]
     assert "cost" in line
-
-
-def test_it_goes_on_with_its_buffer_as_if_it_had_never_stopped(make_trainer, tmp_path):
-    make_trainer("whole").run()
-    make_trainer("halves", "frames=640").run()
-    torch.rand(7)
-    resumed = make_trainer("halves")
-    assert resumed.resume()
-    resumed.run()
-    table, expected = (without_times(tmp_path / n / "progress.csv") for n in ("halves", "whole"))
-    assert len(expected) == 9
-    assert table == expected
-
-
-def test_another_run_starts_from_its_networks(make_trainer, tmp_path):
-    first = make_trainer("first")
-    first.run()
     second = make_trainer("second", "seed=1")
-    taken = initialise_networks(second.algorithm.networks, tmp_path / "first", [])
+    taken = initialise_networks(second.algorithm.networks, tmp_path / "run", [])
     assert taken == ["explorer", "q"]
-    assert torch.equal(second.algorithm.policy.bias, first.algorithm.policy.bias)
-
-
-def test_evaluation_finds_its_policy(make_trainer, tmp_path):
-    trainer = make_trainer("run")
-    trainer.run()
-    config = load_config(tmp_path / "run")
-    env = PointMass(2, 20)
+    assert torch.equal(second.algorithm.policy.bias, trainer.algorithm.policy.bias)
+    config, env = load_config(tmp_path / "run"), PointMass(2, 20)
     checkpoint = find_checkpoint(tmp_path / "run", "last")
     policy = load_policy(config, env, checkpoint, torch.device("cpu"))
     assert policy.bias.tolist() == pytest.approx([0.08, 0.08])
     episodes = collect_episodes(env, policy, 3, env.cost_keys, deterministic=False)
     assert episodes.lengths.tolist() == [20, 20, 20]
+
+
+def test_it_goes_on_with_its_buffer_as_if_it_had_never_stopped(make_trainer, tmp_path):
+    assert_resumes_exactly(make_trainer, tmp_path, "frames=640")

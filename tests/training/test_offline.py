@@ -5,8 +5,8 @@ import warnings
 import numpy as np
 import pytest
 import torch
-from point_mass import PointMass
-from run_configs import compose_config, without_times
+from point_mass import Forgetful, PointMass
+from run_configs import assert_resumes_exactly, compose_config
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 
@@ -81,15 +81,8 @@ def test_what_is_cloned_are_the_safe_episodes(tmp_path):
 
 def test_it_goes_on_as_if_it_had_never_stopped(tmp_path):
     data = record(tmp_path / "data", head_south)
-    make_trainer(offline_config(data), tmp_path / "whole").run()
-    make_trainer(offline_config(data, "frames=640"), tmp_path / "halves").run()
-    torch.rand(7)
-    resumed = make_trainer(offline_config(data), tmp_path / "halves")
-    assert resumed.resume()
-    assert resumed.algorithm.lost_on_resume == ""
-    resumed.run()
-    table, expected = (without_times(tmp_path / n / "progress.csv") for n in ("halves", "whole"))
-    assert table == expected
+    make = lambda name, *first: make_trainer(offline_config(data, *first), tmp_path / name)  # noqa: E731
+    assert assert_resumes_exactly(make, tmp_path, "frames=640").algorithm.lost_on_resume == ""
 
 
 @pytest.mark.parametrize("algo", ["ppo_lagrangian", "sac_lagrangian"])
@@ -135,11 +128,6 @@ def test_a_run_that_goes_on_records_what_it_does_again(tmp_path):
     whole, halves = (read_recording(tmp_path / n / "transitions") for n in ("whole", "halves"))
     assert whole.shape == halves.shape == (4, 120)
     assert torch.equal(whole["observation"], halves["observation"])
-
-
-class Forgetful(PointMass):
-    def get_state(self):
-        """Its worlds cannot be stored."""
 
 
 @pytest.mark.parametrize(("kind", "staggered"), [(PointMass, "true"), (Forgetful, "null")])

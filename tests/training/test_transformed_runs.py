@@ -7,8 +7,8 @@ from pathlib import Path
 import pytest
 import torch
 from commands import status_of
-from point_mass import PointMass
-from run_configs import point_mass_config, without_times
+from point_mass import Forgetful, PointMass
+from run_configs import assert_resumes_exactly, point_mass_config
 from torchrl.envs.transforms import StepCounter
 
 from safe_rl.cli import evaluate
@@ -49,24 +49,15 @@ def test_an_interrupted_run_goes_on_exactly(tmp_path, transforms):
     options += [f"transforms=[{transforms}]"]
     options += ["transforms.simmer.steps=150"] * ("simmer" in transforms)
     options += ["transforms.action_repeat.k=5"] * ("action_repeat" in transforms)
-    whole, halves = tmp_path / "whole", tmp_path / "halves"
-    make_trainer(whole, *options, "frames=1200").run()
-    make_trainer(halves, *options, "frames=600").run()
-    resumed = make_trainer(halves, *options, "frames=1200")
-    assert resumed.resume()
-    resumed.run()
-    assert without_times(halves / "progress.csv") == without_times(whole / "progress.csv")
+    make = lambda name, *more: make_trainer(tmp_path / name, *options, "frames=1200", *more)  # noqa: E731
+    assert_resumes_exactly(make, tmp_path, "frames=600")
 
 
 def test_everything_counts_steps_of_the_environment_where_actions_are_held(tmp_path):
     counts = ["frames_per_batch=160", "exploration.random_steps=320", "replay.num_envs=4"]
     counts += ["policy_update.updates_per_step=0.1", "memory.batch_size=8", "memory.n_steps=1"]
-    counts += [
-        "frames=640",
-        "limits.free_steps=160",
-        "limits.descent_steps=160",
-        "cost_limits={cost: 1}",
-    ]
+    counts += ["limits.free_steps=160", "limits.descent_steps=160", "cost_limits={cost: 1}"]
+    counts += ["frames=640"]
     options = ["algo=sac_lagrangian", "preset=default", "transforms=[action_repeat]", *counts]
     trainer = make_trainer(tmp_path, *options, minibatch_size=None)
     starts = trainer._env.get_state()["step_count"][:, 0].tolist()
@@ -90,11 +81,6 @@ def test_everything_counts_steps_of_the_environment_where_actions_are_held(tmp_p
 def test_batches_that_cannot_be_shared_out_among_repeats_are_refused(tmp_path):
     with pytest.raises(ValueError, match=r"4 environments that take 4 steps at a time.*144 or 160"):
         make_trainer(tmp_path, "transforms=[action_repeat]", "frames_per_batch=150")
-
-
-class Forgetful(PointMass):
-    def get_state(self):
-        """Its worlds cannot be stored."""
 
 
 def test_where_worlds_cannot_be_stored_schedules_go_on_in_other_episodes(tmp_path, monkeypatch):
