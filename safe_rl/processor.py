@@ -1,16 +1,35 @@
-"""The kind of processor, for choices between equivalent computations of torch.
+"""How torch uses the processor: waiting of idle threads, and the kind of processor.
 
-In `safe_rl` itself, because networks and updates both use it.
+Imported before torch, because OpenMP reads the setting when torch is loaded. By default idle
+threads spin for milliseconds after every operation and take the cores from the physics and other
+programs: two training runs on two cores then go ten times slower than one, not twice. Sleeping at
+once costs a few microseconds per operation. A setting of the user's is kept.
+
+In `safe_rl` itself, because networks and updates both ask for the kind of processor.
 """
 
-from __future__ import annotations
-
+import os
+import sys
+import warnings
 from functools import cache
 from pathlib import Path
 
 __all__ = ["cpuinfo"]
 
 _FILE = Path("/proc/cpuinfo")
+
+# GOMP_SPINCOUNT is a finer setting of the same
+_SETTINGS = ("OMP_WAIT_POLICY", "GOMP_SPINCOUNT")
+
+if not any(setting in os.environ for setting in _SETTINGS):
+    # also for processes that this one starts
+    os.environ["OMP_WAIT_POLICY"] = "PASSIVE"
+    if "torch" in sys.modules:
+        warnings.warn(
+            "torch was imported before safe_rl, so that its idle threads spin and slow down "
+            "everything on these cores: import safe_rl first, or set OMP_WAIT_POLICY=PASSIVE.",
+            stacklevel=3,
+        )
 
 
 @cache

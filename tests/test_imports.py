@@ -14,7 +14,6 @@ ROOT = Path(__file__).parents[1]
 # Which part may import which other ones. Environments, losses, collectors and networks know nothing
 # of each other: what they share are TensorDict keys.
 PARTS = {
-    "openmp": (),
     "extras": (),
     "files": (),
     "processes": (),
@@ -40,7 +39,7 @@ PARTS = {
     ),
     "reporting": ("extras", "files", "runs", "scores"),
     "cli": (
-        *("algorithms", "envs", "evaluation", "extras", "files", "naming", "openmp", "parameters"),
+        *("algorithms", "envs", "evaluation", "extras", "files", "naming", "parameters"),
         *("processes", "ranges"),
         *("reporting", "runs", "scores", "targets", "training"),
     ),
@@ -261,10 +260,10 @@ def test_the_package_itself_imports_what_comes_before_torch_and_no_part():
     at_once = [node for node in tree.body if isinstance(node, ast.Import | ast.ImportFrom)]
     assert [ast.unparse(node) for node in at_once] == [
         "from typing import TYPE_CHECKING",
-        "import safe_rl.openmp",
+        "import safe_rl.processor",
         "from safe_rl.lazy import import_later",
     ]
-    at_hand = {"typing", "safe_rl.openmp", "safe_rl.lazy"}
+    at_hand = {"typing", "safe_rl.processor", "safe_rl.lazy"}
     later = {found.imported for found in imports_of("safe_rl")} - at_hand
     assert later == {"safe_rl.cli.python_api", "safe_rl.envs"}
 

@@ -8,7 +8,7 @@ import torch
 from tensordict import TensorDict
 from torchrl.data import Bounded
 
-from safe_rl.algorithms import Memory, ReplayUpdate
+from safe_rl.algorithms import Memory, PolicyUpdate, ReplayUpdate
 from safe_rl.models import QEnsemble, make_squashed_actor
 from safe_rl.objectives import SACLoss
 
@@ -103,3 +103,17 @@ def test_rates_are_those_of_the_longest_beginning_and_wrong_ones_are_told_the_ne
     ]
     with pytest.raises(ValueError, match=r"names 'alpha', but .* Did you mean 'log_alpha'"):
         make_update(0, rates={"alpha": 1e-4})
+
+
+def test_constructors_are_checked_unless_an_annotation_cannot_be_read():
+    with pytest.raises(ValueError, match=r"tau=0.7: it must be a number above 0 and at most 0\.5"):
+        make_update(0, tau=0.7)
+
+    class Own(PolicyUpdate):
+        def __init__(self, loss: "OnlyForTypeCheckers", *, size: int):  # noqa: F821
+            self.size = size
+
+        def __call__(self, batch, cost_violation, episode_length):
+            return {}
+
+    assert Own(None, size=3).size == 3

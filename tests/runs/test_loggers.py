@@ -6,8 +6,9 @@ import pytest
 from point_mass import PointMass
 from run_configs import point_mass_config
 
-from safe_rl.runs.loggers import WandbLogger
+from safe_rl.runs.loggers import ResumableLogger, WandbLogger
 from safe_rl.runs.table import read_table
+from safe_rl.targets import allow
 from safe_rl.training.building import build_trainer, seed_everything
 
 
@@ -45,3 +46,23 @@ def test_what_is_not_installed_is_named(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "wandb", None)
     with pytest.raises(ModuleNotFoundError, match=r"pip install -e '\.\[wandb\]'"):
         WandbLogger(exp_name="", project="p", offline=True, log_dir=str(tmp_path))
+
+
+class Scalars(ResumableLogger):
+    """A logger of one's own, with what it must have and nothing else."""
+
+    steps = []  # noqa: RUF012
+
+    def __init__(self, log_dir):
+        self.log_dir = log_dir
+
+    def log_scalar(self, name, value, step):
+        self.steps.append(step)
+
+
+def test_a_logger_of_ones_own_needs_only_to_log(tmp_path):
+    allow(__name__)
+    own = f"logger._target_={__name__}.Scalars"
+    train(tmp_path, own, "frames=160")
+    train(tmp_path, own, "frames=320")
+    assert sorted(set(Scalars.steps)) == [160, 320]
