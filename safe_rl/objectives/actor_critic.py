@@ -1,4 +1,4 @@
-"""Policy and critics as TorchRL's trainers want them: one loss, one advantage estimator."""
+"""One loss and one advantage estimator of policy and critics, for TorchRL's trainers."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from safe_rl.objectives.critics import CriticLoss
 from safe_rl.objectives.gae import normalise_advantages
 from safe_rl.objectives.surrogate import SurrogateLoss
 
-#: Keys that TorchRL's trainers hand to every loss, and that the estimators read, not the losses.
+#: Keys that TorchRL's trainers pass to every loss, although only estimators read them.
 _OF_ESTIMATORS = {"reward", "done", "terminated"}
 
 

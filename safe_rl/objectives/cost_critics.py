@@ -29,7 +29,7 @@ class CostCritics(QFunctionLoss):
     actor's objective and this is divided by 1 + Σ λ_i / u_i, so that the step size does not grow
     with λ.
 
-    Classes put it before the loss without costs that they inherit from, whose two halves call
+    A base class to put before the loss without costs, whose critic and actor losses call
     `cost_qvalue_loss` and `penalised`.
 
     Args:
@@ -95,7 +95,7 @@ class CostCritics(QFunctionLoss):
         self.out_keys = [*self.out_keys, "loss_cost_qvalue", "cost_qvalue"]
         self.pessimism, self.target_pessimism = pessimism, target_pessimism
         self.lowest_cost_value = lowest_cost_value
-        # not a part of the loss: whoever moves it saves it
+        # not a part of the loss: its owner saves it
         self.__dict__["multiplier"] = multiplier
         self.register_buffer("cost_unit", torch.ones(len(cost_keys), device=device))
         self.register_buffer("reward_unit", torch.ones((), device=device))
@@ -114,7 +114,7 @@ class CostCritics(QFunctionLoss):
         return network(inputs, params).get(network.out_keys[0])
 
     def expected(self, values: Tensor) -> Tensor:
-        """What the critics expect actions to cost, [..., k], from their outputs [E, ..., k]."""
+        """Expected costs of actions, [..., k], from outputs [E, ..., k] of the critics."""
         return values.mean(0)
 
     @torch.no_grad()
@@ -129,11 +129,11 @@ class CostCritics(QFunctionLoss):
         return critic_bias(self.expected(values), costs, *ends, self.gamma)
 
     def calibrate(self, episodes: KnownCosts) -> None:
-        """Take in what a batch says about the costs of episodes, before its updates."""
+        """Update the size of one cost, before the updates of a batch."""
         self.cost_unit.copy_(episodes.unit)
 
     def measure(self, rewards: Tensor) -> None:
-        """Set the size of rewards from those of all steps so far; `rewards` are new ones, [...]."""
+        """Update the size of rewards with those of new steps, [...]."""
         rewards = rewards.detach().flatten().to(self.reward_sums)
         powers = torch.stack([torch.ones_like(rewards), rewards, rewards.square()])
         self.reward_sums.add_(powers.sum(-1))
@@ -162,7 +162,7 @@ class CostCritics(QFunctionLoss):
     def cost_errors(
         self, found: Tensor, costs: Tensor, discount: Tensor, following: Tensor
     ) -> Tensor:
-        """Distance of the critics from what they should say, for every step.
+        """Distance of the critics from their targets, for every step.
 
         Args:
             found: Outputs of the networks, [E, ..., k].
@@ -177,7 +177,7 @@ class CostCritics(QFunctionLoss):
         return distance_loss(found, target, loss_function=self.loss_function)
 
     def bounded(self, values: Tensor) -> Tensor:
-        """What the critics bootstrap on, from outputs [E, ..., k] of the target networks."""
+        """Values to bootstrap on, from outputs [E, ..., k] of the target networks."""
         if self.target_pessimism is not None:
             values = pessimistic(values, self.target_pessimism).expand_as(values)
         lowest = self.lowest_cost_value
@@ -185,7 +185,7 @@ class CostCritics(QFunctionLoss):
 
     @property
     def _detached_cost_params(self) -> TensorDictBase:
-        # TorchRL forgets what begins so whenever parameters move to another device or dtype
+        # TorchRL clears names that begin so whenever parameters move to another device or dtype
         if "_cached_cost_params" not in self.__dict__:
             self.__dict__["_cached_cost_params"] = self.cost_qvalue_network_params.data
         return self.__dict__["_cached_cost_params"]
@@ -202,20 +202,20 @@ class CostCritics(QFunctionLoss):
         return objective, {name: x for name, x in figures.items() if name in self.out_keys}
 
     def charged(self, values: Tensor) -> Tensor:
-        """What actions cost the actor, [..., k], from outputs [E, ..., k] of the cost critics."""
+        """Costs in the actor's objective, [..., k], from outputs [E, ..., k] of the critics."""
         return pessimistic(values, self.pessimism)
 
     def cost_weights(self, values: Tensor) -> Tensor:
-        """What the actor's costs are multiplied by, [k]: λ / u, whatever the critics' values."""
+        """Weights of the costs in the actor's objective, [k]: λ / u."""
         return self.multiplier.value.to(self.cost_unit) / self.cost_unit
 
     def cost_figures(self, values: Tensor) -> dict[str, Tensor]:
-        """What is reported of outputs [E, ..., k] of the cost critics, [k] each."""
+        """Diagnostics of outputs [E, ..., k] of the cost critics, [k] each."""
         return {"cost_qvalue": values.flatten(0, -2).mean(0)}
 
 
 def pessimistic(values: Tensor, deviations: float) -> Tensor:
-    """Mean of an ensemble [E, ...] and so many standard deviations among it on top, [...].
+    """Mean of an ensemble [E, ...] plus a number of its standard deviations, [...].
 
     Examples:
         >>> pessimistic(torch.tensor([1.0, 3.0]), deviations=1.0)

@@ -1,4 +1,4 @@
-"""Losses of the reward critic and the cost critic, and how well they predict."""
+"""Losses of the reward critic and the cost critic, and the quality of their predictions."""
 
 from __future__ import annotations
 
@@ -32,12 +32,11 @@ def explained_variance(prediction: Tensor, target: Tensor) -> Tensor:
 def critic_bias(
     value: Tensor, cost: Tensor, done: Tensor, terminated: Tensor, gamma: float
 ) -> Tensor:
-    """Mean of what a critic predicts less the discounted sum of costs that was then paid, [F].
+    """Mean of a critic's predictions minus the discounted sums of later costs, [F].
 
-    Costs are summed to the end of the episode. Where a row ends before, or a time-out cuts an
-    episode, what follows is unknown: the critic's own value of the last step stands for it, and the
-    share γⁿ that this has in the sum is left out of the mean. A critic that is off by the same
-    number everywhere has exactly this number for its bias.
+    Costs are summed to the end of the episode. Where a row or a time-out cuts an episode, later
+    costs are unknown: the critic's own value of the last step replaces them, and its share γⁿ of
+    the sum is left out of the mean. A critic with a constant error has this error as its bias.
 
     Args:
         value: Predictions for the steps of N rows, in order of time, [N, T, F].
@@ -47,7 +46,7 @@ def critic_bias(
         gamma: Discount γ per step.
 
     Returns:
-        The bias, NaN where no sum says anything.
+        The bias, NaN where all costs are unknown.
 
     Examples:
         >>> value, cost = torch.full((1, 3, 1), 5.0), torch.ones(1, 3, 1)
@@ -60,7 +59,7 @@ def critic_bias(
     cut = ends & ~terminated
     sums = []
     for signal, prediction in ((cost, value), (torch.zeros_like(value), torch.ones_like(value))):
-        # of the last step before a cut, whatever follows agrees with the prediction
+        # at a cut, later costs are taken to agree with the prediction
         signal = torch.where(cut, prediction, signal)
         following = torch.where(cut, 0.0, prediction.roll(-1, 1))
         sums.append(-gae(signal, prediction, following, ends, terminated, gamma=gamma, lmbda=1.0))

@@ -1,4 +1,4 @@
-"""What advantage estimators compute with: ends of trajectories, values, estimates, their scale."""
+"""Parts of advantage estimators: ends of trajectories, values, estimates and normalisation."""
 
 from __future__ import annotations
 
@@ -32,9 +32,9 @@ def one_pass_values(
     """Value every observation of a rollout once.
 
     Inside a trajectory the next observation of step t is the root observation of step t + 1,
-    so that only the observations at which trajectories end are valued in addition. A network with
-    a memory reads the rollout as sequences, and those observations as sequences of one step, with
-    what it remembered there.
+    so that only the last observations of trajectories are valued in addition. A recurrent network
+    reads the rollout as sequences, and those observations as sequences of one step with their
+    states.
 
     Args:
         tensordict: Rollout [..., T] with the network's in_keys, also under ``"next"``.

@@ -113,7 +113,7 @@ class Multiplier(Checked, nn.Module, ABC):
 
         Args:
             violation: J_c − d, [k] (or a scalar if k = 1): mean undiscounted cost of an episode
-                less what it is held against.
+                minus its limit or target.
 
         Raises:
             ValueError: If there is not one number per cost.
@@ -131,10 +131,10 @@ class Multiplier(Checked, nn.Module, ABC):
             buffer.copy_(torch.where(known, new, buffer))
 
     def set_scale(self, scale: Tensor) -> None:
-        """Take note of the units of violations, [k] > 0; most multipliers have their own."""
+        """Set the units of violations, [k] > 0; most multipliers have their own."""
 
     def set_unit(self, unit: Tensor) -> None:
-        """Take note of the size of one cost, [k] > 0, in which what λ weighs is measured."""
+        """Set the size of one cost, [k] > 0, the unit of the costs that λ weighs."""
 
     @abstractmethod
     def _step(self, violation: Tensor) -> dict[str, Tensor]:

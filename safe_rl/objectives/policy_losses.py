@@ -133,8 +133,8 @@ class PPOLagrangianLoss(WeighsCosts, PPOLoss):
 class RCPOLoss(WeighsCosts, PPOLoss):
     """PPO on the penalised reward r − Σᵢ λᵢ cᵢ (Tessler et al. 2019, definition 3).
 
-    Its advantage is A − Σᵢ λᵢ A_cᵢ, from the reward's and the costs' critics, without the lag that
-    a critic of r − λc has behind λ. It is clipped as a whole, min(ρÂ, clip(ρ)Â). The multiplier
+    Its advantage is A − Σᵢ λᵢ A_cᵢ, from the critics of reward and costs, without the lag of a
+    critic of r − λc after changes of λ. It is clipped as a whole, min(ρÂ, clip(ρ)Â). The multiplier
     should move slowly, on the third time scale. Arguments are a multiplier, one λ per column of
     ``cost_advantage``, and those of `PPOLoss`.
 

@@ -1,4 +1,4 @@
-"""What losses on Q functions share: two halves, one discount, ensembles without vmap."""
+"""Bases of losses on Q functions: separate critic and actor losses, ensembles without vmap."""
 
 from __future__ import annotations
 
@@ -27,18 +27,18 @@ class Ensemble(Protocol):
 
 
 Distance = Literal["l2", "smooth_l1", "l1"]
-"""How far a prediction is from its target, see `torchrl.objectives.utils.distance_loss`."""
+"""Distance of a prediction from its target, see `torchrl.objectives.utils.distance_loss`."""
 
 
 class InOneCall:
-    """An ensemble as TorchRL's losses call what they have vmapped.
+    """Lets TorchRL's losses call an ensemble like a function of `vmap`.
 
-    Not a module, which would become a part of the loss, and not a function, which cannot be pickled
-    or follow a copy of the loss to another device.
+    A class of its own, because a module would become part of the loss, and a function could not be
+    pickled or follow a copy of the loss to another device.
 
     Args:
         network: The ensemble.
-        of_copies: Whether steps come once per network: of one copy then, the first is taken.
+        of_copies: Whether steps come as one copy per network, of which the first is used.
     """
 
     def __init__(self, network: Ensemble, *, of_copies: bool = False) -> None:
@@ -50,7 +50,7 @@ class InOneCall:
 
 
 class ReplayLoss(Checked, LossModule):
-    """What the off-policy recipe and its update ask of a loss on steps from a replay buffer.
+    """Contract of losses on steps from a replay buffer, for the off-policy recipe and its update.
 
     Attributes:
         learns_values: Whether it learns Q functions, so that n-step sums and priorities are of use.
@@ -62,7 +62,7 @@ class ReplayLoss(Checked, LossModule):
 
     @property
     def priority_key(self) -> NestedKey:
-        """Where it writes the TD errors, [...], by which a buffer draws."""
+        """Key of the TD errors, [...], for prioritised replay."""
         return "td_error"
 
     def target_pairs(self) -> list[tuple[Tensor, Tensor]]:
@@ -83,17 +83,17 @@ class ReplayLoss(Checked, LossModule):
         raise NotImplementedError
 
     def calibrate(self, episodes: KnownCosts) -> None:
-        """Take in what a batch says about the costs of episodes, before its updates."""
+        """Update estimates of the costs of episodes, before the updates of a batch."""
 
     def measure(self, rewards: Tensor) -> None:
-        """Take in the rewards of new steps, [...]."""
+        """Update the scale of rewards with those of new steps, [...]."""
 
     def cost_bias(self, batch: TensorDictBase) -> Tensor | None:
         """Bias of the critics of k costs on new steps [N, T], [k]; None without such critics."""
 
 
 class QFunctionLoss(ReplayLoss):
-    """What a loss on Q functions has besides TorchRL's loss, before which classes inherit it.
+    """Additions to TorchRL's losses on Q functions: a base class to put before TorchRL's.
 
     Attributes:
         gamma: Discount per step, of reward and costs; that of the value estimator.
@@ -114,7 +114,7 @@ class QFunctionLoss(ReplayLoss):
 
     @property
     def priority_key(self) -> NestedKey:
-        """Where it writes the TD errors, [...]."""
+        """Key of the TD errors, [...]."""
         return self.tensor_keys.priority
 
     def actor_losses(self, tensordict: TensorDictBase) -> TensorDict:

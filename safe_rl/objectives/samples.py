@@ -55,10 +55,10 @@ def flat_samples(batch: TensorDictBase) -> TensorDictBase:
 
 
 def learning_samples(batch: TensorDictBase, in_keys: Iterable[NestedKey]) -> TensorDictBase:
-    """What a policy with these inputs learns from: samples [B], or sequences [N, T].
+    """Samples [B] for a policy with these inputs, or sequences [N, T] if it is recurrent.
 
-    Sequences stay whole and in order. A policy with a memory reads `is_init`, which says where
-    episodes begin.
+    Sequences stay whole and in order. A recurrent policy reads `is_init`, which marks the first
+    steps of episodes.
 
     Raises:
         ValueError: If sequences are padded.
@@ -67,14 +67,14 @@ def learning_samples(batch: TensorDictBase, in_keys: Iterable[NestedKey]) -> Ten
         return flat_samples(batch)
     if sample_mask(batch) is not None or batch.ndim != 2:
         raise ValueError(
-            "A policy with a memory learns from whole sequences [N, T] as collectors make them, "
+            "A recurrent policy learns from whole sequences [N, T] as collectors make them, "
             "without padding: leave split_trajs at False."
         )
     return batch
 
 
 def require_finite(tensordict: TensorDictBase, keys: Iterable[NestedKey]) -> None:
-    """Raise before anything is learnt from numbers that are not numbers.
+    """Refuse a batch with NaN or infinite entries.
 
     Args:
         tensordict: Batch of any shape; padding may hold anything.
@@ -95,7 +95,7 @@ def require_finite(tensordict: TensorDictBase, keys: Iterable[NestedKey]) -> Non
         if wrong.any():
             raise FloatingPointError(
                 f"{key!r} is not finite in {int(wrong.sum())} of {wrong.numel()} samples. Nothing "
-                "has been learnt from this batch: look for the environment's first NaN or "
+                "has been learned from this batch: look for the environment's first NaN or "
                 "infinity, or lower the learning rate or the target KL if training has diverged."
             )
 
@@ -103,7 +103,7 @@ def require_finite(tensordict: TensorDictBase, keys: Iterable[NestedKey]) -> Non
 def _tensors(
     tensordict: TensorDictBase, keys: Iterable[NestedKey]
 ) -> Iterator[tuple[NestedKey, Tensor]]:
-    """What stands at keys, with its own key; of a nested TensorDict every entry."""
+    """The entries at keys with their keys; of a nested TensorDict all entries."""
     for key in keys:
         entry = tensordict.get(key, None)
         if is_tensor_collection(entry):

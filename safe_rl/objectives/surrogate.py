@@ -1,4 +1,4 @@
-"""What all policy losses share: importance ratios, the Lagrangian, and diagnostics."""
+"""Base of all policy losses: importance ratios, the Lagrangian, and diagnostics."""
 
 from __future__ import annotations
 
@@ -126,9 +126,9 @@ class SurrogateLoss(Checked, LossModule):
         return self.multiplier is not None
 
     def anchor(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Prepare a batch before the first step of an update on it, and return it.
+        """Prepare a batch before the first step of an update, and return it.
 
-        A loss that measures from the policy as it is then keeps what it needs of it.
+        A loss relative to the policy at that moment stores what it needs of it.
         """
         return tensordict
 
@@ -177,7 +177,7 @@ class SurrogateLoss(Checked, LossModule):
     def _evaluate(
         self, tensordict: TensorDictBase, log_weight: Tensor, divergence: Tensor
     ) -> dict[str, Tensor]:
-        """`_surrogates`, for losses to override that need the divergence itself, [..., 1]."""
+        """`_surrogates`; losses that need the divergence itself, [..., 1], override it."""
         return self._surrogates(tensordict, log_weight)
 
     def _surrogates(self, tensordict: TensorDictBase, log_weight: Tensor) -> dict[str, Tensor]:
@@ -266,7 +266,7 @@ class SurrogateLoss(Checked, LossModule):
 
 
 class WeighsCosts(SurrogateLoss):
-    """A policy loss that a multiplier weighs costs in; classes put it before the loss without.
+    """A base class to put before a policy loss without costs: a multiplier weighs them.
 
     Args:
         actor_network: Policy with `get_dist`; see `SurrogateLoss`.

@@ -1,4 +1,4 @@
-"""How far a policy is from its limits, as losses and steps read it."""
+"""Violations of limits, as losses and steps read them."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ from torch import Tensor
 
 
 class Violations(Protocol):
-    """What a loss reads at every call; a `safe_rl.algorithms.Constraints` is one.
+    """Violations that a loss reads at every call, such as a `safe_rl.algorithms.Constraints`.
 
     Attributes:
-        violation: By how much J_c is to fall, undiscounted cost per episode, [k]: J_c − d, or with
-            `safe_rl.objectives.LimitTracker` J_c less what it is to be by now, its target.
+        violation: Amount by which J_c must fall, undiscounted cost per episode, [k]: J_c − d, or
+            J_c minus its present target with a `safe_rl.objectives.LimitTracker`.
         episode_length: T̄, mean number of steps of an episode, scalar.
     """
 
@@ -22,7 +22,7 @@ class Violations(Protocol):
 
 
 class KnownCosts(Violations, Protocol):
-    """What losses with cost critics take in; a `safe_rl.algorithms.Constraints` is one.
+    """Costs that losses with cost critics read, such as a `safe_rl.algorithms.Constraints`.
 
     Attributes:
         costs: J_c, undiscounted cost per episode, [k].
