@@ -25,16 +25,19 @@ __all__ = ["MLflowLogger", "ResumableLogger", "TensorboardLogger", "WandbLogger"
 
 
 class ResumableLogger:
-    """What a run calls besides ``log_scalar``: a base of loggers, before TorchRL's class."""
+    """What a run calls besides ``log_scalar``: a base class of loggers, after TorchRL's."""
 
     def continue_from(self, step: int) -> None:
         """Discard what was logged after a step; nothing to do where logging it again does that."""
+
+    def log_hparams(self, cfg: Mapping[str, Any]) -> None:
+        """Log the settings that the user has given, by name."""
 
     def close(self) -> None:
         """Write what is buffered and end the logger's run."""
 
 
-class TensorboardLogger(ResumableLogger, TorchRLTensorboardLogger):
+class TensorboardLogger(TorchRLTensorboardLogger, ResumableLogger):
     """Event files for TensorBoard.
 
     Args:
@@ -80,7 +83,7 @@ class TensorboardLogger(ResumableLogger, TorchRLTensorboardLogger):
 
 
 @needs_extra("mlflow", "mlflow")
-class MLflowLogger(ResumableLogger, MLFlowLogger):
+class MLflowLogger(MLFlowLogger, ResumableLogger):
     """A run of an MLflow experiment; a continued run uses the same one.
 
     Metrics that are logged again after an interruption have the same values as before.
@@ -116,7 +119,7 @@ class MLflowLogger(ResumableLogger, MLFlowLogger):
 
 
 @needs_extra("wandb", "wandb")
-class WandbLogger(ResumableLogger, TorchRLWandbLogger):
+class WandbLogger(TorchRLWandbLogger, ResumableLogger):
     """A run of Weights & Biases; a continued run uses the same one.
 
     Args:
