@@ -43,7 +43,7 @@ class SimulatedEnv(ConstrainedEnv):
     #: What a step takes in the world's own time [s].
     seconds_per_step: float
 
-    #: Whether every world is in an episode, which then is so for ever.
+    #: Whether every world is in an episode; once it is, it stays so.
     _all_begun = False
 
     config: Any

@@ -116,6 +116,31 @@ def test_a_contact_point_costs_its_factor():
     assert not positive(step_from(env, state, 0, 0))
 
 
+FACTORS = {
+    **{"hazards_cost": 2.0, "pillars_cost": 3.0, "buttons_cost": 4.0, "gremlins_contact_cost": 5.0},
+    **{"vases_contact_cost": 6.0, "vases_displace_cost": 7.0, "vases_velocity_cost": 8.0},
+}
+
+
+def test_every_cost_is_multiplied_by_its_factor():
+    numbers = {f"{kind}_num": 1 for kind in ALL_KINDS}
+    places = {"hazard0": (0.1, 0), "pillar0": (-0.295, 0), "button0": (0, 0.19)}
+    places |= {"gremlin0": (0.14, 0.14), "vase0": (0, -0.19, 0)}
+    found = []
+    for factors in (dict.fromkeys(FACTORS, 1.0), FACTORS):
+        env = make({**FROZEN, **numbers, **factors})
+        state = arrange(env, robot=(0, 0, 0), **places)
+        columns = position_columns(env)["vase0"]
+        state["layout"][:, 1 + env.object_names.index("vase0")] += 0.1  # it was moved
+        state["qvel"][:, columns.start : columns.start + 3] = 0.5
+        found.append(costs(step_from(env, state, 0, 0)))
+    once, times = found
+    for key, factor in FACTORS.items():
+        name = "cost_" + key.removesuffix("_cost").replace("gremlins_contact", "gremlins")
+        assert once[name] > 0, name
+        assert math.isclose(times[name], factor * once[name], rel_tol=1e-6), name
+
+
 BUTTONS = {
     **FROZEN,
     **{"task": "button", "buttons_num": 3, "buttons_cost": 2.0, "observe_buttons": True},

@@ -132,7 +132,7 @@ def observation_spec(
 
 
 def _within(bounds: Tensor, shape: tuple[int, ...], kind: dict[str, Any]) -> TensorSpec:
-    """Numbers within (low, high); where only some are bounded the others are as good as not.
+    """Numbers within (low, high); where only some are bounded, the others get very large bounds.
 
     TorchRL draws from a spec by its width, and that of infinite bounds makes numbers that are none.
     """

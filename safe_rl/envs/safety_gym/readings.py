@@ -82,49 +82,21 @@ def _has(config: SafetyGymConfig, element: str) -> bool:
 
 
 READINGS: list[Reading] = [
-    Reading(
-        "goal_compass",
-        lambda c: c.observe_goal_comp and _has(c, "goal"),
-        lambda c, s: c.compass_shape,
-        _compass_to("goal"),
-        bounds=(-1.0, 1.0),
-    ),
-    Reading(
-        "box_compass",
-        lambda c: c.observe_box_comp and _has(c, "box"),
-        lambda c, s: c.compass_shape,
-        _compass_to("box"),
-        bounds=(-1.0, 1.0),
-    ),
-    Reading(
-        "goal_dist",
-        lambda c: c.observe_goal_dist and _has(c, "goal"),
-        lambda c, s: 1,
-        _goal_closeness,
-        bounds=(0.0, 1.0),
-    ),
+    Reading("goal_compass", lambda c: c.observe_goal_comp and _has(c, "goal"),
+            lambda c, s: c.compass_shape, _compass_to("goal"), bounds=(-1.0, 1.0)),
+    Reading("box_compass", lambda c: c.observe_box_comp and _has(c, "box"),
+            lambda c, s: c.compass_shape, _compass_to("box"), bounds=(-1.0, 1.0)),
+    Reading("goal_dist", lambda c: c.observe_goal_dist and _has(c, "goal"),
+            lambda c, s: 1, _goal_closeness, bounds=(0.0, 1.0)),
     Reading("remaining", lambda c: c.observe_remaining, lambda c, s: 1, _remaining),
     Reading("com", lambda c: c.observe_com, lambda c, s: 3, lambda w: w.com),
     Reading("ctrl", lambda c: c.observe_ctrl, lambda c, s: s.model.nu, lambda w: w.ctrl),
-    Reading(
-        "freejoint",
-        lambda c: c.observe_freejoint,
-        _freejoint_size,
-        lambda w: w.qpos[:, :7],
-    ),
-    Reading(
-        "qpos",
-        lambda c: c.observe_qpos,
-        lambda c, s: s.model.nq,
-        lambda w: _from_start(w, w.qpos, moved=True),
-    ),
-    Reading(
-        "qvel",
-        lambda c: c.observe_qvel,
-        lambda c, s: s.model.nv,
-        lambda w: _from_start(w, w.qvel, moved=False),
-    ),
-]
+    Reading("freejoint", lambda c: c.observe_freejoint, _freejoint_size, lambda w: w.qpos[:, :7]),
+    Reading("qpos", lambda c: c.observe_qpos, lambda c, s: s.model.nq,
+            lambda w: _from_start(w, w.qpos, moved=True)),
+    Reading("qvel", lambda c: c.observe_qvel, lambda c, s: s.model.nv,
+            lambda w: _from_start(w, w.qvel, moved=False)),
+]  # fmt: skip
 
 
 def _columns(model: mujoco.MjModel, sensors: list[int], device: torch.device) -> Tensor:

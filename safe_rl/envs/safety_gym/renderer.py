@@ -19,7 +19,7 @@ from safe_rl.envs.safety_gym.elements import BOX, CYLINDER, ELEMENTS, SPHERE
 from safe_rl.envs.safety_gym.world import NO_BUTTON, Block, World
 
 COST_RGBA, COST_RADIUS = (1.0, 0.0, 0.0, 0.5), 0.25
-# of boundaries [m]: as good as endless
+# of boundaries [m]; longer than any arena
 WALL_HALF_WIDTH, WALL_HALF_HEIGHT, WALL_HALF_LENGTH = 0.02, 0.1, 20.0
 WALL_RGBA = (1.0, 0.4, 0.1, 0.3)
 GOAL_BUTTON_RGBA = (0.4, 0.4, 0.4, 0.25)

@@ -48,7 +48,7 @@ class StepCosts(Transform):
         names: Names of all costs, the sum first.
 
     Raises:
-        ConfigError: If there are no costs, or one is no number per row.
+        ConfigError: If there are no costs, or one is not a number per row.
         TargetError: If the module of the function was not named by `import=`.
 
     Examples:
@@ -175,7 +175,7 @@ class Observe(Transform):
         layout: Columns of every entry, as if all of them were one vector.
 
     Raises:
-        ConfigError: For a name that there is not, or pictures that are to be flattened.
+        ConfigError: For an unknown name, or pictures that are to be flattened.
     """
 
     def __init__(self, env: EnvBase, config: Mapping[str, Any]) -> None:

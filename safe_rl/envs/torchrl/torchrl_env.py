@@ -75,12 +75,7 @@ def make_torchrl(
 ) -> TorchRLEnv:
     """Make environments of a class of TorchRL, or of the user.
 
-    Args:
-        config: `id` and any other key of conf/env/torchrl.yaml.
-        num_envs: Number of environments, N.
-        device: Where the TensorDicts live.
-        seed: Determines every row; rows of different seeds have nothing in common.
-        num_threads: Not used by these environments.
+    The arguments are those of `make_gymnasium`, with the keys of conf/env/torchrl.yaml.
 
     Raises:
         ConfigError: For an unknown key or class, or an environment that algorithms cannot use.
@@ -187,7 +182,7 @@ def _batch(make: MakeEnv, num_envs: int) -> EnvBase:
         try:
             rows.reset()
             return rows
-        except Exception:  # whatever its own code stumbles over: not every class keeps its promise
+        except Exception:  # of any type: its own code may not work with more rows than one
             pass
     if list(env.batch_size) == [num_envs]:
         return env

@@ -108,7 +108,7 @@ def check_budgets(budgets: Mapping[str, float], *, above_zero: bool) -> dict[str
 
 
 def check_known(budgets: Collection[str], cost_keys: Collection[str]) -> None:
-    """Raise ValueError for a budget of a cost that there is not."""
+    """Raise ValueError for a budget of an unknown cost."""
     for key in budgets:
         if key not in cost_keys:
             raise ValueError(

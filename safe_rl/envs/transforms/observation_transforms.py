@@ -35,7 +35,7 @@ class SensorNoise(ConstraintTransform):
         components: Names of those that are noisy, as in `observation_layout`; None: all.
 
     Raises:
-        ValueError: for a deviation below 0, or a component that there is not.
+        ValueError: for a deviation below 0, or an unknown component.
 
     Examples:
         >>> from safe_rl.envs import make_env
@@ -223,7 +223,7 @@ class ObservedCosts(ConstraintTransform):
         self._costs = None if costs is None else list(costs)
 
     def check(self, cost_keys: Collection[str]) -> None:
-        """Take note of the costs there are; raise ValueError for one that there is not."""
+        """Take all costs where none are named; raise ValueError for an unknown one."""
         self._costs = list(cost_keys) if self._costs is None else self._costs
         check_known(self._costs, cost_keys)
 
