@@ -27,7 +27,7 @@ from safe_rl.evaluation.loading import (
     without_cost,
 )
 from safe_rl.evaluation.settings import EvaluationOptions, check_options
-from safe_rl.evaluation.video import check_camera, manner_of, record_episode, write_video
+from safe_rl.evaluation.video import check_camera, record_episode, video_format, write_video
 from safe_rl.files import check_no_links, check_place, replace_csv, replace_text
 from safe_rl.runs.folder import RunFolder, checkpoint_steps
 from safe_rl.scores.benchmark import Scores, Suite
@@ -60,10 +60,10 @@ class Evaluation:
         """A table for the terminal."""
         facts = self.facts
         steps = "" if facts["steps"] is None else f" at {facts['steps']:,} steps"
-        manner = "its mean actions" if facts["deterministic"] else "sampled actions"
+        actions = "its mean actions" if facts["deterministic"] else "sampled actions"
         lines = [
             f"{facts['algorithm']} on {facts['environment']}{steps}: {facts['episodes']} episodes "
-            f"with {manner}, {facts['layouts_trained_on']:.0%} of the layouts known from training",
+            f"with {actions}, {facts['layouts_trained_on']:.0%} of the layouts known from training",
             *format_estimates(self.estimates, facts["cost_limits"]),
             *format_unjudged(facts["limits_without_cost"]),
             *(f"wrote {path}" for path in self.files),
@@ -100,14 +100,7 @@ def evaluate(
     config = load_config(directory)
     checkpoint = find_checkpoint(directory, options.checkpoint)
     node = override_env(config, options.env)
-    seed = default_seed(node, config.seed) if options.seed is None else options.seed
-
-    def make(num_envs: int, **keys: Any) -> EnvBase:
-        threads = options.num_threads
-        return for_evaluation(make_env, config)(
-            node | keys, num_envs=num_envs, device=options.device, seed=seed, num_threads=threads
-        )
-
+    seed, make = env_maker(config, node, options, make_env)
     # environments that draw nothing unless they are told have a key for it
     drawing = {"render_mode": "rgb_array"} if "render_mode" in node else {}
     run = RunFolder(directory)
@@ -121,9 +114,12 @@ def evaluate(
     with closing(make(min(options.num_envs, options.episodes))) as env:
         cost_keys = env.cost_keys
         limits = limits_of(config, options.cost_limits, cost_keys)
-        policy = load_policy(config, env, checkpoint, torch.device(options.device))
-        torch.manual_seed(seed)
-        episodes = _collect(env, policy, options, places["transitions"], progress)
+        steps = (
+            StepRecorder(Recording(places["transitions"], cost_keys)) if options.record else None
+        )
+        policy, episodes = run_policy(config, checkpoint, env, options, seed, progress, steps)
+        if steps is not None:
+            steps.flush()
     reference = suite.reference(node, but_for=_LAYOUTS)
     estimates = summarise(episodes, limits, reference, options.cvar_alpha)
     facts = _facts(directory, config, checkpoint, options, node, seed) | {
@@ -136,39 +132,51 @@ def evaluate(
         # the first world draws the same layouts whatever the number of worlds; actions are others
         with closing(make(1, **drawing)) as single:
             torch.manual_seed(seed)
-            manner = manner_of(single, film.suffix[1:])
+            form = video_format(single, film.suffix[1:])
             frames = record_episode(
-                single, policy, cost_keys, deterministic=options.deterministic, manner=manner,
+                single, policy, cost_keys, deterministic=options.deterministic, form=form,
                 camera=options.camera,
             )  # fmt: skip
-            write_video(film, frames, manner)
+            write_video(film, frames, form)
     kept = [places["transitions"]] if options.record else []
     return Evaluation(facts, estimates, (places["json"], places["csv"], *kept, *films))
 
 
-def _collect(
-    env: EnvBase,
-    policy: TensorDictModuleBase,
+def env_maker(
+    config: DictConfig,
+    node: Mapping[str, Any],
     options: EvaluationOptions,
-    transitions: Path,
-    progress: bool,
-) -> Episodes:
-    """Whole episodes; all steps on the way are written if that is wanted."""
-    recorder = None
-    if options.record:
-        recorder = StepRecorder(Recording(transitions, env.cost_keys))
-    episodes = collect_episodes(
-        env,
-        policy,
-        options.episodes,
-        env.cost_keys,
-        deterministic=options.deterministic,
-        progress=progress,
-        record=recorder,
-    )
-    if recorder is not None:
-        recorder.flush()
-    return episodes
+    make_env: Callable[..., EnvBase],
+) -> tuple[int, Callable[..., EnvBase]]:
+    """Seed of an evaluation, and what makes environments: ``make(num_envs, **changed_keys)``."""
+    seed = default_seed(node, config.seed) if options.seed is None else options.seed
+    threads = options.num_threads
+
+    def make(num_envs: int, **keys: Any) -> EnvBase:
+        return for_evaluation(make_env, config)(
+            {**node, **keys}, num_envs=num_envs, device=options.device, seed=seed,
+            num_threads=threads,
+        )  # fmt: skip
+
+    return seed, make
+
+
+def run_policy(
+    config: DictConfig,
+    checkpoint: Path,
+    env: EnvBase,
+    options: EvaluationOptions,
+    seed: int,
+    progress: bool = False,
+    recorder: StepRecorder | None = None,
+) -> tuple[TensorDictModuleBase, Episodes]:
+    """The policy of a checkpoint, and whole episodes of it; a recorder gets all steps."""
+    policy = load_policy(config, env, checkpoint, torch.device(options.device))
+    torch.manual_seed(seed)
+    return policy, collect_episodes(
+        env, policy, options.episodes, env.cost_keys, deterministic=options.deterministic,
+        progress=progress, record=recorder,
+    )  # fmt: skip
 
 
 def _facts(

@@ -8,22 +8,18 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import torch
 from omegaconf import DictConfig, OmegaConf
 from torchrl.envs import EnvBase
 
-from safe_rl.evaluation.episodes import Episodes, collect_episodes, default_seed
 from safe_rl.evaluation.loading import (
     check_env_keys,
     find_checkpoint,
-    for_evaluation,
     limits_of,
     load_config,
-    load_policy,
     override_env,
     without_cost,
 )
-from safe_rl.evaluation.measuring import check_places, summarise
+from safe_rl.evaluation.measuring import check_places, env_maker, run_policy, summarise
 from safe_rl.evaluation.settings import EvaluationOptions, check_options
 from safe_rl.files import replace_csv
 from safe_rl.runs.folder import RunFolder, checkpoint_steps
@@ -229,7 +225,9 @@ def evaluate_variations(
                 continue
             if progress:
                 print(f"… {variation}", flush=True)
-            episodes = _episodes(changed, checkpoint, options, make_env)
+            seed, make = env_maker(changed, override_env(changed, {}), options, make_env)
+            with closing(make(min(options.num_envs, options.episodes))) as env:
+                _, episodes = run_policy(changed, checkpoint, env, options, seed)
         except cannot as error:
             if variation is AS_TRAINED or not may_lack(variation):
                 raise
@@ -244,26 +242,6 @@ def evaluate_variations(
     facts |= {"steps": checkpoint_steps(checkpoint), "episodes": options.episodes}
     facts["limits_without_cost"] = lost
     return Varied(tuple(rows), tuple(left_out), trained_limits, facts, file)
-
-
-def _episodes(
-    config: DictConfig, checkpoint: Path, options: EvaluationOptions, make_env: Any
-) -> Episodes:
-    node = override_env(config, {})
-    seed = default_seed(node, config.seed) if options.seed is None else options.seed
-    env = for_evaluation(make_env, config)(
-        node,
-        num_envs=min(options.num_envs, options.episodes),
-        device=options.device,
-        seed=seed,
-        num_threads=options.num_threads,
-    )
-    with closing(env):
-        policy = load_policy(config, env, checkpoint, torch.device(options.device))
-        torch.manual_seed(seed)
-        return collect_episodes(
-            env, policy, options.episodes, env.cost_keys, deterministic=options.deterministic
-        )
 
 
 def _write(path: Path, rows: Sequence[VariedRow]) -> None:

@@ -18,10 +18,17 @@ from safe_rl.extras import import_extra
 from safe_rl.files import replacing
 from safe_rl.naming import STEPS_TAKEN
 
-__all__ = ["MANNERS", "Manner", "check_camera", "manner_of", "record_episode", "write_video"]
+__all__ = [
+    "FORMATS",
+    "VideoFormat",
+    "check_camera",
+    "record_episode",
+    "video_format",
+    "write_video",
+]
 
 
-class Manner(NamedTuple):
+class VideoFormat(NamedTuple):
     """How an episode is recorded.
 
     Attributes:
@@ -42,24 +49,24 @@ class Manner(NamedTuple):
 DEFAULT_CAMERA = "free"
 # of the line below the picture, and what its text takes of a width at least [pixels]
 _CAPTION_HEIGHT, _CAPTION_WIDTH = 20, 280
-# of a film's frame, in the time of what is filmed [s]
+# of a frame of an MP4, in the time of what is recorded [s]
 _FRAME = 0.04
 # of a GIF's palette; and how long its last frame stays [ms]
 _COLOURS, _LAST = 64, 1500
 
 
-def manner_of(env: EnvBase, suffix: str) -> Manner:
-    """How an episode of an environment is recorded into a file of a suffix of :data:`MANNERS`.
+def video_format(env: EnvBase, suffix: str) -> VideoFormat:
+    """How an episode of an environment is recorded into a file of a suffix of :data:`FORMATS`.
 
-    A film runs as fast as what it shows, where the environment has ``seconds_per_step``.
+    A video plays as fast as what it shows, where the environment has ``seconds_per_step``.
     """
-    manner, seconds, together = MANNERS[suffix], env.seconds_per_step, env.steps_per_decision
-    rate = manner.steps_per_frame * manner.frames_per_second  # steps in a second of the film
-    frame = manner.steps_per_frame
+    form, seconds, together = FORMATS[suffix], env.seconds_per_step, env.steps_per_decision
+    rate = form.steps_per_frame * form.frames_per_second  # steps in a second of the video
+    frame = form.steps_per_frame
     if suffix == "mp4" and seconds:
         rate, frame = 1 / seconds, _FRAME / seconds
     steps = max(1, round(frame / together)) * together
-    return manner._replace(steps_per_frame=steps, frames_per_second=rate / steps)
+    return form._replace(steps_per_frame=steps, frames_per_second=rate / steps)
 
 
 def check_camera(env: EnvBase, camera: str, suffix: str = "mp4") -> None:
@@ -80,7 +87,7 @@ def check_camera(env: EnvBase, camera: str, suffix: str = "mp4") -> None:
         raise ValueError(f"camera={camera}: this environment has no cameras to choose from.")
     env.reset()
     try:
-        picture = _picture(env, camera, MANNERS[suffix])
+        picture = _picture(env, camera, FORMATS[suffix])
     except ValueError:
         raise
     except Exception as error:  # a 'render' is anybody's
@@ -97,9 +104,9 @@ def _parameters(env: EnvBase) -> set[str]:
     return set(signature(env.render).parameters)
 
 
-def _picture(env: EnvBase, camera: str, manner: Manner) -> Image.Image | None:
+def _picture(env: EnvBase, camera: str, form: VideoFormat) -> Image.Image | None:
     """World 0 as it is, if that is drawn; sizes and cameras where they can be chosen."""
-    size = {"width": manner.width, "height": manner.height}
+    size = {"width": form.width, "height": form.height}
     wanted: dict[str, Any] = {"rows": 0, "camera": camera, **size}
     known = _parameters(env)
     pixels = np.asarray(env.render(**{k: v for k, v in wanted.items() if k in known}))
@@ -118,7 +125,7 @@ def record_episode(
     cost_keys: Sequence[str],
     *,
     deterministic: bool,
-    manner: Manner,
+    form: VideoFormat,
     camera: str = DEFAULT_CAMERA,
 ) -> Iterator[np.ndarray]:
     """Run one episode and yield its frames, uint8 [height, width, 3].
@@ -131,13 +138,13 @@ def record_episode(
     step = 0
     with exploration(deterministic):
         while True:
-            if step % manner.steps_per_frame == 0:
-                yield _frame(env, camera, manner, step, *total.values())
+            if step % form.steps_per_frame == 0:
+                yield _frame(env, camera, form, step, *total.values())
             after = env.step(policy(state))["next"]
             step += int(after[STEPS_TAKEN]) if env.steps_per_decision != 1 else 1
             total = {key: value + float(after[key]) for key, value in total.items()}
             if after["done"].any():
-                yield _frame(env, camera, manner, step, *total.values())
+                yield _frame(env, camera, form, step, *total.values())
                 return
             state = after.exclude("reward")
 
@@ -145,13 +152,13 @@ def record_episode(
 def _frame(
     env: EnvBase,
     camera: str,
-    manner: Manner,
+    form: VideoFormat,
     step: int,
     episode_return: float,
     cost: float | None = None,
 ) -> np.ndarray:
     """The picture above a line with what the episode has come to, uint8 [height, width, 3]."""
-    picture = _picture(env, camera, manner)
+    picture = _picture(env, camera, form)
     assert picture is not None, "check_camera has seen one"
     size = (max(picture.width, _CAPTION_WIDTH), picture.height + _CAPTION_HEIGHT)
     canvas = Image.new("RGB", size, "white")
@@ -163,17 +170,17 @@ def _frame(
     return np.asarray(canvas)
 
 
-def write_video(path: Path, frames: Iterator[np.ndarray], manner: Manner) -> None:
-    """Encode frames in the manner in which they were recorded; the file is replaced in one go.
+def write_video(path: Path, frames: Iterator[np.ndarray], form: VideoFormat) -> None:
+    """Encode frames in the format in which they were recorded; the file is replaced in one go.
 
     Raises:
         ModuleNotFoundError: If the encoder is missing; the message names the extra.
     """
     with replacing(path) as unfinished:
-        manner.write(unfinished, frames, path.suffix.lstrip("."), manner.frames_per_second)
+        form.write(unfinished, frames, path.suffix.lstrip("."), form.frames_per_second)
 
 
-def _write_film(path: Path, frames: Iterator[np.ndarray], suffix: str, rate: float) -> None:
+def _write_mp4(path: Path, frames: Iterator[np.ndarray], suffix: str, rate: float) -> None:
     import_extra("imageio_ffmpeg", "video")
     imageio = import_extra("imageio.v2", "video")
     # pixel format and index at the front: what browsers ask of a video
@@ -206,10 +213,10 @@ def _write_animation(path: Path, frames: Iterator[np.ndarray], suffix: str, rate
 
 
 # of 1000 steps: 10 s, whatever is shown, so that no picture gets too large for a page
-_ANIMATION = Manner(400, 300, 5, 20, _write_animation)
-MANNERS = {
+_ANIMATION = VideoFormat(400, 300, 5, 20, _write_animation)
+FORMATS = {
     # of what does not say how long its steps are; 1000 last 20 s
-    "mp4": Manner(640, 480, 2, 25, _write_film),
+    "mp4": VideoFormat(640, 480, 2, 25, _write_mp4),
     "gif": _ANIMATION,
     "webp": _ANIMATION,
 }

@@ -1,4 +1,4 @@
-"""What campaigns are to hold, as their ``plan.yaml`` says, and which of it is done.
+"""Campaigns: which runs their ``plan.yaml`` names, and which of these are done.
 
 A plan is a list of sweeps, each a mapping of keys to one value or a list of values, of which all
 combinations are to be run::
@@ -42,7 +42,7 @@ class Planned(NamedTuple):
 
 
 def read_plan(path: Path) -> list[Planned]:
-    """Read what a campaign is to hold.
+    """Read which runs a campaign is to have.
 
     Raises:
         ValueError: If the file is no plan; the message says what one is.
@@ -120,7 +120,7 @@ def _tables(name: str, cells: Sequence[Planned], runs: Sequence[Run]) -> list[Ta
 
 def _record(name: str, cell: Planned, runs: Sequence[Run]) -> dict[str, Any]:
     found = [run for run in runs if run.seed in cell.seeds and _is_of(run, cell.chosen)]
-    # of one seed the run that has come furthest
+    # of one seed the run with most steps
     shares = {
         run.seed: run.steps / max(1, cell.chosen["frames"])
         for run in sorted(found, key=lambda run: run.steps)

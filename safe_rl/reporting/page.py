@@ -1,4 +1,4 @@
-"""Everything a report says, in its order: figures, tables, Markdown, and one page of HTML."""
+"""The sections of a report, and their files: tables, pictures, Markdown and one page of HTML."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from safe_rl.reporting.slates import complete_slates, improvement_tables, slate_
 from safe_rl.reporting.tables import SYMBOL, Record, Table, clean, escaped, short_number
 from safe_rl.scores.benchmark import Suite
 
-__all__ = ["Block", "Drawing", "Film", "Report", "Section", "build_report", "write_report"]
+__all__ = ["Block", "Drawing", "Report", "Section", "Video", "build_report", "write_report"]
 
 # rows of a picture of learning curves, in environments: what a printed page holds
 _MOST_ROWS = 6
@@ -35,7 +35,7 @@ _MOST_CURVES = 6  # in one panel
 _TEXTS = yaml.safe_load(files(__package__).joinpath("texts.yaml").read_text(encoding="utf-8"))
 
 _MIME_TYPES = {".png": "image/png", ".mp4": "video/mp4"}
-# of a film, above which it is named instead of embedded [bytes]
+# of a video, above which it is named instead of embedded [bytes]
 _LARGEST = 50_000_000
 
 
@@ -48,14 +48,14 @@ class Drawing(NamedTuple):
     shows: str
 
 
-class Film(NamedTuple):
+class Video(NamedTuple):
     """A video, and its caption."""
 
     title: str
     path: Path
 
 
-Block = Table | Drawing | Film | str
+Block = Table | Drawing | Video | str
 Styles = Mapping[str, figures.Style]
 
 
@@ -68,7 +68,7 @@ class Section(NamedTuple):
 
     @property
     def text(self) -> str:
-        """What a reader has to know."""
+        """Explanations for the reader."""
         return _TEXTS.get(self.name, "")
 
 
@@ -142,7 +142,7 @@ def build_report(
         ("better", "Which is better", better_tables(records)),
         ("certificates", "Certificates", [inventory.certificate_table(experiments)]),
         ("evaluations", "Evaluations", [inventory.evaluation_table(experiments)]),
-        ("videos", "Videos", [Film(clean(c), path) for c, path in inventory.videos(experiments)]),
+        ("videos", "Videos", [Video(clean(c), path) for c, path in inventory.videos(experiments)]),
         ("campaigns", "Campaigns", [t for own in campaigns.values() for t in own]),
         ("runs", "Runs", [inventory.run_table(experiments), left_out]),
     ]
@@ -278,9 +278,9 @@ def _written(
         if not block.is_matrix:  # whose table of pairs is a file already
             block.write_csv(place(f"{block.name}.csv"))
         return {"kind": "table", "title": block.title, "table": block} if block.columns else None
-    if isinstance(block, Film):
+    if isinstance(block, Video):
         data = _embedded(block.path)
-        return {"kind": "film", "title": block.title, "file": clean(block.path), "data": data}
+        return {"kind": "video", "title": block.title, "file": clean(block.path), "data": data}
     path = figures.save(block.figure, place(f"{block.name}.png"))
     for form in {*formats} - {"png"}:
         figures.save(block.figure, path.with_suffix(f".{form}"))

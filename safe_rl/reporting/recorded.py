@@ -88,9 +88,9 @@ class Run:
 
     @property
     def length(self) -> int:
-        """Environment steps that it was meant to take; of an unfinished run, those it has taken."""
-        meant = self.config["frames"]
-        return int(meant) if 0 < meant <= self.steps else self.steps
+        """Environment steps that were configured; of an unfinished run, those it has taken."""
+        configured = self.config["frames"]
+        return int(configured) if 0 < configured <= self.steps else self.steps
 
     @property
     def is_finished(self) -> bool:
@@ -156,11 +156,11 @@ def find_runs(root: Path, *, unfinished: bool = False) -> tuple[list[Run], dict[
     for folder in runs_below(root):
         with _noted(folder.directory, skipped):
             run = _run(folder.directory, _recorded(folder, resolved, skipped), unfinished)
-            films = []
-            for path in _films(folder):
+            videos = []
+            for path in _videos(folder):
                 with _noted(path, skipped):
-                    films.append(_own(path, resolved))
-            runs.append(replace(run, videos=tuple(films)))
+                    videos.append(_own(path, resolved))
+            runs.append(replace(run, videos=tuple(videos)))
     if not runs:
         reasons = "".join(f"\n  {clean(path)}: {reason}" for path, reason in skipped.items())
         raise FileNotFoundError(
@@ -190,7 +190,7 @@ def archive_runs(runs: Iterable[Run], root: Path, archive: Path) -> None:
 
 @contextmanager
 def _noted(path: Path, skipped: dict[Path, str]) -> Iterator[None]:
-    """Note why something is left out, and go on: all else is reported."""
+    """Note why something is left out; everything else is reported."""
     try:
         yield
     except Exception as error:
@@ -262,7 +262,7 @@ def _run(directory: Path, recorded: Recorded, unfinished: bool) -> Run:
     )
 
 
-def _films(run: RunFolder) -> list[Path]:
+def _videos(run: RunFolder) -> list[Path]:
     """Videos in a run's folder: neither those of runs below it, nor what a killed one has left."""
     return [
         path

@@ -22,7 +22,7 @@ from safe_rl.envs.transforms import (
     transform_env,
 )
 from safe_rl.evaluation.episodes import collect_episodes
-from safe_rl.evaluation.video import manner_of, record_episode
+from safe_rl.evaluation.video import record_episode, video_format
 
 
 def test_replaced_actions_are_taken_and_counted_and_the_chosen_ones_kept():
@@ -219,14 +219,14 @@ def test_a_snapshot_goes_on_exactly_between_and_before_repeats():
 def test_a_film_shows_repeats_in_the_time_of_the_environment():
     config = {"robot_base": "point", "num_steps": 40}
     env = make_env(config, num_envs=1, seed=0, transforms={"repeat": ActionRepeat(4)})
-    manner = manner_of(env, "mp4")
-    assert manner.steps_per_frame == 4
-    assert manner.frames_per_second == pytest.approx(1 / (4 * env.seconds_per_step))
-    assert manner_of(env, "gif").steps_per_frame == 4
+    form = video_format(env, "mp4")
+    assert form.steps_per_frame == 4
+    assert form.frames_per_second == pytest.approx(1 / (4 * env.seconds_per_step))
+    assert video_format(env, "gif").steps_per_frame == 4
     seen = []
     env.base_env.render = lambda **_: (
         seen.append(0) or torch.zeros(8, 8, 3, dtype=torch.uint8).numpy()
     )
     policy = lambda td: td.set("action", torch.zeros(1, 2))  # noqa: E731
-    frames = list(record_episode(env, policy, ["cost"], deterministic=True, manner=manner))
+    frames = list(record_episode(env, policy, ["cost"], deterministic=True, form=form))
     assert len(frames) == 11

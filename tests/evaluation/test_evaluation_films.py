@@ -14,7 +14,7 @@ from safe_rl.collectors import read_recording
 from safe_rl.envs import from_gymnasium, make_env
 from safe_rl.envs.velocity import VelocityEnv
 from safe_rl.evaluation import video
-from safe_rl.evaluation.video import MANNERS, manner_of
+from safe_rl.evaluation.video import FORMATS, video_format
 
 pytestmark = pytest.mark.long
 
@@ -32,9 +32,9 @@ pytestmark = pytest.mark.long
 )
 def test_a_film_runs_as_fast_as_what_it_shows(make, steps_per_frame, rate):
     """Robots are controlled at different rates; a Doggo would seem to run five times as fast."""
-    film = manner_of(make(), "mp4")
+    film = video_format(make(), "mp4")
     assert (film.steps_per_frame, film.frames_per_second) == pytest.approx((steps_per_frame, rate))
-    assert manner_of(make(), "gif") == MANNERS["gif"]
+    assert video_format(make(), "gif") == FORMATS["gif"]
 
 
 def test_slow_steps_have_a_frame_each(run):
@@ -51,7 +51,7 @@ def test_the_video_shows_an_episode(run):
     imageio = pytest.importorskip("imageio.v2", reason="needs the extra 'video'")
     pytest.importorskip("imageio_ffmpeg", reason="needs the extra 'video'")
     skip_without_opengl()
-    film = MANNERS["mp4"]
+    film = FORMATS["mp4"]
     result = evaluate(run, options(episodes=1, video=True))
     assert result.files[-1] == run / "evaluation.mp4"
     with imageio.get_reader(run / "evaluation.mp4") as reader:
@@ -90,7 +90,7 @@ def test_what_an_evaluation_records_is_what_it_measured(run):
 @pytest.mark.parametrize("suffix", ["gif", "webp"])
 def test_an_animated_picture_shows_the_same_episode(run, tmp_path, suffix):
     skip_without_opengl()
-    film, path = MANNERS[suffix], tmp_path / f"episode.{suffix}"
+    film, path = FORMATS[suffix], tmp_path / f"episode.{suffix}"
     found = [
         evaluate(run, options(episodes=2, picture=str(path), **extra))
         for extra in ({}, {"camera": "fixedfar"})
@@ -122,9 +122,9 @@ def test_of_one_world_it_is_the_first_episode_to_its_end(run, deterministic, tmp
     skip_without_opengl()
     shown, draw = [], video._frame
 
-    def note(env, camera, manner, *counts):
+    def note(env, camera, form, *counts):
         shown.append(counts)
-        return draw(env, camera, manner, *counts)
+        return draw(env, camera, form, *counts)
 
     def drawing(*given, **keys):  # as environments of one's own may, from torch's generator
         torch.rand(3)

@@ -17,12 +17,12 @@ from safe_rl.evaluation.episodes import (
     default_seed,
     shared_layouts,
 )
-from safe_rl.evaluation.video import MANNERS, check_camera, record_episode
+from safe_rl.evaluation.video import FORMATS, check_camera, record_episode
 from safe_rl.models import BehaviourPolicy, make_actor
 
 # steps of every world's episodes, in turn
 LENGTHS = [[30, 1], [2, 3], [1, 1]]
-FILM = {"deterministic": True, "manner": MANNERS["mp4"]}
+FILM = {"deterministic": True, "form": FORMATS["mp4"]}
 
 
 class KnownLengths(ConstrainedEnv):
