@@ -11,6 +11,11 @@ from safe_rl.objectives.fisher import FisherProduct
 from safe_rl.objectives.trust_region import flatten, set_parameters
 
 NUM_OBS, NUM_ACTIONS = 3, 2
+DELTA = 0.01  # radius of trust regions
+TRUST_REGION = {
+    "target_kl": DELTA, "damping": 0.1, "cg_iterations": 60, "backtrack_coeff": 0.8,
+    "max_backtracks": 10,
+}  # fmt: skip
 
 
 def make_actor(in_key="observation", loc="loc", scale="scale", action="action", width=8):

@@ -6,7 +6,7 @@ import pytest
 import torch
 from point_mass import PointMass
 from run_configs import point_mass_config
-from samples import make_actor, make_batch, whole_step
+from samples import DELTA, TRUST_REGION, make_actor, make_batch, whole_step
 
 from safe_rl.algorithms import CTRPOStep, OnPolicy
 from safe_rl.algorithms.recovery_steps import barrier_divergence
@@ -14,12 +14,9 @@ from safe_rl.objectives import CPOLoss
 from safe_rl.objectives.distributions import gaussian_kl
 from safe_rl.objectives.trust_region import flatten, policy_in
 
-DELTA, BETA = 0.01, 0.5
+BETA = 0.5
 LENGTH = torch.tensor(100.0)
-SETTINGS = {
-    "target_kl": DELTA, "damping": 0.1, "cg_iterations": 60, "backtrack_coeff": 0.8,
-    "max_backtracks": 20,
-}  # fmt: skip
+SETTINGS = TRUST_REGION | {"max_backtracks": 20}
 
 
 def make_case(num_costs=2):

@@ -3,18 +3,22 @@
 import numpy as np
 import pytest
 import torch
-from samples import dense_fisher, flat_gradients, make_actor, make_batch, whole_step
+from samples import (
+    DELTA,
+    TRUST_REGION,
+    dense_fisher,
+    flat_gradients,
+    make_actor,
+    make_batch,
+    whole_step,
+)
 from scipy.optimize import minimize
 
 from safe_rl.algorithms import CRPOStep, PCPOStep
 from safe_rl.algorithms.cpo_step import nearest_feasible
 from safe_rl.objectives import CPOLoss
 
-DELTA = 0.01
-SETTINGS = {
-    "target_kl": DELTA, "damping": 0.1, "cg_iterations": 60, "backtrack_coeff": 0.8,
-    "max_backtracks": 10,
-}  # fmt: skip
+SETTINGS = TRUST_REGION
 LENGTH = torch.tensor(100.0)
 
 

@@ -4,9 +4,9 @@ from functools import partial
 
 import pytest
 import torch
-from one_state import total
 from samples import (
-    assert_gradients_are_differences,
+    DELTA,
+    TRUST_REGION,
     dense_fisher,
     flat_gradients,
     make_actor,
@@ -28,11 +28,7 @@ from safe_rl.objectives.fisher import FisherProduct
 from safe_rl.objectives.gae import normalise_advantages
 from safe_rl.objectives.trust_region import conjugate_gradient, flatten, policy_in
 
-DELTA = 0.01
-SETTINGS = {
-    "target_kl": DELTA, "damping": 0.1, "cg_iterations": 50, "backtrack_coeff": 0.8,
-    "max_backtracks": 10,
-}  # fmt: skip
+SETTINGS = TRUST_REGION | {"cg_iterations": 50}
 LENGTH = torch.tensor(100.0)
 
 
@@ -73,20 +69,6 @@ def all_losses(actor):
     ]
 
 
-@pytest.mark.parametrize("index", range(3))
-@pytest.mark.parametrize("entry", [0, 1, "losses"])
-def test_surrogate_gradients_against_finite_differences(index, entry):
-    actor = make_actor(width=4)
-    batch = make_batch(actor, (4, 8), 2).double()
-    actor.double()
-    perturb(actor, 0.1)
-    loss = all_losses(actor)[index].double()
-    if entry == "losses":
-        assert_gradients_are_differences(lambda: total(loss(batch)), actor)
-    elif "cost_surrogate" in loss.out_keys:
-        assert_gradients_are_differences(lambda: loss(batch)["cost_surrogate"][entry], actor)
-
-
 def test_trpo_loss_is_the_definition():
     actor, batch = make_case(2)
     perturb(actor, 0.1)
@@ -100,21 +82,6 @@ def test_trpo_loss_is_the_definition():
     torch.testing.assert_close(losses[1]["loss_objective"], expected)
     torch.testing.assert_close(losses[2]["loss_objective"], -reward)
     torch.testing.assert_close(losses[2]["cost_surrogate"], costs)
-
-
-@pytest.mark.parametrize("index", range(3))
-def test_losses_compile_and_take_nested_keys(index):
-    torch._dynamo.reset()
-    actor = make_actor(in_key=("agent", "obs"))
-    batch = make_batch(make_actor(), [16], 2)
-    batch["agent", "obs"] = batch.pop("observation")
-    batch["adv", "cost"] = batch.pop("cost_advantage")
-    loss = all_losses(actor)[index]
-    loss.set_keys(cost_advantage=("adv", "cost"))
-    expected = loss(batch)
-    compiled = torch.compile(loss, fullgraph=True, backend="aot_eager")(batch)
-    for key in loss.out_keys:
-        torch.testing.assert_close(compiled[key], expected[key])
 
 
 @pytest.mark.parametrize("batch_size", [(400,), (20, 20)])

@@ -20,6 +20,11 @@ from safe_rl.collectors import (
 )
 
 
+@pytest.fixture
+def h5py():
+    return pytest.importorskip("h5py", reason="comes with the extra hdf5")
+
+
 def collected(batches=3):
     torch.manual_seed(0)
     env = PointMass(4, 20)
@@ -103,8 +108,7 @@ def test_safe_episodes_are_those_that_the_accounting_finds(limits):
     torch.testing.assert_close(returns, episodes.returns[expected])
 
 
-def write_hdf5(path, size=6, leave_out=()):
-    h5py = pytest.importorskip("h5py", reason="comes with the extra hdf5")
+def write_hdf5(h5py, path, size=6, leave_out=()):
     rng = np.random.default_rng(0)
     arrays = {
         "observations": rng.normal(size=(size, 3)), "next_observations": rng.normal(size=(size, 3)),
@@ -118,8 +122,8 @@ def write_hdf5(path, size=6, leave_out=()):
     return arrays
 
 
-def test_files_of_offline_benchmarks_are_read(tmp_path):
-    arrays = write_hdf5(tmp_path / "data.hdf5")
+def test_files_of_offline_benchmarks_are_read(tmp_path, h5py):
+    arrays = write_hdf5(h5py, tmp_path / "data.hdf5")
     steps = read_hdf5(tmp_path / "data.hdf5")
     assert steps.shape == (1, 6)
     torch.testing.assert_close(
@@ -131,17 +135,16 @@ def test_files_of_offline_benchmarks_are_read(tmp_path):
     assert isinstance(steps, TensorDict)
 
 
-def test_what_follows_a_step_is_the_next_observation_where_a_file_does_not_say(tmp_path):
-    arrays = write_hdf5(tmp_path / "data.hdf5", leave_out=["next_observations"])
+def test_what_follows_a_step_is_the_next_observation_where_a_file_does_not_say(tmp_path, h5py):
+    arrays = write_hdf5(h5py, tmp_path / "data.hdf5", leave_out=["next_observations"])
     steps = read_dataset(tmp_path / "data.hdf5")
     rows = [1, 2, 2, 4, 5, 5]  # episodes end with the third step and the sixth
     expected = torch.tensor(arrays["observations"][rows]).float()[None]
     torch.testing.assert_close(steps["next", "observation"], expected)
 
 
-def write_minari(path, lengths=(3, 12), reset_infos=True):
+def write_minari(h5py, path, lengths=(3, 12), reset_infos=True):
     """Twelve episodes are needed for names in another order than numbers; the rest have a step."""
-    h5py = pytest.importorskip("h5py", reason="comes with the extra hdf5")
     rng = np.random.default_rng(0)
     episodes = []
     with h5py.File(path, "w") as file:
@@ -163,8 +166,8 @@ def write_minari(path, lengths=(3, 12), reset_infos=True):
 
 
 @pytest.mark.parametrize("reset_infos", [True, False])
-def test_episodes_of_minari_are_read_in_their_order(reset_infos, tmp_path):
-    episodes = write_minari(tmp_path / "main_data.hdf5", reset_infos=reset_infos)
+def test_episodes_of_minari_are_read_in_their_order(reset_infos, tmp_path, h5py):
+    episodes = write_minari(h5py, tmp_path / "main_data.hdf5", reset_infos=reset_infos)
     steps = read_dataset(tmp_path / "main_data.hdf5")
     assert steps.shape == (1, 25)
     for key, parts in {
@@ -183,17 +186,15 @@ def test_episodes_of_minari_are_read_in_their_order(reset_infos, tmp_path):
     assert "is_good" not in steps["next"].keys()  # noqa: SIM118
 
 
-def test_minari_without_costs_is_refused(tmp_path):
-    h5py = pytest.importorskip("h5py", reason="comes with the extra hdf5")
-    write_minari(tmp_path / "data.hdf5")
+def test_minari_without_costs_is_refused(tmp_path, h5py):
+    write_minari(h5py, tmp_path / "data.hdf5")
     with h5py.File(tmp_path / "data.hdf5", "a") as file:
         del file["episode_4/infos/cost"]
     with pytest.raises(ValueError, match=r"no infos/cost: .*has: infos/cost_hazards, infos/is"):
         read_hdf5(tmp_path / "data.hdf5")
 
 
-def test_what_is_no_dataset_is_refused(tmp_path):
-    pytest.importorskip("h5py", reason="comes with the extra hdf5")
+def test_what_is_no_dataset_is_refused(tmp_path, h5py):
     (tmp_path / "notes.txt").write_text("words")
     with pytest.raises(ValueError, match="neither the folder of a recording nor an HDF5 file"):
         read_dataset(tmp_path / "notes.txt")
@@ -201,8 +202,8 @@ def test_what_is_no_dataset_is_refused(tmp_path):
         read_dataset(tmp_path / "nothing")
 
 
-def test_what_a_file_lacks_is_named(tmp_path):
-    write_hdf5(tmp_path / "data.hdf5", leave_out=["costs"])
+def test_what_a_file_lacks_is_named(tmp_path, h5py):
+    write_hdf5(h5py, tmp_path / "data.hdf5", leave_out=["costs"])
     with pytest.raises(ValueError, match=r"has no costs.*What it has: actions"):
         read_hdf5(tmp_path / "data.hdf5")
 
@@ -221,10 +222,9 @@ def test_what_a_file_lacks_is_named(tmp_path):
         ({"next_observations": np.zeros((6, 4))}, r"must be like the observation, .*got \(6, 4\)"),
     ],
 )
-def test_a_file_whose_arrays_do_not_fit_together_is_refused(changes, told, tmp_path):
-    h5py = pytest.importorskip("h5py", reason="comes with the extra hdf5")
+def test_a_file_whose_arrays_do_not_fit_together_is_refused(changes, told, tmp_path, h5py):
     path = tmp_path / "data.hdf5"
-    write_hdf5(path)
+    write_hdf5(h5py, path)
     with h5py.File(path, "a") as file:
         for name, array in changes.items():
             del file[name]
@@ -243,9 +243,8 @@ def test_a_file_whose_arrays_do_not_fit_together_is_refused(changes, told, tmp_p
         ("infos/cost", "group", "no infos/cost"),
     ],
 )
-def test_an_episode_that_does_not_fit_is_named(name, array, told, tmp_path):
-    h5py = pytest.importorskip("h5py", reason="comes with the extra hdf5")
-    write_minari(tmp_path / "data.hdf5")
+def test_an_episode_that_does_not_fit_is_named(name, array, told, tmp_path, h5py):
+    write_minari(h5py, tmp_path / "data.hdf5")
     with h5py.File(tmp_path / "data.hdf5", "a") as file:
         del file[f"episode_4/{name}"]
         if isinstance(array, str):
@@ -256,9 +255,8 @@ def test_an_episode_that_does_not_fit_is_named(name, array, told, tmp_path):
         read_hdf5(tmp_path / "data.hdf5")
 
 
-def test_episodes_without_a_step_and_other_groups_are_passed_over(tmp_path):
-    h5py = pytest.importorskip("h5py", reason="comes with the extra hdf5")
-    write_minari(tmp_path / "data.hdf5")
+def test_episodes_without_a_step_and_other_groups_are_passed_over(tmp_path, h5py):
+    write_minari(h5py, tmp_path / "data.hdf5")
     whole = read_hdf5(tmp_path / "data.hdf5")
     with h5py.File(tmp_path / "data.hdf5", "a") as file:
         file.create_group("episode_notes")
@@ -271,10 +269,9 @@ def test_episodes_without_a_step_and_other_groups_are_passed_over(tmp_path):
     assert (read_hdf5(tmp_path / "data.hdf5") == whole).all()
 
 
-def test_a_damaged_or_empty_file_is_told(tmp_path):
-    h5py = pytest.importorskip("h5py", reason="comes with the extra hdf5")
+def test_a_damaged_or_empty_file_is_told(tmp_path, h5py):
     path = tmp_path / "data.hdf5"
-    write_hdf5(path)
+    write_hdf5(h5py, path)
     path.write_bytes(path.read_bytes()[:3000])
     with pytest.raises(ValueError, match=r"data\.hdf5 cannot be read, is it whole"):
         read_hdf5(path)
@@ -308,16 +305,14 @@ def test_without_h5py_the_extra_is_named(tmp_path, monkeypatch):
         ),
     ],
 )
-def test_a_file_that_leads_elsewhere_or_declares_too_much_is_refused(make, words, tmp_path):
-    h5py = pytest.importorskip("h5py", reason="needs the extra 'hdf5'")
+def test_a_file_that_leads_elsewhere_or_declares_too_much_is_refused(make, words, tmp_path, h5py):
     with h5py.File(tmp_path / "data.hdf5", "w") as file:
         file["rewards"] = make(h5py, file)
     with pytest.raises(ValueError, match=words):
         read_hdf5(tmp_path / "data.hdf5")
 
 
-def test_groups_that_hold_themselves_are_looked_at_once(tmp_path):
-    h5py = pytest.importorskip("h5py", reason="needs the extra 'hdf5'")
+def test_groups_that_hold_themselves_are_looked_at_once(tmp_path, h5py):
     with h5py.File(tmp_path / "data.hdf5", "w") as file:
         group = file.create_group("loop")
         for number in range(200):

@@ -83,13 +83,17 @@ def test_numbers_that_cannot_be_shared(num_collectors, frames):
         )  # fmt: skip
 
 
-def test_batches_follow_the_weights_until_a_worker_dies():
-    env = MAKE(num_envs=4)
+def collect(make_env=MAKE, make_collector=make_process_collector, num_collectors=2, **options):
+    """A collector of batches [4, 20], and the actor that it runs."""
+    env = make_env(num_envs=4)
     size = env.observation_spec["observation"].shape[-1]
     actor = make_actor(size, 2, hidden_sizes=[8], initial_log_std=-0.5)
-    collector = make_process_collector(
-        env, MAKE, BehaviourPolicy(actor), frames_per_batch=80, num_collectors=2, device="cpu"
-    )
+    numbers = {"frames_per_batch": 80, "num_collectors": num_collectors, "device": "cpu"}
+    return make_collector(env, make_env, BehaviourPolicy(actor), **numbers, **options), actor
+
+
+def test_batches_follow_the_weights_until_a_worker_dies():
+    collector, actor = collect()
     batches = iter(collector)
     previous = None
     for _ in range(3):
@@ -119,13 +123,7 @@ def test_batches_follow_the_weights_until_a_worker_dies():
 
 def test_workers_leave_signals_to_the_first_process_from_their_start_on():
     """Ctrl-C and what ends a cluster's job reach all; the first one ends its epoch with them."""
-    env = MAKE(num_envs=4)
-    actor = make_actor(
-        env.observation_spec["observation"].shape[-1], 2, hidden_sizes=[8], initial_log_std=-0.5
-    )
-    collector = make_process_collector(
-        env, MAKE, BehaviourPolicy(actor), frames_per_batch=80, num_collectors=1, device="cpu"
-    )
+    collector, _ = collect(num_collectors=1)
 
     def processes():
         return collector._workers.procs
@@ -186,13 +184,7 @@ def fail():
 
 def collect_in_trouble(trouble):
     """Run by a process of its own, which has to end as well."""
-    make = Troubled(trouble)
-    env = make(num_envs=4)
-    actor = make_actor(env.observation_spec["observation"].shape[-1], 2, hidden_sizes=[8], initial_log_std=-0.5)  # fmt: skip  # noqa: E501
-    collector = make_process_collector(
-        env, make, BehaviourPolicy(actor), frames_per_batch=80, num_collectors=2, device="cpu"
-    )
-    next(iter(collector))
+    next(iter(collect(Troubled(trouble))[0]))
 
 
 SCRIPT = """
@@ -229,14 +221,11 @@ def test_a_worker_in_trouble_while_it_starts_ends_the_run_with_the_reason(
 @pytest.mark.slow
 def test_actors_of_ray_follow_the_weights():
     ray = pytest.importorskip("ray")
-    env = MAKE(num_envs=4)
-    size = env.observation_spec["observation"].shape[-1]
-    actor = make_actor(size, 2, hidden_sizes=[8], initial_log_std=-0.5)
-    collector = make_ray_collector(
-        env, MAKE, BehaviourPolicy(actor), frames_per_batch=80, num_collectors=2, device="cpu",
+    collector, actor = collect(
+        make_collector=make_ray_collector,
         ray_init={"num_cpus": 2, "include_dashboard": False},
         resources={"num_cpus": 1, "num_gpus": 0},
-    )  # fmt: skip
+    )
     try:
         batches = iter(collector)
         for _ in range(3):

@@ -4,7 +4,7 @@ import functools
 
 import pytest
 import torch
-from samples import make_actor, make_batch, make_critic, make_rollout, perturb
+from samples import make_actor, make_batch, make_critic, make_rollout
 from tensordict import TensorDict
 from torchrl.collectors.utils import split_trajectories
 from torchrl.objectives.value import GAE
@@ -14,8 +14,6 @@ from safe_rl.objectives import (
     CostGAE,
     CPOLoss,
     CriticLoss,
-    LagrangeMultiplier,
-    PPOLagrangianLoss,
     TRPOLoss,
     VectorGAE,
     normalise_advantages,
@@ -103,17 +101,9 @@ def test_normalisation():
         torch.testing.assert_close(samples_of(padded, key), flat[key])
 
 
-@pytest.mark.parametrize("name", ["ppo", "cpo", "critics"])
-def test_losses_and_what_they_report(name):
-    actor, flat, padded = padded_pair()
-    if name == "ppo":
-        multiplier = LagrangeMultiplier([1.0], init=1.0, lr=0.1)
-        loss = PPOLagrangianLoss(actor, multiplier, clip_epsilon=0.1, entropy_coeff=0.01)
-    elif name == "cpo":
-        loss = CPOLoss(actor, entropy_coeff=0.01)
-    else:
-        loss = CriticLoss(make_critic(), make_critic("cost_value"))
-    perturb(actor, 0.2)
+def test_losses_of_critics_and_what_they_report():
+    _, flat, padded = padded_pair()
+    loss = CriticLoss(make_critic(), make_critic("cost_value"))
     expected, found = loss(flat), loss(padded)
     for key in loss.out_keys:
         torch.testing.assert_close(found[key], expected[key], msg=key)
