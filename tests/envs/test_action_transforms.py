@@ -201,7 +201,7 @@ def test_schedules_and_budgets_before_it_go_by_single_steps():
     assert env.reset()["observation"][0, -1] == 1.0
 
 
-def test_a_snapshot_goes_on_exactly_between_and_before_repeats():
+def test_a_snapshot_continues_exactly_between_and_before_repeats():
     def make():
         config = {"robot_base": "point", "num_steps": 10}
         return repeating(make_env(config, num_envs=2, seed=0), 4, ObservedCosts(0.5), seed=0)

@@ -128,7 +128,7 @@ def test_a_family_of_ones_own_is_made_once_its_module_is_trusted():
 
 
 def make_one(config, **_):
-    """A family that does not heed how many it is asked for."""
+    """A family that ignores how many it is asked for."""
     return PointMass(1)
 
 

@@ -1,4 +1,4 @@
-"""Copies of an environment go on as it does, and on their own."""
+"""Copies of an environment continue as it does, and on their own."""
 
 import copy
 import pickle
@@ -50,7 +50,7 @@ def play(env, tensordict, num_steps, seed=0):
 
 @pytest.mark.parametrize("how", COPY)
 @pytest.mark.parametrize("name", MAKERS)
-def test_a_copy_goes_on_as_the_original_does(name, how):
+def test_a_copy_continues_as_the_original_does(name, how):
     env = MAKERS[name]()
     _, here = play(env, env.reset(), 10)
     other = COPY[how](env)
@@ -92,7 +92,7 @@ def test_new_seeds_are_for_the_next_episodes_of_a_copy_too():
     assert_same(expected, got)
 
 
-def test_a_copy_under_transforms_goes_on_too():
+def test_a_copy_under_transforms_continues_too():
     env = TransformedEnv(MAKERS["PointGoal2"](), Compose(StepCounter(), RewardSum()))
     _, here = play(env, env.reset(), 10)
     for make_copy in COPY.values():

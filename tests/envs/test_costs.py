@@ -156,23 +156,6 @@ def touching_two_buttons(env, goal: int, timer: int):
     return state
 
 
-def test_buttons_sleep_for_ten_steps():
-    env = make(BUTTONS)
-    lidar = env.observation_layout["buttons_lidar"]
-    state = touching_two_buttons(env, goal=2, timer=10)
-    tensordict = env.set_state(state)
-    assert not tensordict["observation"][:, lidar].any()
-    found, seen = [], []
-    for _ in range(13):
-        following = env.step(tensordict.set("action", torch.zeros(1, 2)))
-        found.append(costs(following["next"])["cost_buttons"])
-        seen.append(bool(following["next", "observation"][:, lidar].any()))
-        tensordict = env.step_mdp(following)
-    assert found == [0.0] * 10 + [4.0] * 3
-    # The timer has counted down when the tenth step is observed.
-    assert seen == [False] * 9 + [True] * 4
-
-
 def test_only_wrong_buttons_cost():
     env = make(BUTTONS)
     for goal, cost in ((0, 2.0), (1, 2.0), (2, 4.0)):

@@ -92,7 +92,7 @@ def test_one_layout_for_all_episodes_where_asked_for():
 
 @pytest.mark.parametrize("name", NAMES)
 def test_a_state_determines_the_future(name):
-    """Branch, go on, come back, go on: through new goals and resets; also in another instance."""
+    """Twice from one state, through new goals and resets; also in another instance."""
     env = make(name, 4, sleep=False)
     play(env, env.reset(), 8)
     state = env.get_state()

@@ -194,12 +194,12 @@ def moving(tensordict):
 @pytest.mark.parametrize(
     "copied", [copy.deepcopy, lambda env: pickle.loads(pickle.dumps(env))], ids=["copy", "pickle"]
 )
-def test_a_copy_goes_on_as_the_original_does(copied):
+def test_a_copy_continues_as_the_original_does(copied):
     env = from_gymnasium(lambda: Walk(), num_envs=3, num_steps=7, cost_keys=["fast", "far"], seed=1)
     before = env.rollout(3, moving)[:, -1]["next"]
-    go_on = {"auto_reset": False, "break_when_any_done": False}
+    resume = {"auto_reset": False, "break_when_any_done": False}
     expected, got = (
-        one.rollout(20, moving, tensordict=before.clone(), **go_on) for one in (env, copied(env))
+        one.rollout(20, moving, tensordict=before.clone(), **resume) for one in (env, copied(env))
     )
     assert expected["next", "done"].sum() > 3
     for key in ("observation", "reward", "cost", "done"):

@@ -110,7 +110,7 @@ def test_seeds_determine_rows_and_share_none():
     assert len({*starts(0), *starts(1), *starts(2)}) == 12
 
 
-def test_workers_without_a_state_to_go_on_from_have_rows_of_their_own():
+def test_workers_without_a_state_to_continue_from_have_rows_of_their_own():
     make = partial(make_env, NODE, seed=0)
     shares = [make() for make in split_rows(make(num_envs=4), make, num_collectors=2)]
     rows = [share.reset()["observation"][:, 0].tolist() for share in shares]

@@ -44,7 +44,7 @@ def test_a_batch_of_one_is_gymnasiums_vector_of_one(mode, flatten):
 
 @pytest.mark.parametrize("mode", MODES)
 def test_rows_of_a_batch_end_apart(mode):
-    """Goals that end episodes make them end at different times; every row goes on as if alone."""
+    """Goals that end episodes make them end at different times; every row continues as if alone."""
     config = {"continue_goal": False, "goal_size": 0.9, "num_steps": 30}
     make = {"id": "Safexp-PointGoal0-v0", "config": config, "autoreset_mode": mode}
     batch = gymnasium.make_vec(**make, num_envs=5)

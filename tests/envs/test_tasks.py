@@ -64,26 +64,6 @@ def test_a_box_is_in_its_goal_by_the_distance_in_space(offset, met):
     assert bool(got["goal_met"]) == met
 
 
-def test_circling_by_hand():
-    com = torch.tensor([[1.5, 0.0], [0.0, 1.0], [3.0, 4.0], [-1.5, 0.0]])
-    velocity = torch.tensor([[0.0, 2.0], [2.0, 7.0], [-0.8, 0.6], [0.0, 1.0]])
-    # On the circle; inside and clockwise; outside along the tangent; clockwise again.
-    want = torch.tensor([2.0, -2.0 / 1.5, 1.0 / 4.5, -1.0])
-    torch.testing.assert_close(circle_speed(com, velocity, 1.5), want)
-
-
-def test_upright_bodies_are_rewarded():
-    config = {**FROZEN, "robot_base": "car", "task": "none", "reward_orientation": True}
-    env = make({**config, "reward_orientation_scale": 0.5})
-    state = env.get_state()
-    tilt = 0.3
-    for angle, upright in ((0.0, 1.0), (tilt, math.cos(tilt)), (math.pi, -1.0)):
-        quat = [math.cos(angle / 2), math.sin(angle / 2), 0.0, 0.0]
-        state["qpos"][:, 3:7] = torch.tensor(quat, dtype=torch.float64)
-        reward = float(step_from(env, state, 0, 0)["reward"])
-        assert math.isclose(reward, 0.5 * upright, rel_tol=1e-6)
-
-
 @pytest.mark.parametrize("sign", [-1, 1])
 def test_dense_rewards_are_clipped_before_the_goal_is_added(sign):
     config = {**POINT, "goal_size": 10.0, "reward_distance": 1e4, "reward_clip": 3.0}

@@ -76,7 +76,7 @@ def test_the_budget_is_what_is_left_of_it_by_kind_and_row():
             assert found.tolist() == pytest.approx(after)
 
 
-def test_rows_that_go_on_keep_their_budget_when_others_begin():
+def test_rows_that_continue_keep_their_budget_when_others_begin():
     env = transformed(Priced([[1.0] * 9, [1.0] * 9]), "saute")
     batch = still(env, 1)
     state = batch[:, -1]["next"].select("observation").set(
@@ -165,7 +165,7 @@ def test_the_budget_of_simmer_grows_from_episode_to_episode():
     assert solved.reset()["observation"][0, -1].item() == 1.0
 
 
-def test_the_schedule_goes_on_where_workers_take_it_up():
+def test_the_schedule_continues_where_workers_take_it_up():
     env = transformed(Priced([[0.5] * 4, [0.5] * 4]), "simmer")
     env.continue_from(8)
     env.reset()
@@ -203,10 +203,10 @@ def test_interventions_can_have_a_budget():
 
 
 @pytest.mark.parametrize("env", ["point_mass", "safety_gym"])
-def test_a_snapshot_goes_on_exactly(env):
+def test_a_snapshot_continues_exactly(env):
     env = transformed(env, *ALL_BUT_SAUTE, seed=0)
 
-    def go_on(state):
+    def resume(state):
         torch.manual_seed(1)
         return env.rollout(
             15, auto_reset=False, tensordict=env.set_state(state), break_when_any_done=False
@@ -214,7 +214,7 @@ def test_a_snapshot_goes_on_exactly(env):
 
     env.rollout(5)
     state = env.get_state()
-    first, second = go_on(state.clone()), go_on(state.clone())
+    first, second = resume(state.clone()), resume(state.clone())
     assert (first["next", "observation"][..., -1] != 1).any()
     for key in ("observation", "reward", "terminated", "cost_interventions"):
         assert torch.equal(first["next", key], second["next", key])
@@ -223,7 +223,7 @@ def test_a_snapshot_goes_on_exactly(env):
     assert begun["observation"].shape == first["observation"][:, 0].shape
 
 
-def test_what_is_transformed_twice_goes_on_with_both():
+def test_what_is_transformed_twice_continues_with_both():
     env = transformed(transformed(Priced([[0.5] * 9]), "saute"), "early_termination")
     last = still(env, 3)["next", "observation"][:, -1]
     begun = env.set_state(env.get_state())
