@@ -173,7 +173,7 @@ FLOORS = {
         ("campaigns", "inventory", "scoring"),
         ("slates",),
         ("figures",),
-        ("curves", "variations"),
+        ("curves",),
         ("page",),
         ("",),
     ),

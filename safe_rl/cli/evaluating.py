@@ -24,7 +24,7 @@ from safe_rl.evaluation.measuring import format_unjudged
 from safe_rl.evaluation.policies import find_run, writable_copy
 from safe_rl.evaluation.variations import Variation, Varied, evaluate_variations, expand
 from safe_rl.naming import did_you_mean
-from safe_rl.reporting.variations import draw_variations
+from safe_rl.reporting.figures import draw_variations
 from safe_rl.runs.folder import RunFolder
 
 __all__ = ["carry_out", "evaluate_run", "evaluate_varied", "read_variations"]

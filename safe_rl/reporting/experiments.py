@@ -128,12 +128,12 @@ def group_runs(runs: Sequence[Run], suite: Suite) -> tuple[list[Experiment], dic
                 reason = f"{run.directory} is the same run with the same seed"
                 skipped[kept[run.seed].directory] = reason
             kept[run.seed] = run
-        first = kept[min(kept)].directory
+        ordered = tuple(kept[seed] for seed in sorted(kept))
+        first = ordered[0].directory
         named, settings = ({k: v for k, v in n.items() if k != "frames"} for n in names[first])
         family = {k: v for k, v in named.items() if not k.startswith("cost_limits.")}
         label, base = (titles[first] + _in_brackets(shown) for shown in (named, family))
-        benchmark = suite.name_of(kept[min(kept)].config["env"])
-        ordered = tuple(kept[seed] for seed in sorted(kept))
+        benchmark = suite.name_of(ordered[0].config["env"])
         experiments.append(Experiment(*own, benchmark, ordered, label, base, settings))
     return sorted(experiments, key=_order), skipped
 

@@ -131,9 +131,7 @@ def test_page_and_markdown_say_the_same(report):
 
 def test_the_counts_are_those_of_the_runs(report):
     words = Page(report / "report.html").words
-    facts = {words[words.index(name) + 1] for name in ("environments", "algorithms", "experiments")}
     shown = [words[words.index(n) + 1] for n in ("environments", "algorithms", "experiments")]
-    assert facts
     assert shown == ["2", "3", "3"]
     assert words[words.index("runs") + 1] == "4 of 5 finished"
 
