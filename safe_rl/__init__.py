@@ -8,7 +8,7 @@ accounting.
 
 from typing import TYPE_CHECKING
 
-import safe_rl.processor  # noqa: F401, whatever is imported first, this comes before torch
+import safe_rl.processor  # noqa: F401, comes before torch
 from safe_rl.lazy import import_later
 
 if TYPE_CHECKING:

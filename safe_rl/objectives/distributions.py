@@ -1,4 +1,4 @@
-"""What losses and trust regions ask of a policy's distribution, whatever its kind.
+"""Divergence, entropy and log-probabilities of any kind of policy distribution.
 
 Closed forms where there are any: of Normals (also under a tanh-Normal's transform, which is the
 same for every policy, so that it changes neither KL divergence nor Fisher information), of

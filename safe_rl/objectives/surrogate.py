@@ -185,7 +185,7 @@ class SurrogateLoss(Checked, LossModule):
         raise NotImplementedError
 
     def _cost_surrogates(self, tensordict: TensorDictBase, gain: Tensor) -> Tensor:
-        """Means over the samples of cost gains [..., k], whatever the reduction: [k]."""
+        """Means over the samples of cost gains [..., k] for any reduction, [k]."""
         means = [self._reduce_loss(cost, tensordict, reduction="mean") for cost in gain.unbind(-1)]
         return torch.stack(means)
 

@@ -37,7 +37,7 @@ def gaussian_tail(tail: float) -> float:
 
 
 class WCSACLoss(SACLagrangianLoss):
-    """SAC on the Lagrangian with CVaR_α of the discounted cost-return in the place of its mean.
+    """SAC on the Lagrangian with CVaR_α of the discounted cost-return instead of its mean.
 
     Yang, Simão, Tindemans, Spaan, *WCSAC: Worst-Case Soft Actor Critic for Safety-Constrained
     Reinforcement Learning* (AAAI 2021), and *Safety-constrained reinforcement learning with a

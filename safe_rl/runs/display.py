@@ -1,4 +1,4 @@
-"""What a run shows on the terminal: a progress bar while it trains, a line when it has ended."""
+"""Output on the terminal: a progress bar during training, and a line at the end."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ class ProgressBar:
     def close(self) -> None:
         """Leave the bar as it is."""
         self._closed.set()
-        if self._redrawing.is_alive():  # else it could draw a closed bar once more
+        if self._redrawing.is_alive():  # otherwise it could redraw a closed bar
             self._redrawing.join()
         self._bar.close()
 
@@ -68,10 +68,10 @@ def shown(
     before: Mapping[str, float] | None = None,
     episode_length: int = _RATE_STEPS,
 ) -> dict[str, str]:
-    """What a bar shows of an epoch: return, costs against their present limits, and λ.
+    """Figures of an epoch for the bar: return, costs against their present limits, and λ.
 
-    Means of the episodes that ended in the epoch; if none did, the epoch's return and costs per
-    1,000 steps. While the limit comes down, its present value follows "target".
+    Means of the episodes that ended in the epoch; without one, return and costs of the epoch per
+    1,000 steps. While the limit comes down, "target" stands before its present value.
 
     Args:
         row: Of a run's table, by column.
@@ -108,7 +108,7 @@ def shown(
 
 
 def _rate(row: Mapping[str, float], before: Mapping[str, float] | None, key: str) -> float:
-    """What an epoch has brought per 1,000 steps, from the means over all steps so far."""
+    """Rate of an epoch per 1,000 steps, from the means over all steps so far."""
     total, steps = row[f"{key}_rate"] * row["steps"], row["steps"]
     if before is not None:
         total, steps = total - before[f"{key}_rate"] * before["steps"], steps - before["steps"]
@@ -118,7 +118,7 @@ def _rate(row: Mapping[str, float], before: Mapping[str, float] | None, key: str
 def _present_limit(
     row: Mapping[str, float], key: str, limits: Mapping[str, float], scale: float
 ) -> str:
-    """What a cost is compared with in an epoch, as the end of its figure."""
+    """The present limit of a cost, as the end of its figure."""
     if key not in limits:
         return ""
     target, limit = row.get(f"target_{key}", -math.inf), limits[key]

@@ -1,6 +1,6 @@
-"""The folder of a run: what lies in it, and where; and the lock that keeps it to one writer.
+"""The folder of a run: names of its files, and the lock that allows one writer.
 
-Nothing else spells these names.
+No other module spells these names.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ KINDS = ("last", "best", "certified")
 """Folders of checkpoints: the newest few, the best that kept every limit, the certified one."""
 
 LEASE = 15.0
-"""Seconds after which a writer on another machine that has not renewed its lease is gone."""
+"""Seconds after which the lease of a writer on another machine expires without renewal."""
 
 _NO_LOCKS = (errno.ENOSYS, errno.ENOLCK, errno.EOPNOTSUPP)
 _locked: dict[Path, int] = {}  # folder -> the process that locked it, not its forks
@@ -74,20 +74,20 @@ class RunFolder:
     config = _Below("config.yaml")  # resolved
     table = _Below("progress.csv")  # a row per epoch
     curves = _Below("curves.png")  # the picture of its learning curves
-    failure = _Below("failure.txt")  # what a job of a sweep has failed of
+    failure = _Below("failure.txt")  # traceback of a failed job of a sweep
     lock = _Below(".lock")  # keeps a second process from writing here
-    lease = _Below(".lease")  # who holds it, for machines that share no locks
-    robot = _Below("robot")  # copies of the robot's files, where it is one of the user's own
+    lease = _Below(".lease")  # the present writer, for machines that share no locks
+    robot = _Below("robot")  # copies of the files of a user's own robot
     robot_note = _Below("robot.json")  # which robot that is, and its SHA-256
     notes = _Below(".hydra")  # Hydra's notes
     overrides = _Below(".hydra/overrides.yaml")  # what the command line said
-    surroundings = _Below(".hydra/hydra.yaml")  # Hydra's own, and where the run was started
+    surroundings = _Below(".hydra/hydra.yaml")  # Hydra's settings, and the folder of the command
     composed = _Below(".hydra/config.yaml")  # the configuration before it was resolved
-    code = _Below("code.json")  # which code carried it out
+    code = _Below("code.json")  # versions of the code
     checkpoints = _Below("checkpoints")  # a folder for each of `KINDS`
     transitions = _Below("transitions")  # what was collected, if it was recorded
     certificate = _Below("certificate.json")  # which checkpoint is certified
-    certifying = _Below(".certifying")  # there from the end of training until it is certified
+    certifying = _Below(".certifying")  # exists between training and certificate
 
     def checkpoint(self, kind: str, steps: int) -> Path:
         """The checkpoint of a kind after so many environment steps."""
@@ -99,7 +99,7 @@ class RunFolder:
         return found[-1] if found else None
 
     def evaluation(self, name: str, suffix: str) -> Path:
-        """What an evaluation leaves: ``json`` for estimates, ``csv``, ``mp4``, ``transitions``."""
+        """A file of an evaluation: ``json`` for estimates, ``csv``, ``mp4``, ``transitions``."""
         return self.directory / f"{'_'.join(filter(None, ('evaluation', name)))}.{suffix}"
 
     def variations(self, name: str, suffix: str) -> Path:
@@ -111,7 +111,7 @@ class RunFolder:
         return sorted(self.directory.glob("evaluation*.json"))
 
     def logger_id(self, logger: str) -> Path:
-        """Where the id of this run is kept that a logger's service has given it."""
+        """The file with the id of this run in a logger's service."""
         return self.directory / f"{logger}_run_id.txt"
 
     @property
@@ -215,7 +215,7 @@ def checkpoints_in(directory: Path) -> list[Path]:
 
 
 def run_of(source: Path) -> tuple[Path, int | None]:
-    """Folder of the run that ``init_from`` names, and steps of the checkpoint if it names one.
+    """Folder of the run in ``init_from``, and the steps of a checkpoint if it names one.
 
     Examples:
         >>> folder, steps = run_of(Path("a/checkpoints/best/checkpoint-000000003000.torchrl"))
@@ -229,7 +229,7 @@ def run_of(source: Path) -> tuple[Path, int | None]:
 
 
 def common_source(source: str) -> str:
-    """The part of ``init_from`` that all seeds share, each of which starts from its own run.
+    """The part of ``init_from`` that all seeds share, if each starts from its own run.
 
     Examples:
         >>> common_source("runs/small/seed3")
@@ -242,13 +242,13 @@ def common_source(source: str) -> str:
     if steps is None:
         return str(folder.parent)
     checkpoint = path.relative_to(folder)
-    # the best one comes after other steps in every seed
+    # the steps of the best one differ between seeds
     is_best = checkpoint.parent.name == "best"
     return str(folder.parent / "*" / (checkpoint.parent if is_best else checkpoint))
 
 
 class RunInUseError(ValueError):
-    """A folder into which another process writes; the message says which."""
+    """Another process writes into the folder; the message names it."""
 
 
 @contextmanager

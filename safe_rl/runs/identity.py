@@ -1,7 +1,7 @@
-"""What a configuration's keys are for: which name the experiment, and which may change on resume.
+"""Roles of a configuration's keys: which define the experiment, and which may change on resume.
 
-One table for all that tells runs apart or compares them: ``resume=``, sweeps and the folders of
-their jobs, the report.
+One table for everything that compares runs: ``resume=``, sweeps and the folders of their jobs, the
+report.
 """
 
 from __future__ import annotations
@@ -124,16 +124,16 @@ def role_of(key: str) -> Role:
     names = key.split(".")
     above = [".".join(names[:depth]) for depth in range(len(names), 0, -1)]
     role = next((ROLES[row] for row in above if row in ROLES), Role.EXPERIMENT)
-    # a group that names nothing does not do so by its target either
+    # the target of a group has the role of the group unless that defines the experiment
     return ROLES.get(f"*.{names[-1]}", role) if role.names_experiment and names[1:] else role
 
 
 def experiment_of(config: Mapping[str, Any]) -> dict[str, Hashable]:
-    """Dotted key -> value of all that names a run's experiment.
+    """Dotted key -> value of all keys that define a run's experiment.
 
-    Runs of which this is equal differ in nothing but the seed, and in where and how they were
-    carried out. ``init_from`` is what the sources of all seeds
-    have in common, see :func:`safe_rl.runs.folder.common_source`.
+    Runs with equal results differ only in the seed, and in where and how they were carried out.
+    ``init_from`` is the common part of the sources of all seeds, see
+    :func:`safe_rl.runs.folder.common_source`.
 
     Args:
         config: Configuration of a run, resolved.
@@ -218,7 +218,7 @@ def given_settings(directory: Path, config: DictConfig) -> dict[str, Any]:
 
 
 def check_same_run(directory: Path, config: DictConfig) -> None:
-    """Refuse to continue a run under another configuration; how long and where may change.
+    """Refuse to continue a run with other settings; length and machine may differ.
 
     Raises:
         ValueError: Naming every key that differs.
