@@ -15,9 +15,9 @@ from pathlib import Path
 from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 
-from safe_rl.cli.composing import CONF
 from safe_rl.envs import make_env, store_configs
 from safe_rl.evaluation.loading import transforms_of
+from safe_rl.files import CONF
 from safe_rl.training.building import build_trainer, seed_everything
 
 

@@ -9,7 +9,7 @@ from hydra import compose, initialize_config_dir
 from hydra.core.config_store import ConfigStore
 from omegaconf import DictConfig
 
-from safe_rl.cli.composing import CONF
+from safe_rl.files import CONF
 
 # what the benchmark's environments have and the point mass lacks, a configuration by name
 ConfigStore.instance().store(

@@ -16,7 +16,7 @@ from omegaconf import DictConfig, OmegaConf
 from setting_tables import own_parts, setting_table
 
 from safe_rl.algorithms.build_part import find_recipe
-from safe_rl.cli.composing import CONF
+from safe_rl.files import CONF
 from safe_rl.targets import accepted_names, locate
 
 DOCS = Path(__file__).resolve().parents[1]

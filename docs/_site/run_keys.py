@@ -11,9 +11,9 @@ from hydra import compose, initialize_config_dir
 from omegaconf import DictConfig, OmegaConf
 from tables import table
 
-from safe_rl.cli.composing import CONF
 from safe_rl.cli.schema import KEYS, keys_of_part
 from safe_rl.envs import store_configs
+from safe_rl.files import CONF
 from safe_rl.parameters import Parameter
 from safe_rl.ranges import Options, Values, values_of
 from safe_rl.targets import locate

@@ -9,11 +9,11 @@ from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
 
-from safe_rl.cli.composing import CONF
-from safe_rl.cli.robots import maker_of
+from safe_rl.cli.run_folders import maker_of
 from safe_rl.cli.schema import KEYS
 from safe_rl.evaluation import Certificate, CertificateOptions, certify
 from safe_rl.evaluation.loading import load_config
+from safe_rl.files import CONF
 from safe_rl.naming import did_you_mean
 from safe_rl.runs.folder import RunFolder, lock_folder
 

@@ -1,50 +1,44 @@
-"""From overrides to the configuration of a new run, checked before anything is written."""
+"""The configuration of a run, checked before anything is written.
+
+That of a new run is composed from overrides. That of a run that is continued is read from its
+folder, as plain values: Hydra looks for nothing there, so what somebody else has put into a folder
+cannot make code run.
+"""
 
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
-from functools import partial
 from pathlib import Path
+from typing import Any, cast
 
 from hydra import compose, initialize_config_dir
-from hydra.core.config_loader import ConfigLoader
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.hydra_config import HydraConfig
-from hydra.core.object_type import ObjectType
 from hydra.core.override_parser.types import IntervalSweep, Override
 from hydra.errors import HydraException
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 from yaml import YAMLError
 
-from safe_rl.cli.grammar import CommandLineError, parse
+from safe_rl.cli.grammar import CommandLineError, overrides_of, parse, take_word
 from safe_rl.cli.schema import KEYS, check_settings, plain
-from safe_rl.cli.suggestions import (
-    CONF,
-    GIVEN_WHOLE,
-    Options,
-    explain,
-    no_choice,
-    unknown_key,
-    unread_by,
-)
+from safe_rl.cli.suggestions import GIVEN_WHOLE, explain, unknown_key, unread_by
+from safe_rl.cli.user_code import check_imports, note_imports
 from safe_rl.envs import store_configs
-from safe_rl.naming import did_you_mean
+from safe_rl.files import CONF, read_config, read_yaml
+from safe_rl.runs.folder import RunFolder
+from safe_rl.runs.identity import role_of
 
-__all__ = ["CONF", "check_once", "check_read", "compose_jobs", "hydras_own", "resolving"]
+__all__ = ["compose_jobs", "compose_resumed", "hydra_on_conf", "resolving", "search_folders"]
 
 _ONE_EACH = ("env", "algo", "preset", "model", "risk", "collector", "logger", "lagrangian")
+_MISSING = object()
 
 
 def compose_jobs(
-    texts: Sequence[str],
-    *,
-    sweep: bool = False,
-    shown: bool = False,
-    folder: Path = CONF,
-    name: str = "config",
+    texts: Sequence[str], *, sweep: bool = False, shown: bool = False
 ) -> list[DictConfig]:
     """Compose what overrides ask for, and check it.
 
@@ -53,8 +47,6 @@ def compose_jobs(
         sweep: Whether they may have several values each. Every value is checked once, with the
             first of the other values.
         shown: Whether the configuration is only shown: it may hold any values.
-        folder: Folder of the configurations; ``hydra.searchpath`` adds others.
-        name: Of the main file there.
 
     Returns:
         Configurations with Hydra's own node: one, or of a sweep those that were checked.
@@ -68,25 +60,29 @@ def compose_jobs(
         >>> compose_jobs(["env=CarGoal1", "seed=3"])[0].seed
         3
     """
-    store_configs()
     overrides = [parse(text) for text in texts]
-    check_once(overrides)
-    with _hydra(folder) as loader:
-        options = partial(_options, loader, name, texts)
-        _check_choices(overrides, options)
+    _check_once(overrides)
+    with hydra_on_conf():
         jobs = list(_jobs(overrides)) if sweep else [list(texts)]
-        configs = [_compose(job, name, options) for job in jobs]
+        configs = [_compose(job) for job in jobs]
     for config in [] if shown else configs:
         _check_package(config)
-        check_read(overrides, config)
+        _check_read(overrides, config)
         _check_values(config, overrides)
     return configs
 
 
-def hydras_own(texts: Sequence[str] = ()) -> DictConfig:
-    """Hydra's own node with some overrides of it."""
-    with _hydra(CONF):
-        return compose("config", list(texts), return_hydra_config=True).hydra
+@contextmanager
+def hydra_on_conf() -> Iterator[Any]:
+    """Hydra on ``conf/``; whoever has initialised it elsewhere finds it as it was."""
+    store_configs()
+    before = GlobalHydra.instance().hydra
+    GlobalHydra.instance().clear()
+    try:
+        with initialize_config_dir(str(CONF), job_name="train", version_base="1.3"):
+            yield GlobalHydra.instance().hydra
+    finally:
+        GlobalHydra.instance().hydra = before
 
 
 @contextmanager
@@ -100,44 +96,38 @@ def resolving(config: DictConfig) -> Iterator[None]:
         HydraConfig.instance().cfg = before
 
 
-@contextmanager
-def _hydra(folder: Path) -> Iterator[ConfigLoader]:
-    """Hydra on a folder; whoever has initialised it elsewhere finds it as it was."""
-    before = GlobalHydra.instance().hydra
-    GlobalHydra.instance().clear()
+def search_folders(folders: Iterable[str | Path], texts: Sequence[str]) -> list[str]:
+    """Overrides by which Hydra looks for files in some folders, too.
+
+    Raises:
+        CommandLineError: If there is no such folder.
+    """
+    paths = [Path(folder).expanduser().absolute() for folder in folders]
+    if missing := next((path for path in paths if not path.is_dir()), None):
+        raise CommandLineError(f"--config-dir {missing}: there is no such folder.")
+    value, others = take_word("hydra.searchpath", texts)
+    before = [] if value is None else parse(f"hydra.searchpath={value}").value()
+    found = [*(f"file://{path}" for path in paths), *cast(list[str], before)]
+    return [*others, *overrides_of({"hydra.searchpath": found} if found else {})]
+
+
+def _compose(texts: list[str]) -> DictConfig:
     try:
-        with initialize_config_dir(str(folder.absolute()), job_name="train", version_base="1.3"):
-            yield GlobalHydra.instance().config_loader()
-    finally:
-        GlobalHydra.instance().hydra = before
-
-
-def _options(loader: ConfigLoader, name: str, texts: Sequence[str], group: str) -> list[str]:
-    """Names of the files in a group, also in the folders that overrides add."""
-    searched = [text for text in texts if text.startswith("hydra.searchpath=")]
-    return loader.get_group_options(group, ObjectType.CONFIG, name, searched)
-
-
-def _compose(texts: list[str], name: str, options: Options) -> DictConfig:
-    try:
-        return compose(name, texts, return_hydra_config=True)
+        return compose("config", texts, return_hydra_config=True)
     except (HydraException, OmegaConfBaseException, YAMLError, ValueError, OSError) as error:
-        key = re.match(r"Could not override '([^']+)'", str(error))
-        head = f"{key[1]}=" if key else ""
-        given = next((text for text in texts if head and text.lstrip("+").startswith(head)), None)
-        if key is None or given is None:
-            raise CommandLineError(explain(error, texts, options)) from None
-        # with all that is right, for what refers to it: the name of env=gymnasium is its env.id
-        values = plain(_compose([text for text in texts if text != given], name, options))
+        wrong = re.match(r"Could not override '([^']+)'", str(error))
+        given = next((t for t in texts if wrong and t.lstrip("+").startswith(f"{wrong[1]}=")), None)
+        if wrong is None or given is None:
+            raise CommandLineError(explain(error, texts)) from None
         inner = re.search(r"full_key: (\S+)", str(error.__cause__))
-        section, _, last = inner[1].rpartition(".") if inner else ("", "", "")
-        if section and f"{section}.".startswith(f"{key[1]}."):
-            known = OmegaConf.select(OmegaConf.create(values), section) or {}
+        if inner and inner[1].startswith(f"{wrong[1]}."):
             raise CommandLineError(
-                f"'{given}': '{section}' has no '{last}'.{did_you_mean(last, map(str, known))} "
-                f"A key that it lacks is added as +{section}.{last}=…"
+                f"'{given}': there is no '{inner[1]}'. If it is not misspelt, add it as "
+                f"+{inner[1]}=…"
             ) from None
-        raise CommandLineError(unknown_key(given, key[1], values)) from None
+        # with all that is right, for what refers to it: the name of env=gymnasium is its env.id
+        values = plain(_compose([text for text in texts if text != given]))
+        raise CommandLineError(unknown_key(given, wrong[1], values)) from None
 
 
 def _jobs(overrides: Sequence[Override]) -> Iterator[list[str]]:
@@ -159,8 +149,8 @@ def _sweep_lines(override: Override) -> list[str]:
     return [str(override.input_line)]
 
 
-def check_once(overrides: Sequence[Override]) -> None:
-    """Refuse keys that are given twice, and parts of mappings that are given as a whole."""
+def _check_once(overrides: Sequence[Override]) -> None:
+    """Refuse keys that are given twice, parts of what is given as a whole, and lists of choices."""
     given: dict[str, list[str]] = {}
     for override in overrides:
         key, line = override.key_or_group, str(override.input_line)
@@ -173,25 +163,14 @@ def check_once(overrides: Sequence[Override]) -> None:
                     f"'{line}': {what} are given all at once, as "
                     f"{section}='{{{name}: {override.get_value_element_as_str()}}}'."
                 )
+        if key in _ONE_EACH and isinstance(values := override.value(), list):
+            raise CommandLineError(
+                f"'{line}': a run has one {key}; for a run with each of them: "
+                f"-m {key}={','.join(map(str, values))}"
+            )
     for key, lines in given.items():
         if lines[1:]:
             raise CommandLineError(f"'{key}' is given more than once: {', '.join(lines)}.")
-
-
-def _check_choices(overrides: Sequence[Override], options: Options) -> None:
-    """Check what is chosen of groups, as far as Hydra's own words would not help."""
-    for override in overrides:
-        group, value, line = override.key_or_group, override.value(), override.input_line
-        if override.is_delete() or override.is_sweep_override() or not (known := options(group)):
-            continue
-        if isinstance(value, list) and value and group in _ONE_EACH:
-            raise CommandLineError(
-                f"'{line}': a run has one {group}; for a run with each of them: "
-                f"-m {group}={','.join(map(str, value))}"
-            )
-        if value in ("", None) or isinstance(value, bool):
-            name = override.get_value_element_as_str()
-            raise CommandLineError(f"'{line}': {no_choice(group, name, known)}")
 
 
 def _check_package(config: DictConfig) -> None:
@@ -205,13 +184,12 @@ def _check_package(config: DictConfig) -> None:
         )
 
 
-def check_read(overrides: Sequence[Override], config: DictConfig) -> None:
+def _check_read(overrides: Sequence[Override], config: DictConfig) -> None:
     """Refuse keys that a configuration holds and its algorithm does not read."""
     algo = config.get("algo") or {}
-    refused = unread_by(algo)
     for override in overrides:
         key = override.key_or_group.replace("/", ".")
-        for unread, reason in refused.items():
+        for unread, reason in unread_by(algo).items():
             path, _, choice = unread.partition("=")
             is_chosen = not choice or OmegaConf.select(config, path) == choice
             if is_chosen and f"{key}.".startswith(f"{path}."):
@@ -235,18 +213,106 @@ def _check_values(config: DictConfig, overrides: Sequence[Override]) -> None:
 
 
 def _check_added(overrides: Sequence[Override], config: DictConfig) -> None:
-    """Refuse keys that are added at the top level, ``+key=…``, and that nothing refers to.
-
-    Keys below sections and parts are checked with their values.
-    """
+    """Refuse keys that are added at the top level, ``+key=…``, and that nothing refers to."""
     text = OmegaConf.to_yaml(config)
     for override in overrides:
-        head = override.key_or_group.partition(".")[0]
-        is_added = override.is_add() or override.is_force_add()
-        if not is_added or head in KEYS or head not in config or "/" in override.key_or_group:
-            continue
+        key, head = override.key_or_group, override.key_or_group.partition(".")[0]
+        is_added = (override.is_add() or override.is_force_add()) and head in config
         # ${head}, ${head.key}, ${resolver:head.key}
-        if not re.search(rf"\$\{{(?:[^${{}}]*[:,])?{re.escape(head)}[.,}}]", text):
-            others = {key: node for key, node in plain(config).items() if key != head}
-            line = str(override.input_line)
-            raise CommandLineError(unknown_key(line, override.key_or_group, others))
+        if is_added and head not in KEYS and not re.search(rf"[{{:,]{re.escape(head)}[.,}}]", text):
+            others = {name: node for name, node in plain(config).items() if name != head}
+            raise CommandLineError(unknown_key(str(override.input_line), key, others))
+
+
+def compose_resumed(
+    directory: Path, texts: Iterable[str], modules: Sequence[str] | None = None
+) -> DictConfig:
+    """The configuration of the run in a folder, with what is to be different from now on.
+
+    What a run has already may be said again.
+
+    Args:
+        directory: The folder.
+        texts: Overrides of what is to be different.
+        modules: The user's modules; None if none are named.
+
+    Raises:
+        CommandLineError: If it is not the folder of a run, or something cannot change.
+        SettingError: For a value that a run cannot have.
+    """
+    run = RunFolder(directory)
+    try:
+        run.check_is_run()
+        config = OmegaConf.create(read_config(run.config))
+    except (OSError, ValueError) as error:
+        raise CommandLineError(f"resume={directory}: {error}") from None
+    check_imports(config, modules, directory)
+    overrides = [parse(text) for text in (*texts, *note_imports(modules))]
+    _check_once(overrides)
+    _refuse_foreign_cluster(config, overrides, run.config)
+    try:
+        said = list(read_yaml(run.overrides))
+    except (OSError, ValueError, TypeError):
+        said = []
+    changes = [o for o in overrides if not _is_held(o, config, directory, said)]
+    for override in changes:
+        _check_may_change(override, config, directory)
+        if not override.is_hydra_override():
+            OmegaConf.update(config, override.key_or_group, override.value(), force_add=True)
+    _check_read(changes, config)
+    check_settings(config, run)
+    return config
+
+
+def _is_held(override: Override, config: DictConfig, directory: Path, said: Sequence[Any]) -> bool:
+    """Whether a run is told what it has already: a value, a name, a choice of its beginning."""
+    key, value = override.key_or_group, override.value()
+    if key == "hydra.run.dir":
+        return Path(str(value)).expanduser().resolve() == directory.expanduser().resolve()
+    if override.input_line in said and not _is_number(override, config):
+        return True
+    there = OmegaConf.select(config, key, default=_MISSING) if "/" not in key else _MISSING
+    name = there.get("name", _MISSING) if isinstance(there, DictConfig) else there
+    return not override.is_delete() and value in (name, there)
+
+
+def _is_number(override: Override, config: DictConfig) -> bool:
+    """Whether an override is of a value that may change, and chooses and deletes nothing."""
+    key = override.key_or_group
+    is_choice = "/" in key or isinstance(config.get(key), DictConfig)
+    return role_of(key).may_change and not (is_choice or override.is_delete())
+
+
+def _check_may_change(override: Override, config: DictConfig, directory: Path) -> None:
+    key, line = override.key_or_group, override.input_line
+    is_plain = override.get_key_element() == key and not override.is_hydra_override()
+    if is_plain and "/" not in key and OmegaConf.select(config, key, default=_MISSING) is _MISSING:
+        raise CommandLineError(unknown_key(str(line), key, plain(config)))
+    if override.is_sweep_override():
+        raise CommandLineError(f"'{line}': a run has one value of it.")
+    if not _is_number(override, config):
+        raise CommandLineError(
+            f"'{line}' cannot change in a run that is continued. What can: its length "
+            "(frames=…), what belongs to the machine (checkpoint.interval=…), and numbers "
+            "below loss, limits, policy_update and the like, except those that a checkpoint "
+            "brings along, such as an optimiser's lr. For a new run from trained networks use "
+            f"init_from={directory}."
+        )
+
+
+def _refuse_foreign_cluster(config: DictConfig, overrides: Sequence[Override], path: Path) -> None:
+    """What Ray is started with can make code run: only the command line says it, not a file."""
+    stored = dict(OmegaConf.select(config, "collector.ray_init") or {})
+    is_said = any(o.key_or_group == "collector.ray_init.address" for o in overrides)
+    if stored.pop("address", None) is not None and not is_said:
+        raise CommandLineError(
+            f"{path} names a Ray cluster, which is not taken from a file: say again "
+            "collector.ray_init.address=… (null for Ray on this machine)."
+        )
+    if "runtime_env" in (OmegaConf.select(config, "collector.resources") or {}):
+        stored["runtime_env"] = None  # actors can be started with it, too
+    if stored:
+        raise CommandLineError(
+            f"{path} starts Ray with {', '.join(stored)}, which could make code run: delete that "
+            "there to resume."
+        )

@@ -11,10 +11,9 @@ from typing import Any
 import yaml
 
 from safe_rl.cli.certificates import certify_run
-from safe_rl.cli.composing import CONF
 from safe_rl.cli.grammar import CommandLineError
 from safe_rl.cli.report import suite
-from safe_rl.cli.robots import maker_of
+from safe_rl.cli.run_folders import maker_of
 from safe_rl.cli.session import SETTING_ERRORS
 from safe_rl.cli.user_code import check_imports, import_modules
 from safe_rl.envs import LayoutError, OpenGLError
@@ -23,6 +22,7 @@ from safe_rl.evaluation.loading import load_config
 from safe_rl.evaluation.measuring import format_unjudged
 from safe_rl.evaluation.policies import find_run, writable_copy
 from safe_rl.evaluation.variations import Variation, Varied, evaluate_variations, expand
+from safe_rl.files import CONF
 from safe_rl.naming import did_you_mean
 from safe_rl.reporting.figures import draw_variations
 from safe_rl.runs.folder import RunFolder

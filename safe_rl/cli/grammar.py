@@ -23,7 +23,7 @@ from safe_rl.naming import did_you_mean
 
 __all__ = [
     *("CommandLineError", "overrides_of", "parse", "parse_options", "quote", "take_options"),
-    "usage",
+    *("take_word", "usage"),
 ]
 
 if TYPE_CHECKING:
@@ -54,23 +54,24 @@ def parse(text: str) -> Override:
         raise CommandLineError(
             f"'{text}' cannot be read: {str(error).splitlines()[0]}.{hint}"
         ) from None
-    if isinstance(override.value(), dict):  # of which the last of equal names would count
-        plain = re.sub(r"\$\{[^}]*\}|'[^']*'|\"[^\"]*\"", "_", text)
-        names = re.findall(r"[{,]\s*([^\s{}\[\],:]+)\s*:", plain)
-        held = _names_in(override.value())
-        if len(names) > len(held):
-            twice = next(name for name in names if names.count(name) > held.count(name))
-            raise CommandLineError(f"'{text}': {twice} is given twice.")
     return override
 
 
-def _names_in(value: Any) -> list[str]:
-    """Names in a mapping and in mappings within it."""
-    if isinstance(value, list):
-        return [name for item in value for name in _names_in(item)]
-    if not isinstance(value, dict):
-        return []
-    return [*map(str, value), *(name for item in value.values() for name in _names_in(item))]
+def take_word(name: str, words: Sequence[str]) -> tuple[str | None, list[str]]:
+    """The value of a word ``name=value``, None if it is not given; and the other words.
+
+    Raises:
+        CommandLineError: If it is given more than once.
+
+    Examples:
+        >>> take_word("slate", ["slate=SG6", "seed=0"])
+        ('SG6', ['seed=0'])
+    """
+    given = [word for word in words if word.lstrip("+").startswith(f"{name}=")]
+    if len(given) > 1:
+        raise CommandLineError(f"'{name}' is given more than once: {', '.join(given)}.")
+    others = [word for word in words if word not in given]
+    return given[0].partition("=")[2] if given else None, others
 
 
 def quote(text: str) -> str:

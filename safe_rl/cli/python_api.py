@@ -5,18 +5,14 @@ They do what the commands do, from the same configurations; Hydra stays inside.
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from signal import Signals
 from typing import Any
 
-from omegaconf import open_dict
-
-from safe_rl.cli.composing import compose_jobs, resolving
+from safe_rl.cli.composing import compose_jobs, compose_resumed, search_folders
 from safe_rl.cli.grammar import CommandLineError, overrides_of, take_options
-from safe_rl.cli.resuming import compose_resumed
-from safe_rl.cli.session import Session, missing_folders, new_folder
+from safe_rl.cli.session import Session
 from safe_rl.cli.suggestions import GIVEN_WHOLE
 from safe_rl.cli.trained_run import Run, load
 from safe_rl.cli.user_code import import_modules, note_imports
@@ -76,27 +72,16 @@ def train(
         >>> run.table["steps"]
         [40.0, 80.0]
     """
-    _check_kinds(imports, directory)
+    for key, name in {"env": env, "algo": algo}.items():
+        if not isinstance(name, str):
+            what = " ".join(repr(name).split())[:80]
+            raise CommandLineError(f"{key}={what}: it must be a name. {_OF_YOUR_OWN[key]}")
+    folders = [config_dir] if isinstance(config_dir, str | Path) else config_dir or ()
     modules = import_modules(imports)
-    overrides = [*_new_run(env, algo, settings, config_dir), *note_imports(modules or None)]
-    (config,) = compose_jobs(overrides)
-    if directory is None:
-        with resolving(config):
-            folder, missing = new_folder(config.hydra)
-    else:
-        folder = Path(directory).expanduser()
-        missing = missing_folders(folder)
-    with open_dict(config):
-        own = config.pop("hydra")
-    return _carry_out(
-        Session(
-            *(config, folder, own),
-            missing=missing,
-            otherwise=_otherwise(folder),
-            quiet=True,
-            callbacks=callbacks,
-        )
-    )
+    words = [f"env={env}", f"algo={algo}", *overrides_of(settings, _WHOLE)]
+    (config,) = compose_jobs([*search_folders(folders, words), *note_imports(modules or None)])
+    folder = None if directory is None else Path(directory).expanduser()
+    return _carry_out(Session.begin(config, folder, program=None, callbacks=callbacks))
 
 
 def resume(
@@ -127,32 +112,10 @@ def resume(
         Resuming after 40 of 80 frames.
         [40.0, 80.0]
     """
-    _check_kinds(imports, directory)
     modules = None if imports is None else import_modules(imports)
     folder = Path(directory).expanduser()
     config = compose_resumed(folder, overrides_of(settings, _WHOLE), modules)
-    return _carry_out(
-        Session(
-            *(config, folder),
-            continues=True,
-            otherwise=_otherwise(folder),
-            quiet=True,
-            callbacks=callbacks,
-        )
-    )
-
-
-def _check_kinds(imports: Any, directory: Any) -> None:
-    """Refuse what names neither modules nor a folder.
-
-    Raises:
-        CommandLineError: If so.
-    """
-    names = [imports] if isinstance(imports, str | None) else imports
-    if not isinstance(names, Sequence) or not all(isinstance(n, str | None) for n in names):
-        raise CommandLineError(f"imports={imports!r}: it must be names of modules.")
-    if not isinstance(directory, str | os.PathLike | None):
-        raise CommandLineError(f"directory={directory!r}: it must be the path of a folder.")
+    return _carry_out(Session(config, folder, continues=True, program=None, callbacks=callbacks))
 
 
 def _carry_out(session: Session) -> Run:
@@ -162,36 +125,6 @@ def _carry_out(session: Session) -> Run:
     if session.interrupted_by is not None:
         raise SystemExit(128 + session.interrupted_by)
     return Run(session.folder.directory)
-
-
-def _otherwise(folder: Path) -> str:
-    """What continues a run beside the command."""
-    return f", or safe_rl.resume({str(folder)!r})"
-
-
-def _new_run(
-    env: Any,
-    algo: Any,
-    settings: Mapping[str, Any],
-    folders: str | Path | Sequence[str | Path] | None,
-) -> list[str]:
-    """Overrides of a new run: environment and algorithm by their names, settings, YAMLs' folders.
-
-    Raises:
-        CommandLineError: If one is no name, a setting nothing that can be written, a folder not
-            there.
-    """
-    for key, value in {"env": env, "algo": algo}.items():
-        if not isinstance(value, str):
-            what = " ".join(repr(value).split())[:80]
-            raise CommandLineError(f"{key}={what}: it must be a name. {_OF_YOUR_OWN[key]}")
-    given = [folders] if isinstance(folders, str | Path) else folders or ()
-    found = [Path(folder).expanduser().absolute() for folder in given]
-    if missing := next((folder for folder in found if not folder.is_dir()), None):
-        raise CommandLineError(f"config_dir={missing}: there is no such folder.")
-    if found:
-        settings = {**settings, "hydra.searchpath": [f"file://{folder}" for folder in found]}
-    return [f"env={env}", f"algo={algo}", *overrides_of(settings, _WHOLE)]
 
 
 def evaluate(run: Run | str | Path, **options: Any) -> Evaluation:

@@ -12,7 +12,7 @@ from typing import Annotated, Any, Literal, NamedTuple
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from safe_rl.cli.robots import robot_of
+from safe_rl.cli.run_folders import robot_of
 from safe_rl.envs import complete_env
 from safe_rl.evaluation.settings import check_device
 from safe_rl.extras import check_extra

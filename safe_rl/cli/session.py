@@ -5,12 +5,9 @@ from __future__ import annotations
 import logging
 import math
 import os
-import shutil
 import sys
-import tempfile
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
-from itertools import count
 from pathlib import Path
 from signal import SIGINT, Signals
 from typing import Any, cast
@@ -27,8 +24,14 @@ from safe_rl.cli.certificates import (
     train_on,
     why_not_certified,
 )
-from safe_rl.cli.grammar import CommandLineError
-from safe_rl.cli.robots import keep_robot, robot_of
+from safe_rl.cli.composing import resolving
+from safe_rl.cli.run_folders import (
+    keep_robot,
+    missing_folders,
+    new_folder,
+    remove_folders,
+    robot_of,
+)
 from safe_rl.cli.schema import check_settings
 from safe_rl.cli.user_code import imported, make_after_imports
 from safe_rl.envs import ConfigError, ContractError, LayoutError, complete_env, make_env
@@ -43,9 +46,7 @@ from safe_rl.runs.table import TableError, read_table
 from safe_rl.training.building import begin_from, build_trainer, physics_threads, seed_everything
 from safe_rl.training.trainer import EpisodeError, Trainer, WorkerError
 
-__all__ = [
-    *("SETTING_ERRORS", "Session", "check_writable", "missing_folders", "new_folder", "run_job"),
-]
+__all__ = ["SETTING_ERRORS", "Session", "run_job"]
 
 SETTING_ERRORS: tuple[type[Exception], ...] = (
     *(ValueError, CheckpointError, OmegaConfBaseException, OSError, LayoutError),
@@ -68,9 +69,8 @@ class Session:
         continues: Whether to continue the run in the folder.
         missing: Folders that were not there before, the run's own first: they go again if it
             cannot begin.
-        program: What trains, as the user has called it.
-        otherwise: What continues the run beside the command.
-        quiet: Whether to leave out what came of it.
+        program: The command, as the user has called it; None: Python, which is not told what came
+            of it.
         callbacks: Called after every epoch with its row; one that returns False ends the run.
 
     Attributes:
@@ -85,17 +85,36 @@ class Session:
         *,
         continues: bool = False,
         missing: Sequence[Path] = (),
-        program: str = "python train.py",
-        otherwise: str = "",
-        quiet: bool = False,
+        program: str | None = "python train.py",
         callbacks: Sequence[Callable[[Mapping[str, float]], Any]] = (),
     ) -> None:
         self.config, self.folder, self.hydra = config, RunFolder(folder), hydra
         self.interrupted_by: Signals | None = None
-        self._continues, self._missing, self._quiet = continues, missing, quiet
-        self._program, self._again = program, f"{program} {self.folder.resuming}{otherwise}"
-        self._callbacks = callbacks
+        self._continues, self._missing, self._callbacks = continues, missing, callbacks
+        self._quiet = program is None
+        self._program = program or "python train.py"
+        self._again = f"{self._program} {self.folder.resuming}"
+        if program is None:
+            self._again += f", or safe_rl.resume({str(folder)!r})"
         self._has_begun = False
+
+    @classmethod
+    def begin(cls, config: DictConfig, folder: Path | None = None, **options: Any) -> Session:
+        """A new run.
+
+        Args:
+            config: As `compose_jobs` returns it, with Hydra's own node, which is taken out.
+            folder: Its folder; None: the one that the configuration names.
+            options: As of the class.
+        """
+        if folder is None:
+            with resolving(config):
+                folder, missing = new_folder(config.hydra)
+        else:
+            missing = missing_folders(folder)
+        with open_dict(config):
+            hydra = config.pop("hydra")
+        return cls(config, folder, hydra, missing=missing, **options)
 
     def run(self) -> None:
         """Train, or continue to train, and certify at the end what is to keep limits.
@@ -120,7 +139,7 @@ class Session:
                     outcome = trainer.run()
         finally:
             if not self._has_begun:
-                _remove(self._missing)
+                remove_folders(self._missing)
         if trainer is None:
             if self.folder.certifying.exists():
                 self._certify()
@@ -279,70 +298,6 @@ def run_job(config: DictConfig) -> float:
     value = figures["episode_return"]
     is_above = any(violation(figures, key, limit) > 0 for key, limit in limits.items())
     return -math.inf if is_above or math.isnan(value) else value
-
-
-def new_folder(hydra: DictConfig) -> tuple[Path, list[Path]]:
-    """The folder of a new run, and which folders were missing before.
-
-    It is made, so that it is nobody else's. Where the name is taken, by a run that began in the
-    same second say, it gets a number. A folder that the command line names is left as it is.
-
-    Args:
-        hydra: Hydra's own configuration.
-
-    Raises:
-        CommandLineError: If nothing can be written there.
-    """
-    wanted = Path(os.path.abspath(Path(hydra.run.dir).expanduser()))
-    check_writable(wanted, "hydra.run.dir")
-    missing = missing_folders(wanted)
-    if any(text.lstrip("+").startswith("hydra.run.dir=") for text in hydra.overrides.hydra):
-        return wanted, missing
-    path = wanted
-    for number in count(2):
-        try:
-            path.mkdir(parents=True)
-            break
-        except FileExistsError:
-            path = wanted.with_name(f"{wanted.name}_{number}")
-    return path, [path, *missing[1:]]
-
-
-def missing_folders(folder: Path) -> list[Path]:
-    """A folder and those above it, as far as they are not there."""
-    place = Path(os.path.abspath(folder))
-    return [path for path in (place, *place.parents) if not path.exists()]
-
-
-def check_writable(folder: Path, key: str) -> None:
-    """Refuse a folder in which nothing can be written, before it is made.
-
-    Args:
-        folder: The folder.
-        key: What names it, for the message.
-
-    Raises:
-        CommandLineError: If so.
-    """
-    try:
-        existing = next(path for path in (folder, *folder.absolute().parents) if path.exists())
-        with tempfile.TemporaryFile(dir=existing):
-            pass
-    except OSError as error:
-        raise CommandLineError(
-            f"{key}={folder}: nothing can be written there: {error.strerror}."
-        ) from None
-
-
-def _remove(missing: Sequence[Path]) -> None:
-    """Remove the folder of a run that could not begin, and those above it that are empty."""
-    for path in missing[:1]:
-        shutil.rmtree(path, ignore_errors=True)
-    for path in missing[1:]:
-        try:
-            path.rmdir()
-        except OSError:  # other runs have come into it
-            return
 
 
 def _print(line: str) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 from hydra.errors import MissingConfigException
@@ -15,7 +15,7 @@ from safe_rl.extras import installing
 from safe_rl.files import CONF
 from safe_rl.naming import did_you_mean, nearest
 
-__all__ = ["CONF", "GIVEN_WHOLE", "explain", "unknown_key", "unread_by"]
+__all__ = ["GIVEN_WHOLE", "explain", "unknown_key", "unread_by"]
 
 _PLUGINS = {
     "hydra/launcher=joblib": "sweep",
@@ -66,36 +66,27 @@ _LARGE = ("env", "algo", "preset")
 _LIKENESS = 0.6
 _MOST_LISTED = 40
 
-Options = Callable[[str], Sequence[str]]
-"""Names of the files in a group."""
 
-
-def explain(error: Exception, texts: Sequence[str], options: Options) -> str:
+def explain(error: Exception, texts: Sequence[str]) -> str:
     """Say in one line what is wrong with overrides, or files, that Hydra could not compose.
 
     Args:
         error: What Hydra says.
         texts: The overrides.
-        options: What there is to choose from.
     """
     words = " ".join(str(error.__cause__ or error if not str(error) else error).split())
     file, _, said = words.removeprefix("In '").partition("': ")
     if isinstance(error, MissingConfigException) and error.missing_cfg_file is not None:
         group, _, name = error.missing_cfg_file.rpartition("/")
-        given = next(
-            (t for t in texts if re.match(rf"\+?{group}(@[\w.]+)?=.*{re.escape(name)}", t)), None
-        )
-        if given is not None:
-            return f"'{given}': {no_choice(group, name, options(group))}"
-        return f"{file}.yaml: {no_choice(group, name, options(group))}"
-    if there := re.search(r"An item is already at '([^']+)'", words):
-        return f"'{there[1]}' is there already: write it without +."
+        pattern = rf"\+?{group}(@[\w.]+)?=.*{re.escape(name)}"
+        given = next((f"'{text}'" for text in texts if re.match(pattern, text)), f"{file}.yaml")
+        return f"{given}: {_no_choice(group, name, error.options or ())}"
     return f"{file}.yaml: {said}" if words.startswith("In '") else words
 
 
-def no_choice(group: str, name: str, known: Sequence[str]) -> str:
+def _no_choice(group: str, name: str, known: Sequence[str]) -> str:
     """Say that a group has no file of a name, and which was meant or which there are."""
-    listed = f" There are {', '.join(known)}."
+    listed = f" There are {', '.join(known)}." if known else ""
     if len(known) > _MOST_LISTED:
         listed = " 'python train.py --help' names all there are."
     own = _names_here(name.replace("-", "").replace("_", "")) if group == "algo" else ""
@@ -119,14 +110,10 @@ def unknown_key(given: str, key: str, values: Mapping[str, Any]) -> str:
         return f"'{given}': algo={algo.get('name')} has no '{section}'."
     if choice := _choice_with(key):
         return f"'{given}': nothing reads '{key}' without {choice}."
-    unread, held = unread_by(algo), list(_paths(values))
-    refused = {
-        p: why for p in held for head, why in unread.items() if f"{p}.".startswith(f"{head}.")
-    }
+    unread = unread_by(algo)
+    held = [p for p in _paths(values) if not any(f"{p}.".startswith(f"{u}.") for u in unread)]
     optional = {p: f"+{p}" for p in optional_keys(values) if p.split(".")[0] not in unread}
-    meant = _meant(key, [p for p in held if p not in refused], list(optional), list(refused))
-    if meant and meant[0] in refused:
-        return f"'{given}': algo={algo['name']} does not read '{meant[0]}'. {refused[meant[0]]}"
+    meant = _meant(key, held, list(optional))
     names = " or ".join(f"'{optional.get(path, path)}'" for path in meant)
     return f"'{given}': nothing reads '{key}'.{f' Did you mean {names}?' if names else ''}"
 
@@ -142,22 +129,20 @@ def unread_by(algo: Mapping[str, Any]) -> Mapping[str, str]:
     return find_recipe(OmegaConf.create({"algo": dict(algo)})).unused_keys
 
 
-def _meant(
-    key: str, held: Sequence[str], optional: Sequence[str], refused: Sequence[str]
-) -> list[str]:
+def _meant(key: str, held: Sequence[str], optional: Sequence[str]) -> list[str]:
     """Keys with the last name of a wrong one, or its name here, or else the one most like it.
 
     Examples:
-        >>> _meant("lr", ["policy_update.optimizer.lr", "frames"], [], [])
+        >>> _meant("lr", ["policy_update.optimizer.lr", "frames"], [])
         ['policy_update.optimizer.lr']
-        >>> _meant("total_timesteps", ["frames", "env.num_steps"], [], [])
+        >>> _meant("total_timesteps", ["frames", "env.num_steps"], [])
         ['frames']
-        >>> _meant("frmaes", ["frames", "env.num_steps"], [], [])
+        >>> _meant("frmaes", ["frames", "env.num_steps"], [])
         ['frames']
     """
     name = _end(key)
     here = _names_here(name)
-    for word, paths in ((name, held), (here, [*_ALWAYS, *held]), (name, optional), (name, refused)):
+    for word, paths in ((name, held), (here, [*_ALWAYS, *held]), (name, optional)):
         if word is not None and word in paths:
             return [word]
         if found := [path for path in paths if path.endswith(f".{word}")]:

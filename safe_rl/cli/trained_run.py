@@ -18,7 +18,7 @@ from torchrl.envs import EnvBase
 from safe_rl.cli.certificates import certify_run
 from safe_rl.cli.evaluating import evaluate_run, evaluate_varied
 from safe_rl.cli.grammar import take_options
-from safe_rl.cli.robots import maker_of
+from safe_rl.cli.run_folders import maker_of
 from safe_rl.cli.user_code import check_imports, import_modules, several
 from safe_rl.evaluation import Certificate, Evaluation, EvaluationOptions
 from safe_rl.evaluation.episodes import default_seed

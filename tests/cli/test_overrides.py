@@ -8,8 +8,8 @@ from omegaconf import OmegaConf
 from run_configs import CONF
 
 from safe_rl.cli.grammar import CommandLineError
+from safe_rl.cli.run_folders import check_writable
 from safe_rl.cli.schema import SettingError
-from safe_rl.cli.session import check_writable
 from safe_rl.cli.train import read_command
 
 MINE = """
@@ -46,8 +46,9 @@ WRONG = {
     "transforms.saute.budgets.cost=1": r"budgets are given all at once, as .*='\{cost: 1\}'",
     "model.input_scale.gyro=1": r"factors are given all at once, as .*='\{gyro: 1\}'",
     "+model.input_scale.velocimeter=0.5": r"model.input_scale='\{velocimeter: 0.5\}'",
-    "certificate={episodez: 5}": "'certificate' has no 'episodez'. Did you mean 'episodes'",
-    "+seed=1": "'seed' is there already: write it without +",
+    "certificate={episodez: 5}": r"no 'certificate\.episodez'\. .* \+certificate\.episodez=",
+    "+certificate.episodez=5": "Did you mean 'certificate.episodes'",
+    "+seed=1": "at 'seed'. Either remove [+] prefix: 'seed=1'",
     "env=PointGaol1": "no env 'PointGaol1'. Did you mean 'PointGoal1'",
     "env=CarGoal2,CarGaol2": "no env 'CarGaol2'. Did you mean 'CarGoal2'",
     "algo=cop": "no algo 'cop'. Did you mean 'cpo'",
@@ -79,7 +80,6 @@ WRONG = {
     "transforms.saute.budgets={cost: 3}": r"without transforms=\[saute\]\.$",
     # choices that are none, or too many
     "algo=": r"no algo ''\. There are bc, ",
-    "risk=null": r"no risk 'null'\. There are chance, cvar, mean\.$",
     "algo=[cpo,ppo]": r"a run has one algo; for a run with each of them: -m algo=cpo,ppo$",
     "env=CartPole-v1": r"no env 'CartPole-v1'\. It is one of Gymnasium's: env=gymnasium env\.id",
     "env=Safexp-CarGoal1-v0": r"Did you mean 'CarGoal1'\?$",
@@ -151,8 +151,6 @@ def test_what_only_other_algorithms_read_is_refused_with_the_reason(argument):
         "lr=1e-3": r"nothing reads 'lr'\. Did you mean 'policy_update.optimizer.lr'\?$",
         "+lr=1e-3": r"nothing reads 'lr'\. Did you mean 'policy_update.optimizer.lr'\?$",
         "gamma=0.9": r"Did you mean 'loss.gamma'\?$",
-        "lmbda=0.9": "algo=sac does not read 'advantage.lmbda'. .*memory.n_steps",
-        "initial_log_std=0": "does not read 'model.initial_log_std'. Its network tells",
         "policy_update.minibatch_size=9": r"Did you mean 'memory.batch_size'\?$",
     }.items(),
 )
@@ -182,7 +180,7 @@ def test_the_paper_s_setting_is_refused_where_the_paper_has_none():
 
 
 def test_what_a_mapping_lacks_is_added_with_a_plus():
-    with pytest.raises(CommandLineError, match=r"no 'num_gpus'\. .* \+collector\.ray_init"):
+    with pytest.raises(CommandLineError, match=r"no 'collector\.ray_init\.num_gpus'\. .* add it"):
         read_command(["collector=ray", "collector.ray_init={num_gpus: 3}"])
 
 
@@ -197,7 +195,7 @@ FAULTY = {
     "defaults: [sac_lagrangian, {override /limits/replay: default}]": (
         r"algo/mine\.yaml: .*Did you mean to override limits/replay@limits"
     ),
-    "defaults: [ppo_lagrangien]": r"algo/mine\.yaml: there is no algo 'ppo_lagrangien'\. Did you",
+    "defaults: [ppo_lagrangien]": r"algo/mine\.yaml: there is no algo 'ppo_lagrangien'\.",
     # Hydra says it of the file whose choice is overridden
     "defaults: [ppo_lagrangian, {override /lagrangian: pidd}]": (
         r"algo/ppo_lagrangian\.yaml: there is no lagrangian 'pidd'\. Did you mean 'pid'\?"
@@ -294,10 +292,3 @@ def test_mappings_that_are_given_whole_are_given_once(second):
     with pytest.raises(CommandLineError, match=said):
         read_command(arguments)
     read_command([arguments[0], "~cost_limits", f"+cost_limits={second}"])
-
-
-def test_equal_names_within_braces_are_refused():
-    with pytest.raises(CommandLineError, match="cost is given twice"):
-        read_command(["cost_limits={cost: 25, cost: 3}"])
-    (config,) = read_command(["cost_limits={cost: 25, cost_hazards: 3}"]).configs
-    assert dict(config.cost_limits) == {"cost": 25, "cost_hazards": 3}

@@ -370,9 +370,3 @@ def test_the_package_lists_what_it_offers():
     names = {name for name in dir(safe_rl) if not name.startswith("__")}
     assert names == {"Run", "evaluate", "load", "make_env", "report", "resume", "train"}
     assert safe_rl.make_env("PointGoal1", num_envs=2, seed=0).batch_size == torch.Size([2])
-
-
-@pytest.mark.parametrize(("setting", "words"), [("directory", "a folder"), ("imports", "modules")])
-def test_numbers_are_neither_folders_nor_modules(setting, words):
-    with pytest.raises(ValueError, match=rf"^{setting}=5: it must be .*{words}"):
-        safe_rl.train("PointGoal1", frames=80, **{setting: 5})

@@ -4,8 +4,8 @@ import pytest
 from omegaconf import OmegaConf
 from run_configs import point_mass_config
 
+from safe_rl.cli.composing import compose_resumed
 from safe_rl.cli.grammar import CommandLineError
-from safe_rl.cli.resuming import compose_resumed
 from safe_rl.cli.train import read_command
 from safe_rl.runs.folder import RunFolder
 from safe_rl.runs.record import RunRecord
@@ -121,9 +121,8 @@ def test_only_a_run_can_be_resumed(run):
         read_command(["-m", f"resume={run}"])
     with pytest.raises(CommandLineError, match="more than once"):
         read_command([f"resume={run}", f"resume={run}"])
-    for flag in ("--config-name=other", "-cp=elsewhere", "--cfg=job"):
-        with pytest.raises(CommandLineError, match="does not go with resume="):
-            read_command([f"resume={run}", flag])
+    with pytest.raises(CommandLineError, match="no flag goes with it"):
+        read_command([f"resume={run}", "--cfg=job"])
     (run / "config.yaml").write_text("algo: [")
     with pytest.raises(CommandLineError, match=r"config\.yaml cannot be read"):
         compose_resumed(run, [])

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from omegaconf import OmegaConf
 
-from safe_rl.cli.session import new_folder
+from safe_rl.cli.run_folders import new_folder
 
 ROOT = Path(__file__).parents[2]
 

@@ -13,12 +13,12 @@ from omegaconf import OmegaConf
 from PIL import Image
 
 import safe_rl
-from safe_rl.cli.composing import CONF
 from safe_rl.cli.evaluate import main
 from safe_rl.cli.evaluating import evaluate_run, read_variations
 from safe_rl.cli.train import read_command
 from safe_rl.evaluation import EvaluationOptions
 from safe_rl.evaluation.variations import Variation, expand, varied
+from safe_rl.files import CONF
 
 pytestmark = pytest.mark.long
 

@@ -7,10 +7,10 @@ import pytest
 import yaml
 from synthetic import SUITE, write_run
 
-from safe_rl.cli.composing import CONF
 from safe_rl.cli.report import main
 from safe_rl.cli.train import read_command
 from safe_rl.envs import store_configs
+from safe_rl.files import CONF
 from safe_rl.reporting.campaigns import PLAN, campaign_tables, read_plan
 from safe_rl.reporting.page import build_report
 from safe_rl.reporting.recorded import find_runs

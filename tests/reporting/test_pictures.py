@@ -5,7 +5,7 @@ import pytest
 from matplotlib.figure import Figure
 from synthetic import experiments_in, write_run
 
-from safe_rl.cli.composing import CONF
+from safe_rl.files import CONF
 from safe_rl.reporting.curves import draw_learning_curves, draw_small_multiples
 from safe_rl.reporting.figures import add_legend, algorithm_styles, compared, draw_fronts, save
 from safe_rl.reporting.scoring import final_table

@@ -5,7 +5,7 @@ import json
 import pytest
 from synthetic import grouped, write_run
 
-from safe_rl.cli.composing import CONF
+from safe_rl.files import CONF
 from safe_rl.reporting.experiments import distinguishing_keys, title_of
 from safe_rl.reporting.recorded import find_runs
 

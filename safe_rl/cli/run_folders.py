@@ -1,7 +1,7 @@
-"""Custom robots: a run keeps a copy, and is continued with the robot that it began with.
+"""Folders of new runs, and a run's own copy of a custom robot.
 
-The configuration still names the user's file, by which runs are told apart; where that is gone
-or has changed, the run's copy takes its place.
+A run is continued with the robot that it began with. The configuration still names the user's file,
+by which runs are told apart; where that is gone or has changed, the run's copy takes its place.
 """
 
 from __future__ import annotations
@@ -9,17 +9,88 @@ from __future__ import annotations
 import json
 import os
 import shutil
-from collections.abc import Callable, Mapping
+import tempfile
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
+from itertools import count
 from pathlib import Path
 from typing import Any
 
+from omegaconf import DictConfig
+
 from safe_rl import envs
+from safe_rl.cli.grammar import CommandLineError
 from safe_rl.envs import ConfigError
 from safe_rl.envs.safety_gym.robots import copy_robot, fingerprint, is_robot, own_robot
 from safe_rl.files import replace_text
 from safe_rl.runs.folder import RunFolder
 
-__all__ = ["keep_robot", "maker_of", "robot_of"]
+__all__ = [
+    *("check_writable", "keep_robot", "maker_of", "missing_folders", "new_folder"),
+    *("remove_folders", "robot_of"),
+]
+
+
+def new_folder(hydra: DictConfig) -> tuple[Path, list[Path]]:
+    """The folder of a new run, and which folders were missing before.
+
+    It is made, so that it is nobody else's. Where the name is taken, by a run that began in the
+    same second say, it gets a number. A folder that the command line names is left as it is.
+
+    Args:
+        hydra: Hydra's own configuration.
+
+    Raises:
+        CommandLineError: If nothing can be written there.
+    """
+    wanted = Path(os.path.abspath(Path(hydra.run.dir).expanduser()))
+    check_writable(wanted, "hydra.run.dir")
+    missing = missing_folders(wanted)
+    if any(text.lstrip("+").startswith("hydra.run.dir=") for text in hydra.overrides.hydra):
+        return wanted, missing
+    for number in count(1):
+        path = wanted if number == 1 else wanted.with_name(f"{wanted.name}_{number}")
+        with suppress(FileExistsError):
+            path.mkdir(parents=True)
+            break
+    return path, [path, *missing[1:]]
+
+
+def missing_folders(folder: Path) -> list[Path]:
+    """A folder and those above it, as far as they are not there."""
+    place = Path(os.path.abspath(folder))
+    return [path for path in (place, *place.parents) if not path.exists()]
+
+
+def check_writable(folder: Path, key: str) -> None:
+    """Refuse a folder in which nothing can be written, before it is made.
+
+    Args:
+        folder: The folder.
+        key: What names it, for the message.
+
+    Raises:
+        CommandLineError: If so.
+    """
+    try:
+        existing = next(path for path in (folder, *folder.absolute().parents) if path.exists())
+        with tempfile.TemporaryFile(dir=existing):
+            pass
+    except OSError as error:
+        raise CommandLineError(
+            f"{key}={folder}: nothing can be written there: {error.strerror}."
+        ) from None
+
+
+def remove_folders(missing: Sequence[Path]) -> None:
+    """Remove the folder of a run that could not begin, and those above it that are empty."""
+    for path in missing[:1]:
+        shutil.rmtree(path, ignore_errors=True)
+    for path in missing[1:]:
+        try:
+            path.rmdir()
+        except OSError:  # other runs have come into it
+            return
 
 
 def keep_robot(folder: RunFolder, env: Mapping[str, Any]) -> None:
