@@ -16,9 +16,9 @@ from omegaconf import OmegaConf
 from run_configs import CONF, without_times
 
 import safe_rl
-from safe_rl.cli.composing import compose_jobs
+from safe_rl.cli.composing import compose_jobs, search_folders
 from safe_rl.cli.grammar import overrides_of
-from safe_rl.cli.python_api import _WHOLE, _new_run
+from safe_rl.cli.python_api import _WHOLE
 from safe_rl.envs import ConfigError, store_configs
 from safe_rl.evaluation.loading import find_checkpoint
 from safe_rl.reporting.recorded import archive_runs, find_runs
@@ -151,9 +151,8 @@ def test_folders_of_ones_own_one_or_several(tmp_path):
         (folder / "algo").mkdir(parents=True)
         text = f"{head}lagrangian: {{init: {place + 1}}}\n"
         (folder / "algo" / f"mine{place}.yaml").write_text(text)
-    for given in (folders, folders[1], str(folders[1])):
-        (config,) = compose_jobs(_new_run("PointGoal1", "mine1", {}, given))
-        assert config.lagrangian.init == 2
+    (config,) = compose_jobs(search_folders(folders, ["algo=mine1"]))
+    assert config.lagrangian.init == 2
     (tmp_path / "mine.py").write_text("imported = True\n")
     run = safe_rl.train(
         algo="mine0", frames=40, directory=tmp_path / "run", config_dir=folders[0],
