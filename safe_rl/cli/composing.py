@@ -104,7 +104,7 @@ def search_folders(folders: Iterable[str | Path], texts: Sequence[str]) -> list[
     """
     paths = [Path(folder).expanduser().absolute() for folder in folders]
     if missing := next((path for path in paths if not path.is_dir()), None):
-        raise CommandLineError(f"--config-dir {missing}: there is no such folder.")
+        raise CommandLineError(f"config_dir={missing}: there is no such folder.")
     value, others = take_word("hydra.searchpath", texts)
     before = [] if value is None else parse(f"hydra.searchpath={value}").value()
     found = [*(f"file://{path}" for path in paths), *cast(list[str], before)]
