@@ -134,19 +134,13 @@ class Claim:
             )
         if self.tail < 1:
             start = self.thresholds[key]
-            excess, highest = (
-                start + (capped - start).clip(0) / self.tail,
-                self._worst(key, highest),
-            )
+            excess = start + (capped - start).clip(0) / self.tail
+            highest = max(start, start + (highest - start) / self.tail)
             yield Statement(f"cvar_{key}", limit, highest, excess)
         else:
             yield Statement(f"mean_{key}", limit, highest, capped)
         if self.most_over < 1:
             yield Statement(f"over_limit_{key}", self.most_over, 1.0, _above(costs, limit), True)
-
-    def _worst(self, key: str, highest: float) -> float:
-        start = self.thresholds[key]
-        return max(start, start + (highest - start) / self.tail)
 
     def bounds(self, costs: Costs, tests: int) -> dict[str, tuple[float, float]]:
         """Every upper confidence bound beside what it has to keep, by name.
