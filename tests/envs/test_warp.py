@@ -14,7 +14,9 @@ from safe_rl.envs import ConfigError, SafetyGymEnv
 from safe_rl.envs.physics.batch import BatchPhysics
 from safe_rl.envs.physics.warp_physics import BufferOverflowError, WarpPhysics
 from safe_rl.envs.safety_gym.building import build_scene
+from safe_rl.envs.safety_gym.robots import ROBOTS
 from safe_rl.envs.safety_gym.suite import resolve
+from safe_rl.envs.velocity import VelocityConfig
 from safe_rl.runs.identity import experiment_of
 
 # kernels are compiled once for all tests, which takes a minute
@@ -210,7 +212,32 @@ def test_a_lack_of_room_is_an_error_that_names_the_key(two):
         physics.step(5)
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("robot", ["Point", "Car", "Doggo"])
+def test_all_names_of_the_suite_step(robot):
+    for name in [f"{robot}{task}{level}" for task in ("Goal", "Button", "Push") for level in "012"]:
+        cpu, warp = pair(name, 2)
+        assert warp.cost_keys == cpu.cost_keys
+        following = warp.rollout(3)["next"]
+        assert following["observation"].isfinite().all(), name
+        assert following["observation"].shape[-1] == cpu.observation_spec["observation"].shape[-1]
+
+
+def test_an_own_robot_between_walls_steps_as_on_the_cpu(tmp_path):
+    robot = tmp_path / "robot.xml"
+    robot.write_text(ROBOTS["point"].read_text())
+    keys = {"robot_base": str(robot), "walls_num": 2, "walls_locations": [[0.0, 1.0], [1.0, 0.0]]}
+    assert largest_difference(*pair(BUSY | keys, 2), 3).median() < 1e-5
+
+
 def test_what_warp_lacks_is_refused(tmp_path):
+    robot = tmp_path / "robot.xml"
+    text = ROBOTS["point"].read_text().replace("<option ", '<option solver="PGS" ', 1)
+    robot.write_text(text)
+    with pytest.raises(ConfigError, match=r"'physics' warp does not take the robot .*PGS"):
+        SafetyGymEnv(BUSY | {"robot_base": str(robot), "physics": "warp"})
+    with pytest.raises(ConfigError, match="has no configuration key 'physics'"):
+        VelocityConfig.from_dict({"robot": "hopper", "physics": "warp"})
     with pytest.raises(ConfigError, match="'physics' warp runs on the devices cpu and cuda"):
         SafetyGymEnv(resolve(BUSY | {"physics": "warp"}), device="meta")
     with pytest.raises(ConfigError, match="'physics' must be one of"):
