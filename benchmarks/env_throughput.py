@@ -11,7 +11,6 @@ one reset of all worlds is spread over the steps of an episode.
 """
 
 import argparse
-import dataclasses
 import itertools
 import json
 import resource
@@ -24,7 +23,7 @@ import safe_rl  # isort: skip  # noqa: F401, before torch, for its settings of t
 import torch
 from omegaconf import OmegaConf
 
-from safe_rl.envs import SUITE, SafetyGymConfig, SafetyGymEnv
+from safe_rl.envs import SUITE, SafetyGymEnv
 from safe_rl.envs.physics.batch import BatchPhysics
 from safe_rl.envs.safety_gym.building import build_scene
 from safe_rl.envs.safety_gym.state import gremlin_path
@@ -36,7 +35,7 @@ COLUMNS = ("env", "num_envs", "threads", "env steps/s", "bare steps/s", "ratio",
 def configuration(name, change):
     """An environment of the suite with some keys changed: "hazards_num=0 vases_num=5"."""
     changes = OmegaConf.to_container(OmegaConf.from_dotlist(change.split()))
-    return SafetyGymConfig.from_dict(dataclasses.asdict(resolve(name)) | changes)
+    return resolve(name).replace(**changes)
 
 
 def time_env(env, tensordict, actions):
