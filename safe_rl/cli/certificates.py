@@ -119,7 +119,7 @@ def why_not_certified(config: DictConfig, episode_length: int, directory: Path) 
     if not steps:
         return None
     return (
-        f"Not certified: the run has {config.frames:,} steps, fewer than the {steps:,} of a short "
+        f"Not certified: frames={config.frames:_} are fewer than the {steps:,} steps of a short "
         f"test (a fifth of certificate.episodes={config.certificate.episodes}). To test it all the "
         f"same: "
         f"python -m safe_rl.evaluate {shlex.quote(str(directory))} certify=true"

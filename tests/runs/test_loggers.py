@@ -40,6 +40,7 @@ def test_mlflow_holds_the_table_and_goes_on_in_the_same_run(tmp_path):
         zip(table["steps"], table["policy_kl"], strict=True)
     )
     assert run.info.status == "FINISHED"
+    assert run.data.params == {"env": "PointMass", "algo": "ppo_lagrangian", "seed": "0"}
 
 
 def test_what_is_not_installed_is_named(tmp_path, monkeypatch):
