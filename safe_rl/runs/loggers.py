@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
+from secrets import token_hex
 from typing import Any
 
 from tensorboard.compat.proto.event_pb2 import Event, SessionLog
@@ -136,9 +137,9 @@ class WandbLogger(TorchRLWandbLogger, ResumableLogger):
     def __init__(
         self, exp_name: Text, project: Text, offline: bool, log_dir: str, **kwargs: Any
     ) -> None:
-        wandb = import_extra("wandb", extra="wandb")
+        import_extra("wandb", extra="wandb")
         path = RunFolder(Path(log_dir)).logger_id("wandb")
-        run_id = path.read_text() if path.exists() else wandb.util.generate_id()
+        run_id = path.read_text() if path.exists() else token_hex(4)
         replace_text(path, run_id)
         super().__init__(
             exp_name, offline=offline, project=project, log_dir=log_dir, id=run_id, **kwargs
