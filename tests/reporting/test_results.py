@@ -9,6 +9,7 @@ import pytest
 from safe_rl.reporting.archive import RUNS as FILE
 from safe_rl.reporting.archive import read_archive
 from safe_rl.reporting.recorded import find_runs
+from safe_rl.scores.measures import joined
 
 RESULTS = Path(__file__).parents[2] / "results"
 PAGE = (RESULTS / "README.md").read_text()
@@ -50,7 +51,9 @@ def test_the_figures_are_those_of_the_tables(run, row):
     for number, said in enumerate(means):
         known = (steps > number * width) & (steps <= (number + 1) * width)
         assert f"{np.nanmean(returns[known]):.1f} / {np.nanmean(costs[known]):.0f}" == said
-    assert f"{np.mean(costs[steps > 1_000_000] > 25):.0%}".replace("%", " %") == above
+    # short epochs are counted together, as many as have 20,000 steps
+    epochs = joined(costs[steps > 1_000_000], max(1, round(20_000 / steps[0])))
+    assert f"{np.mean(epochs > 25):.0%}".replace("%", " %") == above
 
 
 @pytest.mark.parametrize(("run", "row"), QUARTERS)
