@@ -17,6 +17,7 @@ from safe_rl.cli.suggestions import GIVEN_WHOLE
 from safe_rl.cli.trained_run import Run, load
 from safe_rl.cli.user_code import import_modules, note_imports
 from safe_rl.evaluation import Evaluation
+from safe_rl.runs.folder import RunFolder
 
 __all__ = ["Run", "evaluate", "load", "report", "resume", "train"]
 
@@ -81,6 +82,11 @@ def train(
     words = [f"env={env}", f"algo={algo}", *overrides_of(settings, _WHOLE)]
     (config,) = compose_jobs([*search_folders(folders, words), *note_imports(modules or None)])
     folder = None if directory is None else Path(directory).expanduser()
+    if folder is not None and RunFolder(folder).has_begun:
+        raise FileExistsError(
+            f"{folder} already holds a run. Continue it with safe_rl.resume({str(folder)!r}), or "
+            "give this one another directory."
+        )
     return _carry_out(Session.begin(config, folder, program=None, callbacks=callbacks))
 
 

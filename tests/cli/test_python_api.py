@@ -286,7 +286,7 @@ def test_folders_in_the_home_are_found_however_they_are_named(run, tmp_path, mon
     monkeypatch.setenv("HOME", str(tmp_path))
     (tmp_path / "taken").mkdir()
     (tmp_path / "taken" / "progress.csv").touch()
-    with pytest.raises(FileExistsError, match=f"{tmp_path}/taken already holds a run"):
+    with pytest.raises(FileExistsError, match=rf"resume\('{tmp_path}/taken'\)"):
         safe_rl.train("PointGoal0", algo="cpo", frames=40, directory="~/taken", **SMALL)
 
 
