@@ -5,12 +5,13 @@ import pickle
 import pytest
 import torch
 from commands import run_train
-from looking import no_looks
+from looking import CountLooks, no_looks
 from omegaconf import OmegaConf
+from run_configs import compose_config
 
 pytest.importorskip("mujoco_warp")
 
-from safe_rl.envs import ConfigError, SafetyGymEnv
+from safe_rl.envs import ConfigError, SafetyGymEnv, make_env, store_configs
 from safe_rl.envs.physics.batch import BatchPhysics
 from safe_rl.envs.physics.warp_physics import BufferOverflowError, WarpPhysics
 from safe_rl.envs.safety_gym.building import build_scene
@@ -18,6 +19,7 @@ from safe_rl.envs.safety_gym.robots import ROBOTS
 from safe_rl.envs.safety_gym.suite import resolve
 from safe_rl.envs.velocity import VelocityConfig
 from safe_rl.runs.identity import experiment_of
+from safe_rl.training.building import build_trainer, seed_everything
 
 # kernels are compiled once for all tests, which takes a minute
 pytestmark = pytest.mark.long
@@ -130,6 +132,32 @@ def test_a_step_does_not_wait_for_the_device(keys, monkeypatch):
     assert following["observation"].isfinite().all()
     monkeypatch.undo()
     env._physics._late.look()
+
+
+def looks_of_an_epoch(directory, num_steps):
+    """How often one epoch looks at values: a rollout, advantages and costs, and the updates."""
+    store_configs()
+    config = compose_config(
+        *("env=PointGoal1", "algo=ppo_lagrangian", "preset=gpu", "num_envs=4", "logger=none"),
+        *(f"frames={8 * num_steps}", f"frames_per_batch={4 * num_steps}", "num_threads=1"),
+        *("certificate.episodes=0", f"critic_update.minibatch_size={2 * num_steps}"),
+    )
+    seed_everything(config.seed, 1)
+    env = make_env(OmegaConf.to_container(config.env, resolve=True), num_envs=4, num_threads=1)
+    env._physics.waits, env._physics._late.look = True, lambda: None
+    trainer = build_trainer(config, env, directory)
+    batches = trainer.batches()
+    trainer.epoch(batches)
+    with CountLooks() as mode:
+        trainer.epoch(batches)
+    trainer.close()
+    return mode.num_looks
+
+
+def test_an_epoch_waits_for_the_device_in_the_collector_alone_for_every_step(tmp_path):
+    few, many = (looks_of_an_epoch(tmp_path / str(steps), steps) for steps in (8, 24))
+    # TorchRL's collector asks twice after a step whether an episode has ended
+    assert many - few <= 2 * (24 - 8)
 
 
 @pytest.mark.gpu
