@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shlex
 from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import Any
@@ -15,12 +14,9 @@ from safe_rl.evaluation import Certificate, CertificateOptions, certify
 from safe_rl.evaluation.loading import load_config
 from safe_rl.files import CONF
 from safe_rl.naming import did_you_mean
-from safe_rl.runs.folder import RunFolder, lock_folder
+from safe_rl.runs.folder import RunFolder
 
-__all__ = [
-    *("certificate_options", "certify_ended", "certify_run", "is_to_keep_limits"),
-    *("is_worth_a_certificate", "train_on", "why_not_certified"),
-]
+__all__ = ["certificate_options", "certify_run", "is_to_keep_limits", "steps_of_test"]
 
 
 def certify_run(
@@ -47,22 +43,6 @@ def certify_run(
     return certificate
 
 
-def certify_ended(directory: Path, num_threads: int = 0) -> Certificate | None:
-    """:func:`certify_run` at the end of a run; if interrupted, it leaves a note to do it later.
-
-    Args:
-        directory: Folder of the run, into which nobody else writes meanwhile.
-        num_threads: Threads that step environments; 0 is one per core.
-
-    Raises:
-        RunInUseError: If another process writes there.
-    """
-    folder = RunFolder(directory)
-    with lock_folder(folder):
-        folder.certifying.touch()
-        return certify_run(directory, num_threads=num_threads)
-
-
 def certificate_options(
     config: DictConfig, changes: Mapping[str, Any] | None = None
 ) -> CertificateOptions:
@@ -77,24 +57,18 @@ def certificate_options(
         del own["episodes"]
     options |= {name: value for name, value in own.items() if name in options}
     for name, value in (changes or {}).items():
-        _check_change(name, value, options)
+        if name not in options:
+            raise ValueError(
+                f"There is no certificate.{name}.{did_you_mean(name, options)} There are: "
+                f"{', '.join(options)}."
+            )
+        KEYS[f"certificate.{name}"].check(f"certificate.{name}", value)
+        if name == "episodes" and not value:
+            raise ValueError("certificate.episodes=0: it must be at least 1 to test anything.")
     options |= changes or {}
     risk = config.get("risk") or {}
     share = min(options["most_over"], risk.get("most_over", 1.0))
     return CertificateOptions(**options | {"most_over": share}, tail=risk.get("tail", 1.0))
-
-
-def _check_change(name: str, value: Any, known: Collection[str]) -> None:
-    if name not in known:
-        raise ValueError(
-            f"There is no certificate.{name}.{did_you_mean(name, known)} There are: "
-            f"{', '.join(known)}."
-        )
-    values = KEYS[f"certificate.{name}"].values
-    if not values.hold(value):
-        raise ValueError(f"certificate.{name}={value}: it must be {values.words}.")
-    if name == "episodes" and not value:
-        raise ValueError("certificate.episodes=0: it must be at least 1 to test anything.")
 
 
 def is_to_keep_limits(config: DictConfig, cost_keys: Collection[str]) -> bool:
@@ -108,29 +82,6 @@ def is_to_keep_limits(config: DictConfig, cost_keys: Collection[str]) -> bool:
     return bool(cost_keys) or any("budgets" in transform for transform in transforms)
 
 
-def is_worth_a_certificate(config: DictConfig, episode_length: int) -> bool:
-    """Whether a run is longer than a short test by which it would be certified."""
-    return 0 < _test_steps(config, episode_length) <= config.frames
-
-
-def why_not_certified(config: DictConfig, episode_length: int, directory: Path) -> str | None:
-    """What a run says that is too short for a certificate; None if it was to have none."""
-    steps = _test_steps(config, episode_length)
-    if not steps:
-        return None
-    return (
-        f"Not certified: frames={config.frames:_} are fewer than the {steps:,} steps of a short "
-        f"test (a fifth of certificate.episodes={config.certificate.episodes}). To test it all the "
-        f"same: "
-        f"python -m safe_rl.evaluate {shlex.quote(str(directory))} certify=true"
-    )
-
-
-def train_on(config: DictConfig, directory: Path) -> str:
-    """Arguments that continue a run whose policies are not safe enough yet."""
-    return f"resume={shlex.quote(str(directory))} frames={2 * config.frames:_}"
-
-
-def _test_steps(config: DictConfig, episode_length: int) -> int:
+def steps_of_test(config: DictConfig, episode_length: int) -> int:
     """Steps of a test that ends early, after a fifth of its episodes; 0 if there is to be none."""
     return int(config.certificate.episodes * episode_length / 5) if "certificate" in config else 0

@@ -50,7 +50,7 @@ def evaluate_run(
 
 
 def carry_out(
-    directory: Path, options: EvaluationOptions, modules: Sequence[str] | None = None
+    directory: str | Path, options: EvaluationOptions, modules: Sequence[str] | None = None
 ) -> int:
     """Evaluate, certify or vary a run, and print what was found.
 
@@ -67,34 +67,32 @@ def carry_out(
         check_imports(load_config(directory), modules, directory)
         import_modules(modules or ())
         if options.certify:
-            _refuse_beside_certify(options)
-            certificate = certify_run(
-                directory, num_threads=options.num_threads, changes=options.certificate
-            )
-            print(certificate or "Nothing to certify: the run has no limits, or no checkpoints.")
-            return 0 if certificate is not None and certificate.checkpoint is not None else 1
+            return _certify(directory, options)
         if options.variations is not None:
             found, picture = evaluate_varied(directory, options, progress=True)
             print(_table_of(found), f"wrote {found.file}", f"wrote {picture}", sep="\n")
-            return 0
-        result = evaluate_run(directory, options, progress=True)
+        else:
+            print(evaluate_run(directory, options, progress=True))
     except _ERRORS as error:
         print(f"error: {error}", file=sys.stderr)
         return 1
-    print(result)
     return 0
 
 
-def _refuse_beside_certify(options: EvaluationOptions) -> None:
-    """A certificate is of the run's own problem: what else is asked for would have no effect."""
-    used = ("certify", "certificate", "num_threads")
-    plain = EvaluationOptions()
-    for field in fields(options):
-        if field.name not in used and getattr(options, field.name) != getattr(plain, field.name):
+def _certify(directory: Path, options: EvaluationOptions) -> int:
+    """Certify a run's own problem, to which other options would make no difference."""
+    own, plain = ("certify", "certificate", "num_threads"), EvaluationOptions()
+    for name in (field.name for field in fields(options) if field.name not in own):
+        if getattr(options, name) != getattr(plain, name):
             raise CommandLineError(
-                f"{field.name}: it is ignored by certify=true. A certificate is of the run's own "
+                f"{name}: it is ignored by certify=true. A certificate is of the run's own "
                 "environment, and takes certificate.episodes=… and the like, and num_threads=…"
             )
+    certificate = certify_run(
+        directory, num_threads=options.num_threads, changes=options.certificate
+    )
+    print(certificate or "Nothing to certify: the run has no limits, or no checkpoints.")
+    return 0 if certificate is not None and certificate.checkpoint is not None else 1
 
 
 def evaluate_varied(

@@ -8,10 +8,11 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Iterator, Mapping, Sequence
+import sys
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import MISSING, fields
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar, get_type_hints
+from typing import TYPE_CHECKING, Any, TypeVar, cast, get_type_hints
 
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Override
@@ -19,17 +20,20 @@ from hydra.errors import HydraException
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
+from safe_rl.cli import say_interruptions
 from safe_rl.naming import did_you_mean
 
 __all__ = [
-    *("CommandLineError", "overrides_of", "parse", "parse_options", "quote", "take_options"),
-    *("take_word", "usage"),
+    *("IMPORT", "CommandLineError", "overrides_of", "parse", "parse_options", "quote"),
+    *("run_command", "split_imports", "take_options", "take_word", "usage"),
 ]
 
 if TYPE_CHECKING:
     from _typeshed import DataclassInstance
 
 Schema = TypeVar("Schema", bound="DataclassInstance")
+IMPORT = "import"
+"""The word that names modules of the user's."""
 
 
 class CommandLineError(ValueError):
@@ -83,6 +87,31 @@ def quote(text: str) -> str:
     """
     # backslashes are doubled before a quote only
     return "'" + re.sub(r"(\\*)('|$)", lambda m: m[1] * 2 + ("\\'" if m[2] else ""), text) + "'"
+
+
+def split_imports(arguments: Sequence[str]) -> tuple[list[str] | None, list[str]]:
+    """Take ``import=`` out of a command line.
+
+    Args:
+        arguments: Arguments of a command; ``import=`` may be repeated, or hold a list.
+
+    Returns:
+        The modules, None if ``import=`` is not given; and the other arguments.
+
+    Raises:
+        CommandLineError: If a list cannot be read.
+
+    Examples:
+        >>> split_imports(["import=mine", "seed=1", "import=[examples/other.py]"])
+        (['mine', 'examples/other.py'], ['seed=1'])
+    """
+    given = [argument for argument in arguments if argument.lstrip("+").startswith(f"{IMPORT}=")]
+    others = [argument for argument in arguments if argument not in given]
+    modules: list[str] = []
+    for argument in given:
+        text = argument.partition("=")[2]
+        modules += cast(list[str], parse(argument).value()) if text.startswith("[") else [text]
+    return (list(dict.fromkeys(modules)) if given else None), others
 
 
 def overrides_of(
@@ -227,8 +256,7 @@ def _check_kinds(given: DictConfig, schema: type[DataclassInstance]) -> None:
                 f"{field.name}={value}: it takes keys with values, {field.name}.KEY=VALUE: "
                 f"{field.metadata['help']}."
             )
-        is_number = isinstance(value, int | float) and not isinstance(value, bool)
-        if isinstance(field.default, bool) and is_number:
+        if isinstance(field.default, bool) and not isinstance(value, bool | str | None):
             raise CommandLineError(f"{field.name}={value}: it must be true or false.")
 
 
@@ -241,3 +269,36 @@ def usage(command: str, schema: type[DataclassInstance]) -> str:
         lines.append(f"  {shown:<24} {field.metadata['help']}")
     lines.append(f"  {'import=…':<24} a module or file of yours to import before; may be repeated")
     return "\n".join(lines)
+
+
+def run_command(
+    carry_out: Callable[[list[str], Schema, list[str] | None], int],
+    arguments: Sequence[str] | None,
+    command: str,
+    schema: type[Schema],
+) -> int:
+    """Read the words of a command, show its help or carry it out; returns its exit status.
+
+    Args:
+        carry_out: Takes what stands first, the options, and the modules of ``import=``, None if
+            there are none; returns the exit status.
+        arguments: The words; None: those of the process.
+        command: How it is called: the program, then in capitals what stands first.
+        schema: Dataclass of its options.
+    """
+    say_interruptions()
+    words = sys.argv[1:] if arguments is None else list(arguments)
+    places = [word for word in command.split() if word[0].isupper()]
+    is_help = words[:1] in (["-h"], ["--help"])
+    if is_help or len(words) < len(places):
+        print(usage(command, schema))
+        return 0 if is_help else 2
+    try:
+        modules, words = split_imports(words)
+        if len(words) < len(places):
+            raise CommandLineError(f"{' and '.join(places)} comes first: {command} [option=…].")
+        options = parse_options(words[len(places) :], schema)
+        return carry_out(words[: len(places)], options, modules)
+    except (ValueError, OSError, ModuleNotFoundError) as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 1

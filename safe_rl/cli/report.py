@@ -7,9 +7,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from safe_rl.cli import say_interruptions
-from safe_rl.cli.grammar import CommandLineError, parse_options, usage
-from safe_rl.cli.user_code import import_modules, split_imports
+from safe_rl.cli.grammar import run_command
+from safe_rl.cli.user_code import import_modules
 from safe_rl.envs.families import config_node
 from safe_rl.envs.safety_gym.suite import SUITE, resolve
 from safe_rl.evaluation.settings import option
@@ -21,7 +20,6 @@ from safe_rl.scores.benchmark import SEEDS, Suite
 
 __all__ = ["ReportOptions", "main", "report", "suite"]
 
-COMMAND = "python -m safe_rl.report"
 FORMATS = ("png", "svg", "pdf")
 
 
@@ -98,32 +96,18 @@ def report(root: Path, options: ReportOptions) -> tuple[Report, Path]:
     return result, write_report(result, out, options.title or root.resolve().name, formats)
 
 
-def main(arguments: Sequence[str] | None = None, program: str = COMMAND) -> int:
+def main(arguments: Sequence[str] | None = None, program: str = "python -m safe_rl.report") -> int:
     """The command; returns its exit status."""
-    say_interruptions()
-    arguments = sys.argv[1:] if arguments is None else list(arguments)
-    if not arguments or arguments[0] in ("-h", "--help"):
-        print(usage(f"{program} RUNS_DIR", ReportOptions))
-        return 0 if arguments else 2
-    try:
-        modules, arguments = split_imports(arguments)
-        if not arguments:
-            raise CommandLineError(f"{program} takes a folder of runs first.")
-        for other in (argument for argument in arguments[1:] if "=" not in argument):
-            raise CommandLineError(
-                f"'{other}': a report is of one folder and all runs below it. Name a folder above "
-                "them, or copy them into one; options are written key=value."
-            )
-        import_modules(modules or ())
-        options = parse_options(arguments[1:], ReportOptions)
-        root = Path(arguments[0])
-        result, page = report(root, options)
-        if options.archive is not None:
-            archive_runs(result.runs, root, Path(options.archive))
-            print(f"kept {len(result.runs)} runs in {options.archive}")
-    except (OSError, ModuleNotFoundError, ValueError) as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 1
+    return run_command(_carry_out, arguments, f"{program} RUNS_DIR", ReportOptions)
+
+
+def _carry_out(first: list[str], options: ReportOptions, modules: list[str] | None) -> int:
+    import_modules(modules or ())
+    root = Path(first[0])
+    result, page = report(root, options)
+    if options.archive is not None:
+        archive_runs(result.runs, root, Path(options.archive))
+        print(f"kept {len(result.runs)} runs in {options.archive}")
     for path, reason in result.skipped.items():
         print(f"left out {clean(path)}: {reason}", file=sys.stderr)
     for name, (plan, *_) in result.campaigns.items():

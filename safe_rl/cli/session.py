@@ -9,6 +9,7 @@ import sys
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
+from shlex import quote
 from signal import SIGINT, Signals
 from typing import Any, cast
 
@@ -17,13 +18,7 @@ from omegaconf import DictConfig, OmegaConf, open_dict
 from omegaconf.errors import OmegaConfBaseException
 from torchrl.checkpoint import CheckpointError
 
-from safe_rl.cli.certificates import (
-    certify_ended,
-    is_to_keep_limits,
-    is_worth_a_certificate,
-    train_on,
-    why_not_certified,
-)
+from safe_rl.cli.certificates import certify_run, is_to_keep_limits, steps_of_test
 from safe_rl.cli.composing import resolving
 from safe_rl.cli.run_folders import (
     keep_robot,
@@ -256,23 +251,33 @@ class Session:
                 OmegaConf.save(content, unfinished)
 
     def _certify_if_long(self, episode_length: int) -> None:
-        directory = self.folder.directory
-        if is_worth_a_certificate(self.config, episode_length):
+        config, steps = self.config, steps_of_test(self.config, episode_length)
+        if 0 < steps <= config.frames:
             self._certify()
-        elif reason := why_not_certified(self.config, episode_length, directory):
-            self._say(reason)
+        elif steps:
+            self._say(
+                f"Not certified: frames={config.frames:_} are fewer than the {steps:,} steps of a "
+                f"short test (a fifth of certificate.episodes={config.certificate.episodes}). To "
+                "test it all the same: python -m safe_rl.evaluate "
+                f"{quote(str(self.folder.directory))} certify=true"
+            )
 
     def _certify(self) -> None:
-        directory = self.folder.directory
+        """Certify the run; if that is interrupted, a note stays, by which it is done later."""
+        folder = self.folder
         try:
-            certificate = certify_ended(directory, self.config.num_threads or 0)
+            with lock_folder(folder):
+                folder.certifying.touch()
+                threads = self.config.num_threads or 0
+                certificate = certify_run(folder.directory, num_threads=threads)
         except KeyboardInterrupt:
             self._say(f"Interrupted before it was certified. To do so: {self._again}")
             self.interrupted_by = SIGINT
             return
         self._say(str(certificate))
         if certificate is not None and certificate.checkpoint is None:
-            self._say(f"To train on: {self._program} {train_on(self.config, directory)}")
+            more = f"{folder.resuming} frames={2 * self.config.frames:_}"
+            self._say(f"To train on: {self._program} {more}")
 
 
 def run_job(config: DictConfig) -> float:

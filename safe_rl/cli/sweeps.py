@@ -15,11 +15,11 @@ from pathlib import Path
 from threading import Event, Thread
 from typing import Any
 
-from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.utils import JobReturn, JobStatus
 from hydra.experimental.callback import Callback
 from omegaconf import DictConfig
 
+from safe_rl.cli.grammar import parse
 from safe_rl.cli.user_code import import_modules, imported
 from safe_rl.files import read_config, replace_text
 from safe_rl.processes import end_with_parent
@@ -42,12 +42,8 @@ def count_jobs(overrides: Sequence[str]) -> int:
         >>> count_jobs(["env=PointGoal1,CarGoal1", "seed=0,10,20", "algo=cpo"])
         6
     """
-    parsed = OverridesParser.create().parse_overrides(list(overrides))
-    return math.prod(
-        len(list(override.sweep_string_iterator()))
-        for override in parsed
-        if override.is_discrete_sweep()
-    )
+    swept = (override for override in map(parse, overrides) if override.is_discrete_sweep())
+    return math.prod(len(list(override.sweep_string_iterator())) for override in swept)
 
 
 def threads_per_job(num_jobs: int, num_workers: int, num_cores: int) -> int:
@@ -155,19 +151,19 @@ class SweepReport(Callback):
         if self._display is not None:
             self._display.stop()
             self._display = None
-        last = _last_notes(self._journal)
-        done = [note for note in last.values() if note["event"] == "done"]
-        print(f"Sweep: {len(done)} of {self._num_jobs} runs are finished.")
-        for note in last.values():
+        last = _last_notes(self._journal).values()
+        num_done = sum(note["event"] == "done" for note in last)
+        print(f"Sweep: {num_done} of {self._num_jobs} runs are finished.")
+        for note in last:
             if note["event"] == "failed":
                 file = RunFolder(Path(note["directory"])).failure
                 hint = f" (see {file.name} there)" if file.exists() else ""
                 print(f"  failed: {note['directory']}: {note['error']}{hint}")
             if note["event"] == "begun":
                 print(f"  interrupted: {note['directory']}")
-        if len(done) < self._num_jobs:
+        if num_done < self._num_jobs:
             print("Start it again as it was: finished runs are skipped, the others continue.")
-        return len(done) < self._num_jobs
+        return num_done < self._num_jobs
 
 
 def _journal_path(sweep_directory: Path) -> Path:
@@ -208,7 +204,7 @@ def _last_notes(journal: Path) -> dict[int, Mapping[str, str]]:
 
 
 class _Display:
-    """Prints every minute how far each run at hand is, beside what this process does."""
+    """Prints every minute how far each unfinished run is, in a thread of its own."""
 
     def __init__(self, journal: Path, seconds: float = 60.0) -> None:
         self._journal, self._seconds, self._end = journal, seconds, Event()

@@ -26,8 +26,8 @@ from safe_rl.cli.composing import (
     resolving,
     search_folders,
 )
-from safe_rl.cli.grammar import CommandLineError, take_word
-from safe_rl.cli.user_code import import_modules, note_imports, split_imports
+from safe_rl.cli.grammar import CommandLineError, split_imports, take_word
+from safe_rl.cli.user_code import import_modules, note_imports
 from safe_rl.envs import store_configs
 from safe_rl.naming import did_you_mean
 from safe_rl.scores.benchmark import SLATES

@@ -19,7 +19,7 @@ from safe_rl.cli.certificates import certify_run
 from safe_rl.cli.evaluating import evaluate_run, evaluate_varied
 from safe_rl.cli.grammar import take_options
 from safe_rl.cli.run_folders import maker_of
-from safe_rl.cli.user_code import check_imports, import_modules, several
+from safe_rl.cli.user_code import check_imports, import_modules
 from safe_rl.evaluation import Certificate, Evaluation, EvaluationOptions
 from safe_rl.evaluation.episodes import default_seed
 from safe_rl.evaluation.loading import (
@@ -224,7 +224,7 @@ def load(
         torch.Size([1, 2])
     """
     run = Run(find_run(directory), checkpoint)
-    check_imports(run.config, imports if imports is None else several(imports), run.directory)
+    check_imports(run.config, imports, run.directory)
     import_modules(imports or ())
     find_checkpoint(run.directory, checkpoint)
     return run

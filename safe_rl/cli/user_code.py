@@ -12,50 +12,21 @@ import traceback
 from collections.abc import Callable, Mapping, Sequence
 from importlib import import_module
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 from safe_rl import targets
-from safe_rl.cli.grammar import CommandLineError, parse, quote
+from safe_rl.cli.grammar import IMPORT as KEY
+from safe_rl.cli.grammar import CommandLineError, quote
 
 __all__ = [
-    "KEY",
     "check_imports",
     "import_modules",
     "imported",
     "make_after_imports",
     "note_imports",
-    "several",
-    "split_imports",
 ]
 
-KEY = "import"
-_KEYS = tuple(f"{prefix}{KEY}=" for prefix in ("", "+", "++"))
 _imported: list[str] = []
-
-
-def split_imports(arguments: Sequence[str]) -> tuple[list[str] | None, list[str]]:
-    """Take ``import=`` out of a command line.
-
-    Args:
-        arguments: Arguments of a command; ``import=`` may be repeated, or hold a list.
-
-    Returns:
-        The modules, None if ``import=`` is not given; and the other arguments.
-
-    Raises:
-        CommandLineError: If a list cannot be read.
-
-    Examples:
-        >>> split_imports(["import=mine", "seed=1", "import=[examples/other.py]"])
-        (['mine', 'examples/other.py'], ['seed=1'])
-    """
-    given = [argument for argument in arguments if argument.startswith(_KEYS)]
-    others = [argument for argument in arguments if argument not in given]
-    modules: list[str] = []
-    for argument in given:
-        text = argument.partition("=")[2]
-        modules += cast(list[str], parse(argument).value()) if text.startswith("[") else [text]
-    return (list(dict.fromkeys(modules)) if given else None), others
 
 
 def note_imports(modules: Sequence[str] | None) -> list[str]:
@@ -80,7 +51,7 @@ def import_modules(modules: str | Sequence[str]) -> list[str]:
     Raises:
         CommandLineError: If one does not exist, cannot be imported, or is hidden by another.
     """
-    modules = several(modules)
+    modules = [modules] if isinstance(modules, str) else list(modules)
     for module in modules:
         if not module.strip(". /"):
             raise CommandLineError(f"{KEY}={module}: name a module, or a file by its path.")
@@ -104,16 +75,6 @@ def import_modules(modules: str | Sequence[str]) -> list[str]:
         if where not in _imported:
             _imported.append(where)
     return modules
-
-
-def several(given: str | Sequence[str]) -> list[str]:
-    """A list of what may be given as one text or as several.
-
-    Examples:
-        >>> several("losses.py"), several(("losses.py", "my.envs")), several(())
-        (['losses.py'], ['losses.py', 'my.envs'], [])
-    """
-    return [given] if isinstance(given, str) else list(given)
 
 
 def imported() -> list[str]:
@@ -143,7 +104,7 @@ def make_after_imports(modules: Sequence[str], make: Callable[..., Any], **optio
     return make(**options)
 
 
-def check_imports(config: Mapping[Any, Any], given: Sequence[str] | None, run: Path) -> None:
+def check_imports(config: Mapping[Any, Any], given: str | Sequence[str] | None, run: Path) -> None:
     """Refuse to open a run that has used modules of its user's, unless ``import=`` is given.
 
     Args:

@@ -6,7 +6,6 @@ import sys
 import pytest
 import torch
 from hydra.core.config_store import ConfigStore
-from hydra.errors import HydraException
 from omegaconf import OmegaConf
 from point_mass import PointMass
 from run_configs import CONF, compose_config
@@ -105,8 +104,6 @@ def test_hydra_makes_no_node_that_nobody_asked_for(monkeypatch, capsys):
 def test_overrides_reach_the_environment():
     config = compose_config("env=PointGoal1", "env.hazards_num=3")
     assert make_env(OmegaConf.to_container(config.env), num_envs=1).config.hazards_num == 3
-    with pytest.raises(HydraException, match="hazard_num"):
-        compose_config("env=PointGoal1", "env.hazard_num=3")
 
 
 def test_learning_rates_are_given_by_the_names_of_parameters():
@@ -280,21 +277,6 @@ def test_cost_limits_on_the_command_line_replace_the_default():
     assert compose_config().cost_limits == {"cost": 25.0}
     config = compose_config("cost_limits={cost_hazards: 10, cost_vases_contact: 5}")
     assert config.cost_limits == {"cost_hazards": 10, "cost_vases_contact": 5}
-
-
-@pytest.mark.parametrize(
-    ("overrides", "message"),
-    [
-        (["algo=ppo_lagrangien"], "ppo_lagrangian"),
-        (["env=PointGoal3"], "PointGoal2"),
-        (["preset=papers"], "paper"),
-        (["algo=ppo", "lagrangian=adam"], "lagrangian"),
-        (["fames=10"], "fames"),
-    ],
-)
-def test_unknown_names_are_errors_that_list_the_known_ones(overrides, message):
-    with pytest.raises(HydraException, match=message):
-        compose_config(*overrides)
 
 
 def test_cost_limits_must_name_costs_of_the_environment():

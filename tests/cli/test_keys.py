@@ -138,6 +138,15 @@ def test_no_value_ends_in_a_traceback(configs):
 @pytest.mark.parametrize(
     ("path", "value", "words"),
     [
+        ("frames", "abc", "frames=abc: it must be a whole number from 1 to "),
+        ("frames", 0, "frames=0"),
+        ("frames", 1.5, "frames=1.5"),
+        ("seed", -1, "seed=-1: it must be a whole number from 0"),
+        ("seed", True, "seed=true"),
+        ("checkpoint.interval", "abc", "checkpoint.interval=abc: it must be a number from 0"),
+        ("checkpoint.keep_last", 0, "checkpoint.keep_last=0"),
+        ("model.hidden_sizes", 64, "model.hidden_sizes=64: it must be a list"),
+        ("cost_limits", 25, "cost_limits=25: it must be a mapping"),
         ("advantage.gamma", 2, "advantage.gamma=2: it must be a number from 0 to 1 (discount"),
         ("advantage.lmbda", 1.5, "advantage.lmbda=1.5: it must be a number from 0 to 1"),
         (

@@ -246,12 +246,14 @@ def test_a_run_is_certified_and_what_is_no_evaluation_refused(run):
 
 def test_a_certificate_takes_the_threads_of_its_run(run, monkeypatch):
     given = []
-    monkeypatch.setattr("safe_rl.cli.session.certify_ended", lambda *said: given.append(said))
+    monkeypatch.setattr(
+        "safe_rl.cli.session.certify_run", lambda *said, **options: given.append((*said, options))
+    )
     note = run.directory / ".certifying"
     note.touch()
     safe_rl.resume(run.directory)
     note.unlink()
-    assert given == [(run.directory, 1)]
+    assert given == [(run.directory, {"num_threads": 1})]
 
 
 def test_an_interrupted_run_says_how_to_go_on(tmp_path, monkeypatch, capsys):

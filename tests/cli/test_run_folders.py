@@ -67,6 +67,10 @@ def test_a_refused_run_changes_nothing_of_the_one_that_is_there(tmp_path):
     assert "cannot change" in elsewhere.stderr
     after = {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
     assert after == before
-    # one that could not begin leaves no folder
+    # those that could not begin leave no folder
+    crowded = train(*TINY, f"hydra.run.dir={tmp_path / 'new'}", "env.hazards_num=200")
+    assert "attempts: most often 'hazard" in crowded.stderr
+    assert "('hazards_num' is 200)" in crowded.stderr
+    assert len(crowded.stderr.strip().splitlines()) == 1
     assert train(*TINY, f"hydra.run.dir={tmp_path / 'new'}", "frames=-1").returncode == 1
     assert [path.name for path in tmp_path.iterdir()] == ["run"]

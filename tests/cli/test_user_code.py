@@ -11,9 +11,9 @@ from run_configs import point_mass_config
 from safe_rl import targets
 from safe_rl.cli import user_code
 from safe_rl.cli.composing import compose_resumed
-from safe_rl.cli.grammar import CommandLineError
+from safe_rl.cli.grammar import CommandLineError, split_imports
 from safe_rl.cli.session import SETTING_ERRORS
-from safe_rl.cli.user_code import check_imports, import_modules, note_imports, split_imports
+from safe_rl.cli.user_code import check_imports, import_modules, note_imports
 from safe_rl.envs import make_env
 from safe_rl.runs.record import RunRecord
 from safe_rl.training.building import build_trainer

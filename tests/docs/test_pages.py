@@ -19,10 +19,9 @@ from safe_rl import targets
 from safe_rl.cli import user_code
 from safe_rl.cli.evaluating import read_variations
 from safe_rl.cli.export import ExportOptions
-from safe_rl.cli.grammar import parse_options
+from safe_rl.cli.grammar import parse_options, split_imports
 from safe_rl.cli.report import ReportOptions
 from safe_rl.cli.train import read_command
-from safe_rl.cli.user_code import split_imports
 from safe_rl.evaluation import EvaluationOptions
 from safe_rl.evaluation.settings import check_options
 

@@ -100,10 +100,10 @@ def test_a_run_that_others_may_only_read_is_evaluated_as_a_copy(run, capsys, mon
     assert f"{run} is read-only. A run's evaluations lie in its folder: evaluate a copy" in error
 
 
-@pytest.mark.parametrize(("command", "what"), [(main, "a run"), (report_main, "runs")])
+@pytest.mark.parametrize(("command", "what"), [(main, "RUN_DIR"), (report_main, "RUNS_DIR")])
 def test_a_command_without_a_folder_asks_for_it(command, what, capsys):
     assert command(["import=json"]) == 1
-    assert f"{what} first." in capsys.readouterr().err
+    assert f"error: {what} comes first" in capsys.readouterr().err
 
 
 def test_an_environment_that_breaks_its_contract_ends_in_one_line(run, capsys, monkeypatch):
