@@ -147,7 +147,8 @@ FLOORS = {
         ("",),
     ),
     "cli": (
-        ("", "grammar"),
+        ("",),
+        ("grammar",),
         ("run_folders", "user_code"),
         ("schema", "sweeps"),
         ("suggestions",),
