@@ -210,11 +210,8 @@ class WarpPhysics(Physics):
                 *(self._model, self._data, wp.from_torch(start, dtype=wp.vec3)),
                 wp.from_torch(directions.to(self.dtype).contiguous(), dtype=wp.vec3),
                 *(mjw._src.types.vec6(*seen), True, wp.from_torch(excluded)),
-                *(
-                    wp.from_torch(distance),
-                    wp.from_torch(hit),
-                    wp.from_torch(normal, dtype=wp.vec3),
-                ),
+                *(wp.from_torch(distance), wp.from_torch(hit)),
+                wp.from_torch(normal, dtype=wp.vec3),
             )
         return distance
 
@@ -320,9 +317,8 @@ class WarpPhysics(Physics):
 
 def _align_capsules(model: Any, data: Any) -> None:
     """Give contacts of capsules on planes the frames that MuJoCo gives them."""
-    contact = data.contact
-    inputs = [data.nacon, model.geom_type, contact.geom, contact.worldid, data.geom_xmat]
-    wp.launch(align_capsules, data.naconmax, inputs, [contact.frame])
+    inputs = [data.nacon, model.geom_type, data.contact.geom, data.contact.worldid, data.geom_xmat]
+    wp.launch(align_capsules, data.naconmax, inputs, [data.contact.frame])
 
 
 class _LateChecks:
