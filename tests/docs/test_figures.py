@@ -277,17 +277,3 @@ def test_what_each_part_contributes():
             mean, above = costs.mean().mean(), costs.agg(lambda c: (c > 25).mean()).mean()
             ends = ", ".join(ends_of_seeds(runs, lambda steps: steps > 2e6))
             assert told == [ends, f"{mean:.1f}, {percent(above)}"]
-
-
-def test_halves_of_three_million():
-    """Return / cost by half million steps, and what is above the limit, of every run."""
-    text = (RESULTS / "README.md").read_text().partition("## holding_the_limit")[2]
-    table = text.partition("<!-- table: halves -->\n")[2].partition("\n\n")[0]
-    shown = [line.strip("| ").split(" | ") for line in table.splitlines()[2:]]
-    assert {name.strip("`") for name, *_ in shown} == set(campaign("holding_the_limit"))
-    for name, *cells in shown:
-        epochs = pandas.DataFrame(campaign("holding_the_limit")[name.strip("`")].table)
-        halves = epochs.groupby(np.ceil(epochs.steps / 5e5))[["episode_return", "episode_cost"]]
-        expected = ["{:.1f} / {:.0f}".format(*row) for row in halves.mean().to_numpy()]
-        stretches = epochs.groupby(np.ceil(epochs.steps / 2e4)).episode_cost.mean()
-        assert cells[:7] == [*expected, percent((stretches.loc[51:] > 25).mean())], name
