@@ -15,9 +15,9 @@ import tempfile
 import time
 from pathlib import Path
 
+import safe_rl  # isort: skip  # noqa: F401, before torch, for its settings of threads
 import torch
 
-import safe_rl  # noqa: F401  # before torch, so that idle threads sleep
 from safe_rl.envs import SafetyGymEnv
 from safe_rl.envs.safety_gym.suite import resolve
 
