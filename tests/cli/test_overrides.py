@@ -128,7 +128,7 @@ UNREAD = {
     "+cost_advantage.gamma=0.9": "does not read 'cost_advantage'",
     "+then.again.loss._target_=safe_rl.objectives.PPOLoss": "'then'. It has one update",
     "model.head=tanh": "'model.head'. The distribution of its actions is the algorithm's own",
-    "model.initial_log_std=-1": "Its network tells the standard deviation",
+    "model.initial_log_std=-1": "Its network gives the standard deviation",
 }
 
 
