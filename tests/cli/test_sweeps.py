@@ -11,6 +11,7 @@ import pytest
 from filelock import SoftFileLease
 from hydra.core.utils import JobReturn, JobStatus
 from omegaconf import OmegaConf
+from registrations import undone
 
 from safe_rl.cli.composing import resolving
 from safe_rl.cli.sweeps import SweepReport, count_jobs, threads_per_job
@@ -118,7 +119,8 @@ def test_single_runs_are_left_alone(tmp_path):
 )
 def test_folders_of_a_sweep_name_what_a_person_overrode(words, between):
     env = [] if any(word.startswith("slate=") for word in words) else ["env=PointGoal1"]
-    config = read_command(["-m", *env, "algo=cpo,ppo", "seed=0,1", *words]).configs[0]
+    with undone():  # of the example's rows
+        config = read_command(["-m", *env, "algo=cpo,ppo", "seed=0,1", *words]).configs[0]
     with resolving(config):
         folder = Path(config.hydra.sweep.subdir)
     assert folder == Path("PointGoal1") / "cpo" / between / "seed0"
