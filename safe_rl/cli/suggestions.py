@@ -6,6 +6,7 @@ import re
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
+from hydra.core.global_hydra import GlobalHydra
 from hydra.errors import MissingConfigException
 from omegaconf import OmegaConf
 
@@ -80,7 +81,9 @@ def explain(error: Exception, texts: Sequence[str]) -> str:
         group, _, name = error.missing_cfg_file.rpartition("/")
         pattern = rf"\+?{group}(@[\w.]+)?=.*{re.escape(name)}"
         given = next((f"'{text}'" for text in texts if re.match(pattern, text)), f"{file}.yaml")
-        return f"{given}: {_no_choice(group, name, error.options or ())}"
+        # for a list of choices, such as transforms=[…], Hydra's error has no options
+        known = error.options or GlobalHydra.instance().config_loader().get_group_options(group)
+        return f"{given}: {_no_choice(group, name, known)}"
     return f"{file}.yaml: {said}" if words.startswith("In '") else words
 
 

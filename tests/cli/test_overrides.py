@@ -71,6 +71,7 @@ WRONG = {
     "note=x": r"Did you mean '\+note'\?$",
     "algo=CPO": r"no algo 'CPO'\. Did you mean 'cpo'",
     "algo=PPOLag": r"Did you mean 'ppo_lagrangian'",
+    "transforms=[saut]": r"there is no transforms 'saut'\. Did you mean 'saute'\?$",
     "--algo=cpo": r"'--algo=cpo': there is no such flag\. .* without dashes, algo=cpo",
     'cost_limits={"cost": 3}': r"cannot be read.*have no quotes: '\{cost: 10\}'\.$",
     # what another choice would read

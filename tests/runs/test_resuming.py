@@ -161,12 +161,17 @@ def test_a_run_whose_checkpoints_are_gone_is_left_as_it_is(tmp_path, missing):
     assert {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()} == before
 
 
-def test_a_run_continued_with_what_cannot_train_keeps_its_configuration(tmp_path):
+def test_a_run_continued_with_what_cannot_train_keeps_its_configuration(tmp_path, monkeypatch):
     point_mass_trainer(tmp_path, "frames=640").run()
     before = (tmp_path / "config.yaml").read_text()
-    broken = point_mass_trainer(tmp_path, "frames=960", "policy_update.max_kl=abc")
+    broken = point_mass_trainer(tmp_path, "frames=960")
     broken.resume()
-    with pytest.raises(TypeError):
+
+    def diverge(batch, episodes):
+        raise FloatingPointError("not finite")
+
+    monkeypatch.setattr(broken.algorithm, "learn", diverge)
+    with pytest.raises(FloatingPointError):
         broken.run()
     assert (tmp_path / "config.yaml").read_text() == before
     whole = point_mass_trainer(tmp_path, "frames=960")
