@@ -144,20 +144,35 @@ def test_quarters_of_harder_tasks():
         assert cells.split(" | ") == [*quarters, certificate(folder)]
 
 
+# campaign of exploration -> steps of the environment per logged step: one counted decisions
+TRIED = {"hard_tasks": 4, "held_actions": 1}
+
+
 def test_quarters_of_what_was_tried_on_hard_tasks():
     page = (ROOT / "docs" / "algorithms" / "hard_tasks.md").read_text()
-    rows = re.findall(r"^\| .+ \| `([\w.]+)` \| ((?:[^|]+ / [^|]+ \|)+)", page, re.MULTILINE)
-    assert len(rows) == len(campaign("hard_tasks"))
-    for name, cells in rows:
-        (steps, returns, costs), _ = figures(
-            RESULTS / "hard_tasks/PointGoal2/sac_lagrangian" / name / "seed110"
-        )
-        quarters = (4 * steps - 1) // 250_000  # its steps are decisions of four
-        told = [
+    rows = re.findall(r"^\| (?:.+ \| )?`([\w.]+)` \| ((?:[^|]+ / [^|]+ \|)+)", page, re.MULTILINE)
+    runs = [(name, path) for name in TRIED for path in campaign(name)]
+    assert len(rows) == len(runs)
+    told = {(name, tuple(cell.strip() for cell in cells.split("|")[:-1])) for name, cells in rows}
+    for name, path in runs:
+        (steps, returns, costs), _ = figures(RESULTS / name / path)
+        quarters = (TRIED[name] * steps - 1) // 250_000
+        cells = tuple(
             f"{np.nanmean(returns[quarters == q]):.1f} / {np.nanmean(costs[quarters == q]):.0f}"
             for q in np.unique(quarters)
-        ]
-        assert [cell.strip() for cell in cells.strip("|").split("|")] == told
+        )
+        assert (Path(path).parts[2], cells) in told
+
+
+def test_the_run_of_held_actions_at_its_limit():
+    said = sentences((ROOT / "docs" / "algorithms" / "hard_tasks.md").read_text())
+    run = RESULTS / "held_actions/PointGoal2/sac_lagrangian/lead/seed110"
+    assert "the return is {:.1f} at a cost of {:.1f} ".format(*last(run, 0.25)) in said
+    assert f"{percent(held(run, 1_500_000)[1])} of the spans of 20,000 steps" in said
+    assert (
+        certificate(run, "mean cost ≤ {:.1f} (21.1 in 1,400 new episodes) at a return of {:.1f}")
+        in said
+    )
 
 
 def test_the_table_is_found():
