@@ -119,14 +119,12 @@ def _compose(texts: list[str]) -> DictConfig:
         given = next((t for t in texts if wrong and t.lstrip("+").startswith(f"{wrong[1]}=")), None)
         if wrong is None or given is None:
             raise CommandLineError(explain(error, texts)) from None
-        inner = re.search(r"full_key: (\S+)", str(error.__cause__))
-        if inner and inner[1].startswith(f"{wrong[1]}."):
-            raise CommandLineError(
-                f"'{given}': there is no '{inner[1]}'. If it is not misspelt, add it as "
-                f"+{inner[1]}=…"
-            ) from None
         # with all that is right, for what refers to it: the name of env=gymnasium is its env.id
         values = plain(_compose([text for text in texts if text != given]))
+        inner = re.search(r"full_key: (\S+)", str(error.__cause__))
+        if inner and inner[1].startswith(f"{wrong[1]}."):
+            words = unknown_key(given, inner[1], values)
+            raise CommandLineError(f"{words} A new key is added as +{inner[1]}=…") from None
         raise CommandLineError(unknown_key(given, wrong[1], values)) from None
 
 
