@@ -1,7 +1,4 @@
-"""Small environments of Gymnasium, as somebody else's would be; some are registered.
-
-Nothing here imports torch, so that processes that step them start at once.
-"""
+"""Small environments of Gymnasium, as somebody else's would be; some are registered."""
 
 import gymnasium
 import numpy as np
@@ -14,8 +11,8 @@ class Walk(gymnasium.Env):
     action_space = gymnasium.spaces.Box(-2.0, 2.0, (1,), np.float32)
     observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (2,), np.float64)
 
-    def __init__(self, border=3.0, nested=False, broken=False, render_mode=None):
-        self.border, self.nested, self.broken = border, nested, broken
+    def __init__(self, border=3.0, nested=False, render_mode=None):
+        self.border, self.nested = border, nested
         self.render_mode = render_mode
         if nested:
             self.observation_space = gymnasium.spaces.Dict(
@@ -29,8 +26,6 @@ class Walk(gymnasium.Env):
         return self._observe(), {}
 
     def step(self, action):
-        if self.broken:
-            raise ArithmeticError("the line is broken")
         self.speed = float(action[0])
         self.place += 0.3 * self.speed
         info = {"fast": float(abs(self.speed) > 1), "far": abs(self.place)}

@@ -80,10 +80,9 @@ FLOORS = {
         ("velocity",),
         # The table of families, and environments of other libraries.
         ("families",),
-        ("gymnasium.env_wrappers", "gymnasium.worker_processes", "gymnasium.world_arrays"),
+        ("gymnasium.env_wrappers", "gymnasium.world_arrays"),
         ("gymnasium.gymnasium_env", "gymnasium.gymnasium_interfaces"),
         ("gymnasium.conversion",),
-        ("gymnasium.six_values",),
         ("gymnasium",),
         ("torchrl.step_entries",),
         ("torchrl.torchrl_env",),
@@ -332,8 +331,6 @@ def test_tables_have_no_circles_and_no_ruins():
     [
         # a fifth of the seconds in which a run begins
         (("training.building",), {"matplotlib", "scipy.optimize", "scipy.stats"}),
-        # which every process that steps Gymnasium's environments would load: 290 MB
-        (("envs.gymnasium.env_wrappers", "envs.gymnasium.worker_processes"), {"torch"}),
     ],
 )
 def test_what_is_not_needed_yet_is_not_imported(modules, unneeded):

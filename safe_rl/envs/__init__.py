@@ -22,8 +22,7 @@ if TYPE_CHECKING:
         ContractError,
         check_constrained_env,
     )
-    from safe_rl.envs.gymnasium.conversion import from_gymnasium
-    from safe_rl.envs.gymnasium.six_values import from_six_values
+    from safe_rl.envs.gymnasium.conversion import from_gymnasium, from_six_values
     from safe_rl.envs.making import make_env
     from safe_rl.envs.safety_gym.env import SafetyGymEnv
     from safe_rl.envs.safety_gym.layouts import LayoutError
@@ -61,7 +60,7 @@ __getattr__, __dir__ = import_later(
         "SafetyGymEnv": "safe_rl.envs.safety_gym.env",
         "from_gymnasium": "safe_rl.envs.gymnasium.conversion",
         "make_env": "safe_rl.envs.making",
-        "from_six_values": "safe_rl.envs.gymnasium.six_values",
+        "from_six_values": "safe_rl.envs.gymnasium.conversion",
     },
 )
 

@@ -14,7 +14,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
 from importlib import import_module
-from typing import Annotated, Any
+from typing import Any
 
 import gymnasium
 from hydra.core.config_store import ConfigStore
@@ -24,7 +24,7 @@ from safe_rl.envs.costs import parse_ranges
 from safe_rl.envs.errors import ConfigError, nearest
 from safe_rl.envs.safety_gym.suite import EXTRAS, SUITE, resolve
 from safe_rl.envs.velocity.velocity_config import VELOCITY_SUITE, resolve_velocity
-from safe_rl.ranges import Count, Range, Text, values_of
+from safe_rl.ranges import Count, Text, values_of
 
 # MuJoCo's own library is installed; the default of these classes is another package.
 _MUJOCO = {"backend": "mujoco", "parallel": False}
@@ -141,7 +141,6 @@ _COMMON: dict[str, tuple[Any, Any]] = {
 }
 _GYMNASIUM_KEYS = {
     **_COMMON,
-    "workers": (0, Annotated[int, Range(0)]),
     "render_mode": (None, Text | None),
 }
 
@@ -152,7 +151,7 @@ GYMNASIUM = ForeignFamily(
     arguments="Arguments for gymnasium.make stand in 'kwargs', as env.kwargs='{render_fps: 30}'.",
     which="Name a registered one: env.id=…",
     check=_check_gymnasium,
-    describe="safe_rl.envs.gymnasium.conversion:describe_node",
+    describe="safe_rl.envs.gymnasium.conversion:describe_gymnasium",
 )
 SAFETY_GYMNASIUM = ForeignFamily(
     target="safe_rl.envs.gymnasium.make_safety_gymnasium",
@@ -163,7 +162,7 @@ SAFETY_GYMNASIUM = ForeignFamily(
     ),
     which="env.id=SafetyPointGoal1-v0, for example.",
     check=_check_gymnasium,
-    describe="safe_rl.envs.gymnasium.six_values:describe_node",
+    describe="safe_rl.envs.gymnasium.conversion:describe_safety_gymnasium",
 )
 TORCHRL = ForeignFamily(
     target="safe_rl.envs.torchrl.make_torchrl",

@@ -2,10 +2,7 @@
 
 import json
 import os
-import signal
-import subprocess
 from functools import partial
-from itertools import product
 from pathlib import Path
 
 import gymnasium
@@ -72,35 +69,6 @@ def test_it_is_evaluated_on_video(run, capsys):
     assert "no key 'borders'" in capsys.readouterr().err
 
 
-def test_processes_step_what_one_process_would_and_ignore_signals():
-    """Ctrl-C and what ends a cluster's job reach all; the first one ends its epoch with them."""
-    inline, shared = (
-        make_env({**NODE, "workers": workers, "kwargs": {"border": 1.5}}, num_envs=5, seed=3)
-        for workers in (0, 2)
-    )
-    processes = [process for process, _ in shared.base_env._env._workers]
-    for process, name in product(processes, ("INT", "TERM")):
-        subprocess.run(["kill", f"-{name}", str(process.pid)], check=True)
-    rollouts = []
-    for env in (inline, shared):
-        torch.manual_seed(0)
-        rollouts.append(env.rollout(40, break_when_any_done=False))
-    assert rollouts[0]["next", "terminated"].sum() > 5
-    for key in ("observation", "reward", "cost", "fast", "far", "done", "terminated"):
-        assert torch.equal(rollouts[1]["next", key], rollouts[0]["next", key])
-    step = rollouts[0]["next"]
-    torch.testing.assert_close(step["cost"], step["fast"] + step["far"])
-    os.kill(processes[1].pid, signal.SIGKILL)
-    processes[1].join(300)
-    with pytest.raises(RuntimeError, match=r"died \(exit code -9\)"):
-        shared.rollout(2)
-
-
-def test_what_fails_in_a_process_is_told():
-    with pytest.raises(RuntimeError, match="the line is broken"):
-        make_env({**NODE, "workers": 1, "kwargs": {"broken": True}}, seed=0).rollout(2)
-
-
 def starts(seed: int, num_envs: int = 4) -> list[float]:
     return make_env(NODE, num_envs=num_envs, seed=seed).reset()["observation"][:, 0].tolist()
 
@@ -125,12 +93,10 @@ def test_workers_without_a_state_to_continue_from_have_rows_of_their_own():
         ({"id": "Wolk-v0"}, "Did you mean 'Walk-v0'.*import=my_module"),
         ({"id": "os.path:Walk-v0"}, "import=os.path env.id=Walk-v0"),
         ({"border": 3}, "no key 'border'.*env.kwargs"),
-        ({"worker": 3}, "no key 'worker'. Did you mean 'workers'"),
-        ({"workers": -1}, "'workers' must be a whole number from 0"),
+        ({"num_step": 3}, "no key 'num_step'. Did you mean 'num_steps'"),
         ({"num_steps": 0}, "'num_steps' must be a whole number from 1"),
         ({"cost_keys": None}, "Walk-v0.*reports no costs.*'cost_keys'"),
         ({"id": "Cliff-v0", "cost_keys": None}, "that are arrays.*flatten=true"),
-        ({"kwargs": {"nested": True}, "workers": 2}, "use workers=0"),
         ({"kwargs": {"speed": 3}}, "Walk-v0.*speed"),
         ({"kwargs": 3, "num_steps": 5}, "'kwargs' must be a mapping"),
         ({"cost_keys": "fast", "num_steps": 5}, "'cost_keys' must be a list.*'fast'"),

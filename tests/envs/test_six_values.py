@@ -1,4 +1,4 @@
-"""Environments whose step returns six values: by id, from a function, and in batches."""
+"""Environments whose step returns six values: by id, and from a function."""
 
 import sys
 from pathlib import Path
@@ -57,19 +57,6 @@ def test_a_step_has_its_cost_beside_the_reward():
     assert 0 < taken["next", "terminated"].sum() < 200
 
 
-def test_a_batch_that_begins_by_itself_is_as_one_that_is_asked(package):
-    makers = [lambda: package.make("SafetyIce1-v0", border=1.5)] * 4
-    eager = from_six_values(package.SafetySyncVectorEnv(makers), num_steps=12, seed=5)
-    patient = from_six_values(makers[0], num_envs=4, seed=5)
-    assert eager.cost_keys == patient.cost_keys == ["cost", "cost_right", "cost_fast"]
-    first, second = rollout(eager), rollout(patient)
-    assert first["next", "done"].sum() > 8
-    for key in ("observation", "reward", *eager.cost_keys, "terminated", "done"):
-        assert torch.equal(first["next", key], second["next", key])
-    assert torch.equal(first["observation"], second["observation"])
-    check_env_specs(eager)
-
-
 def test_choices_and_dictionaries_become_integers_and_vectors():
     node = {**NODE, "id": "SafetyButtons0-v0", "kwargs": None, "num_steps": 6}
     env = make_env(node, num_envs=3, seed=0)
@@ -123,4 +110,6 @@ def test_a_missing_package_and_five_values_are_said(monkeypatch):
         make_env(NODE)
     with pytest.raises(ValueError, match=r"returned 5 values.*env=gymnasium"):
         from_six_values(lambda: gymnasium.make("Pendulum-v1"))
+    with pytest.raises(ConfigError, match="a function that makes one environment"):
+        from_six_values(gymnasium.make_vec("Pendulum-v1", num_envs=2), num_steps=5)
     monkeypatch.undo()

@@ -1,13 +1,12 @@
-"""Stands in for the package: environments whose step returns six values, one and several.
+"""Stands in for the package: environments whose step returns six values.
 
 What is imitated is its release 1.0 on Gymnasium 0.28: `make`, the limit of time, kinds of costs and
-their sum in `info`, and batches that start a new episode within the step that ends one.
+their sum in `info`.
 """
 
 import gymnasium
 import numpy as np
 from gymnasium.envs.registration import EnvSpec
-from gymnasium.vector.utils import batch_space
 
 
 class Ice(gymnasium.Env):
@@ -77,48 +76,6 @@ class Limited(gymnasium.Wrapper):
         *values, _, info = self.env.step(action)
         self.taken += 1
         return (*values, self.taken >= self.steps, info)
-
-
-class SafetySyncVectorEnv:
-    """A batch as Gymnasium 0.28 had them: an episode that ends is followed within the step."""
-
-    def __init__(self, makers):
-        self.envs = [make() for make in makers]
-        self.num_envs = len(self.envs)
-        self.single_observation_space = self.envs[0].observation_space
-        self.single_action_space = self.envs[0].action_space
-        self.observation_space = batch_space(self.single_observation_space, self.num_envs)
-        self.action_space = batch_space(self.single_action_space, self.num_envs)
-
-    def reset(self, *, seed=None, options=None):
-        seeds = [None if seed is None else seed + i for i in range(self.num_envs)]
-        seen = [env.reset(seed=s)[0] for env, s in zip(self.envs, seeds, strict=True)]
-        return np.stack(seen), {}
-
-    def step(self, actions):
-        seen, numbers, infos = [], [], {}
-        for row, (env, action) in enumerate(zip(self.envs, actions, strict=True)):
-            observation, *values, info = env.step(action)
-            if values[2] or values[3]:
-                last = {"final_observation": observation, "final_info": info}
-                observation, info = env.reset()
-                info = {**info, **last}
-            seen.append(observation)
-            numbers.append(values)
-            self._note(infos, info, row)
-        rewards, costs, terminated, truncated = map(np.array, zip(*numbers, strict=True))
-        return np.stack(seen), rewards, costs, terminated, truncated, infos
-
-    def _note(self, infos, info, row):
-        for key, value in info.items():
-            kind = float if isinstance(value, float) else object
-            array = infos.setdefault(key, np.zeros(self.num_envs, dtype=kind))
-            array[row] = value
-            infos.setdefault(f"_{key}", np.zeros(self.num_envs, dtype=bool))[row] = True
-
-    def close(self):
-        for env in self.envs:
-            env.close()
 
 
 KNOWN = {"SafetyIce1-v0": Ice, "SafetyButtons0-v0": Buttons}

@@ -10,15 +10,10 @@ from typing import TYPE_CHECKING
 from safe_rl.lazy import import_later
 
 if TYPE_CHECKING:
-    from safe_rl.envs.gymnasium.conversion import make_gymnasium
-    from safe_rl.envs.gymnasium.six_values import make_safety_gymnasium
+    from safe_rl.envs.gymnasium.conversion import make_gymnasium, make_safety_gymnasium
 
 __all__ = ["make_gymnasium", "make_safety_gymnasium"]
 
 __getattr__, __dir__ = import_later(
-    __name__,
-    {
-        "make_gymnasium": "safe_rl.envs.gymnasium.conversion",
-        "make_safety_gymnasium": "safe_rl.envs.gymnasium.six_values",
-    },
+    __name__, dict.fromkeys(__all__, "safe_rl.envs.gymnasium.conversion")
 )

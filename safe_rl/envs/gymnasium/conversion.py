@@ -5,23 +5,22 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from inspect import signature
-from multiprocessing import current_process
 from typing import Any
 
 import gymnasium
 import numpy as np
 import torch
-from gymnasium.vector import AutoresetMode, SyncVectorEnv, VectorEnv
+from gymnasium.vector import AutoresetMode, SyncVectorEnv
+from torchrl.envs import GymWrapper
 
-from safe_rl.envs.costs import CostRange, is_cost, parse_ranges
+from safe_rl.envs.costs import COST, is_cost, parse_ranges
 from safe_rl.envs.errors import ConfigError, nearest, require_integer, require_names
-from safe_rl.envs.families import GYMNASIUM, ForeignFamily, complete_foreign
-from safe_rl.envs.gymnasium.env_wrappers import CostsOutside, adapt, make_adapted
-from safe_rl.envs.gymnasium.gymnasium_env import GymnasiumEnv, from_vector
-from safe_rl.envs.gymnasium.worker_processes import ProcessVectorEnv
+from safe_rl.envs.families import GYMNASIUM, SAFETY_GYMNASIUM, ForeignFamily, complete_foreign
+from safe_rl.envs.gymnasium.env_wrappers import CostsOutside, SixValues, adapt, make_adapted
+from safe_rl.envs.gymnasium.gymnasium_env import CostReader, GymnasiumEnv
 from safe_rl.envs.rng import spread_seed
 
-__all__ = ["describe_node", "from_gymnasium", "make_gymnasium", "make_node"]
+__all__ = ["from_gymnasium", "from_six_values", "make_gymnasium", "make_safety_gymnasium"]
 
 MakeEnv = Callable[[], gymnasium.Env]
 _FAILURES = (AssertionError, gymnasium.error.Error, TypeError, ValueError)
@@ -35,7 +34,6 @@ def from_gymnasium(
     cost_keys: Sequence[str] | None = None,
     num_steps: int | None = None,
     seed: int | None = None,
-    workers: int = 0,
     device: torch.device | str = "cpu",
     flatten: bool = True,
     highest_costs: Mapping[str, float] | None = None,
@@ -45,7 +43,7 @@ def from_gymnasium(
 
     Observations become one float32 vector each, continuous actions are clipped to [-1, 1] and
     stretched to the environment's bounds, so that the algorithms can be used as they are. Choices
-    (Discrete, MultiDiscrete) are integers.
+    (Discrete, MultiDiscrete) are integers. The N environments are stepped one after the other.
 
     Args:
         env: Gymnasium id, or a function that makes an environment.
@@ -54,8 +52,6 @@ def from_gymnasium(
             taking one step.
         num_steps: The largest number of steps of an episode; None takes what the id says.
         seed: Of all environments; row k has this one plus k.
-        workers: Processes that step them; 0 steps them in this process, one after the other. A
-            process that is itself a worker always does.
         device: Where the TensorDicts live.
         flatten: Make one vector of every observation; False leaves pictures and dictionaries as
             they are.
@@ -66,7 +62,7 @@ def from_gymnasium(
     Returns:
         An environment [N], with the costs in its reward spec; `cost` is the sum of the others if
         there is none of that name. A copy (`copy`, `pickle`) continues where it was if copies of
-        the environments inside do; with workers it starts from its seed.
+        the environments inside do.
 
     Raises:
         ValueError: If no costs are reported, actions are neither continuous and bounded nor
@@ -78,19 +74,54 @@ def from_gymnasium(
         torch.Size([2, 3, 1])
     """
     require_integer("num_envs", num_envs, lowest=1)
-    require_integer("workers", workers, lowest=0)
     require_names("cost_keys", cost_keys)
     make = _maker(env, kwargs, num_steps)
-    keys, length = _describe(make, cost_keys, num_steps, flatten, workers)
+    keys, length = _describe(make, cost_keys, num_steps, flatten)
     _check_keys(keys, highest_costs or {})
     make_one = partial(make_adapted, make, length, flatten, keys)
-    worlds: VectorEnv
-    if workers and not current_process().daemon:
-        worlds = ProcessVectorEnv(make_one, num_envs, min(workers, num_envs), keys)
-    else:
-        worlds = SyncVectorEnv([make_one] * num_envs, autoreset_mode=AutoresetMode.DISABLED)
-        worlds.env_fns = ()  # not asked again: custom functions might not be pickled
-    return from_vector(worlds, keys, length, seed=seed, device=device, highest_costs=highest_costs)
+    worlds = SyncVectorEnv([make_one] * num_envs, autoreset_mode=AutoresetMode.DISABLED)
+    worlds.env_fns = ()  # not needed again, and custom functions might not be pickled
+    base = GymWrapper(worlds, device=torch.device(device), categorical_action_encoding=True)
+    base.set_info_dict_reader(CostReader(keys, [num_envs], highest_costs, patience=length))
+    batch = GymnasiumEnv(base, keys, length)
+    batch.set_seed(int(torch.randint(2**31, ())) if seed is None else seed)
+    return batch
+
+
+def from_six_values(
+    env: MakeEnv, *, cost_keys: Sequence[str] | None = None, **settings: Any
+) -> GymnasiumEnv:
+    """Make a TorchRL environment of environments whose step returns six values.
+
+    Args:
+        env: A function that makes one environment, as Safety-Gymnasium's interface has them.
+        cost_keys: Kinds of costs that are taken from `info` beside the step's own cost; None takes
+            all that are called `cost_<kind>`, found by taking a step.
+        settings: Any other argument of `from_gymnasium`.
+
+    Returns:
+        An environment [N]; `cost` is what a step returns.
+
+    Raises:
+        ValueError: If a step has another number of values, or the length of episodes is not known.
+
+    Examples:
+        >>> class Slide(gymnasium.Env):
+        ...     observation_space = gymnasium.spaces.Box(-1, 1, (1,), np.float32)
+        ...     action_space = gymnasium.spaces.Box(-1, 1, (1,), np.float32)
+        ...     def reset(self, seed=None, options=None):
+        ...         return np.zeros(1, np.float32), {}
+        ...     def step(self, action):
+        ...         return action, 1.0, float(action[0] > 0), False, False, {}
+        >>> from_six_values(Slide, num_envs=2, num_steps=5).rollout(9)["next", "cost"].shape
+        torch.Size([2, 5, 1])
+    """
+    if not callable(env):
+        raise ConfigError(
+            f"Give a function that makes one environment; num_envs=… makes several. Got {env!r}."
+        )
+    keys = None if cost_keys is None else [COST, *(key for key in cost_keys if key != COST)]
+    return from_gymnasium(partial(_wrapped, SixValues, env), cost_keys=keys, **settings)
 
 
 def make_gymnasium(
@@ -118,10 +149,28 @@ def make_gymnasium(
         >>> make_gymnasium(config, num_envs=2, seed=0).cost_keys
         ['cost', 'cost_hazards', 'cost_exception']
     """
-    return make_node(GYMNASIUM, _maker_of_node, config, num_envs, device, seed)
+    return _make_node(GYMNASIUM, _registered, config, num_envs, device, seed)
 
 
-def make_node(
+def make_safety_gymnasium(
+    config: Mapping[str, Any],
+    *,
+    num_envs: int,
+    device: torch.device | str = "cpu",
+    seed: int | None = None,
+    num_threads: int = 0,
+) -> GymnasiumEnv:
+    """Make environments of an id that `safety_gymnasium.make` knows.
+
+    The arguments are those of `make_gymnasium`, with the keys of conf/env/safety_gymnasium.yaml.
+
+    Raises:
+        ConfigError: For an unknown key or id, or if the package cannot be imported.
+    """
+    return _make_node(SAFETY_GYMNASIUM, _of_safety_gymnasium, config, num_envs, device, seed)
+
+
+def _make_node(
     family: ForeignFamily,
     maker: Callable[[Mapping[str, Any]], MakeEnv],
     config: Mapping[str, Any],
@@ -129,11 +178,6 @@ def make_node(
     device: torch.device | str,
     seed: int | None,
 ) -> GymnasiumEnv:
-    """Make the environments of a node; `maker` returns a function that makes one of them.
-
-    Raises:
-        ConfigError: For an unknown key or id, or an environment that the algorithms cannot use.
-    """
     config = complete_foreign(family, config)
     outside = list(config.get("outside") or {})
     make = maker(config)
@@ -144,7 +188,6 @@ def make_node(
             cost_keys=[*dict.fromkeys([*config["cost_keys"], *outside])],
             num_steps=config["num_steps"],
             seed=None if seed is None else spread_seed(seed),
-            workers=config["workers"],
             flatten=config.get("flatten", True),
             device=device,
             highest_costs=dict.fromkeys(outside, 1.0),
@@ -153,30 +196,20 @@ def make_node(
         raise ConfigError(f"env.id={config['id']}: {error}") from error
 
 
-def describe_node(
-    config: Mapping[str, Any], maker: Callable[[Mapping[str, Any]], MakeEnv] | None = None
+def _describe_node(
+    maker: Callable[[Mapping[str, Any]], MakeEnv], config: Mapping[str, Any]
 ) -> tuple[list[str], int]:
-    """Return the cost keys and the length of episodes of a node, found out where they are None.
-
-    Raises:
-        ConfigError: If there is no such environment, or the algorithms cannot use it.
-    """
-    make = (maker or _maker_of_node)(config)
+    """Cost keys and length of episodes of a node, found out where they are None."""
+    make, flatten = maker(config), config.get("flatten", True)
     try:
-        flatten = config.get("flatten", True)
         return _describe(make, config["cost_keys"], config["num_steps"], flatten)
     except _FAILURES as error:
         raise ConfigError(f"env.id={config['id']}: {error}") from error
 
 
 def _describe(
-    make: MakeEnv,
-    cost_keys: Sequence[str] | None,
-    num_steps: int | None,
-    flatten: bool,
-    workers: int = 0,
+    make: MakeEnv, cost_keys: Sequence[str] | None, num_steps: int | None, flatten: bool
 ) -> tuple[list[str], int]:
-    """Names of the costs and the length of episodes, found out where they are None."""
     if num_steps is not None:
         require_integer("num_steps", num_steps, lowest=1)
     probe = make()
@@ -184,8 +217,6 @@ def _describe(
         raise ConfigError(f"It makes no environment of Gymnasium (gymnasium.Env), but {probe!r}.")
     try:
         adapted = adapt(probe, flatten=flatten)
-        if workers and isinstance(adapted.observation_space, gymnasium.spaces.Dict):
-            raise ValueError("workers are for observations that are arrays: use workers=0.")
         keys = _find_costs(adapted) if cost_keys is None else [*dict.fromkeys(cost_keys)]
         known = None if adapted.spec is None else adapted.spec.max_episode_steps
         length = known if num_steps is None else num_steps
@@ -219,11 +250,8 @@ def _check_keys(keys: Sequence[str], highest_costs: Mapping[str, float]) -> None
 
 
 def _find_costs(probe: gymnasium.Env) -> list[str]:
-    try:
-        probe.reset(seed=0)
-        *_, info = probe.step(np.zeros(probe.action_space.shape, dtype=probe.action_space.dtype))
-    except SystemExit as error:
-        raise ValueError(f"{probe.unwrapped} called sys.exit({error.code}).") from error
+    probe.reset(seed=0)
+    *_, info = probe.step(np.zeros(probe.action_space.shape, dtype=probe.action_space.dtype))
     keys = [key for key in info if is_cost(key)]
     if not keys:
         raise ValueError(
@@ -235,8 +263,14 @@ def _find_costs(probe: gymnasium.Env) -> list[str]:
     return keys
 
 
-def _maker_of_node(config: Mapping[str, Any]) -> MakeEnv:
-    """Return a function that makes one environment; what is registered goes with it to workers."""
+def _arguments(config: Mapping[str, Any]) -> dict[str, Any]:
+    named = {"render_mode": config["render_mode"], "max_episode_steps": config["num_steps"]}
+    given = {key: value for key, value in named.items() if value is not None}
+    return {**given, **(config["kwargs"] or {})}
+
+
+def _registered(config: Mapping[str, Any]) -> MakeEnv:
+    """Return a function that makes one environment of a node of `env=gymnasium`."""
     env_id = config["id"]
     try:
         spec = gymnasium.spec(env_id)
@@ -245,15 +279,28 @@ def _maker_of_node(config: Mapping[str, Any]) -> MakeEnv:
             f"env.id={env_id}: {error} {nearest(env_id, gymnasium.registry)} A module that "
             "registers an environment is imported by import=my_module."
         ) from error
-    kwargs = dict(config["kwargs"] or {})
-    if config["num_steps"] is not None:
-        kwargs.setdefault("max_episode_steps", config["num_steps"])
-    if config["render_mode"] is not None:
-        kwargs["render_mode"] = config["render_mode"]
-    make = partial(gymnasium.make, spec, **kwargs)
+    make = partial(gymnasium.make, spec, **_arguments(config))
     ranges = parse_ranges(config["outside"], "observation")
-    return partial(_with_costs, make, ranges) if ranges else make
+    return partial(_wrapped, partial(CostsOutside, ranges=ranges), make) if ranges else make
 
 
-def _with_costs(make: MakeEnv, ranges: dict[str, CostRange]) -> gymnasium.Env:
-    return CostsOutside(make(), ranges)
+def _of_safety_gymnasium(config: Mapping[str, Any]) -> MakeEnv:
+    """Return a function that makes one environment of a node of `env=safety_gymnasium`."""
+    try:
+        import safety_gymnasium
+    except ImportError as error:
+        raise ConfigError(
+            f"Safety-Gymnasium cannot be imported in this Python ({error}). Its release 1.0 wants "
+            "an older Gymnasium and MuJoCo than safe_rl; install a release that can be imported "
+            "beside it. Environments of yours with six values need no package: from_six_values."
+        ) from error
+    make = partial(safety_gymnasium.make, config["id"], **_arguments(config))
+    return partial(_wrapped, SixValues, make)
+
+
+def _wrapped(wrapper: Callable[[gymnasium.Env], gymnasium.Env], make: MakeEnv) -> gymnasium.Env:
+    return wrapper(make())
+
+
+describe_gymnasium = partial(_describe_node, _registered)
+describe_safety_gymnasium = partial(_describe_node, _of_safety_gymnasium)

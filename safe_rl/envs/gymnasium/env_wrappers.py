@@ -1,12 +1,8 @@
-"""Wrappers of single Gymnasium environments: spaces as policies take them, costs in `info`.
-
-Worker processes import this module, and it does not import torch: they start within a second.
-"""
+"""Wrappers of single Gymnasium environments: spaces as policies take them, costs in `info`."""
 
 from __future__ import annotations
 
-import warnings
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any
 
@@ -16,9 +12,7 @@ from gymnasium.spaces import Box, Dict, Discrete, MultiDiscrete
 from gymnasium.wrappers import TransformAction, TransformObservation
 
 from safe_rl.envs.costs import COST, CostRange
-from safe_rl.envs.errors import ConfigError
 
-_ALWAYS = 10  # steps in a row after which a cost is expected at every step
 COST_SUM = "cost_sum"  # Safety-Gymnasium's name for the sum of all kinds
 
 
@@ -26,7 +20,7 @@ def make_adapted(
     make: Callable[[], gymnasium.Env], num_steps: int, flatten: bool, cost_keys: Sequence[str]
 ) -> gymnasium.Env:
     """Make an environment, :func:`adapt` it, and have its costs reported as floats."""
-    return CheckedSteps(adapt(make(), num_steps, flatten=flatten), cost_keys)
+    return FloatCosts(adapt(make(), num_steps, flatten=flatten), cost_keys)
 
 
 def adapt(
@@ -48,8 +42,8 @@ def adapt(
     return env if num_steps is None else gymnasium.wrappers.TimeLimit(env, num_steps)
 
 
-class CheckedSteps(gymnasium.Wrapper):
-    """Checks what an environment returns, and makes the costs in `info` floats.
+class FloatCosts(gymnasium.Wrapper):
+    """Makes the costs in `info` floats.
 
     Gymnasium puts the costs of a batch into an array of the type of the first row: if that is an
     integer, the costs of all rows would be rounded.
@@ -58,72 +52,27 @@ class CheckedSteps(gymnasium.Wrapper):
         env: The environment.
         cost_keys: Names in `info`; what is no single number stays as it is.
 
-    Raises:
-        ConfigError: By :meth:`step`, if what it returns breaks Gymnasium's rules.
-
     Examples:
         >>> class Push(gymnasium.Env):
-        ...     observation_space = gymnasium.spaces.Box(-1, 1, (1,))
         ...     def step(self, action):
         ...         return np.zeros(1), 0.0, False, False, {"cost": 0, "pushes": 3}
-        >>> CheckedSteps(Push(), ["cost"]).step(None)[-1]
+        >>> FloatCosts(Push(), ["cost"]).step(None)[-1]
         {'cost': 0.0, 'pushes': 3}
     """
 
     def __init__(self, env: gymnasium.Env, cost_keys: Sequence[str]) -> None:
         super().__init__(env)
         self._cost_keys = list(cost_keys)
-        # steps in a row, from the first, of which each has reported a cost; None: one has not
-        self._reported: dict[str, int | None] = dict.fromkeys(cost_keys, 0)
 
     def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
-        """Step, check, and convert what is reported."""
-        try:
-            step = self.env.step(action)
-        except SystemExit as error:
-            what = f"sys.exit({error.code})"
-            raise ConfigError(f"A step of {self.unwrapped} called {what}.") from error
-        for fault in _faults(step, self.observation_space):
-            raise ConfigError(f"A step of {self.unwrapped} returned {fault}.")
-        *values, info = step
-        self._watch(info)
+        """Step, and convert what is reported."""
+        *values, info = self.env.step(action)
         costs = {
             key: float(info[key])
             for key in self._cost_keys
-            if isinstance(info.get(key), bool | int | float | np.generic)
-            and not isinstance(info[key], np.flexible)
+            if isinstance(info.get(key), bool | int | float | np.number | np.bool_)
         }
         return *values, {**info, **costs}
-
-    def _watch(self, info: dict[str, Any]) -> None:
-        """Warn of a cost that was in every `info` so far, and is missing now."""
-        for key, steps in self._reported.items():
-            if steps is None:
-                continue
-            if key in info:
-                self._reported[key] = steps + 1
-                continue
-            self._reported[key] = None
-            if steps >= _ALWAYS:
-                warnings.warn(
-                    f"The cost '{key}' was in the info of each of the first {steps} steps and is "
-                    "missing now: it counts as 0 wherever it is missing.",
-                    stacklevel=2,
-                )
-
-
-def _faults(step: tuple[Any, ...], space: gymnasium.Space) -> Iterator[str]:
-    """What breaks Gymnasium's rules, in words that follow "it returned"."""
-    observation, reward, *ends, info = step
-    if isinstance(space, Box) and np.shape(observation) != space.shape:
-        yield f"an observation of shape {np.shape(observation)}, where its space is {space.shape}"
-    if np.asarray(reward).size != 1 or np.asarray(reward).dtype.kind not in "bif":
-        yield f"the reward {reward!r}, which is no number"
-    for name, end in zip(("terminated", "truncated"), ends, strict=True):
-        if not isinstance(end, bool | np.bool_) and not (isinstance(end, int) and end in (0, 1)):
-            yield f"{name}={end!r}, which is neither True nor False"
-    if not isinstance(info, dict):
-        yield f"the info {info!r}, which is no dictionary"
 
 
 class CostsOutside(gymnasium.Wrapper):
@@ -243,25 +192,18 @@ def _entries(space: Dict, observation: dict[str, Any]) -> dict[str, dict[str, np
 
 
 def _with_plain_actions(env: gymnasium.Env) -> gymnasium.Env:
-    actions, plain = env.action_space, plain_actions(env.action_space, str(env.unwrapped))
+    """Let policies act in [-1, 1], or choose from 0."""
+    actions, plain = env.action_space, _plain_actions(env)
     if isinstance(actions, Box):
         return TransformAction(env, partial(stretch, actions), plain)
     start = actions.start if isinstance(actions, Discrete | MultiDiscrete) else 0
     return TransformAction(env, partial(np.add, start), plain) if np.any(start) else env
 
 
-def plain_actions(actions: gymnasium.Space, whose: str) -> gymnasium.Space:
-    """Return the space that policies act in: [-1, 1], or choices from 0.
-
-    Raises:
-        ValueError: For any other space; the message names `whose` it is.
-    """
-    if isinstance(actions, Box) and not np.issubdtype(actions.dtype, np.floating):
-        raise ValueError(
-            f"{whose} has actions that are whole numbers in a Box, {actions}: a choice of one of "
-            "several is Discrete or MultiDiscrete."
-        )
-    if isinstance(actions, Box) and actions.is_bounded():
+def _plain_actions(env: gymnasium.Env) -> gymnasium.Space:
+    actions = env.action_space
+    is_real = isinstance(actions, Box) and np.issubdtype(actions.dtype, np.floating)
+    if isinstance(actions, Box) and is_real and actions.is_bounded():
         return Box(-1.0, 1.0, actions.shape, actions.dtype.type)
     if isinstance(actions, Discrete):
         return Discrete(int(actions.n))
@@ -269,7 +211,7 @@ def plain_actions(actions: gymnasium.Space, whose: str) -> gymnasium.Space:
         return MultiDiscrete(actions.nvec)
     raise ValueError(
         "The algorithms need actions that are continuous and bounded (a Box) or choices "
-        f"(Discrete, MultiDiscrete), but {whose} has {actions}."
+        f"(Discrete, MultiDiscrete), but {env.unwrapped} has {actions}."
     )
 
 

@@ -5,12 +5,11 @@ from __future__ import annotations
 import math
 import reprlib
 import warnings
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 import torch
-from gymnasium.vector import VectorEnv
 from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.data import Bounded, Composite, TensorSpec, Unbounded
@@ -19,10 +18,10 @@ from torchrl.envs.gym_like import BaseInfoDictReader
 
 from safe_rl import naming
 from safe_rl.envs.contract import ConstrainedEnv, add_columns
-from safe_rl.envs.costs import COST, is_cost
+from safe_rl.envs.costs import COST
 from safe_rl.envs.errors import ConfigError, nearest
 
-__all__ = ["CostReader", "GymnasiumEnv", "cost_spec", "from_vector"]
+__all__ = ["CostReader", "GymnasiumEnv", "cost_spec"]
 
 _MISSPELT = 0.85
 """Likeness above which two names are thought to be one."""
@@ -32,8 +31,8 @@ class CostReader(BaseInfoDictReader):
     """Reads costs from `info` into the TensorDict, float32 [N, 1]; 0 where none is reported.
 
     Some environments report a cost only where it occurs. A warning names, once, a cost that no
-    `info` has had for `patience` steps, and a cost that is reported but not in `cost_keys`. A name
-    that is missing while `info` has nearly the same one is an error.
+    `info` has had for `patience` steps. A name that is missing while `info` has nearly the same one
+    is an error.
 
     Args:
         cost_keys: Names in `info`.
@@ -88,8 +87,6 @@ class CostReader(BaseInfoDictReader):
         self._names |= new
         self._unseen -= new
         others = self._names.difference(self._cost_keys)
-        if new and self._num_steps and COST not in self._cost_keys:
-            _warn_of_uncounted(filter(is_cost, new & others), self._cost_keys)
         for key in self._unseen if new else ():
             if alike := naming.nearest(key, others, _MISSPELT):
                 raise ConfigError(
@@ -98,7 +95,14 @@ class CostReader(BaseInfoDictReader):
                 )
         self._num_steps += 1
         if self._patience is not None and self._num_steps > self._patience:
-            _warn_of_unseen(self._unseen, others, self._patience)
+            for key in sorted(self._unseen):
+                warnings.warn(
+                    f"The cost '{key}' is in no info of the first {self._patience} steps, and "
+                    f"counts as 0.{nearest(key, others)} The infos have "
+                    f"{', '.join(sorted(others)) or 'no other'}. If it is reported only where it "
+                    "occurs, it may not have occurred yet.",
+                    stacklevel=3,
+                )
             self._unseen.clear()
 
     @property
@@ -187,28 +191,6 @@ class GymnasiumEnv(ConstrainedEnv, TransformedEnv):
         return drawn[0] if isinstance(rows, int) else drawn
 
 
-def from_vector(
-    worlds: VectorEnv,
-    cost_keys: Sequence[str],
-    num_steps: int,
-    *,
-    seed: int | None = None,
-    device: torch.device | str = "cpu",
-    highest_costs: Mapping[str, float] | None = None,
-) -> GymnasiumEnv:
-    """Make a TorchRL environment of N environments that are reset by a mask only.
-
-    Their observations and actions are as policies take them; the other arguments are those of
-    `from_gymnasium`.
-    """
-    base = GymWrapper(worlds, device=torch.device(device), categorical_action_encoding=True)
-    reader = CostReader(cost_keys, [worlds.num_envs], highest_costs, patience=num_steps)
-    base.set_info_dict_reader(reader)
-    batch = GymnasiumEnv(base, cost_keys, num_steps)
-    batch.set_seed(int(torch.randint(2**31, ())) if seed is None else seed)
-    return batch
-
-
 def cost_spec(
     highest: float | None, shape: Sequence[int], device: torch.device | None = None
 ) -> TensorSpec:
@@ -223,25 +205,6 @@ def _columns(spec: TensorSpec) -> dict[str, slice]:
     parts = dict(spec.items()) if isinstance(spec, Composite) else {"observation": spec}
     sizes = {str(name): part.shape[1:].numel() for name, part in sorted(parts.items())}
     return add_columns({}, sizes)
-
-
-def _warn_of_uncounted(keys: Iterable[str], named: Sequence[str]) -> None:
-    for key in keys:
-        warnings.warn(
-            f"A step reports the cost '{key}', which the first one did not, and which counts "
-            f"nowhere: 'cost_keys' are {', '.join(named)}. Add it there.",
-            stacklevel=4,
-        )
-
-
-def _warn_of_unseen(keys: Iterable[str], others: Collection[str], patience: int) -> None:
-    for key in sorted(keys):
-        warnings.warn(
-            f"The cost '{key}' is in no info of the first {patience} steps, and counts as 0."
-            f"{nearest(key, others)} The infos have {', '.join(sorted(others)) or 'no other'}. If "
-            "it is reported only where it occurs, it may not have occurred yet.",
-            stacklevel=4,
-        )
 
 
 def _spec_of_sum(specs: Sequence[TensorSpec]) -> TensorSpec:
