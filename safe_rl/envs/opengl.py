@@ -34,24 +34,8 @@ class OpenGLError(RuntimeError):
     """Nothing can be drawn on this machine; the message names the package to install."""
 
 
-def has_screen() -> bool:
-    """Whether windows can be opened on this machine."""
-    if sys.platform != "linux":
-        return True
-    return bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
-
-
-def require_screen() -> None:
-    """Check that windows can be opened on this machine.
-
-    Raises:
-        OpenGLError: If they cannot.
-    """
-    if not has_screen():
-        raise OpenGLError(
-            "A window needs a screen, and there is no screen here (neither DISPLAY nor "
-            "WAYLAND_DISPLAY is set). Use render_mode='rgb_array', which needs none."
-        )
+def _has_screen() -> bool:
+    return sys.platform != "linux" or any(map(os.environ.get, ("DISPLAY", "WAYLAND_DISPLAY")))
 
 
 def open_renderer(model: mujoco.MjModel, width: int, height: int) -> mujoco.Renderer:
@@ -77,7 +61,7 @@ def open_renderer(model: mujoco.MjModel, width: int, height: int) -> mujoco.Rend
 
 def load_backend() -> None:
     """Choose and load MuJoCo's OpenGL backend, for code that opens its own contexts."""
-    if not os.environ.get("MUJOCO_GL") and not has_screen():
+    if not os.environ.get("MUJOCO_GL") and not _has_screen():
         os.environ["MUJOCO_GL"] = "egl"
     elif hasattr(gl_context, "GLContext"):
         return

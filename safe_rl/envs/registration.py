@@ -16,7 +16,7 @@ from omegaconf import OmegaConf
 
 from safe_rl.envs.families import GROUP, config_node, env_names, env_node
 from safe_rl.envs.safety_gym.config import SafetyGymConfig
-from safe_rl.envs.safety_gym.suite import EXTRAS, SUITE, TESTING, resolve
+from safe_rl.envs.safety_gym.suite import EXTRAS, SUITE, resolve
 from safe_rl.envs.velocity.velocity_config import VELOCITY_SUITE
 from safe_rl.targets import allow
 
@@ -114,13 +114,11 @@ def store_configs() -> None:
 def register_gymnasium() -> None:
     """Give Gymnasium an id `Safexp-{name}-v0` for every name, and `Safexp-Custom-v0`.
 
-    The original's environments for tests are `Testing-{name}-v0`, as there. The custom one has the
-    defaults of every configuration key; all of them take a `config` with keys to change. The
-    velocity family has `SafeHopperVelocity-v0` and so on. What the ids stand for is imported when
-    an environment is made.
+    The custom one has the defaults of every configuration key; all of them take a `config` with
+    keys to change. The velocity family has `SafeHopperVelocity-v0` and so on. What the ids stand
+    for is imported when an environment is made.
     """
     ids = {f"Safexp-{name}-v0": name for name in (*SUITE, *EXTRAS)} | {"Safexp-Custom-v0": None}
-    ids |= {f"Testing-{name}-v0": name for name in TESTING}
     ids |= {f"{name}-v0": name for name in VELOCITY_SUITE}
     for env_id, name in ids.items():
         if env_id not in gymnasium.registry:

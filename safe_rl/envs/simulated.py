@@ -35,8 +35,6 @@ class SimulatedEnv(ConstrainedEnv):
     flags: ClassVar[tuple[str, ...]] = ("done", "terminated", "truncated")
     #: Camera of pictures where none is named.
     first_camera: ClassVar[str]
-    #: Modes of Gymnasium's interface that the family can be shown in.
-    render_modes: ClassVar[tuple[str, ...]] = ("rgb_array",)
     #: What a copy has beside the state: attributes that are tensors.
     copied: ClassVar[tuple[str, ...]] = ("_row_seed", "_has_cost", "_begun")
 
@@ -263,7 +261,7 @@ class SimulatedEnv(ConstrainedEnv):
         return frames[0] if isinstance(rows, int) else frames
 
     def close(self, *, raise_if_closed: bool = True) -> None:
-        """Free what OpenGL holds, and close the viewer if there is one."""
+        """Free what OpenGL holds."""
         self._renderer.close()
         super().close(raise_if_closed=raise_if_closed)
 

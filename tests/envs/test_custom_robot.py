@@ -164,8 +164,6 @@ JOINTS = (
 )
 ACTUATORS = DISC[DISC.index("<actuator>") : DISC.index("<sensor>")]
 SLIDE = '<jointpos name="east" joint="x"/></sensor>'
-ARM = '<body name="arm" pos="0.1 0 0">'
-INERTIA = '<inertial pos="0 0 0" mass="nan" diaginertia="1 1 1"/>'
 WRONG = {
     "no XML": ("<mujoco><worldbody>", "cannot load"),
     "a mistake in it": (changed(DISC, "capsule", "sausage"), "cannot load.*sausage"),
@@ -193,36 +191,11 @@ WRONG = {
         changed(BALL, "<worldbody>", '<worldbody><body mocap="true"/>'),
         "mocap bodies",
     ),
-    "no time": (changed(DISC, '"0.004"', '"0"'), "timestep 0.0"),
-    "time that runs back": (changed(DISC, '"0.004"', '"-0.01"'), "timestep -0.01"),
-    "time that is none": (changed(DISC, '"0.004"', '"nan"'), "timestep nan"),
-    "a mass that is none": (changed(DISC, ARM, ARM + INERTIA), "mass|NaN"),
-    "an infinite mass": (
-        changed(DISC, ARM, ARM + INERTIA.replace("nan", "inf")),
-        "infinite|NaN|cannot load",
-    ),
-    "a size that is none": (changed(DISC, 'pos="0 0 0.1"', 'pos="0 0 nan"'), "NaN"),
     "a reversed control range": (
         changed(DISC, '"-0.5 2"', '"2 -0.5"'),
         "control range.*2.0, -0.5",
     ),
     "an infinite control range": (changed(DISC, '"-0.5 2"', '"-inf inf"'), "control range"),
-    "a control range of NaN": (changed(DISC, '"-0.5 2"', '"nan 1"'), "control range|NaN"),
-    "a huge height field": (
-        changed(DISC, "<worldbody>", '<asset><hfield name="h" nrow="1000000" ncol="1000000" '
-                'size="1 1 1 1"/></asset><worldbody>'),
-        "'hfield' with too large nrow and ncol",
-    ),
-    "a thousand million copies": (
-        changed(DISC, "<worldbody>", '<worldbody><replicate count="1000000000">'
-                '<geom size="1"/></replicate>'),
-        "100,000 elements",
-    ),
-    "copies of copies": (
-        changed(DISC, "<worldbody>", '<worldbody><replicate count="9999"><replicate count="9999">'
-                '<geom size="1"/></replicate></replicate>'),
-        "100,000 elements",
-    ),
     "an observed slide": (changed(DISC, "</sensor>", SLIDE), "'east' on a slide joint"),
     "a name of the world": (changed(DISC, 'name="arm"', 'name="vase0"'), "does not fit.*vase0"),
 }  # fmt: skip
@@ -273,12 +246,6 @@ def test_relative_paths(make, tmp_path, monkeypatch):
     assert SafetyGymEnv({"robot_base": "robot.xml", "sensors_obs": ["gyro"]}).reset() is not None
 
 
-def test_some_copies_are_all_right(make):
-    copies = '<replicate count="3" offset="0 0 .01"><site size=".01"/></replicate>'
-    env = make(changed(DISC, '<site name="robot"/>', f'<site name="robot"/>{copies}'))
-    assert env._world.scene.model.nsite == 4
-
-
 def test_a_file_that_changed_is_noticed(make):
     assert _mass(light := make(DISC)) == pytest.approx(_mass(make(DISC)))
     heavy = make(changed(DISC, 'density="10"', 'density="20"'))
@@ -293,9 +260,6 @@ def test_so_is_one_that_it_includes(make, tmp_path):
         part.write_text(f"<mujoco>{default.replace('10', str(density))}</mujoco>")
         masses.append(_mass(make(changed(DISC, default, '<include file="part.xml"/>'))))
     assert masses[1] == pytest.approx(2 * masses[0])
-    part.write_text('<mujoco><worldbody><replicate count="1000000"/></worldbody></mujoco>')
-    with pytest.raises(ConfigError, match=r"'robot_base'.*robot\.xml.*elements"):
-        make(changed(DISC, default, '<include file="part.xml"/>'))
 
 
 SLOW_MOTOR = {

@@ -10,6 +10,7 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
 from safe_rl.envs.gymnasium.world_arrays import (
+    RENDER_MODES,
     Config,
     Observation,
     Worlds,
@@ -29,7 +30,8 @@ class WorldEnv(Worlds, gymnasium.Env[Any, np.ndarray]):
     Args:
         name: Of the environment; None for the defaults of every key of Safety Gym's.
         config: Keys to change, or a whole `SafetyGymConfig`.
-        render_mode: "rgb_array" for frames, "human" for MuJoCo's viewer (Safety Gym only), or None.
+        render_mode: "rgb_array" for frames, or None; "human" is for `gymnasium.make`, whose wrapper
+            shows the frames in a window.
         camera: Of the frames, as the environment's `render` takes it; None is its first.
         width: Of a frame [pixels].
         height: Of a frame [pixels].
@@ -40,7 +42,6 @@ class WorldEnv(Worlds, gymnasium.Env[Any, np.ndarray]):
     Raises:
         ConfigError: For a configuration that cannot be used.
         ValueError: For another render mode.
-        OpenGLError: For the mode "human" where there is no screen.
 
     Examples:
         >>> import gymnasium
@@ -51,7 +52,7 @@ class WorldEnv(Worlds, gymnasium.Env[Any, np.ndarray]):
         ['cost', 'cost_exception', 'cost_hazards', 'goal_met']
     """
 
-    metadata: dict[str, Any] = {"render_modes": ["human", "rgb_array"]}  # noqa: RUF012
+    metadata: dict[str, Any] = {"render_modes": RENDER_MODES}  # noqa: RUF012
 
     def __init__(
         self,
@@ -76,24 +77,21 @@ class WorldEnv(Worlds, gymnasium.Env[Any, np.ndarray]):
         super().reset(seed=seed)
         self._seed(seed, self.np_random)
         observation = take(self._reset(), 0)
-        self._show()
         return observation, self._position()
 
     def step(self, action: np.ndarray) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
         """Take one action [nu]."""
         observation, values, infos = self._step(np.asarray(action)[None])
-        self._show()
         reward, terminated, truncated = (value[0].item() for value in values)
         info = {key: value[0].item() for key, value in infos.items()} | self._position()
         return take(observation, 0), reward, terminated, truncated, info
 
     def render(self) -> np.ndarray | None:
         """Return a frame, uint8 [height, width, 3], in the mode "rgb_array"."""
-        self._show()
         return self.batch.render(0, **self._view) if self.render_mode == "rgb_array" else None
 
     def close(self) -> None:
-        """Close the viewer and free what OpenGL holds."""
+        """Free what OpenGL holds."""
         self.batch.close()
 
     def _position(self) -> dict[str, Any]:
@@ -113,7 +111,7 @@ class WorldVectorEnv(Worlds, VectorEnv[Any, np.ndarray, np.ndarray]):
         autoreset_mode: When an ended episode is followed by a new one: with the next step, within
             the same step (what ended is then in `infos["final_obs"]` and `infos["final_info"]`), or
             by `reset(options={"reset_mask": mask})`.
-        render_mode: "rgb_array" for frames, "human" for a viewer of row 0, None for neither.
+        render_mode: "rgb_array" for frames, or None.
         camera: As `WorldEnv` takes it.
         width: Of a frame [pixels].
         height: Of a frame [pixels].
@@ -125,7 +123,6 @@ class WorldVectorEnv(Worlds, VectorEnv[Any, np.ndarray, np.ndarray]):
 
     Raises:
         ConfigError: For a configuration that cannot be used.
-        OpenGLError: For the mode "human" where there is no screen.
 
     Examples:
         >>> import gymnasium
@@ -137,7 +134,7 @@ class WorldVectorEnv(Worlds, VectorEnv[Any, np.ndarray, np.ndarray]):
     """
 
     metadata: dict[str, Any] = {  # noqa: RUF012
-        "render_modes": ["human", "rgb_array"],
+        "render_modes": RENDER_MODES,
         "autoreset_mode": AutoresetMode.NEXT_STEP,
     }
 
@@ -189,7 +186,6 @@ class WorldVectorEnv(Worlds, VectorEnv[Any, np.ndarray, np.ndarray]):
         observation = self._reset(mask)
         new = np.ones(self.num_envs, dtype=bool) if mask is None else mask
         self._ended = self._ended & ~new
-        self._show()
         return observation, with_masks(self._positions(), new)
 
     def step(
@@ -217,16 +213,14 @@ class WorldVectorEnv(Worlds, VectorEnv[Any, np.ndarray, np.ndarray]):
             observation = choose(begins, self._reset(begins), observation)
         # Those of a world that begins are of its new episode.
         reported |= with_masks(self._positions(), np.ones_like(begins))
-        self._show()
         return observation, reward, terminated, truncated, reported
 
     def render(self) -> tuple[np.ndarray, ...] | None:
         """Return a frame of every world, uint8 [height, width, 3], in the mode "rgb_array"."""
-        self._show()
         return tuple(self.batch.render(**self._view)) if self.render_mode == "rgb_array" else None
 
     def close_extras(self, **kwargs: Any) -> None:
-        """Close the viewer and free what OpenGL holds."""
+        """Free what OpenGL holds."""
         self.batch.close()
 
     def _check_mask(self, mask: np.ndarray, seed: Any) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
@@ -15,7 +14,6 @@ from gymnasium.spaces import Box, Dict
 from tensordict import TensorDict, TensorDictBase
 from torchrl.data import Composite
 
-from safe_rl.envs.opengl import has_screen, require_screen
 from safe_rl.envs.safety_gym.config import SafetyGymConfig
 from safe_rl.envs.safety_gym.env import SafetyGymEnv
 from safe_rl.envs.safety_gym.suite import resolve
@@ -24,6 +22,7 @@ from safe_rl.envs.velocity.velocity_config import VELOCITY_SUITE
 from safe_rl.envs.velocity.velocity_env import VelocityEnv
 
 NUM_SEEDS = 2**62
+RENDER_MODES = ["rgb_array"]
 
 Observation = np.ndarray | dict[str, np.ndarray]
 Config = Mapping[str, Any] | SafetyGymConfig | None
@@ -42,18 +41,14 @@ class Worlds:
     batch: SimulatedEnv
     _spec: EnvSpec | None = None
     _is_seeded = False
-    _shown_at = 0.0
 
     def _open(self, batch: SimulatedEnv, mode: str | None, positions: bool) -> None:
-        if mode not in (None, *batch.render_modes):
-            raise ValueError(f"render_mode must be one of {batch.render_modes}, got {mode!r}.")
-        if mode == "human":
-            require_screen()
+        if mode not in (None, *RENDER_MODES):
+            raise ValueError(f"render_mode must be one of {RENDER_MODES}, got {mode!r}.")
         self.batch, self.render_mode, self._has_positions = batch, mode, positions
         self._events = [name for name in batch.flags if name not in SimulatedEnv.flags]
-        modes = [name for name in batch.render_modes if name != "human" or has_screen()]
         rate = max(1, round(1 / batch.seconds_per_step))  # in real time, as Gymnasium's
-        self.metadata: dict[str, Any] = {"render_modes": modes, "render_fps": rate}
+        self.metadata: dict[str, Any] = {"render_modes": RENDER_MODES, "render_fps": rate}
 
     @property
     def spec(self) -> EnvSpec | None:
@@ -117,13 +112,6 @@ class Worlds:
     def _positions(self) -> dict[str, Any]:
         """Where everything is now, by kind [N, K, 3] (m), under `positions`; or nothing."""
         return {"positions": arrays_of(self.batch.get_positions())} if self._has_positions else {}
-
-    def _show(self) -> None:
-        """Bring the viewer, if there is to be one, up to date, no faster than real time."""
-        if self.render_mode == "human":
-            time.sleep(max(0.0, self._shown_at + self.batch.seconds_per_step - time.monotonic()))
-            self.batch.show()
-            self._shown_at = time.monotonic()
 
 
 def batch_of(

@@ -1,10 +1,9 @@
-"""Drawing single worlds: for frames, for MuJoCo's viewer and as what a robot's camera sees."""
+"""Drawing single worlds: for frames, and as what a robot's camera sees."""
 
 from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Iterable
 
 import mujoco
 import numpy as np
@@ -12,8 +11,7 @@ import torch
 from torch import Tensor
 
 from safe_rl.envs.errors import ConfigError
-from safe_rl.envs.opengl import PACKAGES, OpenGLError, require_screen
-from safe_rl.envs.pictures import Marker, Pictures, add_markers
+from safe_rl.envs.pictures import Pictures
 from safe_rl.envs.safety_gym.bodies import TRACK, VISION
 from safe_rl.envs.safety_gym.building import build_scene
 from safe_rl.envs.safety_gym.config import SafetyGymConfig
@@ -97,57 +95,6 @@ class Display(Pictures):
 
 def _numbers(values: torch.Tensor, row: int) -> np.ndarray:
     return values[row].cpu().numpy()
-
-
-class Viewer:
-    """A window onto a display; the mouse moves its camera.
-
-    Args:
-        display: what is shown, as it was posed last.
-
-    Raises:
-        OpenGLError: if there is no screen, or no OpenGL.
-    """
-
-    def __init__(self, display: Display) -> None:
-        require_screen()
-        # Its import opens a connection to the screen.
-        import mujoco.viewer
-
-        try:
-            self._window = mujoco.viewer.launch_passive(
-                display.scene.model, display.data, show_left_ui=False, show_right_ui=False
-            )
-        except Exception as error:  # GLFW raises errors of any type
-            raise OpenGLError(
-                f"MuJoCo's viewer cannot be opened ({error}). It needs OpenGL: on Debian or "
-                f"Ubuntu 'apt-get install {PACKAGES['glfw']}'."
-            ) from error
-        camera = display.free_camera()
-        with self._window.lock():
-            self._window.cam.lookat[:] = camera.lookat
-            self._window.cam.distance = camera.distance
-            self._window.cam.azimuth, self._window.cam.elevation = camera.azimuth, camera.elevation
-            self._window.opt.geomgroup[:] = 1
-
-    @property
-    def is_open(self) -> bool:
-        """Whether nobody closed the window."""
-        return self._window.is_running()
-
-    def show(self, markers: Iterable[Marker]) -> None:
-        """Bring the window up to date with the display, and draw markers in it."""
-        if not self.is_open:
-            return
-        with self._window.lock():
-            drawn = self._window.user_scn
-            drawn.ngeom = 0
-            add_markers(drawn, markers)
-        self._window.sync()
-
-    def close(self) -> None:
-        """Close the window."""
-        self._window.close()
 
 
 def vision_blocks(config: SafetyGymConfig, scene: Scene, device: torch.device) -> list[Block]:

@@ -89,7 +89,6 @@ class SafetyGymEnv(SimulatedEnv):
 
     flags: ClassVar = ("goal_met", *SimulatedEnv.flags)
     first_camera: ClassVar = "fixedfar"
-    render_modes: ClassVar = ("human", "rgb_array")
     copied: ClassVar = ("_fixed_layout", *SimulatedEnv.copied)
 
     def __init__(
@@ -259,11 +258,3 @@ class SafetyGymEnv(SimulatedEnv):
             self.reset()
         write_state(self._world, state)
         self._measured.copy_(self._task.measure(self._world))
-
-    def show(self, row: int = 0) -> None:
-        """Show one world as it is in MuJoCo's viewer, opened by the first call.
-
-        Raises:
-            OpenGLError: if there is no screen.
-        """
-        self._renderer.show(row, self._has_cost)

@@ -14,7 +14,7 @@ from torch import Tensor
 from safe_rl.envs.pictures import Camera, Marker
 from safe_rl.envs.safety_gym.bodies import VISION
 from safe_rl.envs.safety_gym.config import SafetyGymConfig
-from safe_rl.envs.safety_gym.display import Display, Viewer
+from safe_rl.envs.safety_gym.display import Display
 from safe_rl.envs.safety_gym.elements import BOX, CYLINDER, ELEMENTS, SPHERE
 from safe_rl.envs.safety_gym.world import NO_BUTTON, Block, World
 
@@ -106,7 +106,6 @@ class WorldRenderer:
         self._config = config = world.scene.config
         self._display = Display(config)
         self._lidars = lidars if config.render_lidar_markers else []
-        self._viewer: Viewer | None = None
 
     def frames(
         self, rows: list[int], has_cost: Tensor, camera: Camera, width: int, height: int
@@ -122,23 +121,9 @@ class WorldRenderer:
             self._add_inset(frame)
         return frames
 
-    def show(self, row: int, has_cost: Tensor) -> None:
-        """Show one of the worlds in MuJoCo's viewer, which is opened by the first call.
-
-        Raises:
-            OpenGLError: if there is no screen.
-        """
-        self._display.pose(self._world, row)
-        if self._viewer is None:
-            self._viewer = Viewer(self._display)
-        self._viewer.show(self._markers(row, self._readings(), bool(has_cost[row])))
-
     def close(self) -> None:
-        """Close the viewer and free what OpenGL holds."""
+        """Free what OpenGL holds."""
         self._display.close()
-        if self._viewer is not None:
-            self._viewer.close()
-            self._viewer = None
 
     def _readings(self) -> dict[str, Tensor]:
         """Present lidar readings of all worlds by kind, [N, num_bins]."""

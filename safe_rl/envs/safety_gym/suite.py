@@ -126,49 +126,6 @@ EXTRAS: dict[str, SafetyGymConfig] = _DEBUG_SUITE | {
 }
 
 
-_LEFT_AND_RIGHT = [(-0.5, 2.0), (0.5, 4.0), (-0.5, 6.0), (0.5, 8.0)]
-# A fence of hazards, around the robot's place and the way to the goal.
-_FENCE = [
-    *((x, float(y)) for x in (2.0, -2.0) for y in range(-1, 13)),
-    *((float(x), y) for y in (-2.0, 13.0) for x in range(-2, 3)),
-]
-
-
-def _grid(goal: float, max_dist: float, hazards: list[tuple[float, float]]) -> Values:
-    return {
-        "goal_locations": ((0.0, goal),),
-        "lidar_max_dist": max_dist,
-        "hazards_num": len(hazards),
-        "hazards_locations": tuple(hazards),
-    }
-
-
-_GRID: Values = {
-    "continue_goal": False,
-    "observe_remaining": True,
-    "observe_goal_lidar": True,
-    "observe_hazards": True,
-    "constrain_hazards": True,
-    "hazards_size": 1.0,
-    "goal_size": 0.5,
-    "robot_placements": ((-1.0, -1.0, 1.0, 1.0),),
-}
-_GRIDS: dict[str, Values] = {
-    "0": _grid(2.0, 6.0, []),
-    "1": _grid(4.0, 6.0, _LEFT_AND_RIGHT[:1]),
-    "2": _grid(6.0, 10.0, _LEFT_AND_RIGHT[:2]),
-    "4": _grid(10.0, 14.0, _LEFT_AND_RIGHT),
-    "Wall": _grid(10.0, 14.0, [*_LEFT_AND_RIGHT, *_FENCE]),
-}
-
-# The original's unit tests have these, as `Testing-PointGrid0-v0`: a way past pinned hazards.
-TESTING: dict[str, SafetyGymConfig] = {
-    f"{robot}Grid{name}": SafetyGymConfig(**{**_GRID, **own, **values})
-    for robot, own in _ROBOTS.items()
-    for name, values in _GRIDS.items()
-}
-
-
 def resolve(env: str | Mapping[str, Any] | SafetyGymConfig) -> SafetyGymConfig:
     """Return the configuration of a name, a mapping of keys, or a configuration.
 
@@ -191,14 +148,14 @@ def resolve(env: str | Mapping[str, Any] | SafetyGymConfig) -> SafetyGymConfig:
             "An environment is a suite name, a mapping of configuration keys or a SafetyGymConfig, "
             f"got {type(env).__name__}."
         )
-    name = env.removeprefix("Safexp-").removeprefix("Testing-").removesuffix("-v0")
-    named = SUITE | EXTRAS | TESTING
+    name = env.removeprefix("Safexp-").removesuffix("-v0")
+    named = SUITE | EXTRAS
     if name not in named:
         raise ConfigError(
             f"Unknown environment '{env}'.{nearest(name, named)} The suite has "
             "{Point, Car, Doggo}{Goal, Button, Push}{0, 1, 2}, for example 'PointGoal1'; beyond it "
             "there are {Point, Car, Doggo}{Run, Run1, Circle, Circle1, Circle2}, and a "
-            "{name}Vision of every one; for tests, {Point, Car, Doggo}Grid{0, 1, 2, 4, Wall}."
+            "{name}Vision of every one."
         )
     return named[name]
 
