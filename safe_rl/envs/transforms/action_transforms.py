@@ -117,9 +117,6 @@ class ActionDelay(ConstraintTransform):
     Args:
         steps: Steps from an action to its effect.
 
-    Raises:
-        ValueError: for fewer than one.
-
     Examples:
         >>> import torch
         >>> from safe_rl.envs import make_env
@@ -132,8 +129,6 @@ class ActionDelay(ConstraintTransform):
 
     def __init__(self, steps: Annotated[int, Range(1, 1000)]) -> None:
         super().__init__()
-        if steps < 1:
-            raise ValueError(f"steps={steps} must be at least 1.")
         self._steps = steps
         self._pending: Tensor | None = None
 
@@ -172,9 +167,6 @@ class ActionRepeat(ConstraintTransform):
     Args:
         k: Steps for which an action is held.
 
-    Raises:
-        ValueError: for fewer than one.
-
     Examples:
         >>> from safe_rl.envs import make_env
         >>> env = make_env("PointGoal1", seed=0, transforms={"repeat": ActionRepeat(4)})
@@ -184,8 +176,6 @@ class ActionRepeat(ConstraintTransform):
 
     def __init__(self, k: Annotated[int, Range(1, 1000)]) -> None:
         super().__init__()
-        if k < 1:
-            raise ValueError(f"k={k} must be at least 1.")
         self.steps_per_decision = k
 
     def _sums(self) -> Sequence[str]:

@@ -13,12 +13,13 @@ from torchrl.envs.transforms import Transform
 
 from safe_rl.envs.costs import is_cost
 from safe_rl.naming import did_you_mean, key_name
+from safe_rl.ranges import Checked
 
 OWN_REWARD = "task_reward"
 """Where transforms that change the reward leave the environment's own one."""
 
 
-class ConstraintTransform(Transform):
+class ConstraintTransform(Checked, Transform):
     """Base of transforms that keep the environment's contract and are saved in snapshots.
 
     A subclass keeps what it needs of every row's episode in `_rows`, tensors [..., m] by name:

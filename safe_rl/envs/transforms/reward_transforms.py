@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from typing import Any
 
@@ -35,9 +34,6 @@ class RewardScale(ConstraintTransform):
     Args:
         factor: What rewards are multiplied by.
 
-    Raises:
-        ValueError: for a factor that is not positive.
-
     Examples:
         >>> from safe_rl.envs import make_env
         >>> env = make_env("SafeHopperVelocity", seed=0, transforms={"s": RewardScale(0.01)})
@@ -50,8 +46,6 @@ class RewardScale(ConstraintTransform):
 
     def __init__(self, factor: Positive) -> None:
         super().__init__()
-        if not (math.isfinite(factor) and factor > 0):
-            raise ValueError(f"factor={factor:g} must be a number above 0.")
         self._factor = factor
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
@@ -164,8 +158,6 @@ class Saute(ConstraintTransform):
         rescale_budgets: bool,
     ) -> None:
         super().__init__()
-        if not 0 < discount <= 1:
-            raise ValueError(f"discount={discount:g} must be above 0 and at most 1.")
         self.needed_costs = self._budgets = check_budgets(budgets, above_zero=True)
         self._discount = discount
         self._unsafe_reward = unsafe_reward
@@ -273,10 +265,6 @@ class Simmer(Saute):
         **settings: Any,
     ) -> None:
         super().__init__(budgets, **settings)
-        if not 0 < first <= 1:
-            raise ValueError(f"first={first:g} must be above 0 and at most 1.")
-        if steps < 1:
-            raise ValueError(f"steps={steps} must be at least 1.")
         self._first, self._steps = first, steps
         self._steps_before = 0
 
