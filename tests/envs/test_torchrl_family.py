@@ -17,7 +17,6 @@ from torchrl.envs.utils import check_env_specs
 
 from safe_rl import targets
 from safe_rl.cli import evaluate, report
-from safe_rl.collectors.workers import split_rows
 from safe_rl.envs import ConfigError, complete_env, make_env
 from safe_rl.envs.families import TORCHRL_CLASSES
 from safe_rl.runs.table import read_table
@@ -151,18 +150,6 @@ def test_gymnasiums_environments_step_as_they_do_there():
     assert 0 < far.sum() < far.numel()
 
 
-def test_numbers_in_info_are_costs_where_they_are_named():
-    node = GYM | {"kwargs": {"env_name": "Walk-v0"}, "cost_keys": ["fast", "far"]}
-    env = make_env(node, num_envs=2, seed=0)
-    check_env_specs(env)
-    rollout = env.rollout(30, break_when_any_done=False)
-    place, speed = rollout["next", "observation"].split(1, -1)
-    torch.testing.assert_close(rollout["next", "fast"], (speed.abs() > 1).float())
-    torch.testing.assert_close(rollout["next", "far"], place.abs())
-    torch.testing.assert_close(rollout["next", "cost"], rollout["next", "fast"] + place.abs())
-    assert env.max_episode_steps == 25
-
-
 def test_costs_may_be_entries_ranges_and_functions_at_once(trusted):
     env = make_env(RUNNER | {"outside": {"cost_out": ["place", -9, 1.5]}}, num_envs=3, seed=0)
     assert env.cost_keys == ["cost", "cost_effort", "cost_out"]
@@ -197,13 +184,6 @@ def test_several_entries_become_a_vector_or_a_dictionary():
     assert flat.observation_layout["price_history"] == slice(1, 51)
 
 
-def test_a_dictionary_is_trained_on_entry_by_entry(tmp_path):
-    parts = ("env.flatten=false", "model=dict", "model.encoders.vector=[4]")
-    outside = "env.outside={cost_speed: [thdot, -4, 4]}"
-    run_train(*SMALL, outside, *parts, "frames=160", f"hydra.run.dir={tmp_path / 'run'}")
-    assert read_table(tmp_path / "run" / "progress.csv")["steps"] == [160]
-
-
 def starts(seed: int, num_envs: int = 4) -> list[float]:
     return make_env(PENDULUM, num_envs=num_envs, seed=seed).reset()["th"].tolist()
 
@@ -211,15 +191,6 @@ def starts(seed: int, num_envs: int = 4) -> list[float]:
 def test_seeds_determine_rows_and_share_none():
     assert starts(0) == starts(0)
     assert len({*starts(0), *starts(1), *starts(2)}) == 12
-
-
-def test_workers_have_rows_of_their_own():
-    def make(num_envs=1, seed=0):
-        return make_env(PENDULUM, num_envs=num_envs, seed=seed)
-
-    shares = [share() for share in split_rows(make(num_envs=4), make, num_collectors=2)]
-    rows = [share.reset()["th"].tolist() for share in shares]
-    assert len({*rows[0], *rows[1]}) == 4
 
 
 @pytest.mark.parametrize(

@@ -30,7 +30,6 @@ from safe_rl.envs.contract import ConstrainedEnv
 from safe_rl.envs.costs import is_cost
 from safe_rl.envs.errors import ConfigError
 from safe_rl.envs.families import TORCHRL, TORCHRL_CLASSES, complete_foreign
-from safe_rl.envs.gymnasium.gymnasium_env import CostReader
 from safe_rl.envs.opengl import load_backend
 from safe_rl.envs.rng import spread_seed
 from safe_rl.envs.torchrl.step_entries import Observe, StepCosts
@@ -145,33 +144,19 @@ def _tried(config: Mapping[str, Any], make_some: Callable[[MakeEnv], EnvBase]) -
     else:
         made = partial(getattr(torchrl.envs, name), **{**TORCHRL_CLASSES[name], **kwargs})
     try:
-        return make_some(partial(_with_infos, made, config))
+        return make_some(made)
     except _FAILURES as error:
         raise ConfigError(f"env.id={name}: {type(error).__name__}: {error}") from error
 
 
-def _with_infos(make: MakeEnv, config: Mapping[str, Any], **kwargs: Any) -> EnvBase:
-    """Make an environment, which also reads costs that Gymnasium reports in `info`."""
-    env = make(**kwargs)
-    if isinstance(env, GymLikeEnv):
-        known = (*env.observation_spec.keys(), *env.full_reward_spec.keys())
-        reported = [key for key in config["cost_keys"] or () if key not in known]
-        if reported:
-            patience = config["num_steps"]
-            env.set_info_dict_reader(CostReader(reported, env.batch_size, patience=patience))
-    return env
-
-
 def _one(make: MakeEnv) -> EnvBase:
-    found: Any = make
-    while isinstance(found, partial):
-        found = found.args[0] if found.func is _with_infos else found.func
+    found = make.func if isinstance(make, partial) else make
     made = found.__init__ if inspect.isclass(found) else found
     return make(num_envs=1) if "num_envs" in inspect.signature(made).parameters else make()
 
 
 def _batch(make: MakeEnv, num_envs: int) -> EnvBase:
-    """Make N environments, by whatever way their class has to be many.
+    """Make N environments.
 
     A class that takes `num_envs` makes them itself. A class without a state of its own is stepped
     with the states of all rows at once; of others there are N, stepped one after the other.
