@@ -90,14 +90,7 @@ def complete_foreign(family: ForeignFamily, node: Mapping[str, Any]) -> dict[str
 
 
 def hint_of_gymnasium(name: str) -> str:
-    """Say how to choose an environment by its Gymnasium id; an empty text for any other name.
-
-    Examples:
-        >>> hint_of_gymnasium("CartPole-v1")
-        " It is one of Gymnasium's: env=gymnasium env.id=CartPole-v1."
-        >>> hint_of_gymnasium("Safexp-PointGoal1-v0"), hint_of_gymnasium("PointGaol1")
-        ('', '')
-    """
+    """Say how to choose an environment by its Gymnasium id; an empty text for any other name."""
     spec = gymnasium.registry.get(name)
     if spec is None or str(spec.entry_point).startswith("safe_rl."):
         return ""
@@ -200,10 +193,6 @@ def config_node(name: str, config: Any, target: str | None = None) -> dict[str, 
         name: Of the environment.
         config: A `SafetyGymConfig` or a `VelocityConfig`.
         target: `_target_` of the family; None is Safety Gym's.
-
-    Examples:
-        >>> config_node("mine", VELOCITY_SUITE["SafeHopperVelocity"])["healthy_angle_range"]
-        [-0.2, 0.2]
     """
     family = {} if target is None else {"_target_": target}
     return {"name": name, **family, **{k: _plain(v) for k, v in config.to_dict().items()}}
@@ -241,15 +230,7 @@ def env_names() -> list[str]:
 
 
 def env_node(name: str) -> dict[str, Any]:
-    """Return the node of the group `env` that a name stands for, with every key.
-
-    Raises:
-        KeyError: If there is no such name.
-
-    Examples:
-        >>> env_node("CarPush2")["pillars_num"]
-        4
-    """
+    """Return the node of the group `env` that a name stands for; KeyError if there is none."""
     target = _TARGETS[name]
     return config_node(name, FAMILIES[target].suite[name], target)
 
@@ -257,29 +238,15 @@ def env_node(name: str) -> dict[str, Any]:
 def complete_env(node: Mapping[str, Any]) -> dict[str, Any]:
     """Complete a node that has only what differs from the defaults of its family.
 
-    Args:
-        node: As `make_env` takes it; what it holds stays as it is.
-
     Raises:
         ConfigError: For an unknown key or a value that cannot be used.
-
-    Examples:
-        >>> complete_env({"name": "mine", "robot_base": "point"})["randomize_layout"]
-        True
     """
     family = FAMILIES.get(node.get("_target_"))
     return dict(node) if family is None else family.complete(node)
 
 
 def stored_node(name: str) -> dict[str, Any] | None:
-    """Return the node that was stored by a name, see `safe_rl.envs.store_config`; None without.
-
-    Examples:
-        >>> from safe_rl.envs import store_config
-        >>> store_config("MyPoint", {"robot_base": "point", "hazards_num": 3})
-        >>> stored_node("MyPoint")["hazards_num"]
-        3
-    """
+    """Return the node that was stored by a name, see `safe_rl.envs.store_config`; None without."""
     held = _stored().get(f"{name}.yaml")
     if held is None:
         return None

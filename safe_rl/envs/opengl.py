@@ -39,14 +39,10 @@ def _has_screen() -> bool:
 
 
 def open_renderer(model: mujoco.MjModel, width: int, height: int) -> mujoco.Renderer:
-    """Open an OpenGL context that draws pictures of one size.
+    """Open an OpenGL context that draws pictures of one size [pixels].
 
     The backend is the one that MUJOCO_GL names, or EGL where there is neither that nor a screen.
-
-    Args:
-        model: What is drawn; its offscreen buffer is set to the size.
-        width: Of the pictures [pixels].
-        height: Of the pictures [pixels].
+    The model's offscreen buffer is set to the size.
 
     Raises:
         OpenGLError: If OpenGL is missing or cannot be started.

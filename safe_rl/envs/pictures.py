@@ -73,17 +73,7 @@ class Pictures(ABC):
         markers: Iterable[Marker] = (),
         labels: Collection[str] = (),
     ) -> np.ndarray:
-        """Draw what is in `data`.
-
-        Args:
-            camera: A name of `cameras`, or a custom camera.
-            width: Of the picture [pixels].
-            height: Of the picture [pixels].
-            markers: Drawn besides the model.
-            labels: Names of bodies that are written at them.
-
-        Returns:
-            RGB, uint8 [height, width, 3].
+        """Draw what is in `data`, with markers and labels of bodies: uint8 [height, width, 3].
 
         Raises:
             ValueError: For an unknown camera.

@@ -114,9 +114,8 @@ def store_configs() -> None:
 def register_gymnasium() -> None:
     """Give Gymnasium an id `Safexp-{name}-v0` for every name, and `Safexp-Custom-v0`.
 
-    The custom one has the defaults of every configuration key; all of them take a `config` with
-    keys to change. The velocity family has `SafeHopperVelocity-v0` and so on. What the ids stand
-    for is imported when an environment is made.
+    The custom one has the defaults of every key; all of them take a `config` with keys
+    to change. The velocity family has `SafeHopperVelocity-v0` and so on.
     """
     ids = {f"Safexp-{name}-v0": name for name in (*SUITE, *EXTRAS)} | {"Safexp-Custom-v0": None}
     ids |= {f"{name}-v0": name for name in VELOCITY_SUITE}

@@ -102,9 +102,7 @@ class SimulatedEnv(ConstrainedEnv):
         return {}
 
     def set_row_seeds(self, seeds: Sequence[int | None]) -> None:
-        """Seed every world on its own, [N]: with the episodes of row 0 of its seed.
-
-        None leaves a world as it was seeded.
+        """Seed worlds on their own, [N]: with the episodes of row 0 of a seed; None leaves one.
 
         Raises:
             ValueError: If there are not as many seeds as worlds.
@@ -186,24 +184,17 @@ class SimulatedEnv(ConstrainedEnv):
         """Check a state, and put the worlds into it."""
 
     def get_state(self) -> TensorDict:
-        """Return a copy of everything that determines what happens next.
-
-        Returns:
-            TensorDict [N] with what the class says of states, and the seeds: `seed`, `episode`.
-        """
+        """Return a copy of everything that determines what happens next, seeds included, [N]."""
         state = self._read_state()
         state["seed"], state["episode"] = self._row_seed.clone(), self._episode.clone()
         return state
 
     @torch.no_grad()
     def set_state(self, state: TensorDictBase) -> TensorDict:
-        """Set the worlds to a state, for resuming, branching and tests.
+        """Set the worlds to a state, for resuming and tests; returns what a reset returns.
 
         Args:
             state: TensorDict [N] as `get_state` returns it; without seeds the present ones stay.
-
-        Returns:
-            What a reset returns, for that state.
 
         Raises:
             KeyError: If a key is missing.
@@ -271,14 +262,7 @@ class ResetNeededError(RuntimeError):
 
 
 def require_episodes(begun: Tensor) -> None:
-    """Check that every environment is in an episode.
-
-    Args:
-        begun: Environments that were reset or put into a state, bool [N].
-
-    Raises:
-        ResetNeededError: If some were not.
-    """
+    """Raise ResetNeededError unless every environment is in an episode, `begun` [N]."""
     if not begun.all():
         rows = (~begun).nonzero()[:, 0].tolist()
         which = "" if not begun.any() else f" of rows {rows}"
@@ -298,10 +282,6 @@ def check_state(
         state: What is about to be set.
         optional: Keys that may be missing.
         finite: Keys that may hold no NaN or infinity; elsewhere they are failures of the physics.
-
-    Raises:
-        KeyError: If another key is missing.
-        ValueError: If a shape or a type does not fit, or a number is not finite.
     """
     for key, value in expected.items():
         if key not in state:

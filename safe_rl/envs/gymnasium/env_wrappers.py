@@ -34,8 +34,7 @@ def adapt(
         flatten: Make one vector of the observation; False leaves pictures and dictionaries.
 
     Raises:
-        ValueError: If actions are neither continuous and bounded nor choices, or observations are
-            no arrays and not to be flattened.
+        ValueError: For actions or observations that policies cannot have.
     """
     env = _flat(env) if flatten else _by_entry(env)
     env = _with_plain_actions(env)
@@ -43,21 +42,10 @@ def adapt(
 
 
 class FloatCosts(gymnasium.Wrapper):
-    """Makes the costs in `info` floats.
+    """Makes the costs in `info` floats; what is no single number stays as it is.
 
     Gymnasium puts the costs of a batch into an array of the type of the first row: if that is an
     integer, the costs of all rows would be rounded.
-
-    Args:
-        env: The environment.
-        cost_keys: Names in `info`; what is no single number stays as it is.
-
-    Examples:
-        >>> class Push(gymnasium.Env):
-        ...     def step(self, action):
-        ...         return np.zeros(1), 0.0, False, False, {"cost": 0, "pushes": 3}
-        >>> FloatCosts(Push(), ["cost"]).step(None)[-1]
-        {'cost': 0.0, 'pushes': 3}
     """
 
     def __init__(self, env: gymnasium.Env, cost_keys: Sequence[str]) -> None:
@@ -81,17 +69,6 @@ class CostsOutside(gymnasium.Wrapper):
     Args:
         env: The environment.
         ranges: Name of the cost -> range of a column of the flattened observation.
-
-    Raises:
-        ValueError: If the observation has no such column.
-
-    Examples:
-        >>> from safe_rl.envs.costs import parse_ranges
-        >>> ranges = parse_ranges({"cost_position": [0, -0.5, 0.5]}, "observation")
-        >>> env = CostsOutside(gymnasium.make("CartPole-v1"), ranges)
-        >>> _ = env.reset(seed=0)
-        >>> env.step(0)[-1]
-        {'cost_position': 0.0}
     """
 
     def __init__(self, env: gymnasium.Env, ranges: dict[str, CostRange]) -> None:
@@ -132,11 +109,7 @@ class SixValues(gymnasium.Wrapper):
     """
 
     def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
-        """Take an action.
-
-        Raises:
-            ValueError: If the environment returns another number of values.
-        """
+        """Take an action; ValueError if the environment returns another number of values."""
         values: tuple[Any, ...] = self.env.step(action)
         if len(values) != 6:
             raise ValueError(

@@ -40,12 +40,6 @@ class CostReader(BaseInfoDictReader):
         highest: Name -> the most that a step can cost, where that is known.
         patience: Steps until the warning; None: never.
 
-    Examples:
-        >>> from tensordict import TensorDict
-        >>> reader = CostReader(["cost_crash"], [2])
-        >>> reader({"speed": np.ones(2)}, TensorDict(batch_size=[2]))["cost_crash"].flatten()
-        tensor([0., 0.])
-
     Raises:
         ConfigError: By the call, if a cost is not one number per step, or its name is misspelt.
     """

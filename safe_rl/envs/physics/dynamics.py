@@ -30,15 +30,6 @@ def scale_dynamics(model: mujoco.MjModel, scales: Mapping[str, float], bodies: s
 
     Raises:
         ConfigError: if an actuator's force is no linear function of its gain, as a muscle's.
-
-    Examples:
-        >>> hopper = mujoco.MjModel.from_xml_string(
-        ...     "<mujoco><worldbody><body><freejoint/><geom size='1' mass='2'/></body></worldbody>"
-        ...     "</mujoco>"
-        ... )
-        >>> scale_dynamics(hopper, {"mass_scale": 1.5}, slice(1, 2))
-        >>> hopper.body_mass.tolist(), hopper.body_subtreemass.tolist()
-        ([0.0, 3.0], [3.0, 3.0])
     """
     for name, scale in SCALES.items():
         factor = scales.get(name, 1.0)

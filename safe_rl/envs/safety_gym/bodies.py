@@ -101,12 +101,7 @@ DISPLAY_RIM = 0.1  # how far a cropped floor reaches beyond the placements [m]
 
 
 def decorate(spec: mujoco.MjSpec, config: SafetyGymConfig) -> None:
-    """Add cameras, light, sky and floor pattern to a world, and nothing that physics feels.
-
-    Args:
-        spec: the world, with its robot and a geom named "floor".
-        config: the environment; `floor_display_mode` crops the visible floor to the placements.
-    """
+    """Add cameras, light, sky and floor pattern to a world, and nothing that physics feels."""
     floor = spec.geom("floor")
     if config.floor_display_mode:
         half = max(abs(bound) for bound in config.placements_extents) + DISPLAY_RIM
@@ -151,10 +146,7 @@ def _add_sky(spec: mujoco.MjSpec) -> None:
 
 
 def _add_light(spec: mujoco.MjSpec) -> None:
-    """Light from above and the south-west, so that upright faces differ.
-
-    It casts no shadows: they would take software OpenGL a hundred times longer than the rest.
-    """
+    """Light from above and the south-west; shadows would take software OpenGL much longer."""
     spec.worldbody.add_light(
         pos=[0, 0, 4],
         dir=[0.3, 0.4, -1],

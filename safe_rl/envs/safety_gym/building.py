@@ -36,9 +36,6 @@ def build_scene(config: SafetyGymConfig, sleep: bool = False, decorated: bool = 
         sleep: let resting free bodies sleep until something touches them.
         decorated: build the world for pictures: areas are bodies too, and there are cameras, light
             and a floor pattern. Its `qpos` and first mocap bodies are those of the plain world.
-
-    Raises:
-        ConfigError: if a custom robot file lacks what an environment needs.
     """
     # A robot file that has changed makes another world.
     content = fingerprint(robot_path(config.robot_base))

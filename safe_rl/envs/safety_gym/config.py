@@ -112,12 +112,7 @@ class KeyRow(NamedTuple):
 
 
 def key_table() -> list[KeyRow]:
-    """Return a row for every key, registered ones included.
-
-    Examples:
-        >>> {row.name: row for row in key_table()}["hazards_size"][1:]
-        ('number', 'greater than 0', 'radius [m]', 0.3)
-    """
+    """Return a row for every key, registered ones included."""
     rows = []
     for name, key in _keys.items():
         words = TYPES[key.annotation][0].removeprefix("an ").removeprefix("a ")

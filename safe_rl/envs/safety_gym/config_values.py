@@ -150,11 +150,7 @@ TYPES: dict[str, tuple[str, Callable[[Any], Any]]] = {
 
 
 def coerce(name: str, key: Key, value: Any) -> Any:
-    """Return `value` as the type of a key, within the key's range.
-
-    Raises:
-        ConfigError: if it is of another type, or out of range.
-    """
+    """Return `value` as the type of a key, within the key's range; ConfigError if it is not."""
     if key.annotation not in TYPES:
         raise ConfigError(f"The type of key '{name}' must be one of {tuple(TYPES)}.")
     words, parse = TYPES[key.annotation]
@@ -190,11 +186,7 @@ def _numbers(value: Any) -> list[float]:
 
 
 def infer_key(name: str, default: Any) -> Key:
-    """Return the key of the type that a default value has.
-
-    Raises:
-        ConfigError: if the default alone does not tell.
-    """
+    """Return the key of the type that a default value has; ConfigError if it does not tell."""
     kind = type(default[0] if isinstance(default, tuple) and default else default)
     name_of = {bool: "bool", int: "int", float: "float", str: "str"}.get(kind)
     if isinstance(default, tuple):
@@ -222,11 +214,7 @@ def infer_range(name: str) -> Range:
 
 
 def check_choice(name: str, value: Any, choices: Collection[Any]) -> None:
-    """Check that a value is one of several.
-
-    Raises:
-        ConfigError: if it is none of them; the nearest one is named.
-    """
+    """Check that a value is one of several; ConfigError names the nearest one."""
     if value not in choices:
         hint = nearest(value, map(str, choices)) if isinstance(value, str) else ""
         raise ConfigError(f"'{name}' must be one of {tuple(choices)}, got {value!r}.{hint}")

@@ -20,13 +20,7 @@ from safe_rl.envs.safety_gym.world import World
 
 
 def hazard_cost(robot_xy: Tensor, hazard_xy: Tensor, size: float) -> Tensor:
-    """Depth [m] to which the robot is inside hazards, summed over them.
-
-    Args:
-        robot_xy: [N, 2].
-        hazard_xy: [N, K, 2].
-        size: radius of a hazard [m].
-    """
+    """Depth [m] to which the robot [N, 2] is inside hazards [N, K, 2] of a radius, summed."""
     distance = torch.hypot(*(hazard_xy - robot_xy.unsqueeze(-2)).unbind(-1))
     return torch.rsub(distance, size).relu_().sum(-1)
 
@@ -37,13 +31,7 @@ def contact_cost(contacts: Tensor) -> Tensor:
 
 
 def displacement_cost(xy: Tensor, start_xy: Tensor, threshold: float) -> Tensor:
-    """Distance [m] objects were moved since the reset, where above the threshold, summed.
-
-    Args:
-        xy: current positions [N, K, 2].
-        start_xy: positions at the reset [N, K, 2].
-        threshold: displacements up to this one are free [m].
-    """
+    """Distance [m] that objects [N, K, 2] were moved since the reset, if above the threshold."""
     moved = torch.hypot(*(xy - start_xy).unbind(-1))
     return torch.where(moved > threshold, moved, 0.0).sum(-1)
 
@@ -55,13 +43,7 @@ def velocity_cost(velocity: Tensor, threshold: float) -> Tensor:
 
 
 def wrong_button_cost(contacts: Tensor, goal_button: Tensor, timer: Tensor) -> Tensor:
-    """Contact points with buttons that are not the goal, while the buttons are awake.
-
-    Args:
-        contacts: [N, K].
-        goal_button: index of the goal button or -1, int64 [N].
-        timer: steps until the buttons wake up, int64 [N].
-    """
+    """Contact points [N, K] with buttons that are not the goal [N], while the `timer` [N] is 0."""
     number = torch.arange(contacts.shape[-1], device=contacts.device)
     wrong = number != goal_button.unsqueeze(-1)
     return (contacts * wrong).sum(-1) * (timer == 0)
@@ -70,12 +52,7 @@ def wrong_button_cost(contacts: Tensor, goal_button: Tensor, timer: Tensor) -> T
 def boundary_cost(xy: Tensor, half_x: float | None, half_y: float | None) -> Tensor:
     """How far [m] the robot is outside of |x| ≤ half_x and |y| ≤ half_y, summed: [N, 2] -> [N].
 
-    The CPO paper's circle task (Achiam et al. 2017, section 8.1) has the first of them.
-
-    Args:
-        xy: of the robot.
-        half_x: None is no boundary.
-        half_y: likewise.
+    None is no boundary. The CPO paper's circle task (Achiam et al. 2017, section 8.1) has one in x.
     """
     (x, y), (most_x, most_y) = xy.abs().unbind(-1), map(_or_infinite, (half_x, half_y))
     return (x - most_x).clamp_(min=0.0).add_((y - most_y).clamp_(min=0.0))
@@ -158,16 +135,9 @@ def _magnitude(row: Cost, config: SafetyGymConfig, world: World) -> Tensor:
 def compute_costs(
     rows: Sequence[Cost], config: SafetyGymConfig, world: World, failed: Tensor
 ) -> Tensor:
-    """Compute every cost of the worlds as they are.
+    """Compute every cost of the worlds as they are, one row for each of `cost_keys(rows)`: [R, N].
 
-    Args:
-        rows: what the environment was made with, from `active_costs`.
-        config: the environment.
-        world: the worlds, up to date.
-        failed: worlds whose physics failed, bool [N]; their only cost is `cost_exception`.
-
-    Returns:
-        One row for each of `cost_keys(rows)`, [1 + number of kinds + 1, N].
+    The only cost of worlds whose physics failed, bool [N], is `cost_exception`.
 
     Raises:
         ConfigError: if a registered cost is not one number of at least 0 per world.

@@ -46,15 +46,10 @@ class Purpose(IntEnum):
 
 
 def pick_layouts(config: SafetyGymConfig, key: Tensor) -> Tensor:
-    """Pick layouts from the finite set that a configuration names, uniformly.
+    """Pick layouts uniformly from the finite set of `layout_seeds`, by keys [N]: layout keys [N].
 
-    Args:
-        config: the environment, with `layout_seeds`.
-        key: random keys to pick with, int64 [N].
-
-    Returns:
-        Layout keys [N]: functions of the picked layout seeds alone, so that environments with other
-        seeds, and runs that evaluate on the same set, meet the same layouts.
+    They depend on the picked layout seeds alone, so that environments with other seeds, and runs
+    that evaluate on the same set, meet the same layouts.
     """
     assert config.layout_seeds is not None
     index = (rng.uniform(key, Purpose.SPLIT) * config.layout_seeds).to(torch.int64)
@@ -76,15 +71,7 @@ def pinned_yaws(scene: Scene) -> Tensor:
 
 
 def draw_layouts(plan: PlacementPlan, physics: Physics, key: Tensor) -> Tensor:
-    """Draw where everything stands when episodes begin.
-
-    Args:
-        plan: what is placed where.
-        physics: the backend that it is for.
-        key: random key of each episode, int64 [B].
-
-    Returns:
-        Positions [B, 1 + M, 2]: the robot, then the objects by slot.
+    """Draw where everything stands in the episodes of keys [B]: [B, 1 + M, 2], the robot first.
 
     Raises:
         LayoutError: naming the object that did not fit.
@@ -99,13 +86,13 @@ def draw_layouts(plan: PlacementPlan, physics: Physics, key: Tensor) -> Tensor:
 
 
 def start_episodes(world: World, layouts: Tensor, key: Tensor, mask: Tensor) -> None:
-    """Set some worlds to the initial state of a new episode.
+    """Set the worlds of a mask, bool [N], to the initial state of a new episode.
 
     Args:
         world: the worlds; those in `mask` are brought up to date.
         layouts: where everything stands [N, 1 + M, 2].
         key: random key of each world's episode, int64 [N].
-        mask: worlds to start anew, bool [N].
+        mask: worlds to start anew.
     """
     scene = world.scene
     put(world.layout, mask, layouts)
@@ -133,16 +120,7 @@ def _choose_button(world: World, key: Tensor, mask: Tensor) -> None:
 
 
 def next_goals(world: World, plan: PlacementPlan, key: Tensor, mask: Tensor) -> Tensor:
-    """Draw a new goal for some worlds.
-
-    Args:
-        world: the worlds, up to date.
-        plan: what is placed where.
-        key: random keys, int64 [N].
-        mask: worlds that get a new goal, bool [N].
-
-    Returns:
-        Worlds where no place for a goal was found, bool [N].
+    """Draw a new goal for the worlds of a mask: where no place for one was found, bool [N].
 
     Raises:
         LayoutError: for those, if `terminate_resample_failure` is False.
@@ -206,19 +184,6 @@ class LayoutsAhead:
         num_envs: number of rows, N.
         num_columns: 1 + M.
         device: where the keys are.
-
-    Examples:
-        >>> asked = []
-        >>> def draw(key):
-        ...     asked.append(key.tolist())
-        ...     return key.view(-1, 1, 1).expand(-1, 1, 2).double()
-        >>> layouts = LayoutsAhead(draw, num_envs=2, num_columns=1)
-        >>> layouts(torch.tensor([1, 2]), torch.tensor([3, 4]), torch.tensor([True, False]))
-        tensor([[[1., 1.]],
-        <BLANKLINE>
-                [[4., 4.]]], dtype=torch.float64)
-        >>> asked  # of the second row, what comes next
-        [[1, 4]]
     """
 
     def __init__(
@@ -234,15 +199,12 @@ class LayoutsAhead:
         self._layouts = torch.zeros(num_envs, num_columns, 2, dtype=torch.float64, device=device)
 
     def __call__(self, key: Tensor, following: Tensor, mask: Tensor) -> Tensor:
-        """Layouts of the rows of a mask.
+        """Layouts [N, 1 + M, 2], up to date in the rows of a mask, whose episodes begin.
 
         Args:
             key: keys of the episodes that begin, int64 [N].
             following: keys of the episodes after the present ones, int64 [N].
-            mask: rows whose episodes begin, bool [N].
-
-        Returns:
-            Positions [N, 1 + M, 2], those of the rows of `mask` up to date.
+            mask: bool [N].
 
         Raises:
             LayoutError: naming the object that did not fit.

@@ -15,29 +15,14 @@ def distance(a: Tensor, b: Tensor) -> Tensor:
 
 
 def to_ego(position: Tensor, robot_pos: Tensor, robot_mat: Tensor) -> Tensor:
-    """Rotate positions in the world into the robot's frame.
-
-    Args:
-        position: [N, M, 3].
-        robot_pos: [N, 3].
-        robot_mat: columns are the robot's axes in the world [N, 3, 3].
-
-    Returns:
-        [N, M, 3].
-    """
+    """Rotate positions [N, M, 3] into the frame of robots at [N, 3] with axes [N, 3, 3]."""
     return (position - robot_pos.unsqueeze(-2)) @ robot_mat
 
 
 def floor_to_ego(xy: Tensor, robot_pos: Tensor, robot_mat: Tensor) -> Tensor:
-    """Rotate points on the floor into the robot's frame and leave out z: `to_ego` in fewer passes.
+    """Rotate points on the floor [N, M, 2] into the robot's frame, without z, in few passes.
 
-    Args:
-        xy: [N, M, 2].
-        robot_pos: [N, 3].
-        robot_mat: columns are the robot's axes in the world [N, 3, 3].
-
-    Returns:
-        [N, M, 2], in memory all x before all y, as the passes that follow want it.
+    The result [N, M, 2] has all x before all y in memory, as the passes that follow want it.
     """
     robot_xy, robot_z = robot_pos.split([2, 1], -1)
     x, y = (xy - robot_xy.unsqueeze(1)).unbind(-1)
@@ -67,18 +52,15 @@ def circling_targets(
     timestep: float,
     num_substeps: int,
 ) -> Tensor:
-    """Positions of the gremlins' targets before each substep (circles of radius `travel`).
+    """Positions of the gremlins' targets before each of S substeps: [N, S, K, 3].
 
     Args:
         centres: where the gremlins were placed [N, K, 2].
-        time: simulation time before the first substep [N].
+        time: simulation time before the first substep [N]; at 0 targets stand at +travel along y.
         travel: radius of the circle [m], for all or for each [K].
         height: z of the targets [m], for all or for each [K].
         timestep: length of a substep [s].
         num_substeps: S.
-
-    Returns:
-        [N, S, K, 3]; at time 0 a target stands at +travel along y.
     """
     steps = torch.arange(num_substeps, dtype=time.dtype, device=time.device)
     phase = (time.unsqueeze(-1) + timestep * steps)[..., None]

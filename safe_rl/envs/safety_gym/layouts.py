@@ -72,13 +72,7 @@ def plan_placements(
     num_slots: int,
     device: torch.device | None = None,
 ) -> PlacementPlan:
-    """Build the plan of a configuration.
-
-    Args:
-        config: the environment.
-        slots: slots of each kind that has objects.
-        num_slots: M.
-        device: where layouts are drawn.
+    """Build the plan of a configuration, for kinds in slots of the M objects.
 
     Raises:
         ConfigError: if a placement leaves no room for its object's keepout.
@@ -234,17 +228,10 @@ def _rounds(total: int, rows: int) -> Iterator[tuple[int, int]]:
 
 
 def sample_layouts(plan: PlacementPlan, key: Tensor) -> Tensor:
-    """Draw a layout for every key.
+    """Draw a layout for every key [B]: positions [B, 1 + M, 2], zero for what is not placed.
 
     Every object in its turn gets 100 tries; then the layout is thrown away and drawn again, 10,000
     times at most, and less often where no row's layout is found.
-
-    Args:
-        plan: what to place.
-        key: random keys, int64 [B]; equal keys give equal layouts.
-
-    Returns:
-        Positions [B, 1 + M, 2]: the robot, then the objects by slot; zero for what is not placed.
 
     Raises:
         LayoutError: naming the object that did not fit, and the keys that it depends on.
@@ -295,18 +282,18 @@ def resample_goal(
     layouts: Tensor,
     wanted: Tensor | None = None,
 ) -> tuple[Tensor, Tensor]:
-    """Draw a new goal position beside everything else where it is now.
+    """Draw a new goal beside everything else where it is now, layouts [B, 1 + M, 2].
 
     Args:
         plan: the plan, with a goal in it.
         physics: the backend that it is for, which says whether the host looks at results.
         key: random keys, int64 [B].
-        layouts: current positions [B, 1 + M, 2].
+        layouts: current positions.
         wanted: layouts that get a new goal, bool [B]; None: all.
 
     Returns:
-        The new positions [B, 2], and whether one was wanted and found within 10,000 draws [B],
-        or within 200 where the host does not look.
+        The positions [B, 2], and whether one was wanted and found within 10,000 draws [B], or
+        within 200 where the host does not look.
     """
     item, columns, clearance = plan.beside_goal
     position = layouts.new_zeros(len(key), 2)

@@ -28,15 +28,9 @@ def _num_laps(num_bins: int) -> int:
 def lidar_cells(group: Tensor, num_groups: int, num_bins: int, num_robots: int) -> Tensor:
     """Cells that objects straight ahead are written to, in one array for all lidars of all robots.
 
-    Args:
-        group: which lidar sees each object, int64 [M] below `num_groups`.
-        num_groups: number of lidars, G.
-        num_bins: bins over the full circle.
-        num_robots: N.
-
-    Returns:
-        int64 [3, N, M], for the bin before, that of the object and the one after; robot after
-        robot, lidar after lidar, each of several turns of the circle.
+    For every object, int64 [M], `group` says which of G lidars sees it. The result [3, N, M] is for
+    the bin before, that of the object and the one after; robot after robot, lidar after lidar, each
+    of several turns of the circle.
     """
     laps = _num_laps(num_bins)
     robot = torch.arange(num_robots, device=group.device).unsqueeze(1)
@@ -162,9 +156,8 @@ def _natural(
 ) -> Callable[[World], Tensor]:
     """Rays that see one geom group each: exp(-distance), 0 for a miss.
 
-    Kinds of the same group see the same, so each group's rays are cast once. The benchmark's
-    quirks are kept: the goal's group is the floor's and the robot's limbs' too, and groups beyond
-    MuJoCo's six (the circle's) are never seen.
+    The benchmark's quirks are kept: the goal's group is the floor's and the robot's limbs' too, and
+    groups beyond MuJoCo's six (the circle's) are never seen.
     """
     rays = ray_directions(config.lidar_num_bins).to(device)
     groups = list(dict.fromkeys(element.group for element in elements))

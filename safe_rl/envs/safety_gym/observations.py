@@ -132,10 +132,7 @@ def observation_spec(
 
 
 def _within(bounds: Tensor, shape: tuple[int, ...], kind: dict[str, Any]) -> TensorSpec:
-    """Numbers within (low, high); where only some are bounded, the others get very large bounds.
-
-    TorchRL draws from a spec by its width, and that of infinite bounds makes numbers that are none.
-    """
+    """Numbers within (low, high); where only some are bounded, the others get very large bounds."""
     if bounds.isinf().all():
         return Unbounded(shape=shape, **kind)
     # half as far as there are numbers, so that there is one for the width

@@ -33,14 +33,7 @@ def lidar_halos(
     robot_pos: np.ndarray,
     robot_mat: np.ndarray,
 ) -> Iterator[Marker]:
-    """Rings of spheres above the robot, one per lidar, as bright as the readings.
-
-    Args:
-        config: sizes and heights of the rings (`render_lidar_*`).
-        readings: of every lidar by kind of object, [num_bins] in [0, 1].
-        robot_pos: [3].
-        robot_mat: columns are the robot's axes [3, 3].
-    """
+    """Rings of spheres above the robot, one per lidar, as bright as its readings in [0, 1]."""
     radius, offset = config.render_lidar_radius, config.render_lidar_offset_init
     # A pseudo-lidar's bin is a sector and is drawn at its middle, a natural one's is a ray.
     middle = 0.5 if config.lidar_type == "pseudo" else 0.0
@@ -94,12 +87,7 @@ INSET_SHARE = 1 / 3
 
 
 class WorldRenderer:
-    """Draws the worlds of one environment with lidar halos, goal button, costs and labels.
-
-    Args:
-        world: what is drawn, as it is at the time of drawing.
-        lidars: the observation's lidars, of which halos are drawn.
-    """
+    """Draws the worlds of one environment with lidar halos, goal button, costs and labels."""
 
     def __init__(self, world: World, lidars: list[Block]) -> None:
         self._world = world

@@ -22,11 +22,7 @@ from safe_rl.envs.errors import ConfigError, nearest
 
 
 def fingerprint(path: Path) -> str:
-    """Return a hash of the contents of a robot's files.
-
-    Raises:
-        ConfigError: if one cannot be read.
-    """
+    """Return a hash of the contents of a robot's files."""
     digest = hashlib.sha256()
     for file in robot_files(path):
         content = file.read_bytes()
@@ -48,11 +44,8 @@ def robot_files(path: Path) -> list[Path]:
 def _collect(path: Path, home: Path, folders: Mapping[str, Path], found: dict[Path, None]) -> None:
     """Add a file and all that it names to `found`.
 
-    Args:
-        path: the file.
-        home: folder of the robot's own file, to which all paths are relative.
-        folders: where MuJoCo looks for textures and meshes, also for included files.
-        found: the files so far.
+    All paths are relative to `home`, the folder of the robot's own file; `folders` are where MuJoCo
+    looks for textures and meshes.
     """
     if path in found:
         return
@@ -231,14 +224,7 @@ def own_robot(keys: Mapping[str, Any]) -> Path | None:
 
 
 def copy_robot(path: Path, folder: Path) -> Path:
-    """Copy a robot's file and all files that it names, with their relative paths.
-
-    Args:
-        path: its MJCF file.
-        folder: where to, made if it is not there.
-
-    Returns:
-        The MJCF file of the copy.
+    """Copy a robot's file and all files that it names into a folder: the path of the copy.
 
     Raises:
         ConfigError: if it names files that do not lie in its own folder or below.
@@ -263,11 +249,7 @@ def copy_robot(path: Path, folder: Path) -> Path:
 
 
 def is_robot(path: Path, folder: Path, content: str) -> bool:
-    """Whether a robot's files have a fingerprint, and all of them are in a folder.
-
-    Raises:
-        ConfigError: if one cannot be read.
-    """
+    """Whether a robot's files have a fingerprint, and all of them are in a folder."""
     inside = folder.resolve()
     return fingerprint(path) == content and all(
         file.resolve().is_relative_to(inside) for file in robot_files(path)

@@ -148,14 +148,7 @@ def read_state(world: World) -> TensorDict:
 
 
 def write_state(world: World, state: TensorDictBase) -> None:
-    """Set N worlds to a state and bring everything derived from it up to date.
-
-    Args:
-        world: the worlds.
-        state: TensorDict [N] as `read_state` returns it, which `check_worlds` has passed; `layout`,
-            `start_pose`, `target_quat` and `ctrl` may be missing, and then actuators remember
-            nothing where `act` and `history` are.
-    """
+    """Set N worlds to a state that `check_worlds` has passed, with all that is derived from it."""
     scene, physics = world.scene, world.physics
     target_quat = state.get("target_quat", physics.mocap_quat[:, : scene.num_targets].clone())
     everywhere = torch.ones_like(world.step_count, dtype=torch.bool)
@@ -184,12 +177,7 @@ def write_state(world: World, state: TensorDictBase) -> None:
 
 
 def check_worlds(world: World, expected: TensorDictBase, state: TensorDictBase) -> None:
-    """Check a state before it is set.
-
-    Args:
-        world: the worlds that it is for.
-        expected: their present state, with seeds.
-        state: what is about to be set.
+    """Check a state before it is set, against the `expected` present one.
 
     Raises:
         KeyError: if a key is missing.

@@ -26,13 +26,7 @@ _CENTRE = 1e-12  # [m]
 
 
 def circle_speed(com_xy: Tensor, velocity_xy: Tensor, radius: float) -> Tensor:
-    """Angular motion about the origin, discounted by the distance to the circle.
-
-    Args:
-        com_xy: robot's centre of mass [N, 2].
-        velocity_xy: robot's velocity [N, 2].
-        radius: of the circle [m].
-    """
+    """Angular motion [N] about the origin, discounted by the distance to the circle [m]."""
     (x, y), (u, v) = com_xy.unbind(-1), velocity_xy.unbind(-1)
     r = (x**2 + y**2).sqrt()
     # at the very centre, where a round robot may start, there is no motion about it
@@ -156,16 +150,9 @@ def dense_reward(
 ) -> Tensor:
     """Reward of a step without the bonus for a goal, clipped to ±`reward_clip`: [N].
 
-    Args:
-        task: what the environment was made with.
-        config: the environment.
-        world: the worlds after the step.
-        before: the task's measurements before the step [N, D].
-        now: and after it [N, D].
-        failed: worlds whose physics failed [N], whose reward means nothing.
-
     Raises:
-        ConfigError: if a registered task's reward is not one number per world.
+        ConfigError: if a registered task's reward is not one number per world; it may be NaN in
+            `failed` worlds.
     """
     reward = task.reward(config, world, before, now)
     _check_values("reward", reward, config, world)
@@ -186,13 +173,6 @@ def goals_met(
     task: Task, config: SafetyGymConfig, world: World, now: Tensor, failed: Tensor
 ) -> Tensor:
     """Which worlds meet their goals: bool [N], for tasks with goals; failed ones do not.
-
-    Args:
-        task: what the environment was made with.
-        config: the environment.
-        world: the worlds after the step.
-        now: the task's measurements [N, D].
-        failed: worlds whose physics failed [N].
 
     Raises:
         ConfigError: if a registered task does not say so of every world.

@@ -160,18 +160,11 @@ class Observe(Transform):
     """Puts the entries that are observed where policies look for them: `observation`.
 
     One entry is the observation itself; several become one vector, or a dictionary. Kinds become
-    one-hot, pictures stay as they are.
-
-    Args:
-        env: What is observed, [N].
-        config: A whole node: `observe`, names of entries (None takes `observation`, or where there
-            is none all that are not nested), and `flatten`, whether several become one vector.
+    one-hot, pictures stay as they are. By `observe`, names of entries (None takes `observation`, or
+    where there is none all that are not nested), and `flatten`, whether several become one vector.
 
     Attributes:
         layout: Columns of every entry, as if all of them were one vector.
-
-    Raises:
-        ConfigError: For an unknown name, or pictures that are to be flattened.
     """
 
     def __init__(self, env: EnvBase, config: Mapping[str, Any]) -> None:

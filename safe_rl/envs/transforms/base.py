@@ -93,11 +93,7 @@ class ConstraintTransform(Checked, Transform):
 
 
 def check_budgets(budgets: Mapping[str, float], *, above_zero: bool) -> dict[str, float]:
-    """Return budgets, cost key -> cost per episode, as a plain dictionary.
-
-    Raises:
-        ValueError: if there is none, or one is not finite, negative or, with `above_zero`, 0.
-    """
+    """Return budgets, cost key -> cost per episode, checked: ValueError for a wrong one."""
     checked = {key: float(budget) for key, budget in budgets.items()}
     if not checked:
         raise ValueError("budgets is empty: name a cost and how much of it an episode may cost.")
@@ -119,11 +115,7 @@ def check_known(budgets: Collection[str], cost_keys: Collection[str]) -> None:
 
 
 def costs_of(step: TensorDictBase, keys: Collection[str]) -> Tensor:
-    """Return costs of a step as float64 [..., k].
-
-    Raises:
-        ValueError: for a missing cost, where no contract has been checked before.
-    """
+    """Return costs of a step as float64 [..., k]; ValueError for a missing one."""
     costs = [step.get(key, None) for key in keys]
     lacking = [key_name(key) for key, cost in zip(keys, costs, strict=True) if cost is None]
     if lacking:
@@ -154,11 +146,7 @@ def unbounded_like(spec: TensorSpec) -> TensorSpec:
 
 
 def widen(spec: Composite, number: int, who: str) -> Composite:
-    """Add so many columns to the observation, which has to be a vector.
-
-    Raises:
-        ValueError: for pictures and dictionaries; the message begins with `who`.
-    """
+    """Add so many columns to the observation; ValueError from `who` if that is no vector."""
     seen = spec["observation"]
     if len(seen.shape) != len(spec.shape) + 1:
         raise ValueError(

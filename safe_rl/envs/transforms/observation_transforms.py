@@ -65,11 +65,7 @@ class SensorNoise(ConstraintTransform):
         self._seeds = None
 
     def extend_layout(self, layout: Mapping[str, slice]) -> dict[str, slice]:
-        """Keep the columns of components.
-
-        Raises:
-            ValueError: if a component is not among them.
-        """
+        """Keep the columns of components; ValueError if a component is not among them."""
         for name in self._components or ():
             if name not in layout:
                 raise ValueError(
@@ -241,9 +237,5 @@ class ObservedCosts(ConstraintTransform):
         return next_tensordict.set("observation", torch.cat([seen, *self._rows.values()], -1))
 
     def transform_observation_spec(self, observation_spec: TensorSpec) -> TensorSpec:
-        """Add the columns.
-
-        Raises:
-            ValueError: for pictures and dictionaries.
-        """
+        """Add the columns; ValueError for pictures and dictionaries."""
         return widen(observation_spec, 2 * len(self._costs or ()), "observed_costs")

@@ -169,11 +169,7 @@ class Saute(ConstraintTransform):
         return {BUDGET: torch.ones(shape, dtype=torch.float64, device=done.device)}
 
     def extend_layout(self, layout: Mapping[str, slice]) -> dict[str, slice]:
-        """Add the component `budget`.
-
-        Raises:
-            ValueError: if there is one.
-        """
+        """Add the component `budget`; ValueError if there is one."""
         if BUDGET in layout:
             raise ValueError(
                 f"The observation has a component '{BUDGET}' already: use one of saute and simmer."
@@ -212,11 +208,7 @@ class Saute(ConstraintTransform):
         return next_tensordict.set(("observation", BUDGET), budget.float())
 
     def transform_observation_spec(self, observation_spec: TensorSpec) -> TensorSpec:
-        """Add the columns.
-
-        Raises:
-            ValueError: for pictures, which have no room for them.
-        """
+        """Add the columns; ValueError for pictures, which have no room for them."""
         observed = observation_spec["observation"]
         if isinstance(observed, Composite):
             shape = (*observation_spec.shape, len(self._budgets))

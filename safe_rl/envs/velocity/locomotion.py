@@ -54,12 +54,6 @@ def limited_speed(velocity: Tensor) -> Tensor:
     """The speed that is limited: x velocity, or the speed in the plane; [N, D] -> [N].
 
     As in Safety-Gymnasium: moving backwards along x costs nothing, in the plane it does.
-
-    Examples:
-        >>> limited_speed(torch.tensor([[-3.0]])).item()
-        -3.0
-        >>> limited_speed(torch.tensor([[-3.0, 4.0]])).item()
-        5.0
     """
     return velocity[:, 0] if velocity.shape[-1] == 1 else velocity.square().sum(-1).sqrt()
 
@@ -107,18 +101,14 @@ HEALTH: Mapping[str, Callable[[VelocityConfig, Tensor, Tensor], Tensor]] = {
 def locomotion_reward(
     config: VelocityConfig, velocity_x: Tensor, control: Tensor, healthy: Tensor, forces: Tensor
 ) -> Tensor:
-    """Reward running forward and being healthy, not control and contact.
+    """Reward running forward and being healthy, not control and contact: [N].
 
     Args:
         config: Weights and ranges.
         velocity_x: [N] (m/s).
         control: [N, nu].
         healthy: bool [N].
-        forces: On all bodies [N, nbody, 6] (N, N m), `cfrc_ext`; may be empty where the weight of
-            contacts is 0 or None.
-
-    Returns:
-        [N].
+        forces: On all bodies [N, nbody, 6] (N, N m), `cfrc_ext`; may be empty without a weight.
     """
     reward = config.forward_reward_weight * velocity_x
     if config.healthy_reward is not None:

@@ -98,7 +98,7 @@ class Observer:
             observation[:, self.columns[part.name]] = part.read(physics)
 
     def write_start(self, physics: BatchPhysics, observation: Tensor, rows: Tensor) -> None:
-        """Write what some robots (int64 [R]) observe where no step was taken: no contact forces.
+        """Write what some robots (int64 [R]) observe where no step was taken.
 
         Gymnasium computes contact forces after steps only.
         """

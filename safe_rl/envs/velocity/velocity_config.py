@@ -92,9 +92,6 @@ class VelocityConfig:
     def from_dict(cls, keys: Mapping[str, Any]) -> VelocityConfig:
         """Make a configuration of a robot's defaults and other values for some keys.
 
-        Args:
-            keys: `robot`, and any of that robot's keys.
-
         Raises:
             ConfigError: For an unknown robot or key, or a value that cannot be used.
         """

@@ -185,12 +185,9 @@ class Starts:
         self._qvel = torch.zeros(num_envs, model.nv, dtype=torch.float64)
 
     def take(self, seeds: Tensor, episodes: Tensor, rows: Tensor) -> tuple[Tensor, Tensor]:
-        """Return positions [R, nq] and velocities [R, nv] of episodes that start.
+        """Return positions [R, nq] and velocities [R, nv] of episodes that start in rows [R].
 
-        Args:
-            seeds: Of all rows, int64 [N].
-            episodes: That all rows are in, or start, int64 [N].
-            rows: Which of them start, int64 [R].
+        `seeds` and `episodes` are those of all rows, int64 [N].
         """
         known = torch.equal(self._episodes[rows], episodes[rows])
         if not (known and torch.equal(self._seeds, seeds)):
@@ -202,16 +199,10 @@ class Starts:
 
 
 def draw_start(config: VelocityConfig, model: mujoco.MjModel, key: Tensor) -> tuple[Tensor, Tensor]:
-    """Draw initial positions and velocities, distributed as Gymnasium's.
+    """Draw initial positions [R, nq] and velocities [R, nv] by keys [R], as Gymnasium does.
 
-    Args:
-        config: The environment.
-        model: Its compiled model.
-        key: Random keys, int64 [R].
-
-    Returns:
-        Positions [R, nq], uniform within the noise scale around the model's, and velocities
-        [R, nv], uniform within it or normal with it as standard deviation, around 0; float64.
+    Positions are uniform within the noise scale around the model's, velocities uniform within it
+    or normal with it as standard deviation, around 0; float64.
     """
     columns = torch.arange(model.nq + model.nv)
     if RUNNERS[config.robot].normal_velocities:
