@@ -11,6 +11,7 @@ from hydra.errors import MissingConfigException
 from omegaconf import OmegaConf
 
 from safe_rl.cli.schema import KEYS, optional_keys
+from safe_rl.envs.errors import on_cpu_only
 from safe_rl.envs.families import hint_of_gymnasium
 from safe_rl.extras import installing
 from safe_rl.files import CONF
@@ -113,6 +114,8 @@ def unknown_key(given: str, key: str, values: Mapping[str, Any]) -> str:
         return f"'{given}': algo={algo.get('name')} has no '{section}'."
     if choice := _choice_with(key):
         return f"'{given}': nothing reads '{key}' without {choice}."
+    if section == "env" and (hint := on_cpu_only(key.removeprefix("env."))):
+        return f"'{given}': nothing reads '{key}'.{hint}"
     unread = unread_by(algo)
     held = [p for p in _paths(values) if not any(f"{p}.".startswith(f"{u}.") for u in unread)]
     optional = {p: f"+{p}" for p in optional_keys(values) if p.split(".")[0] not in unread}

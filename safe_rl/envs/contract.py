@@ -86,6 +86,16 @@ class ConstrainedEnv(EnvBase):
         calls = self.max_episode_steps / self.steps_per_decision
         return highest * calls if is_bounded else math.inf
 
+    def any_done(self, tensordict: TensorDictBase) -> bool:
+        """Whether an episode has ended; where, is written as `_reset`.
+
+        As TorchRL's, which returns a tensor: the host would wait for a device a second time.
+        """
+        done = tensordict.get("done")
+        if has_ended := bool(done.any()):
+            tensordict.set("_reset", done.clone())
+        return has_ended
+
     def continue_from(self, steps: int) -> None:
         """Continue schedules after so many steps of every row."""
         self.steps_before = steps

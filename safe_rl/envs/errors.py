@@ -9,6 +9,7 @@ from safe_rl.naming import did_you_mean as nearest
 __all__ = [
     "ConfigError",
     "nearest",
+    "on_cpu_only",
     "require_integer",
     "require_names",
 ]
@@ -16,6 +17,21 @@ __all__ = [
 
 class ConfigError(ValueError):
     """A configuration that cannot be used; the message names the key and what to change."""
+
+
+def on_cpu_only(key: str) -> str:
+    """Say that a family without MuJoCo Warp cannot have a key; an empty text for other keys.
+
+    Examples:
+        >>> on_cpu_only("frame_skip")
+        ''
+    """
+    if key not in ("physics", "physics_buffers"):
+        return ""
+    return (
+        f" Only Safety Gym's environments have '{key}': the physics of all others, such as the "
+        "velocity family, runs on the CPU only. Leave it out, and preset=gpu, which sets 'physics'."
+    )
 
 
 def require_integer(name: str, value: Any, lowest: int, highest: int = 2**63 - 1) -> None:

@@ -21,7 +21,7 @@ from hydra.core.config_store import ConfigStore
 from omegaconf import OmegaConf
 
 from safe_rl.envs.costs import parse_ranges
-from safe_rl.envs.errors import ConfigError, nearest
+from safe_rl.envs.errors import ConfigError, nearest, on_cpu_only
 from safe_rl.envs.safety_gym.suite import EXTRAS, SUITE, resolve
 from safe_rl.envs.velocity.velocity_config import VELOCITY_SUITE, resolve_velocity
 from safe_rl.ranges import Count, Text, values_of
@@ -70,10 +70,8 @@ def complete_foreign(family: ForeignFamily, node: Mapping[str, Any]) -> dict[str
     """
     for key in node:
         if key not in (*family.keys, "id", "name", "_target_"):
-            raise ConfigError(
-                f"{family.title} has no key '{key}'.{nearest(str(key), [*family.keys, 'id'])} "
-                f"{family.arguments}"
-            )
+            meant = f"{nearest(str(key), [*family.keys, 'id'])} {family.arguments}"
+            raise ConfigError(f"{family.title} has no key '{key}'.{on_cpu_only(key) or meant}")
     if not isinstance(node.get("id"), str):
         raise ConfigError(f"Which environment? {family.which}")
     full = {"name": node["id"], **{key: row[0] for key, row in family.keys.items()}, **node}

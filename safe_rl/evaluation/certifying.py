@@ -184,6 +184,9 @@ class _Runner:
     ) -> None:
         self._config, self._make_env = config, for_evaluation(make_env, config)
         self._threads, self._progress = threads, progress
+        # training's, where the physics may be; a machine without a GPU certifies on its CPU
+        has_device = torch.cuda.is_available()
+        self._device = torch.device(config.device if has_device else "cpu")
         self.highest: dict[str, float] = {}
 
     def run(self, checkpoint: Path, purpose: int, number: int) -> Iterator[Episodes]:
@@ -198,7 +201,7 @@ class _Runner:
         env = self._make_env(
             node,
             num_envs=batch,
-            device="cpu",
+            device=self._device,
             seed=seed if has_fixed_layout(node) else seed + purpose,
             num_threads=self._threads,
         )
@@ -207,7 +210,7 @@ class _Runner:
         if purpose == _RANKING:
             batch = number
         with closing(env), tqdm(total=number, disable=None if self._progress else True) as bar:
-            policy = load_policy(self._config, env, checkpoint, torch.device("cpu"))
+            policy = load_policy(self._config, env, checkpoint, self._device)
             torch.manual_seed(seed + purpose)
             for _ in range(math.ceil(number / batch)):
                 yield collect_episodes(env, policy, batch, keys, deterministic=False)

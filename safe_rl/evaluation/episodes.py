@@ -102,10 +102,12 @@ def collect_episodes(
             after = step["next"]
             is_repeating = env.steps_per_decision != 1
             taken = after[STEPS_TAKEN] if is_repeating else torch.ones_like(after[return_key])
-            signals = [taken, after[return_key]]
+            signals = [after["done"], taken, after[return_key]]
             signals += [after[key] for key in cost_keys]
-            sums += torch.cat(signals, -1).to(sums)
-            done = after["done"].squeeze(-1).cpu()
+            # in one piece: every copy waits for the device
+            found = torch.cat(signals, -1).to(sums)
+            done = found[:, 0].bool()
+            sums += found[:, 1:]
             if done.any():
                 counts = done & (finished < quota)
                 rows.append((counts.nonzero().squeeze(-1), sums[counts]))

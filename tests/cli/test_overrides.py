@@ -9,6 +9,7 @@ from safe_rl.cli.grammar import CommandLineError
 from safe_rl.cli.run_folders import check_writable
 from safe_rl.cli.schema import SettingError
 from safe_rl.cli.train import read_command
+from safe_rl.envs import ConfigError
 
 MINE = """
 # @package _global_
@@ -110,6 +111,16 @@ def test_wrong_names_name_the_right_ones(argument):
     flags = ["-m"] if argument == "env=CarGoal2,CarGaol2" else []
     with pytest.raises((CommandLineError, SettingError), match=WRONG[argument]) as caught:
         read_command([*flags, "logger=none", argument])
+    assert len(str(caught.value).splitlines()) == 1
+
+
+@pytest.mark.parametrize("choice", ["env.physics=warp", "preset=gpu"])
+@pytest.mark.parametrize("family", ["SafeHopperVelocity", "gymnasium env.id=Walk-v0"])
+def test_only_the_suite_runs_on_mujoco_warp(family, choice):
+    with pytest.raises(
+        (CommandLineError, ConfigError), match=r"'physics'.*runs on the CPU only\."
+    ) as caught:
+        read_command([*f"env={family}".split(), choice])
     assert len(str(caught.value).splitlines()) == 1
 
 

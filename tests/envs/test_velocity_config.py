@@ -71,6 +71,7 @@ def test_another_robot_brings_its_own_keys():
         ({"robot": "hoper"}, "Did you mean 'hopper'"),
         ({"robot": "hopper", "velocity_treshold": 1.0}, "Did you mean 'velocity_threshold'"),
         ({"robot": "swimmer", "healthy_reward": 1.0}, "'swimmer' has no configuration key"),
+        ({"robot": "ant", "physics": "warp"}, "no configuration key 'physics'.*on the CPU only"),
         ({"robot": "hopper", "frame_skip": 0}, "'frame_skip' must be a whole number from 1"),
         ({"robot": "hopper", "num_steps": 2.5}, "'num_steps' must be a whole number"),
         (

@@ -10,6 +10,13 @@ if TYPE_CHECKING:
     from torch import Tensor
 
 
+STATE = ("time", "qpos", "qvel", "qacc_warmstart", "ctrl", "mocap_pos", "mocap_quat")
+"""What the simulations are in, beside the memory of actuators and sensors."""
+MEMORY = ("act", "history")
+OUTPUTS = ("xpos", "xmat", "sensordata", "subtree_com")
+"""What is read of them, unless others are asked for."""
+
+
 class Physics(Protocol):
     """N simulations of one model, advanced together on one device.
 
@@ -110,7 +117,7 @@ class Physics(Protocol):
 
         What is done then must change nothing where the mask does not hold.
         """
-        ...
+        return self.waits or bool(mask.any())
 
     def rows(self, mask: Tensor) -> Tensor:
         """Return indices of rows that include those of a mask, int64.
@@ -118,7 +125,7 @@ class Physics(Protocol):
         They are just those, or all where that is unknown without waiting: what is written for the
         rows is masked in any case.
         """
-        ...
+        return mask.new_ones(len(mask)).cumsum(0) - 1 if self.waits else mask.nonzero()[:, 0]
 
     def check(self, wrong: Tensor, error: Callable[[], Exception]) -> None:
         """Raise an error if `wrong` (bool) holds anywhere; a device may look at it later.
@@ -127,3 +134,5 @@ class Physics(Protocol):
             wrong: Where something is wrong.
             error: Makes the error, and may look at tensors.
         """
+        if wrong.any():
+            raise error()

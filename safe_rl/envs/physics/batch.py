@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import mujoco
 import numpy as np
@@ -12,11 +12,8 @@ import torch
 from mujoco.batch import Batch
 from torch import Tensor
 
-from safe_rl.envs.physics import Physics
+from safe_rl.envs.physics import MEMORY, OUTPUTS, STATE, Physics
 
-_STATE = ("time", "qpos", "qvel", "qacc_warmstart", "ctrl", "mocap_pos", "mocap_quat")
-_MEMORY = ("act", "history")
-_OUTPUTS = ("xpos", "xmat", "sensordata", "subtree_com")
 _PATH_INPUTS = int(mujoco.mjtState.mjSTATE_CTRL) | int(mujoco.mjtState.mjSTATE_MOCAP_POS)
 _NO_SENSORS = int(mujoco.mjtDisableBit.mjDSBL_SENSOR)
 _NO_STAGE = int(mujoco.mjtStage.mjSTAGE_NONE)
@@ -59,24 +56,13 @@ class BatchPhysics(Physics):
     device = torch.device("cpu")
     dtype = torch.float64
     waits = False
-    time: Tensor
-    qpos: Tensor
-    qvel: Tensor
-    qacc_warmstart: Tensor
-    ctrl: Tensor
-    mocap_pos: Tensor
-    mocap_quat: Tensor
-    xpos: Tensor
-    xmat: Tensor
-    sensordata: Tensor
-    subtree_com: Tensor
 
     def __init__(
         self,
         model: mujoco.MjModel,
         num_envs: int,
         num_threads: int,
-        outputs: Sequence[str] = _OUTPUTS,
+        outputs: Sequence[str] = OUTPUTS,
     ) -> None:
         _log_to_console_only()
         sleeps = bool(model.opt.enableflags & mujoco.mjtEnableBit.mjENBL_SLEEP)
@@ -85,16 +71,16 @@ class BatchPhysics(Physics):
         self.timestep = float(model.opt.timestep)
         self._batch = Batch(model, num_envs, num_threads, persistent=sleeps)
         # Every field is bound before the first call: later ones would be zero until the next.
-        for name in _STATE:
+        for name in STATE:
             setattr(self, name, _share(self._batch.bind(name)))
-        sizes = dict(zip(_MEMORY, (model.na, model.nhistory), strict=True))
-        remembered = [name for name in _MEMORY if sizes[name]]
+        sizes = dict(zip(MEMORY, (model.na, model.nhistory), strict=True))
+        remembered = [name for name in MEMORY if sizes[name]]
         self.memory = {name: _share(self._batch.bind(name)) for name in remembered}
         read = {name: _share(self._batch.bind(name)) for name in outputs}
         if "xmat" in read:
             read["xmat"] = read["xmat"].view(num_envs, model.nbody, 3, 3)
         self.outputs = read
-        for name in set(_OUTPUTS).intersection(outputs):
+        for name in set(OUTPUTS).intersection(outputs):
             setattr(self, name, self.outputs[name])
         self._disableflags = self._batch.expand("opt.disableflags")
         self._with_sensors = int(model.opt.disableflags)
@@ -154,19 +140,6 @@ class BatchPhysics(Physics):
             origin.numpy()[:, None], directions.numpy(), geomgroup=seen, bodyexclude=exclude_body
         )
         return torch.from_numpy(distance)
-
-    def maybe_any(self, mask: Tensor) -> bool:
-        """Whether a mask holds anywhere."""
-        return bool(mask.any())
-
-    def rows(self, mask: Tensor) -> Tensor:
-        """Return the indices of the rows of a mask, int64."""
-        return mask.nonzero()[:, 0]
-
-    def check(self, wrong: Tensor, error: Callable[[], Exception]) -> None:
-        """Raise an error if `wrong` holds anywhere."""
-        if wrong.any():
-            raise error()
 
     def _check_process(self) -> None:
         """Raise in a forked process, which has no threads and would wait for them for ever."""

@@ -13,7 +13,7 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from safe_rl.envs.physics import Physics
+from safe_rl.envs.physics import MEMORY, OUTPUTS, STATE, Physics
 from safe_rl.envs.physics.warp_kernels import (
     align_capsules,
     find_failures,
@@ -23,11 +23,8 @@ from safe_rl.envs.physics.warp_kernels import (
     restore_rows,
 )
 
-_VIEWS = ("time", "qpos", "qvel", "qacc_warmstart", "ctrl", "mocap_pos", "mocap_quat")
-_OUTPUTS = ("xpos", "xmat", "sensordata", "subtree_com")
-_MEMORY = ("act", "history")
 # What a substep changes, and what a simulation starts from.
-_INTEGRATED = ("time", "qpos", "qvel", "qacc_warmstart", *_MEMORY)
+_INTEGRATED = ("time", "qpos", "qvel", "qacc_warmstart", *MEMORY)
 _INITIAL = (*_INTEGRATED, "ctrl", "mocap_pos", "mocap_quat")
 _LARGEST = 1e10  # MuJoCo's mjMAXVAL: larger numbers are a simulation that failed
 _NO_SENSORS = int(mujoco.mjtDisableBit.mjDSBL_SENSOR)
@@ -72,17 +69,6 @@ class WarpPhysics(Physics):
     """
 
     dtype = torch.float32
-    time: Tensor
-    qpos: Tensor
-    qvel: Tensor
-    qacc_warmstart: Tensor
-    ctrl: Tensor
-    mocap_pos: Tensor
-    mocap_quat: Tensor
-    xpos: Tensor
-    xmat: Tensor
-    sensordata: Tensor
-    subtree_com: Tensor
 
     def __init__(
         self,
@@ -91,7 +77,7 @@ class WarpPhysics(Physics):
         device: torch.device | str,
         contacts: int,
         constraints: int,
-        outputs: Sequence[str] = _OUTPUTS,
+        outputs: Sequence[str] = OUTPUTS,
         use_graphs: bool = True,
     ) -> None:
         self.device = torch.device(device)
@@ -124,13 +110,13 @@ class WarpPhysics(Physics):
     def _bind(self, model: mujoco.MjModel, outputs: Sequence[str]) -> None:
         """Share memory with torch, and note what a simulation starts from."""
         data, num_envs = self._data, self._data.nworld
-        shared = {name: wp.to_torch(getattr(data, name)) for name in (*_VIEWS, *_MEMORY, *outputs)}
-        for name in _VIEWS:
+        shared = {name: wp.to_torch(getattr(data, name)) for name in (*STATE, *MEMORY, *outputs)}
+        for name in STATE:
             setattr(self, name, shared[name])
-        sizes = dict(zip(_MEMORY, (model.na, model.nhistory), strict=True))
-        self.memory = {name: shared[name] for name in _MEMORY if sizes[name]}
+        sizes = dict(zip(MEMORY, (model.na, model.nhistory), strict=True))
+        self.memory = {name: shared[name] for name in MEMORY if sizes[name]}
         self.outputs = {name: shared[name] for name in outputs}
-        for name in set(_OUTPUTS).intersection(outputs):
+        for name in set(OUTPUTS).intersection(outputs):
             setattr(self, name, shared[name])
         flat = {name: shared[name].view(num_envs, -1) for name in _INITIAL if shared[name].numel()}
         self._rows: dict[str, Any] = {name: wp.from_torch(values) for name, values in flat.items()}
@@ -215,20 +201,12 @@ class WarpPhysics(Physics):
             )
         return distance
 
-    def maybe_any(self, mask: Tensor) -> bool:
-        """Whether a mask may hold anywhere."""
-        return self.waits or bool(mask.any())
-
-    def rows(self, mask: Tensor) -> Tensor:
-        """Return the indices of the rows of a mask, or of all, int64."""
-        return torch.arange(len(mask), device=self.device) if self.waits else mask.nonzero()[:, 0]
-
     def check(self, wrong: Tensor, error: Callable[[], Exception]) -> None:
         """Raise an error if `wrong` holds anywhere, now or in a later call."""
         if self.waits:
             self._late.add(wrong.any(), error)
-        elif wrong.any():
-            raise error()
+        else:
+            super().check(wrong, error)
 
     def _check_rooms(self) -> None:
         self._late.look()

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from functools import cache
 from typing import Annotated, Any, get_type_hints
 
-from safe_rl.envs.errors import ConfigError, nearest
+from safe_rl.envs.errors import ConfigError, nearest, on_cpu_only
 from safe_rl.envs.velocity.runners import RUNNERS
 from safe_rl.ranges import Count, NotNegative, Number, Positive, Values, values_of
 
@@ -127,10 +127,8 @@ def _check_keys(robot: Any, given: Any) -> None:
     known = ["robot", *RUNNERS[robot].defaults]
     for key in given:
         if key not in known:
-            raise ConfigError(
-                f"Robot '{robot}' has no configuration key '{key}'.{nearest(str(key), known)} "
-                f"It has {sorted(known)}."
-            )
+            hint = on_cpu_only(key) or f"{nearest(str(key), known)} It has {sorted(known)}."
+            raise ConfigError(f"Robot '{robot}' has no configuration key '{key}'.{hint}")
 
 
 @cache
