@@ -5,10 +5,9 @@ import torch
 from looking import no_looks
 
 from safe_rl.envs import SafetyGymEnv
+from safe_rl.envs.physics import OUTPUTS, STATE, Physics
 from safe_rl.envs.physics.batch import BatchPhysics
 
-BATCH = ("time", "qpos", "qvel", "qacc_warmstart", "ctrl", "mocap_pos", "mocap_quat")
-OUTPUTS = ("xpos", "xmat", "sensordata", "subtree_com")
 EVERYTHING = {
     **{"robot_base": "point", "task": "goal", "goal_size": 3.0, "action_noise": 0.1},
     **{"hazards_num": 3, "vases_num": 2, "gremlins_num": 2, "pillars_num": 1, "buttons_num": 2},
@@ -25,7 +24,7 @@ CASES = {
 }
 
 
-class WaitingPhysics:
+class WaitingPhysics(Physics):
     """A backend that computes in another type, and whose values nobody can look at for nothing."""
 
     device, waits = torch.device("cpu"), True
@@ -34,15 +33,15 @@ class WaitingPhysics:
         self.dtype, self._batch = dtype, BatchPhysics(model, num_envs, 1)
         self.timestep, self.memory = self._batch.timestep, self._batch.memory
         self.inside, self.wrong = False, []
-        for name in BATCH + OUTPUTS:
+        for name in STATE + OUTPUTS:
             setattr(self, name, getattr(self._batch, name).to(dtype, copy=True))
 
     def _call(self, method, *arguments):
         self.inside = True
-        for name in BATCH:
+        for name in STATE:
             getattr(self._batch, name).copy_(getattr(self, name))
         result = getattr(self._batch, method)(*arguments)
-        for name in BATCH + OUTPUTS:
+        for name in STATE + OUTPUTS:
             getattr(self, name).copy_(getattr(self._batch, name))
         self.inside = False
         return result
@@ -57,15 +56,12 @@ class WaitingPhysics:
         path = None if mocap_path is None else mocap_path.double()
         return self._call("step", num_substeps, path, refresh, counts)
 
+    def failed(self):
+        return self._call("failed")
+
     def rays(self, origin, directions, group, exclude_body):
         distance = self._call("rays", origin.double(), directions.double(), group, exclude_body)
         return distance.to(self.dtype)
-
-    def maybe_any(self, mask):
-        return True
-
-    def rows(self, mask):
-        return torch.arange(len(mask), device=mask.device)
 
     def check(self, wrong, error):
         self.wrong.append((wrong, error))

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     import torch
@@ -17,7 +18,7 @@ OUTPUTS = ("xpos", "xmat", "sensordata", "subtree_com")
 """What is read of them, unless others are asked for."""
 
 
-class Physics(Protocol):
+class Physics(ABC):
     """N simulations of one model, advanced together on one device.
 
     Rules, layouts and observations are made of its tensors, on its device and of its floating-point
@@ -62,15 +63,18 @@ class Physics(Protocol):
     subtree_com: Tensor
     outputs: Mapping[str, Tensor]
 
+    @abstractmethod
     def reset(self, mask: Tensor) -> None:
         """Set the simulations in `mask` (bool [N]) to the model's initial state, awake."""
 
+    @abstractmethod
     def forward(self, mask: Tensor | None = None, sensors: bool = True) -> None:
         """Bring the outputs up to date with the state, for all simulations or those in `mask`.
 
         Without `sensors`, the readings and what is computed for them alone stay as they are.
         """
 
+    @abstractmethod
     def step(
         self,
         num_substeps: int,
@@ -92,12 +96,12 @@ class Physics(Protocol):
             bool [N]: simulations that failed (non-finite or huge state); their state is finite
             again but meaningless until reset.
         """
-        ...
 
+    @abstractmethod
     def failed(self) -> Tensor:
         """Return the simulations that failed since the last call of this or `step`, bool [N]."""
-        ...
 
+    @abstractmethod
     def rays(self, origin: Tensor, directions: Tensor, group: int, exclude_body: int) -> Tensor:
         """Cast rays into the simulations as their state is now.
 
@@ -110,7 +114,6 @@ class Physics(Protocol):
         Returns:
             Distance to the first surface [N, R] (m), -1 where there is none.
         """
-        ...
 
     def maybe_any(self, mask: Tensor) -> bool:
         """Whether a mask may hold anywhere: where that is unknown without waiting, True.
