@@ -69,7 +69,7 @@ _REQUIRED: dict[str, tuple[Any, str]] = {
     # torch starts all of them at once, and crashes where the system gives it no more
     "num_threads": (_int(1, 1024) | None, "threads of physics and torch; null: all cores"),
     "compile": (bool, "whether to compile the losses"),
-    "preset": (Text, "set of defaults: default or paper"),
+    "preset": (Text, "set of defaults: default, paper, gpu or hard_tasks"),
     "env": (Options, "the environment: env=PointGoal1"),
     "env.name": (Annotated[str, _FOLDER._replace(words=_FOLDER_OF_ENV)], "name of the environment"),
     "algo": (Options, "the algorithm: algo=cpo"),

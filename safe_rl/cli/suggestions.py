@@ -80,6 +80,8 @@ def explain(error: Exception, texts: Sequence[str]) -> str:
     file, _, said = words.removeprefix("In '").partition("': ")
     if isinstance(error, MissingConfigException) and error.missing_cfg_file is not None:
         group, _, name = error.missing_cfg_file.rpartition("/")
+        if group != "preset" and f"preset={name}" in texts:  # which chose it
+            return f"'preset={name}' is not for this algorithm: {file} has no {group} '{name}'."
         pattern = rf"\+?{group}(@[\w.]+)?=.*{re.escape(name)}"
         given = next((f"'{text}'" for text in texts if re.match(pattern, text)), f"{file}.yaml")
         # for a list of choices, such as transforms=[…], Hydra's error has no options

@@ -24,7 +24,13 @@ def options(group: str) -> list[str]:
 
 
 ALGORITHMS = options("algo")
-COMBINATIONS = list(itertools.product(ALGORITHMS, options("preset")))
+# those that preset=hard_tasks is for
+WITH_REPLAY = ("cal", "sac", "sac_lagrangian", "td3", "td3_lagrangian", "wcsac")
+COMBINATIONS = [
+    (algo, preset)
+    for algo, preset in itertools.product(ALGORITHMS, options("preset"))
+    if preset != "hard_tasks" or algo in WITH_REPLAY
+]
 # of the groups that only some algorithms have
 LAGRANGIAN = [
     name for name in ALGORITHMS if "- /lagrangian:" in (CONF / "algo" / f"{name}.yaml").read_text()

@@ -53,6 +53,7 @@ WRONG = {
     "env=CarGoal2,CarGaol2": "no env 'CarGaol2'. Did you mean 'CarGoal2'",
     "algo=cop": "no algo 'cop'. Did you mean 'cpo'",
     "preset=papers": "Did you mean 'paper'",
+    "preset=hard_tasks": "'preset=hard_tasks' is not for this algorithm: algo/ppo_lagrangian has",
     "limits=bad": r"no limits 'bad'\. There are default, ",
     "env=zzzzz": r"no env 'zzzzz'\. 'python train.py --help' names all there are\.$",
     "cost_limits.cost=10": r"cost_limits='\{cost: 10\}'",
