@@ -171,7 +171,7 @@ FLOORS = {
         ("archive",),
         ("recorded",),
         ("experiments",),
-        ("campaigns", "inventory", "scoring"),
+        ("inventory", "scoring"),
         ("slates",),
         ("figures",),
         ("curves",),

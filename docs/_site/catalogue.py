@@ -13,7 +13,6 @@ import algorithm_pages
 import algorithm_results
 import curves
 import mujoco
-from campaigns import campaigns
 from run_keys import run_keys
 from tables import table as _table
 from velocity_tables import velocity_runs
@@ -184,7 +183,7 @@ TABLES: dict[str, Callable[..., str]] = {
     table.__name__: table
     for table in (
         *(benchmark, debug, velocity, keys, observations, lidars, costs, robots),
-        *(campaigns, run_keys, velocity_runs, curves.curves),
+        *(run_keys, velocity_runs, curves.curves),
         *(algorithm_pages.settings, algorithm_pages.columns, algorithm_pages.loop),
         algorithm_pages.listed,
         *(algorithm_results.measured, algorithm_results.compared, algorithm_results.timed),

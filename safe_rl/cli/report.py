@@ -40,11 +40,6 @@ class ReportOptions:
     archive: str | None = option(
         None, "campaign archive to add the runs to, for others; null: none"
     )
-    good: float = option(
-        0.5,
-        "a policy is good if J_c <= d and J_r is at least this share of the published PPO's, "
-        "elsewhere of the best here",
-    )
     title: str | None = option(None, "heading; null: the folder's name")
 
 
@@ -68,13 +63,10 @@ def report(root: Path, options: ReportOptions) -> tuple[Report, Path]:
         FileNotFoundError: If there is no run.
         OSError: If the page cannot be written, which is seen before any run is read.
         ValueError: If RUNS_DIR/report is a link, by which others would choose what is overwritten;
-            if a slate is to take less than one run per environment, or what is good is no
-            share of a return.
+            if a slate is to take less than one run per environment.
     """
     if options.seeds < 1:
         raise ValueError(f"seeds={options.seeds}: a slate takes at least one run per environment.")
-    if not 0.0 < options.good <= 10.0:
-        raise ValueError(f"good={options.good}: a share of a return, for example 0.5 for half.")
     formats = [form.strip() for form in options.formats.split(",")]
     for form in formats:
         if form not in FORMATS:
@@ -90,7 +82,6 @@ def report(root: Path, options: ReportOptions) -> tuple[Report, Path]:
         suite(),
         seeds_needed=options.seeds,
         unfinished=options.unfinished,
-        good=options.good,
         algorithms=algorithms,
     )
     return result, write_report(result, out, options.title or root.resolve().name, formats)
@@ -110,7 +101,5 @@ def _carry_out(first: list[str], options: ReportOptions, modules: list[str] | No
         print(f"kept {len(result.runs)} runs in {options.archive}")
     for path, reason in result.skipped.items():
         print(f"left out {clean(path)}: {reason}", file=sys.stderr)
-    for name, (plan, *_) in result.campaigns.items():
-        print(f"{name}: {plan.note}")
     print(f"wrote {page}")
     return 0

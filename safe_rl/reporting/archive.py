@@ -1,4 +1,4 @@
-"""A campaign in two files: what its runs recorded, and the rows of all their tables.
+"""An archive of runs in two files: what every run recorded, and the rows of all their tables.
 
 ``runs.json.gz`` has a line per run: its configuration and its notes. ``rows.csv.gz`` has the epochs
 of all runs, with the run in the first column.
@@ -9,24 +9,17 @@ from __future__ import annotations
 import gzip
 import io
 import json
-import math
 import os
 import zlib
 from collections import defaultdict
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from safe_rl.extras import import_extra
 from safe_rl.files import read_bounded, replacing
-from safe_rl.reporting.tables import clean
-from safe_rl.runs.folder import checkpoint_steps
 
-__all__ = [
-    *("ROWS", "RUNS", "Recorded", "read_archive", "read_certificate", "read_code"),
-    *("read_evaluation", "without_places", "write_archive"),
-]
+__all__ = ["ROWS", "RUNS", "Recorded", "read_archive", "without_places", "write_archive"]
 
 RUNS, ROWS = "runs.json.gz", "rows.csv.gz"
 _MOST_BYTES = 300_000_000  # of each file, unpacked; a hundred runs have about ten million
@@ -47,7 +40,7 @@ class Recorded(NamedTuple):
 
 
 def write_archive(runs: Mapping[str, Recorded], folder: Path) -> None:
-    """Write a campaign's runs; the same runs make the same bytes.
+    """Write runs by their names; the same runs make the same bytes.
 
     Examples:
         >>> folder, table = getfixture("tmp_path"), {"steps": [1000.0, 2000.0]}
@@ -61,14 +54,17 @@ def write_archive(runs: Mapping[str, Recorded], folder: Path) -> None:
     folder.mkdir(parents=True, exist_ok=True)
     entries = {name: {"config": run.config, **run.notes} for name, run in runs.items()}
     lines = [f"{json.dumps(name)}: {json.dumps(entry)}" for name, entry in entries.items()]
-    _pack(folder / RUNS, "{" + ",\n".join(lines) + "}\n")
     tables = {name: pandas.DataFrame(run.table) for name, run in runs.items()}
-    rows = pandas.concat(tables, names=["run", "row"]).reset_index("run")
-    _pack(folder / ROWS, rows.convert_dtypes().to_csv(index=False, lineterminator="\n"))
+    rows = pandas.concat(tables, names=["run", "row"]).reset_index("run").convert_dtypes()
+    texts = {RUNS: "{" + ",\n".join(lines) + "}\n"}
+    texts[ROWS] = rows.to_csv(index=False, lineterminator="\n")
+    for name, text in texts.items():
+        with replacing(folder / name) as unfinished:
+            unfinished.write_bytes(gzip.compress(text.encode(), mtime=0))
 
 
 def read_archive(folder: Path) -> dict[str, Recorded]:
-    """Read a campaign's runs.
+    """Read the runs of an archive by their names.
 
     Raises:
         ValueError: If the files are not those of an archive, or larger than any.
@@ -97,11 +93,6 @@ def _tables(path: Path) -> Iterator[tuple[str, dict[str, list[float]]]]:
         yield name, own.loc[:, always | own.notna().any()].to_dict("list")
 
 
-def _pack(path: Path, text: str) -> None:
-    with replacing(path) as unfinished:
-        unfinished.write_bytes(gzip.compress(text.encode(), mtime=0))
-
-
 def _unpack(path: Path) -> bytes:
     try:
         with gzip.open(io.BytesIO(read_bounded(path, _MOST_BYTES))) as file:
@@ -114,7 +105,7 @@ def _unpack(path: Path) -> bytes:
 
 
 def without_places(notes: Mapping[str, Any]) -> dict[str, Any]:
-    """Notes without the folders of this machine, but for what command lines said."""
+    """Notes without the folders of this machine, except in the words of command lines."""
     kept = dict(notes)
     start = kept.pop("cwd", None)
     if start and "config_dirs" in kept:
@@ -126,69 +117,3 @@ def without_places(notes: Mapping[str, Any]) -> dict[str, Any]:
             for e in kept["evaluations"]
         ]
     return kept
-
-
-def read_evaluation(content: Any) -> dict[str, Any]:
-    """An evaluation with the types that tables need; `ValueError` if it is none."""
-    with _in_words("it is no evaluation"):
-        return {
-            "name": clean(content.get("name") or "", 60),
-            "checkpoint": clean(content["checkpoint"]),
-            "steps": content["steps"],
-            "episodes": int(content["episodes"]),
-            "deterministic": bool(content["deterministic"]),
-            "env": {clean(key): clean(value) for key, value in content["env"].items()},
-            "layouts_trained_on": float(content["layouts_trained_on"]),
-            "cvar_alpha": float(content["cvar_alpha"]),
-            "cost_limits": {str(k): float(d) for k, d in content["cost_limits"].items()},
-            "estimates": {
-                name: {part: _number(estimate[part]) for part in ("value", "low", "high")}
-                for name, estimate in content["estimates"].items()
-            },
-        }
-
-
-def read_certificate(content: Any) -> dict[str, Any]:
-    """A certificate with the types that tables need; `ValueError` if it is none.
-
-    Its ``checkpoint`` is the number of steps, or None where no policy is certified.
-    """
-    with _in_words("it is no certificate"):
-        checkpoint = content["checkpoint"]
-        return {
-            "checkpoint": None if checkpoint is None else checkpoint_steps(Path(str(checkpoint))),
-            "certified_return": _number(content["episode_return"]),
-            "bounds": {
-                clean(name): (_number(bound["bound"]), _number(bound["most"]))
-                for name, bound in content["bounds"].items()
-            },
-            "episodes": int(content["episodes"]),
-            "level": float(content["level"]),
-        }
-
-
-def read_code(content: Any) -> str:
-    """By which code a run was carried out, and from which step on by which other one.
-
-    `ValueError` if it does not say so.
-    """
-    parts = []
-    with _in_words("it says nothing of the code"):
-        for entry in content[:9]:
-            words = [clean(entry["version"], 20), clean(entry["commit"] or "")[:10]]
-            words += ["with changes"] if entry["changed"] else []
-            words += [f"from {int(entry['steps']):,} steps on"] if entry["steps"] else []
-            parts.append(" ".join(filter(None, words)))
-    return "; ".join(parts)
-
-
-@contextmanager
-def _in_words(otherwise: str) -> Iterator[None]:
-    try:
-        yield
-    except (ValueError, KeyError, TypeError, AttributeError) as error:
-        raise ValueError(f"{otherwise} ({type(error).__name__}: {error})") from error
-
-
-def _number(value: float | None) -> float:
-    return math.nan if value is None else float(value)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from math import inf
 from pathlib import Path
 from typing import Any
@@ -22,6 +22,12 @@ def _each_run(
     for e in experiments:
         place = {"environment": e.environment, "algorithm": e.algorithm}
         yield from (({**place, "seed": run.seed}, e, run) for run in e.runs)
+
+
+def _names(records: Sequence[Record], start: str) -> list[str]:
+    """Ends of the names of all fields that start so."""
+    fields = dict.fromkeys(name for record in records for name in record)
+    return [name.removeprefix(start) for name in fields if name.startswith(start)]
 
 
 def run_table(experiments: Sequence[Experiment]) -> Table:
@@ -68,13 +74,12 @@ def duration(hours: float) -> str:
 def evaluation_table(experiments: Sequence[Experiment]) -> Table:
     """What ``python -m safe_rl.evaluate`` has found of the runs."""
     records = [
-        where | _evaluation_record(experiment, evaluation)
-        for where, experiment, run in _each_run(experiments)
-        for evaluation in run.evaluations
+        {**where, **found, "other_measures": e.limits_of_other_measures}
+        for where, e, run in _each_run(experiments)
+        for found in run.evaluations
     ]
-    names = dict.fromkeys(name for record in records for name in record)
-    limited = [name.removeprefix("limit_") for name in names if name.startswith("limit_")]
-    keys = list(dict.fromkeys([*(["cost"] if "episode_cost" in names else []), *limited]))
+    total = ["cost"] if any("episode_cost" in record for record in records) else []
+    keys = list(dict.fromkeys([*total, *_names(records, "limit_")]))
     columns = {
         **_WHERE,
         "checkpoint": "{checkpoint}",
@@ -91,33 +96,14 @@ def evaluation_table(experiments: Sequence[Experiment]) -> Table:
     fields = {"limit": "limit_{}", "over": "over_limit_{}"}
     for end in ("", "_low", "_high"):
         fields |= {f"mean{end}": f"episode_{{}}{end}", f"cvar{end}": f"cvar_{{}}{end}"}
+
+    def over(row: Record) -> str:
+        # of another measure than the mean these episodes do not say whether it keeps the limit
+        judged = row.get("key") not in row["other_measures"]
+        return "bad" if judged and row.get("mean", 0.0) > row.get("limit", inf) else ""
+
     rows = each_cost(records, keys, **fields)
-    marks = {"$J_c$": _is_over}
-    return Table("evaluations", "Evaluations", columns, records, shown=rows, marks=marks)
-
-
-def _evaluation_record(experiment: Experiment, evaluation: Mapping[str, Any]) -> dict[str, Any]:
-    manner = [evaluation["name"]] if evaluation["name"] else []
-    manner += ["mean actions" if evaluation["deterministic"] else "sampled actions"]
-    manner += [f"{key}={value}" for key, value in evaluation["env"].items()]
-    manner.append(f"{evaluation['layouts_trained_on']:.0%} known layouts")
-    record = {
-        **{key: evaluation[key] for key in ("checkpoint", "steps", "episodes", "cvar_alpha")},
-        "manner": clean(", ".join(manner)),
-        "other_measures": experiment.limits_of_other_measures,
-        **{f"limit_{key}": limit for key, limit in evaluation["cost_limits"].items()},
-    }
-    for name, estimate in evaluation["estimates"].items():
-        for part, value in estimate.items():
-            record[name if part == "value" else f"{name}_{part}"] = value
-    return record
-
-
-def _is_over(row: Record) -> str:
-    # of another measure than the mean these episodes do not say whether it keeps the limit
-    if row.get("key") in row["other_measures"]:
-        return ""
-    return "bad" if row.get("mean", 0.0) > row.get("limit", inf) else ""
+    return Table("evaluations", "Evaluations", columns, records, shown=rows, marks={"$J_c$": over})
 
 
 def certificate_table(experiments: Sequence[Experiment]) -> Table:
@@ -125,14 +111,9 @@ def certificate_table(experiments: Sequence[Experiment]) -> Table:
     records = []
     for where, _, run in _each_run(experiments):
         if (found := run.certificate) is not None:
-            record = {**where, "certified": "no" if found["checkpoint"] is None else "yes"}
-            record["surely"] = f"{100 * found['level']:.12g}%"  # not rounded up to 100
-            record |= {name: value for name, value in found.items() if name != "bounds"}
-            bounds = found["bounds"].items()
-            record |= {f"bound_{name}": bound for name, (bound, _) in bounds}
-            records.append(record | {f"most_{name}": most for name, (_, most) in bounds})
-    names = dict.fromkeys(name for record in records for name in record)
-    keys = [name.removeprefix("bound_") for name in names if name.startswith("bound_")]
+            said = {"certified": "no" if found["checkpoint"] is None else "yes"}
+            said["surely"] = f"{100 * found['level']:.12g}%"  # not rounded up to 100
+            records.append({**where, **said, **found})
     columns = {
         **_WHERE,
         "certified": "{certified}| at {surely}",
@@ -143,7 +124,7 @@ def certificate_table(experiments: Sequence[Experiment]) -> Table:
         "limit": "{most:g}",
         "episodes": "{episodes:d}",
     }
-    rows = each_cost(records, keys, bound="bound_{}", most="most_{}")
+    rows = each_cost(records, _names(records, "bound_"), bound="bound_{}", most="most_{}")
     marks = {"certified": lambda row: "bad" if row["certified"] == "no" else ""}
     return Table("certificates", "Certificates", columns, records, shown=rows, marks=marks)
 

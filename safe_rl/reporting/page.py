@@ -1,4 +1,4 @@
-"""The sections of a report, and their files: tables, pictures, Markdown and one page of HTML."""
+"""The sections of a report, and their files: tables, pictures, and one page of HTML."""
 
 from __future__ import annotations
 
@@ -18,13 +18,12 @@ from matplotlib.figure import Figure
 from safe_rl.extras import import_extra
 from safe_rl.files import check_no_links, replace_text
 from safe_rl.reporting import figures, inventory
-from safe_rl.reporting.campaigns import campaign_tables
 from safe_rl.reporting.curves import draw_learning_curves, draw_small_multiples, drawn_keys
 from safe_rl.reporting.experiments import Experiment, group_runs
 from safe_rl.reporting.recorded import Run, find_runs
-from safe_rl.reporting.scoring import better_tables, final_table, learning_table
-from safe_rl.reporting.slates import complete_slates, improvement_tables, slate_table
-from safe_rl.reporting.tables import SYMBOL, Record, Table, clean, escaped, short_number
+from safe_rl.reporting.scoring import final_table, learning_table
+from safe_rl.reporting.slates import complete_slates, slate_table
+from safe_rl.reporting.tables import Record, Table, clean, short_number
 from safe_rl.scores.benchmark import Suite
 
 __all__ = ["Block", "Drawing", "Report", "Section", "Video", "build_report", "write_report"]
@@ -33,10 +32,10 @@ __all__ = ["Block", "Drawing", "Report", "Section", "Video", "build_report", "wr
 _MOST_ROWS = 6
 _MOST_CURVES = 6  # in one panel
 _TEXTS = yaml.safe_load(files(__package__).joinpath("texts.yaml").read_text(encoding="utf-8"))
-
 _MIME_TYPES = {".png": "image/png", ".mp4": "video/mp4"}
 # of a video, above which it is named instead of embedded [bytes]
 _LARGEST = 50_000_000
+_SYMBOL = re.compile(r"\$(\\bar )?(\\rho|\w)(?:_(\w))?\$")  # such as $\bar J_r$
 
 
 class Drawing(NamedTuple):
@@ -79,13 +78,11 @@ class Report:
     Attributes:
         experiments: Runs, grouped.
         sections: What is said of them; none is empty.
-        campaigns: Name -> tables of what was planned, and what of it is done.
         skipped: Folder or file -> why it was left out.
     """
 
     experiments: Sequence[Experiment]
     sections: Sequence[Section]
-    campaigns: Mapping[str, Sequence[Table]]
     skipped: Mapping[Path, str]
 
     @property
@@ -100,7 +97,6 @@ def build_report(
     *,
     seeds_needed: int,
     unfinished: bool,
-    good: float = 0.5,
     algorithms: Sequence[str] = (),
 ) -> Report:
     """Find the runs below a folder and put everything together.
@@ -110,7 +106,6 @@ def build_report(
         suite: The benchmark.
         seeds_needed: Finished runs that a slate takes per environment.
         unfinished: Whether unfinished runs count as finished ones.
-        good: Share of a return that a good policy has, see :func:`learning_table`.
         algorithms: Names in ``conf/algo`` of those to report; empty: all.
 
     Raises:
@@ -122,28 +117,24 @@ def build_report(
     for name in algorithms:
         if name not in known:
             raise ValueError(f"algos={name}: there are runs of {', '.join(map(clean, known))}.")
-    campaigns, no_plans = campaign_tables(root, runs)
     chosen = [run for run in runs if run.algorithm in (algorithms or known)]
     experiments, repeated = group_runs(chosen, suite)
-    skipped |= repeated | no_plans
+    skipped |= repeated
     styles = figures.algorithm_styles(experiments)
     groups = _by_environment([e for e in experiments if e.finished])
     finals = [final_table(group) for group in groups]
     records = [record for table in finals for record in table.records]
-    learning = [learning_table(group, good) for group in groups]
     reasons = [{"what": clean(path), "why": clean(why, 500)} for path, why in skipped.items()]
     left_out = Table("left_out", "Left out", {"what": "{what}", "why": "{why}"}, reasons)
     parts: list[tuple[str, str, Sequence[Block]]] = [
         ("final", "Final scores", finals or ["No run is finished."]),
-        ("learning", "What learning cost", list(filter(None, learning))),
+        ("learning", "What learning cost", list(filter(None, map(learning_table, groups)))),
         ("curves", "Learning curves", _curves(experiments, styles)),
         ("fronts", "Return against cost", _fronts(records, experiments, styles)),
         ("normalised", "Normalised scores", _slates(experiments, styles, seeds_needed)),
-        ("better", "Which is better", better_tables(records)),
         ("certificates", "Certificates", [inventory.certificate_table(experiments)]),
         ("evaluations", "Evaluations", [inventory.evaluation_table(experiments)]),
         ("videos", "Videos", [Video(clean(c), path) for c, path in inventory.videos(experiments)]),
-        ("campaigns", "Campaigns", [t for own in campaigns.values() for t in own]),
         ("runs", "Runs", [inventory.run_table(experiments), left_out]),
     ]
     # a table without a row says nothing
@@ -151,7 +142,7 @@ def build_report(
         Section(name, title, [b for b in blocks if not isinstance(b, Table) or b.records])
         for name, title, blocks in parts
     ]
-    return Report(experiments, [s for s in sections if s.blocks], campaigns, skipped)
+    return Report(experiments, [s for s in sections if s.blocks], skipped)
 
 
 def _by_environment(experiments: Sequence[Experiment]) -> list[list[Experiment]]:
@@ -207,16 +198,15 @@ def _slates(experiments: Sequence[Experiment], styles: Styles, seeds_needed: int
             names = ", ".join(one.algorithm for one in known)
             says = f"Share of runs above every score: {table.title}, {names}"
             blocks += [Drawing(f"profiles_{name}", "", figures.draw_profiles(known, styles), says)]
-        blocks += improvement_tables(name, aggregates)
     return blocks
 
 
 def write_report(report: Report, out: Path, title: str, formats: Sequence[str] = ("png",)) -> Path:
-    """Write a report into a folder, made if need be: a page, Markdown, pictures, a CSV per table.
+    """Write a report into a folder: a page, pictures, tables as CSV and all of them in LaTeX.
 
     Args:
         report: What there is to say.
-        out: The folder; files of an earlier report in it are replaced.
+        out: The folder, made if need be; files of an earlier report in it are replaced.
         title: Heading of the page.
         formats: Of the pictures: png, svg, pdf. PNG is always among them, for the page.
 
@@ -230,27 +220,23 @@ def write_report(report: Report, out: Path, title: str, formats: Sequence[str] =
     out.mkdir(parents=True, exist_ok=True)
     check_no_links(out)
     place = _places(out)
-    context = {
-        "title": clean(title),
-        "date": datetime.datetime.now().astimezone().strftime("%d %B %Y, %H:%M"),
-        "facts": _facts(report),
-        "sections": [
-            (s, list(filter(None, (_written(b, place, formats) for b in s.blocks))))
-            for s in report.sections
-        ],
-    }
+    tables = [b for s in report.sections for b in s.blocks if isinstance(b, Table)]
+    replace_text(out / "tables.tex", "\n".join(table.latex() for table in tables))
     environment = jinja2.Environment(
         loader=jinja2.FileSystemLoader(Path(__file__).parent),
-        autoescape=jinja2.select_autoescape(["html.jinja"]),
+        autoescape=True,
         trim_blocks=True,
         lstrip_blocks=True,
         undefined=jinja2.StrictUndefined,
     )
-    environment.filters |= {"symbols": _symbols, "words": _words}
-    environment.filters["md"] = lambda text: escaped(clean(text, most=10_000))
-    for name in ("report.md", "report.html"):
-        text = environment.get_template(f"{name}.jinja").render(context)
-        replace_text(out / name, text)
+    environment.filters["symbols"] = _symbols
+    text = environment.get_template("report.html.jinja").render(
+        title=clean(title),
+        date=datetime.datetime.now().astimezone().strftime("%d %B %Y, %H:%M"),
+        facts=_facts(report),
+        sections=[(s, [_written(b, place, formats) for b in s.blocks]) for s in report.sections],
+    )
+    replace_text(out / "report.html", text)
     return out / "report.html"
 
 
@@ -268,24 +254,22 @@ def _places(out: Path) -> Callable[[str], Path]:
     return place
 
 
-def _written(
-    block: Block, place: Callable[[str], Path], formats: Sequence[str]
-) -> dict[str, Any] | None:
-    """A block as the templates see it; tables and pictures are written on the way."""
+def _written(block: Block, place: Callable[[str], Path], formats: Sequence[str]) -> dict[str, Any]:
+    """A block as the template sees it; tables and pictures are written on the way."""
     if isinstance(block, str):
         return {"kind": "text", "title": "", "text": block}
     if isinstance(block, Table):
-        if not block.is_matrix:  # whose table of pairs is a file already
-            block.write_csv(place(f"{block.name}.csv"))
-        return {"kind": "table", "title": block.title, "table": block} if block.columns else None
+        block.write_csv(place(f"{block.name}.csv"))
+        return {"kind": "table", "title": block.title, "table": block}
     if isinstance(block, Video):
         data = _embedded(block.path)
         return {"kind": "video", "title": block.title, "file": clean(block.path), "data": data}
     path = figures.save(block.figure, place(f"{block.name}.png"))
     for form in {*formats} - {"png"}:
         figures.save(block.figure, path.with_suffix(f".{form}"))
-    seen = {"kind": "picture", "title": block.title, "says": block.shows}
-    return seen | {"file": path.name, "data": _embedded(path)}
+    return {
+        "kind": "picture", "title": block.title, "says": block.shows, "data": _embedded(path)
+    }  # fmt: skip
 
 
 def _embedded(path: Path) -> str:
@@ -309,7 +293,7 @@ def _facts(report: Report) -> dict[str, str]:
 
 
 def _symbols(text: str) -> Any:
-    r"""Symbols as Markdown writes them, ``$\bar J_r$``, in HTML."""
+    r"""Symbols, ``$\bar J_r$``, in HTML."""
     markupsafe = import_extra("markupsafe", "report")
 
     def html(match: re.Match[str]) -> str:
@@ -318,10 +302,4 @@ def _symbols(text: str) -> Any:
         letter = f'<i class="bar">{letter}</i>' if bar else f"<i>{letter}</i>"
         return letter + (f"<sub>{index}</sub>" if index else "")
 
-    return markupsafe.Markup(SYMBOL.sub(html, str(markupsafe.escape(text))))
-
-
-def _words(text: str) -> str:
-    """Symbols as plain letters, for where a page takes no markup: ``J_r``."""
-    plain = SYMBOL.sub(lambda match: match.group().strip("$").replace(r"\bar ", ""), text)
-    return plain.replace(r"\rho", "ρ")  # noqa: RUF001
+    return markupsafe.Markup(_SYMBOL.sub(html, str(markupsafe.escape(text))))

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import math
 import os
-import shlex
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -18,7 +17,14 @@ import numpy as np
 
 from safe_rl.files import read_config, read_json, read_yaml
 from safe_rl.reporting import archive as archives
-from safe_rl.reporting.archive import Recorded, read_certificate, read_code, read_evaluation
+from safe_rl.reporting.archive import Recorded
+from safe_rl.reporting.notes import (
+    command_of,
+    read_certificate,
+    read_code,
+    read_evaluation,
+    select,
+)
 from safe_rl.reporting.tables import clean
 from safe_rl.runs.folder import RunFolder, paths_below, runs_below
 from safe_rl.runs.outcome import final_figures, judges_another_measure, violation
@@ -26,7 +32,7 @@ from safe_rl.runs.table import read_table
 
 __all__ = ["Run", "archive_runs", "find_runs"]
 
-# A number that has left all bounds says as little as NaN, and fits no picture.
+# a number beyond says as little as NaN, and fits no picture
 _EXPLODED = 1e30
 
 
@@ -41,8 +47,8 @@ class Run:
         frames: Environment steps after which it counts as finished.
         overrides: What its command line said.
         command: The command line that does it again, if Hydra has recorded it.
-        evaluations: What ``safe_rl.evaluate`` has written into its folder.
-        certificate: Which of its checkpoints is certified, or by how much none is.
+        evaluations: What ``safe_rl.evaluate`` has found, a record each, see `read_evaluation`.
+        certificate: Which of its checkpoints is certified, see `read_certificate`.
         code: By which version and commit it was carried out, in words, if that is recorded.
         videos: Videos in its folder.
         recorded: What all of this was made of.
@@ -115,8 +121,7 @@ class Run:
 
     def final(self, cost_keys: Sequence[str]) -> dict[str, float]:
         """Final J_r, J_c and ρ_c by column name (section 5.1), of the costs that it has."""
-        own = [key for key in cost_keys if f"{key}_rate" in self.table]
-        return final_figures(self.table, own)
+        return final_figures(self.table, [key for key in cost_keys if f"{key}_rate" in self.table])
 
     def excess(self, key: str) -> float:
         """What the limit of a cost judges, minus d: a mean over the last epochs."""
@@ -144,22 +149,21 @@ def find_runs(root: Path, *, unfinished: bool = False) -> tuple[list[Run], dict[
         raise FileNotFoundError(f"There is no folder '{root}': give the folder of the runs.")
     runs: list[Run] = []
     skipped: dict[Path, str] = {}
-    resolved = root.resolve()
     for archive in paths_below(root, archives.RUNS):
         with _noted(archive, skipped):
             for path in (archive, archive.with_name(archives.ROWS)):
-                _own(path, resolved)
+                _own(path, root)
             for name, recorded in archives.read_archive(archive.parent).items():
                 directory = archive.parent / name
                 with _noted(directory, skipped):
                     runs.append(_run(directory, recorded, unfinished))
     for folder in runs_below(root):
         with _noted(folder.directory, skipped):
-            run = _run(folder.directory, _recorded(folder, resolved, skipped), unfinished)
+            run = _run(folder.directory, _recorded(folder, root, skipped), unfinished)
             videos = []
-            for path in _videos(folder):
+            for path in sorted(folder.directory.glob("[!.]*.mp4")):
                 with _noted(path, skipped):
-                    videos.append(_own(path, resolved))
+                    videos.append(_own(path, root))
             runs.append(replace(run, videos=tuple(videos)))
     if not runs:
         reasons = "".join(f"\n  {clean(path)}: {reason}" for path, reason in skipped.items())
@@ -193,8 +197,19 @@ def _noted(path: Path, skipped: dict[Path, str]) -> Iterator[None]:
     """Note why something is left out; everything else is reported."""
     try:
         yield
-    except Exception as error:
-        skipped[path] = clean(error) or type(error).__name__
+    except (ValueError, OSError) as error:
+        skipped[path] = clean(error)
+    except Exception as error:  # files of anybody may hold anything
+        skipped[path] = clean(f"{path.name} is not as a run writes it ({error!r})")
+
+
+def _own(path: Path, root: Path) -> Path:
+    """A file, which no link may lead out of the folder of all runs."""
+    if not path.resolve().is_relative_to(root.resolve()):
+        raise ValueError(f"{path.name} is a link to outside of the folder")
+    if not path.is_file():
+        raise ValueError(f"{path.name} is no file")
+    return path
 
 
 def _recorded(folder: RunFolder, root: Path, skipped: dict[Path, str]) -> Recorded:
@@ -212,40 +227,31 @@ def _recorded(folder: RunFolder, root: Path, skipped: dict[Path, str]) -> Record
     config = read_config(_own(folder.config, root))
     if not folder.table.exists():
         raise ValueError("it has not begun: no progress.csv")
-    try:
-        table = read_table(_own(folder.table, root))
-    except ValueError as error:
-        raise ValueError(f"progress.csv cannot be read ({error})") from error
-    runtime = _select(read(folder.surroundings), "hydra", "runtime")
-    before = _select(read(folder.composed), "frames")
-    evaluations = [read(path, _check_evaluation) for path in folder.evaluations()]
+    table = read_table(_own(folder.table, root))
+    runtime = select(read(folder.surroundings), "hydra", "runtime")
+    before = select(read(folder.composed), "frames")
     notes = {
         "overrides": read(folder.overrides),
-        "cwd": _select(runtime, "cwd"),
+        "cwd": select(runtime, "cwd"),
         # of --config-dir, and of Python's config_dir
         "config_dirs": [
-            str(_select(source, "path"))
-            for source in _select(runtime, "config_sources") or ()
-            if str(_select(source, "provider")).endswith("command-line")
+            str(select(source, "path"))
+            for source in select(runtime, "config_sources") or ()
+            if str(select(source, "provider")).endswith("command-line")
         ],
         "frames_before": before if before != config.get("frames") else None,
         "certificate": read(folder.certificate, read_certificate),
         "code": read(folder.code, read_code),
-        "evaluations": [found for found in evaluations if found and "estimates" in found],
+        "evaluations": [
+            found for path in folder.evaluations() if (found := read(path, read_evaluation))
+        ],
     }
     return Recorded(config, table, {name: value for name, value in notes.items() if value})
 
 
-def _check_evaluation(content: Any) -> None:
-    if not isinstance(content, dict) or "estimates" in content:
-        read_evaluation(content)
-
-
 def _run(directory: Path, recorded: Recorded, unfinished: bool) -> Run:
     config, table, notes = recorded
-    for key, (is_right, wanted) in _NEEDED.items():
-        if not is_right(config.get(key)):
-            raise ValueError(f"config.yaml is not that of a run: its '{key}' is not {wanted}")
+    _check(config)
     said = notes.get("overrides")
     overrides = tuple(map(clean, said)) if isinstance(said, list) else None
     return Run(
@@ -254,7 +260,7 @@ def _run(directory: Path, recorded: Recorded, unfinished: bool) -> Run:
         _checked(table, config.get("cost_limits") or {}),
         frames=0 if unfinished else config["frames"],
         overrides=overrides,
-        command=None if overrides is None else _command(overrides, notes, config),
+        command=None if overrides is None else command_of(overrides, notes, config),
         evaluations=tuple(map(read_evaluation, notes.get("evaluations", ()))),
         certificate=read_certificate(notes["certificate"]) if "certificate" in notes else None,
         code=read_code(notes["code"]) if "code" in notes else None,
@@ -262,44 +268,25 @@ def _run(directory: Path, recorded: Recorded, unfinished: bool) -> Run:
     )
 
 
-def _videos(run: RunFolder) -> list[Path]:
-    """Videos in a run's folder: neither those of runs below it, nor what a killed one has left."""
-    return [
-        path
-        for path in paths_below(run.directory, "*.mp4")
-        if next(above for above in path.parents if RunFolder(above).is_run) == run.directory
-        and not path.name.startswith(".")
-    ]
-
-
-def _own(path: Path, root: Path) -> Path:
-    if not path.resolve().is_relative_to(root):
-        raise ValueError(f"{path.name} is a link to outside of the folder")
-    if not path.is_file():
-        raise ValueError(f"{path.name} is no file")
-    return path
+def _check(config: Mapping[str, Any]) -> None:
+    """Refuse a configuration without what every run has."""
+    frames, limits = config.get("frames"), config.get("cost_limits") or {}
+    source = config.get("init_from")
+    are_right = {
+        "env": isinstance(config.get("env"), dict),
+        "algo": bool(name := select(config.get("algo"), "name")) and isinstance(name, str),
+        "seed": type(config.get("seed")) is int,
+        "frames": _is_number(frames) and frames >= 0,
+        "cost_limits": isinstance(limits, dict) and all(map(_is_number, limits.values())),
+        "init_from": source is None or isinstance(source, str),
+    }
+    if wrong := [key for key, is_right in are_right.items() if not is_right]:
+        keys = ", ".join(wrong)
+        raise ValueError(f"config.yaml is not that of a run: it lacks a usable {keys}")
 
 
 def _is_number(value: Any) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
-
-
-def _is_name(value: Any) -> bool:
-    return isinstance(value, str) and value != ""
-
-
-# key -> what it has to be, and how that is called
-_NEEDED: dict[str, tuple[Callable[[Any], bool], str]] = {
-    "env": (lambda v: isinstance(v, dict), "a mapping"),
-    "algo": (lambda v: _is_name(_select(v, "name")), "a mapping with a name"),
-    "seed": (lambda v: _is_number(v) and isinstance(v, int), "a whole number"),
-    "frames": (lambda v: _is_number(v) and v >= 0, "a number of steps"),
-    "cost_limits": (
-        lambda v: v is None or (isinstance(v, dict) and all(map(_is_number, v.values()))),
-        "a mapping of costs to numbers",
-    ),
-    "init_from": (lambda v: v is None or isinstance(v, str), "a path"),
-}
+    return type(value) in (int, float) and math.isfinite(value)
 
 
 def _checked(table: Mapping[str, list[float]], limits: Mapping[str, Any]) -> dict[str, list[float]]:
@@ -308,9 +295,8 @@ def _checked(table: Mapping[str, list[float]], limits: Mapping[str, Any]) -> dic
         raise ValueError("it has not finished an epoch")
     needed = ["episode_return", "time_total"]
     needed += [name for key in limits for name in (f"episode_{key}", f"{key}_rate")]
-    for name in needed:
-        if name not in table:
-            raise ValueError(f"progress.csv has no column {name}")
+    if missing := [name for name in needed if name not in table]:
+        raise ValueError(f"progress.csv has no column {missing[0]}")
     bounded = {
         name: [value if abs(value) < _EXPLODED else math.nan for value in values]
         for name, values in table.items()
@@ -319,18 +305,3 @@ def _checked(table: Mapping[str, list[float]], limits: Mapping[str, Any]) -> dic
     if not (steps[0] > 0 and all(np.diff(steps) > 0) and seconds > 0):
         raise ValueError("progress.csv cannot be read (its steps or times do not grow)")
     return bounded
-
-
-def _command(overrides: Sequence[str], notes: Mapping[str, Any], config: Mapping[str, Any]) -> str:
-    """The command line, with what it did not say in its overrides."""
-    if isinstance(notes.get("frames_before"), int):  # it was continued for longer
-        kept = [override for override in overrides if not override.startswith("frames=")]
-        overrides = [*kept, f"frames={config['frames']}"]
-    folders = [f"--config-dir={clean(path)}" for path in notes.get("config_dirs", ())]
-    return shlex.join(["python", "train.py", *folders, *overrides])
-
-
-def _select(node: Any, *keys: str) -> Any:
-    for key in keys:
-        node = node.get(key) if isinstance(node, dict) else None
-    return node

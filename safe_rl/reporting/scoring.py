@@ -1,4 +1,4 @@
-"""Final scores of experiments, what learning them has cost, and which are better than which."""
+"""Final scores of experiments, and what learning them has cost."""
 
 from __future__ import annotations
 
@@ -13,20 +13,11 @@ import numpy as np
 from safe_rl.reporting.experiments import Experiment, cost_keys_of
 from safe_rl.reporting.recorded import Run
 from safe_rl.reporting.tables import Record, Table, each_cost, mark_best, short_number, spread
-from safe_rl.runs.curves import moving_mean
 from safe_rl.runs.outcome import FINAL_EPOCHS, final_rows, final_width
 from safe_rl.scores.benchmark import PUBLISHED_STEPS, REIMPLEMENTATION_STEPS, REIMPLEMENTATIONS
-from safe_rl.scores.measures import (
-    Agent,
-    compare,
-    first_good_epoch,
-    joined,
-    longest_streak,
-    regret,
-    share_of_epochs_over,
-)
+from safe_rl.scores.measures import joined, longest_streak, regret, share_of_epochs_over
 
-__all__ = ["better_tables", "final_record", "final_table", "learning_table", "matrix", "signs_of"]
+__all__ = ["final_record", "final_table", "learning_table"]
 
 
 def final_record(experiment: Experiment, cost_keys: Sequence[str]) -> dict[str, Any]:
@@ -56,14 +47,13 @@ def _critic_bias(run: Run) -> dict[str, float]:
     return {k: float(np.nanmean(v)) for k, v in known.items() if np.isfinite(v).any()}
 
 
-def _over_seeds(values: Sequence[Mapping[str, float | None]]) -> dict[str, float]:
+def _over_seeds(values: Sequence[Mapping[str, float]]) -> dict[str, float]:
     """Mean and standard deviation of figures over the seeds that have them."""
     record = {}
     for name in dict.fromkeys(name for one in values for name in one):
-        known = np.array([one[name] for one in values if one.get(name) is not None], dtype=float)
-        if known.size:
-            record[name] = float(known.mean())
-            record[f"{name}_std"] = float(known.std(ddof=1)) if known.size > 1 else math.nan
+        known = np.array([one[name] for one in values if name in one])
+        record[name] = float(known.mean())
+        record[f"{name}_std"] = float(known.std(ddof=1)) if known.size > 1 else math.nan
     return record
 
 
@@ -89,43 +79,46 @@ def final_table(experiments: Sequence[Experiment]) -> Table:
     for row in rows:
         if row.get("key") in others[row["algorithm"]]:
             row["measure"] = row["limit"] + row["excess"]
-    shown = {"cost": len(keys) > 1, "limited measure": any("measure" in row for row in rows)}
-    shown["critics' bias"] = any("bias" in row for row in rows)
+    has = {name for row in [*rows, *records] for name in row}
     columns = {
         "algorithm": "{algorithm}",
         "seeds": "{seeds:d}",
         "steps": "{fewest_steps:,}| to {most_steps:,}",
         "$J_r$": spread("episode_return", 2),
-        "cost": "{cost}",
+        **({"cost": "{cost}"} if len(keys) > 1 else {}),
         "$J_c$": spread("mean", 1),
-        "limited measure": "{measure:.1f}",
+        **({"limited measure": "{measure:.1f}"} if "measure" in has else {}),
         "$d$": "{limit:g}",
         r"$\rho_c$": spread("rate", 4),
-        "critics' bias": "{bias:+.1f}",
+        **({"critics' bias": "{bias:+.1f}"} if "bias" in has else {}),
     }
-    columns = {title: text for title, text in columns.items() if shown.get(title, True)}
-    if any("paper_episode_return" in record for record in records):
+    if "paper_episode_return" in has:
         title = f"paper, {short_number(PUBLISHED_STEPS[experiments[0].benchmark or ''])} steps"
         columns[title] = "{paper_episode_return:g} / {paper_episode_cost:g} / {paper_cost_rate:g}"
-    if any("later_return" in record for record in records):
+    if "later_return" in has:
         title = f"later work, {short_number(REIMPLEMENTATION_STEPS)} steps"
         columns[title] = "{later_return:g} / {later_cost:g}"
+    marks = _final_marks(records)
+    return Table(_stem("final", environment), environment, columns, records, "", rows, marks)
+
+
+def _final_marks(records: Sequence[Record]) -> dict[str, Callable[[Record], str]]:
+    """What is over its limit, and the best of what is not, column by column."""
 
     def best(name: str, of: Callable[..., float]) -> Callable[[Record], str]:
         mark = mark_best(records, name, of, lambda r: r["satisfies"], _rivals)
-        # what single costs cost is not ranked
+        # single costs are not ranked
         return lambda row: mark(row) if name == "episode_return" or row["key"] == "cost" else ""
 
     def over(row: Record) -> str:
         return "bad" if row.get("excess", 0.0) > 0 else ""
 
-    marks = {
+    return {
         "$J_r$": best("episode_return", max),
         r"$\rho_c$": best("cost_rate", min),
         "$J_c$": lambda row: "" if "measure" in row else over(row),
         "limited measure": lambda row: over(row) if "measure" in row else "",
     }
-    return Table(_stem("final", environment), environment, columns, records, "", rows, marks)
 
 
 def _stem(kind: str, environment: str) -> str:
@@ -138,122 +131,48 @@ def _rivals(record: Record) -> Hashable:
     return record["fewest_steps"], record["steps"], frozenset(limits.items())
 
 
-def learning_table(experiments: Sequence[Experiment], good: float = 0.5) -> Table | None:
-    """What learning has cost on one environment, if anything on it has a limit.
-
-    A policy is good from a share of a return on: the published PPO's, or the best here.
-    """
+def learning_table(experiments: Sequence[Experiment]) -> Table | None:
+    """What learning has cost on one environment, if anything on it has a limit."""
     experiments = [e for e in experiments if e.limits]
     if not experiments:
         return None
-    environment, keys = experiments[0].environment, cost_keys_of(experiments)
-    keys = [key for key in keys if any(key in e.limits for e in experiments)]
-    least, definition = _good(experiments, good)
-    records = []
-    for e in experiments:
-        figures = [_learning_figures(run, least) for run in e.finished]
-        reached = sum(one["good_steps"] is not None for one in figures)
-        record = {"environment": environment, "algorithm": e.algorithm, "seeds": len(figures)}
-        record["hours"] = mean(run.hours for run in e.finished)
-        record["seeds_good"] = None if least is None else reached
-        records.append(record | _over_seeds(figures))
+    environment = experiments[0].environment
+    keys = [k for k in cost_keys_of(experiments) if any(k in e.limits for e in experiments)]
+    records = [
+        {
+            "environment": environment,
+            "algorithm": e.algorithm,
+            "seeds": len(e.finished),
+            "hours": mean(run.hours for run in e.finished),
+            **_over_seeds([_learning_figures(run) for run in e.finished]),
+        }
+        for e in experiments
+    ]
     columns = {
         **{"algorithm": "{algorithm}", "seeds": "{seeds:d}"},
         **({"cost": "{cost}"} if len(keys) > 1 else {}),
         "regret": spread("regret", 1),
         "epochs over": "{over:.0%}",
         "longest streak": "{streak:.0f}",
-        "steps until good": "{good_steps:,.0f}",
-        "hours until good": "{good_hours:.2f}",
-        "hours in all": "{hours:.2f}",
-        "good seeds": "{seeds_good:d} of {seeds:d}",
+        "hours": "{hours:.2f}",
     }
     fields = {"regret": "regret_{}", "regret_std": "regret_{}_std"}
     rows = each_cost(records, keys, **fields, over="share_over_{}", streak="streak_{}")
-    return Table(_stem("learning", environment), environment, columns, records, definition, rows)
+    return Table(_stem("learning", environment), environment, columns, records, "", rows)
 
 
-def _good(experiments: Sequence[Experiment], share: float) -> tuple[float | None, str]:
-    """The least return of a good policy on an environment, and the definition in words."""
-    reference, whose = experiments[0].reference, "the published PPO's"
-    if reference is not None:
-        whole = reference.episode_return
-    else:
-        whose = "the final return of the best here"
-        finals = [[run.final([])["episode_return"] for run in e.finished] for e in experiments]
-        whole = max([value for value in map(mean, finals) if math.isfinite(value)], default=0.0)
-    if whole <= 0:
-        return None, f"Good: not defined, as {whose} is not above 0."
-    return share * whole, (
-        f"Good: $J_r$ at least {share * whole:.4g}, {share:.0%} of {whose}, and every $J_c$ within "
-        "its limit, over as many epochs as final scores; steps and hours are means over the good "
-        "seeds."
-    )
-
-
-def _learning_figures(run: Run, least_return: float | None) -> dict[str, float | None]:
-    returns = run.column("episode_return")
-    figures: dict[str, float | None] = {"good_steps": None, "good_hours": None}
-    if not returns.size:
+def _learning_figures(run: Run) -> dict[str, float]:
+    figures: dict[str, float] = {}
+    if not run.column("episode_return").size:
         return figures
-    worst, width = np.full(returns.shape, -np.inf), final_width(run.column("steps"))
+    width = final_width(run.column("steps"))
     for key, limit in run.limits.items():
-        violation = run.column(f"violation_{key}")
-        costs = run.column(f"episode_{key}")
-        judged = np.where(np.isfinite(violation), limit + violation, costs)
-        judged = judged if run.limits_another_measure(key) else costs
+        judged = costs = run.column(f"episode_{key}")
+        if run.limits_another_measure(key):
+            violation = run.column(f"violation_{key}")
+            judged = np.where(np.isfinite(violation), limit + violation, costs)
         spans = joined(judged, width // FINAL_EPOCHS)
         figures[f"regret_{key}"] = regret(spans, limit)
         figures[f"share_over_{key}"] = share_of_epochs_over(spans, limit)
         figures[f"streak_{key}"] = longest_streak(spans, limit)
-        worst = np.maximum(worst, moving_mean(judged, width) - limit)
-    least = math.inf if least_return is None else least_return
-    epoch = first_good_epoch(moving_mean(returns, width), worst, least, 0.0)
-    if epoch is not None:
-        figures["good_steps"] = float(run.column("steps")[epoch])
-        figures["good_hours"] = float(run.column("time_total")[epoch]) / 3600
     return figures
-
-
-def better_tables(records: Sequence[Record]) -> list[Table]:
-    """Which algorithm is better than which: a file of all pairs, and a matrix per environment.
-
-    What has finished no episode neither keeps its limits nor breaks them, and is not ranked.
-    """
-    groups: dict[Hashable, list[Record]] = {}
-    for record in records:
-        judged = [value for name, value in record.items() if name.startswith("excess_")]
-        if all(map(math.isfinite, [record["episode_return"], *judged])):
-            groups.setdefault((record["environment"], _rivals(record)), []).append(record)
-    pairs: list[Record] = []
-    matrices = []
-    for own in groups.values():
-        first = own[0]
-        agents = {
-            r["algorithm"]: Agent(r["episode_return"], r.get("cost_rate", 0.0), r["satisfies"], 0)
-            for r in own
-        }
-        place, fields = first["environment"], ("environment", "better", "worse", "reason")
-        found = [dict(zip(fields, (place, *pair), strict=True)) for pair in compare(agents)]
-        pairs += found
-        words = [place, f"{short_number(first['steps'])} steps"]
-        words += [f"{name[6:]} ≤ {first[name]:g}" for name in first if name.startswith("limit_")]
-        matrices += [matrix(", ".join(words), [*agents], signs_of(agents))] if found else []
-    return [Table("dominance", "", {}, pairs), *matrices]
-
-
-def signs_of(agents: Mapping[str, Agent]) -> dict[tuple[str, str], str]:
-    """Pair of algorithms -> sign, if the first is better by the rules of the paper."""
-    signs = {"satisfies": "✓", "dominates": "≻"}
-    return {(better, worse): signs[reason] for better, worse, reason in compare(agents)}
-
-
-def matrix(title: str, names: Sequence[str], signs: Mapping[tuple[str, str], str]) -> Table:
-    """A table with a row and a column per algorithm."""
-    numbers = range(1, len(names) + 1)
-    rows = []
-    for row, one in zip(numbers, names, strict=True):
-        cells = {f"c{n}": signs.get((one, names[n - 1]), "") for n in numbers} | {f"c{row}": "·"}
-        rows.append({"algorithm": f"{row} {one}", **cells})
-    columns = {"better than …": "{algorithm}"} | {f"{n}": f"{{c{n}}}" for n in numbers}
-    return Table("", title, columns, rows, is_matrix=True)

@@ -2,30 +2,25 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from itertools import chain, permutations
+from itertools import chain
 from typing import Any
 
 import numpy as np
 
 from safe_rl.reporting.experiments import Experiment
-from safe_rl.reporting.scoring import matrix, signs_of
 from safe_rl.reporting.tables import Table, interval, mark_best
 from safe_rl.scores.benchmark import PUBLISHED, PUBLISHED_STEPS, REFERENCE, SLATES, Normalised
-from safe_rl.scores.comparisons import Estimate, interquartile_mean, probability_of_improvement
+from safe_rl.scores.comparisons import interquartile_mean
 from safe_rl.scores.measures import (
     NOISE_OF_ZERO,
-    Agent,
     normalised_cost_rate,
     normalised_return,
     normalised_violation,
 )
 
-__all__ = [
-    *("SYMBOLS", "Aggregate", "aggregate", "complete_slates", "improvement_tables", "slate_table"),
-]
+__all__ = ["SYMBOLS", "Aggregate", "aggregate", "complete_slates", "slate_table"]
 
 SYMBOLS = dict(
     zip(Normalised._fields, (r"$\bar J_r$", r"$\bar M_c$", r"$\bar \rho_c$"), strict=True)
@@ -117,10 +112,6 @@ def complete_slates(
             yield name, SLATES.get(name, shared), list(map(aggregate, members))
 
 
-def _named(name: str, estimate: Estimate) -> dict[str, float]:
-    return dict(zip((name, f"{name}_low", f"{name}_high"), estimate, strict=True))
-
-
 def slate_table(slate: str, environments: Sequence[str], aggregates: Sequence[Aggregate]) -> Table:
     """One of the paper's Tables 1 and 2, the published values beside ours."""
     conditions = {one.algorithm: one.conditions for one in aggregates}
@@ -133,7 +124,8 @@ def slate_table(slate: str, environments: Sequence[str], aggregates: Sequence[Ag
         record |= one.mean._asdict()
         if one.num_runs > 1:
             for name in SYMBOLS:
-                record |= _named(f"iqm_{name}", interquartile_mean(one.strata[name]))
+                names = (f"iqm_{name}", f"iqm_{name}_low", f"iqm_{name}_high")
+                record |= zip(names, interquartile_mean(one.strata[name]), strict=True)
         if all(e.has_published_limit for e in one.experiments):
             paper = PUBLISHED.get(slate, {}).get(one.experiments[0].base)
             record |= {f"paper_{n}": v for n, v in (paper._asdict() if paper else {}).items()}
@@ -165,34 +157,3 @@ def slate_table(slate: str, environments: Sequence[str], aggregates: Sequence[Ag
     }
     title = {"shared": "What all algorithms were trained on"}.get(slate, slate)
     return Table(f"slate_{slate}", title, columns, records, " ".join(notes), marks=marks)
-
-
-def improvement_tables(slate: str, aggregates: Sequence[Aggregate]) -> list[Table]:
-    """Which algorithm is better than which on a slate: a file of all pairs, and a matrix.
-
-    The file has the probabilities of improvement in each score. The matrix has the sign of the
-    paper's rules and the probability of a higher return. Pairs are those that were trained for
-    equally many steps; two single runs have no probability.
-    """
-    agents = {}
-    for one in aggregates:
-        value, violation, rate = one.mean
-        if one.is_measured:  # without an episode nothing is kept, and nothing violated
-            agents[one.algorithm] = Agent(value, rate, violation <= NOISE_OF_ZERO, one.conditions)
-    signs, records = signs_of(agents), []
-    for first, second in permutations(aggregates, 2):
-        alike = first.conditions[0] == second.conditions[0]
-        if not alike or max(first.num_runs, second.num_runs) == 1:
-            continue
-        pair = (first.algorithm, second.algorithm)
-        record: dict[str, Any] = {"slate": slate, "algorithm": pair[0], "other": pair[1]}
-        for name in SYMBOLS:
-            both = [one.strata[name] for one in (first, second)]
-            found = probability_of_improvement(*(both if name == "episode_return" else both[::-1]))
-            record |= _named(name, found)
-        records.append(record)
-        if math.isfinite(share := record["episode_return"]):
-            signs[pair] = f"{signs.get(pair, '')} {share:.2f}".strip()
-    rows = [one.algorithm for one in aggregates]
-    shown = [matrix(f"{slate}, which is better", rows, signs)] if signs else []
-    return [Table(f"slate_{slate}_improvement", "", {}, records), *shown]

@@ -1,9 +1,8 @@
-"""Tables of a report: numbers for CSV, and what a reader sees as Markdown and HTML."""
+"""Tables of a report: records for CSV, and what a reader sees in HTML and LaTeX."""
 
 from __future__ import annotations
 
 import math
-import re
 from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -14,13 +13,16 @@ from safe_rl.extras import import_extra
 from safe_rl.files import replace_text
 
 __all__ = [
-    *("SYMBOL", "Cell", "Record", "Table", "as_override", "clean", "each_cost", "escaped"),
-    *("filled", "interval", "mark_best", "short_number", "spread"),
+    *("Cell", "Record", "Table", "as_override", "clean", "each_cost", "filled", "interval"),
+    *("mark_best", "short_number", "spread"),
 ]
 
-SYMBOL = re.compile(r"\$(\\bar )?(\\rho|\w)(?:_(\w))?\$")
-r"""A symbol in a title or a sentence, such as ``$\bar J_r$``."""
 Record = Mapping[str, Any]
+_LATEX = str.maketrans(
+    {character: rf"\{character}" for character in "&%$#_{}"}
+    | {"\\": r"\textbackslash{}", "~": r"\textasciitilde{}", "^": r"\textasciicircum{}"}
+    | {"±": r"$\pm$", "≤": r"$\leq$", "…": r"\dots{}", "—": "--", "\N{NO-BREAK SPACE}": "~"}
+)
 
 
 def clean(text: Any, most: int = 200) -> str:
@@ -30,19 +32,11 @@ def clean(text: Any, most: int = 200) -> str:
         >>> clean("a\nb\x07"), clean("x" * 10, most=4)
         ('a b�', 'xxx…')
     """
-    shown = "".join(c if c.isprintable() else " " if c.isspace() else "�" for c in str(text))
+    kept = "\N{NO-BREAK SPACE}"
+    shown = "".join(
+        c if c.isprintable() or c == kept else " " if c.isspace() else "�" for c in str(text)
+    )
     return shown if len(shown) <= most else f"{shown[: most - 1]}…"
-
-
-def escaped(text: str) -> str:
-    r"""Text as Markdown shows it, symbols aside.
-
-    Examples:
-        >>> print(escaped("<b> a|b $x_y$"))
-        \<b\> a\|b $x_y$
-    """
-    special = rf"({SYMBOL.pattern})|[\\`*_{{}}\[\]<>|#$~&]"
-    return re.sub(special, lambda match: match[0] if match[1] else rf"\{match[0]}", text)
 
 
 def short_number(value: float) -> str:
@@ -95,11 +89,12 @@ def filled(template: str, record: Record) -> str:
         >>> filled("{x:.1f}| ± {x_std:.1f}", {"x": 1.25}), filled("{x:.1f}", {"y": 1})
         ('1.2', '—')
     """
-    parts = template.split("|")
-    names = [[name for _, name, _, _ in Formatter().parse(part) if name] for part in parts]
-    known = [not any(_is_missing(record.get(name)) for name in own) for own in names]
-    texts = [part.format(**record) for part, kept in zip(parts, known, strict=True) if kept]
-    return "".join(texts) if known[0] else "—"
+    texts = []
+    for part in template.split("|"):
+        names = [name for _, name, _, _ in Formatter().parse(part) if name]
+        texts.append(None if any(_is_missing(record.get(n)) for n in names) else part)
+    found = "".join(text.format(**record) for text in texts if text is not None)
+    return "—" if texts[0] is None else found
 
 
 def _is_missing(value: Any) -> bool:
@@ -129,10 +124,8 @@ def each_cost(records: Sequence[Record], keys: Sequence[str], **fields: str) -> 
 class Cell(NamedTuple):
     """What a reader sees of one entry; its mark is "best", "bad", or nothing."""
 
-    title: str
     text: str
     mark: str
-    is_number: bool
 
 
 @dataclass(frozen=True)
@@ -140,21 +133,18 @@ class Table:
     """Records, and how they are shown.
 
     Attributes:
-        name: Stem of the file.
+        name: Stem of the CSV file.
         title: Its heading.
-        columns: Head of a column -> template, see `filled`; without any it is only a file.
+        columns: Head of a column -> template, see `filled`.
         records: The CSV file holds all their fields, as numbers.
         note: Said below it.
         shown: Records that a reader sees, if not these.
         marks: Head of a column -> record -> "best" (bold), "bad" (over a limit), or nothing.
-        is_matrix: Whether cells are signs and short numbers, of records that another file holds.
 
     Examples:
         >>> table = Table("t", "A table", {"x": "{x:.2f}"}, [{"x": 1.23456}])
-        >>> print(table.markdown())
-        | x |
-        |---:|
-        | 1.23 |
+        >>> table.rows()
+        [[Cell(text='1.23', mark='')]]
     """
 
     name: str
@@ -164,7 +154,6 @@ class Table:
     note: str = ""
     shown: Sequence[Record] | None = None
     marks: Mapping[str, Callable[[Record], str]] = field(default_factory=dict)
-    is_matrix: bool = False
 
     @property
     def numbers(self) -> list[bool]:
@@ -173,22 +162,22 @@ class Table:
 
     def rows(self) -> list[list[Cell]]:
         """What a reader sees."""
-        columns = list(zip(self.columns.items(), self.numbers, strict=True))
         return [
             [
-                Cell(title, filled(text, row), self.marks.get(title, lambda _: "")(row), is_number)
-                for (title, text), is_number in columns
+                Cell(clean(filled(text, row), 1000), self.marks.get(title, lambda _: "")(row))
+                for title, text in self.columns.items()
             ]
             for row in (self.records if self.shown is None else self.shown)
         ]
 
-    def markdown(self) -> str:
-        """The table in GitHub's Markdown; what is over its limit has a triangle."""
-        looks = {"best": "**{}**", "bad": "{} ▲", "": "{}"}
-        rule = ["---:" if number else "---" for number in self.numbers]
-        rows = [[looks[cell.mark].format(escaped(cell.text)) for cell in r] for r in self.rows()]
-        lines = [f"| {' | '.join(row)} |" for row in (list(map(escaped, self.columns)), *rows)]
-        return "\n".join([lines[0], f"|{'|'.join(rule)}|", *lines[1:]])
+    def latex(self) -> str:
+        """The table in LaTeX, for the package booktabs; what is over its limit has a triangle."""
+        looks = {"best": r"\textbf{{{}}}", "bad": r"{} $\triangle$", "": "{}"}
+        cells = [[looks[c.mark].format(c.text.translate(_LATEX)) for c in r] for r in self.rows()]
+        frame = import_extra("pandas", "report").DataFrame(cells, columns=list(self.columns))
+        sides = "".join("r" if number else "l" for number in self.numbers)
+        text: str = frame.to_latex(index=False, escape=False, column_format=sides)
+        return f"% {clean(self.title)}\n{text}"
 
     def write_csv(self, path: Path) -> None:
         """Write the records; what is not a number becomes an empty field."""

@@ -1,1 +1,1 @@
-"""The protocol: published scores, slates, normalisation, dominance, intervals."""
+"""The protocol: published scores, slates, normalisation, intervals."""

@@ -24,40 +24,8 @@ __all__ = [
     "mean",
     "pareto_front",
     "performance_profile",
-    "probability_of_improvement",
     "share_over",
 ]
-
-
-def probability_of_improvement(first: Sequence[ArrayLike], second: Sequence[ArrayLike]) -> Estimate:
-    """How likely a run of the first algorithm scores higher than one of the second.
-
-    Ties count half. Probabilities are those of single environments, averaged; the bootstrap of the
-    interval resamples the runs of either algorithm on every environment on their own.
-
-    Args:
-        first: Scores per environment, one list of runs each.
-        second: The same of the other algorithm, environments in the same order.
-
-    Examples:
-        >>> probability_of_improvement([[1.0, 3.0]], [[2.0, 2.0]]).value
-        0.5
-    """
-    samples = [np.asarray(stratum, dtype=float) for stratum in (*first, *second)]
-    number = len(first)
-
-    def statistic(*strata: np.ndarray, axis: int = -1) -> Any:
-        pairs = zip(strata[:number], strata[number:], strict=True)
-        return np.mean([_share_higher(x, y) for x, y in pairs], axis=0)
-
-    low, high = bootstrap(samples, statistic)
-    return Estimate(float(statistic(*samples)), float(low), float(high))
-
-
-def _share_higher(x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """Share of pairs of [..., n] and [..., m] in which the first is higher, shape [...]."""
-    differences = x[..., :, np.newaxis] - y[..., np.newaxis, :]
-    return ((np.sign(differences) + 1) / 2).mean((-2, -1))
 
 
 def performance_profile(

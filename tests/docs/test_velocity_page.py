@@ -5,10 +5,9 @@ import re
 import archived_runs
 import numpy as np
 import pytest
-from velocity_tables import ARCHIVE, PUBLISHED, velocity_runs
+from velocity_tables import ARCHIVE, PUBLISHED, SEEDS, velocity_runs
 
 from safe_rl.envs.velocity import VELOCITY_SUITE
-from safe_rl.reporting.campaigns import PLAN, read_plan
 from safe_rl.reporting.recorded import Run
 
 STEPS = np.arange(20_000, 1_000_001, 20_000)
@@ -62,14 +61,13 @@ def test_runs_are_averaged_over_the_last_quarter_and_missing_ones_named(runs):
 
 
 def test_nothing_is_missing_where_all_is_done(runs):
-    for cell in read_plan(ARCHIVE / PLAN):
-        for seed in cell.seeds:
-            add_run(runs, cell.chosen["env"], seed)
+    for env in VELOCITY_SUITE:
+        for seed in SEEDS:
+            add_run(runs, env, seed)
     page = velocity_runs()
     assert "none yet" not in page
     assert "Not run yet" not in page
 
 
-def test_the_campaign_is_of_the_whole_family():
-    cells = read_plan(ARCHIVE / PLAN)
-    assert {cell.chosen["env"] for cell in cells} == set(VELOCITY_SUITE) == set(PUBLISHED)
+def test_published_values_are_of_the_whole_family():
+    assert set(VELOCITY_SUITE) == set(PUBLISHED)

@@ -77,8 +77,8 @@ def test_it_is_swept_and_reported(tmp_path):
     assert "import" not in str(folders[0].relative_to(tmp_path))
     status, printed = run("-m", "safe_rl.report", str(tmp_path), IMPORT)
     assert status == 0, printed
-    data = (tmp_path / "report" / "report.md").read_text()
-    assert r"import=\[" in data, "the command that does it again"
+    data = (tmp_path / "report" / "runs.csv").read_text()
+    assert "import=[" in data, "the command that does it again"
 
 
 def test_danger_rises_towards_the_centre(example):

@@ -73,7 +73,7 @@ def test_it_resumes_is_evaluated_and_reported(run, tmp_path, capsys):
     assert facts["environment"] == "PendulumEnv"
     assert facts["estimates"]["episode_length"]["value"] == 20
     assert report.main([str(folder.parent)]) == 0
-    assert "PendulumEnv" in (folder.parent / "report" / "report.md").read_text()
+    assert "PendulumEnv" in (folder.parent / "report" / "runs.csv").read_text()
 
 
 @pytest.mark.parametrize("name", sorted(set(TORCHRL_CLASSES) - {"GymEnv"}))

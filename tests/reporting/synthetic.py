@@ -28,6 +28,19 @@ def experiments_in(root: Path):
     return grouped(root)[0]
 
 
+def texts_of(table):
+    """What a reader sees, by column, row by row."""
+    return [
+        dict(zip(table.columns, (cell.text for cell in row), strict=True)) for row in table.rows()
+    ]
+
+
+def marks(table, title):
+    """Marks of a column, row by row."""
+    place = list(table.columns).index(title)
+    return [row[place].mark for row in table.rows()]
+
+
 def write_run(
     root: Path,
     env: str = "PointGoal1",

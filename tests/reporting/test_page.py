@@ -10,7 +10,7 @@ from html.parser import HTMLParser
 import numpy as np
 import pytest
 from matplotlib.image import imread
-from synthetic import experiments_in, write_run
+from synthetic import experiments_in, marks, texts_of, write_run
 
 from safe_rl.cli.report import main
 from safe_rl.reporting.inventory import evaluation_table, videos
@@ -96,28 +96,26 @@ class Page(HTMLParser):
 
 def test_everything_is_written(report):
     names = {path.name for path in report.iterdir()}
-    assert {"report.html", "report.md", "runs.csv", "dominance.csv", "evaluations.csv"} <= names
+    assert {"report.html", "tables.tex", "runs.csv", "evaluations.csv"} <= names
     # a table and a figure of every kind that these runs give reason for, and no other
     kinds = {re.match("[a-z]+", name)[0] for name in names}
     assert kinds == {
-        "report", "runs", "dominance", "evaluations", "final", "learning", "curves", "fronts",
+        "report", "runs", "tables", "evaluations", "final", "learning", "curves", "fronts",
         "slate", "profiles", "left",
     }  # fmt: skip
     for picture in report.glob("*.png"):
         assert imread(picture).std() > 0
 
 
-def test_page_and_markdown_say_the_same(report):
-    page, text = Page(report / "report.html"), (report / "report.md").read_text()
-    for heading in page.headings[1:]:
-        assert heading in text
+def test_page_and_latex_say_the_same(report):
+    page, text = Page(report / "report.html"), (report / "tables.tex").read_text()
     # a row of the table of final scores, and one of an evaluation
     (row,) = (r for r in page.rows if r[:3] == ["PPO", "2", "3,000"] and r[5] == "25")
     assert row[2:7] == ["3,000", "2.00\xa0± 0.00", "55.5\xa0± 0.7▲", "25", "0.0400\xa0± 0.0000"]
     assert (
-        "| PPO | 2 | 3,000 | 2.00 ± 0.00 | 55.5 ± 0.7 ▲ | 25 | 0.0400 ± 0.0000 |"
-        in text.replace("\xa0", " ")
-    )
+        r"PPO & 2 & 3,000 & 2.00~$\pm$ 0.00 & 55.5~$\pm$ 0.7 $\triangle$ & 25 & "
+        r"0.0400~$\pm$ 0.0000 &"
+    ) in text
     (row,) = (r for r in page.rows if "mean actions, x=1, 0% known layouts" in r)
     assert row[-5:] == [
         "12.00 [11.00, 13.00]",
@@ -126,7 +124,6 @@ def test_page_and_markdown_say_the_same(report):
         "25.0%",
         "10.0%: 70.0 [69.0, 71.0]",
     ]
-    assert ["2 PPO-Lagrangian", "✓", "·"] in page.rows
 
 
 def test_the_counts_are_those_of_the_runs(report):
@@ -146,8 +143,6 @@ def test_the_page_is_for_everybody(report):
     marked = [e for e in page.of("b") if e.get("class") == "flag"]
     assert marked
     assert all(mark["aria-label"] == "over the limit" for mark in marked)
-    # on a narrow screen every number stands beside the head of its column
-    assert all(cell["data-label"] for cell in page.of("td"))
     css = (report / "report.html").read_text().partition("</style>")[0]
     for query in ("prefers-color-scheme: dark", "@media print", "max-width: 640px"):
         assert query in css
@@ -166,22 +161,21 @@ def test_an_evaluation_shows_every_limit(tmp_path):
     evaluation = {**EVALUATION, "cost_limits": limits, "estimates": estimates}
     (directory / "evaluation.json").write_text(json.dumps(evaluation))
     table = evaluation_table(experiments_in(tmp_path))
-    titles = list(table.columns)
     # a row of each cost, so that there may be many; the aggregate cost has no limit
-    total, *rows = (dict(zip(titles, row, strict=True)) for row in table.rows())
-    assert [total[name].text for name in ("cost", "$J_c$", "$d$")] == [
+    assert marks(table, "$J_c$") == ["", "bad", ""]
+    total, *rows = texts_of(table)
+    assert [total[name] for name in ("cost", "$J_c$", "$d$")] == [
         "cost", "40.0 [39.0, 41.0]", "—",
     ]  # fmt: skip
-    for cells, (key, cost, limit, mark) in zip(
-        rows, (("cost_hazards", 21, "5", "bad"), ("cost_vases", 22, "30", "")), strict=True
+    for cells, (key, cost, limit) in zip(
+        rows, (("cost_hazards", 21, "5"), ("cost_vases", 22, "30")), strict=True
     ):
-        assert cells["cost"].text == key
-        assert cells["$J_r$"].text == "12.00 [11.00, 13.00]"
-        assert cells["$J_c$"].text == f"{cost}.0 [{cost - 1}.0, {cost + 1}.0]"
-        assert cells["$J_c$"].mark == mark
-        assert cells["$d$"].text == limit
-        assert cells["P($C$ > $d$)"].text == "25.0%"
-        assert cells["CVaR"].text.startswith(f"10.0%: {cost + 10}.0 [")
+        assert cells["cost"] == key
+        assert cells["$J_r$"] == "12.00 [11.00, 13.00]"
+        assert cells["$J_c$"] == f"{cost}.0 [{cost - 1}.0, {cost + 1}.0]"
+        assert cells["$d$"] == limit
+        assert cells["P($C$ > $d$)"] == "25.0%"
+        assert cells["CVaR"].startswith(f"10.0%: {cost + 10}.0 [")
 
 
 def test_a_few_of_many_episodes_are_not_none(tmp_path):
@@ -189,8 +183,7 @@ def test_a_few_of_many_episodes_are_not_none(tmp_path):
     estimates = {**EVALUATION["estimates"], "over_limit_cost": _estimate(0.004)}
     evaluation = {**EVALUATION, "estimates": estimates, "cvar_alpha": 0.005}
     (directory / "evaluation.json").write_text(json.dumps(evaluation))
-    (row,) = evaluation_table(experiments_in(tmp_path)).rows()
-    cells = {cell.title: cell.text for cell in row}
+    (cells,) = texts_of(evaluation_table(experiments_in(tmp_path)))
     assert cells["P($C$ > $d$)"] == "0.4%"
     assert cells["CVaR"].startswith("0.5%: 70.0")
 
@@ -203,8 +196,7 @@ def test_evaluations_and_films_are_told_apart_by_their_names(tmp_path):
         path.write_text(json.dumps(evaluation))
     RunFolder(directory).evaluation("many", "mp4").write_bytes(VIDEO)
     experiments = experiments_in(tmp_path)
-    rows = evaluation_table(experiments).rows()
-    shown = [{cell.title: cell.text for cell in row}["what"] for row in rows]
+    shown = [row["what"] for row in texts_of(evaluation_table(experiments))]
     assert shown == [f"{name}mean actions, x=1, 0% known layouts" for name in ("", "many, ")]
     assert [caption for caption, _ in videos(experiments)] == ["PointGoal1, PPO, seed 0, many"]
     (directory / "evaluation.mp4").write_bytes(VIDEO)
@@ -216,7 +208,7 @@ def test_an_evaluation_is_not_judged_by_the_mean_if_training_was_not(tmp_path):
     estimates = {**EVALUATION["estimates"], "episode_cost": _estimate(90.0)}
     (directory / "evaluation.json").write_text(json.dumps({**EVALUATION, "estimates": estimates}))
     table = evaluation_table(experiments_in(tmp_path))
-    assert "bad" not in [cell.mark for cell in table.rows()[0]]
+    assert marks(table, "$J_c$") == [""]
 
 
 def test_the_page_holds_everything_itself(report):
@@ -260,7 +252,6 @@ def test_algorithms_and_formats_can_be_chosen(folder, tmp_path):
         (["sedes=1"], "'seeds'"),
         (["seeds=0"], "at least one run"),
         (["seeds=two"], "'seeds'"),
-        (["good=0"], "for half"),
         (["formats=bmp"], "png, svg, pdf"),
         (["algos=cup"], "there are runs of ppo"),
         (["other/runs"], "'other/runs' is not an option: options are written key=value"),
@@ -292,9 +283,7 @@ PROBE = """
   const images = [...document.images].map(image => image.naturalWidth);
   const tables = [...document.querySelectorAll("table")].map(
     table => [table.offsetWidth, table.parentElement.clientWidth]);
-  const entries = Math.max(...[...document.querySelectorAll("td span")].map(
-    entry => entry.getBoundingClientRect().right));
-  const facts = {images, tables, entries, page: document.documentElement.scrollWidth,
+  const facts = {images, tables, page: document.documentElement.scrollWidth,
                  window: window.innerWidth, heading: document.querySelector("h1").textContent};
   const probe = document.createElement("pre");
   probe.id = "probe";
@@ -335,7 +324,8 @@ def test_a_browser_shows_the_page(report, tmp_path, width):
     assert facts["window"] == width
     # nothing sticks out of the window, nor a table out of its box
     assert facts["page"] <= facts["window"]
-    assert all(table <= box for table, box in facts["tables"])
+    if width > 1000:  # on a narrow screen tables are moved sideways
+        assert all(table <= box for table, box in facts["tables"])
 
 
 @pytest.mark.skipif(CHROMIUM is None, reason="Chromium is not installed")

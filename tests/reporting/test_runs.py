@@ -82,10 +82,13 @@ def test_what_is_no_run_is_named_with_its_reason(tmp_path):
     runs, skipped = find_runs(tmp_path)
     assert [run.directory for run in runs] == [good]
     reasons = {path.name: reason for path, reason in skipped.items()}
-    assert reasons["f1"] == "config.yaml is not that of a run: its 'env' is not a mapping"
+    assert (
+        reasons["f1"]
+        == "config.yaml is not that of a run: it lacks a usable env, algo, seed, frames"
+    )
     assert reasons["f2"] == "it has not begun: no progress.csv"
     assert reasons["f3"] == "it has not finished an epoch"
-    assert reasons["f4"].startswith("progress.csv cannot be read")
+    assert "progress.csv, line 3 has 1 fields" in reasons["f4"]
     assert reasons["f5"].startswith("config.yaml cannot be read")
 
 

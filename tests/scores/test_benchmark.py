@@ -1,7 +1,5 @@
 """Only what is exactly the benchmark's is measured by its scores; tables agree with each other."""
 
-import itertools
-
 import numpy as np
 import pytest
 
@@ -16,9 +14,6 @@ from safe_rl.scores.benchmark import (
     Scores,
 )
 from safe_rl.scores.measures import (
-    Agent,
-    compare,
-    dominates,
     normalised_cost_rate,
     normalised_return,
     normalised_violation,
@@ -87,37 +82,6 @@ def test_a_reference_within_the_limit_divides_by_epsilon():
     reference = Scores(20.0, 10.0, 0.01)
     np.testing.assert_allclose(normalised_violation(26.0, 25.0, reference), 1e6)
     assert normalised_violation(25.0, 25.0, reference) == 0.0
-
-
-def test_dominance_is_the_papers_definition():
-    grid = [
-        Agent(*values, 1e6) for values in itertools.product((1.0, 2.0), (0.01, 0.02), (True, False))
-    ]
-    for a, b in itertools.product(grid, grid):
-        first = a.episode_return >= b.episode_return and a.cost_rate < b.cost_rate
-        second = a.episode_return > b.episode_return and a.cost_rate <= b.cost_rate
-        both_satisfy = a.is_satisfying and b.is_satisfying
-        assert dominates(a, b) == (both_satisfy and (first or second)), (a, b)
-
-
-def test_agents_that_were_trained_for_different_times_are_not_ranked():
-    longer, shorter = Agent(9.0, 0.01, True, 2e6), Agent(1.0, 0.02, True, 1e6)
-    assert list(compare({"longer": longer, "shorter": shorter})) == []
-
-
-def test_comparison_names_every_pair_once():
-    agents = {
-        "good": Agent(10.0, 0.02, True, 1),
-        "fair": Agent(8.0, 0.03, True, 1),
-        "odd": Agent(12.0, 0.04, True, 1),
-        "rash": Agent(99.0, 0.01, False, 1),
-    }
-    assert list(compare(agents)) == [
-        ("good", "fair", "dominates"),
-        ("good", "rash", "satisfies"),
-        ("fair", "rash", "satisfies"),
-        ("odd", "rash", "satisfies"),
-    ]
 
 
 @pytest.mark.parametrize("name", REFERENCE)

@@ -10,45 +10,17 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from scipy.stats import mannwhitneyu
 
 from safe_rl.scores.comparisons import (
     interquartile_mean,
     pareto_front,
     performance_profile,
-    probability_of_improvement,
 )
 from safe_rl.scores.measures import (
-    first_good_epoch,
     longest_streak,
     regret,
     share_of_epochs_over,
 )
-
-
-def test_probability_of_improvement_is_the_statistic_of_mann_and_whitney():
-    generator = np.random.default_rng(0)
-    # rounded, so that there are ties
-    first = [generator.normal(size=n).round(1) for n in (5, 7)]
-    second = [generator.normal(size=n).round(1) for n in (6, 4)]
-    expected = np.mean(
-        [
-            mannwhitneyu(x, y).statistic / (len(x) * len(y))
-            for x, y in zip(first, second, strict=True)
-        ]
-    )
-    found = probability_of_improvement(first, second)
-    assert found.value == pytest.approx(expected)
-    assert found.low < found.value < found.high
-    assert probability_of_improvement(second, first).value == pytest.approx(1 - expected)
-
-
-def test_the_interval_of_the_probability_is_that_of_all_resamples():
-    first, second = [0.0, 2.0], [1.0, 1.0]
-    resamples = itertools.product(itertools.product(first, repeat=2), [second])
-    outcomes = {np.mean([x > y for x in a for y in b]) for a, b in resamples}
-    found = probability_of_improvement([first], [second])
-    assert (found.low, found.high) == (min(outcomes), max(outcomes)) == (0.0, 1.0)
 
 
 def test_a_profile_is_the_share_of_runs_above():
@@ -90,18 +62,9 @@ def test_figures_of_the_course_by_counting(costs, limit):
     assert regret(costs, limit) == pytest.approx(excess / len(costs))
 
 
-@given(costs=EPOCHS, seed=st.integers(0, 99), limit=st.integers(0, 4))
-def test_the_first_good_epoch_is_good_and_none_before_it(costs, seed, limit):
-    returns = np.random.default_rng(seed).integers(0, 5, len(costs))
-    found = first_good_epoch(returns, costs, 2.0, limit)
-    good = [r >= 2 and c <= limit for r, c in zip(returns, costs, strict=True)]
-    assert found == (good.index(True) if any(good) else None)
-
-
-# five runs of two algorithms on three environments
+# five runs on three environments
 GENERATOR = np.random.default_rng(7)
 FIRST = GENERATOR.normal(1.0, 0.4, (5, 3)).round(2).T
-SECOND = GENERATOR.normal(0.8, 0.5, (5, 3)).round(2).T
 
 
 def test_the_interquartile_mean_and_its_interval():
@@ -109,12 +72,6 @@ def test_the_interquartile_mean_and_its_interval():
     assert found.value == pytest.approx(0.93666667)
     # as near as two bootstraps come to each other
     assert (found.low, found.high) == pytest.approx((0.79444444, 1.05333333), abs=0.015)
-
-
-def test_the_probability_of_improvement_and_its_interval():
-    found = probability_of_improvement(FIRST, SECOND)
-    assert found.value == pytest.approx(0.8)
-    assert (found.low, found.high) == pytest.approx((0.61333333, 0.94666667), abs=0.02)
 
 
 def test_the_profile_and_its_band():
