@@ -270,7 +270,7 @@ def _run(directory: Path, recorded: Recorded, unfinished: bool) -> Run:
 
 def _check(config: Mapping[str, Any]) -> None:
     """Refuse a configuration without what every run has."""
-    frames, limits = config.get("frames"), config.get("cost_limits") or {}
+    frames, limits = config.get("frames", -1), config.get("cost_limits") or {}
     source = config.get("init_from")
     are_right = {
         "env": isinstance(config.get("env"), dict),
