@@ -168,7 +168,7 @@ FLOORS = {
     ),
     "reporting": (
         ("tables",),
-        ("archive",),
+        ("archive", "notes"),
         ("recorded",),
         ("experiments",),
         ("inventory", "scoring"),
