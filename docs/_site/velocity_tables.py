@@ -7,8 +7,6 @@ from typing import NamedTuple
 
 from algorithm_results import RESULTS, end_cells, finished_runs, last_quarter, spread
 
-from safe_rl.envs.velocity import VELOCITY_SUITE
-
 ARCHIVE = RESULTS / "velocity"
 ALGORITHM, SEEDS = "ppo_lagrangian", (300, 301, 302)  # of all runs that were planned
 
@@ -39,7 +37,7 @@ def velocity_runs(archive: Path = ARCHIVE) -> str:
         "|---|---|---|---|---|---|---|",
     ]
     missing = []
-    for env in VELOCITY_SUITE:
+    for env in PUBLISHED:
         runs = finished_runs(archive, ALGORITHM, env)
         parts = last_quarter(runs.values())
         ours = [str(len(parts)), *end_cells(parts, 0)] if parts else ["none yet", *"———"]
