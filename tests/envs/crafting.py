@@ -1,4 +1,4 @@
-"""States in which something happens: the robot beside, on or in every kind of object."""
+"""States in which something happens: where things are, and how they are put there."""
 
 import math
 
@@ -6,10 +6,6 @@ import torch
 from tensordict import TensorDict
 
 FREE = ("vase", "gremlin", "box")
-# How far a robot reaches from its centre, at least and at most [m].
-REACH = {"point": (0.09, 0.13), "car": (0.1, 0.17), "doggo": (0.12, 0.28)}
-# How far an object reaches; the robot's centre has to be over those that are flat [m].
-HALF_WIDTH = {"vase": 0.1, "gremlin": 0.1, "box": 0.2, "pillar": 0.2, "button": 0.1}
 
 
 def kind_of(name: str) -> str:
@@ -41,46 +37,6 @@ def after_random_steps(env, num_steps: int) -> TensorDict:
     for _ in range(num_steps):
         tensordict = env.step_mdp(env.step(env.rand_action(tensordict)))
     return env.get_state()
-
-
-def random_direction() -> torch.Tensor:
-    """A unit vector in the plane [2]."""
-    bearing = 2 * math.pi * torch.rand((), dtype=torch.float64)
-    return torch.stack([torch.cos(bearing), torch.sin(bearing)])
-
-
-def meet(env, state: TensorDict, row: int, name: str) -> None:
-    """Let the robot of one row run into an object, or the box reach its goal, in place."""
-    where, direction = places(env, state)[name][row], random_direction()
-    chance, speed = torch.rand(2).tolist()
-    if name == "goal" and env.config.task == "push":
-        box = position_columns(env)["box"]
-        state["qpos"][row, box] = where - 1.5 * env.config.goal_size * chance * direction
-        return
-    nearest, farthest = REACH[env.config.robot_base]
-    gap = HALF_WIDTH.get(kind_of(name), 0.0) + nearest + (farthest - nearest) * chance
-    state["qpos"][row, :2] = where - gap * direction
-    state["qvel"][row, :2] = speed * direction
-
-
-def encounters(env, num_calm: int) -> TensorDict:
-    """States after random steps, in which robots meet objects of one kind after another.
-
-    Args:
-        env: the environment; its number of worlds is the number of states.
-        num_calm: the first so many rows are left as they came.
-    """
-    state = after_random_steps(env, num_steps=5)
-    kinds: dict[str, list[str]] = {}
-    for name in env.object_names:
-        kinds.setdefault(kind_of(name), []).append(name)
-    for row in range(num_calm, len(state) if kinds else 0):
-        number, turn = divmod(row - num_calm, len(kinds))
-        names = list(kinds.values())[turn]
-        meet(env, state, row, names[number % len(names)])
-    if env.config.task == "button":
-        state["buttons_timer"][torch.rand(len(state)) < 0.2] = 3
-    return state
 
 
 def arrange(env, **poses: tuple[float, ...]) -> TensorDict:
