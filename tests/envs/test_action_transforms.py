@@ -18,11 +18,9 @@ from safe_rl.envs.transforms import (
     EarlyTermination,
     ObservedCosts,
     RewardScale,
-    Simmer,
     transform_env,
 )
 from safe_rl.evaluation.episodes import collect_episodes
-from safe_rl.evaluation.video import record_episode, video_format
 
 
 def test_replaced_actions_are_taken_and_counted_and_the_chosen_ones_kept():
@@ -189,18 +187,6 @@ def test_evaluation_counts_steps_of_the_environment():
     assert safety_gym.highest_cost("cost") == 8.0
 
 
-def test_schedules_and_budgets_before_it_go_by_single_steps():
-    simmer = Simmer(
-        {"cost": 4.0}, first=0.5, steps=16, discount=1.0, unsafe_reward=0.0, rescale_budgets=False
-    )
-    env = repeating(Priced([[1.0, 0.0] * 4]), 4, simmer)
-    left = still(env, 5)["next", "observation"][0, :, -1]
-    # 2 of 4, and 3 of 4 in the second episode, of which every step of cost takes a quarter
-    assert left.tolist() == [0.0, -0.5, 0.25, -0.25, 0.5]
-    env.continue_from(16)
-    assert env.reset()["observation"][0, -1] == 1.0
-
-
 def test_a_snapshot_continues_exactly_between_and_before_repeats():
     def make():
         config = {"robot_base": "point", "num_steps": 10}
@@ -214,19 +200,3 @@ def test_a_snapshot_continues_exactly_between_and_before_repeats():
     assert torch.equal(put["steps_taken"], state["steps_taken"])
     steps = [one.step(one.set_state(kept).set("action", action))["next"] for one in (env, other)]
     assert (steps[0] == steps[1]).all()
-
-
-def test_a_film_shows_repeats_in_the_time_of_the_environment():
-    config = {"robot_base": "point", "num_steps": 40}
-    env = make_env(config, num_envs=1, seed=0, transforms={"repeat": ActionRepeat(4)})
-    form = video_format(env, "mp4")
-    assert form.steps_per_frame == 4
-    assert form.frames_per_second == pytest.approx(1 / (4 * env.seconds_per_step))
-    assert video_format(env, "gif").steps_per_frame == 4
-    seen = []
-    env.base_env.render = lambda **_: (
-        seen.append(0) or torch.zeros(8, 8, 3, dtype=torch.uint8).numpy()
-    )
-    policy = lambda td: td.set("action", torch.zeros(1, 2))  # noqa: E731
-    frames = list(record_episode(env, policy, ["cost"], deterministic=True, form=form))
-    assert len(frames) == 11

@@ -136,13 +136,6 @@ def test_one_state_can_be_branched_into_all_rows():
     assert not torch.equal(following["observation"][0], following["observation"][2])
 
 
-def test_set_state_returns_what_a_reset_returns():
-    env = make("push", 3)
-    start = env.reset()
-    again = env.set_state(env.get_state())
-    assert_same(start, again)
-
-
 def test_layout_and_seeds_may_be_left_out_of_a_state():
     env = make("goal", 3, sleep=False)
     env.rollout(5)

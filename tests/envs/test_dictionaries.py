@@ -107,41 +107,18 @@ def test_keys_that_are_no_more_say_what_replaces_them(key):
 
 def test_values_of_numpy_are_those_of_python():
     given = {
-        **{"hazards_num": np.int64(3), "vases_num": np.uint8(2), "num_steps": np.float32(7.0)},
-        **{"constrain_hazards": np.True_, "goal_size": np.float64(0.5), "task": np.str_("push")},
-        **{"placements_extents": np.array([-3, -3, 3, 3]), "robot_locations": np.zeros((1, 2))},
-        **{"vision_size": np.array([30, 20]), "lidar_max_dist": np.int32(4)},
-        "sensors_obs": np.array(["gyro"]),
+        **{"hazards_num": np.int64(3), "num_steps": np.float32(7.0), "task": np.str_("push")},
+        **{"constrain_hazards": np.True_, "goal_size": np.float64(0.5)},
+        **{"placements_extents": np.array([-3, -3, 3, 3]), "sensors_obs": np.array(["gyro"])},
     }
-    plain = {
-        **{"hazards_num": 3, "vases_num": 2, "num_steps": 7, "constrain_hazards": True},
-        **{"goal_size": 0.5, "task": "push", "placements_extents": [-3, -3, 3, 3]},
-        **{"robot_locations": [[0, 0]], "vision_size": [30, 20], "lidar_max_dist": 4},
-        "sensors_obs": ["gyro"],
-    }
+    plain = {key: value.tolist() for key, value in given.items()}
     config = SafetyGymConfig.from_dict(given)
     assert config == SafetyGymConfig.from_dict(plain)
     assert {type(config.hazards_num), type(config.num_steps)} == {int}
     assert config.constrain_hazards is True
-    for wrong in (
-        {"hazards_num": np.True_},
-        {"goal_size": np.bool_(1)},
-        {"lidar_alias": np.int8(1)},
-    ):
+    for wrong in ({"hazards_num": np.True_}, {"lidar_alias": np.int8(1)}):
         with pytest.raises(ConfigError):
             SafetyGymConfig.from_dict(wrong)
-
-
-def test_rectangles_without_room_are_skipped():
-    """As rectangle and as probability: where the others are is where everything is."""
-    rectangles = [[-2, -2, -1.5, 2], [0, 0, 2, 2], [-2, 1, 2, 1.5]]
-    keys = {"robot_base": "point", "task": "none", "robot_placements": rectangles}
-    env = SafetyGymEnv(keys, num_envs=500, seed=0, num_threads=1)
-    env.reset()
-    xy = env.get_state()["qpos"][:, :2]
-    assert xy.min() >= 0.4
-    assert xy.max() <= 1.6
-    assert (xy.mean(0) - 1.0).abs().max() < 4 * 1.2 / math.sqrt(12 * 500)
 
 
 @pytest.mark.parametrize("clip", [0, None, 0.5])

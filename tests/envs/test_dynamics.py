@@ -4,12 +4,10 @@ import mujoco
 import numpy as np
 import pytest
 import torch
-from torchrl.envs.utils import check_env_specs
 
-from safe_rl.envs import ConfigError, SafetyGymEnv, env_node, make_env
+from safe_rl.envs import ConfigError, SafetyGymEnv
 from safe_rl.envs.physics.dynamics import SCALES, scale_dynamics
 from safe_rl.envs.safety_gym.robots import ROBOTS
-from safe_rl.envs.velocity import VELOCITY_SUITE, VelocityEnv
 from safe_rl.envs.velocity.runner_model import ASSETS
 from safe_rl.envs.velocity.runners import RUNNERS
 
@@ -67,27 +65,6 @@ def test_the_model_is_the_one_that_is_compiled_from_multiplied_numbers(robot, sc
     assert scaled.stat.meaninertia == pytest.approx(compiled.stat.meaninertia)
 
 
-@pytest.mark.parametrize("scale", SCALES)
-@pytest.mark.parametrize("name", ["SafeHopperVelocity", "SafeHumanoidVelocity"])
-def test_a_step_is_that_of_the_multiplied_model(name, scale):
-    config = VELOCITY_SUITE[name].replace(**{scale: 1.7})
-    env = VelocityEnv(config, num_envs=3, seed=0, num_threads=1)
-    spec = mujoco.MjSpec.from_file(FILES[config.robot])
-    IN_THE_FILE[scale](spec, 1.7)
-    model = spec.compile()
-    env.rollout(20, break_when_any_done=False)
-    state, action = env.get_state(), env.action_spec.rand()
-    env.step(state.empty().set("action", action))
-    after = env.get_state()
-    for row in range(3):
-        data = mujoco.MjData(model)
-        for key in ("qpos", "qvel", "qacc_warmstart"):
-            getattr(data, key)[:] = state[key][row]
-        data.ctrl[:] = action[row]
-        mujoco.mj_step(model, data, config.frame_skip)
-        np.testing.assert_allclose(after["qpos"][row], data.qpos, atol=1e-9)
-
-
 def forwards(td):
     return td.set("action", torch.full((*td.batch_size, 2), 0.7))
 
@@ -118,13 +95,6 @@ def test_without_friction_a_car_goes_nowhere_and_without_strength_neither(keys, 
                 tensordict=env.set_state(start))  # fmt: skip
     way = (env.get_state()["qpos"] - start["qpos"])[:, :2].norm().item()
     assert way > 0.3 if moves else way < 0.06
-
-
-@pytest.mark.parametrize("name", ["PointGoal1", "SafeHopperVelocity"])
-def test_scales_are_keys_of_an_environment(name):
-    env = make_env({**env_node(name), "mass_scale": 1.5, "damping_scale": 0.5})
-    check_env_specs(env)
-    assert env.config.mass_scale == 1.5
 
 
 def test_muscles_have_no_strength_to_multiply(tmp_path):

@@ -66,21 +66,6 @@ def test_it_is_trained_resumed_and_evaluated_by_the_ordinary_commands(tmp_path):
     assert "cost_mines" in (tmp_path / "evaluation.json").read_text()
 
 
-@pytest.mark.slow
-def test_it_is_swept_and_reported(tmp_path):
-    status, printed = run("train.py", "-m", IMPORT, *MINES, *SHORT, "seed=0,1",
-                          "hydra.launcher.n_jobs=2", f"hydra.sweep.dir={tmp_path}")  # fmt: skip
-    assert status == 0, printed
-    assert "2 of 2 runs are finished" in printed
-    folders = sorted(path.parent for path in tmp_path.rglob("progress.csv"))
-    assert [folder.name for folder in folders] == ["seed0", "seed1"]
-    assert "import" not in str(folders[0].relative_to(tmp_path))
-    status, printed = run("-m", "safe_rl.report", str(tmp_path), IMPORT)
-    assert status == 0, printed
-    data = (tmp_path / "report" / "runs.csv").read_text()
-    assert "import=[" in data, "the command that does it again"
-
-
 def test_danger_rises_towards_the_centre(example):
     robot = torch.tensor([[0.0, 0.0]])
     mines = torch.tensor([[[0.1, 0.0], [0.0, 0.3]]])

@@ -241,55 +241,6 @@ def test_tasks_with_goals_of_their_own():
     assert not step_from(env, arrange(env, robot=(0, 0, 0), goal=(1.6, 0)), 0.0, 0.0)["goal_met"]
 
 
-def test_rewards_may_have_any_type_and_measures_may_be_views():
-    torch.manual_seed(0)
-    for reward, wanted in ((lambda c, w, b, n: torch.ones(len(n), dtype=torch.int64), 1.0),
-                           (lambda c, w, b, n: n[:, 0] < 9, 1.0)):  # fmt: skip
-        register_task("typed", Task(reward, measure=lambda w: torch.zeros(1, 1).expand(1, 1)))
-        env = make({"task": "typed", "reward_clip": None})
-        assert float(step_from(env, env.get_state(), 1.0, 0.0)["reward"]) == wanted
-    moved = Task(lambda c, w, before, now: (now - before)[:, 0], lambda w: w.robot_pos[:, :1])
-    register_task("moved", moved)
-    env = make({"task": "moved"})
-    state = arrange(env, robot=(0, 0, 0))
-    state["qvel"][:, 0] = 0.5
-    for _ in range(3):
-        result = step_from(env, state, 0.0, 0.0)
-        after = env.get_state()
-        assert float(result["reward"]) == pytest.approx(
-            float(after["qpos"][0, 0] - state["qpos"][0, 0]), rel=1e-5
-        )
-        assert float(result["reward"]) > 1e-3
-        state = after
-
-
-def test_no_gradients_are_kept_of_what_is_measured():
-    network = torch.nn.Linear(3, 1).double()
-    register_task("valued", Task(lambda c, w, b, n: (n - b)[:, 0], lambda w: network(w.robot_pos)))
-    env = make({"task": "valued"})
-    for _ in range(2):
-        tensordict = env.rollout(2)[:, -1]["next"]
-        assert not any(value.requires_grad for value in tensordict.values())
-        assert not env._measured.requires_grad
-        env.set_state(env.get_state())
-
-
-@pytest.mark.parametrize("indicator", [False, True])
-@pytest.mark.parametrize(
-    "values", [[True, True], [True, 1.5], [200, 100], [128, 128], [0.25, 1.0], [0, 0]]
-)
-def test_costs_of_any_type_add_up(values, indicator):
-    kinds = {bool: torch.bool, int: torch.uint8, float: torch.float32}
-    for index, value in enumerate(values):
-        magnitude = torch.tensor([value], dtype=kinds[type(value)])
-        register_cost(Cost(f"cost_{index}", lambda c: True, lambda c, w, m=magnitude: m))
-    env = make({"constrain_indicator": indicator})
-    result = step_from(env, env.get_state(), 0.0, 0.0)
-    assert float(result["cost"]) == (any(values) if indicator else sum(values))
-    for index, value in enumerate(values):
-        assert float(result[f"cost_{index}"]) == (bool(value) if indicator else value)
-
-
 def test_observations_are_sorted_in_and_may_feel_contacts():
     touch = Reading(
         "feel",
@@ -334,15 +285,3 @@ def test_registering_again_replaces_the_row():
     assert env.object_names == ("hazard0", "bomb0", "bomb1")
     result = step_from(env, arrange(env, robot=(0, 0), bomb0=(0.3, 0), bomb1=(5, 5)), 0.0, 0.0)
     assert float(result["cost_mines"]) == 7.0 * 2.5
-
-
-def test_environments_made_before_keep_the_costs_and_the_task_that_they_were_made_with():
-    register_cost(Cost("cost_steady", lambda c: True, lambda c, w: torch.full((1,), 2.0)))
-    register_task("steady", Task(lambda c, w, b, n: torch.full((1,), 3.0)))
-    env = make({"task": "steady", "constrain_indicator": False})
-    register_cost(Cost("cost_steady", lambda c: True, lambda c, w: torch.full((1,), 5.0)))
-    register_cost(Cost("cost_newer", lambda c: True, lambda c, w: torch.full((1,), 7.0)))
-    register_task("steady", Task(lambda c, w, b, n: torch.full((1,), 9.0)))
-    result = step_from(env, env.get_state(), 0.0, 0.0)
-    assert [float(result[key]) for key in ("cost", "cost_steady", "reward")] == [2.0, 2.0, 3.0]
-    assert "cost_newer" not in result

@@ -117,11 +117,6 @@ def test_an_unknown_name_is_said_once_where_costs_are_to_be_found_out():
     assert str(error.value).count("env.id=") == 1
 
 
-def test_nested_observations_become_a_vector_on_request():
-    env = make_env({**NODE, "kwargs": {"nested": True}, "flatten": True}, num_envs=2)
-    assert env.reset()["observation"].shape == (2, 4)
-
-
 def test_nested_observations_are_trained_on_entry_by_entry(tmp_path):
     nested = {**NODE, "kwargs": {"nested": True}}
     env = make_env(nested, num_envs=2, seed=0)

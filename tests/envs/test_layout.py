@@ -183,12 +183,6 @@ def test_first_goals_are_drawn_beside_everything_that_stands(name):
         assert measured == pytest.approx(1.165, abs=3 * 0.008 * math.sqrt(2))
 
 
-def test_first_goals_follow_from_the_seed_of_their_row():
-    few, many = (fresh_places(SUITE["PointGoal2"], number, seed=3)["goal"] for number in (3, 50))
-    assert np.array_equal(few, many[:3])
-    assert len(np.unique(many, axis=0)) == 50
-
-
 def test_a_goal_without_a_second_place_keeps_its_first():
     """Nothing but one point, which the pinned goal is drawn at again, up to its tolerance."""
     pins = {"robot_locations": [[0, 0]], "goal_locations": [[0.8, 0]], "goal_keepout": 0.4}
@@ -234,49 +228,6 @@ def test_pinned_layouts():
     assert (state["qpos"][:, 2] == 0.3).all()
 
 
-@pytest.mark.parametrize("robot", ["car", "doggo"])
-def test_yaws_are_uniform(robot):
-    config = {"robot_base": robot, "task": "none", "vases_num": 1, "gremlins_num": 1}
-    _, state = fresh_state(config, 2000)
-    robot_quat, vase_quat = state["qpos"][:, 3:7], state["qpos"][:, -11:-7]
-    gremlin_quat = state["qpos"][:, -4:]
-    for quat in (robot_quat, vase_quat, gremlin_quat):
-        assert (quat[:, 1:3] == 0).all()
-        yaw = 2 * torch.atan2(quat[:, 3], quat[:, 0]).numpy()
-        assert (
-            stats.kstest(yaw % (2 * math.pi), stats.uniform(0, 2 * math.pi).cdf).pvalue > UNLIKELY
-        )
-
-
-def test_margin_is_added_to_the_distance():
-    config = {**POINT, "hazards_num": 1, "placements_margin": 0.7}
-    found = fresh_places(config, 1000)
-    distance = np.linalg.norm(found["robot"] - found["hazard0"], axis=1)
-    assert 1.5 <= distance.min() < 1.55
-
-
-@pytest.mark.parametrize(
-    ("config", "culprit"),
-    [
-        ({"hazards_num": 30, "placements_extents": [-1, -1, 1, 1]}, "hazard"),
-        ({"vases_num": 1, "vases_locations": [[0, 0.3]], "robot_locations": [[0, 0]]}, "vase0"),
-    ],
-)
-def test_impossible_layouts_name_the_object(config, culprit):
-    env = SafetyGymEnv({**POINT, **config}, num_envs=2, seed=0, num_threads=1)
-    with pytest.raises(LayoutError, match=f"'{culprit}.*keepout"):
-        env.reset()
-
-
-def test_a_rectangle_of_twice_the_keepout_is_a_point():
-    """Rounding turns one in five of them inside out."""
-    rng = np.random.default_rng(0)
-    for x, y in rng.uniform(-2, 2, (30, 2)).round(2).tolist():
-        rectangle = [x - 0.4, y - 0.4, x + 0.4, y + 0.4]
-        found = fresh_places({**POINT, "robot_placements": [rectangle]}, 2)["robot"]
-        np.testing.assert_allclose(found, [[x, y], [x, y]], atol=1e-9)
-
-
 def test_placements_without_room_name_the_key():
     config = {**POINT, "hazards_num": 1, "hazards_placements": [[0, 0, 0.7, 2]]}
     with pytest.raises(ConfigError, match=r"hazard0.*'hazards_placements'.*'hazards_keepout'"):
@@ -302,8 +253,3 @@ def test_what_never_fits_is_said_within_seconds(key):
         env.reset()
     assert time.process_time() - begun < 12
     assert len(str(caught.value).splitlines()) == 1
-
-
-def test_a_negative_margin_lets_keepouts_overlap_and_asks_for_no_distance():
-    keys = {**POINT, "task": "goal", "hazards_num": 8, "placements_margin": -50.0}
-    assert fresh_places(keys, num_envs=4).keys() >= {"goal", "hazard0", "hazard7"}

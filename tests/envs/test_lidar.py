@@ -8,7 +8,6 @@ import torch
 from crafting import after_random_steps, arrange, places, position_columns
 
 from safe_rl.envs import SafetyGymEnv
-from safe_rl.envs.safety_gym.geometry import circling_targets, floor_to_ego, to_ego
 from safe_rl.envs.safety_gym.lidar import lidar_cells, pseudo_lidar
 
 BARE = {"robot_base": "point", "task": "none", "sensors_obs": [], "lidar_num_bins": 8}
@@ -115,19 +114,6 @@ def test_observations_do_not_know_where_the_origin_is(env_name):
     torch.testing.assert_close(here, there, rtol=1e-4, atol=1e-4)
 
 
-def test_gremlins_are_led_in_circles():
-    """At time 0 the target is ahead along y; a quarter of 2π later along x."""
-    centres = torch.tensor([[[1.0, 2.0]], [[-1.0, 0.0]]])
-    time = torch.tensor([0.0, math.pi / 2 - 0.1])
-    path = circling_targets(centres, time, 0.3, 0.2, timestep=0.1, num_substeps=3)
-    assert path.shape == (2, 3, 1, 3)
-    s, c = math.sin(0.1), math.cos(0.1)
-    want = torch.tensor([[1.0, 2.3, 0.2], [1.0 + 0.3 * s, 2.0 + 0.3 * c, 0.2]])
-    torch.testing.assert_close(path[0, :2, 0], want)
-    want = torch.tensor([[-1 + 0.3 * c, 0.3 * s, 0.2], [-0.7, 0.0, 0.2]])
-    torch.testing.assert_close(path[1, :2, 0], want, atol=1e-6, rtol=0)
-
-
 def one_by_one(x: float, y: float, num_bins: int) -> np.ndarray:
     """What one object 1 m from zero lights up in a lidar with aliasing, by the paper's words."""
     turn = (math.atan2(y, x) % (2 * math.pi)) / (2 * math.pi) * num_bins
@@ -151,11 +137,3 @@ def test_any_number_of_bins_closes_to_a_circle(num_bins):
     alone = [one_by_one(*place, num_bins) for place in xy.tolist()]
     want = [np.max([a for a, g in zip(alone, group, strict=True) if g == k], 0) for k in (0, 1)]
     np.testing.assert_allclose(seen[1].unflatten(0, (2, -1)), want, atol=1e-12)
-
-
-def test_points_on_the_floor_turn_like_all_others():
-    robot_mat = torch.linalg.qr(torch.randn(5, 3, 3, dtype=torch.float64)).Q
-    robot_pos, xy = torch.randn(5, 3).double(), torch.randn(5, 4, 2).double()
-    there = torch.cat([xy, torch.zeros(5, 4, 1, dtype=torch.float64)], -1)
-    want = to_ego(there, robot_pos, robot_mat)[..., :2]
-    torch.testing.assert_close(floor_to_ego(xy, robot_pos, robot_mat), want)

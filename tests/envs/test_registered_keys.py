@@ -99,7 +99,6 @@ WRONG = {
         "'visit'.*'goal'",
     ),
     "the aggregate cost": (lambda: register_cost(Cost("cost", bool, follow)), "'cost'.*built-in"),
-    "a cost by another name": (lambda: register_cost(Cost("mines", bool, follow)), "'cost_'"),
     "contacts with nothing known": (
         lambda: register_cost(Cost("cost_mines", bool, follow, touches=("pilars",))),
         "'pilars'.*'pillars'",
@@ -108,17 +107,9 @@ WRONG = {
         lambda: register_cost(Cost("cost_mines", bool, follow, touches="pillars")),
         r"'pillars' is a text: .*\('pillars',\)",
     ),
-    "an unknown element at the origin": (
-        lambda: register_task("follow", Task(follow, at_origin=("gaol",))),
-        "'gaol'.*'goal'",
-    ),
     "a motion by its name": (
         lambda: register_element(replace(disc("mines", "mine"), motion="virtual")),
         r"'mines': motion='virtual'.*Motion\.VIRTUAL",
-    ),
-    "a built-in observation": (
-        lambda: register_observation(Reading("com", bool, len, len)),
-        "'com'.*built-in",
     ),
     "a built-in key": (
         lambda: register_element(disc("mines", "mine"), keys={"num_steps": 3}),
@@ -127,10 +118,6 @@ WRONG = {
     "a default of the wrong type": (
         lambda: register_element(disc("mines", "mine"), keys={"mines_num": "many"}),
         "'mines_num'.*integer",
-    ),
-    "a default out of range": (
-        lambda: register_element(disc("mines", "mine"), keys={"mines_size": -1.0}),
-        "'mines_size'.*greater than 0",
     ),
     "a default without a type": (
         lambda: register_element(disc("mines", "mine"), keys={"mines_fuse": None}),

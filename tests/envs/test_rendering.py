@@ -11,12 +11,9 @@ import numpy as np
 import pytest
 import torch
 from pictures import colour_at, from_above, likeness, make_env, needs_opengl, redness
-from torchrl.envs import TransformedEnv
-from torchrl.record import CSVLogger, PixelRenderTransform, VideoRecorder
 
 import safe_rl.envs
-from safe_rl.envs import SUITE, OpenGLError, SafetyGymConfig, SafetyGymEnv
-from safe_rl.envs.safety_gym.renderer import lidar_halos
+from safe_rl.envs import SUITE, OpenGLError, SafetyGymEnv
 
 PLACE = (1.0, 0.5)
 # One object of every kind at PLACE, and the colour that the benchmark gives it.
@@ -53,21 +50,6 @@ def test_an_object_is_seen_where_it_stands_in_its_colour(kind):
     floor = colour_at(env, -PLACE[0], PLACE[1])
     assert np.ptp(floor) < 0.02
     assert likeness(colour_at(env, *PLACE), rgb) > 0.95
-
-
-@needs_opengl
-def test_a_wall_is_darker_than_the_floor_and_grey():
-    env = make_env({"walls_num": 1, "walls_locations": [PLACE]})
-    wall, floor = colour_at(env, *PLACE), colour_at(env, -PLACE[0], PLACE[1])
-    assert np.ptp(wall) < 0.02
-    assert wall.mean() < floor.mean() - 0.1
-
-
-@needs_opengl
-def test_the_circle_is_seen_although_lidar_has_no_group_for_it():
-    env = make_env({"task": "circle", "circle_radius": 1.5})
-    assert likeness(colour_at(env, 1.2, 0.0), (0, 1, 0)) > 0.95
-    assert np.ptp(colour_at(env, 1.8, 0.0)) < 0.02
 
 
 @needs_opengl
@@ -174,22 +156,6 @@ def test_halos_are_lit_towards_the_object(bearing, yaw, lidar_type):
     assert abs(math.remainder(seen - bearing, 2 * math.pi)) < math.radians(10)
 
 
-def test_halos_stand_at_the_heights_and_radius_of_the_configuration():
-    config = SafetyGymConfig()
-    up = np.eye(3)
-    readings = {"hazards": np.zeros(4), "goal": np.array([1.0, 0.5, 0.0, 0.0])}
-    halos = list(lidar_halos(config, readings, np.array([1.0, 2.0, 0.1]), up))
-    assert len(halos) == 8
-    places = np.array([halo.pos for halo in halos]) - [1.0, 2.0, 0.1]
-    np.testing.assert_allclose(np.linalg.norm(places[:, :2], axis=1), 0.15)
-    assert sorted({round(z, 6) for z in places[:, 2]}) == [0.5, 0.56]
-    goal = [halo for halo in halos if halo.rgba[1] > halo.rgba[2]]
-    # Four bins: the first is a quarter turn wide and drawn at its middle.
-    np.testing.assert_allclose(goal[0].pos[:2] - [1.0, 2.0], 0.15 / math.sqrt(2) * np.ones(2))
-    assert [halo.rgba[1] for halo in goal] == pytest.approx([1.0, 0.6, 0.1, 0.1])
-    assert all(halo.size[0] == 0.025 for halo in halos)
-
-
 @needs_opengl
 def test_a_red_sphere_is_shown_while_a_cost_is_incurred():
     env = make_env(ON_HAZARD)
@@ -244,42 +210,6 @@ def test_every_camera_draws_something_of_its_own(robot):
     frames = [env.render(0, camera=name, width=60, height=40) for name in names]
     assert all(frame.std() > 5 for frame in frames)
     assert len({frame.tobytes() for frame in frames}) == len(names)
-
-
-@needs_opengl
-def test_display_mode_crops_the_floor():
-    beyond = (2.5, 0.0)
-    plain = colour_at(make_env({}), *beyond)
-    cropped = colour_at(make_env({}, floor_display_mode=True), *beyond)
-    assert np.ptp(plain) < 0.02
-    assert likeness(cropped, (0, 0, 1)) > 0.8  # the sky
-    assert np.ptp(colour_at(make_env({}, floor_display_mode=True), 1.9, 0.0)) < 0.02
-
-
-@needs_opengl
-def test_a_closed_environment_can_draw_again():
-    env = make_env({})
-    before = env.render(0, width=30, height=20)
-    env.close()
-    np.testing.assert_array_equal(env.render(0, width=30, height=20), before)
-
-
-@needs_opengl
-def test_the_video_recorder_films_all_rows(tmp_path):
-    env = SafetyGymEnv("PointGoal1", num_envs=4, seed=0)
-    logger = CSVLogger("films", log_dir=str(tmp_path), video_format="pt")
-    filmed = TransformedEnv(env, PixelRenderTransform(width=32, height=24, camera="track"))
-    filmed.append_transform(VideoRecorder(logger, "run"))
-    filmed.transform.dump()  # drops what was filmed while the transforms asked for shapes
-    rollout = filmed.rollout(5)
-    assert rollout["pixels"].shape == (4, 5, 24, 32, 3)
-    filmed.transform.dump()
-    newest = max(tmp_path.rglob("*.pt"), key=lambda path: path.stat().st_mtime_ns)
-    film = torch.load(newest)
-    assert film.shape == (1, 6, 3, 48, 64)
-    first, second, third, fourth = rollout["next", "pixels"][:, -1]
-    lines = torch.cat([first, second], 1), torch.cat([third, fourth], 1)
-    np.testing.assert_array_equal(film[0, -1].permute(1, 2, 0), torch.cat(lines))
 
 
 @pytest.mark.parametrize(("backend", "package"), [("egl", "libegl1"), ("osmesa", "libosmesa6")])

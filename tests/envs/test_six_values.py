@@ -9,7 +9,7 @@ import torch
 from commands import run_train
 from torchrl.envs.utils import check_env_specs
 
-from safe_rl.envs import ConfigError, complete_env, from_six_values, make_env
+from safe_rl.envs import ConfigError, from_six_values, make_env
 from safe_rl.runs.table import read_table
 
 NODE = {
@@ -80,14 +80,6 @@ def test_it_is_trained_on(tmp_path):
     table = read_table(tmp_path / "ice" / "progress.csv")
     assert table["steps"] == [80, 160]
     assert all(cost > 0 for cost in table["episode_cost_right"])
-
-
-def test_pictures():
-    env = make_env({**complete_env(NODE), "render_mode": "rgb_array"}, num_envs=2, seed=0)
-    env.reset()
-    picture = env.render(width=60, height=20)
-    assert picture.shape == (2, 20, 60, 3)
-    assert picture.any()
 
 
 @pytest.mark.parametrize(

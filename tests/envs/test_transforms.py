@@ -5,7 +5,6 @@ import math
 import pytest
 import torch
 from point_mass import PointMass
-from tensordict import TensorDict
 from torchrl.envs import TransformedEnv
 from torchrl.envs.transforms import RewardScaling, StepCounter
 from torchrl.envs.utils import check_env_specs
@@ -15,14 +14,12 @@ from safe_rl.envs import ConstrainedEnv, SafetyGymEnv, check_constrained_env, ma
 from safe_rl.envs.transforms import (
     ActionFilter,
     ActionRepeat,
-    ConstraintTransform,
     EarlyTermination,
     ObservedCosts,
     RewardScale,
     Saute,
     SensorNoise,
 )
-from safe_rl.envs.transforms.base import costs_of
 from safe_rl.targets import TargetError, allow
 
 allow("transforming")
@@ -128,19 +125,6 @@ def test_a_scaled_reward_is_torchrls_and_returns_are_the_own_ones():
     assert torch.equal(rewards_of(solved)["reward"], own)
 
 
-@pytest.mark.parametrize(("first", "spent"), [("saute", -1.5), ("scale", -3.0)])
-def test_the_own_reward_is_kept_through_several_changes(first, spent):
-    costs = [[1.0, 1.0, 0.0, 0.0]]
-    own = rewards_of(Priced(costs), 4)["reward"]
-    saute = Saute({"cost": 2.0}, discount=1.0, unsafe_reward=-3.0, rescale_budgets=False)
-    both = {"saute": saute, "scale": RewardScale(0.5)}
-    named = {first: both.pop(first), **both}
-    batch = rewards_of(transformed(Priced(costs), **named), 4)
-    expected = torch.cat([0.5 * own[:, :1], torch.full_like(own[:, 1:], spent)], 1)
-    torch.testing.assert_close(batch["reward"], expected)
-    assert torch.equal(batch["task_reward"], own)
-
-
 def test_a_rescaled_budget_is_spent_by_costs_that_are_spread_over_the_episode():
     env = Priced([[2.5] * 10])  # 25 in all
     saute = Saute({"cost": 25.0}, discount=0.9, unsafe_reward=-1.0, rescale_budgets=True)
@@ -221,16 +205,6 @@ def test_a_snapshot_continues_exactly(env):
     assert begun["observation"].shape == first["observation"][:, 0].shape
 
 
-def test_what_is_transformed_twice_continues_with_both():
-    env = transformed(transformed(Priced([[0.5] * 9]), "saute"), "early_termination")
-    last = still(env, 3)["next", "observation"][:, -1]
-    begun = env.set_state(env.get_state())
-    assert torch.equal(begun["observation"], last)
-    # of a budget of 2.0 as much is left to spend
-    steps = env.rollout(9, auto_reset=False, tensordict=begun)
-    assert steps["next", "terminated"].squeeze().tolist() == [False, True]
-
-
 def test_transforms_of_torchrl_can_stand_among_ours():
     env = transformed(PointMass(2), "saute", count=StepCounter())
     check_env_specs(env)
@@ -243,13 +217,6 @@ def test_an_environment_without_the_contract_is_transformed_too():
     env = TransformedEnv(SafetyGymEnv("PointGoal1", seed=0), EarlyTermination({"cost_hazard": 1.0}))
     with pytest.raises(ValueError, match=r"'cost_hazard'.*Did you mean 'cost_hazards'\?"):
         env.rollout(1)
-
-
-def test_costs_may_be_nested():
-    step = TensorDict({"agents": {"cost": torch.full((2, 1), 3.0)}}, [2])
-    assert costs_of(step, [("agents", "cost")]).tolist() == [[3.0], [3.0]]
-    with pytest.raises(ValueError, match=r"'agents/costs'.*Did you mean 'agents/cost'\?"):
-        costs_of(step, [("agents", "costs")])
 
 
 def test_nodes_are_built_and_their_keys_named():
@@ -298,15 +265,3 @@ def test_nodes_are_built_and_their_keys_named():
 def test_what_cannot_be_is_refused(make, words):
     with pytest.raises(ValueError, match=words):
         make()
-
-
-def test_one_of_ones_own_needs_a_step_only():
-    class Tax(ConstraintTransform):
-        """Every step costs reward."""
-
-        def _step(self, tensordict, next_tensordict):
-            return next_tensordict.set("reward", next_tensordict["reward"] - 1)
-
-    env = transformed(PointMass(1), tax=Tax())
-    action = TensorDict(action=torch.zeros(1, 2), batch_size=[1])
-    assert env.step(env.reset().update(action))["next", "reward"].item() == -1

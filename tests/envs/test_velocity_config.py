@@ -5,10 +5,7 @@ import math
 
 import gymnasium
 import pytest
-from hydra import compose, initialize
-from omegaconf import OmegaConf
 
-from safe_rl.envs import complete_env, env_node, make_env, store_configs
 from safe_rl.envs.errors import ConfigError
 from safe_rl.envs.physics.dynamics import SCALES
 from safe_rl.envs.velocity import (
@@ -30,25 +27,6 @@ def test_keys_and_defaults_are_gymnasiums(name):
     defaults = {key: row.default for key, row in parameters.items() if key not in THEIRS}
     ours = {key: value for key, value in config.to_dict().items() if key not in OURS}
     assert ours == defaults
-
-
-@pytest.mark.parametrize("name", VELOCITY_SUITE)
-def test_nodes_survive_yaml(name):
-    node = env_node(name)
-    read = OmegaConf.to_container(OmegaConf.create(OmegaConf.to_yaml(OmegaConf.create(node))))
-    assert read["name"] == name
-    assert make_env(read, seed=0).config == VELOCITY_SUITE[name]
-    assert complete_env({"_target_": node["_target_"], "robot": node["robot"]})["num_steps"] == 1000
-
-
-def test_names_are_in_hydras_group():
-    store_configs()
-    overrides = ["+env=SafeAntVelocity", "env.healthy_z_range=[0.1,inf]"]
-    with initialize(version_base="1.3", config_path=None):
-        node = OmegaConf.to_container(compose(overrides=overrides).env)
-    made = make_env(node, num_envs=3, seed=0)
-    assert made.config == VELOCITY_SUITE["SafeAntVelocity"].replace(healthy_z_range=(0.1, math.inf))
-    assert made.batch_size == (3,)
 
 
 @pytest.mark.parametrize("name", ["SafeHopperVelocity", "SafetyHopperVelocity-v1"])

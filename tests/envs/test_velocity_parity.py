@@ -144,19 +144,6 @@ def test_starts_are_distributed_as_gymnasiums(name):
     assert kstest(noise.ravel() / scale, uniform(-1, 2).cdf).pvalue > 1e-3
 
 
-@pytest.mark.parametrize("name", FAMILY)
-def test_spaces_are_gymnasiums(name):
-    env, other = make_both(name, {}, num_envs=2)
-    assert env.observation_spec["observation"].shape == (2, *other.observation_space.shape)
-    assert np.array_equal(env.action_spec.space.low[0].numpy(), other.action_space.low)
-    assert np.array_equal(env.action_spec.space.high[0].numpy(), other.action_space.high)
-    sizes = {key: size for key, size in other.observation_structure.items() if size}
-    sizes.pop("skipped_qpos")
-    layout = env.observation_layout
-    assert {key: span.stop - span.start for key, span in layout.items()} == sizes
-    assert list(layout) == list(sizes)
-
-
 def test_actions_beyond_the_control_range_are_clipped():
     env, _ = make_both("SafeHumanoidVelocity", {}, num_envs=2)
     env.reset()
