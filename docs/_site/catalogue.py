@@ -116,9 +116,9 @@ def keys() -> str:
     for row in key_table():
         if row.name in heading:
             groups[heading[row.name]] = []
-        cells = (f"`{row.name}`", row.type, row.range, f"`{row.default}`", row.meaning)
+        cells = (f"`{row.name}`", row.values, f"`{row.default}`", row.meaning)
         next(reversed(groups.values())).append(cells)
-    head = ("key", "type", "range", "default", "meaning")
+    head = ("key", "values", "default", "meaning")
     return "\n".join(f"## {n.capitalize()}\n\n{_table(head, rows)}" for n, rows in groups.items())
 
 

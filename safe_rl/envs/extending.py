@@ -14,7 +14,13 @@ from typing import Any
 from safe_rl.envs.errors import ConfigError, nearest
 from safe_rl.envs.safety_gym.building import forget_scenes
 from safe_rl.envs.safety_gym.config import registered_keys, set_registered_keys
-from safe_rl.envs.safety_gym.config_values import Key, infer_key
+from safe_rl.envs.safety_gym.config_values import (
+    Key,
+    Locations,
+    Objects,
+    Placements,
+    infer_key,
+)
 from safe_rl.envs.safety_gym.costs import (
     COSTS,
     EXCEPTION_KEY,
@@ -37,6 +43,7 @@ from safe_rl.envs.safety_gym.readings import READINGS, Reading
 from safe_rl.envs.safety_gym.robots import ROBOTS, load_robot
 from safe_rl.envs.safety_gym.tasks import TASKS, NextGoal, Task
 from safe_rl.envs.safety_gym.world import World
+from safe_rl.ranges import NotNegative, Positive
 
 __all__ = [
     "BOX",
@@ -226,19 +233,19 @@ def _refuse_unknown_kinds(kinds: Iterable[str]) -> None:
 def _keys_of(element: Element) -> dict[str, Key]:
     """Keys that every element of this sort has."""
     keys = {
-        "placements": Key(None, "Placements"),
-        "locations": Key((), "Locations"),
-        "keepout": Key(0.4, "float"),
-        "size": Key(0.1, "float"),
+        "placements": Key(None, Placements),
+        "locations": Key((), Locations),
+        "keepout": Key(0.4, NotNegative),
+        "size": Key(0.1, Positive),
     }
     if not element.singular:
-        keys["num"] = Key(0, "int")
+        keys["num"] = Key(0, Objects)
     if element.motion in (Motion.FREE, Motion.GUIDED):
-        keys |= {"density": Key(0.001, "float"), "rots": Key((), "tuple[float, ...]")}
+        keys |= {"density": Key(0.001, Positive), "rots": Key((), tuple[float, ...])}
     if element.motion is Motion.GUIDED:
-        keys["travel"] = Key(0.3, "float")
+        keys["travel"] = Key(0.3, NotNegative)
     named = {f"{element.kind}_{suffix}": key for suffix, key in keys.items()}
-    return named if element.flag else {**named, f"observe_{element.kind}": Key(False, "bool")}
+    return named if element.flag else {**named, f"observe_{element.kind}": Key(False, bool)}
 
 
 def _add_keys(given: Mapping[str, Any] | None, standard: Mapping[str, Key] | None = None) -> None:

@@ -25,7 +25,9 @@ def cells(page):
 def test_every_key_has_its_row_below_a_heading():
     page = catalogue.keys()
     assert {row.name for row in key_table()} <= set(cells(page))
-    assert "| number | greater than 0 | `0.3` | radius [m] |" in cells(page)["hazards_size"]
+    assert (
+        "| a number above 0 and at most 1e+09 | `0.3` | radius [m] |" in cells(page)["hazards_size"]
+    )
     assert page.index("## Hazards") < page.index("`hazards_size`") < page.index("## Vases")
 
 

@@ -89,7 +89,7 @@ def test_every_row_keeps_its_specs_and_lasts_500_steps(name):
     [
         ({"constrain_boundary": True}, "'constrain_boundary' needs 'boundary_x', 'boundary_y'"),
         ({"constrain_velocity": True}, "'constrain_velocity' needs 'velocity_limit'"),
-        ({"boundary_x": 0.0}, "'boundary_x' must be greater than 0"),
+        ({"boundary_x": 0.0}, "'boundary_x' must be a number above 0"),
     ],
 )
 def test_what_is_missing_is_said(keys, message):

@@ -112,7 +112,7 @@ def test_actions_are_clipped_to_the_control_range():
 
 WRONG_CONFIGS = {
     "unknown key": ({"hazard_num": 3}, "'hazard_num'.*'hazards_num'"),
-    "not finite": ({"robot_keepout": math.nan}, "'robot_keepout' must be a number, got nan"),
+    "not finite": ({"robot_keepout": math.nan}, "'robot_keepout' must be a number from 0.*got nan"),
     "unknown task": ({"task": "gaol"}, "'task'.*Did you mean 'goal'"),
     "unknown robot": ({"robot_base": "dogo"}, "'robot_base'.*Did you mean 'doggo'"),
     "no such file": ({"robot_base": "nowhere.xml"}, "'robot_base'.*nowhere.xml"),

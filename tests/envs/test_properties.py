@@ -1,7 +1,6 @@
 """Any valid configuration makes a working environment; errors name the key that is wrong."""
 
 import math
-import re
 
 import pytest
 from hypothesis import HealthCheck, given, settings
@@ -135,20 +134,16 @@ def test_valid_configurations_work(config, sleep, seed):
     assert env.config.to_dict().keys() >= config.keys()
 
 
-NOT_NUMBERS = st.sampled_from(["1", None, [1.0], {}, math.nan, math.inf, True, 1j])
+NOT_NUMBERS = st.sampled_from(["1", [1.0], {}, math.nan, math.inf, True, 1j, 10**400])
 WRONG = {
     "bool": st.sampled_from([0, 1, "yes", None, 0.5]),
-    "int": NOT_NUMBERS | st.just(0.5),
-    "float": NOT_NUMBERS | st.just(10**400),
-    "str": st.sampled_from([1, None, ["goal"], True]),
-    "int | None": NOT_NUMBERS.filter(lambda value: value is not None),
-    "float | None": NOT_NUMBERS.filter(lambda value: value is not None),
+    "Text": st.sampled_from([1, None, ["goal"], True]),
     "Rectangle": st.sampled_from([None, (), (1, 2, 3), "0 0 1 1", (1, 0, 0, 1), (0, 0, 1, "1")]),
     "Placements": st.sampled_from([(), ((0, 0, 1),), ((1, 0, 0, 1),), (0, 0, 1, 1), "all"]),
     "Locations": st.sampled_from([None, ((1,),), (1, 2), ((1, 2, 3),), ((math.nan, 0),)]),
-    "tuple[str, ...]": st.sampled_from([None, "gyro", (1,), 3]),
+    "tuple[Text, ...]": st.sampled_from([None, "gyro", (1,), 3]),
     "tuple[float, ...]": st.sampled_from([None, ("a",), 1.0, ((1.0,),), "12"]),
-    "tuple[int, int]": st.sampled_from([None, (1,), (1.5, 2), 3, (0, 4), (60, -40)]),
+    "Pixels": st.sampled_from([None, (1,), (1.5, 2), 3, (0, 4), (60, -40)]),
 }
 
 
@@ -156,7 +151,7 @@ WRONG = {
 @given(st.data())
 def test_wrong_values_name_their_key(data):
     key = data.draw(st.sampled_from(sorted(FIELDS)))
-    value = data.draw(WRONG[FIELDS[key]])
+    value = data.draw(WRONG.get(FIELDS[key], NOT_NUMBERS))
     with pytest.raises(ConfigError, match=rf"'{key}'"):
         SafetyGymConfig.from_dict({key: value})
 
@@ -172,34 +167,29 @@ def test_placements_smaller_than_the_keepout_name_their_key(kind, keepout):
         SafetyGymEnv(config)
 
 
-OUTSIDE = {
-    "one of ('cpu', 'warp')": "jax",
-    "greater than 0": 0,
-    "0 or more": -1,
-    "a probability between 0 and 1": 1.5,
-    "one of ('pseudo', 'natural')": "laser",
-    "one of (2, 3)": 4,
-}
-ROWS = {row.name: row for row in key_table()}
-
-
 def test_every_key_has_a_row_that_says_what_it_is():
-    assert {name: row.default for name, row in ROWS.items()} == SafetyGymConfig().to_dict()
-    assert all(row.type and len(row.meaning) > 4 for row in ROWS.values())
-    assert ROWS["num_steps"] == (
-        *("num_steps", "integer", "greater than 0"),
-        *("steps after which an episode is truncated", 1000),
-    )
+    rows = {row.name: row for row in key_table()}
+    assert {name: row.default for name, row in rows.items()} == SafetyGymConfig().to_dict()
+    assert all(row.values and len(row.meaning) > 4 for row in rows.values())
 
 
-@pytest.mark.parametrize("name", [name for name, row in ROWS.items() if row.range])
-def test_the_range_it_names_is_the_range_that_is_checked(name):
-    row = ROWS[name]
-    wanted, _, bound = row.range.partition(", at most ")
-    outside = {wanted: OUTSIDE[wanted]}
-    if bound:
-        outside[f"at most {bound}"] = int(bound.replace(",", "")) + 1
-    for words, value in outside.items():
-        with pytest.raises(ConfigError, match=f"'{name}' must be {re.escape(words)}"):
-            SafetyGymConfig.from_dict({name: [value, 40] if row.type == "two integers" else value})
-    assert SafetyGymConfig.from_dict({name: row.default}) == SafetyGymConfig()
+@pytest.mark.parametrize(
+    ("name", "value", "words"),
+    [
+        ("hazards_size", 0, "a number above 0"),
+        ("lidar_max_dist", -1.0, "a number above 0.*, or null"),
+        ("hazards_keepout", -1, "a number from 0"),
+        ("frameskip_binom_p", 1.5, "a number from 0 to 1,"),
+        ("num_steps", 0.5, "a whole number from 1"),
+        ("hazards_num", 1001, "a whole number from 0 to 1,000"),
+        ("vases_num", 201, "a whole number from 0 to 200"),
+        ("lidar_num_bins", 10_001, "a whole number from 1 to 10,000"),
+        ("layout_seeds_first", 2**62 + 1, "a whole number from 0"),
+        ("lidar_type", "laser", "one of pseudo, natural"),
+        ("compass_shape", 4, "a whole number from 2 to 3"),
+        ("vision_size", [0, 40], "a list of 2 items, each a whole number from 1"),
+    ],
+)
+def test_values_out_of_range_are_refused(name, value, words):
+    with pytest.raises(ConfigError, match=f"'{name}' must be {words}"):
+        SafetyGymConfig.from_dict({name: value})

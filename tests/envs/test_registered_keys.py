@@ -29,6 +29,7 @@ from safe_rl.envs.extending import (
     register_observation,
     register_task,
 )
+from safe_rl.ranges import Share
 
 POINT = {"robot_base": "point", "task": "none", "sensors_obs": ["gyro"]}
 
@@ -50,15 +51,15 @@ def test_registered_keys_are_keys_like_the_others():
     before = SafetyGymConfig(robot_base="point")
     register_mines()
     rows = {row.name: row for row in key_table()}
-    assert rows["mines_num"].range == "0 or more, at most 1,000"
-    assert rows["mines_size"][1:3] == ("number", "greater than 0")
+    assert rows["mines_num"].values == "a whole number from 0 to 1,000"
+    assert rows["mines_size"].values.startswith("a number above 0")
     config = SafetyGymConfig(**POINT, mines_num=2)
     assert (config.mines_size, config.mines_keepout, config.mines_cost) == (0.2, 0.3, 2.5)
     with pytest.raises(ConfigError, match=r"'mine_num'.*'mines_num'"):
         SafetyGymConfig.from_dict({"mine_num": 2})
-    with pytest.raises(ConfigError, match=r"'mines_num'.*integer"):
+    with pytest.raises(ConfigError, match=r"'mines_num'.*whole number"):
         config.replace(mines_num=1.5)
-    with pytest.raises(ConfigError, match=r"'mines_size'.*greater than 0"):
+    with pytest.raises(ConfigError, match=r"'mines_size'.*above 0"):
         config.replace(mines_size=0.0)
     with pytest.raises(AttributeError):
         config.mines_num = 3
@@ -117,7 +118,7 @@ WRONG = {
     ),
     "a default of the wrong type": (
         lambda: register_element(disc("mines", "mine"), keys={"mines_num": "many"}),
-        "'mines_num'.*integer",
+        "'mines_num'.*whole number",
     ),
     "a default without a type": (
         lambda: register_element(disc("mines", "mine"), keys={"mines_fuse": None}),
@@ -146,12 +147,14 @@ def test_names_that_meet_an_observation_are_refused():
 
 
 def test_keys_of_any_type():
-    fuse, colours = Key(None, "float | None"), Key((), "tuple[str, ...]")
+    fuse, colours = Key(None, Share | None), Key((), tuple[str, ...])
     keys = {"mines_fuse": fuse, "mines_colours": colours, "mines_times": (1.0, 2), "mines_on": True}
     register_element(disc("mines", "mine"), keys=keys)
     config = SafetyGymConfig(mines_colours=["red"])
     assert (config.mines_fuse, config.mines_colours) == (None, ("red",))
     assert (config.mines_times, config.mines_on) == ((1.0, 2.0), True)
-    assert config.replace(mines_fuse=2).mines_fuse == 2.0
+    assert config.replace(mines_fuse=1).mines_fuse == 1.0
+    with pytest.raises(ConfigError, match="'mines_fuse' must be a number from 0 to 1, or null"):
+        config.replace(mines_fuse=2)
     with pytest.raises(ConfigError, match=r"'mines_on'"):
         config.replace(mines_on=1)

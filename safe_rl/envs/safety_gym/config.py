@@ -6,17 +6,17 @@ Lengths are metres, angles radians, times environment steps unless said otherwis
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, get_type_hints
 
 import numpy as np
 
 from safe_rl.envs.errors import ConfigError, nearest
 from safe_rl.envs.safety_gym.config_keys import RETIRED, Vocabulary
-from safe_rl.envs.safety_gym.config_values import TYPES, Key, coerce, infer_range
+from safe_rl.envs.safety_gym.config_values import Key, allowed, coerce
 
 _BUILT_IN: dict[str, Key] = {
     name: vars(Vocabulary)[name]._replace(annotation=annotation)
-    for name, annotation in Vocabulary.__annotations__.items()
+    for name, annotation in get_type_hints(Vocabulary, include_extras=True).items()
 }
 _keys = dict(_BUILT_IN)  # and those that are registered
 
@@ -94,31 +94,25 @@ class SafetyGymConfig(Vocabulary):
 
 
 class KeyRow(NamedTuple):
-    """A row of the table of keys: what a configuration may hold.
-
-    Attributes:
-        name: of the key.
-        type: in words.
-        range: in words; "" for any value of its type.
-        meaning: what it is.
-        default: its value where none is given.
-    """
+    """A row of the table of keys: name, what it may be in words, meaning and default."""
 
     name: str
-    type: str
-    range: str
+    values: str
     meaning: str
     default: Any
 
 
 def key_table() -> list[KeyRow]:
-    """Return a row for every key, registered ones included."""
-    rows = []
-    for name, key in _keys.items():
-        words = TYPES[key.annotation][0].removeprefix("an ").removeprefix("a ")
-        range = infer_range(name) if key.range is None else key.range
-        rows.append(KeyRow(name, words, str(range), key.meaning, key.default))
-    return rows
+    """Return a row for every key, registered ones included.
+
+    Examples:
+        >>> {row.name: row for row in key_table()}["hazards_num"][1:]
+        ('a whole number from 0 to 1,000', 'number of objects', 0)
+    """
+    return [
+        KeyRow(name, allowed(key.annotation).words, key.meaning, key.default)
+        for name, key in _keys.items()
+    ]
 
 
 def registered_keys() -> dict[str, Key]:
