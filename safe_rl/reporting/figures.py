@@ -1,4 +1,4 @@
-"""Pictures of scores, slates and variations; what all pictures share: styles, legends, files."""
+"""Pictures of final scores and of variations; what all pictures share: styles, legends, files."""
 
 from __future__ import annotations
 
@@ -19,14 +19,13 @@ from matplotlib.figure import Figure
 
 from safe_rl.files import replacing
 from safe_rl.reporting.experiments import PACKAGED, Experiment
-from safe_rl.reporting.slates import SYMBOLS, Aggregate
 from safe_rl.reporting.tables import Record, short_number
 from safe_rl.scores.benchmark import ALGORITHMS
-from safe_rl.scores.comparisons import Estimate, pareto_front, performance_profile
+from safe_rl.scores.comparisons import Estimate, pareto_front
 
 __all__ = [
     *("LIMIT_STYLE", "WIDTH", "Style", "add_legend", "algorithm_styles", "compared"),
-    *("draw_fronts", "draw_profiles", "draw_variations", "literal", "save", "set_grid"),
+    *("draw_fronts", "draw_variations", "literal", "save", "set_grid"),
 ]
 
 # colours and markers of the package's algorithms, those of the paper first, in colours of Okabe
@@ -49,11 +48,10 @@ LIMIT_STYLE: dict[str, Any] = {"color": "#c00000", "linestyle": "--", "linewidth
 WIDTH = 12.0
 """Of a figure, in inches."""
 _LONGEST_LABEL = 60  # of a line of the legend, in letters
-_NUM_POINTS = 101  # thresholds of a profile
 _PANEL, _MOST_COLUMNS = (2.2, 2.0), 5  # of variations: width and height [inch]; beside each other
 _COLOURS = ("#0072b2", "#d55e00", "#cc79a7", "#009e73")
 _OTHERS = "others"
-_NONE = Estimate(math.nan, math.nan, math.nan)  # of a cost that a variation has not
+_NONE = Estimate(math.nan, math.nan, math.nan)  # of a cost that a variation does not have
 
 
 class Style(NamedTuple):
@@ -87,15 +85,14 @@ def algorithm_styles(experiments: Iterable[Experiment]) -> dict[str, Style]:
     looks = dict(zip((*ALGORITHMS, *sorted(PACKAGED - ALGORITHMS.keys())), _LOOKS, strict=False))
     further = cycle(_FURTHER)
     styles: dict[str, Style] = {}
-    for base in sorted(variants):
+    for base, own_variants in sorted(variants.items()):
         colour, marker = looks.get(base) or next(further)
-        families = [family for _, family, _ in sorted(variants[base])]
-        for number, (key, names) in enumerate(sorted(variants[base].items())):
+        first_family = min(own_variants)[1]
+        for number, (key, names) in enumerate(sorted(own_variants.items())):
             paler = 1 - 0.7 ** (number // len(_LINES))
-            red, green, blue = (part + (1 - part) * paler for part in to_rgb(colour))
-            shade = to_hex((red, green, blue))
+            shade = to_hex([part + (1 - part) * paler for part in to_rgb(colour)])
             line = _LINES[number % len(_LINES)]
-            styles |= dict.fromkeys(names, Style(shade, marker, line, key[1] == families[0]))
+            styles |= dict.fromkeys(names, Style(shade, marker, line, key[1] == first_family))
     return styles
 
 
@@ -144,7 +141,7 @@ def save(figure: Figure, path: Path) -> Path:
 
 
 def compared(records: Sequence[Record]) -> dict[str, list[Record]]:
-    """Experiments that can be held against each other, by what stands above their panel.
+    """Experiments that can be compared, by what stands above their panel.
 
     At least two with a return and a cost on the same environment after equally many steps.
     """
@@ -193,7 +190,6 @@ def _draw_front(
     points = np.array([(r["episode_cost"], r["episode_return"]) for r, _ in pairs])
     front = points[pareto_front(points[:, 1], points[:, 0])]
     axis.plot(*front.T, color="0.7", linewidth=1, zorder=1, drawstyle="steps-post")
-    limits = {e.limits["cost"] for _, e in pairs if "cost" in e.limits}
     families: dict[str, list[tuple[Record, Experiment]]] = defaultdict(list)
     for record, experiment in pairs:
         families[experiment.family].append((record, experiment))
@@ -212,36 +208,8 @@ def _draw_front(
                 axis.annotate(
                     text, (cost, value), (5, 4), textcoords="offset points", fontsize=7, color="0.3"
                 )
-    for limit in limits:
+    for limit in {e.limits["cost"] for _, e in pairs if "cost" in e.limits}:
         axis.axvline(limit, **LIMIT_STYLE)
-
-
-def draw_profiles(aggregates: Sequence[Aggregate], styles: Mapping[str, Style]) -> Figure:
-    """Draw the share of runs above every value of a normalised score, a panel per score.
-
-    Bands are 95 % intervals of a bootstrap that resamples every environment's seeds. Every run has
-    finished an episode.
-    """
-    figure = Figure(figsize=(WIDTH, 3.0), layout="constrained")
-    panels = figure.subplots(1, 3, sharey=True)
-    for axis, (name, symbol) in zip(panels, SYMBOLS.items(), strict=True):
-        values = np.concatenate([v for one in aggregates for v in one.strata[name]])
-        # from where all runs are above to where none is
-        margin = 0.05 * float(np.ptp(values)) + 1e-3
-        thresholds = np.linspace(values.min() - margin, values.max() + margin, _NUM_POINTS)
-        for one in aggregates:
-            share, low, high = performance_profile(one.strata[name], thresholds)
-            style, label = styles[one.algorithm], literal(one.algorithm)
-            axis.plot(
-                thresholds, share, **style.point, linestyle=style.line, label=label,
-                markevery=_NUM_POINTS // 5, markersize=5,
-            )  # fmt: skip
-            axis.fill_between(thresholds, low, high, color=style.colour, alpha=0.2, linewidth=0)
-        axis.set(xlabel=f"τ of {symbol}", ylim=(0, 1.02))
-        set_grid(axis)
-    panels[0].set_ylabel("share of runs above τ")
-    add_legend(figure, panels[:1])
-    return figure
 
 
 def draw_variations(
@@ -255,32 +223,27 @@ def draw_variations(
     are dashed. Without limits, ``cost`` is drawn.
     """
     (_, trained), *varied = rows
-    groups = _rows_of(varied) or {_OTHERS: [("as trained", trained)]}
+    groups: dict[str, list[tuple[str, Mapping[str, Estimate]]]] = {}
+    for (row, value, _), estimates in varied:
+        group = groups.setdefault(_OTHERS if value is None else row, [])
+        group.append((row if value is None else f"{value}", estimates))
+    groups = groups or {_OTHERS: [("as trained", trained)]}
     names = ["episode_return", *(f"episode_{key}" for key in cost_limits or ["cost"])]
     columns = min(len(groups), _MOST_COLUMNS)
-    bands = math.ceil(len(groups) / columns)
-    lines = bands * len(names)
-    figure = Figure(
-        figsize=(0.8 + _PANEL[0] * columns, 0.5 + _PANEL[1] * lines), layout="constrained"
-    )
+    lines = -(-len(groups) // columns) * len(names)
+    size = (0.8 + _PANEL[0] * columns, 0.5 + _PANEL[1] * lines)
+    figure = Figure(figsize=size, layout="constrained")
     panels = figure.subplots(lines, columns, squeeze=False)
-    for name, colour, line in zip(names, cycle(_COLOURS), range(len(names)), strict=False):
-        limit = cost_limits.get(name.removeprefix("episode_"))
-        drawn = []
+    for line, (name, colour) in enumerate(zip(names, cycle(_COLOURS), strict=False)):
+        key, drawn = name.removeprefix("episode_"), []
         for number, (row, group) in enumerate(groups.items()):
             axis = panels[number // columns * len(names) + line][number % columns]
-            _draw(
-                axis,
-                [(label, found.get(name, _NONE)) for label, found in group],
-                trained[name],
-                colour,
-            )
-            if limit is not None:
-                axis.axhline(limit, **LIMIT_STYLE)
-            if line == 0:
-                axis.set_title(literal(row))
-            if number % columns == 0:
-                axis.set_ylabel(literal(name.removeprefix("episode_")))
+            values = [(label, found.get(name, _NONE)) for label, found in group]
+            _draw_values(axis, values, trained[name], colour)
+            if key in cost_limits:
+                axis.axhline(cost_limits[key], **LIMIT_STYLE)
+            axis.set_title(literal(row) if line == 0 else "")
+            axis.set_ylabel(literal(key) if number % columns == 0 else "")
             drawn.append(axis)
         low, high = zip(*(axis.get_ylim() for axis in drawn), strict=True)
         for axis in drawn:
@@ -291,29 +254,16 @@ def draw_variations(
     save(figure, path)
 
 
-def _rows_of(
-    varied: Sequence[tuple[Any, Mapping[str, Estimate]]],
-) -> dict[str, list[tuple[str, Mapping[str, Estimate]]]]:
-    """Row -> label and estimates of its values; what has a single value is in a row of all such."""
-    groups: dict[str, list[tuple[str, Mapping[str, Estimate]]]] = {}
-    for variation, estimates in varied:
-        single = variation.value is None
-        label = variation.row if single else f"{variation.value}"
-        groups.setdefault(_OTHERS if single else variation.row, []).append((label, estimates))
-    return groups
-
-
-def _draw(
+def _draw_values(
     axis: Axes, values: Sequence[tuple[str, Estimate]], trained: Estimate, colour: str
 ) -> None:
-    places = range(len(values))
     axis.axhspan(trained.low, trained.high, color="0.85", zorder=0)
     axis.axhline(trained.value, color="0.5", linewidth=1, zorder=1)
-    for place, (_, estimate) in zip(places, values, strict=True):
+    for place, (_, estimate) in enumerate(values):
         axis.plot([place] * 2, [estimate.low, estimate.high], color=colour, linewidth=2)
         axis.plot(place, estimate.value, marker="o", color=colour)
-    long = any(len(label) > 5 for label, _ in values)
-    axis.set_xticks(list(places), [literal(label) for label, _ in values], rotation=25 * long)
+    labels = [literal(label) for label, _ in values]
+    axis.set_xticks(range(len(values)), labels, rotation=25 * any(len(n) > 5 for n, _ in values))
     axis.set_xlim(-0.6, len(values) - 0.4)
     axis.grid(alpha=0.25, axis="y")
     axis.spines[["top", "right"]].set_visible(False)

@@ -1,17 +1,16 @@
-"""What runs have left in their folders: evaluations, certificates, videos, commands."""
+"""What runs have left in their folders: evaluations, certificates, commands."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from math import inf
-from pathlib import Path
 from typing import Any
 
 from safe_rl.reporting.experiments import Experiment
 from safe_rl.reporting.recorded import Run
 from safe_rl.reporting.tables import Record, Table, clean, each_cost, interval
 
-__all__ = ["certificate_table", "duration", "evaluation_table", "run_table", "videos"]
+__all__ = ["certificate_table", "duration", "evaluation_table", "run_table"]
 
 _WHERE = {"environment": "{environment}", "algorithm": "{algorithm}", "seed": "{seed:d}"}
 
@@ -127,15 +126,3 @@ def certificate_table(experiments: Sequence[Experiment]) -> Table:
     rows = each_cost(records, _names(records, "bound_"), bound="bound_{}", most="most_{}")
     marks = {"certified": lambda row: "bad" if row["certified"] == "no" else ""}
     return Table("certificates", "Certificates", columns, records, shown=rows, marks=marks)
-
-
-def videos(experiments: Sequence[Experiment]) -> Iterator[tuple[str, Path]]:
-    """One video of every experiment that has any: caption and file."""
-    for experiment in experiments:
-        found = [(run, path) for run in experiment.runs for path in run.videos]
-        if found:
-            run, path = found[0]
-            # of an evaluation with a name, as of another environment, its name
-            words = [experiment.environment, experiment.algorithm, f"seed {run.seed}"]
-            words += filter(None, [path.stem.removeprefix("evaluation").lstrip("_")])
-            yield ", ".join(words), path

@@ -26,15 +26,12 @@ from safe_rl.reporting.slates import complete_slates, slate_table
 from safe_rl.reporting.tables import Record, Table, clean, short_number
 from safe_rl.scores.benchmark import Suite
 
-__all__ = ["Block", "Drawing", "Report", "Section", "Video", "build_report", "write_report"]
+__all__ = ["Block", "Drawing", "Report", "Section", "build_report", "write_report"]
 
 # rows of a picture of learning curves, in environments: what a printed page holds
 _MOST_ROWS = 6
 _MOST_CURVES = 6  # in one panel
 _TEXTS = yaml.safe_load(files(__package__).joinpath("texts.yaml").read_text(encoding="utf-8"))
-_MIME_TYPES = {".png": "image/png", ".mp4": "video/mp4"}
-# of a video, above which it is named instead of embedded [bytes]
-_LARGEST = 50_000_000
 _SYMBOL = re.compile(r"\$(\\bar )?(\\rho|\w)(?:_(\w))?\$")  # such as $\bar J_r$
 
 
@@ -47,14 +44,7 @@ class Drawing(NamedTuple):
     shows: str
 
 
-class Video(NamedTuple):
-    """A video, and its caption."""
-
-    title: str
-    path: Path
-
-
-Block = Table | Drawing | Video | str
+Block = Table | Drawing | str
 Styles = Mapping[str, figures.Style]
 
 
@@ -124,6 +114,7 @@ def build_report(
     groups = _by_environment([e for e in experiments if e.finished])
     finals = [final_table(group) for group in groups]
     records = [record for table in finals for record in table.records]
+    slates = [slate_table(*slate) for slate in complete_slates(experiments, seeds_needed)]
     reasons = [{"what": clean(path), "why": clean(why, 500)} for path, why in skipped.items()]
     left_out = Table("left_out", "Left out", {"what": "{what}", "why": "{why}"}, reasons)
     parts: list[tuple[str, str, Sequence[Block]]] = [
@@ -131,10 +122,9 @@ def build_report(
         ("learning", "What learning cost", list(filter(None, map(learning_table, groups)))),
         ("curves", "Learning curves", _curves(experiments, styles)),
         ("fronts", "Return against cost", _fronts(records, experiments, styles)),
-        ("normalised", "Normalised scores", _slates(experiments, styles, seeds_needed)),
+        ("normalised", "Normalised scores", slates),
         ("certificates", "Certificates", [inventory.certificate_table(experiments)]),
         ("evaluations", "Evaluations", [inventory.evaluation_table(experiments)]),
-        ("videos", "Videos", [Video(clean(c), path) for c, path in inventory.videos(experiments)]),
         ("runs", "Runs", [inventory.run_table(experiments), left_out]),
     ]
     # a table without a row says nothing
@@ -186,19 +176,6 @@ def _curves(experiments: Sequence[Experiment], styles: Styles) -> list[Drawing]:
             says = f"{what} over environment steps: {names}"
             drawings.append(Drawing(f"curves_{robot}", "", figure, says))
     return drawings
-
-
-def _slates(experiments: Sequence[Experiment], styles: Styles, seeds_needed: int) -> list[Block]:
-    blocks: list[Block] = []
-    for name, environments, aggregates in complete_slates(experiments, seeds_needed):
-        blocks += [table := slate_table(name, environments, aggregates)]
-        # where a run has finished no episode there is no share of runs
-        known = [one for one in aggregates if one.is_measured]
-        if known and max(one.num_runs for one in known) > 1:
-            names = ", ".join(one.algorithm for one in known)
-            says = f"Share of runs above every score: {table.title}, {names}"
-            blocks += [Drawing(f"profiles_{name}", "", figures.draw_profiles(known, styles), says)]
-    return blocks
 
 
 def write_report(report: Report, out: Path, title: str, formats: Sequence[str] = ("png",)) -> Path:
@@ -261,22 +238,11 @@ def _written(block: Block, place: Callable[[str], Path], formats: Sequence[str])
     if isinstance(block, Table):
         block.write_csv(place(f"{block.name}.csv"))
         return {"kind": "table", "title": block.title, "table": block}
-    if isinstance(block, Video):
-        data = _embedded(block.path)
-        return {"kind": "video", "title": block.title, "file": clean(block.path), "data": data}
     path = figures.save(block.figure, place(f"{block.name}.png"))
     for form in {*formats} - {"png"}:
         figures.save(block.figure, path.with_suffix(f".{form}"))
-    return {
-        "kind": "picture", "title": block.title, "says": block.shows, "data": _embedded(path)
-    }  # fmt: skip
-
-
-def _embedded(path: Path) -> str:
-    """A file as the text of a link, so that the page needs no other; "" if it is too big."""
-    if path.stat().st_size > _LARGEST:
-        return ""
-    return f"data:{_MIME_TYPES[path.suffix]};base64,{base64.b64encode(path.read_bytes()).decode()}"
+    data = base64.b64encode(path.read_bytes()).decode()  # so that the page needs no other file
+    return {"kind": "picture", "title": block.title, "says": block.shows, "data": data}
 
 
 def _facts(report: Report) -> dict[str, str]:

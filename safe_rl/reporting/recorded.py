@@ -9,7 +9,7 @@ import math
 import os
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -50,7 +50,6 @@ class Run:
         evaluations: What ``safe_rl.evaluate`` has found, a record each, see `read_evaluation`.
         certificate: Which of its checkpoints is certified, see `read_certificate`.
         code: By which version and commit it was carried out, in words, if that is recorded.
-        videos: Videos in its folder.
         recorded: What all of this was made of.
     """
 
@@ -63,7 +62,6 @@ class Run:
     evaluations: tuple[Mapping[str, Any], ...] = ()
     certificate: Mapping[str, Any] | None = None
     code: str | None = None
-    videos: tuple[Path, ...] = ()
     recorded: Recorded | None = None
 
     @property
@@ -159,12 +157,7 @@ def find_runs(root: Path, *, unfinished: bool = False) -> tuple[list[Run], dict[
                     runs.append(_run(directory, recorded, unfinished))
     for folder in runs_below(root):
         with _noted(folder.directory, skipped):
-            run = _run(folder.directory, _recorded(folder, root, skipped), unfinished)
-            videos = []
-            for path in sorted(folder.directory.glob("[!.]*.mp4")):
-                with _noted(path, skipped):
-                    videos.append(_own(path, root))
-            runs.append(replace(run, videos=tuple(videos)))
+            runs.append(_run(folder.directory, _recorded(folder, root, skipped), unfinished))
     if not runs:
         reasons = "".join(f"\n  {clean(path)}: {reason}" for path, reason in skipped.items())
         raise FileNotFoundError(

@@ -59,11 +59,6 @@ class Aggregate:
         )
 
     @property
-    def is_measured(self) -> bool:
-        """Whether every run has finished an episode."""
-        return bool(np.isfinite(self.mean).all())
-
-    @property
     def num_runs(self) -> int:
         """Runs that went into it."""
         return sum(map(len, self.strata["episode_return"]))

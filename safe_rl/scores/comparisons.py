@@ -23,34 +23,8 @@ __all__ = [
     "interquartile_mean",
     "mean",
     "pareto_front",
-    "performance_profile",
     "share_over",
 ]
-
-
-def performance_profile(
-    strata: Sequence[ArrayLike], thresholds: ArrayLike
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Share of runs that score higher than each threshold, with its interval.
-
-    Args:
-        strata: Scores per environment, one list of runs each.
-        thresholds: τ, shape [t].
-
-    Returns:
-        Shares and the ends of their intervals from a stratified bootstrap, each of shape [t].
-
-    Examples:
-        >>> performance_profile([[1.0, 3.0], [5.0, 5.0]], [0.0, 2.0, 4.0])[0].tolist()
-        [1.0, 0.75, 0.5]
-    """
-    heights = np.asarray(thresholds, dtype=float)[:, np.newaxis]
-    samples = [(np.asarray(runs, dtype=float) > heights).astype(float) for runs in strata]
-
-    def share(*parts: np.ndarray, axis: int = -1) -> np.ndarray:
-        return np.concatenate(parts, axis=axis).mean(axis)
-
-    return share(*samples), *bootstrap(samples, share)
 
 
 def pareto_front(returns: ArrayLike, costs: ArrayLike) -> np.ndarray:

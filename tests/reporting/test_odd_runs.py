@@ -98,9 +98,6 @@ UNREADABLE_FILES = {
     "deep": lambda run: evaluate(run, "[" * 100_000),
     "evaluation is a folder": lambda run: (run / "evaluation.json").mkdir(),
     "evaluation elsewhere": lambda run: link(run, "evaluation.json", "outside.json"),
-    "dangling video": lambda run: link(run, "evaluation.mp4", "gone.mp4"),
-    "video elsewhere": lambda run: link(run, "evaluation.mp4", "outside.mp4"),
-    "video is a folder": lambda run: (run / "evaluation.mp4").mkdir(),
     "overrides": lambda run: (run / ".hydra/overrides.yaml").write_text("{"),
     "overrides elsewhere": lambda run: link(run, ".hydra/overrides.yaml", "outside.yaml"),
     "hydra": lambda run: (run / ".hydra/hydra.yaml").write_text("hydra: [[["),
@@ -143,7 +140,6 @@ def outside(tmp_path, monkeypatch):
     (tmp_path / "outside.yaml").write_text(f"- note={SECRET}")
     (tmp_path / "outside.csv").write_text(f"{HEAD},{SECRET}\n1,1000,1,1,1,1,1,1\n")
     (tmp_path / "outside.json").write_text(json.dumps({**EVALUATION, "checkpoint": SECRET}))
-    (tmp_path / "outside.mp4").write_bytes(SECRET.encode())
 
 
 def report(tmp_path, damages):
@@ -180,7 +176,7 @@ def test_runs_that_cannot_be_read_are_left_out_with_their_reasons(tmp_path, caps
 def test_files_that_cannot_be_read_are_left_out_and_their_runs_kept(tmp_path):
     runs, skipped = report(tmp_path, UNREADABLE_FILES.values())
     assert len(runs) == 1 + len(UNREADABLE_FILES)
-    assert not any(run.videos or run.evaluations for run in runs.values())
+    assert not any(run.evaluations for run in runs.values())
     own = {part for place in skipped for part in place.parts if part.startswith("odd")}
     assert own == {f"odd{number}" for number in range(len(UNREADABLE_FILES))}
     assert len(skipped) == len(UNREADABLE_FILES)
@@ -214,17 +210,3 @@ def test_whatever_happens_to_bytes_of_a_run_the_others_are_reported(tmp_path_fac
         (run / name).write_bytes(bytes(content[:place]) + noise + bytes(content[kept:]))
     found = build_report(root, SUITE, seeds_needed=1, unfinished=False)
     assert "good" in {known.directory.name for known in found.runs}
-
-
-def test_films_are_a_runs_own_and_complete(tmp_path):
-    """A killed evaluation leaves a film that plays nothing; a run may lie in another's folder."""
-    first = write_run(tmp_path, **EPOCHS)
-    (first / ".evaluation.unfinished.mp4").write_bytes(b"half of it")
-    second = write_run(first, seed=1, **EPOCHS)
-    for film in (first / "b.mp4", second / "a.mp4"):
-        film.write_bytes(b"all of it")
-    found = build_report(tmp_path, SUITE, seeds_needed=1, unfinished=False)
-    assert {run.seed: [path.name for path in run.videos] for run in found.runs} == {
-        0: ["b.mp4"], 1: ["a.mp4"],
-    }  # fmt: skip
-    assert not found.skipped

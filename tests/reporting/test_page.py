@@ -13,15 +13,13 @@ from matplotlib.image import imread
 from synthetic import experiments_in, marks, texts_of, write_run
 
 from safe_rl.cli.report import main
-from safe_rl.reporting.inventory import evaluation_table, videos
+from safe_rl.reporting.inventory import evaluation_table
 from safe_rl.runs.folder import RunFolder
 
 CHROMIUM = next(
     filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None
 )
 ROWS = {"returns": (1.0, 2.0, 3.0), "rates": (0.06, 0.05, 0.04)}
-# one frame of H.264 is not needed: the page embeds whatever bytes there are
-VIDEO = b"not really a film"
 
 
 @pytest.fixture(scope="module")
@@ -33,7 +31,6 @@ def folder(tmp_path_factory):
             directory = write_run(
                 root, "PointGoal1", algo, seed, **ROWS, costs=np.array(costs) + seed / 10
             )
-    (directory / "evaluation.mp4").write_bytes(VIDEO)
     (directory / "evaluation.json").write_text(json.dumps(EVALUATION))
     write_run(root, "Mine", "cpo", 0, frames=10**6, overrides=["env=Mine", "+note=<b>&"])
     (write_run(root, folder="unbegun") / "progress.csv").unlink()
@@ -101,7 +98,7 @@ def test_everything_is_written(report):
     kinds = {re.match("[a-z]+", name)[0] for name in names}
     assert kinds == {
         "report", "runs", "tables", "evaluations", "final", "learning", "curves", "fronts",
-        "slate", "profiles", "left",
+        "slate", "left",
     }  # fmt: skip
     for picture in report.glob("*.png"):
         assert imread(picture).std() > 0
@@ -188,19 +185,13 @@ def test_a_few_of_many_episodes_are_not_none(tmp_path):
     assert cells["CVaR"].startswith("0.5%: 70.0")
 
 
-def test_evaluations_and_films_are_told_apart_by_their_names(tmp_path):
+def test_evaluations_are_told_apart_by_their_names(tmp_path):
     directory = write_run(tmp_path)
     for name in ("", "many"):
-        evaluation = {**EVALUATION, "name": name}
         path = RunFolder(directory).evaluation(name, "json")
-        path.write_text(json.dumps(evaluation))
-    RunFolder(directory).evaluation("many", "mp4").write_bytes(VIDEO)
-    experiments = experiments_in(tmp_path)
-    shown = [row["what"] for row in texts_of(evaluation_table(experiments))]
+        path.write_text(json.dumps({**EVALUATION, "name": name}))
+    shown = [row["what"] for row in texts_of(evaluation_table(experiments_in(tmp_path)))]
     assert shown == [f"{name}mean actions, x=1, 0% known layouts" for name in ("", "many, ")]
-    assert [caption for caption, _ in videos(experiments)] == ["PointGoal1, PPO, seed 0, many"]
-    (directory / "evaluation.mp4").write_bytes(VIDEO)
-    assert next(videos(experiments_in(tmp_path)))[0] == "PointGoal1, PPO, seed 0"
 
 
 def test_an_evaluation_is_not_judged_by_the_mean_if_training_was_not(tmp_path):
@@ -218,7 +209,6 @@ def test_the_page_holds_everything_itself(report):
     anchors = [link[1:] for link in links if link.startswith("#")]
     assert anchors
     assert all(f'id="{anchor}"' in html for anchor in anchors)
-    assert base64.b64encode(VIDEO).decode() in html
     assert base64.b64encode((report / "curves_point.png").read_bytes()).decode() in html
     # what people wrote is text, not markup
     assert "A &lt;title&gt;" in html
@@ -319,7 +309,7 @@ def facts_in_a_browser(report, tmp_path, width):
 def test_a_browser_shows_the_page(report, tmp_path, width):
     facts = facts_in_a_browser(report, tmp_path, width)
     assert facts["heading"] == "A <title>"
-    assert len(facts["images"]) == 4
+    assert len(facts["images"]) == 3
     assert all(pixels > 1000 for pixels in facts["images"])
     assert facts["window"] == width
     # nothing sticks out of the window, nor a table out of its box

@@ -14,25 +14,12 @@ from hypothesis import strategies as st
 from safe_rl.scores.comparisons import (
     interquartile_mean,
     pareto_front,
-    performance_profile,
 )
 from safe_rl.scores.measures import (
     longest_streak,
     regret,
     share_of_epochs_over,
 )
-
-
-def test_a_profile_is_the_share_of_runs_above():
-    strata = [np.random.default_rng(1).normal(size=n) for n in (3, 8)]
-    thresholds = np.linspace(-2, 2, 9)
-    everything = np.concatenate(strata)
-    value, low, high = performance_profile(strata, thresholds)
-    for threshold, *found in zip(thresholds, value, low, high, strict=True):
-        share = sum(run > threshold for run in everything) / len(everything)
-        assert found[0] == pytest.approx(share)
-        assert found[1] <= share <= found[2]
-    assert (np.diff(value) <= 0).all()
 
 
 @given(st.lists(st.tuples(st.integers(0, 5), st.integers(0, 5)), min_size=1, max_size=9))
@@ -72,11 +59,3 @@ def test_the_interquartile_mean_and_its_interval():
     assert found.value == pytest.approx(0.93666667)
     # as near as two bootstraps come to each other
     assert (found.low, found.high) == pytest.approx((0.79444444, 1.05333333), abs=0.015)
-
-
-def test_the_profile_and_its_band():
-    share, low, high = performance_profile(FIRST, np.linspace(0.0, 2.0, 9))
-    assert share == pytest.approx([1, 1, 1, 11 / 15, 0.4, 1 / 15, 1 / 15, 0, 0])
-    # ends are shares of 15 runs; resamples that are as likely as 2.5 % fall on either side
-    assert low == pytest.approx([1, 1, 1, 8 / 15, 0.2, 0, 0, 0, 0], abs=1.01 / 15)
-    assert high == pytest.approx([1, 1, 1, 14 / 15, 10 / 15, 0.2, 0.2, 0, 0], abs=1.01 / 15)
