@@ -90,7 +90,8 @@ def algorithm_styles(experiments: Iterable[Experiment]) -> dict[str, Style]:
         first_family = min(own_variants)[1]
         for number, (key, names) in enumerate(sorted(own_variants.items())):
             paler = 1 - 0.7 ** (number // len(_LINES))
-            shade = to_hex([part + (1 - part) * paler for part in to_rgb(colour)])
+            red, green, blue = (part + (1 - part) * paler for part in to_rgb(colour))
+            shade = to_hex((red, green, blue))
             line = _LINES[number % len(_LINES)]
             styles |= dict.fromkeys(names, Style(shade, marker, line, key[1] == first_family))
     return styles
