@@ -35,7 +35,8 @@ from safe_rl.scores.comparisons import LEVEL, Estimate, cvar, mean, share_over
 from safe_rl.scores.measures import normalised_return, normalised_violation
 
 __all__ = [
-    *("Evaluation", "check_places", "evaluate", "format_estimates", "format_unjudged", "summarise"),
+    *("Evaluation", "Trial", "check_places", "evaluate", "format_estimates", "format_unjudged"),
+    "summarise",
 ]
 
 # which layouts are shown does not make it another environment
@@ -71,6 +72,76 @@ class Evaluation:
         return "\n".join(lines)
 
 
+@dataclass(frozen=True)
+class Trial:
+    """A run's policy in an environment, its own or a changed one.
+
+    Attributes:
+        config: Configuration of the run; its ``env`` is the environment.
+        checkpoint: The policy's.
+        options: How it is run.
+        make_env: ``make_env(node, num_envs=, device=, seed=, num_threads=)`` makes environments.
+    """
+
+    config: DictConfig
+    checkpoint: Path
+    options: EvaluationOptions
+    make_env: Callable[..., EnvBase]
+
+    @property
+    def node(self) -> dict[str, Any]:
+        """The environment's configuration."""
+        return OmegaConf.to_container(self.config.env)  # type: ignore[return-value]
+
+    @property
+    def seed(self) -> int:
+        """Of layouts and actions."""
+        seed = self.options.seed
+        return default_seed(self.node, self.config.seed) if seed is None else seed
+
+    def make(self, num_envs: int, **keys: Any) -> EnvBase:
+        """Make environments, with some keys changed."""
+        return for_evaluation(self.make_env, self.config)(
+            {**self.node, **keys}, num_envs=num_envs, device=self.options.device, seed=self.seed,
+            num_threads=self.options.num_threads,
+        )  # fmt: skip
+
+    def run(
+        self, *, progress: bool = False, record: Path | None = None
+    ) -> tuple[TensorDictModuleBase, Episodes, dict[str, float]]:
+        """The policy, whole episodes of it, and the limits on their costs.
+
+        Args:
+            progress: Whether to show a bar.
+            record: Folder for all steps; None: they are not recorded.
+        """
+        options = self.options
+        with closing(self.make(min(options.num_envs, options.episodes))) as env:
+            limits = limits_of(self.config, options.cost_limits, env.cost_keys)
+            recorder = None if record is None else StepRecorder(Recording(record, env.cost_keys))
+            policy = load_policy(self.config, env, self.checkpoint, torch.device(options.device))
+            torch.manual_seed(self.seed)
+            episodes = collect_episodes(
+                env, policy, options.episodes, env.cost_keys, deterministic=options.deterministic,
+                progress=progress, record=recorder,
+            )  # fmt: skip
+            if recorder is not None:
+                recorder.flush()
+        return policy, episodes, limits
+
+    def film(self, policy: TensorDictModuleBase, file: Path, **drawing: Any) -> None:
+        """Write an episode as a film or a picture; ``drawing`` are keys of the environment."""
+        # the first world draws the same layouts whatever the number of worlds; actions are others
+        with closing(self.make(1, **drawing)) as single:
+            torch.manual_seed(self.seed)
+            form = video_format(single, file.suffix[1:])
+            frames = record_episode(
+                single, policy, single.cost_keys, deterministic=self.options.deterministic,
+                form=form, camera=self.options.camera,
+            )  # fmt: skip
+            write_video(file, frames, form)
+
+
 def evaluate(
     directory: Path,
     options: EvaluationOptions,
@@ -99,106 +170,47 @@ def evaluate(
     check_options(options)
     config = load_config(directory)
     checkpoint = find_checkpoint(directory, options.checkpoint)
-    node = override_env(config, options.env)
-    seed, make = env_maker(config, node, options, make_env)
+    changed = config.copy()
+    changed.env = override_env(config, options.env)
+    trial = Trial(changed, checkpoint, options, make_env)
     # environments that draw nothing unless they are told have a key for it
-    drawing = {"render_mode": "rgb_array"} if "render_mode" in node else {}
+    drawing = {"render_mode": "rgb_array"} if "render_mode" in trial.node else {}
     run = RunFolder(directory)
-    places = {kind: run.evaluation(options.name, kind) for kind in ("json", "csv", "transitions")}
+    summary, table = (run.evaluation(options.name, kind) for kind in ("json", "csv"))
     films = [run.evaluation(options.name, "mp4")] if options.video else []
     films += [Path(options.picture)] if options.picture else []
-    check_places([places["json"], places["csv"], *films])
+    kept = [run.evaluation(options.name, "transitions")] if options.record else []
+    check_places([summary, table, *films])
     for film in films:
-        with closing(make(1, **drawing)) as single:
+        with closing(trial.make(1, **drawing)) as single:
             check_camera(single, options.camera, film.suffix[1:])
-    with closing(make(min(options.num_envs, options.episodes))) as env:
-        cost_keys = env.cost_keys
-        limits = limits_of(config, options.cost_limits, cost_keys)
-        steps = (
-            StepRecorder(Recording(places["transitions"], cost_keys)) if options.record else None
-        )
-        policy, episodes = run_policy(config, checkpoint, env, options, seed, progress, steps)
-        if steps is not None:
-            steps.flush()
-    reference = suite.reference(node, but_for=_LAYOUTS)
+    policy, episodes, limits = trial.run(progress=progress, record=kept[0] if kept else None)
+    reference = suite.reference(trial.node, but_for=_LAYOUTS)
     estimates = summarise(episodes, limits, reference, options.cvar_alpha)
-    facts = _facts(directory, config, checkpoint, options, node, seed) | {
+    facts = _facts(directory, config, trial) | {
         "cost_limits": limits,
-        "limits_without_cost": without_cost(config, cost_keys),
+        "limits_without_cost": without_cost(config, episodes.costs),
     }
-    write_summary(places["json"], facts, estimates)
-    write_episodes(places["csv"], episodes)
+    _write_summary(summary, facts, estimates)
+    columns = {"return": episodes.returns, "length": episodes.lengths, **episodes.costs}
+    rows = zip(*(column.tolist() for column in columns.values()), strict=True)
+    replace_csv(table, [columns, *rows])
     for film in films:
-        # the first world draws the same layouts whatever the number of worlds; actions are others
-        with closing(make(1, **drawing)) as single:
-            torch.manual_seed(seed)
-            form = video_format(single, film.suffix[1:])
-            frames = record_episode(
-                single, policy, cost_keys, deterministic=options.deterministic, form=form,
-                camera=options.camera,
-            )  # fmt: skip
-            write_video(film, frames, form)
-    kept = [places["transitions"]] if options.record else []
-    return Evaluation(facts, estimates, (places["json"], places["csv"], *kept, *films))
+        trial.film(policy, film, **drawing)
+    return Evaluation(facts, estimates, (summary, table, *kept, *films))
 
 
-def env_maker(
-    config: DictConfig,
-    node: Mapping[str, Any],
-    options: EvaluationOptions,
-    make_env: Callable[..., EnvBase],
-) -> tuple[int, Callable[..., EnvBase]]:
-    """Seed of an evaluation, and what makes environments: ``make(num_envs, **changed_keys)``."""
-    seed = default_seed(node, config.seed) if options.seed is None else options.seed
-    threads = options.num_threads
-
-    def make(num_envs: int, **keys: Any) -> EnvBase:
-        return for_evaluation(make_env, config)(
-            {**node, **keys}, num_envs=num_envs, device=options.device, seed=seed,
-            num_threads=threads,
-        )  # fmt: skip
-
-    return seed, make
-
-
-def run_policy(
-    config: DictConfig,
-    checkpoint: Path,
-    env: EnvBase,
-    options: EvaluationOptions,
-    seed: int,
-    progress: bool = False,
-    recorder: StepRecorder | None = None,
-) -> tuple[TensorDictModuleBase, Episodes]:
-    """The policy of a checkpoint, and whole episodes of it; a recorder gets all steps."""
-    policy = load_policy(config, env, checkpoint, torch.device(options.device))
-    torch.manual_seed(seed)
-    return policy, collect_episodes(
-        env, policy, options.episodes, env.cost_keys, deterministic=options.deterministic,
-        progress=progress, record=recorder,
-    )  # fmt: skip
-
-
-def _facts(
-    directory: Path,
-    config: DictConfig,
-    checkpoint: Path,
-    options: EvaluationOptions,
-    node: Mapping[str, Any],
-    seed: int,
-) -> dict[str, Any]:
-    trained = OmegaConf.to_container(config.env)
-    assert isinstance(trained, dict)
-    shared = shared_layouts(trained, node, same_seed=seed == config.seed)  # type: ignore[arg-type]
+def _facts(directory: Path, config: DictConfig, trial: Trial) -> dict[str, Any]:
+    trained, node, seed = OmegaConf.to_container(config.env), trial.node, trial.seed
     return {
         "run": str(directory),
         "environment": node.get("name", ""),
         "algorithm": config.algo.name,
-        "checkpoint_file": str(checkpoint),
-        "steps": checkpoint_steps(checkpoint),
-        "layouts_trained_on": shared,
+        "checkpoint_file": str(trial.checkpoint),
+        "steps": checkpoint_steps(trial.checkpoint),
+        "layouts_trained_on": shared_layouts(trained, node, same_seed=seed == config.seed),  # type: ignore[arg-type]
         "interval_level": LEVEL,
-        **asdict(options),
+        **asdict(trial.options),
         "seed": seed,
     }
 
@@ -239,24 +251,20 @@ def summarise(
         >>> [summary[name].value for name in ("episode_cost", "cvar_cost", "over_limit_cost")]
         [20.0, 30.0, 0.5]
     """
-    estimates = {
-        "episode_return": mean(episodes.returns),
-        "episode_length": mean(episodes.lengths),
-    }
-    estimates |= {f"episode_{key}": mean(costs) for key, costs in episodes.costs.items()}
+    values = {"return": episodes.returns, "length": episodes.lengths, **episodes.costs}
+    estimates = {f"episode_{name}": mean(value) for name, value in values.items()}
     for key in cost_limits or list(episodes.costs)[:1]:
-        estimates[f"cvar_{key}"] = cvar(episodes.costs[key], cvar_alpha)
+        costs = episodes.costs[key]
+        estimates[f"cvar_{key}"] = cvar(costs, cvar_alpha)
         if key in cost_limits:
-            over = share_over(episodes.costs[key], cost_limits[key])
-            estimates[f"over_limit_{key}"] = over
+            estimates[f"over_limit_{key}"] = share_over(costs, cost_limits[key])
     if reference is not None:
-        estimates["normalised_return"] = Estimate(
-            *map(float, normalised_return(estimates["episode_return"], reference))
-        )
-    if reference is not None and "cost" in cost_limits:
-        # monotone in J_c, so the interval's ends are those of J_c
-        violation = normalised_violation(estimates["episode_cost"], cost_limits["cost"], reference)
-        estimates["normalised_violation"] = Estimate(*map(float, violation))
+        scores = {"return": normalised_return(estimates["episode_return"], reference)}
+        if "cost" in cost_limits:
+            # monotone in J_c, so the interval's ends are those of J_c
+            cost, limit = estimates["episode_cost"], cost_limits["cost"]
+            scores["violation"] = normalised_violation(cost, limit, reference)
+        estimates |= {f"normalised_{n}": Estimate(*map(float, v)) for n, v in scores.items()}
     return estimates
 
 
@@ -269,46 +277,24 @@ def format_estimates(
     for name, estimate in estimates.items():
         key = name.removeprefix("episode_")
         limit = f"   limit {cost_limits[key]:g}" if key in cost_limits else ""
-        interval = f"[{_number(estimate.low)}, {_number(estimate.high)}]"
-        lines.append(f"{name:{width}} {_number(estimate.value):>10}   {interval}{limit}")
+        value, low, high = ("—" if math.isnan(v) else f"{v:.4g}" for v in estimate)
+        lines.append(f"{name:{width}} {value:>10}   [{low}, {high}]{limit}")
     return lines
 
 
 def format_unjudged(limits: Mapping[str, float]) -> list[str]:
-    """A line for each limit of the run on a cost that its changed environment does not have.
-
-    Examples:
-        >>> format_unjudged({"cost_hazards": 20.0})
-        ["the run's limit 20 on cost_hazards is not judged: this environment has no such cost"]
-    """
+    """A line for each limit of the run on a cost that its changed environment does not have."""
     return [
         f"the run's limit {limit:g} on {key} is not judged: this environment has no such cost"
         for key, limit in limits.items()
     ]
 
 
-def _number(value: float) -> str:
-    return "—" if math.isnan(value) else f"{value:.4g}"
-
-
-def write_summary(path: Path, facts: Mapping[str, Any], estimates: Mapping[str, Estimate]) -> None:
-    """Write facts and estimates as JSON, in one go; what is not a number becomes null."""
-    content = {
-        **facts,
-        "estimates": {
-            name: {
-                part: value if math.isfinite(value) else None
-                for part, value in estimate._asdict().items()
-            }
-            for name, estimate in estimates.items()
-        },
+def _write_summary(path: Path, facts: Mapping[str, Any], estimates: Mapping[str, Estimate]) -> None:
+    """Write facts and estimates as JSON; what is not a number becomes null."""
+    parts = {
+        name: {k: v if math.isfinite(v) else None for k, v in estimate._asdict().items()}
+        for name, estimate in estimates.items()
     }
-    text = json.dumps(content, indent=2, ensure_ascii=False, allow_nan=False) + "\n"
-    replace_text(path, text)
-
-
-def write_episodes(path: Path, episodes: Episodes) -> None:
-    """Write one row per episode as CSV, in one go."""
-    columns = {"return": episodes.returns, "length": episodes.lengths, **episodes.costs}
-    rows = zip(*(column.tolist() for column in columns.values()), strict=True)
-    replace_csv(path, [columns, *rows])
+    content = {**facts, "estimates": parts}
+    replace_text(path, json.dumps(content, indent=2, ensure_ascii=False, allow_nan=False) + "\n")

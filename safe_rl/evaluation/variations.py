@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -14,12 +13,11 @@ from torchrl.envs import EnvBase
 from safe_rl.evaluation.loading import (
     check_env_keys,
     find_checkpoint,
-    limits_of,
     load_config,
     override_env,
     without_cost,
 )
-from safe_rl.evaluation.measuring import check_places, env_maker, run_policy, summarise
+from safe_rl.evaluation.measuring import Trial, check_places, summarise
 from safe_rl.evaluation.settings import EvaluationOptions, check_options
 from safe_rl.files import replace_csv
 from safe_rl.runs.folder import RunFolder, checkpoint_steps
@@ -213,9 +211,9 @@ def evaluate_variations(
     file = RunFolder(directory).variations(options.name, "csv")
     check_places([file, RunFolder(directory).variations(options.name, "png")])
     rows: list[VariedRow] = []
-    trained_limits: dict[str, float] = {}
-    lost: dict[str, float] = {}
     left_out: list[tuple[Variation, str]] = []
+    facts = {"algorithm": config.algo.name, "environment": config.env.get("name", "")}
+    facts |= {"steps": checkpoint_steps(checkpoint), "episodes": options.episodes}
     cannot: tuple[type[Exception], ...] = (ValueError, *refusals)
     for variation in (AS_TRAINED, *variations):
         try:
@@ -225,29 +223,24 @@ def evaluate_variations(
                 continue
             if progress:
                 print(f"… {variation}", flush=True)
-            seed, make = env_maker(changed, override_env(changed, {}), options, make_env)
-            with closing(make(min(options.num_envs, options.episodes))) as env:
-                _, episodes = run_policy(changed, checkpoint, env, options, seed)
+            _, episodes, limits = Trial(changed, checkpoint, options, make_env).run()
         except cannot as error:
             if variation is AS_TRAINED or not may_lack(variation):
                 raise
             left_out.append((variation, str(error)))
             continue
-        limits = limits_of(config, options.cost_limits, episodes.costs)
         if not rows:
-            trained_limits, lost = limits, without_cost(config, episodes.costs)
+            own_limits = limits
+            facts["limits_without_cost"] = without_cost(config, episodes.costs)
         rows.append(VariedRow(variation, summarise(episodes, limits, None, options.cvar_alpha)))
     _write(file, rows)
-    facts = {"algorithm": config.algo.name, "environment": config.env.get("name", "")}
-    facts |= {"steps": checkpoint_steps(checkpoint), "episodes": options.episodes}
-    facts["limits_without_cost"] = lost
-    return Varied(tuple(rows), tuple(left_out), trained_limits, facts, file)
+    return Varied(tuple(rows), tuple(left_out), own_limits, facts, file)
 
 
 def _write(path: Path, rows: Sequence[VariedRow]) -> None:
     """A row per variation: what was changed to what, and every estimate with its interval.
 
-    Nothing stands where a variation has not the cost of another one.
+    Nothing stands where a variation does not have the cost of another one.
     """
     names = list(dict.fromkeys(name for row in rows for name in row.estimates))
     columns = [f"{name}{end}" for name in names for end in ("", "_low", "_high")]

@@ -32,9 +32,6 @@ from safe_rl.runs.table import read_table
 
 __all__ = ["Run", "archive_runs", "find_runs"]
 
-# a number beyond says as little as NaN, and fits no picture
-_EXPLODED = 1e30
-
 
 @dataclass(frozen=True)
 class Run:
@@ -245,12 +242,13 @@ def _recorded(folder: RunFolder, root: Path, skipped: dict[Path, str]) -> Record
 def _run(directory: Path, recorded: Recorded, unfinished: bool) -> Run:
     config, table, notes = recorded
     _check(config)
+    _check_table(table, config.get("cost_limits") or {})
     said = notes.get("overrides")
     overrides = tuple(map(clean, said)) if isinstance(said, list) else None
     return Run(
         directory,
         config,
-        _checked(table, config.get("cost_limits") or {}),
+        table,
         frames=0 if unfinished else config["frames"],
         overrides=overrides,
         command=None if overrides is None else command_of(overrides, notes, config),
@@ -282,19 +280,14 @@ def _is_number(value: Any) -> bool:
     return type(value) in (int, float) and math.isfinite(value)
 
 
-def _checked(table: Mapping[str, list[float]], limits: Mapping[str, Any]) -> dict[str, list[float]]:
-    """A table with the columns and the growing steps that a report needs."""
+def _check_table(table: Mapping[str, list[float]], limits: Mapping[str, Any]) -> None:
+    """Refuse a table without the columns and the growing steps that a report needs."""
     if not table.get("steps"):
         raise ValueError("it has not finished an epoch")
     needed = ["episode_return", "time_total"]
     needed += [name for key in limits for name in (f"episode_{key}", f"{key}_rate")]
     if missing := [name for name in needed if name not in table]:
         raise ValueError(f"progress.csv has no column {missing[0]}")
-    bounded = {
-        name: [value if abs(value) < _EXPLODED else math.nan for value in values]
-        for name, values in table.items()
-    }
-    steps, seconds = bounded["steps"], bounded["time_total"][-1]
-    if not (steps[0] > 0 and all(np.diff(steps) > 0) and seconds > 0):
+    steps, seconds = table["steps"], table["time_total"][-1]
+    if not (0 < steps[0] <= steps[-1] < math.inf and all(np.diff(steps) > 0) and seconds > 0):
         raise ValueError("progress.csv cannot be read (its steps or times do not grow)")
-    return bounded

@@ -54,11 +54,9 @@ def as_override(value: Any) -> str:
     """A value as a command line has it.
 
     Examples:
-        >>> as_override({"cost": 10.0, "names": ("a", None)}), as_override(True)
-        ('{cost: 10, names: [a,null]}', 'true')
+        >>> as_override((10.0, "a", None)), as_override(True)
+        ('[10,a,null]', 'true')
     """
-    if isinstance(value, Mapping):
-        return f"{{{', '.join(f'{key}: {as_override(part)}' for key, part in value.items())}}}"
     if isinstance(value, tuple | list):
         return f"[{','.join(map(as_override, value))}]"
     if isinstance(value, bool) or value is None:

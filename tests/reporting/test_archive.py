@@ -6,16 +6,18 @@ from functools import partial
 
 import pytest
 import yaml
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from synthetic import write_run
 
 from safe_rl.cli.report import main
 from safe_rl.reporting import archive as archives
-from safe_rl.reporting.archive import ROWS, RUNS, Recorded, read_archive, write_archive
+from safe_rl.reporting.archive import ROWS, RUNS, read_archive
 from safe_rl.reporting.recorded import archive_runs, find_runs
 
-EPOCHS = {"returns": (1.0, 2.0, 2.5), "costs": (40.0, 30.0, 20.0), "rates": (0.04, 0.035, 0.03)}
+EPOCHS = {
+    "returns": (0.1 + 0.2, 1e300, 2.5),
+    "costs": (40.0, 30.0, 20.0),
+    "rates": (0.04, 0.035, 0.03),
+}
 pack = partial(gzip.compress, mtime=0)
 CERTIFICATE = {
     "checkpoint": None,
@@ -75,28 +77,6 @@ def test_an_archive_follows_runs_that_go_on_and_is_the_same_bytes_otherwise(runs
     assert len(again) == 4
     assert again["PointGoal1/ppo/seed0"].table["steps"][-1] == 4000
     assert "cpo" not in again["PointGoal1/ppo/seed0"].table
-
-
-VALUES = st.none() | st.booleans() | st.integers(-3, 3) | st.sampled_from([1.0, 1e-5, "1", "", []])
-NODES = st.dictionaries(st.text("abc", min_size=1, max_size=2), VALUES | st.just({}), max_size=4)
-CONFIGS = st.dictionaries(st.text("abc", min_size=1, max_size=2), VALUES | NODES, max_size=30)
-
-
-@settings(deadline=None, max_examples=40)
-@given(configs=st.lists(CONFIGS, min_size=1, max_size=4))
-def test_configurations_are_read_back_as_they_were(configs, tmp_path_factory):
-    folder = tmp_path_factory.mktemp("kept")
-    table = {"steps": [1.0, 2.0], "episode_return": [0.1 + 0.2, 1e300]}
-    runs = {f"run{n}": Recorded(config, table, {"n": n}) for n, config in enumerate(configs)}
-    write_archive(runs, folder)
-    found = read_archive(folder)
-    assert {name: repr(run.table) for name, run in found.items()} == {
-        name: repr(table) for name in runs
-    }
-    for name, run in runs.items():
-        assert found[name].notes == run.notes
-        same = json.dumps(found[name].config, sort_keys=True)
-        assert same == json.dumps(run.config, sort_keys=True)
 
 
 def test_nothing_says_where_the_runs_were_but_their_commands(runs, tmp_path):

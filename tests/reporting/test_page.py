@@ -316,27 +316,3 @@ def test_a_browser_shows_the_page(report, tmp_path, width):
     assert facts["page"] <= facts["window"]
     if width > 1000:  # on a narrow screen tables are moved sideways
         assert all(table <= box for table, box in facts["tables"])
-
-
-@pytest.mark.skipif(CHROMIUM is None, reason="Chromium is not installed")
-def test_tables_of_many_costs_fit_a_window(tmp_path):
-    limits = {f"cost_of_something_with_a_name_{n}": 5.0 * n for n in range(1, 6)}
-    estimates = dict(EVALUATION["estimates"])
-    for key in limits:
-        names = (f"episode_{key}", f"cvar_{key}", f"over_limit_{key}")
-        estimates |= {name: _estimate(21.0) for name in names}
-    bounds = {f"mean_{key}": {"bound": 19.7, "most": most} for key, most in limits.items()}
-    certificate = {"checkpoint": None, "episode_return": None, "bounds": bounds,
-                   "episodes": 400, "level": 0.95}  # fmt: skip
-    for seed in (0, 10):
-        directory = write_run(
-            tmp_path, "PointGoal1", "cpo", seed, **ROWS, costs=(30.0, 20.0, 20.0), limits=limits
-        )
-        evaluation = {**EVALUATION, "cost_limits": limits, "estimates": estimates}
-        (directory / "evaluation.json").write_text(json.dumps(evaluation))
-        (directory / "certificate.json").write_text(json.dumps(certificate))
-    assert main([str(tmp_path)]) == 0
-    facts = facts_in_a_browser(tmp_path / "report", tmp_path, 1280)
-    assert len(facts["tables"]) >= 5
-    assert facts["page"] <= facts["window"]
-    assert all(table <= box for table, box in facts["tables"])
