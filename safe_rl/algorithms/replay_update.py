@@ -70,7 +70,8 @@ class ReplayUpdate(Checked):
         self.loss, self.policy_delay = loss, policy_delay
         self.updates_per_step, self.max_grad_norm = updates_per_step, max_grad_norm
         self.optimizer = optimizer(_groups(loss, rates or {}))
-        self._device = next(loss.parameters()).device
+        self._parameters = list(loss.parameters())
+        self._device = self._parameters[0].device
         # makes them equal, and refuses a loss without target networks; its steps are slow
         self._share = 0.0 if tau is None else 1 - SoftUpdate(loss, tau=tau).eps
         pairs = loss.target_pairs()
@@ -126,10 +127,13 @@ class ReplayUpdate(Checked):
         return sum_of_losses(losses), losses
 
     def _step(self, total: Tensor, with_actor: bool) -> None:
-        self.optimizer.zero_grad(set_to_none=True)
+        for (
+            parameter
+        ) in self._parameters:  # `zero_grad` of the optimiser takes twenty times as long
+            parameter.grad = None
         total.backward()
         if self.max_grad_norm is not None:
-            nn.utils.clip_grad_norm_(self.loss.parameters(), self.max_grad_norm)
+            nn.utils.clip_grad_norm_(self._parameters, self.max_grad_norm)
         self.optimizer.step()
         if with_actor and self._targets:
             torch._foreach_lerp_(self._targets, self._sources, self._share)

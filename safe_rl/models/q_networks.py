@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from itertools import pairwise
 
 import torch
@@ -13,6 +13,8 @@ from torch import Tensor, nn
 from safe_rl.models.input_scales import InputScale
 
 __all__ = ["EnsembleMLP", "QEnsemble"]
+
+Layers = Sequence[tuple[Tensor, Tensor]]
 
 
 class EnsembleMLP(nn.Module):
@@ -46,23 +48,29 @@ class EnsembleMLP(nn.Module):
                 values = torch.empty(num_networks, *shape, device=device).uniform_(-bound, bound)
                 parameters.append(nn.Parameter(values))
 
-    def forward(self, inputs: Tensor, params: TensorDictBase | None = None) -> Tensor:
-        """Outputs [E, …, n] of all networks for inputs […, m], with parameters of its own or given.
+    def forward(self, inputs: Tensor, layers: Layers | None = None) -> Tensor:
+        """Outputs [E, …, n] of all networks for inputs […, m].
 
-        Parameters are named as its own are.
+        Args:
+            inputs: The same for every network.
+            layers: Parameters to take instead of its own, from `layers`.
         """
         hidden = inputs.reshape(-1, inputs.shape[-1]).expand(self.num_networks, -1, -1)
-        for layer, (weight, bias) in enumerate(self._layers(params)):
+        for number, (weight, bias) in enumerate(self.layers() if layers is None else layers):
             # in place: the backward pass needs what the rectifier leaves, not what it gets
-            hidden = torch.baddbmm(bias, hidden.relu_() if layer else hidden, weight)
+            hidden = torch.baddbmm(bias, hidden.relu_() if number else hidden, weight)
         return hidden.reshape(self.num_networks, *inputs.shape[:-1], hidden.shape[-1])
 
-    def _layers(self, params: TensorDictBase | None) -> Iterable[tuple[Tensor, Tensor]]:
+    def layers(self, params: TensorDictBase | None = None) -> Layers:
+        """Weights [E, m, n] and biases [E, 1, n] of every layer, its own or of others like it.
+
+        Args:
+            params: Parameters that are named as its own are.
+        """
         if params is None:
-            return zip(self.weights, self.biases, strict=True)
-        weights, biases = params.get("weights"), params.get("biases")
+            return list(zip(self.weights, self.biases, strict=True))
         names = map(str, range(len(self.weights)))
-        return ((weights.get(name), biases.get(name)) for name in names)
+        return [(params["weights", name], params["biases", name]) for name in names]
 
 
 class QEnsemble(TensorDictModuleBase):
@@ -115,7 +123,14 @@ class QEnsemble(TensorDictModuleBase):
             tensordict: Observations and actions.
             params: Parameters to take instead of its own, such as a target network's.
         """
-        observation, action = (tensordict[key] for key in self.in_keys)
-        given = None if params is None else params.get("network")
-        values = self.network(torch.cat([self.scale(observation), action], -1), given)
+        inputs = (tensordict[key] for key in self.in_keys)
+        values = self.values(*inputs, None if params is None else self.layers(params))
         return TensorDict({self.out_keys[0]: values}, batch_size=values.shape[:-1])
+
+    def values(self, observation: Tensor, action: Tensor, layers: Layers | None = None) -> Tensor:
+        """Values [E, …, n], with parameters of its own or given: `forward` without TensorDicts."""
+        return self.network(torch.cat([self.scale(observation), action], -1), layers)
+
+    def layers(self, params: TensorDictBase) -> Layers:
+        """What `values` takes, from parameters that are named as its own are."""
+        return self.network.layers(params["network"])

@@ -13,9 +13,11 @@ from torchrl.objectives.utils import distance_loss
 
 from safe_rl.objectives.critics import critic_bias
 from safe_rl.objectives.multipliers import Multiplier
-from safe_rl.objectives.q_functions import Ensemble, QFunctionLoss, discount_of
+from safe_rl.objectives.q_functions import QFunctionLoss, check_ensemble, discount_of
 from safe_rl.objectives.violation import KnownCosts
 from safe_rl.ranges import Number
+
+_COSTS = "cost_qvalue_network"
 
 
 class CostCritics(QFunctionLoss):
@@ -78,11 +80,7 @@ class CostCritics(QFunctionLoss):
         **settings: Any,
     ) -> None:
         device = next(cost_qvalue_network.parameters()).device
-        if not isinstance(cost_qvalue_network, Ensemble):
-            raise ValueError(
-                "The cost critic has to be a safe_rl.models.QEnsemble with one output per cost, "
-                f"not a {type(cost_qvalue_network).__name__}."
-            )
+        check_ensemble(cost_qvalue_network, "cost critic")
         if len(cost_keys) != multiplier.num_costs:
             raise ValueError(
                 f"There are {len(cost_keys)} cost_keys but {multiplier.num_costs} multipliers."
@@ -106,13 +104,6 @@ class CostCritics(QFunctionLoss):
         super()._set_in_keys()
         self._in_keys = [*self._in_keys, *(("next", key) for key in self.cost_keys)]
 
-    def cost_values(self, steps: TensorDictBase, action: Tensor, params: TensorDictBase) -> Tensor:
-        """Q_c of actions in the states of steps [...], by every network: [E, ..., k]."""
-        network = self.cost_qvalue_network
-        inputs = steps.select(*network.in_keys, strict=False)
-        inputs.set(self.tensor_keys.action, action)
-        return network(inputs, params).get(network.out_keys[0])
-
     def expected(self, values: Tensor) -> Tensor:
         """Expected costs of actions, [..., k], from outputs [E, ..., k] of the critics."""
         return values.mean(0)
@@ -123,7 +114,7 @@ class CostCritics(QFunctionLoss):
         keys = self.tensor_keys
         steps = batch.select(*self.in_keys, ("next", keys.done), strict=False)
         steps = steps.to(self.cost_unit.device)
-        values = self.cost_values(steps, steps.get(keys.action), self.cost_qvalue_network_params)
+        values = self.q_values(_COSTS, steps, steps.get(keys.action))
         costs = torch.cat([self.column(steps, key) for key in self.cost_keys], -1)
         ends = self.column(steps, keys.done), self.column(steps, keys.terminated)
         return critic_bias(self.expected(values), costs, *ends, self.gamma)
@@ -146,18 +137,13 @@ class CostCritics(QFunctionLoss):
         following = tensordict.get("next")
         costs = torch.cat([self.column(tensordict, key) for key in self.cost_keys], -1)
         with torch.no_grad():
-            values = self.cost_values(
-                following, next_action, self.target_cost_qvalue_network_params
-            )
+            values = self.q_values(_COSTS, following, next_action, "target")
             ends = self.column(tensordict, self.tensor_keys.terminated)
             spanned = self.value_estimator.tensor_keys.steps_to_next_obs
             discount = discount_of(tensordict, self.gamma, spanned) * ends.logical_not()
-        found = self.cost_values(
-            tensordict, tensordict.get(self.tensor_keys.action), self.cost_qvalue_network_params
-        )
+        found = self.q_values(_COSTS, tensordict, tensordict.get(self.tensor_keys.action))
         loss = self.cost_errors(found, costs, discount, values).sum(-1).sum(0)
-        weights = self._maybe_get_priority_weight(tensordict)
-        return self._reduce_loss(loss, tensordict=tensordict, weights=weights)
+        return self._mean(loss, tensordict)
 
     def cost_errors(
         self, found: Tensor, costs: Tensor, discount: Tensor, following: Tensor
@@ -183,18 +169,11 @@ class CostCritics(QFunctionLoss):
         lowest = self.lowest_cost_value
         return values if lowest is None else values.clamp_min(lowest)
 
-    @property
-    def _detached_cost_params(self) -> TensorDictBase:
-        # TorchRL clears names that begin so whenever parameters move to another device or dtype
-        if "_cached_cost_params" not in self.__dict__:
-            self.__dict__["_cached_cost_params"] = self.cost_qvalue_network_params.data
-        return self.__dict__["_cached_cost_params"]
-
     def penalised(
         self, objective: Tensor, tensordict: TensorDictBase, action: Tensor
     ) -> tuple[Tensor, dict[str, Tensor]]:
         """The actor's objective [...] with the costs of its actions, and figures."""
-        values = self.cost_values(tensordict, action, self._detached_cost_params)
+        values = self.q_values(_COSTS, tensordict, action, "frozen")
         weights = self.cost_weights(values.detach()).to(values)
         charges = self.reward_unit * (self.charged(values) @ weights)
         objective = (objective + charges) / (1 + weights.sum())

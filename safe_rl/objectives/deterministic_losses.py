@@ -14,10 +14,10 @@ from torchrl.objectives.utils import distance_loss
 from safe_rl.objectives.cost_critics import CostCritics
 from safe_rl.objectives.q_functions import (
     Distance,
-    Ensemble,
     InOneCall,
     QFunctionLoss,
     ReplayLoss,
+    check_ensemble,
     scalars,
 )
 from safe_rl.objectives.samples import require
@@ -29,7 +29,7 @@ class TD3Loss(QFunctionLoss, objectives.TD3Loss):
 
     Args:
         actor_network: Deterministic policy.
-        qvalue_network: A `safe_rl.models.QEnsemble`, or what TorchRL takes, of which two are made.
+        qvalue_network: A `safe_rl.models.QEnsemble`.
         action_spec: Spec of one action [A], bounded.
         gamma: Discount per step, of reward and costs.
         policy_noise: Standard deviation of the noise on the target policy's actions, in halves of
@@ -58,18 +58,17 @@ class TD3Loss(QFunctionLoss, objectives.TD3Loss):
         noise_clip: NotNegative,
         loss_function: Distance = "l2",
     ) -> None:
-        joint = isinstance(qvalue_network, Ensemble)
+        check_ensemble(qvalue_network, "Q function of rewards")
         super().__init__(
             actor_network,
             qvalue_network,
             action_spec=action_spec,
-            num_qvalue_nets=0 if joint else 2,
+            num_qvalue_nets=0,
             policy_noise=policy_noise,
             noise_clip=noise_clip,
             loss_function=loss_function,
         )
-        # copies of the steps that go into the Q functions: an ensemble needs none
-        self.num_qvalue_nets = 1 if joint else 2
+        self.num_qvalue_nets = 1  # copies of the steps that go into the Q functions
         self.gamma = gamma
         self.make_value_estimator(ValueEstimators.TD0, gamma=gamma)
         self.out_keys = ["loss_qvalue", "loss_actor", "qvalue"]
@@ -94,10 +93,7 @@ class TD3Loss(QFunctionLoss, objectives.TD3Loss):
         self._noise_clip = share
 
     def _make_vmap(self) -> None:
-        if isinstance(self.qvalue_network, Ensemble):
-            self._vmap_qvalue_network00 = InOneCall(self.qvalue_network, of_copies=True)
-        else:
-            super()._make_vmap()
+        self._vmap_qvalue_network00 = InOneCall(self.qvalue_network, of_copies=True)
 
     def critic_losses(self, tensordict: TensorDictBase) -> TensorDict:
         """Losses of the Q functions."""
@@ -108,6 +104,19 @@ class TD3Loss(QFunctionLoss, objectives.TD3Loss):
         td_error = metadata["td_error"].detach().max(0).values.sqrt()
         tensordict.set(self.tensor_keys.priority, td_error)
         return scalars(loss_qvalue=loss)
+
+    def _act(self, steps: TensorDictBase, params: TensorDictBase) -> Tensor:
+        inputs = steps.select(*self.actor_network.in_keys, strict=False)
+        with params.to_module(self.actor_network, preserve_module_state=False):
+            return self.actor_network(inputs).get(self.tensor_keys.action)
+
+    def actor_loss(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
+        """Loss of the policy, with costs where there are critics of them."""
+        action = self._act(tensordict, self.actor_network_params)
+        values = self.q_values("qvalue_network", tensordict, action, "frozen").squeeze(-1)
+        objective, reported = self.penalised(-values[0], tensordict, action)
+        reported["state_action_value_actor"] = values.detach()
+        return self._mean(objective, tensordict), reported
 
     def actor_losses(self, tensordict: TensorDictBase) -> TensorDict:
         """Loss of the policy, and the mean value of its actions."""
@@ -146,25 +155,6 @@ class TD3LagrangianLoss(CostCritics, TD3Loss):
             )
             action = (action + noise).clamp(self.min_action, self.max_action)
         return losses.set("loss_cost_qvalue", self.cost_qvalue_loss(tensordict, action))
-
-    def _act(self, steps: TensorDictBase, params: TensorDictBase) -> Tensor:
-        inputs = steps.select(*self.actor_network.in_keys, strict=False)
-        with params.to_module(self.actor_network, preserve_module_state=False):
-            return self.actor_network(inputs).get(self.tensor_keys.action)
-
-    def actor_loss(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
-        """Loss of the policy; TorchRL's does not tell the actions whose costs are needed."""
-        action = self._act(tensordict, self.actor_network_params)
-        inputs = tensordict.select(*self.qvalue_network.in_keys, strict=False)
-        inputs = inputs.set(self.tensor_keys.action, action)
-        inputs = inputs.expand(self.num_qvalue_nets, *tensordict.batch_size)
-        params = self._cached_detach_qvalue_network_params
-        values = self._vmap_qvalue_network00(inputs, params)
-        values = values.get(self.tensor_keys.state_action_value).squeeze(-1)
-        objective, reported = self.penalised(-values[0], tensordict, action)
-        weights = self._maybe_get_priority_weight(tensordict)
-        loss = self._reduce_loss(objective, tensordict=tensordict, weights=weights)
-        return loss, {"state_action_value_actor": values.detach(), **reported}
 
 
 class BCLoss(ReplayLoss):

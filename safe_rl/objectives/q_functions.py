@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any, ClassVar, Literal, Protocol, runtime_checkable
 
 from tensordict import NestedKey, TensorDict, TensorDictBase
@@ -20,10 +21,27 @@ class Ensemble(Protocol):
     """A network that evaluates several Q functions by itself, such as a `QEnsemble`."""
 
     num_networks: int  # E
+    in_keys: Sequence[NestedKey]  # of observation and action
 
     def __call__(self, tensordict: TensorDictBase, params: TensorDictBase) -> TensorDictBase:
         """Values [E, ...] of steps [...], with these parameters."""
         ...
+
+    def layers(self, params: TensorDictBase) -> Any:
+        """What `values` takes, from parameters."""
+        ...
+
+    def values(self, observation: Tensor, action: Tensor, layers: Any) -> Tensor:
+        """Values [E, ..., n] without TensorDicts, which take longer than the arithmetic."""
+        ...
+
+
+def check_ensemble(network: Any, what: str) -> None:
+    """Refuse a network that does not evaluate several Q functions by itself."""
+    if not isinstance(network, Ensemble):
+        raise ValueError(
+            f"The {what} has to be a safe_rl.models.QEnsemble, not a {type(network).__name__}."
+        )
 
 
 Distance = Literal["l2", "smooth_l1", "l1"]
@@ -121,6 +139,41 @@ class QFunctionLoss(ReplayLoss):
         """Losses of the policy, and what is reported of it."""
         raise NotImplementedError
 
+    def penalised(
+        self, objective: Tensor, tensordict: TensorDictBase, action: Tensor
+    ) -> tuple[Tensor, dict[str, Tensor]]:
+        """The actor's objective [...], with the costs of its actions if any, and figures."""
+        del tensordict, action
+        return objective, {}
+
+    def _mean(self, losses: Tensor, tensordict: TensorDictBase) -> Tensor:
+        """Mean of losses [...] over the steps, by the weights of prioritised replay if any."""
+        weights = self._maybe_get_priority_weight(tensordict)
+        return self._reduce_loss(losses, tensordict=tensordict, weights=weights)
+
+    def q_values(
+        self,
+        name: str,
+        steps: TensorDictBase,
+        action: Tensor,
+        kind: Literal["own", "target", "frozen"] = "own",
+    ) -> Tensor:
+        """Values [E, ..., n] of actions in the states of steps [...].
+
+        Args:
+            name: Attribute of the ensemble.
+            steps: They have the observation.
+            action: [..., A].
+            kind: Whose parameters: its own, the target network's, or its own without gradients.
+        """
+        network: Ensemble = getattr(self, name)
+        # TorchRL clears it whenever parameters move to another device or dtype
+        cache = self.__dict__.setdefault("_cache", {})
+        if (name, kind) not in cache:
+            params = getattr(self, f"{'target_' if kind == 'target' else ''}{name}_params")
+            cache[name, kind] = network.layers(params.data if kind == "frozen" else params)
+        return network.values(require(steps, network.in_keys[0]), action, cache[name, kind])
+
     def column(self, tensordict: TensorDictBase, key: NestedKey) -> Tensor:
         """An entry below ``next`` that holds one number per step, [..., 1].
 
@@ -145,9 +198,24 @@ class QFunctionLoss(ReplayLoss):
         self.gamma = hyperparams.get("gamma", self.gamma)
         return made
 
+    def _apply(self, *args: Any, **kwargs: Any) -> Any:
+        moved = super()._apply(*args, **kwargs)
+        self._share_tensors()
+        return moved
+
+    def _share_tensors(self) -> None:
+        """Let networks have the loss's own tensors: a copy of both, or a move, separates them."""
+        for name in ("actor_network", "qvalue_network", "cost_qvalue_network"):
+            if (params := self._modules.get(f"{name}_params")) is not None:
+                params.to_module(self.__dict__[name])
+
     def __getstate__(self) -> dict[str, Any]:
         # the parameters without gradients, which TorchRL keeps, would be those of another loss
         return {name: x for name, x in self.__dict__.items() if not name.startswith("_cache")}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        super().__setstate__(state)
+        self._share_tensors()
 
 
 def discount_of(tensordict: TensorDictBase, gamma: float, spanned: NestedKey) -> Tensor | float:

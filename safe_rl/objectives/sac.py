@@ -13,17 +13,19 @@ from torchrl.data import TensorSpec
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 from torchrl.modules.distributions.utils import rsample_and_log_prob
 from torchrl.objectives import ValueEstimators
+from torchrl.objectives.utils import distance_loss
 from torchrl.objectives.value import TD0Estimator
 
 from safe_rl.objectives.cost_critics import CostCritics
 from safe_rl.objectives.q_functions import (
     Distance,
-    Ensemble,
     InOneCall,
     QFunctionLoss,
+    check_ensemble,
     discount_of,
     scalars,
 )
+from safe_rl.objectives.samples import require
 from safe_rl.ranges import Number, Range, Share
 
 
@@ -32,7 +34,7 @@ class SACLoss(QFunctionLoss, objectives.SACLoss):
 
     Args:
         actor_network: Policy with ``get_dist``.
-        qvalue_network: A `safe_rl.models.QEnsemble`, or what TorchRL takes, of which two are made.
+        qvalue_network: A `safe_rl.models.QEnsemble`.
         gamma: Discount per step, of reward and costs.
         alpha_init: First temperature α, the weight of the entropy.
         target_entropy: Entropy of the policy, to which α is adapted; ``"auto"`` is minus the number
@@ -77,10 +79,11 @@ class SACLoss(QFunctionLoss, objectives.SACLoss):
         loss_function: Distance = "l2",
         action_spec: TensorSpec | None = None,
     ) -> None:
+        check_ensemble(qvalue_network, "Q function of rewards")
         super().__init__(
             actor_network,
             qvalue_network,
-            num_qvalue_nets=0 if isinstance(qvalue_network, Ensemble) else 2,
+            num_qvalue_nets=0,
             loss_function=loss_function,
             alpha_init=alpha_init,
             target_entropy=target_entropy,
@@ -92,20 +95,15 @@ class SACLoss(QFunctionLoss, objectives.SACLoss):
         self.out_keys = ["loss_qvalue", "loss_actor", "loss_alpha", "alpha", "entropy"]
 
     def _make_vmap(self) -> None:
-        if isinstance(self.qvalue_network, Ensemble):
-            self._vmap_qnetworkN0 = InOneCall(self.qvalue_network)
-        else:
-            super()._make_vmap()
+        self._vmap_qnetworkN0 = InOneCall(self.qvalue_network)
 
     def _compute_target_v2(self, tensordict: TensorDictBase) -> Tensor:
         """TorchRL's targets [...]; those of TD(0), the default, in half of the time."""
         keys, following = self.tensor_keys, tensordict.get("next")
         with torch.no_grad():
             self._next_action, log_prob = self._act(following)
-            inputs = following.select(*self.qvalue_network.in_keys, strict=False)
-            inputs.set(keys.action, self._next_action)
-            values = self._vmap_qnetworkN0(inputs, self.target_qvalue_network_params)
-            lowest = values.get(keys.state_action_value).min(0).values
+            values = self.q_values("qvalue_network", following, self._next_action, "target")
+            lowest = values.min(0).values
             soft = lowest - self._alpha * log_prob.unsqueeze(-1)
             estimator = self.value_estimator
             if type(estimator) is not TD0Estimator or estimator.average_rewards:
@@ -119,27 +117,34 @@ class SACLoss(QFunctionLoss, objectives.SACLoss):
 
     def _act(self, steps: TensorDictBase) -> tuple[Tensor, Tensor]:
         """Actions of the present policy, through which gradients pass, and log π."""
-        params = self.actor_network_params
-        with (
-            set_exploration_type(ExplorationType.RANDOM),
-            params.to_module(self.actor_network, preserve_module_state=False),
-        ):
+        with set_exploration_type(ExplorationType.RANDOM):
             # of a copy: a policy writes what its distribution is made of
             inputs = steps.select(*self.actor_network.in_keys)
             return rsample_and_log_prob(self.actor_network.get_dist(inputs))
 
     def critic_losses(self, tensordict: TensorDictBase) -> TensorDict:
         """Losses of the Q functions."""
-        loss, metadata = self.qvalue_v2_loss(tensordict)
-        tensordict.set(self.tensor_keys.priority, metadata["td_error"])
-        return scalars(loss_qvalue=loss)
+        keys = self.tensor_keys
+        target = self._compute_target_v2(tensordict)
+        action = require(tensordict, keys.action)
+        values = self.q_values("qvalue_network", tensordict, action).squeeze(-1)
+        errors = distance_loss(values, target.expand_as(values), loss_function=self.loss_function)
+        tensordict.set(keys.priority, (values.detach() - target).abs().max(0).values)
+        return scalars(loss_qvalue=self._mean(errors.sum(0), tensordict))
+
+    def actor_loss(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
+        """Loss of the policy, with costs where there are critics of them."""
+        action, log_prob = self._act(tensordict)
+        values = self.q_values("qvalue_network", tensordict, action, "frozen")
+        objective = self._alpha * log_prob - values.min(0).values.squeeze(-1)
+        objective, reported = self.penalised(objective, tensordict, action)
+        return self._mean(objective, tensordict), {"log_prob": log_prob.detach(), **reported}
 
     def actor_losses(self, tensordict: TensorDictBase) -> TensorDict:
         """Losses of the policy and of the temperature, and what both come from."""
-        loss, metadata = self.actor_loss(tensordict.copy())
+        loss, metadata = self.actor_loss(tensordict)
         log_prob = metadata.pop("log_prob")
-        weights = self._maybe_get_priority_weight(tensordict)
-        alpha = self._reduce_loss(self.alpha_loss(log_prob), tensordict=tensordict, weights=weights)
+        alpha = self._mean(self.alpha_loss(log_prob), tensordict)
         metadata |= {"alpha": self._alpha, "entropy": -log_prob.mean()}
         return scalars(loss_actor=loss, loss_alpha=alpha, **metadata)
 
@@ -171,15 +176,3 @@ class SACLagrangianLoss(CostCritics, SACLoss):
         losses = super().critic_losses(tensordict)
         loss = self.cost_qvalue_loss(tensordict, self._next_action)
         return losses.set("loss_cost_qvalue", loss)
-
-    def actor_loss(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
-        """Loss of the policy; TorchRL's does not tell the actions whose costs are needed."""
-        action, log_prob = self._act(tensordict)
-        inputs = tensordict.select(*self.qvalue_network.in_keys, strict=False)
-        inputs.set(self.tensor_keys.action, action)
-        values = self._vmap_qnetworkN0(inputs, self._cached_detached_qvalue_params)
-        lowest = values.get(self.tensor_keys.state_action_value).min(0).values.squeeze(-1)
-        objective, reported = self.penalised(self._alpha * log_prob - lowest, tensordict, action)
-        weights = self._maybe_get_priority_weight(tensordict)
-        loss = self._reduce_loss(objective, tensordict=tensordict, weights=weights)
-        return loss, {"log_prob": log_prob.detach(), **reported}

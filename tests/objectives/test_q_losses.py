@@ -228,7 +228,7 @@ def test_what_does_not_fit_is_refused():
     critic = ValueOperator(nn.Linear(3, 1), in_keys=["observation"])
     actor = make_squashed_actor(3, *BOUNDS, hidden_sizes=[8])
     keys = {"multiplier": lagrange(1.0, 1.0), **SAC}
-    with pytest.raises(ValueError, match="QEnsemble with one output per cost, not a ValueOp"):
+    with pytest.raises(ValueError, match=r"cost critic has to be a safe_rl.*, not a ValueOp"):
         SACLagrangianLoss(actor, make_q(), critic, cost_keys=COSTS, **keys)
     with pytest.raises(ValueError, match="1 cost_keys but 2 multipliers"):
         SACLagrangianLoss(actor, make_q(), make_q(num_outputs=2), cost_keys=["cost"], **keys)
@@ -298,6 +298,18 @@ def test_a_copy_learns_from_its_own_critics(kind):
     for module in (copied, fresh):
         torch.manual_seed(1)
         found.append(module.actor_losses(steps)["loss_actor"])
+    torch.testing.assert_close(*found)
+
+
+@pytest.mark.parametrize("kind", ["sac", "td3"])
+def test_a_loss_may_be_moved_and_loaded_after_it_was_evaluated(kind):
+    loss, fresh, steps = *(make_loss(kind, lagrange(1.0, 1.0)) for _ in range(2)), make_steps()
+    loss(steps.clone())
+    loss.double().float().load_state_dict(fresh.state_dict())
+    found = []
+    for module in (loss, fresh):
+        torch.manual_seed(1)
+        found.append(module(steps.clone()).to_dict())
     torch.testing.assert_close(*found)
 
 

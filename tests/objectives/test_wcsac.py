@@ -74,7 +74,7 @@ def test_a_chain_is_learned_to_the_mean_and_variance_of_its_gaussian_return(end)
         optimizer.step()
         schedule.step()
     assert not torch.cat([bias, target_bias]).any()
-    values = loss.cost_values(steps, steps["action"], loss.cost_qvalue_network_params)
+    values = loss.q_values("cost_qvalue_network", steps, steps["action"])
     mean, variance = (part[0, :, 0].detach() for part in loss.moments(values))
     left = np.arange(4, 0, -1)
     goes_on = end == "gaussian"
