@@ -166,12 +166,7 @@ class MinibatchUpdate(PolicyUpdate):
         cost_violation: Tensor | None = None,
         episode_length: Tensor | None = None,
     ) -> dict[str, Tensor]:
-        """Take the gradient steps on ``batch``, of any shape.
-
-        Args:
-            batch: Data with the entries that the loss reads; padding is left out.
-            cost_violation: Not used: the multiplier within the loss stands for it.
-            episode_length: Not used.
+        """Take the gradient steps on ``batch``, of any shape; padding is left out.
 
         Returns:
             The mean over the steps of everything that the loss reports, save ``kl``, which is the
@@ -184,11 +179,7 @@ class MinibatchUpdate(PolicyUpdate):
         num_steps = 0
         if isinstance(self.loss, SurrogateLoss):
             self.loss.anchor(batch)
-        require_finite(batch, self.loss.in_keys)
-        mask_keys = [key for key in AUTO_LOSS_MASK_KEYS if batch.get(key, None) is not None]
-        selected = batch.select(*self.loss.in_keys, *mask_keys)
-        selected.update(batch.select(*estimates_read(self.loss), strict=False))
-        samples = learning_samples(selected, self.loss.in_keys)
+        samples = self._samples(batch)
         for minibatch in self._minibatches(samples):
             total, losses = self._evaluate(minibatch)
             history.append(losses.detach())
@@ -206,17 +197,26 @@ class MinibatchUpdate(PolicyUpdate):
                 f"max_kl={self.max_kl}. Collect with the present policy, or raise max_kl.",
                 stacklevel=2,
             )
-        elif self.adapt_rate is not None and self.max_kl is not None:
+        if self.adapt_rate is not None:
             planned = self.num_passes * self._num_minibatches(samples)
-            shares = {
-                "share_of_steps": num_steps / planned,
-                "share_of_kl": float(diagnostics["kl"]) / self.max_kl,
-            }
+            diagnostics["lr"] = self._next_rate(num_steps / planned, diagnostics["kl"])
+        return diagnostics
+
+    def _samples(self, batch: TensorDictBase) -> TensorDictBase:
+        """What the loss reads of a batch, without padding; refuses what is not finite."""
+        require_finite(batch, self.loss.in_keys)
+        mask_keys = [key for key in AUTO_LOSS_MASK_KEYS if batch.get(key, None) is not None]
+        selected = batch.select(*self.loss.in_keys, *mask_keys)
+        selected.update(batch.select(*estimates_read(self.loss), strict=False))
+        return learning_samples(selected, self.loss.in_keys)
+
+    def _next_rate(self, share_of_steps: float, kl: Tensor) -> Tensor:
+        """Adapt the learning rate after an update; as it is if no step was taken."""
+        if self.adapt_rate is not None and self.max_kl is not None and share_of_steps:
+            shares = {"share_of_steps": share_of_steps, "share_of_kl": float(kl) / self.max_kl}
             for group in self.optimizer.param_groups:
                 group["lr"] = self.adapt_rate(group["lr"], **shares)
-        if self.adapt_rate is not None:
-            diagnostics["lr"] = torch.tensor(self.optimizer.param_groups[0]["lr"])
-        return diagnostics
+        return torch.tensor(self.optimizer.param_groups[0]["lr"])
 
     def _num_minibatches(self, samples: TensorDictBase) -> int:
         number = samples.numel()

@@ -93,15 +93,9 @@ class OffPolicy(Algorithm, Recipe):
     def build(cls, config: DictConfig, env: EnvBase) -> OffPolicy:
         """Build networks, replay buffer, losses and updates.
 
-        Args:
-            config: Configuration as composed from ``conf/``.
-            env: Environment that keeps the contract of `safe_rl.envs`, with bounded actions.
-
         Raises:
-            ValueError: If a cost limit names a cost that the environment does not have, a
-                constrained algorithm gets no limit, actions have no bounds, the critics do not know
-                the risk measure, the replay buffer is too small for learning to begin, or a dataset
-                does not fit.
+            ValueError: If parts of the configuration do not fit together, the environment (whose
+                actions must have bounds), or the dataset.
             FileNotFoundError: If there is no such dataset.
         """
         limits = constrained_limits(config, env, otherwise="sac")
@@ -121,14 +115,7 @@ class OffPolicy(Algorithm, Recipe):
             cost_limits=limits,
         )
         _check_risk(config, constraints, loss)
-        _check_memory(config, loss)
-        memory = build_part(
-            config.memory,
-            in_keys=loss.in_keys,
-            reward_keys=["reward", *constraints.keys],
-            reward_gamma=config.loss.get("gamma", 1.0),
-            device=device,
-        )
+        memory = _build_memory(config, loss, ["reward", *constraints.keys], device)
         learns_from, collects = begin_memory(config, memory, env)
         random_steps = setting(config, "exploration.random_steps") if collects else 0
         _check_room(memory, random_steps // env.steps_per_decision, collects)
@@ -260,16 +247,24 @@ def _check_room(memory: Memory, random_steps: int, collects: bool) -> None:
         )
 
 
-def _check_memory(config: DictConfig, loss: ReplayLoss) -> None:
-    """Refuse settings of value learning for a loss that learns no values."""
-    if loss.learns_values:
-        return
+def _build_memory(
+    config: DictConfig, loss: ReplayLoss, reward_keys: list[str], device: torch.device
+) -> Memory:
+    """The replay buffer; refuses settings of value learning for a loss that learns no values."""
     for key, off in (("n_steps", 1), ("prioritised", None)):
-        if config.memory[key] != off:
+        if not loss.learns_values and config.memory[key] != off:
             raise ValueError(
                 f"memory.{key}={config.memory[key]}: algo={config.algo.name} learns no values, and "
                 f"ignores this. Use memory.{key}={'null' if off is None else off}."
             )
+    memory: Memory = build_part(
+        config.memory,
+        in_keys=loss.in_keys,
+        reward_keys=reward_keys,
+        reward_gamma=config.loss.get("gamma", 1.0),
+        device=device,
+    )
+    return memory
 
 
 def _check_risk(config: DictConfig, constraints: Constraints, loss: ReplayLoss) -> None:

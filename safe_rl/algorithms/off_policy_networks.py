@@ -61,7 +61,7 @@ def exploring(actor: TensorDictModuleBase, env: EnvBase, noise: float) -> Explor
 def build_networks(
     config: DictConfig, env: EnvBase, num_costs: int, device: torch.device
 ) -> dict[str, Any]:
-    """Build the actor, the critic of the reward and that of costs.
+    """Build the actor and, unless their number in ``critics`` is 0, critics of reward and costs.
 
     Args:
         config: Configuration as composed from ``conf/``.
@@ -69,15 +69,30 @@ def build_networks(
         num_costs: Costs that are constrained; without them, there is no critic of costs.
         device: Of the parameters.
 
-    Returns:
-        ``actor`` and, as far as ``critics.rewards`` and ``critics.costs`` are not 0, ``critic``
-        and ``cost_critic``.
-
     Raises:
         ValueError: If actions have no bounds, the observation is no vector, or the model is one for
             on-policy algorithms.
     """
     model, spec = config.model, bounded_actions(env)
+    size, actions = _observation_size(config, env), len(spec.low)
+    common: dict[str, Any] = {
+        "hidden_sizes": list(model.hidden_sizes),
+        "input_scale": input_scale_vector(model.input_scale, env.observation_layout),
+        "device": device,
+    }
+    bounds = {"low": spec.low, "high": spec.high}
+    networks = {"actor": build_part(config.actor, observation_size=size, **bounds, **common)}
+    if number := setting(config, "critics.rewards"):
+        networks["critic"] = QEnsemble(size, actions, num_networks=number, **common)
+    if num_costs and (number := setting(config, "critics.costs")):
+        common |= {"num_outputs": num_costs, "out_key": "cost_state_action_value"}
+        networks["cost_critic"] = QEnsemble(size, actions, num_networks=number, **common)
+    return networks
+
+
+def _observation_size(config: DictConfig, env: EnvBase) -> int:
+    """Length of the observation; refuses a model, or an observation, that is not of one vector."""
+    model = config.model
     if others := [key for key in _ON_POLICY_ONLY if model.get(key)]:
         raise ValueError(
             f"algo={config.algo.name} learns with perceptrons on a vector as it is; model."
@@ -90,26 +105,4 @@ def build_networks(
             f"observes {', '.join(map(str, observed))}: {TO_FLATTEN}, or use algo=ppo_lagrangian "
             "with model=dict or model=cnn."
         )
-    (size,) = observed[0].shape
-    common: dict[str, Any] = {
-        "hidden_sizes": list(model.hidden_sizes),
-        "input_scale": input_scale_vector(model.input_scale, env.observation_layout),
-        "device": device,
-    }
-    networks = {
-        "actor": build_part(
-            config.actor, observation_size=size, low=spec.low, high=spec.high, **common
-        )
-    }
-    if number := setting(config, "critics.rewards"):
-        networks["critic"] = QEnsemble(size, len(spec.low), num_networks=number, **common)
-    if num_costs and (number := setting(config, "critics.costs")):
-        networks["cost_critic"] = QEnsemble(
-            size,
-            len(spec.low),
-            num_networks=number,
-            num_outputs=num_costs,
-            out_key="cost_state_action_value",
-            **common,
-        )
-    return networks
+    return int(observed[0].shape[0])

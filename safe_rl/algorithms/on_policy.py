@@ -84,12 +84,7 @@ class OnPolicy(Algorithm, Recipe):
             ValueError: If a cost limit names a cost that the environment does not have, or a
                 constrained algorithm gets no limit.
         """
-        limits = constrained_limits(config, env, otherwise="ppo")
-        if limits and config.get("cost_advantage") is None:
-            raise ValueError(
-                f"algo={config.algo.name} is constrained and has no cost_advantage: add "
-                "'- /cost_advantage: ${preset}' to its defaults, or say algo.constrained=false."
-            )
+        limits = _limits(config, env)
         device = torch.device(config.device)
         networks = _build_networks(config, env, len(limits), device)
         constraints = build_constraints(config, limits, env, device)
@@ -109,17 +104,10 @@ class OnPolicy(Algorithm, Recipe):
                 cost_advantage.set_keys(reward=[CHARGES])
         policy_update = _build_update(config, critic_network=critic, **parts)
         del parts["actor_network"]
-        advantage = build_part(config.advantage, value_network=critic, **parts)
-        if advantage.tensor_keys.value not in critic.out_keys:
-            raise ValueError(
-                f"advantage._target_={config.advantage._target_} estimates from "
-                f"'{advantage.tensor_keys.value}', and the critic writes {critic.out_keys}: that "
-                "of costs is cost_advantage."
-            )
         return cls(
             **{"cost_critic": None, **networks},
             constraints=constraints,
-            advantage=advantage,
+            advantage=_build_advantage(config, critic, **parts),
             cost_advantage=cost_advantage,
             policy_update=policy_update,
             critic_update=build_update(
@@ -215,6 +203,29 @@ class OnPolicy(Algorithm, Recipe):
             "algorithm": self.constraints,
         }
         return {name: part for name, part in parts.items() if part is not None}
+
+
+def _limits(config: DictConfig, env: EnvBase) -> dict[str, float]:
+    """Limits of the algorithm, which then has to have an estimator of cost advantages."""
+    limits = constrained_limits(config, env, otherwise="ppo")
+    if limits and config.get("cost_advantage") is None:
+        raise ValueError(
+            f"algo={config.algo.name} is constrained and has no cost_advantage: add "
+            "'- /cost_advantage: ${preset}' to its defaults, or say algo.constrained=false."
+        )
+    return limits
+
+
+def _build_advantage(config: DictConfig, critic: TensorDictModule, **parts: Any) -> VectorGAE:
+    """The estimator of the reward advantage; refuses one that reads another critic's values."""
+    advantage: VectorGAE = build_part(config.advantage, value_network=critic, **parts)
+    if advantage.tensor_keys.value not in critic.out_keys:
+        raise ValueError(
+            f"advantage._target_={config.advantage._target_} estimates from "
+            f"'{advantage.tensor_keys.value}', and the critic writes {critic.out_keys}: that of "
+            "costs is cost_advantage."
+        )
+    return advantage
 
 
 def _build_update(config: DictConfig, **parts: Any) -> PolicyUpdate:

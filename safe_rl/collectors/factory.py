@@ -37,18 +37,14 @@ def make_collector(
 ) -> Collector:
     """Build an endless in-process collector of [N, T] batches.
 
-    Trajectory identifiers are not tracked: they cost a tenth of the time of a small environment's
-    step, and ``("next", "done")`` already marks where episodes end.
+    It resets the environment, so seed that first. It does not track trajectory identifiers, which
+    take time: ``("next", "done")`` marks where episodes end.
 
     Args:
         env: Batched environment, batch_size [N].
-        policy: Module that writes what ``env`` and the losses need, for example a
-            :class:`~safe_rl.models.BehaviourPolicy`.
+        policy: Module that writes what ``env`` and the losses need.
         frames_per_batch: Steps of all environments together in one batch, N·T.
         device: Device of policy and batches. Defaults to that of the environment.
-
-    Returns:
-        A :class:`torchrl.collectors.Collector`. It has reset the environment, so seed that first.
 
     Raises:
         ValueError: If ``frames_per_batch`` is not a positive multiple of N.

@@ -43,27 +43,19 @@ def build_networks(
     recurrent.
 
     Args:
-        model: Node ``model`` of a configuration as composed from ``conf/``; of earlier runs, with
-            fewer keys.
+        model: Node ``model`` of a configuration as composed from ``conf/``.
         observation_spec: Of N environments.
         action_spec: Of N environments.
         layout: Component -> columns of the flat observation.
         num_costs: Outputs of the cost critic.
         device: Of all parameters.
 
-    Returns:
-        ``actor``, ``critic`` and ``cost_critic`` if there is one.
-
     Raises:
         ValueError: If the configuration does not fit the environment.
     """
-    observed = Observed(
-        observed_entries(observation_spec),
-        layout,
-        model["input_scale"],
-        clip=model.get("normalise"),
-        encoders=model.get("encoders"),
-    )
+    entries, normalise = observed_entries(observation_spec), model.get("normalise")
+    encoders = model.get("encoders")
+    observed = Observed(entries, layout, model["input_scale"], clip=normalise, encoders=encoders)
     widths = list(model["hidden_sizes"])
     remembered = model["memory"]["size"] if model.get("memory") else 0
     if remembered and MEMORY not in observation_spec.keys():  # noqa: SIM118, a spec is no mapping
@@ -71,22 +63,14 @@ def build_networks(
             "A recurrent policy needs the transform that keeps its state between steps: choose "
             "model=gru instead of setting model.memory alone."
         )
-    head = make_head(
-        model.get("head") or AUTO,
-        action_spec,
-        initial_log_std=model["initial_log_std"],
-        device=device,
-    )
-    if remembered:
-        actor = _recurrent_actor(observed, head, widths, remembered, device)
-    else:
-        body = _body(observed, head.num_outputs, widths, 0, device)
-        actor = assemble_actor(body, head, in_keys=observed.keys)
-    critic_keys = [*observed.keys, MEMORY] if remembered else observed.keys
+    kind, log_std = model.get("head") or AUTO, model["initial_log_std"]
+    head = make_head(kind, action_spec, initial_log_std=log_std, device=device)
+    actor = _actor(observed, head, widths, remembered, device)
 
     def critic(num_outputs: int, out_key: str) -> TensorDictModule:
         body = _body(observed, num_outputs, widths, remembered, device)
-        return TensorDictModule(body, in_keys=critic_keys, out_keys=[out_key])
+        in_keys = [*observed.keys, MEMORY] if remembered else observed.keys
+        return TensorDictModule(body, in_keys=in_keys, out_keys=[out_key])
 
     networks: dict[str, Any] = {"actor": actor, "critic": critic(1, "state_value")}
     if num_costs:
@@ -94,14 +78,17 @@ def build_networks(
     return networks
 
 
-def _recurrent_actor(
+def _actor(
     observed: Observed,
     head: Head,
     widths: Sequence[int],
     remembered: int,
     device: torch.device,
 ) -> ProbabilisticTensorDictSequential:
-    """Hidden layers, the recurrent layer, and a linear layer to the head."""
+    """Hidden layers to the head; or a recurrent layer after them, and a linear one to the head."""
+    if not remembered:
+        body = _body(observed, head.num_outputs, widths, 0, device)
+        return assemble_actor(body, head, in_keys=observed.keys)
     if not widths:
         raise ValueError(
             "model.hidden_sizes=[]: a recurrent policy needs at least one hidden layer."

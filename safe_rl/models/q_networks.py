@@ -123,8 +123,9 @@ class QEnsemble(TensorDictModuleBase):
             tensordict: Observations and actions.
             params: Parameters to take instead of its own, such as a target network's.
         """
-        inputs = (tensordict[key] for key in self.in_keys)
-        values = self.values(*inputs, None if params is None else self.layers(params))
+        observation, action = (tensordict[key] for key in self.in_keys)
+        layers = None if params is None else self.layers(params)
+        values = self.values(observation, action, layers)
         return TensorDict({self.out_keys[0]: values}, batch_size=values.shape[:-1])
 
     def values(self, observation: Tensor, action: Tensor, layers: Layers | None = None) -> Tensor:
