@@ -109,7 +109,6 @@ def read_hdf5(path: Path | str) -> TensorDict:
         raise ValueError(f"{path} is neither the folder of a recording nor an HDF5 file.")
     try:
         with h5py.File(path, "r") as file:
-            _check_tree(path, file, h5py)
             names = [n for n in file if fullmatch(_EPISODE, n)]
             arrays = _read_episodes(path, file, names) if names else _read_flat(path, file)
     except OSError as error:
@@ -121,34 +120,6 @@ def read_hdf5(path: Path | str) -> TensorDict:
         steps[key] = column
     steps["next", "done"] = steps["next", "terminated"] | steps["next", "truncated"]
     return steps
-
-
-def _check_tree(path: Path | str, file: Any, h5py: Any) -> None:
-    """Refuse a file with links to others, or with declared sizes far beyond its own.
-
-    Raises:
-        ValueError: If so.
-    """
-    left = 1000 * Path(path).stat().st_size  # no compression of HDF5 reaches this
-    groups, seen = [file], set()
-    while groups:
-        group = groups.pop()
-        for name in group:
-            if not isinstance(group.get(name, getlink=True), h5py.HardLink):
-                raise ValueError(f"{path}: {name} is a link, and only arrays are read.")
-            node = group[name]
-            place = h5py.h5o.get_info(node.id).addr
-            if place in seen:  # a group may contain itself
-                continue
-            seen.add(place)
-            if isinstance(node, h5py.Group):
-                groups.append(node)
-            elif isinstance(node, h5py.Dataset):
-                if node.external or node.is_virtual:
-                    raise ValueError(f"{path}: the numbers of {name} are in other files.")
-                left -= node.nbytes
-        if left < 0:
-            raise ValueError(f"{path} declares a thousand times more numbers than fit into it.")
 
 
 def _read_episodes(path: Path | str, file: Any, names: list[str]) -> Arrays:
@@ -181,9 +152,9 @@ def _read_episode(path: Path | str, group: Any) -> Arrays:
     arrays = _arrays(path, group, _OF_AN_EPISODE)
     observed, number = arrays["observation"], len(arrays["action"])
     infos = group.get("infos", {})
-    # infos of the reset come first, if they were stored
     named = [name for name in infos if name.startswith("cost") and _is_array(infos[name])]
-    costs = {("next", name): _last(infos[name][:], number) for name in named}
+    # infos of the reset come first, if they were stored
+    costs = {("next", name): infos[name][max(0, len(infos[name]) - number) :] for name in named}
     if ("next", "cost") not in costs:
         raise _lacking(path, ["infos/cost"], [f"infos/{name}" for name in infos] or list(group))
     here, following = observed[:number], observed[1 : number + 1]
@@ -193,10 +164,6 @@ def _read_episode(path: Path | str, group: Any) -> Arrays:
     return arrays
 
 
-def _last(array: np.ndarray, number: int) -> np.ndarray:
-    return array[max(0, len(array) - number) :]
-
-
 def _is_array(node: Any) -> bool:
     """Whether a node of a file is an array with a row for each step, not a number or a group."""
     return bool(getattr(node, "shape", ()))
@@ -204,30 +171,25 @@ def _is_array(node: Any) -> bool:
 
 def _check_lengths(where: Path | str, arrays: Arrays) -> Arrays:
     """Refuse arrays that are not of the same steps, not of numbers, or of too many of them."""
-    number = len(arrays["action"])
+    number, observation = len(arrays["action"]), arrays["observation"]
     for key, array in arrays.items():
-        name = " ".join(key) if isinstance(key, tuple) else key
+        wrong = ""
         if len(array) != number:
-            raise ValueError(
-                f"{where}: the {name} is given for {len(array):,} steps, the action for {number:,}."
-            )
-        if array.dtype.kind not in _NUMBERS:
-            raise ValueError(f"{where}: the {name} must be numbers, got {array.dtype}.")
-        if key not in _VECTORS and array.size != number:
-            raise ValueError(
-                f"{where}: the {name} must be one number a step, its shape is {array.shape}."
-            )
-    here, following = (arrays.get(key) for key in ("observation", ("next", "observation")))
-    if here is not None and following is not None and here.shape != following.shape:
-        raise ValueError(
-            f"{where}: the next observation must be like the observation, whose shape is "
-            f"{here.shape}, got {following.shape}."
-        )
+            wrong = f"is given for {len(array):,} steps, the action for {number:,}"
+        elif array.dtype.kind not in _NUMBERS:
+            wrong = f"must be numbers, got {array.dtype}"
+        elif key not in _VECTORS and array.size != number:
+            wrong = f"must be one number a step, its shape is {array.shape}"
+        elif key == ("next", "observation") and array.shape != observation.shape:
+            wrong = f"must be like the observation, of shape {observation.shape}, got {array.shape}"
+        if wrong:
+            name = key if isinstance(key, str) else " ".join(key)
+            raise ValueError(f"{where}: the {name} {wrong}.")
     return arrays
 
 
 def _arrays(path: Path | str, group: Any, names: Mapping[NestedKey, str]) -> Arrays:
-    found = [name for name in group if _is_array(group[name])]
+    found = [name for name in group if _is_array(group.get(name))]
     if missing := sorted(set(names.values()) - set(found)):
         raise _lacking(path, missing, found)
     return {

@@ -286,36 +286,3 @@ def test_without_h5py_the_extra_is_named(tmp_path, monkeypatch):
     monkeypatch.setattr("safe_rl.extras.find_spec", lambda name: None)
     with pytest.raises(ModuleNotFoundError, match=r"\[hdf5\]"):
         read_hdf5(tmp_path / "data.hdf5")
-
-
-@pytest.mark.parametrize(
-    ("make", "words"),
-    [
-        (lambda h5py, file: h5py.ExternalLink("/etc/passwd", "/"), "rewards is a link"),
-        (lambda h5py, file: h5py.SoftLink("/nowhere"), "rewards is a link"),
-        (
-            lambda h5py, file: file.create_dataset(
-                "secret", (2,), "f4", external=[("/etc/passwd", 0, 8)]
-            ),
-            "rewards are in other files",
-        ),
-        (
-            lambda h5py, file: file.create_dataset("more", (3 * 10**11,), "f8"),
-            "a thousand times more numbers than fit",
-        ),
-    ],
-)
-def test_a_file_that_leads_elsewhere_or_declares_too_much_is_refused(make, words, tmp_path, h5py):
-    with h5py.File(tmp_path / "data.hdf5", "w") as file:
-        file["rewards"] = make(h5py, file)
-    with pytest.raises(ValueError, match=words):
-        read_hdf5(tmp_path / "data.hdf5")
-
-
-def test_groups_that_hold_themselves_are_looked_at_once(tmp_path, h5py):
-    with h5py.File(tmp_path / "data.hdf5", "w") as file:
-        group = file.create_group("loop")
-        for number in range(200):
-            group[f"again{number}"] = group
-    with pytest.raises(ValueError, match="observations"):
-        read_hdf5(tmp_path / "data.hdf5")
