@@ -171,19 +171,6 @@ GROUP = "env"
 VELOCITY_TARGET = "safe_rl.envs.velocity.VelocityEnv"
 
 
-@dataclass(frozen=True)
-class Family:
-    """What nodes with one `_target_` have in common.
-
-    Attributes:
-        complete: Fills up a node that holds only what differs from the defaults.
-        suite: Name -> configuration, for environments that have a name of their own.
-    """
-
-    complete: Callable[[Mapping[str, Any]], dict[str, Any]]
-    suite: Mapping[str, Any]
-
-
 def config_node(name: str, config: Any, target: str | None = None) -> dict[str, Any]:
     """Return a configuration as a node of the group `env`: `name`, family, and every key.
 
@@ -209,17 +196,21 @@ def _complete(
     return {**config_node(node.get("name", "custom"), config, target), **node}
 
 
-FAMILIES: dict[str | None, Family] = {
-    None: Family(partial(_complete, resolve, None), SUITE | EXTRAS),
-    VELOCITY_TARGET: Family(partial(_complete, resolve_velocity, VELOCITY_TARGET), VELOCITY_SUITE),
+_SUITES: dict[str | None, Mapping[str, Any]] = {
+    None: SUITE | EXTRAS,
+    VELOCITY_TARGET: VELOCITY_SUITE,
+}
+FAMILIES: dict[str | None, Callable[[Mapping[str, Any]], dict[str, Any]]] = {
+    None: partial(_complete, resolve, None),
+    VELOCITY_TARGET: partial(_complete, resolve_velocity, VELOCITY_TARGET),
     **{
-        foreign.target: Family(partial(complete_foreign, foreign), {})
+        foreign.target: partial(complete_foreign, foreign)
         for foreign in (GYMNASIUM, TORCHRL, SAFETY_GYMNASIUM)
     },
 }
-"""`_target_` -> family; nodes with any other are taken as they are."""
+"""`_target_` -> what fills up a node; nodes with any other are taken as they are."""
 
-_TARGETS = {name: target for target, family in FAMILIES.items() for name in family.suite}
+_TARGETS = {name: target for target, suite in _SUITES.items() for name in suite}
 
 
 def env_names() -> list[str]:
@@ -230,7 +221,7 @@ def env_names() -> list[str]:
 def env_node(name: str) -> dict[str, Any]:
     """Return the node of the group `env` that a name stands for; KeyError if there is none."""
     target = _TARGETS[name]
-    return config_node(name, FAMILIES[target].suite[name], target)
+    return config_node(name, _SUITES[target][name], target)
 
 
 def complete_env(node: Mapping[str, Any]) -> dict[str, Any]:
@@ -239,8 +230,8 @@ def complete_env(node: Mapping[str, Any]) -> dict[str, Any]:
     Raises:
         ConfigError: For an unknown key or a value that cannot be used.
     """
-    family = FAMILIES.get(node.get("_target_"))
-    return dict(node) if family is None else family.complete(node)
+    complete = FAMILIES.get(node.get("_target_"))
+    return dict(node) if complete is None else complete(node)
 
 
 def stored_node(name: str) -> dict[str, Any] | None:

@@ -269,19 +269,12 @@ def require_episodes(begun: Tensor) -> None:
         raise ResetNeededError(f"No episode has begun{which}: call reset() before the first step.")
 
 
-def check_state(
-    expected: TensorDictBase,
-    state: TensorDictBase,
-    optional: Collection[str],
-    finite: Collection[str] = (),
-) -> None:
-    """Compare a state with one that the environment made.
+def check_state(expected: TensorDictBase, state: TensorDictBase, optional: Collection[str]) -> None:
+    """Compare a state, of which some keys are optional, with one that the environment made.
 
-    Args:
-        expected: The environment's own.
-        state: What is about to be set.
-        optional: Keys that may be missing.
-        finite: Keys that may hold no NaN or infinity; elsewhere they are failures of the physics.
+    Raises:
+        KeyError: If another key is missing.
+        ValueError: If a shape or a type does not fit.
     """
     for key, value in expected.items():
         if key not in state:
@@ -297,5 +290,3 @@ def check_state(
             )
         if not value.dtype.is_floating_point and given.dtype != value.dtype:
             raise ValueError(f"State '{key}' must be {value.dtype}, got {given.dtype}.")
-        if key in finite and not given.isfinite().all():
-            raise ValueError(f"State '{key}' has numbers that are not finite.")

@@ -177,15 +177,6 @@ def test_states_with_wrong_seeds_are_refused_and_leave_all_as_it_was(name, key, 
     assert all(torch.equal(env.get_state()[k], v) for k, v in before.items())
 
 
-def test_nan_in_a_layout_is_named():
-    env = make()
-    env.reset()
-    state = env.get_state()
-    state["layout"][BROKEN] = math.nan
-    with pytest.raises(ValueError, match=r"'layout'.*not finite"):
-        env.set_state(state)
-
-
 @pytest.mark.parametrize("name", ["PointGoal1", "PointButton1", "SafeHopperVelocity"])
 def test_a_step_before_the_first_reset_says_so(name):
     env = make_env(name, num_envs=3, seed=0, num_threads=1)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any
 
 import gymnasium
@@ -54,20 +55,8 @@ class WorldEnv(Worlds, gymnasium.Env[Any, np.ndarray]):
 
     metadata: dict[str, Any] = {"render_modes": RENDER_MODES}  # noqa: RUF012
 
-    def __init__(
-        self,
-        name: str | None = None,
-        config: Config = None,
-        *,
-        render_mode: str | None = None,
-        camera: Any = None,
-        width: int = 480,
-        height: int = 360,
-        sleep: bool = True,
-        positions: bool = False,
-    ) -> None:
-        self._open(batch_of(name, config, 1, 1, sleep), render_mode, positions)
-        self._view: dict[str, Any] = {"camera": camera, "width": width, "height": height}
+    def __init__(self, name: str | None = None, config: Config = None, **settings: Any) -> None:
+        self._open(partial(batch_of, name, config, 1, 1, None), **settings)
         self.observation_space, self.action_space = self.spaces()
 
     def reset(
@@ -111,15 +100,9 @@ class WorldVectorEnv(Worlds, VectorEnv[Any, np.ndarray, np.ndarray]):
         autoreset_mode: When an ended episode is followed by a new one: with the next step, within
             the same step (what ended is then in `infos["final_obs"]` and `infos["final_info"]`), or
             by `reset(options={"reset_mask": mask})`.
-        render_mode: "rgb_array" for frames, or None.
-        camera: As `WorldEnv` takes it.
-        width: Of a frame [pixels].
-        height: Of a frame [pixels].
         num_threads: Threads that step the physics; 0 for one per core.
-        sleep: As `SafetyGymEnv` takes it.
-        positions: Put `infos["positions"]` into all infos: float64 [N, K, 3] by kind (m), as
-            `SafetyGymEnv.get_positions` has them.
         max_episode_steps: Takes the place of `num_steps`; `gymnasium.make_vec` passes it on.
+        settings: Others of `WorldEnv`; positions are [N, K, 3].
 
     Raises:
         ConfigError: For a configuration that cannot be used.
@@ -145,18 +128,12 @@ class WorldVectorEnv(Worlds, VectorEnv[Any, np.ndarray, np.ndarray]):
         config: Config = None,
         *,
         autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
-        render_mode: str | None = None,
-        camera: Any = None,
-        width: int = 480,
-        height: int = 360,
         num_threads: int = 0,
-        sleep: bool = True,
-        positions: bool = False,
         max_episode_steps: int | None = None,
+        **settings: Any,
     ) -> None:
-        batch = batch_of(name, config, num_envs, num_threads, sleep, max_episode_steps)
-        self._open(batch, render_mode, positions)
-        self._view: dict[str, Any] = {"camera": camera, "width": width, "height": height}
+        make = partial(batch_of, name, config, num_envs, num_threads, max_episode_steps)
+        self._open(make, **settings)
         self.num_envs, self.autoreset_mode = num_envs, AutoresetMode(autoreset_mode)
         self.metadata = {**self.metadata, "autoreset_mode": self.autoreset_mode}
         self.single_observation_space, self.single_action_space = self.spaces()

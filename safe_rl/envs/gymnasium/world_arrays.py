@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import gymnasium
@@ -42,12 +43,23 @@ class Worlds:
     _spec: EnvSpec | None = None
     _is_seeded = False
 
-    def _open(self, batch: SimulatedEnv, mode: str | None, positions: bool) -> None:
-        if mode not in (None, *RENDER_MODES):
-            raise ValueError(f"render_mode must be one of {RENDER_MODES}, got {mode!r}.")
-        self.batch, self.render_mode, self._has_positions = batch, mode, positions
-        self._events = [name for name in batch.flags if name not in SimulatedEnv.flags]
-        rate = max(1, round(1 / batch.seconds_per_step))  # in real time, as Gymnasium's
+    def _open(
+        self,
+        batch: partial[SimulatedEnv],
+        *,
+        render_mode: str | None = None,
+        camera: Any = None,
+        width: int = 480,
+        height: int = 360,
+        sleep: bool = True,
+        positions: bool = False,
+    ) -> None:
+        if render_mode not in (None, *RENDER_MODES):
+            raise ValueError(f"render_mode must be one of {RENDER_MODES}, got {render_mode!r}.")
+        self.batch, self.render_mode, self._has_positions = batch(sleep), render_mode, positions
+        self._view: dict[str, Any] = {"camera": camera, "width": width, "height": height}
+        self._events = [name for name in self.batch.flags if name not in SimulatedEnv.flags]
+        rate = max(1, round(1 / self.batch.seconds_per_step))  # in real time, as Gymnasium's
         self.metadata: dict[str, Any] = {"render_modes": RENDER_MODES, "render_fps": rate}
 
     @property
@@ -119,8 +131,8 @@ def batch_of(
     config: Config,
     num_envs: int,
     num_threads: int,
+    num_steps: int | None,
     sleep: bool,
-    num_steps: int | None = None,
 ) -> SimulatedEnv:
     """Make the environment of a name, with some keys changed, or of a whole configuration."""
     base = VELOCITY_SUITE.get(name or "") or (resolve(name) if name else SafetyGymConfig())

@@ -132,8 +132,6 @@ TASK_KEYS = ("goal_button", "buttons_timer", "step_count")
 LAYOUT_KEYS = ("layout", "start_pose")
 # Without the last control, sensors that feel the actuators differ until the next step.
 OPTIONAL_KEYS = (*LAYOUT_KEYS, "target_quat", "ctrl", "act", "history", "seed", "episode")
-# What is not part of the physics, whose failures are noticed by themselves.
-FINITE_KEYS = (*LAYOUT_KEYS, "goal_pos", "target_quat")
 
 
 def read_state(world: World) -> TensorDict:
@@ -183,7 +181,7 @@ def check_worlds(world: World, expected: TensorDictBase, state: TensorDictBase) 
         KeyError: if a key is missing.
         ValueError: if it does not fit, or there is no such goal button.
     """
-    check_state(expected, state, OPTIONAL_KEYS, FINITE_KEYS)
+    check_state(expected, state, OPTIONAL_KEYS)
     button, number = state["goal_button"], world.scene.config.buttons_num
     if goal_is_button(world.scene.config.task) and not ((button >= 0) & (button < number)).all():
         raise ValueError(f"State 'goal_button' must be between 0 and {number - 1}: {button}.")
