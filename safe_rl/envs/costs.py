@@ -51,8 +51,6 @@ def parse_ranges(outside: Any, entry: str | None = None) -> dict[str, CostRange]
     Examples:
         >>> parse_ranges({"cost_speed": ["thdot", -4, 4]})
         {'cost_speed': CostRange(entry='thdot', column=0, low=-4, high=4)}
-        >>> parse_ranges({"cost_position": [0, -0.5, 0.5]}, "observation")["cost_position"].entry
-        'observation'
     """
     form = _ENTRY_FORM if entry is None else _COLUMN_FORM
     if outside is not None and not isinstance(outside, Mapping):

@@ -143,11 +143,6 @@ def make_gymnasium(
 
     Raises:
         ConfigError: For an unknown key or id, or an environment that the algorithms cannot use.
-
-    Examples:
-        >>> config = {"id": "Safexp-PointGoal1-v0", "num_steps": 100}
-        >>> make_gymnasium(config, num_envs=2, seed=0).cost_keys
-        ['cost', 'cost_hazards', 'cost_exception']
     """
     return _make_node(GYMNASIUM, _registered, config, num_envs, device, seed)
 

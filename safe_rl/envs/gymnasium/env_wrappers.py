@@ -44,8 +44,7 @@ def adapt(
 class FloatCosts(gymnasium.Wrapper):
     """Makes the costs in `info` floats; what is no single number stays as it is.
 
-    Gymnasium puts the costs of a batch into an array of the type of the first row: if that is an
-    integer, the costs of all rows would be rounded.
+    Gymnasium puts the costs of a batch into an array of the type of the first row, and rounds.
     """
 
     def __init__(self, env: gymnasium.Env, cost_keys: Sequence[str]) -> None:

@@ -29,13 +29,10 @@ SLEEP_TOLERANCE = 1e-5
 
 
 def build_scene(config: SafetyGymConfig, sleep: bool = False, decorated: bool = False) -> Scene:
-    """Compile the world of a configuration.
+    """Compile the world of a configuration; with `sleep`, resting free bodies do until touched.
 
-    Args:
-        config: the environment.
-        sleep: let resting free bodies sleep until something touches them.
-        decorated: build the world for pictures: areas are bodies too, and there are cameras, light
-            and a floor pattern. Its `qpos` and first mocap bodies are those of the plain world.
+    A `decorated` world is for pictures: areas are bodies too, and there are cameras, light and a
+    floor pattern. Its `qpos` and first mocap bodies are those of the plain world.
     """
     # A robot file that has changed makes another world.
     content = fingerprint(robot_path(config.robot_base))

@@ -235,16 +235,9 @@ class SafetyGymEnv(SimulatedEnv):
         """Return where everything is: for shields, privileged critics and plots.
 
         Returns:
-            TensorDict [N] of copies, float64 [N, K, 3] each (m, in the world's frame): `robot`
-            (its root body, K = 1), and the centres of the objects of every kind that there is, by
-            kind: `goal` (K = 1; that of a button task is the goal button's place), `hazards`, …
-
-        Examples:
-            >>> env = SafetyGymEnv("PointGoal1", num_envs=4, seed=0)
-            >>> _ = env.reset()
-            >>> positions = env.get_positions()
-            >>> (positions["hazards"] - positions["robot"])[..., :2].norm(dim=-1).shape
-            torch.Size([4, 8])
+            TensorDict [N] of copies, float64 [N, K, 3] each (m, in the world's frame): `robot` (its
+            root body, K = 1), and the centres of the objects of every kind that there is, by kind:
+            `goal` (K = 1; that of a button task is the goal button's place), `hazards`, …
         """
         places = {"robot": self._world.robot_pos.unsqueeze(1), **self._world.objects}
         return TensorDict(places, self.batch_size).clone().to(self.device)

@@ -82,12 +82,7 @@ class Observer(NamedTuple):
 
 
 def make_observer(scene: Scene, device: torch.device) -> Observer:
-    """Resolve what a configuration observes, with indices on the device of the worlds.
-
-    Raises:
-        ConfigError: for sensors the robot does not have, if two components have one name, or if
-            nothing is observed.
-    """
+    """Resolve what a configuration observes; ConfigError for sensors the robot does not have."""
     blocks = [block for source in SOURCES for block in source(scene.config, scene, device)]
     names = [name for block in blocks for name in block.shapes]
     if not names:

@@ -129,11 +129,7 @@ def _named_sensors(config: SafetyGymConfig, scene: Scene) -> list[int]:
 
 
 def sensor_blocks(config: SafetyGymConfig, scene: Scene, device: torch.device) -> list[Block]:
-    """Robot sensors: raw ones, hinge angles as (sin, cos), ball joints as rotation matrices.
-
-    Raises:
-        ConfigError: for sensors the robot does not have, or sensors of slide joints.
-    """
+    """Robot sensors: raw ones, hinge angles as (sin, cos), ball joints as rotation matrices."""
     if not config.observe_sensors:
         return []
     sensor, joint = mujoco.mjtSensor, mujoco.mjtJoint

@@ -119,17 +119,10 @@ def robot_path(base: str) -> Path:
 
 
 def load_robot(base: str) -> Robot:
-    """Load a robot and check that it can be placed, moved and stepped.
-
-    Args:
-        base: a name in `ROBOTS`, or the path of an MJCF file.
+    """Load a robot, by name or file, and check that it can be placed, moved and stepped.
 
     Raises:
         ConfigError: if MuJoCo cannot load the file, or the file lacks what an environment needs.
-
-    Examples:
-        >>> load_robot("car").planar
-        False
     """
     path = robot_path(base)
     try:
@@ -210,13 +203,7 @@ def _is_planar(model: mujoco.MjModel, path: Path) -> bool:
 
 
 def own_robot(keys: Mapping[str, Any]) -> Path | None:
-    """Return the file of the robot that an environment's keys name, if it is none of the bundled.
-
-    Examples:
-        >>> own_robot({"robot_base": "mine.xml"})
-        PosixPath('mine.xml')
-        >>> own_robot({"robot_base": "doggo"})
-    """
+    """Return the file of the robot that keys name, if it is none of the bundled."""
     base = str(keys.get("robot_base", "car"))
     path = robot_path(base)
     is_bundled = path.parent == BUNDLED or (base in PATHS_OF_2019 and not path.is_file())

@@ -148,12 +148,7 @@ def dense_reward(
     now: Tensor,
     failed: Tensor,
 ) -> Tensor:
-    """Reward of a step without the bonus for a goal, clipped to ±`reward_clip`: [N].
-
-    Raises:
-        ConfigError: if a registered task's reward is not one number per world; it may be NaN in
-            `failed` worlds.
-    """
+    """Reward [N] without the bonus for a goal, clipped to ±`reward_clip`."""
     reward = task.reward(config, world, before, now)
     _check_values("reward", reward, config, world)
     if config.task not in BUILT_IN:
@@ -172,11 +167,7 @@ def dense_reward(
 def goals_met(
     task: Task, config: SafetyGymConfig, world: World, now: Tensor, failed: Tensor
 ) -> Tensor:
-    """Which worlds meet their goals: bool [N], for tasks with goals; failed ones do not.
-
-    Raises:
-        ConfigError: if a registered task does not say so of every world.
-    """
+    """Which worlds meet their goals: bool [N], for tasks with goals; failed ones do not."""
     assert task.met is not None
     met = task.met(config, world, now)
     _check_values("met", met, config, world)

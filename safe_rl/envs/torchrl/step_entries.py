@@ -49,13 +49,6 @@ class StepCosts(Transform):
 
     Raises:
         ConfigError: If there are no costs, or one is not a number per row.
-        TargetError: If the module of the function was not named by `import=`.
-
-    Examples:
-        >>> from torchrl.envs import SerialEnv, PendulumEnv
-        >>> node = {"cost_keys": [], "outside": {"cost_speed": ["thdot", -4, 4]}, "cost": None}
-        >>> StepCosts(SerialEnv(2, PendulumEnv), node).names
-        ['cost', 'cost_speed']
     """
 
     def __init__(self, env: EnvBase, config: Mapping[str, Any]) -> None:

@@ -79,13 +79,6 @@ def make_torchrl(
     Raises:
         ConfigError: For an unknown key or class, or an environment that algorithms cannot use.
         TargetError: For a class or function whose module was not named by `import=`.
-
-    Examples:
-        >>> config = {"id": "PendulumEnv", "num_steps": 200}
-        >>> config["outside"] = {"cost_speed": ["thdot", -4, 4]}
-        >>> env = make_torchrl(config, num_envs=3, seed=0)
-        >>> env.rollout(5)["next", "cost_speed"].shape
-        torch.Size([3, 5, 1])
     """
     config = complete_foreign(TORCHRL, config)
     env = _tried(config, partial(_batch, num_envs=num_envs))
@@ -100,11 +93,7 @@ def make_torchrl(
 
 
 def describe_node(config: Mapping[str, Any]) -> tuple[list[str], int]:
-    """Return the cost keys and the length of episodes of a node; one environment is asked.
-
-    Raises:
-        ConfigError: If the environment does not say how long its episodes are.
-    """
+    """Return the cost keys and the length of episodes of a node; one environment is asked."""
     env = _tried(config, _one)
     try:
         known = getattr(env, "max_episode_steps", None)
@@ -181,13 +170,9 @@ def _batch(make: MakeEnv, num_envs: int) -> EnvBase:
 
 
 class Rows(EnvBase):
-    """N copies of an environment without a state of its own, stepped at once.
+    """N copies of an environment without a state (`batch_locked` is False), stepped at once.
 
     Not TorchRL's `BatchSizeTransform`: other transforms cannot change actions outside of it.
-
-    Args:
-        env: Its step is a function of the TensorDict, of any batch size (`batch_locked` is False).
-        num_envs: N.
     """
 
     def __init__(self, env: EnvBase, num_envs: int) -> None:

@@ -32,11 +32,6 @@ class ConstraintTransform(Checked, Transform):
         return_key: where it leaves the reward that returns are made of, if it changes the reward.
         steps_per_decision: steps of the environment that a call of `step` takes. One that takes
             several has to be the last: those before it then act at every step.
-
-    Examples:
-        >>> from torchrl.envs import PendulumEnv, TransformedEnv
-        >>> TransformedEnv(PendulumEnv(), ConstraintTransform()).rollout(3).shape
-        torch.Size([3])
     """
 
     evaluating = False

@@ -21,18 +21,9 @@ _STATE = "transforms"
 class TransformedConstrainedEnv(ConstrainedEnv, TransformedEnv):
     """N environments with transforms, made by `transform_env`.
 
-    Args:
-        base_env: fulfils the contract `ConstrainedEnv`.
-        transforms: name -> transform, any of TorchRL's; the first is the innermost.
-        seed: of what transforms draw; the environment has its own. None takes torch's generator.
-
     Attributes:
         cost_keys: the environment's, then those of the transforms.
-        return_key: the entry below "next" that returns are made of, `reward` unless that is
-            changed.
-
-    Raises:
-        ValueError: if the transforms do not fit the environment, or one another.
+        return_key: the entry below "next" that returns are made of, `reward` by default.
     """
 
     def __init__(
@@ -129,11 +120,7 @@ class TransformedConstrainedEnv(ConstrainedEnv, TransformedEnv):
         return state
 
     def set_state(self, state: TensorDictBase) -> TensorDictBase:
-        """Put the worlds into a state; transforms that are not in it start an episode.
-
-        Returns:
-            What a reset returns, for that state.
-        """
+        """Put the worlds into a state; transforms that are not in it start an episode."""
         ours = self._ours()
         # the environment inside may have transforms of its own
         inside = state.exclude(*((_STATE, name) for name in ours)).filter_empty_()

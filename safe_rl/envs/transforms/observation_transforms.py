@@ -33,19 +33,12 @@ class SensorNoise(ConstraintTransform):
         std: Standard deviation of the noise, in the units of what is observed.
         components: Names of those that are noisy, as in `observation_layout`; None: all.
 
-    Raises:
-        ValueError: for an unknown component.
-
     Examples:
         >>> from safe_rl.envs import make_env
         >>> noise = SensorNoise(std=0.1, components=["hazards_lidar"])
-        >>> exact, noisy = (
-        ...     make_env("PointGoal1", seed=0, transforms=changes)
-        ...     for changes in ({}, {"noise": noise})
-        ... )
-        >>> differs = exact.reset()["observation"] != noisy.reset()["observation"]
-        >>> exact.observation_layout["hazards_lidar"], differs[0].nonzero()[:, 0].tolist()[::15]
-        (slice(22, 38, None), [22, 37])
+        >>> env = make_env("PointGoal1", num_envs=2, seed=0, transforms={"noise": noise})
+        >>> env.reset()["observation"].shape
+        torch.Size([2, 60])
     """
 
     def __init__(self, std: NotNegative, components: Sequence[Text] | None = None) -> None:
@@ -185,25 +178,17 @@ class ObservedCosts(ConstraintTransform):
     """The last step's costs and a trace of those before them become part of the observation.
 
     Costs may have causes that no sensor shows: a vase that was touched costs as long as it moves.
-    A policy that reads its costs can tell that state from others. This is more than the published
-    observation, and the policy needs it in use as well: say so beside every result.
-
-    The trace e of a cost c is e ← decay · e + (1 − decay) · c, a mean over the last 1 / (1 − decay)
-    steps. `observation` gets 2 columns per cost, the components `last_costs` and `cost_traces`.
-    Both are 0 when an episode begins. It is on in evaluation too.
+    This is more than the published observation, and the policy needs it in use as well: say so
+    beside every result. The trace e of a cost c is e ← decay · e + (1 − decay) · c, a mean over the
+    last 1 / (1 − decay) steps. Both are 0 when an episode begins.
 
     Args:
         decay: Weight of the past in the trace.
         costs: Names of the costs that are observed; None: all.
 
-    Raises:
-        ValueError: for an unknown cost, or an observation that is no vector.
-
     Examples:
         >>> from safe_rl.envs import make_env
         >>> env = make_env("PointGoal2", seed=0, transforms={"seen": ObservedCosts(decay=0.95)})
-        >>> len(env.cost_keys)
-        5
         >>> env.observation_layout["last_costs"], env.observation_layout["cost_traces"]
         (slice(60, 65, None), slice(65, 70, None))
     """

@@ -27,9 +27,8 @@ class RewardScale(ConstraintTransform):
     """Multiply the rewards that are learned from by a number.
 
     If discounted returns are in the hundreds, the hidden layers of critics saturate on the way to
-    such values and no longer distinguish states: they should be about 1 to 10. Logged returns are
-    those of the environment's own reward, which is kept in `task_reward`; evaluation changes
-    nothing.
+    such values: they should be about 1 to 10. Logged returns are those of the environment's own
+    reward, which is kept in `task_reward`; evaluation changes nothing.
 
     Args:
         factor: What rewards are multiplied by.
@@ -63,17 +62,13 @@ class EarlyTermination(ConstraintTransform):
     """The episode terminates with the step at which it has cost more than its budget.
 
     There is no reward beyond the budget, so an algorithm without constraints learns to keep it: the
-    early terminated MDP of Sun et al. 2021, "Safe Exploration by Solving Early Terminated MDP".
-    What is left of the budget is observed only with `saute` before it. In evaluation episodes
-    continue, as in the paper, so that the cost of the whole episode counts. With `in_evaluation`
-    they end there too: no episode then costs more than the budget and one step.
+    early terminated MDP of Sun et al. 2021, "Safe Exploration by Solving Early Terminated MDP". In
+    evaluation episodes continue, as in the paper, so that the cost of the whole episode counts.
 
     Args:
         budgets: Cost key -> undiscounted cost per episode; one that costs exactly this continues.
-        in_evaluation: Whether episodes of an evaluation end in the same way.
-
-    Raises:
-        ValueError: for a budget below 0.
+        in_evaluation: Whether episodes of an evaluation end in the same way: none then costs more
+            than the budget and one step.
 
     Examples:
         >>> from torchrl.envs import TransformedEnv

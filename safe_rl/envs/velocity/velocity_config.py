@@ -102,11 +102,7 @@ class VelocityConfig:
         return cls(robot=keys["robot"], **(dict(RUNNERS[keys["robot"]].defaults) | given))
 
     def replace(self, **changes: Any) -> VelocityConfig:
-        """Return a copy with some keys changed; another `robot` brings its own other keys.
-
-        Raises:
-            ConfigError: As `from_dict`.
-        """
+        """Return a copy with some keys changed; another `robot` brings its own other keys."""
         if changes.get("robot", self.robot) != self.robot:
             return VelocityConfig.from_dict(changes)
         return VelocityConfig.from_dict(self.to_dict() | changes)
@@ -152,10 +148,6 @@ def resolve_velocity(env: str | Mapping[str, Any] | VelocityConfig) -> VelocityC
 
     Raises:
         ConfigError: For an unknown name (the nearest one is named), or an invalid configuration.
-
-    Examples:
-        >>> resolve_velocity("SafetyAntVelocity-v1").velocity_threshold
-        2.6222
     """
     if isinstance(env, VelocityConfig):
         return env
