@@ -6,7 +6,6 @@ from functools import partial
 import pytest
 import torch
 from point_mass import PointMass
-from torchrl.data import Bounded, Categorical, OneHot
 from torchrl.envs.utils import check_env_specs
 from transforming import ENVIRONMENTS, Priced, half_speed, still, transformed
 
@@ -101,25 +100,6 @@ def test_what_is_pending_ends_with_the_episode_of_its_row():
     speed = env.step(state)["next", "observation"][:, 2:4]
     assert (speed[0] == 0).all()
     assert (speed[1:] > 0).all()
-
-
-@pytest.mark.parametrize(
-    ("spec", "nothing"),
-    [
-        (Bounded(-1.0, 1.0, (3, 2)), [0.0, 0.0]),
-        (Bounded(0.5, 1.0, (3, 2)), [0.5, 0.5]),
-        (Categorical(4, shape=(3,)), [0]),
-        (OneHot(4, shape=(3, 4)), [1, 0, 0, 0]),
-    ],
-    ids=["around 0", "above 0", "choices", "one-hot"],
-)
-def test_nothing_is_the_allowed_action_next_to_zero(spec, nothing):
-    env = ENVIRONMENTS["point_mass"]()
-    env.action_spec = spec
-    env = transformed(env, delay=ActionDelay(3))
-    env.reset()
-    pending = env.transform[0].rows()["pending"]
-    assert pending.tolist() == [nothing * 3] * 3
 
 
 def repeating(env, k, *before, **named):

@@ -66,14 +66,6 @@ def test_a_copy_continues_as_the_original_does(name, how):
     assert expected["truncated"].any()
 
 
-def test_what_slept_wakes_up_in_a_copy():
-    env = safety_gym("PointGoal2")
-    _, here = play(env, env.reset(), 10)
-    other = copy.deepcopy(env)
-    (expected, _), (got, _) = play(env, here.clone(), 5), play(other, here.clone(), 5)
-    torch.testing.assert_close(got["observation"], expected["observation"], rtol=0, atol=1e-5)
-
-
 @pytest.mark.parametrize("name", ["PointPush1", "CarButton2", "SafeHopperVelocity"])
 def test_copies_before_the_first_reset_begin_the_same_episodes(name):
     env = MAKERS[name]()

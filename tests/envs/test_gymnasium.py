@@ -134,16 +134,6 @@ def test_any_configuration_can_be_made():
         gymnasium.make("SafeHopperVelocity-v0", render_mode="ansi", disable_env_checker=True)
 
 
-def test_nested_observations_are_dictionaries():
-    env = gymnasium.make("Safexp-CarGoal1-v0", config={"observation_flatten": False})
-    observation, _ = env.reset(seed=0)
-    assert isinstance(env.observation_space, gymnasium.spaces.Dict)
-    assert observation in env.observation_space
-    flat, _ = gymnasium.make("Safexp-CarGoal1-v0").reset(seed=0)
-    joined = [observation[key].reshape(-1) for key in sorted(observation)]
-    np.testing.assert_array_equal(np.concatenate(joined), flat)
-
-
 @needs_opengl
 def test_frames_are_what_the_camera_sees():
     make = {"render_mode": "rgb_array", "camera": "track", "width": 64, "height": 48}

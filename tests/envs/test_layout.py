@@ -10,7 +10,7 @@ import torch
 from crafting import kind_of, places
 from scipy import stats
 
-from safe_rl.envs import SUITE, ConfigError, LayoutError, SafetyGymEnv
+from safe_rl.envs import SUITE, LayoutError, SafetyGymEnv
 
 # By hand from sections 1 and 9 of the benchmark's description [m].
 HALF_EXTENTS = {
@@ -226,12 +226,6 @@ def test_pinned_layouts():
     want = torch.tensor([0.5, 0.6, 0.7, 0.4], dtype=torch.float64).expand(50, 4)
     torch.testing.assert_close(yaw, want)
     assert (state["qpos"][:, 2] == 0.3).all()
-
-
-def test_placements_without_room_name_the_key():
-    config = {**POINT, "hazards_num": 1, "hazards_placements": [[0, 0, 0.7, 2]]}
-    with pytest.raises(ConfigError, match=r"hazard0.*'hazards_placements'.*'hazards_keepout'"):
-        SafetyGymEnv(config, num_threads=1)
 
 
 HOPELESS = {

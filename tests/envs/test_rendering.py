@@ -180,16 +180,6 @@ def test_the_goal_button_stands_in_a_grey_cylinder():
 
 
 @needs_opengl
-def test_labels_name_the_objects():
-    config = {"hazards_num": 1, "hazards_locations": [PLACE], "observe_hazards": False}
-    view = {"camera": from_above(*PLACE, 3.0), "width": 100, "height": 100}
-    plain = make_env(config).render(0, **view)
-    labelled = make_env(config, render_labels=True).render(0, **view)
-    assert (plain.min(-1) == 255).sum() == 0
-    assert (labelled.min(-1) == 255).sum() > 20
-
-
-@needs_opengl
 def test_the_tracking_camera_is_behind_the_robot_and_level():
     ahead = {"task": "goal", "goal_locations": [(-0.5, 1.5)]}
     env = make_env(ahead, robot_rot=math.atan2(1.5, -0.5), render_lidar_markers=False)

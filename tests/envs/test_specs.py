@@ -136,16 +136,6 @@ def test_partial_resets_leave_other_rows_alone(env_name):
     assert not torch.equal(plain["observation"], interrupted["observation"])
 
 
-@pytest.mark.parametrize("env_name", ["PointGoal2", "CarButton1", "DoggoPush0", "SafeAntVelocity"])
-def test_a_reset_of_no_world_changes_nothing(env_name):
-    env = make_env(env_name, num_envs=2, seed=0, num_threads=1)
-    before = env.rollout(3)[:, -1]["next"]
-    state = env.get_state()
-    nobody = before.set("_reset", torch.zeros(2, 1, dtype=torch.bool))
-    assert torch.equal(env.reset(nobody)["observation"], before["observation"])
-    assert all(torch.equal(value, state[key]) for key, value in env.get_state().items())
-
-
 def test_a_reset_leaves_nothing_of_the_episode_before():
     env = SafetyGymEnv("CarButton2", num_envs=3, seed=0, num_threads=1)
     env.rollout(5)

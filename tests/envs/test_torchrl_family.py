@@ -11,7 +11,6 @@ import torch
 import torchrl_envs
 import yaml
 from commands import run_train
-from torchrl.data import Unbounded
 from torchrl.envs import PendulumEnv
 from torchrl.envs.utils import check_env_specs
 
@@ -240,15 +239,3 @@ def test_costs_may_stand_beside_the_reward_already(trusted, named):
     assert after["reward"].any()
     assert torch.equal(after["cost_effort"], after["reward"].square())
     assert torch.equal(after["cost"], after["cost_effort"])
-
-
-def test_costs_of_ranges_are_bounded_in_the_spec_and_others_are_not(trusted):
-    env = make_env(PENDULUM, num_envs=2, seed=0)
-    bounds = {key: env.full_reward_spec[key].high.max().item() for key in env.cost_keys}
-    assert bounds == dict.fromkeys(["cost", *OUTSIDE], 1.0)
-    # a cost of one's own that is called so is no sum of those of ranges
-    both = make_env(PENDULUM | {"cost": "torchrl_envs:upright"}, num_envs=2, seed=0)
-    assert isinstance(both.full_reward_spec["cost"], Unbounded)
-    assert both.full_reward_spec["cost_speed"].high.max().item() == 1.0
-    own = make_env(PENDULUM | {"outside": None, "cost": "torchrl_envs:kinds"}, num_envs=2, seed=0)
-    assert all(isinstance(own.full_reward_spec[key], Unbounded) for key in own.cost_keys)

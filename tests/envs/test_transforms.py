@@ -10,7 +10,7 @@ from torchrl.envs.transforms import RewardScaling, StepCounter
 from torchrl.envs.utils import check_env_specs
 from transforming import ENVIRONMENTS, SAUTE, TRANSFORMS, Priced, half_speed, still, transformed
 
-from safe_rl.envs import ConstrainedEnv, SafetyGymEnv, check_constrained_env, make_env
+from safe_rl.envs import ConstrainedEnv, check_constrained_env, make_env
 from safe_rl.envs.transforms import (
     ActionFilter,
     ActionRepeat,
@@ -210,13 +210,6 @@ def test_transforms_of_torchrl_can_stand_among_ours():
     check_env_specs(env)
     # what they remember is in no snapshot
     assert env.get_state() is None
-
-
-def test_an_environment_without_the_contract_is_transformed_too():
-    check_env_specs(TransformedEnv(SafetyGymEnv("PointGoal1"), Saute({"cost": 25.0}, **SAUTE)))
-    env = TransformedEnv(SafetyGymEnv("PointGoal1", seed=0), EarlyTermination({"cost_hazard": 1.0}))
-    with pytest.raises(ValueError, match=r"'cost_hazard'.*Did you mean 'cost_hazards'\?"):
-        env.rollout(1)
 
 
 def test_nodes_are_built_and_their_keys_named():
