@@ -5,7 +5,7 @@ from __future__ import annotations
 import inspect
 import os
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from functools import cache
 from typing import (
     Annotated,
@@ -19,10 +19,11 @@ from typing import (
     is_typeddict,
 )
 
+from safe_rl.extras import check_extra
 from safe_rl.ranges import NotNegative, Range, Values, Weight, bytes_each, is_described, values_of
-from safe_rl.targets import constructors
+from safe_rl.targets import locate
 
-__all__ = ["Parameter", "SettingError", "parameters_of"]
+__all__ = ["Parameter", "Part", "SettingError", "accepted_names", "parameters_of", "read_part"]
 
 
 class SettingError(ValueError):
@@ -81,6 +82,23 @@ class Parameter(NamedTuple):
             )
 
 
+class Part(NamedTuple):
+    """A class or function that a configuration names as ``_target_``.
+
+    Attributes:
+        rows: Its arguments by name; none if its signature cannot be read.
+        names: All that it takes; None if it takes any, or its signature cannot be read.
+    """
+
+    rows: Mapping[str, Parameter]
+    names: list[str] | None
+
+    @property
+    def settings(self) -> dict[str, Parameter]:
+        """Its hyper-parameters: all arguments that the program does not hand over."""
+        return {name: row for name, row in self.rows.items() if row.is_described}
+
+
 class Optimiser(TypedDict, total=False):
     """Arguments of torch's optimisers, whose annotations do not say what they may be.
 
@@ -107,11 +125,58 @@ class Optimiser(TypedDict, total=False):
     nesterov: bool
 
 
+def read_part(target: Any, path: str = "") -> Part:
+    """Find what a node names as ``_target_``, and read what it takes.
+
+    Args:
+        target: The dotted name.
+        path: Key of the node, which is to be built; empty if it is only to be read.
+
+    Raises:
+        TargetError: If it may not be named, or does not exist.
+        SettingError: If it is to be built and needs a package of an extra that is not installed.
+
+    Examples:
+        >>> part = read_part("safe_rl.objectives.ProjectedMultiplier")
+        >>> list(part.settings), part.names
+        (['init', 'lr', 'highest'], ['cost_limits', 'highest', 'init', 'lr'])
+    """
+    found = locate(target, f"{path}._target_" if path else "")
+    try:
+        check_extra(found if path else None)
+    except ModuleNotFoundError as error:
+        raise SettingError(f"{path}: {error}") from None
+    try:
+        chain = constructors(found)
+        # the package's constructors hand on all that they do not name, others may use it
+        ours = all(function.__module__.startswith("safe_rl.") for function in chain)
+        is_open = _takes_any(chain[-1] if ours else chain[0])
+        return Part(parameters_of(found), None if is_open else sorted(accepted_names(found)))
+    except (AttributeError, TypeError, ValueError):
+        return Part({}, None)
+
+
+def accepted_names(target: Callable[..., Any]) -> set[str]:
+    """Names of the arguments that a function or a class takes.
+
+    A constructor with ``**kwargs`` hands them on to its base, whose names count too.
+
+    Examples:
+        >>> class Base:
+        ...     def __init__(self, actor_network, *, multiplier=None): ...
+        >>> class Own(Base):
+        ...     def __init__(self, *args, penalty, **kwargs): ...
+        >>> sorted(accepted_names(Own))
+        ['actor_network', 'multiplier', 'penalty']
+    """
+    return {name for name, *_ in _arguments(target)}
+
+
 @cache
 def parameters_of(target: Callable[..., Any]) -> Mapping[str, Parameter]:
     """Arguments of a function or class by name, those of its bases included; keys of a `TypedDict`.
 
-    As `targets.accepted_names`, this follows ``**kwargs`` to the next constructor. An annotation
+    As `accepted_names`, this follows ``**kwargs`` to the next constructor. An annotation
     that cannot be read, such as a name imported for type checkers only, allows anything.
     """
     if target.__module__.startswith("torch.optim"):
@@ -135,7 +200,14 @@ def _annotations(target: Callable[..., Any]) -> list[tuple[str, Any, bool]]:
     if is_typeddict(target):
         hints = get_type_hints(target, include_extras=True)
         return [(k, _bare(hint), get_origin(hint) is not NotRequired) for k, hint in hints.items()]
-    rows = []
+    return [
+        (name, _evaluated(parameter.annotation, names), parameter.default is parameter.empty)
+        for name, parameter, names in _arguments(target)
+    ]
+
+
+def _arguments(target: Callable[..., Any]) -> Iterator[tuple[str, inspect.Parameter, Any]]:
+    """Arguments that have names, each with what its module defines."""
     for function in constructors(target):
         names = getattr(inspect.unwrap(function), "__globals__", {})
         for name, parameter in inspect.signature(function).parameters.items():
@@ -143,9 +215,22 @@ def _annotations(target: Callable[..., Any]) -> list[tuple[str, Any, bool]]:
                 parameter.POSITIONAL_OR_KEYWORD,
                 parameter.KEYWORD_ONLY,
             ):
-                annotation = _evaluated(parameter.annotation, names)
-                rows.append((name, annotation, parameter.default is parameter.empty))
-    return rows
+                yield name, parameter, names
+
+
+def constructors(target: Callable[..., Any]) -> list[Callable[..., Any]]:
+    """A function, or a class's constructors as far as each hands ``**kwargs`` on to the next."""
+    functions = [target]
+    if inspect.isclass(target):
+        functions = [vars(base)["__init__"] for base in target.__mro__ if "__init__" in vars(base)]
+    ends = (index for index, function in enumerate(functions, 1) if not _takes_any(function))
+    return functions[: next(ends, len(functions))]
+
+
+def _takes_any(function: Callable[..., Any]) -> bool:
+    """Whether a function takes arguments that it does not name."""
+    parameters = inspect.signature(function).parameters.values()
+    return any(parameter.kind is parameter.VAR_KEYWORD for parameter in parameters)
 
 
 def _bare(hint: Any) -> Any:

@@ -19,9 +19,7 @@ from omegaconf import DictConfig, ListConfig, OmegaConf
 
 from safe_rl.naming import did_you_mean
 
-__all__ = [
-    *("TargetError", "accepted_names", "allow", "build", "constructors", "locate", "takes_any"),
-]
+__all__ = ["TargetError", "allow", "build", "locate"]
 
 # Rooms with parts of a run; where only some of the classes and functions are, their names: others
 # start programs, import modules, or write and remove files.
@@ -141,41 +139,6 @@ def locate(target: Any, key: str = "") -> Callable[..., Any]:
     if _is_inside(home, _OPTIMISERS) and not _is_optimiser(found):
         raise TargetError(f"{shown} is neither an optimiser nor a scheduler of {_OPTIMISERS}.")
     return found
-
-
-def accepted_names(target: Callable[..., Any]) -> set[str]:
-    """Names of the arguments that a function or a class takes.
-
-    A constructor with ``**kwargs`` hands them on to its base, whose names count too.
-
-    Examples:
-        >>> class Base:
-        ...     def __init__(self, actor_network, *, multiplier=None): ...
-        >>> class Own(Base):
-        ...     def __init__(self, *args, penalty, **kwargs): ...
-        >>> sorted(accepted_names(Own))
-        ['actor_network', 'multiplier', 'penalty']
-    """
-    names: set[str] = set()
-    for function in constructors(target):
-        parameters = inspect.signature(function).parameters.values()
-        names |= {p.name for p in parameters if p.kind in (p.POSITIONAL_OR_KEYWORD, p.KEYWORD_ONLY)}
-    return names - {"self"}
-
-
-def constructors(target: Callable[..., Any]) -> list[Callable[..., Any]]:
-    """A function, or a class's constructors as far as each hands ``**kwargs`` on to the next."""
-    functions = [target]
-    if inspect.isclass(target):
-        functions = [vars(base)["__init__"] for base in target.__mro__ if "__init__" in vars(base)]
-    ends = (index for index, function in enumerate(functions, 1) if not takes_any(function))
-    return functions[: next(ends, len(functions))]
-
-
-def takes_any(function: Callable[..., Any]) -> bool:
-    """Whether a function takes arguments that it does not name."""
-    parameters = inspect.signature(function).parameters.values()
-    return any(parameter.kind is parameter.VAR_KEYWORD for parameter in parameters)
 
 
 def _checked(node: Any, key: str) -> Any:

@@ -17,7 +17,8 @@ from setting_tables import own_parts, setting_table
 
 from safe_rl.algorithms.build_part import find_recipe
 from safe_rl.files import CONF
-from safe_rl.targets import accepted_names, locate
+from safe_rl.parameters import accepted_names
+from safe_rl.targets import locate
 
 DOCS = Path(__file__).resolve().parents[1]
 # what the live arguments are called here

@@ -8,7 +8,8 @@ from typing import Any
 from omegaconf import DictConfig, OmegaConf
 
 from safe_rl.cli.schema import KEYS
-from safe_rl.targets import accepted_names, locate
+from safe_rl.parameters import accepted_names
+from safe_rl.targets import locate
 
 NODES = ("memory",)
 # what is not a part; the first four are what such an algorithm brings along for the preset

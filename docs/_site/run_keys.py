@@ -11,12 +11,11 @@ from hydra import compose, initialize_config_dir
 from omegaconf import DictConfig, OmegaConf
 from tables import table
 
-from safe_rl.cli.schema import KEYS, keys_of_part
+from safe_rl.cli.schema import KEYS
 from safe_rl.envs import store_configs
 from safe_rl.files import CONF
-from safe_rl.parameters import Parameter
+from safe_rl.parameters import Parameter, read_part
 from safe_rl.ranges import Options, Values, values_of
-from safe_rl.targets import locate
 
 _HEAD = ("key", "may be", "default", "meaning")
 # an algorithm of either kind: between them they have every key that is no part's
@@ -38,7 +37,7 @@ def run_keys() -> str:
     parts = [
         f"### {_title(target)}\n\n" + table(_HEAD, _part_rows(keys, found[target]))
         for target in sorted(found, key=_title)
-        if (keys := keys_of_part(locate(target)))
+        if (keys := read_part(target).settings)
     ]
     return "\n".join([table(_HEAD, general), "## Parts\n", *parts])
 

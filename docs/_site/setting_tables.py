@@ -8,8 +8,7 @@ from typing import Any
 import replay_loops
 from omegaconf import DictConfig, OmegaConf
 
-from safe_rl.cli.schema import keys_of_part
-from safe_rl.targets import locate
+from safe_rl.parameters import read_part
 
 # nodes of a configuration that are an algorithm's own
 NODES = ("loss", "policy_update", "lagrangian", "then.projection.loss")
@@ -43,8 +42,8 @@ def _settings(config: DictConfig, paper: DictConfig) -> Iterator[tuple[str, str,
         other = str(OmegaConf.select(paper, f"{path}._target_"))
         yield f"`{path}._target_`", f"`{name}`", f"`{other.rpartition('.')[2]}`", "the class"
         lacking = _cell(None) if other == target else "—"
-        known = keys_of_part(locate(target))
-        known |= {} if other == "None" else keys_of_part(locate(other))
+        known = read_part(target).settings
+        known |= {} if other == "None" else read_part(other).settings
         node = OmegaConf.to_container(
             OmegaConf.select(paper, path) or OmegaConf.create(), resolve=True
         )

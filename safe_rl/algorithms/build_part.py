@@ -16,7 +16,8 @@ from torchrl.envs import EnvBase
 
 from safe_rl.algorithms.algorithm_contract import Recipe
 from safe_rl.algorithms.constraints import Constraints, TrackedConstraints, check_cost_limits
-from safe_rl.targets import TargetError, accepted_names, build, locate
+from safe_rl.parameters import accepted_names
+from safe_rl.targets import TargetError, build, locate
 
 __all__ = ["build_constraints", "build_part", "build_update", "constrained_limits", "find_recipe"]
 

@@ -8,7 +8,7 @@ cannot make code run.
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, cast
@@ -17,23 +17,28 @@ from hydra import compose, initialize_config_dir
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.types import IntervalSweep, Override
-from hydra.errors import HydraException
+from hydra.errors import HydraException, MissingConfigException
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 from yaml import YAMLError
 
 from safe_rl.cli.grammar import CommandLineError, overrides_of, parse, take_word
-from safe_rl.cli.schema import KEYS, check_settings, plain
-from safe_rl.cli.suggestions import GIVEN_WHOLE, explain, unknown_key, unread_by
+from safe_rl.cli.schema import GIVEN_WHOLE, KEYS, check_settings, keys_of, nearest_keys, plain
 from safe_rl.cli.user_code import check_imports, note_imports
-from safe_rl.envs import store_configs
-from safe_rl.files import CONF, read_config, read_yaml
+from safe_rl.envs import complete_env, store_configs
+from safe_rl.envs.errors import on_cpu_only
+from safe_rl.envs.families import hint_of_gymnasium
+from safe_rl.files import CONF, read_config
+from safe_rl.naming import did_you_mean
 from safe_rl.runs.folder import RunFolder
-from safe_rl.runs.identity import role_of
+from safe_rl.runs.identity import flatten, role_of
 
 __all__ = ["compose_jobs", "compose_resumed", "hydra_on_conf", "resolving", "search_folders"]
 
+_LARGE = ("env", "algo", "preset")
+"""Groups whose files differ in more than a few keys."""
 _ONE_EACH = ("env", "algo", "preset", "model", "risk", "collector", "logger", "lagrangian")
+_MOST_LISTED = 40
 _MISSING = object()
 
 
@@ -61,14 +66,12 @@ def compose_jobs(
         3
     """
     overrides = [parse(text) for text in texts]
-    _check_once(overrides)
+    _check_form(overrides)
     with hydra_on_conf():
         jobs = list(_jobs(overrides)) if sweep else [list(texts)]
         configs = [_compose(job) for job in jobs]
     for config in [] if shown else configs:
-        _check_package(config)
-        _check_read(overrides, config)
-        _check_values(config, overrides)
+        _check(config, overrides)
     return configs
 
 
@@ -111,21 +114,21 @@ def search_folders(folders: Iterable[str | Path], texts: Sequence[str]) -> list[
     return [*others, *overrides_of({"hydra.searchpath": found} if found else {})]
 
 
-def _compose(texts: list[str]) -> DictConfig:
-    try:
-        return compose("config", texts, return_hydra_config=True)
-    except (HydraException, OmegaConfBaseException, YAMLError, ValueError, OSError) as error:
-        wrong = re.match(r"Could not override '([^']+)'", str(error))
-        given = next((t for t in texts if wrong and t.lstrip("+").startswith(f"{wrong[1]}=")), None)
-        if wrong is None or given is None:
-            raise CommandLineError(explain(error, texts)) from None
-        # with all that is right, for what refers to it: the name of env=gymnasium is its env.id
-        values = plain(_compose([text for text in texts if text != given]))
-        inner = re.search(r"full_key: (\S+)", str(error.__cause__))
-        if inner and inner[1].startswith(f"{wrong[1]}."):
-            words = unknown_key(given, inner[1], values)
-            raise CommandLineError(f"{words} A new key is added as +{inner[1]}=…") from None
-        raise CommandLineError(unknown_key(given, wrong[1], values)) from None
+def _check_form(overrides: Sequence[Override]) -> None:
+    """Refuse parts of what is given as a whole, and lists of choices, which Hydra would merge."""
+    for override in overrides:
+        key, line = override.key_or_group, override.input_line
+        section, _, name = key.rpartition(".")
+        if section in GIVEN_WHOLE:
+            raise CommandLineError(
+                f"'{line}': {GIVEN_WHOLE[section]} are given all at once, as "
+                f"{section}='{{{name}: {override.get_value_element_as_str()}}}'."
+            )
+        if key in _ONE_EACH and isinstance(values := override.value(), list):
+            raise CommandLineError(
+                f"'{line}': a run has one {key}; for a run with each of them: "
+                f"-m {key}={','.join(map(str, values))}"
+            )
 
 
 def _jobs(overrides: Sequence[Override]) -> Iterator[list[str]]:
@@ -147,39 +150,95 @@ def _sweep_lines(override: Override) -> list[str]:
     return [str(override.input_line)]
 
 
-def _check_once(overrides: Sequence[Override]) -> None:
-    """Refuse keys that are given twice, parts of what is given as a whole, and lists of choices."""
-    given: dict[str, list[str]] = {}
-    for override in overrides:
-        key, line = override.key_or_group, str(override.input_line)
-        if not override.is_delete():
-            given.setdefault("@".join(filter(None, (key, override.package))), []).append(line)
-        for section, what in GIVEN_WHOLE.items():
-            name = key.removeprefix(f"{section}.")
-            if name != key:
-                raise CommandLineError(
-                    f"'{line}': {what} are given all at once, as "
-                    f"{section}='{{{name}: {override.get_value_element_as_str()}}}'."
-                )
-        if key in _ONE_EACH and isinstance(values := override.value(), list):
-            raise CommandLineError(
-                f"'{line}': a run has one {key}; for a run with each of them: "
-                f"-m {key}={','.join(map(str, values))}"
-            )
-    for key, lines in given.items():
-        if lines[1:]:
-            raise CommandLineError(f"'{key}' is given more than once: {', '.join(lines)}.")
+def _compose(texts: list[str]) -> DictConfig:
+    try:
+        return compose("config", texts, return_hydra_config=True)
+    except (HydraException, OmegaConfBaseException, YAMLError, ValueError, OSError) as error:
+        wrong = re.match(r"Could not override '([^']+)'", str(error))
+        given = next((t for t in texts if wrong and t.lstrip("+").startswith(f"{wrong[1]}=")), None)
+        if wrong is None or given is None:
+            raise CommandLineError(_explain(error, texts)) from None
+        inner = re.search(r"full_key: (\S+)", str(error.__cause__))
+        key = inner[1] if inner and inner[1].startswith(f"{wrong[1]}.") else wrong[1]
+        # with all that is right, for what refers to it: the name of env=gymnasium is its env.id
+        values = plain(_compose([text for text in texts if text != given]))
+        raise CommandLineError(f"'{given}': {_unknown(key, values)}") from None
 
 
-def _check_package(config: DictConfig) -> None:
-    """An algorithm's file that does not say so ends up below ``algo``, with all its keys."""
-    own = ("name", "_target_", "constrained")
-    misplaced = [str(key) for key in config.get("algo") or () if key in config and key not in own]
-    if misplaced:
-        raise CommandLineError(
-            f"algo={config.hydra.runtime.choices.get('algo')}: {', '.join(misplaced)} would stand "
-            "below algo: its file has to begin with the line '# @package _global_'."
-        )
+def _explain(error: Exception, texts: Sequence[str]) -> str:
+    """Say in one line what is wrong with overrides, or files, that Hydra could not compose."""
+    words = " ".join(str(error.__cause__ or error if not str(error) else error).split())
+    if not isinstance(error, MissingConfigException) or error.missing_cfg_file is None:
+        return words
+    group, _, name = error.missing_cfg_file.rpartition("/")
+    # for a list of choices, such as transforms=[…], Hydra's error has no options
+    known = error.options or GlobalHydra.instance().config_loader().get_group_options(group)
+    listed = f" There are {', '.join(known)}." if len(known) <= _MOST_LISTED else (
+        " 'python train.py --help' names all there are."
+    )  # fmt: skip
+    hint = hint_of_gymnasium(name) if group == "env" else ""
+    file = re.match(r"In '(?!config')([^']+)'", words)
+    if file and group != "preset" and f"preset={name}" in texts:  # which chose it
+        return f"'preset={name}' is not for this algorithm: {file[1]} has no {group} '{name}'."
+    place = f"{file[1]}.yaml: " if file else ""
+    return f"{place}there is no {group} '{name}'.{hint or did_you_mean(name, known) or listed}"
+
+
+def _unknown(key: str, values: Mapping[str, Any]) -> str:
+    """Say that nothing reads a key, and what was meant: another key, or a choice that reads it.
+
+    Args:
+        key: The key.
+        values: What the configuration holds without it.
+    """
+    algo, section = values.get("algo") or {}, key.partition(".")[0]
+    if section not in values and section in KEYS and section != "note":  # which is added
+        return f"algo={algo.get('name')} has no '{section}'."
+    if section == "env" and (reason := on_cpu_only(key.removeprefix("env."))):
+        return f"nothing reads '{key}'.{reason}"
+    if choice := _choice_with(key):
+        return f"nothing reads '{key}' without {choice}."
+    unread = tuple(f"{path}." for path in _unread_by(algo))
+    paths = {p: is_held for p, is_held in keys_of(values) if not f"{p}.".startswith(unread)}
+    own = ["env", "algo", "preset", *(path for path, is_held in paths.items() if is_held)]
+    meant = nearest_keys(key, own) or nearest_keys(key, [p for p in paths if not paths[p]])
+    names = " or ".join(f"'{'' if path in own else '+'}{path}'" for path in meant)
+    how = f"A new key is added by +{key}=…" if "." in key else "'--cfg job' prints all keys."
+    return f"nothing reads '{key}'. {f'Did you mean {names}?' if names else how}"
+
+
+def _choice_with(key: str) -> str | None:
+    """The choice that would bring a key, as ``risk=cvar`` brings ``risk.tail``, or None."""
+    section, _, rest = key.partition(".")
+    for file in sorted((CONF / section).glob("*.yaml")) if section not in _LARGE and rest else ():
+        node = OmegaConf.to_container(OmegaConf.load(file))
+        held = flatten(node)  # type: ignore[arg-type]
+        if any(f"{path}.".startswith((f"{rest}.", f"{key}.")) for path in held):
+            name = f"[{file.stem}]" if section == "transforms" else file.stem
+            return f"{section}={name}"
+    return None
+
+
+def _unread_by(algo: Mapping[str, Any]) -> Mapping[str, str]:
+    """Keys that an algorithm does not read, choices that are not for it, and the reasons."""
+    from safe_rl.algorithms.build_part import find_recipe  # with torch: not for help and --cfg
+
+    return find_recipe(OmegaConf.create({"algo": dict(algo)})).unused_keys
+
+
+def _check(config: DictConfig, overrides: Sequence[Override]) -> None:
+    try:
+        with resolving(config):
+            OmegaConf.select(config, "hydra.run.dir")  # which names what every run has
+            _check_read(overrides, config)
+            check_settings(config)
+            complete_env(plain(config)["env"])
+            _check_top(config)
+    except OmegaConfBaseException as error:
+        words = " ".join(str(error).split())
+        if missing := re.search(r"Missing mandatory value: (\S+)", words):
+            words = f"{missing[1]} has to be given: {missing[1]}=…"
+        raise CommandLineError(words) from None
 
 
 def _check_read(overrides: Sequence[Override], config: DictConfig) -> None:
@@ -187,7 +246,7 @@ def _check_read(overrides: Sequence[Override], config: DictConfig) -> None:
     algo = config.get("algo") or {}
     for override in overrides:
         key = override.key_or_group.replace("/", ".")
-        for unread, reason in unread_by(algo).items():
+        for unread, reason in _unread_by(algo).items():
             path, _, choice = unread.partition("=")
             is_chosen = not choice or OmegaConf.select(config, path) == choice
             if is_chosen and f"{key}.".startswith(f"{path}."):
@@ -197,37 +256,21 @@ def _check_read(overrides: Sequence[Override], config: DictConfig) -> None:
                 )
 
 
-def _check_values(config: DictConfig, overrides: Sequence[Override]) -> None:
-    try:
-        with resolving(config):
-            OmegaConf.select(config, "hydra.run.dir")  # which names what every run has
-            check_settings(config)
-            _check_added(overrides, config)
-    except OmegaConfBaseException as error:
-        words = " ".join(str(error).split())
-        if missing := re.search(r"Missing mandatory value: (\S+)", words):
-            words = f"{missing[1]} has to be given: {missing[1]}=…"
-        raise CommandLineError(words) from None
-
-
-def _check_added(overrides: Sequence[Override], config: DictConfig) -> None:
-    """Refuse keys that are added at the top level, ``+key=…``, and that nothing refers to."""
+def _check_top(config: DictConfig) -> None:
+    """Refuse what stands at the top level and nothing refers to, as ``+lr=1e-4`` would add it."""
     text = OmegaConf.to_yaml(config)
-    for override in overrides:
-        key, head = override.key_or_group, override.key_or_group.partition(".")[0]
-        is_added = (override.is_add() or override.is_force_add()) and head in config
+    for head in map(str, config):
         # ${head}, ${head.key}, ${resolver:head.key}
-        if is_added and head not in KEYS and not re.search(rf"[{{:,]{re.escape(head)}[.,}}]", text):
-            others = {name: node for name, node in plain(config).items() if name != head}
-            raise CommandLineError(unknown_key(str(override.input_line), key, others))
+        if head not in (*KEYS, "hydra") and not re.search(rf"[{{:,]{re.escape(head)}[.,}}]", text):
+            values = plain(config)
+            key = next(iter(flatten({head: values.pop(head)})), head)
+            raise CommandLineError(_unknown(key, values))
 
 
 def compose_resumed(
     directory: Path, texts: Iterable[str], modules: Sequence[str] | None = None
 ) -> DictConfig:
     """The configuration of the run in a folder, with what is to be different from now on.
-
-    What a run has already may be said again.
 
     Args:
         directory: The folder.
@@ -246,49 +289,27 @@ def compose_resumed(
         raise CommandLineError(f"resume={directory}: {error}") from None
     check_imports(config, modules, directory)
     overrides = [parse(text) for text in (*texts, *note_imports(modules))]
-    _check_once(overrides)
+    _check_form(overrides)
     _refuse_foreign_cluster(config, overrides, run.config)
-    try:
-        said = list(read_yaml(run.overrides))
-    except (OSError, ValueError, TypeError):
-        said = []
-    changes = [o for o in overrides if not _is_held(o, config, directory, said)]
-    for override in changes:
-        _check_may_change(override, config, directory)
-        if not override.is_hydra_override():
-            OmegaConf.update(config, override.key_or_group, override.value(), force_add=True)
-    _check_read(changes, config)
-    check_settings(config, run)
+    for override in overrides:
+        _change(config, override, directory)
+    _check_read(overrides, config)
+    check_settings(config)
     return config
 
 
-def _is_held(override: Override, config: DictConfig, directory: Path, said: Sequence[Any]) -> bool:
-    """Whether a run is told what it has already: a value, a name, a choice of its beginning."""
-    key, value = override.key_or_group, override.value()
-    if key == "hydra.run.dir":
-        return Path(str(value)).expanduser().resolve() == directory.expanduser().resolve()
-    if override.input_line in said and not _is_number(override, config):
-        return True
-    there = OmegaConf.select(config, key, default=_MISSING) if "/" not in key else _MISSING
-    name = there.get("name", _MISSING) if isinstance(there, DictConfig) else there
-    return not override.is_delete() and value in (name, there)
-
-
-def _is_number(override: Override, config: DictConfig) -> bool:
-    """Whether an override is of a value that may change, and chooses and deletes nothing."""
-    key = override.key_or_group
-    is_choice = "/" in key or isinstance(config.get(key), DictConfig)
-    return role_of(key).may_change and not (is_choice or override.is_delete())
-
-
-def _check_may_change(override: Override, config: DictConfig, directory: Path) -> None:
-    key, line = override.key_or_group, override.input_line
-    is_plain = override.get_key_element() == key and not override.is_hydra_override()
-    if is_plain and "/" not in key and OmegaConf.select(config, key, default=_MISSING) is _MISSING:
-        raise CommandLineError(unknown_key(str(line), key, plain(config)))
+def _change(config: DictConfig, override: Override, directory: Path) -> None:
+    """Change a key of a run that is continued; its own value may be said again."""
+    key, line, value = override.key_or_group, override.input_line, override.value()
+    before = OmegaConf.select(config, key, default=_MISSING) if "/" not in key else None
     if override.is_sweep_override():
         raise CommandLineError(f"'{line}': a run has one value of it.")
-    if not _is_number(override, config):
+    if before is _MISSING and not (override.is_add() or override.is_hydra_override()):
+        raise CommandLineError(f"'{line}': {_unknown(key, plain(config))}")
+    is_plain = not (override.is_delete() or override.package or isinstance(before, DictConfig))
+    if is_plain and value == before:
+        return
+    if not (is_plain and "/" not in key and role_of(key).may_change):
         raise CommandLineError(
             f"'{line}' cannot change in a run that is continued. What can: its length "
             "(frames=…), what belongs to the machine (checkpoint.interval=…), and numbers "
@@ -296,21 +317,19 @@ def _check_may_change(override: Override, config: DictConfig, directory: Path) -
             "brings along, such as an optimiser's lr. For a new run from trained networks use "
             f"init_from={directory}."
         )
+    if not override.is_hydra_override():
+        OmegaConf.update(config, key, value, force_add=True)
 
 
 def _refuse_foreign_cluster(config: DictConfig, overrides: Sequence[Override], path: Path) -> None:
     """What Ray is started with can make code run: only the command line says it, not a file."""
-    stored = dict(OmegaConf.select(config, "collector.ray_init") or {})
-    is_said = any(o.key_or_group == "collector.ray_init.address" for o in overrides)
-    if stored.pop("address", None) is not None and not is_said:
-        raise CommandLineError(
-            f"{path} names a Ray cluster, which is not taken from a file: say again "
-            "collector.ray_init.address=… (null for Ray on this machine)."
-        )
-    if "runtime_env" in (OmegaConf.select(config, "collector.resources") or {}):
-        stored["runtime_env"] = None  # actors can be started with it, too
-    if stored:
-        raise CommandLineError(
-            f"{path} starts Ray with {', '.join(stored)}, which could make code run: delete that "
-            "there to resume."
-        )
+    said = [override.key_or_group for override in overrides]
+    held = flatten({"collector": config.get("collector") or {}})
+    for key, value in held.items():
+        is_harmless = value is None or re.fullmatch(r"collector\.resources\.num_[cg]pus", key)
+        of_ray = key.startswith(("collector.ray_init.", "collector.resources."))
+        if of_ray and key not in said and not is_harmless:
+            raise CommandLineError(
+                f"{path} has {key}, which is not taken from a file, as it could make code run: "
+                f"say again {key}=…"
+            )

@@ -14,11 +14,5 @@ def main(
     arguments: Sequence[str] | None = None, program: str = "python -m safe_rl.evaluate"
 ) -> int:
     """The command; returns its exit status."""
-    return run_command(_carry_out, arguments, f"{program} RUN_DIR", EvaluationOptions)
-
-
-def _carry_out(first: list[str], options: EvaluationOptions, modules: list[str] | None) -> int:
-    # here, because help and mistyped options need none of torch
-    from safe_rl.cli.evaluating import carry_out
-
-    return carry_out(first[0], options, modules)
+    work = "safe_rl.cli.evaluating:carry_out"
+    return run_command(work, arguments, f"{program} RUN_DIR", EvaluationOptions)

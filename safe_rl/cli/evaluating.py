@@ -1,23 +1,29 @@
-"""Carry out what ``python -m safe_rl.evaluate`` is asked for: evaluate, certify, vary."""
+"""A trained policy evaluated, certified, or run under variations."""
 
 from __future__ import annotations
 
-import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
 import yaml
+from omegaconf import DictConfig, OmegaConf
 
-from safe_rl.cli.certificates import certify_run
 from safe_rl.cli.grammar import CommandLineError
 from safe_rl.cli.report import suite
 from safe_rl.cli.run_folders import maker_of
-from safe_rl.cli.session import SETTING_ERRORS
+from safe_rl.cli.schema import KEYS
 from safe_rl.cli.user_code import check_imports, import_modules
-from safe_rl.envs import LayoutError, OpenGLError
-from safe_rl.evaluation import Evaluation, EvaluationOptions, evaluate
+from safe_rl.envs import LayoutError
+from safe_rl.evaluation import (
+    Certificate,
+    CertificateOptions,
+    Evaluation,
+    EvaluationOptions,
+    certify,
+    evaluate,
+)
 from safe_rl.evaluation.loading import load_config
 from safe_rl.evaluation.measuring import format_unjudged
 from safe_rl.evaluation.policies import find_run, writable_copy
@@ -27,10 +33,34 @@ from safe_rl.naming import did_you_mean
 from safe_rl.reporting.figures import draw_variations
 from safe_rl.runs.folder import RunFolder
 
-__all__ = ["carry_out", "evaluate_run", "evaluate_varied", "read_variations"]
+__all__ = [
+    *("carry_out", "certificate_options", "certify_run", "evaluate_run", "evaluate_varied"),
+    *("is_to_keep_limits", "read_variations"),
+]
 
-_SETS = CONF / "variations"
-_ERRORS: tuple[type[Exception], ...] = (*SETTING_ERRORS, LayoutError, OpenGLError)
+
+def carry_out(words: list[str], options: EvaluationOptions, modules: Sequence[str] | None) -> int:
+    """Evaluate, certify or vary a run, and print what was found.
+
+    Args:
+        words: The folder of the run.
+        options: What to do.
+        modules: The user's modules to import; None if ``import=`` was not given.
+
+    Returns:
+        Exit status of the command.
+    """
+    directory = find_run(words[0])
+    check_imports(load_config(directory), modules, directory)
+    import_modules(modules or ())
+    if options.certify:
+        return _certify(directory, options)
+    if options.variations is not None:
+        found, picture = evaluate_varied(directory, options, progress=True)
+        print(_table_of(found), f"wrote {found.file}", f"wrote {picture}", sep="\n")
+    else:
+        print(evaluate_run(directory, options, progress=True))
+    return 0
 
 
 def evaluate_run(
@@ -44,39 +74,8 @@ def evaluate_run(
     directory = writable_copy(directory)
     if options.certify or options.variations is not None:
         raise ValueError("evaluate: certificates are made by certify(), variations by vary(…).")
-    return evaluate(
-        directory, options, make_env=maker_of(directory), suite=suite(), progress=progress
-    )
-
-
-def carry_out(
-    directory: str | Path, options: EvaluationOptions, modules: Sequence[str] | None = None
-) -> int:
-    """Evaluate, certify or vary a run, and print what was found.
-
-    Args:
-        directory: Folder of the run.
-        options: What to do.
-        modules: The user's modules to import; None if ``import=`` was not given.
-
-    Returns:
-        Exit status of the command.
-    """
-    try:
-        directory = find_run(directory)
-        check_imports(load_config(directory), modules, directory)
-        import_modules(modules or ())
-        if options.certify:
-            return _certify(directory, options)
-        if options.variations is not None:
-            found, picture = evaluate_varied(directory, options, progress=True)
-            print(_table_of(found), f"wrote {found.file}", f"wrote {picture}", sep="\n")
-        else:
-            print(evaluate_run(directory, options, progress=True))
-    except _ERRORS as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 1
-    return 0
+    make = maker_of(directory)
+    return evaluate(directory, options, make_env=make, suite=suite(), progress=progress)
 
 
 def _certify(directory: Path, options: EvaluationOptions) -> int:
@@ -93,6 +92,67 @@ def _certify(directory: Path, options: EvaluationOptions) -> int:
     )
     print(certificate or "Nothing to certify: the run has no limits, or no checkpoints.")
     return 0 if certificate is not None and certificate.checkpoint is not None else 1
+
+
+def certify_run(
+    directory: Path, *, num_threads: int = 0, changes: Mapping[str, Any] | None = None
+) -> Certificate | None:
+    """:func:`safe_rl.evaluation.certify` with the options of the run's own configuration.
+
+    Args:
+        directory: Folder of the run.
+        num_threads: Threads that step environments; 0 is one per core.
+        changes: Options to replace, such as ``{"episodes": 2000}``.
+
+    Raises:
+        ValueError: If an option does not exist, or cannot have its value.
+    """
+    options = certificate_options(load_config(directory), changes or {})
+    certificate = certify(
+        directory,
+        options,
+        make_env=maker_of(directory),
+        num_threads=num_threads,
+        progress=True,
+    )
+    RunFolder(directory).certifying.unlink(missing_ok=True)
+    return certificate
+
+
+def certificate_options(
+    config: DictConfig, changes: Mapping[str, Any] | None = None
+) -> CertificateOptions:
+    """What is certified of a run: what its section ``certificate`` says, and what it has limited.
+
+    With ``risk=chance`` the share of episodes above the limit is certified, too, with ``risk=cvar``
+    the mean of the costliest ones.
+    """
+    packages = OmegaConf.load(CONF / "config.yaml").certificate
+    own = dict(config.get("certificate") or {})
+    if not own.get("episodes", 1):  # the run was to end without a certificate
+        del own["episodes"]
+    options = {**packages, **{name: value for name, value in own.items() if name in packages}}
+    for name, value in (changes or {}).items():
+        if name not in options:
+            raise ValueError(f"There is no certificate.{name}.{did_you_mean(name, options)}")
+        KEYS[f"certificate.{name}"].check(f"certificate.{name}", value)
+        if name == "episodes" and not value:
+            raise ValueError("certificate.episodes=0: it must be at least 1 to test anything.")
+    options |= changes or {}
+    risk = config.get("risk") or {}
+    share = min(options["most_over"], risk.get("most_over", 1.0))
+    return CertificateOptions(**options | {"most_over": share}, tail=risk.get("tail", 1.0))
+
+
+def is_to_keep_limits(config: DictConfig, cost_keys: Collection[str]) -> bool:
+    """Whether limits are kept by the algorithm, or by a transform that gives episodes a budget.
+
+    Args:
+        config: Configuration of the run.
+        cost_keys: Costs that its algorithm constrains.
+    """
+    transforms = (config.get("transforms") or {}).values()
+    return bool(cost_keys) or any("budgets" in transform for transform in transforms)
 
 
 def evaluate_varied(
@@ -118,7 +178,7 @@ def evaluate_varied(
         options,
         [*named, *own],
         make_env=maker_of(directory),
-        transform_node=_transform_node,
+        transform_node=lambda name: _from_conf("transforms", name)[name],
         refusals=(LayoutError,),
         may_lack=lambda variation: variation in named,
         progress=progress,
@@ -151,17 +211,33 @@ def read_variations(given: Any) -> tuple[list[Variation], list[Variation]]:
     for part in given if isinstance(given, list) else [given]:
         if isinstance(part, Mapping):
             own += expand(part)
-        elif str(part) in _names():
-            named += expand(_read(_SETS / f"{part}.yaml"))
         elif str(part).endswith((".yaml", ".yml")):
             own += expand(_read(Path(str(part)).expanduser()))
         else:
-            raise ValueError(
-                f"variations={part}: there is no such set.{did_you_mean(str(part), _names())} Sets "
-                f"are {', '.join(_names())}; a file ends in .yaml; one of your own is "
-                "variations='{heavy: {env.mass_scale: 1.5}}'."
-            )
+            named += expand(_from_conf("variations", str(part)))
     return named, own
+
+
+def _from_conf(group: str, name: str) -> Mapping[str, Any]:
+    """The content of a file of the package's configuration."""
+    known = sorted(path.stem for path in (CONF / group).glob("*.yaml"))
+    if name not in known:
+        raise ValueError(
+            f"variations: there is no '{name}' among {group}.{did_you_mean(name, known)} There "
+            f"are {', '.join(known)}; a file of yours ends in .yaml; keys are given as "
+            "variations='{heavy: {env.mass_scale: 1.5}}'."
+        )
+    return _read(CONF / group / f"{name}.yaml")
+
+
+def _read(path: Path) -> Mapping[str, Any]:
+    try:
+        content = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except (OSError, yaml.YAMLError) as error:
+        raise ValueError(f"variations={path}: {' '.join(str(error).split())}") from error
+    if not isinstance(content, Mapping):
+        raise ValueError(f"variations={path}: it must have rows, as conf/variations has them.")
+    return content
 
 
 def _table_of(found: Varied) -> str:
@@ -170,49 +246,20 @@ def _table_of(found: Varied) -> str:
     heads = ["", "return", *keys, *(f"over {d:g}" for d in found.cost_limits.values())]
     names = ["episode_return", *(f"episode_{key}" for key in keys)]
     names += [f"over_limit_{key}" for key in found.cost_limits]
-    lines = [[str(v), *(str(e.get(name, "—")) for name in names)] for v, e in found.rows]
-    widths = [max(map(len, column)) for column in zip(heads, *lines, strict=True)]
+    lines = [heads, *([str(v), *(str(e.get(n, "—")) for n in names)] for v, e in found.rows)]
+    widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
     facts = found.facts
     steps = "" if facts["steps"] is None else f" at {facts['steps']:,} steps"
     text = [
         f"{facts['algorithm']} on {facts['environment']}{steps}: {facts['episodes']} episodes "
         "each, means with 95 % intervals"
     ]
-    text += [
-        "  ".join(cell.ljust(width) for cell, width in zip(line, widths, strict=True)).rstrip()
-        for line in (heads, *lines)
-    ]
+    for line in lines:
+        cells = (cell.ljust(width) for cell, width in zip(line, widths, strict=True))
+        text.append("  ".join(cells).rstrip())
     text += format_unjudged(facts["limits_without_cost"])
     reasons: dict[str, list[str]] = {}
     for variation, reason in found.left_out:
         reasons.setdefault(reason, []).append(str(variation))
     text += [f"left out: {', '.join(which)}: {reason}" for reason, which in reasons.items()]
     return "\n".join(text)
-
-
-def _names() -> list[str]:
-    return sorted(path.stem for path in _SETS.glob("*.yaml"))
-
-
-def _read(path: Path) -> Mapping[str, Any]:
-    try:
-        content = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise ValueError(f"variations={path}: {error.strerror}.") from error
-    except yaml.YAMLError as error:
-        raise ValueError(f"variations={path}: {' '.join(str(error).split())}") from error
-    if not isinstance(content, Mapping):
-        raise ValueError(f"variations={path}: it must have rows, as conf/variations has them.")
-    return content
-
-
-def _transform_node(name: str) -> Mapping[str, Any]:
-    """A transform as ``transforms=[name]`` has it."""
-    path = CONF / "transforms" / f"{name}.yaml"
-    known = sorted(path.stem for path in path.parent.glob("*.yaml"))
-    if name not in known:
-        raise ValueError(
-            f"variations: there is no transform '{name}'.{did_you_mean(name, known)} There are "
-            f"{', '.join(known)}."
-        )
-    return _read(path)[name]

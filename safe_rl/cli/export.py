@@ -25,10 +25,18 @@ class ExportOptions:
 
 def main(arguments: Sequence[str] | None = None, program: str = "python -m safe_rl.export") -> int:
     """The command; returns its exit status."""
-    return run_command(_export, arguments, f"{program} RUN_DIR FILE.onnx|FOLDER", ExportOptions)
+    places = f"{program} RUN_DIR FILE.onnx|FOLDER"
+    return run_command("safe_rl.cli.export:export", arguments, places, ExportOptions)
 
 
-def _export(first: list[str], options: ExportOptions, modules: list[str] | None) -> int:
+def export(words: list[str], options: ExportOptions, modules: list[str] | None) -> int:
+    """Write a policy to a file, or to a folder.
+
+    Args:
+        words: Folder of the run, and where to.
+        options: Which of its policies.
+        modules: The user's modules to import.
+    """
     # here, because help and mistyped options need none of torch
     from safe_rl.cli.trained_run import Run
     from safe_rl.evaluation.loading import find_checkpoint
@@ -36,16 +44,13 @@ def _export(first: list[str], options: ExportOptions, modules: list[str] | None)
     from safe_rl.runs.folder import RunFolder
 
     import_modules(modules or ())
-    run, target = Run(find_run(first[0])), Path(first[1])
+    run, target = Run(find_run(words[0])), Path(words[1])
     has_certified = RunFolder(run.directory).newest_checkpoint("certified") is not None
     which = options.checkpoint or ("certified" if has_certified else "last")
-    try:
-        if target.suffix == ".onnx":
-            with closing(run.make_env()) as env:
-                export_onnx(run.config, env, find_checkpoint(run.directory, which), target)
-        else:
-            target = pack_policy(run.directory, target, which)
-    except RuntimeError as error:
-        raise ValueError(str(error)) from error
+    if target.suffix == ".onnx":
+        with closing(run.make_env()) as env:
+            export_onnx(run.config, env, find_checkpoint(run.directory, which), target)
+    else:
+        target = pack_policy(run.directory, target, which)
     print(f"wrote {target}")
     return 0

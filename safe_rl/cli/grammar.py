@@ -7,25 +7,27 @@ a dataclass, whose metadata holds their help.
 from __future__ import annotations
 
 import json
+import os
 import re
 import sys
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import MISSING, fields
+from importlib import import_module
 from pathlib import Path
+from types import TracebackType
 from typing import TYPE_CHECKING, Any, TypeVar, cast, get_type_hints
 
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Override
 from hydra.errors import HydraException
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from safe_rl.cli import say_interruptions
 from safe_rl.naming import did_you_mean
 
 __all__ = [
     *("IMPORT", "CommandLineError", "overrides_of", "parse", "parse_options", "quote"),
-    *("run_command", "split_imports", "take_options", "take_word", "usage"),
+    *("run_command", "say_interruptions", "split_imports", "take_options", "take_word", "usage"),
 ]
 
 if TYPE_CHECKING:
@@ -62,20 +64,15 @@ def parse(text: str) -> Override:
 
 
 def take_word(name: str, words: Sequence[str]) -> tuple[str | None, list[str]]:
-    """The value of a word ``name=value``, None if it is not given; and the other words.
-
-    Raises:
-        CommandLineError: If it is given more than once.
+    """The last value of a word ``name=value``, None if it is not given; and the other words.
 
     Examples:
         >>> take_word("slate", ["slate=SG6", "seed=0"])
         ('SG6', ['seed=0'])
     """
     given = [word for word in words if word.lstrip("+").startswith(f"{name}=")]
-    if len(given) > 1:
-        raise CommandLineError(f"'{name}' is given more than once: {', '.join(given)}.")
     others = [word for word in words if word not in given]
-    return given[0].partition("=")[2] if given else None, others
+    return given[-1].partition("=")[2] if given else None, others
 
 
 def quote(text: str) -> str:
@@ -181,83 +178,35 @@ def parse_options(arguments: Sequence[str], schema: type[Schema]) -> Schema:
         safe_rl.cli.grammar.CommandLineError: Unknown option 'episode'. Did you mean 'episodes'? Options are: episodes, video.
     """  # noqa: E501
     kinds = get_type_hints(schema)
-    given: dict[str, Any] = {}
+    read = OmegaConf.create()
     for argument in arguments:
         key, equals, written = argument.partition("=")
+        name = key.partition(".")[0]
         if not equals:
+            raise CommandLineError(f"'{argument}' is not an option: they are written key=value.")
+        if name not in kinds:
             raise CommandLineError(
-                f"'{argument}' is not an option: options are written key=value, for example "
-                f"{fields(schema)[0].name}=…"
+                f"Unknown option '{name}'.{did_you_mean(name, kinds)} "
+                f"Options are: {', '.join(kinds)}."
             )
-        _check_name(key, schema)
-        if key in given:
-            raise CommandLineError(f"'{key}' is given more than once.")
         # names and paths are what was written, where the grammar reads `off`, `007` or `it's`
-        is_text = kinds.get(key) in (str, str | None)
-        given[key] = _text(written) if is_text else parse(argument).value()
-    return take_options(given, schema)
-
-
-def _text(written: str) -> str | None:
-    """A text without the quotes around it."""
-    inner = re.fullmatch(r"(['\"])(.*)\1", written)
-    return None if written == "null" else inner[2] if inner else written
-
-
-def take_options(given: Mapping[str, Any], schema: type[Schema]) -> Schema:
-    """Check options that are given as keyword arguments; nested keys may have dots.
-
-    Raises:
-        CommandLineError: For an option that is unknown, or of another type than the schema's.
-
-    Examples:
-        >>> from dataclasses import dataclass
-        >>> @dataclass
-        ... class Options:
-        ...     episodes: int = 100
-        >>> take_options({"episodes": 7}, Options)
-        Options(episodes=7)
-    """
-    read = OmegaConf.create()
-    for key, value in given.items():
-        _check_name(key, schema)
-        OmegaConf.update(read, key, _plain(value))
+        is_text = kinds[name] in (str, str | None) and written[:1] not in ("'", '"')
+        is_plain = is_text and written != "null"
+        OmegaConf.update(read, key, written if is_plain else parse(argument).value())
     try:
-        _check_kinds(read, schema)
         return OmegaConf.to_object(OmegaConf.merge(OmegaConf.structured(schema), read))  # type: ignore[return-value]
     except OmegaConfBaseException as error:
         line = str(error).splitlines()[0]
         raise CommandLineError(f"{line} (option '{error.full_key}')") from error
 
 
-def _plain(value: Any) -> Any:
-    """Numbers and arrays of NumPy and torch are none of OmegaConf's."""
-    if isinstance(value, Mapping):
-        return {key: _plain(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [_plain(item) for item in value]
-    return value.tolist() if hasattr(value, "tolist") else value
+def take_options(given: Mapping[str, Any], schema: type[Schema]) -> Schema:
+    """Read options that are given as keyword arguments, as :func:`parse_options` does.
 
-
-def _check_name(key: str, schema: type[DataclassInstance]) -> None:
-    name, known = key.partition(".")[0], [field.name for field in fields(schema)]
-    if name not in known:
-        raise CommandLineError(
-            f"Unknown option '{name}'.{did_you_mean(name, known)} Options are: {', '.join(known)}."
-        )
-
-
-def _check_kinds(given: DictConfig, schema: type[DataclassInstance]) -> None:
-    """OmegaConf takes every number for a boolean, and says of a mapping that it is a Dict."""
-    for field in fields(schema):
-        value = given.get(field.name)
-        if field.default_factory is dict and not isinstance(value, Mapping | None):
-            raise CommandLineError(
-                f"{field.name}={value}: it takes keys with values, {field.name}.KEY=VALUE: "
-                f"{field.metadata['help']}."
-            )
-        if isinstance(field.default, bool) and not isinstance(value, bool | str | None):
-            raise CommandLineError(f"{field.name}={value}: it must be true or false.")
+    Raises:
+        CommandLineError: As by `parse_options`.
+    """
+    return parse_options(list(overrides_of(given, ["variations"])), schema)
 
 
 def usage(command: str, schema: type[DataclassInstance]) -> str:
@@ -272,16 +221,16 @@ def usage(command: str, schema: type[DataclassInstance]) -> str:
 
 
 def run_command(
-    carry_out: Callable[[list[str], Schema, list[str] | None], int],
-    arguments: Sequence[str] | None,
-    command: str,
-    schema: type[Schema],
+    work: str, arguments: Sequence[str] | None, command: str, schema: type[DataclassInstance]
 ) -> int:
     """Read the words of a command, show its help or carry it out; returns its exit status.
 
+    An error is said in a line; ``HYDRA_FULL_ERROR=1`` shows all of it.
+
     Args:
-        carry_out: Takes what stands first, the options, and the modules of ``import=``, None if
-            there are none; returns the exit status.
+        work: ``module:function``, imported when it is carried out: help and refusals need no torch.
+            The function takes what stands first, the options, and the modules of ``import=``, None
+            if there are none, and returns the exit status.
         arguments: The words; None: those of the process.
         command: How it is called: the program, then in capitals what stands first.
         schema: Dataclass of its options.
@@ -298,7 +247,28 @@ def run_command(
         if len(words) < len(places):
             raise CommandLineError(f"{' and '.join(places)} comes first: {command} [option=…].")
         options = parse_options(words[len(places) :], schema)
-        return carry_out(words[: len(places)], options, modules)
-    except (ValueError, OSError, ModuleNotFoundError) as error:
+        module, _, function = work.partition(":")
+        status: int = getattr(import_module(module), function)(
+            words[: len(places)], options, modules
+        )
+        return status
+    except (ValueError, OSError, RuntimeError, ImportError, OmegaConfBaseException) as error:
+        if os.environ.get("HYDRA_FULL_ERROR") == "1":
+            raise
         print(f"error: {error}", file=sys.stderr)
         return 1
+
+
+def say_interruptions() -> None:
+    """Let Ctrl-C print a word instead of a traceback, which ``HYDRA_FULL_ERROR=1`` shows.
+
+    The process still ends by the signal, as shells want it that run commands in a loop.
+    """
+    sys.excepthook = _say
+
+
+def _say(kind: type[BaseException], error: BaseException, trace: TracebackType | None) -> None:
+    if issubclass(kind, KeyboardInterrupt) and os.environ.get("HYDRA_FULL_ERROR") != "1":
+        print("Interrupted.", file=sys.stderr)
+    else:
+        sys.__excepthook__(kind, error, trace)

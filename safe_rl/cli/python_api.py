@@ -12,8 +12,8 @@ from typing import Any
 
 from safe_rl.cli.composing import compose_jobs, compose_resumed, search_folders
 from safe_rl.cli.grammar import CommandLineError, overrides_of, take_options
+from safe_rl.cli.schema import GIVEN_WHOLE
 from safe_rl.cli.session import Session
-from safe_rl.cli.suggestions import GIVEN_WHOLE
 from safe_rl.cli.trained_run import Run, load
 from safe_rl.cli.user_code import import_modules, note_imports
 from safe_rl.evaluation import Evaluation

@@ -89,12 +89,14 @@ def report(root: Path, options: ReportOptions) -> tuple[Report, Path]:
 
 def main(arguments: Sequence[str] | None = None, program: str = "python -m safe_rl.report") -> int:
     """The command; returns its exit status."""
-    return run_command(_carry_out, arguments, f"{program} RUNS_DIR", ReportOptions)
+    work = "safe_rl.cli.report:carry_out"
+    return run_command(work, arguments, f"{program} RUNS_DIR", ReportOptions)
 
 
-def _carry_out(first: list[str], options: ReportOptions, modules: list[str] | None) -> int:
+def carry_out(words: list[str], options: ReportOptions, modules: list[str] | None) -> int:
+    """Report the runs below the folder that stands first, and print what was left out."""
     import_modules(modules or ())
-    root = Path(first[0])
+    root = Path(words[0])
     result, page = report(root, options)
     if options.archive is not None:
         archive_runs(result.runs, root, Path(options.archive))

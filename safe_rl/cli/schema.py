@@ -6,18 +6,15 @@ defaults are in ``conf/``.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from typing import Annotated, Any, Literal, NamedTuple
 
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from safe_rl.cli.run_folders import robot_of
-from safe_rl.envs import complete_env
 from safe_rl.evaluation.settings import check_device
-from safe_rl.extras import check_extra
-from safe_rl.naming import did_you_mean
-from safe_rl.parameters import Parameter, SettingError, parameters_of
+from safe_rl.naming import nearest
+from safe_rl.parameters import Parameter, Part, SettingError, read_part
 from safe_rl.ranges import (
     PART,
     Bytes,
@@ -34,10 +31,22 @@ from safe_rl.ranges import (
     is_text,
     values_of,
 )
-from safe_rl.runs.folder import RunFolder
-from safe_rl.targets import accepted_names, constructors, locate, takes_any
 
-__all__ = ["KEYS", "SettingError", "check_settings", "keys_of_part", "optional_keys", "plain"]
+__all__ = [
+    "GIVEN_WHOLE",
+    "KEYS",
+    "SettingError",
+    "check_settings",
+    "keys_of",
+    "nearest_keys",
+    "plain",
+]
+
+GIVEN_WHOLE = {
+    **{"cost_limits": "limits", "model.input_scale": "factors"},
+    **{f"transforms.{t}.budgets": "budgets" for t in ("saute", "simmer", "early_termination")},
+}
+"""Mappings that are given all at once, and what is in them."""
 
 _FOLDER = Values(lambda v: is_text(v) and "/" not in v, "a text that is not empty and has no /")
 _FOLDER_OF_ENV = f"{_FOLDER.words}: it names folders, and env.name=… gives another name"
@@ -47,6 +56,16 @@ def _int(low: int, high: int | None = None, *more: Any) -> Any:
     return Annotated[int, Range(low, high), *more]
 
 
+def _is_device(value: Any) -> bool:
+    try:
+        check_device(value)
+    except (ValueError, TypeError):
+        return False
+    return True
+
+
+_Device = Annotated[str, Values(_is_device, "cpu, or cuda or cuda:<number> if torch finds that")]
+_ONE = "1, as collector=local is one process; for more use collector=process or collector=ray"
 _Width = Annotated[int, Range(1, 16_384)]
 _Widths = Annotated[list[_Width], MaxLength(32)]
 _Limits = dict[str, NotNegative]
@@ -65,7 +84,7 @@ _REQUIRED: dict[str, tuple[Any, str]] = {
     "seed": (_int(0, 2**62), "seed of the run"),
     "init_from": (Text | None, "folder or checkpoint of the run to start from"),
     "cost_limits": (_Limits, "cost allowed per episode, by cost: '{cost: 25}'"),
-    "device": (Text, "where networks are trained: cpu or cuda"),
+    "device": (_Device, "where networks are trained: cpu or cuda"),
     # torch starts all of them at once, and crashes where the system gives it no more
     "num_threads": (_int(1, 1024) | None, "threads of physics and torch; null: all cores"),
     "compile": (bool, "whether to compile the losses"),
@@ -78,7 +97,7 @@ _REQUIRED: dict[str, tuple[Any, str]] = {
     "checkpoint.interval": (NotNegative, "seconds between checkpoints"),
     "checkpoint.keep_last": (_Kept, "checkpoints that are kept besides the best"),
     "collector": (Options, "where environments are stepped: collector=local"),
-    "collector.num_collectors": (_int(1, 1024), "processes that step environments"),
+    "collector.num_collectors": (Annotated[int, Values(lambda v: v == 1, _ONE)], "processes"),
     "logger": (Options, "where else columns go: logger=wandb; logger=none: nowhere"),
     "model": (Options, "the networks"),
     "model.hidden_sizes": (_Widths, "widths of layers, such as [64, 64]"),
@@ -151,67 +170,62 @@ KEYS = {
     for path, (kind, meaning) in rows.items()
 }
 """By full path: all keys but those of parts and environments."""
-_CLOSED = ("model", "model.encoders", "model.memory", "logger", "checkpoint", "certificate",
+_CLOSED = ("algo", "model", "model.encoders", "model.memory", "logger", "checkpoint", "certificate",
            "collector", "critics", "dataset", "evaluation", "exploration")  # fmt: skip
 """Sections whose keys are all in the table, unless they are a part."""
-_OF_PARTS = {"_partial_": Parameter(values_of(bool), "whether it is built later")}
+_LIKENESS = 0.6
+"""Ratio of difflib's from which a key is taken for a misspelt one."""
 
 
 class _Node(NamedTuple):
-    """A mapping of a configuration that has keys with rows.
+    """A mapping of a configuration.
 
     Attributes:
         path: Its key.
         values: What it holds.
-        rows: Its keys, as far as they are described.
-        names: All keys that are read there; None if others may be.
-        part: What is built from it, if something is.
+        part: What its keys may hold, and which there are.
+        is_built: Whether a class is built from it.
     """
 
     path: str
     values: Mapping[str, Any]
-    rows: Mapping[str, Parameter]
-    names: list[str] | None = None
-    part: Callable[..., Any] | None = None
+    part: Part
+    is_built: bool = False
+
+    def check(self) -> None:
+        """Refuse a key that is not there, or that holds what it cannot, or that nothing reads."""
+        for name, row in self.part.rows.items():
+            if name in self.values:
+                row.check(_join(self.path, name), self.values[name])
+            elif row.is_required and not self.is_built:
+                raise SettingError(f"{_join(self.path, name)} is missing: {row.meaning}.")
+        known = list(self.values) if self.part.names is None else self.part.names
+        for name in self.values:
+            if name not in known and not str(name).startswith("_"):
+                meant = nearest_keys(name, known)
+                hint = f" Did you mean '{_join(self.path, meant[0])}'?" if meant else ""
+                raise SettingError(f"{_join(self.path, name)}: nothing reads this key.{hint}")
 
 
-def check_settings(config: DictConfig, folder: RunFolder | None = None) -> None:
-    """Check every key of a configuration: the run's by `KEYS`, those of parts by their signatures.
+def check_settings(config: DictConfig) -> None:
+    """Check every key but the environment's: by `KEYS`, those of parts by their signatures.
 
     Custom parts are checked like the package's. Whole numbers that are written as 3e5 become
     integers.
 
     Args:
         config: Configuration as composed from ``conf/``.
-        folder: That of a run that is continued, if it is; its robot is checked.
 
     Raises:
         SettingError: For the first key that does not exist or holds what it cannot.
         TargetError: For a part that cannot be built.
-        ConfigError: For one of the environment's.
     """
-    values = plain(config)
-    for node in _nodes(values):
-        for name, row in node.rows.items():
-            path = _join(node.path, name)
-            if name in node.values:
-                row.check(path, node.values[name])
-                if row.values.whole:
-                    OmegaConf.update(config, path, _whole(node.values[name]), merge=False)
-            elif row.is_required and node.part is None:
-                raise SettingError(f"{path} is missing: {row.meaning}.")
-        _check_part(node)
-    try:
-        check_device(values["device"])
-    except ValueError as error:
-        raise SettingError(str(error)) from None
-    number = values["collector"]["num_collectors"]
-    if values["collector"].get("_target_") is None and number != 1:
-        raise SettingError(
-            f"collector.num_collectors={number}: collector=local is one process; for more use "
-            "collector=process or collector=ray."
-        )
-    complete_env(values["env"] if folder is None else robot_of(folder, values["env"])[0])
+    for node in _nodes(plain(config)):
+        node.check()
+        for name, row in node.part.rows.items():
+            if row.values.whole and name in node.values:
+                holder = OmegaConf.select(config, node.path) if node.path else config
+                holder[name] = _whole(node.values[name])
 
 
 def plain(config: DictConfig) -> dict[str, Any]:
@@ -227,68 +241,57 @@ def plain(config: DictConfig) -> dict[str, Any]:
         raise SettingError(f"{error.full_key}: {str(error).partition(chr(10))[0]}") from None
 
 
-def optional_keys(values: Mapping[str, Any]) -> Iterator[str]:
-    """Full paths of what a configuration does not hold and its parts would read."""
+def nearest_keys(key: str, known: Iterable[str]) -> list[str]:
+    """Keys that a wrong one may stand for: those with its last name, or else those most like it.
+
+    Examples:
+        >>> nearest_keys("lr", ["policy_update.optimizer.lr", "frames"])
+        ['policy_update.optimizer.lr']
+        >>> nearest_keys("frmaes", ["frames", "env.num_steps"])
+        ['frames']
+    """
+    paths, name = list(known), _end(key)
+    if same := [path for path in paths if _end(path) == name]:
+        return same
+    if (whole := nearest(key, paths, _LIKENESS)) is not None:
+        return [whole]
+    end = nearest(name, map(_end, paths), _LIKENESS)
+    return [path for path in paths if _end(path) == end]
+
+
+def keys_of(values: Mapping[str, Any]) -> Iterator[tuple[str, bool]]:
+    """Full paths of what a configuration holds, and of what its parts would read besides.
+
+    Yields:
+        A path, and whether the configuration holds it.
+    """
+    whole = (*GIVEN_WHOLE, "default_cost_limits", "paper")
     for node in _nodes(values):
-        if node.part is not None:
-            known = keys_of_part(node.part)
-            yield from (_join(node.path, name) for name in known if name not in node.values)
-
-
-def keys_of_part(found: Callable[..., Any]) -> dict[str, Parameter]:
-    """Hyper-parameters of what a configuration can build, by name."""
-    return {name: row for name, row in _rows(found).items() if row.is_described}
+        held = [name for name in node.values if not str(name).startswith("_")]
+        for name in held if not node.path.startswith(whole) else ():
+            path = _join(node.path, name)
+            if not isinstance(node.values[name], Mapping) or path in whole or node.path == "env":
+                yield path, True
+        if node.is_built:
+            yield from ((_join(node.path, k), False) for k in node.part.settings if k not in held)
 
 
 def _nodes(values: Mapping[str, Any], path: str = "") -> Iterator[_Node]:
-    """What has keys with rows, each before what is within it; of environments only the name."""
+    """Mappings of a configuration, each before those within it."""
     target = values.get("_target_")
+    if path == "env":
+        yield _Node(path, values, Part({"name": KEYS["env.name"]}, None))
+        return
     if target is not None and path != "algo":
-        part = locate(target, f"{path}._target_")
-        yield _Node(path, values, {**_OF_PARTS, **_rows(part)}, _names(part), part)
+        yield _Node(path, values, read_part(target, path), is_built=True)
     else:
         head = f"{path}." if path else ""
         rows = {key.removeprefix(head): row for key, row in KEYS.items() if key.startswith(head)}
         own = {name: row for name, row in rows.items() if "." not in name}
-        yield _Node(path, values, own, list(own) if path in _CLOSED else None)
+        yield _Node(path, values, Part(own, list(own) if path in _CLOSED else None))
     for name, value in values.items():
-        if (path, name) == ("", "env"):
-            yield _Node("env", value, {"name": KEYS["env.name"]})
-        elif isinstance(value, Mapping):
+        if isinstance(value, Mapping):
             yield from _nodes(value, _join(path, name))
-
-
-def _check_part(node: _Node) -> None:
-    """Check that a part's packages are there, and that what a node holds is read."""
-    try:
-        check_extra(node.part)
-    except ModuleNotFoundError as error:
-        raise SettingError(f"{node.path}: {error}") from None
-    names = list(node.values) if node.names is None else node.names
-    for name in node.values:
-        if name not in names and not str(name).startswith("_"):
-            path, known = _join(node.path, name), [_join(node.path, key) for key in names]
-            raise SettingError(f"{path}: nothing reads this key.{did_you_mean(path, known)}")
-
-
-def _rows(found: Callable[..., Any]) -> Mapping[str, Parameter]:
-    """What the signature of a part says of its arguments; nothing if it has none to read."""
-    try:
-        return parameters_of(found)
-    except (AttributeError, TypeError, ValueError):
-        return {}
-
-
-def _names(found: Callable[..., Any]) -> list[str] | None:
-    """Arguments that a part takes; None if it takes any, or cannot be known."""
-    try:
-        known = constructors(found)
-        ours = all(function.__module__.startswith("safe_rl.") for function in known)
-        # the package's constructors hand on all that they do not name, others may use it
-        last = known[-1] if ours else known[0]
-        return None if takes_any(last) else sorted(accepted_names(found))
-    except (AttributeError, TypeError, ValueError):
-        return None
 
 
 def _whole(value: Any) -> Any:
@@ -299,3 +302,7 @@ def _whole(value: Any) -> Any:
 
 def _join(path: str, name: str) -> str:
     return f"{path}.{name}" if path else str(name)
+
+
+def _end(path: str) -> str:
+    return path.rpartition(".")[2]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import math
 import os
+import shutil
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
@@ -18,15 +19,9 @@ from omegaconf import DictConfig, OmegaConf, open_dict
 from omegaconf.errors import OmegaConfBaseException
 from torchrl.checkpoint import CheckpointError
 
-from safe_rl.cli.certificates import certify_run, is_to_keep_limits, steps_of_test
 from safe_rl.cli.composing import resolving
-from safe_rl.cli.run_folders import (
-    keep_robot,
-    missing_folders,
-    new_folder,
-    remove_folders,
-    robot_of,
-)
+from safe_rl.cli.evaluating import certify_run, is_to_keep_limits
+from safe_rl.cli.run_folders import keep_robot, new_folder, robot_of
 from safe_rl.cli.schema import check_settings
 from safe_rl.cli.user_code import imported, make_after_imports
 from safe_rl.envs import ConfigError, ContractError, LayoutError, complete_env, make_env
@@ -62,8 +57,7 @@ class Session:
         folder: Its folder.
         hydra: Hydra's own configuration, which a new run notes.
         continues: Whether to continue the run in the folder.
-        missing: Folders that were not there before, the run's own first: they go again if it
-            cannot begin.
+        is_new: Whether the folder was not there before: it goes again if the run cannot begin.
         program: The command, as the user has called it; None: Python, which is not told what came
             of it.
         callbacks: Called after every epoch with its row; one that returns False ends the run.
@@ -79,13 +73,13 @@ class Session:
         hydra: DictConfig | None = None,
         *,
         continues: bool = False,
-        missing: Sequence[Path] = (),
+        is_new: bool = False,
         program: str | None = "python train.py",
         callbacks: Sequence[Callable[[Mapping[str, float]], Any]] = (),
     ) -> None:
         self.config, self.folder, self.hydra = config, RunFolder(folder), hydra
         self.interrupted_by: Signals | None = None
-        self._continues, self._missing, self._callbacks = continues, missing, callbacks
+        self._continues, self._is_new, self._callbacks = continues, is_new, callbacks
         self._quiet = program is None
         self._program = program or "python train.py"
         self._again = f"{self._program} {self.folder.resuming}"
@@ -104,12 +98,12 @@ class Session:
         """
         if folder is None:
             with resolving(config):
-                folder, missing = new_folder(config.hydra)
+                folder, is_new = new_folder(config.hydra)
         else:
-            missing = missing_folders(folder)
+            is_new = not folder.exists()
         with open_dict(config):
             hydra = config.pop("hydra")
-        return cls(config, folder, hydra, missing=missing, **options)
+        return cls(config, folder, hydra, is_new=is_new, **options)
 
     def run(self) -> None:
         """Train, or continue to train, and certify at the end what is to keep limits.
@@ -133,8 +127,8 @@ class Session:
                         self._write_notes(self.hydra)
                     outcome = trainer.run()
         finally:
-            if not self._has_begun:
-                remove_folders(self._missing)
+            if self._is_new and not (self._has_begun or self.folder.has_begun):
+                shutil.rmtree(self.folder.directory, ignore_errors=True)
         if trainer is None:
             if self.folder.certifying.exists():
                 self._certify()
@@ -159,7 +153,7 @@ class Session:
         """Fill the environment's keys up, so that the run's folder tells all of them."""
         given = self._env_node()
         with open_dict(self.config):
-            full = complete_env(robot_of(self.folder, given)[0])
+            full = complete_env(robot_of(self.folder, given))
             # what is given as null has been found out
             known = {key: value for key, value in given.items() if value is not None}
             self.config.env = full | known
@@ -205,11 +199,7 @@ class Session:
         return trainer
 
     def _build(self) -> Trainer:
-        config, env = self.config, self._env_node()
-        if self._continues:
-            env, notice = robot_of(self.folder, env)
-            if notice:
-                print(notice)
+        config, env = self.config, robot_of(self.folder, self._env_node())
         make = partial(
             make_env,
             env,
@@ -251,7 +241,9 @@ class Session:
                 OmegaConf.save(content, unfinished)
 
     def _certify_if_long(self, episode_length: int) -> None:
-        config, steps = self.config, steps_of_test(self.config, episode_length)
+        config = self.config
+        # of a test that ends early, after a fifth of its episodes
+        steps = int(config.get("certificate", {}).get("episodes", 0) * episode_length / 5)
         if 0 < steps <= config.frames:
             self._certify()
         elif steps:
@@ -293,7 +285,7 @@ def run_job(config: DictConfig) -> float:
     """
     hydra = cast(DictConfig, HydraConfig.instance().cfg).hydra
     folder = RunFolder(Path(hydra.runtime.output_dir).resolve())
-    check_settings(config, folder)
+    check_settings(config)
     session = Session(config, folder.directory, hydra, continues=True)
     session.run()
     if session.interrupted_by is not None:

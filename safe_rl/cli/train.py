@@ -18,7 +18,6 @@ from hydra.core.utils import configure_log
 from hydra.errors import HydraException
 from omegaconf import DictConfig
 
-from safe_rl.cli import say_interruptions
 from safe_rl.cli.composing import (
     compose_jobs,
     compose_resumed,
@@ -26,7 +25,12 @@ from safe_rl.cli.composing import (
     resolving,
     search_folders,
 )
-from safe_rl.cli.grammar import CommandLineError, split_imports, take_word
+from safe_rl.cli.grammar import (
+    CommandLineError,
+    say_interruptions,
+    split_imports,
+    take_word,
+)
 from safe_rl.cli.user_code import import_modules, note_imports
 from safe_rl.envs import store_configs
 from safe_rl.naming import did_you_mean
@@ -148,7 +152,7 @@ def main(arguments: Sequence[str] | None = None, program: str = "python train.py
         session = _session(command, program)
         session.run()
     except Exception as error:
-        is_about_words = isinstance(error, ValueError | HydraException)
+        is_about_words = isinstance(error, ValueError | HydraException | OSError)
         is_expected = is_about_words if session is None else session.refuses(error)
         if not is_expected or os.environ.get("HYDRA_FULL_ERROR") == "1":
             raise
@@ -243,9 +247,7 @@ def _ask_hydra(command: Command) -> int:
         elif flags.info:
             hydra.show_info(flags.info, "config", words)
         else:
-            from safe_rl.cli.run_folders import check_writable
-
             with resolving(command.configs[0]):
-                check_writable(Path(command.configs[0].hydra.sweep.dir), "hydra.sweep.dir")
+                Path(command.configs[0].hydra.sweep.dir).mkdir(parents=True, exist_ok=True)
             hydra.multirun("config", job, ["hydra.mode=MULTIRUN", *words])
     return 0

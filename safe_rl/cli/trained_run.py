@@ -15,8 +15,7 @@ from omegaconf import DictConfig
 from tensordict.nn import TensorDictModuleBase
 from torchrl.envs import EnvBase
 
-from safe_rl.cli.certificates import certify_run
-from safe_rl.cli.evaluating import evaluate_run, evaluate_varied
+from safe_rl.cli.evaluating import certify_run, evaluate_run, evaluate_varied
 from safe_rl.cli.grammar import take_options
 from safe_rl.cli.run_folders import maker_of
 from safe_rl.cli.user_code import check_imports, import_modules

@@ -4,7 +4,7 @@ import pytest
 from omegaconf import OmegaConf
 from run_configs import compose_config
 
-from safe_rl.cli.certificates import certificate_options, is_to_keep_limits
+from safe_rl.cli.evaluating import certificate_options, is_to_keep_limits
 
 
 @pytest.mark.parametrize(

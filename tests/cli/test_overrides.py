@@ -1,12 +1,8 @@
 """Names on the command line: what nothing reads is refused with what was meant, before a run."""
 
-import os
-import re
-
 import pytest
 
 from safe_rl.cli.grammar import CommandLineError
-from safe_rl.cli.run_folders import check_writable
 from safe_rl.cli.schema import SettingError
 from safe_rl.cli.train import read_command
 from safe_rl.envs import ConfigError
@@ -31,7 +27,6 @@ WRONG = {
     "hazards_num=3": r"Did you mean 'env.hazards_num'\?",
     "frmaes=3": "nothing reads 'frmaes'. Did you mean 'frames'",
     "presett=paper": "Did you mean 'preset'",
-    "lr=1e-4": "Did you mean 'policy_update.optimizer.lr' or 'critic_update.optimizer.lr'",
     "+lr=1e-4": "Did you mean 'policy_update.optimizer.lr' or 'critic_update.optimizer.lr'",
     "++deep.lr=1e-4": "nothing reads 'deep.lr'. Did you mean 'policy_update.optimizer.lr'",
     "policy_update.lr=1e-4": "Did you mean 'policy_update.optimizer.lr'",
@@ -46,7 +41,8 @@ WRONG = {
     "transforms.saute.budgets.cost=1": r"budgets are given all at once, as .*='\{cost: 1\}'",
     "model.input_scale.gyro=1": r"factors are given all at once, as .*='\{gyro: 1\}'",
     "+model.input_scale.velocimeter=0.5": r"model.input_scale='\{velocimeter: 0.5\}'",
-    "certificate={episodez: 5}": r"mean 'certificate\.episodes'\? .* \+certificate\.episodez=",
+    "certificate={episodez: 5}": r"mean 'certificate\.episodes'\?$",
+    "zzzzz=3": "'--cfg job' prints all keys",
     "+certificate.episodez=5": "Did you mean 'certificate.episodes'",
     "+seed=1": "at 'seed'. Either remove [+] prefix: 'seed=1'",
     "env=PointGaol1": "no env 'PointGaol1'. Did you mean 'PointGoal1'",
@@ -60,17 +56,6 @@ WRONG = {
     "frames=[1": r"frames=\[1",
     "seed=0,1": "--multirun",
     "frames=${nowhere}": "frames: .*nowhere",
-    # what other libraries call it
-    "total_timesteps=10": r"Did you mean 'frames'\?$",
-    "max_epochs=10": r"Did you mean 'frames'\?$",
-    "algo_cfgs.steps_per_epoch=10": r"Did you mean 'frames_per_batch'\?$",
-    "epochs=10": r"Did you mean 'frames'\?$",
-    "learning_rate=1": r"Did you mean 'policy_update\.optimizer\.lr' or 'critic_update\.opt",
-    "batch_size=64": r"Did you mean 'policy_update\.minibatch_size' or 'critic_update",
-    "target_kl=0.1": r"Did you mean 'policy_update\.max_kl'\?$",
-    "env_id=PointGoal1": r"Did you mean 'env'\?$",
-    "logdir=x": r"Did you mean 'hydra\.run\.dir'\?$",
-    "note=x": r"Did you mean '\+note'\?$",
     "algo=CPO": r"no algo 'CPO'\. Did you mean 'cpo'",
     "algo=PPOLag": r"Did you mean 'ppo_lagrangian'",
     "transforms=[saut]": r"there is no transforms 'saut'\. Did you mean 'saute'\?$",
@@ -86,7 +71,6 @@ WRONG = {
     "env=CartPole-v1": r"no env 'CartPole-v1'\. It is one of Gymnasium's: env=gymnasium env\.id",
     "env=Safexp-CarGoal1-v0": r"Did you mean 'CarGoal1'\?$",
     "env=gymnasium": r"^env\.id has to be given: env\.id=…$",
-    "+name=first": r"nothing reads 'name'\. Did you mean 'env\.name' or 'algo\.name'",
 }
 
 
@@ -161,8 +145,6 @@ MEANT = {
     ("sac", "lr=1e-3"): "policy_update.optimizer.lr",
     ("sac", "+lr=1e-3"): "policy_update.optimizer.lr",
     ("sac", "gamma=0.9"): "loss.gamma",
-    ("sac", "policy_update.minibatch_size=9"): "memory.batch_size",
-    ("cpo", "max_kl=0.1"): "policy_update.target_kl",
     ("cpo", "policy_update.max_kl=0.1"): "policy_update.target_kl",
 }
 
@@ -184,16 +166,11 @@ def test_the_paper_s_setting_is_refused_where_the_paper_has_none():
         read_command(["-m", "algo=sac", "preset=default,paper"])
 
 
-def test_what_a_mapping_lacks_is_added_with_a_plus():
-    with pytest.raises(CommandLineError, match=r"added as \+collector\.ray_init\.num_gpus="):
-        read_command(["collector=ray", "collector.ray_init={num_gpus: 3}"])
-
-
 # files of one's own, each with what the line about it must name: the file, and the key or the place
 FAULTY = {
-    "defaults: [ppo, {override /lagrangian: pid}]": r"algo/mine\.yaml: .*override 'lagrangian'",
+    "defaults: [ppo, {override /lagrangian: pid}]": r"algo/mine': .*override 'lagrangian'",
     "defaults: [sac_lagrangian, {override /limits/replay: default}]": (
-        r"algo/mine\.yaml: .*Did you mean to override limits/replay@limits"
+        r"algo/mine': .*Did you mean to override limits/replay@limits"
     ),
     "defaults: [ppo_lagrangien]": r"algo/mine\.yaml: there is no algo 'ppo_lagrangien'\.",
     # Hydra says it of the file whose choice is overridden
@@ -202,7 +179,7 @@ FAULTY = {
     ),
     "defaults: [ppo_lagrangian, {/lagrangian: pid}]": "Multiple values for lagrangian",
     "defaults: {ppo: null}": r"Invalid defaults list in 'algo/mine'",
-    "- 1": r"algo/mine\.yaml: ",
+    "- 1": "algo/mine': ",
     "loss: {a: 1\nb: 2": r"mine\.yaml\", line 3",
     "frames: ${a": "full_key: frames",
     "frames: 3": r"algo\.name' not found",
@@ -217,10 +194,10 @@ def test_faults_of_files_are_told_by_the_file(own_conf, text):
     assert len(str(caught.value).splitlines()) == 1
 
 
-def test_an_algorithm_below_its_own_name_is_told_its_first_line(own_conf):
+def test_an_algorithm_below_its_own_name_is_refused(own_conf):
     file = own_conf / "algo" / "mine.yaml"
     file.write_text(file.read_text().partition("\n")[2])
-    with pytest.raises(CommandLineError, match=r"algo=mine: .*with the line '# @package _gl"):
+    with pytest.raises(SettingError, match=r"^algo\."):
         read_command([f"--config-dir={own_conf}", "algo=mine"])
 
 
@@ -264,25 +241,6 @@ def test_configurations_are_shown_with_wrong_values_but_not_with_wrong_names():
         read_command(["--cfg", "job", "frmaes=3"])
 
 
-@pytest.mark.parametrize("place", ["a_file/run", "x" * 300])
-def test_folders_that_cannot_be_written(tmp_path, place):
-    (tmp_path / "a_file").write_text("")
-    with pytest.raises(CommandLineError, match=r"hydra\.run\.dir=.*nothing can be written there"):
-        check_writable(tmp_path / place, "hydra.run.dir")
-    assert os.listdir(tmp_path) == ["a_file"]
-
-
 def test_a_wrong_key_beside_a_name_that_others_refer_to():
     with pytest.raises(CommandLineError, match=r"nothing reads 'env\.cost_kyes'.*env\.cost_keys"):
         read_command(["env=gymnasium", "env.id=CartPole-v1", "env.cost_kyes=[cost_a]"])
-
-
-@pytest.mark.parametrize("second", ["{cost: 20}", "{cost_vases_contact: 20}"])
-def test_mappings_that_are_given_whole_are_given_once(second):
-    """Hydra merges them: limits of the first would stay, or what the second adds is an error."""
-    first = "cost_limits={cost: 10, cost_hazards: 5}"
-    arguments = ["env=PointGoal2", first, f"cost_limits={second}"]
-    said = rf"'cost_limits' is given more than once: {re.escape(first)}, cost_limits="
-    with pytest.raises(CommandLineError, match=said):
-        read_command(arguments)
-    read_command([arguments[0], "~cost_limits", f"+cost_limits={second}"])

@@ -7,11 +7,9 @@ from run_configs import point_mass_config
 from safe_rl.cli.composing import compose_resumed
 from safe_rl.cli.grammar import CommandLineError
 from safe_rl.cli.train import read_command
-from safe_rl.runs.folder import RunFolder
 from safe_rl.runs.record import RunRecord
 
 NAMES = ("it's frames=10,num_envs=4", "a${oc.env:HOME}", "a\\'b", "ends with \\")
-SAID = ["env=PointMass", "frames=1280", "logger=none", "transforms=[]", "model=mlp"]
 
 
 def begin(directory):
@@ -19,9 +17,6 @@ def begin(directory):
         directory, point_mass_config("env.robot_base=point"), {"cost": 25.0}, 20
     ).writing():
         pass
-    notes = RunFolder(directory)
-    notes.notes.mkdir()
-    notes.overrides.write_text(OmegaConf.to_yaml(OmegaConf.create(SAID)))
     return directory
 
 
@@ -87,23 +82,21 @@ def test_what_is_marked_may_change(run, key, value):
 @pytest.mark.parametrize(
     "override",
     [
-        *("algo=ppo_lagrangian", "env=PointMass", "env.robot_base=point", "seed=0"),
-        *("preset=default", "cost_limits={cost: 25}", "model.hidden_sizes=[16]", *SAID[2:]),
-        *("policy_update.optimizer.lr=${.lr}", "num_envs=4"),
+        *("env.robot_base=point", "seed=0", "preset=default", "num_envs=4"),
+        *("model.hidden_sizes=[16]", "policy_update.optimizer.lr=${.lr}", "frames=1280"),
     ],
 )
-def test_the_command_that_began_a_run_may_be_said_again(run, override):
+def test_values_of_a_run_may_be_said_again(run, override):
     override = override.replace("${.lr}", str(point_mass_config().policy_update.optimizer.lr))
     before = compose_resumed(run, [])
-    assert compose_resumed(run, [override, f"hydra.run.dir={run}"]) == before
+    assert compose_resumed(run, [override]) == before
 
 
 @pytest.mark.parametrize(
     ("override", "words"),
     [
         ("framse=9", r"nothing reads 'framse'\. Did you mean 'frames'\?$"),
-        ("total_timesteps=9", r"Did you mean 'frames'\?$"),
-        ("zzz=1", r"nothing reads 'zzz'\.$"),
+        ("zzz=1", r"nothing reads 'zzz'\."),
         ("policy_update.max_kll=1", r"Did you mean 'policy_update\.max_kl'"),
         ("frames=9,10", "a run has one value"),
         ("policy_update.optimizer.lr=1e-9", "a checkpoint brings along, such as an optimiser's"),
@@ -119,8 +112,6 @@ def test_only_a_run_can_be_resumed(run):
         read_command([f"resume={run.parent}"])
     with pytest.raises(CommandLineError, match="start it again as it was"):
         read_command(["-m", f"resume={run}"])
-    with pytest.raises(CommandLineError, match="more than once"):
-        read_command([f"resume={run}", f"resume={run}"])
     with pytest.raises(CommandLineError, match="no flag goes with it"):
         read_command([f"resume={run}", "--cfg=job"])
     (run / "config.yaml").write_text("algo: [")
@@ -149,7 +140,7 @@ def test_what_ray_is_started_with_is_not_taken_from_a_file(run):
     actors = "null}\n  resources: {runtime_env: {pip: [theirs]}}"
     for started in ("null, runtime_env: {pip: [theirs]}}", actors):
         path.write_text(local.replace("null}", started))
-        with pytest.raises(CommandLineError, match="starts Ray with runtime_env"):
+        with pytest.raises(CommandLineError, match=r"collector\.\w+\.runtime_env.*could make code"):
             compose_resumed(run, [])
 
 

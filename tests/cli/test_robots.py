@@ -69,19 +69,14 @@ def run(tmp_path, monkeypatch):
     return begin
 
 
-def test_a_changed_robot_changes_neither_the_run_nor_its_evaluation(run, tmp_path, capsys):
+def test_a_changed_robot_changes_neither_the_run_nor_its_evaluation(run, tmp_path):
     whole, folder = run("whole", frames=80), run()
     assert evaluate.main([str(folder), "episodes=2", "num_threads=1", "name=before"]) == 0
-    assert "the run's copy" not in capsys.readouterr().out
     write_robot(tmp_path, density=30)
     assert evaluate.main([str(folder), "episodes=2", "num_threads=1", "name=after"]) == 0
-    said = capsys.readouterr().out
-    notice = "robot/ball.xml has changed since the run began: using the run's copy, "
-    assert said.count(f"{notice}{folder}/robot/ball.xml") == 1
     rows = [(folder / f"evaluation_{name}.csv").read_text() for name in ("before", "after")]
     assert rows[0] == rows[1]
     assert train.main([f"resume={folder}", "frames=80"]) == 0
-    assert notice in capsys.readouterr().out
     assert without_times(folder / "progress.csv") == without_times(whole / "progress.csv")
     # the name of the robot, by which runs are told apart, stays
     assert yaml.safe_load((folder / "config.yaml").read_text())["env"]["robot_base"] == (
@@ -95,30 +90,23 @@ def test_a_run_is_carried_elsewhere(run, tmp_path, monkeypatch, capsys):
     elsewhere.mkdir()
     folder = folder.rename(elsewhere / "run")
     monkeypatch.chdir(elsewhere)
-    notice = "there is no file 'robot/ball.xml': using the run's copy"
     assert train.main(["resume=run", "frames=80"]) == 0
-    assert notice in capsys.readouterr().out
     assert safe_rl.load("run").env.rollout(3).shape == (1, 3)
-    assert notice in capsys.readouterr().out
     assert evaluate.main(["run", "episodes=2", "num_threads=1", "env.robot_base=point"]) == 1
     assert "trained on other observations or actions" in capsys.readouterr().err
 
 
 def test_another_robot_than_the_runs_is_never_taken(run, tmp_path, capsys):
     folder = run()
+    note = json.loads((folder / "robot.json").read_text())
     with (folder / "robot" / "meshes" / "hat.stl").open("ab") as file:
         file.write(b"more")
-    assert evaluate.main([str(folder), "episodes=2", "num_threads=1"]) == 0  # by the original
     write_robot(tmp_path, density=30)
-    for words in ("and so has the run's own copy", "has no copy of it"):
+    for kept in (note["file"], None, "../../robot/ball.xml"):
+        (folder / "robot.json").write_text(json.dumps(note | {"file": kept}))
         assert evaluate.main([str(folder), "episodes=2", "num_threads=1"]) == 1
-        assert words in capsys.readouterr().err
-        assert words in train.main([f"resume={folder}", "frames=80"])
-        note = json.loads((folder / "robot.json").read_text()) | {"file": None}
-        (folder / "robot.json").write_text(json.dumps(note))
-    note["file"] = "../../robot/ball.xml"
-    (folder / "robot.json").write_text(json.dumps(note))
-    assert evaluate.main([str(folder), "episodes=2", "num_threads=1"]) == 1
+        assert "has changed since the run began" in capsys.readouterr().err
+    assert "has changed since the run began" in train.main([f"resume={folder}", "frames=80"])
 
 
 @pytest.mark.parametrize("place", ["../meshes", "{}/meshes", "linked"])
@@ -135,7 +123,7 @@ def test_what_lies_outside_of_its_folder_is_not_copied(place, run, tmp_path, cap
     assert evaluate.main([str(folder), "episodes=2", "num_threads=1"]) == 0
     write_robot(tmp_path, meshes=meshes, density=30)
     assert evaluate.main([str(folder), "episodes=2", "num_threads=1"]) == 1
-    assert "has changed since the run began, and" in capsys.readouterr().err
+    assert "has changed since the run began" in capsys.readouterr().err
 
 
 def test_only_what_mujoco_loads_is_copied(run, tmp_path):

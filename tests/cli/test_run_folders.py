@@ -35,7 +35,7 @@ def test_runs_that_begin_in_the_same_second_get_folders_of_their_own(tmp_path):
 @pytest.mark.parametrize("override", ["hydra.run.dir", "+hydra.run.dir"])
 def test_a_folder_that_was_named_stays(tmp_path, override):
     config = hydra_config(tmp_path, f"{override}={tmp_path}")
-    assert new_folder(config) == (tmp_path, [])
+    assert new_folder(config) == (tmp_path, False)
     assert not list(tmp_path.iterdir())
 
 
