@@ -168,27 +168,6 @@ def test_keys_of_sets_are_taken_by_training(name):
         read_command(["env=PointGoal1", *chosen, *changes])
 
 
-@pytest.mark.parametrize(
-    ("given", "message"),
-    [
-        ("variations=dynamic", "Did you mean 'dynamics'"),
-        ("variations=nowhere.yaml", "nowhere.yaml: No such file"),
-        ("variations={heavy: 2}", "'heavy' must have keys"),
-        ("variations={heavy: {algo.name: cpo}}", "must be a key of the environment"),
-        ("variations={noise: {transforms.sensor_noise: 2}}", "must be a key of the environment"),
-        ("variations={noise: {transforms.sensor_nois.std: 2}}", "Did you mean 'sensor_noise'"),
-        ("variations={heavy: {env.mas_scale: 2}}", "Did you mean 'mass_scale'"),
-        ("variations={a: {env.mass_scale: [1], env.friction_scale: [2]}}", "several lists"),
-        ("variations=dynamics video=true", "combined with video=true"),
-    ],
-)
-def test_what_cannot_be_varied_is_said(run, given, message, capsys):
-    arguments = given.split(" video=")
-    more = [f"video={arguments[1]}"] if len(arguments) > 1 else []
-    assert main([str(run), arguments[0], *more, *QUICK]) == 1
-    assert message in capsys.readouterr().err
-
-
 def test_rows_with_a_list_are_several():
     found = expand({"mass": {"env.mass_scale": [0.5, 2], "env.friction_scale": 0.9}})
     assert [v.keys for v in found] == [

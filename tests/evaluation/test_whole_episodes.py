@@ -25,6 +25,10 @@ LENGTHS = [[30, 1], [2, 3], [1, 1]]
 FILM = {"deterministic": True, "form": FORMATS["mp4"]}
 
 
+def small_policy():
+    return BehaviourPolicy(make_actor(1, 1, hidden_sizes=[4], initial_log_std=0.0))
+
+
 class KnownLengths(ConstrainedEnv):
     """The reward of a step is 1, its cost 0.5."""
 
@@ -76,7 +80,7 @@ class KnownLengths(ConstrainedEnv):
     ],
 )
 def test_every_world_contributes_its_first_episodes(number, expected):
-    policy = BehaviourPolicy(make_actor(1, 1, hidden_sizes=[4], initial_log_std=0.0))
+    policy = small_policy()
     episodes = collect_episodes(KnownLengths(), policy, number, ["cost"], deterministic=False)
     assert episodes.lengths.tolist() == expected
     assert episodes.returns.tolist() == expected
@@ -108,7 +112,7 @@ def test_returns_are_of_the_entry_that_the_environment_names(transforms, monkeyp
     def make():
         return transform_env(Shaped([[2, 2]]), transforms, evaluating=True)
 
-    policy = BehaviourPolicy(make_actor(1, 1, hidden_sizes=[4], initial_log_std=0.0))
+    policy = small_policy()
     episodes = collect_episodes(make(), policy, 2, ["cost"], deterministic=True)
     assert make().return_key == "score"
     assert episodes.returns.tolist() == [2.0, 2.0]
@@ -129,7 +133,7 @@ class Drawn(KnownLengths):
 
 
 def test_a_film_takes_the_pictures_that_an_environment_has():
-    env, policy = Drawn(), BehaviourPolicy(make_actor(1, 1, hidden_sizes=[4], initial_log_std=0.0))
+    env, policy = Drawn(), small_policy()
     check_camera(env, "free")
     frames = list(record_episode(env, policy, ["cost"], **FILM))
     # every other step of six, and the end; what the encoder cannot halve twice is cut off
@@ -144,7 +148,7 @@ def test_a_film_takes_the_pictures_that_an_environment_has():
 
 @pytest.mark.parametrize("shape", [(50, 70), (1, 50, 70, 3), (50, 70, 4)])
 def test_a_film_takes_grey_pictures_batches_and_fourth_channels(shape):
-    env, policy = Drawn(), BehaviourPolicy(make_actor(1, 1, hidden_sizes=[4], initial_log_std=0.0))
+    env, policy = Drawn(), small_policy()
     env.render = lambda: np.full(shape, 200, np.uint8)
     check_camera(env, "free")
     frames = list(record_episode(env, policy, ["cost"], **FILM))
@@ -182,8 +186,8 @@ def test_whatever_a_render_fails_of_prevents_a_film(error, words):
         check_camera(env, "free")
 
 
-def layouts(env):
-    return set(range(env["layout_seeds_first"], env["layout_seeds_first"] + env["layout_seeds"]))
+FIXED = {"randomize_layout": False, "layout_seeds": None, "layout_seeds_first": 0}
+UNLIMITED = {**FIXED, "randomize_layout": True}
 
 
 @pytest.mark.parametrize(
@@ -191,28 +195,26 @@ def layouts(env):
 )
 def test_shared_layouts_are_those_in_both_ranges(trained, evaluated):
     envs = [
-        {"randomize_layout": True, "layout_seeds_first": first, "layout_seeds": number}
+        {**UNLIMITED, "layout_seeds_first": first, "layout_seeds": number}
         for first, number in (trained, evaluated)
     ]
-    common = len(layouts(envs[0]) & layouts(envs[1])) / len(layouts(envs[1]))
-    assert shared_layouts(*envs, same_seed=False) == common
+    met, shown = (set(range(first, first + number)) for first, number in (trained, evaluated))
+    assert shared_layouts(*envs, same_seed=False) == len(met & shown) / len(shown)
 
 
-def test_what_says_nothing_of_layouts_shows_new_ones():
+def test_layouts_without_a_range_are_known_where_they_are_fixed_and_the_seed_is_trainings():
+    assert default_seed(FIXED, 4) == 4
+    assert default_seed(UNLIMITED, 4) != 4
     assert default_seed({}, 4) != 4
-    assert shared_layouts({}, {}, same_seed=False) == 0.0
-    assert shared_layouts({"layout_seeds": 5}, {"layout_seeds": 10}, same_seed=False) == 0.5
-
-
-def test_a_fixed_layout_is_trainings_only_with_its_seed():
-    fixed = {"randomize_layout": False, "layout_seeds": None, "layout_seeds_first": 0}
-    unlimited = {**fixed, "randomize_layout": True}
-    assert default_seed(fixed, 4) == 4
-    assert default_seed(unlimited, 4) != 4
-    assert shared_layouts(fixed, fixed, same_seed=True) == 1.0
-    assert shared_layouts(fixed, fixed, same_seed=False) == 0.0
-    assert shared_layouts(unlimited, unlimited, same_seed=False) == 0.0
-    assert shared_layouts(unlimited, fixed, same_seed=True) == 0.0
+    for trained, evaluated, same_seed, share in (
+        (FIXED, FIXED, True, 1.0),
+        (FIXED, FIXED, False, 0.0),
+        (UNLIMITED, UNLIMITED, False, 0.0),
+        (UNLIMITED, FIXED, True, 0.0),
+        ({}, {}, False, 0.0),
+        ({"layout_seeds": 5}, {"layout_seeds": 10}, False, 0.5),
+    ):
+        assert shared_layouts(trained, evaluated, same_seed=same_seed) == share
 
 
 def make_evaluation(make, device="cpu", **keys):

@@ -48,11 +48,3 @@ def test_a_certificate_and_a_missing_one_have_a_row_each(run, tmp_path):
         "CPO": "19.7252",
         next(row["algorithm"] for row in rows if row["algorithm"] != "CPO"): "31.6566",
     }
-
-
-@pytest.mark.parametrize("content", ["{", json.dumps(certificate(bounds=[3]))])
-def test_an_odd_one_is_left_out_and_stops_nothing(content, run, tmp_path, capsys):
-    (run / "certificate.json").write_text(content)
-    assert main([str(tmp_path)]) == 0
-    assert "certificate" in capsys.readouterr().err
-    assert not (tmp_path / "report" / "certificates.csv").exists()

@@ -97,6 +97,8 @@ UNREADABLE_FILES = {
     "deep": lambda run: evaluate(run, "[" * 100_000),
     "evaluation is a folder": lambda run: (run / "evaluation.json").mkdir(),
     "evaluation elsewhere": lambda run: link(run, "evaluation.json", "outside.json"),
+    "half a certificate": lambda run: (run / "certificate.json").write_text("{"),
+    "certificate is a list": lambda run: (run / "certificate.json").write_text("[3]"),
     "overrides": lambda run: (run / ".hydra/overrides.yaml").write_text("{"),
     "overrides elsewhere": lambda run: link(run, ".hydra/overrides.yaml", "outside.yaml"),
     "hydra": lambda run: (run / ".hydra/hydra.yaml").write_text("hydra: [[["),
@@ -172,7 +174,7 @@ def test_runs_that_cannot_be_read_are_left_out_with_their_reasons(tmp_path, caps
 def test_files_that_cannot_be_read_are_left_out_and_their_runs_kept(tmp_path):
     runs, skipped = report(tmp_path, UNREADABLE_FILES.values())
     assert len(runs) == 1 + len(UNREADABLE_FILES)
-    assert not any(run.evaluations for run in runs.values())
+    assert not any(run.evaluations or run.certificate for run in runs.values())
     own = {part for place in skipped for part in place.parts if part.startswith("odd")}
     assert own == {f"odd{number}" for number in range(len(UNREADABLE_FILES))}
     assert len(skipped) == len(UNREADABLE_FILES)
