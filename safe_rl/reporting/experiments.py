@@ -171,7 +171,7 @@ def _settings_of_names(
     """Folder -> settings that its name has, and all that differ between runs of its algorithm.
 
     A name has what a person has set and what differs; on an environment where this does not tell
-    all apart, as few of the other settings as do.
+    all apart, everything that differs.
     """
     found: dict[Path, tuple[Settings, Settings]] = {}
     for algorithm in {run.algorithm for run in runs}:
@@ -192,7 +192,8 @@ def _settings_of_names(
                 known = tuple((key, of_run[key]) for key in keys if of_run.get(key) is not None)
                 whole[run.directory] = known
                 given[known] |= {key for key in keys if _is_given(key, run)}
-            further = _further(keys, given)
+            names = [tuple(p for p in known if p[0] in said) for known, said in given.items()]
+            further = keys if len(set(names)) < len(names) else []
             for place, known in whole.items():
                 named = {k: v for k, v in known if k in given[known] or k in further}
                 found[place] = named, dict(known)
@@ -205,23 +206,6 @@ def _is_given(key: str, run: Run) -> bool:
     return key.partition(".")[0] in _ALWAYS_NAMED or any(
         key == one or key.startswith(f"{one.partition('@')[0]}.") for one in said
     )
-
-
-def _further(keys: Sequence[str], given: Mapping[Known, set[str]]) -> list[str]:
-    """As few keys as tell settings apart that are alike in the given ones."""
-    further: list[str] = []
-
-    def count(others: Sequence[str]) -> int:
-        names = (
-            tuple(pair for pair in known if pair[0] in own or pair[0] in others)
-            for known, own in given.items()
-        )
-        return len(set(names))
-
-    while count(further) < len(given):
-        left = [key for key in keys if key not in further]
-        further.append(max(left, key=lambda key: count([*further, key])))
-    return further
 
 
 def title_of(algorithm: str) -> str:

@@ -171,14 +171,13 @@ def test_names_leave_out_what_nobody_has_set(tmp_path):
     }
 
 
-def test_names_have_as_many_settings_as_it_takes(tmp_path):
-    # two numbers tell apart what differs in five; neither of them does alone
-    for number, (a, b) in enumerate(((1, 1), (1, 2), (2, 1), (2, 2))):
-        own = {"loss": {"a": a, "b": b, "c": a, "d": b, "e": 1 if a == b == 1 else 2}}
-        write_run(tmp_path, algo="mine", folder=str(number), **own)
-    experiments, _ = grouped(tmp_path)
-    found = sorted(e.algorithm for e in experiments)
-    assert found == [f"mine (loss.a={a}, loss.b={b})" for a in (1, 2) for b in (1, 2)]
+def test_names_have_all_settings_where_those_that_were_set_tell_nothing_apart(tmp_path):
+    for number in range(2):
+        write_run(
+            tmp_path, algo="mine", folder=str(number), loss={"a": number, "b": number, "c": 1}
+        )
+    found = [e.algorithm for e in grouped(tmp_path)[0]]
+    assert found == [f"mine (loss.a={number}, loss.b={number})" for number in range(2)]
 
 
 def test_names_have_what_the_command_lines_of_their_runs_have_set(tmp_path):
