@@ -136,8 +136,11 @@ def test_a_step_does_not_wait_for_the_device(keys, monkeypatch):
 def looks_of_an_epoch(directory, num_steps, algo):
     """How often one epoch looks at values: a rollout, advantages and costs, and the updates."""
     store_configs()
-    own = {
-        "ppo_lagrangian": [f"critic_update.minibatch_size={2 * num_steps}"],
+    own = {  # as many gradient steps of PPO, whatever they change
+        "ppo_lagrangian": [
+            f"critic_update.minibatch_size={2 * num_steps}",
+            "policy_update.max_kl=1e3",
+        ],
         "sac_lagrangian": ["memory.batch_size=16", "exploration.random_steps=0"],
     }
     config = compose_config(
@@ -192,13 +195,15 @@ def test_what_is_wrong_on_the_device_is_said_by_a_later_call(two):
     physics.waits = False
 
 
+@pytest.mark.parametrize("device", ["cpu", pytest.param("cuda", marks=pytest.mark.gpu)])
 @pytest.mark.parametrize("algo", ["ppo_lagrangian", "sac_lagrangian"])
-def test_training_with_the_preset_for_gpus(algo, tmp_path):
+def test_training_and_a_certificate_with_the_preset_for_gpus(algo, device, tmp_path):
     run_train(
-        *("env=PointGoal1", f"algo={algo}", "preset=gpu", "num_envs=4", "frames=64"),
-        *("frames_per_batch=32", "certificate.episodes=0", "logger=none", "num_threads=1"),
-        f"hydra.run.dir={tmp_path}",
+        *("env=PointGoal1", f"algo={algo}", "preset=gpu", f"device={device}", "num_envs=4"),
+        *("env.num_steps=10", "frames=64", "frames_per_batch=32", "certificate.ranking=2"),
+        *("certificate.episodes=4", "logger=none", "num_threads=1", f"hydra.run.dir={tmp_path}"),
     )
+    assert (tmp_path / "certificate.json").exists()
     config = OmegaConf.load(next(tmp_path.rglob("config.yaml")))
     assert config.env.physics == "warp"
     cpu = OmegaConf.merge(config, {"env": {"physics": "cpu"}})

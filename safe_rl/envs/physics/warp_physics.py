@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable, Hashable, Iterator, Sequence
+from collections.abc import Callable, Hashable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
@@ -53,7 +53,6 @@ class WarpPhysics(Physics):
         device: Where they are.
         contacts: Contacts that there is room for, per simulation; they share what there is.
         constraints: Rows of constraints that there is room for in each simulation.
-        outputs: Names of the fields of `MjData` that are read.
         use_graphs: False launches the kernels one by one, to find errors in them.
 
     Raises:
@@ -77,7 +76,6 @@ class WarpPhysics(Physics):
         device: torch.device | str,
         contacts: int,
         constraints: int,
-        outputs: Sequence[str] = OUTPUTS,
         use_graphs: bool = True,
     ) -> None:
         self.device = torch.device(device)
@@ -104,20 +102,18 @@ class WarpPhysics(Physics):
             self._data: Any = mjw.make_data(
                 model, num_envs, nconmax=contacts, njmax=constraints, nvmax=None
             )
-        self._bind(model, outputs)
+        self._bind(model)
         self._warm_up()
 
-    def _bind(self, model: mujoco.MjModel, outputs: Sequence[str]) -> None:
+    def _bind(self, model: mujoco.MjModel) -> None:
         """Share memory with torch, and note what a simulation starts from."""
         data, num_envs = self._data, self._data.nworld
-        shared = {name: wp.to_torch(getattr(data, name)) for name in (*STATE, *MEMORY, *outputs)}
-        for name in STATE:
+        shared = {name: wp.to_torch(getattr(data, name)) for name in (*STATE, *MEMORY, *OUTPUTS)}
+        for name in (*STATE, *OUTPUTS):
             setattr(self, name, shared[name])
         sizes = dict(zip(MEMORY, (model.na, model.nhistory), strict=True))
         self.memory = {name: shared[name] for name in MEMORY if sizes[name]}
-        self.outputs = {name: shared[name] for name in outputs}
-        for name in set(OUTPUTS).intersection(outputs):
-            setattr(self, name, shared[name])
+        self.outputs = {name: shared[name] for name in OUTPUTS}
         flat = {name: shared[name].view(num_envs, -1) for name in _INITIAL if shared[name].numel()}
         self._rows: dict[str, Any] = {name: wp.from_torch(values) for name, values in flat.items()}
         self._start = {name: wp.from_torch(values[0].clone()) for name, values in flat.items()}
@@ -308,12 +304,10 @@ class _LateChecks:
 
     def add(self, wrong: Tensor, error: Callable[[], Exception]) -> None:
         """Note a condition, bool []; `look` raises the error if it holds."""
-        seen = torch.empty((), dtype=torch.bool, device="cpu", pin_memory=self._is_cuda)
+        on_cuda = self._device.type == "cuda"
+        seen = torch.empty((), dtype=torch.bool, device="cpu", pin_memory=on_cuda)
         seen.copy_(wrong, non_blocking=True)
-        done = None
-        if self._is_cuda:
-            done = torch.cuda.Event()
-            done.record(torch.cuda.current_stream(self._device))
+        done = torch.cuda.current_stream(self._device).record_event() if on_cuda else None
         self._pending.append((seen, done, error))
 
     def look(self) -> None:
@@ -322,7 +316,3 @@ class _LateChecks:
             seen, _, error = self._pending.pop(0)
             if seen:
                 raise error()
-
-    @property
-    def _is_cuda(self) -> bool:
-        return self._device.type == "cuda"
