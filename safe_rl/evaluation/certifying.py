@@ -7,7 +7,7 @@ import math
 import shutil
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import closing
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +18,9 @@ from torchrl.envs import EnvBase
 from tqdm import tqdm
 
 from safe_rl.evaluation.episodes import Episodes, collect_episodes, default_seed, has_fixed_layout
-from safe_rl.evaluation.loading import for_evaluation, load_config, load_policy, override_env
+from safe_rl.evaluation.loading import load_config
+from safe_rl.evaluation.measuring import Trial
+from safe_rl.evaluation.settings import EvaluationOptions
 from safe_rl.files import check_no_links, replace_text, replacing
 from safe_rl.runs.folder import RunFolder, checkpoint_steps, checkpoints_in
 from safe_rl.scores.certificate import Claim, Verdict, first_certified, rank
@@ -182,11 +184,10 @@ class _Runner:
     def __init__(
         self, config: DictConfig, make_env: Callable[..., EnvBase], threads: int, progress: bool
     ) -> None:
-        self._config, self._make_env = config, for_evaluation(make_env, config)
-        self._threads, self._progress = threads, progress
+        self._config, self._make_env, self._progress = config, make_env, progress
         # training's, where the physics may be; a machine without a GPU certifies on its CPU
-        has_device = torch.cuda.is_available()
-        self._device = torch.device(config.device if has_device else "cpu")
+        device = config.device if torch.cuda.is_available() else "cpu"
+        self._options = EvaluationOptions(device=device, num_threads=threads)
         self.highest: dict[str, float] = {}
 
     def run(self, checkpoint: Path, purpose: int, number: int) -> Iterator[Episodes]:
@@ -195,23 +196,19 @@ class _Runner:
         A ranking is one batch. Every environment contributes one episode to a batch of a test, so
         that short episodes are not looked at before long ones.
         """
-        node = override_env(self._config, {})
-        seed = default_seed(node, self._config.seed)
-        batch = min(number, _BATCH)
-        env = self._make_env(
-            node,
-            num_envs=batch,
-            device=self._device,
-            seed=seed if has_fixed_layout(node) else seed + purpose,
-            num_threads=self._threads,
-        )
-        keys = list(self._config.cost_limits)
-        self.highest = {key: env.highest_cost(key) for key in keys}
-        if purpose == _RANKING:
-            batch = number
-        with closing(env), tqdm(total=number, disable=None if self._progress else True) as bar:
-            policy = load_policy(self._config, env, checkpoint, self._device)
-            torch.manual_seed(seed + purpose)
+        own = default_seed(self._config.env, self._config.seed)
+        seed = own if has_fixed_layout(self._config.env) else own + purpose
+        options = replace(self._options, seed=seed)
+        trial = Trial(self._config, checkpoint, options, self._make_env)
+        worlds, keys = min(number, _BATCH), list(self._config.cost_limits)
+        batch = number if purpose == _RANKING else worlds
+        with (
+            closing(trial.make(worlds)) as env,
+            tqdm(total=number, disable=None if self._progress else True) as bar,
+        ):
+            self.highest = {key: env.highest_cost(key) for key in keys}
+            policy = trial.policy(env)
+            torch.manual_seed(own + purpose)
             for _ in range(math.ceil(number / batch)):
                 yield collect_episodes(env, policy, batch, keys, deterministic=False)
                 bar.update(batch)

@@ -106,6 +106,10 @@ class Trial:
             num_threads=self.options.num_threads,
         )  # fmt: skip
 
+    def policy(self, env: EnvBase) -> TensorDictModuleBase:
+        """The policy, for such an environment."""
+        return load_policy(self.config, env, self.checkpoint, torch.device(self.options.device))
+
     def run(
         self, *, progress: bool = False, record: Path | None = None
     ) -> tuple[TensorDictModuleBase, Episodes, dict[str, float]]:
@@ -119,7 +123,7 @@ class Trial:
         with closing(self.make(min(options.num_envs, options.episodes))) as env:
             limits = limits_of(self.config, options.cost_limits, env.cost_keys)
             recorder = None if record is None else StepRecorder(Recording(record, env.cost_keys))
-            policy = load_policy(self.config, env, self.checkpoint, torch.device(options.device))
+            policy = self.policy(env)
             torch.manual_seed(self.seed)
             episodes = collect_episodes(
                 env, policy, options.episodes, env.cost_keys, deterministic=options.deterministic,
