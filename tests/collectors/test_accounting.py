@@ -79,17 +79,6 @@ def test_agrees_with_a_loop_over_several_batches(num_envs, num_steps, done_proba
         assert statistics.cost_rates["agent/cost_speed"].item() == pytest.approx(speed_rate)
 
 
-def test_result_does_not_depend_on_where_batches_are_cut():
-    batch = random_batch(torch.Generator().manual_seed(1), 3, 60, 0.05)
-    whole = EpisodeAccounting(3, COST_KEYS).update(batch)
-    pieces = EpisodeAccounting(3, COST_KEYS)
-    parts = [pieces.update(batch[:, start : start + 12]) for start in range(0, 60, 12)]
-    for key in whole.costs:
-        joined = torch.cat([part.costs[key] for part in parts])
-        torch.testing.assert_close(joined.sort().values, whole.costs[key].sort().values)
-        assert parts[-1].cost_rates[key].item() == pytest.approx(whole.cost_rates[key].item())
-
-
 def test_means_are_nan_and_rates_are_known_before_an_episode_finishes():
     batch = random_batch(torch.Generator().manual_seed(0), 2, 5, 0.0)
     statistics = EpisodeAccounting(2, COST_KEYS).update(batch)
@@ -105,29 +94,20 @@ def test_means_are_nan_and_rates_are_known_before_an_episode_finishes():
     ]  # fmt: skip
 
 
-def test_state_dict_continues_open_episodes():
+def test_a_saved_state_continues_open_episodes_and_is_not_changed_by_later_batches():
     generator = torch.Generator().manual_seed(3)
     batches = [random_batch(generator, 4, 10, 0.1) for _ in range(2)]
     first, second = EpisodeAccounting(4, COST_KEYS), EpisodeAccounting(4, COST_KEYS)
     first.update(batches[0])
-    second.load_state_dict(first.state_dict())
+    state = first.state_dict()
+    before = {name: value.clone() for name, value in state.items()}
+    second.load_state_dict(state)
     expected, continued = first.update(batches[1]), second.update(batches[1])
     assert torch.equal(expected.returns, continued.returns)
     assert torch.equal(expected.cost_rates["cost"], continued.cost_rates["cost"])
-
-
-def test_saved_state_is_not_changed_by_later_batches():
-    generator = torch.Generator().manual_seed(3)
-    accounting = EpisodeAccounting(4, COST_KEYS)
-    accounting.update(random_batch(generator, 4, 10, 0.1))
-    state = accounting.state_dict()
-    before = {name: value.clone() for name, value in state.items()}
-    accounting.update(random_batch(generator, 4, 10, 0.1))
-    assert all(torch.equal(state[name], before[name]) for name in state)
-    other = EpisodeAccounting(4, COST_KEYS)
-    other.load_state_dict(state)
-    other.forget_open_episodes()
-    other.update(random_batch(generator, 4, 10, 0.1))
+    second.load_state_dict(state)
+    second.forget_open_episodes()
+    second.update(batches[1])
     assert all(torch.equal(state[name], before[name]) for name in state)
 
 
