@@ -38,7 +38,7 @@ def export(words: list[str], options: ExportOptions, modules: list[str] | None) 
         modules: The user's modules to import.
     """
     # here, because help and mistyped options need none of torch
-    from safe_rl.cli.trained_run import Run
+    from safe_rl.cli.python_api import Run
     from safe_rl.evaluation.loading import find_checkpoint
     from safe_rl.evaluation.policies import export_onnx, find_run, pack_policy
     from safe_rl.runs.folder import RunFolder

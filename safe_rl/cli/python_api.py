@@ -1,37 +1,53 @@
-"""The way in from Python: ``safe_rl.train``, ``resume``, ``evaluate`` and ``report``.
+"""The way in from Python: ``safe_rl.train``, ``resume``, ``load``, ``evaluate`` and ``report``.
 
 They do what the commands do, from the same configurations; Hydra stays inside.
 """
 
 from __future__ import annotations
 
+import base64
+import html
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from signal import Signals
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
+import torch
+from omegaconf import DictConfig
+from tensordict.nn import TensorDictModuleBase
+from torchrl.envs import EnvBase
+
+from safe_rl.cli import report as report_command
 from safe_rl.cli.composing import compose_jobs, compose_resumed, search_folders
+from safe_rl.cli.evaluating import certify_run, evaluate_run, evaluate_varied
 from safe_rl.cli.grammar import CommandLineError, overrides_of, take_options
+from safe_rl.cli.run_folders import maker_of
 from safe_rl.cli.schema import GIVEN_WHOLE
 from safe_rl.cli.session import Session
-from safe_rl.cli.trained_run import Run, load
-from safe_rl.cli.user_code import import_modules, note_imports
-from safe_rl.evaluation import Evaluation
+from safe_rl.cli.user_code import check_imports, import_modules, note_imports
+from safe_rl.evaluation import Certificate, Evaluation, EvaluationOptions, loading
+from safe_rl.evaluation.episodes import default_seed
+from safe_rl.evaluation.policies import find_run
+from safe_rl.evaluation.variations import Varied
+from safe_rl.extras import import_extra
+from safe_rl.files import read_json
+from safe_rl.runs.curves import Figure, learning_curves
+from safe_rl.runs.display import outcome_line
 from safe_rl.runs.folder import RunFolder
+from safe_rl.runs.outcome import final_figures
+from safe_rl.runs.table import read_table
+
+if TYPE_CHECKING:
+    import pandas
 
 __all__ = ["Run", "evaluate", "load", "report", "resume", "train"]
 
 Callback = Callable[[Mapping[str, float]], Any]
 # mappings that are given all at once
-_WHOLE = (
-    *GIVEN_WHOLE,
-    *("env.outside", "env.kwargs", "env.cost", "memory.prioritised", "policy_update.rates"),
-)
-_OF_YOUR_OWN = {
-    "env": "safe_rl.envs.store_config(name, {…}) gives one to keys, and what Gymnasium has "
-    "registered is 'gymnasium' with **{'env.id': …}.",
-    "algo": "One of your own is a YAML, which config_dir=… finds.",
-}
+_WHOLE = [*GIVEN_WHOLE, "env.outside", "env.kwargs", "env.cost", "memory.prioritised"]
+_WHOLE += ["policy_update.rates"]
 
 
 def train(
@@ -73,10 +89,11 @@ def train(
         >>> run.table["steps"]
         [40.0, 80.0]
     """
-    for key, name in {"env": env, "algo": algo}.items():
-        if not isinstance(name, str):
-            what = " ".join(repr(name).split())[:80]
-            raise CommandLineError(f"{key}={what}: it must be a name. {_OF_YOUR_OWN[key]}")
+    if not (isinstance(env, str) and isinstance(algo, str)):
+        raise CommandLineError(
+            "env and algo are names. safe_rl.envs.store_config(name, {…}) gives one to an "
+            "environment of your own, a YAML that config_dir=… finds to an algorithm."
+        )
     folders = [config_dir] if isinstance(config_dir, str | Path) else config_dir or ()
     modules = import_modules(imports)
     words = [f"env={env}", f"algo={algo}", *overrides_of(settings, _WHOLE)]
@@ -126,10 +143,8 @@ def resume(
 
 def _carry_out(session: Session) -> Run:
     session.run()
-    if session.interrupted_by is Signals.SIGINT:
-        raise KeyboardInterrupt
-    if session.interrupted_by is not None:
-        raise SystemExit(128 + session.interrupted_by)
+    if (signal := session.interrupted_by) is not None:
+        raise KeyboardInterrupt if signal is Signals.SIGINT else SystemExit(128 + signal)
     return Run(session.folder.directory)
 
 
@@ -147,6 +162,35 @@ def evaluate(run: Run | str | Path, **options: Any) -> Evaluation:
     return (run if isinstance(run, Run) else load(run)).evaluate(**options)
 
 
+def load(
+    directory: str | Path, checkpoint: str = "last", imports: str | Sequence[str] | None = None
+) -> Run:
+    """Open a run: its table, environment and policy.
+
+    Args:
+        directory: Folder of the run, or ``certified/<environment>`` for one of the package's
+            policies, such as ``certified/PointGoal1``.
+        checkpoint: "last", "best" (highest return that kept every limit), "certified" (to
+            keep them), or a path.
+        imports: Modules that its environment or policy needs; none is imported unless named here.
+            ``[]`` goes without those that the run has used.
+
+    Raises:
+        FileNotFoundError: If the folder is not that of a run, or has no such checkpoint.
+        ValueError: If the run has used modules that ``imports`` lacks.
+
+    Examples:
+        >>> run = load(getfixture("tiny_run").directory)
+        >>> run.policy(run.env.reset())["action"].shape
+        torch.Size([1, 2])
+    """
+    run = Run(find_run(directory), checkpoint)
+    check_imports(run.config, imports, run.directory)
+    import_modules(imports or ())
+    loading.find_checkpoint(run.directory, checkpoint)
+    return run
+
+
 def report(directory: str | Path, **options: Any) -> Path:
     """Report the runs below a folder on one page, as ``python -m safe_rl.report`` does.
 
@@ -157,7 +201,142 @@ def report(directory: str | Path, **options: Any) -> Path:
     Returns:
         The page.
     """
-    from safe_rl.cli.report import ReportOptions
-    from safe_rl.cli.report import report as report_runs  # with pandas and Jinja
+    given = take_options(options, report_command.ReportOptions)
+    return report_command.report(Path(directory).expanduser(), given)[1]
 
-    return report_runs(Path(directory).expanduser(), take_options(options, ReportOptions))[1]
+
+@dataclass(frozen=True, repr=False)
+class Run:
+    """A run in its folder: table, environment and trained policy.
+
+    Attributes:
+        directory: Its folder.
+        checkpoint: Which checkpoint ``policy`` has: "last", "best", "certified", or a path.
+
+    Examples:
+        >>> run = getfixture("tiny_run")  # what `safe_rl.train` returns
+        >>> sorted(run.final)[:4]
+        ['cost_rate', 'episode_cost', 'episode_return', 'steps_per_second']
+        >>> run.env.rollout(5, run.policy).shape
+        torch.Size([1, 5])
+    """
+
+    directory: Path
+    checkpoint: str = "last"
+
+    @cached_property
+    def config(self) -> DictConfig:
+        """Its whole configuration."""
+        return loading.load_config(self.directory)
+
+    @cached_property
+    def table(self) -> dict[str, list[float]]:
+        """Its table, by column of ``progress.csv``; NaN where no episode ended in an epoch."""
+        return read_table(RunFolder(self.directory).table)
+
+    @property
+    def final(self) -> dict[str, float]:
+        """Final J_r (``episode_return``), J_c (``episode_<cost>``) and ρ_c (``<cost>_rate``)."""
+        return final_figures(self.table, list(self.config.cost_limits) or ["cost"])
+
+    @cached_property
+    def env(self) -> EnvBase:
+        """One instance of its environment, with layouts that training has not met."""
+        return self.make_env()
+
+    @cached_property
+    def policy(self) -> TensorDictModuleBase:
+        """Its trained policy; :func:`torchrl.envs.set_exploration_type` chooses mean or sample."""
+        path = loading.find_checkpoint(self.directory, self.checkpoint)
+        return loading.load_policy(self.config, self.env, path, torch.device("cpu"))
+
+    @property
+    def certificate(self) -> dict[str, Any] | None:
+        """The content of ``certificate.json``: bounds, or by how much they are missed; or None."""
+        path = RunFolder(self.directory).certificate
+        return read_json(path) if path.is_file() else None
+
+    def to_pandas(self) -> pandas.DataFrame:
+        """Its table as a frame, a row per epoch; needs the extra ``report``."""
+        return import_extra("pandas", "report").DataFrame(self.table)
+
+    def plot(self) -> Figure:
+        """Its learning curves, a Matplotlib figure: return, costs and multipliers."""
+        config, length = self.config, self.env.max_episode_steps
+        title = f"{config.env.name} {config.algo.name} seed {config.seed}"
+        return learning_curves(self.table, dict(config.cost_limits), length, title)
+
+    def __repr__(self) -> str:
+        """What it is, how it ended, and what is certified."""
+        config = self.config
+        lines = [f"Run({str(self.directory)!r}): {config.algo.name} on {config.env.name}"]
+        if RunFolder(self.directory).num_rows:
+            length = int(config.env.get("num_steps") or 1000)
+            lines.append(outcome_line(self.table, dict(config.cost_limits), length))
+        if (found := self.certificate) is not None:
+            bounds = ", ".join(f"{name} ≤ {b['bound']:.3g}" for name, b in found["bounds"].items())
+            which = f": {bounds} ({found['checkpoint']})" if found["certified"] else ""
+            lines.append(f"{'C' if which else 'Not c'}ertified at {found['level']:.0%}{which}.")
+        return "\n".join(lines)
+
+    def _repr_html_(self) -> str:
+        """The same in a notebook, with the learning curves."""
+        text = f"<pre>{html.escape(repr(self))}</pre>"
+        curves = RunFolder(self.directory).curves
+        picture = base64.b64encode(curves.read_bytes()).decode() if curves.is_file() else ""
+        shown = f'<img alt="learning curves" src="data:image/png;base64,{picture}">'
+        return text + (shown if picture else "")
+
+    def make_env(self, num_envs: int = 1, seed: int | None = None, **keys: Any) -> EnvBase:
+        """Make its environment.
+
+        Args:
+            num_envs: Number of worlds, N.
+            seed: Of layouts and noise; None: as for evaluation, one that training never used.
+            keys: Keys of the environment to change, such as ``hazards_num=12``.
+
+        Raises:
+            ConfigError: If the environment does not accept a key.
+        """
+        node = loading.override_env(self.config, keys)
+        seed = default_seed(node, self.config.seed) if seed is None else seed
+        make = loading.for_evaluation(maker_of(self.directory), self.config)
+        return make(node, num_envs=num_envs, seed=seed)
+
+    def evaluate(self, **options: Any) -> Evaluation:
+        """Run the policy for whole episodes; writes into the folder what the command writes.
+
+        Args:
+            options: Those of :class:`safe_rl.evaluation.EvaluationOptions`, such as
+                ``episodes=100``; keys of the environment as ``env={"hazards_num": 12}``.
+
+        Raises:
+            ValueError: If there is no such option, or it cannot have the value.
+        """
+        given = {"checkpoint": self.checkpoint, **options}
+        return evaluate_run(self.directory, take_options(given, EvaluationOptions))
+
+    def certify(self, **changes: Any) -> Certificate | None:
+        """Find and certify its best checkpoint that keeps the limits, as at the end of training.
+
+        Args:
+            changes: Keys of the section ``certificate`` to replace, such as ``episodes=2000``.
+
+        Returns:
+            The certificate; None if the run has no limits or no checkpoints.
+
+        Raises:
+            ValueError: If there is no such key, or it cannot have the value.
+        """
+        return certify_run(self.directory, changes=changes)
+
+    def vary(self, variations: Any, **options: Any) -> Varied:
+        """Run the policy under variations of its environment; writes what the command writes.
+
+        Args:
+            variations: As the command's ``variations=``: ``"dynamics"``, or custom rows,
+                ``{"mass": {"env.mass_scale": [0.5, 2.0]}}``.
+            options: Those of :class:`safe_rl.evaluation.EvaluationOptions`.
+        """
+        given = {"checkpoint": self.checkpoint, "variations": variations, **options}
+        return evaluate_varied(self.directory, take_options(given, EvaluationOptions))[0]
