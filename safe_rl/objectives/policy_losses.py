@@ -32,7 +32,7 @@ class PPOLoss(SurrogateLoss):
 
     Args:
         actor_network: Policy with `get_dist`; see `SurrogateLoss`.
-        clip_epsilon: Half-width ε of the clipping range, within which a ratio earns.
+        clip_epsilon: Half-width ε of the range to which ratios are clipped.
         settings: Those of every policy loss, see `SurrogateLoss`.
 
     Examples:
