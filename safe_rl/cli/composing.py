@@ -28,7 +28,7 @@ from safe_rl.cli.user_code import check_imports, note_imports
 from safe_rl.envs import complete_env, store_configs
 from safe_rl.envs.errors import on_cpu_only
 from safe_rl.envs.families import hint_of_gymnasium
-from safe_rl.files import CONF, read_config
+from safe_rl.files import CONF, read_config, read_yaml
 from safe_rl.naming import did_you_mean
 from safe_rl.runs.folder import RunFolder
 from safe_rl.runs.identity import flatten, role_of
@@ -285,6 +285,7 @@ def compose_resumed(
     try:
         run.check_is_run()
         config = OmegaConf.create(read_config(run.config))
+        said = read_yaml(run.overrides) if run.overrides.is_file() else None
     except (OSError, ValueError) as error:
         raise CommandLineError(f"resume={directory}: {error}") from None
     check_imports(config, modules, directory)
@@ -292,24 +293,26 @@ def compose_resumed(
     _check_form(overrides)
     _refuse_foreign_cluster(config, overrides, run.config)
     for override in overrides:
-        _change(config, override, directory)
+        _change(config, override, directory, said or ())
     _check_read(overrides, config)
     check_settings(config)
     return config
 
 
-def _change(config: DictConfig, override: Override, directory: Path) -> None:
-    """Change a key of a run that is continued; its own value may be said again."""
+def _change(config: DictConfig, override: Override, directory: Path, said: Sequence[str]) -> None:
+    """Change a key of a run that is continued; what it began with may be said again."""
     key, line, value = override.key_or_group, override.input_line, override.value()
     before = OmegaConf.select(config, key, default=_MISSING) if "/" not in key else None
     if override.is_sweep_override():
         raise CommandLineError(f"'{line}': a run has one value of it.")
     if before is _MISSING and not (override.is_add() or override.is_hydra_override()):
         raise CommandLineError(f"'{line}': {_unknown(key, plain(config))}")
-    is_plain = not (override.is_delete() or override.package or isinstance(before, DictConfig))
-    if is_plain and value == before:
+    is_plain = not (override.is_delete() or "/" in key or isinstance(before, DictConfig))
+    may_change = is_plain and not override.package and role_of(key).may_change
+    is_place = key == "hydra.run.dir" and Path(str(value)).resolve() == directory.resolve()
+    if is_place or (is_plain and value == before) or (line in said and not may_change):
         return
-    if not (is_plain and "/" not in key and role_of(key).may_change):
+    if not may_change:
         raise CommandLineError(
             f"'{line}' cannot change in a run that is continued. What can: its length "
             "(frames=…), what belongs to the machine (checkpoint.interval=…), and numbers "

@@ -7,8 +7,10 @@ from run_configs import point_mass_config
 from safe_rl.cli.composing import compose_resumed
 from safe_rl.cli.grammar import CommandLineError
 from safe_rl.cli.train import read_command
+from safe_rl.runs.folder import RunFolder
 from safe_rl.runs.record import RunRecord
 
+SAID = ["env=PointMass", "logger=none", "transforms=[]", "lagrangian=default"]
 NAMES = ("it's frames=10,num_envs=4", "a${oc.env:HOME}", "a\\'b", "ends with \\")
 
 
@@ -17,6 +19,8 @@ def begin(directory):
         directory, point_mass_config("env.robot_base=point"), {"cost": 25.0}, 20
     ).writing():
         pass
+    RunFolder(directory).notes.mkdir()
+    RunFolder(directory).overrides.write_text(OmegaConf.to_yaml(OmegaConf.create(SAID)))
     return directory
 
 
@@ -84,12 +88,13 @@ def test_what_is_marked_may_change(run, key, value):
     [
         *("env.robot_base=point", "seed=0", "preset=default", "num_envs=4"),
         *("model.hidden_sizes=[16]", "policy_update.optimizer.lr=${.lr}", "frames=1280"),
+        *SAID,
     ],
 )
 def test_values_of_a_run_may_be_said_again(run, override):
     override = override.replace("${.lr}", str(point_mass_config().policy_update.optimizer.lr))
     before = compose_resumed(run, [])
-    assert compose_resumed(run, [override]) == before
+    assert compose_resumed(run, [override, f"hydra.run.dir={run}"]) == before
 
 
 @pytest.mark.parametrize(
