@@ -36,6 +36,7 @@ from safe_rl.runs.identity import flatten, role_of
 __all__ = ["compose_jobs", "compose_resumed", "hydra_on_conf", "resolving", "search_folders"]
 
 _LARGE = ("env", "algo", "preset")
+_STEPS = ("total_timesteps", "total_steps", "timesteps", "max_steps")  # elsewhere, for frames
 """Groups whose files differ in more than a few keys."""
 _ONE_EACH = ("env", "algo", "preset", "model", "risk", "collector", "logger", "lagrangian")
 _MOST_LISTED = 40
@@ -201,7 +202,10 @@ def _unknown(key: str, values: Mapping[str, Any]) -> str:
     unread = tuple(f"{path}." for path in _unread_by(algo))
     paths = {p: is_held for p, is_held in keys_of(values) if not f"{p}.".startswith(unread)}
     own = ["env", "algo", "preset", *(path for path, is_held in paths.items() if is_held)]
-    meant = nearest_keys(key, own) or nearest_keys(key, [p for p in paths if not paths[p]])
+    others = ["frames"] if key in _STEPS else []
+    meant = (
+        others or nearest_keys(key, own) or nearest_keys(key, [p for p in paths if not paths[p]])
+    )
     names = " or ".join(f"'{'' if path in own else '+'}{path}'" for path in meant)
     how = f"A new key is added by +{key}=…" if "." in key else "'--cfg job' prints all keys."
     return f"nothing reads '{key}'. {f'Did you mean {names}?' if names else how}"

@@ -25,6 +25,7 @@ RIGHT = [
 WRONG = {
     "env.hazard_num=3": r"nothing reads 'env.hazard_num'\. Did you mean 'env.hazards_num'\?",
     "hazards_num=3": r"Did you mean 'env.hazards_num'\?",
+    "total_timesteps=3": "nothing reads 'total_timesteps'. Did you mean 'frames'",
     "frmaes=3": "nothing reads 'frmaes'. Did you mean 'frames'",
     "presett=paper": "Did you mean 'preset'",
     "+lr=1e-4": "Did you mean 'policy_update.optimizer.lr' or 'critic_update.optimizer.lr'",
@@ -209,6 +210,7 @@ def test_folders_of_ones_own_are_searched_too(own_conf, flag):
         "algo=mime": "Did you mean 'mine'",
         "env=Nearbye": "Did you mean 'Nearby'",
         "mine.tial=1": "Did you mean 'mine.tail'",
+        "total_timesteps=3": "nothing reads 'total_timesteps'. Did you mean 'frames'",
         "frmaes=3": "Did you mean 'frames'",
         "+frmaes=3": "Did you mean 'frames'",
         "mine.tail=abc": "lagrangian.init=abc",
