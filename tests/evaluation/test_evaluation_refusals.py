@@ -26,7 +26,7 @@ from safe_rl.evaluation.variations import Variation, varied
         (["cvar_alpha=2"], "cvar_alpha"),
         (["variations=sensing", "record=true"], "cannot be combined with video=true"),
         (["variations=dynamic"], "Did you mean 'dynamics'"),
-        (["variations=nowhere.yaml"], "nowhere.yaml: No such file"),
+        (["variations=nowhere.yaml"], "No such file or directory: 'nowhere.yaml'"),
         (["variations={heavy: 2}"], "'heavy' must have keys"),
         (["variations={heavy: {algo.name: cpo}}"], "must be a key of the environment"),
         (["variations={noise: {transforms.sensor_noise: 2}}"], "must be a key of the environment"),
