@@ -8,10 +8,26 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, TypeVar
 
-__all__ = ["check_extra", "import_extra", "installing", "needs_extra", "require_extra"]
+__all__ = [
+    "check_extra",
+    "hint_of_plugin",
+    "import_extra",
+    "installing",
+    "needs_extra",
+    "require_extra",
+]
 
 T = TypeVar("T")
 _NEEDED: dict[Any, tuple[str, str]] = {}
+
+
+_PLUGINS = {
+    "hydra/launcher=joblib": "sweep",
+    "hydra/launcher=ray": "sweep-ray",
+    "hydra/launcher=submitit_local": "submitit",
+    "hydra/launcher=submitit_slurm": "submitit",
+    "hydra/sweeper=optuna": "sweep-optuna",
+}
 
 
 def require_extra(module: str, extra: str) -> None:
@@ -42,6 +58,17 @@ def installing(extra: str) -> str:
     if (checkout / "pyproject.toml").is_file():
         return f"in {checkout}, pip install -e '.[{extra}]'"
     return f"pip install 'safe-rl-torch[{extra}]'"
+
+
+def hint_of_plugin(choice: str) -> str:
+    """A sentence on the extra that installs a plugin of Hydra, with its space, or nothing.
+
+    Examples:
+        >>> hint_of_plugin("hydra/launcher=basic")
+        ''
+    """
+    extra = _PLUGINS.get(choice)
+    return f" It comes with the extra '{extra}': {installing(extra)}" if extra else ""
 
 
 def import_extra(module: str, extra: str) -> Any:

@@ -28,6 +28,7 @@ from safe_rl.cli.user_code import check_imports, note_imports
 from safe_rl.envs import complete_env, store_configs
 from safe_rl.envs.errors import on_cpu_only
 from safe_rl.envs.families import hint_of_gymnasium
+from safe_rl.extras import hint_of_plugin
 from safe_rl.files import CONF, read_config, read_yaml
 from safe_rl.naming import did_you_mean
 from safe_rl.runs.folder import RunFolder
@@ -36,8 +37,8 @@ from safe_rl.runs.identity import flatten, role_of
 __all__ = ["compose_jobs", "compose_resumed", "hydra_on_conf", "resolving", "search_folders"]
 
 _LARGE = ("env", "algo", "preset")
-_STEPS = ("total_timesteps", "total_steps", "timesteps", "max_steps")  # elsewhere, for frames
 """Groups whose files differ in more than a few keys."""
+_STEPS = ("total_timesteps", "total_steps", "timesteps", "max_steps")  # elsewhere, for frames
 _ONE_EACH = ("env", "algo", "preset", "model", "risk", "collector", "logger", "lagrangian")
 _MOST_LISTED = 40
 _MISSING = object()
@@ -177,7 +178,7 @@ def _explain(error: Exception, texts: Sequence[str]) -> str:
     listed = f" There are {', '.join(known)}." if len(known) <= _MOST_LISTED else (
         " 'python train.py --help' names all there are."
     )  # fmt: skip
-    hint = hint_of_gymnasium(name) if group == "env" else ""
+    hint = hint_of_gymnasium(name) if group == "env" else hint_of_plugin(f"{group}={name}")
     file = re.match(r"In '(?!config')([^']+)'", words)
     if file and group != "preset" and f"preset={name}" in texts:  # which chose it
         return f"'preset={name}' is not for this algorithm: {file[1]} has no {group} '{name}'."

@@ -174,7 +174,7 @@ _CLOSED = ("algo", "model", "model.encoders", "model.memory", "logger", "checkpo
            "collector", "critics", "dataset", "evaluation", "exploration")  # fmt: skip
 """Sections whose keys are all in the table, unless they are a part."""
 _LIKENESS = 0.6
-"""Ratio of difflib's from which a key is taken for a misspelt one."""
+"""Likeness from which a key is taken for a misspelt one."""
 
 
 class _Node(NamedTuple):

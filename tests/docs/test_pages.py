@@ -121,11 +121,7 @@ def check(words: list[str], run: Path) -> None:
             if parsed.variations is not None and "my_" not in str(parsed.variations):
                 assert any(read_variations(parsed.variations))
         return
-    # Hydra does not say of which extra a launcher is
-    given = [
-        word for word in arguments if not word.startswith(("hydra/launcher=", "hydra.launcher."))
-    ]
-    read_command(given)
+    read_command(arguments)
 
 
 def check_all(found: list[list[str]], run: Path, page: str) -> None:
