@@ -6,6 +6,7 @@ import math
 import shutil
 import warnings
 from collections.abc import Iterable, Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -204,17 +205,6 @@ class CheckpointStore:
         return restored
 
     @staticmethod
-    def newest_step(directory: Path | str) -> int:
-        """Environment steps of the newest whole checkpoint in a folder, 0 if there is none."""
-        for path in reversed(checkpoints_in(Path(directory) / "last")):
-            try:
-                read_facts(path)
-            except CheckpointError:
-                continue
-            return checkpoint_steps(path) or 0
-        return 0
-
-    @staticmethod
     def load(
         path: Path, components: Mapping[str, Stateful], run: Mapping[str, Any] | None = None
     ) -> None:
@@ -240,8 +230,12 @@ class CheckpointStore:
 
 
 def is_finished(directory: Path, frames: int) -> bool:
-    """Whether the run in a folder is finished."""
-    return CheckpointStore.newest_step(RunFolder(directory).checkpoints) >= frames
+    """Whether the newest whole checkpoint of the run in a folder is after so many steps."""
+    for path in reversed(checkpoints_in(RunFolder(directory).checkpoints / "last")):
+        with suppress(CheckpointError):
+            read_facts(path)
+            return (checkpoint_steps(path) or 0) >= frames
+    return False
 
 
 def _clear_beginnings(directory: Path) -> None:

@@ -125,12 +125,6 @@ class RunFolder:
         return self.table.exists()
 
     @property
-    def is_untouched(self) -> bool:
-        """Whether nothing is here but the files of the lock."""
-        lock = (self.lock.name, self.lease.name)
-        return all(path.name in lock for path in self.directory.iterdir())
-
-    @property
     def num_rows(self) -> int:
         """Finished epochs in the table."""
         try:

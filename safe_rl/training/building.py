@@ -151,7 +151,7 @@ def initialise_networks(
 
     Raises:
         CheckpointError: If there is no checkpoint, it lacks a network, or its networks have other
-            sizes; nothing has been changed then.
+            shapes; nothing has been changed then.
     """
     if not source.exists():
         raise CheckpointError(f"init_from={source}: there is no such folder or file.")
@@ -165,7 +165,7 @@ def initialise_networks(
     _check_parts(taken, checkpoint)
     weights = read_states(checkpoint, taken)
     for name, network in taken.items():
-        _check_sizes(name, network.state_dict(), weights[name], checkpoint)
+        _check_shapes(name, network.state_dict(), weights[name], checkpoint)
     for name, network in taken.items():
         network.load_state_dict(weights[name])
     return list(taken)
@@ -204,55 +204,17 @@ def _check_parts(networks: Collection[str], checkpoint: Path) -> None:
         )
 
 
-def _check_sizes(
+def _check_shapes(
     name: str, own: Mapping[str, Any], given: Mapping[str, Any], checkpoint: Path
 ) -> None:
-    sizes = [_layer_sizes(weights) for weights in (own, given)]
-    if name == "actor" and _gives_spread_too(*sizes):
+    here, there = (
+        {key: tuple(value.shape) for key, value in weights.items() if isinstance(value, Tensor)}
+        for weights in (own, given)
+    )
+    if other := next((key for key in here | there if here.get(key) != there.get(key)), None):
         raise CheckpointError(
-            f"The actor of {checkpoint} has {sizes[1][-1]} outputs, this run's has {sizes[0][-1]}: "
-            "of as many actions one gives the mean, the other their spread, too, as SAC's does and "
-            "PPO's does not. init_from needs a run with these actions and this kind of actor."
+            f"The {name} of {checkpoint} does not fit this run's: the shape of {other} is "
+            f"{there.get(other, 'absent')} there and {here.get(other, 'absent')} here. init_from "
+            "needs a run with these observations and actions, and with this kind of actor: SAC's "
+            "gives a spread, too, PPO's does not. Set model.… and critics.… as in its config.yaml."
         )
-    if sizes[0] != sizes[1]:
-        raise CheckpointError(
-            f"The {name} of {checkpoint} has layers of {_arrows(sizes[1])} numbers, this run's has "
-            f"{_arrows(sizes[0])}: the first is the observation, the last the output. Observations "
-            "and actions must be those of the other run; for the others set model.hidden_sizes."
-        )
-    if set(own) != set(given):
-        raise CheckpointError(
-            f"The {name} of {checkpoint} scales or normalises its inputs and this run's does not, "
-            "or the other way round: set model.input_scale and model.normalise as in the other "
-            "run's config.yaml."
-        )
-    shapes = [_shapes(weights) for weights in (own, given)]
-    if other := next((key for key in own if shapes[0][key] != shapes[1][key]), None):
-        raise CheckpointError(
-            f"The {name} of {checkpoint} has a {other} of shape {shapes[1][other]}, this run's has "
-            f"{shapes[0][other]}: set model.… and critics.… as in the other run's config.yaml."
-        )
-
-
-def _gives_spread_too(own: list[int], given: list[int]) -> bool:
-    """Whether of two networks of the same observations one has twice the other's outputs."""
-    if not own or not given or own[0] != given[0]:
-        return False
-    few, many = sorted((own[-1], given[-1]))
-    return 2 * few == many
-
-
-def _shapes(weights: Mapping[str, Any]) -> dict[str, tuple[int, ...]]:
-    return {key: tuple(getattr(value, "shape", ())) for key, value in weights.items()}
-
-
-def _layer_sizes(weights: Mapping[str, Any]) -> list[int]:
-    """Numbers that go into a perceptron and come out of each of its layers."""
-    matrices = [
-        value for value in weights.values() if isinstance(value, Tensor) and value.ndim == 2
-    ]
-    return [matrices[0].shape[1], *(matrix.shape[0] for matrix in matrices)] if matrices else []
-
-
-def _arrows(sizes: list[int]) -> str:
-    return " → ".join(map(str, sizes))

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from pathlib import Path
 from signal import Signals
 from typing import Any, Protocol
 
@@ -139,16 +138,6 @@ class Trainer:
         if self._worlds is not None:
             parts["env"] = self._worlds
         return parts
-
-    def restore(self, checkpoint: Path) -> None:
-        """Continue from a checkpoint of a run with the same configuration.
-
-        Raises:
-            CheckpointError: If the file is no checkpoint, or does not fit this run.
-        """
-        CheckpointStore.load(checkpoint, self.components())
-        self._is_continued = True
-        self._begin_episodes()
 
     def resume(self) -> bool:
         """Continue the run in the folder from its newest checkpoint; if it has none, start over.

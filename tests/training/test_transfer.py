@@ -8,7 +8,7 @@ from omegaconf import OmegaConf
 from point_mass_runs import point_mass_trainer
 from torchrl.checkpoint import CheckpointError
 
-from safe_rl.models import QEnsemble, make_actor, make_bounded_actor, make_squashed_actor
+from safe_rl.models import QEnsemble, make_bounded_actor
 from safe_rl.runs.checkpoints import CheckpointStore
 from safe_rl.training.building import initialise_networks
 
@@ -72,9 +72,9 @@ def test_a_checkpoint_can_be_named(trained):
 @pytest.mark.parametrize(
     ("override", "message"),
     [
-        ("model.hidden_sizes=[8, 8]", r"4 → 16 → 2 numbers, this run's has 4 → 8 → 8 → 2"),
-        ("model.input_scale={position: 0.5}", "set model.input_scale"),
-        ("model.normalise=10", "set .*model.normalise as in the other"),
+        ("model.hidden_sizes=[8, 8]", r"is \(16, 4\) there and \(8, 4\) here.*Set model\."),
+        ("model.input_scale={position: 0.5}", "is absent there and .* here.*Set model"),
+        ("model.normalise=10", "is absent there and .* here.*Set model"),
     ],
 )
 def test_other_sizes_are_named_and_nothing_changes(trained, override, message):
@@ -94,21 +94,10 @@ def test_an_ensemble_of_another_number_is_named_and_nothing_changes(tmp_path):
     checkpoint = CheckpointStore(tmp_path, make(2), keep_last=1).save(10)
     networks = make(4)
     before = {k: v.clone() for k, v in networks["actor"].state_dict().items()}
-    with pytest.raises(CheckpointError, match=r"critic of .*shape \(2, .*this run's has \(4, "):
+    with pytest.raises(CheckpointError, match=r"critic of .* is \(2, .* there and \(4, "):
         initialise_networks(networks, checkpoint, [])
     after = networks["actor"].state_dict()
     assert all(torch.equal(after[key], value) for key, value in before.items())
-
-
-def test_an_actor_of_another_kind_is_not_one_of_other_sizes(tmp_path):
-    """SAC's has a spread for every observation, and its own widths, which are not what is wrong."""
-    low, high = -torch.ones(2), torch.ones(2)
-    sac = make_squashed_actor(3, low, high, hidden_sizes=[16])
-    ppo = make_actor(3, 2, hidden_sizes=[8], initial_log_std=0.0)
-    for first, second, numbers in ((ppo, sac, "2 outputs, this run's has 4"), (sac, ppo, "4 .* 2")):
-        store = CheckpointStore(tmp_path / numbers[0], {"actor": first}, keep_last=1)
-        with pytest.raises(CheckpointError, match=rf"{numbers}.*as SAC's does and PPO's does not"):
-            initialise_networks({"actor": second}, store.save(10), [])
 
 
 def test_what_a_run_has_not_learned_is_named(tmp_path):
@@ -118,14 +107,6 @@ def test_what_a_run_has_not_learned_is_named(tmp_path):
     networks = {"actor": actor, "critic": QEnsemble(3, 2, hidden_sizes=[8], num_networks=2)}
     with pytest.raises(CheckpointError, match=r"torchrl has no critic, which this run begins with"):
         initialise_networks(networks, clone, [])
-
-
-def test_an_actor_without_matrices_has_no_sizes_that_could_differ(tmp_path):
-    first, second = (torch.nn.LayerNorm(3) for _ in range(2))
-    torch.nn.init.uniform_(first.weight)
-    checkpoint = CheckpointStore(tmp_path, {"actor": first}, keep_last=1).save(10)
-    assert initialise_networks({"actor": second}, checkpoint, []) == ["actor"]
-    assert torch.equal(first.weight, second.weight)
 
 
 def test_a_folder_without_a_checkpoint(trained, tmp_path):
