@@ -148,9 +148,7 @@ class RunRecord:
 
     def rows(self) -> list[dict[str, float]]:
         """Return the epochs that are in the table, by column."""
-        if not self.folder.num_rows:
-            return []
-        table = read_table(self.folder.table)
+        table = read_table(self.folder.table) if self.folder.num_rows else {}
         return [dict(zip(table, row, strict=True)) for row in zip(*table.values(), strict=True)]
 
     def draw_curves(self) -> None:

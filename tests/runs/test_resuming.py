@@ -1,6 +1,5 @@
 """Runs that are killed and continued; what continues, what does not, and what it says."""
 
-import errno
 import multiprocessing
 import os
 import random
@@ -16,7 +15,7 @@ from point_mass import Forgetful, PointMass
 from point_mass_runs import point_mass_trainer as trainer_of_point_mass
 from run_configs import compose_config, point_mass_config, without_times
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
-from torchrl.checkpoint import Checkpoint, CheckpointError
+from torchrl.checkpoint import CheckpointError
 
 from safe_rl.envs import SafetyGymEnv, store_configs
 from safe_rl.runs.checkpoints import is_finished
@@ -178,31 +177,6 @@ def test_a_run_continued_with_what_cannot_train_keeps_its_configuration(tmp_path
     whole.resume()
     whole.run()
     assert len(read_table(tmp_path / "progress.csv")["steps"]) == 6
-
-
-def test_a_full_disk_ends_the_run_and_leaves_one_that_goes_on(tmp_path, monkeypatch):
-    point_mass_trainer(tmp_path / "whole").run()
-    trainer = point_mass_trainer(tmp_path / "run", "checkpoint.interval=0")
-    save = Checkpoint.save
-    saved = []
-
-    def fill(checkpoint, path, **options):
-        saved.append(path)
-        if len(saved) == 4:
-            path.with_name(f".{path.name}.archive-0").write_text("half")
-            raise OSError(errno.ENOSPC, "No space left on device")
-        return save(checkpoint, path, **options)
-
-    with monkeypatch.context() as patch:
-        patch.setattr(Checkpoint, "save", fill)
-        with pytest.raises(OSError, match="No space"):
-            trainer.run()
-    resumed = point_mass_trainer(tmp_path / "run")
-    assert resumed.resume()
-    resumed.run()
-    tables = [without_times(tmp_path / name / "progress.csv") for name in ("run", "whole")]
-    assert tables[0] == tables[1]
-    assert not list((tmp_path / "run").rglob("*.archive-*"))
 
 
 def test_a_second_process_does_not_touch_a_run_that_is_being_written(tmp_path):

@@ -90,13 +90,17 @@ def test_without_its_memory_it_says_so_and_fills_it_anew(make_trainer, tmp_path)
     assert table["policy_num_updates"] == [0, 8, 8, 8, 0, 8, 8, 8]
 
 
-def test_one_that_is_too_short_to_learn_does_not_go_on_from_a_dataset(make_trainer):
-    short = ["algo=sac", "memory.keep=false", "exploration.random_steps=2000"]
-    make_trainer("run", *short, "frames=160").run()
+def test_a_run_that_ends_before_it_learns_says_so(make_trainer):
+    short = ["algo=sac", "memory.keep=false", "exploration.random_steps=321"]
+    first = make_trainer("run", *short, "frames=160")
+    said = "Nothing will be learned: exploration.random_steps=321 come first, and the run has 160."
+    assert first.algorithm.learns_from == said
+    first.run()
     resumed = make_trainer("run", *short, "frames=320")
     assert resumed.resume()
     assert "Nothing will be learned" in resumed.algorithm.learns_from
-    assert "when it holds 2,000 new ones" in resumed.algorithm.lost_on_resume
+    assert "when it holds 321 new ones" in resumed.algorithm.lost_on_resume
+    assert make_trainer("longer", *short, "frames=480").algorithm.learns_from == ""
 
 
 def test_the_update_to_data_ratio_holds_for_fractions(make_trainer, tmp_path):
@@ -237,20 +241,24 @@ def test_it_is_evaluated_in_between_without_noise_and_without_consequences(tmp_p
     assert evaluated["evaluation_cost"][-1] == expected.costs["cost"].mean().item()
 
 
-def test_a_memory_that_never_holds_enough_is_refused():
-    config = off_policy_config("algo=sac", "memory.capacity=100")
-    with pytest.raises(ValueError, match=r"must hold exploration.random_steps=160"):
-        OffPolicy.build(config, PointMass(2))
-    with pytest.raises(ValueError, match=r"risk: algo=sac_lagrangian limits mean costs only"):
-        OffPolicy.build(off_policy_config("algo=sac_lagrangian", "risk=cvar"), PointMass(2))
+@pytest.mark.parametrize(
+    ("overrides", "message"),
+    [
+        (["algo=sac", "memory.capacity=100"], "must hold exploration.random_steps=160"),
+        (["algo=sac_lagrangian", "risk=cvar"], "risk: algo=sac_lagrangian limits mean costs only"),
+        (["algo=sac_lagrangian", "cost_limits={}"], "Without constraints use algo=sac"),
+        *(
+            (["algo=sac_lagrangian", f"{key}=0"], rf"^{key}=0: algo=sac_lagrangian.*, as {key}=2")
+            for key in ("critics.rewards", "critics.costs")
+        ),
+    ],
+)
+def test_what_could_not_learn_is_refused(overrides, message):
+    with pytest.raises(ValueError, match=message):
+        OffPolicy.build(off_policy_config(*overrides), PointMass(2))
 
 
-@pytest.mark.parametrize("key", ["critics.rewards", "critics.costs"])
-def test_q_functions_that_are_learned_are_there(key):
-    both = "cost_limits={cost: 25, cost_north: 5}"
-    config = off_policy_config("algo=sac_lagrangian", f"{key}=0", both)
-    with pytest.raises(ValueError, match=rf"^{key}=0: algo=sac_lagrangian.*, as {key}=2\.$"):
-        OffPolicy.build(config, PointMass(2))
+def test_without_limits_no_critics_of_costs_are_needed():
     OffPolicy.build(off_policy_config("algo=sac", "critics.costs=0"), PointMass(2))
 
 
@@ -270,11 +278,6 @@ def test_what_is_held_against_the_limit_is_the_mean_of_the_worst_episodes(make_t
     assert rows[-1]["violation_cost"] == pytest.approx(rows[-1]["estimate_cost"] - 25.0)
 
 
-def test_a_constrained_one_needs_a_limit():
-    with pytest.raises(ValueError, match="Without constraints use algo=sac"):
-        OffPolicy.build(off_policy_config("algo=sac_lagrangian", "cost_limits={}"), PointMass(2))
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("algo", ["sac_lagrangian", "td3_lagrangian"])
 def test_it_learns_to_go_around_a_hazard(algo, tmp_path):
@@ -292,11 +295,3 @@ def test_it_learns_to_go_around_a_hazard(algo, tmp_path):
     episodes = collect_episodes(env, trainer.algorithm.policy, 40, ["cost"], deterministic=True)
     assert episodes.returns.mean() > 0.9
     assert episodes.costs["cost"].mean() < 1.5
-
-
-def test_a_run_that_ends_before_it_learns_says_so(make_trainer):
-    short = make_trainer("short", "algo=sac", "frames=320", "exploration.random_steps=321")
-    said = "Nothing will be learned: exploration.random_steps=321 come first, and the run has 320."
-    assert short.algorithm.learns_from == said
-    enough = make_trainer("longer", "algo=sac", "frames=320", "exploration.random_steps=320")
-    assert enough.algorithm.learns_from == ""

@@ -53,6 +53,14 @@ def offline_config(folder, *overrides, algo="bc", limits="{cost: 1}"):
     )
 
 
+def recorded_config(*overrides):
+    """Of a run that writes what it collects."""
+    return compose_config(
+        *("env=PointMass", "logger=none", "record=true", "num_envs=4", "frames_per_batch=160"),
+        *("model.hidden_sizes=[16]", "algo=ppo", *overrides),
+    )
+
+
 def make_trainer(config, directory):
     seed_everything(config.seed, None)
     return build_trainer(config, PointMass(config.num_envs, 20, config.seed), directory)
@@ -87,10 +95,7 @@ def test_it_goes_on_as_if_it_had_never_stopped(tmp_path):
 
 @pytest.mark.parametrize("algo", ["ppo_lagrangian", "sac_lagrangian"])
 def test_a_run_that_is_recorded_can_be_learned_from(algo, tmp_path):
-    sizes = ["num_envs=4", "frames_per_batch=160", "model.hidden_sizes=[16]", "logger=none"]
-    keys = ["env=PointMass", f"algo={algo}", "frames=480", "record=true", *sizes]
-    config = compose_config(*keys)
-    trainer = make_trainer(config, tmp_path / "run")
+    trainer = make_trainer(recorded_config(f"algo={algo}", "frames=480"), tmp_path / "run")
     collected, update = [], trainer.accounting.update
     trainer.accounting.update = lambda batch: (collected.append(batch.clone()), update(batch))[1]
     trainer.run()
@@ -109,10 +114,8 @@ def test_a_run_that_is_recorded_can_be_learned_from(algo, tmp_path):
 
 
 def test_a_run_that_goes_on_records_what_it_does_again(tmp_path):
-    keys = ["env=PointMass", "algo=ppo", "frames=480", "logger=none", "record=true"]
-    keys += ["num_envs=4", "frames_per_batch=160", "model.hidden_sizes=[16]"]
-    make_trainer(compose_config(*keys), tmp_path / "whole").run()
-    make_trainer(compose_config(*keys, "frames=160"), tmp_path / "halves").run()
+    make_trainer(recorded_config("frames=480"), tmp_path / "whole").run()
+    make_trainer(recorded_config("frames=160"), tmp_path / "halves").run()
     # of a process that was killed before it could write a checkpoint, and was to be a longer run
     ahead = tmp_path / "halves" / "transitions"
     for number in (1, 2, 3):
@@ -122,7 +125,7 @@ def test_a_run_that_goes_on_records_what_it_does_again(tmp_path):
                 "observation", "reward", "done", "terminated", "truncated",
             )},
         ))  # fmt: skip
-    resumed = make_trainer(compose_config(*keys), tmp_path / "halves")
+    resumed = make_trainer(recorded_config("frames=480"), tmp_path / "halves")
     assert resumed.resume()
     resumed.run()
     whole, halves = (read_recording(tmp_path / n / "transitions") for n in ("whole", "halves"))
@@ -135,9 +138,8 @@ def test_whole_episodes_of_a_recording_are_those_of_the_table(kind, staggered, t
     """Not those that began before it, nor those that a run left open when it was interrupted."""
 
     def build(frames):
-        keys = ["env=PointMass", "algo=ppo", f"frames={frames}", "logger=none", "record=true"]
-        keys += ["num_envs=4", "frames_per_batch=200", "model.hidden_sizes=[16]"]
-        config = compose_config(*keys, f"staggered_starts={staggered}")
+        keys = [f"frames={frames}", "frames_per_batch=200", f"staggered_starts={staggered}"]
+        config = recorded_config(*keys)
         seed_everything(config.seed, None)
         return build_trainer(config, kind(4, 20, config.seed), tmp_path)
 
@@ -159,10 +161,8 @@ def test_recording_may_begin_within_episodes(tmp_path):
     """Of a run that goes on where it was, and was not recorded until then."""
 
     def build(frames, record):
-        keys = ["env=PointMass", "algo=ppo", f"frames={frames}", "logger=none", f"record={record}"]
-        keys += ["num_envs=4", "frames_per_batch=200", "staggered_starts=null"]
-        config = compose_config(*keys, "model.hidden_sizes=[16]")
-        return make_trainer(config, tmp_path)
+        keys = [f"frames={frames}", f"record={record}", "frames_per_batch=200"]
+        return make_trainer(recorded_config(*keys, "staggered_starts=null"), tmp_path)
 
     build(200, "false").run()
     resumed = build(600, "true")

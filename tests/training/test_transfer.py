@@ -1,5 +1,6 @@
 """Starting from trained networks: what is taken over, and what does not fit."""
 
+import copy
 from pathlib import Path
 
 import pytest
@@ -15,9 +16,10 @@ from safe_rl.training.building import initialise_networks
 pytestmark = pytest.mark.long
 
 
-@pytest.fixture
-def trained(tmp_path):
-    trainer = point_mass_trainer(tmp_path / "first", "frames=320")
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory):
+    """A run of two epochs, which no test changes."""
+    trainer = point_mass_trainer(tmp_path_factory.mktemp("trained") / "first", "frames=320")
     trainer.run()
     return trainer
 
@@ -27,12 +29,24 @@ def same(first, second):
     return all(torch.equal(a, b) for a, b in pairs)
 
 
-def take_over(trained, *overrides):
-    fresh = point_mass_trainer(trained.record.directory.parent / "second", "seed=1", *overrides)
+def make_fresh(trained, *overrides):
+    return point_mass_trainer(trained.record.directory.parent / "second", "seed=1", *overrides)
+
+
+def take_over(trained, *overrides, source=None):
+    fresh = make_fresh(trained, *overrides)
     networks, algorithm = fresh.algorithm.networks, fresh.algorithm
     assert not same(networks["actor"], trained.algorithm.actor)
-    taken = initialise_networks(networks, trained.record.directory, list(algorithm.cost_keys))
-    return fresh, taken
+    source = source or trained.record.directory
+    return fresh, initialise_networks(networks, source, list(algorithm.cost_keys))
+
+
+def refuse(networks, source, match, cost_keys=()):
+    """The networks do not fit, which the message says, and they stay as they were."""
+    before = {name: copy.deepcopy(network) for name, network in networks.items()}
+    with pytest.raises(CheckpointError, match=match):
+        initialise_networks(networks, source, cost_keys)
+    assert all(same(before[name], network) for name, network in networks.items())
 
 
 def test_all_networks_are_taken_over_and_nothing_else(trained):
@@ -63,9 +77,7 @@ def test_the_cost_critic_stays_new_where_the_costs_are_others(trained, overrides
 
 
 def test_a_checkpoint_can_be_named(trained):
-    path = trained.record.folder.newest_checkpoint()
-    fresh = point_mass_trainer(trained.record.directory.parent / "second", "seed=1")
-    initialise_networks(fresh.algorithm.networks, path, ["cost"])
+    fresh, _ = take_over(trained, source=trained.record.folder.newest_checkpoint())
     assert same(fresh.algorithm.networks["actor"], trained.algorithm.actor)
 
 
@@ -78,12 +90,8 @@ def test_a_checkpoint_can_be_named(trained):
     ],
 )
 def test_other_sizes_are_named_and_nothing_changes(trained, override, message):
-    fresh = point_mass_trainer(trained.record.directory.parent / "second", "seed=1", override)
-    before = {k: v.clone() for k, v in fresh.algorithm.actor.state_dict().items()}
-    with pytest.raises(CheckpointError, match=message):
-        initialise_networks(fresh.algorithm.networks, trained.record.directory, ["cost"])
-    after = fresh.algorithm.actor.state_dict()
-    assert all(torch.equal(after[key], value) for key, value in before.items())
+    networks = make_fresh(trained, override).algorithm.networks
+    refuse(networks, trained.record.directory, message, ["cost"])
 
 
 def test_an_ensemble_of_another_number_is_named_and_nothing_changes(tmp_path):
@@ -92,12 +100,7 @@ def test_an_ensemble_of_another_number_is_named_and_nothing_changes(tmp_path):
         return {"actor": actor, "critic": QEnsemble(3, 2, hidden_sizes=[8], num_networks=number)}
 
     checkpoint = CheckpointStore(tmp_path, make(2), keep_last=1).save(10)
-    networks = make(4)
-    before = {k: v.clone() for k, v in networks["actor"].state_dict().items()}
-    with pytest.raises(CheckpointError, match=r"critic of .* is \(2, .* there and \(4, "):
-        initialise_networks(networks, checkpoint, [])
-    after = networks["actor"].state_dict()
-    assert all(torch.equal(after[key], value) for key, value in before.items())
+    refuse(make(4), checkpoint, r"critic of .* is \(2, .* there and \(4, ")
 
 
 def test_what_a_run_has_not_learned_is_named(tmp_path):
@@ -105,8 +108,7 @@ def test_what_a_run_has_not_learned_is_named(tmp_path):
     actor = make_bounded_actor(3, -torch.ones(2), torch.ones(2), hidden_sizes=[8])
     clone = CheckpointStore(tmp_path, {"actor": actor}, keep_last=1).save(10)
     networks = {"actor": actor, "critic": QEnsemble(3, 2, hidden_sizes=[8], num_networks=2)}
-    with pytest.raises(CheckpointError, match=r"torchrl has no critic, which this run begins with"):
-        initialise_networks(networks, clone, [])
+    refuse(networks, clone, "torchrl has no critic, which this run begins with")
 
 
 def test_a_folder_without_a_checkpoint(trained, tmp_path):
