@@ -60,9 +60,7 @@ class TableWriter:
         """Append a row."""
         if self._columns is None:
             self._columns = list(row)
-            self._writer.writerow(self._columns)
-            self._file.flush()
-            self._size = self._file.tell()
+            self._append(self._columns)
         if list(row) != self._columns:
             unexpected = sorted(set(row).symmetric_difference(self._columns))
             raise TableError(
@@ -71,12 +69,15 @@ class TableWriter:
                 "put it back; a diagnostic is reported in every epoch, as NaN where it does not "
                 "exist."
             )
+        self._append([_field(value) for value in row.values()])
+
+    def _append(self, fields: Sequence[str]) -> None:
         if os.fstat(self._file.fileno()).st_size != self._size:
             raise TableError(
                 f"{self._path} has been changed by another program while the run was writing it: "
                 "put its rows back to continue the run."
             )
-        self._writer.writerow([_field(value) for value in row.values()])
+        self._writer.writerow(fields)
         self._file.flush()
         self._size = self._file.tell()
 

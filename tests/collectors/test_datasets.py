@@ -37,7 +37,7 @@ def test_a_recording_is_what_was_collected(tmp_path):
     recording = Recording(tmp_path, PointMass.cost_keys)
     for number, batch in enumerate(batches):
         recording.write(number, batch)
-    recording.write(1, batches[1])  # by a run that was interrupted and goes on
+    recording.write(1, batches[1])  # by a run that was interrupted and resumed
     found, expected = read_recording(tmp_path), torch.cat(batches, -1)
     assert found.shape == (4, 75)
     for key in ("observation", "action", ("next", "observation"), ("next", "cost_north")):

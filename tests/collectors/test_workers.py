@@ -104,7 +104,7 @@ def test_batches_follow_the_weights_until_a_worker_dies():
         noise = (batch["action"] - batch["loc"])[:, 0, 0]
         assert len(set(noise.tolist())) == 4
         if previous is not None:
-            # rows go on where they were, unless their episode of 30 steps has ended
+            # rows continue where they were, unless their episode of 30 steps has ended
             kept = ~previous["next", "done"][:, -1, 0]
             assert torch.equal(
                 batch["observation"][kept, 0], previous["next", "observation"][kept, -1]

@@ -76,7 +76,7 @@ def test_without_git_a_run_is_noted_all_the_same(found, tmp_path, monkeypatch):
     assert entry == {"steps": 0, "version": safe_rl.__version__, "commit": None, "changed": None}
 
 
-def test_code_that_goes_on_with_a_run_stands_below_what_began_it(tmp_path, monkeypatch):
+def test_code_that_resumes_a_run_stands_below_what_began_it(tmp_path, monkeypatch):
     path = tmp_path / "code.json"
 
     def noted(commit, steps):

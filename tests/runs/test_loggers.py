@@ -21,7 +21,7 @@ def train(directory, *overrides):
     trainer.run()
 
 
-def test_mlflow_holds_the_table_and_goes_on_in_the_same_run(tmp_path):
+def test_mlflow_holds_the_table_and_continues_the_same_run(tmp_path):
     mlflow = pytest.importorskip("mlflow")
     pytest.importorskip("sqlalchemy", reason="only the whole of MLflow has its own database")
     uri = f"sqlite:///{tmp_path}/mlflow.db"

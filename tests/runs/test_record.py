@@ -141,7 +141,7 @@ def test_a_measure_of_ones_own_is_what_is_held_against_the_limit(tmp_path, capsy
     assert "cost=89.0/25" in capsys.readouterr().err
 
 
-def test_a_continued_table_goes_on_after_its_epoch(tmp_path):
+def test_a_continued_table_resumes_after_its_epoch(tmp_path):
     config = compose_config("env=PointMass", "logger=none")
     record = RunRecord(tmp_path, config, {"cost": 25.0}, 1000)
     with record.writing():

@@ -198,7 +198,7 @@ def test_a_second_process_does_not_touch_a_run_that_is_being_written(tmp_path):
     assert steps == [120.0 * (i + 1) for i in range(len(steps))]
 
 
-def test_a_longer_run_goes_on_from_the_end(tmp_path):
+def test_a_longer_run_resumes_from_the_end(tmp_path):
     point_mass_trainer(tmp_path, "frames=640").run()
     assert is_finished(tmp_path, 640)
     assert not is_finished(tmp_path, 641)

@@ -1,4 +1,4 @@
-"""Runs that learn from memory, killed at any moment and continued from the command line."""
+"""Runs that learn from a replay buffer, killed at any moment and resumed by command."""
 
 import os
 import signal
@@ -53,7 +53,7 @@ def kill_after_rows(process, directory, number):
         ["algo=cal"],
     ],
 )
-def test_a_killed_run_that_keeps_its_memory_leaves_the_table_of_one_that_was_not(
+def test_a_killed_run_that_keeps_its_replay_buffer_leaves_the_table_of_one_that_was_not(
     overrides, tmp_path
 ):
     keys = [*SMALL, *overrides, "memory.keep=true"]
@@ -73,7 +73,7 @@ def test_a_killed_run_that_keeps_its_memory_leaves_the_table_of_one_that_was_not
 
 
 @pytest.mark.slow
-def test_a_killed_run_without_its_memory_says_what_is_lost(tmp_path):
+def test_a_killed_run_without_its_replay_buffer_says_what_is_lost(tmp_path):
     keys = [*SMALL, "algo=sac_lagrangian", "checkpoint.interval=0", f"hydra.run.dir={tmp_path}"]
     kill_after_rows(command(*keys), tmp_path, 4)
     before = (tmp_path / "progress.csv").read_text().splitlines()[:4]

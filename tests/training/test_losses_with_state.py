@@ -57,12 +57,12 @@ def _trainer(folder, algo, loss, frames, *overrides):
 @pytest.mark.parametrize(
     ("algo", "loss"), [("ppo_lagrangian", "RememberingPPO"), ("trpo_lagrangian", "RememberingTRPO")]
 )
-def test_a_resumed_run_goes_on_with_it(tmp_path, algo, loss):
+def test_a_resumed_run_restores_it(tmp_path, algo, loss):
     make = lambda name, *first: _trainer(tmp_path / name, algo, loss, 640, *first)  # noqa: E731
     assert_resumes_exactly(make, tmp_path, "frames=320")
 
 
-def test_coefficients_are_those_of_the_run_that_goes_on(tmp_path):
+def test_coefficients_are_those_of_the_resumed_run(tmp_path):
     given = ("ppo_lagrangian", "RememberingPPO")
     _trainer(tmp_path, *given, 320).run()
     resumed = _trainer(tmp_path, *given, 640, "loss.clip_epsilon=0.05", "loss.entropy_coeff=0.5")

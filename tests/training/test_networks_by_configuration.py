@@ -75,7 +75,7 @@ def test_workers_normalise_as_the_first_process_does(tmp_path):
 
 
 @pytest.mark.parametrize("choice", ["model.normalise=10", "model=dict", "model=gru"])
-def test_learning_from_memory_takes_perceptrons_alone(choice):
+def test_off_policy_algorithms_take_perceptrons_alone(choice):
     config = compose_config("algo=sac", "env=PointGoal1", choice)
     with pytest.raises(ValueError, match=r"algo=sac.*model\.\w+ is for on-policy algorithms"):
         find_recipe(config).build(config, make_env("PointGoal1", num_envs=2, seed=0))
@@ -96,7 +96,7 @@ def test_a_memory_recalls_what_was_shown_once(model, lowest, highest, tmp_path):
 
 
 def test_workers_of_a_resumed_run_do_not_begin_with_its_first_episodes_again(tmp_path):
-    """They have no worlds to go on with, and get new ones."""
+    """They have no stored worlds, and get new ones."""
     keys = ("env=PointGoal1", "collector=process", "collector.num_collectors=1", "record=true")
     run_train(*SMALL, *PPO, *keys, "frames=160", f"hydra.run.dir={tmp_path}")
     run_train(f"resume={tmp_path}", "frames=320")

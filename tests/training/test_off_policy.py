@@ -1,4 +1,4 @@
-"""Runs that learn from memory: they learn, resume, start from one another and are evaluated."""
+"""Runs with a replay buffer: they learn, resume, start from one another and are evaluated."""
 
 import math
 from functools import partial
@@ -69,14 +69,16 @@ def test_it_writes_a_run(algo, make_trainer, tmp_path):
         ["algo=td3_lagrangian", "memory.prioritised={alpha: 0.6, beta: 0.4}"],
     ],
 )
-def test_it_goes_on_with_its_memory_as_if_it_had_never_stopped(overrides, make_trainer, tmp_path):
+def test_it_resumes_with_its_replay_buffer_as_if_it_had_never_stopped(
+    overrides, make_trainer, tmp_path
+):
     half = [] if "limits/replay@limits=paper" in overrides else ["limits.frames=1280"]
     make = lambda name, *first: make_trainer(name, *first, *overrides)  # noqa: E731
     resumed = assert_resumes_exactly(make, tmp_path, "frames=640", *half)
     assert resumed.algorithm.lost_on_resume == ""
 
 
-def test_without_its_memory_it_says_so_and_fills_it_anew(make_trainer, tmp_path):
+def test_without_its_replay_buffer_it_says_so_and_fills_a_new_one(make_trainer, tmp_path):
     forgetful = ["algo=sac_lagrangian", "memory.keep=false"]
     make_trainer("run", *forgetful, "frames=640", "exploration.random_steps=200").run()
     resumed = make_trainer("run", *forgetful, "exploration.random_steps=200")
@@ -106,7 +108,7 @@ def test_a_run_that_ends_before_it_learns_says_so(make_trainer):
 def test_the_update_to_data_ratio_holds_for_fractions(make_trainer, tmp_path):
     make_trainer("run", "algo=sac", "policy_update.updates_per_step=0.021").run()
     table = read_table(tmp_path / "run" / "progress.csv")
-    # 3.36 of an epoch: the first one's are due as well, the memory being full enough
+    # 3.36 of an epoch: the first one's are due as well, the replay buffer being full enough
     assert sum(table["policy_num_updates"]) == int(8 * 160 * 0.021) == 26
     assert set(table["policy_num_updates"]) == {3, 4}
 

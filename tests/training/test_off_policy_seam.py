@@ -126,5 +126,5 @@ def test_its_run_is_written_transferred_and_evaluated(make_trainer, tmp_path):
     assert episodes.lengths.tolist() == [20, 20, 20]
 
 
-def test_it_goes_on_with_its_buffer_as_if_it_had_never_stopped(make_trainer, tmp_path):
+def test_it_resumes_with_its_buffer_as_if_it_had_never_stopped(make_trainer, tmp_path):
     assert_resumes_exactly(make_trainer, tmp_path, "frames=640")

@@ -87,7 +87,7 @@ def test_what_is_cloned_are_the_safe_episodes(tmp_path):
     assert len(trainer.algorithm.memory) == 160  # nothing of what it did itself
 
 
-def test_it_goes_on_as_if_it_had_never_stopped(tmp_path):
+def test_it_resumes_as_if_it_had_never_stopped(tmp_path):
     data = record(tmp_path / "data", head_south)
     make = lambda name, *first: make_trainer(offline_config(data, *first), tmp_path / name)  # noqa: E731
     assert assert_resumes_exactly(make, tmp_path, "frames=640").algorithm.lost_on_resume == ""
@@ -113,7 +113,7 @@ def test_a_run_that_is_recorded_can_be_learned_from(algo, tmp_path):
     assert actions.abs().max() <= 1
 
 
-def test_a_run_that_goes_on_records_what_it_does_again(tmp_path):
+def test_a_resumed_run_records_again_what_it_repeats(tmp_path):
     make_trainer(recorded_config("frames=480"), tmp_path / "whole").run()
     make_trainer(recorded_config("frames=160"), tmp_path / "halves").run()
     # of a process that was killed before it could write a checkpoint, and was to be a longer run
@@ -158,7 +158,7 @@ def test_whole_episodes_of_a_recording_are_those_of_the_table(kind, staggered, t
 
 
 def test_recording_may_begin_within_episodes(tmp_path):
-    """Of a run that goes on where it was, and was not recorded until then."""
+    """Of a resumed run that was not recorded until then."""
 
     def build(frames, record):
         keys = [f"frames={frames}", f"record={record}", "frames_per_batch=200"]

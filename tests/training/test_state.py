@@ -53,14 +53,14 @@ def test_a_signal_in_the_last_epoch_interrupts_nothing(tmp_path):
 
 
 @pytest.fixture
-def heeding_interrupts():
+def interrupts_are_not_ignored():
     """What a shell runs in the background ignores them."""
     before = signal.signal(signal.SIGINT, signal.default_int_handler)
     yield
     signal.signal(signal.SIGINT, before)
 
 
-@pytest.mark.usefixtures("heeding_interrupts")
+@pytest.mark.usefixtures("interrupts_are_not_ignored")
 def test_a_second_interrupt_acts_at_once():
     with StopRequest() as stop:
         signal.raise_signal(signal.SIGINT)
@@ -82,7 +82,7 @@ def test_signals_are_left_alone_outside_the_main_thread():
     assert received == [None]
 
 
-def test_a_run_that_a_terminal_must_not_end_goes_on():
+def test_a_run_that_a_terminal_must_not_end_continues():
     before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
     try:
         with StopRequest() as stop:

@@ -168,7 +168,7 @@ def test_the_folder_of_a_run(tmp_path):
         "score": pytest.approx(means[best]),
         "run": {"environment": "PointMass", "algorithm": "ppo_lagrangian", "seed": 0},
     }
-    # what acts, and not what going on takes
+    # what acts, and not what only resuming needs
     kept, last = (
         set(Checkpoint.manifest(file)["components"])
         for file in (path, max((tmp_path / "checkpoints" / "last").iterdir()))

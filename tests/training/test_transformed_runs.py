@@ -43,7 +43,7 @@ def make_trainer(directory, *overrides, minibatch_size=40):
     ],
     ids=["budgets", "noise", "repeats"],
 )
-def test_an_interrupted_run_goes_on_exactly(tmp_path, transforms):
+def test_an_interrupted_run_resumes_exactly(tmp_path, transforms):
     # 50 steps a batch: episodes of 20 are open at every checkpoint
     options = ["algo=ppo", "cost_limits={cost: 2}", "frames_per_batch=200"]
     options += [f"transforms=[{transforms}]"]
