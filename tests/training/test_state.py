@@ -10,16 +10,21 @@ from safe_rl.runs.table import read_table
 from safe_rl.training.state import StopRequest
 
 
-def test_a_signal_ends_the_run_after_the_epoch_with_a_checkpoint(tmp_path):
-    trainer = point_mass_trainer(tmp_path, "frames=100_000_000")
+def signal_in(trainer, epoch):
+    """Let a signal come while an epoch is recorded."""
     record = trainer.record.add
 
     def record_and_signal(row):
         record(row)
-        if row["epoch"] == 3:
+        if row["epoch"] == epoch:
             signal.raise_signal(signal.SIGTERM)
 
     trainer.record.add = record_and_signal
+
+
+def test_a_signal_ends_the_run_after_the_epoch_with_a_checkpoint(tmp_path):
+    trainer = point_mass_trainer(tmp_path, "frames=100_000_000")
+    signal_in(trainer, epoch=3)
     handler = signal.getsignal(signal.SIGTERM)
     trainer.run()
     assert signal.getsignal(signal.SIGTERM) is handler
@@ -40,13 +45,7 @@ def test_a_signal_before_the_first_epoch_lets_it_end(tmp_path):
 
 def test_a_signal_in_the_last_epoch_interrupts_nothing(tmp_path):
     trainer = point_mass_trainer(tmp_path, "frames=160")
-    record = trainer.record.add
-
-    def record_and_signal(row):
-        record(row)
-        signal.raise_signal(signal.SIGTERM)
-
-    trainer.record.add = record_and_signal
+    signal_in(trainer, epoch=1)
     trainer.run()
     assert trainer.progress.steps == 160
     assert trainer.interrupted_by is None
