@@ -174,12 +174,11 @@ def _settings_of_names(
     all apart, everything that differs.
     """
     found: dict[Path, tuple[Settings, Settings]] = {}
-    for algorithm in {run.algorithm for run in runs}:
-        settings = {run.directory: _settings(run) for run in runs if run.algorithm == algorithm}
-        cells: dict[str, list[Run]] = defaultdict(list)
-        for run in runs:
-            if run.algorithm == algorithm:
-                cells[environments[run.directory]].append(run)
+    by_algorithm: dict[str, dict[str, list[Run]]] = defaultdict(lambda: defaultdict(list))
+    for run in runs:
+        by_algorithm[run.algorithm][environments[run.directory]].append(run)
+    for cells in by_algorithm.values():
+        settings = {run.directory: _settings(run) for own in cells.values() for run in own}
         # an experiment may train longer on one environment than on another
         anywhere = [{**own, "frames": None} for own in settings.values()]
         by_cell = [[settings[run.directory] for run in own] for own in cells.values()]

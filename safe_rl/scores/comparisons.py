@@ -137,9 +137,7 @@ def _with_constants(
 
 def mean(values: ArrayLike) -> Estimate:
     """Mean of independent values, shape [n]."""
-    values = np.asarray(values, dtype=float)
-    low, high = bootstrap([values], np.mean)
-    return Estimate(float(values.mean()), float(low), float(high))
+    return _estimate([values], np.mean)
 
 
 def interquartile_mean(strata: Sequence[ArrayLike]) -> Estimate:
@@ -152,13 +150,18 @@ def interquartile_mean(strata: Sequence[ArrayLike]) -> Estimate:
         >>> interquartile_mean([[0.0, 1.0], [2.0, 99.0]]).value
         1.5
     """
+
+    def trimmed_mean(*samples: np.ndarray, axis: int) -> np.ndarray:
+        return scipy.stats.trim_mean(np.concatenate(samples, axis=axis), 0.25, axis=axis)
+
+    return _estimate(strata, trimmed_mean)
+
+
+def _estimate(strata: Sequence[ArrayLike], statistic: Callable[..., Any]) -> Estimate:
+    """A statistic of strata [n_i] and its bootstrap interval."""
     samples = [np.asarray(stratum, dtype=float) for stratum in strata]
-    low, high = bootstrap(samples, _trimmed_mean)
-    return Estimate(float(_trimmed_mean(*samples)), float(low), float(high))
-
-
-def _trimmed_mean(*samples: np.ndarray, axis: int = -1) -> np.ndarray:
-    return scipy.stats.trim_mean(np.concatenate(samples, axis=axis), 0.25, axis=axis)
+    low, high = bootstrap(samples, statistic)
+    return Estimate(float(statistic(*samples, axis=-1)), float(low), float(high))
 
 
 def cvar(values: ArrayLike, alpha: float) -> Estimate:
@@ -174,16 +177,15 @@ def cvar(values: ArrayLike, alpha: float) -> Estimate:
         3.5
     """
     check_share(alpha)
-    values = np.asarray(values, dtype=float)
-    size = alpha * len(values)
+    number = np.size(values)
+    size = alpha * number
 
-    def tail_mean(sample: np.ndarray, axis: int = -1) -> np.ndarray:
+    def tail_mean(sample: np.ndarray, axis: int) -> np.ndarray:
         largest = -np.sort(-sample, axis=axis)
-        weights = np.clip(size - np.arange(len(values)), 0.0, 1.0)
+        weights = np.clip(size - np.arange(number), 0.0, 1.0)
         return (largest * weights).sum(axis) / size
 
-    low, high = bootstrap([values], tail_mean)
-    return Estimate(float(tail_mean(values)), float(low), float(high))
+    return _estimate([values], tail_mean)
 
 
 def check_share(alpha: float) -> None:

@@ -20,10 +20,8 @@ from safe_rl.evaluation.variations import Variation, varied
     [
         (["epsiodes=3"], "Did you mean 'episodes'?"),
         (["env.hazard_num=3"], "hazards_num"),
-        (["episodes=0"], "episodes=0"),
         (["checkpoint=there.torchrl"], "checkpoint is last, best, certified or the path"),
         (["env.lidar_num_bins=8"], "trained on other observations"),
-        (["cvar_alpha=2"], "cvar_alpha"),
         (["variations=sensing", "record=true"], "cannot be combined with video=true"),
         (["variations=dynamic"], "Did you mean 'dynamics'"),
         (["variations=nowhere.yaml"], "No such file or directory: 'nowhere.yaml'"),
