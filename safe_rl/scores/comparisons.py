@@ -177,15 +177,16 @@ def cvar(values: ArrayLike, alpha: float) -> Estimate:
         3.5
     """
     check_share(alpha)
-    number = np.size(values)
+    sample = np.asarray(values, dtype=float)
+    number = len(sample)
     size = alpha * number
 
-    def tail_mean(sample: np.ndarray, axis: int) -> np.ndarray:
-        largest = -np.sort(-sample, axis=axis)
+    def tail_mean(resampled: np.ndarray, axis: int) -> np.ndarray:
+        largest = -np.sort(-resampled, axis=axis)
         weights = np.clip(size - np.arange(number), 0.0, 1.0)
         return (largest * weights).sum(axis) / size
 
-    return _estimate([values], tail_mean)
+    return _estimate([sample], tail_mean)
 
 
 def check_share(alpha: float) -> None:
