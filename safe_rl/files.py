@@ -10,10 +10,11 @@ import json
 import os
 import re
 import secrets
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
+from zipfile import ZipFile
 
 import yaml
 
@@ -22,12 +23,13 @@ __all__ = [
         "CONF",
         "check_no_links",
         "check_place",
+        "load_tensors",
         "read_bounded",
         "read_config",
         "read_json",
         "read_yaml",
     ),
-    *("read_yaml", "replace_csv", "replace_text", "replacing"),
+    *("replace_csv", "replace_text", "replacing", "save_tensors"),
 ]
 
 _PACKAGED = Path(__file__).parent / "conf"
@@ -214,6 +216,60 @@ def replace_csv(path: Path, rows: Iterable[Iterable[Any]]) -> None:
     """Write a CSV file, its header being the first of the rows, by :func:`replacing`."""
     with replacing(path) as unfinished, unfinished.open("w", newline="", encoding="utf-8") as file:
         csv.writer(file, lineterminator="\n").writerows(rows)
+
+
+def save_tensors(path: Path, content: Mapping[str, Any]) -> None:
+    """Write tensors, numbers, texts and plain containers by `torch.save` and :func:`replacing`.
+
+    Raises:
+        OSError: If they cannot be written.
+    """
+    import torch  # here, because help and configurations are shown without it
+
+    try:
+        with replacing(path) as unfinished:
+            torch.save(content, unfinished)
+    except RuntimeError as error:  # of torch, for any failure to write
+        reason = str(error).splitlines()[0]
+        raise OSError(f"{path} cannot be written; is the disk full? ({reason})") from error
+
+
+def load_tensors(path: Path, *, lazy: bool = False) -> Any:
+    """Read what :func:`save_tensors` has written, by whomever; no code in it is run.
+
+    Args:
+        path: The file.
+        lazy: Whether tensors are read from the file when they are used, and not checked before.
+
+    Raises:
+        ValueError: If it cannot be read.
+
+    Examples:
+        >>> path = getfixture("tmp_path") / "state.pt"
+        >>> save_tensors(path, {"steps": 3})
+        >>> load_tensors(path)
+        {'steps': 3}
+    """
+    import torch
+
+    # without a GPU, tensors of one are read into main memory
+    device = None if torch.cuda.is_available() and not lazy else "cpu"
+    try:
+        if not path.is_file():
+            raise ValueError("there is no such file")
+        with ZipFile(path) as archive:
+            if any(
+                one.compress_type or one.file_size > one.compress_size for one in archive.filelist
+            ):
+                raise ValueError("it has compressed parts, which could fill the memory")
+            if not lazy and (part := archive.testzip()) is not None:
+                raise ValueError(f"its part {part} is damaged")
+        return torch.load(path, map_location=device, weights_only=True, mmap=lazy)
+    except Exception as error:  # a file of unknown origin can be wrong in any way
+        words = " ".join(str(error).split()) or type(error).__name__
+        if "weights_only" in words:  # torch's own message advises to turn this off
+            words = "it holds more than tensors, numbers and plain containers"
+        raise ValueError(words) from error
 
 
 def check_no_links(folder: Path) -> None:

@@ -2,18 +2,14 @@
 
 from __future__ import annotations
 
-import math
-import shutil
-import tempfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
-from safe_rl.files import check_no_links, read_bounded, read_json
+from safe_rl.files import check_no_links, load_tensors, save_tensors
 
 __all__ = ["PARTIAL", "Recording", "StepRecorder", "read_recording"]
 
@@ -22,11 +18,10 @@ PARTIAL = "partial"
 
 # other entries, such as those that a policy writes, are not recorded
 _FLAGS = ("done", "terminated", "truncated")
-_UNFINISHED = ".unfinished-"
 
 
 class Recording:
-    """A folder with the transitions of a run, one memory-mapped TensorDict per batch [N, T].
+    """A folder with the transitions of a run, a file of `torch.save` per batch [N, T].
 
     Args:
         folder: Where they go; made if it does not exist.
@@ -36,7 +31,7 @@ class Recording:
         KeyError: When a batch is written that lacks one of the entries.
 
     Examples:
-        >>> folder = Path(tempfile.mkdtemp())
+        >>> folder = getfixture("tmp_path")
         >>> done = torch.tensor([[[False], [True], [False]]])
         >>> following = {
         ...     "observation": torch.ones(1, 3, 2), "reward": torch.ones(1, 3, 1),
@@ -67,11 +62,11 @@ class Recording:
         if self.folder.is_symlink():
             raise ValueError(f"{self.folder} is a link: a recording is written to a folder.")
         check_no_links(self.folder)
-        for path in self.folder.glob(f"{_UNFINISHED}*"):  # of a run that was killed
-            shutil.rmtree(path)
+        for path in self.folder.glob(".*.pt"):  # unfinished, of a run that was killed
+            path.unlink()
         for path in _pieces(self.folder):
-            if int(path.name) >= number:
-                shutil.rmtree(path)
+            if int(path.stem) >= number:
+                path.unlink()
 
     def write(self, number: int, batch: TensorDictBase, *, begun: Tensor | None = None) -> None:
         """Write a batch [N, T] under its number; one that is there already is replaced.
@@ -87,7 +82,7 @@ class Recording:
         steps = batch.select(*self._keys).cpu()
         steps[PARTIAL] = torch.zeros_like(steps["next", "done"])
         if not self._place(number - 1).exists():
-            before = [int(path.name) for path in _pieces(self.folder) if int(path.name) < number]
+            before = [n for path in _pieces(self.folder) if (n := int(path.stem)) < number]
             self.cut_after(max(before, default=-1))
             if begun is not None:
                 steps[PARTIAL][:, 0] |= begun.cpu().unsqueeze(-1)
@@ -104,18 +99,12 @@ class Recording:
         self._store(number, steps)
 
     def _place(self, number: int) -> Path:
-        return self.folder / f"{number:08d}"
+        return self.folder / f"{number:08d}.pt"
 
     def _store(self, number: int, steps: TensorDictBase) -> None:
-        place = self._place(number)
         self.folder.mkdir(parents=True, exist_ok=True)
-        # written completely or not at all: a run may end at any moment
-        with tempfile.TemporaryDirectory(prefix=_UNFINISHED, dir=self.folder) as unfinished:
-            written = Path(unfinished) / place.name
-            steps.memmap(str(written), copy_existing=True)
-            if place.exists():
-                shutil.rmtree(place)
-            written.rename(place)
+        # copies, because a part of a larger tensor would be stored with the whole
+        save_tensors(self._place(number), steps.clone().to_dict())
 
 
 class StepRecorder:
@@ -133,7 +122,7 @@ class StepRecorder:
         ...     observation=torch.zeros(4, 2), action=torch.zeros(4, 1), next=following,
         ...     batch_size=[4],
         ... )
-        >>> folder = tempfile.mkdtemp()
+        >>> folder = getfixture("tmp_path")
         >>> recorder = StepRecorder(Recording(folder, []), steps=2)
         >>> for _ in range(3):
         ...     recorder(step)
@@ -181,46 +170,14 @@ def read_recording(folder: Path | str) -> TensorDict:
     return torch.cat([_read(path) for path in pieces], -1)
 
 
-def _read(place: Path) -> TensorDict:
-    """A batch in main memory, read from what `TensorDict.memmap` has written.
-
-    `TensorDict.load_memmap` would open files for writing and extend short ones with zeros.
-    """
+def _read(path: Path) -> TensorDict:
     try:
-        check_no_links(place)
-        return _read_entries(place)
-    except (AttributeError, KeyError, TypeError, ValueError, OSError, RuntimeError) as error:
-        reason = f"{type(error).__name__} {error}" if isinstance(error, KeyError) else error
-        raise ValueError(f"{place} cannot be read as steps of a run: {reason}") from error
-
-
-def _read_entries(place: Path) -> TensorDict:
-    notes = read_json(place / "meta.json")
-    entries: dict[str, Any] = {}
-    for name, note in notes.items():
-        if Path(name).name != name:
-            raise ValueError(f"meta.json names an entry {name!r}")
-        if isinstance(note, dict) and note.get("type") == "TensorDict":
-            entries[name] = _read_entries(place / name)
-        elif isinstance(note, dict) and "type" in note:
-            raise ValueError(f"its entry {name!r} is no tensor")
-        elif isinstance(note, dict):
-            entries[name] = _read_tensor(place / f"{name}.memmap", note)
-    return TensorDict(entries, batch_size=notes["shape"])
-
-
-def _read_tensor(path: Path, note: Mapping[str, Any]) -> Tensor:
-    dtype = getattr(torch, str(note["dtype"]).removeprefix("torch."))
-    shape = [int(length) for length in note["shape"]]
-    if min(shape, default=0) < 0:
-        raise ValueError(f"{path.name} would have the shape {shape}")
-    size = math.prod(shape) * dtype.itemsize
-    content = read_bounded(path, size)
-    if len(content) < size:
-        raise ValueError(f"{path.name} has {len(content):,} bytes of {size:,}")
-    return torch.frombuffer(bytearray(content), dtype=dtype).reshape(shape)
+        entries = load_tensors(path)
+        return TensorDict(entries, batch_size=entries["action"].shape[:2])
+    except (AttributeError, KeyError, TypeError, ValueError, RuntimeError) as error:
+        raise ValueError(f"{path} cannot be read as steps of a run: {error}") from error
 
 
 def _pieces(folder: Path) -> list[Path]:
-    """Folders of the batches, in order of their numbers."""
-    return sorted(path for path in folder.glob("[0-9]*") if path.is_dir())
+    """Files of the batches, in order of their numbers."""
+    return sorted(folder.glob("[0-9]*.pt"))

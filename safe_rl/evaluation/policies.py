@@ -19,9 +19,9 @@ from torchrl.envs import EnvBase
 from safe_rl.evaluation.episodes import exploration
 from safe_rl.evaluation.loading import find_checkpoint, load_config, load_policy
 from safe_rl.extras import import_extra
-from safe_rl.files import read_json, replace_text, replacing
+from safe_rl.files import read_json, replace_text, replacing, save_tensors
 from safe_rl.naming import did_you_mean
-from safe_rl.runs.checkpoint_file import as_parts, read_facts, read_states, writer
+from safe_rl.runs.checkpoints import read_facts, read_states
 from safe_rl.runs.folder import RunFolder, checkpoint_steps
 
 __all__ = ["POLICIES", "export_onnx", "find_run", "pack_policy", "writable_copy"]
@@ -80,9 +80,8 @@ def pack_policy(run: Path, folder: Path, checkpoint: str = "certified") -> Path:
     for file, copy in ((source.certificate, target.certificate), (source.code, target.code)):
         if file.is_file():
             shutil.copyfile(file, copy)
-    states = read_states(path, ["actor"])
     facts = {name: value for name, value in read_facts(path).items() if name != "run"}
-    writer(as_parts(states)).save(kept, metadata=facts)
+    save_tensors(kept, {"facts": facts, "parts": read_states(path, ["actor"])})
     words = source.overrides.read_text().splitlines() if source.overrides.is_file() else []
     command = " ".join(["python train.py", *(word.removeprefix("- ") for word in words)])
     about = {"environment": config.env.get("name", ""), "algorithm": config.algo.name}

@@ -1,22 +1,85 @@
-"""Checkpoints of a run: the last few and the best feasible ones, written atomically."""
+"""Checkpoints of a run: the last few and the best feasible ones, written atomically.
+
+A file holds facts, and for every part of a run tensors, numbers and plain containers. Reading one
+that another person made runs no code in it.
+"""
 
 from __future__ import annotations
 
 import math
-import shutil
 import warnings
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-from torchrl.checkpoint import Checkpoint, CheckpointError
+from torch import Tensor, nn
+from torchrl.checkpoint import CheckpointError
 
-from safe_rl.algorithms.algorithm_contract import Stateful
-from safe_rl.runs.checkpoint_file import as_parts, read_facts, restore, writer
+from safe_rl.algorithms.algorithm_contract import Stateful, states_of
+from safe_rl.files import load_tensors, save_tensors
 from safe_rl.runs.folder import RunFolder, checkpoint_name, checkpoint_steps, checkpoints_in
 
-__all__ = ["CheckpointStore", "best_checkpoint", "is_finished"]
+__all__ = ["CheckpointStore", "best_checkpoint", "is_finished", "read_facts", "read_states"]
+
+
+def read_facts(path: Path) -> dict[str, Any]:
+    """The facts that a checkpoint was written with, without reading its tensors.
+
+    Raises:
+        CheckpointError: If the file is no checkpoint.
+    """
+    facts: dict[str, Any] = _read(path, lazy=True)["facts"]
+    return facts
+
+
+def read_states(path: Path, names: Collection[str] | None = None) -> dict[str, Any]:
+    """States of parts by name: tensors, numbers and plain containers.
+
+    Args:
+        path: The checkpoint.
+        names: Those that are needed; None: all that there are.
+
+    Raises:
+        CheckpointError: If the file is no checkpoint, is damaged, or lacks a part.
+    """
+    parts = _read(path)["parts"]
+    names = parts.keys() if names is None else names
+    if missing := sorted(set(names) - set(parts)):
+        raise CheckpointError(f"The checkpoint {path} has no {' and no '.join(missing)}.")
+    return {name: parts[name] for name in names}
+
+
+def _read(path: Path, *, lazy: bool = False) -> dict[str, dict[str, Any]]:
+    try:
+        content = load_tensors(path, lazy=lazy)
+        if not all(isinstance(content[name], dict) for name in ("facts", "parts")):
+            raise ValueError("it has no facts, or no parts")
+    except (ValueError, KeyError, TypeError) as error:
+        raise CheckpointError(f"Cannot use the checkpoint {path}: {error}.") from error
+    return content  # type: ignore[no-any-return]
+
+
+def _restore(path: Path, components: Mapping[str, Stateful]) -> None:
+    """Give parts the states of a checkpoint, all of which are read before the first is changed."""
+    states = read_states(path, components)
+    for name in sorted(states):
+        try:
+            _check_types(components[name], states[name])
+            components[name].load_state_dict(states[name])
+        except Exception as error:  # a part of unknown origin can be wrong in any way
+            words = " ".join(str(error).split())
+            raise CheckpointError(
+                f"Cannot use the checkpoint {path}: its {name!r} does not fit: {words}"
+            ) from error
+
+
+def _check_types(component: Stateful, state: Mapping[str, Any]) -> None:
+    """Refuse weights of another dtype than the network's, which would be converted silently."""
+    for name, tensor in component.state_dict().items() if isinstance(component, nn.Module) else ():
+        given = state.get(name)
+        if isinstance(given, Tensor) and given.dtype != tensor.dtype:
+            raise ValueError(f"'{name}' is {given.dtype}, where the network has {tensor.dtype}.")
 
 
 def best_checkpoint(directory: Path) -> Path | None:
@@ -76,7 +139,6 @@ class CheckpointStore:
         self.last = Path(directory) / "last"
         self.best = Path(directory) / "best"
         self._components = dict(components)
-        self._writer = writer(components)
         # exists until the first checkpoint does: with neither, checkpoints were removed
         self._none_yet = self.last / "none-yet"
         self._keep_last, self._keep_best = keep_last, keep_best
@@ -96,7 +158,7 @@ class CheckpointStore:
             steps: Environment steps so far.
             facts: JSON-compatible facts, readable without loading.
         """
-        path = self._write(self.last, steps, facts, self._writer)
+        path = self._write(self.last, steps, facts, states_of(self._components))
         others = [other for other in checkpoints_in(self.last) if other != path]
         for old in others[: max(0, len(others) + 1 - self._keep_last)]:
             old.unlink()
@@ -130,8 +192,8 @@ class CheckpointStore:
         scores = sorted(filter(math.isfinite, map(_score, checkpoints_in(self.best))))
         if len(scores) >= self._keep_best and not score > scores[-self._keep_best]:
             return False
-        saver = self._writer if states is None else writer(as_parts(states))
-        path = self._write(self.best, steps, {**(facts or {}), "score": score}, saver)
+        states = states_of(self._components) if states is None else states
+        path = self._write(self.best, steps, {**(facts or {}), "score": score}, states)
         others = [other for other in checkpoints_in(self.best) if other != path]
         others.sort(key=_score, reverse=True)
         newest = max((saved.name for saved in checkpoints_in(self.last)), default="")
@@ -148,15 +210,16 @@ class CheckpointStore:
             (self.best / checkpoint_name(number)).unlink(missing_ok=True)
 
     def _write(
-        self, directory: Path, steps: int, facts: Mapping[str, Any] | None, saver: Checkpoint
+        self,
+        directory: Path,
+        steps: int,
+        facts: Mapping[str, Any] | None,
+        states: Mapping[str, Any],
     ) -> Path:
+        directory.mkdir(parents=True, exist_ok=True)
         path = directory / checkpoint_name(steps)
         facts = {**(facts or {}), **({"run": self._run} if self._run else {})}
-        try:
-            saver.save(path, metadata=facts)
-        except RuntimeError as error:  # of torch, for any failure to write
-            reason = str(error).splitlines()[0]
-            raise OSError(f"{path} cannot be written; is the disk full? ({reason})") from error
+        save_tensors(path, {"facts": facts, "parts": dict(states)})
         return path
 
     def resume(self, epochs: int = 0) -> Path | None:
@@ -226,7 +289,7 @@ class CheckpointStore:
                     f"The checkpoint {path} is another run's: its {key} is {known[key]}, this "
                     f"run's is {expected}. For a new run from its networks use init_from=."
                 )
-        restore(path, components)
+        _restore(path, components)
 
 
 def is_finished(directory: Path, frames: int) -> bool:
@@ -239,12 +302,6 @@ def is_finished(directory: Path, frames: int) -> bool:
 
 
 def _clear_beginnings(directory: Path) -> None:
-    """Remove unfinished checkpoints of a killed run, and restore files that it had put aside."""
-    for remains in directory.glob(".checkpoint-*"):
-        name, _, kind = remains.name[1:].rpartition(".")
-        if kind.startswith("backup-") and not (directory / name).exists():
-            remains.rename(directory / name)
-        elif remains.is_dir() and not remains.is_symlink():
-            shutil.rmtree(remains)
-        else:
-            remains.unlink()
+    """Remove unfinished checkpoints of a run that was killed."""
+    for unfinished in directory.glob(".checkpoint-*"):
+        unfinished.unlink()

@@ -24,7 +24,7 @@ from safe_rl.algorithms.constraints import check_cost_limits
 from safe_rl.collectors import Recording, WorkerCollector, make_collector
 from safe_rl.collectors.workers import MakeEnv
 from safe_rl.files import read_config
-from safe_rl.runs.checkpoint_file import part_names, read_states
+from safe_rl.runs.checkpoints import read_states
 from safe_rl.runs.folder import RunFolder, run_of
 from safe_rl.runs.record import RunRecord
 from safe_rl.targets import build
@@ -162,8 +162,12 @@ def initialise_networks(
         for name, network in networks.items()
         if same_costs or name not in cost_networks
     }
-    _check_parts(taken, checkpoint)
-    weights = read_states(checkpoint, taken)
+    weights = read_states(checkpoint)
+    if absent := [name for name in taken if name not in weights]:
+        raise CheckpointError(
+            f"{checkpoint} has no {' and no '.join(absent)}, which this run begins with, too: "
+            "init_from needs a run whose algorithm has learned all of them, as algo=bc does not."
+        )
     for name, network in taken.items():
         _check_shapes(name, network.state_dict(), weights[name], checkpoint)
     for name, network in taken.items():
@@ -193,15 +197,6 @@ def _cost_critics(checkpoint: Path) -> tuple[list[str], str | None]:
 def _cost_loss(config: Mapping[str, Any]) -> str | None:
     """Loss of Q functions: equal networks may give a mean in one and a variance in another."""
     return (config.get("loss") or {}).get("_target_") if config.get("critics") else None
-
-
-def _check_parts(networks: Collection[str], checkpoint: Path) -> None:
-    known = part_names(checkpoint)
-    if known and (absent := [name for name in networks if name not in known]):
-        raise CheckpointError(
-            f"{checkpoint} has no {' and no '.join(absent)}, which this run begins with, too: "
-            "init_from needs a run whose algorithm has learned all of them, as algo=bc does not."
-        )
 
 
 def _check_shapes(

@@ -16,7 +16,7 @@ from registrations import undone
 from safe_rl.cli.composing import resolving
 from safe_rl.cli.sweeps import SweepReport, count_jobs, threads_per_job
 from safe_rl.cli.train import read_command
-from safe_rl.runs.checkpoint_file import read_facts
+from safe_rl.runs.checkpoints import read_facts
 from safe_rl.runs.folder import runs_below
 from safe_rl.runs.outcome import final_figures
 from safe_rl.runs.table import read_table

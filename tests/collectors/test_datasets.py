@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 from point_mass import PointMass
-from tensordict import NonTensorData, TensorDict
+from tensordict import TensorDict
 from torchrl.modules import RandomPolicy
 
 from safe_rl.collectors import (
@@ -43,9 +43,9 @@ def test_a_recording_is_what_was_collected(tmp_path):
     for key in ("observation", "action", ("next", "observation"), ("next", "cost_north")):
         assert torch.equal(found[key], expected[key])
     assert torch.equal(found["next", "truncated"], expected["next", "done"])
-    (tmp_path / "00000002").rename(tmp_path / ".unfinished-2")  # as of a run that is killed there
+    (tmp_path / "00000002.pt").rename(tmp_path / ".00000002.0a.pt")  # as of a run killed there
     recording.begin(2)
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["00000000", "00000001"]
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["00000000.pt", "00000001.pt"]
     with pytest.raises(FileNotFoundError, match=r"holds no transitions: is it the folder of a rec"):
         read_recording(tmp_path / "elsewhere")
     Recording(tmp_path / "run" / "transitions", PointMass.cost_keys).write(0, batches[0])
@@ -56,12 +56,26 @@ def test_a_recording_is_what_was_collected(tmp_path):
 
 
 def test_a_recording_of_somebody_else_makes_no_code_run(tmp_path):
-    theirs = NonTensorData(Touching(tmp_path / "trace"), batch_size=[4, 25])
-    collected(1)[0].set("theirs", theirs).memmap(str(tmp_path / "00000000"))
-    (tmp_path / "trace").unlink(missing_ok=True)
-    with pytest.raises(ValueError, match=r"steps of a run: its entry .* is no tensor"):
+    torch.save({"action": Touching(tmp_path / "trace")}, tmp_path / "00000000.pt")
+    with pytest.raises(ValueError, match="steps of a run: it holds more than tensors"):
         read_recording(tmp_path)
     assert not (tmp_path / "trace").exists()
+
+
+@pytest.mark.parametrize("damage", ["cut", "flipped", "no action", "another shape"])
+def test_a_damaged_batch_is_refused(damage, tmp_path):
+    Recording(tmp_path, ["cost"]).write(0, collected(1)[0])
+    path = tmp_path / "00000000.pt"
+    content, entries = bytearray(path.read_bytes()), torch.load(path)
+    content[len(content) // 2] ^= 1
+    if damage == "no action":
+        del entries["action"]
+    entries["observation"] = entries["observation"][1:]
+    torch.save(entries, path)
+    if damage in ("cut", "flipped"):
+        path.write_bytes(content[:800] if damage == "cut" else content)
+    with pytest.raises(ValueError, match=r"00000000\.pt cannot be read as steps of a run"):
+        read_recording(tmp_path)
 
 
 class Touching:

@@ -9,12 +9,10 @@ import torch
 from point_mass import PointMass
 from point_mass_runs import point_mass_trainer
 from run_configs import assert_resumes_exactly, point_mass_config, without_times
-from torchrl.checkpoint import Checkpoint
 
 from safe_rl.algorithms import PolicyUpdate
 from safe_rl.objectives import PPOLagrangianLoss
-from safe_rl.runs.checkpoint_file import read_facts
-from safe_rl.runs.checkpoints import CheckpointStore
+from safe_rl.runs.checkpoints import CheckpointStore, read_facts, read_states
 from safe_rl.runs.folder import checkpoints_in
 from safe_rl.runs.table import read_table
 from safe_rl.targets import allow
@@ -163,14 +161,14 @@ def test_the_folder_of_a_run(tmp_path):
     means = [fmean(returns[max(0, epoch - 2) : epoch + 1]) for epoch in range(8)]
     best = means.index(max(means))
     path = max((tmp_path / "checkpoints" / "best").iterdir())
-    assert Checkpoint.manifest(path)["metadata"] == {
+    assert read_facts(path) == {
         "epoch": best + 1,
         "score": pytest.approx(means[best]),
         "run": {"environment": "PointMass", "algorithm": "ppo_lagrangian", "seed": 0},
     }
     # what acts, and not what only resuming needs
     kept, last = (
-        set(Checkpoint.manifest(file)["components"])
+        set(read_states(file))
         for file in (path, max((tmp_path / "checkpoints" / "last").iterdir()))
     )
     assert {"actor", "critic", "cost_critic", "multiplier"} <= kept
