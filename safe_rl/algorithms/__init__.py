@@ -1,4 +1,4 @@
-"""What moves parameters: recipes, updates, trust-region steps, and building them."""
+"""Algorithms: recipes, gradient updates, trust-region steps, and how they are built."""
 
 from safe_rl.algorithms.algorithm_contract import Algorithm, PolicyUpdate, Recipe, SequentialUpdates
 from safe_rl.algorithms.constraints import Constraints

@@ -1,6 +1,6 @@
-"""What the training loop asks of an algorithm, and a configuration of a recipe for one.
+"""Interfaces between the training loop, recipes, algorithms and updates.
 
-Each class here is a base to derive from: what is optional has a default.
+Each class here is a base class. Its optional methods have defaults.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ class Stateful(Protocol):
     """Anything with a ``state_dict``."""
 
     def state_dict(self) -> Mapping[str, Any]:
-        """Everything that an exact continuation needs."""
+        """State from which a resumed run continues exactly."""
         ...
 
     def load_state_dict(self, state_dict: Mapping[str, Any]) -> Any:
@@ -49,14 +49,14 @@ def load_states(parts: Mapping[str, Stateful], states: Mapping[str, Any]) -> Non
 
 
 class Algorithm(ABC):
-    """What learns, as the loop, checkpoints, transfer and evaluation see it.
+    """An algorithm, as the training loop, checkpoints, transfer and evaluation use it.
 
     Attributes:
         cost_keys: Keys of the constrained costs; empty for an unconstrained algorithm.
         policy: Exploring policy, for the collector; it shares the networks' parameters.
-        networks: What is trained, by name. Another run can start from them.
-        cost_networks: Names of the networks of the constrained costs: a run takes them over only
-            from one with the same costs.
+        networks: Trained networks, by name. Another run can start from them.
+        cost_networks: Names of the networks of the constrained costs. A run starts from another
+            run's cost networks only if both have the same costs.
     """
 
     cost_keys: Sequence[str] = ()
@@ -76,16 +76,16 @@ class Algorithm(ABC):
 
     @property
     def lost_on_resume(self) -> str:
-        """A sentence on what checkpoints do not hold of it; empty if they hold all."""
+        """A sentence on the state that checkpoints do not have; empty if they have all of it."""
         return ""
 
     @abstractmethod
     def learn(self, batch: TensorDictBase, episodes: EpisodeStatistics) -> dict[str, float]:
-        """Learn from what the policy has just collected.
+        """Learn from the batch that the policy has just collected.
 
         Args:
             batch: Steps [N, T], in order of time.
-            episodes: What they say about episodes.
+            episodes: Statistics of the episodes in the batch.
 
         Returns:
             Values for columns of the table, by name: The same names at every call, NaN where there
@@ -97,19 +97,19 @@ class Algorithm(ABC):
         """Parts with a state, by name; learning depends on nothing else."""
 
     def networks_replaced(self) -> None:
-        """Set target networks to the networks, which have received another run's weights."""
+        """Copy the networks, which got another run's weights, into the target networks."""
 
     def forget_open_episodes(self) -> None:
-        """End what spans several steps, such as n-step sums: new episodes begin."""
+        """End n-step sums and the like, because new episodes begin."""
 
 
 class Recipe(ABC):
-    """How an algorithm is put together; a configuration names it as ``algo._target_``.
+    """Builds an algorithm from a configuration, which names the recipe as ``algo._target_``.
 
     Attributes:
         off_policy: Whether it learns from a replay buffer, with Q functions for critics.
-        unused_keys: Keys that it ignores although presets contain them, and choices that do not
-            suit it (``preset=paper``), each with the reason: a command with one is refused.
+        unused_keys: Keys of presets that the recipe does not use, and choices that do not suit it
+            (``preset=paper``), each with the reason. A command with one of them is refused.
     """
 
     off_policy: ClassVar[bool] = False
@@ -129,7 +129,7 @@ class Recipe(ABC):
     def build_policy(
         cls, config: DictConfig, env: EnvBase, device: torch.device
     ) -> tuple[TensorDictModuleBase, Mapping[str, nn.Module]]:
-        """Build only what acts, for evaluation.
+        """Build only the policy, for evaluation.
 
         Returns:
             The policy, and the networks that it consists of, by the names that they have in
@@ -138,7 +138,7 @@ class Recipe(ABC):
 
 
 class PolicyUpdate(Checked, ABC):
-    """What a recipe asks of an update: gradient steps, a trust-region step, or your own."""
+    """Interface of a policy update: gradient steps, a trust-region step, or your own."""
 
     @abstractmethod
     def __call__(
@@ -151,13 +151,14 @@ class PolicyUpdate(Checked, ABC):
 
         Args:
             batch: On-policy data with advantages, any batch shape.
-            cost_violation: Amount by which J_c must fall, for every constraint, shape [k]: J_c − d,
-                or J_c minus the column ``target_…`` where the limit comes down to d.
+            cost_violation: Amount by which J_c must fall, for every constraint, [k]: J_c − d, or
+                J_c minus the current target (column ``target_…``) if the limit falls during
+                training.
             episode_length: Mean episode length T̄ in steps, a scalar.
         """
 
     def loss_modules(self) -> Mapping[str, nn.Module]:
-        """Losses that are modules, by name: checkpoints keep what networks do not hold of them."""
+        """Losses that are modules, by name. Checkpoints save their state beside the networks."""
         return {}
 
     def state_dict(self) -> Mapping[str, Any]:
@@ -169,15 +170,15 @@ class PolicyUpdate(Checked, ABC):
 
 
 class SequentialUpdates(PolicyUpdate):
-    """A `PolicyUpdate` of several, each of which starts from the policy that the previous one left.
+    """Several updates, one after the other, as a single `PolicyUpdate`.
 
     In a configuration, ``then`` names what comes after ``policy_update``: a loss and an update for
     each of any number of names (see ``conf/algo/cup.yaml``).
 
     Args:
-        first: The first update; what it reports keeps its names.
-        then: The others in their order; what they report is called ``<name>_…``. The
-            ``cost_surrogate`` of the last one that has any is that of all together.
+        first: The first update; its diagnostics keep their names.
+        then: The other updates, in order. Their diagnostics are called ``<name>_…``.
+            ``cost_surrogate`` is that of the last update that reports one.
 
     Examples:
         >>> import torch

@@ -1,7 +1,7 @@
-"""From nodes of a configuration to the parts of a recipe, and to its constraints.
+"""Build the parts of an algorithm, and its constraints, from nodes of a configuration.
 
 Parts with a ``_target_`` (losses, multipliers, updates, advantage estimators) may be classes of
-your own: each gets those live objects that its constructor names.
+your own. A constructor gets those objects of the run that its arguments name.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ def find_recipe(config: DictConfig) -> type[Recipe]:
 
 
 def build_part(node: DictConfig, **objects: Any) -> Any:
-    """Build a node with those live objects that its constructor names; None is not passed.
+    """Build a node with the objects of the run that its constructor names; None is not passed.
 
     Raises:
         TargetError: If its target may not be built, or refuses; the message names the node.
@@ -55,7 +55,7 @@ def build_part(node: DictConfig, **objects: Any) -> Any:
 
 
 def build_update(node: DictConfig, kind: type[Update], **objects: Any) -> Update:
-    """Build, as `build_part` does, what improves networks.
+    """Build an update of networks, as `build_part` does.
 
     Raises:
         TargetError: As by `build_part`, or if it is no update of this kind.
@@ -75,7 +75,7 @@ def constrained_limits(config: DictConfig, env: EnvBase, *, otherwise: str) -> d
     Args:
         config: Configuration as composed from ``conf/``.
         env: Environment that has the costs.
-        otherwise: Its like without constraints, for the message.
+        otherwise: A similar algorithm without constraints, for the message.
 
     Raises:
         ValueError: If a limit names no cost of the environment, a constrained algorithm has no

@@ -22,13 +22,13 @@ __all__ = ["CHARGES", "Constraints", "TrackedConstraints", "check_cost_limits"]
 class Constraints:
     """Keys, limits, the violations J_c − d, and the multiplier that weighs the costs.
 
-    Every recipe has one, and updates it with every batch. Losses and updates that need the
-    violation take the object itself and read ``violation`` and ``episode_length`` at every call.
+    Every algorithm has one, and updates it with every batch. Losses and updates that need the
+    violation get this object, and read ``violation`` and ``episode_length`` at every call.
 
     Args:
         limits: Cost key -> d, undiscounted cost allowed per episode; empty without constraints.
-        max_length: Steps after which an episode is over: its length until one has finished; None
-            takes the length of the batch.
+        max_length: Largest length of an episode in steps. It is the mean length until an episode
+            has finished. None takes the length of the batch.
         multiplier: Weighs the costs against the return, or None.
         device: Of all tensors.
 
@@ -79,7 +79,7 @@ class Constraints:
 
     @property
     def held_limits(self) -> dict[NestedKey, float]:
-        """What violations are differences from, by cost: d, or a limit of the risk measure's."""
+        """Limits from which violations are measured, by cost: d, or those of the risk measure."""
         held = self.limits if self.risk is None else self.risk.held_limits
         return dict(zip(self.keys, held.tolist(), strict=True))
 
@@ -89,13 +89,14 @@ class Constraints:
         return ""
 
     def apply_risk(self, episodes: EpisodeStatistics, batch: TensorDictBase) -> None:
-        """Write a risk measure's charges into a batch, before advantages are estimated."""
+        """Write the costs of a risk measure into a batch, before advantages are estimated."""
 
     def update(self, episodes: EpisodeStatistics, batch: TensorDictBase) -> None:
-        """Take in what a batch says about episodes, and move the multiplier.
+        """Update costs, violations and the multiplier from the episodes of a batch.
 
-        The length is the mean of the last batch in which an episode finished. So is the cost, if
-        batches are at least as long; in shorter batches it is the cost rate times that length.
+        The episode length is the mean over the last batch in which an episode finished. J_c is that
+        batch's mean too, if batches are at least as long as episodes. In shorter batches J_c is the
+        cost rate times the episode length.
 
         Args:
             episodes: Statistics of the batch.
@@ -164,7 +165,7 @@ class Constraints:
 def check_cost_limits(
     cost_limits: Mapping[str, float], cost_keys: Sequence[str]
 ) -> dict[str, float]:
-    """Return the limits as a plain dictionary, once every key is known to the environment.
+    """Check that the environment has every key, and return the limits as a plain dictionary.
 
     Raises:
         ValueError: If a key is unknown, or a limit is negative, infinite or not a number.
@@ -194,12 +195,13 @@ CHARGES = "charged_costs"
 class TrackedConstraints(Constraints):
     """`Constraints` whose violations come from a `LimitTracker`.
 
-    ``violation`` is the change of J_c that a step's surrogate must predict: J_c minus its target,
-    over the share of predicted changes that is realised. Multipliers get J_c minus its target.
+    ``violation`` is the decrease of J_c that a step's surrogate must predict: J_c minus its target,
+    divided by the share of predicted changes that is observed. Multipliers get J_c minus its
+    target.
 
     Args:
         limits: Cost key -> d, undiscounted cost allowed per episode.
-        tracker: Estimates J_c and its present target.
+        tracker: Estimates J_c and computes its current target.
         multiplier: Weighs the costs against the return, or None.
         risk: What is limited instead of the mean cost of an episode, or None.
         cost_advantage: Key of the cost advantages that the multiplier weighs.
@@ -224,11 +226,11 @@ class TrackedConstraints(Constraints):
 
     @property
     def schedule(self) -> str:
-        """When costs are free, when the limits come down, and when they hold."""
+        """Until when costs have no effect, when the limits fall, and when they hold."""
         return self.tracker.schedule if self.keys else ""
 
     def apply_risk(self, episodes: EpisodeStatistics, batch: TensorDictBase) -> None:
-        """Write the charges of the risk measure below ``"next"``."""
+        """Write the costs of the risk measure below ``"next"``."""
         if self.risk is None:
             return
         costs = self._costs_of(batch).cpu()
@@ -242,7 +244,7 @@ class TrackedConstraints(Constraints):
         return torch.cat([batch["next", key] for key in self.keys], -1)
 
     def update(self, episodes: EpisodeStatistics, batch: TensorDictBase) -> None:
-        """Take in a batch [N, T] and move the multiplier.
+        """Update the tracker and the multiplier from a batch [N, T].
 
         Cost advantages in the batch are divided by the size of one cost if there is a
         multiplier.
@@ -268,7 +270,7 @@ class TrackedConstraints(Constraints):
             batch[self.cost_advantage] = advantage / state.unit
 
     def record_prediction(self, metrics: Mapping[str, Tensor]) -> None:
-        """Note the change of J_c that an update's surrogates predict, if it reports them."""
+        """Store the change of J_c that an update's surrogates predict, if it reports them."""
         if "cost_surrogate" in metrics:
             change = metrics["cost_surrogate"] * self.episode_length
             self.tracker.predictions.record_prediction(change)

@@ -30,19 +30,19 @@ class CPOStep(TRPOStep):
     takes the first fraction with KL(π_θ ‖ π_k) ≤ δ and L_c(new) − L_c(old) ≤ max(−c, 0), and,
     unless the step is a recovery (cases 0 and 1), a loss that is not worse.
 
-    The violations are those of the call, from any estimate of J_c: the mean over finished episodes,
-    or, where a batch is shorter than its episodes, the cost rate of the batch times T̄.
+    The violations are arguments of the call. They can be from any estimate of J_c: the mean over
+    finished episodes, or, if a batch is shorter than its episodes, its cost rate times T̄.
 
     Args:
         loss: A `CPOLoss`, or a callable of your own that returns a TensorDict with scalars
             ``loss_…`` and the differentiable ``cost_surrogate``, [k].
         rescale_violation: Whether to divide the violations by the episode length; see
             `constraint_value`.
-        largest_demand: Bound of every c, as a share of √(2δ bᵀH⁻¹b), the most that a step within
-            the trust region lowers its surrogate by; None for none. A policy that is further
-            above its limit than one step mends takes recoveries (case 0), which do not look at the
-            reward, until the limit is reached: a return learned in 20 updates is forgotten in as
-            many. With 0.8, one constraint leaves √(1 − 0.8²) = 0.6 of the step to the reward.
+        largest_demand: Bound of every c, as a share of √(2δ bᵀH⁻¹b), which is the largest decrease
+            of the surrogate within the trust region; None: no bound. Without a bound, a policy far
+            above its limit takes recovery steps (case 0), which ignore the reward, until the limit
+            is reached: a return learned in 20 updates is forgotten in as many. With 0.8, one
+            constraint leaves √(1 − 0.8²) = 0.6 of the step to the reward.
         settings: Those of every step, see `TRPOStep`.
 
     Examples:
@@ -168,13 +168,14 @@ class PCPOStep(CPOStep):
 
         x = x₀ − max(0, e / bᵀL⁻¹b) L⁻¹b,  L = H (``"kl"``) or the identity (``"l2"``),
 
-    and for several the nearest point that keeps them all (see `nearest_feasible`). From inside the
-    limits a KL projection stays in the trust region. Other steps may leave it: they are shortened
-    to it, because neither the Fisher matrix nor the gradients say anything of what is beyond. The
-    line search then takes the first fraction with KL(π_θ ‖ π_k) ≤ δ and
-    L_c(new) − L_c(old) ≤ max(−c, 0), and, where nothing was projected, a loss that is not worse.
+    and for several constraints the nearest point that keeps them all (see `nearest_feasible`). If
+    the policy keeps its limits, a KL projection stays in the trust region. Other steps may leave
+    it. They are shortened to its boundary, because the Fisher matrix and the gradients are valid
+    only inside. The line search then takes the first fraction with KL(π_θ ‖ π_k) ≤ δ and L_c(new) −
+    L_c(old) ≤ max(−c, 0). If nothing was projected, the loss must also not be worse.
 
-    Adds to the diagnostics ``c`` and ``nu``, [k], and ``shortened``, the share of x that is left.
+    The diagnostics also have ``c`` and ``nu``, [k], and ``shortened``, the factor by which x was
+    shortened.
 
     Args:
         loss: As of a `CPOStep`.

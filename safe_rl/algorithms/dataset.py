@@ -1,4 +1,4 @@
-"""Transitions of a dataset in the replay buffer, before or instead of collected ones."""
+"""Put transitions of a dataset into the replay buffer, before or instead of collected ones."""
 
 from __future__ import annotations
 
@@ -32,7 +32,8 @@ def begin_memory(config: DictConfig, memory: Memory, env: EnvBase) -> tuple[str,
     """Fill an empty replay buffer with the dataset of a configuration, if it has one.
 
     Returns:
-        What is learned from, in a sentence, and whether collected transitions are added.
+        A sentence on the data that the run learns from, and whether collected transitions are
+        added.
 
     Raises:
         ValueError: As by `fill_memory`, or if ``dataset.alone`` is true without a path.
@@ -63,7 +64,7 @@ def fill_memory(
         actions: Spec of one of its actions; actions are clipped to its bounds.
 
     Returns:
-        What was taken, in a sentence.
+        A sentence on the transitions that were taken.
 
     Raises:
         ValueError: If they do not fit the environment, lack an entry or are not finite, if no

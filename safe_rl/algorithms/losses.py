@@ -75,7 +75,7 @@ Without them the losses would estimate advantages themselves, from shuffled samp
 
 
 def estimates_read(loss: nn.Module) -> list[NestedKey]:
-    """Where advantages and value targets are, for a loss that reads an advantage."""
+    """Keys of the advantages and value targets, if the loss reads an advantage."""
     if not isinstance(loss, LossModule):
         return []
     keys = {key.name: getattr(loss.tensor_keys, key.name) for key in fields(loss.tensor_keys)}
@@ -102,7 +102,7 @@ class LossState:
     """Buffers and parameters of losses that belong to no network and no multiplier.
 
     Coefficients that TorchRL schedules (``register_coeff_buffer``) and those of its value
-    estimators are settings, and left out: a resumed run may have others.
+    estimators are left out: they are settings, which a resumed run may change.
 
     Args:
         losses: Losses by name: `PolicyUpdate.loss_modules`.
@@ -132,7 +132,7 @@ class LossState:
 
     @torch.no_grad()
     def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
-        """Continue from :meth:`state_dict`, in place: an optimiser holds the same tensors."""
+        """Continue from :meth:`state_dict`, in place, because an optimiser has the same tensors."""
         for name, tensor in self._own().items():
             tensor.copy_(state_dict[name])
 

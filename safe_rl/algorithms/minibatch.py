@@ -1,8 +1,7 @@
 """Gradient updates: passes of minibatch steps over one batch, and their learning rate.
 
-Policies (PPO) and critics are trained by the same object. Policy updates of another kind, such as
-trust-region steps, take its place if they follow
-:class:`~safe_rl.algorithms.algorithm_contract.PolicyUpdate`.
+The same class trains policies (PPO) and critics. Policy updates of another kind, such as
+trust-region steps, are also a :class:`~safe_rl.algorithms.algorithm_contract.PolicyUpdate`.
 """
 
 from __future__ import annotations
@@ -31,19 +30,19 @@ __all__ = ["KLAdaptiveRate", "MinibatchUpdate"]
 
 @dataclass(frozen=True, kw_only=True)
 class KLAdaptiveRate:
-    """Lower the rate if the KL limit ends updates early, raise it if updates fall short of it.
+    """Lower the learning rate if max_kl ends updates early, raise it if the KL stays small.
 
-    An update that a limit on the KL divergence ends after a few of its steps has followed the
-    gradient of a few minibatches; at a lower rate it averages over all of them. With large
-    multipliers, whose cost gradients are noisy, that decides whether a cost limit is held. The
-    idea is the adaptive penalty of PPO (Schulman et al. 2017, section 4), applied to the rate.
+    If the bound on the KL divergence ends an update after a few steps, the update has used the
+    gradients of only a few minibatches. With a lower learning rate it averages over all
+    minibatches. This matters with large multipliers, whose cost gradients are noisy. The idea is
+    the adaptive penalty of PPO (Schulman et al. 2017, section 4), applied to the learning rate.
 
     Attributes:
         factor: Factor by which the rate is divided or multiplied.
         lowest: Lower bound of the rate.
         highest: Upper bound of the rate.
-        few_steps: Share of the planned steps below which an update has ended early.
-        low_kl: Share of the KL limit below which a whole update has fallen short.
+        few_steps: Share of the planned steps; with fewer, an update has ended early.
+        low_kl: Share of the KL bound; if a whole update stays below, the rate is raised.
 
     Raises:
         ValueError: If the factor is not above 1 or the bounds are not positive and in order.
@@ -89,14 +88,13 @@ class KLAdaptiveRate:
 class MinibatchUpdate(PolicyUpdate):
     """Several passes of gradient steps over one batch, minimising the sum of all ``loss_*``.
 
-    Every pass shuffles the batch once and cuts it into contiguous minibatches of equal size: as
-    many as fit ``minibatch_size`` best. Samples that are left over (fewer than there are
-    minibatches) are left out of this pass. For a recurrent policy, whole sequences are shuffled
-    instead of samples.
+    Every pass shuffles the batch once and cuts it into minibatches of equal size, close to
+    ``minibatch_size``. Remaining samples (fewer than there are minibatches) are not used in this
+    pass. For a recurrent policy, whole sequences are shuffled instead of samples.
 
-    If the loss reports ``kl``, ``max_kl`` stops the update as soon as it is exceeded. The KL is
-    that of the minibatch at hand at the parameters before its step, so the check costs nothing and
-    the step that would follow is not taken; with the full batch as minibatch this is the rule of
+    ``max_kl`` is for early stopping: if the ``kl`` that the loss reports exceeds it, the update
+    ends. The KL is computed on the current minibatch before its step, and this step is then not
+    taken. So the check costs no extra time. With the full batch as minibatch this is the rule of
     Ray, Achiam, Amodei (2019). With minibatches of thousands of states its error is a few percent.
     The method ``anchor`` of a `SurrogateLoss` is called with the batch before the first step.
 
@@ -104,16 +102,16 @@ class MinibatchUpdate(PolicyUpdate):
     the batch, no step is taken and a warning says so.
 
     Args:
-        loss: Loss module whose ``in_keys`` name what it needs of the batch; advantages, value
-            targets and values that are there go by the keys that it has for them.
+        loss: Loss module; its ``in_keys`` name the entries of the batch that it needs, with its own
+            keys for advantages, value targets and values.
         optimizer: Function of the parameters that builds the optimiser, for example
             ``functools.partial(torch.optim.Adam, lr=3e-4, fused=True)``.
         num_passes: Passes over the batch.
         minibatch_size: Samples per gradient step; None takes the whole batch.
         max_kl: Mean KL divergence that ends the update, or None.
         max_grad_norm: Norm to which the gradient is clipped, or None.
-        adapt_rate: Sets the learning rate of the next call by the steps and the KL of this one, or
-            None for a constant rate; needs ``max_kl``.
+        adapt_rate: Computes the learning rate of the next call from the number of steps and the KL
+            of this one; None for a constant rate. It needs ``max_kl``.
         compile: Whether to compile the loss and its gradient with torch.compile.
 
     Raises:
@@ -166,12 +164,12 @@ class MinibatchUpdate(PolicyUpdate):
         cost_violation: Tensor | None = None,
         episode_length: Tensor | None = None,
     ) -> dict[str, Tensor]:
-        """Take the gradient steps on ``batch``, of any shape; padding is left out.
+        """Take the gradient steps on ``batch``, of any shape; padding is not used.
 
         Returns:
-            The mean over the steps of everything that the loss reports, save ``kl``, which is the
-            last one measured: After the last step if the limit ended the update, before it if the
-            passes were over; ``num_steps``, the gradient steps taken; and ``lr``, the next
+            Means over the steps of all that the loss reports, except for ``kl``: this is the last
+            value measured, from after the last step if ``max_kl`` ended the update, else from
+            before the last step. Also ``num_steps``, the gradient steps taken, and ``lr``, the next
             learning rate, if it is adapted.
         """
         del cost_violation, episode_length
