@@ -54,7 +54,7 @@ _UNUSED = {
 
 @dataclass
 class OffPolicy(Algorithm, Recipe):
-    """SAC, TD3 and their like: an algorithm, and the recipe that builds it.
+    """SAC, TD3 and similar algorithms: the algorithm, and the recipe that builds it.
 
     Attributes:
         policy: Exploring policy, with the actor's parameters.
@@ -63,11 +63,12 @@ class OffPolicy(Algorithm, Recipe):
             episodes, not the discounted critics.
         memory: The replay buffer.
         policy_update: Trains all networks on minibatches.
-        random_steps: Steps of environments with random actions in the beginning. Learning begins
-            when the replay buffer holds as many; 0 if nothing is collected.
+        random_steps: Environment steps with random actions at the beginning. Learning begins when
+            the replay buffer has this many transitions; 0 if nothing is collected.
         steps_per_decision: Steps of an environment per transition.
         collects: Whether collected transitions go into the replay buffer.
-        learns_from: The dataset in it, in a sentence, or a warning that nothing will be learned.
+        learns_from: A sentence on the dataset in the replay buffer, or a warning that nothing will
+            be learned.
     """
 
     off_policy: ClassVar[bool] = True
@@ -141,7 +142,7 @@ class OffPolicy(Algorithm, Recipe):
 
     @property
     def lost_on_resume(self) -> str:
-        """What a checkpoint does not hold, in a sentence; empty if it holds all."""
+        """A sentence on the state that a checkpoint does not have; empty if it has all of it."""
         if self.memory.keeps or not self.collects:
             return ""
         resumes = f"resumes when it holds {self.random_steps:,} new ones"
@@ -161,8 +162,8 @@ class OffPolicy(Algorithm, Recipe):
         """Store a batch [N, T] and take the gradient steps that are due on the replay buffer.
 
         Args:
-            batch: Steps of the present policy, in order of time.
-            episodes: Its episodes.
+            batch: Steps of the current policy, in order of time.
+            episodes: Statistics of the episodes in the batch.
 
         Returns:
             Values for columns of the table, by name.
@@ -187,7 +188,7 @@ class OffPolicy(Algorithm, Recipe):
         return row
 
     def networks_replaced(self) -> None:
-        """Set target networks to the networks, which have received another run's weights."""
+        """Copy the networks, which got another run's weights, into the target networks."""
         self.policy_update.equate_targets()
 
     def forget_open_episodes(self) -> None:
@@ -199,7 +200,7 @@ class OffPolicy(Algorithm, Recipe):
         self.policy.is_random.fill_(self._counts["steps"] < self.random_steps)
 
     def state_dict(self) -> dict[str, Any]:
-        """Steps so far, and the constraints'."""
+        """Steps so far, and the state of the constraints."""
         return {"counts": dict(self._counts), "constraints": self.constraints.state_dict()}
 
     def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
@@ -221,7 +222,7 @@ class OffPolicy(Algorithm, Recipe):
 
 
 def _check_critics(config: DictConfig) -> None:
-    """Refuse 0 Q functions of a kind that the loss learns."""
+    """Refuse a configuration without Q functions that the loss has to train."""
     loss = locate(config.loss.get("_target_"), "loss._target_")
     for key, kind in (("critics.rewards", QFunctionLoss), ("critics.costs", CostCritics)):
         if not setting(config, key) and isclass(loss) and issubclass(loss, kind):
@@ -268,7 +269,7 @@ def _build_memory(
 
 
 def _check_risk(config: DictConfig, constraints: Constraints, loss: ReplayLoss) -> None:
-    """Refuse a risk measure that the cost critics do not know."""
+    """Refuse a risk measure that the cost critics do not support."""
     risk, known = constraints.risk, loss.risk_measure
     if risk is None or (known is not None and isinstance(risk, known)):
         return

@@ -20,7 +20,7 @@ _ON_POLICY_ONLY = ("encoders", "memory", "normalise")
 
 
 def setting(config: DictConfig, key: str) -> Any:
-    """The value of a key that has to be there.
+    """The value of a required key.
 
     Raises:
         ValueError: If it is not.
@@ -53,7 +53,7 @@ def bounded_actions(env: EnvBase) -> TensorSpec:
 
 
 def exploring(actor: TensorDictModuleBase, env: EnvBase, noise: float) -> ExploringPolicy:
-    """The policy that acts with an actor, within the bounds of an environment's actions."""
+    """The exploring policy of an actor, within the bounds of an environment's actions."""
     spec = bounded_actions(env)
     return ExploringPolicy(actor, spec.low, spec.high, noise=noise)
 
@@ -65,7 +65,7 @@ def build_networks(
 
     Args:
         config: Configuration as composed from ``conf/``.
-        env: Tells the sizes of observations and actions.
+        env: Its specs have the sizes of observations and actions.
         num_costs: Costs that are constrained; without them, there is no critic of costs.
         device: Of the parameters.
 

@@ -42,7 +42,7 @@ __all__ = ["OnPolicy"]
 
 @dataclass
 class OnPolicy(Algorithm, Recipe):
-    """PPO, TRPO, CPO and their like: an algorithm, and the recipe that builds it.
+    """PPO, TRPO, CPO and similar algorithms: the algorithm, and the recipe that builds it.
 
     Attributes:
         actor: Policy with ``get_dist``.
@@ -119,7 +119,7 @@ class OnPolicy(Algorithm, Recipe):
     def build_policy(
         cls, config: DictConfig, env: EnvBase, device: torch.device
     ) -> tuple[TensorDictModuleBase, Mapping[str, nn.Module]]:
-        """Build what acts, and the networks that it consists of."""
+        """Build the policy, and the networks that it consists of."""
         actor = _build_networks(config, env, 0, device)["actor"]
         return make_behaviour(actor), {"actor": actor}
 
@@ -133,7 +133,7 @@ class OnPolicy(Algorithm, Recipe):
 
         Args:
             batch: Rollouts of the current policy, [N, T]; advantages are written into it.
-            episodes: Its episodes.
+            episodes: Statistics of the episodes in the batch.
 
         Returns:
             Values for columns of the table, by name.
@@ -158,7 +158,7 @@ class OnPolicy(Algorithm, Recipe):
         return row
 
     def _critic_bias(self, batch: TensorDictBase) -> dict[str, float]:
-        """By how much the cost critic's predictions exceed the discounted costs then paid."""
+        """Bias of the cost critic: predictions minus the discounted costs that then occurred."""
         if self.cost_advantage is None:
             return {}
         estimator, following = self.cost_advantage, batch["next"]
@@ -229,7 +229,7 @@ def _build_advantage(config: DictConfig, critic: TensorDictModule, **parts: Any)
 
 
 def _build_update(config: DictConfig, **parts: Any) -> PolicyUpdate:
-    """What moves the policy: ``policy_update`` on ``loss``, and the pairs of ``then`` after it."""
+    """The update of the policy: ``policy_update`` on ``loss``, then the pairs in ``then``."""
     loss = build_part(config.loss, **parts)
     if isinstance(loss, SurrogateLoss) and loss.has_costs and not parts["cost_limits"]:
         raise ValueError(

@@ -19,9 +19,9 @@ __all__ = ["fast_products", "in_parallel", "prefers_onednn", "torch_threads"]
 def prefers_onednn(cpuinfo: str) -> bool:
     """Whether oneDNN multiplies matrices faster than MKL on a processor, and as exactly.
 
-    MKL leaves half of the width of AMD's vector units unused: oneDNN takes about half as long there
-    for products of minibatches. torch asks it only if products may be rounded to bfloat16,
-    of which oneDNN makes use where there are tile registers (AMX), and nowhere else.
+    MKL does not use half of the width of AMD's vector units. There oneDNN takes about half as long
+    for products of minibatches. torch uses oneDNN only if products may be rounded to bfloat16.
+    oneDNN really rounds only on processors with tile registers (AMX).
 
     Args:
         cpuinfo: What Linux says of the processor, the text of ``/proc/cpuinfo``.
@@ -46,9 +46,9 @@ def _is_of_use() -> bool:
 def fast_products() -> Iterator[None]:
     """Let torch multiply matrices inside the block by oneDNN, on processors that it suits.
 
-    For updates, whose minibatches have thousands of rows: a call costs some ten microseconds
-    more, too many for the few rows that a policy acts on. Sums differ in their last digits.
-    What the caller has set (``torch.backends.mkldnn.matmul.fp32_precision``) is kept.
+    Use it for updates, whose minibatches have thousands of rows. A call takes some ten microseconds
+    more, which is too much for the few rows that a policy acts on. Sums differ in their last
+    digits. A setting of the caller (``torch.backends.mkldnn.matmul.fp32_precision``) is kept.
 
     Examples:
         >>> with fast_products():
@@ -82,9 +82,9 @@ def torch_threads(number: int) -> Iterator[None]:
 def in_parallel(first: Callable[[], Any], second: Callable[[], Any]) -> tuple[Any, Any]:
     """Call two functions that share nothing they change, each with half of torch's threads.
 
-    Minibatches of narrow networks are too small to be worth two threads each: two of them side by
-    side are. With one thread, the second function follows the first. TorchRL's exploration type is
-    DETERMINISTIC meanwhile, as in its losses.
+    Minibatches of narrow networks are too small for two threads each, so it is faster to run two
+    updates at the same time. With one thread, the second function follows the first. TorchRL's
+    exploration type is DETERMINISTIC meanwhile, as in its losses.
 
     Args:
         first: Called in this thread.

@@ -1,4 +1,4 @@
-"""Steps that go against a cost where its limit is broken: C-TRPO's and CRPO's."""
+"""Steps that lower a cost while its limit is violated: C-TRPO and CRPO."""
 
 from __future__ import annotations
 
@@ -41,24 +41,25 @@ def barrier_divergence(change: Tensor, slack: Tensor) -> Tensor:
 
 
 class CTRPOStep(TRPOStep):
-    """A step within a trust region that does not reach beyond the limits.
+    """A step within a trust region that lies within the limits (C-TRPO).
 
     The region is that of the divergence (Milosevic et al. 2025)
 
         D_C(π_θ ‖ π_k) = KL(π_θ ‖ π_k) + β Σᵢ D_φ(dᵢ − J_cᵢ(θ), dᵢ − J_cᵢ(θ_k)) ≤ δ
 
-    with `barrier_divergence` as D_φ and J_c(θ) − J_c(θ_k) = T̄ E[(ρ − 1) A_c]: the mean length of
-    an episode makes an undiscounted sum of an average per step, as 1/(1 − γ) makes the article's
-    discounted one. Its Hessian at θ_k is H + β T̄² Σᵢ bᵢbᵢᵀ / (dᵢ − J_cᵢ): where a limit is near,
-    the natural gradient turns along it. The line search takes the first fraction with D_C ≤ δ that
-    does not worsen the loss.
+    with `barrier_divergence` as D_φ and J_c(θ) − J_c(θ_k) = T̄ E[(ρ − 1) A_c]. The mean episode
+    length T̄ converts an average per step to an undiscounted sum, as 1/(1 − γ) converts it to a
+    discounted sum in the article. The Hessian of D_C at θ_k is H + β T̄² Σᵢ bᵢbᵢᵀ / (dᵢ − J_cᵢ):
+    near a limit, the natural gradient becomes parallel to it. The line search takes the first
+    fraction with D_C ≤ δ that does not worsen the loss.
 
-    A policy beyond a limit recovers: `TRPOStep`'s step against E[ρ A_c] until J_c is (1 −
-    `hysteresis`) d below what it is held against, which is d or, by a margin, less. The barriers
-    of the costs that are within their limits stay; of several to recover, the one exceeded most
-    comes first. A limit of 0 has no barrier, and where nothing costs there is nothing to recover.
+    A policy above a limit recovers: it takes `TRPOStep`'s step against E[ρ A_c] until J_c is (1 −
+    `hysteresis`) d below its target, which is d, or less by a margin. The barriers of costs within
+    their limits stay active. If several limits are violated, the cost that exceeds its limit most
+    is lowered first. A limit of 0 has no barrier, and a batch without any cost is no reason to
+    recover.
 
-    Adds ``recovers`` to the diagnostics, [k]: 1 for the costs that are being recovered.
+    The diagnostics also have ``recovers``, [k]: 1 for the costs from which the policy recovers.
 
     Args:
         loss: A `CPOLoss`, or a callable of your own that returns a TensorDict with scalars
@@ -135,7 +136,7 @@ class CTRPOStep(TRPOStep):
         return Proposal(-scale * direction, is_acceptable, diagnostics)
 
     def state_dict(self) -> dict[str, Any]:
-        """Which costs are being recovered."""
+        """The costs from which the policy recovers."""
         return {"recovering": self.recovering.clone()}
 
     def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
@@ -144,14 +145,14 @@ class CTRPOStep(TRPOStep):
 
 
 class CRPOStep(TRPOStep):
-    """A step for the reward while all costs are within d + η, else one against a cost.
+    """A step for the reward if all costs are at most d + η, else a step against one cost (CRPO).
 
-    The algorithm of Xu, Liang and Lan 2021, with a trust region for the policy update: if
-    J_cᵢ ≤ dᵢ + η for all i, a `TRPOStep` on the loss, otherwise one on E[ρA_cᵢ] of the cost that
-    is exceeded most, in its own units. (The article takes any of the exceeded ones.) There is
-    no multiplier, and nothing to tune but η.
+    The algorithm of Xu, Liang and Lan 2021, with a trust region for the policy update. If J_cᵢ ≤ dᵢ
+    + η for all i, it is a `TRPOStep` on the loss. Otherwise it is a `TRPOStep` on E[ρA_cᵢ] of the
+    cost that exceeds its limit most, in its own units. (The article takes any of these costs.)
+    There is no multiplier, and only η to tune.
 
-    Adds ``reduces`` to the diagnostics, [k]: 1 for the cost that the step was against.
+    The diagnostics also have ``reduces``, [k]: 1 for the cost that the step lowers.
 
     Args:
         loss: A `CPOLoss`, or a callable of your own that returns a TensorDict with scalars

@@ -1,4 +1,4 @@
-"""The replay buffer: transitions drawn uniformly or by priority."""
+"""The replay buffer, with uniform or prioritised sampling."""
 
 from __future__ import annotations
 
@@ -29,12 +29,12 @@ _LONGEST_ROW = 1_000
 class Memory(Checked):
     """A `TensorDictReplayBuffer` of transitions over one step or over n steps.
 
-    A transition over n steps holds the discounted sum of n rewards, and of n costs, and the n-th
-    observation after its own. Where the episode ends before, it ends there; ``terminated`` is that
-    of its last step. Time-outs are truncations: values bootstrap after them.
+    A transition over n steps has the discounted sums of n rewards and of n costs, and the
+    observation n steps later. If the episode ends earlier, the transition ends there;
+    ``terminated`` is that of its last step. Time-outs are truncations: values bootstrap after them.
 
     Args:
-        capacity: Transitions that are kept; the oldest go first.
+        capacity: Largest number of transitions; the oldest are overwritten first.
         batch_size: Transitions in a minibatch.
         in_keys: Entries of a step that are kept.
         reward_keys: Entries below ``next`` that are summed over n steps.
@@ -44,7 +44,7 @@ class Memory(Checked):
             files.
         prioritised: Exponents ``alpha`` and ``beta`` of prioritised replay (Schaul et al. 2016,
             sections 3.3 and 3.4), or None for uniform draws.
-        keep: Whether checkpoints hold the transitions, so that a run continues exactly.
+        keep: Whether checkpoints have the transitions, so that a resumed run continues exactly.
         device: Device of the minibatches.
 
     Raises:
@@ -95,11 +95,11 @@ class Memory(Checked):
             self._in_keys.append("steps_to_next_obs")
 
     def __len__(self) -> int:
-        """Transitions that are there."""
+        """Number of transitions in the buffer."""
         return len(self._buffer)
 
     def extend(self, batch: TensorDictBase) -> None:
-        """Take in the steps [N, T] that follow those of the last call."""
+        """Add the steps [N, T] that follow those of the last call."""
         self._keep([batch] if self._multi_step is None else self._summed(batch, self._multi_step))
 
     def _keep(self, pieces: list[TensorDictBase]) -> None:
@@ -110,7 +110,7 @@ class Memory(Checked):
         self._buffer.extend(steps.reshape(-1))
 
     def _summed(self, batch: TensorDictBase, transform: MultiStepTransform) -> list[TensorDictBase]:
-        """Transitions over n steps, piece by piece; the transform remembers what came before."""
+        """Transitions over n steps, piece by piece; the transform remembers earlier steps."""
         wanted = batch.select(*{("next", "done"), *self.in_keys})
         found = [transform.inv(piece) for piece in wanted.split(_LONGEST_ROW, -1)]
         return [piece for piece in found if piece is not None]
@@ -130,13 +130,13 @@ class Memory(Checked):
 
     @property
     def in_keys(self) -> list[NestedKey]:
-        """Entries of a step that it takes in."""
+        """Entries of a step that it stores."""
         return [key for key in self._in_keys if key != "steps_to_next_obs"]
 
     def minibatches(self, number: int) -> Iterator[TensorDictBase]:
         """Draw a number of minibatches.
 
-        Uniform draws for several of them are gathered together: that costs a tenth of the time.
+        Uniform samples of several minibatches are gathered together, in a tenth of the time.
         """
         at_once = 1 if self._is_prioritised else max(1, _MOST_AT_ONCE // self.batch_size)
         for first in range(0, number, at_once):
@@ -150,11 +150,11 @@ class Memory(Checked):
             self._buffer.update_priority(minibatch["index"], minibatch[priority])
 
     def components(self) -> dict[str, Stateful]:
-        """What a checkpoint holds of it: itself, if it is to be kept."""
+        """The parts that a checkpoint has: the buffer itself if ``keep``, else none."""
         return {"memory": self} if self.keeps else {}
 
     def state_dict(self) -> dict[str, Any]:
-        """The transitions, where the next one goes, and what the next n-step sums need."""
+        """The transitions, the position of the next one, and the state of n-step sums."""
         size = len(self)
         state: dict[str, Any] = {"size": size, "writer": self._buffer.writer.state_dict()}
         if self._is_prioritised:
@@ -204,18 +204,18 @@ _SMALLEST = 1e-8
 
 
 class ProportionalSampler(Sampler):
-    """Draws transition i with probability p_i / Σ p, where p = (|TD error| + ε)^α.
+    """Samples transition i with probability p_i / Σ p, where p = (|TD error| + ε)^α.
 
-    Schaul et al. 2016, section 3.3; what is drawn is weighed by (p_i / min p)^−β (section 3.4, with
-    the largest weight 1). New transitions have the largest p so far.
+    Schaul et al. 2016, section 3.3. Samples have the importance weights (p_i / min p)^−β (section
+    3.4, with the largest weight 1). New transitions get the largest p so far.
 
-    TorchRL's `PrioritizedSampler` needs a compiled extension that is missing wherever torch is
-    newer than the one it was built for, draws from NumPy's generator, which a run does not seed,
-    and leaves new transitions without a priority. This one sums all priorities for every draw: a
-    millisecond for a million transitions.
+    TorchRL's `PrioritizedSampler` has three problems: it needs a compiled extension that is missing
+    if torch is newer than the version it was built for; it samples from NumPy's generator, which a
+    run does not seed; and it gives new transitions no priority. This class sums all priorities for
+    every sample, a millisecond for a million transitions.
 
     Args:
-        capacity: Transitions that there can be.
+        capacity: Largest number of transitions.
         alpha: α, 0 for uniform draws.
         beta: β, 0 for no weights.
 

@@ -22,15 +22,15 @@ __all__ = ["ReplayUpdate"]
 
 
 class ReplayUpdate(Checked):
-    """Minimise the sum of all ``loss_*`` on minibatches, and move target networks.
+    """Minimise the sum of all ``loss_*`` on minibatches, and update target networks.
 
     Args:
         loss: Loss on steps of the buffer, with target networks unless ``tau`` is None.
         optimizer: Function of the parameters that builds the optimiser, for example
             ``functools.partial(torch.optim.Adam, lr=3e-4, fused=True)``.
         updates_per_step: Gradient steps per step of an environment, the update-to-data ratio.
-        tau: Step τ of target networks towards the networks after every step; None without target
-            networks.
+        tau: Polyak averaging τ: weight of the new parameters in the target networks at every
+            update; None without target networks.
         policy_delay: Steps of the critics per step of the policy, and of the targets.
         rates: Learning rates of parameters whose names begin with a key, such as ``log_alpha``; for
             others that of the optimiser.
@@ -88,7 +88,7 @@ class ReplayUpdate(Checked):
 
     @torch.no_grad()
     def equate_targets(self) -> None:
-        """Make target networks equal to the networks, whose weights have been replaced."""
+        """Copy the networks, whose weights have been replaced, into the target networks."""
         for target, source in zip(self._targets, self._sources, strict=True):
             target.copy_(source)
 
@@ -102,8 +102,8 @@ class ReplayUpdate(Checked):
         """Take a number of gradient steps.
 
         Returns:
-            The mean over the steps of everything that the loss reports and that is one number, NaN
-            if there was no step; and ``num_updates``.
+            Means over the steps of all single numbers that the loss reports, NaN if there was no
+            step; and ``num_updates``.
         """
         names = self.loss.out_keys
         nothing = torch.zeros((), device=self._device)

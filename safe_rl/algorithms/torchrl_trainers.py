@@ -28,7 +28,7 @@ class ConstraintHook(TrainerHookBase):
     multipliers.
 
     Args:
-        constraints: What is limited; its multiplier, if any, is the one that the loss reads.
+        constraints: The constraints; their multiplier, if any, is the one that the loss reads.
         accounting: Sums costs and rewards of the collector's batches over episodes.
 
     Raises:
@@ -55,14 +55,14 @@ class ConstraintHook(TrainerHookBase):
         self._row: dict[str, float] = {}
 
     def __call__(self, batch: TensorDictBase) -> TensorDictBase:
-        """Account for a batch [N, T] or [T]; it stays as it is."""
+        """Update the constraints from a batch [N, T] or [T], which is not changed."""
         episodes = self.accounting.update(batch)
         self.constraints.update(episodes, batch)
         self._row = episodes.scalars() | self.constraints.columns()
         return batch
 
     def log(self, batch: TensorDictBase) -> dict[str, float]:
-        """What is worth logging about the last batch."""
+        """Values to log about the last batch."""
         del batch
         return self._row
 
@@ -92,13 +92,13 @@ class ConstraintHook(TrainerHookBase):
 class UpdateStepper(OptimizationStepper):
     """A trust-region step, or another of our updates, as a trainer's optimisation step.
 
-    It takes the batch as the trainer hands it over: without a replay buffer the whole collected
-    batch, to which a trust-region step belongs, with ``optim_steps_per_batch=1``.
+    It takes the batch that the trainer passes. Without a replay buffer and with
+    ``optim_steps_per_batch=1`` this is the whole collected batch, as a trust-region step needs it.
 
     Args:
         policy_update: A `TRPOStep`, a `CPOStep` or a `MinibatchUpdate`.
         critic_update: Fits the critics afterwards, or None.
-        constraints: What a constrained step has to keep, filled by a `ConstraintHook`; or None.
+        constraints: Constraints of a constrained step, updated by a `ConstraintHook`; or None.
 
     Examples:
         >>> from safe_rl.algorithms import TRPOStep
@@ -128,11 +128,11 @@ class UpdateStepper(OptimizationStepper):
         """Improve policy and critics on a batch.
 
         Args:
-            trainer: Not asked for anything.
+            trainer: Not used.
             sub_batch: Data with advantages and value targets, any shape.
 
         Returns:
-            What the updates report, as scalars: One per constraint of what there is per constraint.
+            Diagnostics of the updates, as scalars; one per constraint for vectors [k].
         """
         del trainer
         known = self.constraints

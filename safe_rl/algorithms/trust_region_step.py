@@ -38,7 +38,7 @@ Loss = Callable[[TensorDictBase], TensorDictBase]
 
 
 class StepProblem(NamedTuple):
-    """What a step is proposed from.
+    """The quantities from which a step is computed.
 
     Attributes:
         losses: Entries of the loss before the step, with gradients.
@@ -75,9 +75,9 @@ class Proposal(NamedTuple):
 
     Attributes:
         step: Change of the parameters, [P].
-        is_acceptable: Judges the losses and the KL divergence after a step that is no further than
-            δ.
-        diagnostics: What is worth logging about the step.
+        is_acceptable: Whether the losses and the KL divergence after a step within δ are
+            acceptable.
+        diagnostics: Values to log about the step.
     """
 
     step: Tensor
@@ -86,7 +86,7 @@ class Proposal(NamedTuple):
 
 
 def total_loss(losses: TensorDictBase) -> Tensor:
-    """Sum of all entries that are named ``loss_…``: what TorchRL means to be minimised.
+    """Sum of all entries that are named ``loss_…``, which TorchRL minimises.
 
     Raises:
         FloatingPointError: If it is not finite.
@@ -105,7 +105,7 @@ class TRPOStep(PolicyUpdate):
 
     The step is √(2δ / xᵀHx)·x with H x = −g solved by conjugate gradients, H the Fisher matrix of
     the policy plus damping. A backtracking line search takes its first fraction with
-    KL(π_θ ‖ π_k) ≤ δ that does not worsen the loss. If there is none, the policy stays.
+    KL(π_θ ‖ π_k) ≤ δ that does not worsen the loss. If there is none, the policy does not change.
 
     The loss may be any callable from a batch to a TensorDict with scalars ``loss_…``, for example
     a surrogate of your own; their sum is minimised.
@@ -167,18 +167,19 @@ class TRPOStep(PolicyUpdate):
         """Take one step.
 
         Args:
-            batch: On-policy data with what the loss reads, of any shape; padding is left out.
+            batch: On-policy data with the entries that the loss reads, of any shape; padding is not
+                used.
             cost_violation: J_c − d, [k]; read by constrained steps only.
             episode_length: T̄, scalar; read by constrained steps only.
 
         Returns:
             The losses' entries after the step, ``kl`` (mean KL(π_θ ‖ π_k)), ``step_fraction``
-            (accepted by the line search; 0: none, or nothing to step along), ``backtracks``
-            (tries before that one) and what the step itself reports.
+            (share of the full step that the line search accepted; 0: none, or the gradient was 0),
+            ``backtracks`` (rejected tries) and the diagnostics of the step itself.
 
         Raises:
-            FloatingPointError: If an entry of the batch, the loss or the step is not finite; the
-                policy is as it was then.
+            FloatingPointError: If an entry of the batch, the loss or the step is not finite; then
+                the policy has not changed.
         """
         if isinstance(self.loss, LossModule):
             require_finite(batch, self.loss.in_keys)
@@ -217,16 +218,16 @@ class TRPOStep(PolicyUpdate):
         return Proposal(-length * direction, lambda after, kl: bool(objective(after) <= before), {})
 
     def _gradients(self, surrogates: Iterable[Tensor]) -> Tensor:
-        """Gradients of k scalars, of whose graph more is to be differentiated, [k, P]."""
+        """Gradients of k scalars, [k, P]; their graph is kept for further derivatives."""
         rows = [flat_gradient(row, self.parameters, retain_graph=True) for row in surrogates]
         return torch.stack(rows) if rows else flatten(self.parameters).detach()[None, :][:0]
 
     def _solve_all(self, fisher: FisherProduct, g: Tensor, b: Tensor) -> tuple[Tensor, Tensor]:
-        """H⁻¹g, [P], and H⁻¹bᵢ, [k, P], such that q, r and S are those of one and the same metric.
+        """H⁻¹g, [P], and H⁻¹bᵢ, [k, P], so that q, r and S are consistent with one metric.
 
-        A few conjugate gradients leave residuals of tens of percents, and gᵀw, bᵀv and wᵀHv then
-        are three different numbers, while a dual knows but one r. In the span of the solutions
-        they are one: there a step keeps linearised constraints and the radius exactly.
+        A few iterations of conjugate gradients leave residuals of tens of percents. Then gᵀw, bᵀv
+        and wᵀHv are three different numbers, but the dual needs one r. In the span of the solutions
+        they are equal, and there a step keeps linearised constraints and the radius exactly.
         """
         right = torch.cat([g[None], b])
         pairs = [solve_with_image(fisher, row, self.cg_iterations) for row in right]

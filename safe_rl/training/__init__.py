@@ -1,1 +1,1 @@
-"""The loop: collect, account, learn, record."""
+"""The training loop: collect a batch, compute episode statistics, learn, record."""

@@ -1,4 +1,4 @@
-"""From a configuration and an environment to a run that is ready to begin.
+"""Build a run from a configuration and an environment.
 
 A run can start from the networks of another one (Ray, Achiam, Amodei 2019, section 6).
 """
@@ -65,8 +65,8 @@ def build_trainer(
 
     Args:
         config: Configuration as composed from ``conf/``.
-        env: Seeded environment that keeps the contract of `safe_rl.envs`; if it has ``get_state``
-            and ``set_state``, a checkpoint holds the state of its worlds.
+        env: Seeded environment that fulfils the contract of `safe_rl.envs`; if it has ``get_state``
+            and ``set_state``, checkpoints have the state of its worlds.
         directory: Folder of the run.
         make_env: Makes an environment like ``env`` with another ``num_envs``, for collectors with
             workers.
@@ -115,7 +115,7 @@ def _decisions_per_batch(config: DictConfig, env: EnvBase) -> int:
 
 
 def begin_from(algorithm: Algorithm, config: Mapping[str, Any]) -> list[str]:
-    """Let an algorithm begin with the networks of ``init_from``; see `initialise_networks`."""
+    """Give an algorithm the networks of ``init_from``; see `initialise_networks`."""
     taken = initialise_networks(
         algorithm.networks,
         Path(config["init_from"]),
@@ -134,10 +134,10 @@ def initialise_networks(
     cost_loss: str | None = None,
     cost_networks: Collection[str] = ("cost_critic",),
 ) -> list[str]:
-    """Give networks the weights that a run has learned.
+    """Give networks the trained weights of another run.
 
-    Optimisers, multipliers and counters start new. Networks of costs are taken over if the run had
-    the same constrained costs and, with Q functions, the same loss.
+    Optimisers, multipliers and counters start anew. Cost networks get the other run's weights only
+    if that run had the same constrained costs and, with Q functions, the same loss.
 
     Args:
         networks: The new run's by name, changed in place.
@@ -151,7 +151,7 @@ def initialise_networks(
 
     Raises:
         CheckpointError: If there is no checkpoint, it lacks a network, or its networks have other
-            shapes; nothing has been changed then.
+            shapes. Then nothing has been changed.
     """
     if not source.exists():
         raise CheckpointError(f"init_from={source}: there is no such folder or file.")

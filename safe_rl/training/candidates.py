@@ -1,4 +1,4 @@
-"""The best policies of a run: each is judged by the episodes that it played itself."""
+"""Candidates for the best checkpoints: each policy is judged by its own episodes."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ _LONGEST = 10
 
 
 def epochs_until_judged(over: int, length: float, steps_per_epoch: float) -> int:
-    """Epochs after an update until finished episodes were, on average, played by its policy.
+    """Epochs from a policy's update until the finished episodes are, on average, its own.
 
-    A policy collects its batch in the epoch after its update. Episodes longer than a batch began
-    before it; half an episode later they lie around it.
+    A policy collects its batch in the epoch after its update. Episodes that are longer than a batch
+    began before it. Half an episode later, the finished episodes are centred on this batch.
 
     Args:
-        over: Number of epochs whose mean judges a policy.
+        over: Number of epochs over which returns and costs are averaged.
         length: Steps of an episode.
         steps_per_epoch: Steps of every row in an epoch.
 
@@ -42,10 +42,10 @@ class Judged(NamedTuple):
     """A policy that kept every limit: the arguments of `CheckpointStore.save_best`.
 
     Attributes:
-        steps: Environment steps after which it was the run's policy.
+        steps: Environment steps of the run when it was the current policy.
         score: Its return.
-        facts: What its checkpoint says of it.
-        states: The parts of the run then, by name.
+        facts: Facts about it for its checkpoint.
+        states: States of the parts of the run at that time, by name.
     """
 
     steps: int
@@ -55,15 +55,15 @@ class Judged(NamedTuple):
 
 
 class Candidates:
-    """Policies that wait for the epochs that judge them.
+    """Policies that wait for the epochs in which their own episodes end.
 
     Args:
-        components: Parts of the run, by name, that a checkpoint of a policy holds.
+        components: Parts of the run, by name, that a checkpoint of a policy has.
         limits: Cost key -> d, undiscounted cost per episode.
-        over: Number of epochs whose mean judges a policy.
-        delay: Mean length of episodes -> epochs from a policy's update to the last one that judges
-            it.
-        longest: Most steps of an episode, taken for the mean length until one has ended.
+        over: Number of epochs over which returns and costs are averaged.
+        delay: Function from the mean episode length to the number of epochs from a policy's update
+            to the last epoch of its average.
+        longest: Largest length of an episode, used as the mean length until an episode has ended.
 
     Examples:
         >>> import functools
@@ -95,12 +95,12 @@ class Candidates:
         self._waiting: deque[dict[str, Any]] = deque()
 
     def continue_after(self, rows: Iterable[Mapping[str, float]]) -> None:
-        """Take in the epochs of a run that is continued."""
+        """Add the epochs of a run that is resumed."""
         for row in rows:
             self._take(row)
 
     def add(self, row: Mapping[str, float]) -> list[Judged]:
-        """Add an epoch: its policy waits, and the policy that is due is judged.
+        """Add an epoch, and judge the waiting policy whose epochs are complete.
 
         Args:
             row: Of the run's table, by column.
@@ -127,9 +127,9 @@ class Candidates:
         return [policy["steps"] for policy in self._waiting]
 
     def judge_all(self) -> list[Judged]:
-        """Judge all that wait by the epochs that there are, at the end of a run.
+        """Judge all waiting policies by the epochs so far, at the end of a run.
 
-        They stay: a run that is continued has later epochs to judge them.
+        They keep waiting, because a resumed run has later epochs to judge them by.
         """
         return [one for policy in self._waiting for one in self._judge(policy)]
 
@@ -147,7 +147,7 @@ class Candidates:
         """Continue from :meth:`state_dict`.
 
         Raises:
-            ValueError: If they are no policies of a run.
+            ValueError: If the state is not of this class.
         """
         waiting = list(state_dict["waiting"])
         for policy in waiting:

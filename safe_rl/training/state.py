@@ -1,4 +1,4 @@
-"""State of the loop: counters, the worlds between epochs, a request to stop."""
+"""State of the training loop: counters, saved worlds between epochs, a request to stop."""
 
 from __future__ import annotations
 
@@ -60,11 +60,11 @@ class Progress:
 
 
 class WorldSnapshot:
-    """The worlds as the next epoch finds them, and the observation to continue from.
+    """The state of the worlds at the start of the next epoch, and the observation there.
 
-    Every epoch starts from a snapshot, with or without a checkpoint. Writing a state into a
-    simulation changes what snapshots do not hold (it wakes sleeping bodies): done only on resuming,
-    it would make an interrupted run differ from an uninterrupted one.
+    Every epoch restores a snapshot, also in a run that is not resumed. The reason: restoring a
+    state changes things that snapshots do not have (it wakes sleeping bodies). If only resumed runs
+    did this, they would differ from uninterrupted runs.
 
     Args:
         env: Environment with ``get_state`` and ``set_state``.
@@ -81,14 +81,14 @@ class WorldSnapshot:
         self._go_on_from(self._env.get_state())
 
     def stagger(self, max_steps: int, multiple: int = 1) -> bool:
-        """Put row i of N at step i · max_steps / N of its first episode: not all end at once.
+        """Start row i of N at step i · max_steps / N of its first episode, so not all end at once.
 
         Args:
             max_steps: Steps of an episode.
-            multiple: Steps that are taken at a time, of which all begin at a multiple.
+            multiple: Environment steps per decision; all rows start at a multiple of it.
 
         Returns:
-            Whether that could be done: The environment's state holds its ``step_count``.
+            Whether this was possible: the environment's state must have a ``step_count``.
         """
         state = self._env.get_state()
         steps = state.get("step_count", None)
@@ -101,11 +101,11 @@ class WorldSnapshot:
         return True
 
     def state_dict(self) -> dict[str, Any]:
-        """The snapshot taken last."""
+        """The last snapshot."""
         return self._snapshot.to_dict()
 
     def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
-        """Put the worlds back, and the collector in front of them."""
+        """Restore the worlds, and let the collector continue from them."""
         self._go_on_from(self._snapshot.from_dict(state_dict, batch_size=self._env.batch_size))
 
     def _go_on_from(self, snapshot: TensorDictBase) -> None:
@@ -115,10 +115,11 @@ class WorldSnapshot:
 
 
 class StopRequest:
-    """Remembers the first SIGINT (Ctrl-C), SIGTERM or SIGHUP; the second acts as it always did.
+    """Remembers the first SIGINT (Ctrl-C), SIGTERM or SIGHUP; a second one acts as usual.
 
-    SIGHUP, which comes when a terminal is closed, stays ignored where it is, as below ``nohup``.
-    Signals can only be caught in the main thread; elsewhere this does nothing.
+    SIGHUP is sent when a terminal is closed; if it is already ignored, as with ``nohup``, it stays
+    ignored. Signals can only be caught in the main thread; in other threads this class does
+    nothing.
 
     Examples:
         >>> import signal
