@@ -1,6 +1,6 @@
 """Constrained losses, advantages and multipliers.
 
-Everything here reads and writes TensorDict keys and knows no environment.
+Everything here reads and writes TensorDict keys, and does not depend on an environment.
 """
 
 from safe_rl.objectives.actor_critic import ActorCriticLoss, JointAdvantages

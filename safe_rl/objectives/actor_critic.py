@@ -1,4 +1,4 @@
-"""One loss and one advantage estimator of policy and critics, for TorchRL's trainers."""
+"""A joint loss and a joint advantage estimator of policy and critics, for TorchRL's trainers."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _OF_ESTIMATORS = {"reward", "done", "terminated"}
 
 
 class ActorCriticLoss(LossModule):
-    """A policy loss and the critics' loss as one, for trainers with one optimiser for both.
+    """A policy loss and the critics' loss in one, for trainers with a single optimiser.
 
     Such as `torchrl.trainers.algorithms.PPOTrainer`.
 
@@ -92,7 +92,7 @@ class ActorCriticLoss(LossModule):
 
 
 class JointAdvantages(TensorDictModuleBase):
-    """Advantages of the reward and of the costs, normalised: one call per batch.
+    """Normalised advantages of the reward and of the costs, in one call per batch.
 
     Stands where TorchRL's trainers expect a `GAE`.
 

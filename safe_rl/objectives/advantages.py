@@ -1,8 +1,8 @@
 """Generalised advantage estimates for the reward and for k costs at once.
 
-Rollouts are [..., T] TensorDicts, time last. A trajectory ends where ``("next", "done")`` is set,
-at the last step of the batch, and where the mask of a padded one does. Unless it ends with
-``("next", "terminated")``, its last observation is bootstrapped.
+Rollouts are [..., T] TensorDicts; time is the last dimension. A trajectory ends where ``("next",
+"done")`` is set, at the last step of the batch, and where the mask of a padded rollout ends. Unless
+it ends with ``("next", "terminated")``, the value of its last observation is bootstrapped.
 """
 
 from __future__ import annotations
@@ -31,8 +31,8 @@ _ONE_PASS = "target_params needs two passes: use torchrl.objectives.value.GAE."
 class VectorGAE(Checked, ValueEstimatorBase):
     """Advantages and value targets of one or several reward-like signals.
 
-    Differs from `torchrl.objectives.value.GAE` in three points: several signals at once, every
-    observation valued once, and a choice of value target.
+    It differs from `torchrl.objectives.value.GAE` in three points: it takes several signals at
+    once, it evaluates every observation once, and it has a choice of value targets.
 
     Args:
         value_network: Writes the value key, [..., T, F], one output per signal; None if the

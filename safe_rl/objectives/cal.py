@@ -32,25 +32,25 @@ class CALLoss(SACLagrangianLoss):
     """SAC on an augmented Lagrangian of a conservative estimate of the costs.
 
     Wu, Tang, Lin, Yu, Mao, Xie, Wang, Wang, *Off-Policy Primal-Dual Safe Reinforcement Learning*
-    (ICLR 2024). Actions cost Q_i = mean + κ std of an ensemble (conservative policy optimisation),
-    and are weighed by
+    (ICLR 2024). The cost of an action is Q_i = mean + κ std of an ensemble (conservative policy
+    optimisation). Its weight is
 
         λ̂_i = max(0, λ_i − c (d'_i − E[Q_i]) / u_i)                   (local policy convexification)
 
-    which is the gradient of (1 / 2c) Σ_i max(0, λ_i + c (E[Q_i] − d'_i) / u_i)²: near the limit
-    the objective is convex in E[Q_i], so that the policy comes to rest at the limit instead of
-    oscillating about it. The expectation is that over a minibatch.
+    which is the gradient of (1 / 2c) Σ_i max(0, λ_i + c (E[Q_i] − d'_i) / u_i)². So near the limit
+    the objective is convex in E[Q_i], and the policy converges to the limit instead of oscillating
+    about it. The expectation is over a minibatch.
 
-    λ and the limit d are about undiscounted costs of episodes, E[Q_i] is discounted. The article
-    converts d by `discounted_share`, which is some 30 % off: states in a replay buffer are those of
-    older policies, and costs are not spread evenly. With c = 10, λ̂ would then settle at a distance
-    from λ that no λ makes up for. So d' = ρ d with a measured ρ: the mean of the critics (without
-    κ) over what episodes cost, both averaged over the past batches.
+    λ and the limit d are about undiscounted costs of episodes, but E[Q_i] is discounted. The
+    article converts d by `discounted_share`. This has an error of some 30 %: states in a replay
+    buffer are those of older policies, and costs are not spread evenly. With c = 10, this error
+    shifts λ̂ by more than λ can compensate. So d' = ρ d with a measured ρ: the mean of the critics
+    (without κ) divided by the cost of episodes, both averaged over past batches.
 
     Args:
         networks: Actor, Q functions and cost Q functions, as of `SACLagrangianLoss`.
         convexity: Weight c per unit of discounted cost beyond the limit.
-        ratio_memory: Weight of the past batches in ρ, the unit of the limit.
+        ratio_memory: Weight of the past batches in ρ.
         largest_ratio: Factor by which ρ may differ from `discounted_share`, up or down; 1 for the
             article's conversion.
         settings: Those of a `SACLagrangianLoss`.
@@ -108,7 +108,7 @@ class CALLoss(SACLagrangianLoss):
         return weight.clamp_min(0) / self.cost_unit
 
     def calibrate(self, episodes: KnownCosts) -> None:
-        """Find d' from the last updates and the new batch; the limit is J_c less the violation."""
+        """Compute d' from the last updates and the new batch (limit = J_c − violation)."""
         super().calibrate(episodes)
         said, number = self.critics_say
         expected = discounted_share(self.gamma, episodes.episode_length)

@@ -1,4 +1,4 @@
-"""Controllers of Lagrange multipliers: proportional and integral, and with a derivative."""
+"""Lagrange multipliers by PI and PID controllers."""
 
 from __future__ import annotations
 
@@ -15,19 +15,19 @@ from safe_rl.ranges import NotNegative, Positive, Range, Weight
 class PIMultiplier(Multiplier):
     """λ = clip(K_P Δ + I, 0, highest), I ← clip(I + K_I Δ, 0, highest), |Δ| ≤ saturation.
 
-    Δ = (J_c − d) / scale. The integral stops at the bounds of λ (anti-windup by clamping), and
-    violations are bounded: a cost of six times the limit does not charge the integral six times as
-    fast as a cost of 0 empties it.
+    Δ = (J_c − d) / scale. The integral stops at the bounds of λ (anti-windup by clamping).
+    Violations are bounded too; otherwise a cost of six times the limit would raise the integral
+    several times as fast as a cost of 0 lowers it.
 
-    To the multiplier a policy is an integrator: per update, J_c moves by about β (λ* − λ) limits,
-    λ* being the multiplier that keeps J_c where it is, and β ≈ ¼ or less. Proportional plus
-    integral control of an integrator has the natural frequency √(β K_I) and the damping
-    ½ K_P √(β / K_I); an integral alone is undamped. K_P = 4 and K_I = 0.4 give a period of 20
-    updates at a damping of 1.6, and of 1 where β is a tenth.
+    For the controller, a policy behaves like an integrator: per update, J_c changes by about β (λ*
+    − λ) times the limit. λ* is the multiplier that keeps J_c constant, and β ≈ ¼ or less. PI
+    control of an integrator has the natural frequency √(β K_I) and the damping ½ K_P √(β / K_I); an
+    integral alone has no damping. K_P = 4 and K_I = 0.4 give a period of 20 updates and a damping
+    of 1.6. If β is a tenth, the damping is 1.
 
     Args:
         cost_limits: Mapping from cost key to limit d, or limits alone; see `parse_cost_limits`.
-        init: First λ, for all costs or one per cost.
+        init: Initial λ, for all costs or one per cost.
         kp: Proportional gain K_P.
         ki: Integral gain K_I.
         saturation: Bound of the error |Δ|, in units of the limit.
@@ -66,7 +66,7 @@ class PIMultiplier(Multiplier):
         self.register_buffer("integral", initial.clone())
 
     def set_scale(self, scale: Tensor) -> None:
-        """Set the units of violations, [k] > 0: until then the limits, or 1 for a limit of 0."""
+        """Set the units of violations, [k] > 0; by default the limits, or 1 for a limit of 0."""
         self.scale.copy_(scale)
 
     def _step(self, violation: Tensor) -> dict[str, Tensor]:

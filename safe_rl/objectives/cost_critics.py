@@ -23,13 +23,12 @@ _COSTS = "cost_qvalue_network"
 class CostCritics(QFunctionLoss):
     """k cost critics for a loss on Q functions: their TD(0) loss, and the penalty on the actor.
 
-    A policy that minimises Q_c exploits its underestimates, which bootstrapping spreads. As rewards
-    bootstrap on the least of two networks, costs bootstrap on mean_E Q' + κ' std_E Q', which is the
-    largest of two networks for κ' = 1. The penalty on an action is
-    r Σ_i λ_i (mean_E Q_i + κ std_E Q_i) / u_i, with the size u of one cost and the size r of
-    rewards: at λ = 1 one cost weighs as much as a reward of one standard deviation. The sum of the
-    actor's objective and this is divided by 1 + Σ λ_i / u_i, so that the step size does not grow
-    with λ.
+    A policy that minimises Q_c exploits its underestimates, and bootstrapping spreads these.
+    Rewards bootstrap on the smaller of two networks. Costs bootstrap on mean_E Q' + κ' std_E Q',
+    which is the larger of two networks for κ' = 1. The penalty on an action is r Σ_i λ_i (mean_E
+    Q_i + κ std_E Q_i) / u_i, where u is the size of one cost and r the size of rewards: with λ = 1
+    one cost has the weight of a reward of one standard deviation. The sum of the actor's objective
+    and this penalty is divided by 1 + Σ λ_i / u_i, so that the step size does not grow with λ.
 
     A base class to put before the loss without costs, whose critic and actor losses call
     `cost_qvalue_loss` and `penalised`.
@@ -37,14 +36,14 @@ class CostCritics(QFunctionLoss):
     Args:
         actor_network, qvalue_network: Of the loss without costs.
         cost_qvalue_network: A `safe_rl.models.QEnsemble` with one output per cost.
-        multiplier: λ; read at every call, and no part of the loss or its ``state_dict``.
+        multiplier: λ; read at every call. It is not part of the loss or its ``state_dict``.
         cost_keys: Costs below ``next``, [..., 1] each; of transitions over n steps their discounted
             sums, which TorchRL's `MultiStepTransform` makes of no more than its ``reward_keys``.
         pessimism: Standard deviations κ among the cost critics that are added to their mean.
-        target_pessimism: The same for what critics bootstrap on, which all then have in common;
-            None: every critic bootstraps on its own target network.
-        lowest_cost_value: Lower bound of what critics bootstrap on, such as 0 where no cost is
-            negative; None: none.
+        target_pessimism: The same for the value that all critics bootstrap on. None: every critic
+            bootstraps on its own target network.
+        lowest_cost_value: Lower bound of the values that critics bootstrap on, such as 0 if no cost
+            is negative; None: no bound.
         settings: Those of the loss without costs.
 
     Raises:
@@ -52,7 +51,8 @@ class CostCritics(QFunctionLoss):
 
     Attributes:
         cost_unit: u, the size of one cost, [k]; 1 until `calibrate` is called.
-        reward_unit: r, the standard deviation of the rewards of single steps; 1 until `measure` is.
+        reward_unit: r, the standard deviation of the rewards of single steps; 1 until `measure` is
+            called.
     """
 
     _in_keys: list[NestedKey]
@@ -110,7 +110,7 @@ class CostCritics(QFunctionLoss):
 
     @torch.no_grad()
     def cost_bias(self, batch: TensorDictBase) -> Tensor:
-        """Bias of the predictions on steps [N, T] of the present policy, [k]; see `critic_bias`."""
+        """Bias of the predictions on steps [N, T] of the current policy, [k]; see `critic_bias`."""
         keys = self.tensor_keys
         steps = batch.select(*self.in_keys, ("next", keys.done), strict=False)
         steps = steps.to(self.cost_unit.device)
@@ -124,7 +124,7 @@ class CostCritics(QFunctionLoss):
         self.cost_unit.copy_(episodes.unit)
 
     def measure(self, rewards: Tensor) -> None:
-        """Update the size of rewards with those of new steps, [...]."""
+        """Update the size of rewards with the rewards of new steps, [...]."""
         rewards = rewards.detach().flatten().to(self.reward_sums)
         powers = torch.stack([torch.ones_like(rewards), rewards, rewards.square()])
         self.reward_sums.add_(powers.sum(-1))

@@ -4,10 +4,10 @@ The step x of CPO (Achiam et al. 2017, equation 10) solves
 
     minimise gᵀx  subject to  cᵢ + bᵢᵀx ≤ 0 for i = 1 … k  and  ½ xᵀHx ≤ δ,
 
-and needs of its vectors no more than their products under the metric H⁻¹:
+and needs only the products of its vectors under the metric H⁻¹:
 q = gᵀH⁻¹g, rᵢ = gᵀH⁻¹bᵢ and Sᵢⱼ = bᵢᵀH⁻¹bⱼ. Its optimum is x = −(v + Σᵢ νᵢ wᵢ)/λ with v = H⁻¹g and
-wᵢ = H⁻¹bᵢ. Which constraints are active there is found by trying all 2ᵏ sets of them, in one
-batch: every set has a closed-form candidate, and the best feasible candidate is the optimum.
+wᵢ = H⁻¹bᵢ. To find the active constraints, all 2ᵏ sets of constraints are tried in one batch. Every
+set has a closed-form candidate, and the best feasible candidate is the optimum.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ class DualSolution(NamedTuple):
             0: nothing in the trust region is feasible, the step only recovers.
         lam: λ, multiplier of the trust region, [...]; 0 in case 0.
         nu: ν, multipliers of the constraints, [..., k].
-        reward_coefficient: 1/λ, or 0 where g has no component the constraints leave free, [...].
+        reward_coefficient: 1/λ, or 0 if the constraints leave no component of g free, [...].
         cost_coefficient: ν/λ, finite throughout, [..., k].
     """
 
@@ -66,11 +66,12 @@ class _Scaled(NamedTuple):
 def solve_dual(q: Tensor, r: Tensor, S: Tensor, c: Tensor, delta: Tensor | float) -> DualSolution:
     """Solve the CPO step for batches of problems; see the module for the notation.
 
-    Never NaN: where several g, b or c make the step ambiguous or void, it is
+    Never NaN. If g, b or c do not define a unique step, it is
 
     - g = 0, or g in the span of the active constraints: the shortest step to their boundary;
     - bᵢ = 0: the constraint is left out if cᵢ ≤ 0; otherwise nothing is feasible;
-    - infeasible: towards the nearest point that satisfies all constraints (with one constraint
+    - infeasible: a step towards the nearest point that satisfies all constraints (with one
+    constraint
       −√(2δ/s)·w), of the length of the trust region's radius; no step at all if none of the
       violated constraints has a gradient, or if they cancel out exactly.
 

@@ -34,9 +34,10 @@ def critic_bias(
 ) -> Tensor:
     """Mean of a critic's predictions minus the discounted sums of later costs, [F].
 
-    Costs are summed to the end of the episode. Where a row or a time-out cuts an episode, later
-    costs are unknown: the critic's own value of the last step replaces them, and its share γⁿ of
-    the sum is left out of the mean. A critic with a constant error has this error as its bias.
+    Costs are summed to the end of the episode. If the end of a row or a time-out cuts an episode,
+    later costs are unknown. Then the critic's own value of the last step replaces them, and its
+    share γⁿ of the sum is left out of the mean. A critic with a constant error has this error as
+    its bias.
 
     Args:
         value: Predictions for the steps of N rows, in order of time, [N, T, F].

@@ -25,7 +25,7 @@ from safe_rl.ranges import NotNegative, Share
 
 
 class TD3Loss(QFunctionLoss, objectives.TD3Loss):
-    """TorchRL's loss in two halves, with an ensemble of Q functions that needs no vmap.
+    """TorchRL's TD3 loss, split into critic and actor losses, for ensembles that need no vmap.
 
     Args:
         actor_network: Deterministic policy.
@@ -111,7 +111,7 @@ class TD3Loss(QFunctionLoss, objectives.TD3Loss):
             return self.actor_network(inputs).get(self.tensor_keys.action)
 
     def actor_loss(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
-        """Loss of the policy, with costs where there are critics of them."""
+        """Loss of the policy, with costs if there are cost critics."""
         action = self._act(tensordict, self.actor_network_params)
         values = self.q_values("qvalue_network", tensordict, action, "frozen").squeeze(-1)
         objective, reported = self.penalised(-values[0], tensordict, action)
@@ -158,7 +158,7 @@ class TD3LagrangianLoss(CostCritics, TD3Loss):
 
 
 class BCLoss(ReplayLoss):
-    """Distance of a deterministic policy's actions from those that were taken.
+    """Behaviour cloning: distance of a deterministic policy's actions from recorded ones.
 
     Liu et al., *Datasets and Benchmarks for Offline Safe Reinforcement Learning* (2024), where the
     steps are those of safe episodes (BC-Safe). The loss reads neither costs nor rewards.

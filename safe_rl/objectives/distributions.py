@@ -1,9 +1,10 @@
-"""Divergence, entropy and log-probabilities of any kind of policy distribution.
+"""KL divergence, entropy and log-probabilities of policies with any distribution.
 
-Closed forms where there are any: of Normals (also under a tanh-Normal's transform, which is the
-same for every policy, so that it changes neither KL divergence nor Fisher information), of
-everything registered with `torch.distributions.kl_divergence`. From samples otherwise. A composite
-distribution's parts are independent: everything is the sum over them, each in its own way.
+There are closed forms for Normals and for everything registered with
+`torch.distributions.kl_divergence`; other distributions are evaluated from samples. A tanh-Normal
+counts as a Normal: its transform is the same for every policy, so it changes neither KL divergence
+nor Fisher information. The parts of a composite distribution are independent, so all quantities are
+sums over the parts.
 """
 
 from __future__ import annotations
@@ -52,15 +53,15 @@ def gaussian_kl(loc_p: Tensor, scale_p: Tensor, loc_q: Tensor, scale_q: Tensor) 
 def categorical_kl(p: Categorical, q: Categorical) -> Tensor:
     """KL(p ‖ q) of single choices, [...], as torch's, with a gradient where choices are masked.
 
-    A choice that neither has adds 0 to the divergence; torch multiplies 0 by −∞ + ∞, and the
-    gradient of that is no number.
+    A choice that is masked in both distributions adds 0 to the divergence. torch's own function
+    multiplies 0 by −∞ + ∞ there, whose gradient is NaN.
     """
     change = (p.logits - q.logits).masked_fill(p.probs == 0, 0.0)
     return (p.probs * change).masked_fill((q.probs == 0) & (p.probs > 0), torch.inf).sum(-1)
 
 
 def root(distribution: Distribution) -> Distribution:
-    """The distribution underneath independent ones and transforms that no policy learns."""
+    """The base distribution, without Independent and without transforms that are not learned."""
     while isinstance(distribution, Independent | TransformedDistribution):
         if _may_learn_its_transform(distribution):
             break
@@ -121,9 +122,9 @@ def kl(
 ) -> Tensor:
     """KL(p ‖ q) of two distributions of the same kind, one number per state.
 
-    Without a closed form it is estimated from an action a that q sampled in each state, as
-    ρ log ρ − ρ + 1 with ρ = p(a)/q(a): without bias, never negative, and 0 with a zero gradient
-    where p = q (Schulman, *Approximating KL divergence*, 2020).
+    Without a closed form it is estimated from an action a that q sampled in each state, as ρ log ρ
+    − ρ + 1 with ρ = p(a)/q(a). The estimate is unbiased and never negative. For p = q it is 0 with
+    a zero gradient (Schulman, *Approximating KL divergence*, 2020).
 
     Args:
         p: Distribution in the states [...].
@@ -155,8 +156,8 @@ def kl(
 def entropy(distribution: Distribution) -> Tensor:
     """Differentiable entropy per state, [...]: in closed form, or −log π(a) of one sampled action.
 
-    The gradient of a sampled entropy goes through the sample where the distribution allows it, and
-    is the score function's elsewhere; both are without bias.
+    The gradient of a sampled entropy goes through the sample if the distribution allows it.
+    Otherwise it is the score-function gradient. Both are unbiased.
     """
     if isinstance(distribution, CompositeDistribution):
         return _total(map(entropy, distribution.dists.values()), distribution.batch_shape)
@@ -187,7 +188,7 @@ def sampler_of(actor: ProbabilisticTensorDictSequential) -> ProbabilisticTensorD
 def composite_keys(
     sampler: ProbabilisticTensorDictModule,
 ) -> tuple[list[NestedKey], list[NestedKey]] | None:
-    """Where the parts' actions and log-probabilities are written; None if there are no parts."""
+    """Keys of the parts' actions and log-probabilities; None if there are no parts."""
     made = sampler.distribution_class
     made = made.func if isinstance(made, partial) else made
     if made is not CompositeDistribution:
@@ -196,7 +197,7 @@ def composite_keys(
 
 
 class ReferencePolicy:
-    """A policy as it is now, in the states of a batch, to measure later ones against.
+    """The current policy in the states of a batch, from which the KL of later ones is measured.
 
     Args:
         distribution: Of the policy, without gradients.

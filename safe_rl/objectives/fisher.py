@@ -55,7 +55,7 @@ def _geometry_by_differentiation(
 ) -> Geometry:
     """Hessian of the mean KL(π ‖ π_k) with respect to the distribution's parameters, at π_k.
 
-    The gradient of the divergence is 0 there, so that JᵀMJ with this M is its whole Hessian with
+    The gradient of the divergence is 0 there, so JᵀMJ with this M is its complete Hessian with
     respect to θ. The network itself is not in this graph.
     """
     sampler = sampler_of(actor)
@@ -93,11 +93,12 @@ def policy_geometry(actor: ProbabilisticTensorDictSequential, batch: TensorDictB
 class FisherProduct:
     """Product of a vector with the Fisher matrix of a policy, plus damping.
 
-    The Fisher matrix is the Hessian of the mean KL(π_θ ‖ π_k) at θ_k: Jᵀ M J with J the Jacobian
-    of the network's outputs with respect to θ, and M the outputs' own Fisher matrix: in closed form
-    for Gaussian and categorical policies, by differentiating the divergence twice for others.
-    J v comes from differentiating the vector-Jacobian product uᵀJ, which is linear in u, with
-    respect to u. Both graphs are built once, so that a product costs two backward passes.
+    The Fisher matrix is the Hessian of the mean KL(π_θ ‖ π_k) at θ_k. It is Jᵀ M J, where J is the
+    Jacobian of the network's outputs with respect to θ, and M is the Fisher matrix with respect to
+    the outputs. M has a closed form for Gaussian and categorical policies; for others the
+    divergence is differentiated twice. J v is the derivative of the vector-Jacobian product uᵀJ,
+    which is linear in u, with respect to u. Both graphs are built once, so a product costs two
+    backward passes.
 
     Args:
         actor_network: Policy with `get_dist`; any network that can be differentiated twice.

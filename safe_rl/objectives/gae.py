@@ -29,12 +29,12 @@ def trajectory_ends(done: Tensor, mask: Tensor | None) -> Tensor:
 def one_pass_values(
     tensordict: TensorDictBase, value_network: TensorDictModuleBase, key: NestedKey, ends: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Value every observation of a rollout once.
+    """Evaluate every observation of a rollout once.
 
-    Inside a trajectory the next observation of step t is the root observation of step t + 1,
-    so that only the last observations of trajectories are valued in addition. A recurrent network
-    reads the rollout as sequences, and those observations as sequences of one step with their
-    states.
+    Inside a trajectory the next observation of step t is the root observation of step t + 1. So
+    only the last observations of trajectories are evaluated in addition. A recurrent network reads
+    the rollout as sequences, and the last observations as sequences of one step with their
+    recurrent states.
 
     Args:
         tensordict: Rollout [..., T] with the network's in_keys, also under ``"next"``.
@@ -118,9 +118,9 @@ def normalise_advantages(
 ) -> TensorDictBase:
     """Standardise the reward advantage and centre the cost advantages, in place.
 
-    Cost advantages are never rescaled: their size against the standardised reward advantage is
-    what a multiplier acts on, and in CPO it carries the units of the constraint. Padding, by the
-    mask of TorchRL's collectors, counts for nothing.
+    Cost advantages are never rescaled. A multiplier depends on their size relative to the
+    standardised reward advantage, and in CPO they must have the units of the constraint. Padding,
+    by the mask of TorchRL's collectors, is ignored.
 
     Args:
         tensordict: Batch of any shape with `advantage` [..., 1] and, if there are costs,
