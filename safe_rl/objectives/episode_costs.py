@@ -1,14 +1,15 @@
-"""What an episode costs: J_c, from batches that are shorter than episodes as well as longer ones.
+"""Estimates of J_c, the cost of an episode, also from batches that are shorter than episodes.
 
-The cost rate of a batch times the mean length of an episode, J_c = (Σ c / steps) · T̄, uses every
-step that was taken. By the renewal-reward theorem it tends to E[C] even where the length and the
-cost of an episode depend on each other, if rows are at independent points of their episodes
-(``staggered_starts``) and the policy stays as it is; while all rows are in the same part of an
-episode, it is the rate of that part. For a batch of many whole episodes it *is* their mean cost.
+The estimate is the cost rate of a batch times the mean length of an episode, J_c = (Σ c / steps) ·
+T̄. It uses every step. By the renewal-reward theorem it converges to E[C], even if the length and
+the cost of an episode depend on each other. There are two conditions: rows must be at independent
+points of their episodes (``staggered_starts``), and the policy must not change. If all rows are in
+the same part of an episode, the rate is that of this part. For a batch of many whole episodes the
+estimate *is* their mean cost.
 
 T̄ is the number of steps per end of an episode in the last batches. A mean over the episodes that
-have ended would be too low while episodes grow longer, by a factor of two to five: the long ones
-are those that have not ended yet, and the many short ones of before outnumber them.
+have ended would be too low while episodes grow longer, by a factor of two to five: the long
+episodes have not ended yet, and there are many short episodes from before.
 """
 
 from __future__ import annotations
@@ -40,14 +41,14 @@ class CostEstimate(NamedTuple):
 
 
 def rate_estimate(costs: Tensor, length: Tensor) -> CostEstimate:
-    """J_c as cost per step times steps per episode, with the standard error among rows.
+    """J_c as cost per step times steps per episode, with the standard error over rows.
 
     Args:
         costs: Costs of N rows of T consecutive steps, [N, T, k].
         length: Mean episode length T̄ in steps, scalar.
 
     Returns:
-        The estimate. Few rows are cut into pieces, whose costs are then taken as independent.
+        The estimate. If there are few rows, they are cut into pieces that count as independent.
 
     Examples:
         >>> costs = torch.tensor([[0.0, 1.0], [1.0, 1.0]]).unsqueeze(-1)
@@ -93,12 +94,12 @@ def shrink(past: CostEstimate, present: CostEstimate, drift: Tensor) -> CostEsti
 class EpisodeLengths:
     """Mean episode length T̄: steps per end of an episode, over the last 100 ends or a few more.
 
-    The steps are counted from a batch on that follows one with ends, so that a batch without any
-    adds to T̄. T̄ is at most the longest possible length, and exactly that where no episode has
-    ended before it.
+    Steps are counted from the batch after one with ends, so that a batch without ends makes T̄
+    larger. T̄ is at most the largest possible length, and equal to it until an episode has ended
+    earlier.
 
     Args:
-        longest: Steps after which an episode is over: T̄ until one has ended.
+        longest: Largest possible length of an episode; T̄ until one has ended.
 
     Examples:
         >>> lengths = EpisodeLengths(1000)
@@ -116,7 +117,7 @@ class EpisodeLengths:
         self.counts = torch.zeros(0, 3, dtype=torch.float64)
 
     def update(self, num_steps: int, lengths: Tensor) -> None:
-        """Take in a batch of so many steps, and the steps [E] of the episodes that ended in it."""
+        """Add the number of steps of a batch, and the lengths [E] of episodes that ended in it."""
         early = int((lengths < self.longest).sum())
         row = torch.tensor([[num_steps, lengths.numel(), early]], dtype=torch.float64)
         if len(self.counts) and not self.counts[-1, 1]:
@@ -135,16 +136,17 @@ class EpisodeLengths:
 
 
 class NoiseCorrelation:
-    """Correlation of the noise of a batch with that of the next one, from the rows of both.
+    """Correlation of the noise of successive batches, measured from their rows.
 
-    An episode that spans several batches keeps its layout, so that a row that costs much in one
-    batch is likely to cost much in the next. Rows are independent of each other: the correlation
-    of their deviations from the batch's mean is that of the noise of means, and what a change of
-    the policy adds to all rows alike is not in it. It begins as 0, with the weight of one batch.
+    An episode that spans several batches keeps its layout. So a row with a high cost in one batch
+    is likely to have a high cost in the next. Rows are independent of each other. Therefore the
+    correlation of their deviations from the batch's mean is also the correlation of the noise of
+    the means. A change of the policy shifts all rows alike and does not count. The correlation
+    begins as 0, with the weight of one batch.
 
     Args:
-        memory: weight in [0, 1) of the past.
-        largest: upper bound, below 1; 0 takes batches as independent.
+        memory: Weight in [0, 1) of the past.
+        largest: Upper bound, below 1; with 0, batches count as independent.
 
     Examples:
         >>> noise = NoiseCorrelation(memory=0.9, largest=0.6)
@@ -166,11 +168,11 @@ class NoiseCorrelation:
 
     @property
     def variance_factor(self) -> Tensor:
-        """(1 + r) / (1 − r), [k]: by it the variance of a mean of many batches is larger."""
+        """(1 + r) / (1 − r), [k]: factor of the variance of a mean over many batches."""
         return (1 + self.correlation) / (1 - self.correlation)
 
     def update(self, rates: Tensor) -> None:
-        """Take in the mean cost per step of every row of a batch, [N, k]."""
+        """Update the correlation with the mean cost per step of every row of a batch, [N, k]."""
         last, present = self._last, rates - rates.mean(0)
         self._last = present
         if last.shape != present.shape:
@@ -196,12 +198,12 @@ class EpisodeCosts:
     Args:
         num_costs: k.
         max_length: Steps after which an episode is over; see `EpisodeLengths`.
-        drift: Share by which J_c changes from one policy to the next, about; it weighs the past
-            against the batch. None uses the batch alone.
-        memory: Weight in [0, 1) of the past in how much costs scatter.
-        smallest: Costs per step that count as J_c's size where it is smaller, for the drift: from
-            batches without any cost nothing else would lead away.
-        largest_correlation: bound of the correlation of batches by which errors are enlarged; see
+        drift: Expected relative change of J_c from one policy to the next; it sets the weights of
+            past batches and of the new one. None uses the new batch alone.
+        memory: Weight in [0, 1) of the past in the estimated scatter of costs.
+        smallest: Cost per step; J_c counts as at least this large for the drift. Otherwise an
+            estimate of 0 could not change any more.
+        largest_correlation: Bound of the correlation of batches, which enlarges errors; see
             `NoiseCorrelation`.
 
     Examples:
@@ -256,7 +258,7 @@ class EpisodeCosts:
         Args:
             costs: Costs of its steps, [N, T, k].
             lengths: Steps of every episode that finished in it, [E].
-            charges: What is to be estimated in place of the mean cost; `unit` stays that of costs.
+            charges: Values to estimate instead of the mean cost; `unit` is still that of the costs.
         """
         costs = costs.to(self._state["sums"])
         self._state["sums"] += torch.stack([costs.sum((0, 1)), costs.square().sum((0, 1))])
@@ -276,15 +278,16 @@ class EpisodeCosts:
         return batch
 
     def _size(self, mean: Tensor) -> Tensor:
-        """J_c, or the least that counts as its size, [k]."""
+        """J_c, or its lower bound `smallest`, [k]."""
         return torch.maximum(mean, self.smallest * self.length * self.unit)
 
     def _expected_error(self, batch: CostEstimate, size: Tensor) -> Tensor:
-        """Standard error of a batch as the batches before it say, for J_c of this size, [k].
+        """Standard error of a batch, expected from earlier batches, for J_c of this size, [k].
 
-        Costs come in heaps: a batch that has few of them by luck also shows little spread. Weighed
-        by its own error it would count for more than a dear one, and the estimate would be too low.
-        The variance is taken as in proportion to J_c, as for counts, by a factor φ that is learned.
+        Costs come in clusters: a batch with few of them by chance also has a small spread. If it
+        was weighted by its own error, it would count more than a batch with many costs, and the
+        estimate would be too low. So the variance is assumed to be proportional to J_c, as for
+        counts, by a factor φ that is estimated.
         """
         seen = torch.stack([batch.error.square(), self._size(batch.mean)])
         self._state["scatter"] = torch.lerp(seen, self._state["scatter"], self.memory)

@@ -1,16 +1,16 @@
-"""The distance of each cost from its present target, for multipliers and CPO steps.
+"""The distance of each cost from its current target, for multipliers and CPO steps.
 
 Four decisions lead from the costs of a batch to the violation that an update sees:
 
 - **how J_c is estimated** from a batch (`safe_rl.objectives.episode_costs`);
-- **a descent**: costs are free until the policy has found its goal, then the limit comes down from
-  the cost of the policy then. With pressure from the start the goal is not found; a policy that
-  has learned to ignore costs takes longest to reduce them;
-- **a margin**: z standard errors of a batch's J_c below the limit, so that what one batch shows
-  is above the limit with a chance of about Φ(−z);
-- **trust**: the surrogate of a step predicts a change of J_c, of which only a share is realised.
-  The share is measured, and violations are divided by it, for steps that act on predictions (CPO).
-  Violations that remain after an update are summed up and added, as an integral.
+- **a descent**: costs have no effect until the policy has found its goal. Then the limit falls from
+  the policy's current cost to its final value. If costs count from the start, the goal is not
+  found. If they count too late, the policy has learned to ignore costs, and reduces them slowly;
+- **a margin**: the target is z standard errors of a batch's J_c below the limit. Then the estimate
+  of one batch is above the limit with a probability of about Φ(−z);
+- **trust**: the surrogate of a step predicts a change of J_c, but only a share of it is observed.
+  For steps that rely on predictions (CPO), this share is measured, and violations are divided by
+  it. Violations that remain after an update are summed and added, as an integral.
 """
 
 from __future__ import annotations
@@ -27,16 +27,16 @@ from safe_rl.ranges import Checked, Count, Fraction, NotNegative, Positive, Rang
 
 
 class LimitState(NamedTuple):
-    """What an update needs to know about k limits.
+    """The state of k limits that an update needs.
 
     Attributes:
         cost: Estimate of J_c, undiscounted cost per episode, [k].
-        target: Present upper bound of J_c: limit, descent and margin together, [k].
+        target: Current upper bound of J_c, from limit, descent and margin, [k].
         length: Mean episode length T̄ in steps, scalar.
         unit: Size of one cost, [k]; see `EpisodeCosts.unit`.
         scale: Unit of violations, [k]: the limit, or a small share of the steps if that is more.
-        trust: Share of a predicted change of J_c that is realised, [k].
-        integrated: What is added to the violation, the sum of those before, [k].
+        trust: Share of a predicted change of J_c that is observed, [k].
+        integrated: Integral that is added to the violation: a sum of earlier ones, [k].
     """
 
     cost: Tensor
@@ -54,7 +54,7 @@ class LimitState(NamedTuple):
 
     @property
     def demand(self) -> Tensor:
-        """Change by which a surrogate must lower J_c, [k]; if negative, J_c may rise by it."""
+        """Decrease of J_c that a surrogate must predict, [k]; if negative, J_c may rise by it."""
         change = self.violation + self.integrated
         return torch.where(change > 0, change / self.trust, change)
 
@@ -64,7 +64,7 @@ class LimitState(NamedTuple):
 
 
 def descend(start: Tensor, goal: Tensor, share: float) -> Tensor:
-    """Go a share of the way from `start` down to `goal`; never up, and never below `goal`.
+    """Interpolate from `start` down to `goal`; the result is never above `start` or below `goal`.
 
     Examples:
         >>> descend(torch.tensor([65.0, 5.0]), torch.tensor([25.0, 25.0]), share=0.75)
@@ -74,15 +74,16 @@ def descend(start: Tensor, goal: Tensor, share: float) -> Tensor:
 
 
 class PredictedChange:
-    """Share of the predicted changes of J_c that were realised: a regression through the origin.
+    """Share of predicted changes of J_c that was observed, by a regression through the origin.
 
-    The realised change of one update is mostly noise; over updates, Σ predicted · realised /
-    Σ predicted² is not. It begins as 1, with the weight of one prediction of size `prior`.
+    The observed change of one update is mostly noise, but Σ predicted · observed / Σ predicted²
+    over many updates is not. The share begins as 1, with the weight of one prediction of size
+    `prior`.
 
     Args:
         num_costs: k.
         memory: Weight in [0, 1) of the past.
-        lowest: Lower bound of the share; 1 relies on predictions as they are.
+        lowest: Lower bound of the share; with 1, predictions are not corrected.
 
     Examples:
         >>> realised = PredictedChange(1, memory=0.9, lowest=0.1)
@@ -109,7 +110,7 @@ class PredictedChange:
         return share.clamp(self.lowest, 1.0)
 
     def update(self, cost: Tensor, prior: Tensor) -> None:
-        """Compare the new J_c with the last one and what was predicted since; all [k]."""
+        """Compare the change of J_c since the last call with the predicted one; all [k]."""
         if not self._state["products"].any():
             self._state["products"] = prior.square().expand(2, -1).clone()
         predicted = self._state["predicted"]
@@ -121,7 +122,7 @@ class PredictedChange:
         self._state["predicted"] = torch.full_like(predicted, torch.nan)
 
     def record_prediction(self, change: Tensor) -> None:
-        """Note the change of J_c that an update's surrogate predicts, [k]."""
+        """Store the change of J_c that an update's surrogate predicts, [k]."""
         self._state["predicted"] = change.detach().to(self._state["predicted"])
 
     def state_dict(self) -> dict[str, Tensor]:
@@ -135,37 +136,36 @@ class PredictedChange:
 
 
 class LimitTracker(Checked):
-    """Turns the costs of every batch into violations of a limit that comes down over time.
+    """Computes violations of a falling limit from the costs of every batch.
 
     Args:
         cost_limits: d, undiscounted cost per episode, [k].
-        max_length: Rows of time of a batch after which an episode is over.
-        margin: Standard errors of a batch's J_c by which the aim is below the limit.
+        max_length: Largest length of an episode, in rows of time of a batch.
+        margin: Standard errors of a batch's J_c by which the target is below the limit.
         largest_margin: Bound of the margin, as a share of d.
-        free_steps: Environment steps for which costs are free.
-        descent_steps: Environment steps in which the limit then comes down.
-        recovery: Share of d that is the aim once J_c is above d, until J_c is there: hysteresis, as
-            in the published C-TRPO and CPO with hysteresis; 1 for none.
+        free_steps: Environment steps for which costs have no effect.
+        descent_steps: Environment steps in which the limit then falls.
+        recovery: Share of d that is the target once J_c is above d, until J_c has reached it. This
+            is the hysteresis of the published C-TRPO and CPO with hysteresis; 1 for none.
         steps_per_decision: Environment steps per row of time of a batch.
         frames: Environment steps of the whole run.
-        latest_end: Share of the run by which the descent is over: in a run too short for that, both
-            numbers of steps are shortened in proportion.
-        smallest_scale: Lower bound of the unit of violations, in costs per step: that of a limit
-            near 0.
-        drift: Share by which J_c changes per update, about; see `EpisodeCosts`.
+        latest_end: Share of the run at which the descent ends at the latest. In a shorter run, both
+            numbers of steps are reduced in proportion.
+        smallest_scale: Lower bound of the unit of violations, in costs per step, for limits near 0.
+        drift: Expected relative change of J_c per update; see `EpisodeCosts`.
         memory: Weight of the past in the standard error of a batch and in the trust.
-        largest_correlation: Bound of the correlation r of a batch's noise with that of the next, as
-            the rows show it where episodes span batches; the variance of a batch is taken as
-            (1 + r) / (1 − r) times that of its rows. 0 takes batches as independent.
-        descent_errors: Standard errors that are added to J_c's estimate before the limit follows it
-            down. With 0 the limit follows the least of noisy estimates, and comes down faster than
-            the policy does.
-        lowest_trust: Lower bound of trust_<cost>, the share of a predicted change that is counted
-            on; 1 counts on all of it.
-        integral: Share of every violation that is asked for again in all updates to come (the
+        largest_correlation: Bound of the correlation r of the noise of successive batches, which is
+            measured from rows whose episodes span batches. The variance of a batch is (1 + r) /
+            (1 − r) times that of its rows. With 0, batches count as independent.
+        descent_errors: Standard errors that are added to the estimate of J_c before the limit
+            follows it down. With 0 the limit follows the lowest of several noisy estimates, and
+            falls faster than the policy's cost.
+        lowest_trust: Lower bound of trust_<cost>, the share of a predicted change that is expected;
+            1 expects all of it.
+        integral: Share of every violation that is added to the violations of all later updates (the
             learned margin of the code of Ray, Achiam and Amodei 2019); 0 for multipliers, which
-            integrate themselves.
-        largest_integral: Bound of what is asked for in this way, in units of violations.
+            have integrals of their own.
+        largest_integral: Bound of this integral, in units of violations.
 
     Examples:
         >>> tracker = LimitTracker(
@@ -230,7 +230,7 @@ class LimitTracker(Checked):
 
     @property
     def schedule(self) -> str:
-        """When costs are free, when the limits come down, and when they hold, in a sentence."""
+        """A sentence: until when costs have no effect, when the limits fall, and when they hold."""
         end = self.free_steps + self.descent_steps
         if not end:
             return ""
@@ -247,7 +247,7 @@ class LimitTracker(Checked):
         Args:
             costs: Costs of its steps, [N, T, k].
             lengths: Steps of every episode that finished in it, [E].
-            charges: What stands for the costs, if the limits are not on their mean.
+            charges: Values that replace the costs if another measure than their mean is limited.
         """
         costs, lengths = costs.detach().cpu(), lengths.detach().cpu()
         estimate = self.costs.update(costs, lengths, charges)
@@ -275,7 +275,7 @@ class LimitTracker(Checked):
         )
 
     def _target(self, estimate: CostEstimate, scale: Tensor, num_steps: int) -> Tensor:
-        """What J_c is to be at most after an update, which came with `num_steps` steps, [k]."""
+        """The target of J_c after an update with a batch of `num_steps` steps, [k]."""
         self._steps += num_steps
         # a descent that has begun continues, also if the run was made longer meanwhile
         if self._steps <= self.free_steps and not self._reached.isfinite().any():

@@ -1,8 +1,8 @@
 """Lagrange multipliers, one λ per cost: dual ascent by Adam and by plain steps.
 
-Once per epoch a multiplier receives the violations J_c − d, J_c being the mean undiscounted cost of
-an episode, and moves λ up where J_c exceeds its limit d and down where it does not. Its whole state
-is in buffers. Controllers are in `safe_rl.objectives.controllers`.
+Once per epoch a multiplier gets the violations J_c − d, where J_c is the mean undiscounted cost of
+an episode. It increases λ if J_c exceeds its limit d, and decreases λ if not. Its whole state is in
+buffers. Controllers are in `safe_rl.objectives.controllers`.
 """
 
 from __future__ import annotations
@@ -72,8 +72,8 @@ def per_cost(name: str, value: float | Sequence[float] | Tensor, num_costs: int)
 class Multiplier(Checked, nn.Module, ABC):
     """Base of the multipliers: limits, `value` and `update`.
 
-    Subclasses keep their state in buffers and implement `_step`; and `value`, unless λ is the
-    buffer `penalty`.
+    Subclasses have their state in buffers and implement `_step`. They also implement `value`,
+    unless λ is the buffer `penalty`.
 
     Args:
         cost_limits: Mapping from cost key to limit, or limits alone; see `parse_cost_limits`.
@@ -106,10 +106,10 @@ class Multiplier(Checked, nn.Module, ABC):
 
     @torch.no_grad()
     def update(self, violation: Tensor | Sequence[float] | float) -> None:
-        """Move λ after an epoch.
+        """Update λ after an epoch.
 
-        A cost whose violation is not finite (NaN: no episode finished in the epoch) keeps its
-        multiplier and its state as they are.
+        If a violation is not finite (NaN: no episode finished in the epoch), the multiplier of this
+        cost and its state do not change.
 
         Args:
             violation: J_c − d, [k] (or a scalar if k = 1): mean undiscounted cost of an episode
@@ -131,10 +131,10 @@ class Multiplier(Checked, nn.Module, ABC):
             buffer.copy_(torch.where(known, new, buffer))
 
     def set_scale(self, scale: Tensor) -> None:
-        """Set the units of violations, [k] > 0; most multipliers have their own."""
+        """Set the units of violations, [k] > 0; most multipliers ignore this."""
 
     def set_unit(self, unit: Tensor) -> None:
-        """Set the size of one cost, [k] > 0, the unit of the costs that λ weighs."""
+        """Set the size of one cost, [k] > 0: the unit of the costs that λ is a weight of."""
 
     @abstractmethod
     def _step(self, violation: Tensor) -> dict[str, Tensor]:
@@ -142,12 +142,12 @@ class Multiplier(Checked, nn.Module, ABC):
 
 
 class LagrangeMultiplier(Multiplier):
-    """λ = softplus(ν), with ν moved by Adam on the dual loss −ν·(J_c − d).
+    """λ = softplus(ν), where Adam updates ν on the dual loss −ν·(J_c − d).
 
     The gradient is taken with respect to ν directly, not through the softplus, as in the
     Lagrangian baselines of Ray, Achiam and Amodei, *Benchmarking Safe Exploration in Deep
-    Reinforcement Learning* (2019), section 5.1. Adam (Kingma and Ba 2015, algorithm 1) is
-    written out here, because its moments belong to the state that is moved and saved.
+    Reinforcement Learning* (2019), section 5.1. Adam (Kingma and Ba 2015, algorithm 1) is written
+    out here, because its moments are part of the state that is saved and moved between devices.
 
     Args:
         cost_limits: Mapping from cost key to limit d, or limits alone; see `parse_cost_limits`.
@@ -209,9 +209,9 @@ class LagrangeMultiplier(Multiplier):
 class ProjectedMultiplier(Multiplier):
     """λ ← clip(λ + α (J_c − d) / u, 0, λ_max), the plain dual ascent.
 
-    Of FOCOPS (Zhang, Vuong and Ross 2020), CUP (Yang et al. 2022) and,
-    slow and without λ_max, RCPO (Tessler et al. 2019, algorithm 1). u is the size of one cost: 1,
-    as in the articles, unless what λ weighs is in other units (`set_unit`).
+    It is the multiplier of FOCOPS (Zhang, Vuong and Ross 2020) and CUP (Yang et al. 2022). With a
+    small α and without λ_max it is that of RCPO (Tessler et al. 2019, algorithm 1). u is the size
+    of one cost: 1, as in the articles, unless cost advantages are in other units (`set_unit`).
 
     Args:
         cost_limits: Mapping from cost key to limit d, or limits alone; see `parse_cost_limits`.

@@ -1,4 +1,4 @@
-"""Clipped policy losses with a penalty on costs: P3O's exact one, and IPO's barrier."""
+"""Clipped policy losses with a penalty on costs: P3O's exact penalty and IPO's barrier."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from safe_rl.ranges import NotNegative, Range
 
 
 class PenaltyLoss(PPOLoss):
-    """PPO with a penalty on what the cost surrogates predict, for k constraints.
+    """PPO with a penalty on the predicted costs, for k constraints.
 
     Args:
         actor_network: Policy with `get_dist`; see `SurrogateLoss`.
-        constraints: Where J_c − d and T̄ stand at every call.
+        constraints: J_c − d and T̄ are read from them at every call.
         settings: Those of every clipped loss, see `PPOLoss`; costs are always averaged.
     """
 
@@ -47,10 +47,10 @@ class P3OLoss(PenaltyLoss):
 
         E[−min(ρA, clip(ρ)A)] + κ Σᵢ relu(E[max(ρA_cᵢ, clip(ρ)A_cᵢ)] + (J_cᵢ − dᵢ) / T̄).
 
-    With κ at least as large as the largest multiplier of the constrained problem, both have the
-    same solution. The expectation is taken before the relu. The surrogate is an average per step.
-    The article's costs and limits are discounted sums, of which 1 − γ makes such an average; those
-    here are undiscounted, of which 1/T̄ does.
+    If κ is at least as large as the largest multiplier of the constrained problem, both problems
+    have the same solution. The expectation is taken before the relu. The surrogate is an average
+    per step. The article's costs and limits are discounted sums, which the factor 1 − γ converts to
+    such an average. Here they are undiscounted, so the factor is 1/T̄.
 
     Adds ``loss_penalty`` and the detached ``cost_surrogate`` [k], E[max(ρA_c, clip(ρ)A_c)].
 
@@ -98,7 +98,7 @@ class P3OLoss(PenaltyLoss):
 
 
 def log_barrier(slack: Tensor, kappa: Tensor | float, max_weight: float) -> Tensor:
-    """−κ log(slack), continued by its tangent where its slope is beyond ``max_weight``.
+    """−κ log(slack), continued by its tangent where its slope would exceed ``max_weight``.
 
     The tangent begins at slack = κ / max_weight, so that value and slope are continuous.
 
@@ -119,21 +119,21 @@ def log_barrier(slack: Tensor, kappa: Tensor | float, max_weight: float) -> Tens
 
 
 class IPOLoss(PenaltyLoss):
-    """PPO with a logarithmic barrier before every limit, for k constraints.
+    """PPO with a logarithmic barrier at every limit, for k constraints.
 
     Minimises (Liu, Ding and Liu 2020, their logarithmic barrier, with κ = 1/t)
 
         E[−min(ρA, clip(ρ)A)] − (κ / T̄) Σᵢ log(−cᵢ − E[ρA_cᵢ]),  cᵢ = (J_cᵢ − dᵢ) / T̄.
 
-    The argument is the distance to the limit that the surrogate predicts, per step: a cost at a
-    distance Δ = d − J_c is weighed by κ / Δ. Near the limit and beyond it, where the article has no
-    value, the barrier continues with the slope `max_weight`, as a multiplier of this size.
+    The argument is the predicted distance to the limit, per step. The weight of a cost at a
+    distance Δ = d − J_c is κ / Δ. Near and above the limit, where the article's barrier is not
+    defined, the barrier continues with the slope `max_weight`, like a multiplier of this size.
 
     Adds ``loss_barrier`` and the detached ``cost_surrogate`` [k], E[ρA_c].
 
     Args:
         parts: Actor, and constraints, whose J_c − d and T̄ are read at every call.
-        kappa: Strength κ = 1/t of the barrier, of the costs of an episode.
+        kappa: Strength κ = 1/t of the barrier, in units of the cost of an episode.
         max_weight: Weight of a cost at the limit and beyond, in units of the standardised reward
             advantage.
         settings: Those of every clipped loss, see `PPOLoss`; costs are always averaged.

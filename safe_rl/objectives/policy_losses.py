@@ -27,8 +27,9 @@ def clipped_gain(log_weight: Tensor, advantage: Tensor, clip_epsilon: Tensor) ->
 class PPOLoss(SurrogateLoss):
     """Clipped policy loss of PPO (Schulman et al. 2017), without constraints.
 
-    Differs from `torchrl.objectives.ClipPPOLoss` in that critics have a `CriticLoss` of their own
-    and that ``kl`` is the exact mean KL(π_θ ‖ π_k), for early stopping. Adds ``clip_fraction``.
+    It differs from `torchrl.objectives.ClipPPOLoss` in two points: critics have a separate
+    `CriticLoss`, and ``kl`` is the exact mean KL(π_θ ‖ π_k), for early stopping. It also reports
+    ``clip_fraction``.
 
     Args:
         actor_network: Policy with `get_dist`; see `SurrogateLoss`.
@@ -80,12 +81,12 @@ class PPOLoss(SurrogateLoss):
 class PPOLagrangianLoss(WeighsCosts, PPOLoss):
     """PPO on the Lagrangian (Ray, Achiam and Amodei 2019, section 5.1), for k constraints.
 
-    The objective is (L_r − Σᵢ λᵢ L_cᵢ) / (1 + Σᵢ λᵢ). What of it is clipped is a choice:
+    The objective is (L_r − Σᵢ λᵢ L_cᵢ) / (1 + Σᵢ λᵢ). ``cost_clipping`` says what is clipped:
 
-    - ``"none"``: only the reward surrogate L_r, the costs stay E[ρA_c], as in the article. Nothing
-      bounds what a few samples predict, and at high λ updates end at their KL limit after a few
-      steps;
-    - ``"pessimistic"``: each cost to its own pessimistic side, E[max(ρA_c, clip(ρ)A_c)] (Zhang et
+    - ``"none"``: only the reward surrogate L_r; costs are E[ρA_c], as in the article. Then nothing
+      bounds the effect of a few samples, and with a high λ updates end by early stopping after a
+      few steps;
+    - ``"pessimistic"``: each cost too, to its pessimistic side, E[max(ρA_c, clip(ρ)A_c)] (Zhang et
       al. 2022, clipped costs);
     - ``"joint"``: the objective as a whole, PPO on the advantage (A − Σᵢ λᵢ A_cᵢ) / (1 + Σᵢ λᵢ).
 
@@ -133,10 +134,10 @@ class PPOLagrangianLoss(WeighsCosts, PPOLoss):
 class RCPOLoss(WeighsCosts, PPOLoss):
     """PPO on the penalised reward r − Σᵢ λᵢ cᵢ (Tessler et al. 2019, definition 3).
 
-    Its advantage is A − Σᵢ λᵢ A_cᵢ, from the critics of reward and costs, without the lag of a
-    critic of r − λc after changes of λ. It is clipped as a whole, min(ρÂ, clip(ρ)Â). The multiplier
-    should move slowly, on the third time scale. Arguments are a multiplier, one λ per column of
-    ``cost_advantage``, and those of `PPOLoss`.
+    Its advantage is Â = A − Σᵢ λᵢ A_cᵢ, from the critics of reward and costs. A single critic of r
+    − λc would lag behind changes of λ. The objective is clipped as a whole, min(ρÂ, clip(ρ)Â). The
+    multiplier should change slowly (the third time scale of the article). Arguments are a
+    multiplier, with one λ per column of ``cost_advantage``, and those of `PPOLoss`.
 
     Examples:
         >>> from safe_rl.models import make_actor
@@ -192,7 +193,7 @@ class TRPOLagrangianLoss(WeighsCosts, TRPOLoss):
 class CPOLoss(SurrogateLoss):
     """Surrogates of CPO: ``loss_objective`` = −E[ρ A] and ``cost_surrogate`` = E[ρ A_c], [k].
 
-    Both carry gradients. The cost surrogates are constraints, not losses: a
+    Both have gradients. The cost surrogates are constraints, not losses: a
     `safe_rl.algorithms.CPOStep` keeps them within their limits. Arguments are those of
     `SurrogateLoss`; a step needs the mean over the samples.
 

@@ -1,4 +1,4 @@
-"""Losses that project on the networks' policies: FOCOPS and CUP."""
+"""Losses of algorithms that project onto the policies of a network: FOCOPS and CUP."""
 
 from __future__ import annotations
 
@@ -16,15 +16,15 @@ from safe_rl.ranges import Positive, Range, Share, Weight
 
 
 class FOCOPSLoss(WeighsCosts):
-    """Distance to the optimal policy of the trust region, projected on the networks'.
+    """KL divergence from the optimal policy within a trust region (FOCOPS).
 
     Minimises (Zhang, Vuong and Ross 2020, the gradient of its projection)
 
         E[1{KL(s) ≤ δ} (KL(s) − (1/β) ρ (A − Σᵢ νᵢ A_cᵢ))],  KL(s) = KL(π_θ ‖ π_k) in state s.
 
-    Its minimum over all policies is π_k exp((A − Σᵢ νᵢ A_cᵢ)/β) / Z, the optimum within the
-    trust region of which β and ν are the multipliers. States beyond δ are ignored. Adds
-    ``trusted_fraction``, the share of the others.
+    Its minimum over all policies is π_k exp((A − Σᵢ νᵢ A_cᵢ)/β) / Z. This is the optimal policy
+    within the trust region whose multipliers are β and ν. States with a KL above δ are ignored. The
+    loss also reports ``trusted_fraction``, the share of the other states.
 
     Args:
         parts: Actor, and a multiplier with one ν per column of ``cost_advantage``; a
@@ -71,19 +71,19 @@ ANCHOR = "anchor"
 
 
 class CUPLoss(WeighsCosts):
-    """The second of CUP's two steps: from an improved policy back to where the costs are low.
+    """The projection of CUP: the second of its two updates, which lowers the costs.
 
-    The first step improves the policy for the reward, by PPO's loss, to π½. Then this loss is
-    minimised from there (Yang et al. 2022, their projection step),
+    The first update improves the policy for the reward by PPO's loss; its result is π½. Then this
+    loss is minimised (Yang et al. 2022, their projection step),
 
         E[KL(π_θ ‖ π½) + h Σᵢ νᵢ ρ A_cᵢ],  ρ = π_θ/π_k,  h = (1 − γλ_GAE)/(1 − γ),
 
-    with advantages of π_k, which collected the batch. h belongs to the article's bound for
-    generalised advantage estimates. Here it is divided by 1 + h Σᵢ νᵢ, which leaves the minimum
-    where it is: otherwise gradients grow with ν, and Adam takes steps so large that an update ends
-    at its KL limit after two of them. `anchor` fixes π½; a `safe_rl.algorithms.MinibatchUpdate`
-    calls it before its first step. ``kl`` is KL(π_θ ‖ π½). Adds the detached ``cost_surrogate``
-    [k], E[ρA_c].
+    with advantages of π_k, which collected the batch. h is from the article's bound for generalised
+    advantage estimates. Here the loss is divided by 1 + h Σᵢ νᵢ, which does not change the minimum.
+    Without this division gradients grow with ν, and Adam's steps become so large that early
+    stopping ends an update after two of them. `anchor` stores π½; a
+    `safe_rl.algorithms.MinibatchUpdate` calls it before its first step. ``kl`` is KL(π_θ ‖ π½). The
+    loss also reports the detached ``cost_surrogate`` [k], E[ρA_c].
 
     Args:
         parts: Actor, of a distribution whose KL has a closed form, and a multiplier with one ν per
@@ -119,12 +119,12 @@ class CUPLoss(WeighsCosts):
 
     @property
     def behaviour_keys(self) -> dict[NestedKey, NestedKey]:
-        """Where the batch holds π½, from which ``kl`` is measured."""
+        """Keys of π½ in the batch, from which ``kl`` is measured."""
         return {key: (ANCHOR, str(name)) for name, key in self._parameter_keys.items()}
 
     @torch.no_grad()
     def anchor(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Write the present policy's parameters into a batch, as π½, and return the batch."""
+        """Write the current policy's parameters into a batch, as π½, and return the batch."""
         observed = tensordict.select(*self.actor_network.in_keys)
         actor, weights = self.actor_network, self.actor_network_params
         with weights.to_module(actor, preserve_module_state=False), set_recurrent_mode(True):
