@@ -16,9 +16,6 @@ as well: `algo=cpo risk=semideviation`, `algo=quadratic risk=cvar`. The column `
 what is limited less d.
 """
 
-from collections.abc import Mapping
-from typing import Any
-
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
@@ -50,6 +47,8 @@ class QuadraticPenaltyLoss(PPOLoss):
 class UpperSemideviation(RiskMeasure):
     """Charges whose mean over episodes is E[C] + w E[(C − m)₊], m the running mean of C."""
 
+    state_names = ("_mean",)  # what checkpoints keep of it
+
     def __init__(self, cost_limits: Tensor, *, weight: float, memory: float) -> None:
         self.limits, self.weight, self.memory = cost_limits, weight, memory
         self._mean = torch.full_like(cost_limits, torch.inf)  # no episode is above it yet
@@ -63,11 +62,3 @@ class UpperSemideviation(RiskMeasure):
         beyond = (cost_so_far(costs, ends, before) - self._mean).clamp_min(0)
         charged = costs + self.weight * torch.minimum(costs, beyond)
         return Charges(charged, offset=torch.zeros_like(self.limits), limit=self.limits)
-
-    def state_dict(self) -> dict[str, Any]:
-        """Everything the next charges depend on."""
-        return {"mean": self._mean}
-
-    def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
-        """Continue from :meth:`state_dict`."""
-        self._mean = state_dict["mean"]

@@ -20,7 +20,7 @@ from torchrl.envs.utils import ExplorationType
 from torchrl.modules import IndependentNormal, OneHotCategorical, ProbabilisticActor, TanhNormal
 from torchrl.modules import TruncatedNormal as TorchRLTruncatedNormal
 
-from safe_rl.models.action_distributions import Choices
+from safe_rl.models.action_distributions import choices
 from safe_rl.models.heads import _Components
 
 
@@ -143,7 +143,7 @@ KINDS = {
     "categorical": (5, nn.Identity(), ["logits"], Categorical),
     "one_hot": (5, nn.Identity(), ["logits"], OneHotCategorical),
     "multi_discrete": (6, Grid(), ["logits"], MultiCategorical),
-    "unequal_multi_discrete": (5, _Components([2, 3]), ["logits"], Choices),
+    "unequal_multi_discrete": (5, _Components([2, 3]), ["logits"], choices),
     "composite": (9, Steering(), ["params"], composite(IndependentNormal)),
     "apart_composite": (9, Steering(), ["params"], composite(Normal)),
     "sampled_composite": (9, Steering(), ["params"], composite(Anonymous)),

@@ -18,7 +18,10 @@ TRUST_REGION = {
 }  # fmt: skip
 
 
-def make_actor(in_key="observation", loc="loc", scale="scale", action="action", width=8):
+def make_actor(
+    in_key="observation", loc="loc", scale="scale", action="action", width=8,
+    log_prob="action_log_prob",
+):  # fmt: skip
     net = nn.Sequential(
         nn.Linear(NUM_OBS, width),
         nn.Tanh(),
@@ -32,7 +35,7 @@ def make_actor(in_key="observation", loc="loc", scale="scale", action="action", 
         distribution_class=IndependentNormal,
         default_interaction_type=ExplorationType.RANDOM,
         return_log_prob=True,
-        log_prob_key="action_log_prob",
+        log_prob_key=log_prob,
     )
 
 

@@ -18,11 +18,9 @@ from torchrl.envs import EnvBase
 
 from safe_rl.collectors import EpisodeStatistics
 from safe_rl.ranges import Checked
+from safe_rl.resumable import Resumable
 
-__all__ = [
-    *("Algorithm", "PolicyUpdate", "Recipe", "SequentialUpdates", "Stateful", "load_states"),
-    "states_of",
-]
+__all__ = ["Algorithm", "PolicyUpdate", "Recipe", "SequentialUpdates", "Stateful", "states_of"]
 
 
 class Stateful(Protocol):
@@ -40,12 +38,6 @@ class Stateful(Protocol):
 def states_of(parts: Mapping[str, Stateful]) -> dict[str, Any]:
     """State of every part, by name."""
     return {name: part.state_dict() for name, part in parts.items()}
-
-
-def load_states(parts: Mapping[str, Stateful], states: Mapping[str, Any]) -> None:
-    """Let every part continue from its state in :func:`states_of`."""
-    for name, part in parts.items():
-        part.load_state_dict(states[name])
 
 
 class Algorithm(ABC):
@@ -137,8 +129,11 @@ class Recipe(ABC):
         """
 
 
-class PolicyUpdate(Checked, ABC):
-    """Interface of a policy update: gradient steps, a trust-region step, or your own."""
+class PolicyUpdate(Checked, Resumable, ABC):
+    """Interface of a policy update: gradient steps, a trust-region step, or your own.
+
+    ``state_names`` names what an exact continuation needs beyond the networks' parameters.
+    """
 
     @abstractmethod
     def __call__(
@@ -160,13 +155,6 @@ class PolicyUpdate(Checked, ABC):
     def loss_modules(self) -> Mapping[str, nn.Module]:
         """Losses that are modules, by name. Checkpoints save their state beside the networks."""
         return {}
-
-    def state_dict(self) -> Mapping[str, Any]:
-        """State beyond the network's parameters, for an exact continuation."""
-        return {}
-
-    def load_state_dict(self, state_dict: Mapping[str, Any]) -> Any:
-        """Continue from :meth:`state_dict`."""
 
 
 class SequentialUpdates(PolicyUpdate):
@@ -192,6 +180,8 @@ class SequentialUpdates(PolicyUpdate):
         >>> update(TensorDict(), torch.zeros(1), torch.ones(()))
         {'kl': tensor(0.0100), 'projection_kl': tensor(0.0200)}
     """
+
+    state_names = ("first", "then")
 
     def __init__(self, first: PolicyUpdate, then: Mapping[str, PolicyUpdate]) -> None:
         self.first, self.then = first, dict(then)
@@ -220,15 +210,3 @@ class SequentialUpdates(PolicyUpdate):
             for place, loss in update.loss_modules().items():
                 found[f"loss.{name}{place.removeprefix('loss')}"] = loss
         return found
-
-    def state_dict(self) -> dict[str, Any]:
-        """State of each, by its name; that of the first by ``first``."""
-        return states_of(self._named)
-
-    def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
-        """Continue from :meth:`state_dict`."""
-        load_states(self._named, state_dict)
-
-    @property
-    def _named(self) -> dict[str, PolicyUpdate]:
-        return {"first": self.first, **self.then}

@@ -47,9 +47,6 @@ def build_part(node: DictConfig, **objects: Any) -> Any:
     Raises:
         TargetError: If its target may not be built, or refuses; the message names the node.
     """
-    if node.get("_partial_"):
-        key = node._get_full_key(None)
-        raise TargetError(f"{key}._partial_=true: {key} is built at once, without _partial_.")
     names = accepted_names(locate(node.get("_target_"), f"{node._get_full_key(None)}._target_"))
     return build(node, **{k: v for k, v in objects.items() if v is not None and k in names})
 

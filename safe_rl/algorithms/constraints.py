@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import Any
 
 import torch
 from tensordict import NestedKey, TensorDictBase
@@ -15,11 +14,12 @@ from safe_rl.naming import did_you_mean, key_name
 from safe_rl.objectives.limits import LimitTracker
 from safe_rl.objectives.multipliers import Multiplier
 from safe_rl.objectives.risk import Charges, RiskMeasure
+from safe_rl.resumable import Resumable
 
 __all__ = ["CHARGES", "Constraints", "TrackedConstraints", "check_cost_limits"]
 
 
-class Constraints:
+class Constraints(Resumable):
     """Keys, limits, the violations J_c − d, and the multiplier that weighs the costs.
 
     Every algorithm has one, and updates it with every batch. Losses and updates that need the
@@ -55,6 +55,9 @@ class Constraints:
         >>> constraints.violation, constraints.episode_length
         (tensor([5.]), tensor(1000.))
     """
+
+    # those of the last batch in which an episode finished
+    state_names = ("_finished", "_mean_length")
 
     def __init__(
         self,
@@ -152,15 +155,6 @@ class Constraints:
         names = map(key_name, self.keys)
         return {f"{name}_{key}": v for key, v in zip(names, value.tolist(), strict=True)}
 
-    def state_dict(self) -> dict[str, Tensor]:
-        """The costs and the length of the last batch in which an episode finished."""
-        return {"costs": self._finished, "mean_length": self._mean_length}
-
-    def load_state_dict(self, state_dict: Mapping[str, Tensor]) -> None:
-        """Continue from :meth:`state_dict`."""
-        self._finished = state_dict["costs"].to(self._finished)
-        self._mean_length = state_dict["mean_length"].to(self._mean_length)
-
 
 def check_cost_limits(
     cost_limits: Mapping[str, float], cost_keys: Sequence[str]
@@ -207,6 +201,8 @@ class TrackedConstraints(Constraints):
         cost_advantage: Key of the cost advantages that the multiplier weighs.
         device: Of all tensors.
     """
+
+    state_names = ("tracker", "risk")
 
     def __init__(
         self,
@@ -281,14 +277,3 @@ class TrackedConstraints(Constraints):
         if self.multiplier is not None:
             row |= self.column("multiplier", self.multiplier.value)
         return row
-
-    def state_dict(self) -> dict[str, Any]:
-        """State of the tracker, and of the risk measure."""
-        states = self.tracker.state_dict()
-        return states if self.risk is None else {**states, "risk": self.risk.state_dict()}
-
-    def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
-        """Continue from :meth:`state_dict`."""
-        self.tracker.load_state_dict(state_dict)
-        if self.risk is not None:
-            self.risk.load_state_dict(state_dict["risk"])

@@ -14,29 +14,24 @@ from safe_rl.algorithms.off_policy_networks import bounded_actions, setting
 from safe_rl.algorithms.replay_buffer import Memory
 from safe_rl.collectors import read_dataset, safe_episodes
 
-__all__ = ["begin_memory", "fill_memory"]
-
-
-def _nothing_learned(config: DictConfig) -> str:
-    """A warning if the run ends before learning begins; empty otherwise."""
-    random_steps = setting(config, "exploration.random_steps")
-    if config.frames >= random_steps:
-        return ""
-    return (
-        f"Nothing will be learned: exploration.random_steps={random_steps} come first, and the run "
-        f"has {config.frames:,}."
-    )
+__all__ = ["begin_memory"]
 
 
 def begin_memory(config: DictConfig, memory: Memory, env: EnvBase) -> tuple[str, bool]:
     """Fill an empty replay buffer with the dataset of a configuration, if it has one.
 
+    The node ``dataset`` has a ``path``, of a recording's folder or of an HDF5 file, and says with
+    ``safe_episodes`` whether only whole episodes within the limits are taken. Actions are clipped
+    to the bounds of the environment's.
+
     Returns:
-        A sentence on the data that the run learns from, and whether collected transitions are
-        added.
+        A sentence on the data that the run learns from, or a warning that it will learn nothing,
+        or an empty text; and whether collected transitions are added.
 
     Raises:
-        ValueError: As by `fill_memory`, or if ``dataset.alone`` is true without a path.
+        ValueError: If ``dataset.alone`` is true without a path; if transitions do not fit the
+            environment, lack an entry or are not finite; if no episode is within the limits, or
+            the replay buffer is too small.
     """
     node = config.get("dataset")
     if node is None or node.path is None:
@@ -45,31 +40,20 @@ def begin_memory(config: DictConfig, memory: Memory, env: EnvBase) -> tuple[str,
                 f"dataset.path is missing: algo={config.algo.name} with dataset.alone=true learns "
                 "from nothing else. Give the folder of a recording (record=true), or an HDF5 file."
             )
-        return _nothing_learned(config), True
+        random_steps = setting(config, "exploration.random_steps")
+        warning = (
+            f"Nothing will be learned: exploration.random_steps={random_steps} come first, and the "
+            f"run has {config.frames:,}."
+        )
+        return warning if config.frames < random_steps else "", True
     limits = check_cost_limits(config.cost_limits, env.cost_keys)
-    return fill_memory(memory, node, limits, env, bounded_actions(env)), not node.alone
+    return _fill(memory, node, limits, env, bounded_actions(env)), not node.alone
 
 
-def fill_memory(
+def _fill(
     memory: Memory, node: DictConfig, limits: Mapping[str, float], env: EnvBase, actions: TensorSpec
 ) -> str:
-    """Put the transitions of a dataset into a replay buffer.
-
-    Args:
-        memory: An empty replay buffer.
-        node: ``path`` of a recording's folder or of an HDF5 file, and ``safe_episodes``: whether to
-            take only whole episodes within the limits.
-        limits: Cost key -> undiscounted cost allowed per episode.
-        env: Environment, which the transitions must fit.
-        actions: Spec of one of its actions; actions are clipped to its bounds.
-
-    Returns:
-        A sentence on the transitions that were taken.
-
-    Raises:
-        ValueError: If they do not fit the environment, lack an entry or are not finite, if no
-            episode is within the limits, or the replay buffer is too small.
-    """
+    """Put the transitions of a dataset into a replay buffer; return a sentence on them."""
     steps = read_dataset(node.path)
     _check(steps, node, memory, env, actions)
     number = steps.batch_size.numel()
@@ -99,9 +83,10 @@ def _check(
     steps: TensorDictBase, node: DictConfig, memory: Memory, env: EnvBase, actions: TensorSpec
 ) -> None:
     """Refuse transitions of another environment, or without an entry that the loss reads."""
-    if missing := [key for key in memory.in_keys if key not in steps.keys(True)]:
-        names = ", ".join(map(_name, missing))
-        raise ValueError(f"dataset.path={node.path} has no {names}, which is learned from.")
+    if missing := [_name(key) for key in memory.in_keys if key not in steps.keys(True)]:
+        raise ValueError(
+            f"dataset.path={node.path} has no {', '.join(missing)}, which is learned from."
+        )
     sizes = {
         "observation": env.observation_spec["observation"].shape[-1],
         "action": actions.shape[-1],

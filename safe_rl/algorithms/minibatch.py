@@ -7,10 +7,10 @@ trust-region steps, are also a :class:`~safe_rl.algorithms.algorithm_contract.Po
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from functools import partial
-from typing import Annotated, Any
+from typing import Annotated
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -44,9 +44,6 @@ class KLAdaptiveRate:
         few_steps: Share of the planned steps; with fewer, an update has ended early.
         low_kl: Share of the KL bound; if a whole update stays below, the rate is raised.
 
-    Raises:
-        ValueError: If the factor is not above 1 or the bounds are not positive and in order.
-
     Examples:
         >>> adapt = KLAdaptiveRate(
         ...     factor=2.0, lowest=1e-5, highest=1e-3, few_steps=0.5, low_kl=0.5
@@ -62,13 +59,6 @@ class KLAdaptiveRate:
     highest: Annotated[float, Range(0, 1000, above=True)]
     few_steps: Share
     low_kl: Share
-
-    def __post_init__(self) -> None:
-        if not self.factor > 1 or not 0 < self.lowest <= self.highest:
-            raise ValueError(
-                "KLAdaptiveRate needs factor > 1 and 0 < lowest <= highest, got "
-                f"factor={self.factor}, lowest={self.lowest}, highest={self.highest}."
-            )
 
     def __call__(self, rate: float, *, share_of_steps: float, share_of_kl: float) -> float:
         """Return the rate of the next update.
@@ -131,6 +121,8 @@ class MinibatchUpdate(PolicyUpdate):
         >>> update(batch.auto_batch_size_(2))["num_steps"]
         tensor(8)
     """
+
+    state_names = ("optimizer", "_generator")
 
     def __init__(
         self,
@@ -258,15 +250,3 @@ class MinibatchUpdate(PolicyUpdate):
     def loss_modules(self) -> dict[str, nn.Module]:
         """The loss."""
         return {"loss": self.loss}
-
-    def state_dict(self) -> dict[str, Any]:
-        """State of the optimiser and of the shuffles; the parameters belong to the network."""
-        return {
-            "optimizer": self.optimizer.state_dict(),
-            "shuffles": self._generator.get_state(),
-        }
-
-    def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
-        """Continue from :meth:`state_dict`."""
-        self.optimizer.load_state_dict(state_dict["optimizer"])
-        self._generator.set_state(state_dict["shuffles"].cpu())

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
-from inspect import isclass
+from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import torch
@@ -33,9 +32,8 @@ from safe_rl.algorithms.replay_buffer import Memory
 from safe_rl.algorithms.replay_update import ReplayUpdate
 from safe_rl.collectors import EpisodeStatistics
 from safe_rl.models import ExploringPolicy
-from safe_rl.objectives.cost_critics import CostCritics
-from safe_rl.objectives.q_functions import QFunctionLoss, ReplayLoss
-from safe_rl.targets import locate
+from safe_rl.objectives.q_functions import ReplayLoss
+from safe_rl.resumable import Resumable
 
 __all__ = ["OffPolicy"]
 
@@ -53,7 +51,7 @@ _UNUSED = {
 
 
 @dataclass
-class OffPolicy(Algorithm, Recipe):
+class OffPolicy(Resumable, Algorithm, Recipe):
     """SAC, TD3 and similar algorithms: the algorithm, and the recipe that builds it.
 
     Attributes:
@@ -69,10 +67,12 @@ class OffPolicy(Algorithm, Recipe):
         collects: Whether collected transitions go into the replay buffer.
         learns_from: A sentence on the dataset in the replay buffer, or a warning that nothing will
             be learned.
+        steps: Environment steps so far.
     """
 
     off_policy: ClassVar[bool] = True
     unused_keys: ClassVar[Mapping[str, str]] = _UNUSED
+    state_names = ("steps", "constraints")
 
     policy: ExploringPolicy
     networks: Mapping[str, nn.Module]
@@ -83,7 +83,7 @@ class OffPolicy(Algorithm, Recipe):
     steps_per_decision: int = 1
     collects: bool = True
     learns_from: str = ""
-    _counts: dict[str, int] = field(default_factory=lambda: {"steps": 0})
+    steps: int = 0
 
     def __post_init__(self) -> None:
         self.cost_keys = self.constraints.keys
@@ -101,7 +101,6 @@ class OffPolicy(Algorithm, Recipe):
         """
         limits = constrained_limits(config, env, otherwise="sac")
         device = torch.device(config.device)
-        _check_critics(config)
         networks = build_networks(config, env, len(limits), device)
         constraints = build_constraints(config, limits, env, device)
         loss = build_part(
@@ -116,7 +115,13 @@ class OffPolicy(Algorithm, Recipe):
             cost_limits=limits,
         )
         _check_risk(config, constraints, loss)
-        memory = _build_memory(config, loss, ["reward", *constraints.keys], device)
+        memory: Memory = build_part(
+            config.memory,
+            in_keys=loss.in_keys,
+            reward_keys=["reward", *constraints.keys],
+            reward_gamma=config.loss.get("gamma", 1.0),
+            device=device,
+        )
         learns_from, collects = begin_memory(config, memory, env)
         random_steps = setting(config, "exploration.random_steps") if collects else 0
         _check_room(memory, random_steps // env.steps_per_decision, collects)
@@ -196,18 +201,13 @@ class OffPolicy(Algorithm, Recipe):
         self.memory.end_rows()
 
     def _count_steps(self, steps: int) -> None:
-        self._counts["steps"] += steps
-        self.policy.is_random.fill_(self._counts["steps"] < self.random_steps)
-
-    def state_dict(self) -> dict[str, Any]:
-        """Steps so far, and the state of the constraints."""
-        return {"counts": dict(self._counts), "constraints": self.constraints.state_dict()}
+        self.steps += steps
+        self.policy.is_random.fill_(self.steps < self.random_steps)
 
     def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
         """Continue from :meth:`state_dict`."""
-        self._counts.update(state_dict["counts"])
+        super().load_state_dict(state_dict)
         self._count_steps(0)
-        self.constraints.load_state_dict(state_dict["constraints"])
 
     def checkpoint_components(self) -> dict[str, Stateful]:
         """Parts with a state, by name; the replay buffer only with ``memory.keep``."""
@@ -219,17 +219,6 @@ class OffPolicy(Algorithm, Recipe):
             **self.memory.components(),
         }
         return {name: part for name, part in parts.items() if part is not None}
-
-
-def _check_critics(config: DictConfig) -> None:
-    """Refuse a configuration without Q functions that the loss has to train."""
-    loss = locate(config.loss.get("_target_"), "loss._target_")
-    for key, kind in (("critics.rewards", QFunctionLoss), ("critics.costs", CostCritics)):
-        if not setting(config, key) and isclass(loss) and issubclass(loss, kind):
-            raise ValueError(
-                f"{key}=0: algo={config.algo.name} learns such Q functions ({loss.__name__}). Give "
-                f"it at least one, as {key}=2."
-            )
 
 
 def _check_room(memory: Memory, random_steps: int, collects: bool) -> None:
@@ -246,26 +235,6 @@ def _check_room(memory: Memory, random_steps: int, collects: bool) -> None:
             f"memory.capacity={memory.capacity}: it must hold "
             f"exploration.random_steps={random_steps} transitions and {needed}"
         )
-
-
-def _build_memory(
-    config: DictConfig, loss: ReplayLoss, reward_keys: list[str], device: torch.device
-) -> Memory:
-    """The replay buffer; refuses settings of value learning for a loss that learns no values."""
-    for key, off in (("n_steps", 1), ("prioritised", None)):
-        if not loss.learns_values and config.memory[key] != off:
-            raise ValueError(
-                f"memory.{key}={config.memory[key]}: algo={config.algo.name} learns no values, and "
-                f"ignores this. Use memory.{key}={'null' if off is None else off}."
-            )
-    memory: Memory = build_part(
-        config.memory,
-        in_keys=loss.in_keys,
-        reward_keys=reward_keys,
-        reward_gamma=config.loss.get("gamma", 1.0),
-        device=device,
-    )
-    return memory
 
 
 def _check_risk(config: DictConfig, constraints: Constraints, loss: ReplayLoss) -> None:

@@ -31,11 +31,9 @@ from safe_rl.algorithms.losses import LossState
 from safe_rl.algorithms.processor_use import in_parallel
 from safe_rl.collectors import EpisodeStatistics
 from safe_rl.models import build_networks, make_behaviour, take_in
-from safe_rl.objectives import CriticLoss
+from safe_rl.objectives import CriticLoss, JointAdvantages
 from safe_rl.objectives.advantages import CostGAE, VectorGAE
 from safe_rl.objectives.critics import critic_bias
-from safe_rl.objectives.gae import normalise_advantages
-from safe_rl.objectives.surrogate import SurrogateLoss
 
 __all__ = ["OnPolicy"]
 
@@ -107,7 +105,7 @@ class OnPolicy(Algorithm, Recipe):
         return cls(
             **{"cost_critic": None, **networks},
             constraints=constraints,
-            advantage=_build_advantage(config, critic, **parts),
+            advantage=build_part(config.advantage, value_network=critic, **parts),
             cost_advantage=cost_advantage,
             policy_update=policy_update,
             critic_update=build_update(
@@ -138,15 +136,10 @@ class OnPolicy(Algorithm, Recipe):
         Returns:
             Values for columns of the table, by name.
         """
-        self.constraints.apply_risk(episodes, batch)
-        self.advantage(batch)
-        keys = {"advantage": self.advantage.tensor_keys.advantage}
-        if self.cost_advantage is not None:
-            self.cost_advantage(batch)
-            keys["cost_advantage"] = self.cost_advantage.tensor_keys.advantage
-        bias = self._critic_bias(batch)
-        normalise_advantages(batch, **keys)
         constraints = self.constraints
+        constraints.apply_risk(episodes, batch)
+        JointAdvantages(self.advantage, self.cost_advantage)(batch)
+        bias = self._critic_bias(batch)
         constraints.update(episodes, batch)
         metrics = self._update(batch)
         constraints.record_prediction(metrics["policy"])
@@ -216,27 +209,9 @@ def _limits(config: DictConfig, env: EnvBase) -> dict[str, float]:
     return limits
 
 
-def _build_advantage(config: DictConfig, critic: TensorDictModule, **parts: Any) -> VectorGAE:
-    """The estimator of the reward advantage; refuses one that reads another critic's values."""
-    advantage: VectorGAE = build_part(config.advantage, value_network=critic, **parts)
-    if advantage.tensor_keys.value not in critic.out_keys:
-        raise ValueError(
-            f"advantage._target_={config.advantage._target_} estimates from "
-            f"'{advantage.tensor_keys.value}', and the critic writes {critic.out_keys}: that of "
-            "costs is cost_advantage."
-        )
-    return advantage
-
-
 def _build_update(config: DictConfig, **parts: Any) -> PolicyUpdate:
     """The update of the policy: ``policy_update`` on ``loss``, then the pairs in ``then``."""
     loss = build_part(config.loss, **parts)
-    if isinstance(loss, SurrogateLoss) and loss.has_costs and not parts["cost_limits"]:
-        raise ValueError(
-            f"{type(loss).__name__} reads cost advantages (has_costs), and its algorithm is not "
-            "constrained: write algo.constrained=true and '- /cost_advantage: ${preset}' among "
-            "its defaults."
-        )
     others = {name: part for name, part in parts.items() if name != "actor_network"}
     update = build_update(config.policy_update, PolicyUpdate, loss=loss, **others)
     then = config.get("then") or {}

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import Any
 
 import torch
@@ -88,6 +87,8 @@ class CTRPOStep(TRPOStep):
         [1.0, 1.0, 0.0]
     """
 
+    state_names = ("recovering",)
+
     def __init__(
         self,
         loss: Loss,
@@ -135,14 +136,6 @@ class CTRPOStep(TRPOStep):
         diagnostics = {"recovers": self.recovering.to(surrogates.dtype)}
         return Proposal(-scale * direction, is_acceptable, diagnostics)
 
-    def state_dict(self) -> dict[str, Any]:
-        """The costs from which the policy recovers."""
-        return {"recovering": self.recovering.clone()}
-
-    def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
-        """Continue from :meth:`state_dict`."""
-        self.recovering = state_dict["recovering"].clone()
-
 
 class CRPOStep(TRPOStep):
     """A step for the reward if all costs are at most d + η, else a step against one cost (CRPO).
@@ -152,27 +145,14 @@ class CRPOStep(TRPOStep):
     cost that exceeds its limit most, in its own units. (The article takes any of these costs.)
     There is no multiplier, and only η to tune.
 
-    The diagnostics also have ``reduces``, [k]: 1 for the cost that the step lowers.
+    The diagnostics also have ``reduces``, [k]: 1 for the cost that the step lowers. It is built and
+    called as a `CTRPOStep`, whose docstring has an example.
 
     Args:
         loss: A `CPOLoss`, or a callable of your own that returns a TensorDict with scalars
             ``loss_…`` and the differentiable ``cost_surrogate``, [k].
         tolerance: Tolerated violation η, undiscounted cost per episode.
         settings: Those of every step, see `TRPOStep`.
-
-    Examples:
-        >>> from tensordict import TensorDict
-        >>> from safe_rl.models import make_actor
-        >>> from safe_rl.objectives import CPOLoss
-        >>> actor = make_actor(3, 2, hidden_sizes=[16], initial_log_std=-0.5)
-        >>> with torch.no_grad():
-        ...     batch = actor(TensorDict(observation=torch.randn(8, 3), batch_size=[8]))
-        >>> batch["advantage"], batch["cost_advantage"] = torch.randn(8, 1), torch.randn(8, 2)
-        >>> search = {"cg_iterations": 10, "backtrack_coeff": 0.8, "max_backtracks": 10}
-        >>> loss = CPOLoss(actor, entropy_coeff=0.0)
-        >>> step = CRPOStep(loss, tolerance=2.0, target_kl=0.01, damping=0.1, **search)
-        >>> step(batch, cost_violation=torch.tensor([1.0, 5.0]))["reduces"]
-        tensor([0., 1.])
     """
 
     def __init__(self, loss: Loss, *, tolerance: NotNegative, **settings: Any) -> None:

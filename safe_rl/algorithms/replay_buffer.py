@@ -16,6 +16,7 @@ from torchrl.envs import MultiStepTransform
 
 from safe_rl.algorithms.algorithm_contract import Stateful
 from safe_rl.ranges import Bytes, Checked, Count, Range, Share
+from safe_rl.resumable import Resumable
 
 __all__ = ["Memory", "ProportionalSampler"]
 
@@ -203,7 +204,7 @@ _SMALLEST = 1e-8
 """Added to errors, so that every transition can be drawn."""
 
 
-class ProportionalSampler(Sampler):
+class ProportionalSampler(Resumable, Sampler):
     """Samples transition i with probability p_i / Σ p, where p = (|TD error| + ε)^α.
 
     Schaul et al. 2016, section 3.3. Samples have the importance weights (p_i / min p)^−β (section
@@ -231,6 +232,8 @@ class ProportionalSampler(Sampler):
         >>> sorted(set(buffer.sample().tolist()))
         [1, 3]
     """
+
+    state_names = ("_priorities", "_largest")
 
     def __init__(self, capacity: int, *, alpha: float, beta: float) -> None:
         if min(alpha, beta) < 0:
@@ -271,15 +274,6 @@ class ProportionalSampler(Sampler):
         raised = (errors + _SMALLEST) ** self.alpha
         self._priorities[torch.as_tensor(index).cpu()] = raised
         self._largest = max(self._largest, raised.max().item())
-
-    def state_dict(self) -> dict[str, Any]:
-        """All priorities."""
-        return {"priorities": self._priorities.clone(), "largest": self._largest}
-
-    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """Continue from :meth:`state_dict`."""
-        self._priorities.copy_(state_dict["priorities"])
-        self._largest = float(state_dict["largest"])
 
     def dumps(self, path: Path) -> None:
         """Write the state into a folder."""

@@ -127,9 +127,8 @@ class ReplayUpdate(Checked):
         return sum_of_losses(losses), losses
 
     def _step(self, total: Tensor, with_actor: bool) -> None:
-        for (
-            parameter
-        ) in self._parameters:  # `zero_grad` of the optimiser takes twenty times as long
+        # `zero_grad` of the optimiser takes twenty times as long
+        for parameter in self._parameters:
             parameter.grad = None
         total.backward()
         if self.max_grad_norm is not None:

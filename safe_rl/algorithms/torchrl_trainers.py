@@ -5,23 +5,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any
-
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torchrl.trainers import Trainer
 from torchrl.trainers.trainers import OptimizationStepper, TrainerHookBase
 
-from safe_rl.algorithms.algorithm_contract import PolicyUpdate, Stateful, load_states, states_of
+from safe_rl.algorithms.algorithm_contract import PolicyUpdate
 from safe_rl.algorithms.constraints import Constraints
 from safe_rl.algorithms.minibatch import MinibatchUpdate
 from safe_rl.collectors import EpisodeAccounting
+from safe_rl.objectives import Multiplier
+from safe_rl.resumable import Resumable
 
 __all__ = ["ConstraintHook", "UpdateStepper"]
 
 
-class ConstraintHook(TrainerHookBase):
+class ConstraintHook(Resumable, TrainerHookBase):
     """Updates the constraints, and with them the multiplier, with every collected batch.
 
     Registered with a trainer it runs before the losses, and logs returns, costs, violations and
@@ -43,6 +42,8 @@ class ConstraintHook(TrainerHookBase):
         >>> hook.constraints.violation
         tensor([1.])
     """
+
+    state_names = ("accounting", "constraints", "multiplier")
 
     def __init__(self, constraints: Constraints, accounting: EpisodeAccounting) -> None:
         if type(constraints).apply_risk is not Constraints.apply_risk:
@@ -66,21 +67,10 @@ class ConstraintHook(TrainerHookBase):
         del batch
         return self._row
 
-    def state_dict(self) -> dict[str, Any]:
-        """Open episodes, last known costs and multiplier."""
-        return states_of(self._parts())
-
-    def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
-        """Continue from :meth:`state_dict`."""
-        load_states(self._parts(), state_dict)
-
-    def _parts(self) -> dict[str, Stateful]:
-        parts: dict[str, Stateful | None] = {
-            "accounting": self.accounting,
-            "constraints": self.constraints,
-            "multiplier": self.constraints.multiplier,
-        }
-        return {name: part for name, part in parts.items() if part is not None}
+    @property
+    def multiplier(self) -> Multiplier | None:
+        """That of the constraints, which do not save it."""
+        return self.constraints.multiplier
 
     def register(self, trainer: Trainer, name: str = "constraints") -> None:
         """Add the hook to a trainer, for every batch, its log and its checkpoints."""
@@ -89,7 +79,7 @@ class ConstraintHook(TrainerHookBase):
         trainer.register_module(name, self)
 
 
-class UpdateStepper(OptimizationStepper):
+class UpdateStepper(Resumable, OptimizationStepper):
     """A trust-region step, or another of our updates, as a trainer's optimisation step.
 
     It takes the batch that the trainer passes. Without a replay buffer and with
@@ -114,6 +104,8 @@ class UpdateStepper(OptimizationStepper):
         >>> bool(UpdateStepper(update).step(None, batch)["kl"] <= 0.01)
         True
     """
+
+    state_names = ("policy_update", "critic_update")
 
     def __init__(
         self,
@@ -144,15 +136,3 @@ class UpdateStepper(OptimizationStepper):
             for name, value in row.items():
                 scalars |= known.column(name, torch.as_tensor(value))
         return TensorDict({name: torch.tensor(value) for name, value in scalars.items()})
-
-    def state_dict(self) -> dict[str, Any]:
-        """State of both updates."""
-        return states_of(self._parts())
-
-    def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
-        """Continue from :meth:`state_dict`."""
-        load_states(self._parts(), state_dict)
-
-    def _parts(self) -> dict[str, Stateful]:
-        critic = {} if self.critic_update is None else {"critic_update": self.critic_update}
-        return {"policy_update": self.policy_update, **critic}

@@ -25,7 +25,6 @@ from safe_rl.objectives.trust_region import (
     flatten,
     mean_kl,
     policy_in,
-    solve_with_image,
     subsample,
 )
 from safe_rl.objectives.violation import matched_violation
@@ -210,7 +209,7 @@ class TRPOStep(PolicyUpdate):
         """The longest step along the natural gradient of an objective of the losses."""
         loss = objective(problem.losses)
         gradient = flat_gradient(loss, self.parameters)
-        direction = conjugate_gradient(problem.fisher, gradient, self.cg_iterations)
+        direction, _ = conjugate_gradient(problem.fisher, gradient, self.cg_iterations)
         # Conjugate gradients leave a residual orthogonal to the solution x, so that xᵀHx = xᵀg.
         squared = (gradient @ direction).clamp_min(0)
         length = torch.where(squared > 0, (2 * self.target_kl / squared).sqrt(), 0.0)
@@ -230,7 +229,7 @@ class TRPOStep(PolicyUpdate):
         they are equal, and there a step keeps linearised constraints and the radius exactly.
         """
         right = torch.cat([g[None], b])
-        pairs = [solve_with_image(fisher, row, self.cg_iterations) for row in right]
+        pairs = [conjugate_gradient(fisher, row, self.cg_iterations) for row in right]
         solutions, images = (torch.stack(rows) for rows in zip(*pairs, strict=True))
         solved = best_in_span(solutions, images, right)
         return solved[0], solved[1:]

@@ -11,53 +11,24 @@ from torch.distributions import Beta, Categorical, Independent
 from torch.nn.functional import softplus
 from torchrl.modules import TanhNormal
 
-__all__ = ["BoundedBeta", "Choices", "OneChoice", "SquashedNormal"]
+__all__ = ["BoundedBeta", "SquashedNormal", "choices"]
 
 # Beta densities are infinite or zero at the ends of (0, 1), which single precision rounds to.
 _EDGE = 1e-6
 Shape: TypeAlias = torch.Size | list[int] | tuple[int, ...]
 
 
-class Choices(Independent):
+def choices(logits: Tensor) -> Independent:
     """A choice in each of A components of an action, independent of one another.
 
     Args:
         logits: [..., A, C]; components with fewer than C choices have very low ones at their end.
 
     Examples:
-        >>> import torch
-        >>> Choices(torch.zeros(5, 2, 3)).log_prob(torch.zeros(5, 2)).exp()[0]
+        >>> choices(torch.zeros(5, 2, 3)).log_prob(torch.zeros(5, 2)).exp()[0]
         tensor(0.1111)
     """
-
-    def __init__(self, logits: Tensor) -> None:
-        super().__init__(Categorical(logits=logits), 1)
-
-    @property
-    def deterministic_sample(self) -> Tensor:
-        """The likeliest choices, [..., A]."""
-        return self.base_dist.mode
-
-
-class OneChoice(Categorical):
-    """A choice among C, as an integer.
-
-    Args:
-        logits: [..., C].
-
-    Examples:
-        >>> import torch
-        >>> OneChoice(torch.tensor([0.0, 2.0])).deterministic_sample
-        tensor(1)
-    """
-
-    def __init__(self, logits: Tensor) -> None:
-        super().__init__(logits=logits)
-
-    @property
-    def deterministic_sample(self) -> Tensor:
-        """The likeliest choice, [...]."""
-        return self.mode
+    return Independent(Categorical(logits=logits), 1)
 
 
 class BoundedBeta(Independent):
@@ -143,11 +114,6 @@ class SquashedNormal(TanhNormal):
             raise AttributeError(f"'{type(self).__name__}' has no attribute '{name}'")
         super().__init__(**given)
         return getattr(self, name)
-
-    def update(self, loc: Tensor, scale: Tensor) -> None:
-        """Take other means and standard deviations."""
-        super().update(loc, scale)
-        self.__dict__["_given"].update(loc=loc, scale=scale)
 
     def rsample_and_log_prob(self, sample_shape: Shape = torch.Size()) -> tuple[Tensor, Tensor]:  # noqa: B008
         """Draw actions [..., A], differentiably, and their densities [...], exact at the bounds."""

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from typing import Any
 
 import torch
-from tensordict import NestedKey, TensorDictBase
+from tensordict import TensorDictBase
 from tensordict.nn import (
     ProbabilisticTensorDictModule,
     ProbabilisticTensorDictSequential,
@@ -50,8 +50,6 @@ def make_squashed_actor(
     hidden_sizes: Sequence[int],
     input_scale: Tensor | None = None,
     device: torch.device | None = None,
-    in_key: NestedKey = "observation",
-    action_key: NestedKey = "action",
 ) -> ProbabilisticTensorDictSequential:
     """Build a policy whose actions are the tanh of a Gaussian, within bounds (SAC's).
 
@@ -62,8 +60,6 @@ def make_squashed_actor(
         hidden_sizes: Width of every hidden layer.
         input_scale: Fixed factors of the observation, or None.
         device: Device of the parameters.
-        in_key: Key of the observation.
-        action_key: Key of the action.
 
     Examples:
         >>> from tensordict import TensorDict
@@ -75,10 +71,10 @@ def make_squashed_actor(
     layers = _perceptron((observation_size, 2 * len(low)), hidden_sizes, input_scale, device)
     extractor = NormalParamExtractor("biased_softplus_1.0", scale_lb=_SCALE_FLOOR)
     return _SquashedActor(
-        _GaussianParameters(nn.Sequential(*layers, extractor), in_key),
+        _GaussianParameters(nn.Sequential(*layers, extractor)),
         ProbabilisticTensorDictModule(
             in_keys=["loc", "scale"],
-            out_keys=[action_key],
+            out_keys=["action"],
             distribution_class=SquashedNormal,
             distribution_kwargs={"low": low.to(device), "high": high.to(device)},
             return_log_prob=True,
@@ -96,8 +92,6 @@ def make_bounded_actor(
     hidden_sizes: Sequence[int],
     input_scale: Tensor | None = None,
     device: torch.device | None = None,
-    in_key: NestedKey = "observation",
-    action_key: NestedKey = "action",
 ) -> TensorDictModule:
     """Build a deterministic policy whose actions are the tanh of a network, within bounds (TD3's).
 
@@ -112,7 +106,8 @@ def make_bounded_actor(
     """
     layers = _perceptron((observation_size, len(low)), hidden_sizes, input_scale, device)
     squash = _Squash(low, high, device)
-    return TensorDictModule(nn.Sequential(*layers, squash), in_keys=[in_key], out_keys=[action_key])
+    network = nn.Sequential(*layers, squash)
+    return TensorDictModule(network, in_keys=["observation"], out_keys=["action"])
 
 
 class _SquashedActor(ProbabilisticTensorDictSequential):
@@ -125,22 +120,22 @@ class _SquashedActor(ProbabilisticTensorDictSequential):
         **kwargs: Any,
     ) -> SquashedNormal:
         parameters, head = self
-        loc, scale = parameters.module(tensordict.get(parameters.in_keys[0]))
+        loc, scale = parameters.module(tensordict.get("observation"))
         return SquashedNormal(loc, scale, **head.distribution_kwargs)
 
 
 class _GaussianParameters(TensorDictModuleBase):
     """Writes ``loc`` and ``scale``: a `TensorDictModule` in a fifth of its time."""
 
-    def __init__(self, module: nn.Module, in_key: NestedKey) -> None:
+    def __init__(self, module: nn.Module) -> None:
         super().__init__()
         self.module = module
-        self.in_keys, self.out_keys = [in_key], ["loc", "scale"]
+        self.in_keys, self.out_keys = ["observation"], ["loc", "scale"]
 
     def forward(
         self, tensordict: TensorDictBase, tensordict_out: TensorDictBase | None = None
     ) -> TensorDictBase:
-        loc, scale = self.module(tensordict.get(self.in_keys[0]))
+        loc, scale = self.module(tensordict.get("observation"))
         written = tensordict if tensordict_out is None else tensordict_out
         return written.set("loc", loc).set("scale", scale)
 

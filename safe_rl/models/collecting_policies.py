@@ -13,7 +13,7 @@ from tensordict.nn import (
 )
 from torch import Tensor
 from torchrl.envs.utils import ExplorationType, exploration_type
-from torchrl.modules import IndependentNormal, TanhNormal
+from torchrl.modules import IndependentNormal
 
 __all__ = ["WITHOUT_NOISE", "BehaviourPolicy", "ExploringPolicy", "make_behaviour"]
 
@@ -70,10 +70,8 @@ class BehaviourPolicy(TensorDictModuleBase):
         ):
             raise TypeError(
                 "BehaviourPolicy samples one TensorDictModule that writes loc and scale, followed "
-                "by an IndependentNormal of them with return_log_prob=True, got "
-                f"{len(actor.module)} modules, the first a {type(parameters).__name__} that writes "
-                f"{parameters.out_keys}, and {sampler.distribution_class}. Hand the actor itself "
-                "to the collector instead."
+                "by an IndependentNormal of them with return_log_prob=True: hand another actor "
+                "itself to the collector."
             )
         self.network = parameters.module
         self.in_keys = list(parameters.in_keys)
@@ -115,9 +113,6 @@ class ExploringPolicy(TensorDictModuleBase):
         is_random: Whether actions are uniformly random; a buffer, that collectors' workers get with
             the weights.
 
-    Raises:
-        TypeError: If the actor is neither kind.
-
     Examples:
         >>> import torch
         >>> from tensordict import TensorDict
@@ -143,19 +138,10 @@ class ExploringPolicy(TensorDictModuleBase):
         noise: float = 0.0,
     ) -> None:
         super().__init__()
-        parameters, self._samples = actor, False
-        if isinstance(actor, ProbabilisticTensorDictSequential):
-            parameters, sampler = actor.module[0], actor.module[-1]
-            self._samples = True
-            is_squashed = issubclass(sampler.distribution_class, TanhNormal)
-            if len(actor.module) != 2 or not is_squashed:
-                raise TypeError(
-                    "ExploringPolicy samples a network followed by a TanhNormal, got "
-                    f"{len(actor.module)} modules and {sampler.distribution_class.__name__}."
-                )
-        self.network, self.noise = parameters.module, noise
-        self.in_keys = list(parameters.in_keys)
-        self.out_keys = list(actor.out_keys[-1:] if not self._samples else sampler.out_keys[:1])
+        self._samples = isinstance(actor, ProbabilisticTensorDictSequential)
+        self.network = (actor.module[0] if self._samples else actor).module
+        self.noise = noise
+        self.in_keys, self.out_keys = ["observation"], ["action"]
         device = next(actor.parameters()).device
         self.register_buffer("low", low.to(device), persistent=False)
         self.register_buffer("high", high.to(device), persistent=False)
@@ -165,7 +151,7 @@ class ExploringPolicy(TensorDictModuleBase):
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write the action."""
-        outputs = self.network(tensordict.get(self.in_keys[0]))
+        outputs = self.network(tensordict.get("observation"))
         is_noisy = exploration_type() not in WITHOUT_NOISE
         half = (self.high - self.low) / 2
         if self._samples:
@@ -180,4 +166,4 @@ class ExploringPolicy(TensorDictModuleBase):
         if is_noisy:
             uniform = self.low + 2 * half * torch.rand_like(action)
             action = torch.where(self.is_random, uniform, action)
-        return tensordict.set(self.out_keys[0], action)
+        return tensordict.set("action", action)

@@ -11,8 +11,7 @@ from typing import NamedTuple
 
 import torch
 from tensordict.nn import AddStateIndependentNormalScale
-from torch import Tensor, nn
-from torch.distributions import Distribution
+from torch import Tensor, distributions, nn
 from torch.nn.functional import pad, softplus
 from torchrl.data import (
     Binary,
@@ -25,7 +24,7 @@ from torchrl.data import (
 )
 from torchrl.modules import IndependentNormal, OneHotCategorical, TanhNormal
 
-from safe_rl.models.action_distributions import BoundedBeta, Choices, OneChoice
+from safe_rl.models.action_distributions import BoundedBeta, choices
 
 __all__ = ["AUTO", "HEADS", "Head", "gaussian_head", "make_head"]
 
@@ -51,7 +50,7 @@ class Head(NamedTuple):
     num_outputs: int
     parameters: nn.Module
     keys: tuple[str, ...]
-    distribution: Callable[..., Distribution]
+    distribution: Callable[..., distributions.Distribution]
 
 
 class _Row(NamedTuple):
@@ -128,10 +127,10 @@ def _beta(spec: TensorSpec, initial_log_std: float, device: torch.device | None)
 
 def _categorical(spec: TensorSpec, initial_log_std: float, device: torch.device | None) -> Head:
     """As many logits as there are choices; a plain choice has no component dimension."""
-    choices = list(_choices(spec))
+    numbers = list(_num_choices(spec))
     if len(spec.shape) == 1:
-        return Head(choices[0], nn.Identity(), ("logits",), OneChoice)
-    return Head(sum(choices), _Components(choices), ("logits",), Choices)
+        return Head(numbers[0], nn.Identity(), ("logits",), distributions.Categorical)
+    return Head(sum(numbers), _Components(numbers), ("logits",), choices)
 
 
 def _one_hot(spec: TensorSpec, initial_log_std: float, device: torch.device | None) -> Head:
@@ -168,7 +167,7 @@ def _bounds(spec: TensorSpec, device: torch.device | None) -> tuple[Tensor, Tens
     return low.to(device), high.to(device)
 
 
-def _choices(spec: TensorSpec) -> Iterator[int]:
+def _num_choices(spec: TensorSpec) -> Iterator[int]:
     """Number of choices of every component of one environment's action."""
     size = spec.shape[-1] if len(spec.shape) > 1 else 1
     if isinstance(spec, MultiCategorical):

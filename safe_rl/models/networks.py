@@ -133,9 +133,6 @@ def make_actor(
     initial_log_std: float,
     input_scale: Tensor | None = None,
     device: torch.device | None = None,
-    in_key: NestedKey = "observation",
-    action_key: NestedKey = "action",
-    log_prob_key: NestedKey = "action_log_prob",
 ) -> ProbabilisticTensorDictSequential:
     """Build a diagonal Gaussian policy with a state-independent standard deviation.
 
@@ -148,13 +145,10 @@ def make_actor(
         initial_log_std: Initial logarithm of the standard deviation.
         input_scale: Fixed factors, shape [observation_size], or None.
         device: Device of the parameters.
-        in_key: Key of the observation.
-        action_key: Key of the action.
-        log_prob_key: Key of the action's log-probability, shape [...] without a trailing 1.
 
     Returns:
-        A module with ``get_dist`` that writes ``loc``, ``scale``, the action and its
-        log-probability.
+        A module with ``get_dist`` that writes ``loc``, ``scale``, ``action`` and
+        ``action_log_prob``, shape [...] without a trailing 1.
 
     Examples:
         >>> import torch
@@ -166,9 +160,7 @@ def make_actor(
     """
     head = gaussian_head(action_size, initial_log_std, device)
     body = perceptron(observation_size, head.num_outputs, hidden_sizes, input_scale, device)
-    return assemble_actor(
-        body, head, in_keys=[in_key], action_key=action_key, log_prob_key=log_prob_key
-    )
+    return assemble_actor(body, head)
 
 
 def assemble_actor(
@@ -176,8 +168,6 @@ def assemble_actor(
     head: Head,
     *,
     in_keys: Sequence[NestedKey] = ("observation",),
-    action_key: NestedKey = "action",
-    log_prob_key: NestedKey = "action_log_prob",
     before: Sequence[TensorDictModuleBase] = (),
 ) -> ProbabilisticTensorDictSequential:
     """Put a head on a network.
@@ -186,13 +176,11 @@ def assemble_actor(
         body: Network from what stands under ``in_keys`` to the head's outputs.
         head: What makes a distribution of them.
         in_keys: Keys of the observation.
-        action_key: Key of the action.
-        log_prob_key: Key of the action's log-probability, shape [...].
         before: Modules that write what stands under ``in_keys``.
 
     Returns:
-        A module with ``get_dist`` that writes the distribution's parameters, the action and its
-        log-probability.
+        A module with ``get_dist`` that writes the distribution's parameters, ``action`` and
+        ``action_log_prob``, shape [...].
     """
     parameters = Chain(body, head.parameters)
     return ProbabilisticTensorDictSequential(
@@ -200,10 +188,10 @@ def assemble_actor(
         TensorDictModule(parameters, in_keys=list(in_keys), out_keys=list(head.keys)),
         ProbabilisticTensorDictModule(
             in_keys=list(head.keys),
-            out_keys=[action_key],
+            out_keys=["action"],
             distribution_class=head.distribution,
             return_log_prob=True,
-            log_prob_key=log_prob_key,
+            log_prob_key="action_log_prob",
             default_interaction_type=ExplorationType.RANDOM,
         ),
     )
@@ -215,7 +203,6 @@ def make_critic(
     hidden_sizes: Sequence[int],
     input_scale: Tensor | None = None,
     device: torch.device | None = None,
-    in_key: NestedKey = "observation",
     out_key: NestedKey = "state_value",
     num_outputs: int = 1,
 ) -> TensorDictModule:
@@ -226,7 +213,6 @@ def make_critic(
         hidden_sizes: Width of every hidden layer.
         input_scale: Fixed factors, shape [observation_size], or None.
         device: Device of the parameters.
-        in_key: Key of the observation.
         out_key: Key of the value.
         num_outputs: Number of values: 1 for the reward, the number of constrained costs for them.
 
@@ -238,4 +224,4 @@ def make_critic(
         torch.Size([5, 2])
     """
     network = perceptron(observation_size, num_outputs, hidden_sizes, input_scale, device)
-    return TensorDictModule(network, in_keys=[in_key], out_keys=[out_key])
+    return TensorDictModule(network, in_keys=["observation"], out_keys=[out_key])

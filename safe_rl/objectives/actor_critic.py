@@ -8,14 +8,10 @@ from tensordict import NestedKey, TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase, dispatch
 from torchrl.objectives import LossModule
 
-from safe_rl.naming import did_you_mean
 from safe_rl.objectives.advantages import CostGAE, VectorGAE
 from safe_rl.objectives.critics import CriticLoss
 from safe_rl.objectives.gae import normalise_advantages
 from safe_rl.objectives.surrogate import SurrogateLoss
-
-#: Keys that TorchRL's trainers pass to every loss, although only estimators read them.
-_OF_ESTIMATORS = {"reward", "done", "terminated"}
 
 
 class ActorCriticLoss(LossModule):
@@ -63,22 +59,11 @@ class ActorCriticLoss(LossModule):
         return list(dict.fromkeys([*self.policy_loss.in_keys, *self.critic_loss.in_keys]))
 
     def set_keys(self, **kwargs: NestedKey) -> None:
-        """Name entries of the batch; each part takes the names that it knows.
-
-        Raises:
-            ValueError: If neither part knows a name.
-        """
+        """Name entries of the batch; each part takes the names that it knows."""
         parts: tuple[LossModule, LossModule] = (self.policy_loss, self.critic_loss)
-        accepted = [set(part._AcceptedKeys.__dataclass_fields__) for part in parts]
-        known = set.union(_OF_ESTIMATORS, *accepted)
-        for name in kwargs:
-            if name not in known:
-                raise ValueError(
-                    f"set_keys() does not know {name!r}.{did_you_mean(name, known)} It knows "
-                    f"{sorted(known)}."
-                )
-        for part, names in zip(parts, accepted, strict=True):
-            part.set_keys(**{name: key for name, key in kwargs.items() if name in names})
+        for part in parts:
+            known = part._AcceptedKeys.__dataclass_fields__
+            part.set_keys(**{name: key for name, key in kwargs.items() if name in known})
 
     @dispatch
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:

@@ -27,7 +27,7 @@ class PIMultiplier(Multiplier):
 
     Args:
         cost_limits: Mapping from cost key to limit d, or limits alone; see `parse_cost_limits`.
-        init: Initial λ, for all costs or one per cost.
+        init: Initial λ, at most `highest`, for all costs or one per cost.
         kp: Proportional gain K_P.
         ki: Integral gain K_I.
         saturation: Bound of the error |Δ|, in units of the limit.
@@ -58,8 +58,6 @@ class PIMultiplier(Multiplier):
     ) -> None:
         super().__init__(cost_limits)
         initial = per_cost("init", init, self.num_costs)
-        if not ((initial >= 0) & (initial <= highest)).all():
-            raise ValueError(f"init must lie in [0, highest={highest}], got {initial.tolist()}.")
         self.kp, self.ki, self.saturation, self.highest = kp, ki, saturation, highest
         self.register_buffer("scale", torch.where(self.limits > 0, self.limits, 1.0))
         self.register_buffer("penalty", initial)

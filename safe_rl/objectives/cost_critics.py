@@ -47,7 +47,7 @@ class CostCritics(QFunctionLoss):
         settings: Those of the loss without costs.
 
     Raises:
-        ValueError: If the cost critic is no ensemble, or keys and multipliers differ in number.
+        ValueError: If the cost critic is no ensemble.
 
     Attributes:
         cost_unit: u, the size of one cost, [k]; 1 until `calibrate` is called.
@@ -81,10 +81,6 @@ class CostCritics(QFunctionLoss):
     ) -> None:
         device = next(cost_qvalue_network.parameters()).device
         check_ensemble(cost_qvalue_network, "cost critic")
-        if len(cost_keys) != multiplier.num_costs:
-            raise ValueError(
-                f"There are {len(cost_keys)} cost_keys but {multiplier.num_costs} multipliers."
-            )
         self.cost_keys = list(cost_keys)  # the base's constructor makes in_keys of them
         super().__init__(actor_network, qvalue_network, **settings)
         self.convert_to_functional(

@@ -78,7 +78,6 @@ class CriticLoss(LossModule):
     Args:
         critic: Writes the value key, [..., 1].
         cost_critic: Writes the cost value key, [..., k].
-        reduction: ``"mean"``, ``"sum"`` or ``"none"`` over the samples.
 
     Examples:
         >>> import torch
@@ -115,6 +114,7 @@ class CriticLoss(LossModule):
     tensor_keys: _AcceptedKeys
     default_keys = _AcceptedKeys
 
+    reduction = "mean"
     critic: TensorDictModuleBase
     critic_params: TensorDictParams
     target_critic_params: TensorDictParams
@@ -126,11 +126,8 @@ class CriticLoss(LossModule):
         self,
         critic: TensorDictModuleBase,
         cost_critic: TensorDictModuleBase | None = None,
-        *,
-        reduction: str = "mean",
     ) -> None:
         super().__init__()
-        self.reduction = reduction
         self.convert_to_functional(critic, "critic")
         self.out_keys = ["loss_critic", "explained_variance"]
         self.cost_critic, self.cost_critic_params = None, None

@@ -171,18 +171,8 @@ def entropy(distribution: Distribution) -> Tensor:
 
 
 def sampler_of(actor: ProbabilisticTensorDictSequential) -> ProbabilisticTensorDictModule:
-    """The module of an actor that builds its distribution from parameters.
-
-    Raises:
-        TypeError: If there is none.
-    """
-    samplers = [m for m in actor.modules() if isinstance(m, ProbabilisticTensorDictModule)]
-    if not samplers:
-        raise TypeError(
-            f"The actor, {type(actor).__name__}, has no ProbabilisticTensorDictModule that builds "
-            "its distribution: make it with torchrl.modules.ProbabilisticActor."
-        )
-    return samplers[-1]
+    """The module of an actor that builds its distribution from parameters."""
+    return [m for m in actor.modules() if isinstance(m, ProbabilisticTensorDictModule)][-1]
 
 
 def composite_keys(

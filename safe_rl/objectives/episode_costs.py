@@ -14,13 +14,13 @@ episodes have not ended yet, and there are many short episodes from before.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 from safe_rl.objectives.risk import Charges
+from safe_rl.resumable import Resumable
 
 #: Ends of episodes from which the mean length is taken.
 _ENDS = 100
@@ -91,7 +91,7 @@ def shrink(past: CostEstimate, present: CostEstimate, drift: Tensor) -> CostEsti
     )
 
 
-class EpisodeLengths:
+class EpisodeLengths(Resumable):
     """Mean episode length T̄: steps per end of an episode, over the last 100 ends or a few more.
 
     Steps are counted from the batch after one with ends, so that a batch without ends makes T̄
@@ -110,6 +110,8 @@ class EpisodeLengths:
         >>> lengths.mean.round()
         tensor(95.)
     """
+
+    state_names = ("counts",)
 
     def __init__(self, longest: float) -> None:
         self.longest = longest
@@ -135,7 +137,7 @@ class EpisodeLengths:
         return torch.tensor(min(steps / ends, self.longest) if early else float(self.longest))
 
 
-class NoiseCorrelation:
+class NoiseCorrelation(Resumable):
     """Correlation of the noise of successive batches, measured from their rows.
 
     An episode that spans several batches keeps its layout. So a row with a high cost in one batch
@@ -156,9 +158,11 @@ class NoiseCorrelation:
         (tensor([0.6000]), tensor([4.0000]))
     """
 
+    state_names = ("_rows", "_products")
+
     def __init__(self, *, memory: float, largest: float) -> None:
         self.memory, self.largest = memory, largest
-        self._last, self._products = torch.zeros(0, 1), torch.zeros(2, 1)
+        self._rows, self._products = torch.zeros(0, 1), torch.zeros(2, 1)
 
     @property
     def correlation(self) -> Tensor:
@@ -173,8 +177,8 @@ class NoiseCorrelation:
 
     def update(self, rates: Tensor) -> None:
         """Update the correlation with the mean cost per step of every row of a batch, [N, k]."""
-        last, present = self._last, rates - rates.mean(0)
-        self._last = present
+        last, present = self._rows, rates - rates.mean(0)
+        self._rows = present
         if last.shape != present.shape:
             self._products = torch.stack([torch.zeros_like(rates[0]), present.square().mean(0)])
             return
@@ -182,17 +186,8 @@ class NoiseCorrelation:
         seen = torch.stack([(last * present).mean(0), whole])
         self._products = torch.lerp(seen, self._products, self.memory)
 
-    def state_dict(self) -> dict[str, Tensor]:
-        """Everything the next correlation depends on."""
-        return {"rows": self._last.clone(), "products": self._products.clone()}
 
-    def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
-        """Continue from :meth:`state_dict`."""
-        self._last = state_dict["rows"].to(self._last, copy=True)
-        self._products = state_dict["products"].to(self._products, copy=True)
-
-
-class EpisodeCosts:
+class EpisodeCosts(Resumable):
     """Estimator of J_c, of the mean episode length T̄ and of the size of one cost, over a run.
 
     Args:
@@ -214,6 +209,8 @@ class EpisodeCosts:
         tensor([20.])
     """
 
+    state_names = ("_mean", "_error", "_sums", "_scatter", "lengths", "noise")
+
     def __init__(
         self,
         num_costs: int,
@@ -227,12 +224,9 @@ class EpisodeCosts:
         self.drift, self.memory, self.smallest = drift, memory, smallest
         self.lengths = EpisodeLengths(max_length)
         self.noise = NoiseCorrelation(memory=memory, largest=largest_correlation)
-        self._state = {
-            "mean": torch.full((num_costs,), torch.nan),
-            "error": torch.full((num_costs,), torch.nan),
-            "sums": torch.zeros(2, num_costs, dtype=torch.float64),
-            "scatter": torch.zeros(2, num_costs),
-        }
+        self._mean, self._error = torch.full((2, num_costs), torch.nan)
+        self._sums = torch.zeros(2, num_costs, dtype=torch.float64)
+        self._scatter = torch.zeros(2, num_costs)
 
     @property
     def length(self) -> Tensor:
@@ -242,13 +236,13 @@ class EpisodeCosts:
     @property
     def unit(self) -> Tensor:
         """Σ c² / Σ c over all steps so far, [k]: 1 for indicators, and 1 before any cost."""
-        first, second = self._state["sums"]
+        first, second = self._sums
         return torch.where(first > 0, second / first, 1.0).float()
 
     @property
     def estimate(self) -> CostEstimate:
         """The last estimate; NaN before the first batch."""
-        return CostEstimate(self._state["mean"], self._state["error"])
+        return CostEstimate(self._mean, self._error)
 
     def update(
         self, costs: Tensor, lengths: Tensor, charges: Charges | None = None
@@ -260,8 +254,8 @@ class EpisodeCosts:
             lengths: Steps of every episode that finished in it, [E].
             charges: Values to estimate instead of the mean cost; `unit` is still that of the costs.
         """
-        costs = costs.to(self._state["sums"])
-        self._state["sums"] += torch.stack([costs.sum((0, 1)), costs.square().sum((0, 1))])
+        costs = costs.to(self._sums)
+        self._sums += torch.stack([costs.sum((0, 1)), costs.square().sum((0, 1))])
         self.lengths.update(costs.shape[0] * costs.shape[1], lengths)
         charged = costs if charges is None else charges.costs.to(costs)
         self.noise.update(charged.mean(1).float())
@@ -274,7 +268,7 @@ class EpisodeCosts:
             size = self._size(self.estimate.mean)
             expected = batch._replace(error=self._expected_error(batch, size))
             batch = shrink(self.estimate, expected, self.drift * size)
-        self._state["mean"], self._state["error"] = batch
+        self._mean, self._error = batch
         return batch
 
     def _size(self, mean: Tensor) -> Tensor:
@@ -290,20 +284,7 @@ class EpisodeCosts:
         counts, by a factor φ that is estimated.
         """
         seen = torch.stack([batch.error.square(), self._size(batch.mean)])
-        self._state["scatter"] = torch.lerp(seen, self._state["scatter"], self.memory)
-        squared, sizes = self._state["scatter"]
+        self._scatter = torch.lerp(seen, self._scatter, self.memory)
+        squared, sizes = self._scatter
         error = (squared / sizes * size).sqrt()
         return torch.where(error.isfinite(), error, batch.error)
-
-    def state_dict(self) -> dict[str, Tensor]:
-        """Everything the next estimate depends on."""
-        state = {name: value.clone() for name, value in self._state.items()}
-        return state | self.noise.state_dict() | {"counts": self.lengths.counts.clone()}
-
-    def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
-        """Continue from :meth:`state_dict`."""
-        for name, value in self._state.items():
-            # a copy, because sums are added to in place
-            self._state[name] = state_dict[name].to(value, copy=True)
-        self.lengths.counts = state_dict["counts"].to(self.lengths.counts)
-        self.noise.load_state_dict(state_dict)

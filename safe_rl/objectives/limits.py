@@ -15,8 +15,7 @@ Four decisions lead from the costs of a batch to the violation that an update se
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, NamedTuple
 
 import torch
 from torch import Tensor
@@ -24,6 +23,7 @@ from torch import Tensor
 from safe_rl.objectives.episode_costs import CostEstimate, EpisodeCosts
 from safe_rl.objectives.risk import Charges
 from safe_rl.ranges import Checked, Count, Fraction, NotNegative, Positive, Range, Share, Weight
+from safe_rl.resumable import Resumable
 
 
 class LimitState(NamedTuple):
@@ -73,7 +73,7 @@ def descend(start: Tensor, goal: Tensor, share: float) -> Tensor:
     return goal + (start - goal).clamp_min(0) * (1 - min(max(share, 0.0), 1.0))
 
 
-class PredictedChange:
+class PredictedChange(Resumable):
     """Share of predicted changes of J_c that was observed, by a regression through the origin.
 
     The observed change of one update is mostly noise, but Σ predicted · observed / Σ predicted²
@@ -94,48 +94,38 @@ class PredictedChange:
         tensor([0.5013])
     """
 
+    state_names = ("_predicted", "_cost", "_products")
+
     def __init__(self, num_costs: int, *, memory: float, lowest: float) -> None:
         self.memory, self.lowest = memory, lowest
-        self._state = {
-            "predicted": torch.full((num_costs,), torch.nan),
-            "cost": torch.full((num_costs,), torch.nan),
-            "products": torch.zeros(2, num_costs),
-        }
+        self._predicted, self._cost = torch.full((2, num_costs), torch.nan)
+        self._products = torch.zeros(2, num_costs)
 
     @property
     def share(self) -> Tensor:
         """The share, [k], in [lowest, 1]."""
-        realised, predicted = self._state["products"]
+        realised, predicted = self._products
         share = torch.where(predicted > 0, realised / predicted, 1.0)
         return share.clamp(self.lowest, 1.0)
 
     def update(self, cost: Tensor, prior: Tensor) -> None:
         """Compare the change of J_c since the last call with the predicted one; all [k]."""
-        if not self._state["products"].any():
-            self._state["products"] = prior.square().expand(2, -1).clone()
-        predicted = self._state["predicted"]
-        products = predicted * torch.stack([cost - self._state["cost"], predicted])
+        if not self._products.any():
+            self._products = prior.square().expand(2, -1).clone()
+        predicted = self._predicted
+        products = predicted * torch.stack([cost - self._cost, predicted])
         known = products.isfinite().all(0)
-        updated = self.memory * self._state["products"] + products
-        self._state["products"] = torch.where(known, updated, self._state["products"])
-        self._state["cost"] = cost.clone()
-        self._state["predicted"] = torch.full_like(predicted, torch.nan)
+        updated = self.memory * self._products + products
+        self._products = torch.where(known, updated, self._products)
+        self._cost = cost.clone()
+        self._predicted = torch.full_like(predicted, torch.nan)
 
     def record_prediction(self, change: Tensor) -> None:
         """Store the change of J_c that an update's surrogate predicts, [k]."""
-        self._state["predicted"] = change.detach().to(self._state["predicted"])
-
-    def state_dict(self) -> dict[str, Tensor]:
-        """Everything the share depends on."""
-        return {name: value.clone() for name, value in self._state.items()}
-
-    def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
-        """Continue from :meth:`state_dict`."""
-        for name, value in self._state.items():
-            self._state[name] = state_dict[name].to(value)
+        self._predicted = change.detach().to(self._predicted)
 
 
-class LimitTracker(Checked):
+class LimitTracker(Checked, Resumable):
     """Computes violations of a falling limit from the costs of every batch.
 
     Args:
@@ -179,6 +169,10 @@ class LimitTracker(Checked):
         >>> state.cost, state.target  # half of the descent is over
         (tensor([65.]), tensor([45.]))
     """
+
+    state_names = (
+        *("costs", "predictions", "_steps", "_reached", "_noise", "_integrated", "_recovers"),
+    )
 
     def __init__(
         self,
@@ -294,25 +288,3 @@ class LimitTracker(Checked):
             self._recovers, estimate.mean > safe, estimate.mean > self.limits
         )
         return torch.where(self._recovers, torch.minimum(self._reached, safe), self._reached)
-
-    def state_dict(self) -> dict[str, Any]:
-        """Everything the next state depends on."""
-        return {
-            "costs": self.costs.state_dict(),
-            "predictions": self.predictions.state_dict(),
-            "steps": self._steps,
-            "reached": self._reached.clone(),
-            "noise": self._noise.clone(),
-            "integrated": self._integrated.clone(),
-            "recovers": self._recovers.clone(),
-        }
-
-    def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
-        """Continue from :meth:`state_dict`."""
-        self.costs.load_state_dict(state_dict["costs"])
-        self.predictions.load_state_dict(state_dict["predictions"])
-        self._steps = int(state_dict["steps"])
-        self._reached = state_dict["reached"].to(self._reached)
-        self._noise = state_dict["noise"].to(self._noise)
-        self._integrated = state_dict["integrated"].to(self._integrated)
-        self._recovers = state_dict["recovers"].to(self._recovers)

@@ -16,7 +16,7 @@ from tensordict import NestedKey
 from torch import Tensor, nn
 from torch.nn.functional import softplus
 
-from safe_rl.ranges import Checked, NotNegative, Positive, Range, Weight
+from safe_rl.ranges import Checked, Positive, Range
 
 CostLimits = Mapping[NestedKey, float] | Sequence[float] | float
 AboveZero = Annotated[float, Range(0, 1e6, above=True)]
@@ -151,10 +151,8 @@ class LagrangeMultiplier(Multiplier):
 
     Args:
         cost_limits: Mapping from cost key to limit d, or limits alone; see `parse_cost_limits`.
-        init: First λ, for all costs or one per cost.
+        init: First λ, for all costs or one per cost; above 0, which a softplus never reaches.
         lr: Step size of Adam.
-        betas: Decay rates of Adam's moments.
-        eps: Adam's ε, added to denominators.
 
     Examples:
         >>> multiplier = LagrangeMultiplier({"cost": 25.0}, init=1.0, lr=0.05)
@@ -174,17 +172,10 @@ class LagrangeMultiplier(Multiplier):
         *,
         init: AboveZero | Sequence[AboveZero],
         lr: Positive,
-        betas: tuple[Weight, Weight] = (0.9, 0.999),
-        eps: NotNegative = 1e-8,
     ) -> None:
         super().__init__(cost_limits)
         initial = per_cost("init", init, self.num_costs)
-        if not (initial > 0).all():
-            raise ValueError(
-                f"init must be positive, got {init}: a softplus never reaches 0; "
-                "use a small number such as 1e-3."
-            )
-        self.lr, self.betas, self.eps = lr, betas, eps
+        self.lr = lr
         # softplus⁻¹(λ) = log(exp(λ) − 1), in the form that does not overflow.
         self.register_buffer("nu", initial + torch.log(-torch.expm1(-initial)))
         for name in ("step", "exp_avg", "exp_avg_sq"):
@@ -196,12 +187,12 @@ class LagrangeMultiplier(Multiplier):
         return softplus(self.nu).detach()
 
     def _step(self, violation: Tensor) -> dict[str, Tensor]:
-        beta1, beta2 = self.betas
+        beta1, beta2 = 0.9, 0.999
         grad = -violation
         step = self.step + 1
         exp_avg = torch.lerp(grad, self.exp_avg, beta1)
         exp_avg_sq = torch.lerp(grad.square(), self.exp_avg_sq, beta2)
-        denominator = (exp_avg_sq / (1 - beta2**step)).sqrt() + self.eps
+        denominator = (exp_avg_sq / (1 - beta2**step)).sqrt() + 1e-8
         nu = self.nu - self.lr * exp_avg / (1 - beta1**step) / denominator
         return {"nu": nu, "step": step, "exp_avg": exp_avg, "exp_avg_sq": exp_avg_sq}
 
@@ -218,9 +209,6 @@ class ProjectedMultiplier(Multiplier):
         init: First λ, at most `highest`, for all costs or one per cost.
         lr: Step size α, change of λ per cost of size u in an episode.
         highest: Upper bound λ_max; None for none.
-
-    Raises:
-        ValueError: If an initial λ is outside the bounds.
 
     Examples:
         >>> multiplier = ProjectedMultiplier({"cost": 25.0}, init=0.0, lr=0.01, highest=2.0)
@@ -244,12 +232,9 @@ class ProjectedMultiplier(Multiplier):
     ) -> None:
         super().__init__(cost_limits)
         self.lr, self.highest = lr, highest
-        initial = per_cost("init", init, self.num_costs)
-        if not torch.equal(initial.clamp(0, highest), initial):
-            raise ValueError(f"init must be between 0 and highest={highest}, got {init}.")
-        self.register_buffer("penalty", initial)
+        self.register_buffer("penalty", per_cost("init", init, self.num_costs))
         # set before every update: checkpoints need not hold it
-        self.register_buffer("unit", torch.ones_like(initial), persistent=False)
+        self.register_buffer("unit", torch.ones_like(self.limits), persistent=False)
 
     def set_unit(self, unit: Tensor) -> None:
         """Set u, [k] > 0."""

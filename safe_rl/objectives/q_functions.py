@@ -71,11 +71,9 @@ class ReplayLoss(Checked, LossModule):
     """Contract of losses on steps from a replay buffer, for the off-policy recipe and its update.
 
     Attributes:
-        learns_values: Whether it learns Q functions, so that n-step sums and priorities are of use.
         risk_measure: Kind of risk measure that its cost critics estimate, or None for means only.
     """
 
-    learns_values: ClassVar[bool] = True
     risk_measure: ClassVar[type | None] = None
 
     @property

@@ -12,13 +12,13 @@ what it had cost when the batch began, and batches need not hold whole episodes.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, NamedTuple
 
 import torch
 from torch import Tensor
 
 from safe_rl.ranges import Checked, Fraction, Range, Weight
+from safe_rl.resumable import Resumable
 
 
 class Charges(NamedTuple):
@@ -35,8 +35,10 @@ class Charges(NamedTuple):
     limit: Tensor
 
 
-class RiskMeasure(Checked, ABC):
+class RiskMeasure(Checked, Resumable, ABC):
     """A measure of episode costs that is limited instead of their mean.
+
+    One that depends on more than the batch names this in ``state_names``.
 
     Attributes:
         limits: d, [k].
@@ -59,13 +61,6 @@ class RiskMeasure(Checked, ABC):
             before: Cost of the open episodes before the first step, [N, k].
             finished: Costs of the episodes that finished, [E, k].
         """
-
-    def state_dict(self) -> dict[str, Any]:
-        """Everything the next charges depend on, if not on the batch alone."""
-        return {}
-
-    def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
-        """Continue from :meth:`state_dict`."""
 
 
 def value_at_risk(costs: Tensor, tail: float) -> Tensor:
@@ -123,6 +118,8 @@ class CVaR(RiskMeasure):
         (tensor([0., 6.]), tensor([3.]))
     """
 
+    state_names = ("_finished", "_steps")
+
     def __init__(
         self,
         cost_limits: Tensor,
@@ -158,15 +155,6 @@ class CVaR(RiskMeasure):
         beyond = (cost_so_far(costs, ends, before) - threshold).clamp_min(0)
         tail = torch.minimum(costs, beyond) / self.tail
         return Charges((1 - weight) * costs + weight * tail, weight * threshold, self.limits)
-
-    def state_dict(self) -> dict[str, Any]:
-        """Everything the next charges depend on."""
-        return {"finished": self._finished.clone(), "steps": self._steps}
-
-    def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
-        """Continue from :meth:`state_dict`."""
-        self._finished = state_dict["finished"].to(self._finished)
-        self._steps = int(state_dict["steps"])
 
 
 class Chance(RiskMeasure):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any
 
 import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase, TensorDictParams
@@ -53,9 +53,6 @@ def effective_sample_size(log_weight: Tensor, mask: Tensor | None = None) -> Ten
     return log_size.exp() / (log_weight.numel() if mask is None else mask.sum())
 
 
-Reduction = Literal["mean", "sum"]
-
-
 class SurrogateLoss(Checked, LossModule):
     """Base of the policy losses: subclasses turn log-ratios into surrogates.
 
@@ -69,7 +66,6 @@ class SurrogateLoss(Checked, LossModule):
         actor_network: Policy with `get_dist`, such as a `torchrl.modules.ProbabilisticActor`.
         entropy_coeff: Factor of the entropy bonus; a buffer, so that it can be scheduled, also up
             from 0.
-        reduction: How samples are reduced; the attribute may also be ``"none"``.
     """
 
     @dataclass
@@ -90,6 +86,7 @@ class SurrogateLoss(Checked, LossModule):
     tensor_keys: _AcceptedKeys
     default_keys = _AcceptedKeys
     _schedulable_buffers = frozenset({"entropy_coeff"})
+    reduction = "mean"  # may be set to "sum" or "none"
 
     actor_network: ProbabilisticTensorDictSequential
     actor_network_params: TensorDictParams
@@ -104,12 +101,10 @@ class SurrogateLoss(Checked, LossModule):
         actor_network: ProbabilisticTensorDictSequential,
         *,
         entropy_coeff: NotNegative,
-        reduction: Reduction = "mean",
     ) -> None:
         super().__init__()
         self.convert_to_functional(actor_network, "actor_network")
         self.multiplier: Multiplier | None = None
-        self.reduction = reduction
         self.register_coeff_buffer("entropy_coeff", entropy_coeff, device=self._default_device)
         sampler = sampler_of(actor_network)
         names = [name if isinstance(name, str) else name[-1] for name in sampler.dist_keys]

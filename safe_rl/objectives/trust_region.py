@@ -66,13 +66,7 @@ def mean_kl(
 
 
 def subsample(batch: TensorDictBase, fraction: float) -> TensorDictBase:
-    """A fraction of a flat batch [B], at equal distances: over all episodes, no randomness.
-
-    Raises:
-        ValueError: If `fraction` is not in (0, 1].
-    """
-    if not 0 < fraction <= 1:
-        raise ValueError(f"fisher_subsample must be in (0, 1], got {fraction}.")
+    """A fraction of a flat batch [B], at equal distances: over all episodes, no randomness."""
     if fraction == 1:
         return batch
     # The small number undoes the rounding of 3 / 0.1 = 29.999….
@@ -83,7 +77,7 @@ def subsample(batch: TensorDictBase, fraction: float) -> TensorDictBase:
 
 def conjugate_gradient(
     product: Callable[[Tensor], Tensor], right: Tensor, iterations: int, tolerance: float = 1e-10
-) -> Tensor:
+) -> tuple[Tensor, Tensor]:
     """Solve A x = right for a symmetric positive definite A (Hestenes and Stiefel 1952).
 
     Args:
@@ -93,19 +87,12 @@ def conjugate_gradient(
         tolerance: Squared residual, relative to that of x = 0, at which to stop.
 
     Returns:
-        x, [P].
+        x, [P], possibly not converged; and A x, which costs no further product.
 
     Examples:
         >>> conjugate_gradient(lambda x: 2 * x, torch.tensor([2.0, 4.0]), iterations=10)
-        tensor([1., 2.])
+        (tensor([1., 2.]), tensor([2., 4.]))
     """
-    return solve_with_image(product, right, iterations, tolerance)[0]
-
-
-def solve_with_image(
-    product: Callable[[Tensor], Tensor], right: Tensor, iterations: int, tolerance: float = 1e-10
-) -> tuple[Tensor, Tensor]:
-    """`conjugate_gradient`, and A x of its possibly unconverged solution x at no further cost."""
     solution = torch.zeros_like(right)
     residual, direction = right.clone(), right.clone()
     squared = first = residual @ residual

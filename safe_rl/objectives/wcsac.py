@@ -23,15 +23,10 @@ def gaussian_tail(tail: float) -> float:
     Args:
         tail: α in (0, 1].
 
-    Raises:
-        ValueError: If α is outside its range.
-
     Examples:
         >>> round(gaussian_tail(0.5), 4), gaussian_tail(1.0)
         (0.7979, 0.0)
     """
-    if not 0 < tail <= 1:
-        raise ValueError(f"tail={tail}: the share of the worst returns must lie in (0, 1].")
     standard = NormalDist()
     return 0.0 if tail == 1 else standard.pdf(standard.inv_cdf(tail)) / tail
 
@@ -81,12 +76,7 @@ class WCSACLoss(SACLagrangianLoss):
     risk_measure = CVaR
     """What of episodes may be limited besides the mean, because the critics know it."""
 
-    def __init__(
-        self,
-        *networks: Any,
-        tail: Fraction,
-        **settings: Any,
-    ) -> None:
+    def __init__(self, *networks: Any, tail: Fraction, **settings: Any) -> None:
         self._factor = gaussian_tail(tail)
         super().__init__(*networks, **settings)
         if (number := self.cost_qvalue_network.num_networks) % 2:

@@ -1,28 +1,35 @@
-"""An archive of runs in two files: what every run recorded, and the rows of all their tables.
+"""What runs have recorded, and archives of it.
 
-``runs.json.gz`` has a line per run: its configuration and its notes. ``rows.csv.gz`` has the epochs
-of all runs, with the run in the first column.
+An archive has two files: ``runs.json.gz`` with a line per run, its configuration and its notes, and
+``rows.csv.gz`` with the epochs of all runs, with the run in the first column.
+
+Notes are what a run wrote beside its table: its command, certificate, evaluations and code. Their
+readers raise an error for whatever a note has instead of what it should.
 """
 
 from __future__ import annotations
 
 import gzip
-import io
 import json
+import math
 import os
-import zlib
+import shlex
 from collections import defaultdict
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from safe_rl.extras import import_extra
-from safe_rl.files import read_bounded, replacing
+from safe_rl.files import replacing
+from safe_rl.reporting.tables import clean
+from safe_rl.runs.folder import checkpoint_steps
 
-__all__ = ["ROWS", "RUNS", "Recorded", "read_archive", "without_places", "write_archive"]
+__all__ = [
+    *("ROWS", "RUNS", "Recorded", "command_of", "read_archive", "read_certificate", "read_code"),
+    *("read_evaluation", "select", "without_places", "write_archive"),
+]
 
 RUNS, ROWS = "runs.json.gz", "rows.csv.gz"
-_MOST_BYTES = 300_000_000  # of each file, unpacked; a hundred runs have about ten million
 
 
 class Recorded(NamedTuple):
@@ -67,14 +74,13 @@ def read_archive(folder: Path) -> dict[str, Recorded]:
     """Read the runs of an archive by their names.
 
     Raises:
-        ValueError: If the files are not those of an archive, or larger than any.
-        OSError: If they cannot be read.
+        ValueError: If the files are not those of an archive.
     """
     try:
-        entries = json.loads(_unpack(folder / RUNS))
+        entries = json.loads(gzip.decompress((folder / RUNS).read_bytes()))
         configs = {name: entry.pop("config") for name, entry in entries.items()}
         tables = dict(_tables(folder / ROWS))
-    except (ValueError, LookupError, AttributeError, TypeError, RecursionError) as error:
+    except Exception as error:  # the files may hold anything
         raise ValueError(f"{folder.name} is no archive ({error})") from error
     return {
         name: Recorded(configs[name], tables.get(name, {}), notes)
@@ -85,23 +91,12 @@ def read_archive(folder: Path) -> dict[str, Recorded]:
 def _tables(path: Path) -> Iterator[tuple[str, dict[str, list[float]]]]:
     """Tables by run, each with the columns in which it has a number."""
     types: defaultdict[str, type] = defaultdict(lambda: float, run=str)
-    rows = import_extra("pandas", "report").read_csv(io.BytesIO(_unpack(path)), dtype=types)
+    rows = import_extra("pandas", "report").read_csv(path, dtype=types)
     for name, table in rows.groupby("run", sort=False):
         own = table.drop(columns="run")
         # before its first episode has ended, a run has no number of these
         always = own.columns.isin(["episode_return", "episode_cost"])
         yield name, own.loc[:, always | own.notna().any()].to_dict("list")
-
-
-def _unpack(path: Path) -> bytes:
-    try:
-        with gzip.open(io.BytesIO(read_bounded(path, _MOST_BYTES))) as file:
-            content = file.read(_MOST_BYTES + 1)  # a small file can unpack to any size
-    except (gzip.BadGzipFile, zlib.error, EOFError) as error:
-        raise ValueError(f"{path.name} cannot be read ({error})") from error
-    if len(content) > _MOST_BYTES:
-        raise ValueError(f"{path.name} unpacks to more than {_MOST_BYTES:,} bytes")
-    return content
 
 
 def without_places(notes: Mapping[str, Any]) -> dict[str, Any]:
@@ -117,3 +112,73 @@ def without_places(notes: Mapping[str, Any]) -> dict[str, Any]:
             for e in kept["evaluations"]
         ]
     return kept
+
+
+def command_of(
+    overrides: Sequence[str], notes: Mapping[str, Any], config: Mapping[str, Any]
+) -> str:
+    """The command line, with what it did not say in its overrides."""
+    if isinstance(notes.get("frames_before"), int):  # it was continued for longer
+        kept = [override for override in overrides if not override.startswith("frames=")]
+        overrides = [*kept, f"frames={config['frames']}"]
+    folders = [f"--config-dir={clean(path)}" for path in notes.get("config_dirs", ())]
+    return shlex.join(["python", "train.py", *folders, *overrides])
+
+
+def read_certificate(content: Mapping[str, Any]) -> dict[str, Any]:
+    """A certificate as a record of tables.
+
+    Its ``checkpoint`` is the number of steps, or None where no policy is certified;
+    ``bound_<name>`` and ``most_<name>`` are the bound on a mean, and what it has to keep.
+    """
+    checkpoint, bounds = content["checkpoint"], content["bounds"]
+    return {
+        "checkpoint": None if checkpoint is None else checkpoint_steps(Path(str(checkpoint))),
+        "certified_return": _number(content["episode_return"]),
+        "episodes": int(content["episodes"]),
+        "level": float(content["level"]),
+        **{f"bound_{name}": _number(bound["bound"]) for name, bound in bounds.items()},
+        **{f"most_{name}": _number(bound["most"]) for name, bound in bounds.items()},
+    }
+
+
+def read_evaluation(content: Mapping[str, Any]) -> dict[str, Any]:
+    """An evaluation as a record of tables: every estimate and the ends of its interval."""
+    manner = [str(content["name"])] if content.get("name") else []
+    manner.append("mean actions" if content["deterministic"] else "sampled actions")
+    manner += [f"{key}={value}" for key, value in content["env"].items()]
+    manner.append(f"{content['layouts_trained_on']:.0%} known layouts")
+    record = {
+        "checkpoint": clean(content["checkpoint"]),
+        "steps": content["steps"],
+        "episodes": int(content["episodes"]),
+        "cvar_alpha": float(content["cvar_alpha"]),
+        "manner": clean(", ".join(manner)),
+        **{f"limit_{key}": float(d) for key, d in content["cost_limits"].items()},
+    }
+    for name, estimate in content["estimates"].items():
+        for part, suffix in (("value", ""), ("low", "_low"), ("high", "_high")):
+            record[f"{name}{suffix}"] = _number(estimate[part])
+    return record
+
+
+def read_code(content: Sequence[Mapping[str, Any]]) -> str:
+    """By which code a run was carried out, and from which step on by which other one."""
+    parts = []
+    for entry in content[:9]:
+        words = [clean(entry["version"], 20), clean(entry["commit"] or "")[:10]]
+        words += ["with changes"] if entry["changed"] else []
+        words += [f"from {int(entry['steps']):,} steps on"] if entry["steps"] else []
+        parts.append(" ".join(filter(None, words)))
+    return "; ".join(parts)
+
+
+def _number(value: float | None) -> float:
+    return math.nan if value is None else float(value)
+
+
+def select(node: Any, *keys: str) -> Any:
+    """What lies below keys of nested mappings; None where there is nothing."""
+    for key in keys:
+        node = node.get(key) if isinstance(node, dict) else None
+    return node

@@ -23,8 +23,6 @@ PACKAGED = frozenset(file.stem for file in (CONF / "algo").glob("*.yaml"))
 Settings = Mapping[str, Hashable]
 Known = tuple[tuple[str, Hashable], ...]
 
-# longer names are cut off and numbered
-_MOST_KEYS, _LONGEST_NAME, _LONGEST_VALUE = 12, 240, 60
 # settings that a name has wherever they differ, whether or not a command line has them
 _ALWAYS_NAMED = ("preset", "init_from", "frames", "cost_limits", "risk")
 
@@ -113,12 +111,10 @@ def group_runs(runs: Sequence[Run], suite: Suite) -> tuple[list[Experiment], dic
     environments = _environment_names(runs, suite)
     names = _settings_of_names(runs, environments)
     titles = {run.directory: clean(title_of(run.algorithm), 80) for run in runs}
-    differing = {place: {**own, "algo": titles[place]} for place, (_, own) in names.items()}
-    long = {place: title + _in_brackets(names[place][0]) for place, title in titles.items()}
-    algorithms = _numbered(long, differing, environments)
     cells: dict[tuple[str, str], list[Run]] = defaultdict(list)
     for run in runs:
-        cells[environments[run.directory], algorithms[run.directory]].append(run)
+        algorithm = titles[run.directory] + _in_brackets(names[run.directory][0])
+        cells[environments[run.directory], algorithm].append(run)
     skipped: dict[Path, str] = {}
     experiments = []
     for own, members in cells.items():
@@ -149,20 +145,19 @@ def _order(experiment: Experiment) -> tuple[Hashable, ...]:
 def _environment_names(runs: Sequence[Run], suite: Suite) -> dict[Path, str]:
     """Folder -> name of the environment, with the keys that differ from the suite's, or first's."""
     firsts: dict[str, Settings] = {}
-    titles, keys = {}, {}
+    titles = {}
     for run in runs:
         node = run.config["env"]
         name = str(node.get("name", "environment"))
-        shown = settings = flatten(node)
         changes = suite.changes(node)
         if changes is None:
+            settings = flatten(node)
             first = firsts.setdefault(name, settings)
             shown = {k: v for k, v in settings.items() if k not in first or v != first[k]}
         else:
-            shown = settings = flatten(changes)
-        keys[run.directory] = settings
+            shown = flatten(changes)
         titles[run.directory] = clean(name, 80) + _in_brackets(shown)
-    return _numbered(titles, keys, {})
+    return titles
 
 
 def _settings_of_names(
@@ -265,35 +260,17 @@ def _follows(key: str, cell: Sequence[Settings]) -> bool:
     )
 
 
-def _numbered(
-    titles: Mapping[Path, str], settings: Mapping[Path, Settings], cells: Mapping[Path, str]
-) -> dict[Path, str]:
-    """Titles of bounded length; within a cell they are alike only where settings are."""
-    taken: dict[tuple[str | None, str], list[Settings]] = defaultdict(list)
-    names = {}
-    for place, title in titles.items():
-        short = clean(title, _LONGEST_NAME)
-        own = taken[cells.get(place), short]
-        if settings[place] not in own:
-            own.append(settings[place])
-        number = own.index(settings[place]) + 1
-        names[place] = short if number == 1 else f"{short} #{number}"
-    return names
-
-
 def _in_brackets(settings: Settings) -> str:
     """Settings as on the command line, ``" (1M steps, cost ≤ 10)"``, or nothing."""
     texts = []
     for key, value in settings.items():
         if key.endswith("._target_"):
             key, value = key.removesuffix("._target_"), str(value).rpartition(".")[2]
-        shown = clean(as_override(value), _LONGEST_VALUE)
+        shown = clean(as_override(value))
         if key == "frames" and isinstance(value, int | float):
             texts.append(f"{short_number(value)} steps")
         elif key.startswith("cost_limits."):
             texts.append(f"{clean(key.removeprefix('cost_limits.'))} ≤ {shown}")
         else:
             texts.append(f"{clean(key)}={shown}")
-    if len(texts) > _MOST_KEYS:
-        texts[_MOST_KEYS:] = ["…"]
     return f" ({', '.join(texts)})" if texts else ""

@@ -9,6 +9,7 @@ from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from importlib.resources import files
+from itertools import count
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -16,7 +17,7 @@ import yaml
 from matplotlib.figure import Figure
 
 from safe_rl.extras import import_extra
-from safe_rl.files import check_no_links, replace_text
+from safe_rl.files import replace_text
 from safe_rl.reporting import figures, inventory
 from safe_rl.reporting.curves import draw_learning_curves, draw_small_multiples, drawn_keys
 from safe_rl.reporting.experiments import Experiment, group_runs
@@ -195,7 +196,6 @@ def write_report(report: Report, out: Path, title: str, formats: Sequence[str] =
     """
     jinja2 = import_extra("jinja2", "report")
     out.mkdir(parents=True, exist_ok=True)
-    check_no_links(out)
     place = _places(out)
     tables = [b for s in report.sections for b in s.blocks if isinstance(b, Table)]
     replace_text(out / "tables.tex", "\n".join(table.latex() for table in tables))
@@ -218,14 +218,13 @@ def write_report(report: Report, out: Path, title: str, formats: Sequence[str] =
 
 
 def _places(out: Path) -> Callable[[str], Path]:
-    """Names of files that no other has, also where case is not told apart."""
+    """Names of files without a suffix, each of which it gives out once."""
     taken: set[str] = set()
 
     def place(name: str) -> Path:
-        stem, suffix = re.sub(r"\W+", "_", name.rpartition(".")[0])[:100], Path(name).suffix
-        numbered = (f"{stem}{number or ''}{suffix}" for number in range(len(taken) + 1))
-        free = next(name for name in numbered if name.lower() not in taken)
-        taken.add(free.lower())
+        stem = re.sub(r"\W+", "_", name).strip("_")[:100]
+        free = next(n for i in count() if (n := f"{stem}{i or ''}") not in taken)
+        taken.add(free)
         return out / free
 
     return place
@@ -236,12 +235,13 @@ def _written(block: Block, place: Callable[[str], Path], formats: Sequence[str])
     if isinstance(block, str):
         return {"kind": "text", "title": "", "text": block}
     if isinstance(block, Table):
-        block.write_csv(place(f"{block.name}.csv"))
+        block.write_csv(place(block.name).with_suffix(".csv"))
         return {"kind": "table", "title": block.title, "table": block}
-    path = figures.save(block.figure, place(f"{block.name}.png"))
-    for form in {*formats} - {"png"}:
+    path = place(block.name)
+    for form in {*formats, "png"}:
         figures.save(block.figure, path.with_suffix(f".{form}"))
-    data = base64.b64encode(path.read_bytes()).decode()  # so that the page needs no other file
+    # so that the page needs no other file
+    data = base64.b64encode(path.with_suffix(".png").read_bytes()).decode()
     return {"kind": "picture", "title": block.title, "says": block.shows, "data": data}
 
 

@@ -1,12 +1,8 @@
-"""Runs as their folders and archives record them; what cannot be read is left out with a reason.
-
-Nothing is read that a link names outside of the folder, and nothing that a file says is followed.
-"""
+"""Runs as their folders and archives record them; what cannot be read is left out with a reason."""
 
 from __future__ import annotations
 
 import math
-import os
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -17,8 +13,8 @@ import numpy as np
 
 from safe_rl.files import read_config, read_json, read_yaml
 from safe_rl.reporting import archive as archives
-from safe_rl.reporting.archive import Recorded
-from safe_rl.reporting.notes import (
+from safe_rl.reporting.archive import (
+    Recorded,
     command_of,
     read_certificate,
     read_code,
@@ -146,15 +142,13 @@ def find_runs(root: Path, *, unfinished: bool = False) -> tuple[list[Run], dict[
     skipped: dict[Path, str] = {}
     for archive in paths_below(root, archives.RUNS):
         with _noted(archive, skipped):
-            for path in (archive, archive.with_name(archives.ROWS)):
-                _own(path, root)
             for name, recorded in archives.read_archive(archive.parent).items():
                 directory = archive.parent / name
                 with _noted(directory, skipped):
                     runs.append(_run(directory, recorded, unfinished))
     for folder in runs_below(root):
         with _noted(folder.directory, skipped):
-            runs.append(_run(folder.directory, _recorded(folder, root, skipped), unfinished))
+            runs.append(_run(folder.directory, _recorded(folder, skipped), unfinished))
     if not runs:
         reasons = "".join(f"\n  {clean(path)}: {reason}" for path, reason in skipped.items())
         raise FileNotFoundError(
@@ -193,31 +187,22 @@ def _noted(path: Path, skipped: dict[Path, str]) -> Iterator[None]:
         skipped[path] = clean(f"{path.name} is not as a run writes it ({error!r})")
 
 
-def _own(path: Path, root: Path) -> Path:
-    """A file, which no link may lead out of the folder of all runs."""
-    if not path.resolve().is_relative_to(root.resolve()):
-        raise ValueError(f"{path.name} is a link to outside of the folder")
-    if not path.is_file():
-        raise ValueError(f"{path.name} is no file")
-    return path
-
-
-def _recorded(folder: RunFolder, root: Path, skipped: dict[Path, str]) -> Recorded:
+def _recorded(folder: RunFolder, skipped: dict[Path, str]) -> Recorded:
     """What a run's folder holds; notes that cannot be read are left out."""
 
     def read(path: Path, check: Callable[[Any], object] = bool) -> Any:
         """What a file holds that passes a check; None of any other."""
         with _noted(path, skipped):
-            if os.path.lexists(path):
-                content = (read_json if path.suffix == ".json" else read_yaml)(_own(path, root))
+            if path.exists():
+                content = (read_json if path.suffix == ".json" else read_yaml)(path)
                 check(content)
                 return content
         return None
 
-    config = read_config(_own(folder.config, root))
+    config = read_config(folder.config)
     if not folder.table.exists():
         raise ValueError("it has not begun: no progress.csv")
-    table = read_table(_own(folder.table, root))
+    table = read_table(folder.table)
     runtime = select(read(folder.surroundings), "hydra", "runtime")
     before = select(read(folder.composed), "frames")
     notes = {

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import re
 from collections.abc import Callable, Hashable, Mapping, Sequence
 from statistics import mean
 from typing import Any
@@ -99,7 +98,7 @@ def final_table(experiments: Sequence[Experiment]) -> Table:
         title = f"later work, {short_number(REIMPLEMENTATION_STEPS)} steps"
         columns[title] = "{later_return:g} / {later_cost:g}"
     marks = _final_marks(records)
-    return Table(_stem("final", environment), environment, columns, records, "", rows, marks)
+    return Table(f"final_{environment}", environment, columns, records, "", rows, marks)
 
 
 def _final_marks(records: Sequence[Record]) -> dict[str, Callable[[Record], str]]:
@@ -119,10 +118,6 @@ def _final_marks(records: Sequence[Record]) -> dict[str, Callable[[Record], str]
         "$J_c$": lambda row: "" if "measure" in row else over(row),
         "limited measure": lambda row: over(row) if "measure" in row else "",
     }
-
-
-def _stem(kind: str, environment: str) -> str:
-    return f"{kind}_{re.sub(r'[^A-Za-z0-9]+', '_', environment).strip('_')[:80]}"
 
 
 def _rivals(record: Record) -> Hashable:
@@ -158,7 +153,7 @@ def learning_table(experiments: Sequence[Experiment]) -> Table | None:
     }
     fields = {"regret": "regret_{}", "regret_std": "regret_{}_std"}
     rows = each_cost(records, keys, **fields, over="share_over_{}", streak="streak_{}")
-    return Table(_stem("learning", environment), environment, columns, records, "", rows)
+    return Table(f"learning_{environment}", environment, columns, records, "", rows)
 
 
 def _learning_figures(run: Run) -> dict[str, float]:

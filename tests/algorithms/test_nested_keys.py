@@ -7,12 +7,12 @@ import pytest
 import torch
 from point_mass import PointMass
 from run_configs import point_mass_config
+from samples import make_actor, make_critic
 from tensordict import NestedKey, TensorDict
 
 from safe_rl.algorithms import MinibatchUpdate, OnPolicy
 from safe_rl.algorithms.constraints import Constraints, TrackedConstraints
 from safe_rl.collectors import EpisodeAccounting
-from safe_rl.models import make_actor, make_critic
 from safe_rl.objectives import (
     CostGAE,
     CriticLoss,
@@ -30,7 +30,7 @@ TRACKER = {
     "lowest_trust": 0.1, "integral": 0.0, "largest_integral": 0.5,
 }  # fmt: skip
 WRITTEN = {
-    "actor": {"action_key": "action", "log_prob_key": "action_log_prob"},
+    "actor": {"action": "action", "log_prob": "action_log_prob"},
     "critic": {"out_key": "state_value"},
     "cost_critic": {"out_key": "cost_value"},
     "advantage": {"advantage": "advantage", "value_target": "value_target", "value": "state_value",
@@ -54,10 +54,9 @@ def make_algorithm(below, constraints_of):
         return {name: at(key) for name, key in WRITTEN[part].items()}
 
     torch.manual_seed(0)
-    sizes = {"hidden_sizes": [8], "in_key": at("observation")}
-    actor = make_actor(3, 2, initial_log_std=-0.5, **sizes, **keys("actor"))
-    critic = make_critic(3, **sizes, **keys("critic"))
-    cost_critic = make_critic(3, **sizes, **keys("cost_critic"))
+    actor = make_actor(at("observation"), **keys("actor"))
+    critic = make_critic(in_key=at("observation"), **keys("critic"))
+    cost_critic = make_critic(in_key=at("observation"), **keys("cost_critic"))
     constraints = constraints_of(at)
     advantage = VectorGAE(critic, **SETTINGS)
     cost_advantage = CostGAE([at("cost")], cost_critic, **SETTINGS)

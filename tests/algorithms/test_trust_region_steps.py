@@ -196,7 +196,7 @@ def test_unconverged_cpo_steps_meet_the_linear_constraints_and_the_radius(violat
     violations = torch.tensor([violation, -1.0])
     fisher = FisherProduct(actor, batch, parameters, SETTINGS["damping"])
     solution = torch.linalg.solve(matrix, g)
-    residual = matrix @ conjugate_gradient(fisher, g.float(), 3).double() - g
+    residual = matrix @ conjugate_gradient(fisher, g.float(), 3)[0].double() - g
     assert residual.norm() > 0.02 * g.norm()
     x, metrics = whole_step(step, batch, violations, LENGTH)
     x = x.double()
@@ -272,12 +272,6 @@ def test_errors_say_what_to_change():
         step(batch)
     with pytest.raises(ValueError, match="one per cost surrogate"):
         step(batch, torch.zeros(2), LENGTH)
-    with pytest.raises(ValueError, match=r"fisher_subsample=2\.0: it must be"):
-        cpo_step(actor, fisher_subsample=2.0)
-    with pytest.raises(ValueError, match=r"largest_demand=0\.0: it must be"):
-        cpo_step(actor, largest_demand=0.0)
-    with pytest.raises(TypeError, match="use PPOLoss or TRPOLoss"):
-        TRPOLagrangianLoss(actor, None, entropy_coeff=0.0)
 
 
 @pytest.mark.parametrize("entry", ["advantage", "cost_advantage", "observation", "action"])

@@ -24,7 +24,7 @@ LIVE = {
     *("self", "loss", "actor_network", "multiplier", "value_network", "cost_keys", "cost_limits"),
     *("constraints", "max_length", "qvalue_network", "cost_qvalue_network", "action_spec"),
     *("in_keys", "reward_keys", "observation_size", "low", "high", "hidden_sizes", "input_scale"),
-    *("in_key", "action_key", "reward_gamma", "steps_per_decision"),
+    *("reward_gamma", "steps_per_decision"),
     *("env", "make_env", "policy", "frames_per_batch", "device", "log_dir", "kwargs"),
 }
 MAPPINGS = ("cost_limits", "default_cost_limits", "model.input_scale", "policy_update.rates")

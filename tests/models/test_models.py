@@ -99,7 +99,7 @@ def test_behaviour_policy_follows_the_actors_parameters_and_the_exploration_type
 def test_behaviour_policy_refuses_other_distributions():
     network = TensorDictModule(nn.Linear(5, 4), in_keys=["observation"], out_keys=["loc", "scale"])
     squashed = ProbabilisticActor(network, in_keys=["loc", "scale"], distribution_class=TanhNormal)
-    with pytest.raises(TypeError, match="TanhNormal"):
+    with pytest.raises(TypeError, match="hand another actor"):
         BehaviourPolicy(squashed)
 
 
@@ -193,5 +193,3 @@ def test_input_scale_is_fixed_saved_and_applied():
 
 def test_input_scale_without_observed_components_is_none():
     assert input_scale_vector({"gyro": 0.5}, {"lidar": slice(0, 3)}) is None
-    with pytest.raises(ValueError, match="'gyro' is 0"):
-        input_scale_vector({"gyro": 0.0}, {"gyro": slice(0, 3)})

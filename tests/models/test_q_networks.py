@@ -11,7 +11,6 @@ from safe_rl.models import (
     EnsembleMLP,
     ExploringPolicy,
     QEnsemble,
-    make_actor,
     make_bounded_actor,
     make_squashed_actor,
 )
@@ -102,11 +101,6 @@ def test_it_begins_at_random_but_is_never_evaluated_so():
     torch.testing.assert_close(found.var(0), (HIGH - LOW).square() / 12, rtol=0.05, atol=0)
     with set_exploration_type(ExplorationType.DETERMINISTIC):
         torch.testing.assert_close(explorer(batch)["action"], actor(batch)["action"])
-
-
-def test_actors_of_another_kind_are_refused():
-    with pytest.raises(TypeError, match="TanhNormal, got 2 modules and IndependentNormal"):
-        ExploringPolicy(make_actor(5, 2, hidden_sizes=[8], initial_log_std=0.0), LOW, HIGH)
 
 
 def test_a_squashed_normal_is_torchrls():

@@ -215,12 +215,3 @@ def test_parameters_are_read_where_the_actor_writes_them():
     del batch["pi", "logits"]
     with pytest.raises(KeyError, match="behaviour policy's"):
         loss(batch)
-
-
-def test_an_actor_without_a_sampler_is_refused():
-    with pytest.raises(TypeError, match="ProbabilisticActor"):
-        PPOLoss(
-            TensorDictModule(nn.Linear(3, 2), in_keys=["observation"], out_keys=["action"]),
-            clip_epsilon=0.2,
-            entropy_coeff=0.0,
-        )

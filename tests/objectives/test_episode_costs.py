@@ -178,20 +178,3 @@ def test_the_unit_of_a_cost_is_1_for_indicators_and_grows_with_the_cost():
     assert estimator.unit.tolist() == [1.0, 1.0]
     estimator.update(costs, torch.empty(0))
     assert estimator.unit.tolist() == [1.0, 7.0]
-
-
-def test_a_saved_state_goes_on_as_if_it_had_never_stopped_and_can_be_loaded_twice():
-    generator = torch.Generator().manual_seed(3)
-    *before, last = [renewals(8, 50, generator) for _ in range(6)]
-    estimators = [EpisodeCosts(1, max_length=40, drift=0.1, memory=0.9) for _ in range(3)]
-    whole, *others = estimators
-    for batch in before:
-        whole.update(*batch)
-    state = whole.state_dict()
-    for other in others:
-        other.load_state_dict(state)
-    for estimator in estimators:
-        estimator.update(*last)
-        for name, value in whole.state_dict().items():
-            assert torch.equal(estimator.state_dict()[name], value)
-        assert torch.equal(whole.estimate.mean, estimator.estimate.mean)

@@ -20,7 +20,6 @@ from safe_rl.objectives.trust_region import (
     flat_gradient,
     flatten,
     policy_in,
-    solve_with_image,
     subsample,
     unflatten,
 )
@@ -139,7 +138,7 @@ def test_conjugate_gradient_against_a_direct_solve():
     root = torch.randn(size, size, dtype=torch.float64)
     matrix = root @ root.T + torch.eye(size, dtype=torch.float64)
     right = torch.randn(size, dtype=torch.float64)
-    solution = conjugate_gradient(matrix.__matmul__, right, iterations=60, tolerance=1e-24)
+    solution, _ = conjugate_gradient(matrix.__matmul__, right, iterations=60, tolerance=1e-24)
     torch.testing.assert_close(solution, torch.linalg.solve(matrix, right))
 
 
@@ -150,9 +149,9 @@ def test_conjugate_gradient_stops_and_never_divides_by_zero():
         products.append(vector)
         return 2 * vector
 
-    assert torch.equal(conjugate_gradient(product, torch.zeros(4), 10), torch.zeros(4))
+    assert not conjugate_gradient(product, torch.zeros(4), 10)[0].any()
     assert not products
-    solution = conjugate_gradient(product, torch.ones(4), 10)
+    solution, _ = conjugate_gradient(product, torch.ones(4), 10)
     torch.testing.assert_close(solution, torch.full((4,), 0.5))
     assert len(products) == 1
 
@@ -162,7 +161,7 @@ def test_truncated_solution_is_orthogonal_to_its_residual():
     root = torch.randn(30, 30, dtype=torch.float64)
     matrix = root @ root.T + torch.eye(30, dtype=torch.float64)
     right = torch.randn(30, dtype=torch.float64)
-    x = conjugate_gradient(matrix.__matmul__, right, iterations=5)
+    x, _ = conjugate_gradient(matrix.__matmul__, right, iterations=5)
     assert (matrix @ x - right).norm() > 0.01
     torch.testing.assert_close(x @ matrix @ x, x @ right)
 
@@ -177,7 +176,7 @@ def ill_conditioned_system(size=60, rows=3):
 
 def test_solutions_in_the_span_agree_with_each_other_and_are_better():
     matrix, right = ill_conditioned_system()
-    pairs = [solve_with_image(matrix.__matmul__, row, 5) for row in right]
+    pairs = [conjugate_gradient(matrix.__matmul__, row, 5) for row in right]
     rough, images = (torch.stack(rows) for rows in zip(*pairs, strict=True))
     torch.testing.assert_close(images, rough @ matrix)
     assert (images - right).norm() > 0.2 * right.norm()
@@ -194,7 +193,7 @@ def test_solutions_in_the_span_agree_with_each_other_and_are_better():
 def test_parallel_and_vanishing_right_hand_sides_are_no_trouble():
     matrix, right = ill_conditioned_system()
     right = torch.stack([right[0], -3 * right[0], 0 * right[0]]).float()
-    pairs = [solve_with_image(matrix.float().__matmul__, row, 5) for row in right]
+    pairs = [conjugate_gradient(matrix.float().__matmul__, row, 5) for row in right]
     rough, images = (torch.stack(rows) for rows in zip(*pairs, strict=True))
     torch.testing.assert_close(best_in_span(rough, images, right), rough, rtol=1e-4, atol=1e-5)
 
@@ -241,5 +240,3 @@ def test_subsample_is_spread_over_the_batch():
         assert not len(gaps) or int(gaps.max() - gaps.min()) <= 1
     assert subsample(batch[:5], 0.1)["index"].tolist() == [0]
     assert subsample(batch[:95], 0.1)["index"].tolist() == list(range(0, 95, 10))
-    with pytest.raises(ValueError, match="fisher_subsample"):
-        subsample(batch, 0.0)

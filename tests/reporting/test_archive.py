@@ -9,7 +9,6 @@ import yaml
 from synthetic import write_run
 
 from safe_rl.cli.report import main
-from safe_rl.reporting import archive as archives
 from safe_rl.reporting.archive import ROWS, RUNS, read_archive
 from safe_rl.reporting.recorded import archive_runs, find_runs
 
@@ -132,10 +131,7 @@ def test_an_archive_is_not_among_the_runs(runs, capsys):
         (ROWS, b"no gzip", "gzip"),
         (ROWS, pack(b"run,steps\na,1\n" * 9)[:20], "no archive"),
         (ROWS, pack(b"run,steps\na,many\n"), "many"),
-        (RUNS, b"{}", "gzip"),
-        (RUNS, pack(b"{"), "no archive"),
         (RUNS, pack(b"[" * 200_000), "no archive"),
-        (RUNS, pack(b"[]"), "no archive"),
         (RUNS, pack(b'{"a": {}}'), "no archive"),
     ],
 )
@@ -157,11 +153,3 @@ def test_a_run_of_an_archive_that_cannot_be_read_is_left_out_alone(runs, tmp_pat
     found, skipped = find_runs(kept)
     assert len(found) == 3
     assert "KeyError('checkpoint')" in skipped[kept / "PointGoal1" / "cpo" / "seed0"]
-
-
-def test_a_small_file_that_unpacks_to_any_size_is_refused(runs, tmp_path, monkeypatch):
-    keep(runs, tmp_path / "kept")
-    (tmp_path / "kept" / ROWS).write_bytes(gzip.compress(b"0" * 100_000))
-    monkeypatch.setattr(archives, "_MOST_BYTES", 50_000)
-    with pytest.raises(ValueError, match="unpacks to more than 50,000 bytes"):
-        read_archive(tmp_path / "kept")

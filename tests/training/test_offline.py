@@ -260,12 +260,6 @@ class Wider(PointMass):
         (["+limit=0"], PointMass, "of its 160 transitions 0 are taken in whole"),
         (["memory.capacity=80"], PointMass, "room for them: memory.capacity=80"),
         ([], Wider, "its observations are 4 numbers, those of this environment 5"),
-        (["memory.n_steps=3"], PointMass, "memory.n_steps=3: algo=bc learns no values"),
-        (
-            ["memory.prioritised={alpha: 0.6, beta: 0.4}"],
-            PointMass,
-            "algo=bc learns no values.*Use memory.prioritised=null",
-        ),
     ],
 )
 def test_what_does_not_fit_is_said(overrides, env, words, tmp_path):

@@ -332,16 +332,3 @@ def test_multipliers_move_with_batches_in_which_no_episode_ends(tmp_path):
     assert len(set(table["multiplier_cost"][2:])) == 8
     # limited by the costs of all steps: the rate times the steps of an episode
     assert table["estimate_cost"][0] == pytest.approx(80 * table["cost_rate"][0])
-
-
-@pytest.mark.parametrize(
-    ("override", "message"),
-    [
-        ("+loss._partial_=true", "loss is built at once, without _partial_"),
-        ("advantage._target_=safe_rl.objectives.CostGAE", "that of costs is cost_advantage"),
-    ],
-)
-def test_parts_that_cannot_learn_are_refused_before_the_run(override, message, tmp_path):
-    config = point_mass_config("algo=ppo", override)
-    with pytest.raises(ValueError, match=message):
-        build_trainer(config, PointMass(config.num_envs, 40), tmp_path / "run")

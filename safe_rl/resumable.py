@@ -1,0 +1,72 @@
+"""The state of objects that are no networks: what checkpoints keep of them.
+
+Directly in ``safe_rl/``, because objectives, algorithms and what records a run have such objects.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, ClassVar
+
+import torch
+from torch import Tensor
+
+__all__ = ["Resumable"]
+
+
+class Resumable:
+    """Base of objects whose state is in some of their attributes.
+
+    Attributes:
+        state_names: Names of these attributes: tensors, generators of random numbers, plain values,
+            parts with a ``state_dict``, and dictionaries of all of these.
+
+    Examples:
+        >>> class Counter(Resumable):
+        ...     state_names = ("sums", "steps")
+        ...     def __init__(self):
+        ...         self.sums, self.steps = torch.zeros(1), 0
+        >>> counter = Counter()
+        >>> counter.load_state_dict({"sums": torch.ones(1), "steps": 5})
+        >>> counter.state_dict()
+        {'sums': tensor([1.]), 'steps': 5}
+    """
+
+    state_names: ClassVar[tuple[str, ...]] = ()
+
+    def state_dict(self) -> Mapping[str, Any]:
+        """Everything that an exact continuation needs, by name."""
+        return {name: _saved(getattr(self, name)) for name in self.state_names}
+
+    def load_state_dict(self, state_dict: Mapping[str, Any]) -> Any:
+        """Continue from :meth:`state_dict`."""
+        for name in self.state_names:
+            own = getattr(self, name)
+            value = _restored(own, state_dict[name])
+            if value is not own:
+                setattr(self, name, value)
+
+
+def _saved(value: Any) -> Any:
+    if isinstance(value, Tensor):
+        return value.clone()
+    if isinstance(value, torch.Generator):
+        return value.get_state()
+    if isinstance(value, Mapping):
+        return {name: _saved(part) for name, part in value.items()}
+    return value.state_dict() if hasattr(value, "state_dict") else value
+
+
+def _restored(own: Any, saved: Any) -> Any:
+    """The saved value on the device of the present one; or the present part, which has taken it."""
+    if isinstance(own, Tensor):
+        return saved.to(own, copy=True)
+    if isinstance(own, Mapping):
+        return {name: _restored(part, saved[name]) for name, part in own.items()}
+    if isinstance(own, torch.Generator):
+        own.set_state(saved.cpu())
+    elif hasattr(own, "load_state_dict"):
+        own.load_state_dict(saved)
+    else:
+        return saved
+    return own
