@@ -1,4 +1,4 @@
-"""Bases of losses on Q functions: separate critic and actor losses, ensembles without vmap."""
+"""Base classes of losses on Q functions: separate critic and actor losses, no vmap."""
 
 from __future__ import annotations
 
@@ -18,26 +18,26 @@ from safe_rl.ranges import Checked
 
 @runtime_checkable
 class Ensemble(Protocol):
-    """A network that evaluates several Q functions by itself, such as a `QEnsemble`."""
+    """A network that evaluates several Q functions in one call, such as a `QEnsemble`."""
 
     num_networks: int  # E
     in_keys: Sequence[NestedKey]  # of observation and action
 
     def __call__(self, tensordict: TensorDictBase, params: TensorDictBase) -> TensorDictBase:
-        """Values [E, ...] of steps [...], with these parameters."""
+        """Values [E, ...] of steps [...], with the given parameters."""
         ...
 
     def layers(self, params: TensorDictBase) -> Any:
-        """What `values` takes, from parameters."""
+        """Convert parameters to the argument of `values`."""
         ...
 
     def values(self, observation: Tensor, action: Tensor, layers: Any) -> Tensor:
-        """Values [E, ..., n] without TensorDicts, which take longer than the arithmetic."""
+        """Values [E, ..., n] without TensorDicts, which would take longer than the computation."""
         ...
 
 
 def check_ensemble(network: Any, what: str) -> None:
-    """Refuse a network that does not evaluate several Q functions by itself."""
+    """Refuse a network that is not an ensemble of Q functions."""
     if not isinstance(network, Ensemble):
         raise ValueError(
             f"The {what} has to be a safe_rl.models.QEnsemble, not a {type(network).__name__}."
@@ -51,24 +51,24 @@ Distance = Literal["l2", "smooth_l1", "l1"]
 class InOneCall:
     """Lets TorchRL's losses call an ensemble like a function of `vmap`.
 
-    A class of its own, because a module would become part of the loss, and a function could not be
+    It is a class because a module would become part of the loss, and a function could not be
     pickled or follow a copy of the loss to another device.
 
     Args:
         network: The ensemble.
-        of_copies: Whether steps come as one copy per network, of which the first is used.
+        of_copies: Whether steps come as one copy per network; then the first copy is used.
     """
 
     def __init__(self, network: Ensemble, *, of_copies: bool = False) -> None:
         self.network, self.of_copies = network, of_copies
 
     def __call__(self, steps: TensorDictBase, params: TensorDictBase) -> TensorDictBase:
-        """Values [E, ...] of steps, with parameters that are given."""
+        """Values [E, ...] of steps, with the given parameters."""
         return self.network(steps[0] if self.of_copies else steps, params)
 
 
 class ReplayLoss(Checked, LossModule):
-    """Contract of losses on steps from a replay buffer, for the off-policy recipe and its update.
+    """Interface of losses on steps from a replay buffer, for the off-policy recipe and its update.
 
     Attributes:
         risk_measure: Kind of risk measure that its cost critics estimate, or None for means only.
@@ -82,7 +82,7 @@ class ReplayLoss(Checked, LossModule):
         return "td_error"
 
     def target_pairs(self) -> list[tuple[Tensor, Tensor]]:
-        """Tensors of target networks, each with that of the network that it follows.
+        """Pairs of tensors: of a target network, and of the network that it follows.
 
         TorchRL's losses call those of the network ``x`` ``target_x``.
         """
@@ -95,14 +95,14 @@ class ReplayLoss(Checked, LossModule):
         ]
 
     def critic_losses(self, tensordict: TensorDictBase) -> TensorDict:
-        """Losses of the Q functions alone, for steps that leave the policy as it is."""
+        """Losses of the Q functions alone, for gradient steps that do not change the policy."""
         raise NotImplementedError
 
     def calibrate(self, episodes: KnownCosts) -> None:
         """Update estimates of the costs of episodes, before the updates of a batch."""
 
     def measure(self, rewards: Tensor) -> None:
-        """Update the scale of rewards with those of new steps, [...]."""
+        """Update the scale of rewards with the rewards of new steps, [...]."""
 
     def cost_bias(self, batch: TensorDictBase) -> Tensor | None:
         """Bias of the critics of k costs on new steps [N, T], [k]; None without such critics."""
@@ -134,13 +134,13 @@ class QFunctionLoss(ReplayLoss):
         return self.tensor_keys.priority
 
     def actor_losses(self, tensordict: TensorDictBase) -> TensorDict:
-        """Losses of the policy, and what is reported of it."""
+        """Losses and diagnostics of the policy."""
         raise NotImplementedError
 
     def penalised(
         self, objective: Tensor, tensordict: TensorDictBase, action: Tensor
     ) -> tuple[Tensor, dict[str, Tensor]]:
-        """The actor's objective [...], with the costs of its actions if any, and figures."""
+        """The actor's objective [...], with the costs of its actions if any, and diagnostics."""
         del tensordict, action
         return objective, {}
 
@@ -189,7 +189,7 @@ class QFunctionLoss(ReplayLoss):
         return value
 
     def make_value_estimator(self, value_type: Any = None, **hyperparams: Any) -> LossModule | None:
-        """As TorchRL's; its ``gamma`` holds for the critics of the costs as well."""
+        """As TorchRL's; its ``gamma`` is also used for the cost critics."""
         made = super().make_value_estimator(value_type, **hyperparams)
         if isinstance(value_type, ValueEstimatorBase):
             hyperparams = {"gamma": value_type.gamma.item()}
@@ -202,7 +202,7 @@ class QFunctionLoss(ReplayLoss):
         return moved
 
     def _share_tensors(self) -> None:
-        """Let networks have the loss's own tensors: a copy of both, or a move, separates them."""
+        """Let networks share the loss's tensors again, after a copy or a move."""
         for name in ("actor_network", "qvalue_network", "cost_qvalue_network"):
             if (params := self._modules.get(f"{name}_params")) is not None:
                 params.to_module(self.__dict__[name])

@@ -1,12 +1,13 @@
-"""Limits on more than the mean: the worst episodes (CVaR), and how many may cost too much.
+"""Limits on other measures than the mean: CVaR, and the share of episodes above a limit.
 
-A limit d on the mean cost leaves a third to a half of the episodes above d. A risk measure replaces
-the costs of steps by *charges*, whose sum over an episode has the measure as its mean, up to an
-offset that does not depend on the policy to first order. Everything that holds a limit on a mean
-(critics, advantages, multipliers, steps, the descent of the limit) then holds one on the measure.
+With a limit d on the mean cost, a third to a half of the episodes are above d. A risk measure
+replaces the costs of steps by *charges*. The mean of their sum over an episode is the measure, up
+to an offset that does not depend on the policy to first order. So everything that keeps a limit on
+a mean (critics, advantages, multipliers, steps, the descent of the limit) also keeps a limit on the
+measure.
 
-Charges fall due when the cost of the episode so far passes a threshold, so that they need to know
-what it had cost when the batch began, and batches need not hold whole episodes.
+Steps have charges when the cost of the episode so far passes a threshold. So the measure needs the
+cost of open episodes at the start of the batch, but batches need not have whole episodes.
 """
 
 from __future__ import annotations
@@ -22,12 +23,12 @@ from safe_rl.resumable import Resumable
 
 
 class Charges(NamedTuple):
-    """What stands for the costs of a batch.
+    """The values that replace the costs of a batch.
 
     Attributes:
         costs: Charges of its steps, [N, T, k].
-        offset: What is to be added to the charges of an episode, [k].
-        limit: What the sum is held against, [k].
+        offset: Added to the sum of the charges of an episode, [k].
+        limit: Limit of this total, [k].
     """
 
     costs: Tensor
@@ -48,12 +49,12 @@ class RiskMeasure(Checked, Resumable, ABC):
 
     @property
     def held_limits(self) -> Tensor:
-        """What an episode's charges are held against on average, [k]."""
+        """Limit of the mean charges of an episode, [k]."""
         return self.limits
 
     @abstractmethod
     def __call__(self, costs: Tensor, ends: Tensor, before: Tensor, finished: Tensor) -> Charges:
-        """Charge the steps of a batch.
+        """Compute the charges of a batch.
 
         Args:
             costs: Costs of its steps, [N, T, k], none negative.
@@ -92,19 +93,20 @@ def cost_so_far(costs: Tensor, ends: Tensor, before: Tensor) -> Tensor:
 class CVaR(RiskMeasure):
     """CVaR_α ≤ d: the mean cost of the worst fraction α of the episodes.
 
-    CVaR = ν + E[(C − ν)₊] / α with ν, the value at risk, the cost that a fraction α of the episodes
-    exceeds (Rockafellar and Uryasev 2000, theorem 1). ν minimises the expression, so that how it
-    moves with the policy is of second order, and (C − ν)₊ / α has the gradient (Chow, Ghavamzadeh,
-    Janson and Pavone 2017). A step is charged for what it adds to (C − ν)₊ / α.
+    CVaR = ν + E[(C − ν)₊] / α. ν is the value at risk, the cost that a fraction α of the episodes
+    exceeds (Rockafellar and Uryasev 2000, theorem 1). ν minimises the expression, so its change
+    with the policy has an effect of second order only, and (C − ν)₊ / α has the gradient of the
+    CVaR (Chow, Ghavamzadeh, Janson and Pavone 2017). The charge of a step is what it adds to (C −
+    ν)₊ / α.
 
-    Before the tail is ramped in, the mean is limited: with κ from 0 to 1, what is limited is
-    (1 − κ) E[C] + κ CVaR. A CVaR limit needs a d of its own: that of a policy with a mean of 25 is
-    about 60 at α = 0.1 on PointGoal1.
+    At first the mean is limited. The limited measure is (1 − κ) E[C] + κ CVaR, where κ rises from 0
+    to 1. A limit on the CVaR must be higher than one on the mean: on PointGoal1 a policy with a
+    mean of 25 has a CVaR of about 60 at α = 0.1.
 
     Args:
         cost_limits: d, [k].
         tail: Share α of the worst episodes.
-        window: Episodes of the past from which ν, the value at risk, is taken.
+        window: Number of past episodes from which ν, the value at risk, is estimated.
         ramp_start: Environment steps before which κ = 0: the mean is limited.
         ramp_steps: Environment steps in which κ then goes to 1.
         steps_per_decision: Environment steps per row of time of a batch.
@@ -139,7 +141,7 @@ class CVaR(RiskMeasure):
 
     @property
     def weight(self) -> float:
-        """κ of the tail in [0, 1]; the mean has the rest."""
+        """κ, the weight of the CVaR, in [0, 1]; the mean has the rest."""
         if not len(self._finished):
             return 0.0
         return min(1.0, max(0.0, (self._steps - self.ramp_start) / max(1, self.ramp_steps)))
@@ -160,9 +162,9 @@ class CVaR(RiskMeasure):
 class Chance(RiskMeasure):
     """P(C > d) ≤ ε: at most a fraction ε of the episodes costs more than d.
 
-    The step with which an episode's cost passes d is charged w = max(d, 1) and no other, so that an
-    episode's charges are w 1{C > d}; their mean is held against w ε. The weight gives λ the size
-    that it has for limits on means.
+    The step at which an episode's cost passes d has the charge w = max(d, 1), all other steps 0. So
+    the charges of an episode are w 1{C > d}, and the limit of their mean is w ε. With the weight w,
+    λ has the same size as for limits on means.
 
     Args:
         cost_limits: d, [k].
@@ -182,7 +184,7 @@ class Chance(RiskMeasure):
 
     @property
     def held_limits(self) -> Tensor:
-        """What an episode's charges are held against on average, w ε, [k]."""
+        """Limit of the mean charges of an episode, w ε, [k]."""
         return self.weight * self.most_over
 
     def __call__(self, costs: Tensor, ends: Tensor, before: Tensor, finished: Tensor) -> Charges:

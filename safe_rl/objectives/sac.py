@@ -30,16 +30,16 @@ from safe_rl.ranges import Number, Range, Share
 
 
 class SACLoss(QFunctionLoss, objectives.SACLoss):
-    """TorchRL's loss in two halves, with an ensemble of Q functions that needs no vmap.
+    """TorchRL's SAC loss, split into critic and actor losses, for ensembles that need no vmap.
 
     Args:
         actor_network: Policy with ``get_dist``.
         qvalue_network: A `safe_rl.models.QEnsemble`.
         gamma: Discount per step, of reward and costs.
-        alpha_init: First temperature α, the weight of the entropy.
+        alpha_init: Initial entropy coefficient (temperature) α.
         target_entropy: Entropy of the policy, to which α is adapted; ``"auto"`` is minus the number
             of actions.
-        fixed_alpha: Whether α stays as it is.
+        fixed_alpha: Whether α is constant.
         loss_function: Loss of the TD errors.
         action_spec: Spec of one action [A]; needed for ``target_entropy="auto"``.
 
@@ -116,7 +116,7 @@ class SACLoss(QFunctionLoss, objectives.SACLoss):
             return (reward + discount * goes_on * soft).squeeze(-1)
 
     def _act(self, steps: TensorDictBase) -> tuple[Tensor, Tensor]:
-        """Actions of the present policy, through which gradients pass, and log π."""
+        """Actions of the current policy, with gradients, and log π."""
         with set_exploration_type(ExplorationType.RANDOM):
             # of a copy: a policy writes what its distribution is made of
             inputs = steps.select(*self.actor_network.in_keys)
@@ -133,7 +133,7 @@ class SACLoss(QFunctionLoss, objectives.SACLoss):
         return scalars(loss_qvalue=self._mean(errors.sum(0), tensordict))
 
     def actor_loss(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
-        """Loss of the policy, with costs where there are critics of them."""
+        """Loss of the policy, with costs if there are cost critics."""
         action, log_prob = self._act(tensordict)
         values = self.q_values("qvalue_network", tensordict, action, "frozen")
         objective = self._alpha * log_prob - values.min(0).values.squeeze(-1)
@@ -141,7 +141,7 @@ class SACLoss(QFunctionLoss, objectives.SACLoss):
         return self._mean(objective, tensordict), {"log_prob": log_prob.detach(), **reported}
 
     def actor_losses(self, tensordict: TensorDictBase) -> TensorDict:
-        """Losses of the policy and of the temperature, and what both come from."""
+        """Losses of the policy and of α, and diagnostics."""
         loss, metadata = self.actor_loss(tensordict)
         log_prob = metadata.pop("log_prob")
         alpha = self._mean(self.alpha_loss(log_prob), tensordict)
@@ -172,7 +172,7 @@ class SACLagrangianLoss(CostCritics, SACLoss):
     """
 
     def critic_losses(self, tensordict: TensorDictBase) -> TensorDict:
-        """Losses of the Q functions of reward and costs, for the same actions that follow."""
+        """Losses of the Q functions of reward and costs, with the same next actions."""
         losses = super().critic_losses(tensordict)
         loss = self.cost_qvalue_loss(tensordict, self._next_action)
         return losses.set("loss_cost_qvalue", loss)

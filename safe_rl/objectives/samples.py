@@ -37,10 +37,10 @@ FIRST = "is_init"
 
 
 def sample_mask(tensordict: TensorDictBase) -> Tensor | None:
-    """Which entries of a batch are samples, as a bool tensor of its shape; None: all of them.
+    """Bool mask of the entries of a batch that are samples, not padding; None: all of them.
 
-    Trajectories of different lengths in one batch are padded. The masks of the collectors
-    (``split_trajs=True``) and of the value estimators, which TorchRL's losses honour, say where.
+    Trajectories of different lengths in one batch are padded. The mask is the one of TorchRL's
+    collectors (``split_trajs=True``) and value estimators, which TorchRL's losses use too.
     """
     masks = [tensordict.get(key, None) for key in AUTO_LOSS_MASK_KEYS]
     present = [mask.reshape(tensordict.batch_size) for mask in masks if mask is not None]
@@ -77,8 +77,8 @@ def require_finite(tensordict: TensorDictBase, keys: Iterable[NestedKey]) -> Non
     """Refuse a batch with NaN or infinite entries.
 
     Args:
-        tensordict: Batch of any shape; padding may hold anything.
-        keys: Entries to check, those of floating point; missing ones are left to the reader.
+        tensordict: Batch of any shape; padding may have any values.
+        keys: Entries to check if they are floating-point numbers; missing ones are ignored.
 
     Raises:
         FloatingPointError: Naming the entry and how many samples are concerned.

@@ -44,7 +44,7 @@ def effective_sample_size(log_weight: Tensor, mask: Tensor | None = None) -> Ten
 
     Args:
         log_weight: Logarithms of the weights, any shape.
-        mask: Which of them count, bool of the same number of elements; None: all.
+        mask: Bool mask of the weights that count, with the same number of elements; None: all.
     """
     log_weight = log_weight.flatten()
     if mask is not None:
@@ -56,16 +56,16 @@ def effective_sample_size(log_weight: Tensor, mask: Tensor | None = None) -> Ten
 class SurrogateLoss(Checked, LossModule):
     """Base of the policy losses: subclasses turn log-ratios into surrogates.
 
-    Reads a batch of any shape, [B] or [N, T], with normalised advantages; masked padding counts for
-    nothing. Writes ``loss_objective`` and ``loss_entropy`` (to minimise), and the detached scalars
-    ``kl`` (mean over states of KL(π_θ ‖ π_k), π_k the policy whose parameters the batch holds),
-    ``entropy`` and ``ESS``. Policies may have any distribution; its divergence and entropy are
-    closed forms where there are any, and are estimated from samples elsewhere.
+    It reads a batch of any shape, [B] or [N, T], with normalised advantages; padding is ignored. It
+    writes ``loss_objective`` and ``loss_entropy`` (to minimise), and the detached scalars ``kl``,
+    ``entropy`` and ``ESS``. ``kl`` is the mean over states of KL(π_θ ‖ π_k), where the batch has
+    the parameters of π_k. Policies may have any distribution. Divergence and entropy are computed
+    in closed form if there is one, else they are estimated from samples.
 
     Args:
         actor_network: Policy with `get_dist`, such as a `torchrl.modules.ProbabilisticActor`.
-        entropy_coeff: Factor of the entropy bonus; a buffer, so that it can be scheduled, also up
-            from 0.
+        entropy_coeff: Factor of the entropy bonus; a buffer, so that it can be scheduled, also from
+            0 up.
     """
 
     @dataclass
@@ -123,15 +123,15 @@ class SurrogateLoss(Checked, LossModule):
     def anchor(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Prepare a batch before the first step of an update, and return it.
 
-        A loss relative to the policy at that moment stores what it needs of it.
+        A loss that is relative to the policy at that moment stores that policy's parameters.
         """
         return tensordict
 
     @property
     def behaviour_keys(self) -> dict[NestedKey, NestedKey]:
-        """Where the batch holds the behaviour policy's parameters, by where the actor writes them.
+        """Key of each parameter of the behaviour policy in the batch, by the actor's key.
 
-        A mean and a standard deviation can be elsewhere: ``set_keys(loc=…, scale=…)``.
+        Mean and standard deviation can have other keys: ``set_keys(loc=…, scale=…)``.
         """
         moved = {"loc": self.tensor_keys.loc, "scale": self.tensor_keys.scale}
         return {key: moved.get(name, key) for name, key in self._parameter_keys.items()}
@@ -147,7 +147,7 @@ class SurrogateLoss(Checked, LossModule):
 
     @dispatch
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Evaluate the loss on a batch, which stays as it is.
+        """Evaluate the loss on a batch, which is not changed.
 
         Raises:
             KeyError: If an entry is missing.
@@ -180,7 +180,7 @@ class SurrogateLoss(Checked, LossModule):
         raise NotImplementedError
 
     def _cost_surrogates(self, tensordict: TensorDictBase, gain: Tensor) -> Tensor:
-        """Means over the samples of cost gains [..., k] for any reduction, [k]."""
+        """Means over the samples of cost surrogates [..., k], for any reduction: [k]."""
         means = [self._reduce_loss(cost, tensordict, reduction="mean") for cost in gain.unbind(-1)]
         return torch.stack(means)
 
@@ -253,7 +253,7 @@ class SurrogateLoss(Checked, LossModule):
         return ratio * self._cost_advantage(tensordict)
 
     def _penalised_advantage(self, tensordict: TensorDictBase, log_weight: Tensor) -> Tensor:
-        """A − Σᵢ λᵢ A_cᵢ, the advantage of the reward less the weighed costs, [..., 1]."""
+        """A − Σᵢ λᵢ A_cᵢ, the advantage of the reward minus the weighted costs, [..., 1]."""
         assert self.multiplier is not None
         advantage = SurrogateLoss._advantage(self, tensordict, log_weight)
         weighed = self._cost_advantage(tensordict) * self.multiplier.value
@@ -261,7 +261,7 @@ class SurrogateLoss(Checked, LossModule):
 
 
 class WeighsCosts(SurrogateLoss):
-    """A base class to put before a policy loss without costs: a multiplier weighs them.
+    """Mixin for a policy loss without costs: adds costs, weighted by a multiplier.
 
     Args:
         actor_network: Policy with `get_dist`; see `SurrogateLoss`.

@@ -1,4 +1,4 @@
-"""Pieces of a trust-region step: flat parameters, divergence, conjugate gradients, line search."""
+"""Functions for trust-region steps: flat parameters, KL, conjugate gradients, line search."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def flat_gradient(
 def policy_in(
     actor_network: ProbabilisticTensorDictSequential, batch: TensorDictBase
 ) -> Distribution:
-    """Distribution of the policy in the states of a batch; one with a memory reads sequences."""
+    """Distribution of the policy in the states of a batch; a recurrent policy reads sequences."""
     with set_recurrent_mode(True):
         return actor_network.get_dist(batch.select(*actor_network.in_keys))
 
@@ -66,7 +66,7 @@ def mean_kl(
 
 
 def subsample(batch: TensorDictBase, fraction: float) -> TensorDictBase:
-    """A fraction of a flat batch [B], at equal distances: over all episodes, no randomness."""
+    """A fraction of a flat batch [B], at equal distances, so without randomness."""
     if fraction == 1:
         return batch
     # The small number undoes the rounding of 3 / 0.1 = 29.999….
@@ -111,9 +111,9 @@ def conjugate_gradient(
 def best_in_span(solutions: Tensor, images: Tensor, right: Tensor) -> Tensor:
     """Solve A x = right for several right-hand sides within the span of approximate solutions.
 
-    The Galerkin solutions, of all combinations of the approximate ones the best in the norm of A.
-    Unlike those of conjugate gradients stopped early, they agree with each other: for any two,
-    xᵢᵀ A xⱼ = rightᵢᵀ xⱼ = rightⱼᵀ xᵢ.
+    These are the Galerkin solutions: of all combinations of the approximate solutions, the best in
+    the norm of A. Solutions of conjugate gradients that were stopped early do not agree with each
+    other, but these do: for any two, xᵢᵀ A xⱼ = rightᵢᵀ xⱼ = rightⱼᵀ xᵢ.
 
     Args:
         solutions: Approximate solutions xᵢ, [m, P]; any of them may depend on others or be 0.
@@ -142,13 +142,13 @@ def backtracking_search(
     coeff: float,
     max_tries: int,
 ) -> float:
-    """Move parameters along a step, shortening it until it is accepted.
+    """Change parameters by a step, which is shortened until it is accepted.
 
     Args:
-        parameters: Moved in place; left at their old values if no step is accepted, or
-            `accept` raises.
+        parameters: Changed in place; they keep their old values if no step is accepted or `accept`
+            raises.
         step: Full step, [P].
-        accept: Called with the parameters moved.
+        accept: Called after the parameters have been changed; whether the step is accepted.
         coeff: Factor in (0, 1) between one try and the next.
         max_tries: Number of tries, the full step included.
 

@@ -13,7 +13,7 @@ class Violations(Protocol):
 
     Attributes:
         violation: Amount by which J_c must fall, undiscounted cost per episode, [k]: J_c − d, or
-            J_c minus its present target with a `safe_rl.objectives.LimitTracker`.
+            J_c minus its current target with a `safe_rl.objectives.LimitTracker`.
         episode_length: T̄, mean number of steps of an episode, scalar.
     """
 
@@ -36,8 +36,7 @@ class KnownCosts(Violations, Protocol):
 def matched_violation(violation: Tensor | None, surrogates: Tensor) -> Tensor:
     """J_c − d in the type and on the device of the cost surrogates, [k].
 
-    Before a batch has been observed it is NaN, which counts as 0: the policy is taken to be at
-    its limits.
+    Before the first batch it is NaN, which counts as 0: the policy is assumed to be at its limits.
 
     Args:
         violation: J_c − d of every constraint, [k].
@@ -62,7 +61,7 @@ def matched_violation(violation: Tensor | None, surrogates: Tensor) -> Tensor:
 
 
 def violation_of(violations: Violations, surrogates: Tensor) -> Tensor:
-    """`matched_violation` of what a loss reads at every call, [k]."""
+    """`matched_violation` of the constraints that a loss reads at every call, [k]."""
     return matched_violation(violations.violation, surrogates)
 
 
@@ -76,7 +75,7 @@ def constraint_value(
 
     Args:
         cost_violation: J_c − d, [k]. NaN (no episode has finished) counts as 0: the policy is
-            taken to be at the limit, and not allowed to raise the cost.
+            assumed to be at the limit, and must not raise the cost.
         episode_length: T̄, scalar.
         rescale_violation: Whether to divide.
     """

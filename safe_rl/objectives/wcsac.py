@@ -1,4 +1,4 @@
-"""Loss of the worst-case soft actor-critic: the tail of the cost-return is what actions cost."""
+"""Loss of the worst-case soft actor-critic: it limits the tail of the discounted cost."""
 
 from __future__ import annotations
 
@@ -36,14 +36,16 @@ class WCSACLoss(SACLagrangianLoss):
 
     Yang, Simão, Tindemans, Spaan, *WCSAC: Worst-Case Soft Actor Critic for Safety-Constrained
     Reinforcement Learning* (AAAI 2021), and *Safety-constrained reinforcement learning with a
-    distributional safety critic* (Machine Learning 2023), the Gaussian one. The cost-return of an
-    action is taken for a Gaussian, with a critic for its mean Q_c and one for its variance V_c:
+    distributional safety critic* (Machine Learning 2023), in its Gaussian form. The cost-return of
+    an action is modelled as a Gaussian, with a critic for its mean Q_c and one for its variance
+    V_c:
 
         CVaR_α = Q_c + α⁻¹ φ(Φ⁻¹(α)) √V_c
         Q_c ← c + γ Q_c',   V_c ← c² + 2 γ c Q_c' + γ² (V_c' + Q_c'²) − Q_c²
 
     The critics' loss is the squared 2-Wasserstein distance of two Gaussians, (Q_c − target)² +
-    (√V_c − √target)². α = 1 is `SACLagrangianLoss` with a critic of the variance that nobody asks.
+    (√V_c − √target)². With α = 1 it is `SACLagrangianLoss`, and the critic of the variance is not
+    used.
 
     Args:
         networks: Actor, Q functions and cost Q functions, as of `SACLagrangianLoss`. The number of
@@ -104,11 +106,11 @@ class WCSACLoss(SACLagrangianLoss):
     def moment_targets(
         self, mean: Tensor, costs: Tensor, discount: Tensor, following: tuple[Tensor, Tensor]
     ) -> tuple[Tensor, Tensor]:
-        """What one step says that mean and variance should be, [E/2, ..., k] each.
+        """Targets of mean and variance from one step, [E/2, ..., k] each.
 
         Args:
-            mean: Q_c of the steps, [E/2, ..., k]. The variance is about it, so that what differs
-                from one successor to the next is a part of the variance.
+            mean: Q_c of the steps, [E/2, ..., k]. The variance is around this mean, so differences
+                between successors are a part of the variance.
             costs: Of the steps, [..., k].
             discount: Of what follows, 0 after an end, [..., 1].
             following: Mean and variance of what follows, [E/2, ..., k] each.
