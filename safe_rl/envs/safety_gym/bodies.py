@@ -1,4 +1,4 @@
-"""What is added to the specification of a world: elements, and what pictures need."""
+"""Add bodies to the specification of a world: elements, and objects for pictures."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def add_bodies(
 ) -> None:
     """Add a body per object: free where it can be pushed, else one that is placed at resets.
 
-    Areas have a shape where rays see them, or in a `decorated` world, which is for pictures.
+    Areas have a shape only if rays see them, or in a `decorated` world, which is for pictures.
     """
     free = element.motion in (Motion.FREE, Motion.GUIDED)
     for name in element.names(config):
@@ -101,7 +101,7 @@ DISPLAY_RIM = 0.1  # how far a cropped floor reaches beyond the placements [m]
 
 
 def decorate(spec: mujoco.MjSpec, config: SafetyGymConfig) -> None:
-    """Add cameras, light, sky and floor pattern to a world, and nothing that physics feels."""
+    """Add cameras, light, sky and floor pattern to a world; they have no effect on the physics."""
     floor = spec.geom("floor")
     if config.floor_display_mode:
         half = max(abs(bound) for bound in config.placements_extents) + DISPLAY_RIM

@@ -1,8 +1,8 @@
 """From a configuration to one compiled model, and the integer maps into its arrays.
 
 The model is compiled once per configuration. Everything that differs between episodes is state:
-free bodies stand in `qpos`, static ones are mocap bodies. Body order: robot, vases, gremlins, box,
-the gremlins' targets, static bodies.
+free bodies are in `qpos`, and static bodies are mocap bodies. The order of bodies is robot, vases,
+gremlins, box, the gremlins' targets, static bodies.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ SLEEP_TOLERANCE = 1e-5
 
 
 def build_scene(config: SafetyGymConfig, sleep: bool = False, decorated: bool = False) -> Scene:
-    """Compile the world of a configuration; with `sleep`, resting free bodies do until touched.
+    """Compile the world of a configuration; with `sleep`, resting free bodies sleep until touched.
 
     A `decorated` world is for pictures: areas are bodies too, and there are cameras, light and a
     floor pattern. Its `qpos` and first mocap bodies are those of the plain world.
@@ -98,7 +98,7 @@ def _set_options(spec: mujoco.MjSpec, sleep: bool) -> None:
 
 
 def _touched_kinds(config: SafetyGymConfig) -> set[str]:
-    """Kinds whose contacts with the robot anything reads."""
+    """Kinds whose contacts with the robot are read by a cost, a task or an observation."""
     costs = [row.touches for row in COSTS if row.active(config)]
     readings = [row.touches for row in READINGS if row.present(config)]
     return {kind for kinds in (TASKS[config.task].touches, *costs, *readings) for kind in kinds}
@@ -186,7 +186,7 @@ def _index(
 
 
 def _oriented_body(config: SafetyGymConfig, model: mujoco.MjModel, robot: Robot) -> int:
-    """Body id of `reward_orientation_body`; the robot's root where nobody asks for it."""
+    """Body id of `reward_orientation_body`; the robot's root if it is not used."""
     wanted = config.reward_orientation_body if config.reward_orientation else "robot"
     names = [model.body(i).name for i in range(1, 1 + robot.num_bodies)]
     if wanted not in names:

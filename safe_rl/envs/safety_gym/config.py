@@ -25,8 +25,8 @@ class SafetyGymConfig(Vocabulary):
     """Everything that defines one environment.
 
     Keys that `safe_rl.envs.extending` registered are attributes like the others. Types and ranges
-    are checked here; whether there is such a task or robot, and what keys need of one another, is
-    checked where an environment is made or stored, see `suite.resolve`.
+    are checked here. Whether a task or robot exists, and whether keys fit together, is checked when
+    an environment is made or stored, see `suite.resolve`.
 
     Args:
         values: of the keys that differ from their defaults.
@@ -121,7 +121,7 @@ def registered_keys() -> dict[str, Key]:
 
 
 def set_registered_keys(keys: Mapping[str, Key]) -> None:
-    """Let the vocabulary consist of the built-in keys and these.
+    """Set the keys that exist in addition to the built-in ones.
 
     Raises:
         ConfigError: if a key is built in, or a default is not of its type.

@@ -1,4 +1,4 @@
-"""The environment-builder's keys: one declaration each of type, default, meaning and range.
+"""The keys of an environment: each is declared with type, default, meaning and range.
 
 Names, defaults and meaning are those of the 2019 Safety Gym engine (paper, section 4.1), so that
 its dictionaries can be used as they are, see also `RETIRED`; `layout_seeds`, `layout_seeds_first`,

@@ -1,4 +1,4 @@
-"""Values of configuration keys, each by itself: how a key is declared, and how it is checked."""
+"""How a single configuration key is declared, and how its value is checked."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ def key(default: Any, meaning: str) -> Any:
 
 @cache
 def allowed(annotation: Any) -> Values:
-    """Return which values a key of this annotation has."""
+    """Return the allowed values of a key with this annotation, in words."""
     return values_of(annotation)
 
 
@@ -94,7 +94,7 @@ def _cast(value: Any, kind: type) -> Any:
 
 
 def infer_key(name: str, default: Any) -> Key:
-    """Return the key of the type that a default value has; ConfigError if it does not tell."""
+    """Return a key with the type of a default value; ConfigError if the type is not clear."""
     kind = type(default[0] if isinstance(default, tuple) and default else default)
     if kind not in (bool, int, float, str):
         raise ConfigError(

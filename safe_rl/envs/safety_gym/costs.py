@@ -1,7 +1,7 @@
 """Safety costs: one batched function per cost key, and the table that names them.
 
-Spec: paper section 4.1.3. Every function returns one number per world, [N], before
-`constrain_indicator` turns positive ones into 1.
+Source: paper section 4.1.3. Every function returns one number per world, [N]. Afterwards
+`constrain_indicator` turns positive numbers into 1.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from safe_rl.envs.safety_gym.world import World
 
 
 def hazard_cost(robot_xy: Tensor, hazard_xy: Tensor, size: float) -> Tensor:
-    """Depth [m] to which the robot [N, 2] is inside hazards [N, K, 2] of a radius, summed."""
+    """Depth [m] of the robot [N, 2] inside hazards [N, K, 2] of a given radius, summed."""
     distance = torch.hypot(*(hazard_xy - robot_xy.unsqueeze(-2)).unbind(-1))
     return torch.rsub(distance, size).relu_().sum(-1)
 
@@ -72,7 +72,7 @@ class Cost(NamedTuple):
     """A row: one cost.
 
     Attributes:
-        key: what it is called in TensorDicts, "cost_<kind>".
+        key: its key in TensorDicts, "cost_<kind>".
         active: whether a configuration has it.
         magnitude: (config, world) -> [N], 0 or more.
         touches: kinds whose contacts with the robot it reads.

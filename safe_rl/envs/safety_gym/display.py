@@ -1,4 +1,4 @@
-"""Drawing single worlds: for frames, and as what a robot's camera sees."""
+"""Drawing single worlds: frames, and images of the robot's camera."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ TRACK_BEHIND, TRACK_ABOVE = 2.0, 2.0  # where the tracking camera is, from the r
 
 
 class Display(Pictures):
-    """Draws worlds of one configuration; nothing is built or opened before the first picture.
+    """Draws worlds of one configuration. Nothing is built or opened before the first picture.
 
     Args:
         config: the environment.
@@ -49,7 +49,7 @@ class Display(Pictures):
         return build_scene(self._config, decorated=True)
 
     def pose(self, world: World, row: int) -> None:
-        """Put everything where it is in one of the worlds."""
+        """Set all positions to those in one of the worlds."""
         data, physics = self.data, world.physics
         data.qpos[:] = _numbers(physics.qpos, row)
         # The plain world's mocap bodies come first, then the areas that have none there.

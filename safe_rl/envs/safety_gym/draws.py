@@ -1,6 +1,6 @@
-"""What is drawn at random: the start of an episode, new goals, noise and frame skip.
+"""Random draws: the start of an episode, new goals, noise and frame skip.
 
-Every draw is addressed by its row's seed, the episode, its purpose and the step, see `rng`.
+Every draw has a key from its row's seed, the episode, its purpose and the step, see `rng`.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from safe_rl.envs.safety_gym.world import Scene, World
 
 
 class Purpose(IntEnum):
-    """What a random draw is for; part of its address."""
+    """The purpose of a random draw, which is a part of its key."""
 
     LAYOUT = 0
     YAW = 1
@@ -48,8 +48,8 @@ class Purpose(IntEnum):
 def pick_layouts(config: SafetyGymConfig, key: Tensor) -> Tensor:
     """Pick layouts uniformly from the finite set of `layout_seeds`, by keys [N]: layout keys [N].
 
-    They depend on the picked layout seeds alone, so that environments with other seeds, and runs
-    that evaluate on the same set, meet the same layouts.
+    They depend only on the picked layout seeds. So environments with other seeds, and evaluations
+    on the same set, have the same layouts.
     """
     assert config.layout_seeds is not None
     index = (rng.uniform(key, Purpose.SPLIT) * config.layout_seeds).to(torch.int64)
@@ -71,7 +71,7 @@ def pinned_yaws(scene: Scene) -> Tensor:
 
 
 def draw_layouts(plan: PlacementPlan, physics: Physics, key: Tensor) -> Tensor:
-    """Draw where everything stands in the episodes of keys [B]: [B, 1 + M, 2], the robot first.
+    """Draw the positions of robot and objects for episodes with keys [B]: [B, 1 + M, 2].
 
     Raises:
         LayoutError: naming the object that did not fit.
@@ -90,9 +90,9 @@ def start_episodes(world: World, layouts: Tensor, key: Tensor, mask: Tensor) -> 
 
     Args:
         world: the worlds; those in `mask` are brought up to date.
-        layouts: where everything stands [N, 1 + M, 2].
+        layouts: positions of the robot and all objects [N, 1 + M, 2].
         key: random key of each world's episode, int64 [N].
-        mask: worlds to start anew.
+        mask: worlds that begin a new episode.
     """
     scene = world.scene
     put(world.layout, mask, layouts)
@@ -120,7 +120,7 @@ def _choose_button(world: World, key: Tensor, mask: Tensor) -> None:
 
 
 def next_goals(world: World, plan: PlacementPlan, key: Tensor, mask: Tensor) -> Tensor:
-    """Draw a new goal for the worlds of a mask: where no place for one was found, bool [N].
+    """Draw a new goal for the worlds of a mask; returns where no place was found, bool [N].
 
     Raises:
         LayoutError: for those, if `terminate_resample_failure` is False.
@@ -172,11 +172,11 @@ def draw_substeps(config: SafetyGymConfig, key: Tensor) -> Tensor:
 
 
 class LayoutsAhead:
-    """Layouts by their keys, remembered until they are asked for.
+    """Layouts by their keys, drawn in advance and stored until they are needed.
 
-    A layout is a function of its key alone, and to draw one takes about as long as to draw a
-    hundred: where rows begin their episodes one by one, what the others will ask for next is drawn
-    along. A snapshot of the worlds needs nothing of it.
+    A layout depends only on its key, and drawing one layout takes about as long as drawing a
+    hundred. So when a row begins an episode, the next layouts of the other rows are drawn too. A
+    saved state of the worlds does not need these.
 
     Args:
         draw: draws layouts of keys, int64 [B] -> [B, 1 + M, 2]; raises `LayoutError` if there is

@@ -1,4 +1,4 @@
-"""The kinds of object a world is built from: one row each, read by every other module.
+"""The table of the kinds of objects in a world, one row each.
 
 Sizes, heights and colours are those of the 2019 benchmark. The order of the rows is the order of
 objects in every `[N, M, …]` tensor: free bodies first, as in `qpos`, then static, then virtual.
@@ -37,8 +37,8 @@ class Motion(Enum):
 
     Attributes:
         FREE: a body that can be pushed, as vases.
-        GUIDED: a body pulled along by a target that runs in a circle of radius `<kind>_travel` [m]
-            around where the layout puts it, as gremlins; it moves by itself and can be pushed.
+        GUIDED: a body that follows a target on a circle of radius `<kind>_travel` [m] around its
+            position in the layout, as gremlins; it moves by itself and can be pushed.
         STATIC: collides and never moves within an episode, as pillars.
         VIRTUAL: an area without physics, as hazards.
     """
@@ -64,13 +64,14 @@ class Element:
     Attributes:
         kind: prefix of its configuration keys and of its lidar ("hazards").
         label: name of one object in layouts and errors. There are `<kind>_num` objects, with an
-            index; a kind that is its own label belongs to the tasks that list it, one object each.
+            index. If kind and label are equal, there is one object, in the tasks that list this
+            kind.
         motion: how it takes part in the physics.
         height: z of the object's centre [m].
         geoms: its shapes.
         rgb: colour in pictures and lidar halos.
-        group: MuJoCo geom group, which `lidar_type="natural"` selects by: kinds of the same group
-            are then seen as one. Otherwise any number from 0 to 5 will do.
+        group: MuJoCo geom group. With `lidar_type="natural"` a lidar sees all kinds of one group;
+            otherwise any number from 0 to 5 is possible.
         flag: configuration key that turns its lidar on; "" for `observe_<kind>`.
         always_observed: whether the lidar is there (all zeros) even without any object.
     """

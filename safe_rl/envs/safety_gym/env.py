@@ -56,25 +56,25 @@ class SafetyGymEnv(SimulatedEnv):
     `goal_met`, `done`, `terminated`, `truncated`. Time-outs are truncations. Where the physics of
     a world fails, that world gets `reward_exception`, `cost_exception` 1 and termination.
 
-    A state holds `qpos`, `qvel`, `qacc_warmstart`, `time`, `goal_pos` [N, 3], `goal_button`,
-    `buttons_timer`, `step_count`, `act` and `history` of actuators that remember, and the layout
-    and seeds, which may be left out where one is set. What sleeps then wakes up; with `sleep` False
-    what follows is the same to the last digit.
+    A state has `qpos`, `qvel`, `qacc_warmstart`, `time`, `goal_pos` [N, 3], `goal_button`,
+    `buttons_timer`, `step_count`, `act` and `history` of actuators with a state, and the layout and
+    seeds, which may be missing in a state that is set. Setting a state wakes sleeping bodies; with
+    `sleep` False the continuation is identical to the last digit.
 
-    Cameras of pictures, which show lidar halos, too, are "fixedfar", "fixednear", "track" (behind
+    Cameras of pictures, which also show lidar halos, are "fixedfar", "fixednear", "track" (behind
     the robot), "vision" (the robot's) and "free" (above).
 
     Args:
         env: name in the suite ("PointGoal1", "Safexp-PointGoal1-v0"), mapping of configuration
             keys, or `SafetyGymConfig`.
         num_envs: number of worlds, N.
-        device: where the TensorDicts live. The physics runs on the CPU, or with the key `physics`
-            "warp" there, too.
-        seed: integer that determines every draw; None takes one from torch's generator. Row k gets
-            the same episodes whatever N and the number of threads are.
+        device: device of the TensorDicts. The physics runs on the CPU; if the key `physics` is
+            "warp", it also runs on this device.
+        seed: integer that determines every random draw; None takes one from torch's generator. Row
+            k has the same episodes for any N and any number of threads.
         num_threads: threads that step the physics; 0 for one per core.
         sleep: let resting objects sleep until touched, which is faster and changes no statistics;
-            with `physics` "warp" they never do.
+            with `physics` "warp" they never sleep.
 
     Raises:
         ConfigError: for an unknown name or key, or a value that cannot be used.
@@ -148,7 +148,7 @@ class SafetyGymEnv(SimulatedEnv):
         return rng.fold(torch.tensor(seed, device=self._physics.device), Purpose.LAYOUT)
 
     def set_row_seeds(self, seeds: Sequence[int | None]) -> None:
-        """Seed every world on its own, [N], its layout too; None leaves one as it was seeded."""
+        """Seed every world, [N], and its layout; None keeps the seed of a world."""
         super().set_row_seeds(seeds)
         self._fixed_layout = self._fixed_layout.expand(self.batch_size).clone()
         for row, seed in enumerate(seeds):
@@ -156,7 +156,7 @@ class SafetyGymEnv(SimulatedEnv):
                 self._fixed_layout[row] = self._layout_of(seed)
 
     def _layout_key(self, ahead: int = 0) -> Tensor:
-        """Random key of the layouts of so many episodes after the present ones, [N]."""
+        """Random keys of the layouts that many episodes after the current ones, [N]."""
         key = rng.fold(self._row_seed, self._episode + ahead)
         if not self.config.randomize_layout:
             key = self._fixed_layout.expand(self.batch_size)
@@ -203,7 +203,7 @@ class SafetyGymEnv(SimulatedEnv):
         return self._step_output(torch.cat([reward.unsqueeze(0), costs]), flags)
 
     def _advance(self, action: Tensor) -> Tensor:
-        """Run the substeps of one step; returns the worlds whose physics failed [N]."""
+        """Run the substeps of one step; return the worlds whose physics failed [N]."""
         config, physics = self.config, self._physics
         control = action.clamp(*self._control_range)
         counts = None
@@ -220,7 +220,7 @@ class SafetyGymEnv(SimulatedEnv):
         return failed
 
     def _handle_goals(self, now: Tensor, failed: Tensor) -> tuple[Tensor, Tensor | None]:
-        """Give worlds that met their goal a new one: which met it, which have no place for one."""
+        """Give worlds that met their goal a new one; return these, and those without a place for it."""
         self._measured.copy_(now)
         if self._task.met is None:
             return torch.zeros_like(failed), None
@@ -232,7 +232,7 @@ class SafetyGymEnv(SimulatedEnv):
         return met, stuck
 
     def get_positions(self) -> TensorDict:
-        """Return where everything is: for shields, privileged critics and plots.
+        """Return the positions of robot and objects, for shields, privileged critics and plots.
 
         Returns:
             TensorDict [N] of copies, float64 [N, K, 3] each (m, in the world's frame): `robot` (its

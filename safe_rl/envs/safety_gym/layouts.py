@@ -1,7 +1,7 @@
 """Where objects may be placed, and batched rejection sampling of layouts and of new goals.
 
 Many layouts are drawn at once: one object after the other, for all rows together. Distances and
-lengths in metres.
+lengths are in metres.
 """
 
 from __future__ import annotations
@@ -55,14 +55,14 @@ class PlacementPlan:
 
     @cached_property
     def beside_goal(self) -> tuple[int, Tensor, Tensor]:
-        """The goal's place in the order, the others' columns [P - 1], and clearances [P - 1]."""
+        """Index of the goal in the order, columns [P - 1] of the others, and clearances [P - 1]."""
         item = self.names.index("goal")
         others = [i for i in range(len(self.names)) if i != item]
         columns = torch.tensor([self.columns[i] for i in others], device=self.keepouts.device)
         return item, columns, self.clearance(item, others)
 
     def clearance(self, item: int, others: slice | list[int]) -> Tensor:
-        """Distances that an object keeps from others at least, [K]."""
+        """Minimal distances of an object from the others, [K]."""
         return (self.keepouts[others] + self.keepouts[item] + self.margin).clamp(min=0.0)
 
 
@@ -107,7 +107,7 @@ def plan_placements(
 def _rectangles(
     config: SafetyGymConfig, kind: str, label: str, index: int
 ) -> list[tuple[float, ...]]:
-    """Rectangles for the centre of one object: its placements, less its keepout, that are left."""
+    """Rectangles for the centre of one object: its placements, reduced by its keepout."""
     locations = getattr(config, f"{kind}_locations")
     keepout = getattr(config, f"{kind}_keepout")
     if index < len(locations):
@@ -218,7 +218,7 @@ def _try_layouts(plan: PlacementPlan, key: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _rounds(total: int, rows: int) -> Iterator[tuple[int, int]]:
-    """Ranges of attempts that grow, so that a few stubborn rows don't take thousands of rounds."""
+    """Growing ranges of attempts, so that a few difficult rows don't take thousands of rounds."""
     start, most = 0, max(1, _MAX_ROWS // max(1, rows))
     size = 1
     while start < total:
@@ -230,8 +230,8 @@ def _rounds(total: int, rows: int) -> Iterator[tuple[int, int]]:
 def sample_layouts(plan: PlacementPlan, key: Tensor) -> Tensor:
     """Draw a layout for every key [B]: positions [B, 1 + M, 2], zero for what is not placed.
 
-    Every object in its turn gets 100 tries; then the layout is thrown away and drawn again, 10,000
-    times at most, and less often where no row's layout is found.
+    Objects are placed one after the other, with 100 tries each. If one does not fit, the whole
+    layout is drawn again, at most 10,000 times, and less often if no row's layout is found.
 
     Raises:
         LayoutError: naming the object that did not fit, and the keys that it depends on.
@@ -257,7 +257,7 @@ def sample_layouts(plan: PlacementPlan, key: Tensor) -> Tensor:
 
 
 def _is_hopeless(misfits: Tensor) -> bool:
-    """Whether enough layouts have failed, by the number of those that failed at each object."""
+    """Whether to give up, by the number of layouts that failed at each object."""
     failed = int(misfits.sum())
     numbers = torch.arange(1, 1 + len(misfits), device=misfits.device)
     pairs = int((misfits * numbers.square()).sum())
@@ -282,18 +282,18 @@ def resample_goal(
     layouts: Tensor,
     wanted: Tensor | None = None,
 ) -> tuple[Tensor, Tensor]:
-    """Draw a new goal beside everything else where it is now, layouts [B, 1 + M, 2].
+    """Draw a new goal position that keeps its distance from all other current positions.
 
     Args:
         plan: the plan, with a goal in it.
-        physics: the backend that it is for, which says whether the host looks at results.
+        physics: the backend, which says whether the host reads results.
         key: random keys, int64 [B].
         layouts: current positions.
         wanted: layouts that get a new goal, bool [B]; None: all.
 
     Returns:
-        The positions [B, 2], and whether one was wanted and found within 10,000 draws [B], or
-        within 200 where the host does not look.
+        The positions [B, 2], and whether one was wanted and found [B]: within 10,000 draws, or
+        within 200 if the host does not read results.
     """
     item, columns, clearance = plan.beside_goal
     position = layouts.new_zeros(len(key), 2)

@@ -1,7 +1,7 @@
-"""Lidars: what is near in which direction (paper section 4.1.4).
+"""Lidars: how near objects are in each direction (paper section 4.1.4).
 
-Pseudo-lidar computes bearings and distances of object centres; natural lidar casts rays into the
-physics and sees surfaces.
+The pseudo-lidar uses directions and distances of object centres. The natural lidar casts rays in
+the physics and sees surfaces.
 """
 
 from __future__ import annotations
@@ -21,16 +21,16 @@ from safe_rl.envs.safety_gym.world import Block, Scene, World
 
 
 def _num_laps(num_bins: int) -> int:
-    """Turns of the circle that readings are written to, so that no index of a bin has to wrap."""
+    """Number of turns of the circle in the array of readings, so that bin indices need not wrap."""
     return 2 if num_bins > 2 else 4
 
 
 def lidar_cells(group: Tensor, num_groups: int, num_bins: int, num_robots: int) -> Tensor:
     """Cells that objects straight ahead are written to, in one array for all lidars of all robots.
 
-    For every object, int64 [M], `group` says which of G lidars sees it. The result [3, N, M] is for
-    the bin before, that of the object and the one after; robot after robot, lidar after lidar, each
-    of several turns of the circle.
+    `group`, int64 [M], is the lidar (of G) that sees each object. The result [3, N, M] has the
+    cells of the bin before the object's, of its own, and of the one after. Cells are ordered by
+    robot, then by lidar; each lidar has several turns of the circle.
     """
     laps = _num_laps(num_bins)
     robot = torch.arange(num_robots, device=group.device).unsqueeze(1)
@@ -97,7 +97,7 @@ def lidar_blocks(config: SafetyGymConfig, scene: Scene, device: torch.device) ->
 
 
 def _while_awake(read: Callable[[World], Tensor], columns: slice) -> Callable[[World], Tensor]:
-    """Buttons are not seen while they wait for the next goal."""
+    """Buttons are not seen while their timer runs after a goal."""
 
     def read_awake(world: World) -> Tensor:
         readings = read(world)
@@ -156,8 +156,8 @@ def _natural(
 ) -> Callable[[World], Tensor]:
     """Rays that see one geom group each: exp(-distance), 0 for a miss.
 
-    The benchmark's quirks are kept: the goal's group is the floor's and the robot's limbs' too, and
-    groups beyond MuJoCo's six (the circle's) are never seen.
+    Two peculiarities of the benchmark are kept: the goal's group is also that of the floor and of
+    the robot's limbs; and groups beyond MuJoCo's six (the circle's) are never seen.
     """
     rays = ray_directions(config.lidar_num_bins).to(device)
     groups = list(dict.fromkeys(element.group for element in elements))

@@ -1,7 +1,7 @@
-"""What a robot observes: a table of sources, from which sizes, order and values all come.
+"""The observation: its components, their sizes, order and values.
 
-A source yields a block: named components that are computed together. The observation is all
-components in alphabetical order of their names (paper section 4.1.4).
+Components that are computed together are a block. The observation has all components in the
+alphabetical order of their names (paper section 4.1.4).
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ def _plain(config: SafetyGymConfig, scene: Scene, device: torch.device) -> list[
 
 
 def _read(row: Reading, size: int, world: World) -> Tensor:
-    """The values of a reading [N, size]; of another width they would move all that follow."""
+    """The values of a reading [N, size]; an error if the width is another one."""
     values, shape = row.read(world), (len(world.step_count), size)
     if not isinstance(values, Tensor) or values.shape != shape:
         got = list(values.shape) if isinstance(values, Tensor) else f"a {type(values).__name__}"
@@ -54,7 +54,7 @@ SOURCES: tuple[Callable[[SafetyGymConfig, Scene, torch.device], list[Block]], ..
 
 
 class Observer(NamedTuple):
-    """How to observe the worlds of one scene.
+    """Computes the observations of the worlds of one scene.
 
     Attributes:
         shapes: shape of every component, in the order of the flat observation.
@@ -82,7 +82,7 @@ class Observer(NamedTuple):
 
 
 def make_observer(scene: Scene, device: torch.device) -> Observer:
-    """Resolve what a configuration observes; ConfigError for sensors the robot does not have."""
+    """Build the observer of a configuration; ConfigError for sensors the robot does not have."""
     blocks = [block for source in SOURCES for block in source(scene.config, scene, device)]
     names = [name for block in blocks for name in block.shapes]
     if not names:
@@ -127,7 +127,7 @@ def observation_spec(
 
 
 def _within(bounds: Tensor, shape: tuple[int, ...], kind: dict[str, Any]) -> TensorSpec:
-    """Numbers within (low, high); where only some are bounded, the others get very large bounds."""
+    """Spec of numbers within (low, high); numbers without bounds get very large ones."""
     if bounds.isinf().all():
         return Unbounded(shape=shape, **kind)
     # half as far as there are numbers, so that there is one for the width

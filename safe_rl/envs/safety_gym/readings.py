@@ -1,4 +1,4 @@
-"""What a robot observes besides lidars and its camera: its sensors, and rows.
+"""Components of the observation besides lidars and camera: sensors, and the table of others.
 
 Paper sections 4.1.1 and 4.1.4.
 """
@@ -66,7 +66,7 @@ def _freejoint_size(config: SafetyGymConfig, scene: Scene) -> int:
 
 
 def _from_start(world: World, vector: Tensor, moved: bool) -> Tensor:
-    """A planar robot's coordinates as seen from where it started: observations know no origin."""
+    """A planar robot's coordinates relative to its start, so they do not depend on the origin."""
     if not world.scene.planar:
         return vector
     start = world.start_pose if moved else torch.zeros_like(world.start_pose)

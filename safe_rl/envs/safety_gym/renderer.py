@@ -62,7 +62,7 @@ def goal_button(config: SafetyGymConfig, button_pos: np.ndarray) -> Marker:
 
 
 def boundaries(config: SafetyGymConfig) -> Iterator[Marker]:
-    """Low translucent walls where the robot must not go beyond."""
+    """Low translucent walls at the boundaries."""
     if not config.constrain_boundary:
         return
     halves = [config.boundary_x, config.boundary_y]
@@ -136,7 +136,7 @@ class WorldRenderer:
             yield cost_sphere(robot_pos)
 
     def _add_inset(self, frame: np.ndarray) -> None:
-        """Show in a corner what the robot's camera sees, where that is observed."""
+        """Show the image of the robot's camera in a corner, if it is observed."""
         config = self._config
         if not (config.observe_vision and config.vision_render):
             return

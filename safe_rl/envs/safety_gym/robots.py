@@ -1,8 +1,8 @@
-"""Robots: reading an MJCF file, what an environment needs of it, and copies that runs keep.
+"""Robots: reading and checking an MJCF file, and the copies of it in the folders of runs.
 
-A robot file describes a body named "robot" at the top level of its world, which stands upright and
-is placed by its root joint: a free joint, or slides along x and y and a hinge about z. Its geom
-defaults hold for the whole world. An actuator without a `ctrlrange` gets [-1, 1].
+A robot file has a body named "robot" at the top level of its world. The body stands upright and is
+placed by its root joint: a free joint, or slides along x and y and a hinge about z. The geom
+defaults of the file apply to the whole world. An actuator without a `ctrlrange` gets [-1, 1].
 """
 
 from __future__ import annotations

@@ -121,7 +121,7 @@ def place_mocaps(world: World) -> None:
 
 
 def point_goal_at_button(world: World, mask: Tensor) -> None:
-    """Let the goal be where the goal button is, in some worlds."""
+    """Set the goal's position to that of the goal button, in some worlds."""
     number = world.goal_button.clamp(min=0).view(-1, 1, 1).expand(-1, 1, 3)
     button = world.at("buttons").gather(1, number)[:, 0]
     put(world.positions[:, world.scene.slots["goal"].start], mask, button)
@@ -146,7 +146,7 @@ def read_state(world: World) -> TensorDict:
 
 
 def write_state(world: World, state: TensorDictBase) -> None:
-    """Set N worlds to a state that `check_worlds` has passed, with all that is derived from it."""
+    """Set N worlds to a state that `check_worlds` accepted, and compute all that depends on it."""
     scene, physics = world.scene, world.physics
     target_quat = state.get("target_quat", physics.mocap_quat[:, : scene.num_targets].clone())
     everywhere = torch.ones_like(world.step_count, dtype=torch.bool)

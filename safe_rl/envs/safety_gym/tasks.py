@@ -1,10 +1,11 @@
-"""Tasks: what is measured, what is rewarded, when a goal is met (paper section 4.1.2).
+"""Tasks: measurements, rewards, and when a goal is met (paper section 4.1.2).
 
-Dense rewards are differences of measurements between two steps; the environment keeps the earlier
-one and measures again when a new goal is drawn, so that changing goals costs nothing.
+Dense rewards are differences of measurements between two steps. The environment stores the earlier
+measurement, and measures again when a new goal is drawn. So a change of goal does not change the
+reward.
 
-Commands that only compose a configuration read the table too and must start quickly: functions
-here import torch themselves, where methods of tensors are not enough.
+Commands that only compose a configuration also read the table and must start quickly. So functions
+here import torch only if methods of tensors are not enough.
 """
 
 from __future__ import annotations
@@ -34,7 +35,7 @@ def circle_speed(com_xy: Tensor, velocity_xy: Tensor, radius: float) -> Tensor:
 
 
 class NextGoal(Enum):
-    """What a new goal is."""
+    """How a new goal is drawn."""
 
     POSITION = "position"
     BUTTON = "button"

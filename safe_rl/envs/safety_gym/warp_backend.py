@@ -1,4 +1,4 @@
-"""The worlds on MuJoCo Warp: what it needs to know beforehand, and what it cannot do."""
+"""Build the physics on MuJoCo Warp: sizes of its buffers, and checks of what it supports."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def make_warp_physics(
         config: the environment.
         model: its compiled world.
         num_envs: number of worlds, N.
-        device: where they are; None is the CPU.
+        device: device of the worlds; None is the CPU.
         env_class: `SafetyGymEnv`, for a trial on the CPU.
 
     Raises:

@@ -1,4 +1,4 @@
-"""Records of a compiled world: where things are in its arrays, and named views of its state."""
+"""Records of a compiled world: indices into its arrays, and named views of its state."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from safe_rl.envs.safety_gym.config import SafetyGymConfig
 
 @dataclass(frozen=True)
 class Scene:
-    """A compiled world and where things are in it.
+    """A compiled world, and the indices of its objects.
 
     Attributes:
         config: the configuration it was built from.
