@@ -1,8 +1,8 @@
 """The environments of the Safety Gym benchmark (Ray, Achiam, Amodei 2019).
 
 The modules, from the lowest layer up: the configuration (`config`, `config_keys`, `config_values`),
-records of a world
-(`world`), tables of rules (`robots`, `tasks`, `costs`, `elements`, `readings`), names (`suite`),
-the compiled model (`building`, `bodies`), episodes (`layouts`, `draws`, `state`), pictures
-(`display`, `renderer`), what is observed (`lidar`, `observations`), and the environment (`env`).
+records of a world (`world`), tables of rules (`robots`, `tasks`, `costs`, `elements`, `readings`),
+names (`suite`), the compiled model (`building`, `bodies`), episodes (`layouts`, `draws`, `state`),
+pictures (`display`, `renderer`), what is observed (`lidar`, `observations`), and the environment
+(`env`).
 """

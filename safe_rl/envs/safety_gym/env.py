@@ -220,7 +220,7 @@ class SafetyGymEnv(SimulatedEnv):
         return failed
 
     def _handle_goals(self, now: Tensor, failed: Tensor) -> tuple[Tensor, Tensor | None]:
-        """Give worlds that met their goal a new one; return these, and those without a place for it."""
+        """Give worlds that met their goal a new one; return these, and those without a place."""
         self._measured.copy_(now)
         if self._task.met is None:
             return torch.zeros_like(failed), None
