@@ -7,7 +7,6 @@ from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
-import yaml
 from omegaconf import DictConfig, OmegaConf
 
 from safe_rl.cli.grammar import CommandLineError
@@ -27,7 +26,7 @@ from safe_rl.evaluation import (
 from safe_rl.evaluation.loading import load_config
 from safe_rl.evaluation.measuring import format_unjudged
 from safe_rl.evaluation.policies import find_run, writable_copy
-from safe_rl.evaluation.variations import Variation, Varied, evaluate_variations, expand
+from safe_rl.evaluation.variations import Varied, evaluate_variations
 from safe_rl.files import CONF
 from safe_rl.naming import did_you_mean
 from safe_rl.reporting.figures import draw_variations
@@ -35,7 +34,7 @@ from safe_rl.runs.folder import RunFolder
 
 __all__ = [
     *("carry_out", "certificate_options", "certify_run", "evaluate_run", "evaluate_varied"),
-    *("is_to_keep_limits", "read_variations"),
+    "is_to_keep_limits",
 ]
 
 
@@ -172,72 +171,16 @@ def evaluate_varied(
         ValueError: For variations that there are not, or that the environment cannot have.
     """
     directory = writable_copy(directory)
-    named, own = read_variations(options.variations)
     found = evaluate_variations(
         directory,
         options,
-        [*named, *own],
         make_env=maker_of(directory),
-        transform_node=lambda name: _from_conf("transforms", name)[name],
         refusals=(LayoutError,),
-        may_lack=lambda variation: variation in named,
         progress=progress,
     )
     picture = RunFolder(directory).variations(options.name, "png")
     draw_variations(found.rows, found.cost_limits, picture)
     return found, picture
-
-
-def read_variations(given: Any) -> tuple[list[Variation], list[Variation]]:
-    """Variations that ``variations=…`` asks for.
-
-    Args:
-        given: Name of a set in ``conf/variations``, path of a YAML of that form, keys by name, or
-            a list of all these.
-
-    Returns:
-        Those of sets, of which environments may lack some, and one's own.
-
-    Raises:
-        ValueError: For a name that there is not, or what is no set.
-
-    Examples:
-        >>> named, own = read_variations(["sensing", {"heavy": {"env.mass_scale": 2.0}}])
-        >>> len(named), [str(variation) for variation in own]
-        (8, ['heavy'])
-    """
-    named: list[Variation] = []
-    own: list[Variation] = []
-    for part in given if isinstance(given, list) else [given]:
-        if isinstance(part, Mapping):
-            own += expand(part)
-        elif str(part).endswith((".yaml", ".yml")):
-            own += expand(_read(Path(str(part)).expanduser()))
-        else:
-            named += expand(_from_conf("variations", str(part)))
-    return named, own
-
-
-def _from_conf(group: str, name: str) -> Mapping[str, Any]:
-    """The content of a file of the package's configuration."""
-    known = sorted(path.stem for path in (CONF / group).glob("*.yaml"))
-    if name not in known:
-        raise ValueError(
-            f"variations: there is no '{name}' among {group}.{did_you_mean(name, known)} There "
-            f"are {', '.join(known)}; a file of yours ends in .yaml; keys are given as "
-            "variations='{heavy: {env.mass_scale: 1.5}}'."
-        )
-    return _read(CONF / group / f"{name}.yaml")
-
-
-def _read(path: Path) -> Mapping[str, Any]:
-    try:
-        content = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except (OSError, yaml.YAMLError) as error:
-        raise ValueError(f"variations={path}: {' '.join(str(error).split())}") from error
-    if not isinstance(content, Mapping):
-        raise ValueError(f"variations={path}: it must have rows, as conf/variations has them.")
-    return content
 
 
 def _table_of(found: Varied) -> str:

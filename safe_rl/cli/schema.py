@@ -12,9 +12,9 @@ from typing import Annotated, Any, Literal, NamedTuple
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from safe_rl.evaluation.settings import check_device
+from safe_rl.evaluation.settings import CertificateOptions, Device
 from safe_rl.naming import nearest
-from safe_rl.parameters import Parameter, Part, SettingError, read_part
+from safe_rl.parameters import Parameter, Part, SettingError, parameters_of, read_part
 from safe_rl.ranges import (
     PART,
     Bytes,
@@ -24,7 +24,6 @@ from safe_rl.ranges import (
     Options,
     Positive,
     Range,
-    Share,
     Text,
     Values,
     bytes_each,
@@ -56,15 +55,6 @@ def _int(low: int, high: int | None = None, *more: Any) -> Any:
     return Annotated[int, Range(low, high), *more]
 
 
-def _is_device(value: Any) -> bool:
-    try:
-        check_device(value)
-    except (ValueError, TypeError):
-        return False
-    return True
-
-
-_Device = Annotated[str, Values(_is_device, "cpu, or cuda or cuda:<number> if torch finds that")]
 _ONE = "1, as collector=local is one process; for more use collector=process or collector=ray"
 _Width = Annotated[int, Range(1, 16_384)]
 _Widths = Annotated[list[_Width], MaxLength(32)]
@@ -72,7 +62,6 @@ _Limits = dict[str, NotNegative]
 _Part = Annotated[Any, PART]
 _Few = _int(0, 1000)
 _Kept = _int(1, 10_000)
-_Level = Annotated[float, Range(0.5, 1, above=True, below=True)]
 _Head = Literal["auto", "gaussian", "tanh", "beta", "categorical", "one_hot"]
 
 _REQUIRED: dict[str, tuple[Any, str]] = {
@@ -84,7 +73,7 @@ _REQUIRED: dict[str, tuple[Any, str]] = {
     "seed": (_int(0, 2**62), "seed of the run"),
     "init_from": (Text | None, "folder or checkpoint of the run to start from"),
     "cost_limits": (_Limits, "cost allowed per episode, by cost: '{cost: 25}'"),
-    "device": (_Device, "where networks are trained: cpu or cuda"),
+    "device": (Device, "where networks are trained: cpu or cuda"),
     # torch starts all of them at once, and crashes where the system gives it no more
     "num_threads": (_int(1, 1024) | None, "threads of physics and torch; null: all cores"),
     "compile": (bool, "whether to compile the losses"),
@@ -132,14 +121,6 @@ _OPTIONAL: dict[str, tuple[Any, str]] = {
     "checkpoint.keep_best": (_Kept, "best checkpoints kept"),
     "checkpoint.best_over": (_Kept, "epochs that the best are averaged over"),
     "certificate": (Options, "the test at a run's end; certificate.episodes=0 for none"),
-    "certificate.ranking": (_int(2, 10**6), "episodes per candidate that rank them"),
-    "certificate.episodes": (_int(0, 10**6), "new episodes of a test at most; 0: none"),
-    "certificate.tests": (_int(1, 1000), "candidates tested at most"),
-    "certificate.bound": (Literal["betting", "student"], "of means; betting holds for all costs"),
-    "certificate.cap": (Positive | None, "cost up to which an episode counts; null: all of it"),
-    "certificate.most_beyond": (Share, "share of episodes that may cost more than the cap"),
-    "certificate.level": (_Level, "confidence of a certificate"),
-    "certificate.most_over": (Share, "share of episodes that may exceed a limit"),
     "model.head": (_Head, "distribution of the actions"),
     "model.normalise": (Positive | None, "bound of normalised observations; null: not normalised"),
     "model.encoders": (Options | None, "encoders of observed entries: model=dict, model=cnn"),
@@ -168,6 +149,10 @@ KEYS = {
     path: Parameter(values_of(kind), meaning, bytes_each(kind), is_required=rows is _REQUIRED)
     for rows in (_REQUIRED, _OPTIONAL)
     for path, (kind, meaning) in rows.items()
+} | {
+    f"certificate.{name}": row._replace(is_required=False)
+    for name, row in parameters_of(CertificateOptions).items()
+    if name != "tail"  # that of the risk
 }
 """By full path: all keys but those of parts and environments."""
 _CLOSED = ("algo", "model", "model.encoders", "model.memory", "logger", "checkpoint", "certificate",

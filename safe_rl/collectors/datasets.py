@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from re import fullmatch
 from typing import Any
@@ -18,28 +18,23 @@ __all__ = ["read_dataset", "read_hdf5", "safe_episodes"]
 
 Arrays = dict[NestedKey, np.ndarray]
 
-# DSRL's (Liu et al. 2024), which are those of D4RL, and `costs`
-_FLAT: dict[NestedKey, str] = {
+_NAMES: dict[NestedKey, str] = {
     "observation": "observations",
     "action": "actions",
     ("next", "reward"): "rewards",
+}
+# DSRL's (Liu et al. 2024), which are those of D4RL, and `costs`
+_FLAT = _NAMES | {
     ("next", "cost"): "costs",
     ("next", "terminated"): "terminals",
     ("next", "truncated"): "timeouts",
 }
 # of each of Minari's episodes; costs are among the `infos`
-_OF_AN_EPISODE: dict[NestedKey, str] = {
-    "observation": "observations",
-    "action": "actions",
-    ("next", "reward"): "rewards",
+_OF_AN_EPISODE = _NAMES | {
     ("next", "terminated"): "terminations",
     ("next", "truncated"): "truncations",
 }
-_EPISODE = r"episode_(\d+)"
-_NUMBERS = "biuf"  # kinds of NumPy's types
 _FLAGS = (("next", "terminated"), ("next", "truncated"))
-_VECTORS = ("observation", "action", ("next", "observation"))
-"""What may be several numbers in a step."""
 
 
 def read_dataset(path: Path | str) -> TensorDictBase:
@@ -99,9 +94,8 @@ def read_hdf5(path: Path | str) -> TensorDict:
       any ``cost_<kind>``. An episode that was cut off counts as truncated.
 
     Raises:
-        ValueError: If the file is no HDF5 file, or damaged; if an array is missing, of another
-            length than the actions, not of numbers, or of more of them for a step than there should
-            be. The message names what is there.
+        ValueError: If the file is no HDF5 file, or damaged; if an array is missing, or is not of
+            numbers, a row for each action.
         ModuleNotFoundError: If h5py is not installed.
     """
     h5py = import_extra("h5py", "hdf5")
@@ -109,29 +103,27 @@ def read_hdf5(path: Path | str) -> TensorDict:
         raise ValueError(f"{path} is neither the folder of a recording nor an HDF5 file.")
     try:
         with h5py.File(path, "r") as file:
-            names = [n for n in file if fullmatch(_EPISODE, n)]
+            numbers = sorted(int(n[8:]) for n in file if fullmatch(r"episode_\d+", n))
+            names = [f"episode_{number}" for number in numbers]
             arrays = _read_episodes(path, file, names) if names else _read_flat(path, file)
     except OSError as error:
         raise ValueError(f"{path} cannot be read, is it whole? {error}") from error
-    if not len(arrays["action"]):
+    number = len(arrays["action"])
+    if not number:
         raise ValueError(f"{path} holds no transitions.")
-    steps = TensorDict(batch_size=[1, len(arrays["action"])])
-    for key, column in _columns(arrays):
-        steps[key] = column
+    steps = TensorDict(batch_size=[1, number])
+    for key, array in arrays.items():
+        column = torch.from_numpy(array.reshape(1, number, -1))
+        steps[key] = column if key in _FLAGS else column.float()
     steps["next", "done"] = steps["next", "terminated"] | steps["next", "truncated"]
     return steps
 
 
 def _read_episodes(path: Path | str, file: Any, names: list[str]) -> Arrays:
-    names.sort(key=lambda name: int(name.rpartition("_")[2]))
-    episodes = [_read_episode(path, file[name]) for name in names]
-    costs = [sorted(key[1] for key in e if key[1].startswith("cost")) for e in episodes]
-    for name, those in zip(names, costs, strict=True):
-        if those != costs[0]:
-            raise ValueError(
-                f"{path}: the costs of {name} are {', '.join(those)}, those of {names[0]} "
-                f"{', '.join(costs[0])}."
-            )
+    episodes = [_read_episode(f"{path}, {name}", file[name]) for name in names]
+    for name, episode in zip(names, episodes, strict=True):
+        if episode.keys() != episodes[0].keys():
+            raise ValueError(f"{path}: {name} has other costs than {names[0]}.")
     return {key: np.concatenate([e[key] for e in episodes]) for key in episodes[0]}
 
 
@@ -140,26 +132,26 @@ def _read_flat(path: Path | str, file: Any) -> Arrays:
     if "next_observations" in file:
         following = file["next_observations"][:]
     else:
-        _check_lengths(path, arrays)
+        _check_shapes(path, arrays)
         here = arrays["observation"]
         ends = arrays["next", "terminated"] | arrays["next", "truncated"]
         ends = np.append(ends[:-1], True).reshape(-1, *[1] * (here.ndim - 1))
         following = np.where(ends, here, np.roll(here, -1, 0))
-    return _check_lengths(path, {**arrays, ("next", "observation"): following})
+    return _check_shapes(path, {**arrays, ("next", "observation"): following})
 
 
-def _read_episode(path: Path | str, group: Any) -> Arrays:
-    arrays = _arrays(path, group, _OF_AN_EPISODE)
+def _read_episode(place: str, group: Any) -> Arrays:
+    arrays = _arrays(place, group, _OF_AN_EPISODE)
     observed, number = arrays["observation"], len(arrays["action"])
+    arrays |= {"observation": observed[:number], ("next", "observation"): observed[1 : number + 1]}
     infos = group.get("infos", {})
-    named = [name for name in infos if name.startswith("cost") and _is_array(infos[name])]
-    # infos of the reset come first, if they were stored
-    costs = {("next", name): infos[name][max(0, len(infos[name]) - number) :] for name in named}
-    if ("next", "cost") not in costs:
-        raise _lacking(path, ["infos/cost"], [f"infos/{name}" for name in infos] or list(group))
-    here, following = observed[:number], observed[1 : number + 1]
-    arrays = {**arrays, **costs, "observation": here, ("next", "observation"): following}
-    _check_lengths(f"{path}, {group.name[1:]}", arrays)
+    for name in infos:
+        if name.startswith("cost") and _is_array(infos[name]):
+            # infos of the reset come first, if they were stored
+            arrays["next", name] = infos[name][max(0, len(infos[name]) - number) :]
+    if ("next", "cost") not in arrays:
+        raise ValueError(f"{place} has no infos/cost. What it has: {', '.join(infos)}.")
+    _check_shapes(place, arrays)
     arrays["next", "truncated"][-1:] |= ~arrays["next", "terminated"][-1:]
     return arrays
 
@@ -169,44 +161,31 @@ def _is_array(node: Any) -> bool:
     return bool(getattr(node, "shape", ()))
 
 
-def _check_lengths(where: Path | str, arrays: Arrays) -> Arrays:
-    """Refuse arrays that are not of the same steps, not of numbers, or of too many of them."""
-    number, observation = len(arrays["action"]), arrays["observation"]
-    for key, array in arrays.items():
-        wrong = ""
-        if len(array) != number:
-            wrong = f"is given for {len(array):,} steps, the action for {number:,}"
-        elif array.dtype.kind not in _NUMBERS:
-            wrong = f"must be numbers, got {array.dtype}"
-        elif key not in _VECTORS and array.size != number:
-            wrong = f"must be one number a step, its shape is {array.shape}"
-        elif key == ("next", "observation") and array.shape != observation.shape:
-            wrong = f"must be like the observation, of shape {observation.shape}, got {array.shape}"
-        if wrong:
-            name = key if isinstance(key, str) else " ".join(key)
-            raise ValueError(f"{where}: the {name} {wrong}.")
-    return arrays
-
-
-def _arrays(path: Path | str, group: Any, names: Mapping[NestedKey, str]) -> Arrays:
+def _arrays(place: Path | str, group: Any, names: Mapping[NestedKey, str]) -> Arrays:
     found = [name for name in group if _is_array(group.get(name))]
     if missing := sorted(set(names.values()) - set(found)):
-        raise _lacking(path, missing, found)
-    return {
-        key: group[name][:].astype(bool) if key in _FLAGS else group[name][:]
-        for key, name in names.items()
-    }
+        raise ValueError(
+            f"{place} has no {', '.join(missing)}: transitions are read from files like those of "
+            f"DSRL or Minari. What it has: {', '.join(found) or 'nothing'}."
+        )
+    arrays = {key: group[name][:] for key, name in names.items()}
+    return arrays | {key: arrays[key].astype(bool) for key in _FLAGS}
 
 
-def _lacking(path: Path | str, missing: Sequence[str], found: Sequence[str]) -> ValueError:
-    return ValueError(
-        f"{path} has no {', '.join(missing)}: transitions are read from files like those of DSRL "
-        f"or Minari. What it has: {', '.join(sorted(found)) or 'nothing'}."
-    )
-
-
-def _columns(arrays: Arrays) -> Iterator[tuple[NestedKey, torch.Tensor]]:
-    """Tensors [1, M, n], numbers as float32 and flags as bool."""
+def _check_shapes(place: Path | str, arrays: Arrays) -> Arrays:
+    """Refuse arrays that are not of the same steps, or not of numbers."""
+    number, observation = len(arrays["action"]), arrays["observation"]
+    observed = (number, *observation.shape[1:])
+    shapes: dict[NestedKey, tuple[int, ...]] = {
+        "action": arrays["action"].shape, "observation": observed, ("next", "observation"): observed
+    }  # fmt: skip
     for key, array in arrays.items():
-        column = torch.from_numpy(array.reshape(len(array), -1)).unsqueeze(0)
-        yield key, column if key in _FLAGS else column.float()
+        shape = shapes.get(key, (number,))
+        fits = len(array) == number and array.size == np.prod(shape)
+        if not fits or array.dtype.kind not in "biuf":
+            name = key if isinstance(key, str) else " ".join(key)
+            raise ValueError(
+                f"{place}: the {name} must be numbers of shape {shape}, as there are {number} "
+                f"actions, not {array.dtype} of shape {array.shape}."
+            )
+    return arrays

@@ -13,14 +13,7 @@ from torchrl.collectors import Collector, MultiSyncCollector
 from torchrl.collectors.distributed import RayCollector
 from torchrl.envs import EnvBase
 
-from safe_rl.collectors.workers import (
-    Known,
-    KnownWorkers,
-    MakeEnv,
-    WorkerCollector,
-    check_rows,
-    split_rows,
-)
+from safe_rl.collectors.workers import Known, KnownWorkers, MakeEnv, Makers, WorkerCollector
 from safe_rl.extras import needs_extra
 from safe_rl.processes import starting_processes
 from safe_rl.ranges import Options, Range
@@ -110,10 +103,8 @@ def make_process_collector(
     Raises:
         ValueError: If N is not a multiple of W, or ``frames_per_batch`` of N.
     """
-    check_rows(env, num_collectors, frames_per_batch)
 
-    def start(known: Known) -> None:
-        makers = split_rows(env, make_env, num_collectors)
+    def start(known: Known, makers: Makers) -> None:
         with starting_processes():
             _ProcessCollector(
                 known,
@@ -129,7 +120,7 @@ def make_process_collector(
                 auto_register_policy_transforms=False,
             )
 
-    return WorkerCollector(start, env.batch_size.numel(), torch.device(device))
+    return WorkerCollector(start, env, make_env, num_collectors, frames_per_batch, device)
 
 
 class _RayCollector(KnownWorkers, RayCollector):
@@ -139,7 +130,7 @@ class _RayCollector(KnownWorkers, RayCollector):
 
 
 @needs_extra("ray", "ray")
-def make_ray_collector(
+def make_ray_collector(  # noqa: D417
     env: EnvBase,
     make_env: MakeEnv,
     policy: TensorDictModuleBase,
@@ -150,27 +141,18 @@ def make_ray_collector(
     ray_init: Options,
     resources: Options,
 ) -> WorkerCollector:
-    """Collect in actors of a Ray cluster.
+    """Collect in actors of a Ray cluster; other arguments are as for processes.
 
     Args:
-        env: The run's environment; its rows are shared out, itself it is not stepped.
-        make_env: Makes an environment like it with fewer rows, in the worker.
-        policy: Policy, whose weights are sent to the workers.
-        frames_per_batch: Steps of all rows together in one batch, N·T.
         num_collectors: Number of actors W, which divides N.
-        device: Device of policy and batches.
         ray_init: Arguments of ``ray.init``, such as ``address``.
         resources: Resources of every actor: ``num_cpus``, ``num_gpus``, ``memory``.
-
-    Raises:
-        ValueError: If N is not a multiple of W, or ``frames_per_batch`` of N.
     """
-    check_rows(env, num_collectors, frames_per_batch)
 
-    def start(known: Known) -> None:
+    def start(known: Known, makers: Makers) -> None:
         known(
             _RayCollector(
-                split_rows(env, make_env, num_collectors),
+                makers,
                 policy,
                 frames_per_batch=frames_per_batch,
                 total_frames=sys.maxsize,
@@ -181,4 +163,4 @@ def make_ray_collector(
             )
         )
 
-    return WorkerCollector(start, env.batch_size.numel(), torch.device(device))
+    return WorkerCollector(start, env, make_env, num_collectors, frames_per_batch, device)

@@ -20,7 +20,7 @@ from torchrl.envs import EnvBase
 
 from safe_rl.processes import is_stopped, leave_signals_to_parent
 
-__all__ = ["Known", "MakeEnv", "WorkerCollector", "check_rows", "kill_workers", "split_rows"]
+__all__ = ["Known", "MakeEnv", "Makers", "WorkerCollector", "kill_workers", "split_rows"]
 
 
 class MakeEnv(Protocol):
@@ -31,18 +31,10 @@ class MakeEnv(Protocol):
         ...
 
 
-def check_rows(env: EnvBase, num_collectors: int, frames_per_batch: int) -> None:
-    """Refuse numbers of rows and frames that workers cannot share equally."""
-    num_envs = env.batch_size.numel()
-    if num_collectors < 1 or num_envs % num_collectors or frames_per_batch % num_envs:
-        raise ValueError(
-            f"{num_collectors} collectors cannot share {num_envs} environments and batches of "
-            f"{frames_per_batch} frames equally: num_envs must be a multiple of num_collectors, "
-            "and frames_per_batch of num_envs."
-        )
+Makers = list[Callable[[], EnvBase]]
 
 
-def split_rows(env: EnvBase, make_env: MakeEnv, num_collectors: int) -> list[Callable[[], EnvBase]]:
+def split_rows(env: EnvBase, make_env: MakeEnv, num_collectors: int) -> Makers:
     """Functions that make every worker's environment, with its share of the rows of ``env``.
 
     Where ``get_state`` of the environment is not None, workers continue its rows from their next
@@ -115,22 +107,41 @@ class WorkerCollector:
     The workers get the policy's weights before every batch but the first, with which they start.
 
     Args:
-        start: Starts TorchRL's collector, whose batches are [W, n, T] or [N, T], and hands it, as
-            soon as it has processes, to the function that ``start`` is given.
-        num_envs: Rows of all workers together, N.
+        start: Starts TorchRL's collector, whose batches are [W, n, T] or [N, T], with the functions
+            that make its environments, and hands it, as soon as it has processes, to a function.
+        env: The run's environment; its rows are shared out, itself it is not stepped.
+        make_env: Makes an environment like it with fewer rows, in the worker.
+        num_collectors: Number of workers W.
+        frames_per_batch: Steps of all rows together in one batch, N·T.
         device: Device of the batches.
+
+    Raises:
+        ValueError: If N is not a multiple of W, or ``frames_per_batch`` of N.
     """
 
     def __init__(
         self,
-        start: Callable[[Known], Any],
-        num_envs: int,
-        device: torch.device,
+        start: Callable[[Known, Makers], Any],
+        env: EnvBase,
+        make_env: MakeEnv,
+        num_collectors: int,
+        frames_per_batch: int,
+        device: torch.device | str,
     ) -> None:
-        self.storing_device = device
-        self._start = start
+        self._num_envs = env.batch_size.numel()
+        if (
+            num_collectors < 1
+            or self._num_envs % num_collectors
+            or frames_per_batch % self._num_envs
+        ):
+            raise ValueError(
+                f"{num_collectors} collectors cannot share {self._num_envs} environments and "
+                f"batches of {frames_per_batch} frames equally: num_envs must be a multiple of "
+                "num_collectors, and frames_per_batch of num_envs."
+            )
+        self.storing_device = torch.device(device)
+        self._start = lambda: start(self._known, split_rows(env, make_env, num_collectors))
         self._workers: Any = KnownWorkers()
-        self._num_envs = num_envs
         self._looks = 0
 
     def __iter__(self) -> Iterator[TensorDictBase]:
@@ -139,7 +150,7 @@ class WorkerCollector:
         Raises:
             WorkerError: If a worker has died or was stopped.
         """
-        self._wait_for(_begin(lambda: self._start(self._known)))
+        self._wait_for(_begin(self._start))
         batches = iter(self._workers)
         asked = _begin(lambda: next(batches))
         while True:

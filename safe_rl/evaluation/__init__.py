@@ -2,11 +2,11 @@
 
 from typing import TYPE_CHECKING
 
-from safe_rl.evaluation.settings import EvaluationOptions
+from safe_rl.evaluation.settings import CertificateOptions, EvaluationOptions
 from safe_rl.lazy import import_later
 
 if TYPE_CHECKING:
-    from safe_rl.evaluation.certifying import Certificate, CertificateOptions, certify
+    from safe_rl.evaluation.certifying import Certificate, certify
     from safe_rl.evaluation.episodes import Episodes, collect_episodes
     from safe_rl.evaluation.measuring import Evaluation, evaluate, summarise
 
@@ -26,7 +26,6 @@ __getattr__, __dir__ = import_later(
     __name__,
     {
         "Certificate": "safe_rl.evaluation.certifying",
-        "CertificateOptions": "safe_rl.evaluation.certifying",
         "Episodes": "safe_rl.evaluation.episodes",
         "Evaluation": "safe_rl.evaluation.measuring",
         "certify": "safe_rl.evaluation.certifying",

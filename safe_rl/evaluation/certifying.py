@@ -20,44 +20,17 @@ from tqdm import tqdm
 from safe_rl.evaluation.episodes import Episodes, collect_episodes, default_seed, has_fixed_layout
 from safe_rl.evaluation.loading import load_config
 from safe_rl.evaluation.measuring import Trial
-from safe_rl.evaluation.settings import EvaluationOptions
+from safe_rl.evaluation.settings import CertificateOptions, EvaluationOptions
 from safe_rl.files import check_no_links, replace_text, replacing
 from safe_rl.runs.folder import RunFolder, checkpoint_steps, checkpoints_in
 from safe_rl.scores.certificate import Claim, Verdict, first_certified, rank
 
-__all__ = ["Certificate", "CertificateOptions", "certify"]
+__all__ = ["Certificate", "certify"]
 
 # environments that are stepped together, and episodes between two looks at a test
 _BATCH = 100
 # seeds are so far apart that the tests of one run are not the ranking of the next seed's run
 _RANKING, _TEST = 100_000_000_003, 200_000_000_041
-
-
-@dataclass(frozen=True, kw_only=True)
-class CertificateOptions:
-    """What is certified and by how many episodes: the section ``certificate`` of a configuration.
-
-    Attributes:
-        ranking: Episodes of every candidate for ranking the candidates.
-        episodes: Fresh episodes of a test at most.
-        tests: Candidates tested at most.
-        level: Confidence of the statement, in (0.5, 1).
-        most_over: Largest share of episodes that may cost more than a limit; 1 asks for nothing.
-        bound: "betting" or "student".
-        cap: Cost up to which an episode counts; None: all of it, if the environment has a highest.
-        most_beyond: Largest share of episodes that may cost more than the cap.
-        tail: Share of the costliest episodes whose mean is limited (CVaR); 1: all.
-    """
-
-    ranking: int
-    episodes: int
-    tests: int
-    level: float
-    most_over: float
-    bound: str = "betting"
-    cap: float | None = None
-    most_beyond: float = 0.01
-    tail: float = 1.0
 
 
 @dataclass(frozen=True)

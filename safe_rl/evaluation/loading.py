@@ -28,7 +28,6 @@ __all__ = [
     "load_policy",
     "override_env",
     "transforms_of",
-    "without_cost",
 ]
 
 
@@ -92,11 +91,6 @@ def limits_of(
             )
     limits = {**config.cost_limits, **others}
     return {key: float(limit) for key, limit in limits.items() if key in cost_keys}
-
-
-def without_cost(config: DictConfig, cost_keys: Collection[str]) -> dict[str, float]:
-    """Limits of the run, cost key -> d, on costs that a changed environment does not have."""
-    return {k: float(limit) for k, limit in config.cost_limits.items() if k not in cost_keys}
 
 
 def transforms_of(config: DictConfig) -> dict[str, Any]:

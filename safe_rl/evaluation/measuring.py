@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
 from contextlib import closing
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -24,7 +24,6 @@ from safe_rl.evaluation.loading import (
     load_config,
     load_policy,
     override_env,
-    without_cost,
 )
 from safe_rl.evaluation.settings import EvaluationOptions, check_options
 from safe_rl.evaluation.video import check_camera, record_episode, video_format, write_video
@@ -98,6 +97,22 @@ class Trial:
         """Of layouts and actions."""
         seed = self.options.seed
         return default_seed(self.node, self.config.seed) if seed is None else seed
+
+    def facts(self, limits: Mapping[str, float], cost_keys: Collection[str]) -> dict[str, Any]:
+        """What is evaluated, and which limits on it: the run's, but for costs it does not have."""
+        return {
+            "environment": self.node.get("name", ""),
+            "algorithm": self.config.algo.name,
+            "checkpoint_file": str(self.checkpoint),
+            "steps": checkpoint_steps(self.checkpoint),
+            "interval_level": LEVEL,
+            **asdict(self.options),
+            "seed": self.seed,
+            "cost_limits": dict(limits),
+            "limits_without_cost": {
+                key: float(d) for key, d in self.config.cost_limits.items() if key not in cost_keys
+            },
+        }
 
     def make(self, num_envs: int, **keys: Any) -> EnvBase:
         """Make environments, with some keys changed."""
@@ -191,10 +206,13 @@ def evaluate(
     policy, episodes, limits = trial.run(progress=progress, record=kept[0] if kept else None)
     reference = suite.reference(trial.node, but_for=_LAYOUTS)
     estimates = summarise(episodes, limits, reference, options.cvar_alpha)
-    facts = _facts(directory, config, trial) | {
-        "cost_limits": limits,
-        "limits_without_cost": without_cost(config, episodes.costs),
-    }
+    known = shared_layouts(
+        OmegaConf.to_container(config.env),  # type: ignore[arg-type]
+        trial.node,
+        same_seed=trial.seed == config.seed,
+    )
+    facts = {"run": str(directory), "layouts_trained_on": known}
+    facts |= trial.facts(limits, episodes.costs)
     _write_summary(summary, facts, estimates)
     columns = {"return": episodes.returns, "length": episodes.lengths, **episodes.costs}
     rows = zip(*(column.tolist() for column in columns.values()), strict=True)
@@ -202,21 +220,6 @@ def evaluate(
     for film in films:
         trial.film(policy, film, **drawing)
     return Evaluation(facts, estimates, (summary, table, *kept, *films))
-
-
-def _facts(directory: Path, config: DictConfig, trial: Trial) -> dict[str, Any]:
-    trained, node, seed = OmegaConf.to_container(config.env), trial.node, trial.seed
-    return {
-        "run": str(directory),
-        "environment": node.get("name", ""),
-        "algorithm": config.algo.name,
-        "checkpoint_file": str(trial.checkpoint),
-        "steps": checkpoint_steps(trial.checkpoint),
-        "layouts_trained_on": shared_layouts(trained, node, same_seed=seed == config.seed),  # type: ignore[arg-type]
-        "interval_level": LEVEL,
-        **asdict(trial.options),
-        "seed": seed,
-    }
 
 
 def check_places(places: Iterable[Path]) -> None:

@@ -1,26 +1,44 @@
-"""What an evaluation can be told."""
+"""What an evaluation and a certificate can be told."""
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Literal
 
-from safe_rl.scores.comparisons import check_share
+from safe_rl.parameters import parameters_of
+from safe_rl.ranges import Fraction, NotNegative, Positive, Range, Share, Values
 
-__all__ = ["EvaluationOptions", "check_device", "check_options", "option"]
+__all__ = [
+    "PICTURES",
+    "CertificateOptions",
+    "Device",
+    "EvaluationOptions",
+    "check_options",
+    "option",
+]
 
-# Threads beyond it are not to be had, and worlds fill the memory.
-_RANGES = {
-    "episodes": (1, 10**8),
-    "num_envs": (1, 100_000),
-    "num_threads": (0, 1024),
-    "seed": (0, 2**62),
-}
+PICTURES = ("gif", "webp")
+"""Suffixes of animated pictures."""
 
 
-_PICTURES = (".gif", ".webp")
+def _is_device(value: Any) -> bool:
+    import torch  # here, because help and configurations are shown without it
+
+    try:
+        device = torch.device(value)
+    except (RuntimeError, TypeError):
+        return False
+    here = {"cpu": 1, "cuda": torch.cuda.device_count()}
+    return (device.index or 0) < here.get(device.type, 0)
+
+
+Device = Annotated[str, Values(_is_device, "cpu, or cuda or cuda:<number> if torch finds that")]
+_PICTURE = Values(
+    lambda v: v is not None and Path(v).suffix[1:] in PICTURES,
+    f"a file ending in .{' or .'.join(PICTURES)}",
+)
+_NAME = Values(lambda v: "/" not in v and v.isprintable(), "a part of files' names, without /")
 
 
 def option(default: Any, help: str) -> Any:
@@ -38,23 +56,25 @@ class EvaluationOptions:
         'last'
     """
 
-    episodes: int = option(100, "whole episodes to run")
+    episodes: Annotated[int, Range(1, 10**8)] = option(100, "whole episodes to run")
     checkpoint: str = option(
         "last", "last, best (highest return that kept every limit), certified, or a path"
     )
     deterministic: bool = option(False, "act with the policy's mean instead of sampling from it")
-    seed: int | None = option(
+    seed: Annotated[int, Range(0, 2**62)] | None = option(
         None, "seed of layouts and actions; null: one that training never used"
     )
-    num_envs: int = option(25, "environments that are stepped together")
-    num_threads: int = option(0, "threads that step them; 0: one per core")
-    device: str = option("cpu", "where the policy acts: cpu or cuda")
-    cvar_alpha: float = option(0.1, "share of the costliest episodes in the CVaR")
-    video: bool = option(
-        False,
-        "write an MP4 of an episode from the first layout (extra 'video')",
+    # worlds fill the memory, and more threads are not to be had
+    num_envs: Annotated[int, Range(1, 100_000)] = option(
+        25, "environments that are stepped together"
     )
-    picture: str | None = option(
+    num_threads: Annotated[int, Range(0, 1024)] = option(
+        0, "threads that step them; 0: one per core"
+    )
+    device: Device = option("cpu", "where the policy acts: cpu or cuda")
+    cvar_alpha: Fraction = option(0.1, "share of the costliest episodes in the CVaR")
+    video: bool = option(False, "write an MP4 of an episode from the first layout (extra 'video')")
+    picture: Annotated[str, _PICTURE] | None = option(
         None, "file for an animated picture of that episode, .gif or .webp"
     )
     camera: str = option("free", "of the video: free, fixednear, fixedfar, track or vision")
@@ -63,10 +83,12 @@ class EvaluationOptions:
     certificate: dict[str, Any] = option(
         dict, "with certify=true: certificate.episodes=2000, as in training"
     )
-    cost_limits: dict[str, float] = option(
+    cost_limits: dict[str, NotNegative] = option(
         dict, "limits to use instead of the run's own, such as '{cost: 10}'"
     )
-    name: str = option("", "suffix of the files, to keep several evaluations of a run")
+    name: Annotated[str, _NAME] = option(
+        "", "suffix of the files, to keep several evaluations of a run"
+    )
     variations: Any = option(
         None, "evaluate in changed environments: dynamics, sensing, layout, a YAML, keys"
     )
@@ -75,24 +97,43 @@ class EvaluationOptions:
     )
 
 
+@dataclass(frozen=True, kw_only=True)
+class CertificateOptions:
+    """What is certified and by how many episodes: the section ``certificate`` of a configuration.
+
+    Attributes:
+        ranking: Episodes per candidate that rank them.
+        episodes: New episodes of a test at most; 0: none.
+        tests: Candidates tested at most.
+        level: Confidence of a certificate.
+        most_over: Share of episodes that may exceed a limit; 1 asks for nothing.
+        bound: Of means; betting holds for all costs.
+        cap: Cost up to which an episode counts; null: all of it, if the environment has a highest.
+        most_beyond: Share of episodes that may cost more than the cap.
+        tail: Share of the costliest episodes whose mean is limited (CVaR); 1: all.
+    """
+
+    ranking: Annotated[int, Range(2, 10**6)]
+    episodes: Annotated[int, Range(0, 10**6)]
+    tests: Annotated[int, Range(1, 1000)]
+    level: Annotated[float, Range(0.5, 1, above=True, below=True)]
+    most_over: Share
+    bound: Literal["betting", "student"] = "betting"
+    cap: Positive | None = None
+    most_beyond: Share = 0.01
+    tail: Fraction = 1.0
+
+
 def check_options(options: EvaluationOptions) -> None:
     """Refuse what cannot be done before anything is.
 
     Raises:
         ValueError: If an option is out of its range; the message names it.
     """
-    for name, (lowest, highest) in _RANGES.items():
-        value = getattr(options, name)
-        if value is not None and not lowest <= value <= highest:
-            raise ValueError(f"{name}={value}: at least {lowest} and at most {highest:,}.")
-    for key, limit in options.cost_limits.items():
-        if not 0 <= limit < math.inf:
-            raise ValueError(f"cost_limits.{key}={limit}: it must be a number from 0.")
-    check_share(options.cvar_alpha)
+    for name, parameter in parameters_of(EvaluationOptions).items():
+        parameter.check(name, getattr(options, name))
     if options.certificate and not options.certify:
         raise ValueError("certificate.…: it is the certificate's: add certify=true.")
-    if "/" in options.name or not options.name.isprintable():
-        raise ValueError(f"name={options.name}: it is part of the files' names, without /.")
     films = options.video or options.picture
     if options.variations is not None and (films or options.record or options.certify):
         raise ValueError(
@@ -101,34 +142,6 @@ def check_options(options: EvaluationOptions) -> None:
         )
     if not films and options.camera != EvaluationOptions.camera:
         raise ValueError(f"camera={options.camera}: it is the video's: add video=true.")
-    if options.picture is not None:
-        _check_picture(Path(options.picture))
-    check_device(options.device)
-
-
-def _check_picture(path: Path) -> None:
-    if path.suffix not in _PICTURES:
-        raise ValueError(f"picture={path}: its name must end in {' or '.join(_PICTURES)}.")
-    if not path.parent.is_dir():
-        raise ValueError(f"picture={path}: there is no folder {path.parent}.")
-
-
-def check_device(device: str) -> None:
-    """Refuse devices that networks cannot be on, here or anywhere.
-
-    Raises:
-        ValueError: If there is none of the name.
-
-    Examples:
-        >>> check_device("cpu")
-    """
-    import torch  # here, because help and configurations are shown without it
-
-    try:
-        kind, index = torch.device(device).type, torch.device(device).index or 0
-    except RuntimeError:
-        kind, index = "", 0
-    if kind not in ("cpu", "cuda"):
-        raise ValueError(f"device={device}: it must be cpu, cuda or cuda:<number>.")
-    if kind == "cuda" and index >= torch.cuda.device_count():
-        raise ValueError(f"device={device}: torch finds {torch.cuda.device_count()} CUDA devices.")
+    folder = Path(options.picture or "").parent
+    if not folder.is_dir():
+        raise ValueError(f"picture={options.picture}: there is no folder {folder}.")

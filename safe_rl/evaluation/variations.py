@@ -15,19 +15,19 @@ from safe_rl.evaluation.loading import (
     find_checkpoint,
     load_config,
     override_env,
-    without_cost,
 )
 from safe_rl.evaluation.measuring import Trial, check_places, summarise
 from safe_rl.evaluation.settings import EvaluationOptions, check_options
-from safe_rl.files import replace_csv
-from safe_rl.runs.folder import RunFolder, checkpoint_steps
+from safe_rl.files import CONF, read_yaml, replace_csv
+from safe_rl.naming import did_you_mean
+from safe_rl.runs.folder import RunFolder
 from safe_rl.scores.comparisons import Estimate
 
 __all__ = [
-    *("AS_TRAINED", "Varied", "VariedRow", "Variation", "evaluate_variations", "expand", "varied"),
+    *("AS_TRAINED", "Varied", "VariedRow", "Variation", "evaluate_variations", "read_variations"),
+    "varied",
 ]
 
-TransformNode = Callable[[str], Mapping[str, Any]]
 _FACTOR = "x"
 _PARTS = ("env", "transforms")
 
@@ -39,31 +39,71 @@ class Variation(NamedTuple):
         row: What is changed, a name.
         value: To what, where the row has several values; else None.
         keys: Full key of a run's configuration -> value.
+        may_lack: Whether it is left out where the environment cannot have it.
     """
 
     row: str
     value: Any
     keys: Mapping[str, Any]
+    may_lack: bool = False
 
     def __str__(self) -> str:
         """The row and its value."""
         return self.row if self.value is None else f"{self.row} {self.value}"
 
 
-def expand(rows: Mapping[str, Any]) -> list[Variation]:
-    """Turn the rows of a set, keys with values, into variations, one for each value of a list.
+def read_variations(given: Any) -> list[Variation]:
+    """Variations that ``variations=…`` asks for, one for each value of a row's list.
+
+    Args:
+        given: Name of a set in ``conf/variations``, of which environments may lack some; path of a
+            YAML of that form, keys by name, or a list of all these.
 
     Raises:
-        ValueError: For what is no such row, or keys of something else than the environment.
+        ValueError: For a name that there is not, what is no set, or keys of something else than the
+            environment.
 
     Examples:
-        >>> [str(v) for v in expand({"mass": {"env.mass_scale": [0.5, 2.0]}})]
+        >>> [str(v) for v in read_variations({"mass": {"env.mass_scale": [0.5, 2.0]}})]
         ['mass 0.5', 'mass 2.0']
+        >>> len(read_variations(["sensing", {"heavy": {"env.mass_scale": 2.0}}]))
+        9
     """
-    return [variation for row, keys in rows.items() for variation in _expand_row(str(row), keys)]
+    found: list[Variation] = []
+    for part in given if isinstance(given, list) else [given]:
+        is_set = isinstance(part, str) and not part.endswith((".yaml", ".yml"))
+        rows = _from_conf("variations", part) if is_set else part
+        if not isinstance(rows, Mapping):
+            rows = _read(Path(part).expanduser())
+        found += [
+            v._replace(may_lack=is_set) for name in rows for v in _expand(str(name), rows[name])
+        ]
+    return found
 
 
-def _expand_row(row: str, keys: Any) -> Iterator[Variation]:
+def _from_conf(group: str, name: str) -> Mapping[str, Any]:
+    """The content of a file of the package's configuration."""
+    known = sorted(path.stem for path in (CONF / group).glob("*.yaml"))
+    if name not in known:
+        raise ValueError(
+            f"variations: there is no '{name}' among {group}.{did_you_mean(name, known)} There "
+            f"are {', '.join(known)}; a file of yours ends in .yaml; keys are given as "
+            "variations='{heavy: {env.mass_scale: 1.5}}'."
+        )
+    return _read(CONF / group / f"{name}.yaml")
+
+
+def _read(path: Path) -> Mapping[str, Any]:
+    try:
+        content = read_yaml(path)
+    except (OSError, ValueError) as error:
+        raise ValueError(f"variations={path}: {error}") from error
+    if not isinstance(content, Mapping):
+        raise ValueError(f"variations={path}: it must have rows, as conf/variations has them.")
+    return content
+
+
+def _expand(row: str, keys: Any) -> Iterator[Variation]:
     if not isinstance(keys, Mapping) or not keys:
         raise ValueError(
             f"variations: '{row}' must have keys, as {{{row}: {{env.mass_scale: 1.5}}}}; got "
@@ -81,19 +121,15 @@ def _expand_row(row: str, keys: Any) -> Iterator[Variation]:
         raise ValueError(f"variations: '{row}' has several lists: {', '.join(map(str, lists))}.")
     if not lists:
         yield Variation(row, None, dict(keys))
-        return
-    for value in keys[lists[0]]:
+    for value in keys[lists[0]] if lists else ():
         yield Variation(row, value, {**keys, lists[0]: value})
 
 
-def varied(
-    config: DictConfig, variation: Variation, transform_node: TransformNode
-) -> DictConfig | None:
+def varied(config: DictConfig, variation: Variation) -> DictConfig | None:
     """A run's configuration with a variation of its environment; None if it would be as it is.
 
     It is if that has these values itself, or none of the elements that they are about. A text
-    ``x1.5`` is 1.5 times the run's own value; ``transform_node`` has the nodes of transforms that
-    the run lacks.
+    ``x1.5`` is 1.5 times the run's own value. Transforms that the run lacks are those of ``conf/``.
 
     Raises:
         ValueError: For a factor of what the environment lacks, or of no number; for a key that an
@@ -101,7 +137,7 @@ def varied(
 
     Examples:
         >>> config = OmegaConf.create({"env": {"hazards_num": 8}})
-        >>> varied(config, Variation("dense", None, {"env.hazards_num": "x1.5"}), dict).env
+        >>> varied(config, Variation("dense", None, {"env.hazards_num": "x1.5"})).env
         {'hazards_num': 12}
     """
     before: Any = OmegaConf.to_container(config)
@@ -112,7 +148,7 @@ def varied(
         if part == "env":
             check_env_keys(changed.env, [name])
         elif name not in changed.transforms:
-            changed.transforms[name] = dict(transform_node(name))
+            changed.transforms[name] = _from_conf("transforms", name)[name]
         value = _resolved(value, OmegaConf.select(changed, key), key)
         OmegaConf.update(changed, key, value, merge=False, force_add=True)
     is_same = _present(OmegaConf.to_container(changed)) == _present(before)
@@ -161,80 +197,76 @@ class Varied:
     Attributes:
         rows: First the environment as trained on, then every variation.
         left_out: Variations that this environment cannot have, and why.
-        cost_limits: Cost key -> d, of the environment as trained on.
-        facts: Of what, for the terminal.
+        facts: What was evaluated as trained on, and how.
         file: The table.
     """
 
     rows: tuple[VariedRow, ...]
     left_out: tuple[tuple[Variation, str], ...]
-    cost_limits: Mapping[str, float]
     facts: Mapping[str, Any]
     file: Path
+
+    @property
+    def cost_limits(self) -> dict[str, float]:
+        """Cost key -> d, of the environment as trained on."""
+        return dict(self.facts["cost_limits"])
 
 
 def evaluate_variations(
     directory: Path,
     options: EvaluationOptions,
-    variations: Sequence[Variation],
     *,
     make_env: Callable[..., EnvBase],
-    transform_node: TransformNode,
     refusals: tuple[type[Exception], ...],
-    may_lack: Callable[[Variation], bool],
     progress: bool = False,
 ) -> Varied:
-    """Run a trained policy in its own environment and in variations of it.
+    """Run a trained policy in its own environment and under ``options.variations``.
 
     All of them draw from the same seed, so that what differs between them is not luck.
 
     Args:
         directory: Folder of a run.
         options: As for an evaluation; ``env`` changes every one of the environments.
-        variations: What is changed.
         make_env: ``make_env(node, num_envs=, device=, seed=, num_threads=)``.
-        transform_node: Name of a transform -> its node, for those that the run lacks.
         refusals: What an environment raises that cannot have a variation, beside ValueError.
-        may_lack: Whether a variation is left out where the environment cannot have it.
         progress: Whether to say what is next.
 
     Raises:
         FileNotFoundError: If the folder is not a run's, or has no such checkpoint.
         OSError: If what it finds cannot be written, which is seen before any episode.
         CheckpointError: If the policy does not fit a varied environment.
-        ValueError: If an environment cannot have a variation that was asked for by itself.
+        ValueError: For variations that there are not, or that an environment cannot have.
     """
     check_options(options)
+    variations = read_variations(options.variations)
     config = load_config(directory)
     config.env = override_env(config, options.env)
     checkpoint = find_checkpoint(directory, options.checkpoint)
-    file = RunFolder(directory).variations(options.name, "csv")
-    check_places([file, RunFolder(directory).variations(options.name, "png")])
+    file, picture = (RunFolder(directory).variations(options.name, kind) for kind in ("csv", "png"))
+    check_places([file, picture])
     rows: list[VariedRow] = []
     left_out: list[tuple[Variation, str]] = []
-    facts = {"algorithm": config.algo.name, "environment": config.env.get("name", "")}
-    facts |= {"steps": checkpoint_steps(checkpoint), "episodes": options.episodes}
+    facts: dict[str, Any] = {}
     cannot: tuple[type[Exception], ...] = (ValueError, *refusals)
     for variation in (AS_TRAINED, *variations):
         try:
-            changed = varied(config, variation, transform_node) if variation.keys else config
+            changed = varied(config, variation) if variation.keys else config
             if changed is None:
                 left_out.append((variation, "it would be as it was trained"))
                 continue
             if progress:
                 print(f"… {variation}", flush=True)
-            _, episodes, limits = Trial(changed, checkpoint, options, make_env).run()
+            trial = Trial(changed, checkpoint, options, make_env)
+            _, episodes, limits = trial.run()
         except cannot as error:
-            if variation is AS_TRAINED or not may_lack(variation):
+            if not variation.may_lack:
                 raise
             left_out.append((variation, str(error)))
             continue
-        if not rows:
-            own_limits = limits
-            facts["limits_without_cost"] = without_cost(config, episodes.costs)
+        facts = facts or trial.facts(limits, episodes.costs)
         rows.append(VariedRow(variation, summarise(episodes, limits, None, options.cvar_alpha)))
     _write(file, rows)
-    return Varied(tuple(rows), tuple(left_out), own_limits, facts, file)
+    return Varied(tuple(rows), tuple(left_out), facts, file)
 
 
 def _write(path: Path, rows: Sequence[VariedRow]) -> None:
@@ -246,7 +278,7 @@ def _write(path: Path, rows: Sequence[VariedRow]) -> None:
     columns = [f"{name}{end}" for name in names for end in ("", "_low", "_high")]
     table: list[list[Any]] = [["variation", "row", "value", "keys", *columns]]
     for variation, estimates in rows:
-        row, value, keys = variation
+        row, value, keys, _ = variation
         changes = " ".join(f"{key}={changed}" for key, changed in keys.items())
         found = [number for name in names for number in estimates.get(name, ("", "", ""))]
         table.append([str(variation), row, "" if value is None else value, changes, *found])

@@ -14,6 +14,7 @@ from tensordict import TensorDictBase
 from torchrl.envs import EnvBase
 
 from safe_rl.evaluation.episodes import exploration
+from safe_rl.evaluation.settings import PICTURES
 from safe_rl.extras import import_extra
 from safe_rl.files import replacing
 from safe_rl.naming import STEPS_TAKEN
@@ -217,7 +218,6 @@ _ANIMATION = VideoFormat(400, 300, 5, 20, _write_animation)
 FORMATS = {
     # of what does not say how long its steps are; 1000 last 20 s
     "mp4": VideoFormat(640, 480, 2, 25, _write_mp4),
-    "gif": _ANIMATION,
-    "webp": _ANIMATION,
+    **dict.fromkeys(PICTURES, _ANIMATION),
 }
 """Suffix of a file -> how an episode is recorded into it."""

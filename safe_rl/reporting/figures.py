@@ -225,7 +225,7 @@ def draw_variations(
     """
     (_, trained), *varied = rows
     groups: dict[str, list[tuple[str, Mapping[str, Estimate]]]] = {}
-    for (row, value, _), estimates in varied:
+    for (row, value, *_), estimates in varied:
         group = groups.setdefault(_OTHERS if value is None else row, [])
         group.append((row if value is None else f"{value}", estimates))
     groups = groups or {_OTHERS: [("as trained", trained)]}

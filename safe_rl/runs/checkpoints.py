@@ -57,7 +57,7 @@ def _read(path: Path, *, lazy: bool = False) -> dict[str, dict[str, Any]]:
             raise ValueError("it has no facts, or no parts")
     except (ValueError, KeyError, TypeError) as error:
         raise CheckpointError(f"Cannot use the checkpoint {path}: {error}.") from error
-    return content  # type: ignore[no-any-return]
+    return content
 
 
 def _restore(path: Path, components: Mapping[str, Stateful]) -> None:

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import math
-import sys
 from collections.abc import Mapping, Sequence
-from threading import Event, Thread
 
 from tqdm import tqdm
 
@@ -14,13 +12,10 @@ from safe_rl.runs.outcome import final_figures, final_rows, measured
 __all__ = ["ProgressBar", "outcome_line", "shown"]
 
 _RATE_STEPS = 1000
-_REDRAW = 1.0  # seconds
 
 
 class ProgressBar:
     """Steps done, steps per second, return and costs against their present limits.
-
-    On a terminal it is redrawn every second, also within an epoch.
 
     Args:
         total: Environment steps of the whole run.
@@ -38,10 +33,6 @@ class ProgressBar:
         )  # fmt: skip
         self._limits, self._episode_length = limits, episode_length
         self._before: Mapping[str, float] | None = None
-        self._closed = Event()
-        self._redrawing = Thread(target=self._redraw, daemon=True)
-        if not self._bar.disable and sys.stderr.isatty():
-            self._redrawing.start()
 
     def add(self, row: Mapping[str, float]) -> None:
         """Show an epoch, by columns of the table."""
@@ -52,14 +43,7 @@ class ProgressBar:
 
     def close(self) -> None:
         """Leave the bar as it is."""
-        self._closed.set()
-        if self._redrawing.is_alive():  # otherwise it could redraw a closed bar
-            self._redrawing.join()
         self._bar.close()
-
-    def _redraw(self) -> None:
-        while not self._closed.wait(_REDRAW):
-            self._bar.refresh()
 
 
 def shown(

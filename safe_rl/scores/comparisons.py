@@ -18,7 +18,6 @@ __all__ = [
     "LEVEL",
     "Estimate",
     "bootstrap",
-    "check_share",
     "cvar",
     "interquartile_mean",
     "mean",
@@ -176,7 +175,8 @@ def cvar(values: ArrayLike, alpha: float) -> Estimate:
         >>> cvar([1.0, 2.0, 3.0, 4.0], alpha=0.5).value
         3.5
     """
-    check_share(alpha)
+    if not 0.0 < alpha <= 1.0:
+        raise ValueError(f"alpha={alpha} must be a share of episodes, in (0, 1].")
     sample = np.asarray(values, dtype=float)
     number = len(sample)
     size = alpha * number
@@ -187,16 +187,6 @@ def cvar(values: ArrayLike, alpha: float) -> Estimate:
         return (largest * weights).sum(axis) / size
 
     return _estimate([sample], tail_mean)
-
-
-def check_share(alpha: float) -> None:
-    """Refuse what is no share of episodes that a CVaR can be the mean of.
-
-    Raises:
-        ValueError: If ``alpha`` is not in (0, 1].
-    """
-    if not 0.0 < alpha <= 1.0:
-        raise ValueError(f"cvar_alpha={alpha} must be a share of episodes, in (0, 1].")
 
 
 def share_over(values: ArrayLike, limit: float) -> Estimate:

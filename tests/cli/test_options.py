@@ -62,16 +62,16 @@ def test_errors_say_what_to_write(argument, message):
 @pytest.mark.parametrize(
     ("argument", "message"),
     [
-        ("episodes=0", "episodes=0: at least 1"),
-        ("num_envs=1000000000", "num_envs=1000000000: .* at most 100,000"),
-        ("num_threads=1000000", "num_threads=1000000: .* at most 1,024"),
-        ("seed=-1", "seed=-1: at least 0"),
+        ("episodes=0", "episodes=0: .* from 1 to 100,000,000"),
+        ("num_envs=1000000000", "num_envs=1000000000: .* to 100,000"),
+        ("num_threads=1000000", "num_threads=1000000: .* to 1,024"),
+        ("seed=-1", "seed=-1: .* from 0"),
         ("name=a/b", "name=a/b: .*without /"),
         ("camera=track", r"camera=track: it is the video's: add video=true\."),
-        ("device=meta", "device=meta: it must be cpu, cuda or"),
+        ("device=meta", "device=meta: it must be cpu, or cuda"),
         ("cvar_alpha=nan", "nan"),
-        ("cost_limits={cost: -1}", r"cost_limits.cost=-1.0: it must be a number from 0"),
-        ("cost_limits={cost: nan}", r"cost_limits.cost=nan: it must be a number from 0"),
+        ("cost_limits={cost: -1}", "cost_limits=.*-1.*each a number from 0"),
+        ("cost_limits={cost: nan}", "cost_limits=.*nan.*each a number from 0"),
     ],
 )
 def test_options_are_checked_before_anything_is_done(tmp_path, argument, message):

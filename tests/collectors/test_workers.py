@@ -148,10 +148,10 @@ def test_workers_leave_signals_to_the_first_process_from_their_start_on():
 
 
 def test_what_keeps_workers_from_starting_is_told():
-    def start(known):
+    def start(known, makers):
         raise OSError("no room for another process")
 
-    collector = WorkerCollector(start, num_envs=4, device=torch.device("cpu"))
+    collector = WorkerCollector(start, PointMass(4, 20), PointMass, 2, 80, "cpu")
     with pytest.raises(OSError, match="no room for another process"):
         next(iter(collector))
     collector.shutdown()

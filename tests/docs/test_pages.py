@@ -17,13 +17,13 @@ from registrations import undone
 import safe_rl
 from safe_rl import targets
 from safe_rl.cli import user_code
-from safe_rl.cli.evaluating import read_variations
 from safe_rl.cli.export import ExportOptions
 from safe_rl.cli.grammar import parse_options, split_imports
 from safe_rl.cli.report import ReportOptions
 from safe_rl.cli.train import read_command
 from safe_rl.evaluation import EvaluationOptions
 from safe_rl.evaluation.settings import check_options
+from safe_rl.evaluation.variations import read_variations
 
 ROOT = Path(__file__).resolve().parents[2]
 PAGES = ["README.md", *(str(p.relative_to(ROOT)) for p in sorted((ROOT / "docs").rglob("*.md")))]
@@ -119,7 +119,7 @@ def check(words: list[str], run: Path) -> None:
         if isinstance(parsed, EvaluationOptions):
             check_options(parsed)
             if parsed.variations is not None and "my_" not in str(parsed.variations):
-                assert any(read_variations(parsed.variations))
+                assert read_variations(parsed.variations)
         return
     read_command(arguments)
 

@@ -14,10 +14,10 @@ from PIL import Image
 
 import safe_rl
 from safe_rl.cli.evaluate import main
-from safe_rl.cli.evaluating import evaluate_run, read_variations
+from safe_rl.cli.evaluating import evaluate_run
 from safe_rl.cli.train import read_command
 from safe_rl.evaluation import EvaluationOptions
-from safe_rl.evaluation.variations import Variation, expand, varied
+from safe_rl.evaluation.variations import Variation, read_variations, varied
 from safe_rl.files import CONF
 
 pytestmark = pytest.mark.long
@@ -112,15 +112,15 @@ def test_transforms_are_those_of_a_run_that_has_them(run, tmp_path):
 def test_a_factor_changes_the_runs_own_value(run):
     config = OmegaConf.create({"env": {"hazards_num": 5, "size": 0.2, "kwargs": None}})
     for text, number in (("x0.5", 2), ("x1.5", 8), ("x2", 10)):
-        changed = varied(config, Variation("h", text, {"env.hazards_num": text}), dict)
+        changed = varied(config, Variation("h", text, {"env.hazards_num": text}))
         assert changed.env.hazards_num == number  # whole numbers, halves to even ones
-    wider = varied(config, Variation("s", None, {"env.size": "x1.5"}), dict)
+    wider = varied(config, Variation("s", None, {"env.size": "x1.5"}))
     assert wider.env.size == pytest.approx(0.3)
-    assert varied(config, Variation("s", None, {"env.size": 0.2}), dict) is None
-    deep = varied(config, Variation("g", None, {"env.kwargs.g": 5}), dict)
+    assert varied(config, Variation("s", None, {"env.size": 0.2})) is None
+    deep = varied(config, Variation("g", None, {"env.kwargs.g": 5}))
     assert deep.env == {"hazards_num": 5, "size": 0.2, "kwargs": {"g": 5}}
     with pytest.raises(ValueError, match=r"no number 'env\.vases_num'"):
-        varied(config, Variation("v", None, {"env.vases_num": "x2"}), dict)
+        varied(config, Variation("v", None, {"env.vases_num": "x2"}))
 
 
 def test_what_sets_ask_for_in_vain_is_left_out(tmp_path, capsys):
@@ -145,8 +145,7 @@ def test_what_sets_ask_for_in_vain_is_left_out(tmp_path, capsys):
 def test_a_file_of_ones_own(run, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     Path("my_set.yaml").write_text("light: {env.mass_scale: 0.7}\n")
-    named, own = read_variations("my_set.yaml")
-    assert (named, [str(variation) for variation in own]) == ([], ["light"])
+    assert [(str(v), v.may_lack) for v in read_variations("my_set.yaml")] == [("light", False)]
     assert main([str(run), "variations=my_set.yaml", *QUICK]) == 0
     assert rows_of(run)["light"]["keys"] == "env.mass_scale=0.7"
     found = safe_rl.load(run).vary("my_set.yaml", episodes=6, num_envs=3, num_threads=1)
@@ -158,7 +157,7 @@ def test_a_file_of_ones_own(run, tmp_path, monkeypatch):
 @pytest.mark.parametrize("name", SETS)
 def test_keys_of_sets_are_taken_by_training(name):
     """Every row, as a command line has it; `x1.5` is a number there."""
-    for variation in read_variations(name)[0]:
+    for variation in read_variations(name):
         keys = {k: 4 if str(v).startswith("x") else v for k, v in variation.keys.items()}
         if any(key.endswith("_size") for key in keys):
             keys = dict.fromkeys(keys, 0.25)
@@ -169,7 +168,7 @@ def test_keys_of_sets_are_taken_by_training(name):
 
 
 def test_rows_with_a_list_are_several():
-    found = expand({"mass": {"env.mass_scale": [0.5, 2], "env.friction_scale": 0.9}})
+    found = read_variations({"mass": {"env.mass_scale": [0.5, 2], "env.friction_scale": 0.9}})
     assert [v.keys for v in found] == [
         {"env.mass_scale": 0.5, "env.friction_scale": 0.9},
         {"env.mass_scale": 2, "env.friction_scale": 0.9},
@@ -178,11 +177,11 @@ def test_rows_with_a_list_are_several():
 
 def test_what_concerns_elements_that_are_not_there_is_left_out():
     config = OmegaConf.create({"env": {"hazards_num": 0, "hazards_size": 0.2, "vases_num": 2}})
-    named, _ = read_variations("layout")
-    kept = [str(v) for v in named if varied(config, v, dict) is not None]
+    named = read_variations("layout")
+    kept = [str(v) for v in named if varied(config, v) is not None]
     assert kept == ["vases x0.5", "vases x2"]
     more = {"env.hazards_num": 4, "env.hazards_size": 0.3}
-    assert varied(config, Variation("more", None, more), dict).env.hazards_size == 0.3
+    assert varied(config, Variation("more", None, more)).env.hazards_size == 0.3
     config.env._target_ = "mine.make"  # what its keys mean is its own business
     size = Variation("size", None, {"env.hazards_size": 0.3})
-    assert varied(config, size, dict).env.hazards_size == 0.3
+    assert varied(config, size).env.hazards_size == 0.3

@@ -117,7 +117,7 @@ def test_a_run_killed_several_times_leaves_the_table_of_one_that_was_not(tmp_pat
     assert table == expected
     best, expected = (sorted((f / "checkpoints/best").iterdir()) for f in (killed, whole))
     assert [path.name for path in best] == [path.name for path in expected]
-    assert not list(killed.rglob("*.stage-*"))
+    assert not list(killed.rglob(".checkpoint-*"))
 
 
 def test_checkpoints_change_nothing(tmp_path):
