@@ -20,10 +20,17 @@ __all__ = ["WITHOUT_NOISE", "BehaviourPolicy", "ExploringPolicy", "make_behaviou
 
 def make_behaviour(actor: ProbabilisticTensorDictSequential) -> TensorDictModuleBase:
     """The fastest module that samples an actor: a `BehaviourPolicy` of it, or the actor itself."""
-    try:
-        return BehaviourPolicy(actor)
-    except TypeError:
-        return actor
+    parameters, sampler = actor.module[0], actor.module[-1]
+    is_plain = (
+        len(actor.module) == 2
+        and type(parameters) is TensorDictModule  # others may call their network otherwise
+        and sampler.distribution_class is IndependentNormal
+        and not sampler.distribution_kwargs
+        and list(sampler.dist_keys) == ["loc", "scale"]
+        and list(parameters.out_keys) == list(sampler.in_keys)
+        and len(sampler.out_keys) == 2
+    )
+    return BehaviourPolicy(actor) if is_plain else actor
 
 
 WITHOUT_NOISE = (ExplorationType.DETERMINISTIC, ExplorationType.MODE, ExplorationType.MEAN)
@@ -43,9 +50,7 @@ class BehaviourPolicy(TensorDictModuleBase):
         actor: Policy made by :func:`make_actor`, or any ``ProbabilisticTensorDictSequential`` of a
             plain ``TensorDictModule`` that writes a mean and a standard deviation, and of an
             ``IndependentNormal`` of these that writes an action and its log-probability.
-
-    Raises:
-        TypeError: If the actor is another.
+            `make_behaviour` tells whether an actor is one.
 
     Examples:
         >>> import torch
@@ -59,20 +64,6 @@ class BehaviourPolicy(TensorDictModuleBase):
     def __init__(self, actor: ProbabilisticTensorDictSequential) -> None:
         super().__init__()
         parameters, sampler = actor.module[0], actor.module[-1]
-        if not (
-            len(actor.module) == 2
-            and type(parameters) is TensorDictModule  # others may call their network otherwise
-            and sampler.distribution_class is IndependentNormal
-            and not sampler.distribution_kwargs
-            and list(sampler.dist_keys) == ["loc", "scale"]
-            and list(parameters.out_keys) == list(sampler.in_keys)
-            and len(sampler.out_keys) == 2
-        ):
-            raise TypeError(
-                "BehaviourPolicy samples one TensorDictModule that writes loc and scale, followed "
-                "by an IndependentNormal of them with return_log_prob=True: hand another actor "
-                "itself to the collector."
-            )
         self.network = parameters.module
         self.in_keys = list(parameters.in_keys)
         self.out_keys = [*parameters.out_keys, *sampler.out_keys]

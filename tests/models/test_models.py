@@ -96,13 +96,6 @@ def test_behaviour_policy_follows_the_actors_parameters_and_the_exploration_type
         assert not torch.equal(policy(batch)["action"], sample["action"])
 
 
-def test_behaviour_policy_refuses_other_distributions():
-    network = TensorDictModule(nn.Linear(5, 4), in_keys=["observation"], out_keys=["loc", "scale"])
-    squashed = ProbabilisticActor(network, in_keys=["loc", "scale"], distribution_class=TanhNormal)
-    with pytest.raises(TypeError, match="hand another actor"):
-        BehaviourPolicy(squashed)
-
-
 class Swapped(nn.Sequential):
     """Puts out a standard deviation, then a mean."""
 
@@ -166,10 +159,11 @@ def test_gaussians_of_ones_own_are_sampled_with_their_own_log_probability(name):
     torch.testing.assert_close(sample["action_log_prob"], expected)
 
 
-def test_a_gaussian_that_writes_no_log_probability_is_left_alone():
-    network = gaussian(nn.Sequential, "loc", "scale")
+@pytest.mark.parametrize(("kind", "has_log_prob"), [(TanhNormal, True), (IndependentNormal, False)])
+def test_an_actor_that_samples_or_writes_otherwise_is_left_alone(kind, has_log_prob):
+    network, keys = gaussian(nn.Sequential, "loc", "scale"), ["loc", "scale"]
     actor = ProbabilisticActor(
-        network, in_keys=["loc", "scale"], distribution_class=IndependentNormal
+        network, in_keys=keys, distribution_class=kind, return_log_prob=has_log_prob
     )
     assert make_behaviour(actor) is actor
 
