@@ -228,8 +228,10 @@ class LimitTracker(Checked, Resumable):
         end = self.free_steps + self.descent_steps
         if not end:
             return ""
-        free = f"Costs are free until step {self.free_steps:,}; the " if self.free_steps else "The "
-        line = f"{free}limits come down until step {end:,} and hold from there."
+        free = (
+            f"Costs are ignored until step {self.free_steps:,}; the " if self.free_steps else "The "
+        )
+        line = f"{free}limits fall until step {end:,} and are constant from there."
         if self._is_shortened:
             line += " (limits.free_steps and limits.descent_steps are shortened to fit frames=…)"
         return line

@@ -23,13 +23,13 @@ from safe_rl.envs.safety_gym.config_values import (
 from safe_rl.ranges import Count, NotNegative, Positive, Range, Share, Text
 
 _AREAS = "rectangles where centres may be; None: anywhere within placements_extents"
-_PINNED = "(x, y) of the first objects, which then stand there [m]"
-_KEEPOUT = "distance that other keepouts stay away from the centre [m]"
-_YAWS = "yaw of the first objects; the others' are drawn"
+_PINNED = "fixed positions (x, y) of the first objects [m]"
+_KEEPOUT = "radius around the centre that no keepout of another object overlaps [m]"
+_YAWS = "fixed yaw of the first objects; others are random"
 _LIDAR = "whether there is a lidar for "
 _COSTS = "whether there is a cost for "
 _NUMBER = "number of objects"
-_UNUSED = "part of the vocabulary; no cost reads it"
+_UNUSED = "not used; exists because the 2019 engine has it"
 
 # Keys of 2019 that nothing reads any more -> the value that changes nothing, and what to do else.
 RETIRED = {
@@ -47,27 +47,27 @@ class Vocabulary:
     frameskip_binom_n: Annotated[int, Range(1, 10_000)] = key(
         10, "substeps per step ~ Binomial(n, p): n"
     )
-    frameskip_binom_p: Share = key(1.0, "and p")
+    frameskip_binom_p: Share = key(1.0, "substeps per step ~ Binomial(n, p): p")
 
     # physics
     physics: Literal["cpu", "warp"] = key("cpu", "MuJoCo on the CPU, or MuJoCo Warp on the device")
     physics_buffers: Positive = key(
-        2.0, "room for contacts in Warp, in multiples of the most that a trial met"
+        2.0, "size of Warp's contact buffers, in multiples of the number in a trial"
     )
 
     # placement
     placements_extents: Rectangle = key(
-        (-2.0, -2.0, 2.0, 2.0), "xmin, ymin, xmax, ymax of where anything is placed [m]"
+        (-2.0, -2.0, 2.0, 2.0), "rectangle for all objects: xmin, ymin, xmax, ymax [m]"
     )
-    placements_margin: float = key(0.0, "added to the sum of two keepouts [m]")
+    placements_margin: float = key(0.0, "minimal distance between two keepouts [m]")
     randomize_layout: bool = key(True, "whether every episode has another layout")
     layout_seeds: Annotated[int, Range(1, LARGEST_SEED)] | None = key(
         None, "number of different layouts; None: unlimited"
     )
     layout_seeds_first: Annotated[int, Range(0, LARGEST_SEED)] = key(
-        0, "they are first, first + 1, …; disjoint ranges share none"
+        0, "the first of these layout seeds; the others follow it"
     )
-    continue_goal: bool = key(True, "draw a new goal where one was met; False ends the episode")
+    continue_goal: bool = key(True, "draw a new goal after one was met; False ends the episode")
     terminate_resample_failure: bool = key(
         True, "end an episode whose new goal has no place; False is an error"
     )
@@ -86,7 +86,7 @@ class Vocabulary:
     strength_scale: NotNegative = key(1.0, "factor on the forces of its actuators")
 
     # observations
-    observation_flatten: bool = key(True, "one vector; False: every component by its name")
+    observation_flatten: bool = key(True, "True: one vector; False: an entry per component")
     observe_sensors: bool = key(True, "whether the robot's sensors are observed")
     observe_goal_dist: bool = key(False, "exp(-distance to the goal)")
     observe_goal_comp: bool = key(False, "compass to the goal")
@@ -101,8 +101,8 @@ class Vocabulary:
     observe_pillars: bool = key(False, _LIDAR + "pillars")
     observe_buttons: bool = key(False, _LIDAR + "buttons")
     observe_gremlins: bool = key(False, _LIDAR + "gremlins")
-    observe_vision: bool = key(False, "picture of the robot's camera")
-    observe_qpos: bool = key(False, "positions of joints; a planar root's from where it started")
+    observe_vision: bool = key(False, "image of the robot's camera")
+    observe_qpos: bool = key(False, "positions of joints; those of a planar root from its start")
     observe_qvel: bool = key(False, "velocities of joints")
     observe_ctrl: bool = key(False, "the last control")
     observe_freejoint: bool = key(False, "position and quaternion of a free root")
@@ -117,15 +117,17 @@ class Vocabulary:
     )
     lidar_num_bins: Annotated[int, Range(1, 10_000)] = key(10, "bins over the full circle")
     lidar_max_dist: Positive | None = key(
-        None, "readings fall linearly to 0 there [m]; None: exponentially"
+        None, "distance at which readings reach 0 [m]; None: exponential decay"
     )
     lidar_exp_gain: NotNegative = key(1.0, "gain of exponential readings [1/m]")
-    lidar_type: Literal["pseudo", "natural"] = key("pseudo", "by bearings of centres, or by rays")
-    lidar_alias: bool = key(True, "also light neighbouring bins, by where in its bin an object is")
+    lidar_type: Literal["pseudo", "natural"] = key(
+        "pseudo", "pseudo: from centres; natural: by rays"
+    )
+    lidar_alias: bool = key(True, "an object in a bin also raises the two neighbouring bins")
     compass_shape: Annotated[int, Range(2, 3)] = key(2, "components of a compass")
-    vision_size: Pixels = key((60, 40), "width and height of the picture")
-    vision_render: bool = key(True, "show it in the corner of frames, where it is observed")
-    vision_render_size: Pixels = key((300, 200), "and how large at most")
+    vision_size: Pixels = key((60, 40), "width and height of this image [pixels]")
+    vision_render: bool = key(True, "show it in a corner of rendered frames")
+    vision_render_size: Pixels = key((300, 200), "its largest size in frames [pixels]")
 
     # task and reward
     task: Text = key("goal", "what is rewarded: goal, button, push, x, z, circle or none")
@@ -138,21 +140,25 @@ class Vocabulary:
     box_rots: tuple[float, ...] = key((), _YAWS)
     box_keepout: NotNegative = key(0.2, _KEEPOUT)
     box_size: Positive = key(0.2, "half side of the box [m]")
-    box_density: Positive = key(0.001, "of the box")
-    box_null_dist: float = key(2.0, "approach is rewarded beyond this, in units of box_size")
-    reward_distance: float = key(1.0, "per metre nearer to the goal")
-    reward_goal: float = key(1.0, "for a goal that is met")
-    reward_box_dist: float = key(1.0, "per metre nearer to the box")
-    reward_box_goal: float = key(1.0, "per metre that the box is nearer to the goal")
+    box_density: Positive = key(0.001, "density of the box")
+    box_null_dist: float = key(
+        2.0, "distance beyond which approaching the box is rewarded, in units of box_size"
+    )
+    reward_distance: float = key(1.0, "reward per metre nearer to the goal")
+    reward_goal: float = key(1.0, "reward for a goal that is met")
+    reward_box_dist: float = key(1.0, "reward per metre nearer to the box")
+    reward_box_goal: float = key(1.0, "reward per metre that the box is nearer to the goal")
     reward_orientation: bool = key(False, "whether being upright is rewarded")
-    reward_orientation_scale: float = key(0.002, "and how much, per step")
-    reward_orientation_body: Text = key("robot", "body of the robot that is to be upright")
-    reward_exception: float = key(-10.0, "of a step in which the physics failed")
-    reward_x: float = key(1.0, "per metre along x, in task x")
-    reward_z: float = key(1.0, "per metre upwards, in task z")
-    reward_circle: float = key(0.1, "of moving round the circle, in task circle")
+    reward_orientation_scale: float = key(0.002, "reward per step for being upright")
+    reward_orientation_body: Text = key("robot", "body of the robot that must be upright")
+    reward_exception: float = key(-10.0, "reward of a step in which the physics failed")
+    reward_x: float = key(1.0, "reward per metre along x, in task x")
+    reward_z: float = key(1.0, "reward per metre upwards, in task z")
+    reward_circle: float = key(
+        0.1, "factor of the reward for moving round the circle, in task circle"
+    )
     reward_clip: NotNegative | None = key(10.0, "bound of dense rewards; None or 0: none")
-    circle_radius: Positive = key(1.5, "of the circle [m]")
+    circle_radius: Positive = key(1.5, "radius of the circle [m]")
 
     # constraints
     constrain_hazards: bool = key(False, _COSTS + "being in hazards")
@@ -161,10 +167,14 @@ class Vocabulary:
     constrain_buttons: bool = key(False, _COSTS + "pressing wrong buttons")
     constrain_gremlins: bool = key(False, _COSTS + "touching gremlins")
     constrain_boundary: bool = key(False, _COSTS + "leaving the boundaries")
-    boundary_x: Positive | None = key(None, "beyond this |x| is outside [m]; None: nothing")
-    boundary_y: Positive | None = key(None, "beyond this |y| is outside [m]; None: nothing")
+    boundary_x: Positive | None = key(
+        None, "largest |x| within the boundary [m]; None: no boundary"
+    )
+    boundary_y: Positive | None = key(
+        None, "largest |y| within the boundary [m]; None: no boundary"
+    )
     constrain_velocity: bool = key(False, _COSTS + "being faster than velocity_limit")
-    velocity_limit: Positive | None = key(None, "speed of the robot that costs nothing [m/s]")
+    velocity_limit: Positive | None = key(None, "largest speed of the robot without a cost [m/s]")
     constrain_indicator: bool = key(True, "costs are 0 or 1 per step; False: their magnitudes")
 
     # walls
@@ -180,7 +190,7 @@ class Vocabulary:
     hazards_locations: Locations = key((), _PINNED)
     hazards_keepout: NotNegative = key(0.4, _KEEPOUT)
     hazards_size: Positive = key(0.3, "radius [m]")
-    hazards_cost: NotNegative = key(1.0, "per metre that the robot is inside")
+    hazards_cost: NotNegative = key(1.0, "cost per metre of depth inside a hazard")
 
     # vases
     vases_num: FreeObjects = key(0, _NUMBER)
@@ -189,13 +199,13 @@ class Vocabulary:
     vases_rots: tuple[float, ...] = key((), _YAWS)
     vases_keepout: NotNegative = key(0.15, _KEEPOUT)
     vases_size: Positive = key(0.1, "half side [m]")
-    vases_density: Positive = key(0.001, "of vases")
-    vases_sink: float = key(4e-5, "how deep they stand in the floor at the start [m]")
-    vases_contact_cost: NotNegative = key(1.0, "per contact point with the robot")
-    vases_displace_cost: NotNegative = key(0.0, "per metre from where one stood; 0: no such cost")
-    vases_displace_threshold: NotNegative = key(1e-3, "displacement that is free [m]")
-    vases_velocity_cost: NotNegative = key(1.0, "per m/s of a vase; 0: no such cost")
-    vases_velocity_threshold: NotNegative = key(1e-4, "speed below which it is free [m/s]")
+    vases_density: Positive = key(0.001, "density of vases")
+    vases_sink: float = key(4e-5, "depth in the floor at the start [m]")
+    vases_contact_cost: NotNegative = key(1.0, "cost per contact point with the robot")
+    vases_displace_cost: NotNegative = key(0.0, "cost per metre of displacement; 0: no such cost")
+    vases_displace_threshold: NotNegative = key(1e-3, "displacement without a cost [m]")
+    vases_velocity_cost: NotNegative = key(1.0, "cost per m/s of a vase; 0: no such cost")
+    vases_velocity_threshold: NotNegative = key(1e-4, "speed below which there is no cost [m/s]")
 
     # pillars
     pillars_num: Objects = key(0, _NUMBER)
@@ -204,7 +214,7 @@ class Vocabulary:
     pillars_keepout: NotNegative = key(0.3, _KEEPOUT)
     pillars_size: Positive = key(0.2, "radius [m]")
     pillars_height: Positive = key(0.5, "half height [m]")
-    pillars_cost: NotNegative = key(1.0, "per contact point with the robot")
+    pillars_cost: NotNegative = key(1.0, "cost per contact point with the robot")
 
     # buttons
     buttons_num: Objects = key(0, _NUMBER)
@@ -212,9 +222,9 @@ class Vocabulary:
     buttons_locations: Locations = key((), _PINNED)
     buttons_keepout: NotNegative = key(0.3, _KEEPOUT)
     buttons_size: Positive = key(0.1, "radius [m]")
-    buttons_cost: NotNegative = key(1.0, "per contact point of the robot with a wrong one")
+    buttons_cost: NotNegative = key(1.0, "cost per contact point of the robot with a wrong button")
     buttons_resampling_delay: Annotated[int, Range(0)] = key(
-        10, "steps for which buttons sleep after one was pressed"
+        10, "steps without effect of buttons after one was pressed"
     )
 
     # gremlins
@@ -223,18 +233,18 @@ class Vocabulary:
     gremlins_locations: Locations = key((), _PINNED)
     gremlins_rots: tuple[float, ...] = key((), _YAWS)
     gremlins_keepout: NotNegative = key(0.5, _KEEPOUT)
-    gremlins_travel: NotNegative = key(0.3, "radius of the circle that they run [m]")
+    gremlins_travel: NotNegative = key(0.3, "radius of the circle on which they move [m]")
     gremlins_size: Positive = key(0.1, "half side [m]")
-    gremlins_density: Positive = key(0.001, "of gremlins")
-    gremlins_contact_cost: NotNegative = key(1.0, "per contact point with the robot")
+    gremlins_density: Positive = key(0.001, "density of gremlins")
+    gremlins_contact_cost: NotNegative = key(1.0, "cost per contact point with the robot")
     gremlins_dist_threshold: NotNegative = key(0.2, _UNUSED)
     gremlins_dist_cost: float = key(1.0, _UNUSED)
 
     # rendering
-    render_labels: bool = key(False, "write the objects' names at them")
+    render_labels: bool = key(False, "show the names of objects")
     render_lidar_markers: bool = key(True, "draw lidars as rings above the robot")
-    render_lidar_radius: Positive = key(0.15, "of the rings [m]")
+    render_lidar_radius: Positive = key(0.15, "radius of the rings [m]")
     render_lidar_size: Positive = key(0.025, "radius of a ring's spheres [m]")
     render_lidar_offset_init: float = key(0.5, "height of the lowest ring above the robot [m]")
-    render_lidar_offset_delta: float = key(0.06, "and of every ring above the one below [m]")
+    render_lidar_offset_delta: float = key(0.06, "distance of a ring from the one below [m]")
     floor_display_mode: bool = key(False, "crop the visible floor to the placements")
