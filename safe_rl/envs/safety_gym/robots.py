@@ -10,11 +10,10 @@ from __future__ import annotations
 import hashlib
 import math
 import shutil
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
-from xml.etree import ElementTree
 
 import mujoco
 
@@ -22,12 +21,9 @@ from safe_rl.envs.errors import ConfigError, nearest
 
 
 def fingerprint(path: Path) -> str:
-    """Return a hash of the contents of a robot's files."""
-    digest = hashlib.sha256()
-    for file in robot_files(path):
-        content = file.read_bytes()
-        digest.update(f"{len(content)} ".encode() + content)
-    return digest.hexdigest()
+    """Return a hash of the contents of a robot's files, whatever they are called."""
+    contents = sorted(hashlib.sha256(file.read_bytes()).hexdigest() for file in robot_files(path))
+    return hashlib.sha256(" ".join(contents).encode()).hexdigest()
 
 
 def robot_files(path: Path) -> list[Path]:
@@ -36,46 +32,11 @@ def robot_files(path: Path) -> list[Path]:
     Raises:
         ConfigError: if one cannot be read.
     """
-    found: dict[Path, None] = {}
-    _collect(path, path.parent, dict.fromkeys(("mesh", "texture"), path.parent), found)
-    return list(found)
-
-
-def _collect(path: Path, home: Path, folders: Mapping[str, Path], found: dict[Path, None]) -> None:
-    """Add a file and all that it names to `found`.
-
-    All paths are relative to `home`, the folder of the robot's own file; `folders` are where MuJoCo
-    looks for textures and meshes.
-    """
-    if path in found:
-        return
-    found[path] = None
     try:
-        root = ElementTree.fromstring(path.read_bytes())
-    except (ElementTree.ParseError, OSError, ValueError) as error:
-        message = f"'robot_base': MuJoCo cannot load {path}: {error}"
-        raise ConfigError(message) from error
-    for compiler in root.iter("compiler"):
-        for kind in folders:
-            place = compiler.get(f"{kind}dir", compiler.get("assetdir"))
-            folders = folders if place is None else {**folders, kind: home / place}
-    for element in root.iter():
-        for file in _named_files(element, home, folders):
-            if file.suffix == ".xml":
-                _collect(file, home, folders, found)
-            else:
-                found[file] = None
-
-
-def _named_files(
-    element: ElementTree.Element, home: Path, folders: Mapping[str, Path]
-) -> Iterator[Path]:
-    """The files that an element names, where MuJoCo looks for them."""
-    is_xml = element.tag in ("include", "model")
-    folder = home if is_xml else folders["texture" if element.tag == "texture" else "mesh"]
-    for name, value in element.attrib.items():
-        if name.startswith("file") and (folder / value).is_file():
-            yield folder / value
+        named = mujoco.mju_getXMLDependencies(str(path))
+    except mujoco.FatalError as error:
+        raise ConfigError(f"'robot_base': MuJoCo cannot load {path}: {error}") from error
+    return [file for file in map(Path, named) if file.is_file()]
 
 
 BUNDLED = Path(__file__).parent / "robots"
