@@ -9,10 +9,9 @@ from typing import Any, NamedTuple
 from safe_rl.envs.errors import ConfigError
 
 COST = "cost"
-_COLUMN_FORM = "'{cost_position: [0, -0.5, 0.5]}': column of the observation, lowest, highest"
-_ENTRY_FORM = (
-    "'{cost_speed: [thdot, -4, 4]}': entry, lowest, highest; of an entry with several numbers "
-    "[observation, 2, -4, 4], with the column"
+_FORM = (
+    "'{cost_speed: [2, -4, 4]}': column of the observation, lowest, highest; of another entry "
+    "[thdot, -4, 4], or with the column, [thdot, 0, -4, 4]"
 )
 
 
@@ -37,13 +36,12 @@ def is_cost(name: Any) -> bool:
     return name == COST or str(name).startswith(f"{COST}_")
 
 
-def parse_ranges(outside: Any, entry: str | None = None) -> dict[str, CostRange]:
+def parse_ranges(outside: Any) -> dict[str, CostRange]:
     """Return the ranges of the key `outside` by the name of their cost.
 
     Args:
-        outside: Name -> (column, lowest, highest) of `entry`; without `entry`, name -> (entry,
-            lowest, highest) or (entry, column, lowest, highest). None is no range at all.
-        entry: The entry that all columns belong to.
+        outside: Name -> (entry, column, lowest, highest). Without an entry it is the observation,
+            without a column the first one. None is no range at all.
 
     Raises:
         ConfigError: Naming what is wrong.
@@ -52,18 +50,15 @@ def parse_ranges(outside: Any, entry: str | None = None) -> dict[str, CostRange]
         >>> parse_ranges({"cost_speed": ["thdot", -4, 4]})
         {'cost_speed': CostRange(entry='thdot', column=0, low=-4, high=4)}
     """
-    form = _ENTRY_FORM if entry is None else _COLUMN_FORM
     if outside is not None and not isinstance(outside, Mapping):
-        raise ConfigError(f"'outside' must be as {form}; got {outside!r}.")
+        raise ConfigError(f"'outside' must be as {_FORM}; got {outside!r}.")
     ranges = {}
     for name, row in (outside or {}).items():
         full = list(row) if isinstance(row, list | tuple) else []
-        if entry is not None:
-            full = [entry, *full]
-        elif len(full) == 3:
-            full.insert(1, 0)
+        if len(full) == 3:
+            full = [full[0], 0, *full[1:]] if isinstance(full[0], str) else ["observation", *full]
         if not _is_range(full):
-            raise ConfigError(f"'outside' must be as {form}; got {name}: {row!r}.")
+            raise ConfigError(f"'outside' must be as {_FORM}; got {name}: {row!r}.")
         kept = CostRange(full[0], int(full[1]), *full[2:])
         if not kept.low <= kept.high or (math.isinf(kept.low) and math.isinf(kept.high)):
             raise ConfigError(f"'outside': {name} has the range {kept.low} to {kept.high}.")

@@ -11,7 +11,6 @@ __all__ = [
     "nearest",
     "on_cpu_only",
     "require_integer",
-    "require_names",
 ]
 
 
@@ -38,10 +37,3 @@ def require_integer(name: str, value: Any, lowest: int, highest: int = 2**63 - 1
     """Raise ConfigError unless an argument is an integer between the bounds."""
     if isinstance(value, bool) or not isinstance(value, int) or not lowest <= value <= highest:
         raise ConfigError(f"'{name}' must be an integer of at least {lowest}, got {value!r}.")
-
-
-def require_names(name: str, value: Any) -> None:
-    """Raise ConfigError unless it is None or a list of names; one name alone is none."""
-    is_list = isinstance(value, list | tuple) and all(isinstance(item, str) for item in value)
-    if value is not None and not is_list:
-        raise ConfigError(f"'{name}' must be a list of names, as [first, second]; got {value!r}.")

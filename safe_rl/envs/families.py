@@ -31,7 +31,6 @@ _MUJOCO = {"backend": "mujoco", "parallel": False}
 TORCHRL_CLASSES: dict[str, Mapping[str, Any]] = {
     "PendulumEnv": {},
     "FinancialRegimeEnv": {},
-    "GymEnv": {"categorical_action_encoding": True},
     **dict.fromkeys(("AntEnv", "HopperEnv", "HumanoidEnv", "Walker2dEnv"), _MUJOCO),
 }
 """Classes of `torchrl.envs` that need no `import=`, and the arguments that they get by default."""
@@ -95,19 +94,14 @@ def hint_of_gymnasium(name: str) -> str:
     return f" It is one of Gymnasium's: env=gymnasium env.id={name}."
 
 
-def _refuse_module(key: str, name: str, instead: str) -> None:
-    """Refuse `module:Name-v0`, for which a library imports the module."""
-    module, _, plain = name.rpartition(":")
-    if module:
-        raise ConfigError(
-            f"{key}={name}: configurations import nothing. If you trust '{module}', use "
-            f"import={module} {instead}{plain}"
-        )
-
-
 def _check_gymnasium(node: Mapping[str, Any]) -> None:
-    _refuse_module("env.id", node["id"], "env.id=")
-    parse_ranges(node.get("outside"), "observation")
+    module, _, plain = node["id"].rpartition(":")
+    if module:  # which Gymnasium would import
+        raise ConfigError(
+            f"env.id={node['id']}: configurations import nothing. If you trust '{module}', use "
+            f"import={module} env.id={plain}"
+        )
+    parse_ranges(node.get("outside"))
 
 
 def _check_torchrl(node: Mapping[str, Any]) -> None:
@@ -120,8 +114,6 @@ def _check_torchrl(node: Mapping[str, Any]) -> None:
             "env.id=my_module.NAME, and one of Gymnasium's by its id with env=gymnasium."
         )
     parse_ranges(node["outside"])
-    known_name = (node["kwargs"] or {}).get("env_name", "")
-    _refuse_module("env.kwargs.env_name", str(known_name), "and env_name: ")
 
 
 _Names, _Arguments = list[Text] | None, Mapping[str, Any] | None

@@ -89,32 +89,22 @@ def test_workers_without_a_state_to_continue_from_have_rows_of_their_own():
     ("keys", "message"),
     [
         ({"id": None}, r"env\.id="),
-        ({"id": "Walk-v1"}, "Walk-v1.*Did you mean 'Walk-v0'"),
         ({"id": "Wolk-v0"}, "Did you mean 'Walk-v0'.*import=my_module"),
         ({"id": "os.path:Walk-v0"}, "import=os.path env.id=Walk-v0"),
         ({"border": 3}, "no key 'border'.*env.kwargs"),
         ({"num_step": 3}, "no key 'num_step'. Did you mean 'num_steps'"),
         ({"num_steps": 0}, "'num_steps' must be a whole number from 1"),
         ({"cost_keys": None}, "Walk-v0.*reports no costs.*'cost_keys'"),
-        ({"id": "Cliff-v0", "cost_keys": None}, "that are arrays.*flatten=true"),
         ({"kwargs": {"speed": 3}}, "Walk-v0.*speed"),
-        ({"kwargs": 3, "num_steps": 5}, "'kwargs' must be a mapping"),
         ({"cost_keys": "fast", "num_steps": 5}, "'cost_keys' must be a list.*'fast'"),
-        ({"cost_keys": []}, "'cost_keys' is empty"),
-        ({"cost_keys": ["fast", "reward"]}, "'reward' is none of them"),
-        ({"flatten": "ture"}, "'flatten' must be true or false"),
+        ({"cost_keys": []}, "what does a step cost"),
+        ({"cost_keys": ["fast", "reward"]}, "'reward' is a state.*stays"),
         ({"outside": {"cost_x": [float("inf"), 0, 1]}}, "'outside' must be as"),
     ],
 )
 def test_what_cannot_be_made_is_said(keys, message):
     with pytest.raises(ConfigError, match=message):
         make_env({**NODE, **keys})
-
-
-def test_an_unknown_name_is_said_once_where_costs_are_to_be_found_out():
-    with pytest.raises(ConfigError, match="Did you mean 'Walk-v0'") as error:
-        complete_env({**NODE, "id": "Wolk-v0", "cost_keys": None})
-    assert str(error.value).count("env.id=") == 1
 
 
 def test_nested_observations_are_trained_on_entry_by_entry(tmp_path):
@@ -162,14 +152,18 @@ def test_registered_arguments_and_limits_are_kept():
 @pytest.mark.parametrize(
     ("outside", "reported", "bounds"),
     [
-        ({"cost_a": [0, -1, 1]}, None, [1.0, 1.0]),
-        ({"cost_a": [0, -1, 1], "cost_b": [2, -0.1, 0.1]}, None, [2.0, 1.0, 1.0]),
-        ({"cost_a": [0, -1, 1]}, ["cost_told"], None),
+        ({"cost_a": [1, -0.3, 0.3]}, None, [1.0, 1.0]),
+        ({"cost_a": [1, -0.3, 0.3], "cost_b": [2, -0.1, 0.1]}, None, [2.0, 1.0, 1.0]),
+        ({"cost_a": [1, -0.3, 0.3]}, ["cost_told"], None),
     ],
 )
 def test_costs_of_ranges_are_bounded_in_the_spec_and_stand_beside_others(outside, reported, bounds):
     node = {**NODE, "id": "CartPole-v1", "num_steps": 10, "outside": outside}
     env = make_env(node | {"cost_keys": reported}, num_envs=2, seed=0)
+    step = env.rollout(10)["next"]
+    left = step["observation"][..., 1:2].abs() > 0.3
+    torch.testing.assert_close(step["cost_a"], left.float())
+    assert 0 < left.sum() < left.numel()
     assert env.cost_keys == ["cost", *(reported or []), *outside]
     if bounds:
         assert [env.full_reward_spec[k].high.max().item() for k in env.cost_keys] == bounds

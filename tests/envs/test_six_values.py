@@ -6,11 +6,9 @@ from pathlib import Path
 import gymnasium
 import pytest
 import torch
-from commands import run_train
 from torchrl.envs.utils import check_env_specs
 
 from safe_rl.envs import ConfigError, from_six_values, make_env
-from safe_rl.runs.table import read_table
 
 NODE = {
     "_target_": "safe_rl.envs.gymnasium.make_safety_gymnasium",
@@ -67,19 +65,6 @@ def test_choices_and_dictionaries_become_integers_and_vectors():
     torch.testing.assert_close(seen[..., :4].argmax(-1), taken["action"])
     torch.testing.assert_close(seen[..., 4:], torch.ones(3, 9, 2))
     assert taken["next", "truncated"][:, 5].all()
-
-
-def test_it_is_trained_on(tmp_path):
-    run_train(
-        *("env=safety_gymnasium", "env.id=SafetyIce1-v0", "num_envs=4", "num_threads=1"),
-        *("frames_per_batch=80", "frames=160", "logger=none", "model.hidden_sizes=[8]"),
-        *("cost_limits={cost_right: 3}", "env.kwargs={border: 1.5}"),
-        *("policy_update.minibatch_size=40", "critic_update.minibatch_size=40"),
-        f"hydra.run.dir={tmp_path / 'ice'}",
-    )
-    table = read_table(tmp_path / "ice" / "progress.csv")
-    assert table["steps"] == [80, 160]
-    assert all(cost > 0 for cost in table["episode_cost_right"])
 
 
 @pytest.mark.parametrize(

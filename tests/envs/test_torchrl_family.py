@@ -4,8 +4,6 @@ import json
 import shutil
 from pathlib import Path
 
-import gymnasium
-import gymnasium_envs  # noqa: F401, registers Walk-v0
 import pytest
 import torch
 import torchrl_envs
@@ -24,7 +22,6 @@ from safe_rl.targets import TargetError
 TARGET = "safe_rl.envs.torchrl.make_torchrl"
 OUTSIDE = {"cost_speed": ["thdot", -4, 4]}
 PENDULUM = {"_target_": TARGET, "id": "PendulumEnv", "num_steps": 30, "outside": OUTSIDE}
-GYM = {"_target_": TARGET, "id": "GymEnv", "kwargs": {"env_name": "Pendulum-v1"}}
 RUNNER = {"_target_": TARGET, "id": "torchrl_envs.Runner", "num_steps": 5}
 SMALL = (
     *("env=torchrl", "env.id=PendulumEnv", "env.num_steps=20", "num_envs=4"),
@@ -75,7 +72,7 @@ def test_it_resumes_is_evaluated_and_reported(run, tmp_path, capsys):
     assert "PendulumEnv" in (folder.parent / "report" / "runs.csv").read_text()
 
 
-@pytest.mark.parametrize("name", sorted(set(TORCHRL_CLASSES) - {"GymEnv"}))
+@pytest.mark.parametrize("name", TORCHRL_CLASSES)
 def test_specs_hold_for_every_row(name):
     entry = {"PendulumEnv": "thdot", "FinancialRegimeEnv": "entry_price"}.get(name, "observation")
     node = {"_target_": TARGET, "id": name, "outside": {"cost_far": [entry, -1, 1]}}
@@ -118,35 +115,6 @@ def test_rows_end_and_begin_apart():
         assert (same == ~done).all()
         ended.append(done.tolist())
     assert [[row[i] for row in ended].index(True) for i in range(3)] == [7, 1, 4]
-
-
-def test_gymnasiums_environments_step_as_they_do_there():
-    node = GYM | {"outside": {"cost_speed": ["observation", 2, -4, 4]}}
-    env = make_env(node, num_envs=2, seed=3)
-    assert env.max_episode_steps == 200
-    state = env.reset()
-    plain = gymnasium.make("Pendulum-v1")
-    plain.reset(seed=0)
-    x, y, speed = state["observation"][1].double().tolist()
-    plain.unwrapped.state = [torch.atan2(torch.tensor(y), torch.tensor(x)).item(), speed]
-    for action in (0.3, -0.9, 1.0, 1.0, 1.0):
-        state["action"] = torch.tensor([[0.0], [action]])
-        step = env.step(state)["next"]
-        observation, reward, *_ = plain.step([2 * action])
-        torch.testing.assert_close(
-            step["observation"][1], torch.from_numpy(observation), rtol=1e-4, atol=1e-4
-        )
-        assert step["reward"][1].item() == pytest.approx(reward, rel=1e-3, abs=1e-3)
-        assert step["cost"][1].item() == float(abs(observation[2]) > 4)
-        state = step
-    discrete = GYM | {"kwargs": {"env_name": "CartPole-v1"}}
-    discrete |= {"outside": {"cost_position": ["observation", 0, -0.05, 0.05]}}
-    env = make_env(discrete, num_envs=3, seed=0)
-    check_env_specs(env)
-    step = env.rollout(60, break_when_any_done=False)["next"]
-    far = step["observation"][..., :1].abs() > 0.05
-    torch.testing.assert_close(step["cost"], far.float())
-    assert 0 < far.sum() < far.numel()
 
 
 def test_costs_may_be_entries_ranges_and_functions_at_once(trusted):
@@ -209,8 +177,6 @@ def test_seeds_determine_rows_and_share_none():
         ({"cost_keys": ["cost_none"]}, "no entry 'cost_none'"),
         *(({"cost_keys": [key]}, f"'{key}' is a state.*env.outside") for key in ("th", "reward")),
         ({"kwargs": {"mass": 3}}, "env.id=PendulumEnv: TypeError.*mass"),
-        ({**GYM, "kwargs": {"env_name": "os.path:Walk-v0"}}, "import=os.path and env_name: Walk"),
-        ({**GYM, "kwargs": {"env_name": "Pendulum-v9"}}, "env.id=GymEnv: VersionNotFound.*`v9`"),
         ({"cost": 3}, "'cost' names a function"),
     ],
 )

@@ -8,23 +8,25 @@ from inspect import signature
 from typing import Any
 
 import gymnasium
-import numpy as np
 import torch
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from torchrl.envs import GymWrapper
 
-from safe_rl.envs.costs import COST, is_cost, parse_ranges
-from safe_rl.envs.errors import ConfigError, nearest, require_integer, require_names
+from safe_rl.envs.costs import COST, is_cost
+from safe_rl.envs.errors import ConfigError, nearest, require_integer
 from safe_rl.envs.families import GYMNASIUM, SAFETY_GYMNASIUM, ForeignFamily, complete_foreign
-from safe_rl.envs.gymnasium.env_wrappers import CostsOutside, SixValues, adapt, make_adapted
+from safe_rl.envs.gymnasium.env_wrappers import SixValues, make_adapted
 from safe_rl.envs.gymnasium.gymnasium_env import CostReader, GymnasiumEnv
 from safe_rl.envs.rng import spread_seed
+from safe_rl.envs.torchrl.step_entries import dotted
 
 __all__ = ["from_gymnasium", "from_six_values", "make_gymnasium", "make_safety_gymnasium"]
 
 MakeEnv = Callable[[], gymnasium.Env]
-_FAILURES = (AssertionError, gymnasium.error.Error, TypeError, ValueError)
-_NO_COSTS = {"observation", "action", "reward", "done", "terminated", "truncated"}
+_FAILURES = (
+    *(AssertionError, NotImplementedError, TypeError, ValueError),
+    gymnasium.error.Error,
+)
 
 
 def from_gymnasium(
@@ -32,11 +34,11 @@ def from_gymnasium(
     *,
     num_envs: int = 1,
     cost_keys: Sequence[str] | None = None,
+    outside: Mapping[str, Sequence[Any]] | None = None,
     num_steps: int | None = None,
     seed: int | None = None,
     device: torch.device | str = "cpu",
     flatten: bool = True,
-    highest_costs: Mapping[str, float] | None = None,
     **kwargs: Any,
 ) -> GymnasiumEnv:
     """Make a TorchRL environment of any Gymnasium environment that reports costs in `info`.
@@ -50,13 +52,13 @@ def from_gymnasium(
         num_envs: Number of environments, N.
         cost_keys: Names of the costs in `info`; None finds those called `cost` or `cost_<kind>` by
             taking one step.
+        outside: Cost key -> a range that costs 1 to leave: (column of the observation, lowest,
+            highest), or of a dictionary (entry, column, lowest, highest).
         num_steps: The largest number of steps of an episode; None takes what the id says.
         seed: Of all environments; row k has this one plus k.
         device: Where the TensorDicts live.
         flatten: Make one vector of every observation; False leaves pictures and dictionaries as
             they are.
-        highest_costs: Cost key -> the most that a step can cost, if that is known, for the specs
-            and for certificates.
         kwargs: For `gymnasium.make`, with an id.
 
     Returns:
@@ -65,8 +67,8 @@ def from_gymnasium(
         the environments inside do.
 
     Raises:
-        ValueError: If no costs are reported, actions are neither continuous and bounded nor
-            choices, observations are no arrays, or the length of episodes is not known.
+        ValueError: If there are no costs, actions are neither continuous and bounded nor choices,
+            observations are no arrays, or the length of episodes is not known.
 
     Examples:
         >>> env = from_gymnasium("Safexp-PointGoal1-v0", num_envs=2, num_steps=1000, seed=0)
@@ -74,16 +76,16 @@ def from_gymnasium(
         torch.Size([2, 3, 1])
     """
     require_integer("num_envs", num_envs, lowest=1)
-    require_names("cost_keys", cost_keys)
     make = _maker(env, kwargs, num_steps)
-    keys, length = _describe(make, cost_keys, num_steps, flatten)
-    _check_keys(keys, highest_costs or {})
+    keys, length = _describe(make, cost_keys, num_steps, outside)
     make_one = partial(make_adapted, make, length, flatten, keys)
     worlds = SyncVectorEnv([make_one] * num_envs, autoreset_mode=AutoresetMode.DISABLED)
     worlds.env_fns = ()  # not needed again, and custom functions might not be pickled
     base = GymWrapper(worlds, device=torch.device(device), categorical_action_encoding=True)
-    base.set_info_dict_reader(CostReader(keys, [num_envs], highest_costs, patience=length))
-    batch = GymnasiumEnv(base, keys, length)
+    observed = list(map(dotted, base.observation_spec.keys(True, True)))
+    base.set_info_dict_reader(CostReader(keys, num_envs, patience=length))
+    config = {"cost_keys": keys, "outside": outside, "observe": observed, "flatten": flatten}
+    batch = GymnasiumEnv(base, {**config, "cost": None, "num_steps": length})
     batch.set_seed(int(torch.randint(2**31, ())) if seed is None else seed)
     return batch
 
@@ -121,48 +123,30 @@ def from_six_values(
             f"Give a function that makes one environment; num_envs=… makes several. Got {env!r}."
         )
     keys = None if cost_keys is None else [COST, *(key for key in cost_keys if key != COST)]
-    return from_gymnasium(partial(_wrapped, SixValues, env), cost_keys=keys, **settings)
+    return from_gymnasium(partial(_six_values, env), cost_keys=keys, **settings)
 
 
-def make_gymnasium(
-    config: Mapping[str, Any],
-    *,
-    num_envs: int,
-    device: torch.device | str = "cpu",
-    seed: int | None = None,
-    num_threads: int = 0,
-) -> GymnasiumEnv:
+def make_gymnasium(config: Mapping[str, Any], **settings: Any) -> GymnasiumEnv:
     """Make environments of an id that is registered with Gymnasium: `env=gymnasium env.id=…`.
 
     Args:
         config: `id` and any other key of conf/env/gymnasium.yaml.
-        num_envs: Number of environments, N.
-        device: Where the TensorDicts live.
-        seed: Determines every row; rows of different seeds have nothing in common.
-        num_threads: Not used by these environments.
+        settings: `num_envs`, `device`, `seed` and `num_threads`; the last one is not used. Rows of
+            different seeds have nothing in common.
 
     Raises:
         ConfigError: For an unknown key or id, or an environment that the algorithms cannot use.
     """
-    return _make_node(GYMNASIUM, _registered, config, num_envs, device, seed)
+    return _make_node(GYMNASIUM, _registered, config, **settings)
 
 
-def make_safety_gymnasium(
-    config: Mapping[str, Any],
-    *,
-    num_envs: int,
-    device: torch.device | str = "cpu",
-    seed: int | None = None,
-    num_threads: int = 0,
-) -> GymnasiumEnv:
-    """Make environments of an id that `safety_gymnasium.make` knows.
-
-    The arguments are those of `make_gymnasium`, with the keys of conf/env/safety_gymnasium.yaml.
+def make_safety_gymnasium(config: Mapping[str, Any], **settings: Any) -> GymnasiumEnv:
+    """Make environments of an id that `safety_gymnasium.make` knows, as `make_gymnasium`.
 
     Raises:
-        ConfigError: For an unknown key or id, or if the package cannot be imported.
+        ConfigError: As there, and if the package cannot be imported.
     """
-    return _make_node(SAFETY_GYMNASIUM, _of_safety_gymnasium, config, num_envs, device, seed)
+    return _make_node(SAFETY_GYMNASIUM, _of_safety_gymnasium, config, **settings)
 
 
 def _make_node(
@@ -170,22 +154,22 @@ def _make_node(
     maker: Callable[[Mapping[str, Any]], MakeEnv],
     config: Mapping[str, Any],
     num_envs: int,
-    device: torch.device | str,
-    seed: int | None,
+    device: torch.device | str = "cpu",
+    seed: int | None = None,
+    num_threads: int = 0,
 ) -> GymnasiumEnv:
     config = complete_foreign(family, config)
-    outside = list(config.get("outside") or {})
     make = maker(config)
     try:
         return from_gymnasium(
             make,
             num_envs=num_envs,
-            cost_keys=[*dict.fromkeys([*config["cost_keys"], *outside])],
+            cost_keys=config["cost_keys"],
+            outside=config.get("outside"),
             num_steps=config["num_steps"],
             seed=None if seed is None else spread_seed(seed),
             flatten=config.get("flatten", True),
             device=device,
-            highest_costs=dict.fromkeys(outside, 1.0),
         )
     except _FAILURES as error:
         raise ConfigError(f"env.id={config['id']}: {error}") from error
@@ -195,15 +179,15 @@ def _describe_node(
     maker: Callable[[Mapping[str, Any]], MakeEnv], config: Mapping[str, Any]
 ) -> tuple[list[str], int]:
     """Cost keys and length of episodes of a node, found out where they are None."""
-    make, flatten = maker(config), config.get("flatten", True)
+    make, outside = maker(config), config.get("outside")
     try:
-        return _describe(make, config["cost_keys"], config["num_steps"], flatten)
+        return _describe(make, config["cost_keys"], config["num_steps"], outside)
     except _FAILURES as error:
         raise ConfigError(f"env.id={config['id']}: {error}") from error
 
 
 def _describe(
-    make: MakeEnv, cost_keys: Sequence[str] | None, num_steps: int | None, flatten: bool
+    make: MakeEnv, cost_keys: Sequence[str] | None, num_steps: int | None, outside: Any
 ) -> tuple[list[str], int]:
     if num_steps is not None:
         require_integer("num_steps", num_steps, lowest=1)
@@ -211,12 +195,18 @@ def _describe(
     if not isinstance(probe, gymnasium.Env):
         raise ConfigError(f"It makes no environment of Gymnasium (gymnasium.Env), but {probe!r}.")
     try:
-        adapted = adapt(probe, flatten=flatten)
-        keys = _find_costs(adapted) if cost_keys is None else [*dict.fromkeys(cost_keys)]
-        known = None if adapted.spec is None else adapted.spec.max_episode_steps
+        keys = _find_costs(probe) if cost_keys is None else [*dict.fromkeys(cost_keys)]
+        if cost_keys is None and not keys and not outside:
+            raise ValueError(
+                f"{probe.unwrapped} reports no costs: there is no 'cost' or 'cost_<kind>' in its "
+                "info. If a cost is called otherwise, or is not reported at every step, name it "
+                "in 'cost_keys'; 'outside' makes a cost of leaving a range: "
+                "env.outside='{cost_position: [0, -0.5, 0.5]}'."
+            )
+        known = None if probe.spec is None else probe.spec.max_episode_steps
         length = known if num_steps is None else num_steps
         if length is None:
-            raise ValueError(f"{adapted} does not say how long episodes are: give 'num_steps'.")
+            raise ValueError(f"{probe} does not say how long episodes are: give 'num_steps'.")
         return keys, length
     finally:
         probe.close()
@@ -235,27 +225,11 @@ def _maker(env: Any, kwargs: Mapping[str, Any], num_steps: int | None) -> MakeEn
     return env
 
 
-def _check_keys(keys: Sequence[str], highest_costs: Mapping[str, float]) -> None:
-    if not keys:
-        raise ValueError("'cost_keys' is empty: name costs in info, or leave it away (null).")
-    for key in _NO_COSTS.intersection(keys):
-        raise ValueError(f"'cost_keys' are names of numbers in info, and '{key}' is none of them.")
-    for key in set(highest_costs).difference(keys):
-        raise ValueError(f"'highest_costs' has '{key}', which is no cost.{nearest(key, keys)}")
-
-
 def _find_costs(probe: gymnasium.Env) -> list[str]:
+    probe.action_space.seed(0)
     probe.reset(seed=0)
-    *_, info = probe.step(np.zeros(probe.action_space.shape, dtype=probe.action_space.dtype))
-    keys = [key for key in info if is_cost(key)]
-    if not keys:
-        raise ValueError(
-            f"{probe.unwrapped} reports no costs: there is no 'cost' or 'cost_<kind>' in its info, "
-            f"which has {', '.join(sorted(info)) or 'nothing'}. If a cost is called otherwise, or "
-            "is not reported at every step, name it in 'cost_keys'; 'outside' makes a cost of "
-            "leaving a range: env.outside='{cost_position: [0, -0.5, 0.5]}'."
-        )
-    return keys
+    *_, info = probe.step(probe.action_space.sample())
+    return [key for key in info if is_cost(key)]
 
 
 def _arguments(config: Mapping[str, Any]) -> dict[str, Any]:
@@ -274,9 +248,7 @@ def _registered(config: Mapping[str, Any]) -> MakeEnv:
             f"env.id={env_id}: {error} {nearest(env_id, gymnasium.registry)} A module that "
             "registers an environment is imported by import=my_module."
         ) from error
-    make = partial(gymnasium.make, spec, **_arguments(config))
-    ranges = parse_ranges(config["outside"], "observation")
-    return partial(_wrapped, partial(CostsOutside, ranges=ranges), make) if ranges else make
+    return partial(gymnasium.make, spec, **_arguments(config))
 
 
 def _of_safety_gymnasium(config: Mapping[str, Any]) -> MakeEnv:
@@ -290,11 +262,11 @@ def _of_safety_gymnasium(config: Mapping[str, Any]) -> MakeEnv:
             "beside it. Environments of yours with six values need no package: from_six_values."
         ) from error
     make = partial(safety_gymnasium.make, config["id"], **_arguments(config))
-    return partial(_wrapped, SixValues, make)
+    return partial(_six_values, make)
 
 
-def _wrapped(wrapper: Callable[[gymnasium.Env], gymnasium.Env], make: MakeEnv) -> gymnasium.Env:
-    return wrapper(make())
+def _six_values(make: MakeEnv) -> gymnasium.Env:
+    return SixValues(make())
 
 
 describe_gymnasium = partial(_describe_node, _registered)

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import math
-import reprlib
 import warnings
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -11,147 +9,67 @@ from typing import Any
 import numpy as np
 import torch
 from tensordict import TensorDictBase
-from torch import Tensor
-from torchrl.data import Bounded, Composite, TensorSpec, Unbounded
-from torchrl.envs import GymWrapper, Transform, TransformedEnv
+from torchrl.data import Composite, Unbounded
 from torchrl.envs.gym_like import BaseInfoDictReader
 
-from safe_rl import naming
-from safe_rl.envs.contract import ConstrainedEnv, add_columns
-from safe_rl.envs.costs import COST
-from safe_rl.envs.errors import ConfigError, nearest
+from safe_rl.envs.errors import nearest
+from safe_rl.envs.torchrl.torchrl_env import TorchRLEnv
 
-__all__ = ["CostReader", "GymnasiumEnv", "cost_spec"]
-
-_MISSPELT = 0.85
-"""Likeness above which two names are thought to be one."""
+__all__ = ["CostReader", "GymnasiumEnv"]
 
 
 class CostReader(BaseInfoDictReader):
     """Reads costs from `info` into the TensorDict, float32 [N, 1]; 0 where none is reported.
 
     Some environments report a cost only where it occurs. A warning names, once, a cost that no
-    `info` has had for `patience` steps. A name that is missing while `info` has nearly the same one
-    is an error.
+    `info` has had for `patience` steps.
 
     Args:
         cost_keys: Names in `info`.
-        batch_size: [N], or [] of a single environment.
-        highest: Name -> the most that a step can cost, where that is known.
-        patience: Steps until the warning; None: never.
-
-    Raises:
-        ConfigError: By the call, if a cost is not one number per step, or its name is misspelt.
+        num_envs: N.
+        patience: Steps until the warning.
     """
 
-    def __init__(
-        self,
-        cost_keys: Sequence[str],
-        batch_size: Sequence[int],
-        highest: Mapping[str, float] | None = None,
-        patience: int | None = None,
-    ) -> None:
-        self._cost_keys = list(cost_keys)
-        self._shape = (*batch_size, 1)
-        self._highest = dict(highest or {})
-        self._patience = patience
-        self._unseen, self._names = set(self._cost_keys), set[str]()
-        self._num_steps = 0
+    def __init__(self, cost_keys: Sequence[str], num_envs: int, patience: int) -> None:
+        self._cost_keys, self._shape = list(cost_keys), (num_envs, 1)
+        self._patience, self._num_steps = patience, 0
+        self._unseen, self._names = set(cost_keys), set[str]()
 
     def __call__(self, info_dict: dict[str, Any], tensordict: TensorDictBase) -> TensorDictBase:
         """Write the costs of a step."""
-        if "reward" in tensordict:
+        if "reward" in tensordict and self._unseen:
             self._look_at_names(info_dict)
         for key in self._cost_keys:
-            tensordict[key] = self._one_each(key, info_dict.get(key, np.zeros(self._shape)))
+            values = info_dict.get(key, np.zeros(self._shape))
+            tensordict[key] = torch.as_tensor(values, dtype=torch.float32).reshape(self._shape)
         return tensordict
-
-    def _one_each(self, key: str, value: Any) -> Tensor:
-        try:
-            return torch.as_tensor(value, dtype=torch.float32).reshape(self._shape)
-        except (TypeError, ValueError, RuntimeError):
-            raise ConfigError(
-                f"info['{key}'] must be one number per step, as a cost is; the steps of "
-                f"{math.prod(self._shape)} environments brought {reprlib.repr(value)}."
-            ) from None
 
     def _look_at_names(self, info_dict: Mapping[str, Any]) -> None:
         # names that begin so are Gymnasium's masks
-        new = {name for name in info_dict if not name.startswith("_")} - self._names
-        self._names |= new
-        self._unseen -= new
-        others = self._names.difference(self._cost_keys)
-        for key in self._unseen if new else ():
-            if alike := naming.nearest(key, others, _MISSPELT):
-                raise ConfigError(
-                    f"No info has the cost '{key}'. Did you mean '{alike}'? If there are both, "
-                    f"let every step report '{key}', or name both in 'cost_keys'."
-                )
+        self._names |= {name for name in info_dict if not name.startswith("_")}
+        self._unseen -= self._names
         self._num_steps += 1
-        if self._patience is not None and self._num_steps > self._patience:
-            for key in sorted(self._unseen):
-                warnings.warn(
-                    f"The cost '{key}' is in no info of the first {self._patience} steps, and "
-                    f"counts as 0.{nearest(key, others)} The infos have "
-                    f"{', '.join(sorted(others)) or 'no other'}. If it is reported only where it "
-                    "occurs, it may not have occurred yet.",
-                    stacklevel=3,
-                )
-            self._unseen.clear()
+        if self._num_steps <= self._patience:
+            return
+        for key in sorted(self._unseen):
+            others = sorted(self._names.difference(self._cost_keys))
+            warnings.warn(
+                f"The cost '{key}' is in no info of the first {self._patience} steps, and counts "
+                f"as 0.{nearest(key, others)} The infos have {', '.join(others) or 'no other'}. If "
+                "it is reported only where it occurs, it may not have occurred yet.",
+                stacklevel=3,
+            )
+        self._unseen.clear()
 
     @property
     def info_spec(self) -> Composite:
         """Shapes and types of the costs."""
-        costs = {key: cost_spec(self._highest.get(key), self._shape) for key in self._cost_keys}
+        costs = {key: Unbounded(self._shape) for key in self._cost_keys}
         return Composite(costs, shape=self._shape[:-1])
 
 
-class CostsAsRewards(Transform):
-    """Moves costs from the observations to the rewards; adds `cost`, the sum, if it is missing."""
-
-    def __init__(self, cost_keys: Sequence[str]) -> None:
-        super().__init__()
-        self._cost_keys = list(cost_keys)
-        self._sums = COST not in self._cost_keys
-
-    def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:
-        if self._sums:
-            costs = torch.stack([next_tensordict[key] for key in self._cost_keys])
-            next_tensordict[COST] = costs.sum(0)
-        return next_tensordict
-
-    def _reset(
-        self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
-    ) -> TensorDictBase:
-        return tensordict_reset.exclude(*self._cost_keys)
-
-    def transform_output_spec(self, output_spec: Composite) -> Composite:
-        """Move the specs of the costs."""
-        output_spec = super().transform_output_spec(output_spec)
-        rewards = output_spec["full_reward_spec"]
-        observations = output_spec["full_observation_spec"]
-        for key in self._cost_keys:
-            rewards[key] = observations[key]
-            del observations[key]
-        if self._sums:
-            rewards[COST] = _spec_of_sum([rewards[key] for key in self._cost_keys])
-        return output_spec
-
-
-class GymnasiumEnv(ConstrainedEnv, TransformedEnv):
-    """N environments of Gymnasium as one of TorchRL, made by `from_gymnasium`.
-
-    Attributes:
-        cost_keys: The aggregate `cost`, then one key per kind.
-        observation_layout: One component, the whole observation; of a dictionary, its entries.
-        max_episode_steps: The largest number of steps of an episode.
-    """
-
-    def __init__(self, base_env: GymWrapper, cost_keys: Sequence[str], num_steps: int) -> None:
-        super().__init__(base_env, CostsAsRewards(cost_keys))
-        self.cost_keys = [COST, *(key for key in cost_keys if key != COST)]
-        self.observation_layout = _columns(base_env.observation_spec["observation"])
-        self.max_episode_steps = num_steps
+class GymnasiumEnv(TorchRLEnv):
+    """N environments of Gymnasium as one of TorchRL, made by `from_gymnasium`."""
 
     @property
     def seconds_per_step(self) -> float | None:
@@ -183,28 +101,6 @@ class GymnasiumEnv(ConstrainedEnv, TransformedEnv):
         chosen = range(len(frames)) if rows is None else [rows] if isinstance(rows, int) else rows
         drawn = np.stack([_fit(np.asarray(frames[row]), width, height) for row in chosen])
         return drawn[0] if isinstance(rows, int) else drawn
-
-
-def cost_spec(
-    highest: float | None, shape: Sequence[int], device: torch.device | None = None
-) -> TensorSpec:
-    """Spec of a step's cost, float32, from 0 to the most that is known of it, if anything is."""
-    if highest is None:
-        return Unbounded(shape=shape, device=device)
-    return Bounded(0.0, highest, shape=shape, device=device, dtype=torch.float32)
-
-
-def _columns(spec: TensorSpec) -> dict[str, slice]:
-    """Columns of every component of N observations, of entries as if they were one vector."""
-    parts = dict(spec.items()) if isinstance(spec, Composite) else {"observation": spec}
-    sizes = {str(name): part.shape[1:].numel() for name, part in sorted(parts.items())}
-    return add_columns({}, sizes)
-
-
-def _spec_of_sum(specs: Sequence[TensorSpec]) -> TensorSpec:
-    highest = [float(spec.high.max()) for spec in specs if isinstance(spec, Bounded)]
-    is_known = len(highest) == len(specs)
-    return cost_spec(sum(highest) if is_known else None, specs[0].shape, specs[0].device)
 
 
 def _fit(picture: np.ndarray, width: int, height: int) -> np.ndarray:

@@ -10,14 +10,13 @@ import torch
 from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
 from torch.nn.functional import one_hot
-from torchrl.data import Binary, Categorical, Composite, NonTensor, TensorSpec, Unbounded
+from torchrl.data import Binary, Bounded, Categorical, Composite, NonTensor, TensorSpec, Unbounded
 from torchrl.envs import EnvBase
 from torchrl.envs.transforms import Transform
 
 from safe_rl.envs.contract import add_columns
 from safe_rl.envs.costs import COST, parse_ranges
 from safe_rl.envs.errors import ConfigError, nearest
-from safe_rl.envs.gymnasium.gymnasium_env import cost_spec
 from safe_rl.targets import locate
 
 __all__ = ["Observe", "StepCosts"]
@@ -40,7 +39,7 @@ class StepCosts(Transform):
     """Writes the costs of a step beside its reward, the sum first.
 
     Args:
-        env: What is stepped, [N]. One step is taken: only that tells what a function returns.
+        env: What is stepped, [N].
         config: A whole node: `cost_keys` (entries that are costs), `outside` (ranges), and `cost`,
             a function of a step as TorchRL has it, [N] or [N, 1], of one cost or several by name.
 
@@ -70,7 +69,7 @@ class StepCosts(Transform):
                     f"env.cost_keys: '{name}' is a state, an action, a reward or an end, and stays "
                     "one. Make a cost of it by env.outside, or by a function of yours (env.cost)."
                 )
-        self.names = list(self._costs(env.rand_step(env.reset())))
+        self.names = list(self._costs(env.fake_tensordict()))
 
     def _costs(self, step: TensorDictBase) -> dict[str, Tensor]:
         """All costs [N, 1] of a step [N] by name."""
@@ -122,8 +121,9 @@ class StepCosts(Transform):
         if COST not in highest and not self._entries and self._function is None:
             highest[COST] = float(len(highest))
         for name in self.names:
-            shape = (*rewards.shape, 1)
-            rewards[name] = cost_spec(highest.get(name), shape, rewards.device)
+            like: dict[str, Any] = {"shape": (*rewards.shape, 1), "device": rewards.device}
+            most = highest.get(name)
+            rewards[name] = Unbounded(**like) if most is None else Bounded(0.0, most, **like)
         return output_spec
 
 

@@ -12,14 +12,13 @@ import gymnasium
 import torch
 import torchrl.envs
 from tensordict import TensorDict, TensorDictBase
-from torchrl.data import Bounded
+from torchrl.data import Binary, Bounded, Categorical, OneHot
 from torchrl.envs import (
     ActionScaling,
     BatchSizeTransform,
     ClipTransform,
     Compose,
     EnvBase,
-    GymLikeEnv,
     SerialEnv,
     StepCounter,
     TransformedEnv,
@@ -46,19 +45,21 @@ _FAILURES = (ImportError, TypeError, ValueError, LookupError, gymnasium.error.Er
 class TorchRLEnv(ConstrainedEnv, TransformedEnv):
     """N environments of TorchRL with costs, made by `make_torchrl`.
 
+    Args:
+        base_env: What is stepped, [N].
+        config: `num_steps`, and the keys of `StepCosts` and `Observe`.
+        others: Transforms that come after the costs.
+
     Attributes:
         cost_keys: The aggregate `cost`, then one key per kind.
         observation_layout: Columns of every entry that is observed, as if all were one vector.
         max_episode_steps: The largest number of steps of an episode.
     """
 
-    def __init__(self, base_env: EnvBase, config: Mapping[str, Any]) -> None:
+    def __init__(self, base_env: EnvBase, config: Mapping[str, Any], *others: Transform) -> None:
         costs = StepCosts(base_env, config)
-        seen = TransformedEnv(base_env, costs.clone())
-        observe = Observe(seen, config)
-        length = StepCounter(max_steps=config["num_steps"], step_count_key=_STEP)
-        changes = Compose(costs, length, *_plain_actions(base_env), observe)
-        super().__init__(base_env, changes)
+        observe = Observe(TransformedEnv(base_env, costs.clone()), config)
+        super().__init__(base_env, Compose(costs, *others, *_plain_actions(base_env), observe))
         self.cost_keys = costs.names
         self.observation_layout = observe.layout
         self.max_episode_steps = int(config["num_steps"])
@@ -87,7 +88,8 @@ def make_torchrl(
         raise ConfigError(
             f"env.id={config['id']}: it must make an environment [N] or a single one, got {shown}."
         )
-    made = TorchRLEnv(env.to(torch.device(device)), config)
+    length = StepCounter(max_steps=config["num_steps"], step_count_key=_STEP)
+    made = TorchRLEnv(env.to(torch.device(device)), config, length)
     made.set_seed(int(torch.randint(2**31, ())) if seed is None else spread_seed(seed))
     return made
 
@@ -96,10 +98,7 @@ def describe_node(config: Mapping[str, Any]) -> tuple[list[str], int]:
     """Return the cost keys and the length of episodes of a node; one environment is asked."""
     env = _tried(config, _one)
     try:
-        known = getattr(env, "max_episode_steps", None)
-        if known is None and isinstance(env, GymLikeEnv):
-            known = getattr(env.spec, "max_episode_steps", None)
-        steps = config["num_steps"] or known
+        steps = config["num_steps"] or getattr(env, "max_episode_steps", None)
         if not isinstance(steps, int):
             raise ConfigError(
                 f"env.id={config['id']} does not say how long episodes are: give env.num_steps=…"
@@ -114,13 +113,19 @@ def describe_node(config: Mapping[str, Any]) -> tuple[list[str], int]:
 def _plain_actions(env: EnvBase) -> Iterator[Transform]:
     """Continuous actions are cut to [-1, 1] and stretched to the bounds; choices stay."""
     spec = env.action_spec
-    if not isinstance(spec, Bounded):
-        if spec.dtype.is_floating_point and not hasattr(spec.space, "n"):
-            raise ConfigError("The algorithms need actions that are bounded, or choices.")
-        return
-    if spec.dtype.is_floating_point:
+    if isinstance(spec, Bounded) and spec.dtype.is_floating_point:
         yield ActionScaling()
         yield ClipTransform(in_keys_inv=["action"], low=-1.0, high=1.0)
+        return
+    if isinstance(spec, Bounded):  # a MultiDiscrete of several environments
+        is_choice = not spec.space.low.any()
+    else:
+        is_choice = isinstance(spec, Categorical | OneHot) and not isinstance(spec, Binary)
+    if not is_choice:
+        raise ConfigError(
+            "The algorithms need actions that are continuous and bounded (a Box) or choices "
+            f"(Discrete, MultiDiscrete), got {type(spec).__name__} {spec.dtype}."
+        )
 
 
 def _tried(config: Mapping[str, Any], make_some: Callable[[MakeEnv], EnvBase]) -> EnvBase:
