@@ -122,16 +122,6 @@ def cost_keys(rows: Sequence[Cost]) -> list[str]:
     return ["cost", *(row.key for row in rows), EXCEPTION_KEY]
 
 
-def _magnitude(row: Cost, config: SafetyGymConfig, world: World) -> Tensor:
-    cost, shape = row.magnitude(config, world), world.robot_xy.shape[:1]
-    if not isinstance(cost, Tensor) or cost.shape != shape:
-        got = list(cost.shape) if isinstance(cost, Tensor) else f"a {type(cost).__name__}"
-        raise ConfigError(
-            f"{row.key} must be a tensor of one number per world, {list(shape)}, got {got}."
-        )
-    return cost
-
-
 def compute_costs(
     rows: Sequence[Cost], config: SafetyGymConfig, world: World, failed: Tensor
 ) -> Tensor:
@@ -142,7 +132,7 @@ def compute_costs(
     Raises:
         ConfigError: if a registered cost is not one number of at least 0 per world.
     """
-    magnitudes = [_magnitude(row, config, world) for row in rows]
+    magnitudes = [world.require(row.key, row.magnitude(config, world)) for row in rows]
     if world.physics.maybe_any(failed):
         magnitudes = [magnitude.masked_fill(failed, 0.0) for magnitude in magnitudes]
     exceptions = failed.to(world.physics.dtype)  # the sum has this type, whatever a cost has

@@ -35,14 +35,7 @@ def _plain(config: SafetyGymConfig, scene: Scene, device: torch.device) -> list[
 
 def _read(row: Reading, size: int, world: World) -> Tensor:
     """The values of a reading [N, size]; an error if the width is another one."""
-    values, shape = row.read(world), (len(world.step_count), size)
-    if not isinstance(values, Tensor) or values.shape != shape:
-        got = list(values.shape) if isinstance(values, Tensor) else f"a {type(values).__name__}"
-        raise ConfigError(
-            f"The observation '{row.name}' must be a tensor {list(shape)} (worlds, its 'size'), "
-            f"got {got}."
-        )
-    return values
+    return world.require(f"The observation '{row.name}'", row.read(world), size)
 
 
 SOURCES: tuple[Callable[[SafetyGymConfig, Scene, torch.device], list[Block]], ...] = (

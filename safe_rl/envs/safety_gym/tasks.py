@@ -150,8 +150,9 @@ def dense_reward(
     failed: Tensor,
 ) -> Tensor:
     """Reward [N] without the bonus for a goal, clipped to ±`reward_clip`."""
-    reward = task.reward(config, world, before, now)
-    _check_values("reward", reward, config, world)
+    reward = world.require(
+        f"'reward' of task '{config.task}'", task.reward(config, world, before, now)
+    )
     if config.task not in BUILT_IN:
         error = ConfigError(
             f"'reward' of task '{config.task}' is NaN, from which nothing can be learned: return "
@@ -170,18 +171,5 @@ def goals_met(
 ) -> Tensor:
     """Which worlds meet their goals: bool [N], for tasks with goals; failed ones do not."""
     assert task.met is not None
-    met = task.met(config, world, now)
-    _check_values("met", met, config, world)
+    met = world.require(f"'met' of task '{config.task}'", task.met(config, world, now))
     return (met > 0) & ~failed
-
-
-def _check_values(what: str, values: Tensor, config: SafetyGymConfig, world: World) -> None:
-    from torch import Tensor
-
-    shape = world.robot_xy.shape[:1]
-    if not isinstance(values, Tensor) or values.shape not in (shape, ()):
-        got = list(values.shape) if isinstance(values, Tensor) else f"a {type(values).__name__}"
-        raise ConfigError(
-            f"'{what}' of task '{config.task}' must return a tensor of one value per world, "
-            f"{list(shape)}, got {got}."
-        )

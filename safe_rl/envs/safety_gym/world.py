@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import mujoco
 from torch import Tensor
@@ -149,6 +149,16 @@ class World:
         if kind in self.contacts:
             return self.contacts[kind]
         return self.sensordata[:, self._slots(kind)]
+
+    def require(self, what: str, values: Any, *size: int) -> Tensor:
+        """Return values of the worlds; ConfigError unless they are a tensor [N, *size]."""
+        shape = (len(self.step_count), *size)
+        if isinstance(values, Tensor) and values.shape == shape:
+            return values
+        got = list(values.shape) if isinstance(values, Tensor) else f"a {type(values).__name__}"
+        raise ConfigError(
+            f"{what} must be a tensor {list(shape)}, with a row for every world, got {got}."
+        )
 
     def _slots(self, kind: str) -> slice:
         if kind not in self.scene.slots and kind not in self.scene.kinds:
