@@ -104,7 +104,8 @@ class Worlds:
         ask = None
         if mask is not None:
             ask = TensorDict({"_reset": torch.from_numpy(mask).unsqueeze(-1)}, len(mask))
-        return arrays_of(self.batch.reset(ask)["observation"])
+        # of TorchRL's `reset`, the other worlds would observe zeros
+        return arrays_of(self.batch._reset(ask)["observation"])
 
     def _step(
         self, actions: np.ndarray

@@ -99,13 +99,6 @@ READINGS: list[Reading] = [
 ]  # fmt: skip
 
 
-def _columns(model: mujoco.MjModel, sensors: list[int], device: torch.device) -> Tensor:
-    """`sensordata` columns of sensors, in their order."""
-    spans = [(model.sensor_adr[i], model.sensor_adr[i] + model.sensor_dim[i]) for i in sensors]
-    columns = [column for span in spans for column in range(*span)]
-    return torch.tensor(columns, dtype=torch.int64, device=device)
-
-
 def _joint_sensors(scene: Scene, kind: mujoco.mjtSensor, joint: mujoco.mjtJoint) -> list[int]:
     """Sensors of one type on one type of joint."""
     model = scene.model
@@ -151,36 +144,31 @@ def sensor_blocks(config: SafetyGymConfig, scene: Scene, device: torch.device) -
     raw = [i for i in dict.fromkeys(raw) if i not in (*angles, *quaternions)]
     if not config.sensors_angle_components:
         raw, angles, quaternions = raw + angles + quaternions, [], []
-    readers = ((raw, _read_raw), (angles, _read_angles), (quaternions, _read_rotations))
-    return [reader(scene.model, group, device) for group, reader in readers if group]
+    groups = (
+        (raw, None, lambda values: values),
+        (angles, (2,), lambda angle: torch.stack([torch.sin(angle), torch.cos(angle)], -1)),
+        (quaternions, (3, 3), lambda q: rotation_matrix(q.unflatten(1, (-1, 4)))),
+    )
+    return [
+        _sensor_block(scene.model, sensors, shape, convert, device)
+        for sensors, shape, convert in groups
+        if sensors
+    ]
 
 
-def _read_raw(model: mujoco.MjModel, sensors: list[int], device: torch.device) -> Block:
-    shapes: Shapes = {model.sensor(i).name: (int(model.sensor_dim[i]),) for i in sensors}
-    columns = _columns(model, sensors, device)
-    return Block(shapes, lambda w: w.sensordata.index_select(1, columns))
-
-
-def _read_angles(model: mujoco.MjModel, sensors: list[int], device: torch.device) -> Block:
-    shapes: Shapes = {model.sensor(i).name: (2,) for i in sensors}
-    columns = _columns(model, sensors, device)
-
-    def read(world: World) -> Tensor:
-        angle = world.sensordata.index_select(1, columns)
-        return torch.stack([torch.sin(angle), torch.cos(angle)], -1).flatten(1)
-
-    return Block(shapes, read)
-
-
-def _read_rotations(model: mujoco.MjModel, sensors: list[int], device: torch.device) -> Block:
-    shapes: Shapes = {model.sensor(i).name: (3, 3) for i in sensors}
-    columns = _columns(model, sensors, device)
-
-    def read(world: World) -> Tensor:
-        quaternion = world.sensordata.index_select(1, columns).unflatten(1, (-1, 4))
-        return rotation_matrix(quaternion).flatten(1)
-
-    return Block(shapes, read)
+def _sensor_block(
+    model: mujoco.MjModel,
+    sensors: list[int],
+    shape: tuple[int, ...] | None,
+    convert: Callable[[Tensor], Tensor],
+    device: torch.device,
+) -> Block:
+    """Readings of sensors, converted to components of a shape, or as they are."""
+    shapes: Shapes = {model.sensor(i).name: shape or (int(model.sensor_dim[i]),) for i in sensors}
+    spans = [(model.sensor_adr[i], model.sensor_adr[i] + model.sensor_dim[i]) for i in sensors]
+    numbers = [column for span in spans for column in range(*span)]
+    columns = torch.tensor(numbers, dtype=torch.int64, device=device)
+    return Block(shapes, lambda w: convert(w.sensordata.index_select(1, columns)).flatten(1))
 
 
 def rotation_matrix(quaternion: Tensor) -> Tensor:
