@@ -2,10 +2,20 @@
 
 import math
 
+import numpy as np
 import torch
 from tensordict import TensorDict
 
+from safe_rl.envs import SafetyGymEnv
+
 FREE = ("vase", "gremlin", "box")
+
+
+def make(config, num_envs: int = 1, seed: int = 0, sleep: bool = False) -> SafetyGymEnv:
+    """Worlds whose first episodes have begun, and in which nothing sleeps."""
+    env = SafetyGymEnv(config, num_envs=num_envs, seed=seed, sleep=sleep, num_threads=1)
+    env.reset()
+    return env
 
 
 def kind_of(name: str) -> str:
@@ -69,3 +79,9 @@ def step_from(env, state: TensorDict, *controls: float) -> TensorDict:
     """What a step from a state returns, with the same action in every row."""
     action = torch.tensor(controls, dtype=torch.float32).expand(env.action_spec.shape)
     return env.step(env.set_state(state).set("action", action.clone()))["next"]
+
+
+def observe(env, **poses: tuple[float, ...]) -> dict[str, np.ndarray]:
+    """Every component of the first world's observation of an arrangement."""
+    flat = env.set_state(arrange(env, **poses))["observation"][0].double().numpy()
+    return {name: flat[columns] for name, columns in env.observation_layout.items()}

@@ -7,7 +7,7 @@ import pytest
 import torch
 from point_mass import PointMass
 from torchrl.envs.utils import check_env_specs
-from transforming import ENVIRONMENTS, Priced, half_speed, still, transformed
+from transforming import ENVIRONMENTS, Priced, still, transformed
 
 from safe_rl.envs import check_constrained_env, make_env
 from safe_rl.envs.transforms import (
@@ -15,7 +15,6 @@ from safe_rl.envs.transforms import (
     ActionFilter,
     ActionRepeat,
     EarlyTermination,
-    ObservedCosts,
     RewardScale,
     transform_env,
 )
@@ -40,10 +39,8 @@ def test_a_filter_may_change_actions_in_place():
     stepped = in_place.step(in_place.reset().set("action", chosen.clone()))
     assert torch.equal(stepped["action"], chosen)
     assert stepped["next", "cost_interventions"].flatten().tolist() == [1.0, 1.0]
-    other = transformed(PointMass(2), f=ActionFilter(half_speed))
-    wanted = other.step(other.reset().set("action", chosen.clone()))
-    for key in ("observation", "reward"):
-        assert torch.equal(stepped["next", key], wanted["next", key])
+    moved = stepped["next", "observation"][:, 2:4]
+    torch.testing.assert_close(moved, torch.full((2, 2), 0.15 * 0.5))
 
 
 def test_a_filter_that_returns_no_actions_is_refused():
@@ -165,18 +162,3 @@ def test_evaluation_counts_steps_of_the_environment():
     safety_gym = ENVIRONMENTS["safety_gym"]()
     assert repeating(ENVIRONMENTS["safety_gym"](), 3).highest_cost("cost") == 8.0
     assert safety_gym.highest_cost("cost") == 8.0
-
-
-def test_a_snapshot_continues_exactly_between_and_before_repeats():
-    def make():
-        config = {"robot_base": "point", "num_steps": 10}
-        return repeating(make_env(config, num_envs=2, seed=0), 4, ObservedCosts(0.5), seed=0)
-
-    env, other, action = make(), make(), torch.full((2, 2), 0.3)
-    state = env.rollout(2, lambda td: td.set("action", action))[:, -1]["next"]
-    kept = env.get_state()
-    put = other.set_state(kept)
-    assert torch.equal(put["observation"], state["observation"])
-    assert torch.equal(put["steps_taken"], state["steps_taken"])
-    steps = [one.step(one.set_state(kept).set("action", action))["next"] for one in (env, other)]
-    assert (steps[0] == steps[1]).all()

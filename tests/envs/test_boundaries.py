@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 import torch
-from crafting import arrange, step_from
+from crafting import arrange, make, step_from
 from torchrl.envs.utils import check_env_specs
 
 from safe_rl.envs import EXTRAS, ConfigError, SafetyGymEnv
@@ -16,11 +16,8 @@ NAMES = [f"{robot}{task}" for robot in ROBOTS for task in ("Run1", "Circle1", "C
 FROZEN = {"robot_base": "point", "task": "none", "frameskip_binom_p": 0.0}
 
 
-def make(name, **changes):
-    config = EXTRAS[name].replace(**changes)
-    env = SafetyGymEnv(config, num_envs=1, seed=0, sleep=False, num_threads=1)
-    env.reset()
-    return env
+def begin(name, **changes):
+    return make(EXTRAS[name].replace(**changes))
 
 
 def at(env, x, y, velocity=(0.0, 0.0)):
@@ -44,12 +41,12 @@ def at(env, x, y, velocity=(0.0, 0.0)):
     ],
 )
 def test_leaving_the_boundary_costs_one(name, place, cost):
-    got = at(make(name, frameskip_binom_p=0.0), *place)
+    got = at(begin(name, frameskip_binom_p=0.0), *place)
     assert got["cost_boundary"].item() == got["cost"].item() == cost
 
 
 def test_being_fast_costs_one_however_it_is_done():
-    env = make("PointRun1", frameskip_binom_p=0.0)
+    env = begin("PointRun1", frameskip_binom_p=0.0)
     for velocity, cost in (((0.99, 0.0), 0.0), ((0.8, 0.61), 1.0), ((-1.01, 0.0), 1.0)):
         got = at(env, 0.0, 0.0, velocity)
         assert got["cost_velocity"].item() == got["cost"].item() == cost
@@ -61,8 +58,7 @@ def test_being_fast_costs_one_however_it_is_done():
 def test_magnitudes_are_metres_and_metres_per_second():
     keys = {"constrain_boundary": True, "boundary_x": 1.0, "boundary_y": 2.0}
     keys |= {"constrain_velocity": True, "velocity_limit": 0.5, "constrain_indicator": False}
-    env = SafetyGymEnv({**FROZEN, **keys}, num_envs=1, seed=0, sleep=False)
-    env.reset()
+    env = make({**FROZEN, **keys})
     got = at(env, 1.25, -2.5, (0.3, 0.4))
     assert math.isclose(got["cost_boundary"].item(), 0.75, rel_tol=1e-6)
     assert math.isclose(got["cost_velocity"].item(), 0.0, abs_tol=1e-6)
@@ -98,9 +94,9 @@ def test_what_is_missing_is_said(keys, message):
 
 
 def test_boundaries_are_drawn_where_they_are():
-    narrow, wide = (make("PointRun1", boundary_y=half) for half in (0.3, 0.9))
+    narrow, wide = (begin("PointRun1", boundary_y=half) for half in (0.3, 0.9))
     pictures = [env.render(0, camera="fixedfar", width=120, height=90) for env in (narrow, wide)]
-    free = make("PointRun", robot_placements=((-0.2, -0.2, 0.2, 0.2),), robot_keepout=0.0)
+    free = begin("PointRun", robot_placements=((-0.2, -0.2, 0.2, 0.2),), robot_keepout=0.0)
     free.set_state(narrow.get_state())
     plain = free.render(0, camera="fixedfar", width=120, height=90)
     assert (pictures[0] != plain).any()

@@ -1,30 +1,22 @@
-"""Costs in situations small enough to work out by hand."""
+"""Costs in situations small enough to work out by hand, and positions against costs."""
 
 import math
 
 import pytest
 import torch
-from crafting import arrange, position_columns, step_from
+from crafting import arrange, make, position_columns, step_from
 
-from safe_rl.envs import SafetyGymEnv
+from safe_rl.envs import SUITE, SafetyGymEnv
 
-# The Point reaches 0.15 m ahead: a box of half side 0.05 at 0.1.
-NOSE = 0.15
 ALL_KINDS = ("hazards", "vases", "pillars", "buttons", "gremlins")
 MAGNITUDES = {
     "robot_base": "point",
     "constrain_indicator": False,
+    "placements_extents": [-6, -6, 6, 6],
     **{f"constrain_{kind}": True for kind in ALL_KINDS},
 }
 # No substeps: a step judges the state that it starts from.
 FROZEN = {**MAGNITUDES, "task": "none", "frameskip_binom_p": 0.0}
-OFF_STAGE = {"placements_extents": [-6, -6, 6, 6]}
-
-
-def make(config: dict) -> SafetyGymEnv:
-    env = SafetyGymEnv({**OFF_STAGE, **config}, num_envs=1, seed=0, sleep=False, num_threads=1)
-    env.reset()
-    return env
 
 
 def costs(got) -> dict[str, float]:
@@ -33,35 +25,6 @@ def costs(got) -> dict[str, float]:
 
 def positive(got) -> set[str]:
     return {key for key, value in costs(got).items() if value > 0} - {"cost"}
-
-
-# What is ahead: its half width [m], None where it circles, and the costs of running into it.
-AHEAD = {
-    "hazard0": (0.3 - NOSE, {"cost_hazards"}),  # judged by the robot's centre
-    "pillar0": (0.2, {"cost_pillars"}),
-    "button0": (0.1, {"cost_buttons"}),
-    "vase0": (0.1, {"cost_vases_contact", "cost_vases_displace", "cost_vases_velocity"}),
-    "gremlin0": (None, {"cost_gremlins"}),
-}
-
-
-@pytest.mark.parametrize("name", AHEAD)
-def test_running_into_things_costs_what_it_should_and_nothing_else(name):
-    half_width, expected = AHEAD[name]
-    config = {f"{kind}_num": 1 for kind in ALL_KINDS}
-    env = make({**MAGNITUDES, **config, "task": "none", "vases_displace_cost": 1.0})
-    far = {f"{kind[:-1]}0": (5.0, 5.0 - 2 * i) for i, kind in enumerate(ALL_KINDS)}
-    poses = {**far, "robot": (0, 0, 0), name: (1.0, 0.0, 0.0)[: 3 if name == "vase0" else 2]}
-    tensordict, seen = env.set_state(arrange(env, **poses)), set()
-    for _ in range(120):
-        following = env.step(tensordict.set("action", torch.tensor([[1.0, 0.0]])))
-        found = positive(following["next"])
-        if found and not seen and half_width is not None:
-            nose = float(env.get_state()["qpos"][0, 0]) + NOSE
-            assert 0 <= nose - (1.0 - half_width) <= 0.02
-        seen |= found
-        tensordict = env.step_mdp(following)
-    assert seen == expected
 
 
 VASES = {**FROZEN, "vases_num": 2, "vases_displace_cost": 2.0, "vases_velocity_cost": 3.0}
@@ -101,19 +64,6 @@ def test_only_costs_with_a_factor_have_keys():
     keys = {"cost", "cost_exception", "cost_vases_contact", "cost_hazards", "cost_pillars"}
     assert set(make(config).cost_keys) == keys | {"cost_buttons", "cost_gremlins"}
     assert "cost_vases_displace" in make(VASES).cost_keys
-
-
-def test_a_contact_point_costs_its_factor():
-    """The sphere of the Point touches a pillar in one point, the nose looks the other way."""
-    config = {**FROZEN, "pillars_num": 2, "pillars_cost": 3.5, "pillars_size": 0.2}
-    env = make(config)
-    state = arrange(env, robot=(0, 0, math.pi), pillar0=(0.295, 0), pillar1=(2, 0))
-    assert costs(step_from(env, state, 0, 0))["cost_pillars"] == 3.5
-    state = arrange(env, robot=(0, 0, math.pi / 2), pillar0=(0.295, 0), pillar1=(-0.295, 0))
-    got = costs(step_from(env, state, 0, 0))
-    assert got["cost_pillars"] == got["cost"] == 7.0
-    state = arrange(env, robot=(0, 0, math.pi), pillar0=(0.305, 0), pillar1=(2, 0))
-    assert not positive(step_from(env, state, 0, 0))
 
 
 FACTORS = {
@@ -183,3 +133,41 @@ def test_a_met_goal_puts_buttons_to_sleep_in_goal_tasks_too():
     got = step_from(env, touching_two_buttons(env, -1, 0), 0, 0)
     assert got["goal_met"]
     assert env.get_state()["buttons_timer"] == 10
+
+
+def test_pinned_objects_are_where_they_were_put():
+    places = [(1.0, 1.0), (-1.0, 0.5)]
+    config = SUITE["PointGoal1"].replace(
+        hazards_num=2, hazards_locations=places, robot_locations=[(0.0, -1.0)]
+    )
+    positions = make(config, 3).get_positions()
+    sizes = {key: value.shape[1] for key, value in positions.items()}
+    assert sizes == {"robot": 1, "goal": 1, "hazards": 2, "vases": 1}
+    expected = torch.tensor(places, dtype=torch.float64).expand(3, -1, -1)
+    torch.testing.assert_close(positions["hazards"][..., :2], expected, rtol=0, atol=1e-6)
+    robot = torch.tensor([0.0, -1.0, 0.1], dtype=torch.float64).expand(3, 1, 3)
+    torch.testing.assert_close(positions["robot"], robot, rtol=0, atol=1e-6)
+    vase = torch.full((3, 1), 0.1 - 4e-5, dtype=torch.float64)  # half side less what it sinks in
+    torch.testing.assert_close(positions["vases"][..., 2], vase, rtol=0, atol=1e-6)
+
+
+@pytest.mark.parametrize("name", ["CarGoal2", "DoggoButton2", "PointPush2"])
+def test_costs_and_rewards_follow_from_them(name):
+    env = SafetyGymEnv(SUITE[name].replace(hazards_size=0.9, goal_size=0.01), num_envs=8, seed=0)
+    tensordict, seen = env.reset(), 0
+    for _ in range(30):
+        before = env.get_positions()
+        tensordict = env.rand_action(tensordict)
+        following = env.step(tensordict)["next"]
+        now = env.get_positions()
+        to_hazards = (now["hazards"] - now["robot"])[..., :2].norm(dim=-1)
+        inside = (to_hazards <= 0.9).any(-1, keepdim=True)
+        assert torch.equal(following["cost_hazards"] > 0, inside)
+        seen += int(inside.sum())
+        if name == "CarGoal2":
+            old, new = ((p["goal"] - p["robot"])[:, 0, :2].norm(dim=-1) for p in (before, now))
+            torch.testing.assert_close(
+                following["reward"][:, 0].double(), old - new, rtol=0, atol=1e-6
+            )
+        tensordict = following
+    assert seen > 0

@@ -11,7 +11,6 @@ from torchrl.envs.utils import check_env_specs
 
 from safe_rl.envs import ConfigError, SafetyGymEnv
 from safe_rl.envs.extending import register_robot
-from safe_rl.envs.safety_gym.robots import ROBOTS
 
 # A planar disc with an arm on a hinge; the turning motor has no control range of its own.
 DISC = """
@@ -115,17 +114,6 @@ def test_actions_have_the_range_of_the_actuators(make):
         assert result[0, columns].tolist() == applied
 
 
-def test_they_turn_and_drive(make):
-    env = make(DISC, task="none", observe_qpos=True)
-    env.reset()
-    # The motor has a force of the control in newtons: v' = F/m without other forces.
-    tensordict = env.step(env.reset().set("action", torch.tensor([[1.0, 0.0, 0.0]] * 2)))
-    way = tensordict["next", "observation"][0, env.observation_layout["qpos"].start]
-    assert float(way) == pytest.approx(0.5 * 0.04**2 * (1.0 / _mass(env)), rel=0.2)
-    env.step(env.reset().set("action", torch.tensor([[0.0, 1.0, 0.0]] * 2)))
-    assert float(env.get_state()["qvel"][0, 2]) > 1e-2
-
-
 def _mass(env) -> float:
     return float(env._world.scene.model.body_subtreemass[1])
 
@@ -162,7 +150,6 @@ ACTUATORS = DISC[DISC.index("<actuator>") : DISC.index("<sensor>")]
 SLIDE = '<jointpos name="east" joint="x"/></sensor>'
 WRONG = {
     "no XML": ("<mujoco><worldbody>", "cannot load"),
-    "a mistake in it": (changed(DISC, "capsule", "sausage"), "cannot load.*sausage"),
     "no robot": (changed(BALL, '"robot"', '"robto"'), "no body named 'robot'.*'robto'"),
     "robot inside another": (
         changed(changed(BALL, "<worldbody>", '<worldbody><body name="cart">'),
@@ -172,25 +159,14 @@ WRONG = {
     "a turned root": (changed(BALL, 'pos="0.3 0.2 0.12"', 'euler="90 0 0"'), "turns its body"),
     "no actuators": (without(DISC, ACTUATORS), "no actuators"),
     "no root joint": (without(DISC, *JOINTS[:2]), "free joint, or slides"),
-    "another order": (
-        changed(changed(DISC, 'axis="1 0 0" damping', 'axis="0 0 0.5" damping'),
-                'axis="0 1 0" damping', 'axis="1 0 0" damping'),
-        "free joint, or slides",
-    ),
-    "a root off the origin": (changed(DISC, 'pos="0 0 0.1"', 'pos="1 0 0.1"'), "origin.*must be 0"),
     "another body before": (
         changed(BALL, "<worldbody>", '<worldbody><body><freejoint/><geom size="1"/></body>'),
         "put that body first",
-    ),
-    "mocap bodies": (
-        changed(BALL, "<worldbody>", '<worldbody><body mocap="true"/>'),
-        "mocap bodies",
     ),
     "a reversed control range": (
         changed(DISC, '"-0.5 2"', '"2 -0.5"'),
         "control range.*2.0, -0.5",
     ),
-    "an infinite control range": (changed(DISC, '"-0.5 2"', '"-inf inf"'), "control range"),
     "an observed slide": (changed(DISC, "</sensor>", SLIDE), "'east' on a slide joint"),
     "a name of the world": (changed(DISC, 'name="arm"', 'name="vase0"'), "does not fit.*vase0"),
 }  # fmt: skip
@@ -200,13 +176,6 @@ WRONG = {
 def test_files_that_lack_something_are_told_what(make, xml, message):
     with pytest.raises(ConfigError, match="'robot_base'.*" + message):
         make(xml, vases_num=1)
-
-
-def test_missing_sensors_are_named_with_the_nearest(make):
-    with pytest.raises(ConfigError, match=r"'sensors_obs'.*'sped'.*'speed'.*elbow_pos"):
-        make(DISC, sensors_obs=["sped"])
-    with pytest.raises(ConfigError, match=r"no sensor 'accelerometer'.*It has gyro"):
-        make(BALL, sensors_obs=["accelerometer"])
 
 
 def test_the_body_that_is_kept_upright_is_one_of_the_robots(make):
@@ -224,20 +193,14 @@ def test_the_body_that_is_kept_upright_is_one_of_the_robots(make):
         make(DISC, **keys, reward_orientation_body="vase0", vases_num=1)
 
 
-def test_a_file_that_changed_is_noticed(make):
-    assert _mass(light := make(DISC)) == pytest.approx(_mass(make(DISC)))
-    heavy = make(changed(DISC, 'density="10"', 'density="20"'))
-    assert _mass(heavy) == pytest.approx(2 * _mass(light))
-
-
-def test_so_is_one_that_it_includes(make, tmp_path):
-    default = '<default><geom condim="6" density="10"/></default>'
-    part = tmp_path / "part.xml"
+def test_a_file_that_changed_is_noticed_and_one_that_it_includes(make, tmp_path):
+    default, part = '<default><geom condim="6" density="10"/></default>', tmp_path / "part.xml"
     masses = []
-    for density in (10, 20):
-        part.write_text(f"<mujoco>{default.replace('10', str(density))}</mujoco>")
+    for density in ("10", "20"):
+        part.write_text(f"<mujoco>{default.replace('10', density)}</mujoco>")
         masses.append(_mass(make(changed(DISC, default, '<include file="part.xml"/>'))))
-    assert masses[1] == pytest.approx(2 * masses[0])
+        masses.append(_mass(make(changed(DISC, 'density="10"', f'density="{density}"'))))
+    assert masses == pytest.approx([masses[0], masses[0], 2 * masses[0], 2 * masses[0]])
 
 
 SLOW_MOTOR = {
@@ -264,26 +227,13 @@ def test_what_actuators_remember_is_part_of_a_state(make, kind):
     assert torch.equal(twin.step(here.clone().set("action", idle))["next", "observation"], onward)
     env.set_state(state)
     assert torch.equal(env.step(here.clone().set("action", idle))["next", "observation"], onward)
-    forgetful = state.exclude("act", "history")  # of a run before they were part of it
-    env.set_state(forgetful)
-    assert not torch.equal(
-        env.step(here.clone().set("action", idle))["next", "observation"], onward
-    )
 
 
-def test_registered_robots_are_made_by_name(tmp_path):
-    source, slow = ROBOTS["point"].read_text(), 'gear=".3 0 0 0 0 0" site'
-    assert slow in source
-    path = tmp_path / "mine.xml"
-    path.write_text(source.replace(slow, slow.replace(".3", ".6")))
+def test_registered_robots_are_made_by_name(make, tmp_path):
+    make(BALL)
     with undone():
-        register_robot("mine", path)
-        ways = []
-        for robot in ("point", "mine"):
-            keys = {"robot_base": robot, "robot_locations": [[0, 0]], "robot_rot": 0.0}
-            env = SafetyGymEnv({**keys, "task": "none"}, seed=0, num_threads=1)
-            env.step(env.reset().set("action", torch.tensor([[1.0, 0.0]])))
-            ways.append(float(env.get_state()["qpos"][0, 0]))
-    assert ways[1] == pytest.approx(2 * ways[0], rel=0.05)
+        register_robot("mine", tmp_path / "robot.xml")
+        env = SafetyGymEnv({"robot_base": "mine", "sensors_obs": ["gyro"]}, seed=0)
+        assert env.observation_layout == {"gyro": slice(0, 3)}
     with pytest.raises(ConfigError, match=r"built-in robot"):
-        register_robot("car", path)
+        register_robot("car", tmp_path / "robot.xml")

@@ -3,7 +3,6 @@
 import pytest
 import torch
 from playing import assert_same, play
-from tensordict import TensorDict
 
 from safe_rl.envs import SUITE, SafetyGymEnv
 from safe_rl.envs.velocity import VELOCITY_SUITE, VelocityEnv
@@ -72,68 +71,26 @@ def test_without_a_seed_torch_decides(name):
     assert torch.equal(*seeded)
 
 
-def test_one_layout_for_all_episodes_where_asked_for():
-    def starts(seed: int) -> list[TensorDict]:
-        config = SUITE["CarButton1"].replace(randomize_layout=False)
-        env = SafetyGymEnv(config, num_envs=3, seed=seed, num_threads=1)
-        states = []
-        for _ in range(3):
-            env.rollout(2)
-            env.reset()
-            states.append(env.get_state())
-        return states
-
-    first, *others = starts(0)
-    for state in (first, *others):
-        for key in ("layout", "qpos", "goal_button", "start_pose"):
-            assert torch.equal(state[key], first[key][:1].expand_as(state[key])), key
-    assert not torch.equal(starts(1)[0]["layout"], first["layout"])
-
-
 @pytest.mark.parametrize("name", NAMES)
-def test_a_state_determines_the_future(name):
-    """Twice from one state, through new goals and resets; also in another instance."""
-    env = make(name, 4, sleep=False)
-    play(env, env.reset(), 8)
-    state = env.get_state()
-    kept = state.clone()
-    runs = [play(env, env.set_state(state), 45)]
-    runs.append(play(env, env.set_state(state), 45))
-    elsewhere = make(name, 4, seed=99, num_threads=2, sleep=False)
-    runs.append(play(elsewhere, elsewhere.set_state(state), 45))
-    assert_same(runs[0], runs[1])
-    assert_same(runs[0], runs[2])
-    assert_same(state, kept)
-    assert runs[0]["done"].sum() >= 8
-    if name in MEETS_GOALS:
-        assert runs[0]["goal_met"].any()
-
-
-@pytest.mark.parametrize("name", NAMES)
-def test_setting_the_present_state_interrupts_nothing(name):
+def test_a_state_determines_the_future_and_setting_it_interrupts_nothing(name):
+    """Through new goals and resets; also in another instance."""
     plain, interrupted = make(name, 4, sleep=False), make(name, 4, sleep=False)
     first = play(plain, plain.reset(), 8)
     play(interrupted, interrupted.reset(), 8)
     state = interrupted.get_state()
-    tensordict = interrupted.set_state(state)
+    tensordict, kept = interrupted.set_state(state), state.clone()
     assert_same(interrupted.get_state(), state)
     going = ~first["done"][:, -1, 0]
     assert going.any()
     assert torch.equal(tensordict["observation"][going], first["observation"][going, -1])
-    run = play(plain, tensordict.clone(), 30)
-    assert_same(run, play(interrupted, tensordict, 30))
-
-
-def test_one_state_can_be_branched_into_all_rows():
-    env = make("goal", 4, sleep=False)
-    env.rollout(10)
-    state = env.get_state()
-    branches = env.set_state(state[2:3].expand(4).clone())
-    action = env.action_spec.rand()
-    action[1] = action[0]
-    following = env.step(branches.set("action", action))["next"]
-    assert torch.equal(following["observation"][0], following["observation"][1])
-    assert not torch.equal(following["observation"][0], following["observation"][2])
+    run = play(plain, tensordict.clone(), 45)
+    assert_same(run, play(interrupted, tensordict, 45))
+    elsewhere = make(name, 4, seed=99, num_threads=2, sleep=False)
+    assert_same(run, play(elsewhere, elsewhere.set_state(state), 45))
+    assert_same(state, kept)
+    assert run["done"].sum() >= 8
+    if name in MEETS_GOALS:
+        assert run["goal_met"].any()
 
 
 def test_layout_and_seeds_may_be_left_out_of_a_state():

@@ -28,7 +28,7 @@ EVERYWHERE = {
     **{"observe_goal_lidar": True, "observe_box_lidar": True},
     **{"lidar_max_dist": 3, "lidar_num_bins": 16, "_seed": None, "build_resample": True},
 }
-SHARED = {
+TASKS = {
     "Goal": {
         **{"task": "goal", "goal_size": 0.3, "goal_keepout": 0.305},
         **{"hazards_size": 0.2, "hazards_keepout": 0.18},
@@ -40,43 +40,30 @@ SHARED = {
     },
     "Push": {"task": "push", "box_size": 0.2, "box_null_dist": 0, "hazards_size": 0.3},
 }
-SEEN = {
-    "Goal": {"observe_hazards": True, "observe_vases": True, "constrain_hazards": True},
-    "Button": {
-        **{"observe_hazards": True, "observe_gremlins": True, "constrain_hazards": True},
-        **{"constrain_buttons": True, "constrain_gremlins": True},
-    },
-    "Push": {"observe_hazards": True, "observe_pillars": True, "constrain_hazards": True},
-}
+# Half of the extents, what is observed, what costs, and how many there are.
+BUTTON_COSTS = ("hazards", "buttons", "gremlins")
 LEVELS = {
-    "Goal0": {"placements_extents": [-1, -1, 1, 1]},
-    "Goal1": {"placements_extents": [-1.5, -1.5, 1.5, 1.5], "hazards_num": 8, "vases_num": 1},
-    "Goal2": {
-        **{"placements_extents": [-2, -2, 2, 2], "constrain_vases": True},
-        **{"hazards_num": 10, "vases_num": 10},
-    },
-    "Button0": {"placements_extents": [-1, -1, 1, 1]},
-    "Button1": {
-        **{"placements_extents": [-1.5, -1.5, 1.5, 1.5]},
-        **{"hazards_num": 4, "gremlins_num": 4},
-    },
-    "Button2": {
-        **{"placements_extents": [-1.8, -1.8, 1.8, 1.8]},
-        **{"hazards_num": 8, "gremlins_num": 6},
-    },
-    "Push0": {"placements_extents": [-1, -1, 1, 1]},
-    "Push1": {"placements_extents": [-1.5, -1.5, 1.5, 1.5], "hazards_num": 2, "pillars_num": 1},
-    "Push2": {
-        **{"placements_extents": [-2, -2, 2, 2], "constrain_pillars": True},
-        **{"hazards_num": 4, "pillars_num": 4},
-    },
+    "Goal0": (1, (), (), {}),
+    "Goal1": (1.5, ("hazards", "vases"), ("hazards",), {"hazards": 8, "vases": 1}),
+    "Goal2": (2, ("hazards", "vases"), ("hazards", "vases"), {"hazards": 10, "vases": 10}),
+    "Button0": (1, (), (), {}),
+    "Button1": (1.5, ("hazards", "gremlins"), BUTTON_COSTS, {"hazards": 4, "gremlins": 4}),
+    "Button2": (1.8, ("hazards", "gremlins"), BUTTON_COSTS, {"hazards": 8, "gremlins": 6}),
+    "Push0": (1, (), (), {}),
+    "Push1": (1.5, ("hazards", "pillars"), ("hazards",), {"hazards": 2, "pillars": 1}),
+    "Push2": (2, ("hazards", "pillars"), ("hazards", "pillars"), {"hazards": 4, "pillars": 4}),
 }
 
 
 def dictionary(robot: str, level: str) -> dict:
-    task = level[:-1]
-    seen = {} if level.endswith("0") else SEEN[task]
-    return {**EVERYWHERE, **SHARED[task], **seen, **LEVELS[level], **ROBOTS[robot]}
+    half, observed, constrained, numbers = LEVELS[level]
+    return {
+        **{**EVERYWHERE, **TASKS[level[:-1]], **ROBOTS[robot]},
+        "placements_extents": [-half, -half, half, half],
+        **{f"observe_{kind}": True for kind in observed},
+        **{f"constrain_{kind}": True for kind in constrained},
+        **{f"{kind}_num": number for kind, number in numbers.items()},
+    }
 
 
 @pytest.mark.parametrize("level", LEVELS)

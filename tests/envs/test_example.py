@@ -1,8 +1,9 @@
 """The example of an environment of one's own does what it says, by the ordinary commands."""
 
-import importlib.util
+import runpy
 import subprocess
 import sys
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -27,11 +28,8 @@ SHORT = (
 
 @pytest.fixture
 def example():
-    spec = importlib.util.spec_from_file_location("custom_environment", PATH)
-    module = importlib.util.module_from_spec(spec)
     with undone():
-        spec.loader.exec_module(module)
-        yield module
+        yield SimpleNamespace(**runpy.run_path(str(PATH)))
 
 
 def run(*words):

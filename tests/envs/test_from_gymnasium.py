@@ -91,19 +91,6 @@ def test_costs_of_rows_may_be_of_different_types():
     assert torch.equal(cost[:, 0], cost[:, 1])
 
 
-def test_a_cost_that_is_reported_where_it_occurs_is_nothing_to_tell():
-    class Late(Counter):
-        def step(self, action):
-            *values, _ = super().step(action)
-            return *values, {"cost": 1.0} if self.count == 2 else {}
-
-    env = from_gymnasium(Late, num_envs=2, num_steps=4, cost_keys=["cost"], seed=3)
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        costs = env.rollout(12, break_when_any_done=False)["next", "cost"]
-    assert costs[0].flatten().tolist() == [0, 1, 0] * 4
-
-
 def test_rows_are_reset_apart():
     env = from_gymnasium(Counter, num_envs=3, num_steps=4, seed=2)
     rollout = env.rollout(9, break_when_any_done=False)

@@ -9,7 +9,6 @@ import gymnasium
 import gymnasium_envs  # noqa: F401, registers Walk-v0
 import pytest
 import torch
-import yaml
 from commands import run_train
 from torchrl.envs.utils import check_env_specs
 
@@ -38,18 +37,6 @@ def run(tmp_path_factory) -> Path:
     return folder
 
 
-def test_its_folder_tells_everything(run):
-    env = yaml.safe_load((run / "config.yaml").read_text())["env"]
-    assert env["name"] == "Walk-v0"
-    assert env["num_steps"] == 25  # as it was registered
-    assert env["kwargs"] == {"border": 2.5}
-    table = read_table(run / "progress.csv")
-    assert table["steps"] == [200, 400, 600]
-    # many episodes end before their time-out
-    assert all(length < 25 for length in table["episode_length"])
-    assert all(cost > 0 for cost in table["episode_fast"])
-
-
 def test_it_resumes(run, tmp_path, capsys):
     folder = tmp_path / "copied"
     os.system(f"cp -r {run} {folder}")
@@ -69,13 +56,18 @@ def test_it_is_evaluated_on_video(run, capsys):
     assert "no key 'borders'" in capsys.readouterr().err
 
 
-def starts(seed: int, num_envs: int = 4) -> list[float]:
-    return make_env(NODE, num_envs=num_envs, seed=seed).reset()["observation"][:, 0].tolist()
+PENDULUM = {"_target_": "safe_rl.envs.torchrl.make_torchrl", "id": "PendulumEnv"}
+PENDULUM |= {"num_steps": 9, "outside": {"cost_speed": ["thdot", -4, 4]}}
 
 
-def test_seeds_determine_rows_and_share_none():
-    assert starts(0) == starts(0)
-    assert len({*starts(0), *starts(1), *starts(2)}) == 12
+@pytest.mark.parametrize("node", [NODE, PENDULUM], ids=["gymnasium", "torchrl"])
+def test_seeds_determine_rows_and_share_none(node):
+    starts = [
+        make_env(node, num_envs=4, seed=seed).reset()["observation"][:, 0].tolist()
+        for seed in (0, 0, 1, 2)
+    ]
+    assert starts[0] == starts[1]
+    assert len({place for rows in starts for place in rows}) == 12
 
 
 def test_workers_without_a_state_to_continue_from_have_rows_of_their_own():

@@ -5,30 +5,17 @@ import math
 import numpy as np
 import pytest
 import torch
-from crafting import after_random_steps, arrange, places, position_columns
+from crafting import after_random_steps, arrange, make, observe, places, position_columns
 
-from safe_rl.envs import SafetyGymEnv
 from safe_rl.envs.safety_gym.lidar import lidar_cells, pseudo_lidar
 
 BARE = {"robot_base": "point", "task": "none", "sensors_obs": [], "lidar_num_bins": 8}
 HAZARDS = {**BARE, "observe_hazards": True, "lidar_max_dist": 2.0}
 
 
-def make(config) -> SafetyGymEnv:
-    env = SafetyGymEnv(config, num_envs=1, seed=0, sleep=False, num_threads=1)
-    env.reset()
-    return env
-
-
 def polar(bearing: float, distance: float) -> tuple[float, float]:
     """Cartesian coordinates of a bearing in degrees."""
     return distance * math.cos(math.radians(bearing)), distance * math.sin(math.radians(bearing))
-
-
-def observe(env, **poses) -> dict[str, np.ndarray]:
-    """Every component of the observation of an arrangement."""
-    flat = env.set_state(arrange(env, **poses))["observation"][0].double().numpy()
-    return {name: flat[columns] for name, columns in env.observation_layout.items()}
 
 
 def assert_reads(readings: np.ndarray, expected: dict[int, float]) -> None:
@@ -37,16 +24,6 @@ def assert_reads(readings: np.ndarray, expected: dict[int, float]) -> None:
     for index, value in expected.items():
         want[index] = value
     np.testing.assert_allclose(readings, want, atol=1e-6)
-
-
-@pytest.mark.parametrize("y", [-1e-20, -1e-17, 0.0])
-def test_a_bearing_at_the_seam_is_in_the_first_or_last_bin(y):
-    env = make({**HAZARDS, "hazards_num": 1})
-    readings = observe(env, robot=(0, 0, 0), hazard0=(1.0, y))["hazards_lidar"]
-    full = 7 if y < 0 else 0
-    np.testing.assert_allclose(readings[[0, 7]], 0.5)
-    assert readings[full] == 0.5
-    assert readings[1:7].max() <= 1e-6
 
 
 def test_lidars_are_there_without_objects_for_hazards_and_vases_only():
@@ -100,7 +77,7 @@ def test_remaining_counts_the_steps_taken():
 
 @pytest.mark.parametrize("env_name", ["PointGoal2", "CarPush2", "DoggoButton1", "PointRun"])
 def test_observations_do_not_know_where_the_origin_is(env_name):
-    env = SafetyGymEnv(env_name, num_envs=8, seed=0, sleep=False, num_threads=1)
+    env = make(env_name, 8)
     state = after_random_steps(env, 5)
     here = env.set_state(state)["observation"]
     offset = torch.tensor([0.75, -1.25], dtype=torch.float64)
@@ -137,3 +114,64 @@ def test_any_number_of_bins_closes_to_a_circle(num_bins):
     alone = [one_by_one(*place, num_bins) for place in xy.tolist()]
     want = [np.max([a for a, g in zip(alone, group, strict=True) if g == k], 0) for k in (0, 1)]
     np.testing.assert_allclose(seen[1].unflatten(0, (2, -1)), want, atol=1e-12)
+
+
+# Natural lidar: rays against surfaces worked out by hand.
+RAYS = {"robot_base": "point", "task": "none", "observe_sensors": False}
+RAYS |= {"lidar_type": "natural", "lidar_num_bins": 24}
+SOLID = ("walls", "hazards", "vases", "pillars", "buttons", "gremlins")
+EVERYTHING = {
+    **{**RAYS, "task": "push", "observe_box_lidar": True, "observe_goal_lidar": True},
+    **{f"{kind}_num": 2 for kind in SOLID},
+    **{f"observe_{kind}": True for kind in SOLID},
+    **{"walls_size": 0.2, "placements_extents": [-2.5, -2.5, 2.5, 2.5]},
+}
+
+
+def test_rays_pass_over_hazards_and_a_tilted_robot_sees_them():
+    config = {**RAYS, "robot_base": "car", "hazards_num": 1, "observe_hazards": True}
+    env = make(config)
+    assert not observe(env, robot=(0, 0), hazard0=(1.0, 0.0))["hazards_lidar"].any()
+    state = arrange(env, robot=(0, 0), hazard0=(1.0, 0.0))
+    pitch = 0.12  # the ray along x falls by 0.12 rad: from 0.1 m to the hazard's top at 0.03 m
+    quat = torch.tensor([math.cos(pitch / 2), 0.0, math.sin(pitch / 2), 0.0])
+    state["qpos"][:, 3:7] = quat.double()
+    state["qpos"][:, 2] = 0.1
+    got = env.set_state(state)["observation"][0, 0]
+    # Down to the rim at x = 0.7 the ray is at 0.1 - 0.7·tan(0.12) = 0.0156: it meets the side.
+    assert float(got) == pytest.approx(math.exp(-0.7 / math.cos(pitch)), abs=1e-6)
+
+
+def test_a_button_that_is_the_goal_is_seen_by_its_own_lidar_only():
+    config = {**RAYS, "task": "button", "buttons_num": 1, "observe_buttons": True}
+    env = make({**config, "observe_goal_lidar": True})
+    got = observe(env, robot=(0, 0, 0), button0=(1, 0))
+    assert got["buttons_lidar"][0] == pytest.approx(math.exp(-0.9), abs=1e-6)
+    # The goal's rays see geom group 0: the floor, which level rays never reach.
+    assert not got["goal_lidar"].any()
+    state = arrange(env, robot=(0, 0, 0), button0=(1, 0))
+    state["buttons_timer"].fill_(3)
+    assert not env.set_state(state)["observation"].any()
+
+
+def test_the_targets_of_gremlins_are_seen_once_they_circle():
+    config = {**RAYS, "robot_base": "doggo", "gremlins_num": 1, "gremlins_travel": 0.3}
+    pinned = {"robot_locations": [[0, 0]], "gremlins_locations": [[1, -0.3]], "robot_rot": 0.0}
+    pinned["gremlins_rots"] = [0.0]
+    env = make({**config, **pinned, "gremlins_keepout": 0.1, "observe_gremlins": True})
+    # Doggo's rays leave at 0.22 m, above the gremlin; at first its target stands inside it.
+    assert not env.reset()["observation"].any()
+    state = env.get_state()
+    state["time"].fill_(0.01)  # a substep: the target now runs, from 0.3 m along y
+    got = env.set_state(state)["observation"][0].double().numpy()
+    np.testing.assert_allclose(got[0], math.exp(-0.9), atol=1e-6)
+
+
+def test_sleeping_objects_are_seen_where_they_are():
+    seen = []
+    for sleep in (False, True):
+        env = make(EVERYTHING, 4, sleep=sleep)
+        torch.manual_seed(0)
+        after_random_steps(env, 40)
+        seen.append(env.step(env.rand_action())["next", "observation"])
+    torch.testing.assert_close(*seen, atol=2e-3, rtol=0)

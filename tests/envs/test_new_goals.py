@@ -6,7 +6,7 @@ import math
 import numpy as np
 import pytest
 import torch
-from crafting import places, position_columns
+from crafting import make, places, position_columns
 from scipy import stats
 from tensordict import TensorDict
 
@@ -18,12 +18,6 @@ UNLIKELY = 1e-3  # p values below this one would be a finding
 NUM_ENVS = 1000
 
 
-def make(config: dict, num_envs: int = NUM_ENVS) -> SafetyGymEnv:
-    env = SafetyGymEnv(config, num_envs=num_envs, seed=0, sleep=False, num_threads=1)
-    env.reset()
-    return env
-
-
 def stay(env: SafetyGymEnv, state: TensorDict | None = None) -> TensorDict:
     """One step without any action, from a state or the present."""
     tensordict = TensorDict(batch_size=env.batch_size) if state is None else env.set_state(state)
@@ -33,7 +27,7 @@ def stay(env: SafetyGymEnv, state: TensorDict | None = None) -> TensorDict:
 def test_new_goals_are_uniform_where_they_fit():
     pins = {"robot_locations": [[0, 0]], "hazards_num": 1, "hazards_locations": [[1, 1]]}
     keepouts = {"goal_keepout": 0.2, "robot_keepout": 0.5, "hazards_keepout": 0.3}
-    env = make({**ALWAYS_MET, **pins, **keepouts})
+    env = make({**ALWAYS_MET, **pins, **keepouts}, NUM_ENVS)
     goals = []
     for _ in range(4):
         assert stay(env)["goal_met"].all()
@@ -51,36 +45,26 @@ def test_new_goals_are_uniform_where_they_fit():
 
 
 MOVED = {
-    "robot": ({"task": "goal", "robot_keepout": 0.6}, 0.6),
-    "vase0": ({"task": "goal", "vases_num": 1, "vases_keepout": 0.6}, 0.6),
-    "box": ({"task": "push", "box_keepout": 0.6}, 0.6),
+    "robot": {"robot_keepout": 0.6},
+    "vase0": {"vases_num": 1, "vases_keepout": 0.6},
+    "box": {"task": "push", "box_keepout": 0.6},
+    "gremlin0": {"gremlins_num": 1, "gremlins_keepout": 0.6},
 }
 
 
 @pytest.mark.parametrize("name", MOVED)
 def test_new_goals_keep_clear_of_where_things_have_moved(name):
-    config, keepout = MOVED[name]
-    env = make({**ALWAYS_MET, **config, "goal_keepout": 0.2})
+    """And of the place of a gremlin's circle, wherever it is on it."""
+    env = make({**ALWAYS_MET, **MOVED[name], "goal_keepout": 0.2}, NUM_ENVS)
     state = env.get_state()
     before = places(env, state)[name].clone()
     now = 0.5 * torch.randn(NUM_ENVS, 2, dtype=torch.float64)
     state["qpos"][:, position_columns(env)[name]] = now
     assert stay(env, state)["goal_met"].all()
     goal = env.get_state()["goal_pos"][:, :2]
-    assert (goal - now).norm(dim=-1).min() >= keepout + 0.2 - 1e-9
-    assert ((goal - before).norm(dim=-1) < keepout + 0.2).any(), "the old place was kept clear"
-
-
-def test_gremlins_keep_the_place_of_their_circle():
-    env = make({**ALWAYS_MET, "gremlins_num": 1, "gremlins_keepout": 0.6, "goal_keepout": 0.2})
-    state = env.get_state()
-    circle = places(env, state)["gremlin0"].clone()
-    now = 0.5 * torch.randn(NUM_ENVS, 2, dtype=torch.float64)
-    state["qpos"][:, position_columns(env)["gremlin0"]] = now
-    assert stay(env, state)["goal_met"].all()
-    goal = env.get_state()["goal_pos"][:, :2]
-    assert (goal - circle).norm(dim=-1).min() >= 0.8 - 1e-9
-    assert ((goal - now).norm(dim=-1) < 0.8).any()
+    kept, free = (before, now) if name == "gremlin0" else (now, before)
+    assert (goal - kept).norm(dim=-1).min() >= 0.8 - 1e-9
+    assert ((goal - free).norm(dim=-1) < 0.8).any(), "the other place was kept clear"
 
 
 def test_goal_buttons_are_uniform_and_forget_the_last_one():
@@ -103,9 +87,7 @@ def test_goal_buttons_are_uniform_and_forget_the_last_one():
 
 
 def test_the_goal_of_a_button_task_is_where_its_button_is():
-    env = make(
-        {"robot_base": "car", "task": "button", "buttons_num": 3, "observe_goal_lidar": True}
-    )
+    env = make({"robot_base": "car", "task": "button", "buttons_num": 3}, NUM_ENVS)
     state = env.get_state()
     buttons = torch.stack([places(env, state)[f"button{i}"] for i in range(3)], 1)
     rows = torch.arange(NUM_ENVS)

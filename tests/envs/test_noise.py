@@ -3,18 +3,11 @@
 import numpy as np
 import pytest
 import torch
+from crafting import make
 from scipy.stats import binom, chisquare, kstest, pearsonr
-
-from safe_rl.envs import SafetyGymEnv
 
 POINT = {"robot_base": "point", "task": "none", "observe_sensors": False, "observe_ctrl": True}
 NUM_ENVS = 2000
-
-
-def make(num_envs: int = NUM_ENVS, seed: int = 0, **keys) -> SafetyGymEnv:
-    env = SafetyGymEnv({**POINT, **keys}, num_envs, seed=seed, sleep=False, num_threads=1)
-    env.reset()
-    return env
 
 
 def controls(env, action: tuple[float, float]) -> np.ndarray:
@@ -24,22 +17,22 @@ def controls(env, action: tuple[float, float]) -> np.ndarray:
 
 
 def test_noise_is_added_to_the_clipped_control():
-    got = controls(make(action_noise=0.3), (0.2, 5.0))
+    got = controls(make({**POINT, "action_noise": 0.3}, NUM_ENVS), (0.2, 5.0))
     for column, mean in ((0, 0.2), (1, 1.0)):
         assert kstest(got[:, column], "norm", (mean, 0.3)).pvalue > 1e-3
     assert abs(pearsonr(got[:, 0], got[:, 1]).statistic) < 0.1
 
 
 def test_noise_is_new_in_every_step_and_belongs_to_the_seed():
-    env = make(num_envs=50, action_noise=0.1)
+    env = make({**POINT, "action_noise": 0.1}, 50)
     tensordict, steps = env.reset(), []
     for _ in range(2):
         tensordict = env.step_mdp(env.step(tensordict.set("action", torch.zeros(50, 2))))
         steps.append(tensordict["observation"])
     assert not (steps[0] == steps[1]).any()
-    again = make(num_envs=50, action_noise=0.1)
+    again = make({**POINT, "action_noise": 0.1}, 50)
     assert np.array_equal(controls(again, (0.0, 0.0)), steps[0].double().numpy())
-    other = make(num_envs=50, action_noise=0.1, seed=1)
+    other = make({**POINT, "action_noise": 0.1}, 50, seed=1)
     assert not np.array_equal(controls(other, (0.0, 0.0)), steps[0].double().numpy())
 
 
@@ -51,7 +44,9 @@ def substeps(env) -> np.ndarray:
 
 @pytest.mark.parametrize(("trials", "probability"), [(10, 0.7), (4, 0.5)])
 def test_substeps_are_binomial(trials, probability):
-    got = substeps(make(frameskip_binom_n=trials, frameskip_binom_p=probability))
+    got = substeps(
+        make({**POINT, "frameskip_binom_n": trials, "frameskip_binom_p": probability}, NUM_ENVS)
+    )
     counts = np.bincount(got, minlength=trials + 1)
     expected = NUM_ENVS * binom.pmf(np.arange(trials + 1), trials, probability)
     common = expected >= 5
@@ -64,13 +59,15 @@ def test_substeps_are_binomial(trials, probability):
 
 @pytest.mark.parametrize(("trials", "probability", "number"), [(3, 1.0, 3), (10, 0.0, 0)])
 def test_certain_numbers_of_substeps(trials, probability, number):
-    got = substeps(make(num_envs=20, frameskip_binom_n=trials, frameskip_binom_p=probability))
+    got = substeps(
+        make({**POINT, "frameskip_binom_n": trials, "frameskip_binom_p": probability}, 20)
+    )
     assert set(got) == {number}
 
 
 def test_worlds_with_fewer_substeps_and_gremlins_do_what_a_plain_world_does():
     gremlins = {"gremlins_num": 2, "frameskip_binom_n": 6, "frameskip_binom_p": 0.5}
-    env = make(num_envs=12, **gremlins)
+    env = make({**POINT, **gremlins}, 12)
     env.rollout(3)
     before, action = env.get_state(), env.action_spec.rand()
     env.step(env.set_state(before).set("action", action))
@@ -78,7 +75,7 @@ def test_worlds_with_fewer_substeps_and_gremlins_do_what_a_plain_world_does():
     numbers = ((after["time"] - before["time"]) / 0.002).round().int()
     assert len(numbers.unique()) > 2
     for number in range(1, 7):
-        plain = make(num_envs=12, gremlins_num=2, frameskip_binom_n=number)
+        plain = make({**POINT, "gremlins_num": 2, "frameskip_binom_n": number}, 12)
         plain.step(plain.set_state(before).set("action", action))
         rows = numbers == number
         got, want = after["qpos"][rows], plain.get_state()["qpos"][rows]

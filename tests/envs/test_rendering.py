@@ -14,6 +14,8 @@ from pictures import colour_at, from_above, likeness, make_env, needs_opengl, re
 
 import safe_rl.envs
 from safe_rl.envs import SUITE, OpenGLError, SafetyGymEnv
+from safe_rl.envs.safety_gym.robots import ROBOTS
+from safe_rl.envs.velocity import VELOCITY_SUITE, VelocityEnv
 
 PLACE = (1.0, 0.5)
 # One object of every kind at PLACE, and the colour that the benchmark gives it.
@@ -52,43 +54,24 @@ def test_an_object_is_seen_where_it_stands_in_its_colour(kind):
     assert likeness(colour_at(env, *PLACE), rgb) > 0.95
 
 
-@needs_opengl
-def test_pictures_follow_the_state():
-    env = make_env({"render_lidar_markers": False})
-    state = env.get_state()
-    state["qpos"][0, :2] = torch.tensor([-1.0, 1.0])
-    assert redness(colour_at(env, 0.0, 0.0)) > 0.5
-    env.set_state(state)
-    assert redness(colour_at(env, 0.0, 0.0)) < 0.1
-    assert redness(colour_at(env, -1.0, 1.0)) > 0.5
-
-
 # What files of robots often have, too.
-OF_THE_ROBOT = """
-<mujoco>
+ASSETS = """
   <asset>
     <texture name="sky" type="skybox" builtin="flat" rgb1="1 0 0" width="8" height="8"/>
     <texture name="floor" type="2d" builtin="flat" rgb1="1 0 0" width="8" height="8"/>
     <material name="floor" texture="floor"/>
   </asset>
-  <worldbody>
-    <body name="robot" pos="0 0 0.1">
-      <freejoint/>
-      <geom size="0.1"/>
-      <site name="middle"/>
-      <camera name="track" mode="trackcom" pos="0 0 3" xyaxes="1 0 0 0 1 0"/>
-      <camera pos="0 0 1"/>
-    </body>
-  </worldbody>
-  <actuator><general site="middle" gear="0 0 0 0 0 1"/></actuator>
-</mujoco>
-"""
+  <worldbody>"""
+TRACK = (
+    '<camera name="track" mode="trackcom" pos="0 0 3" xyaxes="1 0 0 0 1 0"/><camera name="vision"'
+)
 
 
 @needs_opengl
 def test_a_robots_own_names_do_not_clash_with_those_of_pictures(tmp_path):
     path = tmp_path / "robot.xml"
-    path.write_text(OF_THE_ROBOT)
+    text = ROBOTS["point"].read_text()
+    path.write_text(text.replace("<worldbody>", ASSETS).replace('<camera name="vision"', TRACK))
     config, rgb = KINDS["goal"]
     observed = {"observe_sensors": False, "observe_goal_lidar": True}
     env = make_env({**config, **observed, "robot_base": str(path)})
@@ -97,7 +80,7 @@ def test_a_robots_own_names_do_not_clash_with_those_of_pictures(tmp_path):
     height = 101 / (2 * 3.1 * math.tan(math.radians(45 / 2)))  # pixels per metre
     line, column = round(50 - PLACE[1] * height), round(50 + PLACE[0] * height)
     assert likeness(seen[line, column] / 255, rgb) > 0.95
-    with pytest.raises(ValueError, match=r"\['fixednear', 'fixedfar', 'track', 'free'\]"):
+    with pytest.raises(ValueError, match=r"\['fixednear', 'fixedfar', 'track', 'vision', 'free'\]"):
         env.render(0, camera="eye")
     with pytest.raises(ValueError, match="Did you mean 'fixedfar'"):
         env.render(0, camera="fixdfar")
@@ -200,6 +183,56 @@ def test_every_camera_draws_something_of_its_own(robot):
     frames = [env.render(0, camera=name, width=60, height=40) for name in names]
     assert all(frame.std() > 5 for frame in frames)
     assert len({frame.tobytes() for frame in frames}) == len(names)
+
+
+def is_skin(frame):
+    """Where the robots' brown is."""
+    red, _, blue = (frame[..., part].astype(int) for part in range(3))
+    return red - blue > 25
+
+
+def is_red(frame):
+    """Where the sphere is: much more red than anything else."""
+    red, green, blue = (frame[..., part].astype(int) for part in range(3))
+    return red - np.maximum(green, blue) > 60
+
+
+@needs_opengl
+@pytest.mark.parametrize("name", VELOCITY_SUITE)
+@pytest.mark.parametrize("camera", ["track", "free"])
+def test_cameras_move_with_the_robot(name, camera):
+    env = VelocityEnv(name, seed=0, num_threads=1)
+    env.reset()
+    state = env.get_state()
+    frames = []
+    for distance in (0.0, 3.0):
+        state["qpos"][:, 0] = distance
+        env.set_state(state)
+        frames.append(env.render(0, camera=camera, width=128, height=96))
+    near, far = frames
+    assert near.shape == (96, 128, 3)
+    assert near.dtype == np.uint8
+    assert not np.array_equal(near, far)  # the floor has moved
+    seen = [is_skin(frame).sum() for frame in frames]
+    assert min(seen) > 50
+    assert min(seen) > 0.8 * max(seen)
+    lines, columns = is_skin(far).nonzero()
+    assert 32 < columns.mean() < 96
+    assert 24 < lines.mean() < 80
+
+
+@needs_opengl
+def test_too_fast_robots_are_marked():
+    keys = {"robot": "half_cheetah", "velocity_threshold": 1.0}
+    env = VelocityEnv(keys, num_envs=2, seed=0, num_threads=1)
+    env.reset()
+    state = env.get_state()
+    state["qvel"][:, 0] = torch.tensor([0.0, 5.0])
+    env.set_state(state)
+    env.step(env.full_action_spec.zero())
+    marked = [is_red(frame).sum() for frame in env.render(width=64, height=48)]
+    assert marked[0] < 5
+    assert marked[1] > 50
 
 
 @pytest.mark.parametrize(("backend", "package"), [("egl", "libegl1"), ("osmesa", "libosmesa6")])

@@ -1,12 +1,14 @@
-"""Specs, names and sizes of all 27 environments, ends of episodes, and partial resets."""
+"""Specs, names and sizes of both families' environments, ends of episodes, and partial resets."""
 
 import itertools
 
 import pytest
 import torch
+from playing import play
 from torchrl.envs.utils import check_env_specs
 
 from safe_rl.envs import SUITE, SafetyGymEnv, env_node, make_env
+from safe_rl.envs.velocity import VELOCITY_SUITE
 
 # By hand from sections 4, 8 and 9 of the benchmark's description: names and sizes.
 COMMON_SENSORS = {"accelerometer": 3, "gyro": 3, "magnetometer": 3, "velocimeter": 3}
@@ -76,15 +78,30 @@ def test_specs(robot, task):
     assert all(env.full_reward_spec[key].shape == (2, 1) for key in keys)
 
 
-@pytest.mark.parametrize("env_name", ["PointGoal1", "CarButton1", "DoggoPush1"])
-def test_time_outs_truncate_at_exactly_the_last_step(env_name):
-    env = SafetyGymEnv(SUITE[env_name].replace(num_steps=7), num_envs=3, seed=0, num_threads=1)
-    last = env.rollout(20)["next"]
-    assert last.shape == (3, 7)
-    for key in ("done", "truncated"):
-        assert not last[key][:, :-1].any()
-        assert last[key][:, -1].all()
-    assert not last["terminated"].any()
+@pytest.mark.parametrize("name", VELOCITY_SUITE)
+def test_specs_of_the_velocity_family(name):
+    env = make_env(name, num_envs=2, seed=0, num_threads=1)
+    check_env_specs(env)
+    assert env.cost_keys == ["cost", "cost_velocity"]
+    assert list(env.full_reward_spec.keys()) == ["reward", *env.cost_keys]
+    columns = [i for span in env.observation_layout.values() for i in range(span.start, span.stop)]
+    assert columns == list(range(env.observation_spec["observation"].shape[-1]))
+
+
+FALLING = [name for name, row in VELOCITY_SUITE.items() if row.healthy_reward is not None]
+
+
+@pytest.mark.parametrize("name", FALLING)
+def test_fallen_robots_terminate_and_start_anew(name):
+    run, staying = (
+        play(env, env.reset(), 120)
+        for keys in ({}, {"terminate_when_unhealthy": False})
+        for env in [make_env({**env_node(name), **keys}, num_envs=8, seed=0, num_threads=1)]
+    )
+    assert run["terminated"].any()
+    assert torch.equal(run["done"], run["terminated"])
+    assert run["reward"][run["terminated"]].isfinite().all()
+    assert not staying["terminated"].any()
 
 
 @pytest.mark.parametrize("env_name", ["PointGoal1", "SafeSwimmerVelocity"])

@@ -4,29 +4,14 @@ import math
 
 import pytest
 import torch
-from crafting import arrange, step_from
+from crafting import arrange, make, step_from
 
-from safe_rl.envs import SafetyGymEnv
 from safe_rl.envs.safety_gym.tasks import circle_speed
 
 POINT = {"robot_base": "point", "placements_extents": [-4, -4, 4, 4]}
 FROZEN = {**POINT, "frameskip_binom_p": 0.0}
 GOAL_HEIGHT = 0.3 / 2 + 0.01
 POINT_HEIGHT = 0.1
-
-
-def make(config, num_envs: int = 1) -> SafetyGymEnv:
-    env = SafetyGymEnv(config, num_envs=num_envs, seed=0, sleep=False, num_threads=1)
-    env.reset()
-    return env
-
-
-def walk(env, num_steps: int):
-    """States before and after random steps, and what each step returned."""
-    for _ in range(num_steps):
-        before = env.get_state()
-        got = env.step(env.rand_action())["next"]
-        yield before, got, env.get_state()
 
 
 @pytest.mark.parametrize(("distance", "met"), [(0.2999, True), (0.3001, False)])
@@ -71,13 +56,6 @@ def test_dense_rewards_are_clipped_before_the_goal_is_added(sign):
     state = arrange(env, robot=(0, 0, 0), goal=(3, 0))
     state["qvel"][:, 0] = 1.0 * sign
     assert float(step_from(env, state, 0, 0)["reward"]) == 3.0 * sign + 1.0
-
-
-def test_no_task_no_reward():
-    env = make({**POINT, "task": "none"}, 4)
-    for _, got, _ in walk(env, 5):
-        assert not got["reward"].any()
-        assert not got["goal_met"].any()
 
 
 def test_the_very_centre_of_the_circle_is_no_motion_about_it():

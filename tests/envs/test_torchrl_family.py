@@ -7,7 +7,6 @@ from pathlib import Path
 import pytest
 import torch
 import torchrl_envs
-import yaml
 from commands import run_train
 from torchrl.envs import PendulumEnv
 from torchrl.envs.utils import check_env_specs
@@ -43,16 +42,6 @@ def run(tmp_path_factory) -> Path:
     outside = ("env.outside={cost_speed: [thdot, -4, 4]}", "cost_limits={cost_speed: 3}")
     run_train(*SMALL, *own, *outside, "frames=320", f"hydra.run.dir={folder}")
     return folder
-
-
-def test_its_folder_tells_everything(run):
-    env = yaml.safe_load((run / "config.yaml").read_text())["env"]
-    assert env["name"] == "PendulumEnv"
-    assert env["cost"] == "torchrl_envs:upright"
-    table = read_table(run / "progress.csv")
-    assert table["steps"] == [160, 320]
-    assert table["episode_length"] == [20, 20]
-    assert all(cost > 0 for cost in table["episode_cost_speed"] + table["episode_cost"])
 
 
 def test_it_resumes_is_evaluated_and_reported(run, tmp_path, capsys):
@@ -151,30 +140,18 @@ def test_several_entries_become_a_vector_or_a_dictionary():
     assert flat.observation_layout["price_history"] == slice(1, 51)
 
 
-def starts(seed: int, num_envs: int = 4) -> list[float]:
-    return make_env(PENDULUM, num_envs=num_envs, seed=seed).reset()["th"].tolist()
-
-
-def test_seeds_determine_rows_and_share_none():
-    assert starts(0) == starts(0)
-    assert len({*starts(0), *starts(1), *starts(2)}) == 12
-
-
 @pytest.mark.parametrize(
     ("keys", "message"),
     [
         ({"id": None}, r"env\.id="),
         ({"id": "PendulunEnv"}, "Did you mean 'PendulumEnv'.*import=torchrl.envs"),
-        ({"speed": 3}, "no key 'speed'.*env.kwargs"),
         ({"num_steps": None}, "does not say how long"),
         ({"outside": None}, "what does a step cost"),
         ({"outside": {"speed": ["thdot", -4, 4]}}, "called cost or cost_<kind>, not 'speed'"),
         ({"outside": {"cost_speed": ["thdto", -4, 4]}}, "Did you mean 'thdot'"),
         ({"outside": {"cost_speed": ["thdot", 1, -4, 4]}}, "column 1 of thdot, which has 1"),
         ({"outside": {"cost_speed": ["thdot", 4, -4]}}, "range 4 to -4"),
-        ({"outside": {"cost_speed": 4}}, "must be as"),
         ({"observe": ["thdto"]}, "Did you mean 'thdot'"),
-        ({"cost_keys": ["cost_none"]}, "no entry 'cost_none'"),
         *(({"cost_keys": [key]}, f"'{key}' is a state.*env.outside") for key in ("th", "reward")),
         ({"kwargs": {"mass": 3}}, "env.id=PendulumEnv: TypeError.*mass"),
         ({"cost": 3}, "'cost' names a function"),

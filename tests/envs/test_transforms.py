@@ -185,8 +185,10 @@ def test_interventions_can_have_a_budget():
 
 
 @pytest.mark.parametrize("env", ["point_mass", "safety_gym"])
-def test_a_snapshot_continues_exactly(env):
-    env = transformed(env, *ALL_BUT_SAUTE, seed=0)
+@pytest.mark.parametrize("k", [1, 3])
+def test_a_snapshot_continues_exactly(env, k):
+    repeat = {"repeat": ActionRepeat(k)} if k > 1 else {}
+    env = transformed(env, *ALL_BUT_SAUTE, **repeat, seed=0)
 
     def resume(state):
         torch.manual_seed(1)
