@@ -109,9 +109,6 @@ def register_element(element: Element, keys: Mapping[str, Any] | None = None) ->
         0.1
     """
     _refuse_taken("element", element.kind)
-    if not isinstance(element.motion, Motion):
-        names = ", ".join(f"Motion.{motion.name}" for motion in Motion)
-        raise ConfigError(f"'{element.kind}': motion={element.motion!r} must be one of {names}.")
     others = [row for row in ELEMENTS if row.kind != element.kind]
     if element.label in {"robot", "floor", *(row.label for row in others)}:
         raise ConfigError(f"Another object is called '{element.label}': choose another label.")

@@ -57,14 +57,6 @@ def test_substeps_are_binomial(trials, probability):
     assert chisquare(observed, wanted).pvalue > 1e-3
 
 
-@pytest.mark.parametrize(("trials", "probability", "number"), [(3, 1.0, 3), (10, 0.0, 0)])
-def test_certain_numbers_of_substeps(trials, probability, number):
-    got = substeps(
-        make({**POINT, "frameskip_binom_n": trials, "frameskip_binom_p": probability}, 20)
-    )
-    assert set(got) == {number}
-
-
 def test_worlds_with_fewer_substeps_and_gremlins_do_what_a_plain_world_does():
     gremlins = {"gremlins_num": 2, "frameskip_binom_n": 6, "frameskip_binom_p": 0.5}
     env = make({**POINT, **gremlins}, 12)

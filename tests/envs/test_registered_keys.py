@@ -1,7 +1,6 @@
 """Keys registered from outside the package: validation, pickling, Hydra, and refused rows."""
 
 import pickle
-from dataclasses import replace
 
 import pytest
 import torch
@@ -95,10 +94,6 @@ WRONG = {
     "a kind without its tuple": (
         lambda: register_cost(Cost("cost_mines", bool, follow, touches="pillars")),
         r"'pillars' is a text: .*\('pillars',\)",
-    ),
-    "a motion by its name": (
-        lambda: register_element(replace(disc("mines", "mine"), motion="virtual")),
-        r"'mines': motion='virtual'.*Motion\.VIRTUAL",
     ),
     "a built-in key": (
         lambda: register_element(disc("mines", "mine"), keys={"num_steps": 3}),

@@ -44,7 +44,6 @@ def test_another_robot_brings_its_own_keys():
     ("given", "message"),
     [
         ("SafeHoperVelocity", "Did you mean 'SafeHopperVelocity'"),
-        (7, "got int"),
         ({"frame_skip": 2}, "lacks 'robot'"),
         ({"robot": "hoper"}, "Did you mean 'hopper'"),
         ({"robot": "hopper", "velocity_treshold": 1.0}, "Did you mean 'velocity_threshold'"),

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from functools import cache
 from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 
-from safe_rl.envs.errors import ConfigError, nearest
+from safe_rl.envs.errors import ConfigError
 from safe_rl.ranges import Range, Values, values_of
 
 LARGEST_SEED = 2**62  # of layouts, which are hashed as 64-bit integers
@@ -104,10 +104,3 @@ def infer_key(name: str, default: Any) -> Key:
     if isinstance(default, tuple):
         return Key(default, tuple[float if kind is int else kind, ...])  # type: ignore[misc]
     return Key(default, kind)
-
-
-def check_choice(name: str, value: Any, choices: Collection[Any]) -> None:
-    """Check that a value is one of several; ConfigError names the nearest one."""
-    if value not in choices:
-        hint = nearest(value, map(str, choices)) if isinstance(value, str) else ""
-        raise ConfigError(f"'{name}' must be one of {tuple(choices)}, got {value!r}.{hint}")

@@ -13,7 +13,7 @@ from typing import Any
 
 from safe_rl.envs.errors import ConfigError, nearest
 from safe_rl.envs.safety_gym.config import SafetyGymConfig
-from safe_rl.envs.safety_gym.config_values import LARGEST_SEED, check_choice
+from safe_rl.envs.safety_gym.config_values import LARGEST_SEED
 from safe_rl.envs.safety_gym.robots import PATHS_OF_2019, ROBOTS
 from safe_rl.envs.safety_gym.tasks import TASKS, goal_is_button
 
@@ -143,11 +143,6 @@ def resolve(env: str | Mapping[str, Any] | SafetyGymConfig) -> SafetyGymConfig:
         return check(env)
     if isinstance(env, Mapping):
         return check(SafetyGymConfig.from_dict(env))
-    if not isinstance(env, str):
-        raise ConfigError(
-            "An environment is a suite name, a mapping of configuration keys or a SafetyGymConfig, "
-            f"got {type(env).__name__}."
-        )
     name = env.removeprefix("Safexp-").removesuffix("-v0")
     named = SUITE | EXTRAS
     if name not in named:
@@ -166,7 +161,9 @@ def check(config: SafetyGymConfig) -> SafetyGymConfig:
     Raises:
         ConfigError: naming the first key that is wrong.
     """
-    check_choice("task", config.task, TASKS)
+    if config.task not in TASKS:
+        hint = nearest(config.task, TASKS)
+        raise ConfigError(f"'task' must be one of {tuple(TASKS)}, got {config.task!r}.{hint}")
     name = PATHS_OF_2019.get(config.robot_base)
     if name is not None and not Path(config.robot_base).is_file():
         config = config.replace(robot_base=name)

@@ -153,11 +153,6 @@ def resolve_velocity(env: str | Mapping[str, Any] | VelocityConfig) -> VelocityC
         return env
     if isinstance(env, Mapping):
         return VelocityConfig.from_dict(env)
-    if not isinstance(env, str):
-        raise ConfigError(
-            "An environment is a name, a mapping of configuration keys or a VelocityConfig, got "
-            f"{type(env).__name__}."
-        )
     name = env.removesuffix("-v1")
     if name.startswith("Safety"):
         name = f"Safe{name.removeprefix('Safety')}"
