@@ -43,8 +43,8 @@ class Memory(Checked):
         n_steps: Steps n of n-step returns.
         storage: Where transitions are kept: ``"tensor"`` in main memory, ``"memmap"`` in temporary
             files.
-        prioritised: Exponents ``alpha`` and ``beta`` of prioritised replay (Schaul et al. 2016,
-            sections 3.3 and 3.4), or None for uniform draws.
+        prioritised: Exponents ``alpha`` and ``beta`` of prioritised replay, or None for uniform
+            sampling. See Schaul et al. 2016, sections 3.3 and 3.4.
         keep: Whether checkpoints have the transitions, so that a resumed run continues exactly.
         device: Device of the minibatches.
 

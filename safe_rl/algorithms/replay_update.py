@@ -29,8 +29,8 @@ class ReplayUpdate(Checked):
         optimizer: Function of the parameters that builds the optimiser, for example
             ``functools.partial(torch.optim.Adam, lr=3e-4, fused=True)``.
         updates_per_step: Gradient steps per step of an environment, the update-to-data ratio.
-        tau: Polyak averaging τ: weight of the new parameters in the target networks at every
-            update; None without target networks.
+        tau: Weight τ of the new parameters in the target networks at every update (Polyak
+            averaging); None without target networks.
         policy_delay: Steps of the critics per step of the policy, and of the targets.
         rates: Learning rates of parameters whose names begin with a key, such as ``log_alpha``; for
             others that of the optimiser.

@@ -30,7 +30,7 @@ class PIMultiplier(Multiplier):
         init: Initial λ, at most `highest`, for all costs or one per cost.
         kp: Proportional gain K_P.
         ki: Integral gain K_I.
-        saturation: Bound of the error |Δ|, in units of the limit.
+        saturation: Bound of the size of the error Δ, in units of the limit.
         highest: Upper bound of λ. The reward keeps at least the weight 1 / (1 + highest) in a
             Lagrangian loss with one cost.
 
@@ -87,7 +87,7 @@ class PIDMultiplier(Multiplier):
 
     Args:
         cost_limits: Mapping from cost key to limit d, or limits alone; see `parse_cost_limits`.
-        init: First λ, for all costs or one per cost.
+        init: Initial λ, for all costs or one per cost.
         kp: Proportional gain K_P.
         ki: Integral gain K_I.
         kd: Derivative gain K_D.

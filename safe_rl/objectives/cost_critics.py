@@ -40,7 +40,7 @@ class CostCritics(QFunctionLoss):
         cost_keys: Costs below ``next``, [..., 1] each; of transitions over n steps their discounted
             sums, which TorchRL's `MultiStepTransform` makes of no more than its ``reward_keys``.
         pessimism: Standard deviations κ among the cost critics that are added to their mean.
-        target_pessimism: The same for the value that all critics bootstrap on. None: every critic
+        target_pessimism: The same for the value that all critics bootstrap on; None: every critic
             bootstraps on its own target network.
         lowest_cost_value: Lower bound of the values that critics bootstrap on, such as 0 if no cost
             is negative; None: no bound.

@@ -135,18 +135,19 @@ class LimitTracker(Checked, Resumable):
         largest_margin: Bound of the margin, as a share of d.
         free_steps: Environment steps for which costs have no effect.
         descent_steps: Environment steps in which the limit then falls.
-        recovery: Share of d that is the target once J_c is above d, until J_c has reached it. This
-            is the hysteresis of the published C-TRPO and CPO with hysteresis; 1 for none.
+        recovery: Share of d that is the target once J_c is above d, until J_c has reached it; 1 for
+            none. This is the hysteresis of the published C-TRPO and CPO with hysteresis.
         steps_per_decision: Environment steps per row of time of a batch.
         frames: Environment steps of the whole run.
         latest_end: Share of the run at which the descent ends at the latest. In a shorter run, both
             numbers of steps are reduced in proportion.
         smallest_scale: Lower bound of the unit of violations, in costs per step, for limits near 0.
-        drift: Expected relative change of J_c per update; see `EpisodeCosts`.
+        drift: Expected relative change of J_c per update, see `EpisodeCosts`; None uses each batch
+            alone.
         memory: Weight of the past in the standard error of a batch and in the trust.
-        largest_correlation: Bound of the correlation r of the noise of successive batches, which is
-            measured from rows whose episodes span batches. The variance of a batch is (1 + r) /
-            (1 − r) times that of its rows. With 0, batches count as independent.
+        largest_correlation: Bound of the correlation r of the noise of successive batches; with 0,
+            batches count as independent. r is measured from rows whose episodes span batches. The
+            variance of a batch is (1 + r) / (1 − r) times that of its rows.
         descent_errors: Standard errors that are added to the estimate of J_c before the limit
             follows it down. With 0 the limit follows the lowest of several noisy estimates, and
             falls faster than the policy's cost.

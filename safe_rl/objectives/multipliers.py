@@ -151,7 +151,7 @@ class LagrangeMultiplier(Multiplier):
 
     Args:
         cost_limits: Mapping from cost key to limit d, or limits alone; see `parse_cost_limits`.
-        init: First λ, for all costs or one per cost; above 0, which a softplus never reaches.
+        init: Initial λ, for all costs or one per cost; above 0, which a softplus never reaches.
         lr: Step size of Adam.
 
     Examples:
@@ -206,7 +206,7 @@ class ProjectedMultiplier(Multiplier):
 
     Args:
         cost_limits: Mapping from cost key to limit d, or limits alone; see `parse_cost_limits`.
-        init: First λ, at most `highest`, for all costs or one per cost.
+        init: Initial λ, at most `highest`, for all costs or one per cost.
         lr: Step size α, change of λ per cost of size u in an episode.
         highest: Upper bound λ_max; None for none.
 

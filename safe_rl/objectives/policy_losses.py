@@ -95,7 +95,8 @@ class PPOLagrangianLoss(WeighsCosts, PPOLoss):
 
     Args:
         parts: Actor, and a multiplier with one λ per column of ``cost_advantage``.
-        cost_clipping: How cost surrogates are clipped, see above.
+        cost_clipping: Whether the surrogates of costs are clipped: not, each one, or jointly with
+            the reward's.
         settings: Those of every clipped loss, see `PPOLoss`.
 
     Examples:

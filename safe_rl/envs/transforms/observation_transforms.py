@@ -31,7 +31,7 @@ class SensorNoise(ConstraintTransform):
 
     Args:
         std: Standard deviation of the noise, in the units of what is observed.
-        components: Names of those that are noisy, as in `observation_layout`; None: all.
+        components: Names of the noisy components, as in `observation_layout`; None: all.
 
     Examples:
         >>> from safe_rl.envs import make_env
@@ -135,7 +135,7 @@ class PolicyMemory(ConstraintTransform):
     it had.
 
     Args:
-        size: Numbers per row.
+        size: Size of the recurrent state of a row.
 
     Examples:
         >>> from torchrl.envs import TransformedEnv

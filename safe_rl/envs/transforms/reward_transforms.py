@@ -31,7 +31,7 @@ class RewardScale(ConstraintTransform):
     reward, which is kept in `task_reward`; evaluation changes nothing.
 
     Args:
-        factor: What rewards are multiplied by.
+        factor: Factor of the rewards.
 
     Examples:
         >>> from safe_rl.envs import make_env
