@@ -71,7 +71,7 @@ COST_MEANINGS = {
     "cost_vases_displace": "vases have been moved since the reset; size: distance [m]",
     "cost_vases_velocity": "vases move; size: speed [m/s]",
     "cost_pillars": "the robot touches pillars; size: number of contact points",
-    "cost_buttons": "the robot touches a wrong button (not shortly after a goal); size: contact points",
+    "cost_buttons": "the robot touches a wrong button, not just after a goal; size: contact points",
     "cost_gremlins": "the robot touches gremlins; size: number of contact points",
     "cost_boundary": "the robot's centre is outside of a boundary; size: distance [m]",
     "cost_velocity": "the robot is faster than `velocity_limit`; size: excess [m/s]",
