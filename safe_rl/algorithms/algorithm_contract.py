@@ -132,7 +132,8 @@ class Recipe(ABC):
 class PolicyUpdate(Checked, Resumable, ABC):
     """Interface of a policy update: gradient steps, a trust-region step, or your own.
 
-    ``state_names`` names what an exact continuation needs beyond the networks' parameters.
+    ``state_names`` are attributes that an exact continuation needs, besides the networks'
+    parameters.
     """
 
     @abstractmethod

@@ -193,7 +193,7 @@ class MinibatchUpdate(PolicyUpdate):
         return diagnostics
 
     def _samples(self, batch: TensorDictBase) -> TensorDictBase:
-        """What the loss reads of a batch, without padding; refuses what is not finite."""
+        """Entries of a batch that the loss reads, without padding; an error if not finite."""
         require_finite(batch, self.loss.in_keys)
         mask_keys = [key for key in AUTO_LOSS_MASK_KEYS if batch.get(key, None) is not None]
         selected = batch.select(*self.loss.in_keys, *mask_keys)

@@ -24,7 +24,7 @@ def prefers_onednn(cpuinfo: str) -> bool:
     oneDNN really rounds only on processors with tile registers (AMX).
 
     Args:
-        cpuinfo: What Linux says of the processor, the text of ``/proc/cpuinfo``.
+        cpuinfo: Text of ``/proc/cpuinfo`` on Linux.
 
     Examples:
         >>> prefers_onednn("vendor_id : AuthenticAMD flags : fpu avx2 avx512f")

@@ -15,7 +15,7 @@ from safe_rl.ranges import NotNegative, Range, Weight
 def discounted_share(gamma: float, episode_length: Tensor) -> Tensor:
     """Discounted cost per cost of an episode, if costs are spread evenly over its T steps.
 
-    (1 − γᵀ) / ((1 − γ) T): what the published code multiplies limits by.
+    (1 − γᵀ) / ((1 − γ) T): the factor of limits in the published code.
 
     Examples:
         >>> discounted_share(0.99, torch.tensor(1000.0))

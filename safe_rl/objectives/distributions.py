@@ -86,7 +86,7 @@ def has_closed_kl(distribution: Distribution) -> bool:
 
 
 def _total(numbers: Iterable[Tensor], states: torch.Size) -> Tensor:
-    """Sum over the parts, and over what a part leaves apart: [*states, ...] each -> [*states]."""
+    """Sum over the parts and their remaining dimensions: [*states, ...] each -> [*states]."""
     return torch.stack([each.reshape(*states, -1).sum(-1) for each in numbers]).sum(0)
 
 

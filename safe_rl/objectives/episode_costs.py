@@ -247,7 +247,7 @@ class EpisodeCosts(Resumable):
     def update(
         self, costs: Tensor, lengths: Tensor, charges: Charges | None = None
     ) -> CostEstimate:
-        """Take in a batch.
+        """Update the estimate with a batch.
 
         Args:
             costs: Costs of its steps, [N, T, k].

@@ -239,7 +239,7 @@ class LimitTracker(Checked, Resumable):
 
     @torch.no_grad()
     def update(self, costs: Tensor, lengths: Tensor, charges: Charges | None = None) -> LimitState:
-        """Take in a batch.
+        """Update estimates and targets with a batch.
 
         Args:
             costs: Costs of its steps, [N, T, k].

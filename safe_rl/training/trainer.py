@@ -1,4 +1,4 @@
-"""The training loop: collect, account, learn, record."""
+"""The training loop: collect a batch, compute episode statistics, learn, record."""
 
 from __future__ import annotations
 
@@ -37,10 +37,10 @@ _FOR_RESUMING = {"memory", "policy_update", "critic_update", "env", "accounting"
 
 
 class Evaluator(Protocol):
-    """What evaluates a policy while it is trained."""
+    """Interface of periodic evaluations during training."""
 
     def __call__(self, before: int, after: int) -> dict[str, float]:
-        """Columns after an epoch, between two numbers of steps: the same at every call."""
+        """Columns of an epoch from step `before` to step `after`; the same names at every call."""
         ...
 
 
@@ -49,10 +49,10 @@ class Trainer:
 
     Args:
         env: Environment that the collector steps.
-        algorithm: What learns.
+        algorithm: The algorithm to train.
         collector: Endless collector of [N, T] batches, running the algorithm's policy.
         cost_limits: Cost key -> d, undiscounted cost per episode, for the best checkpoints.
-        record: What the run writes into its folder.
+        record: Writes the files of the run.
         config: Configuration of the run, for ``frames`` and ``checkpoint``.
         evaluation: Evaluates the policy after every epoch in which that is due, or None.
         recording: Where every batch is written, or None.
@@ -140,7 +140,7 @@ class Trainer:
         return parts
 
     def resume(self) -> bool:
-        """Continue the run in the folder from its newest checkpoint; if it has none, start over.
+        """Continue the run in the folder from its newest checkpoint, or from the beginning if none.
 
         Returns:
             Whether there was one.
@@ -161,7 +161,7 @@ class Trainer:
         return self._worlds is None
 
     def _begin_episodes(self) -> None:
-        """Without their state, the worlds cannot continue the episodes that were open."""
+        """Begin new episodes, because the state of the worlds was not saved."""
         if self._worlds is not None:
             return
         self.accounting.forget_open_episodes()
@@ -178,8 +178,8 @@ class Trainer:
     def run(self) -> str:
         """Train for ``frames`` steps, rounded up to whole batches.
 
-        Ctrl-C, SIGTERM or SIGHUP ends the run after the epoch at hand, with a checkpoint;
-        ``interrupted_by`` then holds the signal, unless that epoch was the last one.
+        Ctrl-C, SIGTERM or SIGHUP ends the run after the current epoch, with a checkpoint. Then
+        ``interrupted_by`` is the signal, unless that epoch was the last one.
 
         Returns:
             One line on the outcome.
@@ -235,7 +235,7 @@ class Trainer:
             self._save()
 
     def batches(self) -> Iterator[TensorDictBase]:
-        """Rollouts [N, T] of the present policy, without end."""
+        """Endless rollouts [N, T] of the current policy."""
         return iter(self._collector)
 
     def epoch(self, batches: Iterator[TensorDictBase]) -> dict[str, float]:
@@ -279,6 +279,6 @@ class Trainer:
         self.record.draw_curves()
 
     def _keep(self, judged: Iterable[Judged]) -> None:
-        """Keep those of the policies that are among the best so far."""
+        """Save checkpoints of those policies that are among the best so far."""
         for one in judged:
             self._checkpoints.save_best(one.steps, one.score, one.facts, states=one.states)

@@ -94,7 +94,7 @@ class SafetyGymConfig(Vocabulary):
 
 
 class KeyRow(NamedTuple):
-    """A row of the table of keys: name, what it may be in words, meaning and default."""
+    """A row of the table of keys: name, allowed values in words, meaning and default."""
 
     name: str
     values: str

@@ -45,9 +45,9 @@ class Key(NamedTuple):
     """A configuration key.
 
     Attributes:
-        default: its value where none is given.
+        default: its value if none is given.
         annotation: its type and range, such as `float | None` or `safe_rl.ranges.Positive`.
-        meaning: what it is, for the table of keys.
+        meaning: its meaning, for the table of keys.
     """
 
     default: Any

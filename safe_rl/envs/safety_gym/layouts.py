@@ -26,7 +26,7 @@ PIN_TOLERANCE = 1e-9  # half width of the square that a pinned location stands f
 
 @dataclass(frozen=True)
 class PlacementPlan:
-    """What is placed, in which order, and where each object may stand.
+    """The objects to place, their order, and where each may be.
 
     Attributes:
         names: the P objects in order of placement.
@@ -228,7 +228,7 @@ def _rounds(total: int, rows: int) -> Iterator[tuple[int, int]]:
 
 
 def sample_layouts(plan: PlacementPlan, key: Tensor) -> Tensor:
-    """Draw a layout for every key [B]: positions [B, 1 + M, 2], zero for what is not placed.
+    """Draw a layout for every key [B]: positions [B, 1 + M, 2], zero for objects not placed.
 
     Objects are placed one after the other, with 100 tries each. If one does not fit, the whole
     layout is drawn again, at most 10,000 times, and less often if no row's layout is found.

@@ -50,7 +50,7 @@ class Task(NamedTuple):
 
     Attributes:
         reward: (config, world, measured one step before [N, D], measured now [N, D]) -> [N].
-        measure: what the reward takes differences of, [N, D].
+        measure: measurements whose differences are the reward, [N, D].
         met: (config, world, measured now) -> bool [N], for tasks with goals.
         next_goal: how a new goal is drawn, for tasks with goals.
         elements: kinds of which the task brings one object each.
