@@ -26,7 +26,7 @@ def random_problems(num_problems, num_costs, seed):
     return g, b, c
 
 
-def solve(g, b, c):
+def solve(g, b, c, dtype=torch.float64):
     """Dual solution and the step x of every problem, through q, r, S and c only."""
     inputs = (
         np.einsum("ni,ni->n", g, g),
@@ -34,7 +34,7 @@ def solve(g, b, c):
         np.einsum("nki,nli->nkl", b, b),
         c,
     )
-    solution = solve_dual(*map(torch.as_tensor, inputs), DELTA)
+    solution = solve_dual(*(torch.as_tensor(x, dtype=dtype) for x in inputs), DELTA)
     step = -solution.reward_coefficient.numpy()[:, None] * g
     step = step - np.einsum("nk,nki->ni", solution.cost_coefficient.numpy(), b)
     return solution, step
@@ -170,15 +170,7 @@ def test_single_precision_inputs_of_nearly_parallel_gradients():
     g, b, c = random_problems(500, 2, seed=11)
     b[:, 0] = -g + 1e-4 * b[:, 0]
     b[:, 1] = b[:, 0] + 1e-4 * b[:, 1]
-    inputs = (
-        np.einsum("ni,ni->n", g, g),
-        np.einsum("ni,nki->nk", g, b),
-        np.einsum("nki,nli->nkl", b, b),
-        c,
-    )
-    solution = solve_dual(*(torch.as_tensor(x, dtype=torch.float32) for x in inputs), DELTA)
-    step = -solution.reward_coefficient.numpy()[:, None] * g
-    step = step - np.einsum("nk,nki->ni", solution.cost_coefficient.numpy(), b)
+    solution, step = solve(g, b, c, torch.float32)
     assert np.isfinite(step).all()
     assert solution.lam.dtype == torch.float32
     # Rounding can lengthen a step that is a difference of large parts; line searches shorten it.
