@@ -220,17 +220,10 @@ def _settings(run: Run) -> dict[str, Hashable]:
     """What tells a run's algorithm from others of the same name."""
     named = experiment_of(run.config).items()
     settings = {key: value for key, value in named if key.partition(".")[0] != "env"}
-    for key in [key for key in settings if role_of(key) is Role.LENGTH and key != "frames"]:
-        if settings[key] == settings.get("frames"):
-            del settings[key]  # it only says again how long the run is
-    # what the preset sets for the robot tells nothing apart
-    robots = (Path(str(run.config["env"].get("robot_base"))).stem, "point")
-
-    def of_robot(key: str) -> Hashable:
-        found = (settings.get(f"paper.{key}.{robot}") for robot in robots)
-        return next((value for value in found if value is not None), None)
-
-    return {key: value for key, value in settings.items() if value != of_robot(key)}
+    # some only say again how long the run is
+    is_length = {key: role_of(key) is Role.LENGTH and key != "frames" for key in settings}
+    frames = settings.get("frames")
+    return {k: v for k, v in settings.items() if not is_length[k] or v != frames}
 
 
 def distinguishing_keys(cells: Sequence[Sequence[Settings]]) -> list[str]:
