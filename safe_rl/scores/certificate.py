@@ -1,7 +1,7 @@
-"""Which of several policies keeps its limits: what is claimed, the order of tests, the tests.
+"""Statistical tests of which of several policies keeps its limits.
 
-A mean below its limit on the episodes that a policy was chosen by says little: the luckiest of many
-was chosen. So policies are ranked by some episodes and tested on others.
+If a policy was chosen by its mean cost on some episodes, this mean says little, because the
+luckiest of many policies was chosen. So policies are ranked by some episodes and tested on others.
 """
 
 from __future__ import annotations
@@ -32,13 +32,13 @@ Costs = Mapping[str, ArrayLike]
 
 @dataclass(frozen=True)
 class Statement:
-    """That the mean of some values of episodes is at most a limit.
+    """The statement that the mean of a value of episodes is at most a limit.
 
     Attributes:
-        name: Of the mean.
-        limit: The most that it may be.
+        name: Name of the mean.
+        limit: Limit of the mean.
         highest: The largest possible value.
-        values: Of every episode, [E].
+        values: Value of every episode, [E].
         is_share: Whether values are 0 or 1.
     """
 
@@ -63,10 +63,11 @@ class Statement:
         return bool(log_wealth(self.values, self.limit, self.highest)[-1] >= -math.log(1 - level))
 
     def is_hopeless(self, level: float, most: int) -> bool:
-        """Whether so many episodes in all would hardly exclude a mean above the limit.
+        """Whether the test will probably fail with this total number of episodes.
 
-        That is so if the best bet has grown to less than a quarter of what it needs, pro rata.
-        It makes no certificate more likely: one may give up at any time.
+        This is the case if the best bet has grown to less than a quarter of what it needs, in
+        proportion to the episodes so far. A wrong certificate does not become more likely by this:
+        a test may be given up at any time.
         """
         if self.highest <= self.limit:
             return False
@@ -76,21 +77,22 @@ class Statement:
 
 @dataclass(frozen=True)
 class Claim:
-    """What is to be certified of a policy's episode costs.
+    """The claim about a policy's episode costs that is to be certified.
 
     Attributes:
-        limits: Cost key -> d, of the mean cost per episode.
-        most_over: Largest share of episodes that may cost more than d; 1 asks for nothing.
+        limits: Cost key -> d, limit of the mean cost per episode.
+        most_over: Largest share of episodes that may cost more than d; 1: no bound.
         level: Confidence of the whole statement.
-        highest: Cost key -> the most that an episode can cost; infinite where nothing is said.
+        highest: Cost key -> the highest possible cost of an episode; infinite if not given.
         bound: One of :data:`BOUNDS`.
-        cap: Costs of episodes count up to here, and at most a share ``most_beyond`` of them may
-            cost more; None: only where the highest cost is infinite, at ten times the limit.
+        cap: Costs of episodes count only up to this value, and at most a share ``most_beyond`` of
+            them may cost more. None: a cap of ten times the limit, only if the highest cost is
+            infinite.
         most_beyond: Largest share of episodes that may cost more than a cap.
-        tail: The limits are on the mean cost of the costliest share α of the episodes (CVaR); 1: on
-            the mean of all.
+        tail: Share α of the episodes with the highest costs, whose mean is limited (CVaR); 1: the
+            mean of all episodes is limited.
         thresholds: With a tail: cost key -> ν of the bound ν + E[(C − ν)₊] / α of the CVaR, which
-            is tight where a share α of the episodes costs more than ν. It holds for every ν that is
+            is tight if a share α of the episodes costs more than ν. It holds for every ν that is
             chosen before the test.
 
     Examples:
@@ -110,14 +112,14 @@ class Claim:
     thresholds: Mapping[str, float] = field(default_factory=dict)
 
     def with_thresholds(self, costs: Costs) -> Claim:
-        """The claim with the value at risk of some episodes, which are in no test, as ν."""
+        """The claim with ν set to the value at risk of episodes that are in no test."""
         if self.tail == 1:
             return self
         quantiles = {key: np.quantile(np.asarray(costs[key]), 1 - self.tail) for key in self.limits}
         return replace(self, thresholds={key: float(q) for key, q in quantiles.items()})
 
     def statements(self, costs: Costs) -> list[Statement]:
-        """Everything that has to be shown, with its values of some episodes, [E] each."""
+        """All statements that have to be shown, with their values for some episodes, [E] each."""
         return [
             one for key in self.limits for one in self._about(key, np.asarray(costs[key], float))
         ]
@@ -143,10 +145,10 @@ class Claim:
             yield Statement(f"over_limit_{key}", self.most_over, 1.0, _above(costs, limit), True)
 
     def bounds(self, costs: Costs, tests: int) -> dict[str, tuple[float, float]]:
-        """Every upper confidence bound beside what it has to keep, by name.
+        """Every upper confidence bound and its limit, by name.
 
-        All of them have to be kept, so that each is at the level of the whole test: a policy that
-        breaks a limit has to pass that limit's own test (intersection–union test).
+        All limits have to be kept. So each bound is at the level of the whole test: a policy that
+        violates a limit has to pass the test of that limit (intersection–union test).
 
         Args:
             costs: Cost key -> episode costs, [E].
@@ -157,17 +159,17 @@ class Claim:
         return {one.name: (one.bound(level, self.bound), one.limit) for one in found}
 
     def shortfalls(self, costs: Costs, tests: int) -> dict[str, float]:
-        """By how much bounds exceed what they have to keep; empty if the claim is certified."""
+        """By how much bounds exceed their limits; empty if the claim is certified."""
         bounds = self.bounds(costs, tests)
         return {name: bound - most for name, (bound, most) in bounds.items() if bound > most}
 
     def is_shown(self, costs: Costs, tests: int) -> bool:
-        """Whether betting has shown everything, so that a test may end."""
+        """Whether betting has shown all statements, so that a test may end."""
         level = self._level(tests)
         return all(one.is_shown(level) for one in self.statements(costs))
 
     def is_hopeless(self, costs: Costs, tests: int, most: int) -> bool:
-        """Whether ``most`` episodes in all would hardly certify it, after those so far."""
+        """Whether the test will probably fail with a total of ``most`` episodes."""
         level = self._level(tests)
         return any(one.is_hopeless(level, most) for one in self.statements(costs))
 
@@ -187,8 +189,8 @@ class Verdict:
     Attributes:
         certified: Number of the policy that is certified, or None.
         tested: Numbers of the policies that were tested, in this order.
-        bounds: Of the policy that is certified, or else of the one that fell short least: name ->
-            (bound, what it has to keep).
+        bounds: Of the certified policy, or else of the one that missed its limits least: name ->
+            (bound, limit).
         shortfalls: Of the same policy, if none is certified.
         means: Of the same policy: name -> mean over the episodes of its test.
         highest: Likewise: name -> the largest possible value.
@@ -209,13 +211,13 @@ def rank(
 ) -> list[int]:
     """Order candidates for the tests: those likely to pass by return, then the others by cost.
 
-    Likely is a policy whose means on these episodes are within the limits by z standard errors,
-    with the normal distribution's quantile z of the claim's level.
+    A policy is likely to pass if its means on these episodes are below the limits by at least z
+    standard errors, where z is the normal distribution's quantile of the claim's level.
 
     Args:
         returns: Episode returns of every candidate.
         costs: Cost key -> episode costs, of every candidate.
-        claims: What is to be certified of each.
+        claims: Claim about each.
     """
 
     def key(candidate: int) -> tuple[bool, float]:
@@ -229,7 +231,7 @@ def rank(
 
 
 def _expected_excess(statement: Statement, level: float) -> float:
-    """Mean plus z standard errors less the limit, in units of the limit."""
+    """Mean plus z standard errors minus the limit, in units of the limit."""
     values = statement.values
     error = values.std(ddof=1) / np.sqrt(len(values)) if len(values) > 1 else 0.0
     expected = float(values.mean() + NormalDist().inv_cdf(level) * error)
@@ -251,13 +253,13 @@ def first_certified(
 ) -> Verdict:
     """Test candidates in order on fresh episodes until one is certified.
 
-    With the betting bound a test ends as soon as its bounds are within the limits, or as there is
-    no hope left; Student's bound may be looked at only once, after all episodes.
+    With the betting bound a test ends as soon as its bounds are within the limits, or when it will
+    probably fail. Student's bound may be computed only once, after all episodes.
 
     Args:
         order: Numbers of the candidates, from :func:`rank`.
         collect: Costs of a candidate's fresh episodes, batch by batch.
-        claims: What is to be certified of each candidate.
+        claims: Claim about each candidate.
         tests: Candidates tested at most; they share the error.
         episodes: Episodes of a test at most.
 
@@ -309,5 +311,5 @@ def _test(
 
 
 def _furthest(verdict: Verdict) -> float:
-    """By how much the worst bound exceeds what it has to keep; 0 of what is certified."""
+    """By how much the worst bound exceeds its limit; 0 if certified."""
     return max(verdict.shortfalls.values(), default=0.0)
