@@ -1,6 +1,6 @@
-"""The state of objects that are no networks: what checkpoints keep of them.
+"""Saving and restoring the state of objects that are not torch modules.
 
-Directly in ``safe_rl/``, because objectives, algorithms and what records a run have such objects.
+It is directly in ``safe_rl/``, because several folders have such objects.
 """
 
 from __future__ import annotations
@@ -15,11 +15,12 @@ __all__ = ["Resumable"]
 
 
 class Resumable:
-    """Base of objects whose state is in some of their attributes.
+    """Base class of objects that checkpoints save: it saves the attributes in ``state_names``.
 
     Attributes:
-        state_names: Names of these attributes: tensors, generators of random numbers, plain values,
-            parts with a ``state_dict``, and dictionaries of all of these.
+        state_names: Names of the attributes that an exact continuation needs. Each is a tensor, a
+            random number generator, a plain value, an object with a ``state_dict``, or a dictionary
+            of these.
 
     Examples:
         >>> class Counter(Resumable):
@@ -58,7 +59,7 @@ def _saved(value: Any) -> Any:
 
 
 def _restored(own: Any, saved: Any) -> Any:
-    """The saved value on the device of the present one; or the present part, which has taken it."""
+    """The saved value on the device of the current one; an object with a state loads it itself."""
     if isinstance(own, Tensor):
         return saved.to(own, copy=True)
     if isinstance(own, Mapping):

@@ -39,7 +39,7 @@ class Charges(NamedTuple):
 class RiskMeasure(Checked, Resumable, ABC):
     """A measure of episode costs that is limited instead of their mean.
 
-    One that depends on more than the batch names this in ``state_names``.
+    If the charges depend on earlier batches, ``state_names`` names the attributes to save.
 
     Attributes:
         limits: d, [k].
