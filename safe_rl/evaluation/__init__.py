@@ -1,4 +1,4 @@
-"""What a trained policy does: whole episodes, estimates with intervals, a video."""
+"""Evaluation of a trained policy: whole episodes, estimates, certificates, variations, videos."""
 
 from typing import TYPE_CHECKING
 

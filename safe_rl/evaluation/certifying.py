@@ -41,7 +41,7 @@ class Certificate:
         checkpoint: The policy that is certified, or None.
         episode_return: Its mean return in the test.
         verdict: Bounds, tests and shortfalls.
-        options: What was asked for.
+        options: Options of the test.
     """
 
     checkpoint: Path | None
@@ -50,7 +50,7 @@ class Certificate:
     options: CertificateOptions
 
     def __str__(self) -> str:
-        """What is certified, what that excludes and what it cannot see, in one line."""
+        """One line: what is certified, what it excludes, and what the test cannot detect."""
         level, verdict = f"at {100 * self.options.level:.12g}%", self.verdict
         if self.checkpoint is None:
             missing = ", ".join(
@@ -70,7 +70,7 @@ class Certificate:
         )
 
     def _excluded(self) -> str:
-        """What the bounds say of rare episodes."""
+        """Text on what the bounds say about rare episodes."""
         if self.options.bound == "student":
             return "The bound assumes that no rare episodes cost far more than those tested."
         capped = [name for name in self.verdict.bounds if name.startswith("beyond_")]
@@ -92,12 +92,12 @@ def certify(
 ) -> Certificate | None:
     """Find and certify the best checkpoint of a run that keeps its limits.
 
-    All checkpoints are ranked by episodes of their own; the first of them are tested on fresh ones.
-    The result is written to ``certificate.json``, the policy kept as ``checkpoint=certified``.
+    All candidates are ranked by some episodes; the first ones are tested on fresh episodes. The
+    result is written to ``certificate.json``, and the policy is saved as ``checkpoint=certified``.
 
     Args:
         directory: Folder of the run.
-        options: What to certify, and by how many episodes.
+        options: Options of the test, such as the number of episodes.
         make_env: ``make_env(node, num_envs=, device=, seed=, num_threads=)``.
         num_threads: Threads that step environments; 0 is one per core.
         progress: Whether to show a bar.
@@ -152,7 +152,7 @@ def _candidates(folder: RunFolder) -> list[Path]:
 
 
 class _Runner:
-    """Runs policies on episodes that neither training nor another purpose has seen."""
+    """Runs policies on episodes that neither training nor another purpose has used."""
 
     def __init__(
         self, config: DictConfig, make_env: Callable[..., EnvBase], threads: int, progress: bool
@@ -166,8 +166,8 @@ class _Runner:
     def run(self, checkpoint: Path, purpose: int, number: int) -> Iterator[Episodes]:
         """Episodes in batches, of all candidates with the same layouts.
 
-        A ranking is one batch. Every environment contributes one episode to a batch of a test, so
-        that short episodes are not looked at before long ones.
+        A ranking is one batch. In a batch of a test every environment has one episode, so short
+        episodes do not count before long ones.
         """
         own = default_seed(self._config.env, self._config.seed)
         seed = own if has_fixed_layout(self._config.env) else own + purpose
@@ -188,10 +188,10 @@ class _Runner:
 
 
 def _keep(folder: RunFolder, checkpoint: Path | None) -> Path | None:
-    """Copy the certified checkpoint to where no other takes its place.
+    """Copy the certified checkpoint to a file that is not overwritten by later ones.
 
-    That of an earlier certificate goes when the copy is complete: with its replay buffer one takes
-    long enough to be interrupted.
+    The checkpoint of an earlier certificate is deleted after the copy is complete, because copying
+    a replay buffer takes long enough to be interrupted.
     """
     directory = folder.checkpoints / "certified"
     if checkpoint is None:
@@ -208,7 +208,7 @@ def _keep(folder: RunFolder, checkpoint: Path | None) -> Path | None:
 
 
 def _finite(value: float) -> float | None:
-    """A number as JSON has it, which knows no infinity."""
+    """A number for JSON, which has no infinity."""
     return value if math.isfinite(value) else None
 
 

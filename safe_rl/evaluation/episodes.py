@@ -1,4 +1,4 @@
-"""Whole episodes of a fixed policy, after training and every so often during it."""
+"""Run whole episodes of a fixed policy, after training and periodically during training."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ __all__ = [
 
 @dataclass(frozen=True)
 class Episodes:
-    """What happened in E whole episodes.
+    """Returns, lengths and costs of E whole episodes.
 
     Attributes:
         returns: Undiscounted returns, shape [E].
@@ -45,7 +45,7 @@ class Episodes:
 
 
 def exploration(deterministic: bool) -> set_exploration_type:
-    """Within it, policies act with their mean or sample."""
+    """Context in which policies act with their mean, or sample."""
     kind = ExplorationType.DETERMINISTIC if deterministic else ExplorationType.RANDOM
     return set_exploration_type(kind)
 
@@ -63,17 +63,17 @@ def collect_episodes(
 ) -> Episodes:
     """Run a policy for exactly ``num_episodes`` episodes.
 
-    How many episodes each world contributes is fixed before the first step. Taking whichever
-    episodes end first would favour short ones.
+    The number of episodes of each world is fixed before the first step. Taking the episodes that
+    end first would favour short ones.
 
     Args:
         env: Batched environment, batch_size [N].
-        policy: What acts.
-        num_episodes: E; worlds whose share is done continue unobserved until the last one is.
+        policy: The policy.
+        num_episodes: E; worlds that have their number continue, uncounted, until all have it.
         cost_keys: Keys of the costs to sum, below "next".
         deterministic: Whether the policy acts with its mean.
         progress: Whether to show a bar.
-        record: Gets every step [N], also those of worlds that continue unobserved.
+        record: Gets every step [N], also those of worlds that continue uncounted.
 
     Examples:
         >>> from safe_rl.envs import make_env
@@ -134,10 +134,10 @@ def has_fixed_layout(env: Mapping[str, Any]) -> bool:
 
 
 def default_seed(env: Mapping[str, Any], training_seed: int) -> int:
-    """Seed of an evaluation: another than training's, so that neither layouts nor noise repeat.
+    """Seed of an evaluation: not the one of training, so that layouts and noise are new.
 
-    Where the layout is fixed it is drawn from the seed, and belongs to what was learned; then it
-    is training's.
+    If the layout is fixed, it is drawn from the seed and was learned in training; then the seed is
+    that of training.
     """
     return training_seed + (0 if has_fixed_layout(env) else _OFFSET)
 
@@ -145,7 +145,7 @@ def default_seed(env: Mapping[str, Any], training_seed: int) -> int:
 def shared_layouts(
     trained: Mapping[str, Any], evaluated: Mapping[str, Any], *, same_seed: bool
 ) -> float:
-    """Share of the evaluation's layouts that training could have met, in [0, 1].
+    """Share of the evaluation's layouts that training could have used, in [0, 1].
 
     Examples:
         >>> finite = {"randomize_layout": True, "layout_seeds": 10, "layout_seeds_first": 0}
@@ -172,18 +172,19 @@ _MOST_WORLDS = 50
 
 
 class PeriodicEvaluation:
-    """Runs whole episodes of the policy, without exploration, every so many steps.
+    """Runs whole episodes of the policy, without exploration, at regular intervals.
 
-    The worlds of an evaluation are drawn from the seed and the number of steps alone: it neither
-    changes what training draws nor depends on whether the run was interrupted.
+    The worlds of an evaluation depend only on the seed and the number of steps. So an evaluation
+    does not change the random draws of training, and does not depend on interruptions.
 
     Args:
         make_env: ``make_env(num_envs=, seed=)`` makes environments like the run's.
-        policy: What acts; it shares the parameters that are trained.
+        policy: The policy; it shares the parameters that are trained.
         cost_keys: Keys of the costs to sum.
         interval: Steps of training from one evaluation to the next.
         episodes: Episodes of each.
-        seed: Of the worlds, to which the steps of training are added, and of what the policy draws.
+        seed: Seed of the worlds, to which the steps of training are added, and of the policy's
+            actions.
         fixed_layout: Whether all worlds have one layout, drawn from ``seed`` alone.
 
     Examples:
@@ -218,7 +219,7 @@ class PeriodicEvaluation:
         self._fixed_layout = fixed_layout
 
     def __call__(self, before: int, after: int) -> dict[str, float]:
-        """Means over episodes, if one is due between two numbers of steps; otherwise NaN."""
+        """Means over episodes if an evaluation is due between two numbers of steps, else NaN."""
         names = ["return", *self._cost_keys]
         if before // self._interval == after // self._interval:
             return {f"evaluation_{name}": math.nan for name in names}

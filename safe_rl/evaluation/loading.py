@@ -1,4 +1,4 @@
-"""From a run's folder to its environment and its trained policy."""
+"""Load the environment and the trained policy of a run from its folder."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def load_config(directory: Path) -> DictConfig:
 
 
 def override_env(config: DictConfig, overrides: Mapping[str, Any]) -> dict[str, Any]:
-    """The run's environment with some keys changed; in mappings only what is named, as in training.
+    """The run's environment with some keys changed; of a mapping, only the named entries.
 
     Raises:
         ValueError: As by `check_env_keys`; the package's families look at their keys themselves.
@@ -73,7 +73,7 @@ def _changed(node: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, A
 def limits_of(
     config: DictConfig, others: Mapping[str, float], cost_keys: Collection[str]
 ) -> dict[str, float]:
-    """Cost key -> d: the run's limits, with others in their place where these are asked for.
+    """Cost key -> d: the run's limits, some of them replaced by others.
 
     Raises:
         ValueError: If others name a cost that the environment does not have.
@@ -94,7 +94,7 @@ def limits_of(
 
 
 def transforms_of(config: DictConfig) -> dict[str, Any]:
-    """Nodes of what changes the run's problem from outside, by name; earlier runs have none."""
+    """Nodes of the run's transforms, by name; earlier runs have none."""
     return OmegaConf.to_container(config.get("transforms") or OmegaConf.create(), resolve=True)  # type: ignore[return-value]
 
 
