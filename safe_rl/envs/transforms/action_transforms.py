@@ -25,12 +25,13 @@ def _parameters(function: Callable[..., Any]) -> set[str]:
 
 
 class ActionFilter(ConstraintTransform):
-    """A function replaces unsafe actions, and every step at which it does costs 1.
+    """A function replaces unsafe actions; every step with a replaced action costs 1.
 
-    A safety layer (Dalal et al. 2018, "Safe Exploration in Continuous Action Spaces"), shield or
-    projection ("action replacement" and "action projection" of Krasowski et al. 2023, "Provably
-    Safe Reinforcement Learning"), also in evaluation. The algorithm learns from the action that its
-    policy chose; the environment takes the replaced one. The cost can be limited:
+    The function can be a safety layer (Dalal et al. 2018, "Safe Exploration in Continuous Action
+    Spaces"), a shield or a projection ("action replacement" and "action projection" of Krasowski et
+    al. 2023, "Provably Safe Reinforcement Learning"). It is also used in evaluation. The algorithm
+    learns from the action that its policy chose; the environment takes the replaced one. The cost
+    can be limited:
     cost_limits='{cost: 25, cost_interventions: 10}'.
 
     Args:
@@ -84,7 +85,7 @@ class ActionFilter(ConstraintTransform):
         return tensordict.set("action", replaced)
 
     def _asked(self) -> dict[str, Any]:
-        """What the filter asks for by the names of its parameters."""
+        """The arguments that the filter needs, by the names of its parameters."""
         given: dict[str, Any] = {}
         if "layout" in self._asks_for:
             given["layout"] = self.container.observation_layout
@@ -109,10 +110,10 @@ class ActionFilter(ConstraintTransform):
 
 
 class ActionDelay(ConstraintTransform):
-    """The environment takes the action of some steps before, also in evaluation.
+    """Actions take effect some steps later, also in evaluation.
 
-    The first steps of an episode take the action nearest to 0, or the first choice. Pending actions
-    are not observed, so recurrent policies have an advantage.
+    In the first steps of an episode the environment gets the action nearest to 0, or the first
+    discrete action. Pending actions are not observed, so recurrent policies have an advantage.
 
     Args:
         steps: Steps from an action to its effect.
@@ -130,7 +131,7 @@ class ActionDelay(ConstraintTransform):
         self._pending: Tensor | None = None
 
     def start(self, done: Tensor) -> dict[str, Tensor]:
-        """Return as many actions that do nothing."""
+        """Return `steps` neutral actions."""
         spec = self.container.action_spec
         nothing = spec.zero()
         if isinstance(spec, OneHot):
@@ -156,10 +157,10 @@ class ActionDelay(ConstraintTransform):
 class ActionRepeat(ConstraintTransform):
     """The policy decides at every k-th step, and its action is held for the steps between.
 
-    Rewards and costs of the k steps are summed, so that returns and limits mean the same. A row
-    whose episode ends inside a repeat takes no further steps; `steps_taken` says how many a
-    decision took. It is on in evaluation too, and has to be the last transform: others act at every
-    step.
+    Rewards and costs of the k steps are summed, so that returns and limits keep their meaning. A
+    row whose episode ends between two decisions takes no further steps; `steps_taken` is the number
+    of steps of a decision. The transform is also used in evaluation. It has to be the last
+    transform; the others act at every step.
 
     Args:
         k: Steps for which an action is held.

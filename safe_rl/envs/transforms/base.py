@@ -1,4 +1,4 @@
-"""What the transforms of constrained problems have in common."""
+"""Base class and helpers of transforms of constrained problems."""
 
 from __future__ import annotations
 
@@ -20,18 +20,19 @@ OWN_REWARD = "task_reward"
 
 
 class ConstraintTransform(Checked, Transform):
-    """Base of transforms that keep the environment's contract and are saved in snapshots.
+    """Base class of transforms that keep the environment's contract and have a saved state.
 
-    A subclass keeps what it needs of every row's episode in `_rows`, tensors [..., m] by name:
-    `start` returns their values at the start of an episode, and its `_step` updates them.
+    A subclass stores the state of every row's episode in `_rows`, tensors [..., m] by name. `start`
+    returns their values at the start of an episode, and `_step` updates them.
 
     Attributes:
-        evaluating: whether policies are evaluated; changes that only help learning are then off.
+        evaluating: whether policies are evaluated; then changes that only help learning are off.
         added_costs: names of costs that it writes beside the environment's.
         needed_costs: names of costs that the environment has to have.
-        return_key: where it leaves the reward that returns are made of, if it changes the reward.
-        steps_per_decision: steps of the environment that a call of `step` takes. One that takes
-            several has to be the last: those before it then act at every step.
+        return_key: key of the environment's own reward, from which returns are computed, if the
+            transform changes the reward.
+        steps_per_decision: steps of the environment per call of `step`. A transform that takes
+            several has to be the last one; those before it act at every step.
     """
 
     evaluating = False
@@ -60,18 +61,18 @@ class ConstraintTransform(Checked, Transform):
         self._rows = {name: value.clone() for name, value in rows.items()}
 
     def continue_from(self, steps: int) -> None:
-        """Continue schedules after so many steps of every row in earlier parts of the run."""
+        """Continue schedules after this number of steps per row in earlier parts of the run."""
 
     def check(self, cost_keys: Collection[str]) -> None:
         """Raise ValueError if it needs a cost that is not among these."""
         check_known(self.needed_costs, cost_keys)
 
     def highest_cost(self, key: str, highest: float, of_a_step: float) -> float:
-        """Return the most that an episode can cost, from what it can without the transform."""
+        """Return the highest possible cost of an episode, given the one without the transform."""
         return highest
 
     def extend_layout(self, layout: Mapping[str, slice]) -> dict[str, slice]:
-        """Add what it observes to the columns of the observation."""
+        """Add its observations to the columns of the observation."""
         return dict(layout)
 
     def _reset(

@@ -58,7 +58,7 @@ class TransformedConstrainedEnv(ConstrainedEnv, TransformedEnv):
 
     @property
     def seconds_per_step(self) -> float | None:
-        """What a step takes in the environment's own time [s], if it says that."""
+        """Simulated duration of a step [s], if the environment gives it."""
         return self.base_env.seconds_per_step
 
     @property
@@ -73,7 +73,7 @@ class TransformedConstrainedEnv(ConstrainedEnv, TransformedEnv):
         return self.base_env.render
 
     def highest_cost(self, key: str) -> float:
-        """Return the most that an episode can cost, with what transforms do about it."""
+        """Return the highest possible cost of an episode, with all transforms."""
         # transforms add costs of their own, which have specs
         known = key in self.base_env.cost_keys
         highest = self.base_env.highest_cost(key) if known else super().highest_cost(key)
@@ -83,11 +83,11 @@ class TransformedConstrainedEnv(ConstrainedEnv, TransformedEnv):
         return highest
 
     def get_positions(self) -> TensorDictBase:
-        """Return where things are in the environment inside."""
+        """Return the positions of the environment inside."""
         return self.base_env.get_positions()
 
     def set_seed(self, seed: int | None = None, static_seed: bool = False) -> int | None:
-        """Determine every draw to come, of the environment and of its transforms."""
+        """Seed all later random draws of the environment and of its transforms."""
         self._seed_transforms(seed)
         return super().set_seed(seed, static_seed)
 
@@ -100,14 +100,14 @@ class TransformedConstrainedEnv(ConstrainedEnv, TransformedEnv):
             transform.seed(rng.fold(rows, -number))
 
     def continue_from(self, steps: int) -> None:
-        """Continue schedules after so many steps of every row, from the next reset on."""
+        """Continue schedules after this number of steps of every row, from the next reset on."""
         self.steps_before = steps
         self.base_env.continue_from(steps)
         for transform in self._ours().values():
             transform.continue_from(steps)
 
     def get_state(self) -> TensorDictBase | None:
-        """Return a copy of everything that determines what happens next, a TensorDict [N].
+        """Return a copy of the complete state, a TensorDict [N].
 
         None if the environment inside, or one of the transforms, cannot be stored.
         """
@@ -120,7 +120,7 @@ class TransformedConstrainedEnv(ConstrainedEnv, TransformedEnv):
         return state
 
     def set_state(self, state: TensorDictBase) -> TensorDictBase:
-        """Put the worlds into a state; transforms that are not in it start an episode."""
+        """Set a state; transforms that are not in it start an episode."""
         ours = self._ours()
         # the environment inside may have transforms of its own
         inside = state.exclude(*((_STATE, name) for name in ours)).filter_empty_()
@@ -149,10 +149,10 @@ def transform_env(
     Args:
         env: fulfils the contract `ConstrainedEnv`.
         transforms: name -> transform, or node of a configuration with its `_target_`; the first is
-            the innermost: it sees the environment's own costs, and actions last.
+            the innermost: it reads the environment's own costs, and changes actions last.
         evaluating: whether policies are evaluated: rewards and lengths of episodes are then the
             environment's own.
-        seed: of what transforms draw; None takes it from torch's generator.
+        seed: seed of the transforms' random draws; None takes it from torch's generator.
 
     Raises:
         ValueError: if a transform refuses its keys, or does not fit the environment.

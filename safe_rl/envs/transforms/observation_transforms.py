@@ -26,11 +26,11 @@ from safe_rl.ranges import NotNegative, Range, Text, Weight
 class SensorNoise(ConstraintTransform):
     """Add normally distributed noise to observations, also in evaluation.
 
-    Every draw depends on its row's seed, the episode, the step and the column only, so that resumed
-    runs are identical and rows independent. Pictures of integers are not changed.
+    Every draw depends only on its row's seed, the episode, the step and the column. So resumed runs
+    are identical, and rows are independent. Images of integers are not changed.
 
     Args:
-        std: Standard deviation of the noise, in the units of what is observed.
+        std: Standard deviation of the noise, in the units of the observation.
         components: Names of the noisy components, as in `observation_layout`; None: all.
 
     Examples:
@@ -128,11 +128,11 @@ MEMORY, FIRST = "memory", "is_init"
 
 
 class PolicyMemory(ConstraintTransform):
-    """Carry what a policy leaves under ``("next", "memory")`` to its next step as ``memory``.
+    """Copy the recurrent state ``("next", "memory")`` of a policy to its next step as ``memory``.
 
-    It is 0 at the start of an episode, which `is_init` marks. Like TorchRL's `TensorDictPrimer` and
-    `InitTracker`, but part of snapshots and resumed runs. A policy that leaves nothing keeps what
-    it had.
+    The state is 0 at the start of an episode, which `is_init` marks. This is like TorchRL's
+    `TensorDictPrimer` and `InitTracker`, but part of saved states and resumed runs. If a policy
+    writes no state, the old one is kept.
 
     Args:
         size: Size of the recurrent state of a row.
