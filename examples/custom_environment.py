@@ -1,8 +1,8 @@
 """An environment of your own: a new kind of object, a cost and an observation.
 
-Mines lie between the robot and its goal. Their cost rises towards the centre, and the robot's
-lidar sees them. Nothing in the package changes: every row stands in this file. `import=` puts it
-beside the built-in ones, for the same commands:
+Mines lie between the robot and its goal. Their cost rises towards the centre, and the robot has a
+lidar for them. The package does not change: everything is in this file. `import=` adds it to the
+built-in objects, for the same commands:
 
     python train.py import=examples/custom_environment.py env=PointMines \
         cost_limits='{cost_mines: 10}' frames=400_000

@@ -1,19 +1,20 @@
 """A constrained loss and a risk measure of your own.
 
-- `QuadraticPenaltyLoss` is PPO's loss plus a penalty on how far the surrogate of J_c would be above
-  its limit, squared. The live objects that its constructor names (`constraints`) are handed to it.
-- `UpperSemideviation` limits E[C] + w E[(C − E[C])₊], the mean cost of an episode and w times what
-  costly episodes are above it (Ruszczyński and Shapiro 2006). It says what each step is charged
-  for; advantages, critics and limits follow from that.
+- `QuadraticPenaltyLoss` is PPO's loss plus a penalty: the square of the amount by which the
+  predicted J_c exceeds its limit. Its constructor has an argument `constraints`, so it gets this
+  object of the run.
+- `UpperSemideviation` limits E[C] + w E[(C − E[C])₊], the mean cost of an episode plus w times the
+  mean excess of costly episodes (Ruszczyński and Shapiro 2006). It computes the charge of each
+  step, which replaces its cost; advantages, critics and limits use the charges.
 
-The files in `conf/` beside this one name them:
+The files in `conf/` beside this one name these classes:
 
     python train.py import=examples/custom_loss.py --config-dir examples/conf \
         algo=quadratic risk=semideviation env=PointGoal1 frames=60_000
 
-Three epochs, to see it run; without `frames` it learns. Each of the two goes with the package's own
-as well: `algo=cpo risk=semideviation`, `algo=quadratic risk=cvar`. The column `violation_cost` is
-what is limited less d.
+This runs three epochs, to see it work; without `frames` it learns. Both classes can be combined
+with the package's own: `algo=cpo risk=semideviation`, `algo=quadratic risk=cvar`. The column
+`violation_cost` is the limited measure minus d.
 """
 
 import torch

@@ -2,9 +2,9 @@
 
     python examples/replay_buffer.py --env PointGoal1 --frames 200_000
 
-Only networks, loss, multiplier and accounting are this package's. `train.py algo=sac_lagrangian`
-is the whole of it: costs taken pessimistically (`loss.pessimism`), a limit that comes down,
-checkpoints, evaluation and a table.
+Only networks, loss, multiplier and episode accounting are from this package. The complete algorithm
+is `train.py algo=sac_lagrangian`: it also has pessimistic costs (`loss.pessimism`), a limit that
+falls during training, checkpoints, evaluations and a table.
 """
 
 from __future__ import annotations

@@ -3,8 +3,8 @@
     python examples/torchrl_trainer.py --algo ppo_lagrangian --env PointGoal1 --frames 300_000
     python examples/torchrl_trainer.py --algo cpo
 
-Loss, advantages, constraints and steps are this package's; loop, buffer, logging hooks and
-checkpoints are TorchRL's. `train.py` does all of it, and more, from configurations.
+Loss, advantages, constraints and steps are from this package; loop, buffer, logging hooks and
+checkpoints are from TorchRL. `train.py` does all of this, and more, from configurations.
 """
 
 from __future__ import annotations
