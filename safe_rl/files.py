@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import csv
 import json
+import math
 import os
 import re
 import secrets
@@ -29,7 +30,7 @@ __all__ = [
         "read_json",
         "read_yaml",
     ),
-    *("replace_csv", "replace_text", "replacing", "save_tensors"),
+    *("replace_csv", "replace_json", "replace_text", "replacing", "save_tensors"),
 ]
 
 _PACKAGED = Path(__file__).parent / "conf"
@@ -210,6 +211,20 @@ def replace_text(path: Path, text: str) -> None:
     """Write a text file by :func:`replacing`."""
     with replacing(path) as unfinished:
         unfinished.write_text(text, encoding="utf-8")
+
+
+def replace_json(path: Path, content: Any) -> None:
+    """Write a JSON file by :func:`replacing`; a number that is not finite becomes null."""
+    text = json.dumps(_finite(content), indent=2, ensure_ascii=False, allow_nan=False)
+    replace_text(path, text + "\n")
+
+
+def _finite(content: Any) -> Any:
+    if isinstance(content, Mapping):
+        return {name: _finite(value) for name, value in content.items()}
+    if isinstance(content, list | tuple):
+        return list(map(_finite, content))
+    return None if isinstance(content, float) and not math.isfinite(content) else content
 
 
 def replace_csv(path: Path, rows: Iterable[Iterable[Any]]) -> None:

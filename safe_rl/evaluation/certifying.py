@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 import shutil
 from collections.abc import Callable, Iterator, Mapping
@@ -21,7 +20,7 @@ from safe_rl.evaluation.episodes import Episodes, collect_episodes, default_seed
 from safe_rl.evaluation.loading import load_config
 from safe_rl.evaluation.measuring import Trial
 from safe_rl.evaluation.settings import CertificateOptions, EvaluationOptions
-from safe_rl.files import check_no_links, replace_text, replacing
+from safe_rl.files import check_no_links, replace_json, replacing
 from safe_rl.runs.folder import RunFolder, checkpoint_steps, checkpoints_in
 from safe_rl.scores.certificate import Claim, Verdict, first_certified, rank
 
@@ -207,11 +206,6 @@ def _keep(folder: RunFolder, checkpoint: Path | None) -> Path | None:
     return kept
 
 
-def _finite(value: float) -> float | None:
-    """A number for JSON, which has no infinity."""
-    return value if math.isfinite(value) else None
-
-
 def _write(folder: RunFolder, certificate: Certificate, candidates: list[int | None]) -> None:
     verdict = certificate.verdict
     content: Mapping[str, Any] = {
@@ -219,16 +213,15 @@ def _write(folder: RunFolder, certificate: Certificate, candidates: list[int | N
         "checkpoint": None if certificate.checkpoint is None else certificate.checkpoint.name,
         "episode_return": None if verdict.certified is None else certificate.episode_return,
         "bounds": {
-            name: {"bound": _finite(bound), "most": most}
-            for name, (bound, most) in verdict.bounds.items()
+            name: {"bound": bound, "most": most} for name, (bound, most) in verdict.bounds.items()
         },
-        "shortfalls": {name: _finite(value) for name, value in verdict.shortfalls.items()},
-        "means": {name: _finite(value) for name, value in verdict.means.items()},
-        "highest": {name: _finite(value) for name, value in verdict.highest.items()},
+        "shortfalls": verdict.shortfalls,
+        "means": verdict.means,
+        "highest": verdict.highest,
         "candidates": candidates,
         "tested": [candidates[number] for number in verdict.tested],
         **asdict(certificate.options),
         "episodes": verdict.episodes,
         "most_episodes": certificate.options.episodes,
     }
-    replace_text(folder.certificate, json.dumps(content, indent=2) + "\n")
+    replace_json(folder.certificate, content)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Callable, Collection, Iterable, Mapping
 from contextlib import closing
@@ -27,7 +26,7 @@ from safe_rl.evaluation.loading import (
 )
 from safe_rl.evaluation.settings import EvaluationOptions, check_options
 from safe_rl.evaluation.video import check_camera, record_episode, video_format, write_video
-from safe_rl.files import check_no_links, check_place, replace_csv, replace_text
+from safe_rl.files import check_no_links, check_place, replace_csv, replace_json
 from safe_rl.runs.folder import RunFolder, checkpoint_steps
 from safe_rl.scores.benchmark import Scores, Suite
 from safe_rl.scores.comparisons import LEVEL, Estimate, cvar, mean, share_over
@@ -213,7 +212,8 @@ def evaluate(
     )
     facts = {"run": str(directory), "layouts_trained_on": known}
     facts |= trial.facts(limits, episodes.costs)
-    _write_summary(summary, facts, estimates)
+    parts = {name: estimate._asdict() for name, estimate in estimates.items()}
+    replace_json(summary, {**facts, "estimates": parts})
     columns = {"return": episodes.returns, "length": episodes.lengths, **episodes.costs}
     rows = zip(*(column.tolist() for column in columns.values()), strict=True)
     replace_csv(table, [columns, *rows])
@@ -295,13 +295,3 @@ def format_unjudged(limits: Mapping[str, float]) -> list[str]:
         f"the run's limit {limit:g} on {key} is not judged: this environment has no such cost"
         for key, limit in limits.items()
     ]
-
-
-def _write_summary(path: Path, facts: Mapping[str, Any], estimates: Mapping[str, Estimate]) -> None:
-    """Write facts and estimates as JSON; what is not a number becomes null."""
-    parts = {
-        name: {k: v if math.isfinite(v) else None for k, v in estimate._asdict().items()}
-        for name, estimate in estimates.items()
-    }
-    content = {**facts, "estimates": parts}
-    replace_text(path, json.dumps(content, indent=2, ensure_ascii=False, allow_nan=False) + "\n")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import logging
 import shutil
 import warnings
@@ -19,7 +18,7 @@ from torchrl.envs import EnvBase
 from safe_rl.evaluation.episodes import exploration
 from safe_rl.evaluation.loading import find_checkpoint, load_config, load_policy
 from safe_rl.extras import import_extra
-from safe_rl.files import read_json, replace_text, replacing, save_tensors
+from safe_rl.files import read_json, replace_json, replacing, save_tensors
 from safe_rl.naming import did_you_mean
 from safe_rl.runs.checkpoints import read_facts, read_states
 from safe_rl.runs.folder import RunFolder, checkpoint_steps
@@ -88,7 +87,7 @@ def pack_policy(run: Path, folder: Path, checkpoint: str = "certified") -> Path:
     about |= {"steps": steps, "command": command}
     if source.code.is_file():
         about["commit"] = read_json(source.code)[-1]["commit"]
-    replace_text(folder / "policy.json", json.dumps(about, indent=2) + "\n")
+    replace_json(folder / "policy.json", about)
     return kept
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 import os
 import subprocess
@@ -15,7 +14,7 @@ from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
 
-from safe_rl.files import read_json, replace_text, replacing
+from safe_rl.files import read_json, replace_json, replacing
 from safe_rl.runs.display import ProgressBar, outcome_line
 from safe_rl.runs.folder import RunFolder, lock_folder
 from safe_rl.runs.identity import given_settings
@@ -183,7 +182,7 @@ def note_code(path: Path, steps: int) -> None:
     code = code_of()
     if not entries or any(entries[-1].get(name) != value for name, value in code.items()):
         entries.append({"steps": steps, **code})
-    replace_text(path, json.dumps(entries, indent=2) + "\n")
+    replace_json(path, entries)
 
 
 @cache

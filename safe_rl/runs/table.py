@@ -165,8 +165,7 @@ def last_row(path: Path) -> dict[str, float]:
         ValueError: If no epoch is finished.
         OSError: If the file cannot be read.
     """
-    complete = _complete_lines(path)
-    if len(complete) < 2:
+    columns = read_table(path)
+    if not all(columns.values()):
         raise ValueError(f"{path} has no row: the run has not finished an epoch.")
-    names, values = csv.reader([complete[0], complete[-1]])
-    return dict(zip(names, map(_number, values), strict=True))
+    return {name: values[-1] for name, values in columns.items()}

@@ -163,15 +163,19 @@ class Claim:
         bounds = self.bounds(costs, tests)
         return {name: bound - most for name, (bound, most) in bounds.items() if bound > most}
 
-    def is_shown(self, costs: Costs, tests: int) -> bool:
-        """Whether betting has shown all statements, so that a test may end."""
-        level = self._level(tests)
-        return all(one.is_shown(level) for one in self.statements(costs))
+    def may_end(self, costs: Costs, tests: int, most: int) -> bool:
+        """Whether a test of up to ``most`` episodes may end early.
 
-    def is_hopeless(self, costs: Costs, tests: int, most: int) -> bool:
-        """Whether the test will probably fail with a total of ``most`` episodes."""
-        level = self._level(tests)
-        return any(one.is_hopeless(level, most) for one in self.statements(costs))
+        It may if betting has shown all statements, or if the test will probably fail. Student's
+        bound may be computed only once, after all episodes.
+        """
+        if self.bound != "betting":
+            return False
+        level, found = self._level(tests), self.statements(costs)
+        if all(one.is_shown(level) for one in found):
+            return True
+        is_long = 5 * min((len(one.values) for one in found), default=0) >= most
+        return is_long and any(one.is_hopeless(level, most) for one in found)
 
     def _level(self, tests: int) -> float:
         return 1 - (1 - self.level) / max(1, tests)
@@ -278,7 +282,9 @@ def first_certified(
         verdicts.append(replace(verdict, tested=tested))
         if verdict.certified is not None:
             return verdicts[-1]
-    return min(verdicts, key=_furthest, default=Verdict(None, tested))
+    # by how much the worst bound exceeds what it has to keep
+    excess = [max(verdict.shortfalls.values()) for verdict in verdicts]
+    return verdicts[int(np.argmin(excess))] if verdicts else Verdict(None, tested)
 
 
 def _test(
@@ -290,13 +296,8 @@ def _test(
     for batch in batches:
         costs = {key: np.r_[costs[key], np.asarray(batch[key], float)][:episodes] for key in costs}
         number = min((len(values) for values in costs.values()), default=episodes)
-        if number >= episodes:
+        if number >= episodes or claim.may_end(costs, tests, episodes):
             break
-        if claim.bound == "betting":
-            if claim.is_shown(costs, tests):
-                break
-            if 5 * number >= episodes and claim.is_hopeless(costs, tests, episodes):
-                break
     bounds, missing = claim.bounds(costs, tests), claim.shortfalls(costs, tests)
     statements = claim.statements(costs)
     return Verdict(
@@ -308,8 +309,3 @@ def _test(
         highest={one.name: one.highest for one in statements},
         episodes=number,
     )
-
-
-def _furthest(verdict: Verdict) -> float:
-    """By how much the worst bound exceeds its limit; 0 if certified."""
-    return max(verdict.shortfalls.values(), default=0.0)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from signal import Signals
-from typing import Any, Protocol
+from typing import Any
 
 import torch
 from omegaconf import DictConfig
@@ -36,12 +36,8 @@ __all__ = ["EpisodeError", "Evaluator", "Trainer", "WorkerError"]
 _FOR_RESUMING = {"memory", "policy_update", "critic_update", "env", "accounting", "rng"}
 
 
-class Evaluator(Protocol):
-    """Interface of periodic evaluations during training."""
-
-    def __call__(self, before: int, after: int) -> dict[str, float]:
-        """Columns of an epoch from step `before` to step `after`; the same names at every call."""
-        ...
+Evaluator = Callable[[int, int], dict[str, float]]
+"""A periodic evaluation: steps before and after an epoch -> columns, the same at every call."""
 
 
 class Trainer:

@@ -136,18 +136,6 @@ def test_without_a_best_checkpoint_the_last_is_offered(run, capsys):
     assert "no epoch kept every cost limit. Use checkpoint=last" in error
 
 
-def last_checkpoint(run):
-    return next((run / "checkpoints" / "last").iterdir())
-
-
-def test_a_truncated_checkpoint_is_named(run, capsys):
-    path = last_checkpoint(run)
-    path.write_bytes(path.read_bytes()[:2000])
-    assert main([str(run)]) == 1
-    assert path.name in capsys.readouterr().err
-    assert not (run / "evaluation.json").exists()
-
-
 def test_of_mappings_only_what_is_named_changes():
     """The others would go back to the environment's own, without a word."""
     cost = {"_target_": "mine.cost", "limit": 1.0}

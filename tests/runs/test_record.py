@@ -141,19 +141,6 @@ def test_a_measure_of_ones_own_is_what_is_held_against_the_limit(tmp_path, capsy
     assert "cost=89.0/25" in capsys.readouterr().err
 
 
-def test_a_continued_table_resumes_after_its_epoch(tmp_path):
-    config = compose_config("env=PointMass", "logger=none")
-    record = RunRecord(tmp_path, config, {"cost": 25.0}, 1000)
-    with record.writing():
-        for epoch in (1, 2, 3):
-            record.add(row(epoch, 0.0, 0.0))
-    with record.writing(epoch=2, steps=2000):
-        record.add(row(3, 7.0, 7.0))
-    lines = record.folder.table.read_text().splitlines()
-    assert [line.split(",")[0] for line in lines] == ["epoch", "1", "2", "3"]
-    assert lines[3].startswith("3,3000,7,7")
-
-
 def test_a_new_run_does_not_overwrite_another(tmp_path):
     config = compose_config("env=PointMass", "logger=none")
     with RunRecord(tmp_path, config, {}, 1000).writing():

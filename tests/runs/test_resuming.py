@@ -120,13 +120,6 @@ def test_a_run_killed_several_times_leaves_the_table_of_one_that_was_not(tmp_pat
     assert not list(killed.rglob(".checkpoint-*"))
 
 
-def test_checkpoints_change_nothing(tmp_path):
-    often, never = tmp_path / "often", tmp_path / "never"
-    train(often, "env=PointGoal1", "frames=480", "checkpoint.interval=0")
-    train(never, "env=PointGoal1", "frames=480", "checkpoint.interval=1000")
-    assert without_times(often / "progress.csv") == without_times(never / "progress.csv")
-
-
 # episodes are open at the end of every epoch of 40 steps
 point_mass_trainer = partial(trainer_of_point_mass, num_steps=27)
 

@@ -94,15 +94,6 @@ def test_other_sizes_are_named_and_nothing_changes(trained, override, message):
     refuse(networks, trained.record.directory, message, ["cost"])
 
 
-def test_an_ensemble_of_another_number_is_named_and_nothing_changes(tmp_path):
-    def make(number):
-        actor = make_bounded_actor(3, -torch.ones(2), torch.ones(2), hidden_sizes=[8])
-        return {"actor": actor, "critic": QEnsemble(3, 2, hidden_sizes=[8], num_networks=number)}
-
-    checkpoint = CheckpointStore(tmp_path, make(2), keep_last=1).save(10)
-    refuse(make(4), checkpoint, r"critic of .* is \(2, .* there and \(4, ")
-
-
 def test_what_a_run_has_not_learned_is_named(tmp_path):
     """Behaviour cloning has an actor alone."""
     actor = make_bounded_actor(3, -torch.ones(2), torch.ones(2), hidden_sizes=[8])
