@@ -45,8 +45,6 @@ class ForeignFamily:
         title: What messages call one of its environments.
         keys: Key -> its default, and an annotation that says what it may be. All have `id` and
             `name`.
-        arguments: What `kwargs` are, for messages.
-        which: What to say where no `id` is given.
         check: Checks the whole node, before an environment is made.
         describe: "module:function" that returns the cost keys and the length of episodes of a node,
             and finds out those that are None by making an environment.
@@ -55,8 +53,6 @@ class ForeignFamily:
     target: str
     title: str
     keys: Mapping[str, tuple[Any, Any]]
-    arguments: str
-    which: str
     check: Callable[[Mapping[str, Any]], None]
     describe: str
 
@@ -69,10 +65,13 @@ def complete_foreign(family: ForeignFamily, node: Mapping[str, Any]) -> dict[str
     """
     for key in node:
         if key not in (*family.keys, "id", "name", "_target_"):
-            meant = f"{nearest(str(key), [*family.keys, 'id'])} {family.arguments}"
-            raise ConfigError(f"{family.title} has no key '{key}'.{on_cpu_only(key) or meant}")
+            meant = nearest(str(key), [*family.keys, "id"])
+            others = " The environment's own arguments stand in 'kwargs': env.kwargs='{…}'."
+            raise ConfigError(
+                f"{family.title} has no key '{key}'.{on_cpu_only(key) or meant + others}"
+            )
     if not isinstance(node.get("id"), str):
-        raise ConfigError(f"Which environment? {family.which}")
+        raise ConfigError("Which environment? Name it: env.id=…")
     full = {"name": node["id"], **{key: row[0] for key, row in family.keys.items()}, **node}
     for key, (_, annotation) in family.keys.items():
         values = values_of(annotation)
@@ -122,17 +121,12 @@ _COMMON: dict[str, tuple[Any, Any]] = {
     "num_steps": (None, Count | None),
     "kwargs": (None, _Arguments),
 }
-_GYMNASIUM_KEYS = {
-    **_COMMON,
-    "render_mode": (None, Text | None),
-}
+_GYMNASIUM_KEYS = {**_COMMON, "render_mode": (None, Text | None)}
 
 GYMNASIUM = ForeignFamily(
     target="safe_rl.envs.gymnasium.make_gymnasium",
     title="A Gymnasium environment",
     keys={**_GYMNASIUM_KEYS, "outside": (None, Any), "flatten": (False, bool)},
-    arguments="Arguments for gymnasium.make stand in 'kwargs', as env.kwargs='{render_fps: 30}'.",
-    which="Name a registered one: env.id=…",
     check=_check_gymnasium,
     describe="safe_rl.envs.gymnasium.conversion:describe_gymnasium",
 )
@@ -140,10 +134,6 @@ SAFETY_GYMNASIUM = ForeignFamily(
     target="safe_rl.envs.gymnasium.make_safety_gymnasium",
     title="An environment of Safety-Gymnasium",
     keys=_GYMNASIUM_KEYS,
-    arguments=(
-        "Arguments for safety_gymnasium.make stand in 'kwargs', as env.kwargs='{config: {…}}'."
-    ),
-    which="env.id=SafetyPointGoal1-v0, for example.",
     check=_check_gymnasium,
     describe="safe_rl.envs.gymnasium.conversion:describe_safety_gymnasium",
 )
@@ -152,8 +142,6 @@ TORCHRL = ForeignFamily(
     title="An environment of TorchRL",
     keys={**_COMMON, "observe": (None, _Names), "flatten": (True, bool)}
     | dict.fromkeys(("outside", "cost"), (None, Any)),
-    arguments="Arguments of its class stand in 'kwargs', as env.kwargs='{frame_skip: 2}'.",
-    which=f"env.id=…, one of {', '.join(TORCHRL_CLASSES)}, or your own.",
     check=_check_torchrl,
     describe="safe_rl.envs.torchrl.torchrl_env:describe_node",
 )

@@ -70,7 +70,7 @@ def test_choices_and_dictionaries_become_integers_and_vectors():
 @pytest.mark.parametrize(
     ("keys", "message"),
     [
-        ({"id": None}, r"env\.id=Safety"),
+        ({"id": None}, r"env\.id="),
         ({"id": "SafetyIce2-v0"}, "SafetyIce2-v0 is not registered"),
         ({"id": "my_ice:SafetyMine-v0"}, r"import nothing.*import=my_ice env.id=SafetyMine-v0"),
         ({"kwargs": {"speed": 3}}, "SafetyIce1-v0.*speed"),
