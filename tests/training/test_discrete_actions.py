@@ -28,7 +28,7 @@ MINIBATCHES = "policy_update.minibatch_size=50"
 def test_a_cart_learns_to_stay_within_a_range(algo, tmp_path):
     run_train(*SMALL, *CART_POLE, *algo, "frames=600", f"hydra.run.dir={tmp_path}")
     env = yaml.safe_load((tmp_path / "config.yaml").read_text())["env"]
-    assert env["cost_keys"] == ["cost_position"]
+    assert env["outside"] == {"cost_position": [0, -0.05, 0.05]}
     table = read_table(tmp_path / "progress.csv")
     assert all(
         0 < cost <= length
@@ -70,7 +70,7 @@ def test_the_cost_is_that_of_the_position_alone():
         ({"cost_x": [0.5, 0.0, 1.0]}, "got cost_x:"),
         ({"cost_x": [0, 1.0, 0.0]}, "has the range 1.0 to 0.0"),
         ({"far": [0, 0.0, 1.0]}, "called cost or cost_<kind>, not 'far'"),
-        ({"cost_x": [4, 0.0, 1.0]}, "column 4, but the observation has 4"),
+        ({"cost_x": [4, 0.0, 1.0]}, "column 4 of observation, which has 4"),
     ],
 )
 def test_ranges_that_cannot_be_are_refused(outside, message):

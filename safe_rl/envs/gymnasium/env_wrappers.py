@@ -35,8 +35,9 @@ def make_adapted(
         space = Box(-np.inf, np.inf, (gymnasium.spaces.flatdim(seen),), np.float32)
         env = TransformObservation(env, partial(_vector, seen), space)
     if isinstance(actions, Discrete | MultiDiscrete) and np.any(actions.start):
-        is_one = isinstance(actions, Discrete)
-        choices = Discrete(actions.n) if is_one else MultiDiscrete(actions.nvec)
+        choices = (
+            Discrete(actions.n) if isinstance(actions, Discrete) else MultiDiscrete(actions.nvec)
+        )
         env = TransformAction(env, partial(np.add, actions.start), choices)
     return FloatCosts(TimeLimit(env, num_steps), cost_keys)
 
