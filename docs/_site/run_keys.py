@@ -86,7 +86,6 @@ def _part_defaults() -> Mapping[str, dict[str, Mapping[str, Any]]]:
         for node in _nodes(yaml.safe_load(path.read_text())):
             target = str(node["_target_"])
             found[_OPTIMISER if target.startswith("torch.optim.") else target][file] = node
-    found.pop("safe_rl.cli.sweeps.SweepReport")
     return found
 
 

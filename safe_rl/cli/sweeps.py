@@ -1,36 +1,29 @@
-"""Sweeps of many runs: threads per job, what the jobs are doing, and what became of every one."""
+"""Sweeps of many runs: threads per job, and what became of every one."""
 
 from __future__ import annotations
 
-import atexit
 import json
 import math
 import os
-import sys
 import traceback
-from collections.abc import Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Sequence
 from datetime import datetime
 from pathlib import Path
-from threading import Event, Thread
-from typing import Any
+from typing import Any, cast
 
-from hydra.core.utils import JobReturn, JobStatus
-from hydra.experimental.callback import Callback
+from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
 from safe_rl.cli.grammar import parse
 from safe_rl.cli.user_code import import_modules, imported
-from safe_rl.files import read_config, replace_text
+from safe_rl.envs import store_configs
+from safe_rl.files import replace_text
 from safe_rl.processes import end_with_parent
-from safe_rl.runs.display import shown
+from safe_rl.runs.display import LINE_SECONDS
 from safe_rl.runs.folder import RunFolder, RunInUseError
-from safe_rl.runs.table import last_row
 
-__all__ = ["SweepReport", "count_jobs", "progress_of", "threads_per_job"]
+__all__ = ["Sweep", "count_jobs", "threads_per_job"]
 
-_IN_TURN = "hydra._internal.core_plugins.basic_launcher.BasicLauncher"
-"""The launcher whose jobs run in this process, with a bar of their own."""
 _GRACE = 30.0
 """Seconds in which a job whose sweep was killed may end its epoch and write a checkpoint."""
 
@@ -63,95 +56,72 @@ def threads_per_job(num_jobs: int, num_workers: int, num_cores: int) -> int:
     return max(1, num_cores // max(1, min(workers, num_jobs)))
 
 
-class SweepReport(Callback):
-    """Keeps a failing job from ending the sweep, and names it at the end.
+class Sweep:
+    """The function that Hydra's launcher calls for each job, in this process or in another one.
 
-    Every job leaves lines in a journal below the sweep's folder; a failing one also its traceback
-    in its own. In single runs this does nothing.
+    A failing job does not end the sweep: its traceback is written into its folder. Every job notes
+    in a journal below the sweep's folder that it has begun and how it has ended.
+
+    Args:
+        hydra: Hydra's own node, of the first job.
+        overrides: Of the whole sweep.
     """
 
-    def __init__(self) -> None:
-        self._journal: Path | None = None
-        self._num_jobs = 0
-        self._process = os.getpid()
-        self._modules: list[str] = []  # jobs run in processes that get this object
-        self._display: _Display | None = None
-
-    def __getstate__(self) -> dict[str, Any]:
-        """What jobs in other processes get: all but what shows them."""
-        return {**vars(self), "_display": None}
-
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        """Import the user's modules in a job's process, which gets this before it composes."""
-        vars(self).update(state)
-        import_modules(self._modules)
-
-    def on_multirun_start(self, config: DictConfig, **kwargs: Any) -> None:
-        """Share the cores out among the jobs and begin the journal."""
-        trials = config.hydra.sweeper.get("n_trials")  # of a sweeper that chooses the values
-        self._num_jobs = trials or count_jobs(config.hydra.overrides.task)
+    def __init__(self, hydra: DictConfig, overrides: Sequence[str]) -> None:
+        # a sweeper that chooses the values has a number of trials
+        self._num_jobs = hydra.sweeper.get("n_trials") or count_jobs(overrides)
         self._modules = imported()
-        self._journal = _journal_path(Path(config.hydra.sweep.dir))
-        num_workers = config.hydra.launcher.get("n_jobs")
+        self._process = os.getpid()
+        folder = Path(hydra.sweep.dir).absolute() / "sweeps"
+        folder.mkdir(parents=True, exist_ok=True)
+        self._journal = folder / f"{datetime.now():%Y-%m-%d_%H-%M-%S}_{self._process}.jsonl"
+        num_workers = hydra.launcher.get("n_jobs")
         if num_workers is not None:
             num_cores = len(os.sched_getaffinity(0))
             threads = threads_per_job(self._num_jobs, num_workers, num_cores)
             os.environ["SAFE_RL_NUM_THREADS"] = str(threads)
             # bars of several jobs would overwrite each other
-            os.environ.setdefault("TQDM_DISABLE", "1")
-        if config.hydra.launcher.get("_target_", _IN_TURN) != _IN_TURN:
-            self._display = _Display(self._journal)
-        # if the launcher itself fails, Hydra does not come to the end of the sweep
-        atexit.register(self._print_summary)
+            os.environ.setdefault(LINE_SECONDS, "60")
 
-    def on_job_start(self, config: DictConfig, **kwargs: Any) -> None:
-        """Note that a job has begun."""
-        self._note(config, "begun")
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """Import the user's modules in a job's process, which gets this before it composes."""
+        vars(self).update(state)
+        store_configs()
+        import_modules(self._modules)
+
+    def __call__(self, config: DictConfig) -> float:
+        """Carry out a job; returns what a sweeper maximises, −∞ if the job has failed."""
+        from safe_rl.cli.session import run_job  # with torch: a sweep is checked without it
+
+        hydra = cast(DictConfig, HydraConfig.get())
+        folder = RunFolder(Path(hydra.runtime.output_dir))
+        self._note(hydra, "begun")
         if os.getppid() == self._process:
             # else it would train on, or wait for ever, when the sweep was killed
             end_with_parent(_GRACE)
+        try:
+            value = run_job(config)
+        except Exception as error:
+            if not isinstance(error, RunInUseError):  # the folder is somebody else's
+                folder.directory.mkdir(parents=True, exist_ok=True)
+                replace_text(folder.failure, "".join(traceback.format_exception(error)))
+            summary = str(error).strip().partition("\n")[0]
+            self._note(hydra, "failed", f"{type(error).__name__}: {summary}")
+            return -math.inf
+        folder.failure.unlink(missing_ok=True)
+        self._note(hydra, "done")
+        return value
 
-    def on_job_end(self, config: DictConfig, job_return: JobReturn, **kwargs: Any) -> None:
-        """Note how a job has ended, and take its error out of the way of the others."""
-        if self._journal is None:
-            return
-        failure = RunFolder(Path(config.hydra.runtime.output_dir)).failure
-        error = job_return._return_value if job_return.status is JobStatus.FAILED else None
-        if not isinstance(error, RunInUseError):  # the folder is somebody else's
-            failure.unlink(missing_ok=True)
-            if error is not None:
-                replace_text(failure, "".join(traceback.format_exception(error)))
-        if error is None:
-            self._note(config, "done")
-            return
-        summary = str(error).strip().partition("\n")[0]
-        self._note(config, "failed", f"{type(error).__name__}: {summary}")
-        # as a sweeper that optimises takes it
-        job_return.return_value, job_return.status = -math.inf, JobStatus.COMPLETED
-
-    def on_multirun_end(self, config: DictConfig, **kwargs: Any) -> None:
-        """Say what became of the jobs; exit with status 1 if one failed."""
-        atexit.unregister(self._print_summary)
-        if self._print_summary():
-            raise SystemExit(1)
-
-    def _note(self, config: DictConfig, event: str, error: str = "") -> None:
-        if self._journal is None:
-            return
-        directory = config.hydra.runtime.output_dir
-        line = json.dumps({"job": config.hydra.job.num, "event": event, "error": error,
-                           "directory": directory})  # fmt: skip
+    def _note(self, hydra: DictConfig, event: str, error: str = "") -> None:
+        note = {"job": hydra.job.num, "event": event, "error": error}
         # appended in one piece, also by several processes
         with self._journal.open("a") as file:
-            file.write(f"{line}\n")
+            file.write(json.dumps({**note, "directory": hydra.runtime.output_dir}) + "\n")
 
-    def _print_summary(self) -> bool:
-        """Print how the jobs ended; returns whether one is not finished."""
-        assert self._journal is not None
-        if self._display is not None:
-            self._display.stop()
-            self._display = None
-        last = _last_notes(self._journal).values()
+    def print_summary(self) -> bool:
+        """Print how the jobs have ended; returns whether all are finished."""
+        lines = self._journal.read_text().splitlines() if self._journal.exists() else []
+        last = {note["job"]: note for note in map(json.loads, lines)}.values()
         num_done = sum(note["event"] == "done" for note in last)
         print(f"Sweep: {num_done} of {self._num_jobs} runs are finished.")
         for note in last:
@@ -163,64 +133,4 @@ class SweepReport(Callback):
                 print(f"  interrupted: {note['directory']}")
         if num_done < self._num_jobs:
             print("Start it again as it was: finished runs are skipped, the others continue.")
-        return num_done < self._num_jobs
-
-
-def _journal_path(sweep_directory: Path) -> Path:
-    folder = sweep_directory / "sweeps"
-    folder.mkdir(parents=True, exist_ok=True)
-    return (folder / f"{datetime.now():%Y-%m-%d_%H-%M-%S}_{os.getpid()}.jsonl").absolute()
-
-
-def progress_of(directory: Path) -> str:
-    """How far the run in a folder is, in a line.
-
-    Examples:
-        >>> progress_of(getfixture("tiny_run").directory)[:17]
-        '100% of 80 steps,'
-        >>> progress_of(Path("/nowhere"))
-        'its first epoch'
-    """
-    folder = RunFolder(directory)
-    with suppress(OSError, ValueError, LookupError, TypeError):
-        config, row = read_config(folder.config), last_row(folder.table)
-        limits = {key: float(limit) for key, limit in (config["cost_limits"] or {}).items()}
-        share, speed = row["steps"] / config["frames"], row["steps_per_second"]
-        figures = [f"{name}={value}" for name, value in shown(row, limits).items()]
-        done = f"{share:.0%} of {config['frames']:,} steps"
-        return ", ".join([done, f"{speed:,.0f} steps/s", *figures])
-    return "its first epoch"
-
-
-def _last_notes(journal: Path) -> dict[int, Mapping[str, str]]:
-    """Number of a job -> the last note on it in the sweep's journal."""
-    notes = {}
-    with suppress(OSError):
-        for line in journal.read_text().splitlines():
-            with suppress(ValueError):  # of a line that is being written
-                note = json.loads(line)
-                notes[note["job"]] = note
-    return notes
-
-
-class _Display:
-    """Prints every minute how far each unfinished run is, in a thread of its own."""
-
-    def __init__(self, journal: Path, seconds: float = 60.0) -> None:
-        self._journal, self._seconds, self._end = journal, seconds, Event()
-        self._thread = Thread(target=self._watch, daemon=True)
-        self._thread.start()
-
-    def stop(self) -> None:
-        """Print no more."""
-        self._end.set()
-        self._thread.join()
-
-    def _watch(self) -> None:
-        sweep = self._journal.parent.parent
-        while not self._end.wait(self._seconds):
-            for note in _last_notes(self._journal).values():
-                if note["event"] == "begun":
-                    path = Path(note["directory"])
-                    name = path.relative_to(sweep) if sweep in path.parents else path
-                    print(f"{name}: {progress_of(path)}", file=sys.stderr, flush=True)
+        return bool(num_done >= self._num_jobs)

@@ -3,13 +3,20 @@
 from __future__ import annotations
 
 import math
+import os
+import sys
 from collections.abc import Mapping, Sequence
+from pathlib import Path
+from time import monotonic
 
 from tqdm import tqdm
 
 from safe_rl.runs.outcome import final_figures, final_rows, measured
 
-__all__ = ["ProgressBar", "outcome_line", "shown"]
+__all__ = ["LINE_SECONDS", "ProgressBar", "outcome_line", "shown"]
+
+LINE_SECONDS = "SAFE_RL_LINE_SECONDS"
+"""Variable of runs that share a terminal: seconds between lines, which take the bar's place."""
 
 _RATE_STEPS = 1000
 
@@ -18,6 +25,7 @@ class ProgressBar:
     """Steps done, steps per second, return and costs against their present limits.
 
     Args:
+        directory: Folder of the run, whose name stands in its lines where it prints lines.
         total: Environment steps of the whole run.
         begun: Steps that a continued run has made before.
         limits: Cost key -> d, undiscounted cost per episode.
@@ -25,11 +33,20 @@ class ProgressBar:
     """
 
     def __init__(
-        self, total: int, begun: int, limits: Mapping[str, float], episode_length: int
+        self,
+        directory: Path,
+        total: int,
+        begun: int,
+        limits: Mapping[str, float],
+        episode_length: int,
     ) -> None:
+        self._name = os.path.relpath(directory)
+        self._seconds = float(os.environ.get(LINE_SECONDS, "inf"))
+        self._printed = monotonic()
+        options = {"disable": True} if math.isfinite(self._seconds) else {}
         self._bar = tqdm(
             total=total, initial=begun, unit=" steps", unit_scale=True, dynamic_ncols=True,
-            smoothing=0.1,
+            smoothing=0.1, **options,
         )  # fmt: skip
         self._limits, self._episode_length = limits, episode_length
         self._before: Mapping[str, float] | None = None
@@ -40,6 +57,12 @@ class ProgressBar:
         self._bar.set_postfix(figures, refresh=False)
         self._bar.update(int(row["steps"]) - self._bar.n)
         self._before = row
+        if monotonic() - self._printed >= self._seconds:
+            self._printed = monotonic()
+            words = [f"{row['steps'] / self._bar.total:.0%} of {self._bar.total:,} steps"]
+            words += [f"{row['steps_per_second']:,.0f} steps/s"]
+            words += [f"{name}={value}" for name, value in figures.items()]
+            print(f"{self._name}: {', '.join(words)}", file=sys.stderr, flush=True)
 
     def close(self) -> None:
         """Leave the bar as it is."""

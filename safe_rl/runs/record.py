@@ -104,7 +104,9 @@ class RunRecord:
             # whole batches, so that the last one does not go beyond the bar
             batch = self._config.get("frames_per_batch", 1)
             total = math.ceil(self._config.frames / batch) * batch
-            self._bar = ProgressBar(total, steps, self._cost_limits, self._episode_length)
+            self._bar = ProgressBar(
+                self.directory, total, steps, self._cost_limits, self._episode_length
+            )
             try:
                 yield
                 self._save_config()

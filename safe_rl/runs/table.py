@@ -10,7 +10,7 @@ from pathlib import Path
 
 from safe_rl.files import read_bounded, replace_text
 
-__all__ = ["TableError", "TableWriter", "last_row", "read_table"]
+__all__ = ["TableError", "TableWriter", "read_table"]
 
 # Of a table; ten thousand epochs with a hundred columns have about 20 million
 _MOST_BYTES = 100_000_000
@@ -156,16 +156,3 @@ def read_table(path: Path) -> dict[str, list[float]]:
     if not lines:
         raise ValueError(f"{path} is empty: the run has not finished an epoch.")
     return _columns_of(path, lines)
-
-
-def last_row(path: Path) -> dict[str, float]:
-    """The newest row of a table that is being written.
-
-    Raises:
-        ValueError: If no epoch is finished.
-        OSError: If the file cannot be read.
-    """
-    columns = read_table(path)
-    if not all(columns.values()):
-        raise ValueError(f"{path} has no row: the run has not finished an epoch.")
-    return {name: values[-1] for name, values in columns.items()}

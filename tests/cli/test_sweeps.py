@@ -2,6 +2,7 @@
 
 import json
 import math
+import pickle
 import subprocess
 import sys
 import time
@@ -9,14 +10,16 @@ from pathlib import Path
 
 import pytest
 from filelock import SoftFileLease
-from hydra.core.utils import JobReturn, JobStatus
+from hydra.core.hydra_config import HydraConfig
 from omegaconf import OmegaConf
 from registrations import undone
 
+from safe_rl.cli import session
 from safe_rl.cli.composing import resolving
-from safe_rl.cli.sweeps import SweepReport, count_jobs, threads_per_job
+from safe_rl.cli.sweeps import Sweep, count_jobs, threads_per_job
 from safe_rl.cli.train import read_command
 from safe_rl.runs.checkpoints import read_facts
+from safe_rl.runs.display import LINE_SECONDS, ProgressBar
 from safe_rl.runs.folder import runs_below
 from safe_rl.runs.outcome import final_figures
 from safe_rl.runs.table import read_table
@@ -47,39 +50,42 @@ def test_jobs_at_a_time_share_the_cores(jobs, workers, cores, threads):
     assert threads == 1 or threads * min(jobs, workers) <= cores
 
 
-def sweep_config(directory, job=0):
-    return OmegaConf.create(
-        {
-            "hydra": {
-                "overrides": {"task": ["seed=0,1,2"]},
-                "sweep": {"dir": str(directory)},
-                "launcher": {},
-                "sweeper": {},
-                "runtime": {"output_dir": str(directory / f"seed{job}")},
-                "job": {"num": job},
-            }
-        }
-    )
+@pytest.fixture
+def job(tmp_path, monkeypatch):
+    """Carries out a job of a sweep of three, which returns or raises what is given."""
+
+    def node(number):
+        words = {"job": {"num": number}, "sweep": {"dir": str(tmp_path)}, "launcher": {}}
+        words |= {"sweeper": {}, "runtime": {"output_dir": str(tmp_path / f"seed{number}")}}
+        return OmegaConf.create(words)
+
+    def carry_out(number, outcome):
+        def run_job(config):
+            if isinstance(outcome, BaseException):
+                raise outcome
+            return outcome
+
+        monkeypatch.setattr(session, "run_job", run_job)
+        (tmp_path / f"seed{number}").mkdir(exist_ok=True)
+        # as where Hydra runs it
+        monkeypatch.setattr(
+            HydraConfig.instance(), "cfg", OmegaConf.create({"hydra": node(number)})
+        )
+        return carry_out.sweep(OmegaConf.create({}))
+
+    carry_out.sweep = Sweep(node(0), ["seed=0,1,2"])
+    return carry_out
 
 
-def end_job(report, config, error=None):
-    Path(config.hydra.runtime.output_dir).mkdir(exist_ok=True)
-    outcome = JobReturn(status=JobStatus.FAILED if error else JobStatus.COMPLETED)
-    outcome.return_value = error
-    report.on_job_start(config=config)
-    report.on_job_end(config=config, job_return=outcome)
-    return outcome
-
-
-def test_a_failing_job_is_named_and_stops_nobody(tmp_path, capsys):
-    report = SweepReport()
-    report.on_multirun_start(sweep_config(tmp_path))
-    end_job(report, sweep_config(tmp_path, 0))
-    failed = end_job(report, sweep_config(tmp_path, 1), ValueError("no such cost\nmore"))
-    assert failed.return_value == -math.inf
-    report.on_job_start(config=sweep_config(tmp_path, 2))
-    with pytest.raises(SystemExit, match="1"):
-        report.on_multirun_end(sweep_config(tmp_path))
+def test_a_failing_job_is_named_and_stops_nobody(job, tmp_path, capsys):
+    (tmp_path / "seed0").mkdir()
+    (tmp_path / "seed0" / "failure.txt").write_text("of last time")
+    assert job(0, 3.5) == 3.5
+    assert not (tmp_path / "seed0" / "failure.txt").exists()
+    assert job(1, ValueError("no such cost\nmore")) == -math.inf
+    with pytest.raises(SystemExit):
+        job(2, SystemExit(130))
+    assert not job.sweep.print_summary()
     assert capsys.readouterr().out.splitlines() == [
         "Sweep: 1 of 3 runs are finished.",
         f"  failed: {tmp_path}/seed1: ValueError: no such cost (see failure.txt there)",
@@ -87,25 +93,31 @@ def test_a_failing_job_is_named_and_stops_nobody(tmp_path, capsys):
         "Start it again as it was: finished runs are skipped, the others continue.",
     ]
     assert "ValueError: no such cost\nmore" in (tmp_path / "seed1" / "failure.txt").read_text()
-
-
-def test_a_sweep_without_failures_ends_well_and_clears_old_failures(tmp_path, capsys):
-    (tmp_path / "seed0").mkdir()
-    (tmp_path / "seed0" / "failure.txt").write_text("of last time")
-    report = SweepReport()
-    report.on_multirun_start(sweep_config(tmp_path))
-    for job in range(3):
-        end_job(report, sweep_config(tmp_path, job))
-    report.on_multirun_end(sweep_config(tmp_path))
+    for number in range(3):
+        job(number, 0.0)
+    assert job.sweep.print_summary()
     assert capsys.readouterr().out == "Sweep: 3 of 3 runs are finished.\n"
-    assert not (tmp_path / "seed0" / "failure.txt").exists()
 
 
-def test_single_runs_are_left_alone(tmp_path):
-    failed = end_job(SweepReport(), sweep_config(tmp_path), ValueError("wrong"))
-    with pytest.raises(ValueError, match="wrong"):
-        failed.return_value  # noqa: B018, raises what the job raised
-    assert [path.name for path in tmp_path.iterdir()] == ["seed0"]
+def test_runs_that_share_a_terminal_print_lines(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv(LINE_SECONDS, "0")
+    row = {"steps": 250, "steps_per_second": 5000.0, "episode_return": 1.5, "episode_cost": 30.0}
+    bar = ProgressBar(tmp_path / "seed0", 1000, 0, {"cost": 25.0}, 1000)
+    bar.add({**row, "multiplier_cost": 0.5})
+    bar.close()
+    line = "seed0: 25% of 1,000 steps, 5,000 steps/s, return=1.50, cost=30.0/25, λ=0.5\n"
+    assert capsys.readouterr().err == line
+
+
+def test_a_process_imports_the_users_modules_before_it_composes(job, tmp_path, monkeypatch):
+    monkeypatch.setattr(sys, "path", list(sys.path))
+    (tmp_path / "module_of_a_sweep.py").write_text("")
+    job.sweep._modules = [str(tmp_path / "module_of_a_sweep.py")]
+    sent = pickle.dumps(job.sweep)
+    assert "module_of_a_sweep" not in sys.modules
+    pickle.loads(sent)
+    assert "module_of_a_sweep" in sys.modules
 
 
 @pytest.mark.parametrize(
