@@ -8,10 +8,10 @@ The module is in `safe_rl` itself because all rooms build something.
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from importlib import import_module
 from importlib.util import find_spec
-from typing import Any
+from typing import Any, cast
 
 from hydra.errors import InstantiationException
 from hydra.utils import instantiate
@@ -72,8 +72,9 @@ def build(node: DictConfig | Mapping[str, Any] | None, /, **objects: Any) -> Any
         >>> build(node, cost_limits={"cost": 25.0}).value
         tensor([1.])
     """
-    key = node._get_full_key(None) if isinstance(node, DictConfig) else ""
-    plain = OmegaConf.to_container(node, resolve=True) if isinstance(node, DictConfig) else node
+    key, plain = "", cast(Any, node)
+    if isinstance(node, DictConfig):
+        key, plain = node._get_full_key(None), OmegaConf.to_container(node, resolve=True)
     if plain is None:
         return None
     if not isinstance(plain, Mapping):
@@ -125,12 +126,10 @@ def locate(target: Any, key: str = "") -> Callable[..., Any]:
             f"{shown}: of '{root}' configurations reach only {', '.join(known)}."
             f"{did_you_mean(part, known)}"
         )
-    found = _walk(root, name, shown)
+    found = _find(root, part, shown)
+    # what a module has imported from elsewhere, or a class has from a base, is not its own
     home = getattr(found, "__module__", None) or ""
-    if not (inspect.isclass(found) or inspect.isroutine(found)):
-        raise TargetError(f"{shown} is neither a class nor a function.")
-    whole = [room for room in _roots() if _known(room) is None]
-    if not any(_is_inside(home, room) for room in (root, *whole)):
+    if not any(_is_inside(home, room) for room in _roots() if room == root or not _known(room)):
         raise TargetError(
             f"{shown}: '{root}' only borrows it from '{home}', which is out of reach of "
             f"configurations. If you trust '{home}', add import={home} to the command and write "
@@ -153,31 +152,22 @@ def _checked(node: Any, key: str) -> Any:
     return copied
 
 
-def _walk(root: str, name: str, shown: str) -> Any:
-    """Follow a dotted name from an allowed module; other modules on the way are no way."""
+def _find(root: str, part: str, shown: str) -> Callable[..., Any]:
+    """The class or function of a dotted name below a module."""
     found: Any = import_module(root)
-    for part in name.removeprefix(f"{root}.").split("."):
-        below = f"{found.__name__}.{part}" if inspect.ismodule(found) else ""
-        if part.startswith("_"):
-            raise TargetError(f"{shown}: '{part}' is private.")
-        if hasattr(found, part):
-            following = getattr(found, part)
-        elif hasattr(found, "__path__") and find_spec(below):
-            following = import_module(below)
-        else:
-            hint = did_you_mean(part, _public(found))
-            raise TargetError(f"{shown}: '{found.__name__}' has no '{part}'.{hint}")
-        if inspect.ismodule(following) and following.__name__ != below:
-            raise TargetError(
-                f"{shown}: '{part}' is the module '{following.__name__}', which is no part of "
-                f"'{root}'. If you trust it, add import={following.__name__} to the command."
-            )
-        found = following
+    for name in part.split("."):
+        if name.startswith("_"):
+            raise TargetError(f"{shown}: '{name}' is private.")
+        is_package = hasattr(found, "__path__") and _is_inside(found.__name__, root)
+        if is_package and not hasattr(found, name) and find_spec(f"{found.__name__}.{name}"):
+            import_module(f"{found.__name__}.{name}")
+        if not hasattr(found, name):
+            hint = did_you_mean(name, (other for other in dir(found) if other[0] != "_"))
+            raise TargetError(f"{shown}: '{found.__name__}' has no '{name}'.{hint}")
+        found = getattr(found, name)
+    if not (inspect.isclass(found) or inspect.isroutine(found)):
+        raise TargetError(f"{shown} is neither a class nor a function.")
     return found
-
-
-def _public(found: Any) -> Iterator[str]:
-    return (name for name in dir(found) if not name.startswith("_"))
 
 
 def _roots() -> tuple[str, ...]:
