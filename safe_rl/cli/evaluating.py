@@ -14,7 +14,6 @@ from safe_rl.cli.report import suite
 from safe_rl.cli.run_folders import maker_of
 from safe_rl.cli.schema import KEYS
 from safe_rl.cli.user_code import check_imports, import_modules
-from safe_rl.envs import LayoutError
 from safe_rl.evaluation import (
     Certificate,
     CertificateOptions,
@@ -126,11 +125,9 @@ def certificate_options(
     With ``risk=chance`` the share of episodes above the limit is certified, too, with ``risk=cvar``
     the mean of the costliest ones.
     """
-    packages = OmegaConf.load(CONF / "config.yaml").certificate
-    own = dict(config.get("certificate") or {})
-    if not own.get("episodes", 1):  # the run was to end without a certificate
-        del own["episodes"]
-    options = {**packages, **{name: value for name, value in own.items() if name in packages}}
+    options = dict(config.certificate)
+    if not options["episodes"]:  # the run was to end without a certificate
+        options["episodes"] = OmegaConf.load(CONF / "config.yaml").certificate.episodes
     for name, value in (changes or {}).items():
         if name not in options:
             raise ValueError(f"There is no certificate.{name}.{did_you_mean(name, options)}")
@@ -171,13 +168,8 @@ def evaluate_varied(
         ValueError: For variations that there are not, or that the environment cannot have.
     """
     directory = writable_copy(directory)
-    found = evaluate_variations(
-        directory,
-        options,
-        make_env=maker_of(directory),
-        refusals=(LayoutError,),
-        progress=progress,
-    )
+    make = maker_of(directory)
+    found = evaluate_variations(directory, options, make_env=make, progress=progress)
     picture = RunFolder(directory).variations(options.name, "png")
     draw_variations(found.rows, found.cost_limits, picture)
     return found, picture

@@ -99,14 +99,8 @@ def robot_of(folder: RunFolder, env: Mapping[str, Any]) -> dict[str, Any]:
 
 def maker_of(directory: Path) -> Callable[..., envs.ConstrainedEnv]:
     """:func:`safe_rl.envs.make_env` for a run's environments, with the robot that it began with."""
-
-    def make(env: Mapping[str, Any], **options: Any) -> envs.ConstrainedEnv:
-        try:
-            return envs.make_env(robot_of(RunFolder(directory), env), **options)
-        except envs.ContractError as error:
-            raise ConfigError(str(error)) from error
-
-    return make
+    folder = RunFolder(directory)
+    return lambda env, **options: envs.make_env(robot_of(folder, env), **options)
 
 
 def _own_robot(env: Mapping[str, Any]) -> Path | None:

@@ -120,7 +120,7 @@ _DEFAULTS = (
 )
 
 
-class ContractError(TypeError):
+class ContractError(ValueError):
     """An environment that does not fulfil the contract; the message lists what it lacks."""
 
 

@@ -217,7 +217,6 @@ def evaluate_variations(
     options: EvaluationOptions,
     *,
     make_env: Callable[..., EnvBase],
-    refusals: tuple[type[Exception], ...],
     progress: bool = False,
 ) -> Varied:
     """Run a trained policy in its own environment and under ``options.variations``.
@@ -228,7 +227,6 @@ def evaluate_variations(
         directory: Folder of a run.
         options: As for an evaluation; ``env`` changes every one of the environments.
         make_env: ``make_env(node, num_envs=, device=, seed=, num_threads=)``.
-        refusals: What an environment raises that cannot have a variation, beside ValueError.
         progress: Whether to say what is next.
 
     Raises:
@@ -247,7 +245,6 @@ def evaluate_variations(
     rows: list[VariedRow] = []
     left_out: list[tuple[Variation, str]] = []
     facts: dict[str, Any] = {}
-    cannot: tuple[type[Exception], ...] = (ValueError, *refusals)
     for variation in (AS_TRAINED, *variations):
         try:
             changed = varied(config, variation) if variation.keys else config
@@ -258,7 +255,7 @@ def evaluate_variations(
                 print(f"… {variation}", flush=True)
             trial = Trial(changed, checkpoint, options, make_env)
             _, episodes, limits = trial.run()
-        except cannot as error:
+        except ValueError as error:
             if not variation.may_lack:
                 raise
             left_out.append((variation, str(error)))

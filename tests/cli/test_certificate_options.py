@@ -1,7 +1,6 @@
 """What the certificate of a run asks for, from its configuration."""
 
 import pytest
-from omegaconf import OmegaConf
 from run_configs import compose_config
 
 from safe_rl.cli.evaluating import certificate_options, is_to_keep_limits
@@ -28,14 +27,6 @@ def test_a_limit_on_the_share_of_episodes_is_certified_with_the_mean(overrides, 
 )
 def test_a_limit_on_the_costliest_episodes_is_certified_for_them(overrides, tail):
     assert certificate_options(compose_config(*overrides)).tail == tail
-
-
-def test_runs_without_the_section_or_with_keys_of_earlier_versions_get_the_packages_options():
-    packages = certificate_options(compose_config())
-    old = OmegaConf.create({"cost_limits": {"cost": 25.0}})
-    assert certificate_options(old) == packages
-    old.certificate = {**compose_config().certificate, "retest": 2}
-    assert certificate_options(old) == packages
 
 
 @pytest.mark.parametrize(

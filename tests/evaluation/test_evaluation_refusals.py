@@ -109,8 +109,8 @@ def test_a_run_that_others_may_only_read_is_evaluated_as_a_copy(run, capsys, mon
 
 @pytest.mark.parametrize(("command", "what"), [(main, "RUN_DIR"), (report_main, "RUNS_DIR")])
 def test_a_command_without_a_folder_asks_for_it(command, what, capsys):
-    assert command(["import=json"]) == 1
-    assert f"error: {what} comes first" in capsys.readouterr().err
+    assert command(["import=json"]) == 2
+    assert f" {what} [option=value ...]" in capsys.readouterr().out
 
 
 def test_an_environment_that_breaks_its_contract_ends_in_one_line(run, capsys, monkeypatch):

@@ -159,7 +159,7 @@ _HOPELESS_LAYOUTS = (100, 10_000)
 _HOPELESS_PAIRS = 1 << 26
 
 
-class LayoutError(RuntimeError):
+class LayoutError(ValueError):
     """No layout was found; the message names the object that did not fit."""
 
 
