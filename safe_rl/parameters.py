@@ -3,24 +3,13 @@
 from __future__ import annotations
 
 import inspect
-import os
 import re
 from collections.abc import Callable, Iterator, Mapping
 from functools import cache
-from typing import (
-    Annotated,
-    Any,
-    NamedTuple,
-    NotRequired,
-    TypedDict,
-    get_args,
-    get_origin,
-    get_type_hints,
-    is_typeddict,
-)
+from typing import Annotated, Any, NamedTuple
 
 from safe_rl.extras import check_extra
-from safe_rl.ranges import NotNegative, Range, Values, Weight, bytes_each, is_described, values_of
+from safe_rl.ranges import NotNegative, Range, Values, Weight, is_described, values_of
 from safe_rl.targets import locate
 
 __all__ = ["Parameter", "Part", "SettingError", "accepted_names", "parameters_of", "read_part"]
@@ -31,12 +20,11 @@ class SettingError(ValueError):
 
 
 class Parameter(NamedTuple):
-    """One argument of a function or class, or one key of a `TypedDict`.
+    """One argument of a function or class.
 
     Attributes:
         values: What it may be.
         meaning: What its docstring says of it, a sentence without its full stop.
-        bytes_each: Memory that every unit of a count takes at least; 0 if it takes none.
         is_described: Whether its annotation says more than a type: a hyper-parameter.
         is_required: Whether it has to be given.
 
@@ -56,7 +44,6 @@ class Parameter(NamedTuple):
 
     values: Values
     meaning: str
-    bytes_each: int = 0
     is_described: bool = True
     is_required: bool = True
 
@@ -68,18 +55,11 @@ class Parameter(NamedTuple):
             value: The value, as a YAML file has it.
 
         Raises:
-            SettingError: If it is none of its values, or needs more memory than the machine has.
+            SettingError: If it is none of its values.
         """
         if not self.values.hold(value):
             meaning = f" ({self.meaning})" if self.meaning else ""
             raise SettingError(f"{path}={_shown(value)}: it must be {self.values.words}{meaning}.")
-        each = self.bytes_each
-        needed, present = each * (value if each else 0), _memory()
-        if needed > present:
-            raise SettingError(
-                f"{path}={_shown(value)}: this takes {needed / 1e9:,.0f} GB of memory at least, "
-                f"and the machine has {present / 1e9:,.0f}, room for {present // each:,}."
-            )
 
 
 class Part(NamedTuple):
@@ -99,10 +79,10 @@ class Part(NamedTuple):
         return {name: row for name, row in self.rows.items() if row.is_described}
 
 
-class Optimiser(TypedDict, total=False):
+class Optimiser:
     """Arguments of torch's optimisers, whose annotations do not say what they may be.
 
-    Attributes:
+    Args:
         lr: Learning rate.
         betas: Decay rates of the moments.
         eps: What is added to denominators.
@@ -114,15 +94,18 @@ class Optimiser(TypedDict, total=False):
         nesterov: Whether to use Nesterov momentum.
     """
 
-    lr: Annotated[float, Range(0, 1000, above=True)]
-    betas: tuple[Weight, Weight]
-    eps: NotNegative
-    weight_decay: NotNegative
-    momentum: Weight
-    fused: bool | None
-    foreach: bool | None
-    amsgrad: bool
-    nesterov: bool
+    def __init__(
+        self,
+        lr: Annotated[float, Range(0, 1000, above=True)],
+        betas: tuple[Weight, Weight],
+        eps: NotNegative,
+        weight_decay: NotNegative,
+        momentum: Weight,
+        fused: bool | None,
+        foreach: bool | None,
+        amsgrad: bool,
+        nesterov: bool,
+    ) -> None: ...
 
 
 def read_part(target: Any, path: str = "") -> Part:
@@ -174,7 +157,7 @@ def accepted_names(target: Callable[..., Any]) -> set[str]:
 
 @cache
 def parameters_of(target: Callable[..., Any]) -> Mapping[str, Parameter]:
-    """Arguments of a function or class by name, those of its bases included; keys of a `TypedDict`.
+    """Arguments of a function or class by name, those of its bases included.
 
     As `accepted_names`, this follows ``**kwargs`` to the next constructor. An annotation
     that cannot be read, such as a name imported for type checkers only, allows anything.
@@ -183,31 +166,20 @@ def parameters_of(target: Callable[..., Any]) -> Mapping[str, Parameter]:
         return parameters_of(Optimiser)
     meanings = _meanings(target)
     found: dict[str, Parameter] = {}
-    for name, annotation, is_required in _annotations(target):
+    for name, parameter, names in _arguments(target):
         if name not in found:
+            annotation = _evaluated(parameter.annotation, names)
             found[name] = Parameter(
                 values_of(annotation),
                 meanings.get(name, ""),
-                bytes_each(annotation),
                 is_described(annotation),
-                is_required,
+                parameter.default is parameter.empty,
             )
     return found
 
 
-def _annotations(target: Callable[..., Any]) -> list[tuple[str, Any, bool]]:
-    """Name, annotation and whether it is required, the class's own arguments first."""
-    if is_typeddict(target):
-        hints = get_type_hints(target, include_extras=True)
-        return [(k, _bare(hint), get_origin(hint) is not NotRequired) for k, hint in hints.items()]
-    return [
-        (name, _evaluated(parameter.annotation, names), parameter.default is parameter.empty)
-        for name, parameter, names in _arguments(target)
-    ]
-
-
 def _arguments(target: Callable[..., Any]) -> Iterator[tuple[str, inspect.Parameter, Any]]:
-    """Arguments that have names, each with what its module defines."""
+    """Arguments that have names, the class's own first, each with what its module defines."""
     for function in constructors(target):
         names = getattr(inspect.unwrap(function), "__globals__", {})
         for name, parameter in inspect.signature(function).parameters.items():
@@ -231,10 +203,6 @@ def _takes_any(function: Callable[..., Any]) -> bool:
     """Whether a function takes arguments that it does not name."""
     parameters = inspect.signature(function).parameters.values()
     return any(parameter.kind is parameter.VAR_KEYWORD for parameter in parameters)
-
-
-def _bare(hint: Any) -> Any:
-    return get_args(hint)[0] if get_origin(hint) is NotRequired else hint
 
 
 def _evaluated(annotation: Any, names: dict[str, Any]) -> Any:
@@ -269,11 +237,6 @@ def _sentence(text: str) -> str:
     plain = " ".join(text.replace("`", "").split())
     first = re.split(r"\.(?:\s|$)", plain, maxsplit=1)[0]
     return first[:1].lower() + first[1:] if first[1:2].islower() else first
-
-
-def _memory() -> int:
-    """Bytes of this machine."""
-    return os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
 
 
 def _shown(value: Any) -> str:

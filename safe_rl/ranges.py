@@ -12,14 +12,13 @@ from dataclasses import dataclass
 from functools import cache, reduce, wraps
 from inspect import signature
 from types import NoneType, UnionType
-from typing import Annotated, Any, Literal, NamedTuple, NotRequired, Required, Union
+from typing import Annotated, Any, Literal, NamedTuple, Union
 from typing import get_args as arguments_of
 from typing import get_origin as origin_of
 
 __all__ = [
-    *("ANYTHING", "PART", "Bytes", "Checked", "Count", "Fraction", "MaxLength", "NotNegative"),
-    *("Number", "Options", "Positive", "Range", "Share", "Text", "Values", "Weight", "bytes_each"),
-    *("is_described", "values_of"),
+    *("ANYTHING", "PART", "Checked", "Count", "Fraction", "NotNegative", "Number", "Options"),
+    *("Positive", "Range", "Share", "Text", "Values", "Weight", "is_described", "values_of"),
 ]
 
 
@@ -63,20 +62,6 @@ class Range:
     high: float | None = None
     above: bool = False
     below: bool = False
-
-
-@dataclass(frozen=True)
-class MaxLength:
-    """Most items of a list."""
-
-    items: int
-
-
-@dataclass(frozen=True)
-class Bytes:
-    """Memory that every unit of a count takes at least."""
-
-    each: int
 
 
 def is_number(value: Any) -> bool:
@@ -131,8 +116,6 @@ def values_of(annotation: Any) -> Values:
     origin, inner = origin_of(annotation), arguments_of(annotation)
     if origin is Annotated:
         return _narrowed(inner[0], inner[1:])
-    if origin in (Required, NotRequired):
-        return values_of(inner[0])
     if origin is Literal:
         return _choice(inner)
     if origin in (Union, UnionType):
@@ -161,12 +144,6 @@ def is_described(annotation: Any) -> bool:
     return any(map(is_described, arguments_of(annotation)))
 
 
-def bytes_each(annotation: Any) -> int:
-    """Memory that every unit of a count takes at least; 0 if its annotation has no `Bytes`."""
-    found = (item.each for item in getattr(annotation, "__metadata__", ()) if type(item) is Bytes)
-    return next(found, 0)
-
-
 def _narrowed(kind: Any, metadata: Collection[Any]) -> Values:
     """The values of a type that its metadata leaves; unknown metadata leaves all."""
     for item in metadata:
@@ -174,8 +151,6 @@ def _narrowed(kind: Any, metadata: Collection[Any]) -> Values:
             return item
         if isinstance(item, Range):
             return _whole(item) if kind is int else _number(item)
-        if isinstance(item, MaxLength):
-            return _items(values_of(arguments_of(kind)[0]), item.items)
     return values_of(kind)
 
 

@@ -244,7 +244,7 @@ def _check_risk(config: DictConfig, constraints: Constraints, loss: ReplayLoss) 
         return
     limited = "mean costs" if known is None else f"mean costs or {known.__name__}"
     raise ValueError(
-        f"risk: algo={config.algo.name} limits {limited} only, because the charge of a step "
-        "depends on its episode: use risk=mean, algo=wcsac with risk=cvar, or an on-policy "
-        "algorithm."
+        f"risk: algo={config.algo.name} limits {limited} only, because its replay buffer holds "
+        "single steps and other risk measures need whole episodes. Use risk=mean, algo=wcsac with "
+        "risk=cvar, or an on-policy algorithm such as algo=ppo_lagrangian."
     )

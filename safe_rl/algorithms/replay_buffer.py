@@ -15,7 +15,7 @@ from torchrl.data.replay_buffers.storages import Storage
 from torchrl.envs import MultiStepTransform
 
 from safe_rl.algorithms.algorithm_contract import Stateful
-from safe_rl.ranges import Bytes, Checked, Count, Range, Share
+from safe_rl.ranges import Checked, Count, Range, Share
 from safe_rl.resumable import Resumable
 
 __all__ = ["Memory", "ProportionalSampler"]
@@ -66,7 +66,7 @@ class Memory(Checked):
     def __init__(
         self,
         *,
-        capacity: Annotated[int, Range(1), Bytes(50)],
+        capacity: Annotated[int, Range(1, 10**8)],
         batch_size: Count,
         in_keys: Sequence[NestedKey],
         reward_keys: Sequence[NestedKey],

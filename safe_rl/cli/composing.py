@@ -11,7 +11,7 @@ import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 from hydra import compose, initialize_config_dir
 from hydra.core.global_hydra import GlobalHydra
@@ -22,7 +22,7 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 from yaml import YAMLError
 
-from safe_rl.cli.grammar import CommandLineError, overrides_of, parse, take_word
+from safe_rl.cli.grammar import CommandLineError, overrides_of, parse
 from safe_rl.cli.schema import GIVEN_WHOLE, KEYS, check_settings, keys_of, nearest_keys, plain
 from safe_rl.cli.user_code import check_imports, note_imports
 from safe_rl.envs import complete_env, store_configs
@@ -38,7 +38,11 @@ __all__ = ["compose_jobs", "compose_resumed", "hydra_on_conf", "resolving", "sea
 
 _LARGE = ("env", "algo", "preset")
 """Groups whose files differ in more than a few keys."""
-_STEPS = ("total_timesteps", "total_steps", "timesteps", "max_steps")  # elsewhere, for frames
+_ELSEWHERE = {
+    **dict.fromkeys(("total_timesteps", "total_steps", "timesteps", "max_steps"), "frames"),
+    **dict.fromkeys(("dir", "directory", "log_dir", "output_dir", "run_dir"), "hydra.run.dir"),
+}
+"""What other libraries call a key -> the key."""
 _ONE_EACH = ("env", "algo", "preset", "model", "risk", "collector", "logger", "lagrangian")
 _MOST_LISTED = 40
 _MISSING = object()
@@ -101,8 +105,8 @@ def resolving(config: DictConfig) -> Iterator[None]:
         HydraConfig.instance().cfg = before
 
 
-def search_folders(folders: Iterable[str | Path], texts: Sequence[str]) -> list[str]:
-    """Overrides by which Hydra looks for files in some folders, too.
+def search_folders(folders: Iterable[str | Path]) -> list[str]:
+    """The override by which Hydra looks for files in some folders, too; none without folders.
 
     Raises:
         CommandLineError: If there is no such folder.
@@ -110,10 +114,8 @@ def search_folders(folders: Iterable[str | Path], texts: Sequence[str]) -> list[
     paths = [Path(folder).expanduser().absolute() for folder in folders]
     if missing := next((path for path in paths if not path.is_dir()), None):
         raise CommandLineError(f"config_dir={missing}: there is no such folder.")
-    value, others = take_word("hydra.searchpath", texts)
-    before = [] if value is None else parse(f"hydra.searchpath={value}").value()
-    found = [*(f"file://{path}" for path in paths), *cast(list[str], before)]
-    return [*others, *overrides_of({"hydra.searchpath": found} if found else {})]
+    found = [f"file://{path}" for path in paths]
+    return list(overrides_of({"hydra.searchpath": found} if found else {}))
 
 
 def _check_form(overrides: Sequence[Override]) -> None:
@@ -187,7 +189,7 @@ def _explain(error: Exception, texts: Sequence[str]) -> str:
 
 
 def _unknown(key: str, values: Mapping[str, Any]) -> str:
-    """Say that nothing reads a key, and what was meant: another key, or a choice that reads it.
+    """Say that there is no such key, and what was meant: another key, or a choice that has it.
 
     Args:
         key: The key.
@@ -197,19 +199,17 @@ def _unknown(key: str, values: Mapping[str, Any]) -> str:
     if section not in values and section in KEYS and section != "note":  # which is added
         return f"algo={algo.get('name')} has no '{section}'."
     if section == "env" and (reason := on_cpu_only(key.removeprefix("env."))):
-        return f"nothing reads '{key}'.{reason}"
+        return f"there is no key '{key}'.{reason}"
     if choice := _choice_with(key):
-        return f"nothing reads '{key}' without {choice}."
+        return f"there is no key '{key}' without {choice}."
     unread = tuple(f"{path}." for path in _unread_by(algo))
     paths = {p: is_held for p, is_held in keys_of(values) if not f"{p}.".startswith(unread)}
     own = ["env", "algo", "preset", *(path for path, is_held in paths.items() if is_held)]
-    others = ["frames"] if key in _STEPS else []
-    meant = (
-        others or nearest_keys(key, own) or nearest_keys(key, [p for p in paths if not paths[p]])
-    )
-    names = " or ".join(f"'{'' if path in own else '+'}{path}'" for path in meant)
+    elsewhere = [_ELSEWHERE[key]] if key in _ELSEWHERE else []
+    meant = elsewhere or nearest_keys(key, own) or nearest_keys(key, paths)
+    names = " or ".join(f"'{'' if path in own + elsewhere else '+'}{path}'" for path in meant)
     how = f"A new key is added by +{key}=…" if "." in key else "'--cfg job' prints all keys."
-    return f"nothing reads '{key}'. {f'Did you mean {names}?' if names else how}"
+    return f"there is no key '{key}'. {f'Did you mean {names}?' if names else how}"
 
 
 def _choice_with(key: str) -> str | None:
@@ -332,11 +332,9 @@ def _change(config: DictConfig, override: Override, directory: Path, said: Seque
 def _refuse_foreign_cluster(config: DictConfig, overrides: Sequence[Override], path: Path) -> None:
     """What Ray is started with can make code run: only the command line says it, not a file."""
     said = [override.key_or_group for override in overrides]
-    held = flatten({"collector": config.get("collector") or {}})
-    for key, value in held.items():
-        is_harmless = value is None or re.fullmatch(r"collector\.resources\.num_[cg]pus", key)
-        of_ray = key.startswith(("collector.ray_init.", "collector.resources."))
-        if of_ray and key not in said and not is_harmless:
+    for key, value in flatten({"collector": config.get("collector") or {}}).items():
+        is_of_ray = re.match(r"collector\.(ray_init|resources)\.(?!num_[cg]pus$)", key)
+        if is_of_ray and value is not None and key not in said:
             raise CommandLineError(
                 f"{path} has {key}, which is not taken from a file, as it could make code run: "
                 f"say again {key}=…"

@@ -53,14 +53,13 @@ def parse(text: str) -> Override:
         3
     """
     try:
-        override = OverridesParser.create().parse_override(text)
+        return OverridesParser.create().parse_override(text)
     except HydraException as error:
         quoted = re.search(r"\{\s*['\"]", text)
         hint = " Names within braces have no quotes: '{cost: 10}'." if quoted else ""
         raise CommandLineError(
             f"'{text}' cannot be read: {str(error).splitlines()[0]}.{hint}"
         ) from None
-    return override
 
 
 def take_word(name: str, words: Sequence[str]) -> tuple[str | None, list[str]]:
@@ -239,18 +238,14 @@ def run_command(
     words = sys.argv[1:] if arguments is None else list(arguments)
     places = [word for word in command.split() if word[0].isupper()]
     is_help = words[:1] in (["-h"], ["--help"])
-    if is_help or len(words) < len(places):
-        print(usage(command, schema))
-        return 0 if is_help else 2
     try:
         modules, words = split_imports(words)
-        if len(words) < len(places):
-            raise CommandLineError(f"{' and '.join(places)} comes first: {command} [option=…].")
-        options = parse_options(words[len(places) :], schema)
+        if is_help or len(words) < len(places):
+            print(usage(command, schema))
+            return 0 if is_help else 2
+        first, options = words[: len(places)], parse_options(words[len(places) :], schema)
         module, _, function = work.partition(":")
-        status: int = getattr(import_module(module), function)(
-            words[: len(places)], options, modules
-        )
+        status: int = getattr(import_module(module), function)(first, options, modules)
         return status
     except (ValueError, OSError, RuntimeError, ImportError, OmegaConfBaseException) as error:
         if os.environ.get("HYDRA_FULL_ERROR") == "1":
@@ -264,11 +259,11 @@ def say_interruptions() -> None:
 
     The process still ends by the signal, as shells want it that run commands in a loop.
     """
-    sys.excepthook = _say
 
+    def say(kind: type[BaseException], error: BaseException, trace: TracebackType | None) -> None:
+        if issubclass(kind, KeyboardInterrupt) and os.environ.get("HYDRA_FULL_ERROR") != "1":
+            print("Interrupted.", file=sys.stderr)
+        else:
+            sys.__excepthook__(kind, error, trace)
 
-def _say(kind: type[BaseException], error: BaseException, trace: TracebackType | None) -> None:
-    if issubclass(kind, KeyboardInterrupt) and os.environ.get("HYDRA_FULL_ERROR") != "1":
-        print("Interrupted.", file=sys.stderr)
-    else:
-        sys.__excepthook__(kind, error, trace)
+    sys.excepthook = say

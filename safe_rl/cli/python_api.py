@@ -20,12 +20,12 @@ from tensordict.nn import TensorDictModuleBase
 from torchrl.envs import EnvBase
 
 from safe_rl.cli import report as report_command
-from safe_rl.cli.composing import compose_jobs, compose_resumed, search_folders
 from safe_rl.cli.evaluating import certify_run, evaluate_run, evaluate_varied
 from safe_rl.cli.grammar import CommandLineError, overrides_of, take_options
 from safe_rl.cli.run_folders import maker_of
 from safe_rl.cli.schema import GIVEN_WHOLE
 from safe_rl.cli.session import Session
+from safe_rl.cli.train import read_command
 from safe_rl.cli.user_code import check_imports, import_modules, note_imports
 from safe_rl.evaluation import Certificate, Evaluation, EvaluationOptions, loading
 from safe_rl.evaluation.episodes import default_seed
@@ -95,9 +95,9 @@ def train(
             "environment of your own, a YAML that config_dir=… finds to an algorithm."
         )
     folders = [config_dir] if isinstance(config_dir, str | Path) else config_dir or ()
-    modules = import_modules(imports)
     words = [f"env={env}", f"algo={algo}", *overrides_of(settings, _WHOLE)]
-    (config,) = compose_jobs([*search_folders(folders, words), *note_imports(modules or None)])
+    words += [f"--config-dir={place}" for place in folders]
+    (config,) = read_command([*words, *note_imports(imports or None)]).configs
     folder = None if directory is None else Path(directory).expanduser()
     if folder is not None and RunFolder(folder).has_begun:
         raise FileExistsError(
@@ -135,9 +135,9 @@ def resume(
         Resuming after 40 of 80 frames.
         [40.0, 80.0]
     """
-    modules = None if imports is None else import_modules(imports)
     folder = Path(directory).expanduser()
-    config = compose_resumed(folder, overrides_of(settings, _WHOLE), modules)
+    words = [f"resume={folder}", *overrides_of(settings, _WHOLE), *note_imports(imports)]
+    (config,) = read_command(words).configs
     return _carry_out(Session(config, folder, continues=True, program=None, callbacks=callbacks))
 
 

@@ -17,16 +17,13 @@ from safe_rl.naming import nearest
 from safe_rl.parameters import Parameter, Part, SettingError, parameters_of, read_part
 from safe_rl.ranges import (
     PART,
-    Bytes,
     Count,
-    MaxLength,
     NotNegative,
     Options,
     Positive,
     Range,
     Text,
     Values,
-    bytes_each,
     is_text,
     values_of,
 )
@@ -51,13 +48,13 @@ _FOLDER = Values(lambda v: is_text(v) and "/" not in v, "a text that is not empt
 _FOLDER_OF_ENV = f"{_FOLDER.words}: it names folders, and env.name=… gives another name"
 
 
-def _int(low: int, high: int | None = None, *more: Any) -> Any:
-    return Annotated[int, Range(low, high), *more]
+def _int(low: int, high: int | None = None) -> Any:
+    return Annotated[int, Range(low, high)]
 
 
 _ONE = "1, as collector=local is one process; for more use collector=process or collector=ray"
 _Width = Annotated[int, Range(1, 16_384)]
-_Widths = Annotated[list[_Width], MaxLength(32)]
+_Widths = list[_Width]
 _Limits = dict[str, NotNegative]
 _Part = Annotated[Any, PART]
 _Few = _int(0, 1000)
@@ -66,9 +63,8 @@ _Head = Literal["auto", "gaussian", "tanh", "beta", "categorical", "one_hot"]
 
 _REQUIRED: dict[str, tuple[Any, str]] = {
     "frames": (Count, "steps to train for"),
-    # a world of the smallest robot, and a step with one number of observation
-    "num_envs": (_int(1, None, Bytes(20_000)), "environments that are stepped together"),
-    "frames_per_batch": (_int(1, None, Bytes(50)), "steps of all environments in one batch"),
+    "num_envs": (_int(1, 10**6), "environments that are stepped together"),
+    "frames_per_batch": (_int(1, 10**8), "steps of all environments in one batch"),
     # evaluations add to a seed, and environments count in 64 bits
     "seed": (_int(0, 2**62), "seed of the run"),
     "init_from": (Text | None, "folder or checkpoint of the run to start from"),
@@ -152,7 +148,7 @@ _OPTIONAL: dict[str, tuple[Any, str]] = {
 }
 
 KEYS = {
-    path: Parameter(values_of(kind), meaning, bytes_each(kind), is_required=rows is _REQUIRED)
+    path: Parameter(values_of(kind), meaning, is_required=rows is _REQUIRED)
     for rows in (_REQUIRED, _OPTIONAL)
     for path, (kind, meaning) in rows.items()
 } | {
@@ -161,9 +157,6 @@ KEYS = {
     if name != "tail"  # that of the risk
 }
 """By full path: all keys but those of parts and environments."""
-_CLOSED = ("algo", "model", "model.encoders", "model.memory", "logger", "checkpoint", "certificate",
-           "collector", "critics", "dataset", "evaluation", "exploration")  # fmt: skip
-"""Sections whose keys are all in the table, unless they are a part."""
 _LIKENESS = 0.6
 """Likeness from which a key is taken for a misspelt one."""
 
@@ -183,20 +176,6 @@ class _Node(NamedTuple):
     part: Part
     is_built: bool = False
 
-    def check(self) -> None:
-        """Refuse a key that is not there, or that holds what it cannot, or that nothing reads."""
-        for name, row in self.part.rows.items():
-            if name in self.values:
-                row.check(_join(self.path, name), self.values[name])
-            elif row.is_required and not self.is_built:
-                raise SettingError(f"{_join(self.path, name)} is missing: {row.meaning}.")
-        known = list(self.values) if self.part.names is None else self.part.names
-        for name in self.values:
-            if name not in known and not str(name).startswith("_"):
-                meant = nearest_keys(name, known)
-                hint = f" Did you mean '{_join(self.path, meant[0])}'?" if meant else ""
-                raise SettingError(f"{_join(self.path, name)}: nothing reads this key.{hint}")
-
 
 def check_settings(config: DictConfig) -> None:
     """Check every key but the environment's: by `KEYS`, those of parts by their signatures.
@@ -211,12 +190,21 @@ def check_settings(config: DictConfig) -> None:
         SettingError: For the first key that does not exist or holds what it cannot.
         TargetError: For a part that cannot be built.
     """
-    for node in _nodes(plain(config)):
-        node.check()
-        for name, row in node.part.rows.items():
-            if row.values.whole and name in node.values:
-                holder = OmegaConf.select(config, node.path) if node.path else config
-                holder[name] = _whole(node.values[name])
+    for path, values, part, is_built in _nodes(plain(config)):
+        for name, row in part.rows.items():
+            if name in values:
+                row.check(_join(path, name), values[name])
+                if row.values.whole:
+                    holder = OmegaConf.select(config, path) if path else config
+                    holder[name] = _whole(values[name])
+            elif row.is_required and not is_built:
+                raise SettingError(f"{_join(path, name)} is missing: {row.meaning}.")
+        known = list(values) if part.names is None else part.names
+        for name in values:
+            if name not in known and not str(name).startswith("_"):
+                meant = nearest_keys(name, known)
+                hint = f" Did you mean '{_join(path, meant[0])}'?" if meant else ""
+                raise SettingError(f"there is no key '{_join(path, name)}'.{hint}")
 
 
 def plain(config: DictConfig) -> dict[str, Any]:
@@ -279,7 +267,9 @@ def _nodes(values: Mapping[str, Any], path: str = "") -> Iterator[_Node]:
         head = f"{path}." if path else ""
         rows = {key.removeprefix(head): row for key, row in KEYS.items() if key.startswith(head)}
         own = {name: row for name, row in rows.items() if "." not in name}
-        yield _Node(path, values, Part(own, list(own) if path in _CLOSED else None))
+        # a section has no other keys than its rows; others may be tables of an algorithm's own
+        is_closed = path == "logger" or bool(path and own)
+        yield _Node(path, values, Part(own, list(own) if is_closed else None))
     for name, value in values.items():
         if isinstance(value, Mapping):
             yield from _nodes(value, _join(path, name))

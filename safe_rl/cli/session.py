@@ -24,7 +24,7 @@ from safe_rl.cli.evaluating import certify_run, is_to_keep_limits
 from safe_rl.cli.run_folders import keep_robot, new_folder, robot_of
 from safe_rl.cli.schema import check_settings
 from safe_rl.cli.user_code import imported, make_after_imports
-from safe_rl.envs import ConfigError, ContractError, LayoutError, complete_env, make_env
+from safe_rl.envs import ConfigError, complete_env, make_env
 from safe_rl.evaluation.episodes import PeriodicEvaluation, default_seed, has_fixed_layout
 from safe_rl.evaluation.loading import transforms_of
 from safe_rl.files import replacing
@@ -39,14 +39,11 @@ from safe_rl.training.trainer import EpisodeError, Trainer, WorkerError
 __all__ = ["SETTING_ERRORS", "Session", "run_job"]
 
 SETTING_ERRORS: tuple[type[Exception], ...] = (
-    *(ValueError, CheckpointError, OmegaConfBaseException, OSError, LayoutError),
-    *(ModuleNotFoundError, ContractError),
+    *(ValueError, CheckpointError, OmegaConfBaseException, OSError, ModuleNotFoundError),
 )
 """What is raised about settings and files, when a run is built or evaluated."""
-# the last two are about the environment: where they stand says less than the message
-_TRAINING_ERRORS = (
-    *(OSError, TableError, ConfigError, EpisodeError, FloatingPointError, WorkerError),
-)
+_TRAINING_ERRORS = (OSError, TableError, ConfigError, EpisodeError, FloatingPointError, WorkerError)
+"""Errors of training whose message says more than where they were raised."""
 
 
 class Session:
@@ -58,8 +55,8 @@ class Session:
         hydra: Hydra's own configuration, which a new run notes.
         continues: Whether to continue the run in the folder.
         is_new: Whether the folder was not there before: it goes again if the run cannot begin.
-        program: The command, as the user has called it; None: Python, which is not told what came
-            of it.
+        program: The command, as the user has called it; None: Python, where the outcome is not
+            printed.
         callbacks: Called after every epoch with its row; one that returns False ends the run.
 
     Attributes:
@@ -80,11 +77,9 @@ class Session:
         self.config, self.folder, self.hydra = config, RunFolder(folder), hydra
         self.interrupted_by: Signals | None = None
         self._continues, self._is_new, self._callbacks = continues, is_new, callbacks
-        self._quiet = program is None
-        self._program = program or "python train.py"
-        self._again = f"{self._program} {self.folder.resuming}"
-        if program is None:
-            self._again += f", or safe_rl.resume({str(folder)!r})"
+        self._program = program
+        words = f"{program} {self.folder.resuming}"
+        self._again = words if program else f"safe_rl.resume({str(folder)!r})"
         self._has_begun = False
 
     @classmethod
@@ -115,15 +110,14 @@ class Session:
         """
         try:
             self._complete()
-            if self._continues and self.hydra is not None:  # a job, whose folder has its settings
+            is_job = self._continues and self.hydra is not None
+            if is_job:  # its folder may hold a run with other settings
                 check_same_run(self.folder.directory, self.config)
             with lock_folder(self.folder):
                 trainer = self._prepare()
                 self._has_begun = True
                 if trainer is not None:
-                    if self.hydra is not None and not (
-                        self._continues and self.folder.notes.exists()
-                    ):
+                    if self.hydra is not None and not (is_job and self.folder.notes.exists()):
                         self._write_notes(self.hydra)
                     outcome = trainer.run()
         finally:
@@ -146,17 +140,16 @@ class Session:
         return isinstance(error, _TRAINING_ERRORS if self._has_begun else SETTING_ERRORS)
 
     def _say(self, line: str) -> None:
-        if not self._quiet:
+        if self._program is not None:
             _print(line)
 
     def _complete(self) -> None:
         """Fill the environment's keys up, so that the run's folder tells all of them."""
         given = self._env_node()
+        # what is given as null has been found out
+        known = {key: value for key, value in given.items() if value is not None}
         with open_dict(self.config):
-            full = complete_env(robot_of(self.folder, given))
-            # what is given as null has been found out
-            known = {key: value for key, value in given.items() if value is not None}
-            self.config.env = full | known
+            self.config.env = complete_env(robot_of(self.folder, given)) | known
 
     def _env_node(self) -> dict[str, Any]:
         return cast(dict[str, Any], OmegaConf.to_container(self.config.env, resolve=True))
@@ -169,13 +162,10 @@ class Session:
         if not self._continues:
             folder.check_is_free()
         elif is_finished(folder.directory, config.frames):
-            was_interrupted = folder.certifying.exists()  # before it was certified
-            what = (
-                "; certifying it, as was begun"
-                if was_interrupted
-                else ": raise 'frames' to train on"
-            )
-            print(f"{folder.directory} has its {config.frames:,} frames already{what}.")
+            more = ": raise 'frames' to train on"
+            if folder.certifying.exists():
+                more = "; certifying it, as was begun"
+            print(f"{folder.directory} has its {config.frames:,} frames already{more}.")
             return None
         if config.frames % config.frames_per_batch:
             whole = math.ceil(config.frames / config.frames_per_batch) * config.frames_per_batch
@@ -210,16 +200,16 @@ class Session:
         )
         in_workers = partial(make_after_imports, imported(), make)
         training = make(num_envs=config.num_envs)
-        evaluation = None
-        if config.get("evaluation") is not None:
+        evaluation, periodic = None, config.get("evaluation")
+        if periodic is not None:
             evaluation = partial(
                 PeriodicEvaluation,
                 partial(make, evaluating=True),
                 cost_keys=training.cost_keys,
                 seed=default_seed(env, config.seed),
                 fixed_layout=has_fixed_layout(env),
-                interval=config.evaluation.interval,
-                episodes=config.evaluation.episodes,
+                interval=periodic.interval,
+                episodes=periodic.episodes,
             )
         return build_trainer(config, training, self.folder.directory, in_workers, evaluation)
 

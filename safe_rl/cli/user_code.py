@@ -29,14 +29,17 @@ __all__ = [
 _imported: list[str] = []
 
 
-def note_imports(modules: Sequence[str] | None) -> list[str]:
-    """The override by which a run notes its modules; none for None.
+def note_imports(modules: str | Sequence[str] | None) -> list[str]:
+    """The override by which a run notes its modules, or one module; none for None.
 
     Examples:
         >>> note_imports(["mine", "examples/other.py"])
         ["++import=['mine','examples/other.py']"]
     """
-    return [] if modules is None else [f"++{KEY}=[{','.join(map(quote, modules))}]"]
+    if modules is None:
+        return []
+    modules = [modules] if isinstance(modules, str) else modules
+    return [f"++{KEY}=[{','.join(map(quote, modules))}]"]
 
 
 def import_modules(modules: str | Sequence[str]) -> list[str]:

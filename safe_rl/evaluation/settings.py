@@ -33,7 +33,9 @@ def _is_device(value: Any) -> bool:
     return (device.index or 0) < here.get(device.type, 0)
 
 
-Device = Annotated[str, Values(_is_device, "cpu, or cuda or cuda:<number> if torch finds that")]
+Device = Annotated[
+    str, Values(_is_device, "cpu, or a CUDA GPU that torch finds here: cuda or cuda:<number>")
+]
 _PICTURE = Values(
     lambda v: v is not None and Path(v).suffix[1:] in PICTURES,
     f"a file ending in .{' or .'.join(PICTURES)}",

@@ -56,6 +56,11 @@ def build_networks(
     entries, normalise = observed_entries(observation_spec), model.get("normalise")
     encoders = model.get("encoders")
     observed = Observed(entries, layout, model["input_scale"], clip=normalise, encoders=encoders)
+    if encoders is not None and not encoders["vector"] and observed.is_vector:
+        raise ValueError(
+            "model=cnn encodes pictures, and this environment observes only a vector. Use "
+            "model=mlp, or an environment with pictures, such as env=PointGoal1Vision."
+        )
     widths = list(model["hidden_sizes"])
     remembered = model["memory"]["size"] if model.get("memory") else 0
     if remembered and MEMORY not in observation_spec.keys():  # noqa: SIM118, a spec is no mapping
@@ -111,8 +116,7 @@ def _body(
 ) -> nn.Module:
     """From what is observed, and remembered, to outputs: a perceptron where that will do."""
     first = observed.entries[0]
-    is_vector = len(observed.entries) == 1 and len(first.shape) == 1
-    if observed.encoders is None and not is_vector:
+    if observed.encoders is None and not observed.is_vector:
         pictures = any(len(entry.shape) == 3 for entry in observed.entries)
         advice = "model=cnn for the pictures" if pictures else "model=dict, an encoder for each"
         raise ValueError(

@@ -92,6 +92,11 @@ class Observed(NamedTuple):
         """Where the entries stand."""
         return [entry.key for entry in self.entries]
 
+    @property
+    def is_vector(self) -> bool:
+        """Whether there is one entry, a vector."""
+        return len(self.entries) == 1 and len(self.entries[0].shape) == 1
+
 
 class Body(nn.Module):
     """Encode every entry, put the codes side by side, and run a perceptron on them.

@@ -131,7 +131,7 @@ class LimitTracker(Checked, Resumable):
     Args:
         cost_limits: d, undiscounted cost per episode, [k].
         max_length: Largest length of an episode, in rows of time of a batch.
-        margin: Standard errors of a batch's J_c by which the target is below the limit.
+        margin: How far below the limit the target is, in standard errors of a batch's J_c.
         largest_margin: Bound of the margin, as a share of d.
         free_steps: Environment steps for which costs have no effect.
         descent_steps: Environment steps in which the limit then falls.

@@ -12,11 +12,10 @@ from run_configs import CONF
 
 import safe_rl.objectives
 from safe_rl.algorithms.build_part import find_recipe
-from safe_rl.cli.schema import KEYS, SettingError, check_settings, plain
+from safe_rl.cli.schema import KEYS, check_settings, plain
 from safe_rl.envs import ConfigError, SafetyGymConfig, resolve
 from safe_rl.parameters import read_part
 from safe_rl.ranges import ANYTHING
-from safe_rl.targets import TargetError
 
 ALGORITHMS = sorted(path.stem for path in (CONF / "algo").glob("*.yaml"))
 # what recipes, collectors and run folders hand to a part themselves
@@ -97,7 +96,7 @@ def outcome(config: Any, path: str, value: Any) -> str:
     OmegaConf.update(changed, path, value, merge=False, force_add=True)
     try:
         check_settings(changed)
-    except (SettingError, ConfigError, TargetError) as error:
+    except ValueError as error:
         return str(error)
     try:
         find_recipe(changed).build(changed, PointMass(2))
@@ -173,17 +172,16 @@ def test_no_value_ends_in_a_traceback(configs):
             1_000_000,
             "num_threads=1000000: it must be a whole number from 1 to",
         ),
-        ("num_envs", 10**9, "num_envs=1000000000: this takes 20,000 GB of memory at least"),
-        ("frames_per_batch", 1e12, "frames_per_batch=1000000000000.0: this takes 50,000 GB"),
         ("seed", 1e30, "seed=1e+30: it must be a whole number from 0 to"),
         ("compile", "maybe", "compile=maybe: it must be true or false"),
-        ("device", "mps", "device=mps: it must be cpu, or cuda or cuda:<number>"),
-        ("device", "cuda:99", "device=cuda:99: it must be"),
+        ("device", "mps", "device=mps: it must be cpu, or a CUDA GPU that torch finds here"),
+        ("device", "cuda:99", "device=cuda:99: it must be cpu, or a CUDA GPU that"),
+        ("limits.margin", "abc", "margin=abc: it must be a number from 0 to 1e+09 (how far below"),
         ("env.name", "", "env.name=: it must be a text"),
         ("env.name", "a/b", "env.name=a/b: it must be"),
         ("cost_limits", {"cost": math.inf}, "cost_limits={'cost': inf}: it must be a mapping"),
         ("loss._target_", "torch.load", "loss._target_=torch.load: configurations reach only"),
-        ("lagrangian.kpp", 1, "lagrangian.kpp: nothing reads this key. Did you mean 'lagr"),
+        ("lagrangian.kpp", 1, "there is no key 'lagrangian.kpp'. Did you mean 'lagr"),
     ],
 )
 def test_refusals_name_the_key_and_what_it_may_hold(configs, path, value, words):
@@ -235,7 +233,7 @@ def test_parts_of_ones_own_are_checked_by_what_they_inherit(configs, monkeypatch
     check_settings(config)
     for path, value in {"lagrangian.kp": math.nan, "loss.clip_epsilon": -1}.items():
         assert f"{path}={value}: it must be" in outcome(config, path, value)
-    assert "loss.epsilon: nothing reads" in outcome(config, "loss.epsilon", 1)
+    assert "no key 'loss.epsilon'" in outcome(config, "loss.epsilon", 1)
 
 
 @pytest.mark.parametrize("key", sorted(SafetyGymConfig().to_dict()))

@@ -1,4 +1,4 @@
-"""Names on the command line: what nothing reads is refused with what was meant, before a run."""
+"""Names on the command line: a wrong one is refused with what was meant, before a run."""
 
 import pytest
 
@@ -23,26 +23,27 @@ RIGHT = [
     ["algo=sac", "policy_update.optimizer.lr=1e-3", "loss.gamma=0.9"],
 ]
 WRONG = {
-    "env.hazard_num=3": r"nothing reads 'env.hazard_num'\. Did you mean 'env.hazards_num'\?",
+    "env.hazard_num=3": r"there is no key 'env.hazard_num'\. Did you mean 'env.hazards_num'\?",
     "hazards_num=3": r"Did you mean 'env.hazards_num'\?",
-    "total_timesteps=3": "nothing reads 'total_timesteps'. Did you mean 'frames'",
-    "frmaes=3": "nothing reads 'frmaes'. Did you mean 'frames'",
+    "total_timesteps=3": "there is no key 'total_timesteps'. Did you mean 'frames'",
+    "frmaes=3": "there is no key 'frmaes'. Did you mean 'frames'",
     "presett=paper": "Did you mean 'preset'",
     "+lr=1e-4": "Did you mean 'policy_update.optimizer.lr' or 'critic_update.optimizer.lr'",
-    "++deep.lr=1e-4": "nothing reads 'deep.lr'. Did you mean 'policy_update.optimizer.lr'",
+    "++deep.lr=1e-4": "there is no key 'deep.lr'. Did you mean 'policy_update.optimizer.lr'",
     "policy_update.lr=1e-4": "Did you mean 'policy_update.optimizer.lr'",
     "max_grad_norm=1": r"Did you mean '\+policy_update.max_grad_norm'",
     "policy_update.max_kll=1": "Did you mean 'policy_update.max_kl'",
-    "+policy_update.max_kll=1": "policy_update.max_kll: nothing reads.*'policy_update.max_kl'",
-    "+checkpoint.kept=1": "checkpoint.kept: nothing reads.*'checkpoint.keep_last'",
+    "+policy_update.max_kll=1": "no key 'policy_update.max_kll'.*'policy_update.max_kl'",
+    "+checkpoint.kept=1": "no key 'checkpoint.kept'.*'checkpoint.keep_last'",
     "+lagrangian.kpp=1": "Did you mean 'lagrangian.kp'",
-    "+logger.path=x": "logger.path: nothing reads",
+    "+logger.path=x": "no key 'logger.path'",
     "~logger": "logger is missing: .*logger=none: nowhere",
     "~frames": "'frames' not found",
     "transforms.saute.budgets.cost=1": r"budgets are given all at once, as .*='\{cost: 1\}'",
     "model.input_scale.gyro=1": r"factors are given all at once, as .*='\{gyro: 1\}'",
     "+model.input_scale.velocimeter=0.5": r"model.input_scale='\{velocimeter: 0.5\}'",
     "certificate={episodez: 5}": r"mean 'certificate\.episodes'\?$",
+    "dir=x": r"no key 'dir'\. Did you mean 'hydra\.run\.dir'\?$",
     "zzzzz=3": "'--cfg job' prints all keys",
     "+certificate.episodez=5": "Did you mean 'certificate.episodes'",
     "+seed=1": "at 'seed'. Either remove [+] prefix: 'seed=1'",
@@ -63,7 +64,7 @@ WRONG = {
     "--algo=cpo": r"'--algo=cpo': there is no such flag\. .* without dashes, algo=cpo",
     'cost_limits={"cost": 3}': r"cannot be read.*have no quotes: '\{cost: 10\}'\.$",
     # what another choice would read
-    "risk.tail=0.2": r"nothing reads 'risk\.tail' without risk=cvar\.$",
+    "risk.tail=0.2": r"there is no key 'risk\.tail' without risk=cvar\.$",
     "model.memory.size=8": r"without model=gru\.$",
     "transforms.saute.budgets={cost: 3}": r"without transforms=\[saute\]\.$",
     # choices that are none, or too many
@@ -210,8 +211,6 @@ def test_folders_of_ones_own_are_searched_too(own_conf, flag):
         "algo=mime": "Did you mean 'mine'",
         "env=Nearbye": "Did you mean 'Nearby'",
         "mine.tial=1": "Did you mean 'mine.tail'",
-        "total_timesteps=3": "nothing reads 'total_timesteps'. Did you mean 'frames'",
-        "frmaes=3": "Did you mean 'frames'",
         "+frmaes=3": "Did you mean 'frames'",
         "mine.tail=abc": "lagrangian.init=abc",
     }.items():
@@ -227,22 +226,21 @@ def test_a_folder_that_is_not_there():
 
 def test_every_value_of_a_sweep_is_checked():
     for wrong in ("lagrangian.kp=0.1,nan", "+lr=1,2"):
-        with pytest.raises((CommandLineError, SettingError), match=r"kp=nan|nothing reads 'lr'"):
+        with pytest.raises((CommandLineError, SettingError), match=r"kp=nan|there is no key 'lr'"):
             read_command(["-m", "seed=0,1", wrong])
 
 
-@pytest.mark.parametrize("flags", [["-sc", "install=bash"], ["--help"], ["--hydra-help"]])
+@pytest.mark.parametrize("flags", [["-sc", "install=bash"], ["--help"]])
 def test_questions_to_hydra_pass_untouched(flags):
     read_command([*flags, "no_such=key"])
 
 
 def test_configurations_are_shown_with_wrong_values_but_not_with_wrong_names():
     read_command(["--cfg", "job", "seed=abc"])
-    read_command(["--info", "defaults"])
     with pytest.raises(CommandLineError, match="Did you mean 'frames'"):
         read_command(["--cfg", "job", "frmaes=3"])
 
 
 def test_a_wrong_key_beside_a_name_that_others_refer_to():
-    with pytest.raises(CommandLineError, match=r"nothing reads 'env\.cost_kyes'.*env\.cost_keys"):
+    with pytest.raises(CommandLineError, match=r"there is no key 'env\.cost_kyes'.*env\.cost_keys"):
         read_command(["env=gymnasium", "env.id=CartPole-v1", "env.cost_kyes=[cost_a]"])

@@ -151,7 +151,7 @@ def test_folders_of_ones_own_one_or_several(tmp_path):
         (folder / "algo").mkdir(parents=True)
         text = f"{head}lagrangian: {{init: {place + 1}}}\n"
         (folder / "algo" / f"mine{place}.yaml").write_text(text)
-    (config,) = compose_jobs(search_folders(folders, ["algo=mine1"]))
+    (config,) = compose_jobs([*search_folders(folders), "algo=mine1"])
     assert config.lagrangian.init == 2
     (tmp_path / "mine.py").write_text("imported = True\n")
     run = safe_rl.train(
@@ -258,7 +258,7 @@ def test_an_interrupted_run_says_how_to_go_on(tmp_path, monkeypatch, capsys):
     small = {**SMALL, "certificate.episodes": 1}
     with pytest.raises(KeyboardInterrupt):
         safe_rl.train("PointGoal0", algo="cpo", frames=400, directory=tmp_path / "a run", **small)
-    assert f"resume='{tmp_path / 'a run'}'" in capsys.readouterr().out
+    assert f"safe_rl.resume('{tmp_path / 'a run'}')" in capsys.readouterr().out
     assert not (tmp_path / "a run" / "certificate.json").exists()
     assert len(read_table(tmp_path / "a run" / "progress.csv")["steps"]) == 1
 

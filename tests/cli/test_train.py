@@ -44,7 +44,7 @@ def test_configurations_are_shown(command):
 @pytest.mark.parametrize(
     ("overrides", "words"),
     [
-        (["lr=1e-4"], "'lr=1e-4': nothing reads 'lr'. Did you mean 'policy_update.optimizer.lr'"),
+        (["lr=1e-4"], "'lr=1e-4': there is no key 'lr'. Did you mean 'policy_update.optimizer.lr'"),
         (["loss.clip_epsilon=nan"], "loss.clip_epsilon=nan: it must be a number above 0"),
         (["env.hazards_num=abc"], "'hazards_num' must be a whole number from 0"),
         (["loss._target_=os.system"], "loss._target_=os.system: configurations reach only parts"),
@@ -64,7 +64,7 @@ def test_what_is_wrong_is_said_in_a_line_and_leaves_nothing(command, overrides, 
 
 def test_the_whole_error_is_there_for_those_who_ask(command, monkeypatch):
     monkeypatch.setenv("HYDRA_FULL_ERROR", "1")
-    with pytest.raises(ValueError, match="nothing reads 'lr'"):
+    with pytest.raises(ValueError, match="there is no key 'lr'"):
         command("lr=1e-4")
 
 

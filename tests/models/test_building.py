@@ -36,6 +36,8 @@ def test_one_vector_needs_no_encoder():
         build(spec(gyro=Unbounded((3, 3)), sight=Unbounded((3, 9, 9, 3))))
     with pytest.raises(ValueError, match=r"gyro \[3\], lidar \[9\].*use model=dict"):
         build(spec(gyro=Unbounded((3, 3)), lidar=Unbounded((3, 9))))
+    with pytest.raises(ValueError, match=r"model=cnn encodes pictures.* Use model=mlp"):
+        build(flat, encoders={**ENCODERS, "vector": []})
 
 
 def test_every_entry_has_its_encoder():
