@@ -108,6 +108,7 @@ def from_six_values(
         ValueError: If a step has another number of values, or the length of episodes is not known.
 
     Examples:
+        >>> import numpy as np
         >>> class Slide(gymnasium.Env):
         ...     observation_space = gymnasium.spaces.Box(-1, 1, (1,), np.float32)
         ...     action_space = gymnasium.spaces.Box(-1, 1, (1,), np.float32)
