@@ -145,14 +145,27 @@ class CRPOStep(TRPOStep):
     cost that exceeds its limit most, in its own units. (The article takes any of these costs.)
     There is no multiplier, and only η to tune.
 
-    The diagnostics also have ``reduces``, [k]: 1 for the cost that the step lowers. It is built and
-    called as a `CTRPOStep`, whose docstring has an example.
+    The diagnostics also have ``reduces``, [k]: 1 for the cost that the step lowers.
 
     Args:
         loss: A `CPOLoss`, or a callable of your own that returns a TensorDict with scalars
             ``loss_…`` and the differentiable ``cost_surrogate``, [k].
         tolerance: Tolerated violation η, undiscounted cost per episode.
         settings: Those of every step, see `TRPOStep`.
+
+    Examples:
+        >>> from tensordict import TensorDict
+        >>> from safe_rl.models import make_actor
+        >>> from safe_rl.objectives import CPOLoss
+        >>> actor = make_actor(3, 2, hidden_sizes=[16], initial_log_std=-0.5)
+        >>> with torch.no_grad():
+        ...     batch = actor(TensorDict(observation=torch.randn(8, 3), batch_size=[8]))
+        >>> batch["advantage"], batch["cost_advantage"] = torch.randn(8, 1), torch.randn(8, 2)
+        >>> search = {"cg_iterations": 10, "backtrack_coeff": 0.8, "max_backtracks": 10}
+        >>> loss = CPOLoss(actor, entropy_coeff=0.0)
+        >>> step = CRPOStep(loss, tolerance=2.0, target_kl=0.01, damping=0.1, **search)
+        >>> step(batch, cost_violation=torch.tensor([1.0, 5.0]))["reduces"]
+        tensor([0., 1.])
     """
 
     def __init__(self, loss: Loss, *, tolerance: NotNegative, **settings: Any) -> None:

@@ -138,8 +138,16 @@ class RCPOLoss(WeighsCosts, PPOLoss):
     Its advantage is Â = A − Σᵢ λᵢ A_cᵢ, from the critics of reward and costs. A single critic of r
     − λc would lag behind changes of λ. The objective is clipped as a whole, min(ρÂ, clip(ρ)Â). The
     multiplier should change slowly (the third time scale of the article). Arguments are a
-    multiplier, with one λ per column of ``cost_advantage``, and those of `PPOLoss`; a
-    `PPOLagrangianLoss` has an example.
+    multiplier, with one λ per column of ``cost_advantage``, and those of `PPOLoss`.
+
+    Examples:
+        >>> from safe_rl.models import make_actor
+        >>> from safe_rl.objectives import ProjectedMultiplier
+        >>> actor = make_actor(3, 2, hidden_sizes=[16], initial_log_std=-0.5)
+        >>> multiplier = ProjectedMultiplier({"cost": 25.0}, init=0.0, lr=0.001, highest=None)
+        >>> loss = RCPOLoss(actor, multiplier, clip_epsilon=0.2, entropy_coeff=0.0)
+        >>> "cost_advantage" in loss.in_keys
+        True
     """
 
     def _advantage(self, tensordict: TensorDictBase, log_weight: Tensor) -> Tensor:
@@ -171,8 +179,15 @@ class TRPOLoss(SurrogateLoss):
 class TRPOLagrangianLoss(WeighsCosts, TRPOLoss):
     """`TRPOLoss` on the Lagrangian (L_r − Σᵢ λᵢ L_cᵢ) / (1 + Σᵢ λᵢ), for k constraints.
 
-    Arguments are a multiplier, one λ per column of ``cost_advantage``, and those of `TRPOLoss`; a
-    `PPOLagrangianLoss` has an example.
+    Arguments are a multiplier, one λ per column of ``cost_advantage``, and those of `TRPOLoss`.
+
+    Examples:
+        >>> from safe_rl.objectives.multipliers import LagrangeMultiplier
+        >>> from safe_rl.models import make_actor
+        >>> actor = make_actor(3, 2, hidden_sizes=[8], initial_log_std=-0.5)
+        >>> multiplier = LagrangeMultiplier({"cost": 25.0}, init=1.0, lr=0.05)
+        >>> "cost_advantage" in TRPOLagrangianLoss(actor, multiplier, entropy_coeff=0.0).in_keys
+        True
     """
 
 
