@@ -13,7 +13,7 @@ from contextlib import contextmanager
 from multiprocessing import resource_tracker
 from threading import Thread
 
-__all__ = ["end_with_parent", "is_stopped", "leave_signals_to_parent", "starting_processes"]
+__all__ = ["end_with_parent", "leave_signals_to_parent", "starting_processes"]
 
 _LOOK = 1.0
 """Seconds between checks of the parent."""
@@ -84,13 +84,3 @@ def leave_signals_to_parent() -> None:
         os._exit(128 + signal.SIGTERM)
 
     Thread(target=wait, name="wait for the parent's order", daemon=True).start()
-
-
-def is_stopped(pid: int) -> bool:
-    """Whether a process was stopped (SIGSTOP); False where the system does not tell."""
-    try:
-        with open(f"/proc/{pid}/stat") as file:
-            # the second field is a name in parentheses, which may hold anything
-            return file.read().rpartition(")")[2].split()[0] in "Tt"
-    except (OSError, IndexError):
-        return False

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from safe_rl.processes import is_stopped, starting_processes
+from safe_rl.processes import starting_processes
 
 pytestmark = pytest.mark.long
 
@@ -45,23 +45,6 @@ def test_a_child_ends_soon_after_its_parent(ending, grace, last_words):
     # the pipe ends when the last process that writes into it has
     assert parent.stdout.read().split() == last_words
     assert time.monotonic() - start < 300
-
-
-def test_a_stopped_process_is_told_from_a_running_one():
-    process = subprocess.Popen([sys.executable, "-c", "import time; time.sleep(600)"])
-    try:
-        assert not is_stopped(process.pid)
-        process.send_signal(signal.SIGSTOP)
-        deadline = time.monotonic() + 300
-        while not is_stopped(process.pid):
-            assert time.monotonic() < deadline
-        process.send_signal(signal.SIGCONT)
-        while is_stopped(process.pid):
-            assert time.monotonic() < deadline
-    finally:
-        process.kill()
-        process.wait()
-    assert not is_stopped(process.pid)
 
 
 DEAF = """

@@ -6,6 +6,7 @@ of episodes however many workers it has.
 
 from __future__ import annotations
 
+import signal
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, wait
 from functools import partial
@@ -18,7 +19,7 @@ import torch
 from tensordict import TensorDictBase
 from torchrl.envs import EnvBase
 
-from safe_rl.processes import is_stopped, leave_signals_to_parent
+from safe_rl.processes import leave_signals_to_parent
 
 __all__ = ["Known", "MakeEnv", "Makers", "WorkerCollector", "kill_workers", "split_rows"]
 
@@ -93,12 +94,14 @@ class KnownWorkers:
     _weight_sync_schemes: Mapping[str, Any] | None = None
 
 
-_MOST_LOOKS = 5
-"""Seconds for which a worker may be missing: a suspended job resumes all of its processes."""
+_MOST_LOOKS = 20
+"""Seconds after the end of a worker in which TorchRL may still raise its error."""
+_EXPLAINED = {0, 1, -signal.SIGKILL}
+"""Exit codes of workers whose error may follow: TorchRL kills all of them before it raises it."""
 
 
 class WorkerError(RuntimeError):
-    """A worker has died or was stopped."""
+    """A worker has died."""
 
 
 class WorkerCollector:
@@ -148,7 +151,7 @@ class WorkerCollector:
         """Start the workers and collect without end.
 
         Raises:
-            WorkerError: If a worker has died or was stopped.
+            WorkerError: If a worker has died.
         """
         self._wait_for(_begin(self._start))
         batches = iter(self._workers)
@@ -169,29 +172,24 @@ class WorkerCollector:
         failure = asked.exception()
         if failure is None:
             return asked.result()
+        if isinstance(failure, (EOFError, OSError)):  # the pipe of a process that has ended
+            self._looks = _MOST_LOOKS
         self._check_workers()
         kill_workers(self._workers)
         raise failure
 
     def _check_workers(self) -> None:
-        """Raise, and end all processes, if one was killed or is missing for some time."""
+        """Raise, and end all processes, if one has ended for some time."""
         processes = [p for p in self._workers.procs if not p._closed]
         ended = [p.exitcode for p in processes if p.exitcode is not None]
-        stopped = [p.pid for p in processes if p.pid is not None and is_stopped(p.pid)]
-        self._looks = self._looks + 1 if ended or stopped else 0
-        # one that fails with an error reports it, given time
-        if not set(ended) - {0, 1} and self._looks <= _MOST_LOOKS:
+        self._looks = self._looks + 1 if ended else 0
+        if not set(ended) - _EXPLAINED and self._looks <= _MOST_LOOKS:
             return
         codes = ", ".join(map(str, ended))
-        reason = (
-            f"has died (exit code {codes}; -9 is mostly a lack of memory: use fewer environments)"
-            if ended
-            else f"was stopped by a signal (process {stopped[0]})"
-        )
         kill_workers(self._workers)
         raise WorkerError(
-            f"A worker of the collector {reason}. The last checkpoint is whole: continue with "
-            "resume=."
+            f"A worker of the collector has died (exit code {codes}; -9 is mostly a lack of "
+            "memory: use fewer environments). The last checkpoint is whole: continue with resume=."
         )
 
     def kill(self) -> None:

@@ -37,7 +37,7 @@ WRONG = {
     "+checkpoint.kept=1": "no key 'checkpoint.kept'.*'checkpoint.keep_last'",
     "+lagrangian.kpp=1": "Did you mean 'lagrangian.kp'",
     "+logger.path=x": "no key 'logger.path'",
-    "~logger": "logger is missing: .*logger=none: nowhere",
+    "~logger": "logger is missing: .*logger=none",
     "~frames": "'frames' not found",
     "transforms.saute.budgets.cost=1": r"budgets are given all at once, as .*='\{cost: 1\}'",
     "model.input_scale.gyro=1": r"factors are given all at once, as .*='\{gyro: 1\}'",

@@ -248,28 +248,10 @@ def test_a_certificate_takes_the_threads_of_its_run(run, monkeypatch):
     assert given == [(run.directory, {"num_threads": 1})]
 
 
-def test_an_interrupted_run_says_how_to_go_on(tmp_path, monkeypatch, capsys):
-    def epoch_that_is_stopped(trainer, batches):
-        signal.raise_signal(signal.SIGINT)
-        return own(trainer, batches)
-
-    own = Trainer.epoch
-    monkeypatch.setattr(Trainer, "epoch", epoch_that_is_stopped)
-    small = {**SMALL, "certificate.episodes": 1}
-    with pytest.raises(KeyboardInterrupt):
-        safe_rl.train("PointGoal0", algo="cpo", frames=400, directory=tmp_path / "a run", **small)
-    assert f"safe_rl.resume('{tmp_path / 'a run'}')" in capsys.readouterr().out
-    assert not (tmp_path / "a run" / "certificate.json").exists()
-    assert len(read_table(tmp_path / "a run" / "progress.csv")["steps"]) == 1
-
-
 def test_mappings_that_go_together_and_numbers_of_numpy_are_written_as_hydra_takes_them():
     given = {"env.outside": {"cost_a": [0, -1, 1]}, "seed": np.int64(3)}
     assert list(overrides_of(given, _WHOLE)) == ["env.outside={cost_a:[0,-1,1]}", "seed=3"]
     assert list(overrides_of({"layers": np.array([8, 4])})) == ["layers=[8,4]"]
-
-
-def test_what_is_no_setting_is_named():
     with pytest.raises(ValueError, match=r"^loss\._target_=<class .*: a setting takes numbers"):
         list(overrides_of({"loss": {"_target_": Trainer}}))
 
@@ -299,17 +281,20 @@ def test_mappings_take_the_place_of_what_is_none(algo, key, value):
     assert OmegaConf.select(config, key) == value
 
 
-def test_an_interrupted_run_is_resumed_to_the_same_table(run, tmp_path, monkeypatch):
+def test_an_interrupted_run_is_resumed_to_the_same_table(run, tmp_path, monkeypatch, capsys):
     def epoch_that_is_stopped(trainer, batches):
         signal.raise_signal(signal.SIGINT)
         return own(trainer, batches)
 
     own, folder = Trainer.epoch, tmp_path / "a=run"
     settings = {"cost_limits": {"cost_hazards": 3, "cost": 5.5}, "seed": 4, **SMALL}
+    settings["certificate.episodes"] = 1
     monkeypatch.setattr(Trainer, "epoch", epoch_that_is_stopped)
     with pytest.raises(KeyboardInterrupt):
         safe_rl.train("CarGoal1", algo="cpo", frames=120, directory=folder, **settings)
     monkeypatch.undo()
+    assert f"safe_rl.resume('{folder}')" in capsys.readouterr().out
+    assert not (folder / "certificate.json").exists()
     assert len(read_table(folder / "progress.csv")["steps"]) == 1
     resumed = safe_rl.resume(folder)
     assert resumed.directory == folder
