@@ -132,10 +132,11 @@ def draw_small_multiples(
             draw_experiment(experiment, key, axes, styles[experiment.label])
         title, *settings = own[0].label.partition(" (")
         colour = styles[own[0].label].colour
-        axes[0].set_title(literal(title), fontsize=10, fontweight="bold", color=colour)
+        axes[0].set_title(literal(clean(title, 30)), fontsize=10, fontweight="bold", color=colour)
         if len(own) > 1 or any(settings):
             handles, names = axes[0].get_legend_handles_labels()
             shown = [name.partition(" (")[2].removesuffix(")") or "default" for name in names]
+            shown = [clean(text, 50) for text in shown]
             axes[0].legend(handles, shown, fontsize=6, frameon=False, handlelength=2.5)
         for axis, height in limits_of(own, key, axes):
             axis.axhline(height, **LIMIT_STYLE)
