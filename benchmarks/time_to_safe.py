@@ -50,8 +50,10 @@ def passes(config, policy, claim, options, number):
 def time_to_safe(config, options, directory):
     """Train until a policy passes, the tests are used up, or the run is over."""
     seed_everything(config.seed, config.num_threads)
-    trainer = build_trainer(config, new_env(config), directory)
-    claim = Claim({key: float(limit) for key, limit in config.cost_limits.items()})
+    env = new_env(config)
+    trainer = build_trainer(config, env, directory)
+    limits = {key: float(limit) for key, limit in config.cost_limits.items()}
+    claim = Claim(limits, highest={key: env.highest_cost(key) for key in limits})
     batches, rows, tests = trainer.batches(), [], 0
     start = time.perf_counter()
     while trainer.progress.steps < config.frames and tests < options.tests:
@@ -73,7 +75,7 @@ def main():
     parser.add_argument("overrides", nargs="*", help="as train.py takes them")
     parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2, 3, 4])
     parser.add_argument("--target", type=float, default=15.0, help="mean return")
-    parser.add_argument("--episodes", type=int, default=400, help="of a test")
+    parser.add_argument("--episodes", type=int, default=1000, help="of a test")
     parser.add_argument("--tests", type=int, default=5, help="at most, of a run")
     options = parser.parse_args()
     found = []
