@@ -1,6 +1,13 @@
-"""The command train.py, in this process."""
+"""The command train.py in this process, and any program in one of its own."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
 
 from safe_rl.cli import train
+
+ROOT = Path(__file__).parents[1]
 
 
 def status_of(*arguments: str) -> object:
@@ -14,3 +21,16 @@ def status_of(*arguments: str) -> object:
 def run_train(*arguments: str) -> None:
     """A run that comes to its end."""
     assert status_of(*arguments) == 0
+
+
+def in_a_process(*words: str, status: int = 0, cwd: Path = ROOT, **environment: str) -> str:
+    """What Python prints with these arguments, ending with that status."""
+    # this process has a policy because it has imported safe_rl
+    outside = {name: value for name, value in os.environ.items() if name != "OMP_WAIT_POLICY"}
+    result = subprocess.run(
+        [sys.executable, *words],
+        cwd=cwd, env=outside | environment, capture_output=True, text=True, timeout=300,
+    )  # fmt: skip
+    printed = result.stdout + result.stderr
+    assert result.returncode == status, printed
+    return printed

@@ -17,7 +17,6 @@ class Golden:
     name: str
     config: dict
     components: dict[str, slice]  # columns of the observation
-    shapes: dict[str, tuple[int, ...]]  # of the components
     layout: dict[str, list[float]]  # (x, y) of every object at the reset
     arrays: dict[str, np.ndarray]
 
@@ -34,7 +33,6 @@ def load(name):
         name=name,
         config=described["config"],
         components={row["key"]: slice(row["start"], row["stop"]) for row in rows},
-        shapes={row["key"]: tuple(row["shape"]) for row in rows},
         layout=described["reset_layout"],
         arrays=arrays,
     )

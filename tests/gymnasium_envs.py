@@ -127,22 +127,6 @@ def make_pendulum(**kwargs):
     return Costly(gymnasium.make("Pendulum-v1", **kwargs))
 
 
-class Toll(gymnasium.Env):
-    """A step costs what the seed says in a list, where the types are as they come."""
-
-    observation_space = gymnasium.spaces.Box(0, 9, (1,), np.float32)
-    action_space = gymnasium.spaces.Box(-1, 1, (1,), np.float32)
-    costs = (0, 0.5, np.True_, np.float32(0.25), True, np.int64(2))
-
-    def reset(self, *, seed=None, options=None):
-        super().reset(seed=seed)
-        self.cost = self.cost if seed is None else self.costs[seed % len(self.costs)]
-        return np.zeros(1, np.float32), {}
-
-    def step(self, action):
-        return np.zeros(1, np.float32), 0.0, False, False, {"cost": self.cost}
-
-
 gymnasium.register("Recall-v0", entry_point=f"{__name__}:Recall", max_episode_steps=8)
 gymnasium.register("Cliff-v0", entry_point=f"{__name__}:Cliff", max_episode_steps=30)
 gymnasium.register("Boxes-v0", entry_point=f"{__name__}:Boxes", max_episode_steps=10)

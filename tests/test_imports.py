@@ -1,15 +1,13 @@
 """Imports point one way, as `.importlinter` says, and what is slow to import comes late."""
 
 import ast
-import os
-import subprocess
-import sys
-from pathlib import Path
+from importlib import import_module
 
 import pytest
+from commands import ROOT, in_a_process
 from importlinter.cli import EXIT_STATUS_SUCCESS, lint_imports
 
-ROOT = Path(__file__).parents[1]
+LAZY = ["safe_rl", "safe_rl.envs", "safe_rl.envs.gymnasium", "safe_rl.envs.velocity"]
 
 
 def test_imports_point_one_way():
@@ -27,23 +25,20 @@ def test_the_package_itself_imports_what_comes_before_torch_and_no_part():
     ]
 
 
-def in_a_process(code, **environment):
-    """Run code in a process of its own; returns what it says."""
-    clean = {name: value for name, value in os.environ.items() if name != "OMP_WAIT_POLICY"}
-    result = subprocess.run(
-        [sys.executable, "-c", code],
-        env=clean | environment, capture_output=True, text=True, timeout=120, check=True,
-    )  # fmt: skip
-    return result.stdout + result.stderr
+@pytest.mark.parametrize("package", [*LAZY, "safe_rl.evaluation"])
+def test_what_is_imported_later_is_listed_at_once(package):
+    module = import_module(package)
+    assert {name for name in dir(module) if not name.startswith("__")} == set(module.__all__)
 
 
-def test_the_package_is_imported_in_no_time_and_without_torch():
-    said = in_a_process(
+def test_the_package_is_imported_in_no_time_and_says_what_it_has_without_torch():
+    seconds, *names, has_torch = in_a_process(
+        "-c",
         "import sys, time; start = time.process_time(); import safe_rl\n"
-        "print(time.process_time() - start, 'torch' in sys.modules)"
-    )
-    seconds, has_torch = said.split()
+        "print(time.process_time() - start, *dir(safe_rl), 'torch' in sys.modules)",
+    ).split()
     assert float(seconds) < 0.05
+    assert {"Run", "load", "train"} <= set(names)
     assert has_torch == "False"
 
 
@@ -52,14 +47,14 @@ OPENMP_SAYS = {"OMP_DISPLAY_ENV": "verbose"}  # libgomp prints its settings when
 
 @pytest.mark.long
 def test_idle_threads_sleep_if_the_package_comes_first():
-    said = in_a_process("import safe_rl, torch; torch.ones(9) + 1", **OPENMP_SAYS)
+    said = in_a_process("-c", "import safe_rl, torch; torch.ones(9) + 1", **OPENMP_SAYS)
     assert "GOMP_SPINCOUNT = '0'" in said
     assert "import safe_rl first" not in said
 
 
 @pytest.mark.long
 def test_torch_first_is_said_to_be_too_late():
-    said = in_a_process("import torch\nimport safe_rl", **OPENMP_SAYS)
+    said = in_a_process("-c", "import torch\nimport safe_rl", **OPENMP_SAYS)
     assert "GOMP_SPINCOUNT = '0'" not in said
     assert "UserWarning: torch was imported before safe_rl" in said
     assert said.count("import safe_rl first") == 1
@@ -69,23 +64,15 @@ def test_torch_first_is_said_to_be_too_late():
 @pytest.mark.parametrize("setting", [{"OMP_WAIT_POLICY": "ACTIVE"}, {"GOMP_SPINCOUNT": "10"}])
 def test_a_setting_of_the_users_is_kept_without_a_word(setting):
     code = "import torch, safe_rl, os; print(os.environ.get('OMP_WAIT_POLICY'))"
-    assert in_a_process(code, **setting).strip() == setting.get("OMP_WAIT_POLICY", "None")
+    assert in_a_process("-c", code, **setting).strip() == setting.get("OMP_WAIT_POLICY", "None")
 
 
 @pytest.mark.long
-@pytest.mark.parametrize(
-    ("modules", "unneeded"),
-    [
-        # a fifth of the seconds in which a run begins
-        (("training.building",), {"matplotlib", "scipy.optimize", "scipy.stats"}),
-    ],
-)
-def test_what_is_not_needed_yet_is_not_imported(modules, unneeded):
-    said = in_a_process(
-        f"import sys, {', '.join(f'safe_rl.{module}' for module in modules)}\n"
-        f"print({unneeded} & sys.modules.keys())"
-    )
-    assert said == "set()\n"
+def test_what_is_not_needed_yet_is_not_imported():
+    """A fifth of the seconds in which a run begins."""
+    unneeded = {"matplotlib", "scipy.optimize", "scipy.stats"}
+    code = f"import sys, safe_rl.training.building; print({unneeded} & sys.modules.keys())"
+    assert in_a_process("-c", code) == "set()\n"
 
 
 @pytest.mark.long
@@ -101,10 +88,11 @@ def test_what_is_not_needed_yet_is_not_imported(modules, unneeded):
 def test_help_and_configurations_are_shown_without_importing_what_trains(command, arguments, words):
     """Which takes longer than all the rest of it."""
     said = in_a_process(
+        "-c",
         "import sys; sys.stderr = sys.stdout\n"
         f"from safe_rl.cli.{command} import main; sys.argv[1:] = {arguments}\n"
         "try: main()\n"
-        "finally: print('slow:', {'torch', 'matplotlib'} & sys.modules.keys())"
+        "finally: print('slow:', {'torch', 'matplotlib'} & sys.modules.keys())",
     )
     assert words in said
     assert said.splitlines()[-1] == "slow: set()"

@@ -34,8 +34,3 @@ def test_links_lead_to_files_and_headings(page):
             assert target.exists(), path
         if anchor and target.suffix == ".md":
             assert anchor in headings(target.read_text()), f"{path}#{anchor}"
-
-
-def test_an_anchor_is_a_heading_without_what_github_drops():
-    page = "# One *two*\n## `a_key`: [there](x.md), 3\n```\n# no heading\n```\n"
-    assert headings(page) == {"one-two", "a_key-there-3"}

@@ -1,53 +1,33 @@
 """Filtered, delayed and held actions, against single steps of the same environment."""
 
-import re
 from functools import partial
 
 import pytest
 import torch
 from point_mass import PointMass
-from torchrl.envs.utils import check_env_specs
 from transforming import ENVIRONMENTS, Priced, still, transformed
 
-from safe_rl.envs import check_constrained_env, make_env
+from safe_rl.envs import make_env
 from safe_rl.envs.transforms import (
     ActionDelay,
     ActionFilter,
     ActionRepeat,
     EarlyTermination,
     RewardScale,
-    transform_env,
 )
 from safe_rl.evaluation.episodes import collect_episodes
 
 
-def test_replaced_actions_are_taken_and_counted_and_the_chosen_ones_kept():
-    env = transformed(PointMass(2), "action_filter")
+@pytest.mark.parametrize("clamp", [torch.clamp, torch.clamp_])
+def test_replaced_actions_are_taken_and_counted_and_the_chosen_ones_kept(clamp):
+    env = transformed(PointMass(2), f=ActionFilter(lambda step: clamp(step["action"], -0.5, 0.5)))
     assert env.cost_keys == [*PointMass.cost_keys, "cost_interventions"]
     chosen = torch.tensor([[0.2, -0.2], [0.2, 0.9]])
-    step = env.step(env.reset().set("action", chosen))
+    step = env.step(env.reset().set("action", chosen.clone()))
     assert torch.equal(step["action"], chosen)
     assert step["next", "cost_interventions"].squeeze(-1).tolist() == [0.0, 1.0]
     moved = step["next", "observation"][:, 2:4]
     torch.testing.assert_close(moved, 0.15 * torch.tensor([[0.2, -0.2], [0.2, 0.5]]))
-
-
-def test_a_filter_may_change_actions_in_place():
-    env = PointMass(2)
-    in_place = transformed(env, f=ActionFilter(lambda step: step["action"].mul_(0.5)))
-    chosen = torch.ones(2, *env.action_spec.shape[1:])
-    stepped = in_place.step(in_place.reset().set("action", chosen.clone()))
-    assert torch.equal(stepped["action"], chosen)
-    assert stepped["next", "cost_interventions"].flatten().tolist() == [1.0, 1.0]
-    moved = stepped["next", "observation"][:, 2:4]
-    torch.testing.assert_close(moved, torch.full((2, 2), 0.15 * 0.5))
-
-
-def test_a_filter_that_returns_no_actions_is_refused():
-    broken = ActionFilter(lambda step: step["action"][:, :1])
-    env = transformed(PointMass(2), filter=broken)
-    with pytest.raises(ValueError, match=re.escape("actions of shape (2, 2), got (2, 1)")):
-        env.rollout(1)
 
 
 def test_a_filter_gets_the_positions_before_the_step_and_the_layout_if_it_asks_for_them():
@@ -68,9 +48,6 @@ def test_a_filter_gets_the_positions_before_the_step_and_the_layout_if_it_asks_f
         torch.testing.assert_close(seen[-1][0][:, 0, :2], xy, rtol=0, atol=1e-9)
     assert seen[-1][2] == env.observation_layout
     assert not torch.equal(seen[0][0], seen[-1][0])
-    blind = transformed(PointMass(2), f=ActionFilter(shield))
-    with pytest.raises(ValueError, match="asks for 'positions'"):
-        blind.rollout(1)
 
 
 @pytest.mark.parametrize("env", ["point_mass", "safety_gym"])
@@ -99,26 +76,13 @@ def test_what_is_pending_ends_with_the_episode_of_its_row():
     assert (speed[1:] > 0).all()
 
 
-def repeating(env, k, *before, **named):
-    changes = {str(number): transform for number, transform in enumerate(before)}
-    return transform_env(env, {**changes, "repeat": ActionRepeat(k)}, evaluating=False, **named)
-
-
-@pytest.mark.parametrize("env", ENVIRONMENTS)
-def test_specs_of_repeats_are_true_and_the_contract_is_kept(env):
-    env = repeating(ENVIRONMENTS[env](), 3, EarlyTermination({"cost": 2.0}))
-    check_env_specs(env)
-    check_constrained_env(env)
-    env.close()
-
-
 @pytest.mark.parametrize("k", [1, 3, 4])
 def test_sums_are_those_of_single_steps_over_several_episodes(k):
     # of episodes of 10 steps, repeats of 3 and 4 reach beyond the end
     config = {"robot_base": "point", "task": "goal", "num_steps": 10, "hazards_num": 8}
     config |= {"constrain_hazards": True, "hazards_keepout": 0.0, "hazards_size": 0.6}
     single, env = make_env(config, num_envs=3, seed=1), make_env(config, num_envs=3, seed=1)
-    env = repeating(env, k)
+    env = transformed(env, repeat=ActionRepeat(k))
     torch.manual_seed(0)
     decisions = -(-10 // k)
     held = env.rollout(2 * decisions, break_when_any_done=False)
@@ -141,7 +105,8 @@ def test_sums_are_those_of_single_steps_over_several_episodes(k):
 
 def test_a_row_that_ends_inside_a_repeat_stops_alone():
     costs = [[1.0, 2.0, 0.0, 4.0, 8.0, 16.0, 32.0, 64.0], [0.0, 0.0, 0.0, 1.0, 0.0, 1.0, 0.0, 0.0]]
-    env = repeating(Priced(costs), 4, EarlyTermination({"cost": 2.5}))
+    end = EarlyTermination({"cost": 2.5})
+    env = transformed(Priced(costs), end=end, repeat=ActionRepeat(4))
     steps = still(env, 2)["next"]
     assert steps["cost"][..., 0].tolist() == [[3.0, 3.0], [1.0, 1.0]]
     assert steps["cost_north"][..., 0].tolist() == [[6.0, 6.0], [2.0, 2.0]]
@@ -153,12 +118,11 @@ def test_a_row_that_ends_inside_a_repeat_stops_alone():
 
 def test_evaluation_counts_steps_of_the_environment():
     costs = [[1.0] * 10, [0.0] * 10]
-    env = repeating(Priced(costs), 4)
+    env = transformed(Priced(costs), repeat=ActionRepeat(4))
     found = collect_episodes(
         env, lambda td: td.set("action", torch.zeros(2, 2)), 4, ["cost"], deterministic=True
     )
     assert found.lengths.tolist() == [10.0] * 4
     assert found.costs["cost"].tolist() == [10.0, 10.0, 0.0, 0.0]
-    safety_gym = ENVIRONMENTS["safety_gym"]()
-    assert repeating(ENVIRONMENTS["safety_gym"](), 3).highest_cost("cost") == 8.0
-    assert safety_gym.highest_cost("cost") == 8.0
+    for repeat in ({}, {"repeat": ActionRepeat(3)}):
+        assert transformed("safety_gym", **repeat).highest_cost("cost") == 8.0

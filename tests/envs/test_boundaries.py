@@ -8,7 +8,7 @@ import torch
 from crafting import arrange, make, step_from
 from torchrl.envs.utils import check_env_specs
 
-from safe_rl.envs import EXTRAS, ConfigError, SafetyGymEnv
+from safe_rl.envs import EXTRAS, SafetyGymEnv
 
 ROBOTS = ("Point", "Car", "Doggo")
 NAMES = [f"{robot}{task}" for robot in ROBOTS for task in ("Run1", "Circle1", "Circle2")]
@@ -78,19 +78,6 @@ def test_every_row_keeps_its_specs_and_lasts_500_steps(name):
     assert xy.abs().max() <= half + 1e-6
     expected = {"cost", "cost_boundary", "cost_exception"}
     assert set(env.cost_keys) == expected | ({"cost_velocity"} if "Run" in name else set())
-
-
-@pytest.mark.parametrize(
-    ("keys", "message"),
-    [
-        ({"constrain_boundary": True}, "'constrain_boundary' needs 'boundary_x', 'boundary_y'"),
-        ({"constrain_velocity": True}, "'constrain_velocity' needs 'velocity_limit'"),
-        ({"boundary_x": 0.0}, "'boundary_x' must be a number above 0"),
-    ],
-)
-def test_what_is_missing_is_said(keys, message):
-    with pytest.raises(ConfigError, match=message):
-        SafetyGymEnv({"robot_base": "point", **keys})
 
 
 def test_boundaries_are_drawn_where_they_are():

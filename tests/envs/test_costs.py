@@ -135,22 +135,6 @@ def test_a_met_goal_puts_buttons_to_sleep_in_goal_tasks_too():
     assert env.get_state()["buttons_timer"] == 10
 
 
-def test_pinned_objects_are_where_they_were_put():
-    places = [(1.0, 1.0), (-1.0, 0.5)]
-    config = SUITE["PointGoal1"].replace(
-        hazards_num=2, hazards_locations=places, robot_locations=[(0.0, -1.0)]
-    )
-    positions = make(config, 3).get_positions()
-    sizes = {key: value.shape[1] for key, value in positions.items()}
-    assert sizes == {"robot": 1, "goal": 1, "hazards": 2, "vases": 1}
-    expected = torch.tensor(places, dtype=torch.float64).expand(3, -1, -1)
-    torch.testing.assert_close(positions["hazards"][..., :2], expected, rtol=0, atol=1e-6)
-    robot = torch.tensor([0.0, -1.0, 0.1], dtype=torch.float64).expand(3, 1, 3)
-    torch.testing.assert_close(positions["robot"], robot, rtol=0, atol=1e-6)
-    vase = torch.full((3, 1), 0.1 - 4e-5, dtype=torch.float64)  # half side less what it sinks in
-    torch.testing.assert_close(positions["vases"][..., 2], vase, rtol=0, atol=1e-6)
-
-
 @pytest.mark.parametrize("name", ["CarGoal2", "DoggoButton2", "PointPush2"])
 def test_costs_and_rewards_follow_from_them(name):
     env = SafetyGymEnv(SUITE[name].replace(hazards_size=0.9, goal_size=0.01), num_envs=8, seed=0)

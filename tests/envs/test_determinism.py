@@ -1,5 +1,12 @@
-"""Every trajectory follows from the seed of its row, and every future from a state."""
+"""Every trajectory follows from the seed of its row, and every future from a state or a copy."""
 
+import copy
+import gc
+import pickle
+import weakref
+
+import gymnasium
+import numpy as np
 import pytest
 import torch
 from playing import assert_same, play
@@ -18,6 +25,9 @@ CONFIGS = {
 # Met goals are rare with random actions, but for these tasks.
 MEETS_GOALS = ("goal", "push")
 NAMES = [*CONFIGS, *VELOCITY_SUITE]
+CONFIGS["nested"] = SUITE["CarGoal1"].replace(**BUSY, observation_flatten=False, layout_seeds=3)
+CONFIGS["one layout"] = SUITE["PointPush1"].replace(**BUSY, randomize_layout=False)
+COPY = {"deepcopy": copy.deepcopy, "pickle": lambda env: pickle.loads(pickle.dumps(env))}
 
 
 def make(name: str, num_envs: int, seed: int | None = 0, num_threads: int = 1, **sleep: bool):
@@ -31,7 +41,7 @@ def make(name: str, num_envs: int, seed: int | None = 0, num_threads: int = 1, *
 @pytest.mark.parametrize("name", NAMES)
 def test_threads_and_batch_size_do_not_matter(name):
     few, many = make(name, 3), make(name, 8, num_threads=2)
-    run, larger = play(few, few.reset(), 50), play(many, many.reset(), 50)
+    run, larger = play(few, few.reset(), 25), play(many, many.reset(), 25)
     assert_same(run, larger[:3])
     assert run["done"].any()
     if name in MEETS_GOALS:
@@ -71,9 +81,9 @@ def test_without_a_seed_torch_decides(name):
     assert torch.equal(*seeded)
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", [*NAMES, "nested"])
 def test_a_state_determines_the_future_and_setting_it_interrupts_nothing(name):
-    """Through new goals and resets; also in another instance."""
+    """Through new goals and resets; also in another instance, and in copies."""
     plain, interrupted = make(name, 4, sleep=False), make(name, 4, sleep=False)
     first = play(plain, plain.reset(), 8)
     play(interrupted, interrupted.reset(), 8)
@@ -82,11 +92,14 @@ def test_a_state_determines_the_future_and_setting_it_interrupts_nothing(name):
     assert_same(interrupted.get_state(), state)
     going = ~first["done"][:, -1, 0]
     assert going.any()
-    assert torch.equal(tensordict["observation"][going], first["observation"][going, -1])
-    run = play(plain, tensordict.clone(), 45)
-    assert_same(run, play(interrupted, tensordict, 45))
+    assert (tensordict["observation"][going] == first["observation"][going, -1]).all()
+    copies = [make_copy(interrupted) for make_copy in COPY.values()]
+    run = play(plain, tensordict.clone(), 34)
+    # the original first: what it does must not reach its copies
+    for env in (interrupted, *copies):
+        assert_same(run, play(env, tensordict.clone(), 34))
     elsewhere = make(name, 4, seed=99, num_threads=2, sleep=False)
-    assert_same(run, play(elsewhere, elsewhere.set_state(state), 45))
+    assert_same(run, play(elsewhere, elsewhere.set_state(state), 34))
     assert_same(state, kept)
     assert run["done"].sum() >= 8
     if name in MEETS_GOALS:
@@ -106,3 +119,35 @@ def test_layout_and_seeds_may_be_left_out_of_a_state():
     for span in lidars:
         assert torch.equal(env.set_state(partial)["observation"][:, span], observation[:, span])
     assert torch.equal(env.get_state()["episode"], episode)
+
+
+@pytest.mark.parametrize("name", ["one layout", "noise", "SafeHopperVelocity"])
+def test_copies_before_the_first_reset_begin_the_same_episodes(name):
+    env = make(name, 3)
+    other = copy.deepcopy(env)
+    for _ in range(2):
+        assert_same(env.reset(), other.reset())
+
+
+@pytest.mark.parametrize("how", COPY)
+def test_copies_in_gymnasium(how):
+    spec = {"id": "Safexp-PointGoal2-v0", "config": {"num_steps": 15}, "sleep": False}
+    for env in (gymnasium.make(**spec), gymnasium.make_vec(**spec, num_envs=2)):
+        env.reset(seed=1)
+        actions = np.random.default_rng(0).uniform(-1, 1, (14, *env.action_space.shape))
+        actions = actions.astype(np.float32)
+        for action in actions[:7]:
+            env.step(action)
+        other = COPY[how](env)
+        for action in actions[7:]:  # each of them in turn
+            for expected, got in zip(env.step(action)[:2], other.step(action)[:2], strict=True):
+                np.testing.assert_array_equal(expected, got)
+
+
+def test_nothing_keeps_an_environment_that_is_no_longer_used():
+    env = make("goal", 3)
+    env.rollout(2)
+    physics = weakref.ref(env._physics)
+    del env
+    gc.collect()
+    assert physics() is None

@@ -1,21 +1,18 @@
 """The example of an environment of one's own does what it says, by the ordinary commands."""
 
 import runpy
-import subprocess
-import sys
 from types import SimpleNamespace
 
 import pytest
 import torch
+from commands import ROOT, in_a_process
 from registrations import undone
-from run_configs import CONF
 
 from safe_rl.envs import SafetyGymEnv
 from safe_rl.runs.table import read_table
 
 pytestmark = pytest.mark.long
 
-ROOT = CONF.parent
 PATH = ROOT / "examples" / "custom_environment.py"
 IMPORT = f"import={PATH.relative_to(ROOT)}"
 MINES = ("env=PointMines", "cost_limits={cost_mines: 10}", "env.mines_num=8")
@@ -32,35 +29,17 @@ def example():
         yield SimpleNamespace(**runpy.run_path(str(PATH)))
 
 
-def run(*words):
-    """Run a command of the checkout; returns its status, and what it printed."""
-    result = subprocess.run(
-        [sys.executable, *words],
-        cwd=ROOT, capture_output=True, text=True, timeout=300, check=False,
-    )  # fmt: skip
-    return result.returncode, result.stdout + result.stderr
-
-
 def test_it_is_trained_resumed_and_evaluated_by_the_ordinary_commands(tmp_path):
     # with workers, which have to import it too
-    status, printed = run("train.py", IMPORT, *MINES, *SHORT, "collector=process",
-                          f"hydra.run.dir={tmp_path}")  # fmt: skip
-    assert status == 0, printed
+    begun = (*MINES, *SHORT, "collector=process", f"hydra.run.dir={tmp_path}")
+    in_a_process("train.py", IMPORT, *begun)
     assert "estimate_cost_mines" in read_table(tmp_path / "progress.csv")
-    status, printed = run("train.py", f"resume={tmp_path}", "frames=160")
-    assert status == 1
-    assert f"add {IMPORT}" not in printed
-    assert printed.count("\n") == 1
-    assert f"was trained with {IMPORT}: add that to the command" in printed
-    status, printed = run("train.py", f"resume={tmp_path}", IMPORT, "frames=160")
-    assert status == 0, printed
-    assert read_table(tmp_path / "progress.csv")["steps"] == [40, 80, 120, 160]
     evaluate = ("-m", "safe_rl.evaluate", str(tmp_path), "episodes=2")
-    status, printed = run(*evaluate)
-    assert status == 1
-    assert f"was trained with {IMPORT}: add that to the command" in printed
-    status, printed = run(*evaluate, IMPORT, "env.mines_size=0.3")
-    assert status == 0, printed
+    for command in (("train.py", f"resume={tmp_path}", "frames=160"), evaluate):
+        said = in_a_process(*command, status=1)
+        assert f"was trained with {IMPORT}: add that to the command" in said
+        in_a_process(*command, IMPORT)
+    assert read_table(tmp_path / "progress.csv")["steps"] == [40, 80, 120, 160]
     assert "cost_mines" in (tmp_path / "evaluation.json").read_text()
 
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 from crafting import arrange, step_from
-from registrations import cube, disc, inside, register_mines, undone
+from registrations import MINES, cube, disc, inside, register_mines, undone
 from torchrl.envs.utils import check_env_specs
 
 from safe_rl.envs import SUITE, ConfigError, SafetyGymEnv
@@ -26,7 +26,6 @@ from safe_rl.envs.extending import (
 from safe_rl.envs.safety_gym.tasks import TASKS
 
 POINT = {"robot_base": "point", "task": "none", "sensors_obs": ["gyro"]}
-MINES = {"mines_num": 2, "observe_mines": True, "constrain_mines": True}
 
 
 @pytest.fixture(autouse=True)

@@ -99,8 +99,6 @@ def test_actions_are_clipped_to_the_control_range(name):
 
 
 WRONG_CONFIGS = {
-    "unknown key": ({"hazard_num": 3}, "'hazard_num'.*'hazards_num'"),
-    "not finite": ({"robot_keepout": math.nan}, "'robot_keepout' must be a number from 0.*got nan"),
     "unknown task": ({"task": "gaol"}, "'task'.*Did you mean 'goal'"),
     "unknown robot": ({"robot_base": "dogo"}, "'robot_base'.*Did you mean 'doggo'"),
     "no such file": ({"robot_base": "nowhere.xml"}, "'robot_base'.*nowhere.xml"),
@@ -108,6 +106,9 @@ WRONG_CONFIGS = {
     "unknown sensor": ({"sensors_obs": ["gyros"]}, "'sensors_obs'.*Did you mean 'gyro'"),
     "no free joint": ({"observe_freejoint": True}, "'observe_freejoint'.*'observe_qpos'"),
     "nothing observed": ({"observe_sensors": False}, "observe_"),
+    "no boundary": ({"constrain_boundary": True}, "needs 'boundary_x', 'boundary_y'"),
+    "no speed": ({"constrain_velocity": True}, "'constrain_velocity' needs 'velocity_limit'"),
+    "a seed of 2019": ({"_seed": 3}, "'_seed'.*seed.*3"),
 }
 
 

@@ -78,16 +78,6 @@ def test_steps_are_those_of_the_batched_environment(env_id, name, keys):
     assert 0 < np.mean(costs) < 1
 
 
-def test_a_seed_determines_this_episode_and_the_next():
-    env = gymnasium.make("Safexp-PointGoal1-v0", config=SHORT)
-    episodes = [(env.reset(seed=seed)[0], env.reset()[0]) for seed in (1, 1, 2)]
-    np.testing.assert_array_equal(episodes[0], episodes[1])
-    assert (episodes[0][0] != episodes[2][0]).any()
-    assert (episodes[0][0] != episodes[0][1]).any()
-    unseeded = [gymnasium.make("Safexp-PointGoal1-v0").reset()[0] for _ in range(2)]
-    assert (unseeded[0] != unseeded[1]).any()
-
-
 def test_any_configuration_can_be_made():
     config = {"robot_base": "point", "hazards_num": 2, "constrain_hazards": True}
     env = gymnasium.make("Safexp-Custom-v0", config=config)

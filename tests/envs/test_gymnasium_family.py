@@ -1,8 +1,6 @@
 """Somebody else's environment, registered with Gymnasium, through the ordinary commands."""
 
 import json
-import os
-from functools import partial
 from pathlib import Path
 
 import gymnasium
@@ -13,7 +11,6 @@ from commands import run_train
 from torchrl.envs.utils import check_env_specs
 
 from safe_rl.cli import evaluate
-from safe_rl.collectors.workers import split_rows
 from safe_rl.envs import ConfigError, complete_env, make_env
 from safe_rl.runs.table import read_table
 
@@ -35,14 +32,6 @@ def run(tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("runs") / "walk"
     run_train(*SMALL, "frames=600", "env.kwargs={border: 2.5}", f"hydra.run.dir={folder}")
     return folder
-
-
-def test_it_resumes(run, tmp_path, capsys):
-    folder = tmp_path / "copied"
-    os.system(f"cp -r {run} {folder}")
-    run_train(f"resume={folder}", "frames=1000")
-    assert read_table(folder / "progress.csv")["steps"] == [200, 400, 600, 800, 1000]
-    assert "The state of its environments is not stored" in capsys.readouterr().out
 
 
 def test_it_is_evaluated_on_video(run, capsys):
@@ -68,13 +57,6 @@ def test_seeds_determine_rows_and_share_none(node):
     ]
     assert starts[0] == starts[1]
     assert len({place for rows in starts for place in rows}) == 12
-
-
-def test_workers_without_a_state_to_continue_from_have_rows_of_their_own():
-    make = partial(make_env, NODE, seed=0)
-    shares = [make() for make in split_rows(make(num_envs=4), make, num_collectors=2)]
-    rows = [share.reset()["observation"][:, 0].tolist() for share in shares]
-    assert len({*rows[0], *rows[1]}) == 4
 
 
 @pytest.mark.parametrize(

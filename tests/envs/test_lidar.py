@@ -10,20 +10,6 @@ from crafting import after_random_steps, arrange, make, observe, places, positio
 from safe_rl.envs.safety_gym.lidar import lidar_cells, pseudo_lidar
 
 BARE = {"robot_base": "point", "task": "none", "sensors_obs": [], "lidar_num_bins": 8}
-HAZARDS = {**BARE, "observe_hazards": True, "lidar_max_dist": 2.0}
-
-
-def polar(bearing: float, distance: float) -> tuple[float, float]:
-    """Cartesian coordinates of a bearing in degrees."""
-    return distance * math.cos(math.radians(bearing)), distance * math.sin(math.radians(bearing))
-
-
-def assert_reads(readings: np.ndarray, expected: dict[int, float]) -> None:
-    """Assert what some bins read, and that the others read nothing."""
-    want = np.zeros(len(readings))
-    for index, value in expected.items():
-        want[index] = value
-    np.testing.assert_allclose(readings, want, atol=1e-6)
 
 
 def test_lidars_are_there_without_objects_for_hazards_and_vases_only():
@@ -43,15 +29,17 @@ def test_straight_behind_is_half_way_round(num_bins):
 
 def test_the_goal_of_a_button_task_shows_while_the_buttons_sleep():
     config = {"task": "button", "buttons_num": 2, "observe_buttons": True, "lidar_alias": False}
-    env = make({**HAZARDS, **config, "observe_goal_lidar": True})
-    state = arrange(env, robot=(0, 0, 0), button0=polar(10, 1.0), button1=polar(100, 1.0))
+    env = make({**BARE, **config, "observe_goal_lidar": True, "lidar_max_dist": 2.0})
+    state = arrange(env, robot=(0, 0, 0), button0=(0.8, 0.6), button1=(-0.6, 0.8))
     state["goal_button"][:] = 1
     columns = env.observation_layout
     for timer in (0, 1, 10):
         state["buttons_timer"][:] = timer
         flat = env.set_state(state)["observation"][0].numpy()
-        assert_reads(flat[columns["goal_lidar"]], {2: 0.5})
-        assert_reads(flat[columns["buttons_lidar"]], {} if timer else {0: 0.5, 2: 0.5})
+        # half of the largest distance away, at 37 and 127 degrees
+        seen = {"goal": [0, 0, 0.5], "buttons": [0, 0, 0] if timer else [0.5, 0, 0.5]}
+        for kind, first in seen.items():
+            assert flat[columns[f"{kind}_lidar"]].tolist() == pytest.approx([*first, *[0] * 5])
 
 
 @pytest.mark.parametrize("components", [2, 3])
@@ -66,13 +54,6 @@ def test_compass_and_distance(components):
         want = vector / (np.linalg.norm(vector) + 0.001)
         np.testing.assert_allclose(parts[name], want, atol=1e-6)
     np.testing.assert_allclose(parts["goal_dist"], math.exp(-3.0), rtol=1e-6)
-
-
-def test_remaining_counts_the_steps_taken():
-    env = make({**BARE, "observe_remaining": True, "num_steps": 4})
-    assert env.reset()["observation"][0, 0] == 0
-    seen = env.rollout(10)["next", "observation"][0, :, 0]
-    assert seen.tolist() == [0.25, 0.5, 0.75, 1.0]
 
 
 @pytest.mark.parametrize("env_name", ["PointGoal2", "CarPush2", "DoggoButton1", "PointRun"])
@@ -119,13 +100,6 @@ def test_any_number_of_bins_closes_to_a_circle(num_bins):
 # Natural lidar: rays against surfaces worked out by hand.
 RAYS = {"robot_base": "point", "task": "none", "observe_sensors": False}
 RAYS |= {"lidar_type": "natural", "lidar_num_bins": 24}
-SOLID = ("walls", "hazards", "vases", "pillars", "buttons", "gremlins")
-EVERYTHING = {
-    **{**RAYS, "task": "push", "observe_box_lidar": True, "observe_goal_lidar": True},
-    **{f"{kind}_num": 2 for kind in SOLID},
-    **{f"observe_{kind}": True for kind in SOLID},
-    **{"walls_size": 0.2, "placements_extents": [-2.5, -2.5, 2.5, 2.5]},
-}
 
 
 def test_rays_pass_over_hazards_and_a_tilted_robot_sees_them():
@@ -165,13 +139,3 @@ def test_the_targets_of_gremlins_are_seen_once_they_circle():
     state["time"].fill_(0.01)  # a substep: the target now runs, from 0.3 m along y
     got = env.set_state(state)["observation"][0].double().numpy()
     np.testing.assert_allclose(got[0], math.exp(-0.9), atol=1e-6)
-
-
-def test_sleeping_objects_are_seen_where_they_are():
-    seen = []
-    for sleep in (False, True):
-        env = make(EVERYTHING, 4, sleep=sleep)
-        torch.manual_seed(0)
-        after_random_steps(env, 40)
-        seen.append(env.step(env.rand_action())["next", "observation"])
-    torch.testing.assert_close(*seen, atol=2e-3, rtol=0)

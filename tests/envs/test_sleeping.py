@@ -17,6 +17,13 @@ from safe_rl.envs import SUITE, SafetyGymEnv
 MOST_CHAOTIC = 0.4  # share of worlds in which contacts differ
 NUM_ENVS, NUM_WINDOWS, WINDOW = 100, 12, 25
 TELLING, NEGLIGIBLE = 0.05, 0.005  # of what is measured
+SOLID = ("walls", "hazards", "vases", "pillars", "buttons", "gremlins")
+SEEN_BY_RAYS = {
+    **{"robot_base": "point", "task": "push", "lidar_type": "natural", "observe_sensors": False},
+    **{f"{verb}_{kind}": True for verb in ("observe", "constrain") for kind in SOLID[1:]},
+    **{f"{kind}_num": 2 for kind in SOLID},
+    **{"walls_size": 0.2, "observe_box_lidar": True, "observe_walls": True},
+}
 
 
 def forward_driving() -> torch.Tensor:
@@ -57,11 +64,13 @@ def test_sleeping_biases_neither_returns_nor_costs(name):
             assert 3 * error <= TELLING * size, f"{key}: too few events to tell"
 
 
-@pytest.mark.parametrize("name", ["PointGoal2", "CarPush2", "DoggoGoal2", "PointButton2"])
-def test_a_step_with_sleeping_objects_is_one_without(name):
+@pytest.mark.parametrize(
+    "config", ["PointGoal2", "CarPush2", "DoggoGoal2", "PointButton2", SEEN_BY_RAYS]
+)
+def test_a_step_with_sleeping_objects_is_one_without(config):
     torch.manual_seed(3)
-    asleep = SafetyGymEnv(name, num_envs=16, seed=3, num_threads=1)
-    awake = SafetyGymEnv(name, num_envs=16, seed=3, num_threads=1, sleep=False)
+    asleep = SafetyGymEnv(config, num_envs=16, seed=3, num_threads=1)
+    awake = SafetyGymEnv(config, num_envs=16, seed=3, num_threads=1, sleep=False)
     here = awake.set_state(after_random_steps(asleep, num_steps=60))
     action = asleep.action_spec.rand()
     got, want = (env.step(here.clone().set("action", action))["next"] for env in (asleep, awake))

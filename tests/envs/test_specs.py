@@ -61,6 +61,7 @@ def test_the_suite_has_its_27_names():
 @pytest.mark.parametrize(("robot", "task"), NAMES)
 def test_specs(robot, task):
     env = SafetyGymEnv(f"Safexp-{robot}{task}-v0", num_envs=2, seed=0, num_threads=1)
+    observation = env.reset()["observation"]
     check_env_specs(env)
     sizes = ROBOT_SENSORS[robot] | {f"{kind}_lidar": 16 for kind in LIDARS[task]}
     columns, first = {}, 0
@@ -76,6 +77,12 @@ def test_specs(robot, task):
     keys = ["reward", "cost", "cost_exception", *(f"cost_{kind}" for kind in COST_KINDS[task])]
     assert sorted(env.full_reward_spec.keys()) == sorted(keys)
     assert all(env.full_reward_spec[key].shape == (2, 1) for key in keys)
+    nested = SafetyGymEnv(SUITE[robot + task].replace(observation_flatten=False), 2, seed=0)
+    entries = nested.reset()["observation"]
+    check_env_specs(nested)
+    assert set(entries.keys()) == set(columns)
+    for name, span in columns.items():
+        assert torch.equal(entries[name].flatten(1), observation[:, span]), name
 
 
 @pytest.mark.parametrize("name", VELOCITY_SUITE)
@@ -185,27 +192,3 @@ def test_nothing_that_is_returned_shares_memory(env_name, keys):
         one.fill_(one.new_tensor(7).logical_not_() if one.dtype is torch.bool else 7)
         one.logical_not_()
         assert torch.equal(other, before)
-
-
-NESTED = ("PointGoal2", "CarButton1", "DoggoPush2")
-
-
-def make(name: str, **keys) -> SafetyGymEnv:
-    config = SUITE[name].replace(**keys)
-    return SafetyGymEnv(config, num_envs=3, seed=0, num_threads=1)
-
-
-@pytest.mark.parametrize("name", NESTED)
-def test_components_are_the_columns_of_the_flat_observation(name):
-    flat, nested = make(name), make(name, observation_flatten=False)
-    check_env_specs(nested)
-    nested = make(name, observation_flatten=False)
-    torch.manual_seed(0)
-    wanted = flat.rollout(6)
-    torch.manual_seed(0)
-    got = nested.rollout(6)
-    assert torch.equal(got["next", "reward"], wanted["next", "reward"])
-    assert set(got["observation"].keys()) == set(flat.observation_layout)
-    for name, columns in flat.observation_layout.items():
-        component = got["next", "observation", name]
-        assert torch.equal(component.flatten(2), wanted["next", "observation"][..., columns])

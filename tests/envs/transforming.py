@@ -8,6 +8,7 @@ from safe_rl.envs import SafetyGymEnv, from_gymnasium
 from safe_rl.envs.transforms import (
     ActionDelay,
     ActionFilter,
+    ActionRepeat,
     EarlyTermination,
     RewardScale,
     Saute,
@@ -46,6 +47,7 @@ TRANSFORMS = {
     "early_termination": lambda: EarlyTermination({"cost": 2.0}),
     "action_filter": lambda: ActionFilter(half_speed),
     "reward_scale": lambda: RewardScale(0.5),
+    "action_repeat": lambda: ActionRepeat(3),  # the last one
 }
 ENVIRONMENTS = {
     "point_mass": lambda: PointMass(3),
