@@ -73,12 +73,14 @@ def _letters(plain: str) -> str:
     return plain.replace("_", "")
 
 
-def did_you_mean(name: str, known: Iterable[str]) -> str:
+def did_you_mean(name: str, known: Iterable[str], likeness: float = _LIKENESS) -> str:
     """Return a sentence to append to an error, with its space, or nothing if no name is like it.
+
+    For names that all begin alike, as costs do, `likeness` has to be higher (`nearest`).
 
     Examples:
         >>> did_you_mean("cop", ["cpo", "cup", "ppo"])
         " Did you mean 'cpo'?"
     """
-    close = nearest(name, known)
+    close = nearest(name, known, likeness)
     return "" if close is None else f" Did you mean '{close}'?"

@@ -169,8 +169,8 @@ def check_cost_limits(
         if key not in cost_keys:
             raise ValueError(
                 f"cost_limits names '{key}', but this environment has no such cost."
-                f"{did_you_mean(key, cost_keys)} It has {', '.join(cost_keys)}; in Safety Gym's "
-                "environments env.constrain_<kind>=true adds those of another kind."
+                f"{did_you_mean(key, cost_keys, 0.7)} It has {', '.join(cost_keys)}; in Safety "
+                "Gym's environments env.constrain_<kind>=true adds those of another kind."
             )
         is_number = isinstance(limit, int | float) and not isinstance(limit, bool)
         if not is_number or not 0 <= limit < math.inf:

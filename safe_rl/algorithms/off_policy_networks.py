@@ -41,8 +41,8 @@ def bounded_actions(env: EnvBase) -> TensorSpec:
     is_continuous = isinstance(spec, Bounded) and spec.dtype.is_floating_point
     if not is_continuous or not (spec.low.isfinite() & spec.high.isfinite()).all():
         raise ValueError(
-            "This algorithm's actions lie within bounds, and those of this environment have none: "
-            f"its action_spec is {type(spec).__name__}. Use algo=ppo_lagrangian, or bound them."
+            "Off-policy algorithms need continuous actions within bounds, and this environment's "
+            f"action_spec is {type(spec).__name__}. Use an on-policy one such as ppo_lagrangian."
         )
     if len(spec.shape) != 1:
         raise ValueError(
@@ -95,13 +95,13 @@ def _observation_size(config: DictConfig, env: EnvBase) -> int:
     model = config.model
     if others := [key for key in _ON_POLICY_ONLY if model.get(key)]:
         raise ValueError(
-            f"algo={config.algo.name} learns with perceptrons on a vector as it is; model."
-            f"{others[0]} is for on-policy algorithms. Use model=mlp without it."
+            f"algo={config.algo.name} takes model=mlp only, and model.{others[0]} is for on-policy "
+            "algorithms. Use model=mlp without it."
         )
     observed = observed_entries(env.observation_spec)
     if observed[0].key != "observation" or len(observed[0].shape) != 1:
         raise ValueError(
-            f"algo={config.algo.name} learns with perceptrons on one vector, and this environment "
+            f"algo={config.algo.name} needs an observation of one vector, and this environment "
             f"observes {', '.join(map(str, observed))}: {TO_FLATTEN}, or use algo=ppo_lagrangian "
             "with model=dict or model=cnn."
         )

@@ -178,14 +178,14 @@ def _explain(error: Exception, texts: Sequence[str]) -> str:
     # for a list of choices, such as transforms=[…], Hydra's error has no options
     known = error.options or GlobalHydra.instance().config_loader().get_group_options(group)
     listed = f" There are {', '.join(known)}." if len(known) <= _MOST_LISTED else (
-        " 'python train.py --help' names all there are."
+        " 'python train.py --help' names all; a file of yours needs --config-dir=FOLDER."
     )  # fmt: skip
     hint = hint_of_gymnasium(name) if group == "env" else hint_of_plugin(f"{group}={name}")
     file = re.match(r"In '(?!config')([^']+)'", words)
     if file and group != "preset" and f"preset={name}" in texts:  # which chose it
         return f"'preset={name}' is not for this algorithm: {file[1]} has no {group} '{name}'."
     place = f"{file[1]}.yaml: " if file else ""
-    return f"{place}there is no {group} '{name}'.{hint or did_you_mean(name, known) or listed}"
+    return f"{place}there is no {group} '{name}'.{hint or did_you_mean(name, known, 0.6) or listed}"
 
 
 def _unknown(key: str, values: Mapping[str, Any]) -> str:

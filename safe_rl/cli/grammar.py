@@ -55,8 +55,13 @@ def parse(text: str) -> Override:
     try:
         return OverridesParser.create().parse_override(text)
     except HydraException as error:
-        quoted = re.search(r"\{\s*['\"]", text)
-        hint = " Names within braces have no quotes: '{cost: 10}'." if quoted else ""
+        hint = ""
+        if "=" not in text:
+            hint = " A setting is written key=value, such as env=PointGoal1."
+        elif re.search(r"\{\s*['\"]", text):
+            hint = " Names within braces have no quotes: '{cost: 10}'."
+        elif text.count("{") != text.count("}"):
+            hint = " Put values with spaces in quotes: cost_limits='{cost: 10}'."
         raise CommandLineError(
             f"'{text}' cannot be read: {str(error).splitlines()[0]}.{hint}"
         ) from None

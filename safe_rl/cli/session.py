@@ -24,7 +24,7 @@ from safe_rl.cli.evaluating import certify_run, is_to_keep_limits
 from safe_rl.cli.run_folders import keep_robot, new_folder, robot_of
 from safe_rl.cli.schema import check_settings
 from safe_rl.cli.user_code import imported, make_after_imports
-from safe_rl.envs import ConfigError, complete_env, make_env
+from safe_rl.envs import ConfigError, ContractError, complete_env, make_env
 from safe_rl.evaluation.episodes import PeriodicEvaluation, default_seed, has_fixed_layout
 from safe_rl.evaluation.loading import transforms_of
 from safe_rl.files import replacing
@@ -42,7 +42,10 @@ SETTING_ERRORS: tuple[type[Exception], ...] = (
     *(ValueError, CheckpointError, OmegaConfBaseException, OSError, ModuleNotFoundError),
 )
 """What is raised about settings and files, when a run is built or evaluated."""
-_TRAINING_ERRORS = (OSError, TableError, ConfigError, EpisodeError, FloatingPointError, WorkerError)
+_TRAINING_ERRORS = (
+    *(OSError, TableError, ConfigError, ContractError, EpisodeError, FloatingPointError),
+    WorkerError,
+)
 """Errors of training whose message says more than where they were raised."""
 
 
@@ -238,9 +241,9 @@ class Session:
             self._certify()
         elif steps:
             self._say(
-                f"Not certified: frames={config.frames:_} are fewer than the {steps:,} steps of a "
-                f"short test (a fifth of certificate.episodes={config.certificate.episodes}). To "
-                "test it all the same: python -m safe_rl.evaluate "
+                f"Not certified: frames={config.frames:_} are fewer than {steps:,}, a fifth of the "
+                f"steps of certificate.episodes={config.certificate.episodes} episodes. To make a "
+                "certificate all the same: python -m safe_rl.evaluate "
                 f"{quote(str(self.folder.directory))} certify=true"
             )
 

@@ -200,9 +200,9 @@ class EpisodeAccounting:
             if below:
                 raise EpisodeError(
                     f"The cost '{key_name(key)}' is below 0 in {below} of {costs[..., 0].numel()} "
-                    "steps, and nothing has been learned from them. Costs are 0 or more: let the "
-                    "environment clamp them, or add the same to every step and, times the steps of "
-                    "an episode, to the limit."
+                    "steps, and nothing has been learned from them. Costs must be 0 or more: clamp "
+                    "them in the environment, or add a constant to the cost of every step, and "
+                    "this constant times the length of an episode to the limit."
                 )
 
     def _require_ends(self, lengths: Tensor) -> None:

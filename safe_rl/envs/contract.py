@@ -96,6 +96,17 @@ class ConstrainedEnv(EnvBase):
             tensordict.set("_reset", done.clone())
         return has_ended
 
+    def _step_proc_data(self, next_tensordict_out: TensorDictBase) -> TensorDictBase:
+        try:
+            return super()._step_proc_data(next_tensordict_out)
+        except (AttributeError, RuntimeError) as error:
+            written = {key: next_tensordict_out.get(key, None) for key in self.reward_keys}
+            shapes = {key: None if v is None else list(v.shape) for key, v in written.items()}
+            raise ContractError(
+                f"{type(self).__name__}._step must write {[*self.batch_size, 1]} numbers for each "
+                f"of {', '.join(map(key_name, shapes))}. It wrote the shapes {shapes}."
+            ) from error
+
     def continue_from(self, steps: int) -> None:
         """Continue schedules after so many steps of every row."""
         self.steps_before = steps

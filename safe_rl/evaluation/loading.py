@@ -87,7 +87,7 @@ def limits_of(
         if key not in cost_keys:
             raise ValueError(
                 f"cost_limits names '{key}', but this environment has no such cost."
-                f"{did_you_mean(key, cost_keys)} It has {', '.join(cost_keys)}."
+                f"{did_you_mean(key, cost_keys, 0.7)} It has {', '.join(cost_keys)}."
             )
     limits = {**config.cost_limits, **others}
     return {key: float(limit) for key, limit in limits.items() if key in cost_keys}

@@ -34,7 +34,7 @@ def _is_device(value: Any) -> bool:
 
 
 Device = Annotated[
-    str, Values(_is_device, "cpu, or a CUDA GPU that torch finds here: cuda or cuda:<number>")
+    str, Values(_is_device, "cpu; or cuda or cuda:<number>, if torch finds this GPU here")
 ]
 _PICTURE = Values(
     lambda v: v is not None and Path(v).suffix[1:] in PICTURES,

@@ -210,6 +210,6 @@ def _check_shapes(
         raise CheckpointError(
             f"The {name} of {checkpoint} does not fit this run's: the shape of {other} is "
             f"{there.get(other, 'absent')} there and {here.get(other, 'absent')} here. init_from "
-            "needs a run with these observations and actions, and with this kind of actor: SAC's "
-            "gives a spread, too, PPO's does not. Set model.… and critics.… as in its config.yaml."
+            "needs a run with the same observations, actions and kind of algorithm (on-policy, SAC "
+            "or TD3). Set model.… and critics.… as in its config.yaml."
         )

@@ -31,7 +31,7 @@ class Acting(PointMass):
 @pytest.mark.parametrize(
     ("spec", "message"),
     [
-        (Unbounded((2, 2)), r"actions lie within bounds.*Unbounded"),
+        (Unbounded((2, 2)), r"actions within bounds.*Unbounded"),
         (Bounded(-1, 1, (2, 2, 3)), r"the shape \[2, 3\]: policies act by vectors"),
     ],
 )

@@ -290,6 +290,8 @@ def test_cost_limits_must_name_costs_of_the_environment():
     assert check_cost_limits({"cost_hazards": 10}, keys) == {"cost_hazards": 10.0}
     with pytest.raises(ValueError, match="Did you mean 'cost_hazards'"):
         check_cost_limits({"cost_hazard": 10}, keys)
+    with pytest.raises(ValueError, match=r"no such cost\. It has cost, "):  # nothing like it
+        check_cost_limits({"cost_pillars": 10}, keys)
     for limit in (-1, "many", None, float("nan"), float("inf"), True):
         with pytest.raises(ValueError, match="'cost' is"):
             check_cost_limits({"cost": limit}, keys)

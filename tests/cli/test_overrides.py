@@ -53,7 +53,7 @@ WRONG = {
     "preset=papers": "Did you mean 'paper'",
     "preset=hard_tasks": "'preset=hard_tasks' is not for this algorithm: algo/ppo_lagrangian has",
     "limits=bad": r"no limits 'bad'\. There are default, ",
-    "env=zzzzz": r"no env 'zzzzz'\. 'python train.py --help' names all there are\.$",
+    "env=zzzzz": r"no env 'zzzzz'\. 'python train.py --help' names all; a file of yours needs --c",
     "cost_limits.cost=10": r"cost_limits='\{cost: 10\}'",
     "frames=[1": r"frames=\[1",
     "seed=0,1": "--multirun",
@@ -63,6 +63,8 @@ WRONG = {
     "transforms=[saut]": r"there is no transforms 'saut'\. Did you mean 'saute'\?$",
     "--algo=cpo": r"'--algo=cpo': there is no such flag\. .* without dashes, algo=cpo",
     'cost_limits={"cost": 3}': r"cannot be read.*have no quotes: '\{cost: 10\}'\.$",
+    "PointGoal1": r"cannot be read.* written key=value, such as env=PointGoal1\.$",
+    "cost_limits={cost:": r"cannot be read.*in quotes: cost_limits='\{cost: 10\}'\.$",
     # what another choice would read
     "risk.tail=0.2": r"there is no key 'risk\.tail' without risk=cvar\.$",
     "model.memory.size=8": r"without model=gru\.$",

@@ -70,7 +70,7 @@ def test_the_cost_is_that_of_the_position_alone():
         ({"cost_x": [0.5, 0.0, 1.0]}, "got cost_x:"),
         ({"cost_x": [0, 1.0, 0.0]}, "has the range 1.0 to 0.0"),
         ({"far": [0, 0.0, 1.0]}, "called cost or cost_<kind>, not 'far'"),
-        ({"cost_x": [4, 0.0, 1.0]}, "column 4 of observation, which has 4"),
+        ({"cost_x": [4, 0.0, 1.0]}, "no column 4 in observation. It has 4"),
     ],
 )
 def test_ranges_that_cannot_be_are_refused(outside, message):

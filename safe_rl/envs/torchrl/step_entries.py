@@ -78,8 +78,8 @@ class StepCosts(Transform):
             values = _entry(step, kept.entry).reshape(*step.batch_size, -1)
             if kept.column >= values.shape[-1]:
                 raise ConfigError(
-                    f"'outside': column {kept.column} of {kept.entry}, which has "
-                    f"{values.shape[-1]}, counted from 0."
+                    f"'outside': there is no column {kept.column} in {kept.entry}. It has "
+                    f"{values.shape[-1]} columns, counted from 0."
                 )
             value = values[..., kept.column]
             found.append((name, (value < kept.low) | (value > kept.high)))
