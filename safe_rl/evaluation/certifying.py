@@ -52,12 +52,13 @@ class Certificate:
         """One line: what is certified, what it excludes, and what the test cannot detect."""
         level, verdict = f"at {100 * self.options.level:.12g}%", self.verdict
         if self.checkpoint is None:
-            missing = ", ".join(
-                f"{name} by {value:.3g}, {verdict.means.get(name, math.nan):.3g} on average"
-                for name, value in verdict.shortfalls.items()
+            missing = "; ".join(
+                f"{name} ≤ {bound:.3g}, limit {most:g}, mean {verdict.means[name]:.3g}"
+                for name, (bound, most) in verdict.bounds.items()
+                if name in verdict.shortfalls
             )
             return (
-                f"Not certified {level}: no checkpoint's bound is within its limit ({missing} in "
+                f"Not certified {level}: no checkpoint's bound is within its limit ({missing}; "
                 f"{verdict.episodes:,} new episodes)."
             )
         bounds = ", ".join(f"{name} ≤ {b:.3g}" for name, (b, _) in verdict.bounds.items())

@@ -79,7 +79,7 @@ def learning_curves(
     multipliers = {key: f"multiplier_{key}" for key in cost_limits if f"multiplier_{key}" in table}
     layout = ConstrainedLayoutEngine(h_pad=0.1)  # inch; it ends a pixel or two beside its aim
     figure = NotebookFigure(figsize=(16 if multipliers else 12, 3.7), layout=layout)
-    returns, costs, rates, *more = figure.subplots(1, 4 if multipliers else 3)
+    returns, costs, rates, *more = figure.subplots(1, 4 if multipliers else 3, sharex=True)
     steps = np.asarray(table["steps"], dtype=float)
     _draw(returns, steps, table["episode_return"], "C0", "return")
     for index, key in enumerate(cost_limits or ["cost"]):
@@ -136,6 +136,8 @@ def _draw(
 ) -> None:
     """Epochs in which an episode finished, faint, and their moving mean."""
     known = np.isfinite(values)
+    if not known.any():
+        axes.text(0.5, 0.5, "no episode has ended", transform=axes.transAxes, ha="center")
     steps, heights = steps[known], np.asarray(values, dtype=float)[known]
     marker = point_marker(steps)
     width = final_width(steps)  # so that curves end at the final figures

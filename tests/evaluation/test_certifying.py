@@ -197,6 +197,13 @@ def test_levels_are_not_rounded(level, shown):
     assert f"at {shown}: " in str(certificate)
 
 
+def test_the_bounds_that_miss_their_limits_are_shown_with_the_limits():
+    bounds, means = {"mean_cost": (10.87, 5.0), "mean_fast": (1.0, 2.0)}, {"mean_cost": 4.0}
+    verdict = Verdict(None, [0], bounds, {"mean_cost": 5.87}, means, {}, 20)
+    shown = str(Certificate(None, math.nan, verdict, OPTIONS))
+    assert shown.endswith("(mean_cost ≤ 10.9, limit 5, mean 4; 20 new episodes).")
+
+
 def test_costs_without_a_highest_are_said_to_count_up_to_a_cap_and_written_as_json(tmp_path):
     bounds = {"beyond_250_cost": (0.008, 0.01), "mean_cost": (math.inf, 25.0)}
     verdict = Verdict(0, [0], bounds, {}, {"mean_cost": 9.0}, {"mean_cost": 250.0}, 700)

@@ -102,6 +102,15 @@ def test_a_single_epoch_is_drawn_as_a_point(drawn):
     assert not any(line.get_marker() == "o" for line in lines)
 
 
+def test_without_a_finished_episode_panels_say_so_and_have_the_steps_of_the_run(drawn):
+    none = dict.fromkeys(("episode_return", "episode_cost"), [math.nan] * 7)
+    panels = drawn({"cost": 25.0}, TABLE | none)
+    assert [[text.get_text() for text in axes.texts] for axes in panels] == [
+        ["no episode has ended"], ["no episode has ended"], [],
+    ]  # fmt: skip
+    assert {axes.get_xlim() for axes in panels} == {panels[2].get_xlim()}
+
+
 @pytest.mark.parametrize("limits", [{"cost": 25.0}, {"cost": 25.0, "cost_hazards": 10.0}])
 def test_the_legend_covers_no_line(drawn, limits):
     for axes in drawn(limits)[1:]:
