@@ -8,7 +8,7 @@ from typing import NamedTuple
 from algorithm_results import RESULTS, end_cells, finished_runs, last_quarter, spread
 
 ARCHIVE = RESULTS / "velocity"
-ALGORITHM, SEEDS = "ppo_lagrangian", (300, 301, 302)  # of all runs that were planned
+ALGORITHM, SEEDS = "ppo_lagrangian", (1321, 2201, 4420)  # of all runs that were planned
 
 
 class Published(NamedTuple):

@@ -41,9 +41,9 @@ def row_of(page, env):
 
 
 def test_runs_are_averaged_over_the_last_quarter_and_missing_ones_named(runs):
-    measured = np.array([add_run(runs, "SafeHopperVelocity", seed) for seed in (300, 302)])
-    alone = add_run(runs, "SafeAntVelocity", 301)
-    add_run(runs, "SafeAntVelocity", 302, frames=600_000)  # interrupted
+    measured = np.array([add_run(runs, "SafeHopperVelocity", seed) for seed in (1321, 4420)])
+    alone = add_run(runs, "SafeAntVelocity", 2201)
+    add_run(runs, "SafeAntVelocity", 4420, frames=600_000)  # interrupted
     page = velocity_runs()
     mean, deviation = measured.mean(0), measured.std(0, ddof=1)
     assert row_of(page, "SafeHopperVelocity")[:4] == [
@@ -56,8 +56,8 @@ def test_runs_are_averaged_over_the_last_quarter_and_missing_ones_named(runs):
     assert row_of(page, "SafeAntVelocity") == [*ant, "3262 ± 80", "12.1 ± 6.6"]
     assert row_of(page, "SafeSwimmerVelocity")[:4] == ["none yet", "—", "—", "—"]
     missing = page.partition("Not run yet, or not to the end: ")[2]
-    assert missing.startswith("`SafeAntVelocity` (300, 302), `SafeHalfCheetahVelocity` (300, 301,")
-    assert "`SafeHopperVelocity` (301)" in missing
+    assert missing.startswith("`SafeAntVelocity` (1321, 4420), `SafeHalfCheetahVelocity` (1321, ")
+    assert "`SafeHopperVelocity` (2201)" in missing
 
 
 def test_nothing_is_missing_where_all_is_done(runs):
