@@ -74,25 +74,26 @@ def policy_mean(actor):
         return actor.get_dist(TensorDict(observation=torch.ones(1, 1), batch_size=[1])).mean[0]
 
 
-def rollout(cmdp, actor):
-    """Whole episodes, [EPISODES, STEPS], cut by a time limit."""
+def play(actor):
+    """Whole episodes, [EPISODES, STEPS], cut by a time limit; without rewards and costs."""
     shape = (EPISODES, STEPS)
     data = TensorDict(observation=torch.ones(*shape, 1), batch_size=shape)
     with torch.no_grad():
         actor(data)
     done = torch.zeros(*shape, 1, dtype=torch.bool)
     done[:, -1] = True
-    following = TensorDict(
-        observation=torch.ones(*shape, 1),
-        reward=-(data["action"] - TARGET).square().sum(-1, keepdim=True),
-        done=done,
-        terminated=torch.zeros_like(done),
-        batch_size=shape,
-    )
+    ends = {"done": done, "terminated": torch.zeros_like(done)}
+    data["next"] = TensorDict({"observation": torch.ones(*shape, 1), **ends}, shape)
+    return data
+
+
+def rollout(cmdp, actor):
+    """Episodes, and their mean costs [k]."""
+    data = play(actor)
+    data["next", "reward"] = -(data["action"] - TARGET).square().sum(-1, keepdim=True)
     costs = data["action"] @ cmdp.weights.T
     for key, cost in zip(cmdp.cost_keys, costs.split(1, -1), strict=True):
-        following[key] = cost
-    data["next"] = following
+        data["next", key] = cost
     return data, costs.sum(1).mean(0)
 
 

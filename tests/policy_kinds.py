@@ -35,20 +35,6 @@ class IndependentBeta(Independent):
         return self.mean
 
 
-class MultiCategorical(Independent):
-    """As many choices in every component of the action."""
-
-    def __init__(self, logits):
-        super().__init__(Categorical(logits=logits), 1)
-
-
-class MatrixNormal(Independent):
-    """Normal in every entry of a matrix."""
-
-    def __init__(self, loc, scale):
-        super().__init__(Normal(loc, scale), 2)
-
-
 class Anonymous(Distribution):
     """A normal distribution that tells neither its entropy nor what it is made of."""
 
@@ -108,30 +94,16 @@ def composite(wheel):
     return functools.partial(CompositeDistribution, distribution_map=parts, name_map=names)
 
 
-class Shaped(nn.Module):
-    """Means and standard deviations in the shape of an action that is no vector."""
-
-    def __init__(self, *shape):
-        super().__init__()
-        self.shape = shape
+class Number(nn.Module):
+    """Mean and standard deviation of an action that is no vector."""
 
     def forward(self, x):
-        loc, scale = NormalParamExtractor()(x)
-        size = (*x.shape[:-1], *self.shape)
-        return loc.reshape(size), scale.reshape(size)
-
-
-class Grid(nn.Module):
-    """Two choices among three."""
-
-    def forward(self, x):
-        return x.unflatten(-1, (2, 3))
+        return tuple(part.squeeze(-1) for part in NormalParamExtractor()(x))
 
 
 KINDS = {
     "normal": (4, NormalParamExtractor(), ["loc", "scale"], IndependentNormal),
-    "number": (2, Shaped(), ["loc", "scale"], Normal),
-    "matrix": (12, Shaped(2, 3), ["loc", "scale"], MatrixNormal),
+    "number": (2, Number(), ["loc", "scale"], Normal),
     "tanh_normal": (4, NormalParamExtractor(), ["loc", "scale"], TanhNormal),
     "bounded_tanh_normal": (
         4, NormalParamExtractor(), ["loc", "scale"],
@@ -142,7 +114,6 @@ KINDS = {
     "beta": (4, Positive(), ["alpha", "beta"], IndependentBeta),
     "categorical": (5, nn.Identity(), ["logits"], Categorical),
     "one_hot": (5, nn.Identity(), ["logits"], OneHotCategorical),
-    "multi_discrete": (6, Grid(), ["logits"], MultiCategorical),
     "unequal_multi_discrete": (5, _Components([2, 3]), ["logits"], choices),
     "composite": (9, Steering(), ["params"], composite(IndependentNormal)),
     "apart_composite": (9, Steering(), ["params"], composite(Normal)),

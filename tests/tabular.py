@@ -8,7 +8,7 @@ what earns most per cost, and the last of it with the probability that is left.
 from dataclasses import dataclass
 
 import torch
-from cmdp import EPISODES, STEPS
+from cmdp import play
 from tensordict import TensorDict
 from torch import Tensor
 from torchrl.data import Categorical, MultiCategorical, TensorSpec
@@ -49,24 +49,12 @@ class Knapsack:
         return sum(row[column] for row, column in zip(table, columns, strict=True)).unsqueeze(-1)
 
     def rollout(self, _cmdp, actor):
-        """Whole episodes, [EPISODES, STEPS], cut by a time limit."""
-        shape = (EPISODES, STEPS)
-        data = TensorDict(observation=torch.ones(*shape, 1), batch_size=shape)
-        with torch.no_grad():
-            actor(data)
-        done = torch.zeros(*shape, 1, dtype=torch.bool)
-        done[:, -1] = True
-        cost = self._sum(self.costs, data["action"])
+        """Episodes, and their mean cost [1]."""
+        data = play(actor)
         reward = self._sum(self.rewards, data["action"])
-        data["next"] = TensorDict(
-            observation=torch.ones(*shape, 1),
-            # noise keeps the spread of the rewards, in units of which multipliers weigh costs
-            reward=reward + torch.randn_like(reward),
-            cost_0=cost,
-            done=done,
-            terminated=torch.zeros_like(done),
-            batch_size=shape,
-        )
+        # noise keeps the spread of the rewards, in units of which multipliers weigh costs
+        data["next", "reward"] = reward + torch.randn_like(reward)
+        data["next", "cost_0"] = cost = self._sum(self.costs, data["action"])
         return data, cost.sum(1).mean(0)
 
     @property

@@ -10,7 +10,6 @@ from omegaconf import OmegaConf
 
 from safe_rl import targets
 from safe_rl.algorithms import MinibatchUpdate
-from safe_rl.objectives import LagrangeMultiplier
 from safe_rl.targets import TargetError, build, locate
 
 ADAM = {"_target_": "torch.optim.Adam", "_partial_": True, "lr": 0.1}
@@ -188,8 +187,3 @@ def test_errors_name_the_full_key():
         build(config.lagrangian, cost_limits={"cost": 1.0})
     with pytest.raises(TargetError, match=r"^policy_update\.adapt_rate: .*lowest"):
         build(config.policy_update)
-    assert isinstance(
-        build({"_target_": "safe_rl.objectives.LagrangeMultiplier", "init": 1.0, "lr": 1.0},
-              cost_limits={"cost": 1.0}),
-        LagrangeMultiplier,
-    )  # fmt: skip

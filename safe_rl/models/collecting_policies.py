@@ -15,21 +15,18 @@ from torch import Tensor
 from torchrl.envs.utils import ExplorationType, exploration_type
 from torchrl.modules import IndependentNormal
 
+from safe_rl.models.networks import Chain
+
 __all__ = ["WITHOUT_NOISE", "BehaviourPolicy", "ExploringPolicy", "make_behaviour"]
 
 
 def make_behaviour(actor: ProbabilisticTensorDictSequential) -> TensorDictModuleBase:
     """The fastest module that samples an actor: a `BehaviourPolicy` of it, or the actor itself."""
     parameters, sampler = actor.module[0], actor.module[-1]
-    is_plain = (
-        len(actor.module) == 2
-        and type(parameters) is TensorDictModule  # others may call their network otherwise
-        and sampler.distribution_class is IndependentNormal
-        and not sampler.distribution_kwargs
-        and list(sampler.dist_keys) == ["loc", "scale"]
-        and list(parameters.out_keys) == list(sampler.in_keys)
-        and len(sampler.out_keys) == 2
-    )
+    # of somebody else's network it is not known in which order it puts out what
+    network = getattr(parameters, "module", None)
+    is_ours = len(actor.module) == 2 and isinstance(network, Chain)
+    is_plain = is_ours and sampler.distribution_class is IndependentNormal
     return BehaviourPolicy(actor) if is_plain else actor
 
 
@@ -47,10 +44,7 @@ class BehaviourPolicy(TensorDictModuleBase):
     ``loc``, which is all of these of a Gaussian.
 
     Args:
-        actor: Policy made by :func:`make_actor`, or any ``ProbabilisticTensorDictSequential`` of a
-            plain ``TensorDictModule`` that writes a mean and a standard deviation, and of an
-            ``IndependentNormal`` of these that writes an action and its log-probability.
-            `make_behaviour` tells whether an actor is one.
+        actor: Policy made by :func:`make_actor`, or by `assemble_actor` with the head "gaussian".
 
     Examples:
         >>> import torch

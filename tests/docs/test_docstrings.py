@@ -15,13 +15,6 @@ MODULES = [
 ]
 
 
-@pytest.fixture(scope="session")
-def tiny_run(tmp_path_factory):
-    """A finished run of two epochs, as examples want one."""
-    small = {"num_envs": 2, "frames_per_batch": 40, "frames": 80, "env.num_steps": 20}
-    return safe_rl.train(directory=tmp_path_factory.mktemp("tiny"), logger="none", **small)
-
-
 @pytest.mark.parametrize("module", [name for name in MODULES if not name.endswith("__main__")])
 def test_examples(module, request, capsys):
     found = doctest.DocTestFinder().find(import_module(module))

@@ -47,21 +47,21 @@ def seeds_of(folder):
 
 
 def figures(folder):
+    """Steps, returns and costs of a run, by epochs."""
     columns = run_at(folder).table
-    names = ("steps", "episode_return", "episode_cost")
-    return [np.array(columns[name]) for name in names], columns
+    return [np.array(columns[name]) for name in ("steps", "episode_return", "episode_cost")]
 
 
 def last(folder, share):
     """Mean return and cost of the last `share` of a run."""
-    (steps, returns, costs), _ = figures(folder)
+    steps, returns, costs = figures(folder)
     late = steps > steps[-1] * (1 - share)
     return np.nanmean(returns[late]), np.nanmean(costs[late])
 
 
 def held(folder, start=1_000_000):
     """Mean cost after so many steps, and the share of spans of 20,000 that cost more than 25."""
-    (steps, _, costs), _ = figures(folder)
+    steps, _, costs = figures(folder)
     spans = [
         costs[(steps > end - 20_000) & (steps <= end)]
         for end in range(start + 20_000, int(steps[-1]) + 1, 20_000)
@@ -135,7 +135,7 @@ def test_quarters_of_harder_tasks():
     assert len(rows) == 3
     for env, algo, cells in rows:
         folder = RESULTS / "off_policy" / env / algo / "seed401"
-        (steps, returns, costs), _ = figures(folder)
+        steps, returns, costs = figures(folder)
         ends = np.arange(0, 5) * 250_000
         quarters = [
             f"{np.nanmean(returns[within]):.1f} / {np.nanmean(costs[within]):.0f}"
@@ -155,7 +155,7 @@ def test_quarters_of_what_was_tried_on_hard_tasks():
     assert len(rows) == len(runs)
     told = {(name, tuple(cell.strip() for cell in cells.split("|")[:-1])) for name, cells in rows}
     for name, path in runs:
-        (steps, returns, costs), _ = figures(RESULTS / name / path)
+        steps, returns, costs = figures(RESULTS / name / path)
         quarters = (TRIED[name] * steps - 1) // 250_000
         cells = tuple(
             f"{np.nanmean(returns[quarters == q]):.1f} / {np.nanmean(costs[quarters == q]):.0f}"
@@ -174,7 +174,7 @@ def test_the_ends_of_the_runs_on_hard_tasks():
     for env, seed, millions, *cells in rows:
         run = RESULTS / f"held_actions/{env}/sac_lagrangian/lead/seed{seed}"
         steps = int(millions) * 1_000_000
-        assert figures(run)[0][0][-1] == steps
+        assert figures(run)[0][-1] == steps
         final = "{:.1f} / {:.1f}".format(*last(run, 500_000 / steps))
         above = percent(held(run, steps - 500_000)[1])
         assert cells == [final, above, certificate(run)]

@@ -14,7 +14,6 @@ from typing import NamedTuple
 import pytest
 from registrations import undone
 
-import safe_rl
 from safe_rl import targets
 from safe_rl.cli import user_code
 from safe_rl.cli.export import ExportOptions
@@ -76,14 +75,6 @@ def commands(text: str) -> list[list[str]]:
     return [shlex.split(line, comments=True) for line in written if "…" not in line]
 
 
-@pytest.fixture(scope="session")
-def run_folder(tmp_path_factory):
-    """A finished run, for commands that take one."""
-    small = {"num_envs": 2, "frames_per_batch": 40, "frames": 80, "env.num_steps": 20}
-    folder = tmp_path_factory.mktemp("run")
-    return safe_rl.train(directory=folder, logger="none", num_threads=1, **small).directory
-
-
 @pytest.fixture
 def workplace(tmp_path, monkeypatch):
     """The folder that a page's reader is in: a checkout, as far as pages name what is in it."""
@@ -135,7 +126,7 @@ def check_all(found: list[list[str]], run: Path, page: str) -> None:
 
 
 @pytest.mark.parametrize("page", PAGES)
-def test_snippets_run_and_commands_are_taken(page, workplace, run_folder):
+def test_snippets_run_and_commands_are_taken(page, workplace, tiny_run):
     names = {"__name__": "page"}
     for other in linked(page):
         write_files(blocks(other), workplace)
@@ -145,17 +136,17 @@ def test_snippets_run_and_commands_are_taken(page, workplace, run_folder):
         elif block.language == "python" and not page.startswith(TESTED_ELSEWHERE):
             exec(compile(block.text, page, "exec"), names)
         elif block.language in ("", "sh", "bash"):
-            check_all(commands(block.text), run_folder, page)
-    check_all(inline(page), run_folder, page)
+            check_all(commands(block.text), tiny_run.directory, page)
+    check_all(inline(page), tiny_run.directory, page)
 
 
 @pytest.mark.parametrize(
     "wrong",
     ["train.py env=PointGaol1", "train.py alog=cpo", "-m safe_rl.evaluate RUN_DIR episode=3"],
 )
-def test_a_wrong_command_is_found(wrong, workplace, run_folder):
+def test_a_wrong_command_is_found(wrong, workplace, tiny_run):
     with pytest.raises(ValueError, match=r"Did you mean|no key|no option|Unknown"):
-        check(wrong.split(), run_folder)
+        check(wrong.split(), tiny_run.directory)
 
 
 def test_there_are_commands_and_snippets():

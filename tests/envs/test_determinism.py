@@ -14,10 +14,13 @@ from playing import assert_same, play
 from safe_rl.envs import SUITE, SafetyGymEnv
 from safe_rl.envs.velocity import VELOCITY_SUITE, VelocityEnv
 
-# Short episodes and large goals, so that resets and new goals are among the compared steps.
+# Short episodes and large goals, so that resets and new goals are among the compared steps; of
+# some rows alone where a goal ends the episode.
 BUSY = {"num_steps": 20}
 CONFIGS = {
-    "goal": SUITE["PointGoal2"].replace(**BUSY, goal_size=1.8),
+    "goal": SUITE["PointGoal2"].replace(
+        **BUSY, goal_size=1.8, continue_goal=False, gremlins_num=2, observe_gremlins=True
+    ),
     "button": SUITE["CarButton2"].replace(**BUSY, buttons_size=0.2),
     "push": SUITE["DoggoPush2"].replace(**BUSY, goal_size=1.0),
     "noise": SUITE["PointPush1"].replace(**BUSY, action_noise=0.3, frameskip_binom_p=0.7),

@@ -12,7 +12,6 @@ from torchrl.envs.utils import check_env_specs
 
 from safe_rl.cli import evaluate
 from safe_rl.envs import ConfigError, complete_env, make_env
-from safe_rl.runs.table import read_table
 
 NODE = {
     "_target_": "safe_rl.envs.gymnasium.make_gymnasium",
@@ -34,13 +33,11 @@ def run(tmp_path_factory) -> Path:
     return folder
 
 
-def test_it_is_evaluated_on_video(run, capsys):
-    pytest.importorskip("imageio_ffmpeg")
-    assert evaluate.main([str(run), "episodes=6", "num_envs=3", "video=true"]) == 0
+def test_it_is_evaluated(run, capsys):
+    assert evaluate.main([str(run), "episodes=6", "num_envs=3"]) == 0
     facts = json.loads((run / "evaluation.json").read_text())
     assert facts["environment"] == "Walk-v0"
     assert facts["layouts_trained_on"] == 0.0
-    assert (run / "evaluation.mp4").stat().st_size > 1000
     assert evaluate.main([str(run), "env.borders=3"]) == 1
     assert "no key 'borders'" in capsys.readouterr().err
 
@@ -81,7 +78,7 @@ def test_what_cannot_be_made_is_said(keys, message):
         make_env({**NODE, **keys})
 
 
-def test_nested_observations_are_trained_on_entry_by_entry(tmp_path):
+def test_observations_may_be_nested():
     nested = {**NODE, "kwargs": {"nested": True}}
     env = make_env(nested, num_envs=2, seed=0)
     flat = make_env({**nested, "flatten": True}, num_envs=2, seed=0).reset()["observation"]
@@ -89,11 +86,6 @@ def test_nested_observations_are_trained_on_entry_by_entry(tmp_path):
     torch.testing.assert_close(torch.cat([entries["place"], entries["side"]], -1), flat)
     assert env.observation_layout == {"place": slice(0, 2), "side": slice(2, 4)}
     check_env_specs(env)
-    folder = tmp_path / "run"
-    kwargs = ("env.kwargs={nested: true}", "model=dict", "model.encoders.vector=[4]")
-    run_train(*SMALL, *kwargs, "frames=400", f"hydra.run.dir={folder}")
-    assert read_table(folder / "progress.csv")["steps"] == [200, 400]
-    assert evaluate.main([str(folder), "episodes=2", "num_envs=2"]) == 0
 
 
 def test_pictures_are_fitted_in():

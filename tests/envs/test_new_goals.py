@@ -1,7 +1,6 @@
 """New goals: where they are drawn, which button they are, and what happens if there is no place."""
 
 import itertools
-import math
 
 import numpy as np
 import pytest
@@ -107,25 +106,17 @@ def at_the_goal(env: SafetyGymEnv) -> TensorDict:
     return state
 
 
-def test_episodes_end_where_no_new_goal_fits():
-    env = make(NO_PLACE, num_envs=3)
+@pytest.mark.parametrize(("continues", "end"), [(True, "truncated"), (False, "terminated")])
+def test_episodes_end_where_no_new_goal_fits_and_where_none_is_wanted(continues, end):
+    env = make({**NO_PLACE, "continue_goal": continues}, num_envs=3)
     got = stay(env, at_the_goal(env))
-    assert got["goal_met"][:, 0].tolist() == [True, False, False]
-    assert got["truncated"][:, 0].tolist() == [True, False, False]
-    assert not got["terminated"].any()
-    assert math.isclose(float(got["reward"][0]), 1.0)
-    assert not got["reward"][1:].any()
+    for key in ("goal_met", "done", "reward", end):
+        assert got[key][:, 0].tolist() == [True, False, False], key
+    (other,) = {"truncated", "terminated"} - {end}
+    assert not got[other].any()
 
 
 def test_or_it_is_an_error_that_says_what_to_change():
     env = make({**NO_PLACE, "terminate_resample_failure": False}, num_envs=3)
     with pytest.raises(LayoutError, match="terminate_resample_failure"):
         stay(env, at_the_goal(env))
-
-
-def test_without_further_goals_the_episode_terminates():
-    env = make({**NO_PLACE, "continue_goal": False}, num_envs=3)
-    got = stay(env, at_the_goal(env))
-    for key in ("goal_met", "terminated", "done"):
-        assert got[key][:, 0].tolist() == [True, False, False], key
-    assert not got["truncated"].any()

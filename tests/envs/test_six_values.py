@@ -27,16 +27,14 @@ def package(monkeypatch):
     del sys.modules["safety_gymnasium"]
 
 
-def rollout(env, steps=40):
+def rollout(env):
     """Random actions, of which the type of the spec would otherwise make other numbers."""
     torch.manual_seed(0)
 
     def act(tensordict):
-        if env.action_spec.dtype == torch.int64:
-            return env.rand_action(tensordict)
         return tensordict.set("action", 2.2 * torch.rand(env.action_spec.shape) - 1.1)
 
-    return env.rollout(steps, act, break_when_any_done=False)
+    return env.rollout(40, act, break_when_any_done=False)
 
 
 def test_a_step_has_its_cost_beside_the_reward():
@@ -53,18 +51,6 @@ def test_a_step_has_its_cost_beside_the_reward():
     torch.testing.assert_close(taken["next", "cost"], (place > 0) + speed.abs())
     torch.testing.assert_close(taken["next", "terminated"], place.abs() > 1.5)
     assert 0 < taken["next", "terminated"].sum() < 200
-
-
-def test_choices_and_dictionaries_become_integers_and_vectors():
-    node = {**NODE, "id": "SafetyButtons0-v0", "kwargs": None, "num_steps": 6}
-    env = make_env(node, num_envs=3, seed=0)
-    taken = rollout(env, 9)
-    assert env.cost_keys == ["cost"]
-    torch.testing.assert_close(taken["next", "cost"].squeeze(-1), taken["action"].float())
-    seen = taken["next", "observation"]
-    torch.testing.assert_close(seen[..., :4].argmax(-1), taken["action"])
-    torch.testing.assert_close(seen[..., 4:], torch.ones(3, 9, 2))
-    assert taken["next", "truncated"][:, 5].all()
 
 
 @pytest.mark.parametrize(

@@ -4,7 +4,6 @@ import itertools
 
 import pytest
 import torch
-from playing import play
 from torchrl.envs.utils import check_env_specs
 
 from safe_rl.envs import SUITE, SafetyGymEnv, env_node, make_env
@@ -49,11 +48,6 @@ COST_KINDS = {
 NAMES = [(robot, task) for robot, task in itertools.product(ACTIONS, LIDARS)]
 
 
-def actions(env, num_steps: int, seed: int = 0) -> torch.Tensor:
-    generator = torch.Generator().manual_seed(seed)
-    return 2 * torch.rand(num_steps, *env.action_spec.shape, generator=generator) - 1
-
-
 def test_the_suite_has_its_27_names():
     assert sorted(SUITE) == sorted(robot + task for robot, task in NAMES)
 
@@ -95,29 +89,13 @@ def test_specs_of_the_velocity_family(name):
     assert columns == list(range(env.observation_spec["observation"].shape[-1]))
 
 
-FALLING = [name for name, row in VELOCITY_SUITE.items() if row.healthy_reward is not None]
-
-
-@pytest.mark.parametrize("name", FALLING)
-def test_fallen_robots_terminate_and_start_anew(name):
-    run, staying = (
-        play(env, env.reset(), 120)
-        for keys in ({}, {"terminate_when_unhealthy": False})
-        for env in [make_env({**env_node(name), **keys}, num_envs=8, seed=0, num_threads=1)]
-    )
-    assert run["terminated"].any()
-    assert torch.equal(run["done"], run["terminated"])
-    assert run["reward"][run["terminated"]].isfinite().all()
-    assert not staying["terminated"].any()
-
-
 @pytest.mark.parametrize("env_name", ["PointGoal1", "SafeSwimmerVelocity"])
 def test_rows_time_out_by_their_own_count(env_name):
     env = make_env({**env_node(env_name), "num_steps": 5}, num_envs=2, seed=0, num_threads=1)
     tensordict = env.reset()
     ends = []
-    for step, action in enumerate(actions(env, 12)):
-        following, tensordict = env.step_and_maybe_reset(tensordict.set("action", action))
+    for step in range(12):
+        following, tensordict = env.step_and_maybe_reset(env.rand_action(tensordict))
         ends.append(following["next", "truncated"][:, 0].tolist())
         if step == 1:
             mask = torch.tensor([[True], [False]])
@@ -125,39 +103,6 @@ def test_rows_time_out_by_their_own_count(env_name):
     # Row 0 was started anew after two steps, so it times out two steps later ever after.
     assert [step for step, end in enumerate(ends) if end[0]] == [6, 11]
     assert [step for step, end in enumerate(ends) if end[1]] == [4, 9]
-
-
-@pytest.mark.parametrize(
-    "env_name",
-    [
-        *("PointGoal2", "CarPush2", "DoggoGoal1", "PointButton2"),
-        *("SafeHopperVelocity", "SafeAntVelocity", "SafeHumanoidVelocity"),
-    ],
-)
-def test_partial_resets_leave_other_rows_alone(env_name):
-    mask = torch.tensor([[True], [False], [True], [False]])
-    kept = ~mask[:, 0]
-    trajectories = []
-    for interrupted in (False, True):
-        env = make_env(env_name, num_envs=4, seed=3, num_threads=1)
-        tensordict, steps = env.reset(), []
-        for step, action in enumerate(actions(env, 20)):
-            if step == 10 and interrupted:
-                state, observation = env.get_state(), tensordict["observation"].clone()
-                tensordict = env.reset(tensordict.set("_reset", mask))
-                for key, value in env.get_state().items():
-                    assert torch.equal(value[kept], state[key][kept]), key
-                assert torch.equal(tensordict["observation"][kept], observation[kept])
-                assert not torch.equal(tensordict["observation"][~kept], observation[~kept])
-                assert env.get_state()["step_count"].tolist() == [0, 10, 0, 10]
-            following = env.step(tensordict.set("action", action))
-            steps.append(following["next"].clone())
-            tensordict = env.step_mdp(following)
-        trajectories.append(torch.stack(steps))
-    plain, interrupted = trajectories
-    for key, value in plain.items():
-        assert torch.equal(value[:, kept], interrupted[key][:, kept]), key
-    assert not torch.equal(plain["observation"], interrupted["observation"])
 
 
 def test_a_reset_leaves_nothing_of_the_episode_before():

@@ -5,15 +5,10 @@ import math
 import pytest
 import torch
 from tensordict import TensorDict
-from tensordict.nn import (
-    NormalParamExtractor,
-    TensorDictModule,
-    TensorDictModuleBase,
-    TensorDictSequential,
-)
+from tensordict.nn import NormalParamExtractor, TensorDictModule
 from torch import nn
 from torchrl.envs.utils import ExplorationType, set_exploration_type
-from torchrl.modules import IndependentNormal, ProbabilisticActor, TanhNormal
+from torchrl.modules import IndependentNormal, ProbabilisticActor
 
 from safe_rl.models import (
     BehaviourPolicy,
@@ -96,76 +91,15 @@ def test_behaviour_policy_follows_the_actors_parameters_and_the_exploration_type
         assert not torch.equal(policy(batch)["action"], sample["action"])
 
 
-class Swapped(nn.Sequential):
-    """Puts out a standard deviation, then a mean."""
-
-    def forward(self, observation):
-        return super().forward(observation)[::-1]
-
-
-class Direct(TensorDictModuleBase):
-    """Parameters of a Gaussian, written without a `TensorDictModule`."""
-
-    def __init__(self):
-        super().__init__()
-        self.in_keys, self.out_keys = ["observation"], ["loc", "scale"]
-        self.layers = nn.Sequential(nn.Linear(5, 4), NormalParamExtractor())
-
-    def forward(self, tensordict):
-        loc, scale = self.layers(tensordict["observation"])
-        return tensordict.set("loc", loc).set("scale", scale)
-
-
-def with_features(observation, layers=nn.Sequential(nn.Linear(5, 4), NormalParamExtractor())):  # noqa: B008
-    return *layers(observation), observation
-
-
-def gaussian(make, *out_keys):
-    layers = make(nn.Linear(5, 4), NormalParamExtractor())
-    return TensorDictModule(layers, in_keys=["observation"], out_keys=list(out_keys))
-
-
-GAUSSIANS = {
-    "trunk_and_head": lambda: TensorDictSequential(
-        TensorDictModule(nn.Linear(5, 5), in_keys=["observation"], out_keys=["hidden"]),
-        TensorDictModule(
-            nn.Sequential(nn.Linear(5, 4), NormalParamExtractor()),
-            in_keys=["hidden"],
-            out_keys=["loc", "scale"],
-        ),
-    ),
-    "own_module": Direct,
-    "scale_first": lambda: gaussian(Swapped, "scale", "loc"),
-    "three_outputs": lambda: TensorDictModule(
-        with_features, in_keys=["observation"], out_keys=["loc", "scale", "features"]
-    ),
-    "matrices": lambda: gaussian(
-        lambda *layers: nn.Sequential(layers[0], nn.Unflatten(-1, (2, 2)), layers[1]),
-        "loc",
-        "scale",
-    ),
-}
-
-
-@pytest.mark.parametrize("name", GAUSSIANS)
-def test_gaussians_of_ones_own_are_sampled_with_their_own_log_probability(name):
-    settings = {"distribution_kwargs": {"event_dim": 2}} if name == "matrices" else {}
-    actor = ProbabilisticActor(
-        GAUSSIANS[name](), in_keys=["loc", "scale"], distribution_class=IndependentNormal,
-        return_log_prob=True, default_interaction_type=ExplorationType.RANDOM, **settings,
-    )  # fmt: skip
-    sample = make_behaviour(actor)(observations(4))
-    expected = actor.get_dist(observations(4).update(sample)).log_prob(sample["action"])
-    torch.testing.assert_close(sample["action_log_prob"], expected)
-
-
-@pytest.mark.parametrize(("kind", "has_log_prob"), [(TanhNormal, True), (IndependentNormal, False)])
-def test_an_actor_that_samples_or_writes_otherwise_is_left_alone(kind, has_log_prob):
-    network, keys = gaussian(nn.Sequential, "loc", "scale"), ["loc", "scale"]
-    actor = ProbabilisticActor(
-        network, in_keys=keys, distribution_class=kind, return_log_prob=has_log_prob
-    )
+def test_an_actor_of_somebody_elses_is_left_alone():
+    """Its network may put out other things, in another order, for another distribution."""
+    layers = nn.Sequential(nn.Linear(5, 4), NormalParamExtractor())
+    keys = ["loc", "scale"]
+    network = TensorDictModule(layers, in_keys=["observation"], out_keys=keys)
+    actor = ProbabilisticActor(network, in_keys=keys, distribution_class=IndependentNormal)
     assert make_behaviour(actor) is actor
+    actor = make_actor(5, 2, hidden_sizes=[6], initial_log_std=-0.5)
+    assert isinstance(make_behaviour(actor), BehaviourPolicy)
 
 
 def test_input_scale_is_fixed_saved_and_applied():

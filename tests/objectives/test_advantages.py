@@ -100,15 +100,9 @@ def test_other_keys_and_a_single_trajectory():
         value = critic(rollout.clone())["values", "state"]
         next_value = critic(rollout["next"].clone())["values", "state"]
     following = rollout["next"]
-    advantage = loop_gae(
-        following["agent", "r"][None],
-        value[None],
-        next_value[None],
-        following["done"][None],
-        following["terminated"][None],
-        0.9,
-        0.9,
-    )[0]
+    ends = following["done"], following["terminated"]
+    given = (x[None] for x in (following["agent", "r"], value, next_value, *ends))
+    advantage = loop_gae(*given, 0.9, 0.9)[0]
     assert ("next", "agent", "r") in estimator.in_keys
     out = estimator(rollout)
     torch.testing.assert_close(out["out", "a"], advantage, atol=1e-5, rtol=1e-5)

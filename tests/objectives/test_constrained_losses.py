@@ -69,14 +69,16 @@ def test_gradients_against_finite_differences(name):
 
 
 @pytest.mark.parametrize("name", LOSSES)
-def test_they_compile_take_masks_and_report_what_they_name(name):
+def test_they_compile_take_masks_leave_batches_and_report_what_they_name(name):
     torch._dynamo.reset()
     actor = make_actor()
     batch = make_batch(actor, [16], 2)
     perturb(actor, 0.1)
-    loss = LOSSES[name](actor)
+    loss, before = LOSSES[name](actor), batch.clone()
     expected = loss(batch)
     assert set(expected.keys()) == set(loss.out_keys)
+    assert set(batch.keys()) == set(before.keys())
+    assert (batch == before).all()
     padded = TensorDict.cat([batch, torch.full_like(batch, 7.0)])
     padded["collector", "mask"] = torch.arange(32) < 16
     compiled = torch.compile(loss, fullgraph=True, backend="aot_eager")(batch)

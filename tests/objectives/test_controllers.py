@@ -1,4 +1,4 @@
-"""PI and PID multipliers by hand, PID by Stooke et al. (algorithm 2), and a simulated policy."""
+"""PI and PID multipliers by hand, PID by Stooke et al. (algorithm 2)."""
 
 import pytest
 import torch
@@ -6,28 +6,6 @@ import torch
 from safe_rl.objectives.controllers import PIDMultiplier, PIMultiplier
 
 GAINS = {"init": 0.0, "kp": 2.0, "ki": 0.2, "saturation": 1.0, "highest": 5.0}
-# what lagrangian=pid says
-PID = {
-    "init": 0.0, "kp": 0.25, "ki": 0.05, "kd": 0.0, "proportional_ema": 0.5,
-    "derivative_ema": 0.5, "derivative_delay": 10, "scale": "limit",
-}  # fmt: skip
-
-
-def follow(multiplier, epochs=300, noise=5.0, seed=0):
-    """J_c of a policy that λ controls as experiments have it, [epochs].
-
-    Per update J_c moves by a quarter of (λ* − λ) limits, at most by a fifth of one; the λ* that
-    keeps it where it is rises from 0.9 to 1.4 over the first hundred; the controller sees noise.
-    """
-    generator = torch.Generator().manual_seed(seed)
-    cost, costs, limit = torch.tensor([60.0]), [], multiplier.limits
-    for epoch in range(epochs):
-        multiplier.update(cost - limit + noise * torch.randn(1, generator=generator))
-        balance = 0.9 + 0.5 * min(epoch / 100, 1.0)
-        cost = cost + limit * (0.25 * (balance - multiplier.value)).clamp(-0.2, 0.2)
-        cost = cost.clamp_min(0)
-        costs.append(cost)
-    return torch.cat(costs)
 
 
 def test_two_updates_by_hand():
@@ -41,21 +19,6 @@ def test_two_updates_by_hand():
     multiplier = PIMultiplier(10.0, **(GAINS | {"init": 4.0, "saturation": 0.5}))
     multiplier.update(-10.0)
     assert multiplier.value.item() == pytest.approx(4.0 - 0.1 - 1.0)
-
-
-def test_it_follows_a_ramp_where_the_pid_swings_about():
-    seeds = range(8)
-    ours = torch.stack([follow(PIMultiplier(25.0, **GAINS), seed=seed) for seed in seeds])
-    pid = torch.stack([follow(PIDMultiplier(25.0, **PID), seed=seed) for seed in seeds])
-    ramp, settled = slice(20, 100), slice(150, 300)
-    assert (ours[:, ramp] - 25).abs().mean() < 0.6 * (pid[:, ramp] - 25).abs().mean()
-    assert ours[:, settled].mean() == pytest.approx(25, abs=0.5)
-
-
-def test_it_is_well_damped():
-    costs = follow(PIMultiplier(25.0, **GAINS), noise=0.0)
-    assert costs.min() > 0.5 * 25
-    assert (costs[60:] - 25).abs().max() < 0.2 * 25
 
 
 def test_the_integral_is_not_wound_up_beyond_what_it_can_put_out():
@@ -127,14 +90,6 @@ def test_costs_are_controlled_separately():
     first = run([14.0, 11.0], limits=10.0, kp=0.1, ki=0.05, kd=0.02)
     second = run([1.0, 9.0], limits=4.0, kp=0.1, ki=0.05, kd=0.02)
     torch.testing.assert_close(torch.tensor(both).T, torch.tensor([first, second]))
-
-
-def test_integral_control_settles_where_the_plant_meets_the_limit():
-    # A plant whose cost falls with λ: J_c = 30 − 10 λ meets the limit 10 at λ = 2.
-    multiplier = PIDMultiplier(10.0, **(PLAIN | {"kp": 0.02, "ki": 0.02}))
-    for _ in range(200):
-        multiplier.update(30 - 10 * multiplier.value - 10.0)
-    torch.testing.assert_close(multiplier.value, torch.tensor([2.0]), atol=1e-3, rtol=0)
 
 
 def test_a_limit_of_0_is_no_unit():

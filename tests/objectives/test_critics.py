@@ -1,6 +1,5 @@
 """Critic losses against torch's own regression loss and numbers worked out by hand."""
 
-import cmdp
 import pytest
 import torch
 from samples import NUM_OBS, make_critic
@@ -109,13 +108,3 @@ def test_rows_that_are_cut_show_the_bias_of_a_critic_that_is_off_everywhere():
         torch.testing.assert_close(found, torch.tensor([3.0, -0.5]), atol=1e-3, rtol=0)
     nothing = torch.zeros(1, 1, 1, dtype=torch.bool)
     assert critic_bias(torch.ones(1, 1, 1), torch.ones(1, 1, 1), nothing, nothing, 0.9).isnan()
-
-
-def test_the_bias_in_a_problem_whose_values_are_known():
-    """Of one state, where a policy of mean μ pays Wμ per step: its costs are worth Wμ / (1 − γ)."""
-    data, _ = cmdp.rollout(cmdp.TWO, cmdp.make_actor())
-    costs = torch.cat([data["next", key] for key in cmdp.TWO.cost_keys], -1)
-    ends = data["next", "done"], data["next", "terminated"]
-    worth = cmdp.TWO.weights @ torch.zeros(2) / (1 - 0.9)
-    found = critic_bias((worth + torch.tensor([3.0, -2.0])).expand_as(costs), costs, *ends, 0.9)
-    torch.testing.assert_close(found, torch.tensor([3.0, -2.0]), atol=0.4, rtol=0)

@@ -59,6 +59,7 @@ def test_kl_in_closed_form(kind):
     expected = kl_divergence(present, past).mean()
     torch.testing.assert_close(losses["kl"], expected.detach())
     assert losses["kl"] > 0
+    assert not losses["kl"].requires_grad
 
 
 def known(part):

@@ -1,10 +1,9 @@
-"""PPO losses against TorchRL's PPO, loops written from the definition, and torch's KL."""
+"""PPO losses against TorchRL's PPO and loops written from the definition."""
 
 import pytest
 import torch
 import torch._dynamo.testing
 from samples import make_actor, make_batch, perturb
-from torch.distributions import Independent, Normal, kl_divergence
 from torchrl.objectives import ClipPPOLoss
 
 from safe_rl.objectives.multipliers import LagrangeMultiplier
@@ -41,51 +40,27 @@ def test_plain_ppo_agrees_with_torchrl(batch_size):
     torch.testing.assert_close(ours, gradient(expected["loss_objective"], actor))
 
 
+@pytest.mark.parametrize("clipping", ["none", "pessimistic", "joint"])
 @pytest.mark.parametrize("batch_size", [[64], [4, 16]])
-@pytest.mark.parametrize("num_costs", [1, 2, 3])
-def test_lagrangian_from_the_definition(batch_size, num_costs):
+def test_lagrangian_from_the_definition(batch_size, clipping):
     actor = make_actor()
-    batch = make_batch(actor, batch_size, num_costs)
-    perturb(actor, 0.2)
-    multipliers = [0.5, 2.0, 0.1][:num_costs]
-    loss = make_lagrangian(actor, init=multipliers, limits=[1.0] * num_costs)
-    losses = loss(batch)
-    total = 0.0
-    flat = batch.flatten()
-    with torch.no_grad():
-        log_prob = actor.get_dist(flat.clone()).log_prob(flat["action"])
-    for i in range(flat.shape[0]):
-        ratio = (log_prob[i] - flat["action_log_prob"][i]).exp().item()
-        advantage = flat["advantage"][i].item()
-        bound = (1.2 if advantage > 0 else 0.8) * advantage
-        gain = min(ratio * advantage, bound)
-        costs = flat["cost_advantage"][i].tolist()
-        penalty = sum(lam * ratio * c for lam, c in zip(multipliers, costs, strict=True))
-        total += (gain - penalty) / (1 + sum(multipliers))
-    expected = torch.tensor(-total / flat.shape[0])
-    torch.testing.assert_close(losses["loss_objective"], expected, atol=1e-5, rtol=1e-5)
-
-
-@pytest.mark.parametrize("clipping", ["pessimistic", "joint"])
-def test_clipped_costs_from_the_definition(clipping):
-    actor = make_actor()
-    batch = make_batch(actor, [64], 2)
+    batch = make_batch(actor, batch_size, 2)
     perturb(actor, 0.5)
+    flat, total = batch.flatten(), 0.0
     with torch.no_grad():
         loss = make_lagrangian(actor, cost_clipping=clipping)(batch)["loss_objective"]
-        log_prob = actor.get_dist(batch.clone()).log_prob(batch["action"])
-    total = 0.0
-    for i, ratio in enumerate((log_prob - batch["action_log_prob"]).exp().tolist()):
+        log_prob = actor.get_dist(flat.clone()).log_prob(flat["action"])
+    for i, ratio in enumerate((log_prob - flat["action_log_prob"]).exp().tolist()):
         near = min(max(ratio, 0.8), 1.2)
-        gain = batch["advantage"][i].item()
-        costs = batch["cost_advantage"][i].tolist()
+        gain, costs = flat["advantage"][i].item(), flat["cost_advantage"][i].tolist()
         if clipping == "joint":
-            net = (gain - 0.5 * costs[0] - 2.0 * costs[1]) / 3.5
+            net = gain - 0.5 * costs[0] - 2.0 * costs[1]
             total += min(ratio * net, near * net)
-        else:
-            worst = [max(ratio * cost, near * cost) for cost in costs]
-            total += (min(ratio * gain, near * gain) - 0.5 * worst[0] - 2.0 * worst[1]) / 3.5
-    assert loss.item() == pytest.approx(-total / 64, rel=1e-5)
+            continue
+        bounds = near if clipping == "pessimistic" else ratio
+        worst = [max(ratio * cost, bounds * cost) for cost in costs]
+        total += min(ratio * gain, near * gain) - 0.5 * worst[0] - 2.0 * worst[1]
+    assert loss.item() == pytest.approx(-total / 64 / 3.5, rel=1e-5)
 
 
 @pytest.mark.parametrize("clipping", ["none", "pessimistic", "joint"])
@@ -103,40 +78,13 @@ def test_an_action_that_has_become_impossible_leaves_the_gradient_to_the_others(
     torch.testing.assert_close(found, gradient(loss(batch)["loss_objective"], actor))
 
 
-def test_kl_is_exact_and_carries_no_gradient():
-    actor = make_actor()
-    batch = make_batch(actor, [4, 16])
-    perturb(actor)
-    behaviour = Independent(Normal(batch["loc"], batch["scale"]), 1)
-    current = actor.get_dist(batch.clone()).base_dist
-    expected = kl_divergence(Independent(current, 1), behaviour).mean()
-    losses = make_lagrangian(actor, init=1.0, limits=25.0)(batch)
-    torch.testing.assert_close(losses["kl"], expected.detach())
-    trained = {key for key, value in losses.items() if value.requires_grad}
-    assert trained == {"loss_objective", "loss_entropy"}
-    assert set(losses.keys()) == {
-        "loss_objective", "loss_entropy", "kl", "entropy", "ESS", "clip_fraction"
-    }  # fmt: skip
-
-
-def test_batch_is_left_as_it_is():
-    actor = make_actor()
-    batch = make_batch(actor, [16])
-    perturb(actor)
-    before = batch.clone()
-    make_lagrangian(actor, init=1.0, limits=25.0)(batch)
-    assert set(batch.keys()) == set(before.keys())
-    assert (batch == before).all()
-
-
-@pytest.mark.parametrize("backend", ["eager", "aot_eager"])
-def test_compiles_in_one_graph_that_is_never_recompiled(backend):
+def test_compiles_in_one_graph_that_is_never_recompiled():
     torch._dynamo.reset()
     actor = make_actor()
     batch = make_batch(actor, [64], 2)
     perturb(actor)
     loss = make_lagrangian(actor)
-    counter = torch._dynamo.testing.CompileCounterWithBackend(backend)
+    counter = torch._dynamo.testing.CompileCounterWithBackend("aot_eager")
     compiled = torch.compile(loss, fullgraph=True, backend=counter)
     for epoch in range(4):
         losses = compiled(batch)

@@ -1,17 +1,19 @@
 """Pieces of trust-region steps against dense linear algebra and finite differences."""
 
 import math
+from functools import partial
 
 import pytest
 import torch
 from cmdp import make_actor as make_fixed_width_actor
 from samples import NUM_ACTIONS, NUM_OBS, make_actor
 from tensordict import TensorDict
-from tensordict.nn import AddStateIndependentNormalScale, TensorDictModule
+from tensordict.nn import TensorDictModule
 from torch import nn
 from torch.distributions import Independent, Normal, kl_divergence
 from torchrl.modules import IndependentNormal, ProbabilisticActor
 
+from safe_rl.models import make_actor as make_tanh_actor
 from safe_rl.objectives.fisher import FisherProduct
 from safe_rl.objectives.trust_region import (
     backtracking_search,
@@ -24,22 +26,10 @@ from safe_rl.objectives.trust_region import (
     unflatten,
 )
 
-
-def state_independent_actor():
-    net = nn.Sequential(
-        nn.Linear(NUM_OBS, 5), nn.ELU(), nn.Linear(5, NUM_ACTIONS),
-        AddStateIndependentNormalScale(NUM_ACTIONS),
-    )  # fmt: skip
-    return ProbabilisticActor(
-        TensorDictModule(net, in_keys=["observation"], out_keys=["loc", "scale"]),
-        in_keys=["loc", "scale"],
-        distribution_class=IndependentNormal,
-    )
-
-
+SIZES = {"hidden_sizes": [5], "initial_log_std": -0.5}
 ACTORS = {
     "state-dependent scale": (make_actor, NUM_OBS),
-    "state-independent scale": (state_independent_actor, NUM_OBS),
+    "state-independent scale": (partial(make_tanh_actor, NUM_OBS, NUM_ACTIONS, **SIZES), NUM_OBS),
     "constant scale": (make_fixed_width_actor, 1),
 }
 

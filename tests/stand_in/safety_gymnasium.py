@@ -40,23 +40,6 @@ class Ice(gymnasium.Env):
         return picture
 
 
-class Buttons(gymnasium.Env):
-    """Choices, and an observation of several entries; no kinds of costs."""
-
-    observation_space = gymnasium.spaces.Dict(
-        count=gymnasium.spaces.Discrete(4), place=gymnasium.spaces.Box(-1, 1, (2,), np.float32)
-    )
-    action_space = gymnasium.spaces.Discrete(3)
-
-    def reset(self, *, seed=None, options=None):
-        super().reset(seed=seed)
-        return {"count": 0, "place": np.zeros(2, np.float32)}, {}
-
-    def step(self, action):
-        seen = {"count": int(action), "place": np.ones(2, np.float32)}
-        return seen, 1.0, float(action), False, False, {}
-
-
 class Limited(gymnasium.Wrapper):
     """The package's own limit of time, for six values."""
 
@@ -78,9 +61,6 @@ class Limited(gymnasium.Wrapper):
         return (*values, self.taken >= self.steps, info)
 
 
-KNOWN = {"SafetyIce1-v0": Ice, "SafetyButtons0-v0": Buttons}
-
-
 def make(id, max_episode_steps=None, **kwargs):
-    assert id in KNOWN, f"Environment {id} is not registered in safety-gymnasium."
-    return Limited(KNOWN[id](**kwargs), max_episode_steps or 12)
+    assert id == "SafetyIce1-v0", f"Environment {id} is not registered in safety-gymnasium."
+    return Limited(Ice(**kwargs), max_episode_steps or 12)
