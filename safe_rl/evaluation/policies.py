@@ -65,19 +65,21 @@ def writable_copy(directory: Path) -> Path:
 def pack_policy(run: Path, folder: Path, checkpoint: str = "certified") -> Path:
     """Write what is needed to use a run's policy into a folder of a few dozen kB.
 
-    The configuration, the certificate, the command and the commit, and of the checkpoint the actor
-    alone, in the format of all checkpoints, which is read without unpickling objects. Returns the
-    file of the weights; `FileNotFoundError` if there is no such checkpoint.
+    The configuration, the command and the commit, of a certified checkpoint also the certificate,
+    and of the checkpoint the actor alone, in the format of all checkpoints, which is read without
+    unpickling objects. Returns the file of the weights; `FileNotFoundError` if there is no such
+    checkpoint.
     """
     source, target = RunFolder(run), RunFolder(folder)
     path, config = find_checkpoint(run, checkpoint), load_config(run)
     steps = checkpoint_steps(path)
-    kept = target.checkpoint("certified", steps or 0)
+    is_certified = path.parent.name == "certified"
+    kept = target.checkpoint("certified" if is_certified else "last", steps or 0)
     shutil.rmtree(target.checkpoints, ignore_errors=True)
     kept.parent.mkdir(parents=True)
     shutil.copyfile(source.config, target.config)
     for file, copy in ((source.certificate, target.certificate), (source.code, target.code)):
-        if file.is_file():
+        if file.is_file() and (is_certified or file != source.certificate):
             shutil.copyfile(file, copy)
     facts = {name: value for name, value in read_facts(path).items() if name != "run"}
     save_tensors(kept, {"facts": facts, "parts": read_states(path, ["actor"])})

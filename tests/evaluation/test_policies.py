@@ -55,6 +55,16 @@ def test_a_packed_policy_is_small_and_says_where_it_is_from(run, tmp_path):
     assert packed < whole / 2
 
 
+def test_only_a_certified_policy_is_packed_as_certified(run, tmp_path):
+    (run / "certificate.json").write_text('{"certified": true}')
+    assert export([str(run), str(tmp_path / "last")]) == 0
+    shutil.copytree(run / "checkpoints/last", run / "checkpoints/certified")
+    assert export([str(run), str(tmp_path / "certified")]) == 0
+    for kind in ("last", "certified"):
+        assert [path.name for path in (tmp_path / kind / "checkpoints").iterdir()] == [kind]
+        assert (tmp_path / kind / "certificate.json").is_file() == (kind == "certified")
+
+
 @pytest.mark.parametrize("path", sorted(policies.POLICIES.glob("*/certificate.json")), ids=str)
 def test_policies_of_the_package_are_certified_and_small(path):
     assert json.loads(path.read_text())["certified"]
