@@ -81,7 +81,8 @@ class Session:
         self.interrupted_by: Signals | None = None
         self._continues, self._is_new, self._callbacks = continues, is_new, callbacks
         self._program = program
-        words = f"{program} {self.folder.resuming}"
+        self._imports = "".join(f" import={quote(name)}" for name in config.get("import") or [])
+        words = f"{program}{self._imports} {self.folder.resuming}"
         self._again = words if program else f"safe_rl.resume({str(folder)!r})"
         self._has_begun = False
 
@@ -244,7 +245,7 @@ class Session:
                 f"Not certified: frames={config.frames:_} are fewer than {steps:,}, a fifth of the "
                 f"steps of certificate.episodes={config.certificate.episodes} episodes. To make a "
                 "certificate all the same: python -m safe_rl.evaluate "
-                f"{quote(str(self.folder.directory))} certify=true"
+                f"{quote(str(self.folder.directory))} certify=true{self._imports}"
             )
 
     def _certify(self) -> None:
@@ -261,8 +262,7 @@ class Session:
             return
         self._say(str(certificate))
         if certificate is not None and certificate.checkpoint is None:
-            more = f"{folder.resuming} frames={2 * self.config.frames:_}"
-            self._say(f"To train on: {self._program} {more}")
+            self._say(f"To train on: {self._again} frames={2 * self.config.frames:_}")
 
 
 def run_job(config: DictConfig) -> float:

@@ -180,4 +180,4 @@ def outcome_line(
 def _final_cost(final: Mapping[str, float], key: str, limit: float | None) -> str:
     mean, own = final[f"episode_{key}"], measured(final, key, limit)
     differs = abs(own - mean) > 0.05
-    return f"{mean:.1f}" + (f", what is limited {own:.1f}" if differs else "")
+    return f"{mean:.1f}" + (f", limited measure {own:.1f}" if differs else "")

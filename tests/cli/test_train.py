@@ -117,7 +117,7 @@ def test_a_run_without_a_certified_policy_says_how_to_train_on(command):
     status, out, _ = command(
         *["env=PointGoal1", "env.num_steps=20", "num_envs=2", "frames=40", "frames_per_batch=40"],
         *["algo=ppo_lagrangian", "certificate.episodes=2", "certificate.ranking=2", "logger=none"],
-        *["cost_limits={cost: 0.5}", "hydra.run.dir=runs/unsafe"],
+        *["cost_limits={cost: 0.5}", "hydra.run.dir=runs/unsafe", "import=json"],
     )
     assert not status
     line = out.splitlines()[-1]

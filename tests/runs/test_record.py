@@ -134,7 +134,7 @@ def test_a_measure_of_ones_own_is_what_is_held_against_the_limit(tmp_path, capsy
     with record.writing():
         record.add(row(1, 1.0, 20.0) | {"violation_cost": 62.0})
         record.add(row(2, 1.0, 30.0) | {"violation_cost": 64.0})
-    assert "cost 25.0, what is limited 88.0 (limit 25)" in record.summary()
+    assert "cost 25.0, limited measure 88.0 (limit 25)" in record.summary()
     with record.writing(0):
         record.add(row(1, NAN, NAN) | {"violation_cost": NAN})
     assert "No episode of 1,000 steps has ended, cost 1.0 (limit 25) per 1,000" in record.summary()
