@@ -82,8 +82,9 @@ def test_ranges_that_cannot_be_are_refused(outside, message):
 @pytest.mark.slow
 def test_several_choices_at_once_are_trained_in_processes_too(tmp_path):
     """The environment itself refuses actions that it does not have."""
-    limits = ("cost_limits={cost: 6}", "env.id=Boxes-v0", MINIBATCHES)
-    run_train(*SMALL, *limits, "collector=process", "frames=400", f"hydra.run.dir={tmp_path}")
+    # imported by the workers, too, which would not know Boxes-v0
+    own = ("import=gymnasium_envs", "env.id=Boxes-v0", "cost_limits={cost: 6}", MINIBATCHES)
+    run_train(*SMALL, *own, "collector=process", "frames=400", f"hydra.run.dir={tmp_path}")
     table = read_table(tmp_path / "progress.csv")
     assert table["steps"] == [200, 400]
     # what every step earns is at most 3, and costs at most 1.5; neither is ever all or nothing
