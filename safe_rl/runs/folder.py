@@ -14,8 +14,9 @@ from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
 from pathlib import Path
+from platform import node
 
-from filelock import FileLock, SoftFileLease, Timeout
+from filelock import FileLock, Timeout
 
 from safe_rl.files import check_no_links
 
@@ -37,11 +38,7 @@ _CHECKPOINT = re.compile(r"checkpoint-(\d+)\.torchrl")
 KINDS = ("last", "best", "certified")
 """Folders of checkpoints: the newest few, the best that kept every limit, the certified one."""
 
-LEASE = 15.0
-"""Seconds after which the lease of a writer on another machine expires without renewal."""
-
 _NO_LOCKS = (errno.ENOSYS, errno.ENOLCK, errno.EOPNOTSUPP)
-_locked: dict[Path, int] = {}  # folder -> the process that locked it, not its forks
 
 
 class _Below:
@@ -75,8 +72,7 @@ class RunFolder:
     table = _Below("progress.csv")  # a row per epoch
     curves = _Below("curves.png")  # the picture of its learning curves
     failure = _Below("failure.txt")  # traceback of a failed job of a sweep
-    lock = _Below(".lock")  # keeps a second process from writing here
-    lease = _Below(".lease")  # the present writer, for machines that share no locks
+    lock = _Below(".lock")  # keeps a second process from writing here; names the first
     robot = _Below("robot")  # copies of the files of a user's own robot
     robot_note = _Below("robot.json")  # which robot that is, and its SHA-256
     notes = _Below(".hydra")  # Hydra's notes
@@ -247,11 +243,10 @@ class RunInUseError(ValueError):
 
 @contextmanager
 def lock_folder(folder: RunFolder) -> Iterator[None]:
-    """Keep others from writing into a folder; inside another such block of this process, continue.
+    """Keep other processes from writing into a folder; inside another such block, continue.
 
-    Two locks of `filelock`: that of the kernel (``flock``), which ends with a killed process, and a
-    lease, because network file systems may have no such lock, or one per machine. The lease of a
-    writer on another machine expires `LEASE` seconds after its last renewal.
+    This is a lock of the kernel (``flock``), which ends with its process. Where a file system has
+    no such locks, or each machine its own, nothing protects the folder from other machines.
 
     Raises:
         RunInUseError: If another process holds it.
@@ -261,46 +256,25 @@ def lock_folder(folder: RunFolder) -> Iterator[None]:
         >>> import tempfile
         >>> folder = RunFolder(Path(tempfile.mkdtemp()))
         >>> with lock_folder(folder):
-        ...     folder.lease.exists()
+        ...     folder.lock.exists()
         True
-        >>> folder.lease.exists()
-        False
     """
-    place = folder.directory.resolve()
-    if _locked.get(place) == os.getpid():
-        yield
-        return
     check_no_links(folder.directory)
-    lease = SoftFileLease(folder.lease, lease_duration=LEASE, thread_local=False)
+    # One object per file, so that this process can lock it several times. Without the fallback: its
+    # file would stay when a process of another machine is killed, whose run could not be continued.
+    options = {"thread_local": False, "is_singleton": True, "fallback_to_soft": False}
+    lock = FileLock(folder.lock.resolve(), blocking=False, **options)
     with ExitStack() as stack:
         try:
-            _lock(folder, lease, stack)
-            stack.enter_context(lease.acquire(timeout=2 * LEASE))
+            stack.enter_context(lock)
+            folder.lock.write_text(f"process {os.getpid()} on {node()}")
         except Timeout:
-            raise _in_use(folder, lease) from None
-        _locked[place] = os.getpid()
-        stack.callback(_locked.pop, place)
+            writer = folder.lock.read_text() or "another process"
+            raise RunInUseError(
+                f"{folder.directory} is being written by {writer}. Wait for it, or end it; a run "
+                "that was ended is continued by resume=."
+            ) from None
+        except OSError as error:
+            if error.errno not in _NO_LOCKS:
+                raise
         yield
-
-
-def _lock(folder: RunFolder, lease: SoftFileLease, stack: ExitStack) -> None:
-    """Take the kernel's lock, where the file system has locks."""
-    try:
-        stack.enter_context(FileLock(folder.lock, blocking=False, thread_local=False))
-    except OSError as error:
-        if error.errno not in _NO_LOCKS:
-            raise
-        return
-    if lease.owner is None:  # of a machine that went down while it was written
-        folder.lease.unlink(missing_ok=True)
-
-
-def _in_use(folder: RunFolder, lease: SoftFileLease) -> RunInUseError:
-    owner = lease.owner
-    # the name of the container follows that of the machine
-    machine = "" if owner is None else owner.hostname.partition("?")[0]
-    who = "another process" if owner is None else f"process {owner.pid} on {machine}"
-    return RunInUseError(
-        f"{folder.directory} is being written by {who}. Wait for it, or end it; a run that was "
-        "ended is continued by resume=."
-    )

@@ -9,7 +9,6 @@ import time
 from pathlib import Path
 
 import pytest
-from filelock import SoftFileLease
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import OmegaConf
 from registrations import undone
@@ -186,8 +185,7 @@ def test_jobs_in_other_processes_know_the_keys_of_a_users_module(tmp_path):
 
 def writers(directory):
     """Folder -> process that writes it, of the runs below a folder."""
-    found = {run.directory: SoftFileLease(run.lease).pid for run in runs_below(directory)}
-    return {folder: pid for folder, pid in found.items() if pid is not None}
+    return {r.directory: int(r.lock.read_text().split()[1]) for r in runs_below(directory)}
 
 
 def wait_until(condition, seconds):
