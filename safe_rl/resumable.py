@@ -40,7 +40,11 @@ class Resumable:
         return {name: _saved(getattr(self, name)) for name in self.state_names}
 
     def load_state_dict(self, state_dict: Mapping[str, Any]) -> Any:
-        """Continue from :meth:`state_dict`."""
+        """Continue from :meth:`state_dict`.
+
+        Raises:
+            ValueError: If there is something else in the place of a number.
+        """
         for name in self.state_names:
             own = getattr(self, name)
             value = _restored(own, state_dict[name])
@@ -68,6 +72,8 @@ def _restored(own: Any, saved: Any) -> Any:
         own.set_state(saved.cpu())
     elif hasattr(own, "load_state_dict"):
         own.load_state_dict(saved)
+    elif isinstance(own, int | float) and type(saved) is not type(own):
+        raise ValueError(f"there is {str(saved)[:40]!r} where a number has to be.")
     else:
         return saved
     return own

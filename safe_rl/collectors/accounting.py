@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Any
 
 import torch
 from tensordict import NestedKey, TensorDictBase, unravel_key
 from torch import Tensor
 
 from safe_rl.naming import STEPS_TAKEN, key_name
+from safe_rl.resumable import Resumable
 
 __all__ = ["EpisodeAccounting", "EpisodeError", "EpisodeStatistics"]
 
@@ -87,7 +87,7 @@ class EpisodeStatistics:
         return rows
 
 
-class EpisodeAccounting:
+class EpisodeAccounting(Resumable):
     """Sum rewards and costs over episodes that may span any number of batches.
 
     The sums are taken over whole batches at once, after collection, so that nothing is added to
@@ -123,6 +123,8 @@ class EpisodeAccounting:
         tensor([3.], dtype=torch.float64)
     """
 
+    state_names = ("open_sums", "totals")
+
     def __init__(
         self,
         num_envs: int,
@@ -141,15 +143,15 @@ class EpisodeAccounting:
         num_sums = 1 + len(self._signal_keys)
         # float64 keeps sums of indicator costs exact and those of rewards independent of how the
         # steps were cut into batches to far below what is logged
-        self._open_sums = torch.zeros(num_envs, num_sums, dtype=torch.float64, device=device)
-        self._totals = torch.zeros(num_sums, dtype=torch.float64, device=device)
+        self.open_sums = torch.zeros(num_envs, num_sums, dtype=torch.float64, device=device)
+        self.totals = torch.zeros(num_sums, dtype=torch.float64, device=device)
 
     def update(self, batch: TensorDictBase) -> EpisodeStatistics:
         """Account for one batch of consecutive steps, [N, T], batches in order of time.
 
         A batch [T] is that of a single environment.
         """
-        num_envs = self._open_sums.shape[0]
+        num_envs = self.open_sums.shape[0]
         if batch.ndim == num_envs == 1:
             batch = batch.unsqueeze(0)
         if batch.ndim != 2 or batch.shape[0] != num_envs:
@@ -163,13 +165,13 @@ class EpisodeAccounting:
         if self.steps_per_decision != 1:
             steps = self._column(batch, STEPS_TAKEN)
         signals = torch.cat([steps.unsqueeze(-1), signals], -1)
-        before = self._open_sums[:, 2:]
+        before = self.open_sums[:, 2:]
         finished = self._close_episodes(signals, self._column(batch, self.done_key).long())
         finished = finished[finished[:, 0].isfinite()]
         self._require_ends(finished[:, 0])
-        self._totals += signals.sum((0, 1))
+        self.totals += signals.sum((0, 1))
         names = [key_name(key) for key in self.cost_keys]
-        reward_rate, *rates = self._totals[1:] / self._totals[0]
+        reward_rate, *rates = self.totals[1:] / self.totals[0]
         return EpisodeStatistics(
             returns=finished[:, 1],
             costs=dict(zip(names, finished[:, 2:].unbind(-1), strict=True)),
@@ -187,11 +189,11 @@ class EpisodeAccounting:
         # index of the episode that each step belongs to, counted from the batch's first step
         episode = done.cumsum(1) - done
         sums = signals.new_zeros(num_envs, int(num_done.max()) + 1, num_sums)
-        sums[:, 0] = self._open_sums
+        sums[:, 0] = self.open_sums
         sums.scatter_add_(1, episode.unsqueeze(-1).expand_as(signals), signals)
         is_finished = torch.arange(sums.shape[1], device=sums.device) < num_done.unsqueeze(1)
         last = num_done.view(-1, 1, 1).expand(-1, 1, num_sums)
-        self._open_sums = sums.gather(1, last).squeeze(1)
+        self.open_sums = sums.gather(1, last).squeeze(1)
         return sums[is_finished]
 
     def _require_costs(self, costs: Tensor) -> None:
@@ -209,7 +211,7 @@ class EpisodeAccounting:
         """Refuse episodes, ended with lengths [E] or open, that are longer than they may be."""
         if self.longest is None:
             return
-        steps = torch.cat([lengths, self._open_sums[:, 0]]).nan_to_num().max().item()
+        steps = torch.cat([lengths, self.open_sums[:, 0]]).nan_to_num().max().item()
         if steps > self.longest:
             raise EpisodeError(
                 f"An episode has {steps:g} steps, but the environment's 'max_episode_steps' is "
@@ -233,28 +235,12 @@ class EpisodeAccounting:
     @property
     def have_begun(self) -> Tensor:
         """Rows [N] that are within an episode, between two batches."""
-        return self._open_sums[:, 0] != 0
+        return self.open_sums[:, 0] != 0
 
     def forget_open_episodes(self) -> None:
         """Drop the sums of open episodes: the environment starts new ones."""
-        self._open_sums.zero_()
+        self.open_sums.zero_()
 
     def ignore_open_episodes(self) -> None:
         """Leave the open episodes, which started late, out of all statistics."""
-        self._open_sums.fill_(torch.nan)
-
-    def state_dict(self) -> dict[str, Tensor]:
-        """Sums of the open episodes and of all steps so far."""
-        return {"open_sums": self._open_sums.clone(), "totals": self._totals.clone()}
-
-    def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
-        """Continue from :meth:`state_dict`."""
-        for name, target in (("open_sums", self._open_sums), ("totals", self._totals)):
-            if state_dict[name].shape != target.shape:
-                raise ValueError(
-                    f"The saved '{name}' has shape {list(state_dict[name].shape)}, this run needs "
-                    f"{list(target.shape)}: it has other environments or cost keys than the saved."
-                )
-        # copies, because both are changed in place
-        self._open_sums = state_dict["open_sums"].to(self._open_sums, copy=True)
-        self._totals = state_dict["totals"].to(self._totals, copy=True)
+        self.open_sums.fill_(torch.nan)

@@ -13,7 +13,6 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-from torch import Tensor, nn
 from torchrl.checkpoint import CheckpointError
 
 from safe_rl.algorithms.algorithm_contract import Stateful, states_of
@@ -65,21 +64,12 @@ def _restore(path: Path, components: Mapping[str, Stateful]) -> None:
     states = read_states(path, components)
     for name in sorted(states):
         try:
-            _check_types(components[name], states[name])
             components[name].load_state_dict(states[name])
         except Exception as error:  # a part of unknown origin can be wrong in any way
             words = " ".join(str(error).split())
             raise CheckpointError(
                 f"Cannot use the checkpoint {path}: its {name!r} does not fit: {words}"
             ) from error
-
-
-def _check_types(component: Stateful, state: Mapping[str, Any]) -> None:
-    """Refuse weights of another dtype than the network's, which would be converted silently."""
-    for name, tensor in component.state_dict().items() if isinstance(component, nn.Module) else ():
-        given = state.get(name)
-        if isinstance(given, Tensor) and given.dtype != tensor.dtype:
-            raise ValueError(f"'{name}' is {given.dtype}, where the network has {tensor.dtype}.")
 
 
 def best_checkpoint(directory: Path) -> Path | None:

@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterable, Mapping
 from typing import Any, NamedTuple
 
 from safe_rl.algorithms.algorithm_contract import Stateful
+from safe_rl.resumable import Resumable
 from safe_rl.runs.outcome import feasible_return
 
 __all__ = ["Candidates", "Judged", "epochs_until_judged"]
@@ -54,7 +55,7 @@ class Judged(NamedTuple):
     states: dict[str, Any]
 
 
-class Candidates:
+class Candidates(Resumable):
     """Policies that wait for the epochs in which their own episodes end.
 
     Args:
@@ -64,6 +65,9 @@ class Candidates:
         delay: Function from the mean episode length to the number of epochs from a policy's update
             to the last epoch of its average.
         longest: Largest length of an episode, used as the mean length until an episode has ended.
+
+    Attributes:
+        waiting: The policies: ``steps`` and ``epoch`` of the run then, and ``states`` by name.
 
     Examples:
         >>> import functools
@@ -80,6 +84,8 @@ class Candidates:
         [(100, 5.0)]
     """
 
+    state_names = ("waiting",)
+
     def __init__(
         self,
         components: Mapping[str, Stateful],
@@ -92,7 +98,7 @@ class Candidates:
         self._components, self._limits = dict(components), dict(limits)
         self._delay, self._length = delay, float(longest)
         self._latest: deque[Mapping[str, float]] = deque(maxlen=over)
-        self._waiting: deque[dict[str, Any]] = deque()
+        self.waiting: list[dict[str, Any]] = []
 
     def continue_after(self, rows: Iterable[Mapping[str, float]]) -> None:
         """Add the epochs of a run that is resumed."""
@@ -111,9 +117,9 @@ class Candidates:
         """
         self._take(row)
         states = {name: copy.deepcopy(part.state_dict()) for name, part in self._components.items()}
-        self._waiting.append({"steps": row["steps"], "epoch": row["epoch"], "states": states})
-        due = len(self._waiting) - self._delay(self._length)
-        passed = [self._waiting.popleft() for _ in range(due)]
+        self.waiting.append({"steps": row["steps"], "epoch": row["epoch"], "states": states})
+        due = len(self.waiting) - self._delay(self._length)
+        passed = [self.waiting.pop(0) for _ in range(due)]
         return self._judge(passed[-1]) if passed else []
 
     def _take(self, row: Mapping[str, float]) -> None:
@@ -121,39 +127,15 @@ class Candidates:
         length = row.get("episode_length", math.nan)
         self._length = length if math.isfinite(length) else self._length
 
-    @property
-    def waiting(self) -> list[int]:
-        """Environment steps of the waiting policies."""
-        return [policy["steps"] for policy in self._waiting]
-
     def judge_all(self) -> list[Judged]:
         """Judge all waiting policies by the epochs so far, at the end of a run.
 
         They keep waiting, because a resumed run has later epochs to judge them by.
         """
-        return [one for policy in self._waiting for one in self._judge(policy)]
+        return [one for policy in self.waiting for one in self._judge(policy)]
 
     def _judge(self, policy: Mapping[str, Any]) -> list[Judged]:
         score = feasible_return(self._latest, self._limits)
         if score is None:
             return []
         return [Judged(policy["steps"], score, {"epoch": policy["epoch"]}, policy["states"])]
-
-    def state_dict(self) -> dict[str, Any]:
-        """The waiting policies."""
-        return {"waiting": list(self._waiting)}
-
-    def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
-        """Continue from :meth:`state_dict`.
-
-        Raises:
-            ValueError: If the state is not of this class.
-        """
-        waiting = list(state_dict["waiting"])
-        for policy in waiting:
-            counters = (policy["steps"], policy["epoch"])
-            if not all(type(n) is int and 0 <= n < 10**15 for n in counters):
-                raise ValueError(f"a policy waits that was there after {counters[0]!r:.40} steps.")
-            if policy["states"].keys() != self._components.keys():
-                raise ValueError("a policy waits that consists of other parts.")
-        self._waiting = deque(waiting)

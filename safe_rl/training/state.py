@@ -15,13 +15,12 @@ from tensordict import TensorDictBase
 from torchrl.collectors import Collector
 from torchrl.envs import EnvBase
 
+from safe_rl.resumable import Resumable
+
 __all__ = ["Progress", "StopRequest", "WorldSnapshot"]
 
 
-_MOST = 10**15  # of steps
-
-
-class Progress:
+class Progress(Resumable):
     """Counters of a run: epochs, environment steps, seconds of training.
 
     Examples:
@@ -30,6 +29,8 @@ class Progress:
         >>> progress.state_dict()
         {'epoch': 1, 'steps': 1000, 'seconds': 2.0}
     """
+
+    state_names = ("epoch", "steps", "seconds")
 
     def __init__(self) -> None:
         self.epoch = 0
@@ -41,22 +42,6 @@ class Progress:
         self.epoch += 1
         self.steps += steps
         self.seconds += seconds
-
-    def state_dict(self) -> dict[str, Any]:
-        """The counters."""
-        return dict(vars(self))
-
-    def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
-        """Continue from :meth:`state_dict`.
-
-        Raises:
-            ValueError: If these are no counters.
-        """
-        for name, value in self.state_dict().items():
-            given = state_dict[name]
-            if type(given) is not type(value) or not 0 <= given < _MOST:
-                raise ValueError(f"'{name}' is {str(given)[:40]!r}, which is no counter of a run.")
-        vars(self).update({name: state_dict[name] for name in vars(self)})
 
 
 class WorldSnapshot:

@@ -210,7 +210,7 @@ class Trainer:
                 self._recording.begin(self.progress.epoch)
             self._candidates.continue_after(self.record.rows())
             # at its end, the shorter run judged these by fewer epochs
-            self._checkpoints.forget_best(self._candidates.waiting)
+            self._checkpoints.forget_best(one["steps"] for one in self._candidates.waiting)
             while self.progress.steps < self._frames:
                 row = self.epoch(batches)
                 self.record.add(row)
