@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase
 from torch import Tensor
-from torchrl.data import LazyMemmapStorage, LazyTensorStorage, RandomSampler, TensorDictReplayBuffer
+from torchrl.data import LazyTensorStorage, RandomSampler, TensorDictReplayBuffer
 from torchrl.data.replay_buffers.samplers import Sampler
 from torchrl.data.replay_buffers.storages import Storage
 from torchrl.envs import MultiStepTransform
@@ -20,7 +20,6 @@ from safe_rl.resumable import Resumable
 
 __all__ = ["Memory", "ProportionalSampler"]
 
-_STORAGES = {"tensor": LazyTensorStorage, "memmap": LazyMemmapStorage}
 _MOST_AT_ONCE = 16_384
 """Steps that are gathered at a time, to be cut into minibatches."""
 _LONGEST_ROW = 1_000
@@ -41,8 +40,6 @@ class Memory(Checked):
         reward_keys: Entries below ``next`` that are summed over n steps.
         reward_gamma: Discount per step of these sums.
         n_steps: Steps n of n-step returns.
-        storage: Where transitions are kept: ``"tensor"`` in main memory, ``"memmap"`` in temporary
-            files.
         prioritised: Exponents ``alpha`` and ``beta`` of prioritised replay, or None for uniform
             sampling. See Schaul et al. 2016, sections 3.3 and 3.4.
         keep: Whether checkpoints have the transitions, so that a resumed run continues exactly.
@@ -54,7 +51,7 @@ class Memory(Checked):
     Examples:
         >>> memory = Memory(
         ...     capacity=100, batch_size=4, in_keys=["observation", ("next", "reward")],
-        ...     reward_keys=["reward"], reward_gamma=0.99, n_steps=1, storage="tensor", keep=True,
+        ...     reward_keys=["reward"], reward_gamma=0.99, n_steps=1, keep=True,
         ... )
         >>> step = {"reward": torch.ones(2, 5, 1), "done": torch.zeros(2, 5, 1, dtype=torch.bool)}
         >>> batch = TensorDict(observation=torch.zeros(2, 5, 3), next=step, batch_size=[2, 5])
@@ -72,7 +69,6 @@ class Memory(Checked):
         reward_keys: Sequence[NestedKey],
         reward_gamma: float,
         n_steps: Annotated[int, Range(1, 1000)],
-        storage: Literal["tensor", "memmap"],
         prioritised: Mapping[str, Share] | None = None,
         keep: bool,
         device: torch.device | str | None = None,
@@ -81,9 +77,7 @@ class Memory(Checked):
         self._in_keys, self._device = list(in_keys), torch.device(device or "cpu")
         self._is_prioritised = prioritised is not None
         self._buffer = TensorDictReplayBuffer(
-            storage=_STORAGES[storage](
-                capacity, device=self._device if storage == "tensor" else torch.device("cpu")
-            ),
+            storage=LazyTensorStorage(capacity, device=self._device),
             sampler=_sampler(capacity, prioritised),
         )
         self._multi_step: MultiStepTransform | None = None

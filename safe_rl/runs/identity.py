@@ -73,7 +73,6 @@ ROLES: dict[str, Role] = {
     "default_cost_limits": Role.MANNER,
     "evaluation": Role.MANNER,
     "memory.keep": Role.MANNER,
-    "memory.storage": Role.MANNER,
     "note": Role.MANNER,
     "certificate": Role.MACHINE,  # what is found out about a run, not what it is
     "checkpoint": Role.MACHINE,
@@ -103,6 +102,7 @@ _SILENT: dict[str, Hashable] = {
         [f"env.{part}_scale" for part in ("mass", "friction", "damping", "strength")], 1.0
     ),
     "dataset.path": None,
+    "memory.storage": "tensor",
     "dataset.safe_episodes": False,
     "dataset.alone": False,
     "model.head": "auto",

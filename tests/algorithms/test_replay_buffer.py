@@ -23,7 +23,7 @@ IN_KEYS = [
 def make_memory(**keys):
     settings = {
         "capacity": 1000, "batch_size": 64, "in_keys": IN_KEYS, "reward_keys": ["reward", "cost"],
-        "reward_gamma": 0.5, "n_steps": 1, "storage": "tensor", "keep": True,
+        "reward_gamma": 0.5, "n_steps": 1, "keep": True,
     }  # fmt: skip
     return Memory(**{**settings, **keys})
 
@@ -94,11 +94,10 @@ def test_several_steps_are_summed_across_batches_and_not_across_ends(terminates)
         assert step["next", "terminated"].item() is (reaches_the_end and terminates)
 
 
-@pytest.mark.parametrize("storage", ["tensor", "memmap"])
 @pytest.mark.parametrize("n_steps", [1, 3])
 @pytest.mark.parametrize("batches", [0, 1, 4])
-def test_a_copy_goes_on_in_the_same_way(storage, n_steps, batches, tmp_path):
-    keys = {"storage": storage, "n_steps": n_steps, "capacity": 20}
+def test_a_copy_goes_on_in_the_same_way(n_steps, batches, tmp_path):
+    keys = {"n_steps": n_steps, "capacity": 20}
     memory, copy = make_memory(**keys), make_memory(**keys)
     copy.extend(make_batch(50, 4))  # which loading forgets
     for number in range(batches):
