@@ -14,10 +14,10 @@ from safe_rl.algorithms.off_policy_networks import bounded_actions, setting
 from safe_rl.algorithms.replay_buffer import Memory
 from safe_rl.collectors import read_dataset, safe_episodes
 
-__all__ = ["begin_memory"]
+__all__ = ["fill_replay_buffer"]
 
 
-def begin_memory(config: DictConfig, memory: Memory, env: EnvBase) -> tuple[str, bool]:
+def fill_replay_buffer(config: DictConfig, buffer: Memory, env: EnvBase) -> tuple[str, bool]:
     """Fill an empty replay buffer with the dataset of a configuration, if it has one.
 
     The node ``dataset`` has a ``path``, of a recording's folder or of an HDF5 file, and says with
@@ -47,15 +47,15 @@ def begin_memory(config: DictConfig, memory: Memory, env: EnvBase) -> tuple[str,
         )
         return warning if config.frames < random_steps else "", True
     limits = check_cost_limits(config.cost_limits, env.cost_keys)
-    return _fill(memory, node, limits, env, bounded_actions(env)), not node.alone
+    return _fill(buffer, node, limits, env, bounded_actions(env)), not node.alone
 
 
 def _fill(
-    memory: Memory, node: DictConfig, limits: Mapping[str, float], env: EnvBase, actions: TensorSpec
+    buffer: Memory, node: DictConfig, limits: Mapping[str, float], env: EnvBase, actions: TensorSpec
 ) -> str:
     """Put the transitions of a dataset into a replay buffer; return a sentence on them."""
     steps = read_dataset(node.path)
-    _check(steps, node, memory, env, actions)
+    _check(steps, node, buffer, env, actions)
     number = steps.batch_size.numel()
     if node.safe_episodes:
         if missing := [key for key in limits if ("next", key) not in steps.keys(True)]:
@@ -65,25 +65,25 @@ def _fill(
         _check_finite(steps, node, [("next", key) for key in limits])
         steps = safe_episodes(steps, limits)
     taken = steps.batch_size.numel()
-    if not 0 < taken <= memory.capacity:
+    if not 0 < taken <= buffer.capacity:
         what = " in whole episodes that keep cost_limits" if node.safe_episodes else ""
         raise ValueError(
             f"dataset.path={node.path}: of its {number:,} transitions {taken:,} are taken"
-            f"{what}. There must be some, and room for them: memory.capacity={memory.capacity}."
+            f"{what}. There must be some, and room for them: memory.capacity={buffer.capacity}."
         )
-    _check_finite(steps, node, memory.in_keys)
+    _check_finite(steps, node, buffer.in_keys)
     steps["action"] = steps["action"].clamp(actions.low.cpu(), actions.high.cpu())
-    memory.extend(steps)
-    memory.end_rows()
+    buffer.extend(steps)
+    buffer.end_rows()
     kept = "those of whole episodes that keep the limits" if node.safe_episodes else "all"
     return f"Learning from {taken:,} of {number:,} transitions in {node.path}: {kept}."
 
 
 def _check(
-    steps: TensorDictBase, node: DictConfig, memory: Memory, env: EnvBase, actions: TensorSpec
+    steps: TensorDictBase, node: DictConfig, buffer: Memory, env: EnvBase, actions: TensorSpec
 ) -> None:
     """Refuse transitions of another environment, or without an entry that the loss reads."""
-    if missing := [_name(key) for key in memory.in_keys if key not in steps.keys(True)]:
+    if missing := [_name(key) for key in buffer.in_keys if key not in steps.keys(True)]:
         raise ValueError(
             f"dataset.path={node.path} has no {', '.join(missing)}, which is learned from."
         )

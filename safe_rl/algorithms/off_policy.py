@@ -21,7 +21,7 @@ from safe_rl.algorithms.build_part import (
     constrained_limits,
 )
 from safe_rl.algorithms.constraints import Constraints
-from safe_rl.algorithms.dataset import begin_memory
+from safe_rl.algorithms.dataset import fill_replay_buffer
 from safe_rl.algorithms.off_policy_networks import (
     bounded_actions,
     build_networks,
@@ -59,7 +59,7 @@ class OffPolicy(Resumable, Algorithm, Recipe):
         networks: Actor, critic and, with constraints, cost critic.
         constraints: Costs, limits and multiplier. Multipliers follow the undiscounted costs of
             episodes, not the discounted critics.
-        memory: The replay buffer.
+        replay_buffer: The replay buffer.
         policy_update: Trains all networks on minibatches.
         random_steps: Environment steps with random actions at the beginning. Learning begins when
             the replay buffer has this many transitions; 0 if nothing is collected.
@@ -77,7 +77,7 @@ class OffPolicy(Resumable, Algorithm, Recipe):
     policy: ExploringPolicy
     networks: Mapping[str, nn.Module]
     constraints: Constraints
-    memory: Memory
+    replay_buffer: Memory
     policy_update: ReplayUpdate
     random_steps: int
     steps_per_decision: int = 1
@@ -115,21 +115,21 @@ class OffPolicy(Resumable, Algorithm, Recipe):
             cost_limits=limits,
         )
         _check_risk(config, constraints, loss)
-        memory: Memory = build_part(
+        buffer: Memory = build_part(
             config.memory,
             in_keys=loss.in_keys,
             reward_keys=["reward", *constraints.keys],
             reward_gamma=config.loss.get("gamma", 1.0),
             device=device,
         )
-        learns_from, collects = begin_memory(config, memory, env)
+        learns_from, collects = fill_replay_buffer(config, buffer, env)
         random_steps = setting(config, "exploration.random_steps") if collects else 0
-        _check_room(memory, random_steps // env.steps_per_decision, collects)
+        _check_room(buffer, random_steps // env.steps_per_decision, collects)
         return cls(
             policy=exploring(networks["actor"], env, setting(config, "exploration.noise")),
             networks=networks,
             constraints=constraints,
-            memory=memory,
+            replay_buffer=buffer,
             policy_update=build_update(config.policy_update, ReplayUpdate, loss=loss),
             random_steps=random_steps,
             steps_per_decision=env.steps_per_decision,
@@ -148,10 +148,10 @@ class OffPolicy(Resumable, Algorithm, Recipe):
     @property
     def lost_on_resume(self) -> str:
         """A sentence on the state that a checkpoint does not have; empty if it has all of it."""
-        if self.memory.keeps or not self.collects:
+        if self.replay_buffer.keeps or not self.collects:
             return ""
         resumes = f"resumes when it holds {self.random_steps:,} new ones"
-        if len(self.memory):
+        if len(self.replay_buffer):
             resumes = "resumes with those of the dataset alone"
         return (
             "The transitions in its replay buffer are not stored (memory.keep=false): learning "
@@ -181,14 +181,14 @@ class OffPolicy(Resumable, Algorithm, Recipe):
             self.policy_update.loss.measure(batch["next", "reward"])
         bias = self.policy_update.loss.cost_bias(batch)
         if self.collects:
-            self.memory.extend(batch)
+            self.replay_buffer.extend(batch)
         steps = batch.numel() * self.steps_per_decision
         self._count_steps(steps)
-        needed = max(self.random_steps // self.steps_per_decision, self.memory.batch_size)
-        number = self.policy_update.due(steps) if len(self.memory) >= needed else 0
+        needed = max(self.random_steps // self.steps_per_decision, self.replay_buffer.batch_size)
+        number = self.policy_update.due(steps) if len(self.replay_buffer) >= needed else 0
         row = constraints.columns()
         row |= {} if bias is None else constraints.column("critic_bias", bias)
-        for name, value in self.policy_update(self.memory, number).items():
+        for name, value in self.policy_update(self.replay_buffer, number).items():
             row |= constraints.column(f"policy_{name}", value)
         return row
 
@@ -198,7 +198,7 @@ class OffPolicy(Resumable, Algorithm, Recipe):
 
     def forget_open_episodes(self) -> None:
         """End n-step sums: the next steps belong to new episodes."""
-        self.memory.end_rows()
+        self.replay_buffer.end_rows()
 
     def _count_steps(self, steps: int) -> None:
         self.steps += steps
@@ -216,23 +216,23 @@ class OffPolicy(Resumable, Algorithm, Recipe):
             "multiplier": self.constraints.multiplier,
             "policy_update": self.policy_update,
             "algorithm": self,
-            **self.memory.components(),
+            **self.replay_buffer.components(),
         }
         return {name: part for name, part in parts.items() if part is not None}
 
 
-def _check_room(memory: Memory, random_steps: int, collects: bool) -> None:
+def _check_room(buffer: Memory, random_steps: int, collects: bool) -> None:
     """Refuse a replay buffer that is too small for learning to begin."""
-    size = memory.batch_size
+    size = buffer.batch_size
     needed = f"a minibatch of {size} (memory.batch_size), or nothing is ever learned."
-    if not collects and size > len(memory):
+    if not collects and size > len(buffer):
         raise ValueError(
-            f"dataset.alone=true: the replay buffer holds {len(memory):,} transitions of the "
+            f"dataset.alone=true: the replay buffer holds {len(buffer):,} transitions of the "
             f"dataset and gets no others. It must hold {needed}"
         )
-    if max(random_steps, size) > memory.capacity:
+    if max(random_steps, size) > buffer.capacity:
         raise ValueError(
-            f"memory.capacity={memory.capacity}: it must hold "
+            f"memory.capacity={buffer.capacity}: it must hold "
             f"exploration.random_steps={random_steps} transitions and {needed}"
         )
 

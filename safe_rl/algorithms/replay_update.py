@@ -98,7 +98,7 @@ class ReplayUpdate(Checked):
         self._counts["owed"] = owed - int(owed)
         return int(owed)
 
-    def __call__(self, memory: Memory, number: int) -> dict[str, Tensor]:
+    def __call__(self, buffer: Memory, number: int) -> dict[str, Tensor]:
         """Take a number of gradient steps.
 
         Returns:
@@ -108,13 +108,13 @@ class ReplayUpdate(Checked):
         names = self.loss.out_keys
         nothing = torch.zeros((), device=self._device)
         sums, counts = nothing.repeat(len(names)), dict.fromkeys(names, 0)
-        for minibatch in memory.minibatches(number):
+        for minibatch in buffer.minibatches(number):
             with_actor = self._counts["updates"] % self.policy_delay == 0
             total, losses = self._evaluate(minibatch, with_actor)
             if not total.isfinite():
                 raise divergence(losses)
             self._step(total, with_actor)
-            memory.learned(minibatch, self.loss.priority_key)
+            buffer.learned(minibatch, self.loss.priority_key)
             with torch.no_grad():
                 values = dict(losses.items())
                 sums += torch.stack([_mean(values.get(name, nothing)) for name in names])

@@ -12,11 +12,11 @@ from torchrl.data import Composite, TensorSpec
 
 from safe_rl.models.encoders import (
     FEATURES,
-    MEMORY,
+    RECURRENT,
     TO_FLATTEN,
     Body,
-    GatedMemory,
     Observed,
+    RecurrentLayer,
     observed_entries,
 )
 from safe_rl.models.heads import AUTO, Head, make_head
@@ -62,19 +62,19 @@ def build_networks(
             "model=mlp, or an environment with pictures, such as env=PointGoal1Vision."
         )
     widths = list(model["hidden_sizes"])
-    remembered = model["memory"]["size"] if model.get("memory") else 0
-    if remembered and MEMORY not in observation_spec.keys():  # noqa: SIM118, a spec is no mapping
+    recurrent_size = model["memory"]["size"] if model.get("memory") else 0
+    if recurrent_size and RECURRENT not in observation_spec.keys():  # noqa: SIM118, a spec is no mapping
         raise ValueError(
             "A recurrent policy needs the transform that keeps its state between steps: choose "
             "model=gru instead of setting model.memory alone."
         )
     kind, log_std = model.get("head") or AUTO, model["initial_log_std"]
     head = make_head(kind, action_spec, initial_log_std=log_std, device=device)
-    actor = _actor(observed, head, widths, remembered, device)
+    actor = _actor(observed, head, widths, recurrent_size, device)
 
     def critic(num_outputs: int, out_key: str) -> TensorDictModule:
-        body = _body(observed, num_outputs, widths, remembered, device)
-        in_keys = [*observed.keys, MEMORY] if remembered else observed.keys
+        body = _body(observed, num_outputs, widths, recurrent_size, device)
+        in_keys = [*observed.keys, RECURRENT] if recurrent_size else observed.keys
         return TensorDictModule(body, in_keys=in_keys, out_keys=[out_key])
 
     networks: dict[str, Any] = {"actor": actor, "critic": critic(1, "state_value")}
@@ -87,11 +87,11 @@ def _actor(
     observed: Observed,
     head: Head,
     widths: Sequence[int],
-    remembered: int,
+    recurrent_size: int,
     device: torch.device,
 ) -> ProbabilisticTensorDictSequential:
     """Hidden layers to the head; or a recurrent layer after them, and a linear one to the head."""
-    if not remembered:
+    if not recurrent_size:
         body = _body(observed, head.num_outputs, widths, 0, device)
         return assemble_actor(body, head, in_keys=observed.keys)
     if not widths:
@@ -101,9 +101,9 @@ def _actor(
     encoder = Chain(_body(observed, widths[-1], widths[:-1], 0, device), Tanh())
     before: list[TensorDictModuleBase] = [
         TensorDictModule(encoder, in_keys=observed.keys, out_keys=[FEATURES]),
-        GatedMemory(widths[-1], remembered, device=device),
+        RecurrentLayer(widths[-1], recurrent_size, device=device),
     ]
-    body = perceptron(remembered, head.num_outputs, [], None, device)
+    body = perceptron(recurrent_size, head.num_outputs, [], None, device)
     return assemble_actor(body, head, in_keys=[FEATURES], before=before)
 
 
@@ -111,10 +111,10 @@ def _body(
     observed: Observed,
     num_outputs: int,
     widths: Sequence[int],
-    remembered: int,
+    recurrent_size: int,
     device: torch.device,
 ) -> nn.Module:
-    """From what is observed, and remembered, to outputs: a perceptron where that will do."""
+    """From observations and the recurrent state to outputs: a perceptron where that will do."""
     first = observed.entries[0]
     if observed.encoders is None and not observed.is_vector:
         pictures = any(len(entry.shape) == 3 for entry in observed.entries)
@@ -123,9 +123,9 @@ def _body(
             f"This environment observes {', '.join(map(str, observed.entries))}, and model=mlp "
             f"takes one vector: use {advice}, or {TO_FLATTEN}."
         )
-    if observed.encoders is not None or remembered:
+    if observed.encoders is not None or recurrent_size:
         plain = observed._replace(encoders=observed.encoders or _AS_IT_IS)
-        return Body(plain, num_outputs, widths, extra=remembered, device=device)
+        return Body(plain, num_outputs, widths, extra=recurrent_size, device=device)
     size = first.shape[0]
     if observed.clip is None:
         scale = input_scale_vector(observed.input_scale, observed.layout)

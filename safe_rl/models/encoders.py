@@ -16,8 +16,8 @@ from safe_rl.models.input_scales import InputScale, RunningScale, input_scale_ve
 from safe_rl.models.networks import Tanh, perceptron
 
 __all__ = [
-    *("FEATURES", "FIRST", "MEMORY", "TO_FLATTEN", "Body", "Entry", "GatedMemory", "Observed"),
-    "observed_entries",
+    *("FEATURES", "FIRST", "RECURRENT", "TO_FLATTEN", "Body", "Entry", "Observed"),
+    *("RecurrentLayer", "observed_entries"),
 ]
 
 
@@ -200,10 +200,10 @@ def _blank(entry: Entry, device: torch.device | None) -> Tensor:
     return torch.zeros(1, *entry.shape, device=device)
 
 
-FEATURES, MEMORY, FIRST = "features", "memory", "is_init"
+FEATURES, RECURRENT, FIRST = "features", "memory", "is_init"
 
 
-class GatedMemory(TensorDictModuleBase):
+class RecurrentLayer(TensorDictModuleBase):
     """Gated recurrent units (Cho et al. 2014) between the features of a network.
 
     A batch [N] is a step of N environments: the new state goes to ``("next", "memory")`` and
@@ -218,21 +218,21 @@ class GatedMemory(TensorDictModuleBase):
     Examples:
         >>> import torch
         >>> from tensordict import TensorDict
-        >>> memory = GatedMemory(3, 4)
+        >>> layer = RecurrentLayer(3, 4)
         >>> steps = TensorDict(
         ...     features=torch.ones(2, 5, 3),
         ...     memory=torch.zeros(2, 5, 4),
         ...     is_init=torch.zeros(2, 5, 1, dtype=torch.bool),
         ...     batch_size=[2, 5],
         ... )
-        >>> memory(steps)["features"].shape
+        >>> layer(steps)["features"].shape
         torch.Size([2, 5, 4])
     """
 
     def __init__(self, num_features: int, size: int, *, device: torch.device | None = None) -> None:
         super().__init__()
-        self.in_keys = [FEATURES, MEMORY, FIRST]
-        self.out_keys = [FEATURES, ("next", MEMORY)]
+        self.in_keys = [FEATURES, RECURRENT, FIRST]
+        self.out_keys = [FEATURES, ("next", RECURRENT)]
         self.recurrent = GRUModule(
             num_features,
             size,
@@ -244,12 +244,12 @@ class GatedMemory(TensorDictModuleBase):
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Replace the features; after a single step also write the new state."""
         inputs = {key: tensordict.get(key) for key in self.in_keys}
-        inputs[MEMORY] = inputs[MEMORY].unsqueeze(-2)  # of its one layer
+        inputs[RECURRENT] = inputs[RECURRENT].unsqueeze(-2)  # of its one layer
         steps = TensorDict(inputs, batch_size=tensordict.batch_size)
         is_sequence = tensordict.ndim > 1
         with set_recurrent_mode(is_sequence):
             self.recurrent(steps)
         tensordict.set(FEATURES, steps.get(FEATURES))
         if not is_sequence:
-            tensordict.set(("next", MEMORY), steps.get(("next", MEMORY)).squeeze(-2))
+            tensordict.set(("next", RECURRENT), steps.get(("next", RECURRENT)).squeeze(-2))
         return tensordict

@@ -59,10 +59,7 @@ def test_it_writes_a_run(algo, make_trainer, tmp_path):
     [
         ["algo=sac_lagrangian"],
         ["algo=td3_lagrangian", "memory.n_steps=3", "lagrangian=adam"],
-        [
-            *("algo=sac_lagrangian", "memory.storage=memmap", "memory.capacity=300"),
-            "limits/replay@limits=paper",
-        ],
+        ["algo=sac_lagrangian", "memory.capacity=300", "limits/replay@limits=paper"],
         ["algo=sac_lagrangian", "cost_limits={cost_hazards: 1, cost_north: 2}", "lagrangian=pid"],
         ["algo=wcsac", "risk.window=9"],
         ["algo=cal", "lagrangian=pid"],
@@ -151,8 +148,8 @@ def test_sums_over_steps_end_where_a_resumed_run_begins_new_episodes(tmp_path):
     assert resumed.resume()
     resumed.epoch(resumed.batches())
     # the last three of the first 40 steps in a row end there, the last three of all are kept back
-    assert len(resumed.algorithm.memory) == 4 * (40 + 37)
-    spanned = resumed.algorithm.memory.state_dict()["steps"]["steps_to_next_obs"].flatten()
+    assert len(resumed.algorithm.replay_buffer) == 4 * (40 + 37)
+    spanned = resumed.algorithm.replay_buffer.state_dict()["steps"]["steps_to_next_obs"].flatten()
     assert spanned[4 * 37 : 4 * 40].tolist() == [3, 2, 1] * 4
 
 

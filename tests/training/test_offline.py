@@ -1,7 +1,5 @@
 """Learning from a dataset: what is taken of it, what is cloned, and what does not fit."""
 
-import warnings
-
 import numpy as np
 import pytest
 import torch
@@ -84,7 +82,7 @@ def test_what_is_cloned_are_the_safe_episodes(tmp_path):
     table = read_table(tmp_path / "run" / "progress.csv")
     assert table["policy_loss_actor"][-1] < 0.01 < table["policy_loss_actor"][0]
     assert table["policy_num_updates"] == [160] * 8
-    assert len(trainer.algorithm.memory) == 160  # nothing of what it did itself
+    assert len(trainer.algorithm.replay_buffer) == 160  # nothing of what it did itself
 
 
 def test_it_resumes_as_if_it_had_never_stopped(tmp_path):
@@ -108,8 +106,8 @@ def test_a_run_that_is_recorded_can_be_learned_from(algo, tmp_path):
     )
     clone.run()
     # rows begin at different points of their first episode: only whole ones are taken
-    assert 0 < len(clone.algorithm.memory) <= 480
-    actions = torch.cat(list(clone.algorithm.memory.minibatches(4)))["action"]
+    assert 0 < len(clone.algorithm.replay_buffer) <= 480
+    actions = torch.cat(list(clone.algorithm.replay_buffer.minibatches(4)))["action"]
     assert actions.abs().max() <= 1
 
 
@@ -178,18 +176,18 @@ def test_any_algorithm_may_begin_with_a_dataset(tmp_path):
     data = record(tmp_path / "data", head_north, head_south)
     keys = ["exploration.random_steps=0", "policy_update.updates_per_step=0.05", "memory.n_steps=3"]
     trainer = make_trainer(offline_config(data, *keys, algo="sac"), tmp_path / "run")
-    assert len(trainer.algorithm.memory) == 320
-    before = len(trainer.algorithm.memory)
+    assert len(trainer.algorithm.replay_buffer) == 320
+    before = len(trainer.algorithm.replay_buffer)
     trainer.epoch(trainer.batches())
     # the last three of each row wait for what follows them
-    assert len(trainer.algorithm.memory) == before + 4 * 37
+    assert len(trainer.algorithm.replay_buffer) == before + 4 * 37
     assert "dataset alone" in trainer.algorithm.lost_on_resume
     alone = make_trainer(
         offline_config(data, *keys, "dataset.alone=true", algo="sac_lagrangian"), tmp_path / "alone"
     )
     row = alone.epoch(alone.batches())
     assert row["policy_num_updates"] == 8
-    assert len(alone.algorithm.memory) == before
+    assert len(alone.algorithm.replay_buffer) == before
 
 
 def test_the_loss_is_the_mean_squared_difference():
@@ -279,9 +277,3 @@ def test_costs_that_a_dataset_lacks_are_named(tmp_path):
         OffPolicy.build(offline_config(folder, limits=limits), PointMass(2))
     with pytest.raises(ValueError, match="has no cost_north, which is learned from"):
         OffPolicy.build(offline_config(folder, algo="sac_lagrangian", limits=limits), PointMass(2))
-
-
-def test_the_loss_of_cloning_warns_of_nothing():
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        BCLoss(make_bounded_actor(3, -torch.ones(2), torch.ones(2), hidden_sizes=[8]))

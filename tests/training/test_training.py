@@ -90,21 +90,6 @@ def test_a_resumed_run_continues_as_if_it_had_never_stopped(tmp_path):
     assert_resumes_exactly(make, tmp_path, "frames=640")
 
 
-def test_the_best_of_a_resumed_run_is_that_of_a_whole_one(tmp_path):
-    whole, halves = tmp_path / "whole", tmp_path / "halves"
-    options = ("limits=paper", "cost_limits={cost: 1000}", "checkpoint.keep_best=8")
-    train(whole, *options)
-    train(halves, *options, "frames=640")
-    resumed = point_mass_trainer(halves, *options)
-    assert resumed.resume()
-    resumed.run()
-    names = [
-        [path.name for path in sorted((run / "checkpoints" / "best").iterdir())]
-        for run in (whole, halves)
-    ]
-    assert names[0] == names[1]
-
-
 def best_of(folder):
     """Scores of the best checkpoints by name."""
     found = checkpoints_in(folder / "checkpoints/best")

@@ -201,12 +201,3 @@ def test_an_evaluation_returns_the_reward_of_the_environment(command):
     assert result.estimates["episode_cost"].value > 0
     assert abs(read_table(Path("run/progress.csv"))["episode_return"][-1]) < 100
     assert abs(result.estimates["episode_return"].value) < 100
-
-
-def test_names_that_are_not_there_are_refused(command):
-    said, *_ = command("transforms=[saut]")
-    assert "there is no transforms 'saut'. Did you mean 'saute'?" in said
-    said, *_ = command("transforms=[saute]", "transforms.saute.discont=0.9")
-    assert "transforms.saute.discount" in said
-    said, *_ = command("transforms=[saute]", "transforms.saute.discount=2")
-    assert "transforms.saute.discount=2: it must be a number above 0" in said
