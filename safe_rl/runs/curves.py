@@ -163,8 +163,8 @@ def moving_mean(values: np.ndarray, width: int) -> np.ndarray:
         >>> moving_mean(np.array([1.0, 3.0, 5.0, 7.0, 9.0, 11.0]), 5).tolist()
         [1.0, 2.0, 3.0, 4.0, 5.0, 7.0]
     """
-    # differences of running sums would lose precision after one huge value
-    sums = np.zeros(len(values))
-    for back in range(min(width, len(values))):
-        sums[back:] += values[: len(values) - back]
+    if not len(values):
+        return values
+    # not by differences of running sums, which would lose precision after one huge value
+    sums = np.convolve(values, np.ones(width))[: len(values)]
     return sums / np.minimum(np.arange(1, len(values) + 1), width)

@@ -49,14 +49,12 @@ class ProgressBar:
             smoothing=0.1, **options,
         )  # fmt: skip
         self._limits, self._episode_length = limits, episode_length
-        self._before: Mapping[str, float] | None = None
 
     def add(self, row: Mapping[str, float]) -> None:
         """Show an epoch, by columns of the table."""
-        figures = shown(row, self._limits, self._before, self._episode_length)
+        figures = shown(row, self._limits, self._episode_length)
         self._bar.set_postfix(figures, refresh=False)
         self._bar.update(int(row["steps"]) - self._bar.n)
-        self._before = row
         if monotonic() - self._printed >= self._seconds:
             self._printed = monotonic()
             words = [f"{row['steps'] / self._bar.total:.0%} of {self._bar.total:,} steps"]
@@ -72,18 +70,16 @@ class ProgressBar:
 def shown(
     row: Mapping[str, float],
     limits: Mapping[str, float],
-    before: Mapping[str, float] | None = None,
     episode_length: int = _RATE_STEPS,
 ) -> dict[str, str]:
     """Figures of an epoch for the bar: return, costs against their present limits, and λ.
 
-    Means of the episodes that ended in the epoch; without one, return and costs of the epoch per
-    1,000 steps. While the limit comes down, "target" stands before its present value.
+    Means of the episodes that ended in the epoch; without one, return and costs of all steps so far
+    per 1,000 steps. While the limit comes down, "target" stands before its present value.
 
     Args:
         row: Of a run's table, by column.
         limits: Cost key -> d, undiscounted cost per episode.
-        before: The row of the epoch before; None takes rates over all steps so far.
         episode_length: Largest number of steps of an episode, by which a limit is a rate.
 
     Examples:
@@ -100,8 +96,8 @@ def shown(
     if math.isnan(row["episode_return"]):
         unit, scale = f" per {_RATE_STEPS:,} steps", _RATE_STEPS / episode_length
         if "reward_rate" in row:
-            figures[f"return{unit}"] = f"{_rate(row, before, 'reward'):.2f}"
-        values = {key: _rate(row, before, key) for key in costs}
+            figures[f"return{unit}"] = f"{_RATE_STEPS * row['reward_rate']:.2f}"
+        values = {key: _RATE_STEPS * row[f"{key}_rate"] for key in costs}
     else:
         unit, scale = "", 1.0
         figures["return"] = f"{row['episode_return']:.2f}"
@@ -112,14 +108,6 @@ def shown(
     if multipliers:
         figures["λ"] = " ".join(f"{value:.3g}" for value in multipliers)
     return figures
-
-
-def _rate(row: Mapping[str, float], before: Mapping[str, float] | None, key: str) -> float:
-    """Rate of an epoch per 1,000 steps, from the means over all steps so far."""
-    total, steps = row[f"{key}_rate"] * row["steps"], row["steps"]
-    if before is not None:
-        total, steps = total - before[f"{key}_rate"] * before["steps"], steps - before["steps"]
-    return _RATE_STEPS * total / steps
 
 
 def _present_limit(

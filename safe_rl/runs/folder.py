@@ -262,8 +262,8 @@ def lock_folder(folder: RunFolder) -> Iterator[None]:
     check_no_links(folder.directory)
     # One object per file, so that this process can lock it several times. Without the fallback: its
     # file would stay when a process of another machine is killed, whose run could not be continued.
-    options = {"thread_local": False, "is_singleton": True, "fallback_to_soft": False}
-    lock = FileLock(folder.lock.resolve(), blocking=False, **options)
+    place = folder.lock.resolve()
+    lock = FileLock(place, 0, thread_local=False, is_singleton=True, fallback_to_soft=False)
     with ExitStack() as stack:
         try:
             stack.enter_context(lock)

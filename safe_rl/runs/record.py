@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import os
 import subprocess
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -23,10 +22,6 @@ from safe_rl.runs.table import TableWriter, read_table
 from safe_rl.targets import build
 
 __all__ = ["RunRecord", "code_of", "commit_of", "note_code"]
-
-# a Git hook sets these: they would name another checkout, or an index to write into
-_CLEARED = ("GIT_DIR", "GIT_WORK_TREE", "GIT_INDEX_FILE")
-_PATIENCE = 5.0  # seconds
 
 
 class RunRecord:
@@ -223,14 +218,13 @@ def commit_of(file: Path) -> tuple[str | None, bool | None]:
 
 def _git(directory: Path, *arguments: str) -> str:
     """The answer of Git without its newline; empty if there is none."""
-    environment = {name: value for name, value in os.environ.items() if name not in _CLEARED}
+    # without locks, which would be in the way of what the user does with Git meanwhile
+    command = ["git", "--no-optional-locks", *arguments]
     try:
         result = subprocess.run(
-            ["git", *arguments],
-            cwd=directory, env={**environment, "GIT_OPTIONAL_LOCKS": "0"}, timeout=_PATIENCE,
-            stdin=subprocess.DEVNULL, capture_output=True, text=True, check=True,
-        )  # fmt: skip
-    except (OSError, subprocess.SubprocessError, UnicodeDecodeError):
+            command, cwd=directory, timeout=5.0, capture_output=True, text=True, check=True
+        )
+    except (OSError, subprocess.SubprocessError):
         return ""
     return result.stdout.strip()
 

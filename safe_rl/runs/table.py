@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import csv
 import math
-import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -33,8 +32,7 @@ class TableWriter:
 
     Raises:
         TableError: If there are fewer rows than are to be kept, or one cannot be read; by
-            :meth:`write`, if a row's columns differ from the first one's, or the file has been
-            changed meanwhile.
+            :meth:`write`, if a row's columns differ from the first one's.
 
     Examples:
         >>> import tempfile
@@ -53,7 +51,6 @@ class TableWriter:
         # replaced atomically: a run killed here still has its table
         replace_text(path, "".join(kept))
         self._file = path.open("a", newline="")
-        self._path, self._size = path, self._file.tell()
         self._writer = csv.writer(self._file, lineterminator="\n")
 
     def write(self, row: Mapping[str, float]) -> None:
@@ -72,14 +69,8 @@ class TableWriter:
         self._append([_field(value) for value in row.values()])
 
     def _append(self, fields: Sequence[str]) -> None:
-        if os.fstat(self._file.fileno()).st_size != self._size:
-            raise TableError(
-                f"{self._path} has been changed by another program while the run was writing it: "
-                "put its rows back to continue the run."
-            )
         self._writer.writerow(fields)
         self._file.flush()
-        self._size = self._file.tell()
 
     def close(self) -> None:
         """Close the file."""

@@ -87,12 +87,3 @@ def test_a_table_that_was_changed_is_told_in_a_line(change, message, tmp_path):
 
     with pytest.raises(TableError, match=message):
         go_on()
-
-
-def test_a_table_that_is_changed_while_it_is_written_is_told(tmp_path):
-    path = tmp_path / "progress.csv"
-    with TableWriter(path) as table:
-        table.write({"epoch": 1})
-        path.write_bytes(b"")
-        with pytest.raises(TableError, match="changed by another program"):
-            table.write({"epoch": 2})
