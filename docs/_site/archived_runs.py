@@ -8,7 +8,8 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-from safe_rl.reporting.recorded import Run, find_runs
+from safe_rl.reporting.archive import find_runs
+from safe_rl.reporting.recorded import Run
 from safe_rl.runs.identity import experiment_of
 
 Rows = list[dict[str, float]]

@@ -16,10 +16,10 @@ from matplotlib.ticker import MultipleLocator
 from PIL import Image
 
 from safe_rl.cli.report import suite
+from safe_rl.reporting.archive import find_runs
 from safe_rl.reporting.curves import draw_experiment, draw_learning_curves, limits_of, set_axes
 from safe_rl.reporting.experiments import Experiment, group_runs
 from safe_rl.reporting.figures import LIMIT_STYLE, add_legend, algorithm_styles, save
-from safe_rl.reporting.recorded import find_runs
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -74,7 +74,7 @@ def draw_columns(experiments: list[Experiment]) -> Figure:
     for axes, name in zip(panels.T, names, strict=True):
         shown = [e for e in experiments if e.environment == name]
         for experiment in shown:
-            draw_experiment(experiment, "cost", axes, styles[experiment.algorithm])
+            draw_experiment(experiment, "cost", axes, styles[experiment.label])
         set_axes(axes)
         for axis, height in limits_of(shown, "cost", axes):
             axis.axhline(height, **LIMIT_STYLE)

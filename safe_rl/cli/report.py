@@ -14,7 +14,7 @@ from safe_rl.envs.safety_gym.suite import SUITE, resolve
 from safe_rl.evaluation.settings import option
 from safe_rl.files import check_place
 from safe_rl.reporting import Report, build_report, write_report
-from safe_rl.reporting.recorded import archive_runs
+from safe_rl.reporting.archive import archive_runs
 from safe_rl.reporting.tables import clean
 from safe_rl.scores.benchmark import SEEDS, Suite
 

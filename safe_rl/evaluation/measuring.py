@@ -30,7 +30,7 @@ from safe_rl.files import check_no_links, check_place, replace_csv, replace_json
 from safe_rl.runs.folder import RunFolder, checkpoint_steps
 from safe_rl.scores.benchmark import Scores, Suite
 from safe_rl.scores.comparisons import LEVEL, Estimate, cvar, mean, share_over
-from safe_rl.scores.measures import normalised_return, normalised_violation
+from safe_rl.scores.measures import normalise
 
 __all__ = [
     *("Evaluation", "Trial", "check_places", "evaluate", "format_estimates", "format_unjudged"),
@@ -266,12 +266,13 @@ def summarise(
         if key in cost_limits:
             estimates[f"over_limit_{key}"] = share_over(costs, cost_limits[key])
     if reference is not None:
-        scores = {"return": normalised_return(estimates["episode_return"], reference)}
-        if "cost" in cost_limits:
-            # monotone in J_c, so the interval's ends are those of J_c
-            cost, limit = estimates["episode_cost"], cost_limits["cost"]
-            scores["violation"] = normalised_violation(cost, limit, reference)
-        estimates |= {f"normalised_{n}": Estimate(*map(float, v)) for n, v in scores.items()}
+        # monotone in J_r and J_c, so the intervals' ends are those of J_r and J_c
+        returns, costs = estimates["episode_return"], estimates["episode_cost"]
+        limit = cost_limits.get("cost", math.nan)
+        scores = normalise(returns, costs, math.nan, limit=limit, reference=reference)
+        shown = ("return", "violation") if "cost" in cost_limits else ("return",)
+        for name, ends in zip(shown, scores, strict=False):
+            estimates[f"normalised_{name}"] = Estimate(*map(float, ends))
     return estimates
 
 

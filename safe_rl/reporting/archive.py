@@ -1,57 +1,141 @@
-"""What runs have recorded, and archives of it.
+"""Runs found below a folder: in folders of their own, and in archives.
 
 An archive has two files: ``runs.json.gz`` with a line per run, its configuration and its notes, and
-``rows.csv.gz`` with the epochs of all runs, with the run in the first column.
-
-Notes are what a run wrote beside its table: its command, certificate, evaluations and code. Their
-readers raise an error for whatever a note has instead of what it should.
+``rows.csv.gz`` with the epochs of all runs, with the run in the first column. What cannot be read
+is left out with a reason.
 """
 
 from __future__ import annotations
 
 import gzip
 import json
-import math
 import os
-import shlex
 from collections import defaultdict
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 from safe_rl.extras import import_extra
-from safe_rl.files import replacing
+from safe_rl.files import read_config, read_json, read_yaml, replacing
+from safe_rl.reporting.recorded import Run, read_certificate, read_code, read_evaluation, select
 from safe_rl.reporting.tables import clean
-from safe_rl.runs.folder import checkpoint_steps
+from safe_rl.runs.folder import RunFolder, paths_below, runs_below
+from safe_rl.runs.table import read_table
 
-__all__ = [
-    *("ROWS", "RUNS", "Recorded", "command_of", "read_archive", "read_certificate", "read_code"),
-    *("read_evaluation", "select", "without_places", "write_archive"),
-]
+__all__ = ["ROWS", "RUNS", "archive_runs", "find_runs", "read_archive", "write_archive"]
 
 RUNS, ROWS = "runs.json.gz", "rows.csv.gz"
 
 
-class Recorded(NamedTuple):
-    """What a run has recorded, unchecked.
+def find_runs(root: Path, *, unfinished: bool = False) -> tuple[list[Run], dict[Path, str]]:
+    """Find every run below a folder, in folders of their own and in archives.
 
-    Attributes:
-        config: Its configuration, resolved.
-        table: Columns of its table, a number per epoch.
-        notes: ``overrides``, ``certificate``, ``code`` and the like, as its files have them.
+    Args:
+        root: The folder.
+        unfinished: Whether runs count as finished that have not come to their configured end.
+
+    Returns:
+        Runs that have finished an epoch, and folder or file -> why it was left out.
+
+    Raises:
+        FileNotFoundError: If there is no such folder, or no run in it.
     """
+    if not root.is_dir():
+        raise FileNotFoundError(f"There is no folder '{root}': give the folder of the runs.")
+    found: list[Run] = []
+    skipped: dict[Path, str] = {}
+    for path in paths_below(root, RUNS):
+        with _noted(path, skipped):
+            found += read_archive(path.parent).values()
+    for folder in runs_below(root):
+        with _noted(folder.directory, skipped):
+            found.append(_read_run(folder, skipped))
+    runs = []
+    for run in found:
+        with _noted(run.directory, skipped):
+            run.check()
+            runs.append(replace(run, takes_part=unfinished))
+    if not runs:
+        reasons = "".join(f"\n  {clean(path)}: {reason}" for path, reason in skipped.items())
+        raise FileNotFoundError(
+            f"There is no run to report below '{root}': a run is a folder with config.yaml and "
+            f"progress.csv, as train.py writes it.{reasons}"
+        )
+    return sorted(runs, key=lambda run: run.directory), skipped
 
-    config: Mapping[str, Any]
-    table: Mapping[str, list[float]]
-    notes: Mapping[str, Any]
+
+@contextmanager
+def _noted(path: Path, skipped: dict[Path, str]) -> Iterator[None]:
+    """Note why something is left out; everything else is reported."""
+    try:
+        yield
+    except Exception as error:  # files of anybody may hold anything
+        is_told = isinstance(error, ValueError | OSError)
+        reason = error if is_told else f"{path.name} is not as a run writes it ({error!r})"
+        skipped[path] = clean(reason)
 
 
-def write_archive(runs: Mapping[str, Recorded], folder: Path) -> None:
+def _read_run(folder: RunFolder, skipped: dict[Path, str]) -> Run:
+    """What a run's folder holds; notes that cannot be read are left out."""
+
+    def read(path: Path, check: Callable[[Any], object] = bool) -> Any:
+        """What a file holds that passes a check; None of any other."""
+        with _noted(path, skipped):
+            if path.exists():
+                content = (read_json if path.suffix == ".json" else read_yaml)(path)
+                check(content)
+                return content
+        return None
+
+    config = read_config(folder.config)
+    if not folder.table.exists():
+        raise ValueError("it has not begun: no progress.csv")
+    table = read_table(folder.table)
+    runtime = select(read(folder.surroundings), "hydra", "runtime")
+    start, sources = select(runtime, "cwd"), select(runtime, "config_sources") or ()
+    # of --config-dir, and of Python's config_dir
+    directories = [s["path"] for s in sources if s["provider"].endswith("command-line")]
+    before = select(read(folder.composed), "frames")
+    notes = {
+        "overrides": read(folder.overrides),
+        # as a person would type them where the run was started
+        "config_dirs": [os.path.relpath(p, start) if start else p for p in directories],
+        "frames_before": before if before != config.get("frames") else None,
+        "certificate": read(folder.certificate, read_certificate),
+        "code": read(folder.code, read_code),
+        "evaluations": [
+            {key: value for key, value in found.items() if key not in ("run", "checkpoint_file")}
+            for path in folder.evaluations()
+            if (found := read(path, read_evaluation))
+        ],
+    }
+    kept = {name: value for name, value in notes.items() if value}
+    return Run(folder.directory, config, table, kept)
+
+
+def archive_runs(runs: Iterable[Run], root: Path, archive: Path) -> None:
+    """Add runs to an archive, or bring them up to date in it, each by its path below ``root``.
+
+    Raises:
+        ValueError: If the archive is among the runs or they in it, or is no archive.
+        OSError: If it cannot be read or written.
+    """
+    here, there = root.resolve(), archive.resolve()
+    if here.is_relative_to(there) or there.is_relative_to(here):
+        raise ValueError(f"archive={archive}: it takes a folder beside {root}, not one within.")
+    kept = read_archive(archive) if (archive / RUNS).exists() else {}
+    names = {run.directory.resolve().relative_to(here).as_posix(): run for run in runs}
+    write_archive(kept | names, archive)
+
+
+def write_archive(runs: Mapping[str, Run], folder: Path) -> None:
     """Write runs by their names; the same runs make the same bytes.
 
     Examples:
         >>> folder, table = getfixture("tmp_path"), {"steps": [1000.0, 2000.0]}
-        >>> run = Recorded({"seed": 0, "model": {"width": 64}}, table, {"overrides": ["seed=0"]})
+        >>> run = Run(folder / "a/seed0", {"model": {"width": 64}}, table, {"code": []})
         >>> write_archive({"a/seed0": run}, folder)
         >>> read_archive(folder)["a/seed0"] == run
         True
@@ -63,122 +147,36 @@ def write_archive(runs: Mapping[str, Recorded], folder: Path) -> None:
     lines = [f"{json.dumps(name)}: {json.dumps(entry)}" for name, entry in entries.items()]
     tables = {name: pandas.DataFrame(run.table) for name, run in runs.items()}
     rows = pandas.concat(tables, names=["run", "row"]).reset_index("run").convert_dtypes()
-    texts = {RUNS: "{" + ",\n".join(lines) + "}\n"}
-    texts[ROWS] = rows.to_csv(index=False, lineterminator="\n")
+    table = rows.to_csv(index=False, lineterminator="\n")
+    texts = {RUNS: "{" + ",\n".join(lines) + "}\n", ROWS: table}
     for name, text in texts.items():
         with replacing(folder / name) as unfinished:
             unfinished.write_bytes(gzip.compress(text.encode(), mtime=0))
 
 
-def read_archive(folder: Path) -> dict[str, Recorded]:
-    """Read the runs of an archive by their names.
+def read_archive(folder: Path) -> dict[str, Run]:
+    """Read the runs of an archive by their names; they are not checked.
 
     Raises:
         ValueError: If the files are not those of an archive.
     """
     try:
         entries = json.loads(gzip.decompress((folder / RUNS).read_bytes()))
-        configs = {name: entry.pop("config") for name, entry in entries.items()}
         tables = dict(_tables(folder / ROWS))
+        return {
+            name: Run(folder / name, notes.pop("config"), tables.get(name, {}), notes)
+            for name, notes in entries.items()
+        }
     except Exception as error:  # the files may hold anything
         raise ValueError(f"{folder.name} is no archive ({error})") from error
-    return {
-        name: Recorded(configs[name], tables.get(name, {}), notes)
-        for name, notes in entries.items()
-    }
 
 
 def _tables(path: Path) -> Iterator[tuple[str, dict[str, list[float]]]]:
     """Tables by run, each with the columns in which it has a number."""
-    types: defaultdict[str, type] = defaultdict(lambda: float, run=str)
-    rows = import_extra("pandas", "report").read_csv(path, dtype=types)
+    pandas = import_extra("pandas", "report")
+    rows = pandas.read_csv(path, dtype=defaultdict(lambda: "float", run="str"))
     for name, table in rows.groupby("run", sort=False):
         own = table.drop(columns="run")
         # before its first episode has ended, a run has no number of these
         always = own.columns.isin(["episode_return", "episode_cost"])
         yield name, own.loc[:, always | own.notna().any()].to_dict("list")
-
-
-def without_places(notes: Mapping[str, Any]) -> dict[str, Any]:
-    """Notes without the folders of this machine, except in the words of command lines."""
-    kept = dict(notes)
-    start = kept.pop("cwd", None)
-    if start and "config_dirs" in kept:
-        # as a person would type them where the run was started
-        kept["config_dirs"] = [os.path.relpath(path, start) for path in kept["config_dirs"]]
-    if "evaluations" in kept:
-        kept["evaluations"] = [
-            {k: Path(v).name if k == "checkpoint_file" else v for k, v in e.items() if k != "run"}
-            for e in kept["evaluations"]
-        ]
-    return kept
-
-
-def command_of(
-    overrides: Sequence[str], notes: Mapping[str, Any], config: Mapping[str, Any]
-) -> str:
-    """The command line, with what it did not say in its overrides."""
-    if isinstance(notes.get("frames_before"), int):  # it was continued for longer
-        kept = [override for override in overrides if not override.startswith("frames=")]
-        overrides = [*kept, f"frames={config['frames']}"]
-    folders = [f"--config-dir={clean(path)}" for path in notes.get("config_dirs", ())]
-    return shlex.join(["python", "train.py", *folders, *overrides])
-
-
-def read_certificate(content: Mapping[str, Any]) -> dict[str, Any]:
-    """A certificate as a record of tables.
-
-    Its ``checkpoint`` is the number of steps, or None where no policy is certified;
-    ``bound_<name>`` and ``most_<name>`` are the bound on a mean, and what it has to keep.
-    """
-    checkpoint, bounds = content["checkpoint"], content["bounds"]
-    return {
-        "checkpoint": None if checkpoint is None else checkpoint_steps(Path(str(checkpoint))),
-        "certified_return": _number(content["episode_return"]),
-        "episodes": int(content["episodes"]),
-        "level": float(content["level"]),
-        **{f"bound_{name}": _number(bound["bound"]) for name, bound in bounds.items()},
-        **{f"most_{name}": _number(bound["most"]) for name, bound in bounds.items()},
-    }
-
-
-def read_evaluation(content: Mapping[str, Any]) -> dict[str, Any]:
-    """An evaluation as a record of tables: every estimate and the ends of its interval."""
-    manner = [str(content["name"])] if content.get("name") else []
-    manner.append("mean actions" if content["deterministic"] else "sampled actions")
-    manner += [f"{key}={value}" for key, value in content["env"].items()]
-    manner.append(f"{content['layouts_trained_on']:.0%} known layouts")
-    record = {
-        "checkpoint": clean(content["checkpoint"]),
-        "steps": content["steps"],
-        "episodes": int(content["episodes"]),
-        "cvar_alpha": float(content["cvar_alpha"]),
-        "manner": clean(", ".join(manner)),
-        **{f"limit_{key}": float(d) for key, d in content["cost_limits"].items()},
-    }
-    for name, estimate in content["estimates"].items():
-        for part, suffix in (("value", ""), ("low", "_low"), ("high", "_high")):
-            record[f"{name}{suffix}"] = _number(estimate[part])
-    return record
-
-
-def read_code(content: Sequence[Mapping[str, Any]]) -> str:
-    """By which code a run was carried out, and from which step on by which other one."""
-    parts = []
-    for entry in content[:9]:
-        words = [clean(entry["version"], 20), clean(entry["commit"] or "")[:10]]
-        words += ["with changes"] if entry["changed"] else []
-        words += [f"from {int(entry['steps']):,} steps on"] if entry["steps"] else []
-        parts.append(" ".join(filter(None, words)))
-    return "; ".join(parts)
-
-
-def _number(value: float | None) -> float:
-    return math.nan if value is None else float(value)
-
-
-def select(node: Any, *keys: str) -> Any:
-    """What lies below keys of nested mappings; None where there is nothing."""
-    for key in keys:
-        node = node.get(key) if isinstance(node, dict) else None
-    return node

@@ -15,7 +15,7 @@ from safe_rl.reporting.experiments import Experiment, cost_keys_of
 from safe_rl.reporting.figures import LIMIT_STYLE, WIDTH, Style, add_legend, literal, set_grid
 from safe_rl.reporting.recorded import Run
 from safe_rl.reporting.tables import clean, short_number
-from safe_rl.runs.curves import moving_mean, point_marker
+from safe_rl.runs.curves import moving_mean
 from safe_rl.runs.outcome import final_width
 from safe_rl.scores.comparisons import bootstrap
 
@@ -124,10 +124,10 @@ def draw_small_multiples(
     for number, own in enumerate(columns.values()):
         band, column = divmod(number, width)
         axes = list(panels[3 * band : 3 * band + 3, column])
-        for label in [label for label in means if label not in {e.label for e in own}]:
-            for axis, curve in zip(axes, means[label], strict=True):
-                if curve is not None:
-                    axis.plot(curve.steps, curve.mean, color="0.88", linewidth=0.8, zorder=0)
+        others = [means[label] for label in means if label not in {e.label for e in own}]
+        for axis, *curves in zip(axes, *others, strict=True):
+            for curve in filter(None, curves):
+                axis.plot(curve.steps, curve.mean, color="0.88", linewidth=0.8, zorder=0)
         for experiment in own:
             draw_experiment(experiment, key, axes, styles[experiment.label])
         title, *settings = own[0].label.partition(" (")
@@ -135,8 +135,7 @@ def draw_small_multiples(
         axes[0].set_title(literal(clean(title, 30)), fontsize=10, fontweight="bold", color=colour)
         if len(own) > 1 or any(settings):
             handles, names = axes[0].get_legend_handles_labels()
-            shown = [name.partition(" (")[2].removesuffix(")") or "default" for name in names]
-            shown = [clean(text, 50) for text in shown]
+            shown = [clean(n.partition(" (")[2].removesuffix(")") or "default", 50) for n in names]
             axes[0].legend(handles, shown, fontsize=6, frameon=False, handlelength=2.5)
         for axis, height in limits_of(own, key, axes):
             axis.axhline(height, **LIMIT_STYLE)
@@ -152,14 +151,13 @@ def draw_small_multiples(
 
 def _level(panels: Iterable[Axes], finals: Sequence[float], limits: Sequence[float]) -> None:
     """One scale for all panels of a quantity; those without a curve are hidden."""
-    panels = list(panels)
-    for axis in panels:
-        axis.set_visible(axis.has_data())
-        axis.tick_params(labelsize=8)
-    low, high = zip(*(axis.get_ylim() for axis in panels if axis.has_data()), strict=True)
+    used = [axis for axis in panels if axis.has_data()]
+    low, high = zip(*(axis.get_ylim() for axis in used), strict=True)
     cut = 4 * max(limits, default=0.0)
     top = cut if cut > max(finals, default=np.inf) else max(high)
     for axis in panels:
+        axis.set_visible(axis in used)
+        axis.tick_params(labelsize=8)
         axis.set_ylim(min(low), min(top, max(high)))
 
 
@@ -201,10 +199,9 @@ def draw_experiment(experiment: Experiment, key: str, axes: Sequence[Axes], styl
             if curve is None:
                 continue
             every = max(1, len(curve.steps) // _NUM_MARKERS)
-            alone = bool(point_marker(curve.steps))
             axis.plot(
                 curve.steps, curve.mean, **style.point, linestyle=line, linewidth=width,
-                label=label, markevery=every, markersize=4, clip_on=not alone,
+                label=label, markevery=every, markersize=4,
             )  # fmt: skip
             if len(runs) > 1:
                 look: dict[str, Any] = {"color": style.colour, "alpha": 0.2, "linewidth": 0}
@@ -219,7 +216,4 @@ def set_axes(axes: Sequence[Axes], ticks: int = 6) -> None:
         set_grid(axis)
         axis.set_xlim(left=0)
     for axis in axes[1:]:
-        # with zero among the data, the margin above them is a share of their height
-        axis.update_datalim([(0.0, 0.0)], updatex=False)
-        axis.autoscale_view(scalex=False)
         axis.set_ylim(bottom=0)

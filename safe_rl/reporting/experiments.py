@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
+import json
 from collections import defaultdict
-from collections.abc import Hashable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Hashable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from safe_rl.files import CONF
 from safe_rl.reporting.recorded import Run
-from safe_rl.reporting.tables import as_override, clean, short_number
+from safe_rl.reporting.tables import clean, short_number
 from safe_rl.runs.identity import Role, experiment_of, flatten, role_of
 from safe_rl.scores.benchmark import ALGORITHMS, COST_LIMIT, REFERENCE, Scores, Suite
 
@@ -21,7 +22,6 @@ PACKAGED = frozenset(file.stem for file in (CONF / "algo").glob("*.yaml"))
 """Names of the package's algorithms."""
 
 Settings = Mapping[str, Hashable]
-Known = tuple[tuple[str, Hashable], ...]
 
 # settings that a name has wherever they differ, whether or not a command line has them
 _ALWAYS_NAMED = ("preset", "init_from", "frames", "cost_limits", "risk")
@@ -33,21 +33,37 @@ class Experiment:
 
     Attributes:
         environment: Name of the environment, with what was changed of it.
-        algorithm: Name of the algorithm, with what tells it from others of that name.
+        title: Name of the algorithm, without its settings.
+        settings: What tells it from other experiments with this algorithm.
         benchmark: Name in the suite if the environment is exactly that one, else None.
         runs: One per seed.
-        label: The name without the number of steps, for pictures of one number of steps.
-        family: The label without limits: the same for one algorithm under several limits.
-        settings: All settings that differ between the runs of this algorithm, its length aside.
     """
 
     environment: str
-    algorithm: str
+    title: str
+    settings: Settings
     benchmark: str | None
     runs: tuple[Run, ...]
-    label: str
-    family: str
-    settings: Settings
+
+    def name_without(self, *groups: str) -> str:
+        """Name of the algorithm, with its settings but for those of some groups."""
+        kept = {k: v for k, v in self.settings.items() if k.partition(".")[0] not in groups}
+        return self.title + _in_brackets(kept)
+
+    @property
+    def algorithm(self) -> str:
+        """Name of the algorithm, with its settings."""
+        return self.name_without()
+
+    @property
+    def label(self) -> str:
+        """The name in pictures of one number of steps."""
+        return self.name_without("frames")
+
+    @property
+    def family(self) -> str:
+        """The label without limits: the same for one algorithm under several limits."""
+        return self.name_without("frames", "cost_limits")
 
     @property
     def base(self) -> str:
@@ -95,9 +111,8 @@ class Experiment:
         return int(self.runs[0].config["frames"]) or max(run.steps for run in self.runs)
 
 
-def cost_keys_of(experiments: Iterable[Experiment]) -> list[str]:
+def cost_keys_of(experiments: Sequence[Experiment]) -> list[str]:
     """The aggregate cost if there is one, and every cost key that an experiment limits."""
-    experiments = list(experiments)
     keys = ["cost"] if any("cost_rate" in run.table for e in experiments for run in e.runs) else []
     return list(dict.fromkeys([*keys, *(key for e in experiments for key in e.limits)]))
 
@@ -109,37 +124,29 @@ def group_runs(runs: Sequence[Run], suite: Suite) -> tuple[list[Experiment], dic
         Experiments, and folder -> why a run was left out.
     """
     environments = _environment_names(runs, suite)
-    names = _settings_of_names(runs, environments)
-    titles = {run.directory: clean(title_of(run.algorithm), 80) for run in runs}
-    cells: dict[tuple[str, str], list[Run]] = defaultdict(list)
-    for run in runs:
-        algorithm = titles[run.directory] + _in_brackets(names[run.directory][0])
-        cells[environments[run.directory], algorithm].append(run)
+    settings = _settings_of_names(runs, environments)
+    cells: dict[tuple[str, str], dict[int, Experiment]] = defaultdict(dict)
     skipped: dict[Path, str] = {}
-    experiments = []
-    for own, members in cells.items():
-        kept: dict[int, Run] = {}  # of a seed the one that has come further, then the last by name
-        for run in sorted(members, key=lambda run: (run.steps, run.directory)):
-            if run.seed in kept:
-                reason = f"{run.directory} is the same run with the same seed"
-                skipped[kept[run.seed].directory] = reason
-            kept[run.seed] = run
-        ordered = tuple(kept[seed] for seed in sorted(kept))
-        first = ordered[0].directory
-        named, settings = ({k: v for k, v in n.items() if k != "frames"} for n in names[first])
-        family = {k: v for k, v in named.items() if not k.startswith("cost_limits.")}
-        label, base = (titles[first] + _in_brackets(shown) for shown in (named, family))
-        benchmark = suite.name_of(ordered[0].config["env"])
-        experiments.append(Experiment(*own, benchmark, ordered, label, base, settings))
+    # of a seed the run is kept that has come further, then the last by name
+    for run in sorted(runs, key=lambda run: (run.steps, run.directory)):
+        environment, title = environments[run.directory], clean(title_of(run.algorithm), 80)
+        benchmark = suite.name_of(run.config["env"])
+        own = Experiment(environment, title, settings[run.directory], benchmark, (run,))
+        cell = cells[environment, own.algorithm]
+        if run.seed in cell:
+            repeated = cell[run.seed].runs[0].directory
+            skipped[repeated] = f"{run.directory} is the same run with the same seed"
+        cell[run.seed] = own
+    ordered = [[cell[seed] for seed in sorted(cell)] for cell in cells.values()]
+    experiments = [replace(own[0], runs=tuple(e.runs[0] for e in own)) for own in ordered]
     return sorted(experiments, key=_order), skipped
 
 
 def _order(experiment: Experiment) -> tuple[Hashable, ...]:
     """Benchmark environments first, algorithms as in the paper, variants after each other."""
-    benchmarks = {name: place for place, name in enumerate(REFERENCE)}
-    algorithms = {name: place for place, name in enumerate(ALGORITHMS)}
-    places = benchmarks.get(experiment.benchmark or "", 99), experiment.environment
-    return *places, algorithms.get(experiment.base, 99), experiment.algorithm
+    places = {name: place for place, name in enumerate([*REFERENCE, *ALGORITHMS])}
+    environment = places.get(experiment.benchmark or "", 99), experiment.environment
+    return *environment, places.get(experiment.base, 99), experiment.algorithm
 
 
 def _environment_names(runs: Sequence[Run], suite: Suite) -> dict[Path, str]:
@@ -153,22 +160,20 @@ def _environment_names(runs: Sequence[Run], suite: Suite) -> dict[Path, str]:
         if changes is None:
             settings = flatten(node)
             first = firsts.setdefault(name, settings)
-            shown = {k: v for k, v in settings.items() if k not in first or v != first[k]}
-        else:
-            shown = flatten(changes)
-        titles[run.directory] = clean(name, 80) + _in_brackets(shown)
+            changes = {k: v for k, v in settings.items() if k not in first or v != first[k]}
+        titles[run.directory] = clean(name, 80) + _in_brackets(flatten(changes))
     return titles
 
 
 def _settings_of_names(
     runs: Sequence[Run], environments: Mapping[Path, str]
-) -> dict[Path, tuple[Settings, Settings]]:
-    """Folder -> settings that its name has, and all that differ between runs of its algorithm.
+) -> dict[Path, Settings]:
+    """Folder -> settings that its name has.
 
-    A name has what a person has set and what differs; on an environment where this does not tell
-    all apart, everything that differs.
+    These are what a person has set and what differs; on an environment where this does not tell
+    all apart, everything that differs between runs of the algorithm.
     """
-    found: dict[Path, tuple[Settings, Settings]] = {}
+    found: dict[Path, Settings] = {}
     by_algorithm: dict[str, dict[str, list[Run]]] = defaultdict(lambda: defaultdict(list))
     for run in runs:
         by_algorithm[run.algorithm][environments[run.directory]].append(run)
@@ -179,18 +184,18 @@ def _settings_of_names(
         by_cell = [[settings[run.directory] for run in own] for own in cells.values()]
         keys = distinguishing_keys([*by_cell, anywhere])
         for own in cells.values():
-            given: dict[Known, set[str]] = defaultdict(set)
-            whole: dict[Path, Known] = {}
+            alike: dict[tuple[tuple[str, Hashable], ...], list[Run]] = defaultdict(list)
             for run in own:
                 of_run = settings[run.directory]
                 known = tuple((key, of_run[key]) for key in keys if of_run.get(key) is not None)
-                whole[run.directory] = known
-                given[known] |= {key for key in keys if _is_given(key, run)}
-            names = [tuple(p for p in known if p[0] in said) for known, said in given.items()]
-            further = keys if len(set(names)) < len(names) else []
-            for place, known in whole.items():
-                named = {k: v for k, v in known if k in given[known] or k in further}
-                found[place] = named, dict(known)
+                alike[known].append(run)
+            names = {
+                known: tuple(p for p in known if any(_is_given(p[0], run) for run in members))
+                for known, members in alike.items()
+            }
+            for known, members in alike.items():
+                name = names[known] if len(set(names.values())) == len(names) else known
+                found |= {run.directory: dict(name) for run in members}
     return found
 
 
@@ -211,19 +216,17 @@ def title_of(algorithm: str) -> str:
     """
     if algorithm not in PACKAGED:
         return algorithm
-    words = algorithm.split("_")
-    written = (word.capitalize() if len(word) > 6 else word.upper() for word in words)
+    written = (w.capitalize() if len(w) > 6 else w.upper() for w in algorithm.split("_"))
     return ALGORITHMS.get(algorithm) or "-".join(written)
 
 
 def _settings(run: Run) -> dict[str, Hashable]:
     """What tells a run's algorithm from others of the same name."""
-    named = experiment_of(run.config).items()
-    settings = {key: value for key, value in named if key.partition(".")[0] != "env"}
+    frames, settings = run.config["frames"], experiment_of(run.config)
     # some only say again how long the run is
-    is_length = {key: role_of(key) is Role.LENGTH and key != "frames" for key in settings}
-    frames = settings.get("frames")
-    return {k: v for k, v in settings.items() if not is_length[k] or v != frames}
+    repeated = {key for key, v in settings.items() if v == frames and role_of(key) is Role.LENGTH}
+    left_out = repeated - {"frames"} | {key for key in settings if key.startswith("env.")}
+    return {key: value for key, value in settings.items() if key not in left_out}
 
 
 def distinguishing_keys(cells: Sequence[Sequence[Settings]]) -> list[str]:
@@ -246,11 +249,8 @@ def _follows(key: str, cell: Sequence[Settings]) -> bool:
     names = key.split(".")
     groups = [".".join([*names[:depth], "_target_"]) for depth in range(1, len(names))]
     above = [other for other in ("preset", *groups) if other != key]
-    values: dict[tuple[Hashable, ...], Hashable] = {}
-    return all(
-        values.setdefault(tuple(s.get(other) for other in above), s.get(key)) == s.get(key)
-        for s in cell
-    )
+    pairs = {(tuple(s.get(other) for other in above), s.get(key)) for s in cell}
+    return len(pairs) == len({values for values, _ in pairs})
 
 
 def _in_brackets(settings: Settings) -> str:
@@ -259,7 +259,7 @@ def _in_brackets(settings: Settings) -> str:
     for key, value in settings.items():
         if key.endswith("._target_"):
             key, value = key.removesuffix("._target_"), str(value).rpartition(".")[2]
-        shown = clean(as_override(value))
+        shown = clean(_as_override(value))
         if key == "frames" and isinstance(value, int | float):
             texts.append(f"{short_number(value)} steps")
         elif key.startswith("cost_limits."):
@@ -267,3 +267,14 @@ def _in_brackets(settings: Settings) -> str:
         else:
             texts.append(f"{clean(key)}={shown}")
     return f" ({', '.join(texts)})" if texts else ""
+
+
+def _as_override(value: Hashable) -> str:
+    """A value as a command line has it: ``[10,a,null]``."""
+    if isinstance(value, tuple):
+        return f"[{','.join(map(_as_override, value))}]"
+    if isinstance(value, bool) or value is None:
+        return json.dumps(value)
+    if isinstance(value, float):
+        return f"{value:g}" if float(f"{value:g}") == value else f"{value}"
+    return f"{value:_}" if isinstance(value, int) else str(value)

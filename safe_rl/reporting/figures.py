@@ -5,16 +5,14 @@ from __future__ import annotations
 import math
 from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
-from itertools import chain, cycle
+from itertools import cycle
 from pathlib import Path
 from textwrap import fill
 from typing import Any, NamedTuple
 
 import numpy as np
-from matplotlib import rc_context
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.colors import to_hex, to_rgb
 from matplotlib.figure import Figure
 
 from safe_rl.files import replacing
@@ -35,22 +33,16 @@ _LOOKS = (
     *(("#999933", "p"), ("#17becf", "<"), ("#6699cc", "d"), ("#7f7f7f", ">"), ("#bcbd22", "v")),
     *(("#9467bd", "^"), ("#44aa99", "X"), ("#aa4499", "P"), ("#8c564b", "d"), ("#56b4e9", "v")),
     *(("#b07c00", "*"), ("#117733", "p"), ("#e31a1c", "h"), ("#332288", "H"), ("#cc6677", "8")),
-)
-# of other algorithms
-_FURTHER = (
+    # of other algorithms
     *(("#1f78b4", "^"), ("#ff7f00", "D"), ("#33a02c", "v"), ("#6a3d9a", "X")),
     *(("#b15928", "<"), ("#fb9a99", "P"), ("#a6cee3", "*"), ("#000000", ">")),
 )
-# of an algorithm's variants; when these are used up, in paler colours
-_LINES: tuple[Any, ...] = ("-", "-.", (0, (7, 2)), (0, (7, 2, 1, 2, 1, 2)))
 LIMIT_STYLE: dict[str, Any] = {"color": "#c00000", "linestyle": "--", "linewidth": 1.0}
 """How limits are drawn."""
 WIDTH = 12.0
 """Of a figure, in inches."""
-_LONGEST_LABEL = 60  # of a line of the legend, in letters
+_LEGEND, _LONGEST_LABEL = 140, 60  # of a legend and a line of it: letters beside each other
 _PANEL, _MOST_COLUMNS = (2.2, 2.0), 5  # of variations: width and height [inch]; beside each other
-_COLOURS = ("#0072b2", "#d55e00", "#cc79a7", "#009e73")
-_OTHERS = "others"
 _NONE = Estimate(math.nan, math.nan, math.nan)  # of a cost that a variation does not have
 
 
@@ -77,23 +69,20 @@ class Style(NamedTuple):
 
 
 def algorithm_styles(experiments: Iterable[Experiment]) -> dict[str, Style]:
-    """Name and label of an experiment -> its style, the same in every picture."""
-    variants: dict[str, dict[tuple[int, str, str], list[str]]] = defaultdict(dict)
+    """Label of an experiment -> its style, the same in every picture."""
+    variants: dict[str, set[tuple[int, str, str]]] = defaultdict(set)
     for e in experiments:
-        own = variants[e.base].setdefault((len(e.family), e.family, e.label), [e.label])
-        own.append(e.algorithm)
-    looks = dict(zip((*ALGORITHMS, *sorted(PACKAGED - ALGORITHMS.keys())), _LOOKS, strict=False))
-    further = cycle(_FURTHER)
+        variants[e.base].add((len(e.family), e.family, e.label))
+    known = (*ALGORITHMS, *sorted(PACKAGED - ALGORITHMS.keys()))
+    looks = dict(zip(known, _LOOKS, strict=False))
+    further = cycle(_LOOKS[len(known) :])
     styles: dict[str, Style] = {}
     for base, own_variants in sorted(variants.items()):
         colour, marker = looks.get(base) or next(further)
         first_family = min(own_variants)[1]
-        for number, (key, names) in enumerate(sorted(own_variants.items())):
-            paler = 1 - 0.7 ** (number // len(_LINES))
-            red, green, blue = (part + (1 - part) * paler for part in to_rgb(colour))
-            shade = to_hex((red, green, blue))
-            line = _LINES[number % len(_LINES)]
-            styles |= dict.fromkeys(names, Style(shade, marker, line, key[1] == first_family))
+        for number, (_, family, label) in enumerate(sorted(own_variants)):
+            line = (0, (7, 2, *(1, 2) * (number - 1))) if number else "-"
+            styles[label] = Style(colour, marker, line, family == first_family)
     return styles
 
 
@@ -113,68 +102,57 @@ def add_legend(figure: Figure, axes: Iterable[Axes]) -> None:
 
     It has as many columns as there is room for, and breaks long labels into lines.
     """
-    pairs = chain.from_iterable(
-        zip(*axis.get_legend_handles_labels(), strict=True) for axis in axes
-    )
-    handles = {label: handle for handle, label in pairs}
+    pairs = (pair for axis in axes for pair in zip(*axis.get_legend_handles_labels(), strict=True))
+    handles = {fill(label, _LONGEST_LABEL, break_on_hyphens=False): h for h, label in pairs}
     if not handles:
         return
-    labels = [fill(label, _LONGEST_LABEL, break_on_hyphens=False) for label in handles]
-    for columns in range(min(6, len(handles)), 0, -1):
-        legend = figure.legend(
-            handles.values(), labels, loc="outside lower center", ncols=columns,
-            frameon=False, handlelength=3.0,
-        )  # fmt: skip
-        size = legend.get_window_extent(FigureCanvasAgg(figure).get_renderer())
-        if size.width < 0.97 * figure.bbox.width or columns == 1:
-            break
-        legend.remove()
+    longest = max(len(line) for label in handles for line in label.splitlines())
+    legend = figure.legend(
+        handles.values(), handles, loc="outside lower center", frameon=False, handlelength=3.0,
+        ncols=max(1, min(6, len(handles), _LEGEND // (longest + 9))),
+    )  # fmt: skip
+    size = legend.get_window_extent(FigureCanvasAgg(figure).get_renderer())
     figure.set_figheight(figure.get_figheight() + size.height / figure.dpi)
 
 
 def save(figure: Figure, path: Path) -> Path:
-    """Write a figure as PNG, SVG or PDF, as its file is called; the same bytes each time."""
-    form = path.suffix.lstrip(".")
-    metadata = {"png": {}, "svg": {"Date": None}, "pdf": {"CreationDate": None}}[form]
-    with replacing(path) as unfinished, rc_context({"svg.hashsalt": "safe_rl"}):
-        figure.savefig(unfinished, dpi=120, format=form, metadata=metadata)
+    """Write a figure as PNG, SVG or PDF, as its file is called."""
+    with replacing(path) as unfinished:
+        figure.savefig(unfinished, dpi=120)
     return path
 
 
-def compared(records: Sequence[Record]) -> dict[str, list[Record]]:
+Final = tuple[Experiment, Record]
+"""An experiment, and the record of its final scores."""
+
+
+def compared(finals: Iterable[Final]) -> dict[str, list[Final]]:
     """Experiments that can be compared, by what stands above their panel.
 
     At least two with a return and a cost on the same environment after equally many steps.
     """
-    groups: dict[tuple[str, int, int], list[Record]] = {}
-    for record in records:
+    groups: dict[tuple[str, ...], list[Final]] = defaultdict(list)
+    for experiment, record in finals:
         if math.isfinite(record["episode_return"] + record.get("episode_cost", math.nan)):
-            key = (record["environment"], record["fewest_steps"], record["steps"])
-            groups.setdefault(key, []).append(record)
-    kept = {key: members for key, members in sorted(groups.items()) if len(members) > 1}
-    spans = {key: " to ".join(map(short_number, dict.fromkeys(key[1:]))) for key in kept}
-    return {f"{key[0]}, {spans[key]} steps": own for key, own in kept.items()}
+            steps = dict.fromkeys((record["fewest_steps"], record["steps"]))
+            key = (experiment.environment, " to ".join(map(short_number, steps)))
+            groups[key].append((experiment, record))
+    return {f"{e}, {n} steps": own for (e, n), own in groups.items() if len(own) > 1}
 
 
-def draw_fronts(
-    groups: Mapping[str, Sequence[Record]],
-    experiments: Iterable[Experiment],
-    styles: Mapping[str, Style],
-) -> Figure:
+def draw_fronts(groups: Mapping[str, Sequence[Final]], styles: Mapping[str, Style]) -> Figure:
     """Draw final returns against final costs, a panel per group of :func:`compared`.
 
     A point is an experiment, with the standard deviations over its seeds. A line in an
     algorithm's colour joins its experiments under several limits, which stand beside their points.
     The grey line joins those that no other one beats in both.
     """
-    known = {(e.environment, e.algorithm): e for e in experiments}
     columns = min(3, len(groups))
     rows = -(-len(groups) // columns)
     figure = Figure(figsize=(WIDTH, 3.3 * rows + 0.2), layout="constrained")
     panels = figure.subplots(rows, columns, squeeze=False).ravel()
     for number, (axis, (title, own)) in enumerate(zip(panels, groups.items(), strict=False)):
-        pairs = [(record, known[record["environment"], record["algorithm"]]) for record in own]
-        _draw_front(axis, pairs, styles)
+        _draw_front(axis, own, styles)
         axis.set_title(literal(fill(title, 44)), fontsize=10, fontweight="bold")
         axis.set_xlabel("episode cost")
         axis.set_ylabel("return" if number % columns == 0 else "")
@@ -185,21 +163,19 @@ def draw_fronts(
     return figure
 
 
-def _draw_front(
-    axis: Axes, pairs: Sequence[tuple[Record, Experiment]], styles: Mapping[str, Style]
-) -> None:
-    points = np.array([(r["episode_cost"], r["episode_return"]) for r, _ in pairs])
+def _draw_front(axis: Axes, finals: Sequence[Final], styles: Mapping[str, Style]) -> None:
+    points = np.array([(r["episode_cost"], r["episode_return"]) for _, r in finals])
     front = points[pareto_front(points[:, 1], points[:, 0])]
     axis.plot(*front.T, color="0.7", linewidth=1, zorder=1, drawstyle="steps-post")
-    families: dict[str, list[tuple[Record, Experiment]]] = defaultdict(list)
-    for record, experiment in pairs:
-        families[experiment.family].append((record, experiment))
+    families: dict[str, list[Final]] = defaultdict(list)
+    for experiment, record in finals:
+        families[experiment.family].append((experiment, record))
     for family, own in families.items():
-        own.sort(key=lambda pair: pair[1].limits.get("cost", math.inf))
-        style = styles[own[0][1].label]
-        joined = np.array([(r["episode_cost"], r["episode_return"]) for r, _ in own]).T
+        own.sort(key=lambda pair: pair[0].limits.get("cost", math.inf))
+        style = styles[own[0][0].label]
+        joined = np.array([(r["episode_cost"], r["episode_return"]) for _, r in own]).T
         axis.plot(*joined, color=style.colour, linewidth=1, alpha=0.6)
-        for (record, experiment), cost, value in zip(own, *joined, strict=True):
+        for (experiment, record), cost, value in zip(own, *joined, strict=True):
             axis.errorbar(
                 cost, value, xerr=record["episode_cost_std"], yerr=record["episode_return_std"],
                 **style.point, linestyle="", elinewidth=0.8, markersize=7, label=literal(family),
@@ -209,7 +185,7 @@ def _draw_front(
                 axis.annotate(
                     text, (cost, value), (5, 4), textcoords="offset points", fontsize=7, color="0.3"
                 )
-    for limit in {e.limits["cost"] for _, e in pairs if "cost" in e.limits}:
+    for limit in {e.limits["cost"] for e, _ in finals if "cost" in e.limits}:
         axis.axvline(limit, **LIMIT_STYLE)
 
 
@@ -226,29 +202,27 @@ def draw_variations(
     (_, trained), *varied = rows
     groups: dict[str, list[tuple[str, Mapping[str, Estimate]]]] = {}
     for (row, value, *_), estimates in varied:
-        group = groups.setdefault(_OTHERS if value is None else row, [])
-        group.append((row if value is None else f"{value}", estimates))
-    groups = groups or {_OTHERS: [("as trained", trained)]}
+        label = (row, "others") if value is None else (f"{value}", row)
+        groups.setdefault(label[1], []).append((label[0], estimates))
+    groups = groups or {"others": [("as trained", trained)]}
     names = ["episode_return", *(f"episode_{key}" for key in cost_limits or ["cost"])]
     columns = min(len(groups), _MOST_COLUMNS)
     lines = -(-len(groups) // columns) * len(names)
     size = (0.8 + _PANEL[0] * columns, 0.5 + _PANEL[1] * lines)
     figure = Figure(figsize=size, layout="constrained")
     panels = figure.subplots(lines, columns, squeeze=False)
-    for line, (name, colour) in enumerate(zip(names, cycle(_COLOURS), strict=False)):
-        key, drawn = name.removeprefix("episode_"), []
-        for number, (row, group) in enumerate(groups.items()):
-            axis = panels[number // columns * len(names) + line][number % columns]
-            values = [(label, found.get(name, _NONE)) for label, found in group]
-            _draw_values(axis, values, trained[name], colour)
+    for number, (row, group) in enumerate(groups.items()):
+        band, column = divmod(number, columns)
+        for line, name in enumerate(names):
+            axis, key = panels[band * len(names) + line, column], name.removeprefix("episode_")
+            if number > 0:
+                axis.sharey(panels[line, 0])
+            found = {label: estimates.get(name, _NONE) for label, estimates in group}
+            _draw_values(axis, found, trained[name], f"C{line}")
             if key in cost_limits:
                 axis.axhline(cost_limits[key], **LIMIT_STYLE)
             axis.set_title(literal(row) if line == 0 else "")
-            axis.set_ylabel(literal(key) if number % columns == 0 else "")
-            drawn.append(axis)
-        low, high = zip(*(axis.get_ylim() for axis in drawn), strict=True)
-        for axis in drawn:
-            axis.set_ylim(min(low), max(high))
+            axis.set_ylabel(literal(key) if column == 0 else "")
     for axis in panels.flat:
         axis.set_visible(axis.has_data())
     figure.supxlabel("grey: as trained; dashed: the limit", fontsize="small", color="0.3")
@@ -256,15 +230,14 @@ def draw_variations(
 
 
 def _draw_values(
-    axis: Axes, values: Sequence[tuple[str, Estimate]], trained: Estimate, colour: str
+    axis: Axes, values: Mapping[str, Estimate], trained: Estimate, colour: str
 ) -> None:
     axis.axhspan(trained.low, trained.high, color="0.85", zorder=0)
     axis.axhline(trained.value, color="0.5", linewidth=1, zorder=1)
-    for place, (_, estimate) in enumerate(values):
-        axis.plot([place] * 2, [estimate.low, estimate.high], color=colour, linewidth=2)
-        axis.plot(place, estimate.value, marker="o", color=colour)
-    labels = [literal(label) for label, _ in values]
-    axis.set_xticks(range(len(values)), labels, rotation=25 * any(len(n) > 5 for n, _ in values))
+    means, low, high = np.array(list(values.values())).T
+    axis.errorbar(range(len(values)), means, (means - low, high - means), fmt="o", color=colour)
+    rotation = 25 if any(len(label) > 5 for label in values) else 0
+    axis.set_xticks(range(len(values)), [literal(label) for label in values], rotation=rotation)
     axis.set_xlim(-0.6, len(values) - 0.4)
-    axis.grid(alpha=0.25, axis="y")
-    axis.spines[["top", "right"]].set_visible(False)
+    set_grid(axis)
+    axis.grid(visible=False, axis="x")

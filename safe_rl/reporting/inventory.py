@@ -35,7 +35,7 @@ def run_table(experiments: Sequence[Experiment]) -> Table:
         {
             **where,
             "steps": run.steps,
-            "state": run.state,
+            "state": "finished" if run.steps >= frames else f"{run.steps / frames:.0%}",
             "hours": run.hours,
             "time": duration(run.hours),
             **run.final(["cost"]),
@@ -44,6 +44,7 @@ def run_table(experiments: Sequence[Experiment]) -> Table:
             "command": run.command or "not recorded",
         }
         for where, _, run in _each_run(experiments)
+        for frames in [run.config["frames"]]
     ]
     columns = {
         **_WHERE,
@@ -107,12 +108,8 @@ def evaluation_table(experiments: Sequence[Experiment]) -> Table:
 
 def certificate_table(experiments: Sequence[Experiment]) -> Table:
     """Which runs have a checkpoint that is certified to keep the limits."""
-    records = []
-    for where, _, run in _each_run(experiments):
-        if (found := run.certificate) is not None:
-            said = {"certified": "no" if found["checkpoint"] is None else "yes"}
-            said["surely"] = f"{100 * found['level']:.12g}%"  # not rounded up to 100
-            records.append({**where, **said, **found})
+    runs = _each_run(experiments)
+    records = [{**where, **run.certificate} for where, _, run in runs if run.certificate]
     columns = {
         **_WHERE,
         "certified": "{certified}| at {surely}",

@@ -5,32 +5,30 @@ from __future__ import annotations
 import base64
 import datetime
 import re
-from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from html import escape
 from importlib.resources import files
-from itertools import count
+from itertools import chain, count, groupby, starmap
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import yaml
 from matplotlib.figure import Figure
 
 from safe_rl.extras import import_extra
 from safe_rl.files import replace_text
-from safe_rl.reporting import figures, inventory
+from safe_rl.reporting import figures, inventory, scoring
+from safe_rl.reporting.archive import find_runs
 from safe_rl.reporting.curves import draw_learning_curves, draw_small_multiples, drawn_keys
 from safe_rl.reporting.experiments import Experiment, group_runs
-from safe_rl.reporting.recorded import Run, find_runs
-from safe_rl.reporting.scoring import final_table, learning_table
-from safe_rl.reporting.slates import complete_slates, slate_table
-from safe_rl.reporting.tables import Record, Table, clean, short_number
+from safe_rl.reporting.recorded import Run
+from safe_rl.reporting.tables import Table, clean, short_number
 from safe_rl.scores.benchmark import Suite
 
 __all__ = ["Block", "Drawing", "Report", "Section", "build_report", "write_report"]
 
-# rows of a picture of learning curves, in environments: what a printed page holds
-_MOST_ROWS = 6
+_MOST_ROWS = 6  # of a picture of learning curves: what a printed page holds
 _MOST_CURVES = 6  # in one panel
 _TEXTS = yaml.safe_load(files(__package__).joinpath("texts.yaml").read_text(encoding="utf-8"))
 _SYMBOL = re.compile(r"\$(\\bar )?(\\rho|\w)(?:_(\w))?\$")  # such as $\bar J_r$
@@ -45,7 +43,7 @@ class Drawing(NamedTuple):
     shows: str
 
 
-Block = Table | Drawing | str
+Block = Table | Drawing
 Styles = Mapping[str, figures.Style]
 
 
@@ -55,11 +53,6 @@ class Section(NamedTuple):
     name: str
     title: str
     blocks: Sequence[Block]
-
-    @property
-    def text(self) -> str:
-        """Explanations for the reader."""
-        return _TEXTS.get(self.name, "")
 
 
 @dataclass(frozen=True)
@@ -113,17 +106,16 @@ def build_report(
     skipped |= repeated
     styles = figures.algorithm_styles(experiments)
     groups = _by_environment([e for e in experiments if e.finished])
-    finals = [final_table(group) for group in groups]
-    records = [record for table in finals for record in table.records]
-    slates = [slate_table(*slate) for slate in complete_slates(experiments, seeds_needed)]
+    finals = [scoring.final_table(group) for group in groups]
+    slates = scoring.complete_slates(experiments, seeds_needed)
     reasons = [{"what": clean(path), "why": clean(why, 500)} for path, why in skipped.items()]
     left_out = Table("left_out", "Left out", {"what": "{what}", "why": "{why}"}, reasons)
     parts: list[tuple[str, str, Sequence[Block]]] = [
-        ("final", "Final scores", finals or ["No run is finished."]),
-        ("learning", "What learning cost", list(filter(None, map(learning_table, groups)))),
+        ("final", "Final scores", finals),
+        ("learning", "What learning cost", list(filter(None, map(scoring.learning_table, groups)))),
         ("curves", "Learning curves", _curves(experiments, styles)),
-        ("fronts", "Return against cost", _fronts(records, experiments, styles)),
-        ("normalised", "Normalised scores", slates),
+        ("fronts", "Return against cost", _fronts(groups, finals, styles)),
+        ("normalised", "Normalised scores", list(starmap(scoring.slate_table, slates))),
         ("certificates", "Certificates", [inventory.certificate_table(experiments)]),
         ("evaluations", "Evaluations", [inventory.evaluation_table(experiments)]),
         ("runs", "Runs", [inventory.run_table(experiments), left_out]),
@@ -137,32 +129,29 @@ def build_report(
 
 
 def _by_environment(experiments: Sequence[Experiment]) -> list[list[Experiment]]:
-    names = dict.fromkeys(e.environment for e in experiments)
-    return [[e for e in experiments if e.environment == name] for name in names]
+    return [list(own) for _, own in groupby(experiments, key=lambda e: e.environment)]
 
 
 def _fronts(
-    records: Sequence[Record], experiments: Sequence[Experiment], styles: Styles
+    groups: Sequence[Sequence[Experiment]], finals: Sequence[Table], styles: Styles
 ) -> list[Drawing]:
-    groups = figures.compared(records)
-    if not groups:
+    panels = figures.compared(zip(chain(*groups), chain(*(t.records for t in finals)), strict=True))
+    if not panels:
         return []
-    panels = [f"{what}: {', '.join(r['algorithm'] for r in own)}" for what, own in groups.items()]
-    says = f"Final return against final episode cost. {'; '.join(panels)}"
-    return [Drawing("fronts", "", figures.draw_fronts(groups, experiments, styles), says)]
+    texts = [f"{what}: {', '.join(e.algorithm for e, _ in own)}" for what, own in panels.items()]
+    says = f"Final return against final episode cost. {'; '.join(texts)}"
+    return [Drawing("fronts", "", figures.draw_fronts(panels, styles), says)]
 
 
 def _curves(experiments: Sequence[Experiment], styles: Styles) -> list[Drawing]:
-    """Small multiples where there are many curves; of the rest a picture per robot, or several."""
+    """Small multiples where there are many curves; the rest as rows of pictures."""
     what = "Return, episode cost and cost rate"
-    robots: dict[str, list[list[Experiment]]] = defaultdict(list)
-    drawings = []
+    rows, drawings = [], []
     for group in _by_environment(experiments):
-        robot = Path(str(group[0].runs[0].config["env"].get("robot_base", "other"))).stem
         for steps in sorted({e.planned_steps for e in group}):
             own = [e for e in group if e.planned_steps == steps]
             if len(own) <= _MOST_CURVES:
-                robots[clean(robot, 40)].append(own)
+                rows.append(own)
                 continue
             for key in drawn_keys(own):
                 title = f"{group[0].environment}, {short_number(steps)} steps"
@@ -170,12 +159,11 @@ def _curves(experiments: Sequence[Experiment], styles: Styles) -> list[Drawing]:
                 figure = draw_small_multiples(own, key, styles)
                 says = f"{what}, a column per algorithm: {title}"
                 drawings.append(Drawing(f"curves_{title}", title, figure, says))
-    for robot, groups in robots.items():
-        for shown in (groups[n : n + _MOST_ROWS] for n in range(0, len(groups), _MOST_ROWS)):
-            names = ", ".join(dict.fromkeys(group[0].environment for group in shown))
-            figure = draw_learning_curves([e for group in shown for e in group], styles)
-            says = f"{what} over environment steps: {names}"
-            drawings.append(Drawing(f"curves_{robot}", "", figure, says))
+    for shown in (rows[n : n + _MOST_ROWS] for n in range(0, len(rows), _MOST_ROWS)):
+        names = ", ".join(dict.fromkeys(own[0].environment for own in shown))
+        figure = draw_learning_curves([e for own in shown for e in own], styles)
+        says = f"{what} over environment steps: {names}"
+        drawings.append(Drawing("curves", "", figure, says))
     return drawings
 
 
@@ -211,7 +199,8 @@ def write_report(report: Report, out: Path, title: str, formats: Sequence[str] =
         title=clean(title),
         date=datetime.datetime.now().astimezone().strftime("%d %B %Y, %H:%M"),
         facts=_facts(report),
-        sections=[(s, [_written(b, place, formats) for b in s.blocks]) for s in report.sections],
+        texts=_TEXTS,
+        sections=[(s, [(b, _write(b, place, formats)) for b in s.blocks]) for s in report.sections],
     )
     replace_text(out / "report.html", text)
     return out / "report.html"
@@ -230,19 +219,16 @@ def _places(out: Path) -> Callable[[str], Path]:
     return place
 
 
-def _written(block: Block, place: Callable[[str], Path], formats: Sequence[str]) -> dict[str, Any]:
-    """A block as the template sees it; tables and pictures are written on the way."""
-    if isinstance(block, str):
-        return {"kind": "text", "title": "", "text": block}
+def _write(block: Block, place: Callable[[str], Path], formats: Sequence[str]) -> str:
+    """Write the files of a block; returns the PNG of a picture in base64, for the page."""
     if isinstance(block, Table):
         block.write_csv(place(block.name).with_suffix(".csv"))
-        return {"kind": "table", "title": block.title, "table": block}
+    if not isinstance(block, Drawing):
+        return ""
     path = place(block.name)
     for form in {*formats, "png"}:
         figures.save(block.figure, path.with_suffix(f".{form}"))
-    # so that the page needs no other file
-    data = base64.b64encode(path.with_suffix(".png").read_bytes()).decode()
-    return {"kind": "picture", "title": block.title, "says": block.shows, "data": data}
+    return base64.b64encode(path.with_suffix(".png").read_bytes()).decode()
 
 
 def _facts(report: Report) -> dict[str, str]:
@@ -258,14 +244,13 @@ def _facts(report: Report) -> dict[str, str]:
     }
 
 
-def _symbols(text: str) -> Any:
-    r"""Symbols, ``$\bar J_r$``, in HTML."""
-    markupsafe = import_extra("markupsafe", "report")
+def _symbols(text: str) -> str:
+    r"""HTML of a text with symbols, ``$\bar J_r$``."""
 
-    def html(match: re.Match[str]) -> str:
+    def letters(match: re.Match[str]) -> str:
         bar, letter, index = match.groups()
-        letter = {r"\rho": "ρ"}.get(letter, letter)  # noqa: RUF001
-        letter = f'<i class="bar">{letter}</i>' if bar else f"<i>{letter}</i>"
-        return letter + (f"<sub>{index}</sub>" if index else "")
+        sign = letter.replace(r"\rho", "&rho;")
+        shown = f'<i class="bar">{sign}</i>' if bar else f"<i>{sign}</i>"
+        return shown + (f"<sub>{index}</sub>" if index else "")
 
-    return markupsafe.Markup(_SYMBOL.sub(html, str(markupsafe.escape(text))))
+    return _SYMBOL.sub(letters, escape(text))

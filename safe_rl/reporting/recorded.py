@@ -1,32 +1,22 @@
-"""Runs as their folders and archives record them; what cannot be read is left out with a reason."""
+"""One training run: its configuration, its table, and what it wrote beside them."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
-from dataclasses import dataclass
+import shlex
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from safe_rl.files import read_config, read_json, read_yaml
-from safe_rl.reporting import archive as archives
-from safe_rl.reporting.archive import (
-    Recorded,
-    command_of,
-    read_certificate,
-    read_code,
-    read_evaluation,
-    select,
-)
 from safe_rl.reporting.tables import clean
-from safe_rl.runs.folder import RunFolder, paths_below, runs_below
+from safe_rl.runs.folder import checkpoint_steps
 from safe_rl.runs.outcome import final_figures, judges_another_measure, violation
-from safe_rl.runs.table import read_table
 
-__all__ = ["Run", "archive_runs", "find_runs"]
+__all__ = ["Run", "read_certificate", "read_code", "read_evaluation", "select"]
 
 
 @dataclass(frozen=True)
@@ -35,27 +25,47 @@ class Run:
 
     Attributes:
         directory: Its folder; of an archived run the folder that it would have in the archive.
-        config: Its configuration.
+        config: Its configuration, resolved.
         table: Columns of its table; a row per epoch, NaN where there is no number.
-        frames: Environment steps after which it counts as finished.
-        overrides: What its command line said.
-        command: The command line that does it again, if Hydra has recorded it.
-        evaluations: What ``safe_rl.evaluate`` has found, a record each, see `read_evaluation`.
-        certificate: Which of its checkpoints is certified, see `read_certificate`.
-        code: By which version and commit it was carried out, in words, if that is recorded.
-        recorded: What all of this was made of.
+        notes: ``overrides``, ``certificate``, ``code`` and the like, as its files have them.
+        takes_part: Whether it counts as finished before it has come to its end.
     """
 
     directory: Path
     config: Mapping[str, Any]
     table: Mapping[str, list[float]]
-    frames: int
-    overrides: tuple[str, ...] | None = None
-    command: str | None = None
-    evaluations: tuple[Mapping[str, Any], ...] = ()
-    certificate: Mapping[str, Any] | None = None
-    code: str | None = None
-    recorded: Recorded | None = None
+    notes: Mapping[str, Any] = field(default_factory=dict)
+    takes_part: bool = False
+
+    def check(self) -> None:
+        """Refuse a run without what a report needs of every run.
+
+        Raises:
+            ValueError: If the configuration or the table lacks it.
+            Exception: Of any type, if notes are not as a run writes them.
+        """
+        frames, limits = self.config.get("frames", -1), self.config.get("cost_limits") or {}
+        usable = {
+            "env": isinstance(self.config.get("env"), dict),
+            "algo": isinstance(select(self.config, "algo", "name"), str),
+            "seed": type(self.config.get("seed")) is int,
+            "frames": _is_number(frames) and frames >= 0,
+            "cost_limits": isinstance(limits, dict) and all(map(_is_number, limits.values())),
+            "init_from": isinstance(self.config.get("init_from"), str | None),
+        }
+        if wrong := ", ".join(key for key, is_usable in usable.items() if not is_usable):
+            raise ValueError(f"config.yaml is not that of a run: it lacks a usable {wrong}")
+        if not self.table.get("steps"):
+            raise ValueError("it has not finished an epoch")
+        needed = ["episode_return", "time_total"]
+        needed += [name for key in limits for name in (f"episode_{key}", f"{key}_rate")]
+        if missing := [name for name in needed if name not in self.table]:
+            raise ValueError(f"progress.csv has no column {missing[0]}")
+        steps = np.array([0.0, *self.table["steps"]])
+        if not (np.isfinite(steps).all() and (np.diff(steps) > 0).all() and self.hours > 0):
+            raise ValueError("progress.csv cannot be read (its steps or times do not grow)")
+        for name in ("command", "evaluations", "certificate", "code"):
+            getattr(self, name)
 
     @property
     def seed(self) -> int:
@@ -91,19 +101,46 @@ class Run:
 
     @property
     def is_finished(self) -> bool:
-        """Whether it is finished."""
-        return self.steps >= self.frames
-
-    @property
-    def state(self) -> str:
-        """How far it has come to its own end, whether or not it counts as finished."""
-        whole = self.config["frames"]
-        return "finished" if self.steps >= whole else f"{self.steps / whole:.0%}"
+        """Whether it counts as finished."""
+        return self.takes_part or self.steps >= self.config["frames"]
 
     @property
     def hours(self) -> float:
         """Time of training so far [h]."""
         return self.table["time_total"][-1] / 3600
+
+    @property
+    def overrides(self) -> list[str] | None:
+        """What its command line said, if Hydra has recorded it."""
+        said = self.notes.get("overrides")
+        return [clean(override) for override in said] if isinstance(said, list) else None
+
+    @property
+    def command(self) -> str | None:
+        """The command line that does it again, with what was not in its overrides."""
+        overrides = self.overrides
+        if overrides is None:
+            return None
+        if isinstance(self.notes.get("frames_before"), int):  # it was continued for longer
+            kept = [override for override in overrides if not override.startswith("frames=")]
+            overrides = [*kept, f"frames={self.config['frames']}"]
+        folders = [f"--config-dir={clean(path)}" for path in self.notes.get("config_dirs", ())]
+        return shlex.join(["python", "train.py", *folders, *overrides])
+
+    @cached_property
+    def evaluations(self) -> list[dict[str, Any]]:
+        """What ``safe_rl.evaluate`` has found, a record each, see `read_evaluation`."""
+        return [read_evaluation(found) for found in self.notes.get("evaluations", ())]
+
+    @cached_property
+    def certificate(self) -> dict[str, Any] | None:
+        """Which of its checkpoints is certified, see `read_certificate`."""
+        return read_certificate(self.notes["certificate"]) if "certificate" in self.notes else None
+
+    @cached_property
+    def code(self) -> str | None:
+        """By which version and commit it was carried out, see `read_code`."""
+        return read_code(self.notes["code"]) if "code" in self.notes else None
 
     def column(self, name: str) -> np.ndarray:
         """A column in the epochs in which an episode finished, shape [epochs]; NaN without one."""
@@ -123,156 +160,66 @@ class Run:
         return judges_another_measure(self.table, key, self.limits[key])
 
 
-def find_runs(root: Path, *, unfinished: bool = False) -> tuple[list[Run], dict[Path, str]]:
-    """Find every run below a folder, in folders of their own and in archives.
+def read_certificate(content: Mapping[str, Any]) -> dict[str, Any]:
+    """A certificate as a record of tables; errors of any type if it is none.
 
-    Args:
-        root: The folder.
-        unfinished: Whether runs count as finished that have not come to their configured end.
-
-    Returns:
-        Runs that have finished an epoch, and folder or file -> why it was left out.
-
-    Raises:
-        FileNotFoundError: If there is no such folder, or no run in it.
+    Its ``checkpoint`` is the number of steps, or None where no policy is certified;
+    ``bound_<name>`` and ``most_<name>`` are the bound on a mean, and what it has to keep.
     """
-    if not root.is_dir():
-        raise FileNotFoundError(f"There is no folder '{root}': give the folder of the runs.")
-    runs: list[Run] = []
-    skipped: dict[Path, str] = {}
-    for archive in paths_below(root, archives.RUNS):
-        with _noted(archive, skipped):
-            for name, recorded in archives.read_archive(archive.parent).items():
-                directory = archive.parent / name
-                with _noted(directory, skipped):
-                    runs.append(_run(directory, recorded, unfinished))
-    for folder in runs_below(root):
-        with _noted(folder.directory, skipped):
-            runs.append(_run(folder.directory, _recorded(folder, skipped), unfinished))
-    if not runs:
-        reasons = "".join(f"\n  {clean(path)}: {reason}" for path, reason in skipped.items())
-        raise FileNotFoundError(
-            f"There is no run to report below '{root}': a run is a folder with config.yaml and "
-            f"progress.csv, as train.py writes it.{reasons}"
-        )
-    return sorted(runs, key=lambda run: run.directory), skipped
-
-
-def archive_runs(runs: Iterable[Run], root: Path, archive: Path) -> None:
-    """Add runs to an archive, or bring them up to date in it, each by its path below ``root``.
-
-    Raises:
-        ValueError: If the archive is among the runs or they in it, or is no archive.
-        OSError: If it cannot be read or written.
-    """
-    here, there = root.resolve(), archive.resolve()
-    if here.is_relative_to(there) or there.is_relative_to(here):
-        raise ValueError(f"archive={archive}: it takes a folder beside {root}, not one within.")
-    kept = archives.read_archive(archive) if (archive / archives.RUNS).exists() else {}
-    for run in runs:
-        if run.recorded is not None:
-            name = run.directory.resolve().relative_to(here).as_posix()
-            kept[name] = run.recorded._replace(notes=archives.without_places(run.recorded.notes))
-    archives.write_archive(kept, archive)
-
-
-@contextmanager
-def _noted(path: Path, skipped: dict[Path, str]) -> Iterator[None]:
-    """Note why something is left out; everything else is reported."""
-    try:
-        yield
-    except (ValueError, OSError) as error:
-        skipped[path] = clean(error)
-    except Exception as error:  # files of anybody may hold anything
-        skipped[path] = clean(f"{path.name} is not as a run writes it ({error!r})")
-
-
-def _recorded(folder: RunFolder, skipped: dict[Path, str]) -> Recorded:
-    """What a run's folder holds; notes that cannot be read are left out."""
-
-    def read(path: Path, check: Callable[[Any], object] = bool) -> Any:
-        """What a file holds that passes a check; None of any other."""
-        with _noted(path, skipped):
-            if path.exists():
-                content = (read_json if path.suffix == ".json" else read_yaml)(path)
-                check(content)
-                return content
-        return None
-
-    config = read_config(folder.config)
-    if not folder.table.exists():
-        raise ValueError("it has not begun: no progress.csv")
-    table = read_table(folder.table)
-    runtime = select(read(folder.surroundings), "hydra", "runtime")
-    before = select(read(folder.composed), "frames")
-    notes = {
-        "overrides": read(folder.overrides),
-        "cwd": select(runtime, "cwd"),
-        # of --config-dir, and of Python's config_dir
-        "config_dirs": [
-            str(select(source, "path"))
-            for source in select(runtime, "config_sources") or ()
-            if str(select(source, "provider")).endswith("command-line")
-        ],
-        "frames_before": before if before != config.get("frames") else None,
-        "certificate": read(folder.certificate, read_certificate),
-        "code": read(folder.code, read_code),
-        "evaluations": [
-            found for path in folder.evaluations() if (found := read(path, read_evaluation))
-        ],
+    checkpoint, bounds = content["checkpoint"], content["bounds"]
+    return {
+        "certified": "no" if checkpoint is None else "yes",
+        "surely": f"{100 * content['level']:.12g}%",  # not rounded up to 100
+        "checkpoint": None if checkpoint is None else checkpoint_steps(Path(str(checkpoint))),
+        "certified_return": _number(content["episode_return"]),
+        "episodes": int(content["episodes"]),
+        "level": float(content["level"]),
+        **{f"bound_{name}": _number(bound["bound"]) for name, bound in bounds.items()},
+        **{f"most_{name}": _number(bound["most"]) for name, bound in bounds.items()},
     }
-    return Recorded(config, table, {name: value for name, value in notes.items() if value})
 
 
-def _run(directory: Path, recorded: Recorded, unfinished: bool) -> Run:
-    config, table, notes = recorded
-    _check(config)
-    _check_table(table, config.get("cost_limits") or {})
-    said = notes.get("overrides")
-    overrides = tuple(map(clean, said)) if isinstance(said, list) else None
-    return Run(
-        directory,
-        config,
-        table,
-        frames=0 if unfinished else config["frames"],
-        overrides=overrides,
-        command=None if overrides is None else command_of(overrides, notes, config),
-        evaluations=tuple(map(read_evaluation, notes.get("evaluations", ()))),
-        certificate=read_certificate(notes["certificate"]) if "certificate" in notes else None,
-        code=read_code(notes["code"]) if "code" in notes else None,
-        recorded=recorded,
-    )
-
-
-def _check(config: Mapping[str, Any]) -> None:
-    """Refuse a configuration without what every run has."""
-    frames, limits = config.get("frames", -1), config.get("cost_limits") or {}
-    source = config.get("init_from")
-    are_right = {
-        "env": isinstance(config.get("env"), dict),
-        "algo": bool(name := select(config.get("algo"), "name")) and isinstance(name, str),
-        "seed": type(config.get("seed")) is int,
-        "frames": _is_number(frames) and frames >= 0,
-        "cost_limits": isinstance(limits, dict) and all(map(_is_number, limits.values())),
-        "init_from": source is None or isinstance(source, str),
+def read_evaluation(content: Mapping[str, Any]) -> dict[str, Any]:
+    """An evaluation as a record of tables: every estimate and the ends of its interval."""
+    manner = [str(content["name"])] if content.get("name") else []
+    manner.append("mean actions" if content["deterministic"] else "sampled actions")
+    manner += [f"{key}={value}" for key, value in content["env"].items()]
+    manner.append(f"{content['layouts_trained_on']:.0%} known layouts")
+    record = {
+        "checkpoint": clean(content["checkpoint"]),
+        "steps": content["steps"],
+        "episodes": int(content["episodes"]),
+        "cvar_alpha": float(content["cvar_alpha"]),
+        "manner": clean(", ".join(manner)),
+        **{f"limit_{key}": float(d) for key, d in content["cost_limits"].items()},
     }
-    if wrong := [key for key, is_right in are_right.items() if not is_right]:
-        keys = ", ".join(wrong)
-        raise ValueError(f"config.yaml is not that of a run: it lacks a usable {keys}")
+    for name, estimate in content["estimates"].items():
+        for part, suffix in (("value", ""), ("low", "_low"), ("high", "_high")):
+            record[f"{name}{suffix}"] = _number(estimate[part])
+    return record
+
+
+def read_code(content: Sequence[Mapping[str, Any]]) -> str:
+    """By which code a run was carried out, and from which step on by which other one."""
+    parts = []
+    for entry in content[:9]:
+        words = [clean(entry["version"], 20), clean(entry["commit"] or "")[:10]]
+        words += ["with changes"] if entry["changed"] else []
+        words += [f"from {int(entry['steps']):,} steps on"] if entry["steps"] else []
+        parts.append(" ".join(filter(None, words)))
+    return "; ".join(parts)
+
+
+def select(node: Any, *keys: str) -> Any:
+    """What lies below keys of nested mappings; None where there is nothing."""
+    for key in keys:
+        node = node.get(key) if isinstance(node, dict) else None
+    return node
+
+
+def _number(value: float | None) -> float:
+    return math.nan if value is None else float(value)
 
 
 def _is_number(value: Any) -> bool:
     return type(value) in (int, float) and math.isfinite(value)
-
-
-def _check_table(table: Mapping[str, list[float]], limits: Mapping[str, Any]) -> None:
-    """Refuse a table without the columns and the growing steps that a report needs."""
-    if not table.get("steps"):
-        raise ValueError("it has not finished an epoch")
-    needed = ["episode_return", "time_total"]
-    needed += [name for key in limits for name in (f"episode_{key}", f"{key}_rate")]
-    if missing := [name for name in needed if name not in table]:
-        raise ValueError(f"progress.csv has no column {missing[0]}")
-    steps, seconds = table["steps"], table["time_total"][-1]
-    if not (0 < steps[0] <= steps[-1] < math.inf and all(np.diff(steps) > 0) and seconds > 0):
-        raise ValueError("progress.csv cannot be read (its steps or times do not grow)")

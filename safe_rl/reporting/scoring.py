@@ -1,9 +1,9 @@
-"""Final scores of experiments, and what learning them has cost."""
+"""Final scores of experiments, what learning them has cost, and normalised scores."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Hashable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from statistics import mean
 from typing import Any
 
@@ -11,12 +11,20 @@ import numpy as np
 
 from safe_rl.reporting.experiments import Experiment, cost_keys_of
 from safe_rl.reporting.recorded import Run
-from safe_rl.reporting.tables import Record, Table, each_cost, mark_best, short_number, spread
+from safe_rl.reporting.tables import Record, Table, each_cost, interval, mark_best, spread
 from safe_rl.runs.outcome import FINAL_EPOCHS, final_rows, final_width
-from safe_rl.scores.benchmark import PUBLISHED_STEPS, REIMPLEMENTATION_STEPS, REIMPLEMENTATIONS
-from safe_rl.scores.measures import joined, longest_streak, regret, share_of_epochs_over
+from safe_rl.scores import benchmark, measures
+from safe_rl.scores.benchmark import Normalised
+from safe_rl.scores.comparisons import interquartile_mean
 
-__all__ = ["final_record", "final_table", "learning_table"]
+__all__ = [
+    *("complete_slates", "final_record", "final_table", "learning_table", "normalised_scores"),
+    "slate_table",
+]
+
+_SYMBOLS = dict(
+    zip(Normalised._fields, (r"$\bar J_r$", r"$\bar M_c$", r"$\bar \rho_c$"), strict=True)
+)
 
 
 def final_record(experiment: Experiment, cost_keys: Sequence[str]) -> dict[str, Any]:
@@ -58,13 +66,12 @@ def _over_seeds(values: Sequence[Mapping[str, float]]) -> dict[str, float]:
 
 def _published(experiment: Experiment) -> dict[str, Any]:
     """Values printed elsewhere for the same environment and algorithm."""
-    if not (experiment.benchmark and experiment.has_published_limit) or experiment.is_continued:
+    if experiment.is_continued or not experiment.has_published_limit:
         return {}
-    later = REIMPLEMENTATIONS.get(experiment.benchmark, {}).get(experiment.base)
-    fields: dict[str, Any] = {}
-    if experiment.base == "ppo" and experiment.reference is not None:
-        fields |= {f"paper_{k}": v for k, v in experiment.reference._asdict().items()}
-    return fields | ({"later_return": later[0], "later_cost": later[1]} if later else {})
+    paper = experiment.reference if experiment.base == "ppo" else None
+    later = benchmark.REIMPLEMENTATIONS.get(experiment.benchmark or "", {}).get(experiment.base)
+    fields = {f"paper_{name}": value for name, value in (paper._asdict() if paper else {}).items()}
+    return fields | dict(zip(("later_return", "later_cost"), later or (), strict=False))
 
 
 def final_table(experiments: Sequence[Experiment]) -> Table:
@@ -92,20 +99,26 @@ def final_table(experiments: Sequence[Experiment]) -> Table:
         **({"critics' bias": "{bias:+.1f}"} if "bias" in has else {}),
     }
     if "paper_episode_return" in has:
-        title = f"paper, {short_number(PUBLISHED_STEPS[experiments[0].benchmark or ''])} steps"
+        steps = benchmark.PUBLISHED_STEPS[str(experiments[0].benchmark)]
+        title = f"paper, {steps / 1e6:g}M steps"
         columns[title] = "{paper_episode_return:g} / {paper_episode_cost:g} / {paper_cost_rate:g}"
     if "later_return" in has:
-        title = f"later work, {short_number(REIMPLEMENTATION_STEPS)} steps"
+        title = f"later work, {benchmark.REIMPLEMENTATION_STEPS / 1e6:g}M steps"
         columns[title] = "{later_return:g} / {later_cost:g}"
-    marks = _final_marks(records)
+    marks = _final_marks(records, {e.algorithm: (e.lengths, e.limits) for e in experiments})
     return Table(f"final_{environment}", environment, columns, records, "", rows, marks)
 
 
-def _final_marks(records: Sequence[Record]) -> dict[str, Callable[[Record], str]]:
-    """What is over its limit, and the best of what is not, column by column."""
+def _final_marks(
+    records: Sequence[Record], rivals: Mapping[str, Any]
+) -> dict[str, Callable[[Record], str]]:
+    """What is over its limit, and the best of what is not, column by column.
+
+    Experiments are ranked with those of equal rivals: the lengths of training, and the limits.
+    """
 
     def best(name: str, of: Callable[..., float]) -> Callable[[Record], str]:
-        mark = mark_best(records, name, of, lambda r: r["satisfies"], _rivals)
+        mark = mark_best(records, name, of, lambda r: r["satisfies"], rivals)
         # single costs are not ranked
         return lambda row: mark(row) if name == "episode_return" or row["key"] == "cost" else ""
 
@@ -118,12 +131,6 @@ def _final_marks(records: Sequence[Record]) -> dict[str, Callable[[Record], str]
         "$J_c$": lambda row: "" if "measure" in row else over(row),
         "limited measure": lambda row: over(row) if "measure" in row else "",
     }
-
-
-def _rivals(record: Record) -> Hashable:
-    """What is equal in experiments that can be ranked: the length of training, and the limits."""
-    limits = {key: value for key, value in record.items() if key.startswith("limit_")}
-    return record["fewest_steps"], record["steps"], frozenset(limits.items())
 
 
 def learning_table(experiments: Sequence[Experiment]) -> Table | None:
@@ -166,8 +173,106 @@ def _learning_figures(run: Run) -> dict[str, float]:
         if run.limits_another_measure(key):
             violation = run.column(f"violation_{key}")
             judged = np.where(np.isfinite(violation), limit + violation, costs)
-        spans = joined(judged, width // FINAL_EPOCHS)
-        figures[f"regret_{key}"] = regret(spans, limit)
-        figures[f"share_over_{key}"] = share_of_epochs_over(spans, limit)
-        figures[f"streak_{key}"] = longest_streak(spans, limit)
+        spans = measures.joined(judged, width // FINAL_EPOCHS)
+        figures |= {f"{name}_{key}": v for name, v in measures.learning_cost(spans, limit).items()}
     return figures
+
+
+def complete_slates(
+    experiments: Sequence[Experiment], needed: int
+) -> Iterator[tuple[str, list[list[Experiment]]]]:
+    """Slates that are complete for an algorithm or more, and what all have in common.
+
+    Yields the name, and for each algorithm with as many finished runs per environment as are needed
+    its experiments, one per environment. Runs that started from another run's networks do not
+    count.
+    """
+    own: dict[str, dict[str, Experiment]] = {}
+    for e in experiments:
+        if e.benchmark in benchmark.REFERENCE and not e.is_continued:
+            found = own.setdefault(e.algorithm, {})
+            if "cost" in e.limits and e.finished:
+                found[str(e.benchmark)] = e
+    shared = tuple(n for n in benchmark.REFERENCE if all(n in found for found in own.values()))
+    slates = {name: (slate, needed) for name, slate in benchmark.SLATES.items()}
+    shown = []
+    for name, (slate, least) in {**slates, "shared": (shared, 1)}.items():
+        members = [
+            [found[env] for env in slate]
+            for found in own.values()
+            if all(env in found and len(found[env].finished) >= least for env in slate)
+        ]
+        if slate and members and slate not in shown:
+            shown.append(slate)
+            yield name, members
+
+
+def normalised_scores(experiments: Sequence[Experiment]) -> dict[str, list[np.ndarray]]:
+    """Normalised final scores of one algorithm: score -> values per environment, one of each run.
+
+    The experiments have finished runs and a limit on ``cost``.
+    """
+    strata: dict[str, list[np.ndarray]] = {name: [] for name in Normalised._fields}
+    for e in experiments:
+        assert e.reference is not None
+        finals = [run.final(["cost"]) for run in e.finished]
+        returns, rates = ([f[name] for f in finals] for name in ("episode_return", "cost_rate"))
+        # J_c, or what the run compares with the limit in its place
+        limit = e.limits["cost"]
+        judged = limit + np.array([run.excess("cost") for run in e.finished])
+        scores = measures.normalise(returns, judged, rates, limit=limit, reference=e.reference)
+        for name, values in zip(strata, scores, strict=True):
+            strata[name].append(values)
+    return strata
+
+
+def _record(slate: str, experiments: Sequence[Experiment]) -> dict[str, Any]:
+    """Averages over environments of averages over seeds, and interquartile means of all runs."""
+    strata = normalised_scores(experiments)
+    steps = {steps for e in experiments for steps in e.lengths}
+    record: dict[str, Any] = {
+        "slate": slate,
+        "algorithm": experiments[0].algorithm,
+        "runs": sum(map(len, strata["violation"])),
+        "fewest_steps": min(steps),
+        "most_steps": max(steps) if len(steps) > 1 else None,
+        **{name: float(np.mean([runs.mean() for runs in s])) for name, s in strata.items()},
+    }
+    if record["runs"] > 1:
+        for name in strata:
+            names = (f"iqm_{name}", f"iqm_{name}_low", f"iqm_{name}_high")
+            record |= zip(names, interquartile_mean(strata[name]), strict=True)
+    paper = benchmark.PUBLISHED.get(slate, {}).get(experiments[0].base)
+    if paper and all(e.has_published_limit for e in experiments):
+        record |= {f"paper_{name}": value for name, value in paper._asdict().items()}
+    return record
+
+
+def slate_table(slate: str, members: Sequence[Sequence[Experiment]]) -> Table:
+    """A slate of `complete_slates` as the paper's Tables 1 and 2, published values beside ours."""
+    records = [_record(slate, experiments) for experiments in members]
+    # what has to be equal in two that are compared
+    rivals = {m[0].algorithm: [(e.lengths, e.limits["cost"]) for e in m] for m in members}
+    columns = {"algorithm": "{algorithm}", "runs": "{runs:d}"}
+    columns["steps"] = "{fewest_steps:,}| to {most_steps:,}"
+    columns |= {symbol: f"{{{name}:.3f}}" for name, symbol in _SYMBOLS.items()}
+    if any("iqm_violation" in record for record in records):
+        columns |= {f"IQM {s}": interval(f"iqm_{name}", 3) for name, s in _SYMBOLS.items()}
+    note = f"On {', '.join(str(e.benchmark) for e in members[0])}."
+    if slate in benchmark.PUBLISHED:
+        columns |= {f"paper {s}": f"{{paper_{name}:.3f}}" for name, s in _SYMBOLS.items()}
+        after = sorted({benchmark.PUBLISHED_STEPS[e] for e in benchmark.SLATES[slate]})
+        note += f" Paper: after {' (Doggo: '.join(f'{n:,}' for n in after)} steps"
+        note += ")." if len(after) > 1 else "."
+
+    def best(name: str, of: Any) -> Any:
+        is_able = lambda r: r["violation"] <= measures.NOISE_OF_ZERO  # noqa: E731
+        return mark_best(records, name, of, is_able, rivals)
+
+    marks = {
+        _SYMBOLS["episode_return"]: best("episode_return", max),
+        _SYMBOLS["violation"]: lambda r: "bad" if r["violation"] > measures.NOISE_OF_ZERO else "",
+        _SYMBOLS["cost_rate"]: best("cost_rate", min),
+    }
+    title = {"shared": "What all algorithms were trained on"}.get(slate, slate)
+    return Table(f"slate_{slate}", title, columns, records, note, marks=marks)

@@ -3,18 +3,20 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Hashable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from string import Formatter
 from typing import Any, NamedTuple
 
+from matplotlib.ticker import EngFormatter
+
 from safe_rl.extras import import_extra
 from safe_rl.files import replace_text
 
 __all__ = [
-    *("Cell", "Record", "Table", "as_override", "clean", "each_cost", "filled", "interval"),
-    *("mark_best", "short_number", "spread"),
+    *("Cell", "Record", "Table", "clean", "each_cost", "filled", "interval", "mark_best"),
+    *("short_number", "spread"),
 ]
 
 Record = Mapping[str, Any]
@@ -23,6 +25,8 @@ _LATEX = str.maketrans(
     | {"\\": r"\textbackslash{}", "~": r"\textasciitilde{}", "^": r"\textasciicircum{}"}
     | {"±": r"$\pm$", "≤": r"$\leq$", "…": r"\dots{}", "—": "--", "\N{NO-BREAK SPACE}": "~"}
 )
+short_number = EngFormatter(sep="")
+"""A number of steps in few letters, such as 1.5M."""
 
 
 def clean(text: Any, most: int = 200) -> str:
@@ -37,33 +41,6 @@ def clean(text: Any, most: int = 200) -> str:
         c if c.isprintable() or c == kept else " " if c.isspace() else "�" for c in str(text)
     )
     return shown if len(shown) <= most else f"{shown[: most - 1]}…"
-
-
-def short_number(value: float) -> str:
-    """A number of steps in few letters.
-
-    Examples:
-        >>> short_number(1_500_000), short_number(20_000), short_number(999)
-        ('1.5M', '20k', '999')
-    """
-    sizes = ((1e6, "M"), (1e3, "k"))
-    return next((f"{value / size:g}{unit}" for size, unit in sizes if value >= size), f"{value:g}")
-
-
-def as_override(value: Any) -> str:
-    """A value as a command line has it.
-
-    Examples:
-        >>> as_override((10.0, "a", None)), as_override(True)
-        ('[10,a,null]', 'true')
-    """
-    if isinstance(value, tuple | list):
-        return f"[{','.join(map(as_override, value))}]"
-    if isinstance(value, bool) or value is None:
-        return {True: "true", False: "false", None: "null"}[value]
-    if isinstance(value, float):
-        return f"{value:g}" if float(f"{value:g}") == value else f"{value}"
-    return f"{value:_}" if isinstance(value, int) else str(value)
 
 
 def spread(name: str, decimals: int) -> str:
@@ -191,16 +168,17 @@ def mark_best(
     name: str,
     best: Callable[..., float],
     is_able: Callable[[Record], bool],
-    rivals: Callable[[Record], Hashable],
+    rivals: Mapping[str, Any],
 ) -> Callable[[Record], str]:
     """Mark the best value of a column, and all equal to it, among records that are comparable.
 
-    Best is ``max`` or ``min`` of those that are able, with equal rivals. A record without any rival
-    is not marked.
+    Best is ``max`` or ``min`` of those that are able, among algorithms with equal ``rivals``. A
+    record without any rival is not marked.
     """
 
     def mark(record: Record) -> str:
-        group = [other for other in records if rivals(other) == rivals(record)]
+        own = rivals[record["algorithm"]]
+        group = [other for other in records if rivals[other["algorithm"]] == own]
         if len(group) < 2 or name not in record or not is_able(record):
             return ""
         known = [r[name] for r in group if is_able(r) and not _is_missing(r.get(name))]

@@ -21,7 +21,7 @@ from safe_rl.cli.grammar import overrides_of
 from safe_rl.cli.python_api import _WHOLE
 from safe_rl.envs import ConfigError, store_configs
 from safe_rl.evaluation.loading import find_checkpoint
-from safe_rl.reporting.recorded import archive_runs, find_runs
+from safe_rl.reporting.archive import archive_runs, find_runs
 from safe_rl.runs.table import read_table
 from safe_rl.training.trainer import Trainer
 

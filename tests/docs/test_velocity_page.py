@@ -29,7 +29,7 @@ def add_run(runs, env, seed, frames=1_000_000):
     columns["cost_rate"] = costs / 1000
     epochs = frames // 20_000
     table = {name: column[:epochs].tolist() for name, column in columns.items()}
-    run = Run(ARCHIVE, {}, table, frames=1_000_000)
+    run = Run(ARCHIVE, {}, table)
     runs.setdefault((env, "ppo_lagrangian"), {})[seed] = run
     late = STEPS > 750_000
     return returns[late].mean(), costs[late].mean(), (costs[late] > 25).mean()

@@ -15,7 +15,7 @@ from safe_rl import envs
 from safe_rl.evaluation import Certificate, CertificateOptions, certify
 from safe_rl.evaluation.certifying import _write
 from safe_rl.evaluation.loading import find_checkpoint
-from safe_rl.reporting.archive import read_certificate
+from safe_rl.reporting.recorded import read_certificate
 from safe_rl.runs.folder import RunFolder
 from safe_rl.scores.certificate import Verdict
 from safe_rl.training.building import build_trainer, seed_everything

@@ -8,8 +8,8 @@ from pathlib import Path
 import yaml
 
 from safe_rl.cli.report import suite
+from safe_rl.reporting.archive import find_runs
 from safe_rl.reporting.experiments import group_runs
-from safe_rl.reporting.recorded import find_runs
 
 COLUMNS = [
     *("epoch", "steps", "episodes", "episode_return", "episode_cost", "cost_rate", "time_total"),

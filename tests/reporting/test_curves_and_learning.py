@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from synthetic import experiments_in, write_run
 
+from safe_rl.reporting.archive import find_runs
 from safe_rl.reporting.curves import average
-from safe_rl.reporting.recorded import find_runs
 from safe_rl.reporting.scoring import final_record, learning_table
 from safe_rl.reporting.tables import Table, spread
 

@@ -206,7 +206,7 @@ def test_the_page_holds_everything_itself(report):
     anchors = [link[1:] for link in links if link.startswith("#")]
     assert anchors
     assert all(f'id="{anchor}"' in html for anchor in anchors)
-    assert base64.b64encode((report / "curves_point.png").read_bytes()).decode() in html
+    assert base64.b64encode((report / "curves.png").read_bytes()).decode() in html
     # what people wrote is text, not markup
     assert "A &lt;title&gt;" in html
     assert "python train.py env=Mine &#39;+note=&lt;b&gt;&amp;&#39;" in html
@@ -230,7 +230,7 @@ def test_algorithms_and_formats_can_be_chosen(folder, tmp_path):
     page = Page(tmp_path / "report.html")
     assert "PPO-Lagrangian" not in " ".join(page.words)
     names = {path.name for path in tmp_path.iterdir()}
-    assert {"curves_point.png", "curves_point.svg", "curves_point.pdf"} <= names
+    assert {"curves.png", "curves.svg", "curves.pdf"} <= names
 
 
 @pytest.mark.parametrize(
@@ -302,7 +302,7 @@ def facts_in_a_browser(report, tmp_path):
 def test_a_browser_shows_the_page(report, tmp_path):
     facts = facts_in_a_browser(report, tmp_path)
     assert facts["heading"] == "A <title>"
-    assert len(facts["images"]) == 3
+    assert len(facts["images"]) == 2
     assert all(pixels > 1000 for pixels in facts["images"])
     # nothing sticks out of the window, nor a table out of its box
     assert facts["page"] <= facts["window"] == 1280

@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 
 from safe_rl.reporting.archive import RUNS as FILE
-from safe_rl.reporting.archive import read_archive
-from safe_rl.reporting.recorded import find_runs
+from safe_rl.reporting.archive import find_runs, read_archive
 from safe_rl.scores.measures import joined
 
 RESULTS = Path(__file__).parents[2] / "results"

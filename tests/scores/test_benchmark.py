@@ -13,11 +13,7 @@ from safe_rl.scores.benchmark import (
     SLATES,
     Scores,
 )
-from safe_rl.scores.measures import (
-    normalised_cost_rate,
-    normalised_return,
-    normalised_violation,
-)
+from safe_rl.scores.measures import normalise
 
 BENCHMARK = suite()
 NODE = BENCHMARK.environments["PointGoal1"]
@@ -61,27 +57,17 @@ def test_every_table_has_every_algorithm():
     assert all(value > 0 for scores in REFERENCE.values() for value in scores)
 
 
-@pytest.mark.parametrize("environment", REFERENCE)
-def test_the_reference_is_one_in_its_own_measure(environment):
-    reference = REFERENCE[environment]
-    assert normalised_return(reference.episode_return, reference) == 1.0
-    assert normalised_violation(reference.episode_cost, 25.0, reference) == 1.0
-    assert normalised_cost_rate(reference.cost_rate, reference) == 1.0
-
-
 def test_normalisation_by_hand():
     reference = Scores(20.0, 75.0, 0.08)
-    np.testing.assert_allclose(normalised_return([-10.0, 30.0], reference), [-0.5, 1.5])
     # nothing for what stays below the limit; the excess over the limit, not over the reference
     costs = [0.0, 25.0, 30.0, 125.0]
-    np.testing.assert_allclose(normalised_violation(costs, 25.0, reference), [0, 0, 0.1, 2.0])
-    np.testing.assert_allclose(normalised_cost_rate(0.02, reference), 0.25)
-
-
-def test_a_reference_within_the_limit_divides_by_epsilon():
-    reference = Scores(20.0, 10.0, 0.01)
-    np.testing.assert_allclose(normalised_violation(26.0, 25.0, reference), 1e6)
-    assert normalised_violation(25.0, 25.0, reference) == 0.0
+    found = normalise([-10.0, 30.0], costs, 0.02, limit=25.0, reference=reference)
+    expected = ([-0.5, 1.5], [0, 0, 0.1, 2.0], 0.25)
+    for values, known in zip(found, expected, strict=True):
+        np.testing.assert_allclose(values, known)
+    # a reference within the limit divides by epsilon
+    below = normalise(1.0, [26.0, 25.0], 1.0, limit=25.0, reference=Scores(20.0, 10.0, 0.01))[1]
+    np.testing.assert_allclose(below, [1e6, 0.0])
 
 
 @pytest.mark.parametrize("name", REFERENCE)
