@@ -9,6 +9,8 @@ falls during training, checkpoints, evaluations and a table.
 
 from __future__ import annotations
 
+import safe_rl  # isort: skip  # noqa: F401, before torch, so that idle threads sleep
+
 import argparse
 
 import torch

@@ -9,6 +9,8 @@ checkpoints are from TorchRL. `train.py` does all of this, and more, from config
 
 from __future__ import annotations
 
+import safe_rl  # isort: skip  # noqa: F401, before torch, so that idle threads sleep
+
 import argparse
 import functools
 import warnings

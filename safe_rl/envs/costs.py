@@ -61,7 +61,7 @@ def parse_ranges(outside: Any) -> dict[str, CostRange]:
             raise ConfigError(f"'outside' must be as {_FORM}; got {name}: {row!r}.")
         kept = CostRange(full[0], int(full[1]), *full[2:])
         if not kept.low <= kept.high or (math.isinf(kept.low) and math.isinf(kept.high)):
-            raise ConfigError(f"'outside': {name} has the range {kept.low} to {kept.high}.")
+            raise ConfigError(f"'outside': {name} cannot have the range {kept.low} to {kept.high}.")
         if not is_cost(name):
             raise ConfigError(f"'outside': costs are called cost or cost_<kind>, not '{name}'.")
         ranges[name] = kept

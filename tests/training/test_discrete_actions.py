@@ -68,7 +68,7 @@ def test_the_cost_is_that_of_the_position_alone():
         ([1], "'outside' must be as"),
         ({"cost_x": [0, 1.0]}, "got cost_x:"),
         ({"cost_x": [0.5, 0.0, 1.0]}, "got cost_x:"),
-        ({"cost_x": [0, 1.0, 0.0]}, "has the range 1.0 to 0.0"),
+        ({"cost_x": [0, 1.0, 0.0]}, "cannot have the range 1.0 to 0.0"),
         ({"far": [0, 0.0, 1.0]}, "called cost or cost_<kind>, not 'far'"),
         ({"cost_x": [4, 0.0, 1.0]}, "no column 4 in observation. It has 4"),
     ],
