@@ -159,7 +159,7 @@ class SimulatedEnv(ConstrainedEnv):
         return next_tensordict_out
 
     def _checked_action(self, tensordict: TensorDictBase) -> Tensor:
-        action, needed = tensordict.get("action"), self._physics.ctrl.shape
+        action, needed = tensordict["action"], self._physics.ctrl.shape
         if action.shape != needed or not action.dtype.is_floating_point:
             raise ValueError(
                 f"'action' must be a floating-point tensor of shape {tuple(needed)} (num_envs, "

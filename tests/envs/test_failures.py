@@ -85,6 +85,8 @@ def test_wrong_actions():
     for action in (torch.zeros(NUM_ENVS, 3), torch.zeros(NUM_ENVS, 2, dtype=torch.int64)):
         with pytest.raises(ValueError, match=r"'action'.*\(4, 2\)"):
             env.step(env.reset().set("action", action))
+    with pytest.raises(KeyError, match="action"):
+        env.step(env.reset())
 
 
 @pytest.mark.parametrize("name", ["PointGoal2", "SafeHumanoidVelocity"])
