@@ -47,29 +47,14 @@ _CONTROLS = re.compile(r"[\x00-\x08\x0b-\x1f\x7f-\x9f]")
 
 
 class _Loader(getattr(yaml, "CSafeLoader", yaml.SafeLoader)):  # type: ignore[misc]
-    """Reads YAML as OmegaConf does, which writes runs' files, in a tenth of its time.
+    """Reads YAML in a tenth of OmegaConf's time, and 1e-4 as a number, as OmegaConf does.
 
-    1e-4 is a number, a date is a text, and equal keys are an error.
+    To PyYAML alone, floats have a point, and exponents a sign.
     """
 
-    # texts to PyYAML, whose floats have a point, and whose exponents have a sign
-    _WITH_EXPONENT = re.compile(r"[-+]?\d+(_\d+)*(\.[\d_]*)?[eE][-+]?\d+$")
 
-    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
-        names = [key.value for key, _ in node.value if isinstance(key, yaml.ScalarNode)]
-        if len(set(names)) < len(names):
-            twice = next(name for name in names if names.count(name) > 1)
-            raise yaml.constructor.ConstructorError(
-                None, None, f"{twice} is there twice", node.start_mark
-            )
-        return super().construct_mapping(node, deep)
-
-
-_Loader.yaml_implicit_resolvers = {
-    letter: [(tag, form) for tag, form in resolvers if not tag.endswith(":timestamp")]
-    for letter, resolvers in _Loader.yaml_implicit_resolvers.items()
-}
-_Loader.add_implicit_resolver("tag:yaml.org,2002:float", _Loader._WITH_EXPONENT, [*"-+0123456789"])
+_WITH_EXPONENT = re.compile(r"[-+]?\d+(_\d+)*(\.[\d_]*)?[eE][-+]?\d+$")
+_Loader.add_implicit_resolver("tag:yaml.org,2002:float", _WITH_EXPONENT, [*"-+0123456789"])
 
 
 def read_bounded(path: Path, most: int = _MOST_BYTES) -> bytes:

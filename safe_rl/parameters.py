@@ -26,7 +26,6 @@ class Parameter(NamedTuple):
         values: What it may be.
         meaning: What its docstring says of it, a sentence without its full stop.
         is_described: Whether its annotation says more than a type: a hyper-parameter.
-        is_required: Whether it has to be given.
 
     Examples:
         >>> from safe_rl.ranges import Share
@@ -45,7 +44,6 @@ class Parameter(NamedTuple):
     values: Values
     meaning: str
     is_described: bool = True
-    is_required: bool = True
 
     def check(self, path: str, value: Any) -> None:
         """Refuse a value that it cannot be.
@@ -170,10 +168,7 @@ def parameters_of(target: Callable[..., Any]) -> Mapping[str, Parameter]:
         if name not in found:
             annotation = _evaluated(parameter.annotation, names)
             found[name] = Parameter(
-                values_of(annotation),
-                meanings.get(name, ""),
-                is_described(annotation),
-                parameter.default is parameter.empty,
+                values_of(annotation), meanings.get(name, ""), is_described(annotation)
             )
     return found
 

@@ -9,8 +9,7 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Callable, Mapping
-from importlib import import_module
-from importlib.util import find_spec
+from pkgutil import resolve_name
 from typing import Any, cast
 
 from hydra.errors import InstantiationException
@@ -33,8 +32,8 @@ _ROOMS: dict[str, tuple[str, ...] | None] = {
     "safe_rl.models": None,
     "safe_rl.objectives": None,
     "safe_rl.runs.loggers": ("MLflowLogger", "TensorboardLogger", "WandbLogger"),
+    "torch.optim": None,
 }
-_OPTIMISERS = "torch.optim"
 _users_modules: set[str] = set()
 
 
@@ -77,9 +76,7 @@ def build(node: DictConfig | Mapping[str, Any] | None, /, **objects: Any) -> Any
         key, plain = node._get_full_key(None), OmegaConf.to_container(node, resolve=True)
     if plain is None:
         return None
-    if not isinstance(plain, Mapping):
-        raise TargetError(f"What is built is a node with a _target_, not {plain!r}.")
-    if "_target_" not in plain:
+    if not isinstance(plain, Mapping) or "_target_" not in plain:
         raise TargetError(f"{_join(key, '_target_')} is missing: it names the class to build.")
     if plain["_target_"] is None:
         return None
@@ -113,11 +110,12 @@ def locate(target: Any, key: str = "") -> Callable[..., Any]:
     """  # noqa: E501
     shown = f"{key}={target}" if key else f"{target}"
     name = str(target)
-    root = next((root for root in _roots() if _is_inside(name, root) and name != root), None)
+    roots = (*sorted(_users_modules), *_ROOMS)
+    root = next((root for root in roots if name.startswith(f"{root}.")), None)
     if root is None:
         module = name.rpartition(".")[0] or name
         raise TargetError(
-            f"{shown}: configurations reach only parts of safe_rl, {_OPTIMISERS} and modules of "
+            f"{shown}: configurations reach only parts of safe_rl, torch.optim and modules of "
             f"yours. If you trust '{module}', add import={module} to the command."
         )
     known, part = _known(root), name.removeprefix(f"{root}.")
@@ -126,17 +124,25 @@ def locate(target: Any, key: str = "") -> Callable[..., Any]:
             f"{shown}: of '{root}' configurations reach only {', '.join(known)}."
             f"{did_you_mean(part, known)}"
         )
-    found = _find(root, part, shown)
+    if any(word.startswith("_") for word in part.split(".")):
+        raise TargetError(f"{shown}: what begins with _ is private.")
+    try:
+        found = resolve_name(name)
+    except AttributeError as error:
+        raise TargetError(f"{shown}: {error}.{did_you_mean(error.name, dir(error.obj))}") from None
+    except ValueError:
+        raise TargetError(f"{shown} is no dotted name.") from None
+    if not (inspect.isclass(found) or inspect.isroutine(found)):
+        raise TargetError(f"{shown} is neither a class nor a function.")
     # what a module has imported from elsewhere, or a class has from a base, is not its own
     home = getattr(found, "__module__", None) or ""
-    if not any(_is_inside(home, room) for room in _roots() if room == root or not _known(room)):
+    homes = (room for room in roots if room == root or not _known(room))
+    if not any(f"{home}.".startswith(f"{room}.") for room in homes):
         raise TargetError(
             f"{shown}: '{root}' only borrows it from '{home}', which is out of reach of "
             f"configurations. If you trust '{home}', add import={home} to the command and write "
             f"_target_={home}.{found.__qualname__}."
         )
-    if _is_inside(home, _OPTIMISERS) and not _is_optimiser(found):
-        raise TargetError(f"{shown} is neither an optimiser nor a scheduler of {_OPTIMISERS}.")
     return found
 
 
@@ -152,42 +158,9 @@ def _checked(node: Any, key: str) -> Any:
     return copied
 
 
-def _find(root: str, part: str, shown: str) -> Callable[..., Any]:
-    """The class or function of a dotted name below a module."""
-    found: Any = import_module(root)
-    for name in part.split("."):
-        if name.startswith("_"):
-            raise TargetError(f"{shown}: '{name}' is private.")
-        is_package = hasattr(found, "__path__") and _is_inside(found.__name__, root)
-        if is_package and not hasattr(found, name) and find_spec(f"{found.__name__}.{name}"):
-            import_module(f"{found.__name__}.{name}")
-        if not hasattr(found, name):
-            hint = did_you_mean(name, (other for other in dir(found) if other[0] != "_"))
-            raise TargetError(f"{shown}: '{found.__name__}' has no '{name}'.{hint}")
-        found = getattr(found, name)
-    if not (inspect.isclass(found) or inspect.isroutine(found)):
-        raise TargetError(f"{shown} is neither a class nor a function.")
-    return found
-
-
-def _roots() -> tuple[str, ...]:
-    return (*sorted(_users_modules), *_ROOMS, _OPTIMISERS)
-
-
 def _known(root: str) -> tuple[str, ...] | None:
     """All that configurations reach there; None where that is every class and function."""
     return None if root in _users_modules else _ROOMS.get(root)
-
-
-def _is_inside(name: str, module: str) -> bool:
-    return name == module or name.startswith(f"{module}.")
-
-
-def _is_optimiser(found: Any) -> bool:
-    from torch.optim import Optimizer  # here, because commands that build nothing need no torch
-    from torch.optim.lr_scheduler import LRScheduler
-
-    return inspect.isclass(found) and issubclass(found, Optimizer | LRScheduler)
 
 
 def _join(key: str, name: str) -> str:

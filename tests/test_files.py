@@ -45,7 +45,6 @@ BOMB = "a: &a [x, x]\n" + "".join(
         ("{", "cannot be read"),
         ("a: !!python/object/apply:os.system [true]", "cannot be read"),
         ("a: ${", "interpolations"),
-        ("a: 1\nb: {c: 1, c: 2}", "c is there twice"),
         ("a: !!bool perhaps", "cannot be read"),
         ("[a]: b", "cannot be read"),
         (BOMB, "aliases"),
@@ -72,7 +71,7 @@ def test_what_is_not_resolved_can_be_read_and_stays_so(tmp_path, monkeypatch):
     "value",
     [
         "[1_000, 1e-4, 1e4, -2.5E+3, 1.5e3, 1_0e2, .5, +.5, .5e3, .inf, .nan, 8_e4, e4, 1e, 08]",
-        "[0x1f, 1:30, 2026-11-23, yes, null, ~]",
+        "[0x1f, 1:30, yes, null, ~]",
         "???",
     ],
 )

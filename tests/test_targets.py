@@ -61,7 +61,7 @@ def test_a_null_target_is_nothing_and_a_missing_one_an_error():
     assert build(OmegaConf.create({"logger": {"_target_": None}}).logger) is None
     with pytest.raises(TargetError, match=r"^loss\._target_ is missing"):
         build(OmegaConf.create({"loss": {"clip_epsilon": 0.2}}).loss)
-    with pytest.raises(TargetError, match="a node with a _target_, not 3"):
+    with pytest.raises(TargetError, match=r"^_target_ is missing"):
         build(3)
 
 
@@ -93,7 +93,6 @@ def test_partial_nodes_wait_for_their_arguments():
         # what classes have of others
         *("safe_rl.objectives.PPOLoss.load_state_dict", "safe_rl.objectives.PPOLoss.__class__"),
         *("safe_rl.objectives.policy_losses.__builtins__.eval", "safe_rl.objectives.PPOLoss.mro"),
-        *("torch.optim.Optimizer.load_state_dict", "torch.optim.swa_utils.update_bn"),
         *("safe_rl.objectives", "safe_rl", "torch.optim", "torch.optim.adam", "", ".", "..os"),
         *(3, True, "safe_rl.objectivesx.y", "safe_rl.envs..os", "torch.optimx.Adam"),
     ],
@@ -169,7 +168,9 @@ def test_modules_named_by_the_user_are_reached_but_not_what_they_borrow(users):
     for name in ("os.system", "system", "pickle.loads", "NUMBER", "Loss.__init__"):
         with pytest.raises(TargetError):
             locate(f"users_module.{name}")
-    with pytest.raises(TargetError, match=r"'users_module' has no 'Lose'\. Did you mean 'Loss'"):
+    with pytest.raises(
+        TargetError, match=r"'users_module' has no attribute 'Lose'\. Did you mean 'Loss'"
+    ):
         locate("users_module.Lose")
 
 

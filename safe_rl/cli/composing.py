@@ -8,7 +8,7 @@ cannot make code run.
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -23,10 +23,16 @@ from omegaconf.errors import OmegaConfBaseException
 from yaml import YAMLError
 
 from safe_rl.cli.grammar import CommandLineError, overrides_of, parse
-from safe_rl.cli.schema import GIVEN_WHOLE, KEYS, check_settings, keys_of, nearest_keys, plain
+from safe_rl.cli.schema import (
+    GIVEN_WHOLE,
+    KEYS,
+    check_settings,
+    plain,
+    unknown_key,
+    unread_by,
+)
 from safe_rl.cli.user_code import check_imports, note_imports
 from safe_rl.envs import complete_env, store_configs
-from safe_rl.envs.errors import on_cpu_only
 from safe_rl.envs.families import hint_of_gymnasium
 from safe_rl.extras import hint_of_plugin
 from safe_rl.files import CONF, read_config, read_yaml
@@ -34,15 +40,11 @@ from safe_rl.naming import did_you_mean
 from safe_rl.runs.folder import RunFolder
 from safe_rl.runs.identity import flatten, role_of
 
-__all__ = ["compose_jobs", "compose_resumed", "hydra_on_conf", "resolving", "search_folders"]
+__all__ = [
+    *("check_risk", "compose_jobs", "compose_resumed", "hydra_on_conf", "is_to_keep_limits"),
+    *("resolving", "search_folders"),
+]
 
-_LARGE = ("env", "algo", "preset")
-"""Groups whose files differ in more than a few keys."""
-_ELSEWHERE = {
-    **dict.fromkeys(("total_timesteps", "total_steps", "timesteps", "max_steps"), "frames"),
-    **dict.fromkeys(("dir", "directory", "log_dir", "output_dir", "run_dir"), "hydra.run.dir"),
-}
-"""What other libraries call a key -> the key."""
 _ONE_EACH = ("env", "algo", "preset", "model", "risk", "collector", "logger", "lagrangian")
 _MOST_LISTED = 40
 _MISSING = object()
@@ -158,7 +160,8 @@ def _compose(texts: list[str]) -> DictConfig:
     try:
         return compose("config", texts, return_hydra_config=True)
     except (HydraException, OmegaConfBaseException, YAMLError, ValueError, OSError) as error:
-        wrong = re.match(r"Could not override '([^']+)'", str(error))
+        # of a group in a place of its own Hydra says itself how it is chosen
+        wrong = re.match(r"Could not override '([^']+)'\.(?!\s*Did you mean)", str(error))
         given = next((t for t in texts if wrong and t.lstrip("+").startswith(f"{wrong[1]}=")), None)
         if wrong is None or given is None:
             raise CommandLineError(_explain(error, texts)) from None
@@ -166,7 +169,7 @@ def _compose(texts: list[str]) -> DictConfig:
         key = inner[1] if inner and inner[1].startswith(f"{wrong[1]}.") else wrong[1]
         # with all that is right, for what refers to it: the name of env=gymnasium is its env.id
         values = plain(_compose([text for text in texts if text != given]))
-        raise CommandLineError(f"'{given}': {_unknown(key, values)}") from None
+        raise CommandLineError(f"'{given}': {unknown_key(key, values)}") from None
 
 
 def _explain(error: Exception, texts: Sequence[str]) -> str:
@@ -188,49 +191,6 @@ def _explain(error: Exception, texts: Sequence[str]) -> str:
     return f"{place}there is no {group} '{name}'.{hint or did_you_mean(name, known, 0.6) or listed}"
 
 
-def _unknown(key: str, values: Mapping[str, Any]) -> str:
-    """Say that there is no such key, and what was meant: another key, or a choice that has it.
-
-    Args:
-        key: The key.
-        values: What the configuration holds without it.
-    """
-    algo, section = values.get("algo") or {}, key.partition(".")[0]
-    if section not in values and section in KEYS and section != "note":  # which is added
-        return f"algo={algo.get('name')} has no '{section}'."
-    if section == "env" and (reason := on_cpu_only(key.removeprefix("env."))):
-        return f"there is no key '{key}'.{reason}"
-    if choice := _choice_with(key):
-        return f"there is no key '{key}' without {choice}."
-    unread = tuple(f"{path}." for path in _unread_by(algo))
-    paths = {p: is_held for p, is_held in keys_of(values) if not f"{p}.".startswith(unread)}
-    own = ["env", "algo", "preset", *(path for path, is_held in paths.items() if is_held)]
-    elsewhere = [_ELSEWHERE[key]] if key in _ELSEWHERE else []
-    meant = elsewhere or nearest_keys(key, own) or nearest_keys(key, paths)
-    names = " or ".join(f"'{'' if path in own + elsewhere else '+'}{path}'" for path in meant)
-    how = f"A new key is added by +{key}=…" if "." in key else "'--cfg job' prints all keys."
-    return f"there is no key '{key}'. {f'Did you mean {names}?' if names else how}"
-
-
-def _choice_with(key: str) -> str | None:
-    """The choice that would bring a key, as ``risk=cvar`` brings ``risk.tail``, or None."""
-    section, _, rest = key.partition(".")
-    for file in sorted((CONF / section).glob("*.yaml")) if section not in _LARGE and rest else ():
-        node = OmegaConf.to_container(OmegaConf.load(file))
-        held = flatten(node)  # type: ignore[arg-type]
-        if any(f"{path}.".startswith((f"{rest}.", f"{key}.")) for path in held):
-            name = f"[{file.stem}]" if section == "transforms" else file.stem
-            return f"{section}={name}"
-    return None
-
-
-def _unread_by(algo: Mapping[str, Any]) -> Mapping[str, str]:
-    """Keys that an algorithm does not read, choices that are not for it, and the reasons."""
-    from safe_rl.algorithms.build_part import find_recipe  # with torch: not for help and --cfg
-
-    return find_recipe(OmegaConf.create({"algo": dict(algo)})).unused_keys
-
-
 def _check(config: DictConfig, overrides: Sequence[Override]) -> None:
     try:
         with resolving(config):
@@ -239,6 +199,7 @@ def _check(config: DictConfig, overrides: Sequence[Override]) -> None:
             check_settings(config)
             complete_env(plain(config)["env"])
             _check_top(config)
+            check_risk(config)
     except OmegaConfBaseException as error:
         words = " ".join(str(error).split())
         if missing := re.search(r"Missing mandatory value: (\S+)", words):
@@ -251,7 +212,7 @@ def _check_read(overrides: Sequence[Override], config: DictConfig) -> None:
     algo = config.get("algo") or {}
     for override in overrides:
         key = override.key_or_group.replace("/", ".")
-        for unread, reason in _unread_by(algo).items():
+        for unread, reason in unread_by(algo).items():
             path, _, choice = unread.partition("=")
             is_chosen = not choice or OmegaConf.select(config, path) == choice
             if is_chosen and f"{key}.".startswith(f"{path}."):
@@ -269,7 +230,33 @@ def _check_top(config: DictConfig) -> None:
         if head not in (*KEYS, "hydra") and not re.search(rf"[{{:,]{re.escape(head)}[.,}}]", text):
             values = plain(config)
             key = next(iter(flatten({head: values.pop(head)})), head)
-            raise CommandLineError(_unknown(key, values))
+            raise CommandLineError(unknown_key(key, values))
+
+
+def check_risk(config: DictConfig) -> None:
+    """Refuse a measure of costs where nothing limits them.
+
+    Raises:
+        CommandLineError: If the algorithm, or a transform, would not read it.
+    """
+    measure = (config.get("risk") or {}).get("_target_")
+    is_constrained = config.algo.get("constrained") is not False
+    if measure is not None and not is_to_keep_limits(config, is_constrained):
+        raise CommandLineError(
+            f"risk={measure.rpartition('.')[2].lower()}: algo={config.algo.name} limits no costs, "
+            "so it would have no effect. Choose risk=mean, or an algorithm that keeps cost_limits."
+        )
+
+
+def is_to_keep_limits(config: DictConfig, is_constrained: bool) -> bool:
+    """Whether limits are kept by the algorithm, or by a transform that gives episodes a budget.
+
+    Args:
+        config: Configuration of a run.
+        is_constrained: Whether its algorithm constrains costs.
+    """
+    transforms = (config.get("transforms") or {}).values()
+    return is_constrained or any("budgets" in transform for transform in transforms)
 
 
 def compose_resumed(
@@ -311,7 +298,7 @@ def _change(config: DictConfig, override: Override, directory: Path, said: Seque
     if override.is_sweep_override():
         raise CommandLineError(f"'{line}': a run has one value of it.")
     if before is _MISSING and not (override.is_add() or override.is_hydra_override()):
-        raise CommandLineError(f"'{line}': {_unknown(key, plain(config))}")
+        raise CommandLineError(f"'{line}': {unknown_key(key, plain(config))}")
     is_plain = not (override.is_delete() or "/" in key or isinstance(before, DictConfig))
     may_change = is_plain and not override.package and role_of(key).may_change
     is_place = key == "hydra.run.dir" and Path(str(value)).resolve() == directory.resolve()

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
-from dataclasses import fields
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -31,10 +30,7 @@ from safe_rl.naming import did_you_mean
 from safe_rl.reporting.figures import draw_variations
 from safe_rl.runs.folder import RunFolder
 
-__all__ = [
-    *("carry_out", "certificate_options", "certify_run", "evaluate_run", "evaluate_varied"),
-    "is_to_keep_limits",
-]
+__all__ = ["carry_out", "certificate_options", "certify_run", "evaluate_run", "evaluate_varied"]
 
 
 def carry_out(words: list[str], options: EvaluationOptions, modules: Sequence[str] | None) -> int:
@@ -78,9 +74,9 @@ def evaluate_run(
 
 def _certify(directory: Path, options: EvaluationOptions) -> int:
     """Certify a run's own problem, to which other options would make no difference."""
-    own, plain = ("certify", "certificate", "num_threads"), EvaluationOptions()
-    for name in (field.name for field in fields(options) if field.name not in own):
-        if getattr(options, name) != getattr(plain, name):
+    read = {name: getattr(options, name) for name in ("certify", "certificate", "num_threads")}
+    for name, value in vars(EvaluationOptions(**read)).items():
+        if getattr(options, name) != value:
             raise CommandLineError(
                 f"{name}: it is ignored by certify=true. A certificate is of the run's own "
                 "environment, and takes certificate.episodes=… and the like, and num_threads=…"
@@ -138,17 +134,6 @@ def certificate_options(
     risk = config.get("risk") or {}
     share = min(options["most_over"], risk.get("most_over", 1.0))
     return CertificateOptions(**options | {"most_over": share}, tail=risk.get("tail", 1.0))
-
-
-def is_to_keep_limits(config: DictConfig, cost_keys: Collection[str]) -> bool:
-    """Whether limits are kept by the algorithm, or by a transform that gives episodes a budget.
-
-    Args:
-        config: Configuration of the run.
-        cost_keys: Costs that its algorithm constrains.
-    """
-    transforms = (config.get("transforms") or {}).values()
-    return bool(cost_keys) or any("budgets" in transform for transform in transforms)
 
 
 def evaluate_varied(

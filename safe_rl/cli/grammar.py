@@ -14,7 +14,6 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import MISSING, fields
 from importlib import import_module
 from pathlib import Path
-from types import TracebackType
 from typing import TYPE_CHECKING, Any, TypeVar, cast, get_type_hints
 
 from hydra.core.override_parser.overrides_parser import OverridesParser
@@ -67,16 +66,16 @@ def parse(text: str) -> Override:
         ) from None
 
 
-def take_word(name: str, words: Sequence[str]) -> tuple[str | None, list[str]]:
-    """The last value of a word ``name=value``, None if it is not given; and the other words.
+def take_word(name: str, words: Sequence[str]) -> tuple[list[str], list[str]]:
+    """The values of a word ``name=value``, and the other words.
 
     Examples:
         >>> take_word("slate", ["slate=SG6", "seed=0"])
-        ('SG6', ['seed=0'])
+        (['SG6'], ['seed=0'])
     """
     given = [word for word in words if word.lstrip("+").startswith(f"{name}=")]
     others = [word for word in words if word not in given]
-    return given[-1].partition("=")[2] if given else None, others
+    return [word.partition("=")[2] for word in given], others
 
 
 def quote(text: str) -> str:
@@ -106,12 +105,11 @@ def split_imports(arguments: Sequence[str]) -> tuple[list[str] | None, list[str]
         >>> split_imports(["import=mine", "seed=1", "import=[examples/other.py]"])
         (['mine', 'examples/other.py'], ['seed=1'])
     """
-    given = [argument for argument in arguments if argument.lstrip("+").startswith(f"{IMPORT}=")]
-    others = [argument for argument in arguments if argument not in given]
+    given, others = take_word(IMPORT, arguments)
     modules: list[str] = []
-    for argument in given:
-        text = argument.partition("=")[2]
-        modules += cast(list[str], parse(argument).value()) if text.startswith("[") else [text]
+    for text in given:
+        is_list = text.startswith("[")
+        modules += cast(list[str], parse(f"{IMPORT}={text}").value()) if is_list else [text]
     return (list(dict.fromkeys(modules)) if given else None), others
 
 
@@ -260,15 +258,15 @@ def run_command(
 
 
 def say_interruptions() -> None:
-    """Let Ctrl-C print a word instead of a traceback, which ``HYDRA_FULL_ERROR=1`` shows.
+    """Let Ctrl-C print a word instead of a traceback.
 
     The process still ends by the signal, as shells want it that run commands in a loop.
     """
 
-    def say(kind: type[BaseException], error: BaseException, trace: TracebackType | None) -> None:
-        if issubclass(kind, KeyboardInterrupt) and os.environ.get("HYDRA_FULL_ERROR") != "1":
+    def say(kind: type[BaseException], *error: Any) -> None:
+        if issubclass(kind, KeyboardInterrupt):
             print("Interrupted.", file=sys.stderr)
         else:
-            sys.__excepthook__(kind, error, trace)
+            sys.__excepthook__(kind, *error)
 
     sys.excepthook = say

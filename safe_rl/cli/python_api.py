@@ -99,11 +99,6 @@ def train(
     words += [f"--config-dir={place}" for place in folders]
     (config,) = read_command([*words, *note_imports(imports or None)]).configs
     folder = None if directory is None else Path(directory).expanduser()
-    if folder is not None and RunFolder(folder).has_begun:
-        raise FileExistsError(
-            f"{folder} already holds a run. Continue it with safe_rl.resume({str(folder)!r}), or "
-            "give this one another directory."
-        )
     return _carry_out(Session.begin(config, folder, program=None, callbacks=callbacks))
 
 

@@ -6,13 +6,15 @@ defaults are in ``conf/``.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
-from typing import Annotated, Any, Literal, NamedTuple
+from collections.abc import Iterator, Mapping
+from typing import Annotated, Any, Literal
 
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
+from safe_rl.envs.errors import on_cpu_only
 from safe_rl.evaluation.settings import CertificateOptions, Device
+from safe_rl.files import CONF
 from safe_rl.naming import nearest
 from safe_rl.parameters import Parameter, Part, SettingError, parameters_of, read_part
 from safe_rl.ranges import (
@@ -27,15 +29,16 @@ from safe_rl.ranges import (
     is_text,
     values_of,
 )
+from safe_rl.runs.identity import flatten
 
 __all__ = [
     "GIVEN_WHOLE",
     "KEYS",
     "SettingError",
     "check_settings",
-    "keys_of",
-    "nearest_keys",
     "plain",
+    "unknown_key",
+    "unread_by",
 ]
 
 GIVEN_WHOLE = {
@@ -61,7 +64,7 @@ _Few = _int(0, 1000)
 _Kept = _int(1, 10_000)
 _Head = Literal["auto", "gaussian", "tanh", "beta", "categorical", "one_hot"]
 
-_REQUIRED: dict[str, tuple[Any, str]] = {
+_ROWS: dict[str, tuple[Any, str]] = {
     "frames": (Count, "steps to train for"),
     "num_envs": (_int(1, 10**6), "environments that are stepped together"),
     "frames_per_batch": (_int(1, 10**8), "steps of all environments in one batch"),
@@ -78,9 +81,15 @@ _REQUIRED: dict[str, tuple[Any, str]] = {
     "env.name": (Annotated[str, _FOLDER._replace(words=_FOLDER_OF_ENV)], "name of the environment"),
     "algo": (Options, "the algorithm: algo=cpo"),
     "algo.name": (Annotated[str, _FOLDER], "name of the algorithm"),
+    "algo.constrained": (bool, "whether it uses cost_limits; false: costs are only recorded"),
     "checkpoint": (Options, "when checkpoints are written"),
     "checkpoint.interval": (NotNegative, "seconds between checkpoints"),
     "checkpoint.keep_last": (_Kept, "number of last checkpoints that are kept besides the best"),
+    "checkpoint.keep_best": (_Kept, "number of best checkpoints that are kept"),
+    "checkpoint.best_over": (
+        _Kept,
+        "epochs over which return and costs of candidates are averaged",
+    ),
     "collector": (Options, "where environments are stepped: collector=local"),
     "collector.num_collectors": (Annotated[int, Values(lambda v: v == 1, _ONE)], "processes"),
     "logger": (Options, "logger in addition to progress.csv: logger=wandb, logger=none"),
@@ -96,15 +105,20 @@ _REQUIRED: dict[str, tuple[Any, str]] = {
     "model.encoders.kernels": (_Widths, "kernel sizes of these convolutions [pixels]"),
     "model.encoders.strides": (_Widths, "strides of these convolutions [pixels]"),
     "model.memory.size": (_Width, "size of the recurrent state"),
+    "model.head": (_Head, "distribution of the actions"),
+    "model.normalise": (Positive | None, "bound of normalised observations; null: not normalised"),
+    "model.encoders": (Options | None, "encoders of observed entries: model=dict, model=cnn"),
+    "model.memory": (Options | None, "recurrence: model=gru"),
+    "critics": (Options, "sizes of the ensembles of Q functions"),
     "critics.rewards": (_Few, "number of Q functions of the reward"),
     "critics.costs": (_Few, "number of Q functions of the costs"),
+    "dataset": (Options, "recorded transitions that the replay buffer begins with"),
     "dataset.path": (Text | None, "folder of a recording, or an HDF5 file"),
     "dataset.safe_episodes": (bool, "whether only episodes within cost_limits are taken"),
     "dataset.alone": (bool, "whether to learn from the dataset only"),
+    "exploration": (Options, "exploration of off-policy algorithms"),
     "exploration.random_steps": (_int(0), "random steps at the start"),
-}
-"""What every run has, and every section (``model`` and the like) that a run has."""
-_OPTIONAL: dict[str, tuple[Any, str]] = {
+    "exploration.noise": (NotNegative, "standard deviation of a deterministic actor's noise"),
     "default_cost_limits": (_Limits | None, "cost_limits unless given"),
     "record": (bool, "whether transitions are written to disk"),
     "note": (Any, "a note on the run, kept in its config.yaml"),
@@ -116,17 +130,7 @@ _OPTIONAL: dict[str, tuple[Any, str]] = {
         bool | None,
         "whether environments start at different steps of an episode",
     ),
-    "algo.constrained": (bool, "whether it uses cost_limits; false: costs are only recorded"),
-    "checkpoint.keep_best": (_Kept, "number of best checkpoints that are kept"),
-    "checkpoint.best_over": (
-        _Kept,
-        "epochs over which return and costs of candidates are averaged",
-    ),
     "certificate": (Options, "the test at a run's end; certificate.episodes=0 for none"),
-    "model.head": (_Head, "distribution of the actions"),
-    "model.normalise": (Positive | None, "bound of normalised observations; null: not normalised"),
-    "model.encoders": (Options | None, "encoders of observed entries: model=dict, model=cnn"),
-    "model.memory": (Options | None, "recurrence: model=gru"),
     "advantage": (_Part, "estimator of the reward's advantages"),
     "cost_advantage": (_Part | None, "estimator of the costs' advantages"),
     "lagrangian": (_Part | None, "the multiplier"),
@@ -134,10 +138,6 @@ _OPTIONAL: dict[str, tuple[Any, str]] = {
     "limits": (Options | None, "how the limit is approached: limits=default or paper"),
     "memory": (_Part, "the replay buffer of off-policy algorithms"),
     "actor": (_Part, "the policy's network of off-policy algorithms"),
-    "critics": (Options, "sizes of the ensembles of Q functions"),
-    "dataset": (Options, "recorded transitions that the replay buffer begins with"),
-    "exploration": (Options, "exploration of off-policy algorithms"),
-    "exploration.noise": (NotNegative, "standard deviation of a deterministic actor's noise"),
     "evaluation": (Options | None, "evaluation while training"),
     "evaluation.interval": (Count, "steps between evaluations"),
     "evaluation.episodes": (_int(1, 10**6), "episodes of an evaluation"),
@@ -146,35 +146,19 @@ _OPTIONAL: dict[str, tuple[Any, str]] = {
     "then": (dict[str, dict[str, _Part]], "losses and updates after policy_update"),
     "critic_update": (_Part, "the update of the critics"),
 }
-
-KEYS = {
-    path: Parameter(values_of(kind), meaning, is_required=rows is _REQUIRED)
-    for rows in (_REQUIRED, _OPTIONAL)
-    for path, (kind, meaning) in rows.items()
-} | {
-    f"certificate.{name}": row._replace(is_required=False)
+KEYS = {path: Parameter(values_of(kind), meaning) for path, (kind, meaning) in _ROWS.items()} | {
+    f"certificate.{name}": row
     for name, row in parameters_of(CertificateOptions).items()
     if name != "tail"  # that of the risk
 }
 """By full path: all keys but those of parts and environments."""
+_ELSEWHERE = {
+    **dict.fromkeys(("total_timesteps", "total_steps", "timesteps", "max_steps"), "frames"),
+    **dict.fromkeys(("dir", "directory", "log_dir", "output_dir", "run_dir"), "hydra.run.dir"),
+}
+"""What other libraries call a key -> the key."""
 _LIKENESS = 0.6
 """Likeness from which a key is taken for a misspelt one."""
-
-
-class _Node(NamedTuple):
-    """A mapping of a configuration.
-
-    Attributes:
-        path: Its key.
-        values: What it holds.
-        part: What its keys may hold, and which there are.
-        is_built: Whether a class is built from it.
-    """
-
-    path: str
-    values: Mapping[str, Any]
-    part: Part
-    is_built: bool = False
 
 
 def check_settings(config: DictConfig) -> None:
@@ -190,21 +174,17 @@ def check_settings(config: DictConfig) -> None:
         SettingError: For the first key that does not exist or holds what it cannot.
         TargetError: For a part that cannot be built.
     """
-    for path, values, part, is_built in _nodes(plain(config)):
-        for name, row in part.rows.items():
-            if name in values:
-                row.check(_join(path, name), values[name])
+    values = plain(config)
+    for path, node, part in _nodes(values):
+        for name, value in node.items():
+            key = _join(path, name)
+            if name in part.rows:
+                row = part.rows[name]
+                row.check(key, value)
                 if row.values.whole:
-                    holder = OmegaConf.select(config, path) if path else config
-                    holder[name] = _whole(values[name])
-            elif row.is_required and not is_built:
-                raise SettingError(f"{_join(path, name)} is missing: {row.meaning}.")
-        known = list(values) if part.names is None else part.names
-        for name in values:
-            if name not in known and not str(name).startswith("_"):
-                meant = nearest_keys(name, known)
-                hint = f" Did you mean '{_join(path, meant[0])}'?" if meant else ""
-                raise SettingError(f"there is no key '{_join(path, name)}'.{hint}")
+                    (OmegaConf.select(config, path) if path else config)[name] = _whole(value)
+            elif part.names is not None and name not in part.names and str(name)[0] != "_":
+                raise SettingError(unknown_key(key, values))
 
 
 def plain(config: DictConfig) -> dict[str, Any]:
@@ -220,56 +200,92 @@ def plain(config: DictConfig) -> dict[str, Any]:
         raise SettingError(f"{error.full_key}: {str(error).partition(chr(10))[0]}") from None
 
 
-def nearest_keys(key: str, known: Iterable[str]) -> list[str]:
-    """Keys that a wrong one may stand for: those with its last name, or else those most like it.
+def unknown_key(key: str, values: Mapping[str, Any]) -> str:
+    """Say that there is no such key, and what was meant: another key, or a choice that has it.
 
-    Examples:
-        >>> nearest_keys("lr", ["policy_update.optimizer.lr", "frames"])
-        ['policy_update.optimizer.lr']
-        >>> nearest_keys("frmaes", ["frames", "env.num_steps"])
-        ['frames']
+    Args:
+        key: The key.
+        values: The configuration, as `plain` returns it.
     """
-    paths, name = list(known), _end(key)
-    if same := [path for path in paths if _end(path) == name]:
-        return same
-    if (whole := nearest(key, paths, _LIKENESS)) is not None:
+    algo, section = values.get("algo") or {}, key.partition(".")[0]
+    if section not in values and section in KEYS and section != "note":  # which is added
+        return f"algo={algo.get('name')} has no '{section}'."
+    if section == "env" and (reason := on_cpu_only(key.removeprefix("env."))):
+        return f"there is no key '{key}'.{reason}"
+    if choice := _choice_with(key):
+        return f"there is no key '{key}' without {choice}."
+    known, unread = dict(_keys_of(values)), tuple(f"{path}." for path in unread_by(algo))
+    read = [path for path in known if path != key and not f"{path}.".startswith(unread)]
+    held = [path for path in read if known[path]]
+    elsewhere = [_ELSEWHERE[key]] if key in _ELSEWHERE else []
+    meant = elsewhere or _nearest_keys(key, held) or _nearest_keys(key, read)
+    names = " or ".join(f"'{'' if known.get(path, True) else '+'}{path}'" for path in meant)
+    how = f"A new key is added by +{key}=…" if "." in key else "'--cfg job' prints all keys."
+    return f"there is no key '{key}'. {f'Did you mean {names}?' if names else how}"
+
+
+def unread_by(algo: Mapping[str, Any]) -> Mapping[str, str]:
+    """Keys that an algorithm does not read, choices that are not for it, and the reasons."""
+    from safe_rl.algorithms.build_part import find_recipe  # with torch: not for help and --cfg
+
+    return find_recipe(OmegaConf.create({"algo": dict(algo)})).unused_keys
+
+
+def _nearest_keys(key: str, known: list[str]) -> list[str]:
+    """Those with the same last name, or the most alike one, or those with the most alike name."""
+    ends = [path.rpartition(".")[2] for path in known]
+    name = key.rpartition(".")[2]
+    if name not in ends and (whole := nearest(key, known, _LIKENESS)):
         return [whole]
-    end = nearest(name, map(_end, paths), _LIKENESS)
-    return [path for path in paths if _end(path) == end]
+    end = nearest(name, ends, _LIKENESS)
+    return [path for path, other in zip(known, ends, strict=True) if other == end]
 
 
-def keys_of(values: Mapping[str, Any]) -> Iterator[tuple[str, bool]]:
+def _choice_with(key: str) -> str | None:
+    """The choice that would bring a key, as ``risk=cvar`` brings ``risk.tail``, or None."""
+    section, _, rest = key.partition(".")
+    for file in sorted((CONF / section).glob("*.yaml")) if rest else ():
+        held = flatten(OmegaConf.to_container(OmegaConf.load(file)))  # type: ignore[arg-type]
+        if any(f"{path}.".startswith((f"{rest}.", f"{key}.")) for path in held):
+            return (
+                f"{section}=[{file.stem}]" if section == "transforms" else f"{section}={file.stem}"
+            )
+    return None
+
+
+def _keys_of(values: Mapping[str, Any]) -> Iterator[tuple[str, bool]]:
     """Full paths of what a configuration holds, and of what its parts would read besides.
 
     Yields:
         A path, and whether the configuration holds it.
     """
-    whole = (*GIVEN_WHOLE, "default_cost_limits", "paper")
-    for node in _nodes(values):
-        held = [name for name in node.values if not str(name).startswith("_")]
-        for name in held if not node.path.startswith(whole) else ():
-            path = _join(node.path, name)
-            if not isinstance(node.values[name], Mapping) or path in whole or node.path == "env":
-                yield path, True
-        if node.is_built:
-            yield from ((_join(node.path, k), False) for k in node.part.settings if k not in held)
+    for path, node, part in _nodes(values):
+        if not path.startswith((*GIVEN_WHOLE, "default_cost_limits", "paper")):
+            settings = part.settings if "_target_" in node else {}
+            names = (*(name for name in node if str(name)[0] != "_"), *settings)
+            yield from ((_join(path, name), name in node) for name in names)
 
 
-def _nodes(values: Mapping[str, Any], path: str = "") -> Iterator[_Node]:
-    """Mappings of a configuration, each before those within it."""
+def _nodes(
+    values: Mapping[str, Any], path: str = ""
+) -> Iterator[tuple[str, Mapping[str, Any], Part]]:
+    """Mappings of a configuration, each before those within it.
+
+    Yields:
+        Its key, what it holds, and what it may hold.
+    """
     target = values.get("_target_")
     if path == "env":
-        yield _Node(path, values, Part({"name": KEYS["env.name"]}, None))
+        yield path, values, Part({"name": KEYS["env.name"]}, None)
         return
     if target is not None and path != "algo":
-        yield _Node(path, values, read_part(target, path), is_built=True)
+        yield path, values, read_part(target, path)
     else:
-        head = f"{path}." if path else ""
-        rows = {key.removeprefix(head): row for key, row in KEYS.items() if key.startswith(head)}
-        own = {name: row for name, row in rows.items() if "." not in name}
+        places = {key: key.rpartition(".") for key in KEYS}
+        own = {name: KEYS[key] for key, (section, _, name) in places.items() if section == path}
         # a section has no other keys than its rows; others may be tables of an algorithm's own
         is_closed = path == "logger" or bool(path and own)
-        yield _Node(path, values, Part(own, list(own) if is_closed else None))
+        yield path, values, Part(own, list(own) if is_closed else None)
     for name, value in values.items():
         if isinstance(value, Mapping):
             yield from _nodes(value, _join(path, name))
@@ -283,7 +299,3 @@ def _whole(value: Any) -> Any:
 
 def _join(path: str, name: str) -> str:
     return f"{path}.{name}" if path else str(name)
-
-
-def _end(path: str) -> str:
-    return path.rpartition(".")[2]

@@ -19,8 +19,8 @@ from omegaconf import DictConfig, OmegaConf, open_dict
 from omegaconf.errors import OmegaConfBaseException
 from torchrl.checkpoint import CheckpointError
 
-from safe_rl.cli.composing import resolving
-from safe_rl.cli.evaluating import certify_run, is_to_keep_limits
+from safe_rl.cli.composing import check_risk, is_to_keep_limits, resolving
+from safe_rl.cli.evaluating import certify_run
 from safe_rl.cli.run_folders import keep_robot, new_folder, robot_of
 from safe_rl.cli.schema import check_settings
 from safe_rl.cli.user_code import imported, make_after_imports
@@ -136,7 +136,7 @@ class Session:
             _print(f"Interrupted. Continue with: {self._again}")
         else:
             self._say(outcome)
-            if is_to_keep_limits(self.config, trainer.algorithm.cost_keys):
+            if is_to_keep_limits(self.config, bool(trainer.algorithm.cost_keys)):
                 self._certify_if_long(trainer.episode_length)
 
     def refuses(self, error: Exception) -> bool:
@@ -163,9 +163,12 @@ class Session:
         if "RL_LOGGING_LEVEL" not in os.environ:  # by which users let TorchRL say more
             logging.getLogger("torchrl").setLevel(logging.WARNING)
         config, folder = self.config, self.folder
-        if not self._continues:
-            folder.check_is_free()
-        elif is_finished(folder.directory, config.frames):
+        if not self._continues and folder.has_begun:
+            raise FileExistsError(
+                f"{folder.directory} already holds a run. Continue it with: {self._again}; or give "
+                "this one another folder."
+            )
+        if self._continues and is_finished(folder.directory, config.frames):
             more = ": raise 'frames' to train on"
             if folder.certifying.exists():
                 more = "; certifying it, as was begun"
@@ -279,6 +282,7 @@ def run_job(config: DictConfig) -> float:
     hydra = cast(DictConfig, HydraConfig.instance().cfg).hydra
     folder = RunFolder(Path(hydra.runtime.output_dir).resolve())
     check_settings(config)
+    check_risk(config)  # of this combination
     session = Session(config, folder.directory, hydra, continues=True)
     session.run()
     if session.interrupted_by is not None:

@@ -91,14 +91,14 @@ def read_command(words: Sequence[str]) -> Command:
     modules, overrides = split_imports(flags.overrides)
     import_modules(modules or ())
     resume, overrides = take_word("resume", overrides)
-    if resume is not None:
+    if resume:
         if is_sweep or flags.cfg:
             raise CommandLineError(
                 "resume= continues one run, which has its configuration in config.yaml: no flag "
                 "goes with it. To continue a sweep, start it again as it was: finished runs are "
                 "skipped, interrupted ones continue."
             )
-        run = Path(resume).expanduser().absolute()
+        run = Path(resume[-1]).expanduser().absolute()
         return Command(flags, overrides, [compose_resumed(run, overrides, modules)], run, True)
     overrides = expand_slate(overrides, is_sweep)
     overrides = [*search_folders(flags.config_dir or ()), *overrides, *note_imports(modules)]
@@ -162,9 +162,10 @@ def expand_slate(words: Sequence[str], is_sweep: bool) -> list[str]:
         >>> expand_slate(["slate=SGDoggo", "seed=0"], is_sweep=True)[0]
         'env=DoggoGoal1,DoggoGoal2,DoggoButton1,DoggoButton2,DoggoPush1,DoggoPush2'
     """
-    name, others = take_word("slate", words)
-    if name is None:
+    given, others = take_word("slate", words)
+    if not given:
         return others
+    name = given[-1]
     if name not in SLATES:
         raise CommandLineError(
             f"Unknown slate '{name}'.{did_you_mean(name, SLATES)} Slates are: {', '.join(SLATES)}."

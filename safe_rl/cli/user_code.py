@@ -16,15 +16,9 @@ from typing import Any
 
 from safe_rl import targets
 from safe_rl.cli.grammar import IMPORT as KEY
-from safe_rl.cli.grammar import CommandLineError, quote
+from safe_rl.cli.grammar import CommandLineError, overrides_of
 
-__all__ = [
-    "check_imports",
-    "import_modules",
-    "imported",
-    "make_after_imports",
-    "note_imports",
-]
+__all__ = ["check_imports", "import_modules", "imported", "make_after_imports", "note_imports"]
 
 _imported: list[str] = []
 
@@ -36,29 +30,22 @@ def note_imports(modules: str | Sequence[str] | None) -> list[str]:
         >>> note_imports(["mine", "examples/other.py"])
         ["++import=['mine','examples/other.py']"]
     """
-    if modules is None:
-        return []
     modules = [modules] if isinstance(modules, str) else modules
-    return [f"++{KEY}=[{','.join(map(quote, modules))}]"]
+    return [] if modules is None else list(overrides_of({f"++{KEY}": list(modules)}))
 
 
-def import_modules(modules: str | Sequence[str]) -> list[str]:
+def import_modules(modules: str | Sequence[str]) -> None:
     """Import modules and let configurations name what they define.
 
     Args:
         modules: Dotted names, looked for in the current directory too, or paths of files; or one.
-
-    Returns:
-        All of them.
 
     Raises:
         CommandLineError: If one does not exist, cannot be imported, or is hidden by another.
     """
     modules = [modules] if isinstance(modules, str) else list(modules)
     for module in modules:
-        if not module.strip(". /"):
-            raise CommandLineError(f"{KEY}={module}: name a module, or a file by its path.")
-        name, path = module, Path(*module.split(".")).with_suffix(".py")
+        name, path = module, Path(f"{module.replace('.', '/')}.py")
         if module.endswith(".py"):
             path = Path(module).expanduser()
             name = path.stem
@@ -77,7 +64,6 @@ def import_modules(modules: str | Sequence[str]) -> list[str]:
         where = module if name == module else str(path.resolve())
         if where not in _imported:
             _imported.append(where)
-    return modules
 
 
 def imported() -> list[str]:

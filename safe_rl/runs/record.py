@@ -91,7 +91,7 @@ class RunRecord:
             if epoch is None or not self.folder.is_run:
                 self._save_config()
             self._table = TableWriter(self.folder.table, keep_rows=epoch or 0)
-            self._logger = build(self._config.logger, log_dir=str(self.directory))
+            self._logger = build(self._config.get("logger"), log_dir=str(self.directory))
             if epoch is not None and self._logger is not None:
                 self._logger.continue_from(steps)
             if not epoch and self._logger is not None:

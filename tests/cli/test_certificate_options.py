@@ -3,7 +3,8 @@
 import pytest
 from run_configs import compose_config
 
-from safe_rl.cli.evaluating import certificate_options, is_to_keep_limits
+from safe_rl.cli.composing import is_to_keep_limits
+from safe_rl.cli.evaluating import certificate_options
 
 
 @pytest.mark.parametrize(
@@ -30,17 +31,17 @@ def test_a_limit_on_the_costliest_episodes_is_certified_for_them(overrides, tail
 
 
 @pytest.mark.parametrize(
-    ("overrides", "cost_keys", "is_to"),
+    ("overrides", "is_constrained", "is_to"),
     [
-        ([], ["cost"], True),
-        ([], [], False),
-        (["transforms=[early_termination]"], [], True),
-        (["transforms=[reward_scale]"], [], False),
+        ([], True, True),
+        ([], False, False),
+        (["transforms=[early_termination]"], False, True),
+        (["transforms=[reward_scale]"], False, False),
     ],
 )
-def test_a_budget_of_a_transform_is_a_limit_to_keep(overrides, cost_keys, is_to):
+def test_a_budget_of_a_transform_is_a_limit_to_keep(overrides, is_constrained, is_to):
     config = compose_config("algo=ppo", *overrides)
-    assert is_to_keep_limits(config, cost_keys) == is_to
+    assert is_to_keep_limits(config, is_constrained) == is_to
 
 
 def test_options_are_replaced_and_wrong_ones_named():

@@ -37,7 +37,6 @@ WRONG = {
     "+checkpoint.kept=1": "no key 'checkpoint.kept'.*'checkpoint.keep_last'",
     "+lagrangian.kpp=1": "Did you mean 'lagrangian.kp'",
     "+logger.path=x": "no key 'logger.path'",
-    "~logger": "logger is missing: .*logger=none",
     "~frames": "'frames' not found",
     "transforms.saute.budgets.cost=1": r"budgets are given all at once, as .*='\{cost: 1\}'",
     "model.input_scale.gyro=1": r"factors are given all at once, as .*='\{gyro: 1\}'",
@@ -120,6 +119,14 @@ def test_multipliers_go_with_algorithms_that_have_them(override):
     part = override.partition("=")[0].partition(".")[0]
     with pytest.raises(CommandLineError, match=f"algo=ppo has no '{part}'"):
         read_command(["algo=ppo", override])
+
+
+def test_a_risk_measure_is_refused_where_no_limit_is_kept():
+    read_command(["algo=cpo", "risk=cvar"])
+    read_command(["algo=ppo", "risk=chance", "transforms=[saute]"])  # which is certified
+    for words in (["algo=ppo", "risk=cvar"], ["-m", "algo=cpo,sac", "risk=cvar"]):
+        with pytest.raises(CommandLineError, match=r"risk=cvar: algo=\w+ limits no costs"):
+            read_command(words)
 
 
 UNREAD = {
