@@ -29,7 +29,7 @@ PAGES = ["README.md", *(str(p.relative_to(ROOT)) for p in sorted((ROOT / "docs")
 # snippets that have tests of their own, with more to say
 TESTED_ELSEWHERE = ("README.md", "docs/algorithms")
 # a package that not everybody has
-LACKING = ("comes with the extra", "cannot be imported in this Python", "GPU that torch finds here")
+LACKING = ("comes with the extra", "cannot be imported in this Python", "if torch finds this GPU")
 # options of our other commands, and what else stands after the folder
 SCHEMAS: dict[str, list] = {
     "safe_rl.evaluate": [EvaluationOptions],
