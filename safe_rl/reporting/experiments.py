@@ -150,17 +150,21 @@ def _order(experiment: Experiment) -> tuple[Hashable, ...]:
 
 
 def _environment_names(runs: Sequence[Run], suite: Suite) -> dict[Path, str]:
-    """Folder -> name of the environment, with the keys that differ from the suite's, or first's."""
-    firsts: dict[str, Settings] = {}
+    """Folder -> name of the environment, with the keys that differ from the suite's.
+
+    Other environments are named with the keys in which those of the same name differ.
+    """
+    alike: dict[str, list[Settings]] = defaultdict(list)
+    for run in runs:
+        alike[str(run.config["env"].get("name", "environment"))].append(flatten(run.config["env"]))
     titles = {}
     for run in runs:
         node = run.config["env"]
         name = str(node.get("name", "environment"))
         changes = suite.changes(node)
         if changes is None:
-            settings = flatten(node)
-            first = firsts.setdefault(name, settings)
-            changes = {k: v for k, v in settings.items() if k not in first or v != first[k]}
+            settings, keys = flatten(node), distinguishing_keys([alike[name]])
+            changes = {key: settings[key] for key in keys if key in settings}
         titles[run.directory] = clean(name, 80) + _in_brackets(flatten(changes))
     return titles
 

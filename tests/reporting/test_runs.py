@@ -246,7 +246,7 @@ def test_a_changed_environment_is_another_one(tmp_path):
     experiments, _ = grouped(tmp_path)
     assert [(e.environment, e.benchmark) for e in experiments] == [
         ("PointGoal1", "PointGoal1"),
-        ("Mine", None),
+        ("Mine (hazards_num=1)", None),
         ("Mine (hazards_num=2)", None),
         ("PointGoal1 (layout_seeds=5, hazards_num=12)", None),
     ]
