@@ -122,15 +122,13 @@ def certificate_options(
     the mean of the costliest ones.
     """
     options = dict(config.certificate)
-    if not options["episodes"]:  # the run was to end without a certificate
-        options["episodes"] = OmegaConf.load(CONF / "config.yaml").certificate.episodes
     for name, value in (changes or {}).items():
         if name not in options:
             raise ValueError(f"There is no certificate.{name}.{did_you_mean(name, options)}")
         KEYS[f"certificate.{name}"].check(f"certificate.{name}", value)
-        if name == "episodes" and not value:
-            raise ValueError("certificate.episodes=0: it must be at least 1 to test anything.")
-    options |= changes or {}
+        options[name] = value
+    if not options["episodes"]:  # the run was to end without a certificate
+        options["episodes"] = OmegaConf.load(CONF / "config.yaml").certificate.episodes
     risk = config.get("risk") or {}
     share = min(options["most_over"], risk.get("most_over", 1.0))
     return CertificateOptions(**options | {"most_over": share}, tail=risk.get("tail", 1.0))

@@ -164,9 +164,10 @@ class Session:
             logging.getLogger("torchrl").setLevel(logging.WARNING)
         config, folder = self.config, self.folder
         if not self._continues and folder.has_begun:
+            key = "hydra.run.dir" if self._program else "directory"
             raise FileExistsError(
                 f"{folder.directory} already holds a run. Continue it with: {self._again}; or give "
-                "this one another folder."
+                f"this one another folder, {key}=…"
             )
         if self._continues and is_finished(folder.directory, config.frames):
             more = ": raise 'frames' to train on"

@@ -60,7 +60,7 @@ class Sweep:
     """The function that Hydra's launcher calls for each job, in this process or in another one.
 
     A failing job does not end the sweep: its traceback is written into its folder. Every job notes
-    in a journal below the sweep's folder that it has begun and how it has ended.
+    in a log below the sweep's folder that it has begun and how it has ended.
 
     Args:
         hydra: Hydra's own node, of the first job.
@@ -74,7 +74,7 @@ class Sweep:
         self._process = os.getpid()
         folder = Path(hydra.sweep.dir).absolute() / "sweeps"
         folder.mkdir(parents=True, exist_ok=True)
-        self._journal = folder / f"{datetime.now():%Y-%m-%d_%H-%M-%S}_{self._process}.jsonl"
+        self._log = folder / f"{datetime.now():%Y-%m-%d_%H-%M-%S}_{self._process}.jsonl"
         num_workers = hydra.launcher.get("n_jobs")
         if num_workers is not None:
             num_cores = len(os.sched_getaffinity(0))
@@ -95,42 +95,39 @@ class Sweep:
 
         hydra = cast(DictConfig, HydraConfig.get())
         folder = RunFolder(Path(hydra.runtime.output_dir))
-        self._note(hydra, "begun")
+        self._note(hydra, "interrupted")  # unless another line follows
         if os.getppid() == self._process:
             # else it would train on, or wait for ever, when the sweep was killed
             end_with_parent(_GRACE)
         try:
             value = run_job(config)
         except Exception as error:
+            summary = f"{type(error).__name__}: {str(error).strip().partition(chr(10))[0]}"
             if not isinstance(error, RunInUseError):  # the folder is somebody else's
                 folder.directory.mkdir(parents=True, exist_ok=True)
                 replace_text(folder.failure, "".join(traceback.format_exception(error)))
-            summary = str(error).strip().partition("\n")[0]
-            self._note(hydra, "failed", f"{type(error).__name__}: {summary}")
+                summary += f" (see {folder.failure.name} there)"
+            self._note(hydra, "failed", f": {summary}")
             return -math.inf
         folder.failure.unlink(missing_ok=True)
         self._note(hydra, "done")
         return value
 
-    def _note(self, hydra: DictConfig, event: str, error: str = "") -> None:
-        note = {"job": hydra.job.num, "event": event, "error": error}
+    def _note(self, hydra: DictConfig, state: str, error: str = "") -> None:
+        note = [hydra.job.num, state, hydra.runtime.output_dir + error]
         # appended in one piece, also by several processes
-        with self._journal.open("a") as file:
-            file.write(json.dumps({**note, "directory": hydra.runtime.output_dir}) + "\n")
+        with self._log.open("a") as file:
+            file.write(json.dumps(note) + "\n")
 
     def print_summary(self) -> bool:
         """Print how the jobs have ended; returns whether all are finished."""
-        lines = self._journal.read_text().splitlines() if self._journal.exists() else []
-        last = {note["job"]: note for note in map(json.loads, lines)}.values()
-        num_done = sum(note["event"] == "done" for note in last)
+        lines = self._log.read_text().splitlines() if self._log.exists() else []
+        last = {job: (state, words) for job, state, words in map(json.loads, lines)}.values()
+        num_done = sum(state == "done" for state, _ in last)
         print(f"Sweep: {num_done} of {self._num_jobs} runs are finished.")
-        for note in last:
-            if note["event"] == "failed":
-                file = RunFolder(Path(note["directory"])).failure
-                hint = f" (see {file.name} there)" if file.exists() else ""
-                print(f"  failed: {note['directory']}: {note['error']}{hint}")
-            if note["event"] == "begun":
-                print(f"  interrupted: {note['directory']}")
+        for state, words in last:
+            if state != "done":
+                print(f"  {state}: {words}")
         if num_done < self._num_jobs:
             print("Start it again as it was: finished runs are skipped, the others continue.")
         return bool(num_done >= self._num_jobs)

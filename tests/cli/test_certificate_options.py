@@ -52,6 +52,5 @@ def test_options_are_replaced_and_wrong_ones_named():
     assert certificate_options(config).tests == 2
     with pytest.raises(ValueError, match=r"no certificate\.episode\. Did you mean 'episodes'"):
         certificate_options(config, {"episode": 10})
-    for changes in ({"episodes": 0}, {"level": 1.5}):
-        with pytest.raises(ValueError, match="it must be"):
-            certificate_options(config, changes)
+    with pytest.raises(ValueError, match="it must be"):
+        certificate_options(config, {"level": 1.5})

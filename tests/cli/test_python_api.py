@@ -49,6 +49,7 @@ def test_a_run_is_its_figures_environment_and_policy(run):
     rollout = run.env.rollout(20, run.policy)
     assert rollout.shape == (1, 20)
     assert rollout["next", "cost_hazards"].shape == (1, 20, 1)
+    assert rollout["action"].numpy().shape == (1, 20, 2)
     assert run.make_env(3, hazards_num=2).batch_size == (3,)
     with pytest.raises(ConfigError, match="hazards_num"):
         run.make_env(hazard_num=2)
@@ -127,14 +128,11 @@ def test_hydra_is_left_as_it_was(tmp_path, monkeypatch):
     ("settings", "message"),
     [
         ({"fames": 3}, "fames"),
-        ({"env": "PointGaol1"}, "PointGoal1"),
-        ({"algo": "cop"}, "cpo"),
         ({"frames": -1}, "frames=-1"),
         ({"cost_limits": {"cost_hazard": 1}}, "cost_hazards"),
         ({"policy_update": {"max_kll": 1}}, "max_kll"),
         ({"env.hazard_num": 1}, "hazards_num"),
         ({"imports": ["users_nowhere"]}, "import=users_nowhere"),
-        ({"imports": "users_nowhere"}, "import=users_nowhere"),
         ({"config_dir": "nowhere"}, "config_dir=.*nowhere: there is no such folder"),
     ],
 )
@@ -177,8 +175,6 @@ def test_strange_texts_arrive_as_they_are(text):
     ("options", "message"),
     [
         ({"episode": 3}, "Unknown option 'episode'. Did you mean 'episodes'"),
-        ({"episodes": "many"}, "'many'.*option 'episodes'"),
-        ({"video": "maybe"}, "'maybe'.*option 'video'"),
         ({"episodes": 2, "cost_limits": {"cots": 3}}, "no such cost. Did you mean 'cost'"),
     ],
 )
@@ -196,11 +192,6 @@ def test_keys_of_an_evaluation_may_be_written_with_dots(run):
     )
     assert dotted.facts["env"] == nested.facts["env"] == {"hazards_num": 3}
     assert dotted.estimates == nested.estimates
-
-
-def test_rollouts_of_a_trained_policy_are_arrays(run):
-    action = run.env.rollout(2, run.policy)["action"]
-    assert action.numpy().shape == (1, 2, 2)
 
 
 @pytest.mark.parametrize("choice", [{"env": {"hazards_num": 3}}, {"algo": None}])
