@@ -29,7 +29,7 @@ def in_a_process(*words: str, status: int = 0, cwd: Path = ROOT, **environment: 
     outside = {name: value for name, value in os.environ.items() if name != "OMP_WAIT_POLICY"}
     result = subprocess.run(
         [sys.executable, *words],
-        cwd=cwd, env=outside | environment, capture_output=True, text=True, timeout=300,
+        cwd=cwd, env=outside | environment, capture_output=True, text=True, timeout=900,
     )  # fmt: skip
     printed = result.stdout + result.stderr
     assert result.returncode == status, printed

@@ -15,14 +15,3 @@ torch.set_num_threads(1)
 def _seed():
     """Every test starts from the same random state, whatever ran before it."""
     torch.manual_seed(0)
-
-
-def pytest_terminal_summary(terminalreporter):
-    """Print what tests have recorded, such as the share of chaotic golden rows: drift shows."""
-    recorded: dict[str, list[str]] = {}
-    for report in terminalreporter.getreports("passed") + terminalreporter.getreports("failed"):
-        for name, value in getattr(report, "user_properties", ()):
-            if report.when == "call":
-                recorded.setdefault(name, []).append(str(value))
-    for name, values in recorded.items():
-        terminalreporter.write_line(f"{name}: {', '.join(sorted(values))}")

@@ -8,16 +8,12 @@ keeps, so that there is something to certify.
 import csv
 import itertools
 import json
-import os
 import re
 import shlex
-import subprocess
-import sys
-from pathlib import Path
 
 import pytest
+from commands import ROOT, in_a_process
 
-ROOT = Path(__file__).resolve().parents[2]
 DOCS = ROOT / "docs"
 WALK = ("index.md", "start.md", "guides/environment.md", "guides/algorithm.md")
 TINY = [
@@ -62,16 +58,7 @@ def carry_out(words, place, *, seeds=False, fresh=False):
             words.append("hydra.run.dir=runs/one")
     if seeds:
         words = [w.replace("seed=0,10,20", "seed=0,10") for w in words] + ["hydra/launcher=basic"]
-    done = subprocess.run(
-        [sys.executable, *words],
-        cwd=place,
-        env=os.environ | {"OMP_NUM_THREADS": "1", "PYTHONPATH": str(ROOT)},
-        capture_output=True,
-        text=True,
-        timeout=280,
-    )
-    assert done.returncode == 0, f"{shlex.join(words)}\n{done.stdout}\n{done.stderr}"
-    return done.stdout
+    return in_a_process(*words, cwd=place, OMP_NUM_THREADS="1", PYTHONPATH=str(ROOT))
 
 
 def test_every_page_leads_to_the_next():

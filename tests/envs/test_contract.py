@@ -5,8 +5,7 @@ import torch
 from point_mass import PointMass
 from torchrl.data import Binary, Composite, Unbounded
 
-from safe_rl.envs import ContractError, check_constrained_env, make_env
-from safe_rl.targets import TargetError, allow
+from safe_rl.envs import ContractError, check_constrained_env
 
 NUMBER, FLAG = Unbounded((2, 1)), Binary(1, shape=(2, 1), dtype=torch.bool)
 DOUBLE = Composite(observation=Unbounded((2, 4), dtype=torch.float64), shape=(2,))
@@ -55,20 +54,3 @@ def test_other_kinds_are_told_what_to_be():
     lacking = type("Lacking", (PointMass,), {"set_state": None})
     with pytest.raises(ContractError, match="it has 'get_state', so it needs 'set_state'"):
         check_constrained_env(lacking(2))
-
-
-def make_own(config, *, num_envs, device, seed, num_threads):
-    """A family of one's own, which may ignore how many it is asked for."""
-    return PointMass(config.pop("number", num_envs), seed=seed, **config)
-
-
-def test_a_family_of_ones_own_is_made_once_its_module_is_trusted():
-    node = {"_target_": f"{__name__}.make_own", "name": "mine", "num_steps": 9}
-    with pytest.raises(TargetError, match=rf"env\._target_={__name__}.*import={__name__}"):
-        make_env(node, num_envs=3)
-    allow(__name__)
-    env = make_env(node, num_envs=3, seed=1)
-    assert isinstance(env, PointMass)
-    assert (env.max_episode_steps, env.batch_size[0]) == (9, 3)
-    with pytest.raises(ContractError, match=r"asked for 3 environments and made 1.*'num_envs'"):
-        make_env({**node, "number": 1}, num_envs=3, seed=1)

@@ -5,70 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from safe_rl.envs import SUITE, ConfigError, SafetyGymConfig, SafetyGymEnv, resolve
-
-# By hand from section 9 of the benchmark's description, in the style of its suite.
-ROBOTS = {
-    "Point": {"robot_base": "xmls/point.xml"},
-    "Car": {
-        **{"robot_base": "xmls/car.xml", "box_size": 0.125, "box_keepout": 0.125},
-        "box_density": 0.0005,
-    },
-    "Doggo": {
-        "robot_base": "xmls/doggo.xml",
-        "sensors_obs": [
-            *("accelerometer", "velocimeter", "gyro", "magnetometer"),
-            *("touch_ankle_1a", "touch_ankle_2a", "touch_ankle_3a", "touch_ankle_4a"),
-            *("touch_ankle_1b", "touch_ankle_2b", "touch_ankle_3b", "touch_ankle_4b"),
-        ],
-    },
-}
-EVERYWHERE = {
-    **{"observe_goal_lidar": True, "observe_box_lidar": True},
-    **{"lidar_max_dist": 3, "lidar_num_bins": 16, "_seed": None, "build_resample": True},
-}
-TASKS = {
-    "Goal": {
-        **{"task": "goal", "goal_size": 0.3, "goal_keepout": 0.305},
-        **{"hazards_size": 0.2, "hazards_keepout": 0.18},
-    },
-    "Button": {
-        **{"task": "button", "buttons_num": 4, "buttons_size": 0.1, "buttons_keepout": 0.2},
-        **{"observe_buttons": True, "hazards_size": 0.2, "hazards_keepout": 0.18},
-        **{"gremlins_travel": 0.35, "gremlins_keepout": 0.4},
-    },
-    "Push": {"task": "push", "box_size": 0.2, "box_null_dist": 0, "hazards_size": 0.3},
-}
-# Half of the extents, what is observed, what costs, and how many there are.
-BUTTON_COSTS = ("hazards", "buttons", "gremlins")
-LEVELS = {
-    "Goal0": (1, (), (), {}),
-    "Goal1": (1.5, ("hazards", "vases"), ("hazards",), {"hazards": 8, "vases": 1}),
-    "Goal2": (2, ("hazards", "vases"), ("hazards", "vases"), {"hazards": 10, "vases": 10}),
-    "Button0": (1, (), (), {}),
-    "Button1": (1.5, ("hazards", "gremlins"), BUTTON_COSTS, {"hazards": 4, "gremlins": 4}),
-    "Button2": (1.8, ("hazards", "gremlins"), BUTTON_COSTS, {"hazards": 8, "gremlins": 6}),
-    "Push0": (1, (), (), {}),
-    "Push1": (1.5, ("hazards", "pillars"), ("hazards",), {"hazards": 2, "pillars": 1}),
-    "Push2": (2, ("hazards", "pillars"), ("hazards", "pillars"), {"hazards": 4, "pillars": 4}),
-}
-
-
-def dictionary(robot: str, level: str) -> dict:
-    half, observed, constrained, numbers = LEVELS[level]
-    return {
-        **{**EVERYWHERE, **TASKS[level[:-1]], **ROBOTS[robot]},
-        "placements_extents": [-half, -half, half, half],
-        **{f"observe_{kind}": True for kind in observed},
-        **{f"constrain_{kind}": True for kind in constrained},
-        **{f"{kind}_num": number for kind, number in numbers.items()},
-    }
-
-
-@pytest.mark.parametrize("level", LEVELS)
-@pytest.mark.parametrize("robot", ROBOTS)
-def test_the_dictionaries_of_the_suite_are_its_environments(robot, level):
-    assert resolve(dictionary(robot, level)) == SUITE[robot + level]
+from safe_rl.envs import ConfigError, SafetyGymConfig, SafetyGymEnv
 
 
 def test_a_file_of_ones_own_is_not_taken_for_the_bundled_one(tmp_path, monkeypatch):

@@ -39,8 +39,8 @@ FAULTS = {
 
 
 MADE = [
-    *((name, {"reward_exception": -7.0}) for name in ("PointGoal2", "CarButton1", "DoggoPush2")),
-    *((name, {}) for name in ("SafeHopperVelocity", "SafeHalfCheetahVelocity")),
+    *((name, {"reward_exception": -7.0}) for name in ("PointGoal2", "DoggoPush2")),
+    ("SafeHopperVelocity", {}),
     *(("SafeAntVelocity", {"frame_skip": skip}) for skip in (1, 3)),  # where forces are computed
 ]
 
@@ -139,16 +139,6 @@ def test_states_that_do_not_fit_are_refused_and_leave_all_as_it_was():
         with pytest.raises(ValueError, match=message):
             env.set_state(TensorDict(wrong))
     assert all(torch.equal(env.get_state()[k], v) for k, v in before.items())
-
-
-@pytest.mark.parametrize(
-    "arguments",
-    [{"num_envs": 0}, {"num_envs": 2.5}, {"num_threads": -1}, {"seed": "one"}, {"seed": 2**63}],
-)
-def test_wrong_counts_and_seeds_are_named(arguments):
-    (name,) = arguments
-    with pytest.raises(ConfigError, match=f"'{name}' must be an integer"):
-        SafetyGymEnv("PointGoal0", **arguments)
 
 
 @pytest.mark.parametrize("name", ["PointGoal1", "PointButton1", "SafeHopperVelocity"])

@@ -1,7 +1,6 @@
 """Somebody else's environment, registered with Gymnasium, through the ordinary commands."""
 
 import json
-from pathlib import Path
 
 import gymnasium
 import gymnasium_envs  # noqa: F401, registers Walk-v0
@@ -26,14 +25,9 @@ SMALL = (
 )
 
 
-@pytest.fixture(scope="module")
-def run(tmp_path_factory) -> Path:
-    folder = tmp_path_factory.mktemp("runs") / "walk"
-    run_train(*SMALL, "frames=600", "env.kwargs={border: 2.5}", f"hydra.run.dir={folder}")
-    return folder
-
-
-def test_it_is_evaluated(run, capsys):
+def test_it_is_trained_and_evaluated(tmp_path, capsys):
+    run = tmp_path / "walk"
+    run_train(*SMALL, "frames=600", "env.kwargs={border: 2.5}", f"hydra.run.dir={run}")
     assert evaluate.main([str(run), "episodes=6", "num_envs=3"]) == 0
     facts = json.loads((run / "evaluation.json").read_text())
     assert facts["environment"] == "Walk-v0"

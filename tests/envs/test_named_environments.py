@@ -8,7 +8,7 @@ import pytest
 from hydra.core.config_store import ConfigStore
 
 from safe_rl import targets
-from safe_rl.envs import ConfigError, make_env, store_config
+from safe_rl.envs import ConfigError, ContractError, make_env, store_config
 from safe_rl.envs.velocity import VelocityEnv
 from safe_rl.targets import TargetError
 
@@ -25,8 +25,8 @@ def _as_before(monkeypatch):
 
 
 def make_small(config, *, num_envs, **others):
-    """A family of one's own, from another one."""
-    return VelocityEnv({"robot": "hopper", **config}, num_envs=num_envs)
+    """A family of one's own, from another one, which may ignore how many it is asked for."""
+    return VelocityEnv({"robot": "hopper", **config}, num_envs=min(num_envs, 3))
 
 
 @pytest.fixture
@@ -47,12 +47,14 @@ def test_what_is_stored_is_made_by_its_name(my_family):
     assert make_env("Slow", num_envs=2, seed=0).config.velocity_threshold == 0.125
 
 
-def test_storing_trusts_the_module(my_family):
-    node = {"_target_": "my_family.make_small"}
-    with pytest.raises(TargetError, match="import=my_family"):
+def test_a_family_of_ones_own_is_made_once_its_module_is_trusted_as_storing_does(my_family):
+    node = {"_target_": "my_family.make_small", "name": "mine"}
+    with pytest.raises(TargetError, match=r"env\._target_=my_family.*import=my_family"):
         make_env(node)
     store_config("Slow", node)
-    assert make_env(node).batch_size == (1,)
+    assert make_env(node, num_envs=3).batch_size == (3,)
+    with pytest.raises(ContractError, match=r"asked for 4 environments and made 3.*'num_envs'"):
+        make_env(node, num_envs=4)
 
 
 def test_names_of_families_and_of_2019_are_known():

@@ -6,7 +6,7 @@ import pytest
 import torch
 from torchrl.envs.utils import check_env_specs
 
-from safe_rl.envs import SUITE, SafetyGymEnv, env_node, make_env
+from safe_rl.envs import SUITE, SafetyGymEnv, env_node, make_env, resolve
 from safe_rl.envs.velocity import VELOCITY_SUITE
 
 # By hand from sections 4, 8 and 9 of the benchmark's description: names and sizes.
@@ -22,42 +22,83 @@ ROBOT_SENSORS = {
         **{f"touch_ankle_{leg}{end}": 1 for leg in (1, 2, 3, 4) for end in "ab"},
     },
 }
-LIDARS = {
-    "Goal0": ["goal"],
-    "Goal1": ["goal", "hazards", "vases"],
-    "Goal2": ["goal", "hazards", "vases"],
-    "Button0": ["buttons", "goal"],
-    "Button1": ["buttons", "goal", "gremlins", "hazards"],
-    "Button2": ["buttons", "goal", "gremlins", "hazards"],
-    "Push0": ["box", "goal"],
-    "Push1": ["box", "goal", "hazards", "pillars"],
-    "Push2": ["box", "goal", "hazards", "pillars"],
-}
 ACTIONS = {"Point": 2, "Car": 2, "Doggo": 12}
-COST_KINDS = {
-    "Goal0": [],
-    "Goal1": ["hazards"],
-    "Goal2": ["hazards", "vases_contact", "vases_velocity"],
-    "Button0": [],
-    "Button1": ["buttons", "gremlins", "hazards"],
-    "Button2": ["buttons", "gremlins", "hazards"],
-    "Push0": [],
-    "Push1": ["hazards"],
-    "Push2": ["hazards", "pillars"],
+# Its suite in the style of 2019.
+ROBOTS = {
+    "Point": {"robot_base": "xmls/point.xml"},
+    "Car": {
+        **{"robot_base": "xmls/car.xml", "box_size": 0.125, "box_keepout": 0.125},
+        "box_density": 0.0005,
+    },
+    "Doggo": {
+        "robot_base": "xmls/doggo.xml",
+        "sensors_obs": [
+            *("accelerometer", "velocimeter", "gyro", "magnetometer"),
+            *("touch_ankle_1a", "touch_ankle_2a", "touch_ankle_3a", "touch_ankle_4a"),
+            *("touch_ankle_1b", "touch_ankle_2b", "touch_ankle_3b", "touch_ankle_4b"),
+        ],
+    },
 }
-NAMES = [(robot, task) for robot, task in itertools.product(ACTIONS, LIDARS)]
+EVERYWHERE = {
+    **{"observe_goal_lidar": True, "observe_box_lidar": True},
+    **{"lidar_max_dist": 3, "lidar_num_bins": 16, "_seed": None, "build_resample": True},
+}
+TASKS = {
+    "Goal": {
+        **{"task": "goal", "goal_size": 0.3, "goal_keepout": 0.305},
+        **{"hazards_size": 0.2, "hazards_keepout": 0.18},
+    },
+    "Button": {
+        **{"task": "button", "buttons_num": 4, "buttons_size": 0.1, "buttons_keepout": 0.2},
+        **{"observe_buttons": True, "hazards_size": 0.2, "hazards_keepout": 0.18},
+        **{"gremlins_travel": 0.35, "gremlins_keepout": 0.4},
+    },
+    "Push": {"task": "push", "box_size": 0.2, "box_null_dist": 0, "hazards_size": 0.3},
+}
+COST_KINDS = {"vases": ("vases_contact", "vases_velocity")}
+# Half of the extents, what is observed, what costs, and how many there are.
+BUTTON_COSTS = ("hazards", "buttons", "gremlins")
+LEVELS = {
+    "Goal0": (1, (), (), {}),
+    "Goal1": (1.5, ("hazards", "vases"), ("hazards",), {"hazards": 8, "vases": 1}),
+    "Goal2": (2, ("hazards", "vases"), ("hazards", "vases"), {"hazards": 10, "vases": 10}),
+    "Button0": (1, (), (), {}),
+    "Button1": (1.5, ("hazards", "gremlins"), BUTTON_COSTS, {"hazards": 4, "gremlins": 4}),
+    "Button2": (1.8, ("hazards", "gremlins"), BUTTON_COSTS, {"hazards": 8, "gremlins": 6}),
+    "Push0": (1, (), (), {}),
+    "Push1": (1.5, ("hazards", "pillars"), ("hazards",), {"hazards": 2, "pillars": 1}),
+    "Push2": (2, ("hazards", "pillars"), ("hazards", "pillars"), {"hazards": 4, "pillars": 4}),
+}
+
+
+def dictionary(robot: str, level: str) -> dict:
+    half, observed, constrained, numbers = LEVELS[level]
+    return {
+        **{**EVERYWHERE, **TASKS[level[:-1]], **ROBOTS[robot]},
+        "placements_extents": [-half, -half, half, half],
+        **{f"observe_{kind}": True for kind in observed},
+        **{f"constrain_{kind}": True for kind in constrained},
+        **{f"{kind}_num": number for kind, number in numbers.items()},
+    }
+
+
+NAMES = list(itertools.product(ROBOTS, LEVELS))
 
 
 def test_the_suite_has_its_27_names():
-    assert sorted(SUITE) == sorted(robot + task for robot, task in NAMES)
+    assert sorted(SUITE) == sorted(map("".join, NAMES))
 
 
-@pytest.mark.parametrize(("robot", "task"), NAMES)
-def test_specs(robot, task):
-    env = SafetyGymEnv(f"Safexp-{robot}{task}-v0", num_envs=2, seed=0, num_threads=1)
+@pytest.mark.parametrize(("robot", "level"), NAMES)
+def test_names_of_the_suite_make_its_dictionaries_and_specs(robot, level):
+    config = SUITE[robot + level]
+    assert resolve(dictionary(robot, level)) == config
+    env = SafetyGymEnv(f"Safexp-{robot}{level}-v0", num_envs=2, seed=0, num_threads=1)
     observation = env.reset()["observation"]
     check_env_specs(env)
-    sizes = ROBOT_SENSORS[robot] | {f"{kind}_lidar": 16 for kind in LIDARS[task]}
+    _, observed, constrained, _ = LEVELS[level]
+    seen = ["goal", *observed, *{"Button": ["buttons"], "Push": ["box"]}.get(level[:-1], [])]
+    sizes = ROBOT_SENSORS[robot] | {f"{kind}_lidar": 16 for kind in seen}
     columns, first = {}, 0
     for name in sorted(sizes):
         columns[name], first = slice(first, first + sizes[name]), first + sizes[name]
@@ -68,10 +109,11 @@ def test_specs(robot, task):
     low, high = env.action_spec.space.low, env.action_spec.space.high
     assert (low == -1).all()
     assert (high == 1).all()
-    keys = ["reward", "cost", "cost_exception", *(f"cost_{kind}" for kind in COST_KINDS[task])]
+    kinds = [k for kind in constrained for k in COST_KINDS.get(kind, (kind,))]
+    keys = ["reward", "cost", "cost_exception", *(f"cost_{kind}" for kind in kinds)]
     assert sorted(env.full_reward_spec.keys()) == sorted(keys)
     assert all(env.full_reward_spec[key].shape == (2, 1) for key in keys)
-    nested = SafetyGymEnv(SUITE[robot + task].replace(observation_flatten=False), 2, seed=0)
+    nested = SafetyGymEnv(config.replace(observation_flatten=False), 2, seed=0)
     entries = nested.reset()["observation"]
     check_env_specs(nested)
     assert set(entries.keys()) == set(columns)

@@ -1,8 +1,6 @@
 """TorchRL's own environments, and somebody's for it, through the ordinary commands."""
 
 import json
-import shutil
-from pathlib import Path
 
 import pytest
 import torch
@@ -35,19 +33,11 @@ def trusted(monkeypatch):
     monkeypatch.setattr(targets, "_users_modules", {"torchrl_envs"})
 
 
-@pytest.fixture(scope="module")
-def run(tmp_path_factory) -> Path:
-    folder = tmp_path_factory.mktemp("runs") / "pendulum"
-    own = (f"import={torchrl_envs.__file__}", "env.cost=torchrl_envs:upright")
-    outside = ("env.outside={cost_speed: [thdot, -4, 4]}", "cost_limits={cost_speed: 3}")
-    run_train(*SMALL, *own, *outside, "frames=320", f"hydra.run.dir={folder}")
-    return folder
-
-
-def test_it_resumes_is_evaluated_and_reported(run, tmp_path, capsys):
-    folder = tmp_path / "runs" / "copied"
-    shutil.copytree(run, folder)
-    trust = f"import={torchrl_envs.__file__}"
+def test_it_resumes_is_evaluated_and_reported(tmp_path, capsys):
+    folder, trust = tmp_path / "runs" / "pendulum", f"import={torchrl_envs.__file__}"
+    costs = ("env.outside={cost_speed: [thdot, -4, 4]}", "env.cost=torchrl_envs:upright")
+    limit = "cost_limits={cost_speed: 3}"
+    run_train(*SMALL, trust, *costs, limit, "frames=320", f"hydra.run.dir={folder}")
     run_train(trust, f"resume={folder}", "frames=480")
     assert read_table(folder / "progress.csv")["steps"] == [160, 320, 480]
     assert "The state of its environments is not stored" in capsys.readouterr().out

@@ -5,7 +5,7 @@ import torch
 from tensordict import TensorDict
 from torch import nn
 from torch.distributions import Beta, Categorical, kl_divergence
-from torchrl.data import Binary, Bounded, MultiCategorical, MultiOneHot, OneHot
+from torchrl.data import Binary, Bounded, MultiCategorical, OneHot
 from torchrl.data import Categorical as CategoricalSpec
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
@@ -111,10 +111,7 @@ def test_betas_are_torchs_between_bounds():
         ("beta", SPECS["categorical"], "model.head=beta is not for.*auto or categorical"),
         ("categorical", SPECS["gaussian"], "auto or gaussian or tanh or beta"),
         ("auto", Binary(3, shape=(7, 3)), "No policy can act in Binary"),
-        ("auto", MultiOneHot([2, 3], shape=(7, 5)), "No policy can act in MultiOneHot"),
-        ("auto", Bounded(-1, 1, (7, 2, 3)), r"act in BoundedContinuous\[7, 2, 3\]"),
         ("auto", Bounded(-1, 1, (7,)), r"act in BoundedContinuous\[7\]"),
-        ("auto", CategoricalSpec(4, shape=(7, 2, 3)), r"act in Categorical\[7, 2, 3\]"),
         ("auto", OneHot(4, shape=(7, 2, 4)), r"act in OneHot\[7, 2, 4\]"),
     ],
 )

