@@ -64,7 +64,6 @@ def test_seeds_determine_rows_and_share_none(node):
         ({"cost_keys": "fast", "num_steps": 5}, "'cost_keys' must be a list.*'fast'"),
         ({"cost_keys": []}, "what does a step cost"),
         ({"cost_keys": ["fast", "reward"]}, "'reward' is a state.*stays"),
-        ({"outside": {"cost_x": [float("inf"), 0, 1]}}, "'outside' must be as"),
     ],
 )
 def test_what_cannot_be_made_is_said(keys, message):

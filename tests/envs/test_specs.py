@@ -147,6 +147,24 @@ def test_rows_time_out_by_their_own_count(env_name):
     assert [step for step, end in enumerate(ends) if end[1]] == [4, 9]
 
 
+@pytest.mark.parametrize("name", ["CarPush2", "PointButton2", "SafeAntVelocity"])
+def test_partial_resets_leave_other_rows_alone(name):
+    envs = [make_env(name, num_envs=3, seed=3, num_threads=1) for _ in range(2)]
+    states, kept = [env.reset() for env in envs], torch.tensor([0, 2])
+    for step in range(15):
+        if step == 8:
+            states[1]["_reset"] = torch.tensor([[False], [True], [False]])
+            states[1] = envs[1].reset(states[1])
+        action = envs[0].action_spec.rand()
+        pairs = zip(envs, states, strict=True)
+        steps = [env.step(state.set("action", action.clone())) for env, state in pairs]
+        for key, value in steps[0]["next"].items():
+            assert torch.equal(value[kept], steps[1]["next", key][kept]), key
+        same = torch.equal(steps[0]["next", "observation"], steps[1]["next", "observation"])
+        assert same == (step < 8)
+        states = [env.step_mdp(taken) for env, taken in zip(envs, steps, strict=True)]
+
+
 def test_a_reset_leaves_nothing_of_the_episode_before():
     env = SafetyGymEnv("CarButton2", num_envs=3, seed=0, num_threads=1)
     env.rollout(5)

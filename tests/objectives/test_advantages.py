@@ -63,6 +63,8 @@ def test_reward_advantage_and_targets(lmbda, precomputed):
         torch.testing.assert_close(out["value_target"], target, atol=1e-5, rtol=1e-5)
         torch.testing.assert_close(out["state_value"], rollout["state_value"])
         assert not out["advantage"].requires_grad
+    single = VectorGAE(critic, gamma=0.95, lmbda=lmbda, value_target=name)(rollout[0].clone())
+    torch.testing.assert_close(single["advantage"], advantage[0], atol=1e-5, rtol=1e-5)
 
 
 @pytest.mark.parametrize("keys", [["cost"], ["cost_hazards", "cost_vases"], ["a", ("b", "c"), "d"]])
@@ -86,26 +88,6 @@ def test_each_observation_is_valued_once():
     ends = rollout["next", "done"].squeeze(-1).clone()
     ends[:, -1] = True
     assert sum(valued) == N * T + ends.sum()
-
-
-def test_other_keys_and_a_single_trajectory():
-    critic = make_critic(("values", "state"), in_key=("agent", "observation"))
-    rollout = make_rollout([])[0]
-    rollout["agent", "observation"] = rollout.pop("observation")
-    rollout["next", "agent", "observation"] = rollout.pop(("next", "observation"))
-    rollout["next", "agent", "r"] = rollout.pop(("next", "reward"))
-    estimator = VectorGAE(critic, gamma=0.9, lmbda=0.9, value_target="lambda_return")
-    estimator.set_keys(value=("values", "state"), reward=("agent", "r"), advantage=("out", "a"))
-    with torch.no_grad():
-        value = critic(rollout.clone())["values", "state"]
-        next_value = critic(rollout["next"].clone())["values", "state"]
-    following = rollout["next"]
-    ends = following["done"], following["terminated"]
-    given = (x[None] for x in (following["agent", "r"], value, next_value, *ends))
-    advantage = loop_gae(*given, 0.9, 0.9)[0]
-    assert ("next", "agent", "r") in estimator.in_keys
-    out = estimator(rollout)
-    torch.testing.assert_close(out["out", "a"], advantage, atol=1e-5, rtol=1e-5)
 
 
 def test_normalisation():
