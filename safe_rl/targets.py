@@ -129,7 +129,9 @@ def locate(target: Any, key: str = "") -> Callable[..., Any]:
     try:
         found = resolve_name(name)
     except AttributeError as error:
-        raise TargetError(f"{shown}: {error}.{did_you_mean(error.name, dir(error.obj))}") from None
+        raise TargetError(
+            f"{shown}: {error}.{did_you_mean(error.name or '', dir(error.obj))}"
+        ) from None
     except ValueError:
         raise TargetError(f"{shown} is no dotted name.") from None
     if not (inspect.isclass(found) or inspect.isroutine(found)):

@@ -22,7 +22,6 @@ from safe_rl.evaluation import (
     evaluate,
 )
 from safe_rl.evaluation.loading import load_config
-from safe_rl.evaluation.measuring import format_unjudged
 from safe_rl.evaluation.policies import find_run, writable_copy
 from safe_rl.evaluation.variations import Varied, evaluate_variations
 from safe_rl.files import CONF
@@ -51,7 +50,7 @@ def carry_out(words: list[str], options: EvaluationOptions, modules: Sequence[st
         return _certify(directory, options)
     if options.variations is not None:
         found, picture = evaluate_varied(directory, options, progress=True)
-        print(_table_of(found), f"wrote {found.file}", f"wrote {picture}", sep="\n")
+        print(found, f"wrote {found.file}", f"wrote {picture}", sep="\n")
     else:
         print(evaluate_run(directory, options, progress=True))
     return 0
@@ -156,28 +155,3 @@ def evaluate_varied(
     picture = RunFolder(directory).variations(options.name, "png")
     draw_variations(found.rows, found.cost_limits, picture)
     return found, picture
-
-
-def _table_of(found: Varied) -> str:
-    """Return and costs under every variation, for the terminal."""
-    keys = list(found.cost_limits) or ["cost"]
-    heads = ["", "return", *keys, *(f"over {d:g}" for d in found.cost_limits.values())]
-    names = ["episode_return", *(f"episode_{key}" for key in keys)]
-    names += [f"over_limit_{key}" for key in found.cost_limits]
-    lines = [heads, *([str(v), *(str(e.get(n, "—")) for n in names)] for v, e in found.rows)]
-    widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
-    facts = found.facts
-    steps = "" if facts["steps"] is None else f" at {facts['steps']:,} steps"
-    text = [
-        f"{facts['algorithm']} on {facts['environment']}{steps}: {facts['episodes']} episodes "
-        "each, means with 95 % intervals"
-    ]
-    for line in lines:
-        cells = (cell.ljust(width) for cell, width in zip(line, widths, strict=True))
-        text.append("  ".join(cells).rstrip())
-    text += format_unjudged(facts["limits_without_cost"])
-    reasons: dict[str, list[str]] = {}
-    for variation, reason in found.left_out:
-        reasons.setdefault(reason, []).append(str(variation))
-    text += [f"left out: {', '.join(which)}: {reason}" for reason, which in reasons.items()]
-    return "\n".join(text)

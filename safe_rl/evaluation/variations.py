@@ -16,7 +16,7 @@ from safe_rl.evaluation.loading import (
     load_config,
     override_env,
 )
-from safe_rl.evaluation.measuring import Trial, check_places, summarise
+from safe_rl.evaluation.measuring import Trial, check_places, format_unjudged, summarise
 from safe_rl.evaluation.settings import EvaluationOptions, check_options
 from safe_rl.files import CONF, read_yaml, replace_csv
 from safe_rl.naming import did_you_mean
@@ -210,6 +210,30 @@ class Varied:
     def cost_limits(self) -> dict[str, float]:
         """Cost key -> d, of the environment as trained on."""
         return dict(self.facts["cost_limits"])
+
+    def __str__(self) -> str:
+        """Return and costs under every variation, as the command prints them."""
+        keys = list(self.cost_limits) or ["cost"]
+        heads = ["", "return", *keys, *(f"over {d:g}" for d in self.cost_limits.values())]
+        names = ["episode_return", *(f"episode_{key}" for key in keys)]
+        names += [f"over_limit_{key}" for key in self.cost_limits]
+        lines = [heads, *([str(v), *(str(e.get(n, "—")) for n in names)] for v, e in self.rows)]
+        widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
+        facts = self.facts
+        steps = "" if facts["steps"] is None else f" at {facts['steps']:,} steps"
+        text = [
+            f"{facts['algorithm']} on {facts['environment']}{steps}: {facts['episodes']} episodes "
+            "each, means with 95 % intervals"
+        ]
+        for line in lines:
+            cells = (cell.ljust(width) for cell, width in zip(line, widths, strict=True))
+            text.append("  ".join(cells).rstrip())
+        text += format_unjudged(facts["limits_without_cost"])
+        reasons: dict[str, list[str]] = {}
+        for variation, reason in self.left_out:
+            reasons.setdefault(reason, []).append(str(variation))
+        text += [f"left out: {', '.join(which)}: {reason}" for reason, which in reasons.items()]
+        return "\n".join(text)
 
 
 def evaluate_variations(
