@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-import re
-import statistics
-from collections.abc import Iterable, Sequence
-from itertools import accumulate, pairwise, product
-from math import ceil
+from collections.abc import Iterable
+from itertools import product
 from pathlib import Path
 
 import archived_runs
-from archived_runs import Rows
+import numpy as np
+from pandas import DataFrame, Series
 
 PAGES = Path(__file__).resolve().parents[1] / "algorithms"
 RESULTS = Path(__file__).resolve().parents[2] / "results"
@@ -22,31 +20,29 @@ MISSING = "—"
 PAUSE = 20  # times the median of a run's epochs: longer ones are not training alone
 
 
-def finished_runs(archive: Path, algo: str, env: str) -> dict[int, Rows]:
+def finished_runs(archive: Path, algo: str, env: str) -> dict[int, DataFrame]:
     """Tables by seed of the runs that are as long as those that are compared."""
     return archived_runs.finished_runs(archive, algo, env, FRAMES)
 
 
-def last_quarter(runs: Iterable[Rows]) -> list[dict[str, float]]:
+def last_quarter(runs: Iterable[DataFrame]) -> DataFrame:
     """Return, episode cost and share of epochs above the limit of every run towards its end."""
-    return [_part_of(rows, FRAMES - QUARTER, FRAMES) for rows in runs]
+    return DataFrame([_part_of(rows, FRAMES - QUARTER, FRAMES) for rows in runs])
 
 
-def _part_of(rows: Rows, start: int, end: int) -> dict[str, float]:
+def _part_of(rows: DataFrame, start: float, end: float) -> dict[str, float]:
     """Means over the epochs of a part of a run in which episodes ended.
 
     What is above the limit is counted by stretches of the protocol's 20,000 steps, whatever number
     of steps an algorithm's epochs have.
     """
-    part = [row for row in rows if start < row["steps"] <= end and "episode_return" in row]
-    stretches: dict[int, list[float]] = {}
-    for row in part:
-        stretches.setdefault(ceil(row["steps"] / EPOCH), []).append(row["episode_cost"])
+    part = rows[(rows.steps > start) & (rows.steps <= end)].dropna(subset="episode_return")
+    stretches = part.groupby(np.ceil(part.steps / EPOCH)).episode_cost.mean()
     return {
-        "return": statistics.fmean(row["episode_return"] for row in part),
-        "cost": statistics.fmean(row["episode_cost"] for row in part),
-        "above": statistics.fmean(statistics.fmean(own) > LIMIT for own in stretches.values()),
-        "rate": rows[-1]["cost_rate"],
+        "return": part.episode_return.mean(),
+        "cost": part.episode_cost.mean(),
+        "above": (stretches > LIMIT).mean(),
+        "rate": rows.cost_rate.iloc[-1],
     }
 
 
@@ -55,7 +51,7 @@ def _command(algo: str, seeds: str, env: str, settings: str = "") -> str:
     return f"`{words.rstrip()}`"
 
 
-def _groups(algo: str, env: str, runs: dict[int, Rows]) -> list[tuple[str, list[int]]]:
+def _groups(algo: str, env: str, runs: dict[int, DataFrame]) -> list[tuple[str, list[int]]]:
     return archived_runs.groups(ARCHIVE, algo, env, list(runs))
 
 
@@ -77,7 +73,7 @@ episode cost by quarters of the run ([all algorithms](comparison.md)):
 {tables}"""
 
 
-def _quarters(algo: str, env: str, runs: dict[int, Rows]) -> str:
+def _quarters(algo: str, env: str, runs: dict[int, DataFrame]) -> str:
     """Table of the runs in one environment, a row per seed."""
     rows = [
         f"| {env}, seed | first | second | third | last | epochs of the last above the limit "
@@ -97,9 +93,10 @@ def _quarters(algo: str, env: str, runs: dict[int, Rows]) -> str:
 
 
 def algorithms() -> list[str]:
-    """Those whose pages have measurements of a million steps, in the order of index.md."""
-    listed = re.findall(r"^\| \[`(\w+)`\]\(\1\.md\)", (PAGES / "index.md").read_text(), re.M)
-    return [a for a in listed if f"<!-- made: measured {a} -->" in (PAGES / f"{a}.md").read_text()]
+    """Those whose pages have measurements of a million steps."""
+    return [
+        p.stem for p in sorted(PAGES.glob("*.md")) if f"made: measured {p.stem} " in p.read_text()
+    ]
 
 
 def compared(env: str) -> str:
@@ -135,7 +132,7 @@ def _compared(algorithms: Iterable[str], env: str) -> str:
                 _named(algo, settings),
                 str(len(parts)),
                 *end_cells(parts, 1),
-                f"{statistics.fmean(part['rate'] for part in parts):.3f}",
+                f"{parts.rate.mean():.3f}",
                 archived_runs.certificates(ARCHIVE, algo, env, seeds),
             ]
             rows.append(f"| {' | '.join(cells)} |")
@@ -143,18 +140,16 @@ def _compared(algorithms: Iterable[str], env: str) -> str:
     return f"{found}Not run yet on {env}: {', '.join(missing)}." if missing else found.rstrip()
 
 
-def end_cells(parts: Sequence[dict[str, float]], digits: int) -> list[str]:
+def end_cells(parts: DataFrame, digits: int) -> list[str]:
     """Cells of a table: return with so many digits, episode cost, epochs above the limit."""
+    several = len(parts) > 1
     return [
-        _spread([part["return"] for part in parts], digits),
-        _spread([part["cost"] for part in parts], 1),
-        f"{statistics.fmean(part['above'] for part in parts):.0%}",
+        *(
+            spread(parts[name].mean(), parts[name].std() if several else None, n)
+            for name, n in (("return", digits), ("cost", 1))
+        ),
+        f"{parts.above.mean():.0%}",
     ]
-
-
-def _spread(values: list[float], digits: int) -> str:
-    several = len(values) > 1
-    return spread(statistics.fmean(values), statistics.stdev(values) if several else None, digits)
 
 
 def spread(mean: float, deviation: float | None, digits: int) -> str:
@@ -184,31 +179,31 @@ def _timed(algorithms: Iterable[str], env: str) -> str:
     return "\n".join([lines[0], "|---" * len(heads) + "|", *lines[1:]])
 
 
-def _within(tables: list[Rows], seconds: float) -> str:
+def _within(tables: list[DataFrame], seconds: float) -> str:
     """Return / cost of runs after a time, and their steps by then; a dash if one of them ended."""
     parts = []
     for rows in tables:
-        done = [row for row, time in zip(rows, _times(rows), strict=True) if time <= seconds]
-        steps = done[-1]["steps"] if done else 0.0
-        shown = [row for row in done if row["steps"] > 0.9 * steps and "episode_return" in row]
-        if len(done) == len(rows) or not shown:
+        done = rows[_times(rows) <= seconds]
+        steps = done.steps.max()
+        if (
+            len(done) in (0, len(rows))
+            or done[done.steps > 0.9 * steps].episode_return.isna().all()
+        ):
             return MISSING
         parts.append(_part_of(done, 0.9 * steps, steps) | {"steps": steps})
-    mean = {key: statistics.fmean(part[key] for part in parts) for key in parts[0]}
-    return f"{mean['return']:.1f} / {mean['cost']:.0f} ({mean['steps'] / 1e6:.2f})"
+    mean = DataFrame(parts).mean()
+    return f"{mean['return']:.1f} / {mean.cost:.0f} ({mean.steps / 1e6:.2f})"
 
 
 def _spread_of_times(algorithms: Iterable[str]) -> float:
     """Largest factor between the times that seeds of one algorithm took, in any environment."""
     pairs = product(algorithms, ENVIRONMENTS)
     found = (finished_runs(ARCHIVE, algo, env).values() for algo, env in pairs)
-    times = [[_times(rows)[-1] for rows in tables] for tables in found if tables]
+    times = [[_times(rows).iloc[-1] for rows in tables] for tables in found if tables]
     return max((max(of_one) / min(of_one) for of_one in times), default=1.0)
 
 
-def _times(rows: Rows) -> list[float]:
+def _times(rows: DataFrame) -> Series:
     """Seconds of training by the end of each epoch, without pauses."""
-    totals = [row["time_total"] for row in rows]
-    epochs = [after - before for before, after in pairwise([0.0, *totals])]
-    usual = statistics.median(epochs)
-    return list(accumulate(time if time < PAUSE * usual else usual for time in epochs))
+    epochs = rows.time_total.diff().fillna(rows.time_total)
+    return epochs.mask(epochs >= PAUSE * epochs.median(), epochs.median()).cumsum()

@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Hashable, Mapping
 from functools import cache
 from pathlib import Path
 from typing import Any
 
+from pandas import DataFrame
+
 from safe_rl.reporting.archive import find_runs
 from safe_rl.reporting.recorded import Run
 from safe_rl.runs.identity import experiment_of
 
-Rows = list[dict[str, float]]
 Settings = Mapping[str, Hashable]
 
 
@@ -26,18 +26,10 @@ def runs_of(archive: Path) -> dict[tuple[str, str], dict[int, Run]]:
     return found
 
 
-def finished_runs(archive: Path, algo: str, env: str, frames: int) -> dict[int, Rows]:
-    """Rows of the recorded tables by seed, numbers only, of runs that came to their end."""
+def finished_runs(archive: Path, algo: str, env: str, frames: int) -> dict[int, DataFrame]:
+    """Recorded tables by seed of runs that came to their end, a row per epoch."""
     runs = runs_of(archive).get((env, algo), {})
-    return {seed: _rows(run.table) for seed, run in runs.items() if run.steps >= frames}
-
-
-def _rows(table: Mapping[str, list[float]]) -> Rows:
-    lines = zip(*table.values(), strict=True)
-    return [
-        {key: value for key, value in zip(table, line, strict=True) if not math.isnan(value)}
-        for line in lines
-    ]
+    return {seed: DataFrame(run.table) for seed, run in runs.items() if run.steps >= frames}
 
 
 def groups(archive: Path, algo: str, env: str, seeds: list[int]) -> list[tuple[str, list[int]]]:

@@ -40,7 +40,7 @@ def velocity_runs(archive: Path = ARCHIVE) -> str:
     for env in PUBLISHED:
         runs = finished_runs(archive, ALGORITHM, env)
         parts = last_quarter(runs.values())
-        ours = [str(len(parts)), *end_cells(parts, 0)] if parts else ["none yet", *"———"]
+        ours = [str(len(parts)), *end_cells(parts, 0)] if runs else ["none yet", *"———"]
         rows.append(f"| `{env}` | {' | '.join([*ours, *_published(env)])} |")
         lacking = [str(seed) for seed in SEEDS if seed not in runs]
         if lacking:

@@ -6,6 +6,8 @@ from pathlib import Path
 import algorithm_results
 import archived_runs
 import pytest
+from made import ALGORITHMS
+from pandas import DataFrame
 
 from safe_rl.reporting.recorded import Run
 
@@ -88,7 +90,11 @@ def test_the_limit_is_compared_with_costs_of_20000_steps():
         for n, cost in enumerate([30, 30, 30, 0, 0, 0, 90, 90], 1)
     ]
     # the means of four epochs are 22.5 and 45
-    assert algorithm_results._part_of(short, 0, 40_000)["above"] == 0.5
+    assert algorithm_results._part_of(DataFrame(short), 0, 40_000)["above"] == 0.5
+
+
+def test_all_pages_with_measurements_are_compared():
+    assert {"ppo_lagrangian", "cal"} < set(algorithm_results.algorithms()) < set(ALGORITHMS)
 
 
 def test_seeds_with_different_settings_are_not_averaged(compared):
