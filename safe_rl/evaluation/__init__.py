@@ -22,15 +22,11 @@ __all__ = [
     "summarise",
 ]
 
+_HOMES = {
+    "certifying": ("Certificate", "certify"),
+    "episodes": ("Episodes", "collect_episodes"),
+    "measuring": ("Evaluation", "evaluate", "summarise"),
+}
 __getattr__, __dir__ = import_later(
-    __name__,
-    {
-        "Certificate": "safe_rl.evaluation.certifying",
-        "Episodes": "safe_rl.evaluation.episodes",
-        "Evaluation": "safe_rl.evaluation.measuring",
-        "certify": "safe_rl.evaluation.certifying",
-        "collect_episodes": "safe_rl.evaluation.episodes",
-        "evaluate": "safe_rl.evaluation.measuring",
-        "summarise": "safe_rl.evaluation.measuring",
-    },
+    __name__, {name: f"{__name__}.{home}" for home, names in _HOMES.items() for name in names}
 )

@@ -4,19 +4,17 @@ from __future__ import annotations
 
 import math
 import shutil
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from contextlib import closing
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
-from omegaconf import DictConfig
 from torchrl.envs import EnvBase
 from tqdm import tqdm
 
-from safe_rl.evaluation.episodes import Episodes, collect_episodes, default_seed, has_fixed_layout
+from safe_rl.evaluation.episodes import Episodes, collect_episodes, has_fixed_layout
 from safe_rl.evaluation.loading import load_config
 from safe_rl.evaluation.measuring import Trial
 from safe_rl.evaluation.settings import CertificateOptions, EvaluationOptions
@@ -112,17 +110,21 @@ def certify(
     limits = {key: float(limit) for key, limit in config.cost_limits.items()}
     if not limits or not candidates:
         return None
-    runner = _Runner(config, make_env, num_threads, progress)
-    first = [next(runner.run(path, _RANKING, options.ranking)) for path in candidates]
+    # training's device, where the physics may be; a machine without a GPU certifies on its CPU
+    device = config.device if torch.cuda.is_available() else "cpu"
+    plain = EvaluationOptions(device=device, num_threads=num_threads)
+    trials = [Trial(config, path, plain, make_env) for path in candidates]
+    highest: dict[str, float] = {}
+    first = [next(_run(trial, _RANKING, options.ranking, highest, progress)) for trial in trials]
     asked = ("most_over", "level", "bound", "cap", "most_beyond", "tail")
     settings = {name: getattr(options, name) for name in asked}
-    claim = Claim(limits, highest=runner.highest, **settings)
+    claim = Claim(limits, highest=highest, **settings)
     costs = [_costs(episodes) for episodes in first]
     claims = [claim.with_thresholds(found) for found in costs]
     returns: dict[int, list[torch.Tensor]] = {}
 
     def collect(number: int) -> Iterator[dict[str, np.ndarray]]:
-        for episodes in runner.run(candidates[number], _TEST, options.episodes):
+        for episodes in _run(trials[number], _TEST, options.episodes, highest, progress):
             returns.setdefault(number, []).append(episodes.returns)
             yield _costs(episodes)
 
@@ -151,40 +153,30 @@ def _candidates(folder: RunFolder) -> list[Path]:
     return [found[steps] for steps in sorted(found, key=lambda steps: steps or 0)]
 
 
-class _Runner:
-    """Runs policies on episodes that neither training nor another purpose has used."""
+def _run(
+    trial: Trial, purpose: int, number: int, highest: dict[str, float], progress: bool
+) -> Iterator[Episodes]:
+    """Episodes in batches that neither training nor another purpose has used.
 
-    def __init__(
-        self, config: DictConfig, make_env: Callable[..., EnvBase], threads: int, progress: bool
-    ) -> None:
-        self._config, self._make_env, self._progress = config, make_env, progress
-        # training's, where the physics may be; a machine without a GPU certifies on its CPU
-        device = config.device if torch.cuda.is_available() else "cpu"
-        self._options = EvaluationOptions(device=device, num_threads=threads)
-        self.highest: dict[str, float] = {}
-
-    def run(self, checkpoint: Path, purpose: int, number: int) -> Iterator[Episodes]:
-        """Episodes in batches, of all candidates with the same layouts.
-
-        A ranking is one batch. In a batch of a test every environment has one episode, so short
-        episodes do not count before long ones.
-        """
-        own = default_seed(self._config.env, self._config.seed)
-        seed = own if has_fixed_layout(self._config.env) else own + purpose
-        options = replace(self._options, seed=seed)
-        trial = Trial(self._config, checkpoint, options, self._make_env)
-        worlds, keys = min(number, _BATCH), list(self._config.cost_limits)
-        batch = number if purpose == _RANKING else worlds
-        with (
-            closing(trial.make(worlds)) as env,
-            tqdm(total=number, disable=None if self._progress else True) as bar,
-        ):
-            self.highest = {key: env.highest_cost(key) for key in keys}
-            policy = trial.policy(env)
-            torch.manual_seed(own + purpose)
-            for _ in range(math.ceil(number / batch)):
-                yield collect_episodes(env, policy, batch, keys, deterministic=False)
-                bar.update(batch)
+    What an episode can cost at most is written into ``highest``.
+    All candidates have the same layouts. A ranking is one batch. In a batch of a test every
+    environment has one episode, so short episodes do not count before long ones.
+    """
+    own = trial.seed  # of a fixed layout that of training
+    seed = own if has_fixed_layout(trial.node) else own + purpose
+    trial = replace(trial, options=replace(trial.options, seed=seed))
+    worlds, keys = min(number, _BATCH), list(trial.config.cost_limits)
+    batch = number if purpose == _RANKING else worlds
+    with (
+        closing(trial.make(worlds)) as env,
+        tqdm(total=number, disable=None if progress else True) as bar,
+    ):
+        highest |= {key: env.highest_cost(key) for key in keys}
+        policy = trial.policy(env)
+        torch.manual_seed(own + purpose)
+        for _ in range(math.ceil(number / batch)):
+            yield collect_episodes(env, policy, batch, keys, deterministic=False)
+            bar.update(batch)
 
 
 def _keep(folder: RunFolder, checkpoint: Path | None) -> Path | None:
@@ -208,21 +200,18 @@ def _keep(folder: RunFolder, checkpoint: Path | None) -> Path | None:
 
 
 def _write(folder: RunFolder, certificate: Certificate, candidates: list[int | None]) -> None:
-    verdict = certificate.verdict
-    content: Mapping[str, Any] = {
+    verdict, options = certificate.verdict, certificate.options
+    content = asdict(verdict) | asdict(options)
+    content |= {
         "certified": certificate.checkpoint is not None,
         "checkpoint": None if certificate.checkpoint is None else certificate.checkpoint.name,
-        "episode_return": None if verdict.certified is None else certificate.episode_return,
+        "episode_return": certificate.episode_return,
         "bounds": {
             name: {"bound": bound, "most": most} for name, (bound, most) in verdict.bounds.items()
         },
-        "shortfalls": verdict.shortfalls,
-        "means": verdict.means,
-        "highest": verdict.highest,
         "candidates": candidates,
         "tested": [candidates[number] for number in verdict.tested],
-        **asdict(certificate.options),
         "episodes": verdict.episodes,
-        "most_episodes": certificate.options.episodes,
+        "most_episodes": options.episodes,
     }
     replace_json(folder.certificate, content)

@@ -54,20 +54,9 @@ def override_env(config: DictConfig, overrides: Mapping[str, Any]) -> dict[str, 
     Raises:
         ValueError: As by `check_env_keys`; the package's families look at their keys themselves.
     """
-    env = OmegaConf.to_container(config.env)
-    check_env_keys(env, overrides)  # type: ignore[arg-type]
-    return _changed(env, overrides)  # type: ignore[arg-type]
-
-
-def _changed(node: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
-    """A node with changes; what has a ``_target_`` of its own stands for itself."""
-    changed = dict(node)
-    for key, value in changes.items():
-        before = node.get(key)
-        is_within = isinstance(before, Mapping) and isinstance(value, Mapping)
-        is_whole = not is_within or "_target_" in value
-        changed[key] = value if is_whole else _changed(before, value)  # type: ignore[arg-type]
-    return changed
+    check_env_keys(config.env, overrides)
+    changed = OmegaConf.merge(config.env, dict(overrides))
+    return OmegaConf.to_container(changed)  # type: ignore[return-value]
 
 
 def limits_of(
@@ -125,7 +114,7 @@ def find_checkpoint(directory: Path, which: str) -> Path:
     folder = RunFolder(directory)
     found = {kind: folder.newest_checkpoint(kind) for kind in KINDS}
     found["best"] = best_checkpoint(folder.checkpoints / "best")
-    path = found.pop(which)
+    path = found[which]
     if which == "last" and not folder.has_begun:  # a policy without its run
         path = path or found["certified"]
     if path is None:
@@ -134,8 +123,8 @@ def find_checkpoint(directory: Path, which: str) -> Path:
             "best": "no epoch kept every cost limit",
             "certified": "none of its policies has been certified",
         }
-        others = [f"checkpoint={kind}" for kind, other in found.items() if other is not None]
-        hint = f" Use {others[0]}." if others else ""
+        other = next((kind for kind, other in found.items() if other is not None), None)
+        hint = f" Use checkpoint={other}." if other else ""
         raise FileNotFoundError(f"{directory} has no {which} checkpoint: {reason[which]}.{hint}")
     return path
 
@@ -158,13 +147,9 @@ def load_policy(
     except CheckpointError as error:
         if "size mismatch" not in str(error):
             raise
-        # of a dictionary all entries
-        seen = env.reset()[0].select("observation").values(include_nested=True, leaves_only=True)
-        sizes = [sum(part.numel() for part in seen), env.action_spec.zero()[0].numel()]
         raise CheckpointError(
             f"The policy in {checkpoint} was trained on other observations or actions than this "
-            f"environment's ({sizes[0]} numbers, {sizes[1]} actions): undo the env.… "
-            "override that changes them."
+            "environment's: undo the env.… override that changes them."
         ) from error
     for network in networks.values():
         if not all(weight.isfinite().all() for weight in network.parameters()):

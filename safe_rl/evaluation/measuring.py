@@ -267,9 +267,9 @@ def summarise(
             estimates[f"over_limit_{key}"] = share_over(costs, cost_limits[key])
     if reference is not None:
         # monotone in J_r and J_c, so the intervals' ends are those of J_r and J_c
-        returns, costs = estimates["episode_return"], estimates["episode_cost"]
+        figures = estimates["episode_return"], estimates["episode_cost"], math.nan
         limit = cost_limits.get("cost", math.nan)
-        scores = normalise(returns, costs, math.nan, limit=limit, reference=reference)
+        scores = normalise(*figures, limit=limit, reference=reference)
         shown = ("return", "violation") if "cost" in cost_limits else ("return",)
         for name, ends in zip(shown, scores, strict=False):
             estimates[f"normalised_{name}"] = Estimate(*map(float, ends))
@@ -281,12 +281,11 @@ def format_estimates(
 ) -> list[str]:
     """Lines of a table for the terminal."""
     width = max(map(len, estimates))
-    lines = [f"{'':{width}} {'estimate':>10}   95 % interval"]
+    lines = [f"{'':{width}}  estimate [95 % interval]"]
     for name, estimate in estimates.items():
         key = name.removeprefix("episode_")
         limit = f"   limit {cost_limits[key]:g}" if key in cost_limits else ""
-        value, low, high = ("—" if math.isnan(v) else f"{v:.4g}" for v in estimate)
-        lines.append(f"{name:{width}} {value:>10}   [{low}, {high}]{limit}")
+        lines.append(f"{name:{width}}  {estimate}{limit}")
     return lines
 
 

@@ -29,7 +29,6 @@ __all__ = [
 ]
 
 _FACTOR = "x"
-_PARTS = ("env", "transforms")
 
 
 class Variation(NamedTuple):
@@ -74,7 +73,12 @@ def read_variations(given: Any) -> list[Variation]:
         is_set = isinstance(part, str) and not part.endswith((".yaml", ".yml"))
         rows = _from_conf("variations", part) if is_set else part
         if not isinstance(rows, Mapping):
-            rows = _read(Path(part).expanduser())
+            try:
+                rows = read_yaml(Path(part).expanduser())
+            except (OSError, ValueError) as error:
+                raise ValueError(f"variations={part}: {error}") from error
+        if not isinstance(rows, Mapping):
+            raise ValueError(f"variations={part}: it must have rows, as conf/variations has them.")
         found += [
             v._replace(may_lack=is_set) for name in rows for v in _expand(str(name), rows[name])
         ]
@@ -90,35 +94,18 @@ def _from_conf(group: str, name: str) -> Mapping[str, Any]:
             f"are {', '.join(known)}; a file of yours ends in .yaml; keys are given as "
             "variations='{heavy: {env.mass_scale: 1.5}}'."
         )
-    return _read(CONF / group / f"{name}.yaml")
-
-
-def _read(path: Path) -> Mapping[str, Any]:
-    try:
-        content = read_yaml(path)
-    except (OSError, ValueError) as error:
-        raise ValueError(f"variations={path}: {error}") from error
-    if not isinstance(content, Mapping):
-        raise ValueError(f"variations={path}: it must have rows, as conf/variations has them.")
-    return content
+    return read_yaml(CONF / group / f"{name}.yaml")
 
 
 def _expand(row: str, keys: Any) -> Iterator[Variation]:
-    if not isinstance(keys, Mapping) or not keys:
+    parts = [str(key).split(".") for key in keys] if isinstance(keys, Mapping) else []
+    lists = [key for key in keys if isinstance(keys[key], list)] if parts else []
+    least = {"env": 2, "transforms": 3}
+    if not parts or len(lists) > 1 or any(len(p) < least.get(p[0], 99) for p in parts):
         raise ValueError(
-            f"variations: '{row}' must have keys, as {{{row}: {{env.mass_scale: 1.5}}}}; got "
-            f"{keys!r}."
+            f"variations: '{row}: {keys}' must have keys of the environment (env.mass_scale) or of "
+            "a transform (transforms.sensor_noise.std), one of them with a list at most."
         )
-    for key in keys:
-        parts = str(key).split(".")
-        if parts[0] not in _PARTS or len(parts) < (3 if parts[0] == "transforms" else 2):
-            raise ValueError(
-                f"variations: '{row}' changes '{key}': it must be a key of the environment "
-                "(env.mass_scale) or of a transform (transforms.sensor_noise.std)."
-            )
-    lists = [key for key, value in keys.items() if isinstance(value, list)]
-    if len(lists) > 1:
-        raise ValueError(f"variations: '{row}' has several lists: {', '.join(map(str, lists))}.")
     if not lists:
         yield Variation(row, None, dict(keys))
     for value in keys[lists[0]] if lists else ():
@@ -149,7 +136,12 @@ def varied(config: DictConfig, variation: Variation) -> DictConfig | None:
             check_env_keys(changed.env, [name])
         elif name not in changed.transforms:
             changed.transforms[name] = _from_conf("transforms", name)[name]
-        value = _resolved(value, OmegaConf.select(changed, key), key)
+        if isinstance(value, str) and value.startswith(_FACTOR):
+            own = OmegaConf.select(changed, key)
+            if not isinstance(own, int | float):
+                raise ValueError(f"{key}={value}: this environment has no number '{key}'.")
+            product = float(value.removeprefix(_FACTOR)) * own
+            value = round(product) if isinstance(own, int) else product
         OmegaConf.update(changed, key, value, merge=False, force_add=True)
     is_same = _present(OmegaConf.to_container(changed)) == _present(before)
     return None if is_same else changed
@@ -162,17 +154,6 @@ def _present(config: Any) -> dict[str, Any]:
     if "_target_" in env:  # another family's
         absent = ()
     return {**config, "env": {key: env[key] for key in env if not key.startswith(absent)}}
-
-
-def _resolved(value: Any, own: Any, key: str) -> Any:
-    """A value, of a factor the product with what the run has."""
-    if not (isinstance(value, str) and value.startswith(_FACTOR)):
-        return value
-    try:
-        product = float(value.removeprefix(_FACTOR)) * own
-    except (TypeError, ValueError):
-        raise ValueError(f"{key}={value}: this environment has no number '{key}'.") from None
-    return round(product) if isinstance(own, int) else product
 
 
 AS_TRAINED = Variation("as trained", None, {})
@@ -299,8 +280,8 @@ def _write(path: Path, rows: Sequence[VariedRow]) -> None:
     columns = [f"{name}{end}" for name in names for end in ("", "_low", "_high")]
     table: list[list[Any]] = [["variation", "row", "value", "keys", *columns]]
     for variation, estimates in rows:
-        row, value, keys, _ = variation
-        changes = " ".join(f"{key}={changed}" for key, changed in keys.items())
+        changes = " ".join(f"{key}={changed}" for key, changed in variation.keys.items())
         found = [number for name in names for number in estimates.get(name, ("", "", ""))]
-        table.append([str(variation), row, "" if value is None else value, changes, *found])
+        # no value is an empty field
+        table.append([str(variation), variation.row, variation.value, changes, *found])
     replace_csv(path, table)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from inspect import signature
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -37,23 +37,24 @@ class VideoFormat(NamedTuple):
         height: Likewise.
         steps_per_frame: Environment steps from one frame to the next.
         frames_per_second: When it is played.
-        write: Encodes the frames into a file: (file, frames, suffix, frames per second).
     """
 
     width: int
     height: int
     steps_per_frame: int
     frames_per_second: float
-    write: Callable[[Path, Iterator[np.ndarray], str, float], None]
 
 
+FORMATS = {
+    # of what does not say how long its steps are; 1000 last 20 s
+    "mp4": VideoFormat(640, 480, 2, 25),
+    # 1000 steps last 10 s, whatever is shown, so that no picture gets too large for a page
+    **dict.fromkeys(PICTURES, VideoFormat(400, 300, 5, 20)),
+}
+"""Suffix of a file -> how an episode is recorded into it."""
 DEFAULT_CAMERA = "free"
-# of the line below the picture, and what its text takes of a width at least [pixels]
-_CAPTION_HEIGHT, _CAPTION_WIDTH = 20, 280
-# of a frame of an MP4, in the time of what is recorded [s]
-_FRAME = 0.04
-# of a GIF's palette; and how long its last frame stays [ms]
-_COLOURS, _LAST = 64, 1500
+_CAPTION = 20  # height of the line below the picture [pixels]
+_FRAME = 0.04  # of an MP4, in the time of what is recorded [s]
 
 
 def video_format(env: EnvBase, suffix: str) -> VideoFormat:
@@ -78,41 +79,32 @@ def check_camera(env: EnvBase, camera: str, suffix: str = "mp4") -> None:
             no such camera.
         ModuleNotFoundError: If the encoder is missing; the message names the extra.
     """
-    asked = "video=true" if suffix == "mp4" else "picture=…"
     if suffix == "mp4":
         for package in ("imageio", "imageio_ffmpeg"):
             import_extra(package, "video")
+    asked = "video=true" if suffix == "mp4" else "picture=…"
     if env.render is None:
         raise ValueError(f"{asked}: this environment draws no pictures, it has no 'render'.")
-    if camera != DEFAULT_CAMERA and "camera" not in _parameters(env):
+    if camera != DEFAULT_CAMERA and "camera" not in signature(env.render).parameters:
         raise ValueError(f"camera={camera}: this environment has no cameras to choose from.")
     env.reset()
     try:
-        picture = _picture(env, camera, FORMATS[suffix])
-    except ValueError:
-        raise
+        _picture(env, camera, FORMATS[suffix])
     except Exception as error:  # a 'render' is anybody's
         words = " ".join(str(error).split()) or type(error).__name__
         raise ValueError(f"{asked}: this environment cannot be drawn: {words}") from error
-    if picture is None:
-        raise ValueError(
-            f"{asked}: this environment draws no pictures: its 'render' returns none. One of "
-            "Gymnasium's may have to be made with render_mode=rgb_array, here one of env.kwargs."
-        )
 
 
-def _parameters(env: EnvBase) -> set[str]:
-    return set(signature(env.render).parameters)
-
-
-def _picture(env: EnvBase, camera: str, form: VideoFormat) -> Image.Image | None:
-    """World 0 as it is, if that is drawn; sizes and cameras where they can be chosen."""
-    size = {"width": form.width, "height": form.height}
-    wanted: dict[str, Any] = {"rows": 0, "camera": camera, **size}
-    known = _parameters(env)
+def _picture(env: EnvBase, camera: str, form: VideoFormat) -> Image.Image:
+    """World 0 as it is; sizes and cameras where they can be chosen."""
+    wanted = {"rows": 0, "camera": camera, "width": form.width, "height": form.height}
+    known = signature(env.render).parameters
     pixels = np.asarray(env.render(**{k: v for k, v in wanted.items() if k in known}))
     if pixels.dtype == object:  # None, or a list of it
-        return None
+        raise ValueError(
+            "its 'render' draws no picture; one of Gymnasium's may have to be made with "
+            "render_mode=rgb_array, here one of env.kwargs"
+        )
     # grey ones, and those with a fourth channel, are pictures, too
     picture = Image.fromarray(pixels[0] if pixels.ndim == 4 else pixels)
     # the encoding halves both sides
@@ -140,29 +132,22 @@ def record_episode(
     with exploration(deterministic):
         while True:
             if step % form.steps_per_frame == 0:
-                yield _frame(env, camera, form, step, *total.values())
+                yield _frame(_picture(env, camera, form), step, *total.values())
             after = env.step(policy(state))["next"]
             step += int(after[STEPS_TAKEN]) if env.steps_per_decision != 1 else 1
             total = {key: value + float(after[key]) for key, value in total.items()}
             if after["done"].any():
-                yield _frame(env, camera, form, step, *total.values())
+                yield _frame(_picture(env, camera, form), step, *total.values())
                 return
             state = after.exclude("reward")
 
 
 def _frame(
-    env: EnvBase,
-    camera: str,
-    form: VideoFormat,
-    step: int,
-    episode_return: float,
-    cost: float | None = None,
+    picture: Image.Image, step: int, episode_return: float, cost: float | None = None
 ) -> np.ndarray:
     """The picture above a line with what the episode has come to, uint8 [height, width, 3]."""
-    picture = _picture(env, camera, form)
-    assert picture is not None, "check_camera has seen one"
-    size = (max(picture.width, _CAPTION_WIDTH), picture.height + _CAPTION_HEIGHT)
-    canvas = Image.new("RGB", size, "white")
+    # a text is not cut off below a narrow picture
+    canvas = Image.new("RGB", (max(picture.width, 280), picture.height + _CAPTION), "white")
     canvas.paste(picture)
     text = f"step {step:>5}     return {episode_return:>7.2f}"
     text += "" if cost is None else f"     cost {cost:>5.0f}"
@@ -177,47 +162,31 @@ def write_video(path: Path, frames: Iterator[np.ndarray], form: VideoFormat) -> 
     Raises:
         ModuleNotFoundError: If the encoder is missing; the message names the extra.
     """
+    write = _write_mp4 if path.suffix == ".mp4" else _write_animation
     with replacing(path) as unfinished:
-        form.write(unfinished, frames, path.suffix.lstrip("."), form.frames_per_second)
+        write(unfinished, frames, form.frames_per_second)
 
 
-def _write_mp4(path: Path, frames: Iterator[np.ndarray], suffix: str, rate: float) -> None:
-    import_extra("imageio_ffmpeg", "video")
-    imageio = import_extra("imageio.v2", "video")
+def _write_mp4(path: Path, frames: Iterator[np.ndarray], rate: float) -> None:
     # pixel format and index at the front: what browsers ask of a video
-    with imageio.get_writer(
-        path,
-        format="FFMPEG",
-        fps=rate,
-        codec="libx264",
-        pixelformat="yuv420p",
-        macro_block_size=4,
+    with import_extra("imageio.v2", "video").get_writer(
+        path, format="FFMPEG", fps=rate, codec="libx264", pixelformat="yuv420p",
+        macro_block_size=4, ffmpeg_log_level="error",
         output_params=["-crf", "26", "-preset", "veryfast", "-movflags", "+faststart"],
-        ffmpeg_log_level="error",
-    ) as writer:
+    ) as writer:  # fmt: skip
         for frame in frames:
             writer.append_data(frame)
 
 
-def _write_animation(path: Path, frames: Iterator[np.ndarray], suffix: str, rate: float) -> None:
+def _write_animation(path: Path, frames: Iterator[np.ndarray], rate: float) -> None:
     pictures = [Image.fromarray(frame) for frame in frames]
-    if suffix == "gif":
+    if path.suffix == ".gif":
         # one palette for all, and no dither, so that what stands still is stored once
         few = np.concatenate([np.asarray(one) for one in pictures[:: len(pictures) // 8 + 1]])
-        palette = Image.fromarray(few).quantize(_COLOURS)
+        palette = Image.fromarray(few).quantize(64)
         pictures = [p.quantize(palette=palette, dither=Image.Dither.NONE) for p in pictures]
-    durations = [round(1000 / rate)] * (len(pictures) - 1) + [_LAST]
+    durations = [round(1000 / rate)] * (len(pictures) - 1) + [1500]  # the last one stays [ms]
     pictures[0].save(
-        path, format=suffix, save_all=True, append_images=pictures[1:], duration=durations,
+        path, save_all=True, append_images=pictures[1:], duration=durations,
         loop=0, optimize=True, quality=60, method=6,
     )  # fmt: skip
-
-
-# of 1000 steps: 10 s, whatever is shown, so that no picture gets too large for a page
-_ANIMATION = VideoFormat(400, 300, 5, 20, _write_animation)
-FORMATS = {
-    # of what does not say how long its steps are; 1000 last 20 s
-    "mp4": VideoFormat(640, 480, 2, 25, _write_mp4),
-    **dict.fromkeys(PICTURES, _ANIMATION),
-}
-"""Suffix of a file -> how an episode is recorded into it."""

@@ -96,7 +96,8 @@ class Suite:
             return None
         own = {**self.defaults, **node}
         keys = dict.fromkeys([*standard, *own])
-        return {key: own.get(key) for key in keys if key != "name" and _differ(key, own, standard)}
+        differ = [key for key in keys if own.get(key, ...) != standard.get(key, ...)]
+        return {key: own.get(key) for key in differ if key != "name"}
 
     def name_of(self, node: Node, *, but_for: Collection[str] = ()) -> str | None:
         """Name of the environment that a configuration is exactly, or None."""
@@ -106,17 +107,6 @@ class Suite:
     def reference(self, node: Node, *, but_for: Collection[str] = ()) -> Scores | None:
         """Scores to normalise by, if a configuration is exactly an environment that has any."""
         return REFERENCE.get(self.name_of(node, but_for=but_for) or "")
-
-
-def _differ(key: str, own: Node, standard: Node) -> bool:
-    # before there were other families of environments, none was named
-    if key == "_target_" and key not in own:
-        return False
-    return key not in standard or key not in own or _plain(own[key]) != _plain(standard[key])
-
-
-def _plain(value: Any) -> Any:
-    return [_plain(item) for item in value] if isinstance(value, list | tuple) else value
 
 
 SLATES: dict[str, tuple[str, ...]] = {

@@ -8,7 +8,7 @@ import numpy as np
 import scipy  # its parts are loaded on first use, which takes half a second
 from numpy.typing import ArrayLike
 
-__all__ = ["best_growth", "betting_bound", "log_wealth", "share_bound", "student_bound"]
+__all__ = ["best_growth", "betting_bound", "log_wealth", "student_bound"]
 
 # shares of the largest possible bet, and how the first wealth is divided among them: an episode's
 # highest cost is usually far above the limit, and then large bets are the best ones
@@ -119,20 +119,3 @@ def student_bound(values: ArrayLike, level: float) -> float:
     quantile = float(scipy.stats.t.ppf(level, number - 1))
     correction = 2 * max(0.0, skewness) * (1 + 2 * quantile**2) / (6 * math.sqrt(number))
     return float(mean + (quantile + correction) * spread / math.sqrt(number))
-
-
-def share_bound(number: int, trials: int, level: float) -> float:
-    """Upper confidence bound of a probability, exact (Clopper and Pearson 1934).
-
-    Args:
-        number: How often the event was seen.
-        trials: Of how many trials; their number must not depend on what was seen.
-        level: Confidence.
-
-    Examples:
-        >>> round(share_bound(0, 59, level=0.95), 3)
-        0.05
-    """
-    if number >= trials:
-        return 1.0
-    return float(scipy.stats.beta.ppf(level, number + 1, trials - number))

@@ -12,15 +12,10 @@ from dataclasses import dataclass, field, replace
 from statistics import NormalDist
 
 import numpy as np
+import scipy  # its parts are loaded on first use, which takes half a second
 from numpy.typing import ArrayLike
 
-from safe_rl.scores.bounds import (
-    best_growth,
-    betting_bound,
-    log_wealth,
-    share_bound,
-    student_bound,
-)
+from safe_rl.scores.bounds import best_growth, betting_bound, log_wealth, student_bound
 
 __all__ = ["BOUNDS", "Claim", "Statement", "Verdict", "first_certified", "rank"]
 
@@ -51,7 +46,11 @@ class Statement:
     def bound(self, level: float, kind: str) -> float:
         """Upper confidence bound of the mean; one of :data:`BOUNDS`."""
         if kind == "student" and self.is_share:
-            return share_bound(int(self.values.sum()), len(self.values), level)
+            # exact (Clopper and Pearson 1934)
+            test = scipy.stats.binomtest(
+                int(self.values.sum()), len(self.values), alternative="less"
+            )
+            return float(test.proportion_ci(level, method="exact").high)
         if kind == "student":
             return min(student_bound(self.values, level), self.highest)
         return betting_bound(self.values, level, self.highest)

@@ -83,8 +83,8 @@ def bootstrap(
         statistic: Vectorised function ``statistic(*samples, axis)``.
 
     Returns:
-        Lower and upper ends, of the shape of the statistic; NaN where there is one observation
-        per stratum, which says nothing about the spread, or an observation is no number.
+        Lower and upper ends, of the shape of the statistic; NaN where a stratum has a single
+        observation, which says nothing about the spread, or an observation is no number.
 
     Examples:
         >>> low, high = bootstrap([np.arange(100.0)], np.mean)
@@ -93,12 +93,12 @@ def bootstrap(
     """
     samples = [np.asarray(sample, dtype=float) for sample in samples]
     are_known = all(np.isfinite(sample).all() for sample in samples)
-    if max(sample.shape[-1] for sample in samples) < 2 or not are_known:
+    if min(sample.shape[-1] for sample in samples) < 2 or not are_known:
         shape = np.shape(statistic(*samples, axis=-1))
         return np.full(shape, math.nan), np.full(shape, math.nan)
     result = scipy.stats.bootstrap(
-        [sample for sample in samples if sample.shape[-1] > 1],
-        _with_constants(samples, statistic),
+        samples,
+        statistic,
         n_resamples=NUM_RESAMPLES,
         batch=max(1, _PORTION // sum(sample.size for sample in samples)),
         axis=-1,
@@ -108,30 +108,6 @@ def bootstrap(
         rng=np.random.default_rng(0),
     )
     return result.confidence_interval.low, result.confidence_interval.high
-
-
-def _with_constants(
-    samples: Sequence[np.ndarray], statistic: Callable[..., Any]
-) -> Callable[..., Any]:
-    """The statistic as a function of the strata with several observations.
-
-    SciPy refuses to resample a single observation, which can only ever be drawn itself.
-    """
-
-    def of_resampled(*resampled: np.ndarray, axis: int = -1) -> Any:
-        left = iter(resampled)
-        num_draws = resampled[0].shape[-2]
-        return statistic(
-            *(
-                next(left)
-                if sample.shape[-1] > 1
-                else np.repeat(sample[..., np.newaxis, :], num_draws, axis=-2)
-                for sample in samples
-            ),
-            axis=axis,
-        )
-
-    return of_resampled
 
 
 def mean(values: ArrayLike) -> Estimate:

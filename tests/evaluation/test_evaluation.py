@@ -13,7 +13,6 @@ from omegaconf import OmegaConf
 
 from safe_rl.cli.evaluate import main
 from safe_rl.cli.evaluating import evaluate_run as evaluate
-from safe_rl.cli.report import suite
 from safe_rl.envs import make_env
 from safe_rl.scores.benchmark import REFERENCE
 
@@ -99,15 +98,6 @@ def test_an_environment_of_another_kind_has_no_published_scores(run, monkeypatch
     assert "normalised_return" not in found
 
 
-def test_a_configuration_may_hold_the_changed_keys_only(run):
-    full, defaults = yaml.safe_load((run / "config.yaml").read_text())["env"], suite().defaults
-    changed = {key: value for key, value in full.items() if value != defaults[key]}
-    assert "randomize_layout" not in changed
-    change_config(run, env={**changed, "name": "mine"})
-    result = evaluate(run, options(episodes=2))
-    assert (result.facts["environment"], result.facts["layouts_trained_on"]) == ("mine", 0.0)
-
-
 def test_a_foreign_configuration_learns_nothing_of_this_machine(run, capsys, monkeypatch):
     monkeypatch.setenv("SECRET", "hush")
     change_config(run, env={"name": "${oc.env:SECRET}", "robot_base": "point"})
@@ -147,16 +137,6 @@ def test_environments_are_closed_whatever_happens(run, monkeypatch):
     with pytest.raises(TypeError):
         evaluate(run, options(episodes=1))
     assert [env.is_closed for env in made] == [True, True]
-
-
-def test_evaluations_of_a_name_stand_side_by_side(run):
-    evaluate(run, options(episodes=1))
-    evaluate(run, options(episodes=2, name="other"))
-    numbers = [
-        json.loads((run / f"{name}.json").read_text())["episodes"]
-        for name in ("evaluation", "evaluation_other")
-    ]
-    assert numbers == [1, 2]
 
 
 def test_the_best_checkpoint_is_taken_on_demand(run):

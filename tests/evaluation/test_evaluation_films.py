@@ -37,16 +37,6 @@ def test_a_film_runs_as_fast_as_what_it_shows(make, steps_per_frame, rate):
     assert video_format(make(), "gif") == FORMATS["gif"]
 
 
-def test_slow_steps_have_a_frame_each(run):
-    imageio = pytest.importorskip("imageio.v2", reason="needs the extra 'video'")
-    pytest.importorskip("imageio_ffmpeg", reason="needs the extra 'video'")
-    skip_without_opengl()
-    evaluate(run, options(episodes=1, video=True, env={"frameskip_binom_n": 40}))
-    with imageio.get_reader(run / "evaluation.mp4") as reader:
-        assert reader.get_meta_data()["fps"] == 12.5
-        assert len([frame for frame in reader]) == NUM_STEPS + 1  # noqa: C416
-
-
 def test_the_video_shows_an_episode(run):
     imageio = pytest.importorskip("imageio.v2", reason="needs the extra 'video'")
     pytest.importorskip("imageio_ffmpeg", reason="needs the extra 'video'")
@@ -122,9 +112,9 @@ def test_of_one_world_it_is_the_first_episode_to_its_end(run, deterministic, tmp
     skip_without_opengl()
     shown, draw = [], video._frame
 
-    def note(env, camera, form, *counts):
+    def note(picture, *counts):
         shown.append(counts)
-        return draw(env, camera, form, *counts)
+        return draw(picture, *counts)
 
     def drawing(*given, **keys):  # as environments of one's own may, from torch's generator
         torch.rand(3)

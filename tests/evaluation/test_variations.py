@@ -167,14 +167,6 @@ def test_keys_of_sets_are_taken_by_training(name):
         read_command(["env=PointGoal1", *chosen, *changes])
 
 
-def test_rows_with_a_list_are_several():
-    found = read_variations({"mass": {"env.mass_scale": [0.5, 2], "env.friction_scale": 0.9}})
-    assert [v.keys for v in found] == [
-        {"env.mass_scale": 0.5, "env.friction_scale": 0.9},
-        {"env.mass_scale": 2, "env.friction_scale": 0.9},
-    ]
-
-
 def test_what_concerns_elements_that_are_not_there_is_left_out():
     config = OmegaConf.create({"env": {"hazards_num": 0, "hazards_size": 0.2, "vases_num": 2}})
     named = read_variations("layout")

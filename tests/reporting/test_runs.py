@@ -191,18 +191,6 @@ def test_names_have_what_the_command_lines_of_their_runs_have_set(tmp_path):
     }  # fmt: skip
 
 
-def test_what_a_preset_holds_for_every_robot_tells_nothing_apart(tmp_path):
-    paper = {"preset": "paper", "paper": {"num_envs": {"point": 30, "doggo": 60}}}
-    write_run(tmp_path, "PointGoal1", "cpo", num_envs=30, **paper)
-    write_run(tmp_path, "CarGoal1", "cpo", num_envs=30, **paper)
-    write_run(tmp_path, "DoggoGoal1", "cpo", num_envs=60, frames=10**8, **paper)
-    assert {name for _, name, _ in names(grouped(tmp_path)[0])} == {"CPO"}
-    write_run(tmp_path, "DoggoGoal2", "cpo", num_envs=30, **paper, overrides=["num_envs=30"])
-    found = {environment: name for environment, name, _ in names(grouped(tmp_path)[0])}
-    assert found["DoggoGoal2"] == "CPO (num_envs=30)"
-    assert {name for env, name in found.items() if env != "DoggoGoal2"} == {"CPO"}
-
-
 def test_how_long_a_run_is_is_said_once(tmp_path):
     for env, frames in (("PointGoal1", 2000), ("DoggoGoal1", 1000)):
         write_run(tmp_path, env, "cpo", frames=frames, paper={})
@@ -211,18 +199,6 @@ def test_how_long_a_run_is_is_said_once(tmp_path):
         frames = 2000 if "Point" in str(directory) else 1000
         path.write_text(path.read_text() + f"limits: {{frames: {frames}}}\n")
     assert {name for _, name, _ in names(grouped(tmp_path)[0])} == {"CPO"}
-
-
-def test_an_algorithm_under_several_limits_is_one_family(tmp_path):
-    for limit in (10.0, 25.0):
-        write_run(tmp_path, algo="c_trpo", limits={"cost": limit}, folder=f"{limit}")
-    write_run(tmp_path, algo="c_trpo", preset="paper", folder="paper")
-    experiments, _ = grouped(tmp_path)
-    assert [(e.algorithm, e.family) for e in experiments] == [
-        ("C-TRPO (preset=default, cost ≤ 10)", "C-TRPO (preset=default)"),
-        ("C-TRPO (preset=default, cost ≤ 25)", "C-TRPO (preset=default)"),
-        ("C-TRPO (preset=paper, cost ≤ 25)", "C-TRPO (preset=paper)"),
-    ]
 
 
 def test_the_preset_stands_for_what_follows_from_it():

@@ -223,16 +223,6 @@ def test_what_counts_towards_no_slate(changes, tmp_path):
     assert "normalised" not in [section.name for section in result.sections]
 
 
-def test_what_has_finished_no_episode_has_no_empty_pictures(tmp_path):
-    for seed in (0, 10):
-        write_run(tmp_path, seed=seed, returns=[float("nan")], costs=[float("nan")])
-    report = build_report(tmp_path, SUITE, seeds_needed=3, unfinished=False)
-    drawn = [
-        block.name for s in report.sections for block in s.blocks if isinstance(block, Drawing)
-    ]
-    assert drawn == ["curves"]
-
-
 def test_what_has_finished_no_episode_is_neither_best_nor_worse_than_others(tmp_path):
     nothing = [float("nan")]
     for seed in (0, 10):
