@@ -75,7 +75,7 @@ def test_none_is_certified_where_limits_are_broken_and_it_says_by_how_much(train
     assert certificate.checkpoint is None
     assert certificate.verdict.shortfalls["mean_cost_hazards"] > 0.1
     assert len(certificate.verdict.tested) == 2
-    assert "mean_cost_hazards by" in str(certificate)
+    assert "mean_cost_hazards ≤ " in str(certificate)
     with pytest.raises(FileNotFoundError, match="none of its policies has been certified"):
         find_checkpoint(directory, "certified")
 
