@@ -306,11 +306,10 @@ def _change(config: DictConfig, override: Override, directory: Path, said: Seque
         return
     if not may_change:
         raise CommandLineError(
-            f"'{line}' cannot change in a run that is continued. What can: its length "
-            "(frames=…), what belongs to the machine (checkpoint.interval=…), and numbers "
-            "below loss, limits, policy_update and the like, except those that a checkpoint "
-            "brings along, such as an optimiser's lr. For a new run from trained networks use "
-            f"init_from={directory}."
+            f"'{line}' cannot change in a run that is continued. You may change frames, keys of "
+            "the machine such as checkpoint.interval, and single numbers below loss, limits, "
+            "policy_update and so on, but not an optimiser's lr: the checkpoint has it. For a new "
+            f"run from this run's networks use init_from={directory}."
         )
     if not override.is_hydra_override():
         OmegaConf.update(config, key, value, force_add=True)

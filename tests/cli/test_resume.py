@@ -104,7 +104,7 @@ def test_values_of_a_run_may_be_said_again(run, override):
         ("zzz=1", r"there is no key 'zzz'\."),
         ("policy_update.max_kll=1", r"Did you mean 'policy_update\.max_kl'"),
         ("frames=9,10", "a run has one value"),
-        ("policy_update.optimizer.lr=1e-9", "a checkpoint brings along, such as an optimiser's"),
+        ("policy_update.optimizer.lr=1e-9", "not an optimiser's lr: the checkpoint has it"),
     ],
 )
 def test_refusals_name_what_to_write(run, override, words):
