@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable
-from typing import Annotated, Any
+from typing import Annotated
 
 import torch
 from tensordict import TensorDictBase
@@ -13,7 +13,7 @@ from torchrl.collectors import Collector, MultiSyncCollector
 from torchrl.collectors.distributed import RayCollector
 from torchrl.envs import EnvBase
 
-from safe_rl.collectors.workers import Known, KnownWorkers, MakeEnv, Makers, WorkerCollector
+from safe_rl.collectors.workers import MakeEnv, Makers, WorkerCollector
 from safe_rl.extras import needs_extra
 from safe_rl.processes import starting_processes
 from safe_rl.ranges import Options, Range
@@ -73,14 +73,6 @@ def make_collector(
     )
 
 
-class _ProcessCollector(KnownWorkers, MultiSyncCollector):
-    """Known while it starts, because a worker may die before all have started."""
-
-    def __init__(self, known: Known, *args: Any, **options: Any) -> None:
-        known(self)
-        super().__init__(*args, **options)
-
-
 def make_process_collector(
     env: EnvBase,
     make_env: MakeEnv,
@@ -104,10 +96,9 @@ def make_process_collector(
         ValueError: If N is not a multiple of W, or ``frames_per_batch`` of N.
     """
 
-    def start(known: Known, makers: Makers) -> None:
+    def start(makers: Makers) -> MultiSyncCollector:
         with starting_processes():
-            _ProcessCollector(
-                known,
+            return MultiSyncCollector(
                 makers,
                 policy,
                 frames_per_batch=frames_per_batch,
@@ -121,12 +112,6 @@ def make_process_collector(
             )
 
     return WorkerCollector(start, env, make_env, num_collectors, frames_per_batch, device)
-
-
-class _RayCollector(KnownWorkers, RayCollector):
-    def __init__(self, *args: Any, **options: Any) -> None:
-        super().__init__(*args, **options)
-        self.closed = False
 
 
 @needs_extra("ray", "ray")
@@ -149,18 +134,16 @@ def make_ray_collector(  # noqa: D417
         resources: Resources of every actor: ``num_cpus``, ``num_gpus``, ``memory``.
     """
 
-    def start(known: Known, makers: Makers) -> None:
-        known(
-            _RayCollector(
-                makers,
-                policy,
-                frames_per_batch=frames_per_batch,
-                total_frames=sys.maxsize,
-                sync=True,
-                ray_init_config=ray_init,
-                remote_configs=resources,
-                num_collectors=num_collectors,
-            )
+    def start(makers: Makers) -> RayCollector:
+        return RayCollector(
+            makers,
+            policy,
+            frames_per_batch=frames_per_batch,
+            total_frames=sys.maxsize,
+            sync=True,
+            ray_init_config=ray_init,
+            remote_configs=resources,
+            num_collectors=num_collectors,
         )
 
     return WorkerCollector(start, env, make_env, num_collectors, frames_per_batch, device)

@@ -6,13 +6,15 @@ of episodes however many workers it has.
 
 from __future__ import annotations
 
+import gc
 import signal
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator
 from concurrent.futures import Future, wait
 from functools import partial
-from multiprocessing import parent_process
-from multiprocessing.queues import Queue
+from multiprocessing import active_children, connection, parent_process
+from multiprocessing.process import BaseProcess
 from threading import Thread
+from traceback import clear_frames
 from typing import Any, Protocol
 
 import torch
@@ -21,7 +23,7 @@ from torchrl.envs import EnvBase
 
 from safe_rl.processes import leave_signals_to_parent
 
-__all__ = ["Known", "MakeEnv", "Makers", "WorkerCollector", "kill_workers", "split_rows"]
+__all__ = ["MakeEnv", "Makers", "WorkerCollector", "WorkerError", "split_rows"]
 
 
 class MakeEnv(Protocol):
@@ -75,31 +77,6 @@ def _make_rows(
     return env
 
 
-Known = Callable[["KnownWorkers"], None]
-"""Stores a collector of TorchRL's."""
-
-
-class KnownWorkers:
-    """Defaults of what TorchRL's collectors of workers have once they are running.
-
-    A base of collectors, before TorchRL's class: they are known while they still start.
-
-    Attributes:
-        procs: Processes on this machine; none where workers are actors elsewhere.
-        closed: Whether there is nothing to shut down.
-    """
-
-    procs: Sequence[Any] = ()
-    closed: bool = True
-    _weight_sync_schemes: Mapping[str, Any] | None = None
-
-
-_MOST_LOOKS = 20
-"""Seconds after the end of a worker in which TorchRL may still raise its error."""
-_EXPLAINED = {0, 1, -signal.SIGKILL}
-"""Exit codes of workers whose error may follow: TorchRL kills all of them before it raises it."""
-
-
 class WorkerError(RuntimeError):
     """A worker has died."""
 
@@ -111,7 +88,7 @@ class WorkerCollector:
 
     Args:
         start: Starts TorchRL's collector, whose batches are [W, n, T] or [N, T], with the functions
-            that make its environments, and hands it, as soon as it has processes, to a function.
+            that make its environments.
         env: The run's environment; its rows are shared out, itself it is not stepped.
         make_env: Makes an environment like it with fewer rows, in the worker.
         num_collectors: Number of workers W.
@@ -124,7 +101,7 @@ class WorkerCollector:
 
     def __init__(
         self,
-        start: Callable[[Known, Makers], Any],
+        start: Callable[[Makers], Any],
         env: EnvBase,
         make_env: MakeEnv,
         num_collectors: int,
@@ -143,9 +120,8 @@ class WorkerCollector:
                 "num_collectors, and frames_per_batch of num_envs."
             )
         self.storing_device = torch.device(device)
-        self._start = lambda: start(self._known, split_rows(env, make_env, num_collectors))
-        self._workers: Any = KnownWorkers()
-        self._looks = 0
+        self._start = lambda: start(split_rows(env, make_env, num_collectors))
+        self._workers: Any = None
 
     def __iter__(self) -> Iterator[TensorDictBase]:
         """Start the workers and collect without end.
@@ -153,96 +129,70 @@ class WorkerCollector:
         Raises:
             WorkerError: If a worker has died.
         """
-        self._wait_for(_begin(self._start))
+        others = set(active_children())
+        try:
+            self._workers = self._ask(self._start)
+        except BaseException as error:
+            # Python would wait at its end for workers that have started, and for what sends weights
+            # to them, which the frames of the error keep
+            for process in set(active_children()) - others:
+                process.kill()
+            clear_frames(error.__traceback__)
+            gc.collect()
+            raise
         batches = iter(self._workers)
-        asked = _begin(lambda: next(batches))
         while True:
-            yield self._wait_for(asked).reshape(self._num_envs, -1).to(self.storing_device)
-            self._wait_for(_begin(self._workers.update_policy_weights_))
-            asked = _begin(lambda: next(batches))
+            batch = self._ask(lambda: next(batches)).reshape(self._num_envs, -1)
+            yield batch.to(self.storing_device)
+            self._ask(self._workers.update_policy_weights_)
 
-    def _known(self, workers: Any) -> None:
-        """Store TorchRL's collector, which is passed while it still starts its processes."""
-        self._workers = workers
+    def _ask(self, call: Callable[[], Any]) -> Any:
+        """The result of a call, which would wait without end for a worker that has died.
 
-    def _wait_for(self, asked: Future[Any]) -> Any:
-        """The result of a call that would wait without end for a worker that has died."""
+        It runs in a thread, for which neither signals nor the end of Python have to wait.
+        """
+        asked: Future[Any] = Future()
+
+        def run() -> None:
+            try:
+                asked.set_result(call())
+            except BaseException as error:  # also StopIteration
+                asked.set_exception(error)
+
+        Thread(target=run, daemon=True).start()
         while not wait([asked], timeout=1.0).done:
             self._check_workers()
-        failure = asked.exception()
-        if failure is None:
-            return asked.result()
-        if isinstance(failure, (EOFError, OSError)):  # the pipe of a process that has ended
-            self._looks = _MOST_LOOKS
-        self._check_workers()
-        kill_workers(self._workers)
-        raise failure
+        if asked.exception() is not None and self._processes:
+            # it may follow from a worker's end, whose exit code is not known yet
+            connection.wait([process.sentinel for process in self._processes], timeout=5.0)
+            self._check_workers()
+        return asked.result()
+
+    @property
+    def _processes(self) -> list[BaseProcess]:
+        """Workers on this machine that nobody has ended."""
+        return [p for p in getattr(self._workers, "procs", ()) if not p._closed]
 
     def _check_workers(self) -> None:
-        """Raise, and end all processes, if one has ended for some time."""
-        processes = [p for p in self._workers.procs if not p._closed]
-        ended = [p.exitcode for p in processes if p.exitcode is not None]
-        self._looks = self._looks + 1 if ended else 0
-        if not set(ended) - _EXPLAINED and self._looks <= _MOST_LOOKS:
+        """Raise, and end all workers, if one has died; TorchRL ends the others by SIGTERM."""
+        codes = {process.exitcode for process in self._processes}
+        if not (died := codes - {None, 0, 128 + signal.SIGTERM}):
             return
-        codes = ", ".join(map(str, ended))
-        kill_workers(self._workers)
+        self.kill()
         raise WorkerError(
-            f"A worker of the collector has died (exit code {codes}; -9 is mostly a lack of "
-            "memory: use fewer environments). The last checkpoint is whole: continue with resume=."
+            f"A worker of the collector has died (exit code {', '.join(map(str, died))}; -9 is "
+            "mostly a lack of memory: use fewer environments). The last checkpoint is whole: "
+            "continue with resume=."
         )
 
     def kill(self) -> None:
-        """Kill the workers; those on other machines are shut down."""
-        if self._workers.procs:
-            kill_workers(self._workers)
-        else:
-            self.shutdown()
+        """End the workers, whatever they are doing."""
+        self.shutdown(timeout=0.0)
 
-    def shutdown(self) -> None:
-        """End the workers, if there are any."""
-        if not self._workers.closed:
-            self._workers.shutdown()
-
-
-def _begin(call: Callable[[], Any]) -> Future[Any]:
-    """Begin a call in a thread that does not keep Python from ending."""
-    asked: Future[Any] = Future()
-
-    def run() -> None:
-        try:
-            asked.set_result(call())
-        except BaseException as error:  # also StopIteration
-            asked.set_exception(error)
-
-    Thread(target=run, daemon=True).start()
-    return asked
-
-
-def kill_workers(collector: Any) -> None:
-    """Kill the processes of a collector, and release what this process would wait for at exit.
-
-    Args:
-        collector: TorchRL's, started or not.
-    """
-    processes = [p for p in collector.procs if not p._closed]
-    for process in processes:
-        process.kill()
-    for process in processes:
-        process.join(timeout=5.0)
-    # Python would wait at exit for weights sent to dead processes, and for a thread of the schemes
-    schemes = (collector._weight_sync_schemes or {}).values()
-    for holder in (collector, *schemes):
-        for queue in _queues(vars(holder).values()):
-            queue.cancel_join_thread()
-    for scheme in schemes:
-        scheme.shutdown()
-    collector.closed = True
-
-
-def _queues(values: Iterable[Any]) -> Iterator[Queue]:
-    for value in values:
-        if isinstance(value, Queue):
-            yield value
-        elif isinstance(value, dict):
-            yield from _queues(value.values())
+    def shutdown(self, timeout: float | None = None) -> None:
+        """End the workers, if there are any; after a number of seconds by force."""
+        workers, self._workers = self._workers, None
+        if workers is not None:
+            workers.shutdown(timeout=timeout)
+            for scheme in (workers._weight_sync_schemes or {}).values():
+                scheme.shutdown()
