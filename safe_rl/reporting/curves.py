@@ -165,8 +165,7 @@ def limits_of(
     experiments: Iterable[Experiment], key: str, axes: Sequence[Any]
 ) -> list[tuple[Any, float]]:
     """Panels of episode cost and cost rate, and the heights of limits in them: d and d / T_ep."""
-    limited = [e for e in experiments if key in e.limits]
-    pairs = {(e.limits[key], e.runs[0].episode_length) for e in limited}
+    pairs = {(e.limits[key], e.runs[0].episode_length) for e in experiments if key in e.limits}
     return [
         *((axes[1], limit) for limit, _ in pairs),
         *((axes[2], limit / length) for limit, length in pairs if length is not None),

@@ -79,10 +79,9 @@ def algorithm_styles(experiments: Iterable[Experiment]) -> dict[str, Style]:
     styles: dict[str, Style] = {}
     for base, own_variants in sorted(variants.items()):
         colour, marker = looks.get(base) or next(further)
-        first_family = min(own_variants)[1]
         for number, (_, family, label) in enumerate(sorted(own_variants)):
             line = (0, (7, 2, *(1, 2) * (number - 1))) if number else "-"
-            styles[label] = Style(colour, marker, line, family == first_family)
+            styles[label] = Style(colour, marker, line, family == min(own_variants)[1])
     return styles
 
 

@@ -184,8 +184,8 @@ def complete_slates(
     """Slates that are complete for an algorithm or more, and what all have in common.
 
     Yields the name, and for each algorithm with as many finished runs per environment as are needed
-    its experiments, one per environment. Runs that started from another run's networks do not
-    count.
+    its experiments, one per environment, with a limit on ``cost``. Runs that started from another
+    run's networks do not count.
     """
     own: dict[str, dict[str, Experiment]] = {}
     for e in experiments:
@@ -208,10 +208,7 @@ def complete_slates(
 
 
 def normalised_scores(experiments: Sequence[Experiment]) -> dict[str, list[np.ndarray]]:
-    """Normalised final scores of one algorithm: score -> values per environment, one of each run.
-
-    The experiments have finished runs and a limit on ``cost``.
-    """
+    """Normalised final scores of one algorithm: score -> values per environment, one of a run."""
     strata: dict[str, list[np.ndarray]] = {name: [] for name in Normalised._fields}
     for e in experiments:
         assert e.reference is not None
