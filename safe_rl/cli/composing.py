@@ -168,8 +168,10 @@ def _compose(texts: list[str]) -> DictConfig:
         inner = re.search(r"full_key: (\S+)", str(error.__cause__))
         key = inner[1] if inner and inner[1].startswith(f"{wrong[1]}.") else wrong[1]
         # with all that is right, for what refers to it: the name of env=gymnasium is its env.id
-        values = plain(_compose([text for text in texts if text != given]))
-        raise CommandLineError(f"'{given}': {unknown_key(key, values)}") from None
+        rest = _compose([text for text in texts if text != given])
+        meant = [place for place in rest.hydra.runtime.choices if place.endswith(f"@{key}")]
+        words = f"write {meant[0]}=…" if meant else unknown_key(key, plain(rest))
+        raise CommandLineError(f"'{given}': {words}") from None
 
 
 def _explain(error: Exception, texts: Sequence[str]) -> str:

@@ -68,7 +68,7 @@ def test_errors_say_what_to_write(argument, message):
         ("seed=-1", "seed=-1: .* from 0"),
         ("name=a/b", "name=a/b: .*without /"),
         ("camera=track", r"camera=track: it is the video's: add video=true\."),
-        ("device=meta", "device=meta: it must be cpu, or a CUDA GPU"),
+        ("device=meta", "device=meta: it must be cpu; or cuda"),
         ("cvar_alpha=nan", "nan"),
         ("cost_limits={cost: -1}", "cost_limits=.*-1.*each a number from 0"),
         ("cost_limits={cost: nan}", "cost_limits=.*nan.*each a number from 0"),

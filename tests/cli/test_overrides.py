@@ -45,6 +45,7 @@ WRONG = {
     "algo=cop": "no algo 'cop'. Did you mean 'cpo'",
     "preset=papers": "Did you mean 'paper'",
     "preset=hard_tasks": "'preset=hard_tasks' is not for this algorithm: algo/ppo_lagrangian has",
+    "policy_update=paper": r"write policy_update/ppo@policy_update=…$",
     "limits=bad": r"no limits 'bad'\. There are default, ",
     "env=zzzzz": r"no env 'zzzzz'\. 'python train.py --help' names all; a file of yours needs --c",
     "cost_limits.cost=10": r"cost_limits='\{cost: 10\}'",

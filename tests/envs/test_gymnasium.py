@@ -90,6 +90,8 @@ def test_any_configuration_can_be_made():
         gymnasium.make("Safexp-Custom-v0", config={"hazard_num": 2})
     with pytest.raises(ConfigError, match="Did you mean 'velocity_threshold'"):
         gymnasium.make("SafeHopperVelocity-v0", config={"velocity_treshold": 1.0})
+    with pytest.raises(TypeError, match=r"config=\{'hazards_num': …\}"):
+        gymnasium.make("Safexp-PointGoal1-v0", hazards_num=3)
     with pytest.raises(ValueError, match="render_mode must be one of"):
         gymnasium.make("SafeHopperVelocity-v0", render_mode="ansi", disable_env_checker=True)
 

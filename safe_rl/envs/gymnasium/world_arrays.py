@@ -53,7 +53,11 @@ class Worlds:
         height: int = 360,
         sleep: bool = True,
         positions: bool = False,
+        **unknown: Any,
     ) -> None:
+        if unknown:
+            name = next(iter(unknown))
+            raise TypeError(f"No argument '{name}': keys go into config, config={{'{name}': …}}.")
         if render_mode not in (None, *RENDER_MODES):
             raise ValueError(f"render_mode must be one of {RENDER_MODES}, got {render_mode!r}.")
         self.batch, self.render_mode, self._has_positions = batch(sleep), render_mode, positions
