@@ -8,6 +8,11 @@ from pathlib import Path
 from safe_rl.cli import train
 
 ROOT = Path(__file__).parents[1]
+SMALL = (
+    *("env.num_steps=20", "num_envs=2", "frames_per_batch=40", "logger=none", "num_threads=1"),
+    "model.hidden_sizes=[8]",
+)
+"""Overrides of a run whose epochs are two short episodes."""
 
 
 def status_of(*arguments: str) -> object:

@@ -14,7 +14,7 @@ from safe_rl.algorithms import OffPolicy, OnPolicy
 from safe_rl.algorithms.build_part import find_recipe
 from safe_rl.algorithms.constraints import check_cost_limits
 from safe_rl.cli import train
-from safe_rl.envs import EXTRAS, SUITE, env_names, env_node, make_env, registration, store_configs
+from safe_rl.envs import EXTRAS, SUITE, env_names, env_node, registration, store_configs
 
 store_configs()
 
@@ -105,11 +105,6 @@ def test_hydra_makes_no_node_that_nobody_asked_for(monkeypatch, capsys):
     assert len(made) < 5
     stored = ConfigStore.instance().repo["env"]
     assert not {f"{name}.yaml" for name in (*SUITE, *EXTRAS)} & set(stored)
-
-
-def test_overrides_reach_the_environment():
-    config = compose_config("env=PointGoal1", "env.hazards_num=3")
-    assert make_env(OmegaConf.to_container(config.env), num_envs=1).config.hazards_num == 3
 
 
 def test_learning_rates_are_given_by_the_names_of_parameters():

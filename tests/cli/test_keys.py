@@ -156,12 +156,7 @@ def test_no_value_ends_in_a_traceback(configs):
         ("collector.num_collectors", 4, "use collector=process or collector=ray"),
         ("seed", 1e30, "seed=1e+30: it must be a whole number from 0 to"),
         ("compile", "maybe", "compile=maybe: it must be true or false"),
-        (
-            "device",
-            "mps",
-            "device=mps: it must be cpu; or cuda or cuda:<number>, if torch",
-        ),
-        ("device", "cuda:99", "device=cuda:99: it must be cpu; or cuda"),
+        ("device", "cuda:99", "device=cuda:99: it must be cpu; or cuda or cuda:<number>, if torch"),
         ("limits.margin", "abc", "margin=abc: it must be a number from 0 to 1e+09 (how far below"),
         ("env.name", "", "env.name=: it must be a text"),
         ("env.name", "a/b", "env.name=a/b: it must be"),

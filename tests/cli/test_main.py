@@ -1,9 +1,7 @@
 """One command for all: names, help and exit status."""
 
-import subprocess
-import sys
-
 import pytest
+from commands import in_a_process
 
 from safe_rl.__main__ import COMMANDS, main
 
@@ -21,8 +19,5 @@ def test_an_unknown_command_is_refused_with_the_nearest(capsys):
 
 
 def test_a_command_gets_the_rest(tmp_path):
-    words = [sys.executable, "-m", "safe_rl", "report", str(tmp_path), "seed=3"]
-    result = subprocess.run(words, capture_output=True, text=True, timeout=120, check=False)
-    assert result.returncode == 1
-    assert "Unknown option 'seed'" in result.stderr
-    assert "seeds" in result.stderr
+    said = in_a_process("-m", "safe_rl", "report", str(tmp_path), "seed=3", status=1)
+    assert "Unknown option 'seed'. Did you mean 'seeds'" in said

@@ -18,8 +18,6 @@ def test_values_are_read_with_their_types():
         ["episodes=1_000", "video=true", "seed=3", "env.layout_seeds_first=7", "env.goal_size=0.4"],
         EvaluationOptions,
     )
-    assert (options.episodes, options.video, options.seed) == (1000, True, 3)
-    assert options.env == {"layout_seeds_first": 7, "goal_size": 0.4}
     assert options == EvaluationOptions(
         episodes=1000, video=True, seed=3, env={"layout_seeds_first": 7, "goal_size": 0.4}
     )
@@ -87,6 +85,8 @@ def test_keywords_may_be_numbers_of_numpy_and_paths():
     )
     assert (options.episodes, options.checkpoint, options.env) == (3, "a/b", {"x": [1.5, 2.0]})
     assert options.variations == {"m": {"k": [0.5, 1]}}
+    for keys in ({"env.hazards_num": 3}, {"env": {"hazards_num": 3}}):
+        assert take_options(keys, EvaluationOptions).env == {"hazards_num": 3}
 
 
 def test_the_help_has_every_option_and_its_default():

@@ -128,10 +128,7 @@ def test_hydra_is_left_as_it_was(tmp_path, monkeypatch):
     ("settings", "message"),
     [
         ({"fames": 3}, "fames"),
-        ({"frames": -1}, "frames=-1"),
         ({"cost_limits": {"cost_hazard": 1}}, "cost_hazards"),
-        ({"policy_update": {"max_kll": 1}}, "max_kll"),
-        ({"env.hazard_num": 1}, "hazards_num"),
         ({"imports": ["users_nowhere"]}, "import=users_nowhere"),
         ({"config_dir": "nowhere"}, "config_dir=.*nowhere: there is no such folder"),
     ],
@@ -183,15 +180,6 @@ def test_an_evaluation_cannot_be_asked_for_what_there_is_not(run, options, messa
         run.evaluate(**options)
     with pytest.raises(ValueError, match=message):
         run.vary({"few": {"env.hazards_num": 2}}, **options)
-
-
-def test_keys_of_an_evaluation_may_be_written_with_dots(run):
-    dotted, nested = (
-        run.evaluate(episodes=2, name=name, **keys)
-        for name, keys in (("a", {"env.hazards_num": 3}), ("b", {"env": {"hazards_num": 3}}))
-    )
-    assert dotted.facts["env"] == nested.facts["env"] == {"hazards_num": 3}
-    assert dotted.estimates == nested.estimates
 
 
 @pytest.mark.parametrize("choice", [{"env": {"hazards_num": 3}}, {"algo": None}])

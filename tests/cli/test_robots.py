@@ -5,16 +5,12 @@ import struct
 
 import pytest
 import yaml
+from commands import SMALL
 from run_configs import without_times
 
 import safe_rl
 from safe_rl.cli import evaluate, train
 
-SMALL = (
-    *("num_envs=2", "frames_per_batch=40", "logger=none", "model.hidden_sizes=[8]", "seed=3"),
-    *("policy_update.minibatch_size=20", "critic_update.minibatch_size=20", "num_threads=1"),
-    *("env=PointGoal1", "env.sensors_obs=[gyro]", "env.num_steps=20"),
-)
 ROBOT = """
 <mujoco>
   <compiler meshdir="{meshes}"/>
@@ -59,11 +55,11 @@ def run(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     monkeypatch.delenv("HYDRA_FULL_ERROR", raising=False)
 
-    def begin(name="run", frames=40, base="robot/ball.xml", **robot):
+    def begin(name="run", frames=40, **robot):
         write_robot(tmp_path, **robot)
         folder = tmp_path / name
-        arguments = (f"hydra.run.dir={folder}", f"frames={frames}")
-        assert train.main([f"env.robot_base={base}", *SMALL, *arguments]) == 0
+        robot = ("env.robot_base=robot/ball.xml", "env.sensors_obs=[gyro]")
+        assert train.main([*SMALL, *robot, f"hydra.run.dir={folder}", f"frames={frames}"]) == 0
         return folder
 
     return begin
@@ -133,8 +129,3 @@ def test_only_what_mujoco_loads_is_copied(run, tmp_path):
     folder = run(meshes='meshes" texturedir="textures')
     copied = {str(path.relative_to(folder)) for path in folder.glob("robot/**/*.*")}
     assert copied == {"robot/ball.xml", "robot/meshes/hat.stl", "robot/parts/hat.xml"}
-
-
-def test_bundled_robots_need_no_copy(run):
-    folder = run(base="point")
-    assert not {"robot", "robot.json"} & {path.name for path in folder.iterdir()}

@@ -8,6 +8,7 @@ import time
 from pathlib import Path
 
 import pytest
+from commands import ROOT, SMALL, in_a_process
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import OmegaConf
 from registrations import undone
@@ -21,8 +22,6 @@ from safe_rl.runs.display import LINE_SECONDS, ProgressBar
 from safe_rl.runs.folder import runs_below
 from safe_rl.runs.outcome import final_figures
 from safe_rl.runs.table import read_table
-
-ROOT = Path(__file__).parents[2]
 
 
 @pytest.mark.parametrize(
@@ -126,17 +125,9 @@ def test_folders_of_a_sweep_name_what_a_person_overrode(words, between):
     assert folder == Path("PointGoal1") / "cpo" / between / "seed0"
 
 
-TINY = [
-    *("env.num_steps=40", "num_envs=2", "frames_per_batch=80", "frames=240", "logger=none"),
-    *("model.hidden_sizes=[8]", "critic_update.num_passes=1", "policy_update.num_passes=1"),
-]
-
-
-def sweep(directory, *overrides):
-    return subprocess.run(
-        [sys.executable, "train.py", "-m", *TINY, f"hydra.sweep.dir={directory}", *overrides],
-        cwd=ROOT, capture_output=True, text=True, timeout=600,
-    )  # fmt: skip
+def sweep(directory, *overrides, status=0):
+    words = (*SMALL, "frames=120", f"hydra.sweep.dir={directory}", *overrides)
+    return in_a_process("train.py", "-m", *words, status=status)
 
 
 @pytest.mark.slow
@@ -146,16 +137,15 @@ def test_a_sweep_end_to_end(tmp_path, launcher):
         pytest.importorskip("hydra_plugins.hydra_joblib_launcher")
     # the constrained algorithm cannot work without a limit, the other one does not need any
     jobs = ["env=PointGoal1", "algo=ppo,ppo_lagrangian", "seed=0,10", f"hydra/launcher={launcher}"]
-    first = sweep(tmp_path, *jobs, "default_cost_limits=null", "cost_limits={}")
-    assert first.returncode == 1, first.stderr
-    assert "Sweep: 2 of 4 runs are finished." in first.stdout
-    assert first.stdout.count("needs at least one entry in cost_limits") == 2
+    jobs += ["default_cost_limits=null", "cost_limits={}"]
+    first = sweep(tmp_path, *jobs, status=1)
+    assert "Sweep: 2 of 4 runs are finished." in first
+    assert first.count("needs at least one entry in cost_limits") == 2
     tables = sorted(tmp_path.glob("PointGoal1/ppo/*/seed*/progress.csv"))
     assert [table.parent.name for table in tables] == ["seed0", "seed10"]
     assert not list(tmp_path.glob("PointGoal1/ppo_lagrangian/*/*/progress.csv"))
     before = [table.stat().st_mtime_ns for table in tables]
-    again = sweep(tmp_path, *jobs, "default_cost_limits=null", "cost_limits={}")
-    assert again.stdout.count("has its 240 frames already") == 2
+    assert sweep(tmp_path, *jobs, status=1).count("has its 120 frames already") == 2
     assert [table.stat().st_mtime_ns for table in tables] == before
     journals = sorted((tmp_path / "sweeps").iterdir())
     assert len(journals) == 2
@@ -169,8 +159,7 @@ def test_jobs_in_other_processes_know_the_keys_of_a_users_module(tmp_path):
     pytest.importorskip("hydra_plugins.hydra_joblib_launcher")
     keys = ["env=PointGoal1", "env.constrain_mines=true", "env.mines_num=1", "algo=ppo"]
     keys += ["hydra/launcher=joblib", "import=examples/custom_environment.py"]
-    said = sweep(tmp_path, *keys, "seed=0,1")
-    assert "Sweep: 2 of 2 runs are finished." in said.stdout, said.stderr
+    assert "Sweep: 2 of 2 runs are finished." in sweep(tmp_path, *keys, "seed=0,1")
 
 
 def writers(directory):
@@ -195,21 +184,18 @@ def is_running(pid):
 @pytest.mark.slow
 def test_jobs_have_their_folders_for_themselves_and_end_with_the_sweep(tmp_path):
     pytest.importorskip("hydra_plugins.hydra_joblib_launcher")
-    endless = [override for override in TINY if not override.startswith("frames=")]
     command = [
-        *(sys.executable, "train.py", "-m", *endless, f"hydra.sweep.dir={tmp_path}", "seed=0,1"),
+        *(sys.executable, "train.py", "-m", *SMALL, f"hydra.sweep.dir={tmp_path}", "seed=0,1"),
         *("hydra/launcher=joblib", "hydra.launcher.n_jobs=2", "frames=100_000_000"),
     ]
     first = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.DEVNULL)
     try:
         wait_until(lambda: [r.num_rows > 1 for r in runs_below(tmp_path)] == [True, True], 900)
         processes = writers(tmp_path)
-        again = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=900)
-        assert again.returncode == 1
+        again = in_a_process(*command[1:], status=1)
         for directory, pid in processes.items():
-            assert f"{directory}: RunInUseError: {directory} is being written by process {pid}" in (
-                again.stdout
-            )
+            said = f"{directory}: RunInUseError: {directory} is being written by process {pid}"
+            assert said in again
         assert writers(tmp_path) == processes
         assert not list(tmp_path.rglob("failure.txt"))
     finally:
@@ -228,7 +214,7 @@ def test_optuna_takes_the_return_within_the_limits(tmp_path):
     search = ["hydra/sweeper=optuna", "hydra.sweeper.n_trials=2", "hydra.sweeper.n_jobs=1"]
     search += ["hydra.sweeper.direction=maximize", "hydra/launcher=basic", "env=PointGoal1"]
     said = sweep(tmp_path, *search, "lagrangian.kp=interval(0.1,1)")
-    assert "Sweep: 2 of 2 runs are finished." in said.stdout, said.stderr
+    assert "Sweep: 2 of 2 runs are finished." in said
     best = OmegaConf.load(tmp_path / "optimization_results.yaml")
     tables = [read_table(path) for path in tmp_path.rglob("progress.csv")]
     returns = [max(final_figures(table, ["cost"])["episode_return"] for table in tables)]

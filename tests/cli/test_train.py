@@ -2,21 +2,16 @@
 
 import logging
 import logging.handlers
-import os
 import signal
-import subprocess
-import sys
 from pathlib import Path
 
-import gymnasium
-import numpy as np
 import pytest
-from commands import status_of
+from commands import SMALL, in_a_process, status_of
 
 from safe_rl.cli import evaluating
+from safe_rl.envs import ConfigError
 from safe_rl.runs.table import read_table
-
-ROOT = Path(__file__).parents[2]
+from safe_rl.training.trainer import Trainer
 
 
 @pytest.fixture
@@ -81,10 +76,7 @@ def test_torchrls_notes_are_kept_off_the_terminal_but_not_its_warnings(command, 
     logger = logging.getLogger("torchrl")
     monkeypatch.setattr(logger, "handlers", [kept := logging.handlers.BufferingHandler(9)])
     logger.setLevel(logging.INFO)
-    status, *_ = command(
-        *["env=PointGoal1", "env.num_steps=20", "num_envs=2", "frames=40", "frames_per_batch=40"],
-        *["algo=sac", "model.hidden_sizes=[8]", "logger=none", "hydra.run.dir=runs/quiet"],
-    )
+    status, *_ = command(*SMALL, "frames=40", "algo=sac", "hydra.run.dir=runs/quiet")
     logger.warning("of something that is wrong")
     assert not status
     assert [record.levelname for record in kept.buffer] == ["WARNING"]
@@ -99,8 +91,7 @@ def test_torchrls_notes_are_kept_off_the_terminal_but_not_its_warnings(command, 
     ],
 )
 def test_a_run_too_short_for_its_certificate_says_so(command, overrides, lines):
-    small = ["env=PointGoal1", "env.num_steps=20", "num_envs=2", "frames=40", "frames_per_batch=40"]
-    status, out, _ = command(*small, *overrides, "logger=none", "hydra.run.dir=runs/short")
+    status, out, _ = command(*SMALL, "frames=40", *overrides, "hydra.run.dir=runs/short")
     assert not status
     said = [line for line in out.splitlines() if line.startswith("Not certified: ")]
     assert len(said) == lines
@@ -115,9 +106,8 @@ def test_a_run_too_short_for_its_certificate_says_so(command, overrides, lines):
 def test_a_run_without_a_certified_policy_says_how_to_train_on(command):
     # two episodes can certify nothing
     status, out, _ = command(
-        *["env=PointGoal1", "env.num_steps=20", "num_envs=2", "frames=40", "frames_per_batch=40"],
-        *["algo=ppo_lagrangian", "certificate.episodes=2", "certificate.ranking=2", "logger=none"],
-        *["cost_limits={cost: 0.5}", "hydra.run.dir=runs/unsafe", "import=json"],
+        *(*SMALL, "frames=40", "certificate.episodes=2", "certificate.ranking=2"),
+        *("cost_limits={cost: 0.5}", "hydra.run.dir=runs/unsafe", "import=json"),
     )
     assert not status
     line = out.splitlines()[-1]
@@ -136,9 +126,8 @@ def test_a_run_interrupted_while_it_is_certified_is_certified_when_it_is_resumed
     with monkeypatch.context() as patch:
         patch.setattr(evaluating, "certify", interrupt)
         status, out, _ = command(
-            *["env=PointGoal1", "env.num_steps=20", "num_envs=2", "frames=40", "logger=none"],
-            *["frames_per_batch=40", "algo=ppo_lagrangian", "certificate.episodes=2"],
-            *["certificate.ranking=2", "hydra.run.dir=runs/mine"],
+            *(*SMALL, "frames=40", "certificate.episodes=2", "certificate.ranking=2"),
+            "hydra.run.dir=runs/mine",
         )
     assert status == 130
     before, _, resume = out.splitlines()[-1].partition("python train.py ")
@@ -159,73 +148,22 @@ def test_a_run_interrupted_while_it_is_certified_is_certified_when_it_is_resumed
 
 def test_an_interruption_is_said_in_a_line_and_ends_by_the_signal():
     source = "from safe_rl.cli.grammar import say_interruptions as say\nsay()\n"
-    ended = subprocess.run(
-        [sys.executable, "-c", f"{source}raise KeyboardInterrupt"],
-        cwd=ROOT, capture_output=True, text=True, timeout=300,
-    )  # fmt: skip
-    assert (ended.returncode, ended.stderr) == (-signal.SIGINT, "Interrupted.\n")
+    words = ("-c", f"{source}raise KeyboardInterrupt")
+    assert in_a_process(*words, status=-signal.SIGINT) == "Interrupted.\n"
 
 
 def test_a_backend_that_matplotlib_does_not_know_is_said_before_the_run_begins(tmp_path):
-    where, small = f"hydra.run.dir={tmp_path / 'run'}", "frames=20_000"
-    ended = subprocess.run(
-        [sys.executable, "train.py", "env=PointGoal0", "algo=ppo", small, where],
-        cwd=ROOT, env=os.environ | {"MPLBACKEND": "nonsense"},
-        capture_output=True, text=True, timeout=300,
-    )  # fmt: skip
-    assert ended.returncode == 1
-    assert "'nonsense' is not a valid value for backend" in ended.stderr.splitlines()[-1]
-    assert "Traceback" not in ended.stderr
+    words = ("train.py", *SMALL, "frames=40", f"hydra.run.dir={tmp_path / 'run'}")
+    said = in_a_process(*words, status=1, MPLBACKEND="nonsense")
+    assert "'nonsense' is not a valid value for backend" in said.splitlines()[-1]
+    assert "Traceback" not in said
     assert not (tmp_path / "run").exists()
 
 
-class OddCost(gymnasium.Env):
-    """Two steps without a cost, then one of `cost`."""
+@pytest.mark.parametrize("kind", [ConfigError, FloatingPointError])
+def test_what_is_wrong_while_it_trains_ends_the_run_in_a_line(command, monkeypatch, kind):
+    def fail(trainer, batches):
+        raise kind("the cost is not finite")
 
-    observation_space = gymnasium.spaces.Box(-1, 1, (1,), np.float32)
-    action_space = gymnasium.spaces.Box(-1, 1, (1,), np.float32)
-
-    def __init__(self, cost):
-        self.cost = cost
-
-    def reset(self, *, seed=None, options=None):
-        self.costs = [0.0, 0.0, self.cost]
-        return np.zeros(1, np.float32), {}
-
-    def step(self, action):
-        return np.zeros(1, np.float32), 0.0, False, False, {"cost": self.costs.pop(0)}
-
-
-gymnasium.register("OddCost-v0", OddCost, max_episode_steps=3)
-
-
-@pytest.mark.parametrize(
-    ("cost", "words"),
-    [
-        ("nan", "('next', 'cost') is not finite in 4 of 12 samples"),
-        ("much", "info['cost'] must be one number per step"),
-    ],
-)
-def test_what_is_wrong_with_a_cost_ends_training_in_a_line(command, cost, words):
-    keys = ["env=gymnasium", "env.id=OddCost-v0", f"env.kwargs={{cost: {cost}}}"]
-    small = ["env.cost_keys=[cost]", "num_envs=2", "frames=12", "frames_per_batch=12"]
-    status, _, _ = command(*keys, *small, "logger=none", "algo=ppo_lagrangian")
-    assert words in status
-    assert len(status.splitlines()) == 1
-
-
-def test_a_run_whose_table_was_cut_off_is_refused_in_a_line(command):
-    keys = ["env=PointGoal1", "env.num_steps=20", "num_envs=2", "frames=40", "frames_per_batch=40"]
-    assert command(*keys, "algo=ppo", "logger=none", "hydra.run.dir=cut")[0] == 0
-    Path("cut/progress.csv").write_text("epoch,steps\n1,")
-    status, _, _ = command("resume=cut", "frames=80")
-    assert "holds 0 complete rows" in status
-    assert "init_from=" in status
-    assert len(status.splitlines()) == 1
-
-
-@pytest.mark.parametrize("room", ["safe_rl.training", "safe_rl.cli"])
-def test_rooms_are_no_commands(room):
-    result = subprocess.run([sys.executable, "-m", room], cwd=ROOT, capture_output=True, text=True)
-    assert result.returncode
-    assert "cannot be directly executed" in result.stderr
+    monkeypatch.setattr(Trainer, "epoch", fail)
+    assert command(*SMALL, "frames=40")[0].splitlines() == ["the cost is not finite"]

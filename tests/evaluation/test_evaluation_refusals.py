@@ -17,8 +17,6 @@ from safe_rl.evaluation.variations import Variation, varied
     ("arguments", "message"),
     [
         (["epsiodes=3"], "Did you mean 'episodes'?"),
-        (["episodes=0"], "episodes=0"),
-        (["cvar_alpha=nan"], "cvar_alpha=nan"),
         (["env.hazard_num=3"], "hazards_num"),
         (["checkpoint=there.torchrl"], "checkpoint is last, best, certified or the path"),
         (["env.lidar_num_bins=8"], "trained on other observations"),
