@@ -98,16 +98,16 @@ class Trainer:
         self._frames, self._frames_per_batch = config.frames, config.frames_per_batch
         self._checkpoint_interval = config.checkpoint.interval
         self._candidates = self._find_candidates(config.checkpoint.get("best_over", 1), cost_limits)
-        self._checkpoints = CheckpointStore(
-            record.folder.checkpoints,
+        self._checkpoints = self._open_checkpoints(config)
+
+    def _open_checkpoints(self, config: DictConfig) -> CheckpointStore:
+        run = {"environment": config.env.name, "algorithm": config.algo.name, "seed": config.seed}
+        return CheckpointStore(
+            self.record.folder.checkpoints,
             self.components(),
             keep_last=config.checkpoint.keep_last,
             keep_best=config.checkpoint.get("keep_best", 1),
-            run={
-                "environment": config.env.name,
-                "algorithm": config.algo.name,
-                "seed": config.seed,
-            },
+            run=run,
         )
 
     def _find_candidates(self, over: int, limits: Mapping[str, float]) -> Candidates:
