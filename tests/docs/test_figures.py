@@ -225,6 +225,25 @@ def test_the_table_of_readme_is_a_part_of_the_full_one():
         assert cells.split(" | ") == [end, above, certified.partition(",")[0]]
 
 
+def test_the_campaign_at_one_commit():
+    rows = re.findall(r"^\| (\w+) \| (\d{4}) \| (.+) \|$", PAGE, re.MULTILINE)
+    assert len(rows) == len(campaign("held_out"))
+    ends = []
+    for env, seed, cells in rows:
+        run = RESULTS / "held_out" / env / "ppo_lagrangian" / f"seed{seed}"
+        ends += [last(run, 1 / 6)] if env == "PointGoal1" else []
+        cost, above = held(run)
+        (fresh,) = run_at(run).notes["evaluations"]
+        assert (fresh["checkpoint"], fresh["episodes"]) == ("certified", 2000)
+        mean = "{value:.1f} ({low:.1f} to {high:.1f})".format(**fresh["estimates"]["episode_cost"])
+        end = "{:.1f} / {:.1f}".format(*last(run, 1 / 6))
+        assert cells.split(" | ") == [end, f"{cost:.1f}", percent(above), certificate(run), mean]
+    means, spreads = np.mean(ends, 0), np.std(ends, 0, ddof=1)
+    told = " / ".join(f"{m:.1f} ± {d:.1f}" for m, d in zip(means, spreads, strict=True))
+    assert f"PointGoal1: {told}" in sentences(PAGE)
+    assert told in sentences(README)
+
+
 def test_how_many_runs_are_within_the_limit():
     within = []
     for env, algo, seeds, _ in HELD_OUT:
