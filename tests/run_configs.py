@@ -43,6 +43,16 @@ def point_mass_config(*overrides: str, minibatch_size: int | None = 40) -> DictC
     )
 
 
+def off_policy_config(*overrides: str) -> DictConfig:
+    """A run with a replay buffer: 8 epochs of 4 x 40 steps, 8 gradient steps after each."""
+    return compose_config(
+        *("env=PointMass", "frames=1280", "num_envs=4", "frames_per_batch=160", "logger=none"),
+        *("model.hidden_sizes=[16]", "memory.batch_size=32", "exploration.random_steps=160"),
+        *("policy_update.updates_per_step=0.05", "memory.keep=true", "memory.n_steps=1"),
+        *overrides,
+    )
+
+
 def without_times(path: Path) -> list[list[str]]:
     """Rows of a run's table without its columns of times."""
     lines = [line.split(",") for line in path.read_text().splitlines()]

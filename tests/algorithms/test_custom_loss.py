@@ -4,9 +4,8 @@ import math
 
 import pytest
 import torch
-from point_mass import PointMass
 from point_mass_runs import point_mass_trainer
-from run_configs import CONF, point_mass_config
+from run_configs import CONF
 from tensordict import TensorDict
 
 from safe_rl import targets
@@ -15,7 +14,6 @@ from safe_rl.cli.user_code import import_modules
 from safe_rl.models import make_actor
 from safe_rl.runs.table import read_table
 from safe_rl.targets import allow
-from safe_rl.training.building import build_trainer
 
 ROOT = CONF.parent
 EXAMPLES = ROOT / "examples"
@@ -53,13 +51,11 @@ def test_charges_sum_to_mean_and_semideviation():
 
 @pytest.mark.parametrize("algo", ["quadratic", "cpo"])
 def test_it_trains_with_several_costs(tmp_path, algo):
-    config = point_mass_config(
-        f"hydra.searchpath=[file://{EXAMPLES / 'conf'}]", f"algo={algo}", "risk=semideviation",
-        "cost_limits={cost_hazards: 1, cost_north: 0.5}",
+    point_mass_trainer(
+        tmp_path, f"hydra.searchpath=[file://{EXAMPLES / 'conf'}]", f"algo={algo}",
+        "risk=semideviation", "cost_limits={cost_hazards: 1, cost_north: 0.5}",
         minibatch_size=None if algo == "cpo" else 40,
-    )  # fmt: skip
-    trainer = build_trainer(config, PointMass(config.num_envs, 20, config.seed), tmp_path)
-    trainer.run()
+    ).run()  # fmt: skip
     table = read_table(tmp_path / "progress.csv")
     for key, limit in (("cost_hazards", 1), ("cost_north", 0.5)):
         expected = [estimate - limit for estimate in table[f"estimate_{key}"]]

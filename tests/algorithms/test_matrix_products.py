@@ -2,12 +2,10 @@
 
 import pytest
 import torch
-from point_mass import PointMass
-from run_configs import point_mass_config
+from point_mass_runs import point_mass_trainer
 
 from safe_rl.algorithms import processor_use
 from safe_rl.algorithms.processor_use import fast_products, prefers_onednn
-from safe_rl.training.building import build_trainer
 
 ZEN = "vendor_id : AuthenticAMD\nmodel name : AMD EPYC\nflags : fpu avx2 avx512f avx512_bf16\n"
 
@@ -73,8 +71,7 @@ def test_a_precision_of_the_users_is_kept(of_use):
 
 
 def test_training_has_it_for_updates_alone(of_use, tmp_path):
-    config = point_mass_config("algo=ppo")
-    trainer = build_trainer(config, PointMass(config.num_envs, 20, config.seed), tmp_path)
+    trainer = point_mass_trainer(tmp_path, "algo=ppo")
     learn, seen = trainer.algorithm.learn, []
 
     def watched(*args):

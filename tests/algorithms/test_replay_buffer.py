@@ -94,6 +94,16 @@ def test_several_steps_are_summed_across_batches_and_not_across_ends(terminates)
         assert step["next", "terminated"].item() is (reaches_the_end and terminates)
 
 
+def check_draws(memory, copy, batch):
+    """Both give the same minibatches after another batch."""
+    drawn = []
+    for each in (memory, copy):
+        torch.manual_seed(3)
+        each.extend(batch.clone())
+        drawn.append(torch.cat([m["observation"] for m in each.minibatches(3)]))
+    assert torch.equal(*drawn)
+
+
 @pytest.mark.parametrize("n_steps", [1, 3])
 @pytest.mark.parametrize("batches", [0, 1, 4])
 def test_a_copy_goes_on_in_the_same_way(n_steps, batches, tmp_path):
@@ -105,13 +115,8 @@ def test_a_copy_goes_on_in_the_same_way(n_steps, batches, tmp_path):
     torch.save(memory.state_dict(), tmp_path / "state")
     copy.load_state_dict(torch.load(tmp_path / "state", weights_only=True))
     assert len(memory) == len(copy)
-    drawn = []
-    for each in (memory, copy):
-        torch.manual_seed(3)
-        each.extend(make_batch(5 * batches, 5))
-        drawn.append(torch.cat([m["observation"] for m in each.minibatches(3)]))
+    check_draws(memory, copy, make_batch(5 * batches, 5))
     assert len(memory) == len(copy)
-    assert torch.equal(*drawn)
 
 
 @pytest.mark.parametrize(("length", "ends"), [(2, [1]), (8, [2, 7]), (8, [2])])
@@ -192,12 +197,7 @@ def test_a_copy_goes_on_with_the_same_priorities(tmp_path):
     copy = make_memory(keep=False, prioritised=EXPONENTS)
     torch.save(memory.state_dict(), tmp_path / "state")
     copy.load_state_dict(torch.load(tmp_path / "state", weights_only=True))
-    drawn = []
-    for each in (memory, copy):
-        torch.manual_seed(3)
-        each.extend(make_batch(10, 5, rows=1))
-        drawn.append(torch.cat([m["observation"] for m in each.minibatches(3)]))
-    assert torch.equal(*drawn)
+    check_draws(memory, copy, make_batch(10, 5, rows=1))
 
 
 def test_errors_are_read_where_the_loss_writes_them():

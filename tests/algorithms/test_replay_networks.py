@@ -3,21 +3,12 @@
 import pytest
 import torch
 from point_mass import PointMass
-from run_configs import compose_config
+from run_configs import off_policy_config
 from torchrl.data import Bounded, Composite, Unbounded
 
 from safe_rl.algorithms import OffPolicy
 from safe_rl.runs.table import read_table
 from safe_rl.training.building import build_trainer
-
-
-def config_of(algo):
-    """Three epochs of 4 x 40 steps, with a gradient step for 20 of them."""
-    return compose_config(
-        *("env=PointMass", f"algo={algo}", "frames=480", "num_envs=4", "frames_per_batch=160"),
-        *("logger=none", "model.hidden_sizes=[16]", "memory.batch_size=32", "memory.n_steps=1"),
-        "exploration.random_steps=160",
-    )
 
 
 class Acting(PointMass):
@@ -37,7 +28,7 @@ class Acting(PointMass):
 )
 def test_other_actions_than_vectors_within_bounds_are_refused(spec, message):
     with pytest.raises(ValueError, match=message):
-        OffPolicy.build(config_of("sac"), Acting(spec))
+        OffPolicy.build(off_policy_config("algo=sac"), Acting(spec))
 
 
 @pytest.mark.parametrize(
@@ -52,13 +43,13 @@ def test_other_observations_than_a_vector_are_refused(observation, message):
     env = PointMass(2)
     env.observation_spec = Composite(observation=observation, shape=[2])
     with pytest.raises(ValueError, match=message):
-        OffPolicy.build(config_of("sac"), env)
+        OffPolicy.build(off_policy_config("algo=sac"), env)
 
 
 @pytest.mark.parametrize("algo", ["sac_lagrangian", "td3_lagrangian"])
 def test_bounds_of_double_precision_are_for_networks_of_single_precision(algo, tmp_path):
     env = Acting(Bounded(-1, 1, (4, 2), dtype=torch.float64))
-    trainer = build_trainer(config_of(algo), env, tmp_path)
+    trainer = build_trainer(off_policy_config(f"algo={algo}", "frames=480"), env, tmp_path)
     trainer.run()
     assert read_table(tmp_path / "progress.csv")["policy_num_updates"] == [8, 8, 8]
     assert trainer.algorithm.policy(env.reset())["action"].dtype == torch.float32

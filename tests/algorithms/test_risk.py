@@ -2,8 +2,7 @@
 
 import pytest
 import torch
-from point_mass import PointMass
-from run_configs import point_mass_config
+from point_mass_runs import point_mass_trainer
 from scipy.optimize import minimize_scalar
 from scipy.stats import norm
 from tensordict import TensorDict
@@ -16,7 +15,6 @@ from safe_rl.collectors import EpisodeAccounting
 from safe_rl.objectives import Chance, CostGAE, CVaR, TRPOLoss
 from safe_rl.objectives.risk import cost_so_far
 from safe_rl.runs.table import read_table
-from safe_rl.training.building import build_trainer
 
 
 def cvar_of(limits, tail=0.25, window=10_000, ramp_start=0, ramp_steps=0):
@@ -217,10 +215,8 @@ def test_the_gradient_of_a_chance_in_closed_form():
 
 def train(directory, *overrides, **settings):
     """A run of a second on the point mass."""
-    config = point_mass_config(
-        "cost_limits={cost_hazards: 2, cost_north: 1}", *overrides, **settings
-    )
-    trainer = build_trainer(config, PointMass(config.num_envs, 20, config.seed), directory)
+    limits = "cost_limits={cost_hazards: 2, cost_north: 1}"
+    trainer = point_mass_trainer(directory, limits, *overrides, **settings)
     trainer.run()
     return trainer, read_table(directory / "progress.csv")
 

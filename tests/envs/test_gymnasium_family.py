@@ -1,6 +1,7 @@
 """Somebody else's environment, registered with Gymnasium, through the ordinary commands."""
 
 import json
+import math
 
 import gymnasium
 import gymnasium_envs  # noqa: F401, registers Walk-v0
@@ -64,6 +65,9 @@ def test_seeds_determine_rows_and_share_none(node):
         ({"cost_keys": "fast", "num_steps": 5}, "'cost_keys' must be a list.*'fast'"),
         ({"cost_keys": []}, "what does a step cost"),
         ({"cost_keys": ["fast", "reward"]}, "'reward' is a state.*stays"),
+        ({"outside": {"cost_x": [0, 1.0]}}, "got cost_x:"),
+        ({"outside": {"cost_x": [0, 1.0, 0.0]}}, "cannot have the range 1.0 to 0.0"),
+        ({"outside": {"far": [0, 0.0, 1.0]}}, "called cost or cost_<kind>, not 'far'"),
     ],
 )
 def test_what_cannot_be_made_is_said(keys, message):
@@ -112,17 +116,22 @@ def test_registered_arguments_and_limits_are_kept():
     ("outside", "reported", "bounds"),
     [
         ({"cost_a": [1, -0.3, 0.3]}, None, [1.0, 1.0]),
-        ({"cost_a": [1, -0.3, 0.3], "cost_b": [2, -0.1, 0.1]}, None, [2.0, 1.0, 1.0]),
+        ({"cost_a": [0, -0.04, 0.03], "cost_b": [2, -0.1, math.inf]}, None, [2.0, 1.0, 1.0]),
         ({"cost_a": [1, -0.3, 0.3]}, ["cost_told"], None),
     ],
 )
 def test_costs_of_ranges_are_bounded_in_the_spec_and_stand_beside_others(outside, reported, bounds):
-    node = {**NODE, "id": "CartPole-v1", "num_steps": 10, "outside": outside}
-    env = make_env(node | {"cost_keys": reported}, num_envs=2, seed=0)
-    step = env.rollout(10)["next"]
-    left = step["observation"][..., 1:2].abs() > 0.3
-    torch.testing.assert_close(step["cost_a"], left.float())
-    assert 0 < left.sum() < left.numel()
+    node = {**NODE, "id": "CartPole-v1", "num_steps": 200, "outside": outside}
+    env = make_env(node | {"cost_keys": reported}, num_envs=3, seed=0)
+    rollout = env.rollout(200, break_when_any_done=False)
+    assert rollout["action"].dtype == torch.int64
+    step = rollout["next"]
+    for key, (column, low, high) in outside.items():
+        place = step["observation"][..., [column]]
+        expected = ((place < low) | (place > high)).float()
+        assert 0 < expected.mean() < 1
+        torch.testing.assert_close(step[key], expected)
+    torch.testing.assert_close(step["cost"], sum(step[key] for key in outside))
     assert env.cost_keys == ["cost", *(reported or []), *outside]
     if bounds:
         assert [env.full_reward_spec[k].high.max().item() for k in env.cost_keys] == bounds

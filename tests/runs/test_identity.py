@@ -93,7 +93,10 @@ def test_whether_transitions_are_kept_makes_no_other_experiment():
 
 @pytest.mark.parametrize(
     "override",
-    ["frames=7", "policy_update.max_kl=0.1", "cost_limits={cost: 3}", "env.name=Other"],
+    [
+        *("frames=7", "policy_update.max_kl=0.1", "cost_limits={cost: 3}", "env.name=Other"),
+        "transforms=[saute]",
+    ],
 )
 def test_everything_else_does(override):
     assert experiment_of(as_saved(override)) != experiment_of(as_saved())

@@ -9,7 +9,6 @@ import yaml
 from commands import run_train
 
 from safe_rl.cli import evaluate
-from safe_rl.envs import ConfigError, make_env
 from safe_rl.runs.table import read_table
 
 pytestmark = pytest.mark.long
@@ -44,39 +43,6 @@ def test_a_cart_learns_to_stay_within_a_range(algo, tmp_path):
     options = ["episodes=4", "num_envs=2", "deterministic=true"]
     assert evaluate.main([str(tmp_path), *options]) == 0
     assert json.loads((tmp_path / "evaluation.json").read_text())["environment"] == "CartPole-v1"
-
-
-def test_the_cost_is_that_of_the_position_alone():
-    node = {"_target_": "safe_rl.envs.gymnasium.make_gymnasium", "id": "CartPole-v1"}
-    ranges = {"cost_position": [0, -0.04, 0.03], "cost_angle": [2, -0.1, float("inf")]}
-    rollout = make_env({**node, "outside": ranges}, num_envs=3, seed=0).rollout(
-        200, break_when_any_done=False
-    )
-    assert rollout["action"].dtype == torch.int64
-    step = rollout["next"]
-    for key, (column, low, high) in ranges.items():
-        place = step["observation"][..., [column]]
-        expected = ((place < low) | (place > high)).float()
-        assert 0 < expected.mean() < 1
-        torch.testing.assert_close(step[key], expected)
-    torch.testing.assert_close(step["cost"], step["cost_position"] + step["cost_angle"])
-
-
-@pytest.mark.parametrize(
-    ("outside", "message"),
-    [
-        ([1], "'outside' must be as"),
-        ({"cost_x": [0, 1.0]}, "got cost_x:"),
-        ({"cost_x": [0.5, 0.0, 1.0]}, "got cost_x:"),
-        ({"cost_x": [0, 1.0, 0.0]}, "cannot have the range 1.0 to 0.0"),
-        ({"far": [0, 0.0, 1.0]}, "called cost or cost_<kind>, not 'far'"),
-        ({"cost_x": [4, 0.0, 1.0]}, "no column 4 in observation. It has 4"),
-    ],
-)
-def test_ranges_that_cannot_be_are_refused(outside, message):
-    node = {"_target_": "safe_rl.envs.gymnasium.make_gymnasium", "id": "CartPole-v1"}
-    with pytest.raises(ConfigError, match=message):
-        make_env({**node, "outside": outside})
 
 
 @pytest.mark.slow

@@ -6,7 +6,7 @@ from functools import partial
 import pytest
 import torch
 from point_mass import Forgetful, PointMass
-from run_configs import assert_resumes_exactly, compose_config
+from run_configs import assert_resumes_exactly, off_policy_config
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from safe_rl.algorithms import OffPolicy
@@ -20,16 +20,6 @@ from safe_rl.training.building import begin_from, build_trainer, seed_everything
 pytestmark = pytest.mark.long
 
 NAMES = ["sac", "sac_lagrangian", "td3", "td3_lagrangian", "wcsac", "cal"]
-
-
-def off_policy_config(*overrides):
-    """8 epochs of 4 x 40 steps, 8 gradient steps each after a random one."""
-    return compose_config(
-        *("env=PointMass", "frames=1280", "num_envs=4", "frames_per_batch=160", "logger=none"),
-        *("model.hidden_sizes=[16]", "memory.batch_size=32", "exploration.random_steps=160"),
-        *("policy_update.updates_per_step=0.05", "memory.keep=true", "memory.n_steps=1"),
-        *overrides,
-    )
 
 
 @pytest.fixture

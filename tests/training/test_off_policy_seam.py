@@ -8,7 +8,7 @@ import pytest
 import torch
 from point_mass import PointMass
 from run_configs import assert_resumes_exactly, point_mass_config
-from tensordict.nn import TensorDictModule, TensorDictModuleBase
+from tensordict.nn import TensorDictModuleBase
 from torch import nn
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 from torchrl.modules import RandomPolicy
@@ -21,15 +21,6 @@ from safe_rl.targets import allow
 from safe_rl.training.building import build_trainer, initialise_networks, seed_everything
 
 pytestmark = pytest.mark.long
-
-
-class QNetwork(nn.Module):
-    def __init__(self, num_obs, num_actions):
-        super().__init__()
-        self.layers = nn.Sequential(nn.Linear(num_obs + num_actions, 8), nn.Tanh(), nn.Linear(8, 1))
-
-    def forward(self, observation, action):
-        return self.layers(torch.cat([observation, action], -1))
 
 
 class RandomExploration(TensorDictModuleBase):
@@ -54,10 +45,8 @@ class OneStepQ(Algorithm, Recipe):
 
     def __init__(self, env):
         self.policy = RandomExploration(env)
-        self._q = QNetwork(env.observation_spec["observation"].shape[-1], 2)
+        self._q = nn.Linear(env.observation_spec["observation"].shape[-1] + 2, 1)
         self.networks = {"explorer": self.policy, "q": self._q}
-        module = TensorDictModule(self._q, in_keys=["observation", "action"], out_keys=["q"])
-        self._predict = module
         self._optimizer = torch.optim.Adam(self._q.parameters(), lr=1e-2)
         self._buffer = TensorDictReplayBuffer(storage=LazyTensorStorage(2000), batch_size=64)
 
@@ -73,8 +62,8 @@ class OneStepQ(Algorithm, Recipe):
     def learn(self, batch, episodes):
         self._buffer.extend(batch.reshape(-1))
         sample = self._buffer.sample()
-        error = self._predict(sample)["q"] - sample["next", "reward"]
-        loss = error.square().mean()
+        q = self._q(torch.cat([sample["observation"], sample["action"]], -1))
+        loss = (q - sample["next", "reward"]).square().mean()
         self._optimizer.zero_grad()
         loss.backward()
         self._optimizer.step()

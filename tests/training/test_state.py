@@ -79,13 +79,3 @@ def test_signals_are_left_alone_outside_the_main_thread():
     thread.start()
     thread.join()
     assert received == [None]
-
-
-def test_a_run_that_a_terminal_must_not_end_continues():
-    before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
-    try:
-        with StopRequest() as stop:
-            signal.raise_signal(signal.SIGHUP)
-        assert not stop.received
-    finally:
-        signal.signal(signal.SIGHUP, before)

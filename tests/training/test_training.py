@@ -6,9 +6,8 @@ from statistics import fmean
 
 import pytest
 import torch
-from point_mass import PointMass
 from point_mass_runs import point_mass_trainer
-from run_configs import assert_resumes_exactly, point_mass_config, without_times
+from run_configs import assert_resumes_exactly, without_times
 
 from safe_rl.algorithms import PolicyUpdate
 from safe_rl.objectives import PPOLagrangianLoss
@@ -16,7 +15,6 @@ from safe_rl.runs.checkpoints import CheckpointStore, read_facts, read_states
 from safe_rl.runs.folder import checkpoints_in
 from safe_rl.runs.table import read_table
 from safe_rl.targets import allow
-from safe_rl.training.building import build_trainer
 from safe_rl.training.trainer import Trainer
 
 allow("test_training")
@@ -239,6 +237,12 @@ def own_algorithm(folder, text):
     return [f"hydra.searchpath=[file://{folder}]", "algo=mine"]
 
 
+def train_own_update(folder, limits, num_steps):
+    """The table of a run whose update reports what it is given."""
+    words = (*own_algorithm(folder, OWN_UPDATE), limits, "staggered_starts=null")
+    return train(folder / "run", *words, num_steps=num_steps, minibatch_size=None)[1]
+
+
 def test_a_loss_from_outside_the_package(tmp_path):
     own = own_algorithm(tmp_path, OWN_ALGORITHM)
     trainer, table = train(tmp_path / "run", *own, "cost_limits={cost: 1}")
@@ -250,11 +254,7 @@ def test_a_loss_from_outside_the_package(tmp_path):
 
 def test_a_policy_update_from_outside_the_package(tmp_path):
     limits = "cost_limits={cost: 25, cost_north: 5}"
-    directory, own = tmp_path / "run", own_algorithm(tmp_path, OWN_UPDATE)
-    config = point_mass_config(*own, limits, "staggered_starts=null", minibatch_size=None)
-    trainer = build_trainer(config, PointMass(config.num_envs, 100), directory)
-    trainer.run()
-    table = read_table(directory / "progress.csv")
+    table = train_own_update(tmp_path, limits, num_steps=100)
     assert table["policy_length"] == [100] * 8
     for key, limit in (("cost", 25), ("cost_north", 5)):
         # what an episode of 100 steps costs at the rate of the 160 steps of each batch
@@ -267,19 +267,13 @@ def test_a_policy_update_from_outside_the_package(tmp_path):
 
 def test_an_update_of_another_kind_is_refused_when_it_is_built(tmp_path):
     own = own_algorithm(tmp_path, OWN_UPDATE.replace("Reporting", "Foreign"))
-    config = point_mass_config(*own, minibatch_size=None)
     said = r"ForeignUpdate is no update: derive it from safe_rl\.algorithms\.PolicyUpdate"
     with pytest.raises(ValueError, match=said):
-        build_trainer(config, PointMass(config.num_envs, 40), tmp_path / "run")
+        point_mass_trainer(tmp_path / "run", *own, minibatch_size=None)
 
 
 def test_batches_of_whole_episodes_are_judged_by_those(tmp_path):
-    limits = "cost_limits={cost: 5}"
-    own = own_algorithm(tmp_path, OWN_UPDATE)
-    config = point_mass_config(*own, limits, "staggered_starts=null", minibatch_size=None)
-    trainer = build_trainer(config, PointMass(config.num_envs, 40), tmp_path / "run")
-    trainer.run()
-    table = read_table(tmp_path / "run" / "progress.csv")
+    table = train_own_update(tmp_path, "cost_limits={cost: 5}", num_steps=40)
     expected = [cost - 5 for cost in table["episode_cost"]]
     assert table["policy_violation_cost"] == pytest.approx(expected, rel=1e-6)
 

@@ -1,11 +1,9 @@
 """Starting from trained networks: what is taken over, and what does not fit."""
 
 import copy
-from pathlib import Path
 
 import pytest
 import torch
-from omegaconf import OmegaConf
 from point_mass_runs import point_mass_trainer
 from torchrl.checkpoint import CheckpointError
 
@@ -33,11 +31,11 @@ def make_fresh(trained, *overrides):
     return point_mass_trainer(trained.record.directory.parent / "second", "seed=1", *overrides)
 
 
-def take_over(trained, *overrides, source=None):
+def take_over(trained, *overrides):
     fresh = make_fresh(trained, *overrides)
     networks, algorithm = fresh.algorithm.networks, fresh.algorithm
     assert not same(networks["actor"], trained.algorithm.actor)
-    source = source or trained.record.directory
+    source = trained.record.directory
     return fresh, initialise_networks(networks, source, list(algorithm.cost_keys))
 
 
@@ -76,11 +74,6 @@ def test_the_cost_critic_stays_new_where_the_costs_are_others(trained, overrides
     assert take_over(trained, *overrides)[1] == ["actor", "critic"]
 
 
-def test_a_checkpoint_can_be_named(trained):
-    fresh, _ = take_over(trained, source=trained.record.folder.newest_checkpoint())
-    assert same(fresh.algorithm.networks["actor"], trained.algorithm.actor)
-
-
 @pytest.mark.parametrize(
     ("override", "message"),
     [
@@ -105,14 +98,3 @@ def test_what_a_run_has_not_learned_is_named(tmp_path):
 def test_a_folder_without_a_checkpoint(trained, tmp_path):
     with pytest.raises(CheckpointError, match=r"init_from=.*no checkpoint"):
         initialise_networks(trained.algorithm.networks, tmp_path, ["cost"])
-
-
-@pytest.mark.parametrize("path", ["nowhere", "some/where/else/nowhere.torchrl"])
-def test_a_source_that_does_not_exist_is_named(trained, path):
-    with pytest.raises(CheckpointError, match=f"init_from={path}: there is no such folder"):
-        initialise_networks(trained.algorithm.networks, Path(path), ["cost"])
-
-
-def test_the_configuration_records_where_a_run_came_from(tmp_path):
-    point_mass_trainer(tmp_path, "init_from=runs/first", "frames=160").run()
-    assert OmegaConf.load(tmp_path / "config.yaml").init_from == "runs/first"

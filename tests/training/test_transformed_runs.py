@@ -16,7 +16,6 @@ from safe_rl.cli.evaluating import evaluate_run
 from safe_rl.envs.transforms import transform_env
 from safe_rl.evaluation import EvaluationOptions
 from safe_rl.evaluation.loading import transforms_of
-from safe_rl.runs.identity import experiment_of
 from safe_rl.runs.table import read_table
 from safe_rl.training.building import build_trainer, seed_everything
 
@@ -125,12 +124,6 @@ def test_returns_are_those_of_the_own_reward(tmp_path, monkeypatch):
     ]
     assert len(expected) >= 4
     torch.testing.assert_close(episodes.returns, torch.stack(expected))
-
-
-def test_transforms_name_the_experiment():
-    plain, changed = ({"transforms": node} for node in ({}, {"saute": {"discount": 0.999}}))
-    assert experiment_of(plain) == experiment_of({})
-    assert experiment_of(changed) != experiment_of(plain)
 
 
 RUN = [
