@@ -60,7 +60,7 @@ def _geometry_by_differentiation(
     """
     sampler = sampler_of(actor)
     parameters = actor.get_dist_params(batch.select(*actor.in_keys)).select(*sampler.in_keys)
-    keys = [key for key in sampler.in_keys if parameters.get(key).requires_grad]
+    keys = [key for key, output in parameters.items(True, True) if output.requires_grad]
     outputs = [parameters.get(key) for key in keys]
     moved = parameters.detach()
     leaves = [output.detach().requires_grad_() for output in outputs]

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 
 import torch
-from tensordict import NestedKey, TensorDictBase
+from tensordict import NestedKey, TensorDictBase, is_tensor_collection
 from tensordict.utils import unravel_key
 from torch import Tensor
 from torchrl.objectives.common import AUTO_LOSS_MASK_KEYS
@@ -84,9 +84,8 @@ def require_finite(tensordict: TensorDictBase, keys: Iterable[NestedKey]) -> Non
         FloatingPointError: Naming the entry and how many samples are concerned.
     """
     mask = sample_mask(tensordict)
-    for key in keys:
-        entry = tensordict.get(key, None)
-        if entry is None or not entry.is_floating_point() or entry.is_meta:
+    for key, entry in _tensors(tensordict, keys):
+        if not entry.is_floating_point() or entry.is_meta:
             continue
         # A sum is finite only if all its terms are, and much cheaper than looking at each.
         if mask is None and entry.sum().isfinite():
@@ -99,3 +98,15 @@ def require_finite(tensordict: TensorDictBase, keys: Iterable[NestedKey]) -> Non
                 "has been learned from this batch: look for the environment's first NaN or "
                 "infinity, or lower the learning rate or the target KL if training has diverged."
             )
+
+
+def _tensors(
+    tensordict: TensorDictBase, keys: Iterable[NestedKey]
+) -> Iterator[tuple[NestedKey, Tensor]]:
+    """The entries at keys with their keys; of a nested TensorDict all entries."""
+    for key in keys:
+        entry = tensordict.get(key, None)
+        if is_tensor_collection(entry):
+            yield from ((unravel_key((key, name)), x) for name, x in entry.items(True, True))
+        elif entry is not None:
+            yield key, entry

@@ -12,7 +12,13 @@ from torch import Tensor
 from torch.distributions import Distribution
 from torchrl.objectives import LossModule
 
-from safe_rl.objectives.distributions import entropy, kl, sampler_of
+from safe_rl.objectives.distributions import (
+    composite_keys,
+    composite_log_probs,
+    entropy,
+    kl,
+    sampler_of,
+)
 from safe_rl.objectives.multipliers import Multiplier
 from safe_rl.objectives.samples import require, sample_mask
 from safe_rl.ranges import Checked, NotNegative
@@ -66,7 +72,8 @@ class SurrogateLoss(Checked, LossModule):
     class _AcceptedKeys:
         """Keys that `set_keys` accepts.
 
-        Other parameters of the behaviour policy are read where the actor writes them.
+        Other parameters of the behaviour policy, and actions and log-probabilities of a composite
+        distribution, are read where the actor writes them.
         """
 
         advantage: NestedKey = "advantage"  # of the reward, [..., 1]
@@ -102,6 +109,7 @@ class SurrogateLoss(Checked, LossModule):
         sampler = sampler_of(actor_network)
         names = [name if isinstance(name, str) else name[-1] for name in sampler.dist_keys]
         self._parameter_keys = dict(zip(names, sampler.in_keys, strict=True))
+        self._composite_keys = composite_keys(sampler)
         self.set_keys(**{k: v for k, v in self._parameter_keys.items() if k in ("loc", "scale")})
         self.out_keys = [
             "loss_objective", "loss_entropy", *self.extra_out_keys, "kl", "entropy", "ESS",
@@ -133,7 +141,8 @@ class SurrogateLoss(Checked, LossModule):
         """Entries of the batch that are read."""
         keys = self.tensor_keys
         costs = [keys.cost_advantage] if self.has_costs else []
-        behaviour = [keys.action, keys.sample_log_prob, *self.behaviour_keys.values()]
+        actions, log_probs = self._composite_keys or ([keys.action], [keys.sample_log_prob])
+        behaviour = [*actions, *log_probs, *self.behaviour_keys.values()]
         return [*self.actor_network.in_keys, *behaviour, keys.advantage, *costs]
 
     @dispatch
@@ -184,6 +193,10 @@ class SurrogateLoss(Checked, LossModule):
     def _log_weight(self, tensordict: TensorDictBase, distribution: Distribution) -> Tensor:
         """log(π_θ(a|s) / π_k(a|s)), [..., 1]."""
         keys = self.tensor_keys
+        if self._composite_keys is not None:
+            stored = self._composite_keys[1]
+            now, behaviour = composite_log_probs(distribution, tensordict, stored)
+            return (now - behaviour).unsqueeze(-1)
         log_prob = distribution.log_prob(require(tensordict, keys.action))
         behaviour = require(tensordict, keys.sample_log_prob, "The collector writes it.")
         if behaviour.shape != log_prob.shape:
@@ -201,7 +214,7 @@ class SurrogateLoss(Checked, LossModule):
         keys = self.behaviour_keys.items()
         stored = TensorDict({key: require(tensordict, found, hint) for key, found in keys})
         behaviour = self.actor_network.build_dist_from_params(stored)
-        return kl(distribution, behaviour, log_weight.squeeze(-1))
+        return kl(distribution, behaviour, log_weight.squeeze(-1), tensordict)
 
     def _advantage(self, tensordict: TensorDictBase, log_weight: Tensor) -> Tensor:
         """Reward advantage, [..., 1]."""
@@ -219,7 +232,8 @@ class SurrogateLoss(Checked, LossModule):
         advantage = require(tensordict, key, "CostGAE writes it.")
         num_costs = advantage.shape[-1] if self.multiplier is None else self.multiplier.num_costs
         # of several agents in a state each has its own, as it has its own log-probability
-        samples = tensordict[self.tensor_keys.sample_log_prob]
+        is_composite = self._composite_keys is not None
+        samples = tensordict if is_composite else tensordict[self.tensor_keys.sample_log_prob]
         if advantage.shape != (*samples.shape, num_costs):
             raise ValueError(
                 f"{key!r} has shape {tuple(advantage.shape)}, expected "
