@@ -8,11 +8,7 @@ import pytest
 
 from safe_rl.envs.errors import ConfigError
 from safe_rl.envs.physics.dynamics import SCALES
-from safe_rl.envs.velocity import (
-    VELOCITY_SUITE,
-    VelocityConfig,
-    resolve_velocity,
-)
+from safe_rl.envs.velocity import VELOCITY_SUITE, VelocityConfig, resolve_velocity
 from safe_rl.envs.velocity.runners import RUNNERS
 
 OURS = {"robot", "velocity_threshold", "num_steps", *SCALES}
