@@ -179,10 +179,12 @@ class WorkerCollector:
         if not (died := codes - {None, 0, 128 + signal.SIGTERM}):
             return
         self.kill()
+        reason = "what it printed is above"
+        if -signal.SIGKILL in died:
+            reason = "mostly for lack of memory: use fewer environments"
         raise WorkerError(
-            f"A worker of the collector has died (exit code {', '.join(map(str, died))}; -9 is "
-            "mostly a lack of memory: use fewer environments). The last checkpoint is whole: "
-            "continue with resume=."
+            f"A worker of the collector has died (exit code {', '.join(map(str, died))}, {reason})."
+            " The last checkpoint is whole: continue with resume=."
         )
 
     def kill(self) -> None:

@@ -102,6 +102,8 @@ class ConstrainedEnv(EnvBase):
         except (AttributeError, RuntimeError) as error:
             written = {key: next_tensordict_out.get(key, None) for key in self.reward_keys}
             shapes = {key: None if v is None else list(v.shape) for key, v in written.items()}
+            if all(shape == [*self.batch_size, 1] for shape in shapes.values()):
+                raise  # for another reason
             raise ContractError(
                 f"{type(self).__name__}._step must write {[*self.batch_size, 1]} numbers for each "
                 f"of {', '.join(map(key_name, shapes))}. It wrote the shapes {shapes}."
