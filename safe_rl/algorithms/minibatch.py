@@ -84,8 +84,9 @@ class MinibatchUpdate(PolicyUpdate):
 
     ``max_kl`` is for early stopping: if the ``kl`` that the loss reports exceeds it, the update
     ends. The KL is computed on the current minibatch before its step, and this step is then not
-    taken. So the check costs no extra time. With the full batch as minibatch this is the rule of
-    Ray, Achiam, Amodei (2019). With minibatches of thousands of states its error is a few percent.
+    taken. So the check costs no extra time. With minibatches of thousands of states its error is a
+    few percent. The code of Ray, Achiam, Amodei (2019) measures on the full batch, and still takes
+    this step: ``step_beyond_kl``.
     The method ``anchor`` of a `SurrogateLoss` is called with the batch before the first step.
 
     If the KL exceeds ``max_kl`` before the first step, because a very different policy collected
@@ -99,6 +100,8 @@ class MinibatchUpdate(PolicyUpdate):
         num_passes: Passes over the batch.
         minibatch_size: Samples per gradient step; None takes the whole batch.
         max_kl: Mean KL divergence that ends the update, or None.
+        step_beyond_kl: Whether to take the step before which the KL is found to exceed ``max_kl``.
+            Then every update takes at least two steps, unless fewer are planned.
         max_grad_norm: Norm to which the gradient is clipped, or None.
         adapt_rate: Computes the learning rate of the next call from the number of steps and the KL
             of this one; None for a constant rate. It needs ``max_kl``.
@@ -132,6 +135,7 @@ class MinibatchUpdate(PolicyUpdate):
         num_passes: Annotated[int, Range(1, 10**9)],
         minibatch_size: Count | None,
         max_kl: Positive | None = None,
+        step_beyond_kl: bool = False,
         max_grad_norm: Positive | None = None,
         adapt_rate: Annotated[KLAdaptiveRate, PART] | None = None,
         compile: bool = False,
@@ -142,6 +146,7 @@ class MinibatchUpdate(PolicyUpdate):
         self.num_passes = num_passes
         self.minibatch_size = minibatch_size
         self.max_kl = max_kl
+        self.step_beyond_kl = step_beyond_kl
         self.max_grad_norm = max_grad_norm
         self.adapt_rate = adapt_rate
         self._parameters = [parameter for parameter in loss.parameters() if parameter.requires_grad]
@@ -160,9 +165,9 @@ class MinibatchUpdate(PolicyUpdate):
 
         Returns:
             Means over the steps of all that the loss reports, except for ``kl``: this is the last
-            value measured, from after the last step if ``max_kl`` ended the update, else from
-            before the last step. Also ``num_steps``, the gradient steps taken, and ``lr``, the next
-            learning rate, if it is adapted.
+            value measured, from after the last step if ``max_kl`` ended the update without
+            ``step_beyond_kl``, else from before the last step. Also ``num_steps``, the gradient
+            steps taken, and ``lr``, the next learning rate, if it is adapted.
         """
         del cost_violation, episode_length
         history: list[TensorDictBase] = []
@@ -173,12 +178,15 @@ class MinibatchUpdate(PolicyUpdate):
         for minibatch in self._minibatches(samples):
             total, losses = self._evaluate(minibatch)
             history.append(losses.detach())
-            if self.max_kl is not None and reported_kl(losses) > self.max_kl:
+            ends = self.max_kl is not None and bool(reported_kl(losses) > self.max_kl)
+            if ends and not self.step_beyond_kl:
                 break
             if not total.isfinite():
                 raise divergence(losses)
             self._step(total)
             num_steps += 1
+            if ends:
+                break
         diagnostics = self._diagnostics(history, num_steps)
         if not num_steps:
             warnings.warn(

@@ -62,13 +62,17 @@ def test_the_whole_batch_as_minibatch_is_plain_gradient_descent():
     assert torch.equal(loss.w, reference.w)
 
 
-def test_the_update_stops_before_the_first_step_beyond_the_kl_limit():
+@pytest.mark.parametrize("beyond", [False, True])
+def test_the_update_stops_before_or_after_the_first_step_beyond_the_kl_limit(beyond):
     loss, reference = RecordingLoss(), RecordingLoss()
-    update = MinibatchUpdate(loss, optimizer=adam, num_passes=80, minibatch_size=None, max_kl=0.012)
+    all_samples = {"optimizer": adam, "minibatch_size": None}
+    update = MinibatchUpdate(
+        loss, num_passes=80, max_kl=0.012, step_beyond_kl=beyond, **all_samples
+    )
     diagnostics = update(samples(20))
     # the KLs are 0, .004, .008, .012, .016: the fifth exceeds the limit, after four steps
-    MinibatchUpdate(reference, optimizer=adam, num_passes=4, minibatch_size=None)(samples(20))
-    assert diagnostics["num_steps"] == 4
+    MinibatchUpdate(reference, num_passes=4 + beyond, **all_samples)(samples(20))
+    assert diagnostics["num_steps"] == 4 + beyond
     assert diagnostics["kl"].item() == pytest.approx(0.016)
     assert torch.equal(loss.w, reference.w)
 

@@ -145,7 +145,8 @@ COSTS = {
 MULTIPLIER = {
     "lagrangian": {"_target_": "safe_rl.objectives.LagrangeMultiplier", "init": 1.0, "lr": 0.05}
 }
-PPO = {"policy_update": {**FULL_BATCH, "optimizer": {**ADAM, "lr": 3e-4}, "max_kl": 1.2 * 0.01}}
+STOP = {"max_kl": 1.2 * 0.01, "step_beyond_kl": True}
+PPO = {"policy_update": {**FULL_BATCH, "optimizer": {**ADAM, "lr": 3e-4}, **STOP}}
 TRUST_REGION = {
     "target_kl": 0.01, "damping": 0.1, "cg_iterations": 10, "backtrack_coeff": 0.8,
     "max_backtracks": 10, "fisher_subsample": 1.0,
