@@ -41,7 +41,7 @@ def states_of(parts: Mapping[str, Stateful]) -> dict[str, Any]:
 
 
 class Algorithm(ABC):
-    """An algorithm, as the training loop, checkpoints, transfer and evaluation use it.
+    """Interface of algorithms for the training loop, checkpoints, transfer and evaluation.
 
     Attributes:
         cost_keys: Keys of the constrained costs; empty for an unconstrained algorithm.
@@ -58,7 +58,7 @@ class Algorithm(ABC):
 
     @property
     def learns_from(self) -> str:
-        """A sentence on what it learns from besides the run's own steps; empty if nothing."""
+        """A sentence on the data besides the run's own steps that it learns from; or empty."""
         return ""
 
     @property
@@ -80,8 +80,8 @@ class Algorithm(ABC):
             episodes: Statistics of the episodes in the batch.
 
         Returns:
-            Values for columns of the table, by name: The same names at every call, NaN where there
-            is no value.
+            Values for columns of the run's table, by name: the same names at every call, with NaN
+            where there is no value.
         """
 
     @abstractmethod
@@ -92,14 +92,14 @@ class Algorithm(ABC):
         """Copy the networks, which got another run's weights, into the target networks."""
 
     def forget_open_episodes(self) -> None:
-        """End n-step sums and the like, because new episodes begin."""
+        """End the n-step sums of unfinished episodes, because new episodes begin."""
 
 
 class Recipe(ABC):
     """Builds an algorithm from a configuration, which names the recipe as ``algo._target_``.
 
     Attributes:
-        off_policy: Whether it learns from a replay buffer, with Q functions for critics.
+        off_policy: Whether it learns from a replay buffer, with Q functions as critics.
         unused_keys: Keys of presets that the recipe does not use, and choices that do not suit it
             (``preset=paper``), each with the reason. A command with one of them is refused.
     """
@@ -205,7 +205,7 @@ class SequentialUpdates(PolicyUpdate):
         return metrics
 
     def loss_modules(self) -> dict[str, nn.Module]:
-        """Losses of all; those of the others are called ``loss.<name>``."""
+        """Losses of all updates; those after the first are called ``loss.<name>``."""
         found = dict(self.first.loss_modules())
         for name, update in self.then.items():
             for place, loss in update.loss_modules().items():

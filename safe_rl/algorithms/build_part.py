@@ -1,7 +1,7 @@
 """Build the parts of an algorithm, and its constraints, from nodes of a configuration.
 
 Parts with a ``_target_`` (losses, multipliers, updates, advantage estimators) may be classes of
-your own. A constructor gets those objects of the run that its arguments name.
+your own. A constructor gets the objects of the run, such as ``actor_network``, by their names.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ _DEFAULT_RECIPE = "safe_rl.algorithms.OnPolicy"
 
 
 def find_recipe(config: DictConfig) -> type[Recipe]:
-    """The recipe that a configuration names as ``algo._target_``; on-policy unless it says so.
+    """The recipe that a configuration names as ``algo._target_``; by default `OnPolicy`.
 
     Raises:
         TargetError: If there is no such class, or it is no recipe.
@@ -42,10 +42,10 @@ def find_recipe(config: DictConfig) -> type[Recipe]:
 
 
 def build_part(node: DictConfig, **objects: Any) -> Any:
-    """Build a node with the objects of the run that its constructor names; None is not passed.
+    """Build what a node names; its constructor gets the `objects` that it names, but no None.
 
     Raises:
-        TargetError: If its target may not be built, or refuses; the message names the node.
+        TargetError: If the target may not be built, or if building it fails.
     """
     names = accepted_names(locate(node.get("_target_"), f"{node._get_full_key(None)}._target_"))
     return build(node, **{k: v for k, v in objects.items() if v is not None and k in names})
@@ -55,7 +55,7 @@ def build_update(node: DictConfig, kind: type[Update], **objects: Any) -> Update
     """Build an update of networks, as `build_part` does.
 
     Raises:
-        TargetError: As by `build_part`, or if it is no update of this kind.
+        TargetError: As in `build_part`, or if the result is no update of this kind.
     """
     update = build_part(node, **objects)
     if not isinstance(update, kind):
@@ -67,12 +67,12 @@ def build_update(node: DictConfig, kind: type[Update], **objects: Any) -> Update
 
 
 def constrained_limits(config: DictConfig, env: EnvBase, *, otherwise: str) -> dict[str, float]:
-    """Limits of a constrained algorithm; one without constraints has none.
+    """Cost limits of the configuration's algorithm; empty if it is unconstrained.
 
     Args:
         config: Configuration as composed from ``conf/``.
         env: Environment that has the costs.
-        otherwise: A similar algorithm without constraints, for the message.
+        otherwise: Name of a similar algorithm without constraints, for the error message.
 
     Raises:
         ValueError: If a limit names no cost of the environment, a constrained algorithm has no
@@ -97,9 +97,9 @@ def constrained_limits(config: DictConfig, env: EnvBase, *, otherwise: str) -> d
 def build_constraints(
     config: DictConfig, limits: dict[str, float], env: EnvBase, device: torch.device
 ) -> Constraints:
-    """Constraints with multiplier, tracker and risk measure as a configuration names them.
+    """Constraints with the multiplier, tracker and risk measure that a configuration names.
 
-    Lengths of episodes are in decisions, as batches are; schedules in steps of the environment.
+    Lengths of episodes are in decisions (time steps of a batch), schedules in environment steps.
 
     Raises:
         ValueError: If a risk measure is named without a tracker.

@@ -20,26 +20,26 @@ __all__ = ["CHARGES", "Constraints", "TrackedConstraints", "check_cost_limits"]
 
 
 class Constraints(Resumable):
-    """Keys, limits, the violations J_c − d, and the multiplier that weighs the costs.
+    """Constraints of an algorithm: cost keys, limits d, violations J_c − d, and the multiplier.
 
-    Every algorithm has one, and updates it with every batch. Losses and updates that need the
-    violation get this object, and read ``violation`` and ``episode_length`` at every call.
+    Every algorithm has one such object, and updates it with every batch. Losses and updates that
+    need violations get this object, and read ``violation`` and ``episode_length`` at every call.
 
     Args:
         limits: Cost key -> d, undiscounted cost allowed per episode; empty without constraints.
         max_length: Largest length of an episode in steps. It is the mean length until an episode
             has finished. None takes the length of the batch.
-        multiplier: Weighs the costs against the return, or None.
-        device: Of all tensors.
+        multiplier: Multiplier that weighs the costs against the return, or None.
+        device: Device of all tensors.
 
     Attributes:
         keys: Keys of the k costs.
-        limits: d, [k].
+        limits: Limits d, [k].
         costs: J_c, undiscounted cost per episode, [k], as of the last batch.
         violation: J_c − d, [k], as of the last batch.
-        episode_length: T̄, mean number of decisions of an episode, as in batches, scalar.
-        unit: Size of one cost; losses divide weighed costs by it, [k].
-        risk: What is limited instead of the mean cost of an episode, or None.
+        episode_length: T̄, mean number of decisions (time steps of a batch) per episode, scalar.
+        unit: Typical size of one cost, by which losses divide λ, [k]; see `EpisodeCosts.unit`.
+        risk: Risk measure that is limited instead of the mean cost of an episode, or None.
         cost_advantage: Key of the cost advantages that the multiplier weighs.
 
     Examples:
@@ -56,7 +56,7 @@ class Constraints(Resumable):
         (tensor([5.]), tensor(1000.))
     """
 
-    # those of the last batch in which an episode finished
+    # mean costs and length of episodes in the last batch in which an episode finished
     state_names = ("_finished", "_mean_length")
 
     def __init__(
@@ -127,16 +127,16 @@ class Constraints(Resumable):
         """Store the change of J_c that an update predicts."""
 
     def columns(self) -> dict[str, float]:
-        """Violations and multipliers, by column of the table."""
+        """Violations and multipliers, by name of their column in the run's table."""
         row = self.column("violation", self.violation)
         if self.multiplier is not None:
             row |= self.column("multiplier", self.multiplier.value)
         return row
 
     def column(self, name: str, value: Tensor) -> dict[str, float]:
-        """One column for a scalar, one per constraint for a vector [k].
+        """Columns of the run's table: one for a scalar, one per constraint for a vector [k].
 
-        A single number is a scalar unless there is one constraint and the value is a vector.
+        A vector [1] counts as a scalar, unless there is exactly one constraint.
 
         Raises:
             ValueError: For any other shape.
@@ -183,23 +183,23 @@ def check_cost_limits(
 
 
 CHARGES = "charged_costs"
-"""Key below ``"next"``, [N, T, k]: what a risk measure charges instead of the costs."""
+"""Key below ``"next"``, [N, T, k], of the charges that a risk measure puts in place of costs."""
 
 
 class TrackedConstraints(Constraints):
     """`Constraints` whose violations come from a `LimitTracker`.
 
-    ``violation`` is the decrease of J_c that a step's surrogate must predict: J_c minus its target,
-    divided by the share of predicted changes that is observed. Multipliers get J_c minus its
-    target.
+    ``violation`` is `LimitState.demand`, the decrease of J_c that a step's surrogate must predict:
+    J_c minus its target, plus an integral of earlier violations, divided by the share of predicted
+    changes that is observed. Multipliers get J_c minus its target.
 
     Args:
         limits: Cost key -> d, undiscounted cost allowed per episode.
-        tracker: Estimates J_c and computes its current target.
-        multiplier: Weighs the costs against the return, or None.
-        risk: What is limited instead of the mean cost of an episode, or None.
+        tracker: Tracker that estimates J_c and computes its current target.
+        multiplier: Multiplier that weighs the costs against the return, or None.
+        risk: Risk measure that is limited instead of the mean cost of an episode, or None.
         cost_advantage: Key of the cost advantages that the multiplier weighs.
-        device: Of all tensors.
+        device: Device of all tensors.
     """
 
     state_names = ("tracker", "risk")
@@ -242,8 +242,7 @@ class TrackedConstraints(Constraints):
     def update(self, episodes: EpisodeStatistics, batch: TensorDictBase) -> None:
         """Update the tracker and the multiplier from a batch [N, T].
 
-        Cost advantages in the batch are divided by the size of one cost if there is a
-        multiplier.
+        With a multiplier, cost advantages in the batch are divided by the typical size of one cost.
         """
         state = self.tracker.update(self._costs_of(batch), episodes.decisions, self._charges)
         state = state.to(self.limits.device)
@@ -272,7 +271,7 @@ class TrackedConstraints(Constraints):
             self.tracker.predictions.record_prediction(change)
 
     def columns(self) -> dict[str, float]:
-        """Estimates, targets, and multipliers or the share of predictions realised, by column."""
+        """Estimates and targets of J_c, and multipliers or else trust, by name of their column."""
         row = dict(self._row)
         if self.multiplier is not None:
             row |= self.column("multiplier", self.multiplier.value)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any, Literal
 
-import scipy  # which loads its parts when they are asked for: half a second
+import scipy  # its parts are loaded on first use, which takes half a second
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
@@ -38,12 +38,12 @@ class CPOStep(TRPOStep):
             ``loss_…`` and the differentiable ``cost_surrogate``, [k].
         rescale_violation: Whether to divide the violations by the episode length; see
             `constraint_value`.
-        largest_demand: Bound of every c, as a share of √(2δ bᵀH⁻¹b), which is the largest decrease
-            of the surrogate within the trust region; None: no bound. Without a bound, a policy far
-            above its limit takes recovery steps (case 0), which ignore the reward, until the limit
-            is reached: a return learned in 20 updates is forgotten in as many. With 0.8, one
-            constraint leaves √(1 − 0.8²) = 0.6 of the step to the reward.
-        settings: Those of every step, see `TRPOStep`.
+        largest_demand: Upper bound of every c, as a share of √(2δ bᵀH⁻¹b), which is the largest
+            decrease of the surrogate within the trust region; None: no bound. Without a bound, a
+            policy far above its limit takes recovery steps (case 0), which ignore the reward, until
+            the limit is reached: a return learned in 20 updates is forgotten in as many. With 0.8
+            and one constraint, √(1 − 0.8²) = 0.6 of the step are left for the reward.
+        settings: Settings of every trust-region step, see `TRPOStep`.
 
     Examples:
         >>> from tensordict import TensorDict
@@ -73,7 +73,7 @@ class CPOStep(TRPOStep):
 
     def _propose(self, problem: StepProblem) -> Proposal:
         g, b, c = self._linearised(problem)
-        # Left out by a zero gradient: the dual takes such constraints for case 4.
+        # With its gradient set to 0, the dual leaves out a satisfied constraint (case 4).
         b = b * ~((b.square().sum(-1, keepdim=True) <= _NO_GRADIENT) & (c[:, None] < 0))
         v, w = self._solve_all(problem.fisher, g, b)
         q, r, s = g @ v, w @ g, b @ w.T
@@ -84,7 +84,7 @@ class CPOStep(TRPOStep):
         return Proposal(step, accepts, self._diagnostics(q, r, s.diagonal(), c, dual))
 
     def _bounded(self, c: Tensor, s: Tensor) -> Tensor:
-        """c, at most `largest_demand` of what a step can lower the surrogates by, [k]."""
+        """c, bounded by the share `largest_demand` of the surrogates' largest decrease, [k]."""
         if self.largest_demand is None:
             return c
         within_reach = (2 * self.target_kl * s.clamp_min(0)).sqrt()
@@ -94,7 +94,7 @@ class CPOStep(TRPOStep):
     def _acceptance(
         losses: TensorDictBase, c: Tensor, may_be_worse: Tensor
     ) -> Callable[[TensorDictBase, Tensor], bool]:
-        """Lets costs grow by max(−c, 0), and the loss get no worse unless it may."""
+        """Criterion: costs rise by max(−c, 0) at most, and the loss only if `may_be_worse`."""
         before, cost_before = total_loss(losses).detach(), losses["cost_surrogate"].detach()
         allowance = (-c).clamp_min(0)
 
@@ -162,7 +162,7 @@ def nearest_feasible(excess: Tensor, gram: Tensor) -> Tensor:
 
 
 class PCPOStep(CPOStep):
-    """TRPO's step, then the nearest point that keeps the linearised constraints.
+    """TRPO's step, followed by a projection onto the linearised constraints.
 
     With x₀ = −√(2δ/gᵀH⁻¹g) H⁻¹g and e = b x₀ + c (Yang et al. 2020; for one constraint)
 
@@ -178,9 +178,9 @@ class PCPOStep(CPOStep):
     shortened.
 
     Args:
-        loss: As of a `CPOStep`.
-        projection: Distance that the projection keeps small.
-        settings: Those of a `CPOStep` and of every step, see `TRPOStep`.
+        loss: Loss with surrogates of the costs, as in `CPOStep`.
+        projection: Distance that the projection minimises: ``"kl"`` or ``"l2"``.
+        settings: Settings of a `CPOStep` and of every trust-region step, see `TRPOStep`.
 
     Examples:
         >>> from tensordict import TensorDict

@@ -22,11 +22,11 @@ def fill_replay_buffer(config: DictConfig, buffer: Memory, env: EnvBase) -> tupl
 
     The node ``dataset`` has a ``path``, of a recording's folder or of an HDF5 file, and says with
     ``safe_episodes`` whether only whole episodes within the limits are taken. Actions are clipped
-    to the bounds of the environment's.
+    to the environment's bounds.
 
     Returns:
         A sentence on the data that the run learns from, or a warning that it will learn nothing,
-        or an empty text; and whether collected transitions are added.
+        or an empty text; and whether transitions that the run collects are added to the buffer.
 
     Raises:
         ValueError: If ``dataset.alone`` is true without a path; if transitions do not fit the
@@ -100,7 +100,7 @@ def _check(
 
 
 def _check_finite(steps: TensorDictBase, node: DictConfig, keys: Sequence[NestedKey]) -> None:
-    """Refuse numbers that would look like diverged training, or like a cost of 0."""
+    """Refuse NaN and infinity, which would look like diverged training, or like a cost of 0."""
     for key in keys:
         if wrong := int((~steps[key].isfinite()).any(-1).sum()):
             raise ValueError(

@@ -48,7 +48,7 @@ def sum_of_losses(losses: TensorDictBase) -> Tensor:
 
 
 def divergence(losses: TensorDictBase) -> FloatingPointError:
-    """The error for losses whose sum is not finite: which of them are not, and what to do.
+    """Make the error for losses whose sum is not finite: it names them, and says what to do.
 
     Examples:
         >>> from tensordict import TensorDict
@@ -75,7 +75,7 @@ Without them the losses would estimate advantages themselves, from shuffled samp
 
 
 def estimates_read(loss: nn.Module) -> list[NestedKey]:
-    """Keys of the advantages and value targets, if the loss reads an advantage."""
+    """Keys of advantages, value targets and values that a loss reads; empty without advantages."""
     if not isinstance(loss, LossModule):
         return []
     keys = {key.name: getattr(loss.tensor_keys, key.name) for key in fields(loss.tensor_keys)}
@@ -105,8 +105,8 @@ class LossState:
     estimators are left out: they are settings, which a resumed run may change.
 
     Args:
-        losses: Losses by name: `PolicyUpdate.loss_modules`.
-        saved_elsewhere: Modules with a state of their own; losses share their tensors.
+        losses: Losses by name, see `PolicyUpdate.loss_modules`.
+        saved_elsewhere: Modules that checkpoints save themselves; losses share their tensors.
 
     Examples:
         >>> network, loss = torch.nn.Linear(2, 1), torch.nn.Module()
@@ -123,7 +123,7 @@ class LossState:
         self._saved_elsewhere = list(saved_elsewhere)
 
     def __bool__(self) -> bool:
-        """Whether there is anything to keep."""
+        """Whether there is any such tensor."""
         return bool(self._own())
 
     def state_dict(self) -> dict[str, Tensor]:
@@ -132,7 +132,7 @@ class LossState:
 
     @torch.no_grad()
     def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
-        """Continue from :meth:`state_dict`, in place, because an optimiser has the same tensors."""
+        """Load a :meth:`state_dict` in place, because an optimiser has the same tensors."""
         for name, tensor in self._own().items():
             tensor.copy_(state_dict[name])
 
@@ -153,6 +153,6 @@ def _tensors(module: nn.Module) -> Iterator[tuple[str, Tensor]]:
 
 
 def _is_setting(name: str, loss: nn.Module) -> bool:
-    """Whether TorchRL schedules it, by any class of the loss, or it is an estimator's."""
+    """Whether a tensor is a schedulable coefficient of the loss or belongs to a value estimator."""
     declared = (vars(kind).get("_schedulable_buffers", ()) for kind in type(loss).__mro__)
     return name.startswith(ESTIMATOR) or name in chain.from_iterable(declared)

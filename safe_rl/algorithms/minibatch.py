@@ -1,4 +1,4 @@
-"""Gradient updates: passes of minibatch steps over one batch, and their learning rate.
+"""Gradient updates: passes over one batch in minibatches, and their learning rate.
 
 The same class trains policies (PPO) and critics. Policy updates of another kind, such as
 trust-region steps, are also a :class:`~safe_rl.algorithms.algorithm_contract.PolicyUpdate`.
@@ -41,7 +41,7 @@ class KLAdaptiveRate:
         factor: Factor by which the rate is divided or multiplied.
         lowest: Lower bound of the rate.
         highest: Upper bound of the rate.
-        few_steps: Share of the planned steps; with fewer, an update has ended early.
+        few_steps: Share of the planned steps; after an update with fewer, the rate is lowered.
         low_kl: Share of the KL bound; if a whole update stays below, the rate is raised.
 
     Examples:
@@ -65,8 +65,8 @@ class KLAdaptiveRate:
 
         Args:
             rate: Rate of this update.
-            share_of_steps: Steps taken over steps planned.
-            share_of_kl: Last KL divergence over its limit.
+            share_of_steps: Gradient steps taken divided by gradient steps planned.
+            share_of_kl: Last measured KL divergence divided by its bound.
         """
         if share_of_steps < self.few_steps:
             rate = rate / self.factor
@@ -83,36 +83,36 @@ class MinibatchUpdate(PolicyUpdate):
     pass. For a recurrent policy, whole sequences are shuffled instead of samples.
 
     ``max_kl`` is for early stopping: if the ``kl`` that the loss reports exceeds it, the update
-    ends. The KL is computed on the current minibatch before its step, and this step is then not
-    taken. So the check costs no extra time. With minibatches of thousands of states its error is a
-    few percent. The code of Ray, Achiam, Amodei (2019) measures on the full batch, and still takes
-    this step: ``step_beyond_kl``.
-    The method ``anchor`` of a `SurrogateLoss` is called with the batch before the first step.
+    ends. The KL is computed on the current minibatch before its step, so the check takes no extra
+    time. With minibatches of thousands of states its error is a few percent. The step on this
+    minibatch is not taken, unless ``step_beyond_kl`` is set. The code of Ray, Achiam, Amodei (2019)
+    takes it, but measures the KL on the full batch.
 
     If the KL exceeds ``max_kl`` before the first step, because a very different policy collected
-    the batch, no step is taken and a warning says so.
+    the batch, no step is taken and a warning says so. Before the first step, the method ``anchor``
+    of a `SurrogateLoss` is called with the batch.
 
     Args:
-        loss: Loss module; its ``in_keys`` name the entries of the batch that it needs, with its own
-            keys for advantages, value targets and values.
+        loss: Loss module. It gets the entries of the batch that its ``in_keys`` name, and the
+            advantages, value targets and values that its other keys name.
         optimizer: Function of the parameters that builds the optimiser, for example
             ``functools.partial(torch.optim.Adam, lr=3e-4, fused=True)``.
-        num_passes: Passes over the batch.
+        num_passes: Number of passes over the batch.
         minibatch_size: Samples per gradient step; None takes the whole batch.
-        max_kl: Mean KL divergence that ends the update, or None.
-        step_beyond_kl: Whether to take the step before which the KL is found to exceed ``max_kl``.
-            Then every update takes at least two steps, unless fewer are planned.
+        max_kl: Mean KL divergence above which the update ends, or None.
+        step_beyond_kl: Whether to take one more step when the KL has been found to exceed
+            ``max_kl``. Then every update takes at least two steps, unless fewer are planned.
         max_grad_norm: Norm to which the gradient is clipped, or None.
         adapt_rate: Computes the learning rate of the next call from the number of steps and the KL
             of this one; None for a constant rate. It needs ``max_kl``.
         compile: Whether to compile the loss and its gradient with torch.compile.
 
     Raises:
-        ValueError: If an argument is outside its range, or ``adapt_rate`` comes
-            without ``max_kl``.
+        ValueError: If an argument is outside its range, or ``adapt_rate`` is set without
+            ``max_kl``.
         KeyError: By the call, if ``max_kl`` is set and the loss does not report ``kl``.
-        FloatingPointError: By the call, if an entry of the batch is not finite, before any step;
-            or if a loss is not, before the step that would follow it.
+        FloatingPointError: By the call, if an entry of the batch is not finite, before any step; or
+            if a loss is not finite, before the step on this loss.
 
     Examples:
         >>> from functools import partial
@@ -201,7 +201,7 @@ class MinibatchUpdate(PolicyUpdate):
         return diagnostics
 
     def _samples(self, batch: TensorDictBase) -> TensorDictBase:
-        """Entries of a batch that the loss reads, without padding; an error if not finite."""
+        """Entries of a batch that the loss reads, without padding; refuses non-finite entries."""
         require_finite(batch, self.loss.in_keys)
         mask_keys = [key for key in AUTO_LOSS_MASK_KEYS if batch.get(key, None) is not None]
         selected = batch.select(*self.loss.in_keys, *mask_keys)
@@ -209,7 +209,7 @@ class MinibatchUpdate(PolicyUpdate):
         return learning_samples(selected, self.loss.in_keys)
 
     def _next_rate(self, share_of_steps: float, kl: Tensor) -> Tensor:
-        """Adapt the learning rate after an update; as it is if no step was taken."""
+        """Adapt the learning rate after an update, if it took a step, and return the rate."""
         if self.adapt_rate is not None and self.max_kl is not None and share_of_steps:
             shares = {"share_of_steps": share_of_steps, "share_of_kl": float(kl) / self.max_kl}
             for group in self.optimizer.param_groups:
@@ -219,7 +219,7 @@ class MinibatchUpdate(PolicyUpdate):
     def _num_minibatches(self, samples: TensorDictBase) -> int:
         number = samples.numel()
         size = number if self.minibatch_size is None else self.minibatch_size
-        # of sequences, which stay whole, there may be fewer
+        # there may be fewer sequences than minibatches: sequences are not divided
         return max(1, min(round(number / size), samples.shape[0]))
 
     def _minibatches(self, samples: TensorDictBase) -> Iterator[TensorDictBase]:

@@ -61,9 +61,9 @@ class OffPolicy(Resumable, Algorithm, Recipe):
             episodes, not the discounted critics.
         replay_buffer: The replay buffer.
         policy_update: Trains all networks on minibatches.
-        random_steps: Environment steps with random actions at the beginning. Learning begins when
-            the replay buffer has this many transitions; 0 if nothing is collected.
-        steps_per_decision: Steps of an environment per transition.
+        random_steps: Environment steps with random actions at the beginning, 0 if nothing is
+            collected. Learning begins when the replay buffer holds as many steps.
+        steps_per_decision: Environment steps per transition.
         collects: Whether collected transitions go into the replay buffer.
         learns_from: A sentence on the dataset in the replay buffer, or a warning that nothing will
             be learned.

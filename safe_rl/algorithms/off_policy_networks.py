@@ -23,7 +23,7 @@ def setting(config: DictConfig, key: str) -> Any:
     """The value of a required key.
 
     Raises:
-        ValueError: If it is not.
+        ValueError: If the key is missing or null.
     """
     value = OmegaConf.select(config, key)
     if value is None:
@@ -32,10 +32,10 @@ def setting(config: DictConfig, key: str) -> Any:
 
 
 def bounded_actions(env: EnvBase) -> TensorSpec:
-    """Spec of one environment's bounded action, [A], in single precision as networks are.
+    """Spec of one environment's bounded action, [A], in single precision like the networks.
 
     Raises:
-        ValueError: If it has none, or another shape.
+        ValueError: If actions are not continuous within finite bounds, or no vectors [A].
     """
     spec = env.action_spec_unbatched
     is_continuous = isinstance(spec, Bounded) and spec.dtype.is_floating_point
@@ -65,9 +65,9 @@ def build_networks(
 
     Args:
         config: Configuration as composed from ``conf/``.
-        env: Its specs have the sizes of observations and actions.
-        num_costs: Costs that are constrained; without them, there is no critic of costs.
-        device: Of the parameters.
+        env: Environment whose specs have the sizes of observations and actions.
+        num_costs: Number of constrained costs; 0: no cost critics.
+        device: Device of the parameters.
 
     Raises:
         ValueError: If actions have no bounds, the observation is no vector, or the model is one for
@@ -91,7 +91,7 @@ def build_networks(
 
 
 def _observation_size(config: DictConfig, env: EnvBase) -> int:
-    """Length of the observation; refuses a model, or an observation, that is not of one vector."""
+    """Length of the observation; refuses models and observations that are not of one vector."""
     model = config.model
     if others := [key for key in _ON_POLICY_ONLY if model.get(key)]:
         raise ValueError(

@@ -1,4 +1,4 @@
-"""The on-policy recipe: advantages, constraints, policy update, value fitting, once per batch."""
+"""The on-policy recipe: for every batch advantages, constraints, policy update, critic update."""
 
 from __future__ import annotations
 
@@ -189,7 +189,7 @@ class OnPolicy(Algorithm, Recipe):
         parts: dict[str, Stateful | None] = {
             **self.networks,
             "multiplier": multiplier,
-            # None where losses hold nothing, as those of this package
+            # None if the losses have no state of their own, such as those of this package
             "losses": LossState(self.policy_update.loss_modules(), saved_elsewhere=kept) or None,
             "policy_update": self.policy_update,
             "critic_update": self.critic_update,
@@ -199,7 +199,7 @@ class OnPolicy(Algorithm, Recipe):
 
 
 def _limits(config: DictConfig, env: EnvBase) -> dict[str, float]:
-    """Limits of the algorithm, which then has to have an estimator of cost advantages."""
+    """Limits of the algorithm; refuses limits without an estimator of cost advantages."""
     limits = constrained_limits(config, env, otherwise="ppo")
     if limits and config.get("cost_advantage") is None:
         raise ValueError(

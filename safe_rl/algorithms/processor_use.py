@@ -44,7 +44,7 @@ def _is_of_use() -> bool:
 
 @contextmanager
 def fast_products() -> Iterator[None]:
-    """Let torch multiply matrices inside the block by oneDNN, on processors that it suits.
+    """Let torch multiply matrices by oneDNN inside the block, on processors where it is faster.
 
     Use it for updates, whose minibatches have thousands of rows. A call takes some ten microseconds
     more, which is too much for the few rows that a policy acts on. Sums differ in their last
@@ -82,24 +82,24 @@ def torch_threads(number: int) -> Iterator[None]:
 def in_parallel(first: Callable[[], Any], second: Callable[[], Any]) -> tuple[Any, Any]:
     """Call two functions that share nothing they change, each with half of torch's threads.
 
-    Minibatches of narrow networks are too small for two threads each, so it is faster to run two
-    updates at the same time. With one thread, the second function follows the first. TorchRL's
-    exploration type is DETERMINISTIC meanwhile, as in its losses.
+    With narrow networks, the computations of one minibatch are too small for two threads, so it is
+    faster to run two updates at the same time. With one thread, the second function follows the
+    first. TorchRL's exploration type is DETERMINISTIC meanwhile, as in its losses.
 
     Args:
         first: Called in this thread.
         second: Called in a thread of its own.
 
     Returns:
-        What they return. Both have ended, also if one of them raises.
+        The two results. Both functions have ended, even if one of them raises an error.
 
     Examples:
         >>> in_parallel(lambda: 1, lambda: 2)
         (1, 2)
     """
     threads = torch.get_num_threads()
-    # Losses set the process's one exploration type, and put back what they have found: in two
-    # threads that is the other's. So it is the same before, and only this block restores it.
+    # Losses set the exploration type, of which a process has only one, and then restore it. In two
+    # threads, one would restore what the other has set. So it is set before both and restored here.
     with set_exploration_type(ExplorationType.DETERMINISTIC):
         return (first(), second()) if threads == 1 else _beside(first, second, threads // 2)
 

@@ -17,14 +17,14 @@ __all__ = ["CRPOStep", "CTRPOStep", "barrier_divergence"]
 
 
 def barrier_divergence(change: Tensor, slack: Tensor) -> Tensor:
-    """Bregman divergence of x log x from one distance to a limit to another.
+    """Bregman divergence, for x log x, between two distances of a cost to its limit.
 
     D(s − a, s) = a + (s − a) log((s − a)/s): 0 with a slope of 0 at a = 0, of curvature 1/s there,
     and infinite beyond the limit.
 
     Args:
-        change: a, by how much a cost grows, any shape.
-        slack: s > 0, how far it was below its limit, of the same shape.
+        change: Increase a of the cost, any shape.
+        slack: Distance s > 0 of the cost to its limit before the increase, of the same shape.
 
     Returns:
         The divergence, of this shape.
@@ -40,23 +40,23 @@ def barrier_divergence(change: Tensor, slack: Tensor) -> Tensor:
 
 
 class CTRPOStep(TRPOStep):
-    """A step within a trust region that lies within the limits (C-TRPO).
+    """A step within a trust region of safe policies (C-TRPO).
 
-    The region is that of the divergence (Milosevic et al. 2025)
+    The trust region is defined by the divergence (Milosevic et al. 2025)
 
         D_C(π_θ ‖ π_k) = KL(π_θ ‖ π_k) + β Σᵢ D_φ(dᵢ − J_cᵢ(θ), dᵢ − J_cᵢ(θ_k)) ≤ δ
 
     with `barrier_divergence` as D_φ and J_c(θ) − J_c(θ_k) = T̄ E[(ρ − 1) A_c]. The mean episode
     length T̄ converts an average per step to an undiscounted sum, as 1/(1 − γ) converts it to a
     discounted sum in the article. The Hessian of D_C at θ_k is H + β T̄² Σᵢ bᵢbᵢᵀ / (dᵢ − J_cᵢ):
-    near a limit, the natural gradient becomes parallel to it. The line search takes the first
-    fraction with D_C ≤ δ that does not worsen the loss.
+    near a limit, the natural gradient becomes parallel to the limit's boundary. The line search
+    takes the first fraction with D_C ≤ δ that does not worsen the loss.
 
-    A policy above a limit recovers: it takes `TRPOStep`'s step against E[ρ A_c] until J_c is (1 −
-    `hysteresis`) d below its target, which is d, or less by a margin. The barriers of costs within
-    their limits stay active. If several limits are violated, the cost that exceeds its limit most
-    is lowered first. A limit of 0 has no barrier, and a batch without any cost is no reason to
-    recover.
+    A policy above a limit recovers: it takes steps like those of `TRPOStep` that lower E[ρ A_c],
+    until J_c is (1 − `hysteresis`) d below its target, which is d minus a margin if there is one.
+    Barriers of costs within their limits stay active. If several limits are violated, the cost that
+    exceeds its limit most is lowered first. A limit of 0 has no barrier, and a batch without any
+    cost starts no recovery.
 
     The diagnostics also have ``recovers``, [k]: 1 for the costs from which the policy recovers.
 
@@ -66,7 +66,7 @@ class CTRPOStep(TRPOStep):
         cost_limits: d, as of a multiplier; see `parse_cost_limits`.
         beta: Weight β of the barrier, per unit of an episode's undiscounted cost, for every cost.
         hysteresis: Share of d at which a recovery ends; 1 ends it at the limit.
-        settings: Those of every step, see `TRPOStep`.
+        settings: Settings of every trust-region step, see `TRPOStep`.
 
     Examples:
         >>> from tensordict import TensorDict
@@ -140,9 +140,9 @@ class CTRPOStep(TRPOStep):
 class CRPOStep(TRPOStep):
     """A step for the reward if all costs are at most d + η, else a step against one cost (CRPO).
 
-    The algorithm of Xu, Liang and Lan 2021, with a trust region for the policy update. If J_cᵢ ≤ dᵢ
-    + η for all i, it is a `TRPOStep` on the loss. Otherwise it is a `TRPOStep` on E[ρA_cᵢ] of the
-    cost that exceeds its limit most, in its own units. (The article takes any of these costs.)
+    This is the algorithm of Xu, Liang and Lan 2021, with a trust region for the policy update. If
+    J_cᵢ ≤ dᵢ + η for all i, it is a `TRPOStep` on the loss. Otherwise it is a `TRPOStep` on
+    E[ρA_cᵢ] of the cost with the largest J_cᵢ − dᵢ. (The article takes any of the violated costs.)
     There is no multiplier, and only η to tune.
 
     The diagnostics also have ``reduces``, [k]: 1 for the cost that the step lowers.
@@ -151,7 +151,7 @@ class CRPOStep(TRPOStep):
         loss: A `CPOLoss`, or a callable of your own that returns a TensorDict with scalars
             ``loss_…`` and the differentiable ``cost_surrogate``, [k].
         tolerance: Tolerated violation η, undiscounted cost per episode.
-        settings: Those of every step, see `TRPOStep`.
+        settings: Settings of every trust-region step, see `TRPOStep`.
 
     Examples:
         >>> from tensordict import TensorDict

@@ -21,9 +21,9 @@ from safe_rl.resumable import Resumable
 __all__ = ["Memory", "ProportionalSampler"]
 
 _MOST_AT_ONCE = 16_384
-"""Steps that are gathered at a time, to be cut into minibatches."""
+"""Largest number of transitions that are sampled in one call and then cut into minibatches."""
 _LONGEST_ROW = 1_000
-"""Steps of a row that are summed at a time: TorchRL goes through all of them for every episode."""
+"""Time steps per call of TorchRL's n-step transform, which goes through all for every episode."""
 
 
 class Memory(Checked):
@@ -31,15 +31,15 @@ class Memory(Checked):
 
     A transition over n steps has the discounted sums of n rewards and of n costs, and the
     observation n steps later. If the episode ends earlier, the transition ends there;
-    ``terminated`` is that of its last step. Time-outs are truncations: values bootstrap after them.
+    ``terminated`` is that of its last step. Values are bootstrapped after a time-out.
 
     Args:
         capacity: Largest number of transitions; the oldest are overwritten first.
         batch_size: Transitions in a minibatch.
-        in_keys: Entries of a step that are kept.
+        in_keys: Entries of a step that are stored.
         reward_keys: Entries below ``next`` that are summed over n steps.
         reward_gamma: Discount per step of these sums.
-        n_steps: Steps n of n-step returns.
+        n_steps: Number n of steps that a transition spans (n-step returns).
         prioritised: Exponents ``alpha`` and ``beta`` of prioritised replay, or None for uniform
             sampling. See Schaul et al. 2016, sections 3.3 and 3.4.
         keep: Whether checkpoints have the transitions, so that a resumed run continues exactly.
@@ -82,8 +82,8 @@ class Memory(Checked):
         )
         self._multi_step: MultiStepTransform | None = None
         if n_steps > 1:
-            # by default it keeps `terminated` of the first step: values would bootstrap beyond an
-            # end within the n steps
+            # its default done_keys keep `terminated` of the first step, so that values would be
+            # bootstrapped beyond an end within the n steps
             self._multi_step = MultiStepTransform(
                 n_steps, reward_gamma, reward_keys=list(reward_keys), done_keys=[]
             )
@@ -95,9 +95,9 @@ class Memory(Checked):
 
     def extend(self, batch: TensorDictBase) -> None:
         """Add the steps [N, T] that follow those of the last call."""
-        self._keep([batch] if self._multi_step is None else self._summed(batch, self._multi_step))
+        self._add([batch] if self._multi_step is None else self._summed(batch, self._multi_step))
 
-    def _keep(self, pieces: list[TensorDictBase]) -> None:
+    def _add(self, pieces: list[TensorDictBase]) -> None:
         if not pieces:  # fewer than n steps so far
             return
         pieces = [piece.select(*self._in_keys) for piece in pieces]
@@ -111,21 +111,21 @@ class Memory(Checked):
         return [piece for piece in found if piece is not None]
 
     def end_rows(self) -> None:
-        """End sums over n steps: the next batch does not follow the last one."""
+        """Complete the sums over n steps, because the next batch does not follow the last one."""
         transform = self._multi_step
-        # the transform has no public access to steps whose sums are not complete
+        # TorchRL has no public access to the steps whose sums are not complete
         if transform is None or transform._buffer is None:
             return
         waiting = transform._buffer.clone()
         waiting["next", "done"][..., -1, :] = True
         transform._buffer = waiting
         beyond = waiting[..., -1:].expand(*waiting.shape[:-1], transform.n_steps)
-        self._keep([transform.inv(beyond)])
+        self._add([transform.inv(beyond)])
         transform._buffer = None
 
     @property
     def in_keys(self) -> list[NestedKey]:
-        """Entries of a step that it stores."""
+        """Entries of a step that are stored."""
         return [key for key in self._in_keys if key != "steps_to_next_obs"]
 
     def minibatches(self, number: int) -> Iterator[TensorDictBase]:
@@ -145,7 +145,7 @@ class Memory(Checked):
             self._buffer.update_priority(minibatch["index"], minibatch[priority])
 
     def components(self) -> dict[str, Stateful]:
-        """The parts that a checkpoint has: the buffer itself if ``keep``, else none."""
+        """The parts that checkpoints save: the buffer itself if ``keep``, else none."""
         return {"memory": self} if self.keeps else {}
 
     def state_dict(self) -> dict[str, Any]:
@@ -156,7 +156,7 @@ class Memory(Checked):
             state["sampler"] = self._buffer.sampler.state_dict()
         if size:
             steps = self._buffer[:].exclude("index").flatten_keys("/")
-            # torch saves the whole storage of a view
+            # of a view, torch would save the whole underlying storage
             steps = steps if size == self.capacity else steps.clone()
             state["steps"] = {key: v.as_subclass(torch.Tensor) for key, v in steps.items()}
         tail = None if self._multi_step is None else self._multi_step._buffer
@@ -195,7 +195,7 @@ def _sampler(capacity: int, prioritised: Mapping[str, float] | None) -> Sampler:
 
 
 _SMALLEST = 1e-8
-"""Added to errors, so that every transition can be drawn."""
+"""ε, added to TD errors, so that every transition can be drawn."""
 
 
 class ProportionalSampler(Resumable, Sampler):
@@ -263,7 +263,7 @@ class ProportionalSampler(Resumable, Sampler):
         *,
         storage: Storage | None = None,
     ) -> None:
-        """Set the priorities of transitions by their errors."""
+        """Set the priorities of transitions from their TD errors."""
         errors = torch.as_tensor(priority).to(self._priorities).abs()
         raised = (errors + _SMALLEST) ** self.alpha
         self._priorities[torch.as_tensor(index).cpu()] = raised

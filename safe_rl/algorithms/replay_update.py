@@ -25,13 +25,13 @@ class ReplayUpdate(Checked):
     """Minimise the sum of all ``loss_*`` on minibatches, and update target networks.
 
     Args:
-        loss: Loss on steps of the buffer, with target networks unless ``tau`` is None.
+        loss: Loss on transitions of the buffer, with target networks unless ``tau`` is None.
         optimizer: Function of the parameters that builds the optimiser, for example
             ``functools.partial(torch.optim.Adam, lr=3e-4, fused=True)``.
-        updates_per_step: Gradient steps per step of an environment, the update-to-data ratio.
+        updates_per_step: Gradient steps per environment step (update-to-data ratio).
         tau: Weight τ of the new parameters in the target networks at every update (Polyak
             averaging); None without target networks.
-        policy_delay: Steps of the critics per step of the policy, and of the targets.
+        policy_delay: Updates of the critics per update of the policy and of the target networks.
         rates: Learning rates of parameters whose names begin with a key, such as ``log_alpha``; for
             others that of the optimiser.
         max_grad_norm: Norm to which the gradient is clipped, or None.
@@ -40,7 +40,7 @@ class ReplayUpdate(Checked):
     Raises:
         ValueError: If an argument is outside its range, no parameter's name begins with a key of
             ``rates``, or the loss has target networks and ``tau`` is None.
-        FloatingPointError: By the call, if a loss is not finite, before the step that would follow.
+        FloatingPointError: By the call, if a loss is not finite, before the step on this loss.
 
     Examples:
         >>> from functools import partial
@@ -72,7 +72,7 @@ class ReplayUpdate(Checked):
         self.optimizer = optimizer(_groups(loss, rates or {}))
         self._parameters = list(loss.parameters())
         self._device = self._parameters[0].device
-        # makes them equal, and refuses a loss without target networks; its steps are slow
+        # SoftUpdate equates the targets, and refuses losses without them; its own steps are slow
         self._share = 0.0 if tau is None else 1 - SoftUpdate(loss, tau=tau).eps
         pairs = loss.target_pairs()
         self._targets = [target.data for target, _ in pairs]
@@ -102,8 +102,8 @@ class ReplayUpdate(Checked):
         """Take a number of gradient steps.
 
         Returns:
-            Means over the steps of all single numbers that the loss reports, NaN if there was no
-            step; and ``num_updates``.
+            Means over the steps (and over costs) of everything that the loss reports, NaN if there
+            was no step; and ``num_updates``.
         """
         names = self.loss.out_keys
         nothing = torch.zeros((), device=self._device)
@@ -157,7 +157,7 @@ class ReplayUpdate(Checked):
         self.optimizer.load_state_dict(state_dict["optimizer"])
         stored = state_dict["loss"]
         for name, tensor in self._tensors():
-            # a constant that TorchRL makes with the first loss: before an update it is not stored
+            # TorchRL makes this constant when it first computes the loss: it may not be stored yet
             if name in stored or name != "_target_entropy":
                 tensor.copy_(stored[name])
         self._counts.update(state_dict["counts"])

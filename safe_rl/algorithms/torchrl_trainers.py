@@ -1,6 +1,6 @@
 """Constraints and updates as parts of TorchRL's own `Trainer`.
 
-`examples/torchrl_trainer.py` puts them together, with its `PPOTrainer` and with a `CPOStep`.
+`examples/torchrl_trainer.py` uses them with TorchRL's `PPOTrainer` and with a `CPOStep`.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ __all__ = ["ConstraintHook", "UpdateStepper"]
 class ConstraintHook(Resumable, TrainerHookBase):
     """Updates the constraints, and with them the multiplier, with every collected batch.
 
-    Registered with a trainer it runs before the losses, and logs returns, costs, violations and
+    A trainer calls it before the losses (`register`), and logs its returns, costs, violations and
     multipliers.
 
     Args:
@@ -31,7 +31,7 @@ class ConstraintHook(Resumable, TrainerHookBase):
         accounting: Sums costs and rewards of the collector's batches over episodes.
 
     Raises:
-        TypeError: If the constraints charge steps, as `TrackedConstraints` do for a risk measure.
+        TypeError: If the constraints can replace costs by charges, as `TrackedConstraints` can.
 
     Examples:
         >>> accounting = EpisodeAccounting(num_envs=1, cost_keys=["cost"])
@@ -69,7 +69,7 @@ class ConstraintHook(Resumable, TrainerHookBase):
 
     @property
     def multiplier(self) -> Multiplier | None:
-        """That of the constraints, which do not save it."""
+        """The constraints' multiplier, saved with this hook because the constraints do not."""
         return self.constraints.multiplier
 
     def register(self, trainer: Trainer, name: str = "constraints") -> None:
@@ -80,14 +80,14 @@ class ConstraintHook(Resumable, TrainerHookBase):
 
 
 class UpdateStepper(Resumable, OptimizationStepper):
-    """A trust-region step, or another of our updates, as a trainer's optimisation step.
+    """A trust-region step, or another `PolicyUpdate`, as a trainer's optimisation step.
 
     It takes the batch that the trainer passes. Without a replay buffer and with
     ``optim_steps_per_batch=1`` this is the whole collected batch, as a trust-region step needs it.
 
     Args:
         policy_update: A `TRPOStep`, a `CPOStep` or a `MinibatchUpdate`.
-        critic_update: Fits the critics afterwards, or None.
+        critic_update: Update that fits the critics afterwards, or None.
         constraints: Constraints of a constrained step, updated by a `ConstraintHook`; or None.
 
     Examples:

@@ -40,8 +40,8 @@ class StepProblem(NamedTuple):
     """The quantities from which a step is computed.
 
     Attributes:
-        losses: Entries of the loss before the step, with gradients.
-        fisher: Fisher matrix of the policy.
+        losses: Outputs of the loss before the step, with gradients.
+        fisher: Product with the Fisher matrix of the policy, plus damping.
         cost_violation: J_c − d, [k], if the caller knows it.
         episode_length: T̄, scalar, if the caller knows it.
     """
@@ -63,7 +63,7 @@ class StepProblem(NamedTuple):
 
     @property
     def length(self) -> Tensor:
-        """T̄, which a step with limits on the costs of episodes needs."""
+        """T̄, scalar; an error if the caller does not give it."""
         if self.episode_length is None:
             raise ValueError("A step with limits on episodes needs the mean episode_length.")
         return torch.as_tensor(self.episode_length).to(self.surrogates)
@@ -74,8 +74,8 @@ class Proposal(NamedTuple):
 
     Attributes:
         step: Change of the parameters, [P].
-        is_acceptable: Whether the losses and the KL divergence after a step within δ are
-            acceptable.
+        is_acceptable: Function of the losses and of the KL divergence, at most δ, after a step:
+            whether the line search may take this step.
         diagnostics: Values to log about the step.
     """
 
@@ -113,11 +113,11 @@ class TRPOStep(PolicyUpdate):
         loss: The loss; a `TRPOLoss`, a `TRPOLagrangianLoss` or your own.
         target_kl: Radius δ of the trust region, mean KL divergence over the states of the batch.
         damping: Multiple of the identity added to the Fisher matrix.
-        cg_iterations: Iterations of the conjugate gradient method, for every system solved.
-        backtrack_coeff: Factor from one try of the line search to the next.
-        max_backtracks: Tries of the line search.
-        fisher_subsample: Share of the batch that the Fisher matrix is averaged over.
-        actor_network: Policy to step; by default ``loss.actor_network``.
+        cg_iterations: Iterations of the conjugate gradient method, for every linear system.
+        backtrack_coeff: Factor by which the line search shortens a step that it has rejected.
+        max_backtracks: Largest number of tries of the line search, the full step included.
+        fisher_subsample: Share of the batch over which the Fisher matrix is averaged.
+        actor_network: Policy that the step changes; by default ``loss.actor_network``.
 
     Examples:
         >>> from tensordict import TensorDict
@@ -172,9 +172,9 @@ class TRPOStep(PolicyUpdate):
             episode_length: T̄, scalar; read by constrained steps only.
 
         Returns:
-            The losses' entries after the step, ``kl`` (mean KL(π_θ ‖ π_k)), ``step_fraction``
+            The outputs of the loss after the step, ``kl`` (mean KL(π_θ ‖ π_k)), ``step_fraction``
             (share of the full step that the line search accepted; 0: none, or the gradient was 0),
-            ``backtracks`` (rejected tries) and the diagnostics of the step itself.
+            ``backtracks`` (number of rejected tries) and the diagnostics of the step itself.
 
         Raises:
             FloatingPointError: If an entry of the batch, the loss or the step is not finite; then
@@ -206,7 +206,7 @@ class TRPOStep(PolicyUpdate):
     def _natural_step(
         self, problem: StepProblem, objective: Callable[[TensorDictBase], Tensor]
     ) -> Proposal:
-        """The longest step along the natural gradient of an objective of the losses."""
+        """The longest step, within the trust region, down the natural gradient of an objective."""
         loss = objective(problem.losses)
         gradient = flat_gradient(loss, self.parameters)
         direction, _ = conjugate_gradient(problem.fisher, gradient, self.cg_iterations)
@@ -222,11 +222,11 @@ class TRPOStep(PolicyUpdate):
         return torch.stack(rows) if rows else flatten(self.parameters).detach()[None, :][:0]
 
     def _solve_all(self, fisher: FisherProduct, g: Tensor, b: Tensor) -> tuple[Tensor, Tensor]:
-        """H⁻¹g, [P], and H⁻¹bᵢ, [k, P], so that q, r and S are consistent with one metric.
+        """Solutions v = H⁻¹g, [P], and wᵢ = H⁻¹bᵢ, [k, P], that are consistent with each other.
 
         A few iterations of conjugate gradients leave residuals of tens of percents. Then gᵀw, bᵀv
         and wᵀHv are three different numbers, but the dual needs one r. In the span of the solutions
-        they are equal, and there a step keeps linearised constraints and the radius exactly.
+        they are equal, and a step keeps linearised constraints and the radius exactly.
         """
         right = torch.cat([g[None], b])
         pairs = [conjugate_gradient(fisher, row, self.cg_iterations) for row in right]

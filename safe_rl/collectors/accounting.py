@@ -21,18 +21,18 @@ class EpisodeError(ValueError):
 
 @dataclass(frozen=True)
 class EpisodeStatistics:
-    """What one batch says about episodes.
+    """Statistics of the episodes in one batch.
 
     Attributes:
         returns: Undiscounted return of every episode that finished in the batch, shape [E].
         costs: Cost key -> undiscounted cost of every finished episode, shape [E]. Here and below,
             nested keys are joined by ``/``.
         lengths: Steps of every finished episode, shape [E].
-        steps_per_decision: Steps of the environment per row of time of a batch.
+        steps_per_decision: Environment steps per time step of a batch, which is one action.
         cost_rates: Cost key -> all cost so far divided by all steps so far, ρ_c, scalar tensors.
         reward_rate: All reward so far divided by all steps so far, a scalar tensor.
-        open_costs: Cost key -> what the open episode of every row had cost before the batch, shape
-            [N]; NaN where it is left out of the statistics.
+        open_costs: Cost key -> cost that the unfinished episode of every row had before the batch,
+            shape [N]; NaN for episodes that are left out of the statistics.
 
     Examples:
         >>> import torch
@@ -61,7 +61,7 @@ class EpisodeStatistics:
 
     @property
     def decisions(self) -> Tensor:
-        """Actions that were chosen in every finished episode, [E]; the last may be cut short."""
+        """Number of actions in every finished episode, [E]; the last may take fewer steps."""
         return (self.lengths / self.steps_per_decision).ceil()
 
     def episode_costs(self, cost_keys: Sequence[NestedKey]) -> Tensor:
@@ -75,7 +75,7 @@ class EpisodeStatistics:
         return self.episode_costs(cost_keys).mean(0)
 
     def scalars(self) -> dict[str, float]:
-        """Means under the names of the log; NaN where no episode finished."""
+        """Means, by name of their column in the run's table; NaN where no episode finished."""
         rows = {
             "episodes": float(self.num_episodes),
             "episode_return": self.returns.mean().item(),
@@ -90,19 +90,19 @@ class EpisodeStatistics:
 class EpisodeAccounting(Resumable):
     """Sum rewards and costs over episodes that may span any number of batches.
 
-    The sums are taken over whole batches at once, after collection, so that nothing is added to
-    the steps of the environment.
+    The sums are taken over whole batches at once, after collection, so that environment steps take
+    no longer.
 
     Args:
         num_envs: Number of environments N.
-        cost_keys: Keys below ``"next"`` to account for, each [N, T, 1] or, of one environment
-            without a batch dimension, [T, 1].
+        cost_keys: Keys of the costs below ``"next"``, each [N, T, 1], or [T, 1] for one environment
+            without a batch dimension.
         reward_key: Key of the reward below ``"next"``.
         done_key: Key of the end of an episode below ``"next"``.
         device: Device of the batches.
-        longest: Largest number of steps of an episode, where that is known.
-        steps_per_decision: Steps of the environment per row of time. If not 1, ``steps_taken``
-            below ``"next"`` says how many each took.
+        longest: Largest number of steps of an episode, or None if it is not known.
+        steps_per_decision: Environment steps per time step of a batch. If it is not 1,
+            ``steps_taken`` below ``"next"`` has the number of each time step.
 
     Raises:
         KeyError: By :meth:`update`, if a key is not in the batch.
@@ -141,16 +141,13 @@ class EpisodeAccounting(Resumable):
         self.done_key = done_key
         self._signal_keys = [reward_key, *self.cost_keys]
         num_sums = 1 + len(self._signal_keys)
-        # float64 keeps sums of indicator costs exact and those of rewards independent of how the
-        # steps were cut into batches to far below what is logged
+        # in float64, sums of indicator costs are exact, and how steps are divided into batches
+        # changes sums of rewards far less than the digits that are logged
         self.open_sums = torch.zeros(num_envs, num_sums, dtype=torch.float64, device=device)
         self.totals = torch.zeros(num_sums, dtype=torch.float64, device=device)
 
     def update(self, batch: TensorDictBase) -> EpisodeStatistics:
-        """Account for one batch of consecutive steps, [N, T], batches in order of time.
-
-        A batch [T] is that of a single environment.
-        """
+        """Add the next batch of consecutive steps, [N, T], or [T] of a single environment."""
         num_envs = self.open_sums.shape[0]
         if batch.ndim == num_envs == 1:
             batch = batch.unsqueeze(0)
@@ -208,7 +205,7 @@ class EpisodeAccounting(Resumable):
                 )
 
     def _require_ends(self, lengths: Tensor) -> None:
-        """Refuse episodes, ended with lengths [E] or open, that are longer than they may be."""
+        """Refuse episodes, finished with lengths [E] or unfinished, longer than `longest`."""
         if self.longest is None:
             return
         steps = torch.cat([lengths, self.open_sums[:, 0]]).nan_to_num().max().item()
@@ -234,13 +231,13 @@ class EpisodeAccounting(Resumable):
 
     @property
     def have_begun(self) -> Tensor:
-        """Rows [N] that are within an episode, between two batches."""
+        """Rows [N] whose episode is unfinished at the end of the last batch, bool."""
         return self.open_sums[:, 0] != 0
 
     def forget_open_episodes(self) -> None:
-        """Drop the sums of open episodes: the environment starts new ones."""
+        """Drop the sums of unfinished episodes: the environment starts new ones."""
         self.open_sums.zero_()
 
     def ignore_open_episodes(self) -> None:
-        """Leave the open episodes, which started late, out of all statistics."""
+        """Leave the present episodes, whose first steps are missing, out of all statistics."""
         self.open_sums.fill_(torch.nan)

@@ -1,4 +1,4 @@
-"""Transitions from disk: recordings, HDF5 files as of DSRL or Minari, and their safe episodes."""
+"""Transitions from disk: recordings, HDF5 files of DSRL or Minari, and their safe episodes."""
 
 from __future__ import annotations
 
@@ -23,13 +23,13 @@ _NAMES: dict[NestedKey, str] = {
     "action": "actions",
     ("next", "reward"): "rewards",
 }
-# DSRL's (Liu et al. 2024), which are those of D4RL, and `costs`
+# names of arrays in files of DSRL (Liu et al. 2024): those of D4RL, and `costs`
 _FLAT = _NAMES | {
     ("next", "cost"): "costs",
     ("next", "terminated"): "terminals",
     ("next", "truncated"): "timeouts",
 }
-# of each of Minari's episodes; costs are among the `infos`
+# names of arrays in each episode of a Minari file; costs are among its `infos`
 _OF_AN_EPISODE = _NAMES | {
     ("next", "terminated"): "terminations",
     ("next", "truncated"): "truncations",
@@ -54,8 +54,8 @@ def safe_episodes(steps: TensorDictBase, limits: Mapping[str, float]) -> TensorD
     """Steps [1, M] of all complete episodes within the limits, one after the other.
 
     Args:
-        steps: Consecutive steps [N, T]; the last episode of a row counts only if finished, and none
-            with a ``partial`` step, where there is such an entry.
+        steps: Consecutive steps [N, T]. The last episode of a row counts only if it has finished;
+            an episode with a step marked as ``partial`` does not count.
         limits: Cost key -> undiscounted cost allowed per episode.
 
     Examples:
@@ -83,19 +83,19 @@ def safe_episodes(steps: TensorDictBase, limits: Mapping[str, float]) -> TensorD
 def read_hdf5(path: Path | str) -> TensorDict:
     """Transitions [1, M] of an HDF5 file, one episode after the other; needs the extra `hdf5`.
 
-    Files are those of
+    Files have the format of
 
     - DSRL and D4RL: flat arrays over all episodes, ``observations``, ``actions``, ``rewards``,
-      ``costs``, ``terminals``, ``timeouts``, and ``next_observations``. Without the last, what
-      follows a step is the observation of the next one, and that of the step itself where an
-      episode ends;
+      ``costs``, ``terminals``, ``timeouts``, and ``next_observations``. If the last array is
+      missing, a step's next observation is the observation of the step after it, or, at the end of
+      an episode, the step's own observation;
     - Minari: a group ``episode_<i>`` for each episode, with ``observations`` (one more than steps),
       ``actions``, ``rewards``, ``terminations``, ``truncations``, and ``infos`` with ``cost`` and
-      any ``cost_<kind>``. An episode that was cut off counts as truncated.
+      any ``cost_<kind>``. An episode without an end in its last step counts as truncated.
 
     Raises:
-        ValueError: If the file is no HDF5 file, or damaged; if an array is missing, or is not of
-            numbers, a row for each action.
+        ValueError: If the file is no HDF5 file, or damaged; if an array is missing, or does not
+            have one row of numbers for each action.
         ModuleNotFoundError: If h5py is not installed.
     """
     h5py = import_extra("h5py", "hdf5")

@@ -1,4 +1,4 @@
-"""The collectors that a configuration can name, with the settings that training needs."""
+"""Functions that build the collectors which a configuration can name."""
 
 from __future__ import annotations
 
@@ -30,12 +30,12 @@ def make_collector(
 ) -> Collector:
     """Build an endless in-process collector of [N, T] batches.
 
-    It resets the environment, so seed that first. It does not track trajectory identifiers, which
-    take time: ``("next", "done")`` marks where episodes end.
+    The collector resets the environment, so seed the environment before. To save time, it does not
+    track trajectory identifiers: ``("next", "done")`` marks where episodes end.
 
     Args:
         env: Batched environment, batch_size [N].
-        policy: Module that writes what ``env`` and the losses need.
+        policy: Module that writes the actions, and all other entries that the losses need.
         frames_per_batch: Steps of all environments together in one batch, N·T.
         device: Device of policy and batches. Defaults to that of the environment.
 
@@ -85,8 +85,8 @@ def make_process_collector(
     """Collect in processes of this machine.
 
     Args:
-        env: The run's environment; its rows are shared out, itself it is not stepped.
-        make_env: Makes an environment like it with fewer rows, in the worker.
+        env: The run's environment. Its rows are divided among workers; it is not stepped itself.
+        make_env: Function that makes such an environment with fewer rows, in a worker.
         policy: Policy, whose weights are sent to the workers.
         frames_per_batch: Steps of all rows together in one batch, N·T.
         num_collectors: Number of processes W, which divides N.
@@ -126,7 +126,7 @@ def make_ray_collector(  # noqa: D417
     ray_init: Options,
     resources: Options,
 ) -> WorkerCollector:
-    """Collect in actors of a Ray cluster; other arguments are as for processes.
+    """Collect in actors of a Ray cluster; for other arguments see `make_process_collector`.
 
     Args:
         num_collectors: Number of actors W, which divides N.

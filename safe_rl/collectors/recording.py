@@ -14,17 +14,17 @@ from safe_rl.files import check_no_links, load_tensors, save_tensors
 __all__ = ["PARTIAL", "Recording", "StepRecorder", "read_recording"]
 
 PARTIAL = "partial"
-"""Entry [N, T, 1], true in some step of an episode that is not recorded completely."""
+"""Entry [N, T, 1] bool, true in at least one step of an episode that is not recorded completely."""
 
 # other entries, such as those that a policy writes, are not recorded
 _FLAGS = ("done", "terminated", "truncated")
 
 
 class Recording:
-    """A folder with the transitions of a run, a file of `torch.save` per batch [N, T].
+    """A folder with the transitions of a run, one file of `torch.save` per batch [N, T].
 
     Args:
-        folder: Where they go; made if it does not exist.
+        folder: Path of the folder, which is made if it does not exist.
         cost_keys: Costs below ``next`` that are recorded.
 
     Raises:
@@ -54,7 +54,7 @@ class Recording:
         self._keys = ["observation", "action", *(("next", key) for key in following)]
 
     def begin(self, number: int = 0) -> None:
-        """Remove the batches of an earlier recording, from a number on.
+        """Remove the batches of an earlier recording with this number and higher ones.
 
         Raises:
             ValueError: If the folder is a link or holds links: files elsewhere could be removed.
@@ -69,15 +69,15 @@ class Recording:
                 path.unlink()
 
     def write(self, number: int, batch: TensorDictBase, *, begun: Tensor | None = None) -> None:
-        """Write a batch [N, T] under its number; one that is there already is replaced.
+        """Write a batch [N, T]; an earlier file with the same number is replaced.
 
-        If the previous batch is missing, open episodes of the last recorded one end there and are
-        marked as partial.
+        If batch ``number - 1`` is missing, the unfinished episodes at the end of the last recorded
+        batch are truncated there and marked as partial.
 
         Args:
-            number: Of the batch, which follows the one before it.
+            number: Number of the batch in order of time.
             batch: Consecutive steps.
-            begun: Rows [N] that start within an episode, for use if the previous batch is missing.
+            begun: Rows [N] that start within an episode, partial if the previous batch is missing.
         """
         steps = batch.select(*self._keys).cpu()
         steps[PARTIAL] = torch.zeros_like(steps["next", "done"])
@@ -89,7 +89,7 @@ class Recording:
         self._store(number, steps)
 
     def cut_after(self, number: int) -> None:
-        """End the open episodes of a batch as partial ones, because new episodes follow."""
+        """Truncate a batch's unfinished episodes and mark them as partial: new ones follow."""
         if not self._place(number).exists():
             return
         steps = _read(self._place(number))
@@ -103,7 +103,7 @@ class Recording:
 
     def _store(self, number: int, steps: TensorDictBase) -> None:
         self.folder.mkdir(parents=True, exist_ok=True)
-        # copies, because a part of a larger tensor would be stored with the whole
+        # of a view, torch would save the whole underlying storage
         save_tensors(self._place(number), steps.clone().to_dict())
 
 
@@ -111,8 +111,8 @@ class StepRecorder:
     """Collects single steps [N] and writes many at a time to a recording.
 
     Args:
-        recording: Where they go, as batches 0, 1, 2, …; what is there already is removed.
-        steps: How many make a batch.
+        recording: Recording that gets batches 0, 1, 2, …; those that it has already are removed.
+        steps: Number of steps per batch.
 
     Examples:
         >>> done = torch.zeros(4, 1, dtype=torch.bool)
@@ -138,7 +138,7 @@ class StepRecorder:
         self._written = 0
 
     def __call__(self, step: TensorDictBase) -> None:
-        """Take in the next step [N]."""
+        """Add the next step [N]."""
         self._steps.append(step.clone())
         if len(self._steps) == self._number:
             self.flush()
@@ -153,12 +153,12 @@ class StepRecorder:
 def read_recording(folder: Path | str) -> TensorDict:
     """Transitions [N, T] of a folder in order of time, in main memory.
 
-    ``partial`` is true in at least one step of an incomplete episode: where rows began within an
-    episode (``staggered_starts``), and where a run was resumed without the state of its worlds or
-    without recording. The latter episodes are truncated there.
+    ``partial`` is true in at least one step of an incomplete episode. Episodes are incomplete if
+    rows began within an episode (``staggered_starts``). They are incomplete, and truncated, if the
+    run was resumed without the state of its environments, or went on without recording.
 
     Raises:
-        FileNotFoundError: If there are none.
+        FileNotFoundError: If the folder has no transitions.
         ValueError: If a batch cannot be read, or holds more than tensors.
     """
     pieces = _pieces(Path(folder))

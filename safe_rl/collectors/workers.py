@@ -1,7 +1,7 @@
-"""Collection by workers, on this machine or on others, and the rows that each of them steps.
+"""Collection by workers, on this machine or on others, each with a part of the environment's rows.
 
-Every worker has the seeds that its rows have in a single process, so that a run meets the same kind
-of episodes however many workers it has.
+The rows have the same seeds as in a single process, so that a run meets the same kind of episodes
+with any number of workers.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ __all__ = ["MakeEnv", "Makers", "WorkerCollector", "WorkerError", "split_rows"]
 
 
 class MakeEnv(Protocol):
-    """Makes the run's environment with another number of rows; workers call it."""
+    """Function, called in workers, that makes the run's environment with fewer rows."""
 
     def __call__(self, *, num_envs: int) -> EnvBase:
         """Make an environment of ``num_envs`` rows."""
@@ -38,11 +38,11 @@ Makers = list[Callable[[], EnvBase]]
 
 
 def split_rows(env: EnvBase, make_env: MakeEnv, num_collectors: int) -> Makers:
-    """Functions that make every worker's environment, with its share of the rows of ``env``.
+    """Functions, one per worker, that make environments with parts of the rows of ``env``.
 
-    Where ``get_state`` of the environment is not None, workers continue its rows from their next
-    reset. Otherwise every worker makes a new environment with a seed of its own, whose schedules
-    continue after the ``steps_before`` of ``env``.
+    If the environment has states that can be copied (``get_state``), workers continue its rows from
+    their next reset. Otherwise every worker makes a new environment with a seed of its own, whose
+    schedules continue after the ``steps_before`` of ``env``.
     """
     states: list[TensorDictBase | None]
     if env.get_state() is None:
@@ -72,7 +72,7 @@ def _make_rows(
     else:
         env.set_seed(seed % 2**31)
         env.continue_from(steps_before)
-    # again: an environment that is seeded may have seeded all that torch draws
+    # again, because an environment may seed torch's global generator when it is seeded
     torch.manual_seed(seed)
     return env
 
@@ -82,15 +82,15 @@ class WorkerError(RuntimeError):
 
 
 class WorkerCollector:
-    """Batches [N, T] of the present policy, collected by workers in step with each other.
+    """Collector of batches [N, T] of the present policy from synchronous workers.
 
-    The workers get the policy's weights before every batch but the first, with which they start.
+    The workers start with the policy's weights, and get its new weights before every later batch.
 
     Args:
-        start: Starts TorchRL's collector, whose batches are [W, n, T] or [N, T], with the functions
-            that make its environments.
-        env: The run's environment; its rows are shared out, itself it is not stepped.
-        make_env: Makes an environment like it with fewer rows, in the worker.
+        start: Function that starts TorchRL's collector, whose batches are [W, n, T] or [N, T], from
+            the list of functions that make the workers' environments.
+        env: The run's environment. Its rows are divided among workers; it is not stepped itself.
+        make_env: Function that makes such an environment with fewer rows, in a worker.
         num_collectors: Number of workers W.
         frames_per_batch: Steps of all rows together in one batch, N·T.
         device: Device of the batches.
@@ -133,8 +133,8 @@ class WorkerCollector:
         try:
             self._workers = self._ask(self._start)
         except BaseException as error:
-            # Python would wait at its end for workers that have started, and for what sends weights
-            # to them, which the frames of the error keep
+            # At its exit, Python would wait for workers that have started, and for the objects that
+            # send weights to them. The frames of the error keep these objects alive.
             for process in set(active_children()) - others:
                 process.kill()
             clear_frames(error.__traceback__)
@@ -147,9 +147,9 @@ class WorkerCollector:
             self._ask(self._workers.update_policy_weights_)
 
     def _ask(self, call: Callable[[], Any]) -> Any:
-        """The result of a call, which would wait without end for a worker that has died.
+        """The result of a call; raises if a worker dies, for which the call would wait forever.
 
-        It runs in a thread, for which neither signals nor the end of Python have to wait.
+        The call runs in a daemon thread, which delays neither signals nor the exit of Python.
         """
         asked: Future[Any] = Future()
 
@@ -163,18 +163,18 @@ class WorkerCollector:
         while not wait([asked], timeout=1.0).done:
             self._check_workers()
         if asked.exception() is not None and self._processes:
-            # it may follow from a worker's end, whose exit code is not known yet
+            # a worker's death may be the cause, but its exit code may not be known yet
             connection.wait([process.sentinel for process in self._processes], timeout=5.0)
             self._check_workers()
         return asked.result()
 
     @property
     def _processes(self) -> list[BaseProcess]:
-        """Workers on this machine that nobody has ended."""
+        """Worker processes on this machine that have not been closed."""
         return [p for p in getattr(self._workers, "procs", ()) if not p._closed]
 
     def _check_workers(self) -> None:
-        """Raise, and end all workers, if one has died; TorchRL ends the others by SIGTERM."""
+        """End all workers and raise if one has died; SIGTERM is how TorchRL ends them."""
         codes = {process.exitcode for process in self._processes}
         if not (died := codes - {None, 0, 128 + signal.SIGTERM}):
             return
@@ -188,7 +188,7 @@ class WorkerCollector:
         )
 
     def kill(self) -> None:
-        """End the workers, whatever they are doing."""
+        """End the workers at once, whatever they are doing."""
         self.shutdown(timeout=0.0)
 
     def shutdown(self, timeout: float | None = None) -> None:

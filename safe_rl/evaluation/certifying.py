@@ -24,9 +24,9 @@ from safe_rl.scores.certificate import Claim, Verdict, first_certified, rank
 
 __all__ = ["Certificate", "certify"]
 
-# environments that are stepped together, and episodes between two looks at a test
+# number of environments that are stepped together, and of episodes between two checks of a test
 _BATCH = 100
-# seeds are so far apart that the tests of one run are not the ranking of the next seed's run
+# added to the seed: so far apart that no test of a run has the episodes of another run's ranking
 _RANKING, _TEST = 100_000_000_003, 200_000_000_041
 
 
@@ -47,7 +47,7 @@ class Certificate:
     options: CertificateOptions
 
     def __str__(self) -> str:
-        """One line: what is certified, what it excludes, and what the test cannot detect."""
+        """One line: what is certified, and what the bounds do not cover."""
         level, verdict = f"at {100 * self.options.level:.12g}%", self.verdict
         if self.checkpoint is None:
             missing = "; ".join(
@@ -64,10 +64,10 @@ class Certificate:
         return (
             f"Certified {level}: {bounds} ({means} in {verdict.episodes:,} new episodes), return "
             f"{self.episode_return:.2f}, at {checkpoint_steps(self.checkpoint):,} steps. "
-            f"{self._excluded()} Not covered: single episodes, other environments."
+            f"{self._on_rare_episodes()} Not covered: single episodes, other environments."
         )
 
-    def _excluded(self) -> str:
+    def _on_rare_episodes(self) -> str:
         """Text on what the bounds say about rare episodes."""
         if self.options.bound == "student":
             return "The bound assumes that no rare episodes cost far more than those tested."
@@ -90,13 +90,13 @@ def certify(
 ) -> Certificate | None:
     """Find and certify the best checkpoint of a run that keeps its limits.
 
-    All candidates are ranked by some episodes; the first ones are tested on fresh episodes. The
+    All checkpoints are ranked by some episodes; the first ones are tested on new episodes. The
     result is written to ``certificate.json``, and the policy is saved as ``checkpoint=certified``.
 
     Args:
         directory: Folder of the run.
         options: Options of the test, such as the number of episodes.
-        make_env: ``make_env(node, num_envs=, device=, seed=, num_threads=)``.
+        make_env: ``make_env(node, num_envs=, device=, seed=, num_threads=)`` makes environments.
         num_threads: Threads that step environments; 0 is one per core.
         progress: Whether to show a bar.
 
@@ -110,7 +110,7 @@ def certify(
     limits = {key: float(limit) for key, limit in config.cost_limits.items()}
     if not limits or not candidates:
         return None
-    # training's device, where the physics may be; a machine without a GPU certifies on its CPU
+    # the device of training, where the simulation may run; without a GPU, the CPU
     device = config.device if torch.cuda.is_available() else "cpu"
     plain = EvaluationOptions(device=device, num_threads=num_threads)
     trials = [Trial(config, path, plain, make_env) for path in candidates]
@@ -144,7 +144,7 @@ def _costs(episodes: Episodes) -> dict[str, np.ndarray]:
 
 
 def _candidates(folder: RunFolder) -> list[Path]:
-    """Checkpoints of all kinds by ascending steps, one for every number of steps."""
+    """Checkpoints, best and last ones, by ascending steps, one for every number of steps."""
     found = {
         checkpoint_steps(path): path
         for kind in ("best", "last")
@@ -156,13 +156,13 @@ def _candidates(folder: RunFolder) -> list[Path]:
 def _run(
     trial: Trial, purpose: int, number: int, highest: dict[str, float], progress: bool
 ) -> Iterator[Episodes]:
-    """Episodes in batches that neither training nor another purpose has used.
+    """Batches of episodes with seeds that neither training nor the other purpose uses.
 
-    What an episode can cost at most is written into ``highest``.
-    All candidates have the same layouts. A ranking is one batch. In a batch of a test every
-    environment has one episode, so short episodes do not count before long ones.
+    A purpose is a ranking or a test. All candidates have the same layouts. A ranking is one batch.
+    In a batch of a test every environment has one episode, so short episodes do not count before
+    long ones. The highest possible cost of an episode is written into ``highest``.
     """
-    own = trial.seed  # of a fixed layout that of training
+    own = trial.seed  # if the layout is fixed, the seed of training
     seed = own if has_fixed_layout(trial.node) else own + purpose
     trial = replace(trial, options=replace(trial.options, seed=seed))
     worlds, keys = min(number, _BATCH), list(trial.config.cost_limits)
@@ -182,8 +182,8 @@ def _run(
 def _keep(folder: RunFolder, checkpoint: Path | None) -> Path | None:
     """Copy the certified checkpoint to a file that is not overwritten by later ones.
 
-    The checkpoint of an earlier certificate is deleted after the copy is complete, because copying
-    a replay buffer takes long enough to be interrupted.
+    The checkpoint of an earlier certificate is deleted only when the copy is complete: copying a
+    checkpoint with a replay buffer takes long enough to be interrupted.
     """
     directory = folder.checkpoints / "certified"
     if checkpoint is None:

@@ -63,17 +63,18 @@ def collect_episodes(
 ) -> Episodes:
     """Run a policy for exactly ``num_episodes`` episodes.
 
-    The number of episodes of each world is fixed before the first step. Taking the episodes that
-    end first would favour short ones.
+    The number of episodes of each world (one of the N environments) is fixed before the first step.
+    Taking the episodes that end first would favour short ones.
 
     Args:
         env: Batched environment, batch_size [N].
         policy: The policy.
-        num_episodes: E; worlds that have their number continue, uncounted, until all have it.
+        num_episodes: Number of episodes E. Worlds that have finished their share continue until all
+            have, but their further episodes do not count.
         cost_keys: Keys of the costs to sum, below "next".
         deterministic: Whether the policy acts with its mean.
         progress: Whether to show a bar.
-        record: Gets every step [N], also those of worlds that continue uncounted.
+        record: Function that gets every step [N], including those that do not count.
 
     Examples:
         >>> from safe_rl.envs import make_env
@@ -104,7 +105,7 @@ def collect_episodes(
             taken = after[STEPS_TAKEN] if is_repeating else torch.ones_like(after[return_key])
             signals = [after["done"], taken, after[return_key]]
             signals += [after[key] for key in cost_keys]
-            # in one piece: every copy waits for the device
+            # one copy for all of them, because every copy waits for the device
             found = torch.cat(signals, -1).to(sums)
             done = found[:, 0].bool()
             sums += found[:, 1:]
@@ -114,30 +115,30 @@ def collect_episodes(
                 finished += counts
                 sums[done] = 0.0
                 bar.update(int(counts.sum()))
-    # by world, so that the table does not depend on which episode happened to end first
+    # sorted by world, so that the order does not depend on which episode happened to end first
     order = torch.cat([worlds for worlds, _ in rows]).argsort(stable=True)
     lengths, returns, *costs = torch.cat([ended for _, ended in rows])[order].unbind(-1)
     return Episodes(returns, lengths, dict(zip(cost_keys, costs, strict=True)))
 
 
-# Far from any seed that a person counts up from a run's own.
+# far larger than what a user would add to a run's seed for further runs
 _OFFSET = 1_000_000_007
 
 
-# where a configuration does not say, or its environments have no layouts: every episode is new
+# defaults of keys, also for environments without layouts: every episode is new
 _UNLIMITED = {"randomize_layout": True, "layout_seeds": None, "layout_seeds_first": 0}
 
 
 def has_fixed_layout(env: Mapping[str, Any]) -> bool:
-    """Whether all episodes of a world have one layout, which is drawn from the seed."""
+    """Whether all episodes have one layout, which is drawn from the seed."""
     return not (_UNLIMITED | {**env})["randomize_layout"]
 
 
 def default_seed(env: Mapping[str, Any], training_seed: int) -> int:
     """Seed of an evaluation: not the one of training, so that layouts and noise are new.
 
-    If the layout is fixed, it is drawn from the seed and was learned in training; then the seed is
-    that of training.
+    A fixed layout is drawn from the seed, and the policy has learned on this layout only. With such
+    a layout, the seed is that of training.
     """
     return training_seed + (0 if has_fixed_layout(env) else _OFFSET)
 
@@ -167,7 +168,7 @@ def shared_layouts(
     return max(0, common) / len(ranges[1])
 
 
-# worlds that are stepped together at most
+# largest number of worlds that are stepped together
 _MOST_WORLDS = 50
 
 
@@ -182,7 +183,7 @@ class PeriodicEvaluation:
         policy: The policy; it shares the parameters that are trained.
         cost_keys: Keys of the costs to sum.
         interval: Steps of training from one evaluation to the next.
-        episodes: Episodes of each.
+        episodes: Episodes per evaluation.
         seed: Seed of the worlds, to which the steps of training are added, and of the policy's
             actions.
         fixed_layout: Whether all worlds have one layout, drawn from ``seed`` alone.
@@ -223,13 +224,13 @@ class PeriodicEvaluation:
         names = ["return", *self._cost_keys]
         if before // self._interval == after // self._interval:
             return {f"evaluation_{name}": math.nan for name in names}
-        # new ones every time: not all environments forget what was before a new seed
+        # new environments every time, because some keep a part of their state after a new seed
         worlds = min(self._episodes, _MOST_WORLDS)
         fresh = (self._seed + after) % 2**62
         seed = self._seed if self._fixed_layout else fresh
         devices = {parameter.device for parameter in self._policy.parameters() if parameter.is_cuda}
         with (
-            # first: environments that are made, and seeded, may draw from torch's generator
+            # before environments are made and seeded, which may draw from torch's generator
             torch.random.fork_rng(devices=devices),
             closing(self._make_env(num_envs=worlds, seed=seed)) as env,
         ):

@@ -35,7 +35,7 @@ def load_config(directory: Path) -> DictConfig:
     """Read the resolved configuration of a run.
 
     Raises:
-        FileNotFoundError: If the folder is not that of a run; runs below it are named.
+        FileNotFoundError: If the folder is not that of a run; the message names runs below it.
         ValueError: If the configuration is not that of a run, or not resolved.
     """
     run = RunFolder(directory)
@@ -49,10 +49,10 @@ def load_config(directory: Path) -> DictConfig:
 
 
 def override_env(config: DictConfig, overrides: Mapping[str, Any]) -> dict[str, Any]:
-    """The run's environment with some keys changed; of a mapping, only the named entries.
+    """The run's environment with some keys changed; in a mapping, only the named entries change.
 
     Raises:
-        ValueError: As by `check_env_keys`; the package's families look at their keys themselves.
+        ValueError: As in `check_env_keys`; the package's own environments check their keys later.
     """
     check_env_keys(config.env, overrides)
     changed = OmegaConf.merge(config.env, dict(overrides))
@@ -62,7 +62,7 @@ def override_env(config: DictConfig, overrides: Mapping[str, Any]) -> dict[str, 
 def limits_of(
     config: DictConfig, others: Mapping[str, float], cost_keys: Collection[str]
 ) -> dict[str, float]:
-    """Cost key -> d: the run's limits, some of them replaced by others.
+    """Cost key -> d: the run's limits on costs of the environment, some replaced by others.
 
     Raises:
         ValueError: If others name a cost that the environment does not have.
@@ -83,7 +83,7 @@ def limits_of(
 
 
 def transforms_of(config: DictConfig) -> dict[str, Any]:
-    """Nodes of the run's transforms, by name; earlier runs have none."""
+    """Configuration of the run's transforms, by name; runs of older versions have none."""
     return OmegaConf.to_container(config.get("transforms") or OmegaConf.create(), resolve=True)  # type: ignore[return-value]
 
 
@@ -110,12 +110,12 @@ def find_checkpoint(directory: Path, which: str) -> Path:
                 "path of a file."
             )
         return Path(which)
-    # readable or not: an older one is not silently put in its place
+    # the newest one, even if it cannot be read: an older one must not silently replace it
     folder = RunFolder(directory)
     found = {kind: folder.newest_checkpoint(kind) for kind in KINDS}
     found["best"] = best_checkpoint(folder.checkpoints / "best")
     path = found[which]
-    if which == "last" and not folder.has_begun:  # a policy without its run
+    if which == "last" and not folder.has_begun:  # only a policy, see `pack_policy`
         path = path or found["certified"]
     if path is None:
         reason = {
@@ -134,8 +134,8 @@ def load_policy(
 ) -> TensorDictModuleBase:
     """Build the run's policy and give it the weights of a checkpoint.
 
-    Only weights are read: neither the checkpoint nor the configuration can make code run. Nothing
-    keeps track of gradients, so that rollouts of it become arrays of NumPy's as they are.
+    Only weights are read: neither the checkpoint nor the configuration can make code run. No weight
+    requires gradients, so that rollouts can be converted to NumPy arrays directly.
 
     Raises:
         CheckpointError: If the file is no checkpoint, its policy does not fit the environment, or
@@ -163,8 +163,8 @@ def load_policy(
 def check_env_keys(env: Mapping[str, Any], keys: Iterable[str]) -> None:
     """Refuse keys that a custom environment does not have, with a `ValueError`.
 
-    Such a family ignores other keys, and the result would be said to be of another environment
-    than it is.
+    It would ignore such keys, and the results would be taken for those of an environment that was
+    not evaluated.
 
     Examples:
         >>> check_env_keys({"_target_": "mine.make", "edge": 1.0}, ["edgy"])

@@ -1,4 +1,4 @@
-"""A trained policy measured: from a run's folder to estimates, and their files in it."""
+"""Evaluation of a run's policy: whole episodes, estimates, and their files in the run's folder."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ __all__ = [
     "summarise",
 ]
 
-# which layouts are shown does not make it another environment
+# keys of the choice of layouts: with other values it is still the same environment
 _LAYOUTS = ("layout_seeds", "layout_seeds_first")
 
 
@@ -76,8 +76,8 @@ class Trial:
 
     Attributes:
         config: Configuration of the run; its ``env`` is the environment.
-        checkpoint: The policy's.
-        options: How it is run.
+        checkpoint: Checkpoint with the policy.
+        options: Options of the evaluation.
         make_env: ``make_env(node, num_envs=, device=, seed=, num_threads=)`` makes environments.
     """
 
@@ -93,12 +93,12 @@ class Trial:
 
     @property
     def seed(self) -> int:
-        """Of layouts and actions."""
+        """Seed of layouts and actions."""
         seed = self.options.seed
         return default_seed(self.node, self.config.seed) if seed is None else seed
 
     def facts(self, limits: Mapping[str, float], cost_keys: Collection[str]) -> dict[str, Any]:
-        """What is evaluated, and which limits on it: the run's, but for costs it does not have."""
+        """What is evaluated, how, and the limits; limits on missing costs are listed apart."""
         return {
             "environment": self.node.get("name", ""),
             "algorithm": self.config.algo.name,
@@ -121,17 +121,17 @@ class Trial:
         )  # fmt: skip
 
     def policy(self, env: EnvBase) -> TensorDictModuleBase:
-        """The policy, for such an environment."""
+        """The policy, for such an environment as `make` returns."""
         return load_policy(self.config, env, self.checkpoint, torch.device(self.options.device))
 
     def run(
         self, *, progress: bool = False, record: Path | None = None
     ) -> tuple[TensorDictModuleBase, Episodes, dict[str, float]]:
-        """The policy, whole episodes of it, and the limits on their costs.
+        """Run whole episodes; returns the policy, the episodes, and the limits on their costs.
 
         Args:
             progress: Whether to show a bar.
-            record: Folder for all steps; None: they are not recorded.
+            record: Folder to which all steps are written; None: they are not recorded.
         """
         options = self.options
         with closing(self.make(min(options.num_envs, options.episodes))) as env:
@@ -149,7 +149,7 @@ class Trial:
 
     def film(self, policy: TensorDictModuleBase, file: Path, **drawing: Any) -> None:
         """Write an episode as a film or a picture; ``drawing`` are keys of the environment."""
-        # the first world draws the same layouts whatever the number of worlds; actions are others
+        # world 0 has the same layouts for any number of worlds, but other random actions
         with closing(self.make(1, **drawing)) as single:
             torch.manual_seed(self.seed)
             form = video_format(single, file.suffix[1:])
@@ -168,7 +168,7 @@ def evaluate(
     suite: Suite,
     progress: bool = False,
 ) -> Evaluation:
-    """Run a trained policy for whole episodes and write what they say into the run's folder.
+    """Run a trained policy for whole episodes and write estimates into the run's folder.
 
     Args:
         directory: Folder of a run.
@@ -180,7 +180,7 @@ def evaluate(
 
     Raises:
         FileNotFoundError: If the folder is not a run's, or has no such checkpoint.
-        OSError: If what it finds cannot be written, which is seen before any episode.
+        OSError: If results cannot be written, which is checked before any episode.
         CheckpointError: If the checkpoint is damaged, or does not fit the environment.
         ConfigError: If the environment does not accept an override.
         ValueError: If an option is out of its range, or the environment cannot be drawn.
@@ -191,7 +191,7 @@ def evaluate(
     changed = config.copy()
     changed.env = override_env(config, options.env)
     trial = Trial(changed, checkpoint, options, make_env)
-    # environments that draw nothing unless they are told have a key for it
+    # some environments draw pictures only if this key asks for it
     drawing = {"render_mode": "rgb_array"} if "render_mode" in trial.node else {}
     run = RunFolder(directory)
     summary, table = (run.evaluation(options.name, kind) for kind in ("json", "csv"))
@@ -223,7 +223,7 @@ def evaluate(
 
 
 def check_places(places: Iterable[Path]) -> None:
-    """Refuse files in a run's folder that cannot be written, before any episode."""
+    """Refuse files that cannot be written, before any episode."""
     places = list(places)
     for folder in {place.parent for place in places}:
         check_no_links(folder)
@@ -240,10 +240,10 @@ def summarise(
     """Estimate everything that is reported of an evaluation.
 
     Args:
-        episodes: What happened.
+        episodes: Returns, lengths and costs of episodes.
         cost_limits: Cost key -> d, undiscounted cost per episode.
         reference: Characteristic metrics of the environment, for normalised scores; or None.
-        cvar_alpha: Share of the costliest episodes that the CVaR is the mean of.
+        cvar_alpha: Share of the costliest episodes, whose mean cost is the CVaR.
 
     Returns:
         Estimates by name: ``episode_return``, ``episode_length``, ``episode_<key>`` for every cost
@@ -266,7 +266,7 @@ def summarise(
         if key in cost_limits:
             estimates[f"over_limit_{key}"] = share_over(costs, cost_limits[key])
     if reference is not None:
-        # monotone in J_r and J_c, so the intervals' ends are those of J_r and J_c
+        # scores are monotone in J_r and J_c, so ends of intervals become ends of intervals
         figures = estimates["episode_return"], estimates["episode_cost"], math.nan
         limit = cost_limits.get("cost", math.nan)
         scores = normalise(*figures, limit=limit, reference=reference)

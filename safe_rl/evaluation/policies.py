@@ -1,4 +1,4 @@
-"""Trained policies for others: small folders, such as those of the package, and ONNX."""
+"""Export of trained policies: as small folders, such as those in the package, and as ONNX."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ def find_run(name: str | Path) -> Path:
 
 
 def writable_copy(directory: Path) -> Path:
-    """The folder itself, or of one of the package's policies a copy in the working directory."""
+    """The folder itself, or, if it is part of the package, a copy in the working directory."""
     if directory.parent != POLICIES:
         return directory
     copy = Path(_PREFIX, directory.name)
@@ -65,10 +65,10 @@ def writable_copy(directory: Path) -> Path:
 def pack_policy(run: Path, folder: Path, checkpoint: str = "certified") -> Path:
     """Write what is needed to use a run's policy into a folder of a few dozen kB.
 
-    The configuration, the command and the commit, of a certified checkpoint also the certificate,
-    and of the checkpoint the actor alone, in the format of all checkpoints, which is read without
-    unpickling objects. Returns the file of the weights; `FileNotFoundError` if there is no such
-    checkpoint.
+    The folder gets the configuration, the command, the commit, the certificate of a certified
+    checkpoint, and the actor's weights. They have the format of all checkpoints, which is read
+    without unpickling objects. Returns the file of the weights; raises `FileNotFoundError` if there
+    is no such checkpoint.
     """
     source, target = RunFolder(run), RunFolder(folder)
     path, config = find_checkpoint(run, checkpoint), load_config(run)
@@ -94,7 +94,7 @@ def pack_policy(run: Path, folder: Path, checkpoint: str = "certified") -> Path:
 
 
 class _MeanAction(nn.Module):
-    """Observations [N, D] to actions within the environment's bounds, [N, A]."""
+    """Module from observations [N, D] to mean actions within the environment's bounds, [N, A]."""
 
     _low: Tensor
     _high: Tensor
@@ -114,13 +114,13 @@ class _MeanAction(nn.Module):
 def export_onnx(config: DictConfig, env: EnvBase, checkpoint: Path, file: Path) -> None:
     """Write a policy's mean action as a function of the observation, scaling of inputs included.
 
-    The input ``observation`` is float32 [N, D] for any N, the output ``action`` [N, A]. ``env`` is
-    one like the run's, whose observations and actions are the policy's.
+    The input ``observation`` is float32 [N, D] for any N, the output ``action`` [N, A]. ``env`` has
+    to be an environment with the observations and actions of the run.
 
     Raises:
         ModuleNotFoundError: If the extra ``onnx`` is not installed.
-        ValueError: If observations are no vectors, or actions no numbers within bounds, or the
-            policy remembers earlier observations.
+        ValueError: If observations are no vectors, if actions are not numbers within bounds, or if
+            the policy is recurrent.
         CheckpointError: If the checkpoint does not fit the environment.
     """
     import_extra("onnx", "onnx")

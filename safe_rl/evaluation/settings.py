@@ -1,4 +1,4 @@
-"""What an evaluation and a certificate can be told."""
+"""Options of an evaluation and of a certificate."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ _NAME = Values(lambda v: "/" not in v and v.isprintable(), "a part of files' nam
 
 
 def option(default: Any, help: str) -> Any:
-    """A field of a command's options; a default that changes is given by what makes it."""
+    """A field of a command's options; `default` may be a function that makes the default."""
     kind = "default_factory" if callable(default) else "default"
     return field(metadata={"help": help}, **{kind: default})
 
@@ -66,7 +66,7 @@ class EvaluationOptions:
     seed: Annotated[int, Range(0, 2**62)] | None = option(
         None, "seed of layouts and actions; null: one that training never used"
     )
-    # worlds fill the memory, and more threads are not to be had
+    # with upper bounds, because memory and the number of threads are limited
     num_envs: Annotated[int, Range(1, 100_000)] = option(
         25, "environments that are stepped together"
     )
@@ -104,15 +104,15 @@ class CertificateOptions:
     """What is certified and by how many episodes: the section ``certificate`` of a configuration.
 
     Attributes:
-        ranking: Episodes per candidate that rank them.
-        episodes: New episodes of a test at most; 0: none.
-        tests: Candidates tested at most.
+        ranking: Number of episodes per candidate by which candidates are ranked.
+        episodes: Largest number of new episodes in each test; 0: no certificate.
+        tests: Largest number of candidates that are tested.
         level: Confidence of a certificate.
-        most_over: Share of episodes that may exceed a limit; 1 asks for nothing.
-        bound: Of means; betting holds for all costs.
-        cap: Cost up to which an episode counts; null: all of it, if the environment has a highest.
+        most_over: Share of episodes that may cost more than a limit; 1: no bound on this share.
+        bound: Kind of upper confidence bound of means; betting holds for all costs.
+        cap: Cost up to which an episode counts; null: all of it, if costs have an upper bound.
         most_beyond: Share of episodes that may cost more than the cap.
-        tail: Share of the costliest episodes whose mean is limited (CVaR); 1: all.
+        tail: Share of the costliest episodes whose mean is limited (CVaR); 1: all episodes.
     """
 
     ranking: Annotated[int, Range(2, 10**6)]
@@ -127,10 +127,10 @@ class CertificateOptions:
 
 
 def check_options(options: EvaluationOptions) -> None:
-    """Refuse what cannot be done before anything is.
+    """Refuse options that cannot be used, before any work begins.
 
     Raises:
-        ValueError: If an option is out of its range; the message names it.
+        ValueError: If an option is out of its range, or needs another one; the message names it.
     """
     for name, parameter in parameters_of(EvaluationOptions).items():
         parameter.check(name, getattr(options, name))

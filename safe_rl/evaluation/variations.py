@@ -1,4 +1,4 @@
-"""Variations of a run's environment: named changes of its keys, and a policy evaluated in each."""
+"""Evaluation of a policy in variations of its environment, which are named changes of its keys."""
 
 from __future__ import annotations
 
@@ -35,10 +35,10 @@ class Variation(NamedTuple):
     """A change of an environment.
 
     Attributes:
-        row: What is changed, a name.
-        value: To what, where the row has several values; else None.
+        row: Name of the row in the set of variations.
+        value: Value of the changed key, if the row has a list of values; else None.
         keys: Full key of a run's configuration -> value.
-        may_lack: Whether it is left out where the environment cannot have it.
+        may_lack: Whether it is left out, without an error, if the environment cannot have it.
     """
 
     row: str
@@ -55,12 +55,12 @@ def read_variations(given: Any) -> list[Variation]:
     """Variations that ``variations=…`` asks for, one for each value of a row's list.
 
     Args:
-        given: Name of a set in ``conf/variations``, of which environments may lack some; path of a
-            YAML of that form, keys by name, or a list of all these.
+        given: Name of a set in ``conf/variations`` (variations that the environment cannot have are
+            left out), path of such a YAML file, a mapping from row to keys, or a list of these.
 
     Raises:
-        ValueError: For a name that there is not, what is no set, or keys of something else than the
-            environment.
+        ValueError: If a set or file does not exist, has no rows, or has a key that is none of the
+            environment or of a transform.
 
     Examples:
         >>> [str(v) for v in read_variations({"mass": {"env.mass_scale": [0.5, 2.0]}})]
@@ -113,14 +113,14 @@ def _expand(row: str, keys: Any) -> Iterator[Variation]:
 
 
 def varied(config: DictConfig, variation: Variation) -> DictConfig | None:
-    """A run's configuration with a variation of its environment; None if it would be as it is.
+    """A run's configuration with a variation of its environment; None if nothing would change.
 
-    It is if that has these values itself, or none of the elements that they are about. A text
-    ``x1.5`` is 1.5 times the run's own value. Transforms that the run lacks are those of ``conf/``.
+    Nothing changes if the environment has these values already, or none of the elements that they
+    describe. A text ``x1.5`` is 1.5 times the run's own value. Other transforms are from ``conf/``.
 
     Raises:
-        ValueError: For a factor of what the environment lacks, or of no number; for a key that an
-            environment of one's own does not have.
+        ValueError: If a factor is given for a key that is missing or no number, or if a custom
+            environment does not have a key.
 
     Examples:
         >>> config = OmegaConf.create({"env": {"hazards_num": 8}})
@@ -148,10 +148,10 @@ def varied(config: DictConfig, variation: Variation) -> DictConfig | None:
 
 
 def _present(config: Any) -> dict[str, Any]:
-    """A configuration but for what a Safety Gym environment says of elements that it has not."""
+    """A configuration without the keys of Safety Gym's elements of which the environment has 0."""
     env = config["env"]
     absent = tuple(k.removesuffix("num") for k in env if k.endswith("_num") and env[k] == 0)
-    if "_target_" in env:  # another family's
+    if "_target_" in env:  # an environment of another family, without such elements
         absent = ()
     return {**config, "env": {key: env[key] for key in env if not key.startswith(absent)}}
 
@@ -160,11 +160,11 @@ AS_TRAINED = Variation("as trained", None, {})
 
 
 class VariedRow(NamedTuple):
-    """What was found under a variation.
+    """Estimates under a variation.
 
     Attributes:
-        variation: What was changed; `AS_TRAINED` for nothing.
-        estimates: As :func:`safe_rl.evaluation.summarise` returns them.
+        variation: The variation; `AS_TRAINED` if nothing was changed.
+        estimates: Name -> estimate, see :func:`safe_rl.evaluation.summarise`.
     """
 
     variation: Variation
@@ -173,12 +173,12 @@ class VariedRow(NamedTuple):
 
 @dataclass(frozen=True)
 class Varied:
-    """What an evaluation under variations found.
+    """The result of an evaluation under variations.
 
     Attributes:
-        rows: First the environment as trained on, then every variation.
+        rows: First the run's own environment, then every variation.
         left_out: Variations that this environment cannot have, and why.
-        facts: What was evaluated as trained on, and how.
+        facts: What was evaluated in the run's own environment, and how; see `Trial.facts`.
         file: The table.
     """
 
@@ -189,7 +189,7 @@ class Varied:
 
     @property
     def cost_limits(self) -> dict[str, float]:
-        """Cost key -> d, of the environment as trained on."""
+        """Cost key -> d, for the run's own environment."""
         return dict(self.facts["cost_limits"])
 
     def __str__(self) -> str:
@@ -226,19 +226,19 @@ def evaluate_variations(
 ) -> Varied:
     """Run a trained policy in its own environment and under ``options.variations``.
 
-    All of them draw from the same seed, so that what differs between them is not luck.
+    All environments have the same seed, so that differences between them are less due to chance.
 
     Args:
         directory: Folder of a run.
-        options: As for an evaluation; ``env`` changes every one of the environments.
-        make_env: ``make_env(node, num_envs=, device=, seed=, num_threads=)``.
-        progress: Whether to say what is next.
+        options: Options of the evaluation; ``env`` changes all of the environments.
+        make_env: ``make_env(node, num_envs=, device=, seed=, num_threads=)`` makes environments.
+        progress: Whether to print the name of the next variation.
 
     Raises:
         FileNotFoundError: If the folder is not a run's, or has no such checkpoint.
-        OSError: If what it finds cannot be written, which is seen before any episode.
+        OSError: If results cannot be written, which is checked before any episode.
         CheckpointError: If the policy does not fit a varied environment.
-        ValueError: For variations that there are not, or that an environment cannot have.
+        ValueError: If variations do not exist, or an environment cannot have them.
     """
     check_options(options)
     variations = read_variations(options.variations)
@@ -272,9 +272,9 @@ def evaluate_variations(
 
 
 def _write(path: Path, rows: Sequence[VariedRow]) -> None:
-    """A row per variation: what was changed to what, and every estimate with its interval.
+    """Write a row per variation: the changed keys, and every estimate with its interval.
 
-    Nothing stands where a variation does not have the cost of another one.
+    Fields are empty if the varied environment does not have a cost that another one has.
     """
     names = list(dict.fromkeys(name for row in rows for name in row.estimates))
     columns = [f"{name}{end}" for name in names for end in ("", "_low", "_high")]
@@ -282,6 +282,6 @@ def _write(path: Path, rows: Sequence[VariedRow]) -> None:
     for variation, estimates in rows:
         changes = " ".join(f"{key}={changed}" for key, changed in variation.keys.items())
         found = [number for name in names for number in estimates.get(name, ("", "", ""))]
-        # no value is an empty field
+        # a value of None becomes an empty field
         table.append([str(variation), variation.row, variation.value, changes, *found])
     replace_csv(path, table)

@@ -30,13 +30,13 @@ __all__ = [
 
 
 class VideoFormat(NamedTuple):
-    """How an episode is recorded.
+    """Format in which an episode is recorded.
 
     Attributes:
-        width: Of the picture in pixels, where the environment lets it be chosen.
-        height: Likewise.
+        width: Width of the picture in pixels, if the environment lets it be chosen.
+        height: Height of the picture in pixels, if the environment lets it be chosen.
         steps_per_frame: Environment steps from one frame to the next.
-        frames_per_second: When it is played.
+        frames_per_second: Frames per second of playback.
     """
 
     width: int
@@ -46,21 +46,21 @@ class VideoFormat(NamedTuple):
 
 
 FORMATS = {
-    # of what does not say how long its steps are; 1000 last 20 s
+    # for environments that do not say how long a step lasts; 1000 steps last 20 s
     "mp4": VideoFormat(640, 480, 2, 25),
-    # 1000 steps last 10 s, whatever is shown, so that no picture gets too large for a page
+    # 1000 steps last 10 s for any environment, so that no picture gets too large for a page
     **dict.fromkeys(PICTURES, VideoFormat(400, 300, 5, 20)),
 }
-"""Suffix of a file -> how an episode is recorded into it."""
+"""Suffix of a file -> format in which an episode is recorded."""
 DEFAULT_CAMERA = "free"
 _CAPTION = 20  # height of the line below the picture [pixels]
-_FRAME = 0.04  # of an MP4, in the time of what is recorded [s]
+_FRAME = 0.04  # simulated time from one frame of an MP4 to the next [s]
 
 
 def video_format(env: EnvBase, suffix: str) -> VideoFormat:
-    """How an episode of an environment is recorded into a file of a suffix of :data:`FORMATS`.
+    """Format of the recording of an environment's episode, for a suffix in :data:`FORMATS`.
 
-    A video plays as fast as what it shows, where the environment has ``seconds_per_step``.
+    An MP4 plays in real time, if the environment has ``seconds_per_step``.
     """
     form, seconds, together = FORMATS[suffix], env.seconds_per_step, env.steps_per_decision
     rate = form.steps_per_frame * form.frames_per_second  # steps in a second of the video
@@ -72,11 +72,11 @@ def video_format(env: EnvBase, suffix: str) -> VideoFormat:
 
 
 def check_camera(env: EnvBase, camera: str, suffix: str = "mp4") -> None:
-    """Draw a picture, to notice before any episode what would prevent a video.
+    """Draw a picture, to find out before any episode whether a video can be made.
 
     Raises:
-        ValueError: If the environment draws no pictures, whatever its ``render`` fails of, or has
-            no such camera.
+        ValueError: If the environment has no ``render`` or no such camera, or if its ``render``
+            fails for any reason.
         ModuleNotFoundError: If the encoder is missing; the message names the extra.
     """
     if suffix == "mp4":
@@ -90,24 +90,24 @@ def check_camera(env: EnvBase, camera: str, suffix: str = "mp4") -> None:
     env.reset()
     try:
         _picture(env, camera, FORMATS[suffix])
-    except Exception as error:  # a 'render' is anybody's
+    except Exception as error:  # the 'render' of any library may raise anything
         words = " ".join(str(error).split()) or type(error).__name__
         raise ValueError(f"{asked}: this environment cannot be drawn: {words}") from error
 
 
 def _picture(env: EnvBase, camera: str, form: VideoFormat) -> Image.Image:
-    """World 0 as it is; sizes and cameras where they can be chosen."""
+    """Picture of world 0; with this size and camera, if `render` has arguments for them."""
     wanted = {"rows": 0, "camera": camera, "width": form.width, "height": form.height}
     known = signature(env.render).parameters
     pixels = np.asarray(env.render(**{k: v for k, v in wanted.items() if k in known}))
-    if pixels.dtype == object:  # None, or a list of it
+    if pixels.dtype == object:  # None, or a list of None
         raise ValueError(
             "its 'render' draws no picture; one of Gymnasium's may have to be made with "
             "render_mode=rgb_array, here one of env.kwargs"
         )
-    # grey ones, and those with a fourth channel, are pictures, too
+    # also grey pictures, and those with a fourth channel
     picture = Image.fromarray(pixels[0] if pixels.ndim == 4 else pixels)
-    # the encoding halves both sides
+    # the encoder needs sides that can be halved
     return picture.crop((0, 0, picture.width // 4 * 4, picture.height // 4 * 4))
 
 
@@ -123,8 +123,8 @@ def record_episode(
 ) -> Iterator[np.ndarray]:
     """Run one episode and yield its frames, uint8 [height, width, 3].
 
-    The last one shows how it ended, and below that what it has come to. The environment has one
-    world; the first of its costs is counted below the picture.
+    Below each picture are the step, the return and the sum of the first cost so far. The last frame
+    shows the final state. The environment must have batch size [1].
     """
     state = env.reset()
     total = dict.fromkeys((env.return_key, *cost_keys[:1]), 0.0)
@@ -145,8 +145,8 @@ def record_episode(
 def _frame(
     picture: Image.Image, step: int, episode_return: float, cost: float | None = None
 ) -> np.ndarray:
-    """The picture above a line with what the episode has come to, uint8 [height, width, 3]."""
-    # a text is not cut off below a narrow picture
+    """The picture above a line with step, return and cost so far, uint8 [height, width, 3]."""
+    # at least as wide as the text
     canvas = Image.new("RGB", (max(picture.width, 280), picture.height + _CAPTION), "white")
     canvas.paste(picture)
     text = f"step {step:>5}     return {episode_return:>7.2f}"
@@ -168,7 +168,7 @@ def write_video(path: Path, frames: Iterator[np.ndarray], form: VideoFormat) -> 
 
 
 def _write_mp4(path: Path, frames: Iterator[np.ndarray], rate: float) -> None:
-    # pixel format and index at the front: what browsers ask of a video
+    # browsers need this pixel format, and the index at the front of the file
     with import_extra("imageio.v2", "video").get_writer(
         path, format="FFMPEG", fps=rate, codec="libx264", pixelformat="yuv420p",
         macro_block_size=4, ffmpeg_log_level="error",
@@ -181,7 +181,7 @@ def _write_mp4(path: Path, frames: Iterator[np.ndarray], rate: float) -> None:
 def _write_animation(path: Path, frames: Iterator[np.ndarray], rate: float) -> None:
     pictures = [Image.fromarray(frame) for frame in frames]
     if path.suffix == ".gif":
-        # one palette for all, and no dither, so that what stands still is stored once
+        # one palette for all frames, and no dither, so that static parts are stored only once
         few = np.concatenate([np.asarray(one) for one in pictures[:: len(pictures) // 8 + 1]])
         palette = Image.fromarray(few).quantize(64)
         pictures = [p.quantize(palette=palette, dither=Image.Dither.NONE) for p in pictures]

@@ -1,6 +1,6 @@
-"""Constrained losses, advantages and multipliers.
+"""Losses of constrained algorithms, advantage estimators and Lagrange multipliers.
 
-Everything here reads and writes TensorDict keys, and does not depend on an environment.
+They read and write entries of TensorDicts, and do not depend on an environment.
 """
 
 from safe_rl.objectives.actor_critic import ActorCriticLoss, JointAdvantages

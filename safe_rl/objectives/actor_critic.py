@@ -15,14 +15,14 @@ from safe_rl.objectives.surrogate import SurrogateLoss
 
 
 class ActorCriticLoss(LossModule):
-    """A policy loss and the critics' loss in one, for trainers with a single optimiser.
+    """Policy loss and critic loss in one module, for trainers with a single optimiser.
 
-    Such as `torchrl.trainers.algorithms.PPOTrainer`.
+    One such trainer is `torchrl.trainers.algorithms.PPOTrainer`.
 
     Args:
         policy_loss: A `PPOLoss`, a `PPOLagrangianLoss` or another `SurrogateLoss`.
-        critic_loss: Of the reward critic and, for constraints, the cost critic.
-        critic_coeff: Factor of the critics' losses.
+        critic_loss: Loss of the reward critic and, with constraints, of the cost critic.
+        critic_coeff: Factor by which the critics' losses are multiplied.
 
     Examples:
         >>> from safe_rl.models import make_actor, make_critic
@@ -59,7 +59,7 @@ class ActorCriticLoss(LossModule):
         return list(dict.fromkeys([*self.policy_loss.in_keys, *self.critic_loss.in_keys]))
 
     def set_keys(self, **kwargs: NestedKey) -> None:
-        """Name entries of the batch; each part takes the names that it knows."""
+        """Set the keys of batch entries; each of the two losses gets the keys that it has."""
         parts: tuple[LossModule, LossModule] = (self.policy_loss, self.critic_loss)
         for part in parts:
             known = part._AcceptedKeys.__dataclass_fields__
@@ -79,7 +79,7 @@ class ActorCriticLoss(LossModule):
 class JointAdvantages(TensorDictModuleBase):
     """Normalised advantages of the reward and of the costs, in one call per batch.
 
-    Stands where TorchRL's trainers expect a `GAE`.
+    TorchRL's trainers accept it in place of their `GAE`.
 
     Args:
         reward: Estimator of the reward advantage.
@@ -113,7 +113,7 @@ class JointAdvantages(TensorDictModuleBase):
         return [key for part in self._estimators for key in part.out_keys]
 
     def set_keys(self, **kwargs: Any) -> None:
-        """Name entries of the reward's estimator; ``done`` and ``terminated`` go to both."""
+        """Set keys of the reward's estimator; ``done`` and ``terminated`` also of the costs'."""
         self.reward.set_keys(**kwargs)
         if self.cost is not None:
             ends = {name: kwargs[name] for name in ("done", "terminated") if name in kwargs}

@@ -35,13 +35,13 @@ class VectorGAE(Checked, ValueEstimatorBase):
     once, it evaluates every observation once, and it has a choice of value targets.
 
     Args:
-        value_network: Writes the value key, [..., T, F], one output per signal; None if the
-            values are in the TensorDict already, at the root and under ``"next"``. The state of a
-            recurrent one, such as an ``LSTMModule``, is read from the rollout where trajectories
-            end.
+        value_network: Critic, which writes the value key, [..., T, F], one output per signal; None
+            if the values are in the TensorDict already, at the root and under ``"next"``. At the
+            ends of trajectories, a recurrent critic (with an ``LSTMModule``) reads its recurrent
+            state from the rollout.
         gamma: Discount per step.
         lmbda: Decay λ of the TD errors in generalised advantage estimation.
-        value_target: What critics learn: ``"lambda_return"`` (advantage + value) or
+        value_target: Target of the critics: ``"lambda_return"`` (advantage + value) or
             ``"return_to_go"`` (discounted sum of the signal to the trajectory's end, bootstrapped
             there unless it terminated).
 
@@ -110,7 +110,7 @@ class VectorGAE(Checked, ValueEstimatorBase):
         params: TensorDictBase | None = None,
         target_params: TensorDictBase | None = None,
     ) -> TensorDictBase:
-        """Write advantages and value targets into a rollout; 0 where it is padded.
+        """Write values, advantages and value targets into a rollout; they are 0 in padding.
 
         Args:
             tensordict: Rollout [..., T] with `in_keys`, or these entries as keyword arguments.
@@ -119,8 +119,8 @@ class VectorGAE(Checked, ValueEstimatorBase):
 
         Raises:
             KeyError: If an entry is missing.
-            ValueError: If values, signals and ends do not match in shape, something stands between
-                time and the signals, or `target_params` is given.
+            ValueError: If values, signals and ends do not match in shape, if there is a dimension
+                between time and the signals, or if `target_params` is given.
             FloatingPointError: If a signal, an observation or a value is not finite.
         """
         if target_params is not None:
@@ -145,7 +145,7 @@ class VectorGAE(Checked, ValueEstimatorBase):
             tensordict: Rollout [..., T] with `in_keys`.
             target_params: Must be None, as in `forward`.
             next_value: Values of the next observations, [..., T, F], instead of the network's.
-            kwargs: Of other estimators, ignored.
+            kwargs: Arguments of TorchRL's other estimators; they are ignored.
         """
         if target_params is not None:
             raise ValueError(_ONE_PASS)
@@ -216,7 +216,7 @@ class CostGAE(VectorGAE):
 
     Args:
         cost_keys: Keys of the costs under ``"next"``, in the order of the k outputs.
-        value_network: Cost critic, writes ``cost_value`` [..., T, k]; or None.
+        value_network: Cost critic, which writes ``cost_value`` [..., T, k]; None: see `VectorGAE`.
         settings: ``gamma``, ``lmbda`` and ``value_target``, see `VectorGAE`.
 
     Examples:

@@ -1,4 +1,4 @@
-"""Loss of CAL: a conservative critic of costs, and an augmented Lagrangian."""
+"""Loss of CAL, an off-policy algorithm: conservative cost critics, and an augmented Lagrangian."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ from safe_rl.ranges import NotNegative, Range, Weight
 
 
 def discounted_share(gamma: float, episode_length: Tensor) -> Tensor:
-    """Discounted cost per cost of an episode, if costs are spread evenly over its T steps.
+    """Ratio of an episode's discounted to its undiscounted cost, for equal costs in all T steps.
 
-    (1 − γᵀ) / ((1 − γ) T): the factor of limits in the published code.
+    It is (1 − γᵀ) / ((1 − γ) T). The published code multiplies limits by this factor.
 
     Examples:
         >>> discounted_share(0.99, torch.tensor(1000.0))
@@ -29,7 +29,7 @@ def discounted_share(gamma: float, episode_length: Tensor) -> Tensor:
 
 
 class CALLoss(SACLagrangianLoss):
-    """SAC on an augmented Lagrangian of a conservative estimate of the costs.
+    """SAC on an augmented Lagrangian, with costs that are overestimated on purpose.
 
     Wu, Tang, Lin, Yu, Mao, Xie, Wang, Wang, *Off-Policy Primal-Dual Safe Reinforcement Learning*
     (ICLR 2024). The cost of an action is Q_i = mean + κ std of an ensemble (conservative policy
@@ -37,23 +37,24 @@ class CALLoss(SACLagrangianLoss):
 
         λ̂_i = max(0, λ_i − c (d'_i − E[Q_i]) / u_i)                   (local policy convexification)
 
-    which is the gradient of (1 / 2c) Σ_i max(0, λ_i + c (E[Q_i] − d'_i) / u_i)². So near the limit
-    the objective is convex in E[Q_i], and the policy converges to the limit instead of oscillating
-    about it. The expectation is over a minibatch.
+    the derivative of (1 / 2c) Σ_i max(0, λ_i + c (E[Q_i] − d'_i) / u_i)² by E[Q_i] / u_i. So near
+    the limit the objective is convex in E[Q_i], and the policy converges to the limit instead of
+    oscillating about it. The expectation is over a minibatch; u_i is explained in `CostCritics`.
 
-    λ and the limit d are about undiscounted costs of episodes, but E[Q_i] is discounted. The
-    article converts d by `discounted_share`. This has an error of some 30 %: states in a replay
-    buffer are those of older policies, and costs are not spread evenly. With c = 10, this error
-    shifts λ̂ by more than λ can compensate. So d' = ρ d with a measured ρ: the mean of the critics
-    (without κ) divided by the cost of episodes, both averaged over past batches.
+    λ and the limit d are for undiscounted costs of episodes, but E[Q_i] is discounted. The article
+    converts d by `discounted_share`. This has an error of some 30 %, because states in a replay
+    buffer are from older policies, and costs are not spread evenly. With c = 10, this error shifts
+    λ̂ by more than λ can compensate. So d' = ρ d, where ρ is measured: the critics' mean prediction
+    (without κ) divided by the mean cost of an episode, both averaged over past batches.
 
     Args:
-        networks: Actor, Q functions and cost Q functions, as of `SACLagrangianLoss`.
-        convexity: Weight c per unit of discounted cost beyond the limit.
-        ratio_memory: Weight of the past batches in ρ.
-        largest_ratio: Factor by which ρ may differ from `discounted_share`, up or down; 1 for the
+        networks: Actor, Q functions and cost Q functions, as in `SACLagrangianLoss`.
+        convexity: Penalty coefficient c of the augmented Lagrangian, per unit of discounted cost
+            above the limit.
+        ratio_memory: Weight of past batches in the moving averages whose ratio is ρ.
+        largest_ratio: Largest factor between ρ and `discounted_share`, up or down; 1 for the
             article's conversion.
-        settings: Those of a `SACLagrangianLoss`.
+        settings: Settings of a `SACLagrangianLoss`.
 
     Attributes:
         discounted_limit: d', [k]; infinite, so that λ̂ is 0, until `calibrate` sets it.
@@ -94,12 +95,12 @@ class CALLoss(SACLagrangianLoss):
         self.out_keys = [*self.out_keys, "cost_weight"]
         zeros = torch.zeros_like(self.cost_unit)
         self.register_buffer("discounted_limit", torch.full_like(zeros, torch.inf))
-        # averages of the critics' means and of J_c; sum and number of the critics' means since
+        # averages over batches, of predicted costs and of J_c; sum and number of new predictions
         self.register_buffer("known_costs", torch.zeros(2, *zeros.shape, device=zeros.device))
         self.register_buffer("critics_say", torch.zeros(2, *zeros.shape, device=zeros.device))
 
     def cost_weights(self, values: Tensor) -> Tensor:
-        """λ̂ / u, [k]; the critics' means are summed for `calibrate`."""
+        """λ̂ / u, [k]; also adds the critics' mean predictions to the sums for `calibrate`."""
         means = values.flatten(0, -2).mean(0).to(self.critics_say)
         self.critics_say.add_(torch.stack([means, torch.ones_like(means)]))
         charged = self.charged(values).flatten(0, -2).mean(0)
@@ -108,12 +109,12 @@ class CALLoss(SACLagrangianLoss):
         return weight.clamp_min(0) / self.cost_unit
 
     def calibrate(self, episodes: KnownCosts) -> None:
-        """Compute d' from the last updates and the new batch (limit = J_c − violation)."""
+        """Compute d' from predictions since the last call and a new batch (d = J_c − violation)."""
         super().calibrate(episodes)
-        said, number = self.critics_say
+        total, number = self.critics_say
         expected = discounted_share(self.gamma, episodes.episode_length)
         if number.any():
-            news = torch.stack([said / number, episodes.costs])
+            news = torch.stack([total / number, episodes.costs])
             self.known_costs.lerp_(news, 1 - self.ratio_memory)
             self.critics_say.zero_()
         by_critics, by_episodes = self.known_costs

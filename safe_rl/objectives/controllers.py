@@ -1,4 +1,4 @@
-"""Lagrange multipliers by PI and PID controllers."""
+"""Lagrange multipliers that are outputs of PI and PID controllers."""
 
 from __future__ import annotations
 
@@ -13,24 +13,25 @@ from safe_rl.ranges import NotNegative, Positive, Range, Weight
 
 
 class PIMultiplier(Multiplier):
-    """λ = clip(K_P Δ + I, 0, highest), I ← clip(I + K_I Δ, 0, highest), |Δ| ≤ saturation.
+    """Multiplier from a proportional-integral (PI) controller of the violation.
 
-    Δ = (J_c − d) / scale. The integral stops at the bounds of λ (anti-windup by clamping).
-    Violations are bounded too; otherwise a cost of six times the limit would raise the integral
-    several times as fast as a cost of 0 lowers it.
+    λ = clip(K_P Δ + I, 0, highest) and I ← clip(I + K_I Δ, 0, highest), with Δ = (J_c − d) / scale
+    and |Δ| ≤ saturation. The integral stops at the bounds of λ (anti-windup by clamping). Without
+    the bound on Δ, a cost of six times the limit would raise the integral several times as fast as
+    a cost of 0 lowers it.
 
-    For the controller, a policy behaves like an integrator: per update, J_c changes by about β (λ*
-    − λ) times the limit. λ* is the multiplier that keeps J_c constant, and β ≈ ¼ or less. PI
-    control of an integrator has the natural frequency √(β K_I) and the damping ½ K_P √(β / K_I); an
-    integral alone has no damping. K_P = 4 and K_I = 0.4 give a period of 20 updates and a damping
-    of 1.6. If β is a tenth, the damping is 1.
+    For the controller, a policy behaves like an integrator: per update, J_c changes by about
+    β (λ* − λ) times the limit, where λ* is the multiplier that keeps J_c constant. PI control of an
+    integrator has the natural frequency √(β K_I) and the damping ratio ½ K_P √(β / K_I); an
+    integral alone has no damping. In our runs β is about ¼ or less. For β = ¼, K_P = 4 and
+    K_I = 0.4 give a period of 20 updates and a damping ratio of 1.6; for β = 0.1 the ratio is 1.
 
     Args:
         cost_limits: Mapping from cost key to limit d, or limits alone; see `parse_cost_limits`.
         init: Initial λ, at most `highest`, for all costs or one per cost.
         kp: Proportional gain K_P.
         ki: Integral gain K_I.
-        saturation: Bound of the size of the error Δ, in units of the limit.
+        saturation: Bound of the absolute value of the error Δ, in units of the limit.
         highest: Upper bound of λ. The reward keeps at least the weight 1 / (1 + highest) in a
             Lagrangian loss with one cost.
 
@@ -76,12 +77,12 @@ class PIMultiplier(Multiplier):
 
 
 class PIDMultiplier(Multiplier):
-    """λ = (K_P Δ + I + K_D ∂)₊ (Stooke, Achiam and Abbeel 2020, algorithm 2).
+    """Multiplier from a PID controller (Stooke, Achiam and Abbeel 2020, algorithm 2).
 
-    With the error Δ = (J_c − d) / scale, one update is
+    λ = (K_P Δ + I + K_D ∂)₊. With the error Δ = (J_c − d) / scale, the terms are
 
     - proportional: Δ, smoothed by an exponential moving average;
-    - integral: I ← (I + K_I Δ)₊, unsmoothed, in units of λ: it starts at `init`;
+    - integral: I ← (I + K_I Δ)₊, with the unsmoothed Δ, in units of λ; it starts at `init`;
     - derivative: ∂ = (J − J')₊, the growth of the smoothed J = J_c / scale over the last
       `derivative_delay` updates. Costs before the first update count as 0, as in the paper.
 
@@ -93,9 +94,9 @@ class PIDMultiplier(Multiplier):
         kd: Derivative gain K_D.
         proportional_ema: Weight of the past in the smoothed error Δ; 0 is no smoothing.
         derivative_ema: Weight of the past in the smoothed cost J; 0 is no smoothing.
-        derivative_delay: Updates over which the growth of the cost is measured.
+        derivative_delay: Number of updates over which the growth of the cost is measured.
         scale: Unit of the errors: one number, one per cost, or ``"limit"`` for the limits
-            themselves, which makes the gains independent of the units of a cost. The paper's is 1.
+            themselves, which makes the gains independent of a cost's units. The paper uses 1.
 
     Examples:
         >>> gains = {"kp": 0.1, "ki": 0.01, "kd": 0.0, "init": 0.0, "scale": 1.0}

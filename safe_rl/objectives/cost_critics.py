@@ -1,4 +1,4 @@
-"""Critics of k costs, for any loss on Q functions."""
+"""Critics of k costs, for off-policy losses."""
 
 from __future__ import annotations
 
@@ -21,38 +21,38 @@ _COSTS = "cost_qvalue_network"
 
 
 class CostCritics(QFunctionLoss):
-    """k cost critics for a loss on Q functions: their TD(0) loss, and the penalty on the actor.
+    """Mixin that adds k cost critics to an off-policy loss: their TD(0) loss, the actor's penalty.
 
-    A policy that minimises Q_c exploits its underestimates, and bootstrapping spreads these.
-    Rewards bootstrap on the smaller of two networks. Costs bootstrap on mean_E Q' + κ' std_E Q',
-    which is the larger of two networks for κ' = 1. The penalty on an action is r Σ_i λ_i (mean_E
-    Q_i + κ std_E Q_i) / u_i, where u is the size of one cost and r the size of rewards: with λ = 1
-    one cost has the weight of a reward of one standard deviation. The sum of the actor's objective
-    and this penalty is divided by 1 + Σ λ_i / u_i, so that the step size does not grow with λ.
+    A policy that minimises Q_c exploits actions whose cost is underestimated, and bootstrapping
+    spreads such errors. Against this, TD targets use mean_E Q' + κ' std_E Q' over an ensemble of E
+    networks: for E = 2 and κ' = 1, the larger of the two. The actor's loss gets the penalty
+    r Σ_i λ_i (mean_E Q_i + κ std_E Q_i) / u_i, where u_i is the typical size of one cost and r the
+    standard deviation of rewards: with λ = 1, one cost weighs as much as a reward of size r. Loss
+    and penalty are divided by 1 + Σ λ_i / u_i, so that the step size does not grow with λ.
 
-    A base class to put before the loss without costs, whose critic and actor losses call
-    `cost_qvalue_loss` and `penalised`.
+    In a class definition it comes before the loss without costs. The critic loss has to call
+    `cost_qvalue_loss`, and the actor loss `penalised`.
 
     Args:
-        actor_network, qvalue_network: Of the loss without costs.
+        actor_network, qvalue_network: Networks of the loss without costs.
         cost_qvalue_network: A `safe_rl.models.QEnsemble` with one output per cost.
         multiplier: λ; read at every call. It is not part of the loss or its ``state_dict``.
-        cost_keys: Costs below ``next``, [..., 1] each; of transitions over n steps their discounted
-            sums, which TorchRL's `MultiStepTransform` makes of no more than its ``reward_keys``.
-        pessimism: Standard deviations κ among the cost critics that are added to their mean.
-        target_pessimism: The same for the value that all critics bootstrap on; None: every critic
-            bootstraps on its own target network.
+        cost_keys: Keys of the costs below ``next``, [..., 1] each. Transitions over n steps need
+            discounted sums of costs: name the costs in ``reward_keys`` of `MultiStepTransform`.
+        pessimism: Number κ of standard deviations among the cost critics that is added to their
+            mean in the actor's loss.
+        target_pessimism: Number κ' of standard deviations among the cost critics that is added to
+            their mean in TD targets; None: every critic bootstraps on its own target network.
         lowest_cost_value: Lower bound of the values that critics bootstrap on, such as 0 if no cost
             is negative; None: no bound.
-        settings: Those of the loss without costs.
+        settings: Settings of the loss without costs.
 
     Raises:
         ValueError: If the cost critic is no ensemble.
 
     Attributes:
-        cost_unit: u, the size of one cost, [k]; 1 until `calibrate` is called.
-        reward_unit: r, the standard deviation of the rewards of single steps; 1 until `measure` is
-            called.
+        cost_unit: u, the typical size of one cost (`EpisodeCosts.unit`), [k]; 1 before `calibrate`.
+        reward_unit: r, the standard deviation of the rewards of single steps; 1 before `measure`.
     """
 
     _in_keys: list[NestedKey]
@@ -93,7 +93,7 @@ class CostCritics(QFunctionLoss):
         self.__dict__["multiplier"] = multiplier
         self.register_buffer("cost_unit", torch.ones(len(cost_keys), device=device))
         self.register_buffer("reward_unit", torch.ones((), device=device))
-        # number, sum and sum of squares
+        # number, sum and sum of squares of the rewards so far
         self.register_buffer("reward_sums", torch.zeros(3, dtype=torch.float64, device=device))
 
     def _set_in_keys(self) -> None:
@@ -101,12 +101,12 @@ class CostCritics(QFunctionLoss):
         self._in_keys = [*self._in_keys, *(("next", key) for key in self.cost_keys)]
 
     def expected(self, values: Tensor) -> Tensor:
-        """Expected costs of actions, [..., k], from outputs [E, ..., k] of the critics."""
+        """Expected discounted costs of actions, [..., k], from critics' outputs [E, ..., k]."""
         return values.mean(0)
 
     @torch.no_grad()
     def cost_bias(self, batch: TensorDictBase) -> Tensor:
-        """Bias of the predictions on steps [N, T] of the current policy, [k]; see `critic_bias`."""
+        """Bias of the critics on steps [N, T] of the current policy, [k]; see `critic_bias`."""
         keys = self.tensor_keys
         steps = batch.select(*self.in_keys, ("next", keys.done), strict=False)
         steps = steps.to(self.cost_unit.device)
@@ -116,11 +116,11 @@ class CostCritics(QFunctionLoss):
         return critic_bias(self.expected(values), costs, *ends, self.gamma)
 
     def calibrate(self, episodes: KnownCosts) -> None:
-        """Update the size of one cost, before the updates of a batch."""
+        """Update the size u of one cost; called before the gradient steps of every batch."""
         self.cost_unit.copy_(episodes.unit)
 
     def measure(self, rewards: Tensor) -> None:
-        """Update the size of rewards with the rewards of new steps, [...]."""
+        """Update the standard deviation r of rewards with the rewards of new steps, [...]."""
         rewards = rewards.detach().flatten().to(self.reward_sums)
         powers = torch.stack([torch.ones_like(rewards), rewards, rewards.square()])
         self.reward_sums.add_(powers.sum(-1))
@@ -144,16 +144,16 @@ class CostCritics(QFunctionLoss):
     def cost_errors(
         self, found: Tensor, costs: Tensor, discount: Tensor, following: Tensor
     ) -> Tensor:
-        """Distance of the critics from their targets, for every step.
+        """Distance of the critics from their TD(0) targets, for every step.
 
         Args:
             found: Outputs of the networks, [E, ..., k].
-            costs: Of the steps, [..., k].
-            discount: Of what follows, 0 after an end, [..., 1].
-            following: Outputs of the target networks for what follows, [E, ..., k].
+            costs: Costs of the steps, [..., k].
+            discount: Discount of the next state's value, 0 if the episode terminated, [..., 1].
+            following: Outputs of the target networks in the next state, [E, ..., k].
 
         Returns:
-            Distances from TD(0) targets, [E, ..., k].
+            The distances, [E, ..., k].
         """
         target = costs + discount * self.bounded(following)
         return distance_loss(found, target, loss_function=self.loss_function)
@@ -168,20 +168,20 @@ class CostCritics(QFunctionLoss):
     def penalised(
         self, objective: Tensor, tensordict: TensorDictBase, action: Tensor
     ) -> tuple[Tensor, dict[str, Tensor]]:
-        """The actor's objective [...] with the costs of its actions, and figures."""
+        """The actor's loss [...] with the cost penalty, and diagnostics."""
         values = self.q_values(_COSTS, tensordict, action, "frozen")
         weights = self.cost_weights(values.detach()).to(values)
         charges = self.reward_unit * (self.charged(values) @ weights)
         objective = (objective + charges) / (1 + weights.sum())
-        figures = {**self.cost_figures(values.detach()), "cost_weight": weights}
-        return objective, {name: x for name, x in figures.items() if name in self.out_keys}
+        reported = {**self.cost_figures(values.detach()), "cost_weight": weights}
+        return objective, {name: x for name, x in reported.items() if name in self.out_keys}
 
     def charged(self, values: Tensor) -> Tensor:
-        """Costs in the actor's objective, [..., k], from outputs [E, ..., k] of the critics."""
+        """Costs of actions as the actor's loss has them, [..., k], from outputs [E, ..., k]."""
         return pessimistic(values, self.pessimism)
 
     def cost_weights(self, values: Tensor) -> Tensor:
-        """Weights of the costs in the actor's objective, [k]: λ / u."""
+        """Weights of the costs in the actor's loss, [k]: λ / u."""
         return self.multiplier.value.to(self.cost_unit) / self.cost_unit
 
     def cost_figures(self, values: Tensor) -> dict[str, Tensor]:

@@ -20,13 +20,13 @@ from torch import Tensor
 
 #: Tolerance on constraints, in units of the radius of the trust region.
 _FEASIBILITY = 1e-6
-#: Sine of the angle between constraints below which they are never active together.
+#: Smallest sine of the angle between the gradients of constraints that are active together.
 _DEPENDENT = 1e-6
-#: Part of the squared gradient outside the active constraints below which it counts as none.
+#: Share of the squared gradient outside the span of the active constraints that counts as 0.
 _PARALLEL = 1e-8
 #: bᵀH⁻¹b below which a constraint's gradient counts as zero.
 _VANISHING = 1e-16
-#: Ridge on S in a recovery, which keeps contradicting constraints from an infinite step.
+#: Ridge added to S in a recovery; without it, contradicting constraints give an infinite step.
 _RIDGE = 1e-6
 
 
@@ -34,13 +34,14 @@ class DualSolution(NamedTuple):
     """Solution of the dual; the step is x = −(reward_coefficient·v + Σᵢ cost_coefficientᵢ·wᵢ).
 
     Attributes:
-        case: [...] int. 4: no constraint has a gradient; 3: whole trust region feasible;
-            2: a boundary crosses it, the policy is inside; 1: the same from outside;
-            0: nothing in the trust region is feasible, the step only recovers.
+        case: Case of the problem, [...] int. 4: no constraint has a gradient; 3: the whole trust
+            region is feasible; 2: a constraint's boundary crosses it, and the policy is feasible;
+            1: a boundary crosses it, and the policy is infeasible; 0: no point of the trust region
+            is feasible, and the step is a recovery, which ignores g.
         lam: λ, multiplier of the trust region, [...]; 0 in case 0.
         nu: ν, multipliers of the constraints, [..., k].
         reward_coefficient: 1/λ, or 0 if the constraints leave no component of g free, [...].
-        cost_coefficient: ν/λ, finite throughout, [..., k].
+        cost_coefficient: ν/λ, [..., k]; finite in every case.
     """
 
     case: Tensor
@@ -51,9 +52,10 @@ class DualSolution(NamedTuple):
 
 
 class _Scaled(NamedTuple):
-    """The problem with g, every bᵢ and the radius scaled to length 1, sets along dimension -2.
+    """The problem in units in which g, every bᵢ and the radius of the trust region have length 1.
 
-    `r`, `c`: [..., 1, k]; `S`: [..., 1, k, k]; `sets`: [2ᵏ, k]; `usable`: [..., 1, k].
+    `r`, `c`: [..., 1, k]; `S`: [..., 1, k, k]. Dimensions of size 1 are for the 2ᵏ sets of active
+    constraints, `sets`: [2ᵏ, k] bool. `usable`: which constraints have a gradient, [..., 1, k].
     """
 
     r: Tensor
@@ -66,20 +68,19 @@ class _Scaled(NamedTuple):
 def solve_dual(q: Tensor, r: Tensor, S: Tensor, c: Tensor, delta: Tensor | float) -> DualSolution:
     """Solve the CPO step for batches of problems; see the module for the notation.
 
-    Never NaN. If g, b or c do not define a unique step, it is
+    The solution is never NaN. Cases in which g, b and c do not define a unique step:
 
     - g = 0, or g in the span of the active constraints: the shortest step to their boundary;
     - bᵢ = 0: the constraint is left out if cᵢ ≤ 0; otherwise nothing is feasible;
-    - infeasible: a step towards the nearest point that satisfies all constraints (with one
-    constraint
-      −√(2δ/s)·w), of the length of the trust region's radius; no step at all if none of the
-      violated constraints has a gradient, or if they cancel out exactly.
+    - infeasible: a step towards the nearest point that satisfies all constraints; its length is the
+      trust region's radius (with one constraint −√(2δ/s)·w). No step at all if no violated
+      constraint has a gradient, or if their gradients cancel out exactly.
 
     Args:
         q: gᵀH⁻¹g, [...].
         r: gᵀH⁻¹bᵢ, [..., k].
         S: bᵢᵀH⁻¹bⱼ, [..., k, k].
-        c: Constraint violations, [..., k]; negative is satisfied.
+        c: Constraint violations, [..., k]; negative if the constraint is satisfied.
         delta: Radius δ > 0 of the trust region in KL.
 
     Returns:
@@ -143,16 +144,16 @@ def _solve_active(problem: _Scaled, right: Tensor, ridge: float) -> tuple[Tensor
 
 
 def _best_feasible(problem: _Scaled) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Best feasible candidate: step −(t ĝ + B̂β), λ in scaled units, and whether there is one.
+    """Best feasible candidate: coefficients of its step −(t ĝ + B̂β), and λ in scaled units.
 
     Returns:
-        t [...], β [..., k], λ [...], feasible [...].
+        t [...], β [..., k], λ [...], and whether any candidate is feasible [...].
     """
     right = torch.stack(torch.broadcast_tensors(problem.c, problem.r), -1)
     inverse, solvable = _solve_active(problem, right, ridge=0.0)
     to_boundary, of_gradient = inverse.unbind(-1)
-    # With the active constraints met, B of the squared radius is left to spend and A of the
-    # squared gradient is left to follow: A = q − rᵀS⁻¹r and B = 2δ − cᵀS⁻¹c.
+    # A = q − rᵀS⁻¹r is the squared gradient outside the span of the active constraints, and
+    # B = 2δ − cᵀS⁻¹c the squared length of a step that is left after they are met.
     a = 1 - (problem.r * of_gradient).sum(-1)
     b = 1 - (problem.c * to_boundary).sum(-1)
     reward = torch.where(a > _PARALLEL, (b.clamp_min(0) / a.clamp_min(_PARALLEL)).sqrt(), 0.0)

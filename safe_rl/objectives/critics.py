@@ -18,11 +18,12 @@ def explained_variance(prediction: Tensor, target: Tensor) -> Tensor:
     """1 − Var(target − prediction) / Var(target), per column.
 
     Args:
-        prediction: [..., F].
-        target: [..., F].
+        prediction: Predicted values, [..., F].
+        target: Values to be predicted, [..., F].
 
     Returns:
-        [F]; 1 is perfect, 0 no better than a constant. 0 for a constant target.
+        One number per column, [F]: 1 is perfect, 0 no better than a constant. It is also 0 for a
+        constant target.
     """
     residual = (target - prediction).flatten(0, -2).var(0, correction=0)
     total = target.flatten(0, -2).var(0, correction=0)
@@ -35,15 +36,15 @@ def critic_bias(
     """Mean of a critic's predictions minus the discounted sums of later costs, [F].
 
     Costs are summed to the end of the episode. If the end of a row or a time-out cuts an episode,
-    later costs are unknown. Then the critic's own value of the last step replaces them, and its
-    share γⁿ of the sum is left out of the mean. A critic with a constant error has this error as
-    its bias.
+    later costs are unknown. Then the critic's prediction at the last step replaces them, and a step
+    n steps before the cut has only the weight 1 − γⁿ in the mean. So a critic whose error is the
+    same everywhere has this error as its bias.
 
     Args:
         value: Predictions for the steps of N rows, in order of time, [N, T, F].
         cost: Costs of these steps, [N, T, F].
         done: Whether an episode ends with a step, [N, T, 1] bool.
-        terminated: Whether nothing can follow, [N, T, 1] bool.
+        terminated: Whether it ends there by termination, not by a time-out, [N, T, 1] bool.
         gamma: Discount γ per step.
 
     Returns:
@@ -71,13 +72,12 @@ def critic_bias(
 class CriticLoss(LossModule):
     """Squared errors of a reward critic and, if there is one, of a cost critic.
 
-    Writes ``loss_critic`` and ``loss_cost_critic`` (summed over the k costs), to be added and
-    minimised, and the detached ``explained_variance`` (scalar) and
-    ``cost_explained_variance`` [k].
+    Returns ``loss_critic`` and ``loss_cost_critic`` (summed over the k costs), whose sum is to be
+    minimised, and the detached ``explained_variance`` (scalar) and ``cost_explained_variance`` [k].
 
     Args:
-        critic: Writes the value key, [..., 1].
-        cost_critic: Writes the cost value key, [..., k].
+        critic: Reward critic, which writes the value key, [..., 1].
+        cost_critic: Cost critic, which writes the cost value key, [..., k]; or None.
 
     Examples:
         >>> import torch
@@ -101,9 +101,9 @@ class CriticLoss(LossModule):
 
         Attributes:
             value: The critic's output, [..., 1].
-            value_target: [..., 1].
+            value_target: Its target, [..., 1].
             cost_value: The cost critic's output, [..., k].
-            cost_value_target: [..., k].
+            cost_value_target: Its target, [..., k].
         """
 
         value: NestedKey = "state_value"

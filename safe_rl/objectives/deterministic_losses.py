@@ -25,16 +25,16 @@ from safe_rl.ranges import NotNegative, Share
 
 
 class TD3Loss(QFunctionLoss, objectives.TD3Loss):
-    """TorchRL's TD3 loss, split into critic and actor losses, for ensembles that need no vmap.
+    """TorchRL's TD3 loss, split into critic and actor losses, with ensembles that need no vmap.
 
     Args:
         actor_network: Deterministic policy.
         qvalue_network: A `safe_rl.models.QEnsemble`.
         action_spec: Spec of one action [A], bounded.
         gamma: Discount per step, of reward and costs.
-        policy_noise: Standard deviation of the noise on the target policy's actions, in halves of
-            the range of each.
-        noise_clip: Bound of that noise, likewise.
+        policy_noise: Standard deviation of the noise on the target policy's actions, in units of
+            half the range of actions.
+        noise_clip: Bound of the noise on target actions, in units of half the range of actions.
         loss_function: Loss of the TD errors.
 
     Examples:
@@ -68,12 +68,12 @@ class TD3Loss(QFunctionLoss, objectives.TD3Loss):
             noise_clip=noise_clip,
             loss_function=loss_function,
         )
-        self.num_qvalue_nets = 1  # copies of the steps that go into the Q functions
+        self.num_qvalue_nets = 1  # copies of the steps that TorchRL passes to the Q functions
         self.gamma = gamma
         self.make_value_estimator(ValueEstimators.TD0, gamma=gamma)
         self.out_keys = ["loss_qvalue", "loss_actor", "qvalue"]
 
-    # TorchRL sets and reads both. No buffers: a resumed run may change the numbers
+    # TorchRL sets and reads both. They are no buffers, because a resumed run may change them
     @property
     def policy_noise(self) -> Tensor:
         """Standard deviation of the noise on the target policy's actions, [A]."""
@@ -85,7 +85,7 @@ class TD3Loss(QFunctionLoss, objectives.TD3Loss):
 
     @property
     def noise_clip(self) -> Tensor:
-        """Bound of that noise, [A]."""
+        """Bound of the noise on the target policy's actions, [A]."""
         return self._noise_clip * (self.max_action - self.min_action) / 2
 
     @noise_clip.setter
@@ -98,7 +98,7 @@ class TD3Loss(QFunctionLoss, objectives.TD3Loss):
     def critic_losses(self, tensordict: TensorDictBase) -> TensorDict:
         """Losses of the Q functions."""
         for key in (self.tensor_keys.reward, self.tensor_keys.terminated):
-            self.column(tensordict, key)  # TorchRL's code tells neither which it is nor its shape
+            self.column(tensordict, key)  # TorchRL's errors name neither the key nor its shape
         loss, metadata = self.value_loss(tensordict)
         # TorchRL's errors are squared
         td_error = metadata["td_error"].detach().max(0).values.sqrt()
@@ -111,7 +111,7 @@ class TD3Loss(QFunctionLoss, objectives.TD3Loss):
             return self.actor_network(inputs).get(self.tensor_keys.action)
 
     def actor_loss(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
-        """Loss of the policy, with costs if there are cost critics."""
+        """Loss of the policy, with the penalty on costs if there are cost critics."""
         action = self._act(tensordict, self.actor_network_params)
         values = self.q_values("qvalue_network", tensordict, action, "frozen").squeeze(-1)
         objective, reported = self.penalised(-values[0], tensordict, action)
@@ -128,7 +128,7 @@ class TD3Loss(QFunctionLoss, objectives.TD3Loss):
 class TD3LagrangianLoss(CostCritics, TD3Loss):
     """TD3 on the Lagrangian: max_π E[Q_1 − r Σ_i w_i Q_i] / (1 + Σ_i w_i), w = λ / u.
 
-    r and u are the sizes of rewards and costs. Arguments are those of `CostCritics` and `TD3Loss`.
+    `CostCritics` explains r and u. Arguments are those of `CostCritics` and `TD3Loss`.
 
     Examples:
         >>> from safe_rl.models import QEnsemble, make_bounded_actor
@@ -160,12 +160,12 @@ class TD3LagrangianLoss(CostCritics, TD3Loss):
 class BCLoss(ReplayLoss):
     """Behaviour cloning: distance of a deterministic policy's actions from recorded ones.
 
-    Liu et al., *Datasets and Benchmarks for Offline Safe Reinforcement Learning* (2024), where the
-    steps are those of safe episodes (BC-Safe). The loss reads neither costs nor rewards.
+    The loss reads neither costs nor rewards. If the steps are those of safe episodes, it is BC-Safe
+    of Liu et al., *Datasets and Benchmarks for Offline Safe Reinforcement Learning* (2024).
 
     Args:
         actor_network: Deterministic policy.
-        loss_function: Loss of the errors of actions.
+        loss_function: Distance between the policy's actions and the recorded ones.
 
     Examples:
         >>> import torch

@@ -51,10 +51,10 @@ def gaussian_kl(loc_p: Tensor, scale_p: Tensor, loc_q: Tensor, scale_q: Tensor) 
 
 
 def categorical_kl(p: Categorical, q: Categorical) -> Tensor:
-    """KL(p ‖ q) of single choices, [...], as torch's, with a gradient where choices are masked.
+    """KL(p ‖ q) of categorical distributions, [...], whose gradient is finite with masked choices.
 
-    A choice that is masked in both distributions adds 0 to the divergence. torch's own function
-    multiplies 0 by −∞ + ∞ there, whose gradient is NaN.
+    A choice that is masked in both distributions adds 0 to the divergence. There torch's own
+    function multiplies 0 by −∞ + ∞, whose gradient is NaN.
     """
     change = (p.logits - q.logits).masked_fill(p.probs == 0, 0.0)
     return (p.probs * change).masked_fill((q.probs == 0) & (p.probs > 0), torch.inf).sum(-1)
@@ -80,7 +80,7 @@ def has_closed_kl(distribution: Distribution) -> bool:
         return all(map(has_closed_kl, distribution.dists.values()))
     under = root(distribution)
     if isinstance(under, TransformedDistribution):
-        # where both transforms are equal it is closed, and says nothing of what is learned in them
+        # torch has a closed form for equal transforms only, which ignores what they have learned
         return False
     return isinstance(under, Normal) or has_analytic_kl(distribution, distribution)
 
@@ -93,11 +93,11 @@ def _total(numbers: Iterable[Tensor], states: torch.Size) -> Tensor:
 def composite_log_probs(
     composite: CompositeDistribution, batch: TensorDictBase, stored: Iterable[NestedKey]
 ) -> tuple[Tensor, Tensor]:
-    """Log-probability of all parts' actions together, and the one stored with them, [...] each.
+    """Joint log-probability of the parts' actions now, and the stored joint one, [...] each.
 
     Args:
         composite: Distribution in the states of the batch.
-        batch: With the actions, by the keys of the parts.
+        batch: Batch with the actions, under the keys of the parts.
         stored: Keys of the parts' stored log-probabilities.
     """
     states, parts = composite.batch_shape, composite.dists.items()
@@ -130,7 +130,7 @@ def kl(
         p: Distribution in the states [...].
         q: Distribution in the same states.
         log_weight: Log ρ of the sampled actions, [...].
-        batch: The sampled actions of composite distributions, by the keys of the parts.
+        batch: The sampled actions, under the keys of the parts; for composite distributions only.
 
     Returns:
         Divergence in nats, [...].
@@ -143,8 +143,8 @@ def kl(
         if not p.event_shape:
             return kl_divergence(*roots)
         divergence = gaussian_kl(roots[0].loc, roots[0].scale, roots[1].loc, roots[1].scale)
-        several = len(p.event_shape) > 1  # dimensions of an action
-        return divergence.flatten(len(p.batch_shape)).sum(-1) if several else divergence
+        is_matrix = len(p.event_shape) > 1  # an action has more than one dimension
+        return divergence.flatten(len(p.batch_shape)).sum(-1) if is_matrix else divergence
     if isinstance(p, Categorical) and isinstance(q, Categorical):
         return categorical_kl(p, q)
     if has_closed_kl(p) and has_analytic_kl(p, q):
@@ -178,7 +178,7 @@ def sampler_of(actor: ProbabilisticTensorDictSequential) -> ProbabilisticTensorD
 def composite_keys(
     sampler: ProbabilisticTensorDictModule,
 ) -> tuple[list[NestedKey], list[NestedKey]] | None:
-    """Keys of the parts' actions and log-probabilities; None if there are no parts."""
+    """Keys of the parts' actions and log-probabilities; None if it is no composite distribution."""
     made = sampler.distribution_class
     made = made.func if isinstance(made, partial) else made
     if made is not CompositeDistribution:
@@ -187,10 +187,10 @@ def composite_keys(
 
 
 class ReferencePolicy:
-    """The current policy in the states of a batch, from which the KL of later ones is measured.
+    """The current policy in the states of a batch, to measure the KL of later policies from it.
 
     Args:
-        distribution: Of the policy, without gradients.
+        distribution: Distribution of the current policy in these states, without gradients.
     """
 
     def __init__(self, distribution: Distribution) -> None:
@@ -204,7 +204,7 @@ class ReferencePolicy:
                 self._sample = sample_and_log_prob(distribution)
 
     def kl(self, policy: Distribution) -> Tensor:
-        """KL(policy ‖ reference) per state, [...]; always from the same samples, if from any."""
+        """KL(policy ‖ reference) per state, [...]; an estimate uses the same samples every time."""
         if isinstance(policy, CompositeDistribution):
             parts = self._parts.items()
             return _total((part.kl(policy.dists[k]) for k, part in parts), policy.batch_shape)

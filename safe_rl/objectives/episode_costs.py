@@ -22,9 +22,9 @@ from torch import Tensor
 from safe_rl.objectives.risk import Charges
 from safe_rl.resumable import Resumable
 
-#: Ends of episodes from which the mean length is taken.
+#: Number of ends of episodes over which the mean length is computed.
 _ENDS = 100
-#: Pieces into which a batch of few rows is cut, so that a spread can be told.
+#: Smallest number of pieces for a standard error; a batch with fewer rows is cut into as many.
 _FEWEST_PIECES = 8
 
 
@@ -48,7 +48,7 @@ def rate_estimate(costs: Tensor, length: Tensor) -> CostEstimate:
         length: Mean episode length T̄ in steps, scalar.
 
     Returns:
-        The estimate. If there are few rows, they are cut into pieces that count as independent.
+        The estimate. If there are few rows, they are cut into pieces that are taken as independent.
 
     Examples:
         >>> costs = torch.tensor([[0.0, 1.0], [1.0, 1.0]]).unsqueeze(-1)
@@ -64,7 +64,7 @@ def rate_estimate(costs: Tensor, length: Tensor) -> CostEstimate:
 
 
 def shrink(past: CostEstimate, present: CostEstimate, drift: Tensor) -> CostEstimate:
-    """Weigh two estimates by their precision: one step of a Kalman filter on a random walk.
+    """Average two estimates by their precision: one step of a Kalman filter on a random walk.
 
     Args:
         past: Estimate for the policies so far; NaN if there is none.
@@ -72,7 +72,7 @@ def shrink(past: CostEstimate, present: CostEstimate, drift: Tensor) -> CostEsti
         drift: Standard deviation of the change of J_c from one policy to the next, [k].
 
     Returns:
-        The estimate for the present policy, with an error below both.
+        The estimate for the present policy, with an error of at most `present.error`.
 
     Examples:
         >>> one, two = torch.ones(1), torch.tensor([2.0])
@@ -81,7 +81,7 @@ def shrink(past: CostEstimate, present: CostEstimate, drift: Tensor) -> CostEsti
     """
     variance = past.error.square() + drift.square()
     noise = present.error.square()
-    # without any noise the batch is the truth
+    # if no estimate has an error, the present one is right
     weight = torch.where(variance + noise > 0, variance / (variance + noise), 1.0)
     mean = torch.lerp(past.mean, present.mean, weight)
     error = ((1 - weight) * variance).sqrt()
@@ -94,12 +94,12 @@ def shrink(past: CostEstimate, present: CostEstimate, drift: Tensor) -> CostEsti
 class EpisodeLengths(Resumable):
     """Mean episode length T̄: steps per end of an episode, over the last 100 ends or a few more.
 
-    Steps are counted from the batch after one with ends, so that a batch without ends makes T̄
-    larger. T̄ is at most the largest possible length, and equal to it until an episode has ended
-    earlier.
+    Counting starts just after a batch in which episodes ended. So batches without ends count too,
+    and make T̄ larger. T̄ is at most the largest possible length, and equal to it until an episode
+    has ended earlier.
 
     Args:
-        longest: Largest possible length of an episode; T̄ until one has ended.
+        longest: Largest possible length of an episode in steps.
 
     Examples:
         >>> lengths = EpisodeLengths(1000)
@@ -115,7 +115,7 @@ class EpisodeLengths(Resumable):
 
     def __init__(self, longest: float) -> None:
         self.longest = longest
-        #: Steps, ends and early ends since the last batch with ends, in order of time.
+        #: Steps, ends and early ends since the previous row, a row per batch with ends, [n, 3].
         self.counts = torch.zeros(0, 3, dtype=torch.float64)
 
     def update(self, num_steps: int, lengths: Tensor) -> None:
@@ -138,13 +138,13 @@ class EpisodeLengths(Resumable):
 
 
 class NoiseCorrelation(Resumable):
-    """Correlation of the noise of successive batches, measured from their rows.
+    """Correlation of the noise in the costs of successive batches, measured from their rows.
 
     An episode that spans several batches keeps its layout. So a row with a high cost in one batch
     is likely to have a high cost in the next. Rows are independent of each other. Therefore the
     correlation of their deviations from the batch's mean is also the correlation of the noise of
-    the means. A change of the policy shifts all rows alike and does not count. The correlation
-    begins as 0, with the weight of one batch.
+    the means. A change of the policy shifts all rows alike, which has no effect on the deviations.
+    The correlation begins as 0, with the weight of one batch.
 
     Args:
         memory: Weight in [0, 1) of the past.
@@ -191,15 +191,15 @@ class EpisodeCosts(Resumable):
     """Estimator of J_c, of the mean episode length T̄ and of the size of one cost, over a run.
 
     Args:
-        num_costs: k.
-        max_length: Steps after which an episode is over; see `EpisodeLengths`.
+        num_costs: Number of costs k.
+        max_length: Largest length of an episode in steps; see `EpisodeLengths`.
         drift: Expected relative change of J_c from one policy to the next; it sets the weights of
             past batches and of the new one. None uses the new batch alone.
-        memory: Weight in [0, 1) of the past in the estimated scatter of costs.
-        smallest: Cost per step; J_c counts as at least this large for the drift. Otherwise an
-            estimate of 0 could not change any more.
-        largest_correlation: Bound of the correlation of batches, which enlarges errors; see
-            `NoiseCorrelation`.
+        memory: Weight in [0, 1) of the past in the estimated variance of costs.
+        smallest: Costs per step, of size `unit`: the drift is relative to at least this J_c.
+            Otherwise an estimate of 0 could not change any more.
+        largest_correlation: Upper bound of the correlation of successive batches, which makes
+            standard errors larger; see `NoiseCorrelation`.
 
     Examples:
         >>> estimator = EpisodeCosts(1, max_length=1000, drift=None, memory=0.9)
@@ -235,7 +235,7 @@ class EpisodeCosts(Resumable):
 
     @property
     def unit(self) -> Tensor:
-        """Σ c² / Σ c over all steps so far, [k]: 1 for indicators, and 1 before any cost."""
+        """Typical size of one cost, Σ c² / Σ c over all steps, [k]; 1 for costs of 0 or 1."""
         first, second = self._sums
         return torch.where(first > 0, second / first, 1.0).float()
 
@@ -252,7 +252,7 @@ class EpisodeCosts(Resumable):
         Args:
             costs: Costs of its steps, [N, T, k].
             lengths: Steps of every episode that finished in it, [E].
-            charges: Values to estimate instead of the mean cost; `unit` is still that of the costs.
+            charges: Charges of a risk measure, to estimate instead of costs; `unit` ignores them.
         """
         costs = costs.to(self._sums)
         self._sums += torch.stack([costs.sum((0, 1)), costs.square().sum((0, 1))])
@@ -278,10 +278,10 @@ class EpisodeCosts(Resumable):
     def _expected_error(self, batch: CostEstimate, size: Tensor) -> Tensor:
         """Standard error of a batch, expected from earlier batches, for J_c of this size, [k].
 
-        Costs come in clusters: a batch with few of them by chance also has a small spread. If it
-        was weighted by its own error, it would count more than a batch with many costs, and the
-        estimate would be too low. So the variance is assumed to be proportional to J_c, as for
-        counts, by a factor φ that is estimated.
+        Costs come in clusters: a batch with few of them by chance also has a small spread. Weighted
+        by its own error, it would count more than a batch with many costs, and the estimate would
+        be too low. So the variance is taken to be proportional to J_c, as for counts, and the
+        factor of proportionality is estimated.
         """
         seen = torch.stack([batch.error.square(), self._size(batch.mean)])
         self._scatter = torch.lerp(seen, self._scatter, self.memory)

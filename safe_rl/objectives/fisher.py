@@ -14,7 +14,7 @@ from torchrl.modules import set_recurrent_mode
 from safe_rl.objectives.distributions import ReferencePolicy, root, sampler_of
 from safe_rl.objectives.trust_region import flatten, policy_in, unflatten
 
-#: What a policy's network puts out, and the product with the Fisher matrix of these outputs.
+#: Outputs of a policy's network, and multiplication by the Fisher matrix with respect to them.
 Geometry = tuple[list[Tensor], Callable[[Sequence[Tensor]], list[Tensor]]]
 
 
@@ -23,9 +23,9 @@ def _num_states(distribution: Distribution) -> int:
 
 
 def _normal_geometry(normal: Normal, num_states: int) -> Geometry:
-    """1/σ² for a mean and 2/σ² for a standard deviation σ."""
+    """Fisher matrix of a Gaussian: 1/σ² for its mean and 2/σ² for its standard deviation σ."""
     precision = normal.scale.detach().square().reciprocal() / num_states
-    # A mean or a standard deviation that is constant has no part in the Fisher matrix.
+    # A constant mean or standard deviation does not enter the Fisher matrix.
     trained = [
         (output, metric)
         for output, metric in ((normal.loc, precision), (normal.scale, 2 * precision))
@@ -40,7 +40,7 @@ def _normal_geometry(normal: Normal, num_states: int) -> Geometry:
 
 
 def _categorical_geometry(categorical: Categorical, num_states: int) -> Geometry:
-    """diag(p) − ppᵀ of the probabilities p, for log-probabilities."""
+    """Fisher matrix of a categorical distribution for its log-probabilities: diag(p) − ppᵀ."""
     probs = categorical.probs.detach()
 
     def multiply(changes: Sequence[Tensor]) -> list[Tensor]:
@@ -55,8 +55,8 @@ def _geometry_by_differentiation(
 ) -> Geometry:
     """Hessian of the mean KL(π ‖ π_k) with respect to the distribution's parameters, at π_k.
 
-    The gradient of the divergence is 0 there, so JᵀMJ with this M is its complete Hessian with
-    respect to θ. The network itself is not in this graph.
+    At π_k the gradient of the divergence is 0. So JᵀMJ, where M is this Hessian, is the complete
+    Hessian with respect to θ. The graph of M does not contain the network itself.
     """
     sampler = sampler_of(actor)
     parameters = actor.get_dist_params(batch.select(*actor.in_keys)).select(*sampler.in_keys)
@@ -138,7 +138,7 @@ class FisherProduct:
         )
 
     def __call__(self, vector: Tensor) -> Tensor:
-        """Multiply a vector [P]."""
+        """Multiply the damped Fisher matrix by a vector [P]."""
         tangents = unflatten(vector, self.parameters)
         used = [(vjp, v) for vjp, v in zip(self._vjp, tangents, strict=True) if vjp.requires_grad]
         jvp = torch.autograd.grad(

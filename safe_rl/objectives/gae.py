@@ -18,7 +18,7 @@ def trajectory_ends(done: Tensor, mask: Tensor | None) -> Tensor:
     """Where the trajectories of a rollout end, [..., T] bool.
 
     Args:
-        done: [..., T, 1] bool.
+        done: Whether an episode ended, [..., T, 1] bool.
         mask: [..., T] bool, False where the rollout is padded; None without padding.
     """
     ends = done.squeeze(-1).clone()
@@ -74,7 +74,7 @@ def gae(
         value: [..., T, F], values of the observations.
         next_value: [..., T, F], values of the next observations.
         done: [..., T, 1] bool, trajectory ends.
-        terminated: [..., T, 1] bool, ends without bootstrap.
+        terminated: [..., T, 1] bool, ends after which values are not bootstrapped.
         gamma: Discount per step.
         lmbda: Decay of the TD errors.
 
@@ -82,7 +82,7 @@ def gae(
         Advantages, [..., T, F].
     """
     if gamma * lmbda == 0:
-        # TorchRL's filter drops even the first TD error when the decay is 0.
+        # With a decay of 0, TorchRL's function loses even the first TD error.
         return reward + gamma * next_value * ~terminated - value
     flags = done.expand_as(reward), terminated.expand_as(reward)
     return vec_generalized_advantage_estimate(gamma, lmbda, value, next_value, reward, *flags)[0]
@@ -102,7 +102,7 @@ def centre(advantage: Tensor) -> Tensor:
 def _of_samples(
     change: Callable[[Tensor], Tensor], advantage: Tensor, mask: Tensor | None
 ) -> Tensor:
-    """Apply a change to the samples alone; padding becomes 0."""
+    """Apply a function to the samples alone; padding becomes 0."""
     if mask is None:
         return change(advantage)
     changed = torch.zeros_like(advantage)

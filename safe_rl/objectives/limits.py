@@ -33,10 +33,10 @@ class LimitState(NamedTuple):
         cost: Estimate of J_c, undiscounted cost per episode, [k].
         target: Current upper bound of J_c, from limit, descent and margin, [k].
         length: Mean episode length T̄ in steps, scalar.
-        unit: Size of one cost, [k]; see `EpisodeCosts.unit`.
-        scale: Unit of violations, [k]: the limit, or a small share of the steps if that is more.
+        unit: Typical size of one cost, [k]; see `EpisodeCosts.unit`.
+        scale: Unit of violations, [k]: the limit, but at least `smallest_scale` per step.
         trust: Share of a predicted change of J_c that is observed, [k].
-        integrated: Integral that is added to the violation: a sum of earlier ones, [k].
+        integrated: Integral (weighted sum of earlier violations) added to the violation, [k].
     """
 
     cost: Tensor
@@ -54,7 +54,7 @@ class LimitState(NamedTuple):
 
     @property
     def demand(self) -> Tensor:
-        """Decrease of J_c that a surrogate must predict, [k]; if negative, J_c may rise by it."""
+        """Decrease of J_c that a step's surrogate must predict, [k]; if negative, J_c may rise."""
         change = self.violation + self.integrated
         return torch.where(change > 0, change / self.trust, change)
 
@@ -109,7 +109,7 @@ class PredictedChange(Resumable):
         return share.clamp(self.lowest, 1.0)
 
     def update(self, cost: Tensor, prior: Tensor) -> None:
-        """Compare the change of J_c since the last call with the predicted one; all [k]."""
+        """Compare the change of J_c since the last call with the predicted change; all [k]."""
         if not self._products.any():
             self._products = prior.square().expand(2, -1).clone()
         predicted = self._predicted
@@ -129,34 +129,34 @@ class LimitTracker(Checked, Resumable):
     """Computes violations of a falling limit from the costs of every batch.
 
     Args:
-        cost_limits: d, undiscounted cost per episode, [k].
-        max_length: Largest length of an episode, in rows of time of a batch.
+        cost_limits: Limits d, undiscounted cost per episode, [k].
+        max_length: Largest length of an episode, in time steps of a batch.
         margin: How far below the limit the target is, in standard errors of a batch's J_c.
-        largest_margin: Bound of the margin, as a share of d.
-        free_steps: Environment steps for which costs have no effect.
-        descent_steps: Environment steps in which the limit then falls.
+        largest_margin: Upper bound of the margin, as a share of d.
+        free_steps: Environment steps at the start during which costs have no effect.
+        descent_steps: Environment steps, after free_steps, during which the limit falls to d.
         recovery: Share of d that is the target once J_c is above d, until J_c has reached it; 1 for
             none. This is the hysteresis of the published C-TRPO and CPO with hysteresis.
-        steps_per_decision: Environment steps per row of time of a batch.
+        steps_per_decision: Environment steps per time step of a batch, which is one action.
         frames: Environment steps of the whole run.
-        latest_end: Share of the run at which the descent ends at the latest. In a shorter run, both
-            numbers of steps are reduced in proportion.
+        latest_end: Share of the run at which the descent ends at the latest. In a shorter run,
+            free_steps and descent_steps are reduced in proportion.
         smallest_scale: Lower bound of the unit of violations, in costs per step, for limits near 0.
         drift: Expected relative change of J_c per update, see `EpisodeCosts`; None uses each batch
             alone.
-        memory: Weight of the past in the standard error of a batch and in the trust.
-        largest_correlation: Bound of the correlation r of the noise of successive batches; with 0,
-            batches count as independent. r is measured from rows whose episodes span batches. The
-            variance of a batch is (1 + r) / (1 − r) times that of its rows.
+        memory: Weight of the past in the averages of a batch's standard error and of trust_<cost>.
+        largest_correlation: Upper bound of the correlation r of the noise of successive batches;
+            with 0, batches count as independent. r is measured from rows whose episodes span
+            batches. The variance of a batch is (1 + r) / (1 − r) times that of its rows.
         descent_errors: Standard errors that are added to the estimate of J_c before the limit
             follows it down. With 0 the limit follows the lowest of several noisy estimates, and
             falls faster than the policy's cost.
-        lowest_trust: Lower bound of trust_<cost>, the share of a predicted change that is expected;
-            1 expects all of it.
+        lowest_trust: Lower bound of trust_<cost>, the share of a predicted change of J_c that is
+            expected to occur; 1 expects all of it.
         integral: Share of every violation that is added to the violations of all later updates (the
             learned margin of the code of Ray, Achiam and Amodei 2019); 0 for multipliers, which
             have integrals of their own.
-        largest_integral: Bound of this integral, in units of violations.
+        largest_integral: Upper bound of the sum that integral adds, as a share of the limit.
 
     Examples:
         >>> tracker = LimitTracker(
@@ -206,7 +206,7 @@ class LimitTracker(Checked, Resumable):
         self.descent_steps = round(descent_steps * shrinkage)
         self._is_shortened = shrinkage < 1
         self.memory, self.recovery, self.steps_per_decision = memory, recovery, steps_per_decision
-        self.smallest_scale = smallest_scale * steps_per_decision  # of a row of time
+        self.smallest_scale = smallest_scale * steps_per_decision  # per time step of a batch
         self.costs = EpisodeCosts(
             num_costs,
             max_length=max_length,
@@ -244,7 +244,7 @@ class LimitTracker(Checked, Resumable):
         Args:
             costs: Costs of its steps, [N, T, k].
             lengths: Steps of every episode that finished in it, [E].
-            charges: Values that replace the costs if another measure than their mean is limited.
+            charges: Charges that replace the costs if a risk measure is limited, not their mean.
         """
         costs, lengths = costs.detach().cpu(), lengths.detach().cpu()
         estimate = self.costs.update(costs, lengths, charges)
@@ -274,15 +274,15 @@ class LimitTracker(Checked, Resumable):
     def _target(self, estimate: CostEstimate, scale: Tensor, num_steps: int) -> Tensor:
         """The target of J_c after an update with a batch of `num_steps` steps, [k]."""
         self._steps += num_steps
-        # a descent that has begun continues, also if the run was made longer meanwhile
+        # a descent that has begun continues, even if a resumed run has more steps than before
         if self._steps <= self.free_steps and not self._reached.isfinite().any():
             return estimate.mean + scale
         margin = torch.minimum(self.margin * self._noise, self.largest_margin * self.limits)
         left = self.free_steps + self.descent_steps - self._steps + num_steps
         share = num_steps / left if left > num_steps else 1.0
-        # from the present cost, where that has come down faster than the limit
-        surely = estimate.mean + self.descent_errors * estimate.error
-        self._reached = torch.minimum(self._reached, surely)
+        # the limit falls from the present cost, if that has already fallen below the limit
+        present = estimate.mean + self.descent_errors * estimate.error
+        self._reached = torch.minimum(self._reached, present)
         self._reached = descend(self._reached, self.limits - margin, share)
         if left > num_steps:
             return self._reached

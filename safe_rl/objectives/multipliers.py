@@ -1,8 +1,8 @@
-"""Lagrange multipliers, one λ per cost: dual ascent by Adam and by plain steps.
+"""Lagrange multipliers, one λ per cost: dual ascent by Adam or by plain gradient steps.
 
 Once per epoch a multiplier gets the violations J_c − d, where J_c is the mean undiscounted cost of
 an episode. It increases λ if J_c exceeds its limit d, and decreases λ if not. Its whole state is in
-buffers. Controllers are in `safe_rl.objectives.controllers`.
+buffers. `safe_rl.objectives.controllers` has multipliers that are PI and PID controllers.
 """
 
 from __future__ import annotations
@@ -134,7 +134,7 @@ class Multiplier(Checked, nn.Module, ABC):
         """Set the units of violations, [k] > 0; most multipliers ignore this."""
 
     def set_unit(self, unit: Tensor) -> None:
-        """Set the size of one cost, [k] > 0: the unit of the costs that λ is a weight of."""
+        """Set the typical size u of one cost, [k] > 0; some multipliers divide violations by it."""
 
     @abstractmethod
     def _step(self, violation: Tensor) -> dict[str, Tensor]:
@@ -142,16 +142,16 @@ class Multiplier(Checked, nn.Module, ABC):
 
 
 class LagrangeMultiplier(Multiplier):
-    """λ = softplus(ν), where Adam updates ν on the dual loss −ν·(J_c − d).
+    """Multiplier λ = softplus(ν), where Adam updates ν with the dual loss −ν·(J_c − d).
 
     The gradient is taken with respect to ν directly, not through the softplus, as in the
     Lagrangian baselines of Ray, Achiam and Amodei, *Benchmarking Safe Exploration in Deep
-    Reinforcement Learning* (2019), section 5.1. Adam (Kingma and Ba 2015, algorithm 1) is written
-    out here, because its moments are part of the state that is saved and moved between devices.
+    Reinforcement Learning* (2019), section 5.1. Adam (Kingma and Ba 2015, algorithm 1) is part of
+    this class, so that its moments are buffers, which are saved and moved between devices.
 
     Args:
         cost_limits: Mapping from cost key to limit d, or limits alone; see `parse_cost_limits`.
-        init: Initial λ, for all costs or one per cost; above 0, which a softplus never reaches.
+        init: Initial λ, for all costs or one per cost; above 0, because a softplus is never 0.
         lr: Step size of Adam.
 
     Examples:
@@ -198,17 +198,17 @@ class LagrangeMultiplier(Multiplier):
 
 
 class ProjectedMultiplier(Multiplier):
-    """λ ← clip(λ + α (J_c − d) / u, 0, λ_max), the plain dual ascent.
+    """Multiplier by projected gradient ascent: λ ← clip(λ + α (J_c − d) / u, 0, λ_max).
 
-    It is the multiplier of FOCOPS (Zhang, Vuong and Ross 2020) and CUP (Yang et al. 2022). With a
-    small α and without λ_max it is that of RCPO (Tessler et al. 2019, algorithm 1). u is the size
-    of one cost: 1, as in the articles, unless cost advantages are in other units (`set_unit`).
+    FOCOPS (Zhang, Vuong and Ross 2020) and CUP (Yang et al. 2022) use it; with a small α and
+    without λ_max, so does RCPO (Tessler et al. 2019, algorithm 1). u is the typical size of one
+    cost: 1, as in the articles, unless cost advantages have been divided by it (`set_unit`).
 
     Args:
         cost_limits: Mapping from cost key to limit d, or limits alone; see `parse_cost_limits`.
         init: Initial λ, at most `highest`, for all costs or one per cost.
-        lr: Step size α, change of λ per cost of size u in an episode.
-        highest: Upper bound λ_max; None for none.
+        lr: Step size α: change of λ per epoch if J_c is above its limit by the size u of one cost.
+        highest: Upper bound λ_max of λ; None: no bound.
 
     Examples:
         >>> multiplier = ProjectedMultiplier({"cost": 25.0}, init=0.0, lr=0.01, highest=2.0)

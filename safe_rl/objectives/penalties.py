@@ -19,7 +19,7 @@ class PenaltyLoss(PPOLoss):
 
     Args:
         actor_network: Policy with `get_dist`; see `SurrogateLoss`.
-        constraints: J_c − d and T̄ are read from them at every call.
+        constraints: Object from which J_c − d and T̄ are read at every call.
         settings: Those of every clipped loss, see `PPOLoss`; costs are always averaged.
     """
 
@@ -35,7 +35,7 @@ class PenaltyLoss(PPOLoss):
         self.constraints = constraints
 
     def _excess(self, surrogates: Tensor) -> Tensor:
-        """(J_c − d) / T̄ plus the surrogates: how far a step leaves each cost above its limit."""
+        """(J_c − d) / T̄ plus the surrogates: predicted violations per step, [k]."""
         violation = violation_of(self.constraints, surrogates)
         return surrogates + constraint_value(violation, self.constraints.episode_length, True)
 
@@ -103,7 +103,7 @@ def log_barrier(slack: Tensor, kappa: Tensor | float, max_weight: float) -> Tens
     The tangent begins at slack = κ / max_weight, so that value and slope are continuous.
 
     Args:
-        slack: How far inside the limits, any shape.
+        slack: Distance to the limit, negative beyond it, any shape.
         kappa: Strength κ > 0 of the barrier, a scalar.
         max_weight: Largest slope > 0.
 
@@ -125,17 +125,17 @@ class IPOLoss(PenaltyLoss):
 
         E[−min(ρA, clip(ρ)A)] − (κ / T̄) Σᵢ log(−cᵢ − E[ρA_cᵢ]),  cᵢ = (J_cᵢ − dᵢ) / T̄.
 
-    The argument is the predicted distance to the limit, per step. The weight of a cost at a
-    distance Δ = d − J_c is κ / Δ. Near and above the limit, where the article's barrier is not
-    defined, the barrier continues with the slope `max_weight`, like a multiplier of this size.
+    The logarithm's argument is the predicted distance to the limit, per step. At a distance
+    Δ = d − J_c, the weight of a cost is κ / Δ. Near the limit and beyond it, where the article's
+    barrier is not defined, the barrier has the slope `max_weight`, like a multiplier of this size.
 
     Adds ``loss_barrier`` and the detached ``cost_surrogate`` [k], E[ρA_c].
 
     Args:
         parts: Actor, and constraints, whose J_c − d and T̄ are read at every call.
         kappa: Strength κ = 1/t of the barrier, in units of the cost of an episode.
-        max_weight: Weight of a cost at the limit and beyond, in units of the standardised reward
-            advantage.
+        max_weight: Largest weight of a cost, which it has at the limit and beyond, in units of the
+            standardised reward advantage.
         settings: Those of every clipped loss, see `PPOLoss`; costs are always averaged.
 
     Examples:

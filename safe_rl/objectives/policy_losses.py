@@ -12,7 +12,7 @@ from torch import Tensor
 from safe_rl.objectives.surrogate import SurrogateLoss, WeighsCosts, lagrangian
 from safe_rl.ranges import Fraction
 
-#: How PPO bounds the gain of lowering costs; see `PPOLagrangianLoss`.
+#: Which surrogates PPO clips besides that of the reward; see `PPOLagrangianLoss`.
 CostClipping = Literal["none", "pessimistic", "joint"]
 
 
@@ -72,7 +72,7 @@ class PPOLoss(SurrogateLoss):
         }
 
     def _objective(self, tensordict: TensorDictBase, log_weight: Tensor) -> Tensor:
-        """What is maximised, per sample, [..., 1]."""
+        """The objective that is maximised, per sample, [..., 1]."""
         advantage = self._advantage(tensordict, log_weight)
         gain = clipped_gain(log_weight, advantage, self.clip_epsilon)
         return self._lagrangian(tensordict, gain, log_weight.exp())
@@ -84,10 +84,10 @@ class PPOLagrangianLoss(WeighsCosts, PPOLoss):
     The objective is (L_r − Σᵢ λᵢ L_cᵢ) / (1 + Σᵢ λᵢ). ``cost_clipping`` says what is clipped:
 
     - ``"none"``: only the reward surrogate L_r; costs are E[ρA_c], as in the article. Then nothing
-      bounds the effect of a few samples, and with a high λ updates end by early stopping after a
+      bounds the influence of a few samples, and with a high λ early stopping ends updates after a
       few steps;
-    - ``"pessimistic"``: each cost too, to its pessimistic side, E[max(ρA_c, clip(ρ)A_c)] (Zhang et
-      al. 2022, clipped costs);
+    - ``"pessimistic"``: also each cost surrogate, E[max(ρA_c, clip(ρ)A_c)], so that it is never
+      below the unclipped one (Zhang et al. 2022, clipped costs);
     - ``"joint"``: the objective as a whole, PPO on the advantage (A − Σᵢ λᵢ A_cᵢ) / (1 + Σᵢ λᵢ).
 
     This loss never trains the multipliers: call ``multiplier.update(mean_costs - limits)`` once per
@@ -117,7 +117,7 @@ class PPOLagrangianLoss(WeighsCosts, PPOLoss):
         if self.cost_clipping == "none":
             return super()._cost_gain(tensordict, ratio)
         cost_advantage = self._cost_advantage(tensordict)
-        # a ratio that has underflowed has a logarithm of infinite slope
+        # the logarithm has an infinite slope at a ratio that has underflowed to 0
         log_weight = ratio.clamp_min(torch.finfo(ratio.dtype).tiny).log()
         return -clipped_gain(log_weight, -cost_advantage, self.clip_epsilon)
 
@@ -195,8 +195,8 @@ class CPOLoss(SurrogateLoss):
     """Surrogates of CPO: ``loss_objective`` = −E[ρ A] and ``cost_surrogate`` = E[ρ A_c], [k].
 
     Both have gradients. The cost surrogates are constraints, not losses: a
-    `safe_rl.algorithms.CPOStep` keeps them within their limits. Arguments are those of
-    `SurrogateLoss`; a step needs the mean over the samples.
+    `safe_rl.algorithms.CPOStep` keeps them within their limits, and needs the mean over the samples
+    (``reduction``). Arguments are those of `SurrogateLoss`.
 
     Examples:
         >>> from safe_rl.models import make_actor

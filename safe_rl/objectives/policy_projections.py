@@ -1,4 +1,4 @@
-"""Losses of algorithms that project onto the policies of a network: FOCOPS and CUP."""
+"""Losses that project an improved policy onto the policies of the network: FOCOPS and CUP."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ from safe_rl.ranges import Positive, Range, Share, Weight
 
 
 class FOCOPSLoss(WeighsCosts):
-    """KL divergence from the optimal policy within a trust region (FOCOPS).
+    """Loss of FOCOPS: KL divergence from the optimal policy within a trust region.
 
-    Minimises (Zhang, Vuong and Ross 2020, the gradient of its projection)
+    Minimises (Zhang, Vuong and Ross 2020, from the gradient of their projection)
 
         E[1{KL(s) ≤ δ} (KL(s) − (1/β) ρ (A − Σᵢ νᵢ A_cᵢ))],  KL(s) = KL(π_θ ‖ π_k) in state s.
 
@@ -66,22 +66,22 @@ class FOCOPSLoss(WeighsCosts):
         }
 
 
-#: Where a batch holds the policy that a projection starts from.
+#: Key of the batch entries with the parameters of the policy that a projection starts from.
 ANCHOR = "anchor"
 
 
 class CUPLoss(WeighsCosts):
-    """The projection of CUP: the second of its two updates, which lowers the costs.
+    """Loss of the second of CUP's two updates: the projection, which lowers the costs.
 
-    The first update improves the policy for the reward by PPO's loss; its result is π½. Then this
-    loss is minimised (Yang et al. 2022, their projection step),
+    The first update improves the policy for the reward by PPO's loss; its result is π½. The second
+    update minimises this loss (Yang et al. 2022, their projection step),
 
         E[KL(π_θ ‖ π½) + h Σᵢ νᵢ ρ A_cᵢ],  ρ = π_θ/π_k,  h = (1 − γλ_GAE)/(1 − γ),
 
     with advantages of π_k, which collected the batch. h is from the article's bound for generalised
     advantage estimates. Here the loss is divided by 1 + h Σᵢ νᵢ, which does not change the minimum.
-    Without this division gradients grow with ν, and Adam's steps become so large that early
-    stopping ends an update after two of them. `anchor` stores π½; a
+    Without this division, gradients grow with ν, and Adam's steps become so large that early
+    stopping ends an update after two steps. `anchor` stores π½ in the batch; a
     `safe_rl.algorithms.MinibatchUpdate` calls it before its first step. ``kl`` is KL(π_θ ‖ π½). The
     loss also reports the detached ``cost_surrogate`` [k], E[ρA_c].
 
@@ -89,12 +89,12 @@ class CUPLoss(WeighsCosts):
         parts: Actor, of a distribution whose KL has a closed form, and a multiplier with one ν per
             column of ``cost_advantage``; a `ProjectedMultiplier` in the article.
         gamma: Discount γ of the cost advantages.
-        lmbda: Decay λ_GAE of their TD errors.
+        lmbda: Decay λ_GAE of the TD errors in the cost advantages.
         settings: Those of every policy loss, see `SurrogateLoss`.
 
     Raises:
-        TypeError: By the call, if a KL has no closed form.
-        KeyError: By the call, if the batch has no anchor.
+        TypeError: When the loss is evaluated, if the KL has no closed form.
+        KeyError: When the loss is evaluated, if the batch does not hold π½.
 
     Examples:
         >>> from tensordict import TensorDict
@@ -119,7 +119,7 @@ class CUPLoss(WeighsCosts):
 
     @property
     def behaviour_keys(self) -> dict[NestedKey, NestedKey]:
-        """Keys of π½ in the batch, from which ``kl`` is measured."""
+        """Keys of the parameters of π½ in the batch, from which ``kl`` is measured."""
         return {key: (ANCHOR, str(name)) for name, key in self._parameter_keys.items()}
 
     @torch.no_grad()

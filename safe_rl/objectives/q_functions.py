@@ -1,4 +1,4 @@
-"""Base classes of losses on Q functions: separate critic and actor losses, no vmap."""
+"""Base classes of off-policy losses: separate critic and actor losses, evaluated without vmap."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class Ensemble(Protocol):
         ...
 
     def values(self, observation: Tensor, action: Tensor, layers: Any) -> Tensor:
-        """Values [E, ..., n] without TensorDicts, which would take longer than the computation."""
+        """Values [E, ..., n] without TensorDicts, whose overhead exceeds the computation."""
         ...
 
 
@@ -49,7 +49,7 @@ Distance = Literal["l2", "smooth_l1", "l1"]
 
 
 class InOneCall:
-    """Lets TorchRL's losses call an ensemble like a function of `vmap`.
+    """Adapter by which TorchRL's losses call an ensemble as if `vmap` had made the function.
 
     It is a class because a module would become part of the loss, and a function could not be
     pickled or follow a copy of the loss to another device.
@@ -71,7 +71,7 @@ class ReplayLoss(Checked, LossModule):
     """Interface of losses on steps from a replay buffer, for the off-policy recipe and its update.
 
     Attributes:
-        risk_measure: Kind of risk measure that its cost critics estimate, or None for means only.
+        risk_measure: Class of risk measure that the cost critics estimate; None for means only.
     """
 
     risk_measure: ClassVar[type | None] = None
@@ -99,7 +99,7 @@ class ReplayLoss(Checked, LossModule):
         raise NotImplementedError
 
     def calibrate(self, episodes: KnownCosts) -> None:
-        """Update estimates of the costs of episodes, before the updates of a batch."""
+        """Update estimates of episode costs; called before the gradient steps of every batch."""
 
     def measure(self, rewards: Tensor) -> None:
         """Update the scale of rewards with the rewards of new steps, [...]."""
@@ -109,14 +109,14 @@ class ReplayLoss(Checked, LossModule):
 
 
 class QFunctionLoss(ReplayLoss):
-    """Additions to TorchRL's losses on Q functions: a base class to put before TorchRL's.
+    """Mixin for TorchRL's off-policy losses; in a class definition it comes before TorchRL's class.
 
     Attributes:
-        gamma: Discount per step, of reward and costs; that of the value estimator.
+        gamma: Discount per step of reward and costs, equal to that of the value estimator.
     """
 
     gamma: float
-    # TorchRL's TD3 has a list in its place, from which subclasses cannot select
+    # TorchRL's TD3 replaces this property by a list, with which `select_out_keys` fails
     out_keys = LossModule.out_keys
 
     @dispatch
@@ -140,12 +140,12 @@ class QFunctionLoss(ReplayLoss):
     def penalised(
         self, objective: Tensor, tensordict: TensorDictBase, action: Tensor
     ) -> tuple[Tensor, dict[str, Tensor]]:
-        """The actor's objective [...], with the costs of its actions if any, and diagnostics."""
+        """The actor's loss [...], with a penalty if there are cost critics, and diagnostics."""
         del tensordict, action
         return objective, {}
 
     def _mean(self, losses: Tensor, tensordict: TensorDictBase) -> Tensor:
-        """Mean of losses [...] over the steps, by the weights of prioritised replay if any."""
+        """Mean of losses [...] over the steps, with weights in case of prioritised replay."""
         weights = self._maybe_get_priority_weight(tensordict)
         return self._reduce_loss(losses, tensordict=tensordict, weights=weights)
 
@@ -159,13 +159,13 @@ class QFunctionLoss(ReplayLoss):
         """Values [E, ..., n] of actions in the states of steps [...].
 
         Args:
-            name: Attribute of the ensemble.
-            steps: They have the observation.
-            action: [..., A].
-            kind: Whose parameters: its own, the target network's, or its own without gradients.
+            name: Name of the attribute that holds the ensemble.
+            steps: Steps with observations.
+            action: Actions, [..., A].
+            kind: Which parameters: its own, the target network's, or its own without gradients.
         """
         network: Ensemble = getattr(self, name)
-        # TorchRL clears it whenever parameters move to another device or dtype
+        # TorchRL clears this cache whenever parameters move to another device or dtype
         cache = self.__dict__.setdefault("_cache", {})
         if (name, kind) not in cache:
             params = getattr(self, f"{'target_' if kind == 'target' else ''}{name}_params")
@@ -189,7 +189,7 @@ class QFunctionLoss(ReplayLoss):
         return value
 
     def make_value_estimator(self, value_type: Any = None, **hyperparams: Any) -> LossModule | None:
-        """As TorchRL's; its ``gamma`` is also used for the cost critics."""
+        """As in TorchRL; the estimator's ``gamma`` is also used for the cost critics."""
         made = super().make_value_estimator(value_type, **hyperparams)
         if isinstance(value_type, ValueEstimatorBase):
             hyperparams = {"gamma": value_type.gamma.item()}
@@ -208,7 +208,7 @@ class QFunctionLoss(ReplayLoss):
                 params.to_module(self.__dict__[name])
 
     def __getstate__(self) -> dict[str, Any]:
-        # the parameters without gradients, which TorchRL keeps, would be those of another loss
+        # a copy must not have the cached parameters, which belong to the original loss
         return {name: x for name, x in self.__dict__.items() if not name.startswith("_cache")}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
@@ -217,7 +217,7 @@ class QFunctionLoss(ReplayLoss):
 
 
 def discount_of(tensordict: TensorDictBase, gamma: float, spanned: NestedKey) -> Tensor | float:
-    """γ, or γ to the power of the steps that each transition spans, [..., 1], if it has the key."""
+    """γ; if `spanned` has the number n of steps per transition, [..., 1], γⁿ."""
     steps = tensordict.get(spanned, None)
     return gamma if steps is None else gamma ** steps.reshape(*tensordict.batch_size, 1)
 

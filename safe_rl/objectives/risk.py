@@ -1,13 +1,13 @@
 """Limits on other measures than the mean: CVaR, and the share of episodes above a limit.
 
-With a limit d on the mean cost, a third to a half of the episodes are above d. A risk measure
-replaces the costs of steps by *charges*. The mean of their sum over an episode is the measure, up
-to an offset that does not depend on the policy to first order. So everything that keeps a limit on
-a mean (critics, advantages, multipliers, steps, the descent of the limit) also keeps a limit on the
-measure.
+With a limit d on the mean cost, a third to a half of the episodes cost more than d. A risk measure
+replaces the costs of steps by other numbers, *charges*. The mean over episodes of the sum of
+charges is the measure, up to an offset that does not depend on the policy to first order. So
+everything that keeps a limit on a mean (critics, advantages, multipliers, steps, the descent of the
+limit) also keeps a limit on the measure.
 
-Steps have charges when the cost of the episode so far passes a threshold. So the measure needs the
-cost of open episodes at the start of the batch, but batches need not have whole episodes.
+A step has a charge if the cost of its episode up to this step passes a threshold. So the measure
+needs the cost of unfinished episodes at the start of a batch, but no batches of whole episodes.
 """
 
 from __future__ import annotations
@@ -26,9 +26,9 @@ class Charges(NamedTuple):
     """The values that replace the costs of a batch.
 
     Attributes:
-        costs: Charges of its steps, [N, T, k].
-        offset: Added to the sum of the charges of an episode, [k].
-        limit: Limit of this total, [k].
+        costs: Charges of the batch's steps, [N, T, k].
+        offset: Constant that is added to the sum of an episode's charges, [k].
+        limit: Limit of the mean of this total over episodes, [k].
     """
 
     costs: Tensor
@@ -42,7 +42,7 @@ class RiskMeasure(Checked, Resumable, ABC):
     If the charges depend on earlier batches, ``state_names`` names the attributes to save.
 
     Attributes:
-        limits: d, [k].
+        limits: Limits d, [k].
     """
 
     limits: Tensor
@@ -59,7 +59,7 @@ class RiskMeasure(Checked, Resumable, ABC):
         Args:
             costs: Costs of its steps, [N, T, k], none negative.
             ends: Whether an episode ends with a step, [N, T] bool.
-            before: Cost of the open episodes before the first step, [N, k].
+            before: Cost of the unfinished episodes before the first step, [N, k].
             finished: Costs of the episodes that finished, [E, k].
         """
 
@@ -83,7 +83,7 @@ def cost_so_far(costs: Tensor, ends: Tensor, before: Tensor) -> Tensor:
         >>> cost_so_far(costs, ends, before=torch.tensor([[10.0]])).flatten()
         tensor([11., 12.,  1.,  2.])
     """
-    # in double precision, so that an episode without costs has cost exactly nothing
+    # in double precision, so that an episode without costs has a cost of exactly 0
     total = costs.double().cumsum(1) + before.unsqueeze(1)
     closed = torch.where(ends.unsqueeze(-1), total, 0).roll(1, 1)
     closed[:, 0] = 0
@@ -93,23 +93,23 @@ def cost_so_far(costs: Tensor, ends: Tensor, before: Tensor) -> Tensor:
 class CVaR(RiskMeasure):
     """CVaR_α ≤ d: the mean cost of the worst fraction α of the episodes.
 
-    CVaR = ν + E[(C − ν)₊] / α. ν is the value at risk, the cost that a fraction α of the episodes
-    exceeds (Rockafellar and Uryasev 2000, theorem 1). ν minimises the expression, so its change
-    with the policy has an effect of second order only, and (C − ν)₊ / α has the gradient of the
-    CVaR (Chow, Ghavamzadeh, Janson and Pavone 2017). The charge of a step is what it adds to (C −
-    ν)₊ / α.
+    With the cost C of an episode, CVaR = ν + E[(C − ν)₊] / α. ν is the value at risk: a fraction α
+    of the episodes costs more (Rockafellar and Uryasev 2000, theorem 1). ν minimises the
+    expression, so its change with the policy has an effect of second order only, and (C − ν)₊ / α
+    has the gradient of the CVaR (Chow, Ghavamzadeh, Janson and Pavone 2017). The charge of a step
+    is the increase of (C − ν)₊ / α by this step.
 
-    At first the mean is limited. The limited measure is (1 − κ) E[C] + κ CVaR, where κ rises from 0
-    to 1. A limit on the CVaR must be higher than one on the mean: on PointGoal1 a policy with a
-    mean of 25 has a CVaR of about 60 at α = 0.1.
+    The measure is (1 − κ) E[C] + κ CVaR, where κ rises from 0 to 1: at first, it is the mean. A
+    limit on the CVaR must be higher than one on the mean: on PointGoal1 a policy with a mean of 25
+    has a CVaR of about 60 at α = 0.1.
 
     Args:
-        cost_limits: d, [k].
-        tail: Share α of the worst episodes.
+        cost_limits: Limits d, [k].
+        tail: Share α of the episodes, those with the highest costs, whose mean cost is limited.
         window: Number of past episodes from which ν, the value at risk, is estimated.
-        ramp_start: Environment steps before which κ = 0: the mean is limited.
-        ramp_steps: Environment steps in which κ then goes to 1.
-        steps_per_decision: Environment steps per row of time of a batch.
+        ramp_start: Environment steps at the start during which κ = 0: only the mean is limited.
+        ramp_steps: Environment steps, after ramp_start, during which the CVaR replaces the mean.
+        steps_per_decision: Environment steps per time step of a batch, which is one action.
 
     Examples:
         >>> risk = CVaR(torch.tensor([50.0]), tail=0.5, window=100, ramp_start=0, ramp_steps=0)
@@ -141,7 +141,7 @@ class CVaR(RiskMeasure):
 
     @property
     def weight(self) -> float:
-        """κ, the weight of the CVaR, in [0, 1]; the mean has the rest."""
+        """κ, the weight of the CVaR, in [0, 1]; the mean has the weight 1 − κ."""
         if not len(self._finished):
             return 0.0
         return min(1.0, max(0.0, (self._steps - self.ramp_start) / max(1, self.ramp_steps)))
@@ -163,11 +163,11 @@ class Chance(RiskMeasure):
     """P(C > d) ≤ ε: at most a fraction ε of the episodes costs more than d.
 
     The step at which an episode's cost passes d has the charge w = max(d, 1), all other steps 0. So
-    the charges of an episode are w 1{C > d}, and the limit of their mean is w ε. With the weight w,
-    λ has the same size as for limits on means.
+    the sum of an episode's charges is w 1{C > d}, and the limit of its mean is w ε. With the weight
+    w, λ has about the same size as for a limit on the mean cost.
 
     Args:
-        cost_limits: d, [k].
+        cost_limits: Limits d, [k].
         most_over: Share ε of episodes that may exceed the limit.
 
     Examples:

@@ -30,16 +30,16 @@ from safe_rl.ranges import Number, Range, Share
 
 
 class SACLoss(QFunctionLoss, objectives.SACLoss):
-    """TorchRL's SAC loss, split into critic and actor losses, for ensembles that need no vmap.
+    """TorchRL's SAC loss, split into critic and actor losses, with ensembles that need no vmap.
 
     Args:
         actor_network: Policy with ``get_dist``.
         qvalue_network: A `safe_rl.models.QEnsemble`.
         gamma: Discount per step, of reward and costs.
         alpha_init: Initial entropy coefficient (temperature) α.
-        target_entropy: Entropy of the policy, to which α is adapted; ``"auto"`` is minus the number
-            of actions.
-        fixed_alpha: Whether α is constant.
+        target_entropy: Entropy of the policy that α is adapted to reach; ``"auto"`` is −A for
+            actions [A].
+        fixed_alpha: Whether the entropy coefficient α is constant.
         loss_function: Loss of the TD errors.
         action_spec: Spec of one action [A]; needed for ``target_entropy="auto"``.
 
@@ -98,7 +98,7 @@ class SACLoss(QFunctionLoss, objectives.SACLoss):
         self._vmap_qnetworkN0 = InOneCall(self.qvalue_network)
 
     def _compute_target_v2(self, tensordict: TensorDictBase) -> Tensor:
-        """TorchRL's targets [...]; those of TD(0), the default, in half of the time."""
+        """TorchRL's TD targets [...]; TD(0), the default, is computed in half of TorchRL's time."""
         keys, following = self.tensor_keys, tensordict.get("next")
         with torch.no_grad():
             self._next_action, log_prob = self._act(following)
@@ -118,7 +118,7 @@ class SACLoss(QFunctionLoss, objectives.SACLoss):
     def _act(self, steps: TensorDictBase) -> tuple[Tensor, Tensor]:
         """Actions of the current policy, with gradients, and log π."""
         with set_exploration_type(ExplorationType.RANDOM):
-            # of a copy: a policy writes what its distribution is made of
+            # a copy, because the policy writes its distribution's parameters into its input
             inputs = steps.select(*self.actor_network.in_keys)
             return rsample_and_log_prob(self.actor_network.get_dist(inputs))
 
@@ -133,7 +133,7 @@ class SACLoss(QFunctionLoss, objectives.SACLoss):
         return scalars(loss_qvalue=self._mean(errors.sum(0), tensordict))
 
     def actor_loss(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
-        """Loss of the policy, with costs if there are cost critics."""
+        """Loss of the policy, with the penalty on costs if there are cost critics."""
         action, log_prob = self._act(tensordict)
         values = self.q_values("qvalue_network", tensordict, action, "frozen")
         objective = self._alpha * log_prob - values.min(0).values.squeeze(-1)
@@ -152,8 +152,8 @@ class SACLoss(QFunctionLoss, objectives.SACLoss):
 class SACLagrangianLoss(CostCritics, SACLoss):
     """SAC on the Lagrangian: min_π E[α log π − min Q_r + r Σ_i w_i Q_i] / (1 + Σ_i w_i), w = λ / u.
 
-    Ha et al., *Learning to Walk in the Real World with Minimal Human Effort* (2020). λ is updated
-    outside, from the undiscounted costs of episodes. r and u are the sizes of rewards and costs.
+    Ha et al., *Learning to Walk in the Real World with Minimal Human Effort* (2020). λ is not
+    updated here, but from the undiscounted costs of episodes. `CostCritics` explains r and u.
     Arguments are those of `CostCritics` and of `SACLoss`.
 
     Examples:

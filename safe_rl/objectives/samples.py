@@ -37,7 +37,7 @@ FIRST = "is_init"
 
 
 def sample_mask(tensordict: TensorDictBase) -> Tensor | None:
-    """Bool mask of the entries of a batch that are samples, not padding; None: all of them.
+    """Bool mask of the entries of a batch that are samples, not padding; None without padding.
 
     Trajectories of different lengths in one batch are padded. The mask is the one of TorchRL's
     collectors (``split_trajs=True``) and value estimators, which TorchRL's losses use too.
@@ -81,13 +81,13 @@ def require_finite(tensordict: TensorDictBase, keys: Iterable[NestedKey]) -> Non
         keys: Entries to check if they are floating-point numbers; missing ones are ignored.
 
     Raises:
-        FloatingPointError: Naming the entry and how many samples are concerned.
+        FloatingPointError: If there are any; the message names the entry and how many samples.
     """
     mask = sample_mask(tensordict)
     for key, entry in _tensors(tensordict, keys):
         if not entry.is_floating_point() or entry.is_meta:
             continue
-        # A sum is finite only if all its terms are, and much cheaper than looking at each.
+        # A finite sum has only finite terms, and is much faster than a check of each term.
         if mask is None and entry.sum().isfinite():
             continue
         wrong = ~entry.reshape(*tensordict.batch_size, -1).isfinite().all(-1)
@@ -103,7 +103,7 @@ def require_finite(tensordict: TensorDictBase, keys: Iterable[NestedKey]) -> Non
 def _tensors(
     tensordict: TensorDictBase, keys: Iterable[NestedKey]
 ) -> Iterator[tuple[NestedKey, Tensor]]:
-    """The entries at keys with their keys; of a nested TensorDict all entries."""
+    """Pairs of key and tensor; for the key of a nested TensorDict, all tensors in it."""
     for key in keys:
         entry = tensordict.get(key, None)
         if is_tensor_collection(entry):

@@ -64,8 +64,8 @@ class SurrogateLoss(Checked, LossModule):
 
     Args:
         actor_network: Policy with `get_dist`, such as a `torchrl.modules.ProbabilisticActor`.
-        entropy_coeff: Factor of the entropy bonus; a buffer, so that it can be scheduled, also from
-            0 up.
+        entropy_coeff: Factor of the entropy bonus. It is a buffer, so that it can be scheduled,
+            even if it is 0 at first.
     """
 
     @dataclass
@@ -231,7 +231,7 @@ class SurrogateLoss(Checked, LossModule):
         key = self.tensor_keys.cost_advantage
         advantage = require(tensordict, key, "CostGAE writes it.")
         num_costs = advantage.shape[-1] if self.multiplier is None else self.multiplier.num_costs
-        # of several agents in a state each has its own, as it has its own log-probability
+        # with several agents in a state, each has its own cost advantage and log-probability
         is_composite = self._composite_keys is not None
         samples = tensordict if is_composite else tensordict[self.tensor_keys.sample_log_prob]
         if advantage.shape != (*samples.shape, num_costs):
@@ -265,8 +265,8 @@ class WeighsCosts(SurrogateLoss):
 
     Args:
         actor_network: Policy with `get_dist`; see `SurrogateLoss`.
-        multiplier: One λ per column of ``cost_advantage``, read at every call.
-        settings: Those of the loss without costs.
+        multiplier: Multiplier with one λ per column of ``cost_advantage``, read at every call.
+        settings: Settings of the loss without costs.
 
     Raises:
         TypeError: If there is no multiplier.

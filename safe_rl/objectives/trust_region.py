@@ -66,10 +66,10 @@ def mean_kl(
 
 
 def subsample(batch: TensorDictBase, fraction: float) -> TensorDictBase:
-    """A fraction of a flat batch [B], at equal distances, so without randomness."""
+    """A fraction of the samples of a flat batch [B]: evenly spaced ones, without randomness."""
     if fraction == 1:
         return batch
-    # The small number undoes the rounding of 3 / 0.1 = 29.999….
+    # The small numbers undo rounding, such as in 7 / 0.07 = 99.999….
     count = math.ceil(batch.shape[0] * fraction - 1e-9)
     index = (torch.arange(count, dtype=torch.float64) / fraction + 1e-9).long()
     return batch[index.to(batch.device)]
@@ -83,11 +83,11 @@ def conjugate_gradient(
     Args:
         product: Multiplies a vector [P] with A.
         right: Right-hand side, [P]; for 0 the solution is 0.
-        iterations: Products at most.
+        iterations: Largest number of products.
         tolerance: Squared residual, relative to that of x = 0, at which to stop.
 
     Returns:
-        x, [P], possibly not converged; and A x, which costs no further product.
+        x, [P], which may not have converged; and A x, which needs no further product.
 
     Examples:
         >>> conjugate_gradient(lambda x: 2 * x, torch.tensor([2.0, 4.0]), iterations=10)
@@ -153,7 +153,7 @@ def backtracking_search(
         max_tries: Number of tries, the full step included.
 
     Returns:
-        The accepted fraction of the step: A power of `coeff`, or 0 if none was accepted.
+        The accepted fraction of the step: a power of `coeff`, or 0 if none was accepted.
     """
     start, accepted = flatten(parameters).detach(), 0.0
     try:

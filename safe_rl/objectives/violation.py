@@ -1,4 +1,4 @@
-"""Violations of limits, as losses and steps read them."""
+"""Violations of cost limits, as losses and trust-region steps read them."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ class KnownCosts(Violations, Protocol):
 
     Attributes:
         costs: J_c, undiscounted cost per episode, [k].
-        unit: Size of one cost, [k].
+        unit: Typical size of one cost, [k]; see `EpisodeCosts.unit`.
     """
 
     costs: Tensor
@@ -36,7 +36,7 @@ class KnownCosts(Violations, Protocol):
 def matched_violation(violation: Tensor | None, surrogates: Tensor) -> Tensor:
     """J_c − d in the type and on the device of the cost surrogates, [k].
 
-    Before the first batch it is NaN, which counts as 0: the policy is assumed to be at its limits.
+    Before the first batch J_c is NaN, which counts as 0: the policy is assumed to be at its limits.
 
     Args:
         violation: J_c − d of every constraint, [k].

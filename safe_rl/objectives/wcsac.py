@@ -14,7 +14,7 @@ from safe_rl.objectives.sac import SACLagrangianLoss
 from safe_rl.ranges import Fraction
 
 _SMALLEST = 1e-8
-"""Variance from which on its root is differentiated, as in the published code."""
+"""Lower bound of variances, so that their root has a finite slope, as in the published code."""
 
 
 def gaussian_tail(tail: float) -> float:
@@ -48,12 +48,12 @@ class WCSACLoss(SACLagrangianLoss):
     used.
 
     Args:
-        networks: Actor, Q functions and cost Q functions, as of `SACLagrangianLoss`. The number of
-            the last is even: the first half are means, the second variances before a softplus.
-        tail: Share α of the worst cost returns.
-        pessimism: Standard deviations κ among the CVaR of several pairs of critics that are added
-            to their mean.
-        settings: Those of a `SACLagrangianLoss`.
+        networks: Actor, Q functions and cost Q functions, as in `SACLagrangianLoss`. Of the last,
+            an even number, the first half are means, the second half variances before a softplus.
+        tail: Share α of the cost-returns, the highest ones, whose mean is limited (CVaR).
+        pessimism: Number κ of standard deviations among the CVaR of several pairs of critics that
+            is added to their mean.
+        settings: Settings of a `SACLagrangianLoss`.
 
     Raises:
         ValueError: If α is outside (0, 1], or the number of networks is odd.
@@ -76,7 +76,7 @@ class WCSACLoss(SACLagrangianLoss):
     """
 
     risk_measure = CVaR
-    """What of episodes may be limited besides the mean, because the critics know it."""
+    """Risk measure of episode costs that may be limited, because the critics estimate it."""
 
     def __init__(self, *networks: Any, tail: Fraction, **settings: Any) -> None:
         self._factor = gaussian_tail(tail)
@@ -111,9 +111,9 @@ class WCSACLoss(SACLagrangianLoss):
         Args:
             mean: Q_c of the steps, [E/2, ..., k]. The variance is around this mean, so differences
                 between successors are a part of the variance.
-            costs: Of the steps, [..., k].
-            discount: Of what follows, 0 after an end, [..., 1].
-            following: Mean and variance of what follows, [E/2, ..., k] each.
+            costs: Costs of the steps, [..., k].
+            discount: Discount of the next state's value, 0 if the episode terminated, [..., 1].
+            following: Mean and variance in the next state, [E/2, ..., k] each.
         """
         target = costs + discount * following[0]
         second_moment = target.square() + discount.square() * following[1]

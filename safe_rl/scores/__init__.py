@@ -1,1 +1,1 @@
-"""The protocol: published scores, slates, normalisation, intervals."""
+"""Statistics of the benchmark's protocol: published scores, normalisation, intervals, tests."""

@@ -1,4 +1,4 @@
-"""The benchmark: its environments and slates, and what was published about it.
+"""The benchmark: its environments, its slates (sets of environments), and published results.
 
 Published figures are in ``published.yaml``: Ray, Achiam, Amodei (2019), sections 5.1 and 5.2,
 Tables 1 and 2, and later re-implementations.
@@ -23,7 +23,7 @@ Node = Mapping[str, Any]
 
 
 class Scores(NamedTuple):
-    """J_r, J_c and ρ_c: mean return and cost of an episode, cost per step of all training."""
+    """J_r, J_c and ρ_c: mean return and cost of an episode, and cost per step of all training."""
 
     episode_return: float
     episode_cost: float
@@ -31,7 +31,7 @@ class Scores(NamedTuple):
 
 
 class Normalised(NamedTuple):
-    """J̄_r, M̄_c and ρ̄_c."""
+    """Normalised return J̄_r, violation M̄_c and cost rate ρ̄_c; see `safe_rl.scores.measures`."""
 
     episode_return: float
     violation: float
@@ -64,7 +64,7 @@ REIMPLEMENTATIONS: dict[str, dict[str, tuple[float, float]]] = {
 }
 """Environment -> algorithm -> return and episode cost of later re-implementations."""
 REIMPLEMENTATION_STEPS: int = _DATA["reimplementations"]["steps"]
-"""Environment steps after which these were measured."""
+"""Environment steps after which the scores of re-implementations were measured."""
 
 
 @dataclass(frozen=True)
@@ -72,8 +72,8 @@ class Suite:
     """The benchmark's environments, as configurations.
 
     Attributes:
-        environments: Name -> all its keys, as a run's configuration holds them.
-        defaults: Value of every key where a configuration leaves it out.
+        environments: Name -> all keys of the environment, as in a run's configuration.
+        defaults: Value of every key that a configuration leaves out.
 
     Examples:
         >>> suite = Suite({"PointGoal1": {"task": "goal", "size": 2}}, {"task": None, "size": 2})
@@ -89,7 +89,7 @@ class Suite:
     defaults: Node
 
     def changes(self, node: Node) -> dict[str, Any] | None:
-        """Keys that differ from the environment of a configuration's name; None if none has it."""
+        """Keys that differ from the benchmark's environment of that name; None if there is none."""
         name = node.get("name")
         standard = self.environments.get(name) if isinstance(name, str) else None
         if standard is None:
@@ -100,12 +100,12 @@ class Suite:
         return {key: own.get(key) for key in differ if key != "name"}
 
     def name_of(self, node: Node, *, but_for: Collection[str] = ()) -> str | None:
-        """Name of the environment that a configuration is exactly, or None."""
+        """Name of the environment that a configuration equals, ignoring keys `but_for`; or None."""
         changes = self.changes(node)
         return None if changes is None or set(changes) - set(but_for) else node["name"]
 
     def reference(self, node: Node, *, but_for: Collection[str] = ()) -> Scores | None:
-        """Scores to normalise by, if a configuration is exactly an environment that has any."""
+        """Scores to normalise by, if there are any for the environment of `name_of`."""
         return REFERENCE.get(self.name_of(node, but_for=but_for) or "")
 
 

@@ -1,4 +1,4 @@
-"""Upper confidence bounds of means: by betting, which holds for bounded costs, and Student's."""
+"""Upper confidence bounds of means: by betting, which holds for bounded values, and Student's."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ from numpy.typing import ArrayLike
 
 __all__ = ["best_growth", "betting_bound", "log_wealth", "student_bound"]
 
-# shares of the largest possible bet, and how the first wealth is divided among them: an episode's
-# highest cost is usually far above the limit, and then large bets are the best ones
+# bets, as shares of the largest possible one, and the share of the first wealth for each. An
+# episode's highest cost is usually far above the limit, and then large bets are the best ones
 _BETS = np.array([0.99, 0.7, 0.4, 0.2, 0.08, 0.03])
 _WEIGHTS = np.array([4, 2, 1, 1, 1, 1]) / 10
 
 
 def _growth(values: ArrayLike, mean: float, highest: float) -> np.ndarray:
-    """Log of what every single bet has grown to, [6, n], after every value [n]."""
+    """Log of the wealth from each of the six bets, starting at 1, after every value [n]: [6, n]."""
     values = np.asarray(values, dtype=float)
     gains = (mean - values) / (highest - mean)
     # a value above the highest would make a negative wealth: it ends the bet
@@ -27,18 +27,18 @@ def _growth(values: ArrayLike, mean: float, highest: float) -> np.ndarray:
 def log_wealth(values: ArrayLike, mean: float, highest: float) -> np.ndarray:
     """Log of the wealth after every value of a player who bets that the mean is below ``mean``.
 
-    The player divides a wealth of 1 among bets λ and multiplies each by 1 + λ (mean − value). If
-    the values' mean is ``mean`` or more, nobody wins such a game in expectation, and the wealth
-    reaches 1/α with a probability of at most α, however often it is looked at (Ville's inequality;
+    The player divides a wealth of 1 among bets λ. Every value multiplies the wealth of each bet by
+    1 + λ (mean − value). If the values' true mean is ``mean`` or more, the expected wealth does not
+    grow, and the probability that the wealth ever reaches 1/α is at most α (Ville's inequality;
     Waudby-Smith and Ramdas 2024, section 4).
 
     Args:
         values: Independent values from 0 to ``highest``, in the order of their draws, [n].
-        mean: The mean that is bet against, below ``highest``.
+        mean: The hypothetical mean, below ``highest``.
         highest: The largest possible value.
 
     Returns:
-        Shape [n].
+        Log of the total wealth, [n].
 
     Examples:
         >>> log_wealth([0.0] * 4, mean=0.5, highest=1.0).round(2).tolist()
@@ -50,15 +50,15 @@ def log_wealth(values: ArrayLike, mean: float, highest: float) -> np.ndarray:
 
 
 def best_growth(values: ArrayLike, mean: float, highest: float) -> float:
-    """Log of what the best of the bets has grown to after all values."""
+    """Log of the wealth from the best of the bets, starting at 1, after all values."""
     return float(_growth(values, mean, highest)[:, -1].max())
 
 
 def betting_bound(values: ArrayLike, level: float, highest: float) -> float:
-    """Upper confidence bound of the mean of values up to ``highest``, however distributed.
+    """Upper confidence bound of the mean of values in [0, ``highest``], for any distribution.
 
-    The largest mean that :func:`log_wealth` does not exclude. The bounds after 1, 2, … values hold
-    together: one may stop as soon as a bound is low enough.
+    It is the largest mean that :func:`log_wealth` does not exclude. The bounds after 1, 2, … values
+    hold simultaneously: one may stop as soon as a bound is low enough.
 
     Args:
         values: Independent values, [n].
@@ -66,7 +66,7 @@ def betting_bound(values: ArrayLike, level: float, highest: float) -> float:
         highest: The largest possible value; finite.
 
     Returns:
-        The bound; infinite where a value is no number or above the highest.
+        The bound; infinite if a value is NaN, infinite or above ``highest``.
 
     Raises:
         ValueError: If ``highest`` is not finite.
@@ -95,16 +95,16 @@ def betting_bound(values: ArrayLike, level: float, highest: float) -> float:
 def student_bound(values: ArrayLike, level: float) -> float:
     """Student's upper confidence bound of the mean, with a correction for skewness; approximate.
 
-    x̄ + (t + γ (1 + 2 t²) / (6 √n)) s / √n, with Student's quantile t and twice the sample's
-    skewness as γ where that is positive (Chen, "Testing the mean of skewed distributions", 1995).
-    It is too low where the mean is made by values so rare that the sample has none.
+    It is x̄ + (t + γ (1 + 2 t²) / (6 √n)) s / √n, with Student's quantile t. γ is twice the
+    sample's skewness, or 0 if that is negative (Chen, "Testing the mean of skewed distributions",
+    1995). The bound is too low if high values are so rare that the sample has none.
 
     Args:
         values: Independent values, [n].
         level: Confidence, in (0.5, 1).
 
     Returns:
-        The bound; infinite for fewer than two values, and where all are alike or one is no number.
+        The bound; infinite for fewer than two values, and if all are equal or one is not finite.
 
     Examples:
         >>> round(student_bound([20.0, 22.0, 24.0, 26.0], level=0.95), 2)

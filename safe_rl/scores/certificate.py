@@ -27,7 +27,7 @@ Costs = Mapping[str, ArrayLike]
 
 @dataclass(frozen=True)
 class Statement:
-    """The statement that the mean of a value of episodes is at most a limit.
+    """The statement that the mean over episodes of a value, such as the cost, is at most a limit.
 
     Attributes:
         name: Name of the mean.
@@ -44,7 +44,7 @@ class Statement:
     is_share: bool = False
 
     def bound(self, level: float, kind: str) -> float:
-        """Upper confidence bound of the mean; one of :data:`BOUNDS`."""
+        """Upper confidence bound of the mean; `kind` is one of :data:`BOUNDS`."""
         if kind == "student" and self.is_share:
             # exact (Clopper and Pearson 1934)
             test = scipy.stats.binomtest(
@@ -64,9 +64,9 @@ class Statement:
     def is_hopeless(self, level: float, most: int) -> bool:
         """Whether the test will probably fail with this total number of episodes.
 
-        This is the case if the best bet has grown to less than a quarter of what it needs, in
-        proportion to the episodes so far. A wrong certificate does not become more likely by this:
-        a test may be given up at any time.
+        This is the case if the log wealth of the best bet is less than a quarter of what it needs,
+        in proportion to the episodes so far. This does not make a wrong certificate more likely,
+        because a test may be given up at any time.
         """
         if self.highest <= self.limit:
             return False
@@ -85,14 +85,14 @@ class Claim:
         highest: Cost key -> the highest possible cost of an episode; infinite if not given.
         bound: One of :data:`BOUNDS`.
         cap: Costs of episodes count only up to this value, and at most a share ``most_beyond`` of
-            them may cost more. None: a cap of ten times the limit, only if the highest cost is
-            infinite.
+            them may cost more. None: no cap, or, for the betting bound if the highest cost is
+            infinite, a cap of ten times the limit.
         most_beyond: Largest share of episodes that may cost more than a cap.
         tail: Share α of the episodes with the highest costs, whose mean is limited (CVaR); 1: the
             mean of all episodes is limited.
-        thresholds: With a tail: cost key -> ν of the bound ν + E[(C − ν)₊] / α of the CVaR, which
-            is tight if a share α of the episodes costs more than ν. It holds for every ν that is
-            chosen before the test.
+        thresholds: With a tail below 1: cost key -> ν. The CVaR is at most ν + E[(C − ν)₊] / α for
+            every ν that is chosen before the test, and equal to it if a share α of the episodes
+            costs more than ν.
 
     Examples:
         >>> claim = Claim({"cost": 25.0}, highest={"cost": 50.0})
@@ -151,7 +151,7 @@ class Claim:
 
         Args:
             costs: Cost key -> episode costs, [E].
-            tests: Policies tested at most, which share the error (Bonferroni).
+            tests: Largest number of policies tested; they share the error (Bonferroni).
         """
         level = self._level(tests)
         found = self.statements(costs)
@@ -165,8 +165,8 @@ class Claim:
     def may_end(self, costs: Costs, tests: int, most: int) -> bool:
         """Whether a test of up to ``most`` episodes may end early.
 
-        It may if betting has shown all statements, or if the test will probably fail. Student's
-        bound may be computed only once, after all episodes.
+        It may if betting has shown all statements, or if the test will probably fail. A test with
+        Student's bound may not, because this bound may be computed only once, after all episodes.
         """
         if self.bound != "betting":
             return False
@@ -181,7 +181,7 @@ class Claim:
 
 
 def _above(costs: np.ndarray, limit: float) -> np.ndarray:
-    """1 for every episode that costs more, or no number; else 0."""
+    """1 for every episode whose cost is above the limit or NaN, else 0; [E]."""
     return (~(costs <= limit)).astype(float)
 
 
@@ -190,13 +190,13 @@ class Verdict:
     """The result of testing candidates.
 
     Attributes:
-        certified: Number of the policy that is certified, or None.
+        certified: Number (index) of the policy that is certified, or None.
         tested: Numbers of the policies that were tested, in this order.
         bounds: Of the certified policy, or else of the one that missed its limits least: name ->
             (bound, limit).
         shortfalls: Of the same policy, if none is certified.
         means: Of the same policy: name -> mean over the episodes of its test.
-        highest: Likewise: name -> the largest possible value.
+        highest: Of the same policy: name -> the largest possible value.
         episodes: Episodes of its test.
     """
 
@@ -238,7 +238,7 @@ def _expected_excess(statement: Statement, level: float) -> float:
     values = statement.values
     error = values.std(ddof=1) / np.sqrt(len(values)) if len(values) > 1 else 0.0
     expected = float(values.mean() + NormalDist().inv_cdf(level) * error)
-    # of shares, rare ones cannot be seen in so few episodes
+    # not in units of the limit if that is a small share: so few episodes show no rare ones
     return (_or_infinite(expected) - statement.limit) / max(statement.limit, 1.0)
 
 
@@ -263,8 +263,8 @@ def first_certified(
         order: Numbers of the candidates, from :func:`rank`.
         collect: Costs of a candidate's fresh episodes, batch by batch.
         claims: Claim about each candidate.
-        tests: Candidates tested at most; they share the error.
-        episodes: Episodes of a test at most.
+        tests: Largest number of candidates tested; they share the error.
+        episodes: Largest number of episodes of a test.
 
     Examples:
         >>> costs = [[26.0, 30.0, 31.0], [15.0, 16.0, 14.0]]
@@ -281,7 +281,7 @@ def first_certified(
         verdicts.append(replace(verdict, tested=tested))
         if verdict.certified is not None:
             return verdicts[-1]
-    # by how much the worst bound exceeds what it has to keep
+    # by how much the worst bound of each candidate exceeds its limit
     excess = [max(verdict.shortfalls.values()) for verdict in verdicts]
     return verdicts[int(np.argmin(excess))] if verdicts else Verdict(None, tested)
 

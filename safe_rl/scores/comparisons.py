@@ -1,7 +1,7 @@
-"""Intervals of single figures, and comparisons of whole samples of scores.
+"""Confidence intervals of statistics, and comparisons of samples of scores.
 
-As in Agarwal et al., "Deep Reinforcement Learning at the Edge of the Statistical Precipice" (2021),
-with SciPy's bootstrap.
+They follow Agarwal et al., "Deep Reinforcement Learning at the Edge of the Statistical Precipice"
+(2021), with SciPy's bootstrap.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
-import scipy  # which loads its parts when they are asked for: half a second
+import scipy  # its parts are loaded on first use, which takes half a second
 from numpy.typing import ArrayLike
 
 __all__ = [
@@ -27,14 +27,14 @@ __all__ = [
 
 
 def pareto_front(returns: ArrayLike, costs: ArrayLike) -> np.ndarray:
-    """Which agents no other one beats: none has as much return for less cost, or more for as much.
+    """Pareto-optimal agents: no other has as much return for less cost, or more for as much cost.
 
     Args:
-        returns: Shape [n].
-        costs: Shape [n].
+        returns: Return of every agent, shape [n].
+        costs: Cost of every agent, shape [n].
 
     Returns:
-        Their numbers, by ascending cost.
+        Indices of these agents, by ascending cost.
 
     Examples:
         >>> pareto_front([1.0, 2.0, 3.0, 2.5], [10.0, 40.0, 30.0, 20.0]).tolist()
@@ -49,8 +49,8 @@ def pareto_front(returns: ArrayLike, costs: ArrayLike) -> np.ndarray:
 LEVEL = 0.95
 """Confidence level of all intervals."""
 NUM_RESAMPLES = 2000
-"""Of the bootstrap: moves the ends of an interval by about a fiftieth of its width."""
-# resamples are drawn in portions of about so many numbers
+"""Number of bootstrap resamples: with it, interval ends vary by about 1/50 of the width."""
+# resamples are drawn in portions of about this many numbers
 _PORTION = 2_000_000
 
 
@@ -83,8 +83,8 @@ def bootstrap(
         statistic: Vectorised function ``statistic(*samples, axis)``.
 
     Returns:
-        Lower and upper ends, of the shape of the statistic; NaN where a stratum has a single
-        observation, which says nothing about the spread, or an observation is no number.
+        Lower and upper ends, of the shape of the statistic; NaN if a stratum has a single
+        observation, which says nothing about the spread, or if an observation is not finite.
 
     Examples:
         >>> low, high = bootstrap([np.arange(100.0)], np.mean)
@@ -142,7 +142,7 @@ def _estimate(strata: Sequence[ArrayLike], statistic: Callable[..., Any]) -> Est
 def cvar(values: ArrayLike, alpha: float) -> Estimate:
     """Conditional value at risk: the mean of the largest share ``alpha`` of values, shape [n].
 
-    A value that falls into that share in part counts in part (Rockafellar, Uryasev 2000).
+    If ``alpha`` n is no whole number, one value counts in part (Rockafellar, Uryasev 2000).
 
     Raises:
         ValueError: If ``alpha`` is not in (0, 1].

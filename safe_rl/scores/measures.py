@@ -10,12 +10,12 @@ from safe_rl.scores.benchmark import Scores
 __all__ = ["NOISE_OF_ZERO", "joined", "learning_cost", "normalise"]
 
 SMALLEST_EXCESS = 1e-6
-"""ε, keeps the normalised violation finite where the reference keeps the limit."""
+"""ε, which keeps the normalised violation finite if the reference's cost is within the limit."""
 NOISE_OF_ZERO = 0.1
 """Normalised violation up to which a slate counts as constraint-satisfying.
 
-The paper asks for "zero (or within noise of zero)" and gives no number. In its tables what it calls
-satisfying is at most 0.056, and everything else at least 0.35.
+The paper asks for "zero (or within noise of zero)" and gives no number. In its tables, algorithms
+that it calls satisfying have at most 0.056, and all others at least 0.35.
 """
 
 
@@ -46,10 +46,10 @@ def normalise(
 
 
 def joined(values: ArrayLike, number: int) -> np.ndarray:
-    """Means of `number` consecutive epochs, of fewer at the beginning.
+    """Means over groups of `number` consecutive epochs; the first group may have fewer.
 
-    The mean of few episodes is above a limit more often, so that algorithms whose epochs are
-    shorter than others' would seem to break it more.
+    The mean over few episodes is above a limit more often. So without this, algorithms with shorter
+    epochs than others would seem to violate the limit more often.
 
     Examples:
         >>> joined([9.0, 30.0, 20.0, 10.0, 24.0], number=2).tolist()
@@ -61,12 +61,12 @@ def joined(values: ArrayLike, number: int) -> np.ndarray:
 
 
 def learning_cost(costs: ArrayLike, limit: float) -> dict[str, float]:
-    """What learning has cost beyond a limit, of the J_c of all epochs.
+    """Violations of a limit d during training, from the J_c of all epochs, [n].
 
     Returns:
-        ``regret``: cost per episode above the limit, averaged over epochs, of max(0, J_c − d); an
-        epoch below the limit does not make up for another one above it. ``share_over``: share of
-        epochs whose J_c is above the limit. ``streak``: most of these in a row.
+        ``regret``: mean over epochs of max(0, J_c − d), in cost per episode; an epoch below the
+        limit does not make up for another one above it. ``share_over``: share of epochs whose J_c
+        is above the limit. ``streak``: largest number of such epochs in a row.
 
     Examples:
         >>> learning_cost([45.0, 5.0, 35.0, 25.0 + 30.0, 15.0], limit=25.0)
