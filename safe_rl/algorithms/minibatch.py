@@ -110,7 +110,7 @@ class MinibatchUpdate(PolicyUpdate):
     Raises:
         ValueError: If an argument is outside its range, or ``adapt_rate`` is set without
             ``max_kl``.
-        KeyError: By the call, if ``max_kl`` is set and the loss does not report ``kl``.
+        ValueError: By the call, if ``max_kl`` is set and the loss reports no scalar ``kl``.
         FloatingPointError: By the call, if an entry of the batch is not finite, before any step; or
             if a loss is not finite, before the step on this loss.
 

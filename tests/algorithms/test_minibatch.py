@@ -65,13 +65,11 @@ def test_the_whole_batch_as_minibatch_is_plain_gradient_descent():
 @pytest.mark.parametrize("beyond", [False, True])
 def test_the_update_stops_before_or_after_the_first_step_beyond_the_kl_limit(beyond):
     loss, reference = RecordingLoss(), RecordingLoss()
-    all_samples = {"optimizer": adam, "minibatch_size": None}
-    update = MinibatchUpdate(
-        loss, num_passes=80, max_kl=0.012, step_beyond_kl=beyond, **all_samples
-    )
+    common = {"optimizer": adam, "minibatch_size": None}
+    update = MinibatchUpdate(loss, num_passes=80, max_kl=0.012, step_beyond_kl=beyond, **common)
     diagnostics = update(samples(20))
     # the KLs are 0, .004, .008, .012, .016: the fifth exceeds the limit, after four steps
-    MinibatchUpdate(reference, num_passes=4 + beyond, **all_samples)(samples(20))
+    MinibatchUpdate(reference, num_passes=4 + beyond, **common)(samples(20))
     assert diagnostics["num_steps"] == 4 + beyond
     assert diagnostics["kl"].item() == pytest.approx(0.016)
     assert torch.equal(loss.w, reference.w)

@@ -1,6 +1,5 @@
 """Figures that README and the pages name are those of the archived runs."""
 
-import itertools
 import re
 from functools import cache
 from pathlib import Path
@@ -15,6 +14,7 @@ ROOT = Path(__file__).resolve().parents[2]
 RESULTS = ROOT / "results"
 README = (ROOT / "README.md").read_text()
 PAGE = (ROOT / "docs" / "results.md").read_text()
+ALGORITHMS = (ROOT / "docs" / "algorithms" / "index.md").read_text()
 OFF_POLICY = (ROOT / "docs" / "off_policy.md").read_text()
 
 
@@ -23,7 +23,8 @@ def sentences(page):
     return " ".join(page.split())
 
 
-SEEDS = r"^\| (\w+) \| `(\w+)` \| (\d+(?:\W\d+)?) \| (.+) \|$"
+SEEDS = r"^\| (\w+) \| `(\w+)` \| ([34]\d\d(?:\W\d+)?) \| (.+) \|$"
+ONE_COMMIT = r"^\| (\w+) \| `(\w+)` \| (\d) \| (.+) \|$"
 HELD_OUT = re.findall(SEEDS, PAGE, re.MULTILINE)
 ENVIRONMENTS = ("PointGoal1", "CarGoal1")
 OFF_POLICY_ONES = ("cal", "sac_lagrangian", "td3_lagrangian")
@@ -88,29 +89,28 @@ def percent(share):
     return f"{share:.0%}".replace("%", " %")
 
 
-def three_million(env, algo, seed):
-    """The run of the campaign that has it."""
-    campaigns = (RESULTS / name for name in ("holding_the_limit", "off_policy"))
-    folders = [campaign / env / algo / f"seed{seed}" for campaign in campaigns]
-    return next(folder for folder in folders if run_at(folder))
+def three_million(env, algo, seeds):
+    """The runs of a row of the table, each of the campaign that has it."""
+    first, *others = map(int, re.findall(r"\d+", seeds))
+    numbers = range(first, (others or [first])[0] + 1)
+    campaigns = [RESULTS / name for name in ("holding_the_limit", "off_policy")]
+    paths = [[c / env / algo / f"seed{number}" for c in campaigns] for number in numbers]
+    return [next(filter(run_at, candidates)) for candidates in paths]
+
+
+def cells_of(folders):
+    """A row of the table of three million steps."""
+    of_runs = np.array([last(folder, 1 / 6) for folder in folders])
+    final = [f"{mean:.1f}" for mean in of_runs.mean(0)]
+    if len(folders) > 1:
+        final = [f"{m} ± {d:.1f}" for m, d in zip(final, of_runs.std(0, ddof=1), strict=True)]
+    mean_cost, above = np.mean([held(folder) for folder in folders], axis=0)
+    return [" / ".join(final), f"{mean_cost:.1f}", percent(above), kept(folders)]
 
 
 @pytest.mark.parametrize(("env", "algo", "seeds", "cells"), HELD_OUT)
 def test_the_table_of_three_million_steps_is_that_of_the_archive(env, algo, seeds, cells):
-    first, *others = map(int, re.findall(r"\d+", seeds))
-    numbers = range(first, (others or [first])[0] + 1)
-    folders = [three_million(env, algo, number) for number in numbers]
-    of_runs = np.array([last(folder, 1 / 6) for folder in folders])
-    final = [f"{mean:.1f}" for mean in of_runs.mean(0)]
-    if "±" in cells:
-        final = [f"{m} ± {d:.1f}" for m, d in zip(final, of_runs.std(0, ddof=1), strict=True)]
-    mean_cost, above = np.mean([held(folder) for folder in folders], axis=0)
-    assert cells.split(" | ") == [
-        " / ".join(final),
-        f"{mean_cost:.1f}",
-        percent(above),
-        kept(folders),
-    ]
+    assert cells.split(" | ") == cells_of(three_million(env, algo, seeds))
 
 
 @pytest.mark.parametrize("algo", OFF_POLICY_ONES)
@@ -129,18 +129,20 @@ def test_a_million_steps_with_a_replay_buffer(algo):
     assert f"| `{algo}` | {' | '.join(ends)} |\n" in OFF_POLICY
 
 
+def quarters_of(steps, returns, costs):
+    """Means over each quarter million of steps."""
+    quarters = (steps - 1) // 250_000
+    ends = [[np.nanmean(of[quarters == q]) for of in (returns, costs)] for q in np.unique(quarters)]
+    return tuple("{:.1f} / {:.0f}".format(*end) for end in ends)
+
+
 def test_quarters_of_harder_tasks():
     pattern = r"^\| (\w+) \| `(\w+)` \| ((?:[^|]+ / [^|]+ \| ){4}no, by \S+) \|$"
     rows = re.findall(pattern, OFF_POLICY, re.MULTILINE)
     assert len(rows) == 3
     for env, algo, cells in rows:
         folder = RESULTS / "off_policy" / env / algo / "seed401"
-        steps, returns, costs = figures(folder)
-        ends = np.arange(0, 5) * 250_000
-        quarters = [
-            f"{np.nanmean(returns[within]):.1f} / {np.nanmean(costs[within]):.0f}"
-            for within in ((steps > a) & (steps <= b) for a, b in itertools.pairwise(ends))
-        ]
+        quarters = quarters_of(*figures(folder))
         assert cells.split(" | ") == [*quarters, certificate(folder)]
 
 
@@ -156,11 +158,7 @@ def test_quarters_of_what_was_tried_on_hard_tasks():
     told = {(name, tuple(cell.strip() for cell in cells.split("|")[:-1])) for name, cells in rows}
     for name, path in runs:
         steps, returns, costs = figures(RESULTS / name / path)
-        quarters = (TRIED[name] * steps - 1) // 250_000
-        cells = tuple(
-            f"{np.nanmean(returns[quarters == q]):.1f} / {np.nanmean(costs[quarters == q]):.0f}"
-            for q in np.unique(quarters)
-        )
+        cells = quarters_of(TRIED[name] * steps, returns, costs)
         assert (Path(path).parts[2], cells) in told
 
 
@@ -178,10 +176,6 @@ def test_the_ends_of_the_runs_on_hard_tasks():
         final = "{:.1f} / {:.1f}".format(*last(run, 500_000 / steps))
         above = percent(held(run, steps - 500_000)[1])
         assert cells == [final, above, certificate(run)]
-
-
-def test_the_table_is_found():
-    assert len(HELD_OUT) >= 16
 
 
 def means(folders, share, form="{:.1f} / {:.1f}"):
@@ -220,45 +214,52 @@ def test_the_table_of_readme_is_a_part_of_the_full_one():
     assert len(rows) == 7
     for env, algo, count, cells in rows:
         seeds, (end, _, above, certified) = full[env, algo]
-        first, last_one = map(int, re.findall(r"\d+", seeds))
-        assert int(count) == last_one - first + 1
+        assert int(count) == len(three_million(env, algo, seeds))
         assert cells.split(" | ") == [end, above, certified.partition(",")[0]]
 
 
+def new_episodes(folders):
+    """Mean costs of certified policies in new episodes, and the highest end of their intervals."""
+    runs = [run.notes for run in map(run_at, folders) if run.notes["certificate"]["certified"]]
+    tests = [test for notes in runs for test in notes["evaluations"]]
+    assert [(t["checkpoint"], t["episodes"]) for t in tests] == [("certified", 2000)] * len(runs)
+    costs = [test["estimates"]["episode_cost"] for test in tests]
+    ends = dict.fromkeys(f"{f(c['value'] for c in costs):.1f}" for f in (min, max))
+    return f"{' to '.join(ends)} ({max(c['high'] for c in costs):.1f})"
+
+
 def test_the_campaign_at_one_commit():
-    rows = re.findall(r"^\| (\w+) \| (\d{4}) \| (.+) \|$", PAGE, re.MULTILINE)
-    assert len(rows) == len(campaign("held_out"))
-    ends = []
-    for env, seed, cells in rows:
-        run = RESULTS / "held_out" / env / "ppo_lagrangian" / f"seed{seed}"
-        ends += [last(run, 1 / 6)] if env == "PointGoal1" else []
-        cost, above = held(run)
-        (fresh,) = run_at(run).notes["evaluations"]
-        assert (fresh["checkpoint"], fresh["episodes"]) == ("certified", 2000)
-        mean = "{value:.1f} ({low:.1f} to {high:.1f})".format(**fresh["estimates"]["episode_cost"])
-        end = "{:.1f} / {:.1f}".format(*last(run, 1 / 6))
-        assert cells.split(" | ") == [end, f"{cost:.1f}", percent(above), certificate(run), mean]
-    means, spreads = np.mean(ends, 0), np.std(ends, 0, ddof=1)
-    told = " / ".join(f"{m:.1f} ± {d:.1f}" for m, d in zip(means, spreads, strict=True))
-    assert f"PointGoal1: {told}" in sentences(PAGE)
-    assert told in sentences(README)
+    everything, runs = campaign("held_out").values(), 0
+    for env, algo, count, cells in re.findall(ONE_COMMIT, PAGE, re.MULTILINE):
+        folders = seeds_of(RESULTS / "held_out" / env / algo)
+        runs += len(folders)
+        assert int(count) == len(folders)
+        assert cells.split(" | ") == [*cells_of(folders), new_episodes(folders)]
+    assert runs == len(everything)
+    certified = sum(run.notes["certificate"]["certified"] for run in everything)
+    assert f"{certified} of the {runs} runs are certified" in PAGE
+    assert f"certifies {certified} of {runs} runs" in sentences(README)
+
+
+def test_the_last_five_epochs_of_the_paper_preset():
+    for path, run in campaign("paper_preset").items():
+        table, algo = run.table, Path(path).parts[-2]
+        returns, costs = (np.mean(table[f"episode_{of}"][-5:]) for of in ("return", "cost"))
+        row = f"| `{algo}` | {returns:.1f} | {costs:.1f} | {table['cost_rate'][-1]:.3f} |"
+        is_whole = table["steps"][-1] > 5e6
+        assert row in (PAGE if is_whole else ALGORITHMS)
+        assert not is_whole or f"PPO has {returns:.1f} / {costs:.1f}" in sentences(README)
 
 
 def test_how_many_runs_are_within_the_limit():
-    within = []
-    for env, algo, seeds, _ in HELD_OUT:
-        first, *final = map(int, re.findall(r"\d+", seeds))
-        for number in range(first, (final or [first])[0] + 1):
-            folder = three_million(env, algo, number)
-            within.append((*held(folder), last(folder, 1 / 6)[1]))
+    runs = [run for env, algo, seeds, _ in HELD_OUT for run in three_million(env, algo, seeds)]
+    within = [(*held(run), last(run, 1 / 6)[1]) for run in runs]
     from_one_million, above, end = np.array(within).T
     kept_limits = sum(from_one_million <= 25), sum(end <= 25)
     said = "Of these {} runs, {} have a mean cost of at most 25 from one million steps on, and {} "
     assert said.format(len(within), *kept_limits) in sentences(PAGE)
-    shares = "In each run {:.0f} to {:.0f} % of the epochs".format(
-        *100 * above[[above.argmin(), above.argmax()]]
-    )
-    assert shares in sentences(PAGE)
+    shares = f"{100 * above.min():.0f} to {percent(above.max())}"
+    assert f"In each run {shares} of the epochs" in sentences(PAGE)
     assert f"{len(within)} runs of five" in sentences(README)
     assert f"In {kept_limits[0]} of them" in sentences(README)
 
@@ -284,12 +285,9 @@ def rows_of(name):
 
 def ends_of_seeds(epochs, is_late):
     """Return / cost of every seed over its late epochs."""
-    return [
-        "{:.1f} / {:.0f}".format(
-            *run[is_late(run.steps)][["episode_return", "episode_cost"]].mean()
-        )
-        for _, run in epochs.groupby("seed")
-    ]
+    columns = ["episode_return", "episode_cost"]
+    late = [run[is_late(run.steps)][columns] for _, run in epochs.groupby("seed")]
+    return ["{:.1f} / {:.0f}".format(*run.mean()) for run in late]
 
 
 @pytest.mark.parametrize("name", ["equal_seconds", "equal_steps"])
