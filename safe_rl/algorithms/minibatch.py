@@ -89,8 +89,8 @@ class MinibatchUpdate(PolicyUpdate):
     takes it, but measures the KL on the full batch.
 
     If the KL exceeds ``max_kl`` before the first step, because a very different policy collected
-    the batch, no step is taken and a warning says so. Before the first step, the method ``anchor``
-    of a `SurrogateLoss` is called with the batch.
+    the batch, and ``step_beyond_kl`` is not set, no step is taken and a warning says so. Before the
+    first step, the method ``anchor`` of a `SurrogateLoss` is called with the batch.
 
     Args:
         loss: Loss module. It gets the entries of the batch that its ``in_keys`` name, and the
@@ -101,7 +101,7 @@ class MinibatchUpdate(PolicyUpdate):
         minibatch_size: Samples per gradient step; None takes the whole batch.
         max_kl: Mean KL divergence above which the update ends, or None.
         step_beyond_kl: Whether to take one more step when the KL has been found to exceed
-            ``max_kl``. Then every update takes at least two steps, unless fewer are planned.
+            ``max_kl``. Then an update on data of the current policy has at least two steps.
         max_grad_norm: Norm to which the gradient is clipped, or None.
         adapt_rate: Computes the learning rate of the next call from the number of steps and the KL
             of this one; None for a constant rate. It needs ``max_kl``.
