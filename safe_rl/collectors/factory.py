@@ -133,17 +133,24 @@ def make_ray_collector(  # noqa: D417
         ray_init: Arguments of ``ray.init``, such as ``address``.
         resources: Resources of every actor: ``num_cpus``, ``num_gpus``, ``memory``.
     """
+    import ray
+
+    # not in start(): the processes of Ray end with the thread that has started them
+    if not ray.is_initialized():
+        ray.init(**ray_init)
 
     def start(makers: Makers) -> RayCollector:
-        return RayCollector(
+        collector = RayCollector(
             makers,
             policy,
             frames_per_batch=frames_per_batch,
             total_frames=sys.maxsize,
             sync=True,
-            ray_init_config=ray_init,
+            collector_kwargs={"auto_register_policy_transforms": False},
             remote_configs=resources,
             num_collectors=num_collectors,
         )
+        collector.update_policy_weights_()
+        return collector
 
     return WorkerCollector(start, env, make_env, num_collectors, frames_per_batch, device)
