@@ -1,4 +1,4 @@
-"""Networks: actors, critics, and fast policies for collection."""
+"""Networks: actors, critics, and fast policies for data collection."""
 
 from safe_rl.models.bounded_actors import make_bounded_actor, make_squashed_actor
 from safe_rl.models.build_networks import build_networks

@@ -1,4 +1,4 @@
-"""Distributions of actions that neither torch nor TorchRL have."""
+"""Distributions of actions that neither torch nor TorchRL provides."""
 
 from __future__ import annotations
 
@@ -13,16 +13,16 @@ from torchrl.modules import TanhNormal
 
 __all__ = ["BoundedBeta", "SquashedNormal", "choices"]
 
-# Beta densities are infinite or zero at the ends of (0, 1), which single precision rounds to.
+# Single precision rounds to 0 and 1, where Beta densities are zero or infinite.
 _EDGE = 1e-6
 Shape: TypeAlias = torch.Size | list[int] | tuple[int, ...]
 
 
 def choices(logits: Tensor) -> Independent:
-    """A choice in each of A components of an action, independent of one another.
+    """Return a distribution of independent choices, one for each of A components of an action.
 
     Args:
-        logits: [..., A, C]; components with fewer than C choices have very low ones at their end.
+        logits: [..., A, C]; components with fewer than C choices end with very low logits.
 
     Examples:
         >>> choices(torch.zeros(5, 2, 3)).log_prob(torch.zeros(5, 2)).exp()[0]
@@ -34,11 +34,11 @@ def choices(logits: Tensor) -> Independent:
 class BoundedBeta(Independent):
     """A Beta distribution in each component of an action between bounds (Chou et al. 2017).
 
-    Its divergence is that of the Beta distributions, which stretching does not change.
+    Its KL divergence is that of the Beta distributions, because it does not depend on the bounds.
 
     Args:
         alpha: First concentrations, [..., A].
-        beta: Second ones, [..., A].
+        beta: Second concentrations, [..., A].
         low: Lower bounds, [A].
         high: Upper bounds, [A].
 
@@ -63,12 +63,12 @@ class BoundedBeta(Independent):
             return self.rsample(sample_shape)
 
     def log_prob(self, value: Tensor) -> Tensor:
-        """Density of actions [..., A], in the action's units."""
+        """Logarithm of the density of actions [..., A], in the action's units."""
         unit = ((value - self._low) / self._width).clamp(_EDGE, 1 - _EDGE)
         return super().log_prob(unit) - self._width.log().sum(-1)
 
     def entropy(self) -> Tensor:
-        """In closed form, [...]."""
+        """Entropy in closed form, [...]."""
         return super().entropy() + self._width.log().sum(-1)
 
     @property
@@ -78,7 +78,7 @@ class BoundedBeta(Independent):
 
     @property
     def deterministic_sample(self) -> Tensor:
-        """The mean: the mode is at a bound as soon as a concentration is 1."""
+        """The mean, because the mode is at a bound if a concentration is 1."""
         return self.mean
 
     def _stretched(self, unit: Tensor) -> Tensor:
@@ -86,10 +86,10 @@ class BoundedBeta(Independent):
 
 
 class SquashedNormal(TanhNormal):
-    """A `TanhNormal` that is built only if more than `rsample_and_log_prob` is called.
+    """A `TanhNormal` that is built when a method other than `rsample_and_log_prob` is called.
 
-    Soft actor-critics need only that, twice per update; building the transforms and checking
-    bounds takes six times as long.
+    Soft actor-critics only call this method, twice per update. Building the transforms and checking
+    the bounds takes six times as long.
 
     Args:
         loc: Means before the tanh, [..., A].
@@ -116,7 +116,7 @@ class SquashedNormal(TanhNormal):
         return getattr(self, name)
 
     def rsample_and_log_prob(self, sample_shape: Shape = torch.Size()) -> tuple[Tensor, Tensor]:  # noqa: B008
-        """Draw actions [..., A], differentiably, and their densities [...], exact at the bounds."""
+        """Draw actions [..., A], differentiably, and compute their log-densities [...]."""
         loc, scale, low, high = self.__dict__["_given"].values()
         noise = torch.randn(*sample_shape, *loc.shape, dtype=loc.dtype, device=loc.device)
         inner, half = torch.addcmul(loc, scale, noise), (high - low) / 2

@@ -1,4 +1,4 @@
-"""Actors with bounded actions, for off-policy algorithms: SAC's and TD3's."""
+"""Actors with bounded actions for off-policy algorithms: those of SAC and TD3."""
 
 from __future__ import annotations
 
@@ -111,7 +111,7 @@ def make_bounded_actor(
 
 
 class _SquashedActor(ProbabilisticTensorDictSequential):
-    """A sequence of two modules, whose distribution needs no TensorDict: a third of the time."""
+    """A sequence of two modules that makes its distribution in a third of the usual time."""
 
     def get_dist(
         self,
@@ -125,7 +125,7 @@ class _SquashedActor(ProbabilisticTensorDictSequential):
 
 
 class _GaussianParameters(TensorDictModuleBase):
-    """Writes ``loc`` and ``scale``: a `TensorDictModule` in a fifth of its time."""
+    """Writes ``loc`` and ``scale`` in a fifth of the time of a `TensorDictModule`."""
 
     def __init__(self, module: nn.Module) -> None:
         super().__init__()
@@ -141,7 +141,7 @@ class _GaussianParameters(TensorDictModuleBase):
 
 
 class _Squash(nn.Module):
-    """The tanh of the input, stretched to bounds."""
+    """The tanh of the input, scaled to bounds."""
 
     low: Tensor
     reach: Tensor

@@ -1,4 +1,4 @@
-"""From a configuration's ``model`` and an environment's specs to networks."""
+"""Build networks from a configuration's node ``model`` and an environment's specs."""
 
 from __future__ import annotations
 
@@ -39,16 +39,16 @@ def build_networks(
 ) -> dict[str, Any]:
     """Build an actor, a reward critic and, for ``num_costs`` > 0, a cost critic.
 
-    They share no weights. The state of a recurrent actor is an input of the critics, which are not
-    recurrent.
+    They share no weights. Critics are not recurrent; with a recurrent actor, its state is one of
+    their inputs.
 
     Args:
         model: Node ``model`` of a configuration as composed from ``conf/``.
-        observation_spec: Of N environments.
-        action_spec: Of N environments.
+        observation_spec: Spec of the observations of N environments.
+        action_spec: Spec of the actions of N environments.
         layout: Component -> columns of the flat observation.
         num_costs: Outputs of the cost critic.
-        device: Of all parameters.
+        device: Device of all parameters.
 
     Raises:
         ValueError: If the configuration does not fit the environment.
@@ -90,7 +90,7 @@ def _actor(
     recurrent_size: int,
     device: torch.device,
 ) -> ProbabilisticTensorDictSequential:
-    """Hidden layers to the head; or a recurrent layer after them, and a linear one to the head."""
+    """Hidden layers and a head; a recurrent layer between them if ``recurrent_size`` is not 0."""
     if not recurrent_size:
         body = _body(observed, head.num_outputs, widths, 0, device)
         return assemble_actor(body, head, in_keys=observed.keys)
@@ -114,13 +114,13 @@ def _body(
     recurrent_size: int,
     device: torch.device,
 ) -> nn.Module:
-    """From observations and the recurrent state to outputs: a perceptron where that will do."""
+    """From observations and the recurrent state to outputs; a plain perceptron where possible."""
     first = observed.entries[0]
     if observed.encoders is None and not observed.is_vector:
         pictures = any(len(entry.shape) == 3 for entry in observed.entries)
         advice = "model=cnn for the pictures" if pictures else "model=dict, an encoder for each"
         raise ValueError(
-            f"This environment observes {', '.join(map(str, observed.entries))}, and model=mlp "
+            f"This environment observes {', '.join(map(str, observed.entries))}, but model=mlp "
             f"takes one vector: use {advice}, or {TO_FLATTEN}."
         )
     if observed.encoders is not None or recurrent_size:

@@ -1,4 +1,4 @@
-"""Policies for collection, on-policy and off-policy, without distribution objects."""
+"""Policies for on-policy and off-policy data collection, without distribution objects."""
 
 from __future__ import annotations
 
@@ -21,9 +21,9 @@ __all__ = ["WITHOUT_NOISE", "BehaviourPolicy", "ExploringPolicy", "make_behaviou
 
 
 def make_behaviour(actor: ProbabilisticTensorDictSequential) -> TensorDictModuleBase:
-    """The fastest module that samples an actor: a `BehaviourPolicy` of it, or the actor itself."""
+    """Return a `BehaviourPolicy` of an actor, which is faster, or the actor itself."""
     parameters, sampler = actor.module[0], actor.module[-1]
-    # of somebody else's network it is not known in which order it puts out what
+    # the order of the outputs of other networks is not known
     network = getattr(parameters, "module", None)
     is_ours = len(actor.module) == 2 and isinstance(network, Chain)
     is_plain = is_ours and sampler.distribution_class is IndependentNormal
@@ -37,11 +37,10 @@ WITHOUT_NOISE = (ExplorationType.DETERMINISTIC, ExplorationType.MODE, Exploratio
 class BehaviourPolicy(TensorDictModuleBase):
     """Sample a Gaussian actor in one module, without distribution objects.
 
-    It shares the actor's parameters and writes what the actor writes: ``loc``, ``scale``, the
-    action and its log-probability. While an environment is stepped with small batches, most of the
-    actor's time goes into building distributions and nesting modules, which this class leaves out.
-    Under ``set_exploration_type`` with ``DETERMINISTIC``, ``MODE`` or ``MEAN`` the action is
-    ``loc``, which is all of these of a Gaussian.
+    It shares the actor's parameters and writes the same entries: ``loc``, ``scale``, the action and
+    its log-probability. With small batches, an actor spends most of its time on building
+    distributions and calling nested modules, which this class leaves out. Under
+    ``set_exploration_type`` with ``DETERMINISTIC``, ``MODE`` or ``MEAN``, the action is ``loc``.
 
     Args:
         actor: Policy made by :func:`make_actor`, or by `assemble_actor` with the head "gaussian".
@@ -69,7 +68,7 @@ class BehaviourPolicy(TensorDictModuleBase):
             noise = torch.zeros_like(loc)
         else:
             noise = torch.randn_like(loc)
-        # log N(loc + scale * noise; loc, scale) in terms of the noise alone
+        # log N(loc + scale * noise; loc, scale) in terms of the noise
         log_prob = -0.5 * noise.square().sum(-1) - scale.log().sum(-1)
         log_prob = log_prob - 0.5 * math.log(2 * math.pi) * loc.shape[-1]
         outputs = (loc, scale, torch.addcmul(loc, scale, noise), log_prob)
@@ -79,24 +78,24 @@ class BehaviourPolicy(TensorDictModuleBase):
 
 
 class ExploringPolicy(TensorDictModuleBase):
-    """Policy of off-policy collection: the actor's actions, or random ones in the beginning.
+    """Policy of off-policy collection: the actor's actions, or uniformly random ones at first.
 
-    It shares the actor's parameters and writes nothing but the action, without distribution
-    objects. Of a squashed Gaussian it samples; to the actions of a deterministic actor it adds
-    Gaussian noise. Under ``set_exploration_type`` with ``DETERMINISTIC``, ``MODE`` or ``MEAN`` the
-    action is the actor's own: the tanh of the Gaussian's mean.
+    It shares the actor's parameters and writes only the action, without distribution objects. It
+    samples from a squashed Gaussian actor, and adds Gaussian noise to the actions of a
+    deterministic one. Under ``set_exploration_type`` with ``DETERMINISTIC``, ``MODE`` or ``MEAN``,
+    the action is that of the deterministic actor, or the tanh of the Gaussian's mean.
 
     Args:
-        actor: What :func:`~safe_rl.models.make_squashed_actor` or
-            :func:`~safe_rl.models.make_bounded_actor` makes.
+        actor: A policy made by :func:`~safe_rl.models.make_squashed_actor` or
+            :func:`~safe_rl.models.make_bounded_actor`.
         low: Lower bounds of the action, [A].
         high: Upper bounds of the action, [A].
-        noise: Standard deviation of the noise that is added to a deterministic actor's actions, in
-            halves of the range of an action.
+        noise: Standard deviation of the noise of a deterministic actor, as a fraction of half the
+            action's range.
 
     Attributes:
-        is_random: Whether actions are uniformly random; a buffer, that collectors' workers get with
-            the weights.
+        is_random: Whether actions are uniformly random. It is a buffer, so the workers of a
+            collector receive it with the weights.
 
     Examples:
         >>> import torch

@@ -1,4 +1,4 @@
-"""From an observation, a vector, a picture or several of both, to features; the recurrent layer."""
+"""Encoders of observations (vectors, pictures or several of both), and the recurrent layer."""
 
 from __future__ import annotations
 
@@ -31,10 +31,10 @@ class Entry(NamedTuple):
     """A tensor that is observed.
 
     Attributes:
-        key: Where it stands.
-        name: Of the component; of a flat observation, "observation".
-        shape: Of one environment's: [n], or [height, width, colours] or colours first.
-        is_bytes: Whether its numbers are 0 to 255.
+        key: Key of the tensor.
+        name: Name of the component; "observation" if the observation is not nested.
+        shape: Shape in one environment: [n], [height, width, colours] or colours first.
+        is_bytes: Whether the numbers are integers from 0 to 255.
     """
 
     key: NestedKey
@@ -47,10 +47,10 @@ class Entry(NamedTuple):
 
 
 def observed_entries(observation_spec: Composite) -> list[Entry]:
-    """Everything below ``observation``, in alphabetical order of the names.
+    """Return all entries of ``observation``, in alphabetical order of their names.
 
     Raises:
-        ValueError: If one is neither a vector nor a picture.
+        ValueError: If an entry is neither a vector nor a picture.
     """
     observed = observation_spec["observation"]
     if not isinstance(observed, Composite):
@@ -63,22 +63,22 @@ def _entry(key: NestedKey, name: str, spec: TensorSpec) -> Entry:
     shape = tuple(spec.shape[1:])
     if len(shape) not in (1, 3):
         raise ValueError(
-            f"The observation '{name}' of an environment has the shape {list(shape)}: networks "
+            f"The observation '{name}' of an environment has the shape {list(shape)}, but networks "
             "take vectors [n] and pictures [height, width, colours]."
         )
     return Entry(key, name, shape, not spec.dtype.is_floating_point)
 
 
 class Observed(NamedTuple):
-    """What networks need to know about observations.
+    """Properties of observations that networks depend on.
 
     Attributes:
-        entries: What is observed.
-        layout: Component -> columns, of a flat observation.
+        entries: The observed entries.
+        layout: Component -> columns of the flat observation.
         input_scale: Component -> factor.
         clip: Bound of columns normalised by running moments; None without normalisation.
-        encoders: Of every entry before all are put together; None: there is one vector, which
-            needs none.
+        encoders: Settings of the encoders of entries; None if the observation is one vector, which
+            needs no encoder.
     """
 
     entries: Sequence[Entry]
@@ -89,7 +89,7 @@ class Observed(NamedTuple):
 
     @property
     def keys(self) -> list[NestedKey]:
-        """Where the entries stand."""
+        """Keys of the entries."""
         return [entry.key for entry in self.entries]
 
     @property
@@ -99,14 +99,14 @@ class Observed(NamedTuple):
 
 
 class Body(nn.Module):
-    """Encode every entry, put the codes side by side, and run a perceptron on them.
+    """Encode every entry, concatenate the codes, and run a perceptron on them.
 
     Args:
-        observed: What is observed, and how it is encoded.
+        observed: The observed entries, and how they are encoded.
         out_features: Outputs of the perceptron.
         hidden_sizes: Widths of its hidden layers.
-        extra: Numbers that come after the entries and go to the perceptron as they are.
-        device: Of the parameters.
+        extra: Number of further inputs, which follow the entries and are not encoded.
+        device: Device of the parameters.
 
     Examples:
         >>> import torch
@@ -143,7 +143,7 @@ class Body(nn.Module):
 
 
 class Pixels(nn.Module):
-    """Pictures with colours last or first, in bytes or [0, 1], as convolutions want them."""
+    """Converts pictures with colours last or first, in bytes or [0, 1], for convolutions."""
 
     def __init__(self, colours_last: bool, is_bytes: bool) -> None:
         super().__init__()
@@ -157,11 +157,11 @@ class Pixels(nn.Module):
 
 def _vector(entry: Entry, observed: Observed, device: torch.device | None) -> nn.Module:
     size, widths = entry.shape[0], list(observed.encoders["vector"])  # type: ignore[index]
-    # of a dictionary an entry may be called that, too
+    # an entry of a dictionary may have the name "observation", too
     layout = observed.layout if entry.key == "observation" else {entry.name: slice(0, size)}
     scale = input_scale_vector(observed.input_scale, layout)
     layers: list[nn.Module] = []
-    if observed.clip is not None:  # then the units make no difference
+    if observed.clip is not None:  # normalisation makes input scales unnecessary
         layers.append(RunningScale(size, key=entry.key, clip=observed.clip, device=device))
     elif scale is not None:
         layers.append(InputScale(scale.to(device)))
@@ -173,7 +173,7 @@ def _vector(entry: Entry, observed: Observed, device: torch.device | None) -> nn
 def _picture(entry: Entry, observed: Observed, device: torch.device | None) -> nn.Module:
     settings = observed.encoders
     assert settings is not None
-    # up to three colours and a depth; if both ends are that short, colours are last
+    # at most three colours and a depth; if both ends are that short, colours are last
     colours_last = entry.shape[-1] <= 4
     colours = entry.shape[-1] if colours_last else entry.shape[0]
     convolutions = ConvNet(
@@ -206,14 +206,14 @@ FEATURES, RECURRENT, FIRST = "features", "memory", "is_init"
 class RecurrentLayer(TensorDictModuleBase):
     """Gated recurrent units (Cho et al. 2014) between the features of a network.
 
-    A batch [N] is a step of N environments: the new state goes to ``("next", "memory")`` and
-    returns with the next step. A batch [N, T] holds sequences in order of time, of which the
-    first steps' states are read, and 0 wherever ``is_init`` says that an episode begins.
+    A batch [N] is a step of N environments: the new state is written to ``("next", "memory")``, and
+    is an input of the next step. A batch [N, T] contains sequences in order of time: the state of
+    the first step is read, and it is 0 wherever ``is_init`` is True.
 
     Args:
         num_features: Number of inputs.
         size: Size of the state, and number of outputs.
-        device: Of the parameters.
+        device: Device of the parameters.
 
     Examples:
         >>> import torch
@@ -244,7 +244,7 @@ class RecurrentLayer(TensorDictModuleBase):
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Replace the features; after a single step also write the new state."""
         inputs = {key: tensordict.get(key) for key in self.in_keys}
-        inputs[RECURRENT] = inputs[RECURRENT].unsqueeze(-2)  # of its one layer
+        inputs[RECURRENT] = inputs[RECURRENT].unsqueeze(-2)  # the dimension of layers
         steps = TensorDict(inputs, batch_size=tensordict.batch_size)
         is_sequence = tensordict.ndim > 1
         with set_recurrent_mode(is_sequence):

@@ -1,6 +1,6 @@
-"""Heads of policies: from what a network puts out to a distribution of actions.
+"""Heads of policies: from the outputs of a network to a distribution of actions.
 
-A row of `HEADS` says for which actions a head is meant; `auto` takes the first that fits.
+Every row of `HEADS` says for which actions its head is meant; `auto` takes the first that fits.
 """
 
 from __future__ import annotations
@@ -30,10 +30,10 @@ __all__ = ["AUTO", "HEADS", "Head", "gaussian_head", "make_head"]
 
 AUTO = "auto"
 
-# The scale of a policy is exp(log std) and must follow it over the whole range in use: the floor
-# only keeps a collapsed policy from dividing by zero.
+# The scale of a policy is exp(log std). The floor is far below the values in use, and only prevents
+# a division by zero.
 _SCALE_FLOOR = 1e-6
-# of choices that there are not: no probability at all, without the infinities of their gradients
+# Logit of choices that do not exist: probability 0, with finite gradients.
 _NO_CHOICE = -1e9
 
 
@@ -41,8 +41,8 @@ class Head(NamedTuple):
     """How the outputs of a network become a distribution of actions.
 
     Attributes:
-        num_outputs: Numbers that the network puts out.
-        parameters: Module from them, [..., num_outputs], to the distribution's parameters.
+        num_outputs: Number of outputs of the network.
+        parameters: Module from these, [..., num_outputs], to the distribution's parameters.
         keys: Names of these parameters.
         distribution: Class of the distribution, or a function that makes one.
     """
@@ -54,7 +54,7 @@ class Head(NamedTuple):
 
 
 class _Row(NamedTuple):
-    """A head that can be chosen: for which actions, and how it is made."""
+    """A head: the actions that it is meant for, and the function that makes it."""
 
     fits: Callable[[TensorSpec], bool]
     make: Callable[[TensorSpec, float, torch.device | None], Head]
@@ -71,12 +71,14 @@ def make_head(
 
     Args:
         kind: A key of `HEADS`, or "auto".
-        action_spec: Of N environments: [N, A] bounded, [N] or [N, A] integers, or [N, C] one-hot.
-        initial_log_std: Of normal distributions; others have no use for it.
-        device: Of the parameters.
+        action_spec: Spec of the actions of N environments: [N, A] bounded, [N] or [N, A] integers,
+            or [N, C] one-hot.
+        initial_log_std: Initial logarithm of the standard deviation of normal distributions; other
+            heads do not use it.
+        device: Device of the parameters.
 
     Raises:
-        ValueError: If the head is not for such actions, or none is.
+        ValueError: If the head, or every head, is for other actions.
 
     Examples:
         >>> from torchrl.data import Categorical
@@ -101,7 +103,7 @@ def make_head(
 def gaussian_head(
     action_size: int, initial_log_std: float, device: torch.device | None = None
 ) -> Head:
-    """A diagonal Gaussian of state-independent width; the environment clips its actions."""
+    """A diagonal Gaussian with a state-independent scale; the environment clips its actions."""
     scale = AddStateIndependentNormalScale(
         action_size, init_value=initial_log_std, scale_lb=_SCALE_FLOOR, device=device
     )
@@ -113,7 +115,7 @@ def _gaussian(spec: TensorSpec, initial_log_std: float, device: torch.device | N
 
 
 def _tanh(spec: TensorSpec, initial_log_std: float, device: torch.device | None) -> Head:
-    """A Gaussian squashed into the bounds; its width is that before squashing."""
+    """A Gaussian squashed into the bounds; its scale is that before squashing."""
     low, high = _bounds(spec, device)
     head = gaussian_head(spec.shape[-1], initial_log_std, device)
     return head._replace(distribution=partial(TanhNormal, low=low, high=high))
@@ -126,7 +128,7 @@ def _beta(spec: TensorSpec, initial_log_std: float, device: torch.device | None)
 
 
 def _categorical(spec: TensorSpec, initial_log_std: float, device: torch.device | None) -> Head:
-    """As many logits as there are choices; a plain choice has no component dimension."""
+    """One logit per choice; an action of shape [N] has no dimension of components."""
     numbers = list(_num_choices(spec))
     if len(spec.shape) == 1:
         return Head(numbers[0], nn.Identity(), ("logits",), distributions.Categorical)
@@ -138,7 +140,7 @@ def _one_hot(spec: TensorSpec, initial_log_std: float, device: torch.device | No
 
 
 class _Concentrations(nn.Module):
-    """Two concentrations above 1 per component: the density has one hump (Chou et al. 2017)."""
+    """Two concentrations above 1 per component: densities are unimodal (Chou et al. 2017)."""
 
     def forward(self, outputs: Tensor) -> tuple[Tensor, Tensor]:
         alpha, beta = (1 + softplus(outputs)).chunk(2, -1)
@@ -146,7 +148,7 @@ class _Concentrations(nn.Module):
 
 
 class _Components(nn.Module):
-    """Logits of all components, one after the other, as [..., A, C] with C the most choices."""
+    """Reshapes concatenated logits to [..., A, C], with C the largest number of choices."""
 
     def __init__(self, choices: list[int]) -> None:
         super().__init__()
@@ -160,7 +162,7 @@ class _Components(nn.Module):
 
 
 def _bounds(spec: TensorSpec, device: torch.device | None) -> tuple[Tensor, Tensor]:
-    """Of one environment's actions, [A] each."""
+    """Bounds of one environment's actions, [A] each."""
     low, high = (
         bound.reshape(-1, spec.shape[-1])[0] for bound in (spec.space.low, spec.space.high)
     )

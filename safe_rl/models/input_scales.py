@@ -1,4 +1,4 @@
-"""Scales of observations: fixed factors, and running moments as a part of the networks."""
+"""Scales of observations: fixed factors, and running moments that are part of the networks."""
 
 from __future__ import annotations
 
@@ -35,16 +35,16 @@ class InputScale(nn.Module):
 
 
 def input_scale_vector(factors: Mapping[str, float], layout: Mapping[str, slice]) -> Tensor | None:
-    """Turn factors per observation component into one factor per column.
+    """Convert factors per observation component to factors per column.
 
     Args:
-        factors: Component name -> factor > 0. Components not named keep the factor 1.
+        factors: Component name -> factor > 0. Other components have the factor 1.
         layout: Component name -> columns of the flat observation.
 
     Returns:
-        Factors, shape [n] with n the number of columns, or None if none of the named components is
-        observed. A name that is absent from ``layout`` is skipped, because one configuration serves
-        robots with different sensors.
+        Factors, shape [n] with n the number of columns, or None if no named component is observed.
+        A name that is not in ``layout`` is skipped, because robots with different sensors use the
+        same configuration.
 
     Examples:
         >>> input_scale_vector({"gyro": 0.5}, {"gyro": slice(0, 2), "lidar": slice(2, 3)})
@@ -59,22 +59,22 @@ def input_scale_vector(factors: Mapping[str, float], layout: Mapping[str, slice]
     return scale
 
 
-_CONSTANT = 1e-12  # variance up to which a column never changes
+_CONSTANT = 1e-12  # a column with a variance up to this is constant
 
 
 class RunningScale(nn.Module):
-    """Subtract a running mean and divide by a running standard deviation, cut at ±``clip``.
+    """Subtract a running mean, divide by a running standard deviation, and clip at ±``clip``.
 
-    The moments are buffers in double precision: a checkpoint holds them with the weights, and a run
-    that is resumed has the same results. They change only by :meth:`update`, which training calls
-    once per batch after learning from it, so that probabilities of a batch stay those of the policy
-    that collected it. Before the first batch inputs are unchanged.
+    The moments are buffers in double precision: a checkpoint contains them with the weights, so a
+    resumed run has the same results. Only :meth:`update` changes them. Training calls it once per
+    batch, after learning from the batch, so that the log-probabilities of a batch stay those of the
+    policy that collected it. Before the first update, inputs are only clipped.
 
     Args:
         size: Number of columns, n.
-        key: Entry of a batch that the input comes from.
-        clip: Where normalised columns are cut.
-        device: Of the moments.
+        key: Entry of a batch that is the input.
+        clip: Bound of the outputs.
+        device: Device of the moments.
 
     Examples:
         >>> import torch
@@ -103,18 +103,18 @@ class RunningScale(nn.Module):
     def forward(self, inputs: Tensor) -> Tensor:
         """Normalise ``inputs``, shape [..., n]."""
         variance = self.squares / self.count.clamp_min(1)
-        # constant columns keep their unit
+        # constant columns are only centred
         width = torch.where(variance > _CONSTANT, variance.sqrt(), 1.0)
         normalised = (inputs - self.mean.to(inputs)) / width.to(inputs)
         return normalised.clamp(-self.clip, self.clip)
 
     @torch.no_grad()
     def update(self, batch: TensorDictBase) -> None:
-        """Take in the samples of a batch (Chan, Golub, LeVeque 1979, equation 2.1)."""
+        """Add the samples of a batch (Chan, Golub, LeVeque 1979, equation 2.1)."""
         values = batch.get(self.key).to(self.mean).reshape(-1, self.mean.shape[0])
         number, mean = values.shape[0], values.mean(0)
         total, shift = self.count + number, mean - self.mean
-        # in place: compiled losses read the same tensors every time
+        # in place, because compiled losses keep references to these tensors
         self.squares += (values - mean).square().sum(0)
         self.squares += shift.square() * (self.count * number / total)
         self.mean += shift * (number / total)

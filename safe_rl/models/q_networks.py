@@ -18,7 +18,7 @@ Layers = Sequence[tuple[Tensor, Tensor]]
 
 
 class EnsembleMLP(nn.Module):
-    """E perceptrons with ReLUs, evaluated together: one batched matrix product per layer.
+    """E ReLU perceptrons that are evaluated together by one batched matrix product per layer.
 
     Its overhead is a fraction of that of `torch.func.vmap` over modules.
 
@@ -49,23 +49,23 @@ class EnsembleMLP(nn.Module):
                 parameters.append(nn.Parameter(values))
 
     def forward(self, inputs: Tensor, layers: Layers | None = None) -> Tensor:
-        """Outputs [E, …, n] of all networks for inputs […, m].
+        """Return outputs [E, …, n] of all networks for inputs […, m].
 
         Args:
             inputs: The same for every network.
-            layers: Parameters to take instead of its own, from `layers`.
+            layers: Parameters to use instead of the own ones, as `layers` returns them.
         """
         hidden = inputs.reshape(-1, inputs.shape[-1]).expand(self.num_networks, -1, -1)
         for number, (weight, bias) in enumerate(self.layers() if layers is None else layers):
-            # in place: the backward pass needs what the rectifier leaves, not what it gets
+            # in place, because the backward pass of a ReLU needs only its output
             hidden = torch.baddbmm(bias, hidden.relu_() if number else hidden, weight)
         return hidden.reshape(self.num_networks, *inputs.shape[:-1], hidden.shape[-1])
 
     def layers(self, params: TensorDictBase | None = None) -> Layers:
-        """Weights [E, m, n] and biases [E, 1, n] of every layer, its own or of others like it.
+        """Return weights [E, m, n] and biases [E, 1, n] of every layer.
 
         Args:
-            params: Parameters that are named as its own are.
+            params: Parameters with the same names as the own ones; None takes these.
         """
         if params is None:
             return list(zip(self.weights, self.biases, strict=True))
@@ -74,14 +74,14 @@ class EnsembleMLP(nn.Module):
 
 
 class QEnsemble(TensorDictModuleBase):
-    """E Q functions of observation and action, as one module; losses need no vmap over it.
+    """E Q functions of observation and action as one module, without vmap.
 
     Args:
         observation_size: Length of the flat observation.
         action_size: Length of the action.
         hidden_sizes: Width of every hidden layer.
         num_networks: E.
-        num_outputs: Values per network: 1 for the reward, k for k costs.
+        num_outputs: Values per network: 1 for the reward, K for K costs.
         input_scale: Fixed factors of the observation, or None.
         device: Device of the parameters.
         out_key: Key of the values.
@@ -115,11 +115,11 @@ class QEnsemble(TensorDictModuleBase):
     def forward(
         self, tensordict: TensorDictBase, params: TensorDictBase | None = None
     ) -> TensorDictBase:
-        """Values [E, …, n] in a new TensorDict of shape [E, …], for steps […].
+        """Return values [E, …, n] in a new TensorDict of shape [E, …], for steps […].
 
         Args:
             tensordict: Observations and actions.
-            params: Parameters to take instead of its own, such as a target network's.
+            params: Parameters to use instead of the own ones, such as a target network's.
         """
         observation, action = (tensordict[key] for key in self.in_keys)
         layers = None if params is None else self.layers(params)
@@ -127,9 +127,9 @@ class QEnsemble(TensorDictModuleBase):
         return TensorDict({self.out_keys[0]: values}, batch_size=values.shape[:-1])
 
     def values(self, observation: Tensor, action: Tensor, layers: Layers | None = None) -> Tensor:
-        """Values [E, …, n], with parameters of its own or given: `forward` without TensorDicts."""
+        """Return values [E, …, n]: `forward` without TensorDicts."""
         return self.network(torch.cat([self.scale(observation), action], -1), layers)
 
     def layers(self, params: TensorDictBase) -> Layers:
-        """What `values` takes, from parameters that are named as its own are."""
+        """Convert parameters with the same names as the own ones to the argument of `values`."""
         return self.network.layers(params["network"])

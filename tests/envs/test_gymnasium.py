@@ -187,14 +187,14 @@ def test_a_batch_that_is_not_reset_says_so():
     actions = np.zeros((2, 2), np.float32)
     for _ in range(3):
         envs.step(actions)
-    with pytest.raises(RuntimeError, match=r"Worlds \[0, 1\] have ended.*reset_mask"):
+    with pytest.raises(RuntimeError, match=r"Environments \[0, 1\] have ended.*reset_mask"):
         envs.step(actions)
     with pytest.raises(ValueError, match="boolean array of shape"):
         envs.reset(options={"reset_mask": np.array([True])})
-    with pytest.raises(ValueError, match="A seed is for all worlds"):
+    with pytest.raises(ValueError, match="A seed is for all environments"):
         envs.reset(seed=1, options={"reset_mask": np.array([True, False])})
     envs.reset(options={"reset_mask": np.array([True, False])})
-    with pytest.raises(RuntimeError, match=r"Worlds \[1\] have ended"):
+    with pytest.raises(RuntimeError, match=r"Environments \[1\] have ended"):
         envs.step(actions)
 
 

@@ -248,7 +248,7 @@ def filtered(function):
         ),
         (
             lambda: filtered(lambda step, positions: step["action"]).rollout(1),
-            "asks for 'positions'",
+            "parameter 'positions'",
         ),
         (
             lambda: transformed("safety_gym", n=SensorNoise(0.1, ["giro"])),

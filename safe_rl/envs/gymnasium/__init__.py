@@ -1,8 +1,8 @@
-"""The environments in Gymnasium's interfaces, and Gymnasium's environments in TorchRL's.
+"""The environments of safe_rl in Gymnasium's interfaces, and Gymnasium's in TorchRL's interface.
 
-Costs stand in `info`: `info["cost"]`, one `info["cost_<kind>"]` per constrained kind, and
-`info["goal_met"]`. `gymnasium.make` and `gymnasium.make_vec` find the environments under the ids
-that `safe_rl.envs.registration` registers.
+`info` contains the costs, `info["cost"]` and one `info["cost_<kind>"]` per constrained kind, and
+events such as `info["goal_met"]`. `gymnasium.make` and `gymnasium.make_vec` know the environments
+by the ids that `safe_rl.envs.registration` registers.
 """
 
 from typing import TYPE_CHECKING

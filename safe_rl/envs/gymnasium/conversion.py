@@ -1,4 +1,4 @@
-"""Gymnasium's environments in TorchRL, with their costs where the algorithms look for them."""
+"""Gymnasium's environments as TorchRL environments, with their costs beside the reward."""
 
 from __future__ import annotations
 
@@ -43,32 +43,33 @@ def from_gymnasium(
 ) -> GymnasiumEnv:
     """Make a TorchRL environment of any Gymnasium environment that reports costs in `info`.
 
-    Observations become one float32 vector each, continuous actions are clipped to [-1, 1] and
-    stretched to the environment's bounds, so that the algorithms can be used as they are. Choices
-    (Discrete, MultiDiscrete) are integers. The N environments are stepped one after the other.
+    Every observation becomes one float32 vector. Continuous actions are clipped to [-1, 1] and
+    scaled to the environment's bounds. Choices (Discrete, MultiDiscrete) are integers. The N
+    environments are stepped one after the other.
 
     Args:
         env: Gymnasium id, or a function that makes an environment.
         num_envs: Number of environments, N.
-        cost_keys: Names of the costs in `info`; None finds those called `cost` or `cost_<kind>` by
-            taking one step.
-        outside: Cost key -> a range that costs 1 to leave: (column of the observation, lowest,
-            highest), or of a dictionary (entry, column, lowest, highest).
-        num_steps: The largest number of steps of an episode; None takes what the id says.
-        seed: Of all environments; row k has this one plus k.
-        device: Where the TensorDicts live.
-        flatten: Make one vector of every observation; False leaves pictures and dictionaries as
-            they are.
-        kwargs: For `gymnasium.make`, with an id.
+        cost_keys: Names of the costs in `info`; None takes one step, and uses the names `cost` and
+            `cost_<kind>` that it reports.
+        outside: Cost key -> a range; a step that leaves it costs 1. A range is (column of the
+            observation, lowest, highest), or (entry, column, lowest, highest) for a dictionary.
+        num_steps: The largest number of steps of an episode; None takes it from the
+            environment's `spec`.
+        seed: Environment k is seeded with this number plus k; None draws one.
+        device: Device of the TensorDicts.
+        flatten: Whether every observation becomes one vector; False keeps pictures and
+            dictionaries.
+        kwargs: Arguments of `gymnasium.make`, if `env` is an id.
 
     Returns:
-        An environment [N], with the costs in its reward spec; `cost` is the sum of the others if
-        there is none of that name. A copy (`copy`, `pickle`) continues where it was if copies of
-        the environments inside do.
+        An environment [N] with the costs in its reward spec. Without a cost named `cost`, the sum
+        of the others gets this name. A copy (`copy`, `pickle`) continues the present episodes if
+        copies of the Gymnasium environments do.
 
     Raises:
         ValueError: If there are no costs, actions are neither continuous and bounded nor choices,
-            observations are no arrays, or the length of episodes is not known.
+            observations cannot become arrays, or the length of episodes is not known.
 
     Examples:
         >>> env = from_gymnasium("Safexp-PointGoal1-v0", num_envs=2, num_steps=1000, seed=0)
@@ -80,7 +81,7 @@ def from_gymnasium(
     keys, length = _describe(make, cost_keys, num_steps, outside)
     make_one = partial(make_adapted, make, length, flatten, keys)
     worlds = SyncVectorEnv([make_one] * num_envs, autoreset_mode=AutoresetMode.DISABLED)
-    worlds.env_fns = ()  # not needed again, and custom functions might not be pickled
+    worlds.env_fns = ()  # not needed again, and pickle may refuse them
     base = GymWrapper(worlds, device=torch.device(device), categorical_action_encoding=True)
     observed = list(map(dotted, base.observation_spec.keys(True, True)))
     base.set_info_dict_reader(CostReader(keys, num_envs, patience=length))
@@ -96,13 +97,13 @@ def from_six_values(
     """Make a TorchRL environment of environments whose step returns six values.
 
     Args:
-        env: A function that makes one environment, as Safety-Gymnasium's interface has them.
-        cost_keys: Kinds of costs that are taken from `info` beside the step's own cost; None takes
-            all that are called `cost_<kind>`, found by taking a step.
-        settings: Any other argument of `from_gymnasium`.
+        env: A function that makes one environment with the interface of Safety-Gymnasium.
+        cost_keys: Names of costs in `info` that are used beside the cost that a step returns; None
+            takes one step, and uses the names `cost_<kind>` that it reports.
+        settings: Other arguments of `from_gymnasium`.
 
     Returns:
-        An environment [N]; `cost` is what a step returns.
+        An environment [N]; `cost` is the cost that a step returns.
 
     Raises:
         ValueError: If a step has another number of values, or the length of episodes is not known.
@@ -133,7 +134,7 @@ def make_gymnasium(config: Mapping[str, Any], **settings: Any) -> GymnasiumEnv:
     Args:
         config: `id` and any other key of conf/env/gymnasium.yaml.
         settings: `num_envs`, `device`, `seed` and `num_threads`; the last one is not used. Rows of
-            different seeds have nothing in common.
+            different seeds have independent random draws.
 
     Raises:
         ConfigError: For an unknown key or id, or an environment that the algorithms cannot use.
@@ -142,10 +143,10 @@ def make_gymnasium(config: Mapping[str, Any], **settings: Any) -> GymnasiumEnv:
 
 
 def make_safety_gymnasium(config: Mapping[str, Any], **settings: Any) -> GymnasiumEnv:
-    """Make environments of an id that `safety_gymnasium.make` knows, as `make_gymnasium`.
+    """Make environments of an id of `safety_gymnasium.make`; arguments as of `make_gymnasium`.
 
     Raises:
-        ConfigError: As there, and if the package cannot be imported.
+        ConfigError: As `make_gymnasium`, and if Safety-Gymnasium cannot be imported.
     """
     return _make_node(SAFETY_GYMNASIUM, _of_safety_gymnasium, config, **settings)
 
@@ -179,7 +180,7 @@ def _make_node(
 def _describe_node(
     maker: Callable[[Mapping[str, Any]], MakeEnv], config: Mapping[str, Any]
 ) -> tuple[list[str], int]:
-    """Cost keys and length of episodes of a node, found out where they are None."""
+    """Return the cost keys and the length of episodes of a node; None is replaced by a value."""
     make, outside = maker(config), config.get("outside")
     try:
         return _describe(make, config["cost_keys"], config["num_steps"], outside)
@@ -194,14 +195,14 @@ def _describe(
         require_integer("num_steps", num_steps, lowest=1)
     probe = make()
     if not isinstance(probe, gymnasium.Env):
-        raise ConfigError(f"It makes no environment of Gymnasium (gymnasium.Env), but {probe!r}.")
+        raise ConfigError(f"The function must return a gymnasium.Env, but it returned {probe!r}.")
     try:
         keys = _find_costs(probe) if cost_keys is None else [*dict.fromkeys(cost_keys)]
         if cost_keys is None and not keys and not outside:
             raise ValueError(
                 f"{probe.unwrapped} reports no costs: there is no 'cost' or 'cost_<kind>' in its "
-                "info. If a cost is called otherwise, or is not reported at every step, name it "
-                "in 'cost_keys'; 'outside' makes a cost of leaving a range: "
+                "info. If a cost has another name, or is not reported at every step, name it in "
+                "'cost_keys'. To give a cost to every step that leaves a range, use 'outside': "
                 "env.outside='{cost_position: [0, -0.5, 0.5]}'."
             )
         known = None if probe.spec is None else probe.spec.max_episode_steps
@@ -216,13 +217,13 @@ def _describe(
 def _maker(env: Any, kwargs: Mapping[str, Any], num_steps: int | None) -> MakeEnv:
     if isinstance(env, str):
         length = {} if num_steps is None else {"max_episode_steps": num_steps}
-        # what is registered here goes with it to other processes
+        # the spec, because other processes may not have registered the id
         return partial(gymnasium.make, gymnasium.registry.get(env, env), **{**length, **kwargs})
     if isinstance(env, gymnasium.Env) or not callable(env):
         raise ConfigError(f"Give an id, or a function that makes an environment; got {env!r}.")
     for key in kwargs:
         hint = nearest(key, signature(from_gymnasium).parameters)
-        raise ConfigError(f"'{key}' is for gymnasium.make, and a function makes these.{hint}")
+        raise ConfigError(f"'{key}' is for gymnasium.make, which a function does not use.{hint}")
     return env
 
 
@@ -258,9 +259,10 @@ def _of_safety_gymnasium(config: Mapping[str, Any]) -> MakeEnv:
         import safety_gymnasium
     except ImportError as error:
         raise ConfigError(
-            f"Safety-Gymnasium cannot be imported in this Python ({error}). Its release 1.0 wants "
-            "an older Gymnasium and MuJoCo than safe_rl; install a release that can be imported "
-            "beside it. Environments of yours with six values need no package: from_six_values."
+            f"Safety-Gymnasium cannot be imported in this Python ({error}). Its release 1.0 needs "
+            "older releases of Gymnasium and MuJoCo than safe_rl; install a release that can be "
+            "imported beside safe_rl. Your own environments with six values do not need the "
+            "package: use from_six_values."
         ) from error
     make = partial(safety_gymnasium.make, config["id"], **_arguments(config))
     return partial(_six_values, make)

@@ -1,4 +1,4 @@
-"""Wrappers of single Gymnasium environments: observations, actions and costs as they are read."""
+"""Wrappers that convert observations, actions and costs of single Gymnasium environments."""
 
 from __future__ import annotations
 
@@ -20,17 +20,17 @@ COST_SUM = "cost_sum"  # Safety-Gymnasium's name for the sum of all kinds
 def make_adapted(
     make: Callable[[], gymnasium.Env], num_steps: int, flatten: bool, cost_keys: Sequence[str]
 ) -> gymnasium.Env:
-    """Make an environment whose choices count from 0 and whose costs are floats.
+    """Make an environment whose choices start at 0 and whose costs are floats.
 
     Args:
         make: Makes the environment.
         num_steps: Steps after which its episodes are truncated.
-        flatten: Make one vector of the observation, float32; False leaves it alone.
+        flatten: Whether the observation becomes one float32 vector.
         cost_keys: Names of the costs in `info`.
     """
     env = make()
     seen, actions = env.observation_space, env.action_space
-    # Not by the wrapper that Gymnasium has for it: it keeps lambdas, which cannot be pickled.
+    # Gymnasium's own wrapper, FlattenObservation, contains lambdas and cannot be pickled.
     if flatten:
         space = Box(-np.inf, np.inf, (gymnasium.spaces.flatdim(seen),), np.float32)
         env = TransformObservation(env, partial(_vector, seen), space)
@@ -47,9 +47,10 @@ def _vector(space: gymnasium.Space, observation: Any) -> np.ndarray:
 
 
 class FloatCosts(gymnasium.Wrapper):
-    """Makes the costs in `info` floats; ConfigError if one is not a number.
+    """Converts the costs in `info` to floats; ConfigError if one is not a number.
 
-    Gymnasium puts the costs of a batch into an array of the type of the first row, and rounds.
+    Gymnasium puts the costs of a batch into an array of the first row's type. If this is an
+    integer, it rounds the costs of the other rows.
     """
 
     def __init__(self, env: gymnasium.Env, cost_keys: Sequence[str]) -> None:
@@ -57,7 +58,7 @@ class FloatCosts(gymnasium.Wrapper):
         self._cost_keys = list(cost_keys)
 
     def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
-        """Step, and convert what is reported."""
+        """Step, and convert the costs."""
         *values, info = self.env.step(action)
         reported = [key for key in self._cost_keys if key in info]
         return *values, {**info, **{key: _number(key, info[key]) for key in reported}}
@@ -68,14 +69,14 @@ def _number(key: str, value: Any) -> float:
         return float(value)
     except (TypeError, ValueError):
         raise ConfigError(
-            f"info['{key}'] must be one number per step, as a cost is, got {value!r}."
+            f"info['{key}'] must be one number per step, because it is a cost; got {value!r}."
         ) from None
 
 
 class SixValues(gymnasium.Wrapper):
     """An environment whose step returns (observation, reward, cost, terminated, truncated, info).
 
-    Here its step returns Gymnasium's five values, and the cost is in `info`.
+    The wrapper's step returns Gymnasium's five values, with the cost in `info`.
 
     Examples:
         >>> class Slide(gymnasium.Env):
@@ -93,8 +94,8 @@ class SixValues(gymnasium.Wrapper):
         if len(values) != 6:
             raise ValueError(
                 f"A step of {self.env} returned {len(values)} values instead of six (observation, "
-                "reward, cost, terminated, truncated, info). Five with the cost in info are for "
-                "env=gymnasium."
+                "reward, cost, terminated, truncated, info). For an environment that returns five "
+                "values and has the cost in info, use env=gymnasium."
             )
         observation, reward, cost, terminated, truncated, info = values
         others = {key: value for key, value in info.items() if key != COST_SUM}

@@ -21,8 +21,8 @@ __all__ = ["CostReader", "GymnasiumEnv"]
 class CostReader(BaseInfoDictReader):
     """Reads costs from `info` into the TensorDict, float32 [N, 1]; 0 where none is reported.
 
-    Some environments report a cost only where it occurs. A warning names, once, a cost that no
-    `info` has had for `patience` steps.
+    Some environments report a cost only when it occurs. If no `info` of the first `patience` steps
+    contains a cost, there is one warning.
 
     Args:
         cost_keys: Names in `info`.
@@ -45,7 +45,7 @@ class CostReader(BaseInfoDictReader):
         return tensordict
 
     def _look_at_names(self, info_dict: Mapping[str, Any]) -> None:
-        # names that begin so are Gymnasium's masks
+        # Gymnasium's masks begin with an underscore
         self._names |= {name for name in info_dict if not name.startswith("_")}
         self._unseen -= self._names
         self._num_steps += 1
@@ -56,7 +56,7 @@ class CostReader(BaseInfoDictReader):
             warnings.warn(
                 f"The cost '{key}' is in no info of the first {self._patience} steps, and counts "
                 f"as 0.{nearest(key, others)} The infos have {', '.join(others) or 'no other'}. If "
-                "it is reported only where it occurs, it may not have occurred yet.",
+                "the cost is reported only when it occurs, it may not have occurred yet.",
                 stacklevel=3,
             )
         self._unseen.clear()
@@ -73,7 +73,7 @@ class GymnasiumEnv(TorchRLEnv):
 
     @property
     def seconds_per_step(self) -> float | None:
-        """What a step takes in the environment's own time [s], if it says that."""
+        """Duration of a step in the environment's own time [s]; None if unknown."""
         rate = (getattr(self.base_env._env, "metadata", None) or {}).get("render_fps")
         return 1 / rate if rate else None
 
@@ -85,26 +85,26 @@ class GymnasiumEnv(TorchRLEnv):
         width: int = 480,
         height: int = 360,
     ) -> np.ndarray:
-        """Draw environments as they draw themselves, resized; as `SimulatedEnv.render`.
+        """Return the environments' own frames, resized; arguments as of `SimulatedEnv.render`.
 
         Raises:
-            ValueError: For a camera other than "free", or if they were made without pictures.
+            ValueError: For a camera other than "free", or if the environments draw no frames.
         """
         if camera != "free":
             raise ValueError(
-                f"There is no camera '{camera}': an environment of Gymnasium has its own, which "
-                "its arguments may change (env.kwargs)."
+                f"There is no camera '{camera}': an environment of Gymnasium uses its own camera. "
+                "Its arguments may change it (env.kwargs)."
             )
         frames = self.base_env._env.render()
         if frames is None or frames[0] is None:
-            raise ValueError("It was made without pictures: env.render_mode=rgb_array.")
+            raise ValueError("The environment draws no frames: set env.render_mode=rgb_array.")
         chosen = range(len(frames)) if rows is None else [rows] if isinstance(rows, int) else rows
         drawn = np.stack([_fit(np.asarray(frames[row]), width, height) for row in chosen])
         return drawn[0] if isinstance(rows, int) else drawn
 
 
 def _fit(picture: np.ndarray, width: int, height: int) -> np.ndarray:
-    """Resize to the largest picture that keeps its form, in the corner of [height, width, 3]."""
+    """Resize with the same aspect ratio, into the upper left corner of [height, width, 3]."""
     scale = min(width / picture.shape[1], height / picture.shape[0])
     lines, columns = (
         (np.arange(max(1, int(scale * size))) / scale).astype(int) for size in picture.shape[:2]

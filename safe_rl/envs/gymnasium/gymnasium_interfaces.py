@@ -1,4 +1,4 @@
-"""Our simulated environments in Gymnasium's two interfaces: one world, and a batch of worlds."""
+"""The simulated environments in Gymnasium's two interfaces: one environment, and a batch."""
 
 from __future__ import annotations
 
@@ -26,19 +26,19 @@ __all__ = ["WorldEnv", "WorldVectorEnv"]
 
 
 class WorldEnv(Worlds, gymnasium.Env[Any, np.ndarray]):
-    """One world in Gymnasium's interface.
+    """One simulated environment in Gymnasium's interface.
 
     Args:
-        name: Of the environment; None for the defaults of every key of Safety Gym's.
+        name: Name of the environment; None uses Safety Gym with the default of every key.
         config: Keys to change, or a whole `SafetyGymConfig`.
         render_mode: "rgb_array" for frames, or None; "human" is for `gymnasium.make`, whose wrapper
             shows the frames in a window.
-        camera: Of the frames, as the environment's `render` takes it; None is its first.
-        width: Of a frame [pixels].
-        height: Of a frame [pixels].
-        sleep: As `SafetyGymEnv` takes it.
-        positions: Put `info["positions"]` into every info: float64 [K, 3] by kind (m), as
-            `SafetyGymEnv.get_positions` has them.
+        camera: Camera of the frames, as in the environment's `render`; None is its first.
+        width: Width of a frame [pixels].
+        height: Height of a frame [pixels].
+        sleep: As in `SafetyGymEnv`.
+        positions: Whether every info has `info["positions"]`: float64 [K, 3] by kind (m), as
+            in `SafetyGymEnv.get_positions`.
 
     Raises:
         ConfigError: For a configuration that cannot be used.
@@ -62,7 +62,7 @@ class WorldEnv(Worlds, gymnasium.Env[Any, np.ndarray]):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Observation, dict[str, Any]]:
-        """Start an episode; a seed determines it and all that follow."""
+        """Start an episode; a seed determines this one and all later ones."""
         super().reset(seed=seed)
         self._seed(seed, self.np_random)
         observation = take(self._reset(), 0)
@@ -80,7 +80,7 @@ class WorldEnv(Worlds, gymnasium.Env[Any, np.ndarray]):
         return self.batch.render(0, **self._view) if self.render_mode == "rgb_array" else None
 
     def close(self) -> None:
-        """Free what OpenGL holds."""
+        """Free the memory of OpenGL."""
         self.batch.close()
 
     def _position(self) -> dict[str, Any]:
@@ -88,21 +88,21 @@ class WorldEnv(Worlds, gymnasium.Env[Any, np.ndarray]):
 
 
 class WorldVectorEnv(Worlds, VectorEnv[Any, np.ndarray, np.ndarray]):
-    """A batch of worlds in Gymnasium's vector interface, stepped together on a thread pool.
+    """A batch of environments in Gymnasium's vector interface, stepped together on a thread pool.
 
-    Row k of a seed has the same episodes whatever `num_envs` is; row 0 has those of `WorldEnv` with
-    that seed.
+    With a given seed, the episodes of row k do not depend on `num_envs`. Row 0 has the episodes of
+    `WorldEnv` with that seed.
 
     Args:
-        num_envs: Number of worlds, N.
-        name: As `WorldEnv` takes it.
-        config: As `WorldEnv` takes it.
-        autoreset_mode: When an ended episode is followed by a new one: with the next step, within
-            the same step (what ended is then in `infos["final_obs"]` and `infos["final_info"]`), or
-            by `reset(options={"reset_mask": mask})`.
+        num_envs: Number of environments, N.
+        name: As in `WorldEnv`.
+        config: As in `WorldEnv`.
+        autoreset_mode: When a new episode follows one that ended: with the next step, within the
+            same step (`infos["final_obs"]` and `infos["final_info"]` then describe the end), or by
+            `reset(options={"reset_mask": mask})`.
         num_threads: Threads that step the physics; 0 for one per core.
-        max_episode_steps: Takes the place of `num_steps`; `gymnasium.make_vec` passes it on.
-        settings: Others of `WorldEnv`; positions are [N, K, 3].
+        max_episode_steps: Replaces `num_steps`; `gymnasium.make_vec` passes it on.
+        settings: Other arguments of `WorldEnv`; positions are [N, K, 3].
 
     Raises:
         ConfigError: For a configuration that cannot be used.
@@ -147,13 +147,14 @@ class WorldVectorEnv(Worlds, VectorEnv[Any, np.ndarray, np.ndarray]):
         """Start new episodes.
 
         Args:
-            seed: Determines the episodes of all worlds; or one for every world [N], which then has
-                those of `WorldEnv` with that seed. None keeps the present seeds.
-            options: `reset_mask`, bool [N], restricts the reset to some worlds.
+            seed: An integer that determines the episodes of all environments; or N of them, one per
+                environment, which then has the episodes of `WorldEnv` with that seed. None keeps
+                the present seeds.
+            options: `reset_mask`, bool [N], restricts the reset to some environments.
 
         Raises:
-            ValueError: For a mask of another shape or type, or a seed for a part of the worlds,
-                or seeds of another number.
+            ValueError: For a mask of another shape or type, for a mask together with a seed, or
+                if the number of seeds is not N.
         """
         super().reset(seed=seed if isinstance(seed, int) else None)
         mask = (options or {}).get("reset_mask")
@@ -168,36 +169,36 @@ class WorldVectorEnv(Worlds, VectorEnv[Any, np.ndarray, np.ndarray]):
     def step(
         self, actions: np.ndarray
     ) -> tuple[Observation, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
-        """Take an action [N, nu] in every world, see `autoreset_mode` for those that ended."""
+        """Take an action [N, nu] in all environments; `autoreset_mode` says what follows an end."""
         if self.autoreset_mode is AutoresetMode.DISABLED and self._ended.any():
             raise RuntimeError(
-                f"Worlds {np.flatnonzero(self._ended).tolist()} have ended: call "
+                f"Environments {np.flatnonzero(self._ended).tolist()} have ended: call "
                 "reset(options={'reset_mask': terminations | truncations}) before the next step."
             )
         observation, (reward, terminated, truncated), infos = self._step(actions)
         within = self.autoreset_mode is AutoresetMode.SAME_STEP
-        # Worlds that start an episode in this step.
+        # Environments that start an episode in this step.
         begins = terminated | truncated if within else self._ended
         reported = with_masks(infos, ~begins)
         if within:
             reported |= final_infos(observation, infos | self._positions(), begins)
         else:
-            # the step of a world that had already ended does not count
+            # the step of an environment that had already ended does not count
             reward = np.where(begins, 0.0, reward)
             terminated, truncated = terminated & ~begins, truncated & ~begins
             self._ended = terminated | truncated
         if begins.any():
             observation = choose(begins, self._reset(begins), observation)
-        # Those of a world that begins are of its new episode.
+        # Where an episode begins, the positions are those of the new episode.
         reported |= with_masks(self._positions(), np.ones_like(begins))
         return observation, reward, terminated, truncated, reported
 
     def render(self) -> tuple[np.ndarray, ...] | None:
-        """Return a frame of every world, uint8 [height, width, 3], in the mode "rgb_array"."""
+        """Return one frame per row, uint8 [height, width, 3], in the mode "rgb_array"."""
         return tuple(self.batch.render(**self._view)) if self.render_mode == "rgb_array" else None
 
     def close_extras(self, **kwargs: Any) -> None:
-        """Free what OpenGL holds."""
+        """Free the memory of OpenGL."""
         self.batch.close()
 
     def _check_mask(self, mask: np.ndarray, seed: Any) -> None:
@@ -207,4 +208,4 @@ class WorldVectorEnv(Worlds, VectorEnv[Any, np.ndarray, np.ndarray]):
                 f"at least one True, got {mask!r}."
             )
         if seed is not None:
-            raise ValueError("A seed is for all worlds: give either a seed or a 'reset_mask'.")
+            raise ValueError("A seed is for all environments: give a seed or a 'reset_mask'.")

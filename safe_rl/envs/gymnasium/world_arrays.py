@@ -1,4 +1,4 @@
-"""A batched simulated environment as arrays: what Gymnasium's two interfaces have in common."""
+"""A batched simulated environment as arrays: the common part of Gymnasium's two interfaces."""
 
 from __future__ import annotations
 
@@ -30,10 +30,10 @@ Config = Mapping[str, Any] | SafetyGymConfig | None
 
 
 class Worlds:
-    """A batched environment as arrays: what both interfaces have in common.
+    """A batched environment as arrays: the common part of both interfaces.
 
-    The environment's spec says how long episodes are, for wrappers and tools that ask it. The
-    registered one does not: Gymnasium would add a time-out of its own to the environment's.
+    The environment's spec gives the length of episodes, for wrappers and tools that read it. The
+    registered spec does not, because Gymnasium would add a second time limit.
 
     Attributes:
         batch: The batched environment inside.
@@ -57,18 +57,18 @@ class Worlds:
     ) -> None:
         if unknown:
             name = next(iter(unknown))
-            raise TypeError(f"No argument '{name}': keys go into config, config={{'{name}': …}}.")
+            raise TypeError(f"There is no argument '{name}': put keys into config={{'{name}': …}}.")
         if render_mode not in (None, *RENDER_MODES):
             raise ValueError(f"render_mode must be one of {RENDER_MODES}, got {render_mode!r}.")
         self.batch, self.render_mode, self._has_positions = batch(sleep), render_mode, positions
         self._view: dict[str, Any] = {"camera": camera, "width": width, "height": height}
         self._events = [name for name in self.batch.flags if name not in SimulatedEnv.flags]
-        rate = max(1, round(1 / self.batch.seconds_per_step))  # in real time, as Gymnasium's
+        rate = max(1, round(1 / self.batch.seconds_per_step))  # of real time
         self.metadata: dict[str, Any] = {"render_modes": RENDER_MODES, "render_fps": rate}
 
     @property
     def spec(self) -> EnvSpec | None:
-        """What it was made from; `max_episode_steps` is the configuration's `num_steps`."""
+        """The registered spec, with the configuration's `num_steps` as `max_episode_steps`."""
         return self._spec and replace(self._spec, max_episode_steps=self.batch.max_episode_steps)
 
     @spec.setter
@@ -76,7 +76,7 @@ class Worlds:
         self._spec = spec
 
     def spaces(self) -> tuple[gymnasium.Space, Box]:
-        """What one world observes, by name where it is nested, and its actions."""
+        """Spaces of one environment's observation (by name if it is nested) and action."""
         seen, bounds = self.batch.observation_spec["observation"], self.batch.observation_bounds
         ends = self.batch.action_spec.space
         actions = Box(ends.low[0].cpu().numpy(), ends.high[0].cpu().numpy(), dtype=np.float32)
@@ -91,10 +91,10 @@ class Worlds:
         return Box(low, high, dtype=np.float32), actions
 
     def _seed(self, seed: Any, generator: np.random.Generator) -> None:
-        """Seed all episodes to come; without a seed, once, with one that is drawn."""
+        """Seed all later episodes; without a seed, the first call draws one."""
         seed = seed.tolist() if isinstance(seed, np.ndarray) else seed
         if isinstance(seed, str) or not isinstance(seed, int | np.integer | Sequence | None):
-            raise TypeError(f"A seed is an integer, or one for every world, got {seed!r}.")
+            raise TypeError(f"A seed is an integer, or a sequence of one per row, got {seed!r}.")
         if isinstance(seed, int | np.integer):
             self.batch.set_seed(int(seed) % NUM_SEEDS)
         elif not self._is_seeded:
@@ -104,17 +104,17 @@ class Worlds:
         self._is_seeded = True
 
     def _reset(self, mask: np.ndarray | None = None) -> Observation:
-        """Start new episodes, everywhere or where the mask [N] says; all worlds' observation."""
+        """Start episodes in all rows or in those of a mask [N]; return the observation of all."""
         ask = None
         if mask is not None:
             ask = TensorDict({"_reset": torch.from_numpy(mask).unsqueeze(-1)}, len(mask))
-        # of TorchRL's `reset`, the other worlds would observe zeros
+        # TorchRL's `reset` would return zeros for the other rows
         return arrays_of(self.batch._reset(ask)["observation"])
 
     def _step(
         self, actions: np.ndarray
     ) -> tuple[Observation, tuple[Any, Any, Any], dict[str, Any]]:
-        """Observation, (reward, terminated, truncated) [N] each, and infos of a step."""
+        """Take a step; return observation, (reward, terminated, truncated) [N] each, and infos."""
         action = torch.as_tensor(actions, dtype=torch.float32, device=self.batch.device)
         step = self.batch.step(TensorDict({"action": action}, self.batch.batch_size))["next"]
         column = {
@@ -127,7 +127,7 @@ class Worlds:
         return arrays_of(step["observation"]), values, infos
 
     def _positions(self) -> dict[str, Any]:
-        """Where everything is now, by kind [N, K, 3] (m), under `positions`; or nothing."""
+        """Present positions by kind [N, K, 3] (m) under `positions`; empty if not wanted."""
         return {"positions": arrays_of(self.batch.get_positions())} if self._has_positions else {}
 
 
@@ -139,7 +139,7 @@ def batch_of(
     num_steps: int | None,
     sleep: bool,
 ) -> SimulatedEnv:
-    """Make the environment of a name, with some keys changed, or of a whole configuration."""
+    """Make the environments of a name with some keys changed, or of a whole configuration."""
     base = VELOCITY_SUITE.get(name or "") or (resolve(name) if name else SafetyGymConfig())
     whole = config if isinstance(config, SafetyGymConfig) else base.replace(**(config or {}))
     if num_steps is not None:
@@ -150,28 +150,28 @@ def batch_of(
 
 
 def arrays_of(observation: torch.Tensor | TensorDictBase) -> Observation:
-    """An observation of N worlds as arrays, by name where it is nested."""
+    """Observation of N environments as arrays, by name if it is nested."""
     if isinstance(observation, TensorDictBase):
         return {str(key): value.cpu().numpy() for key, value in observation.items()}
     return observation.cpu().numpy()
 
 
 def take(observation: Observation, row: int) -> Observation:
-    """One world's observation."""
+    """Observation of one environment."""
     if isinstance(observation, dict):
         return {key: value[row] for key, value in observation.items()}
     return observation[row]
 
 
 def choose(mask: np.ndarray, chosen: Any, other: Any) -> Any:
-    """The rows of `chosen` where the mask [N] says, of `other` elsewhere."""
+    """Rows of `chosen` where the mask [N] is True, of `other` elsewhere."""
     if isinstance(other, dict):
         return {key: choose(mask, chosen[key], other[key]) for key in other}
     return np.where(mask.reshape(-1, *[1] * (other.ndim - 1)), chosen, other)
 
 
 def with_masks(infos: Mapping[str, Any], mask: np.ndarray) -> dict[str, Any]:
-    """Add to every array [N, …] the mask `_<key>` of the worlds that it speaks of; 0 elsewhere."""
+    """Set every array [N, …] to 0 outside the mask [N], and add the mask as `_<key>`."""
     masked = {
         key: with_masks(values, mask)
         if isinstance(values, dict)
@@ -184,7 +184,7 @@ def with_masks(infos: Mapping[str, Any], mask: np.ndarray) -> dict[str, Any]:
 def final_infos(
     observation: Observation, infos: Mapping[str, Any], ends: np.ndarray
 ) -> dict[str, Any]:
-    """Describe what ended, as Gymnasium does for episodes that are followed within the step."""
+    """Describe the episodes that ended [N], as Gymnasium does in the mode that resets at once."""
     if not ends.any():
         return {}
     observations = np.full(len(ends), None, dtype=object)

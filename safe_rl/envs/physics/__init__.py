@@ -1,4 +1,4 @@
-"""MuJoCo, a batch of worlds at a time: what environments ask of a physics backend."""
+"""The interface of a physics backend: N MuJoCo simulations that are advanced together."""
 
 from __future__ import annotations
 
@@ -12,37 +12,37 @@ if TYPE_CHECKING:
 
 
 STATE = ("time", "qpos", "qvel", "qacc_warmstart", "ctrl", "mocap_pos", "mocap_quat")
-"""What the simulations are in, beside the memory of actuators and sensors."""
+"""Tensors of the state, besides the memory of actuators and sensors."""
 MEMORY = ("act", "history")
 OUTPUTS = ("xpos", "xmat", "sensordata", "subtree_com")
-"""What is read of them, unless others are asked for."""
+"""Outputs that are read by default."""
 
 
 class Physics(ABC):
     """N simulations of one model, advanced together on one device.
 
-    Rules, layouts and observations are made of its tensors, on its device and of its floating-point
-    type. Tensors keep their addresses: what is written into them in place takes effect at the next
-    call, and every call refreshes the outputs of the simulations that it ran. Shapes have the sizes
-    of the model (nq, nv, nu, nbody, nmocap).
+    Rules, layouts and observations use its tensors, device and floating-point type. Tensors keep
+    their addresses: values that are written in place take effect at the next call, and every call
+    refreshes the outputs of the simulations that it ran. Shapes have the sizes of the model (nq,
+    nv, nu, nbody, nmocap).
 
-    A step must not wait for an accelerator. So whoever takes part in it asks `maybe_any`, `rows`
-    and `check`, which look at values only where that costs nothing, as on the CPU.
+    A step must not wait for an accelerator. Therefore code of a step uses `maybe_any`, `rows` and
+    `check`, which read values only where the host need not wait, as on the CPU.
 
     Attributes:
-        device: where the tensors are.
-        dtype: their floating-point type.
-        timestep: length of a substep [s].
-        waits: whether the host would have to wait for the device in order to look at a value.
+        device: Device of the tensors.
+        dtype: Their floating-point type.
+        timestep: Duration of a substep [s].
+        waits: Whether the host must wait for the device to read a value.
         time: [N] s.
-        qpos, qvel, qacc_warmstart: state of the joints, [N, nq] and [N, nv].
-        ctrl: controls [N, nu].
-        mocap_pos, mocap_quat: poses of the mocap bodies [N, nmocap, 3] (m) and [N, nmocap, 4].
-        memory: state of actuators and sensors that remember, `act` [N, na] and `history`
-            [N, nhistory]; empty where there are none.
-        xpos, xmat, sensordata, subtree_com: outputs that are there unless others were asked for,
-            [N, nbody, 3] (m), [N, nbody, 3, 3], [N, nsensordata] and [N, nbody, 3] (m).
-        outputs: all outputs that were asked for, by their names in MuJoCo's `MjData`.
+        qpos, qvel, qacc_warmstart: State of the joints, [N, nq], [N, nv] and [N, nv].
+        ctrl: Controls [N, nu].
+        mocap_pos, mocap_quat: Poses of the mocap bodies [N, nmocap, 3] (m) and [N, nmocap, 4].
+        memory: State of actuators and sensors with memory, `act` [N, na] and `history`
+            [N, nhistory]; without entries that the model does not need.
+        xpos, xmat, sensordata, subtree_com: The default outputs, [N, nbody, 3] (m),
+            [N, nbody, 3, 3], [N, nsensordata] and [N, nbody, 3] (m).
+        outputs: All requested outputs, by their names in MuJoCo's `MjData`.
     """
 
     device: torch.device
@@ -69,9 +69,9 @@ class Physics(ABC):
 
     @abstractmethod
     def forward(self, mask: Tensor | None = None, sensors: bool = True) -> None:
-        """Bring the outputs up to date with the state, for all simulations or those in `mask`.
+        """Compute the outputs from the state, for all simulations or those in `mask`.
 
-        Without `sensors`, the readings and what is computed for them alone stay as they are.
+        Without `sensors`, the readings, and quantities that only sensors need, stay unchanged.
         """
 
     @abstractmethod
@@ -82,19 +82,19 @@ class Physics(ABC):
         refresh: bool = True,
         counts: Tensor | None = None,
     ) -> Tensor:
-        """Advance by substeps under constant `ctrl`, then bring the outputs up to date.
+        """Advance by substeps under constant `ctrl`, then compute the outputs.
 
         Args:
-            num_substeps: S, how many.
-            mocap_path: Mocap positions before each substep [N, S, nmocap, 3], or None where
-                nothing moves.
-            refresh: False leaves the outputs as `mj_step` does: of the state that the last
-                substep evaluated last, which with the Runge-Kutta integrator is its fourth stage.
-            counts: How many each simulation takes instead, at most S, int64 [N].
+            num_substeps: Number of substeps, S.
+            mocap_path: Mocap positions before each substep [N, S, nmocap, 3]; None if they do not
+                change.
+            refresh: False leaves the outputs as `mj_step` does: they belong to the last state that
+                the last substep evaluated, with the Runge-Kutta integrator its fourth stage.
+            counts: A number of substeps for each simulation, at most S, int64 [N]; None means S.
 
         Returns:
             bool [N]: simulations that failed (non-finite or huge state); their state is finite
-            again but meaningless until reset.
+            again, but meaningless until a reset.
         """
 
     @abstractmethod
@@ -108,34 +108,33 @@ class Physics(ABC):
         Args:
             origin: Where the rays of each simulation start [N, 3] (m).
             directions: Unit vectors [N, R, 3].
-            group: The geom group that is seen, 0 to 5.
-            exclude_body: Id of a body whose own geoms are not seen.
+            group: The geom group that rays can hit, 0 to 5.
+            exclude_body: Id of a body whose own geoms rays cannot hit.
 
         Returns:
             Distance to the first surface [N, R] (m), -1 where there is none.
         """
 
     def maybe_any(self, mask: Tensor) -> bool:
-        """Whether a mask may hold anywhere: where that is unknown without waiting, True.
+        """Whether a mask may be True anywhere; True if the host would have to wait to know.
 
-        What is done then must change nothing where the mask does not hold.
+        Code that runs in this case must not change rows where the mask is False.
         """
         return self.waits or bool(mask.any())
 
     def rows(self, mask: Tensor) -> Tensor:
-        """Return indices of rows that include those of a mask, int64.
+        """Return the indices of a mask's rows, int64; of all rows if the host would have to wait.
 
-        They are just those, or all where that is unknown without waiting: what is written for the
-        rows is masked in any case.
+        Code that writes to these rows must apply the mask in any case.
         """
         return mask.new_ones(len(mask)).cumsum(0) - 1 if self.waits else mask.nonzero()[:, 0]
 
     def check(self, wrong: Tensor, error: Callable[[], Exception]) -> None:
-        """Raise an error if `wrong` (bool) holds anywhere; a device may look at it later.
+        """Raise an error if `wrong` (bool) is True anywhere, on a device possibly in a later call.
 
         Args:
             wrong: Where something is wrong.
-            error: Makes the error, and may look at tensors.
+            error: Makes the error, and may read tensors.
         """
         if wrong.any():
             raise error()

@@ -20,14 +20,14 @@ _NO_STAGE = int(mujoco.mjtStage.mjSTAGE_NONE)
 
 
 def _log_to_console_only() -> None:
-    """Keep MuJoCo from leaving a MUJOCO_LOG.TXT in the working directory."""
+    """Keep MuJoCo from writing MUJOCO_LOG.TXT into the working directory."""
     log = mujoco.MjLogConfig.get()
     log.logto_file = False
     log.set()
 
 
 def _share(array: np.ndarray) -> Tensor:
-    """Wrap an array without copying it; outputs are read-only, which torch warns of."""
+    """Wrap an array without copying it, and ignore torch's warning about read-only outputs."""
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", message="The given NumPy array is not writable")
         return torch.from_numpy(array)
@@ -36,14 +36,14 @@ def _share(array: np.ndarray) -> Tensor:
 class BatchPhysics(Physics):
     """N simulations on the CPU, in float64.
 
-    Threads do not survive a fork: simulations with several of them are made in the process that
-    steps them, or that process is spawned.
+    Threads do not survive a fork: the process that steps simulations with several threads must
+    make them itself, or be spawned.
 
     Args:
         model: The compiled model; sleeping follows its options.
         num_envs: Number of simulations, N.
         num_threads: Threads that step them, 0 for one per core.
-        outputs: Names of the fields of `MjData` that are read; every call copies them out.
+        outputs: Names of the fields of `MjData` that are read; every call copies them.
 
     Examples:
         >>> from safe_rl.envs.safety_gym.building import build_scene
@@ -70,7 +70,7 @@ class BatchPhysics(Physics):
         self._process = os.getpid() if has_threads else None
         self.timestep = float(model.opt.timestep)
         self._batch = Batch(model, num_envs, num_threads, persistent=sleeps)
-        # Every field is bound before the first call: later ones would be zero until the next.
+        # All fields are bound before the first call, because later ones would start as zero.
         for name in STATE:
             setattr(self, name, _share(self._batch.bind(name)))
         sizes = dict(zip(MEMORY, (model.na, model.nhistory), strict=True))
@@ -93,7 +93,7 @@ class BatchPhysics(Physics):
         self._warnings[:] = self._batch.warning
 
     def forward(self, mask: Tensor | None = None, sensors: bool = True) -> None:
-        """Bring the outputs up to date with the state, see `Physics`."""
+        """Compute the outputs from the state, see `Physics`."""
         self._check_process()
         self._disableflags[:] = self._with_sensors | (0 if sensors else _NO_SENSORS)
         self._batch.forward(None if mask is None else mask.numpy())
@@ -106,9 +106,9 @@ class BatchPhysics(Physics):
         refresh: bool = True,
         counts: Tensor | None = None,
     ) -> Tensor:
-        """Advance by substeps and bring the outputs up to date, see `Physics`."""
+        """Advance by substeps and compute the outputs, see `Physics`."""
         self._check_process()
-        # Nobody reads sensors between substeps; without them the result is the same to the bit.
+        # Sensors are not read between substeps; without them the result is the same to the bit.
         self._disableflags[:] = self._with_sensors | _NO_SENSORS
         if counts is None:
             self._substeps(num_substeps, mocap_path, None)
@@ -122,12 +122,12 @@ class BatchPhysics(Physics):
 
     def failed(self) -> Tensor:
         """Return the simulations that failed since the last call, bool [N]."""
-        # Their warning counters rose: MuJoCo resets a bad state by itself, silently.
+        # MuJoCo resets a bad state by itself, and only increments a warning counter.
         counts = self._batch.warning
         if np.array_equal(counts, self._warnings):
             return torch.zeros(len(counts), dtype=torch.bool, device=self.device)
         failed = (counts[..., 1] > self._warnings[..., 1]).any(-1)
-        counts[failed] = 0  # so that they rise again if these fail again
+        counts[failed] = 0  # a next failure increments them again
         self._warnings[:] = counts
         self.ctrl[failed] = 0.0
         return torch.from_numpy(failed)
@@ -142,11 +142,11 @@ class BatchPhysics(Physics):
         return torch.from_numpy(distance)
 
     def _check_process(self) -> None:
-        """Raise in a forked process, which has no threads and would wait for them for ever."""
+        """Raise in a forked process: it has no threads, and would wait for them for ever."""
         if self._process is not None and self._process != os.getpid():
             raise RuntimeError(
-                "This environment was made before its process was forked, which its threads do "
-                "not survive. Make it in the process that steps it, start processes with the "
+                "This environment was made before its process was forked, and its threads do not "
+                "survive a fork. Make it in the process that steps it, start processes with the "
                 "method 'spawn', or give it num_threads=1."
             )
 

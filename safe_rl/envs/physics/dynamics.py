@@ -1,6 +1,6 @@
-"""Dynamics that differ from a robot's file by factors: mass, friction, damping, strength.
+"""Factors that change a robot's dynamics: mass, friction, damping and strength.
 
-Factors change the compiled model, so that a batch is as fast with them as without.
+They change the compiled model, so a batch is as fast with them as without.
 """
 
 from __future__ import annotations
@@ -21,15 +21,15 @@ _LINEAR = (
 
 
 def scale_dynamics(model: mujoco.MjModel, scales: Mapping[str, float], bodies: slice) -> None:
-    """Change a compiled model in place; what has the factor 1 stays as it is to the bit.
+    """Change a compiled model in place; a factor of 1 changes no bit.
 
     Args:
-        model: the model.
-        scales: a factor for each of `SCALES`; others are 1.
-        bodies: the robot's.
+        model: The compiled model.
+        scales: Key of `SCALES` -> factor; missing ones are 1.
+        bodies: Ids of the robot's bodies.
 
     Raises:
-        ConfigError: if an actuator's force is no linear function of its gain, as a muscle's.
+        ConfigError: If the force of an actuator is no linear function of its gain, as for a muscle.
     """
     for name, scale in SCALES.items():
         factor = scales.get(name, 1.0)
@@ -41,13 +41,13 @@ def _mass(model: mujoco.MjModel, bodies: slice, factor: float) -> None:
     before = model.dof_M0.mean()
     model.body_mass[bodies] *= factor
     model.body_inertia[bodies] *= factor
-    # what the compiler derives from masses; the unit of the solver's tolerance is left out there
+    # update what the compiler derives from masses, and `meaninertia`, which this call leaves out
     mujoco.mj_setConst(model, mujoco.MjData(model))
     model.stat.meaninertia *= model.dof_M0.mean() / before
 
 
 def _friction(model: mujoco.MjModel, bodies: slice, factor: float) -> None:
-    # of two surfaces that touch, MuJoCo takes the larger coefficients: all of them change
+    # a contact uses the larger coefficients of its two surfaces, so all surfaces must change
     model.geom_friction *= factor
     model.pair_friction *= factor
 
@@ -63,8 +63,8 @@ def _strength(model: mujoco.MjModel, bodies: slice, factor: float) -> None:
     for kind, linear in zip(kinds, _LINEAR, strict=True):
         if not set(kind.tolist()) <= linear:
             raise ConfigError(
-                "'strength_scale' is for actuators whose force grows with their gain: motors, "
-                "position and velocity servos. Those of this robot are others."
+                "'strength_scale' is for actuators whose force is linear in their gain: motors, "
+                "position and velocity servos. This robot has others."
             )
     for values in (
         *(model.actuator_gainprm, model.actuator_biasprm, model.actuator_forcerange),
@@ -80,4 +80,4 @@ SCALES: dict[str, Scale] = {
     "damping_scale": _damping,
     "strength_scale": _strength,
 }
-"""Key of a configuration -> what changes the model."""
+"""Key of a configuration -> function that changes the model by a factor."""

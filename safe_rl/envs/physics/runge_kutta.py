@@ -1,12 +1,12 @@
 """One substep of MuJoCo's Runge-Kutta integrator, stage by stage, with sensors in its last stage.
 
-`mj_step` leaves the derived quantities of the fourth stage behind, and forces on bodies
-(`cfrc_ext`) are computed from those by a call of their own (`mj_rnePostConstraint`), which
-`mujoco.batch` makes for sensors only, and integrators for no stage but the first. Taking the four
-stages one by one costs as many evaluations of the dynamics as `mj_step` and gives the same numbers
+`mj_step` leaves the derived quantities of the fourth stage, and forces on bodies (`cfrc_ext`) must
+be computed from these by a separate call (`mj_rnePostConstraint`). `mujoco.batch` makes this call
+only for sensors, and the integrator evaluates sensors only in its first stage. Taking the four
+stages one by one needs as many evaluations of the dynamics as `mj_step`, and gives the same numbers
 to rounding, forces included.
 
-MuJoCo 4 integrates quaternions on their group: where a classical scheme adds up stage velocities,
+MuJoCo 4 integrates quaternions on their group: before the velocities of the stages are added,
 angular velocities are mapped to the tangent space at the start (Munthe-Kaas 1999; Hairer, Lubich,
 Wanner, Geometric Numerical Integration, section IV.8).
 """
@@ -18,9 +18,9 @@ from torch import Tensor
 
 from safe_rl.envs.physics import Physics
 
-_STAGES = (0.5, 0.5, 1.0)  # how far into the substep the second, third and fourth stage look
-_HUGE = 1e10  # MuJoCo's mjMAXVAL: larger numbers are a simulation that failed
-_SMALL_ANGLE = 1e-7  # rad; smaller ones are as good as this, and nothing is divided by 0
+_STAGES = (0.5, 0.5, 1.0)  # times of the second, third and fourth stage, in substeps
+_HUGE = 1e10  # MuJoCo's mjMAXVAL: with larger numbers, a simulation has failed
+_SMALL_ANGLE = 1e-7  # rad; a lower bound of angles, against divisions by 0
 # The product of quaternions p q is (p @ _LEFT) q.
 _LEFT = torch.tensor(
     [
@@ -34,11 +34,11 @@ _LEFT = torch.tensor(
 
 
 def runge_kutta_substep(physics: Physics) -> Tensor:
-    """Advance by one substep; outputs are those of the fourth stage, also what sensors make.
+    """Advance by one substep; all outputs, those of sensors included, are of the fourth stage.
 
     Args:
-        physics: simulations with `qacc` among their outputs, of a tree of hinges and slides whose
-            first joint may be free, without activations.
+        physics: Simulations with the output `qacc`. The model is a tree of hinges and slides
+            without activations; its first joint may be free.
 
     Returns:
         bool [N]: simulations that failed; they are in the model's initial state.
@@ -69,7 +69,7 @@ def _average(stages: list[Tensor]) -> Tensor:
 
 
 def _move(moved: Tensor, qpos: Tensor, travel: Tensor, duration: float, root: _Root | None) -> None:
-    """Write positions [N, nq] that have travelled [N, nv], as `mj_integratePos` does."""
+    """Write positions [N, nq] after a time at velocities [N, nv], as `mj_integratePos` does."""
     if root is None:
         torch.add(qpos, travel, alpha=duration, out=moved)
         return
@@ -79,19 +79,19 @@ def _move(moved: Tensor, qpos: Tensor, travel: Tensor, duration: float, root: _R
 
 
 class _Root:
-    """Rotations of free roots from where they were at the start of the substep.
+    """Rotations of free roots since the start of the substep.
 
     Args:
-        quaternion: where that was [N, 4].
+        quaternion: Orientations at the start [N, 4].
     """
 
     def __init__(self, quaternion: Tensor) -> None:
         unit = quaternion / torch.linalg.vector_norm(quaternion, dim=-1, keepdim=True)
-        # Matrices that multiply from the left; every entry is one of the four numbers.
+        # Matrices of the product from the left; every entry is plus or minus one of four numbers.
         self._product = (unit @ _LEFT.flatten(1)).view(-1, 4, 4)
 
     def turn(self, angular: Tensor, duration: float) -> Tensor:
-        """Turn at a velocity in the root's own axes [N, 3] (rad/s): quaternions [N, 4]."""
+        """Turn at a velocity in the root's own axes [N, 3] (rad/s); return quaternions [N, 4]."""
         self._rotation = angular * duration
         angle = torch.linalg.vector_norm(self._rotation, dim=-1, keepdim=True)
         self._angle = angle.clamp_(min=_SMALL_ANGLE)
@@ -110,7 +110,7 @@ class _Root:
 
 
 def _reset_failed(physics: Physics) -> Tensor:
-    """Set simulations that failed to the model's initial state: warned of, not finite or huge."""
+    """Reset failed simulations: with a warning of MuJoCo, or not finite or huge numbers."""
     largest = torch.maximum(physics.qpos.abs().amax(-1), physics.qvel.abs().amax(-1))
     failed = physics.failed() | ~(largest < _HUGE)  # also where it is not a number
     if failed.any():

@@ -1,6 +1,6 @@
-"""Kernels that a step needs beside those of MuJoCo Warp: one thread per world, or per number."""
+"""Additional kernels of a step on MuJoCo Warp: one thread per simulation, or per number."""
 
-# Warp reads annotations as objects, which are no types for mypy.
+# Annotations of Warp's kernels are objects, which mypy does not accept as types.
 # mypy: ignore-errors
 import mujoco
 import warp as wp
@@ -19,7 +19,7 @@ def follow_path(
     counts: wp.array(dtype=int),
     live: wp.array2d(dtype=float),
 ):
-    """Copy what belongs to a substep, in worlds that take it: path [N, S, K] -> live [N, K]."""
+    """Copy the positions of a substep, in worlds that take it: path [N, S, K] -> live [N, K]."""
     world, column = wp.tid()
     if substep < counts[world]:
         live[world, column] = path[world, substep, column]
@@ -57,7 +57,7 @@ def align_capsules(
     geom_xmat: wp.array2d(dtype=wp.mat33),
     frames: wp.array(dtype=wp.mat33),
 ):
-    """Turn the frames of capsules on planes along the capsule, as MuJoCo does at every angle.
+    """Align the contact frames of capsules on planes with the capsule, as MuJoCo does.
 
     MuJoCo Warp 4.0.0 does so only for capsules that lie flatter than 60 degrees. Pyramidal friction
     cones depend on the direction of the frame.
@@ -84,7 +84,7 @@ def align_capsules(
 
 @wp.kernel
 def find_failures(live: wp.array2d(dtype=float), largest: float, failed: wp.array(dtype=wp.bool)):
-    """Mark worlds with a number that is larger, or is none."""
+    """Mark worlds with a number that is too large or not a number."""
     world, column = wp.tid()
     if not (wp.abs(live[world, column]) < largest):
         failed[world] = True
@@ -102,7 +102,7 @@ def note_overflow(
     row_bits: int,
     overflow: wp.array(dtype=int),
 ):
-    """Set `overflow` [2] where contacts (0) or constraint rows (1) found no room in a world."""
+    """Set `overflow` [2] if contacts (0) or constraint rows (1) found no room in a world."""
     world = wp.tid()
     if num_contacts[0] > contacts or num_candidates[0] > contacts:
         overflow[0] = 1

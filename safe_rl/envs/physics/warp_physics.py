@@ -1,4 +1,4 @@
-"""N simulations on MuJoCo Warp, on a CUDA device, or slowly on the CPU, in float32."""
+"""N simulations on MuJoCo Warp in float32, on a CUDA device or, slowly, on the CPU."""
 
 from __future__ import annotations
 
@@ -23,10 +23,10 @@ from safe_rl.envs.physics.warp_kernels import (
     restore_rows,
 )
 
-# What a substep changes, and what a simulation starts from.
+# State that a substep changes, and state that a reset sets.
 _INTEGRATED = ("time", "qpos", "qvel", "qacc_warmstart", *MEMORY)
 _INITIAL = (*_INTEGRATED, "ctrl", "mocap_pos", "mocap_quat")
-_LARGEST = 1e10  # MuJoCo's mjMAXVAL: larger numbers are a simulation that failed
+_LARGEST = 1e10  # MuJoCo's mjMAXVAL: with larger numbers, a simulation has failed
 _NO_SENSORS = int(mujoco.mjtDisableBit.mjDSBL_SENSOR)
 _LOST = mjw._src.types.OverflowType
 _LOST_CONTACTS = int(_LOST.BROADPHASE | _LOST.NARROWPHASE | _LOST.CCD | _LOST.CONTACT_MATCH)
@@ -34,29 +34,29 @@ _LOST_ROWS = int(_LOST.NEFC | _LOST.NJMAX_NNZ)
 
 
 class BufferOverflowError(RuntimeError):
-    """More contacts or constraints at once than there is room for; some were left out."""
+    """More contacts or constraints than the buffers can hold; some were left out."""
 
 
 class WarpPhysics(Physics):
     """N simulations of one model on MuJoCo Warp, in float32.
 
-    Every call replays a graph that was recorded when it was first made: on CUDA one launch for all
-    substeps and the forward pass after them. Simulations do not sleep. What is computed for a mask
-    is computed for all of them, which changes nothing in the others.
+    The first call of a kind records a graph, and later calls replay it: on CUDA one launch for all
+    substeps and the forward pass after them. Simulations do not sleep. A forward pass with a mask
+    runs for all simulations, which changes nothing in the others.
 
-    On CUDA, nothing waits for the device: an error that `check` was told of, or an overflow of the
+    On CUDA, the host does not wait for the device: an error of `check`, or an overflow of the
     buffers, is raised by a later call.
 
     Args:
         model: The compiled model.
         num_envs: Number of simulations, N.
-        device: Where they are.
-        contacts: Contacts that there is room for, per simulation; they share what there is.
-        constraints: Rows of constraints that there is room for in each simulation.
-        use_graphs: False launches the kernels one by one, to find errors in them.
+        device: Device of the simulations.
+        contacts: Contacts per simulation that the buffer can hold; all simulations share it.
+        constraints: Rows of constraints that the buffer of each simulation can hold.
+        use_graphs: False launches the kernels one by one, for debugging.
 
     Raises:
-        NotImplementedError: If the model has something that MuJoCo Warp lacks.
+        NotImplementedError: If the model uses a feature that MuJoCo Warp lacks.
 
     Examples:
         >>> from safe_rl.envs.safety_gym.building import build_scene
@@ -95,7 +95,7 @@ class WarpPhysics(Physics):
                 self._model.callback.contactfilter = _align_capsules
             self._model.opt.warn_overflow = 0  # printed by a kernel; we raise instead
             self._model.opt.contact_sensor_maxmatch = contacts
-            # Nobody reads sensors between substeps.
+            # Sensors are not read between substeps.
             self._silent = copy.copy(self._model)
             self._silent.opt = copy.copy(self._model.opt)
             self._silent.opt.disableflags |= _NO_SENSORS
@@ -106,7 +106,7 @@ class WarpPhysics(Physics):
         self._warm_up()
 
     def _bind(self, model: mujoco.MjModel) -> None:
-        """Share memory with torch, and note what a simulation starts from."""
+        """Share memory with torch, and store the initial state of a simulation."""
         data, num_envs = self._data, self._data.nworld
         shared = {name: wp.to_torch(getattr(data, name)) for name in (*STATE, *MEMORY, *OUTPUTS)}
         for name in (*STATE, *OUTPUTS):
@@ -128,13 +128,13 @@ class WarpPhysics(Physics):
         self._failed = self._mask.clone()
 
     def _warm_up(self) -> None:
-        """Compile and load all kernels, outside of a recording; nothing of it stays."""
+        """Compile and load all kernels before graphs are recorded, then reset everything."""
         self._mask.fill_(True)
         with self._launching():
             self._substeps(1, None, True)
             self._forward(True)
             self._reset(self._mask)
-        # everything stands in one place here, in contact with everything else
+        # all objects were at one place here, so there were too many contacts
         self._overflow.zero_()
         wp.to_torch(self._data.overflow).zero_()
 
@@ -144,7 +144,7 @@ class WarpPhysics(Physics):
         self._run("reset", self._reset, self._mask)
 
     def forward(self, mask: Tensor | None = None, sensors: bool = True) -> None:
-        """Bring the outputs of all simulations up to date with the state, see `Physics`."""
+        """Compute the outputs of all simulations from the state, see `Physics`."""
         self._run(("forward", sensors), self._forward, sensors)
         self._check_rooms()
 
@@ -155,7 +155,7 @@ class WarpPhysics(Physics):
         refresh: bool = True,
         counts: Tensor | None = None,
     ) -> Tensor:
-        """Advance by substeps and bring the outputs up to date, see `Physics`."""
+        """Advance by substeps and compute the outputs, see `Physics`."""
         path = None
         if counts is None:
             self._counts.fill_(num_substeps)
@@ -198,7 +198,7 @@ class WarpPhysics(Physics):
         return distance
 
     def check(self, wrong: Tensor, error: Callable[[], Exception]) -> None:
-        """Raise an error if `wrong` holds anywhere, now or in a later call."""
+        """Raise an error if `wrong` is True anywhere, now or in a later call."""
         if self.waits:
             self._late.add(wrong.any(), error)
         else:
@@ -212,8 +212,8 @@ class WarpPhysics(Physics):
         names = [name for name, lost in zip(self._rooms, self._overflow, strict=True) if lost]
         room = " and ".join(f"{self._rooms[name]} {name}" for name in names or self._rooms)
         return BufferOverflowError(
-            f"There is room for {room} in a world, and there were more: some were left out. Raise "
-            "env.physics_buffers."
+            f"There is room for {room} per environment, but there were more; some were left out. "
+            "Raise env.physics_buffers."
         )
 
     @contextmanager
@@ -228,7 +228,7 @@ class WarpPhysics(Physics):
                 yield
 
     def _run(self, key: Hashable, body: Callable[..., None], *arguments: Any) -> None:
-        """Launch kernels: by a graph, which the first call with a key records."""
+        """Launch kernels by a graph, which the first call with a key records."""
         if not self.use_graphs:
             with self._launching():
                 body(*arguments)
@@ -290,20 +290,20 @@ class WarpPhysics(Physics):
 
 
 def _align_capsules(model: Any, data: Any) -> None:
-    """Give contacts of capsules on planes the frames that MuJoCo gives them."""
+    """Give contacts of capsules on planes the same frames as MuJoCo."""
     inputs = [data.nacon, model.geom_type, data.contact.geom, data.contact.worldid, data.geom_xmat]
     wp.launch(align_capsules, data.naconmax, inputs, [data.contact.frame])
 
 
 class _LateChecks:
-    """Conditions on a device that the host looks at when it need not wait for them."""
+    """Conditions on a device that the host reads once it need not wait for them."""
 
     def __init__(self, device: torch.device) -> None:
         self._device = device
         self._pending: list[tuple[Tensor, Any, Callable[[], Exception]]] = []
 
     def add(self, wrong: Tensor, error: Callable[[], Exception]) -> None:
-        """Note a condition, bool []; `look` raises the error if it holds."""
+        """Add a condition, bool []; `look` raises the error if it is True."""
         on_cuda = self._device.type == "cuda"
         seen = torch.empty((), dtype=torch.bool, device="cpu", pin_memory=on_cuda)
         seen.copy_(wrong, non_blocking=True)
@@ -311,7 +311,7 @@ class _LateChecks:
         self._pending.append((seen, done, error))
 
     def look(self) -> None:
-        """Raise the first error whose condition is known to hold."""
+        """Raise the error of the first condition that has arrived and is True."""
         while self._pending and (self._pending[0][1] is None or self._pending[0][1].query()):
             seen, _, error = self._pending.pop(0)
             if seen:

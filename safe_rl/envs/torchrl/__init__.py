@@ -1,4 +1,4 @@
-"""TorchRL's environments, and those that users have written for it, with costs made by a rule."""
+"""Environments of TorchRL, and of users in its interface, with costs that a rule computes."""
 
 from typing import TYPE_CHECKING
 

@@ -1,4 +1,4 @@
-"""Entries of a step: those that are observed, and what it costs."""
+"""Transforms that write the costs of a step, and the entries that are observed."""
 
 from __future__ import annotations
 
@@ -25,29 +25,30 @@ _OBSERVATION = "observation"
 
 
 def entry_key(name: str) -> NestedKey:
-    """Return the key of an entry whose name has dots where it is nested."""
+    """Return the key of an entry; dots in its name separate the parts of a nested key."""
     parts = tuple(name.split("."))
     return parts[0] if len(parts) == 1 else parts
 
 
 def dotted(key: NestedKey) -> str:
-    """Return the name of a key, with dots where it is nested."""
+    """Return the name of a key; dots join the parts of a nested key."""
     return ".".join(key) if isinstance(key, tuple) else str(key)
 
 
 class StepCosts(Transform):
-    """Writes the costs of a step beside its reward, the sum first.
+    """Writes the costs of a step beside its reward, the aggregate `cost` first.
 
     Args:
-        env: What is stepped, [N].
-        config: A whole node: `cost_keys` (entries that are costs), `outside` (ranges), and `cost`,
-            a function of a step as TorchRL has it, [N] or [N, 1], of one cost or several by name.
+        env: The environment, [N].
+        config: A complete node: `cost_keys` (entries that are costs), `outside` (ranges), and
+            `cost`, a function of a step's TensorDict. It returns one cost [N] or [N, 1], or several
+            by name.
 
     Attributes:
-        names: Names of all costs, the sum first.
+        names: Names of all costs, the aggregate first.
 
     Raises:
-        ConfigError: If there are no costs, or one is not a number per row.
+        ConfigError: If there are no costs, or a cost is not one number per row.
     """
 
     def __init__(self, env: EnvBase, config: Mapping[str, Any]) -> None:
@@ -57,9 +58,9 @@ class StepCosts(Transform):
         self._function = None if config["cost"] is None else _located(config["cost"])
         if not (self._entries or self._ranges or self._function):
             raise ConfigError(
-                "what does a step cost? Name entries that are costs (env.cost_keys=[…]), the range "
-                "that one has to stay in (env.outside='{cost_speed: [thdot, -4, 4]}'), or a "
-                "function of yours (import=my_module env.cost=my_module:speed)."
+                "what does a step cost? Name entries that are costs (env.cost_keys=[…]), a range "
+                "that an entry must not leave (env.outside='{cost_speed: [thdot, -4, 4]}'), or "
+                "your own function (import=my_module env.cost=my_module:speed)."
             )
         needed = [env.full_state_spec, env.full_action_spec, env.full_done_spec]
         kept = {"reward", *(key for spec in needed for key in spec.keys(True, True))}
@@ -67,7 +68,7 @@ class StepCosts(Transform):
             if key in kept:
                 raise ConfigError(
                     f"env.cost_keys: '{name}' is a state, an action, a reward or an end, and stays "
-                    "one. Make a cost of it by env.outside, or by a function of yours (env.cost)."
+                    "one. Compute a cost from it by env.outside, or your own function (env.cost)."
                 )
         self.names = list(self._costs(env.fake_tensordict()))
 
@@ -79,7 +80,7 @@ class StepCosts(Transform):
             if kept.column >= values.shape[-1]:
                 raise ConfigError(
                     f"'outside': there is no column {kept.column} in {kept.entry}. It has "
-                    f"{values.shape[-1]} columns, counted from 0."
+                    f"{values.shape[-1]} columns; the first is 0."
                 )
             value = values[..., kept.column]
             found.append((name, (value < kept.low) | (value > kept.high)))
@@ -109,7 +110,7 @@ class StepCosts(Transform):
         return tensordict_reset.exclude(*self._entries.values())
 
     def transform_output_spec(self, output_spec: Composite) -> Composite:
-        """Add the costs to the rewards, and remove those that were observations."""
+        """Add the costs to the reward spec, and remove their entries from where they were."""
         output_spec = super().transform_output_spec(output_spec)
         rewards = output_spec["full_reward_spec"]
         for spec in (output_spec["full_observation_spec"], rewards):
@@ -117,7 +118,7 @@ class StepCosts(Transform):
                 if key in spec.keys(True):
                     del spec[key]
         highest = dict.fromkeys(self._ranges, 1.0)
-        # entries and functions may have a cost of their own that is called so
+        # an entry or a function may have written the aggregate itself
         if COST not in highest and not self._entries and self._function is None:
             highest[COST] = float(len(highest))
         for name in self.names:
@@ -150,11 +151,16 @@ def _entry(step: TensorDictBase, name: str) -> Tensor:
 
 
 class Observe(Transform):
-    """Puts the entries that are observed where policies look for them: `observation`.
+    """Writes the observed entries into `observation`, which policies read.
 
-    One entry is the observation itself; several become one vector, or a dictionary. Kinds become
-    one-hot, pictures stay as they are. By `observe`, names of entries (None takes `observation`, or
-    where there is none all that are not nested), and `flatten`, whether several become one vector.
+    A single entry becomes the observation itself; several become one vector or a dictionary.
+    Categorical entries become one-hot; pictures stay as they are.
+
+    Args:
+        env: The environment, [N].
+        config: A complete node: `observe`, names of entries (None takes `observation`, or without
+            such an entry all that are not nested), and `flatten`, whether several entries become
+            one vector.
 
     Attributes:
         layout: Columns of every entry, as if all of them were one vector.
@@ -167,8 +173,8 @@ class Observe(Transform):
         pictures = [name for name, spec in self._specs.items() if _is_picture(spec)]
         if self._flatten and pictures:
             raise ConfigError(
-                f"{', '.join(pictures)}: pictures are no part of a vector. env.flatten=false makes "
-                "a dictionary, for model=cnn or model=dict; env.observe=[…] leaves some out."
+                f"{', '.join(pictures)}: pictures cannot be part of a vector. Use env.flatten=false"
+                " for a dictionary (model=cnn or model=dict), or leave them out: env.observe=[…]."
             )
         # what the environment needs for its next step stays where it is
         needed = {*map(dotted, env.state_spec.keys(True, True)), _OBSERVATION}
@@ -193,7 +199,7 @@ class Observe(Transform):
         return self._call(tensordict_reset)
 
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:
-        """Describe what is written, and leave out what is moved."""
+        """Add `observation`, and remove the entries that are moved there."""
         shape, device = observation_spec.shape, observation_spec.device
         parts = {
             _last(name): spec
@@ -215,7 +221,7 @@ class Observe(Transform):
 
 
 def _choose_entries(spec: Composite, wanted: list[str] | None) -> dict[str, TensorSpec]:
-    """The entries that are observed, by name, with dots where they are nested."""
+    """Return the specs of the observed entries by their dotted names."""
     known = {
         dotted(key): part
         for key, part in spec.items(True, True)
@@ -230,7 +236,7 @@ def _choose_entries(spec: Composite, wanted: list[str] | None) -> dict[str, Tens
     below = [name for name in known if name.partition(".")[0] == _OBSERVATION]
     chosen = wanted or below or [name for name in known if "." not in name]
     if not chosen:
-        raise ConfigError(f"env.observe: name what is observed, of {', '.join(known) or 'nothing'}")
+        raise ConfigError(f"env.observe: choose among {', '.join(known) or 'no entries at all'}.")
     return {name: known[name] for name in chosen}
 
 
@@ -239,23 +245,23 @@ def _last(name: str) -> str:
 
 
 def _is_picture(spec: TensorSpec) -> bool:
-    """Of N environments, height, width and colours in some order."""
+    """Whether a spec has four dimensions: N, and height, width and colours in any order."""
     return len(spec.shape) == 4
 
 
 def _choices(spec: TensorSpec) -> int | None:
-    """How many kinds there are, where a number stands for one of several."""
+    """Number of choices of a categorical entry; None for any other."""
     is_kind = isinstance(spec, Categorical) and not isinstance(spec, Binary)
     return int(spec.space.n) if is_kind and spec.dtype != torch.bool else None
 
 
 def _size(spec: TensorSpec) -> int:
-    """Numbers of one environment."""
+    """Number of columns of an entry in a vector."""
     return spec.shape[1:].numel() * (_choices(spec) or 1)
 
 
 def _numbers(value: Tensor, spec: TensorSpec) -> Tensor:
-    """A picture as it is, anything else as float32 [N, n]."""
+    """Return a picture as it is, anything else as float32 [N, n]."""
     if _is_picture(spec):
         return value
     choices = _choices(spec)

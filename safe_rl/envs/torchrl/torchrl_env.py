@@ -1,4 +1,4 @@
-"""Environments of TorchRL as a family: `env=torchrl env.id=…`, N of them stepped together."""
+"""Batches of N environments of TorchRL: the family `env=torchrl env.id=…`."""
 
 from __future__ import annotations
 
@@ -37,8 +37,8 @@ from safe_rl.targets import locate
 __all__ = ["TorchRLEnv", "describe_node", "make_torchrl"]
 
 MakeEnv = Callable[..., EnvBase]
-_STEP = "episode_step"  # not the name that environments themselves may have for it
-# Of constructors that cannot use their arguments, or lack a package.
+_STEP = "episode_step"  # environments may write TorchRL's default, "step_count", themselves
+# Errors of constructors that get wrong arguments or lack a package.
 _FAILURES = (ImportError, TypeError, ValueError, LookupError, gymnasium.error.Error)
 
 
@@ -46,13 +46,13 @@ class TorchRLEnv(ConstrainedEnv, TransformedEnv):
     """N environments of TorchRL with costs, made by `make_torchrl`.
 
     Args:
-        base_env: What is stepped, [N].
+        base_env: The environment, [N].
         config: `num_steps`, and the keys of `StepCosts` and `Observe`.
         others: Transforms that come after the costs.
 
     Attributes:
         cost_keys: The aggregate `cost`, then one key per kind.
-        observation_layout: Columns of every entry that is observed, as if all were one vector.
+        observation_layout: Columns of every observed entry, as if all were one vector.
         max_episode_steps: The largest number of steps of an episode.
     """
 
@@ -73,7 +73,7 @@ def make_torchrl(
     seed: int | None = None,
     num_threads: int = 0,
 ) -> TorchRLEnv:
-    """Make environments of a class of TorchRL, or of the user.
+    """Make environments of a class of TorchRL or of the user.
 
     The arguments are those of `make_gymnasium`, with the keys of conf/env/torchrl.yaml.
 
@@ -86,7 +86,7 @@ def make_torchrl(
     if not isinstance(env, EnvBase) or list(env.batch_size) != [num_envs]:
         shown = list(env.batch_size) if isinstance(env, EnvBase) else type(env).__name__
         raise ConfigError(
-            f"env.id={config['id']}: it must make an environment [N] or a single one, got {shown}."
+            f"env.id={config['id']} must make an environment [N] or a single one, got {shown}."
         )
     length = StepCounter(max_steps=config["num_steps"], step_count_key=_STEP)
     made = TorchRLEnv(env.to(torch.device(device)), config, length)
@@ -95,7 +95,7 @@ def make_torchrl(
 
 
 def describe_node(config: Mapping[str, Any]) -> tuple[list[str], int]:
-    """Return the cost keys and the length of episodes of a node; one environment is asked."""
+    """Return the cost keys and the length of episodes of a node, read from one environment."""
     env = _tried(config, _one)
     try:
         steps = config["num_steps"] or getattr(env, "max_episode_steps", None)
@@ -111,7 +111,7 @@ def describe_node(config: Mapping[str, Any]) -> tuple[list[str], int]:
 
 
 def _plain_actions(env: EnvBase) -> Iterator[Transform]:
-    """Continuous actions are cut to [-1, 1] and stretched to the bounds; choices stay."""
+    """Transforms that clip continuous actions to [-1, 1] and scale them to the bounds."""
     spec = env.action_spec
     if isinstance(spec, Bounded) and spec.dtype.is_floating_point:
         yield ActionScaling()
@@ -129,7 +129,7 @@ def _plain_actions(env: EnvBase) -> Iterator[Transform]:
 
 
 def _tried(config: Mapping[str, Any], make_some: Callable[[MakeEnv], EnvBase]) -> EnvBase:
-    """Make some with the function that makes one; failures become errors of the configuration."""
+    """Call `make_some` with the function that makes one environment; failures are ConfigErrors."""
     name, kwargs = config["id"], dict(config["kwargs"] or {})
     if kwargs.get("from_pixels"):
         load_backend()
@@ -152,8 +152,9 @@ def _one(make: MakeEnv) -> EnvBase:
 def _batch(make: MakeEnv, num_envs: int) -> EnvBase:
     """Make N environments.
 
-    A class that takes `num_envs` makes them itself. A class without a state of its own is stepped
-    with the states of all rows at once; of others there are N, stepped one after the other.
+    A class with the argument `num_envs` makes them itself. A stateless class (`batch_locked` is
+    False) is stepped with the states of all rows at once. Any other class is made N times, and the
+    environments are stepped one after the other.
     """
     env = _one(make)
     if not env.batch_size and not env.batch_locked:
@@ -161,7 +162,7 @@ def _batch(make: MakeEnv, num_envs: int) -> EnvBase:
         try:
             rows.reset()
             return rows
-        except Exception:  # of any type: its own code may not work with more rows than one
+        except Exception:  # custom code may not work with several rows, and raise any error
             pass
     if list(env.batch_size) == [num_envs]:
         return env
@@ -169,15 +170,17 @@ def _batch(make: MakeEnv, num_envs: int) -> EnvBase:
     if not env.batch_size:
         return SerialEnv(num_envs, make)
     many = make(num_envs=num_envs)
-    if list(many.batch_size) != [num_envs, 1]:  # of MuJoCo's own library, which is in line anyway
+    if list(many.batch_size) != [num_envs, 1]:
         return many
+    # with MuJoCo's own library, TorchRL makes a SerialEnv of environments [1]
     return SerialEnv(num_envs, partial(_alone, make))
 
 
 class Rows(EnvBase):
-    """N copies of an environment without a state (`batch_locked` is False), stepped at once.
+    """N rows of a stateless environment (`batch_locked` is False), stepped at once.
 
-    Not TorchRL's `BatchSizeTransform`: other transforms cannot change actions outside of it.
+    TorchRL's `BatchSizeTransform` cannot be used here: with it, outer transforms cannot change the
+    actions.
     """
 
     def __init__(self, env: EnvBase, num_envs: int) -> None:
@@ -190,7 +193,7 @@ class Rows(EnvBase):
         self.done_spec = env.full_done_spec.expand(num_envs)
 
     def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDictBase:
-        """Start all rows; TorchRL puts those that continue back in their places."""
+        """Reset all rows; TorchRL then restores those that continue."""
         return self.env.reset(TensorDict(batch_size=self.batch_size, device=self.device), **kwargs)
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -201,5 +204,5 @@ class Rows(EnvBase):
 
 
 def _alone(make: MakeEnv) -> EnvBase:
-    """One of batch size [1] without that dimension, for `SerialEnv`."""
+    """Make an environment of batch size [1], and squeeze it for `SerialEnv`."""
     return TransformedEnv(_one(make), BatchSizeTransform(reshape_fn=methodcaller("squeeze", 0)))

@@ -1,4 +1,4 @@
-"""Transforms of TorchRL that change a constrained problem, for any environment and algorithm."""
+"""TorchRL transforms that change a constrained problem, for any environment and algorithm."""
 
 from safe_rl.envs.transforms.action_transforms import ActionDelay, ActionFilter, ActionRepeat
 from safe_rl.envs.transforms.base import ConstraintTransform

@@ -1,4 +1,4 @@
-"""Transforms of actions: replaced by a filter, delayed, or held for several steps."""
+"""Transforms that replace actions by a filter, delay them, or hold them for several steps."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from safe_rl.ranges import PART, Range, Text
 
 
 def _parameters(function: Callable[..., Any]) -> set[str]:
-    """Names of parameters; an empty set for a function without a signature, as `torch.clamp`."""
+    """Names of parameters; empty for a function without a signature, such as `torch.clamp`."""
     try:
         return set(signature(function).parameters)
     except ValueError:
@@ -35,16 +35,16 @@ class ActionFilter(ConstraintTransform):
     cost_limits='{cost: 25, cost_interventions: 10}'.
 
     Args:
-        filter: Function that replaces actions: gets a TensorDict [N] with `observation` and
-            `action` [N, A], returns the actions to take [N, A]. Where it returns what it got, it
-            did not intervene. If it has a parameter `positions`, it gets where things are before
-            the step (`get_positions` of the environment); if it has one called `layout`, the
-            columns of the observation (`observation_layout`).
+        filter: Function that gets a TensorDict [N] with `observation` and `action` [N, A], and
+            returns the actions to take [N, A]. A row whose action it returns unchanged is no
+            intervention. If the function has a parameter `positions`, it also gets the positions
+            before the step (`get_positions` of the environment). If it has a parameter `layout`, it
+            gets the columns of the observation (`observation_layout`).
         cost_key: Name of the cost of interventions.
 
     Raises:
-        ValueError: at a step, if the function returns something else, or asks for positions of an
-            environment that has none.
+        ValueError: At a step, if the function returns another shape or type, or has a parameter
+            `positions` and the environment has no positions.
 
     Examples:
         >>> import torch
@@ -73,7 +73,7 @@ class ActionFilter(ConstraintTransform):
 
     def _inv_call(self, tensordict: TensorDictBase) -> TensorDictBase:
         action = tensordict.get("action")
-        # a copy: what changes actions in place would change the one that is learned from
+        # a copy, because the algorithm learns from the original and a filter may work in place
         replaced = self._filter(tensordict.set("action", action.clone()), **self._asked())
         if not isinstance(replaced, Tensor) or replaced.shape != action.shape:
             got = tuple(replaced.shape) if isinstance(replaced, Tensor) else type(replaced).__name__
@@ -85,7 +85,7 @@ class ActionFilter(ConstraintTransform):
         return tensordict.set("action", replaced)
 
     def _asked(self) -> dict[str, Any]:
-        """The arguments that the filter needs, by the names of its parameters."""
+        """The additional arguments of the filter, by the names of its parameters."""
         given: dict[str, Any] = {}
         if "layout" in self._asks_for:
             given["layout"] = self.container.observation_layout
@@ -93,8 +93,8 @@ class ActionFilter(ConstraintTransform):
             given["positions"] = self.container.get_positions()
             if given["positions"].is_empty():
                 raise ValueError(
-                    "The action filter asks for 'positions', but this environment has none "
-                    "(get_positions)."
+                    "The action filter has a parameter 'positions', but this environment has no "
+                    "positions (get_positions)."
                 )
         return given
 
@@ -155,12 +155,12 @@ class ActionDelay(ConstraintTransform):
 
 
 class ActionRepeat(ConstraintTransform):
-    """The policy decides at every k-th step, and its action is held for the steps between.
+    """The policy acts at every k-th step, and its action is held for the steps between.
 
     Rewards and costs of the k steps are summed, so that returns and limits keep their meaning. A
     row whose episode ends between two decisions takes no further steps; `steps_taken` is the number
-    of steps of a decision. The transform is also used in evaluation. It has to be the last
-    transform; the others act at every step.
+    of steps of a decision. The transform is also used in evaluation. It must be the last transform;
+    the others act at every step.
 
     Args:
         k: Steps for which an action is held.
@@ -191,7 +191,7 @@ class ActionRepeat(ConstraintTransform):
             active = ~result.get("done")
             if not active.any():
                 break
-            # an environment without a state of its own reads the last step
+            # a stateless environment reads its state from the last step
             state = tensordict.clone(False).update(result)
             if not active.all():
                 # an environment may refuse steps after an end; these steps are not counted
@@ -214,20 +214,20 @@ class ActionRepeat(ConstraintTransform):
         return observation_spec
 
     def transform_reward_spec(self, reward_spec: TensorSpec) -> TensorSpec:
-        """Say that sums of k steps may be k times as large."""
+        """Multiply the bounds by k."""
         for key in list(reward_spec.keys(True, True)):
             reward_spec[key] = _times(reward_spec[key], self.steps_per_decision)
         return reward_spec
 
 
 def _where(mask: Tensor, one: TensorDictBase, other: TensorDictBase) -> TensorDictBase:
-    """Rows [N, 1] of the one where the mask says so, else of the other."""
+    """Rows of `one` where the mask [N, 1] is True, of `other` elsewhere."""
     rows = mask.reshape(one.batch_size)
     return torch.where(rows, one, other.select(*one.keys(True, True)))
 
 
 def _times(spec: TensorSpec, factor: int) -> TensorSpec:
-    """Bounds times a factor, where there are bounds."""
+    """Multiply the bounds of a spec, if it has any."""
     if not isinstance(spec, Bounded):
         return spec
     most = torch.finfo(spec.dtype).max

@@ -1,4 +1,4 @@
-"""Base class and helpers of transforms of constrained problems."""
+"""Base class and helper functions of transforms of constrained problems."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from safe_rl.naming import did_you_mean, key_name
 from safe_rl.ranges import Checked
 
 OWN_REWARD = "task_reward"
-"""Where transforms that change the reward leave the environment's own one."""
+"""Key of the environment's own reward, if a transform changes `reward`."""
 
 
 class ConstraintTransform(Checked, Transform):
@@ -26,13 +26,13 @@ class ConstraintTransform(Checked, Transform):
     returns their values at the start of an episode, and `_step` updates them.
 
     Attributes:
-        evaluating: whether policies are evaluated; then changes that only help learning are off.
-        added_costs: names of costs that it writes beside the environment's.
-        needed_costs: names of costs that the environment has to have.
-        return_key: key of the environment's own reward, from which returns are computed, if the
+        evaluating: Whether policies are evaluated; then changes that only help learning are off.
+        added_costs: Names of the costs that the transform adds.
+        needed_costs: Names of the costs that the environment must have.
+        return_key: Key of the environment's own reward, from which returns are computed, if the
             transform changes the reward.
-        steps_per_decision: steps of the environment per call of `step`. A transform that takes
-            several has to be the last one; those before it act at every step.
+        steps_per_decision: Steps of the environment per call of `step`. A transform that takes
+            several must be the last one; those before it act at every step.
     """
 
     evaluating = False
@@ -46,7 +46,7 @@ class ConstraintTransform(Checked, Transform):
         self._rows: dict[str, Tensor] = {}
 
     def seed(self, seeds: Tensor) -> None:
-        """Seed all later draws by a key per row, int64 [N]; used from the next reset on."""
+        """Seed all later draws with one key per row, int64 [N]; used from the next reset on."""
 
     def start(self, done: Tensor) -> dict[str, Tensor]:
         """Return `_rows` at the start of an episode, for all rows of `done` [..., 1]."""
@@ -57,14 +57,14 @@ class ConstraintTransform(Checked, Transform):
         return {name: value.clone() for name, value in self._rows.items()}
 
     def put_rows(self, rows: Mapping[str, Tensor]) -> None:
-        """Continue from what `rows` returned."""
+        """Restore what `rows` returned."""
         self._rows = {name: value.clone() for name, value in rows.items()}
 
     def continue_from(self, steps: int) -> None:
         """Continue schedules after this number of steps per row in earlier parts of the run."""
 
     def check(self, cost_keys: Collection[str]) -> None:
-        """Raise ValueError if it needs a cost that is not among these."""
+        """Raise ValueError if a needed cost is not among these."""
         check_known(self.needed_costs, cost_keys)
 
     def highest_cost(self, key: str, highest: float, of_a_step: float) -> float:
@@ -72,7 +72,7 @@ class ConstraintTransform(Checked, Transform):
         return highest
 
     def extend_layout(self, layout: Mapping[str, slice]) -> dict[str, slice]:
-        """Add its observations to the columns of the observation."""
+        """Add the columns of the transform's own observations."""
         return dict(layout)
 
     def _reset(
@@ -89,10 +89,10 @@ class ConstraintTransform(Checked, Transform):
 
 
 def check_budgets(budgets: Mapping[str, float], *, above_zero: bool) -> dict[str, float]:
-    """Return budgets, cost key -> cost per episode, checked: ValueError for a wrong one."""
+    """Check budgets, cost key -> cost per episode, and return them; ValueError for a wrong one."""
     checked = {key: float(budget) for key, budget in budgets.items()}
     if not checked:
-        raise ValueError("budgets is empty: name a cost and how much of it an episode may cost.")
+        raise ValueError("budgets is empty: give the name of a cost and a budget per episode.")
     for key, budget in checked.items():
         if not (math.isfinite(budget) and (budget > 0 if above_zero else budget >= 0)):
             least = "above 0" if above_zero else "of at least 0"
@@ -111,7 +111,7 @@ def check_known(budgets: Collection[str], cost_keys: Collection[str]) -> None:
 
 
 def costs_of(step: TensorDictBase, keys: Collection[str]) -> Tensor:
-    """Return costs of a step as float64 [..., k]; ValueError for a missing one."""
+    """Return k costs of a step as float64 [..., k]; ValueError for a missing one."""
     costs = [step.get(key, None) for key in keys]
     lacking = [key_name(key) for key, cost in zip(keys, costs, strict=True) if cost is None]
     if lacking:
@@ -121,32 +121,32 @@ def costs_of(step: TensorDictBase, keys: Collection[str]) -> Tensor:
 
 
 def keep_reward(step: TensorDictBase, key: str) -> Tensor:
-    """Keep the environment's own reward in `key`, if no other transform has; return the reward."""
+    """Copy the reward to `key`, unless an earlier transform has; return the reward."""
     reward = step.get("reward")
     step.set(key, step.get(key, reward))
     return reward
 
 
 def kept_reward_spec(spec: Composite, key: str) -> Composite:
-    """Add the environment's own reward `key` to the spec; both rewards are unbounded."""
+    """Add `key` to the reward spec, and remove the bounds of both rewards."""
     for name in (key, "reward"):
         spec[name] = unbounded_like(spec["reward"])
     return spec
 
 
 def unbounded_like(spec: TensorSpec) -> TensorSpec:
-    """Return a spec without its bounds; one of integers stays as it is."""
+    """Remove the bounds of a spec; a spec of integers is returned unchanged."""
     if not spec.dtype.is_floating_point:
         return spec
     return Unbounded(shape=spec.shape, dtype=spec.dtype, device=spec.device)
 
 
 def widen(spec: Composite, number: int, who: str) -> Composite:
-    """Add so many columns to the observation; ValueError from `who` if that is no vector."""
+    """Add columns to the spec of the observation; ValueError, naming `who`, for no vector."""
     seen = spec["observation"]
     if len(seen.shape) != len(spec.shape) + 1:
         raise ValueError(
-            f"{who} adds columns to an observation that is one vector, and this one has the shape "
+            f"{who} adds columns, so the observation must be one vector, but it has the shape "
             f"{list(seen.shape)}: let the environment make one vector of it."
         )
     shape = (*seen.shape[:-1], seen.shape[-1] + number)

@@ -1,4 +1,4 @@
-"""An environment with transforms, which fulfils the contract as the environment inside does."""
+"""A constrained environment with transforms, which is again a constrained environment."""
 
 from __future__ import annotations
 
@@ -22,8 +22,8 @@ class TransformedConstrainedEnv(ConstrainedEnv, TransformedEnv):
     """N environments with transforms, made by `transform_env`.
 
     Attributes:
-        cost_keys: the environment's, then those of the transforms.
-        return_key: the entry below "next" that returns are made of, `reward` by default.
+        cost_keys: Costs of the inner environment, then those of the transforms.
+        return_key: Entry below "next" from which returns are computed, `reward` by default.
     """
 
     def __init__(
@@ -42,7 +42,7 @@ class TransformedConstrainedEnv(ConstrainedEnv, TransformedEnv):
             except ValueError as error:
                 raise ValueError(f"transforms.{name}: {error}") from error
             self.cost_keys += transform.added_costs
-            if self.return_key == "reward":  # what is kept first is the environment's own
+            if self.return_key == "reward":  # the first copy is the environment's own reward
                 self.return_key = transform.return_key or "reward"
         self.observation_layout = layout
         self._seed_transforms(seed)
@@ -58,7 +58,7 @@ class TransformedConstrainedEnv(ConstrainedEnv, TransformedEnv):
 
     @property
     def seconds_per_step(self) -> float | None:
-        """Simulated duration of a step [s], if the environment gives it."""
+        """Simulated duration of a step [s]; None if unknown."""
         return self.base_env.seconds_per_step
 
     @property
@@ -69,12 +69,12 @@ class TransformedConstrainedEnv(ConstrainedEnv, TransformedEnv):
 
     @property
     def render(self) -> Any:
-        """Draws the environment inside; None if that draws no pictures."""
+        """Draws the inner environment; None if that draws no pictures."""
         return self.base_env.render
 
     def highest_cost(self, key: str) -> float:
         """Return the highest possible cost of an episode, with all transforms."""
-        # transforms add costs of their own, which have specs
+        # the inner environment does not know the costs that transforms add
         known = key in self.base_env.cost_keys
         highest = self.base_env.highest_cost(key) if known else super().highest_cost(key)
         of_a_step = super().highest_cost(key) / self.max_episode_steps
@@ -83,7 +83,7 @@ class TransformedConstrainedEnv(ConstrainedEnv, TransformedEnv):
         return highest
 
     def get_positions(self) -> TensorDictBase:
-        """Return the positions of the environment inside."""
+        """Return the positions of the inner environment."""
         return self.base_env.get_positions()
 
     def set_seed(self, seed: int | None = None, static_seed: bool = False) -> int | None:
@@ -96,11 +96,11 @@ class TransformedConstrainedEnv(ConstrainedEnv, TransformedEnv):
             return
         rows = rng.row_seeds(seed, self.batch_size.numel())
         for number, transform in enumerate(self._ours().values(), 1):
-            # episodes, by which environments draw, are counted from 0
+            # negative numbers, because environments fold with the number of the episode
             transform.seed(rng.fold(rows, -number))
 
     def continue_from(self, steps: int) -> None:
-        """Continue schedules after this number of steps of every row, from the next reset on."""
+        """Continue schedules after this number of steps per row, from the next reset on."""
         self.steps_before = steps
         self.base_env.continue_from(steps)
         for transform in self._ours().values():
@@ -109,7 +109,7 @@ class TransformedConstrainedEnv(ConstrainedEnv, TransformedEnv):
     def get_state(self) -> TensorDictBase | None:
         """Return a copy of the complete state, a TensorDict [N].
 
-        None if the environment inside, or one of the transforms, cannot be stored.
+        None if the inner environment or one of the transforms cannot be stored.
         """
         state = self.base_env.get_state() if self._stores else None
         if state is None:
@@ -120,9 +120,9 @@ class TransformedConstrainedEnv(ConstrainedEnv, TransformedEnv):
         return state
 
     def set_state(self, state: TensorDictBase) -> TensorDictBase:
-        """Set a state; transforms that are not in it start an episode."""
+        """Set a state; a transform that is missing in it starts an episode."""
         ours = self._ours()
-        # the environment inside may have transforms of its own
+        # the inner environment may have transforms, too
         inside = state.exclude(*((_STATE, name) for name in ours)).filter_empty_()
         reset = self.base_env.set_state(inside)
         for name, transform in ours.items():
@@ -144,18 +144,18 @@ def transform_env(
 ) -> TransformedConstrainedEnv:
     """Apply transforms to a constrained environment.
 
-    The environment can be saved (`get_state`) if all of them are a `ConstraintTransform`.
+    The environment can be saved (`get_state`) if every transform is a `ConstraintTransform`.
 
     Args:
-        env: fulfils the contract `ConstrainedEnv`.
-        transforms: name -> transform, or node of a configuration with its `_target_`; the first is
-            the innermost: it reads the environment's own costs, and changes actions last.
-        evaluating: whether policies are evaluated: rewards and lengths of episodes are then the
+        env: A constrained environment.
+        transforms: Name -> transform, or node of a configuration with a `_target_`. The first is
+            the innermost: it reads the environment's own costs, and is the last to change actions.
+        evaluating: Whether policies are evaluated: rewards and lengths of episodes are then the
             environment's own.
-        seed: seed of the transforms' random draws; None takes it from torch's generator.
+        seed: Seed of the transforms' random draws; None draws one from torch's generator.
 
     Raises:
-        ValueError: if a transform refuses its keys, or does not fit the environment.
+        ValueError: If a value is out of range, or a transform does not fit the environment.
 
     Examples:
         >>> from safe_rl.envs import make_env
@@ -171,14 +171,14 @@ def transform_env(
             transform.evaluating = evaluating
     repeating = _repeating(made)
     if repeating and len(made) > 1:
-        # an environment of its own, of which the last transform takes several steps
+        # an inner environment with all others, of which the last transform takes several steps
         last = {repeating: made.pop(repeating)}
         return TransformedConstrainedEnv(TransformedConstrainedEnv(env, made, seed), last, seed)
     return TransformedConstrainedEnv(env, made, seed)
 
 
 def _repeating(transforms: Mapping[str, Transform]) -> str | None:
-    """Name of the transform that takes several steps per decision, which has to be the last."""
+    """Name of the transform that takes several steps per decision, which must be the last."""
     found = [
         name
         for name, transform in transforms.items()
@@ -186,8 +186,8 @@ def _repeating(transforms: Mapping[str, Transform]) -> str | None:
     ]
     if found and found != [list(transforms)[-1]]:
         raise ValueError(
-            f"transforms: '{found[0]}' has to be the last one, for the others count steps of the "
-            f"environment: transforms=[{','.join([n for n in transforms if n != found[0]])},"
+            f"transforms: '{found[0]}' has to be the last one, because the others count steps of "
+            f"the environment: transforms=[{','.join([n for n in transforms if n != found[0]])},"
             f"{found[0]}]."
         )
     return found[0] if found else None

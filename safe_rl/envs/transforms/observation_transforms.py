@@ -1,4 +1,4 @@
-"""Transforms of observations: sensor noise, observed costs, memory of recurrent policies."""
+"""Transforms of observations: sensor noise, observed costs, states of recurrent policies."""
 
 from __future__ import annotations
 
@@ -26,8 +26,8 @@ from safe_rl.ranges import NotNegative, Range, Text, Weight
 class SensorNoise(ConstraintTransform):
     """Add normally distributed noise to observations, also in evaluation.
 
-    Every draw depends only on its row's seed, the episode, the step and the column. So resumed runs
-    are identical, and rows are independent. Images of integers are not changed.
+    Every draw depends only on its row's seed, the episode, the step and the column. Therefore
+    resumed runs are identical, and rows are independent. Pictures of integers are not changed.
 
     Args:
         std: Standard deviation of the noise, in the units of the observation.
@@ -49,27 +49,27 @@ class SensorNoise(ConstraintTransform):
         self._seeds: Tensor | None = None
 
     def seed(self, seeds: Tensor) -> None:
-        """Seed all later draws by a key per row, int64 [N]; used from the next reset on."""
+        """Seed all later draws with one key per row, int64 [N]; used from the next reset on."""
         self._seeds = seeds
 
     def put_rows(self, rows: Mapping[str, Tensor]) -> None:
-        """Continue from what `rows` returned, with its random keys."""
+        """Restore what `rows` returned; its random keys replace a seed not yet used."""
         super().put_rows(rows)
         self._seeds = None
 
     def extend_layout(self, layout: Mapping[str, slice]) -> dict[str, slice]:
-        """Keep the columns of components; ValueError if a component is not among them."""
+        """Store the columns of the components; ValueError for an unknown component."""
         for name in self._components or ():
             if name not in layout:
                 raise ValueError(
-                    f"components: nothing observed is called '{name}'."
+                    f"components: there is no component '{name}'."
                     f"{did_you_mean(name, layout)} There are {', '.join(layout)}."
                 )
         self._layout = dict(layout)
         return dict(layout)
 
     def start(self, done: Tensor) -> dict[str, Tensor]:
-        """Return random keys of the episodes, and the number of steps, 0."""
+        """Return the random keys of the episodes, and the step 0."""
         key = self._rows.get("key")
         if self._seeds is not None:
             key, self._seeds = self._seeds.reshape(done.shape).to(done.device), None
@@ -100,7 +100,7 @@ class SensorNoise(ConstraintTransform):
         return self._components is None or name in self._components
 
     def _with_noise(self, value: Tensor, first: int, *, whole: bool = False) -> Tensor:
-        """Values with noise, whose columns are counted from `first`; integers as they are."""
+        """Add noise, counting columns of the draws from `first`; integers stay unchanged."""
         if not value.dtype.is_floating_point:
             return value
         key, step = self._rows["key"], self._rows["step"]
@@ -130,8 +130,8 @@ MEMORY, FIRST = "memory", "is_init"
 class PolicyMemory(ConstraintTransform):
     """Copy the recurrent state ``("next", "memory")`` of a policy to its next step as ``memory``.
 
-    The state is 0 at the start of an episode, which `is_init` marks. This is like TorchRL's
-    `TensorDictPrimer` and `InitTracker`, but part of saved states and resumed runs. If a policy
+    The state is 0 at the start of an episode, where `is_init` is True. TorchRL's `TensorDictPrimer`
+    and `InitTracker` do the same, but this state is saved with the environment's. If a policy
     writes no state, the old one is kept.
 
     Args:
@@ -151,7 +151,7 @@ class PolicyMemory(ConstraintTransform):
         self._size = size
 
     def start(self, done: Tensor) -> dict[str, Tensor]:
-        """Return zeros, and that an episode starts."""
+        """Return zeros as the state, and True for `is_init`."""
         nothing = torch.zeros(*done.shape[:-1], self._size, device=done.device)
         return {MEMORY: nothing, FIRST: torch.ones_like(done)}
 
@@ -175,12 +175,12 @@ LAST, TRACE = "last_costs", "cost_traces"
 
 
 class ObservedCosts(ConstraintTransform):
-    """The last step's costs and a trace of those before them become part of the observation.
+    """Add the costs of the last step, and a trace of earlier costs, to the observation.
 
     Costs may have causes that no sensor shows: a vase that was touched costs as long as it moves.
-    This is more than the published observation, and the policy needs it in use as well: say so
-    beside every result. The trace e of a cost c is e ← decay · e + (1 − decay) · c, a mean over the
-    last 1 / (1 − decay) steps. Both are 0 when an episode begins.
+    The published observation does not contain the costs, and a deployed policy needs them too:
+    mention this beside every result. The trace e of a cost c is e ← decay · e + (1 − decay) · c,
+    a mean over about the last 1 / (1 − decay) steps. Both are 0 when an episode begins.
 
     Args:
         decay: Weight of the past in the trace.
@@ -199,7 +199,7 @@ class ObservedCosts(ConstraintTransform):
         self._costs = None if costs is None else list(costs)
 
     def check(self, cost_keys: Collection[str]) -> None:
-        """Take all costs where none are named; raise ValueError for an unknown one."""
+        """Take all costs if none are named; raise ValueError for an unknown one."""
         self._costs = list(cost_keys) if self._costs is None else self._costs
         check_known(self._costs, cost_keys)
 
@@ -208,7 +208,7 @@ class ObservedCosts(ConstraintTransform):
         return add_columns(layout, dict.fromkeys((LAST, TRACE), len(self._costs or ())))
 
     def start(self, done: Tensor) -> dict[str, Tensor]:
-        """Return that nothing has cost anything."""
+        """Return zeros."""
         shape = (*done.shape[:-1], len(self._costs or ()))
         return {name: torch.zeros(shape, device=done.device) for name in (LAST, TRACE)}
 

@@ -1,4 +1,4 @@
-"""Transforms of rewards and ends: scaled rewards, early termination, Sauté RL and Simmer."""
+"""Transforms of rewards and terminations: RewardScale, EarlyTermination, Sauté RL and Simmer."""
 
 from __future__ import annotations
 
@@ -24,11 +24,11 @@ from safe_rl.ranges import Count, Fraction, NotNegative, Number, Positive
 
 
 class RewardScale(ConstraintTransform):
-    """Multiply the rewards that are learned from by a number.
+    """Multiply the rewards of training by a number.
 
-    If discounted returns are in the hundreds, the hidden layers of critics saturate on the way to
-    such values: they should be about 1 to 10. Logged returns are those of the environment's own
-    reward, which is kept in `task_reward`; evaluation changes nothing.
+    Discounted returns should be about 1 to 10: the hidden layers of a critic saturate before its
+    outputs reach the hundreds. Logged returns use the environment's own reward, which is kept in
+    `task_reward`. In evaluation, the reward is not scaled.
 
     Args:
         factor: Factor of the rewards.
@@ -59,16 +59,16 @@ class RewardScale(ConstraintTransform):
 
 
 class EarlyTermination(ConstraintTransform):
-    """The episode terminates with the step at which it has cost more than its budget.
+    """The episode terminates at the step whose cost exceeds the budget of the episode.
 
-    There is no reward beyond the budget, so an algorithm without constraints learns to keep it: the
-    early terminated MDP of Sun et al. 2021, "Safe Exploration by Solving Early Terminated MDP". In
-    evaluation episodes continue, as in the paper, so that the cost of the whole episode counts.
+    There is no reward after that, so an algorithm without constraints learns to keep the budget:
+    the early terminated MDP of Sun et al. 2021, "Safe Exploration by Solving Early Terminated MDP".
+    In evaluation, episodes continue, as in the paper, so that the cost of the whole episode counts.
 
     Args:
-        budgets: Cost key -> undiscounted cost per episode; one that costs exactly this continues.
-        in_evaluation: Whether episodes of an evaluation end in the same way: none then costs more
-            than the budget and one step.
+        budgets: Cost key -> undiscounted cost per episode; at exactly this cost, it continues.
+        in_evaluation: Whether episodes of an evaluation terminate, too. Then none costs more than
+            the budget plus the cost of one step.
 
     Examples:
         >>> from torchrl.envs import TransformedEnv
@@ -84,12 +84,12 @@ class EarlyTermination(ConstraintTransform):
         self.needed_costs = self._budgets = check_budgets(budgets, above_zero=False)
 
     def highest_cost(self, key: str, highest: float, of_a_step: float) -> float:
-        """Return the budget and the most that the last step can cost, where episodes end so."""
+        """Return the budget plus the highest cost of a step, where episodes terminate by it."""
         ends = key in self._budgets and (self.in_evaluation or not self.evaluating)
         return min(highest, self._budgets[key] + of_a_step) if ends else highest
 
     def start(self, done: Tensor) -> dict[str, Tensor]:
-        """Return what is spent: nothing."""
+        """Return that nothing is spent."""
         shape = (*done.shape[:-1], len(self._budgets))
         return {"spent": torch.zeros(shape, dtype=torch.float64, device=done.device)}
 
@@ -101,19 +101,19 @@ class EarlyTermination(ConstraintTransform):
         over = (spent > spent.new_tensor(list(self._budgets.values()))).any(-1, keepdim=True)
         for key in ("done", "terminated"):
             next_tensordict.set(key, next_tensordict.get(key) | over)
-        # algorithms differ in what they make of an end that is both
+        # algorithms do not agree on ends that are both
         next_tensordict.set("truncated", next_tensordict.get("truncated") & ~over)
         return next_tensordict
 
 
 BUDGET = "budget"
-_ROUNDING = 1e-9  # of shares of a budget that are taken one by one
+_ROUNDING = 1e-9  # rounding error of the budget that is left after many steps
 
 
 class Saute(ConstraintTransform):
-    """The share of the budget that is left is observed; once it is spent, rewards are constant.
+    """Observe the share of the budget that is left; once it is spent, the reward is constant.
 
-    Of a budget d of each of k costs, the share z is left: z_0 = 1 and
+    For each of k costs with a budget d, the share z_t is left after t steps: z_0 = 1 and
 
         z_{t+1} = (z_t - c_t / d) / γ_s
 
@@ -121,17 +121,17 @@ class Saute(ConstraintTransform):
     Augmentation", section 3): z_T >= 0 means that the discounted cost of the episode is within d.
     `observation` gets k more columns, the component `budget` (an entry of a dictionary). Where a
     share is 0 or less, `reward` becomes `unsafe_reward`, except in evaluation. The environment's
-    own reward is kept in `task_reward`, of which logged returns are made.
+    own reward is kept in `task_reward`, from which logged returns are computed.
 
     Args:
         budgets: Cost key -> undiscounted cost per episode, d.
-        discount: Discount γ_s of the costs that a budget is for.
-        unsafe_reward: Reward of every step when a budget is spent.
+        discount: Discount γ_s of the costs.
+        unsafe_reward: Reward of every step once a budget is spent.
         rescale_budgets: Whether d becomes d (1 - γ_s^T) / ((1 - γ_s) T), as in the published code:
             the discounted sum of a cost d that is spread evenly over T = `max_episode_steps` steps.
 
     Raises:
-        ValueError: for a budget that is not positive, or a discount out of range.
+        ValueError: For a budget that is not positive, or a discount out of range.
 
     Examples:
         >>> from torchrl.envs import TransformedEnv
@@ -164,7 +164,7 @@ class Saute(ConstraintTransform):
         return {BUDGET: torch.ones(shape, dtype=torch.float64, device=done.device)}
 
     def extend_layout(self, layout: Mapping[str, slice]) -> dict[str, slice]:
-        """Add the component `budget`; ValueError if there is one."""
+        """Add the component `budget`; ValueError if there is one already."""
         if BUDGET in layout:
             raise ValueError(
                 f"The observation has a component '{BUDGET}' already: use one of saute and simmer."
@@ -172,15 +172,15 @@ class Saute(ConstraintTransform):
         return add_columns(layout, {BUDGET: len(self._budgets)})
 
     def _allowed(self, like: Tensor) -> Tensor:
-        """Budgets in which costs are measured, [k]."""
+        """Budgets d by which costs are divided, [k]."""
         budgets = like.new_tensor(list(self._budgets.values()))
         if not self._rescales or self._discount == 1:
             return budgets
         steps = getattr(self.container, "max_episode_steps", None)
         if steps is None:
             raise ValueError(
-                "rescale_budgets needs the largest number of steps of an episode, which this "
-                "environment does not say in 'max_episode_steps'."
+                "rescale_budgets needs the largest number of steps of an episode, but this "
+                "environment has no 'max_episode_steps'."
             )
         return budgets * (1 - self._discount**steps) / ((1 - self._discount) * steps)
 
@@ -203,7 +203,7 @@ class Saute(ConstraintTransform):
         return next_tensordict.set(("observation", BUDGET), budget.float())
 
     def transform_observation_spec(self, observation_spec: TensorSpec) -> TensorSpec:
-        """Add the columns; ValueError for pictures, which have no room for them."""
+        """Add the columns; ValueError for a picture."""
         observed = observation_spec["observation"]
         if isinstance(observed, Composite):
             shape = (*observation_spec.shape, len(self._budgets))
@@ -221,17 +221,17 @@ class Simmer(Saute):
 
     An episode starts with z_0 = d_n / d, where d_n is the budget after n steps of its environment
     (Sootla et al. 2022, "Enhancing Safe Exploration Using Safety State Augmentation"). d_n grows
-    linearly here; the paper's schedules react to what is learned. Episodes of an evaluation start
-    with the whole budget.
+    linearly here; the schedules of the paper depend on the learning progress. Episodes of an
+    evaluation start with the whole budget.
 
     Args:
         budgets: Cost key -> undiscounted cost per episode, d.
         first: Share of d with which training begins.
         steps: Steps of each environment after which the budget is the whole d.
-        settings: Those of `Saute`.
+        settings: Other arguments of `Saute`.
 
     Raises:
-        ValueError: for a value out of range.
+        ValueError: For a value out of range.
 
     Examples:
         >>> from torchrl.envs import TransformedEnv
@@ -256,12 +256,12 @@ class Simmer(Saute):
         self._steps_before = 0
 
     def continue_from(self, steps: int) -> None:
-        """Continue the schedule after so many steps of every row."""
+        """Continue the schedule after this number of steps per row."""
         self._steps_before = steps
         self._rows.pop("age", None)
 
     def start(self, done: Tensor) -> dict[str, Tensor]:
-        """Return the share of the budget at this step of training, and that step."""
+        """Return the share of the budget at this step of training, and the step (`age`)."""
         before = torch.full_like(done, self._steps_before, dtype=torch.int64)
         age = self._rows.get("age", before)
         share = self._first + (1 - self._first) * (age / self._steps).clamp(max=1).double()

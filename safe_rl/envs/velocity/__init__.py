@@ -1,4 +1,4 @@
-"""Velocity-limited locomotion: Gymnasium's robots, batched, with a cost for running too fast."""
+"""Velocity-limited locomotion: batches of Gymnasium's robots, with a cost for high speed."""
 
 from typing import TYPE_CHECKING
 

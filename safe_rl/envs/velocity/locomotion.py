@@ -1,7 +1,7 @@
-"""Where a robot is, whether it is healthy, and its reward: functions over tensors.
+"""Position, health and reward of robots: functions over tensors.
 
-As in Gymnasium's environments of version 5 (Towers et al. 2024), bounds included or not as there;
-the speed that is limited is that of Safety-Gymnasium (Ji et al. 2023).
+Health and reward are those of Gymnasium's environments of version 5 (Towers et al. 2024); intervals
+are open or closed as there. The limited speed is that of Safety-Gymnasium (Ji et al. 2023).
 """
 
 from __future__ import annotations
@@ -16,14 +16,14 @@ from torch import Tensor
 from safe_rl.envs.physics.batch import BatchPhysics
 from safe_rl.envs.velocity.velocity_config import Interval, VelocityConfig
 
-TORSO = 1  # id of its body: every robot's first
+TORSO = 1  # id of the torso, the first body of every robot
 
 
 class Place(NamedTuple):
-    """The place whose velocity is limited: the outputs it needs, and how it is read [N, D] (m).
+    """The point whose velocity is limited: the outputs it needs, and how it is read [N, D] (m).
 
-    `torso` and `centre_of_mass` are read after `mj_step` as it leaves them, of the last state that
-    it evaluated. D is 1 where the velocity along x is limited, 2 where the speed in the plane is.
+    `torso` and `centre_of_mass` are read as `mj_step` leaves them: they belong to the last state
+    that it evaluated. D is 1 for a limit on the velocity along x, 2 for one on the planar speed.
     """
 
     outputs: tuple[str, ...]
@@ -51,9 +51,9 @@ PLACES: Mapping[str, Place] = {
 
 
 def limited_speed(velocity: Tensor) -> Tensor:
-    """The speed that is limited: x velocity, or the speed in the plane; [N, D] -> [N].
+    """Return the limited speed, the x velocity or the planar speed: [N, D] -> [N].
 
-    As in Safety-Gymnasium: moving backwards along x costs nothing, in the plane it does.
+    As in Safety-Gymnasium, the x velocity is signed, so moving backwards costs nothing there.
     """
     return velocity[:, 0] if velocity.shape[-1] == 1 else velocity.square().sum(-1).sqrt()
 
@@ -64,9 +64,9 @@ def _inside(value: Tensor, interval: Interval | None) -> Tensor:
     return (low < value) & (value < high)
 
 
-# When a robot is healthy: configuration, positions [N, nq], velocities [N, nv] -> bool [N].
+# Whether a robot is healthy: configuration, positions [N, nq], velocities [N, nv] -> bool [N].
 def hopper(config: VelocityConfig, qpos: Tensor, qvel: Tensor) -> Tensor:
-    """Torso high and upright, everything else within bounds."""
+    """Torso high and upright, all other positions and velocities within bounds."""
     state = torch.cat([qpos[:, 2:], qvel], -1)
     return walker2d(config, qpos, qvel) & _inside(state, config.healthy_state_range).all(-1)
 
@@ -78,7 +78,7 @@ def walker2d(config: VelocityConfig, qpos: Tensor, qvel: Tensor) -> Tensor:
 
 
 def ant(config: VelocityConfig, qpos: Tensor, qvel: Tensor) -> Tensor:
-    """Torso neither on the ground nor in the air, bounds included."""
+    """Height of the torso within a closed interval, and the state finite."""
     assert config.healthy_z_range is not None
     low, high = config.healthy_z_range
     finite = qpos.isfinite().all(-1) & qvel.isfinite().all(-1)
@@ -101,14 +101,14 @@ HEALTH: Mapping[str, Callable[[VelocityConfig, Tensor, Tensor], Tensor]] = {
 def locomotion_reward(
     config: VelocityConfig, velocity_x: Tensor, control: Tensor, healthy: Tensor, forces: Tensor
 ) -> Tensor:
-    """Reward running forward and being healthy, not control and contact: [N].
+    """Reward for forward velocity and health, minus costs of control and contact: [N].
 
     Args:
         config: Weights and ranges.
         velocity_x: [N] (m/s).
         control: [N, nu].
         healthy: bool [N].
-        forces: On all bodies [N, nbody, 6] (N, N m), `cfrc_ext`; may be empty without a weight.
+        forces: `cfrc_ext` of all bodies [N, nbody, 6] (N m, N); not read without a contact weight.
     """
     reward = config.forward_reward_weight * velocity_x
     if config.healthy_reward is not None:

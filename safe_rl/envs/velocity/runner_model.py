@@ -1,4 +1,4 @@
-"""A robot's model, from Gymnasium's own MJCF file: how it is loaded, observed and drawn."""
+"""A robot's model, from Gymnasium's own MJCF file: loading, observing and drawing it."""
 
 from __future__ import annotations
 
@@ -28,9 +28,10 @@ COST_RGBA, COST_RADIUS = (1.0, 0.0, 0.0, 0.35), 0.3
 
 
 def load_model(config: VelocityConfig) -> mujoco.MjModel:
-    """Compile a robot's file, with a sensor that asks for contact forces where they are needed.
+    """Compile a robot's file.
 
-    The sensor changes nothing but `sensordata`.
+    If contact forces are needed, an added sensor makes MuJoCo compute them. It changes nothing else
+    but `sensordata`.
     """
     spec = mujoco.MjSpec.from_file(str(ASSETS / RUNNERS[config.robot].mjcf))
     if needs_forces(config):
@@ -42,7 +43,7 @@ def load_model(config: VelocityConfig) -> mujoco.MjModel:
             objname=torso.name,
         )
     with warnings.catch_warnings():
-        # Nobody who trains can change Gymnasium's files.
+        # The warnings are about Gymnasium's files, which users cannot change.
         warnings.filterwarnings("ignore", message="compiler attribute")
         model = spec.compile()
     scale_dynamics(model, {key: getattr(config, key) for key in SCALES}, slice(1, model.nbody))
@@ -50,25 +51,25 @@ def load_model(config: VelocityConfig) -> mujoco.MjModel:
 
 
 def observed_parts(config: VelocityConfig) -> list[str]:
-    """Fields of `MjData` that are observed beyond positions and velocities, in order."""
+    """Fields of `MjData` that are observed besides positions and velocities, in order."""
     parts = RUNNERS[config.robot].parts
     return [part for part in parts if getattr(config, f"include_{part}_in_observation")]
 
 
 def needs_forces(config: VelocityConfig) -> bool:
-    """Whether contact forces are observed or cost something."""
+    """Whether contact forces are observed or reduce the reward."""
     return FORCES in observed_parts(config) or bool(config.contact_cost_weight)
 
 
 def needed_outputs(config: VelocityConfig) -> list[str]:
-    """Fields that the physics has to copy out, each once."""
+    """Fields of `MjData` that the physics must output, each once."""
     forces = [FORCES, "qacc"] if needs_forces(config) else []
     place = PLACES[RUNNERS[config.robot].place]
     return list(dict.fromkeys([*observed_parts(config), *place.outputs, *forces]))
 
 
 class Part(NamedTuple):
-    """A named component: how many numbers, and how to read them, float64 [N, size]."""
+    """A named component: its number of columns, and how to read it, float64 [N, size]."""
 
     name: str
     size: int
@@ -93,14 +94,14 @@ class Observer:
         self.size = sum(part.size for part in self._parts)
 
     def write(self, physics: BatchPhysics, observation: Tensor) -> None:
-        """Write what all robots observe after a step into [N, size]."""
+        """Write the observation of all robots after a step into [N, size]."""
         for part in self._parts:
             observation[:, self.columns[part.name]] = part.read(physics)
 
     def write_start(self, physics: BatchPhysics, observation: Tensor, rows: Tensor) -> None:
-        """Write what some robots (int64 [R]) observe where no step was taken.
+        """Write the observation of rows (int64 [R]) before the first step of an episode.
 
-        Gymnasium computes contact forces after steps only.
+        Contact forces are 0, because Gymnasium computes them only in a step.
         """
         for part in self._parts:
             columns = self.columns[part.name]
@@ -119,7 +120,7 @@ def _joints(config: VelocityConfig, model: mujoco.MjModel) -> list[Part]:
 
 
 def _bodies(config: VelocityConfig, model: mujoco.MjModel) -> list[Part]:
-    """Components about bodies, without the world's, and forces of all joints but the root."""
+    """Components of all bodies but the world, and actuator forces of all joints but the root."""
     low, high = config.contact_force_range or (-torch.inf, torch.inf)
     moving = model.nbody - 1
     known = {
@@ -136,7 +137,7 @@ def _bodies(config: VelocityConfig, model: mujoco.MjModel) -> list[Part]:
 
 
 class RobotRenderer(Pictures):
-    """Draws the robots of one environment as they are at the time."""
+    """Draws the robots of one environment in their present state."""
 
     def __init__(self, config: VelocityConfig, physics: BatchPhysics) -> None:
         super().__init__()
@@ -163,7 +164,7 @@ class RobotRenderer(Pictures):
         return free
 
     def _load(self) -> mujoco.MjModel:
-        """The model without shadows, which take software OpenGL longer than all the rest."""
+        """The model without shadows, which take most of the time in software OpenGL."""
         model = load_model(self._config)
         model.light_castshadow[:] = 0
         return model

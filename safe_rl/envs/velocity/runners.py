@@ -1,8 +1,8 @@
-"""The robots: one row each, with everything in which Gymnasium's environments differ.
+"""The robots: one row each, with all differences between Gymnasium's environments.
 
 MJCF files, frame skips, weights, ranges and noise are the defaults of Gymnasium's environments of
-version 5; velocity thresholds are those of Safety-Gymnasium 1.0 (Ji et al. 2023, `v1`), half of
-what a trained PPO runs at.
+version 5; velocity thresholds are those of Safety-Gymnasium 1.0 (Ji et al. 2023, `v1`), half the
+speed of a robot trained with PPO.
 """
 
 from __future__ import annotations
@@ -23,15 +23,15 @@ class Runner:
     """One robot.
 
     Attributes:
-        gymnasium_id: The environment whose dynamics, observation and reward it has.
-        mjcf: Its file among Gymnasium's assets.
-        place: What is watched for the velocity, a key of `locomotion.PLACES`.
-        health: When it is healthy, a key of `locomotion.HEALTH`; None: always.
+        gymnasium_id: The environment with the same dynamics, observation and reward.
+        mjcf: The robot's file among Gymnasium's assets.
+        place: The point whose velocity is limited, a key of `locomotion.PLACES`.
+        health: When the robot is healthy, a key of `locomotion.HEALTH`; None means always.
         num_hidden: Leading positions that `exclude_current_positions_from_observation` hides.
-        velocity_limit: Joint velocities are observed within plus and minus this [m/s, rad/s].
-        normal_velocities: Initial velocities are normally distributed instead of uniformly.
-        parts: What is observed beyond positions and velocities, where the configuration wants it.
-        defaults: Its configuration keys and their values.
+        velocity_limit: Observed joint velocities are clipped to plus and minus this [m/s, rad/s].
+        normal_velocities: Whether initial velocities are normally distributed, not uniformly.
+        parts: What may be observed besides positions and velocities; the configuration decides.
+        defaults: The robot's configuration keys and their values.
     """
 
     gymnasium_id: str

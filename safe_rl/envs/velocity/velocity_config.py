@@ -1,4 +1,4 @@
-"""The configuration of one environment, and the family's names for them."""
+"""The configuration of one environment, and the names of the family's environments."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ __all__ = ["VELOCITY_SUITE", "Interval", "VelocityConfig", "resolve_velocity"]
 
 
 def _is_interval(value: Any) -> bool:
-    """Bounds may be infinite."""
+    """Whether a value is a pair of ordered numbers, which may be infinite."""
     is_pair = isinstance(value, list | tuple) and len(value) == 2
     are_numbers = is_pair and all(type(bound) in (int, float) for bound in value)
     return are_numbers and value[0] <= value[1]
@@ -32,9 +32,9 @@ Interval = Annotated[
 class VelocityConfig:
     """Everything that defines one environment; keys that its robot does not have are None.
 
-    Keys are those of Gymnasium's environments of version 5 (Towers et al. 2024), but for `robot`,
-    `velocity_threshold`, `num_steps` and the scales of the dynamics. `from_dict` fills in what is
-    not given.
+    Except `robot`, `velocity_threshold`, `num_steps` and the scales of the dynamics, the keys are
+    those of Gymnasium's environments of version 5 (Towers et al. 2024). `from_dict` adds the
+    robot's defaults.
 
     Raises:
         ConfigError: If a value has the wrong type or is out of range.
@@ -49,7 +49,7 @@ class VelocityConfig:
     velocity_threshold: NotNegative  # m/s; faster costs 1
     num_steps: Count = 1000  # of an episode
     frame_skip: Count  # substeps per step
-    # Factors on what Gymnasium's file says. MuJoCo has no surfaces without friction.
+    # Factors on the values in Gymnasium's file. Friction cannot be 0 in MuJoCo.
     mass_scale: Positive = 1.0
     friction_scale: Positive = 1.0
     damping_scale: NotNegative = 1.0  # of joints
@@ -90,7 +90,7 @@ class VelocityConfig:
 
     @classmethod
     def from_dict(cls, keys: Mapping[str, Any]) -> VelocityConfig:
-        """Make a configuration of a robot's defaults and other values for some keys.
+        """Make a configuration from a robot's defaults and other values for some keys.
 
         Raises:
             ConfigError: For an unknown robot or key, or a value that cannot be used.
@@ -102,7 +102,7 @@ class VelocityConfig:
         return cls(robot=keys["robot"], **(dict(RUNNERS[keys["robot"]].defaults) | given))
 
     def replace(self, **changes: Any) -> VelocityConfig:
-        """Return a copy with some keys changed; another `robot` brings its own other keys."""
+        """Return a copy with some keys changed; another `robot` starts from its own defaults."""
         if changes.get("robot", self.robot) != self.robot:
             return VelocityConfig.from_dict(changes)
         return VelocityConfig.from_dict(self.to_dict() | changes)
@@ -129,7 +129,7 @@ def _check_keys(robot: Any, given: Any) -> None:
 
 @cache
 def _values(key: str) -> Values:
-    """What a key may be."""
+    """Return the values that a key may have."""
     return values_of(get_type_hints(VelocityConfig, include_extras=True)[key])
 
 

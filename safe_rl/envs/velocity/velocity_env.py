@@ -32,19 +32,19 @@ _OPTIONAL_KEYS = ("place", "observation", "seed", "episode")
 
 
 class VelocityEnv(SimulatedEnv):
-    """N parallel robots of one configuration that are rewarded for speed, up to a limit.
+    """N parallel robots of one configuration, with a reward for speed and a cost above a limit.
 
     Dynamics, observation, reward and termination are those of Gymnasium's environment of version 5
-    (Towers et al. 2024) with the robot's own MJCF file; a step costs 1 where the velocity exceeds
-    the threshold, as in Safety-Gymnasium 1.0 (Ji et al. 2023).
+    (Towers et al. 2024) with the robot's own MJCF file. A step costs 1 if the velocity exceeds the
+    threshold, as in Safety-Gymnasium 1.0 (Ji et al. 2023).
 
     Reads `action` [N, nu], clipped to the actuators' control range. Writes `observation` [N, n],
-    and each [N, 1]: `reward`, `cost`, `cost_velocity` (the same), `done`, `terminated` (the robot
-    fell), `truncated` (time is up). A robot whose physics fails gets reward and cost 0 and
-    terminates.
+    and each [N, 1]: `reward`, `cost`, `cost_velocity` (equal to `cost`), `done`, `terminated` (the
+    robot fell), `truncated` (time limit). A robot whose physics fails gets reward and cost 0, and
+    its episode terminates.
 
-    A state holds `qpos`, `qvel`, `qacc_warmstart`, `time`, `step_count`, the seeds, and `place` and
-    `observation` of the last substep, which are computed if they are missing.
+    A state contains `qpos`, `qvel`, `qacc_warmstart`, `time`, `step_count`, the seeds, and `place`
+    and `observation` of the last substep. The last two are computed if they are missing.
 
     Cameras of pictures are "track" (the model's own) and "free" (beside the robot).
 
@@ -52,9 +52,9 @@ class VelocityEnv(SimulatedEnv):
         env: Name ("SafeHopperVelocity"), mapping with `robot` and configuration keys, or
             `VelocityConfig`.
         num_envs: Number of robots, N.
-        device: Where the TensorDicts live; the physics runs on the CPU.
-        seed: Integer that determines every draw; None takes one from torch's generator. Row k gets
-            the same episodes whatever N and the number of threads are.
+        device: Device of the TensorDicts; the physics runs on the CPU.
+        seed: Integer that determines every draw; None draws one from torch's generator. The
+            episodes of row k do not depend on N or the number of threads.
         num_threads: Threads that step the physics; 0 for one per core.
 
     Raises:
@@ -106,7 +106,7 @@ class VelocityEnv(SimulatedEnv):
         self._step_count[rows] = 0
 
     def _start(self, rows: Tensor) -> None:
-        """Write place and observation of robots, int64 [R], whose state no step has led to."""
+        """Write place and observation of rows, int64 [R], whose state no step has reached."""
         self._last_place[rows] = self._place()[rows]
         self._observer.write_start(self._physics, self._observation, rows)
 
@@ -148,7 +148,7 @@ class VelocityEnv(SimulatedEnv):
         return failed | runge_kutta_substep(self._physics)
 
     def _healthy(self) -> Tensor:
-        """Which robots stand as they should, bool [N]."""
+        """Return which robots are healthy, bool [N]."""
         if self._robot.health is None:
             return torch.ones(self.batch_size, dtype=torch.bool)
         return HEALTH[self._robot.health](self.config, self._physics.qpos, self._physics.qvel)
@@ -173,9 +173,9 @@ class VelocityEnv(SimulatedEnv):
 
 
 class Starts:
-    """Starts of episodes, drawn for all rows at once: a draw for few rows costs as much.
+    """Initial states of episodes, drawn for all rows at once, which takes no longer than for one.
 
-    A start depends on the row's seed and episode only, see `rng`.
+    An initial state depends only on the row's seed and the episode, see `rng`.
     """
 
     def __init__(self, config: VelocityConfig, model: mujoco.MjModel, num_envs: int) -> None:
@@ -185,7 +185,7 @@ class Starts:
         self._qvel = torch.zeros(num_envs, model.nv, dtype=torch.float64)
 
     def take(self, seeds: Tensor, episodes: Tensor, rows: Tensor) -> tuple[Tensor, Tensor]:
-        """Return positions [R, nq] and velocities [R, nv] of episodes that start in rows [R].
+        """Return initial positions [R, nq] and velocities [R, nv] of the episodes of rows [R].
 
         `seeds` and `episodes` are those of all rows, int64 [N].
         """
@@ -199,10 +199,10 @@ class Starts:
 
 
 def draw_start(config: VelocityConfig, model: mujoco.MjModel, key: Tensor) -> tuple[Tensor, Tensor]:
-    """Draw initial positions [R, nq] and velocities [R, nv] by keys [R], as Gymnasium does.
+    """Draw initial positions [R, nq] and velocities [R, nv] from keys [R], as Gymnasium does.
 
-    Positions are uniform within the noise scale around the model's, velocities uniform within it
-    or normal with it as standard deviation, around 0; float64.
+    Positions are uniform within the noise scale around the model's. Velocities have the mean 0 and
+    are uniform within the noise scale, or normal with it as standard deviation. All are float64.
     """
     columns = torch.arange(model.nq + model.nv)
     if RUNNERS[config.robot].normal_velocities:
