@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from operator import attrgetter
 from typing import Any
 
 from tensordict import TensorDict, TensorDictBase
@@ -21,10 +22,16 @@ _STATE = "transforms"
 class TransformedConstrainedEnv(ConstrainedEnv, TransformedEnv):
     """N environments with transforms, made by `transform_env`.
 
+    What transforms do not change is read from the inner environment.
+
     Attributes:
         cost_keys: Costs of the inner environment, then those of the transforms.
         return_key: Entry below "next" from which returns are computed, `reward` by default.
     """
+
+    max_episode_steps = property(attrgetter("base_env.max_episode_steps"))
+    seconds_per_step = property(attrgetter("base_env.seconds_per_step"))
+    render = property(attrgetter("base_env.render"))
 
     def __init__(
         self, base_env: ConstrainedEnv, transforms: Mapping[str, Transform], seed: int | None = None
@@ -52,25 +59,10 @@ class TransformedConstrainedEnv(ConstrainedEnv, TransformedEnv):
         return {name: t for name, t in named if isinstance(t, ConstraintTransform)}
 
     @property
-    def max_episode_steps(self) -> int:
-        """The largest number of steps of an episode."""
-        return self.base_env.max_episode_steps
-
-    @property
-    def seconds_per_step(self) -> float | None:
-        """Simulated duration of a step [s]; None if unknown."""
-        return self.base_env.seconds_per_step
-
-    @property
     def steps_per_decision(self) -> int:
         """Steps of the environment that one call of `step` takes."""
         own = (transform.steps_per_decision for transform in self._ours().values())
         return math.prod(own, start=self.base_env.steps_per_decision)
-
-    @property
-    def render(self) -> Any:
-        """Draws the inner environment; None if that draws no pictures."""
-        return self.base_env.render
 
     def highest_cost(self, key: str) -> float:
         """Return the highest possible cost of an episode, with all transforms."""
