@@ -15,9 +15,6 @@ from safe_rl.envs.costs import is_cost
 from safe_rl.naming import did_you_mean, key_name
 from safe_rl.ranges import Checked
 
-OWN_REWARD = "task_reward"
-"""Key of the environment's own reward, if a transform changes `reward`."""
-
 
 class ConstraintTransform(Checked, Transform):
     """Base class of transforms that keep the environment's contract and have a saved state.
@@ -118,20 +115,6 @@ def costs_of(step: TensorDictBase, keys: Collection[str]) -> Tensor:
         names = [key_name(key) for key in step.keys(True, True)]
         check_known(lacking, [name for name in names if is_cost(name.rpartition("/")[2])])
     return torch.cat(costs, -1).double()
-
-
-def keep_reward(step: TensorDictBase, key: str) -> Tensor:
-    """Copy the reward to `key`, unless an earlier transform has; return the reward."""
-    reward = step.get("reward")
-    step.set(key, step.get(key, reward))
-    return reward
-
-
-def kept_reward_spec(spec: Composite, key: str) -> Composite:
-    """Add `key` to the reward spec, and remove the bounds of both rewards."""
-    for name in (key, "reward"):
-        spec[name] = unbounded_like(spec["reward"])
-    return spec
 
 
 def unbounded_like(spec: TensorSpec) -> TensorSpec:

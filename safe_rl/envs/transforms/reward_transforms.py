@@ -12,18 +12,34 @@ from torchrl.data import Composite, TensorSpec, Unbounded
 
 from safe_rl.envs.contract import add_columns
 from safe_rl.envs.transforms.base import (
-    OWN_REWARD,
     ConstraintTransform,
     check_budgets,
     costs_of,
-    keep_reward,
-    kept_reward_spec,
+    unbounded_like,
     widen,
 )
 from safe_rl.ranges import Count, Fraction, NotNegative, Number, Positive
 
 
-class RewardScale(ConstraintTransform):
+class _ChangesReward(ConstraintTransform):
+    """Base class of transforms that change `reward`, and keep the environment's own reward."""
+
+    return_key = "task_reward"
+
+    def _keep_reward(self, step: TensorDictBase) -> Tensor:
+        """Return the reward, and copy it to `return_key`, unless an earlier transform has."""
+        reward = step.get("reward")
+        step.set(self.return_key, step.get(self.return_key, reward))
+        return reward
+
+    def transform_reward_spec(self, reward_spec: TensorSpec) -> TensorSpec:
+        """Add the environment's own reward, and remove the bounds of both rewards."""
+        for key in (self.return_key, "reward"):
+            reward_spec[key] = unbounded_like(reward_spec["reward"])
+        return reward_spec
+
+
+class RewardScale(_ChangesReward):
     """Multiply the rewards of training by a number.
 
     Discounted returns should be about 1 to 10: the hidden layers of a critic saturate before its
@@ -41,21 +57,15 @@ class RewardScale(ConstraintTransform):
         True
     """
 
-    return_key = OWN_REWARD
-
     def __init__(self, factor: Positive) -> None:
         super().__init__()
         self._factor = factor
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
-        reward = keep_reward(next_tensordict, self.return_key)
+        reward = self._keep_reward(next_tensordict)
         if not self.evaluating:
             next_tensordict.set("reward", self._factor * reward)
         return next_tensordict
-
-    def transform_reward_spec(self, reward_spec: TensorSpec) -> TensorSpec:
-        """Add the environment's own reward."""
-        return kept_reward_spec(reward_spec, self.return_key)
 
 
 class EarlyTermination(ConstraintTransform):
@@ -110,7 +120,7 @@ BUDGET = "budget"
 _ROUNDING = 1e-9  # rounding error of the budget that is left after many steps
 
 
-class Saute(ConstraintTransform):
+class Saute(_ChangesReward):
     """Observe the share of the budget that is left; once it is spent, the reward is constant.
 
     For each of k costs with a budget d, the share z_t is left after t steps: z_0 = 1 and
@@ -141,8 +151,6 @@ class Saute(ConstraintTransform):
         >>> TransformedEnv(env, saute).rollout(2)["observation"][0, :, -1]
         tensor([1., 2.])
     """
-
-    return_key = OWN_REWARD
 
     def __init__(
         self,
@@ -188,7 +196,7 @@ class Saute(ConstraintTransform):
         costs = costs_of(next_tensordict, self._budgets)
         left = (self._rows[BUDGET] - costs / self._allowed(costs)) / self._discount
         self._rows = {**self._rows, BUDGET: left}
-        reward = keep_reward(next_tensordict, self.return_key)
+        reward = self._keep_reward(next_tensordict)
         if not self.evaluating:
             spent = (left <= _ROUNDING).any(-1, keepdim=True)
             next_tensordict.set("reward", reward.masked_fill(spent, self._unsafe_reward))
@@ -210,10 +218,6 @@ class Saute(ConstraintTransform):
             observed[BUDGET] = Unbounded(shape=shape, device=observed.device)
             return observation_spec
         return widen(observation_spec, len(self._budgets), "A budget")
-
-    def transform_reward_spec(self, reward_spec: TensorSpec) -> TensorSpec:
-        """Add the environment's own reward."""
-        return kept_reward_spec(reward_spec, self.return_key)
 
 
 class Simmer(Saute):
