@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from inspect import signature
 from typing import Annotated, Any
 
@@ -59,6 +59,8 @@ class ActionFilter(ConstraintTransform):
                 [1.]])
     """
 
+    _intervened: Tensor
+
     def __init__(
         self,
         filter: Annotated[Callable[..., Tensor], PART],
@@ -69,7 +71,6 @@ class ActionFilter(ConstraintTransform):
         self._filter = filter
         self._asks_for = {"positions", "layout"} & _parameters(filter)
         self.added_costs = (cost_key,)
-        self._intervened: Tensor | None = None
 
     def _inv_call(self, tensordict: TensorDictBase) -> TensorDictBase:
         action = tensordict.get("action")
@@ -99,7 +100,6 @@ class ActionFilter(ConstraintTransform):
         return given
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
-        assert self._intervened is not None  # the action was given to the step before
         cost = self._intervened.to(next_tensordict.get("reward").dtype)
         return next_tensordict.set(self.added_costs[0], cost)
 
@@ -125,10 +125,11 @@ class ActionDelay(ConstraintTransform):
         torch.Size([1, 4])
     """
 
+    _pending: Tensor
+
     def __init__(self, steps: Annotated[int, Range(1, 1000)]) -> None:
         super().__init__()
         self._steps = steps
-        self._pending: Tensor | None = None
 
     def start(self, done: Tensor) -> dict[str, Tensor]:
         """Return `steps` neutral actions."""
@@ -149,7 +150,6 @@ class ActionDelay(ConstraintTransform):
         return tensordict.set("action", due.reshape(action.shape))
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
-        assert self._pending is not None  # the action was given to the step before
         self._rows = {"pending": self._pending}
         return next_tensordict
 
@@ -176,16 +176,13 @@ class ActionRepeat(ConstraintTransform):
         super().__init__()
         self.steps_per_decision = k
 
-    def _sums(self) -> Sequence[str]:
-        """Entries of a step that are summed: rewards and costs."""
-        return list(self.container.base_env.full_reward_spec.keys(True, True))
-
     def start(self, done: Tensor) -> dict[str, Tensor]:
         """Return that no step was taken."""
         return {STEPS_TAKEN: torch.zeros_like(done, dtype=torch.int64)}
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
-        env, keys, result = self.container.base_env, self._sums(), next_tensordict
+        env, result = self.container.base_env, next_tensordict
+        rewards_and_costs = list(env.full_reward_spec.keys(True, True))
         taken = torch.ones_like(result.get("done"), dtype=torch.int64)
         for _ in range(self.steps_per_decision - 1):
             active = ~result.get("done")
@@ -197,7 +194,7 @@ class ActionRepeat(ConstraintTransform):
                 # an environment may refuse steps after an end; these steps are not counted
                 state.update(env.reset(TensorDict(_reset=~active, batch_size=env.batch_size)))
             after = env._step(state.set("action", tensordict.get("action")))
-            after.update({key: result.get(key) + after.get(key) for key in keys})
+            after.update({key: result.get(key) + after.get(key) for key in rewards_and_costs})
             taken += active
             result = after if active.all() else _where(active, after, result)
         self._rows = {STEPS_TAKEN: taken}

@@ -196,24 +196,25 @@ class ObservedCosts(ConstraintTransform):
     def __init__(self, decay: Weight, costs: Sequence[Text] | None = None) -> None:
         super().__init__()
         self._decay = decay
-        self._costs = None if costs is None else list(costs)
+        self._takes_all, self._costs = costs is None, list(costs or ())
 
     def check(self, cost_keys: Collection[str]) -> None:
         """Take all costs if none are named; raise ValueError for an unknown one."""
-        self._costs = list(cost_keys) if self._costs is None else self._costs
+        if self._takes_all:
+            self._takes_all, self._costs = False, list(cost_keys)
         check_known(self._costs, cost_keys)
 
     def extend_layout(self, layout: Mapping[str, slice]) -> dict[str, slice]:
         """Add the components `last_costs` and `cost_traces`."""
-        return add_columns(layout, dict.fromkeys((LAST, TRACE), len(self._costs or ())))
+        return add_columns(layout, dict.fromkeys((LAST, TRACE), len(self._costs)))
 
     def start(self, done: Tensor) -> dict[str, Tensor]:
         """Return zeros."""
-        shape = (*done.shape[:-1], len(self._costs or ()))
+        shape = (*done.shape[:-1], len(self._costs))
         return {name: torch.zeros(shape, device=done.device) for name in (LAST, TRACE)}
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
-        costs = costs_of(next_tensordict, self._costs or ()).float()
+        costs = costs_of(next_tensordict, self._costs).float()
         self._rows = {LAST: costs, TRACE: torch.lerp(costs, self._rows[TRACE], self._decay)}
         return self._call(next_tensordict)
 
@@ -223,4 +224,4 @@ class ObservedCosts(ConstraintTransform):
 
     def transform_observation_spec(self, observation_spec: TensorSpec) -> TensorSpec:
         """Add the columns; ValueError for pictures and dictionaries."""
-        return widen(observation_spec, 2 * len(self._costs or ()), "observed_costs")
+        return widen(observation_spec, 2 * len(self._costs), "observed_costs")

@@ -101,7 +101,7 @@ class EarlyTermination(ConstraintTransform):
     def start(self, done: Tensor) -> dict[str, Tensor]:
         """Return that nothing is spent."""
         shape = (*done.shape[:-1], len(self._budgets))
-        return {"spent": torch.zeros(shape, dtype=torch.float64, device=done.device)}
+        return {"spent": done.new_zeros(shape, dtype=torch.float64)}
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
         spent = self._rows["spent"] + costs_of(next_tensordict, self._budgets)
@@ -169,7 +169,7 @@ class Saute(_ChangesReward):
     def start(self, done: Tensor) -> dict[str, Tensor]:
         """Return the whole budget."""
         shape = (*done.shape[:-1], len(self._budgets))
-        return {BUDGET: torch.ones(shape, dtype=torch.float64, device=done.device)}
+        return {BUDGET: done.new_ones(shape, dtype=torch.float64)}
 
     def extend_layout(self, layout: Mapping[str, slice]) -> dict[str, slice]:
         """Add the component `budget`; ValueError if there is one already."""
