@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache
@@ -76,7 +75,7 @@ class VelocityConfig:
     healthy_state_range: Interval | None = None  # of all other positions and velocities
 
     def __post_init__(self) -> None:
-        _check_keys(self.robot, [key for key, value in _items(self) if value is not None])
+        _check_keys(self.robot, self.to_dict())
         for key, default in RUNNERS[self.robot].defaults.items():
             value, values = getattr(self, key), _values(key)
             if value is None or not values.hold(value):
@@ -97,9 +96,8 @@ class VelocityConfig:
         """
         if "robot" not in keys:
             raise ConfigError(f"The configuration lacks 'robot', one of {list(RUNNERS)}.")
-        given = {key: value for key, value in keys.items() if key != "robot"}
-        _check_keys(keys["robot"], given)
-        return cls(robot=keys["robot"], **(dict(RUNNERS[keys["robot"]].defaults) | given))
+        _check_keys(keys["robot"], keys)
+        return cls(**{**RUNNERS[keys["robot"]].defaults, **keys})
 
     def replace(self, **changes: Any) -> VelocityConfig:
         """Return a copy with some keys changed; another `robot` starts from its own defaults."""
@@ -109,11 +107,7 @@ class VelocityConfig:
 
     def to_dict(self) -> dict[str, Any]:
         """Return the keys that the robot has, and their values."""
-        return {key: value for key, value in _items(self) if value is not None}
-
-
-def _items(config: VelocityConfig) -> list[tuple[str, Any]]:
-    return [(field.name, getattr(config, field.name)) for field in dataclasses.fields(config)]
+        return {key: value for key, value in vars(self).items() if value is not None}
 
 
 def _check_keys(robot: Any, given: Any) -> None:
