@@ -17,6 +17,7 @@ from safe_rl.envs.physics.batch import BatchPhysics
 from safe_rl.envs.velocity.velocity_config import Interval, VelocityConfig
 
 TORSO = 1  # id of the torso, the first body of every robot
+FORCES = "cfrc_ext"
 
 
 class Place(NamedTuple):
@@ -99,7 +100,11 @@ HEALTH: Mapping[str, Callable[[VelocityConfig, Tensor, Tensor], Tensor]] = {
 
 
 def locomotion_reward(
-    config: VelocityConfig, velocity_x: Tensor, control: Tensor, healthy: Tensor, forces: Tensor
+    config: VelocityConfig,
+    velocity_x: Tensor,
+    control: Tensor,
+    healthy: Tensor,
+    outputs: Mapping[str, Tensor],
 ) -> Tensor:
     """Reward for forward velocity and health, minus costs of control and contact: [N].
 
@@ -108,13 +113,14 @@ def locomotion_reward(
         velocity_x: [N] (m/s).
         control: [N, nu].
         healthy: bool [N].
-        forces: `cfrc_ext` of all bodies [N, nbody, 6] (N m, N); not read without a contact weight.
+        outputs: Of the physics. With a contact weight, `cfrc_ext` [N, nbody, 6] (N m, N) is read.
     """
     reward = config.forward_reward_weight * velocity_x
     if config.healthy_reward is not None:
         reward = reward + config.healthy_reward * healthy
     reward = reward - config.ctrl_cost_weight * control.square().sum(-1)
     if config.contact_cost_weight:
+        forces = outputs[FORCES]
         if config.contact_force_range is not None:
             forces = forces.clamp(*config.contact_force_range)
         cost = config.contact_cost_weight * forces.square().sum((-2, -1))

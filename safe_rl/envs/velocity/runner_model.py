@@ -17,12 +17,11 @@ from safe_rl.envs.contract import add_columns
 from safe_rl.envs.physics.batch import BatchPhysics
 from safe_rl.envs.physics.dynamics import SCALES, scale_dynamics
 from safe_rl.envs.pictures import Camera, Marker, Pictures
-from safe_rl.envs.velocity.locomotion import PLACES, TORSO
+from safe_rl.envs.velocity.locomotion import FORCES, PLACES, TORSO
 from safe_rl.envs.velocity.runners import RUNNERS
 from safe_rl.envs.velocity.velocity_config import VelocityConfig
 
 ASSETS = Path(gymnasium.__file__).parent / "envs" / "mujoco" / "assets"
-FORCES = "cfrc_ext"
 DISTANCE, ELEVATION = 4.0, -20.0  # of the free camera from the robot [m, degrees], as Gymnasium's
 COST_RGBA, COST_RADIUS = (1.0, 0.0, 0.0, 0.35), 0.3
 

@@ -17,7 +17,6 @@ from safe_rl.envs.physics.runge_kutta import runge_kutta_substep
 from safe_rl.envs.simulated import SimulatedEnv, check_state, require_episodes
 from safe_rl.envs.velocity.locomotion import HEALTH, PLACES, limited_speed, locomotion_reward
 from safe_rl.envs.velocity.runner_model import (
-    FORCES,
     Observer,
     RobotRenderer,
     load_model,
@@ -83,8 +82,6 @@ class VelocityEnv(SimulatedEnv):
         self._robot, self._model = RUNNERS[self.config.robot], load_model(self.config)
         outputs = needed_outputs(self.config)
         self._physics = BatchPhysics(self._model, num_envs, num_threads, outputs)
-        self._has_forces = needs_forces(self.config)
-        self._no_forces = torch.zeros(num_envs, 0, 6, dtype=torch.float64)
         self.seconds_per_step = self._physics.timestep * self.config.frame_skip
         self._observer = Observer(self.config, self._model)
         self._place = PLACES[self._robot.place].reading(self._model, self._physics)
@@ -134,15 +131,14 @@ class VelocityEnv(SimulatedEnv):
         velocity = (place - self._last_place) / self.seconds_per_step
         self._last_place.copy_(place)
         healthy = self._healthy()
-        forces = physics.outputs[FORCES] if self._has_forces else self._no_forces
-        reward = locomotion_reward(config, velocity[:, 0], control, healthy, forces)
+        reward = locomotion_reward(config, velocity[:, 0], control, healthy, physics.outputs)
         self._has_cost = (limited_speed(velocity) > config.velocity_threshold) & ~failed
         terminated = failed | ~healthy if config.terminate_when_unhealthy else failed
         return reward.masked_fill_(failed, 0.0), terminated
 
     def _advance(self) -> Tensor:
         """Run the substeps of one step; returns the robots whose physics failed [N]."""
-        if not self._has_forces:
+        if not needs_forces(self.config):
             return self._physics.step(self.config.frame_skip, refresh=False)
         failed = self._physics.step(self.config.frame_skip - 1, refresh=False)
         return failed | runge_kutta_substep(self._physics)
