@@ -64,10 +64,8 @@ class BehaviourPolicy(TensorDictModuleBase):
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write the distribution's parameters, the action and its log-probability."""
         loc, scale = self.network(*(tensordict.get(key) for key in self.in_keys))
-        if exploration_type() in WITHOUT_NOISE:
-            noise = torch.zeros_like(loc)
-        else:
-            noise = torch.randn_like(loc)
+        is_noisy = exploration_type() not in WITHOUT_NOISE
+        noise = torch.randn_like(loc) if is_noisy else torch.zeros_like(loc)
         # log N(loc + scale * noise; loc, scale) in terms of the noise
         log_prob = -0.5 * noise.square().sum(-1) - scale.log().sum(-1)
         log_prob = log_prob - 0.5 * math.log(2 * math.pi) * loc.shape[-1]
@@ -127,11 +125,8 @@ class ExploringPolicy(TensorDictModuleBase):
         self.noise = noise
         self.in_keys, self.out_keys = ["observation"], ["action"]
         device = next(actor.parameters()).device
-        self.register_buffer("low", low.to(device), persistent=False)
-        self.register_buffer("high", high.to(device), persistent=False)
-        self.register_buffer(
-            "is_random", torch.zeros((), dtype=torch.bool, device=device), persistent=False
-        )
+        for name, value in (("low", low), ("high", high), ("is_random", torch.tensor(False))):
+            self.register_buffer(name, value.to(device), persistent=False)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write the action."""

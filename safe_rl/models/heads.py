@@ -5,7 +5,7 @@ Every row of `HEADS` says for which actions its head is meant; `auto` takes the 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from functools import partial
 from typing import NamedTuple
 
@@ -129,7 +129,7 @@ def _beta(spec: TensorSpec, initial_log_std: float, device: torch.device | None)
 
 def _categorical(spec: TensorSpec, initial_log_std: float, device: torch.device | None) -> Head:
     """One logit per choice; an action of shape [N] has no dimension of components."""
-    numbers = list(_num_choices(spec))
+    numbers = _num_choices(spec)
     if len(spec.shape) == 1:
         return Head(numbers[0], nn.Identity(), ("logits",), distributions.Categorical)
     return Head(sum(numbers), _Components(numbers), ("logits",), choices)
@@ -163,21 +163,18 @@ class _Components(nn.Module):
 
 def _bounds(spec: TensorSpec, device: torch.device | None) -> tuple[Tensor, Tensor]:
     """Bounds of one environment's actions, [A] each."""
-    low, high = (
-        bound.reshape(-1, spec.shape[-1])[0] for bound in (spec.space.low, spec.space.high)
-    )
-    return low.to(device), high.to(device)
+    size, space = spec.shape[-1], spec.space
+    return space.low.reshape(-1, size)[0].to(device), space.high.reshape(-1, size)[0].to(device)
 
 
-def _num_choices(spec: TensorSpec) -> Iterator[int]:
+def _num_choices(spec: TensorSpec) -> list[int]:
     """Number of choices of every component of one environment's action."""
     size = spec.shape[-1] if len(spec.shape) > 1 else 1
     if isinstance(spec, MultiCategorical):
-        yield from (int(number) for number in spec.nvec.reshape(-1, size)[0])
-    elif isinstance(spec, Categorical):
-        yield from [int(spec.space.n)] * size
-    else:
-        yield from (int(highest) + 1 for highest in spec.space.high.reshape(-1, size)[0])
+        return spec.nvec.reshape(-1, size)[0].tolist()
+    if isinstance(spec, Categorical):
+        return [int(spec.space.n)] * size
+    return (spec.space.high.reshape(-1, size)[0] + 1).tolist()
 
 
 def _is_continuous(spec: TensorSpec) -> bool:

@@ -41,12 +41,9 @@ class EnsembleMLP(nn.Module):
         for fan_in, fan_out in pairwise(sizes):
             # the initial weights of torch.nn.Linear
             bound = fan_in**-0.5
-            for shape, parameters in (
-                ((fan_in, fan_out), self.weights),
-                ((1, fan_out), self.biases),
-            ):
-                values = torch.empty(num_networks, *shape, device=device).uniform_(-bound, bound)
-                parameters.append(nn.Parameter(values))
+            for rows, parameters in ((fan_in, self.weights), (1, self.biases)):
+                values = torch.empty(num_networks, rows, fan_out, device=device)
+                parameters.append(nn.Parameter(values.uniform_(-bound, bound)))
 
     def forward(self, inputs: Tensor, layers: Layers | None = None) -> Tensor:
         """Return outputs [E, …, n] of all networks for inputs […, m].
