@@ -23,10 +23,7 @@ from safe_rl.envs.torchrl.step_entries import dotted
 __all__ = ["from_gymnasium", "from_six_values", "make_gymnasium", "make_safety_gymnasium"]
 
 MakeEnv = Callable[[], gymnasium.Env]
-_FAILURES = (
-    *(AssertionError, NotImplementedError, TypeError, ValueError),
-    gymnasium.error.Error,
-)
+_FAILURES = (AssertionError, NotImplementedError, TypeError, ValueError, gymnasium.error.Error)
 
 
 def from_gymnasium(

@@ -12,7 +12,7 @@ import torch
 from mujoco.batch import Batch
 from torch import Tensor
 
-from safe_rl.envs.physics import MEMORY, OUTPUTS, STATE, Physics
+from safe_rl.envs.physics import OUTPUTS, STATE, Physics
 
 _PATH_INPUTS = int(mujoco.mjtState.mjSTATE_CTRL) | int(mujoco.mjtState.mjSTATE_MOCAP_POS)
 _NO_SENSORS = int(mujoco.mjtDisableBit.mjDSBL_SENSOR)
@@ -73,13 +73,11 @@ class BatchPhysics(Physics):
         # All fields are bound before the first call, because later ones would start as zero.
         for name in STATE:
             setattr(self, name, _share(self._batch.bind(name)))
-        sizes = dict(zip(MEMORY, (model.na, model.nhistory), strict=True))
-        remembered = [name for name in MEMORY if sizes[name]]
-        self.memory = {name: _share(self._batch.bind(name)) for name in remembered}
-        read = {name: _share(self._batch.bind(name)) for name in outputs}
-        if "xmat" in read:
-            read["xmat"] = read["xmat"].view(num_envs, model.nbody, 3, 3)
-        self.outputs = read
+        memory = [name for name, size in (("act", model.na), ("history", model.nhistory)) if size]
+        self.memory = {name: _share(self._batch.bind(name)) for name in memory}
+        self.outputs = {name: _share(self._batch.bind(name)) for name in outputs}
+        if "xmat" in self.outputs:
+            self.outputs["xmat"] = self.outputs["xmat"].view(num_envs, model.nbody, 3, 3)
         for name in set(OUTPUTS).intersection(outputs):
             setattr(self, name, self.outputs[name])
         self._disableflags = self._batch.expand("opt.disableflags")

@@ -66,11 +66,10 @@ def _strength(model: mujoco.MjModel, bodies: slice, factor: float) -> None:
                 "'strength_scale' is for actuators whose force is linear in their gain: motors, "
                 "position and velocity servos. This robot has others."
             )
-    for values in (
-        *(model.actuator_gainprm, model.actuator_biasprm, model.actuator_forcerange),
-        model.jnt_actfrcrange,
-    ):
-        values *= factor
+    model.actuator_gainprm *= factor
+    model.actuator_biasprm *= factor
+    model.actuator_forcerange *= factor
+    model.jnt_actfrcrange *= factor
 
 
 Scale = Callable[[mujoco.MjModel, slice, float], None]

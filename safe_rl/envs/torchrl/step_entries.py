@@ -7,7 +7,7 @@ from functools import partial
 from typing import Any
 
 import torch
-from tensordict import NestedKey, TensorDictBase
+from tensordict import NestedKey, TensorDictBase, unravel_key
 from torch import Tensor
 from torch.nn.functional import one_hot
 from torchrl.data import Binary, Bounded, Categorical, Composite, NonTensor, TensorSpec, Unbounded
@@ -26,8 +26,7 @@ _OBSERVATION = "observation"
 
 def entry_key(name: str) -> NestedKey:
     """Return the key of an entry; dots in its name separate the parts of a nested key."""
-    parts = tuple(name.split("."))
-    return parts[0] if len(parts) == 1 else parts
+    return unravel_key(tuple(name.split(".")))
 
 
 def dotted(key: NestedKey) -> str:

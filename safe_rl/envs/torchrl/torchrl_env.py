@@ -36,7 +36,7 @@ from safe_rl.targets import locate
 
 __all__ = ["TorchRLEnv", "describe_node", "make_torchrl"]
 
-MakeEnv = Callable[..., EnvBase]
+MakeEnv = partial[EnvBase]
 _STEP = "episode_step"  # environments may write TorchRL's default, "step_count", themselves
 # Errors of constructors that get wrong arguments or lack a package.
 _FAILURES = (ImportError, TypeError, ValueError, LookupError, gymnasium.error.Error)
@@ -144,8 +144,8 @@ def _tried(config: Mapping[str, Any], make_some: Callable[[MakeEnv], EnvBase]) -
 
 
 def _one(make: MakeEnv) -> EnvBase:
-    found = make.func if isinstance(make, partial) else make
-    made = found.__init__ if inspect.isclass(found) else found
+    # a metaclass may hide the signature of a class
+    made = make.func.__init__ if inspect.isclass(make.func) else make.func
     return make(num_envs=1) if "num_envs" in inspect.signature(made).parameters else make()
 
 
