@@ -174,7 +174,7 @@ def _num_choices(spec: TensorSpec) -> list[int]:
         return spec.nvec.reshape(-1, size)[0].tolist()
     if isinstance(spec, Categorical):
         return [int(spec.space.n)] * size
-    return (spec.space.high.reshape(-1, size)[0] + 1).tolist()
+    return [highest + 1 for highest in spec.space.high.reshape(-1, size)[0].tolist()]
 
 
 def _is_continuous(spec: TensorSpec) -> bool:

@@ -15,14 +15,14 @@ from safe_rl.envs import rng
 from safe_rl.envs.physics.batch import BatchPhysics
 from safe_rl.envs.physics.runge_kutta import runge_kutta_substep
 from safe_rl.envs.simulated import SimulatedEnv, check_state, require_episodes
-from safe_rl.envs.velocity.locomotion import HEALTH, PLACES, limited_speed, locomotion_reward
-from safe_rl.envs.velocity.runner_model import (
-    Observer,
-    RobotRenderer,
-    load_model,
-    needed_outputs,
-    needs_forces,
+from safe_rl.envs.velocity.locomotion import (
+    FORCES,
+    HEALTH,
+    PLACES,
+    limited_speed,
+    locomotion_reward,
 )
+from safe_rl.envs.velocity.runner_model import Observer, RobotRenderer, load_model, needed_outputs
 from safe_rl.envs.velocity.runners import RUNNERS
 from safe_rl.envs.velocity.velocity_config import VelocityConfig, resolve_velocity
 
@@ -138,7 +138,7 @@ class VelocityEnv(SimulatedEnv):
 
     def _advance(self) -> Tensor:
         """Run the substeps of one step; returns the robots whose physics failed [N]."""
-        if not needs_forces(self.config):
+        if FORCES not in self._physics.outputs:
             return self._physics.step(self.config.frame_skip, refresh=False)
         failed = self._physics.step(self.config.frame_skip - 1, refresh=False)
         return failed | runge_kutta_substep(self._physics)
