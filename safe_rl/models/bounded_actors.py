@@ -105,8 +105,7 @@ def make_bounded_actor(
         True
     """
     layers = _perceptron((observation_size, len(low)), hidden_sizes, input_scale, device)
-    squash = _Squash(low, high, device)
-    network = nn.Sequential(*layers, squash)
+    network = nn.Sequential(*layers, _Squash(low, high, device))
     return TensorDictModule(network, in_keys=["observation"], out_keys=["action"])
 
 

@@ -6,11 +6,7 @@ import math
 
 import torch
 from tensordict import TensorDictBase
-from tensordict.nn import (
-    ProbabilisticTensorDictSequential,
-    TensorDictModule,
-    TensorDictModuleBase,
-)
+from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModule, TensorDictModuleBase
 from torch import Tensor
 from torchrl.envs.utils import ExplorationType, exploration_type
 from torchrl.modules import IndependentNormal
@@ -24,8 +20,7 @@ def make_behaviour(actor: ProbabilisticTensorDictSequential) -> TensorDictModule
     """Return a `BehaviourPolicy` of an actor, which is faster, or the actor itself."""
     parameters, sampler = actor.module[0], actor.module[-1]
     # the order of the outputs of other networks is not known
-    network = getattr(parameters, "module", None)
-    is_ours = len(actor.module) == 2 and isinstance(network, Chain)
+    is_ours = len(actor.module) == 2 and isinstance(getattr(parameters, "module", None), Chain)
     is_plain = is_ours and sampler.distribution_class is IndependentNormal
     return BehaviourPolicy(actor) if is_plain else actor
 

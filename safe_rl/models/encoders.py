@@ -234,11 +234,7 @@ class RecurrentLayer(TensorDictModuleBase):
         self.in_keys = [FEATURES, RECURRENT, FIRST]
         self.out_keys = [FEATURES, ("next", RECURRENT)]
         self.recurrent = GRUModule(
-            num_features,
-            size,
-            in_keys=self.in_keys,
-            out_keys=self.out_keys,
-            device=device,
+            num_features, size, in_keys=self.in_keys, out_keys=self.out_keys, device=device
         )
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:

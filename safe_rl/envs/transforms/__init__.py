@@ -3,11 +3,7 @@
 from safe_rl.envs.transforms.action_transforms import ActionDelay, ActionFilter, ActionRepeat
 from safe_rl.envs.transforms.base import ConstraintTransform
 from safe_rl.envs.transforms.environment import TransformedConstrainedEnv, transform_env
-from safe_rl.envs.transforms.observation_transforms import (
-    ObservedCosts,
-    PolicyMemory,
-    SensorNoise,
-)
+from safe_rl.envs.transforms.observation_transforms import ObservedCosts, PolicyMemory, SensorNoise
 from safe_rl.envs.transforms.reward_transforms import EarlyTermination, RewardScale, Saute, Simmer
 
 __all__ = [

@@ -8,11 +8,6 @@ from safe_rl.lazy import import_later
 if TYPE_CHECKING:
     from safe_rl.envs.velocity.velocity_env import VelocityEnv
 
-__all__ = [
-    "VELOCITY_SUITE",
-    "VelocityConfig",
-    "VelocityEnv",
-    "resolve_velocity",
-]
+__all__ = ["VELOCITY_SUITE", "VelocityConfig", "VelocityEnv", "resolve_velocity"]
 
 __getattr__, __dir__ = import_later(__name__, {"VelocityEnv": "safe_rl.envs.velocity.velocity_env"})
