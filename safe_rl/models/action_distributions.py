@@ -3,19 +3,37 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Sequence
 from typing import Any, TypeAlias
 
 import torch
+from tensordict.nn import ProbabilisticTensorDictModule
 from torch import Tensor
-from torch.distributions import Beta, Categorical, Independent
+from torch.distributions import Beta, Categorical, Distribution, Independent
 from torch.nn.functional import softplus
+from torchrl.envs.utils import ExplorationType
 from torchrl.modules import TanhNormal
 
-__all__ = ["BoundedBeta", "SquashedNormal", "choices"]
+__all__ = ["BoundedBeta", "SquashedNormal", "action_sampler", "choices"]
 
 # Single precision rounds to 0 and 1, where Beta densities are zero or infinite.
 _EDGE = 1e-6
 Shape: TypeAlias = torch.Size | list[int] | tuple[int, ...]
+
+
+def action_sampler(
+    parameters: Sequence[str], distribution: Callable[..., Distribution], **settings: Any
+) -> ProbabilisticTensorDictModule:
+    """Return a module that reads parameters, and writes ``action`` and ``action_log_prob``."""
+    return ProbabilisticTensorDictModule(
+        in_keys=list(parameters),
+        out_keys=["action"],
+        distribution_class=distribution,
+        distribution_kwargs=settings,
+        return_log_prob=True,
+        log_prob_key="action_log_prob",
+        default_interaction_type=ExplorationType.RANDOM,
+    )
 
 
 def choices(logits: Tensor) -> Independent:

@@ -7,17 +7,11 @@ from typing import Any
 
 import torch
 from tensordict import TensorDictBase
-from tensordict.nn import (
-    ProbabilisticTensorDictModule,
-    ProbabilisticTensorDictSequential,
-    TensorDictModule,
-    TensorDictModuleBase,
-)
+from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModule, TensorDictModuleBase
 from torch import Tensor, nn
-from torchrl.envs.utils import ExplorationType
 from torchrl.modules import MLP, NormalParamExtractor
 
-from safe_rl.models.action_distributions import SquashedNormal
+from safe_rl.models.action_distributions import SquashedNormal, action_sampler
 from safe_rl.models.input_scales import InputScale
 
 __all__ = ["make_bounded_actor", "make_squashed_actor"]
@@ -72,15 +66,7 @@ def make_squashed_actor(
     extractor = NormalParamExtractor("biased_softplus_1.0", scale_lb=_SCALE_FLOOR)
     return _SquashedActor(
         _GaussianParameters(nn.Sequential(*layers, extractor)),
-        ProbabilisticTensorDictModule(
-            in_keys=["loc", "scale"],
-            out_keys=["action"],
-            distribution_class=SquashedNormal,
-            distribution_kwargs={"low": low.to(device), "high": high.to(device)},
-            return_log_prob=True,
-            log_prob_key="action_log_prob",
-            default_interaction_type=ExplorationType.RANDOM,
-        ),
+        action_sampler(("loc", "scale"), SquashedNormal, low=low.to(device), high=high.to(device)),
     )
 
 

@@ -10,16 +10,11 @@ from typing import Any
 
 import torch
 from tensordict import NestedKey
-from tensordict.nn import (
-    ProbabilisticTensorDictModule,
-    ProbabilisticTensorDictSequential,
-    TensorDictModule,
-    TensorDictModuleBase,
-)
+from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModule, TensorDictModuleBase
 from torch import Tensor, nn
-from torchrl.envs.utils import ExplorationType
 from torchrl.modules import MLP
 
+from safe_rl.models.action_distributions import action_sampler
 from safe_rl.models.heads import Head, gaussian_head
 from safe_rl.models.input_scales import InputScale
 from safe_rl.processor import cpuinfo
@@ -186,14 +181,7 @@ def assemble_actor(
     return ProbabilisticTensorDictSequential(
         *before,
         TensorDictModule(parameters, in_keys=list(in_keys), out_keys=list(head.keys)),
-        ProbabilisticTensorDictModule(
-            in_keys=list(head.keys),
-            out_keys=["action"],
-            distribution_class=head.distribution,
-            return_log_prob=True,
-            log_prob_key="action_log_prob",
-            default_interaction_type=ExplorationType.RANDOM,
-        ),
+        action_sampler(head.keys, head.distribution),
     )
 
 
