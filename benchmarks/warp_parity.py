@@ -2,7 +2,7 @@
 
     python benchmarks/warp_parity.py PointGoal1 CarButton2 --device cpu
 
-prints the figures of docs/environments.md. One step: how far positions (m, rad) are apart after a
+prints the figures of docs/guides/gpu.md. One step: how far positions (m, rad) are apart after a
 step from identical states, and in how many steps by more than 1e-5 and 1e-3; "sensitive": in how
 many of the latter MuJoCo itself ends more than 1e-3 away if the positions before the step are moved
 by 1e-7. Episodes: z of the difference of means of the return, every cost and the goals met by

@@ -65,7 +65,7 @@ COMPONENTS = [
     Component("vision", "1", "image of the robot's camera, height × width × 3", "observe_vision"),
 ]  # fmt: skip
 COST_MEANINGS = {
-    "cost": "any other cost is; with `constrain_indicator=false` it is their sum",
+    "cost": "any of the others is",
     "cost_hazards": "the robot's centre is in a hazard; size: depth [m]",
     "cost_vases_contact": "the robot touches vases; size: number of contact points",
     "cost_vases_displace": "vases have been moved since the reset; size: distance [m]",
@@ -88,7 +88,7 @@ _UNITS = {
     "subtreecom": "m",
     "touch": "N",
 }
-_SUITE_HEADS = ("`env=`", "observation", "actions", "costs", "objects")
+_SUITE_HEADS = ("`env=`", "size of observation", "size of action", "costs", "objects")
 _MARK = re.compile(r"<!-- made: (\w+) ?(.*?) -->")
 
 
@@ -105,7 +105,7 @@ def debug() -> str:
 
 def velocity() -> str:
     """The family of velocity limits."""
-    heads = ("`env=`", "Gymnasium's", "threshold [m/s]", "observation", "actions")
+    heads = ("`env=`", "Gymnasium's id", "threshold [m/s]", *_SUITE_HEADS[1:3])
     return _table(heads, map(_velocity_row, VELOCITY_SUITE.items()))
 
 
@@ -118,7 +118,7 @@ def keys() -> str:
             groups[heading[row.name]] = []
         cells = (f"`{row.name}`", row.values, f"`{row.default}`", row.meaning)
         next(reversed(groups.values())).append(cells)
-    head = ("key", "values", "default", "meaning")
+    head = ("key", "allowed values", "default", "meaning")
     return "\n".join(f"## {n.capitalize()}\n\n{_table(head, rows)}" for n, rows in groups.items())
 
 
@@ -152,7 +152,7 @@ def costs() -> str:
         (f"`{key}`", COST_MEANINGS[key], flags.get(key, "always there"))
         for key in ("cost", *(row.key for row in COSTS), EXCEPTION_KEY)
     ]
-    return _table(("cost", "positive when", "on with"), rows)
+    return _table(("cost", "it is positive if", "switched on by"), rows)
 
 
 def robots() -> str:
@@ -164,16 +164,17 @@ def robots() -> str:
             (f"`{model.actuator(i).name}`", "[{:g}, {:g}]".format(*model.actuator_ctrlrange[i]))
             for i in range(model.nu)
         ]
-        sensors = [
-            (f"`{model.sensor(i).name}`", str(model.sensor_dim[i]), _unit(model.sensor_type[i]))
+        sensors = {
+            model.sensor(i).name: (str(model.sensor_dim[i]), _unit(model.sensor_type[i]))
             for i in range(model.nsensor)
-        ]
+        }
+        rows = [(f"`{shown}`", str(len(g)), *sensors[g[0]]) for shown, g in _alike([*sensors])]
         text += [
             f"## {name}\n",
             f"{model.nu} actuators, {model.nv} degrees of freedom, "
             f"{float(model.body_subtreemass[0]):.3g} kg.\n",
-            _table(("actuator", "control"), actuators),
-            _table(("sensor", "size", "unit"), sensors),
+            _table(("actuator", "range of the control"), actuators),
+            _table(("sensor", "number", "size of each", "unit"), rows),
         ]
     return "\n".join(text)
 
@@ -234,7 +235,8 @@ def _observed() -> Iterable[tuple[str, SafetyGymEnv]]:
     everything = {"task": "push", **readings, "observation_flatten": True}
     yield "any", SafetyGymEnv(everything | {"robot_base": "point"}, num_envs=1)
     yield "Car", SafetyGymEnv(everything | {"robot_base": "car", "observe_freejoint": True}, 1)
-    yield "any", SafetyGymEnv({"task": "goal", "observe_vision": True}, num_envs=1)
+    seeing = {"robot_base": "point", "task": "goal", "observe_vision": True}
+    yield "any", SafetyGymEnv(seeing, num_envs=1)
 
 
 def _robots(labels: set[str]) -> str:

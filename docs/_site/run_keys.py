@@ -17,7 +17,7 @@ from safe_rl.files import CONF
 from safe_rl.parameters import Parameter, read_part
 from safe_rl.ranges import Options, Values, values_of
 
-_HEAD = ("key", "may be", "default", "meaning")
+_HEAD = ("key", "allowed values", "default", "meaning")
 # an algorithm of either kind: between them they have every key that is no part's
 _OPTIMISER = "torch.optim.Adam"
 _ALGORITHMS = ("ppo_lagrangian", "sac_lagrangian")

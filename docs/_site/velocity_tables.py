@@ -32,7 +32,7 @@ def velocity_runs() -> str:
     """The table."""
     rows = [
         "| `env=` | seeds | return | episode cost | epochs above 25 "
-        "| OmniSafe, 10M steps: return | episode cost |",
+        "| OmniSafe after 10M steps: return | episode cost |",
         "|---|---|---|---|---|---|---|",
     ]
     for env, known in PUBLISHED.items():
