@@ -67,8 +67,8 @@ def measured(algo: str) -> str:
         command = _command(algo, "300,301,302", ENVIRONMENTS[0])
         return f"Not yet: {command} is what the comparison is made of."
     tables = "\n\n".join(_quarters(algo, env, found) for env, found in runs.items())
-    return f"""Limit 25, defaults of the commit of each run unless a setting is named; return /
-episode cost by quarters of the run ([all algorithms](comparison.md)):
+    return f"""Return / episode cost in each quarter of a run, with limit 25 and the defaults of the
+run's commit, unless a setting is named ([how far these results go](comparison.md)):
 
 {tables}"""
 

@@ -8,11 +8,11 @@ from made import ALGORITHMS, made, page_of
 
 
 @pytest.mark.parametrize("algo", ALGORITHMS)
-def test_a_page_begins_with_what_it_is_for_and_a_command(algo):
+def test_a_page_has_its_parts_in_order(algo):
     page = page_of(algo)
-    places = [page.find(f"\n{words}") for words in ("**What it is for.**", "**When to use it.**")]
-    places.append(page.find(f"\npython train.py env=PointGoal1 algo={algo}"))
-    places.append(page.find("\n$$"))
+    heads = ("## Options", "## Measured", "## When to choose it", "## What is logged")
+    begin = ("**What it does.**", "$$", f"python train.py env=PointGoal1 algo={algo}", *heads)
+    places = [page.find(f"\n{words}") for words in begin]
     assert places == sorted(places)
     assert places[0] > 0
     assert made(page, "settings") == algo
