@@ -183,22 +183,6 @@ def means(folders, share, form="{:.1f} / {:.1f}"):
 
 
 @pytest.mark.parametrize(
-    "form",
-    [
-        "{sac_lagrangian} and {td3_lagrangian} on PointGoal1",
-        "{sac_lagrangian} and {td3_lagrangian} on CarGoal1; ten of the twelve",
-        "{cal} on PointGoal1 and",
-        "{cal} on CarGoal1 over the last quarter",
-    ],
-)
-def test_means_of_a_million_steps(form):
-    env = re.search(r"on (\w+)", form)[1]
-    runs = {algo: seeds_of(RESULTS / "algorithms" / env / algo) for algo in OFF_POLICY_ONES}
-    said = form.format(**{algo: means(folders, 0.25) for algo, folders in runs.items()})
-    assert said in sentences(PAGE)
-
-
-@pytest.mark.parametrize(
     "env", ["PointGoal1", "CarGoal1", "PointGoal2", "PointButton1", "PointPush1"]
 )
 def test_means_without_a_limit(env):
