@@ -79,7 +79,7 @@ class CALLoss(SACLagrangianLoss):
 
     discounted_limit: Tensor
     known_costs: Tensor
-    critics_say: Tensor
+    predicted_costs: Tensor
 
     def __init__(
         self,
@@ -95,14 +95,15 @@ class CALLoss(SACLagrangianLoss):
         self.out_keys = [*self.out_keys, "cost_weight"]
         zeros = torch.zeros_like(self.cost_unit)
         self.register_buffer("discounted_limit", torch.full_like(zeros, torch.inf))
-        # averages over batches, of predicted costs and of J_c; sum and number of new predictions
+        # averages over batches: of predicted costs, and of J_c
         self.register_buffer("known_costs", torch.zeros(2, *zeros.shape, device=zeros.device))
-        self.register_buffer("critics_say", torch.zeros(2, *zeros.shape, device=zeros.device))
+        # sum and number of the predictions since the last `calibrate`
+        self.register_buffer("predicted_costs", torch.zeros(2, *zeros.shape, device=zeros.device))
 
     def cost_weights(self, values: Tensor) -> Tensor:
         """λ̂ / u, [k]; also adds the critics' mean predictions to the sums for `calibrate`."""
-        means = values.flatten(0, -2).mean(0).to(self.critics_say)
-        self.critics_say.add_(torch.stack([means, torch.ones_like(means)]))
+        means = values.flatten(0, -2).mean(0).to(self.predicted_costs)
+        self.predicted_costs.add_(torch.stack([means, torch.ones_like(means)]))
         charged = self.charged(values).flatten(0, -2).mean(0)
         excess = (charged - self.discounted_limit) / self.cost_unit
         weight = self.multiplier.value.to(excess) + self.convexity * excess
@@ -111,12 +112,12 @@ class CALLoss(SACLagrangianLoss):
     def calibrate(self, episodes: KnownCosts) -> None:
         """Compute d' from predictions since the last call and a new batch (d = J_c − violation)."""
         super().calibrate(episodes)
-        total, number = self.critics_say
+        total, number = self.predicted_costs
         expected = discounted_share(self.gamma, episodes.episode_length)
         if number.any():
             news = torch.stack([total / number, episodes.costs])
             self.known_costs.lerp_(news, 1 - self.ratio_memory)
-            self.critics_say.zero_()
+            self.predicted_costs.zero_()
         by_critics, by_episodes = self.known_costs
         ratio = torch.where(by_episodes > 0, by_critics / by_episodes, expected)
         ratio = ratio.clamp(expected / self.largest_ratio, expected * self.largest_ratio)

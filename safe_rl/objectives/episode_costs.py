@@ -225,6 +225,8 @@ class EpisodeCosts(Resumable):
         self.lengths = EpisodeLengths(max_length)
         self.noise = NoiseCorrelation(memory=memory, largest=largest_correlation)
         self._mean, self._error = torch.full((2, num_costs), torch.nan)
+        #: The estimate from the last batch alone.
+        self.batch = self.estimate
         self._sums = torch.zeros(2, num_costs, dtype=torch.float64)
         self._scatter = torch.zeros(2, num_costs)
 
